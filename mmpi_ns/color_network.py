@@ -1,0 +1,70 @@
+"""Shallow colour networks, one per head or one for all (paper eq. for MLP^(rgb))."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+
+def positional_encoding(x: Float[Tensor, "N 3"], frequencies: int) -> Float[Tensor, "N E"]:
+    """(x, sin 2^i pi x, cos 2^i pi x) for i < frequencies (NeRF eq. 4)."""
+    if frequencies == 0:
+        return x
+    octaves = math.pi * 2.0 ** torch.arange(frequencies, device=x.device, dtype=x.dtype)
+    angles = (x[:, None, :] * octaves[:, None]).reshape(x.shape[0], -1)
+    return torch.cat([x, angles.sin(), angles.cos()], -1)
+
+
+class ColorNetworks(nn.Module):
+    """``count`` networks (features, PE(position), PE(direction)) -> rgb in one pooled parameter.
+
+    The first three features are colour logits, to which the network adds what the view changes; its last layer starts
+    at zero, so colours learn at the grids' rate from the first step.
+    """
+
+    def __init__(self, count: int, channels: int, width: int, position_frequencies: int, direction_frequencies: int):
+        super().__init__()
+        self.position_frequencies, self.direction_frequencies = position_frequencies, direction_frequencies
+        inputs = channels + 3 * (1 + 2 * position_frequencies) + 3 * (1 + 2 * direction_frequencies)
+        self.shapes = [(width, inputs), (width,), (width, width), (width,), (3, width), (3,)]
+        self.weights = nn.Parameter(torch.empty(0, sum(math.prod(s) for s in self.shapes)))
+        self.resize(count)
+
+    @property
+    def count(self) -> int:
+        return self.weights.shape[0]
+
+    @torch.no_grad()
+    def resize(self, count: int) -> None:
+        """Allocates ``count`` networks with PyTorch's default initialisation; equal for all, from a fixed seed."""
+        generator = torch.Generator().manual_seed(0)
+        parts = []
+        for fan_in, shape in zip((s[-1] for s in self.shapes[::2] for _ in range(2)), self.shapes, strict=True):
+            bound = 0.0 if shape[0] == 3 else 1 / math.sqrt(fan_in)
+            parts.append((torch.rand(math.prod(shape), generator=generator) * 2 - 1) * bound)
+        self.weights.data = torch.cat(parts).repeat(count, 1).to(self.weights.device)
+
+    def forward(
+        self,
+        head: int,
+        features: Float[Tensor, "N C"],
+        ndc: Float[Tensor, "N 3"],
+        directions: Float[Tensor, "N 3"],
+    ) -> Float[Tensor, "N 3"]:
+        """Colours in [0, 1] of one head's samples; directions are in the head's axes."""
+        w1, b1, w2, b2, w3, b3 = self._layers(head if self.count > 1 else 0)
+        inputs = [
+            features,
+            positional_encoding(ndc, self.position_frequencies),
+            positional_encoding(directions, self.direction_frequencies),
+        ]
+        hidden = nn.functional.relu(nn.functional.linear(torch.cat(inputs, -1), w1, b1))
+        hidden = nn.functional.relu(nn.functional.linear(hidden, w2, b2))
+        return torch.sigmoid(features[:, :3] + nn.functional.linear(hidden, w3, b3))
+
+    def _layers(self, index: int) -> list[Tensor]:
+        sizes = [math.prod(s) for s in self.shapes]
+        return [p.view(s) for p, s in zip(self.weights[index].split(sizes), self.shapes, strict=True)]

@@ -1,0 +1,55 @@
+"""Image metrics: PSNR, SSIM, and LPIPS where its weights can be had."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor, nn
+from torchmetrics.functional.image import structural_similarity_index_measure
+
+
+class ImageMetrics:
+    """Metrics of a rendered image. LPIPS fetches its weights on first use; without them it is left out, and says so."""
+
+    def __init__(self, lpips_net: Literal["vgg", "alex"]) -> None:
+        self.lpips_net = lpips_net
+        self._lpips: nn.Module | None = None
+        self._lpips_tried = False
+
+    @torch.no_grad()
+    def __call__(self, predicted: Float[Tensor, "H W 3"], observed: Float[Tensor, "H W 3"]) -> dict[str, float]:
+        mse = ((predicted.double() - observed.double()) ** 2).mean().clamp(min=1e-12)
+        a, b = (torch.moveaxis(x, -1, 0)[None].float() for x in (predicted, observed))
+        values = {"psnr": float(-10 * torch.log10(mse))}
+        if min(a.shape[-2:]) >= 11:  # SSIM's window
+            ssim = structural_similarity_index_measure(a, b, data_range=1.0)
+            assert isinstance(ssim, Tensor)
+            values["ssim"] = float(ssim)
+        lpips = self._load_lpips(a.device)
+        if lpips is not None:
+            values[f"lpips_{self.lpips_net}"] = float(lpips(a.clamp(0, 1), b.clamp(0, 1)))
+        return values
+
+    def _load_lpips(self, device: torch.device) -> nn.Module | None:
+        if not self._lpips_tried:
+            self._lpips_tried = True
+            try:
+                from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
+
+                metric = LearnedPerceptualImagePatchSimilarity(net_type=self.lpips_net, normalize=True)
+                self._lpips = metric.to(device)
+            except (OSError, RuntimeError, ImportError) as error:
+                CONSOLE.print(
+                    f"[yellow]LPIPS is left out: the weights of its {self.lpips_net} network cannot be had "
+                    f"({type(error).__name__}). Put them into torch's hub cache to get it."
+                )
+        return self._lpips
+
+
+def head_palette(count: int, device: torch.device | str) -> Float[Tensor, "H 3"]:
+    """Distinct colours, one a head."""
+    hue = torch.arange(count, dtype=torch.float32, device=device) * 0.61803 % 1
+    return 0.5 + 0.45 * torch.cos(2 * torch.pi * (hue[:, None] - torch.tensor([0.0, 1 / 3, 2 / 3], device=device)))

@@ -1,0 +1,193 @@
+"""Pixels on the device, and the training cameras, SfM points and keypoints for the model."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager, VanillaDataManagerConfig
+from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
+from nerfstudio.data.datasets.base_dataset import InputDataset
+from nerfstudio.model_components.ray_generators import RayGenerator
+from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor
+
+from mmpi_ns.placement.observations import Observations
+from mmpi_ns.random_draws import generator
+from mmpi_ns.sfm import SfmModel, find_sfm_model
+
+OBSERVATIONS = "mmpi_observations"
+"""Key under which the model finds the scene's Observations in the data set's metadata."""
+KEYPOINT_DEPTH = "keypoint_inverse_distance"
+"""Ray-bundle metadata: inverse distance of the SfM point on a keypoint ray, 0 on ordinary rays."""
+
+
+@dataclass
+class MMPIDataManagerConfig(VanillaDataManagerConfig):
+    """Settings of the data manager."""
+
+    _target: type = field(default_factory=lambda: MMPIDataManager)
+    train_num_rays_per_batch: int = 4096
+    """Pixel rays a training step."""
+    eval_num_rays_per_batch: int = 1024
+    """Rays of an evaluation batch during training."""
+    keypoint_rays: int = 384
+    """Extra rays a step through SfM keypoints of training images, for depth supervision (scenes with tracks only)."""
+    sfm_path: Path = Path("colmap/sparse/0")
+    """COLMAP model with the tracks, relative to the data; in the frame of transforms.json."""
+    seed: int = 0
+    """Batches depend on this seed and the step alone, so a resumed run draws what an uninterrupted one would."""
+
+
+@dataclass(frozen=True)
+class PixelPool:
+    """All training pixels that may be drawn, resident on the device."""
+
+    colors: Tensor
+    """[P, C] uint8 or float, C = 3 or 4."""
+    indices: Int[Tensor, "P 3"]
+    """(image, row, column) of each pixel."""
+
+    @staticmethod
+    def from_dataset(dataset: InputDataset, device: str | torch.device) -> PixelPool:
+        """Reads every image once; masked pixels are left out.
+
+        Raises:
+            ValueError: an image or mask cannot be used; names the file.
+        """
+        colors, indices = [], []
+        for i in range(len(dataset)):
+            name = dataset.image_filenames[i]
+            data = _read(dataset, i, name)
+            image = data["image"]
+            keep = torch.ones(image.shape[:2], dtype=torch.bool)
+            if "mask" in data:
+                keep = data["mask"][..., 0].bool()
+            rows, columns = keep.nonzero(as_tuple=True)
+            colors.append(image[rows, columns])
+            indices.append(torch.stack([torch.full_like(rows, i), rows, columns], -1).to(torch.int32))
+        if not sum(len(c) for c in colors):
+            raise ValueError("The masks leave no training pixel: white (non-zero) mask pixels are the ones used.")
+        return PixelPool(torch.cat(colors).to(device), torch.cat(indices).to(device))
+
+    def draw(self, count: int, g: torch.Generator) -> tuple[Float[Tensor, "R C"], Int[Tensor, "R 3"]]:
+        chosen = torch.randint(self.colors.shape[0], (count,), generator=g, device=g.device).to(self.colors.device)
+        return self.colors[chosen].float() / 255, self.indices[chosen].long()
+
+
+def _read(dataset: InputDataset, index: int, name: Path) -> dict[str, Any]:
+    try:
+        return dataset.get_data(index, image_type="uint8")
+    except (OSError, AssertionError) as error:
+        raise ValueError(f"Training image {name} cannot be read ({error}): repair or remove it.") from error
+
+
+class MMPIDataManager(VanillaDataManager[InputDataset]):
+    """Draws training batches from a resident pixel pool and hands the scene's observations to the model."""
+
+    config: MMPIDataManagerConfig
+
+    def __init__(self, config: MMPIDataManagerConfig, **kwargs: Any) -> None:
+        self.pool: PixelPool | None = None
+        super().__init__(config, **kwargs)
+
+    def create_train_dataset(self) -> InputDataset:
+        dataset = super().create_train_dataset()
+        self.observations = read_observations(self.train_dataparser_outputs, dataset.cameras, self._sfm())
+        dataset.metadata[OBSERVATIONS] = self.observations
+        return dataset
+
+    def _sfm(self) -> SfmModel | None:
+        data = self.dataparser.config.data
+        return find_sfm_model(Path(data) / self.config.sfm_path)
+
+    def setup_train(self) -> None:
+        """Loads the pixel pool instead of nerfstudio's image cache."""
+        CONSOLE.print("Setting up training dataset...")
+        self.pool = PixelPool.from_dataset(self.train_dataset, self.device)
+        self.train_ray_generator = RayGenerator(self.train_dataset.cameras.to(self.device))
+        self._keypoints = _keypoint_targets(self.observations, self.device)
+
+    def next_train(self, step: int) -> tuple[RayBundle, dict]:
+        """Pixel rays first, then keypoint rays (marked in the bundle's metadata), keyed on (seed, step)."""
+        self.train_count += 1
+        assert self.pool is not None
+        g = generator(self.config.seed, step, "pixels", self.device)
+        colors, indices = self.pool.draw(self.config.train_num_rays_per_batch, g)
+        bundle = self.train_ray_generator(indices)
+        depths = torch.zeros(len(bundle), 1, device=self.device)
+        if self._keypoints is not None and self.config.keypoint_rays > 0:
+            keypoint_bundle, keypoint_depths = self._keypoint_rays(g)
+            bundle, depths = _join(bundle, keypoint_bundle), torch.cat([depths, keypoint_depths])
+        bundle.metadata[KEYPOINT_DEPTH] = depths
+        return bundle, {"image": colors, "indices": indices}
+
+    def _keypoint_rays(self, g: torch.Generator) -> tuple[RayBundle, Float[Tensor, "Q 1"]]:
+        assert self._keypoints is not None
+        cameras, coords, inverse = self._keypoints
+        chosen = torch.randint(cameras.shape[0], (self.config.keypoint_rays,), generator=g, device=g.device)
+        chosen = chosen.to(cameras.device)
+        bundle = self.train_ray_generator.cameras.generate_rays(
+            camera_indices=cameras[chosen][:, None], coords=coords[chosen]
+        )
+        return bundle, inverse[chosen][:, None]
+
+    def get_train_rays_per_batch(self) -> int:
+        return self.config.train_num_rays_per_batch
+
+
+def _join(a: RayBundle, b: RayBundle) -> RayBundle:
+    assert a.camera_indices is not None and b.camera_indices is not None
+    return RayBundle(
+        origins=torch.cat([a.origins, b.origins]),
+        directions=torch.cat([a.directions, b.directions]),
+        pixel_area=torch.cat([a.pixel_area, b.pixel_area]),
+        camera_indices=torch.cat([a.camera_indices, b.camera_indices]),
+        metadata={},
+    )
+
+
+def _keypoint_targets(observations: Observations, device: str | torch.device) -> tuple[Tensor, Tensor, Tensor] | None:
+    """Camera, (row, column) and inverse distance of every keypoint of the training images."""
+    if not len(observations.seen_by):
+        return None
+    offsets = observations.points[observations.seen_point] - observations.centers[observations.seen_by]
+    inverse = 1 / np.maximum(np.linalg.norm(offsets, axis=-1), 1e-12)
+    coords = torch.from_numpy(observations.seen_at[:, ::-1].copy()).float()
+    cameras = torch.from_numpy(observations.seen_by)
+    return cameras.to(device), coords.to(device), torch.from_numpy(inverse).float().to(device)
+
+
+def read_observations(outputs: DataparserOutputs, cameras: Cameras, sfm: SfmModel | None) -> Observations:
+    """Training cameras as they are used, with the SfM points and keypoints moved into their frame.
+
+    Raises:
+        ValueError: poses are missing or not finite.
+    """
+    poses = cameras.camera_to_worlds.double().cpu().numpy()
+    if len(poses) < 1 or not np.isfinite(poses).all():
+        raise ValueError("The training cameras hold no pose or one that is not finite: check transforms.json.")
+    flat = [x.double().cpu().numpy().reshape(-1) for x in (cameras.fx, cameras.fy, cameras.cx, cameras.cy)]
+    sizes = np.stack([cameras.width.cpu().numpy().reshape(-1), cameras.height.cpu().numpy().reshape(-1)], -1)
+    empty = np.zeros(0, dtype=np.int64)
+    result: Mapping[str, Any] = {"points": np.zeros((0, 3)), "seen_by": empty, "seen_point": empty}
+    seen_at = np.zeros((0, 2))
+    if sfm is not None:
+        transform = torch.eye(4, dtype=torch.float64)
+        transform[:3] = outputs.dataparser_transform.double()[:3]
+        moved = sfm.points @ transform[:3, :3].numpy().T + transform[:3, 3].numpy()
+        tracks = sfm.keypoints_of([Path(p).name for p in outputs.image_filenames])
+        result = {"points": moved * outputs.dataparser_scale, "seen_by": tracks[0], "seen_point": tracks[1]}
+        seen_at = tracks[2] * sizes[tracks[0]]
+    elif "points3D_xyz" in outputs.metadata:
+        result = {**result, "points": outputs.metadata["points3D_xyz"].double().numpy()}
+    return Observations(
+        camera_to_worlds=poses, intrinsics=np.stack(flat, -1), sizes=sizes.astype(np.float64), seen_at=seen_at, **result
+    )

@@ -1,0 +1,364 @@
+"""The field: K MPI heads and the cube, their densities, colours and reliabilities (paper sec. III-B to III-D).
+
+One pooled Parameter a kind, with a block of rows per head (``texels.py``), so that K, growth and storage never change
+the parameter list, which nerfstudio fixes before K is known.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Float, Int
+from nerfstudio.cameras.rays import RaySamples
+from nerfstudio.field_components.field_heads import FieldHeadNames
+from nerfstudio.fields.base_field import Field
+from torch import Tensor, nn
+
+from mmpi_ns import geometry, losses
+from mmpi_ns.color_network import ColorNetworks
+from mmpi_ns.compositing import BlendForm, blend_shares, blended_optical_depth
+from mmpi_ns.ops.interpolate import interpolate
+from mmpi_ns.placement.plan import ScenePlan
+from mmpi_ns.texels import TexelGrid, head_grids, resample
+
+RELEASED_DENSITY = -20.0
+"""Raw density of texels that no ray trained: their alpha is below 1e-7."""
+NEGLIGIBLE_DEPTH = 1e-4
+"""Samples thinner than this are given an equal share instead of a reliability lookup when choosing survivors."""
+
+
+def plane_biases(planes: int) -> tuple[Float[Tensor, "L"], float]:
+    """Density biases b_l with which all planes start at equal rendering weight 1/L, and the interval 256/L.
+
+    alpha_l = 1 / (L - l), the last one clamped; alpha = 1 - exp(-softplus(b) interval) solved for b.
+    Source: DVGO v2's MPI; docs/how_it_works.md, "Density".
+    """
+    interval = 256.0 / planes
+    alpha = (1.0 / (planes - torch.arange(planes, dtype=torch.float64))).clamp(max=0.999)
+    return torch.log(torch.expm1(-torch.log1p(-alpha) / interval)).float(), interval
+
+
+@dataclass(frozen=True)
+class Lookup:
+    """Where the valid samples of a merged batch read the tables."""
+
+    shape: torch.Size
+    """(R, S) of the batch."""
+    index: Int[Tensor, "N"]
+    """Flat slots of the valid samples."""
+    heads: Int[Tensor, "N"]
+    planes: Int[Tensor, "N"]
+    ndc: Float[Tensor, "N 3"]
+    groups: list[Any]
+    """(rows, weights, members): all MPI samples ordered by head, then the cube's; members index the N samples."""
+
+    def split(self, members: Int[Tensor, "M"]) -> list[tuple[int, Int[Tensor, "P"]]]:
+        """(head, positions within ``members``), in the order of ``members``."""
+        return by_head(self.heads[members])
+
+
+class MMPIField(Field):
+    """Density, colour and reliability of all heads.
+
+    Args:
+        plan: frames and resolutions.
+        feature_channels: channels of the colour features; the first three are added to the colour logits.
+        hidden_width: width of the colour networks' hidden layers.
+        position_frequencies: octaves of the positional encoding of NDC positions.
+        direction_frequencies: octaves of the positional encoding of directions in the MPI's frame.
+        shared_colour: one colour network for all heads (the paper's notation) instead of one each.
+        depth_scale: factor on every optical depth; 1/K where K MPIs train jointly from the start.
+        samples_per_voxel: samples along a ray per voxel side of the cube.
+        cube_alpha: initial alpha of a cube sample.
+    """
+
+    def __init__(
+        self,
+        plan: ScenePlan,
+        *,
+        feature_channels: int = 9,
+        hidden_width: int = 64,
+        position_frequencies: int = 2,
+        direction_frequencies: int = 2,
+        shared_colour: bool = False,
+        depth_scale: float = 1.0,
+        samples_per_voxel: float = 1.0,
+        cube_alpha: float = 1e-3,
+    ) -> None:
+        super().__init__()
+        self.feature_channels = feature_channels
+        self.depth_scale = depth_scale
+        self.samples_per_voxel = samples_per_voxel
+        self.cube_alpha = cube_alpha
+        self.full_plan = self.plan = plan
+        self.grids: list[TexelGrid] = []
+        self._packed: dict[Any, Any] = {}
+        self.density = nn.Parameter(torch.empty(0, 1))
+        self.features = nn.Parameter(torch.empty(0, feature_channels))
+        self.reliability = nn.Parameter(torch.empty(0, 1))
+        self.networks = ColorNetworks(
+            1 if shared_colour else plan.num_heads,
+            feature_channels,
+            hidden_width,
+            position_frequencies,
+            direction_frequencies,
+        )
+        self.register_buffer("touched", torch.empty(0, dtype=torch.uint8))
+        self.register_buffer("plan_bytes", torch.empty(0, dtype=torch.uint8))
+        self.register_buffer("texel_factor", torch.tensor(1.0, dtype=torch.float64))
+        self.touched: Tensor
+        self.plan_bytes: Tensor
+        self.texel_factor: Tensor
+        self.build(plan, 1.0)
+
+    # Storage ---------------------------------------------------------------------------------------------------
+
+    def build(self, plan: ScenePlan, factor: float) -> None:
+        """Allocates all tables afresh for ``plan`` at ``factor`` times its texels. Parameters stay the same objects."""
+        self.full_plan, self.plan = plan, plan.scaled(factor)
+        self.grids = head_grids(self.plan)
+        texels = self.plan.texels
+        device = self.density.device
+        for table, channels in ((self.density, 1), (self.features, self.feature_channels), (self.reliability, 1)):
+            _replace_data(table, torch.zeros(texels, channels, device=device))
+        self.touched = torch.zeros(texels, dtype=torch.uint8, device=device)
+        self.plan_bytes = torch.frombuffer(bytearray(plan.to_json().encode()), dtype=torch.uint8).to(device)
+        self.texel_factor = torch.tensor(factor, dtype=torch.float64, device=device)
+        self._packed = {}
+
+    @torch.no_grad()
+    def grow(self, factor: float) -> None:
+        """Resamples every table to ``factor`` times the plan's texels (paper sec. IV; bilinear on each plane)."""
+        old, self.plan = self.grids, self.full_plan.scaled(factor)
+        self.grids = head_grids(self.plan)
+        is_cube = [k >= len(self.plan.mpis) for k in range(self.plan.num_heads)]
+        for table in (self.density, self.features, self.reliability):
+            _replace_data(table, resample(table.data, old, self.grids, is_cube))
+        touched = resample(self.touched[:, None].float(), old, self.grids, is_cube)
+        self.touched = (touched[:, 0] > 0).to(torch.uint8)
+        self.texel_factor.fill_(factor)
+        self._packed = {}
+
+    @torch.no_grad()
+    def release_untouched(self) -> None:
+        """Empties the texels that no ray trained: alpha 0, no vote in the blending."""
+        self.density.data[self.touched == 0] = RELEASED_DENSITY
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
+        """Takes plan and resolution from the checkpoint first, so that all shapes fit."""
+        plan_bytes = state_dict.get(prefix + "plan_bytes")
+        if plan_bytes is None:
+            if not any(key.startswith(prefix) for key in state_dict):
+                return  # nerfstudio loads the pipeline's own, empty state in a second pass
+            raise ValueError("The checkpoint holds no scene plan: it was not written by this method.")
+        plan = ScenePlan.from_json(bytes(plan_bytes.cpu().numpy().tolist()).decode())
+        if plan.num_heads != self.full_plan.num_heads and self.networks.count > 1:
+            self.networks.resize(plan.num_heads)
+        self.build(plan, float(state_dict[prefix + "texel_factor"]))
+        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
+
+    # Constants of the plan, on the parameters' device ---------------------------------------------------------
+
+    def _cached(self, name: str, make: Any) -> Any:
+        key = (name, self.density.device)
+        if key not in self._packed:
+            self._packed[key] = make()
+        return self._packed[key]
+
+    @property
+    def frames(self) -> geometry.Frames:
+        return self._cached("frames", lambda: geometry.Frames.pack(self.plan.mpis, device=self.density.device))
+
+    @property
+    def cube(self) -> geometry.Cube | None:
+        plan, device = self.plan.cube, self.density.device
+        if plan is None:
+            return None
+        return self._cached("cube", lambda: geometry.Cube.pack(plan, self.samples_per_voxel, device=device))
+
+    def _biases(self, k: int) -> Tensor:
+        planes, device = self.plan.mpis[k].planes, self.density.device
+        return self._cached(f"bias{k}", lambda: plane_biases(planes)[0].to(device))
+
+    # Density ---------------------------------------------------------------------------------------------------
+
+    def mpi_optical_depth(
+        self, k: int, planes: Int[Tensor, "N"], ndc: Float[Tensor, "N 3"]
+    ) -> Float[Tensor, "N"]:
+        """tau of MPI k at NDC (u, v) on its planes."""
+        rows, weights = self.grids[k].bilinear(planes, ndc)
+        return self._mpi_tau(k, interpolate(self.density, rows, weights)[:, 0], planes)
+
+    def cube_optical_depth(self, ndc: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
+        """tau of the cube at normalised positions."""
+        rows, weights = self.grids[-1].trilinear(ndc)
+        return self._cube_tau(interpolate(self.density, rows, weights)[:, 0])
+
+    def _mpi_tau(self, k: int, raw: Tensor, planes: Tensor) -> Tensor:
+        interval = 256.0 / self.plan.mpis[k].planes
+        raw = raw.float() if raw.dtype in (torch.float16, torch.bfloat16) else raw
+        return nn.functional.softplus(raw + self._biases(k)[planes]) * (interval * self.depth_scale)
+
+    def _cube_tau(self, raw: Tensor) -> Tensor:
+        interval = 1.0 / self.samples_per_voxel
+        alpha = torch.tensor(self.cube_alpha, dtype=torch.float64)
+        bias = float(torch.log(torch.expm1(-torch.log1p(-alpha) / interval)))
+        return nn.functional.softplus(raw + bias) * interval
+
+    # Reliability -----------------------------------------------------------------------------------------------
+
+    def shares(
+        self,
+        origins: Float[Tensor, "N 3"],
+        directions: Float[Tensor, "N 3"],
+        inverse_t: Float[Tensor, "N"],
+        heads: Int[Tensor, "N"],
+    ) -> tuple[Float[Tensor, "N"], Float[Tensor, "N"]]:
+        """log P and log(1 - P) of samples among the heads that cover them (paper sec. III-C).
+
+        A head covers a point inside its frustum whose nearest texel was trained; a sample's own head always does.
+        """
+        ndc, inside = geometry.samples_to_ndc(origins, directions, inverse_t, self.frames)
+        if self.cube is not None:
+            points = origins + directions / inverse_t.clamp(min=1e-10)[:, None]
+            in_cube = self.cube.normalised(points)
+            inside = torch.cat([inside, ((in_cube.abs() <= 1).all(-1) & (inverse_t > 0))[:, None]], -1)
+            ndc = torch.cat([ndc, in_cube.clamp(-1, 1)[:, None]], 1)
+        columns, cover = [], []
+        for j, grid in enumerate(self.grids):
+            is_own = heads == j
+            index = (inside[:, j] | is_own).nonzero()[:, 0]
+            position = ndc[index, j]
+            value = interpolate(self.reliability, *grid.trilinear(position))[:, 0]
+            columns.append(value.new_zeros(heads.shape[0]).index_put((index,), value))
+            voting = torch.zeros_like(is_own)
+            voting[index] = self.touched[grid.nearest(position)] > 0
+            cover.append(voting | is_own)
+        return blend_shares(torch.stack(columns, -1), torch.stack(cover, -1), heads)
+
+    def blend(
+        self,
+        tau: Float[Tensor, "N"],
+        origins: Float[Tensor, "N 3"],
+        directions: Float[Tensor, "N 3"],
+        inverse_t: Float[Tensor, "N"],
+        heads: Int[Tensor, "N"],
+        form: BlendForm,
+    ) -> Float[Tensor, "N"]:
+        """Blended optical depth of many samples, most of them empty: those get an equal share."""
+        index = (tau > NEGLIGIBLE_DEPTH).nonzero()[:, 0]
+        share = self.shares(origins[index], directions[index], inverse_t[index], heads[index])
+        blended = tau / len(self.grids)
+        return blended.index_copy(0, index, blended_optical_depth(tau[index], *share, form))
+
+    # nerfstudio's Field ------------------------------------------------------------------------------------------
+
+    def get_density(self, ray_samples: RaySamples) -> tuple[Float[Tensor, "R S 1"], Lookup]:  # type: ignore[override]
+        """Optical depth of each valid sample (0 in empty slots), and where the lookups went.
+
+        nerfstudio's "density" times interval: on a plane there is no interval, so the product itself is learned.
+        """
+        lookup = self._lookup(ray_samples)
+        tau = lookup.ndc.new_zeros(lookup.index.shape[0])
+        for rows, weights, members in lookup.groups:
+            if self.training and self.density.requires_grad:
+                self.touched.index_fill_(0, rows.reshape(-1), 1)
+            raw = interpolate(self.density, rows, weights)[:, 0]
+            pieces = [self._head_tau(k, raw[sel], lookup.planes[members[sel]]) for k, sel in lookup.split(members)]
+            tau = tau.index_put((members,), torch.cat(pieces))
+        out = tau.new_zeros(lookup.shape.numel()).index_put((lookup.index,), tau)
+        return out.view(*lookup.shape, 1), lookup
+
+    def _head_tau(self, k: int, raw: Tensor, planes: Tensor) -> Tensor:
+        return self._mpi_tau(k, raw, planes) if k < len(self.plan.mpis) else self._cube_tau(raw)
+
+    def _lookup(self, ray_samples: RaySamples) -> Lookup:
+        meta = ray_samples.metadata
+        index = meta["valid"].reshape(-1).nonzero()[:, 0]
+        heads = meta["heads"].reshape(-1)[index]
+        planes, ndc = meta["planes"].reshape(-1)[index], meta["ndc"].reshape(-1, 3)[index]
+        mpi, groups = [], []
+        for k, members in by_head(heads):
+            if k < len(self.plan.mpis):
+                mpi.append((*self.grids[k].bilinear(planes[members], ndc[members]), members))
+            else:
+                groups.append((*self.grids[k].trilinear(ndc[members]), members))
+        if mpi:
+            groups.insert(0, tuple(torch.cat(parts) for parts in zip(*mpi, strict=True)))
+        return Lookup(meta["valid"].shape[:2], index, heads, planes, ndc, groups)
+
+    def get_outputs(  # type: ignore[override]
+        self, ray_samples: RaySamples, density_embedding: Lookup | None = None
+    ) -> dict[FieldHeadNames, Tensor]:
+        """Colours of the valid samples; empty slots are black."""
+        lookup = density_embedding or self._lookup(ray_samples)
+        directions = ray_samples.frustums.directions.reshape(-1, 3)[lookup.index]
+        rgb = lookup.ndc.new_zeros(lookup.index.shape[0], 3)
+        for rows, weights, members in lookup.groups:
+            features = interpolate(self.features, rows, weights)
+            colors = []
+            for k, sel in lookup.split(members):
+                local = directions[members[sel]] @ self._axes(k).T
+                colors.append(self.networks(k, features[sel], lookup.ndc[members[sel]], local))
+            rgb = rgb.index_put((members,), torch.cat(colors))
+        out = rgb.new_zeros(lookup.shape.numel(), 3).index_put((lookup.index,), rgb)
+        return {FieldHeadNames.RGB: out.view(*lookup.shape, 3)}
+
+    def total_variation(self, lookup: Lookup, density_weight: float, feature_weight: float) -> Tensor:
+        """Weighted total variation of the texels that the batch touched, in DVGO's normalisation (not yet per ray)."""
+        total = self.density.new_zeros(())
+        rows = [rows.reshape(-1) for rows, _, _ in lookup.groups]
+        if not rows:
+            return total
+        touched = torch.unique(torch.cat(rows))
+        for k, grid in enumerate(self.grids):
+            own = touched[(touched >= grid.offset) & (touched < grid.offset + grid.texels)]
+            if not own.numel():
+                continue
+            neighbours, exists = grid.neighbours(own)
+            side = torch.tensor([grid.width, grid.width, grid.height, grid.height, grid.depth, grid.depth])
+            if k < len(self.plan.mpis):
+                side[:4] = max(grid.width, grid.height)
+            scales = exists * (side / 128).to(own.device)
+            one = torch.ones_like(own, dtype=self.density.dtype)[:, None]
+            for table, weight in ((self.density, density_weight), (self.features, feature_weight)):
+                if weight > 0:
+                    values = interpolate(table, own[:, None], one)
+                    around = table.data[neighbours.reshape(-1)].view(*neighbours.shape, -1)
+                    total = total + weight * losses.total_variation(values, around, scales)
+        return total
+
+    def _axes(self, k: int) -> Tensor:
+        if k < len(self.plan.mpis):
+            return self.frames.axes[k]
+        return torch.eye(3, device=self.density.device)
+
+    def sample_shares(self, ray_samples: RaySamples, lookup: Lookup) -> tuple[Tensor, Tensor]:
+        """``shares`` of the valid samples of a merged batch, with gradients to the reliability."""
+        meta, frustums = ray_samples.metadata, ray_samples.frustums
+        return self.shares(
+            frustums.origins.reshape(-1, 3)[lookup.index],
+            frustums.directions.reshape(-1, 3)[lookup.index],
+            meta["inverse_t"].reshape(-1)[lookup.index],
+            lookup.heads,
+        )
+
+
+def by_head(heads: Int[Tensor, "N"]) -> list[tuple[int, Int[Tensor, "M"]]]:
+    """(head, indices of its samples) for every head that occurs."""
+    if not heads.numel():
+        return []
+    return [(k, index) for k in range(int(heads.max()) + 1) if (index := (heads == k).nonzero()[:, 0]).numel()]
+
+
+def _replace_data(parameter: nn.Parameter, data: Tensor) -> None:
+    """Gives a parameter data of another shape.
+
+    A graph of an earlier step that is still referenced keeps the parameter's gradient accumulator, and with it the old
+    shape, alive. Torch renews the accumulator when the dtype changes, so the data goes through another dtype.
+    """
+    parameter.grad = None
+    parameter.data = torch.empty(0, dtype=torch.float64, device=data.device)
+    parameter.data = data

@@ -1,0 +1,437 @@
+"""The model: plan -> field -> sampler -> compositing -> losses -> outputs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from jaxtyping import Bool, Float
+from nerfstudio.cameras.rays import RayBundle, RaySamples
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
+from nerfstudio.field_components.field_heads import FieldHeadNames
+from nerfstudio.models.base_model import Model, ModelConfig
+from nerfstudio.viewer.viewer_elements import ViewerDropdown
+from torch import Tensor
+from torch.nn import Parameter
+
+from mmpi_ns import losses
+from mmpi_ns.compositing import (
+    BlendForm,
+    Composite,
+    blended_optical_depth,
+    composite_weights,
+    median_inverse_distance,
+    render_colors,
+)
+from mmpi_ns.metrics import ImageMetrics, head_palette
+from mmpi_ns.mmpi_datamanager import KEYPOINT_DEPTH, OBSERVATIONS
+from mmpi_ns.mmpi_field import Lookup, MMPIField
+from mmpi_ns.mmpi_sampler import MergeReport, MMPISampler
+from mmpi_ns.phases import TRAINS, Schedule, make_schedule
+from mmpi_ns.placement.plan import ScenePlan
+from mmpi_ns.placement.rule import PlacementConfig, place
+from mmpi_ns.random_draws import generator
+
+BACKGROUNDS = {"black": 0.0, "gray": 0.5, "white": 1.0}
+
+
+@dataclass
+class LossWeights:
+    """Weights of the losses beside the photometric one."""
+
+    point_color: float = 0.01
+    """Colour of each sample against its ray's."""
+    background_entropy: float = 0.001
+    """Entropy of what passes a ray."""
+    distortion: float = 0.01
+    """Spread of a ray's mass over distance."""
+    keypoint_depth: float = 0.02
+    """-log of the mass near an SfM keypoint (scenes with tracks)."""
+    tv_density: float = 1e-5
+    """Total variation of the densities, in DVGO's normalisation."""
+    tv_features: float = 1e-6
+    """Total variation of the features, likewise."""
+
+
+@dataclass
+class MMPIModelConfig(ModelConfig):
+    """Settings of the model."""
+
+    _target: type = field(default_factory=lambda: MMPIModel)
+    enable_collider: bool = False
+    """Must stay off: a finite far would drop the plane at infinity."""
+    eval_num_rays_per_chunk: int = 8192
+    """Rays rendered at once."""
+    placement: PlacementConfig = field(default_factory=PlacementConfig)
+    """Where the MPIs stand and how fine they are."""
+    plan_file: Path | None = None
+    """A scene plan (JSON) to use instead of the placement rule."""
+    training: Literal["two-phase", "joint"] = "two-phase"
+    """Each MPI alone, then reliability (two-phase), or all together without reliability (joint)."""
+    total_steps: int = 1
+    """Set by the trainer from --max-num-iterations; the phases are shares of it."""
+    blend_share: float = 0.1
+    """Share of the steps in which only reliability trains."""
+    finetune_share: float = 0.3
+    """Share of the steps in which everything trains together at the end."""
+    finetune_rate: float = 0.3
+    """Learning rates at the start of the fine-tune relative to those of the first phase."""
+    decay_decades: float = 1.5
+    """Decades that learning rates fall over a phase."""
+    growth_shares: tuple[float, ...] = (1 / 15, 2 / 15, 3 / 15, 4 / 15)
+    """When the texels of a plane double, as shares of the first phase."""
+    rays_per_mpi: Literal["split", "all"] = "split"
+    """Individual phase: the MPIs share a batch's rays, or each renders all of them (K times the work a step)."""
+    blend_form: BlendForm = "paper"
+    """How reliability enters: P alpha (paper) or 1 - (1 - alpha)^P (opacity)."""
+    shared_colour: bool = False
+    """One colour network for all MPIs instead of one each."""
+    feature_channels: int = 9
+    """Colour features of a texel."""
+    hidden_width: int = 64
+    """Width of the colour networks."""
+    position_frequencies: int = 2
+    """Octaves of the positional encoding of NDC positions."""
+    direction_frequencies: int = 2
+    """Octaves of the positional encoding of directions."""
+    samples_per_voxel: float = 1.0
+    """Samples per voxel side along a ray through the cube."""
+    cube_alpha: float = 1e-3
+    """Initial alpha of a cube sample: 1e-2 for a small room to 1e-4."""
+    train_threshold: float = 1e-3
+    """Samples of less weight get no gradient (never more than a tenth of an equal share)."""
+    render_threshold: float = 1e-3
+    """Samples of less weight are not coloured when rendering; the dropped mass is reported."""
+    background: Literal["black", "gray", "white"] = "gray"
+    """Behind everything, when rendering. Training uses random colours where the MPIs explain the whole ray."""
+    loss: LossWeights = field(default_factory=LossWeights)
+    """Weights of the losses."""
+    tv_every: int = 4
+    """Total variation is added every so many steps, at so many times its weight."""
+    lpips_net: Literal["vgg", "alex"] = "vgg"
+    """Network of the LPIPS metric (the paper: VGG); left out where its weights cannot be had."""
+    seed: int = 0
+    """Seed of the model's own random draws."""
+
+
+class MMPIModel(Model):
+    """K multi-plane images and a cube, merged by distance and blended by reliability."""
+
+    config: MMPIModelConfig
+
+    def populate_modules(self) -> None:
+        super().populate_modules()
+        plan = self._initial_plan()
+        self.schedule = self._make_schedule()
+        joint = self.config.training == "joint"
+        self.field = MMPIField(
+            plan,
+            feature_channels=self.config.feature_channels,
+            hidden_width=self.config.hidden_width,
+            position_frequencies=self.config.position_frequencies,
+            direction_frequencies=self.config.direction_frequencies,
+            shared_colour=self.config.shared_colour,
+            depth_scale=1.0 / len(plan.mpis) if joint else 1.0,
+            samples_per_voxel=self.config.samples_per_voxel,
+            cube_alpha=self.config.cube_alpha,
+        )
+        self.field.build(plan, self.schedule.texel_factor(0))
+        self.sampler = MMPISampler()
+        self.metrics = ImageMetrics(self.config.lpips_net)
+        self.register_buffer("schedule_bytes", _to_bytes(self.schedule.to_json()))
+        self.step = 0
+        self.show = ViewerDropdown("Show MPI", "all", ["all", *plan.names], hint="One MPI alone, or all blended")
+
+    def _initial_plan(self) -> ScenePlan:
+        if self.config.plan_file is not None:
+            return ScenePlan.load(self.config.plan_file)
+        observations = self.kwargs.get("metadata", {}).get(OBSERVATIONS)
+        if observations is None:
+            raise ValueError("The data manager gave no observations: use MMPIDataManager, or name a plan file.")
+        return place(observations, self.config.placement)
+
+    def _make_schedule(self) -> Schedule:
+        c = self.config
+        return make_schedule(
+            c.training,
+            max(1, c.total_steps),
+            blend_share=c.blend_share,
+            finetune_share=c.finetune_share,
+            growth_shares=c.growth_shares,
+            decay_decades=c.decay_decades,
+            finetune_rate=c.finetune_rate,
+        )
+
+    # State -------------------------------------------------------------------------------------------------------
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
+        """The schedule of a run is the checkpoint's, whatever the config says now."""
+        stored = state_dict.get(prefix + "schedule_bytes")
+        if stored is not None:
+            self.schedule = Schedule.from_json(bytes(stored.cpu().numpy().tolist()).decode())
+            self.schedule_bytes = stored.clone().to(self.device)
+        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
+
+    def get_param_groups(self) -> dict[str, list[Parameter]]:
+        return {
+            "density": [self.field.density],
+            "features": [self.field.features],
+            "colour": [self.field.networks.weights],
+            "reliability": [self.field.reliability],
+        }
+
+    def get_training_callbacks(self, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:  # type: ignore[override]
+        return [
+            TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], self.prepare_step, args=[attributes])
+        ]
+
+    def prepare_step(self, attributes: TrainingCallbackAttributes | None, step: int) -> None:
+        """Brings resolution, freezing and released texels to what the schedule says of this step."""
+        self.step = step
+        phase = self.schedule.phase_at(step)
+        factor = self.schedule.texel_factor(step)
+        if factor != float(self.field.texel_factor):
+            self.field.grow(factor)
+            optimizers = attributes.optimizers.optimizers if attributes and attributes.optimizers else {}
+            for kind in ("density", "features", "reliability"):
+                if kind in optimizers:
+                    optimizers[kind].reset_moments(self.get_param_groups()[kind][0])
+        if phase.name == "blend" and step == phase.start:
+            self.field.release_untouched()
+        for kind, params in self.get_param_groups().items():
+            for p in params:
+                p.requires_grad_(kind in TRAINS[phase.name])
+
+    @property
+    def blends(self) -> bool:
+        """Whether reliability takes part in rendering now. In between phases of training a picture is always blended."""
+        if self.config.training == "joint" or self.field.plan.num_heads == 1:
+            return False
+        return not self.training or self.schedule.blends_at(self.step)
+
+    # Rendering ---------------------------------------------------------------------------------------------------
+
+    def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Tensor]:  # type: ignore[override]
+        """Renders rays: rgb, accumulation, depth and winning MPI, and in training what the losses need."""
+        bundle = self._bounded(ray_bundle)
+        if self.training and self.schedule.phase_at(self.step).name == "individual":
+            bundle, head_mask, choose = self._individual(bundle)
+        else:
+            head_mask, choose = self._shown(len(bundle)), None
+        blend_form = self.config.blend_form if self.blends and head_mask is None else None
+        samples, report = self.sampler(
+            bundle,
+            field=self.field,
+            threshold=self.config.train_threshold if self.training else self.config.render_threshold,
+            head_mask=head_mask,
+            choose=choose,
+            blend_form=blend_form,
+        )
+        tau, lookup = self.field.get_density(samples)
+        tau = tau[..., 0]
+        if blend_form is not None and lookup.index.numel():
+            tau = self._blend(tau, samples, lookup, blend_form)
+        valid = samples.metadata["valid"][..., 0]
+        composite = composite_weights(tau, valid, samples.metadata["skipped_before"][..., 0], report.skipped_total)
+        colors = self.field.get_outputs(samples, lookup)[FieldHeadNames.RGB]
+        outputs = self._outputs(composite, colors, samples, report)
+        if self.training:
+            outputs["training"] = TrainingRays(bundle, samples, composite, colors, report, lookup)  # type: ignore
+        return outputs
+
+    def _bounded(self, bundle: RayBundle) -> RayBundle:
+        """Nears and fars: the plan's start of rays, and no end, unless a crop set tighter ones."""
+        near = torch.full_like(bundle.origins[:, :1], self.field.plan.ray_near)
+        bundle.nears = near if bundle.nears is None else torch.maximum(bundle.nears, near)
+        bundle.fars = torch.full_like(near, torch.inf) if bundle.fars is None else bundle.fars
+        return bundle
+
+    def _individual(self, bundle: RayBundle) -> tuple[RayBundle, Tensor | None, Tensor | None]:
+        """Gives each ray to one MPI (by random priorities), or to every MPI in turn; the cube joins each."""
+        num_mpis, heads = len(self.field.plan.mpis), self.field.plan.num_heads
+        if num_mpis == 1:
+            return bundle, None, None
+        if self.config.rays_per_mpi == "split":
+            g = generator(self.config.seed, self.step, "assignment", self.device)
+            return bundle, None, torch.rand(len(bundle), num_mpis, generator=g, device=self.device)
+        repeated = _repeat(bundle, num_mpis)
+        own = torch.arange(num_mpis, device=self.device).repeat_interleave(len(bundle))
+        mask = torch.arange(heads, device=self.device) == own[:, None]
+        mask[:, num_mpis:] = True
+        return repeated, mask, None
+
+    def _shown(self, num_rays: int) -> Bool[Tensor, "R H"] | None:
+        """The viewer's choice of one MPI, as a head mask."""
+        names = self.field.plan.names
+        if self.training or self.show.value not in names:
+            return None
+        chosen = torch.arange(len(names), device=self.device) == names.index(self.show.value)
+        return chosen.expand(num_rays, -1)
+
+    def _blend(self, tau: Tensor, samples: RaySamples, lookup: Lookup, form: BlendForm) -> Tensor:
+        share, rest = self.field.sample_shares(samples, lookup)
+        flat = blended_optical_depth(tau.reshape(-1)[lookup.index], share, rest, form)
+        return tau.new_zeros(tau.numel()).index_put((lookup.index,), flat).view(tau.shape)
+
+    def _outputs(
+        self, composite: Composite, colors: Tensor, samples: RaySamples, report: MergeReport
+    ) -> dict[str, Tensor]:
+        rgb = render_colors(composite, colors)
+        background = BACKGROUNDS[self.config.background]
+        outputs = {
+            "rgb": rgb + composite.transmittance * background if not self.training else rgb,
+            "accumulation": composite.accumulation,
+            "depth": self._depth(composite, samples),
+        }
+        if not self.training:
+            heads = samples.metadata["heads"][..., 0]
+            mass = rgb.new_zeros(rgb.shape[0], self.field.plan.num_heads).scatter_add(1, heads, composite.weights)
+            outputs["rgb"] = outputs["rgb"].clamp(0, 1)
+            outputs["winning_mpi"] = mass.argmax(-1, keepdim=True).to(rgb.dtype)
+            outputs["dropped_mass"] = report.dropped_mass
+        return outputs
+
+    @torch.no_grad()
+    def _depth(self, composite: Composite, samples: RaySamples) -> Float[Tensor, "R 1"]:
+        """Euclidean distance at half the gathered mass; infinity is shown as ten times the farthest finite plane."""
+        inverse_t, valid = samples.metadata["inverse_t"][..., 0], samples.metadata["valid"][..., 0]
+        farthest = 10 * max(m.near * (m.planes - 1) for m in self.field.plan.mpis)
+        return 1 / median_inverse_distance(composite.weights, inverse_t, valid).clamp(min=1 / farthest)
+
+    # Losses and metrics ------------------------------------------------------------------------------------------
+
+    def get_loss_dict(
+        self, outputs: dict[str, Any], batch: dict[str, Tensor], metrics_dict: dict[str, Any] | None = None
+    ) -> dict[str, Tensor]:
+        image = batch["image"].to(self.device)
+        if "training" not in outputs:  # an evaluation batch during training
+            observed = _over(image, torch.full_like(image[:, :3], BACKGROUNDS[self.config.background]))
+            return {"rgb_loss": losses.photometric(outputs["rgb"], observed)}
+        rays: TrainingRays = outputs["training"]
+        g = generator(self.config.seed, self.step, "background", self.device)
+        return rays.losses(self.field, image, self.config, g, self.step)
+
+    def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Tensor]) -> dict[str, Any]:
+        if "training" in outputs:
+            report = outputs["training"].report
+            return {
+                "live_samples": report.live.float().mean(),
+                "kept_samples": outputs["training"].samples.metadata["valid"].float().sum() / len(report.live),
+                "dropped_mass": report.dropped_mass.mean(),
+            }
+        image = batch["image"].to(self.device)
+        observed = _over(image, torch.full_like(image[:, :3], BACKGROUNDS[self.config.background]))
+        return {"psnr": -10 * torch.log10(losses.photometric(outputs["rgb"], observed))}
+
+    def get_image_metrics_and_images(
+        self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
+    ) -> tuple[dict[str, float], dict[str, Tensor]]:
+        image = batch["image"].to(outputs["rgb"].device)
+        observed = _over(image, torch.full_like(image[..., :3], BACKGROUNDS[self.config.background]))
+        values = self.metrics(outputs["rgb"], observed)
+        values["dropped_mass"] = float(outputs["dropped_mass"].mean())
+        palette = head_palette(self.field.plan.num_heads, outputs["rgb"].device)
+        near = 1 / outputs["depth"].clamp(min=1e-9)
+        images = {
+            "img": torch.cat([observed, outputs["rgb"]], 1),
+            "accumulation": outputs["accumulation"].expand(-1, -1, 3),
+            "inverse_depth": (near / near.flatten().quantile(0.98).clamp(min=1e-9)).clamp(0, 1).expand(-1, -1, 3),
+            "winning_mpi": palette[outputs["winning_mpi"][..., 0].long()],
+        }
+        return values, images
+
+
+@dataclass(frozen=True)
+class TrainingRays:
+    """A rendered training batch: pixel rays first, then keypoint rays (each block repeated for every MPI it went to)."""
+
+    bundle: RayBundle
+    samples: RaySamples
+    composite: Composite
+    colors: Float[Tensor, "R S 3"]
+    report: MergeReport
+    lookup: Lookup
+
+    def losses(
+        self, field: MMPIField, image: Tensor, config: MMPIModelConfig, g: torch.Generator, step: int
+    ) -> dict[str, Tensor]:
+        """All losses of the batch, each times its weight."""
+        known = self.bundle.metadata.get(KEYPOINT_DEPTH)
+        num_pixels = image.shape[0]
+        is_pixel = self._pixel_rays(num_pixels)
+        copies = int(is_pixel.sum()) // num_pixels
+        image = image.repeat(copies, 1)
+        random = torch.rand(image.shape[0], 3, generator=g, device=image.device)
+        observed = _over(image, random)
+        # Where the MPIs see a ray only in part, what they let through is not theirs to explain.
+        explained = self.report.explained[is_pixel] | torch.full_like(self.report.explained[is_pixel], image.shape[-1] == 4)
+        background = torch.where(explained, random, observed)
+        weights, transmittance = self.composite.weights[is_pixel], self.composite.transmittance[is_pixel]
+        rgb = render_colors(self._pixel_composite(is_pixel), self.colors[is_pixel]) + transmittance * background
+        weight = config.loss
+        total = {
+            "rgb_loss": losses.photometric(rgb, observed),
+            "point_color": weight.point_color * losses.point_color(self.colors[is_pixel], weights, observed),
+            "entropy": weight.background_entropy * losses.background_entropy(transmittance),
+            "distortion": weight.distortion * self._distortion(is_pixel, field.plan.content_near),
+        }
+        if known is not None and bool((known > 0).any()):
+            total["keypoint_depth"] = weight.keypoint_depth * self._keypoint_depth(~is_pixel, known)
+        if step % config.tv_every == 0 and field.density.requires_grad:
+            total["tv"] = field.total_variation(self.lookup, weight.tv_density, weight.tv_features) * (
+                config.tv_every / max(1, image.shape[0])
+            )
+        return total
+
+    def _pixel_rays(self, num_pixels: int) -> Bool[Tensor, "R"]:
+        known = self.bundle.metadata.get(KEYPOINT_DEPTH)
+        if known is None:
+            return torch.ones(len(self.bundle), dtype=torch.bool, device=self.colors.device)
+        return known[:, 0] == 0
+
+    def _pixel_composite(self, is_pixel: Tensor) -> Composite:
+        c = self.composite
+        return Composite(c.weights[is_pixel], c.accumulation[is_pixel], c.transmittance[is_pixel])
+
+    def _distortion(self, is_pixel: Tensor, scale: float) -> Tensor:
+        inverse_t = self.samples.metadata["inverse_t"][..., 0][is_pixel]
+        positions = 1 / (1 + inverse_t * scale)
+        intervals = (1 / self.report.live[is_pixel].clamp(min=1))[:, None].to(positions.dtype)
+        return losses.distortion(self.composite.weights[is_pixel], positions, intervals.expand_as(positions))
+
+    def _keypoint_depth(self, chosen: Tensor, known: Tensor) -> Tensor:
+        meta = self.samples.metadata
+        return losses.keypoint_depth(
+            self.composite.weights[chosen],
+            meta["inverse_t"][..., 0][chosen],
+            known[chosen],
+            meta["valid"][..., 0][chosen],
+        )
+
+
+def _over(image: Tensor, background: Tensor) -> Tensor:
+    """RGBA over a background; RGB as it is."""
+    if image.shape[-1] == 4:
+        return image[..., :3] * image[..., 3:] + background * (1 - image[..., 3:])
+    return image
+
+
+def _repeat(bundle: RayBundle, times: int) -> RayBundle:
+    def repeat(x: Tensor | None) -> Any:
+        return None if x is None else x.repeat(times, *([1] * (x.ndim - 1)))
+
+    return RayBundle(
+        origins=repeat(bundle.origins),
+        directions=repeat(bundle.directions),
+        pixel_area=repeat(bundle.pixel_area),
+        camera_indices=repeat(bundle.camera_indices),
+        nears=repeat(bundle.nears),
+        fars=repeat(bundle.fars),
+        metadata={k: repeat(v) for k, v in bundle.metadata.items()},
+    )
+
+
+def _to_bytes(text: str) -> Tensor:
+    return torch.frombuffer(bytearray(text.encode()), dtype=torch.uint8)

@@ -1,0 +1,125 @@
+"""Which phase a step is in, what trains in it, at which resolution and learning rate. Pure functions of the step.
+
+The schedule is fixed before step 0 and travels in the checkpoint, so that a resumed run walks the same path.
+Source: paper sec. III-C ("two-stage reliability learning scheme") and sec. IV (30k + 10k steps).
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from itertools import pairwise
+from typing import Literal
+
+PhaseName = Literal["individual", "blend", "finetune", "joint"]
+ParameterKind = Literal["density", "features", "colour", "reliability"]
+Training = Literal["two-phase", "joint"]
+
+TRAINS: dict[str, frozenset[str]] = {
+    "individual": frozenset({"density", "features", "colour"}),
+    "joint": frozenset({"density", "features", "colour"}),
+    "blend": frozenset({"reliability"}),
+    "finetune": frozenset({"density", "features", "colour", "reliability"}),
+}
+"""What trains in each phase; everything else is frozen, bit for bit."""
+
+
+@dataclass(frozen=True)
+class Phase:
+    name: str
+    start: int
+    end: int
+    """One past the phase's last step."""
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Phases that follow each other, resolution growth, and learning-rate decay."""
+
+    phases: tuple[Phase, ...]
+    growth: tuple[int, ...]
+    """Steps at which the texels of a plane double; before the first they are 2^-len(growth) of the plan's."""
+    decay_decades: float
+    """Learning rates fall by 10^-decay_decades over a phase."""
+    finetune_rate: float
+    """Learning rates at the start of the fine-tune, relative to those of the first phase."""
+
+    @property
+    def total_steps(self) -> int:
+        return self.phases[-1].end
+
+    def phase_at(self, step: int) -> Phase:
+        """The phase of an absolute step; the last phase from its end on (evaluation after training)."""
+        for phase in self.phases:
+            if step < phase.end:
+                return phase
+        return self.phases[-1]
+
+    def blends_at(self, step: int) -> bool:
+        """Whether reliability takes part in rendering at this step."""
+        return self.phase_at(step).name in ("blend", "finetune")
+
+    def texel_factor(self, step: int) -> float:
+        """Share of the plan's texels in use at this step, a power of two."""
+        return 2.0 ** -sum(step < g for g in self.growth)
+
+    def rate_factor(self, kind: str, step: int) -> float:
+        """Learning rate of a parameter kind relative to its start value; 0 where it is frozen."""
+        phase = self.phase_at(step)
+        if kind not in TRAINS[phase.name]:
+            return 0.0
+        progress = (step - phase.start) / max(1, phase.end - phase.start)
+        base = self.finetune_rate if phase.name == "finetune" else 1.0
+        return float(base * 10.0 ** (-self.decay_decades * min(progress, 1.0)))
+
+    def to_json(self) -> str:
+        return json.dumps(asdict(self))
+
+    @staticmethod
+    def from_json(text: str) -> Schedule:
+        data = json.loads(text)
+        phases = tuple(Phase(**p) for p in data.pop("phases"))
+        return Schedule(phases=phases, growth=tuple(data.pop("growth")), **data)
+
+
+def make_schedule(
+    training: Training,
+    total_steps: int,
+    *,
+    blend_share: float = 0.25,
+    finetune_share: float = 0.0,
+    growth_shares: tuple[float, ...] = (1 / 15, 2 / 15, 3 / 15, 4 / 15),
+    decay_decades: float = 1.5,
+    finetune_rate: float = 0.1,
+) -> Schedule:
+    """The schedule of a run of ``total_steps`` steps.
+
+    Args:
+        training: ``two-phase`` (individual, blend, optional fine-tune) or ``joint`` (all MPIs together, no reliability).
+        total_steps: all steps of the run.
+        blend_share: share of the steps in which only reliability trains (two-phase).
+        finetune_share: share of the steps in which everything trains together at the end (two-phase).
+        growth_shares: when texels double, as shares of the first phase.
+        decay_decades: decades that learning rates fall over a phase (paper: x0.1 per 20k of 30k steps = 1.5).
+        finetune_rate: learning rates at the start of the fine-tune relative to the first phase's.
+
+    Raises:
+        ValueError: the shares leave no step for the first phase.
+    """
+    if total_steps < 1:
+        raise ValueError(f"Training needs at least 1 step, got {total_steps}: raise --max-num-iterations.")
+    lengths: list[tuple[str, int]]
+    if training == "joint":
+        lengths = [("joint", total_steps)]
+    else:
+        blend, finetune = round(total_steps * blend_share), round(total_steps * finetune_share)
+        if total_steps - blend - finetune < 1:
+            raise ValueError("blend-share + finetune-share leave no step for the individual phase: lower them.")
+        lengths = [("individual", total_steps - blend - finetune), ("blend", blend), ("finetune", finetune)]
+    lengths = [(name, n) for name, n in lengths if n > 0]
+    ends = [sum(n for _, n in lengths[: i + 1]) for i in range(len(lengths))]
+    phases = tuple(Phase(name, end - n, end) for (name, n), end in zip(lengths, ends, strict=True))
+    growth = tuple(max(1, round(s * phases[0].end)) for s in growth_shares)
+    if any(a > b for a, b in pairwise(growth)):
+        raise ValueError("growth-shares must not decrease.")
+    return Schedule(phases, growth, float(decay_decades), float(finetune_rate))

@@ -1,0 +1,113 @@
+"""Hand-made plans: the frozen rule for drives that automatic placement has to beat, and the paper's room."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mmpi_ns.placement.observations import Array, Observations
+from mmpi_ns.placement.plan import CubePlan, MPIPlan, ScenePlan, Vector
+
+
+def vector(v: Array) -> Vector:
+    return (float(v[0]), float(v[1]), float(v[2]))
+
+
+def facing_axes(base: Array, name: str) -> tuple[Vector, Vector, Vector]:
+    """Rows x, y, z of an MPI that faces ``name`` in a frame with rows right, down, forward."""
+    right, down, forward = base
+    rows = {
+        "front": (right, down, forward),
+        "back": (-right, down, -forward),
+        "left": (forward, down, -right),
+        "right": (-forward, down, right),
+        "below": (right, -forward, down),
+        "above": (right, forward, -down),
+    }[name]
+    x, y, z = (vector(row) for row in rows)
+    return (x, y, z)
+
+
+def drive_plan(
+    observations: Observations,
+    metre: float,
+    planes: int,
+    height: int,
+    width: int,
+    names: tuple[str, ...] = ("front", "left", "right", "below"),
+    pull_back: float = 0.45,
+) -> ScenePlan:
+    """Four MPIs along a straight drive, placed by hand in metres (frozen: the rule to beat).
+
+    Args:
+        observations: training cameras; the drive runs along their mean direction.
+        metre: scene units in a metre.
+        planes: planes of every MPI.
+        height: texel rows of every MPI.
+        width: texel columns of every MPI.
+        names: which of the four to use.
+        pull_back: how far behind the first camera the front MPI stands, as a share of the travel.
+    """
+    base = observations.mean_axes
+    centers = observations.centers @ base.T
+    start = np.array([centers[:, 0].mean(), centers[:, 1].mean(), centers[:, 2].min()])
+    travel = float(np.ptp(centers[:, 2])) / metre
+    back = pull_back * travel
+    # origin (right, down, forward) in metres from the first camera, near, tangents along the MPI's own x and y
+    rule = {
+        "front": ((0.0, 0.0, -back), back + 3, (-1.0, 1.0, -0.35, 0.35)),
+        "left": ((8.0, 0.0, travel / 2), 10.0, (-2.5, 9.0, -0.7, 0.4)),
+        "right": ((-8.0, 0.0, travel / 2), 10.0, (-9.0, 2.5, -0.7, 0.4)),
+        "below": ((0.0, -4.0, travel / 2), 4.8, (-6.0, 6.0, -18.0, 6.0)),
+    }
+    mpis = []
+    for name in names:
+        origin, near, extent = rule[name]
+        world = (start + np.array(origin) * metre) @ base
+        mpis.append(
+            MPIPlan(name, vector(world), facing_axes(base, name), near * metre, extent, planes, height, width)
+        )
+    return ScenePlan(tuple(mpis), None, 1.0 * metre, 5.0 * metre, "hand-made drive")
+
+
+def room_plan(
+    observations: Observations,
+    planes: int,
+    resolution: int,
+    cube_voxels: int,
+    near: float,
+    cube_half_size: float,
+    names: tuple[str, ...] = ("front", "back", "left", "right", "below"),
+    tangent: float = 1.25,
+) -> ScenePlan:
+    """The paper's ScanNet arrangement: five MPIs around the cameras' centre and a cube (sec. IV).
+
+    Args:
+        observations: training cameras.
+        planes: planes of every MPI.
+        resolution: texels along each side of a plane.
+        cube_voxels: voxels along each side of the cube; 0 for none.
+        near: depth of the first plane, scene units.
+        cube_half_size: half the cube's side, scene units.
+        names: the directions to face.
+        tangent: half the extent of each MPI; above 1 neighbours overlap.
+    """
+    base = observations.mean_axes
+    center = (observations.centers.min(0) + observations.centers.max(0)) / 2
+    mpis = tuple(
+        MPIPlan(
+            name,
+            vector(center),
+            facing_axes(base, name),
+            near,
+            (-tangent, tangent, -tangent, tangent),
+            planes,
+            resolution,
+            resolution,
+        )
+        for name in names
+    )
+    cube = None
+    if cube_voxels:
+        shape = (cube_voxels, cube_voxels, cube_voxels)
+        cube = CubePlan(vector(center - cube_half_size), vector(center + cube_half_size), shape)
+    return ScenePlan(mpis, cube, 0.1 * near, near, "hand-made room")

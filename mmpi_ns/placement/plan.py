@@ -1,0 +1,159 @@
+"""ScenePlan: where the MPIs stand and what they spend texels on, as plain data.
+
+A plan is all that a field needs to be built, so it travels inside the checkpoint (as JSON bytes) and beside
+``config.yml`` (as a file that a person can read and edit).
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+
+Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class MPIPlan:
+    """One multi-plane image. Lengths are in scene units, angles as tangents, axes are x right, y down, z facing."""
+
+    name: str
+    """Shown in the viewer and in tables."""
+    origin: Vector
+    """Centre of projection, world axes."""
+    axes: tuple[Vector, Vector, Vector]
+    """Rows are the frame's x, y and z (facing) axes in world coordinates; orthonormal, right-handed."""
+    near: float
+    """Depth of the nearest plane; the planes are evenly spaced in disparity from there to infinity."""
+    extent: tuple[float, float, float, float]
+    """Frustum as tangents (u0, u1, v0, v1); asymmetric is fine."""
+    planes: int
+    """Number of planes, the last one at infinity."""
+    height: int
+    """Texel rows of a plane."""
+    width: int
+    """Texel columns of a plane."""
+
+    @property
+    def texels(self) -> int:
+        return self.planes * self.height * self.width
+
+    def scaled(self, factor: float) -> MPIPlan:
+        """The same frame with ``factor`` times the texels a plane (both sides keep their ratio)."""
+        side = math.sqrt(factor)
+        return replace(self, height=max(2, round(self.height * side)), width=max(2, round(self.width * side)))
+
+
+@dataclass(frozen=True)
+class CubePlan:
+    """The centred voxel grid (paper sec. III-D): an axis-aligned box in world coordinates."""
+
+    lower: Vector
+    upper: Vector
+    shape: tuple[int, int, int]
+    """Voxels along z, y and x (the memory order of the grid)."""
+
+    @property
+    def texels(self) -> int:
+        return self.shape[0] * self.shape[1] * self.shape[2]
+
+    def scaled(self, factor: float) -> CubePlan:
+        side = factor ** (1 / 3)
+        nz, ny, nx = (max(2, round(n * side)) for n in self.shape)
+        return replace(self, shape=(nz, ny, nx))
+
+
+@dataclass(frozen=True)
+class ScenePlan:
+    """All MPIs of a scene, the optional cube, and the two distances that training needs."""
+
+    mpis: tuple[MPIPlan, ...]
+    cube: CubePlan | None
+    ray_near: float
+    """Rays start here: nothing is sampled closer to a camera than this."""
+    content_near: float
+    """Distance from the cameras to the first content: an MPI entered later than this explains a ray only in part."""
+    origin_of_plan: str = "by hand"
+    """Which rule made the plan, for the reader."""
+
+    def __post_init__(self) -> None:
+        self.validate()
+
+    @property
+    def num_heads(self) -> int:
+        return len(self.mpis) + (self.cube is not None)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(m.name for m in self.mpis) + (("cube",) if self.cube is not None else ())
+
+    @property
+    def texels(self) -> int:
+        return sum(m.texels for m in self.mpis) + (self.cube.texels if self.cube else 0)
+
+    def scaled(self, factor: float) -> ScenePlan:
+        """The plan at another resolution: ``factor`` times the texels, equal frames and planes."""
+        if factor == 1:
+            return self
+        cube = self.cube.scaled(factor) if self.cube else None
+        return replace(self, mpis=tuple(m.scaled(factor) for m in self.mpis), cube=cube)
+
+    def validate(self) -> None:
+        """Raises ValueError with one sentence that names the MPI and the field that cannot be used."""
+        if not self.mpis:
+            raise ValueError("A scene plan needs at least one MPI, this one has none: add one to its list 'mpis'.")
+        for mpi in self.mpis:
+            _validate_mpi(mpi)
+        if self.cube is not None:
+            sides = [b - a for a, b in zip(self.cube.lower, self.cube.upper, strict=True)]
+            if not all(math.isfinite(s) and s > 0 for s in sides) or min(self.cube.shape) < 2:
+                raise ValueError("The plan's cube needs upper > lower on every axis and at least 2 voxels a side.")
+        if not (math.isfinite(self.ray_near) and self.ray_near >= 0 and self.content_near >= 0):
+            raise ValueError("The plan's ray_near and content_near must be finite and not negative.")
+
+    def to_json(self) -> str:
+        return json.dumps(asdict(self), indent=1)
+
+    @staticmethod
+    def from_json(text: str) -> ScenePlan:
+        """Reads what ``to_json`` wrote. Raises ValueError naming the field when a field is missing or unknown."""
+        try:
+            data = json.loads(text)
+        except json.JSONDecodeError as error:
+            raise ValueError(f"The scene plan is not valid JSON ({error}): fix it or leave it out.") from error
+        mpis = tuple(_build(MPIPlan, m) for m in data.get("mpis", []))
+        cube = _build(CubePlan, data["cube"]) if data.get("cube") else None
+        return _build(ScenePlan, {**data, "mpis": mpis, "cube": cube})
+
+    @staticmethod
+    def load(path: Path) -> ScenePlan:
+        if not path.is_file():
+            raise ValueError(f"There is no scene plan at {path}: check the path given to --pipeline.model.plan-file.")
+        return ScenePlan.from_json(path.read_text(encoding="utf-8"))
+
+
+def _validate_mpi(mpi: MPIPlan) -> None:
+    numbers = [*mpi.origin, *mpi.extent, mpi.near, *(x for row in mpi.axes for x in row)]
+    if not all(math.isfinite(x) for x in numbers):
+        raise ValueError(f"MPI '{mpi.name}' of the plan holds a number that is not finite: correct or remove it.")
+    dots = [sum(a * b for a, b in zip(p, q, strict=True)) for p in mpi.axes for q in mpi.axes]
+    if max(abs(d - float(i % 4 == 0)) for i, d in enumerate(dots)) > 1e-4:
+        raise ValueError(f"The axes of MPI '{mpi.name}' are not orthonormal: give three perpendicular unit rows.")
+    if mpi.near <= 0 or mpi.extent[0] >= mpi.extent[1] or mpi.extent[2] >= mpi.extent[3]:
+        raise ValueError(f"MPI '{mpi.name}' needs near > 0 and an extent (u0, u1, v0, v1) with u0 < u1 and v0 < v1.")
+    if mpi.planes < 2 or mpi.height < 2 or mpi.width < 2:
+        raise ValueError(f"MPI '{mpi.name}' needs at least 2 planes and 2 x 2 texels.")
+
+
+def _build(cls, data: dict):
+    names = {f.name for f in fields(cls)}
+    unknown, missing = set(data) - names, names - set(data) - {"origin_of_plan"}
+    if unknown or missing:
+        wrong = f"lacks {sorted(missing)}" if missing else f"has unknown fields {sorted(unknown)}"
+        raise ValueError(f"A {cls.__name__} in the scene plan {wrong}: compare it with docs/how_it_works.md.")
+    return cls(**{k: _tuples(v) for k, v in data.items()})
+
+
+def _tuples(value):
+    return tuple(_tuples(v) for v in value) if isinstance(value, list) else value

@@ -1,0 +1,65 @@
+"""Reads a COLMAP model: points, and which image saw which point at which pixel."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+MIN_TRACK = 3
+"""Points seen by fewer images are too uncertain to supervise depth."""
+MAX_ERROR_PX = 2.0
+"""Points with a larger mean reprojection error are left out."""
+
+
+@dataclass(frozen=True)
+class SfmModel:
+    """Sparse points and their keypoints."""
+
+    points: NDArray[np.float64]
+    """[P, 3] in the model's frame."""
+    names: tuple[str, ...]
+    """Image file names."""
+    keypoints: tuple[tuple[NDArray[np.int64], NDArray[np.float64]], ...]
+    """For each image: point of each keypoint [Q], and where it lies as a share of width and height [Q, 2]."""
+
+    def keypoints_of(
+        self, image_names: Sequence[str]
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+        """(index into ``image_names``, point, relative position) of the keypoints of these images only."""
+        by_name = dict(zip(self.names, self.keypoints, strict=True))
+        found = [(i, *by_name[name]) for i, name in enumerate(image_names) if name in by_name]
+        if not found:
+            return np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2))
+        cameras = np.concatenate([np.full(len(p), i, np.int64) for i, p, _ in found])
+        return cameras, np.concatenate([p for _, p, _ in found]), np.concatenate([xy for _, _, xy in found])
+
+
+def find_sfm_model(path: Path) -> SfmModel | None:
+    """The COLMAP model in a folder; None where there is none.
+
+    Raises:
+        ValueError: the folder holds a model that cannot be read.
+    """
+    if not (path / "images.bin").is_file() and not (path / "images.txt").is_file():
+        return None
+    import pycolmap  # slow to import, and only scenes with a model need it
+
+    try:
+        model = pycolmap.Reconstruction(str(path))
+    except (ValueError, RuntimeError, OSError) as error:
+        raise ValueError(f"The COLMAP model in {path} cannot be read ({error}): repair or remove it.") from error
+    good = [i for i, p in model.points3D.items() if p.track.length() >= MIN_TRACK and p.error <= MAX_ERROR_PX]
+    row = {point: n for n, point in enumerate(good)}
+    points = np.array([model.points3D[i].xyz for i in good], dtype=np.float64).reshape(-1, 3)
+    names, keypoints = [], []
+    for image in model.images.values():
+        camera = model.cameras[image.camera_id]
+        seen = [(row[p.point3D_id], *p.xy) for p in image.points2D if p.has_point3D() and p.point3D_id in row]
+        table = np.array(seen, dtype=np.float64).reshape(-1, 3)
+        names.append(Path(image.name).name)
+        keypoints.append((table[:, 0].astype(np.int64), table[:, 1:] / [camera.width, camera.height]))
+    return SfmModel(points, tuple(names), tuple(keypoints))

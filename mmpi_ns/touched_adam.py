@@ -1,0 +1,95 @@
+"""Adam that visits only what a batch touched (DVGO's masked Adam, for sparse row gradients).
+
+Equal to dense Adam in which entries with no gradient are skipped: their values and moments stay as they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from nerfstudio.engine.optimizers import OptimizerConfig
+from torch import Tensor
+from torch.nn import Parameter
+
+
+class TouchedAdam(torch.optim.Optimizer):
+    """Adam over touched rows (sparse gradients) or touched entries (dense gradients).
+
+    Args:
+        params: parameters; tables with sparse gradients are [rows, channels].
+        lr: learning rate.
+        betas: decay of the two moments (paper settings: 0.9, 0.99).
+        eps: added to the root of the second moment.
+    """
+
+    def __init__(self, params: Any, lr: float, betas: tuple[float, float] = (0.9, 0.99), eps: float = 1e-8, **_: Any):
+        super().__init__(params, {"lr": lr, "betas": betas, "eps": eps})
+
+    @torch.no_grad()
+    def step(self, closure: Callable[[], float] | None = None) -> None:  # type: ignore[override]
+        assert closure is None, "TouchedAdam takes no closure"
+        for group in self.param_groups:
+            for param in group["params"]:
+                if param.grad is None:
+                    continue
+                state = self.state[param]
+                if not state:
+                    state["step"] = 0
+                    state["exp_avg"] = torch.zeros_like(param)
+                    state["exp_avg_sq"] = torch.zeros_like(param)
+                state["step"] += 1
+                update = _sparse_update if param.grad.is_sparse else _dense_update
+                update(param, param.grad, state, group)
+
+    def reset_moments(self, param: Parameter) -> None:
+        """Forgets the moments of a parameter whose data was resized or redefined."""
+        self.state.pop(param, None)
+
+
+def _adam(
+    grad: Tensor, mean: Tensor, square: Tensor, state: dict[str, Any], group: dict[str, Any]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """New moments and the step to subtract; all three unchanged (0) where the gradient is exactly 0."""
+    beta1, beta2 = group["betas"]
+    touched = grad != 0
+    mean = torch.where(touched, mean.lerp(grad, 1 - beta1), mean)
+    square = torch.where(touched, (square * beta2).addcmul_(grad, grad, value=1 - beta2), square)
+    correction = (1 - beta2 ** state["step"]) ** 0.5
+    delta = mean / square.sqrt().div_(correction).add_(group["eps"])
+    delta = torch.where(touched, delta, torch.zeros_like(delta))
+    return mean, square, delta.mul_(group["lr"] / (1 - beta1 ** state["step"]))
+
+
+def _sparse_update(param: Parameter, grad: Tensor, state: dict[str, Any], group: dict[str, Any]) -> None:
+    rows, inverse = torch.unique(grad._indices()[0], return_inverse=True)
+    values = torch.zeros((rows.shape[0], *param.shape[1:]), dtype=param.dtype, device=param.device)
+    values.index_add_(0, inverse, grad._values().to(param.dtype))
+    old_mean, old_square = state["exp_avg"].index_select(0, rows), state["exp_avg_sq"].index_select(0, rows)
+    mean, square, delta = _adam(values, old_mean, old_square, state, group)
+    fresh = param.data.index_select(0, rows).sub_(delta)
+    state["exp_avg"].index_copy_(0, rows, mean)
+    state["exp_avg_sq"].index_copy_(0, rows, square)
+    param.data.index_copy_(0, rows, fresh)
+
+
+def _dense_update(param: Parameter, grad: Tensor, state: dict[str, Any], group: dict[str, Any]) -> None:
+    mean, square, delta = _adam(grad, state["exp_avg"], state["exp_avg_sq"], state, group)
+    param.data.sub_(delta)
+    state["exp_avg"].copy_(mean)
+    state["exp_avg_sq"].copy_(square)
+
+
+@dataclass
+class TouchedAdamConfig(OptimizerConfig):
+    """Settings of TouchedAdam."""
+
+    _target: type = TouchedAdam
+    lr: float = 0.1
+    """Learning rate at the start of the group's phase."""
+    betas: tuple[float, float] = (0.9, 0.99)
+    """Decay of the first and second moment."""
+    eps: float = 1e-8
+    """Keeps the update finite where the second moment is zero."""
