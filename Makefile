@@ -1,0 +1,59 @@
+# Development commands; `make` alone lists them. Every target works on a fresh clone.
+
+SHELL := bash
+.SHELLFLAGS := -eu -o pipefail -c
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+
+VENV := .venv
+BIN := $(VENV)/bin
+# Written last, so that an install that failed or was interrupted leaves none.
+STAMP := $(VENV)/.installed
+
+# True of a Python that this package runs on and that can make a virtual environment.
+PYTHON_OK := import sys, venv, ensurepip; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 12))
+
+# The Python that makes .venv: the first of these names that runs and is suitable, or `make venv PYTHON=...`.
+PYTHON ?= $(shell for p in python3.11 python3.12 python3.10 python3; do \
+	if "$$p" -c '$(PYTHON_OK)' >/dev/null 2>&1; then echo "$$p"; break; fi; done)
+
+# Extra arguments for pytest, for example: make test ARGS="-k geometry -x"
+ARGS ?=
+
+.PHONY: help venv test lint build clean
+
+help: ## List these commands
+	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
+
+venv: $(STAMP) ## Make .venv and install the package in it, editable, with its pinned dependencies
+
+$(STAMP): pyproject.toml constraints.txt
+	@rm -f $@
+	@if ! { $(BIN)/python -c '$(PYTHON_OK)' && $(BIN)/python -m pip --version; } >/dev/null 2>&1; then \
+		python="$(PYTHON)"; \
+		if [ -z "$$python" ] || ! "$$python" -c '$(PYTHON_OK)' >/dev/null 2>&1; then \
+			echo "make: no Python 3.10, 3.11 or 3.12 with the venv module was found$${python:+ as $$python}; install one or name it with PYTHON=/path/to/python." >&2; \
+			exit 1; \
+		fi; \
+		echo "Making $(VENV) with $$python"; \
+		"$$python" -m venv --clear $(VENV); \
+	fi
+	@echo "Installing the package and its development tools in $(VENV)"
+	@$(BIN)/python -m pip install -q --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	@touch $@
+
+test: venv ## Run the tests (ARGS="..." goes to pytest)
+	$(BIN)/python -m pytest $(ARGS)
+
+lint: venv ## Check style, formatting and types
+	$(BIN)/python -m ruff check .
+	$(BIN)/python -m ruff format --check .
+	$(BIN)/python -m pyright
+
+build: venv ## Build the sdist and the wheel in dist/
+	rm -rf dist
+	$(BIN)/python -m build
+
+clean: ## Remove build products and caches (not .venv)
+	rm -rf build dist *.egg-info .pytest_cache .hypothesis .ruff_cache
+	find mmpi_ns tests -name __pycache__ -type d -prune -exec rm -rf {} +
