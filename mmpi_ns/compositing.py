@@ -41,6 +41,9 @@ def blend_shares(
     """
     reliability = reliability.float() if reliability.dtype in (torch.float16, torch.bfloat16) else reliability
     lowest = torch.finfo(reliability.dtype).min
+    # Only differences matter, and they are exact only where the numbers are small: the highest becomes 0.
+    highest = torch.where(cover, reliability, torch.full_like(reliability, lowest)).amax(-1, keepdim=True).detach()
+    reliability = reliability - highest
     masked = torch.where(cover, reliability, torch.full_like(reliability, lowest))
     total = torch.logsumexp(masked, -1)
     is_own = torch.arange(cover.shape[-1], device=cover.device) == own[:, None]
@@ -69,8 +72,12 @@ def blended_optical_depth(
     if form == "opacity":
         return tau * log_share.exp()
     sole = torch.isneginf(log_rest)
+    # Two forms of one number: the first is exact for thin samples (and 0 for empty ones), the second for opaque ones.
+    alpha = -torch.expm1(-tau) * log_share.exp()
+    thin = alpha < 0.5
+    log1p = torch.log1p(-torch.where(thin, alpha, torch.zeros_like(alpha)))
     safe_rest = torch.where(sole, torch.zeros_like(log_rest), log_rest)
-    blended = -torch.logaddexp(safe_rest, log_share - tau)
+    blended = -torch.where(thin, log1p, torch.logaddexp(safe_rest, log_share - tau))
     return torch.where(sole, tau, blended.clamp(min=0))
 
 
@@ -113,9 +120,7 @@ def composite_weights(
     return Composite(weights, -torch.expm1(-depth), torch.exp(-depth))
 
 
-def render_colors(
-    composite: Composite, colors: Float[Tensor, "R S 3"]
-) -> Float[Tensor, "R 3"]:
+def render_colors(composite: Composite, colors: Float[Tensor, "R S 3"]) -> Float[Tensor, "R 3"]:
     """Colour gathered along each ray, without background.
 
     The mass of dropped samples is given the mean colour of those kept (a constant factor per ray), so that dropping

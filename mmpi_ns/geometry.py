@@ -237,9 +237,7 @@ class Cube:
     def pack(plan: CubePlan, samples_per_voxel: float, dtype=torch.float32, device="cpu") -> Cube:
         lower = torch.tensor(plan.lower, dtype=dtype, device=device)
         upper = torch.tensor(plan.upper, dtype=dtype, device=device)
-        sides = [
-            (b - a) / (n - 1) for a, b, n in zip(plan.lower, plan.upper, reversed(plan.shape), strict=True)
-        ]
+        sides = [(b - a) / (n - 1) for a, b, n in zip(plan.lower, plan.upper, reversed(plan.shape), strict=True)]
         shape = torch.tensor(plan.shape, device=device)
         return Cube(lower, upper, shape, min(sides) / samples_per_voxel)
 

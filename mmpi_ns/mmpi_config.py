@@ -32,9 +32,7 @@ def _method(name: str, description: str, steps: int, rays: int, model: MMPIModel
         steps_per_eval_image=0,
         steps_per_eval_all_images=0,
         pipeline=VanillaPipelineConfig(
-            datamanager=MMPIDataManagerConfig(
-                dataparser=NerfstudioDataParserConfig(), train_num_rays_per_batch=rays
-            ),
+            datamanager=MMPIDataManagerConfig(dataparser=NerfstudioDataParserConfig(), train_num_rays_per_batch=rays),
             model=model,
         ),
         optimizers=_optimizers(),

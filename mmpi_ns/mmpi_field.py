@@ -6,11 +6,11 @@ the parameter list, which nerfstudio fixes before K is known.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from nerfstudio.cameras.rays import RaySamples
 from nerfstudio.field_components.field_heads import FieldHeadNames
 from nerfstudio.fields.base_field import Field
@@ -57,6 +57,14 @@ class Lookup:
     def split(self, members: Int[Tensor, "M"]) -> list[tuple[int, Int[Tensor, "P"]]]:
         """(head, positions within ``members``), in the order of ``members``."""
         return by_head(self.heads[members])
+
+    def of_rays(self, chosen: Bool[Tensor, "R"]) -> Lookup:
+        """The same samples, with lookups for the chosen rays only."""
+        if bool(chosen.all()):
+            return self
+        wanted = chosen[self.index // self.shape[1]]
+        groups = [tuple(part[wanted[group[2]]] for part in group) for group in self.groups]
+        return replace(self, groups=groups)
 
 
 class MMPIField(Field):
@@ -184,9 +192,7 @@ class MMPIField(Field):
 
     # Density ---------------------------------------------------------------------------------------------------
 
-    def mpi_optical_depth(
-        self, k: int, planes: Int[Tensor, "N"], ndc: Float[Tensor, "N 3"]
-    ) -> Float[Tensor, "N"]:
+    def mpi_optical_depth(self, k: int, planes: Int[Tensor, "N"], ndc: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
         """tau of MPI k at NDC (u, v) on its planes."""
         rows, weights = self.grids[k].bilinear(planes, ndc)
         return self._mpi_tau(k, interpolate(self.density, rows, weights)[:, 0], planes)

@@ -26,8 +26,9 @@ from mmpi_ns.compositing import (
     render_colors,
 )
 from mmpi_ns.metrics import ImageMetrics, head_palette
-from mmpi_ns.mmpi_datamanager import KEYPOINT_DEPTH, OBSERVATIONS
+from mmpi_ns.mmpi_datamanager import OBSERVATIONS
 from mmpi_ns.mmpi_field import Lookup, MMPIField
+from mmpi_ns.mmpi_losses import LossWeights, TrainingRays, is_pixel_ray, over_background
 from mmpi_ns.mmpi_sampler import MergeReport, MMPISampler
 from mmpi_ns.phases import TRAINS, Schedule, make_schedule
 from mmpi_ns.placement.plan import ScenePlan
@@ -35,24 +36,6 @@ from mmpi_ns.placement.rule import PlacementConfig, place
 from mmpi_ns.random_draws import generator
 
 BACKGROUNDS = {"black": 0.0, "gray": 0.5, "white": 1.0}
-
-
-@dataclass
-class LossWeights:
-    """Weights of the losses beside the photometric one."""
-
-    point_color: float = 0.01
-    """Colour of each sample against its ray's."""
-    background_entropy: float = 0.001
-    """Entropy of what passes a ray."""
-    distortion: float = 0.01
-    """Spread of a ray's mass over distance."""
-    keypoint_depth: float = 0.02
-    """-log of the mass near an SfM keypoint (scenes with tracks)."""
-    tv_density: float = 1e-5
-    """Total variation of the densities, in DVGO's normalisation."""
-    tv_features: float = 1e-6
-    """Total variation of the features, likewise."""
 
 
 @dataclass
@@ -108,8 +91,6 @@ class MMPIModelConfig(ModelConfig):
     """Behind everything, when rendering. Training uses random colours where the MPIs explain the whole ray."""
     loss: LossWeights = field(default_factory=LossWeights)
     """Weights of the losses."""
-    tv_every: int = 4
-    """Total variation is added every so many steps, at so many times its weight."""
     lpips_net: Literal["vgg", "alex"] = "vgg"
     """Network of the LPIPS metric (the paper: VGG); left out where its weights cannot be had."""
     seed: int = 0
@@ -206,7 +187,7 @@ class MMPIModel(Model):
 
     @property
     def blends(self) -> bool:
-        """Whether reliability takes part in rendering now. In between phases of training a picture is always blended."""
+        """Whether reliability takes part in rendering now; pictures taken during training are always blended."""
         if self.config.training == "joint" or self.field.plan.num_heads == 1:
             return False
         return not self.training or self.schedule.blends_at(self.step)
@@ -235,7 +216,9 @@ class MMPIModel(Model):
             tau = self._blend(tau, samples, lookup, blend_form)
         valid = samples.metadata["valid"][..., 0]
         composite = composite_weights(tau, valid, samples.metadata["skipped_before"][..., 0], report.skipped_total)
-        colors = self.field.get_outputs(samples, lookup)[FieldHeadNames.RGB]
+        # Keypoint rays are supervised in depth alone: no colours for them.
+        colored = lookup.of_rays(is_pixel_ray(bundle)) if self.training else lookup
+        colors = self.field.get_outputs(samples, colored)[FieldHeadNames.RGB]
         outputs = self._outputs(composite, colors, samples, report)
         if self.training:
             outputs["training"] = TrainingRays(bundle, samples, composite, colors, report, lookup)  # type: ignore
@@ -307,11 +290,11 @@ class MMPIModel(Model):
     ) -> dict[str, Tensor]:
         image = batch["image"].to(self.device)
         if "training" not in outputs:  # an evaluation batch during training
-            observed = _over(image, torch.full_like(image[:, :3], BACKGROUNDS[self.config.background]))
+            observed = over_background(image, torch.full_like(image[:, :3], BACKGROUNDS[self.config.background]))
             return {"rgb_loss": losses.photometric(outputs["rgb"], observed)}
         rays: TrainingRays = outputs["training"]
         g = generator(self.config.seed, self.step, "background", self.device)
-        return rays.losses(self.field, image, self.config, g, self.step)
+        return rays.losses(self.field, image, self.config.loss, g, self.step)
 
     def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Tensor]) -> dict[str, Any]:
         if "training" in outputs:
@@ -322,14 +305,14 @@ class MMPIModel(Model):
                 "dropped_mass": report.dropped_mass.mean(),
             }
         image = batch["image"].to(self.device)
-        observed = _over(image, torch.full_like(image[:, :3], BACKGROUNDS[self.config.background]))
+        observed = over_background(image, torch.full_like(image[:, :3], BACKGROUNDS[self.config.background]))
         return {"psnr": -10 * torch.log10(losses.photometric(outputs["rgb"], observed))}
 
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
         image = batch["image"].to(outputs["rgb"].device)
-        observed = _over(image, torch.full_like(image[..., :3], BACKGROUNDS[self.config.background]))
+        observed = over_background(image, torch.full_like(image[..., :3], BACKGROUNDS[self.config.background]))
         values = self.metrics(outputs["rgb"], observed)
         values["dropped_mass"] = float(outputs["dropped_mass"].mean())
         palette = head_palette(self.field.plan.num_heads, outputs["rgb"].device)
@@ -341,81 +324,6 @@ class MMPIModel(Model):
             "winning_mpi": palette[outputs["winning_mpi"][..., 0].long()],
         }
         return values, images
-
-
-@dataclass(frozen=True)
-class TrainingRays:
-    """A rendered training batch: pixel rays first, then keypoint rays (each block repeated for every MPI it went to)."""
-
-    bundle: RayBundle
-    samples: RaySamples
-    composite: Composite
-    colors: Float[Tensor, "R S 3"]
-    report: MergeReport
-    lookup: Lookup
-
-    def losses(
-        self, field: MMPIField, image: Tensor, config: MMPIModelConfig, g: torch.Generator, step: int
-    ) -> dict[str, Tensor]:
-        """All losses of the batch, each times its weight."""
-        known = self.bundle.metadata.get(KEYPOINT_DEPTH)
-        num_pixels = image.shape[0]
-        is_pixel = self._pixel_rays(num_pixels)
-        copies = int(is_pixel.sum()) // num_pixels
-        image = image.repeat(copies, 1)
-        random = torch.rand(image.shape[0], 3, generator=g, device=image.device)
-        observed = _over(image, random)
-        # Where the MPIs see a ray only in part, what they let through is not theirs to explain.
-        explained = self.report.explained[is_pixel] | torch.full_like(self.report.explained[is_pixel], image.shape[-1] == 4)
-        background = torch.where(explained, random, observed)
-        weights, transmittance = self.composite.weights[is_pixel], self.composite.transmittance[is_pixel]
-        rgb = render_colors(self._pixel_composite(is_pixel), self.colors[is_pixel]) + transmittance * background
-        weight = config.loss
-        total = {
-            "rgb_loss": losses.photometric(rgb, observed),
-            "point_color": weight.point_color * losses.point_color(self.colors[is_pixel], weights, observed),
-            "entropy": weight.background_entropy * losses.background_entropy(transmittance),
-            "distortion": weight.distortion * self._distortion(is_pixel, field.plan.content_near),
-        }
-        if known is not None and bool((known > 0).any()):
-            total["keypoint_depth"] = weight.keypoint_depth * self._keypoint_depth(~is_pixel, known)
-        if step % config.tv_every == 0 and field.density.requires_grad:
-            total["tv"] = field.total_variation(self.lookup, weight.tv_density, weight.tv_features) * (
-                config.tv_every / max(1, image.shape[0])
-            )
-        return total
-
-    def _pixel_rays(self, num_pixels: int) -> Bool[Tensor, "R"]:
-        known = self.bundle.metadata.get(KEYPOINT_DEPTH)
-        if known is None:
-            return torch.ones(len(self.bundle), dtype=torch.bool, device=self.colors.device)
-        return known[:, 0] == 0
-
-    def _pixel_composite(self, is_pixel: Tensor) -> Composite:
-        c = self.composite
-        return Composite(c.weights[is_pixel], c.accumulation[is_pixel], c.transmittance[is_pixel])
-
-    def _distortion(self, is_pixel: Tensor, scale: float) -> Tensor:
-        inverse_t = self.samples.metadata["inverse_t"][..., 0][is_pixel]
-        positions = 1 / (1 + inverse_t * scale)
-        intervals = (1 / self.report.live[is_pixel].clamp(min=1))[:, None].to(positions.dtype)
-        return losses.distortion(self.composite.weights[is_pixel], positions, intervals.expand_as(positions))
-
-    def _keypoint_depth(self, chosen: Tensor, known: Tensor) -> Tensor:
-        meta = self.samples.metadata
-        return losses.keypoint_depth(
-            self.composite.weights[chosen],
-            meta["inverse_t"][..., 0][chosen],
-            known[chosen],
-            meta["valid"][..., 0][chosen],
-        )
-
-
-def _over(image: Tensor, background: Tensor) -> Tensor:
-    """RGBA over a background; RGB as it is."""
-    if image.shape[-1] == 4:
-        return image[..., :3] * image[..., 3:] + background * (1 - image[..., 3:])
-    return image
 
 
 def _repeat(bundle: RayBundle, times: int) -> RayBundle:

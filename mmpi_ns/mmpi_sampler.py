@@ -91,9 +91,7 @@ class MMPISampler(Sampler):
         if blend_form is not None and tau.numel():
             tau = field.blend(tau, origins[flat.rays], directions[flat.rays], flat.inverse_t, heads, blend_form)
         survivors = keep_survivors(merged, tau, threshold)
-        report = MergeReport(
-            counts.sum(-1), survivors.skipped_total, survivors.dropped_mass, explained
-        )
+        report = MergeReport(counts.sum(-1), survivors.skipped_total, survivors.dropped_mass, explained)
         return _ray_samples(ray_bundle, flat, heads, survivors), report
 
     @staticmethod

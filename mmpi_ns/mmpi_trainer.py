@@ -83,7 +83,9 @@ class MMPITrainer(Trainer):
         """Runs up to max-num-iterations in all; 1.1.5 would run as many again after a resume."""
         self.config.max_num_iterations = max(0, self._total_steps - self._start_step)
         if self.config.max_num_iterations == 0:
-            CONSOLE.print(f"The checkpoint already holds {self._start_step} of {self._total_steps} steps: nothing to do.")
+            CONSOLE.print(
+                f"The checkpoint already holds {self._start_step} of {self._total_steps} steps: nothing to do."
+            )
             return
         try:
             super().train()
@@ -92,7 +94,7 @@ class MMPITrainer(Trainer):
 
     @check_main_thread
     def save_checkpoint(self, step: int) -> None:
-        """Writes beside the checkpoint folder first and moves the finished file in: a kill or a full disk loses nothing.
+        """Writes beside the checkpoint folder, then moves the finished file in: a kill or a full disk loses nothing.
 
         Names inside the folder are parsed as steps by nerfstudio, so the unfinished file must not lie there.
         """

@@ -95,7 +95,7 @@ def make_schedule(
     """The schedule of a run of ``total_steps`` steps.
 
     Args:
-        training: ``two-phase`` (individual, blend, optional fine-tune) or ``joint`` (all MPIs together, no reliability).
+        training: ``two-phase`` (individual, blend, optional fine-tune) or ``joint`` (all MPIs at once, no reliability).
         total_steps: all steps of the run.
         blend_share: share of the steps in which only reliability trains (two-phase).
         finetune_share: share of the steps in which everything trains together at the end (two-phase).
@@ -113,6 +113,8 @@ def make_schedule(
         lengths = [("joint", total_steps)]
     else:
         blend, finetune = round(total_steps * blend_share), round(total_steps * finetune_share)
+        if min(blend, finetune) < 0:
+            raise ValueError("blend-share and finetune-share must not be negative.")
         if total_steps - blend - finetune < 1:
             raise ValueError("blend-share + finetune-share leave no step for the individual phase: lower them.")
         lengths = [("individual", total_steps - blend - finetune), ("blend", blend), ("finetune", finetune)]

@@ -60,14 +60,12 @@ class TexelGrid:
         return self.offset + (z * self.height + y) * self.width + x
 
     def neighbours(self, rows: Int[Tensor, "N"]) -> tuple[Int[Tensor, "N 6"], Float[Tensor, "N 6"]]:
-        """Rows of the texels beside each row along x, y and z (-, +), and 1 where there is one (else the row itself)."""
+        """Rows of the texels beside each row along x, y and z (-, +); 1 where there is one, else the row itself."""
         local = rows - self.offset
         x, y = local % self.width, (local // self.width) % self.height
         z = local // (self.width * self.height)
         layer = self.width * self.height
-        exists = torch.stack(
-            [x > 0, x < self.width - 1, y > 0, y < self.height - 1, z > 0, z < self.depth - 1], -1
-        )
+        exists = torch.stack([x > 0, x < self.width - 1, y > 0, y < self.height - 1, z > 0, z < self.depth - 1], -1)
         steps = torch.tensor([-1, 1, -self.width, self.width, -layer, layer], device=rows.device)
         return torch.where(exists, rows[:, None] + steps, rows[:, None]), exists.to(torch.float32)
 

@@ -46,6 +46,4 @@ def interpolate(
         rows: rows to combine for each output.
         weights: their weights (constants).
     """
-    if rows.shape[0] == 0:
-        return table[:0] + 0.0
     return _Interpolate.apply(table, rows, weights.to(table.dtype))  # type: ignore[no-any-return]

@@ -64,9 +64,7 @@ class Survivors:
     """Sum of the weights of the dropped samples."""
 
 
-def keep_survivors(
-    merged: Merged, tau: Float[Tensor, "N"], threshold: float, fair_share: float = 0.1
-) -> Survivors:
+def keep_survivors(merged: Merged, tau: Float[Tensor, "N"], threshold: float, fair_share: float = 0.1) -> Survivors:
     """Keep the samples whose weight exceeds min(threshold, fair_share / samples on the ray).
 
     The second bound matters at the start, when all weights are 1/L: a fixed threshold would keep nothing, and what is

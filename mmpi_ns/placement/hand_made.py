@@ -63,9 +63,7 @@ def drive_plan(
     for name in names:
         origin, near, extent = rule[name]
         world = (start + np.array(origin) * metre) @ base
-        mpis.append(
-            MPIPlan(name, vector(world), facing_axes(base, name), near * metre, extent, planes, height, width)
-        )
+        mpis.append(MPIPlan(name, vector(world), facing_axes(base, name), near * metre, extent, planes, height, width))
     return ScenePlan(tuple(mpis), None, 1.0 * metre, 5.0 * metre, "hand-made drive")
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import asdict, dataclass, fields, replace
+from numbers import Real
 from pathlib import Path
 
 Vector = tuple[float, float, float]
@@ -109,7 +110,7 @@ class ScenePlan:
             sides = [b - a for a, b in zip(self.cube.lower, self.cube.upper, strict=True)]
             if not all(math.isfinite(s) and s > 0 for s in sides) or min(self.cube.shape) < 2:
                 raise ValueError("The plan's cube needs upper > lower on every axis and at least 2 voxels a side.")
-        if not (math.isfinite(self.ray_near) and self.ray_near >= 0 and self.content_near >= 0):
+        if not (math.isfinite(self.ray_near) and self.ray_near >= 0 and 0 <= self.content_near < math.inf):
             raise ValueError("The plan's ray_near and content_near must be finite and not negative.")
 
     def to_json(self) -> str:
@@ -122,6 +123,10 @@ class ScenePlan:
             data = json.loads(text)
         except json.JSONDecodeError as error:
             raise ValueError(f"The scene plan is not valid JSON ({error}): fix it or leave it out.") from error
+        if not isinstance(data, dict) or not isinstance(data.get("mpis", []), list):
+            raise ValueError(
+                "The scene plan is not a JSON object with a list 'mpis': compare it with docs/how_it_works.md."
+            )
         mpis = tuple(_build(MPIPlan, m) for m in data.get("mpis", []))
         cube = _build(CubePlan, data["cube"]) if data.get("cube") else None
         return _build(ScenePlan, {**data, "mpis": mpis, "cube": cube})
@@ -134,12 +139,22 @@ class ScenePlan:
 
 
 def _validate_mpi(mpi: MPIPlan) -> None:
+    rows = {"origin": (mpi.origin, 3), "extent": (mpi.extent, 4), "near": ((mpi.near,), 1)}
+    rows |= {f"axes row {i}": (row, 3) for i, row in enumerate(mpi.axes)} if len(mpi.axes) == 3 else {"axes": ((), 3)}
+    for field, (row, length) in rows.items():
+        if len(row) != length or not all(isinstance(x, Real) for x in row):
+            raise ValueError(f"MPI '{mpi.name}' of the plan needs {length} number(s) in '{field}'.")
     numbers = [*mpi.origin, *mpi.extent, mpi.near, *(x for row in mpi.axes for x in row)]
     if not all(math.isfinite(x) for x in numbers):
         raise ValueError(f"MPI '{mpi.name}' of the plan holds a number that is not finite: correct or remove it.")
     dots = [sum(a * b for a, b in zip(p, q, strict=True)) for p in mpi.axes for q in mpi.axes]
     if max(abs(d - float(i % 4 == 0)) for i, d in enumerate(dots)) > 1e-4:
         raise ValueError(f"The axes of MPI '{mpi.name}' are not orthonormal: give three perpendicular unit rows.")
+    (a, b, c), (d, e, f), (g, h, i) = mpi.axes
+    if a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) < 0:
+        raise ValueError(
+            f"The axes of MPI '{mpi.name}' are left-handed: negate one row, or give x right, y down, z facing."
+        )
     if mpi.near <= 0 or mpi.extent[0] >= mpi.extent[1] or mpi.extent[2] >= mpi.extent[3]:
         raise ValueError(f"MPI '{mpi.name}' needs near > 0 and an extent (u0, u1, v0, v1) with u0 < u1 and v0 < v1.")
     if mpi.planes < 2 or mpi.height < 2 or mpi.width < 2:
@@ -147,6 +162,10 @@ def _validate_mpi(mpi: MPIPlan) -> None:
 
 
 def _build(cls, data: dict):
+    if not isinstance(data, dict):
+        raise ValueError(
+            f"A {cls.__name__} in the scene plan is not a JSON object: compare it with docs/how_it_works.md."
+        )
     names = {f.name for f in fields(cls)}
     unknown, missing = set(data) - names, names - set(data) - {"origin_of_plan"}
     if unknown or missing:

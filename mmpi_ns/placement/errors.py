@@ -1,0 +1,93 @@
+"""Expected pixel errors of a plan: how far off a point can be drawn for lack of planes (e_p) or texels (e_t).
+
+A point between two planes is drawn on one of them, up to half a spacing off in disparity; seen by a camera away from
+the MPI's origin that is a shift in the image. A texel seen from closer than the MPI's origin spans several pixels.
+Formulas for a camera parallel to the MPI are in docs/how_it_works.md; here the projection is differentiated instead,
+which holds for any pose.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mmpi_ns.placement.observations import Array, Observations
+from mmpi_ns.placement.plan import MPIPlan, ScenePlan
+
+
+@dataclass(frozen=True)
+class PixelErrors:
+    """Errors of Q observations in K MPIs; inf where the MPI does not hold the point."""
+
+    plane: Array
+    """[Q, K] e_p: half a plane spacing, in pixels."""
+    texel: Array
+    """[Q, K] e_t: the pixels that a texel spans, along the worse of its sides."""
+
+    @property
+    def combined(self) -> Array:
+        """[Q, K] one figure for both: a sample lies at most e_p, and half a texel, away from where it belongs."""
+        return np.hypot(self.plane, 0.5 * self.texel)
+
+    @property
+    def best(self) -> NDArray[np.int64]:
+        """[Q] the MPI that serves each observation best."""
+        return self.combined.argmin(-1)
+
+    def summary(self) -> dict[str, float]:
+        """Medians and 90th percentiles over the observations, each in the MPI that serves it best; share unserved."""
+        rows = np.arange(len(self.plane))
+        served = np.isfinite(self.combined.min(-1))
+        result = {"unserved": float(1 - served.mean()) if len(rows) else 0.0}
+        for name, values in (("e_p", self.plane), ("e_t", self.texel)):
+            chosen = values[rows, self.best][served]
+            for q in (50, 90):
+                result[f"{name}_{q}"] = float(np.percentile(chosen, q)) if len(chosen) else float("nan")
+        return result
+
+
+def pixel_errors(plan: ScenePlan, observations: Observations, cameras: Array, points: Array) -> PixelErrors:
+    """e_p and e_t of observed points in every MPI of a plan (the cube is left out).
+
+    Args:
+        plan: the MPIs.
+        observations: the cameras.
+        cameras: [Q] camera of each observation.
+        points: [Q, 3] world position of each observed point.
+    """
+    pairs = [_errors_in(m, observations, cameras, points) for m in plan.mpis]
+    return PixelErrors(np.stack([p for p, _ in pairs], -1), np.stack([t for _, t in pairs], -1))
+
+
+def _errors_in(mpi: MPIPlan, observations: Observations, cameras: Array, points: Array) -> tuple[Array, Array]:
+    axes, origin = np.asarray(mpi.axes), np.asarray(mpi.origin)
+    local = (points - origin) @ axes.T
+    ahead = local[:, 2] >= mpi.near
+    z = np.where(ahead, local[:, 2], 1.0)
+    u, v, w = local[:, 0] / z, local[:, 1] / z, 1 / z
+    u0, u1, v0, v1 = mpi.extent
+    inside = ahead & (u >= u0) & (u <= u1) & (v >= v0) & (v <= v1)
+
+    poses = observations.camera_to_worlds[cameras]
+    focal = observations.intrinsics[cameras][:, :2]
+    to_camera = np.swapaxes(poses[:, :, :3], 1, 2)
+    # The homogeneous point (u x + v y + z) + (origin - camera) w, in camera axes, is linear in (u, v, w).
+    columns = np.einsum("qij,kj->qik", to_camera, axes)
+    shift = np.einsum("qij,qj->qi", to_camera, origin - poses[:, :, 3])
+    q = columns[..., 0] * u[:, None] + columns[..., 1] * v[:, None] + columns[..., 2] + shift * w[:, None]
+    depth = -q[:, 2]  # OpenGL cameras look along -z
+    seen = inside & (depth > 1e-9 * np.abs(q).max(-1))
+    depth = np.where(seen, depth, 1.0)
+
+    def pixel_shift(direction: Array) -> Array:
+        """Length in pixels of a unit step along one of (u, v, w)."""
+        moved = direction[:, :2] / depth[:, None] + q[:, :2] * (direction[:, 2] / depth**2)[:, None]
+        return np.linalg.norm(moved * focal, axis=-1)
+
+    step_u, step_v = (u1 - u0) / (mpi.width - 1), (v1 - v0) / (mpi.height - 1)
+    step_w = 1 / (mpi.near * (mpi.planes - 1))
+    texel = np.maximum(pixel_shift(columns[..., 0]) * step_u, pixel_shift(columns[..., 1]) * step_v)
+    plane = 0.5 * step_w * pixel_shift(shift)
+    return np.where(seen, plane, np.inf), np.where(seen, texel, np.inf)

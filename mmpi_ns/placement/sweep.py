@@ -1,0 +1,143 @@
+"""A quick plane sweep: rough points for scenes that come with poses but without structure from motion.
+
+Placement needs to know roughly where content lies, no more. Some views are compared with their neighbours over a range
+of disparities at low resolution; pixels with one clear match become points. Pure NumPy, a few seconds.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mmpi_ns.placement.observations import Array, Observations
+
+HYPOTHESES = 64
+WINDOW = 7
+MIN_SCORE = 0.85
+"""Correlation that a match must reach."""
+MIN_MARGIN = 0.08
+"""By how much it must beat every match at another depth."""
+
+
+@dataclass(frozen=True)
+class _View:
+    image: Array
+    pose: Array
+    intrinsics: Array
+
+
+def add_swept_points(observations: Observations, images: list[Array], num_references: int = 24) -> Observations:
+    """The observations with points found by a plane sweep, each seen by its reference view.
+
+    Args:
+        observations: cameras without points.
+        images: gray images [h, w] in [0, 1] of all cameras, any (small) size.
+        num_references: views to sweep, evenly spread over the capture.
+    """
+    count = len(images)
+    references = np.unique(np.linspace(0, count - 1, min(num_references, count)).round().astype(int))
+    views = [_view(observations, i, image) for i, image in enumerate(images)]
+    points, cameras, pixels = [], [], []
+    for i in references:
+        neighbours = _neighbours(observations, int(i))
+        if not neighbours:
+            continue
+        found, at = _sweep(views[i], [views[j] for j in neighbours])
+        scale = observations.sizes[i] / [views[i].image.shape[1], views[i].image.shape[0]]
+        points.append(found)
+        cameras.append(np.full(len(found), i, np.int64))
+        pixels.append(at * scale)
+    if not points or not sum(len(p) for p in points):
+        return observations
+    total = sum(len(p) for p in points)
+    return replace(
+        observations,
+        points=np.concatenate(points),
+        seen_by=np.concatenate(cameras),
+        seen_point=np.arange(total),
+        seen_at=np.concatenate(pixels),
+    )
+
+
+def _view(observations: Observations, index: int, image: Array) -> _View:
+    scale = image.shape[1] / observations.sizes[index, 0]
+    return _View(image, observations.camera_to_worlds[index], observations.intrinsics[index] * scale)
+
+
+def _neighbours(observations: Observations, index: int, wanted: int = 4) -> list[int]:
+    """The nearest views that look the same way (within 30 degrees) from somewhere else."""
+    offset = observations.centers - observations.centers[index]
+    facing = observations.camera_to_worlds[:, :, 2]
+    distance = np.linalg.norm(offset, axis=-1)
+    usable = (facing @ facing[index] > np.cos(np.radians(30))) & (distance > 1e-9)
+    order = np.argsort(np.where(usable, distance, np.inf), kind="stable")
+    return [int(j) for j in order[: min(wanted, int(usable.sum()))]]
+
+
+def _sweep(reference: _View, neighbours: list[_View]) -> tuple[Array, Array]:
+    """World points and pixels (x, y) of the reference where one disparity matches clearly best."""
+    height, width = reference.image.shape
+    fx, fy, cx, cy = reference.intrinsics
+    ys, xs = np.mgrid[0:height, 0:width] + 0.5
+    rays = np.stack([(xs - cx) / fx, -(ys - cy) / fy, -np.ones_like(xs)], -1)
+    baseline = max(np.linalg.norm(n.pose[:, 3] - reference.pose[:, 3]) for n in neighbours)
+    disparities = np.linspace(0, 0.35 * width / (fx * baseline), HYPOTHESES)
+    scores = np.stack([_score(reference, neighbours, rays, w) for w in disparities])
+    best = scores.argmax(0)
+    top = scores.max(0)
+    level = np.arange(HYPOTHESES)[:, None, None]
+    second = np.where(np.abs(level - best) > 3, scores, -1).max(0)
+    good = (top > MIN_SCORE) & (top - second > MIN_MARGIN) & (best > 0)
+    inverse_depth = np.where(good, disparities[best], 1.0)
+    world = (rays / inverse_depth[..., None]) @ reference.pose[:, :3].T + reference.pose[:, 3]
+    rows, columns = np.nonzero(good)
+    keep = slice(None, None, max(1, len(rows) // 400))
+    rows, columns = rows[keep], columns[keep]
+    return world[rows, columns], np.stack([columns, rows], -1) + 0.5
+
+
+def _score(reference: _View, neighbours: list[_View], rays: Array, disparity: float) -> Array:
+    """Mean correlation of the better half of the neighbours, each warped by the plane at this disparity."""
+    correlations = [_correlation(reference.image, *_warp(reference, n, rays, disparity)) for n in neighbours]
+    ranked = np.sort(np.stack(correlations), 0)[::-1]
+    return ranked[: max(1, (len(neighbours) + 1) // 2)].mean(0)
+
+
+def _warp(reference: _View, neighbour: _View, rays: Array, disparity: float) -> tuple[Array, NDArray[np.bool_]]:
+    """The neighbour's colours where the reference's pixels fall on it, and whether they do."""
+    direction = rays @ reference.pose[:, :3].T + disparity * (reference.pose[:, 3] - neighbour.pose[:, 3])
+    local = direction @ neighbour.pose[:, :3]
+    depth = -local[..., 2]
+    ahead = depth > 1e-9
+    safe = np.where(ahead, depth, 1.0)
+    fx, fy, cx, cy = neighbour.intrinsics
+    x, y = fx * local[..., 0] / safe + cx - 0.5, -fy * local[..., 1] / safe + cy - 0.5
+    height, width = neighbour.image.shape
+    inside = ahead & (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
+    x, y = np.where(inside, x, 0), np.where(inside, y, 0)
+    x0, y0 = np.minimum(x.astype(int), width - 2), np.minimum(y.astype(int), height - 2)
+    fx_, fy_ = x - x0, y - y0
+    im = neighbour.image
+    top = im[y0, x0] * (1 - fx_) + im[y0, x0 + 1] * fx_
+    bottom = im[y0 + 1, x0] * (1 - fx_) + im[y0 + 1, x0 + 1] * fx_
+    return top * (1 - fy_) + bottom * fy_, inside
+
+
+def _correlation(a: Array, b: Array, inside: NDArray[np.bool_]) -> Array:
+    """Zero-mean normalised correlation over windows; -1 where a window leaves the image or holds no texture."""
+    b = np.where(inside, b, 0.0)
+    mean_a, mean_b = _box(a), _box(b)
+    variance_a, variance_b = _box(a * a) - mean_a**2, _box(b * b) - mean_b**2
+    covariance = _box(a * b) - mean_a * mean_b
+    textured = (variance_a > 1e-4) & (variance_b > 1e-4) & (_box(inside.astype(float)) > 0.999)
+    return np.where(textured, covariance / np.sqrt(np.maximum(variance_a * variance_b, 1e-12)), -1.0)
+
+
+def _box(image: Array) -> Array:
+    """Mean over WINDOW x WINDOW pixels, edges padded."""
+    r = WINDOW // 2
+    total = np.pad(image, ((r + 1, r), (r + 1, r)), mode="edge").cumsum(0).cumsum(1)
+    n = WINDOW
+    return (total[n:, n:] - total[:-n, n:] - total[n:, :-n] + total[:-n, :-n]) / n**2

@@ -1,0 +1,22 @@
+"""What all tests share: a small hand-made plan, one thread, and hypothesis settings that suit a busy machine."""
+
+from __future__ import annotations
+
+import hypothesis
+import pytest
+import torch
+from hand_made import make_mpi
+
+from mmpi_ns.placement.plan import CubePlan, ScenePlan
+
+torch.set_num_threads(1)
+hypothesis.settings.register_profile("mmpi", deadline=None, derandomize=True, print_blob=True)
+hypothesis.settings.load_profile("mmpi")
+
+
+@pytest.fixture
+def plan() -> ScenePlan:
+    """Two MPIs that overlap, and a cube."""
+    side = make_mpi("left", (2.0, 0.0, 3.0), ((0.0, 0.0, 1.0), (0.0, 1.0, 0.0), (-1.0, 0.0, 0.0)), near=2.0)
+    cube = CubePlan((-1.0, -1.0, 2.0), (1.0, 1.0, 5.0), (7, 5, 5))
+    return ScenePlan((make_mpi(), side), cube, ray_near=0.05, content_near=1.5)

@@ -1,0 +1,118 @@
+"""Small frames, rays and hypothesis strategies that several test files use."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from hypothesis import assume
+from hypothesis import strategies as st
+
+from mmpi_ns.placement.plan import MPIPlan
+
+IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+
+
+def make_mpi(name="front", origin=(0.0, 0.0, 0.0), axes=IDENTITY, near=1.0, extent=(-1.0, 1.0, -0.5, 0.5), **size):
+    """An MPI at the world's origin facing +z with 9 planes; every field can be replaced."""
+    size = {"planes": 9, "height": 5, "width": 7, **size}
+    return MPIPlan(name=name, origin=origin, axes=axes, near=near, extent=extent, **size)
+
+
+def rotation(quaternion):
+    """Rows of the rotation of a quaternion (need not be normalised)."""
+    w, x, y, z = np.asarray(quaternion, np.float64) / np.linalg.norm(quaternion)
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    return tuple(tuple(float(v) for v in row) for row in rows)
+
+
+def random_mpi(rng, name="random", planes=None):
+    """An MPI anywhere within a few units of the world's origin, with an asymmetric frustum."""
+    u0, v0 = -rng.uniform(0.1, 2, size=2)
+    return make_mpi(
+        name,
+        tuple(float(x) for x in rng.normal(size=3) * 2),
+        rotation(rng.normal(size=4)),
+        near=float(rng.uniform(0.5, 4)),
+        extent=(float(u0), float(u0 + rng.uniform(0.5, 4)), float(v0), float(v0 + rng.uniform(0.5, 4))),
+        planes=int(planes or rng.integers(2, 40)),
+    )
+
+
+def unit(vector):
+    vector = np.asarray(vector, np.float64)
+    return vector / np.linalg.norm(vector)
+
+
+def rays(origins, directions, near=0.0, far=math.inf, dtype=torch.float64):
+    """(origins [R, 3], unit directions [R, 3], nears [R, 1], fars [R, 1])."""
+    origins = np.atleast_2d(np.asarray(origins, np.float64))
+    directions = np.atleast_2d(np.asarray(directions, np.float64))
+    directions = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+    origins, directions = np.broadcast_arrays(origins, directions)
+    column = np.ones((origins.shape[0], 1))
+    return tuple(torch.tensor(x, dtype=dtype) for x in (origins.copy(), directions, near * column, far * column))
+
+
+# Blending ------------------------------------------------------------------------------------------------------------
+
+
+def tensor(values, dtype=torch.float64):
+    return torch.tensor(np.asarray(values), dtype=dtype)
+
+
+def random_votes(rng, samples, heads, scale):
+    """Reliabilities, a cover that contains each sample's own head, and the own heads."""
+    own = rng.integers(0, heads, size=samples)
+    cover = rng.random((samples, heads)) < 0.6
+    cover[np.arange(samples), own] = True
+    return rng.normal(size=(samples, heads)) * scale, cover, own
+
+
+# Hypothesis ----------------------------------------------------------------------------------------------------------
+
+
+def numbers(low, high):
+    return st.floats(low, high, allow_nan=False, allow_subnormal=False)
+
+
+@st.composite
+def vectors(draw, size=3, reach=20.0):
+    return np.array([draw(numbers(-reach, reach)) for _ in range(size)])
+
+
+@st.composite
+def directions(draw):
+    """Unit vectors, axis-parallel ones among them."""
+    vector = draw(vectors(3, 1.0) | st.sampled_from([np.eye(3)[i] * s for i in range(3) for s in (1, -1)]))
+    assume(np.linalg.norm(vector) > 0.01)
+    return unit(vector)
+
+
+@st.composite
+def rotations(draw):
+    quaternion = draw(vectors(4, 1.0))
+    assume(np.linalg.norm(quaternion) > 0.01)
+    return rotation(quaternion)
+
+
+@st.composite
+def mpis(draw):
+    u0, v0 = draw(numbers(-3, 2)), draw(numbers(-3, 2))
+    return make_mpi(
+        origin=tuple(float(x) for x in draw(vectors())),
+        axes=draw(rotations() | st.just(IDENTITY)),
+        near=draw(numbers(0.1, 20)),
+        extent=(u0, u0 + draw(numbers(0.1, 6)), v0, v0 + draw(numbers(0.1, 6))),
+        planes=draw(st.integers(2, 40)),
+    )
+
+
+def range_of(near):
+    """fars for a given near: finite or infinite."""
+    return st.just(math.inf) | numbers(near, near + 40)

@@ -1,0 +1,107 @@
+"""Weighted sums of table rows: the fast path equals the plain one, and its gradient is sparse (ops/interpolate.py)."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from mmpi_ns.ops.interpolate import interpolate, interpolate_reference
+
+F64 = torch.float64
+
+
+def lookup(samples=50, corners=4, rows=30, channels=5, dtype=F64, seed=0):
+    g = torch.Generator().manual_seed(seed)
+    return (
+        torch.randn(rows, channels, generator=g, dtype=F64).to(dtype),
+        torch.randint(0, rows, (samples, corners), generator=g),
+        torch.rand(samples, corners, generator=g, dtype=F64).to(dtype),
+    )
+
+
+class DenseGradient(torch.autograd.Function):
+    """The identity; gradcheck wants a dense gradient, so what comes back sparse is written out."""
+
+    @staticmethod
+    def forward(ctx, table):
+        return table.view_as(table)
+
+    @staticmethod
+    def backward(ctx, grad):
+        return grad.to_dense()
+
+
+def test_interpolation_by_hand():
+    table = torch.tensor([[1.0, 10.0], [2.0, 20.0], [4.0, 40.0]])
+    rows, weights = torch.tensor([[0, 2], [1, 1]]), torch.tensor([[0.25, 0.75], [0.5, 0.5]])
+    for function in (interpolate_reference, interpolate):
+        assert function(table, rows, weights).tolist() == [[3.25, 32.5], [2.0, 20.0]]
+
+
+@pytest.mark.parametrize("channels", [1, 3, 9])
+@pytest.mark.parametrize("corners", [1, 4, 8])
+@pytest.mark.parametrize(("dtype", "error"), [(torch.float32, 2e-6), (F64, 1e-14)])
+def test_fast_path_equals_the_reference_with_its_gradient(channels, corners, dtype, error):
+    table, rows, weights = lookup(channels=channels, corners=corners, dtype=dtype)
+    fast, plain = table.clone().requires_grad_(), table.clone().requires_grad_()
+    out, wanted = interpolate(fast, rows, weights), interpolate_reference(plain, rows, weights)
+    assert out.shape == (50, channels) and torch.allclose(out, wanted, atol=error, rtol=error)
+    upstream = torch.randn(50, channels, generator=torch.Generator().manual_seed(1), dtype=F64).to(dtype)
+    out.backward(upstream)
+    wanted.backward(upstream)
+    assert fast.grad.is_sparse and not plain.grad.is_sparse
+    assert torch.allclose(fast.grad.to_dense(), plain.grad, atol=10 * error, rtol=10 * error)
+
+
+def test_sparse_gradient_is_that_of_finite_differences():
+    table, rows, weights = lookup(samples=6, rows=7, channels=2)
+
+    def read(t):
+        return interpolate(DenseGradient.apply(t), rows, weights)
+
+    assert torch.autograd.gradcheck(read, (table.requires_grad_(),))
+
+
+def test_gradient_names_only_the_rows_that_were_read():
+    table, rows, weights = lookup(samples=3, rows=1000)
+    table.requires_grad_()
+    interpolate(table, rows, weights).sum().backward()
+    assert table.grad._nnz() <= rows.numel()
+    assert set(table.grad.coalesce().indices()[0].tolist()) == set(rows.reshape(-1).tolist())
+
+
+def test_two_lookups_in_one_table_add_their_gradients():
+    table, rows, weights = lookup()
+    fast, plain = table.clone().requires_grad_(), table.clone().requires_grad_()
+    for t, function in ((fast, interpolate), (plain, interpolate_reference)):
+        (function(t, rows, weights).sum() + 2 * (function(t, rows.flip(0), weights) ** 2).sum()).backward()
+    assert fast.grad.is_sparse and torch.allclose(fast.grad.to_dense(), plain.grad)
+
+
+def test_no_samples_give_no_values_and_no_gradient():
+    table = torch.randn(5, 3, requires_grad=True)
+    out = interpolate(table, torch.zeros(0, 4, dtype=torch.int64), torch.zeros(0, 4))
+    assert out.shape == (0, 3) and out.dtype == table.dtype
+    out.sum().backward()
+    assert table.grad is None or table.grad.to_dense().abs().sum() == 0
+
+
+def test_lookup_without_samples_leaves_the_gradient_of_others_sparse():
+    """A head that covers no sample of a batch must not make the optimiser visit the whole table."""
+    table, rows, weights = lookup()
+    table.requires_grad_()
+    empty = interpolate(table, rows[:0], weights[:0])
+    (interpolate(table, rows[:2], weights[:2]).sum() + empty.sum()).backward()
+    assert table.grad.is_sparse and set(table.grad.coalesce().indices()[0].tolist()) == set(rows[:2].view(-1).tolist())
+
+
+def test_weights_of_another_precision_are_taken():
+    table, rows, weights = lookup(dtype=torch.float32)
+    assert torch.equal(interpolate(table, rows, weights.double()), interpolate(table, rows, weights))
+
+
+def test_weights_get_no_gradient():
+    table, rows, weights = lookup()
+    weights.requires_grad_()
+    interpolate(table.requires_grad_(), rows, weights).sum().backward()
+    assert weights.grad is None and table.grad is not None
