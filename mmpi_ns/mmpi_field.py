@@ -216,27 +216,24 @@ class MMPIField(Field):
     # Reliability -----------------------------------------------------------------------------------------------
 
     def shares(
-        self,
-        origins: Float[Tensor, "N 3"],
-        directions: Float[Tensor, "N 3"],
-        inverse_t: Float[Tensor, "N"],
-        heads: Int[Tensor, "N"],
+        self, rays: Int[Tensor, "N"], local: LocalRays, inverse_t: Float[Tensor, "N"], heads: Int[Tensor, "N"]
     ) -> tuple[Float[Tensor, "N"], Float[Tensor, "N"]]:
         """log P and log(1 - P) of samples among the heads that cover them (paper sec. III-C).
 
         A head covers a point inside its frustum whose nearest texel was trained; a sample's own head always does.
+
+        Args:
+            rays: ray of each sample.
+            local: the rays in every head's axes.
+            inverse_t: inverse distance of each sample.
+            heads: head that each sample was taken from.
         """
-        ndc, inside = geometry.samples_to_ndc(origins, directions, inverse_t, self.frames)
-        if self.cube is not None:
-            points = origins + directions / inverse_t.clamp(min=1e-10)[:, None]
-            in_cube = self.cube.normalised(points)
-            inside = torch.cat([inside, ((in_cube.abs() <= 1).all(-1) & (inverse_t > 0))[:, None]], -1)
-            ndc = torch.cat([ndc, in_cube.clamp(-1, 1)[:, None]], 1)
         columns, cover = [], []
         for j, grid in enumerate(self.grids):
+            ndc, inside = self._ndc_in_head(j, rays, local, inverse_t)
             is_own = heads == j
-            index = (inside[:, j] | is_own).nonzero()[:, 0]
-            position = ndc[index, j]
+            index = (inside | is_own).nonzero()[:, 0]
+            position = ndc[index]
             value = interpolate(self.reliability, *grid.trilinear(position))[:, 0]
             columns.append(value.new_zeros(heads.shape[0]).index_put((index,), value))
             voting = torch.zeros_like(is_own)
@@ -244,18 +241,35 @@ class MMPIField(Field):
             cover.append(voting | is_own)
         return blend_shares(torch.stack(columns, -1), torch.stack(cover, -1), heads)
 
+    def _ndc_in_head(
+        self, k: int, rays: Tensor, local: LocalRays, inverse_t: Tensor
+    ) -> tuple[Float[Tensor, "N 3"], Bool[Tensor, "N"]]:
+        """Where samples lie in one head, and whether inside it."""
+        moved = local.table(k).index_select(0, rays)
+        if k < len(self.plan.mpis):
+            point = moved[:, :3] * inverse_t[:, None] + moved[:, 3:]
+            ndc, inside = geometry.local_to_ndc(point[:, None], inverse_t[:, None], self._frame(k))
+            return ndc[:, 0], inside[:, 0]
+        assert self.cube is not None
+        points = moved[:, :3] + moved[:, 3:] / inverse_t.clamp(min=1e-10)[:, None]
+        ndc = self.cube.normalised(points)
+        return ndc.clamp(-1, 1), (ndc.abs() <= 1).all(-1) & (inverse_t > 0)
+
+    def _frame(self, k: int) -> geometry.Frames:
+        return self._cached(f"frame{k}", lambda: geometry.Frames.pack([self.plan.mpis[k]], device=self.density.device))
+
     def blend(
         self,
         tau: Float[Tensor, "N"],
-        origins: Float[Tensor, "N 3"],
-        directions: Float[Tensor, "N 3"],
+        rays: Int[Tensor, "N"],
+        local: LocalRays,
         inverse_t: Float[Tensor, "N"],
         heads: Int[Tensor, "N"],
         form: BlendForm,
     ) -> Float[Tensor, "N"]:
-        """Blended optical depth of many samples, most of them empty: those get an equal share."""
+        """Blended optical depth of many samples; those too thin to matter get an equal share without a lookup."""
         index = (tau > NEGLIGIBLE_DEPTH).nonzero()[:, 0]
-        share = self.shares(origins[index], directions[index], inverse_t[index], heads[index])
+        share = self.shares(rays[index], local, inverse_t[index], heads[index])
         blended = tau / len(self.grids)
         return blended.index_copy(0, index, blended_optical_depth(tau[index], *share, form))
 
@@ -343,13 +357,30 @@ class MMPIField(Field):
 
     def sample_shares(self, ray_samples: RaySamples, lookup: Lookup) -> tuple[Tensor, Tensor]:
         """``shares`` of the valid samples of a merged batch, with gradients to the reliability."""
-        meta, frustums = ray_samples.metadata, ray_samples.frustums
-        return self.shares(
-            frustums.origins.reshape(-1, 3)[lookup.index],
-            frustums.directions.reshape(-1, 3)[lookup.index],
-            meta["inverse_t"].reshape(-1)[lookup.index],
-            lookup.heads,
-        )
+        frustums = ray_samples.frustums
+        local = LocalRays.of(frustums.origins[:, 0], frustums.directions[:, 0], self.frames)
+        inverse_t = ray_samples.metadata["inverse_t"].reshape(-1)[lookup.index]
+        return self.shares(lookup.index // lookup.shape[1], local, inverse_t, lookup.heads)
+
+
+@dataclass(frozen=True)
+class LocalRays:
+    """R rays in world axes and in every MPI's axes."""
+
+    origins: Float[Tensor, "R 3"]
+    directions: Float[Tensor, "R 3"]
+    local_origins: Float[Tensor, "R K 3"]
+    local_directions: Float[Tensor, "R K 3"]
+
+    @staticmethod
+    def of(origins: Tensor, directions: Tensor, frames: geometry.Frames) -> LocalRays:
+        return LocalRays(origins, directions, *geometry.rays_in_frames(origins, directions, frames))
+
+    def table(self, k: int) -> Float[Tensor, "R 6"]:
+        """Origins and directions in MPI k, or in the world for the cube behind the last MPI."""
+        if k < self.local_origins.shape[1]:
+            return torch.cat([self.local_origins[:, k], self.local_directions[:, k]], -1)
+        return torch.cat([self.origins, self.directions], -1)
 
 
 def by_head(heads: Int[Tensor, "N"]) -> list[tuple[int, Int[Tensor, "M"]]]:
