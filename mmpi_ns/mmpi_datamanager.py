@@ -17,9 +17,11 @@ from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.model_components.ray_generators import RayGenerator
 from nerfstudio.utils.rich_utils import CONSOLE
+from numpy.typing import NDArray
 from torch import Tensor
 
 from mmpi_ns.placement.observations import Observations
+from mmpi_ns.placement.sweep import add_swept_points
 from mmpi_ns.random_draws import generator
 from mmpi_ns.sfm import SfmModel, find_sfm_model
 
@@ -82,6 +84,14 @@ class PixelPool:
         return self.colors[chosen].float() / 255, self.indices[chosen].long()
 
 
+def _thumbnail(dataset: InputDataset, index: int, side: int = 128) -> NDArray[np.float64]:
+    """Gray image of at most ``side`` pixels a side, box-filtered."""
+    image = _read(dataset, index, dataset.image_filenames[index])["image"][..., :3].float().mean(-1) / 255
+    scale = max(image.shape) / side
+    size = [max(8, round(n / scale)) for n in image.shape]
+    return torch.nn.functional.interpolate(image[None, None], size=size, mode="area")[0, 0].double().numpy()
+
+
 def _read(dataset: InputDataset, index: int, name: Path) -> dict[str, Any]:
     try:
         return dataset.get_data(index, image_type="uint8")
@@ -100,7 +110,11 @@ class MMPIDataManager(VanillaDataManager[InputDataset]):
 
     def create_train_dataset(self) -> InputDataset:
         dataset = super().create_train_dataset()
-        self.observations = read_observations(self.train_dataparser_outputs, dataset.cameras, self._sfm())
+        observations = read_observations(self.train_dataparser_outputs, dataset.cameras, self._sfm())
+        if not len(observations.seen_by) and self.test_mode != "inference":
+            CONSOLE.print("No SfM tracks: a quick plane sweep finds out where the content lies.")
+            observations = add_swept_points(observations, [_thumbnail(dataset, i) for i in range(len(dataset))])
+        self.observations = observations
         dataset.metadata[OBSERVATIONS] = self.observations
         return dataset
 
@@ -156,7 +170,7 @@ def _join(a: RayBundle, b: RayBundle) -> RayBundle:
 
 def _keypoint_targets(observations: Observations, device: str | torch.device) -> tuple[Tensor, Tensor, Tensor] | None:
     """Camera, (row, column) and inverse distance of every keypoint of the training images."""
-    if not len(observations.seen_by):
+    if not len(observations.seen_at):
         return None
     offsets = observations.points[observations.seen_point] - observations.centers[observations.seen_by]
     inverse = 1 / np.maximum(np.linalg.norm(offsets, axis=-1), 1e-12)

@@ -35,6 +35,8 @@ from mmpi_ns.placement.plan import ScenePlan
 from mmpi_ns.placement.rule import PlacementConfig, place
 from mmpi_ns.random_draws import generator
 
+FAIR_SHARE = 0.1
+"""Until the field has sharpened, samples of more than this part of an equal weight are kept."""
 BACKGROUNDS = {"black": 0.0, "gray": 0.5, "white": 1.0}
 
 
@@ -83,8 +85,8 @@ class MMPIModelConfig(ModelConfig):
     """Samples per voxel side along a ray through the cube."""
     cube_alpha: float = 1e-3
     """Initial alpha of a cube sample: 1e-2 for a small room to 1e-4."""
-    train_threshold: float = 1e-3
-    """Samples of less weight get no gradient (never more than a tenth of an equal share)."""
+    train_threshold: float = 3e-3
+    """Samples of less weight get no gradient (while resolution grows: nor more than a tenth of an equal share)."""
     render_threshold: float = 1e-3
     """Samples of less weight are not coloured when rendering; the dropped mass is reported."""
     background: Literal["black", "gray", "white"] = "gray"
@@ -206,6 +208,7 @@ class MMPIModel(Model):
             bundle,
             field=self.field,
             threshold=self.config.train_threshold if self.training else self.config.render_threshold,
+            fair_share=FAIR_SHARE if self.training and not self.schedule.sharpened(self.step) else float("inf"),
             head_mask=head_mask,
             choose=choose,
             blend_form=blend_form,

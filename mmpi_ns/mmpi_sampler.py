@@ -62,6 +62,7 @@ class MMPISampler(Sampler):
         *,
         field: MMPIField,
         threshold: float,
+        fair_share: float = float("inf"),
         head_mask: Bool[Tensor, "R H"] | None = None,
         choose: Float[Tensor, "R K"] | None = None,
         blend_form: BlendForm | None = None,
@@ -73,6 +74,7 @@ class MMPISampler(Sampler):
             ray_bundle: R rays; nears and fars bound the samples.
             field: heads to sample, with their optical depths.
             threshold: see ``keep_survivors``.
+            fair_share: likewise.
             head_mask: heads that may answer each ray; None for all.
             choose: priorities; each ray is answered by the MPI of highest priority among those it meets (and the cube).
             blend_form: blend by reliability; None where reliability takes no part.
@@ -95,7 +97,7 @@ class MMPISampler(Sampler):
         if blend_form is not None and tau.numel():
             local = LocalRays(origins, directions, hits.local_origins, hits.local_directions)
             tau = _blend_visible(merged, flat, heads, local, field, blend_form)
-        survivors = keep_survivors(merged, tau, threshold)
+        survivors = keep_survivors(merged, tau, threshold, fair_share)
         report = MergeReport(counts.sum(-1), survivors.skipped_total, survivors.dropped_mass, explained)
         return _ray_samples(ray_bundle, flat, heads, survivors), report
 

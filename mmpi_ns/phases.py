@@ -63,6 +63,10 @@ class Schedule:
         """Share of the plan's texels in use at this step, a power of two."""
         return 2.0 ** -sum(step < g for g in self.growth)
 
+    def sharpened(self, step: int) -> bool:
+        """Whether surfaces have formed: resolution has stopped growing (without growth: a tenth of the first phase)."""
+        return step >= (self.growth[-1] if self.growth else self.phases[0].end // 10)
+
     def rate_factor(self, kind: str, step: int) -> float:
         """Learning rate of a parameter kind relative to its start value; 0 where it is frozen."""
         phase = self.phase_at(step)

@@ -6,6 +6,7 @@ import hypothesis
 import pytest
 import torch
 from hand_made import make_mpi
+from tiny_scene import write_scene
 
 from mmpi_ns.placement.plan import CubePlan, ScenePlan
 
@@ -20,3 +21,17 @@ def plan() -> ScenePlan:
     side = make_mpi("left", (2.0, 0.0, 3.0), ((0.0, 0.0, 1.0), (0.0, 1.0, 0.0), (-1.0, 0.0, 0.0)), near=2.0)
     cube = CubePlan((-1.0, -1.0, 2.0), (1.0, 1.0, 5.0), (7, 5, 5))
     return ScenePlan((make_mpi(), side), cube, ray_near=0.05, content_near=1.5)
+
+
+@pytest.fixture(scope="session")
+def scene(tmp_path_factory):
+    """Folder of the tiny scene."""
+    return write_scene(tmp_path_factory.mktemp("scene") / "tiny")
+
+
+@pytest.fixture(scope="session")
+def plan_file(scene, tmp_path_factory):
+    """A plan of two overlapping MPIs and a cube for the tiny scene."""
+    from training_runs import write_plan
+
+    return write_plan(scene, tmp_path_factory.mktemp("plan") / "plan.json", with_cube=True)

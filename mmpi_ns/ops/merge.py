@@ -64,7 +64,7 @@ class Survivors:
     """Sum of the weights of the dropped samples."""
 
 
-def keep_survivors(merged: Merged, tau: Float[Tensor, "N"], threshold: float, fair_share: float = 0.1) -> Survivors:
+def keep_survivors(merged: Merged, tau: Float[Tensor, "N"], threshold: float, fair_share: float) -> Survivors:
     """Keep the samples whose weight exceeds min(threshold, fair_share / samples on the ray).
 
     The second bound matters at the start, when all weights are 1/L: a fixed threshold would keep nothing, and what is
@@ -74,7 +74,7 @@ def keep_survivors(merged: Merged, tau: Float[Tensor, "N"], threshold: float, fa
         merged: all samples, nearest first.
         tau: blended optical depth of the flat samples.
         threshold: weight below which a sample is dropped once the field has sharpened; 0 keeps all.
-        fair_share: the bound relative to equal weights.
+        fair_share: the bound relative to equal weights; inf for the threshold alone.
     """
     depth = torch.where(merged.valid, tau[merged.order] if tau.numel() else 0.0, 0.0)
     weights = torch.exp(-exclusive_cumsum(depth)) * -torch.expm1(-depth)

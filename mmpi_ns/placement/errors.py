@@ -57,11 +57,12 @@ def pixel_errors(plan: ScenePlan, observations: Observations, cameras: Array, po
         cameras: [Q] camera of each observation.
         points: [Q, 3] world position of each observed point.
     """
-    pairs = [_errors_in(m, observations, cameras, points) for m in plan.mpis]
+    pairs = [mpi_errors(m, observations, cameras, points) for m in plan.mpis]
     return PixelErrors(np.stack([p for p, _ in pairs], -1), np.stack([t for _, t in pairs], -1))
 
 
-def _errors_in(mpi: MPIPlan, observations: Observations, cameras: Array, points: Array) -> tuple[Array, Array]:
+def mpi_errors(mpi: MPIPlan, observations: Observations, cameras: Array, points: Array) -> tuple[Array, Array]:
+    """(e_p, e_t) of observed points in one MPI, in pixels; inf where it does not hold the point."""
     axes, origin = np.asarray(mpi.axes), np.asarray(mpi.origin)
     local = (points - origin) @ axes.T
     ahead = local[:, 2] >= mpi.near

@@ -27,7 +27,7 @@ class Observations:
     seen_point: NDArray[np.int64]
     """[Q] point of each keypoint."""
     seen_at: Array
-    """[Q, 2] pixel (x, y) of each keypoint."""
+    """[Q, 2] pixel (x, y) of each SfM keypoint; empty where the points come from a plane sweep."""
 
     @property
     def centers(self) -> Array:

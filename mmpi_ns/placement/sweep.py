@@ -28,37 +28,49 @@ class _View:
     intrinsics: Array
 
 
-def add_swept_points(observations: Observations, images: list[Array], num_references: int = 24) -> Observations:
+def add_swept_points(observations: Observations, images: list[Array], num_references: int = 16) -> Observations:
     """The observations with points found by a plane sweep, each seen by its reference view.
 
     Args:
         observations: cameras without points.
-        images: gray images [h, w] in [0, 1] of all cameras, any (small) size.
+        images: gray images [h, w] in [0, 1] of all cameras, about 128 pixels a side.
         num_references: views to sweep, evenly spread over the capture.
+
+    Returns:
+        The observations with points; each counts as seen by every camera near its reference whose image it falls on.
     """
     count = len(images)
     references = np.unique(np.linspace(0, count - 1, min(num_references, count)).round().astype(int))
     views = [_view(observations, i, image) for i, image in enumerate(images)]
-    points, cameras, pixels = [], [], []
+    points, cameras, indices, total = [], [], [], 0
     for i in references:
-        neighbours = _neighbours(observations, int(i))
+        neighbours = _neighbours(observations, int(i), wanted=8)
         if not neighbours:
             continue
-        found, at = _sweep(views[i], [views[j] for j in neighbours])
-        scale = observations.sizes[i] / [views[i].image.shape[1], views[i].image.shape[0]]
+        found = _sweep(views[i], [views[j] for j in neighbours[:4]])
         points.append(found)
-        cameras.append(np.full(len(found), i, np.int64))
-        pixels.append(at * scale)
-    if not points or not sum(len(p) for p in points):
+        for j in (int(i), *neighbours):
+            seen = np.nonzero(_in_image(views[j], found))[0]
+            cameras.append(np.full(len(seen), j, np.int64))
+            indices.append(total + seen)
+        total += len(found)
+    if not total:
         return observations
-    total = sum(len(p) for p in points)
     return replace(
         observations,
         points=np.concatenate(points),
         seen_by=np.concatenate(cameras),
-        seen_point=np.arange(total),
-        seen_at=np.concatenate(pixels),
+        seen_point=np.concatenate(indices),
     )
+
+
+def _in_image(view: _View, points: Array) -> NDArray[np.bool_]:
+    local = (points - view.pose[:, 3]) @ view.pose[:, :3]
+    depth = np.where(local[:, 2] < 0, -local[:, 2], np.inf)
+    fx, fy, cx, cy = view.intrinsics
+    x, y = fx * local[:, 0] / depth + cx, -fy * local[:, 1] / depth + cy
+    height, width = view.image.shape
+    return np.isfinite(depth) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
 
 
 def _view(observations: Observations, index: int, image: Array) -> _View:
@@ -66,7 +78,7 @@ def _view(observations: Observations, index: int, image: Array) -> _View:
     return _View(image, observations.camera_to_worlds[index], observations.intrinsics[index] * scale)
 
 
-def _neighbours(observations: Observations, index: int, wanted: int = 4) -> list[int]:
+def _neighbours(observations: Observations, index: int, wanted: int) -> list[int]:
     """The nearest views that look the same way (within 30 degrees) from somewhere else."""
     offset = observations.centers - observations.centers[index]
     facing = observations.camera_to_worlds[:, :, 2]
@@ -76,8 +88,8 @@ def _neighbours(observations: Observations, index: int, wanted: int = 4) -> list
     return [int(j) for j in order[: min(wanted, int(usable.sum()))]]
 
 
-def _sweep(reference: _View, neighbours: list[_View]) -> tuple[Array, Array]:
-    """World points and pixels (x, y) of the reference where one disparity matches clearly best."""
+def _sweep(reference: _View, neighbours: list[_View]) -> Array:
+    """World points of the reference's pixels where one disparity matches clearly best."""
     height, width = reference.image.shape
     fx, fy, cx, cy = reference.intrinsics
     ys, xs = np.mgrid[0:height, 0:width] + 0.5
@@ -95,7 +107,7 @@ def _sweep(reference: _View, neighbours: list[_View]) -> tuple[Array, Array]:
     rows, columns = np.nonzero(good)
     keep = slice(None, None, max(1, len(rows) // 400))
     rows, columns = rows[keep], columns[keep]
-    return world[rows, columns], np.stack([columns, rows], -1) + 0.5
+    return world[rows, columns]
 
 
 def _score(reference: _View, neighbours: list[_View], rays: Array, disparity: float) -> Array:

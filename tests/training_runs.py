@@ -1,0 +1,83 @@
+"""Trainers on the tiny scene, small enough to train in a second."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+
+import numpy as np
+from nerfstudio.engine import trainer as nerfstudio_trainer
+
+from mmpi_ns.mmpi_config import mmpi_small
+from mmpi_ns.mmpi_datamanager import MMPIDataManagerConfig
+from mmpi_ns.placement.plan import CubePlan, MPIPlan, ScenePlan
+
+
+def datamanager(data: Path, test_mode="val", **settings):
+    config = copy.deepcopy(mmpi_small.config.pipeline.datamanager)
+    assert isinstance(config, MMPIDataManagerConfig)
+    config.data = data
+    config.train_num_rays_per_batch = 64
+    config.keypoint_rays = 16
+    for name, value in settings.items():
+        setattr(config, name, value)
+    return config.setup(device="cpu", test_mode=test_mode)
+
+
+def plan_of(observations, num_mpis=2, with_cube=False, planes=12) -> ScenePlan:
+    """MPIs side by side behind the cameras of the tiny scene, which all see most of it."""
+    x, y, z = observations.mean_axes
+    center, size = observations.centers.mean(0), np.ptp(observations.centers, axis=0).max()
+    mpis = tuple(
+        MPIPlan(
+            f"mpi{k}",
+            tuple(float(v) for v in center + (0.5 * (k - (num_mpis - 1) / 2) * x - 0.3 * z) * size),
+            tuple(tuple(float(v) for v in row) for row in (x, y, z)),
+            float(size),
+            (-1.0, 1.0, -0.8, 0.8),
+            planes,
+            12,
+            16,
+        )
+        for k in range(num_mpis)
+    )
+    cube = None
+    if with_cube:
+        middle, half = center + 1.5 * size * z, 0.6 * size
+        cube = CubePlan(tuple(float(v) for v in middle - half), tuple(float(v) for v in middle + half), (8, 8, 8))
+    return ScenePlan(mpis, cube, 0.1 * float(size), 1.2 * float(size))
+
+
+def write_plan(data: Path, path: Path, **settings) -> Path:
+    path.write_text(plan_of(datamanager(data, test_mode="inference").observations, **settings).to_json())
+    return path
+
+
+def trainer_config(data: Path, plan: Path, output: Path, steps=24, **model):
+    """mmpi-small on the tiny scene: individual, blend and finetune, with two doublings of the texels."""
+    config = copy.deepcopy(mmpi_small.config)
+    config.output_dir, config.experiment_name, config.timestamp = output, "tiny", "run"
+    config.max_num_iterations, config.steps_per_save, config.save_only_latest_checkpoint = steps, 1, False
+    config.machine.device_type, config.machine.num_devices = "cpu", 1
+    config.logging.local_writer.enable = False
+    config.logging.profiler = "none"
+    config.vis = "tensorboard"
+    config.data = config.pipeline.datamanager.data = data
+    config.pipeline.datamanager.train_num_rays_per_batch = 64
+    config.pipeline.datamanager.keypoint_rays = 16
+    settings = {"plan_file": plan, "blend_share": 0.25, "finetune_share": 0.25, "growth_shares": (1 / 4, 1 / 2)}
+    settings |= {"hidden_width": 8, "feature_channels": 4}
+    for name, value in (settings | model).items():
+        assert hasattr(config.pipeline.model, name), name
+        setattr(config.pipeline.model, name, value)
+    return config
+
+
+def ready(config, **changes):
+    """A trainer that is set up (and has loaded its checkpoint where the config names one)."""
+    for name, value in changes.items():
+        setattr(config, name, value)
+    nerfstudio_trainer.writer.EVENT_WRITERS.clear()
+    trainer = config.setup(local_rank=0, world_size=1)
+    trainer.setup()
+    return trainer
