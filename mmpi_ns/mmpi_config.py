@@ -11,6 +11,7 @@ from nerfstudio.plugins.types import MethodSpecification
 from mmpi_ns.mmpi_datamanager import MMPIDataManagerConfig
 from mmpi_ns.mmpi_model import MMPIModelConfig
 from mmpi_ns.mmpi_trainer import MMPITrainerConfig, PhaseSchedulerConfig
+from mmpi_ns.placement.rule import PlacementConfig
 from mmpi_ns.touched_adam import TouchedAdamConfig
 
 
@@ -22,7 +23,9 @@ def _optimizers() -> dict:
     }
 
 
-def _method(name: str, description: str, steps: int, rays: int, model: MMPIModelConfig) -> MethodSpecification:
+def _method(
+    name: str, description: str, *, steps: int, rays: int, model: MMPIModelConfig, keypoint_rays: int = 384
+) -> MethodSpecification:
     config = MMPITrainerConfig(
         method_name=name,
         max_num_iterations=steps,
@@ -32,20 +35,69 @@ def _method(name: str, description: str, steps: int, rays: int, model: MMPIModel
         steps_per_eval_image=0,
         steps_per_eval_all_images=0,
         pipeline=VanillaPipelineConfig(
-            datamanager=MMPIDataManagerConfig(dataparser=NerfstudioDataParserConfig(), train_num_rays_per_batch=rays),
+            datamanager=MMPIDataManagerConfig(
+                dataparser=NerfstudioDataParserConfig(),
+                train_num_rays_per_batch=rays,
+                keypoint_rays=keypoint_rays,
+            ),
             model=model,
         ),
         optimizers=_optimizers(),
         viewer=ViewerConfig(num_rays_per_chunk=1 << 14, quit_on_train_completion=True),
-        vis="tensorboard",
+        vis="viewer+tensorboard",
     )
     return MethodSpecification(config=config, description=description)
 
 
-mmpi = _method("mmpi", "MMPI: several multi-plane images, blended by reliability.", 20000, 4096, MMPIModelConfig())
-mmpi_small = _method("mmpi-small", "MMPI for a two-core CPU.", 4000, 1024, MMPIModelConfig(hidden_width=32))
-mmpi_kitti = _method("mmpi-kitti", "MMPI with the paper's KITTI settings.", 40000, 4096, MMPIModelConfig())
-mmpi_scannet = _method("mmpi-scannet", "MMPI with the paper's ScanNet settings.", 30000, 4096, MMPIModelConfig())
+mmpi = _method(
+    "mmpi",
+    "MMPI: several multi-plane images, placed among the training cameras.",
+    steps=20000,
+    rays=4096,
+    model=MMPIModelConfig(placement=PlacementConfig(max_mpis=10, planes=128, texel_pixels=1.2)),
+)
+mmpi_small = _method(
+    "mmpi-small",
+    "MMPI in a size that a two-core CPU trains in minutes.",
+    steps=4000,
+    rays=1024,
+    model=MMPIModelConfig(hidden_width=32),
+)
+mmpi_kitti = _method(
+    "mmpi-kitti",
+    "MMPI with the paper's KITTI settings: front, left, right, below; each alone, then reliability.",
+    steps=40000,
+    rays=4096,
+    keypoint_rays=0,
+    model=MMPIModelConfig(
+        placement=PlacementConfig(arrangement="drive", planes=256, height=270, width=270),
+        training="two-phase",
+        blend_share=0.25,
+        finetune_share=0.0,
+    ),
+)
+
+
+def _scannet() -> MMPIModelConfig:
+    return MMPIModelConfig(
+        placement=PlacementConfig(arrangement="room", planes=128, height=192, width=192, cube_voxels=160),
+        training="joint",
+    )
+
+
+mmpi_scannet = _method(
+    "mmpi-scannet",
+    "MMPI with the paper's ScanNet settings: five MPIs and a cube, all together.",
+    steps=30000,
+    rays=4096,
+    keypoint_rays=0,
+    model=_scannet(),
+)
 mmpi_scannet_short = _method(
-    "mmpi-scannet-short", "MMPI with the paper's short ScanNet schedule.", 10000, 4096, MMPIModelConfig()
+    "mmpi-scannet-short",
+    "MMPI with the paper's ScanNet settings and a third of the steps.",
+    steps=10000,
+    rays=4096,
+    keypoint_rays=0,
+    model=_scannet(),
 )

@@ -195,14 +195,15 @@ class MMPIField(Field):
     def mpi_optical_depth(self, k: int, planes: Int[Tensor, "N"], ndc: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
         """tau of MPI k at NDC (u, v) on its planes."""
         rows, weights = self.grids[k].bilinear(planes, ndc)
-        return self._mpi_tau(k, interpolate(self.density, rows, weights)[:, 0], planes)
+        return self.mpi_tau(k, interpolate(self.density, rows, weights)[:, 0], planes)
 
     def cube_optical_depth(self, ndc: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
         """tau of the cube at normalised positions."""
         rows, weights = self.grids[-1].trilinear(ndc)
         return self._cube_tau(interpolate(self.density, rows, weights)[:, 0])
 
-    def _mpi_tau(self, k: int, raw: Tensor, planes: Tensor) -> Tensor:
+    def mpi_tau(self, k: int, raw: Float[Tensor, "N"], planes: Int[Tensor, "N"]) -> Float[Tensor, "N"]:
+        """tau from MPI k's raw densities: softplus(raw + b_l) times the interval, in float32 or wider."""
         interval = 256.0 / self.plan.mpis[k].planes
         raw = raw.float() if raw.dtype in (torch.float16, torch.bfloat16) else raw
         return nn.functional.softplus(raw + self._biases(k)[planes]) * (interval * self.depth_scale)
@@ -292,7 +293,7 @@ class MMPIField(Field):
         return out.view(*lookup.shape, 1), lookup
 
     def _head_tau(self, k: int, raw: Tensor, planes: Tensor) -> Tensor:
-        return self._mpi_tau(k, raw, planes) if k < len(self.plan.mpis) else self._cube_tau(raw)
+        return self.mpi_tau(k, raw, planes) if k < len(self.plan.mpis) else self._cube_tau(raw)
 
     def _lookup(self, ray_samples: RaySamples) -> Lookup:
         meta = ray_samples.metadata

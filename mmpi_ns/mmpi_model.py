@@ -53,7 +53,7 @@ class MMPIModelConfig(ModelConfig):
     """Where the MPIs stand and how fine they are."""
     plan_file: Path | None = None
     """A scene plan (JSON) to use instead of the placement rule."""
-    training: Literal["two-phase", "joint"] = "two-phase"
+    training: Literal["two-phase", "joint"] = "joint"
     """Each MPI alone, then reliability (two-phase), or all together without reliability (joint)."""
     total_steps: int = 1
     """Set by the trainer from --max-num-iterations; the phases are shares of it."""

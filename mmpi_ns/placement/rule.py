@@ -52,6 +52,10 @@ class PlacementConfig:
     """Distances to try for standing behind the camera, relative to the nearest content (cameras)."""
     texel_cost: float = 0.25
     """How much texels count against a candidate: its gain is divided by texels to this power (cameras)."""
+    faces: tuple[str, ...] = ("front", "left", "right", "below")
+    """Which MPIs of the drive to use (drive)."""
+    drive_pull_back: float = 0.45
+    """How far behind the first camera the front MPI stands, as a share of the travel (drive)."""
     cube_voxels: int = 0
     """Voxels along each side of the centred cube; 0 for none."""
 
@@ -79,7 +83,8 @@ def place(observations: Observations, config: PlacementConfig) -> ScenePlan:
     content = find_content(observations)
     if config.arrangement == "drive":
         # The hand-made rule is in metres; it was made where the nearest content lies 5 m away.
-        return drive_plan(observations, content.near / 5, config.planes, config.height, config.width)
+        size = (config.planes, config.height, config.width)
+        return drive_plan(observations, content.near / 5, *size, config.faces, config.drive_pull_back)
     if config.arrangement == "room":
         half_size = float(np.abs(observations.centers - observations.centers.mean(0)).max()) + content.near
         near = max(0.5 * content.near, 1e-6)

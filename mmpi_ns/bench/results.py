@@ -1,0 +1,184 @@
+"""Trains and evaluates the variants of a suite with the real commands, and writes JSON and a Markdown table."""
+
+from __future__ import annotations
+
+import copy
+import functools
+import json
+import os
+import platform
+import re
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+from mmpi_ns.bench.suites import SUITES, Variant
+from mmpi_ns.mmpi_config import mmpi_small
+from mmpi_ns.mmpi_datamanager import MMPIDataManagerConfig
+from mmpi_ns.placement.errors import pixel_errors
+from mmpi_ns.placement.observations import Observations
+from mmpi_ns.placement.plan import ScenePlan
+from mmpi_ns.placement.rule import find_content
+
+RAYS_PER_STEP = 1024
+
+
+@dataclass
+class Results:
+    """Trains and evaluates every variant of a suite on a scene, as a user would."""
+
+    data: Path
+    """The scene (a folder with transforms.json)."""
+    suite: str
+    """Which variants: kitti-street, room-walk, fern or fox."""
+    downscale_factor: int = 4
+    """Image size to use."""
+    output: Path = Path("docs/results")
+    """Where SUITE.json and SUITE.md go; finished rows in SUITE.json are not run again."""
+    work: Path = Path("outputs/results")
+    """Where runs and renders go."""
+    parallel: int = 1
+    """Runs at the same time, each with its share of the cores."""
+    threads: int = 0
+    """Threads of a run; 0 for all cores / parallel."""
+    only: str = ""
+    """Run only variants whose name contains this."""
+
+    def run(self) -> None:
+        path = self.output / f"{self.suite}.json"
+        done: dict[str, Any] = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+        wanted = [v for v in SUITES[self.suite] if self.only in v.name and _key(v) not in done]
+        self.output.mkdir(parents=True, exist_ok=True)
+        with ThreadPoolExecutor(self.parallel) as pool:
+            for variant, row in zip(wanted, pool.map(self._row, wanted), strict=True):
+                done[_key(variant)] = row
+                path.write_text(json.dumps(done, indent=1), encoding="utf-8")
+                print(json.dumps({_key(variant): row}), flush=True)
+        (self.output / f"{self.suite}.md").write_text(self._table(done), encoding="utf-8")
+
+    def _row(self, variant: Variant) -> dict[str, Any]:
+        name = re.sub(r"[^a-z0-9]+", "-", _key(variant).lower()).strip("-")
+        folder = self.work / self.suite / name
+        threads = self.threads or max(1, (os.cpu_count() or 1) // self.parallel)
+        environment = {**os.environ, "OMP_NUM_THREADS": str(threads)}
+        steps = [] if variant.steps is None else ["--max-num-iterations", str(variant.steps)]
+        scene = ["--data", str(self.data), "nerfstudio-data", "--downscale-factor", str(self.downscale_factor)]
+        place = ["--output-dir", str(folder), "--experiment-name", "run", "--timestamp", "1"]
+        start = time.perf_counter()
+        _command(
+            ["ns-train", variant.method, *place, "--vis", "tensorboard", *steps, *variant.options, *scene],
+            folder,
+            environment,
+        )
+        seconds = time.perf_counter() - start
+        run = folder / "run" / variant.method / "1"
+        render = ["--output-path", str(folder / "eval.json"), "--render-output-path", str(folder / "renders")]
+        _command(["ns-eval", "--load-config", str(run / "config.yml"), *render], folder, environment)
+        results = json.loads((folder / "eval.json").read_text(encoding="utf-8"))["results"]
+        row = {k: results[k] for k in ("psnr", "ssim", "num_rays_per_sec", "dropped_mass") if k in results}
+        row.update({k: v for k, v in results.items() if k.startswith("lpips") and not k.endswith("std")})
+        row.update(self._plan_figures(run))
+        row["train_seconds"] = seconds
+        row["steps"] = _steps(run)
+        row["threads"] = threads
+        row["commit"] = _output(["git", "rev-parse", "--short", "HEAD"])
+        row["date"] = date.today().isoformat()
+        row["command"] = " ".join(["ns-train", variant.method, *steps, *variant.options])
+        return row
+
+    def _plan_figures(self, run: Path) -> dict[str, Any]:
+        """MPIs, texels and expected pixel errors of the plan that a run used."""
+        plan = ScenePlan.load(run / "plan.json")
+        observations = load_observations(self.data, self.downscale_factor)
+        content = find_content(observations)
+        errors = pixel_errors(plan, observations, content.cameras, content.points).summary()
+        return {"mpis": len(plan.mpis), "texels": plan.texels, **errors}
+
+    def _table(self, rows: dict[str, Any]) -> str:
+        command = f"python -m mmpi_ns.bench results --suite {self.suite} --downscale-factor {self.downscale_factor}"
+        lines = [
+            f"# {self.suite}, images at 1/{self.downscale_factor}",
+            "",
+            f"Made by `{command} --data <scene>` on {_processor()}.",
+            "Every figure is `ns-eval`'s mean over all test images. Rays are pixel rays of training;",
+            "e_p and e_t are the expected pixel errors for lack of planes and of texels",
+            "(median / 90th percentile over the training observations, each in the MPI that serves it best).",
+        ]
+        for group in dict.fromkeys(v.group for v in SUITES[self.suite]):
+            lines += ["", f"## {group}" if group else "", "", _HEADER, _HEADER_LINE]
+            lines += [_line(v.name, rows[_key(v)]) for v in SUITES[self.suite] if v.group == group and _key(v) in rows]
+        commits = sorted({f"{r['commit']} ({r['date']})" for r in rows.values()})
+        return "\n".join([*lines, "", f"Commits: {', '.join(commits)}. Options of each row: `{self.suite}.json`.", ""])
+
+
+_HEADER = (
+    "| variant | PSNR | SSIM | LPIPS | rays | training, s | threads | render rays/s | MPIs | M texels | e_p | e_t |"
+)
+_HEADER_LINE = "|---|" + "---|" * 11
+
+
+def _line(name: str, r: dict[str, Any]) -> str:
+    lpips = next((f"{v:.3f}" for k, v in r.items() if k.startswith("lpips")), "no weights")
+    cells = [
+        name,
+        f"{r['psnr']:.2f}",
+        f"{r['ssim']:.3f}",
+        lpips,
+        f"{r['steps'] * RAYS_PER_STEP / 1e6:.2f} M",
+        f"{r['train_seconds']:.0f}",
+        str(r["threads"]),
+        f"{r['num_rays_per_sec']:.0f}",
+        str(r["mpis"]),
+        f"{r['texels'] / 1e6:.1f}",
+        f"{r['e_p_50']:.2f} / {r['e_p_90']:.2f}",
+        f"{r['e_t_50']:.2f} / {r['e_t_90']:.2f}",
+    ]
+    return "| " + " | ".join(cells) + " |"
+
+
+def _key(variant: Variant) -> str:
+    return f"{variant.group}: {variant.name}" if variant.group else variant.name
+
+
+@functools.cache
+def load_observations(data: Path, downscale_factor: int) -> Observations:
+    """The observations that training on a scene would use."""
+    config = copy.deepcopy(mmpi_small.config.pipeline.datamanager)
+    assert isinstance(config, MMPIDataManagerConfig)
+    config.data = data
+    config.dataparser.downscale_factor = downscale_factor  # type: ignore[attr-defined]
+    return config.setup(device="cpu", test_mode="val").observations
+
+
+def _steps(run: Path) -> int:
+    last = max(int(p.stem.split("-")[1]) for p in (run / "nerfstudio_models").glob("step-*.ckpt"))
+    return last + 1
+
+
+def _command(words: list[str], folder: Path, environment: dict[str, str]) -> None:
+    """Runs a command of this Python's environment; its output goes to a log beside the run."""
+    folder.mkdir(parents=True, exist_ok=True)
+    program = str(Path(sys.executable).with_name(words[0]))
+    log = folder / f"{words[0]}.log"
+    with log.open("w", encoding="utf-8") as stream:
+        code = subprocess.run(
+            [program, *words[1:]], stdout=stream, stderr=subprocess.STDOUT, env=environment
+        ).returncode
+    if code:
+        raise RuntimeError(f"{words[0]} failed with status {code}: see {log}.")
+
+
+def _output(words: list[str]) -> str:
+    return subprocess.run(words, capture_output=True, text=True, check=False).stdout.strip() or "unknown"
+
+
+def _processor() -> str:
+    info = Path("/proc/cpuinfo")
+    text = info.read_text(encoding="utf-8") if info.is_file() else ""
+    names = re.findall(r"model name\s*: (.*)", text)
+    return f"{os.cpu_count()} cores of {names[0] if names else platform.processor()}"

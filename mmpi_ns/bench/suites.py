@@ -1,0 +1,61 @@
+"""The variants that are compared on each scene: a method's name and its options, as a user would type them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+P = "--pipeline.model.placement."
+JOINT = ("--pipeline.model.training", "joint")
+TWO_PHASE = ("--pipeline.model.training", "two-phase")
+DRIVE = (P + "arrangement", "drive")
+NO_DEPTH = ("--pipeline.datamanager.keypoint-rays", "0")
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One row of a table."""
+
+    name: str
+    options: tuple[str, ...]
+    method: str = "mmpi-small"
+    steps: int | None = 1500
+    """Training steps; None for the method's own."""
+    group: str = ""
+    """Rows of one group share a table."""
+
+
+def _paper_ladder(depth: bool) -> list[Variant]:
+    """Single, joint, two phases: the paper's ablation on the hand-made drive, with SfM depth in all rows or in none."""
+    extra = () if depth else NO_DEPTH
+    group = "with SfM depth" if depth else "without SfM depth"
+    rows = [
+        ("one front MPI at the first camera", (*DRIVE, *JOINT, P + "faces", "front", P + "drive-pull-back", "0")),
+        ("one front MPI, pulled back", (*DRIVE, *JOINT, P + "faces", "front")),
+        ("four MPIs, joint, no reliability", (*DRIVE, *JOINT)),
+        ("four MPIs, individual, then reliability only", (*DRIVE, *TWO_PHASE, *_shares(0.25, 0.0))),
+        ("... then a joint fine-tune", (*DRIVE, *TWO_PHASE, *_shares(0.1, 0.4))),
+        ("placed among the cameras, joint", JOINT),
+    ]
+    return [Variant(name, (*options, *extra), group=group) for name, options in rows]
+
+
+def _shares(blend: float, finetune: float) -> tuple[str, ...]:
+    return ("--pipeline.model.blend-share", str(blend), "--pipeline.model.finetune-share", str(finetune))
+
+
+ROOM = (P + "arrangement", "room", P + "width", "160", *JOINT)
+
+SUITES: dict[str, list[Variant]] = {
+    "kitti-street": [
+        *_paper_ladder(depth=True),
+        *_paper_ladder(depth=False),
+        Variant("mmpi-small, its defaults", (), steps=None, group="defaults"),
+    ],
+    "room-walk": [
+        Variant("five MPIs and cube, joint", (*ROOM, P + "cube-voxels", "96")),
+        Variant("five MPIs, joint", ROOM),
+        Variant("placed among the cameras, joint", JOINT),
+    ],
+    "fern": [Variant("one MPI", (P + "max-mpis", "1", P + "planes", "96"))],
+    "fox": [Variant("placed among the cameras, joint", JOINT)],
+}
