@@ -234,7 +234,9 @@ class Cube:
     step: float
 
     @staticmethod
-    def pack(plan: CubePlan, samples_per_voxel: float, dtype=torch.float32, device="cpu") -> Cube:
+    def pack(
+        plan: CubePlan, samples_per_voxel: float, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu"
+    ) -> Cube:
         lower = torch.tensor(plan.lower, dtype=dtype, device=device)
         upper = torch.tensor(plan.upper, dtype=dtype, device=device)
         sides = [(b - a) / (n - 1) for a, b, n in zip(plan.lower, plan.upper, reversed(plan.shape), strict=True)]

@@ -15,7 +15,7 @@ class ImageMetrics:
     """Metrics of a rendered image. LPIPS fetches its weights on first use; without them it is left out, and says so."""
 
     def __init__(self, lpips_net: Literal["vgg", "alex"]) -> None:
-        self.lpips_net = lpips_net
+        self.lpips_net: Literal["vgg", "alex"] = lpips_net
         self._lpips: nn.Module | None = None
         self._lpips_tried = False
 

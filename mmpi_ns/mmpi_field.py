@@ -296,7 +296,7 @@ class MMPIField(Field):
         return self.mpi_tau(k, raw, planes) if k < len(self.plan.mpis) else self._cube_tau(raw)
 
     def _lookup(self, ray_samples: RaySamples) -> Lookup:
-        meta = ray_samples.metadata
+        meta = metadata_of(ray_samples)
         index = meta["valid"].reshape(-1).nonzero()[:, 0]
         heads = meta["heads"].reshape(-1)[index]
         planes, ndc = meta["planes"].reshape(-1)[index], meta["ndc"].reshape(-1, 3)[index]
@@ -360,7 +360,7 @@ class MMPIField(Field):
         """``shares`` of the valid samples of a merged batch, with gradients to the reliability."""
         frustums = ray_samples.frustums
         local = LocalRays.of(frustums.origins[:, 0], frustums.directions[:, 0], self.frames)
-        inverse_t = ray_samples.metadata["inverse_t"].reshape(-1)[lookup.index]
+        inverse_t = metadata_of(ray_samples)["inverse_t"].reshape(-1)[lookup.index]
         return self.shares(lookup.index // lookup.shape[1], local, inverse_t, lookup.heads)
 
 
@@ -382,6 +382,12 @@ class LocalRays:
         if k < self.local_origins.shape[1]:
             return torch.cat([self.local_origins[:, k], self.local_directions[:, k]], -1)
         return torch.cat([self.origins, self.directions], -1)
+
+
+def metadata_of(ray_samples: RaySamples) -> dict[str, Tensor]:
+    """What the sampler knows about each merged sample (see ``MMPISampler``)."""
+    assert ray_samples.metadata is not None, "these samples do not come from MMPISampler"
+    return ray_samples.metadata
 
 
 def by_head(heads: Int[Tensor, "N"]) -> list[tuple[int, Int[Tensor, "M"]]]:

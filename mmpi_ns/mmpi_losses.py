@@ -12,7 +12,7 @@ from torch import Tensor
 from mmpi_ns import losses
 from mmpi_ns.compositing import Composite, render_colors
 from mmpi_ns.mmpi_datamanager import KEYPOINT_DEPTH
-from mmpi_ns.mmpi_field import Lookup, MMPIField
+from mmpi_ns.mmpi_field import Lookup, MMPIField, metadata_of
 from mmpi_ns.mmpi_sampler import MergeReport
 
 
@@ -82,13 +82,13 @@ class TrainingRays:
         return Composite(c.weights[is_pixel], c.accumulation[is_pixel], c.transmittance[is_pixel])
 
     def _distortion(self, is_pixel: Tensor, scale: float) -> Tensor:
-        inverse_t = self.samples.metadata["inverse_t"][..., 0][is_pixel]
+        inverse_t = metadata_of(self.samples)["inverse_t"][..., 0][is_pixel]
         positions = 1 / (1 + inverse_t * scale)
         intervals = (1 / self.report.live[is_pixel].clamp(min=1))[:, None].to(positions.dtype)
         return losses.distortion(self.composite.weights[is_pixel], positions, intervals.expand_as(positions))
 
     def _keypoint_depth(self, chosen: Tensor, known: Tensor) -> Tensor:
-        meta = self.samples.metadata
+        meta = metadata_of(self.samples)
         return losses.keypoint_depth(
             self.composite.weights[chosen],
             meta["inverse_t"][..., 0][chosen],

@@ -27,7 +27,7 @@ from mmpi_ns.compositing import (
 )
 from mmpi_ns.metrics import ImageMetrics, head_palette
 from mmpi_ns.mmpi_datamanager import OBSERVATIONS
-from mmpi_ns.mmpi_field import Lookup, MMPIField
+from mmpi_ns.mmpi_field import Lookup, MMPIField, metadata_of
 from mmpi_ns.mmpi_losses import LossWeights, TrainingRays, is_pixel_ray, over_background
 from mmpi_ns.mmpi_sampler import MergeReport, MMPISampler
 from mmpi_ns.phases import TRAINS, Schedule, make_schedule
@@ -217,8 +217,8 @@ class MMPIModel(Model):
         tau = tau[..., 0]
         if blend_form is not None and lookup.index.numel():
             tau = self._blend(tau, samples, lookup, blend_form)
-        valid = samples.metadata["valid"][..., 0]
-        composite = composite_weights(tau, valid, samples.metadata["skipped_before"][..., 0], report.skipped_total)
+        valid = metadata_of(samples)["valid"][..., 0]
+        composite = composite_weights(tau, valid, metadata_of(samples)["skipped_before"][..., 0], report.skipped_total)
         # Keypoint rays are supervised in depth alone: no colours for them.
         colored = lookup.of_rays(is_pixel_ray(bundle)) if self.training else lookup
         colors = self.field.get_outputs(samples, colored)[FieldHeadNames.RGB]
@@ -272,7 +272,7 @@ class MMPIModel(Model):
             "depth": self._depth(composite, samples),
         }
         if not self.training:
-            heads = samples.metadata["heads"][..., 0]
+            heads = metadata_of(samples)["heads"][..., 0]
             mass = rgb.new_zeros(rgb.shape[0], self.field.plan.num_heads).scatter_add(1, heads, composite.weights)
             outputs["rgb"] = outputs["rgb"].clamp(0, 1)
             outputs["winning_mpi"] = mass.argmax(-1, keepdim=True).to(rgb.dtype)
@@ -282,7 +282,7 @@ class MMPIModel(Model):
     @torch.no_grad()
     def _depth(self, composite: Composite, samples: RaySamples) -> Float[Tensor, "R 1"]:
         """Euclidean distance at half the gathered mass; infinity is shown as ten times the farthest finite plane."""
-        inverse_t, valid = samples.metadata["inverse_t"][..., 0], samples.metadata["valid"][..., 0]
+        inverse_t, valid = metadata_of(samples)["inverse_t"][..., 0], metadata_of(samples)["valid"][..., 0]
         farthest = 10 * max(m.near * (m.planes - 1) for m in self.field.plan.mpis)
         return 1 / median_inverse_distance(composite.weights, inverse_t, valid).clamp(min=1 / farthest)
 
@@ -304,7 +304,7 @@ class MMPIModel(Model):
             report = outputs["training"].report
             return {
                 "live_samples": report.live.float().mean(),
-                "kept_samples": outputs["training"].samples.metadata["valid"].float().sum() / len(report.live),
+                "kept_samples": metadata_of(outputs["training"].samples)["valid"].float().sum() / len(report.live),
                 "dropped_mass": report.dropped_mass.mean(),
             }
         image = batch["image"].to(self.device)

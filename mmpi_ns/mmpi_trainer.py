@@ -16,6 +16,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
+from mmpi_ns.mmpi_model import MMPIModel
 from mmpi_ns.phases import Schedule
 from mmpi_ns.placement.plan import ScenePlan
 
@@ -54,18 +55,24 @@ class MMPITrainer(Trainer):
 
     config: MMPITrainerConfig
 
+    @property
+    def _model(self) -> MMPIModel:
+        model = self.pipeline.model
+        assert isinstance(model, MMPIModel), "MMPITrainer trains MMPIModel only"
+        return model
+
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         self.config.pipeline.model.total_steps = self.config.max_num_iterations  # type: ignore[attr-defined]
         self._total_steps = self.config.max_num_iterations
         super().setup(test_mode)
-        plan: ScenePlan = self.pipeline.model.field.full_plan
+        plan: ScenePlan = self._model.field.full_plan
         self.base_dir.mkdir(parents=True, exist_ok=True)
         _write_atomically(self.base_dir / PLAN_FILE, lambda path: path.write_text(plan.to_json(), encoding="utf-8"))
         CONSOLE.print(_describe(plan))
 
     def setup_optimizers(self) -> Optimizers:
         """nerfstudio's optimisers, with schedulers that know the phases."""
-        schedule = self.pipeline.model.schedule
+        schedule = self._model.schedule
 
         class Bound(PhaseScheduler):
             pass
@@ -139,7 +146,7 @@ class MMPITrainer(Trainer):
         stored = pipeline_state.get("_model.field.plan_bytes")
         if stored is None:
             raise ValueError(f"{path} holds no scene plan: it was not written by this method.")
-        ours = self.pipeline.model.field.plan_bytes
+        ours = self._model.field.plan_bytes
         if stored.shape != ours.shape or not torch.equal(stored, ours.cpu()):
             raise ValueError(
                 f"{path} was trained with another scene plan: resume with the settings in its config.yml, or give its "

@@ -48,7 +48,7 @@ class PixelErrors:
         return result
 
 
-def pixel_errors(plan: ScenePlan, observations: Observations, cameras: Array, points: Array) -> PixelErrors:
+def pixel_errors(plan: ScenePlan, observations: Observations, cameras: NDArray[np.int64], points: Array) -> PixelErrors:
     """e_p and e_t of observed points in every MPI of a plan (the cube is left out).
 
     Args:
@@ -61,7 +61,9 @@ def pixel_errors(plan: ScenePlan, observations: Observations, cameras: Array, po
     return PixelErrors(np.stack([p for p, _ in pairs], -1), np.stack([t for _, t in pairs], -1))
 
 
-def mpi_errors(mpi: MPIPlan, observations: Observations, cameras: Array, points: Array) -> tuple[Array, Array]:
+def mpi_errors(
+    mpi: MPIPlan, observations: Observations, cameras: NDArray[np.int64], points: Array
+) -> tuple[Array, Array]:
     """(e_p, e_t) of observed points in one MPI, in pixels; inf where it does not hold the point."""
     axes, origin = np.asarray(mpi.axes), np.asarray(mpi.origin)
     local = (points - origin) @ axes.T
