@@ -47,12 +47,12 @@ class Results:
     threads: int = 0
     """Threads of a run; 0 for all cores / parallel."""
     only: str = ""
-    """Run only variants whose name contains this."""
+    """Run only variants whose group and name contain this."""
 
     def run(self) -> None:
         path = self.output / f"{self.suite}.json"
         done: dict[str, Any] = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
-        wanted = [v for v in SUITES[self.suite] if self.only in v.name and _key(v) not in done]
+        wanted = [v for v in SUITES[self.suite] if self.only in _key(v) and _key(v) not in done]
         self.output.mkdir(parents=True, exist_ok=True)
         with ThreadPoolExecutor(self.parallel) as pool:
             for variant, row in zip(wanted, pool.map(self._row, wanted), strict=True):
