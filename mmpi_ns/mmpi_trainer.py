@@ -99,6 +99,17 @@ class MMPITrainer(Trainer):
         finally:
             self.config.max_num_iterations = self._total_steps
 
+    def train_iteration(self, step: int) -> Any:
+        """One step; remembers that it ran."""
+        result = super().train_iteration(step)
+        self._last_step = step
+        return result
+
+    def _after_train(self) -> None:
+        """Saves the last step that ran; 1.1.5 would save the next one's number when training is stopped."""
+        self.step = getattr(self, "_last_step", self.step)
+        super()._after_train()
+
     @check_main_thread
     def save_checkpoint(self, step: int) -> None:
         """Writes beside the checkpoint folder, then moves the finished file in: a kill or a full disk loses nothing.
