@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,8 @@ from mmpi_ns.sfm import SfmModel, find_sfm_model
 
 OBSERVATIONS = "mmpi_observations"
 """Key under which the model finds the scene's Observations in the data set's metadata."""
+MAX_REPROJECTION = 0.02
+"""Median reprojection error, as a share of the image width, beyond which a COLMAP model is in another frame."""
 KEYPOINT_DEPTH = "keypoint_inverse_distance"
 """Ray-bundle metadata: inverse distance of the SfM point on a keypoint ray, 0 on ordinary rays."""
 
@@ -144,12 +146,16 @@ class MMPIDataManager(VanillaDataManager[InputDataset]):
         return bundle, {"image": colors, "indices": indices}
 
     def _keypoint_rays(self, g: torch.Generator) -> tuple[RayBundle, Float[Tensor, "Q 1"]]:
+        """Rays from training cameras straight at SfM points that they saw, and the inverse distances of those."""
         assert self._keypoints is not None
-        cameras, coords, inverse = self._keypoints
+        cameras, origins, directions, inverse = self._keypoints
         chosen = torch.randint(cameras.shape[0], (self.config.keypoint_rays,), generator=g, device=g.device)
         chosen = chosen.to(cameras.device)
-        bundle = self.train_ray_generator.cameras.generate_rays(
-            camera_indices=cameras[chosen][:, None], coords=coords[chosen]
+        bundle = RayBundle(
+            origins=origins[chosen],
+            directions=directions[chosen],
+            pixel_area=torch.ones_like(inverse[chosen][:, None]),
+            camera_indices=cameras[chosen][:, None],
         )
         return bundle, inverse[chosen][:, None]
 
@@ -168,15 +174,19 @@ def _join(a: RayBundle, b: RayBundle) -> RayBundle:
     )
 
 
-def _keypoint_targets(observations: Observations, device: str | torch.device) -> tuple[Tensor, Tensor, Tensor] | None:
-    """Camera, (row, column) and inverse distance of every keypoint of the training images."""
+def _keypoint_targets(observations: Observations, device: str | torch.device) -> tuple[Tensor, ...] | None:
+    """Camera, origin, unit direction and inverse distance of every keypoint of the training images.
+
+    The ray goes to the point itself, a fraction of a pixel from the keypoint: no lens model enters.
+    """
     if not len(observations.seen_at):
         return None
-    offsets = observations.points[observations.seen_point] - observations.centers[observations.seen_by]
-    inverse = 1 / np.maximum(np.linalg.norm(offsets, axis=-1), 1e-12)
-    coords = torch.from_numpy(observations.seen_at[:, ::-1].copy()).float()
-    cameras = torch.from_numpy(observations.seen_by)
-    return cameras.to(device), coords.to(device), torch.from_numpy(inverse).float().to(device)
+    origins = observations.centers[observations.seen_by]
+    offsets = observations.points[observations.seen_point] - origins
+    distance = np.maximum(np.linalg.norm(offsets, axis=-1, keepdims=True), 1e-12)
+    parts = (origins, offsets / distance, 1 / distance[:, 0])
+    cameras = torch.from_numpy(observations.seen_by).to(device)
+    return cameras, *(torch.from_numpy(x).float().to(device) for x in parts)
 
 
 def read_observations(outputs: DataparserOutputs, cameras: Cameras, sfm: SfmModel | None) -> Observations:
@@ -202,6 +212,13 @@ def read_observations(outputs: DataparserOutputs, cameras: Cameras, sfm: SfmMode
         seen_at = tracks[2] * sizes[tracks[0]]
     elif "points3D_xyz" in outputs.metadata:
         result = {**result, "points": outputs.metadata["points3D_xyz"].double().numpy()}
-    return Observations(
+    observations = Observations(
         camera_to_worlds=poses, intrinsics=np.stack(flat, -1), sizes=sizes.astype(np.float64), seen_at=seen_at, **result
     )
+    if len(seen_at) and observations.median_reprojection_error() > MAX_REPROJECTION:
+        CONSOLE.print(
+            "[bold yellow]The COLMAP model does not fit the cameras (its points project elsewhere), so its tracks are "
+            "not used: state its frame as applied_transform in transforms.json."
+        )
+        return replace(observations, points=np.zeros((0, 3)), seen_by=empty, seen_point=empty, seen_at=np.zeros((0, 2)))
+    return observations

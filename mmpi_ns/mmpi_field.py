@@ -6,7 +6,6 @@ the parameter list, which nerfstudio fixes before K is known.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -19,6 +18,7 @@ from torch import Tensor, nn
 from mmpi_ns import geometry, losses
 from mmpi_ns.color_network import ColorNetworks
 from mmpi_ns.compositing import BlendForm, blend_shares, blended_optical_depth
+from mmpi_ns.mmpi_samples import LocalRays, Lookup, by_head, metadata_of
 from mmpi_ns.ops.interpolate import interpolate
 from mmpi_ns.placement.plan import ScenePlan
 from mmpi_ns.texels import TexelGrid, head_grids, resample
@@ -38,33 +38,6 @@ def plane_biases(planes: int) -> tuple[Float[Tensor, "L"], float]:
     interval = 256.0 / planes
     alpha = (1.0 / (planes - torch.arange(planes, dtype=torch.float64))).clamp(max=0.999)
     return torch.log(torch.expm1(-torch.log1p(-alpha) / interval)).float(), interval
-
-
-@dataclass(frozen=True)
-class Lookup:
-    """Where the valid samples of a merged batch read the tables."""
-
-    shape: torch.Size
-    """(R, S) of the batch."""
-    index: Int[Tensor, "N"]
-    """Flat slots of the valid samples."""
-    heads: Int[Tensor, "N"]
-    planes: Int[Tensor, "N"]
-    ndc: Float[Tensor, "N 3"]
-    groups: list[Any]
-    """(rows, weights, members): all MPI samples ordered by head, then the cube's; members index the N samples."""
-
-    def split(self, members: Int[Tensor, "M"]) -> list[tuple[int, Int[Tensor, "P"]]]:
-        """(head, positions within ``members``), in the order of ``members``."""
-        return by_head(self.heads[members])
-
-    def of_rays(self, chosen: Bool[Tensor, "R"]) -> Lookup:
-        """The same samples, with lookups for the chosen rays only."""
-        if bool(chosen.all()):
-            return self
-        wanted = chosen[self.index // self.shape[1]]
-        groups = [tuple(part[wanted[group[2]]] for part in group) for group in self.groups]
-        return replace(self, groups=groups)
 
 
 class MMPIField(Field):
@@ -362,39 +335,6 @@ class MMPIField(Field):
         local = LocalRays.of(frustums.origins[:, 0], frustums.directions[:, 0], self.frames)
         inverse_t = metadata_of(ray_samples)["inverse_t"].reshape(-1)[lookup.index]
         return self.shares(lookup.index // lookup.shape[1], local, inverse_t, lookup.heads)
-
-
-@dataclass(frozen=True)
-class LocalRays:
-    """R rays in world axes and in every MPI's axes."""
-
-    origins: Float[Tensor, "R 3"]
-    directions: Float[Tensor, "R 3"]
-    local_origins: Float[Tensor, "R K 3"]
-    local_directions: Float[Tensor, "R K 3"]
-
-    @staticmethod
-    def of(origins: Tensor, directions: Tensor, frames: geometry.Frames) -> LocalRays:
-        return LocalRays(origins, directions, *geometry.rays_in_frames(origins, directions, frames))
-
-    def table(self, k: int) -> Float[Tensor, "R 6"]:
-        """Origins and directions in MPI k, or in the world for the cube behind the last MPI."""
-        if k < self.local_origins.shape[1]:
-            return torch.cat([self.local_origins[:, k], self.local_directions[:, k]], -1)
-        return torch.cat([self.origins, self.directions], -1)
-
-
-def metadata_of(ray_samples: RaySamples) -> dict[str, Tensor]:
-    """What the sampler knows about each merged sample (see ``MMPISampler``)."""
-    assert ray_samples.metadata is not None, "these samples do not come from MMPISampler"
-    return ray_samples.metadata
-
-
-def by_head(heads: Int[Tensor, "N"]) -> list[tuple[int, Int[Tensor, "M"]]]:
-    """(head, indices of its samples) for every head that occurs."""
-    if not heads.numel():
-        return []
-    return [(k, index) for k in range(int(heads.max()) + 1) if (index := (heads == k).nonzero()[:, 0]).numel()]
 
 
 def _replace_data(parameter: nn.Parameter, data: Tensor) -> None:

@@ -12,8 +12,9 @@ from torch import Tensor
 from mmpi_ns import losses
 from mmpi_ns.compositing import Composite, render_colors
 from mmpi_ns.mmpi_datamanager import KEYPOINT_DEPTH
-from mmpi_ns.mmpi_field import Lookup, MMPIField, metadata_of
+from mmpi_ns.mmpi_field import MMPIField
 from mmpi_ns.mmpi_sampler import MergeReport
+from mmpi_ns.mmpi_samples import Lookup, metadata_of
 
 
 @dataclass

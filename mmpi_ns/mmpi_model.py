@@ -27,9 +27,10 @@ from mmpi_ns.compositing import (
 )
 from mmpi_ns.metrics import ImageMetrics, head_palette
 from mmpi_ns.mmpi_datamanager import OBSERVATIONS
-from mmpi_ns.mmpi_field import Lookup, MMPIField, metadata_of
+from mmpi_ns.mmpi_field import MMPIField
 from mmpi_ns.mmpi_losses import LossWeights, TrainingRays, is_pixel_ray, over_background
 from mmpi_ns.mmpi_sampler import MergeReport, MMPISampler
+from mmpi_ns.mmpi_samples import Lookup, metadata_of
 from mmpi_ns.phases import TRAINS, Schedule, make_schedule
 from mmpi_ns.placement.plan import ScenePlan
 from mmpi_ns.placement.rule import PlacementConfig, place

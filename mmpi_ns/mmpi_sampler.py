@@ -16,7 +16,8 @@ from torch import Tensor
 
 from mmpi_ns.compositing import BlendForm
 from mmpi_ns.geometry import PlaneHits, cube_hits, inverse_distance, plane_hits, sample_disparity
-from mmpi_ns.mmpi_field import LocalRays, MMPIField
+from mmpi_ns.mmpi_field import MMPIField
+from mmpi_ns.mmpi_samples import LocalRays
 from mmpi_ns.ops.merge import Merged, Survivors, keep_survivors, merge
 
 DIRECTION_AT_INFINITY = 1e-10

@@ -49,8 +49,21 @@ class Observations:
         right = _unit(right - right.dot(up) * up)
         return np.stack([right, -up, np.cross(right, -up)])
 
-    def local_points(self, axes: Array, origin: Array) -> Array:
-        return (self.points - origin) @ axes.T
+    def median_reprojection_error(self) -> float:
+        """Median distance between keypoints and their projected points, as a share of the image width.
+
+        Lens distortion is left out: this tells a model in another frame (errors of the image's size) from a good one.
+        """
+        poses = self.camera_to_worlds[self.seen_by]
+        offset = self.points[self.seen_point] - poses[:, :, 3]
+        local = np.einsum("qji,qj->qi", poses[:, :, :3], offset)
+        depth = -local[:, 2]
+        ahead = depth > 0
+        safe = np.where(ahead, depth, 1.0)
+        fx, fy, cx, cy = self.intrinsics[self.seen_by].T
+        x, y = fx * local[:, 0] / safe + cx, -fy * local[:, 1] / safe + cy
+        error = np.hypot(x - self.seen_at[:, 0], y - self.seen_at[:, 1]) / self.sizes[self.seen_by, 0]
+        return float(np.median(np.where(ahead, error, np.inf)))
 
 
 def frustum_points(observations: Observations, near: float, per_camera: int = 64) -> Array:
