@@ -35,6 +35,8 @@ def compare(field, origins, directions, form=None, heads_of=None, near=0.05, far
         assert valid.sum() == count and valid[:count].all()
         assert found.samples.metadata["heads"][i, :count, 0].tolist() == [s.head for s in wanted.samples]
         assert found.samples.metadata["planes"][i, :count, 0].tolist() == [s.plane for s in wanted.samples]
+        inverse_t = found.samples.metadata["inverse_t"][i, :count, 0].tolist()
+        assert inverse_t == pytest.approx([s.inverse_t for s in wanted.samples], rel=1e-4, abs=1e-6)
         assert np.abs(found.composite.weights[i, :count].numpy() - wanted.weights).max(initial=0) < error
         assert np.abs(found.rgb[i].numpy() - wanted.color).max() < error
         assert abs(found.composite.transmittance[i].item() - wanted.transmittance) < error
@@ -112,9 +114,9 @@ def test_dropping_samples_changes_a_ray_by_no_more_than_the_dropped_mass(thresho
     assert torch.allclose(missing, dropped[:, 0], atol=2e-5)
 
 
-def test_at_the_start_where_all_weights_are_equal_nothing_is_dropped():
+def test_with_a_fair_share_nothing_is_dropped_at_the_start_where_all_weights_are_equal():
     plan = ScenePlan((make_mpi(planes=64),), None, 0.05, 1.0)
-    found = render(MMPIField(plan).eval(), bundle([[0, 0, 0]], [[0, 0, 1]]), threshold=0.5)
+    found = render(MMPIField(plan).eval(), bundle([[0, 0, 0]], [[0, 0, 1]]), threshold=0.5, fair_share=0.1)
     assert found.samples.shape == (1, 64) and found.samples.metadata["valid"].all()
     assert torch.allclose(found.composite.weights, torch.tensor(1 / 64), rtol=0.01)
 

@@ -25,13 +25,13 @@ def datamanager(data: Path, test_mode="val", **settings):
 
 
 def plan_of(observations, num_mpis=2, with_cube=False, planes=12) -> ScenePlan:
-    """MPIs side by side behind the cameras of the tiny scene, which all see most of it."""
+    """MPIs side by side behind the cameras of the tiny scene, which all see most of it; no two planes coincide."""
     x, y, z = observations.mean_axes
     center, size = observations.centers.mean(0), np.ptp(observations.centers, axis=0).max()
     mpis = tuple(
         MPIPlan(
             f"mpi{k}",
-            tuple(float(v) for v in center + (0.5 * (k - (num_mpis - 1) / 2) * x - 0.3 * z) * size),
+            tuple(float(v) for v in center + (0.5 * (k - (num_mpis - 1) / 2) * x - (0.3 + 0.07 * k) * z) * size),
             tuple(tuple(float(v) for v in row) for row in (x, y, z)),
             float(size),
             (-1.0, 1.0, -0.8, 0.8),
@@ -65,8 +65,15 @@ def trainer_config(data: Path, plan: Path, output: Path, steps=24, **model):
     config.data = config.pipeline.datamanager.data = data
     config.pipeline.datamanager.train_num_rays_per_batch = 64
     config.pipeline.datamanager.keypoint_rays = 16
-    settings = {"plan_file": plan, "blend_share": 0.25, "finetune_share": 0.25, "growth_shares": (1 / 4, 1 / 2)}
-    settings |= {"hidden_width": 8, "feature_channels": 4}
+    settings = {
+        "plan_file": plan,
+        "training": "two-phase",
+        "rays_per_mpi": "split",
+        "blend_share": 0.25,
+        "finetune_share": 0.25,
+        "growth_shares": (1 / 4, 1 / 2),
+    }
+    settings |= {"hidden_width": 8, "feature_channels": 4, "cube_alpha": 0.03}
     for name, value in (settings | model).items():
         assert hasattr(config.pipeline.model, name), name
         setattr(config.pipeline.model, name, value)

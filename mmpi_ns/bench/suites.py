@@ -18,7 +18,7 @@ class Variant:
     name: str
     options: tuple[str, ...]
     method: str = "mmpi-small"
-    steps: int | None = 1000
+    steps: int | None = 750
     """Training steps; None for the method's own."""
     group: str = ""
     """Rows of one group share a table."""
