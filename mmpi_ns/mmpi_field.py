@@ -74,6 +74,8 @@ class MMPIField(Field):
         self.samples_per_voxel = samples_per_voxel
         self.cube_alpha = cube_alpha
         self.full_plan = self.plan = plan
+        self.learns_cover = True
+        """Whether training rays still mark the texels they train; off once blending has begun, so that P cannot jump."""
         self.grids: list[TexelGrid] = []
         self._packed: dict[Any, Any] = {}
         self.density = nn.Parameter(torch.empty(0, 1))
@@ -135,8 +137,9 @@ class MMPIField(Field):
                 return  # nerfstudio loads the pipeline's own, empty state in a second pass
             raise ValueError("The checkpoint holds no scene plan: it was not written by this method.")
         plan = ScenePlan.from_json(bytes(plan_bytes.cpu().numpy().tolist()).decode())
-        if plan.num_heads != self.full_plan.num_heads and self.networks.count > 1:
-            self.networks.resize(plan.num_heads)
+        stored = state_dict.get(prefix + "networks.weights")
+        if stored is not None and stored.shape[0] != self.networks.count:
+            self.networks.resize(stored.shape[0])
         self.build(plan, float(state_dict[prefix + "texel_factor"]))
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
@@ -257,7 +260,7 @@ class MMPIField(Field):
         lookup = self._lookup(ray_samples)
         tau = lookup.ndc.new_zeros(lookup.index.shape[0])
         for rows, weights, members in lookup.groups:
-            if self.training and self.density.requires_grad:
+            if self.training and self.learns_cover:
                 self.touched.index_fill_(0, rows.reshape(-1), 1)
             raw = interpolate(self.density, rows, weights)[:, 0]
             pieces = [self._head_tau(k, raw[sel], lookup.planes[members[sel]]) for k, sel in lookup.split(members)]

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float
 from nerfstudio.cameras.rays import RayBundle, RaySamples
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.field_components.field_heads import FieldHeadNames
+from nerfstudio.model_components import renderers
 from nerfstudio.models.base_model import Model, ModelConfig
 from nerfstudio.viewer.viewer_elements import ViewerDropdown
 from torch import Tensor
@@ -184,6 +185,7 @@ class MMPIModel(Model):
                     optimizers[kind].reset_moments(self.get_param_groups()[kind][0])
         if phase.name == "blend" and step == phase.start:
             self.field.release_untouched()
+        self.field.learns_cover = phase.name in ("individual", "joint")
         for kind, params in self.get_param_groups().items():
             for p in params:
                 p.requires_grad_(kind in TRAINS[phase.name])
@@ -208,8 +210,8 @@ class MMPIModel(Model):
         samples, report = self.sampler(
             bundle,
             field=self.field,
-            threshold=self.config.train_threshold if self.training else self.config.render_threshold,
-            fair_share=FAIR_SHARE if self.training and not self.schedule.sharpened(self.step) else float("inf"),
+            threshold=self._threshold(),
+            fair_share=FAIR_SHARE if self._sharpening else float("inf"),
             head_mask=head_mask,
             choose=choose,
             blend_form=blend_form,
@@ -227,6 +229,18 @@ class MMPIModel(Model):
         if self.training:
             outputs["training"] = TrainingRays(bundle, samples, composite, colors, report, lookup)  # type: ignore
         return outputs
+
+    @property
+    def _sharpening(self) -> bool:
+        """Whether surfaces are still forming, so that samples of little weight must learn too."""
+        return self.training and not self.schedule.sharpened(self.step)
+
+    def _threshold(self) -> float:
+        """Weight below which samples are dropped; at first low enough for the cube, which starts nearly empty."""
+        if not self.training:
+            return self.config.render_threshold
+        low = 0.1 * self.config.cube_alpha if self._sharpening and self.field.cube is not None else float("inf")
+        return min(self.config.train_threshold, low)
 
     def _bounded(self, bundle: RayBundle) -> RayBundle:
         """Nears and fars: the plan's start of rays, and no end, unless a crop set tighter ones."""
@@ -266,9 +280,8 @@ class MMPIModel(Model):
         self, composite: Composite, colors: Tensor, samples: RaySamples, report: MergeReport
     ) -> dict[str, Tensor]:
         rgb = render_colors(composite, colors)
-        background = BACKGROUNDS[self.config.background]
         outputs = {
-            "rgb": rgb + composite.transmittance * background if not self.training else rgb,
+            "rgb": rgb + composite.transmittance * self._background(rgb) if not self.training else rgb,
             "accumulation": composite.accumulation,
             "depth": self._depth(composite, samples),
         }
@@ -279,6 +292,17 @@ class MMPIModel(Model):
             outputs["winning_mpi"] = mass.argmax(-1, keepdim=True).to(rgb.dtype)
             outputs["dropped_mass"] = report.dropped_mass
         return outputs
+
+    def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
+        """Colours without their background, and how opaque each pixel is (ns-render's output "rgba")."""
+        accumulation = outputs["accumulation"]
+        colors = outputs[output_name] - (1 - accumulation) * self._background(accumulation)
+        return torch.cat([(colors / accumulation.clamp(min=1e-6)).clamp(0, 1), accumulation], -1)
+
+    def _background(self, like: Tensor) -> Tensor:
+        """Colour behind everything: what the viewer or a crop asks for, else the config's."""
+        asked = renderers.BACKGROUND_COLOR_OVERRIDE
+        return like.new_full((3,), BACKGROUNDS[self.config.background]) if asked is None else asked.to(like)
 
     @torch.no_grad()
     def _depth(self, composite: Composite, samples: RaySamples) -> Float[Tensor, "R 1"]:

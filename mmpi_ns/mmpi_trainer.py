@@ -39,8 +39,8 @@ class PhaseScheduler(Scheduler):
     schedule: Schedule | None = None
 
     def get_scheduler(self, optimizer: Optimizer, lr_init: float) -> LambdaLR:
-        kind, schedule = self.config.kind, self.schedule
-        return LambdaLR(optimizer, lambda step: schedule.rate_factor(kind, step) if schedule else 1.0)
+        kind = self.config.kind
+        return LambdaLR(optimizer, lambda step: self.schedule.rate_factor(kind, step) if self.schedule else 1.0)
 
 
 @dataclass
@@ -72,12 +72,13 @@ class MMPITrainer(Trainer):
 
     def setup_optimizers(self) -> Optimizers:
         """nerfstudio's optimisers, with schedulers that know the phases."""
-        schedule = self._model.schedule
+        model = self._model
 
         class Bound(PhaseScheduler):
-            pass
+            @property
+            def schedule(self) -> Schedule:  # type: ignore[override]
+                return model.schedule  # a checkpoint that is loaded later brings its own
 
-        Bound.schedule = schedule
         config: dict[str, Any] = {}
         for name, entry in self.config.optimizers.items():
             scheduler = entry["scheduler"]
@@ -88,6 +89,7 @@ class MMPITrainer(Trainer):
 
     def train(self) -> None:
         """Runs up to max-num-iterations in all; 1.1.5 would run as many again after a resume."""
+        self._last_step = self._start_step - 1
         self.config.max_num_iterations = max(0, self._total_steps - self._start_step)
         if self.config.max_num_iterations == 0:
             CONSOLE.print(
@@ -107,7 +109,7 @@ class MMPITrainer(Trainer):
 
     def _after_train(self) -> None:
         """Saves the last step that ran; 1.1.5 would save the next one's number when training is stopped."""
-        self.step = getattr(self, "_last_step", self.step)
+        self.step = self._last_step
         super()._after_train()
 
     @check_main_thread
@@ -116,6 +118,8 @@ class MMPITrainer(Trainer):
 
         Names inside the folder are parsed as steps by nerfstudio, so the unfinished file must not lie there.
         """
+        if step < 0:
+            return  # stopped before the first step: there is nothing to save
         self.checkpoint_dir.mkdir(parents=True, exist_ok=True)
         path = self.checkpoint_dir / f"step-{step:09d}.ckpt"
         state = {
@@ -143,14 +147,19 @@ class MMPITrainer(Trainer):
         super()._load_checkpoint()
 
     def _checkpoint_path(self) -> Path | None:
-        if self.config.load_checkpoint is not None:
-            return self.config.load_checkpoint
+        path = self.config.load_checkpoint
+        if path is not None:
+            if not path.is_file():
+                raise ValueError(f"There is no checkpoint at {path}: check --load-checkpoint.")
+            return path
         if self.config.load_dir is None:
             return None
         steps = [int(p.stem.split("-")[1]) for p in self.config.load_dir.glob("step-*.ckpt")]
         if not steps:
             raise ValueError(f"There is no checkpoint in {self.config.load_dir}: give the nerfstudio_models folder.")
         step = self.config.load_step if self.config.load_step is not None else max(steps)
+        if step not in steps:
+            raise ValueError(f"There is no step {step} in {self.config.load_dir}: it holds {sorted(steps)}.")
         return self.config.load_dir / f"step-{step:09d}.ckpt"
 
     def _check_same_plan(self, pipeline_state: dict[str, Any], path: Path) -> None:
