@@ -75,7 +75,7 @@ class MMPIField(Field):
         self.cube_alpha = cube_alpha
         self.full_plan = self.plan = plan
         self.learns_cover = True
-        """Whether training rays still mark the texels they train; off once blending has begun, so that P cannot jump."""
+        """Whether training rays mark the texels they train; off once blending has begun, so that P cannot jump."""
         self.grids: list[TexelGrid] = []
         self._packed: dict[Any, Any] = {}
         self.density = nn.Parameter(torch.empty(0, 1))
