@@ -61,7 +61,7 @@ mmpi_small = _method(
     "MMPI in a size that a two-core CPU trains in minutes.",
     steps=4000,
     rays=1024,
-    model=MMPIModelConfig(hidden_width=32),
+    model=MMPIModelConfig(placement=PlacementConfig(texel_pixels=1.2), hidden_width=32),
 )
 mmpi_kitti = _method(
     "mmpi-kitti",

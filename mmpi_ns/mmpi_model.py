@@ -89,7 +89,7 @@ class MMPIModelConfig(ModelConfig):
     """Initial alpha of a cube sample: 1e-2 for a small room to 1e-4."""
     train_threshold: float = 3e-3
     """Samples of less weight get no gradient (while resolution grows: nor more than a tenth of an equal share)."""
-    render_threshold: float = 1e-3
+    render_threshold: float = 3e-3
     """Samples of less weight are not coloured when rendering; the dropped mass is reported."""
     background: Literal["black", "gray", "white"] = "gray"
     """Behind everything, when rendering. Training uses random colours where the MPIs explain the whole ray."""

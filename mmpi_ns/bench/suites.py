@@ -8,6 +8,7 @@ P = "--pipeline.model.placement."
 JOINT = ("--pipeline.model.training", "joint")
 TWO_PHASE = ("--pipeline.model.training", "two-phase")
 DRIVE = (P + "arrangement", "drive")
+PLACED = (*JOINT, P + "texel-pixels", "1.5")
 NO_DEPTH = ("--pipeline.datamanager.keypoint-rays", "0")
 
 
@@ -34,7 +35,7 @@ def _paper_ladder(depth: bool) -> list[Variant]:
         ("four MPIs, joint, no reliability", (*DRIVE, *JOINT)),
         ("four MPIs, individual, then reliability only", (*DRIVE, *TWO_PHASE, *_shares(0.25, 0.0))),
         ("... then a joint fine-tune", (*DRIVE, *TWO_PHASE, *_shares(0.1, 0.4))),
-        ("placed among the cameras, joint", JOINT),
+        ("placed among the cameras, joint", PLACED),
     ]
     return [Variant(name, (*options, *extra), group=group) for name, options in rows]
 
@@ -49,13 +50,22 @@ SUITES: dict[str, list[Variant]] = {
     "kitti-street": [
         *_paper_ladder(depth=True),
         *_paper_ladder(depth=False),
+        Variant(
+            "four MPIs, joint, no reliability", (*DRIVE, *JOINT), steps=1500, group="twice the rays, with SfM depth"
+        ),
+        Variant(
+            "four MPIs, two phases, then a joint fine-tune",
+            (*DRIVE, *TWO_PHASE, *_shares(0.1, 0.4)),
+            steps=1500,
+            group="twice the rays, with SfM depth",
+        ),
         Variant("mmpi-small, its defaults", (), steps=None, group="defaults"),
     ],
     "room-walk": [
         Variant("five MPIs and cube, joint", (*ROOM, P + "cube-voxels", "96")),
         Variant("five MPIs, joint", ROOM),
-        Variant("placed among the cameras, joint", JOINT),
+        Variant("placed among the cameras, joint", PLACED),
     ],
-    "fern": [Variant("one MPI", (P + "max-mpis", "1", P + "planes", "96"))],
-    "fox": [Variant("placed among the cameras, joint", JOINT)],
+    "fern": [Variant("one MPI", (P + "max-mpis", "1", P + "planes", "96"), steps=1500)],
+    "fox": [Variant("placed among the cameras, joint", PLACED)],
 }
