@@ -32,7 +32,7 @@ from mmpi_ns.mmpi_field import MMPIField
 from mmpi_ns.mmpi_losses import LossWeights, TrainingRays, is_pixel_ray, over_background
 from mmpi_ns.mmpi_sampler import MergeReport, MMPISampler
 from mmpi_ns.mmpi_samples import Lookup, metadata_of
-from mmpi_ns.phases import TRAINS, Schedule, make_schedule
+from mmpi_ns.phases import TRAINS, Schedule, Training, make_schedule
 from mmpi_ns.placement.plan import ScenePlan
 from mmpi_ns.placement.rule import PlacementConfig, place
 from mmpi_ns.random_draws import generator
@@ -55,7 +55,7 @@ class MMPIModelConfig(ModelConfig):
     """Where the MPIs stand and how fine they are."""
     plan_file: Path | None = None
     """A scene plan (JSON) to use instead of the placement rule."""
-    training: Literal["two-phase", "joint"] = "joint"
+    training: Training = "joint"
     """Each MPI alone, then reliability (two-phase), or all together without reliability (joint)."""
     total_steps: int = 1
     """Set by the trainer from --max-num-iterations; the phases are shares of it."""
@@ -109,8 +109,9 @@ class MMPIModel(Model):
     def populate_modules(self) -> None:
         super().populate_modules()
         plan = self._initial_plan()
-        self.schedule = self._make_schedule()
-        joint = self.config.training == "joint"
+        # One head has nothing to blend with, so it trains in one go.
+        joint = self.config.training == "joint" or plan.num_heads == 1
+        self.schedule = self._make_schedule("joint" if joint else "two-phase")
         self.field = MMPIField(
             plan,
             feature_channels=self.config.feature_channels,
@@ -137,10 +138,10 @@ class MMPIModel(Model):
             raise ValueError("The data manager gave no observations: use MMPIDataManager, or name a plan file.")
         return place(observations, self.config.placement)
 
-    def _make_schedule(self) -> Schedule:
+    def _make_schedule(self, training: Training) -> Schedule:
         c = self.config
         return make_schedule(
-            c.training,
+            training,
             max(1, c.total_steps),
             blend_share=c.blend_share,
             finetune_share=c.finetune_share,
@@ -322,7 +323,10 @@ class MMPIModel(Model):
             return {"rgb_loss": losses.photometric(outputs["rgb"], observed)}
         rays: TrainingRays = outputs["training"]
         g = generator(self.config.seed, self.step, "background", self.device)
-        return rays.losses(self.field, image, self.config.loss, g, self.step)
+        total = rays.losses(self.field, image, self.config.loss, g, self.step)
+        # A batch that meets nothing that trains would have no gradient at all; this adds 0 with one.
+        total["rgb_loss"] = total["rgb_loss"] + self.device_indicator_param.sum()
+        return total
 
     def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Tensor]) -> dict[str, Any]:
         if "training" in outputs:

@@ -125,6 +125,17 @@ def test_three_equal_mpis_that_render_all_rays_have_the_losses_of_one(scene, tmp
         assert losses[1][name].item() == pytest.approx(losses[0][name].item(), rel=1e-2), name
 
 
+def test_one_mpi_has_nothing_to_blend_with_and_trains_in_one_go(scene, tmp_path):
+    plan = write_plan(scene, tmp_path / "plan.json", num_mpis=1)
+    trainer = trainer_of(scene, plan, tmp_path, training="two-phase")
+    model = trainer.pipeline.model
+    assert [p.name for p in model.schedule.phases] == ["joint"]
+    assert model.field.depth_scale == 1
+    for step in (0, 12, 23):
+        _, losses, _ = run_step(trainer, step)
+        assert all(torch.isfinite(v) for v in losses.values())
+
+
 @pytest.mark.parametrize("training", ["two-phase", "joint"])
 def test_the_cube_learns_from_the_first_step_at_the_default_settings(scene, plan_file, tmp_path, training):
     config = mmpi_small.config.pipeline.model
