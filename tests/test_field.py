@@ -188,10 +188,10 @@ def test_gradients_are_sparse_and_only_in_the_rows_of_the_batch(plan):
     assert field.reliability.grad is None and field.networks.weights.grad is not None
 
 
-@pytest.mark.parametrize("case", ["frozen", "evaluating"])
-def test_texels_count_as_trained_only_when_they_can_learn(plan, case):
+@pytest.mark.parametrize("case", ["blending", "evaluating"])
+def test_texels_count_as_trained_only_before_blending_and_in_training(plan, case):
     field = fill(MMPIField(plan), seed=5).train(case != "evaluating")
-    field.density.requires_grad_(case != "frozen")
+    field.learns_cover = case != "blending"
     field.touched.fill_(0)
     field.get_density(sampled(field, bundle(*random_rays(plan, 3, seed=2))))
     assert field.touched.sum() == 0
