@@ -50,15 +50,6 @@ SUITES: dict[str, list[Variant]] = {
     "kitti-street": [
         *_paper_ladder(depth=True),
         *_paper_ladder(depth=False),
-        Variant(
-            "four MPIs, joint, no reliability", (*DRIVE, *JOINT), steps=1500, group="twice the rays, with SfM depth"
-        ),
-        Variant(
-            "four MPIs, two phases, then a joint fine-tune",
-            (*DRIVE, *TWO_PHASE, *_shares(0.1, 0.4)),
-            steps=1500,
-            group="twice the rays, with SfM depth",
-        ),
         Variant("mmpi-small, its defaults", (), steps=None, group="defaults"),
     ],
     "room-walk": [
@@ -66,6 +57,6 @@ SUITES: dict[str, list[Variant]] = {
         Variant("five MPIs, joint", ROOM),
         Variant("placed among the cameras, joint", PLACED),
     ],
-    "fern": [Variant("one MPI", (P + "max-mpis", "1", P + "planes", "96"), steps=1500)],
-    "fox": [Variant("placed among the cameras, joint", PLACED)],
+    "fern": [Variant("one MPI", (P + "max-mpis", "1", P + "planes", "96"), steps=500)],
+    "fox": [Variant("placed among the cameras, joint", PLACED, steps=500)],
 }
