@@ -94,7 +94,9 @@ def _sweep(reference: _View, neighbours: list[_View]) -> Array:
     fx, fy, cx, cy = reference.intrinsics
     ys, xs = np.mgrid[0:height, 0:width] + 0.5
     rays = np.stack([(xs - cx) / fx, -(ys - cy) / fy, -np.ones_like(xs)], -1)
-    baseline = max(np.linalg.norm(n.pose[:, 3] - reference.pose[:, 3]) for n in neighbours)
+    distances = [float(np.linalg.norm(n.pose[:, 3] - reference.pose[:, 3])) for n in neighbours]
+    # The nearest neighbour sets how near content may be: on a walk the others have long turned away from it.
+    baseline = max(min(distances), 0.1 * max(distances))
     disparities = np.linspace(0, 0.35 * width / (fx * baseline), HYPOTHESES)
     scores = np.stack([_score(reference, neighbours, rays, w) for w in disparities])
     best = scores.argmax(0)
