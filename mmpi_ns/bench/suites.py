@@ -56,6 +56,6 @@ SUITES: dict[str, list[Variant]] = {
         Variant("five MPIs and cube, joint", (*ROOM, P + "cube-voxels", "96"), steps=500),
         Variant("five MPIs, joint", ROOM, steps=500),
     ],
-    "fern": [Variant("one MPI", (P + "max-mpis", "1", P + "planes", "96"), steps=500)],
+    "fern": [Variant("one MPI", (P + "max-mpis", "1", P + "planes", "96", P + "texel-pixels", "3"), steps=500)],
     "fox": [Variant("placed among the cameras, joint", (*JOINT, P + "texel-pixels", "3"), steps=400)],
 }
