@@ -27,6 +27,8 @@ from mmpi_ns.sfm import SfmModel, find_sfm_model
 
 OBSERVATIONS = "mmpi_observations"
 """Key under which the model finds the scene's Observations in the data set's metadata."""
+RAYS_PER_STEP = "mmpi_rays_per_step"
+"""Key under which it finds the pixel rays of a training step."""
 MAX_REPROJECTION = 0.02
 """Median reprojection error, as a share of the image width, beyond which a COLMAP model is in another frame."""
 KEYPOINT_DEPTH = "keypoint_inverse_distance"
@@ -117,6 +119,7 @@ class MMPIDataManager(VanillaDataManager[InputDataset]):
             CONSOLE.print("No SfM tracks: a quick plane sweep finds out where the content lies.")
             observations = add_swept_points(observations, [_thumbnail(dataset, i) for i in range(len(dataset))])
         self.observations = observations
+        dataset.metadata[RAYS_PER_STEP] = self.config.train_num_rays_per_batch
         dataset.metadata[OBSERVATIONS] = self.observations
         return dataset
 

@@ -27,7 +27,7 @@ from mmpi_ns.compositing import (
     render_colors,
 )
 from mmpi_ns.metrics import ImageMetrics, head_palette
-from mmpi_ns.mmpi_datamanager import OBSERVATIONS
+from mmpi_ns.mmpi_datamanager import OBSERVATIONS, RAYS_PER_STEP
 from mmpi_ns.mmpi_field import MMPIField
 from mmpi_ns.mmpi_losses import LossWeights, TrainingRays, is_pixel_ray, over_background
 from mmpi_ns.mmpi_sampler import MergeReport, MMPISampler
@@ -133,10 +133,13 @@ class MMPIModel(Model):
     def _initial_plan(self) -> ScenePlan:
         if self.config.plan_file is not None:
             return ScenePlan.load(self.config.plan_file)
-        observations = self.kwargs.get("metadata", {}).get(OBSERVATIONS)
+        metadata = self.kwargs.get("metadata", {})
+        observations = metadata.get(OBSERVATIONS)
         if observations is None:
             raise ValueError("The data manager gave no observations: use MMPIDataManager, or name a plan file.")
-        return place(observations, self.config.placement)
+        steps = self.config.total_steps  # 1 unless a trainer has set it: then the plan comes from a checkpoint
+        rays = steps * metadata[RAYS_PER_STEP] if steps > 1 and RAYS_PER_STEP in metadata else None
+        return place(observations, self.config.placement, rays)
 
     def _make_schedule(self, training: Training) -> Schedule:
         c = self.config

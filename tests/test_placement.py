@@ -120,6 +120,15 @@ def test_still_cameras_side_by_side_get_one_mpi():
     assert len(place(observed(grid, points), PlacementConfig()).mpis) == 1
 
 
+def test_texels_are_no_finer_than_the_rays_of_a_run_can_train():
+    observations = street()
+    pixels = int(observations.sizes.prod(-1).sum())
+    fine, enough, short = (place(observations, PlacementConfig(), rays) for rays in (None, 10 * pixels, pixels // 10))
+    assert [m.width for m in enough.mpis] == [m.width for m in fine.mpis]
+    tangents = short.mpis[0].extent[1] - short.mpis[0].extent[0]
+    assert tangents * FOCAL / (short.mpis[0].width - 1) == pytest.approx(5.0, rel=0.02)  # (2.5 / 0.1) ** 0.5 pixels
+
+
 def test_every_chosen_mpi_lowers_the_expected_error():
     observations = street()
     plan = place(observations, PlacementConfig())

@@ -40,6 +40,8 @@ class PlacementConfig:
     """Planes of every MPI."""
     texel_pixels: float = 1.5
     """Image pixels that a texel spans, seen from where the MPI stands (cameras)."""
+    rays_per_texel: float = 2.5
+    """Training rays that a texel's footprint should get: a short run on large images gets larger texels (cameras)."""
     height: int = 96
     """Texel rows of every MPI (drive, room)."""
     width: int = 256
@@ -74,8 +76,13 @@ class Content:
     """The same over all cameras."""
 
 
-def place(observations: Observations, config: PlacementConfig) -> ScenePlan:
+def place(observations: Observations, config: PlacementConfig, training_rays: int | None = None) -> ScenePlan:
     """The scene plan for some training cameras and points.
+
+    Args:
+        observations: training cameras and what they saw.
+        config: the rule's settings.
+        training_rays: pixel rays of the whole training, where known: texels are no finer than those can train.
 
     Raises:
         ValueError: the cameras leave nothing to place, e.g. all observations are behind their cameras.
@@ -89,6 +96,10 @@ def place(observations: Observations, config: PlacementConfig) -> ScenePlan:
         half_size = float(np.abs(observations.centers - observations.centers.mean(0)).max()) + content.near
         near = max(0.5 * content.near, 1e-6)
         return room_plan(observations, config.planes, config.width, config.cube_voxels, near, half_size)
+    if training_rays is not None:
+        rays_per_pixel = training_rays / float(observations.sizes.prod(-1).sum())
+        coarsest = (config.rays_per_texel / rays_per_pixel) ** 0.5
+        config = replace(config, texel_pixels=max(config.texel_pixels, coarsest))
     chosen = _choose(_candidates(observations, content, config), observations, content, config)
     mpis = tuple(_named(m, i) for i, m in enumerate(chosen))
     return ScenePlan(mpis, None, 0.2 * content.near, content.near, "camera placement")

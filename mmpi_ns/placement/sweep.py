@@ -104,12 +104,21 @@ def _sweep(reference: _View, neighbours: list[_View]) -> Array:
     level = np.arange(HYPOTHESES)[:, None, None]
     second = np.where(np.abs(level - best) > 3, scores, -1).max(0)
     good = (top > MIN_SCORE) & (top - second > MIN_MARGIN) & (best > 0)
-    inverse_depth = np.where(good, disparities[best], 1.0)
+    inverse_depth = np.where(good, (best + _peak_offset(scores, best)) * disparities[1], 1.0)
     world = (rays / inverse_depth[..., None]) @ reference.pose[:, :3].T + reference.pose[:, 3]
     rows, columns = np.nonzero(good)
     keep = slice(None, None, max(1, len(rows) // 400))
     rows, columns = rows[keep], columns[keep]
     return world[rows, columns]
+
+
+def _peak_offset(scores: Array, best: NDArray[np.int64]) -> Array:
+    """Where between the hypotheses the peak lies: vertex of the parabola through the best and its neighbours."""
+    inner = np.clip(best, 1, HYPOTHESES - 2)[None]
+    below, top, above = (np.take_along_axis(scores, inner + d, 0)[0] for d in (-1, 0, 1))
+    bend = below - 2 * top + above
+    offset = 0.5 * (below - above) / np.where(bend < -1e-9, bend, -1.0)
+    return np.where((bend < -1e-9) & (inner[0] == best), np.clip(offset, -0.5, 0.5), 0.0)
 
 
 def _score(reference: _View, neighbours: list[_View], rays: Array, disparity: float) -> Array:
