@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager, VanillaDataManagerConfig
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
@@ -24,6 +24,7 @@ from mmpi_ns.placement.observations import Observations
 from mmpi_ns.placement.sweep import add_swept_points
 from mmpi_ns.random_draws import generator
 from mmpi_ns.sfm import SfmModel, find_sfm_model
+from mmpi_ns.triangulation import PosedImages, triangulate
 
 OBSERVATIONS = "mmpi_observations"
 """Key under which the model finds the scene's Observations in the data set's metadata."""
@@ -31,6 +32,8 @@ RAYS_PER_STEP = "mmpi_rays_per_step"
 """Key under which it finds the pixel rays of a training step."""
 MAX_REPROJECTION = 0.02
 """Median reprojection error, as a share of the image width, beyond which a COLMAP model is in another frame."""
+ENOUGH_KEYPOINTS = 20
+"""Keypoints an image, on average, that need no plane sweep beside them."""
 KEYPOINT_DEPTH = "keypoint_inverse_distance"
 """Ray-bundle metadata: inverse distance of the SfM point on a keypoint ray, 0 on ordinary rays."""
 
@@ -48,6 +51,8 @@ class MMPIDataManagerConfig(VanillaDataManagerConfig):
     """Extra rays a step through SfM keypoints of training images, for depth supervision (scenes with tracks only)."""
     sfm_path: Path = Path("colmap/sparse/0")
     """COLMAP model with the tracks, relative to the data; in the frame of transforms.json."""
+    triangulate: bool = True
+    """Scenes without tracks: match and triangulate the training images' features at the start (a second or so each)."""
     seed: int = 0
     """Batches depend on this seed and the step alone, so a resumed run draws what an uninterrupted one would."""
 
@@ -115,13 +120,23 @@ class MMPIDataManager(VanillaDataManager[InputDataset]):
     def create_train_dataset(self) -> InputDataset:
         dataset = super().create_train_dataset()
         observations = read_observations(self.train_dataparser_outputs, dataset.cameras, self._sfm())
-        if not len(observations.seen_by) and self.test_mode != "inference":
-            CONSOLE.print("No SfM tracks: a quick plane sweep finds out where the content lies.")
-            observations = add_swept_points(observations, [_thumbnail(dataset, i) for i in range(len(dataset))])
-        self.observations = observations
+        if not len(observations.seen_by) and self.test_mode == "val":  # else the plan comes from a checkpoint
+            observations = self._find_points(observations, dataset)
+        self.observations = drop_masked(observations, dataset)
         dataset.metadata[RAYS_PER_STEP] = self.config.train_num_rays_per_batch
         dataset.metadata[OBSERVATIONS] = self.observations
         return dataset
+
+    def _find_points(self, observations: Observations, dataset: InputDataset) -> Observations:
+        """Points for a scene without tracks: triangulated, and swept where triangulation finds too few."""
+        if self.config.triangulate and (images := posed_images(observations, dataset)) is not None:
+            CONSOLE.print(f"No SfM tracks: matching the features of {len(dataset)} training images.")
+            observations = with_tracks(observations, triangulate(images))
+            CONSOLE.print(f"Triangulated {len(observations.points)} points seen {len(observations.seen_by)} times.")
+        if len(observations.seen_by) < ENOUGH_KEYPOINTS * len(dataset):
+            CONSOLE.print("Few or no tracks: a quick plane sweep finds out where the content lies.")
+            observations = add_swept_points(observations, [_thumbnail(dataset, i) for i in range(len(dataset))])
+        return observations
 
     def _sfm(self) -> SfmModel | None:
         data = self.dataparser.config.data
@@ -182,13 +197,14 @@ def _keypoint_targets(observations: Observations, device: str | torch.device) ->
 
     The ray goes to the point itself, a fraction of a pixel from the keypoint: no lens model enters.
     """
-    if not len(observations.seen_at):
+    tracked = len(observations.seen_at)  # points of a plane sweep come after these: too rough to supervise depth
+    if not tracked:
         return None
-    origins = observations.centers[observations.seen_by]
-    offsets = observations.points[observations.seen_point] - origins
+    origins = observations.centers[observations.seen_by[:tracked]]
+    offsets = observations.points[observations.seen_point[:tracked]] - origins
     distance = np.maximum(np.linalg.norm(offsets, axis=-1, keepdims=True), 1e-12)
     parts = (origins, offsets / distance, 1 / distance[:, 0])
-    cameras = torch.from_numpy(observations.seen_by).to(device)
+    cameras = torch.from_numpy(observations.seen_by[:tracked]).to(device)
     return cameras, *(torch.from_numpy(x).float().to(device) for x in parts)
 
 
@@ -225,3 +241,53 @@ def read_observations(outputs: DataparserOutputs, cameras: Cameras, sfm: SfmMode
         )
         return replace(observations, points=np.zeros((0, 3)), seen_by=empty, seen_point=empty, seen_at=np.zeros((0, 2)))
     return observations
+
+
+def posed_images(observations: Observations, dataset: InputDataset) -> PosedImages | None:
+    """The training images with their cameras and lenses; None where a camera is neither perspective nor fisheye."""
+    cameras = dataset.cameras
+    types = set(cameras.camera_type.reshape(-1).tolist())
+    if types not in ({CameraType.PERSPECTIVE.value}, {CameraType.FISHEYE.value}):
+        return None
+    fisheye = types == {CameraType.FISHEYE.value}
+    lens = cameras.distortion_params  # k1, k2, k3, k4, p1, p2
+    lens = torch.zeros(len(dataset), 6) if lens is None else lens.reshape(len(dataset), 6).cpu()
+    used = [0, 1, 2, 3] if fisheye else [0, 1, 4, 5]
+    return PosedImages(
+        files=tuple(Path(name) for name in dataset.image_filenames),
+        camera_to_worlds=observations.camera_to_worlds,
+        intrinsics=observations.intrinsics,
+        sizes=observations.sizes,
+        distortion=lens[:, used].double().numpy(),
+        fisheye=fisheye,
+    )
+
+
+def with_tracks(observations: Observations, model: SfmModel) -> Observations:
+    """The observations with the points of a model whose image names are the places of the training images."""
+    seen_by, seen_point, relative = model.keypoints_of([str(i) for i in range(len(observations.centers))])
+    return replace(
+        observations,
+        points=model.points,
+        seen_by=seen_by,
+        seen_point=seen_point,
+        seen_at=relative * observations.sizes[seen_by],
+    )
+
+
+def drop_masked(observations: Observations, dataset: InputDataset) -> Observations:
+    """Leaves out keypoints on masked pixels: what moves there has no depth to learn from."""
+    if not len(observations.seen_at) or dataset._dataparser_outputs.mask_filenames is None:
+        return observations
+    keep = np.ones(len(observations.seen_by), dtype=bool)
+    for i in range(len(dataset)):
+        mask = _read(dataset, i, dataset.image_filenames[i])["mask"][..., 0].numpy().astype(bool)
+        own = np.nonzero(observations.seen_by[: len(observations.seen_at)] == i)[0]
+        x, y = observations.seen_at[own].astype(int).T
+        keep[own] = mask[y.clip(0, mask.shape[0] - 1), x.clip(0, mask.shape[1] - 1)]
+    return replace(
+        observations,
+        seen_by=observations.seen_by[keep],
+        seen_point=observations.seen_point[keep],
+        seen_at=observations.seen_at[keep[: len(observations.seen_at)]],
+    )

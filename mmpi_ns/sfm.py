@@ -5,9 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    import pycolmap
 
 MIN_TRACK = 3
 """Points seen by fewer images are too uncertain to supervise depth."""
@@ -52,11 +56,17 @@ def find_sfm_model(path: Path) -> SfmModel | None:
         model = pycolmap.Reconstruction(str(path))
     except (ValueError, RuntimeError, OSError) as error:
         raise ValueError(f"The COLMAP model in {path} cannot be read ({error}): repair or remove it.") from error
-    good = [i for i, p in model.points3D.items() if p.track.length() >= MIN_TRACK and p.error <= MAX_ERROR_PX]
+    return read_reconstruction(model)
+
+
+def read_reconstruction(model: pycolmap.Reconstruction) -> SfmModel:
+    """The well observed points of a reconstruction and their keypoints."""
+    # In the order of the ids: that of the model itself may differ from one reading to the next.
+    good = [i for i, p in sorted(model.points3D.items()) if p.track.length() >= MIN_TRACK and p.error <= MAX_ERROR_PX]
     row = {point: n for n, point in enumerate(good)}
     points = np.array([model.points3D[i].xyz for i in good], dtype=np.float64).reshape(-1, 3)
     names, keypoints = [], []
-    for image in model.images.values():
+    for _, image in sorted(model.images.items()):
         camera = model.cameras[image.camera_id]
         seen = [(row[p.point3D_id], *p.xy) for p in image.points2D if p.has_point3D() and p.point3D_id in row]
         table = np.array(seen, dtype=np.float64).reshape(-1, 3)

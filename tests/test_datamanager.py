@@ -150,3 +150,13 @@ def test_a_hand_written_plan_covers_the_wall(manager):
     for mpi in plan.mpis:
         local = (wall_in_scene_units(manager) - mpi.origin) @ np.array(mpi.axes).T
         assert (local[:, 2] > mpi.near).all() and (np.abs(local[:, 0] / local[:, 2]) < 1).mean() > 0.9
+
+
+def test_keypoints_on_masked_pixels_are_left_out(tmp_path, manager):
+    masked = datamanager(write_scene(tmp_path, masks=True)).observations
+    open_ = manager.observations
+    assert (open_.seen_at[:, 0] >= WIDTH / 2).any()
+    wanted = open_.seen_at[:, 0] < WIDTH / 2
+    assert np.array_equal(masked.seen_at, open_.seen_at[wanted])
+    assert np.array_equal(masked.seen_by, open_.seen_by[wanted])
+    assert np.array_equal(masked.seen_point, open_.seen_point[wanted])

@@ -27,7 +27,7 @@ class Observations:
     seen_point: NDArray[np.int64]
     """[Q] point of each keypoint."""
     seen_at: Array
-    """[Q, 2] pixel (x, y) of each SfM keypoint; empty where the points come from a plane sweep."""
+    """[S, 2] pixel (x, y) of the first S <= Q keypoints, those of SfM; the others come from a plane sweep."""
 
     @property
     def centers(self) -> Array:
@@ -54,15 +54,16 @@ class Observations:
 
         Lens distortion is left out: this tells a model in another frame (errors of the image's size) from a good one.
         """
-        poses = self.camera_to_worlds[self.seen_by]
-        offset = self.points[self.seen_point] - poses[:, :, 3]
+        seen_by, seen_point = self.seen_by[: len(self.seen_at)], self.seen_point[: len(self.seen_at)]
+        poses = self.camera_to_worlds[seen_by]
+        offset = self.points[seen_point] - poses[:, :, 3]
         local = np.einsum("qji,qj->qi", poses[:, :, :3], offset)
         depth = -local[:, 2]
         ahead = depth > 0
         safe = np.where(ahead, depth, 1.0)
-        fx, fy, cx, cy = self.intrinsics[self.seen_by].T
+        fx, fy, cx, cy = self.intrinsics[seen_by].T
         x, y = fx * local[:, 0] / safe + cx, -fy * local[:, 1] / safe + cy
-        error = np.hypot(x - self.seen_at[:, 0], y - self.seen_at[:, 1]) / self.sizes[self.seen_by, 0]
+        error = np.hypot(x - self.seen_at[:, 0], y - self.seen_at[:, 1]) / self.sizes[seen_by, 0]
         return float(np.median(np.where(ahead, error, np.inf)))
 
 

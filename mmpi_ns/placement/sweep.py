@@ -32,7 +32,7 @@ def add_swept_points(observations: Observations, images: list[Array], num_refere
     """The observations with points found by a plane sweep, each seen by its reference view.
 
     Args:
-        observations: cameras without points.
+        observations: cameras; points that they already have, with or without keypoints, stay first.
         images: gray images [h, w] in [0, 1] of all cameras, about 128 pixels a side.
         num_references: views to sweep, evenly spread over the capture.
 
@@ -42,7 +42,8 @@ def add_swept_points(observations: Observations, images: list[Array], num_refere
     count = len(images)
     references = np.unique(np.linspace(0, count - 1, min(num_references, count)).round().astype(int))
     views = [_view(observations, i, image) for i, image in enumerate(images)]
-    points, cameras, indices, total = [], [], [], 0
+    points, cameras, indices = [observations.points], [observations.seen_by], [observations.seen_point]
+    total = len(observations.points)
     for i in references:
         neighbours = _neighbours(observations, int(i), wanted=8)
         if not neighbours:
@@ -54,8 +55,6 @@ def add_swept_points(observations: Observations, images: list[Array], num_refere
             cameras.append(np.full(len(seen), j, np.int64))
             indices.append(total + seen)
         total += len(found)
-    if not total:
-        return observations
     return replace(
         observations,
         points=np.concatenate(points),
