@@ -157,7 +157,7 @@ def test_images_that_show_nothing_in_common_give_no_tracks(tmp_path):
 def test_an_unreadable_image_is_named(tmp_path):
     images = scene_of(tmp_path, POSES[:2])
     images.files[1].write_text("not an image")
-    with pytest.raises(ValueError, match="view1.png cannot be read"):
+    with pytest.raises(ValueError, match=r"view1\.png cannot be read"):
         triangulate(images)
 
 
