@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import functools
 import json
 import os
@@ -18,12 +17,11 @@ from pathlib import Path
 from typing import Any
 
 from mmpi_ns.bench.suites import SUITES, Variant
-from mmpi_ns.mmpi_config import mmpi_small
-from mmpi_ns.mmpi_datamanager import MMPIDataManagerConfig
+from mmpi_ns.mmpi_scene import load_observations
+from mmpi_ns.placement.content import find_content
 from mmpi_ns.placement.errors import pixel_errors
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.placement.plan import ScenePlan
-from mmpi_ns.placement.rule import find_content
 
 RAYS_PER_STEP = 1024
 
@@ -94,7 +92,7 @@ class Results:
     def _plan_figures(self, run: Path) -> dict[str, Any]:
         """MPIs, texels and expected pixel errors of the plan that a run used."""
         plan = ScenePlan.load(run / "plan.json")
-        observations = load_observations(self.data, self.downscale_factor)
+        observations = _observations(self.data, self.downscale_factor)
         content = find_content(observations)
         errors = pixel_errors(plan, observations, content.cameras, content.points).summary()
         return {"mpis": len(plan.mpis), "texels": plan.texels, **errors}
@@ -146,13 +144,8 @@ def _key(variant: Variant) -> str:
 
 
 @functools.cache
-def load_observations(data: Path, downscale_factor: int) -> Observations:
-    """The observations that training on a scene would use."""
-    config = copy.deepcopy(mmpi_small.config.pipeline.datamanager)
-    assert isinstance(config, MMPIDataManagerConfig)
-    config.data = data
-    config.dataparser.downscale_factor = downscale_factor  # type: ignore[attr-defined]
-    return config.setup(device="cpu", test_mode="val").observations
+def _observations(data: Path, downscale_factor: int) -> Observations:
+    return load_observations(data, downscale_factor)
 
 
 def _steps(run: Path) -> int:

@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mmpi_ns.placement.observations import Array, Observations
-from mmpi_ns.placement.plan import MPIPlan, ScenePlan
+from mmpi_ns.placement.plan import CubePlan, MPIPlan, ScenePlan
 
 
 @dataclass(frozen=True)
 class PixelErrors:
-    """Errors of Q observations in K MPIs; inf where the MPI does not hold the point."""
+    """Errors of Q observations in K heads (MPIs, then the cube); inf where the head does not hold the point."""
 
     plane: Array
     """[Q, K] e_p: half a plane spacing, in pixels."""
@@ -33,11 +33,11 @@ class PixelErrors:
 
     @property
     def best(self) -> NDArray[np.int64]:
-        """[Q] the MPI that serves each observation best."""
+        """[Q] the head that serves each observation best."""
         return self.combined.argmin(-1)
 
     def summary(self) -> dict[str, float]:
-        """Medians and 90th percentiles over the observations, each in the MPI that serves it best; share unserved."""
+        """Medians and 90th percentiles over the observations, each in the head that serves it best; share unserved."""
         rows = np.arange(len(self.plane))
         served = np.isfinite(self.combined.min(-1))
         result = {"unserved": float(1 - served.mean()) if len(rows) else 0.0}
@@ -49,15 +49,18 @@ class PixelErrors:
 
 
 def pixel_errors(plan: ScenePlan, observations: Observations, cameras: NDArray[np.int64], points: Array) -> PixelErrors:
-    """e_p and e_t of observed points in every MPI of a plan (the cube is left out).
+    """e_p and e_t of observed points in every head of a plan: its MPIs, then the cube where there is one.
 
     Args:
-        plan: the MPIs.
+        plan: the MPIs and the cube.
         observations: the cameras.
         cameras: [Q] camera of each observation.
         points: [Q, 3] world position of each observed point.
     """
     pairs = [mpi_errors(m, observations, cameras, points) for m in plan.mpis]
+    if plan.cube is not None:
+        texel = cube_errors(plan.cube, observations, cameras, points)
+        pairs.append((np.where(np.isfinite(texel), 0.0, np.inf), texel))
     return PixelErrors(np.stack([p for p, _ in pairs], -1), np.stack([t for _, t in pairs], -1))
 
 
@@ -65,6 +68,22 @@ def mpi_errors(
     mpi: MPIPlan, observations: Observations, cameras: NDArray[np.int64], points: Array
 ) -> tuple[Array, Array]:
     """(e_p, e_t) of observed points in one MPI, in pixels; inf where it does not hold the point."""
+    plane, across, down = pixel_slopes(mpi, observations, cameras, points)
+    u0, u1, v0, v1 = mpi.extent
+    texel = np.maximum(across * (u1 - u0) / (mpi.width - 1), down * (v1 - v0) / (mpi.height - 1))
+    return 0.5 * plane / (mpi.near * (mpi.planes - 1)), texel
+
+
+def pixel_slopes(
+    mpi: MPIPlan, observations: Observations, cameras: NDArray[np.int64], points: Array
+) -> tuple[Array, Array, Array]:
+    """Pixels that an observed point moves per unit of its disparity, tangent u and tangent v in an MPI's frame.
+
+    Neither planes nor texels of the MPI enter, so that they can be chosen by the slopes.
+
+    Returns:
+        Three arrays [Q]; inf where the MPI does not hold the point.
+    """
     axes, origin = np.asarray(mpi.axes), np.asarray(mpi.origin)
     local = (points - origin) @ axes.T
     ahead = local[:, 2] >= mpi.near
@@ -84,13 +103,20 @@ def mpi_errors(
     seen = inside & (depth > 1e-9 * np.abs(q).max(-1))
     depth = np.where(seen, depth, 1.0)
 
-    def pixel_shift(direction: Array) -> Array:
+    def slope(direction: Array) -> Array:
         """Length in pixels of a unit step along one of (u, v, w)."""
         moved = direction[:, :2] / depth[:, None] + q[:, :2] * (direction[:, 2] / depth**2)[:, None]
-        return np.linalg.norm(moved * focal, axis=-1)
+        return np.where(seen, np.linalg.norm(moved * focal, axis=-1), np.inf)
 
-    step_u, step_v = (u1 - u0) / (mpi.width - 1), (v1 - v0) / (mpi.height - 1)
-    step_w = 1 / (mpi.near * (mpi.planes - 1))
-    texel = np.maximum(pixel_shift(columns[..., 0]) * step_u, pixel_shift(columns[..., 1]) * step_v)
-    plane = 0.5 * step_w * pixel_shift(shift)
-    return np.where(seen, plane, np.inf), np.where(seen, texel, np.inf)
+    return slope(shift), slope(columns[..., 0]), slope(columns[..., 1])
+
+
+def cube_errors(cube: CubePlan, observations: Observations, cameras: NDArray[np.int64], points: Array) -> Array:
+    """e_t of observed points in a cube: the pixels that a voxel's longest side spans; inf outside the cube."""
+    lower, upper = np.asarray(cube.lower), np.asarray(cube.upper)
+    voxel = ((upper - lower) / np.array(cube.shape[::-1])).max()
+    poses = observations.camera_to_worlds[cameras]
+    depth = -np.einsum("qi,qi->q", points - poses[:, :, 3], poses[:, :, 2])
+    seen = ((points >= lower) & (points <= upper)).all(-1) & (depth > 0)
+    focal = observations.intrinsics[cameras][:, :2].max(-1)
+    return np.where(seen, voxel * focal / np.where(seen, depth, 1.0), np.inf)

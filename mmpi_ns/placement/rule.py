@@ -1,10 +1,9 @@
-"""The placement rule: MPIs stand where cameras stood, as many as lower the expected pixel error enough.
+"""The placement rule: as many MPIs as lower the expected pixel error enough, each where it lowers it most.
 
-Candidates are the training cameras themselves, pulled back by some amounts and widened by some margins: seen from its
-own origin an MPI has no plane error and texels as fine as pixels, and both errors grow with the distance from there
-(``errors.py``). The candidate that lowers the mean error of all observations most for its texels is taken, again and
-again (greedy facility location), until the next one would add too little. A forward-facing capture ends with one MPI, a
-drive with several that face the same way, one further on than the other, a walk through rooms with one per view.
+Greedy facility location (Nemhauser et al. 1978) over ``candidates.py``: every observation is served by the chosen head
+that shows it with the least expected error (``errors.py``), and the candidate that lowers the mean of log2(error) most
+for its texels is taken, until the next would add too little. Heads that later ones have made superfluous are put back.
+Then each MPI gets the planes that what it serves asks for.
 """
 
 from __future__ import annotations
@@ -13,67 +12,59 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mmpi_ns.placement.errors import mpi_errors
-from mmpi_ns.placement.hand_made import drive_plan, room_plan, vector
-from mmpi_ns.placement.observations import Array, Observations, frustum_points
-from mmpi_ns.placement.plan import MPIPlan, ScenePlan
+from mmpi_ns.placement.candidates import Fineness, cube_candidates, mpi_candidates
+from mmpi_ns.placement.content import Content, find_content
+from mmpi_ns.placement.errors import cube_errors, mpi_errors
+from mmpi_ns.placement.hand_made import drive_plan, room_plan
+from mmpi_ns.placement.observations import Array, Observations
+from mmpi_ns.placement.plan import CubePlan, MPIPlan, ScenePlan
 
 MAX_ERROR = 64.0
-"""Pixels: what an observation costs that no MPI holds; worse errors count no more than this."""
-SAMPLED = 6000
-"""Observations that the choice is based on."""
+"""Pixels: what an observation costs that nothing holds; worse errors count no more than this."""
+MIN_PLANES = 16
+BUDGET_ROUNDS = 8
+"""Attempts at keeping to the budget of texels; each starts with coarser ones."""
 
 
 @dataclass
 class PlacementConfig:
     """Where the MPIs stand and how fine they are."""
 
-    arrangement: Literal["cameras", "drive", "room"] = "cameras"
-    """cameras: chosen among the training cameras; drive: front, left, right, below; room: five around the centre."""
-    max_mpis: int = 8
-    """No more MPIs than this (cameras)."""
-    min_gain: float = 0.01
-    """Stop when the next MPI gains less than this share of what there was to gain (cameras)."""
+    arrangement: Literal["automatic", "drive", "room"] = "automatic"
+    """automatic: what the scene needs; drive: front, left, right, below; room: five around the centre."""
+    max_mpis: int = 64
+    """No more MPIs than this (automatic)."""
+    max_texels: float = 16e6
+    """Texels and voxels in all, about: beyond, all of them are made larger; 0 for no limit (automatic)."""
+    min_gain: float = 1.5
+    """Bits: a further MPI must halve the expected error of one training image's content this often (automatic)."""
     planes: int = 64
-    """Planes of every MPI."""
+    """Planes of every MPI (drive, room)."""
+    max_planes: int = 128
+    """Planes of an MPI at most; each gets those that its content needs (automatic)."""
+    plane_pixels: float = 0.5
+    """Error for lack of planes to allow four fifths of what an MPI serves, relative to a texel's pixels (automatic)."""
     texel_pixels: float = 1.5
-    """Image pixels that a texel spans, seen from where the MPI stands (cameras)."""
+    """Image pixels that a texel spans, seen from where the MPI stands (automatic)."""
     rays_per_texel: float = 2.5
-    """Training rays that a texel's footprint should get: a short run on large images gets larger texels (cameras)."""
+    """Training rays that a texel's footprint should get: a short run on large images gets larger texels (automatic)."""
     height: int = 96
     """Texel rows of every MPI (drive, room)."""
     width: int = 256
     """Texel columns of every MPI (drive, room)."""
     enough: float = 0.75
-    """Pixels of expected error that need no further MPI (cameras)."""
-    margins: tuple[float, ...] = (1.12, 1.4, 1.75)
-    """Frusta to try, relative to the camera's own (cameras)."""
-    pull_backs: tuple[float, ...] = (0.0, 1.0, 2.0)
-    """Distances to try for standing behind the camera, relative to the nearest content (cameras)."""
+    """Expected error that needs no further MPI, relative to a texel's pixels (automatic)."""
     texel_cost: float = 0.25
-    """How much texels count against a candidate: its gain is divided by texels to this power (cameras)."""
+    """How much texels count against a candidate: its gain is divided by texels to this power (automatic)."""
+    max_voxels: int = 128
+    """Voxels along a side of a cube at most, where one is worth it; 0 for none (automatic)."""
     faces: tuple[str, ...] = ("front", "left", "right", "below")
     """Which MPIs of the drive to use (drive)."""
     drive_pull_back: float = 0.45
     """How far behind the first camera the front MPI stands, as a share of the travel (drive)."""
     cube_voxels: int = 0
-    """Voxels along each side of the centred cube; 0 for none."""
-
-
-@dataclass(frozen=True)
-class Content:
-    """Where the content of a scene lies, as placement sees it."""
-
-    cameras: NDArray[np.int64]
-    """[Q] camera of each observation."""
-    points: Array
-    """[Q, 3] what it observes."""
-    nearest: Array
-    """[M] distance from each camera to its nearest content (2nd percentile)."""
-    near: float
-    """The same over all cameras."""
+    """Voxels along each side of the centred cube; 0 for none (room)."""
 
 
 def place(observations: Observations, config: PlacementConfig, training_rays: int | None = None) -> ScenePlan:
@@ -96,98 +87,123 @@ def place(observations: Observations, config: PlacementConfig, training_rays: in
         half_size = float(np.abs(observations.centers - observations.centers.mean(0)).max()) + content.near
         near = max(0.5 * content.near, 1e-6)
         return room_plan(observations, config.planes, config.width, config.cube_voxels, near, half_size)
-    if training_rays is not None:
-        rays_per_pixel = training_rays / float(observations.sizes.prod(-1).sum())
-        coarsest = (config.rays_per_texel / rays_per_pixel) ** 0.5
-        config = replace(config, texel_pixels=max(config.texel_pixels, coarsest))
-    chosen = _choose(_candidates(observations, content, config), observations, content, config)
-    mpis = tuple(_named(m, i) for i, m in enumerate(chosen))
-    return ScenePlan(mpis, None, 0.2 * content.near, content.near, "camera placement")
+    texel_pixels = max(config.texel_pixels, trainable_texel(observations, config, training_rays))
+    chosen = _choose(observations, content, config, texel_pixels)
+    mpis = tuple(h for h in chosen if isinstance(h, MPIPlan))
+    cube = next((h for h in chosen if isinstance(h, CubePlan)), None)
+    return ScenePlan(_named(mpis), cube, 0.2 * content.near, content.near, "automatic placement")
 
 
-def find_content(observations: Observations) -> Content:
-    """The observations that placement weighs: SfM keypoints, else points filling the cameras' frusta.
-
-    Without any points the nearest content is taken to lie at a tenth of the cameras' spread.
-    """
-    centers = observations.centers
-    if len(observations.seen_by):
-        cameras, points = observations.seen_by, observations.points[observations.seen_point]
-    else:
-        spread = float(np.linalg.norm(centers - centers.mean(0), axis=-1).max())
-        cloud = frustum_points(observations, near=max(0.1 * spread, 1e-3))
-        cameras = np.repeat(np.arange(len(centers)), len(cloud) // len(centers))
-        points = cloud
-    depth = -np.einsum("qi,qi->q", points - centers[cameras], observations.camera_to_worlds[cameras][:, :, 2])
-    good = np.isfinite(points).all(-1) & (depth > 0)
-    if not good.any():
-        raise ValueError("No point lies in front of the camera that saw it: check the poses and the points' frame.")
-    cameras, points, depth = cameras[good], points[good], depth[good]
-    distance = np.linalg.norm(points - centers[cameras], axis=-1)
-    near = float(np.percentile(distance, 2))
-    nearest = np.array(
-        [np.percentile(depth[cameras == i], 2) if (cameras == i).sum() >= 20 else near for i in range(len(centers))]
-    )
-    keep = np.linspace(0, len(cameras) - 1, min(SAMPLED, len(cameras))).round().astype(int)
-    return Content(cameras[keep], points[keep], nearest, near)
-
-
-def _candidates(observations: Observations, content: Content, config: PlacementConfig) -> list[MPIPlan]:
-    """Every training camera (at most 64, evenly chosen) with every pull-back and margin."""
-    count = len(observations.centers)
-    chosen = np.unique(np.linspace(0, count - 1, min(64, count)).round().astype(int))
-    return [
-        _candidate(observations, int(i), pull_back * content.near, margin, content, config)
-        for i in chosen
-        for pull_back in config.pull_backs
-        for margin in config.margins
-    ]
-
-
-def _candidate(
-    observations: Observations, i: int, pull_back: float, margin: float, content: Content, config: PlacementConfig
-) -> MPIPlan:
-    right, up, back = observations.camera_to_worlds[i, :, :3].T
-    fx, fy, cx, cy = observations.intrinsics[i]
-    width, height = observations.sizes[i]
-    u, v = np.array([-cx, width - cx]) / fx, np.array([-cy, height - cy]) / fy
-    extent = [float(x) for side in (u, v) for x in side.mean() + margin * (side - side.mean())]
-    texel = config.texel_pixels
-    return MPIPlan(
-        name=str(i),
-        origin=vector(observations.centers[i] + pull_back * back),
-        axes=(vector(right), vector(-up), vector(-back)),
-        near=float(0.6 * min(content.nearest[i], content.near) + pull_back),
-        extent=(extent[0], extent[1], extent[2], extent[3]),
-        planes=config.planes,
-        height=max(8, round((extent[3] - extent[2]) * fy / texel) + 1),
-        width=max(8, round((extent[1] - extent[0]) * fx / texel) + 1),
-    )
+def trainable_texel(observations: Observations, config: PlacementConfig, training_rays: int | None) -> float:
+    """Pixels that a texel must span to get ``rays_per_texel`` of the training's rays; 0 where those are not known."""
+    if training_rays is None:
+        return 0.0
+    rays_per_pixel = training_rays / float(observations.sizes.prod(-1).sum())
+    return (config.rays_per_texel / rays_per_pixel) ** 0.5
 
 
 def _choose(
-    candidates: list[MPIPlan], observations: Observations, content: Content, config: PlacementConfig
-) -> list[MPIPlan]:
-    """Greedy facility location on the mean of log2(expected pixel error), counted from what is small enough."""
-    cost = np.stack([_log_error(m, observations, content, config.enough) for m in candidates])
-    penalty = np.array([m.texels for m in candidates], dtype=np.float64) ** config.texel_cost
-    current = np.full(cost.shape[1], np.log2(MAX_ERROR / config.enough))
-    total = current.mean()
-    chosen: list[int] = []
-    while len(chosen) < config.max_mpis:
-        gain = current.mean() - np.minimum(cost, current).mean(-1)
-        best = int((gain / penalty).argmax())
-        if chosen and gain[best] < config.min_gain * total:
+    observations: Observations, content: Content, config: PlacementConfig, texel_pixels: float
+) -> list[MPIPlan | CubePlan]:
+    """The heads that a scene needs, with texels no finer than the budget allows."""
+    chosen: list[MPIPlan | CubePlan] = []
+    for _ in range(BUDGET_ROUNDS):
+        fineness = Fineness(texel_pixels, config.max_planes, config.max_voxels)
+        heads = [*mpi_candidates(observations, content, fineness), *cube_candidates(observations, content, fineness)]
+        chosen = _Choice(heads, observations, content, config, texel_pixels).run()
+        excess = sum(h.texels for h in chosen) / config.max_texels if config.max_texels else 0.0
+        if excess <= 1.0:
             break
-        chosen.append(best)
-        current = np.minimum(current, cost[best])
-    return [candidates[j] for j in chosen]
+        # Texels shrink a plane's rows and columns, and coarser ones ask for fewer planes: a third power, nearly.
+        texel_pixels *= max(1.04, excess ** (1 / 3))
+    return chosen
 
 
-def _log_error(mpi: MPIPlan, observations: Observations, content: Content, enough: float) -> Array:
-    plane, texel = mpi_errors(mpi, observations, content.cameras, content.points)
-    return np.log2(np.clip(np.hypot(plane, 0.5 * texel), enough, MAX_ERROR) / enough)
+class _Choice:
+    """Greedy choice among candidates, by what each costs every observation."""
+
+    def __init__(
+        self,
+        heads: list[MPIPlan | CubePlan],
+        observations: Observations,
+        content: Content,
+        config: PlacementConfig,
+        texel_pixels: float,
+    ) -> None:
+        self.heads, self.observations, self.content, self.config = heads, observations, content, config
+        self.target, self.enough = config.plane_pixels * texel_pixels, config.enough * texel_pixels
+        self.cost = np.stack([self._bits(h) for h in heads]).astype(np.float32)
+        self.nothing = np.full(self.cost.shape[1], np.log2(max(MAX_ERROR / self.enough, 2.0)), np.float32)
+        self.price = np.array([h.texels for h in heads], dtype=np.float64) ** config.texel_cost
+        self.is_cube = np.array([isinstance(h, CubePlan) for h in heads])
+
+    def run(self) -> list[MPIPlan | CubePlan]:
+        """The chosen heads, in the order of choice, each MPI with the planes it needs."""
+        chosen: list[int] = []
+        while len(chosen) < self.config.max_mpis:
+            best = self._next(chosen)
+            if best is None:
+                break
+            grown = self._without_superfluous([*chosen, best])
+            if sorted(grown) == sorted(chosen):  # it makes itself superfluous: nothing more to gain
+                break
+            chosen = grown
+        return self._with_planes(chosen)
+
+    def _next(self, chosen: list[int]) -> int | None:
+        """The candidate that gains most for its texels; None where none gains enough. The first must be an MPI."""
+        current = self._served(chosen)
+        gain = np.maximum(current - self.cost, 0) @ self.content.weights
+        allowed = ~self.is_cube if not chosen or self.is_cube[chosen].any() else np.ones_like(self.is_cube)
+        score = np.where(allowed & (gain >= self.config.min_gain), gain / self.price, -1.0)
+        if not chosen:
+            score = np.where(allowed, gain / self.price, -1.0)
+        best = int(score.argmax())
+        return best if score[best] > 0 or not chosen else None
+
+    def _served(self, chosen: list[int]) -> Array:
+        return np.minimum(self.nothing, self.cost[chosen].min(0)) if chosen else self.nothing
+
+    def _without_superfluous(self, chosen: list[int]) -> list[int]:
+        """Leaves out, one by one, heads whose absence costs less than the least gain that counts."""
+        while len(chosen) > 1:
+            total = self._served(chosen) @ self.content.weights
+            losses = [self._served([c for c in chosen if c != j]) @ self.content.weights - total for j in chosen]
+            removable = [n for n, j in enumerate(chosen) if not self.is_cube[j]]
+            least = min(range(len(chosen)), key=lambda n: losses[n])
+            last_mpi = removable == [least]
+            if losses[least] >= self.config.min_gain or last_mpi:
+                break
+            chosen = [c for n, c in enumerate(chosen) if n != least]
+        return chosen
+
+    def _with_planes(self, chosen: list[int]) -> list[MPIPlan | CubePlan]:
+        """Each MPI with the planes at which four fifths of what it serves best err little enough."""
+        owner = self.cost[chosen].argmin(0)
+        result = []
+        for n, j in enumerate(chosen):
+            head = self.heads[j]
+            if isinstance(head, MPIPlan):
+                own = np.nonzero(owner == n)[0]
+                plane, _ = mpi_errors(head, self.observations, self.content.cameras[own], self.content.points[own])
+                plane = plane[np.isfinite(plane)]
+                wanted = float(np.quantile(plane, 0.8)) / self.target if len(plane) else 0.0
+                planes = 8 * round((1 + (head.planes - 1) * wanted) / 8)
+                head = replace(head, planes=int(np.clip(planes, MIN_PLANES, self.config.max_planes)))
+            result.append(head)
+        return result
+
+    def _bits(self, head: MPIPlan | CubePlan) -> Array:
+        """log2 of the expected pixel errors over what is small enough: what each observation costs if served here."""
+        cameras, points = self.content.cameras, self.content.points
+        if isinstance(head, CubePlan):
+            plane, texel = 0.0, cube_errors(head, self.observations, cameras, points)
+        else:
+            plane, texel = mpi_errors(head, self.observations, cameras, points)
+        worst = max(MAX_ERROR, 2 * self.enough)
+        return np.log2(np.clip(np.hypot(plane, 0.5 * texel), self.enough, worst) / self.enough)
 
 
-def _named(mpi: MPIPlan, index: int) -> MPIPlan:
-    return replace(mpi, name=f"view {int(mpi.name) + 1} ({index})")
+def _named(mpis: tuple[MPIPlan, ...]) -> tuple[MPIPlan, ...]:
+    """Names that differ where two MPIs stand at one camera."""
+    return tuple(replace(m, name=f"{m.name} ({i})") for i, m in enumerate(mpis))
