@@ -14,12 +14,14 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager, VanillaDataManagerConfig
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
-from nerfstudio.data.datasets.base_dataset import InputDataset
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.model_components.ray_generators import RayGenerator
 from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
 from torch import Tensor
 
+from mmpi_ns.checks import check_transforms, in_one_place
+from mmpi_ns.mmpi_dataset import MMPIDataset
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.placement.sweep import add_swept_points
 from mmpi_ns.random_draws import generator
@@ -31,7 +33,7 @@ OBSERVATIONS = "mmpi_observations"
 RAYS_PER_STEP = "mmpi_rays_per_step"
 """Key under which it finds the pixel rays of a training step."""
 MAX_REPROJECTION = 0.02
-"""Median reprojection error, as a share of the image width, beyond which a COLMAP model is in another frame."""
+"""Median angle between keypoints and points, as a share of the image, beyond which a model is in another frame."""
 ENOUGH_KEYPOINTS = 20
 """Keypoints an image, on average, that need no plane sweep beside them."""
 KEYPOINT_DEPTH = "keypoint_inverse_distance"
@@ -50,7 +52,7 @@ class MMPIDataManagerConfig(VanillaDataManagerConfig):
     keypoint_rays: int = 384
     """Extra rays a step through SfM keypoints of training images, for depth supervision (scenes with tracks only)."""
     sfm_path: Path = Path("colmap/sparse/0")
-    """COLMAP model with the tracks, relative to the data; in the frame of transforms.json."""
+    """COLMAP model with the tracks, relative to the data, in the frame of transforms.json (colmap parser: its own)."""
     triangulate: bool = True
     """Scenes without tracks: match and triangulate the training images' features at the start (a second or so each)."""
     seed: int = 0
@@ -67,16 +69,15 @@ class PixelPool:
     """(image, row, column) of each pixel."""
 
     @staticmethod
-    def from_dataset(dataset: InputDataset, device: str | torch.device) -> PixelPool:
+    def from_dataset(dataset: MMPIDataset, device: str | torch.device) -> PixelPool:
         """Reads every image once; masked pixels are left out.
 
         Raises:
-            ValueError: an image or mask cannot be used; names the file.
+            ValueError: an image or mask cannot be used (names the file), or the masks leave nothing.
         """
         colors, indices = [], []
         for i in range(len(dataset)):
-            name = dataset.image_filenames[i]
-            data = _read(dataset, i, name)
+            data = dataset.get_data(i, image_type="uint8")
             image = data["image"]
             keep = torch.ones(image.shape[:2], dtype=torch.bool)
             if "mask" in data:
@@ -93,41 +94,54 @@ class PixelPool:
         return self.colors[chosen].float() / 255, self.indices[chosen].long()
 
 
-def _thumbnail(dataset: InputDataset, index: int, side: int = 128) -> NDArray[np.float64]:
+def _thumbnail(dataset: MMPIDataset, index: int, side: int = 128) -> NDArray[np.float64]:
     """Gray image of at most ``side`` pixels a side, box-filtered."""
-    image = _read(dataset, index, dataset.image_filenames[index])["image"][..., :3].float().mean(-1) / 255
+    image = dataset.get_data(index, image_type="uint8")["image"][..., :3].float().mean(-1) / 255
     scale = max(image.shape) / side
     size = [max(8, round(n / scale)) for n in image.shape]
     return torch.nn.functional.interpolate(image[None, None], size=size, mode="area")[0, 0].double().numpy()
 
 
-def _read(dataset: InputDataset, index: int, name: Path) -> dict[str, Any]:
-    try:
-        return dataset.get_data(index, image_type="uint8")
-    except (OSError, AssertionError) as error:
-        raise ValueError(f"Training image {name} cannot be read ({error}): repair or remove it.") from error
-
-
-class MMPIDataManager(VanillaDataManager[InputDataset]):
+class MMPIDataManager(VanillaDataManager[MMPIDataset]):
     """Draws training batches from a resident pixel pool and hands the scene's observations to the model."""
 
     config: MMPIDataManagerConfig
 
     def __init__(self, config: MMPIDataManagerConfig, **kwargs: Any) -> None:
         self.pool: PixelPool | None = None
+        parser = config.dataparser
+        if isinstance(parser, NerfstudioDataParserConfig):
+            check_transforms(
+                Path(config.data or parser.data),
+                auto_scale=parser.auto_scale_poses,
+                opens_first_image=parser.downscale_factor is None and kwargs.get("test_mode") != "inference",
+            )
         super().__init__(config, **kwargs)
 
-    def create_train_dataset(self) -> InputDataset:
+    def create_train_dataset(self) -> MMPIDataset:
         dataset = super().create_train_dataset()
         observations = read_observations(self.train_dataparser_outputs, dataset.cameras, self._sfm())
-        if not len(observations.seen_by) and self.test_mode == "val":  # else the plan comes from a checkpoint
-            observations = self._find_points(observations, dataset)
-        self.observations = drop_masked(observations, dataset)
+        if in_one_place(observations.centers):
+            CONSOLE.print("[bold yellow]All training cameras stand in one place: no distance can be learned.")
+        if self.test_mode == "val":  # else the plan comes from a checkpoint, and images may be absent
+            if not len(observations.seen_by):
+                observations = self._find_points(observations, dataset)
+            observations = drop_masked(observations, dataset)
+        self.observations = observations
         dataset.metadata[RAYS_PER_STEP] = self.config.train_num_rays_per_batch
         dataset.metadata[OBSERVATIONS] = self.observations
         return dataset
 
-    def _find_points(self, observations: Observations, dataset: InputDataset) -> Observations:
+    def create_eval_dataset(self) -> MMPIDataset:
+        dataset = super().create_eval_dataset()
+        if not len(dataset):
+            raise ValueError(
+                f"No image of {self.config.data} is left for evaluation: give more images, or --eval-mode all after "
+                "the name of the data parser."
+            )
+        return dataset
+
+    def _find_points(self, observations: Observations, dataset: MMPIDataset) -> Observations:
         """Points for a scene without tracks: triangulated, and swept where triangulation finds too few."""
         if self.config.triangulate and (images := posed_images(observations, dataset)) is not None:
             CONSOLE.print(f"No SfM tracks: matching the features of {len(dataset)} training images.")
@@ -139,25 +153,31 @@ class MMPIDataManager(VanillaDataManager[InputDataset]):
         return observations
 
     def _sfm(self) -> SfmModel | None:
-        data = self.dataparser.config.data
-        return find_sfm_model(Path(data) / self.config.sfm_path)
+        data = Path(self.dataparser.config.data)
+        folder = data.parent if data.suffix == ".json" else data
+        return find_sfm_model(folder / getattr(self.dataparser.config, "colmap_path", self.config.sfm_path))
 
     def setup_train(self) -> None:
         """Loads the pixel pool instead of nerfstudio's image cache."""
         CONSOLE.print("Setting up training dataset...")
         self.pool = PixelPool.from_dataset(self.train_dataset, self.device)
+        # Samples nothing: ns-export sets its batches' size here.
+        self.train_pixel_sampler = self._get_pixel_sampler(self.train_dataset, self.config.train_num_rays_per_batch)
         self.train_ray_generator = RayGenerator(self.train_dataset.cameras.to(self.device))
         self._keypoints = _keypoint_targets(self.observations, self.device)
 
     def next_train(self, step: int) -> tuple[RayBundle, dict]:
-        """Pixel rays first, then keypoint rays (marked in the bundle's metadata), keyed on (seed, step)."""
+        """Pixel rays first, then keypoint rays (marked in the bundle's metadata), keyed on (seed, step).
+
+        Outside training (ns-export asks for step 0 again and again) pixel rays alone, others with each call.
+        """
         self.train_count += 1
         assert self.pool is not None
-        g = generator(self.config.seed, step, "pixels", self.device)
-        colors, indices = self.pool.draw(self.config.train_num_rays_per_batch, g)
+        g = generator(self.config.seed, step if self.training else self.train_count, "pixels", self.device)
+        colors, indices = self.pool.draw(self.get_train_rays_per_batch(), g)
         bundle = self.train_ray_generator(indices)
         depths = torch.zeros(len(bundle), 1, device=self.device)
-        if self._keypoints is not None and self.config.keypoint_rays > 0:
+        if self.training and self._keypoints is not None and self.config.keypoint_rays > 0:
             keypoint_bundle, keypoint_depths = self._keypoint_rays(g)
             bundle, depths = _join(bundle, keypoint_bundle), torch.cat([depths, keypoint_depths])
         bundle.metadata[KEYPOINT_DEPTH] = depths
@@ -176,9 +196,6 @@ class MMPIDataManager(VanillaDataManager[InputDataset]):
             camera_indices=cameras[chosen][:, None],
         )
         return bundle, inverse[chosen][:, None]
-
-    def get_train_rays_per_batch(self) -> int:
-        return self.config.train_num_rays_per_batch
 
 
 def _join(a: RayBundle, b: RayBundle) -> RayBundle:
@@ -212,12 +229,18 @@ def read_observations(outputs: DataparserOutputs, cameras: Cameras, sfm: SfmMode
     """Training cameras as they are used, with the SfM points and keypoints moved into their frame.
 
     Raises:
-        ValueError: poses are missing or not finite.
+        ValueError: poses are missing, or poses or intrinsics cannot be used; names the image.
     """
+    if not len(outputs.image_filenames):
+        raise ValueError("The capture holds no training image: check the split that the data parser made.")
     poses = cameras.camera_to_worlds.double().cpu().numpy()
-    if len(poses) < 1 or not np.isfinite(poses).all():
-        raise ValueError("The training cameras hold no pose or one that is not finite: check transforms.json.")
     flat = [x.double().cpu().numpy().reshape(-1) for x in (cameras.fx, cameras.fy, cameras.cx, cameras.cy)]
+    usable = np.isfinite(poses).all((1, 2)) & np.isfinite(flat).all(0) & (flat[0] > 0) & (flat[1] > 0)
+    if not usable.all():
+        raise ValueError(
+            f"The camera of {outputs.image_filenames[usable.argmin()]} has a pose or focal length that is no finite "
+            "number or not positive: correct it or remove the frame."
+        )
     sizes = np.stack([cameras.width.cpu().numpy().reshape(-1), cameras.height.cpu().numpy().reshape(-1)], -1)
     empty = np.zeros(0, dtype=np.int64)
     result: Mapping[str, Any] = {"points": np.zeros((0, 3)), "seen_by": empty, "seen_point": empty}
@@ -234,16 +257,50 @@ def read_observations(outputs: DataparserOutputs, cameras: Cameras, sfm: SfmMode
     observations = Observations(
         camera_to_worlds=poses, intrinsics=np.stack(flat, -1), sizes=sizes.astype(np.float64), seen_at=seen_at, **result
     )
-    if len(seen_at) and observations.median_reprojection_error() > MAX_REPROJECTION:
+    return _fitting_tracks(observations, cameras) if len(seen_at) else observations
+
+
+def _fitting_tracks(observations: Observations, cameras: Cameras) -> Observations:
+    """Leaves out points behind the camera that saw them, and all tracks where the model is in another frame."""
+    angles = keypoint_angles(observations, cameras)
+    width = np.arctan(0.5 * observations.sizes[:, 0] / observations.intrinsics[:, 0]) * 2
+    if np.median(angles / width[observations.seen_by]) > MAX_REPROJECTION:
         CONSOLE.print(
             "[bold yellow]The COLMAP model does not fit the cameras (its points project elsewhere), so its tracks are "
             "not used: state its frame as applied_transform in transforms.json."
         )
+        empty = np.zeros(0, dtype=np.int64)
         return replace(observations, points=np.zeros((0, 3)), seen_by=empty, seen_point=empty, seen_at=np.zeros((0, 2)))
-    return observations
+    ahead = angles < np.pi / 2
+    if not ahead.all():
+        CONSOLE.print(
+            f"[bold yellow]{(~ahead).sum()} of {len(ahead)} keypoints have their point behind the camera and are not "
+            "used: check the COLMAP model."
+        )
+    return _keep_keypoints(observations, ahead)
 
 
-def posed_images(observations: Observations, dataset: InputDataset) -> PosedImages | None:
+def keypoint_angles(observations: Observations, cameras: Cameras) -> NDArray[np.float64]:
+    """Radians [Q] between each keypoint's ray, lens included, and the direction to its point."""
+    seen_by = torch.from_numpy(observations.seen_by).to(cameras.device)
+    coords = torch.from_numpy(observations.seen_at[:, ::-1].copy()).float().to(cameras.device)
+    rays = cameras.generate_rays(camera_indices=seen_by[:, None], coords=coords)
+    directions = rays.directions.double().cpu().numpy()
+    offsets = observations.points[observations.seen_point] - observations.centers[observations.seen_by]
+    across = np.linalg.norm(np.cross(directions, offsets), axis=-1)
+    return np.arctan2(across, (directions * offsets).sum(-1))
+
+
+def _keep_keypoints(observations: Observations, keep: NDArray[np.bool_]) -> Observations:
+    return replace(
+        observations,
+        seen_by=observations.seen_by[keep],
+        seen_point=observations.seen_point[keep],
+        seen_at=observations.seen_at[keep[: len(observations.seen_at)]],
+    )
+
+
+def posed_images(observations: Observations, dataset: MMPIDataset) -> PosedImages | None:
     """The training images with their cameras and lenses; None where a camera is neither perspective nor fisheye."""
     cameras = dataset.cameras
     types = set(cameras.camera_type.reshape(-1).tolist())
@@ -275,19 +332,14 @@ def with_tracks(observations: Observations, model: SfmModel) -> Observations:
     )
 
 
-def drop_masked(observations: Observations, dataset: InputDataset) -> Observations:
+def drop_masked(observations: Observations, dataset: MMPIDataset) -> Observations:
     """Leaves out keypoints on masked pixels: what moves there has no depth to learn from."""
     if not len(observations.seen_at) or dataset._dataparser_outputs.mask_filenames is None:
         return observations
     keep = np.ones(len(observations.seen_by), dtype=bool)
     for i in range(len(dataset)):
-        mask = _read(dataset, i, dataset.image_filenames[i])["mask"][..., 0].numpy().astype(bool)
+        mask = dataset.get_data(i, image_type="uint8")["mask"][..., 0].numpy().astype(bool)
         own = np.nonzero(observations.seen_by[: len(observations.seen_at)] == i)[0]
         x, y = observations.seen_at[own].astype(int).T
         keep[own] = mask[y.clip(0, mask.shape[0] - 1), x.clip(0, mask.shape[1] - 1)]
-    return replace(
-        observations,
-        seen_by=observations.seen_by[keep],
-        seen_point=observations.seen_point[keep],
-        seen_at=observations.seen_at[keep[: len(observations.seen_at)]],
-    )
+    return _keep_keypoints(observations, keep)

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from threading import current_thread, main_thread
 from typing import Any, Literal
 
 import torch
 from jaxtyping import Bool, Float
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle, RaySamples
+from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.field_components.field_heads import FieldHeadNames
 from nerfstudio.model_components import renderers
@@ -296,6 +299,20 @@ class MMPIModel(Model):
             outputs["winning_mpi"] = mass.argmax(-1, keepdim=True).to(rgb.dtype)
             outputs["dropped_mass"] = report.dropped_mass
         return outputs
+
+    def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
+        """Renders a camera's image, or what of it lies in a box.
+
+        Raises:
+            ValueError: the box has no size. Not so in the viewer, whose render thread an error would end while
+                somebody types a size: there it shows the background.
+        """
+        if obb_box is not None and not bool((obb_box.S > 0).all()) and current_thread() is main_thread():
+            raise ValueError(
+                f"The crop box has no size (its sides are {[round(float(s), 6) for s in obb_box.S]}): give crop_scale "
+                "three positive lengths, or leave the crop out."
+            )
+        return super().get_outputs_for_camera(camera, obb_box)
 
     def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
         """Colours without their background, and how opaque each pixel is (ns-render's output "rgba")."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import pickle
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -16,6 +17,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
+from mmpi_ns.checks import brief
 from mmpi_ns.mmpi_model import MMPIModel
 from mmpi_ns.phases import Schedule
 from mmpi_ns.placement.plan import ScenePlan
@@ -62,6 +64,7 @@ class MMPITrainer(Trainer):
         return model
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
+        _check_device(self.config.machine.device_type)
         self.config.pipeline.model.total_steps = self.config.max_num_iterations  # type: ignore[attr-defined]
         self._total_steps = self.config.max_num_iterations
         super().setup(test_mode)
@@ -139,7 +142,7 @@ class MMPITrainer(Trainer):
     def _load_checkpoint(self) -> None:
         path = self._checkpoint_path()
         if path is not None:
-            state = torch.load(path, map_location="cpu", weights_only=True)
+            state = _read_checkpoint(path)
             self._check_same_plan(state["pipeline"], path)
             if "rng" in state:
                 torch.set_rng_state(state["rng"]["torch"])
@@ -168,10 +171,30 @@ class MMPITrainer(Trainer):
             raise ValueError(f"{path} holds no scene plan: it was not written by this method.")
         ours = self._model.field.plan_bytes
         if stored.shape != ours.shape or not torch.equal(stored, ours.cpu()):
+            theirs = ScenePlan.from_json(bytes(stored.numpy().tolist()).decode())
             raise ValueError(
-                f"{path} was trained with another scene plan: resume with the settings in its config.yml, or give its "
-                f"{PLAN_FILE} with --pipeline.model.plan-file."
+                f"{path} was trained with another scene plan ({len(theirs.mpis)} MPIs there, "
+                f"{len(self._model.field.full_plan.mpis)} here): resume with the settings in its config.yml, or give "
+                f"its {PLAN_FILE} with --pipeline.model.plan-file."
             )
+
+
+def _check_device(device_type: str) -> None:
+    there = {"cuda": torch.cuda.is_available, "mps": torch.backends.mps.is_available}
+    if device_type in there and not there[device_type]():
+        raise ValueError(
+            f"--machine.device-type {device_type} asks for a GPU and torch sees none: check the driver and torch's "
+            "build, or train with --machine.device-type cpu."
+        )
+
+
+def _read_checkpoint(path: Path) -> dict[str, Any]:
+    try:
+        return torch.load(path, map_location="cpu", weights_only=True)
+    except (OSError, RuntimeError, EOFError, pickle.UnpicklingError) as error:
+        raise ValueError(
+            f"{path} cannot be read ({brief(error)}): resume from another one with --load-step."
+        ) from error
 
 
 def _write_atomically(path: Path, write: Any, folder: Path | None = None) -> None:
@@ -180,6 +203,12 @@ def _write_atomically(path: Path, write: Any, folder: Path | None = None) -> Non
     try:
         write(temporary)
         os.replace(temporary, path)
+    except (OSError, RuntimeError) as error:  # torch.save has a RuntimeError for a full disk
+        temporary.unlink(missing_ok=True)
+        raise OSError(
+            f"{path} could not be written ({brief(error)}): earlier files are untouched, so make room and resume with "
+            "--load-dir."
+        ) from error
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
