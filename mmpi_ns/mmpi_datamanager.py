@@ -97,7 +97,7 @@ class PixelPool:
 def _thumbnail(dataset: MMPIDataset, index: int, side: int = 128) -> NDArray[np.float64]:
     """Gray image of at most ``side`` pixels a side, box-filtered."""
     image = dataset.get_data(index, image_type="uint8")["image"][..., :3].float().mean(-1) / 255
-    scale = max(image.shape) / side
+    scale = max(1.0, max(image.shape) / side)
     size = [max(8, round(n / scale)) for n in image.shape]
     return torch.nn.functional.interpolate(image[None, None], size=size, mode="area")[0, 0].double().numpy()
 

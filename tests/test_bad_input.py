@@ -181,7 +181,7 @@ def test_a_scene_without_points_says_how_it_finds_some(tmp_path, capsys):
 
 def test_a_model_whose_points_are_all_behind_the_cameras_is_not_used(data, capsys):
     move_points(data, lambda n, p: p * [1, 1, -1])
-    observations = datamanager(data, triangulate=False).observations
+    observations = datamanager(data, test_mode="test").observations
     assert "does not fit the cameras" in capsys.readouterr().out
     assert not len(observations.seen_at)
 
