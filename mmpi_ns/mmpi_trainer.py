@@ -206,8 +206,8 @@ def _write_atomically(path: Path, write: Any, folder: Path | None = None) -> Non
     except (OSError, RuntimeError) as error:  # torch.save has a RuntimeError for a full disk
         temporary.unlink(missing_ok=True)
         raise OSError(
-            f"{path} could not be written ({brief(error)}): earlier files are untouched, so make room and resume with "
-            "--load-dir."
+            f"{path} could not be written ({brief(error)}): earlier files are untouched, so make room and start again "
+            "(--load-dir goes on from the last checkpoint)."
         ) from error
     except BaseException:
         temporary.unlink(missing_ok=True)

@@ -15,6 +15,7 @@ import pytest
 import torch
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.data.scene_box import OrientedBox
+from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image
 from tiny_scene import HEIGHT, TEST, TRAIN, WIDTH, name_of, write_scene
 from training_runs import datamanager, ready, trainer_config, write_plan
@@ -265,6 +266,7 @@ def test_a_run_resumed_with_another_number_of_mpis_is_refused_and_changes_nothin
         plan = write_plan(scene, tmp_path / "plan.json", num_mpis=num_mpis)
         return trainer_config(scene, plan, tmp_path, 4)
 
+    config(1).save_config()
     first = ready(config(1))
     first.train()
     before = contents(first.base_dir)
@@ -274,6 +276,9 @@ def test_a_run_resumed_with_another_number_of_mpis_is_refused_and_changes_nothin
     )  # fmt: skip
     after = contents(first.base_dir)
     assert all(after[name] == data for name, data in before.items())
+    config(2).save_config()  # ns-train overwrites config.yml before anything of ours runs
+    _, pipeline, _, step = eval_setup(first.base_dir / "config.yml")
+    assert step == 3 and len(pipeline.model.field.plan.mpis) == 1
 
 
 # Devices, and the command as a whole ---------------------------------------------------------------------------------
