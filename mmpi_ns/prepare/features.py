@@ -1,0 +1,130 @@
+"""Features of the images and their matches, in a COLMAP database that an interrupted run goes on filling."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import pycolmap
+
+from mmpi_ns.prepare.images import Photo
+from mmpi_ns.prepare.stages import PrepareError, progress
+
+SEED = 0
+BATCH = 8
+"""Images extracted at a time: what an interruption loses."""
+PAIR_BATCH = 64
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Keeps COLMAP's log to errors."""
+    level = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = int(pycolmap.logging.Level.ERROR)
+    try:
+        yield
+    finally:
+        pycolmap.logging.minloglevel = level
+
+
+def create_database(
+    path: Path, photos: Sequence[Photo], numbers: Sequence[int], cameras: Sequence[pycolmap.Camera]
+) -> None:
+    """A database of the images and cameras; image ids follow the images' order, whatever the threads do later."""
+    if path.exists():
+        return
+    partial = path.with_suffix(".partial")
+    partial.unlink(missing_ok=True)
+    model = empty_model(photos, numbers, cameras)
+    with pycolmap.Database.open(partial) as database:
+        for camera in cameras:
+            database.write_camera(camera, use_camera_id=True)
+        for rig in model.rigs.values():
+            database.write_rig(rig, use_rig_id=True)
+        for image_id in range(1, len(photos) + 1):
+            database.write_frame(model.frames[model.images[image_id].frame_id], use_frame_id=True)
+            database.write_image(model.images[image_id], use_image_id=True)
+    partial.rename(path)
+
+
+def empty_model(
+    photos: Sequence[Photo],
+    numbers: Sequence[int],
+    cameras: Sequence[pycolmap.Camera],
+    poses: dict[str, pycolmap.Rigid3d] | None = None,
+) -> pycolmap.Reconstruction:
+    """A reconstruction without points: image i has id i + 1. With poses, only the images that have one."""
+    model = pycolmap.Reconstruction()
+    for camera in cameras:
+        model.add_camera_with_trivial_rig(camera)
+    for i, (photo, number) in enumerate(zip(photos, numbers, strict=True)):
+        image = pycolmap.Image(name=photo.name, camera_id=number, image_id=i + 1)
+        if poses is None:
+            model.add_image_with_trivial_frame(image)
+        elif photo.name in poses:
+            model.add_image_with_trivial_frame(image, poses[photo.name])
+    return model
+
+
+def extract(
+    database: Path, images: Path, photos: Sequence[Photo], masks: Path | None, max_features: int, threads: int
+) -> list[int]:
+    """SIFT features of all images; images that have theirs are skipped.
+
+    Returns:
+        Features of each image.
+
+    Raises:
+        PrepareError: an image cannot be read, or hardly any has features.
+    """
+    options = pycolmap.FeatureExtractionOptions()
+    options.num_threads = threads
+    options.sift.max_num_features = max_features
+    reader = pycolmap.ImageReaderOptions()
+    if masks is not None:
+        reader.mask_path = masks
+    names = [p.name for p in photos]
+    with progress("Finding features", len(names)) as advance, quiet():
+        for start in range(0, len(names), BATCH):
+            batch = names[start : start + BATCH]
+            pycolmap.extract_features(
+                database, images, image_names=batch, reader_options=reader, extraction_options=options
+            )
+            advance(len(batch))
+    with pycolmap.Database.open(database) as opened:
+        counts = [opened.num_keypoints_for_image(i + 1) for i in range(len(names))]
+        for i, name in enumerate(names):
+            if not opened.exists_keypoints(i + 1):
+                raise PrepareError(f"{name} cannot be read by COLMAP: repair or remove it.")
+    if sum(c >= 50 for c in counts) < 2:
+        raise PrepareError(
+            f"Hardly any features: {max(counts)} in the best image. The images are blank, blurred or masked over."
+        )
+    return counts
+
+
+def match(database: Path, photos: Sequence[Photo], pairs: Sequence[tuple[int, int]], threads: int) -> int:
+    """Matches and verifies pairs of images (places in ``photos``); pairs matched before are skipped.
+
+    Returns:
+        Pairs with verified matches.
+    """
+    options = pycolmap.FeatureMatchingOptions()
+    options.num_threads = threads
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = SEED
+    with progress("Matching pairs", len(pairs)) as advance, quiet(), tempfile.TemporaryDirectory() as folder:
+        listing = Path(folder) / "pairs.txt"
+        pairing = pycolmap.ImportedPairingOptions()
+        pairing.match_list_path = listing
+        for start in range(0, len(pairs), PAIR_BATCH):
+            batch = pairs[start : start + PAIR_BATCH]
+            listing.write_text("".join(f"{photos[i].name} {photos[j].name}\n" for i, j in batch), encoding="utf-8")
+            pycolmap.match_image_pairs(
+                database, matching_options=options, pairing_options=pairing, verification_options=verification
+            )
+            advance(len(batch))
+    with pycolmap.Database.open(database) as opened:
+        return opened.num_verified_image_pairs()

@@ -1,0 +1,147 @@
+"""The scene's frame: gravity up and metres where they can be known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from mmpi_ns.prepare.stages import PrepareError
+
+Array = NDArray[np.float64]
+LEVEL_TURN = 0.15
+"""Least share of the cameras' right vectors across their main direction from which gravity can be read."""
+GROUND_TILT = 25.0
+"""Degrees between gravity as the cameras have it and the normal of the ground, at most."""
+
+
+@dataclass(frozen=True)
+class SceneFrame:
+    """How the model was moved into the scene."""
+
+    similarity: pycolmap.Sim3d
+    """Scene from model."""
+    up: str
+    """Where up comes from, in words."""
+    unit: str
+    """What one unit is, in words."""
+
+
+def camera_poses(model: pycolmap.Reconstruction) -> tuple[list[str], Array]:
+    """Names in order of the image ids, and camera to world with OpenCV axes. [N, 4, 4]"""
+    names, poses = [], []
+    for image_id in sorted(model.reg_image_ids()):
+        image = model.images[image_id]
+        names.append(image.name)
+        pose = np.eye(4)
+        pose[:3] = image.cam_from_world().inverse().matrix()
+        poses.append(pose)
+    return names, np.array(poses).reshape(-1, 4, 4)
+
+
+def up_from_cameras(poses: Array) -> Array:
+    """Gravity's opposite, if cameras are held level: across all right vectors where they turn, else the mean up. [3]"""
+    mean = -poses[:, :3, 1].mean(0)
+    mean /= max(float(np.linalg.norm(mean)), 1e-12)
+    values, vectors = np.linalg.eigh(poses[:, :3, 0].T @ poses[:, :3, 0] / len(poses))
+    level = vectors[:, 0] * np.sign(vectors[:, 0] @ mean)
+    turns_enough = values[1] > LEVEL_TURN and values[0] < 0.1 * values[1]
+    return level if turns_enough and level @ mean > 0.5 else mean
+
+
+def fit_ground(points: Array, centers: Array, up: Array, seed: int = 0) -> tuple[Array, float]:
+    """The plane that the cameras stand over.
+
+    Args:
+        points: SfM points. [P, 3]
+        centers: camera centres. [N, 3]
+        up: rough up. [3]
+
+    Returns:
+        Unit normal towards the cameras [3], and the cameras' median height above the plane, in the points' units.
+
+    Raises:
+        PrepareError: too few points below the cameras, or no plane among them.
+    """
+    rng = np.random.default_rng(seed)
+    step = np.linalg.norm(centers - np.median(centers, axis=0), axis=-1).max() + 1e-12
+    nearest = np.linalg.norm(points[:, None] - centers[None, :: max(1, len(centers) // 32)], axis=-1).argmin(1)
+    offset = points - centers[:: max(1, len(centers) // 32)][nearest]
+    height = offset @ up
+    across = np.linalg.norm(offset - height[:, None] * up, axis=-1)
+    below = points[(height < 0) & (-height > 0.05 * across) & (across < 2 * step)]
+    if len(below) < 50:
+        raise PrepareError(
+            f"--camera-height: only {len(below)} points lie below the cameras: too few to find the ground."
+        )
+    best, best_count, best_normal, best_level = -1, 0, up, 0.0
+    tolerance = 0.04 * float(np.median(-((below - np.median(centers, axis=0)) @ up)))
+    for _ in range(2000):
+        a, b, c = below[rng.choice(len(below), 3, replace=False)]
+        normal = np.cross(b - a, c - a)
+        length = np.linalg.norm(normal)
+        if length < 1e-12 or abs(normal @ up) / length < np.cos(np.radians(GROUND_TILT)):
+            continue
+        normal *= np.sign(normal @ up) / length
+        count = int((np.abs((below - a) @ normal) < abs(tolerance)).sum())
+        if count > best_count:
+            best, best_count, best_normal, best_level = 0, count, normal, float(a @ normal)
+    if best < 0 or best_count < 0.15 * len(below):
+        raise PrepareError("--camera-height: the points below the cameras lie on no common plane.")
+    inside = below[np.abs(below @ best_normal - best_level) < abs(tolerance)]
+    center = inside.mean(0)
+    normal = np.linalg.eigh((inside - center).T @ (inside - center))[1][:, 0]
+    normal *= np.sign(normal @ up)
+    return normal, float(np.median((centers - center) @ normal))
+
+
+def rotation_to_z(up: Array, forward: Array) -> Array:
+    """Rotation that takes up to +z and forward, as far as it is level, to +y. [3, 3]"""
+    y = forward - (forward @ up) * up
+    if np.linalg.norm(y) < 1e-6:
+        y = np.cross(up, [1.0, 0.0, 0.0]) if abs(up[0]) < 0.9 else np.cross(up, [0.0, 1.0, 0.0])
+    y = y / np.linalg.norm(y)
+    return np.stack([np.cross(y, up), y, up])
+
+
+def choose_frame(model: pycolmap.Reconstruction, camera_height: float | None) -> SceneFrame:
+    """Up to +z, the first camera's heading to +y, the cameras' middle (or the ground below it) as origin.
+
+    Args:
+        model: in its own frame.
+        camera_height: metres above the ground, or None: then one unit is the extent of the track.
+    """
+    _, poses = camera_poses(model)
+    centers = poses[:, :3, 3]
+    up = up_from_cameras(poses)
+    words = "mean of the cameras, taken to be held level"
+    if camera_height is not None:
+        points = np.array([p.xyz for p in model.points3D.values()])
+        up, height = fit_ground(points, centers, up)
+        if height <= 0:
+            raise PrepareError("--camera-height: the ground found lies above the cameras.")
+        scale, words = camera_height / height, "normal of the ground"
+        unit = f"1 metre, from a camera height of {camera_height:g} m above the ground"
+    else:
+        extent = float(np.ptp(centers @ np.linalg.svd(centers - centers.mean(0))[2][0]))
+        scale, unit = 1 / max(extent, 1e-12), "the extent of the camera track (metres are not known)"
+    rotation = rotation_to_z(up, poses[0, :3, 2])
+    similarity = pycolmap.Sim3d(scale, pycolmap.Rotation3d(rotation), -scale * rotation @ centers.mean(0))
+    return SceneFrame(similarity, words, unit)
+
+
+def similarity_between(source: Array, target: Array) -> pycolmap.Sim3d:
+    """The similarity that takes camera poses to other poses of the same cameras, rotations first.
+
+    Args:
+        source, target: camera to world. [N, 4, 4]
+    """
+    u, _, vt = np.linalg.svd(np.einsum("nij,nkj->ik", target[:, :3, :3], source[:, :3, :3]))
+    rotation = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
+    a = (source[:, :3, 3] - source[:, :3, 3].mean(0)) @ rotation.T
+    b = target[:, :3, 3] - target[:, :3, 3].mean(0)
+    scale = float((a * b).sum() / max((a * a).sum(), 1e-24))
+    translation = target[:, :3, 3].mean(0) - scale * rotation @ source[:, :3, 3].mean(0)
+    return pycolmap.Sim3d(scale, pycolmap.Rotation3d(rotation), translation)

@@ -1,0 +1,186 @@
+"""The images of a capture: which there are, upright copies of them, their masks, and what their EXIF says."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
+
+from mmpi_ns.prepare.stages import CONSOLE, PrepareError, progress, write_text
+
+IMAGES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
+VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg")
+KEPT = {"JPEG": (".jpg", ".jpeg"), "PNG": (".png",)}
+"""Formats that are copied as they are; others become PNG."""
+FILM_WIDTH = 36.0
+"""Millimetres: EXIF's 35-mm equivalent refers to film this wide."""
+
+
+@dataclass(frozen=True)
+class Photo:
+    """An image of the scene."""
+
+    name: str
+    """File name in the scene; no two are alike."""
+    width: int
+    height: int
+    lens: str = ""
+    """What EXIF says about body and lens: images that differ here do not share intrinsics."""
+    exif_focal: float | None = None
+    """Pixels."""
+    source: str = ""
+    """Where it came from, below the input folder."""
+
+
+def find_images(folder: Path) -> list[Path]:
+    """The images in a folder in natural order; those of its subfolders where it has none itself.
+
+    Raises:
+        PrepareError: fewer than two images.
+    """
+    if not folder.is_dir():
+        raise PrepareError(f"{folder} is no folder of images and no video ({', '.join(VIDEOS)}).")
+    found = [p for p in folder.iterdir() if p.suffix.lower() in IMAGES and p.is_file()]
+    found = found or [p for p in folder.rglob("*") if p.suffix.lower() in IMAGES and p.is_file()]
+    if len(found) < 2:
+        count = "no image" if not found else f"one image only ({found[0].name})"
+        raise PrepareError(
+            f"{folder} holds {count} ({', '.join(IMAGES)}): a scene needs at least two views, and rather twenty."
+        )
+    return sorted(found, key=lambda p: natural_key(str(p.relative_to(folder))))
+
+
+def natural_key(text: str) -> list[tuple[int, int | str]]:
+    """Sorts 9 before 10."""
+    return [(0, int(part)) if part.isdigit() else (1, part) for part in re.split(r"(\d+)", text) if part]
+
+
+def scene_names(files: Sequence[Path], folder: Path) -> list[str]:
+    """Names in the scene: the files' own, with their subfolders in front where there are any; no two alike."""
+    names, used = [], set()
+    for file in files:
+        # COLMAP's list of pairs is split at blanks
+        stem = re.sub(r"\s+", "_", "-".join(file.relative_to(folder).with_suffix("").parts))
+        suffix = file.suffix.lower() if file.suffix.lower() in (".jpg", ".jpeg", ".png") else ".png"
+        name = stem + (file.suffix if suffix == file.suffix.lower() else suffix)
+        while Path(name).stem.lower() in used:  # masks and downscaled copies go by the stem
+            name = Path(name).stem + "_" + suffix
+        used.add(Path(name).stem.lower())
+        names.append(name)
+    return names
+
+
+def gather(folder: Path, files: Sequence[Path], target: Path) -> list[Photo]:
+    """Copies images upright into ``target/images`` and notes their sizes and EXIF; skips those already there.
+
+    Raises:
+        PrepareError: an image cannot be read; names the file.
+    """
+    (target / "images").mkdir(parents=True, exist_ok=True)
+    names = scene_names(files, folder)
+    photos = []
+    with progress("Reading images", len(files)) as advance:
+        for file, name in zip(files, names, strict=True):
+            photos.append(_gather_one(file, target / "images" / name, str(file.relative_to(folder))))
+            advance(1)
+    write_photos(photos, target)
+    return photos
+
+
+def write_photos(photos: Sequence[Photo], target: Path) -> None:
+    write_text(target / "photos.json", json.dumps([asdict(p) for p in photos], indent=1))
+
+
+def read_photos(target: Path) -> list[Photo]:
+    """The images that ``gather`` or the frame selection left."""
+    return [Photo(**entry) for entry in json.loads((target / "photos.json").read_text(encoding="utf-8"))]
+
+
+def _gather_one(source: Path, copy: Path, shown: str) -> Photo:
+    try:
+        with Image.open(source) as image:
+            image.load()
+            exif = image.getexif()
+            turned = exif.get(ExifTags.Base.Orientation, 1) not in (0, 1)
+            keep = not turned and source.suffix.lower() in KEPT.get(image.format or "", ())
+            keep = keep and image.mode in ("L", "RGB", "RGBA")
+            width, height = ImageOps.exif_transpose(image).size if turned else image.size
+            partial = copy.with_name(copy.name + ".partial")
+            if not copy.exists():
+                if keep:
+                    shutil.copyfile(source, partial)
+                else:
+                    _convert(image, partial, copy.suffix.lower())
+                partial.replace(copy)
+    except (OSError, UnidentifiedImageError, SyntaxError, ValueError) as error:
+        raise PrepareError(f"{source} cannot be read ({error}): repair or remove it.") from error
+    lens, focal = _read_exif(exif, max(width, height))
+    return Photo(copy.name, width, height, lens, focal, shown)
+
+
+def _convert(image: Image.Image, path: Path, suffix: str) -> None:
+    """Upright 8-bit copy of an image that nerfstudio would show turned or not read."""
+    upright = ImageOps.exif_transpose(image)
+    if upright.mode.startswith(("I", "F")):
+        values = np.asarray(upright, dtype=np.float64)
+        top = 65535.0 if upright.mode.startswith("I") and values.max() > 255 else max(float(values.max()), 1e-9)
+        upright = Image.fromarray(np.clip(values / top * 255, 0, 255).astype(np.uint8))
+    mode = "L" if upright.mode in ("1", "L") else "RGBA" if upright.mode in ("RGBA", "LA", "PA") else "RGB"
+    form = "PNG" if suffix == ".png" else "JPEG"
+    upright = upright.convert("RGB" if form == "JPEG" and mode == "RGBA" else mode)
+    upright.save(path, format=form, **({"quality": 97, "subsampling": 0} if form == "JPEG" else {}))
+
+
+def _read_exif(exif: Image.Exif, longest: int) -> tuple[str, float | None]:
+    """(body and lens in words, focal length in pixels if EXIF gives the 35-mm equivalent)."""
+    details = exif.get_ifd(ExifTags.IFD.Exif)
+    base, tags = ExifTags.Base, (ExifTags.Base.FocalLength, ExifTags.Base.FocalLengthIn35mmFilm)
+    parts = [exif.get(base.Make), exif.get(base.Model), *(details.get(tag) for tag in tags)]
+    lens = " ".join(str(p).strip() for p in parts if p)
+    try:
+        equivalent = float(details.get(tags[1], 0))
+    except (TypeError, ValueError):
+        equivalent = 0.0
+    return lens, equivalent / FILM_WIDTH * longest if equivalent > 0 else None
+
+
+def gather_masks(folder: Path, photos: Sequence[Photo], target: Path) -> int:
+    """Writes a mask for each image to ``target/NAME.png``: white is used, black (zero) is left out.
+
+    Returns:
+        Images that had a mask; the others get an all-white one, since nerfstudio wants all or none.
+
+    Raises:
+        PrepareError: no mask fits an image, or one has another size.
+    """
+    if not folder.is_dir():
+        raise PrepareError(f"--masks {folder} is no folder.")
+    by_stem = {p.stem: p for p in sorted(folder.rglob("*")) if p.suffix.lower() in IMAGES}
+    by_stem |= {Path(stem).stem: p for stem, p in by_stem.items() if Path(stem).suffix.lower() in IMAGES}  # a.jpg.png
+    target.mkdir(parents=True, exist_ok=True)
+    found = 0
+    for photo in photos:
+        stems = (Path(photo.name).stem, Path(photo.source).stem)
+        source = next((by_stem[s] for s in stems if s in by_stem), None)
+        mask = Image.new("L", (photo.width, photo.height), 255)
+        if source is not None:
+            found += 1
+            with Image.open(source) as image:
+                mask = ImageOps.exif_transpose(image).convert("L").point(lambda v: 255 if v else 0)
+            if mask.size != (photo.width, photo.height):
+                raise PrepareError(
+                    f"Mask {source} is {mask.size[0]}x{mask.size[1]}, its image {photo.name} "
+                    f"{photo.width}x{photo.height}: they must be of one size."
+                )
+        mask.save(target / f"{photo.name}.png")
+    if not found:
+        raise PrepareError(f"No mask in {folder} is named like an image (a.png or a.jpg.png for a.jpg).")
+    if found < len(photos):
+        CONSOLE.print(f"[yellow]{len(photos) - found} of {len(photos)} images have no mask: all of them is used.")
+    return found

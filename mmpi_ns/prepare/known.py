@@ -1,0 +1,101 @@
+"""Points from known poses, and the poses themselves refined if asked."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from mmpi_ns.prepare.features import SEED, quiet
+from mmpi_ns.prepare.frame import camera_poses, similarity_between
+from mmpi_ns.prepare.mapping import bundle_options
+from mmpi_ns.prepare.stages import CONSOLE, PrepareError
+
+ROUNDS = 3
+"""Times that poses are refined and the points triangulated anew."""
+MIN_ANGLE = 0.5
+"""Degrees between the rays of a point, at least: driving forward gives little more."""
+COARSE_PX, FINE_PX = 8.0, 4.0
+"""Largest reprojection error of a point: while poses are to be refined, and in the end."""
+LEAST_POINTS = 10
+"""Points an image, on average, without which poses and images do not belong together."""
+
+
+@dataclass(frozen=True)
+class KnownModel:
+    """Known poses with points."""
+
+    model: pycolmap.Reconstruction
+    says: str
+
+
+def solve_known(
+    model: pycolmap.Reconstruction,
+    database: Path,
+    images: Path,
+    refine_poses: bool,
+    refine_intrinsics: bool,
+    threads: int,
+) -> KnownModel:
+    """Triangulates points from the poses of a model, and refines these.
+
+    Args:
+        model: cameras and posed images without points; changed in place.
+        database: features and matches.
+        images: folder of the images.
+        refine_poses: bundle-adjust poses; scale and frame are fitted back to those given.
+        refine_intrinsics: bundle-adjust intrinsics as well.
+        threads: CPU threads; below 1 for all.
+
+    Raises:
+        PrepareError: the poses fit the matches nowhere.
+    """
+    _, given = camera_poses(model)
+    refine = refine_poses or refine_intrinsics
+    model = _triangulate(model, database, images, COARSE_PX if refine else FINE_PX, threads)
+    if model.num_points3D() < LEAST_POINTS * model.num_reg_images():
+        raise PrepareError(
+            f"From the given poses only {model.num_points3D()} points can be triangulated in {model.num_reg_images()} "
+            "images: the camera axes (--poses-axes opencv or opengl), the order of the images, the direction (camera "
+            "to world is wanted) or the intrinsics (--focal, --camera) are not what the poses were made with."
+        )
+    error = model.compute_mean_reprojection_error()
+    says = f"points from known poses, {error:.2f} px"
+    for _ in range(ROUNDS if refine else 0):
+        with quiet():
+            options = bundle_options(refine_poses, refine_intrinsics, False, threads, robust=True)
+            pycolmap.bundle_adjustment(model, options)
+        model = _triangulate(model, database, images, FINE_PX, threads)
+    if refine:
+        _, refined = camera_poses(model)
+        model.transform(similarity_between(refined, given))
+        says = f"{says}; refined, {model.compute_mean_reprojection_error():.2f} px; {_changes(given, model)}"
+    CONSOLE.print(says)
+    return KnownModel(model, says)
+
+
+def _changes(given: np.ndarray, model: pycolmap.Reconstruction) -> str:
+    _, now = camera_poses(model)
+    moved = np.linalg.norm(now[:, :3, 3] - given[:, :3, 3], axis=-1)
+    cosines = np.einsum("nij,nij->n", now[:, :3, :3], given[:, :3, :3])
+    turned = np.degrees(np.arccos(np.clip((cosines - 1) / 2, -1, 1)))
+    return (
+        f"poses moved by {moved.mean():.3g} units (at most {moved.max():.3g}) "
+        f"and turned by {turned.mean():.2f} degrees (at most {turned.max():.2f})"
+    )
+
+
+def _triangulate(
+    model: pycolmap.Reconstruction, database: Path, images: Path, max_error: float, threads: int
+) -> pycolmap.Reconstruction:
+    options = pycolmap.IncrementalPipelineOptions()
+    options.random_seed = options.triangulation.random_seed = SEED
+    options.num_threads = options.mapper.num_threads = threads
+    options.triangulation.min_angle = options.mapper.filter_min_tri_angle = MIN_ANGLE
+    options.triangulation.merge_max_reproj_error = max_error
+    options.triangulation.complete_max_reproj_error = options.mapper.filter_max_reproj_error = max_error
+    options.ba_refine_focal_length = options.ba_refine_extra_params = False
+    with quiet():
+        return pycolmap.triangulate_points(model, database, images, images.parent, clear_points=True, options=options)

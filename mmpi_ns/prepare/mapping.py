@@ -1,0 +1,218 @@
+"""Poses and points from matches: COLMAP's incremental mapper, with settings that are relaxed until they carry."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import pycolmap
+
+from mmpi_ns.prepare.features import SEED, quiet
+from mmpi_ns.prepare.stages import CONSOLE, PrepareError, progress
+
+ENOUGH = 0.95
+"""Share of the images that, once registered, ends the trying."""
+WORTH = 0.97
+"""Share of the reprojection error to which a richer lens must bring it."""
+SNAPSHOT = 40
+"""Images registered between two snapshots, from which an interrupted mapping goes on."""
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """One way to run the mapper."""
+
+    name: str
+    says: str
+    min_matches: int = 15
+    init_min_tri_angle: float = 16.0
+    init_max_forward_motion: float = 0.95
+    init_min_num_inliers: int = 100
+    init_trials: int = 200
+    filter_min_tri_angle: float = 1.5
+    min_angle: float = 1.5
+    abs_pose_min_num_inliers: int = 30
+    abs_pose_min_inlier_ratio: float = 0.25
+
+
+ATTEMPTS = (
+    Attempt("ordinary", "COLMAP's defaults", init_trials=20),
+    Attempt(
+        "forward", "small angles and forward motion allowed", 15, 3.0, 1.0, filter_min_tri_angle=0.5, min_angle=0.5
+    ),
+    Attempt("loose", "few matches and tiny angles allowed", 10, 1.0, 1.0, 40, 200, 0.25, 0.25, 15, 0.12),
+)
+
+
+@dataclass(frozen=True)
+class Mapping:
+    """What the mapper found."""
+
+    models: tuple[pycolmap.Reconstruction, ...]
+    """Separate models, most images first."""
+    folder: Path
+    """Where the first can be read from again."""
+    attempt: str
+    tried: tuple[tuple[str, int], ...]
+    """(attempt, images in its largest model) in order."""
+
+
+def reconstruct(database: Path, images: Path, work: Path, refine: bool, threads: int) -> Mapping:
+    """Runs the attempts in order until one registers nearly all images; the best one counts.
+
+    Args:
+        database: features and matches.
+        images: folder of the images, for the points' colours.
+        work: folder for models and snapshots; holds those of an interrupted run.
+        refine: refine intrinsics.
+        threads: CPU threads; below 1 for all.
+
+    Raises:
+        PrepareError: no attempt found an initial pair.
+    """
+    with pycolmap.Database.open(database) as opened:
+        total, pairs = opened.num_images(), opened.num_verified_image_pairs()
+    if not pairs:
+        raise PrepareError(
+            "No two images have enough matches in common: they do not overlap, or show too little texture. "
+            "Take views with more overlap (two thirds and more)."
+        )
+    best: Mapping | None = None
+    tried: list[tuple[str, int]] = []
+    for attempt in ATTEMPTS:
+        models = _run(attempt, database, images, work / attempt.name, total, refine, threads)
+        size = models[0][0].num_reg_images() if models else 0
+        tried.append((attempt.name, size))
+        CONSOLE.print(f"Mapping, {attempt.name} ({attempt.says}): {size} of {total} images.")
+        if models and (best is None or size > best.models[0].num_reg_images()):
+            best = Mapping(tuple(m for m, _ in models), models[0][1], attempt.name, ())
+        if size >= ENOUGH * total:
+            break
+    if best is None:
+        raise PrepareError(
+            f"No pair of images can start a reconstruction ({pairs} pairs have matches): the camera hardly moved "
+            "(turning on the spot gives no depth), or the focal length is far off: check --focal and --camera."
+        )
+    return replace(best, tried=tuple(tried))
+
+
+def _run(
+    attempt: Attempt, database: Path, images: Path, folder: Path, total: int, refine: bool, threads: int
+) -> list[tuple[pycolmap.Reconstruction, Path]]:
+    """Models of one attempt and their folders, most images first; read back where it was finished before."""
+    done = folder / "done"
+    if not done.exists():
+        start = _latest_snapshot(folder / "snapshots")
+        shutil.rmtree(folder / "models", ignore_errors=True)
+        (folder / "models").mkdir(parents=True)
+        (folder / "snapshots").mkdir(exist_ok=True)
+        options = mapper_options(attempt, refine, threads)
+        options.snapshot_path, options.snapshot_frames_freq = folder / "snapshots", SNAPSHOT
+        if start is not None:
+            CONSOLE.print(f"Mapping, {attempt.name}: goes on from {pycolmap.Reconstruction(start).num_reg_images()}.")
+        with progress(f"Mapping, {attempt.name}", total) as advance, quiet():
+            pycolmap.incremental_mapping(
+                database,
+                images,
+                folder / "models",
+                options,
+                input_path=start or "",
+                initial_image_pair_callback=_step(advance, 2),
+                next_image_callback=_step(advance, 1),
+            )
+        done.touch()
+        shutil.rmtree(folder / "snapshots")
+    models = [(pycolmap.Reconstruction(p), p) for p in sorted((folder / "models").iterdir()) if p.is_dir()]
+    return sorted(models, key=lambda m: -m[0].num_reg_images())
+
+
+def _step(advance: Callable[[int], None], count: int) -> Callable[[], None]:
+    return lambda: advance(count)
+
+
+def _latest_snapshot(folder: Path) -> Path | None:
+    """The newest snapshot that can be read: the last may be cut off."""
+    for path in sorted(folder.glob("*"), reverse=True) if folder.is_dir() else ():
+        try:
+            pycolmap.Reconstruction(path)
+        except (ValueError, RuntimeError, OSError):
+            continue
+        return path
+    return None
+
+
+def mapper_options(attempt: Attempt, refine: bool, threads: int) -> pycolmap.IncrementalPipelineOptions:
+    """The mapper's settings for an attempt, with given intrinsics left alone unless they are to be refined."""
+    options = pycolmap.IncrementalPipelineOptions()
+    options.min_num_matches = attempt.min_matches
+    options.min_model_size = 3
+    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = SEED
+    options.num_threads = options.mapper.num_threads = threads
+    options.init_num_trials = attempt.init_trials
+    mapper = options.mapper
+    mapper.init_min_tri_angle = attempt.init_min_tri_angle
+    mapper.init_max_forward_motion = attempt.init_max_forward_motion
+    mapper.init_min_num_inliers = attempt.init_min_num_inliers
+    mapper.filter_min_tri_angle = attempt.filter_min_tri_angle
+    mapper.abs_pose_min_num_inliers = attempt.abs_pose_min_num_inliers
+    mapper.abs_pose_min_inlier_ratio = attempt.abs_pose_min_inlier_ratio
+    options.triangulation.min_angle = attempt.min_angle
+    options.ba_refine_focal_length = options.ba_refine_extra_params = refine
+    mapper.abs_pose_refine_focal_length = mapper.abs_pose_refine_extra_params = refine
+    return options
+
+
+def bundle_options(
+    refine_poses: bool, refine: bool, principal_point: bool, threads: int, robust: bool = False
+) -> pycolmap.BundleAdjustmentOptions:
+    """Bundle adjustment of points, and of poses and intrinsics if asked."""
+    options = pycolmap.BundleAdjustmentOptions()
+    options.refine_rig_from_world = refine_poses
+    options.refine_focal_length = options.refine_extra_params = refine
+    options.refine_principal_point = principal_point
+    options.print_summary = False
+    options.ceres.solver_options.num_threads = threads
+    if robust:
+        options.ceres.loss_function_type, options.ceres.loss_function_scale = pycolmap.LossFunctionType.CAUCHY, 1.0
+    return options
+
+
+def polish(
+    model: pycolmap.Reconstruction, folder: Path, full_lens: bool, principal_point: bool, threads: int
+) -> pycolmap.Reconstruction:
+    """A last bundle adjustment with what the mapper left fixed, kept where the images bear it out.
+
+    Args:
+        model: left as it is.
+        folder: where the model can be read from again.
+        full_lens: see whether OpenCV's four lens terms fit clearly better than one radial term. Where they do not,
+            they take up something else: driving forward, the principal point.
+        principal_point: refine the principal point.
+        threads: CPU threads; below 1 for all.
+
+    Returns:
+        The model to use.
+    """
+    if principal_point:
+        _adjust(model, True, threads)
+    if not full_lens or not any(c.model.name == "SIMPLE_RADIAL" for c in model.cameras.values()):
+        return model
+    full = pycolmap.Reconstruction(folder)
+    for camera in full.cameras.values():
+        if camera.model.name == "SIMPLE_RADIAL":
+            f, cx, cy, k = camera.params
+            camera.model = pycolmap.CameraModelId.OPENCV
+            camera.params = [f, f, cx, cy, k, 0.0, 0.0, 0.0]
+    _adjust(full, principal_point, threads)
+    before, after = model.compute_mean_reprojection_error(), full.compute_mean_reprojection_error()
+    chosen = "OpenCV's four terms" if after < WORTH * before else "one radial term"
+    CONSOLE.print(f"Lens: {before:.3f} px with one radial term, {after:.3f} px with OpenCV's four: {chosen}.")
+    return full if after < WORTH * before else model
+
+
+def _adjust(model: pycolmap.Reconstruction, principal_point: bool, threads: int) -> None:
+    with quiet():
+        pycolmap.bundle_adjustment(model, bundle_options(True, True, principal_point, threads))
+    model.update_point_3d_errors()

@@ -1,0 +1,227 @@
+"""Known poses: KITTI, TUM, transforms.json and 4x4 text files, matched with the images."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from mmpi_ns.prepare.cameras import Intrinsics
+from mmpi_ns.prepare.images import IMAGES, Photo, natural_key
+from mmpi_ns.prepare.stages import CONSOLE, PrepareError
+
+Array = NDArray[np.float64]
+MAX_LAG = 0.05
+"""Seconds between an image's time stamp and its pose's, at most."""
+FISHEYE = ("OPENCV_FISHEYE", "FISHEYE")
+
+
+@dataclass(frozen=True)
+class KnownPoses:
+    """Poses by image name."""
+
+    poses: dict[str, Array]
+    """Camera to world, OpenCV axes (x right, y down, z forward). [4, 4]"""
+    says: str
+    """Format and how images were matched, in words."""
+    intrinsics: dict[str, Intrinsics] = field(default_factory=dict)
+    """Of the same images, from a transforms.json."""
+    split: dict[str, Any] | None = None
+    """A transforms.json's lists of files."""
+
+
+def read_poses(path: Path, form: str, axes: str, photos: Sequence[Photo]) -> KnownPoses:
+    """Reads known poses and matches them with the images.
+
+    Args:
+        path: a file, or a folder of 4x4 text files.
+        form: kitti, tum, transforms, matrices, or auto.
+        axes: opencv, opengl, or auto (opengl for transforms.json only).
+        photos: the images.
+
+    Raises:
+        PrepareError: the file is not understood, or fits fewer than two images.
+    """
+    if not path.exists():
+        raise PrepareError(f"--poses {path} does not exist.")
+    form = _guess_format(path) if form == "auto" else form
+    if form == "transforms":
+        known = _read_transforms(path, photos)
+    elif form == "matrices":
+        known = _read_matrices(path, photos)
+    else:
+        rows = _read_rows(path, 12 if form == "kitti" else 8)
+        known = _read_kitti(rows, path, photos) if form == "kitti" else _read_tum(rows, path, photos)
+    opengl = axes == "opengl" or (axes == "auto" and form == "transforms")
+    flip = np.diag([1.0, -1.0, -1.0, 1.0]) if opengl else np.eye(4)
+    poses = {n: _rigid(p @ flip, n) for n, p in known.poses.items() if np.isfinite(p).all()}
+    if len(poses) < 2:
+        raise PrepareError(f"--poses {path} has finite poses for {len(poses)} images: at least two are needed.")
+    if len(poses) < len(photos):
+        CONSOLE.print(f"[yellow]{len(photos) - len(poses)} of {len(photos)} images have no pose: left out.")
+    return KnownPoses(poses, known.says, known.intrinsics, known.split)
+
+
+def rigid3d(pose: Array) -> pycolmap.Rigid3d:
+    """World to camera, as COLMAP wants it, of a camera-to-world matrix. [4, 4]"""
+    return pycolmap.Rigid3d(pycolmap.Rotation3d(pose[:3, :3].T), -pose[:3, :3].T @ pose[:3, 3])
+
+
+def _rigid(pose: Array, name: str) -> Array:
+    """The pose with an exact rotation."""
+    u, s, vt = np.linalg.svd(pose[:3, :3])
+    if np.abs(s - 1).max() > 0.02 or np.linalg.det(u @ vt) < 0:
+        raise PrepareError(f"The pose of {name} is no rotation and translation (singular values {s.round(3)}).")
+    fixed = pose.copy()
+    fixed[:3, :3] = u @ vt
+    return fixed
+
+
+def _guess_format(path: Path) -> str:
+    if path.is_dir():
+        return "matrices"
+    if path.suffix.lower() == ".json":
+        return "transforms"
+    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+        fields = line.split("#")[0].replace(",", " ").split()
+        if fields:
+            if len(fields) in (8, 12):
+                return "tum" if len(fields) == 8 else "kitti"
+            break
+    raise PrepareError(
+        f"--poses {path} is not understood: KITTI has 12 numbers a line, TUM 8 (time, position, quaternion x y z w)."
+    )
+
+
+def _read_rows(path: Path, width: int) -> Array:
+    rows = []
+    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
+        fields = line.split("#")[0].replace(",", " ").split()
+        if not fields:
+            continue
+        try:
+            rows.append([float(f) for f in fields])
+        except ValueError as error:
+            raise PrepareError(f"{path}, line {number}: {error}.") from error
+        if len(rows[-1]) != width:
+            raise PrepareError(f"{path}, line {number}: {len(fields)} numbers, not {width}.")
+    return np.array(rows, dtype=np.float64).reshape(-1, width)
+
+
+def _frame_numbers(photos: Sequence[Photo]) -> list[int] | None:
+    """The last number in each source name, where all have one and no two are alike."""
+    found = [re.findall(r"\d+", Path(p.source).stem) for p in photos]
+    numbers = [int(f[-1]) for f in found if f]
+    return numbers if len(set(numbers)) == len(photos) else None
+
+
+def _read_kitti(rows: Array, path: Path, photos: Sequence[Photo]) -> KnownPoses:
+    """A line an image; with more lines than images, the numbers in the file names choose (counted from 0)."""
+    matrices = np.concatenate([rows.reshape(-1, 3, 4), np.tile([[[0.0, 0.0, 0.0, 1.0]]], (len(rows), 1, 1))], 1)
+    places: Sequence[int] = range(len(photos))
+    says = "KITTI poses, a line an image"
+    if len(rows) != len(photos):
+        numbers = _frame_numbers(photos)
+        if len(rows) < len(photos) or numbers is None or max(numbers) >= len(rows):
+            raise PrepareError(f"{path} has {len(rows)} poses for {len(photos)} images: they cannot be matched.")
+        places, says = numbers, "KITTI poses, the lines that the images' numbers name (from 0)"
+    return KnownPoses({p.name: matrices[i] for p, i in zip(photos, places, strict=True)}, says)
+
+
+def _read_tum(rows: Array, path: Path, photos: Sequence[Photo]) -> KnownPoses:
+    """By time stamp where the file names are time stamps, else a line an image."""
+    if not len(rows):
+        raise PrepareError(f"{path} holds no pose.")
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    for pose, row in zip(poses, rows, strict=True):
+        pose[:3, :3] = pycolmap.Rotation3d(row[4:8]).matrix() if np.linalg.norm(row[4:8]) > 0 else np.nan
+        pose[:3, 3] = row[1:4]
+    stamps = [_time_stamp(p.source) for p in photos]
+    matched: dict[str, Array] = {}
+    for photo, stamp in zip(photos, stamps, strict=True):
+        nearest = int(np.abs(rows[:, 0] - stamp).argmin()) if stamp is not None else 0
+        if stamp is not None and abs(rows[nearest, 0] - stamp) <= MAX_LAG:
+            matched[photo.name] = poses[nearest]
+    if 2 * len(matched) >= len(photos):
+        return KnownPoses(matched, f"TUM poses, matched by time stamp within {MAX_LAG} s")
+    if len(rows) != len(photos):
+        raise PrepareError(
+            f"{path} has {len(rows)} poses for {len(photos)} images, and the images' names are not their time stamps."
+        )
+    return KnownPoses({p.name: pose for p, pose in zip(photos, poses, strict=True)}, "TUM poses, a line an image")
+
+
+def _time_stamp(source: str) -> float | None:
+    found = re.findall(r"\d+\.\d+|\d+", Path(source).stem if Path(source).suffix.lower() in IMAGES else source)
+    return float(found[-1]) if found else None
+
+
+def _read_matrices(path: Path, photos: Sequence[Photo]) -> KnownPoses:
+    """A text file an image, of its name, or else in order."""
+    if not path.is_dir():
+        raise PrepareError(f"--poses {path}: 4x4 matrices are read from a folder, one text file an image.")
+    files = sorted(
+        (p for p in path.iterdir() if p.suffix.lower() in (".txt", ".mat", "")), key=lambda p: natural_key(p.name)
+    )
+    by_stem = {_pose_stem(p): p for p in files if p.is_file()}
+    chosen = {p.name: by_stem[s] for p in photos for s in (_pose_stem(Path(p.source)),) if s in by_stem}
+    says = "4x4 matrices, by name"
+    if len(chosen) < 2:
+        if len(files) != len(photos):
+            raise PrepareError(f"{path} has {len(files)} files for {len(photos)} images, and the names do not match.")
+        chosen, says = {p.name: f for p, f in zip(photos, files, strict=True)}, "4x4 matrices, in order"
+    poses = {}
+    for name, file in chosen.items():
+        try:
+            matrix = np.loadtxt(file, dtype=np.float64)
+        except ValueError as error:
+            raise PrepareError(f"{file} cannot be read ({error}).") from error
+        if matrix.shape not in ((4, 4), (3, 4)):
+            raise PrepareError(f"{file} is {matrix.shape}, not 4x4.")
+        poses[name] = np.vstack([matrix[:3], [0.0, 0.0, 0.0, 1.0]])
+    return KnownPoses(poses, says)
+
+
+def _pose_stem(path: Path) -> str:
+    """Name without what tells images and poses apart: frame-000001.color.png and frame-000001.pose.txt."""
+    return re.sub(r"[._-]?(pose|color|rgb|image)s?$", "", path.stem, flags=re.IGNORECASE)
+
+
+def _read_transforms(path: Path, photos: Sequence[Photo]) -> KnownPoses:
+    """By file name, with intrinsics and lists of train and test files where the file has them."""
+    path = path / "transforms.json" if path.is_dir() else path
+    try:
+        meta = json.loads(path.read_text(encoding="utf-8"))
+        frames = {Path(f["file_path"]).stem: f for f in meta["frames"]}
+        poses, intrinsics = {}, {}
+        for photo in photos:
+            frame = frames.get(Path(photo.name).stem) or frames.get(Path(photo.source).stem)
+            if frame is None:
+                continue
+            poses[photo.name] = np.array(frame["transform_matrix"], dtype=np.float64).reshape(4, 4)
+            if "fl_x" in meta or "fl_x" in frame:
+                intrinsics[photo.name] = _frame_intrinsics({**meta, **frame}, photo)
+    except (ValueError, KeyError, TypeError) as error:
+        raise PrepareError(f"--poses {path} is no transforms.json as nerfstudio writes it ({error!r}).") from error
+    split = meta if "train_filenames" in meta and "test_filenames" in meta else None
+    return KnownPoses(poses, "poses of a transforms.json, by name", intrinsics, split)
+
+
+def _frame_intrinsics(frame: dict[str, Any], photo: Photo) -> Intrinsics:
+    """Of a frame, for images that may be smaller or larger than those the file tells of."""
+    fisheye = frame.get("camera_model") in FISHEYE
+    keys = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2")
+    sx, sy = photo.width / frame.get("w", photo.width), photo.height / frame.get("h", photo.height)
+    if abs(sx / sy - 1) > 0.02:
+        raise PrepareError(f"{photo.name} is {photo.width}x{photo.height}, transforms.json says otherwise.")
+    fx, fy = float(frame["fl_x"]), float(frame.get("fl_y", frame["fl_x"]))
+    cx, cy = float(frame.get("cx", photo.width / sx / 2)), float(frame.get("cy", photo.height / sy / 2))
+    lens = tuple(float(frame.get(k, 0.0)) for k in keys)
+    return Intrinsics(fx * sx, fy * sy, cx * sx, cy * sy, lens, fisheye)  # type: ignore[arg-type]

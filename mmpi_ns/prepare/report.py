@@ -1,0 +1,140 @@
+"""report.md: what came out, in figures and words, with a top view of the track."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from mmpi_ns.prepare.checks import Finding, coverage
+from mmpi_ns.prepare.export import Split
+from mmpi_ns.prepare.frame import camera_poses
+from mmpi_ns.prepare.stages import write_text
+
+WORST = 5
+"""Images of the least coverage that are listed."""
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What the report tells beyond the model."""
+
+    source: str
+    offered: int
+    """Images given (or chosen from the video)."""
+    missing: Sequence[str]
+    """Images without a pose."""
+    groups: Sequence[Sequence[str]]
+    """Images of models that are not connected to this one."""
+    matching: str
+    mapping: str
+    up: str
+    unit: str
+    split: Split
+    findings: Sequence[Finding]
+    notes: Sequence[str]
+    times: dict[str, float]
+    """Seconds of each stage that ran this time."""
+
+
+def write_report(model: pycolmap.Reconstruction, facts: Facts, scene: Path) -> str:
+    """Writes report.md and report/track.png; returns the text."""
+    (scene / "report").mkdir(parents=True, exist_ok=True)
+    _draw_track(model, facts.findings, scene / "report" / "track.png")
+    covered = coverage(model)
+    parts = [
+        f"# {facts.source}\n",
+        "\n".join(_table(model, facts, covered)),
+        "\n## Warnings\n",
+        "\n".join(_warnings(facts)) or "None.",
+        "\n## Track from above\n\n![track](report/track.png)\n",
+        "## Cameras\n",
+        "\n".join(f"- {camera_in_words(c)}" for _, c in sorted(model.cameras.items())),
+        "\n## Coverage\n",
+        "Share of an image's cells (8 x 6) that hold a keypoint with a point; the least:\n",
+        "\n".join(f"- {n}: {v:.0%}" for n, v in sorted(covered.items(), key=lambda x: x[1])[:WORST]),
+        "\n## Notes\n",
+        "\n".join(f"- {n}" for n in facts.notes) or "None.",
+    ]
+    text = "\n".join(parts) + "\n"
+    write_text(scene / "report.md", text)
+    return text
+
+
+def _table(model: pycolmap.Reconstruction, facts: Facts, covered: dict[str, float]) -> list[str]:
+    rows = {
+        "images registered": f"{model.num_reg_images()} of {facts.offered}",
+        "reprojection error": f"{model.compute_mean_reprojection_error():.3f} px",
+        "points": f"{model.num_points3D()}",
+        "track length": f"{model.compute_mean_track_length():.1f} images",
+        "points seen by an image": f"{model.compute_mean_observations_per_reg_image():.0f}",
+        "coverage": f"{np.mean(list(covered.values())):.0%} on average, {min(covered.values()):.0%} at least",
+        "matching": facts.matching,
+        "mapping": facts.mapping,
+        "up": facts.up,
+        "unit": facts.unit,
+        "split": f"{len(facts.split.train)} train, {len(facts.split.test)} test: {facts.split.says}",
+        "times": ", ".join(f"{name} {seconds:.0f} s" for name, seconds in facts.times.items()),
+    }
+    return ["| | |", "|---|---|", *(f"| {k} | {v} |" for k, v in rows.items())]
+
+
+def _warnings(facts: Facts) -> list[str]:
+    lines = []
+    if facts.missing:
+        lines.append(f"- {len(facts.missing)} images have no pose and are left out: {in_short(facts.missing)}")
+    for group in facts.groups:
+        lines.append(f"- {len(group)} images form a group of their own, not connected to the scene: {in_short(group)}")
+    for finding in facts.findings:
+        lines.append(f"- {finding.image + ': ' if finding.image else ''}{finding.says}")
+    return lines
+
+
+def in_short(names: Sequence[str], most: int = 8) -> str:
+    listed = ", ".join(sorted(names)[:most])
+    return listed + (f" and {len(names) - most} more" if len(names) > most else "")
+
+
+def camera_in_words(camera: pycolmap.Camera) -> str:
+    params = ", ".join(f"{v:.5g}" for v in camera.params)
+    return f"{camera.model.name} {camera.width}x{camera.height}: {camera.params_info} = {params}"
+
+
+def _draw_track(model: pycolmap.Reconstruction, findings: Sequence[Finding], path: Path) -> None:
+    """Cameras and points from above."""
+    names, poses = camera_poses(model)
+    axes = _horizontal(poses)
+    centers, facing = poses[:, :3, 3] @ axes, poses[:, :3, 2] @ axes
+    points = np.array([p.xyz for p in model.points3D.values()]).reshape(-1, 3) @ axes
+    reach = 0.6 * max(float(np.ptp(centers, axis=0).max()), 1e-9)
+    low, high = centers.min(0) - reach, centers.max(0) + reach
+    figure = Figure(figsize=(8, 8), layout="constrained")
+    plot = figure.add_subplot(aspect="equal", xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+    plot.plot(*points.T, ",", color="0.55")
+    plot.plot(*centers.T, "-", color="tab:blue", linewidth=1)
+    plot.quiver(*centers.T, *facing.T, color="tab:blue", angles="xy", width=0.002, scale=40)
+    marked = [names.index(f.image) for f in findings if f.image in names and f.says.startswith("misplaced")]
+    plot.plot(*centers[marked].T, "o", color="tab:red", fillstyle="none", label="misplaced?")
+    plot.annotate(names[0], centers[0])
+    plot.annotate(names[-1], centers[-1])
+    figure.savefig(path, dpi=110)
+
+
+def _horizontal(poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Two axes across the cameras' mean up, whatever frame the scene is in. [3, 2]"""
+    up = -poses[:, :3, 1].mean(0)
+    up /= max(float(np.linalg.norm(up)), 1e-12)
+    nearest = np.argmax(np.abs(up))
+    if abs(up[nearest]) > 0.9:  # keep the scene's own axes where one of them is about vertical
+        kept = [i for i in range(3) if i != nearest]
+        axes = np.eye(3)[kept]
+        if np.dot(np.cross(*axes), up) < 0:
+            axes = axes[::-1]
+        return axes.T
+    right = np.linalg.svd(np.eye(3) - np.outer(up, up))[0][:, 0]
+    return np.stack([right, np.cross(up, right)], -1)

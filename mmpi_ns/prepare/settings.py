@@ -1,0 +1,77 @@
+"""The options of mmpi-prepare."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from mmpi_ns.prepare.cameras import Lens, Sharing
+from mmpi_ns.prepare.pairs import Matching
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Makes a scene for ns-train of a folder of images or a video, by structure from motion or from known poses.
+
+    An interrupted run goes on where it stopped when it is started again with the same options.
+    """
+
+    input: tyro.conf.Positional[Path]
+    """Folder of images, or a video."""
+    scene: tyro.conf.Positional[Path]
+    """Folder for the scene."""
+    masks: Path | None = None
+    """Folder of masks named like the images; black is left out, in SfM and in training."""
+    poses: Path | None = None
+    """Known poses: a KITTI or TUM file, a transforms.json, or a folder of 4x4 text files."""
+    poses_format: Literal["auto", "kitti", "tum", "transforms", "matrices"] = "auto"
+    """Format of --poses."""
+    poses_axes: Literal["auto", "opencv", "opengl"] = "auto"
+    """Camera axes of --poses (camera to world): auto is opengl for transforms.json and opencv for the others."""
+    refine_poses: bool = False
+    """Refine known poses by bundle adjustment; frame and scale stay those given."""
+    focal: float | None = None
+    """Focal length in pixels of the input images; kept as it is unless --refine-intrinsics."""
+    camera: tuple[float, ...] | None = None
+    """f cx cy | fx fy cx cy | fx fy cx cy k1 k2 p1 p2 in pixels of the input; kept unless --refine-intrinsics."""
+    lens: Lens = "auto"
+    """Distortion where --camera gives none. auto: none with --focal; else one radial term, at last OpenCV's four."""
+    intrinsics: Sharing = "auto"
+    """auto: images of one size and one EXIF body and lens share a camera."""
+    refine_intrinsics: bool = False
+    """Refine given intrinsics."""
+    refine_principal_point: bool = False
+    """Refine the principal point as well, at the end; otherwise it stays at the image's middle."""
+    undistort: bool = False
+    """Undo lens distortion instead of keeping it in transforms.json."""
+    matching: Matching = "auto"
+    """auto: all pairs of few images, neighbours and revisits of a sequence, look-alikes of many."""
+    overlap: int = 10
+    """Frames of a sequence that each is matched with, before and after."""
+    max_features: int = 4096
+    """SIFT features of an image."""
+    camera_height: float | None = None
+    """Metres of the camera above the ground: gives the scale, and up from the ground's normal."""
+    test_every: int | None = None
+    """One image in so many tests (8 unless said otherwise); 0: all train and test."""
+    train_every: int | None = None
+    """One image in so many trains, the others test."""
+    split_from: Path | None = None
+    """A JSON file whose train_filenames and test_filenames to use, such as another scene's transforms.json."""
+    downscales: tuple[int, ...] = (2, 4)
+    """Factors of downscaled copies."""
+    max_frames: int = 300
+    """Most frames to take from a video."""
+    frame_motion: float = 0.02
+    """Median motion between frames taken from a video, as a share of the image width."""
+    allow_partial: bool = False
+    """Make a scene even when less than half of the images are registered."""
+    overwrite: bool = False
+    """Replace what the scene folder holds; the old files are moved to a folder beside the new ones."""
+    keep_work: bool = False
+    """Keep the features, matches and models in SCENE/.prepare."""
+    threads: Annotated[int, tyro.conf.arg(metavar="N")] = -1
+    """CPU threads; -1 for all cores."""

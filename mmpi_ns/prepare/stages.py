@@ -1,0 +1,84 @@
+"""What makes an interrupted preparation go on where it stopped: each stage knows what it was made from."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TypeVar
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+T = TypeVar("T")
+
+CONSOLE = Console(width=120)
+
+
+class PrepareError(Exception):
+    """The input cannot be made into a scene; the message says why and what to do."""
+
+
+class Stages:
+    """Stages of a preparation, run in order, each skipped when it was finished before from the same settings.
+
+    A stage's outputs stay valid while its own settings and those of all stages before it stay as they were. The first
+    stage whose settings changed is emptied, and so are all after it. A stage that was interrupted finds its own
+    partial output again.
+    """
+
+    def __init__(self, work: Path) -> None:
+        self.work = work
+        self._key = ""
+        work.mkdir(parents=True, exist_ok=True)
+
+    def run(self, name: str, settings: Any, stage: Callable[[Path], T], load: Callable[[Path], T]) -> T:
+        """Runs a stage in its own folder, or loads what it left there.
+
+        Args:
+            name: the folder's name.
+            settings: everything the result depends on beyond the stages before; JSON or text.
+            stage: makes the result; may find its own partial output in the folder.
+            load: reads the result of a finished stage.
+        """
+        text = self._key + name + json.dumps(settings, sort_keys=True, default=str)
+        self._key = hashlib.sha256(text.encode()).hexdigest()
+        folder, stamp = self.work / name, self.work / f"{name}.json"
+        state = _read_json(stamp)
+        if state.get("key") != self._key:
+            shutil.rmtree(folder, ignore_errors=True)
+            write_text(stamp, json.dumps({"key": self._key, "finished": False}))
+        elif state.get("finished"):
+            CONSOLE.print(f"[dim]{name}: done before[/dim]")
+            return load(folder)
+        folder.mkdir(exist_ok=True)
+        result = stage(folder)
+        write_text(stamp, json.dumps({"key": self._key, "finished": True}))
+        return result
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}  # never written, or cut off while being written: the stage starts over
+
+
+def write_text(path: Path, text: str) -> None:
+    """Writes a file whole or not at all."""
+    partial = path.with_name(path.name + ".partial")
+    partial.write_text(text, encoding="utf-8")
+    os.replace(partial, path)
+
+
+@contextmanager
+def progress(what: str, total: int | None) -> Iterator[Callable[[int], None]]:
+    """A progress bar; yields a function that advances it by so many."""
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=CONSOLE) as bar:
+        task = bar.add_task(what, total=total)
+        yield lambda count=1: bar.advance(task, count)

@@ -1,0 +1,162 @@
+"""Frames of a video, chosen by how far the image has moved and how sharp they are."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mmpi_ns.prepare.checks import sharpness
+from mmpi_ns.prepare.images import Photo, write_photos
+from mmpi_ns.prepare.stages import CONSOLE, PrepareError, progress, write_text
+
+TRACK_WIDTH = 320
+"""Width at which motion is measured."""
+LOST = 0.15
+"""Motion, as a share of the width, put down for frames that cannot be tracked from the last (a cut, a blank)."""
+MOST_MOTION = 0.15
+"""Motion between chosen frames beyond which SfM gets difficult."""
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What the first pass over a video finds for each frame."""
+
+    motion: NDArray[np.float64]
+    """Median motion since the frame before, as a share of the width. [N]"""
+    sharp: NDArray[np.float64]
+    """Sharpness. [N]"""
+
+
+def select_frames(video: Path, target: Path, max_frames: int, step: float) -> list[Photo]:
+    """Writes the chosen frames of a video to ``target/images``.
+
+    Raises:
+        PrepareError: the video cannot be read, or shows no motion.
+    """
+    log = target / "motion.json"
+    if not log.exists():
+        measured = measure(video)
+        write_text(log, json.dumps({"motion": measured.motion.tolist(), "sharp": measured.sharp.tolist()}))
+    read = json.loads(log.read_text(encoding="utf-8"))
+    measured = Measured(np.array(read["motion"]), np.array(read["sharp"]))
+    chosen, used = choose_frames(measured, max_frames, step)
+    if len(chosen) < 2:
+        raise PrepareError(f"{video} shows no motion in {len(measured.motion)} frames: there is no second view.")
+    CONSOLE.print(
+        f"{len(chosen)} of {len(measured.motion)} frames taken: "
+        f"the sharpest for every {used:.1%} of the width of motion."
+    )
+    if used > MOST_MOTION:
+        CONSOLE.print(
+            f"[yellow]{used:.0%} of the width between frames is much: raise --max-frames above {max_frames} "
+            "or cut the video into shorter ones."
+        )
+    photos = _write_frames(video, target, chosen)
+    write_photos(photos, target)
+    return photos
+
+
+def measure(video: Path) -> Measured:
+    """First pass: motion and sharpness of every frame; holds two small frames at a time.
+
+    Raises:
+        PrepareError: the video cannot be read.
+    """
+    capture, total = _open(video)
+    motion, sharp = [], []
+    last = None
+    with progress("Looking through the video", total or None) as advance:
+        while True:
+            ok, frame = capture.read()
+            if not ok:
+                break
+            gray = cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
+            sharp.append(sharpness(gray))  # type: ignore[arg-type]
+            scale = TRACK_WIDTH / gray.shape[1]
+            small = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+            motion.append(0.0 if last is None else median_motion(last, small))  # type: ignore[arg-type]
+            last = small
+            advance(1)
+    capture.release()
+    if not motion:
+        raise PrepareError(f"{video} holds no frame that can be read: it is damaged, or its codec is unknown here.")
+    if total and len(motion) < 0.9 * total:
+        CONSOLE.print(f"[yellow]{video.name} breaks off after {len(motion)} of {total} frames: the rest is left out.")
+    return Measured(np.array(motion), np.array(sharp))
+
+
+def _open(video: Path) -> tuple[cv2.VideoCapture, int]:
+    capture = cv2.VideoCapture(str(video))
+    if not capture.isOpened():
+        raise PrepareError(f"{video} cannot be opened as a video: it is damaged, or its codec is unknown here.")
+    return capture, max(0, int(capture.get(cv2.CAP_PROP_FRAME_COUNT)))
+
+
+def median_motion(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> float:
+    """Median optical flow of corners between two gray images, as a share of the width."""
+    corners = cv2.goodFeaturesToTrack(before, 200, 0.01, 7)
+    if corners is None or len(corners) < 8:
+        return LOST
+    moved, found, _ = cv2.calcOpticalFlowPyrLK(before, after, corners, None, winSize=(15, 15), maxLevel=3)  # type: ignore[call-overload]
+    back, found_back, _ = cv2.calcOpticalFlowPyrLK(after, before, moved, None, winSize=(15, 15), maxLevel=3)  # type: ignore[call-overload]
+    good = (found & found_back).ravel().astype(bool) & (np.linalg.norm(back - corners, axis=-1).ravel() < 1)
+    if good.sum() < 8:
+        return LOST
+    return float(np.median(np.linalg.norm(moved - corners, axis=-1).ravel()[good])) / before.shape[1]
+
+
+def choose_frames(measured: Measured, max_frames: int, step: float) -> tuple[list[int], float]:
+    """The sharpest frame of every stretch of equal motion.
+
+    A camera that stands still adds no frame. The first and last stretch give theirs too.
+
+    Args:
+        measured: motion and sharpness of every frame.
+        max_frames: no more frames than this; the step grows to keep to it.
+        step: motion of a stretch, as a share of the width.
+
+    Returns:
+        Indices of the frames, and the step used.
+    """
+    path = np.cumsum(measured.motion)
+    used = max(step, float(path[-1]) / max(max_frames - 1, 1) * (1 + 1e-9))
+    stretch = np.floor(path / used + 0.5).astype(int)
+    chosen = []
+    for number in np.unique(stretch):
+        own = np.nonzero(stretch == number)[0]
+        # near the middle of its stretch, unless another is clearly sharper: keeps the spacing even
+        off = np.abs(path[own] / used - number)
+        chosen.append(int(own[np.argmax(measured.sharp[own] * (1 - 0.5 * off))]))
+    return chosen, used
+
+
+def _write_frames(video: Path, target: Path, chosen: list[int]) -> list[Photo]:
+    """Second pass: writes the chosen frames, named by their place in the video."""
+    (target / "images").mkdir(exist_ok=True)
+    capture, _ = _open(video)
+    wanted, photos = set(chosen), []
+    with progress("Writing frames", len(chosen)) as advance:
+        for index in range(chosen[-1] + 1):
+            if not capture.grab():
+                raise PrepareError(f"{video} could be read to frame {index - 1} this time: it changed, or is damaged.")
+            if index not in wanted:
+                continue
+            _, frame = capture.retrieve()
+            name = f"frame_{index:06d}.jpg"
+            path = target / "images" / name
+            if not path.exists():
+                ok, data = cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, 97])
+                if not ok:
+                    raise PrepareError(f"Frame {index} of {video} cannot be written.")
+                partial = path.with_suffix(".partial")
+                partial.write_bytes(data.tobytes())
+                partial.replace(path)
+            photos.append(Photo(name, frame.shape[1], frame.shape[0], source=name))
+            advance(1)
+    capture.release()
+    return photos
