@@ -12,8 +12,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from mmpi_ns.prepare.features import quiet
-from mmpi_ns.prepare.mapping import bundle_options
+from mmpi_ns.prepare.mapping import adjust, bundle_options
 from mmpi_ns.prepare.stages import PrepareError
 
 Array = NDArray[np.float64]
@@ -190,9 +189,7 @@ def doubtful_intrinsics(model: pycolmap.Reconstruction, fixed: bool, copy: Path,
     if fixed:
         free = pycolmap.Reconstruction(copy)
         before = free.compute_mean_reprojection_error()
-        with quiet():
-            pycolmap.bundle_adjustment(free, bundle_options(True, True, False, threads, robust=True))
-        free.update_point_3d_errors()
+        adjust(free, bundle_options(True, True, False, threads, robust=True))
         after = free.compute_mean_reprojection_error()
         for number, camera in model.cameras.items():
             given, fits = camera.mean_focal_length(), free.cameras[number].mean_focal_length()

@@ -16,6 +16,8 @@ SEED = 0
 BATCH = 8
 """Images extracted at a time: what an interruption loses."""
 PAIR_BATCH = 64
+MIN_INLIERS = 15
+"""Matches from which a pair counts: COLMAP's own limit."""
 
 
 @contextmanager
@@ -126,5 +128,24 @@ def match(database: Path, photos: Sequence[Photo], pairs: Sequence[tuple[int, in
                 database, matching_options=options, pairing_options=pairing, verification_options=verification
             )
             advance(len(batch))
+    return count_matching_pairs(database)
+
+
+def count_matching_pairs(database: Path) -> int:
+    """Pairs with enough matches that one motion of the camera explains."""
     with pycolmap.Database.open(database) as opened:
-        return opened.num_verified_image_pairs()
+        _, inliers = opened.read_two_view_geometry_num_inliers()
+    return sum(n >= MIN_INLIERS for n in inliers)
+
+
+def matched_keypoints(database: Path, image_ids: Sequence[int]) -> int:
+    """Keypoints of these images with a verified match in another of them."""
+    wanted, found = set(image_ids), {i: set() for i in image_ids}
+    with pycolmap.Database.open(database) as opened:
+        pairs, geometries = opened.read_two_view_geometries()
+    for pair, geometry in zip(pairs, geometries, strict=True):
+        a, b = pycolmap.pair_id_to_image_pair(pair)
+        if a in wanted and b in wanted:
+            found[a].update(geometry.inlier_matches[:, 0].tolist())
+            found[b].update(geometry.inlier_matches[:, 1].tolist())
+    return sum(len(keypoints) for keypoints in found.values())

@@ -13,6 +13,8 @@ from mmpi_ns.prepare.stages import PrepareError
 Array = NDArray[np.float64]
 LEVEL_TURN = 0.15
 """Least share of the cameras' right vectors across their main direction from which gravity can be read."""
+LEAST_GROUND, GROUND_SHARE = 50, 0.15
+"""Points below the cameras that are needed to look for the ground, and the share of them that must lie on it."""
 GROUND_TILT = 25.0
 """Degrees between gravity as the cameras have it and the normal of the ground, at most."""
 
@@ -65,36 +67,43 @@ def fit_ground(points: Array, centers: Array, up: Array, seed: int = 0) -> tuple
     Raises:
         PrepareError: too few points below the cameras, or no plane among them.
     """
-    rng = np.random.default_rng(seed)
-    step = np.linalg.norm(centers - np.median(centers, axis=0), axis=-1).max() + 1e-12
-    nearest = np.linalg.norm(points[:, None] - centers[None, :: max(1, len(centers) // 32)], axis=-1).argmin(1)
-    offset = points - centers[:: max(1, len(centers) // 32)][nearest]
-    height = offset @ up
-    across = np.linalg.norm(offset - height[:, None] * up, axis=-1)
-    below = points[(height < 0) & (-height > 0.05 * across) & (across < 2 * step)]
-    if len(below) < 50:
+    below = _below_cameras(points, centers, up)
+    if len(below) < LEAST_GROUND:
         raise PrepareError(
             f"--camera-height: only {len(below)} points lie below the cameras: too few to find the ground."
         )
-    best, best_count, best_normal, best_level = -1, 0, up, 0.0
-    tolerance = 0.04 * float(np.median(-((below - np.median(centers, axis=0)) @ up)))
+    depth = float(np.median(-((below - np.median(centers, axis=0)) @ up)))
+    inside = _largest_plane(below, up, 0.04 * abs(depth), np.random.default_rng(seed))
+    if inside.sum() < GROUND_SHARE * len(below):
+        raise PrepareError("--camera-height: the points below the cameras lie on no common plane.")
+    center = below[inside].mean(0)
+    normal = np.linalg.eigh((below[inside] - center).T @ (below[inside] - center))[1][:, 0]
+    normal *= np.sign(normal @ up)
+    return normal, float(np.median((centers - center) @ normal))
+
+
+def _below_cameras(points: Array, centers: Array, up: Array) -> Array:
+    """Points that lie below the nearest camera and near the track. [Q, 3]"""
+    some = centers[:: max(1, len(centers) // 32)]
+    reach = 2 * np.linalg.norm(centers - np.median(centers, axis=0), axis=-1).max()
+    offset = points - some[np.linalg.norm(points[:, None] - some[None], axis=-1).argmin(1)]
+    height = offset @ up
+    across = np.linalg.norm(offset - height[:, None] * up, axis=-1)
+    return points[(height < 0) & (-height > 0.05 * across) & (across < reach)]
+
+
+def _largest_plane(points: Array, up: Array, tolerance: float, rng: np.random.Generator) -> NDArray[np.bool_]:
+    """Points of the most populous plane among roughly level ones, by RANSAC. [Q]"""
+    best = np.zeros(len(points), dtype=bool)
     for _ in range(2000):
-        a, b, c = below[rng.choice(len(below), 3, replace=False)]
+        a, b, c = points[rng.choice(len(points), 3, replace=False)]
         normal = np.cross(b - a, c - a)
         length = np.linalg.norm(normal)
         if length < 1e-12 or abs(normal @ up) / length < np.cos(np.radians(GROUND_TILT)):
             continue
-        normal *= np.sign(normal @ up) / length
-        count = int((np.abs((below - a) @ normal) < abs(tolerance)).sum())
-        if count > best_count:
-            best, best_count, best_normal, best_level = 0, count, normal, float(a @ normal)
-    if best < 0 or best_count < 0.15 * len(below):
-        raise PrepareError("--camera-height: the points below the cameras lie on no common plane.")
-    inside = below[np.abs(below @ best_normal - best_level) < abs(tolerance)]
-    center = inside.mean(0)
-    normal = np.linalg.eigh((inside - center).T @ (inside - center))[1][:, 0]
-    normal *= np.sign(normal @ up)
-    return normal, float(np.median((centers - center) @ normal))
+        inside = np.abs((points - a) @ normal) < tolerance * length
+        best = inside if inside.sum() > best.sum() else best
+    return best
 
 
 def rotation_to_z(up: Array, forward: Array) -> Array:

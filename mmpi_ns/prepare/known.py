@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from mmpi_ns.prepare.features import SEED, quiet
+from mmpi_ns.prepare.features import SEED, matched_keypoints, quiet
 from mmpi_ns.prepare.frame import camera_poses, similarity_between
-from mmpi_ns.prepare.mapping import bundle_options
+from mmpi_ns.prepare.mapping import adjust, bundle_options
 from mmpi_ns.prepare.stages import CONSOLE, PrepareError
 
 ROUNDS = 3
@@ -19,8 +19,8 @@ MIN_ANGLE = 0.5
 """Degrees between the rays of a point, at least: driving forward gives little more."""
 COARSE_PX, FINE_PX = 8.0, 4.0
 """Largest reprojection error of a point: while poses are to be refined, and in the end."""
-LEAST_POINTS = 10
-"""Points an image, on average, without which poses and images do not belong together."""
+LEAST_SHARE = 0.2
+"""Share of the matched keypoints that must become points; where poses and images do not belong together, few do."""
 
 
 @dataclass(frozen=True)
@@ -55,18 +55,17 @@ def solve_known(
     _, given = camera_poses(model)
     refine = refine_poses or refine_intrinsics
     model = _triangulate(model, database, images, COARSE_PX if refine else FINE_PX, threads)
-    if model.num_points3D() < LEAST_POINTS * model.num_reg_images():
+    share = model.compute_num_observations() / max(matched_keypoints(database, list(model.reg_image_ids())), 1)
+    if share < LEAST_SHARE:
         raise PrepareError(
-            f"From the given poses only {model.num_points3D()} points can be triangulated in {model.num_reg_images()} "
-            "images: the camera axes (--poses-axes opencv or opengl), the order of the images, the direction (camera "
+            f"Only {share:.0%} of the matched keypoints become points from the given poses: the camera axes "
+            "(--poses-axes opencv or opengl), the order of the images, the direction (camera "
             "to world is wanted) or the intrinsics (--focal, --camera) are not what the poses were made with."
         )
     error = model.compute_mean_reprojection_error()
-    says = f"points from known poses, {error:.2f} px"
+    says = f"points from known poses: {share:.0%} of the matched keypoints, {error:.2f} px"
     for _ in range(ROUNDS if refine else 0):
-        with quiet():
-            options = bundle_options(refine_poses, refine_intrinsics, False, threads, robust=True)
-            pycolmap.bundle_adjustment(model, options)
+        adjust(model, bundle_options(refine_poses, refine_intrinsics, False, threads, robust=True))
         model = _triangulate(model, database, images, FINE_PX, threads)
     if refine:
         _, refined = camera_poses(model)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pycolmap
 
-from mmpi_ns.prepare.features import SEED, quiet
+from mmpi_ns.prepare.features import SEED, count_matching_pairs, quiet
 from mmpi_ns.prepare.stages import CONSOLE, PrepareError, progress
 
 ENOUGH = 0.95
@@ -30,7 +30,6 @@ class Attempt:
     init_min_tri_angle: float = 16.0
     init_max_forward_motion: float = 0.95
     init_min_num_inliers: int = 100
-    init_trials: int = 200
     filter_min_tri_angle: float = 1.5
     min_angle: float = 1.5
     abs_pose_min_num_inliers: int = 30
@@ -38,11 +37,11 @@ class Attempt:
 
 
 ATTEMPTS = (
-    Attempt("ordinary", "COLMAP's defaults", init_trials=20),
+    Attempt("ordinary", "COLMAP's defaults"),
     Attempt(
         "forward", "small angles and forward motion allowed", 15, 3.0, 1.0, filter_min_tri_angle=0.5, min_angle=0.5
     ),
-    Attempt("loose", "few matches and tiny angles allowed", 10, 1.0, 1.0, 40, 200, 0.25, 0.25, 15, 0.12),
+    Attempt("loose", "few matches and tiny angles allowed", 10, 1.0, 1.0, 40, 0.25, 0.25, 15, 0.12),
 )
 
 
@@ -59,7 +58,9 @@ class Mapping:
     """(attempt, images in its largest model) in order."""
 
 
-def reconstruct(database: Path, images: Path, work: Path, refine: bool, threads: int) -> Mapping:
+def reconstruct(
+    database: Path, images: Path, work: Path, refine: bool, threads: int, is_sequence: bool = False
+) -> Mapping:
     """Runs the attempts in order until one registers nearly all images; the best one counts.
 
     Args:
@@ -68,12 +69,15 @@ def reconstruct(database: Path, images: Path, work: Path, refine: bool, threads:
         work: folder for models and snapshots; holds those of an interrupted run.
         refine: refine intrinsics.
         threads: CPU threads; below 1 for all.
+        is_sequence: begin with the settings for forward motion. They carry any motion of a sequence, while COLMAP's
+            defaults look through all pairs before they give up (a minute for 64 images).
 
     Raises:
         PrepareError: no attempt found an initial pair.
     """
     with pycolmap.Database.open(database) as opened:
-        total, pairs = opened.num_images(), opened.num_verified_image_pairs()
+        total = opened.num_images()
+    pairs = count_matching_pairs(database)
     if not pairs:
         raise PrepareError(
             "No two images have enough matches in common: they do not overlap, or show too little texture. "
@@ -81,7 +85,7 @@ def reconstruct(database: Path, images: Path, work: Path, refine: bool, threads:
         )
     best: Mapping | None = None
     tried: list[tuple[str, int]] = []
-    for attempt in ATTEMPTS:
+    for attempt in ATTEMPTS[1 if is_sequence else 0 :]:
         models = _run(attempt, database, images, work / attempt.name, total, refine, threads)
         size = models[0][0].num_reg_images() if models else 0
         tried.append((attempt.name, size))
@@ -150,7 +154,6 @@ def mapper_options(attempt: Attempt, refine: bool, threads: int) -> pycolmap.Inc
     options.min_model_size = 3
     options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = SEED
     options.num_threads = options.mapper.num_threads = threads
-    options.init_num_trials = attempt.init_trials
     mapper = options.mapper
     mapper.init_min_tri_angle = attempt.init_min_tri_angle
     mapper.init_max_forward_motion = attempt.init_max_forward_motion
@@ -196,7 +199,7 @@ def polish(
         The model to use.
     """
     if principal_point:
-        _adjust(model, True, threads)
+        adjust(model, bundle_options(True, True, True, threads))
     if not full_lens or not any(c.model.name == "SIMPLE_RADIAL" for c in model.cameras.values()):
         return model
     full = pycolmap.Reconstruction(folder)
@@ -205,14 +208,20 @@ def polish(
             f, cx, cy, k = camera.params
             camera.model = pycolmap.CameraModelId.OPENCV
             camera.params = [f, f, cx, cy, k, 0.0, 0.0, 0.0]
-    _adjust(full, principal_point, threads)
+    adjust(full, bundle_options(True, True, principal_point, threads))
     before, after = model.compute_mean_reprojection_error(), full.compute_mean_reprojection_error()
     chosen = "OpenCV's four terms" if after < WORTH * before else "one radial term"
     CONSOLE.print(f"Lens: {before:.3f} px with one radial term, {after:.3f} px with OpenCV's four: {chosen}.")
     return full if after < WORTH * before else model
 
 
-def _adjust(model: pycolmap.Reconstruction, principal_point: bool, threads: int) -> None:
+def adjust(model: pycolmap.Reconstruction, options: pycolmap.BundleAdjustmentOptions) -> None:
+    """Bundle adjustment over all images, in place. (``pycolmap.bundle_adjustment`` cannot be kept quiet.)"""
+    config = pycolmap.BundleAdjustmentConfig()
+    for image_id in model.reg_image_ids():
+        config.add_image(image_id)
+    if options.refine_rig_from_world:
+        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     with quiet():
-        pycolmap.bundle_adjustment(model, bundle_options(True, True, principal_point, threads))
+        pycolmap.create_default_bundle_adjuster(options, config, model).solve()
     model.update_point_3d_errors()

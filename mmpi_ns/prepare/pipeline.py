@@ -191,7 +191,8 @@ class Preparation:
 
     def _map(self, database: Path, folder: Path) -> Solved:
         s = self.settings
-        found = mapping.reconstruct(database, self.image_folder, folder, not self.is_fixed, s.threads)
+        is_sequence = self.matching.startswith("sequential")
+        found = mapping.reconstruct(database, self.image_folder, folder, not self.is_fixed, s.threads, is_sequence)
         model = found.models[0]
         if not self.is_fixed:
             model = mapping.polish(model, found.folder, s.lens == "auto", s.refine_principal_point, s.threads)

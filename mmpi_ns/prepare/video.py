@@ -38,6 +38,7 @@ def select_frames(video: Path, target: Path, max_frames: int, step: float) -> li
     Raises:
         PrepareError: the video cannot be read, or shows no motion.
     """
+    (target / "images").mkdir(parents=True, exist_ok=True)
     log = target / "motion.json"
     if not log.exists():
         measured = measure(video)
@@ -137,7 +138,6 @@ def choose_frames(measured: Measured, max_frames: int, step: float) -> tuple[lis
 
 def _write_frames(video: Path, target: Path, chosen: list[int]) -> list[Photo]:
     """Second pass: writes the chosen frames, named by their place in the video."""
-    (target / "images").mkdir(exist_ok=True)
     capture, _ = _open(video)
     wanted, photos = set(chosen), []
     with progress("Writing frames", len(chosen)) as advance:

@@ -1,0 +1,256 @@
+"""What mmpi-prepare takes in: images, masks, videos, cameras, pairs; and what it says to bad input."""
+
+from __future__ import annotations
+
+import corridor
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from mmpi_ns.prepare import checks, export, pairs
+from mmpi_ns.prepare.cameras import make_cameras, parse_camera, read_intrinsics, share
+from mmpi_ns.prepare.images import Photo, find_images, gather, gather_masks, scene_names
+from mmpi_ns.prepare.pipeline import prepare
+from mmpi_ns.prepare.settings import Settings
+from mmpi_ns.prepare.stages import PrepareError
+from mmpi_ns.prepare.video import Measured, choose_frames, measure, select_frames
+
+
+def save(path, size=(40, 30), value=100, **more):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.new("RGB", size, (value, value, value)).save(path, **more)
+    return path
+
+
+def test_images_come_in_natural_order(tmp_path):
+    for n in (10, 9, 1):
+        save(tmp_path / f"f{n}.jpg")
+    assert [p.name for p in find_images(tmp_path)] == ["f1.jpg", "f9.jpg", "f10.jpg"]
+
+
+def test_names_of_subfolders_stay_apart(tmp_path):
+    files = [save(tmp_path / f) for f in ("left/a 1.jpg", "right/a 1.jpg", "right/a 1.png")]
+    names = scene_names(files, tmp_path)
+    assert names == ["left-a_1.jpg", "right-a_1.jpg", "right-a_1_.png"]
+
+
+def test_turned_photo_is_set_upright_and_its_focal_length_read(tmp_path):
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    exif.get_ifd(0x8769)[0xA405] = 36
+    for n in range(2):
+        save(tmp_path / "in" / f"{n}.jpg", exif=exif)
+    photos = gather(tmp_path / "in", find_images(tmp_path / "in"), tmp_path / "out")
+    assert (photos[0].width, photos[0].height) == (30, 40)
+    assert Image.open(tmp_path / "out/images/0.jpg").size == (30, 40)
+    assert photos[0].exif_focal == pytest.approx(40)
+
+
+def test_plain_photo_is_copied_byte_for_byte(tmp_path):
+    files = [save(tmp_path / "in" / f"{n}.jpg", value=n) for n in range(2)]
+    gather(tmp_path / "in", files, tmp_path / "out")
+    assert (tmp_path / "out/images/1.jpg").read_bytes() == files[1].read_bytes()
+
+
+def test_image_without_mask_gets_a_white_one(tmp_path):
+    photos = [Photo("a.jpg", 4, 3, source="a.jpg"), Photo("b.jpg", 4, 3, source="b.jpg")]
+    save(tmp_path / "masks/a.jpg.png", (4, 3), 0)
+    assert gather_masks(tmp_path / "masks", photos, tmp_path / "out") == 1
+    assert np.asarray(Image.open(tmp_path / "out/a.jpg.png")).max() == 0
+    assert np.asarray(Image.open(tmp_path / "out/b.jpg.png")).min() == 255
+
+
+def test_mask_of_another_size_is_refused(tmp_path):
+    save(tmp_path / "masks/a.png", (5, 3), 0)
+    with pytest.raises(PrepareError, match="5x3"):
+        gather_masks(tmp_path / "masks", [Photo("a.jpg", 4, 3, source="a.jpg")], tmp_path / "out")
+
+
+def test_masked_pixels_stay_masked_when_downscaled(tmp_path):
+    mask = np.full((4, 4), 255, np.uint8)
+    mask[1, 1] = 0
+    Image.fromarray(mask).save(tmp_path / "m.png")
+    export.downscale(tmp_path / "m.png", tmp_path / "small.png", 2, mask=True)
+    assert np.asarray(Image.open(tmp_path / "small.png")).tolist() == [[0, 255], [255, 255]]
+
+
+def test_images_of_one_lens_share_a_camera():
+    photos = [Photo("a", 4, 3, "x"), Photo("b", 4, 3, "x"), Photo("c", 4, 3, "y"), Photo("d", 8, 6, "x")]
+    assert share(photos, "auto", {}) == [1, 1, 2, 3]
+    assert share(photos, "per-image", {}) == [1, 2, 3, 4]
+    with pytest.raises(PrepareError, match="different sizes"):
+        share(photos, "shared", {})
+
+
+def test_focal_length_comes_from_the_option_then_exif_then_a_guess():
+    photos = [Photo("a", 100, 50, exif_focal=77.0)]
+    assert make_cameras(photos, [1], {}, 60.0, "auto")[0].mean_focal_length() == 60
+    assert make_cameras(photos, [1], {}, None, "auto")[0].mean_focal_length() == 77
+    assert make_cameras([Photo("a", 100, 50)], [1], {}, None, "auto")[0].mean_focal_length() == 120
+
+
+def test_given_camera_comes_back_from_colmaps():
+    given = parse_camera((90.0, 91.0, 50.0, 26.0, 0.1, -0.02, 0.003, 0.004), fisheye=False)
+    camera = make_cameras([Photo("a", 100, 50)], [1], {"a": given}, None, "auto")[0]
+    assert read_intrinsics(camera) == given
+    with pytest.raises(PrepareError, match="--camera takes"):
+        parse_camera((1.0, 2.0), fisheye=False)
+
+
+def chain(count, loop=None):
+    """Similarity that falls off along a sequence; the first and last ``loop`` frames see the same."""
+    place = np.arange(count, dtype=float)
+    if loop:
+        place[-loop:] = place[:loop]
+    alike = np.exp(-((place[:, None] - place[None]) ** 2) / 50)
+    np.fill_diagonal(alike, -1)
+    return alike.astype(np.float32)
+
+
+def test_matching_is_chosen_by_count_and_order():
+    numbered = [f"f{i:03d}.jpg" for i in range(200)]
+    shuffled = np.random.default_rng(0).permutation(200)
+    mixed = chain(200)[np.ix_(shuffled, shuffled)]
+    assert pairs.choose("auto", numbered[:20], chain(20), False)[0] == "exhaustive"
+    assert pairs.choose("auto", numbered, chain(200), False)[0] == "sequential"
+    assert pairs.choose("auto", numbered, mixed, False)[0] == "retrieval"
+    assert pairs.choose("auto", numbered[:100], mixed[:100, :100], False)[0] == "exhaustive"
+    assert pairs.choose("auto", numbered, mixed, True)[0] == "sequential"
+
+
+def test_revisits_close_the_loop_and_a_straight_drive_has_none():
+    found = pairs.revisits(chain(150, loop=10), 10)
+    assert (0, 140) in found and all(i < 20 and j >= 130 for i, j in found)
+    assert pairs.revisits(chain(150), 10) == []
+
+
+def test_split_by_count_and_by_list():
+    names = [f"{i}.jpg" for i in range(9)]
+    split = export.split_by_count(names, None, 3)
+    assert split.train == ("1.jpg", "4.jpg", "7.jpg") and len(split.test) == 6
+    lists = {"train_filenames": ["x/2.jpg"], "test_filenames": ["x/3.jpg", "x/99.jpg"]}
+    assert export.split_from(lists, names, "s").test == ("3.jpg",)
+    with pytest.raises(PrepareError, match="test_filenames"):
+        export.split_from({"train_filenames": ["2.jpg"]}, names, "s")
+
+
+def write_video(path, frames):
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 10, (corridor.WIDTH, corridor.HEIGHT))
+    for frame in frames:
+        writer.write(frame[..., ::-1].copy())
+    writer.release()
+    return path
+
+
+@pytest.fixture(scope="module")
+def drive():
+    """Frames that stand still, drive, and stand again; two of the drive are blurred."""
+    moving = [corridor.picture(p) for p in corridor.poses(16, step=0.25)]
+    for i in (6, 9):
+        moving[i] = cv2.GaussianBlur(moving[i], (0, 0), 3)
+    return [moving[0]] * 6 + moving + [moving[-1]] * 6
+
+
+def test_frames_are_chosen_by_motion_and_sharpness(drive, tmp_path):
+    video = write_video(tmp_path / "drive.avi", drive)
+    photos = select_frames(video, tmp_path / "out", 300, 0.03)
+    chosen = [int(p.name[6:12]) for p in photos]
+    assert 5 <= len(chosen) <= 14
+    assert sum(c < 6 for c in chosen) <= 1 and sum(c > 22 for c in chosen) <= 1  # standing gives no more frames
+    assert not {12, 15} & set(chosen)
+    size = Image.open(tmp_path / "out/images" / photos[0].name).size
+    assert size == (corridor.WIDTH, corridor.HEIGHT) == (photos[0].width, photos[0].height)
+
+
+def test_no_more_frames_than_asked():
+    measured = Measured(np.full(500, 0.05), np.ones(500))
+    chosen, used = choose_frames(measured, 40, 0.01)
+    assert len(chosen) <= 40 and used > 0.5 and chosen == sorted(set(chosen))
+
+
+def test_broken_video_is_named(tmp_path, drive):
+    (tmp_path / "no.mp4").write_bytes(b"not a video at all" * 100)
+    with pytest.raises(PrepareError, match=r"no\.mp4"):
+        measure(tmp_path / "no.mp4")
+    still = write_video(tmp_path / "still.avi", [drive[0]] * 5)
+    with pytest.raises(PrepareError, match="no motion"):
+        select_frames(still, tmp_path / "out2", 300, 0.02)
+
+
+@pytest.mark.parametrize(("count", "words"), [(0, "no image"), (1, "one image only")])
+def test_too_few_images_are_refused(count, words, tmp_path):
+    (tmp_path / "in").mkdir()
+    for n in range(count):
+        save(tmp_path / "in" / f"{n}.png")
+    with pytest.raises(PrepareError, match=words):
+        prepare(Settings(tmp_path / "in", tmp_path / "scene"))
+
+
+def test_truncated_image_is_named(tmp_path):
+    save(tmp_path / "in/a.png")
+    (tmp_path / "in/b.jpg").write_bytes(save(tmp_path / "whole.jpg", (90, 90)).read_bytes()[:300])
+    with pytest.raises(PrepareError, match=r"b\.jpg cannot be read"):
+        prepare(Settings(tmp_path / "in", tmp_path / "scene"))
+
+
+def test_blank_images_are_refused(tmp_path):
+    for n in range(3):
+        save(tmp_path / "in" / f"{n}.png")
+    with pytest.raises(PrepareError, match="Hardly any features"):
+        prepare(Settings(tmp_path / "in", tmp_path / "scene", threads=1))
+
+
+def test_images_without_overlap_are_refused(tmp_path):
+    (tmp_path / "in").mkdir()
+    for n in range(3):
+        Image.fromarray(corridor.picture(corridor.poses(1)[0], seed=n)).save(tmp_path / "in" / f"{n}.png")
+    with pytest.raises(PrepareError, match="overlap"):
+        prepare(Settings(tmp_path / "in", tmp_path / "scene", threads=1))
+
+
+def test_two_disconnected_groups_are_named_and_the_larger_can_be_had(tmp_path):
+    corridor.write_images(tmp_path / "in", 7, seed=1)
+    corridor.write_images(tmp_path / "in", 6, seed=2, start=20)
+    settings = Settings(tmp_path / "in", tmp_path / "scene", threads=1)
+    prepare(settings)
+    report = (tmp_path / "scene/report.md").read_text()
+    assert "7 of 13" in report and "6 images form a group of their own" in report and "frame_021.png" in report
+
+
+def test_scene_and_input_are_kept_apart(tmp_path):
+    corridor.write_images(tmp_path / "scene/images", 2)
+    for scene in (tmp_path / "scene", tmp_path / "scene/images", tmp_path / "scene/images/out"):
+        with pytest.raises(PrepareError, match="mixed with its input"):
+            prepare(Settings(tmp_path / "scene/images", scene, overwrite=True))
+    assert len(list((tmp_path / "scene/images").iterdir())) == 2
+
+
+def test_overwriting_moves_the_old_scene_aside(tmp_path):
+    built, scene = tmp_path / "built", tmp_path / "scene"
+    for folder, text in ((built, "new"), (scene, "old")):
+        (folder / "images").mkdir(parents=True)
+        (folder / "images/a.txt").write_text(text)
+        (folder / "transforms.json").write_text(text)
+    export.publish(built, scene, scene / "previous-1")
+    assert (scene / "images/a.txt").read_text() == (scene / "transforms.json").read_text() == "new"
+    assert (scene / "previous-1/images/a.txt").read_text() == "old"
+
+
+def test_jump_and_turn_of_the_track_are_found():
+    poses = corridor.poses(20)
+    names = [f"f{i:02d}" for i in range(20)]
+    assert checks.misplaced(names, range(20), poses) == []
+    off = poses.copy()
+    off[9, :3, 3] += [0, 6, 0]
+    assert {f.image for f in checks.misplaced(names, range(20), off)} == {"f09", "f10"}
+    turned = poses.copy()
+    turned[9, :3, :3] = turned[9, :3, :3] @ np.diag([-1.0, 1, -1])
+    assert {f.image for f in checks.misplaced(names, range(20), turned)} == {"f09", "f10"}
+
+
+def test_blurred_image_is_found():
+    images = [cv2.cvtColor(corridor.picture(p), cv2.COLOR_RGB2GRAY) for p in corridor.poses(6)]
+    images[3] = cv2.GaussianBlur(images[3], (0, 0), 2)
+    sharp = np.array([checks.sharpness(i) for i in images])
+    assert [f.image for f in checks.blurred(list("abcdef"), sharp, True)] == ["d"]
