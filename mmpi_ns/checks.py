@@ -47,7 +47,7 @@ def in_one_place(centers: NDArray[np.float64]) -> bool:
 
 def brief(error: BaseException) -> str:
     """What an error says, cut after its first sentence: it goes in brackets into a sentence of ours."""
-    return str(error).strip().split("\n")[0].split(". ")[0].rstrip(".")
+    return str(error).strip().split("\n")[0].split(". ")[0].rstrip(" .")
 
 
 def _frames(path: Path) -> list[dict[str, Any]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pickle
+import shutil
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -203,10 +204,11 @@ def _write_atomically(path: Path, write: Any, folder: Path | None = None) -> Non
     try:
         write(temporary)
         os.replace(temporary, path)
-    except (OSError, RuntimeError) as error:  # torch.save has a RuntimeError for a full disk
+    except (OSError, RuntimeError) as error:  # torch.save has a RuntimeError, without a reason, for a full disk
+        free = shutil.disk_usage(temporary.parent).free / 2**20
         temporary.unlink(missing_ok=True)
         raise OSError(
-            f"{path} could not be written ({brief(error)}): earlier files are untouched, so make room and start again "
+            f"{path} could not be written ({brief(error)}; {free:.0f} MB free): earlier files are untouched, so make room and start again "
             "(--load-dir goes on from the last checkpoint)."
         ) from error
     except BaseException:

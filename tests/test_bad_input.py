@@ -242,9 +242,9 @@ def test_a_disk_that_is_full_while_saving_leaves_the_last_checkpoint(trained, sc
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size // 2, limits[1]))  # the real writer fails half way through
     try:
-        refusal(
-            lambda: trainer.save_checkpoint(3), "step-000000003.ckpt could not be written", "--load-dir", error=OSError
-        )
+        for step in (2, 3):
+            words = (f"step-{step:09d}.ckpt could not be written", "MB free", "make room", "--load-dir")
+            refusal(lambda step=step: trainer.save_checkpoint(step), *words, error=OSError)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert contents(trainer.base_dir) == before
