@@ -208,8 +208,8 @@ def _write_atomically(path: Path, write: Any, folder: Path | None = None) -> Non
         free = shutil.disk_usage(temporary.parent).free / 2**20
         temporary.unlink(missing_ok=True)
         raise OSError(
-            f"{path} could not be written ({brief(error)}; {free:.0f} MB free): earlier files are untouched, so make room and start again "
-            "(--load-dir goes on from the last checkpoint)."
+            f"{path} could not be written ({brief(error)}; {free:.0f} MB free): earlier files are "
+            "untouched, so make room and start again (--load-dir goes on from the last checkpoint)."
         ) from error
     except BaseException:
         temporary.unlink(missing_ok=True)
