@@ -12,7 +12,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from mmpi_ns.prepare.mapping import adjust, bundle_options
+from mmpi_ns.prepare.mapping import adjust, bundle_options, is_bent
 from mmpi_ns.prepare.stages import PrepareError
 
 Array = NDArray[np.float64]
@@ -177,7 +177,7 @@ def _moving_share(model: pycolmap.Reconstruction, pair: tuple[int, int], matches
 
 
 def doubtful_intrinsics(model: pycolmap.Reconstruction, fixed: bool, copy: Path, threads: int) -> list[Finding]:
-    """Focal lengths and lenses that do not fit.
+    """Models, focal lengths and lenses that do not fit.
 
     Args:
         model: the final model.
@@ -186,6 +186,9 @@ def doubtful_intrinsics(model: pycolmap.Reconstruction, fixed: bool, copy: Path,
         threads: CPU threads; below 1 for all.
     """
     found = []
+    if is_bent(model):
+        error = model.compute_mean_reprojection_error()
+        found.append(Finding("", f"bent? a reprojection error of {error:.2f} px is high: the track may be wrong"))
     if fixed:
         free = pycolmap.Reconstruction(copy)
         before = free.compute_mean_reprojection_error()

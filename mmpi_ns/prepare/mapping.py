@@ -14,6 +14,8 @@ from mmpi_ns.prepare.stages import CONSOLE, PrepareError, progress
 
 ENOUGH = 0.95
 """Share of the images that, once registered, ends the trying."""
+BENT_PX = 0.8
+"""Mean reprojection error from which another attempt is made even though the images are registered."""
 WORTH = 0.97
 """Share of the reprojection error to which a richer lens must bring it."""
 SNAPSHOT = 40
@@ -89,10 +91,11 @@ def reconstruct(
         models = _run(attempt, database, images, work / attempt.name, total, refine, threads)
         size = models[0][0].num_reg_images() if models else 0
         tried.append((attempt.name, size))
-        CONSOLE.print(f"Mapping, {attempt.name} ({attempt.says}): {size} of {total} images.")
-        if models and (best is None or size > best.models[0].num_reg_images()):
+        says = f", {models[0][0].compute_mean_reprojection_error():.2f} px" if models else ""
+        CONSOLE.print(f"Mapping, {attempt.name} ({attempt.says}): {size} of {total} images{says}.")
+        if models and (best is None or _quality(models[0][0]) > _quality(best.models[0])):
             best = Mapping(tuple(m for m, _ in models), models[0][1], attempt.name, ())
-        if size >= ENOUGH * total:
+        if size >= ENOUGH * total and not is_bent(models[0][0]):
             break
     if best is None:
         raise PrepareError(
@@ -100,6 +103,22 @@ def reconstruct(
             "(turning on the spot gives no depth), or the focal length is far off: check --focal and --camera."
         )
     return replace(best, tried=tuple(tried))
+
+
+def _error(model: pycolmap.Reconstruction) -> float:
+    """Mean reprojection error at an image width of 1,000 pixels, or in pixels of smaller images."""
+    widest = max(camera.width for camera in model.cameras.values())
+    return model.compute_mean_reprojection_error() / max(1.0, widest / 1000)
+
+
+def is_bent(model: pycolmap.Reconstruction) -> bool:
+    """Whether a model fits its images so badly that it may have started from a wrong pair: squeezed or folded."""
+    return _error(model) > BENT_PX
+
+
+def _quality(model: pycolmap.Reconstruction) -> tuple[bool, int, float]:
+    """Sorts models: sound ones first, then those with more images, then those that fit better."""
+    return not is_bent(model), model.num_reg_images(), -_error(model)
 
 
 def _run(

@@ -19,9 +19,9 @@ class Settings:
     An interrupted run goes on where it stopped when it is started again with the same options.
     """
 
-    input: tyro.conf.Positional[Path]
+    input: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="INPUT")]
     """Folder of images, or a video."""
-    scene: tyro.conf.Positional[Path]
+    scene: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
     """Folder for the scene."""
     masks: Path | None = None
     """Folder of masks named like the images; black is left out, in SfM and in training."""
@@ -65,7 +65,7 @@ class Settings:
     """Factors of downscaled copies."""
     max_frames: int = 300
     """Most frames to take from a video."""
-    frame_motion: float = 0.02
+    frame_motion: float = 0.01
     """Median motion between frames taken from a video, as a share of the image width."""
     allow_partial: bool = False
     """Make a scene even when less than half of the images are registered."""

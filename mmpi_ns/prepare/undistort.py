@@ -58,7 +58,7 @@ def undistort(
 def _map(pinhole: pycolmap.Camera, camera: pycolmap.Camera) -> np.ndarray:
     """Where each pixel of the pinhole lies in the distorted image, in OpenCV's pixel centres. [height, width, 2]"""
     columns, rows = np.meshgrid(np.arange(pinhole.width) + 0.5, np.arange(pinhole.height) + 0.5)
-    rays = pinhole.cam_from_img(np.stack([columns.ravel(), rows.ravel()], -1))
+    rays = np.asarray(pinhole.cam_from_img(np.stack([columns.ravel(), rows.ravel()], -1)))
     pixels = camera.img_from_cam(np.c_[rays, np.ones(len(rays))])
     return (np.asarray(pixels).reshape(pinhole.height, pinhole.width, 2) - 0.5).astype(np.float32)
 
@@ -77,7 +77,7 @@ def _move_keypoints(image: pycolmap.Image, old: pycolmap.Camera, new: pycolmap.C
     points = list(image.points2D)
     if not points:
         return
-    rays = old.cam_from_img(np.array([p.xy for p in points]))
+    rays = np.asarray(old.cam_from_img(np.array([p.xy for p in points])))
     pixels = np.asarray(new.img_from_cam(np.c_[rays, np.ones(len(rays))]))
     for point, xy in zip(image.points2D, pixels, strict=True):
         point.xy = xy
