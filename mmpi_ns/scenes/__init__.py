@@ -1,0 +1,1 @@
+from mmpi_ns.scenes.catalogue import make_scene

@@ -1,0 +1,207 @@
+"""Boxes, spheres and upright cylinders, and where rays meet them first. Float64, so that depth is exact.
+
+Rays come in packets that lie close together (tiles of an image): a packet is tested only against the primitives whose
+bounding spheres touch the cone around it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+BOX, SPHERE, CYLINDER = 0, 1, 2
+PACKET = 4096
+"""Rays tested together."""
+START = 1e-6
+"""Hits nearer than this share of a metre are the surface that the ray starts on."""
+
+
+@dataclass(frozen=True)
+class Primitives:
+    """P solids as arrays, sorted by the x of their centres. World axes: z up, metres."""
+
+    kind: NDArray[np.int64]
+    """[P] BOX, SPHERE or CYLINDER."""
+    center: Array
+    """[P, 3]"""
+    half: Array
+    """[P, 3] half extents along the solid's own axes; a sphere's radius thrice; a cylinder's (radius, radius, half height)."""
+    yaw: Array
+    """[P] turn about z, radians."""
+    material: NDArray[np.int64]
+    """[P] row of the table of materials."""
+    colors: Array
+    """[P, 3, 3] three colours that the material mixes."""
+    offset: Array
+    """[P, 2] where in the noise the surface starts, metres."""
+
+    def __len__(self) -> int:
+        return len(self.kind)
+
+    @property
+    def radius(self) -> Array:
+        """[P] of the bounding spheres."""
+        flat = np.hypot(self.half[:, 0], np.where(self.kind == BOX, self.half[:, 1], 0.0))
+        return np.where(self.kind == SPHERE, self.half[:, 0], np.hypot(flat, self.half[:, 2]))
+
+    def take(self, rows: NDArray[np.int64]) -> Primitives:
+        return Primitives(*(getattr(self, f.name)[rows] for f in fields(self)))
+
+    def sorted(self) -> Primitives:
+        return self.take(np.argsort(self.center[:, 0], kind="stable"))
+
+
+def to_local(vectors: Array, yaw: Array) -> Array:
+    """World vectors [..., 3] in axes turned by ``yaw`` about z."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    x, y, z = vectors[..., 0], vectors[..., 1], vectors[..., 2]
+    return np.stack([c * x + s * y, c * y - s * x, np.broadcast_to(z, (c * x).shape)], -1)
+
+
+class Tracer:
+    """Finds first hits; ``reach`` is how far a ray goes before solids no longer count."""
+
+    def __init__(self, primitives: Primitives, reach: float) -> None:
+        self.primitives, self.reach = primitives, reach
+        self.radius = primitives.radius
+        self.widest = float(self.radius.max(initial=0.0))
+        self.top = float((primitives.center[:, 2] + primitives.half[:, 2]).max(initial=0.0))
+        """Height above which there is nothing."""
+
+    def near(self, lowest: float, highest: float, distance: float | None = None) -> NDArray[np.int64]:
+        """Primitives that a ray starting between two x can meet: a search in the sorted centres, not a scan."""
+        margin = (self.reach if distance is None else distance) + self.widest
+        x = self.primitives.center[:, 0]
+        first, last = np.searchsorted(x, [lowest - margin, highest + margin])
+        return np.arange(first, last)
+
+    def __call__(
+        self, origins: Array, directions: Array, limit: float | None = None
+    ) -> tuple[Array, NDArray[np.int64]]:
+        """Distance [R] to the first solid within reach (inf where there is none) and its row (-1).
+
+        Args:
+            origins: [R, 3]
+            directions: [R, 3] unit vectors.
+            limit: nothing farther is asked for, where that is less than the reach.
+        """
+        distance, row = np.full(len(directions), np.inf), np.full(len(directions), -1)
+        if not len(directions) or not len(self.primitives):
+            return distance, row
+        reach = self.reach if limit is None else min(limit, self.reach)
+        near = self.near(origins[:, 0].min(), origins[:, 0].max(), reach)
+        for start in range(0, len(directions), PACKET):
+            self._packet(near, origins, directions, slice(start, min(start + PACKET, len(directions))), reach, distance, row)
+        return distance, row
+
+    def _packet(self, rows, origins, directions, rays: slice, reach: float, distance: Array, row: NDArray) -> None:
+        """Fills in a packet; halves it where it would have to be tested against too much."""
+        rows = self.in_cone(rows, origins[rays], directions[rays], reach)
+        size = rays.stop - rays.start
+        if size > 256 and size * len(rows) > 100_000:
+            middle = rays.start + size // 2
+            for half in (slice(rays.start, middle), slice(middle, rays.stop)):
+                self._packet(rows, origins, directions, half, reach, distance, row)
+        elif len(rows):
+            distance[rays], row[rays] = self._first(rows, origins[rays], directions[rays], reach)
+
+    def in_cone(self, rows: NDArray[np.int64], origins: Array, directions: Array, reach: float) -> NDArray[np.int64]:
+        """Those of ``rows`` that the rays of a packet may meet."""
+        apex, axis = origins.mean(0), directions.mean(0)
+        spread = np.sqrt(((origins - apex) ** 2).sum(-1).max())
+        length = np.linalg.norm(axis)
+        cosine = float((directions @ axis).min() / length) if length > 1e-6 else -1.0
+        offset, radius = self.primitives.center[rows] - apex, self.radius[rows] + spread
+        distance = np.sqrt((offset**2).sum(-1))
+        touching = distance <= radius
+        along = offset @ axis / max(length, 1e-12) / np.maximum(distance, 1e-12)
+        angle = np.arccos(np.clip(along, -1, 1)) - np.arcsin(np.minimum(radius / np.maximum(distance, 1e-12), 1))
+        inside = angle <= np.arccos(np.clip(cosine, -1, 1)) + 1e-6
+        return rows[touching | (inside & (distance - radius < reach))]
+
+    def _first(
+        self, rows: NDArray[np.int64], origins: Array, directions: Array, reach: float
+    ) -> tuple[Array, NDArray[np.int64]]:
+        best, found = np.full(len(directions), np.inf), np.full(len(directions), -1)
+        ray, column = self._touching(rows, origins, directions)
+        if not len(ray):
+            return best, found
+        solid = rows[column]
+        t, kind = np.empty(len(ray)), self.primitives.kind[solid]
+        for k, distances in ((BOX, box_distance), (SPHERE, sphere_distance), (CYLINDER, cylinder_distance)):
+            these = np.flatnonzero(kind == k)
+            shape = Shape(*(getattr(self.primitives, f)[solid[these]] for f in ("center", "half", "yaw")))
+            t[these] = distances(origins[ray[these]], directions[ray[these]], shape)
+        t[t >= reach] = np.inf
+        # Pairs come sorted by ray, so the nearest of each ray is a minimum over a run.
+        starts = np.flatnonzero(np.diff(ray, prepend=-1))
+        best[ray[starts]] = np.minimum.reduceat(t, starts)
+        first = np.flatnonzero((t == best[ray]) & np.isfinite(t))[::-1]
+        found[ray[first]] = solid[first]
+        return best, found
+
+    def _touching(self, rows: NDArray[np.int64], origins: Array, directions: Array) -> tuple[NDArray, NDArray]:
+        """Pairs (ray, column of ``rows``) in which the ray meets the solid's bounding sphere, sorted by ray."""
+        apex = origins[0]
+        center, start = self.primitives.center[rows] - apex, origins - apex
+        square = (self.radius[rows] * (1 + 1e-6) + 1e-6) ** 2
+        along = directions @ center.T - (start * directions).sum(-1)[:, None]
+        away = (center**2).sum(-1) + (start**2).sum(-1)[:, None]
+        if start.any():
+            away -= 2 * start @ center.T
+        meets = (away - along**2 <= square) & ((along > 0) | (away <= square))
+        return np.nonzero(meets)
+
+
+@dataclass(frozen=True)
+class Shape:
+    """One solid for each ray."""
+
+    center: Array
+    """[R, 3]"""
+    half: Array
+    """[R, 3] as in Primitives."""
+    yaw: Array
+    """[R]"""
+
+
+def _inverse(x: Array) -> Array:
+    return 1.0 / np.where(np.abs(x) < 1e-14, 1e-14, x)
+
+
+def box_distance(origins: Array, directions: Array, box: Shape) -> Array:
+    """Distance [R] at which rays enter a box, inf where they miss it or start inside."""
+    o, d = to_local(origins - box.center, box.yaw), to_local(directions, box.yaw)
+    enter, leave = np.full(len(d), -np.inf), np.full(len(d), np.inf)
+    for axis in range(3):
+        inverse = _inverse(d[:, axis])
+        middle, half = -o[:, axis] * inverse, box.half[:, axis] * np.abs(inverse)
+        enter, leave = np.maximum(enter, middle - half), np.minimum(leave, middle + half)
+    return np.where((enter <= leave) & (enter > START), enter, np.inf)
+
+
+def sphere_distance(origins: Array, directions: Array, sphere: Shape) -> Array:
+    """Distance [R] at which rays enter a sphere, inf where they miss it or start inside."""
+    o = origins - sphere.center
+    along = (o * directions).sum(-1)
+    # From the nearest point of the ray: |o|^2 - along^2 would lose the digits of a far, small sphere.
+    aside = ((o - along[:, None] * directions) ** 2).sum(-1)
+    inside = sphere.half[:, 0] ** 2 - aside
+    t = -along - np.sqrt(np.maximum(inside, 0))
+    return np.where((inside > 0) & (t > START), t, np.inf)
+
+
+def cylinder_distance(origins: Array, directions: Array, cylinder: Shape) -> Array:
+    """Distance [R] at which rays enter an upright cylinder, inf where they miss it or start inside."""
+    o, d, (radius, _, half) = origins - cylinder.center, directions, cylinder.half.T
+    flat = np.maximum((d[:, :2] ** 2).sum(-1), 1e-28)
+    along = (o[:, :2] * d[:, :2]).sum(-1) / flat
+    aside = ((o[:, :2] - along[:, None] * d[:, :2]) ** 2).sum(-1)
+    root = np.sqrt(np.maximum(radius**2 - aside, 0) / flat)
+    inverse = _inverse(d[:, 2])
+    middle, reach = -o[:, 2] * inverse, half * np.abs(inverse)
+    enter, leave = np.maximum(-along - root, middle - reach), np.minimum(-along + root, middle + reach)
+    return np.where((aside < radius**2) & (enter <= leave) & (enter > START), enter, np.inf)
