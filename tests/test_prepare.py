@@ -189,3 +189,30 @@ def test_undistorted_scene_has_no_lens_and_straight_images(capture, tmp_path):
 def test_ordered_poses_come_back_in_the_order_of_the_images(scene):
     names, _ = camera_poses(pycolmap.Reconstruction(scene / "colmap/sparse/0"))
     assert names == [f"frame_{i + 1:03d}.png" for i in range(COUNT)]
+
+
+def test_interrupted_mapping_goes_on_from_its_snapshot(capture, tmp_path, monkeypatch):
+    settings = Settings(capture / "frames", tmp_path / "scene", threads=1)
+    registered = []
+
+    def count_to(most):
+        def make(advance, count):
+            def step():
+                registered.append(count)
+                if sum(registered) > most:
+                    raise KeyboardInterrupt
+
+            return step
+
+        return make
+
+    monkeypatch.setattr(mapping, "SNAPSHOT", 3)
+    monkeypatch.setattr(mapping, "_step", count_to(8))
+    with pytest.raises(KeyboardInterrupt):
+        prepare(settings)
+    registered.clear()
+    monkeypatch.setattr(mapping, "_step", count_to(1000))
+    prepare(settings)
+    assert 0 < sum(registered) <= COUNT - 4  # the others came with the snapshot
+    assert len(read_json(tmp_path / "scene")["frames"]) == COUNT
+    assert error_after_alignment(tmp_path / "scene", corridor.poses(COUNT)) < 0.01

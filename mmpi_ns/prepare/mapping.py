@@ -136,7 +136,7 @@ def _run(
         if start is not None:
             CONSOLE.print(f"Mapping, {attempt.name}: goes on from {pycolmap.Reconstruction(start).num_reg_images()}.")
         with progress(f"Mapping, {attempt.name}", total) as advance, quiet():
-            pycolmap.incremental_mapping(
+            found = pycolmap.incremental_mapping(
                 database,
                 images,
                 folder / "models",
@@ -145,6 +145,9 @@ def _run(
                 initial_image_pair_callback=_step(advance, 2),
                 next_image_callback=_step(advance, 1),
             )
+        for number, model in found.items():  # COLMAP itself leaves out a model that it went on from
+            (folder / "models" / str(number)).mkdir(exist_ok=True)
+            model.write(folder / "models" / str(number))
         done.touch()
         shutil.rmtree(folder / "snapshots")
     models = [(pycolmap.Reconstruction(p), p) for p in sorted((folder / "models").iterdir()) if p.is_dir()]
