@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mmpi_ns.prepare import checks, export, pairs
+from mmpi_ns.prepare import checks, export, features, pairs
 from mmpi_ns.prepare.cameras import make_cameras, parse_camera, read_intrinsics, share
+from mmpi_ns.prepare.frame import up_from_cameras
 from mmpi_ns.prepare.images import Photo, find_images, gather, gather_masks, scene_names
 from mmpi_ns.prepare.pipeline import prepare
 from mmpi_ns.prepare.settings import Settings
@@ -123,6 +124,28 @@ def test_revisits_close_the_loop_and_a_straight_drive_has_none():
     found = pairs.revisits(chain(150, loop=10), 10)
     assert (0, 140) in found and all(i < 20 and j >= 130 for i, j in found)
     assert pairs.revisits(chain(150), 10) == []
+
+
+def test_look_alikes_are_found_by_their_features(tmp_path):
+    for seed in (1, 2):
+        corridor.write_images(tmp_path / "in" / str(seed), 2, seed=seed)
+    photos = gather(tmp_path / "in", find_images(tmp_path / "in"), tmp_path)
+    database = tmp_path / "database.db"
+    features.create_database(database, photos, [1] * 4, make_cameras(photos, [1] * 4, {}, None, "auto"))
+    features.extract(database, tmp_path / "images", photos, None, 1000, 1)
+    alike = pairs.similarity(pairs.describe_images(database, 4))
+    assert alike.argmax(-1).tolist() == [1, 0, 3, 2]
+
+
+def test_up_is_found_by_cameras_that_look_down_on_a_turn():
+    poses = np.tile(np.eye(4), (9, 1, 1))
+    for pose, angle in zip(poses, np.linspace(0, 2, 9), strict=True):
+        right = np.array([np.cos(angle), -np.sin(angle), 0])
+        forward = np.array([np.sin(angle), np.cos(angle), -0.6]) / np.sqrt(1.36)
+        pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], -1)
+    assert up_from_cameras(poses) == pytest.approx([0, 0, 1], abs=1e-9)
+    straight = corridor.poses(5, bend=0.0)
+    assert up_from_cameras(straight) == pytest.approx([0, 0, 1], abs=1e-9)
 
 
 def test_split_by_count_and_by_list():
