@@ -59,10 +59,10 @@ def find_sfm_model(path: Path) -> SfmModel | None:
     return read_reconstruction(model)
 
 
-def read_reconstruction(model: pycolmap.Reconstruction) -> SfmModel:
-    """The well observed points of a reconstruction and their keypoints."""
+def read_reconstruction(model: pycolmap.Reconstruction, min_track: int = MIN_TRACK) -> SfmModel:
+    """The points of a reconstruction that at least ``min_track`` images see well, and their keypoints."""
     # In the order of the ids: that of the model itself may differ from one reading to the next.
-    good = [i for i, p in sorted(model.points3D.items()) if p.track.length() >= MIN_TRACK and p.error <= MAX_ERROR_PX]
+    good = [i for i, p in sorted(model.points3D.items()) if p.track.length() >= min_track and p.error <= MAX_ERROR_PX]
     row = {point: n for n, point in enumerate(good)}
     points = np.array([model.points3D[i].xyz for i in good], dtype=np.float64).reshape(-1, 3)
     names, keypoints = [], []

@@ -24,7 +24,27 @@ MAX_ANGLE = 60.0
 """Degrees between the facing directions of two images worth matching."""
 MIN_ANGLE = 0.5
 """Degrees between the rays of a point, at least: driving forward gives little more."""
+MIN_TRACK = 2
+"""Images that see a point, at least: with poses given, two that agree are enough."""
+ENOUGH = 100
+"""Keypoints an image, on average, that make the thorough search unnecessary."""
 SEED = 0
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How hard to look for matches."""
+
+    peak_threshold: float
+    """Contrast of the faintest features (SIFT)."""
+    guided: bool
+    """Whether a pair is matched again along the epipolar lines of its first matches."""
+    min_matches: int
+    """Matches that agree, at least, for a pair to count."""
+
+
+EFFORTS = (Effort(0.0067, False, 15), Effort(0.002, True, 8))
+"""What textured images need, and what rooms at low resolution do (two to four times the time)."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +78,8 @@ class PosedImages:
 def triangulate(images: PosedImages) -> SfmModel:
     """Points seen from several of the images, and where each saw them.
 
-    Deterministic for equal images and poses. Takes about a fifth of a second an image and core, and a hundredth a pair.
+    Deterministic for equal images and poses. A quick search comes first, a thorough one where that finds little.
+    Takes about a third of a second an image and core, the thorough search a second.
 
     Args:
         images: image files with their cameras, whose poses are in any one frame.
@@ -71,25 +92,35 @@ def triangulate(images: PosedImages) -> SfmModel:
     """
     import pycolmap  # slow to import, and only scenes without a model need it
 
-    pairs = images.pairs()
     level = pycolmap.logging.minloglevel
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.ERROR)
     try:
-        with tempfile.TemporaryDirectory(prefix="mmpi-tracks-") as folder:
-            work = Path(folder)
-            names = _link(images.files, work / "images")
-            _extract(pycolmap, work, names)
-            model = _posed_model(pycolmap, work, names, images)
-            if pairs:
-                _match(pycolmap, work, [(names[i], names[j]) for i, j in pairs])
-                (work / "model").mkdir()
-                model = pycolmap.triangulate_points(
-                    model, work / "database.db", work / "images", work / "model", options=_triangulation(pycolmap)
-                )
-            tracks = read_reconstruction(model)
-            return replace(tracks, names=tuple(str(names.index(name)) for name in tracks.names))
+        tracks = None
+        for effort in EFFORTS:
+            tracks = _attempt(pycolmap, images, effort)
+            if sum(len(points) for points, _ in tracks.keypoints) >= ENOUGH * len(images.files):
+                break
+        assert tracks is not None
+        return tracks
     finally:
         pycolmap.logging.minloglevel = level
+
+
+def _attempt(pycolmap: Any, images: PosedImages, effort: Effort) -> SfmModel:
+    pairs = images.pairs()
+    with tempfile.TemporaryDirectory(prefix="mmpi-tracks-") as folder:
+        work = Path(folder)
+        names = _link(images.files, work / "images")
+        _extract(pycolmap, work, names, effort)
+        model = _posed_model(pycolmap, work, names, images)
+        if pairs:
+            _match(pycolmap, work, [(names[i], names[j]) for i, j in pairs], effort)
+            (work / "model").mkdir()
+            model = pycolmap.triangulate_points(
+                model, work / "database.db", work / "images", work / "model", options=_triangulation(pycolmap)
+            )
+        tracks = read_reconstruction(model, MIN_TRACK)
+        return replace(tracks, names=tuple(str(names.index(name)) for name in tracks.names))
 
 
 def _link(files: Sequence[Path], folder: Path) -> list[str]:
@@ -102,25 +133,40 @@ def _link(files: Sequence[Path], folder: Path) -> list[str]:
     return names
 
 
-def _extract(pycolmap: Any, work: Path, names: list[str]) -> None:
+def _extract(pycolmap: Any, work: Path, names: list[str], effort: Effort) -> None:
+    options = pycolmap.FeatureExtractionOptions()
+    options.sift.peak_threshold = effort.peak_threshold
     pycolmap.extract_features(
-        work / "features.db", work / "images", image_names=names, camera_mode=pycolmap.CameraMode.PER_IMAGE
+        work / "features.db",
+        work / "images",
+        image_names=names,
+        camera_mode=pycolmap.CameraMode.PER_IMAGE,
+        extraction_options=options,
     )
 
 
-def _match(pycolmap: Any, work: Path, pairs: list[tuple[str, str]]) -> None:
+def _match(pycolmap: Any, work: Path, pairs: list[tuple[str, str]], effort: Effort) -> None:
     listing = work / "pairs.txt"
     listing.write_text("".join(f"{a} {b}\n" for a, b in pairs), encoding="utf-8")
+    matching = pycolmap.FeatureMatchingOptions()
+    matching.guided_matching = effort.guided
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = SEED
+    verification.min_num_inliers = effort.min_matches
     pairing = pycolmap.ImportedPairingOptions()
     pairing.match_list_path = listing
-    pycolmap.match_image_pairs(work / "database.db", pairing_options=pairing, verification_options=verification)
+    pycolmap.match_image_pairs(
+        work / "database.db",
+        matching_options=matching,
+        pairing_options=pairing,
+        verification_options=verification,
+    )
 
 
 def _triangulation(pycolmap: Any) -> Any:
     options = pycolmap.IncrementalPipelineOptions()
     options.triangulation.min_angle = MIN_ANGLE
+    options.triangulation.ignore_two_view_tracks = False
     options.triangulation.random_seed = SEED
     options.ba_refine_focal_length = options.ba_refine_principal_point = options.ba_refine_extra_params = False
     return options

@@ -151,7 +151,17 @@ def test_one_image_gives_no_tracks(images):
 
 
 def test_images_that_show_nothing_in_common_give_no_tracks(tmp_path):
-    assert len(triangulate(scene_of(tmp_path, [pose_at(40.0 * i) for i in range(3)])).points) == 0
+    images = scene_of(tmp_path, POSES[:3])
+    for seed, file in enumerate(images.files):
+        noise = np.random.default_rng(seed).integers(0, 256, (HEIGHT // 4, WIDTH // 4), dtype=np.uint8)
+        Image.fromarray(noise).resize((WIDTH, HEIGHT), Image.Resampling.BICUBIC).save(file)
+    assert len(triangulate(images).points) == 0
+
+
+def test_two_images_that_agree_are_enough(images):
+    two = {f: getattr(images, f)[:2] for f in ("files", "camera_to_worlds", "intrinsics", "sizes", "distortion")}
+    points = triangulate(PosedImages(**two)).points
+    assert len(points) > 30 and np.median(depth_error(points)) < 0.02
 
 
 def test_an_unreadable_image_is_named(tmp_path):

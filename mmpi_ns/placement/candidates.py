@@ -3,7 +3,7 @@
 Three kinds. *Views* are frusta of training cameras, some pulled back, some widened: seen from its own origin an MPI has
 no plane error and texels as fine as pixels. *Sides* face left, right, down or up from a training camera's place, some
 from behind it: one of them may hold the whole side of a drive, on planes parallel to what stands there. *Cubes*
-surround what the cameras look at, or the cameras.
+surround what the cameras look at from all round.
 """
 
 from __future__ import annotations
@@ -12,9 +12,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mmpi_ns.placement.content import Content
-from mmpi_ns.placement.errors import pixel_slopes
+from mmpi_ns.placement.errors import cube_errors, pixel_slopes
 from mmpi_ns.placement.hand_made import vector
 from mmpi_ns.placement.observations import Array, Observations
 from mmpi_ns.placement.plan import CubePlan, MPIPlan
@@ -34,30 +35,54 @@ CUBE_SIZES = (0.4, 0.7, 1.0)
 
 
 @dataclass(frozen=True)
-class Fineness:
-    """How fine candidates are made."""
+class Candidate:
+    """A place for an MPI or a cube, of any fineness, and the expected errors there."""
 
-    texel_pixels: float
-    """Image pixels that a texel spans, seen from where the MPI stands."""
-    planes: int
-    """Planes of each."""
-    max_voxels: int
-    """Voxels along a side of the cube at most; 0 for no cube."""
+    frame: MPIPlan | CubePlan
+    """Pose and extent; its planes and texels mean nothing yet."""
+    rows: float
+    """Rows (of a cube: voxels a side) if a texel spans one pixel, seen from where the MPI stands."""
+    columns: float
+    plane: NDArray[np.float32]
+    """[Q] e_p of each observation with two planes, in pixels: with L planes it is plane / (L - 1)."""
+    texel: NDArray[np.float32]
+    """[Q] e_t of each observation, relative to the pixels of a texel; inf where the candidate does not hold it."""
+
+    def coarsest(self, max_voxels: int) -> float:
+        """Pixels that a texel spans at least: a cube may not have enough voxels for finer ones."""
+        return self.rows / max_voxels if isinstance(self.frame, CubePlan) else 0.0
+
+    def at(self, texel_pixels: float, planes: int, max_voxels: int) -> MPIPlan | CubePlan:
+        """The MPI or cube with texels of so many pixels."""
+        if isinstance(self.frame, CubePlan):
+            side = int(np.clip(round(self.rows / texel_pixels), 8, max_voxels))
+            return replace(self.frame, shape=(side, side, side))
+        height, width = (max(8, round(n / texel_pixels) + 1) for n in (self.rows, self.columns))
+        return replace(self.frame, planes=planes, height=height, width=width)
 
 
-def mpi_candidates(observations: Observations, content: Content, fineness: Fineness) -> list[MPIPlan]:
-    """Views and sides at training cameras that are spread over the capture."""
+def find_candidates(observations: Observations, content: Content, with_cubes: bool) -> list[Candidate]:
+    """Views and sides at training cameras that are spread over the capture, and cubes."""
     spread = spread_cameras(observations, content, MAX_VIEWS)
     views = [
-        _view(observations, content, fineness, int(i), pull_back * content.near, margin)
+        _view(observations, content, i, pull_back * content.near, margin)
         for i in spread
         for pull_back in PULL_BACKS
         for margin in MARGINS
     ]
-    return [*views, *_sides(observations, content, fineness, spread[:MAX_SIDES])]
+    cubes = _cubes(observations, content) if with_cubes else []
+    return [*views, *_sides(observations, content, spread[:MAX_SIDES]), *cubes]
 
 
-def spread_cameras(observations: Observations, content: Content, wanted: int) -> Array:
+def _candidate(frame: MPIPlan, observations: Observations, content: Content, pixels: tuple[float, float]) -> Candidate:
+    plane, across, down = pixel_slopes(frame, observations, content.cameras, content.points)
+    u0, u1, v0, v1 = frame.extent
+    rows, columns = pixels
+    texel = np.maximum(across * ((u1 - u0) / columns), down * ((v1 - v0) / rows))
+    return Candidate(frame, rows, columns, (0.5 / frame.near * plane).astype(np.float32), texel.astype(np.float32))
+
+
+def spread_cameras(observations: Observations, content: Content, wanted: int) -> list[int]:
     """Cameras far apart in place or direction, each the farthest from those before it.
 
     Starts at the camera farthest from the middle, so the numbering of the cameras does not matter.
@@ -70,32 +95,31 @@ def spread_cameras(observations: Observations, content: Content, wanted: int) ->
     while len(chosen) < min(wanted, len(place)):
         distance = np.minimum(distance, np.linalg.norm(place - place[chosen[-1]], axis=-1))
         chosen.append(int(distance.argmax()))
-    return np.array(chosen)
+    return chosen
 
 
-def _view(
-    observations: Observations, content: Content, fineness: Fineness, i: int, pull_back: float, margin: float
-) -> MPIPlan:
+def _view(observations: Observations, content: Content, i: int, pull_back: float, margin: float) -> Candidate:
     right, up, back = observations.camera_to_worlds[i, :, :3].T
     fx, fy, cx, cy = observations.intrinsics[i]
     width, height = observations.sizes[i]
     u, v = np.array([-cx, width - cx]) / fx, np.array([-cy, height - cy]) / fy
     u0, u1, v0, v1 = (float(x) for side in (u, v) for x in side.mean() + margin * (side - side.mean()))
-    return MPIPlan(
+    frame = MPIPlan(
         name=f"view {i + 1}",
         origin=vector(observations.centers[i] + pull_back * back),
         axes=(vector(right), vector(-up), vector(-back)),
         near=float(NEAR_SHARE * min(content.nearest[i], content.near) + pull_back),
         extent=(u0, u1, v0, v1),
-        planes=fineness.planes,
-        height=max(8, round((v1 - v0) * fy / fineness.texel_pixels) + 1),
-        width=max(8, round((u1 - u0) * fx / fineness.texel_pixels) + 1),
+        planes=2,
+        height=2,
+        width=2,
     )
+    return _candidate(frame, observations, content, (float((v1 - v0) * fy), float((u1 - u0) * fx)))
 
 
-def _sides(observations: Observations, content: Content, fineness: Fineness, cameras: Array) -> Iterator[MPIPlan]:
+def _sides(observations: Observations, content: Content, cameras: list[int]) -> Iterator[Candidate]:
     for i in cameras:
-        right, up, back = observations.camera_to_worlds[int(i), :, :3].T
+        right, up, back = observations.camera_to_worlds[i, :, :3].T
         turns = {
             "left": (-back, -up, -right),
             "right": (back, -up, right),
@@ -104,60 +128,52 @@ def _sides(observations: Observations, content: Content, fineness: Fineness, cam
         }
         for name, axes in turns.items():
             for pull_back in PULL_BACKS:
-                origin = observations.centers[int(i)] - pull_back * content.near * axes[2]
-                side = _side(observations, content, fineness, f"{name} of view {int(i) + 1}", origin, np.stack(axes))
+                origin = observations.centers[i] - pull_back * content.near * axes[2]
+                side = _side(observations, content, f"{name} of view {i + 1}", origin, np.stack(axes))
                 if side is not None:
                     yield side
 
 
-def _side(
-    observations: Observations, content: Content, fineness: Fineness, name: str, origin: Array, axes: Array
-) -> MPIPlan | None:
+def _side(observations: Observations, content: Content, name: str, origin: Array, axes: Array) -> Candidate | None:
     """An MPI around what lies ahead of a frame; None where too little does.
 
     Its texels span the wanted number of pixels in the median over the observations that it holds.
     """
     local = (content.points - origin) @ axes.T
     ahead = np.nonzero((local[:, 2] > 0.2 * content.near) & (np.abs(local[:, :2]).max(-1) < WIDEST * local[:, 2]))[0]
-    if len(ahead) < 0.02 * len(content.points):
+    if content.weights[ahead].sum() < 0.02 * content.weights.sum():
         return None
     near = NEAR_SHARE * float(np.percentile(local[ahead, 2], 3))
-    tangents = local[ahead, :2] / local[ahead, 2:]
-    low, high = np.percentile(tangents, [2, 98], axis=0)
+    low, high = np.percentile(local[ahead, :2] / local[ahead, 2:], [2, 98], axis=0)
     margin = 0.05 * (high - low) + 1e-3
     (u0, v0), (u1, v1) = (low - margin).tolist(), (high + margin).tolist()
-    frame = MPIPlan(name, vector(origin), tuple(vector(a) for a in axes), near, (u0, u1, v0, v1), 2, 2, 2)  # type: ignore
+    rows = (vector(axes[0]), vector(axes[1]), vector(axes[2]))
+    frame = MPIPlan(name, vector(origin), rows, near, (u0, u1, v0, v1), 2, 2, 2)
     _, across, down = pixel_slopes(frame, observations, content.cameras[ahead], content.points[ahead])
     held = np.isfinite(across)
     if not held.any():
         return None
-    width, height = (
-        max(8, round(extent * float(np.median(slope[held])) / fineness.texel_pixels) + 1)
-        for extent, slope in ((u1 - u0, across), (v1 - v0, down))
-    )
-    return replace(frame, planes=fineness.planes, width=width, height=height)
+    pixels = (float((v1 - v0) * np.median(down[held])), float((u1 - u0) * np.median(across[held])))
+    return _candidate(frame, observations, content, pixels)
 
 
-def cube_candidates(observations: Observations, content: Content, fineness: Fineness) -> list[CubePlan]:
-    """Cubes around the point that the cameras look at, where there is one, else around the cameras."""
-    if fineness.max_voxels < 2:
-        return []
+def _cubes(observations: Observations, content: Content) -> Iterator[Candidate]:
+    """Cubes around the point that the cameras look at; none where they look elsewhere.
+
+    Their voxels span the wanted number of pixels in the median over the observations inside.
+    """
     center, distance = _looked_at(observations)
     if center is None:
-        center = observations.centers.mean(0)
-        distance = float(np.linalg.norm(observations.centers - center, axis=-1).max()) + content.near
-    cubes = []
+        return
     for half in (size * distance for size in CUBE_SIZES):
-        seen = np.abs(content.points - center).max(-1) < half
-        if not seen.any():
-            continue
-        poses = observations.camera_to_worlds[content.cameras[seen]]
-        depth = -np.einsum("qi,qi->q", content.points[seen] - poses[:, :, 3], poses[:, :, 2])
-        focal = observations.intrinsics[content.cameras[seen], 0]
-        voxel = fineness.texel_pixels * float(np.median(depth / focal))
-        side = int(np.clip(round(2 * half / voxel), 8, fineness.max_voxels))
-        cubes.append(CubePlan(vector(center - half), vector(center + half), (side, side, side)))
-    return cubes
+        frame = CubePlan(vector(center - half), vector(center + half), (2, 2, 2))
+        # A voxel as large as half the cube spans this many pixels.
+        pixels = cube_errors(frame, observations, content.cameras, content.points)
+        inside = np.isfinite(pixels)
+        if inside.any():
+            side = 2 * float(np.median(pixels[inside]))
+            plane = np.where(inside, 0.0, np.inf).astype(np.float32)
+            yield Candidate(frame, side, side, plane, (2 * pixels / side).astype(np.float32))
 
 
 def _looked_at(observations: Observations) -> tuple[Array | None, float]:

@@ -11,8 +11,9 @@ from mmpi_ns.placement.observations import Array, Observations, frustum_points
 
 SAMPLED, SAMPLED_PER_CAMERA = 6000, 16
 """Observations that the choice is based on: so many, or so many a camera where that is more."""
-FAR_SHARE = 0.15
-"""Weight of what lies far away in every image, where there may be no keypoints (sky) but must be a plane."""
+FRUSTUM_SHARE, FEW = 0.15, 10
+"""Weight, in every image, of points that fill its frustum: a share, and most of it where there are so FEW keypoints.
+Where an image has no keypoints (sky, a white wall) there must be planes all the same."""
 WINDOW, SUPPORT = 1.5, 0.04
 """Content starts where so many of a camera's observations lie within a factor of WINDOW in depth."""
 
@@ -26,7 +27,7 @@ class Content:
     points: Array
     """[Q, 3] what it observes."""
     weights: Array
-    """[Q] what an observation counts; they sum to the number of cameras."""
+    """[Q] what an observation counts; those of a camera sum to 1."""
     nearest: Array
     """[M] depth, along each camera's axis, at which its content starts."""
     near: float
@@ -34,27 +35,25 @@ class Content:
 
 
 def find_content(observations: Observations) -> Content:
-    """The observations that placement weighs: keypoints, else points filling the cameras' frusta, and the far distance.
+    """The observations that placement weighs: keypoints, and points that fill the cameras' frusta.
 
-    Observations that are not finite or lie behind their camera are left out. Without any points the nearest content is
-    taken to lie at a tenth of the cameras' spread.
+    Keypoints that are not finite or lie behind their camera are left out. Without any the nearest content is taken to
+    lie at a tenth of the cameras' spread.
 
     Raises:
-        ValueError: nothing is left.
+        ValueError: there are keypoints, and none of them can be used.
     """
     centers = observations.centers
-    if len(observations.seen_by):
-        cameras, points = observations.seen_by, observations.points[observations.seen_point]
-    else:
-        spread = float(np.linalg.norm(centers - centers.mean(0), axis=-1).max())
-        points = frustum_points(observations, near=max(0.1 * spread, 1e-3))
-        cameras = np.repeat(np.arange(len(centers)), len(points) // len(centers))
+    cameras, points = observations.seen_by, observations.points[observations.seen_point]
     good = np.isfinite(points).all(-1)
     cameras, points = cameras[good], points[good]
     depth = _depth(observations, cameras, points)
     cameras, points, depth = cameras[depth > 0], points[depth > 0], depth[depth > 0]
     if not len(points):
-        raise ValueError("No point lies in front of the camera that saw it: check the poses and the points' frame.")
+        if len(observations.seen_by):
+            raise ValueError("No point lies in front of the camera that saw it: check the poses and the points' frame.")
+        spread = float(np.linalg.norm(centers - centers.mean(0), axis=-1).max())
+        depth = np.array([max(0.1 * spread, 1e-3)])
     starts = {i: _start(depth[cameras == i]) for i in range(len(centers)) if (cameras == i).sum() >= 20}
     near = float(np.median(list(starts.values()))) if starts else _start(depth)
     nearest = np.array([starts.get(i, near) for i in range(len(centers))])
@@ -81,26 +80,15 @@ def _weighed(
     order = np.argsort(_depth(observations, cameras, points) / near, kind="stable")
     wanted = min(len(order), max(SAMPLED, SAMPLED_PER_CAMERA * count))
     keep = order[np.linspace(0, len(order) - 1, wanted).round().astype(int)]
-    far_cameras, far_points = _far(observations, 1e4 * near)
-    weights = [
-        np.full(len(keep), (1 - FAR_SHARE) * count / len(keep)),
-        np.full(len(far_points), FAR_SHARE * count / len(far_points)),
-    ]
+    cameras, points = cameras[keep], points[keep]
+    seen = np.bincount(cameras, minlength=count)
+    share = (1 - FRUSTUM_SHARE) * seen / (seen + FEW)
+    filling = frustum_points(observations, nearest)
+    each = len(filling) // count
     return Content(
-        np.concatenate([cameras[keep], far_cameras]),
-        np.concatenate([points[keep], far_points]),
-        np.concatenate(weights),
-        nearest,
-        near,
+        cameras=np.concatenate([cameras, np.repeat(np.arange(count), each)]),
+        points=np.concatenate([points, filling]),
+        weights=np.concatenate([(share / np.maximum(seen, 1))[cameras], np.repeat((1 - share) / each, each)]),
+        nearest=nearest,
+        near=near,
     )
-
-
-def _far(observations: Observations, distance: float) -> tuple[NDArray[np.int64], Array]:
-    """Six points far away in every image, near its corners and the middles of its long sides."""
-    shares = np.array([[x, y] for x in (0.05, 0.5, 0.95) for y in (0.1, 0.9)])
-    cameras = np.repeat(np.arange(len(observations.centers)), len(shares))
-    fx, fy, cx, cy = observations.intrinsics[cameras].T
-    pixels = np.tile(shares, (len(observations.centers), 1)) * observations.sizes[cameras]
-    local = np.stack([(pixels[:, 0] - cx) / fx, -(pixels[:, 1] - cy) / fy, -np.ones(len(cameras))], -1)
-    world = np.einsum("qij,qj->qi", observations.camera_to_worlds[cameras][:, :, :3], local)
-    return cameras, observations.centers[cameras] + distance * world

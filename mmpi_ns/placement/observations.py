@@ -67,18 +67,26 @@ class Observations:
         return float(np.median(np.where(ahead, error, np.inf)))
 
 
-def frustum_points(observations: Observations, near: float, per_camera: int = 64) -> Array:
-    """Points filling the camera frusta, uniform in pixels and in disparity from ``near``; stands in for SfM points.
+def frustum_points(observations: Observations, near: Array, per_camera: int = 24) -> Array:
+    """Points filling the camera frusta, uniform in pixels and in disparity; the last of each camera far away.
 
-    Deterministic (a low-discrepancy sequence), so equal scenes give equal plans.
+    Deterministic (a low-discrepancy sequence), so equal scenes give equal points.
+
+    Args:
+        observations: the cameras.
+        near: [M] depth at which each camera's points start.
+        per_camera: points of each camera.
+
+    Returns:
+        [M * per_camera, 3] camera after camera.
     """
     index = np.arange(per_camera)
     uvw = np.stack([(index * g) % 1.0 for g in (0.7548776662, 0.5698402910, 0.8191725134)], -1)
     clouds = []
-    for pose, (fx, fy, cx, cy), (w, h) in zip(
-        observations.camera_to_worlds, observations.intrinsics, observations.sizes, strict=True
+    for pose, (fx, fy, cx, cy), (w, h), start in zip(
+        observations.camera_to_worlds, observations.intrinsics, observations.sizes, near, strict=True
     ):
-        depth = near / np.maximum(uvw[:, 2], 0.02)
+        depth = start / np.maximum(uvw[:, 2], 1e-3)
         x, y = (uvw[:, 0] * w - cx) / fx, (uvw[:, 1] * h - cy) / fy
         local = np.stack([x, -y, -np.ones_like(x)], -1) * depth[:, None]
         clouds.append(local @ pose[:, :3].T + pose[:, 3])

@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from mmpi_ns.placement.content import Content
 from mmpi_ns.placement.explain import WORST, PlanReport
@@ -74,7 +75,7 @@ def draw_errors(path: Path, plan: ScenePlan, report: PlanReport) -> None:
     figure.savefig(path, dpi=110)
 
 
-def _nearby(content: Content, observations: Observations) -> Array:
+def _nearby(content: Content, observations: Observations) -> NDArray[np.bool_]:
     """Points near enough to be drawn: the far ones would shrink everything else to a dot."""
     distance = np.linalg.norm(content.points - observations.centers[content.cameras], axis=-1)
     return distance < 40 * content.near

@@ -12,12 +12,12 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
-from mmpi_ns.placement.candidates import Fineness, cube_candidates, mpi_candidates
+from mmpi_ns.placement.candidates import Candidate, find_candidates
 from mmpi_ns.placement.content import Content, find_content
-from mmpi_ns.placement.errors import cube_errors, mpi_errors
 from mmpi_ns.placement.hand_made import drive_plan, room_plan
-from mmpi_ns.placement.observations import Array, Observations
+from mmpi_ns.placement.observations import Observations
 from mmpi_ns.placement.plan import CubePlan, MPIPlan, ScenePlan
 
 MAX_ERROR = 64.0
@@ -53,9 +53,9 @@ class PlacementConfig:
     """Texel rows of every MPI (drive, room)."""
     width: int = 256
     """Texel columns of every MPI (drive, room)."""
-    enough: float = 0.75
+    enough: float = 1.0
     """Expected error that needs no further MPI, relative to a texel's pixels (automatic)."""
-    texel_cost: float = 0.25
+    texel_cost: float = 0.5
     """How much texels count against a candidate: its gain is divided by texels to this power (automatic)."""
     max_voxels: int = 128
     """Voxels along a side of a cube at most, where one is worth it; 0 for none (automatic)."""
@@ -106,102 +106,96 @@ def _choose(
     observations: Observations, content: Content, config: PlacementConfig, texel_pixels: float
 ) -> list[MPIPlan | CubePlan]:
     """The heads that a scene needs, with texels no finer than the budget allows."""
-    chosen: list[MPIPlan | CubePlan] = []
+    candidates = find_candidates(observations, content, with_cubes=config.max_voxels > 0)
+    best: list[MPIPlan | CubePlan] | None = None
+    too_fine = None
     for _ in range(BUDGET_ROUNDS):
-        fineness = Fineness(texel_pixels, config.max_planes, config.max_voxels)
-        heads = [*mpi_candidates(observations, content, fineness), *cube_candidates(observations, content, fineness)]
-        chosen = _Choice(heads, observations, content, config, texel_pixels).run()
+        chosen = _Choice(candidates, content.weights, config, texel_pixels).run()
         excess = sum(h.texels for h in chosen) / config.max_texels if config.max_texels else 0.0
         if excess <= 1.0:
-            break
-        # Texels shrink a plane's rows and columns, and coarser ones ask for fewer planes: a third power, nearly.
-        texel_pixels *= max(1.04, excess ** (1 / 3))
-    return chosen
+            best = chosen
+            if too_fine is None or excess > 0.8:
+                break
+            texel_pixels = (too_fine * texel_pixels) ** 0.5
+        else:
+            too_fine = texel_pixels
+            # Coarser texels have fewer rows and columns and ask for fewer planes: a third power, nearly.
+            texel_pixels *= max(1.04, excess ** (1 / 3)) if best is None else 1.1
+    return best or chosen
 
 
 class _Choice:
     """Greedy choice among candidates, by what each costs every observation."""
 
     def __init__(
-        self,
-        heads: list[MPIPlan | CubePlan],
-        observations: Observations,
-        content: Content,
-        config: PlacementConfig,
-        texel_pixels: float,
+        self, candidates: list[Candidate], weights: NDArray[np.float64], config: PlacementConfig, texel_pixels: float
     ) -> None:
-        self.heads, self.observations, self.content, self.config = heads, observations, content, config
-        self.target, self.enough = config.plane_pixels * texel_pixels, config.enough * texel_pixels
-        self.cost = np.stack([self._bits(h) for h in heads]).astype(np.float32)
-        self.nothing = np.full(self.cost.shape[1], np.log2(max(MAX_ERROR / self.enough, 2.0)), np.float32)
-        self.price = np.array([h.texels for h in heads], dtype=np.float64) ** config.texel_cost
-        self.is_cube = np.array([isinstance(h, CubePlan) for h in heads])
+        self.candidates, self.weights, self.config, self.texel_pixels = candidates, weights, config, texel_pixels
+        self.cost: NDArray[np.float32] = np.stack([self._bits(c) for c in candidates])
+        self.nothing = np.full(self.cost.shape[1], self.cost.max(), np.float32)
+        texels = [self._head(c, config.max_planes).texels for c in candidates]
+        self.price = np.array(texels, dtype=np.float64) ** config.texel_cost
+        self.is_cube = np.array([isinstance(c.frame, CubePlan) for c in candidates])
 
     def run(self) -> list[MPIPlan | CubePlan]:
-        """The chosen heads, in the order of choice, each MPI with the planes it needs."""
+        """The chosen heads, each MPI with the planes it needs."""
         chosen: list[int] = []
         while len(chosen) < self.config.max_mpis:
             best = self._next(chosen)
             if best is None:
                 break
             grown = self._without_superfluous([*chosen, best])
-            if sorted(grown) == sorted(chosen):  # it makes itself superfluous: nothing more to gain
+            if self._total(grown) >= self._total(chosen):  # it makes itself or its better superfluous
                 break
             chosen = grown
-        return self._with_planes(chosen)
+        owner = self.cost[chosen].argmin(0)
+        return [self._head(self.candidates[j], self._planes(j, owner == n)) for n, j in enumerate(chosen)]
+
+    def _total(self, chosen: list[int]) -> float:
+        """Expected error that is left, in bits, summed over images."""
+        served = np.minimum(self.nothing, self.cost[chosen].min(0)) if chosen else self.nothing
+        return float(served @ self.weights)
 
     def _next(self, chosen: list[int]) -> int | None:
         """The candidate that gains most for its texels; None where none gains enough. The first must be an MPI."""
-        current = self._served(chosen)
-        gain = np.maximum(current - self.cost, 0) @ self.content.weights
-        allowed = ~self.is_cube if not chosen or self.is_cube[chosen].any() else np.ones_like(self.is_cube)
-        score = np.where(allowed & (gain >= self.config.min_gain), gain / self.price, -1.0)
-        if not chosen:
-            score = np.where(allowed, gain / self.price, -1.0)
-        best = int(score.argmax())
-        return best if score[best] > 0 or not chosen else None
-
-    def _served(self, chosen: list[int]) -> Array:
-        return np.minimum(self.nothing, self.cost[chosen].min(0)) if chosen else self.nothing
+        served = np.minimum(self.nothing, self.cost[chosen].min(0)) if chosen else self.nothing
+        gain = np.maximum(served - self.cost, 0) @ self.weights
+        if not chosen:  # a scene needs an MPI, however little it gains
+            return int(np.where(self.is_cube, -1.0, gain / self.price).argmax())
+        allowed = gain >= self.config.min_gain
+        if self.is_cube[chosen].any():
+            allowed &= ~self.is_cube
+        return int(np.where(allowed, gain / self.price, -1.0).argmax()) if allowed.any() else None
 
     def _without_superfluous(self, chosen: list[int]) -> list[int]:
         """Leaves out, one by one, heads whose absence costs less than the least gain that counts."""
-        while len(chosen) > 1:
-            total = self._served(chosen) @ self.content.weights
-            losses = [self._served([c for c in chosen if c != j]) @ self.content.weights - total for j in chosen]
-            removable = [n for n, j in enumerate(chosen) if not self.is_cube[j]]
-            least = min(range(len(chosen)), key=lambda n: losses[n])
-            last_mpi = removable == [least]
-            if losses[least] >= self.config.min_gain or last_mpi:
-                break
-            chosen = [c for n, c in enumerate(chosen) if n != least]
-        return chosen
+        while True:
+            total = self._total(chosen)
+            losses = [self._total([c for c in chosen if c != j]) - total for j in chosen]
+            mpis = int((~self.is_cube[chosen]).sum())
+            free = [n for n, j in enumerate(chosen) if self.is_cube[j] or mpis > 1]
+            least = min(free, key=lambda n: losses[n], default=None)
+            if least is None or losses[least] >= self.config.min_gain:
+                return chosen
+            chosen = [j for n, j in enumerate(chosen) if n != least]
 
-    def _with_planes(self, chosen: list[int]) -> list[MPIPlan | CubePlan]:
-        """Each MPI with the planes at which four fifths of what it serves best err little enough."""
-        owner = self.cost[chosen].argmin(0)
-        result = []
-        for n, j in enumerate(chosen):
-            head = self.heads[j]
-            if isinstance(head, MPIPlan):
-                own = np.nonzero(owner == n)[0]
-                plane, _ = mpi_errors(head, self.observations, self.content.cameras[own], self.content.points[own])
-                plane = plane[np.isfinite(plane)]
-                wanted = float(np.quantile(plane, 0.8)) / self.target if len(plane) else 0.0
-                planes = 8 * round((1 + (head.planes - 1) * wanted) / 8)
-                head = replace(head, planes=int(np.clip(planes, MIN_PLANES, self.config.max_planes)))
-            result.append(head)
-        return result
+    def _planes(self, j: int, own: NDArray[np.bool_]) -> int:
+        """Planes at which four fifths of what candidate j serves best err little enough."""
+        error = self.candidates[j].plane[own]
+        error = error[np.isfinite(error)]
+        wanted = float(np.quantile(error, 0.8)) / (self.config.plane_pixels * self.texel_pixels) if len(error) else 0.0
+        return int(np.clip(8 * round((1 + wanted) / 8), MIN_PLANES, self.config.max_planes))
 
-    def _bits(self, head: MPIPlan | CubePlan) -> Array:
+    def _head(self, candidate: Candidate, planes: int) -> MPIPlan | CubePlan:
+        return candidate.at(self.texel_pixels, planes, self.config.max_voxels)
+
+    def _bits(self, candidate: Candidate) -> NDArray[np.float32]:
         """log2 of the expected pixel errors over what is small enough: what each observation costs if served here."""
-        cameras, points = self.content.cameras, self.content.points
-        if isinstance(head, CubePlan):
-            plane, texel = 0.0, cube_errors(head, self.observations, cameras, points)
-        else:
-            plane, texel = mpi_errors(head, self.observations, cameras, points)
-        worst = max(MAX_ERROR, 2 * self.enough)
-        return np.log2(np.clip(np.hypot(plane, 0.5 * texel), self.enough, worst) / self.enough)
+        enough = self.config.enough * self.texel_pixels
+        size = max(self.texel_pixels, candidate.coarsest(self.config.max_voxels))
+        plane, texel = candidate.plane / (self.config.max_planes - 1), 0.5 * size * candidate.texel
+        worst = max(MAX_ERROR, 2 * enough)
+        return np.log2(np.clip(np.hypot(plane, texel), enough, worst) / enough).astype(np.float32)
 
 
 def _named(mpis: tuple[MPIPlan, ...]) -> tuple[MPIPlan, ...]:
