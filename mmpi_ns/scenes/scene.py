@@ -219,7 +219,7 @@ def surface_of(these: Primitives, points: Array, directions: Array, pixel: Array
     return surface, to_local(normal, -these.yaw)
 
 
-def render(scene: Scene, camera: int, supersample: int = 2, contrast: float = 0.05) -> tuple[Colors, Colors]:
+def render(scene: Scene, camera: int, supersample: int = 2, contrast: float = 0.08) -> tuple[Colors, Colors]:
     """One image [H, W, 3] in [0, 1] and the exact distance [H, W] along the pixels' central rays, inf for the sky.
 
     Textures are averaged over the pixel, so one ray shows the inside of a face; pixels that differ from a neighbour
