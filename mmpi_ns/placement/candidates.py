@@ -65,10 +65,10 @@ def find_candidates(observations: Observations, content: Content, with_cubes: bo
     """Views and sides at training cameras that are spread over the capture, and cubes."""
     spread = spread_cameras(observations, content, MAX_VIEWS)
     views = [
-        _view(observations, content, i, pull_back * content.near, margin)
+        view
         for i in spread
         for pull_back in PULL_BACKS
-        for margin in MARGINS
+        for view in _views(observations, content, i, pull_back * content.near)
     ]
     cubes = _cubes(observations, content) if with_cubes else []
     return [*views, *_sides(observations, content, spread[:MAX_SIDES]), *cubes]
@@ -98,23 +98,38 @@ def spread_cameras(observations: Observations, content: Content, wanted: int) ->
     return chosen
 
 
-def _view(observations: Observations, content: Content, i: int, pull_back: float, margin: float) -> Candidate:
+def _views(observations: Observations, content: Content, i: int, pull_back: float) -> Iterator[Candidate]:
+    """One MPI for each margin. They differ in extent alone, so the errors are worked out once, in the widest."""
     right, up, back = observations.camera_to_worlds[i, :, :3].T
     fx, fy, cx, cy = observations.intrinsics[i]
     width, height = observations.sizes[i]
+    origin, axes = observations.centers[i] + pull_back * back, np.stack([right, -up, -back])
     u, v = np.array([-cx, width - cx]) / fx, np.array([-cy, height - cy]) / fy
-    u0, u1, v0, v1 = (float(x) for side in (u, v) for x in side.mean() + margin * (side - side.mean()))
     frame = MPIPlan(
         name=f"view {i + 1}",
-        origin=vector(observations.centers[i] + pull_back * back),
+        origin=vector(origin),
         axes=(vector(right), vector(-up), vector(-back)),
         near=float(NEAR_SHARE * min(content.nearest[i], content.near) + pull_back),
-        extent=(u0, u1, v0, v1),
+        extent=_widened(u, v, max(MARGINS)),
         planes=2,
         height=2,
         width=2,
     )
-    return _candidate(frame, observations, content, (float((v1 - v0) * fy), float((u1 - u0) * fx)))
+    plane, across, down = pixel_slopes(frame, observations, content.cameras, content.points)
+    plane, texel = 0.5 / frame.near * plane, np.maximum(across / fx, down / fy)
+    local = (content.points - origin) @ axes.T
+    for margin in MARGINS:
+        u0, u1, v0, v1 = extent = _widened(u, v, margin)
+        x, y, z = local.T
+        held = (x >= u0 * z) & (x <= u1 * z) & (y >= v0 * z) & (y <= v1 * z)
+        errors = (np.where(held, values, np.inf).astype(np.float32) for values in (plane, texel))
+        yield Candidate(replace(frame, extent=extent), float((v1 - v0) * fy), float((u1 - u0) * fx), *errors)
+
+
+def _widened(u: Array, v: Array, margin: float) -> tuple[float, float, float, float]:
+    """A frustum's tangents (u0, u1, v0, v1), ``margin`` times as wide and high about its middle."""
+    u0, u1, v0, v1 = (float(x) for side in (u, v) for x in side.mean() + margin * (side - side.mean()))
+    return u0, u1, v0, v1
 
 
 def _sides(observations: Observations, content: Content, cameras: list[int]) -> Iterator[Candidate]:

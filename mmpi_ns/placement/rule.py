@@ -108,6 +108,7 @@ def _choose(
     """The heads that a scene needs, with texels no finer than the budget allows."""
     candidates = find_candidates(observations, content, with_cubes=config.max_voxels > 0)
     best: list[MPIPlan | CubePlan] | None = None
+    chosen: list[MPIPlan | CubePlan] = []
     too_fine = None
     for _ in range(BUDGET_ROUNDS):
         chosen = _Choice(candidates, content.weights, config, texel_pixels).run()
