@@ -84,6 +84,7 @@ class Results:
         row["train_seconds"] = seconds
         row["steps"] = _steps(run)
         row["threads"] = threads
+        row["processor"] = _processor()
         row["commit"] = _output(["git", "rev-parse", "--short", "HEAD"])
         row["date"] = date.today().isoformat()
         row["command"] = " ".join(["ns-train", variant.method, *steps, *variant.options])
@@ -102,7 +103,7 @@ class Results:
         lines = [
             f"# {self.suite}, images at 1/{self.downscale_factor}",
             "",
-            f"Made by `{command} --data <scene>` on {_processor()}.",
+            f"Made by `{command} --data <scene>` on {' and '.join(sorted({r['processor'] for r in rows.values()}))}.",
             "Every figure is `ns-eval`'s mean over all test images. Rays are pixel rays of training;",
             "e_p and e_t are the expected pixel errors for lack of planes and of texels",
             "(median / 90th percentile over the training observations, each in the MPI that serves it best).",

@@ -9,6 +9,7 @@ JOINT = ("--pipeline.model.training", "joint")
 TWO_PHASE = ("--pipeline.model.training", "two-phase")
 DRIVE = (P + "arrangement", "drive")
 PLACED = (*JOINT, P + "texel-pixels", "1.5")
+FRONT = (*DRIVE, *JOINT, P + "faces", "front")
 NO_DEPTH = ("--pipeline.datamanager.keypoint-rays", "0")
 
 
@@ -30,12 +31,12 @@ def _paper_ladder(depth: bool) -> list[Variant]:
     extra = () if depth else NO_DEPTH
     group = "with SfM depth" if depth else "without SfM depth"
     rows = [
-        ("one front MPI at the first camera", (*DRIVE, *JOINT, P + "faces", "front", P + "drive-pull-back", "0")),
-        ("one front MPI, pulled back", (*DRIVE, *JOINT, P + "faces", "front")),
+        ("one front MPI at the first camera", (*FRONT, P + "drive-pull-back", "0")),
+        ("one front MPI, pulled back", FRONT),
         ("four MPIs, joint, no reliability", (*DRIVE, *JOINT)),
         ("four MPIs, individual, then reliability only", (*DRIVE, *TWO_PHASE, *_shares(0.25, 0.0))),
         ("... then a joint fine-tune", (*DRIVE, *TWO_PHASE, *_shares(0.1, 0.4))),
-        ("placed among the cameras, joint", PLACED),
+        ("automatic placement, joint", PLACED),
     ]
     return [Variant(name, (*options, *extra), group=group) for name, options in rows]
 
@@ -50,12 +51,17 @@ SUITES: dict[str, list[Variant]] = {
     "kitti-street": [
         *_paper_ladder(depth=True),
         *_paper_ladder(depth=False),
+        # As many steps as take about the time of 750 steps with automatic placement.
+        Variant("one front MPI, pulled back, longer", FRONT, steps=2600, group="with SfM depth"),
+        Variant("four MPIs, joint, longer", (*DRIVE, *JOINT), steps=1200, group="with SfM depth"),
         Variant("mmpi-small, its defaults", (), steps=None, group="defaults"),
     ],
     "room-walk": [
         Variant("five MPIs and cube, joint", (*ROOM, P + "cube-voxels", "96"), steps=500),
         Variant("five MPIs, joint", ROOM, steps=500),
+        Variant("automatic placement, joint", JOINT, steps=500),
+        Variant("automatic placement, joint, longer", JOINT, steps=1500),
     ],
-    "fern": [Variant("one MPI", (P + "max-mpis", "1", P + "planes", "96", P + "texel-pixels", "3"), steps=500)],
-    "fox": [Variant("placed among the cameras, joint", (*JOINT, P + "texel-pixels", "3"), steps=400)],
+    "fern": [Variant("automatic placement", (), steps=2000)],
+    "fox": [Variant("automatic placement", (), steps=2000)],
 }

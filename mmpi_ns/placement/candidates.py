@@ -1,9 +1,8 @@
 """Where MPIs and the cube might stand: a generous list, from which ``rule.py`` chooses.
 
-Three kinds. *Views* are frusta of training cameras, some pulled back, some widened: seen from its own origin an MPI has
-no plane error and texels as fine as pixels. *Sides* face left, right, down or up from a training camera's place, some
-from behind it: one of them may hold the whole side of a drive, on planes parallel to what stands there. *Cubes*
-surround what the cameras look at from all round.
+Two kinds. *Views* are frusta of training cameras, some pulled back, some widened: seen from its own origin an MPI has
+no plane error and texels as fine as pixels. *Cubes* surround what the cameras look at from all round. (MPIs that face
+left, right, up or down from a camera's place were candidates too, and measured worse: docs/experiments.md.)
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from mmpi_ns.placement.hand_made import vector
 from mmpi_ns.placement.observations import Array, Observations
 from mmpi_ns.placement.plan import CubePlan, MPIPlan
 
-MAX_VIEWS, MAX_SIDES = 96, 24
+MAX_VIEWS = 96
 """Training cameras that candidates start from, spread over all of them."""
 MARGINS = (1.12, 1.4, 1.75)
 """Frusta of views, relative to the camera's own."""
@@ -28,8 +27,6 @@ PULL_BACKS = (0.0, 1.0, 2.0)
 """How far behind the camera an MPI may stand, relative to where content starts."""
 NEAR_SHARE = 0.6
 """First plane, relative to where content starts."""
-WIDEST = 9.0
-"""No tangent of a side is larger."""
 CUBE_SIZES = (0.4, 0.7, 1.0)
 """Half a cube's side, relative to the cameras' distance from what they look at."""
 
@@ -62,7 +59,7 @@ class Candidate:
 
 
 def find_candidates(observations: Observations, content: Content, with_cubes: bool) -> list[Candidate]:
-    """Views and sides at training cameras that are spread over the capture, and cubes."""
+    """Views of training cameras that are spread over the capture, and cubes."""
     spread = spread_cameras(observations, content, MAX_VIEWS)
     views = [
         view
@@ -70,16 +67,7 @@ def find_candidates(observations: Observations, content: Content, with_cubes: bo
         for pull_back in PULL_BACKS
         for view in _views(observations, content, i, pull_back * content.near)
     ]
-    cubes = _cubes(observations, content) if with_cubes else []
-    return [*views, *_sides(observations, content, spread[:MAX_SIDES]), *cubes]
-
-
-def _candidate(frame: MPIPlan, observations: Observations, content: Content, pixels: tuple[float, float]) -> Candidate:
-    plane, across, down = pixel_slopes(frame, observations, content.cameras, content.points)
-    u0, u1, v0, v1 = frame.extent
-    rows, columns = pixels
-    texel = np.maximum(across * ((u1 - u0) / columns), down * ((v1 - v0) / rows))
-    return Candidate(frame, rows, columns, (0.5 / frame.near * plane).astype(np.float32), texel.astype(np.float32))
+    return [*views, *(_cubes(observations, content) if with_cubes else [])]
 
 
 def spread_cameras(observations: Observations, content: Content, wanted: int) -> list[int]:
@@ -130,46 +118,6 @@ def _widened(u: Array, v: Array, margin: float) -> tuple[float, float, float, fl
     """A frustum's tangents (u0, u1, v0, v1), ``margin`` times as wide and high about its middle."""
     u0, u1, v0, v1 = (float(x) for side in (u, v) for x in side.mean() + margin * (side - side.mean()))
     return u0, u1, v0, v1
-
-
-def _sides(observations: Observations, content: Content, cameras: list[int]) -> Iterator[Candidate]:
-    for i in cameras:
-        right, up, back = observations.camera_to_worlds[i, :, :3].T
-        turns = {
-            "left": (-back, -up, -right),
-            "right": (back, -up, right),
-            "below": (right, back, -up),
-            "above": (right, -back, up),
-        }
-        for name, axes in turns.items():
-            for pull_back in PULL_BACKS:
-                origin = observations.centers[i] - pull_back * content.near * axes[2]
-                side = _side(observations, content, f"{name} of view {i + 1}", origin, np.stack(axes))
-                if side is not None:
-                    yield side
-
-
-def _side(observations: Observations, content: Content, name: str, origin: Array, axes: Array) -> Candidate | None:
-    """An MPI around what lies ahead of a frame; None where too little does.
-
-    Its texels span the wanted number of pixels in the median over the observations that it holds.
-    """
-    local = (content.points - origin) @ axes.T
-    ahead = np.nonzero((local[:, 2] > 0.2 * content.near) & (np.abs(local[:, :2]).max(-1) < WIDEST * local[:, 2]))[0]
-    if content.weights[ahead].sum() < 0.02 * content.weights.sum():
-        return None
-    near = NEAR_SHARE * float(np.percentile(local[ahead, 2], 3))
-    low, high = np.percentile(local[ahead, :2] / local[ahead, 2:], [2, 98], axis=0)
-    margin = 0.05 * (high - low) + 1e-3
-    (u0, v0), (u1, v1) = (low - margin).tolist(), (high + margin).tolist()
-    rows = (vector(axes[0]), vector(axes[1]), vector(axes[2]))
-    frame = MPIPlan(name, vector(origin), rows, near, (u0, u1, v0, v1), 2, 2, 2)
-    _, across, down = pixel_slopes(frame, observations, content.cameras[ahead], content.points[ahead])
-    held = np.isfinite(across)
-    if not held.any():
-        return None
-    pixels = (float((v1 - v0) * np.median(down[held])), float((u1 - u0) * np.median(across[held])))
-    return _candidate(frame, observations, content, pixels)
 
 
 def _cubes(observations: Observations, content: Content) -> Iterator[Candidate]:
