@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import numpy as np
+import pytest
 import torch
 
 from mmpi_ns.bench import dense
+from mmpi_ns.bench.regions import spearman
 from mmpi_ns.bench.suites import SUITES
 from mmpi_ns.mmpi_field import MMPIField
 from mmpi_ns.mmpi_sampler import MMPISampler
@@ -35,3 +38,11 @@ def test_rows_of_a_suite_have_different_names():
     for variants in SUITES.values():
         keys = [(v.group, v.name) for v in variants]
         assert len(set(keys)) == len(keys)
+
+
+def test_rank_correlation_asks_for_order_alone():
+    a = np.array([3.0, 1.0, 2.0, 10.0])
+    assert spearman(a, np.exp(a)) == pytest.approx(1)
+    assert spearman(a, -a) == pytest.approx(-1)
+    # Ties share their mean rank: ranks (1.5, 1.5, 3, 4) against (1, 2, 3, 4).
+    assert spearman(np.array([5.0, 5.0, 6.0, 7.0]), np.arange(4.0)) == pytest.approx(0.9486832981)

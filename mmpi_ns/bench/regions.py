@@ -1,0 +1,117 @@
+"""Does the error that placement expects show up in the pictures? Rank correlation over regions of the test images."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from nerfstudio.utils.eval_utils import eval_setup
+
+from mmpi_ns.mmpi_datamanager import MMPIDataManager
+from mmpi_ns.mmpi_model import MMPIModel
+from mmpi_ns.placement.errors import pixel_errors
+from mmpi_ns.placement.observations import Array, Observations
+from mmpi_ns.placement.plan import ScenePlan
+
+WORST = 64.0
+MIN_POINTS = 5
+"""SfM points that a region must hold for its expected error to count."""
+
+
+@dataclass
+class Regions:
+    """Expected pixel error against measured colour error over regions of the test images of a trained run."""
+
+    load_config: Path
+    """The run's config.yml."""
+    output: Path = Path("docs/results/regions.json")
+    """Where the figures go."""
+    rows: int = 3
+    """Regions down an image."""
+    columns: int = 8
+    """Regions across an image."""
+
+    def run(self) -> None:
+        _, pipeline, _, _ = eval_setup(self.load_config, test_mode="test")
+        manager, model = pipeline.datamanager, pipeline.model
+        assert isinstance(manager, MMPIDataManager) and isinstance(model, MMPIModel)
+        points = manager.observations.points
+        if not len(points):
+            raise ValueError("The scene has no SfM points in colmap/sparse/0: nothing to expect errors of.")
+        expected, measured = [], []
+        for i in range(len(manager.eval_dataset)):
+            camera = manager.eval_dataset.cameras[i : i + 1].to(model.device)
+            with torch.no_grad():
+                rgb = model.get_outputs_for_camera(camera)["rgb"].cpu()
+            truth = manager.eval_dataset.get_float32_image(i)[..., :3]
+            squared = ((rgb - truth) ** 2).mean(-1).numpy()
+            a, b = self._regions(_as_observations(camera), points, model.field.plan, squared)
+            expected += a
+            measured += b
+            print(f"{i + 1} of {len(manager.eval_dataset)} images", flush=True)
+        result = {"regions": len(expected), "rank_correlation": spearman(np.array(expected), np.array(measured))}
+        self.output.parent.mkdir(parents=True, exist_ok=True)
+        self.output.write_text(json.dumps({"headline": result}, indent=1), encoding="utf-8")
+        print(json.dumps(result))
+
+    def _regions(
+        self, camera: Observations, points: Array, plan: ScenePlan, squared: Array
+    ) -> tuple[list[float], list[float]]:
+        """Median expected error and root mean square colour error of every region with enough points."""
+        pixels, ahead = _project(camera, points)
+        height, width = squared.shape
+        row = np.floor(pixels[:, 1] / height * self.rows).astype(int)
+        column = np.floor(pixels[:, 0] / width * self.columns).astype(int)
+        errors = pixel_errors(plan, camera, np.zeros(len(points), np.int64), points).combined.min(-1)
+        expected, measured = [], []
+        for r in range(self.rows):
+            for c in range(self.columns):
+                inside = ahead & (row == r) & (column == c)
+                if inside.sum() < MIN_POINTS:
+                    continue
+                cell = squared[
+                    r * height // self.rows : (r + 1) * height // self.rows,
+                    c * width // self.columns : (c + 1) * width // self.columns,
+                ]
+                expected.append(float(np.median(np.minimum(errors[inside], WORST))))
+                measured.append(float(np.sqrt(cell.mean())))
+        return expected, measured
+
+
+def spearman(a: Array, b: Array) -> float:
+    """Rank correlation; ties get their mean rank."""
+    ranks = [_ranks(x) for x in (a, b)]
+    return float(np.corrcoef(*ranks)[0, 1])
+
+
+def _ranks(values: Array) -> Array:
+    _, inverse, counts = np.unique(values, return_inverse=True, return_counts=True)
+    last = np.cumsum(counts)
+    return (last - (counts - 1) / 2)[inverse]
+
+
+def _as_observations(camera) -> Observations:
+    """One nerfstudio camera, without points."""
+    flat = [float(x) for x in (camera.fx, camera.fy, camera.cx, camera.cy)]
+    empty = np.zeros(0, np.int64)
+    return Observations(
+        camera_to_worlds=camera.camera_to_worlds.double().cpu().numpy(),
+        intrinsics=np.array([flat]),
+        sizes=np.array([[float(camera.width), float(camera.height)]]),
+        points=np.zeros((0, 3)),
+        seen_by=empty,
+        seen_point=empty,
+        seen_at=np.zeros((0, 2)),
+    )
+
+
+def _project(camera: Observations, points: Array) -> tuple[Array, Array]:
+    """Pixels [P, 2] of points, and whether each lies ahead."""
+    pose, (fx, fy, cx, cy) = camera.camera_to_worlds[0], camera.intrinsics[0]
+    local = (points - pose[:, 3]) @ pose[:, :3]
+    ahead = local[:, 2] < 0
+    depth = np.where(ahead, -local[:, 2], 1.0)
+    return np.stack([fx * local[:, 0] / depth + cx, -fy * local[:, 1] / depth + cy], -1), ahead
