@@ -28,14 +28,27 @@ class Room(Kit):
         (w, d, h), t = ROOM, 0.16
         paper = (self.pick(WALLS), self.pick(WALLS), self.varied(WHITE))
         self.box((0, 0, h + t / 2), (w, d, t), "plaster", WHITE, (0.86, 0.85, 0.82))
-        self.box((w / 2 + t / 2, 0, h / 2), (t, d, h), "bricks", paper[0], self.varied(paper[0], 0.2), (0.8, 0.78, 0.72))
+        self.box(
+            (w / 2 + t / 2, 0, h / 2), (t, d, h), "bricks", paper[0], self.varied(paper[0], 0.2), (0.8, 0.78, 0.72)
+        )
         self.box((-w / 2 - t / 2, 0, h / 2), (t, d, h), "stripes", *paper)
         self.box((0, -d / 2 - t / 2, h / 2), (w, t, h), "plaster", paper[1], self.varied(paper[1], 0.2))
         # The far wall has a window: four pieces round a hole, through which the sky shows.
         left, right, sill, top = -1.3, 1.1, 0.95, 2.15
         y = d / 2 + t / 2
-        for x0, x1, z0, z1 in ((-w / 2, left, 0, h), (right, w / 2, 0, h), (left, right, 0, sill), (left, right, top, h)):
-            self.box(((x0 + x1) / 2, y, (z0 + z1) / 2), (x1 - x0, t, z1 - z0), "checker", paper[1], self.varied(paper[1], 0.2))
+        for x0, x1, z0, z1 in (
+            (-w / 2, left, 0, h),
+            (right, w / 2, 0, h),
+            (left, right, 0, sill),
+            (left, right, top, h),
+        ):
+            self.box(
+                ((x0 + x1) / 2, y, (z0 + z1) / 2),
+                (x1 - x0, t, z1 - z0),
+                "checker",
+                paper[1],
+                self.varied(paper[1], 0.2),
+            )
         for x in (left + 0.04, (left + right) / 2, right - 0.04):
             self.box((x, y, (sill + top) / 2), (0.08, 0.1, top - sill), "wood", WHITE, (0.85, 0.82, 0.75))
         for z in (sill + 0.04, top - 0.04):
@@ -56,7 +69,9 @@ class Room(Kit):
         self.sphere((0.1, 0.05, 0.77 + 0.16), 0.16, "stripes", (0.2, 0.4, 0.62), WHITE, (0.85, 0.6, 0.2))
         self.cylinder((-0.3, 0.12, 0.77), 0.09, 0.24, "checker", (0.75, 0.5, 0.2), (0.25, 0.2, 0.3))
         self.sphere((-0.3, 0.12, 1.15), 0.2, "foliage", GREEN, PALE_GREEN)
-        self.standing((0.5, -0.18, 0.77), (0.3, 0.22, 0.06), "painting", *(self.pick(PAINTS) for _ in range(3)), yaw=0.4)
+        self.standing(
+            (0.5, -0.18, 0.77), (0.3, 0.22, 0.06), "painting", *(self.pick(PAINTS) for _ in range(3)), yaw=0.4
+        )
         self.standing((0.52, -0.17, 0.83), (0.24, 0.18, 0.05), "checker", self.pick(PAINTS), WHITE, yaw=0.7)
         self.cylinder((-0.55, -0.25, 0.77), 0.05, 0.11, "stripes", WHITE, (0.8, 0.25, 0.2))
         self.cylinder((0, 0, 2.5), 0.012, 0.2, "plaster", GRAY)

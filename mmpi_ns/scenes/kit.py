@@ -10,7 +10,13 @@ from mmpi_ns.scenes.materials import ROW
 from mmpi_ns.scenes.primitives import BOX, CYLINDER, SPHERE, Array, Primitives
 
 Color = Sequence[float]
-BEIGE, WHITE, BROWN, GREEN, GRAY = (0.86, 0.76, 0.6), (0.95, 0.94, 0.9), (0.42, 0.26, 0.15), (0.2, 0.38, 0.12), (0.5,) * 3
+BEIGE, WHITE, BROWN, GREEN, GRAY = (
+    (0.86, 0.76, 0.6),
+    (0.95, 0.94, 0.9),
+    (0.42, 0.26, 0.15),
+    (0.2, 0.38, 0.12),
+    (0.5,) * 3,
+)
 PALE_GREEN = (0.5, 0.62, 0.25)
 WALLS: tuple[Color, ...] = (
     (0.84, 0.68, 0.48), (0.78, 0.44, 0.34), (0.9, 0.84, 0.7), (0.62, 0.66, 0.68),

@@ -48,7 +48,9 @@ Material = Callable[[Surface, Noise], Array]
 
 def plaster(s: Surface, noise: Noise) -> Array:
     """One colour, stained: concrete, cloth, ceilings."""
-    return mix(s.colors[:, 0], s.colors[:, 1], 0.5 + 0.8 * s.noise(noise, 1.7)) * (1 + 0.16 * s.noise(noise, 0.3))[:, None]
+    return (
+        mix(s.colors[:, 0], s.colors[:, 1], 0.5 + 0.8 * s.noise(noise, 1.7)) * (1 + 0.16 * s.noise(noise, 0.3))[:, None]
+    )
 
 
 def foliage(s: Surface, noise: Noise) -> Array:
@@ -166,7 +168,9 @@ def painting(s: Surface, noise: Noise) -> Array:
     ground = np.clip((hill - s.v) / np.maximum(s.dv, 0.02) + 0.5, 0, 1)
     canvas = mix(s.colors[:, 0], s.colors[:, 1], ground) * (1 + 0.45 * s.noise(noise, 5.0))[:, None]
     spot = np.hypot(s.u - 0.68 * s.width, s.v - 0.72 * s.height) / np.minimum(s.width, s.height)
-    canvas = mix(canvas, np.broadcast_to(np.float32([0.96, 0.82, 0.4]), canvas.shape), np.clip((0.13 - spot) * 40, 0, 1))
+    canvas = mix(
+        canvas, np.broadcast_to(np.float32([0.96, 0.82, 0.4]), canvas.shape), np.clip((0.13 - spot) * 40, 0, 1)
+    )
     return mix(s.colors[:, 2] * (1 + 0.2 * s.noise(noise, 3.0))[:, None], canvas, inside)
 
 

@@ -28,7 +28,7 @@ class Primitives:
     center: Array
     """[P, 3]"""
     half: Array
-    """[P, 3] half extents along the solid's own axes; a sphere's radius thrice; a cylinder's (radius, radius, half height)."""
+    """[P, 3] half extents along the solid's own axes; of others (radius, radius, radius or half height)."""
     yaw: Array
     """[P] turn about z, radians."""
     material: NDArray[np.int64]
@@ -59,6 +59,11 @@ def to_local(vectors: Array, yaw: Array) -> Array:
     c, s = np.cos(yaw), np.sin(yaw)
     x, y, z = vectors[..., 0], vectors[..., 1], vectors[..., 2]
     return np.stack([c * x + s * y, c * y - s * x, np.broadcast_to(z, (c * x).shape)], -1)
+
+
+def dot(a: Array, b: Array) -> Array:
+    """Inner products [N] of vectors [N, 3] (summing over a short axis is slow in NumPy)."""
+    return np.einsum("ij,ij->i", a, b)
 
 
 class Tracer:
@@ -94,7 +99,9 @@ class Tracer:
         reach = self.reach if limit is None else min(limit, self.reach)
         near = self.near(origins[:, 0].min(), origins[:, 0].max(), reach)
         for start in range(0, len(directions), PACKET):
-            self._packet(near, origins, directions, slice(start, min(start + PACKET, len(directions))), reach, distance, row)
+            self._packet(
+                near, origins, directions, slice(start, min(start + PACKET, len(directions))), reach, distance, row
+            )
         return distance, row
 
     def _packet(self, rows, origins, directions, rays: slice, reach: float, distance: Array, row: NDArray) -> None:
@@ -111,11 +118,12 @@ class Tracer:
     def in_cone(self, rows: NDArray[np.int64], origins: Array, directions: Array, reach: float) -> NDArray[np.int64]:
         """Those of ``rows`` that the rays of a packet may meet."""
         apex, axis = origins.mean(0), directions.mean(0)
-        spread = np.sqrt(((origins - apex) ** 2).sum(-1).max())
+        shift = origins - apex
+        spread = np.sqrt(dot(shift, shift).max())
         length = np.linalg.norm(axis)
         cosine = float((directions @ axis).min() / length) if length > 1e-6 else -1.0
         offset, radius = self.primitives.center[rows] - apex, self.radius[rows] + spread
-        distance = np.sqrt((offset**2).sum(-1))
+        distance = np.sqrt(dot(offset, offset))
         touching = distance <= radius
         along = offset @ axis / max(length, 1e-12) / np.maximum(distance, 1e-12)
         angle = np.arccos(np.clip(along, -1, 1)) - np.arcsin(np.minimum(radius / np.maximum(distance, 1e-12), 1))
@@ -148,8 +156,8 @@ class Tracer:
         apex = origins[0]
         center, start = self.primitives.center[rows] - apex, origins - apex
         square = (self.radius[rows] * (1 + 1e-6) + 1e-6) ** 2
-        along = directions @ center.T - (start * directions).sum(-1)[:, None]
-        away = (center**2).sum(-1) + (start**2).sum(-1)[:, None]
+        along = directions @ center.T - dot(start, directions)[:, None]
+        away = dot(center, center) + dot(start, start)[:, None]
         if start.any():
             away -= 2 * start @ center.T
         meets = (away - along**2 <= square) & ((along > 0) | (away <= square))
@@ -174,21 +182,25 @@ def _inverse(x: Array) -> Array:
 
 def box_distance(origins: Array, directions: Array, box: Shape) -> Array:
     """Distance [R] at which rays enter a box, inf where they miss it or start inside."""
-    o, d = to_local(origins - box.center, box.yaw), to_local(directions, box.yaw)
-    enter, leave = np.full(len(d), -np.inf), np.full(len(d), np.inf)
-    for axis in range(3):
-        inverse = _inverse(d[:, axis])
-        middle, half = -o[:, axis] * inverse, box.half[:, axis] * np.abs(inverse)
-        enter, leave = np.maximum(enter, middle - half), np.minimum(leave, middle + half)
+    o, d = (origins - box.center).T, directions.T
+    c, sn = np.cos(box.yaw), np.sin(box.yaw)
+    enter, leave = np.full(len(directions), -np.inf), np.full(len(directions), np.inf)
+    for axis, half in enumerate(box.half.T):
+        # Along the box's own axes; the third is the world's.
+        start, step = (v[2] if axis == 2 else c * v[axis] + (sn if axis == 0 else -sn) * v[1 - axis] for v in (o, d))
+        inverse = _inverse(step)
+        middle, reach = -start * inverse, half * np.abs(inverse)
+        enter, leave = np.maximum(enter, middle - reach), np.minimum(leave, middle + reach)
     return np.where((enter <= leave) & (enter > START), enter, np.inf)
 
 
 def sphere_distance(origins: Array, directions: Array, sphere: Shape) -> Array:
     """Distance [R] at which rays enter a sphere, inf where they miss it or start inside."""
     o = origins - sphere.center
-    along = (o * directions).sum(-1)
+    along = dot(o, directions)
     # From the nearest point of the ray: |o|^2 - along^2 would lose the digits of a far, small sphere.
-    aside = ((o - along[:, None] * directions) ** 2).sum(-1)
+    nearest = o - along[:, None] * directions
+    aside = dot(nearest, nearest)
     inside = sphere.half[:, 0] ** 2 - aside
     t = -along - np.sqrt(np.maximum(inside, 0))
     return np.where((inside > 0) & (t > START), t, np.inf)
@@ -197,9 +209,10 @@ def sphere_distance(origins: Array, directions: Array, sphere: Shape) -> Array:
 def cylinder_distance(origins: Array, directions: Array, cylinder: Shape) -> Array:
     """Distance [R] at which rays enter an upright cylinder, inf where they miss it or start inside."""
     o, d, (radius, _, half) = origins - cylinder.center, directions, cylinder.half.T
-    flat = np.maximum((d[:, :2] ** 2).sum(-1), 1e-28)
-    along = (o[:, :2] * d[:, :2]).sum(-1) / flat
-    aside = ((o[:, :2] - along[:, None] * d[:, :2]) ** 2).sum(-1)
+    flat = np.maximum(dot(d[:, :2], d[:, :2]), 1e-28)
+    along = dot(o[:, :2], d[:, :2]) / flat
+    nearest = o[:, :2] - along[:, None] * d[:, :2]
+    aside = dot(nearest, nearest)
     root = np.sqrt(np.maximum(radius**2 - aside, 0) / flat)
     inverse = _inverse(d[:, 2])
     middle, reach = -o[:, 2] * inverse, half * np.abs(inverse)

@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mmpi_ns.scenes.materials import MATERIALS, Surface
-from mmpi_ns.scenes.primitives import CYLINDER, PACKET, SPHERE, Array, Primitives, Tracer, to_local
+from mmpi_ns.scenes.primitives import CYLINDER, PACKET, SPHERE, Array, Primitives, Tracer, dot, to_local
 from mmpi_ns.scenes.textures import Noise
 
 Colors = NDArray[np.float32]
 Ground = Callable[[Array, Array, Array, Noise], Colors]
-"""Colours [N, 3] of points [N, 2] on z = 0, seen along unit directions [N, 3] with a pixel width of [N] metres there."""
+"""Colours [N, 3] of points [N, 2] on z = 0, seen along unit directions [N, 3] with pixels [N] metres wide."""
 Sky = Callable[[Array, float, Noise], Colors]
 """Colours [N, 3] of unit directions [N, 3], for pixels so many radians wide."""
 TILE = 64
@@ -121,11 +121,13 @@ class Scene:
         for start in range(0, len(directions), PACKET):
             s = slice(start, start + PACKET)
             distance[s], row = self.hit(origins[s], directions[s])
-            colors[s] = self.shade(origins[s], directions[s], distance[s], row, pixel)
+            colors[s] = self.shade(origins[s], directions[s], distance[s], row, pixel)[0]
         return distance, colors
 
-    def shade(self, origins: Array, directions: Array, distance: Array, row: NDArray, pixel: float) -> Colors:
-        """Colours [R, 3] in [0, 1] of hits; ``pixel`` as in ``trace``."""
+    def shade(
+        self, origins: Array, directions: Array, distance: Array, row: NDArray, pixel: float
+    ) -> tuple[Colors, NDArray]:
+        """Colours [R, 3] in [0, 1] of hits, and a number [R] for each lit or shaded face; ``pixel`` as in ``trace``."""
         finite = np.isfinite(distance)
         colors = np.empty((len(directions), 3), np.float32)
         if not finite.all():
@@ -133,14 +135,18 @@ class Scene:
         points = origins + np.where(finite, distance, 0)[:, None] * directions
         normals = np.broadcast_to(np.array([0.0, 0.0, 1.0]), points.shape).copy()
         floor, solid = finite & (row < 0), row >= 0
+        patch = 8 * row + 2 * finite
         if floor.any():
             colors[floor] = self.ground(points[floor, :2], directions[floor], distance[floor] * pixel, self.noise)
         if solid.any():
             these = self.primitives.take(row[solid])
             surface, normals[solid] = surface_of(these, points[solid], directions[solid], distance[solid] * pixel)
             colors[solid] = self._albedo(these.material, surface)
-        colors[finite] *= self._lit(points[finite], normals[finite])[:, None]
-        return colors.clip(0, 1)
+            patch[solid] = 8 * row[solid] + 2 * surface.side
+        light, in_sun = self._lit(points[finite], normals[finite])
+        colors[finite] *= light[:, None]
+        patch[finite] += in_sun
+        return colors.clip(0, 1), patch
 
     def _albedo(self, material: NDArray[np.int64], surface: Surface) -> Colors:
         colors = np.empty((len(material), 3), np.float32)
@@ -150,18 +156,18 @@ class Scene:
             colors[rows] = functions[m](surface.take(rows), self.noise)
         return colors
 
-    def _lit(self, points: Array, normals: Array) -> Colors:
-        """Light [N] that falls on points: from above, from all round, and from the sun or lamp where nothing hides it."""
+    def _lit(self, points: Array, normals: Array) -> tuple[Colors, NDArray[np.bool_]]:
+        """Light [N] that falls on points, and whether the sun or lamp reaches them [N]."""
         light = self.light
         toward = np.array(light.toward) - (points if light.is_lamp else 0.0) + np.zeros_like(points)
-        far = np.sqrt((toward**2).sum(-1))
+        far = np.sqrt(dot(toward, toward))
         toward /= far[:, None]
-        cosine = (normals * toward).sum(-1)
+        cosine = dot(normals, toward)
         facing = cosine > 1e-3
         if light.casts_shadows and facing.any():
             facing[facing] = self._sees_light(points[facing] + 1e-4 * normals[facing], toward[facing], far[facing])
         direct = np.where(facing, cosine, 0) * light.strength
-        return (light.ambient * (0.85 + 0.15 * normals[:, 2]) + direct).astype(np.float32)
+        return (light.ambient * (0.85 + 0.15 * normals[:, 2]) + direct).astype(np.float32), facing
 
     def _sees_light(self, points: Array, toward: Array, far: Array) -> NDArray[np.bool_]:
         """Whether nothing stands between points [N, 3] and the light [N], ``far`` [N] away."""
@@ -205,7 +211,7 @@ def surface_of(these: Primitives, points: Array, directions: Array, pixel: Array
         turns = np.maximum(np.round(2 * np.pi * h[:, 0] / 16.0), 1)
         scale = 16.0 * turns / (2 * np.pi * h[:, 0])
         up = np.where(these.kind == SPHERE, np.arccos(np.clip(-radial[:, 2], -1, 1)) * h[:, 0], q[:, 2] + h[:, 2])
-        cosine = np.maximum(np.abs((normal * d).sum(-1)), 0.1)
+        cosine = np.maximum(np.abs(dot(normal, d)), 0.1)
         round_ = np.arctan2(q[:, 1], q[:, 0]) / (2 * np.pi) * 16.0 * turns
         u, v = np.where(curved, round_, u), np.where(curved, up * scale, v)
         du, dv = (np.where(curved, pixel * scale / cosine, x) for x in (du, dv))
@@ -219,11 +225,11 @@ def surface_of(these: Primitives, points: Array, directions: Array, pixel: Array
     return surface, to_local(normal, -these.yaw)
 
 
-def render(scene: Scene, camera: int, supersample: int = 2, contrast: float = 0.08) -> tuple[Colors, Colors]:
+def render(scene: Scene, camera: int, supersample: int = 2, contrast: float = 0.25) -> tuple[Colors, Colors]:
     """One image [H, W, 3] in [0, 1] and the exact distance [H, W] along the pixels' central rays, inf for the sky.
 
     Textures are averaged over the pixel, so one ray shows the inside of a face; pixels that differ from a neighbour
-    (another solid, or another colour) are supersampled.
+    (another face, a shadow, another colour) are supersampled.
 
     Args:
         supersample: rays along each side of a pixel at such places.
@@ -231,16 +237,16 @@ def render(scene: Scene, camera: int, supersample: int = 2, contrast: float = 0.
     """
     cameras = scene.cameras
     h, w = cameras.height, cameras.width
-    colors, depths, rows = np.empty((h * w, 3), np.float32), np.empty(h * w), np.empty(h * w, np.int64)
+    colors, depths, patch = np.empty((h * w, 3), np.float32), np.empty(h * w), np.empty(h * w, np.int64)
     x, y = np.meshgrid(np.arange(w) + 0.5, np.arange(h) + 0.5)
     pixels = np.stack([x, y], -1).reshape(-1, 2)
     order = _by_tile(h, w)
     for start in range(0, h * w, PACKET):
         these = order[start : start + PACKET]
         rays = cameras.rays(camera, pixels[these])
-        depths[these], rows[these] = scene.hit(*rays)
-        colors[these] = scene.shade(*rays, depths[these], rows[these], 1 / cameras.focal)
-    edges = order[_differs(colors.reshape(h, w, 3), rows.reshape(h, w), contrast).reshape(-1)[order]]
+        depths[these], row = scene.hit(*rays)
+        colors[these], patch[these] = scene.shade(*rays, depths[these], row, 1 / cameras.focal)
+    edges = order[_differs(colors.reshape(h, w, 3), patch.reshape(h, w), contrast).reshape(-1)[order]]
     inner = (np.arange(supersample) + 0.5) / supersample - 0.5
     shifts = np.stack(np.meshgrid(inner, inner), -1).reshape(-1, 2)
     per_packet = max(PACKET // len(shifts), 1)
@@ -258,11 +264,11 @@ def _by_tile(height: int, width: int) -> NDArray[np.int64]:
     return np.lexsort((x, y, x // TILE, y // TILE))
 
 
-def _differs(colors: Colors, rows: NDArray[np.int64], contrast: float) -> NDArray[np.bool_]:
-    """[H, W] pixels that show another solid or another colour than one of their neighbours."""
-    result = np.full(rows.shape, contrast <= 0)
+def _differs(colors: Colors, patch: NDArray[np.int64], contrast: float) -> NDArray[np.bool_]:
+    """[H, W] pixels that show another face or another colour than one of their neighbours."""
+    result = np.full(patch.shape, contrast <= 0)
     for axis in (0, 1):
-        change = (np.diff(rows, axis=axis) != 0) | (np.abs(np.diff(colors, axis=axis)).max(-1) > contrast)
+        change = (np.diff(patch, axis=axis) != 0) | (np.abs(np.diff(colors, axis=axis)).max(-1) > contrast)
         before = [(1, 0) if k == axis else (0, 0) for k in (0, 1)]
         after = [(0, 1) if k == axis else (0, 0) for k in (0, 1)]
         result |= np.pad(change, before) | np.pad(change, after)

@@ -47,7 +47,9 @@ class Street(Kit):
         place, yaw = self.place(along, side * (back + depth / 2))
         wall = self.pick(WALLS)
         # Fronts face the street on both sides: the solid's own left must be the street's.
-        self.standing(place, (width, depth, height), "facade", wall, self.varied(wall, 0.15), self.varied(WHITE), yaw=yaw)
+        self.standing(
+            place, (width, depth, height), "facade", wall, self.varied(wall, 0.15), self.varied(WHITE), yaw=yaw
+        )
         roof = self.varied((0.5, 0.27, 0.2) if self.random.random() < 0.6 else (0.33, 0.34, 0.37))
         dark = tuple(0.75 * c for c in roof)
         top = (place[0], place[1], height)

@@ -72,8 +72,14 @@ def _street(s, d, ds, dd, blurred, road: Road, noise: Noise) -> Colors:
     patch = (noise(s * 0.05 + 3, np.sign(d) * 4, blurred * 0.05) > 0.45) * band(side, dd, 0.5, 2.6)
     color = mix(color, color * 0.72, patch)
     white = np.full_like(color, 0.92) * (1 + 0.1 * fine)[:, None]
-    marks = pulse(s / 6, ds / 6, 0.0, 0.5) * band(d, dd, -0.08, 0.08) + band(side, dd, road.half_width - 0.4, road.half_width - 0.26)
-    crossing = pulse(s / 55, ds / 55, 0.32, 0.385) * pulse(d / 1.1, dd / 1.1, 0.2, 0.75) * band(side, dd, 0, road.half_width - 0.5)
+    marks = pulse(s / 6, ds / 6, 0.0, 0.5) * band(d, dd, -0.08, 0.08) + band(
+        side, dd, road.half_width - 0.4, road.half_width - 0.26
+    )
+    crossing = (
+        pulse(s / 55, ds / 55, 0.32, 0.385)
+        * pulse(d / 1.1, dd / 1.1, 0.2, 0.75)
+        * band(side, dd, 0, road.half_width - 0.5)
+    )
     color = mix(color, white, np.clip(marks + crossing, 0, 1) * np.clip(0.85 + 0.3 * coarse, 0, 1))
     bay = band(side, dd, road.half_width, road.kerb)
     bays = np.float32([0.45, 0.44, 0.43]) * tone[:, None]

@@ -33,7 +33,11 @@ def band(x: Array, width: Array, start: float | Array, end: float | Array) -> Ar
 
 def cell_hash(i: Array, j: Array, salt: float | Array) -> Array:
     """A number in [0, 1) for each cell of a grid."""
-    n = i.astype(np.int64) * 73856093 ^ j.astype(np.int64) * 19349663 ^ np.asarray(salt * 977).astype(np.int64) * 83492791
+    n = (
+        i.astype(np.int64) * 73856093
+        ^ j.astype(np.int64) * 19349663
+        ^ np.asarray(salt * 977).astype(np.int64) * 83492791
+    )
     n = (n ^ (n >> 13)) * 1274126177 & 0x7FFFFFFF
     return (((n ^ (n >> 16)) & 0xFFFF) / 65536.0).astype(np.float32)
 

@@ -1,0 +1,88 @@
+"""``mmpi-scene``: writes a procedural scene as a Nerfstudio data set."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+Name = Literal["street", "long-road", "room", "look-round", "object", "still-life"]
+
+
+@dataclass
+class SceneCommand:
+    """Writes images, exact depths, cameras and SfM-like points of a made-up scene; equal options give equal files."""
+
+    name: tyro.conf.Positional[Name]
+    """street: driven along. long-road: the same with bends, of any length. room: a walk round a table, looking all
+    round. look-round: nearly one spot of that room. object: walked round. still-life: a grid of cameras facing it."""
+    folder: tyro.conf.Positional[Path]
+    """Folder to write."""
+    width: int | None = None
+    """Of the images, pixels."""
+    height: int | None = None
+    """Of the images, pixels."""
+    count: int | None = None
+    """Images; the default depends on the scene."""
+    length: float | None = None
+    """Metres driven (street: 40, long-road: 1000)."""
+    seed: int = 0
+    """Another seed is another scene of the same kind."""
+    points: int | None = None
+    """SfM points; by default 4,000, and three for each further metre of a drive."""
+    noise: float = 0.3
+    """Standard deviation of the keypoints' noise, pixels; the points are triangulated from them."""
+    outliers: float = 0.02
+    """Share of the points that are wrong."""
+    images: bool = True
+    """False writes cameras, points and tracks alone."""
+    overwrite: bool = False
+    """Replace a data set that is in the folder."""
+
+    def main(self) -> None:
+        from mmpi_ns.scenes.catalogue import make_scene
+        from mmpi_ns.scenes.dataset import check_folder, write_dataset
+
+        check_folder(self.folder, self.overwrite)
+        scene = make_scene(self.name, self.seed, self.count, self.width, self.height, self.length)
+        cameras, points = scene.cameras, self.points
+        if points is None:
+            points = 4000 + 3 * round(self.length or 0)
+        print(f"{self.name}: {len(scene.primitives)} solids, {len(cameras)} cameras; looking for points ...")
+        found = write_dataset(
+            scene, self.folder, points, self.noise, self.outliers, self.images, self.overwrite, _progress
+        )
+        test = int(cameras.is_test.sum())
+        kind = "images with depths" if self.images else "cameras (no images)"
+        print(f"Wrote {self.folder}: {len(cameras)} {kind} of {cameras.width}x{cameras.height} pixels,")
+        print(f"  {len(cameras) - test} to train with and {test} to test with;")
+        print(
+            f"  {len(found.points)} points in {len(found.camera)} keypoints, {int(found.outlier.sum())} points wrong,"
+            " in colmap/sparse/0 and sparse_pc.ply."
+        )
+        if len(found.points) < points:
+            print(f"  The cameras see only so many points well enough: {points} were asked for.")
+        if self.images:
+            print(f"Next: ns-train mmpi-small --data {self.folder}")
+
+
+def _progress(images: Iterable[int]) -> Iterator[int]:
+    from rich.progress import track
+
+    yield from track(images, description="Rendering")
+
+
+def entrypoint() -> None:
+    """The ``mmpi-scene`` command; a mistake is one sentence and exit status 1."""
+    try:
+        tyro.cli(SceneCommand).main()
+    except (ValueError, OSError) as error:
+        sys.exit(f"mmpi-scene: {error}")
+
+
+if __name__ == "__main__":
+    entrypoint()
