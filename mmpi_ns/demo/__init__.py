@@ -1,0 +1,1 @@
+"""Pictures of a trained run: contact sheet, fly-through, PSNR against seconds (``make demo``)."""

@@ -1,0 +1,213 @@
+"""``make demo``: a street is made, learned, evaluated and shown; what is done is kept when it is started again."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+PARTS = 5
+FREE_BYTES = 2 << 30
+"""What a demo may need on the disk: checkpoints are the most of it."""
+OURS = ("street", "runs", "fly", "unfinished.mp4", "fly.mp4", "times.json", "eval.json", "contact-sheet.png",
+        "overview.png", "psnr.png")  # fmt: skip
+"""What the demo writes, and removes when it starts afresh."""
+
+
+class DemoError(Exception):
+    """Why the demo cannot go on, in one sentence that says what to do."""
+
+
+@dataclass
+class Demo:
+    """Makes a procedural street, trains mmpi-small on it, evaluates it, and takes pictures. A rerun goes on where the
+    last one stopped."""
+
+    folder: Path = Path("demo")
+    """Everything is written here."""
+    steps: int = 1000
+    """Training steps."""
+    images: int = 64
+    """Images of the street; half of them are held out for testing."""
+    frames: int = 48
+    """Frames of the fly-through."""
+    fresh: bool = False
+    """Start afresh instead of keeping what an earlier demo has done."""
+
+    def main(self) -> None:
+        start = time.perf_counter()
+        self._prepare_folder()
+        self._part(1, f"the street: {self.images} images of 320 x 96 pixels")
+        self._make_street()
+        self._part(2, f"training mmpi-small for {self.steps} steps")
+        self._train()
+        self._part(3, "evaluating on the images held out")
+        results = self._evaluate()
+        self._part(4, "fly-through and contact sheet")
+        film = self._take_pictures()
+        self._part(5, "PSNR against seconds")
+        self._draw_curve()
+        self._say_where(results, film, time.perf_counter() - start)
+
+    @property
+    def scene(self) -> Path:
+        return self.folder / "street"
+
+    @property
+    def run(self) -> Path:
+        return self.folder / "runs" / "street" / "mmpi-small" / "demo"
+
+    @property
+    def checkpoint(self) -> Path:
+        """The last one, when training is done."""
+        return self.run / "nerfstudio_models" / f"step-{self.steps - 1:09d}.ckpt"
+
+    def _prepare_folder(self) -> None:
+        self.folder.mkdir(parents=True, exist_ok=True)
+        if self.fresh:
+            for name in OURS:
+                path = self.folder / name
+                shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+        free = shutil.disk_usage(self.folder).free
+        if free < FREE_BYTES and not self.checkpoint.is_file():
+            raise DemoError(
+                f"{self.folder.resolve()} has {free / 2**30:.1f} GB free and the demo may need "
+                f"{FREE_BYTES / 2**30:.0f}: make room, or name another folder with --folder."
+            )
+
+    def _part(self, number: int, what: str) -> None:
+        print(f"\n=== {number}/{PARTS} {what} ===", flush=True)
+
+    def _make_street(self) -> None:
+        from mmpi_ns.scenes.catalogue import make_scene
+        from mmpi_ns.scenes.dataset import write_dataset
+
+        if (self.scene / "transforms.json").is_file():
+            _kept(self.scene)
+            return
+        print("Looking for points that several cameras see ...", flush=True)
+        scene = make_scene("street", count=self.images)
+        write_dataset(scene, self.scene, overwrite=True, progress=lambda items: _track(items, "Rendering the street"))
+
+    def _train(self) -> None:
+        if self.checkpoint.is_file():
+            _kept(self.run)
+            return
+        saved = sorted(self.run.glob("nerfstudio_models/step-*.ckpt"))
+        newest = int(saved[-1].stem.split("-")[1]) if saved else -1
+        resume = saved and newest < self.steps - 1
+        if not resume:
+            shutil.rmtree(self.run, ignore_errors=True)
+            (self.folder / "times.json").write_text(json.dumps({"started": time.time()}), encoding="utf-8")
+        else:
+            print(f"Going on from step {newest}.")
+        every = str(max(1, self.steps // 12))
+        self._command(
+            "ns-train", "mmpi-small", "--data", str(self.scene), "--output-dir", str(self.folder / "runs"),
+            "--experiment-name", "street", "--timestamp", "demo", "--max-num-iterations", str(self.steps),
+            "--vis", "tensorboard", "--steps-per-save", str(max(1, self.steps // 3)), "--steps-per-eval-batch", every,
+            "--pipeline.datamanager.eval-num-rays-per-batch", "8192", "--logging.steps-per-log", "20",
+            *(["--load-dir", str(self.run / "nerfstudio_models")] if resume else []),
+        )  # fmt: skip
+        if not self.checkpoint.is_file():
+            raise DemoError(f"ns-train ended before its last step: start again, it goes on from {self.run}.")
+
+    def _evaluate(self) -> dict[str, Any]:
+        target = self.folder / "eval.json"
+        if not self._is_newer(target):
+            self._command("ns-eval", "--load-config", str(self.run / "config.yml"), "--output-path", str(target))
+        return json.loads(target.read_text(encoding="utf-8"))["results"]
+
+    def _take_pictures(self) -> Path:
+        from mmpi_ns.demo.film import film_frames, write_film
+        from mmpi_ns.demo.sheet import contact_sheet, overview, show_views, spread
+        from mmpi_ns.demo.views import load_run
+
+        sheet, film = self.folder / "contact-sheet.png", self.folder / "fly.mp4"
+        if self._is_newer(sheet) and self._is_newer(film):
+            return film
+        run = load_run(self.run / "config.yml")
+        indices = spread(len(run.tests))
+        shown = show_views(run, indices, lambda items: _track(items, "Test views, each MPI alone"))
+        overview(run, shown[len(shown) // 2]).save(self.folder / "overview.png")
+        contact_sheet(run, shown).save(sheet)
+        return write_film(film_frames(run, self.frames, lambda items: _track(items, "Fly-through")), self.folder)
+
+    def _draw_curve(self) -> None:
+        from mmpi_ns.demo.curve import draw_curve
+
+        times = self.folder / "times.json"
+        if not times.is_file():
+            raise DemoError(f"{times} is gone, so nobody knows when training began: start afresh with --fresh.")
+        started = json.loads(times.read_text(encoding="utf-8"))["started"]
+        draw_curve(self.run, self.folder / "psnr.png", started, f"mmpi-small, {self.steps} steps on the demo's street")
+
+    def _say_where(self, results: dict[str, Any], film: Path, seconds: float) -> None:
+        film_note = "the fly-through" if film.suffix else "the fly-through as frames (no encoder was found)"
+        print(
+            f"\nDone in {seconds // 60:.0f} min {seconds % 60:.0f} s. PSNR {results['psnr']:.2f} dB, "
+            f"SSIM {results['ssim']:.3f} over {self.images // 2} images held out.\n\nOpen first:\n"
+            f"  {self.folder / 'contact-sheet.png'}   what each MPI does\n"
+            f"  {film}   {film_note}\n"
+            f"  {self.folder / 'psnr.png'}   PSNR against seconds\n"
+            f"  {self.folder / 'overview.png'}   one view, and where the MPIs stand\n\n"
+            f"Walk through it: {_program('ns-viewer')} --load-config {self.run / 'config.yml'}"
+        )
+
+    def _is_newer(self, path: Path) -> bool:
+        """Whether an output was made from the checkpoint that is there."""
+        newer = path.exists() and path.stat().st_mtime >= self.checkpoint.stat().st_mtime
+        if newer:
+            _kept(path)
+        return newer
+
+    def _command(self, name: str, *arguments: str) -> None:
+        """Runs a command of this environment; shows it, as that is what one would type."""
+        program = _program(name)
+        if not program.is_file():
+            raise DemoError(f"{program} does not exist: install the package into this environment (make venv).")
+        print(f"$ {shlex.join([name, *arguments])}", flush=True)
+        code = subprocess.run([str(program), *arguments], check=False).returncode
+        if code:
+            raise DemoError(f"{name} ended with status {code}: what it said is above.")
+
+
+def _program(name: str) -> Path:
+    return Path(sys.executable).with_name(name)
+
+
+def _kept(path: Path) -> None:
+    print(f"{path} is kept from an earlier demo (--fresh makes it anew).", flush=True)
+
+
+def _track(items: Iterable[Any], what: str) -> Iterator[Any]:
+    from rich.progress import track
+
+    yield from track(list(items), description=what)
+
+
+def main() -> int:
+    """Runs the demo; a mistake is one sentence and status 1."""
+    demo = tyro.cli(Demo)
+    try:
+        demo.main()
+    except (DemoError, ValueError, OSError) as error:
+        print(f"demo: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("\nInterrupted: the same command goes on from here.", file=sys.stderr)
+        return 130
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
