@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from PIL import Image, ImageDraw
 
-from mmpi_ns.demo.painting import rgb8
+from mmpi_ns.demo.painting import font, rgb8
 from mmpi_ns.placement.observations import Array, Observations
 from mmpi_ns.placement.plan import CubePlan, MPIPlan
 
@@ -46,7 +46,9 @@ class Map:
         low, high = every.min(0), every.max(0)
         margin = 0.06 * (high - low).max()
         low, high = low - margin, high + margin
-        scale = float(min(width / (high - low)[0], height / (high - low)[1]))
+        # A map is wide and flat: half of what lies aside may be cut off, cameras may not.
+        aside = max(0.5 * float((high - low)[1]), 1.2 * float(np.ptp(cameras[:, 1])))
+        scale = min(width / float((high - low)[0]), height / aside)
         low = (low + high) / 2 - np.array([width, height]) / scale / 2
         empty = Image.new("RGB", (width * FINER, height * FINER), (250, 250, 250))
         drawn = Map(base, middle, low, scale, (width, height), empty)
@@ -65,8 +67,15 @@ class Map:
         """World points [N, 3] as (forward, right) [N, 2]."""
         return (points - self.middle) @ self.base.T
 
-    def draw(self, heads: list[tuple[MPIPlan | CubePlan, tuple[float, float, float]]]) -> Image.Image:
-        """The map with some MPIs, each in its colour: borders of the frustum, planes, a cross at the origin."""
+    def draw(
+        self, heads: list[tuple[MPIPlan | CubePlan, tuple[float, float, float]]], marks: Array | None = None
+    ) -> Image.Image:
+        """The map with some MPIs: borders of the frustum, planes, a cross at the origin; and places with letters.
+
+        Args:
+            heads: what to draw, and in which colours.
+            marks: world points to name A, B, ... [N, 3]
+        """
         image = self.backdrop.copy()
         for head, color in heads:
             tint = Image.new("RGB", image.size, rgb8(color))
@@ -75,9 +84,17 @@ class Map:
             ImageDraw.Draw(mask).polygon(self.pixels(outline), fill=45 if len(heads) == 1 else 18)
             image = Image.composite(tint, image, mask)
             self._draw_head(ImageDraw.Draw(image), head, outline, rgb8(color))
+        if marks is not None:
+            self._draw_marks(ImageDraw.Draw(image), marks)
         image = image.resize(self.size, Image.Resampling.LANCZOS)
         ImageDraw.Draw(image).rectangle([0, 0, image.width - 1, image.height - 1], outline=(200, 200, 200))
         return image
+
+    def _draw_marks(self, draw: ImageDraw.ImageDraw, marks: Array) -> None:
+        for k, (x, y) in enumerate(self.pixels(self.flat(marks))):
+            draw.line([(x, y), (x, y + 30)], fill=(20, 20, 20), width=4)
+            draw.ellipse([x - 18, y + 24, x + 18, y + 60], fill=(20, 20, 20))
+            draw.text((x, y + 42), chr(ord("A") + k), fill="white", font=font(27, bold=True), anchor="mm")
 
     def _draw_head(self, draw: ImageDraw.ImageDraw, head: MPIPlan | CubePlan, outline: Array, color) -> None:
         draw.line(self.pixels(np.concatenate([outline, outline[:1]])), fill=color, width=3)

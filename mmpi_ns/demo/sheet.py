@@ -23,7 +23,8 @@ from mmpi_ns.demo.painting import (
 )
 from mmpi_ns.demo.views import Picture, Run, View, render_alone, render_view, truth_of
 from mmpi_ns.placement.explain import describe_facing
-from mmpi_ns.placement.plan import CubePlan
+from mmpi_ns.placement.observations import Array
+from mmpi_ns.placement.plan import CubePlan, MPIPlan
 
 LABELS, VIEW, GAP = 400, 360, 6
 """Widths of the column of labels and of a view, and the space between pictures; pixels."""
@@ -94,8 +95,9 @@ def overview(run: Run, shown: Shown) -> Image.Image:
         ("winning MPI: whose colour a pixel has", image_of(_winner_colors(run, shown.view), width)),
     ]
     height = parts[0][1].height + line
-    top_view = Map.of(run.observations, 2 * width + GAP, 250).draw(list(zip(_heads(run), run.colors, strict=True)))
-    picture = Image.new("RGB", (2 * width + 3 * GAP, 2 * (height + GAP) + line + top_view.height + GAP), "white")
+    top_view = Map.of(run.observations, 2 * width + GAP, 220)
+    from_above = top_view.draw(list(zip(_heads(run), run.colors, strict=True)), _places(run, [shown]))
+    picture = Image.new("RGB", (2 * width + 3 * GAP, 2 * (height + GAP) + line + from_above.height + GAP), "white")
     draw = ImageDraw.Draw(picture)
     for k, (text, image) in enumerate(parts):
         x, y = GAP + (k % 2) * (width + GAP), (k // 2) * (height + GAP)
@@ -103,23 +105,26 @@ def overview(run: Run, shown: Shown) -> Image.Image:
         picture.paste(image, (x, y + line))
     y = 2 * (height + GAP)
     count = len(run.plan.names)
-    text = f"from above: training cameras (black), points of the scene (gray), {count} MPIs with their planes (colours)"
+    text = f"from above: training cameras (black), points of the scene (gray), the view (1), {count} MPIs (colours)"
     write(draw, (GAP, y + 3), text)
-    picture.paste(top_view, (GAP, y + line))
+    picture.paste(from_above, (GAP, y + line))
     return picture
 
 
 def _header(run: Run, views: int) -> Image.Image:
+    count = f"{len(run.plan.mpis)} multi-plane images (MPIs){' and a cube' if run.plan.cube else ''}"
     text = (
-        f"The scene is {len(run.plan.mpis)} multi-plane images (MPIs){' and a cube' if run.plan.cube else ''}: stacks "
-        "of see-through planes that face one way and lie denser near their origin.\n"
-        "Each serves the part of the scene that it stands well for (rows below, with a map). A ray reads all of them, "
-        "puts what it finds in order of distance,\nand adds up to the rendering."
+        f"This scene is {count}. Each is a stack of see-through planes that face one way, dense near its origin (cross "
+        "on the maps) and sparse far away.\nAn MPI is sharp for views that stand just past its origin: go down a "
+        "column and see which one is, and that it wins there. A ray reads\nall of them, sorts what it meets by "
+        "distance and adds it up: that is the rendering. Black dots are training cameras, 1, 2, ... the views."
     )
-    header = Image.new("RGB", (LABELS + views * (VIEW + GAP) + GAP, 104), "white")
+    header = Image.new("RGB", (LABELS + views * (VIEW + GAP) + GAP, 122), "white")
     draw = ImageDraw.Draw(header)
-    write(draw, (10, 8), "One radiance field of several multi-plane images", 18, bold=True)
+    write(draw, (10, 8), "One radiance field made of several multi-plane images", 18, bold=True)
     write(draw, (10, 36), text, 13)
+    for k in range(views):
+        write(draw, (LABELS + k * (VIEW + GAP), 102), f"view {k + 1}", 14, bold=True)
     return header
 
 
@@ -147,7 +152,7 @@ def _whole_rows(run: Run, shown: list[Shown]) -> list[tuple[Image.Image, list[Im
     error_ticks = [(0.0, "0"), (0.5, f"{WORST_ERROR / 2:.2f}"), (1.0, f"{WORST_ERROR:.1f} or more")]
     error_bar = scale_bar(_ramp("inferno"), 300, 12, error_ticks)
     return [
-        (_label("Truth", "photographs held out of the training", size), [image_of(s.truth, VIEW) for s in shown]),
+        (_label("Truth", "images held out of the training", size), [image_of(s.truth, VIEW) for s in shown]),
         (
             _label("Rendering", f"all MPIs merged by distance\nPSNR {scores} dB", size),
             [image_of(v.color, VIEW) for v in views],
@@ -170,6 +175,7 @@ def _whole_rows(run: Run, shown: list[Shown]) -> list[tuple[Image.Image, list[Im
 def _alone_rows(run: Run, shown: list[Shown]) -> list[tuple[Image.Image, list[Image.Image]]]:
     size = image_of(shown[0].truth, VIEW).height
     drawn = Map.of(run.observations, LABELS - 22, max(60, size - 46))
+    marks = _places(run, shown)
     rows = []
     for k, (head, color) in enumerate(zip(_heads(run), run.colors, strict=True)):
         won = 100 * float(np.mean([(s.view.winner == k).mean() for s in shown]))
@@ -183,13 +189,19 @@ def _alone_rows(run: Run, shown: list[Shown]) -> list[tuple[Image.Image, list[Im
         write(
             draw, (10, 23), f"facing {facing}; wins {won:.0f} % of the pixels. Checks: it holds nothing", 12, fill=FAINT
         )
-        label.paste(drawn.draw([(head, color)]), (10, size - drawn.size[1]))
+        label.paste(drawn.draw([(head, color)], marks), (10, size - drawn.size[1]))
         rows.append((label, [image_of(over_checks(s.alone[k]), VIEW) for s in shown]))
     return rows
 
 
-def _heads(run: Run) -> list:
+def _heads(run: Run) -> list[MPIPlan | CubePlan]:
     return [*run.plan.mpis, *([run.plan.cube] if run.plan.cube else [])]
+
+
+def _places(run: Run, shown: list[Shown]) -> Array:
+    """[N, 3] where the views stand."""
+    poses = run.tests.cameras.camera_to_worlds[[s.index for s in shown]]
+    return poses[:, :, 3].double().cpu().numpy()
 
 
 def _winner_colors(run: Run, view: View) -> Picture:
