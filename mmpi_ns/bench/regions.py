@@ -83,8 +83,7 @@ class Regions:
 
 def spearman(a: Array, b: Array) -> float:
     """Rank correlation; ties get their mean rank."""
-    ranks = [_ranks(x) for x in (a, b)]
-    return float(np.corrcoef(*ranks)[0, 1])
+    return float(np.corrcoef(_ranks(a), _ranks(b))[0, 1])
 
 
 def _ranks(values: Array) -> Array:

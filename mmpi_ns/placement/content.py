@@ -30,8 +30,10 @@ class Content:
     """[Q] what an observation counts; those of a camera sum to 1."""
     nearest: Array
     """[M] depth, along each camera's axis, at which its content starts."""
+    typical: Array
+    """[M] depth beyond which three quarters of each camera's content lie."""
     near: float
-    """Distance at which content starts for the cameras in general."""
+    """Depth at which content starts for the cameras in general."""
 
 
 def find_content(observations: Observations) -> Content:
@@ -57,7 +59,11 @@ def find_content(observations: Observations) -> Content:
     starts = {i: _start(depth[cameras == i]) for i in range(len(centers)) if (cameras == i).sum() >= 20}
     near = float(np.median(list(starts.values()))) if starts else _start(depth)
     nearest = np.array([starts.get(i, near) for i in range(len(centers))])
-    return _weighed(observations, cameras, points, nearest, near)
+    quarter = float(np.quantile(depth, 0.25))
+    typical = np.array(
+        [np.quantile(depth[cameras == i], 0.25) if i in starts else quarter for i in range(len(centers))]
+    )
+    return _weighed(observations, cameras, points, nearest, typical, near)
 
 
 def _depth(observations: Observations, cameras: NDArray[np.int64], points: Array) -> Array:
@@ -73,7 +79,7 @@ def _start(depth: Array) -> float:
 
 
 def _weighed(
-    observations: Observations, cameras: NDArray[np.int64], points: Array, nearest: Array, near: float
+    observations: Observations, cameras: NDArray[np.int64], points: Array, nearest: Array, typical: Array, near: float
 ) -> Content:
     count = len(observations.centers)
     # Evenly spaced in an order that no numbering, pose or unit enters: by depth.
@@ -90,5 +96,6 @@ def _weighed(
         points=np.concatenate([points, filling]),
         weights=np.concatenate([(share / np.maximum(seen, 1))[cameras], np.repeat((1 - share) / each, each)]),
         nearest=nearest,
+        typical=typical,
         near=near,
     )

@@ -3,7 +3,7 @@
 Greedy facility location (Nemhauser et al. 1978) over ``candidates.py``: every observation is served by the chosen head
 that shows it with the least expected error (``errors.py``), and the candidate that lowers the mean of log2(error) most
 for its texels is taken, until the next would add too little. Heads that later ones have made superfluous are put back.
-Then each MPI gets the planes that what it serves asks for.
+Then each MPI gets the planes that what it serves asks for, and is widened where there would be holes (``coverage.py``).
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from mmpi_ns.placement.candidates import Candidate, find_candidates
 from mmpi_ns.placement.content import Content, find_content
+from mmpi_ns.placement.coverage import widened
 from mmpi_ns.placement.hand_made import drive_plan, room_plan
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.placement.plan import CubePlan, MPIPlan, ScenePlan
@@ -112,6 +113,8 @@ def _choose(
     too_fine = None
     for _ in range(BUDGET_ROUNDS):
         chosen = _Choice(candidates, content.weights, config, texel_pixels).run()
+        mpis = widened([h for h in chosen if isinstance(h, MPIPlan)], observations, content)
+        chosen = [*mpis, *(h for h in chosen if isinstance(h, CubePlan))]
         excess = sum(h.texels for h in chosen) / config.max_texels if config.max_texels else 0.0
         if excess <= 1.0:
             best = chosen
