@@ -60,7 +60,6 @@ SUITES: dict[str, list[Variant]] = {
         Variant("five MPIs and cube, joint", (*ROOM, P + "cube-voxels", "96"), steps=500),
         Variant("five MPIs, joint", ROOM, steps=500),
         Variant("automatic placement, joint", JOINT, steps=500),
-        Variant("automatic placement, joint, longer", JOINT, steps=1000),
     ],
     "fern": [Variant("automatic placement", (), steps=2000)],
     "fox": [Variant("automatic placement", (), steps=1500)],
