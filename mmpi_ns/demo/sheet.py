@@ -105,7 +105,7 @@ def overview(run: Run, shown: Shown) -> Image.Image:
         picture.paste(image, (x, y + line))
     y = 2 * (height + GAP)
     count = len(run.plan.names)
-    text = f"from above: training cameras (black), points of the scene (gray), the view (1), {count} MPIs (colours)"
+    text = f"from above: training cameras (black), points of the scene (gray), this view (A), {count} MPIs (colours)"
     write(draw, (GAP, y + 3), text)
     picture.paste(from_above, (GAP, y + line))
     return picture
@@ -117,14 +117,14 @@ def _header(run: Run, views: int) -> Image.Image:
         f"This scene is {count}. Each is a stack of see-through planes that face one way, dense near its origin (cross "
         "on the maps) and sparse far away.\nAn MPI is sharp for views that stand just past its origin: go down a "
         "column and see which one is, and that it wins there. A ray reads\nall of them, sorts what it meets by "
-        "distance and adds it up: that is the rendering. Black dots are training cameras, 1, 2, ... the views."
+        "distance and adds it up: that is the rendering. Black dots are training cameras, A, B, ... the test views."
     )
     header = Image.new("RGB", (LABELS + views * (VIEW + GAP) + GAP, 122), "white")
     draw = ImageDraw.Draw(header)
     write(draw, (10, 8), "One radiance field made of several multi-plane images", 18, bold=True)
     write(draw, (10, 36), text, 13)
     for k in range(views):
-        write(draw, (LABELS + k * (VIEW + GAP), 102), f"view {k + 1}", 14, bold=True)
+        write(draw, (LABELS + k * (VIEW + GAP), 102), f"test view {chr(ord('A') + k)}", 14, bold=True)
     return header
 
 
@@ -185,10 +185,12 @@ def _alone_rows(run: Run, shown: list[Shown]) -> list[tuple[Image.Image, list[Im
         label = Image.new("RGB", (LABELS, size), "white")
         draw = ImageDraw.Draw(label)
         draw.rectangle([10, 4, 24, 18], fill=rgb8(color))
-        write(draw, (32, 2), f"{run.plan.names[k]} alone", 15, bold=True)
         write(
-            draw, (10, 23), f"facing {facing}; wins {won:.0f} % of the pixels. Checks: it holds nothing", 12, fill=FAINT
+            draw, (32, 2), f'MPI "{run.plan.names[k]}" alone' if k < len(run.plan.mpis) else "cube alone", 15, bold=True
         )
+        empty = max(float((v.alone[k][..., 3] < 0.5).mean()) for v in shown) > 0.01
+        text = f"facing {facing}; wins {won:.0f} % of the pixels{'; checks: it holds nothing' if empty else ''}"
+        write(draw, (10, 23), text, 12, fill=FAINT)
         label.paste(drawn.draw([(head, color)], marks), (10, size - drawn.size[1]))
         rows.append((label, [image_of(over_checks(s.alone[k]), VIEW) for s in shown]))
     return rows
