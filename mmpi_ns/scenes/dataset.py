@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image
 
 from mmpi_ns.scenes.primitives import Array
-from mmpi_ns.scenes.scene import Scene, render
+from mmpi_ns.scenes.scene import Colors, Scene, render
 from mmpi_ns.scenes.sfm_like import SfmPoints, sfm_points
 
 PARTS = ("transforms.json", "images", "images_2", "images_4", "images_8", "depths", "colmap", "sparse_pc.ply")
@@ -87,7 +87,7 @@ def clear(folder: Path) -> None:
             path.unlink(missing_ok=True)
 
 
-def _millimetres(scene: Scene, camera: int, distances: Array) -> np.ndarray:
+def _millimetres(scene: Scene, camera: int, distances: Colors) -> np.ndarray:
     """Depth along the optical axis [H, W] as uint16, 0 where it is too far."""
     height, width = distances.shape
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)

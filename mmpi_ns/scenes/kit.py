@@ -74,7 +74,7 @@ def look(places: Array, yaw: Array, pitch: Array) -> Array:
     """Poses [M, 3, 4] (OpenGL axes) at places [M, 3], facing ``yaw`` about z from +x and ``pitch`` upwards."""
     cy, sy, cp, sp = np.cos(yaw), np.sin(yaw), np.cos(pitch), np.sin(pitch)
     right = np.stack([sy, -cy, np.zeros_like(yaw)], -1)
-    back = -np.stack([cp * cy, cp * sy, sp], -1)
+    back = np.stack([-cp * cy, -cp * sy, -sp], -1)
     return np.stack([right, np.cross(back, right), back, places], -1)
 
 

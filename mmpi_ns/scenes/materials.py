@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from mmpi_ns.scenes.textures import Array, Noise, band, cell_hash, mix, pulse
+from mmpi_ns.scenes.textures import Array, Noise, band, cell_hash, mix, pulse, rgb
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,7 @@ def _panes(s: Surface, noise: Noise, wall: Array, across: tuple, up: tuple, is_d
     share = np.clip(y - np.floor(y), 0, 1)
     glass = np.stack([0.13 + 0.22 * share, 0.17 + 0.27 * share, 0.22 + 0.32 * share], -1) * (0.6 + 0.8 * tone)[:, None]
     curtain = (tone > 0.6) * band(share, dy, 0.55, 1.0)
-    glass = mix(glass, np.broadcast_to(np.float32([0.78, 0.72, 0.62]), glass.shape), curtain)
+    glass = mix(glass, np.broadcast_to(rgb(0.78, 0.72, 0.62), glass.shape), curtain)
     leaf = s.colors[:, 2] * (0.25 + 0.5 * tone)[:, None] * (1 + 0.3 * s.noise(noise, 2.0, 3.0))[:, None]
     bars = np.maximum(pulse(x, dx, 0.48, 0.52), pulse(y, dy, 0.54, 0.57))
     inner = np.where(is_door[:, None], leaf, mix(glass, s.colors[:, 2], bars))
@@ -155,7 +155,7 @@ def cabin(s: Surface, noise: Noise) -> Array:
     pillars = np.where(s.side == 1, 1.05, s.width).astype(np.float32)
     glass = pulse(s.u / pillars, s.du / pillars, 0.05, 0.95) * band(s.v, s.dv, 0.04, s.height - 0.07) * (s.side < 2)
     share = (s.v / s.height)[:, None]
-    pane = np.float32([0.12, 0.16, 0.2]) + np.float32([0.22, 0.26, 0.3]) * share
+    pane = rgb(0.12, 0.16, 0.2) + rgb(0.22, 0.26, 0.3) * share
     pane = pane * (1 + 0.5 * s.noise(noise, 0.7))[:, None]
     return mix(s.colors[:, 0] * (1 + 0.08 * s.noise(noise, 1.0))[:, None], pane, glass)
 
@@ -168,9 +168,7 @@ def painting(s: Surface, noise: Noise) -> Array:
     ground = np.clip((hill - s.v) / np.maximum(s.dv, 0.02) + 0.5, 0, 1)
     canvas = mix(s.colors[:, 0], s.colors[:, 1], ground) * (1 + 0.45 * s.noise(noise, 5.0))[:, None]
     spot = np.hypot(s.u - 0.68 * s.width, s.v - 0.72 * s.height) / np.minimum(s.width, s.height)
-    canvas = mix(
-        canvas, np.broadcast_to(np.float32([0.96, 0.82, 0.4]), canvas.shape), np.clip((0.13 - spot) * 40, 0, 1)
-    )
+    canvas = mix(canvas, np.broadcast_to(rgb(0.96, 0.82, 0.4), canvas.shape), np.clip((0.13 - spot) * 40, 0, 1))
     return mix(s.colors[:, 2] * (1 + 0.2 * s.noise(noise, 3.0))[:, None], canvas, inside)
 
 

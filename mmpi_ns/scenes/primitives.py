@@ -161,7 +161,8 @@ class Tracer:
         if start.any():
             away -= 2 * start @ center.T
         meets = (away - along**2 <= square) & ((along > 0) | (away <= square))
-        return np.nonzero(meets)
+        ray, column = np.nonzero(meets)
+        return ray, column
 
 
 @dataclass(frozen=True)

@@ -216,12 +216,9 @@ def surface_of(these: Primitives, points: Array, directions: Array, pixel: Array
         u, v = np.where(curved, round_, u), np.where(curved, up * scale, v)
         du, dv = (np.where(curved, pixel * scale / cosine, x) for x in (du, dv))
         width, height = np.where(curved, 16.0 * turns, width), np.where(curved, 2 * h[:, 2] * scale, height)
-    surface = Surface(
-        *(x.astype(np.float32) for x in (u, v, du, dv, width, height)),
-        np.where(curved, 3, side).astype(np.int8),
-        these.colors.astype(np.float32),
-        these.offset.astype(np.float32),
-    )
+    u, v, du, dv, width, height = (x.astype(np.float32) for x in (u, v, du, dv, width, height))
+    colors, offset = these.colors.astype(np.float32), these.offset.astype(np.float32)
+    surface = Surface(u, v, du, dv, width, height, np.where(curved, 3, side).astype(np.int8), colors, offset)
     return surface, to_local(normal, -these.yaw)
 
 
@@ -248,7 +245,7 @@ def render(scene: Scene, camera: int, supersample: int = 2, contrast: float = 0.
         colors[these], patch[these] = scene.shade(*rays, depths[these], row, 1 / cameras.focal)
     edges = order[_differs(colors.reshape(h, w, 3), patch.reshape(h, w), contrast).reshape(-1)[order]]
     inner = (np.arange(supersample) + 0.5) / supersample - 0.5
-    shifts = np.stack(np.meshgrid(inner, inner), -1).reshape(-1, 2)
+    shifts: Array = np.stack(np.meshgrid(inner, inner), -1).reshape(-1, 2)
     per_packet = max(PACKET // len(shifts), 1)
     for start in range(0, len(edges), per_packet):
         these = edges[start : start + per_packet]

@@ -7,9 +7,9 @@ import numpy as np
 from mmpi_ns.scenes.primitives import Array
 from mmpi_ns.scenes.road import Road
 from mmpi_ns.scenes.scene import Colors
-from mmpi_ns.scenes.textures import Noise, band, mix, pulse
+from mmpi_ns.scenes.textures import Noise, band, mix, pulse, rgb
 
-GRASS = np.float32([[0.33, 0.42, 0.17], [0.47, 0.5, 0.25]])
+GRASS = rgb(0.33, 0.42, 0.17), rgb(0.47, 0.5, 0.25)
 
 
 def open_sky(directions: Array, pixel: float, noise: Noise) -> Colors:
@@ -18,12 +18,12 @@ def open_sky(directions: Array, pixel: float, noise: Noise) -> Colors:
     up, azimuth = np.arcsin(d[:, 2].clip(-1, 1)), np.arctan2(d[:, 1], d[:, 0]) / np.float32(2 * np.pi)
     width = np.full_like(up, pixel)
     share = np.clip(up / 0.6, 0, 1)[:, None] ** 0.6
-    color = (1 - share) * np.float32([0.88, 0.92, 0.95]) + share * np.float32([0.38, 0.6, 0.9])
+    color = (1 - share) * rgb(0.88, 0.92, 0.95) + share * rgb(0.38, 0.6, 0.9)
     # Clouds lie in a plane overhead: toward the horizon they crowd, and are averaged over wider footprints.
     lift = np.maximum(d[:, 2], 0) + 0.12
     clouds = noise(d[:, 0] / lift * 3, d[:, 1] / lift * 3, width * 3 / lift**2)
     color = mix(color, np.full_like(color, 0.98), np.clip(0.2 + 0.9 * clouds, 0, 0.9) * np.clip(up * 8, 0, 1))
-    far, near = np.float32([0.6, 0.68, 0.76]), np.float32([0.33, 0.43, 0.27])
+    far, near = rgb(0.6, 0.68, 0.76), rgb(0.33, 0.43, 0.27)
     for k, base in enumerate((0.1, 0.065, 0.03)):
         # The ridge is periodic in azimuth, so that there is no seam.
         ridge = base * (1 + 0.5 * noise(azimuth * 32, np.full_like(up, 3.7 * k), width * 5))
@@ -66,7 +66,7 @@ def _street(s, d, ds, dd, blurred, road: Road, noise: Noise) -> Colors:
     fine, coarse = noise(s, d, blurred), noise(s * 0.21, d * 0.21 + 5, blurred * 0.21)
     streaks = noise(s * 0.06, d * 1.3, np.maximum(blurred * 0.06, dd * 1.3))
     tone = 1 + 0.16 * fine + 0.14 * coarse + 0.13 * streaks
-    color = np.float32([0.36, 0.36, 0.38]) * tone[:, None]
+    color = rgb(0.36, 0.36, 0.38) * tone[:, None]
     side = np.abs(d)
     # Patches of newer tar and lids, so that the road has something to hold on to.
     patch = (noise(s * 0.05 + 3, np.sign(d) * 4, blurred * 0.05) > 0.45) * band(side, dd, 0.5, 2.6)
@@ -82,11 +82,11 @@ def _street(s, d, ds, dd, blurred, road: Road, noise: Noise) -> Colors:
     )
     color = mix(color, white, np.clip(marks + crossing, 0, 1) * np.clip(0.85 + 0.3 * coarse, 0, 1))
     bay = band(side, dd, road.half_width, road.kerb)
-    bays = np.float32([0.45, 0.44, 0.43]) * tone[:, None]
+    bays = rgb(0.45, 0.44, 0.43) * tone[:, None]
     bays = mix(bays, white, pulse(s / 5.6, ds / 5.6, 0.0, 0.02))
     color = mix(color, bays, bay)
     slab = np.maximum(pulse(s / 0.8, ds / 0.8, 0.0, 0.045), pulse(side / 0.6, dd / 0.6, 0.0, 0.06))
-    paving = np.float32([0.66, 0.62, 0.57]) * (1 + 0.2 * fine + 0.14 * coarse)[:, None]
+    paving = rgb(0.66, 0.62, 0.57) * (1 + 0.2 * fine + 0.14 * coarse)[:, None]
     color = mix(color, mix(paving, paving * 0.55, slab), band(side, dd, road.kerb, road.pavement))
     stone = np.full_like(color, 0.78) * (1 + 0.15 * fine)[:, None]
     stone = mix(stone, stone * 0.6, pulse(s / 1.0, ds, 0.0, 0.03))
@@ -104,7 +104,7 @@ def floor_inside(width: float, depth: float):
         shift = np.floor(plank) * 0.37
         grain = noise(x * 0.5 + shift * 7, y * 4, np.sqrt(dx * dy) * 2)
         tone = noise(np.floor(plank) * 2.3 + np.floor(x / 1.6 + shift) * 5.1, np.floor(plank) * 3.7, dy * 4)
-        color = mix(np.float32([0.5, 0.31, 0.17]), np.float32([0.74, 0.52, 0.32]), 0.5 + 0.5 * grain + 0.5 * tone)
+        color = mix(rgb(0.5, 0.31, 0.17), rgb(0.74, 0.52, 0.32), 0.5 + 0.5 * grain + 0.5 * tone)
         seam = np.maximum(pulse(plank, dy / 0.18, 0.0, 0.06), pulse(x / 1.6 + shift, dx / 1.6, 0.0, 0.008))
         color = mix(color, color * 0.4, seam)
         inside = (np.abs(x) < width / 2) & (np.abs(y) < depth / 2)

@@ -6,6 +6,8 @@ several octaves in a tile with its box-filtered halves (a mip map). Float32: onl
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -42,6 +44,11 @@ def cell_hash(i: Array, j: Array, salt: float | Array) -> Array:
     return (((n ^ (n >> 16)) & 0xFFFF) / 65536.0).astype(np.float32)
 
 
+def rgb(*color: float) -> Array:
+    """A colour [3]."""
+    return np.array(color, np.float32)
+
+
 def mix(a: Array, b: Array, share: Array) -> Array:
     """Colours [..., 3]: a where share [...] is 0, b where it is 1."""
     return a + (b - a) * share[..., None]
@@ -62,23 +69,25 @@ class Noise:
         self.flat = np.concatenate([t.reshape(-1) for t in levels])
         self.start = np.cumsum([0, *(t.size for t in levels)])[:-1].astype(np.int32)
 
-    def __call__(self, u: Array, v: Array, width: Array) -> Array:
+    def __call__(self, u: NDArray[Any], v: NDArray[Any], width: NDArray[Any]) -> Array:
         """Noise of mean 0 and standard deviation 0.5 at (u, v) metres, averaged over ``width`` metres."""
         level = np.log2(np.maximum(width * (TEXELS / PERIOD), 1.0)).clip(0, len(self.start) - 1.001)
         lower = level.astype(np.int32)
         a, b = self._bilinear(u, v, lower), self._bilinear(u, v, lower + 1)
-        return a + (b - a) * (level - lower)
+        return (a + (b - a) * (level - lower)).astype(np.float32)
 
-    def _bilinear(self, u: Array, v: Array, level: NDArray[np.int32]) -> Array:
+    def _bilinear(self, u: NDArray[Any], v: NDArray[Any], level: NDArray[np.int32]) -> Array:
         side = np.right_shift(TEXELS, level).astype(np.int32)
-        x, y = (c * (side / np.float32(PERIOD)) - np.float32(0.5) for c in (u, v))
+        per_metre = side.astype(np.float32) / PERIOD
+        x, y = u * per_metre - 0.5, v * per_metre - 0.5
         i, j = np.floor(x), np.floor(y)
         x, y = x - i, y - j
         i, j = i.astype(np.int32) & (side - 1), j.astype(np.int32) & (side - 1)
         right, start = (i + 1) & (side - 1), self.start[level]
         row, below = start + j * side, start + ((j + 1) & (side - 1)) * side
         top = self.flat[row + i] * (1 - x) + self.flat[row + right] * x
-        return top * (1 - y) + (self.flat[below + i] * (1 - x) + self.flat[below + right] * x) * y
+        bottom = self.flat[below + i] * (1 - x) + self.flat[below + right] * x
+        return (top + (bottom - top) * y).astype(np.float32)
 
 
 def _smooth_cells(cells: NDArray[np.float64], size: int) -> NDArray[np.float64]:

@@ -33,12 +33,12 @@ class SceneCommand:
     seed: int = 0
     """Another seed is another scene of the same kind."""
     points: int | None = None
-    """SfM points; by default 4,000, and three for each further metre of a drive."""
+    """SfM points; by default 4,000, and four a metre on drives of more than a kilometre."""
     noise: float = 0.3
     """Standard deviation of the keypoints' noise, pixels; the points are triangulated from them."""
     outliers: float = 0.02
     """Share of the points that are wrong."""
-    images: bool = True
+    images: tyro.conf.FlagConversionOff[bool] = True
     """False writes cameras, points and tracks alone."""
     overwrite: bool = False
     """Replace a data set that is in the folder."""
@@ -51,7 +51,7 @@ class SceneCommand:
         scene = make_scene(self.name, self.seed, self.count, self.width, self.height, self.length)
         cameras, points = scene.cameras, self.points
         if points is None:
-            points = 4000 + 3 * round(self.length or 0)
+            points = max(4000, 4 * round(self.length or 0))
         print(f"{self.name}: {len(scene.primitives)} solids, {len(cameras)} cameras; looking for points ...")
         found = write_dataset(
             scene, self.folder, points, self.noise, self.outliers, self.images, self.overwrite, _progress
