@@ -17,10 +17,10 @@ PYTHON_OK := import sys, venv, ensurepip; sys.exit(not (3, 10) <= sys.version_in
 PYTHON ?= $(shell for p in python3.11 python3.12 python3.10 python3; do \
 	if "$$p" -c '$(PYTHON_OK)' >/dev/null 2>&1; then echo "$$p"; break; fi; done)
 
-# Extra arguments for pytest, for example: make test ARGS="-k geometry -x"
+# Extra arguments for pytest or the demo: make test ARGS="-k geometry -x", make demo ARGS=--fresh
 ARGS ?=
 
-.PHONY: help venv test lint build clean
+.PHONY: help venv demo test lint build wheel figures clean
 
 help: ## List these commands
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -42,6 +42,9 @@ $(STAMP): pyproject.toml constraints.txt
 	@$(BIN)/python -m pip install -q --disable-pip-version-check -c constraints.txt -e '.[dev]'
 	@touch $@
 
+demo: venv ## Make a street, learn it, evaluate it and show what came of it, in demo/ (ARGS="..." as in demo --help)
+	@$(BIN)/python -m mmpi_ns.scripts.demo $(ARGS)
+
 test: venv ## Run the tests (ARGS="..." goes to pytest)
 	$(BIN)/python -m pytest $(ARGS)
 
@@ -53,6 +56,12 @@ lint: venv ## Check style, formatting and types
 build: venv ## Build the sdist and the wheel in dist/
 	rm -rf dist
 	$(BIN)/python -m build
+
+wheel: build ## Build, and run the wheel's commands in an otherwise empty environment
+	.ci/wheel
+
+figures: venv ## Draw the figures of the documentation anew, from the demo
+	$(BIN)/python -m mmpi_ns.scripts.figures
 
 clean: ## Remove build products and caches (not .venv)
 	rm -rf build dist *.egg-info .pytest_cache .hypothesis .ruff_cache

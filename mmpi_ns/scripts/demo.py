@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import os
 import shlex
 import shutil
 import subprocess
 import sys
 import time
+import warnings
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -176,7 +178,8 @@ class Demo:
         if not program.is_file():
             raise DemoError(f"{program} does not exist: install the package into this environment (make venv).")
         print(f"$ {shlex.join([name, *arguments])}", flush=True)
-        code = subprocess.run([str(program), *arguments], check=False).returncode
+        quiet = {**os.environ, "PYTHONWARNINGS": "ignore"}  # those of the libraries, which would bury the progress
+        code = subprocess.run([str(program), *arguments], env=quiet, check=False).returncode
         if code:
             raise DemoError(f"{name} ended with status {code}: what it said is above.")
 
@@ -198,6 +201,7 @@ def _track(items: Iterable[Any], what: str) -> Iterator[Any]:
 def main() -> int:
     """Runs the demo; a mistake is one sentence and status 1."""
     demo = tyro.cli(Demo)
+    warnings.simplefilter("ignore")
     try:
         demo.main()
     except (DemoError, ValueError, OSError) as error:
