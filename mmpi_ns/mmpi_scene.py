@@ -6,11 +6,14 @@ import copy
 from pathlib import Path
 from typing import Literal
 
-from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 
+from mmpi_ns.checks import check_transforms
 from mmpi_ns.mmpi_config import mmpi_small
 from mmpi_ns.mmpi_datamanager import MMPIDataManagerConfig
+from mmpi_ns.mmpi_dataset import MMPIDataset
+from mmpi_ns.mmpi_observations import observe, sfm_folder
 from mmpi_ns.placement.observations import Observations
 
 Parser = Literal["auto", "nerfstudio", "colmap"]
@@ -38,10 +41,12 @@ def load_observations(data: Path, downscale_factor: int | None = None, parser: P
             raise ValueError(f"{data} holds neither a transforms.json nor a COLMAP model: it is not a scene.")
         config.dataparser = ColmapDataParserConfig(colmap_path=Path(model))
         config.sfm_path = Path(model)
-    config.data = data
-    _set_factor(config.dataparser, downscale_factor)
-    return config.setup(device="cpu", test_mode="val").observations
-
-
-def _set_factor(parser: DataParserConfig, downscale_factor: int | None) -> None:
-    parser.downscale_factor = downscale_factor  # type: ignore[attr-defined]
+    parser_config = config.dataparser
+    parser_config.data = data
+    parser_config.downscale_factor = downscale_factor  # type: ignore[attr-defined]
+    if isinstance(parser_config, NerfstudioDataParserConfig):
+        check_transforms(data, auto_scale=parser_config.auto_scale_poses, opens_first_image=downscale_factor is None)
+    outputs = parser_config.setup().get_dataparser_outputs(split="train")
+    dataset = MMPIDataset(outputs)
+    folder = sfm_folder(parser_config, config.sfm_path)
+    return observe(outputs, dataset, folder, find_points=True, triangulates=config.triangulate)

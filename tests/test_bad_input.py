@@ -20,7 +20,7 @@ from PIL import Image
 from tiny_scene import HEIGHT, TEST, TRAIN, WIDTH, name_of, write_scene
 from training_runs import datamanager, ready, trainer_config, write_plan
 
-from mmpi_ns.mmpi_datamanager import ENOUGH_KEYPOINTS
+from mmpi_ns.mmpi_observations import ENOUGH_KEYPOINTS
 from mmpi_ns.placement.rule import PlacementConfig, place
 
 

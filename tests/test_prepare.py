@@ -12,7 +12,7 @@ import pytest
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from PIL import Image
 
-from mmpi_ns.mmpi_datamanager import read_observations
+from mmpi_ns.mmpi_observations import read_observations
 from mmpi_ns.prepare import features, mapping
 from mmpi_ns.prepare.frame import camera_poses, similarity_between
 from mmpi_ns.prepare.pipeline import WORK, prepare
