@@ -54,7 +54,7 @@ mmpi = _method(
     "MMPI: several multi-plane images, placed among the training cameras.",
     steps=20000,
     rays=4096,
-    model=MMPIModelConfig(placement=PlacementConfig(max_mpis=10, planes=128, texel_pixels=1.2)),
+    model=MMPIModelConfig(placement=PlacementConfig(texel_pixels=1.2, max_planes=256, max_texels=200e6)),
 )
 mmpi_small = _method(
     "mmpi-small",
