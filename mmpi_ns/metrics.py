@@ -14,8 +14,8 @@ from torchmetrics.functional.image import structural_similarity_index_measure
 class ImageMetrics:
     """Metrics of a rendered image. LPIPS fetches its weights on first use; without them it is left out, and says so."""
 
-    def __init__(self, lpips_net: Literal["vgg", "alex"]) -> None:
-        self.lpips_net: Literal["vgg", "alex"] = lpips_net
+    def __init__(self, lpips_net: Literal["vgg", "alex", "none"]) -> None:
+        self.lpips_net: Literal["vgg", "alex", "none"] = lpips_net
         self._lpips: nn.Module | None = None
         self._lpips_tried = False
 
@@ -34,7 +34,7 @@ class ImageMetrics:
         return values
 
     def _load_lpips(self, device: torch.device) -> nn.Module | None:
-        if not self._lpips_tried:
+        if self.lpips_net != "none" and not self._lpips_tried:
             self._lpips_tried = True
             try:
                 from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity

@@ -98,8 +98,8 @@ class MMPIModelConfig(ModelConfig):
     """Behind everything, when rendering. Training uses random colours where the MPIs explain the whole ray."""
     loss: LossWeights = field(default_factory=LossWeights)
     """Weights of the losses."""
-    lpips_net: Literal["vgg", "alex"] = "vgg"
-    """Network of the LPIPS metric (the paper: VGG); left out where its weights cannot be had."""
+    lpips_net: Literal["vgg", "alex", "none"] = "vgg"
+    """Network of the LPIPS metric (the paper: VGG); left out where its weights (0.5 GB for VGG) cannot be had."""
     seed: int = 0
     """Seed of the model's own random draws."""
 

@@ -118,6 +118,7 @@ class Demo:
             "--experiment-name", "street", "--timestamp", "demo", "--max-num-iterations", str(self.steps),
             "--vis", "tensorboard", "--steps-per-save", str(max(1, self.steps // 3)), "--steps-per-eval-batch", every,
             "--pipeline.datamanager.eval-num-rays-per-batch", "8192", "--logging.steps-per-log", "20",
+            "--pipeline.model.lpips-net", "none",  # half a gigabyte of weights would be fetched for it
             *(["--load-dir", str(self.run / "nerfstudio_models")] if resume else []),
         )  # fmt: skip
         if not self.checkpoint.is_file():

@@ -1,0 +1,237 @@
+"""The demo's pictures on the tiny scene, and what the demo keeps, removes and says."""
+
+from __future__ import annotations
+
+import os
+import sys
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from tiny_scene import HEIGHT, TEST, WIDTH, image_of
+from torch.utils.tensorboard import SummaryWriter
+from training_runs import ready, trainer_config
+
+from mmpi_ns.demo import film, painting
+from mmpi_ns.demo.curve import TEST as TEST_PSNR
+from mmpi_ns.demo.curve import draw_curve, read_curve
+from mmpi_ns.demo.maps import Map, plane_depths
+from mmpi_ns.demo.sheet import GAP, LABELS, VIEW, contact_sheet, overview, show_views, spread
+from mmpi_ns.demo.views import load_run, render_alone, render_view, truth_of
+from mmpi_ns.metrics import ImageMetrics
+from mmpi_ns.scripts import demo as demo_script
+from mmpi_ns.scripts import figures
+from mmpi_ns.scripts.demo import Demo, DemoError
+
+
+@pytest.fixture(scope="module")
+def run(scene, plan_file, tmp_path_factory):
+    """A run of a few steps, loaded from its folder."""
+    config = trainer_config(scene, plan_file, tmp_path_factory.mktemp("run"), steps=30, training="joint")
+    trainer = ready(config)
+    config.save_config()
+    trainer.train()
+    return load_run(config.get_base_dir() / "config.yml")
+
+
+@pytest.fixture(scope="module")
+def shown(run):
+    return show_views(run, [0, 1])
+
+
+def test_light_that_passes_all_mpis_passes_each_alone(run):
+    camera = run.tests.cameras[0:1]
+    alone = [render_alone(run, camera, name)[..., 3] for name in run.plan.names]
+    everything = run.model.get_outputs_for_camera(camera)["accumulation"][..., 0].numpy()
+    assert len(alone) == 3 and min(a.max() for a in alone) > 0.2
+    np.testing.assert_allclose(np.prod([1 - a for a in alone], 0), 1 - everything, atol=1e-4)
+    assert run.model.show.value == "all"
+
+
+def test_a_view_has_the_units_of_the_capture(run):
+    view, truth = render_view(run, run.tests.cameras[0:1]), truth_of(run, 0)
+    assert view.color.shape == truth.shape == (HEIGHT, WIDTH, 3)
+    assert np.abs(truth - image_of(TEST[0])).max() < 0.003
+    outputs = run.model.get_outputs_for_camera(run.tests.cameras[0:1])
+    np.testing.assert_allclose(view.inverse_depth, run.scale / outputs["depth"][..., 0].numpy(), rtol=1e-5)
+    assert set(np.unique(view.winner)) <= {0, 1, 2}
+
+
+def strip_of(sheet, row, column, header, height):
+    """What the sheet shows at a row and column, as an array."""
+    x, y = LABELS + column * (VIEW + GAP), header + row * (height + GAP)
+    return np.asarray(sheet.crop((x, y, x + VIEW, y + height)))
+
+
+def test_the_sheet_shows_truth_rendering_winner_and_each_mpi_of_every_view(run, shown):
+    sheet = contact_sheet(run, shown)
+    height = round(VIEW * HEIGHT / WIDTH)
+    rows = 5 + len(run.plan.names)
+    header = sheet.height - rows * (height + GAP) - GAP
+    assert sheet.width == LABELS + 2 * (VIEW + GAP) + GAP and 80 < header < 160
+    for column, view in enumerate(shown):
+        wanted = [view.truth, view.view.color, None, None, np.array(run.colors)[view.view.winner]]
+        wanted += [painting.over_checks(a) for a in view.alone]
+        for row, picture in enumerate(wanted):
+            if picture is not None:
+                expected = np.asarray(painting.image_of(picture, VIEW))
+                np.testing.assert_array_equal(strip_of(sheet, row, column, header, height), expected)
+    assert not np.array_equal(strip_of(sheet, 5, 0, header, height), strip_of(sheet, 6, 0, header, height))
+
+
+def test_psnr_of_a_view_is_that_of_its_pictures(run, shown):
+    error = ((shown[0].truth.astype(np.float64) - shown[0].view.color) ** 2).mean()
+    assert shown[0].psnr == pytest.approx(-10 * np.log10(error), abs=1e-4)
+    assert overview(run, shown[0]).width > 2 * 400
+
+
+def test_lpips_can_be_left_out_without_looking_for_its_weights(monkeypatch):
+    monkeypatch.setitem(sys.modules, "torchmetrics.image.lpip", None)
+    picture = torch.full((16, 16, 3), 0.5)
+    metrics = ImageMetrics("none")
+    assert set(metrics(picture, picture)) == {"psnr", "ssim"} and not metrics._lpips_tried
+
+
+def test_views_are_spread_evenly():
+    assert spread(32) == [5, 16, 26] and spread(3) == [0, 1, 2] and spread(1) == [0]
+
+
+def test_colour_scales_rise_and_saturate():
+    errors = np.array([[0.0, 0.1, painting.WORST_ERROR, 1.0]], np.float32)
+    bright = painting.error_colors(errors).sum(-1)[0]
+    assert bright[0] < 0.05 < bright[1] < bright[2] == bright[3]
+    depths = painting.depth_colors(np.array([[0.0, 0.1, 0.5, 3.0]], np.float32), nearest=2.0).sum(-1)[0]
+    assert depths[0] < depths[1] < depths[2] == depths[3]
+
+
+def test_checks_show_where_an_mpi_holds_nothing():
+    rgba = np.zeros((12, 12, 4), np.float32)
+    rgba[:, 6:] = [1, 0, 0, 1]
+    over = painting.over_checks(rgba)
+    assert (over[:, 6:] == [1, 0, 0]).all() and len(np.unique(over[:, :6])) == 2
+
+
+def test_the_map_has_cameras_where_they_are_and_the_mpi_between_its_borders(run):
+    drawn = Map.of(run.observations, 400, 100)
+    cameras = np.array(drawn.pixels(drawn.flat(run.observations.centers)))
+    for x, y in cameras:
+        assert drawn.backdrop.getpixel((round(x), round(y))) == (20, 20, 20)
+    mpi, color = run.plan.mpis[0], (1.0, 0.0, 0.0)
+    picture = np.asarray(drawn.draw([(mpi, color)]), np.float64)
+    assert picture.shape == (100, 400, 3)
+    assert (picture[..., 0] > picture[..., 1] + 10).any()
+    assert plane_depths(mpi)[0] == pytest.approx(mpi.near) and np.isfinite(plane_depths(mpi)).all()
+
+
+def test_the_film_starts_and_ends_at_cameras_and_sways_between(run):
+    cameras = run.tests.cameras
+    path = film.fly_path(cameras, 9)
+    assert len(path) == 9
+    for place, i in ((0, 0), (8, len(cameras) - 1)):
+        torch.testing.assert_close(path.camera_to_worlds[place], cameras.camera_to_worlds[i], atol=1e-5, rtol=0)
+    turns = path.camera_to_worlds[:, :, :3]
+    torch.testing.assert_close(turns @ turns.mT, torch.eye(3).expand(9, 3, 3), atol=1e-5, rtol=0)
+    straight = cameras.camera_to_worlds[0, :, 3].lerp(cameras.camera_to_worlds[-1, :, 3], 1 / 8)
+    assert (path.camera_to_worlds[1, :, 3] - straight).norm() > 1e-3
+
+
+def test_a_film_is_encoded_or_left_as_frames(run, tmp_path, monkeypatch):
+    import av
+
+    assert film.find_encoder() is not None, "PyAV comes with nerfstudio and has an encoder"
+    pictures = list(film.film_frames(run, 3))
+    odd = [Image.new("RGB", (65, 33), (250, 0, 0))] * 5
+    with av.open(str(film.write_film(odd, tmp_path))) as video:
+        frames = [f.to_ndarray(format="rgb24") for f in video.decode(video=0)]
+    assert len(frames) == 5 and frames[0].shape == (32, 64, 3) and frames[0][16, 32, 0] > 200
+    monkeypatch.setattr(film, "find_encoder", lambda: None)
+    folder = film.write_film(pictures, tmp_path)
+    assert sorted(p.name for p in folder.iterdir()) == ["0000.png", "0001.png", "0002.png"]
+
+
+def test_the_curve_joins_the_files_of_a_resumed_run(tmp_path):
+    for start in (0, 20):
+        writer = SummaryWriter(str(tmp_path), filename_suffix=f".{start}")
+        for step in (start, start + 10):
+            writer.add_scalar(TEST_PSNR, 20 + step, step, walltime=1000.0 + step)
+        writer.close()
+    curve = read_curve(tmp_path, TEST_PSNR)
+    assert curve.tolist() == [[1000 + s, s, 20 + s] for s in (0, 10, 20, 30)]
+    assert draw_curve(tmp_path, tmp_path / "psnr.png", 990.0, "") == 50
+    assert Image.open(tmp_path / "psnr.png").width > 400
+    with pytest.raises(ValueError, match="steps-per-eval-batch"):
+        draw_curve(tmp_path / "nothing", tmp_path / "none.png", 0.0, "")
+
+
+def test_the_street_is_made_once(tmp_path, capsys):
+    demo = Demo(tmp_path, images=2)
+    demo._make_street()
+    first = (tmp_path / "street" / "transforms.json").stat().st_mtime_ns
+    assert len(list((tmp_path / "street" / "images").iterdir())) == 2
+    demo._make_street()
+    assert (tmp_path / "street" / "transforms.json").stat().st_mtime_ns == first
+    assert "kept" in capsys.readouterr().out
+
+
+def test_fresh_removes_what_the_demo_wrote_and_nothing_else(tmp_path):
+    (tmp_path / "runs").mkdir()
+    for name in ("eval.json", "runs/log", "mine.txt"):
+        (tmp_path / name).touch()
+    Demo(tmp_path, fresh=True)._prepare_folder()
+    assert [p.name for p in tmp_path.iterdir()] == ["mine.txt"]
+
+
+def test_outputs_older_than_the_checkpoint_are_made_again(tmp_path):
+    demo, result = Demo(tmp_path, steps=7), tmp_path / "eval.json"
+    demo.checkpoint.parent.mkdir(parents=True)
+    demo.checkpoint.touch()
+    assert demo.checkpoint.name == "step-000000006.ckpt" and not demo._is_newer(result)
+    result.touch()
+    assert demo._is_newer(result)
+    os.utime(result, (1, 1))
+    assert not demo._is_newer(result)
+
+
+def test_a_command_that_fails_or_is_missing_is_named(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "executable", str(tmp_path / "python"))
+    with pytest.raises(DemoError, match=r"ns-train does not exist.*make venv"):
+        Demo(tmp_path)._command("ns-train")
+    program = tmp_path / "ns-train"
+    program.write_text("#!/bin/sh\nexit 3\n")
+    program.chmod(0o755)
+    with pytest.raises(DemoError, match="ns-train ended with status 3"):
+        Demo(tmp_path)._command("ns-train")
+
+
+def test_a_full_disk_is_one_sentence_and_status_1(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(demo_script.shutil, "disk_usage", lambda _: SimpleNamespace(free=1 << 20))
+    monkeypatch.setattr(sys, "argv", ["demo", "--folder", str(tmp_path)])
+    assert demo_script.main() == 1
+    said = capsys.readouterr().err
+    assert said.startswith("demo: ") and said.count("\n") == 1 and "make room" in said
+
+
+def test_the_ray_of_the_figure_crosses_planes_where_geometry_says():
+    mpi = figures._front("front", 0.0)
+    (found,) = figures._distances([mpi], np.array([6.0, 0, 0]), np.array([1.0, 0, 0]))
+    depths = mpi.near / (1 - np.arange(mpi.planes - 1) / (mpi.planes - 1))
+    np.testing.assert_allclose(found[:-1], [d - 6 for d in depths if d > 6.5], rtol=1e-9)
+    assert np.isinf(found[-1])
+
+
+def test_figures_are_drawn_and_the_demo_is_asked_for(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["figures", "--demo", str(tmp_path / "none"), "--output", str(tmp_path / "out")])
+    assert figures.main() == 1
+    assert "run make demo first" in capsys.readouterr().err
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["errors.png", "merging.png", "reliability.png"]
+
+
+def test_large_pictures_shrink(tmp_path, monkeypatch):
+    monkeypatch.setattr(figures, "MOST_BYTES", 30_000)
+    noise = np.random.default_rng(0).integers(0, 255, (200, 200, 3), np.uint8)
+    Image.fromarray(noise).save(tmp_path / "large.png")
+    figures._shrink(tmp_path / "large.png", tmp_path / "small.png")
+    small = Image.open(tmp_path / "small.png")
+    assert (tmp_path / "small.png").stat().st_size <= 30_000 and small.width < 200 and small.width == small.height
