@@ -141,7 +141,7 @@ def test_a_film_is_encoded_or_left_as_frames(run, tmp_path, monkeypatch):
     import av
 
     assert film.find_encoder() is not None, "PyAV comes with nerfstudio and has an encoder"
-    pictures = list(film.film_frames(run, 3))
+    pictures = list(film.film_frames(run, 3, nearest=1.0))
     odd = [Image.new("RGB", (65, 33), (250, 0, 0))] * 5
     with av.open(str(film.write_film(odd, tmp_path))) as video:
         frames = [f.to_ndarray(format="rgb24") for f in video.decode(video=0)]
@@ -228,10 +228,16 @@ def test_figures_are_drawn_and_the_demo_is_asked_for(tmp_path, monkeypatch, caps
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["errors.png", "merging.png", "reliability.png"]
 
 
-def test_large_pictures_shrink(tmp_path, monkeypatch):
-    monkeypatch.setattr(figures, "MOST_BYTES", 30_000)
+def test_large_pictures_shrink_or_are_refused(tmp_path, monkeypatch):
     noise = np.random.default_rng(0).integers(0, 255, (200, 200, 3), np.uint8)
-    Image.fromarray(noise).save(tmp_path / "large.png")
-    figures._shrink(tmp_path / "large.png", tmp_path / "small.png")
-    small = Image.open(tmp_path / "small.png")
-    assert (tmp_path / "small.png").stat().st_size <= 30_000 and small.width < 200 and small.width == small.height
+    source, target = tmp_path / "large.png", tmp_path / "small.jpg"
+    Image.fromarray(noise).save(source)
+    figures._shrink(source, target)
+    best = target.stat().st_size
+    monkeypatch.setattr(figures, "MOST_BYTES", best // 2)
+    figures._shrink(source, target)
+    assert target.stat().st_size <= best // 2 and Image.open(target).size == (200, 200)
+    monkeypatch.setattr(figures, "MOST_BYTES", 1000)
+    with pytest.raises(ValueError, match="draw less"):
+        figures._shrink(source, target)
+    assert not target.exists()

@@ -57,9 +57,8 @@ def draw_curve(run: Path, target: Path, started: float, title: str) -> float:
             train[:, 0] - started, psnr_of_squared_error(train[:, 2]), ".", color="0.75", label="training batches"
         )
     axes.plot(test[:, 0] - started, test[:, 2], "o-", color="#d62728", label="random pixels of the test images")
-    axes.annotate(
-        f"{test[-1, 2]:.1f} dB", (test[-1, 0] - started, test[-1, 2]), xytext=(-10, 10), textcoords="offset points"
-    )
+    last = (test[-1, 0] - started, test[-1, 2])
+    axes.annotate(f"{last[1]:.1f} dB", last, xytext=(0, -18), textcoords="offset points", ha="right")
     axes.set_xlim(left=0)
     axes.grid(alpha=0.3)
     axes.legend(loc="lower right")

@@ -45,16 +45,20 @@ def fly_path(cameras: Cameras, frames: int) -> Cameras:
 
 
 def film_frames(
-    run: Run, frames: int, progress: Callable[[Iterable[int]], Iterable[int]] = iter
+    run: Run, frames: int, nearest: float, progress: Callable[[Iterable[int]], Iterable[int]] = iter
 ) -> Iterator[Image.Image]:
-    """Renders the film; ``progress`` wraps the frame numbers."""
+    """Renders the film, frame by frame.
+
+    Args:
+        run: the model and the cameras to fly past.
+        frames: how many.
+        nearest: distance drawn brightest, in units of the capture.
+        progress: wraps the frame numbers.
+    """
     path = fly_path(run.tests.cameras, frames)
     colors = np.asarray(run.colors, np.float32)
-    nearest = None
     for i in progress(range(frames)):
-        view = render_view(run, path[i : i + 1])
-        nearest = nearest or float(1 / np.quantile(view.inverse_depth, 0.98))
-        yield _frame(view, colors, nearest)
+        yield _frame(render_view(run, path[i : i + 1]), colors, nearest)
 
 
 def write_film(images: Iterable[Image.Image], folder: Path, rate: int = 12) -> Path:

@@ -91,7 +91,7 @@ def overview(run: Run, shown: Shown) -> Image.Image:
     parts = [
         ("truth (held out of training)", image_of(shown.truth, width)),
         (f"rendering, {shown.psnr:.1f} dB", image_of(shown.view.color, width)),
-        ("depth: near is bright", image_of(depth_colors(shown.view.inverse_depth, _nearest([shown])), width)),
+        ("depth: near is bright", image_of(depth_colors(shown.view.inverse_depth, nearest_of([shown])), width)),
         ("winning MPI: whose colour a pixel has", image_of(_winner_colors(run, shown.view), width)),
     ]
     height = parts[0][1].height + line
@@ -141,7 +141,7 @@ def _label(title: str, text: str, height: int, extra: Image.Image | None = None)
 def _whole_rows(run: Run, shown: list[Shown]) -> list[tuple[Image.Image, list[Image.Image]]]:
     views = [s.view for s in shown]
     size = image_of(shown[0].truth, VIEW).height
-    nearest = _nearest(shown)
+    nearest = nearest_of(shown)
     errors = [np.abs(s.truth - s.view.color).mean(-1) for s in shown]
     scores = ", ".join(f"{s.psnr:.1f}" for s in shown)
     ticks = [
@@ -210,8 +210,8 @@ def _winner_colors(run: Run, view: View) -> Picture:
     return np.asarray(run.colors, np.float32)[view.winner]
 
 
-def _nearest(shown: list[Shown]) -> float:
-    """A distance that nearly all pixels lie beyond."""
+def nearest_of(shown: list[Shown]) -> float:
+    """A distance that nearly all pixels of some views lie beyond, in units of the capture."""
     return float(1 / np.quantile(np.concatenate([s.view.inverse_depth.ravel() for s in shown]), 0.98))
 
 

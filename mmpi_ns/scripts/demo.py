@@ -40,7 +40,7 @@ class Demo:
     """Training steps."""
     images: int = 64
     """Images of the street; half of them are held out for testing."""
-    frames: int = 48
+    frames: int = 40
     """Frames of the fly-through."""
     fresh: bool = False
     """Start afresh instead of keeping what an earlier demo has done."""
@@ -132,7 +132,7 @@ class Demo:
 
     def _take_pictures(self) -> Path:
         from mmpi_ns.demo.film import film_frames, write_film
-        from mmpi_ns.demo.sheet import contact_sheet, overview, show_views, spread
+        from mmpi_ns.demo.sheet import contact_sheet, nearest_of, overview, show_views, spread
         from mmpi_ns.demo.views import load_run
 
         sheet, film = self.folder / "contact-sheet.png", self.folder / "fly.mp4"
@@ -143,7 +143,8 @@ class Demo:
         shown = show_views(run, indices, lambda items: _track(items, "Test views, each MPI alone"))
         overview(run, shown[len(shown) // 2]).save(self.folder / "overview.png")
         contact_sheet(run, shown).save(sheet)
-        return write_film(film_frames(run, self.frames, lambda items: _track(items, "Fly-through")), self.folder)
+        images = film_frames(run, self.frames, nearest_of(shown), lambda items: _track(items, "Fly-through"))
+        return write_film(images, self.folder)
 
     def _draw_curve(self) -> None:
         from mmpi_ns.demo.curve import draw_curve

@@ -22,8 +22,8 @@ from mmpi_ns.placement.observations import Observations
 from mmpi_ns.placement.plan import MPIPlan
 
 COLORS = ("#2b66e8", "#dd8a00", "#2a9d3a")
-HELD = ("contact-sheet.png", "overview.png", "psnr.png")
-"""Pictures of the demo that the documentation shows."""
+SHEET, README_PICTURE = "contact-sheet.png", "contact-sheet.jpg"
+"""The demo's picture that the documentation shows, there and here."""
 MOST_BYTES = 400_000
 AT_INFINITY = 120.0
 """Where the last plane is drawn on a scale of distances, m."""
@@ -34,7 +34,7 @@ class Figures:
     """Draws the figures of README.md and docs/."""
 
     demo: Path = Path("demo")
-    """Folder of ``make demo``; its pictures are copied. Without it only the explanations are drawn."""
+    """Folder of ``make demo``; its contact sheet is copied. Without it only the explanations are drawn."""
     output: Path = Path("docs/images")
     """Folder to write."""
 
@@ -43,11 +43,9 @@ class Figures:
         draw_merging(self.output / "merging.png")
         draw_reliability(self.output / "reliability.png")
         draw_errors(self.output / "errors.png")
-        missing = [name for name in HELD if not (self.demo / name).is_file()]
-        if missing:
-            raise ValueError(f"{self.demo} lacks {missing[0]}: run make demo first (the other figures are written).")
-        for name in HELD:
-            _shrink(self.demo / name, self.output / name)
+        if not (self.demo / SHEET).is_file():
+            raise ValueError(f"{self.demo} lacks {SHEET}: run make demo first (the other figures are written).")
+        _shrink(self.demo / SHEET, self.output / README_PICTURE)
         print(f"Wrote {', '.join(sorted(p.name for p in self.output.iterdir()))} in {self.output}.")
 
 
@@ -210,15 +208,14 @@ def _figure(width: float, height: float) -> Figure:
 
 
 def _shrink(source: Path, target: Path) -> None:
-    """Copies a picture with 256 colours at most, and smaller where it is still too large a file."""
+    """Copies a picture as JPEG, only as good as a file of moderate size allows."""
     image = Image.open(source).convert("RGB")
-    for share in (1.0, 0.9, 0.8, 0.7, 0.6, 0.5):
-        size = (round(share * image.width), round(share * image.height))
-        small = image if share == 1 else image.resize(size, Image.Resampling.LANCZOS)
-        small.quantize(256, dither=Image.Dither.NONE).save(target, optimize=True)
+    for quality in (92, 88, 84, 80, 75, 70, 65, 60):
+        image.save(target, quality=quality, subsampling=0, optimize=True)
         if target.stat().st_size <= MOST_BYTES:
             return
-    raise ValueError(f"{source} stays larger than {MOST_BYTES // 1000} kB at half its size: draw less in it.")
+    target.unlink()
+    raise ValueError(f"{source} is larger than {MOST_BYTES // 1000} kB even as a poor JPEG: draw less in it.")
 
 
 def main() -> int:
