@@ -14,6 +14,8 @@ SAMPLED, SAMPLED_PER_CAMERA = 6000, 16
 FRUSTUM_SHARE, FEW = 0.15, 10
 """Weight, in every image, of points that fill its frustum: a share, and most of it where there are so FEW keypoints.
 Where an image has no keypoints (sky, a white wall) there must be planes all the same."""
+SPAN = (0.25, 0.9)
+"""Between these quantiles of depth an image's content is said to lie."""
 WINDOW, SUPPORT = 1.5, 0.04
 """Content starts where so many of a camera's observations lie within a factor of WINDOW in depth."""
 
@@ -31,7 +33,7 @@ class Content:
     nearest: Array
     """[M] depth, along each camera's axis, at which its content starts."""
     typical: Array
-    """[M] depth beyond which three quarters of each camera's content lie."""
+    """[M, 2] depths before which a quarter and nine tenths of each camera's content lie."""
     near: float
     """Depth at which content starts for the cameras in general."""
 
@@ -59,10 +61,9 @@ def find_content(observations: Observations) -> Content:
     starts = {i: _start(depth[cameras == i]) for i in range(len(centers)) if (cameras == i).sum() >= 20}
     near = float(np.median(list(starts.values()))) if starts else _start(depth)
     nearest = np.array([starts.get(i, near) for i in range(len(centers))])
-    quarter = float(np.quantile(depth, 0.25))
-    typical = np.array(
-        [np.quantile(depth[cameras == i], 0.25) if i in starts else quarter for i in range(len(centers))]
-    )
+    typical = np.tile(np.quantile(depth, SPAN), (len(centers), 1))
+    for i in starts:
+        typical[i] = np.quantile(depth[cameras == i], SPAN)
     return _weighed(observations, cameras, points, nearest, typical, near)
 
 

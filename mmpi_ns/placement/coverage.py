@@ -11,17 +11,17 @@ from mmpi_ns.placement.content import Content
 from mmpi_ns.placement.observations import Array, Observations
 from mmpi_ns.placement.plan import MPIPlan
 
-BEYOND = 0.08
+BEYOND = 0.05
 """How far beyond an image's borders there should be texels, as a share of its sides: other views look there."""
-WIDEST = 3.0
-"""No tangent is widened beyond this."""
+WIDEST, FARTHEST = 3.0, 0.5
+"""No tangent is widened beyond the one, nor by more than the other: a border far from all MPIs would cost too much."""
 
 
 def widened(mpis: list[MPIPlan], observations: Observations, content: Content) -> list[MPIPlan]:
     """The MPIs, widened where the borders of an image are in none of them; texels keep their size.
 
-    A border counts where content typically lies, and far away. Each border point that nothing holds goes to the MPI
-    that must grow least for it.
+    A border counts at the depths between which content lies. Each border point that nothing holds goes to the MPI that
+    must grow least for it.
 
     Args:
         mpis: the chosen MPIs.
@@ -33,7 +33,7 @@ def widened(mpis: list[MPIPlan], observations: Observations, content: Content) -
     extents = np.array([m.extent for m in mpis])
     ahead = depths >= np.array([[m.near] for m in mpis])
     held = ahead & (_outside(tangents, extents).max(-1) <= 0)
-    able = ahead & (np.abs(tangents).max(-1) <= WIDEST)
+    able = ahead & (np.abs(tangents).max(-1) <= WIDEST) & (_outside(tangents, extents).max(-1) <= FARTHEST)
     for p in np.nonzero(~held.any(0) & able.any(0))[0]:
         missing = np.maximum(_outside(tangents[:, p], extents), 0)
         k = int(np.where(able[:, p], missing.sum(-1), np.inf).argmin())
@@ -44,17 +44,17 @@ def widened(mpis: list[MPIPlan], observations: Observations, content: Content) -
 
 
 def border_points(observations: Observations, content: Content) -> Array:
-    """[M * 32, 3] points around every image's border, at a depth where its content typically lies and far away."""
+    """[M * 32, 3] points around every image's border, at the depths where a quarter and most of its content begins."""
     steps = (0.0, 0.25, 0.5, 0.75, 1.0)
     rim = np.array([(a, b) for a in steps for b in steps if a in (0.0, 1.0) or b in (0.0, 1.0)])
     shares = -BEYOND + (1 + 2 * BEYOND) * rim
     clouds = []
-    for pose, (fx, fy, cx, cy), (w, h), depth in zip(
+    for pose, (fx, fy, cx, cy), (w, h), depths in zip(
         observations.camera_to_worlds, observations.intrinsics, observations.sizes, content.typical, strict=True
     ):
         x, y = (shares[:, 0] * w - cx) / fx, (shares[:, 1] * h - cy) / fy
         directions = np.stack([x, -y, -np.ones_like(x)], -1) @ pose[:, :3].T
-        clouds += [pose[:, 3] + depth * directions, pose[:, 3] + 1e4 * depth * directions]
+        clouds += [pose[:, 3] + depth * directions for depth in depths]
     return np.concatenate(clouds)
 
 
