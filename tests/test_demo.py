@@ -175,6 +175,27 @@ def test_the_street_is_made_once(tmp_path, capsys):
     assert "kept" in capsys.readouterr().out
 
 
+def test_another_number_of_images_is_another_street_and_another_training(tmp_path):
+    demo = Demo(tmp_path, images=3, steps=5)
+    (tmp_path / "street").mkdir()
+    (tmp_path / "street" / "transforms.json").write_text('{"frames": [1, 2]}')
+    demo.checkpoint.parent.mkdir(parents=True)
+    demo.checkpoint.touch()
+    demo._make_street()
+    assert len(list((tmp_path / "street" / "images").iterdir())) == 3 and not demo.checkpoint.exists()
+
+
+def test_only_a_training_of_as_many_steps_is_resumed(tmp_path):
+    demo = Demo(tmp_path, steps=9)
+    assert demo._resumable() is None
+    demo.checkpoint.parent.mkdir(parents=True)
+    for step in (3, 6):
+        (demo.checkpoint.parent / f"step-{step:09d}.ckpt").touch()
+    (tmp_path / "times.json").write_text('{"started": 1.0, "steps": 9}')
+    assert demo._resumable() == 6
+    assert Demo(tmp_path, steps=10)._resumable() is None
+
+
 def test_fresh_removes_what_the_demo_wrote_and_nothing_else(tmp_path):
     (tmp_path / "runs").mkdir()
     for name in ("eval.json", "runs/log", "mine.txt"):

@@ -93,9 +93,11 @@ class Demo:
         from mmpi_ns.scenes.catalogue import make_scene
         from mmpi_ns.scenes.dataset import write_dataset
 
-        if (self.scene / "transforms.json").is_file():
+        transforms = self.scene / "transforms.json"
+        if transforms.is_file() and len(json.loads(transforms.read_text(encoding="utf-8"))["frames"]) == self.images:
             _kept(self.scene)
             return
+        shutil.rmtree(self.run, ignore_errors=True)  # it belongs to the street of before
         print("Looking for points that several cameras see ...", flush=True)
         scene = make_scene("street", count=self.images)
         write_dataset(scene, self.scene, overwrite=True, progress=lambda items: _track(items, "Rendering the street"))
@@ -104,12 +106,11 @@ class Demo:
         if self.checkpoint.is_file():
             _kept(self.run)
             return
-        saved = sorted(self.run.glob("nerfstudio_models/step-*.ckpt"))
-        newest = int(saved[-1].stem.split("-")[1]) if saved else -1
-        resume = saved and newest < self.steps - 1
-        if not resume:
+        newest = self._resumable()
+        if newest is None:
             shutil.rmtree(self.run, ignore_errors=True)
-            (self.folder / "times.json").write_text(json.dumps({"started": time.time()}), encoding="utf-8")
+            begun = {"started": time.time(), "steps": self.steps}
+            (self.folder / "times.json").write_text(json.dumps(begun), encoding="utf-8")
         else:
             print(f"Going on from step {newest}.")
         every = str(max(1, self.steps // 12))
@@ -119,10 +120,17 @@ class Demo:
             "--vis", "tensorboard", "--steps-per-save", str(max(1, self.steps // 3)), "--steps-per-eval-batch", every,
             "--pipeline.datamanager.eval-num-rays-per-batch", "8192", "--logging.steps-per-log", "20",
             "--pipeline.model.lpips-net", "none",  # half a gigabyte of weights would be fetched for it
-            *(["--load-dir", str(self.run / "nerfstudio_models")] if resume else []),
+            *(["--load-dir", str(self.run / "nerfstudio_models")] if newest is not None else []),
         )  # fmt: skip
         if not self.checkpoint.is_file():
             raise DemoError(f"ns-train ended before its last step: start again, it goes on from {self.run}.")
+
+    def _resumable(self) -> int | None:
+        """The last step that an interrupted training of as many steps has saved."""
+        times = self.folder / "times.json"
+        if not times.is_file() or json.loads(times.read_text(encoding="utf-8")).get("steps") != self.steps:
+            return None
+        return max((int(p.stem.split("-")[1]) for p in self.run.glob("nerfstudio_models/step-*.ckpt")), default=None)
 
     def _evaluate(self) -> dict[str, Any]:
         target = self.folder / "eval.json"
