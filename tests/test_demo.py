@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import sys
 from types import SimpleNamespace
@@ -21,6 +22,7 @@ from mmpi_ns.demo.maps import Map, plane_depths
 from mmpi_ns.demo.sheet import GAP, LABELS, VIEW, contact_sheet, overview, show_views, spread
 from mmpi_ns.demo.views import load_run, render_alone, render_view, truth_of
 from mmpi_ns.metrics import ImageMetrics
+from mmpi_ns.scenes import dataset
 from mmpi_ns.scripts import demo as demo_script
 from mmpi_ns.scripts import figures
 from mmpi_ns.scripts.demo import Demo, DemoError
@@ -165,6 +167,13 @@ def test_the_curve_joins_the_files_of_a_resumed_run(tmp_path):
         draw_curve(tmp_path / "nothing", tmp_path / "none.png", 0.0, "")
 
 
+@pytest.fixture
+def few_points(monkeypatch):
+    """Streets with few SfM points, which are most of the work."""
+    monkeypatch.setattr(dataset, "write_dataset", functools.partial(dataset.write_dataset, points=40))
+
+
+@pytest.mark.usefixtures("few_points")
 def test_the_street_is_made_once(tmp_path, capsys):
     demo = Demo(tmp_path, images=2)
     demo._make_street()
@@ -175,6 +184,7 @@ def test_the_street_is_made_once(tmp_path, capsys):
     assert "kept" in capsys.readouterr().out
 
 
+@pytest.mark.usefixtures("few_points")
 def test_another_number_of_images_is_another_street_and_another_training(tmp_path):
     demo = Demo(tmp_path, images=3, steps=5)
     (tmp_path / "street").mkdir()

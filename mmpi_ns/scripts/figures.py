@@ -211,7 +211,7 @@ def _shrink(source: Path, target: Path) -> None:
     """Copies a picture as JPEG, only as good as a file of moderate size allows."""
     image = Image.open(source).convert("RGB")
     for quality in (92, 88, 84, 80, 75, 70, 65, 60):
-        image.save(target, quality=quality, subsampling=0, optimize=True)
+        image.save(target, quality=quality, subsampling=0)
         if target.stat().st_size <= MOST_BYTES:
             return
     target.unlink()
