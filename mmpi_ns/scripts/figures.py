@@ -46,7 +46,7 @@ class Figures:
         if not (self.demo / SHEET).is_file():
             raise ValueError(f"{self.demo} lacks {SHEET}: run make demo first (the other figures are written).")
         _shrink(self.demo / SHEET, self.output / README_PICTURE)
-        print(f"Wrote {', '.join(sorted(p.name for p in self.output.iterdir()))} in {self.output}.")
+        print(f"Wrote merging.png, reliability.png, errors.png and {README_PICTURE} in {self.output}.")
 
 
 def draw_merging(path: Path) -> None:
