@@ -31,7 +31,7 @@ def read_curve(run: Path, tag: str) -> NDArray[np.float64]:
 
 
 def psnr_of_squared_error(error: NDArray[np.float64]) -> NDArray[np.float64]:
-    return -10 * np.log10(np.maximum(error, 1e-12))
+    return np.asarray(-10 * np.log10(np.maximum(error, 1e-12)), np.float64)
 
 
 def draw_curve(run: Path, target: Path, started: float, title: str) -> float:

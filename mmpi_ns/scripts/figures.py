@@ -63,7 +63,8 @@ def draw_merging(path: Path) -> None:
         _draw_frustum(axes, mpi, color)
         hits = origin[:2] + t[np.isfinite(t), None] * direction[:2]
         axes.plot(*hits.T, "o", color=color, markersize=6, markeredgecolor="white", markeredgewidth=0.6, zorder=5)
-    axes.annotate("", origin[:2] + 62 * direction[:2], origin[:2], arrowprops={"arrowstyle": "->", "lw": 1.4})
+    start, end = ((float(x), float(y)) for x, y in (origin[:2], origin[:2] + 62 * direction[:2]))
+    axes.annotate("", end, start, arrowprops={"arrowstyle": "->", "lw": 1.4})
     axes.text(float(origin[0]) - 0.5, -2.6, "camera", ha="center")
     axes.set_xlim(-3, 66)
     axes.set_ylim(-13, 19)
@@ -146,9 +147,9 @@ def draw_errors(path: Path) -> None:
 def _distances(mpis: list[MPIPlan], origin: np.ndarray, direction: np.ndarray) -> list[np.ndarray]:
     """Distances at which a ray crosses the live planes of each MPI; inf for the plane at infinity."""
     frames = Frames.pack(mpis, dtype=torch.float64)
-    rays = [torch.from_numpy(x)[None] for x in (origin, direction)]
+    origins, directions = torch.from_numpy(origin)[None], torch.from_numpy(direction)[None]
     near, far = torch.tensor([[0.5]], dtype=torch.float64), torch.tensor([[torch.inf]], dtype=torch.float64)
-    hits = plane_hits(*rays, near, far, frames)
+    hits = plane_hits(origins, directions, near, far, frames)
     found = []
     for k in range(len(mpis)):
         m = hits.m_first[0, k] - torch.arange(int(hits.count[0, k]))
