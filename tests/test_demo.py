@@ -238,6 +238,7 @@ def test_a_command_that_fails_or_is_missing_is_named(tmp_path, monkeypatch):
 
 def test_a_full_disk_is_one_sentence_and_status_1(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(demo_script.shutil, "disk_usage", lambda _: SimpleNamespace(free=1 << 20))
+    monkeypatch.setattr(Demo, "_make_street", lambda _: pytest.fail("it went on"))
     monkeypatch.setattr(sys, "argv", ["demo", "--folder", str(tmp_path)])
     assert demo_script.main() == 1
     said = capsys.readouterr().err
