@@ -18,7 +18,7 @@ from training_runs import ready, trainer_config
 from mmpi_ns.demo import film, painting
 from mmpi_ns.demo.curve import TEST as TEST_PSNR
 from mmpi_ns.demo.curve import draw_curve, read_curve
-from mmpi_ns.demo.maps import Map, plane_depths
+from mmpi_ns.demo.maps import FINER, Map, plane_depths
 from mmpi_ns.demo.sheet import GAP, LABELS, VIEW, contact_sheet, overview, show_views, spread
 from mmpi_ns.demo.views import load_run, render_alone, render_view, truth_of
 from mmpi_ns.metrics import ImageMetrics
@@ -117,8 +117,13 @@ def test_checks_show_where_an_mpi_holds_nothing():
 
 def test_the_map_has_cameras_where_they_are_and_the_mpi_between_its_borders(run):
     drawn = Map.of(run.observations, 400, 100)
-    cameras = np.array(drawn.pixels(drawn.flat(run.observations.centers)))
-    for x, y in cameras:
+    centers = run.observations.centers
+    cameras = np.array(drawn.pixels(drawn.flat(centers))) / FINER
+    assert ((cameras > 0) & (cameras < [400, 100])).all()
+    step, down = centers[-1] - centers[0], run.observations.mean_axes[1]
+    level = step - (step @ down) * down
+    assert np.linalg.norm(cameras[-1] - cameras[0]) == pytest.approx(np.linalg.norm(level) * drawn.scale)
+    for x, y in cameras * FINER:
         assert drawn.backdrop.getpixel((round(x), round(y))) == (20, 20, 20)
     mpi, color = run.plan.mpis[0], (1.0, 0.0, 0.0)
     picture = np.asarray(drawn.draw([(mpi, color)]), np.float64)
