@@ -62,5 +62,5 @@ SUITES: dict[str, list[Variant]] = {
         Variant("automatic placement, joint", JOINT, steps=500),
     ],
     "fern": [Variant("automatic placement", (), steps=2000)],
-    "fox": [Variant("automatic placement", (), steps=1500)],
+    "fox": [Variant("automatic placement", (), steps=750)],
 }
