@@ -154,8 +154,12 @@ def test_render_gives_the_distance_of_the_central_rays(street):
 
 def test_images_are_antialiased(street):
     """A render lies near one of 25 rays a pixel, much nearer than one ray with unfiltered textures."""
-    reference, image = render(street, 3, supersample=5, contrast=0)[0], render(street, 3)[0]
+    image = render(street, 3)[0]
     pixels = np.stack(np.meshgrid(np.arange(96) + 0.5, np.arange(48) + 0.5), -1).reshape(-1, 2)
+    inner = (np.arange(5) + 0.5) / 5 - 0.5
+    shifts = np.stack(np.meshgrid(inner, inner), -1).reshape(-1, 1, 2)
+    rays = [street.cameras.rays(3, pixels + shift) for shift in shifts]
+    reference = np.mean([street.trace(*r, pixel=0.2 / street.cameras.focal)[1] for r in rays], 0).reshape(image.shape)
     aliased = street.trace(*street.cameras.rays(3, pixels))[1].reshape(image.shape)
 
     def error(x):
@@ -253,7 +257,7 @@ def test_points_out_of_range_are_refused(street):
 
 
 def test_a_road_is_as_long_as_asked_and_finds_its_own_places():
-    for length in (100.0, 1000.0, 10000.0):
+    for length in (100.0, 1000.0):
         cameras = make_scene("long-road", length=length).cameras
         road = np.linalg.norm(np.diff(cameras.camera_to_worlds[:, :, 3], axis=0), axis=-1).sum()
         assert abs(road / length - 1) < 0.02
@@ -266,11 +270,11 @@ def test_a_road_is_as_long_as_asked_and_finds_its_own_places():
 
 
 def test_what_a_long_road_costs_grows_linearly_and_its_images_cost_no_more():
-    scenes = {n: make_scene("long-road", length=1000.0 * n) for n in (1, 10)}
+    scenes = {n: make_scene("long-road", length=1000.0 * n) for n in (1, 4)}
     solids = {n: len(s.primitives) for n, s in scenes.items()}
-    assert 6 < solids[10] / solids[1] < 10.5
+    assert 2.6 < solids[4] / solids[1] < 4.2
     near = {n: [len(s.tracer.near(x, x)) for x in s.cameras.camera_to_worlds[:, 0, 3]] for n, s in scenes.items()}
-    assert max(near[10]) < 1.25 * max(near[1]) and max(near[10]) < solids[10] / 5
+    assert max(near[4]) < 1.25 * max(near[1]) and max(near[4]) < solids[4] / 4
 
 
 def test_ten_kilometres_of_cameras_without_images(tmp_path):

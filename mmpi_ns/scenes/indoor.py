@@ -27,7 +27,7 @@ class Room(Kit):
     def shell(self) -> None:
         (w, d, h), t = ROOM, 0.16
         paper = (self.pick(WALLS), self.pick(WALLS), self.varied(WHITE))
-        self.box((0, 0, h + t / 2), (w, d, t), "plaster", WHITE, (0.86, 0.85, 0.82))
+        self.box((0, 0, h + t / 2), (w, d, t), "wood", WHITE, (0.8, 0.77, 0.68))
         self.box(
             (w / 2 + t / 2, 0, h / 2), (t, d, h), "bricks", paper[0], self.varied(paper[0], 0.2), (0.8, 0.78, 0.72)
         )
@@ -74,8 +74,7 @@ class Room(Kit):
         )
         self.standing((0.52, -0.17, 0.83), (0.24, 0.18, 0.05), "checker", self.pick(PAINTS), WHITE, yaw=0.7)
         self.cylinder((-0.55, -0.25, 0.77), 0.05, 0.11, "stripes", WHITE, (0.8, 0.25, 0.2))
-        self.cylinder((0, 0, 2.5), 0.012, 0.2, "plaster", GRAY)
-        self.sphere((0, 0, 2.52), 0.09, "plaster", WHITE, (1.0, 0.95, 0.8))
+        self.cylinder((0, 0, ROOM[2] - 0.07), 0.22, 0.07, "plaster", WHITE, (1.0, 0.95, 0.8))
 
     def chair(self, x: float, y: float, yaw: float) -> None:
         c, s = np.cos(yaw), np.sin(yaw)

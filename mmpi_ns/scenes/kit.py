@@ -75,7 +75,8 @@ def look(places: Array, yaw: Array, pitch: Array) -> Array:
     cy, sy, cp, sp = np.cos(yaw), np.sin(yaw), np.cos(pitch), np.sin(pitch)
     right = np.stack([sy, -cy, np.zeros_like(yaw)], -1)
     back = np.stack([-cp * cy, -cp * sy, -sp], -1)
-    return np.stack([right, np.cross(back, right), back, places], -1)
+    up = np.cross(back, right)
+    return np.asarray(np.stack([right, up, back, places], -1), dtype=np.float64)
 
 
 def look_at(places: Array, target: Array) -> Array:
