@@ -46,7 +46,7 @@ class Regions:
             camera = manager.eval_dataset.cameras[i : i + 1].to(model.device)
             with torch.no_grad():
                 rgb = model.get_outputs_for_camera(camera)["rgb"].cpu()
-            truth = manager.eval_dataset.get_float32_image(i)[..., :3]
+            truth = manager.eval_dataset.get_image_float32(i)[..., :3]
             squared = ((rgb - truth) ** 2).mean(-1).numpy()
             a, b = self._regions(_as_observations(camera), points, model.field.plan, squared)
             expected += a

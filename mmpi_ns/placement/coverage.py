@@ -60,7 +60,9 @@ def border_points(observations: Observations, content: Content) -> Array:
 
 def _in_frames(mpis: list[MPIPlan], points: Array) -> tuple[Array, Array]:
     """Tangents [K, P, 2] and depths [K, P] of points in every MPI."""
-    local = np.stack([(points - np.asarray(m.origin)) @ np.asarray(m.axes).T for m in mpis])
+    origins = np.array([m.origin for m in mpis], dtype=np.float64)
+    axes = np.array([m.axes for m in mpis], dtype=np.float64)
+    local = np.einsum("kij,kpj->kpi", axes, points - origins[:, None])
     depth = local[..., 2]
     return local[..., :2] / np.where(depth > 0, depth, np.nan)[..., None], depth
 
