@@ -31,7 +31,7 @@ def check_transforms(data: Path, *, auto_scale: bool, opens_first_image: bool) -
     path = data if data.suffix == ".json" else data / "transforms.json"
     frames = _frames(path)
     centers = np.stack([_pose(frame, i, path)[:3, 3] for i, frame in enumerate(frames)])
-    if opens_first_image and "file_path" in frames[0]:
+    if opens_first_image:
         _check_image(path.parent / frames[0]["file_path"])
     if auto_scale and in_one_place(centers):
         raise ValueError(
@@ -53,7 +53,7 @@ def brief(error: BaseException) -> str:
 def _frames(path: Path) -> list[dict[str, Any]]:
     if not path.is_file():
         raise ValueError(
-            f"There is no {path}: check --data, make one with ns-process-data, or name the data parser of another "
+            f"There is no {path}: check --data, make one with mmpi-prepare, or name the data parser of another "
             "format after the options (for example: ns-train mmpi-small --data FOLDER colmap)."
         )
     try:

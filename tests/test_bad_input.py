@@ -68,7 +68,7 @@ def set_pose(value):
 
 
 def test_a_folder_without_transforms_is_named_with_what_to_do(tmp_path):
-    refusal(lambda: datamanager(tmp_path), tmp_path / "transforms.json", "--data", "ns-process-data", "colmap")
+    refusal(lambda: datamanager(tmp_path), tmp_path / "transforms.json", "--data", "mmpi-prepare", "colmap")
 
 
 @pytest.mark.parametrize("text", ["", "{ frames: ", "[1, 2]", "{}", '{"frames": []}', '{"frames": [3]}'])

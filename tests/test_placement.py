@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from reprojection import median_reprojection_error
 
 from mmpi_ns.placement.errors import mpi_errors, pixel_errors
 from mmpi_ns.placement.observations import Observations
@@ -154,11 +155,15 @@ def test_without_points_the_cameras_frusta_stand_in():
     assert plan.mpis and plan.content_near > 0
 
 
-def test_a_model_in_another_frame_is_told_from_a_good_one():
+def test_points_project_to_where_they_were_seen_and_behind_the_camera_to_nowhere():
     observations = street()
-    assert observations.median_reprojection_error() < 1e-9
-    swapped = replace(observations, points=observations.points[:, [1, 0, 2]] * [1, 1, -1])
-    assert swapped.median_reprojection_error() > 0.02
+    seen, points = observations.seen_by, observations.points[observations.seen_point]
+    pixels, ahead = observations.project(seen, points)
+    assert ahead.all()
+    np.testing.assert_allclose(pixels, observations.seen_at, atol=1e-6)
+    assert median_reprojection_error(observations) < 1e-9
+    behind = 2 * observations.centers[seen] - points
+    assert not observations.project(seen, behind)[1].any()
 
 
 def test_the_plane_sweep_finds_the_depth_of_a_textured_wall():

@@ -11,10 +11,10 @@ from procedural import observations_of
 
 from mmpi_ns.placement.candidates import find_candidates
 from mmpi_ns.placement.content import find_content
-from mmpi_ns.placement.errors import cube_errors, mpi_errors
+from mmpi_ns.placement.errors import WORST, cube_errors, mpi_errors
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.placement.plan import CubePlan, ScenePlan
-from mmpi_ns.placement.rule import MAX_ERROR, PlacementConfig, place
+from mmpi_ns.placement.rule import PlacementConfig, place
 from mmpi_ns.scenes.catalogue import make_scene
 
 CONFIG = PlacementConfig(max_texels=0)
@@ -42,7 +42,7 @@ def bits(plan: ScenePlan, observations: Observations, config: PlacementConfig = 
         errors.append((np.zeros(1), cube_errors(plan.cube, observations, content.cameras, content.points)))
     least = np.min([np.hypot(plane, 0.5 * texel) for plane, texel in errors], axis=0)
     enough = config.enough * config.texel_pixels
-    return float(np.log2(np.clip(least, enough, MAX_ERROR) / enough) @ content.weights)
+    return float(np.log2(np.clip(least, enough, WORST) / enough) @ content.weights)
 
 
 def test_a_forward_facing_grid_gets_one_mpi_and_no_cube():

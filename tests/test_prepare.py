@@ -11,6 +11,7 @@ import pycolmap
 import pytest
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from PIL import Image
+from reprojection import median_reprojection_error
 
 from mmpi_ns.mmpi_observations import read_observations
 from mmpi_ns.prepare import features, mapping
@@ -77,7 +78,7 @@ def test_nerfstudio_reads_the_scene_and_its_tracks_in_one_frame(scene):
     outputs = parser.get_dataparser_outputs("train")
     observations = read_observations(outputs, outputs.cameras, find_sfm_model(scene / "colmap/sparse/0"))
     assert len(observations.seen_at) > 100 * len(outputs.image_filenames)
-    error = observations.median_reprojection_error() * corridor.WIDTH
+    error = median_reprojection_error(observations) * corridor.WIDTH
     assert error < 0.3
 
 

@@ -12,11 +12,10 @@ from nerfstudio.utils.eval_utils import eval_setup
 
 from mmpi_ns.mmpi_datamanager import MMPIDataManager
 from mmpi_ns.mmpi_model import MMPIModel
-from mmpi_ns.placement.errors import pixel_errors
+from mmpi_ns.placement.errors import WORST, pixel_errors
 from mmpi_ns.placement.observations import Array, Observations
 from mmpi_ns.placement.plan import ScenePlan
 
-WORST = 64.0
 MIN_POINTS = 5
 """SfM points that a region must hold for its expected error to count."""
 
@@ -61,11 +60,12 @@ class Regions:
         self, camera: Observations, points: Array, plan: ScenePlan, squared: Array
     ) -> tuple[list[float], list[float]]:
         """Median expected error and root mean square colour error of every region with enough points."""
-        pixels, ahead = _project(camera, points)
+        only = np.zeros(len(points), np.int64)
+        pixels, ahead = camera.project(only, points)
         height, width = squared.shape
         row = np.floor(pixels[:, 1] / height * self.rows).astype(int)
         column = np.floor(pixels[:, 0] / width * self.columns).astype(int)
-        errors = pixel_errors(plan, camera, np.zeros(len(points), np.int64), points).combined.min(-1)
+        errors = pixel_errors(plan, camera, only, points).combined.min(-1)
         expected, measured = [], []
         for r in range(self.rows):
             for c in range(self.columns):
@@ -105,12 +105,3 @@ def _as_observations(camera) -> Observations:
         seen_point=empty,
         seen_at=np.zeros((0, 2)),
     )
-
-
-def _project(camera: Observations, points: Array) -> tuple[Array, Array]:
-    """Pixels [P, 2] of points, and whether each lies ahead."""
-    pose, (fx, fy, cx, cy) = camera.camera_to_worlds[0], camera.intrinsics[0]
-    local = (points - pose[:, 3]) @ pose[:, :3]
-    ahead = local[:, 2] < 0
-    depth = np.where(ahead, -local[:, 2], 1.0)
-    return np.stack([fx * local[:, 0] / depth + cx, -fy * local[:, 1] / depth + cy], -1), ahead

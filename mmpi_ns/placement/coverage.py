@@ -31,7 +31,7 @@ def widened(mpis: list[MPIPlan], observations: Observations, content: Content) -
     points = border_points(observations, content)
     tangents, depths = _in_frames(mpis, points)
     extents = np.array([m.extent for m in mpis])
-    ahead = depths >= np.array([[m.near] for m in mpis])
+    ahead = (depths >= np.array([[m.near] for m in mpis])) & (depths <= np.array([[m.far] for m in mpis]))
     held = ahead & (_outside(tangents, extents).max(-1) <= 0)
     able = ahead & (np.abs(tangents).max(-1) <= WIDEST) & (_outside(tangents, extents).max(-1) <= FARTHEST)
     for p in np.nonzero(~held.any(0) & able.any(0))[0]:

@@ -16,6 +16,9 @@ from numpy.typing import NDArray
 from mmpi_ns.placement.observations import Array, Observations
 from mmpi_ns.placement.plan import CubePlan, MPIPlan, ScenePlan
 
+WORST = 64.0
+"""Pixels: what an observation costs that nothing holds; worse errors count no more than this."""
+
 
 @dataclass(frozen=True)
 class PixelErrors:
@@ -71,7 +74,7 @@ def mpi_errors(
     plane, across, down = pixel_slopes(mpi, observations, cameras, points)
     u0, u1, v0, v1 = mpi.extent
     texel = np.maximum(across * (u1 - u0) / (mpi.width - 1), down * (v1 - v0) / (mpi.height - 1))
-    return 0.5 * plane / (mpi.near * (mpi.planes - 1)), texel
+    return 0.5 * plane * mpi.depth_share / (mpi.near * (mpi.planes - 1)), texel
 
 
 def pixel_slopes(
@@ -86,7 +89,7 @@ def pixel_slopes(
     """
     axes, origin = np.asarray(mpi.axes), np.asarray(mpi.origin)
     local = (points - origin) @ axes.T
-    ahead = local[:, 2] >= mpi.near
+    ahead = (local[:, 2] >= mpi.near) & (local[:, 2] <= mpi.far)
     z = np.where(ahead, local[:, 2], 1.0)
     u, v, w = local[:, 0] / z, local[:, 1] / z, 1 / z
     u0, u1, v0, v1 = mpi.extent

@@ -7,12 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from mmpi_ns.placement.content import Content
-from mmpi_ns.placement.errors import PixelErrors, pixel_errors
+from mmpi_ns.placement.errors import WORST, PixelErrors, pixel_errors
 from mmpi_ns.placement.observations import Array, Observations
 from mmpi_ns.placement.plan import CubePlan, MPIPlan, ScenePlan
-
-WORST = 64.0
-"""Pixels: stands for the error of what nothing holds."""
 
 
 @dataclass(frozen=True)

@@ -49,22 +49,14 @@ class Observations:
         right = _unit(right - right.dot(up) * up)
         return np.stack([right, -up, np.cross(right, -up)])
 
-    def median_reprojection_error(self) -> float:
-        """Median distance between keypoints and their projected points, as a share of the image width.
-
-        Lens distortion is left out: this tells a model in another frame (errors of the image's size) from a good one.
-        """
-        seen_by, seen_point = self.seen_by[: len(self.seen_at)], self.seen_point[: len(self.seen_at)]
-        poses = self.camera_to_worlds[seen_by]
-        offset = self.points[seen_point] - poses[:, :, 3]
-        local = np.einsum("qji,qj->qi", poses[:, :, :3], offset)
-        depth = -local[:, 2]
-        ahead = depth > 0
-        safe = np.where(ahead, depth, 1.0)
-        fx, fy, cx, cy = self.intrinsics[seen_by].T
-        x, y = fx * local[:, 0] / safe + cx, -fy * local[:, 1] / safe + cy
-        error = np.hypot(x - self.seen_at[:, 0], y - self.seen_at[:, 1]) / self.sizes[seen_by, 0]
-        return float(np.median(np.where(ahead, error, np.inf)))
+    def project(self, cameras: NDArray[np.int64], points: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Pixels [Q, 2] at which cameras [Q] would see points [Q, 3], lens distortion left out, and which lie ahead."""
+        poses = self.camera_to_worlds[cameras]
+        local = np.einsum("qji,qj->qi", poses[:, :, :3], points - poses[:, :, 3])
+        ahead = local[:, 2] < 0
+        depth = np.where(ahead, -local[:, 2], 1.0)
+        fx, fy, cx, cy = self.intrinsics[cameras].T
+        return np.stack([fx * local[:, 0] / depth + cx, cy - fy * local[:, 1] / depth], -1), ahead
 
 
 def frustum_points(observations: Observations, near: Array, per_camera: int = 24) -> Array:

@@ -12,7 +12,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from mmpi_ns.placement.content import Content
-from mmpi_ns.placement.explain import WORST, PlanReport
+from mmpi_ns.placement.errors import WORST
+from mmpi_ns.placement.explain import PlanReport
 from mmpi_ns.placement.observations import Array, Observations
 from mmpi_ns.placement.plan import MPIPlan, ScenePlan
 

@@ -8,11 +8,14 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import MISSING, asdict, dataclass, fields, replace
 from numbers import Real
 from pathlib import Path
 
 Vector = tuple[float, float, float]
+
+SHALLOWEST = 1.001
+"""An MPI's last plane lies at least so many times as deep as its first: closer, float32 could not tell them apart."""
 
 
 @dataclass(frozen=True)
@@ -26,15 +29,37 @@ class MPIPlan:
     axes: tuple[Vector, Vector, Vector]
     """Rows are the frame's x, y and z (facing) axes in world coordinates; orthonormal, right-handed."""
     near: float
-    """Depth of the nearest plane; the planes are evenly spaced in disparity from there to infinity."""
+    """Depth of the nearest plane; the planes are evenly spaced in disparity from there to ``far``."""
     extent: tuple[float, float, float, float]
     """Frustum as tangents (u0, u1, v0, v1); asymmetric is fine."""
     planes: int
-    """Number of planes, the last one at infinity."""
+    """Number of planes, the last one at ``far``."""
     height: int
     """Texel rows of a plane."""
     width: int
     """Texel columns of a plane."""
+    far: float = math.inf
+    """Depth of the last plane; inf (in JSON: null) for an MPI that reaches to infinity."""
+
+    @property
+    def last_disparity(self) -> float:
+        """1 / far: disparity of the last plane, 0 at infinity."""
+        return 1.0 / self.far
+
+    @property
+    def depth_share(self) -> float:
+        """1 - near / far: the share of all disparities beyond the near plane that the planes span; 1 to infinity."""
+        return 1.0 - self.near * self.last_disparity
+
+    @property
+    def disparity_step(self) -> float:
+        """Disparity between neighbouring planes, 1 / scene units."""
+        return self.depth_share / (self.near * (self.planes - 1))
+
+    @property
+    def farthest(self) -> float:
+        """Depth of the last plane that is not at infinity."""
+        return self.near * (self.planes - 1) if self.far == math.inf else self.far
 
     @property
     def texels(self) -> int:
@@ -114,7 +139,11 @@ class ScenePlan:
             raise ValueError("The plan's ray_near and content_near must be finite and not negative.")
 
     def to_json(self) -> str:
-        return json.dumps(asdict(self), indent=1)
+        """Standard JSON: a ``far`` at infinity is written as null."""
+        data = asdict(self)
+        for mpi in data["mpis"]:
+            mpi["far"] = None if mpi["far"] == math.inf else mpi["far"]
+        return json.dumps(data, indent=1, allow_nan=False)
 
     @staticmethod
     def from_json(text: str) -> ScenePlan:
@@ -127,7 +156,7 @@ class ScenePlan:
             raise ValueError(
                 "The scene plan is not a JSON object with a list 'mpis': compare it with docs/how_it_works.md."
             )
-        mpis = tuple(_build(MPIPlan, m) for m in data.get("mpis", []))
+        mpis = tuple(_build(MPIPlan, _with_far(m)) for m in data.get("mpis", []))
         cube = _build(CubePlan, data["cube"]) if data.get("cube") else None
         return _build(ScenePlan, {**data, "mpis": mpis, "cube": cube})
 
@@ -139,7 +168,7 @@ class ScenePlan:
 
 
 def _validate_mpi(mpi: MPIPlan) -> None:
-    rows = {"origin": (mpi.origin, 3), "extent": (mpi.extent, 4), "near": ((mpi.near,), 1)}
+    rows = {"origin": (mpi.origin, 3), "extent": (mpi.extent, 4), "near": ((mpi.near,), 1), "far": ((mpi.far,), 1)}
     rows |= {f"axes row {i}": (row, 3) for i, row in enumerate(mpi.axes)} if len(mpi.axes) == 3 else {"axes": ((), 3)}
     for field, (row, length) in rows.items():
         if len(row) != length or not all(isinstance(x, Real) for x in row):
@@ -157,6 +186,8 @@ def _validate_mpi(mpi: MPIPlan) -> None:
         )
     if mpi.near <= 0 or mpi.extent[0] >= mpi.extent[1] or mpi.extent[2] >= mpi.extent[3]:
         raise ValueError(f"MPI '{mpi.name}' needs near > 0 and an extent (u0, u1, v0, v1) with u0 < u1 and v0 < v1.")
+    if not mpi.far >= SHALLOWEST * mpi.near:
+        raise ValueError(f"MPI '{mpi.name}' needs a far end beyond its near plane, or null in 'far' for infinity.")
     if mpi.planes < 2 or mpi.height < 2 or mpi.width < 2:
         raise ValueError(f"MPI '{mpi.name}' needs at least 2 planes and 2 x 2 texels.")
 
@@ -167,11 +198,17 @@ def _build(cls, data: dict):
             f"A {cls.__name__} in the scene plan is not a JSON object: compare it with docs/how_it_works.md."
         )
     names = {f.name for f in fields(cls)}
-    unknown, missing = set(data) - names, names - set(data) - {"origin_of_plan"}
+    optional = {f.name for f in fields(cls) if f.default is not MISSING}
+    unknown, missing = set(data) - names, names - set(data) - optional
     if unknown or missing:
         wrong = f"lacks {sorted(missing)}" if missing else f"has unknown fields {sorted(unknown)}"
         raise ValueError(f"A {cls.__name__} in the scene plan {wrong}: compare it with docs/how_it_works.md.")
     return cls(**{k: _tuples(v) for k, v in data.items()})
+
+
+def _with_far(mpi):
+    """Null, or nothing as in plans of before MPIs could end, stands for infinity."""
+    return {**mpi, "far": math.inf if mpi.get("far") is None else mpi["far"]} if isinstance(mpi, dict) else mpi
 
 
 def _tuples(value):

@@ -17,12 +17,11 @@ from numpy.typing import NDArray
 from mmpi_ns.placement.candidates import Candidate, find_candidates
 from mmpi_ns.placement.content import Content, find_content
 from mmpi_ns.placement.coverage import widened
+from mmpi_ns.placement.errors import WORST
 from mmpi_ns.placement.hand_made import drive_plan, room_plan
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.placement.plan import CubePlan, MPIPlan, ScenePlan
 
-MAX_ERROR = 64.0
-"""Pixels: what an observation costs that nothing holds; worse errors count no more than this."""
 MIN_PLANES = 16
 BUDGET_ROUNDS = 8
 """Attempts at keeping to the budget of texels; each starts with coarser ones."""
@@ -198,7 +197,7 @@ class _Choice:
         enough = self.config.enough * self.texel_pixels
         size = max(self.texel_pixels, candidate.coarsest(self.config.max_voxels))
         plane, texel = candidate.plane / (self.config.max_planes - 1), 0.5 * size * candidate.texel
-        worst = max(MAX_ERROR, 2 * enough)
+        worst = max(WORST, 2 * enough)
         return np.log2(np.clip(np.hypot(plane, texel), enough, worst) / enough).astype(np.float32)
 
 
