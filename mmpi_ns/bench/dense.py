@@ -130,12 +130,12 @@ def _dense(field: MMPIField, bundle: RayBundle) -> tuple[Tensor, float]:
     count = len(bundle)
     for k, mpi in enumerate(field.plan.mpis):
         m = torch.arange(mpi.planes - 1, -1, -1).expand(count, -1)
-        w = sample_disparity(m, field.frames.disparity_steps[k])
+        w = sample_disparity(m, field.frames.disparity_steps[k], field.frames.last_disparities[k])
         live = (m <= hits.m_first[:, k : k + 1]) & (m > (hits.m_first - hits.count)[:, k : k + 1])
         u0, u1, v0, v1 = mpi.extent
         u = (hits.u[:, k, :1] + w * hits.u[:, k, 1:] - u0) * (2 / (u1 - u0)) - 1
         v = (hits.v[:, k, :1] + w * hits.v[:, k, 1:] - v0) * (2 / (v1 - v0)) - 1
-        ndc = torch.stack([u, v, 1 - 2 * mpi.near * w], -1).reshape(-1, 3)
+        ndc = torch.stack([u, v, 1 - 2 * mpi.near / mpi.depth_share * (w - mpi.last_disparity)], -1).reshape(-1, 3)
         planes = (mpi.planes - 1 - m).reshape(-1)
         rows, weights = field.grids[k].bilinear(planes, ndc)
         raw = interpolate_reference(field.density, rows, weights)[:, 0]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import json
 import os
-import platform
 import re
 import subprocess
 import sys
@@ -16,6 +15,7 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
+from mmpi_ns.bench.provenance import commit, processor
 from mmpi_ns.bench.suites import SUITES, Variant
 from mmpi_ns.mmpi_scene import load_observations
 from mmpi_ns.placement.content import find_content
@@ -84,8 +84,8 @@ class Results:
         row["train_seconds"] = seconds
         row["steps"] = _steps(run)
         row["threads"] = threads
-        row["processor"] = _processor()
-        row["commit"] = _output(["git", "rev-parse", "--short", "HEAD"])
+        row["processor"] = processor()
+        row["commit"] = commit()
         row["date"] = date.today().isoformat()
         row["command"] = " ".join(["ns-train", variant.method, *steps, *variant.options])
         return row
@@ -165,14 +165,3 @@ def _command(words: list[str], folder: Path, environment: dict[str, str]) -> Non
         ).returncode
     if code:
         raise RuntimeError(f"{words[0]} failed with status {code}: see {log}.")
-
-
-def _output(words: list[str]) -> str:
-    return subprocess.run(words, capture_output=True, text=True, check=False).stdout.strip() or "unknown"
-
-
-def _processor() -> str:
-    info = Path("/proc/cpuinfo")
-    text = info.read_text(encoding="utf-8") if info.is_file() else ""
-    names = re.findall(r"model name\s*: (.*)", text)
-    return f"{os.cpu_count()} cores of {names[0] if names else platform.processor()}"

@@ -1,0 +1,318 @@
+"""A whole ray through a field, exactly: every sample by loops in float64, with the gradient of every table.
+
+The field comes in as its plan and plain arrays (``ExactField.of`` slices the pooled tables by the layout that
+``texels.py`` documents); lookups, networks and their derivatives are written out here a second time.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mmpi_ns.bench import exact
+from mmpi_ns.bench.exact import STILL, Array, Jitter
+from mmpi_ns.placement.plan import ScenePlan
+
+TABLES = ("density", "features", "reliability", "networks")
+
+
+@dataclass(frozen=True)
+class ExactField:
+    """A field as arrays; per-head tables are [planes, height, width, channels]."""
+
+    plan: ScenePlan
+    density: list[Array]
+    features: list[Array]
+    reliability: list[Array]
+    touched: list[Array]
+    networks: Array
+    """[N, weights], one row per head or one for all."""
+    layers: list[tuple[int, ...]]
+    """Shapes of weights and biases in such a row."""
+    frequencies: tuple[int, int]
+    depth_scale: float
+    samples_per_voxel: float
+    cube_alpha: float
+
+    @staticmethod
+    def of(source) -> ExactField:
+        """The state of an ``MMPIField``, in float64."""
+        shapes = [(m.planes, m.height, m.width) for m in source.plan.mpis]
+        shapes += [source.plan.cube.shape] if source.plan.cube is not None else []
+        ends = np.cumsum([math.prod(s) for s in shapes])
+
+        def split(table) -> list[Array]:
+            flat = table.detach().double().cpu().numpy().reshape(int(ends[-1]), -1)
+            return [part.reshape(*s, -1) for part, s in zip(np.split(flat, ends[:-1]), shapes, strict=True)]
+
+        networks = source.networks
+        return ExactField(
+            source.plan,
+            split(source.density),
+            split(source.features),
+            split(source.reliability),
+            split(source.touched),
+            networks.weights.detach().double().cpu().numpy(),
+            list(networks.shapes),
+            (networks.position_frequencies, networks.direction_frequencies),
+            source.depth_scale,
+            source.samples_per_voxel,
+            source.cube_alpha,
+        )
+
+    def zeros(self) -> Gradients:
+        tables = [[np.zeros_like(t) for t in table] for table in (self.density, self.features, self.reliability)]
+        return Gradients(*tables, np.zeros_like(self.networks))
+
+
+@dataclass
+class Gradients:
+    """Derivatives by every table, in the tables' shapes."""
+
+    density: list[Array]
+    features: list[Array]
+    reliability: list[Array]
+    networks: Array
+
+    def flat(self, name: str) -> Array:
+        """One table's derivatives, [rows, channels] as the pooled parameter holds them."""
+        value = getattr(self, name)
+        return value if name == "networks" else np.concatenate([t.reshape(-1, t.shape[-1]) for t in value])
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One head's sample on a ray, before blending, and where it was looked up."""
+
+    head: int
+    plane: int
+    inverse_t: float
+    raw: float
+    """Interpolated density plus bias."""
+    scale: float
+    """Factor on softplus."""
+    tau: float
+    votes: Array
+    cover: NDArray[np.bool_]
+    inputs: Array
+    """Of the colour network."""
+    color: Array
+    corners: list[tuple[tuple[int, ...], float]]
+    vote_corners: list[list[tuple[tuple[int, ...], float]]]
+
+
+@dataclass
+class ExactRay:
+    """All samples of one ray, nearest first, and how close any decision about them was."""
+
+    field: ExactField
+    origin: Array
+    direction: Array
+    near: float = 0.05
+    far: float = math.inf
+    jitter: Jitter = field(default_factory=lambda: STILL)
+    margin: float = math.inf
+    samples: list[Sample] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        plan = self.field.plan
+        for k, mpi in enumerate(plan.mpis):
+            met = exact.cross(mpi, self.origin, self.direction, self.near, self.far, self.jitter)
+            self.margin = min(self.margin, float(met.margin.min()))
+            for plane in np.nonzero(met.live)[0]:
+                w = (mpi.planes - 1 - plane) / (mpi.planes - 1) / mpi.near
+                ndc = exact.to_ndc(mpi, met.u[plane], met.v[plane], w)
+                self.samples.append(self._sample(k, int(plane), float(met.inverse_t[plane]), ndc))
+        if plan.cube is not None:
+            sides = [
+                (b - a) / (n - 1)
+                for a, b, n in zip(plan.cube.lower, plan.cube.upper, plan.cube.shape[::-1], strict=True)
+            ]
+            step = min(sides) / self.field.samples_per_voxel
+            found, margin = exact.cube_steps(plan.cube, step, self.origin, self.direction, self.near, self.far)
+            self.margin = min(self.margin, margin)
+            for i in found:
+                t = (i + 0.5) * step
+                self.samples.append(self._sample(len(plan.mpis), i, 1 / t, self._in_cube(1 / t)))
+        self.samples.sort(key=lambda s: (-s.inverse_t, s.head, s.plane))
+        for a, b in itertools.pairwise(self.samples):
+            if a.head != b.head and a.inverse_t != b.inverse_t:
+                self.margin = min(self.margin, (a.inverse_t - b.inverse_t) / (1 + a.inverse_t))
+
+    def _in_cube(self, inverse_t: float) -> Array:
+        assert self.field.plan.cube is not None
+        lower, upper = np.array(self.field.plan.cube.lower), np.array(self.field.plan.cube.upper)
+        point = self.origin + self.direction / inverse_t
+        return self.jitter(2 * (point - lower) / (upper - lower) - 1, 1.0 + np.abs(point / (upper - lower)))
+
+    def _sample(self, k: int, plane: int, inverse_t: float, ndc: Array) -> Sample:
+        f, plan = self.field, self.field.plan
+        if k < len(plan.mpis):
+            corners = [((plane, *at), w) for at, w in _corners(ndc[1::-1], f.density[k].shape[1:3])]
+            axes = np.array(plan.mpis[k].axes)
+            biases, interval = exact.plane_bias(plan.mpis[k].planes)
+            bias, scale = biases[plane], interval * f.depth_scale
+        else:
+            corners, axes = _corners(ndc[::-1], f.density[k].shape[:3]), np.eye(3)
+            scale = 1 / f.samples_per_voxel
+            bias = math.log(math.expm1(-math.log1p(-f.cube_alpha) / scale))
+        raw = self.jitter(_look_up(f.density[k], corners), _size(f.density[k], corners) + abs(bias))[0] + bias
+        features = self.jitter(_look_up(f.features[k], corners), _size(f.features[k], corners))
+        votes, cover, vote_corners = self._votes(k, inverse_t, ndc)
+        inputs = self._encode(ndc, axes @ self.direction, features)
+        tau = float(self.jitter(exact.softplus(raw) * scale))
+        color = self._network(k, inputs, features)[0]
+        return Sample(k, plane, inverse_t, raw, scale, tau, votes, cover, inputs, color, corners, vote_corners)
+
+    def _votes(self, own: int, inverse_t: float, own_ndc: Array):
+        """Reliability of every head at a sample, which of them cover it, and the texels that were read."""
+        f, plan = self.field, self.field.plan
+        votes, cover, read = [], [], []
+        for j in range(plan.num_heads):
+            if j == own:
+                ndc, size = own_ndc, 1.0
+            elif j < len(plan.mpis):
+                found = exact.place_in(plan.mpis[j], self.origin, self.direction, inverse_t, self.jitter)
+                ndc, size = found if found is not None else (None, 1.0)
+            else:
+                ndc, size = (self._in_cube(inverse_t) if inverse_t > 0 else None), 4.0
+            covers = j == own
+            if ndc is not None and j != own:
+                gaps = np.abs(np.abs(ndc) - 1)[: 2 if inverse_t == 0 else 3]
+                self.margin = min(self.margin, float(gaps.min()) / size)
+                covers = bool((np.abs(ndc) <= 1 + 1e-12).all())
+            if ndc is None or not covers:
+                votes.append(0.0), cover.append(False), read.append([])
+                continue
+            corners = _corners(np.clip(ndc, -1, 1)[::-1], f.reliability[j].shape[:3])
+            nearest, gap = _nearest(ndc[::-1], f.touched[j].shape[:3])
+            trained = bool(f.touched[j][nearest][0])
+            self.margin = min(self.margin, gap) if not f.touched[j].all() else self.margin
+            votes.append(float(self.jitter(_look_up(f.reliability[j], corners), _size(f.reliability[j], corners))[0]))
+            cover.append(j == own or trained)
+            read.append(corners)
+        return np.array(votes), np.array(cover), read
+
+    # Colour networks -----------------------------------------------------------------------------------------
+
+    def _encode(self, ndc: Array, direction: Array, features: Array) -> Array:
+        parts = [features]
+        for x, count in zip((ndc, self.jitter(direction, 1.0)), self.field.frequencies, strict=True):
+            angles = np.concatenate([x * math.pi * 2**i for i in range(count)]) if count else np.zeros(0)
+            parts += [x, np.sin(angles), np.cos(angles)]
+        return np.concatenate(parts)
+
+    def _weights(self, head: int) -> list[Array]:
+        row = self.field.networks[head if len(self.field.networks) > 1 else 0]
+        ends = np.cumsum([math.prod(s) for s in self.field.layers])
+        return [part.reshape(s) for part, s in zip(np.split(row, ends[:-1]), self.field.layers, strict=True)]
+
+    def _network(self, head: int, inputs: Array, features: Array) -> tuple[Array, Array, Array, Array]:
+        """Colour, hidden layers, and the network's inputs as it may have rounded them."""
+        w1, b1, w2, b2, w3, b3 = self._weights(head)
+        move = self.jitter.network
+        x = move(inputs)
+        h1 = move(np.maximum(move(w1 @ x + b1, np.abs(w1) @ np.abs(x) + np.abs(b1)), 0))
+        h2 = move(np.maximum(move(w2 @ h1 + b2, np.abs(w2) @ np.abs(h1) + np.abs(b2)), 0))
+        logits = move(w3 @ h2 + b3, np.abs(w3) @ np.abs(h2) + np.abs(b3))
+        return exact.sigmoid(features[:3] + logits), h1, h2, x
+
+    # Rendering -----------------------------------------------------------------------------------------------
+
+    def blended(self, form: str | None) -> list[exact.Blended]:
+        return [exact.blend(s.tau, s.votes, s.cover, s.head, form) for s in self.samples]
+
+    def render(self, form: str | None = None) -> tuple[Array, exact.Composited]:
+        """Colour [3] without background, and weights and transmittance."""
+        made = exact.composite(np.array([b.depth for b in self.blended(form)]))
+        color = np.zeros(3)
+        for weight, sample in zip(made.weights, self.samples, strict=True):
+            color = color + weight * sample.color
+        return color, made
+
+    def add_gradient(self, by_color: Array, form: str | None, total: Gradients, size: Gradients) -> None:
+        """Adds the derivatives of ``by_color`` . colour, and to ``size`` the magnitudes of all that is added."""
+        blended = self.blended(form)
+        taus = np.array([b.depth for b in blended])
+        made = exact.composite(taus)
+        by_weight = np.array([float(by_color @ s.color) for s in self.samples])
+        by_depth = exact.composite_gradient(taus, by_weight, 0.0)
+        by_depth_size = exact.composite_gradient(taus, np.abs(by_weight), 0.0)
+        # Both terms of that difference count: the light that a sample stops and what it takes from those behind.
+        by_depth_size = np.abs(by_depth_size) + 2 * float(np.abs(by_weight) @ made.weights)
+        for i, (s, b) in enumerate(zip(self.samples, blended, strict=True)):
+            raw = b.by_tau * s.scale * float(exact.sigmoid(s.raw))
+            _scatter(total.density[s.head], size.density[s.head], s.corners, by_depth[i] * raw, by_depth_size[i] * raw)
+            for j, corners in enumerate(s.vote_corners):
+                slope = b.by_reliability[j]
+                _scatter(
+                    total.reliability[j], size.reliability[j], corners, by_depth[i] * slope, by_depth_size[i] * slope
+                )
+            self._add_color(s, by_color * made.weights[i], total, size)
+
+    def _add_color(self, s: Sample, by_color: Array, total: Gradients, size: Gradients) -> None:
+        """Backwards through a colour network."""
+        features = s.inputs[: self.field.features[s.head].shape[-1]]
+        color, h1, h2, x = self._network(s.head, s.inputs, features)
+        w1, _, w2, _, w3, _ = self._weights(s.head)
+        by_logit = by_color * color * (1 - color)
+        by_h2 = (w3.T @ by_logit) * (h2 > 0)
+        by_h1 = (w2.T @ by_h2) * (h1 > 0)
+        size_h2 = (np.abs(w3).T @ np.abs(by_logit)) * (h2 > 0)
+        size_h1 = (np.abs(w2).T @ size_h2) * (h1 > 0)
+        by_features, size_features = w1.T @ by_h1, np.abs(w1).T @ size_h1
+        by_features[:3] += by_logit
+        size_features[:3] += np.abs(by_logit)
+        _scatter(total.features[s.head], size.features[s.head], s.corners, by_features[: len(features)],
+                 size_features[: len(features)])  # fmt: skip
+        row = s.head if len(self.field.networks) > 1 else 0
+        parts = [np.outer(by_h1, x), by_h1, np.outer(by_h2, h1), by_h2, np.outer(by_logit, h2), by_logit]
+        sizes = [np.outer(size_h1, np.abs(x)), size_h1, np.outer(size_h2, h1), size_h2,
+                 np.outer(np.abs(by_logit), h2), np.abs(by_logit)]  # fmt: skip
+        total.networks[row] += np.concatenate([p.reshape(-1) for p in parts])
+        size.networks[row] += np.concatenate([p.reshape(-1) for p in sizes])
+
+
+# Lookups -------------------------------------------------------------------------------------------------------------
+
+
+def _corners(position: Array, shape: tuple[int, ...]) -> list[tuple[tuple[int, ...], float]]:
+    """(index, weight) of the texels around a position in [-1, 1]^D; corners of the range are texel centres."""
+    axes = []
+    for x, n in zip(position, shape, strict=True):
+        at = min(max((float(x) + 1) / 2 * (n - 1), 0.0), n - 1.0)
+        lower = min(math.floor(at), n - 2)
+        axes.append(((lower, 1 - (at - lower)), (lower + 1, at - lower)))
+    return [
+        (tuple(i for i, _ in corner), math.prod(weight for _, weight in corner)) for corner in itertools.product(*axes)
+    ]
+
+
+def _nearest(position: Array, shape: tuple[int, ...]) -> tuple[tuple[int, ...], float]:
+    """Index of the nearest texel, and how far the closest choice was from a tie, relative to the side."""
+    at = [min(max((float(x) + 1) / 2 * (n - 1), 0.0), n - 1.0) for x, n in zip(position, shape, strict=True)]
+    gap = min(abs(a % 1 - 0.5) / n for a, n in zip(at, shape, strict=True))
+    return tuple(round(a) for a in at), gap
+
+
+def _look_up(table: Array, corners: list[tuple[tuple[int, ...], float]]) -> Array:
+    value = np.zeros(table.shape[-1])
+    for index, weight in corners:
+        value = value + weight * table[index]
+    return value
+
+
+def _size(table: Array, corners: list[tuple[tuple[int, ...], float]]) -> Array:
+    """Magnitudes of the texels around a lookup, times the texels across: a position is known to a rounding of 1."""
+    across = max(table.shape[:3])
+    return across * np.max([np.abs(table[index]) for index, _ in corners], axis=0)
+
+
+def _scatter(table: Array, sizes: Array, corners, value: Array | float, size: Array | float) -> None:
+    for index, weight in corners:
+        table[index] += weight * value
+        sizes[index] += weight * np.abs(size)
