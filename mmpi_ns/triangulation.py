@@ -63,16 +63,29 @@ class PosedImages:
     fisheye: bool = False
 
     def pairs(self) -> list[tuple[int, int]]:
-        """Images worth matching, by pose: up to ``NEIGHBOURS`` nearest each, looking within ``MAX_ANGLE``."""
-        centers, facing = self.camera_to_worlds[:, :, 3], self.camera_to_worlds[:, :, 2]
-        wanted = set()
-        for i, (center, axis) in enumerate(zip(centers, facing, strict=True)):
-            distance = np.linalg.norm(centers - center, axis=-1)
-            usable = facing @ axis > np.cos(np.radians(MAX_ANGLE))
-            usable[i] = False
-            order = np.argsort(np.where(usable, distance, np.inf), kind="stable")
-            wanted |= {(min(i, int(j)), max(i, int(j))) for j in order[: min(NEIGHBOURS, int(usable.sum()))]}
-        return sorted(wanted)
+        """Images worth matching."""
+        return near_pairs(self.camera_to_worlds[:, :, 3], -self.camera_to_worlds[:, :, 2], NEIGHBOURS)
+
+
+def near_pairs(centers: NDArray[np.float64], facing: NDArray[np.float64], neighbours: int) -> list[tuple[int, int]]:
+    """Each camera with the nearest that look roughly its way.
+
+    Args:
+        centers: camera centres. [M, 3]
+        facing: unit viewing directions. [M, 3]
+        neighbours: most cameras that one chooses.
+
+    Returns:
+        Pairs (i, j) with i < j, in order.
+    """
+    wanted = set()
+    for i, (center, axis) in enumerate(zip(centers, facing, strict=True)):
+        distance = np.linalg.norm(centers - center, axis=-1)
+        usable = facing @ axis > np.cos(np.radians(MAX_ANGLE))
+        usable[i] = False
+        order = np.argsort(np.where(usable, distance, np.inf), kind="stable")
+        wanted |= {(min(i, int(j)), max(i, int(j))) for j in order[: min(neighbours, int(usable.sum()))]}
+    return sorted(wanted)
 
 
 def triangulate(images: PosedImages) -> SfmModel:

@@ -28,8 +28,6 @@ LOOK_ALIKES = 30
 """Look-alikes that each image of a large unordered set is matched with."""
 FAR_STEPS = (15, 20, 30, 45)
 """Frames further apart than the overlap, as far as they go: slow stretches want a longer baseline."""
-MAX_ANGLE = 60.0
-"""Degrees between the facing directions of two posed images worth matching."""
 
 Pairs = list[tuple[int, int]]
 
@@ -137,21 +135,3 @@ def _look_alikes(alike: NDArray[np.float32], number: int, barred: NDArray[np.boo
     order = np.argsort(-allowed, axis=-1, kind="stable")[:, :number]
     found = {(min(i, int(j)), max(i, int(j))) for i, row in enumerate(order) for j in row if np.isfinite(allowed[i, j])}
     return sorted(found)
-
-
-def posed_pairs(poses: NDArray[np.float64], neighbours: int) -> Pairs:
-    """Each camera with the nearest that look roughly its way.
-
-    Args:
-        poses: camera to world, OpenCV axes. [N, 4, 4]
-        neighbours: most images that one is paired with.
-    """
-    centers, facing = poses[:, :3, 3], poses[:, :3, 2]
-    wanted: set[tuple[int, int]] = set()
-    for i in range(len(poses)):
-        distance = np.linalg.norm(centers - centers[i], axis=-1)
-        usable = facing @ facing[i] > np.cos(np.radians(MAX_ANGLE))
-        usable[i] = False
-        order = np.argsort(np.where(usable, distance, np.inf), kind="stable")[: min(neighbours, int(usable.sum()))]
-        wanted |= {(min(i, int(j)), max(i, int(j))) for j in order}
-    return sorted(wanted)

@@ -23,6 +23,7 @@ from mmpi_ns.prepare.settings import Settings
 from mmpi_ns.prepare.stages import CONSOLE, PrepareError, Stages
 from mmpi_ns.prepare.undistort import undistort
 from mmpi_ns.prepare.video import select_frames
+from mmpi_ns.triangulation import near_pairs
 
 WORK = ".prepare"
 LEAST_SHARE = 0.5
@@ -160,7 +161,8 @@ class Preparation:
         s, names = self.settings, [p.name for p in self.photos]
         if self.known is not None and s.matching == "auto":
             places = [i for i, n in enumerate(names) if n in self.known.poses]
-            near = pairs.posed_pairs(np.array([self.known.poses[names[i]] for i in places]), 2 * s.overlap)
+            poses = np.array([self.known.poses[names[i]] for i in places])  # OpenCV axes
+            near = near_pairs(poses[:, :3, 3], poses[:, :3, 2], 2 * s.overlap)
             return [(places[i], places[j]) for i, j in near], f"the {2 * s.overlap} nearest by pose"
         alike = pairs.similarity(pairs.describe_images(database, len(names)))
         chosen, why = pairs.choose(s.matching, names, alike, self.is_video)
