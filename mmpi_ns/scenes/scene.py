@@ -56,10 +56,11 @@ class Cameras:
         directions = local @ pose[:, :3].T / np.sqrt((local**2).sum(-1, keepdims=True))
         return np.broadcast_to(pose[:, 3], directions.shape), directions
 
-    def project(self, camera: int, points: Array) -> tuple[Array, Array]:
-        """Pixels [N, 2] of world points [N, 3], and their depths [N] along the optical axis (negative: behind)."""
-        pose = self.camera_to_worlds[camera]
-        local = (points - pose[:, 3]) @ pose[:, :3]
+    def project(self, camera: int | NDArray[np.int64], points: Array) -> tuple[Array, Array]:
+        """Pixels [N, 2] of world points [N, 3] in a camera, or each in its own [N], and their depths [N] along the
+        optical axis (negative: behind)."""
+        poses = self.camera_to_worlds[camera]
+        local = np.einsum("...ji,...j->...i", poses[..., :3], points - poses[..., 3])
         depth = -local[:, 2]
         safe = np.where(np.abs(depth) < 1e-9, 1e-9, depth)
         return np.stack([local[:, 0], -local[:, 1]], -1) / safe[:, None] * self.focal + self.center, depth

@@ -43,7 +43,7 @@ class SfmPoints:
 
     def errors(self, scene: Scene) -> Array:
         """Distance [Q] between each keypoint and where its point projects to, pixels."""
-        return np.linalg.norm(_project(scene, self.camera, self.points[self.point])[0] - self.pixel, axis=-1)
+        return np.linalg.norm(scene.cameras.project(self.camera, self.points[self.point])[0] - self.pixel, axis=-1)
 
 
 def sfm_points(scene: Scene, count: int, noise_pixels: float = 0.3, outliers: float = 0.02) -> SfmPoints:
@@ -167,7 +167,7 @@ def _misled(scene: Scene, points: Array, tracks: tuple, pixel: Array, share: flo
     center = scene.cameras.camera_to_worlds[first, :, 3]
     stretch = np.exp(random.uniform(0.25, 0.9, len(points)) * random.choice([-1, 1], len(points)))
     wrong = center + (points - center) * stretch[:, None]
-    where, depth = _project(scene, camera, wrong[point])
+    where, depth = scene.cameras.project(camera, wrong[point])
     size = [scene.cameras.width, scene.cameras.height]
     inside = (depth > 0) & ((where > 0) & (where < size)).all(-1)
     able = np.flatnonzero(np.bincount(point, inside, minlength=len(points)) >= MIN_TRACK)
@@ -175,14 +175,6 @@ def _misled(scene: Scene, points: Array, tracks: tuple, pixel: Array, share: flo
     moved[outlier] = wrong[outlier]
     of_outlier = outlier[point]
     return moved, outlier, ~of_outlier | inside, np.where(of_outlier[:, None], where + pixel - exact, pixel)
-
-
-def _project(scene: Scene, camera: NDArray, points: Array) -> tuple[Array, Array]:
-    """Pixels [Q, 2] and depths [Q] of points [Q, 3], each in its own camera."""
-    poses, focal = scene.cameras.camera_to_worlds[camera], scene.cameras.focal
-    local = np.einsum("qji,qj->qi", poses[:, :, :3], points - poses[:, :, 3])
-    depth = np.where(np.abs(local[:, 2]) < 1e-9, 1e-9, -local[:, 2])
-    return np.stack([local[:, 0], -local[:, 1]], -1) / depth[:, None] * focal + scene.cameras.center, depth
 
 
 def _triangulated(scene: Scene, points: Array, camera: NDArray, point: NDArray, pixel: Array) -> Array:
@@ -193,7 +185,7 @@ def _triangulated(scene: Scene, points: Array, camera: NDArray, point: NDArray, 
     starts = np.searchsorted(point, np.arange(len(points)))
     points = points.copy()
     for _ in range(4):
-        where, depth = _project(scene, camera, points[point])
+        where, depth = scene.cameras.project(camera, points[point])
         slope = (where - scene.cameras.center) / scene.cameras.focal
         # d(x, y)/d(point): the image axes less what moving along the optical axis does.
         right, down, ahead = axes[:, :, 0], -axes[:, :, 1], -axes[:, :, 2]
