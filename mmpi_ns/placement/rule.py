@@ -148,7 +148,7 @@ class _Choice:
             if best is None:
                 break
             grown = self._without_superfluous([*chosen, best])
-            if self._total(grown) >= self._total(chosen):  # it makes itself or its better superfluous
+            if chosen and self._total(grown) >= self._total(chosen):  # it makes itself or its better superfluous
                 break
             chosen = grown
         owner = self.cost[chosen].argmin(0)
