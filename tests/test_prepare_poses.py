@@ -9,6 +9,7 @@ import numpy as np
 import pycolmap
 import pytest
 
+from mmpi_ns.prepare.cameras import Intrinsics
 from mmpi_ns.prepare.images import Photo
 from mmpi_ns.prepare.pipeline import prepare
 from mmpi_ns.prepare.poses import read_poses
@@ -88,8 +89,24 @@ def test_lost_poses_are_left_out(tmp_path):
 
 def test_transforms_bring_intrinsics_scaled_to_the_images_and_their_split(tmp_path):
     lists = {"train_filenames": ["images/frame_001.png"], "test_filenames": ["images/frame_002.png"]}
-    known, _ = read(write_transforms(tmp_path / "transforms.json", GIVEN, **lists))
-    assert known.intrinsics["frame_001.png"].fx == pytest.approx(170) and known.split is not None
+    lens = {"fl_y": 350.0, "cx": 236.0, "cy": 162.0, "k1": 0.1, "k2": 0.2, "p1": 0.3, "p2": 0.4, "k3": 0.5}
+    path = tmp_path / "transforms.json"
+    known, _ = read(write_transforms(path, GIVEN, **lens, **lists))  # of images twice as large
+    assert known.intrinsics["frame_001.png"] == Intrinsics(170.0, 175.0, 118.0, 81.0, (0.1, 0.2, 0.3, 0.4))
+    assert known.split is not None and known.split["test_filenames"] == lists["test_filenames"]
+    known, _ = read(write_transforms(path, GIVEN, **lens, k4=0.6, camera_model="OPENCV_FISHEYE"))
+    assert known.intrinsics["frame_008.png"] == Intrinsics(170.0, 175.0, 118.0, 81.0, (0.1, 0.2, 0.5, 0.6), True)
+    assert known.split is None
+    with pytest.raises(PrepareError, match="says otherwise"):
+        read(write_transforms(path, GIVEN, w=400))
+
+
+def test_lines_that_no_number_of_an_image_can_name_are_refused(tmp_path):
+    path = write_kitti(tmp_path / "poses.txt", corridor.poses(30))
+    for last in ("30", "three"):
+        photos = [Photo(f"{n}.png", 9, 9, source=f"{n}.png") for n in ("3", "10", last)]
+        with pytest.raises(PrepareError, match="30 poses for 3 images: they cannot be matched"):
+            read(path, photos=photos)
 
 
 @pytest.mark.parametrize(
@@ -99,6 +116,7 @@ def test_transforms_bring_intrinsics_scaled_to_the_images_and_their_split(tmp_pa
         ("1 0 0 0 0 1 0 0 0 0 1 x\n", "line 1"),
         ("1 0 0 0 0 1 0 0 0 0 1 0\n" * 3, "3 poses for 8 images"),
         ("2 0 0 0 0 2 0 0 0 0 2 0\n" * 8, "no rotation"),
+        ("1 0 0 0 0 1 0 0 0 0 -1 0\n" * 8, "no rotation"),
     ],
 )
 def test_poses_that_make_no_sense_are_named(text, words, tmp_path):

@@ -1,0 +1,229 @@
+"""Parts of mmpi-prepare by themselves: pairs, the scene's frame, lenses, and what the files hold."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import corridor
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+from PIL import Image
+
+from mmpi_ns.prepare import export, mapping, pairs
+from mmpi_ns.prepare.cameras import Intrinsics, make_cameras, read_intrinsics, share
+from mmpi_ns.prepare.frame import choose_frame, similarity_between
+from mmpi_ns.prepare.images import Photo
+from mmpi_ns.prepare.poses import rigid3d
+from mmpi_ns.prepare.stages import PrepareError
+from mmpi_ns.prepare.video import Measured, choose_frames, median_motion
+
+
+def model_of(poses, *cameras):
+    """A model of posed images without points; images take the cameras in turn."""
+    model = pycolmap.Reconstruction()
+    cameras = cameras or (pycolmap.Camera(model="PINHOLE", width=8, height=6, params=[9, 9, 4, 3], camera_id=1),)
+    for camera in cameras:
+        model.add_camera_with_trivial_rig(camera)
+    for i, pose in enumerate(poses):
+        camera = cameras[i % len(cameras)]
+        image = pycolmap.Image(name=f"{i}.jpg", camera_id=camera.camera_id, image_id=i + 1)
+        model.add_image_with_trivial_frame(image, rigid3d(pose))
+    return model
+
+
+# Pairs ---------------------------------------------------------------------------------------------------------------
+
+
+def test_a_sequence_is_matched_with_near_and_far_frames_and_where_it_comes_back():
+    place = np.arange(120.0)
+    place[115:] = place[:5]  # comes back to its start
+    alike = np.exp(-((place[:, None] - place) ** 2) / 50).astype(np.float32)
+    np.fill_diagonal(alike, -1)
+    found = pairs.list_pairs("sequential", alike, 4)
+    steps = {j - i for i, j in found if j < 115}
+    assert steps == {1, 2, 3, 4, 15, 20, 30, 45}
+    assert sum(j - i == 45 for i, j in found) == 120 - 45
+    assert {(i, 115 + i) for i in range(5)} <= set(found)
+    assert len(pairs.list_pairs("exhaustive", alike[:7, :7], 4)) == 21
+
+
+# The scene's frame ---------------------------------------------------------------------------------------------------
+
+
+def test_without_metres_the_track_is_one_unit_long_about_the_origin_and_heads_along_y():
+    turn = pycolmap.Rotation3d(np.array([0.3, -0.5, 0.9])).matrix()
+    poses = corridor.poses(9, bend=0.02)
+    moved = np.tile(np.eye(4), (9, 1, 1))
+    moved[:, :3, :3], moved[:, :3, 3] = turn @ poses[:, :3, :3], 7 * poses[:, :3, 3] @ turn.T + [3, -2, 5]
+    frame = choose_frame(model_of(moved), None)
+    centers = np.array([frame.similarity * c for c in moved[:, :3, 3]])
+    rotations = frame.similarity.rotation.matrix() @ moved[:, :3, :3]
+    assert centers.mean(0) == pytest.approx([0, 0, 0], abs=1e-9)
+    along = np.linalg.svd(centers)[2][0]
+    assert np.ptp(centers @ along) == pytest.approx(1)
+    assert rotations[:, 2, 1] == pytest.approx(np.full(9, -1.0))  # down in the image is down
+    assert rotations[0, :, 2] == pytest.approx([0, 1, 0], abs=1e-9)
+    assert centers[-1, 1] > centers[0, 1] + 0.9 and "extent" in frame.unit
+
+
+def test_a_straight_track_is_fitted_without_a_turn_about_itself():
+    straight = corridor.poses(6, bend=0.0)
+    straight[:, 0, 3] = 0
+    turn = pycolmap.Rotation3d(np.array([0.4, 1.1, -0.2])).matrix()
+    target = straight.copy()
+    target[:, :3, :3] = turn @ straight[:, :3, :3]
+    target[:, :3, 3] = 2.5 * straight[:, :3, 3] @ turn.T + [1, 2, 3]
+    found = similarity_between(straight, target)
+    assert found.scale == pytest.approx(2.5) and found.rotation.matrix() == pytest.approx(turn)
+    assert found.translation == pytest.approx([1, 2, 3])
+
+
+# Video ---------------------------------------------------------------------------------------------------------------
+
+
+def test_frames_of_equal_sharpness_are_evenly_spaced():
+    measured = Measured(np.full(101, 0.01), np.ones(101))
+    chosen, used = choose_frames(measured, 300, 0.1)
+    assert used == 0.1 and chosen == [0, 9, 19, 29, 39, 49, 59, 69, 79, 89, 99]  # frame i has moved by (i + 1) / 100
+    sharp = measured.sharp.copy()
+    sharp[[32, 57]] = 1.1, 3.0  # not worth it so far off the middle of the stretch; worth it
+    assert choose_frames(Measured(measured.motion, sharp), 300, 0.1)[0][3:7] == [29, 39, 49, 57]
+
+
+def test_motion_is_a_share_of_the_width():
+    gray = cv2.cvtColor(corridor.picture(corridor.poses(1)[0]), cv2.COLOR_RGB2GRAY)
+    before, after = np.ascontiguousarray(gray[:, :200]), np.ascontiguousarray(gray[:, 8:208])
+    assert median_motion(before, after) == pytest.approx(8 / 200, rel=0.02)
+    assert median_motion(before, np.zeros_like(before)) == pytest.approx(0.15)
+
+
+# Lenses --------------------------------------------------------------------------------------------------------------
+
+SIZE = {"width": 200, "height": 160, "camera_id": 1}
+
+
+@pytest.mark.parametrize(
+    ("model", "params"),
+    [
+        ("SIMPLE_PINHOLE", [150, 98, 83]),
+        ("PINHOLE", [150, 140, 98, 83]),
+        ("SIMPLE_RADIAL", [150, 98, 83, 0.1]),
+        ("RADIAL", [150, 98, 83, 0.1, -0.05]),
+        ("OPENCV", [150, 140, 98, 83, 0.1, -0.05, 0.02, -0.01]),
+        ("OPENCV_FISHEYE", [150, 140, 98, 83, 0.1, -0.05, 0.02, -0.01]),
+    ],
+)
+def test_a_lens_of_colmap_projects_as_opencv_says(model, params):
+    camera = pycolmap.Camera(model=model, params=params, **SIZE)
+    lens = read_intrinsics(camera)
+    rays = np.array([[0.3, -0.2, 1.0], [-0.4, 0.35, 1.0], [0.1, 0.4, 1.0]])
+    matrix, still = np.array([[lens.fx, 0, lens.cx], [0, lens.fy, lens.cy], [0, 0, 1]]), np.zeros(3)
+    project = cv2.fisheye.projectPoints if lens.fisheye else cv2.projectPoints
+    args = (still, still, matrix, np.array(lens.distortion))
+    wanted = (project(rays[None], *args) if lens.fisheye else project(rays, *args))[0].reshape(-1, 2)
+    assert camera.img_from_cam(rays) == pytest.approx(wanted, abs=1e-6)
+
+
+def test_a_lens_without_a_place_in_transforms_is_named():
+    with pytest.raises(PrepareError, match="FULL_OPENCV"):
+        read_intrinsics(pycolmap.Camera(model="FULL_OPENCV", params=[150, 140, 98, 83, *[0.0] * 8], **SIZE))
+
+
+def test_given_lenses_are_kept_apart_and_come_back_from_colmaps():
+    photos = [Photo(name, 200, 160, source=name) for name in "abcd"]
+    first = Intrinsics(150.0, 140.0, 98.0, 83.0, (0.1, -0.05, 0.02, -0.01), fisheye=True)
+    given = {"a": first, "b": Intrinsics(150.0, 140.0, 98.0, 83.0), "c": first}
+    numbers = share(photos, "auto", given)
+    assert numbers == [1, 2, 1, 3]
+    cameras = make_cameras(photos, numbers, given, 120.0, "auto")
+    assert [c.model.name for c in cameras[:2]] == ["OPENCV_FISHEYE", "PINHOLE"]
+    assert [read_intrinsics(c) for c in cameras[:2]] == [given["a"], given["b"]]
+
+
+# Files ---------------------------------------------------------------------------------------------------------------
+
+
+def test_images_of_several_cameras_state_their_own_intrinsics():
+    cameras = [
+        pycolmap.Camera(model="OPENCV_FISHEYE", params=[150 + n, 140, 98, 83, 0.1, -0.05, 0.02, n], width=200,
+                        height=160 + n, camera_id=n)
+        for n in (1, 2)
+    ]  # fmt: skip
+    split = export.Split(("0.jpg",), ("1.jpg", "2.jpg"), "")
+    content = export.transforms(model_of(corridor.poses(3), *cameras), split, True, {})
+    assert content["camera_model"] == "OPENCV_FISHEYE" and "fl_x" not in content
+    found = [[f[k] for k in ("file_path", "mask_path", "fl_x", "h", "k3", "k4")] for f in content["frames"]]
+    assert found == [[f"images/{i}.jpg", f"masks/{i}.png", 151 + i % 2, 161 + i % 2, 0.02, 1 + i % 2] for i in range(3)]
+    assert content["train_filenames"] == ["images/0.jpg"]
+    assert content["test_filenames"] == content["val_filenames"] == ["images/1.jpg", "images/2.jpg"]
+    (shared,) = cameras[:1]
+    content = export.transforms(model_of(corridor.poses(2), shared), split, False, {})
+    assert (
+        content["fl_x"] == 151 and content["k4"] == 1 and set(content["frames"][0]) == {"file_path", "transform_matrix"}
+    )
+    mixed = [shared, pycolmap.Camera(model="PINHOLE", params=[9, 9, 4, 3], width=8, height=6, camera_id=3)]
+    with pytest.raises(PrepareError, match="Fisheye and perspective"):
+        export.transforms(model_of(corridor.poses(2), *mixed), split, False, {})
+
+
+@pytest.mark.parametrize("mask", [False, True])
+def test_what_remains_at_the_far_edges_is_cut_off_when_downscaled(tmp_path, mask):
+    values = np.random.default_rng(0).integers(0, 255, (7, 9), np.uint8)
+    Image.fromarray(values).save(tmp_path / "whole.png")
+    export.downscale(tmp_path / "whole.png", tmp_path / "small.png", 2, mask)
+    blocks = values[:6, :8].reshape(3, 2, 4, 2)
+    wanted = blocks.min((1, 3)) if mask else blocks.mean((1, 3))
+    assert np.abs(np.asarray(Image.open(tmp_path / "small.png")).astype(float) - wanted).max() <= 0.5
+
+
+def test_a_scene_is_whole_whenever_its_transforms_are_there(tmp_path, monkeypatch):
+    """Moving stops after each file in turn: whoever looks meanwhile finds no transforms.json beside half a scene."""
+    moved, rename = [], Path.rename
+
+    def record(path, target):
+        moved.append((path.parent.name, path.name))
+        return rename(path, target)
+
+    for folder in ("built", "scene"):
+        for name in ("images", "images_2", "masks"):
+            (tmp_path / folder / name).mkdir(parents=True)
+        (tmp_path / folder / "transforms.json").write_text(folder)
+    (tmp_path / "scene/mine.txt").touch()
+    monkeypatch.setattr(Path, "rename", record)
+    export.publish(tmp_path / "built", tmp_path / "scene", tmp_path / "scene/previous")
+    assert moved[0] == ("scene", "transforms.json") and moved[-1] == ("built", "transforms.json")
+    assert sorted(moved[1:4]) == [("scene", n) for n in ("images", "images_2", "masks")]
+    assert {p.name for p in (tmp_path / "scene").iterdir()} == {
+        "images", "images_2", "masks", "transforms.json", "mine.txt", "previous",
+    }  # fmt: skip
+
+
+# Mapping -------------------------------------------------------------------------------------------------------------
+
+
+def found_model(images, error, width=1000):
+    return SimpleNamespace(
+        cameras={1: SimpleNamespace(width=width // 2), 2: SimpleNamespace(width=width)},
+        num_reg_images=lambda: images,
+        compute_mean_reprojection_error=lambda: error,
+    )
+
+
+def test_a_sound_model_beats_a_bent_one_with_more_images_and_errors_are_judged_by_image_size():
+    assert mapping.is_bent(found_model(9, 0.9)) and not mapping.is_bent(found_model(9, 0.7))
+    assert not mapping.is_bent(found_model(9, 1.5, width=2000)) and mapping.is_bent(found_model(9, 0.9, width=300))
+    models = [found_model(50, 0.9), found_model(30, 0.7), found_model(31, 0.7), found_model(31, 0.6)]
+    ranked = sorted(range(4), key=lambda i: mapping._quality(models[i]))
+    assert ranked == [0, 1, 2, 3]
+
+
+def test_given_intrinsics_are_left_alone_and_others_refined():
+    for refine in (False, True):
+        options = mapping.mapper_options(mapping.ATTEMPTS[1], refine, 1)
+        assert options.ba_refine_focal_length == options.ba_refine_extra_params == refine
+        assert options.mapper.abs_pose_refine_focal_length == options.mapper.abs_pose_refine_extra_params == refine
+        assert not options.ba_refine_principal_point
+        assert options.triangulation.min_angle == 0.5 and options.mapper.init_max_forward_motion == 1
