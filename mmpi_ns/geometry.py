@@ -71,14 +71,19 @@ class PlaneHits:
     local_directions: Float[Tensor, "R K 3"]
 
 
+def rotate(axes: Float[Tensor, "*#N 3 3"], vectors: Float[Tensor, "*#N 3"]) -> Float[Tensor, "*N 3"]:
+    """axes @ vector by single products: a matrix product would run in bfloat16 under autocast."""
+    return (axes * vectors[..., None, :]).sum(-1)
+
+
 def rays_in_frames(
     origins: Float[Tensor, "R 3"], directions: Float[Tensor, "R 3"], frames: Frames
 ) -> tuple[Float[Tensor, "R K 3"], Float[Tensor, "R K 3"]]:
     """Ray origins and directions in each MPI's axes, relative to the MPI's origin (differences first: far from the
     world's origin nothing is lost)."""
     offsets = origins[:, None, :] - frames.origins
-    local_origins = torch.einsum("kij,rkj->rki", frames.axes, offsets)
-    return local_origins, torch.einsum("kij,rj->rki", frames.axes, directions)
+    local_origins = rotate(frames.axes, offsets)
+    return local_origins, rotate(frames.axes, directions[:, None, :])
 
 
 def plane_hits(
@@ -182,7 +187,7 @@ def world_to_ndc(
         mask. Where a point lies behind an MPI its NDC is meaningless (finite) and the mask is False.
     """
     relative = points[:, None, :] - frames.origins * inverse_t[:, None, None]
-    local = torch.einsum("kij,nkj->nki", frames.axes, relative)
+    local = rotate(frames.axes, relative)
     return local_to_ndc(local, inverse_t[:, None], frames)
 
 
@@ -220,7 +225,7 @@ def ndc_to_world(
     v = v0 + (ndc[:, 1] + 1) / 2 * (v1 - v0)
     w = (1 - ndc[:, 2]) / 2 / frames.nears[heads]
     rays = torch.stack([u, v, torch.ones_like(u)], -1)
-    directions = torch.einsum("nij,ni->nj", frames.axes[heads], rays)
+    directions = rotate(frames.axes[heads].mT, rays)
     return directions + frames.origins[heads] * w[:, None], w
 
 

@@ -297,7 +297,7 @@ class MMPIField(Field):
             features = interpolate(self.features, rows, weights)
             colors = []
             for k, sel in lookup.split(members):
-                local = directions[members[sel]] @ self._axes(k).T
+                local = geometry.rotate(self._axes(k), directions[members[sel]])
                 colors.append(self.networks(k, features[sel], lookup.ndc[members[sel]], local))
             rgb = rgb.index_put((members,), torch.cat(colors))
         out = rgb.new_zeros(lookup.shape.numel(), 3).index_put((lookup.index,), rgb)
