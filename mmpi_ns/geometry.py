@@ -1,13 +1,13 @@
 """The MPI frame: world <-> NDC, plane hits and the live interval of a ray (docs/how_it_works.md, "Geometry").
 
-Everything here is affine in disparity w = 1/depth, so the plane at infinity (w = 0) is an ordinary plane.
+Everything here is affine in disparity w = 1/depth, so a plane at infinity (w = 0) is an ordinary plane.
 Points travel as homogeneous pairs ``(o/t + d, 1/t)``, which are finite and exact at infinity.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -28,6 +28,8 @@ class Frames:
     nears: Float[Tensor, "K"]
     extents: Float[Tensor, "K 4"]
     num_planes: Int[Tensor, "K"]
+    last_disparities: Float[Tensor, "K"]
+    """Disparity of the last plane, 1 / far; 0 where an MPI reaches to infinity."""
 
     @staticmethod
     def pack(mpis: Sequence[MPIPlan], dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Frames:
@@ -40,22 +42,28 @@ class Frames:
             nears=tensor([m.near for m in mpis]),
             extents=tensor([m.extent for m in mpis]),
             num_planes=torch.tensor([m.planes for m in mpis], device=device),
+            last_disparities=tensor([m.last_disparity for m in mpis]),
         )
 
     @property
     def disparity_steps(self) -> Float[Tensor, "K"]:
-        """Disparity between neighbouring planes, 1 / (near (L - 1)), in 1 / scene units."""
-        return 1.0 / (self.nears * (self.num_planes - 1).to(self.nears.dtype))
+        """Disparity between neighbouring planes, (1/near - 1/far) / (L - 1), in 1 / scene units."""
+        return self.depth_shares / (self.nears * (self.num_planes - 1).to(self.nears.dtype))
+
+    @property
+    def depth_shares(self) -> Float[Tensor, "K"]:
+        """1 - near / far: the share of all disparities beyond the near plane that an MPI spans; 1 to infinity."""
+        return 1.0 - self.nears * self.last_disparities
 
     def to(self, device: torch.device | str) -> Frames:
-        return Frames(*(getattr(self, f).to(device) for f in ("origins", "axes", "nears", "extents", "num_planes")))
+        return Frames(*(getattr(self, f.name).to(device) for f in fields(self)))
 
 
 @dataclass(frozen=True)
 class PlaneHits:
     """Where R rays cross the planes of K MPIs.
 
-    Planes are counted by m = L - 1 - l, so m = 0 is at infinity and the disparity is w = m * step.
+    Planes are counted by m = L - 1 - l, so m = 0 is the last one and the disparity is w = 1/far + m * step.
     The live planes of a ray are m_first, m_first - 1, ..., ``count`` of them, near to far.
     """
 
@@ -123,9 +131,9 @@ def plane_hits(
     q = torch.stack([one, -inverse_far * one, u1 - slope_u, slope_u - u0, v1 - slope_v, slope_v - v0])
 
     last = (frames.num_planes - 1).to(oz.dtype)
-    step = frames.disparity_steps
-    low, high = _half_space_range(p, q, step, last)
-    live = _live_test(p, q, oz, step, last)
+    step, end = frames.disparity_steps, frames.last_disparities
+    low, high = _half_space_range(p, q - p * end, step, last)
+    live = _live_test(p, q, oz, step, end, last)
     # The division may be off by one plane at a border: the half-space test itself decides.
     high = torch.where(live(high + 1), high + 1, torch.where(live(high), high, high - 1))
     low = torch.where(live(low - 1), low - 1, torch.where(live(low), low, low + 1))
@@ -154,17 +162,17 @@ def _half_space_range(
     return torch.where(never, last + 1, low), torch.where(never, torch.full_like(high, -1), high)
 
 
-def _live_test(p: Tensor, q: Tensor, oz: Tensor, step: Tensor, last: Tensor):
+def _live_test(p: Tensor, q: Tensor, oz: Tensor, step: Tensor, end: Tensor, last: Tensor):
     def live(m: Float[Tensor, "R K"]) -> Bool[Tensor, "R K"]:
-        w = m * step
+        w = sample_disparity(m, step, end)
         return (p * w <= q).all(0) & (w * oz < 1) & (m >= 0) & (m <= last)
 
     return live
 
 
-def sample_disparity(m: Tensor, step: Tensor) -> Tensor:
-    """Disparity of plane m = L - 1 - l; exactly 0 at infinity."""
-    return m.to(step.dtype) * step
+def sample_disparity(m: Tensor, step: Tensor, end: Tensor) -> Tensor:
+    """Disparity of plane m = L - 1 - l: ``end`` (1 / far) for the last one, exactly 0 at infinity."""
+    return m.to(step.dtype) * step + end
 
 
 def inverse_distance(w: Tensor, oz: Tensor, dz: Tensor) -> Tensor:
@@ -183,7 +191,7 @@ def world_to_ndc(
         frames: the K MPI frames.
 
     Returns:
-        NDC (u, v, s), each normalised to [-1, 1] over the frustum (s: near plane -1, infinity +1), and the inside
+        NDC (u, v, s), each normalised to [-1, 1] over the frustum (s: near plane -1, last plane +1), and the inside
         mask. Where a point lies behind an MPI its NDC is meaningless (finite) and the mask is False.
     """
     relative = points[:, None, :] - frames.origins * inverse_t[:, None, None]
@@ -201,10 +209,13 @@ def local_to_ndc(
     u0, u1, v0, v1 = frames.extents.unbind(-1)
     u = 2 * (local[..., 0] / safe_z - u0) / (u1 - u0) - 1
     v = 2 * (local[..., 1] / safe_z - v0) / (v1 - v0) - 1
-    s = 1 - 2 * frames.nears * inverse_t / safe_z
+    scale = frames.nears / frames.depth_shares
+    s = 1 - (2 * scale * inverse_t / safe_z - 2 * scale * frames.last_disparities)
     ndc = torch.stack([u, v, s], -1)
-    # A few ulps of slack: a sample on the border of its own MPI stays inside after the round trip.
-    inside = ahead & (ndc.abs() <= 1 + 16 * torch.finfo(ndc.dtype).eps).all(-1)
+    # A few ulps of slack: a sample on the border of its own MPI stays inside after the round trip. In s those are ulps
+    # of 1 / near over the disparities between near and far.
+    slack = torch.stack([torch.ones_like(scale), torch.ones_like(scale), 1 / frames.depth_shares], -1)
+    inside = ahead & (ndc.abs() <= 1 + 16 * torch.finfo(ndc.dtype).eps * slack).all(-1)
     return torch.where(ahead[..., None], ndc, torch.zeros_like(ndc)), inside
 
 
@@ -223,7 +234,7 @@ def ndc_to_world(
     u0, u1, v0, v1 = frames.extents[heads].unbind(-1)
     u = u0 + (ndc[:, 0] + 1) / 2 * (u1 - u0)
     v = v0 + (ndc[:, 1] + 1) / 2 * (v1 - v0)
-    w = (1 - ndc[:, 2]) / 2 / frames.nears[heads]
+    w = (1 - ndc[:, 2]) / 2 / frames.nears[heads] * frames.depth_shares[heads] + frames.last_disparities[heads]
     rays = torch.stack([u, v, torch.ones_like(u)], -1)
     directions = rotate(frames.axes[heads].mT, rays)
     return directions + frames.origins[heads] * w[:, None], w

@@ -29,14 +29,16 @@ NEGLIGIBLE_DEPTH = 1e-4
 """Samples thinner than this are given an equal share instead of a reliability lookup when choosing survivors."""
 
 
-def plane_biases(planes: int) -> tuple[Float[Tensor, "L"], float]:
+def plane_biases(planes: int, missing: float = 0.0) -> tuple[Float[Tensor, "L"], float]:
     """Density biases b_l with which all planes start at equal rendering weight 1/L, and the interval 256/L.
 
     alpha_l = 1 / (L - l), the last one clamped; alpha = 1 - exp(-softplus(b) interval) solved for b.
+    An MPI that ends begins as one to infinity from which the last ``missing`` planes were taken away, alpha_l =
+    1 / (L + missing - l): their share of the weight is left to what lies behind.
     Source: DVGO v2's MPI; docs/how_it_works.md, "Density".
     """
     interval = 256.0 / planes
-    alpha = (1.0 / (planes - torch.arange(planes, dtype=torch.float64))).clamp(max=0.999)
+    alpha = (1.0 / (planes + missing - torch.arange(planes, dtype=torch.float64))).clamp(max=0.999)
     return torch.log(torch.expm1(-torch.log1p(-alpha) / interval)).float(), interval
 
 
@@ -163,8 +165,9 @@ class MMPIField(Field):
         return self._cached("cube", lambda: geometry.Cube.pack(plan, self.samples_per_voxel, device=device))
 
     def _biases(self, k: int) -> Tensor:
-        planes, device = self.plan.mpis[k].planes, self.density.device
-        return self._cached(f"bias{k}", lambda: plane_biases(planes)[0].to(device))
+        mpi, device = self.plan.mpis[k], self.density.device
+        missing = mpi.last_disparity / mpi.disparity_step
+        return self._cached(f"bias{k}", lambda: plane_biases(mpi.planes, missing)[0].to(device))
 
     # Density ---------------------------------------------------------------------------------------------------
 

@@ -329,7 +329,7 @@ class MMPIModel(Model):
     def _depth(self, composite: Composite, samples: RaySamples) -> Float[Tensor, "R 1"]:
         """Euclidean distance at half the gathered mass; infinity is shown as ten times the farthest finite plane."""
         inverse_t, valid = metadata_of(samples)["inverse_t"][..., 0], metadata_of(samples)["valid"][..., 0]
-        farthest = 10 * max(m.near * (m.planes - 1) for m in self.field.plan.mpis)
+        farthest = 10 * max(m.farthest for m in self.field.plan.mpis)
         return 1 / median_inverse_distance(composite.weights, inverse_t, valid).clamp(min=1 / farthest)
 
     # Losses and metrics ------------------------------------------------------------------------------------------

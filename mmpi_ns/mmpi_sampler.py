@@ -128,12 +128,12 @@ def _sample_mpi(k: int, counts: Int[Tensor, "R"], hits: PlaneHits, field: MMPIFi
     table = torch.cat(
         [hits.u[:, k], hits.v[:, k], hits.local_origins[:, k, 2:], hits.local_directions[:, k, 2:]], -1
     ).index_select(0, rays)
-    w = sample_disparity(m, field.frames.disparity_steps[k])
+    w = sample_disparity(m, field.frames.disparity_steps[k], field.frames.last_disparities[k])
     mpi = field.plan.mpis[k]
     u0, u1, v0, v1 = mpi.extent
     u = (table[:, 0] + w * table[:, 1] - u0) * (2 / (u1 - u0)) - 1
     v = (table[:, 2] + w * table[:, 3] - v0) * (2 / (v1 - v0)) - 1
-    s = 1 - 2 * mpi.near * w
+    s = 1 - 2 * mpi.near / mpi.depth_share * (w - mpi.last_disparity)
     ndc = torch.stack([u, v, s], -1)
     planes = mpi.planes - 1 - m
     tau = field.mpi_optical_depth(k, planes, ndc)
@@ -205,12 +205,12 @@ def _explained(hits: PlaneHits, counts: Int[Tensor, "R K"], field: MMPIField) ->
     live = counts > 0
     # One plane before the first live one bounds the entry: behind the camera means that the ray starts inside.
     m_before = torch.minimum(hits.m_first + 1, field.frames.num_planes - 1)
-    w = sample_disparity(m_before, field.frames.disparity_steps)
+    w = sample_disparity(m_before, field.frames.disparity_steps, field.frames.last_disparities)
     oz, dz = hits.local_origins[..., 2], hits.local_directions[..., 2]
     starts_inside = w * oz >= 1
     entry = torch.where(starts_inside, torch.inf, w * dz / torch.where(starts_inside, 1, 1 - w * oz))
     entered = (live & (entry * field.plan.content_near >= 1)).any(-1, keepdim=True)
-    to_infinity = (live & (hits.m_first - counts < 0)).any(-1, keepdim=True)
+    to_infinity = (live & (hits.m_first - counts < 0) & (field.frames.last_disparities == 0)).any(-1, keepdim=True)
     return entered & to_infinity
 
 

@@ -31,14 +31,15 @@ def rotation(quaternion):
     return tuple(tuple(float(v) for v in row) for row in rows)
 
 
-def random_mpi(rng, name="random", planes=None):
-    """An MPI anywhere within a few units of the world's origin, with an asymmetric frustum."""
+def random_mpi(rng, name="random", planes=None, deep=math.inf):
+    """An MPI anywhere within a few units of the world's origin, with an asymmetric frustum, ``deep`` nears deep."""
     u0, v0 = -rng.uniform(0.1, 2, size=2)
     return make_mpi(
         name,
         tuple(float(x) for x in rng.normal(size=3) * 2),
         rotation(rng.normal(size=4)),
-        near=float(rng.uniform(0.5, 4)),
+        near=(near := float(rng.uniform(0.5, 4))),
+        far=deep * near,
         extent=(float(u0), float(u0 + rng.uniform(0.5, 4)), float(v0), float(v0 + rng.uniform(0.5, 4))),
         planes=int(planes or rng.integers(2, 40)),
     )
@@ -104,10 +105,12 @@ def rotations(draw):
 @st.composite
 def mpis(draw):
     u0, v0 = draw(numbers(-3, 2)), draw(numbers(-3, 2))
+    near = draw(numbers(0.1, 20))
     return make_mpi(
         origin=tuple(float(x) for x in draw(vectors())),
         axes=draw(rotations() | st.just(IDENTITY)),
-        near=draw(numbers(0.1, 20)),
+        near=near,
+        far=near * draw(st.sampled_from([math.inf, 1.001, 1e6]) | numbers(1.001, 50)),
         extent=(u0, u0 + draw(numbers(0.1, 6)), v0, v0 + draw(numbers(0.1, 6))),
         planes=draw(st.integers(2, 40)),
     )

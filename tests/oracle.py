@@ -25,7 +25,7 @@ class Crossing:
     """Where a ray meets one plane of an MPI."""
 
     plane: int
-    """0 is the nearest plane, L - 1 the one at infinity."""
+    """0 is the nearest plane, L - 1 the last one."""
     live: bool
     inverse_t: float
     u: float
@@ -45,7 +45,9 @@ def to_local(mpi, point, is_direction=False):
 def plane_depth(mpi, plane):
     """Depth of a plane along the facing direction; planes are evenly spaced in 1 / depth."""
     behind = mpi.planes - 1 - plane
-    return math.inf if behind == 0 else mpi.near * (mpi.planes - 1) / behind
+    if math.isinf(mpi.far):
+        return math.inf if behind == 0 else mpi.near * (mpi.planes - 1) / behind
+    return (mpi.planes - 1) / (behind / mpi.near + plane / mpi.far)
 
 
 def cross_plane(mpi, plane, origin, direction, near, far):
@@ -80,7 +82,7 @@ def crossings(mpi, origin, direction, near=0.0, far=math.inf):
 def point_to_ndc(mpi, point):
     """(u, v, s) of a finite world point, each in [-1, 1] over the frustum; None behind the MPI."""
     x, y, z = to_local(mpi, point)
-    return _ndc(mpi, x, y, z, mpi.near / z) if z > 0 else None
+    return _ndc(mpi, x, y, z, 1 / z) if z > 0 else None
 
 
 def direction_to_ndc(mpi, direction):
@@ -89,9 +91,10 @@ def direction_to_ndc(mpi, direction):
     return _ndc(mpi, x, y, z, 0.0) if z > 0 else None
 
 
-def _ndc(mpi, x, y, z, near_over_depth):
+def _ndc(mpi, x, y, z, inverse_depth):
     u0, u1, v0, v1 = mpi.extent
-    return np.array([2 * (x / z - u0) / (u1 - u0) - 1, 2 * (y / z - v0) / (v1 - v0) - 1, 2 * (1 - near_over_depth) - 1])
+    share = (1 / mpi.near - inverse_depth) / (1 / mpi.near - 1 / mpi.far)
+    return np.array([2 * (x / z - u0) / (u1 - u0) - 1, 2 * (y / z - v0) / (v1 - v0) - 1, 2 * share - 1])
 
 
 def ray_point_to_ndc(mpi, origin, direction, inverse_t):
@@ -113,10 +116,11 @@ def ndc_to_world(mpi, ndc):
     u, v = u0 + (ndc[0] + 1) / 2 * (u1 - u0), v0 + (ndc[1] + 1) / 2 * (v1 - v0)
     x, y, z = (np.asarray(row, np.float64) for row in mpi.axes)
     direction = u * x + v * y + z
-    near_over_depth = 1 - (ndc[2] + 1) / 2
-    if near_over_depth == 0:
+    share = (ndc[2] + 1) / 2
+    inverse_depth = (1 - share) / mpi.near + share / mpi.far
+    if inverse_depth == 0:
         return direction, True
-    return np.asarray(mpi.origin, np.float64) + direction * (mpi.near / near_over_depth), False
+    return np.asarray(mpi.origin, np.float64) + direction / inverse_depth, False
 
 
 def cube_samples(cube, step, origin, direction, near=0.0, far=math.inf):

@@ -56,7 +56,7 @@ def hit_samples(frames, hits, k):
             rows.append(r)
             columns.append(int(hits.m_first[r, k]) - i)
     r, m = torch.tensor(rows, dtype=torch.int64), torch.tensor(columns, dtype=torch.int64)
-    w = sample_disparity(m, frames.disparity_steps[k])
+    w = sample_disparity(m, frames.disparity_steps[k], frames.last_disparities[k])
     u, v = (x[r, k, 0] + w * x[r, k, 1] for x in (hits.u, hits.v))
     return r, m, u, v, inverse_distance(w, hits.local_origins[r, k, 2], hits.local_directions[r, k, 2])
 
@@ -67,9 +67,45 @@ def hit_samples(frames, hits, k):
 def test_planes_stand_at_even_disparities_from_near_to_infinity():
     mpi = make_mpi(near=2.0, planes=5)
     frames = Frames.pack([mpi], dtype=F64)
-    w = sample_disparity(torch.arange(5), frames.disparity_steps)
+    w = sample_disparity(torch.arange(5), frames.disparity_steps, frames.last_disparities)
     assert w.tolist() == pytest.approx([0, 0.125, 0.25, 0.375, 0.5])
     assert w[0] == 0
+
+
+def test_planes_of_an_mpi_that_ends_stand_at_even_disparities_from_near_to_far():
+    frames = Frames.pack([make_mpi(near=2.0, far=10.0, planes=5)], dtype=F64)
+    w = sample_disparity(torch.arange(5), frames.disparity_steps, frames.last_disparities)
+    assert w.tolist() == pytest.approx([0.1, 0.2, 0.3, 0.4, 0.5])
+    assert frames.depth_shares.tolist() == pytest.approx([0.8])
+
+
+@pytest.mark.parametrize(
+    ("origin", "direction", "expected"),
+    [
+        ([0, 0, -1], [0, 0, 1], [0, 1, 2, 3, 4]),
+        ([0, 0, 3], [0, 0, 1], [2, 3, 4]),
+        ([0, 0, 9.99], [0, 0, 1], [4]),
+        ([0, 0, 10.01], [0, 0, 1], []),  # beyond the far end
+        ([0, 0, 1e9], [0.5, 0.2, 1], []),
+        ([1e6, 0, 0], [0.5, 0, 1], []),  # one to infinity holds this ray's direction, not one that ends
+        ([-3.5, 0, 4.9], [3, 0, 1], [3]),  # leaves at the side between depths 5 and 10
+        ([0, 0, 5], [1, 0, 0], []),
+        ([0, 0, 12], [0, 0, -1], []),
+    ],
+)
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+def test_rays_meet_an_mpi_that_ends_before_its_end_only(origin, direction, expected, dtype):
+    mpi = make_mpi(near=2.0, far=10.0, planes=5)  # depths 2, 2.5, 10/3, 5, 10
+    assert live_planes([mpi], *rays(origin, direction, dtype=dtype), dtype=dtype) == [expected]
+
+
+def test_ndc_spans_near_to_far():
+    frames = Frames.pack([make_mpi(near=2.0, far=10.0, extent=(-1.0, 3.0, -0.5, 0.5))], dtype=F64)
+    points = torch.tensor([[0, 0, 2], [0, 0, 10], [0, 0, 10 / 3], [0, 0, 10.1], [0, 0, 1]], dtype=F64)
+    ndc, inside = world_to_ndc(points, torch.tensor([1, 1, 1, 1, 0], dtype=F64), frames)
+    assert torch.allclose(ndc[:3, 0, 2], torch.tensor([-1, 1, 0], dtype=F64))
+    assert inside[:, 0].tolist() == [True, True, True, False, False]
+    assert ndc[4, 0, 2].item() == pytest.approx(1.5)  # infinity lies as far beyond as 1/10 is of 0.4 half-ranges
 
 
 def test_ray_along_the_axis_meets_every_plane_at_its_depth():
@@ -197,10 +233,11 @@ def test_live_interval_equals_testing_every_plane(mpi, origin, direction, near, 
     assert expected == list(range(expected[0], expected[-1] + 1)) if expected and not undecided else True
 
 
+@pytest.mark.parametrize("deep", [math.inf, 5.0])
 @pytest.mark.parametrize("num_mpis", [1, 12])
-def test_hits_of_many_mpis_equal_the_oracle(num_mpis):
+def test_hits_of_many_mpis_equal_the_oracle(num_mpis, deep):
     rng = np.random.default_rng(num_mpis)
-    plans = [random_mpi(rng) for _ in range(num_mpis)]
+    plans = [random_mpi(rng, deep=deep) for _ in range(num_mpis)]
     ray = rays(rng.normal(size=(60, 3)) * 2, rng.normal(size=(60, 3)), near=0.1)
     frames = Frames.pack(plans, dtype=F64)
     hits = plane_hits(*ray, frames)
@@ -216,14 +253,15 @@ def test_hits_of_many_mpis_equal_the_oracle(num_mpis):
     assert found > 30 * num_mpis
 
 
-def test_float32_ranges_differ_from_float64_only_at_borders():
+@pytest.mark.parametrize("deep", [math.inf, 5.0])
+def test_float32_ranges_differ_from_float64_only_at_borders(deep):
     rng = np.random.default_rng(0)
-    plans = [random_mpi(rng, planes=1024) for _ in range(4)]
+    plans = [random_mpi(rng, planes=1024, deep=deep) for _ in range(4)]
     ray = rays(rng.normal(size=(20_000, 3)), rng.normal(size=(20_000, 3)), near=0.05)
     exact, short = (
         plane_hits(*(x.to(dtype) for x in ray), Frames.pack(plans, dtype=dtype)) for dtype in (F64, torch.float32)
     )
-    assert exact.count.sum() > 5_000_000
+    assert exact.count.sum() > (5_000_000 if math.isinf(deep) else 2_000_000)
     differ = (exact.count != short.count) | ((exact.m_first != short.m_first) & (exact.count > 0))
     assert differ.sum() <= 20
     for r, k in differ.nonzero().tolist():
@@ -244,6 +282,7 @@ def test_rigid_motion_and_scaling_of_the_scene_change_nothing(mpi, origin, direc
         origin=tuple(map(float, scale * (turn @ np.array(mpi.origin) + shift))),
         axes=tuple(tuple(map(float, turn @ np.array(row))) for row in mpi.axes),
         near=mpi.near * scale,
+        far=mpi.far * scale,
         extent=mpi.extent,
         planes=mpi.planes,
     )
@@ -293,7 +332,7 @@ def test_world_to_ndc_undoes_ndc_to_world_and_both_equal_the_oracle(mpi, ndc, at
     given_ndc = torch.tensor(ndc, dtype=F64)[None]
     x, w = ndc_to_world(given_ndc, torch.zeros(1, dtype=torch.int64), frames)
     point, is_direction = oracle.ndc_to_world(mpi, ndc)
-    assert (w.item() == 0) == is_direction == (ndc[2] == 1)
+    assert (w.item() == 0) == is_direction == (ndc[2] == 1 and math.isinf(mpi.far))
     if w.item() > 1e-6:
         reach = np.abs(point).max() + np.abs(mpi.origin).max()
         assert np.allclose((x / w[:, None])[0], point, rtol=1e-9, atol=1e-9 * reach)
@@ -307,7 +346,7 @@ def test_world_to_ndc_undoes_ndc_to_world_and_both_equal_the_oracle(mpi, ndc, at
 
 def test_ndc_of_samples_equals_the_oracle_in_every_mpi():
     rng = np.random.default_rng(8)
-    plans = [random_mpi(rng) for _ in range(5)]
+    plans = [random_mpi(rng, deep=deep) for deep in (math.inf, math.inf, 8.0, 2.0, 30.0)]
     origins, dirs, *_ = rays(rng.normal(size=(200, 3)), rng.normal(size=(200, 3)))
     inverse_t = torch.tensor(rng.uniform(0.01, 2, size=200), dtype=F64)
     inverse_t[::7] = 0
@@ -353,7 +392,7 @@ def test_plane_exactly_at_near_or_far_is_kept(dtype):
     """Division finds the range only to one plane; whether a plane at the border is in it, its own distance decides."""
     for planes in range(2, 130):
         frames = Frames.pack([make_mpi(planes=planes)], dtype=dtype)
-        w = sample_disparity(torch.arange(1, planes), frames.disparity_steps)
+        w = sample_disparity(torch.arange(1, planes), frames.disparity_steps, frames.last_disparities)
         distance = (1 / w)[:, None]
         o, d, zeros, infinite = (x.expand(planes - 1, -1) for x in rays([0, 0, 0], [0, 0, 1], dtype=dtype))
         to_far = plane_hits(o, d, zeros, distance, frames)

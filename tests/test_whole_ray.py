@@ -84,7 +84,7 @@ def render_by_modules(scene, origin, direction, form, dtype):
     parts = []
     for k, grid in enumerate(grids):
         m = hits.m_first[0, k] - torch.arange(int(hits.count[0, k]))
-        w = sample_disparity(m, frames.disparity_steps[k])
+        w = sample_disparity(m, frames.disparity_steps[k], frames.last_disparities[k])
         inverse_t = inverse_distance(w, hits.local_origins[0, k, 2], hits.local_directions[0, k, 2])
         ndc, cover = samples_to_ndc(o.expand(len(m), 3), d.expand(len(m), 3), inverse_t, frames)
         cover[:, k] = True

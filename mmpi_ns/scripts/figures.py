@@ -153,7 +153,7 @@ def _distances(mpis: list[MPIPlan], origin: np.ndarray, direction: np.ndarray) -
     found = []
     for k in range(len(mpis)):
         m = hits.m_first[0, k] - torch.arange(int(hits.count[0, k]))
-        w = sample_disparity(m, frames.disparity_steps[k])
+        w = sample_disparity(m, frames.disparity_steps[k], frames.last_disparities[k])
         inverse = inverse_distance(w, hits.local_origins[0, k, 2], hits.local_directions[0, k, 2])
         found.append(np.array([1 / x if x > 0 else np.inf for x in inverse.tolist()]))
     return found
