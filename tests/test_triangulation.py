@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mmpi_ns.triangulation import NEIGHBOURS, PosedImages, triangulate
+from mmpi_ns import triangulation
+from mmpi_ns.triangulation import EFFORTS, NEIGHBOURS, PosedImages, triangulate
 
 WIDTH, HEIGHT, FOCAL = 200, 150, 180.0
 LENS = (0.05, -0.02, 0.001, -0.002)
@@ -53,10 +54,21 @@ def is_near_wall(points):
     return points[:, 0] < 0.2
 
 
-def picture(pose, lens):
+def undistort_fisheye(x, y, lens):
+    """Directions whose fisheye projection (angle a at radius a (1 + k1 a^2 + ... + k4 a^8)) falls on (x, y)."""
+    radius = np.hypot(x, y)
+    angle = radius.copy()
+    for _ in range(30):
+        angle = radius / (1 + sum(k * angle ** (2 * n + 2) for n, k in enumerate(lens)))
+    stretch = np.tan(angle) / radius
+    return x * stretch, y * stretch
+
+
+def picture(pose, lens, fisheye=False):
     """Gray image of a near wall (z = -3, x < 0.2) before a far one (z = -5)."""
     xs, ys = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
-    u, v = undistort((xs - WIDTH / 2) / FOCAL, (ys - HEIGHT / 2) / FOCAL, lens)
+    inverse = undistort_fisheye if fisheye else undistort
+    u, v = inverse((xs - WIDTH / 2) / FOCAL, (ys - HEIGHT / 2) / FOCAL, lens)
     d = np.stack([u, -v, -np.ones_like(u)], -1).reshape(-1, 3) @ pose[:, :3].T
     near, far = ((z - pose[2, 3]) / d[:, 2] for z in (-3.0, -5.0))
     a, b = pose[:, 3] + near[:, None] * d, pose[:, 3] + far[:, None] * d
@@ -64,12 +76,13 @@ def picture(pose, lens):
     return gray.reshape(HEIGHT, WIDTH)
 
 
-def scene_of(folder, poses, lens=(0.0, 0.0, 0.0, 0.0)):
+def scene_of(folder, poses, lens=(0.0, 0.0, 0.0, 0.0), fisheye=False, contrast=1.0):
     folder.mkdir(exist_ok=True)
     files = []
     for i, pose in enumerate(poses):
         files.append(folder / f"view{i}.png")
-        Image.fromarray((picture(pose, lens) * 255).round().astype(np.uint8)).save(files[-1])
+        gray = 0.5 + contrast * (picture(pose, lens, fisheye) - 0.5)
+        Image.fromarray((gray * 255).round().astype(np.uint8)).save(files[-1])
     count = len(poses)
     return PosedImages(
         files=tuple(files),
@@ -77,6 +90,7 @@ def scene_of(folder, poses, lens=(0.0, 0.0, 0.0, 0.0)):
         intrinsics=np.tile([FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2], (count, 1)),
         sizes=np.tile([float(WIDTH), HEIGHT], (count, 1)),
         distortion=np.tile(lens, (count, 1)),
+        fisheye=fisheye,
     )
 
 
@@ -110,6 +124,33 @@ def test_points_lie_on_the_walls(model):
 def test_ignoring_the_lens_would_misplace_the_points(images, model):
     pinhole = triangulate(replace(images, distortion=np.zeros_like(images.distortion)))
     assert np.median(depth_error(model.points)) < 0.5 * np.median(depth_error(pinhole.points))
+
+
+def test_a_fisheye_lens_is_taken_for_what_it_is(tmp_path):
+    images = scene_of(tmp_path, POSES, (0.08, -0.03, 0.02, 0.01), fisheye=True)
+    points = triangulate(images).points
+    assert len(points) > 100 and np.median(depth_error(points)) < 0.005
+    others = triangulate(replace(images, fisheye=False)).points
+    assert not len(others) or np.median(depth_error(others)) > 0.01
+
+
+def test_faint_images_are_searched_more_thoroughly_and_others_are_not(tmp_path, images, monkeypatch):
+    efforts, attempt = [], triangulation._attempt
+
+    def spy(pycolmap, images, effort):
+        efforts.append(effort)
+        return attempt(pycolmap, images, effort)
+
+    monkeypatch.setattr(triangulation, "_attempt", spy)
+    faint = scene_of(tmp_path, POSES[:4], contrast=0.12)
+    points = triangulate(faint).points
+    assert efforts == list(EFFORTS) and np.median(depth_error(points)) < 0.02
+    monkeypatch.setattr(triangulation, "EFFORTS", EFFORTS[:1])
+    assert len(triangulate(faint).points) < 0.5 * len(points)
+    monkeypatch.setattr(triangulation, "EFFORTS", (EFFORTS[1], EFFORTS[0]))
+    efforts.clear()
+    triangulate(images)
+    assert efforts == [EFFORTS[1]]
 
 
 def test_keypoints_are_where_the_points_project(images, model):
