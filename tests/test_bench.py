@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
 
-from mmpi_ns.bench import dense
-from mmpi_ns.bench.regions import spearman
+from mmpi_ns.bench import dense, regions, results
+from mmpi_ns.bench.regions import Regions, spearman
 from mmpi_ns.bench.suites import SUITES
 from mmpi_ns.mmpi_field import MMPIField
 from mmpi_ns.mmpi_sampler import MMPISampler
+from mmpi_ns.placement.plan import MPIPlan, ScenePlan
 
 
 def test_the_dense_reference_renders_what_the_sampler_renders(monkeypatch):
@@ -46,3 +50,48 @@ def test_rank_correlation_asks_for_order_alone():
     assert spearman(a, -a) == pytest.approx(-1)
     # Ties share their mean rank: ranks (1.5, 1.5, 3, 4) against (1, 2, 3, 4).
     assert spearman(np.array([5.0, 5.0, 6.0, 7.0]), np.arange(4.0)) == pytest.approx(0.9486832981)
+
+
+def test_regions_pair_what_is_expected_with_what_is_measured_there():
+    """A camera at the origin looks along -z at three groups of points; its image is 40 x 30, regions 10 x 10."""
+    groups = {(2.0, 7.0): 6, (33.0, 22.0): 5, (22.0, 12.0): 4}  # the last is too small
+    pixels = np.repeat(list(groups), list(groups.values()), axis=0)
+    depth = np.concatenate([np.full(6, 10.0), np.full(5, 20.0), np.full(4, 5.0)])
+    points = np.column_stack([(pixels[:, 0] - 20) / 25, -(pixels[:, 1] - 15) / 25, -np.ones(15)]) * depth[:, None]
+    behind = -points[:6]
+    camera = SimpleNamespace(
+        fx=25.0, fy=25.0, cx=20.0, cy=15.0, width=40, height=30, camera_to_worlds=torch.eye(4)[None, :3]
+    )
+    axes = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0))
+    # 3 behind the camera: a texel of 0.04 spans 25 * 0.04 * D / (D - 3) pixels at the depth D in the MPI.
+    mpi = MPIPlan("one", (0.0, 0.0, 3.0), axes, 4.0, (-1.0, 1.0, -1.0, 1.0), 10_000, 51, 51)
+    squared = np.arange(1200.0).reshape(30, 40)
+    found = Regions(Path(), rows=3, columns=4)._regions(
+        regions._as_observations(camera), np.concatenate([points, behind]), ScenePlan((mpi,), None, 0.1, 1.0), squared
+    )
+    assert found[0] == pytest.approx([0.5 * 13 / 10, 0.5 * 23 / 20], rel=1e-3)
+    cells = squared[:10, :10], squared[20:, 30:]
+    assert found[1] == pytest.approx([np.sqrt(c.mean()) for c in cells])
+
+
+def test_a_row_of_results_says_what_was_run(tmp_path):
+    models = tmp_path / "nerfstudio_models"
+    models.mkdir()
+    for step in (999, 1999, 10):
+        (models / f"step-{step:09d}.ckpt").touch()
+    assert results._steps(tmp_path) == 2000
+    suite = SUITES["fox"]
+    row = {
+        "psnr": 21.237, "ssim": 0.81, "lpips_vgg": 0.4567, "num_rays_per_sec": 1234.5, "train_seconds": 99.6,
+        "steps": 2000, "threads": 2, "mpis": 7, "texels": 12_345_678, "e_p_50": 0.1, "e_p_90": 0.2, "e_t_50": 1.5,
+        "e_t_90": 2.5, "processor": "2 cores of X", "commit": "abc", "date": "2026-01-02",
+    }  # fmt: skip
+    rows = {results._key(suite[0]): row}
+    lines = results.Results(Path(), "fox", 2)._table(rows).splitlines()
+    (line,) = [x for x in lines if x.startswith(f"| {suite[0].name} |")]
+    wanted = [suite[0].name, "21.24", "0.810", "0.457", "2.05 M", "100", "2", "1234", "7", "12.3", "0.10 / 0.20",
+              "1.50 / 2.50"]  # fmt: skip
+    assert [c.strip() for c in line.strip("|").split("|")] == wanted
+    header = next(x for x in lines if x.startswith("| variant |"))
+    assert header.count("|") == line.count("|") == lines[lines.index(header) + 1].count("|")
+    assert "2 cores of X" in lines[2] and "Commits: abc (2026-01-02)" in lines[-2 if not lines[-1] else -1]

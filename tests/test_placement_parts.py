@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from mmpi_ns.placement import rule
 from mmpi_ns.placement.candidates import Candidate, find_candidates, spread_cameras
 from mmpi_ns.placement.content import find_content
 from mmpi_ns.placement.coverage import widened
@@ -70,6 +71,18 @@ def test_without_points_content_starts_at_a_tenth_of_the_cameras_spread():
     assert find_content(observed([[0.0, 0, 0], [10, 0, 0]])).near == pytest.approx(0.5)
 
 
+def test_planes_begin_a_little_before_the_content_of_the_camera_or_of_all_where_that_is_nearer():
+    depths = np.repeat([10.0, 100.0], 40)
+    observations = observed([[0.0, 0, 0], [30, 0, 0]], [[0, 0, -d] for d in depths], np.repeat([0, 1], 40))
+    content = find_content(observations)
+    assert content.near == 55
+    found = {(c.frame.name, c.frame.origin[2]): c.frame.near for c in find_candidates(observations, content, False)}
+    assert found == pytest.approx({
+        ("view 1", 0.0): 6, ("view 1", 55.0): 61, ("view 1", 110.0): 116,
+        ("view 2", 0.0): 33, ("view 2", 55.0): 88, ("view 2", 110.0): 143,
+    })  # fmt: skip
+
+
 def turned_about_y(angles):
     return np.array([[[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]] for a in angles])
 
@@ -81,30 +94,28 @@ def test_candidates_start_from_cameras_far_apart_in_direction_too():
     assert np.diff(chosen).tolist() == [2, 2, 2]
 
 
-def orbit(inwards: bool) -> Observations:
-    """Sixteen cameras on a circle of radius 4 with keypoints around its centre (or around the circle)."""
-    angles = 2 * np.pi * np.arange(16) / 16
-    turns = turned_about_y(angles)
-    centers = 4 * turns[:, :, 2] * (1 if inwards else -1)
-    points = np.random.default_rng(0).uniform(-1, 1, (40, 3)) if inwards else 12 * -turns[:, :, 2]
-    seen_by = np.repeat(np.arange(16), len(points)) if inwards else np.arange(16)
-    seen_point = np.tile(np.arange(len(points)), 16) if inwards else np.arange(16)
-    return observed(centers, points, seen_by, seen_point, turns)
+def orbit(inwards: int = 16) -> Observations:
+    """Sixteen cameras on a circle of radius 4; so many look at keypoints around its centre, the others away from it."""
+    turns = turned_about_y(2 * np.pi * np.arange(16) / 16)
+    centers = 4 * turns[:, :, 2]
+    turns[inwards:] *= [-1, 1, -1]
+    points = np.random.default_rng(0).uniform(-1, 1, (40, 3))
+    return observed(centers, points, np.repeat(np.arange(inwards), 40), np.tile(np.arange(40), inwards), turns)
 
 
-def test_cubes_stand_where_the_cameras_look_and_nowhere_if_they_look_outwards():
+def test_cubes_stand_where_the_cameras_look_and_nowhere_if_many_look_elsewhere():
     def cubes(observations):
         found = find_candidates(observations, find_content(observations), with_cubes=True)
         return [c.frame for c in found if isinstance(c.frame, CubePlan)]
 
-    found = cubes(orbit(inwards=True))
+    found = cubes(orbit())
     assert [c.upper[0] for c in found] == pytest.approx([1.6, 2.8, 4.0])
     assert np.allclose(np.add([c.lower for c in found], [c.upper for c in found]), 0, atol=1e-9)
-    assert cubes(orbit(inwards=False)) == []
+    assert len(cubes(orbit(inwards=13))) == 3 and cubes(orbit(inwards=12)) == []
 
 
 def test_a_candidates_errors_are_those_of_the_mpi_or_cube_made_of_it():
-    observations = orbit(inwards=True)
+    observations = orbit()
     content = find_content(observations)
     candidates = find_candidates(observations, content, with_cubes=True)
     seen = {CubePlan: 0, MPIPlan: 0}
@@ -143,10 +154,10 @@ def test_texel_error_takes_the_worse_side_and_each_side_its_own_focal_length():
 
 def test_a_cubes_error_is_the_longest_side_of_a_voxel_at_the_points_depth():
     observations = observed([[0.0, 0, 4]])
-    cube = CubePlan((-1.0, -2.0, -3.0), (1.0, 2.0, 3.0), (60, 10, 40))  # z, y, x: voxels of 0.05, 0.4, 0.1
+    cube = CubePlan((-1.0, -2.0, -3.0), (1.0, 2.0, 3.0), (10, 40, 20))  # z, y, x: voxels of 0.1, 0.1, 0.6
     points = np.array([[0.5, 1.5, -1.0], [0.5, 1.5, 2.0], [0.5, 2.1, 2.0]])
     found = cube_errors(cube, observations, np.zeros(3, np.int64), points)
-    assert found == pytest.approx([0.4 * FX / 5, 0.4 * FX / 2, np.inf])
+    assert found == pytest.approx([0.6 * FX / 5, 0.6 * FX / 2, np.inf])
 
 
 def test_both_errors_count_as_one_and_a_summary_takes_the_head_that_serves_best():
@@ -215,8 +226,40 @@ def test_there_is_one_cube_at_most_and_never_a_cube_alone():
     assert any(isinstance(h, MPIPlan) for h in alone)
 
 
+@pytest.mark.parametrize(("finest", "wanted"), [(3.1, 3.22), (1000.0, 10.0)])
+def test_the_finest_plan_within_the_budget_is_kept_and_the_coarsest_where_none_is(monkeypatch, finest, wanted):
+    """Texels here are few from a size on; the last of the eight attempts is too fine again."""
+    tried = []
+
+    class Few:
+        def __init__(self, candidates, weights, config, texel_pixels):
+            tried.append(texel_pixels)
+
+        def run(self):
+            side = 10 if tried[-1] >= finest else 100
+            return [mpi(name=str(len(tried)), planes=2, height=side, width=side)]
+
+    monkeypatch.setattr(rule, "_Choice", Few)
+    monkeypatch.setattr(rule, "widened", lambda mpis, *_: mpis)
+    observations = orbit()
+    config = PlacementConfig(max_texels=2000, texel_pixels=1.5)
+    (found,) = rule._choose(observations, find_content(observations), config, 1.5)
+    if finest < 100:
+        assert found.texels == 200 and len(tried) == rule.BUDGET_ROUNDS and tried[-1] < finest
+        assert tried[int(found.name) - 1] == min(t for t in tried if t >= finest) == pytest.approx(wanted, abs=0.02)
+    else:
+        assert found.name == str(len(tried)) and tried[-1] == max(tried) > wanted
+
+
 def test_mpis_at_one_camera_have_different_names():
     assert [m.name for m in _named((marked(7), marked(7)))] == ["7 (0)", "7 (1)"]
+
+
+def test_rays_start_at_a_fifth_of_the_way_to_the_content():
+    observations = orbit()
+    plan = rule.place(observations, PlacementConfig())
+    near = find_content(observations).near
+    assert 2 < near < 4 and plan.content_near == near and plan.ray_near == pytest.approx(near / 5)
 
 
 # Coverage and the table ----------------------------------------------------------------------------------------------
@@ -242,15 +285,21 @@ def test_only_one_side_that_is_missing_is_widened():
     assert got.height == round(60 * 2.55 / 2.3) + 1
 
 
+def looking_aside(degrees) -> Observations:
+    turns = turned_about_y([np.radians(degrees)])
+    return observed([[0.0, 0, 0]], np.tile(-10 * turns[0][:, 2], (30, 1)), np.zeros(30), turns=turns)
+
+
 def test_nothing_is_widened_far_or_beyond_the_widest_tangent():
-    turns = turned_about_y([np.radians(60)])
-    observations = observed([[0.0, 0, 0]], np.tile(-10 * turns[0][:, 2], (30, 1)), np.zeros(30), turns=turns)
-    content = find_content(observations)
-    # The image spans tangents 0.57 to 10.6 (and infinity) on this MPI's left.
-    (got,) = widened([mpi(extent=(-0.6, 0.6, -3.0, 3.0))], observations, content)
-    assert -1.1 <= got.extent[0] < -0.6
-    (got,) = widened([mpi(extent=(-2.9, 0.6, -3.0, 3.0))], observations, content)
-    assert -3.0 <= got.extent[0] <= -2.9
+    # Border points lie at -1.1, -0.55, 0, ... times 2/3 from the image's middle, whose tangent is -1.73 here.
+    observations = looking_aside(60)
+    (got,) = widened([mpi(extent=(-0.6, 0.6, -3.0, 3.0))], observations, find_content(observations))
+    aside = np.tan(np.radians(60) - np.arctan(1.1 / 3))
+    assert got.extent == pytest.approx([-aside, 0.6, -3, 3])  # -0.83; -1.73 would be too far
+    wide, middle = mpi(extent=(-2.9, 0.6, -3.0, 3.0)), looking_aside(np.degrees(np.arctan(2.95)))
+    assert widened([wide], middle, find_content(middle))[0].extent[0] == pytest.approx(-2.95)
+    middle = looking_aside(np.degrees(np.arctan(3.05)))
+    assert widened([wide], middle, find_content(middle)) == [wide]
 
 
 def test_the_table_says_what_a_slow_count_finds():
