@@ -44,19 +44,23 @@ def blend_shares(
     # Only differences matter, and they are exact only where the numbers are small: the highest becomes 0.
     highest = torch.where(cover, reliability, torch.full_like(reliability, lowest)).amax(-1, keepdim=True).detach()
     reliability = reliability - highest
-    masked = torch.where(cover, reliability, torch.full_like(reliability, lowest))
-    total = torch.logsumexp(masked, -1)
     is_own = torch.arange(cover.shape[-1], device=cover.device) == own[:, None]
-    own_value = torch.where(is_own, masked, torch.zeros_like(masked)).sum(-1)
+    own_value = torch.where(is_own, reliability, torch.zeros_like(reliability)).sum(-1)
     others = cover & ~is_own
     has_others = others.any(-1)
     # A row without others would be a logsumexp over nothing: give it a harmless row and mask the result.
     other_values = torch.where(others, reliability, torch.full_like(reliability, lowest))
     other_values = torch.where(has_others[:, None], other_values, torch.zeros_like(other_values))
-    log_rest = torch.logsumexp(other_values, -1) - total
-    log_share = torch.where(has_others, own_value - total, torch.zeros_like(total)).clamp(max=0)
-    log_rest = torch.where(has_others, log_rest.clamp(max=0), torch.full_like(total, -torch.inf))
+    odds = torch.logsumexp(other_values, -1) - own_value
+    # As softplus both logs and both slopes are exact at P near 0 and 1; differences with the sum of all cancel there.
+    log_share = torch.where(has_others, -_softplus(odds), torch.zeros_like(odds))
+    log_rest = torch.where(has_others, -_softplus(-odds), torch.full_like(odds, -torch.inf))
     return log_share, log_rest
+
+
+def _softplus(x: Tensor) -> Tensor:
+    """log(1 + e^x); torch's own returns x from 20 on, which float64 can tell from it."""
+    return torch.nn.functional.softplus(x, threshold=50)
 
 
 def blended_optical_depth(

@@ -201,6 +201,21 @@ def test_float32_gradients_are_finite_on_every_hard_input(form):
         assert torch.isfinite(output) and torch.isfinite(reliability.grad).all() and torch.isfinite(tau.grad).all()
 
 
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("gap", [-80.0, -30.0, -10.0, 10.0, 30.0, 80.0])
+def test_small_gradients_of_reliability_are_right_in_float32(form, gap):
+    """Where P is near 0 or 1 the slopes P (1 - P) are tiny; Adam makes full steps of them, so their sign must be true."""
+    for tau in (1e-3, 1.0, 30.0):
+        reliability = torch.tensor([[gap, 0.0]], requires_grad=True)
+        shares = blend_shares(reliability, torch.ones(1, 2, dtype=torch.bool), torch.tensor([0]))
+        blended_optical_depth(torch.tensor([tau]), *shares, form).sum().backward()
+        h, either = 1e-3, np.ones(2, bool)
+        above, below = (oracle.blended_depth(tau, [gap + s, 0.0], either, 0, form) for s in (h, -h))
+        assert reliability.grad[0].tolist() == pytest.approx(
+            [(above - below) / 2 / h, -(above - below) / 2 / h], rel=1e-4
+        )
+
+
 def test_reliability_learns_in_the_direction_that_helps():
     """Own head opaque, other head empty: raising the own reliability raises the weight, by w's derivative P (1 - P)."""
     reliability = tensor([[0.3, -0.2]]).requires_grad_()
