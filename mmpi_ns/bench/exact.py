@@ -1,8 +1,8 @@
 """Exact geometry, blending and compositing to measure the fast paths against, with exact gradients.
 
 Float64 and 60-digit decimals, one ray at a time, every plane by itself. Shares no code with ``geometry``,
-``compositing``, ``ops``, the sampler or the field: plans come in as plain data. Compared with ``tests/oracle.py``, and its
-gradients with finite differences, in ``tests/test_bench_exact.py``.
+``compositing``, ``ops``, the sampler or the field: plans come in as plain data. ``tests/test_bench_exact.py`` compares it
+with ``tests/oracle.py``, and its gradients with finite differences.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ def cross(mpi: MPIPlan, origin: Array, direction: Array, near: float, far: float
     if not d[2] > FACING:
         nothing = np.zeros(count)
         return Crossings(nothing > 0, nothing, nothing, nothing, nothing, nothing, nothing + facing_margin)
-    w = np.arange(count - 1, -1, -1) / (count - 1) / mpi.near
+    w = disparities(mpi)
     ahead = 1 - w * o[2]
     q = w * d[2] / np.where(ahead != 0, ahead, np.nan)
     u = d[0] / d[2] + w * (o[0] - o[2] * (d[0] / d[2]))
@@ -110,10 +110,17 @@ def cross(mpi: MPIPlan, origin: Array, direction: Array, near: float, far: float
     return Crossings(live, q, u, v, size_uv, size_q, np.minimum(margin, facing_margin))
 
 
+def disparities(mpi: MPIPlan) -> Array:
+    """1 / depth of every plane, evenly spaced from near to far (or to infinity, 0). [L]"""
+    share = np.arange(mpi.planes) / (mpi.planes - 1)
+    return (1 - share) / mpi.near + share / mpi.far
+
+
 def to_ndc(mpi: MPIPlan, u: Array, v: Array, w: Array) -> Array:
     """(u, v, s), each in [-1, 1] over the frustum, from tangents and disparity."""
     u0, u1, v0, v1 = mpi.extent
-    return np.stack([2 * (u - u0) / (u1 - u0) - 1, 2 * (v - v0) / (v1 - v0) - 1, 1 - 2 * mpi.near * w], -1)
+    s = 2 * (1 / mpi.near - w) / (1 / mpi.near - 1 / mpi.far) - 1
+    return np.stack([2 * (u - u0) / (u1 - u0) - 1, 2 * (v - v0) / (v1 - v0) - 1, s], -1)
 
 
 def place_in(
@@ -126,7 +133,7 @@ def place_in(
         return None
     ndc = to_ndc(mpi, np.float64(x / z), np.float64(y / z), np.float64(inverse_t / z))
     widest = 2 / min(mpi.extent[1] - mpi.extent[0], mpi.extent[3] - mpi.extent[2])
-    steep = (1 + max(abs(x), abs(y)) / z) * (widest + mpi.near * inverse_t)
+    steep = (1 + max(abs(x), abs(y)) / z) * (widest + inverse_t / (1 / mpi.near - 1 / mpi.far))
     return ndc, float(1 + steep * (reach * inverse_t + 1) / z)
 
 
@@ -161,12 +168,15 @@ def sigmoid(x: Array | float) -> Array:
     return np.where(x >= 0, 1 / (1 + small), small / (1 + small))
 
 
-def plane_bias(planes: int) -> tuple[Array, float]:
-    """Biases with which all planes start at equal weight, and the interval 256 / L. Solved in decimals."""
+def plane_bias(planes: int, missing: float = 0.0) -> tuple[Array, float]:
+    """Biases with which all planes start at equal weight, and the interval 256 / L. Solved in decimals.
+
+    An MPI that ends lacks its last planes (so many, a real number), whose weight is left to what lies behind.
+    """
     interval = Decimal(256) / planes
     biases = []
     for plane in range(planes):
-        alpha = min(Decimal(1) / (planes - plane), Decimal("0.999"))
+        alpha = min(1 / (planes - plane + Decimal(missing)), Decimal("0.999"))
         depth = -_DIGITS.ln(1 - alpha) / interval
         biases.append(float(_DIGITS.ln(_DIGITS.exp(depth) - 1)))
     return np.array(biases), float(interval)

@@ -91,6 +91,8 @@ class Sample:
     head: int
     plane: int
     inverse_t: float
+    size_q: float
+    """Magnitudes that 1/t is made of."""
     raw: float
     """Interpolated density plus bias."""
     scale: float
@@ -124,9 +126,9 @@ class ExactRay:
             met = exact.cross(mpi, self.origin, self.direction, self.near, self.far, self.jitter)
             self.margin = min(self.margin, float(met.margin.min()))
             for plane in np.nonzero(met.live)[0]:
-                w = (mpi.planes - 1 - plane) / (mpi.planes - 1) / mpi.near
-                ndc = exact.to_ndc(mpi, met.u[plane], met.v[plane], w)
-                self.samples.append(self._sample(k, int(plane), float(met.inverse_t[plane]), ndc))
+                ndc = exact.to_ndc(mpi, met.u[plane], met.v[plane], exact.disparities(mpi)[plane])
+                q = float(met.inverse_t[plane]), float(met.size_q[plane])
+                self.samples.append(self._sample(k, int(plane), q, ndc))
         if plan.cube is not None:
             sides = [
                 (b - a) / (n - 1)
@@ -137,11 +139,16 @@ class ExactRay:
             self.margin = min(self.margin, margin)
             for i in found:
                 t = (i + 0.5) * step
-                self.samples.append(self._sample(len(plan.mpis), i, 1 / t, self._in_cube(1 / t)))
+                self.samples.append(self._sample(len(plan.mpis), i, (1 / t, 1 / t), self._in_cube(1 / t)))
         self.samples.sort(key=lambda s: (-s.inverse_t, s.head, s.plane))
         for a, b in itertools.pairwise(self.samples):
             if a.head != b.head and a.inverse_t != b.inverse_t:
-                self.margin = min(self.margin, (a.inverse_t - b.inverse_t) / (1 + a.inverse_t))
+                self.margin = min(self.margin, (a.inverse_t - b.inverse_t) / (a.size_q + b.size_q))
+
+    def _bias(self, k: int) -> Array:
+        mpi = self.field.plan.mpis[k]
+        step = (1 / mpi.near - 1 / mpi.far) / (mpi.planes - 1)
+        return exact.plane_bias(mpi.planes, 1 / mpi.far / step)[0]
 
     def _in_cube(self, inverse_t: float) -> Array:
         assert self.field.plan.cube is not None
@@ -149,13 +156,12 @@ class ExactRay:
         point = self.origin + self.direction / inverse_t
         return self.jitter(2 * (point - lower) / (upper - lower) - 1, 1.0 + np.abs(point / (upper - lower)))
 
-    def _sample(self, k: int, plane: int, inverse_t: float, ndc: Array) -> Sample:
-        f, plan = self.field, self.field.plan
+    def _sample(self, k: int, plane: int, q: tuple[float, float], ndc: Array) -> Sample:
+        f, plan, (inverse_t, size_q) = self.field, self.field.plan, q
         if k < len(plan.mpis):
             corners = [((plane, *at), w) for at, w in _corners(ndc[1::-1], f.density[k].shape[1:3])]
             axes = np.array(plan.mpis[k].axes)
-            biases, interval = exact.plane_bias(plan.mpis[k].planes)
-            bias, scale = biases[plane], interval * f.depth_scale
+            bias, scale = self._bias(k)[plane], 256 / plan.mpis[k].planes * f.depth_scale
         else:
             corners, axes = _corners(ndc[::-1], f.density[k].shape[:3]), np.eye(3)
             scale = 1 / f.samples_per_voxel
@@ -166,7 +172,7 @@ class ExactRay:
         inputs = self._encode(ndc, axes @ self.direction, features)
         tau = float(self.jitter(exact.softplus(raw) * scale))
         color = self._network(k, inputs, features)[0]
-        return Sample(k, plane, inverse_t, raw, scale, tau, votes, cover, inputs, color, corners, vote_corners)
+        return Sample(k, plane, inverse_t, size_q, raw, scale, tau, votes, cover, inputs, color, corners, vote_corners)
 
     def _votes(self, own: int, inverse_t: float, own_ndc: Array):
         """Reliability of every head at a sample, which of them cover it, and the texels that were read."""

@@ -1,0 +1,166 @@
+"""What a stability case is: an input, what should come of it, and how far from it each arithmetic may land."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mmpi_ns.bench.exact import Array
+from mmpi_ns.placement.plan import CubePlan, MPIPlan, ScenePlan
+
+UNIT = 2.0**-24
+"""Unit roundoff of float32: the largest relative error of one rounding."""
+FLOOR = 1e-37
+"""Below this float32 runs out of exponents; smaller differences count as none."""
+
+
+@dataclass(frozen=True)
+class Precision:
+    """Under which arithmetic a case runs."""
+
+    name: str
+    network_unit: float
+    """Unit roundoff inside the colour networks, the one part that may run in reduced precision."""
+    dtype: torch.dtype | None = None
+    """Of autocast; None: off."""
+
+    def context(self) -> AbstractContextManager:
+        return contextlib.nullcontext() if self.dtype is None else torch.autocast("cpu", self.dtype)
+
+
+PRECISIONS = (Precision("float32", UNIT), Precision("bfloat16 autocast", 2.0**-9, torch.bfloat16))
+
+
+@dataclass(frozen=True)
+class Error:
+    """An error beside its bound, both in the same measure. Not finite where the result was not finite."""
+
+    error: float
+    bound: float
+
+    @property
+    def holds(self) -> bool:
+        return math.isfinite(self.error) and self.error <= self.bound
+
+    @staticmethod
+    def worst(errors: list[Error]) -> Error:
+        """The one that uses most of its bound."""
+        return max(errors, key=lambda e: math.inf if not math.isfinite(e.error) else e.error / max(e.bound, 1e-300))
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a case measured; ``gradient`` is None where nothing is differentiated."""
+
+    value: Error
+    gradient: Error | None = None
+
+    @property
+    def holds(self) -> bool:
+        return self.value.holds and (self.gradient is None or self.gradient.holds)
+
+
+@dataclass(frozen=True)
+class Case:
+    """One row of the table."""
+
+    group: str
+    inputs: str
+    expectation: str
+    measure: Callable[[Precision], Outcome]
+
+
+def as_array(values: Tensor | Array) -> Array:
+    return values.detach().double().cpu().numpy() if isinstance(values, Tensor) else np.asarray(values, np.float64)
+
+
+def compare(found: Tensor | Array, wanted: Array, size: Array | float, roundings: float) -> Error:
+    """Largest error in units of ``size`` (the magnitudes that a number is made of), beside ``roundings`` of them."""
+    found, wanted = as_array(found), np.asarray(wanted, np.float64)
+    if found.shape != wanted.shape:
+        raise ValueError(f"A case compares shapes {found.shape} and {wanted.shape}.")
+    if not np.isfinite(found).all():
+        return Error(math.inf, roundings * UNIT)
+    gap = np.maximum(np.abs(found - wanted) - FLOOR, 0)
+    return Error(float((gap / np.maximum(size, FLOOR)).max(initial=0.0)), roundings * UNIT)
+
+
+def count_wrong(wrong: int | float) -> Error:
+    """Decisions that must all be right."""
+    return Error(float(wrong), 0.0)
+
+
+# Scenes in numbers that float32 holds exactly, so that rounding the input is not counted as an error ----------------
+
+
+def single(x: Array | float) -> Array:
+    """Rounded to float32."""
+    return np.asarray(x, np.float32).astype(np.float64)
+
+
+def _floats(x: Array) -> tuple[float, ...]:
+    return tuple(float(v) for v in single(x))
+
+
+def snap(mpi: MPIPlan) -> MPIPlan:
+    """The MPI with every number rounded to float32 (the axes stay orthonormal to 1e-7)."""
+    axes = tuple(_floats(np.array(row)) for row in mpi.axes)
+    return replace(
+        mpi,
+        origin=_floats(np.array(mpi.origin)),
+        axes=axes,
+        near=float(single(mpi.near)),
+        far=float(single(mpi.far)),
+        extent=_floats(np.array(mpi.extent)),
+    )
+
+
+def rotation(rng: np.random.Generator) -> Array:
+    """A random right-handed frame, rows are axes."""
+    q, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    return q if np.linalg.det(q) > 0 else -q
+
+
+def random_mpi(rng: np.random.Generator, planes: int = 12, axes: Array | None = None, **changes) -> MPIPlan:
+    """An MPI within a few units of the world's origin, with an asymmetric frustum."""
+    low, wide = -rng.uniform(0.1, 2, 2), rng.uniform(0.5, 4, 2)
+    frame = rotation(rng) if axes is None else axes
+    mpi = MPIPlan(
+        name="random",
+        origin=_floats(rng.normal(size=3) * 2),
+        axes=tuple(_floats(row) for row in frame),  # type: ignore[arg-type]
+        near=float(rng.uniform(0.5, 4)),
+        extent=(low[0], low[0] + wide[0], low[1], low[1] + wide[1]),
+        planes=planes,
+        height=5,
+        width=7,
+    )
+    return snap(replace(mpi, **changes))
+
+
+def plan_of(mpis: list[MPIPlan], cube: CubePlan | None = None, ray_near: float = 0.05) -> ScenePlan:
+    named = tuple(replace(m, name=f"mpi{k}") for k, m in enumerate(mpis))
+    return ScenePlan(named, cube, float(single(ray_near)), 1.0)
+
+
+def rays_at(rng: np.random.Generator, mpis: list[MPIPlan], count: int, spread: float = 0.6) -> tuple[Array, Array]:
+    """Origins around one MPI after the other, and unit directions into its frustum."""
+    origins, directions = [], []
+    for i in range(count):
+        mpi = mpis[i % len(mpis)]
+        u, v = (rng.uniform(a, b) * 0.8 for a, b in (mpi.extent[:2], mpi.extent[2:]))
+        depth = mpi.near / rng.uniform(0.1, 0.9)
+        target = depth * (np.array([u, v, 1.0]) @ np.array(mpi.axes))
+        offset = rng.normal(size=3) * spread * mpi.near
+        origins.append(single(np.array(mpi.origin) + offset))
+        # From the rounded origin: far from the world's origin the rounding may be larger than the offset.
+        direction = np.array(mpi.origin) + target - origins[-1]
+        directions.append(single(direction / np.linalg.norm(direction)))
+    return np.array(origins), np.array(directions)
