@@ -227,3 +227,33 @@ def test_given_intrinsics_are_left_alone_and_others_refined():
         assert options.mapper.abs_pose_refine_focal_length == options.mapper.abs_pose_refine_extra_params == refine
         assert not options.ba_refine_principal_point
         assert options.triangulation.min_angle == 0.5 and options.mapper.init_max_forward_motion == 1
+
+
+@pytest.mark.parametrize(("tangential", "kept"), [(0.0, "SIMPLE_RADIAL"), (0.02, "OPENCV")])
+def test_four_lens_terms_are_kept_only_where_the_images_bear_them_out(tangential, kept, tmp_path):
+    """Exact points seen through a known lens with noise of a third of a pixel, in a model with one radial term."""
+    random, true = np.random.default_rng(0), [300, 300, 100, 80, 0.1, 0.0, tangential, -tangential]
+    lens = pycolmap.Camera(model="OPENCV", params=true, **SIZE)
+    poses = corridor.poses(6, bend=0.15)
+    points = np.column_stack([random.uniform(-2, 4, 400), random.uniform(6, 20, 400), random.uniform(-1, 4, 400)])
+    model = model_of(poses, pycolmap.Camera(model="SIMPLE_RADIAL", params=[300, 100, 80, 0.1], **SIZE))
+    tracks = [pycolmap.Track() for _ in points]
+    for i, image in sorted(model.images.items()):
+        local = (points - poses[i - 1, :3, 3]) @ poses[i - 1, :3, :3]
+        pixels = lens.img_from_cam(local) + random.normal(0, 1 / 3, (400, 2))
+        seen = np.flatnonzero((local[:, 2] > 1) & ((pixels > 0) & (pixels < [200, 160])).all(-1))
+        image.points2D = pycolmap.Point2DList([pycolmap.Point2D(xy) for xy in pixels[seen]])
+        for slot, p in enumerate(seen):
+            tracks[p].add_element(i, slot)
+    for point, track in zip(points, tracks, strict=True):
+        if track.length() > 2:
+            model.add_point3D(point, track, np.zeros(3, np.uint8))
+    mapping.adjust(model, mapping.bundle_options(True, True, False, 1))
+    model.write(tmp_path)
+    found = mapping.polish(model, tmp_path, full_lens=True, principal_point=False, threads=1)
+    (camera,) = found.cameras.values()
+    assert camera.model.name == kept and model.num_points3D() > 150
+    assert camera.params[3 if kept == "SIMPLE_RADIAL" else 4] == pytest.approx(0.1, abs=0.05)
+    if tangential:
+        assert camera.params[6:] == pytest.approx(true[6:], abs=0.004)
+        assert mapping.polish(model, tmp_path, full_lens=False, principal_point=False, threads=1) is model
