@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image
+from value_noise import noise
 
 WIDTH, HEIGHT, FOCAL = 240, 160, 170.0
 EYE = 1.5
@@ -16,23 +17,7 @@ PLANES = (  # axis, place, the two other axes
     (2, 4.0, (0, 1)),
     (1, 26.0, (0, 2)),
 )
-
-
-def noise(u, v, table):
-    """Random texture of three octaves."""
-    total = 0.0
-    for octave, (scale, weight) in enumerate(((1.2, 0.35), (4.0, 0.35), (11.0, 0.3))):
-        i, j = np.floor(u * scale).astype(int), np.floor(v * scale).astype(int)
-        a, b = u * scale - i, v * scale - j
-        a, b = a * a * (3 - 2 * a), b * b * (3 - 2 * b)
-        t = table[octave]
-        parts = [
-            t[(i + di) % 97, (j + dj) % 97] * (a if di else 1 - a) * (b if dj else 1 - b)
-            for di in (0, 1)
-            for dj in (0, 1)
-        ]
-        total = total + weight * sum(parts)
-    return total
+OCTAVES = ((1.2, 0.35), (4.0, 0.35), (11.0, 0.3))
 
 
 def poses(count, step=0.35, bend=0.01):
@@ -57,7 +42,7 @@ def picture(pose, seed=0):
             distance = (place - pose[axis, 3]) / rays[:, axis]
         hit = (distance > 0) & (distance < nearest)
         points = pose[:3, 3] + distance[hit, None] * rays[hit]
-        gray = noise(points[:, others[0]], points[:, others[1]], table)
+        gray = noise(points[:, others[0]], points[:, others[1]], table, OCTAVES)
         image[hit] = np.clip(gray[:, None] * np.array([[1.0, 0.95, 0.8], [0.8, 1.0, 0.9]])[number % 2], 0, 1)
         nearest[hit] = distance[hit]
     return (image.reshape(HEIGHT, WIDTH, 3) * 255).round().astype(np.uint8)

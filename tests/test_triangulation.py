@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from PIL import Image
+from value_noise import noise
 
 from mmpi_ns import triangulation
 from mmpi_ns.triangulation import EFFORTS, NEIGHBOURS, PosedImages, triangulate
@@ -32,22 +33,8 @@ def undistort(x, y, lens):
     return u, v
 
 
-def noise(x, y, seed):
-    """Smooth random texture of two octaves on the plane."""
-    table = np.random.default_rng(seed).random((2, 64, 64))
-    total = 0.0
-    for octave, scale in enumerate((6.0, 14.0)):
-        i, j = np.floor(x * scale).astype(int), np.floor(y * scale).astype(int)
-        a, b = x * scale - i, y * scale - j
-        a, b = a * a * (3 - 2 * a), b * b * (3 - 2 * b)
-        t = table[octave]
-        rows = [
-            t[(i + di) % 64, (j + dj) % 64] * (a if di else 1 - a) * (b if dj else 1 - b)
-            for di in (0, 1)
-            for dj in (0, 1)
-        ]
-        total = total + sum(rows) * (0.5, 0.5)[octave]
-    return total
+def texture(x, y, seed):
+    return noise(x, y, np.random.default_rng(seed).random((2, 64, 64)), ((6.0, 0.5), (14.0, 0.5)))
 
 
 def is_near_wall(points):
@@ -72,7 +59,7 @@ def picture(pose, lens, fisheye=False):
     d = np.stack([u, -v, -np.ones_like(u)], -1).reshape(-1, 3) @ pose[:, :3].T
     near, far = ((z - pose[2, 3]) / d[:, 2] for z in (-3.0, -5.0))
     a, b = pose[:, 3] + near[:, None] * d, pose[:, 3] + far[:, None] * d
-    gray = np.where(is_near_wall(a), noise(a[:, 0], a[:, 1], 1), noise(b[:, 0], b[:, 1], 2))
+    gray = np.where(is_near_wall(a), texture(a[:, 0], a[:, 1], 1), texture(b[:, 0], b[:, 1], 2))
     return gray.reshape(HEIGHT, WIDTH)
 
 
@@ -194,8 +181,8 @@ def test_one_image_gives_no_tracks(images):
 def test_images_that_show_nothing_in_common_give_no_tracks(tmp_path):
     images = scene_of(tmp_path, POSES[:3])
     for seed, file in enumerate(images.files):
-        noise = np.random.default_rng(seed).integers(0, 256, (HEIGHT // 4, WIDTH // 4), dtype=np.uint8)
-        Image.fromarray(noise).resize((WIDTH, HEIGHT), Image.Resampling.BICUBIC).save(file)
+        gray = np.random.default_rng(seed).integers(0, 256, (HEIGHT // 4, WIDTH // 4), dtype=np.uint8)
+        Image.fromarray(gray).resize((WIDTH, HEIGHT), Image.Resampling.BICUBIC).save(file)
     assert len(triangulate(images).points) == 0
 
 

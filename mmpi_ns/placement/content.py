@@ -51,7 +51,7 @@ def find_content(observations: Observations) -> Content:
     cameras, points = observations.seen_by, observations.points[observations.seen_point]
     good = np.isfinite(points).all(-1)
     cameras, points = cameras[good], points[good]
-    depth = _depth(observations, cameras, points)
+    depth = observations.depths(cameras, points)
     cameras, points, depth = cameras[depth > 0], points[depth > 0], depth[depth > 0]
     if not len(points):
         if len(observations.seen_by):
@@ -67,11 +67,6 @@ def find_content(observations: Observations) -> Content:
     return _weighed(observations, cameras, points, nearest, typical, near)
 
 
-def _depth(observations: Observations, cameras: NDArray[np.int64], points: Array) -> Array:
-    poses = observations.camera_to_worlds[cameras]
-    return -np.einsum("qi,qi->q", points - poses[:, :, 3], poses[:, :, 2])
-
-
 def _start(depth: Array) -> float:
     """The least depth from which on a factor of WINDOW holds SUPPORT of all: a lone outlier in front does not count."""
     ordered = np.sort(depth)
@@ -84,7 +79,7 @@ def _weighed(
 ) -> Content:
     count = len(observations.centers)
     # Evenly spaced in an order that no numbering, pose or unit enters: by depth.
-    order = np.argsort(_depth(observations, cameras, points) / near, kind="stable")
+    order = np.argsort(observations.depths(cameras, points) / near, kind="stable")
     wanted = min(len(order), max(SAMPLED, SAMPLED_PER_CAMERA * count))
     keep = order[np.linspace(0, len(order) - 1, wanted).round().astype(int)]
     cameras, points = cameras[keep], points[keep]

@@ -118,8 +118,7 @@ def cube_errors(cube: CubePlan, observations: Observations, cameras: NDArray[np.
     """e_t of observed points in a cube: the pixels that a voxel's longest side spans; inf outside the cube."""
     lower, upper = np.asarray(cube.lower), np.asarray(cube.upper)
     voxel = ((upper - lower) / np.array(cube.shape[::-1])).max()
-    poses = observations.camera_to_worlds[cameras]
-    depth = -np.einsum("qi,qi->q", points - poses[:, :, 3], poses[:, :, 2])
+    depth = observations.depths(cameras, points)
     seen = ((points >= lower) & (points <= upper)).all(-1) & (depth > 0)
     focal = observations.intrinsics[cameras][:, :2].max(-1)
     return np.where(seen, voxel * focal / np.where(seen, depth, 1.0), np.inf)

@@ -49,6 +49,11 @@ class Observations:
         right = _unit(right - right.dot(up) * up)
         return np.stack([right, -up, np.cross(right, -up)])
 
+    def depths(self, cameras: NDArray[np.int64], points: Array) -> Array:
+        """Depths [Q] of points [Q, 3] along the axes of cameras [Q]; negative behind."""
+        poses = self.camera_to_worlds[cameras]
+        return -np.einsum("qi,qi->q", points - poses[:, :, 3], poses[:, :, 2])
+
     def project(self, cameras: NDArray[np.int64], points: Array) -> tuple[Array, NDArray[np.bool_]]:
         """Pixels [Q, 2] at which cameras [Q] would see points [Q, 3], lens distortion left out, and which lie ahead."""
         poses = self.camera_to_worlds[cameras]

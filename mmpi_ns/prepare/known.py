@@ -12,11 +12,10 @@ from mmpi_ns.prepare.features import SEED, matched_keypoints, quiet
 from mmpi_ns.prepare.frame import camera_poses, similarity_between
 from mmpi_ns.prepare.mapping import adjust, bundle_options
 from mmpi_ns.prepare.stages import CONSOLE, PrepareError
+from mmpi_ns.triangulation import MIN_ANGLE
 
 ROUNDS = 3
 """Times that poses are refined and the points triangulated anew."""
-MIN_ANGLE = 0.5
-"""Degrees between the rays of a point, at least: driving forward gives little more."""
 COARSE_PX, FINE_PX = 8.0, 4.0
 """Largest reprojection error of a point: while poses are to be refined, and in the end."""
 LEAST_SHARE = 0.2
