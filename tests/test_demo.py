@@ -17,7 +17,7 @@ from training_runs import ready, trainer_config
 
 from mmpi_ns.demo import film, painting
 from mmpi_ns.demo.curve import TEST as TEST_PSNR
-from mmpi_ns.demo.curve import draw_curve, read_curve
+from mmpi_ns.demo.curve import draw_curve, psnr_of_squared_error, read_curve
 from mmpi_ns.demo.maps import FINER, Map, plane_depths
 from mmpi_ns.demo.sheet import GAP, LABELS, VIEW, contact_sheet, overview, show_views, spread
 from mmpi_ns.demo.views import load_run, render_alone, render_view, truth_of
@@ -128,8 +128,22 @@ def test_the_map_has_cameras_where_they_are_and_the_mpi_between_its_borders(run)
     mpi, color = run.plan.mpis[0], (1.0, 0.0, 0.0)
     picture = np.asarray(drawn.draw([(mpi, color)]), np.float64)
     assert picture.shape == (100, 400, 3)
-    assert (picture[..., 0] > picture[..., 1] + 10).any()
-    assert plane_depths(mpi)[0] == pytest.approx(mpi.near) and np.isfinite(plane_depths(mpi)).all()
+    forward, right = (np.asarray(row) for row in run.observations.mean_axes[[2, 0]])
+    start, ahead, aside = np.array(drawn.pixels(drawn.flat(centers.mean(0) + np.stack([0 * down, forward, right]))))
+    assert ahead - start == pytest.approx([drawn.scale * FINER, 0]) and aside - start == pytest.approx(
+        (ahead - start)[::-1]
+    )
+    # Within the frustum the map is tinted, behind the MPI's origin it is not.
+    row, column = np.indices((100, 400))
+    flat = drawn.low + (np.stack([column, row], -1) + 0.5) / drawn.scale - drawn.flat(np.asarray([mpi.origin]))
+    depth, tangent = flat[..., 0], flat[..., 1] / np.where(flat[..., 0] > 0, flat[..., 0], np.nan)
+    tinted = picture[..., 0] > picture[..., 1] + 10
+    inside = (depth > 1.1 * mpi.near) & (tangent > 0.9 * mpi.extent[0]) & (tangent < 0.9 * mpi.extent[1])
+    outside = (depth < 0.9 * mpi.near) | (tangent < 1.1 * mpi.extent[0]) | (tangent > 1.1 * mpi.extent[1])
+    cross = np.hypot(*np.moveaxis(flat, -1, 0)) * drawn.scale < 8
+    assert inside.sum() > 100 and tinted[inside].mean() > 0.9 and tinted[outside & ~cross].mean() < 0.05
+    disparities = 1 / np.array(plane_depths(mpi))
+    assert disparities == pytest.approx((1 - np.arange(len(disparities)) / len(disparities)) / mpi.near)
 
 
 def test_the_film_starts_and_ends_at_cameras_and_sways_between(run):
@@ -141,7 +155,11 @@ def test_the_film_starts_and_ends_at_cameras_and_sways_between(run):
     turns = path.camera_to_worlds[:, :, :3]
     torch.testing.assert_close(turns @ turns.mT, torch.eye(3).expand(9, 3, 3), atol=1e-5, rtol=0)
     straight = cameras.camera_to_worlds[0, :, 3].lerp(cameras.camera_to_worlds[-1, :, 3], 1 / 8)
-    assert (path.camera_to_worlds[1, :, 3] - straight).norm() > 1e-3
+    sway = path.camera_to_worlds[1, :, 3] - straight
+    assert sway.norm() > 1e-3
+    # It looks back from the side to which it swayed.
+    looks, looked = (-poses[0, :, 2] for poses in (path.camera_to_worlds[1:2], cameras.camera_to_worlds))
+    assert (looks - looked) @ sway < -0.05 * sway.norm()
 
 
 def test_a_film_is_encoded_or_left_as_frames(run, tmp_path, monkeypatch):
@@ -149,6 +167,11 @@ def test_a_film_is_encoded_or_left_as_frames(run, tmp_path, monkeypatch):
 
     assert film.find_encoder() is not None, "PyAV comes with nerfstudio and has an encoder"
     pictures = list(film.film_frames(run, 3, nearest=1.0))
+    view, high = render_view(run, film.fly_path(run.tests.cameras, 3)[1:2]), round(film.STRIP * HEIGHT / WIDTH)
+    strips = [view.color, painting.depth_colors(view.inverse_depth, 1.0), np.array(run.colors)[view.winner]]
+    for i, strip in enumerate(strips):
+        shown = np.asarray(pictures[1].crop((0, i * high, film.STRIP, (i + 1) * high)))
+        np.testing.assert_array_equal(shown[40:], np.asarray(painting.image_of(strip, film.STRIP))[40:])
     odd = [Image.new("RGB", (65, 33), (250, 0, 0))] * 5
     with av.open(str(film.write_film(odd, tmp_path))) as video:
         frames = [f.to_ndarray(format="rgb24") for f in video.decode(video=0)]
@@ -156,6 +179,10 @@ def test_a_film_is_encoded_or_left_as_frames(run, tmp_path, monkeypatch):
     monkeypatch.setattr(film, "find_encoder", lambda: None)
     folder = film.write_film(pictures, tmp_path)
     assert sorted(p.name for p in folder.iterdir()) == ["0000.png", "0001.png", "0002.png"]
+
+
+def test_the_psnr_of_a_squared_error():
+    assert psnr_of_squared_error(np.array([1.0, 0.01, 1e-4])).tolist() == pytest.approx([0, 20, 40])
 
 
 def test_the_curve_joins_the_files_of_a_resumed_run(tmp_path):
