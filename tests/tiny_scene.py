@@ -44,6 +44,13 @@ def color_of(origins, directions):
     return np.where((on_wall(x, y) & (t > 0) & (directions[:, 2] < 0))[:, None], wall, sky).clip(0, 1)
 
 
+def pixel_rays(width=WIDTH, height=HEIGHT, focal=FOCAL, undistort=lambda p: np.append(p, -np.ones((len(p), 1)), 1)):
+    """Directions [H W, 3] of all pixels in camera axes; ``undistort`` takes ((x - cx) / f, -(y - cy) / f)."""
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    local = undistort(np.stack([(x - width / 2) / focal, -(y - height / 2) / focal], -1).reshape(-1, 2))
+    return local / np.linalg.norm(local, axis=-1, keepdims=True)
+
+
 def image_of(i):
     """True image [H, W, 3] in [0, 1]."""
     pose = pose_of(i)

@@ -24,6 +24,14 @@ def datamanager(data: Path, test_mode="val", **settings):
     return config.setup(device="cpu", test_mode=test_mode)
 
 
+def in_capture_frame(manager, origins, directions):
+    """Rays as they are in the capture's own axes and units."""
+    outputs = manager.train_dataparser_outputs
+    transform = outputs.dataparser_transform.double().numpy()
+    rotation = transform[:, :3]
+    return (origins / outputs.dataparser_scale - transform[:, 3]) @ rotation, directions @ rotation
+
+
 def plan_of(observations, num_mpis=2, with_cube=False, planes=12) -> ScenePlan:
     """MPIs side by side behind the cameras of the tiny scene, which all see most of it; no two planes coincide."""
     x, y, z = observations.mean_axes

@@ -1,0 +1,171 @@
+"""Scenes of every kind that nerfstudio reads: lenses, sizes, masks, transparency, COLMAP's and Blender's layout."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
+from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from PIL import Image
+from tiny_scene import FOCAL, HEIGHT, TEST, TRAIN, WIDTH, color_of, name_of, pixel_rays, pose_of, write_scene
+from training_runs import datamanager, in_capture_frame, ready, trainer_config
+
+STEPS = 80
+
+
+def repaint(data, i, rays, width=WIDTH, height=HEIGHT, alpha=None):
+    """Writes image i as a camera with these rays [H W, 3] sees it."""
+    pose = pose_of(i)
+    directions = rays @ pose[:3, :3].T
+    image = color_of(np.broadcast_to(pose[:3, 3], directions.shape), directions).reshape(height, width, 3)
+    image = (image * 255).round().astype(np.uint8)
+    if alpha is not None:
+        image = np.concatenate([image, alpha], -1)
+    Image.fromarray(image).save(data / "images" / name_of(i))
+
+
+def edit(data, change):
+    meta = json.loads((data / "transforms.json").read_text())
+    change(meta)
+    (data / "transforms.json").write_text(json.dumps(meta))
+
+
+LENS = {"k1": -0.12, "k2": 0.03, "p1": 0.01, "p2": -0.008}
+
+
+def opencv_undistort(points):
+    """OpenCV's lens (y down), inverted by fixed-point iteration."""
+    target, p = points * [1, -1], points * [1, -1]
+    for _ in range(60):
+        x, y = p.T
+        r = x * x + y * y
+        radial = (1 + LENS["k1"] * r + LENS["k2"] * r * r)[:, None]
+        tangential = np.stack(
+            [
+                2 * LENS["p1"] * x * y + LENS["p2"] * (r + 2 * x * x),
+                LENS["p1"] * (r + 2 * y * y) + 2 * LENS["p2"] * x * y,
+            ],
+            -1,
+        )
+        p = (target - tangential) / radial
+    return np.append(p * [1, -1], -np.ones((len(p), 1)), 1)
+
+
+def equidistant(points):
+    """A fisheye: the angle from the axis grows with the distance from the centre."""
+    angle = np.linalg.norm(points, axis=-1, keepdims=True)
+    return np.append(points / angle * np.sin(angle), -np.cos(angle), 1)
+
+
+def plain(data):
+    return NerfstudioDataParserConfig()
+
+
+def lens(data):
+    for i in range(8):
+        repaint(data, i, pixel_rays(undistort=opencv_undistort))
+    edit(data, lambda meta: meta.update(LENS))
+    return NerfstudioDataParserConfig()
+
+
+def fisheye(data):
+    for i in range(8):
+        repaint(data, i, pixel_rays(undistort=equidistant))
+    edit(data, lambda meta: meta.update(camera_model="OPENCV_FISHEYE"))
+    return NerfstudioDataParserConfig()
+
+
+def several_sizes(data):
+    """Every other image has twice the pixels."""
+
+    def change(meta):
+        for key in ("w", "h", "fl_x", "fl_y", "cx", "cy"):
+            for i, frame in enumerate(meta["frames"]):
+                frame[key] = meta[key] * (1 + i % 2)
+            del meta[key]
+
+    edit(data, change)
+    for i in range(1, 8, 2):
+        repaint(data, i, pixel_rays(2 * WIDTH, 2 * HEIGHT, 2 * FOCAL), 2 * WIDTH, 2 * HEIGHT)
+    return NerfstudioDataParserConfig()
+
+
+def masks(data):
+    shutil.rmtree(data)
+    write_scene(data, masks=True)
+    return NerfstudioDataParserConfig()
+
+
+def colmap(data):
+    """images and sparse/0, as COLMAP leaves them."""
+    (data / "transforms.json").unlink()
+    shutil.move(data / "colmap/sparse", data / "sparse")
+    return ColmapDataParserConfig(colmap_path="sparse/0", eval_interval=4)
+
+
+def blender(data, alpha_color="white"):
+    """transforms_train.json and so on, with transparent backgrounds."""
+    (data / "transforms.json").unlink()
+    shutil.rmtree(data / "colmap")
+    alpha = np.full((HEIGHT, WIDTH, 1), 255, np.uint8)
+    alpha[: HEIGHT // 4] = 0
+    for i in range(8):
+        repaint(data, i, pixel_rays(), alpha=alpha)
+    for split, images in (("train", TRAIN), ("val", TEST), ("test", TEST)):
+        frames = [{"file_path": f"./images/{name_of(i)[:-4]}", "transform_matrix": pose_of(i).tolist()} for i in images]
+        meta = {"camera_angle_x": 2 * np.arctan(WIDTH / 2 / FOCAL), "frames": frames}
+        (data / f"transforms_{split}.json").write_text(json.dumps(meta))
+    return BlenderDataParserConfig(alpha_color=alpha_color)
+
+
+def transparent(data):
+    return blender(data, alpha_color=None)
+
+
+SCENES = (plain, lens, fisheye, several_sizes, masks, colmap, blender, transparent)
+
+
+@pytest.fixture(scope="module", params=SCENES, ids=lambda f: f.__name__)
+def capture(request, tmp_path_factory):
+    """Kind, folder and data parser of a scene."""
+    data = write_scene(tmp_path_factory.mktemp("capture") / "data")
+    return request.param, data, request.param(data)
+
+
+def test_every_pixel_drawn_has_the_colour_that_its_ray_meets(capture):
+    kind, data, parser = capture
+    manager = datamanager(data, dataparser=parser, triangulate=False)
+    rays, batch = manager.next_train(0)
+    origins, directions = (x[:64].double().numpy() for x in (rays.origins, rays.directions))
+    wanted = color_of(*in_capture_frame(manager, origins, directions))
+    found = batch["image"].numpy()
+    seen = batch["indices"][:, 1].numpy() >= HEIGHT // 4
+    if kind is blender:
+        wanted[~seen] = 1  # white behind
+    if kind is transparent:
+        assert np.array_equal(found[:, 3] > 0, seen)
+    error = np.abs(found[:, :3] - wanted).max(-1)
+    # A pixel on the wall's very edge may fall on the other side of it.
+    assert np.sort(error)[-3] < 0.02 and seen.any()
+    if kind in (blender, transparent):
+        assert not manager.observations.seen_at.size
+    else:
+        assert len(rays) == 64 + 16 and len(manager.observations.seen_at) > 60
+
+
+def test_every_kind_of_scene_is_trained_and_evaluated(capture, tmp_path):
+    _, data, parser = capture
+    config = trainer_config(data, None, tmp_path, STEPS, training="joint", growth_shares=())
+    config.pipeline.datamanager.dataparser = parser
+    config.pipeline.datamanager.train_num_rays_per_batch = 256
+    config.pipeline.datamanager.triangulate = False
+    trainer = ready(config)
+    trainer.train()
+    metrics = trainer.pipeline.get_average_eval_image_metrics()
+    image = trainer.pipeline.datamanager.eval_dataset[0]["image"][..., :3]
+    assert metrics["psnr"] > -10 * np.log10(float(image.var(dim=(0, 1)).mean())) + 2
+    assert metrics["dropped_mass"] < 0.2
