@@ -187,3 +187,9 @@ def test_the_plane_sweep_finds_the_depth_of_a_textured_wall():
     found = add_swept_points(observations, images)
     assert len(found.points) > 50
     assert np.percentile(np.abs(found.points[:, 2] - depth), 80) < 0.08 * depth
+    # Every view counts for a point that falls on its image, and no other does.
+    local = found.points - centers[:, None]
+    shown = np.abs(FOCAL * local[..., :2] / local[..., 2:]) < [WIDTH / 2, HEIGHT / 2]
+    wanted = {(int(i), int(p)) for i, p in np.argwhere(shown.all(-1))}
+    assert set(zip(found.seen_by.tolist(), found.seen_point.tolist(), strict=True)) == wanted
+    assert len(found.seen_by) == len(wanted) > 2 * len(found.points) and not shown.all()
