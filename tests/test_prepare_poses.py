@@ -101,6 +101,27 @@ def test_transforms_bring_intrinsics_scaled_to_the_images_and_their_split(tmp_pa
         read(write_transforms(path, GIVEN, w=400))
 
 
+def test_images_of_one_name_in_two_folders_get_the_poses_of_their_folders_or_none(tmp_path):
+    sources = [f"{side}/{n:03d}.png" for side in ("left", "right") for n in range(2)]
+    photos = [Photo(s.replace("/", "-"), 9, 9, source=s) for s in sources]
+    frames = [
+        {"file_path": f"./capture/{s}", "transform_matrix": (pose @ FLIP).tolist()}
+        for s, pose in zip(sources, GIVEN, strict=False)
+    ]
+    path = tmp_path / "transforms.json"
+    path.write_text(json.dumps({"frames": frames[::-1]}))
+    assert read(path, photos=photos)[1] == pytest.approx(GIVEN[:4], abs=1e-9)
+    path.write_text(json.dumps({"frames": frames[:2]}))
+    with pytest.raises(PrepareError, match=r"one pose for left-000\.png and right-000\.png"):
+        read(path, photos=photos)
+    folder = tmp_path / "poses"
+    folder.mkdir()
+    for n in range(2):
+        np.savetxt(folder / f"{n:03d}.txt", GIVEN[n])
+    with pytest.raises(PrepareError, match="one pose for"):
+        read(folder, photos=photos)
+
+
 def test_lines_that_no_number_of_an_image_can_name_are_refused(tmp_path):
     path = write_kitti(tmp_path / "poses.txt", corridor.poses(30))
     for last in ("30", "three"):

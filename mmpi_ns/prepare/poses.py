@@ -177,6 +177,7 @@ def _read_matrices(path: Path, photos: Sequence[Photo]) -> KnownPoses:
         if len(files) != len(photos):
             raise PrepareError(f"{path} has {len(files)} files for {len(photos)} images, and the names do not match.")
         chosen, says = {p.name: f for p, f in zip(photos, files, strict=True)}, "4x4 matrices, in order"
+    _check_apart(chosen, path)
     poses = {}
     for name, file in chosen.items():
         try:
@@ -199,12 +200,12 @@ def _read_transforms(path: Path, photos: Sequence[Photo]) -> KnownPoses:
     path = path / "transforms.json" if path.is_dir() else path
     try:
         meta = json.loads(path.read_text(encoding="utf-8"))
-        frames = {Path(f["file_path"]).stem: f for f in meta["frames"]}
+        frames: list[dict[str, Any]] = meta["frames"]
+        found = {p.name: n for p in photos if (n := _frame_of(p, [Path(f["file_path"]) for f in frames])) is not None}
+        _check_apart(found, path)
         poses, intrinsics = {}, {}
-        for photo in photos:
-            frame = frames.get(Path(photo.name).stem) or frames.get(Path(photo.source).stem)
-            if frame is None:
-                continue
+        for photo in (p for p in photos if p.name in found):
+            frame = frames[found[photo.name]]
             poses[photo.name] = np.array(frame["transform_matrix"], dtype=np.float64).reshape(4, 4)
             if "fl_x" in meta or "fl_x" in frame:
                 intrinsics[photo.name] = _frame_intrinsics({**meta, **frame}, photo)
@@ -212,6 +213,28 @@ def _read_transforms(path: Path, photos: Sequence[Photo]) -> KnownPoses:
         raise PrepareError(f"--poses {path} is no transforms.json as nerfstudio writes it ({error!r}).") from error
     split = meta if "train_filenames" in meta and "test_filenames" in meta else None
     return KnownPoses(poses, "poses of a transforms.json, by name", intrinsics, split)
+
+
+def _frame_of(photo: Photo, files: Sequence[Path]) -> int | None:
+    """The frame of an image's name, and of its folder too where several have that name; None where there is none."""
+    for wanted in (Path(photo.name), Path(photo.source)):
+        named = [n for n, f in enumerate(files) if f.stem == wanted.stem]
+        folders = wanted.parent.parts
+        inside = [n for n in named if files[n].parent.parts[-len(folders) :] == folders] if folders else []
+        if len(named) == 1 or len(inside) == 1:
+            return (inside or named)[0]
+    return None
+
+
+def _check_apart(found: dict[str, Any], path: Path) -> None:
+    """Raises PrepareError where two images were given one pose: those of two folders may have one name."""
+    first: dict[Any, str] = {}
+    for name, pose in found.items():
+        if pose in first:
+            raise PrepareError(
+                f"{path} has one pose for {first[pose]} and {name}: images of one name in two folders need two."
+            )
+        first[pose] = name
 
 
 def _frame_intrinsics(frame: dict[str, Any], photo: Photo) -> Intrinsics:
