@@ -52,7 +52,7 @@ class MMPIField(Field):
         position_frequencies: octaves of the positional encoding of NDC positions.
         direction_frequencies: octaves of the positional encoding of directions in the MPI's frame.
         shared_colour: one colour network for all heads (the paper's notation) instead of one each.
-        depth_scale: factor on every optical depth; 1/K where K MPIs train jointly from the start.
+        shares_depth: K MPIs train jointly from the start, so each has 1/K of the optical depth.
         samples_per_voxel: samples along a ray per voxel side of the cube.
         cube_alpha: initial alpha of a cube sample.
     """
@@ -66,13 +66,13 @@ class MMPIField(Field):
         position_frequencies: int = 2,
         direction_frequencies: int = 2,
         shared_colour: bool = False,
-        depth_scale: float = 1.0,
+        shares_depth: bool = False,
         samples_per_voxel: float = 1.0,
         cube_alpha: float = 1e-3,
     ) -> None:
         super().__init__()
         self.feature_channels = feature_channels
-        self.depth_scale = depth_scale
+        self.shares_depth = shares_depth
         self.samples_per_voxel = samples_per_voxel
         self.cube_alpha = cube_alpha
         self.full_plan = self.plan = plan
@@ -163,6 +163,11 @@ class MMPIField(Field):
         if plan is None:
             return None
         return self._cached("cube", lambda: geometry.Cube.pack(plan, self.samples_per_voxel, device=device))
+
+    @property
+    def depth_scale(self) -> float:
+        """Factor on every optical depth of an MPI, by the plan at hand: a checkpoint's has a K of its own."""
+        return 1.0 / len(self.full_plan.mpis) if self.shares_depth else 1.0
 
     def _biases(self, k: int) -> Tensor:
         mpi, device = self.plan.mpis[k], self.density.device

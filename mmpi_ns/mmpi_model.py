@@ -122,7 +122,7 @@ class MMPIModel(Model):
             position_frequencies=self.config.position_frequencies,
             direction_frequencies=self.config.direction_frequencies,
             shared_colour=self.config.shared_colour,
-            depth_scale=1.0 / len(plan.mpis) if joint else 1.0,
+            shares_depth=joint,
             samples_per_voxel=self.config.samples_per_voxel,
             cube_alpha=self.config.cube_alpha,
         )
@@ -132,6 +132,7 @@ class MMPIModel(Model):
         self.register_buffer("schedule_bytes", _to_bytes(self.schedule.to_json()))
         self.step = 0
         self.show = ViewerDropdown("Show MPI", "all", ["all", *plan.names], hint="One MPI alone, or all blended")
+        self.register_load_state_dict_post_hook(lambda *_: self.show.set_options(["all", *self.field.full_plan.names]))
 
     def _initial_plan(self) -> ScenePlan:
         if self.config.plan_file is not None:
@@ -159,11 +160,12 @@ class MMPIModel(Model):
     # State -------------------------------------------------------------------------------------------------------
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
-        """The schedule of a run is the checkpoint's, whatever the config says now."""
+        """The schedule of a run is the checkpoint's, and so is the plan, whatever config and capture say now."""
         stored = state_dict.get(prefix + "schedule_bytes")
         if stored is not None:
             self.schedule = Schedule.from_json(bytes(stored.cpu().numpy().tolist()).decode())
             self.schedule_bytes = stored.clone().to(self.device)
+            self.field.shares_depth = self.schedule.phase_at(0).name == "joint"
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
     def get_param_groups(self) -> dict[str, list[Parameter]]:

@@ -19,7 +19,7 @@ from mmpi_ns.placement.plan import MPIPlan, ScenePlan
 
 def test_the_dense_reference_renders_what_the_sampler_renders(monkeypatch):
     torch.manual_seed(0)
-    field = MMPIField(dense._plan().scaled(1 / 64), hidden_width=8, depth_scale=0.25)
+    field = MMPIField(dense._plan().scaled(1 / 64), hidden_width=8, shares_depth=True)
     with torch.no_grad():
         field.density.normal_(std=3)
         field.features.normal_()

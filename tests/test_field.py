@@ -44,7 +44,7 @@ def test_every_plane_starts_with_an_equal_share_of_a_ray_that_crosses_all(planes
 def test_mpis_that_train_jointly_start_with_a_share_of_the_depth_each():
     plan = ScenePlan((make_mpi("a"), make_mpi("b"), make_mpi("c")), None, 0.05, 1.0)
     rays = bundle([[0, 0, 0]], [[0, 0, 1]])
-    joint = render(MMPIField(plan, depth_scale=1 / 3).eval(), rays).composite
+    joint = render(MMPIField(plan, shares_depth=True).eval(), rays).composite
     alone = render(MMPIField(one_mpi()).eval(), rays).composite
     assert torch.allclose(joint.weights.view(9, 3).sum(-1), alone.weights[0], atol=1e-6)
     assert torch.allclose(joint.transmittance, alone.transmittance, atol=1e-6)

@@ -322,3 +322,22 @@ def test_lpips_is_left_out_with_a_message_where_its_weights_cannot_be_had(traine
     for name, image in images.items():
         assert image.shape == (HEIGHT, WIDTH * (2 if name == "img" else 1), 3), name
         assert image.min() >= 0 and image.max() <= 1
+
+
+# A checkpoint's own plan ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("training", ["joint", "two-phase"])
+def test_a_checkpoint_renders_the_same_in_a_model_that_was_placed_otherwise(
+    scene, plan_file, tmp_path, camera, training
+):
+    """As in evaluation without the images: placement finds less there, so K differs until the checkpoint is read."""
+    trained = trainer_of(scene, plan_file, tmp_path, steps=8, training=training).pipeline.model.eval()
+    other = write_plan(scene, tmp_path / "other.json", num_mpis=1, planes=20)
+    read = trainer_of(scene, other, tmp_path, steps=8, training=training).pipeline.model.eval()
+    read.load_state_dict(trained.state_dict())
+    for name in ("rgb", "accumulation", "depth"):
+        expected, found = (m.get_outputs_for_camera(camera)[name] for m in (trained, read))
+        assert torch.equal(expected, found), name
+    assert read.show.options == ["all", *trained.field.full_plan.names]
+    assert read.blends == trained.blends

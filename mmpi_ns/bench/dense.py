@@ -69,7 +69,7 @@ class Dense:
 def measure(name: str, steps: int, num_rays: int) -> dict[str, float]:
     """Medians over timed steps of one path, in this process."""
     torch.manual_seed(0)
-    field = MMPIField(_plan(), hidden_width=32, depth_scale=0.25)
+    field = MMPIField(_plan(), hidden_width=32, shares_depth=True)
     params = [field.density, field.features, field.networks.weights]
     rates = (0.1, 0.1, 1e-3)
     groups = [{"params": [p], "lr": lr} for p, lr in zip(params, rates, strict=True)]
