@@ -178,7 +178,7 @@ def _match(pycolmap: Any, work: Path, pairs: list[tuple[str, str]], effort: Effo
 
 def _triangulation(pycolmap: Any) -> Any:
     options = pycolmap.IncrementalPipelineOptions()
-    options.triangulation.min_angle = MIN_ANGLE
+    options.triangulation.min_angle = options.mapper.filter_min_tri_angle = MIN_ANGLE
     options.triangulation.ignore_two_view_tracks = False
     options.triangulation.random_seed = SEED
     options.ba_refine_focal_length = options.ba_refine_principal_point = options.ba_refine_extra_params = False

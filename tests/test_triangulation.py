@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pycolmap
 import pytest
 from PIL import Image
 from value_noise import noise
@@ -128,10 +129,17 @@ def test_faint_images_are_searched_more_thoroughly_and_others_are_not(tmp_path, 
         efforts.append(effort)
         return attempt(pycolmap, images, effort)
 
+    match, guided = pycolmap.match_image_pairs, []
+
+    def spy_match(*args, matching_options, **options):
+        guided.append(matching_options.guided_matching)
+        return match(*args, matching_options=matching_options, **options)
+
     monkeypatch.setattr(triangulation, "_attempt", spy)
+    monkeypatch.setattr(pycolmap, "match_image_pairs", spy_match)
     faint = scene_of(tmp_path, POSES[:4], contrast=0.12)
     points = triangulate(faint).points
-    assert efforts == list(EFFORTS) and np.median(depth_error(points)) < 0.02
+    assert efforts == list(EFFORTS) and guided == [False, True] and np.median(depth_error(points)) < 0.02
     monkeypatch.setattr(triangulation, "EFFORTS", EFFORTS[:1])
     assert len(triangulate(faint).points) < 0.5 * len(points)
     monkeypatch.setattr(triangulation, "EFFORTS", (EFFORTS[1], EFFORTS[0]))
@@ -190,6 +198,13 @@ def test_two_images_that_agree_are_enough(images):
     two = {f: getattr(images, f)[:2] for f in ("files", "camera_to_worlds", "intrinsics", "sizes", "distortion")}
     points = triangulate(PosedImages(**two)).points
     assert len(points) > 30 and np.median(depth_error(points)) < 0.02
+
+
+def test_rays_half_a_degree_apart_are_enough_and_less_is_not(tmp_path):
+    """The near wall is three away, the far one five: angles of 1.1 and 0.7 degrees, or of 0.4 and 0.2."""
+    for step, least, most in ((0.06, 30, 1000), (0.02, 0, 0)):
+        found = triangulate(scene_of(tmp_path / str(step), [pose_at(0.0), pose_at(step)])).points
+        assert least <= len(found) <= most
 
 
 def test_an_unreadable_image_is_named(tmp_path):
