@@ -62,6 +62,18 @@ def test_image_without_mask_gets_a_white_one(tmp_path):
     assert np.asarray(Image.open(tmp_path / "out/b.jpg.png")).min() == 255
 
 
+def test_masks_of_two_folders_go_to_the_images_of_theirs(tmp_path):
+    for side, value in (("left", 0), ("right", 255)):
+        save(tmp_path / f"masks/{side}/1.png", (4, 3), value)
+    sources = [f"{side}/1.jpg" for side in ("left", "right", "back")]
+    photos = [Photo(s.replace("/", "-"), 4, 3, source=s) for s in sources]
+    assert gather_masks(tmp_path / "masks", photos, tmp_path / "out") == 2  # whose "back" is, nobody can tell
+    found = [np.asarray(Image.open(tmp_path / f"out/{p.name}.png")) for p in photos]
+    assert [(f.min(), f.max()) for f in found] == [(0, 0), (255, 255), (255, 255)]
+    save(tmp_path / "one/elsewhere/1.png", (4, 3), 0)
+    assert gather_masks(tmp_path / "one", photos, tmp_path / "out") == 3
+
+
 def test_mask_of_another_size_is_refused(tmp_path):
     save(tmp_path / "masks/a.png", (5, 3), 0)
     with pytest.raises(PrepareError, match="5x3"):

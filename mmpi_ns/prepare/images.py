@@ -161,13 +161,12 @@ def gather_masks(folder: Path, photos: Sequence[Photo], target: Path) -> int:
     """
     if not folder.is_dir():
         raise PrepareError(f"--masks {folder} is no folder.")
-    by_stem = {p.stem: p for p in sorted(folder.rglob("*")) if p.suffix.lower() in IMAGES}
-    by_stem |= {Path(stem).stem: p for stem, p in by_stem.items() if Path(stem).suffix.lower() in IMAGES}  # a.jpg.png
+    by_name = _masks_by_name(folder)
     target.mkdir(parents=True, exist_ok=True)
     found = 0
     for photo in photos:
-        stems = (Path(photo.name).stem, Path(photo.source).stem)
-        source = next((by_stem[s] for s in stems if s in by_stem), None)
+        names = (photo.source.rpartition(".")[0], Path(photo.name).stem, Path(photo.source).stem)
+        source = next((by_name[n] for n in names if n in by_name), None)
         mask = Image.new("L", (photo.width, photo.height), 255)
         if source is not None:
             found += 1
@@ -184,3 +183,19 @@ def gather_masks(folder: Path, photos: Sequence[Photo], target: Path) -> int:
     if found < len(photos):
         CONSOLE.print(f"[yellow]{len(photos) - found} of {len(photos)} images have no mask: all of them is used.")
     return found
+
+
+def _masks_by_name(folder: Path) -> dict[str, Path]:
+    """Masks by their path below the folder without suffix, and by their stem where no other has it."""
+    files = [p for p in sorted(folder.rglob("*")) if p.suffix.lower() in IMAGES]
+    by_name: dict[str, Path] = {}
+    for whole in (True, False):
+        keys = [_bare(p.relative_to(folder)).as_posix() if whole else _bare(p).name for p in files]
+        by_name |= {k: p for k, p in zip(keys, files, strict=True) if whole or keys.count(k) == 1}
+    return by_name
+
+
+def _bare(path: Path) -> Path:
+    """Without its suffix, or both of them: a.jpg.png is the mask of a.jpg."""
+    path = path.with_suffix("")
+    return path.with_suffix("") if path.suffix.lower() in IMAGES else path
