@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 from tiny_scene import write_colmap
 
 from mmpi_ns import mmpi_observations
-from mmpi_ns.mmpi_observations import ENOUGH_KEYPOINTS, drop_masked, posed_images, with_tracks
+from mmpi_ns.mmpi_observations import ENOUGH_KEYPOINTS, drop_masked, posed_images, read_observations, with_tracks
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.sfm import SfmModel, find_sfm_model
 
@@ -61,6 +62,16 @@ def test_a_lens_goes_to_colmap_in_its_order(kind, used):
 
 def test_other_cameras_are_not_triangulated():
     assert posed_images(bare(), as_data(kind=CameraType.EQUIRECTANGULAR)) is None
+
+
+def test_points_of_the_data_parser_stand_in_where_there_is_no_model():
+    points = torch.tensor([[1.0, 2, 3], [4, 5, 6]])
+    outputs: Any = SimpleNamespace(image_filenames=["a.png", "b.png"], metadata={"points3D_xyz": points})
+    found = read_observations(outputs, as_data().cameras, None)
+    assert found.points.tolist() == points.tolist() and not len(found.seen_by) and not len(found.seen_at)
+    assert found.intrinsics.tolist() == [[30, 30, 20, 10]] * 2 and found.sizes.tolist() == [[40, 20]] * 2
+    outputs.metadata = {}
+    assert not len(read_observations(outputs, as_data().cameras, None).points)
 
 
 def model(*keypoints) -> SfmModel:
