@@ -69,7 +69,9 @@ def _equal_start(planes: int, precision: Precision) -> Outcome:
 SHARES = "tau', d tau' / d tau, d tau' / d R to 16 roundings of the differences of reliabilities"
 
 
-def _votes(rng: np.random.Generator, samples: int, heads: int, scale: float, level: float) -> tuple[Array, Array, Array]:
+def _votes(
+    rng: np.random.Generator, samples: int, heads: int, scale: float, level: float
+) -> tuple[Array, Array, Array]:
     own = rng.integers(0, heads, samples)
     cover = rng.random((samples, heads)) < 0.7
     cover[np.arange(samples), own] = True
@@ -139,7 +141,9 @@ def _sole(precision: Precision) -> Outcome:
     tau = torch.tensor([0.0, 1e-30, 1e-7, 3.0, 88.0, 1e4], requires_grad=True)
     cover = torch.tensor([[True, False]] * len(junk))
     with precision.context():
-        blended = blended_optical_depth(tau, *blend_shares(reliability, cover, torch.zeros(len(junk), dtype=torch.long)))
+        blended = blended_optical_depth(
+            tau, *blend_shares(reliability, cover, torch.zeros(len(junk), dtype=torch.long))
+        )
         blended.sum().backward()
     assert reliability.grad is not None and tau.grad is not None
     return Outcome(
@@ -152,7 +156,9 @@ def _sole(precision: Precision) -> Outcome:
 
 # Compositing ---------------------------------------------------------------------------------------------------------
 
-COMPOSITE = "weights, transmittance, accumulation and their gradient to 4 + log2(samples) roundings of the depth in front"
+COMPOSITE = (
+    "weights, transmittance, accumulation and their gradient to 4 + log2(samples) roundings of the depth in front"
+)
 
 
 def _composite(taus: Array, precision: Precision, dropped: bool = False) -> Outcome:
@@ -166,7 +172,9 @@ def _composite(taus: Array, precision: Precision, dropped: bool = False) -> Outc
     before = single(np.cumsum(skipped, -1) - skipped)
     by_weight, by_rest = single(rng.normal(size=taus.shape)), single(rng.normal(size=(rays, 1)))
     given = torch.tensor(taus, dtype=torch.float32, requires_grad=True)
-    constants = [torch.tensor(x, dtype=torch.float32) for x in (before, skipped.sum(-1, keepdims=True), by_weight, by_rest)]
+    constants = [
+        torch.tensor(x, dtype=torch.float32) for x in (before, skipped.sum(-1, keepdims=True), by_weight, by_rest)
+    ]
     with precision.context():
         made = composite_weights(given, torch.tensor(kept), constants[0], constants[1])
         ((made.weights * constants[2]).sum() + (made.transmittance * constants[3]).sum()).backward()
@@ -241,18 +249,17 @@ def _long(mean: float, opaque_at: int | None = None, rays: int = 4) -> Array:
     return taus
 
 
-def _mixed(rng: np.random.Generator, low: float, high: float) -> Array:
-    return 10 ** rng.uniform(low, high, (40, 300))
+def _mixed(low: float, high: float) -> Array:
+    return 10 ** np.random.default_rng(4).uniform(low, high, (40, 300))
 
 
 def _composite_cases() -> list[Case]:
-    rng = np.random.default_rng(4)
     inputs: list[tuple[str, Callable[[], Array]]] = [
         ("alpha 0 everywhere", lambda: np.zeros((4, 300))),
         ("alpha 1 everywhere (tau = 1e4)", lambda: np.full((4, 300), 1e4)),
-        ("optical depths 1e-12 to 1e-4", lambda: _mixed(rng, -12, -4)),
-        ("optical depths 1e-6 to 10", lambda: _mixed(rng, -6, 1)),
-        ("optical depths 1e-30 to 1e4", lambda: _mixed(rng, -30, 4)),
+        ("optical depths 1e-12 to 1e-4", lambda: _mixed(-12, -4)),
+        ("optical depths 1e-6 to 10", lambda: _mixed(-6, 1)),
+        ("optical depths 1e-30 to 1e4", lambda: _mixed(-30, 4)),
         ("10,000 samples of mean depth 1e-6", lambda: _long(1e-6)),
         ("10,000 samples of mean depth 1e-3, the 9,000th opaque", lambda: _long(1e-3, 9000)),
         ("10,000 samples of mean depth 1", lambda: _long(1.0)),
@@ -262,7 +269,7 @@ def _composite_cases() -> list[Case]:
     ]
     rows = [Case("compositing", name, COMPOSITE, lambda p, t=taus: _composite(t(), p)) for name, taus in inputs]
     name = "half of 300 samples dropped"
-    return [*rows, Case("compositing", name, COMPOSITE, lambda p: _composite(_mixed(rng, -4, 0), p, dropped=True))]
+    return [*rows, Case("compositing", name, COMPOSITE, lambda p: _composite(_mixed(-4, 0), p, dropped=True))]
 
 
 def _before_last(depth: float) -> Array:
@@ -273,10 +280,10 @@ def _before_last(depth: float) -> Array:
 
 def cases() -> list[Case]:
     """All cases of densities, shares and compositing."""
-    rng = np.random.default_rng(7)
+    spread = np.random.default_rng(7).uniform(-20, 20, 200)
     rows = [
         Case("density", "raw densities -20 to 20, 64 planes", DENSITY,
-             lambda p: _density(rng.uniform(-20, 20, 200), 64, p)),
+             lambda p: _density(spread, 64, p)),
         Case("density", "raw densities +-1e4, +-200, +-88.7, +-20.001 (softplus' switch)", DENSITY,
              lambda p: _density(np.outer([-1, 1], [1e4, 200, 88.7, 20.001]).ravel(), 64, p)),
         Case("density", "1,024 planes, raw densities around each plane's bias", DENSITY,
@@ -305,5 +312,3 @@ def cases() -> list[Case]:
         Case("compositing", "median distance in 10,000 samples", "half of the mass, to 17 roundings", _median),
     ]
     return rows
-
-

@@ -35,7 +35,7 @@ from mmpi_ns.geometry import (
     sample_disparity,
     samples_to_ndc,
 )
-from mmpi_ns.placement.plan import CubePlan, MPIPlan
+from mmpi_ns.placement.plan import CubePlan, MPIPlan, Vector
 
 GROUP = "geometry"
 ROUNDINGS = 16
@@ -94,7 +94,9 @@ def measure_places(rays: Rays, precision: Precision) -> Outcome:
     mpis, origins, directions, _, _ = rays
     rng = np.random.default_rng(1)
     reach = np.array([np.linalg.norm(o - np.array(mpis[0].origin)) for o in origins]) + mpis[0].near
-    inverse_t = single(np.where(np.arange(len(origins)) % 4 == 0, 0, 1 / (reach * 10 ** rng.uniform(-1, 2, len(reach)))))
+    inverse_t = single(
+        np.where(np.arange(len(origins)) % 4 == 0, 0, 1 / (reach * 10 ** rng.uniform(-1, 2, len(reach))))
+    )
     o, d, q = (torch.tensor(x, dtype=torch.float32) for x in (origins, directions, inverse_t))
     with precision.context():
         ndc, inside = samples_to_ndc(o, d, q, Frames.pack(mpis))
@@ -112,11 +114,16 @@ def measure_places(rays: Rays, precision: Precision) -> Outcome:
     return Outcome(Error.worst(errors) if not wrong else count_wrong(wrong))
 
 
+def _vector(x: Array) -> Vector:
+    a, b, c = single(x)
+    return float(a), float(b), float(c)
+
+
 def measure_cube(precision: Precision, scale: float, parallel: bool) -> Outcome:
     """Samples inside the cube, for rays from inside, from outside, past it and along its faces."""
     rng = np.random.default_rng(2)
-    plan = CubePlan(*(tuple(float(x) for x in single(scale * np.array(b))) for b in ((-1.5, -1.2, -1.0), (1.4, 1.6, 2.0))),
-                    shape=(6, 5, 4))  # fmt: skip
+    lower, upper = (_vector(scale * np.array(x)) for x in ([-1.5, -1.2, -1.0], [1.4, 1.6, 2.0]))
+    plan = CubePlan(lower, upper, (6, 5, 4))
     cube = Cube.pack(plan, 1.5)
     count = 300
     origins = single(rng.normal(size=(count, 3)) * 2 * scale)
@@ -177,7 +184,7 @@ def _nearly_parallel() -> Rays:
 def _behind(distance: float) -> Rays:
     rng = np.random.default_rng(3)
     targets = rng.uniform([-0.8, -0.4, 1], [0.8, 0.4, 1.0001], (64, 3)) * rng.uniform(1, 8, (64, 1))
-    return _towards(front(), np.array([[0.0, 0.0, -distance]]), targets + [0.0, 0.0, distance])
+    return _towards(front(), np.array([[0.0, 0.0, -distance]]), targets + np.array([0.0, 0.0, distance]))
 
 
 def _on_planes() -> Rays:

@@ -1,12 +1,13 @@
 """Exact geometry, blending and compositing to measure the fast paths against, with exact gradients.
 
 Float64 and 60-digit decimals, one ray at a time, every plane by itself. Shares no code with ``geometry``,
-``compositing``, ``ops``, the sampler or the field: plans come in as plain data. ``tests/test_bench_exact.py`` compares it
-with ``tests/oracle.py``, and its gradients with finite differences.
+``compositing``, ``ops``, the sampler or the field: plans come in as plain data. ``tests/test_bench_exact.py``
+compares it with ``tests/oracle.py``, and its gradients with finite differences.
 """
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 from decimal import Context, Decimal
@@ -168,6 +169,7 @@ def sigmoid(x: Array | float) -> Array:
     return np.where(x >= 0, 1 / (1 + small), small / (1 + small))
 
 
+@functools.cache
 def plane_bias(planes: int, missing: float = 0.0) -> tuple[Array, float]:
     """Biases with which all planes start at equal weight, and the interval 256 / L. Solved in decimals.
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from mmpi_ns.bench import exact
 from mmpi_ns.bench.exact import STILL, Array, Jitter
-from mmpi_ns.placement.plan import ScenePlan
+from mmpi_ns.placement.plan import MPIPlan, ScenePlan
 
 TABLES = ("density", "features", "reliability", "networks")
 
@@ -123,10 +123,12 @@ class ExactRay:
     def __post_init__(self) -> None:
         plan = self.field.plan
         for k, mpi in enumerate(plan.mpis):
-            met = exact.cross(mpi, self.origin, self.direction, self.near, self.far, self.jitter)
+            # Which samples there are, and their order, is decided by exact numbers; only what they read is moved.
+            met = exact.cross(mpi, self.origin, self.direction, self.near, self.far)
+            moved = exact.cross(mpi, self.origin, self.direction, self.near, self.far, self.jitter)
             self.margin = min(self.margin, float(met.margin.min()))
             for plane in np.nonzero(met.live)[0]:
-                ndc = exact.to_ndc(mpi, met.u[plane], met.v[plane], exact.disparities(mpi)[plane])
+                ndc = exact.to_ndc(mpi, moved.u[plane], moved.v[plane], exact.disparities(mpi)[plane])
                 q = float(met.inverse_t[plane]), float(met.size_q[plane])
                 self.samples.append(self._sample(k, int(plane), q, ndc))
         if plan.cube is not None:
@@ -187,7 +189,10 @@ class ExactRay:
             else:
                 ndc, size = (self._in_cube(inverse_t) if inverse_t > 0 else None), 4.0
             covers = j == own
-            if ndc is not None and j != own:
+            if max(own, j) < len(plan.mpis) and _same_frame(plan.mpis[j], plan.mpis[own]):
+                # The border that a sample may lie on is its own.
+                ndc, covers = own_ndc, True
+            elif ndc is not None and j != own:
                 gaps = np.abs(np.abs(ndc) - 1)[: 2 if inverse_t == 0 else 3]
                 self.margin = min(self.margin, float(gaps.min()) / size)
                 covers = bool((np.abs(ndc) <= 1 + 1e-12).all())
@@ -284,6 +289,10 @@ class ExactRay:
 
 
 # Lookups -------------------------------------------------------------------------------------------------------------
+
+
+def _same_frame(a: MPIPlan, b: MPIPlan) -> bool:
+    return (a.origin, a.axes, a.near, a.far, a.extent) == (b.origin, b.axes, b.near, b.far, b.extent)
 
 
 def _corners(position: Array, shape: tuple[int, ...]) -> list[tuple[tuple[int, ...], float]]:

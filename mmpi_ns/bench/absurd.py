@@ -1,0 +1,195 @@
+"""Trainings with absurd settings on a tiny procedural scene: each must end with finite weights or one clear error."""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import io
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from nerfstudio.engine import trainer as nerfstudio_trainer
+
+from mmpi_ns.bench.provenance import commit
+from mmpi_ns.mmpi_config import mmpi_small
+from mmpi_ns.mmpi_trainer import MMPITrainer
+from mmpi_ns.placement.plan import MPIPlan, ScenePlan
+from mmpi_ns.scenes.catalogue import make_scene
+from mmpi_ns.scenes.dataset import write_dataset
+
+WIDTH, HEIGHT, IMAGES = 32, 24, 9
+RAYS = 64
+
+
+@dataclass(frozen=True)
+class Absurdity:
+    """One training that nobody should ask for."""
+
+    name: str
+    expectation: str
+    change: Callable[[Any, Path], None]
+    """Alters the config before the trainer is made; the folder is the scene's."""
+    start: Callable[[MMPITrainer], None] | None = None
+    """Alters the model before the first step."""
+
+
+def write_scene(folder: Path) -> Path:
+    """A still life of 9 images of 32 x 24 pixels, once."""
+    if not (folder / "transforms.json").is_file():
+        write_dataset(
+            make_scene("still-life", count=IMAGES, width=WIDTH, height=HEIGHT), folder, points=150, overwrite=True
+        )
+    return folder
+
+
+def _rates(factor: float) -> Callable[[Any, Path], None]:
+    def change(config: Any, _: Path) -> None:
+        for entry in config.optimizers.values():
+            entry["optimizer"].lr *= factor
+
+    return change
+
+
+def _dense(factor: float) -> Callable[[MMPITrainer], None]:
+    def start(trainer: MMPITrainer) -> None:
+        field = trainer._model.field
+        field.density.data.normal_(generator=torch.Generator().manual_seed(0)).mul_(factor)
+
+    return start
+
+
+def _one_image(config: Any, scene: Path) -> None:
+    path = scene / "one-image.json"
+    meta = json.loads((scene / "transforms.json").read_text(encoding="utf-8"))
+    meta["train_filenames"] = meta["train_filenames"][:1]
+    path.write_text(json.dumps(meta), encoding="utf-8")
+    config.data = config.pipeline.datamanager.data = path
+    config.pipeline.datamanager.dataparser.data = path
+
+
+def _with_plan(alter: Callable[[tuple[MPIPlan, ...]], tuple[MPIPlan, ...]]) -> Callable[[Any, Path], None]:
+    """Trains on a plan made of the one that the scene would get."""
+
+    def change(config: Any, scene: Path) -> None:
+        path = scene / f"plan-{alter.__name__.strip('_')}.json"
+        plan = ScenePlan.load(scene / "plan.json")
+        path.write_text(replace(plan, mpis=alter(plan.mpis)).to_json(), encoding="utf-8")
+        config.pipeline.model.plan_file = path
+
+    return change
+
+
+def _identical(mpis: tuple[MPIPlan, ...]) -> tuple[MPIPlan, ...]:
+    return mpis[0], replace(mpis[0], name="its twin")
+
+
+def _turned(mpi: MPIPlan) -> MPIPlan:
+    x, y, z = mpi.axes
+    back = tuple(tuple(-v for v in row) for row in (x, z))
+    return replace(mpi, name="facing away", axes=(back[0], y, back[1]))  # type: ignore[arg-type]
+
+
+def _one_away(mpis: tuple[MPIPlan, ...]) -> tuple[MPIPlan, ...]:
+    return mpis[0], _turned(mpis[0])
+
+
+def _all_away(mpis: tuple[MPIPlan, ...]) -> tuple[MPIPlan, ...]:
+    return (_turned(mpis[0]),)
+
+
+FINITE = "finite weights"
+ABSURDITIES = (
+    Absurdity("learning rates x 100", FINITE, _rates(100.0)),
+    Absurdity("raw densities start at N(0, 1) x 1e3", FINITE, lambda config, scene: None, _dense(1e3)),
+    Absurdity("one training image", FINITE, _one_image),
+    Absurdity("two identical MPIs", FINITE, _with_plan(_identical)),
+    Absurdity("one of two MPIs faces away", FINITE, _with_plan(_one_away)),
+    Absurdity("the only MPI faces away", FINITE, _with_plan(_all_away)),
+)
+
+
+def _config(scene: Path, output: Path, steps: int) -> Any:
+    """mmpi-small with both phases and a fine-tune, few rays and small networks."""
+    config: Any = copy.deepcopy(mmpi_small.config)
+    config.output_dir, config.experiment_name, config.timestamp = output, "absurd", "run"
+    config.max_num_iterations, config.steps_per_save = steps, steps
+    config.machine.device_type, config.machine.num_devices = "cpu", 1
+    config.logging.local_writer.enable, config.logging.profiler, config.vis = False, "none", "tensorboard"
+    config.data = config.pipeline.datamanager.data = scene
+    config.pipeline.datamanager.dataparser.downscale_factor = 1
+    config.pipeline.datamanager.train_num_rays_per_batch = RAYS
+    config.pipeline.datamanager.keypoint_rays = RAYS // 4
+    model = config.pipeline.model
+    model.training, model.hidden_width, model.placement.max_planes = "two-phase", 16, 32
+    return config
+
+
+def _setup(config: Any) -> MMPITrainer:
+    nerfstudio_trainer.writer.EVENT_WRITERS.clear()
+    trainer = config.setup(local_rank=0, world_size=1)
+    trainer.setup()
+    return trainer
+
+
+def prepare(work: Path) -> Path:
+    """The tiny scene, and the plan that the placement rule gives it (by which the altered plans are made)."""
+    scene = write_scene(work / "scene")
+    if not (scene / "plan.json").is_file():
+        with _quiet():
+            plan = _setup(_config(scene, work / "plan", 1))._model.field.full_plan
+        (scene / "plan.json").write_text(plan.to_json(), encoding="utf-8")
+    return scene
+
+
+def _quiet() -> contextlib.AbstractContextManager:
+    return contextlib.redirect_stdout(io.StringIO())
+
+
+def train(absurdity: Absurdity, work: Path, steps: int) -> dict[str, Any]:
+    """Trains to the end or to an error; which numbers of the model are not finite."""
+    scene = prepare(work)
+    config = _config(scene, work / absurdity.name.replace(" ", "-"), steps)
+    row: dict[str, Any] = {"expectation": absurdity.expectation, "steps": steps, "commit": commit()}
+    start = time.perf_counter()
+    try:
+        with _quiet():
+            absurdity.change(config, scene)
+            trainer = _setup(config)
+            if absurdity.start is not None:
+                absurdity.start(trainer)
+            trainer.train()
+    except ValueError as error:
+        row.update(outcome=f"error: {error}", ok=_is_one_sentence(str(error)))
+    except Exception as error:  # anything else is no message to a user, whatever it says: a failure to be reported
+        row.update(outcome=f"{type(error).__name__}: {error}", ok=False)
+    else:
+        row.update(_weights(trainer, steps))
+    row["seconds"] = time.perf_counter() - start
+    return row
+
+
+def _is_one_sentence(text: str) -> bool:
+    return 20 < len(text) < 400 and "\n" not in text.strip()
+
+
+def _weights(trainer: MMPITrainer, steps: int) -> dict[str, Any]:
+    """Whether every step ran, every number is finite, and what a test image gets."""
+    model = trainer._model.eval()
+    state = {k: v for k, v in model.state_dict().items() if v.is_floating_point()}
+    broken = sorted(k for k, v in state.items() if not bool(torch.isfinite(v).all()))
+    largest = max((float(v.abs().max()) for v in state.values() if v.numel()), default=0.0)
+    with torch.no_grad():
+        image = model.get_outputs_for_camera(trainer.pipeline.datamanager.eval_dataset.cameras[0:1])
+    broken += sorted(f"output {k}" for k, v in image.items() if not bool(torch.isfinite(v).all()))
+    truth = trainer.pipeline.datamanager.eval_dataset.get_image_float32(0)[..., :3]
+    psnr = float(-10 * torch.log10(((image["rgb"] - truth) ** 2).mean()))
+    ran = trainer._last_step + 1
+    done = ran == steps and not broken
+    said = "finite weights" if not broken else f"not finite: {', '.join(broken)}"
+    said += "" if ran == steps else f" after {ran} of {steps} steps"
+    return {"outcome": said, "ok": done, "largest": largest, "psnr": psnr}

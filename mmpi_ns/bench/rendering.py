@@ -1,0 +1,63 @@
+"""Rays through a field by the package's own parts, put together as the model does: sampler, field, compositing."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from nerfstudio.cameras.rays import RayBundle, RaySamples
+from nerfstudio.field_components.field_heads import FieldHeadNames
+from torch import Tensor
+
+from mmpi_ns.bench.exact import Array
+from mmpi_ns.compositing import (
+    BlendForm,
+    Composite,
+    blended_optical_depth,
+    composite_weights,
+    median_inverse_distance,
+    render_colors,
+)
+from mmpi_ns.mmpi_field import MMPIField
+from mmpi_ns.mmpi_sampler import MergeReport, MMPISampler
+from mmpi_ns.mmpi_samples import metadata_of
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """R rays, without background."""
+
+    rgb: Tensor
+    """[R, 3]"""
+    composite: Composite
+    samples: RaySamples
+    report: MergeReport
+
+    def median_inverse_distance(self) -> Tensor:
+        """1/t at half the gathered mass [R]."""
+        meta = metadata_of(self.samples)
+        inverse_t, valid = meta["inverse_t"][..., 0], meta["valid"][..., 0]
+        return median_inverse_distance(self.composite.weights, inverse_t, valid)[:, 0]
+
+
+def bundle_of(origins: Array, directions: Array, near: float = 0.05, far: float = math.inf) -> RayBundle:
+    """float32 rays from arrays [R, 3]."""
+    o, d = (torch.tensor(np.atleast_2d(x), dtype=torch.float32) for x in (origins, directions))
+    column = torch.ones(len(o), 1)
+    return RayBundle(origins=o, directions=d, pixel_area=column * 1e-4, nears=near * column, fars=far * column)
+
+
+def render(field: MMPIField, rays: RayBundle, threshold: float = 0.0, form: BlendForm | None = None) -> Rendered:
+    """Colour of rays; differentiable by the field's tables."""
+    samples, report = MMPISampler()(rays, field=field, threshold=threshold, blend_form=form)
+    tau, lookup = field.get_density(samples)
+    tau = tau[..., 0]
+    if form is not None and lookup.index.numel():
+        blended = blended_optical_depth(tau.reshape(-1)[lookup.index], *field.sample_shares(samples, lookup), form)
+        tau = tau.new_zeros(tau.numel()).index_put((lookup.index,), blended).view(tau.shape)
+    meta = metadata_of(samples)
+    made = composite_weights(tau, meta["valid"][..., 0], meta["skipped_before"][..., 0], report.skipped_total)
+    colors = field.get_outputs(samples, lookup)[FieldHeadNames.RGB]
+    return Rendered(render_colors(made, colors), made, samples, report)

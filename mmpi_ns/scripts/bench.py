@@ -1,0 +1,26 @@
+"""``mmpi-bench``: the figures in docs/results, each made again by one command."""
+
+from __future__ import annotations
+
+import sys
+
+import tyro
+
+from mmpi_ns.bench.accuracy import Accuracy
+from mmpi_ns.bench.dense import Dense
+from mmpi_ns.bench.regions import Regions
+from mmpi_ns.bench.results import Results
+from mmpi_ns.bench.stability import Stability
+
+
+def entrypoint() -> None:
+    """The command ``mmpi-bench``; a mistake is one sentence and exit status 1."""
+    command = tyro.cli(Stability | Accuracy | Results | Dense | Regions, prog="mmpi-bench")  # type: ignore[arg-type]
+    try:
+        command.run()
+    except (ValueError, OSError) as error:
+        sys.exit(f"mmpi-bench: {error}")
+
+
+if __name__ == "__main__":
+    entrypoint()
