@@ -74,6 +74,11 @@ def test_regions_pair_what_is_expected_with_what_is_measured_there():
     assert found[1] == pytest.approx([np.sqrt(c.mean()) for c in cells])
 
 
+def test_the_slope_of_an_image_is_its_change_over_a_pixel():
+    ramp = np.arange(12.0)[None, :, None] * [0.3, 0.6, 0.0] + np.arange(9.0)[:, None, None] * [0.0, 0.0, 0.9]
+    assert regions.squared_slope(ramp) == pytest.approx(np.full((9, 12), (0.09 + 0.36 + 0.81) / 3))
+
+
 def test_a_row_of_results_says_what_was_run(tmp_path):
     models = tmp_path / "nerfstudio_models"
     models.mkdir()

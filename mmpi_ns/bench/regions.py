@@ -40,45 +40,56 @@ class Regions:
         points = manager.observations.points
         if not len(points):
             raise ValueError("The scene has no SfM points in colmap/sparse/0: nothing to expect errors of.")
-        expected, measured = [], []
+        expected, errors, slopes = [], [], []
         for i in range(len(manager.eval_dataset)):
             camera = manager.eval_dataset.cameras[i : i + 1].to(model.device)
             with torch.no_grad():
                 rgb = model.get_outputs_for_camera(camera)["rgb"].cpu()
             truth = manager.eval_dataset.get_image_float32(i)[..., :3]
             squared = ((rgb - truth) ** 2).mean(-1).numpy()
-            a, b = self._regions(_as_observations(camera), points, model.field.plan, squared)
-            expected += a
-            measured += b
+            found = self._regions(
+                _as_observations(camera), points, model.field.plan, squared, squared_slope(truth.numpy())
+            )
+            for values, more in zip((expected, errors, slopes), found, strict=True):
+                values += more
             print(f"{i + 1} of {len(manager.eval_dataset)} images", flush=True)
-        result = {"regions": len(expected), "rank_correlation": spearman(np.array(expected), np.array(measured))}
+        # A pixel of displacement costs what the image changes over a pixel: nothing on a plain wall.
+        pixels = np.array(errors) / np.maximum(slopes, 1e-6)
+        result = {
+            "regions": len(expected),
+            "rank_correlation": spearman(np.array(expected), np.array(errors)),
+            "rank_correlation_in_pixels": spearman(np.array(expected), pixels),
+        }
         self.output.parent.mkdir(parents=True, exist_ok=True)
         self.output.write_text(json.dumps({"headline": result}, indent=1), encoding="utf-8")
         print(json.dumps(result))
 
-    def _regions(
-        self, camera: Observations, points: Array, plan: ScenePlan, squared: Array
-    ) -> tuple[list[float], list[float]]:
-        """Median expected error and root mean square colour error of every region with enough points."""
+    def _regions(self, camera: Observations, points: Array, plan: ScenePlan, *squared: Array) -> list[list[float]]:
+        """Median expected error, then the root means of maps of squares [H, W], of every region with enough points."""
         only = np.zeros(len(points), np.int64)
         pixels, ahead = camera.project(only, points)
-        height, width = squared.shape
+        height, width = squared[0].shape
         row = np.floor(pixels[:, 1] / height * self.rows).astype(int)
         column = np.floor(pixels[:, 0] / width * self.columns).astype(int)
         errors = pixel_errors(plan, camera, only, points).combined.min(-1)
-        expected, measured = [], []
+        found: list[list[float]] = [[] for _ in range(1 + len(squared))]
         for r in range(self.rows):
             for c in range(self.columns):
                 inside = ahead & (row == r) & (column == c)
                 if inside.sum() < MIN_POINTS:
                     continue
-                cell = squared[
-                    r * height // self.rows : (r + 1) * height // self.rows,
-                    c * width // self.columns : (c + 1) * width // self.columns,
-                ]
-                expected.append(float(np.median(np.minimum(errors[inside], WORST))))
-                measured.append(float(np.sqrt(cell.mean())))
-        return expected, measured
+                rows = slice(r * height // self.rows, (r + 1) * height // self.rows)
+                columns = slice(c * width // self.columns, (c + 1) * width // self.columns)
+                found[0].append(float(np.median(np.minimum(errors[inside], WORST))))
+                for values, area in zip(found[1:], squared, strict=True):
+                    values.append(float(np.sqrt(area[rows, columns].mean())))
+        return found
+
+
+def squared_slope(image: Array) -> Array:
+    """[H, W] what an image [H, W, 3] changes over a pixel, squared: mean over colours, sum over both directions."""
+    down, right = np.gradient(image, axis=(0, 1))
+    return (down**2 + right**2).mean(-1)
 
 
 def spearman(a: Array, b: Array) -> float:
