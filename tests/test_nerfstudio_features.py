@@ -215,12 +215,12 @@ class Browser:
         )
 
     def settled(self):
-        """The last picture [H, W, 3] of those that come, coarse ones first, until none comes for a second."""
+        """The last picture [H, W, 3] of those that come, coarse ones first, until none comes for three seconds."""
         found, timeout = None, 20
         while True:
             try:
                 found = self.wait_for(lambda m: m["type"] == "BackgroundImageMessage", timeout)
-                timeout = 1
+                timeout = 3  # on a busy machine the fine one takes more than a second
             except TimeoutError:
                 return np.asarray(Image.open(io.BytesIO(found["rgb_bytes"])).convert("RGB"), float) / 255
 
