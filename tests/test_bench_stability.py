@@ -10,7 +10,7 @@ import torch
 
 from mmpi_ns import compositing, geometry
 from mmpi_ns.bench import absurd, cases_blending, cases_geometry, cases_merging, cases_rays, provenance, stability
-from mmpi_ns.bench.cases import PRECISIONS, Error, compare
+from mmpi_ns.bench.cases import PRECISIONS, Case, Error, Outcome, compare
 
 FLOAT32 = PRECISIONS[0]
 
@@ -62,7 +62,7 @@ def test_shares_from_log_softmax_alone_fail_where_reliability_is_saturated(monke
         share = torch.where(cover, reliability, -math.inf).log_softmax(-1).gather(1, own[:, None])[:, 0]
         return share, torch.log1p(-share.exp())
 
-    case = named("2 MPIs, reliabilities +-1000, tau 0 to 1e4, paper", cases_blending)
+    case = named("12 MPIs, reliabilities +-1000, tau 0 to 1e4, paper form", cases_blending)
     assert case.measure(FLOAT32).holds
     monkeypatch.setattr(cases_blending, "blend_shares", plain)
     assert not case.measure(FLOAT32).holds
@@ -143,6 +143,42 @@ def test_the_table_names_command_processor_commit_and_every_case(tmp_path, monke
                    content["made"]["commit"], content["made"]["date"], *(c.inputs for c in chosen)):  # fmt: skip
         assert wanted in text
     assert (tmp_path / "stability.png").stat().st_size > 1000
+
+
+def test_cases_are_measured_once_and_again_only_when_the_sources_change(tmp_path, monkeypatch):
+    measured = []
+    case = Case("group", "input", "nothing", lambda p: measured.append(p.name) or Outcome(Error(0.5, 1.0)))
+    monkeypatch.setattr(stability, "all_cases", lambda: [case])
+    command = stability.Stability(output=tmp_path, training=False)
+    command.run()
+    command.run()
+    assert measured == [p.name for p in PRECISIONS]
+    monkeypatch.setattr(stability, "fingerprint", lambda: "other sources")
+    command.run()
+    assert len(measured) == 2 * len(PRECISIONS)
+
+
+def test_a_case_that_raises_fails_and_the_next_one_runs(tmp_path, monkeypatch):
+    def fall(precision):
+        raise RuntimeError("out of range")
+
+    cases = [
+        Case("group", "bad", "nothing", fall),
+        Case("group", "good", "nothing", lambda p: Outcome(Error(0.5, 1.0))),
+    ]
+    monkeypatch.setattr(stability, "all_cases", lambda: cases)
+    with pytest.raises(SystemExit):
+        stability.Stability(output=tmp_path, training=False).run()
+    content = json.loads((tmp_path / "stability.json").read_text())
+    assert [row["ok"] for row in content["rows"]] == [False, True] and content["headline"]["failed"] == 1
+    assert "out of range" in content["rows"][0]["paths"]["float32"]["raised"]
+
+
+@pytest.mark.parametrize("group", [cases_geometry, cases_blending, cases_merging])
+@pytest.mark.parametrize("precision", PRECISIONS, ids=lambda p: p.name)
+def test_every_case_holds(group, precision):
+    """Whole rays take longer: some of them are above, all of them in docs/results/stability.md."""
+    assert failures(group.cases(), precision) == []
 
 
 def test_a_case_that_fails_is_counted_and_ends_the_command_with_an_error(tmp_path, monkeypatch):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import platform
@@ -28,6 +29,16 @@ def commit() -> str:
     """Short hash of the commit that this package is checked out at; "unknown" where it is installed."""
     words = ["git", "-C", str(Path(__file__).resolve().parent), "rev-parse", "--short", "HEAD"]
     return subprocess.run(words, capture_output=True, text=True, check=False).stdout.strip() or "unknown"
+
+
+def fingerprint() -> str:
+    """Of this package's sources and torch: what was measured with equal ones need not be measured again."""
+    package = Path(__file__).resolve().parents[1]
+    sources = sorted(p for p in package.rglob("*") if p.suffix in (".py", ".cpp", ".h"))
+    digest = hashlib.sha256(torch.__version__.encode())
+    for path in sources:
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
 
 
 def command_of(name: str, settings: Any) -> str:

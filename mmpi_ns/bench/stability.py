@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import math
 import time
+import traceback
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from mmpi_ns.bench import cases_blending, cases_geometry, cases_merging, cases_rays
-from mmpi_ns.bench.cases import PRECISIONS, Case, Error, Outcome
-from mmpi_ns.bench.provenance import read_json, stamp, stamp_line, write_json
+from mmpi_ns.bench.cases import PRECISIONS, Case, Error, Precision
+from mmpi_ns.bench.provenance import fingerprint, read_json, stamp, stamp_line, write_json
 
 GROUPS = (cases_geometry, cases_blending, cases_merging, cases_rays)
 
@@ -20,8 +22,8 @@ GROUPS = (cases_geometry, cases_blending, cases_merging, cases_rays)
 class Stability:
     """Hard cases: error of values and gradients against float64, with bounds; and absurd trainings.
 
-    Ends with status 1 where a case fails. Trainings that are done are not run again: remove stability.json, or name
-    another --output, to start afresh.
+    Ends with status 1 where a case fails. Started again it goes on: cases that were measured with the same sources, and
+    trainings that are done, are taken from stability.json. Remove that to start afresh.
     """
 
     output: Path = Path("docs/results")
@@ -36,23 +38,30 @@ class Stability:
     """Run only the cases (or trainings) whose group and input contain this, and write nothing."""
 
     def run(self) -> None:
-        made = stamp("stability", self)
-        path = self.output / "stability.json"
+        made, path = stamp("stability", self), self.output / "stability.json"
+        before = {} if self.only else read_json(path)
+        content: dict[str, Any] = {"headline": {}, "made": made, "sources": fingerprint(), "rows": []}
+        content["trainings"] = before.get("trainings", {})
+        known = before.get("rows", []) if before.get("sources") == content["sources"] else []
+
+        def save() -> None:
+            content["headline"] = headline(content["rows"], content["trainings"])
+            if not self.only:
+                write_json(path, content)
+
         chosen = [c for c in all_cases() if self.only in f"{c.group}: {c.inputs}"]
-        rows = run_cases(chosen)
-        trainings = read_json(path).get("trainings", {}) if not self.only else {}
+        run_cases(chosen, known, content["rows"], save)
         if self.training:
-            self._train(trainings, path, {"rows": rows, "made": made})
-        content = {"headline": headline(rows, trainings), "made": made, "rows": rows, "trainings": trainings}
+            self._train(content["trainings"], save)
+        save()
         if not self.only:
-            write_json(path, content)
             (self.output / "stability.md").write_text(table(content), encoding="utf-8")
-            draw(self.output / "stability.png", rows)
+            draw(self.output / "stability.png", content["rows"])
         print(content["headline"])
         if content["headline"]["failed"]:
             raise SystemExit("mmpi-bench: a case fails its bound; see the lines above that say FAIL.")
 
-    def _train(self, done: dict[str, Any], path: Path, rest: dict[str, Any]) -> None:
+    def _train(self, done: dict[str, Any], save: Callable[[], None]) -> None:
         from mmpi_ns.bench.absurd import ABSURDITIES, train
 
         for number, absurdity in enumerate(ABSURDITIES, 1):
@@ -60,8 +69,7 @@ class Stability:
                 continue
             if done.get(absurdity.name, {}).get("steps") != self.steps:
                 done[absurdity.name] = train(absurdity, self.work, self.steps)
-                if not self.only:
-                    write_json(path, {"headline": headline(rest["rows"], done), "trainings": done, **rest})
+                save()
             row = done[absurdity.name]
             verdict = "ok" if row["ok"] else "FAIL"
             print(f"[training {number}/{len(ABSURDITIES)}] {verdict} {absurdity.name}: {row['outcome']}", flush=True)
@@ -72,19 +80,23 @@ def all_cases() -> list[Case]:
     return [case for group in GROUPS for case in group.cases()]
 
 
-def run_cases(chosen: list[Case]) -> list[dict[str, Any]]:
-    """Measures each case under every arithmetic; an exception counts as a failure."""
-    rows = []
+def run_cases(
+    chosen: list[Case], known: list[dict[str, Any]], rows: list[dict[str, Any]], save: Callable[[], None]
+) -> None:
+    """Measures each case under every arithmetic into ``rows``; those among ``known`` are taken from there."""
+    by_name = {(row["group"], row["inputs"]): row for row in known}
     for number, case in enumerate(chosen, 1):
         start = time.perf_counter()
-        row: dict[str, Any] = {"group": case.group, "inputs": case.inputs, "expectation": case.expectation}
-        row["paths"] = {p.name: _as_row(case.measure(p)) for p in PRECISIONS}
-        row["ok"] = all(path["ok"] for path in row["paths"].values())
-        row["seconds"] = time.perf_counter() - start
+        row = by_name.get((case.group, case.inputs))
+        if row is None:
+            row = {"group": case.group, "inputs": case.inputs, "expectation": case.expectation}
+            row["paths"] = {p.name: _measure(case, p) for p in PRECISIONS}
+            row["ok"] = all(path["ok"] for path in row["paths"].values())
+            row["seconds"] = time.perf_counter() - start
         rows.append(row)
+        save()
         said = "ok  " if row["ok"] else "FAIL"
         print(f"[{number}/{len(chosen)}] {said} {case.group}: {case.inputs} ({row['seconds']:.1f} s)", flush=True)
-    return rows
 
 
 def headline(rows: list[dict[str, Any]], trainings: dict[str, Any]) -> dict[str, Any]:
@@ -100,7 +112,13 @@ def headline(rows: list[dict[str, Any]], trainings: dict[str, Any]) -> dict[str,
     }
 
 
-def _as_row(outcome: Outcome) -> dict[str, Any]:
+def _measure(case: Case, precision: Precision) -> dict[str, Any]:
+    try:
+        outcome = case.measure(precision)
+    except Exception as error:  # whatever a hard input makes a kernel raise is a result, not the end of the table
+        traceback.print_exc(limit=-3)
+        said = f"{type(error).__name__}: {error}"
+        return {"value": {"error": None, "bound": 0.0}, "gradient": None, "ok": False, "raised": said}
     return {"value": _cell(outcome.value), "gradient": _cell(outcome.gradient), "ok": outcome.holds}
 
 
