@@ -42,6 +42,19 @@ def test_plan_keeps_every_digit_in_json():
     assert ScenePlan.from_json(plan.to_json()).mpis[0] == mpi
 
 
+def test_far_end_is_a_number_or_null_in_json_and_may_be_left_out():
+    plan = ScenePlan((make_mpi(), make_mpi("kerb", far=0.1 + 7.2)), None, 0.1, 1.0)
+
+    def strict(constant):
+        raise AssertionError(f"{constant} is no standard JSON")
+
+    data = json.loads(plan.to_json(), parse_constant=strict)
+    assert [m["far"] for m in data["mpis"]] == [None, 0.1 + 7.2]
+    assert ScenePlan.from_json(plan.to_json()) == plan
+    del data["mpis"][0]["far"], data["mpis"][1]["far"]
+    assert [m.far for m in ScenePlan.from_json(json.dumps(data)).mpis] == [math.inf, math.inf]
+
+
 def test_plan_is_loaded_from_a_file(plan, tmp_path):
     path = tmp_path / "plan.json"
     path.write_text(plan.to_json(), encoding="utf-8")
@@ -76,6 +89,10 @@ def test_heads_are_the_mpis_and_then_the_cube(plan):
         ({"planes": 1}, "planes"),
         ({"height": 1}, "texels"),
         ({"width": 0}, "texels"),
+        ({"far": 1.0}, "far"),
+        ({"far": 0.5}, "far"),
+        ({"far": math.nan}, "far"),
+        ({"far": -math.inf}, "far"),
     ],
 )
 def test_unusable_mpis_are_refused_by_name_and_field(changes, words):
@@ -127,7 +144,9 @@ def test_json_that_is_no_plan_is_refused_with_a_sentence(text):
     assert is_one_sentence(str(error.value))
 
 
-@pytest.mark.parametrize(("field", "value"), [("extent", [0.0, 1.0]), ("origin", [0.0, 1.0]), ("near", "3 m")])
+@pytest.mark.parametrize(
+    ("field", "value"), [("extent", [0.0, 1.0]), ("origin", [0.0, 1.0]), ("near", "3 m"), ("far", "3 m")]
+)
 def test_fields_of_the_wrong_form_name_the_mpi(plan, field, value):
     data = json.loads(plan.to_json())
     data["mpis"][1][field] = value

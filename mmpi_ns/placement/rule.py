@@ -21,6 +21,7 @@ from mmpi_ns.placement.errors import WORST
 from mmpi_ns.placement.hand_made import drive_plan, room_plan
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.placement.plan import CubePlan, MPIPlan, ScenePlan
+from mmpi_ns.placement.reach import with_far_ends
 
 MIN_PLANES = 16
 BUDGET_ROUNDS = 8
@@ -59,6 +60,8 @@ class PlacementConfig:
     """How much texels count against a candidate: its gain is divided by texels to this power (automatic)."""
     max_voxels: int = 128
     """Voxels along a side of a cube at most, where one is worth it; 0 for none (automatic)."""
+    far_ends: bool = False
+    """Let MPIs end where others show what lies beyond, so that a ray on a long road meets fewer of them (automatic)."""
     faces: tuple[str, ...] = ("front", "left", "right", "below")
     """Which MPIs of the drive to use (drive)."""
     drive_pull_back: float = 0.45
@@ -108,6 +111,7 @@ def _choose(
     """The heads that a scene needs, with texels no finer than the budget allows."""
     candidates = find_candidates(observations, content, with_cubes=config.max_voxels > 0)
     best: list[MPIPlan | CubePlan] | None = None
+    size = texel_pixels
     chosen: list[MPIPlan | CubePlan] = []
     too_fine = None
     for _ in range(BUDGET_ROUNDS):
@@ -116,7 +120,7 @@ def _choose(
         chosen = [*mpis, *(h for h in chosen if isinstance(h, CubePlan))]
         excess = sum(h.texels for h in chosen) / config.max_texels if config.max_texels else 0.0
         if excess <= 1.0:
-            best = chosen
+            best, size = chosen, texel_pixels
             if too_fine is None or excess > 0.8:
                 break
             texel_pixels = (too_fine * texel_pixels) ** 0.5
@@ -124,7 +128,14 @@ def _choose(
             too_fine = texel_pixels
             # Coarser texels have fewer rows and columns and ask for fewer planes: a third power, nearly.
             texel_pixels *= max(1.04, excess ** (1 / 3)) if best is None else 1.1
-    return best or chosen
+    if best is None:
+        best, size = chosen, texel_pixels
+    if not config.far_ends:
+        return best
+    mpis = [h for h in best if isinstance(h, MPIPlan)]
+    enough = config.enough * size
+    mpis = with_far_ends(mpis, observations, content, enough, config.max_planes, config.min_gain)
+    return [*mpis, *(h for h in best if isinstance(h, CubePlan))]
 
 
 class _Choice:
