@@ -220,7 +220,10 @@ def _describe(plan: ScenePlan) -> str:
     lines = [f"Scene plan ({plan.origin_of_plan}): {len(plan.mpis)} MPIs, {plan.texels / 1e6:.1f} M texels"]
     for m in plan.mpis:
         tangents = " ".join(f"{t:.2f}" for t in m.extent)
-        lines.append(f"  {m.name}: {m.planes} planes of {m.height} x {m.width}, near {m.near:.3g}, tangents {tangents}")
+        lines.append(
+            f"  {m.name}: {m.planes} planes of {m.height} x {m.width}, "
+            f"depths {m.near:.3g} to {m.far:.3g}, tangents {tangents}"
+        )
     if plan.cube is not None:
         lines.append(f"  cube: {' x '.join(str(n) for n in plan.cube.shape)} voxels")
     return "\n".join(lines)

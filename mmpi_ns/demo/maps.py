@@ -116,8 +116,8 @@ class Map:
         return places[[first, last]]
 
     def _frustum(self, mpi: MPIPlan) -> Array:
-        reach = 4 * max(self.size) / self.scale
-        return np.concatenate([self._across(mpi, mpi.near), self._across(mpi, mpi.near + reach)[::-1]])
+        end = min(mpi.far, mpi.near + 4 * max(self.size) / self.scale)
+        return np.concatenate([self._across(mpi, mpi.near), self._across(mpi, end)[::-1]])
 
     def _cube(self, cube: CubePlan) -> Array:
         (x0, y0, z0), (x1, y1, _) = cube.lower, cube.upper
@@ -125,6 +125,6 @@ class Map:
 
 
 def plane_depths(mpi: MPIPlan) -> list[float]:
-    """Depths of some of an MPI's planes, evenly spaced in disparity as all are, without the one at infinity."""
+    """Depths of some of an MPI's planes, evenly spaced in disparity as all are, without the last one."""
     shares = np.linspace(0, 1, min(SHOWN_PLANES, mpi.planes), endpoint=False)
-    return (mpi.near / (1 - shares)).tolist()
+    return (mpi.near / (1 - mpi.depth_share * shares)).tolist()

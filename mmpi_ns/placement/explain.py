@@ -22,6 +22,8 @@ class HeadReport:
     origin: tuple[float, ...]
     near: float
     """Depth of the first plane; half the side of a cube."""
+    far: float
+    """Depth of the last plane; not a number for a cube."""
     extent: tuple[float, ...]
     """Tangents (u0, u1, v0, v1); the box of a cube."""
     size: tuple[int, ...]
@@ -80,7 +82,8 @@ def explain(plan: ScenePlan, observations: Observations, content: Content) -> Pl
 def table(report: PlanReport) -> str:
     """The report as a Markdown table and a line about the whole."""
     lines = [
-        "| MPI | faces | origin | near | tangents | planes x rows x columns | M texels | serves | error px | without |",
+        "| MPI | faces | origin | depths | tangents | planes x rows x columns | M texels "
+        "| serves | error px | without |",
         "|---|---|---|---|---|---|---|---|---|---|",
     ]
     for h in report.heads:
@@ -88,7 +91,7 @@ def table(report: PlanReport) -> str:
             h.name,
             h.facing,
             ", ".join(f"{x:.3g}" for x in h.origin),
-            f"{h.near:.3g}",
+            f"{h.near:.3g}" if np.isnan(h.far) else f"{h.near:.3g} to {h.far:.3g}",
             ", ".join(f"{x:.2f}" for x in h.extent),
             " x ".join(str(n) for n in h.size),
             f"{h.texels / 1e6:.2f}",
@@ -117,10 +120,12 @@ def _geometry(head: MPIPlan | CubePlan, observations: Observations) -> dict:
         center = (np.asarray(head.lower) + np.asarray(head.upper)) / 2
         half = float((np.asarray(head.upper) - np.asarray(head.lower)).max() / 2)
         box = (*head.lower, *head.upper)
-        return {"facing": "all round", "origin": tuple(center), "near": half, "extent": box, "size": head.shape}
+        depth = {"near": half, "far": float("nan")}
+        return {"facing": "all round", "origin": tuple(center), **depth, "extent": box, "size": head.shape}
     facing = describe_facing(np.asarray(head.axes[2]), observations.mean_axes)
     size = (head.planes, head.height, head.width)
-    return {"facing": facing, "origin": head.origin, "near": head.near, "extent": head.extent, "size": size}
+    depth = {"near": head.near, "far": head.far}
+    return {"facing": facing, "origin": head.origin, **depth, "extent": head.extent, "size": size}
 
 
 def describe_facing(direction: Array, base: Array) -> str:

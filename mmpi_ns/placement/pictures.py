@@ -95,8 +95,10 @@ def _draw_mpi(axes: Axes, mpi: MPIPlan, picture: Array, middle: Array, reach: fl
     """
     u0, u1, v0, v1 = mpi.extent
     origin = (np.asarray(mpi.origin) - middle) @ picture.T
-    depths = mpi.near / (1 - np.linspace(0, 1, min(SHOWN_PLANES, mpi.planes), endpoint=False))
-    depths = np.append(depths[depths < reach], reach)
+    shown = np.linspace(0, 1, min(SHOWN_PLANES, mpi.planes), endpoint=False)
+    depths = mpi.near / (1 - mpi.depth_share * shown)
+    end = min(mpi.far, reach)
+    depths = np.append(depths[depths < end], end)
     corners = np.array([[u, v, 1.0] for u in (u0, u1) for v in (v0, v1)]) @ np.asarray(mpi.axes) @ picture.T
     planes = np.array([_widest(origin + depth * corners) for depth in depths])
     axes.add_collection(LineCollection(list(planes), colors=color, linewidths=0.6, zorder=2))
