@@ -134,7 +134,6 @@ class _Ends:
         """Index of each MPI's end; the last is infinity."""
         count, infinity = len(self.bits), self.met.shape[1] - 1
         level = np.full(count, infinity)
-        lost = np.zeros(count)
         while True:
             loss = self._losses(level)
             spared = self.met[np.arange(count), level][:, None] - self.met
@@ -143,7 +142,6 @@ class _Ends:
             k, end = np.unravel_index(int(net.argmax()), net.shape)
             if not net[k, end] > 0:
                 break
-            lost[k] += loss[k, end]
             level[k] = end
         few = self.met[:, -1] - self.met[np.arange(count), level] < LEAST_SPARED * self.met[:, -1]
         return np.where(few, infinity, level)
