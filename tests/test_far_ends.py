@@ -69,11 +69,13 @@ def test_points_beyond_the_end_are_unserved_and_planes_lie_closer_before_it():
 # The choice, by hand ------------------------------------------------------------------------------------------------
 
 
-def ends_of(bits, reach, met, lattice_reach, min_gain=1.0, held=True):
+def ends_of(bits, reach, met, lattice_reach, min_gain=1.0, held=True, least=None):
     bits, lattice_reach = np.array(bits, float), np.array(lattice_reach)
     lattice_held = np.full(lattice_reach.shape, held)
     weights = np.ones(bits.shape[1])
-    return _Ends(bits, np.array(reach), weights, lattice_reach, lattice_held, np.array(met, float), min_gain).run()
+    least = np.zeros(len(bits), int) if least is None else np.array(least)
+    met = np.array(met, float)
+    return _Ends(bits, np.array(reach), weights, lattice_reach, lattice_held, met, least, min_gain).run()
 
 
 MET = [[10, 20, 100], [10, 20, 100]]
@@ -103,6 +105,11 @@ def test_a_point_of_the_lattice_that_only_one_holds_keeps_it_long():
     bits, reach = [[0, np.inf], [np.inf, 0]], [[0, 0], [0, 0]]
     held = np.array([[True], [False]])
     assert ends_of(bits, reach, MET, [[2], [0]], held=held).tolist() == [2, 0]
+
+
+def test_no_mpi_ends_before_its_first_plane():
+    bits, reach = [[0, np.inf], [np.inf, 0]], [[0, 0], [0, 0]]
+    assert ends_of(bits, reach, MET, [[0], [0]], least=[0, 1]).tolist() == [0, 1]
 
 
 def test_an_end_that_spares_hardly_any_ray_is_not_made():

@@ -27,6 +27,8 @@ INFINITE = 1000.0
 """Depth, relative to where content starts, that stands for infinity: there parallax cannot be told any more."""
 LATTICE = ((0.0, 0.25, 0.5, 0.75, 1.0), (0.0, 0.5, 1.0), (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, INFINITE))
 """Columns, rows and depths (relative to where its content starts) at which each image must stay held."""
+LEAST_DEPTH = 1.5
+"""No MPI ends before so many times the depth of its first plane."""
 LEAST_SPARED = 0.1
 """An end must spare an MPI this share of the training rays that meet it."""
 
@@ -53,7 +55,8 @@ def with_far_ends(
     bits, reach = _costs(mpis, observations, content, (content.cameras, content.points), enough, max_planes)
     held, lattice_reach = _costs(mpis, observations, content, (lattice_cameras, lattice), enough, max_planes)
     met = _rays_met(mpis, observations, content, directions)
-    choice = _Ends(bits, reach, content.weights, lattice_reach, np.isfinite(held), met, min_gain)
+    least = np.searchsorted(ENDS * content.near, LEAST_DEPTH * np.array([m.near for m in mpis]))
+    choice = _Ends(bits, reach, content.weights, lattice_reach, np.isfinite(held), met, least, min_gain)
     ends = np.append(ENDS * content.near, np.inf)
     return [replace(m, far=float(ends[level])) for m, level in zip(mpis, choice.run(), strict=True)]
 
@@ -128,6 +131,8 @@ class _Ends:
     lattice_held: NDArray[np.bool_]
     met: Array
     """[K, E] rays that meet each MPI for each end."""
+    least: NDArray[np.int64]
+    """[K] the least end of each MPI that lies beyond its first plane."""
     min_gain: float
 
     def run(self) -> NDArray[np.int64]:
@@ -138,7 +143,9 @@ class _Ends:
             loss = self._losses(level)
             spared = self.met[np.arange(count), level][:, None] - self.met
             price = self.met[:, -1:] / self.min_gain
-            net = np.where(np.arange(infinity + 1) < level[:, None], spared - loss * price, -np.inf)
+            end = np.arange(infinity + 1)
+            possible = (end < level[:, None]) & (end >= self.least[:, None])
+            net = np.where(possible, spared - loss * price, -np.inf)
             k, end = np.unravel_index(int(net.argmax()), net.shape)
             if not net[k, end] > 0:
                 break
