@@ -54,14 +54,14 @@ mmpi = _method(
     "MMPI: several multi-plane images, placed among the training cameras.",
     steps=20000,
     rays=4096,
-    model=MMPIModelConfig(placement=PlacementConfig(texel_pixels=1.2, max_planes=256, max_texels=200e6, max_voxels=0)),
+    model=MMPIModelConfig(placement=PlacementConfig(texel_pixels=1.2, max_planes=256, max_texels=200e6)),
 )
 mmpi_small = _method(
     "mmpi-small",
     "MMPI in a size that a two-core CPU trains in minutes.",
     steps=4000,
     rays=1024,
-    model=MMPIModelConfig(placement=PlacementConfig(texel_pixels=1.2, max_voxels=0), hidden_width=32),
+    model=MMPIModelConfig(placement=PlacementConfig(texel_pixels=1.2), hidden_width=32),
 )
 mmpi_kitti = _method(
     "mmpi-kitti",

@@ -59,7 +59,7 @@ class TrainingRays:
         image = image.repeat(copies, 1)
         random = torch.rand(image.shape[0], 3, generator=g, device=image.device)
         observed = over_background(image, random)
-        # Where the MPIs see a ray only in part, what they let through is not theirs to explain.
+        # Where MPIs that train apart see a ray only in part, what they let through is not theirs to explain.
         explained = self.report.explained[is_pixel]
         background = random if image.shape[-1] == 4 else torch.where(explained, random, observed)
         weights, transmittance = self.composite.weights[is_pixel], self.composite.transmittance[is_pixel]

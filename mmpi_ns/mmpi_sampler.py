@@ -39,7 +39,8 @@ class MergeReport:
     dropped_mass: Float[Tensor, "R 1"]
     """Rendering weight of the dropped samples: the error bound of dropping."""
     explained: Bool[Tensor, "R 1"]
-    """The heads see the ray from before the first content out to infinity."""
+    """What the ray shows is the asked heads' to account for: they see it from before the first content out to infinity,
+    or there are no other heads to see it."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +93,9 @@ class MMPISampler(Sampler):
         if field.cube is not None and cube_first is not None:
             samples.append(_sample_cube(cube_first, counts[:, -1], ray_bundle, field))
 
-        explained = _explained(hits, counts[:, : len(field.plan.mpis)], field)
+        explained = (counts > 0).any(-1, keepdim=True)
+        if head_mask is not None or choose is not None:
+            explained &= _sees_all(hits, counts[:, : len(field.plan.mpis)], field)
         merged, flat, heads = _merge(samples, counts)
         tau = flat.tau
         if blend_form is not None and tau.numel():
@@ -200,7 +203,7 @@ def _blend_visible(
     return tau
 
 
-def _explained(hits: PlaneHits, counts: Int[Tensor, "R K"], field: MMPIField) -> Bool[Tensor, "R 1"]:
+def _sees_all(hits: PlaneHits, counts: Int[Tensor, "R K"], field: MMPIField) -> Bool[Tensor, "R 1"]:
     """Some head sees the ray out to infinity, and the first head is entered before the first content."""
     live = counts > 0
     # One plane before the first live one bounds the entry: behind the camera means that the ray starts inside.

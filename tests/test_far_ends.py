@@ -24,7 +24,7 @@ from mmpi_ns.placement.reach import _Ends, lattice_points, with_far_ends
 from mmpi_ns.placement.rule import PlacementConfig, place
 from mmpi_ns.scenes.catalogue import make_scene
 
-CONFIG = PlacementConfig(max_texels=0, max_mpis=1000)
+CONFIG = PlacementConfig(max_texels=0, max_mpis=1000, enough=1.0)
 ENOUGH = CONFIG.enough * CONFIG.texel_pixels
 
 
@@ -45,7 +45,9 @@ def test_an_mpi_that_ends_starts_as_one_to_infinity_without_its_last_planes():
 def test_a_ray_is_explained_only_where_some_mpi_reaches_to_infinity():
     def explained(*mpis):
         plan = ScenePlan(mpis, None, 0.05, content_near=1.5)
-        return bool(render(MMPIField(plan).eval(), bundle([[0, 0, 0]], [unit([0, 0, 1])])).report.explained)
+        alone = torch.ones(1, len(mpis), dtype=torch.bool)  # they train apart from others
+        rays = bundle([[0, 0, 0]], [unit([0, 0, 1])])
+        return bool(render(MMPIField(plan).eval(), rays, head_mask=alone).report.explained)
 
     near, whole, beyond = make_mpi(far=10.0), make_mpi(), make_mpi(near=9.0)
     assert explained(whole) and not explained(near)

@@ -184,7 +184,7 @@ def candidate(texel, plane=None, rows=100.0, frame=None) -> Candidate:
 
 def chosen(candidates, weight=10.0, **changes):
     """The heads, with texels of two pixels, planes for one pixel, and so much weight for every observation."""
-    config = PlacementConfig(plane_pixels=0.5, texel_pixels=2.0, **changes)
+    config = PlacementConfig(plane_pixels=0.5, texel_pixels=2.0, max_voxels=128, **changes)
     return _Choice(candidates, np.full(len(candidates[0].texel), weight), config, 2.0).run()
 
 

@@ -17,7 +17,8 @@ from mmpi_ns.placement.plan import CubePlan, ScenePlan
 from mmpi_ns.placement.rule import PlacementConfig, place
 from mmpi_ns.scenes.catalogue import make_scene
 
-CONFIG = PlacementConfig(max_texels=0)
+CONFIG = PlacementConfig(max_texels=0, max_voxels=128)
+"""As fine as asked, and with cubes where they look worth it."""
 
 
 def facing(plan: ScenePlan) -> np.ndarray:
@@ -74,6 +75,8 @@ def test_cameras_round_an_object_get_a_cube_and_mpis_for_what_lies_behind_it():
     plan = place(observations_of(make_scene("object"), per_camera=30), CONFIG)
     assert plan.cube is not None and np.abs(np.add(plan.cube.lower, plan.cube.upper)[:2] / 2).max() < 0.3
     assert len(plan.mpis) >= 3
+    without = place(observations_of(make_scene("object"), per_camera=30), replace(CONFIG, max_voxels=0))
+    assert without.cube is None and len(without.mpis) > len(plan.mpis)
 
 
 def test_mpis_grow_with_the_length_of_a_road():

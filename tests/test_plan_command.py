@@ -63,7 +63,7 @@ def test_a_missing_scene_is_one_sentence(tmp_path, monkeypatch):
 
 def test_the_table_adds_up():
     observations = observations_of(make_scene("object"), per_camera=25)
-    plan = place(observations, PlacementConfig(max_texels=0))
+    plan = place(observations, PlacementConfig(max_texels=0, max_voxels=128))
     report = explain(plan, observations, find_content(observations))
     assert plan.cube is not None and len(report.heads) == len(plan.mpis) + 1
     assert sum(h.share for h in report.heads) + report.unserved == pytest.approx(1)

@@ -183,8 +183,11 @@ def test_a_ray_does_not_depend_on_its_batch(form, threshold):
         assert torch.allclose(whole.report.dropped_mass, dropped, atol=1e-6)
 
 
-def ray_explained(plan, origin, direction):
-    return bool(render(MMPIField(plan).eval(), bundle([origin], [unit(direction)])).report.explained)
+def ray_explained(plan, origin, direction, alone=True):
+    """Alone: all heads of the plan, asked as one of several groups of heads that train apart."""
+    mask = torch.ones(1, plan.num_heads, dtype=torch.bool) if alone else None
+    rays = bundle([origin], [unit(direction)])
+    return bool(render(MMPIField(plan).eval(), rays, head_mask=mask).report.explained)
 
 
 def test_a_ray_is_explained_when_it_enters_before_the_first_content_and_stays_to_infinity():
@@ -210,6 +213,15 @@ def test_the_cube_explains_no_ray():
     cube = CubePlan((-5.0, -5.0, -5.0), (5.0, 5.0, 5.0), (4, 4, 4))
     plan = ScenePlan((make_mpi(),), cube, 0.05, 1.5)
     assert not ray_explained(plan, [0, 0, 0], [0, 0, -1])
+
+
+def test_without_other_heads_all_that_a_ray_shows_is_to_be_explained():
+    one = ScenePlan((make_mpi(near=1.0, extent=(-1.0, 1.0, -0.5, 0.5)),), None, 0.05, content_near=1.5)
+    partly = [0, 0, 1.5], [1.3, 0, 1]
+    assert ray_explained(one, *partly, alone=False) and not ray_explained(one, *partly)
+    assert not ray_explained(one, [0, 0, 0], [0, 0, -1], alone=False), "meets nothing"
+    cube = CubePlan((-5.0, -5.0, -5.0), (5.0, 5.0, 5.0), (4, 4, 4))
+    assert ray_explained(ScenePlan((make_mpi(),), cube, 0.05, 1.5), [0, 0, 0], [0, 0, -1], alone=False), "the cube"
 
 
 def test_stopping_where_a_ray_is_opaque_changes_nothing_visible(monkeypatch):

@@ -54,11 +54,11 @@ class PlacementConfig:
     """Texel rows of every MPI (drive, room)."""
     width: int = 256
     """Texel columns of every MPI (drive, room)."""
-    enough: float = 1.0
+    enough: float = 0.75
     """Expected error that needs no further MPI, relative to a texel's pixels (automatic)."""
     texel_cost: float = 0.5
     """How much texels count against a candidate: its gain is divided by texels to this power (automatic)."""
-    max_voxels: int = 128
+    max_voxels: int = 0
     """Voxels along a side of a cube at most, where one is worth it; 0 for none (automatic)."""
     far_ends: bool = False
     """Let MPIs end where others show what lies beyond, so that a ray on a long road meets fewer of them (automatic)."""
