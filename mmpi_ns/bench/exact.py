@@ -11,13 +11,15 @@ import functools
 import math
 from dataclasses import dataclass
 from decimal import Context, Decimal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mmpi_ns.placement.plan import CubePlan, MPIPlan
 
-Array = NDArray[np.float64]
+Array = NDArray[Any]
+"""Of float64; numpy's stubs lose that in too many operations to say so."""
 FACING = 1e-6
 """Below this cosine between ray and facing direction a ray runs along the planes (the plan's convention)."""
 _DIGITS = Context(prec=60, Emax=10**9, Emin=-(10**9))

@@ -89,9 +89,9 @@ def run_cases(
         start = time.perf_counter()
         row = by_name.get((case.group, case.inputs))
         if row is None:
-            row = {"group": case.group, "inputs": case.inputs, "expectation": case.expectation}
-            row["paths"] = {p.name: _measure(case, p) for p in PRECISIONS}
-            row["ok"] = all(path["ok"] for path in row["paths"].values())
+            paths = {p.name: _measure(case, p) for p in PRECISIONS}
+            row = {"group": case.group, "inputs": case.inputs, "expectation": case.expectation, "paths": paths}
+            row["ok"] = all(path["ok"] for path in paths.values())
             row["seconds"] = time.perf_counter() - start
         rows.append(row)
         save()
