@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 
@@ -29,6 +29,7 @@ class ColorNetworks(nn.Module):
         super().__init__()
         self.position_frequencies, self.direction_frequencies = position_frequencies, direction_frequencies
         inputs = channels + 3 * (1 + 2 * position_frequencies) + 3 * (1 + 2 * direction_frequencies)
+        self.width = width
         self.shapes = [(width, inputs), (width,), (width, width), (width,), (3, width), (3,)]
         self.weights = nn.Parameter(torch.empty(0, sum(math.prod(s) for s in self.shapes)))
         self.resize(count)
@@ -52,19 +53,31 @@ class ColorNetworks(nn.Module):
         head: int,
         features: Float[Tensor, "N C"],
         ndc: Float[Tensor, "N 3"],
-        directions: Float[Tensor, "N 3"],
+        directions: Float[Tensor, "R 3"],
+        rays: Int[Tensor, "N"] | None = None,
     ) -> Float[Tensor, "N 3"]:
-        """Colours in [0, 1] of one head's samples; directions are in the head's axes."""
-        w1, b1, w2, b2, w3, b3 = self._layers(head if self.count > 1 else 0)
+        """Colours in [0, 1] of one head's samples.
+
+        Args:
+            head: whose network.
+            features: of each sample.
+            ndc: position of each sample.
+            directions: of each ray, in the head's axes; encoded once a ray.
+            rays: ray of each sample; None where samples and rays are one.
+        """
+        w1, b1, w2, b2, w3, b3 = self.layers(head)
+        encoded = positional_encoding(directions, self.direction_frequencies)
         inputs = [
             features,
             positional_encoding(ndc, self.position_frequencies),
-            positional_encoding(directions, self.direction_frequencies),
+            encoded if rays is None else encoded.index_select(0, rays),
         ]
         hidden = nn.functional.relu(nn.functional.linear(torch.cat(inputs, -1), w1, b1))
         hidden = nn.functional.relu(nn.functional.linear(hidden, w2, b2))
         return torch.sigmoid(features[:, :3] + nn.functional.linear(hidden, w3, b3))
 
-    def _layers(self, index: int) -> list[Tensor]:
+    def layers(self, head: int) -> list[Tensor]:
+        """Weights [out, in] and biases of one head's three layers."""
+        index = head if self.count > 1 else 0
         sizes = [math.prod(s) for s in self.shapes]
         return [p.view(s) for p, s in zip(self.weights[index].split(sizes), self.shapes, strict=True)]

@@ -6,6 +6,9 @@ the parameter list, which nerfstudio fixes before K is known.
 
 from __future__ import annotations
 
+import ctypes
+import math
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -15,11 +18,15 @@ from nerfstudio.field_components.field_heads import FieldHeadNames
 from nerfstudio.fields.base_field import Field
 from torch import Tensor, nn
 
-from mmpi_ns import geometry, losses
+from mmpi_ns import geometry
 from mmpi_ns.color_network import ColorNetworks
 from mmpi_ns.compositing import BlendForm, blend_shares, blended_optical_depth
-from mmpi_ns.mmpi_samples import LocalRays, Lookup, by_head, metadata_of
-from mmpi_ns.ops.interpolate import interpolate
+from mmpi_ns.mmpi_samples import Gathered, LocalRays, Lookup, Taps, by_head, head_spans, metadata_of
+from mmpi_ns.ops import native
+from mmpi_ns.ops.interpolate import gather_rows, index_rows, interpolate, interpolate_gathered
+from mmpi_ns.ops.march import MarchScene, SceneTables
+from mmpi_ns.ops.shade import shade
+from mmpi_ns.ops.variation import total_variation
 from mmpi_ns.placement.plan import ScenePlan
 from mmpi_ns.texels import TexelGrid, head_grids, resample
 
@@ -193,10 +200,23 @@ class MMPIField(Field):
         return nn.functional.softplus(raw + self._biases(k)[planes]) * (interval * self.depth_scale)
 
     def _cube_tau(self, raw: Tensor) -> Tensor:
-        interval = 1.0 / self.samples_per_voxel
-        alpha = torch.tensor(self.cube_alpha, dtype=torch.float64)
-        bias = float(torch.log(torch.expm1(-torch.log1p(-alpha) / interval)))
+        bias, interval = self._cube_density()
         return nn.functional.softplus(raw + bias) * interval
+
+    def _cube_density(self) -> tuple[float, float]:
+        """Bias and interval of the cube's samples."""
+        interval = 1.0 / self.samples_per_voxel
+        return math.log(math.expm1(-math.log1p(-self.cube_alpha) / interval)), interval
+
+    def march_scene(self) -> SceneTables:
+        """The field as the compiled march reads it."""
+
+        def make() -> MarchScene:
+            cube = None if self.cube is None else (self.cube, *self._cube_density())
+            biases = [self._biases(k) for k in range(len(self.plan.mpis))]
+            return MarchScene(self.plan.mpis, self.grids, self.frames.disparity_steps, biases, self.depth_scale, cube)
+
+        return self._cached("march", make).with_tables(self.density.data, self.reliability.data, self.touched)
 
     # Reliability -----------------------------------------------------------------------------------------------
 
@@ -266,14 +286,16 @@ class MMPIField(Field):
         nerfstudio's "density" times interval: on a plane there is no interval, so the product itself is learned.
         """
         lookup = self._lookup(ray_samples)
-        tau = lookup.ndc.new_zeros(lookup.index.shape[0])
-        for rows, weights, members in lookup.groups:
+        raw = []
+        for taps in lookup.groups:
             if self.training and self.learns_cover:
-                self.touched.index_fill_(0, rows.reshape(-1), 1)
-            raw = interpolate(self.density, rows, weights)[:, 0]
-            pieces = [self._head_tau(k, raw[sel], lookup.planes[members[sel]]) for k, sel in lookup.split(members)]
-            tau = tau.index_put((members,), torch.cat(pieces))
-        out = tau.new_zeros(lookup.shape.numel()).index_put((lookup.index,), tau)
+                self.touched.index_fill_(0, lookup.gathered.rows if lookup.gathered else taps.rows.reshape(-1), 1)
+            raw.append(_read(self.density, lookup.gathered and lookup.gathered.density, taps)[:, 0])
+        out = lookup.ndc.new_zeros(lookup.shape.numel())
+        if raw:
+            flat = torch.cat(raw)
+            tau = torch.cat([self._head_tau(k, flat[own], lookup.planes[own]) for k, own in lookup.spans])
+            out = out.index_put((lookup.index,), tau)
         return out.view(*lookup.shape, 1), lookup
 
     def _head_tau(self, k: int, raw: Tensor, planes: Tensor) -> Tensor:
@@ -282,57 +304,74 @@ class MMPIField(Field):
     def _lookup(self, ray_samples: RaySamples) -> Lookup:
         meta = metadata_of(ray_samples)
         index = meta["valid"].reshape(-1).nonzero()[:, 0]
-        heads = meta["heads"].reshape(-1)[index]
-        planes, ndc = meta["planes"].reshape(-1)[index], meta["ndc"].reshape(-1, 3)[index]
-        mpi, groups = [], []
-        for k, members in by_head(heads):
-            if k < len(self.plan.mpis):
-                mpi.append((*self.grids[k].bilinear(planes[members], ndc[members]), members))
-            else:
-                groups.append((*self.grids[k].trilinear(ndc[members]), members))
-        if mpi:
-            groups.insert(0, tuple(torch.cat(parts) for parts in zip(*mpi, strict=True)))
-        return Lookup(meta["valid"].shape[:2], index, heads, planes, ndc, groups)
+        index = index[by_head(meta["heads"].reshape(-1)[index])]
+        heads, planes = meta["heads"].reshape(-1)[index], meta["planes"].reshape(-1)[index]
+        ndc = meta["ndc"].reshape(-1, 3)[index]
+        spans, num_mpis, groups = head_spans(heads), len(self.plan.mpis), []
+        in_mpis = [self.grids[k].bilinear(planes[own], ndc[own]) for k, own in spans if k < num_mpis]
+        if in_mpis:
+            rows, weights = (torch.cat(parts) for parts in zip(*in_mpis, strict=True))
+            groups.append(Taps(slice(0, len(rows)), rows, weights))
+        if spans and spans[-1][0] == num_mpis:
+            own = spans[-1][1]
+            groups.append(Taps(own, *self.grids[-1].trilinear(ndc[own])))
+        return Lookup(meta["valid"].shape[:2], index, heads, planes, ndc, spans, *self._gather(groups))
+
+    def _gather(self, groups: list[Taps]) -> tuple[list[Taps], Gathered | None]:
+        """The distinct rows of all groups, and the groups with their positions among them."""
+        learns = torch.is_grad_enabled() and (self.density.requires_grad or self.features.requires_grad)
+        if not learns or not groups:
+            return groups, None
+        index = index_rows(torch.cat([taps.rows.reshape(-1) for taps in groups]))
+        positions = index.position.split([taps.rows.numel() for taps in groups])
+        placed = [replace(t, position=p.view(t.rows.shape)) for t, p in zip(groups, positions, strict=True)]
+        density, features = (gather_rows(table, index.unique) for table in (self.density, self.features))
+        return placed, Gathered(index.unique, density, features)
 
     def get_outputs(  # type: ignore[override]
         self, ray_samples: RaySamples, density_embedding: Lookup | None = None
     ) -> dict[FieldHeadNames, Tensor]:
         """Colours of the valid samples; empty slots are black."""
+        lib = None if torch.is_grad_enabled() else native.library(self.features, ray_samples.frustums.directions)
+        if lib is not None and density_embedding is None:
+            return {FieldHeadNames.RGB: self._shade(lib, ray_samples)}
         lookup = density_embedding or self._lookup(ray_samples)
-        directions = ray_samples.frustums.directions.reshape(-1, 3)[lookup.index]
-        rgb = lookup.ndc.new_zeros(lookup.index.shape[0], 3)
-        for rows, weights, members in lookup.groups:
-            features = interpolate(self.features, rows, weights)
-            colors = []
-            for k, sel in lookup.split(members):
-                local = geometry.rotate(self._axes(k), directions[members[sel]])
-                colors.append(self.networks(k, features[sel], lookup.ndc[members[sel]], local))
-            rgb = rgb.index_put((members,), torch.cat(colors))
-        out = rgb.new_zeros(lookup.shape.numel(), 3).index_put((lookup.index,), rgb)
+        directions, rays = ray_samples.frustums.directions[:, 0], lookup.rays
+        out = lookup.ndc.new_zeros(lookup.shape.numel(), 3)
+        if lookup.groups:
+            known = lookup.gathered and lookup.gathered.features
+            features = torch.cat([_read(self.features, known, taps) for taps in lookup.groups])
+            colors = [
+                self.networks(k, features[own], lookup.ndc[own], geometry.rotate(self._axes(k), directions), rays[own])
+                for k, own in lookup.spans
+            ]
+            out = out.index_put((lookup.index,), torch.cat(colors))
         return {FieldHeadNames.RGB: out.view(*lookup.shape, 3)}
+
+    def _shade(self, lib: ctypes.CDLL, ray_samples: RaySamples) -> Float[Tensor, "R S 3"]:
+        meta, rays = metadata_of(ray_samples), ray_samples.frustums.directions[:, 0]
+        directions = torch.stack([geometry.rotate(self._axes(k), rays) for k in range(len(self.grids))])
+        heads, planes, valid = (meta[name][..., 0] for name in ("heads", "planes", "valid"))
+        scene, features = self.march_scene(), self.features.data
+        return shade(lib, scene, features, self.networks, directions, heads, planes, meta["ndc"], valid)
 
     def total_variation(self, lookup: Lookup, density_weight: float, feature_weight: float) -> Tensor:
         """Weighted total variation of the texels that the batch touched, in DVGO's normalisation (not yet per ray)."""
         total = self.density.new_zeros(())
-        rows = [rows.reshape(-1) for rows, _, _ in lookup.groups]
-        if not rows:
+        found = lookup.gathered
+        if found is None:
             return total
-        touched = torch.unique(torch.cat(rows))
+        scales = []
         for k, grid in enumerate(self.grids):
-            own = touched[(touched >= grid.offset) & (touched < grid.offset + grid.texels)]
-            if not own.numel():
-                continue
-            neighbours, exists = grid.neighbours(own)
-            side = torch.tensor([grid.width, grid.width, grid.height, grid.height, grid.depth, grid.depth])
-            if k < len(self.plan.mpis):
-                side[:4] = max(grid.width, grid.height)
-            scales = exists * (side / 128).to(own.device)
-            one = torch.ones_like(own, dtype=self.density.dtype)[:, None]
-            for table, weight in ((self.density, density_weight), (self.features, feature_weight)):
-                if weight > 0:
-                    values = interpolate(table, own[:, None], one)
-                    around = table.data[neighbours.reshape(-1)].view(*neighbours.shape, -1)
-                    total = total + weight * losses.total_variation(values, around, scales)
+            side = max(grid.width, grid.height)
+            sides = (side, side, grid.depth) if k < len(self.plan.mpis) else (grid.width, grid.height, grid.depth)
+            scales.append((sides[0] / 128, sides[1] / 128, sides[2] / 128))
+        for table, values, weight in (
+            (self.density, found.density, density_weight),
+            (self.features, found.features, feature_weight),
+        ):
+            if weight > 0:
+                total = total + weight * total_variation(values, table.data, found.rows, self.grids, scales)
         return total
 
     def _axes(self, k: int) -> Tensor:
@@ -346,6 +385,13 @@ class MMPIField(Field):
         local = LocalRays.of(frustums.origins[:, 0], frustums.directions[:, 0], self.frames)
         inverse_t = metadata_of(ray_samples)["inverse_t"].reshape(-1)[lookup.index]
         return self.shares(lookup.index // lookup.shape[1], local, inverse_t, lookup.heads)
+
+
+def _read(table: Tensor, gathered: Tensor | None, taps: Taps) -> Tensor:
+    """Interpolated rows of a table, or of what was gathered from it."""
+    if gathered is None or taps.position is None:
+        return interpolate(table, taps.rows, taps.weights)
+    return interpolate_gathered(gathered, taps.position, taps.weights)
 
 
 def _replace_data(parameter: nn.Parameter, data: Tensor) -> None:

@@ -35,6 +35,7 @@ from mmpi_ns.mmpi_field import MMPIField
 from mmpi_ns.mmpi_losses import LossWeights, TrainingRays, is_pixel_ray, over_background
 from mmpi_ns.mmpi_sampler import MergeReport, MMPISampler
 from mmpi_ns.mmpi_samples import Lookup, metadata_of
+from mmpi_ns.ops import native
 from mmpi_ns.phases import TRAINS, Schedule, Training, make_schedule
 from mmpi_ns.placement.plan import ScenePlan
 from mmpi_ns.placement.rule import PlacementConfig, place
@@ -92,6 +93,8 @@ class MMPIModelConfig(ModelConfig):
     """Initial alpha of a cube sample: 1e-2 for a small room to 1e-4."""
     train_threshold: float = 3e-3
     """Samples of less weight get no gradient (while resolution grows: nor more than a tenth of an equal share)."""
+    ops: native.Route = "auto"
+    """Inner loops on a CPU: compiled at first use (native), plain torch, or compiled where a C++ compiler is found."""
     render_threshold: float = 3e-3
     """Samples of less weight are not coloured when rendering; the dropped mass is reported."""
     background: Literal["black", "gray", "white"] = "gray"
@@ -111,6 +114,7 @@ class MMPIModel(Model):
 
     def populate_modules(self) -> None:
         super().populate_modules()
+        native.choose(self.config.ops)
         plan = self._initial_plan()
         # One head has nothing to blend with, so it trains in one go.
         joint = self.config.training == "joint" or plan.num_heads == 1
@@ -225,14 +229,11 @@ class MMPIModel(Model):
             choose=choose,
             blend_form=blend_form,
         )
-        tau, lookup = self.field.get_density(samples)
-        tau = tau[..., 0]
-        if blend_form is not None and lookup.index.numel():
-            tau = self._blend(tau, samples, lookup, blend_form)
+        tau, lookup = self._optical_depth(samples, blend_form)
         valid = metadata_of(samples)["valid"][..., 0]
         composite = composite_weights(tau, valid, metadata_of(samples)["skipped_before"][..., 0], report.skipped_total)
         # Keypoint rays are supervised in depth alone: no colours for them.
-        colored = lookup.of_rays(is_pixel_ray(bundle)) if self.training else lookup
+        colored = lookup.of_rays(is_pixel_ray(bundle)) if lookup and self.training else lookup
         colors = self.field.get_outputs(samples, colored)[FieldHeadNames.RGB]
         outputs = self._outputs(composite, colors, samples, report)
         if self.training:
@@ -279,6 +280,16 @@ class MMPIModel(Model):
             return None
         chosen = torch.arange(len(names), device=self.device) == names.index(self.show.value)
         return chosen.expand(num_rays, -1)
+
+    def _optical_depth(self, samples: RaySamples, form: BlendForm | None) -> tuple[Tensor, Lookup | None]:
+        """(Blended) optical depths, with gradients where they are wanted; else the sampler's own, without a lookup."""
+        if not torch.is_grad_enabled():
+            return metadata_of(samples)["tau"][..., 0], None
+        tau, lookup = self.field.get_density(samples)
+        tau = tau[..., 0]
+        if form is not None and lookup.index.numel():
+            tau = self._blend(tau, samples, lookup, form)
+        return tau, lookup
 
     def _blend(self, tau: Tensor, samples: RaySamples, lookup: Lookup, form: BlendForm) -> Tensor:
         share, rest = self.field.sample_shares(samples, lookup)

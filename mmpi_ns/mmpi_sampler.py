@@ -18,7 +18,9 @@ from mmpi_ns.compositing import BlendForm
 from mmpi_ns.geometry import PlaneHits, cube_hits, inverse_distance, plane_hits, sample_disparity
 from mmpi_ns.mmpi_field import MMPIField
 from mmpi_ns.mmpi_samples import LocalRays
-from mmpi_ns.ops.merge import Merged, Survivors, keep_survivors, merge
+from mmpi_ns.ops import native
+from mmpi_ns.ops.march import Kept, march
+from mmpi_ns.ops.merge import Merged, keep_survivors, merge
 
 DIRECTION_AT_INFINITY = 1e-10
 """Inverse distances below this are written as a distance of 1e10 into nerfstudio's starts and ends."""
@@ -82,28 +84,25 @@ class MMPISampler(Sampler):
             blend_form: blend by reliability; None where reliability takes no part.
 
         Returns:
-            RaySamples [R, S] whose metadata holds ``heads``, ``planes``, ``ndc``, ``inverse_t``, ``valid`` and
-            ``skipped_before`` (each [R, S, .]), and what was left out.
+            RaySamples [R, S] whose metadata holds ``heads``, ``planes``, ``ndc``, ``inverse_t``, ``valid``,
+            ``skipped_before`` and ``tau``, the (blended) optical depth (each [R, S, .]), and what was left out.
         """
         assert ray_bundle is not None and ray_bundle.nears is not None and ray_bundle.fars is not None
         origins, directions = ray_bundle.origins, ray_bundle.directions
         hits = plane_hits(origins, directions, ray_bundle.nears, ray_bundle.fars, field.frames)
         counts, cube_first = self._counts(ray_bundle, field, hits, head_mask, choose)
-        samples = [_sample_mpi(k, counts[:, k], hits, field) for k in range(len(field.plan.mpis))]
-        if field.cube is not None and cube_first is not None:
-            samples.append(_sample_cube(cube_first, counts[:, -1], ray_bundle, field))
-
         explained = (counts > 0).any(-1, keepdim=True)
         if head_mask is not None or choose is not None:
             explained &= _sees_all(hits, counts[:, : len(field.plan.mpis)], field)
-        merged, flat, heads = _merge(samples, counts)
-        tau = flat.tau
-        if blend_form is not None and tau.numel():
-            local = LocalRays(origins, directions, hits.local_origins, hits.local_directions)
-            tau = _blend_visible(merged, flat, heads, local, field, blend_form)
-        survivors = keep_survivors(merged, tau, threshold, fair_share)
-        report = MergeReport(counts.sum(-1), survivors.skipped_total, survivors.dropped_mass, explained)
-        return _ray_samples(ray_bundle, flat, heads, survivors), report
+        lib = native.library(origins, field.density)
+        if lib is None:
+            kept = march_reference(ray_bundle, field, hits, cube_first, counts, threshold, fair_share, blend_form)
+        else:
+            first = hits.m_first if cube_first is None else torch.cat([hits.m_first, cube_first[:, None]], -1)
+            scene = field.march_scene()
+            kept = march(lib, scene, origins, directions, hits, first, counts, threshold, fair_share, blend_form)
+        report = MergeReport(counts.sum(-1), kept.skipped_total, kept.dropped_mass, explained)
+        return _ray_samples(ray_bundle, kept), report
 
     @staticmethod
     def _counts(
@@ -122,6 +121,45 @@ class MMPISampler(Sampler):
         if head_mask is not None:
             counts = torch.where(head_mask, counts, torch.zeros_like(counts))
         return counts, first
+
+
+def march_reference(
+    ray_bundle: RayBundle,
+    field: MMPIField,
+    hits: PlaneHits,
+    cube_first: Int[Tensor, "R"] | None,
+    counts: Int[Tensor, "R H"],
+    threshold: float,
+    fair_share: float,
+    blend_form: BlendForm | None,
+) -> Kept:
+    """``ops.march.march`` in plain torch: looks up and sorts all live samples, then drops."""
+    samples = [_sample_mpi(k, counts[:, k], hits, field) for k in range(len(field.plan.mpis))]
+    if cube_first is not None:
+        samples.append(_sample_cube(cube_first, counts[:, -1], ray_bundle, field))
+    merged, flat, heads = _merge(samples, counts)
+    tau = flat.tau
+    if blend_form is not None and tau.numel():
+        local = LocalRays(ray_bundle.origins, ray_bundle.directions, hits.local_origins, hits.local_directions)
+        tau = _blend_visible(merged, flat, heads, local, field, blend_form)
+    survivors = keep_survivors(merged, tau, threshold, fair_share)
+    order, valid = survivors.order, survivors.valid
+
+    def pick(values: Tensor) -> Tensor:
+        empty = values.new_zeros((*order.shape, *values.shape[1:]))
+        return values[order] if values.shape[0] else empty
+
+    return Kept(
+        heads=pick(heads),
+        planes=pick(flat.planes),
+        ndc=pick(flat.ndc),
+        inverse_t=torch.where(valid, pick(flat.inverse_t), 0.0),
+        tau=pick(tau),
+        skipped_before=survivors.skipped_before,
+        valid=valid,
+        skipped_total=survivors.skipped_total,
+        dropped_mass=survivors.dropped_mass,
+    )
 
 
 def _sample_mpi(k: int, counts: Int[Tensor, "R"], hits: PlaneHits, field: MMPIField) -> _HeadSamples:
@@ -217,20 +255,10 @@ def _sees_all(hits: PlaneHits, counts: Int[Tensor, "R K"], field: MMPIField) -> 
     return entered & to_infinity
 
 
-def _ray_samples(
-    ray_bundle: RayBundle, flat: _HeadSamples, heads: Int[Tensor, "N"], survivors: Survivors
-) -> RaySamples:
+def _ray_samples(ray_bundle: RayBundle, kept: Kept) -> RaySamples:
     """nerfstudio's RaySamples; a sample is a point on a plane, so it starts and ends at the same distance."""
-    order, shape = survivors.order, survivors.order.shape
-    valid = survivors.valid
-
-    def pick(values: Tensor) -> Tensor:
-        if not values.shape[0]:
-            return values.new_zeros((*shape, values.shape[-1] if values.ndim > 1 else 1))
-        return values[order].view(*shape, -1)
-
-    inverse_t = torch.where(valid[..., None], pick(flat.inverse_t), 0.0)
-    t = 1 / inverse_t.clamp(min=DIRECTION_AT_INFINITY)
+    shape = kept.valid.shape
+    t = 1 / kept.inverse_t[..., None].clamp(min=DIRECTION_AT_INFINITY)
     frustums = Frustums(
         origins=ray_bundle.origins[:, None].expand(*shape, 3),
         directions=ray_bundle.directions[:, None].expand(*shape, 3),
@@ -238,12 +266,6 @@ def _ray_samples(
         ends=t,
         pixel_area=ray_bundle.pixel_area[:, None].expand(*shape, 1),
     )
-    metadata = {
-        "heads": pick(heads),
-        "planes": pick(flat.planes),
-        "ndc": pick(flat.ndc),
-        "inverse_t": inverse_t,
-        "valid": valid[..., None],
-        "skipped_before": survivors.skipped_before[..., None],
-    }
+    names = ("heads", "planes", "inverse_t", "valid", "skipped_before", "tau")
+    metadata = {"ndc": kept.ndc, **{name: getattr(kept, name)[..., None] for name in names}}
     return RaySamples(frustums=frustums, camera_indices=None, metadata=metadata)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -14,30 +13,72 @@ from mmpi_ns import geometry
 
 
 @dataclass(frozen=True)
+class Taps:
+    """Texels that a range of samples reads: 4 each in the MPIs, 8 in the cube."""
+
+    samples: slice
+    rows: Int[Tensor, "N B"]
+    weights: Float[Tensor, "N B"]
+    position: Int[Tensor, "N B"] | None = None
+    """Of each row among the batch's distinct rows, where gradients are wanted."""
+
+
+@dataclass(frozen=True)
+class Gathered:
+    """The distinct rows that a batch reads. Gradients meet here, so that each row has one."""
+
+    rows: Int[Tensor, "U"]
+    density: Float[Tensor, "U 1"]
+    features: Float[Tensor, "U C"]
+
+
+@dataclass(frozen=True)
 class Lookup:
-    """Where the valid samples of a merged batch read the tables."""
+    """Where the valid samples of a merged batch read the tables. Samples are ordered by head, then by slot."""
 
     shape: torch.Size
     """(R, S) of the batch."""
     index: Int[Tensor, "N"]
-    """Flat slots of the valid samples."""
+    """Flat slots of the samples."""
     heads: Int[Tensor, "N"]
     planes: Int[Tensor, "N"]
     ndc: Float[Tensor, "N 3"]
-    groups: list[Any]
-    """(rows, weights, members): all MPI samples ordered by head, then the cube's; members index the N samples."""
+    spans: list[tuple[int, slice]]
+    """(head, its samples) for every head that occurs."""
+    groups: list[Taps]
+    """All MPIs together, then the cube."""
+    gathered: Gathered | None
+    """What the groups read, where gradients are wanted."""
 
-    def split(self, members: Int[Tensor, "M"]) -> list[tuple[int, Int[Tensor, "P"]]]:
-        """(head, positions within ``members``), in the order of ``members``."""
-        return by_head(self.heads[members])
+    @property
+    def rays(self) -> Int[Tensor, "N"]:
+        return self.index // self.shape[1]
 
     def of_rays(self, chosen: Bool[Tensor, "R"]) -> Lookup:
-        """The same samples, with lookups for the chosen rays only."""
+        """The samples of the chosen rays. Gathered rows stay those of all rays."""
         if bool(chosen.all()):
             return self
-        wanted = chosen[self.index // self.shape[1]]
-        groups = [tuple(part[wanted[group[2]]] for part in group) for group in self.groups]
-        return replace(self, groups=groups)
+        wanted = chosen[self.rays].nonzero()[:, 0]
+        heads = self.heads[wanted]
+        bounds = torch.searchsorted(wanted, torch.tensor([g.samples.stop for g in self.groups], device=wanted.device))
+        groups, start = [], 0
+        for taps, stop in zip(self.groups, bounds.tolist(), strict=True):
+            own = wanted[start:stop] - taps.samples.start
+            position = None if taps.position is None else taps.position[own]
+            groups.append(Taps(slice(start, stop), taps.rows[own], taps.weights[own], position))
+            start = stop
+        samples = (self.index[wanted], heads, self.planes[wanted], self.ndc[wanted])
+        return Lookup(self.shape, *samples, head_spans(heads), groups, self.gathered)
+
+
+def head_spans(heads: Int[Tensor, "N"]) -> list[tuple[int, slice]]:
+    """(head, range of its samples) for every head that occurs among samples ordered by head."""
+    spans, start = [], 0
+    for k, count in enumerate(torch.bincount(heads).tolist() if heads.numel() else []):
+        if count:
+            spans.append((k, slice(start, start + count)))
+        start += count
+    return spans
 
 
 @dataclass(frozen=True)
@@ -66,8 +107,8 @@ def metadata_of(ray_samples: RaySamples) -> dict[str, Tensor]:
     return ray_samples.metadata
 
 
-def by_head(heads: Int[Tensor, "N"]) -> list[tuple[int, Int[Tensor, "M"]]]:
-    """(head, indices of its samples) for every head that occurs."""
+def by_head(heads: Int[Tensor, "N"]) -> Int[Tensor, "N"]:
+    """The order that puts samples of a head together, heads rising, and otherwise keeps their order."""
     if not heads.numel():
-        return []
-    return [(k, index) for k in range(int(heads.max()) + 1) if (index := (heads == k).nonzero()[:, 0]).numel()]
+        return heads
+    return torch.cat([(heads == k).nonzero()[:, 0] for k in range(int(heads.max()) + 1)])

@@ -5,6 +5,7 @@ Equal to dense Adam in which entries with no gradient are skipped: their values 
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -13,6 +14,9 @@ import torch
 from nerfstudio.engine.optimizers import OptimizerConfig
 from torch import Tensor
 from torch.nn import Parameter
+
+from mmpi_ns.ops import native
+from mmpi_ns.ops.interpolate import add_rows, index_rows
 
 
 class TouchedAdam(torch.optim.Optimizer):
@@ -64,15 +68,40 @@ def _adam(
 
 
 def _sparse_update(param: Parameter, grad: Tensor, state: dict[str, Any], group: dict[str, Any]) -> None:
-    rows, inverse = torch.unique(grad._indices()[0], return_inverse=True)
-    values = torch.zeros((rows.shape[0], *param.shape[1:]), dtype=param.dtype, device=param.device)
-    values.index_add_(0, inverse, grad._values().to(param.dtype))
+    index = index_rows(grad._indices()[0])
+    rows, values = index.unique, add_rows(index, grad._values().to(param.dtype), None)
+    lib = native.library(param.data)
+    if lib is not None and param.data.is_contiguous() and param.ndim == 2:
+        return _compiled_update(lib, param, rows, values, state, group)
     old_mean, old_square = state["exp_avg"].index_select(0, rows), state["exp_avg_sq"].index_select(0, rows)
     mean, square, delta = _adam(values, old_mean, old_square, state, group)
     fresh = param.data.index_select(0, rows).sub_(delta)
     state["exp_avg"].index_copy_(0, rows, mean)
     state["exp_avg_sq"].index_copy_(0, rows, square)
     param.data.index_copy_(0, rows, fresh)
+
+
+def _compiled_update(
+    lib: ctypes.CDLL, param: Parameter, rows: Tensor, values: Tensor, state: dict[str, Any], group: dict[str, Any]
+) -> None:
+    beta1, beta2 = group["betas"]
+    constants = (
+        beta1,
+        beta2,
+        (1 - beta2 ** state["step"]) ** 0.5,
+        group["eps"],
+        group["lr"] / (1 - beta1 ** state["step"]),
+    )
+
+    def update(begin: int, end: int) -> None:
+        lib.mmpi_adam_rows(
+            native.address(rows, torch.int64),
+            *map(ctypes.c_int64, (begin, end, param.shape[1])),
+            *map(native.address, (values, param.data, state["exp_avg"], state["exp_avg_sq"])),
+            *map(ctypes.c_float, constants),
+        )
+
+    native.in_parts(update, len(rows), least=4096)
 
 
 def _dense_update(param: Parameter, grad: Tensor, state: dict[str, Any], group: dict[str, Any]) -> None:

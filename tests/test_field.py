@@ -176,8 +176,8 @@ def test_gradients_are_sparse_and_only_in_the_rows_of_the_batch(plan):
     field = fill(MMPIField(plan), seed=5)
     field.touched.fill_(0)
     _, lookup = trained_once(field, bundle(*random_rays(plan, 3, seed=2)))
-    read = {row for rows, _, _ in lookup.groups for row in rows.reshape(-1).tolist()}
-    weighted = {r for rows, w, _ in lookup.groups for r in rows[w > 0].tolist()}
+    read = {row for taps in lookup.groups for row in taps.rows.reshape(-1).tolist()}
+    weighted = {r for taps in lookup.groups for r in taps.rows[taps.weights > 0].tolist()}
     assert 0 < len(read) < plan.texels
     for table in (field.density, field.features):
         assert table.grad.is_sparse and table.grad.shape == table.shape
@@ -218,7 +218,7 @@ def test_total_variation_is_the_sum_over_touched_texels_and_their_neighbours(wit
     field = fill(MMPIField(ScenePlan(mpis, cube, 0.05, 1.0), feature_channels=4), seed=7, log_depths=(-2, 0.5))
     samples = sampled(field, bundle([[0, 0, 0]], [[-0.4, -0.15, 0.9]]))
     _, lookup = field.get_density(samples)
-    touched = {row for rows, _, _ in lookup.groups for row in rows.reshape(-1).tolist()}
+    touched = {row for taps in lookup.groups for row in taps.rows.reshape(-1).tolist()}
     wanted, gradient, size = 0.0, np.zeros(len(field.density)), field.plan.texels
     for k, grid in enumerate(field.grids):
         shape = (grid.depth, grid.height, grid.width)

@@ -12,6 +12,7 @@ from random_fields import OracleRay, bundle, fill, random_field, random_rays, re
 
 from mmpi_ns import mmpi_sampler
 from mmpi_ns.mmpi_field import MMPIField
+from mmpi_ns.ops import native
 from mmpi_ns.placement.plan import CubePlan, ScenePlan
 
 ERROR = 3e-5
@@ -225,6 +226,7 @@ def test_without_other_heads_all_that_a_ray_shows_is_to_be_explained():
 
 
 def test_stopping_where_a_ray_is_opaque_changes_nothing_visible(monkeypatch):
+    monkeypatch.setattr(native, "_chosen", "torch")
     field = random_field(6, True, seed=16, planes=60, log_depths=(-3, 1.2))
     rays = bundle(*random_rays(field.plan, 80, seed=17))
     looked_up = []
@@ -246,7 +248,7 @@ def test_ray_samples_hold_what_the_field_needs():
     assert found.shape == (9, width) and width == valid.sum(1).max()
     shapes = {name: tuple(value.shape) for name, value in found.metadata.items()}
     assert shapes.pop("ndc") == (9, width, 3)
-    assert set(shapes) == {"heads", "planes", "inverse_t", "valid", "skipped_before"}
+    assert set(shapes) == {"heads", "planes", "inverse_t", "valid", "skipped_before", "tau"}
     assert set(shapes.values()) == {(9, width, 1)} and valid.dtype == torch.bool
     assert (valid[:, :-1] | ~valid[:, 1:]).all(), "samples are packed to the left"
     inverse_t = found.metadata["inverse_t"]

@@ -1,17 +1,77 @@
 """Weighted sums of table rows: the gather behind every bilinear and trilinear lookup.
 
-Two paths, one signature: ``interpolate_reference`` in plain indexing, and ``interpolate`` on the embedding-bag kernel
-(3 to 6 times faster on a CPU) whose gradient is a sparse row gradient, so that backward and optimiser cost follow the
-rows a batch touched, never the size of the table.
+``interpolate_reference`` is plain indexing. ``interpolate`` reads by the embedding-bag kernel (3 to 6 times faster on a
+CPU) and has a sparse row gradient, so that backward and optimiser cost follow the rows a batch touched, never the size
+of the table.
 """
 
 from __future__ import annotations
 
+import ctypes
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+
+from mmpi_ns.ops import native
+
+
+@dataclass(frozen=True)
+class RowIndex:
+    """Which rows a list of lookups reads, each once, and which of those every entry is."""
+
+    unique: Int[Tensor, "U"]
+    position: Int[Tensor, "..."]
+    """Of every entry in ``unique``; int32 or int64."""
+
+
+def index_rows(rows: Int[Tensor, "..."]) -> RowIndex:
+    """The distinct rows (in the order of the reference: rising; of the compiled kernel: as they first occur)."""
+    count = rows.numel()
+    lib = native.library() if rows.device.type == "cpu" and 0 < count < 2**30 else None
+    if lib is None:
+        unique, position = torch.unique(rows, return_inverse=True)
+        return RowIndex(unique, position)
+    bits = max(4, (2 * count - 1).bit_length())
+    slots = torch.full((1 << bits,), -1, dtype=torch.int32)
+    unique, position = torch.empty(count, dtype=torch.int64), torch.empty(rows.shape, dtype=torch.int32)
+    found = lib.mmpi_index_rows(
+        native.address(rows.contiguous(), torch.int64),
+        ctypes.c_int64(count),
+        native.address(slots, torch.int32),
+        bits,
+        native.address(unique, torch.int64),
+        native.address(position, torch.int32),
+    )
+    return RowIndex(unique[:found].clone(), position)
+
+
+def sum_by_position(
+    position: Int[Tensor, "N B"], values: Float[Tensor, "N C"], weights: Float[Tensor, "N B"] | None, count: int
+) -> Float[Tensor, "U C"]:
+    """For each of ``count`` rows the sum of weights[n, b] values[n] over its entries (None: B = 1, weights of 1)."""
+    out = torch.zeros(count, values.shape[1], dtype=values.dtype, device=values.device)
+    lib = native.library(values) if position.dtype == torch.int32 else None
+    if lib is None:
+        each = values if weights is None else (values[:, None, :] * weights[..., None]).reshape(-1, values.shape[1])
+        return out.index_add_(0, position.reshape(-1), each)
+    values, position = values.contiguous(), position.contiguous()
+    weights = None if weights is None else weights.contiguous()
+    lib.mmpi_scatter_rows(
+        native.address(position, torch.int32),
+        None if weights is None else native.address(weights),
+        native.address(values),
+        *map(ctypes.c_int64, (values.shape[0], 1 if weights is None else weights.shape[1], values.shape[1])),
+        native.address(out),
+    )
+    return out
+
+
+def add_rows(index: RowIndex, values: Float[Tensor, "N C"], weights: Float[Tensor, "N B"] | None) -> Tensor:
+    """``sum_by_position`` for each distinct row [U, C]."""
+    return sum_by_position(index.position, values, weights, index.unique.shape[0])
 
 
 def interpolate_reference(
@@ -31,9 +91,8 @@ class _Interpolate(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, None, None]:
         rows, weights = ctx.saved_tensors
-        values = (grad_outputs[0][:, None, :] * weights[..., None]).reshape(-1, ctx.table_shape[1])
-        grad = torch.sparse_coo_tensor(rows.reshape(1, -1), values, ctx.table_shape, check_invariants=False)
-        return grad, None, None
+        index = index_rows(rows)
+        return _row_gradient(index.unique, add_rows(index, grad_outputs[0], weights), ctx.table_shape), None, None
 
 
 def interpolate(
@@ -47,3 +106,44 @@ def interpolate(
         weights: their weights (constants).
     """
     return _Interpolate.apply(table, rows, weights.to(table.dtype))  # type: ignore[no-any-return]
+
+
+class _Gather(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, table: Tensor, rows: Tensor) -> Tensor:
+        ctx.save_for_backward(rows)
+        ctx.table_shape = table.shape
+        return table.index_select(0, rows)
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor, None]:
+        return _row_gradient(ctx.saved_tensors[0], grad_outputs[0], ctx.table_shape), None
+
+
+def gather_rows(table: Float[Tensor, "T C"], rows: Int[Tensor, "U"]) -> Float[Tensor, "U C"]:
+    """table[rows], with a sparse gradient: whatever reads the rows adds its gradient densely, over U rows only."""
+    return _Gather.apply(table, rows)  # type: ignore[no-any-return]
+
+
+class _InterpolateGathered(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, gathered: Tensor, position: Tensor, weights: Tensor) -> Tensor:
+        ctx.save_for_backward(position, weights)
+        ctx.count = gathered.shape[0]
+        return torch.nn.functional.embedding_bag(position, gathered, per_sample_weights=weights, mode="sum")
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor, None, None]:
+        position, weights = ctx.saved_tensors
+        return sum_by_position(position, grad_outputs[0], weights, ctx.count), None, None
+
+
+def interpolate_gathered(
+    gathered: Float[Tensor, "U C"], position: Int[Tensor, "N B"], weights: Float[Tensor, "N B"]
+) -> Float[Tensor, "N C"]:
+    """``interpolate_reference`` on gathered rows, of which ``position`` counts."""
+    return _InterpolateGathered.apply(gathered, position, weights.to(gathered.dtype))  # type: ignore[no-any-return]
+
+
+def _row_gradient(rows: Int[Tensor, "U"], values: Float[Tensor, "U C"], shape: torch.Size) -> Tensor:
+    return torch.sparse_coo_tensor(rows[None], values, shape, check_invariants=False)

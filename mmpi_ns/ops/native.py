@@ -1,0 +1,118 @@
+"""The fast path on a CPU: kernels in ``cpp``, compiled by the machine's own C++ compiler at first use (2 seconds).
+
+Which path runs is one setting of the process, ``choose``: ``auto`` takes the kernels where a compiler is found and
+says so where there is none. Every kernel has a reference in plain torch under the same signature.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import hashlib
+import os
+import platform
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
+from pathlib import Path
+from typing import Literal
+
+import torch
+from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor
+
+Route = Literal["auto", "torch", "native"]
+FLAGS = ["-std=c++17", "-O3", "-march=native", "-fno-math-errno", "-shared", "-fPIC"]
+"""Nothing that reorders sums: a result never depends on how the compiler groups them."""
+SOURCES = Path(__file__).parent / "cpp"
+
+_chosen: Route = "auto"
+
+
+def choose(path: Route) -> None:
+    """Sets which path the operations of this process take.
+
+    Raises:
+        ValueError: ``native`` is asked for and cannot be built (says why).
+    """
+    global _chosen
+    _chosen = path
+    if path == "native" and isinstance(reason := _build(), str):
+        raise ValueError(f"The compiled kernels cannot be had: {reason}. Use --pipeline.model.ops auto or torch.")
+
+
+def library(*tensors: Tensor) -> ctypes.CDLL | None:
+    """The compiled kernels, where they are wanted, can be had and take these tensors (float32 on a CPU)."""
+    if _chosen == "torch" or any(t.device.type != "cpu" or t.dtype != torch.float32 for t in tensors):
+        return None
+    built = _build()
+    return None if isinstance(built, str) else built
+
+
+def address(tensor: Tensor, dtype: torch.dtype = torch.float32) -> ctypes.c_void_p:
+    """Where a tensor's numbers lie, for a kernel that expects them close together."""
+    assert tensor.dtype == dtype and tensor.is_contiguous(), (tensor.dtype, tensor.stride())
+    return ctypes.c_void_p(tensor.data_ptr())
+
+
+def in_parts(work: Callable[[int, int], None], count: int, least: int = 256) -> None:
+    """Calls work(begin, end) for parts of 0..count, on as many threads as torch uses. Parts must not meet."""
+    threads = max(1, min(torch.get_num_threads(), count // least))
+    if threads == 1:
+        return work(0, count)
+    bounds = [count * i // threads for i in range(threads + 1)]
+    for done in [_pool(threads).submit(work, a, b) for a, b in pairwise(bounds)]:
+        done.result()
+
+
+@functools.cache
+def _pool(threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads, thread_name_prefix="mmpi")
+
+
+@functools.cache
+def _build() -> ctypes.CDLL | str:
+    """The library, compiled unless it is in the cache, or why there is none (also said once in the log)."""
+    compiler = os.environ.get("CXX") or shutil.which("g++") or shutil.which("clang++")
+    if compiler is None:
+        return _unavailable("no C++ compiler (g++ or clang++) is installed")
+    sources = sorted(SOURCES.glob("*.cpp"))
+    if not sources:
+        return _unavailable(f"{SOURCES} holds no sources: install the package again")
+    texts = [p.read_bytes() for p in sorted(SOURCES.iterdir()) if p.suffix in (".cpp", ".h")]
+    key = hashlib.sha256(b"\0".join([*texts, " ".join([compiler, *FLAGS]).encode(), _processor()])).hexdigest()[:16]
+    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mmpi_ns"
+    target = folder / f"kernels-{key}.so"
+    try:
+        if not target.is_file():
+            folder.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryDirectory(dir=folder) as scratch:
+                made = Path(scratch) / target.name
+                command = [compiler, *FLAGS, "-o", str(made), *map(str, sources)]
+                subprocess.run(command, check=True, capture_output=True, text=True, timeout=120)
+                os.replace(made, target)
+        built = ctypes.CDLL(str(target))
+    except subprocess.CalledProcessError as error:
+        return _unavailable(f"{compiler} failed: {(error.stderr or '').strip().splitlines()[:1]}")
+    except (OSError, subprocess.TimeoutExpired) as error:
+        return _unavailable(str(error))
+    built.mmpi_index_rows.restype = ctypes.c_int64
+    built.mmpi_total_variation.restype = ctypes.c_double
+    return built
+
+
+def _processor() -> bytes:
+    """What -march=native depends on: a home folder may be shared by machines that differ."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        return "".join(sorted({x for x in lines if x.startswith(("model name", "flags", "Features"))})).encode()
+    except OSError:
+        return f"{platform.machine()} {platform.processor()} {platform.node()}".encode()
+
+
+def _unavailable(reason: str) -> str:
+    CONSOLE.print(f"Plain torch instead of the compiled kernels, which are several times faster: {reason}.")
+    return reason

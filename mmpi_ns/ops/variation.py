@@ -1,0 +1,88 @@
+"""Total variation of chosen texels, with its gradient in the same pass."""
+
+from __future__ import annotations
+
+import ctypes
+from typing import Any
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from mmpi_ns import losses
+from mmpi_ns.ops import native
+from mmpi_ns.ops.march import Grid
+from mmpi_ns.texels import TexelGrid
+
+Scales = list[tuple[float, float, float]]
+
+
+def total_variation_reference(
+    values: Float[Tensor, "U C"],
+    table: Float[Tensor, "T C"],
+    rows: Int[Tensor, "U"],
+    grids: list[TexelGrid],
+    scales: Scales,
+) -> Float[Tensor, ""]:
+    """``losses.total_variation`` of distinct texels with their neighbours of the same head.
+
+    Args:
+        values: the texels, gathered from the table.
+        table: the pooled table (held fixed).
+        rows: where they came from.
+        grids: blocks of all heads.
+        scales: weight of a difference along x, y and z, of each head.
+    """
+    total = values.new_zeros(())
+    for grid, each in zip(grids, scales, strict=True):
+        own = ((rows >= grid.offset) & (rows < grid.offset + grid.texels)).nonzero()[:, 0]
+        neighbours, exists = grid.neighbours(rows[own])
+        weights = exists * torch.tensor([s for s in each for _ in range(2)], device=rows.device)
+        around = table[neighbours.reshape(-1)].view(*neighbours.shape, -1)
+        total = total + losses.total_variation(values[own], around, weights)
+    return total
+
+
+class _Variation(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any,
+        values: Tensor,
+        lib: ctypes.CDLL,
+        table: Tensor,
+        rows: Tensor,
+        grids: list[TexelGrid],
+        scales: Scales,
+    ) -> Tensor:
+        gradient = torch.empty_like(values)
+        blocks = (Grid * len(grids))(*(Grid(g.offset, g.depth, g.height, g.width, 0) for g in grids))
+        flat = [s for each in scales for s in each]
+        total = lib.mmpi_total_variation(
+            native.address(rows, torch.int64),
+            *map(ctypes.c_int64, (len(rows), table.shape[1])),
+            native.address(table),
+            blocks,
+            ctypes.c_int64(len(grids)),
+            (ctypes.c_float * len(flat))(*flat),
+            native.address(gradient),
+        )
+        ctx.save_for_backward(gradient)
+        return values.new_tensor(total)
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
+        return ctx.saved_tensors[0] * grad_outputs[0], None, None, None, None, None
+
+
+def total_variation(
+    values: Float[Tensor, "U C"],
+    table: Float[Tensor, "T C"],
+    rows: Int[Tensor, "U"],
+    grids: list[TexelGrid],
+    scales: Scales,
+) -> Float[Tensor, ""]:
+    """``total_variation_reference``, compiled where it can be."""
+    lib = native.library(table)
+    if lib is None:
+        return total_variation_reference(values, table, rows, grids, scales)
+    return _Variation.apply(values, lib, table, rows.contiguous(), grids, scales)  # type: ignore[no-any-return]
