@@ -179,14 +179,15 @@ def _is_one_sentence(text: str) -> bool:
 
 def _weights(trainer: MMPITrainer, steps: int) -> dict[str, Any]:
     """Whether every step ran, every number is finite, and what a test image gets."""
-    model = trainer._model.eval()
+    model, test_images = trainer._model.eval(), trainer.pipeline.datamanager.eval_dataset
+    assert test_images is not None
     state = {k: v for k, v in model.state_dict().items() if v.is_floating_point()}
     broken = sorted(k for k, v in state.items() if not bool(torch.isfinite(v).all()))
     largest = max((float(v.abs().max()) for v in state.values() if v.numel()), default=0.0)
     with torch.no_grad():
-        image = model.get_outputs_for_camera(trainer.pipeline.datamanager.eval_dataset.cameras[0:1])
+        image = model.get_outputs_for_camera(test_images.cameras[0:1])
     broken += sorted(f"output {k}" for k, v in image.items() if not bool(torch.isfinite(v).all()))
-    truth = trainer.pipeline.datamanager.eval_dataset.get_image_float32(0)[..., :3]
+    truth = test_images.get_image_float32(0)[..., :3]
     psnr = float(-10 * torch.log10(((image["rgb"] - truth) ** 2).mean()))
     ran = trainer._last_step + 1
     done = ran == steps and not broken

@@ -178,8 +178,8 @@ def table(content: dict[str, Any]) -> str:
         f"| colour | texel size | 2 | {head['color_order_in_texels']:.2f} |",
         "",
         "The first plane inside a solid is hit, so the depth error should be half a plane's spacing along the ray: the",
-        f"finest is {head['depth_error_over_expected']:.2f} times that. Adding an MPI changed an error by at most "
-        f"{100 * head['largest_change_with_an_added_mpi']:+.1f} %.",
+        f"finest is {head['depth_error_over_expected']:.2f} times that. Of all added MPIs the least helpful changed an "
+        f"error by {100 * head['largest_change_with_an_added_mpi']:+.0f} % (merged jointly).",
         "",
         "![Errors over planes, texels and MPIs](accuracy.png)",
         "",
@@ -210,14 +210,15 @@ def _texels_table(rows: list[dict[str, Any]]) -> list[str]:
 
 
 def _count_table(rows: list[dict[str, Any]]) -> list[str]:
-    lines = ["", "## MPIs", ""]
-    lines += [
-        "K MPIs of 17 planes around the cameras. *Joint*: merged without reliability, as trained together. *Paper*"
+    lines = [
+        "",
+        "## MPIs",
+        "",
+        "K MPIs of 17 planes around the cameras. *Joint*: merged without reliability, as trained together. *Paper* and",
+        "*opacity*: blended with equal reliability everywhere, before it has learned anything. The paper's form then",
+        "lets (1 - 1/K)^K of the light through K opaque samples and mixes in what lies deeper.",
+        "",
     ]
-    lines += [
-        "and *opacity*: blended with equal reliability everywhere, as before reliability has learned anything: the"
-    ]
-    lines += ["paper's form lets (1 - 1/K)^K of the light through K opaque samples, so its depth lies deeper.", ""]
     lines += ["| K | joint: depth | colour | paper: depth | colour | opacity: depth | colour |", "|---" * 7 + "|"]
     for row in rows:
         cells = [f"{row[f or 'joint'][what]:.2e}" for f in FORMS for what in ("depth_error", "color_error")]

@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -105,7 +106,8 @@ def single(x: Array | float) -> Array:
     return np.asarray(x, np.float32).astype(np.float64)
 
 
-def _floats(x: Array) -> tuple[float, ...]:
+def _floats(x: Array) -> Any:
+    """Plain numbers, as plans hold them."""
     return tuple(float(v) for v in single(x))
 
 
@@ -135,7 +137,7 @@ def random_mpi(rng: np.random.Generator, planes: int = 12, axes: Array | None = 
     mpi = MPIPlan(
         name="random",
         origin=_floats(rng.normal(size=3) * 2),
-        axes=tuple(_floats(row) for row in frame),  # type: ignore[arg-type]
+        axes=tuple(_floats(row) for row in frame),  # type: ignore
         near=float(rng.uniform(0.5, 4)),
         extent=(low[0], low[0] + wide[0], low[1], low[1] + wide[1]),
         planes=planes,

@@ -206,9 +206,9 @@ def _keypoint(precision: Precision) -> Outcome:
         # x is a difference of 1/t, 17 widths long: its rounding counts x^2 17 times.
         return float(-np.log(mass)[reach].mean()), slope, np.abs(slope) * (1 + 20 * np.abs(x)) + 1e-30
 
-    tensors = [torch.tensor(x, dtype=torch.float32) for x in (q, known)]
+    places, depth = (torch.tensor(x, dtype=torch.float32) for x in (q, known))
     valid = torch.ones(6, 9, dtype=torch.bool)
-    return _loss(lambda w: losses.keypoint_depth(w, *tensors, valid), weights, wanted, 60.0, 16, precision)
+    return _loss(lambda w: losses.keypoint_depth(w, places, depth, valid), weights, wanted, 60.0, 16, precision)
 
 
 def _variation(precision: Precision) -> Outcome:

@@ -299,7 +299,6 @@ def cases() -> list[Case]:
         ("finite far (8 units)", lambda: replace(scene(3, 12, "paper", 15), far=8.0)),
     ]
     result = [Case(GROUP, name, EXPECTATION, lambda p, make=make: measure(make(), p)) for name, make in rows]
-    dense = {"log_depths": (-3, 1.0)}
     result += [
         Case(GROUP, f"32 rays in chunks of 1, 7, 19, all, and shuffled (threshold {t:g})", "the same colours",
              lambda p, t=t: _chunks(scene(4, 32, "paper", 16, cube=CUBE), p, t))
@@ -307,7 +306,7 @@ def cases() -> list[Case]:
     ]  # fmt: skip
     result += [
         Case(GROUP, f"samples of less than {t:g} dropped", "colours within the dropped mass",
-             lambda p, t=t: _threshold(scene(4, 100, "paper", 17, **dense), p, t))
+             lambda p, t=t: _threshold(scene(4, 100, "paper", 17, log_depths=(-3, 1.0)), p, t))
         for t in (1e-3, 3e-2)
     ]  # fmt: skip
     return [*result, Case(GROUP, "rays that meet nothing; no rays at all", "black and transparent, no NaN", _nothing)]

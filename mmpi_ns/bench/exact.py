@@ -134,7 +134,7 @@ def place_in(
     x, y, z = o * inverse_t + d
     if z <= 0:
         return None
-    ndc = to_ndc(mpi, np.float64(x / z), np.float64(y / z), np.float64(inverse_t / z))
+    ndc = to_ndc(mpi, *(np.asarray(number) for number in (x / z, y / z, inverse_t / z)))
     widest = 2 / min(mpi.extent[1] - mpi.extent[0], mpi.extent[3] - mpi.extent[2])
     steep = (1 + max(abs(x), abs(y)) / z) * (widest + inverse_t / (1 / mpi.near - 1 / mpi.far))
     return ndc, float(1 + steep * (reach * inverse_t + 1) / z)

@@ -6,9 +6,10 @@ The field comes in as its plan and plain arrays (``ExactField.of`` slices the po
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,8 +66,8 @@ class ExactField:
         )
 
     def zeros(self) -> Gradients:
-        tables = [[np.zeros_like(t) for t in table] for table in (self.density, self.features, self.reliability)]
-        return Gradients(*tables, np.zeros_like(self.networks))
+        d, f, r = ([np.zeros_like(t) for t in table] for table in (self.density, self.features, self.reliability))
+        return Gradients(d, f, r, np.zeros_like(self.networks))
 
 
 @dataclass
@@ -116,9 +117,9 @@ class ExactRay:
     direction: Array
     near: float = 0.05
     far: float = math.inf
-    jitter: Jitter = field(default_factory=lambda: STILL)
+    jitter: Jitter = dataclasses.field(default_factory=lambda: STILL)
     margin: float = math.inf
-    samples: list[Sample] = field(default_factory=list)
+    samples: list[Sample] = dataclasses.field(default_factory=list)
 
     def __post_init__(self) -> None:
         plan = self.field.plan
