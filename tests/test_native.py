@@ -1,0 +1,265 @@
+"""The compiled kernels against their references in plain torch, and what happens where they cannot be had."""
+
+from __future__ import annotations
+
+import math
+import subprocess
+
+import pytest
+import torch
+from hand_made import make_mpi
+from random_fields import bundle, random_field, random_rays, render
+
+from mmpi_ns import mmpi_sampler
+from mmpi_ns.color_network import ColorNetworks
+from mmpi_ns.mmpi_field import MMPIField
+from mmpi_ns.mmpi_sampler import MMPISampler
+from mmpi_ns.ops import native
+from mmpi_ns.ops.interpolate import add_rows, gather_rows, index_rows, interpolate_gathered, interpolate_reference
+from mmpi_ns.ops.variation import total_variation, total_variation_reference
+from mmpi_ns.placement.plan import CubePlan, ScenePlan
+from mmpi_ns.touched_adam import TouchedAdam
+
+
+@pytest.fixture(autouse=True)
+def compiled(monkeypatch):
+    """The machine that runs the tests has a compiler: a kernel that silently is not there would test nothing."""
+    monkeypatch.setattr(native, "_chosen", "auto")
+    assert native.library(torch.zeros(1)) is not None
+
+
+def both(monkeypatch, work):
+    """What ``work`` returns by the compiled kernels and by plain torch."""
+    fast = work()
+    monkeypatch.setattr(native, "_chosen", "torch")
+    plain = work()
+    monkeypatch.setattr(native, "_chosen", "auto")
+    return fast, plain
+
+
+def normal(*shape, seed=0):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+# March ---------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("form", ["paper", "opacity", None])
+@pytest.mark.parametrize(("num_mpis", "with_cube"), [(1, False), (4, True), (9, False)])
+@pytest.mark.parametrize("threshold", [0.0, 1e-3, 3e-2])
+def test_the_march_keeps_what_the_reference_keeps(monkeypatch, num_mpis, with_cube, form, threshold):
+    monkeypatch.setattr(mmpi_sampler, "OPAQUE_DEPTH", math.inf)  # the reference stops blending at 1e-4 of the light
+    field = random_field(num_mpis, with_cube, seed=num_mpis, planes=40)
+    rays = bundle(*random_rays(field.plan, 200, seed=1))
+    fast, plain = both(monkeypatch, lambda: render(field, rays, threshold, form))
+    kept, wanted = fast.samples.metadata, plain.samples.metadata
+    # A sample whose weight is the threshold's to the last bits may fall on either side of it.
+    same = (kept["valid"].sum(1) == wanted["valid"].sum(1))[:, 0]
+    assert same.float().mean() > 0.98 and wanted["valid"].any()
+    width = min(kept["valid"].shape[1], wanted["valid"].shape[1])
+    valid = wanted["valid"][same, :width, 0]
+    for name, error in (("heads", 0), ("planes", 0), ("ndc", 1e-5), ("inverse_t", 1e-4), ("tau", 3e-5)):
+        a, b = (m[name][same, :width][valid].double() for m in (kept, wanted))
+        assert ((a - b).abs() <= error * (1 + b.abs())).all(), name
+    assert torch.allclose(
+        kept["skipped_before"][same, :width][valid], wanted["skipped_before"][same, :width][valid], atol=2e-5
+    )
+    assert torch.equal(fast.report.live, plain.report.live)
+    assert (fast.composite.transmittance - plain.composite.transmittance).abs().max() < 1.2e-5
+    difference = fast.report.dropped_mass - plain.report.dropped_mass
+    assert difference[same].min() > -2e-6 and difference[same].max() < 1.2e-5, "what is not visited counts as dropped"
+    assert (fast.rgb - plain.rgb).abs()[same].max() < 3e-5
+
+
+def test_behind_an_opaque_plane_the_march_visits_nothing_and_loses_a_hundred_thousandth():
+    field = MMPIField(ScenePlan((make_mpi(planes=64),), None, 0.05, 1.0)).eval()
+    field.density.data[: 10 * field.grids[0].height * field.grids[0].width] = 30.0
+    found = render(field, bundle([[0, 0, 0]], [[0, 0, 1]]), threshold=1e-3)
+    assert found.report.live.item() == 64 and found.samples.metadata["valid"].sum() == 1
+    assert found.report.skipped_total.item() == 0 and found.report.dropped_mass.item() <= 1e-5
+    assert found.composite.accumulation.item() == pytest.approx(1, abs=1e-5)
+
+
+def test_without_rays_or_samples_there_is_nothing_to_march():
+    field = MMPIField(ScenePlan((make_mpi(),), None, 0.05, 1.0)).eval()
+    away = render(field, bundle([[0, 0, 0]], [[0, 0, -1]]), blend_form="paper")
+    assert away.samples.metadata["valid"].sum() == 0 and away.composite.accumulation.item() == 0
+    samples, report = MMPISampler()(bundle(torch.zeros(0, 3), torch.zeros(0, 3)), field=field, threshold=1e-3)
+    assert samples.shape[0] == 0 and report.live.shape == (0,)
+
+
+def test_results_do_not_depend_on_the_number_of_threads():
+    field = random_field(4, True, seed=5, planes=40)
+    rays, threads = bundle(*random_rays(field.plan, 1200, seed=6)), torch.get_num_threads()
+    found = []
+    for count in (1, 3):
+        try:
+            torch.set_num_threads(count)
+            found.append(render(field, rays, 1e-3, "paper"))
+        finally:
+            torch.set_num_threads(threads)
+    one, three = found
+    assert torch.equal(one.report.dropped_mass, three.report.dropped_mass)
+    assert all(torch.equal(one.samples.metadata[n], three.samples.metadata[n]) for n in one.samples.metadata)
+
+
+# Colours -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("shared", [False, True])
+@pytest.mark.parametrize(("channels", "width", "octaves"), [(3, 5, (0, 0)), (9, 32, (2, 2)), (4, 64, (4, 1))])
+def test_shading_equals_the_colour_networks(monkeypatch, channels, width, octaves, shared):
+    plan = random_field(4, True, seed=7).plan
+    field = MMPIField(
+        plan,
+        feature_channels=channels,
+        hidden_width=width,
+        position_frequencies=octaves[0],
+        direction_frequencies=octaves[1],
+        shared_colour=shared,
+    ).eval()
+    field.features.data = normal(*field.features.shape, seed=1) * 2
+    field.networks.weights.data = normal(*field.networks.weights.shape, seed=2) * 0.3
+    rays = bundle(*random_rays(plan, 60, seed=8))
+    samples, _ = MMPISampler()(rays, field=field, threshold=0.0)
+    assert samples.metadata["heads"].unique().numel() == 5
+    with torch.no_grad():
+        fast, plain = both(monkeypatch, lambda: next(iter(field.get_outputs(samples).values())))
+    assert plain.std() > 0.05 and (fast - plain).abs().max() < 5e-6
+    assert (fast[~samples.metadata["valid"][..., 0]] == 0).all()
+
+
+def test_encoded_once_a_ray_or_once_a_sample_a_direction_gives_the_same_colour():
+    networks = ColorNetworks(2, 4, 8, 2, 2)
+    networks.weights.data = normal(*networks.weights.shape)
+    features, ndc, directions, rays = normal(6, 4), normal(6, 3), normal(3, 3), torch.tensor([2, 0, 0, 1, 2, 2])
+    once, each = networks(1, features, ndc, directions, rays), networks(1, features, ndc, directions[rays])
+    assert torch.allclose(once, each, atol=1e-7)
+
+
+# Rows ----------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("stride", [1, 4096, 2**20 + 1])
+@pytest.mark.parametrize("count", [1, 7, 40_000])
+def test_distinct_rows_are_those_of_the_reference(monkeypatch, count, stride):
+    rows = torch.randint(0, 1 + count // 3, (count, 4), generator=torch.Generator().manual_seed(count)) * stride
+    fast, plain = both(monkeypatch, lambda: index_rows(rows))
+    assert torch.equal(fast.unique.sort()[0], plain.unique)
+    assert fast.position.shape == rows.shape and torch.equal(fast.unique[fast.position.long()], rows)
+
+
+@pytest.mark.parametrize("weighted", [True, False])
+@pytest.mark.parametrize("channels", [1, 9])
+def test_rows_gather_what_their_entries_give(monkeypatch, channels, weighted):
+    rows = torch.randint(0, 40, (300, 4 if weighted else 1), generator=torch.Generator().manual_seed(1))
+    values, weights = normal(300, channels), torch.rand(300, 4) if weighted else None
+
+    def work():
+        index = index_rows(rows)
+        return torch.zeros(40, channels).index_copy_(0, index.unique, add_rows(index, values, weights))
+
+    fast, plain = both(monkeypatch, work)
+    assert plain.abs().max() > 1 and torch.allclose(fast, plain, atol=1e-5)
+
+
+@pytest.mark.parametrize("channels", [1, 9])
+def test_gathered_rows_are_read_like_the_table_and_have_one_gradient_each(channels):
+    rows, weights = torch.randint(0, 50, (80, 4), generator=torch.Generator().manual_seed(1)), torch.rand(80, 4)
+    index = index_rows(rows)
+    some, upstream = torch.arange(0, 80, 3), normal(80, channels, seed=2)
+    table, plain = (normal(50, channels).requires_grad_() for _ in range(2))
+    gathered = gather_rows(table, index.unique)
+    read = interpolate_gathered(gathered, index.position, weights)
+    part = interpolate_gathered(gathered, index.position[some], weights[some])
+    wanted = interpolate_reference(plain, rows, weights)
+    assert torch.allclose(read, wanted, atol=1e-6) and torch.allclose(part, wanted[some], atol=1e-6)
+    ((read * upstream).sum() + 2 * part.sum()).backward()
+    ((wanted * upstream).sum() + 2 * wanted[some].sum()).backward()
+    assert torch.equal(table.grad._indices()[0], index.unique)
+    assert torch.allclose(table.grad.to_dense(), plain.grad, atol=1e-5)
+
+
+@pytest.mark.parametrize("channels", [1, 9])
+def test_variation_equals_the_reference_with_its_gradient(channels):
+    cube = CubePlan((-1.0, -1.0, 2.0), (1.0, 1.0, 5.0), (3, 2, 4))
+    plan = ScenePlan((make_mpi("a", height=5, width=4, planes=3), make_mpi("b", height=2, width=3)), cube, 0.05, 1.0)
+    grids = MMPIField(plan).grids
+    table = normal(plan.texels, channels) * 2
+    rows = torch.randperm(plan.texels, generator=torch.Generator().manual_seed(1))[: plan.texels - 9]
+    found = []
+    for function in (total_variation, total_variation_reference):
+        values = table[rows].requires_grad_()
+        value = function(values, table, rows, grids, [(0.5, 2.0, 1.0), (1.0, 3.0, 0.3), (0.7, 1.0, 2.0)])
+        (3 * value).backward()
+        found.append((value.item(), values.grad))
+    assert found[0][0] == pytest.approx(found[1][0], rel=1e-5) and found[0][0] > 1
+    assert torch.allclose(found[0][1], found[1][1], atol=1e-5)
+
+
+def test_adam_on_rows_equals_the_plain_one_to_the_last_bits(monkeypatch):
+    def work():
+        param = torch.nn.Parameter(normal(500, 9))
+        optimizer = TouchedAdam([param], lr=0.1)
+        for step in range(6):
+            rows = torch.randint(0, 500, (300,), generator=torch.Generator().manual_seed(step))
+            values = normal(300, 9, seed=step)
+            values[:, step] = 0  # entries without a gradient within a touched row
+            param.grad = torch.sparse_coo_tensor(rows[None], values, param.shape)
+            optimizer.step()
+        return param.data, optimizer.state[param]["exp_avg"], optimizer.state[param]["exp_avg_sq"]
+
+    fast, plain = both(monkeypatch, work)
+    assert (plain[0] - normal(500, 9)).abs().max() > 0.3
+    for a, b in zip(fast, plain, strict=True):
+        assert ((a - b).abs() <= 2e-6 * (1 + b.abs())).all()
+
+
+# Where there are none ------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def unbuilt(monkeypatch, tmp_path):
+    """A machine on which nothing has been compiled yet."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    native._build.cache_clear()
+    yield tmp_path
+    native._build.cache_clear()
+
+
+def test_without_a_compiler_plain_torch_runs_and_the_log_says_so(monkeypatch, unbuilt, capsys):
+    monkeypatch.delenv("CXX", raising=False)
+    monkeypatch.setattr(native.shutil, "which", lambda name: None)
+    field = random_field(2, seed=1)
+    rays = bundle(*random_rays(field.plan, 10, seed=1))
+    assert math.isfinite(render(field, rays).rgb.sum()) and native.library(torch.zeros(1)) is None
+    render(field, rays)
+    said = " ".join(capsys.readouterr().out.split())
+    assert said.count("no C++ compiler (g++ or clang++) is installed") == 1
+    with pytest.raises(ValueError, match="no C\\+\\+ compiler"):
+        native.choose("native")
+
+
+def test_a_compiler_that_fails_is_named(monkeypatch, unbuilt, capsys):
+    broken = unbuilt / "broken-compiler"
+    broken.write_text("#!/bin/sh\necho 'no such flag' >&2\nexit 1\n")
+    broken.chmod(0o755)
+    monkeypatch.setenv("CXX", str(broken))
+    assert native.library(torch.zeros(1)) is None
+    said = "".join(capsys.readouterr().out.split())
+    assert "broken-compiler" in said and "nosuchflag" in said
+    assert not list(unbuilt.glob("mmpi_ns/*.so"))
+
+
+def test_what_was_compiled_is_used_again(monkeypatch, unbuilt):
+    assert native.library(torch.zeros(1)) is not None
+    assert [p.suffix for p in (unbuilt / "mmpi_ns").iterdir()] == [".so"]
+    native._build.cache_clear()
+    monkeypatch.setattr(subprocess, "run", lambda *a, **k: pytest.fail("compiled twice"))
+    assert native.library(torch.zeros(1)) is not None
+
+
+def test_other_precisions_and_the_users_choice_take_the_plain_path():
+    assert native.library(torch.zeros(1, dtype=torch.float64)) is None
+    native.choose("torch")
+    assert native.library(torch.zeros(1)) is None
