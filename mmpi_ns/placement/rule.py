@@ -54,7 +54,7 @@ class PlacementConfig:
     """Texel rows of every MPI (drive, room)."""
     width: int = 256
     """Texel columns of every MPI (drive, room)."""
-    enough: float = 0.75
+    enough: float = 0.85
     """Expected error that needs no further MPI, relative to a texel's pixels (automatic)."""
     texel_cost: float = 0.5
     """How much texels count against a candidate: its gain is divided by texels to this power (automatic)."""
