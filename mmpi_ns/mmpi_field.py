@@ -150,6 +150,7 @@ class MMPIField(Field):
         if stored is not None and stored.shape[0] != self.networks.count:
             self.networks.resize(stored.shape[0])
         self.build(plan, float(state_dict[prefix + "texel_factor"]))
+        self.plan_bytes = plan_bytes.clone().to(self.density.device)  # as it was written, whatever a plan has now
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
     # Constants of the plan, on the parameters' device ---------------------------------------------------------

@@ -170,12 +170,11 @@ class MMPITrainer(Trainer):
         stored = pipeline_state.get("_model.field.plan_bytes")
         if stored is None:
             raise ValueError(f"{path} holds no scene plan: it was not written by this method.")
-        ours = self._model.field.plan_bytes
-        if stored.shape != ours.shape or not torch.equal(stored, ours.cpu()):
-            theirs = ScenePlan.from_json(bytes(stored.numpy().tolist()).decode())
+        theirs, ours = ScenePlan.from_json(bytes(stored.numpy().tolist()).decode()), self._model.field.full_plan
+        if theirs != ours:
             raise ValueError(
                 f"{path} was trained with another scene plan ({len(theirs.mpis)} MPIs there, "
-                f"{len(self._model.field.full_plan.mpis)} here): resume with the settings in its config.yml, or give "
+                f"{len(ours.mpis)} here): resume with the settings in its config.yml, or give "
                 f"its {PLAN_FILE} with --pipeline.model.plan-file."
             )
 

@@ -76,7 +76,7 @@ def test_cameras_round_an_object_get_a_cube_and_mpis_for_what_lies_behind_it():
     assert plan.cube is not None and np.abs(np.add(plan.cube.lower, plan.cube.upper)[:2] / 2).max() < 0.3
     assert len(plan.mpis) >= 3
     without = place(observations_of(make_scene("object"), per_camera=30), replace(CONFIG, max_voxels=0))
-    assert without.cube is None and len(without.mpis) > len(plan.mpis)
+    assert without.cube is None and len(without.mpis) >= 5
 
 
 def test_mpis_grow_with_the_length_of_a_road():
