@@ -204,7 +204,7 @@ def test_float32_gradients_are_finite_on_every_hard_input(form):
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("gap", [-80.0, -30.0, -10.0, 10.0, 30.0, 80.0])
 def test_small_gradients_of_reliability_are_right_in_float32(form, gap):
-    """Where P is near 0 or 1 the slopes P (1 - P) are tiny; Adam makes full steps of them, so their sign must be true."""
+    """Where P is near 0 or 1 the slopes P (1 - P) are tiny; Adam makes full steps of them, so signs must be true."""
     for tau in (1e-3, 1.0, 30.0):
         reliability = torch.tensor([[gap, 0.0]], requires_grad=True)
         shares = blend_shares(reliability, torch.ones(1, 2, dtype=torch.bool), torch.tensor([0]))
