@@ -198,7 +198,9 @@ class ExactRay:
                 self.margin = min(self.margin, float(gaps.min()) / size)
                 covers = bool((np.abs(ndc) <= 1 + 1e-12).all())
             if ndc is None or not covers:
-                votes.append(0.0), cover.append(False), read.append([])
+                votes.append(0.0)
+                cover.append(False)
+                read.append([])
                 continue
             corners = _corners(np.clip(ndc, -1, 1)[::-1], f.reliability[j].shape[:3])
             nearest, gap = _nearest(ndc[::-1], f.touched[j].shape[:3])
