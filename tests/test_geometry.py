@@ -326,7 +326,7 @@ def test_scene_scale_changes_nothing_in_float32(scale):
 @settings(max_examples=150)
 @given(mpi=mpis(), ndc=vectors(3, 1.0), at_infinity=st.booleans())
 def test_world_to_ndc_undoes_ndc_to_world_and_both_equal_the_oracle(mpi, ndc, at_infinity):
-    if at_infinity:
+    if at_infinity or ndc[2] > 1 - 1e-12:  # nearer than rounding tells apart
         ndc[2] = 1.0
     frames = Frames.pack([mpi], dtype=F64)
     given_ndc = torch.tensor(ndc, dtype=F64)[None]
