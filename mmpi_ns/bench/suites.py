@@ -55,6 +55,8 @@ SUITES: dict[str, list[Variant]] = {
         Variant("one front MPI, pulled back, longer", FRONT, steps=2600, group="with SfM depth"),
         Variant("four MPIs, joint, longer", (*DRIVE, *JOINT), steps=1200, group="with SfM depth"),
         Variant("mmpi-small, its defaults", (), steps=None, group="defaults"),
+        Variant("four MPIs by hand, joint, as many steps", (*DRIVE, *JOINT), steps=4000, group="defaults"),
+        Variant("one front MPI, pulled back, as many steps", FRONT, steps=4000, group="defaults"),
     ],
     "room-walk": [
         Variant("five MPIs and cube, joint", (*ROOM, P + "cube-voxels", "96"), steps=500),
