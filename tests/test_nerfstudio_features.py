@@ -126,7 +126,8 @@ def test_points_for_export_lie_on_the_wall(run, monkeypatch, capsys):
     cloud = generate_point_cloud(pipeline, 3000, remove_outliers=False)
     points, _ = in_capture_frame(pipeline.datamanager, cloud.points, np.zeros_like(cloud.points))
     share, error = on_the_wall(points)
-    assert len(np.unique(points, axis=0)) > 2500 and share > 0.3 and error < 0.5
+    # 3,000 draws of 4,608 pixels are 2,205 different ones; one batch over and over would be less than 1,000.
+    assert len(np.unique(points, axis=0)) > 2000 and share > 0.3 and error < 0.5
     assert cloud.colors.shape == points.shape and cloud.colors.std() > 0.05
     with pytest.raises(SystemExit):
         generate_point_cloud(pipeline, 3000, normal_output_name="normals")
@@ -145,7 +146,7 @@ def test_export_writes_a_point_cloud_in_the_frame_of_the_capture(run, tmp_path):
     ).main()
     cloud = o3d.io.read_point_cloud(str(tmp_path / "point_cloud.ply"))
     points, colors = np.asarray(cloud.points), np.asarray(cloud.colors)
-    assert len(np.unique(points, axis=0)) > 2500 and np.asarray(cloud.normals).shape == points.shape
+    assert len(np.unique(points, axis=0)) > 2000 and np.asarray(cloud.normals).shape == points.shape
     share, error = on_the_wall(points)
     assert share > 0.3 and error < 0.5 and colors.std() > 0.05
 
