@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 import torch
@@ -278,6 +280,17 @@ def test_a_state_dict_brings_its_own_plan_and_resolution(ours, theirs, shared, f
     form = "paper" if theirs > 1 else None
     a, b = (render(f.eval(), rays, blend_form=form) for f in (written, read))
     assert torch.equal(a.rgb, b.rgb) and torch.equal(a.report.live, b.report.live) and a.report.live.any()
+
+
+def test_a_plan_written_before_a_field_was_added_loads_and_stays_as_it_was_written(plan):
+    state = MMPIField(plan).state_dict()
+    text = json.loads(plan.to_json())
+    for mpi in text["mpis"]:
+        del mpi["far"]
+    old = torch.frombuffer(bytearray(json.dumps(text).encode()), dtype=torch.uint8)
+    read = MMPIField(plan)
+    read.load_state_dict({**state, "plan_bytes": old})
+    assert read.full_plan == plan and torch.equal(read.plan_bytes, old)
 
 
 def test_a_state_dict_without_a_plan_is_refused(plan):
