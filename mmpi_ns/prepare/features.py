@@ -16,6 +16,10 @@ SEED = 0
 BATCH = 8
 """Images extracted at a time: what an interruption loses."""
 PAIR_BATCH = 64
+PIXELS_A_FEATURE = 100
+"""More features than one for so many pixels repeat each other, and matching costs their square."""
+LEAST_FEATURES = 1024
+"""Small images may have so many all the same."""
 MIN_INLIERS = 15
 """Matches from which a pair counts: COLMAP's own limit."""
 
@@ -83,7 +87,8 @@ def extract(
     """
     options = pycolmap.FeatureExtractionOptions()
     options.num_threads = threads
-    options.sift.max_num_features = max_features
+    most = max(p.width * p.height for p in photos) // PIXELS_A_FEATURE
+    options.sift.max_num_features = min(max_features, max(most, LEAST_FEATURES))
     reader = pycolmap.ImageReaderOptions()
     if masks is not None:
         reader.mask_path = masks

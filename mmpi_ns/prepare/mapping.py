@@ -20,6 +20,8 @@ WORTH = 0.97
 """Share of the reprojection error to which a richer lens must bring it."""
 SNAPSHOT = 40
 """Images registered between two snapshots, from which an interrupted mapping goes on."""
+MANY = 100
+"""Images from which adjusting all of them again and again would take most of the time."""
 
 
 @dataclass(frozen=True)
@@ -131,7 +133,7 @@ def _run(
         shutil.rmtree(folder / "models", ignore_errors=True)
         (folder / "models").mkdir(parents=True)
         (folder / "snapshots").mkdir(exist_ok=True)
-        options = mapper_options(attempt, refine, threads)
+        options = mapper_options(attempt, refine, threads, total > MANY)
         options.snapshot_path, options.snapshot_frames_freq = folder / "snapshots", SNAPSHOT
         if start is not None:
             CONSOLE.print(f"Mapping, {attempt.name}: goes on from {pycolmap.Reconstruction(start).num_reg_images()}.")
@@ -169,8 +171,14 @@ def _latest_snapshot(folder: Path) -> Path | None:
     return None
 
 
-def mapper_options(attempt: Attempt, refine: bool, threads: int) -> pycolmap.IncrementalPipelineOptions:
-    """The mapper's settings for an attempt, with given intrinsics left alone unless they are to be refined."""
+def mapper_options(
+    attempt: Attempt, refine: bool, threads: int, is_large: bool = False
+) -> pycolmap.IncrementalPipelineOptions:
+    """The mapper's settings for an attempt, with given intrinsics left alone unless they are to be refined.
+
+    Of a large capture all images are adjusted together less often, and with fewer points: those that add little to
+    what holds an image are left out until the end.
+    """
     options = pycolmap.IncrementalPipelineOptions()
     options.min_num_matches = attempt.min_matches
     options.min_model_size = 3
@@ -185,6 +193,10 @@ def mapper_options(attempt: Attempt, refine: bool, threads: int) -> pycolmap.Inc
     mapper.abs_pose_min_inlier_ratio = attempt.abs_pose_min_inlier_ratio
     options.triangulation.min_angle = attempt.min_angle
     options.ba_refine_focal_length = options.ba_refine_extra_params = refine
+    if is_large:
+        options.ba_global_frames_ratio = options.ba_global_points_ratio = 1.3
+        options.ba_global_max_refinements = 2
+        mapper.ba_global_ignore_redundant_points3D = True
     mapper.abs_pose_refine_focal_length = mapper.abs_pose_refine_extra_params = refine
     return options
 

@@ -52,7 +52,7 @@ class Settings:
     overlap: int = 10
     """Frames of a sequence that each is matched with, before and after."""
     max_features: int = 4096
-    """SIFT features of an image."""
+    """Most SIFT features of an image; a small one gets one for every hundred pixels, or 1,024."""
     camera_height: float | None = None
     """Metres of the camera above the ground: gives the scale, and up from the ground's normal."""
     test_every: int | None = None
