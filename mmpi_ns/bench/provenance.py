@@ -50,8 +50,16 @@ def command_of(name: str, settings: Any) -> str:
         if value == default:
             continue
         flag = f.name.replace("_", "-")
-        words += [f"--{'' if value else 'no-'}{flag}"] if isinstance(value, bool) else [f"--{flag}", str(value)]
+        if isinstance(value, bool):
+            words.append(f"--{'' if value else 'no-'}{flag}")
+        else:
+            words += [f"--{flag}", *(_word(v) for v in (value if isinstance(value, tuple) else (value,)))]
     return shlex.join(words)
+
+
+def _word(value: Any) -> str:
+    """Where a folder lies on this machine is of no interest to others, its name is."""
+    return value.name if isinstance(value, Path) and value.is_absolute() else str(value)
 
 
 def stamp(name: str, settings: Any) -> dict[str, Any]:

@@ -11,11 +11,12 @@ from mmpi_ns.bench.dense import Dense
 from mmpi_ns.bench.regions import Regions
 from mmpi_ns.bench.results import Results
 from mmpi_ns.bench.stability import Stability
+from mmpi_ns.bench.train import Train
 
 
 def entrypoint() -> None:
     """The command ``mmpi-bench``; a mistake is one sentence and exit status 1."""
-    command = tyro.cli(Stability | Accuracy | Results | Dense | Regions, prog="mmpi-bench")  # type: ignore[arg-type]
+    command = tyro.cli(Train | Stability | Accuracy | Results | Dense | Regions, prog="mmpi-bench")  # type: ignore[arg-type]
     try:
         command.run()
     except (ValueError, OSError) as error:

@@ -1,0 +1,124 @@
+"""The methods that are trained side by side: ours and nerfstudio's, as words for ``ns-train``, and what each needs."""
+
+from __future__ import annotations
+
+import importlib.util
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from mmpi_ns.bench.suites import TWO_PHASE, P
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A data set and the size of its images that is used."""
+
+    data: Path
+    downscale_factor: int
+
+    @property
+    def name(self) -> str:
+        return self.data.resolve().name
+
+
+@dataclass(frozen=True)
+class Method:
+    """One way to train a scene."""
+
+    name: str
+    """What the tables call it."""
+    registered: str
+    """nerfstudio's name of it."""
+    options: tuple[str, ...] = ()
+    """As for ns-train."""
+    steps: int = 1500
+    """Steps unless told otherwise."""
+    needs: tuple[str, ...] = ()
+    """Modules that must be installed, and "cuda"."""
+    whole_images: bool = False
+    """Splats images instead of tracing rays: cannot render single pixels."""
+    batch_option: str | None = "--pipeline.datamanager.train-num-rays-per-batch"
+    """The option that sets the rays of a step; None: has none."""
+    camera_option: tuple[str, ...] = ()
+    """What turns the optimisation of cameras off."""
+
+    @property
+    def ours(self) -> bool:
+        return self.registered.startswith("mmpi")
+
+    def why_not(self) -> str | None:
+        """Why it cannot run on this machine; None: it can."""
+        for module in self.needs:
+            if module == "cuda" and not torch.cuda.is_available():
+                return "it needs a CUDA device, and torch sees none"
+            if module != "cuda" and importlib.util.find_spec(module) is None:
+                return f"the module {module} is not installed"
+        return None
+
+    def words(self, scene: Scene, folder: Path, steps: int, rays: int | None, seed: int, device: str) -> list[str]:
+        """An ``ns-train`` line that leaves looking and saving to the harness: it saves once, at the end.
+
+        Args:
+            scene: to train.
+            folder: of the run.
+            steps: of the run.
+            rays: of a step; None leaves it to the method.
+            seed: of every random draw.
+            device: cpu or cuda.
+        """
+        words = [self.registered, *self.options, *self.camera_option, "--machine.seed", str(seed)]
+        if rays is not None and self.batch_option is not None:
+            words += [self.batch_option, str(rays)]
+        if self.ours:
+            words += ["--pipeline.datamanager.seed", str(seed), "--pipeline.model.seed", str(seed)]
+        words += ["--output-dir", str(folder), "--experiment-name", "run", "--timestamp", "1", "--vis", "tensorboard"]
+        words += ["--machine.device-type", device, "--max-num-iterations", str(steps), "--steps-per-save", str(10**9)]
+        words += [word for what in ("batch", "image", "all-images") for word in (f"--steps-per-eval-{what}", "0")]
+        words += ["--logging.profiler", "none", "--logging.local-writer.enable", "False", "--data", str(scene.data)]
+        words += ["nerfstudio-data", "--downscale-factor", str(scene.downscale_factor)]
+        return words + (["--load-3D-points", "True"] if self.whole_images else [])
+
+
+def _nerfacto_options() -> tuple[str, ...]:
+    fast = torch.cuda.is_available() and importlib.util.find_spec("tinycudann") is not None
+    return ("--pipeline.model.implementation", "tcnn" if fast else "torch")
+
+
+CAMERAS_OFF = ("--pipeline.model.camera-optimizer.mode", "off")
+METHODS = {
+    m.name: m
+    for m in (
+        Method("mmpi-small", "mmpi-small", steps=4000),
+        Method("mmpi", "mmpi", steps=20_000),
+        Method("single", "mmpi-small", (P + "max-mpis", "1"), steps=4000),
+        Method("two-phase", "mmpi-small", TWO_PHASE, steps=4000),
+        Method("mmpi-kitti", "mmpi-kitti", steps=40_000),
+        Method("mmpi-scannet", "mmpi-scannet", steps=30_000),
+        Method("mmpi-scannet-short", "mmpi-scannet-short", steps=10_000),
+        Method("nerfacto", "nerfacto", _nerfacto_options(), camera_option=CAMERAS_OFF),
+        # It has no camera optimiser. Its batches adapt themselves to the samples of a ray.
+        Method("instant-ngp", "instant-ngp", steps=10_000, needs=("cuda", "nerfacc"), batch_option=None),
+        Method(
+            "splatfacto",
+            "splatfacto",
+            steps=10_000,
+            needs=("cuda", "gsplat"),
+            whole_images=True,
+            batch_option=None,
+            camera_option=CAMERAS_OFF,
+        ),
+    )
+}
+
+
+def find_method(name: str) -> Method:
+    """A method by its name in the tables.
+
+    Raises:
+        ValueError: there is none of that name.
+    """
+    if name not in METHODS:
+        raise ValueError(f"There is no method {name!r}: choose from {', '.join(METHODS)}.")
+    return METHODS[name]

@@ -1,0 +1,270 @@
+"""One training by nerfstudio's own trainer, evaluated on the way: a process of its own, ``python -m`` this module.
+
+The trainer is untouched but for a callback after each step, which counts rays and, at given steps, stops the clock,
+renders test pixels and starts it again. Whatever draws random numbers meanwhile is given its old state back.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import resource
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import nn
+
+from mmpi_ns.bench.apart import answer
+from mmpi_ns.metrics import ImageMetrics
+
+
+@dataclass(frozen=True)
+class Request:
+    """What to train and where to look."""
+
+    words: tuple[str, ...]
+    """For ns-train: the method, its options and the data parser's."""
+    data: str
+    downscale_factor: int
+    work: str
+    """Folder of the run."""
+    checks: tuple[int, ...]
+    """Evaluate after so many steps; the last is the length of the run."""
+    check_images: int
+    """Test images, evenly spaced, that are looked at on the way; 0 for all."""
+    check_pixels: int
+    """Pixels of each, drawn once; 0 for all. Methods that splat whole images render all and are scored on these."""
+    final_images: int
+    """Test images, evenly spaced, that are rendered whole at the end; 0 for all."""
+    whole_images: bool
+    """The method renders no single pixels."""
+    keep: bool
+    """Keep checkpoints."""
+
+
+class NoLPIPS(nn.Module):
+    """Stands in for the metric that peers build in their constructors, whose weights may be out of reach."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__()
+
+    def forward(self, *args: Any) -> torch.Tensor:
+        return torch.tensor(float("nan"))
+
+
+def replace_lpips() -> None:
+    """Makes models that are built from now on in this process take ``NoLPIPS``."""
+    import torchmetrics.image.lpip as home
+
+    home.LearnedPerceptualImagePatchSimilarity = NoLPIPS  # type: ignore[misc]
+
+
+class Stopwatch:
+    """Seconds that training took, without what it was stopped for."""
+
+    def __init__(self) -> None:
+        self._start = time.perf_counter()
+        self._stopped = 0.0
+
+    @property
+    def seconds(self) -> float:
+        if torch.cuda.is_available():
+            torch.cuda.synchronize()
+        return time.perf_counter() - self._start - self._stopped
+
+    @contextlib.contextmanager
+    def stopped(self) -> Iterator[None]:
+        """Does not count what runs inside, nor lets it change random draws outside."""
+        if torch.cuda.is_available():
+            torch.cuda.synchronize()
+        begin, states = time.perf_counter(), (torch.get_rng_state(), np.random.get_state())  # noqa: NPY002
+        gpu = torch.cuda.get_rng_state_all() if torch.cuda.is_available() else []
+        yield
+        torch.set_rng_state(states[0])
+        np.random.set_state(states[1])  # noqa: NPY002
+        if gpu:
+            torch.cuda.synchronize()
+            torch.cuda.set_rng_state_all(gpu)
+        self._stopped += time.perf_counter() - begin
+
+
+def evenly(count: int, wanted: int) -> list[int]:
+    """``wanted`` of 0 ... count - 1, evenly spaced from half a spacing on; all where 0 or more are wanted."""
+    if wanted <= 0 or wanted >= count:
+        return list(range(count))
+    return [int((i + 0.5) * count / wanted) for i in range(wanted)]
+
+
+def chosen_pixels(image: int, height: int, width: int, wanted: int) -> torch.Tensor:
+    """Indices of the pixels of a test image that are scored on the way; equal for every method."""
+    g = torch.Generator().manual_seed(image)
+    return torch.randperm(height * width, generator=g)[: wanted or None]
+
+
+@torch.no_grad()
+def score(pipeline: Any, images: list[int], pixels: int, whole_images: bool) -> dict[str, float]:
+    """Mean PSNR over some test images, and over whole images SSIM and rays/s too.
+
+    Args:
+        pipeline: nerfstudio's.
+        images: which of the test images.
+        pixels: of each image; 0 for all.
+        whole_images: the model renders no single pixels.
+    """
+    pipeline.eval()
+    metrics, rows, rays, seconds = ImageMetrics("none"), [], 0, 0.0
+    for index, (camera, batch) in enumerate(pipeline.datamanager.fixed_indices_eval_dataloader):
+        if index not in images:
+            continue
+        truth = batch["image"].to("cpu")
+        truth = truth.float() / 255 if truth.dtype == torch.uint8 else truth
+        if truth.shape[-1] != 3:
+            raise ValueError("A test image is see-through: methods put it over different backgrounds.")
+        height, width = truth.shape[:2]
+        chosen = chosen_pixels(index, height, width, pixels)
+        start = time.perf_counter()
+        if pixels and not whole_images:
+            bundle = camera.generate_rays(camera_indices=0, keep_shape=True).flatten()
+            bundle = bundle[chosen.to(bundle.origins.device)].reshape((len(chosen), 1))
+            rgb = pipeline.model.get_outputs_for_camera_ray_bundle(bundle)["rgb"].cpu()
+        else:
+            rgb = pipeline.model.get_outputs_for_camera(camera)["rgb"].cpu()  # on a GPU, waits for it
+        seconds += time.perf_counter() - start
+        rays += rgb.shape[0] * rgb.shape[1]
+        if pixels:
+            rgb = rgb if not whole_images else rgb.reshape(-1, 1, 3)[chosen]
+            truth = truth.reshape(-1, 1, 3)[chosen]
+        rows.append(metrics(rgb.clamp(0, 1), truth))
+    pipeline.train()
+    means = {k: float(np.mean([r[k] for r in rows])) for k in rows[0]}
+    return {**means, "rays_per_s": rays / seconds, "frame_s": seconds / len(rows), "images": len(rows)}
+
+
+def split_of(datamanager: Any) -> dict[str, Any]:
+    """Which images a method trains with and is tested on: counts, image size, and a hash of names, sizes, focal lengths
+    and how far apart the cameras are."""
+    parts = {"train": datamanager.train_dataparser_outputs, "test": datamanager.eval_dataset._dataparser_outputs}
+    found: dict[str, Any] = {}
+    digest = hashlib.sha256()
+    for name, outputs in parts.items():
+        found[name] = [str(p) for p in outputs.image_filenames]
+        cameras = outputs.cameras
+        digest.update(json.dumps([name, [Path(p).name for p in found[name]]]).encode())
+        # Distances, since loading points may turn the world by a quarter.
+        travel = (cameras.camera_to_worlds[:, :, 3] - cameras.camera_to_worlds[:1, :, 3]).norm(dim=-1)
+        for value in (cameras.width, cameras.height, cameras.fx, travel):
+            digest.update(np.ascontiguousarray(value.cpu().double().numpy().round(3)).tobytes())
+        found["size"] = [int(cameras.width[0]), int(cameras.height[0])]
+    return {**found, "digest": digest.hexdigest()[:16]}
+
+
+def check_split(split: dict[str, Any], data: Path, downscale_factor: int) -> None:
+    """Compares with what the scene's own test list says.
+
+    Raises:
+        ValueError: the trainer would evaluate on other images than the test images, or one is in both lists.
+    """
+    from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+
+    parser = NerfstudioDataParserConfig(data=data, downscale_factor=downscale_factor).setup()
+    for name in ("train", "test"):
+        wanted = [str(p) for p in parser.get_dataparser_outputs(split=name).image_filenames]
+        if split[name] != wanted:
+            raise ValueError(f"{data}: the {name} images are not those of its {name} list; val and test must be equal.")
+    if set(split["train"]) & set(split["test"]):
+        raise ValueError(f"{data}: {sorted(set(split['train']) & set(split['test']))[0]} is in both lists.")
+
+
+def run(request: Request, tell: Callable[[str], None] = print) -> dict[str, Any]:
+    """Trains as ``ns-train`` with these words would, and says how good it was when.
+
+    Returns:
+        curve: for each check step, rays, seconds since the trainer was set up (placement and loading included,
+        evaluation not) and PSNR; psnr, ssim, rays_per_s, frame_s over whole test images; setup_seconds, seconds,
+        rays, parameters, peak_gib, split.
+    """
+    import tyro
+    from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
+    from nerfstudio.scripts.train import _set_random_seed
+
+    from mmpi_ns.bench.peers import needs_small_ply_reader, read_points_ourselves
+
+    replace_lpips()
+    if needs_small_ply_reader():
+        read_points_ourselves()
+    config: Any = tyro.cli(AnnotatedBaseConfigUnion, args=list(request.words))
+    config.pipeline.datamanager.data = config.data
+    config.save_config()
+    _set_random_seed(config.machine.seed)
+    watch = Stopwatch()
+    trainer = config.setup(local_rank=0, world_size=1)
+    trainer.setup()
+    row = _follow(trainer, request, watch, tell)
+    for process in getattr(trainer.pipeline.datamanager, "data_procs", []):
+        process.terminate()
+    if not request.keep:
+        shutil.rmtree(trainer.checkpoint_dir)
+    return row
+
+
+def _follow(trainer: Any, request: Request, watch: Stopwatch, tell: Callable[[str], None]) -> dict[str, Any]:
+    """Trains with the callback that looks."""
+    from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
+
+    pipeline, curve = trainer.pipeline, []
+    split = split_of(pipeline.datamanager)
+    check_split(split, Path(request.data), request.downscale_factor)
+    count, rays, setup_seconds = len(split["test"]), 0, watch.seconds
+    final: dict[str, float] = {}
+
+    def look(step: int) -> None:
+        nonlocal rays
+        rays += pixels_of_step(pipeline)
+        if step + 1 not in request.checks:
+            return
+        seconds = watch.seconds
+        with watch.stopped():
+            found = score(pipeline, evenly(count, request.check_images), request.check_pixels, request.whole_images)
+            curve.append({"step": step + 1, "rays": rays, "seconds": seconds, "psnr": found["psnr"]})
+            tell(f"step {step + 1}: {seconds:.0f} s of training, {found['psnr']:.2f} dB")
+            if step + 1 == request.checks[-1]:
+                final.update(score(pipeline, evenly(count, request.final_images), 0, request.whole_images))
+
+    trainer.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], look))
+    trainer.train()
+    peak = {"peak_gib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20}
+    if torch.cuda.is_available():
+        peak["peak_gpu_gib"] = torch.cuda.max_memory_allocated() / 2**30
+    parameters = sum(p.numel() for p in pipeline.model.parameters())
+    return {
+        "curve": curve,
+        **final,
+        "setup_seconds": setup_seconds,
+        "seconds": curve[-1]["seconds"],
+        "rays": rays,
+        "parameters": parameters,
+        **peak,
+        "split": {**{k: len(split[k]) for k in ("train", "test")}, "size": split["size"], "digest": split["digest"]},
+    }
+
+
+def pixels_of_step(pipeline: Any) -> int:
+    """Pixels that the step which just ended compared; splats are trained on images that grow."""
+    pixels = int(pipeline.datamanager.get_train_rays_per_batch())
+    shrink = getattr(pipeline.model, "_get_downscale_factor", None)
+    return pixels if shrink is None else pixels // int(shrink()) ** 2
+
+
+def _answer(request: dict[str, Any], tell: Callable[[str], None]) -> dict[str, Any]:
+    return run(Request(**{k: tuple(v) if isinstance(v, list) else v for k, v in request.items()}), tell)
+
+
+if __name__ == "__main__":
+    answer(_answer)
