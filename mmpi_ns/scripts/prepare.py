@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import os
 import sys
-
-import tyro
-
-from mmpi_ns.prepare.pipeline import prepare
-from mmpi_ns.prepare.settings import Settings
-from mmpi_ns.prepare.stages import CONSOLE, PrepareError
 
 
 def main() -> int:
     """Runs mmpi-prepare; returns the exit status."""
+    # Before pycolmap is loaded: it has threads of its own, and each of them would start as many again for its matrices.
+    for library in ("OMP", "OPENBLAS"):
+        os.environ.setdefault(f"{library}_NUM_THREADS", "1")
+    import tyro
+
+    from mmpi_ns.prepare.pipeline import prepare
+    from mmpi_ns.prepare.settings import Settings
+    from mmpi_ns.prepare.stages import CONSOLE, PrepareError
+
     settings = tyro.cli(Settings, description=Settings.__doc__)
     try:
         prepare(settings)
