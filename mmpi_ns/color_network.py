@@ -40,13 +40,17 @@ class ColorNetworks(nn.Module):
 
     @torch.no_grad()
     def resize(self, count: int) -> None:
-        """Allocates ``count`` networks with PyTorch's default initialisation; equal for all, from a fixed seed."""
+        """Allocates ``count`` fresh networks."""
+        self.weights.data = self.fresh(count).to(self.weights.device)
+
+    def fresh(self, count: int) -> Float[Tensor, "count P"]:
+        """``count`` networks with PyTorch's default initialisation; equal for all, from a fixed seed."""
         generator = torch.Generator().manual_seed(0)
         parts = []
         for fan_in, shape in zip((s[-1] for s in self.shapes[::2] for _ in range(2)), self.shapes, strict=True):
             bound = 0.0 if shape[0] == 3 else 1 / math.sqrt(fan_in)
             parts.append((torch.rand(math.prod(shape), generator=generator) * 2 - 1) * bound)
-        self.weights.data = torch.cat(parts).repeat(count, 1).to(self.weights.device)
+        return torch.cat(parts).repeat(count, 1)
 
     def forward(
         self,

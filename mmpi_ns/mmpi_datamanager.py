@@ -14,6 +14,7 @@ from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager, Va
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.model_components.ray_generators import RayGenerator
 from nerfstudio.utils.rich_utils import CONSOLE
+from numpy.typing import NDArray
 from torch import Tensor
 
 from mmpi_ns.checks import check_transforms
@@ -79,9 +80,18 @@ class PixelPool:
             raise ValueError("The masks leave no training pixel: white (non-zero) mask pixels are the ones used.")
         return PixelPool(torch.cat(colors).to(device), torch.cat(indices).to(device))
 
-    def draw(self, count: int, g: torch.Generator) -> tuple[Float[Tensor, "R C"], Int[Tensor, "R 3"]]:
-        chosen = torch.randint(self.colors.shape[0], (count,), generator=g, device=g.device).to(self.colors.device)
+    def draw(
+        self, count: int, g: torch.Generator, allowed: Int[Tensor, "A"] | None = None
+    ) -> tuple[Float[Tensor, "R C"], Int[Tensor, "R 3"]]:
+        """Colours and indices of random pixels, of all or of those at the ``allowed`` places."""
+        size = self.colors.shape[0] if allowed is None else len(allowed)
+        chosen = torch.randint(size, (count,), generator=g, device=g.device).to(self.colors.device)
+        chosen = chosen if allowed is None else allowed[chosen].long()
         return self.colors[chosen].float() / 255, self.indices[chosen].long()
+
+    def places_of(self, images: Int[Tensor, "I"]) -> Int[Tensor, "A"]:
+        """Where the pixels of some images lie in the pool."""
+        return torch.isin(self.indices[:, 0], images.to(self.indices)).nonzero()[:, 0].to(torch.int32)
 
 
 class MMPIDataManager(VanillaDataManager[MMPIDataset]):
@@ -91,6 +101,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
 
     def __init__(self, config: MMPIDataManagerConfig, **kwargs: Any) -> None:
         self.pool: PixelPool | None = None
+        self._allowed: Tensor | None = None
         parser = config.dataparser
         if isinstance(parser, NerfstudioDataParserConfig):
             check_transforms(
@@ -132,6 +143,20 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         self.train_ray_generator = RayGenerator(self.train_dataset.cameras.to(self.device))
         self._keypoints = _keypoint_targets(self.observations, self.device)
 
+    def use_cameras(self, cameras: NDArray[np.int64] | None) -> None:
+        """Draws pixels and keypoints of these training cameras alone from now on; None for all.
+
+        Raises:
+            ValueError: the masks leave them no pixel.
+        """
+        self._keypoints = _keypoint_targets(self.observations, self.device, cameras)
+        self._allowed = None
+        if cameras is not None:
+            assert self.pool is not None
+            self._allowed = self.pool.places_of(torch.from_numpy(cameras))
+            if not len(self._allowed):
+                raise ValueError("The masks leave no training pixel in one stretch of the capture: use longer windows.")
+
     def next_train(self, step: int) -> tuple[RayBundle, dict]:
         """Pixel rays first, then keypoint rays (marked in the bundle's metadata), keyed on (seed, step).
 
@@ -140,7 +165,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         self.train_count += 1
         assert self.pool is not None
         g = generator(self.config.seed, step if self.training else self.train_count, "pixels", self.device)
-        colors, indices = self.pool.draw(self.get_train_rays_per_batch(), g)
+        colors, indices = self.pool.draw(self.get_train_rays_per_batch(), g, self._allowed)
         bundle = self.train_ray_generator(indices)
         depths = torch.zeros(len(bundle), 1, device=self.device)
         if self.training and self._keypoints is not None and self.config.keypoint_rays > 0:
@@ -175,17 +200,22 @@ def _join(a: RayBundle, b: RayBundle) -> RayBundle:
     )
 
 
-def _keypoint_targets(observations: Observations, device: str | torch.device) -> tuple[Tensor, ...] | None:
-    """Camera, origin, unit direction and inverse distance of every keypoint of the training images.
+def _keypoint_targets(
+    observations: Observations, device: str | torch.device, cameras: NDArray[np.int64] | None = None
+) -> tuple[Tensor, ...] | None:
+    """Camera, origin, unit direction and inverse distance of every keypoint of the training images, or of some.
 
     The ray goes to the point itself, a fraction of a pixel from the keypoint: no lens model enters.
     """
-    tracked = len(observations.seen_at)  # points of a plane sweep come after these: too rough to supervise depth
-    if not tracked:
+    # Points of a plane sweep come after those of the tracks: too rough to supervise depth.
+    tracked = np.arange(len(observations.seen_at))
+    if cameras is not None:
+        tracked = tracked[np.isin(observations.seen_by[tracked], cameras)]
+    if not len(tracked):
         return None
-    origins = observations.centers[observations.seen_by[:tracked]]
-    offsets = observations.points[observations.seen_point[:tracked]] - origins
+    origins = observations.centers[observations.seen_by[tracked]]
+    offsets = observations.points[observations.seen_point[tracked]] - origins
     distance = np.maximum(np.linalg.norm(offsets, axis=-1, keepdims=True), 1e-12)
     parts = (origins, offsets / distance, 1 / distance[:, 0])
-    cameras = torch.from_numpy(observations.seen_by[:tracked]).to(device)
-    return cameras, *(torch.from_numpy(x).float().to(device) for x in parts)
+    seen_by = torch.from_numpy(observations.seen_by[tracked]).to(device)
+    return seen_by, *(torch.from_numpy(x).float().to(device) for x in parts)

@@ -133,6 +133,11 @@ class MMPIField(Field):
         self.texel_factor.fill_(factor)
         self._packed = {}
 
+    def renew_networks(self, count: int) -> None:
+        """``count`` fresh colour networks in the same Parameter."""
+        weights = self.networks.weights
+        _replace_data(weights, self.networks.fresh(count).to(weights.device))
+
     @torch.no_grad()
     def release_untouched(self) -> None:
         """Empties the texels that no ray trained: alpha 0, no vote in the blending."""

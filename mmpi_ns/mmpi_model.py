@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from pathlib import Path
 from threading import current_thread, main_thread
-from typing import Any, Literal
+from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from nerfstudio.cameras.cameras import Cameras
@@ -15,7 +14,7 @@ from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.field_components.field_heads import FieldHeadNames
 from nerfstudio.model_components import renderers
-from nerfstudio.models.base_model import Model, ModelConfig
+from nerfstudio.models.base_model import Model
 from nerfstudio.viewer.viewer_elements import ViewerDropdown
 from torch import Tensor
 from torch.nn import Parameter
@@ -29,82 +28,24 @@ from mmpi_ns.compositing import (
     median_inverse_distance,
     render_colors,
 )
+from mmpi_ns.files import to_bytes, to_text
 from mmpi_ns.metrics import ImageMetrics, head_palette
-from mmpi_ns.mmpi_datamanager import OBSERVATIONS, RAYS_PER_STEP
+from mmpi_ns.mmpi_datamanager import OBSERVATIONS, RAYS_PER_STEP, MMPIDataManager
 from mmpi_ns.mmpi_field import MMPIField
-from mmpi_ns.mmpi_losses import LossWeights, TrainingRays, is_pixel_ray, over_background
+from mmpi_ns.mmpi_losses import TrainingRays, is_pixel_ray, over_background
 from mmpi_ns.mmpi_sampler import MergeReport, MMPISampler
-from mmpi_ns.mmpi_samples import Lookup, metadata_of
+from mmpi_ns.mmpi_samples import Lookup, metadata_of, repeat_rays
+from mmpi_ns.mmpi_settings import MMPIModelConfig
+from mmpi_ns.mmpi_windows import WindowStore, mix_windows
 from mmpi_ns.ops import native
-from mmpi_ns.phases import TRAINS, Schedule, Training, make_schedule
-from mmpi_ns.placement.plan import ScenePlan
-from mmpi_ns.placement.rule import PlacementConfig, place
+from mmpi_ns.phases import TRAINS, Schedule
+from mmpi_ns.placement.split import cameras_in, place_windows
 from mmpi_ns.random_draws import generator
+from mmpi_ns.windows import WindowedPlan, window_shares
 
 FAIR_SHARE = 0.1
 """Until the field has sharpened, samples of more than this part of an equal weight are kept."""
 BACKGROUNDS = {"black": 0.0, "gray": 0.5, "white": 1.0}
-
-
-@dataclass
-class MMPIModelConfig(ModelConfig):
-    """Settings of the model."""
-
-    _target: type = field(default_factory=lambda: MMPIModel)
-    enable_collider: bool = False
-    """Must stay off: a finite far would drop the plane at infinity."""
-    eval_num_rays_per_chunk: int = 8192
-    """Rays rendered at once."""
-    placement: PlacementConfig = field(default_factory=PlacementConfig)
-    """Where the MPIs stand and how fine they are."""
-    plan_file: Path | None = None
-    """A scene plan (JSON) to use instead of the placement rule."""
-    training: Training = "joint"
-    """Each MPI alone, then reliability (two-phase), or all together without reliability (joint)."""
-    total_steps: int = 1
-    """Set by the trainer from --max-num-iterations; the phases are shares of it."""
-    blend_share: float = 0.1
-    """Share of the steps in which only reliability trains."""
-    finetune_share: float = 0.3
-    """Share of the steps in which everything trains together at the end."""
-    finetune_rate: float = 0.3
-    """Learning rates at the start of the fine-tune relative to those of the first phase."""
-    decay_decades: float = 1.5
-    """Decades that learning rates fall over a phase."""
-    growth_shares: tuple[float, ...] = (1 / 15, 2 / 15, 3 / 15, 4 / 15)
-    """When the texels of a plane double, as shares of the first phase."""
-    rays_per_mpi: Literal["split", "all"] = "split"
-    """Individual phase: the MPIs share a batch's rays, or each renders all of them (K times the work a step)."""
-    blend_form: BlendForm = "paper"
-    """How reliability enters: P alpha (paper) or 1 - (1 - alpha)^P (opacity)."""
-    shared_colour: bool = False
-    """One colour network for all MPIs instead of one each."""
-    feature_channels: int = 9
-    """Colour features of a texel."""
-    hidden_width: int = 64
-    """Width of the colour networks."""
-    position_frequencies: int = 2
-    """Octaves of the positional encoding of NDC positions."""
-    direction_frequencies: int = 2
-    """Octaves of the positional encoding of directions."""
-    samples_per_voxel: float = 1.0
-    """Samples per voxel side along a ray through the cube."""
-    cube_alpha: float = 1e-3
-    """Initial alpha of a cube sample: 1e-2 for a small room to 1e-4."""
-    train_threshold: float = 3e-3
-    """Samples of less weight get no gradient (while resolution grows: nor more than a tenth of an equal share)."""
-    ops: native.Route = "auto"
-    """Inner loops on a CPU: compiled at first use (native), plain torch, or compiled where a C++ compiler is found."""
-    render_threshold: float = 3e-3
-    """Samples of less weight are not coloured when rendering; the dropped mass is reported."""
-    background: Literal["black", "gray", "white"] = "gray"
-    """Behind everything, when rendering. Training uses random colours where the MPIs explain the whole ray."""
-    loss: LossWeights = field(default_factory=LossWeights)
-    """Weights of the losses."""
-    lpips_net: Literal["vgg", "alex", "none"] = "vgg"
-    """Network of the LPIPS metric (the paper: VGG); left out where its weights (0.5 GB for VGG) cannot be had."""
-    seed: int = 0
-    """Seed of the model's own random draws."""
 
 
 class MMPIModel(Model):
@@ -115,51 +56,39 @@ class MMPIModel(Model):
     def populate_modules(self) -> None:
         super().populate_modules()
         native.choose(self.config.ops)
-        plan = self._initial_plan()
+        self.windows = self._initial_plan()
+        self.window = 0
+        self.store = WindowStore(self.config.windows_folder, self.config.resident_windows)
         # One head has nothing to blend with, so it trains in one go.
-        joint = self.config.training == "joint" or plan.num_heads == 1
-        self.schedule = self._make_schedule("joint" if joint else "two-phase")
-        self.field = MMPIField(
-            plan,
-            feature_channels=self.config.feature_channels,
-            hidden_width=self.config.hidden_width,
-            position_frequencies=self.config.position_frequencies,
-            direction_frequencies=self.config.direction_frequencies,
-            shared_colour=self.config.shared_colour,
-            shares_depth=joint,
-            samples_per_voxel=self.config.samples_per_voxel,
-            cube_alpha=self.config.cube_alpha,
-        )
-        self.field.build(plan, self.schedule.texel_factor(0))
+        joint = self.config.training == "joint" or all(plan.num_heads == 1 for plan in self.windows.plans)
+        self.schedule = self.config.schedule("joint" if joint else "two-phase", len(self.windows))
+        self.field = self._new_field()
+        self.field.build(self.windows.plans[0], self.schedule.texel_factor(0))
         self.sampler = MMPISampler()
         self.metrics = ImageMetrics(self.config.lpips_net)
-        self.register_buffer("schedule_bytes", _to_bytes(self.schedule.to_json()))
+        self.register_buffer("schedule_bytes", to_bytes(self.schedule.to_json()))
+        self.register_buffer("windows_bytes", to_bytes(self.windows.to_json()))
+        self.register_buffer("window_number", torch.tensor(0))
         self.step = 0
-        self.show = ViewerDropdown("Show MPI", "all", ["all", *plan.names], hint="One MPI alone, or all blended")
-        self.register_load_state_dict_post_hook(lambda *_: self.show.set_options(["all", *self.field.full_plan.names]))
+        self._fed: int | None = None
+        self.show = ViewerDropdown("Show MPI", "all", ["all", *self.windows.names], hint="One MPI alone, or all")
+        self.register_load_state_dict_post_hook(lambda *_: self._after_loading())
 
-    def _initial_plan(self) -> ScenePlan:
+    def _new_field(self) -> MMPIField:
+        """A field of this run's settings, with the smallest of plans: to build on or to load into."""
+        shares_depth = self.schedule.phase_at(0).name == "joint"
+        return MMPIField(self.windows.plans[self.window], shares_depth=shares_depth, **self.config.field_settings())
+
+    def _initial_plan(self) -> WindowedPlan:
         if self.config.plan_file is not None:
-            return ScenePlan.load(self.config.plan_file)
+            return WindowedPlan.load(self.config.plan_file)
         metadata = self.kwargs.get("metadata", {})
         observations = metadata.get(OBSERVATIONS)
         if observations is None:
             raise ValueError("The data manager gave no observations: use MMPIDataManager, or name a plan file.")
         steps = self.config.total_steps  # 1 unless a trainer has set it: then the plan comes from a checkpoint
         rays = steps * metadata[RAYS_PER_STEP] if steps > 1 and RAYS_PER_STEP in metadata else None
-        return place(observations, self.config.placement, rays)
-
-    def _make_schedule(self, training: Training) -> Schedule:
-        c = self.config
-        return make_schedule(
-            training,
-            max(1, c.total_steps),
-            blend_share=c.blend_share,
-            finetune_share=c.finetune_share,
-            growth_shares=c.growth_shares,
-            decay_decades=c.decay_decades,
-            finetune_rate=c.finetune_rate,
-        )
+        return place_windows(observations, self.config.placement, rays)
 
     # State -------------------------------------------------------------------------------------------------------
 
@@ -167,10 +96,20 @@ class MMPIModel(Model):
         """The schedule of a run is the checkpoint's, and so is the plan, whatever config and capture say now."""
         stored = state_dict.get(prefix + "schedule_bytes")
         if stored is not None:
-            self.schedule = Schedule.from_json(bytes(stored.cpu().numpy().tolist()).decode())
+            self.schedule = Schedule.from_json(to_text(stored))
             self.schedule_bytes = stored.clone().to(self.device)
             self.field.shares_depth = self.schedule.phase_at(0).name == "joint"
+            # A checkpoint from before there were windows holds a field of one plan alone.
+            plans = state_dict.setdefault(prefix + "windows_bytes", state_dict.get(prefix + "field.plan_bytes"))
+            state_dict.setdefault(prefix + "window_number", torch.tensor(0))
+            if plans is not None:
+                self.windows = WindowedPlan.from_json(to_text(plans))
+                self.windows_bytes = plans.clone().to(self.device)
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
+
+    def _after_loading(self) -> None:
+        self.window = int(self.window_number)
+        self.show.set_options(["all", *self.windows.names])
 
     def get_param_groups(self) -> dict[str, list[Parameter]]:
         return {
@@ -190,18 +129,45 @@ class MMPIModel(Model):
         self.step = step
         phase = self.schedule.phase_at(step)
         factor = self.schedule.texel_factor(step)
-        if factor != float(self.field.texel_factor):
+        if self.schedule.window_at(step) != self.window:
+            self._enter_window(self.schedule.window_at(step), factor)
+            self._reset_moments(attributes, ("density", "features", "colour", "reliability"))
+        elif factor != float(self.field.texel_factor):
             self.field.grow(factor)
-            optimizers = attributes.optimizers.optimizers if attributes and attributes.optimizers else {}
-            for kind in ("density", "features", "reliability"):
-                if kind in optimizers:
-                    optimizers[kind].reset_moments(self.get_param_groups()[kind][0])
+            self._reset_moments(attributes, ("density", "features", "reliability"))
+        if len(self.windows) > 1 and attributes is not None and self._fed != self.window:
+            self._feed_window(attributes)
         if phase.name == "blend" and step == phase.start:
             self.field.release_untouched()
         self.field.learns_cover = phase.name in ("individual", "joint")
         for kind, params in self.get_param_groups().items():
             for p in params:
                 p.requires_grad_(kind in TRAINS[phase.name])
+
+    def _reset_moments(self, attributes: TrainingCallbackAttributes | None, kinds: tuple[str, ...]) -> None:
+        optimizers = attributes.optimizers.optimizers if attributes and attributes.optimizers else {}
+        for kind in kinds:
+            if kind in optimizers:
+                optimizers[kind].reset_moments(self.get_param_groups()[kind][0])
+
+    def _enter_window(self, window: int, factor: float) -> None:
+        """Puts the window that is trained away, and begins another with fresh tables and networks."""
+        self.store.save(self.window, self.field, self._new_field)
+        self.window = window
+        self.window_number.fill_(window)
+        self.store.forget(window)
+        plan = self.windows.plans[window]
+        self.field.build(plan, factor)
+        self.field.renew_networks(1 if self.config.shared_colour else plan.num_heads)
+
+    def _feed_window(self, attributes: TrainingCallbackAttributes) -> None:
+        """Has the data manager draw from the cameras that ask this window."""
+        manager = attributes.pipeline.datamanager if attributes.pipeline else None
+        assert isinstance(manager, MMPIDataManager), "windows need MMPIDataManager"
+        window = self.windows.windows[self.window]
+        centers = manager.observations.centers
+        manager.use_cameras(cameras_in(centers, np.asarray(window.center), window.radius + window.margin))
+        self._fed = self.window
 
     @property
     def blends(self) -> bool:
@@ -213,7 +179,37 @@ class MMPIModel(Model):
     # Rendering ---------------------------------------------------------------------------------------------------
 
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Tensor]:  # type: ignore[override]
-        """Renders rays: rgb, accumulation, depth and winning MPI, and in training what the losses need."""
+        """Renders rays: rgb, accumulation, depth and winning MPI, and in training what the losses need.
+
+        In training the window at hand answers; later every ray asks the windows that it starts in.
+        """
+        if self.training or len(self.windows) == 1:
+            return self._render(ray_bundle)
+        # Windows are trained in order: those after the present one are not there yet.
+        shares = window_shares(ray_bundle.origins, self.windows.windows[: self.window + 1])
+        shown = self._shown_window()
+        if shown is not None and shown <= self.window:
+            shares = torch.zeros_like(shares).index_fill_(1, torch.tensor([shown], device=shares.device), 1.0)
+        parts = {}
+        for w in (shares > 0).any(0).nonzero()[:, 0].tolist():
+            rays = (shares[:, w] > 0).nonzero()[:, 0]
+            parts[w] = rays, self._render_window(w, ray_bundle[rays])
+        return mix_windows(shares, parts)
+
+    def _render_window(self, window: int, bundle: RayBundle) -> dict[str, Tensor]:
+        """What one window shows; winning MPIs are counted through all windows."""
+        trained = self.window, self.field
+        try:
+            if window != self.window:
+                self.field = self.store.load(window, self._new_field, self.device)
+                self.window = window
+            outputs = self._render(bundle)
+            outputs["winning_mpi"] = outputs["winning_mpi"] + self.windows.first_head(window)
+        finally:
+            self.window, self.field = trained
+        return outputs
+
+    def _render(self, ray_bundle: RayBundle) -> dict[str, Any]:
         bundle = self._bounded(ray_bundle)
         if self.training and self.schedule.phase_at(self.step).name == "individual":
             bundle, head_mask, choose = self._individual(bundle)
@@ -267,7 +263,7 @@ class MMPIModel(Model):
         if self.config.rays_per_mpi == "split":
             g = generator(self.config.seed, self.step, "assignment", self.device)
             return bundle, None, torch.rand(len(bundle), num_mpis, generator=g, device=self.device)
-        repeated = _repeat(bundle, num_mpis)
+        repeated = repeat_rays(bundle, num_mpis)
         own = torch.arange(num_mpis, device=self.device).repeat_interleave(len(bundle))
         mask = torch.arange(heads, device=self.device) == own[:, None]
         mask[:, num_mpis:] = True
@@ -275,11 +271,19 @@ class MMPIModel(Model):
 
     def _shown(self, num_rays: int) -> Bool[Tensor, "R H"] | None:
         """The viewer's choice of one MPI, as a head mask."""
-        names = self.field.plan.names
+        names = self.windows.names
         if self.training or self.show.value not in names:
             return None
-        chosen = torch.arange(len(names), device=self.device) == names.index(self.show.value)
-        return chosen.expand(num_rays, -1)
+        number = names.index(self.show.value) - self.windows.first_head(self.window)
+        return (torch.arange(self.field.plan.num_heads, device=self.device) == number).expand(num_rays, -1)
+
+    def _shown_window(self) -> int | None:
+        """The window of the viewer's choice of one MPI."""
+        names = self.windows.names
+        if self.show.value not in names:
+            return None
+        number = names.index(self.show.value)
+        return max(w for w in range(len(self.windows)) if self.windows.first_head(w) <= number)
 
     def _optical_depth(self, samples: RaySamples, form: BlendForm | None) -> tuple[Tensor, Lookup | None]:
         """(Blended) optical depths, with gradients where they are wanted; else the sampler's own, without a lookup."""
@@ -380,7 +384,7 @@ class MMPIModel(Model):
         observed = over_background(image, torch.full_like(image[..., :3], BACKGROUNDS[self.config.background]))
         values = self.metrics(outputs["rgb"], observed)
         values["dropped_mass"] = float(outputs["dropped_mass"].mean())
-        palette = head_palette(self.field.plan.num_heads, outputs["rgb"].device)
+        palette = head_palette(len(self.windows.names), outputs["rgb"].device)
         near = 1 / outputs["depth"].clamp(min=1e-9)
         images = {
             "img": torch.cat([observed, outputs["rgb"]], 1),
@@ -389,22 +393,3 @@ class MMPIModel(Model):
             "winning_mpi": palette[outputs["winning_mpi"][..., 0].long()],
         }
         return values, images
-
-
-def _repeat(bundle: RayBundle, times: int) -> RayBundle:
-    def repeat(x: Tensor | None) -> Any:
-        return None if x is None else x.repeat(times, *([1] * (x.ndim - 1)))
-
-    return RayBundle(
-        origins=repeat(bundle.origins),
-        directions=repeat(bundle.directions),
-        pixel_area=repeat(bundle.pixel_area),
-        camera_indices=repeat(bundle.camera_indices),
-        nears=repeat(bundle.nears),
-        fars=repeat(bundle.fars),
-        metadata={k: repeat(v) for k, v in bundle.metadata.items()},
-    )
-
-
-def _to_bytes(text: str) -> Tensor:
-    return torch.frombuffer(bytearray(text.encode()), dtype=torch.uint8)

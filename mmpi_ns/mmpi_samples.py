@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
-from nerfstudio.cameras.rays import RaySamples
+from nerfstudio.cameras.rays import RayBundle, RaySamples
 from torch import Tensor
 
 from mmpi_ns import geometry
@@ -112,3 +113,20 @@ def by_head(heads: Int[Tensor, "N"]) -> Int[Tensor, "N"]:
     if not heads.numel():
         return heads
     return torch.cat([(heads == k).nonzero()[:, 0] for k in range(int(heads.max()) + 1)])
+
+
+def repeat_rays(bundle: RayBundle, times: int) -> RayBundle:
+    """All rays, ``times`` times one after the other."""
+
+    def repeat(x: Tensor | None) -> Any:
+        return None if x is None else x.repeat(times, *([1] * (x.ndim - 1)))
+
+    return RayBundle(
+        origins=repeat(bundle.origins),
+        directions=repeat(bundle.directions),
+        pixel_area=repeat(bundle.pixel_area),
+        camera_indices=repeat(bundle.camera_indices),
+        nears=repeat(bundle.nears),
+        fars=repeat(bundle.fars),
+        metadata={k: repeat(v) for k, v in bundle.metadata.items()},
+    )

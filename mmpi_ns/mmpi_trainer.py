@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import pickle
-import shutil
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -19,11 +17,14 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
 from mmpi_ns.checks import brief
+from mmpi_ns.files import write_atomically
 from mmpi_ns.mmpi_model import MMPIModel
 from mmpi_ns.phases import Schedule
 from mmpi_ns.placement.plan import ScenePlan
+from mmpi_ns.windows import WindowedPlan
 
 PLAN_FILE = "plan.json"
+WINDOWS_FOLDER = "windows"
 
 
 @dataclass
@@ -48,9 +49,17 @@ class PhaseScheduler(Scheduler):
 
 @dataclass
 class MMPITrainerConfig(TrainerConfig):
-    """nerfstudio's trainer settings; max-num-iterations is the length of the whole run, resumed or not."""
+    """nerfstudio's trainer settings; max-num-iterations is the length of the whole run, resumed or not.
+
+    A capture so long that it is split into windows gets as many steps for each of them.
+    """
 
     _target: type = field(default_factory=lambda: MMPITrainer)
+
+    def save_config(self) -> None:
+        """Writes config.yml, from which ns-eval and ns-render learn where the windows of a long capture lie."""
+        self.pipeline.model.windows_folder = self.get_base_dir() / WINDOWS_FOLDER  # type: ignore[attr-defined]
+        super().save_config()
 
 
 class MMPITrainer(Trainer):
@@ -66,17 +75,20 @@ class MMPITrainer(Trainer):
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         _check_device(self.config.machine.device_type)
-        self.config.pipeline.model.total_steps = self.config.max_num_iterations  # type: ignore[attr-defined]
-        self._total_steps = self.config.max_num_iterations
+        model_config: Any = self.config.pipeline.model
+        self._window_steps = model_config.total_steps = self.config.max_num_iterations
+        model_config.windows_folder = self.base_dir / WINDOWS_FOLDER
         super().setup(test_mode)
-        plan: ScenePlan = self._model.field.full_plan
+        self.config.max_num_iterations = self._window_steps
+        plan = self._model.windows
         self.base_dir.mkdir(parents=True, exist_ok=True)
-        _write_atomically(self.base_dir / PLAN_FILE, lambda path: path.write_text(plan.to_json(), encoding="utf-8"))
-        CONSOLE.print(_describe(plan))
+        write_atomically(self.base_dir / PLAN_FILE, lambda path: path.write_text(plan.to_json(), encoding="utf-8"))
+        CONSOLE.print(_describe(plan, self._window_steps))
 
     def setup_optimizers(self) -> Optimizers:
         """nerfstudio's optimisers, with schedulers that know the phases."""
         model = self._model
+        self._total_steps = self.config.max_num_iterations = model.schedule.total_steps  # nerfstudio shows what is left
 
         class Bound(PhaseScheduler):
             @property
@@ -103,7 +115,7 @@ class MMPITrainer(Trainer):
         try:
             super().train()
         finally:
-            self.config.max_num_iterations = self._total_steps
+            self.config.max_num_iterations = self._window_steps
 
     def train_iteration(self, step: int) -> Any:
         """One step; remembers that it ran."""
@@ -134,7 +146,7 @@ class MMPITrainer(Trainer):
             "scalers": self.grad_scaler.state_dict(),
             "rng": {"torch": torch.get_rng_state()},
         }
-        _write_atomically(path, lambda p: torch.save(state, p), self.base_dir)
+        write_atomically(path, lambda p: torch.save(state, p), self.base_dir)
         if self.config.save_only_latest_checkpoint:
             for old in self.checkpoint_dir.glob("*.ckpt"):
                 if old != path:
@@ -149,6 +161,8 @@ class MMPITrainer(Trainer):
                 torch.set_rng_state(state["rng"]["torch"])
             del state
         super()._load_checkpoint()
+        if path is not None:
+            self._model.store.adopt(path.parent.parent / WINDOWS_FOLDER, self._model.window)
 
     def _checkpoint_path(self) -> Path | None:
         path = self.config.load_checkpoint
@@ -167,16 +181,20 @@ class MMPITrainer(Trainer):
         return self.config.load_dir / f"step-{step:09d}.ckpt"
 
     def _check_same_plan(self, pipeline_state: dict[str, Any], path: Path) -> None:
-        stored = pipeline_state.get("_model.field.plan_bytes")
+        stored = pipeline_state.get("_model.windows_bytes", pipeline_state.get("_model.field.plan_bytes"))
         if stored is None:
             raise ValueError(f"{path} holds no scene plan: it was not written by this method.")
-        theirs, ours = ScenePlan.from_json(bytes(stored.numpy().tolist()).decode()), self._model.field.full_plan
+        theirs, ours = WindowedPlan.from_json(bytes(stored.numpy().tolist()).decode()), self._model.windows
         if theirs != ours:
             raise ValueError(
-                f"{path} was trained with another scene plan ({len(theirs.mpis)} MPIs there, "
-                f"{len(ours.mpis)} here): resume with the settings in its config.yml, or give "
-                f"its {PLAN_FILE} with --pipeline.model.plan-file."
+                f"{path} was trained with another scene plan ({_in_short(theirs)} there, {_in_short(ours)} here): "
+                f"resume with the settings in its config.yml, or give its {PLAN_FILE} with --pipeline.model.plan-file."
             )
+
+
+def _in_short(windows: WindowedPlan) -> str:
+    mpis = f"{sum(len(plan.mpis) for plan in windows.plans)} MPIs"
+    return mpis if len(windows) == 1 else f"{len(windows)} windows with {mpis}"
 
 
 def _check_device(device_type: str) -> None:
@@ -197,25 +215,22 @@ def _read_checkpoint(path: Path) -> dict[str, Any]:
         ) from error
 
 
-def _write_atomically(path: Path, write: Any, folder: Path | None = None) -> None:
-    """Writes to a temporary file on the same disk and renames it; removes it when writing fails."""
-    temporary = (folder or path.parent) / f".{path.name}.{os.getpid()}.tmp"
-    try:
-        write(temporary)
-        os.replace(temporary, path)
-    except (OSError, RuntimeError) as error:  # torch.save has a RuntimeError, without a reason, for a full disk
-        free = shutil.disk_usage(temporary.parent).free / 2**20
-        temporary.unlink(missing_ok=True)
-        raise OSError(
-            f"{path} could not be written ({brief(error)}; {free:.0f} MB free): earlier files are "
-            "untouched, so make room and start again (--load-dir goes on from the last checkpoint)."
-        ) from error
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
+def _describe(windows: WindowedPlan, steps: int) -> str:
+    """What will be trained, and what it takes."""
+    if len(windows) == 1:
+        return "\n".join(_describe_plan(windows.plans[0]))
+    texels = [plan.texels for plan in windows.plans]
+    lines = [
+        f"A long capture: {len(windows)} windows of {steps} steps each, one after the other; {sum(texels) / 1e6:.1f} M "
+        f"texels on disk, at most {max(texels) / 1e6:.1f} M in training at a time."
+    ]
+    for i, window in enumerate(windows.windows):
+        lines.append(f"Window {i}, cameras within {window.radius:.3g} (and {window.margin:.3g} more to mix):")
+        lines += ["  " + line for line in _describe_plan(window.plan)]
+    return "\n".join(lines)
 
 
-def _describe(plan: ScenePlan) -> str:
+def _describe_plan(plan: ScenePlan) -> list[str]:
     lines = [f"Scene plan ({plan.origin_of_plan}): {len(plan.mpis)} MPIs, {plan.texels / 1e6:.1f} M texels"]
     for m in plan.mpis:
         tangents = " ".join(f"{t:.2f}" for t in m.extent)
@@ -225,4 +240,4 @@ def _describe(plan: ScenePlan) -> str:
         )
     if plan.cube is not None:
         lines.append(f"  cube: {' x '.join(str(n) for n in plan.cube.shape)} voxels")
-    return "\n".join(lines)
+    return lines

@@ -43,17 +43,29 @@ class Schedule:
     """Learning rates fall by 10^-decay_decades over a phase."""
     finetune_rate: float
     """Learning rates at the start of the fine-tune, relative to those of the first phase."""
+    windows: int = 1
+    """Windows of a long capture, which walk through all of this one after the other."""
+
+    @property
+    def window_steps(self) -> int:
+        return self.phases[-1].end
 
     @property
     def total_steps(self) -> int:
-        return self.phases[-1].end
+        return self.window_steps * self.windows
+
+    def window_at(self, step: int) -> int:
+        """The window that an absolute step trains; the last one from the end on."""
+        return min(step // self.window_steps, self.windows - 1)
+
+    def _local(self, step: int) -> int:
+        return step - self.window_at(step) * self.window_steps
 
     def phase_at(self, step: int) -> Phase:
         """The phase of an absolute step; the last phase from its end on (evaluation after training)."""
-        for phase in self.phases:
-            if step < phase.end:
-                return phase
-        return self.phases[-1]
+        first = self.window_at(step) * self.window_steps
+        chosen = next((phase for phase in self.phases if step - first < phase.end), self.phases[-1])
+        return Phase(chosen.name, chosen.start + first, chosen.end + first)
 
     def blends_at(self, step: int) -> bool:
         """Whether reliability takes part in rendering at this step."""
@@ -61,11 +73,11 @@ class Schedule:
 
     def texel_factor(self, step: int) -> float:
         """Share of the plan's texels in use at this step, a power of two."""
-        return 2.0 ** -sum(step < g for g in self.growth)
+        return 2.0 ** -sum(self._local(step) < g for g in self.growth)
 
     def sharpened(self, step: int) -> bool:
         """Whether surfaces have formed: resolution has stopped growing (without growth: a tenth of the first phase)."""
-        return step >= (self.growth[-1] if self.growth else self.phases[0].end // 10)
+        return self._local(step) >= (self.growth[-1] if self.growth else self.phases[0].end // 10)
 
     def rate_factor(self, kind: str, step: int) -> float:
         """Learning rate of a parameter kind relative to its start value; 0 where it is frozen."""
@@ -95,17 +107,19 @@ def make_schedule(
     growth_shares: tuple[float, ...] = (1 / 15, 2 / 15, 3 / 15, 4 / 15),
     decay_decades: float = 1.5,
     finetune_rate: float = 0.1,
+    windows: int = 1,
 ) -> Schedule:
-    """The schedule of a run of ``total_steps`` steps.
+    """The schedule of a run of ``total_steps`` steps a window.
 
     Args:
         training: ``two-phase`` (individual, blend, optional fine-tune) or ``joint`` (all MPIs at once, no reliability).
-        total_steps: all steps of the run.
+        total_steps: all steps of a window.
         blend_share: share of the steps in which only reliability trains (two-phase).
         finetune_share: share of the steps in which everything trains together at the end (two-phase).
         growth_shares: when texels double, as shares of the first phase.
         decay_decades: decades that learning rates fall over a phase (paper: x0.1 per 20k of 30k steps = 1.5).
         finetune_rate: learning rates at the start of the fine-tune relative to the first phase's.
+        windows: windows of a long capture, trained one after the other.
 
     Raises:
         ValueError: the shares leave no step for the first phase.
@@ -128,4 +142,4 @@ def make_schedule(
     growth = tuple(max(1, round(s * phases[0].end)) for s in growth_shares)
     if any(a > b for a, b in pairwise(growth)):
         raise ValueError("growth-shares must not decrease.")
-    return Schedule(phases, growth, float(decay_decades), float(finetune_rate))
+    return Schedule(phases, growth, float(decay_decades), float(finetune_rate), windows)

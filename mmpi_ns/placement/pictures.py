@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
+from matplotlib.patches import Circle
 from numpy.typing import NDArray
 
 from mmpi_ns.placement.content import Content
@@ -16,6 +17,7 @@ from mmpi_ns.placement.errors import WORST
 from mmpi_ns.placement.explain import PlanReport
 from mmpi_ns.placement.observations import Array, Observations
 from mmpi_ns.placement.plan import MPIPlan, ScenePlan
+from mmpi_ns.windows import WindowedPlan
 
 COLORS = ("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b", "#e377c2", "#17becf", "#bcbd22", "#7f7f7f")
 SHOWN_POINTS = 6000
@@ -57,6 +59,34 @@ def draw_plan(path: Path, plan: ScenePlan, observations: Observations, content: 
         axes.set_xlim(low[2], high[2])
         axes.set_ylim(*heights)
     figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside right upper", fontsize=8)
+    figure.savefig(path, dpi=110)
+
+
+def draw_windows(path: Path, windows: WindowedPlan, observations: Observations) -> None:
+    """Writes a map (PNG) of a long capture: cameras, windows with their margins, and where MPIs stand and look."""
+    base = observations.mean_axes
+    map_axes = np.stack([base[2], -base[0]])  # forward to the right, left up
+    middle = observations.centers.mean(0)
+    centers = (observations.centers - middle) @ map_axes.T
+    figure = Figure(figsize=(13, 8), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot(aspect="equal", title="windows, from above", xlabel="forward", ylabel="left")
+    points = (observations.points[:: max(1, len(observations.points) // SHOWN_POINTS)] - middle) @ map_axes.T
+    axes.scatter(*points.T, s=1, c="0.8", linewidths=0)
+    for i, window in enumerate(windows.windows):
+        color = COLORS[i % len(COLORS)]
+        at = (np.asarray(window.center) - middle) @ map_axes.T
+        axes.add_patch(Circle(at, window.radius, fill=False, color=color, label=f"window {i}"))
+        axes.add_patch(Circle(at, window.radius + window.margin, fill=False, color=color, linestyle=":"))
+        for mpi in window.plan.mpis:
+            origin = (np.asarray(mpi.origin) - middle) @ map_axes.T
+            ahead = np.asarray(mpi.axes[2]) @ map_axes.T * 0.4 * window.radius
+            axes.annotate("", origin + ahead, origin, arrowprops={"arrowstyle": "->", "color": color})
+    axes.scatter(*centers.T, s=6, c="black", zorder=4)
+    reach = 0.6 * max(w.radius for w in windows.windows)
+    axes.set_xlim(centers[:, 0].min() - reach, centers[:, 0].max() + reach)
+    axes.set_ylim(centers[:, 1].min() - reach, centers[:, 1].max() + reach)
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside right upper", fontsize=8)
     figure.savefig(path, dpi=110)
 
 

@@ -148,14 +148,9 @@ class ScenePlan:
     @staticmethod
     def from_json(text: str) -> ScenePlan:
         """Reads what ``to_json`` wrote. Raises ValueError naming the field when a field is missing or unknown."""
-        try:
-            data = json.loads(text)
-        except json.JSONDecodeError as error:
-            raise ValueError(f"The scene plan is not valid JSON ({error}): fix it or leave it out.") from error
-        if not isinstance(data, dict) or not isinstance(data.get("mpis", []), list):
-            raise ValueError(
-                "The scene plan is not a JSON object with a list 'mpis': compare it with docs/how_it_works.md."
-            )
+        data = read_object(text)
+        if not isinstance(data.get("mpis", []), list):
+            raise ValueError("The scene plan's 'mpis' is not a list: compare it with docs/how_it_works.md.")
         mpis = tuple(_build(MPIPlan, _with_far(m)) for m in data.get("mpis", []))
         cube = _build(CubePlan, data["cube"]) if data.get("cube") else None
         return _build(ScenePlan, {**data, "mpis": mpis, "cube": cube})
@@ -190,6 +185,19 @@ def _validate_mpi(mpi: MPIPlan) -> None:
         raise ValueError(f"MPI '{mpi.name}' needs a far end beyond its near plane, or null in 'far' for infinity.")
     if mpi.planes < 2 or mpi.height < 2 or mpi.width < 2:
         raise ValueError(f"MPI '{mpi.name}' needs at least 2 planes and 2 x 2 texels.")
+
+
+def read_object(text: str) -> dict:
+    """The JSON object of a plan. Raises ValueError with one sentence where there is none."""
+    try:
+        data = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise ValueError(f"The scene plan is not valid JSON ({error}): fix it or leave it out.") from error
+    if not isinstance(data, dict):
+        raise ValueError(
+            "The scene plan is not a JSON object with a list 'mpis': compare it with docs/how_it_works.md."
+        )
+    return data
 
 
 def _build(cls, data: dict):

@@ -60,6 +60,8 @@ class PlacementConfig:
     """How much texels count against a candidate: its gain is divided by texels to this power (automatic)."""
     max_voxels: int = 0
     """Voxels along a side of a cube at most, where one is worth it; 0 for none (automatic)."""
+    window_length: float = 5.0
+    """A longer capture is split into windows of this length, in median distances of what was seen; 0: never."""
     far_ends: bool = False
     """Let MPIs end where others show what lies beyond, so that a ray on a long road meets fewer of them (automatic)."""
     faces: tuple[str, ...] = ("front", "left", "right", "below")

@@ -5,11 +5,15 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import tyro
 
 from mmpi_ns.placement.rule import PlacementConfig
+
+if TYPE_CHECKING:
+    from mmpi_ns.placement.observations import Observations
+    from mmpi_ns.windows import WindowedPlan
 
 
 @dataclass
@@ -22,7 +26,7 @@ class PlanCommand:
     scene: tyro.conf.Positional[Path]
     """Folder with transforms.json, or with images and a COLMAP model."""
     output: Path
-    """Folder for plan.json, plan.md, plan.png and errors.png."""
+    """Folder for plan.json, plan.md, plan.png and errors.png (of a long capture: of each window too)."""
     method: Literal["mmpi", "mmpi-small"] = "mmpi-small"
     """Whose defaults to place with."""
     downscale_factor: int | None = None
@@ -39,30 +43,46 @@ class PlanCommand:
     def main(self) -> None:
         # Slow imports, which --help does not need.
         from mmpi_ns.mmpi_scene import load_observations
-        from mmpi_ns.placement.content import find_content
-        from mmpi_ns.placement.explain import explain, table
-        from mmpi_ns.placement.pictures import draw_errors, draw_plan
-        from mmpi_ns.placement.plan import ScenePlan
-        from mmpi_ns.placement.rule import place
+        from mmpi_ns.placement.split import place_windows
+        from mmpi_ns.windows import WindowedPlan
 
         observations = load_observations(self.scene, self.downscale_factor, self.parser)
         if self.plan_file is not None:
-            plan = ScenePlan.load(self.plan_file)
+            windows = WindowedPlan.load(self.plan_file)
         else:
-            plan = place(observations, self.placement, self.training_rays or None)
-        content = find_content(observations)
-        report = explain(plan, observations, content)
-        text = table(report)
-        self.output.mkdir(parents=True, exist_ok=True)
-        (self.output / "plan.json").write_text(plan.to_json(), encoding="utf-8")
+            windows = place_windows(observations, self.placement, self.training_rays or None)
+        text = self._explain(windows, observations)
+        (self.output / "plan.json").write_text(windows.to_json(), encoding="utf-8")
         (self.output / "plan.md").write_text(f"# Plan of {self.scene.resolve().name}\n\n{text}\n", encoding="utf-8")
-        draw_plan(self.output / "plan.png", plan, observations, content)
-        draw_errors(self.output / "errors.png", plan, report)
         print(text)
-        print(f"\nWrote plan.json, plan.md, plan.png and errors.png in {self.output}.")
+        print(f"\nWrote plan.json, plan.md and pictures in {self.output}.")
         print(
             f"Train with it: ns-train {self.method} --pipeline.model.plan-file {self.output / 'plan.json'} --data ..."
         )
+
+    def _explain(self, windows: WindowedPlan, observations: Observations) -> str:
+        """Draws the pictures and returns the tables: of each window, over what its own cameras saw."""
+        from mmpi_ns.placement.content import find_content
+        from mmpi_ns.placement.explain import explain, table
+        from mmpi_ns.placement.pictures import draw_errors, draw_plan, draw_windows
+        from mmpi_ns.placement.split import cameras_of
+
+        self.output.mkdir(parents=True, exist_ok=True)
+        parts = []
+        for i, window in enumerate(windows.windows):
+            own = cameras_of(window, observations)
+            content = find_content(own)
+            report = explain(window.plan, own, content)
+            suffix = f"-{i}" if len(windows) > 1 else ""
+            draw_plan(self.output / f"plan{suffix}.png", window.plan, own, content)
+            draw_errors(self.output / f"errors{suffix}.png", window.plan, report)
+            title = f"## Window {i}: {len(own.centers)} training cameras\n\n" if len(windows) > 1 else ""
+            parts.append(title + table(report))
+        if len(windows) > 1:
+            draw_windows(self.output / "plan.png", windows, observations)
+            total = sum(plan.texels for plan in windows.plans) / 1e6
+            parts.append(f"{len(windows)} windows, {total:.2f} M texels in all.")
+        return "\n\n".join(parts)
 
 
 def _defaults(arguments: list[str]) -> PlanCommand:

@@ -1,0 +1,160 @@
+"""Splits a long capture into windows: balls of neighbouring cameras, placed each by itself."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mmpi_ns.placement.content import find_content
+from mmpi_ns.placement.observations import Array, Observations
+from mmpi_ns.placement.rule import PlacementConfig, place
+from mmpi_ns.windows import Window, WindowedPlan
+
+MARGIN = 0.08
+"""Distance over which a window's part falls off, as a share of the windows' length."""
+FEWEST = 4
+"""Training cameras that a window needs; fewer join the window beside them."""
+SLACK = 1.1
+"""Windows may be longer than asked by this factor."""
+ROUNDS = 50
+"""Rounds of moving windows to the middle of their cameras."""
+
+
+def place_windows(
+    observations: Observations, config: PlacementConfig, training_rays: int | None = None
+) -> WindowedPlan:
+    """A plan for each stretch of a capture; one for the whole of a short one.
+
+    Args:
+        observations: training cameras and what they saw.
+        config: the rule's settings; budgets are those of one window.
+        training_rays: pixel rays of one window's training, where known.
+
+    Raises:
+        ValueError: the cameras leave nothing to place.
+    """
+    balls = find_balls(observations, config.window_length) if config.window_length > 0 else []
+    if len(balls) < 2:
+        return WindowedPlan.single(place(observations, config, training_rays))
+    windows = []
+    for center, radius, margin in balls:
+        own = of_cameras(observations, cameras_in(observations.centers, center, radius + margin))
+        windows.append(Window(tuple(center.tolist()), radius, margin, place(own, config, training_rays)))
+    return WindowedPlan(tuple(windows))
+
+
+def find_balls(observations: Observations, length: float) -> list[tuple[Array, float, float]]:
+    """(centre, radius, margin) of the windows, in order along the way; independent of the cameras' order.
+
+    Args:
+        observations: the cameras.
+        length: how long a window may be, in median distances of what the cameras saw.
+    """
+    content = find_content(observations)
+    longest = length * float(np.median(np.linalg.norm(content.points - observations.centers[content.cameras], axis=-1)))
+    centers = observations.centers
+    spread = np.linalg.norm(centers - centers.mean(0), axis=-1)
+    if 2 * spread.max() <= longest:
+        return []
+    middles = _fewest(centers, _spread_out(centers, spread, longest / 2), longest / 2)
+    middles = _without_small(centers, middles)
+    owner = _nearest(centers, middles)
+    margin = MARGIN * longest
+    radii = [float(np.linalg.norm(centers[owner == i] - m, axis=-1).max()) for i, m in enumerate(middles)]
+    return [(middles[i], radii[i], margin) for i in _along(middles)]
+
+
+def cameras_of(window: Window, observations: Observations) -> Observations:
+    """What the cameras saw that ask a window, fully or in part; its placement and its training rest on these."""
+    if window.radius == np.inf:
+        return observations
+    middle = np.asarray(window.center)
+    return of_cameras(observations, cameras_in(observations.centers, middle, window.radius + window.margin))
+
+
+def cameras_in(centers: Array, middle: Array, radius: float) -> NDArray[np.int64]:
+    """Cameras in a ball; all where it has no end."""
+    return np.nonzero(np.linalg.norm(centers - middle, axis=-1) < radius)[0]
+
+
+def of_cameras(observations: Observations, cameras: NDArray[np.int64]) -> Observations:
+    """What some of the cameras saw. Points keep their numbers."""
+    number = np.full(len(observations.centers), -1)
+    number[cameras] = np.arange(len(cameras))
+    keep = number[observations.seen_by] >= 0
+    return replace(
+        observations,
+        camera_to_worlds=observations.camera_to_worlds[cameras],
+        intrinsics=observations.intrinsics[cameras],
+        sizes=observations.sizes[cameras],
+        seen_by=number[observations.seen_by[keep]],
+        seen_point=observations.seen_point[keep],
+        seen_at=observations.seen_at[keep[: len(observations.seen_at)]],
+    )
+
+
+def _spread_out(centers: Array, spread: Array, radius: float) -> Array:
+    """Cameras so far apart that balls of ``radius`` about them hold all (farthest-point traversal, Gonzalez 1985)."""
+    chosen = [int(spread.argmax())]
+    distance = np.linalg.norm(centers - centers[chosen[0]], axis=-1)
+    while distance.max() > radius:
+        chosen.append(int(distance.argmax()))
+        distance = np.minimum(distance, np.linalg.norm(centers - centers[chosen[-1]], axis=-1))
+    return centers[chosen]
+
+
+def _fewest(centers: Array, start: Array, radius: float) -> Array:
+    """The fewest of ``start``, moved to the middle of their cameras, whose balls are hardly larger than ``radius``."""
+    low, high = 1, len(start)  # farthest points are at most twice as many as are needed
+    best = _settled(centers, start)
+    while low < high:
+        count = (low + high) // 2
+        middles = _settled(centers, start[:count])
+        if np.linalg.norm(centers - middles[_nearest(centers, middles)], axis=-1).max() <= SLACK * radius:
+            best, high = middles, count
+        else:
+            low = count + 1
+    return best
+
+
+def _settled(centers: Array, middles: Array) -> Array:
+    """Every ball in the middle of the cameras nearest to it (Lloyd)."""
+    for _ in range(ROUNDS):
+        owner = _nearest(centers, middles)
+        moved = np.stack([_middle(centers[owner == i]) for i in range(len(middles)) if (owner == i).any()])
+        if len(moved) == len(middles) and np.allclose(moved, middles, rtol=1e-9, atol=0):
+            break
+        middles = moved
+    return middles
+
+
+def _nearest(centers: Array, middles: Array) -> NDArray[np.int64]:
+    return np.array([np.linalg.norm(middles - c, axis=-1).argmin() for c in centers])
+
+
+def _middle(points: Array) -> Array:
+    """Centre of the box about points: balls about it are smaller than about their mean."""
+    return (points.min(0) + points.max(0)) / 2
+
+
+def _without_small(centers: Array, middles: Array) -> Array:
+    """Leaves out, smallest first, windows of too few cameras; neighbours take those over."""
+    while len(middles) > 1:
+        counts = np.bincount(_nearest(centers, middles), minlength=len(middles))
+        if counts.min() >= FEWEST:
+            break
+        middles = np.delete(middles, counts.argmin(), axis=0)
+    return middles
+
+
+def _along(middles: Array) -> list[int]:
+    """An order in which neighbours follow each other: from the one farthest from all, always on to the nearest."""
+    left = list(range(len(middles)))
+    order = [int(np.linalg.norm(middles - middles.mean(0), axis=-1).argmax())]
+    left.remove(order[0])
+    while left:
+        order.append(min(left, key=lambda i: float(np.linalg.norm(middles[i] - middles[order[-1]]))))
+        left.remove(order[-1])
+    return order

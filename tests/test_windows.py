@@ -1,0 +1,399 @@
+"""Long captures: split into windows, trained one after the other, mixed where they overlap."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hand_made import make_mpi
+from nerfstudio.utils.eval_utils import eval_setup
+from test_resume import compared, differences, load
+from training_runs import datamanager, plan_of, ready, trainer_config
+
+from mmpi_ns.phases import make_schedule
+from mmpi_ns.placement.observations import Observations
+from mmpi_ns.placement.plan import ScenePlan
+from mmpi_ns.placement.rule import PlacementConfig
+from mmpi_ns.placement.split import FEWEST, find_balls, of_cameras, place_windows
+from mmpi_ns.windows import Window, WindowedPlan, window_shares
+
+STEPS = 6
+
+
+# Splitting -----------------------------------------------------------------------------------------------------------
+
+
+def road(length: float, spacing: float = 1.0) -> Observations:
+    """Cameras that drive along a slow bend and see walls 6 away on both sides, some way ahead."""
+    s = np.arange(0, length, spacing)
+    centers = np.stack([s, 0 * s, 8 * np.sin(s / 60)], -1)
+    heading = np.stack([np.ones_like(s), 0 * s, 8 / 60 * np.cos(s / 60)], -1)
+    facing = heading / np.linalg.norm(heading, axis=-1, keepdims=True)
+    up = np.array([0.0, 1.0, 0.0])
+    right = np.cross(facing, up)
+    poses = np.stack([right, np.broadcast_to(up, right.shape), -facing, centers], -1)
+    rng = np.random.default_rng(0)
+    ahead, side = rng.uniform(4, 20, (len(s), 30)), rng.choice([-6.0, 6.0], (len(s), 30))
+    points = centers[:, None] + ahead[..., None] * facing[:, None] + side[..., None] * right[:, None]
+    points = points + rng.uniform(-2, 2, (len(s), 30))[..., None] * up
+    count = points.shape[0] * points.shape[1]
+    return Observations(
+        camera_to_worlds=poses,
+        intrinsics=np.tile([100.0, 100.0, 80.0, 40.0], (len(s), 1)),
+        sizes=np.tile([160.0, 80.0], (len(s), 1)),
+        points=points.reshape(-1, 3),
+        seen_by=np.repeat(np.arange(len(s)), 30),
+        seen_point=np.arange(count),
+        seen_at=np.zeros((count, 2)),
+    )
+
+
+def test_a_short_capture_is_one_window_and_its_plan_is_written_as_before():
+    plan = place_windows(road(30), PlacementConfig(max_texels=1e5))
+    assert len(plan) == 1 and plan.windows[0].radius == math.inf
+    assert "windows" not in json.loads(plan.to_json())
+    assert ScenePlan.from_json(plan.to_json()) == plan.plans[0]
+
+
+def test_windows_hold_every_camera_are_no_longer_than_asked_and_grow_with_the_road():
+    counts = []
+    for length in (200, 400, 800):
+        seen = road(length)
+        balls = find_balls(seen, 4.0)
+        distance = np.stack([np.linalg.norm(seen.centers - c, axis=-1) for c, _, _ in balls], -1)
+        radii = np.array([r for _, r, _ in balls])
+        assert (distance <= radii + 1e-9).any(-1).all()
+        median = np.median(np.linalg.norm(seen.points - seen.centers[seen.seen_by], axis=-1))
+        assert radii.max() < 0.75 * 4.0 * median
+        order = np.array([c for c, _, _ in balls])[:, 0]
+        assert (np.diff(order) > 0).all() or (np.diff(order) < 0).all()  # along the road
+        counts.append(len(balls))
+    assert counts[0] >= 3
+    assert 1.6 * counts[0] <= counts[1] <= 2.4 * counts[0] and 1.6 * counts[1] <= counts[2] <= 2.4 * counts[1]
+
+
+def test_windows_do_not_depend_on_the_order_of_the_cameras():
+    seen = road(200)
+    shuffled = of_cameras(seen, np.random.default_rng(3).permutation(len(seen.centers)))
+    for (a, ra, ma), (b, rb, mb) in zip(find_balls(seen, 4.0), find_balls(shuffled, 4.0), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-9)
+        np.testing.assert_allclose([ra, ma], [rb, mb], rtol=1e-2)
+
+
+def test_no_window_has_too_few_cameras():
+    seen = road(120)
+    lone = of_cameras(seen, np.array([*range(60), 118, 119]))
+    centers = lone.centers
+    for center, radius, _ in find_balls(lone, 3.0):
+        assert (np.linalg.norm(centers - center, axis=-1) <= radius + 1e-9).sum() >= FEWEST
+
+
+def test_some_cameras_observations_are_those_of_the_whole():
+    seen = road(40)
+    chosen = np.array([7, 3, 20])
+    part = of_cameras(seen, chosen)
+    assert len(part.centers) == 3 and len(part.seen_by) == 90
+    for new, old in enumerate(chosen):
+        np.testing.assert_array_equal(part.centers[new], seen.centers[old])
+        np.testing.assert_array_equal(
+            np.sort(part.seen_point[part.seen_by == new]), np.sort(seen.seen_point[seen.seen_by == old])
+        )
+
+
+# Shares --------------------------------------------------------------------------------------------------------------
+
+
+def line_of(*places: float, radius=1.0, margin=0.5) -> tuple[Window, ...]:
+    plan = ScenePlan((make_mpi(),), None, 0.05, 1.5)
+    return tuple(Window((x, 0.0, 0.0), radius, margin, plan) for x in places)
+
+
+def along(*x: float) -> torch.Tensor:
+    return torch.tensor([[v, 0.0, 0.0] for v in x])
+
+
+def test_shares_are_whole_inside_alone_and_even_in_the_middle_of_an_overlap():
+    windows = line_of(0.0, 2.5)
+    shares = window_shares(along(0.0, 0.5, 1.25, 2.5, 9.0, -7.0), windows)
+    expected = [[1, 0], [1, 0], [0.5, 0.5], [0, 1], [0, 1], [1, 0]]
+    torch.testing.assert_close(shares, torch.tensor(expected).float())
+
+
+def test_shares_change_steadily_along_the_way():
+    windows = line_of(0.0, 2.2, 4.0)
+    shares = window_shares(along(*np.linspace(-1, 5, 6001).tolist()), windows)
+    torch.testing.assert_close(shares.sum(-1), torch.ones(6001))
+    assert shares.diff(dim=0).abs().max() < 0.001 / 0.5 * 1.01
+
+
+# Plans ---------------------------------------------------------------------------------------------------------------
+
+
+def test_a_windowed_plan_survives_json():
+    plan = WindowedPlan(line_of(0.0, 2.5))
+    assert WindowedPlan.from_json(plan.to_json()) == plan
+    assert plan.names[0].startswith("window 0: ") and plan.first_head(1) == 1
+
+
+@pytest.mark.parametrize(
+    "change, sentence",
+    [
+        (lambda d: d["windows"][1].pop("margin"), "Every window of a scene plan needs"),
+        (lambda d: d["windows"][1].update(radius=None), "radius"),
+        (lambda d: d["windows"][0].update(margin=0.0), "margin > 0"),
+        (lambda d: d.update(windows=[]), "at least one window"),
+    ],
+)
+def test_a_windowed_plan_that_cannot_be_used_is_refused(change, sentence):
+    data = json.loads(WindowedPlan(line_of(0.0, 2.5)).to_json())
+    change(data)
+    with pytest.raises(ValueError, match=sentence):
+        WindowedPlan.from_json(json.dumps(data))
+
+
+def test_a_schedule_walks_through_each_window_anew():
+    one = make_schedule("two-phase", 20, blend_share=0.25, finetune_share=0.25)
+    three = replace(one, windows=3)
+    assert three.total_steps == 60
+    for step in range(60):
+        window, local = divmod(step, 20)
+        assert three.window_at(step) == window
+        assert three.phase_at(step).name == one.phase_at(local).name
+        assert three.phase_at(step).start <= step < three.phase_at(step).end
+        assert three.texel_factor(step) == one.texel_factor(local)
+        assert three.sharpened(step) == one.sharpened(local)
+        assert three.rate_factor("density", step) == pytest.approx(one.rate_factor("density", local))
+    assert three.window_at(60) == 2
+
+
+# Training and rendering ----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def windows_file(scene, tmp_path_factory):
+    """Two windows of the tiny scene's walk, one with two MPIs and one with one."""
+    seen = datamanager(scene, test_mode="inference").observations
+    centers = seen.centers[np.argsort(seen.centers @ seen.mean_axes[0])]
+    length = np.linalg.norm(centers[-1] - centers[0])
+    middles = [centers[0] + (centers[-1] - centers[0]) * share for share in (0.25, 0.75)]
+    windows = tuple(
+        Window(tuple(m.tolist()), 0.3 * float(length), 0.1 * float(length), plan_of(seen, num_mpis=k))
+        for m, k in zip(middles, (2, 1), strict=True)
+    )
+    path = tmp_path_factory.mktemp("windows") / "plan.json"
+    path.write_text(WindowedPlan(windows).to_json())
+    return path
+
+
+@pytest.fixture(scope="module")
+def whole(scene, windows_file, tmp_path_factory):
+    """An uninterrupted run through both windows."""
+    config = trainer_config(scene, windows_file, tmp_path_factory.mktemp("whole"), STEPS, training="joint")
+    config.save_config()
+    trainer = ready(config)
+    trainer.train()
+    return trainer
+
+
+def test_each_window_gets_all_steps_and_a_file(whole):
+    steps = sorted(int(p.stem[5:]) for p in whole.checkpoint_dir.iterdir())
+    assert steps == list(range(1, 2 * STEPS))
+    assert [p.name for p in sorted((whole.base_dir / "windows").iterdir())] == ["window-00000.pt"]
+    assert len(load(whole.checkpoint_dir, STEPS - 1)["pipeline"]["_model.field.networks.weights"]) == 2
+    assert len(load(whole.checkpoint_dir, STEPS)["pipeline"]["_model.field.networks.weights"]) == 1
+
+
+def test_a_window_draws_from_its_own_cameras_alone(whole):
+    manager, model = whole.pipeline.datamanager, whole.pipeline.model
+    window = model.windows.windows[1]
+    manager.train()
+    bundle, _ = manager.next_train(2 * STEPS)
+    beyond = (bundle.origins - torch.tensor(window.center)).norm(dim=-1)
+    assert len(bundle) == 80 and beyond.max() < window.radius + window.margin
+    centers = torch.from_numpy(manager.observations.centers)
+    assert ((centers - torch.tensor(window.center)).norm(dim=-1) > window.radius + window.margin).any()
+
+
+def test_a_finished_window_is_the_model_of_the_checkpoint_at_its_end(whole):
+    state = torch.load(whole.base_dir / "windows" / "window-00000.pt", weights_only=True)
+    at_end = load(whole.checkpoint_dir, STEPS - 1)["pipeline"]
+    for name, value in state["field"].items():
+        assert torch.equal(value, at_end[f"_model.field.{name}"]), name
+
+
+def test_the_second_window_learns_as_it_would_alone(whole, scene, tmp_path):
+    """Nothing of the first one is left in tables, networks, moments, rates or growth."""
+    alone = WindowedPlan.single(whole.pipeline.model.windows.plans[1])
+    path = tmp_path / "plan.json"
+    path.write_text(alone.to_json())
+    trainer = ready(trainer_config(scene, path, tmp_path, STEPS, training="joint"))
+    window = whole.pipeline.model.windows.windows[1]
+    manager = trainer.pipeline.datamanager
+    near = np.linalg.norm(manager.observations.centers - np.asarray(window.center), axis=-1)
+    manager.use_cameras(np.nonzero(near < window.radius + window.margin)[0])
+    model, draw = trainer.pipeline.model, manager.next_train
+    manager.next_train = lambda step: draw(step + STEPS)  # the draws of the later steps
+    losses = model.get_loss_dict
+
+    def later(*args, **kwargs):
+        model.step += STEPS
+        try:
+            return losses(*args, **kwargs)
+        finally:
+            model.step -= STEPS
+
+    model.get_loss_dict = later
+    trainer.train()
+    expected = whole.pipeline.model.field
+    assert torch.equal(model.field.density, expected.density)
+    assert torch.equal(model.field.networks.weights, expected.networks.weights)
+
+
+def rendered(model, origins):
+    from nerfstudio.cameras.rays import RayBundle
+
+    axes = -whole_axes(model)
+    directions = torch.tensor(axes[2]).float().expand(len(origins), 3) * -1
+    bundle = RayBundle(origins, directions, torch.ones(len(origins), 1), torch.zeros(len(origins), 1).long())
+    with torch.no_grad():
+        return model.eval().get_outputs(bundle)
+
+
+def whole_axes(model):
+    return np.asarray(model.windows.plans[0].mpis[0].axes)
+
+
+def test_rays_are_mixed_by_where_they_start(whole):
+    model = whole.pipeline.model
+    first, second = (torch.tensor(w.center).float() for w in model.windows.windows)
+    origins = torch.stack([first, first + 0.5 * (second - first), second])
+    mixed = rendered(model, origins)
+    shares = window_shares(origins, model.windows.windows)
+    assert 0 < shares[1, 0] < 1
+    each = []
+    for w in (0, 1):
+        field = model.field if w == 1 else model.store.load(0, model._new_field, model.device)
+        trained, model.field, model.window = model.field, field, w
+        windows, model.windows = model.windows, WindowedPlan.single(model.windows.plans[w])
+        each.append(rendered(model, origins))
+        model.field, model.windows, model.window = trained, windows, 1
+    expected = shares[:, :1] * each[0]["rgb"] + shares[:, 1:] * each[1]["rgb"]
+    torch.testing.assert_close(mixed["rgb"], expected)
+    assert not torch.allclose(each[0]["rgb"], each[1]["rgb"], atol=1e-4)
+    assert torch.equal(mixed["depth"][[0, 2]], torch.stack([each[0]["depth"][0], each[1]["depth"][2]]))
+    assert mixed["winning_mpi"][2] == 2 and mixed["winning_mpi"][0] < 2
+
+
+def test_one_mpi_can_be_shown_alone(whole):
+    model = whole.pipeline.model
+    origins = torch.tensor([model.windows.windows[1].center]).float()
+    model.show.value = model.windows.names[0]
+    try:
+        shown = rendered(model, origins)
+    finally:
+        model.show.value = "all"
+    assert shown["winning_mpi"].item() == 0
+    assert not torch.allclose(shown["rgb"], rendered(model, origins)["rgb"])
+
+
+def test_windows_that_are_not_trained_yet_are_not_asked(scene, windows_file, tmp_path):
+    model = ready(trainer_config(scene, windows_file, tmp_path, STEPS, training="joint")).pipeline.model
+    origins = torch.stack([torch.tensor(w.center).float() for w in model.windows.windows])
+    assert (rendered(model, origins)["winning_mpi"] < 2).all()
+
+
+def test_evaluation_reads_the_windows_back(whole):
+    _, pipeline, _, _ = eval_setup(whole.base_dir / "config.yml", test_mode="inference")
+    model = whole.pipeline.model
+    origins = torch.stack([torch.tensor(w.center).float() for w in model.windows.windows])
+    a, b = rendered(model, origins), rendered(pipeline.model, origins)
+    for name in ("rgb", "depth", "winning_mpi"):
+        assert torch.equal(a[name], b[name]), name
+
+
+@pytest.mark.parametrize("step", [STEPS - 2, STEPS - 1, STEPS, STEPS + 2])
+def test_a_resumed_run_ends_as_the_uninterrupted_one(whole, scene, windows_file, tmp_path, step):
+    config = trainer_config(scene, windows_file, tmp_path, STEPS, training="joint")
+    trainer = ready(config, load_dir=whole.checkpoint_dir, load_step=step)
+    torch.rand(5)
+    trainer.train()
+    found, wanted = (load(t.checkpoint_dir, 2 * STEPS - 1) for t in (trainer, whole))
+    assert differences(compared(wanted), compared(found)) == []
+    ours, theirs = (
+        torch.load(t.base_dir / "windows" / "window-00000.pt", weights_only=True)["field"] for t in (trainer, whole)
+    )
+    assert differences(ours, theirs) == []
+
+
+def test_resuming_without_the_finished_windows_is_refused_in_one_sentence(whole, scene, windows_file, tmp_path):
+    folder = tmp_path / "moved" / "nerfstudio_models"
+    folder.mkdir(parents=True)
+    name = f"step-{STEPS:09d}.ckpt"
+    (folder / name).write_bytes((whole.checkpoint_dir / name).read_bytes())
+    config = trainer_config(scene, windows_file, tmp_path / "new", STEPS, training="joint")
+    with pytest.raises(ValueError, match="Window 0 of the run to go on from is missing"):
+        ready(config, load_dir=folder)
+
+
+@pytest.mark.parametrize("harm, sentence", [("gone", "is missing"), ("cut", "is damaged")])
+def test_a_lost_window_is_named_and_nothing_else_is_touched(whole, harm, sentence):
+    model = whole.pipeline.model
+    path = model.store.path(0)
+    kept = path.read_bytes()
+    model.store._fields.clear()
+    origins = torch.tensor([model.windows.windows[0].center]).float()
+    before = model.field.density.clone()
+    try:
+        if harm == "gone":
+            path.unlink()
+        else:
+            path.write_bytes(kept[: len(kept) // 2])
+        with pytest.raises(ValueError, match=sentence):
+            rendered(model, origins)
+    finally:
+        path.write_bytes(kept)
+    assert model.window == 1 and torch.equal(model.field.density, before)
+
+
+def test_a_full_disk_at_a_windows_end_keeps_the_checkpoint(scene, windows_file, tmp_path, monkeypatch):
+    trainer = ready(trainer_config(scene, windows_file, tmp_path, STEPS, training="joint"))
+    save = torch.save
+
+    def full(state, path, **settings):
+        if "window" in path.name:
+            path.write_bytes(b"half")
+            raise RuntimeError("[enforce fail at inline_container.cc] PytorchStreamWriter failed")
+        return save(state, path, **settings)
+
+    monkeypatch.setattr(torch, "save", full)
+    with pytest.raises(OSError, match="could not be written"):
+        trainer.train()
+    assert not list((trainer.base_dir / "windows").glob("*"))
+    assert load(trainer.checkpoint_dir, STEPS - 1)["step"] == STEPS - 1
+
+
+def test_windows_stay_in_memory_without_a_folder(whole, scene, windows_file, tmp_path):
+    from mmpi_ns.mmpi_windows import WindowStore
+
+    store = WindowStore(None, resident=1)
+    model = whole.pipeline.model
+    store.save(0, model.field, model._new_field)
+    kept = store.load(0, model._new_field, model.device)
+    assert torch.equal(kept.density, model.field.density) and kept.density is not model.field.density
+
+
+def test_no_more_windows_are_in_memory_than_asked(whole):
+    from mmpi_ns.mmpi_windows import WindowStore
+
+    model = whole.pipeline.model
+    store = WindowStore(model.store.folder, resident=1)
+    for number in (0, 1, 0):
+        if number == 1:
+            store.save(1, model.field, model._new_field)
+        store.load(number, model._new_field, model.device)
+        assert list(store._fields) == [number]
+    store.path(1).unlink()
