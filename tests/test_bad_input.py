@@ -272,7 +272,7 @@ def test_a_run_resumed_with_another_number_of_mpis_is_refused_and_changes_nothin
     before = contents(first.base_dir)
     refusal(
         lambda: ready(config(2), load_dir=first.checkpoint_dir),
-        "another scene plan (1 MPIs there, 2 here)", "config.yml", "--pipeline.model.plan-file",
+        "another scene plan (1 MPIs there, 2 MPIs here)", "config.yml", "--pipeline.model.plan-file",
     )  # fmt: skip
     after = contents(first.base_dir)
     assert all(after[name] == data for name, data in before.items())
