@@ -68,6 +68,7 @@ class MMPIModel(Model):
         self.metrics = ImageMetrics(self.config.lpips_net)
         self.register_buffer("schedule_bytes", to_bytes(self.schedule.to_json()))
         self.register_buffer("windows_bytes", to_bytes(self.windows.to_json()))
+        self.window_number: Tensor
         self.register_buffer("window_number", torch.tensor(0))
         self.step = 0
         self._fed: int | None = None
