@@ -1,0 +1,298 @@
+"""``mmpi-bench render``: speed of rendering against its error, over the settings of rendering of a trained run."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from mmpi_ns.bench.exact import Array
+from mmpi_ns.bench.exact_ray import ExactField, ExactRay
+from mmpi_ns.bench.provenance import fingerprint, read_json, stamp, stamp_line, write_json
+from mmpi_ns.bench.trainings import evenly
+from mmpi_ns.metrics import ImageMetrics
+from mmpi_ns.mmpi_model import BACKGROUNDS, MMPIModel
+from mmpi_ns.ops import native
+
+NOISE = 1.05
+"""A setting must be so much faster than another to count as faster."""
+SAME_DB = 5e-4
+"""Losses of PSNR closer than this count as equal."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One way to render."""
+
+    threshold: float
+    chunk: int
+    ops: str
+    also: str = ""
+    """name=value of a further setting of the model."""
+
+    @property
+    def name(self) -> str:
+        return f"threshold {self.threshold:g}, {self.chunk} rays at once, {self.ops}" + (self.also and f", {self.also}")
+
+    def apply(self, model: MMPIModel) -> None:
+        model.config.render_threshold, model.config.eval_num_rays_per_chunk = self.threshold, self.chunk
+        native.choose(self.ops)  # type: ignore[arg-type]
+        if self.also:
+            name, _, text = self.also.partition("=")
+            setattr(model.config, name, type(getattr(model.config, name))(text))
+
+
+@dataclass
+class Render:
+    """Rays/s and frames/s against loss of PSNR and against error with respect to exact arithmetic.
+
+    The exact image is made in float64, one ray and one sample after the other, with every sample kept, for some rays
+    of the test images. Settings take turns, so that a busy moment of the machine does not fall on one of them.
+    """
+
+    load_config: Path
+    """The run's config.yml."""
+    thresholds: tuple[float, ...] = (0.0, 1e-4, 1e-3, 3e-3, 1e-2, 3e-2)
+    """Weights below which samples are not coloured."""
+    chunks: tuple[int, ...] = (1024, 8192, 32768)
+    """Rays rendered at once."""
+    ops: tuple[str, ...] = ("native", "torch")
+    """Inner loops (on a CPU)."""
+    also: tuple[str, ...] = ()
+    """Further settings of the model to try one at a time, as name=value."""
+    images: int = 4
+    """Test images, evenly spaced."""
+    rounds: int = 3
+    """Times that every setting renders them; the median counts."""
+    exact_rays: int = 1000
+    """Random rays of those images that are rendered exactly (0.05 to 0.5 s each)."""
+    output: Path = Path("docs/results")
+    """Where render.json, render.md and render.png go."""
+
+    def run(self) -> None:
+        made, path = stamp("render", self), self.output / "render.json"
+        model, images = _load(self.load_config, self.images)
+        before = read_json(path)
+        known = before if before.get("key") == self._key(model) else {}
+        default = Setting(model.config.render_threshold, model.config.eval_num_rays_per_chunk, _ops_in_use(model))
+        rays = _some_rays(images, self.exact_rays)
+        exact = np.array(known["exact"]) if "exact" in known else exact_colors(model, images, rays)
+        content: dict[str, Any] = {"headline": {}, "made": made, "key": self._key(model), "exact": exact.tolist()}
+        content |= {"settings": known.get("settings", {}), "default": default.name}
+        content |= {"pixels": int(images[0][1].shape[0] * images[0][1].shape[1]), "device": str(model.device)}
+        write_json(path, content)
+        wanted = [s for s in self._settings(default) if s.name not in content["settings"]]
+        for number in range(self.rounds if wanted else 0):
+            for setting in wanted:
+                setting.apply(model)
+                rows = content["settings"].setdefault(setting.name, {**asdict(setting), "frame_s": []})
+                rows |= measure(model, images, rays, exact, rows["frame_s"])
+                rate = 1 / statistics.median(rows["frame_s"])
+                print(f"[{number + 1}/{self.rounds}] {setting.name}: {rate:.2f} frames/s", flush=True)
+        default.apply(model)
+        content["headline"] = headline(content)
+        write_json(path, content)
+        (self.output / "render.md").write_text(table(content), encoding="utf-8")
+        draw(self.output / "render.png", content)
+        print(content["headline"])
+
+    def _key(self, model: MMPIModel) -> str:
+        """Of what a measurement depends on beside the setting."""
+        checkpoint = sorted((self.load_config.parent / "nerfstudio_models").glob("*.ckpt"))[-1]
+        stat = checkpoint.stat()
+        return f"{fingerprint()} {checkpoint} {stat.st_size} {stat.st_mtime_ns} {self.images} {self.exact_rays}"
+
+    def _settings(self, default: Setting) -> list[Setting]:
+        """The default, then one thing at a time, and every threshold under every ops."""
+        found = [default]
+        found += [Setting(t, default.chunk, default.ops) for t in self.thresholds]
+        found += [Setting(default.threshold, c, default.ops) for c in self.chunks]
+        if default.ops in self.ops:  # elsewhere than on a CPU there is one path
+            found += [Setting(t, default.chunk, ops) for ops in self.ops for t in (default.threshold, 0.0)]
+        found += [Setting(default.threshold, default.chunk, default.ops, a) for a in self.also]
+        return list(dict.fromkeys(found))
+
+
+Image = tuple[Any, torch.Tensor]
+"""A test camera and its image [H, W, 3]."""
+
+
+def _load(config: Path, count: int) -> tuple[MMPIModel, list[Image]]:
+    from nerfstudio.utils.eval_utils import eval_setup
+
+    _, pipeline, _, _ = eval_setup(config, test_mode="test")
+    model, data = pipeline.model.eval(), pipeline.datamanager.eval_dataset
+    if not isinstance(model, MMPIModel):
+        raise ValueError(f"{config} is a run of another method: give one of mmpi's.")
+    assert data is not None
+    chosen = evenly(len(data), count)
+    cameras = [data.cameras[i : i + 1].to(model.device) for i in chosen]
+    return model, [(c, data.get_image_float32(i)[..., :3]) for c, i in zip(cameras, chosen, strict=True)]
+
+
+def _ops_in_use(model: MMPIModel) -> str:
+    """What auto chose."""
+    if model.device.type != "cpu":
+        return "auto"
+    return "torch" if native.library(torch.zeros(1)) is None else "native"
+
+
+def _some_rays(images: list[Image], count: int) -> list[Array]:
+    """Pixels (row, column) of each image [N, 2], drawn without repetition."""
+    rng = np.random.default_rng(0)
+    found = []
+    for i, (_, truth) in enumerate(images):
+        share = count // len(images) + (i < count % len(images))
+        height, width = truth.shape[:2]
+        flat = rng.permutation(height * width)[:share]
+        found.append(np.stack([flat // width, flat % width], -1))
+    return found
+
+
+def exact_colors(model: MMPIModel, images: list[Image], rays: list[Array]) -> Array:
+    """Colours [N, 3] of some pixels, in float64, without dropping anything, over the model's background."""
+    field = ExactField.of(model.field)
+    form = model.config.blend_form if model.blends else None
+    near, background = float(np.float32(model.field.plan.ray_near)), BACKGROUNDS[model.config.background]
+    colors, kind = [], ExactRay if form is not None else _Unblended
+    for number, ((camera, _), pixels) in enumerate(zip(images, rays, strict=True), 1):
+        bundle = camera.generate_rays(camera_indices=0, keep_shape=True)
+        at = torch.from_numpy(pixels[:, 0]), torch.from_numpy(pixels[:, 1])
+        origins, directions = (x.cpu()[at].double().numpy() for x in (bundle.origins, bundle.directions))
+        for origin, direction in zip(origins, directions, strict=True):
+            color, made = kind(field, origin, direction, near).render(form)
+            colors.append((color + float(made.transmittance) * background).clip(0, 1))
+        print(f"exact: {number} of {len(images)} images", flush=True)
+    return np.array(colors)
+
+
+class _Unblended(ExactRay):
+    """Where reliability takes no part nobody is asked for it."""
+
+    def _votes(self, own: int, inverse_t: float, own_ndc: Array):
+        heads = self.field.plan.num_heads
+        return np.zeros(heads), np.arange(heads) == own, [[] for _ in range(heads)]
+
+
+@torch.no_grad()
+def measure(
+    model: MMPIModel, images: list[Image], rays: list[Array], exact: Array, seconds: list[float]
+) -> dict[str, Any]:
+    """Renders the images with the settings that the model has now.
+
+    Returns:
+        frame_s: ``seconds`` and those of these frames; psnr: mean; largest and 99.9-percentile error of a colour.
+    """
+    metrics, psnr, found, spent = ImageMetrics("none"), [], [], list(seconds)
+    for (camera, truth), pixels in zip(images, rays, strict=True):
+        start = time.perf_counter()
+        rgb = model.get_outputs_for_camera(camera)["rgb"].cpu()  # waits for a GPU
+        spent.append(time.perf_counter() - start)
+        psnr.append(metrics(rgb, truth)["psnr"])
+        found.append(rgb.double().numpy()[pixels[:, 0], pixels[:, 1]])
+    error = np.abs(np.concatenate(found) - exact)
+    errors = {"max_error": float(error.max()), "error_999": float(np.quantile(error, 0.999))}
+    return {"frame_s": spent, "psnr": float(np.mean(psnr)), **errors}
+
+
+def _rows(content: dict[str, Any]) -> list[dict[str, Any]]:
+    """Settings with rays/s and what they lose against the best that keeps every sample."""
+    settings = content["settings"]
+    best = next((r["psnr"] for r in settings.values() if r["threshold"] == 0 and not r["also"]), None)
+    best = best if best is not None else max(r["psnr"] for r in settings.values())
+    rows = []
+    for name, row in settings.items():
+        fps = 1 / statistics.median(row["frame_s"])
+        rows.append(
+            {**row, "name": name, "fps": fps, "rays_per_s": fps * content["pixels"], "loss": best - row["psnr"]}
+        )
+    for row in rows:
+        row["on_front"] = not any(_beats(other, row) for other in rows)
+    return rows
+
+
+def _beats(a: dict[str, Any], b: dict[str, Any]) -> bool:
+    """Faster beyond noise, and no more error either way of measuring it."""
+    faster = a["rays_per_s"] > NOISE * b["rays_per_s"]
+    return faster and a["loss"] <= b["loss"] + SAME_DB and a["error_999"] <= 1.01 * b["error_999"]
+
+
+def headline(content: dict[str, Any]) -> dict[str, float]:
+    """Figures of the default settings."""
+    rows = _rows(content)
+    default = next(r for r in rows if r["name"] == content["default"])
+    rivals = [r["rays_per_s"] for r in rows if r["loss"] <= default["loss"] + SAME_DB]
+    return {
+        "rays_per_s": default["rays_per_s"],
+        "fps": default["fps"],
+        "psnr_loss_db": default["loss"],
+        "max_error": default["max_error"],
+        "error_999": default["error_999"],
+        "default_on_front": int(default["on_front"]),
+        "fastest_at_no_more_loss_over_default": max(rivals) / default["rays_per_s"],
+        "exact_rays": len(content["exact"]),
+    }
+
+
+def table(content: dict[str, Any]) -> str:
+    """The Markdown page."""
+    head, rows = content["headline"], sorted(_rows(content), key=lambda r: -r["rays_per_s"])
+    verdict = "is on" if head["default_on_front"] else "is **not** on"
+    lines = [
+        "# Rendering: speed against error",
+        "",
+        stamp_line(content["made"]),
+        "",
+        f"Images of {content['pixels']} pixels on {content['device']}. Loss of PSNR is against the same model with",
+        f"every sample kept; errors of colours (0 to 1) are against {head['exact_rays']} rays in float64 with every",
+        f"sample kept. The default {verdict} the front: a setting that is off it is beaten by one that is faster by",
+        f"more than {100 * (NOISE - 1):.0f} % and has no more error by PSNR nor by the 99.9 percentile.",
+        "",
+        "![Frames per second against error](render.png)",
+        "",
+        "| setting | rays/s | frames/s | PSNR | loss, dB | 99.9 % of errors below | largest error | front |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for r in rows:
+        name = f"**{r['name']}** (default)" if r["name"] == content["default"] else r["name"]
+        cells = [
+            name,
+            f"{r['rays_per_s']:.0f}",
+            f"{r['fps']:.2f}",
+            f"{r['psnr']:.3f}",
+            f"{r['loss']:.4f}",
+            f"{r['error_999']:.1e}",
+            f"{r['max_error']:.1e}",
+            "yes" if r["on_front"] else "no",
+        ]
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join([*lines, ""])
+
+
+def draw(path: Path, content: dict[str, Any]) -> None:
+    """Frames per second against loss of PSNR and against the two errors; the front is joined."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    rows = _rows(content)
+    figure, axes = plt.subplots(1, 3, figsize=(15, 4.5), layout="constrained", sharey=True)
+    titles = (("loss", "loss of PSNR, dB"), ("error_999", "99.9 % of errors below"), ("max_error", "largest error"))
+    for axis, (what, title) in zip(axes, titles, strict=True):
+        front = sorted((max(r[what], 1e-6), r["fps"]) for r in rows if r["on_front"])
+        axis.plot(*zip(*front, strict=True), color="0.8", lw=4, zorder=0, label="front")
+        for r in rows:
+            mark = "*" if r["name"] == content["default"] else "o"
+            axis.plot(max(r[what], 1e-6), r["fps"], mark, ms=14 if mark == "*" else 6, label=r["name"])
+        axis.set(xscale="log", yscale="log", xlabel=title)
+        axis.grid(alpha=0.3)
+    axes[0].set_ylabel("frames/s")
+    axes[-1].legend(fontsize=6, loc="upper left", bbox_to_anchor=(1, 1))
+    figure.savefig(path, dpi=110)
+    plt.close(figure)

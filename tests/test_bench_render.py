@@ -1,0 +1,121 @@
+"""``mmpi-bench render``: what each setting costs and loses against exact arithmetic."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+from training_runs import ready, trainer_config
+
+from mmpi_ns.bench import render
+from mmpi_ns.bench.render import Render, Setting
+from mmpi_ns.ops import native
+
+
+@pytest.fixture(scope="module", params=["two-phase", "joint"])
+def run(request, scene, plan_file, tmp_path_factory):
+    """A short training, with reliability and without."""
+    output = tmp_path_factory.mktemp("run")
+    config = trainer_config(scene, plan_file, output, training=request.param, lpips_net="none")
+    config.save_config()
+    ready(config).train()
+    return config.get_base_dir() / "config.yml"
+
+
+@pytest.fixture(autouse=True)
+def usual_ops():
+    yield
+    native.choose("auto")
+
+
+def settings(output, **changes):
+    return {"images": 2, "rounds": 2, "exact_rays": 60, "chunks": (100,), "output": output} | changes
+
+
+def test_every_setting_is_timed_and_compared_with_exact_rays(run, tmp_path):
+    Render(run, **settings(tmp_path)).run()
+    found = json.loads((tmp_path / "render.json").read_text())
+    assert all(isinstance(v, int | float) and math.isfinite(v) for v in found["headline"].values())
+    assert found["headline"]["exact_rays"] == len(found["exact"]) == 60
+    rows = found["settings"]
+    assert {r["threshold"] for r in rows.values()} == {0.0, 1e-4, 1e-3, 3e-3, 1e-2, 3e-2}
+    assert {r["chunk"] for r in rows.values()} == {100, 8192} and {r["ops"] for r in rows.values()} == {
+        "native",
+        "torch",
+    }
+    assert all(len(r["frame_s"]) == 2 * 2 for r in rows.values()), "two images, two rounds"
+    kept = [r for r in rows.values() if r["threshold"] == 0]
+    # float32 against float64; a sample on a border may go either way, so not every ray is as close.
+    assert len(kept) == 2 and all(r["max_error"] < 2e-2 and r["error_999"] <= r["max_error"] for r in kept)
+    dropped = [r for r in rows.values() if r["threshold"] == 3e-2]
+    assert dropped[0]["error_999"] > 2 * kept[0]["error_999"]
+    chunks = [r for r in rows.values() if r["threshold"] == 3e-3 and r["ops"] == "native"]
+    assert len(chunks) == 2 and chunks[0]["psnr"] == pytest.approx(chunks[1]["psnr"], abs=1e-4)
+    text = (tmp_path / "render.md").read_text()
+    assert text.count("(default)") == 1 and f"**{found['default']}**" in text
+    assert (tmp_path / "render.png").stat().st_size > 10_000
+
+
+def test_what_was_measured_is_kept(run, tmp_path, monkeypatch):
+    Render(run, **settings(tmp_path, thresholds=(0.0,), rounds=1)).run()
+    before = json.loads((tmp_path / "render.json").read_text())
+    measured, measure = [], render.measure
+
+    def count(model, *rest):
+        measured.append(model.config.render_threshold)
+        return measure(model, *rest)
+
+    monkeypatch.setattr(render, "measure", count)
+    monkeypatch.setattr(render, "exact_colors", lambda *_: pytest.fail("rendered exactly again"))
+    Render(run, **settings(tmp_path, thresholds=(0.0, 0.5), rounds=1)).run()
+    after = json.loads((tmp_path / "render.json").read_text())
+    assert measured == [0.5] and {k: after["settings"][k] for k in before["settings"]} == before["settings"]
+
+
+def test_exact_rays_without_votes_equal_those_with_them(run):
+    """Where reliability takes no part, leaving it out of the exact ray changes nothing."""
+    model, images = render._load(run, 1)
+    bundle = images[0][0].generate_rays(camera_indices=0, keep_shape=True)
+    origin, direction = (x[5, 7].double().numpy() for x in (bundle.origins, bundle.directions))
+    field = render.ExactField.of(model.field)
+    found = [kind(field, origin, direction).render(None)[0] for kind in (render.ExactRay, render._Unblended)]
+    assert np.array_equal(*found) and found[0].std() > 0
+
+
+def row(threshold, fps, psnr, error):
+    also = {"also": "", "chunk": 1, "ops": "torch", "max_error": error}
+    return {"threshold": threshold, "frame_s": [1 / fps], "psnr": psnr, "error_999": error, **also}
+
+
+def test_a_setting_is_off_the_front_where_another_is_faster_without_more_error():
+    rows = {
+        "all": row(0.0, 1.0, 20.0, 1e-6),
+        "default": row(1e-3, 2.0, 19.99, 1e-3),
+        "a little faster": row(1e-3, 2.05, 19.99, 1e-3),
+        "coarse": row(1e-2, 4.0, 19.5, 1e-2),
+    }
+    content = {"settings": rows, "pixels": 10, "default": "default", "exact": [0] * 7}
+    found = {r["name"]: r for r in render._rows(content)}
+    assert [r["on_front"] for r in found.values()] == [True] * 4, "2.5 % are noise"
+    assert found["coarse"]["loss"] == pytest.approx(0.5) and found["coarse"]["rays_per_s"] == pytest.approx(40)
+    head = render.headline(content)
+    assert head["default_on_front"] == 1 and head["fastest_at_no_more_loss_over_default"] == pytest.approx(1.025)
+    rows["better"] = row(2e-3, 3.0, 19.995, 5e-4)
+    assert render.headline(content)["default_on_front"] == 0
+    rows["better"]["error_999"] = 2e-3
+    assert render.headline(content)["default_on_front"] == 1, "less error by one measure, more by the other"
+
+
+def test_a_further_setting_of_the_model_is_tried_with_its_own_type():
+    class Model:
+        class config:
+            render_threshold, eval_num_rays_per_chunk, background, train_threshold = 0.0, 1, "gray", 1.0
+
+    Setting(0.25, 7, "torch", "train_threshold=0.5").apply(Model)  # type: ignore[arg-type]
+    assert (Model.config.render_threshold, Model.config.eval_num_rays_per_chunk) == (0.25, 7)
+    assert Model.config.train_threshold == 0.5 and native.library(torch.zeros(1)) is None
+    Setting(0.25, 7, "auto", "background=white").apply(Model)  # type: ignore[arg-type]
+    assert Model.config.background == "white"
