@@ -6,6 +6,7 @@ import json
 import math
 import random
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ import torch
 from nerfstudio.engine import trainer as nerfstudio_trainer
 
 from mmpi_ns.bench import methods, peers, train, trainings
+from mmpi_ns.bench.alternate import Steps
 from mmpi_ns.bench.curves import Curve, compare
 from mmpi_ns.bench.methods import METHODS
 from mmpi_ns.bench.train import Train
@@ -180,6 +182,25 @@ def test_test_pixels_are_the_same_for_every_method():
     ]
 
 
+def test_methods_that_render_whole_images_are_scored_on_the_same_pixels(scene, tmp_path):
+    request = command(scene, tmp_path)._request(scene, METHODS["mmpi-small"], 2, 0, tmp_path)
+    trainer = Steps(list(request.words)).trainer
+    one, whole = (trainings.score(trainer.pipeline, [1], 40, way) for way in (False, True))
+    assert one["psnr"] == pytest.approx(whole["psnr"], abs=1e-4) and one["images"] == whole["images"] == 1
+    assert one["psnr"] != trainings.score(trainer.pipeline, [0], 40, False)["psnr"]
+    full = trainings.score(trainer.pipeline, [0, 1], 0, True)
+    assert full["images"] == 2 and "ssim" in full and full["rays_per_s"] > 0
+
+
+def test_splats_count_the_pixels_of_images_that_grow():
+    manager = SimpleNamespace(get_train_rays_per_batch=lambda: 1200)
+    model = SimpleNamespace()
+    pipeline = SimpleNamespace(datamanager=manager, model=model)
+    assert trainings.pixels_of_step(pipeline) == 1200
+    model._get_downscale_factor = lambda: 4
+    assert trainings.pixels_of_step(pipeline) == 75
+
+
 def curve(seconds, psnr, seed=0):
     points = [
         {"step": 100 * (i + 1), "rays": 10, "seconds": s, "psnr": p}
@@ -273,3 +294,26 @@ def test_point_clouds_are_read_without_open3d(tmp_path):
     text.write_text("solid cube")
     with pytest.raises(ValueError, match="not a PLY file"):
         peers.read_ply(text)
+
+
+@pytest.mark.commands
+def test_points_are_where_nerfstudio_puts_them(tmp_path, monkeypatch):
+    pytest.importorskip("open3d")
+    from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio, NerfstudioDataParserConfig
+
+    from mmpi_ns.scenes.catalogue import make_scene
+    from mmpi_ns.scenes.dataset import write_dataset
+
+    write_dataset(make_scene("still-life", 0, 4, 24, 16), tmp_path / "still", 50, 0.3, 0.0, True)
+
+    def points():
+        config = NerfstudioDataParserConfig(data=tmp_path / "still", downscale_factor=1, load_3D_points=True)
+        return config.setup().get_dataparser_outputs(split="train").metadata
+
+    wanted = points()
+    monkeypatch.setattr(Nerfstudio, "_load_3D_points", None)  # restored afterwards
+    peers.read_points_ourselves()
+    found = points()
+    assert len(wanted["points3D_xyz"]) > 20
+    assert torch.allclose(found["points3D_xyz"], wanted["points3D_xyz"].float(), atol=1e-5)
+    assert (found["points3D_rgb"].int() - wanted["points3D_rgb"].int()).abs().max() <= 1

@@ -122,7 +122,7 @@ class Train:
         made = stamp("train", self)
         keep = ("command", "processor", "torch", "date")
         row |= {k: made[k] for k in keep} | {"threads": self.threads or os.cpu_count(), "device": self._device}
-        row |= {"commit": commit(), "options": shlex.join(_shown(request.words))}
+        row |= {"commit": commit(), "options": shlex.join(shown(request.words))}
         if self._device == "cuda":
             row["gpu"] = torch.cuda.get_device_name()
         return row | train_apart(request, folder, int(row["threads"]))
@@ -161,7 +161,7 @@ def _by_name(words: tuple[str, ...], option: str) -> dict[str, list[int]]:
     return found
 
 
-def _shown(words: tuple[str, ...]) -> list[str]:
+def shown(words: tuple[str, ...]) -> list[str]:
     """The words without where things lie on this machine."""
     hidden = {"--output-dir", "--data", "--experiment-name", "--timestamp"}
     return [w for i, w in enumerate(words) if w not in hidden and (i == 0 or words[i - 1] not in hidden)]

@@ -263,7 +263,8 @@ def pixels_of_step(pipeline: Any) -> int:
 
 
 def _answer(request: dict[str, Any], tell: Callable[[str], None]) -> dict[str, Any]:
-    return run(Request(**{k: tuple(v) if isinstance(v, list) else v for k, v in request.items()}), tell)
+    words: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in request.items()}
+    return run(Request(**words), tell)
 
 
 if __name__ == "__main__":
