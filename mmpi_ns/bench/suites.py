@@ -11,6 +11,8 @@ DRIVE = (P + "arrangement", "drive")
 PLACED = (*JOINT, P + "texel-pixels", "1.5")
 FRONT = (*DRIVE, *JOINT, P + "faces", "front")
 NO_DEPTH = ("--pipeline.datamanager.keypoint-rays", "0")
+OPACITY = ("--pipeline.model.blend-form", "opacity")
+SHARED = ("--pipeline.model.shared-colour", "True")
 
 
 @dataclass(frozen=True)
@@ -66,3 +68,51 @@ SUITES: dict[str, list[Variant]] = {
     "fern": [Variant("automatic placement", (), steps=2000)],
     "fox": [Variant("automatic placement", (), steps=750)],
 }
+
+
+REFERENCE = "four MPIs by hand, joint"
+"""What the other variants of a drive are compared with."""
+ROOM_REFERENCE = "five MPIs, joint"
+
+
+def _paper() -> list[Variant]:
+    """The paper's ablation: several MPIs gain on one, reliability on them."""
+    group = "the paper's ablation"
+    rows = [
+        (REFERENCE, (*DRIVE, *JOINT)),
+        ("one front MPI, pulled back", FRONT),
+        ("each alone, then reliability", (*DRIVE, *TWO_PHASE, *_shares(0.25, 0.0))),
+        (
+            "... every MPI sees all rays (30k each)",
+            (*DRIVE, *TWO_PHASE, *_shares(0.25, 0.0), "--pipeline.model.rays-per-mpi", "all"),
+        ),
+        ("... opacity-keeping form", (*DRIVE, *TWO_PHASE, *_shares(0.25, 0.0), *OPACITY)),
+        ("... then a joint fine-tune", (*DRIVE, *TWO_PHASE, *_shares(0.1, 0.4))),
+    ]
+    return [Variant(name, options, group=group) for name, options in rows]
+
+
+def _ours() -> list[Variant]:
+    """What we added or chose, one change at a time."""
+    hand, placed = "changes of the reference", "automatic placement"
+    return [
+        Variant("one front MPI, at the first camera", (*FRONT, P + "drive-pull-back", "0"), group=hand),
+        Variant("four MPIs, the front one not pulled back", (*DRIVE, *JOINT, P + "drive-pull-back", "0"), group=hand),
+        Variant("one colour network for all", (*DRIVE, *JOINT, *SHARED), group=hand),
+        Variant("no SfM depth", (*DRIVE, *JOINT, *NO_DEPTH), group=hand),
+        Variant("placed among the cameras, joint", JOINT, group=placed),
+        Variant("placed, one colour network for all", (*JOINT, *SHARED), group=placed),
+        Variant("placed, no SfM depth", (*JOINT, *NO_DEPTH), group=placed),
+        Variant("placed, each alone, reliability, fine-tune", (*TWO_PHASE, *_shares(0.1, 0.4)), group=placed),
+    ]
+
+
+ABLATIONS: dict[str, list[Variant]] = {
+    "drive": [*_paper(), *_ours()],
+    "room": [
+        Variant(ROOM_REFERENCE, ROOM, group="the paper's ablation"),
+        Variant("five MPIs and cube, joint", (*ROOM, P + "cube-voxels", "96"), group="the paper's ablation"),
+        Variant("placed among the cameras, joint", JOINT, group="automatic placement"),
+    ],
+}
+"""The first variant of each is the reference."""

@@ -6,17 +6,23 @@ import sys
 
 import tyro
 
+from mmpi_ns.bench.ablate import Ablate
 from mmpi_ns.bench.accuracy import Accuracy
 from mmpi_ns.bench.dense import Dense
+from mmpi_ns.bench.ops import Ops
 from mmpi_ns.bench.regions import Regions
+from mmpi_ns.bench.render import Render
 from mmpi_ns.bench.results import Results
+from mmpi_ns.bench.scaling import Scaling
+from mmpi_ns.bench.speed import Speed
 from mmpi_ns.bench.stability import Stability
 from mmpi_ns.bench.train import Train
 
 
 def entrypoint() -> None:
     """The command ``mmpi-bench``; a mistake is one sentence and exit status 1."""
-    command = tyro.cli(Train | Stability | Accuracy | Results | Dense | Regions, prog="mmpi-bench")  # type: ignore[arg-type]
+    measures = Train | Render | Speed | Ops | Scaling | Ablate
+    command = tyro.cli(measures | Stability | Accuracy | Results | Dense | Regions, prog="mmpi-bench")  # type: ignore[arg-type]
     try:
         command.run()
     except (ValueError, OSError) as error:
