@@ -20,6 +20,7 @@ from torch import Tensor
 from mmpi_ns.checks import check_transforms
 from mmpi_ns.mmpi_dataset import MMPIDataset
 from mmpi_ns.mmpi_observations import observe, sfm_folder
+from mmpi_ns.mmpi_rays import PinholeRays
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.random_draws import generator
 
@@ -140,7 +141,9 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         self.pool = PixelPool.from_dataset(self.train_dataset, self.device)
         # Samples nothing: ns-export sets its batches' size here.
         self.train_pixel_sampler = self._get_pixel_sampler(self.train_dataset, self.config.train_num_rays_per_batch)
-        self.train_ray_generator = RayGenerator(self.train_dataset.cameras.to(self.device))
+        cameras = self.train_dataset.cameras
+        pinhole = PinholeRays.of(cameras, self.device) if torch.device(self.device).type == "cuda" else None
+        self.train_ray_generator: Any = pinhole or RayGenerator(cameras.to(self.device))
         self._keypoints = _keypoint_targets(self.observations, self.device)
 
     def use_cameras(self, cameras: NDArray[np.int64] | None) -> None:

@@ -83,6 +83,8 @@ class MMPIField(Field):
         self.samples_per_voxel = samples_per_voxel
         self.cube_alpha = cube_alpha
         self.full_plan = self.plan = plan
+        self.factor = 1.0
+        """Share of the plan's texels in use: ``texel_factor``, where reading it does not wait for a device."""
         self.learns_cover = True
         """Whether training rays mark the texels they train; off once blending has begun, so that P cannot jump."""
         self.grids: list[TexelGrid] = []
@@ -109,7 +111,7 @@ class MMPIField(Field):
 
     def build(self, plan: ScenePlan, factor: float) -> None:
         """Allocates all tables afresh for ``plan`` at ``factor`` times its texels. Parameters stay the same objects."""
-        self.full_plan, self.plan = plan, plan.scaled(factor)
+        self.full_plan, self.plan, self.factor = plan, plan.scaled(factor), factor
         self.grids = head_grids(self.plan)
         texels = self.plan.texels
         device = self.density.device
@@ -123,7 +125,7 @@ class MMPIField(Field):
     @torch.no_grad()
     def grow(self, factor: float) -> None:
         """Resamples every table to ``factor`` times the plan's texels (paper sec. IV; bilinear on each plane)."""
-        old, self.plan = self.grids, self.full_plan.scaled(factor)
+        old, self.plan, self.factor = self.grids, self.full_plan.scaled(factor), factor
         self.grids = head_grids(self.plan)
         is_cube = [k >= len(self.plan.mpis) for k in range(self.plan.num_heads)]
         for table in (self.density, self.features, self.reliability):
@@ -224,6 +226,17 @@ class MMPIField(Field):
 
         return self._cached("march", make).with_tables(self.density.data, self.reliability.data, self.touched)
 
+    def triton_scene(self) -> tuple[Any, tuple[Tensor, Tensor, Tensor]]:
+        """The field as the Triton kernels read it: a ``TritonScene``, and density, reliability and touched texels."""
+        from mmpi_ns.ops.triton_scene import TritonScene
+
+        def make() -> TritonScene:
+            cube = None if self.cube is None else (self.cube, *self._cube_density())
+            biases = [self._biases(k) for k in range(len(self.plan.mpis))]
+            return TritonScene.pack(self.plan.mpis, self.grids, biases, self.depth_scale, cube, self.density.device)
+
+        return self._cached("triton", make), (self.density.data, self.reliability.data, self.touched)
+
     # Reliability -----------------------------------------------------------------------------------------------
 
     def shares(
@@ -313,15 +326,27 @@ class MMPIField(Field):
         index = index[by_head(meta["heads"].reshape(-1)[index])]
         heads, planes = meta["heads"].reshape(-1)[index], meta["planes"].reshape(-1)[index]
         ndc = meta["ndc"].reshape(-1, 3)[index]
-        spans, num_mpis, groups = head_spans(heads), len(self.plan.mpis), []
-        in_mpis = [self.grids[k].bilinear(planes[own], ndc[own]) for k, own in spans if k < num_mpis]
-        if in_mpis:
-            rows, weights = (torch.cat(parts) for parts in zip(*in_mpis, strict=True))
+        spans, num_mpis, groups = head_spans(heads, len(self.grids)), len(self.plan.mpis), []
+        if in_mpis := [(k, own) for k, own in spans if k < num_mpis]:
+            rows, weights = self._mpi_taps(in_mpis, heads, planes, ndc)
             groups.append(Taps(slice(0, len(rows)), rows, weights))
         if spans and spans[-1][0] == num_mpis:
             own = spans[-1][1]
             groups.append(Taps(own, *self.grids[-1].trilinear(ndc[own])))
         return Lookup(meta["valid"].shape[:2], index, heads, planes, ndc, spans, *self._gather(groups))
+
+    def _mpi_taps(
+        self, spans: list[tuple[int, slice]], heads: Tensor, planes: Tensor, ndc: Tensor
+    ) -> tuple[Int[Tensor, "N 4"], Float[Tensor, "N 4"]]:
+        """Rows and weights of the samples in MPIs, which come first."""
+        if native.takes_triton(ndc):
+            from mmpi_ns.ops.triton_tables import taps
+
+            end = spans[-1][1].stop
+            return taps(self.triton_scene()[0], heads[:end], planes[:end], ndc[:end], in_cube=False)
+        parts = [self.grids[k].bilinear(planes[own], ndc[own]) for k, own in spans]
+        rows, weights = (torch.cat(p) for p in zip(*parts, strict=True))
+        return rows, weights
 
     def _gather(self, groups: list[Taps]) -> tuple[list[Taps], Gathered | None]:
         """The distinct rows of all groups, and the groups with their positions among them."""

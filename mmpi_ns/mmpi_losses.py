@@ -55,38 +55,39 @@ class TrainingRays:
         known = self.bundle.metadata.get(KEYPOINT_DEPTH)
         num_pixels = image.shape[0]
         is_pixel = is_pixel_ray(self.bundle)
-        copies = int(is_pixel.sum()) // num_pixels
+        pixels = is_pixel.nonzero()[:, 0]  # once: every use of a mask would wait for the device
+        copies = len(pixels) // num_pixels
         image = image.repeat(copies, 1)
         random = torch.rand(image.shape[0], 3, generator=g, device=image.device)
         observed = over_background(image, random)
         # Where MPIs that train apart see a ray only in part, what they let through is not theirs to explain.
-        explained = self.report.explained[is_pixel]
+        explained = self.report.explained[pixels]
         background = random if image.shape[-1] == 4 else torch.where(explained, random, observed)
-        weights, transmittance = self.composite.weights[is_pixel], self.composite.transmittance[is_pixel]
-        rgb = render_colors(self._pixel_composite(is_pixel), self.colors[is_pixel]) + transmittance * background
+        composite, colors = self._pixel_composite(pixels), self.colors[pixels]
+        rgb = render_colors(composite, colors) + composite.transmittance * background
         total = {
             "rgb_loss": losses.photometric(rgb, observed),
-            "point_color": weight.point_color * losses.point_color(self.colors[is_pixel], weights, observed),
-            "entropy": weight.background_entropy * losses.background_entropy(transmittance),
-            "distortion": weight.distortion * self._distortion(is_pixel, field.plan.content_near),
+            "point_color": weight.point_color * losses.point_color(colors, composite.weights, observed),
+            "entropy": weight.background_entropy * losses.background_entropy(composite.transmittance),
+            "distortion": weight.distortion * self._distortion(pixels, composite, field.plan.content_near),
         }
-        if known is not None and bool((known > 0).any()):
-            total["keypoint_depth"] = weight.keypoint_depth * self._keypoint_depth(~is_pixel, known)
+        if known is not None and len(pixels) < len(is_pixel):
+            total["keypoint_depth"] = weight.keypoint_depth * self._keypoint_depth((~is_pixel).nonzero()[:, 0], known)
         if step % weight.tv_every == 0 and field.density.requires_grad:
             total["tv"] = field.total_variation(self.lookup, weight.tv_density, weight.tv_features) * (
                 weight.tv_every / max(1, image.shape[0])
             )
         return total
 
-    def _pixel_composite(self, is_pixel: Tensor) -> Composite:
+    def _pixel_composite(self, pixels: Tensor) -> Composite:
         c = self.composite
-        return Composite(c.weights[is_pixel], c.accumulation[is_pixel], c.transmittance[is_pixel])
+        return Composite(c.weights[pixels], c.accumulation[pixels], c.transmittance[pixels])
 
-    def _distortion(self, is_pixel: Tensor, scale: float) -> Tensor:
-        inverse_t = metadata_of(self.samples)["inverse_t"][..., 0][is_pixel]
+    def _distortion(self, pixels: Tensor, composite: Composite, scale: float) -> Tensor:
+        inverse_t = metadata_of(self.samples)["inverse_t"][..., 0][pixels]
         positions = 1 / (1 + inverse_t * scale)
-        intervals = (1 / self.report.live[is_pixel].clamp(min=1))[:, None].to(positions.dtype)
-        return losses.distortion(self.composite.weights[is_pixel], positions, intervals.expand_as(positions))
+        intervals = (1 / self.report.live[pixels].clamp(min=1))[:, None].to(positions.dtype)
+        return losses.distortion(composite.weights, positions, intervals.expand_as(positions))
 
     def _keypoint_depth(self, chosen: Tensor, known: Tensor) -> Tensor:
         meta = metadata_of(self.samples)

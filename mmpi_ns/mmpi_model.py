@@ -24,7 +24,6 @@ from mmpi_ns.compositing import (
     BlendForm,
     Composite,
     blended_optical_depth,
-    composite_weights,
     median_inverse_distance,
     render_colors,
 )
@@ -38,6 +37,7 @@ from mmpi_ns.mmpi_samples import Lookup, metadata_of, repeat_rays
 from mmpi_ns.mmpi_settings import MMPIModelConfig
 from mmpi_ns.mmpi_windows import WindowStore, mix_windows
 from mmpi_ns.ops import native
+from mmpi_ns.ops.composite import composite_weights
 from mmpi_ns.phases import TRAINS, Schedule
 from mmpi_ns.placement.split import cameras_in, place_windows
 from mmpi_ns.random_draws import generator
@@ -133,7 +133,7 @@ class MMPIModel(Model):
         if self.schedule.window_at(step) != self.window:
             self._enter_window(self.schedule.window_at(step), factor)
             self._reset_moments(attributes, ("density", "features", "colour", "reliability"))
-        elif factor != float(self.field.texel_factor):
+        elif factor != self.field.factor:
             self.field.grow(factor)
             self._reset_moments(attributes, ("density", "features", "reliability"))
         if len(self.windows) > 1 and attributes is not None and self._fed != self.window:

@@ -95,12 +95,16 @@ class MMPISampler(Sampler):
         if head_mask is not None or choose is not None:
             explained &= _sees_all(hits, counts[:, : len(field.plan.mpis)], field)
         lib = native.library(origins, field.density)
-        if lib is None:
-            kept = march_reference(ray_bundle, field, hits, cube_first, counts, threshold, fair_share, blend_form)
+        first = hits.m_first if cube_first is None else torch.cat([hits.m_first, cube_first[:, None]], -1)
+        given = (origins, directions, hits, first, counts, threshold, fair_share, blend_form)
+        if lib is not None:
+            kept = march(lib, field.march_scene(), *given)
+        elif native.takes_triton(origins, field.density):
+            from mmpi_ns.ops import triton_march
+
+            kept = triton_march.march(*field.triton_scene(), *given)
         else:
-            first = hits.m_first if cube_first is None else torch.cat([hits.m_first, cube_first[:, None]], -1)
-            scene = field.march_scene()
-            kept = march(lib, scene, origins, directions, hits, first, counts, threshold, fair_share, blend_form)
+            kept = march_reference(ray_bundle, field, hits, cube_first, counts, threshold, fair_share, blend_form)
         report = MergeReport(counts.sum(-1), kept.skipped_total, kept.dropped_mass, explained)
         return _ray_samples(ray_bundle, kept), report
 

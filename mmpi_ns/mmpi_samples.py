@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import torch
@@ -69,17 +70,14 @@ class Lookup:
             groups.append(Taps(slice(start, stop), taps.rows[own], taps.weights[own], position))
             start = stop
         samples = (self.index[wanted], heads, self.planes[wanted], self.ndc[wanted])
-        return Lookup(self.shape, *samples, head_spans(heads), groups, self.gathered)
+        last = self.spans[-1][0] if self.spans else 0
+        return Lookup(self.shape, *samples, head_spans(heads, last + 1), groups, self.gathered)
 
 
-def head_spans(heads: Int[Tensor, "N"]) -> list[tuple[int, slice]]:
+def head_spans(heads: Int[Tensor, "N"], num_heads: int) -> list[tuple[int, slice]]:
     """(head, range of its samples) for every head that occurs among samples ordered by head."""
-    spans, start = [], 0
-    for k, count in enumerate(torch.bincount(heads).tolist() if heads.numel() else []):
-        if count:
-            spans.append((k, slice(start, start + count)))
-        start += count
-    return spans
+    edges = torch.searchsorted(heads, torch.arange(num_heads + 1, device=heads.device)).tolist()
+    return [(k, slice(a, b)) for k, (a, b) in enumerate(pairwise(edges)) if a < b]
 
 
 @dataclass(frozen=True)
@@ -112,6 +110,8 @@ def by_head(heads: Int[Tensor, "N"]) -> Int[Tensor, "N"]:
     """The order that puts samples of a head together, heads rising, and otherwise keeps their order."""
     if not heads.numel():
         return heads
+    if heads.device.type != "cpu":  # one launch; a sort takes longer on a CPU
+        return torch.sort(heads, stable=True).indices
     return torch.cat([(heads == k).nonzero()[:, 0] for k in range(int(heads.max()) + 1)])
 
 

@@ -73,7 +73,8 @@ class MMPIModelConfig(ModelConfig):
     train_threshold: float = 3e-3
     """Samples of less weight get no gradient (while resolution grows: nor more than a tenth of an equal share)."""
     ops: native.Route = "auto"
-    """Inner loops on a CPU: compiled at first use (native), plain torch, or compiled where a C++ compiler is found."""
+    """Inner loops: compiled at first use (native; by a C++ compiler on a CPU, by Triton on a GPU), plain torch, or
+    compiled where that can be done (auto)."""
     render_threshold: float = 3e-3
     """Samples of less weight are not coloured when rendering; the dropped mass is reported."""
     background: Literal["black", "gray", "white"] = "gray"

@@ -70,6 +70,11 @@ def _adam(
 def _sparse_update(param: Parameter, grad: Tensor, state: dict[str, Any], group: dict[str, Any]) -> None:
     index = index_rows(grad._indices()[0])
     rows, values = index.unique, add_rows(index, grad._values().to(param.dtype), None)
+    if native.takes_triton(param.data) and param.data.is_contiguous() and param.ndim == 2:
+        from mmpi_ns.ops.triton_tables import adam_rows
+
+        moments = state["exp_avg"], state["exp_avg_sq"]
+        return adam_rows(param.data, *moments, rows, values, _constants(state, group))
     lib = native.library(param.data)
     if lib is not None and param.data.is_contiguous() and param.ndim == 2:
         return _compiled_update(lib, param, rows, values, state, group)
@@ -81,17 +86,17 @@ def _sparse_update(param: Parameter, grad: Tensor, state: dict[str, Any], group:
     param.data.index_copy_(0, rows, fresh)
 
 
+def _constants(state: dict[str, Any], group: dict[str, Any]) -> tuple[float, float, float, float, float]:
+    """beta1, beta2, root of the second moment's correction, eps, and rate with the first one's correction."""
+    beta1, beta2 = group["betas"]
+    correction = (1 - beta2 ** state["step"]) ** 0.5
+    return beta1, beta2, correction, group["eps"], group["lr"] / (1 - beta1 ** state["step"])
+
+
 def _compiled_update(
     lib: ctypes.CDLL, param: Parameter, rows: Tensor, values: Tensor, state: dict[str, Any], group: dict[str, Any]
 ) -> None:
-    beta1, beta2 = group["betas"]
-    constants = (
-        beta1,
-        beta2,
-        (1 - beta2 ** state["step"]) ** 0.5,
-        group["eps"],
-        group["lr"] / (1 - beta1 ** state["step"]),
-    )
+    constants = _constants(state, group)
 
     def update(begin: int, end: int) -> None:
         lib.mmpi_adam_rows(

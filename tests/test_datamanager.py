@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import copy
 import json
 
 import numpy as np
 import pytest
 import torch
+from nerfstudio.cameras.cameras import CameraType
+from nerfstudio.model_components.ray_generators import RayGenerator
 from PIL import Image
 from tiny_scene import HEIGHT, TRAIN, WIDTH, image_of, name_of, project, wall_points, write_scene
 from training_runs import datamanager, plan_of
 
 from mmpi_ns.mmpi_datamanager import KEYPOINT_DEPTH, OBSERVATIONS
+from mmpi_ns.mmpi_rays import PinholeRays
 from mmpi_ns.placement.plan import ScenePlan
 from mmpi_ns.placement.rule import PlacementConfig, place
 from mmpi_ns.sfm import MIN_TRACK
@@ -160,3 +164,28 @@ def test_keypoints_on_masked_pixels_are_left_out(tmp_path, manager):
     assert np.array_equal(masked.seen_at, open_.seen_at[wanted])
     assert np.array_equal(masked.seen_by, open_.seen_by[wanted])
     assert np.array_equal(masked.seen_point, open_.seen_point[wanted])
+
+
+def test_rays_of_pinhole_cameras_are_nerfstudios(scene):
+    manager = datamanager(scene)
+    cameras = manager.train_dataset.cameras
+    g = torch.Generator().manual_seed(1)
+    sizes = torch.stack([cameras.height[:, 0], cameras.width[:, 0]], -1)
+    camera = torch.randint(0, len(cameras), (50,), generator=g)
+    indices = torch.cat([camera[:, None], (torch.rand(50, 2, generator=g) * sizes[camera]).long()], -1)
+    made = PinholeRays.of(cameras, "cpu")
+    assert made is not None
+    ours, theirs = made(indices), RayGenerator(cameras)(indices)
+    for name in ("origins", "directions", "camera_indices"):
+        assert torch.allclose(getattr(ours, name), getattr(theirs, name), atol=1e-6), name
+    assert torch.allclose(ours.pixel_area, theirs.pixel_area, rtol=2e-3)  # a difference of unit vectors
+
+
+def test_other_cameras_are_left_to_nerfstudio(scene):
+    cameras = datamanager(scene).train_dataset.cameras
+    bent, round_ = copy.deepcopy(cameras), copy.deepcopy(cameras)
+    bent.distortion_params = torch.zeros(len(cameras), 6)
+    assert PinholeRays.of(bent, "cpu") is not None, "a lens model without effect"
+    bent.distortion_params[1, 0] = 0.1
+    round_.camera_type[2] = CameraType.FISHEYE.value
+    assert PinholeRays.of(bent, "cpu") is None and PinholeRays.of(round_, "cpu") is None

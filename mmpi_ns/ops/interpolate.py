@@ -1,8 +1,8 @@
 """Weighted sums of table rows: the gather behind every bilinear and trilinear lookup.
 
 ``interpolate_reference`` is plain indexing. ``interpolate`` reads by the embedding-bag kernel (3 to 6 times faster on a
-CPU) and has a sparse row gradient, so that backward and optimiser cost follow the rows a batch touched, never the size
-of the table.
+CPU), on a GPU by a Triton kernel, and has a sparse row gradient, so that backward and optimiser cost follow the rows a
+batch touched, never the size of the table.
 """
 
 from __future__ import annotations
@@ -28,7 +28,12 @@ class RowIndex:
 
 
 def index_rows(rows: Int[Tensor, "..."]) -> RowIndex:
-    """The distinct rows (in the order of the reference: rising; of the compiled kernel: as they first occur)."""
+    """The distinct rows (in the order of the reference: rising; of the compiled kernel: as they first occur; on a GPU
+    by Triton: in no particular order)."""
+    if native.takes_triton(rows):
+        from mmpi_ns.ops import triton_tables
+
+        return RowIndex(*triton_tables.index_rows(rows))
     count = rows.numel()
     lib = native.library() if rows.device.type == "cpu" and 0 < count < 2**30 else None
     if lib is None:
@@ -52,6 +57,10 @@ def sum_by_position(
     position: Int[Tensor, "N B"], values: Float[Tensor, "N C"], weights: Float[Tensor, "N B"] | None, count: int
 ) -> Float[Tensor, "U C"]:
     """For each of ``count`` rows the sum of weights[n, b] values[n] over its entries (None: B = 1, weights of 1)."""
+    if native.takes_triton(values):
+        from mmpi_ns.ops import triton_tables
+
+        return triton_tables.sum_by_position(position, values, weights, count)
     out = torch.zeros(count, values.shape[1], dtype=values.dtype, device=values.device)
     lib = native.library(values) if position.dtype == torch.int32 else None
     if lib is None:
@@ -81,12 +90,20 @@ def interpolate_reference(
     return (table[rows] * weights[..., None]).sum(1)
 
 
+def _weighted_rows(table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
+    if native.takes_triton(table):
+        from mmpi_ns.ops import triton_tables
+
+        return triton_tables.interpolate(table, rows, weights)
+    return torch.nn.functional.embedding_bag(rows, table, per_sample_weights=weights, mode="sum")
+
+
 class _Interpolate(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
         ctx.save_for_backward(rows, weights)
         ctx.table_shape = table.shape
-        return torch.nn.functional.embedding_bag(rows, table, per_sample_weights=weights, mode="sum")
+        return _weighted_rows(table, rows, weights)
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, None, None]:
@@ -130,7 +147,7 @@ class _InterpolateGathered(torch.autograd.Function):
     def forward(ctx: Any, gathered: Tensor, position: Tensor, weights: Tensor) -> Tensor:
         ctx.save_for_backward(position, weights)
         ctx.count = gathered.shape[0]
-        return torch.nn.functional.embedding_bag(position, gathered, per_sample_weights=weights, mode="sum")
+        return _weighted_rows(gathered, position, weights)
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor, None, None]:

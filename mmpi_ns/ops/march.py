@@ -21,7 +21,8 @@ from mmpi_ns.ops import native
 from mmpi_ns.placement.plan import MPIPlan
 from mmpi_ns.texels import TexelGrid
 
-_FORMS: dict[BlendForm | None, int] = {None: 0, "paper": 1, "opacity": 2}
+FORMS: dict[BlendForm | None, int] = {None: 0, "paper": 1, "opacity": 2}
+"""How the kernels are told in which form reliability enters."""
 _SAMPLE_TYPES = (torch.int32, torch.int32, *[torch.float32] * 4)
 
 
@@ -182,7 +183,7 @@ def march(
             ctypes.c_int64(end),
             ctypes.c_float(threshold),
             ctypes.c_float(fair_share),
-            _FORMS[form],
+            FORMS[form],
             *ends,
             *places,
         )

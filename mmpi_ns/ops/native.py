@@ -1,7 +1,8 @@
-"""The fast path on a CPU: kernels in ``cpp``, compiled by the machine's own C++ compiler at first use (2 seconds).
+"""The fast paths. On a CPU: kernels in ``cpp``, compiled by the machine's own C++ compiler at first use (2 seconds).
+On a GPU: Triton kernels in ``triton_*.py``, compiled by Triton, which comes with torch on Linux.
 
-Which path runs is one setting of the process, ``choose``: ``auto`` takes the kernels where a compiler is found and
-says so where there is none. Every kernel has a reference in plain torch under the same signature.
+Which path runs is one setting of the process, ``choose``: ``auto`` takes the kernels where they can be had and says so
+where they cannot. Every kernel has a reference in plain torch under the same signature.
 """
 
 from __future__ import annotations
@@ -29,7 +30,9 @@ FLAGS = ["-std=c++17", "-O3", "-march=native", "-fno-math-errno", "-shared", "-f
 """Nothing that reorders sums: a result never depends on how the compiler groups them."""
 SOURCES = Path(__file__).parent / "cpp"
 
+_OTHER_FLOATS = (torch.float16, torch.bfloat16, torch.float64)
 _chosen: Route = "auto"
+_interpreting = False
 
 
 def choose(path: Route) -> None:
@@ -40,13 +43,43 @@ def choose(path: Route) -> None:
     """
     global _chosen
     _chosen = path
-    if path == "native" and isinstance(reason := _build(), str):
+    if path != "native":
+        return
+    reason = _triton_fault() if torch.cuda.is_available() or _interpreting else _build()
+    if isinstance(reason, str):
         raise ValueError(f"The compiled kernels cannot be had: {reason}. Use --pipeline.model.ops auto or torch.")
+
+
+def interpret(on: bool) -> None:
+    """Lets Triton's interpreter run the GPU's kernels on CPU tensors: for tests and rehearsals, and very slow.
+
+    Raises:
+        ValueError: TRITON_INTERPRET=1 was not in the environment when the process started, or there is no Triton.
+    """
+    global _interpreting
+    if on and os.environ.get("TRITON_INTERPRET") != "1":
+        raise ValueError("Triton's interpreter must be asked for before Python starts: set TRITON_INTERPRET=1.")
+    _interpreting = on
+    if on and (reason := _triton_fault()) is not None:
+        _interpreting = False
+        raise ValueError(f"Triton cannot be had: {reason}.")
+
+
+def takes_triton(*tensors: Tensor) -> bool:
+    """Whether the Triton kernels are wanted, can be had and take these tensors (float32, or integers, on a GPU)."""
+    if _chosen == "torch" or any(t.dtype in _OTHER_FLOATS for t in tensors):
+        return False
+    devices = {t.device.type for t in tensors}
+    if devices == {"cpu"}:
+        return _interpreting
+    return devices == {"cuda"} and not _interpreting and _triton_fault() is None
 
 
 def library(*tensors: Tensor) -> ctypes.CDLL | None:
     """The compiled kernels, where they are wanted, can be had and take these tensors (float32 on a CPU)."""
-    if _chosen == "torch" or any(t.device.type != "cpu" or t.dtype != torch.float32 for t in tensors):
+    if _chosen == "torch" or _interpreting:
+        return None
+    if any(t.device.type != "cpu" or t.dtype != torch.float32 for t in tensors):
         return None
     built = _build()
     return None if isinstance(built, str) else built
@@ -111,6 +144,20 @@ def _processor() -> bytes:
         return "".join(sorted({x for x in lines if x.startswith(("model name", "flags", "Features"))})).encode()
     except OSError:
         return f"{platform.machine()} {platform.processor()} {platform.node()}".encode()
+
+
+@functools.cache
+def _triton_fault() -> str | None:
+    """Why the Triton kernels cannot be had (also said once in the log); None where they can."""
+    try:
+        from mmpi_ns.ops.triton_tables import works
+    except ImportError as error:
+        return _unavailable(f"Triton cannot be imported ({error})")
+    try:
+        works("cpu" if _interpreting else "cuda")
+    except Exception as error:  # a driver, a compiler or a cache folder may fail in many ways: all mean plain torch
+        return _unavailable(f"Triton does not run here ({type(error).__name__}: {error})")
+    return None
 
 
 def _unavailable(reason: str) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import functools
 from typing import Any
 
 import torch
@@ -41,6 +42,13 @@ def total_variation_reference(
         around = table[neighbours.reshape(-1)].view(*neighbours.shape, -1)
         total = total + losses.total_variation(values[own], around, weights)
     return total
+
+
+@functools.lru_cache(maxsize=8)
+def _on_device(grids: tuple[TexelGrid, ...], scales: tuple[tuple[float, ...], ...], device: torch.device):
+    """Blocks and scales as tensors, copied to the device once."""
+    blocks = torch.tensor([(g.offset, g.depth, g.height, g.width, 0) for g in grids], device=device)
+    return blocks, torch.tensor(scales, dtype=torch.float32, device=device)
 
 
 class _Variation(torch.autograd.Function):
@@ -82,6 +90,10 @@ def total_variation(
     scales: Scales,
 ) -> Float[Tensor, ""]:
     """``total_variation_reference``, compiled where it can be."""
+    if native.takes_triton(table):
+        from mmpi_ns.ops.triton_tables import Variation
+
+        return Variation.apply(values, table, rows, *_on_device(tuple(grids), tuple(scales), rows.device))  # type: ignore
     lib = native.library(table)
     if lib is None:
         return total_variation_reference(values, table, rows, grids, scales)

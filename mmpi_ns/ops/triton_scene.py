@@ -1,0 +1,215 @@
+"""What the Triton kernels know of a plan, and the functions they share. The counterpart of ``cpp/scene.h``.
+
+Imported only where Triton is wanted (``native.takes_triton``): the package runs without it.
+"""
+
+# Triton's language has no types that pyright knows: a kernel's functions seem to return nothing.
+# pyright: reportGeneralTypeIssues=false, reportCallIssue=false, reportArgumentType=false
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+import triton
+import triton.language as tl
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from mmpi_ns.geometry import Cube
+from mmpi_ns.placement.plan import MPIPlan
+from mmpi_ns.texels import TexelGrid
+
+# Columns of the constants of a head; the cube's row holds its interval alone.
+STEP = tl.constexpr(0)
+END = tl.constexpr(1)
+SLACK = tl.constexpr(2)
+S_SCALE = tl.constexpr(3)
+U0 = tl.constexpr(4)
+U_SCALE = tl.constexpr(5)
+V0 = tl.constexpr(6)
+V_SCALE = tl.constexpr(7)
+INTERVAL = tl.constexpr(8)
+FLOATS = tl.constexpr(9)
+# Columns of a head's block of the tables.
+OFFSET = tl.constexpr(0)
+DEPTH = tl.constexpr(1)
+HEIGHT = tl.constexpr(2)
+WIDTH = tl.constexpr(3)
+BIAS = tl.constexpr(4)
+INTS = tl.constexpr(5)
+
+
+@dataclass(frozen=True)
+class TritonScene:
+    """A plan's constants on the device (``MarchScene`` for the GPU)."""
+
+    heads: Float[Tensor, "H 9"]
+    grids: Int[Tensor, "H 5"]
+    biases: Float[Tensor, "P"]
+    cube: Float[Tensor, "8"]
+    """Lower corner, extent, step between samples, bias; zeros without a cube."""
+    num_mpis: int
+    num_heads: int
+    most_samples: int
+    """No ray has more: planes of all MPIs, and the cube's diagonal in steps."""
+
+    @staticmethod
+    def pack(
+        mpis: tuple[MPIPlan, ...],
+        grids: list[TexelGrid],
+        biases: list[Float[Tensor, "L"]],
+        depth_scale: float,
+        cube: tuple[Cube, float, float] | None,
+        device: torch.device,
+    ) -> TritonScene:
+        """See ``MarchScene``; ``cube`` comes with the bias and the interval of its samples."""
+        rows, most = [_head_row(m, depth_scale) for m in mpis], sum(m.planes for m in mpis)
+        numbers = [0.0] * 8
+        if cube is not None:
+            box, bias, interval = cube
+            extent = (box.upper - box.lower).tolist()
+            numbers = [*box.lower.tolist(), *extent, box.step, bias]
+            rows.append([0.0] * 8 + [interval])
+            most += int(2 * math.hypot(*extent) / box.step) + 2
+        starts = [sum(len(b) for b in biases[:k]) for k in range(len(grids))]
+        blocks = [(g.offset, g.depth, g.height, g.width, b) for g, b in zip(grids, starts, strict=True)]
+        return TritonScene(
+            torch.tensor(rows, dtype=torch.float32, device=device),
+            torch.tensor(blocks, dtype=torch.int64, device=device),
+            torch.cat(biases).to(device, torch.float32).contiguous(),
+            torch.tensor(numbers, dtype=torch.float32, device=device),
+            len(mpis),
+            len(grids),
+            most,
+        )
+
+    def constants(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        return self.heads, self.grids, self.biases, self.cube
+
+
+def _head_row(mpi: MPIPlan, depth_scale: float) -> list[float]:
+    u0, u1, v0, v1 = mpi.extent
+    slack = 16 * torch.finfo(torch.float32).eps / mpi.depth_share  # as in geometry.local_to_ndc
+    depth = [mpi.disparity_step, mpi.last_disparity, slack, 2 * mpi.near / mpi.depth_share]
+    return [*depth, u0, 2 / (u1 - u0), v0, 2 / (v1 - v0), 256.0 / mpi.planes * depth_scale]
+
+
+def block_size(wanted: int, device: torch.device) -> int:
+    """Rays or rows of a program. The interpreter runs one program after the other, so there the fewer the better."""
+    return wanted if device.type == "cuda" else 16 * wanted
+
+
+# Texels -------------------------------------------------------------------------------------------------------------
+
+
+@triton.jit
+def row_of(grids, head, plane, y, x):
+    """Row of a head's texel in the pooled tables: with ``place_of``, all that knows how texels are stored."""
+    grid = grids + head * INTS
+    return tl.load(grid + OFFSET) + (plane * tl.load(grid + HEIGHT) + y) * tl.load(grid + WIDTH) + x
+
+
+@triton.jit
+def place_of(grids, row, NUM_HEADS: tl.constexpr):
+    """Head, plane, y and x of a row: the inverse of ``row_of``."""
+    head = row.to(tl.int32) * 0
+    for k in tl.static_range(1, NUM_HEADS):
+        head += (row >= tl.load(grids + k * INTS + OFFSET)).to(tl.int32)
+    grid = grids + head * INTS
+    local, width = row - tl.load(grid + OFFSET), tl.load(grid + WIDTH)
+    layer = width * tl.load(grid + HEIGHT)
+    plane = local // layer
+    return head, plane, (local - plane * layer) // width, local % width
+
+
+@triton.jit
+def cell(coordinate, size):
+    """Lower texel and fraction of a coordinate in [-1, 1] over ``size`` texels; outside it clamps to the border."""
+    last = (size - 1).to(tl.float32)
+    position = tl.minimum(tl.maximum((coordinate + 1) * (0.5 * last), 0.0), last)
+    lower = tl.minimum(tl.floor(position), last - 1)
+    return lower.to(tl.int64), position - lower
+
+
+@triton.jit
+def bilinear(table, grids, head, plane, u, v, mask):
+    """A one-channel table at NDC (u, v) on a plane; 0 where masked."""
+    x, fx = cell(u, tl.load(grids + head * INTS + WIDTH))
+    y, fy = cell(v, tl.load(grids + head * INTS + HEIGHT))
+    a = tl.load(table + row_of(grids, head, plane, y, x), mask, 0.0)
+    b = tl.load(table + row_of(grids, head, plane, y, x + 1), mask, 0.0)
+    c = tl.load(table + row_of(grids, head, plane, y + 1, x), mask, 0.0)
+    d = tl.load(table + row_of(grids, head, plane, y + 1, x + 1), mask, 0.0)
+    return (1 - fx) * (1 - fy) * a + fx * (1 - fy) * b + (1 - fx) * fy * c + fx * fy * d
+
+
+@triton.jit
+def trilinear(table, grids, head, u, v, s, mask):
+    """A one-channel table at NDC (u, v, s), s running over planes or layers; 0 where masked."""
+    z, fz = cell(s, tl.load(grids + head * INTS + DEPTH))
+    near = bilinear(table, grids, head, z, u, v, mask)
+    return near * (1 - fz) + bilinear(table, grids, head, z + 1, u, v, mask) * fz
+
+
+@triton.jit
+def nearest(coordinate, size):
+    """Texel nearest to a coordinate in [-1, 1]; halves go to the even one, as torch.round has it."""
+    last = (size - 1).to(tl.float32)
+    position = tl.minimum(tl.maximum((coordinate + 1) * (0.5 * last), 0.0), last)
+    down = tl.floor(position)
+    odd = down - 2 * tl.floor(0.5 * down)
+    up = ((position - down > 0.5) | ((position - down == 0.5) & (odd == 1))).to(tl.float32)
+    return (down + up).to(tl.int64)
+
+
+@triton.jit
+def nearest_row(grids, head, u, v, s):
+    """Row of the texel nearest to NDC (u, v, s)."""
+    grid = grids + head * INTS
+    x, y = nearest(u, tl.load(grid + WIDTH)), nearest(v, tl.load(grid + HEIGHT))
+    return row_of(grids, head, nearest(s, tl.load(grid + DEPTH)), y, x)
+
+
+# Arithmetic that stays exact where its plain form cancels ---------------------------------------------------------
+
+
+@triton.jit
+def twice_atanh(z):
+    """log((1 + z) / (1 - z)) for |z| <= 1/3, to a few ulp."""
+    q = z * z
+    p = 1.0 / 15
+    p = p * q + 1.0 / 13
+    p = p * q + 1.0 / 11
+    p = p * q + 1.0 / 9
+    p = p * q + 1.0 / 7
+    p = p * q + 1.0 / 5
+    p = p * q + 1.0 / 3
+    return 2 * z * (p * q + 1.0)
+
+
+@triton.jit
+def softplus(x):
+    """log(1 + e^x)."""
+    y = tl.exp(-tl.abs(x))
+    return tl.maximum(x, 0.0) + twice_atanh(y / (2 + y))
+
+
+@triton.jit
+def one_minus_exp(tau):
+    """1 - e^-tau for tau >= 0, also of thin samples."""
+    t = tl.minimum(tau, 0.5)
+    p = 1 - t * (1.0 / 8)
+    p = 1 - t * (1.0 / 7) * p
+    p = 1 - t * (1.0 / 6) * p
+    p = 1 - t * (1.0 / 5) * p
+    p = 1 - t * (1.0 / 4) * p
+    p = 1 - t * (1.0 / 3) * p
+    p = 1 - t * (1.0 / 2) * p
+    return tl.where(tau < 0.5, t * p, 1 - tl.exp(-tau))
+
+
+@triton.jit
+def minus_log_of_rest(alpha):
+    """-log(1 - alpha) for alpha in [0, 1/2)."""
+    return twice_atanh(alpha / (2 - alpha))
