@@ -152,8 +152,7 @@ class MMPIModel(Model):
                 optimizers[kind].reset_moments(self.get_param_groups()[kind][0])
 
     def _enter_window(self, window: int, factor: float) -> None:
-        """Puts the window that is trained away, and begins another with fresh tables and networks."""
-        self.store.save(self.window, self.field, self._new_field)
+        """Begins another window with fresh tables and networks; the trainer has put the one before away."""
         self.window = window
         self.window_number.fill_(window)
         self.store.forget(window)

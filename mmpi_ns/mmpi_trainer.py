@@ -11,7 +11,7 @@ import torch
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.schedulers import Scheduler, SchedulerConfig
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
-from nerfstudio.utils.decorators import check_main_thread
+from nerfstudio.utils import comms
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
@@ -78,12 +78,22 @@ class MMPITrainer(Trainer):
         model_config: Any = self.config.pipeline.model
         self._window_steps = model_config.total_steps = self.config.max_num_iterations
         model_config.windows_folder = self.base_dir / WINDOWS_FOLDER
+        # Processes share the windows out among them; nerfstudio would have all of them average their gradients.
+        self._processes, self._process, self.world_size = self.world_size, comms.get_rank(), 1
+        self._resumes_from = self.config.load_dir
+        if self._processes > 1:
+            self.config.load_dir = None
         super().setup(test_mode)
         self.config.max_num_iterations = self._window_steps
         plan = self._model.windows
         self.base_dir.mkdir(parents=True, exist_ok=True)
         write_atomically(self.base_dir / PLAN_FILE, lambda path: path.write_text(plan.to_json(), encoding="utf-8"))
         CONSOLE.print(_describe(plan, self._window_steps))
+        if 1 < self._processes and len(plan) < self._processes:
+            raise ValueError(
+                f"The capture has {len(plan)} window(s), too few to share out among {self._processes} processes: start "
+                "fewer, or make windows shorter with --pipeline.model.placement.window-length."
+            )
 
     def setup_optimizers(self) -> Optimizers:
         """nerfstudio's optimisers, with schedulers that know the phases."""
@@ -104,7 +114,11 @@ class MMPITrainer(Trainer):
         return Optimizers(config, self.pipeline.get_param_groups())
 
     def train(self) -> None:
-        """Runs up to max-num-iterations in all; 1.1.5 would run as many again after a resume."""
+        """Runs up to max-num-iterations in all (a window); 1.1.5 would run as many again after a resume."""
+        if self._processes > 1:
+            for window in range(self._process, len(self._model.windows), self._processes):
+                self._train_window(window)
+            return
         self._last_step = self._start_step - 1
         self.config.max_num_iterations = max(0, self._total_steps - self._start_step)
         if self.config.max_num_iterations == 0:
@@ -117,10 +131,39 @@ class MMPITrainer(Trainer):
         finally:
             self.config.max_num_iterations = self._window_steps
 
+    def _train_window(self, window: int) -> None:
+        """Trains one window of several, from where another run left it; nothing where it is finished."""
+        store, first = self._model.store, window * self._window_steps
+        folders = [self.checkpoint_dir, *([self._resumes_from] if self._resumes_from else [])]
+        if len(folders) > 1:
+            store.adopt(folders[1].parent / WINDOWS_FOLDER, [window])
+        last = len(self._model.windows) - 1
+        known = {s: p for f in folders for s, p in checkpoints_in(f).items() if 0 <= s - first < self._window_steps}
+        if store.path(window).is_file() and (window != last or first + self._window_steps - 1 in known):
+            CONSOLE.print(f"Window {window} is finished already.")
+            return
+        self._start_step = first
+        if known:
+            self.config.load_checkpoint = known[max(known)]
+            self._load_checkpoint()
+            self.config.load_checkpoint = None
+        self._last_step = self._start_step - 1
+        self.config.max_num_iterations = first + self._window_steps - self._start_step
+        try:
+            super().train()
+        finally:
+            self.config.max_num_iterations = self._window_steps
+        if window != last:  # its file is all that is needed of it
+            for path in checkpoints_in(self.checkpoint_dir, range(first, first + self._window_steps)).values():
+                path.unlink()
+
     def train_iteration(self, step: int) -> Any:
-        """One step; remembers that it ran."""
+        """One step; remembers that it ran, and puts a window of several away when it was its last."""
         result = super().train_iteration(step)
         self._last_step = step
+        model = self._model
+        if len(model.windows) > 1 and (step + 1) % model.schedule.window_steps == 0:
+            model.store.save(model.window, model.field)
         return result
 
     def _after_train(self) -> None:
@@ -128,13 +171,12 @@ class MMPITrainer(Trainer):
         self.step = self._last_step
         super()._after_train()
 
-    @check_main_thread
     def save_checkpoint(self, step: int) -> None:
         """Writes beside the checkpoint folder, then moves the finished file in: a kill or a full disk loses nothing.
 
         Names inside the folder are parsed as steps by nerfstudio, so the unfinished file must not lie there.
         """
-        if step < 0:
+        if step < 0 or not (self._processes > 1 or comms.is_main_process()):
             return  # stopped before the first step: there is nothing to save
         self.checkpoint_dir.mkdir(parents=True, exist_ok=True)
         path = self.checkpoint_dir / f"step-{step:09d}.ckpt"
@@ -148,7 +190,9 @@ class MMPITrainer(Trainer):
         }
         write_atomically(path, lambda p: torch.save(state, p), self.base_dir)
         if self.config.save_only_latest_checkpoint:
-            for old in self.checkpoint_dir.glob("*.ckpt"):
+            first = step - step % self._window_steps if self._processes > 1 else 0
+            own = range(first, first + self._window_steps) if self._processes > 1 else None  # others are others' work
+            for old in checkpoints_in(self.checkpoint_dir, own).values():
                 if old != path:
                     old.unlink()
 
@@ -161,8 +205,9 @@ class MMPITrainer(Trainer):
                 torch.set_rng_state(state["rng"]["torch"])
             del state
         super()._load_checkpoint()
-        if path is not None:
-            self._model.store.adopt(path.parent.parent / WINDOWS_FOLDER, self._model.window)
+        if path is not None and self._processes == 1:
+            finished = list(range(self._model.schedule.window_at(self._start_step)))
+            self._model.store.adopt(path.parent.parent / WINDOWS_FOLDER, finished, needed=True)
 
     def _checkpoint_path(self) -> Path | None:
         path = self.config.load_checkpoint
@@ -172,13 +217,13 @@ class MMPITrainer(Trainer):
             return path
         if self.config.load_dir is None:
             return None
-        steps = [int(p.stem.split("-")[1]) for p in self.config.load_dir.glob("step-*.ckpt")]
+        steps = checkpoints_in(self.config.load_dir)
         if not steps:
             raise ValueError(f"There is no checkpoint in {self.config.load_dir}: give the nerfstudio_models folder.")
         step = self.config.load_step if self.config.load_step is not None else max(steps)
         if step not in steps:
             raise ValueError(f"There is no step {step} in {self.config.load_dir}: it holds {sorted(steps)}.")
-        return self.config.load_dir / f"step-{step:09d}.ckpt"
+        return steps[step]
 
     def _check_same_plan(self, pipeline_state: dict[str, Any], path: Path) -> None:
         stored = pipeline_state.get("_model.windows_bytes", pipeline_state.get("_model.field.plan_bytes"))
@@ -195,6 +240,12 @@ class MMPITrainer(Trainer):
 def _in_short(windows: WindowedPlan) -> str:
     mpis = f"{sum(len(plan.mpis) for plan in windows.plans)} MPIs"
     return mpis if len(windows) == 1 else f"{len(windows)} windows with {mpis}"
+
+
+def checkpoints_in(folder: Path, steps: range | None = None) -> dict[int, Path]:
+    """The checkpoints in a folder by their steps, all or those of some steps."""
+    found = {int(p.stem.split("-")[1]): p for p in folder.glob("step-*.ckpt")}
+    return {step: path for step, path in found.items() if steps is None or step in steps}
 
 
 def _check_device(device_type: str) -> None:

@@ -1,4 +1,4 @@
-"""The windows of a long capture that are not being trained: on disk, and a few of them in memory to render."""
+"""The finished windows of a long capture: on disk, and a few of them in memory to render."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from mmpi_ns.mmpi_field import MMPIField
 
 
 class WindowStore:
-    """Finished windows, one file each; without a folder all stay in memory.
+    """Finished windows, one file each.
 
     Args:
-        folder: where the files lie, or None.
+        folder: where the files lie; None where there is one window alone.
         resident: windows held in memory at once to render.
     """
 
@@ -29,27 +29,23 @@ class WindowStore:
         self._fields: dict[int, MMPIField] = {}
 
     def path(self, window: int) -> Path:
-        assert self.folder is not None
+        assert self.folder is not None, "several windows need a folder"
         return self.folder / f"window-{window:05d}.pt"
 
     def forget(self, window: int) -> None:
         """Leaves the file alone: the window is about to be trained, and will be written anew."""
         self._fields.pop(window, None)
 
-    def save(self, window: int, field: MMPIField, empty: Callable[[], MMPIField]) -> None:
-        """Keeps a finished window: written whole, or not at all.
+    def save(self, window: int, field: MMPIField) -> None:
+        """Writes a finished window: whole, or not at all.
 
         Raises:
             OSError: the disk is full or cannot be written.
         """
-        if self.folder is None:
-            kept = empty()
-            kept.load_state_dict({name: value.clone() for name, value in field.state_dict().items()})
-            self._fields[window] = kept.to(field.density.device).eval()
-            return
-        self.folder.mkdir(parents=True, exist_ok=True)
+        path = self.path(window)
+        path.parent.mkdir(parents=True, exist_ok=True)
         state = {"window": window, "field": field.state_dict()}
-        write_atomically(self.path(window), lambda path: torch.save(state, path))
+        write_atomically(path, lambda unfinished: torch.save(state, unfinished))
 
     def load(self, window: int, empty: Callable[[], MMPIField], device: torch.device) -> MMPIField:
         """A finished window, ready to render.
@@ -65,8 +61,8 @@ class WindowStore:
         if window in self._fields:
             self._fields[window] = self._fields.pop(window)  # newest last
             return self._fields[window]
-        path = self.path(window) if self.folder is not None else None
-        if path is None or not path.is_file():
+        path = self.path(window)
+        if not path.is_file():
             raise ValueError(
                 f"Window {window} of this run is missing: {path} is not there. Put the run's folder 'windows' back, or "
                 "name where it is in config.yml (pipeline.model.windows_folder)."
@@ -80,28 +76,29 @@ class WindowStore:
                 f"Window {window} of this run is damaged: {path} cannot be read ({brief(error)}). Copy it anew, or "
                 "train it again: resume from a checkpoint of before its end with --load-step."
             ) from error
-        while self.folder is not None and len(self._fields) >= self.resident:
+        while len(self._fields) >= self.resident:
             del self._fields[next(iter(self._fields))]
         self._fields[window] = field.to(device).eval()
         return self._fields[window]
 
-    def adopt(self, other: Path, windows: int) -> None:
-        """Takes over the first finished windows of the run that this one goes on from.
+    def adopt(self, other: Path, windows: list[int], needed: bool = False) -> None:
+        """Takes over finished windows of the run that this one goes on from.
 
         Raises:
-            ValueError: one is missing there.
+            ValueError: one is missing there that is needed.
         """
-        if self.folder is None or other.resolve() == self.folder.resolve():
+        if not windows or other.resolve() == Path(self.path(0)).parent.resolve():
             return
-        self.folder.mkdir(parents=True, exist_ok=True)
-        for window in range(windows):
-            source = other / self.path(window).name
-            if not source.is_file():
+        for window in windows:
+            path, source = self.path(window), other / self.path(window).name
+            if source.is_file():
+                path.parent.mkdir(parents=True, exist_ok=True)
+                write_atomically(path, lambda unfinished, source=source: shutil.copyfile(source, unfinished))
+            elif needed:
                 raise ValueError(
                     f"Window {window} of the run to go on from is missing: {source} is not there. Put it back, or "
                     "resume from a checkpoint of before its end with --load-step."
                 )
-            write_atomically(self.path(window), lambda path, source=source: shutil.copyfile(source, path))
 
 
 def mix_windows(

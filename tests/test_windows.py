@@ -4,16 +4,22 @@ from __future__ import annotations
 
 import json
 import math
+import os
+import shutil
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 from hand_made import make_mpi
+from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.utils.eval_utils import eval_setup
 from test_resume import compared, differences, load
 from training_runs import datamanager, plan_of, ready, trainer_config
 
+from mmpi_ns.mmpi_windows import WindowStore
 from mmpi_ns.phases import make_schedule
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.placement.plan import ScenePlan
@@ -42,7 +48,7 @@ def road(length: float, spacing: float = 1.0) -> Observations:
     points = points + rng.uniform(-2, 2, (len(s), 30))[..., None] * up
     count = points.shape[0] * points.shape[1]
     return Observations(
-        camera_to_worlds=poses,
+        camera_to_worlds=poses.astype(np.float64),
         intrinsics=np.tile([100.0, 100.0, 80.0, 40.0], (len(s), 1)),
         sizes=np.tile([160.0, 80.0], (len(s), 1)),
         points=points.reshape(-1, 3),
@@ -202,7 +208,7 @@ def whole(scene, windows_file, tmp_path_factory):
 def test_each_window_gets_all_steps_and_a_file(whole):
     steps = sorted(int(p.stem[5:]) for p in whole.checkpoint_dir.iterdir())
     assert steps == list(range(1, 2 * STEPS))
-    assert [p.name for p in sorted((whole.base_dir / "windows").iterdir())] == ["window-00000.pt"]
+    assert sorted(p.name for p in (whole.base_dir / "windows").iterdir()) == ["window-00000.pt", "window-00001.pt"]
     assert len(load(whole.checkpoint_dir, STEPS - 1)["pipeline"]["_model.field.networks.weights"]) == 2
     assert len(load(whole.checkpoint_dir, STEPS)["pipeline"]["_model.field.networks.weights"]) == 1
 
@@ -253,18 +259,12 @@ def test_the_second_window_learns_as_it_would_alone(whole, scene, tmp_path):
     assert torch.equal(model.field.networks.weights, expected.networks.weights)
 
 
-def rendered(model, origins):
-    from nerfstudio.cameras.rays import RayBundle
-
-    axes = -whole_axes(model)
-    directions = torch.tensor(axes[2]).float().expand(len(origins), 3) * -1
+def rendered(model, origins) -> dict[str, torch.Tensor]:
+    facing = np.asarray(model.windows.plans[0].mpis[0].axes)[2]
+    directions = torch.tensor(facing).float().expand(len(origins), 3)
     bundle = RayBundle(origins, directions, torch.ones(len(origins), 1), torch.zeros(len(origins), 1).long())
     with torch.no_grad():
         return model.eval().get_outputs(bundle)
-
-
-def whole_axes(model):
-    return np.asarray(model.windows.plans[0].mpis[0].axes)
 
 
 def test_rays_are_mixed_by_where_they_start(whole):
@@ -373,27 +373,103 @@ def test_a_full_disk_at_a_windows_end_keeps_the_checkpoint(scene, windows_file, 
     with pytest.raises(OSError, match="could not be written"):
         trainer.train()
     assert not list((trainer.base_dir / "windows").glob("*"))
-    assert load(trainer.checkpoint_dir, STEPS - 1)["step"] == STEPS - 1
-
-
-def test_windows_stay_in_memory_without_a_folder(whole, scene, windows_file, tmp_path):
-    from mmpi_ns.mmpi_windows import WindowStore
-
-    store = WindowStore(None, resident=1)
-    model = whole.pipeline.model
-    store.save(0, model.field, model._new_field)
-    kept = store.load(0, model._new_field, model.device)
-    assert torch.equal(kept.density, model.field.density) and kept.density is not model.field.density
+    assert load(trainer.checkpoint_dir, STEPS - 2)["step"] == STEPS - 2
 
 
 def test_no_more_windows_are_in_memory_than_asked(whole):
-    from mmpi_ns.mmpi_windows import WindowStore
-
     model = whole.pipeline.model
     store = WindowStore(model.store.folder, resident=1)
     for number in (0, 1, 0):
         if number == 1:
-            store.save(1, model.field, model._new_field)
+            store.save(1, model.field)
         store.load(number, model._new_field, model.device)
         assert list(store._fields) == [number]
-    store.path(1).unlink()
+
+
+# Several processes ---------------------------------------------------------------------------------------------------
+
+
+def torchrun(scene, windows_file, output, processes, *options):
+    """The command a user would type; returns its exit status and what it said."""
+    command = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", str(processes), "--standalone"]
+    command += ["-m", "mmpi_ns.scripts.train", "mmpi-small", "--data", str(scene), "--output-dir", str(output)]
+    command += ["--experiment-name", "tiny", "--timestamp", "run", "--max-num-iterations", str(STEPS)]
+    command += ["--machine.device-type", "cpu", "--vis", "tensorboard", "--pipeline.model.plan-file", str(windows_file)]
+    command += ["--pipeline.datamanager.train-num-rays-per-batch", "64", "--pipeline.datamanager.keypoint-rays", "16"]
+    command += ["--pipeline.model.hidden-width", "8", "--pipeline.model.feature-channels", "4"]
+    command += ["--pipeline.model.growth-shares", "0.25", "0.5", "--steps-per-save", "2", *options]
+    done = subprocess.run(
+        command, capture_output=True, text=True, timeout=300, env={**os.environ, "OMP_NUM_THREADS": "1"}
+    )
+    return done.returncode, done.stdout + done.stderr
+
+
+@pytest.fixture(scope="module")
+def shared(scene, windows_file, tmp_path_factory):
+    output = tmp_path_factory.mktemp("shared")
+    status, said = torchrun(scene, windows_file, output, 2)
+    assert status == 0, said[-2000:]
+    return output / "tiny" / "mmpi-small" / "run", said
+
+
+def test_two_processes_end_as_one_does(whole, shared):
+    """Same windows, bit for bit: draws depend on seed and step alone."""
+    folder, said = shared
+    for name in ("window-00000.pt", "window-00001.pt"):
+        ours, theirs = (torch.load(f / "windows" / name, weights_only=True) for f in (folder, whole.base_dir))
+        assert differences(ours, theirs) == [], name
+    wanted = load(whole.checkpoint_dir, 2 * STEPS - 1)["pipeline"]
+    assert differences(load(folder / "nerfstudio_models", 2 * STEPS - 1)["pipeline"], wanted) == []
+    assert [p.name for p in (folder / "nerfstudio_models").iterdir()] == [f"step-{2 * STEPS - 1:09d}.ckpt"]
+    assert "All windows are trained" in said
+
+
+def test_what_two_processes_trained_is_evaluated_as_any_run(whole, shared):
+    _, pipeline, _, _ = eval_setup(shared[0] / "config.yml", test_mode="inference")
+    origins = torch.stack([torch.tensor(w.center).float() for w in whole.pipeline.model.windows.windows])
+    assert torch.equal(rendered(pipeline.model, origins)["rgb"], rendered(whole.pipeline.model, origins)["rgb"])
+
+
+def test_another_number_of_processes_goes_on_from_the_windows_that_are_finished(
+    whole, shared, scene, windows_file, tmp_path
+):
+    """Window 1 was cut off in the middle; its checkpoint and the file of window 0 are all that is left."""
+    left = tmp_path / "left"
+    (left / "windows").mkdir(parents=True)
+    (left / "nerfstudio_models").mkdir()
+    shutil.copy(shared[0] / "windows" / "window-00000.pt", left / "windows")
+    name = f"step-{STEPS + 2:09d}.ckpt"
+    shutil.copy(whole.checkpoint_dir / name, left / "nerfstudio_models")
+    load_dir = ("--load-dir", str(left / "nerfstudio_models"))
+    status, said = torchrun(scene, windows_file, tmp_path / "out", 1, *load_dir)
+    assert status == 0, said[-2000:]
+    folder = tmp_path / "out" / "tiny" / "mmpi-small" / "run"
+    ours, theirs = (torch.load(f / "windows" / "window-00001.pt", weights_only=True) for f in (folder, shared[0]))
+    assert differences(ours, theirs) == []
+
+
+def test_more_processes_than_windows_are_refused(scene, windows_file, tmp_path):
+    trainer = trainer_config(scene, windows_file, tmp_path, STEPS).setup(local_rank=0, world_size=3)
+    with pytest.raises(ValueError, match=r"2 window\(s\), too few to share out among 3 processes"):
+        trainer.setup()
+
+
+def test_a_process_that_is_killed_ends_the_run_and_leaves_what_is_finished(scene, windows_file, tmp_path, monkeypatch):
+    """The second process dies in its first step; the first window is whole, or can be trained again."""
+    code = tmp_path / "code"
+    code.mkdir()
+    (code / "sitecustomize.py").write_text(
+        "import os\n"
+        "if os.environ.get('RANK') == '1':\n"
+        "    import mmpi_ns.mmpi_model as m, signal\n"
+        "    m.MMPIModel.prepare_step = lambda self, attributes, step: os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(code), os.environ.get("PYTHONPATH", "")]))
+    status, said = torchrun(scene, windows_file, tmp_path / "out", 2)
+    assert status != 0 and "SIGKILL" in said, said[-3000:]
+    assert "Ended early: another process died" in said and "--load-dir" in said
+    monkeypatch.undo()
+    run = tmp_path / "out" / "tiny" / "mmpi-small" / "run"
+    status, said = torchrun(scene, windows_file, tmp_path / "again", 2, "--load-dir", str(run / "nerfstudio_models"))
+    assert status == 0, said[-2000:]
+    assert (tmp_path / "again" / "tiny" / "mmpi-small" / "run" / "windows" / "window-00001.pt").is_file()

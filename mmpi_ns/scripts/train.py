@@ -1,0 +1,80 @@
+"""``ns-train`` in several processes that share the windows of a long capture out among them; no GPU is needed.
+
+    torchrun --nproc-per-node 2 -m mmpi_ns.scripts.train mmpi-small --data road/
+
+nerfstudio starts several processes on GPUs alone (``--machine.num-devices``). Windows have nothing in common, so
+nothing is exchanged but a barrier at the beginning and at the end. Every finished window is a file; the same command
+with ``--load-dir``, and with any number of processes, goes on from those.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from datetime import timedelta
+from pathlib import Path
+from typing import NoReturn
+
+import torch.distributed as dist
+import tyro
+from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
+from nerfstudio.engine.trainer import TrainerConfig
+from nerfstudio.scripts.train import train_loop
+from nerfstudio.utils import profiler
+
+TIMEOUT = timedelta(days=7)
+"""Processes with less to do wait so long for the others; one that dies ends the run at once, by torchrun."""
+
+
+def main() -> None:
+    """Trains this process's share of the windows."""
+    if "RANK" not in os.environ:
+        sys.exit("Start it as: torchrun --nproc-per-node N -m mmpi_ns.scripts.train mmpi-small --data ...")
+    config: TrainerConfig = tyro.cli(AnnotatedBaseConfigUnion)
+    dist.init_process_group("gloo", timeout=TIMEOUT)
+    rank, processes = dist.get_rank(), dist.get_world_size()
+    try:
+        _agree(config, rank)
+        signal.signal(signal.SIGTERM, lambda *_: _end_early(config.get_base_dir()))
+        train_loop(rank, processes, config)
+        _wait_for_others(config.get_base_dir())
+        if rank == 0:
+            print(f"All windows are trained: ns-eval --load-config {config.get_base_dir() / 'config.yml'}")
+    finally:
+        profiler.flush_profiler(config.logging)
+        dist.destroy_process_group()
+
+
+def _end_early(folder: Path) -> NoReturn:
+    """torchrun ends all processes when one dies."""
+    sys.exit(
+        "Ended early: another process died (see above) or the run was stopped. Finished windows lie in "
+        f"{folder / 'windows'}; the same command with --load-dir {folder / 'nerfstudio_models'} goes on from them, "
+        "with any number of processes."
+    )
+
+
+def _wait_for_others(folder: Path) -> None:
+    try:
+        dist.barrier()
+    except RuntimeError:  # gloo's own words name a socket
+        _end_early(folder)
+
+
+def _agree(config: TrainerConfig, rank: int) -> None:
+    """One folder for all processes, with one config.yml."""
+    if config.data:
+        config.pipeline.datamanager.data = config.data
+    config.set_timestamp()
+    said = [config.timestamp]
+    dist.broadcast_object_list(said, src=0)
+    config.timestamp = said[0]
+    if rank == 0:
+        config.print_to_terminal()
+        config.save_config()
+    dist.barrier()
+
+
+if __name__ == "__main__":
+    main()
