@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import random
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -12,9 +13,11 @@ import numpy as np
 import pytest
 import torch
 from nerfstudio.engine import trainer as nerfstudio_trainer
+from torchmetrics.image import lpip
 
 from mmpi_ns.bench import methods, peers, train, trainings
 from mmpi_ns.bench.alternate import Steps
+from mmpi_ns.bench.apart import run_apart
 from mmpi_ns.bench.curves import Curve, compare
 from mmpi_ns.bench.methods import METHODS
 from mmpi_ns.bench.train import Train
@@ -109,6 +112,7 @@ def test_finished_rows_are_kept_and_others_are_run_again(scene, trained, monkeyp
 
 @pytest.mark.commands
 def test_nerfacto_trains_through_nerfstudios_own_trainer(scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(lpip, "LearnedPerceptualImagePatchSimilarity", None)  # its weights would be fetched
     monkeypatch.setattr(train, "train_apart", in_this_process)
     command(scene, tmp_path, methods=("nerfacto",), steps=("nerfacto=2",), seeds=(0,)).run()
     (row,) = read(tmp_path)["rows"].values()
@@ -118,14 +122,18 @@ def test_nerfacto_trains_through_nerfstudios_own_trainer(scene, tmp_path, monkey
     assert not list((tmp_path / "work").rglob("*.ckpt"))
 
 
+def test_a_process_that_fails_says_why_and_where(tmp_path):
+    row = run_apart("mmpi_ns.bench.nothing", {}, tmp_path, 1)
+    assert row["not_run"].startswith("it failed with status 1 (") and "No module named" in row["not_run"]
+    assert row["not_run"].endswith(f"see {tmp_path / 'output.log'}")
+    assert "nothing" in (tmp_path / "output.log").read_text()
+
+
 @pytest.mark.commands
-def test_a_training_that_fails_says_why_and_where(scene, tmp_path, capsys):
-    made = command(scene, tmp_path, methods=("mmpi-small",), steps=("mmpi-small=1",))
-    request = made._request(scene, METHODS["mmpi-small"], 1, 0, tmp_path)
-    broken = trainings.Request(**{**vars(request), "words": ("mmpi-small", "--no-such-option")})
-    row = train.train_apart(broken, tmp_path / "broken", 1)
-    assert row["not_run"].startswith("it failed with status 2") and "output.log" in row["not_run"]
-    assert "no-such-option" in (tmp_path / "broken" / "output.log").read_text()
+def test_a_process_answers_with_the_threads_that_it_was_given(tmp_path, capsys):
+    point = {"planes": 8, "height": 6, "width": 8, "rays": 16, "mpis": 1, "steps": 1}
+    row = run_apart("mmpi_ns.bench.scaling", point, tmp_path, 1)
+    assert row["texels"] == 8 * 6 * 8 and row["threads"] == 1
 
 
 def test_a_scene_whose_test_images_are_not_the_ones_evaluated_is_refused(scene):
@@ -296,24 +304,26 @@ def test_point_clouds_are_read_without_open3d(tmp_path):
         peers.read_ply(text)
 
 
-@pytest.mark.commands
 def test_points_are_where_nerfstudio_puts_them(tmp_path, monkeypatch):
-    pytest.importorskip("open3d")
-    from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio, NerfstudioDataParserConfig
+    from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio
 
-    from mmpi_ns.scenes.catalogue import make_scene
-    from mmpi_ns.scenes.dataset import write_dataset
-
-    write_dataset(make_scene("still-life", 0, 4, 24, 16), tmp_path / "still", 50, 0.3, 0.0, True)
-
-    def points():
-        config = NerfstudioDataParserConfig(data=tmp_path / "still", downscale_factor=1, load_3D_points=True)
-        return config.setup().get_dataparser_outputs(split="train").metadata
-
-    wanted = points()
+    rng = np.random.default_rng(0)
+    xyz, rgb = rng.normal(size=(7, 3)).astype(np.float32), rng.integers(0, 256, (7, 3))
+    kinds = [f"property float {c}" for c in "xyz"] + [f"property uchar {c}" for c in ("red", "green", "blue")]
+    rows = [" ".join(map(str, [*p, *c])) for p, c in zip(xyz.tolist(), rgb.tolist(), strict=True)]
+    cloud = tmp_path / "cloud.ply"
+    cloud.write_text("\n".join(["ply", "format ascii 1.0", "element vertex 7", *kinds, "end_header", *rows, ""]))
+    # What open3d would have read, in its units.
+    known = SimpleNamespace(points=xyz.astype(np.float64), colors=(rgb + 0.5) / 255)
+    open3d = SimpleNamespace(io=SimpleNamespace(read_point_cloud=lambda path: known))
+    monkeypatch.setitem(sys.modules, "open3d", open3d)  # type: ignore[arg-type]
+    given = (None, cloud, torch.randn(3, 4), 0.3)
+    wanted = Nerfstudio._load_3D_points(*given)  # type: ignore[arg-type]
     monkeypatch.setattr(Nerfstudio, "_load_3D_points", None)  # restored afterwards
     peers.read_points_ourselves()
-    found = points()
-    assert len(wanted["points3D_xyz"]) > 20
-    assert torch.allclose(found["points3D_xyz"], wanted["points3D_xyz"].float(), atol=1e-5)
-    assert (found["points3D_rgb"].int() - wanted["points3D_rgb"].int()).abs().max() <= 1
+    found = Nerfstudio._load_3D_points(*given)  # type: ignore[arg-type]
+    assert wanted is not None and found is not None
+    assert torch.allclose(found["points3D_xyz"], wanted["points3D_xyz"], atol=1e-6)
+    assert torch.equal(found["points3D_rgb"], wanted["points3D_rgb"])
+    cloud.write_text("\n".join(["ply", "format ascii 1.0", "element vertex 0", *kinds, "end_header", ""]))
+    assert Nerfstudio._load_3D_points(*given) is None  # type: ignore[arg-type]

@@ -12,6 +12,7 @@ from nerfstudio.cameras.rays import RayBundle
 
 from mmpi_ns.bench.apart import answer
 from mmpi_ns.bench.dense import _dense as dense_colors
+from mmpi_ns.bench.trainings import replace_lpips
 from mmpi_ns.mmpi_field import MMPIField
 
 
@@ -43,6 +44,7 @@ class Steps:
         from nerfstudio.engine import trainer as nerfstudio_trainer
         from nerfstudio.scripts.train import _set_random_seed
 
+        replace_lpips()
         nerfstudio_trainer.writer.EVENT_WRITERS.clear()
         config: Any = tyro.cli(AnnotatedBaseConfigUnion, args=words)
         config.pipeline.datamanager.data = config.data
@@ -140,30 +142,39 @@ def run(request: Request, tell: Callable[[str], None]) -> dict[str, Any]:
     """Rounds of everything in turn.
 
     Returns:
-        Rays/s of each round for ours, dense and nerfacto, seconds of a frame and of a large one, rays/s of nerfacto's
-        rendering; pixels of the frames; samples a ray of the dense reference.
+        Rays/s of each round for ours, dense and nerfacto; after training, seconds of a frame and of a large one and
+        rays/s of nerfacto's rendering; pixels of the frames; samples a ray of the dense reference.
     """
     ours = Steps(request.ours)
     dense, nerfacto = DenseSteps(ours), Steps(request.nerfacto)
+    assert nerfacto.rays == ours.rays
     nerfacto.run(2)  # its process that prepares batches takes seconds to start
     dense.run(1)
-    names = ("rays_per_s", "dense_rays_per_s", "nerfacto_rays_per_s", "frame_s", "frame_full_s")
-    found: dict[str, Any] = {name: [] for name in (*names, "nerfacto_render_rays_per_s")}
+    training = ("rays_per_s", "dense_rays_per_s", "nerfacto_rays_per_s")
+    frames = ("frame_s", "frame_full_s", "nerfacto_render_rays_per_s")
+    found: dict[str, Any] = {name: [] for name in (*training, *frames)}
+
+    def told(number: int, names: tuple[str, ...]) -> None:
+        tell(f"round {number} of {request.rounds}: " + ", ".join(f"{n} {found[n][-1]:.3g}" for n in names))
+
     steps, seconds = request.steps // request.rounds, 0.0
     for number in range(1, request.rounds + 1):
         spent = ours.run(steps)
         seconds += spent
         found["rays_per_s"].append(steps * ours.rays / spent)
-        found["dense_rays_per_s"].append(request.dense_steps * ours.rays / dense.run(request.dense_steps))
-        found["nerfacto_rays_per_s"].append(
-            request.nerfacto_steps * nerfacto.rays / nerfacto.run(request.nerfacto_steps)
-        )
+        for name, other, count in (
+            ("dense_rays_per_s", dense, request.dense_steps),
+            ("nerfacto_rays_per_s", nerfacto, request.nerfacto_steps),
+        ):
+            found[name].append(count * ours.rays / other.run(count))
+        told(number, training)
+    for number in range(1, request.rounds + 1):  # of the trained model
         for name, larger in (("frame_s", 1), ("frame_full_s", request.full_size)):
             frame_s, found[name.replace("_s", "_pixels")] = ours.render(larger)
             found[name].append(frame_s)
         render_s, rays = nerfacto.render(rays=request.nerfacto_rays)
         found["nerfacto_render_rays_per_s"].append(rays / render_s)
-        tell(f"round {number} of {request.rounds}: " + ", ".join(f"{n} {found[n][-1]:.3g}" for n in names))
+        told(number, frames)
     nerfacto.close()
     whole_run = steps * request.rounds * ours.rays / seconds
     return {**found, "whole_run_rays_per_s": whole_run, "dense_samples": dense.samples}

@@ -125,6 +125,7 @@ def measure(steps: Steps, repeats: int) -> dict[str, Any]:
     ops, counts = operations(model, steps)
     rows = {}
     for op in ops:
+        assert op.name not in rows, f"two operations are called {op.name}"
         seconds = _seconds(op.work, repeats)
         rows[op.name] = {"ms": 1e3 * seconds, "mb": op.bytes_ / 1e6, "mflop": op.flops / 1e6}
         print(f"{op.name}: {1e3 * seconds:.2f} ms", flush=True)
@@ -182,7 +183,11 @@ def _interpolation(field: Any, taps: Taps, gathered: Gathered, channels: int) ->
     return [
         Op("gather rows", lambda: gather_rows(field.features.data, rows), len(rows) * 8 + 2 * table),
         Op("interpolation", lambda: interpolate_gathered(known, position, weights), read + table + values),
-        Op("... backward", lambda: sum_by_position(position, grad, weights, len(rows)), read + table + values),
+        Op(
+            "interpolation, backward",
+            lambda: sum_by_position(position, grad, weights, len(rows)),
+            read + table + values,
+        ),
     ]
 
 
@@ -204,7 +209,7 @@ def _colors(field: Any, samples: Any, lookup: Lookup, channels: int) -> list[Op]
 
     return [
         Op("colour network of one MPI", forward, moved, sums),
-        Op("... and backward", both, 2 * moved, 3 * sums),
+        Op("colour network of one MPI, and backward", both, 2 * moved, 3 * sums),
     ]
 
 
@@ -221,7 +226,7 @@ def _compositing(field: Any, samples: Any, meta: dict[str, Tensor], report: Any)
         tau.grad = colors.grad = None
 
     moved = valid.numel() * (4 + 4 + 1 + 3 * 4)
-    return [Op("compositing", forward, moved), Op("... and backward", both, 2 * moved)]
+    return [Op("compositing", forward, moved), Op("compositing, and backward", both, 2 * moved)]
 
 
 def _variation(field: Any, lookup: Lookup, moved: float) -> Op:
@@ -249,9 +254,16 @@ def _adam(model: MMPIModel, steps: Steps, moved: float) -> Op:
         optimizer.zero_grad()
     torch.stack([loss.reshape(()) for loss in losses.values()]).sum().backward()
 
+    params = [p for o in trainer.optimizers.optimizers.values() for g in o.param_groups for p in g["params"]]
+    grads = [p.grad for p in params]
+
     def work() -> None:
+        for p, grad in zip(params, grads, strict=True):
+            p.grad = grad
         for optimizer in trainer.optimizers.optimizers.values():
             optimizer.step()
+        for p in params:
+            p.grad = None  # other operations have gradients of their own
 
     return Op("Adam", work, moved)
 
@@ -266,19 +278,10 @@ def headline(content: dict[str, Any]) -> dict[str, float]:
     found: dict[str, float] = dict(content["limits"])
     for stage, rows in content["stages"].items():
         found[f"{stage}_step_ms"] = rows["step_ms"]
-        for name, row in _named(rows["ops"]):
+        for name, row in rows["ops"].items():
             slug = "_".join("".join(c if c.isalnum() else " " for c in name.lower()).split())
             found[f"{stage}_{slug}_ms"] = row["ms"]
             found[f"{stage}_{slug}_of_limit"] = _limit(row, content["limits"]) / row["ms"]
-    return found
-
-
-def _named(ops: dict[str, Any]) -> list[tuple[str, dict[str, float]]]:
-    """Names that go on from the one before are written out."""
-    found, before = [], ""
-    for name, row in ops.items():
-        before = name if not name.startswith("...") else before
-        found.append((name.replace("...", before), row))
     return found
 
 
@@ -308,7 +311,7 @@ def table(content: dict[str, Any]) -> str:
             "| operation | ms | MB | GB/s | of the copy | GFLOP/s | limit, ms | of the limit |",
             "|---|---|---|---|---|---|---|---|",
         ]
-        for name, r in _named(found["ops"]):
+        for name, r in found["ops"].items():
             rate, limit = r["mb"] / r["ms"], _limit(r, limits)
             flops = f"{r['mflop'] / r['ms']:.0f}" if r["mflop"] else ""
             lines.append(
@@ -328,7 +331,7 @@ def draw(path: Path, content: dict[str, Any]) -> None:
     stages = content["stages"]
     figure, axes = plt.subplots(1, len(stages), figsize=(12, 4.5), layout="constrained", sharey=True)
     for axis, (stage, found) in zip(axes, stages.items(), strict=True):
-        named = _named(found["ops"])
+        named = list(found["ops"].items())
         axis.barh([n for n, _ in named], [r["ms"] for _, r in named], color="C0", alpha=0.6, label="measured")
         axis.plot([_limit(r, content["limits"]) for _, r in named], range(len(named)), "k|", ms=12, label="limit")
         axis.set(xscale="log", xlabel="milliseconds", title=f"{stage}: {found['step_ms']:.0f} ms a step")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 from pathlib import Path
 
 import numpy as np
@@ -10,10 +9,6 @@ import torch
 from numpy.typing import NDArray
 
 TYPES = {"float": "f4", "float32": "f4", "double": "f8", "float64": "f8", "uchar": "u1", "uint8": "u1", "int": "i4"}
-
-
-def needs_small_ply_reader() -> bool:
-    return importlib.util.find_spec("open3d") is None
 
 
 def read_ply(path: Path) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
@@ -44,7 +39,10 @@ def read_ply(path: Path) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
 
 
 def read_points_ourselves() -> None:
-    """Makes nerfstudio's data parser read point clouds by ``read_ply`` in this process."""
+    """Makes nerfstudio's data parser read point clouds by ``read_ply`` in this process.
+
+    open3d, by which it would, is often absent from a machine, or there without the system's libraries that it needs.
+    """
     from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio
 
     def load(self, ply_file_path: Path, transform_matrix: torch.Tensor, scale_factor: float):

@@ -152,6 +152,7 @@ def measure(request: dict[str, Any], tell: Callable[[str], None]) -> dict[str, f
         "march_ms": 1e3 * middle["march"],
         "texels": float(len(field.density)),
         "table_bytes": float(sum(t.numel() * t.element_size() for t in tensors)),
+        "threads": float(torch.get_num_threads()),
         "gained_gib": (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 2**20,
     }
 

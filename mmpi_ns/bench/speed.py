@@ -109,8 +109,8 @@ class Speed:
             downscale_factor=self.downscale_factor,
             work=str(folder),
             checks=(self.steps,),
-            check_images=1,
-            check_pixels=1,
+            check_images=self.test_images,
+            check_pixels=64,
             final_images=self.test_images,
             whole_images=False,
             keep=False,
@@ -156,7 +156,8 @@ def table(content: dict[str, Any]) -> str:
     rounds = rows["rounds"]
 
     def spread(name: str) -> str:
-        return f"{h[name]:.3g} ({min(rounds[name]):.3g} to {max(rounds[name]):.3g})"
+        middle, least, most = (_digits(x) for x in (h[name], min(rounds[name]), max(rounds[name])))
+        return f"{middle} ({least} to {most})"
 
     images = f"{rows['ours']['images']} test images"
     lines = [
@@ -164,9 +165,10 @@ def table(content: dict[str, Any]) -> str:
         "",
         stamp_line(content["made"]),
         "",
-        f"Medians of {len(rounds['rays_per_s'])} rounds in one process (least to most in brackets); in a round each",
-        "trains and renders in turn. Rays are pixel rays (ours trains on 384 keypoint rays a step besides, where there",
-        "are SfM tracks). The dense reference evaluates all planes of all MPIs and has the photometric loss alone.",
+        f"Medians of {len(rounds['rays_per_s'])} rounds in one process (least to most in brackets), in which each has",
+        "its turn of training; frames are rendered in turn after that. Rays are pixel rays (ours trains on 384",
+        "keypoint rays a step besides, where there are SfM tracks). The dense reference evaluates all planes of all",
+        "MPIs and has the photometric loss alone.",
         "",
         "| | ours | dense | nerfacto |",
         "|---|---|---|---|",
@@ -188,6 +190,10 @@ def table(content: dict[str, Any]) -> str:
         "",
     ]
     return "\n".join(lines)
+
+
+def _digits(x: float) -> str:
+    return f"{x:.0f}" if x >= 100 else f"{x:.3g}"
 
 
 def draw(path: Path, content: dict[str, Any]) -> None:

@@ -194,11 +194,10 @@ def run(request: Request, tell: Callable[[str], None] = print) -> dict[str, Any]
     from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
     from nerfstudio.scripts.train import _set_random_seed
 
-    from mmpi_ns.bench.peers import needs_small_ply_reader, read_points_ourselves
+    from mmpi_ns.bench.peers import read_points_ourselves
 
     replace_lpips()
-    if needs_small_ply_reader():
-        read_points_ourselves()
+    read_points_ourselves()
     config: Any = tyro.cli(AnnotatedBaseConfigUnion, args=list(request.words))
     config.pipeline.datamanager.data = config.data
     config.save_config()
