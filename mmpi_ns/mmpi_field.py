@@ -363,9 +363,10 @@ class MMPIField(Field):
         self, ray_samples: RaySamples, density_embedding: Lookup | None = None
     ) -> dict[FieldHeadNames, Tensor]:
         """Colours of the valid samples; empty slots are black."""
-        lib = None if torch.is_grad_enabled() else native.library(self.features, ray_samples.frustums.directions)
-        if lib is not None and density_embedding is None:
-            return {FieldHeadNames.RGB: self._shade(lib, ray_samples)}
+        if not torch.is_grad_enabled() and density_embedding is None:
+            lib = native.library(self.features, ray_samples.frustums.directions)
+            if lib is not None or native.takes_triton(self.features, ray_samples.frustums.directions):
+                return {FieldHeadNames.RGB: self._shade(lib, ray_samples)}
         lookup = density_embedding or self._lookup(ray_samples)
         directions, rays = ray_samples.frustums.directions[:, 0], lookup.rays
         out = lookup.ndc.new_zeros(lookup.shape.numel(), 3)
@@ -379,12 +380,16 @@ class MMPIField(Field):
             out = out.index_put((lookup.index,), torch.cat(colors))
         return {FieldHeadNames.RGB: out.view(*lookup.shape, 3)}
 
-    def _shade(self, lib: ctypes.CDLL, ray_samples: RaySamples) -> Float[Tensor, "R S 3"]:
+    def _shade(self, lib: ctypes.CDLL | None, ray_samples: RaySamples) -> Float[Tensor, "R S 3"]:
         meta, rays = metadata_of(ray_samples), ray_samples.frustums.directions[:, 0]
         directions = torch.stack([geometry.rotate(self._axes(k), rays) for k in range(len(self.grids))])
         heads, planes, valid = (meta[name][..., 0] for name in ("heads", "planes", "valid"))
-        scene, features = self.march_scene(), self.features.data
-        return shade(lib, scene, features, self.networks, directions, heads, planes, meta["ndc"], valid)
+        given = (self.features.data, self.networks, directions, heads, planes, meta["ndc"], valid)
+        if lib is not None:
+            return shade(lib, self.march_scene(), *given)
+        from mmpi_ns.ops import triton_shade
+
+        return triton_shade.shade(self.triton_scene()[0], *given)
 
     def total_variation(self, lookup: Lookup, density_weight: float, feature_weight: float) -> Tensor:
         """Weighted total variation of the texels that the batch touched, in DVGO's normalisation (not yet per ray)."""

@@ -111,7 +111,7 @@ def by_head(heads: Int[Tensor, "N"]) -> Int[Tensor, "N"]:
     if not heads.numel():
         return heads
     if heads.device.type != "cpu":  # one launch; a sort takes longer on a CPU
-        return torch.sort(heads, stable=True).indices
+        return torch.sort(heads.to(torch.int16), stable=True).indices
     return torch.cat([(heads == k).nonzero()[:, 0] for k in range(int(heads.max()) + 1)])
 
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import subprocess
+import tempfile
 from contextlib import contextmanager
+from pathlib import Path
 
 import torch
 import triton
@@ -10,8 +13,9 @@ from random_fields import bundle, random_field, random_rays
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 
+from mmpi_ns.color_network import ColorNetworks
 from mmpi_ns.mmpi_sampler import MMPISampler
-from mmpi_ns.ops import triton_composite, triton_march, triton_tables
+from mmpi_ns.ops import triton_composite, triton_march, triton_shade, triton_tables
 
 TARGET = GPUTarget("cuda", 90, 32)
 NAMES = {
@@ -39,7 +43,10 @@ def compiling(made):
 
     def compile_instead(self, *args, grid, warmup, num_warps=4, **constants):
         del grid, warmup
-        signature = {name: _type(value) for name, value in zip(self.arg_names, args, strict=False)}
+        given = dict(zip(self.arg_names, args, strict=False))
+        # As a launch does: an integer of 1 becomes a constant.
+        constants |= {name: 1 for name, value in given.items() if type(value) is int and value == 1}
+        signature = {name: _type(value) for name, value in given.items()}
         signature |= {name: "constexpr" for name in constants}
         key = (self.fn.__name__, tuple(sorted(constants.items())), tuple(signature.values()))
         if key not in made:
@@ -56,13 +63,22 @@ def compiling(made):
         triton.runtime.JITFunction.run = run
 
 
+def resources(kernel):
+    """What the disassembler says that a compiled kernel needs; registers that do not fit go to its stack."""
+    tool = Path(triton.__file__).parent / "backends" / "nvidia" / "bin" / "cuobjdump"
+    with tempfile.NamedTemporaryFile(suffix=".cubin") as file:
+        file.write(kernel.asm["cubin"])
+        file.flush()
+        return subprocess.run([tool, "-res-usage", file.name], capture_output=True, text=True, check=True).stdout
+
+
 def launches(monkeypatch):
     """Launches every kernel as on a GPU."""
     for module in (triton_march, triton_tables):
         monkeypatch.setattr(module, "block_size", lambda wanted, device: wanted)
-    for num_mpis, with_cube, form in ((4, False, None), (2, True, "paper")):
+    for num_mpis, with_cube, form, count in ((4, False, None, 20), (2, True, "paper", 1)):
         field = random_field(num_mpis, with_cube, seed=1)
-        rays = bundle(*random_rays(field.plan, 20, seed=1))
+        rays = bundle(*random_rays(field.plan, count, seed=1))
         MMPISampler()(rays, field=field, threshold=1e-3, blend_form=form)
     number = torch.zeros(50, dtype=torch.int64)
     rows, weights, values, table = (
@@ -81,6 +97,12 @@ def launches(monkeypatch):
     scene = random_field(2, True, seed=1).triton_scene()[0]
     for in_cube in (False, True):
         triton_tables.taps(scene, number, number, torch.zeros(50, 3), in_cube)
-    tau = torch.zeros(20, 40, requires_grad=True)
-    made = triton_composite.composite_weights(tau, tau >= 0, torch.zeros(20, 40), torch.zeros(20, 1))
-    made.weights.sum().backward()
+    networks, grid = ColorNetworks(3, 9, 64, 2, 2), torch.arange(60).view(20, 3)
+    with monkeypatch.context() as edges:
+        edges.setattr(torch.Tensor, "tolist", lambda self: [0, 20, 40, 60])
+        rays, places = torch.zeros(3, 20, 3), torch.zeros(20, 3, 3)
+        triton_shade.shade(scene, table, networks, rays, grid, grid, places, grid >= 0)
+    for shape in ((20, 40), (1, 1)):
+        tau = torch.zeros(*shape, requires_grad=True)
+        made = triton_composite.composite_weights(tau, tau >= 0, torch.zeros(*shape), torch.zeros(shape[0], 1))
+        made.weights.sum().backward()

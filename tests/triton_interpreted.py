@@ -277,7 +277,7 @@ def test_taps_are_those_of_the_grids_also_at_borders_and_outside():
     ndc = torch.rand(200, 3, generator=g) * 2.4 - 1.2
     ndc[:20] = ndc[:20].sign()
     heads, planes = torch.randint(0, 3, (200,), generator=g), torch.randint(0, 9, (200,), generator=g)
-    scene, table = field.triton_scene()[0], normal(field.plan.texels, 1)
+    scene, table = field.triton_scene()[0], normal(len(field.density), 1)
     rows, weights = triton_tables.taps(scene, heads, planes, ndc, in_cube=False)
     for k in range(3):
         own = heads == k
@@ -320,6 +320,39 @@ def test_adam_on_rows_equals_the_plain_one():
     assert (plain[0] - normal(500, 9)).abs().max() > 0.2
     for a, b in zip(fast, plain, strict=True):
         assert ((a - b).abs() <= 3e-6 * (1 + b.abs())).all()
+
+
+# Colours -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("shared", [False, True])
+@pytest.mark.parametrize(("channels", "width", "octaves"), [(3, 5, (0, 0)), (9, 32, (2, 2)), (4, 64, (4, 1))])
+def test_shading_equals_the_colour_networks(channels, width, octaves, shared):
+    plan = random_field(3, True, seed=7).plan
+    field = MMPIField(
+        plan,
+        feature_channels=channels,
+        hidden_width=width,
+        position_frequencies=octaves[0],
+        direction_frequencies=octaves[1],
+        shared_colour=shared,
+    ).eval()
+    field.features.data = normal(*field.features.shape, seed=1) * 2
+    field.networks.weights.data = normal(*field.networks.weights.shape, seed=2) * 0.3
+    samples, _ = MMPISampler()(bundle(*random_rays(plan, 30, seed=8)), field=field, threshold=0.0)
+    assert samples.metadata["heads"].unique().numel() == 4
+    with torch.no_grad():
+        fast = next(iter(field.get_outputs(samples).values()))
+        plain = by_torch(lambda: next(iter(field.get_outputs(samples).values())))
+    assert plain.std() > 0.05 and (fast - plain).abs().max() < 5e-6
+    assert (fast[~samples.metadata["valid"][..., 0]] == 0).all()
+
+
+def test_without_samples_there_are_no_colours():
+    field = random_field(2, seed=1)
+    samples, _ = MMPISampler()(bundle([[0, 0, 0]], [[0, 0, 1]], far=1e-3), field=field, threshold=0.0)
+    with torch.no_grad():
+        assert (next(iter(field.get_outputs(samples).values())) == 0).all()
 
 
 # Compositing ---------------------------------------------------------------------------------------------------------

@@ -64,7 +64,7 @@ def composite_backward_kernel(
 def _shape(slots: int) -> tuple[int, int]:
     """Rays and slots of a program."""
     width = triton.next_power_of_2(max(1, slots))
-    return max(1, SLOTS // width), width
+    return max(1, SLOTS // width), width  # type: ignore[return-value]
 
 
 class _Weights(torch.autograd.Function):

@@ -169,7 +169,7 @@ def _count_vote(votes, scene, k, head, place, thick):
     asked = thick & (inside | is_own)
     vote = trilinear(reliability, grids, k, u, v, s, asked)
     counts = asked & (head != k)
-    counts = counts & (tl.load(touched + nearest_row(grids, k, u, v, s), counts, 0) > 0)
+    counts = counts & (tl.load(touched + nearest_row(grids, k, u, v, s, counts), counts, 0) > 0)
     higher = tl.where(counts, tl.maximum(highest, vote), highest)
     # -1e30 instead of -infinity: differences of it are numbers.
     others = tl.where(counts, others * tl.exp(highest - higher) + tl.exp(vote - higher), others)

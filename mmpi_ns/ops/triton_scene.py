@@ -73,10 +73,9 @@ class TritonScene:
             rows.append([0.0] * 8 + [interval])
             most += int(2 * math.hypot(*extent) / box.step) + 2
         starts = [sum(len(b) for b in biases[:k]) for k in range(len(grids))]
-        blocks = [(g.offset, g.depth, g.height, g.width, b) for g, b in zip(grids, starts, strict=True)]
         return TritonScene(
             torch.tensor(rows, dtype=torch.float32, device=device),
-            torch.tensor(blocks, dtype=torch.int64, device=device),
+            layout_of(grids, starts, device),
             torch.cat(biases).to(device, torch.float32).contiguous(),
             torch.tensor(numbers, dtype=torch.float32, device=device),
             len(mpis),
@@ -86,6 +85,18 @@ class TritonScene:
 
     def constants(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         return self.heads, self.grids, self.biases, self.cube
+
+
+def layout_of(grids: list[TexelGrid], biases: list[int], device: torch.device) -> Int[Tensor, "H 5"]:
+    """Where the texels of every head are, for ``row_of`` and ``place_of``.
+
+    Args:
+        grids: of all heads.
+        biases: where those of each head's planes start.
+        device: of the tables.
+    """
+    rows = [(g.offset, g.depth, g.height, g.width, b) for g, b in zip(grids, biases, strict=True)]
+    return torch.tensor(rows, dtype=torch.int64, device=device)
 
 
 def _head_row(mpi: MPIPlan, depth_scale: float) -> list[float]:
@@ -104,15 +115,18 @@ def block_size(wanted: int, device: torch.device) -> int:
 
 
 @triton.jit
-def row_of(grids, head, plane, y, x):
-    """Row of a head's texel in the pooled tables: with ``place_of``, all that knows how texels are stored."""
+def row_of(grids, head, plane, y, x, mask):
+    """Row of a head's texel in the pooled tables: with ``place_of``, all that knows how texels are stored.
+
+    Where masked, plane, y and x may be out of range, and so may the row.
+    """
     grid = grids + head * INTS
     return tl.load(grid + OFFSET) + (plane * tl.load(grid + HEIGHT) + y) * tl.load(grid + WIDTH) + x
 
 
 @triton.jit
-def place_of(grids, row, NUM_HEADS: tl.constexpr):
-    """Head, plane, y and x of a row: the inverse of ``row_of``."""
+def place_of(grids, row, mask, NUM_HEADS: tl.constexpr):
+    """Head, plane, y and x of a row, the inverse of ``row_of``; and whether it is any head's."""
     head = row.to(tl.int32) * 0
     for k in tl.static_range(1, NUM_HEADS):
         head += (row >= tl.load(grids + k * INTS + OFFSET)).to(tl.int32)
@@ -120,7 +134,13 @@ def place_of(grids, row, NUM_HEADS: tl.constexpr):
     local, width = row - tl.load(grid + OFFSET), tl.load(grid + WIDTH)
     layer = width * tl.load(grid + HEIGHT)
     plane = local // layer
-    return head, plane, (local - plane * layer) // width, local % width
+    return head, plane, (local - plane * layer) // width, local % width, mask
+
+
+@triton.jit
+def is_stored(row):
+    """Whether the tables hold anything at a row that ``row_of`` found."""
+    return row >= 0
 
 
 @triton.jit
@@ -137,10 +157,10 @@ def bilinear(table, grids, head, plane, u, v, mask):
     """A one-channel table at NDC (u, v) on a plane; 0 where masked."""
     x, fx = cell(u, tl.load(grids + head * INTS + WIDTH))
     y, fy = cell(v, tl.load(grids + head * INTS + HEIGHT))
-    a = tl.load(table + row_of(grids, head, plane, y, x), mask, 0.0)
-    b = tl.load(table + row_of(grids, head, plane, y, x + 1), mask, 0.0)
-    c = tl.load(table + row_of(grids, head, plane, y + 1, x), mask, 0.0)
-    d = tl.load(table + row_of(grids, head, plane, y + 1, x + 1), mask, 0.0)
+    a = tl.load(table + row_of(grids, head, plane, y, x, mask), mask, 0.0)
+    b = tl.load(table + row_of(grids, head, plane, y, x + 1, mask), mask, 0.0)
+    c = tl.load(table + row_of(grids, head, plane, y + 1, x, mask), mask, 0.0)
+    d = tl.load(table + row_of(grids, head, plane, y + 1, x + 1, mask), mask, 0.0)
     return (1 - fx) * (1 - fy) * a + fx * (1 - fy) * b + (1 - fx) * fy * c + fx * fy * d
 
 
@@ -164,11 +184,11 @@ def nearest(coordinate, size):
 
 
 @triton.jit
-def nearest_row(grids, head, u, v, s):
+def nearest_row(grids, head, u, v, s, mask):
     """Row of the texel nearest to NDC (u, v, s)."""
     grid = grids + head * INTS
     x, y = nearest(u, tl.load(grid + WIDTH)), nearest(v, tl.load(grid + HEIGHT))
-    return row_of(grids, head, nearest(s, tl.load(grid + DEPTH)), y, x)
+    return row_of(grids, head, nearest(s, tl.load(grid + DEPTH)), y, x, mask)
 
 
 # Arithmetic that stays exact where its plain form cancels ---------------------------------------------------------
@@ -213,3 +233,19 @@ def one_minus_exp(tau):
 def minus_log_of_rest(alpha):
     """-log(1 - alpha) for alpha in [0, 1/2)."""
     return twice_atanh(alpha / (2 - alpha))
+
+
+@triton.jit
+def sin_turn(t):
+    """sin(pi t), to 1e-7. The library's sine keeps a table for huge angles in memory; there are none here."""
+    t -= 2 * tl.floor(0.5 * t + 0.5)
+    size = tl.abs(t)
+    z = tl.minimum(size, 1 - size) * 3.14159265
+    q = z * z
+    p = -1.0 / 39916800
+    p = p * q + 1.0 / 362880
+    p = p * q - 1.0 / 5040
+    p = p * q + 1.0 / 120
+    p = p * q - 1.0 / 6
+    sine = z + z * q * p
+    return tl.where(t < 0, -sine, sine)

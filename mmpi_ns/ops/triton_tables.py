@@ -16,7 +16,18 @@ import triton.language as tl
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from mmpi_ns.ops.triton_scene import DEPTH, HEIGHT, INTS, WIDTH, TritonScene, block_size, cell, place_of, row_of
+from mmpi_ns.ops.triton_scene import (
+    DEPTH,
+    HEIGHT,
+    INTS,
+    WIDTH,
+    TritonScene,
+    block_size,
+    cell,
+    is_stored,
+    place_of,
+    row_of,
+)
 
 ROWS = 128
 """Samples, or rows, of a program."""
@@ -54,7 +65,7 @@ def taps_kernel(
     for tap in tl.static_range(TAPS):
         dx, dy, dz = tap % 2, tap // 2 % 2, tap // 4
         weight = (fx if dx else 1 - fx) * (fy if dy else 1 - fy) * (fz if dz else 1 - fz)
-        tl.store(rows + i * TAPS + tap, row_of(grids, head, z + dz, y + dy, x + dx), inside)
+        tl.store(rows + i * TAPS + tap, row_of(grids, head, z + dz, y + dy, x + dx, inside), inside)
         tl.store(weights + i * TAPS + tap, weight, inside)
 
 
@@ -251,21 +262,22 @@ def variation_kernel(
     """Huber loss of the differences of texels with their neighbours, which are held fixed, and its gradient."""
     i, c = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK), tl.arange(0, CHANNELS)
     inside, is_channel = i < count, (c < channels)[None, :]
-    head, plane, y, x = place_of(grids, tl.load(rows + i, inside, tl.load(grids)), NUM_HEADS)
+    head, plane, y, x, inside = place_of(grids, tl.load(rows + i, inside, 0), inside, NUM_HEADS)
     grid = grids + head * INTS
     own = tl.load(values + i[:, None] * channels + c[None, :], inside[:, None] & is_channel, 0.0)
     slope, total = own * 0, own * 0
     for way in tl.static_range(6):
         axis, side = way // 2, way % 2 * 2 - 1
         nx, ny, nz = x + (side if axis == 0 else 0), y + (side if axis == 1 else 0), plane + (side if axis == 2 else 0)
-        exists = (nx >= 0) & (nx < tl.load(grid + WIDTH)) & (ny >= 0) & (ny < tl.load(grid + HEIGHT))
-        exists = (exists & (nz >= 0) & (nz < tl.load(grid + DEPTH)) & inside)[:, None] & is_channel
-        row = row_of(grids, head, nz, ny, nx)
+        exists = inside & (nx >= 0) & (nx < tl.load(grid + WIDTH)) & (ny >= 0) & (ny < tl.load(grid + HEIGHT))
+        exists = exists & (nz >= 0) & (nz < tl.load(grid + DEPTH))
+        row = row_of(grids, head, nz, ny, nx, exists)
+        exists = (exists & is_stored(row))[:, None] & is_channel
         difference = tl.where(exists, own - tl.load(table + row[:, None] * channels + c[None, :], exists, 0.0), 0.0)
         size, scale = tl.abs(difference), tl.load(scales + 3 * head + axis)[:, None] / 6
         slope += scale * tl.minimum(tl.maximum(difference, -1.0), 1.0)
         total += scale * tl.where(size <= 1, 0.5 * difference * difference, size - 0.5)
-    tl.store(gradient + i[:, None] * channels + c[None, :], slope, inside[:, None] & is_channel)
+    tl.store(gradient + i[:, None] * channels + c[None, :], slope, (i < count)[:, None] & is_channel)
     tl.store(totals + tl.program_id(0), tl.sum(tl.sum(total, 1), 0))
 
 
@@ -273,15 +285,15 @@ class Variation(torch.autograd.Function):
     """``total_variation_reference``: value and gradient in one pass."""
 
     @staticmethod
-    def forward(ctx: Any, values: Tensor, table: Tensor, rows: Tensor, grids: Tensor, scales: Tensor) -> Tensor:
+    def forward(ctx: Any, values: Tensor, table: Tensor, rows: Tensor, layout: Tensor, scales: Tensor) -> Tensor:
         count, channels = values.shape
         block = block_size(ROWS, values.device)
         gradient, programs = torch.empty_like(values), triton.cdiv(count, block)
         totals = torch.zeros(max(1, programs), device=values.device)
         if count:
             variation_kernel[(programs,)](
-                rows.contiguous(), values.contiguous(), table, grids, scales, gradient, totals, count, channels,
-                NUM_HEADS=len(grids), CHANNELS=triton.next_power_of_2(channels), BLOCK=block,
+                rows.contiguous(), values.contiguous(), table, layout, scales, gradient, totals, count, channels,
+                NUM_HEADS=len(scales), CHANNELS=triton.next_power_of_2(channels), BLOCK=block,
             )  # fmt: skip
         ctx.save_for_backward(gradient)
         return totals.sum()

@@ -46,9 +46,10 @@ def total_variation_reference(
 
 @functools.lru_cache(maxsize=8)
 def _on_device(grids: tuple[TexelGrid, ...], scales: tuple[tuple[float, ...], ...], device: torch.device):
-    """Blocks and scales as tensors, copied to the device once."""
-    blocks = torch.tensor([(g.offset, g.depth, g.height, g.width, 0) for g in grids], device=device)
-    return blocks, torch.tensor(scales, dtype=torch.float32, device=device)
+    """Layout and scales as tensors, copied to the device once."""
+    from mmpi_ns.ops.triton_scene import layout_of
+
+    return layout_of(list(grids), [0] * len(grids), device), torch.tensor(scales, dtype=torch.float32, device=device)
 
 
 class _Variation(torch.autograd.Function):
