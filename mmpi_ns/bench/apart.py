@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,9 @@ PROGRESS = "@ "
 """Lines that start so are shown while it runs."""
 
 
-def run_apart(module: str, request: dict[str, Any], folder: Path, threads: int) -> dict[str, Any]:
+def run_apart(
+    module: str, request: dict[str, Any], folder: Path, threads: int, seconds: float | None = None
+) -> dict[str, Any]:
     """Calls ``python -m module`` with a request.
 
     Args:
@@ -24,6 +27,7 @@ def run_apart(module: str, request: dict[str, Any], folder: Path, threads: int) 
         request: what it is asked.
         folder: where request, answer and everything that it prints (output.log) go.
         threads: of its arithmetic.
+        seconds: after which it is ended; None: never.
 
     Returns:
         Its answer, or why there is none (``not_run``): one that fails is no reason to lose the others.
@@ -47,11 +51,17 @@ def run_apart(module: str, request: dict[str, Any], folder: Path, threads: int) 
         ) as process,
     ):
         assert process.stdout is not None
+        alarm = threading.Timer(seconds, process.kill) if seconds is not None else None
+        if alarm is not None:
+            alarm.start()
         for line in process.stdout:
             stream.write(line)
             if line.startswith(PROGRESS):
                 print(f"    {line[len(PROGRESS) :].rstrip()}", flush=True)
             last = line.strip() or last
+        process.wait()
+        if alarm is not None:
+            alarm.cancel()
     if process.returncode or not target.is_file():
         return {"not_run": f"it failed with status {process.returncode} ({last[:300]}); see {log}"}
     return read_json(target)

@@ -1,0 +1,187 @@
+"""``mmpi-bench gpu``: all that matters on a GPU in under ten minutes, correctness first, without a network."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import re
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from mmpi_ns.bench.apart import run_apart
+from mmpi_ns.bench.gpu_report import draw, headline, table
+from mmpi_ns.bench.methods import METHODS, Method, Scene
+from mmpi_ns.bench.provenance import stamp, write_json
+from mmpi_ns.bench.suites import JOINT
+from mmpi_ns.bench.trainings import Request
+
+SHARES = {
+    "checks": 0.15,
+    "operations": 0.1,
+    "training triton": 0.15,
+    "training torch": 0.12,
+    "kitti": 0.2,
+    "quality": 0.28,
+}
+"""The parts in the order in which they run, and their shares of the time; what one leaves, the next ones have."""
+PEERS = {"mmpi": 3000, "nerfacto": 3000, "splatfacto": 5000}
+"""Whose error is followed over time, and for how many steps at most."""
+GRACE = 60.0
+"""Seconds that a part may run beyond its time before it is ended from outside: starting Python takes ten."""
+
+
+@dataclass
+class Gpu:
+    """Kernels against float64, then training, frames, the paper's KITTI size, and error over time, on one GPU.
+
+    Every part runs in a process of its own within its share of the time: one that fails is recorded, and the others go
+    on. Ends with status 1 where a kernel is wrong.
+    """
+
+    data: Path | None = None
+    """A drive (a folder with transforms.json); a procedural street is made where none is given."""
+    downscale_factor: int = 1
+    """Image size to use."""
+    output: Path = Path("docs/results")
+    """Where gpu.json, gpu.md and gpu.png go."""
+    work: Path = Path("outputs/gpu")
+    """Where the street, runs and logs go."""
+    seconds: float = 560.0
+    """For everything."""
+    parts: tuple[str, ...] = tuple(SHARES)
+    """Which parts to run."""
+    rehearse: bool = False
+    """Run everything in miniature on a CPU, the kernels by Triton's interpreter: to see that it runs, not how fast."""
+
+    def run(self) -> None:
+        self._check()
+        start, made = time.monotonic(), stamp("gpu", self)
+        content: dict[str, Any] = {"headline": {}, "made": made, "rehearsal": self.rehearse, "parts": {}}
+        data, made["scene_seconds"] = self._scene(), time.monotonic() - start
+        options = [] if importlib.util.find_spec("pycolmap") else ["--pipeline.datamanager.sfm-path", "none"]
+        made["tracks"] = "of the data set" if not options else "triangulated from images: pycolmap is not installed"
+        for number, name in enumerate(self.parts):
+            left = self.seconds - (time.monotonic() - start)
+            share = SHARES[name] / sum(SHARES[n] for n in self.parts[number:])
+            print(f"{name}: {max(0.0, left * share):.0f} s ...", flush=True)
+            begin = time.monotonic()
+            found = self._part(name, data, options, left * share) if left > 0 else {"not_run": "no time was left"}
+            content["parts"][name] = {**found, "wall_s": time.monotonic() - begin}
+            content["headline"] = headline(content["parts"])
+            write_json(self.output / "gpu.json", content)
+            (self.output / "gpu.md").write_text(table(content), encoding="utf-8")
+        draw(self.output / "gpu.png", content["parts"].get("quality", {}))
+        print(content["headline"])
+        wrong = [name for name, part in content["parts"].items() if "not_run" in part] if self.rehearse else []
+        if content["headline"].get("failed_checks") or wrong:
+            raise SystemExit(
+                f"mmpi-bench: a kernel is wrong or a rehearsed part failed ({', '.join(wrong) or 'checks'})."
+            )
+
+    def _check(self) -> None:
+        """Raises ValueError where nothing could be measured."""
+        if unknown := set(self.parts) - set(SHARES):
+            raise ValueError(f"There is no part {sorted(unknown)[0]!r}: choose from {', '.join(SHARES)}.")
+        if not self.rehearse and not torch.cuda.is_available():
+            raise ValueError(
+                "gpu measures a CUDA device, and torch sees none: run it where there is one, or --rehearse on a CPU."
+            )
+        if self.rehearse:
+            os.environ["TRITON_INTERPRET"] = "1"  # for the parts' processes; this one runs no kernel
+            os.environ["CUDA_VISIBLE_DEVICES"] = ""
+        if self.data is not None and not self.data.exists():
+            raise ValueError(f"There is no scene at {self.data}: check --data.")
+
+    def _scene(self) -> Path:
+        """The data set, or a street that is made now."""
+        if self.data is not None:
+            return self.data.resolve()
+        from mmpi_ns.scenes.catalogue import make_scene
+        from mmpi_ns.scenes.dataset import write_dataset
+
+        folder, (width, height) = (self.work / "street").resolve(), (40, 12) if self.rehearse else (621, 188)
+        if not (folder / "transforms.json").is_file():
+            print(f"No --data: making a street of {width} x {height} pixels ...", flush=True)
+            scene = make_scene("street", count=10 if self.rehearse else 40, width=width, height=height)
+            write_dataset(scene, folder, points=150 if self.rehearse else 4000, overwrite=True)
+        return folder
+
+    def _part(self, name: str, data: Path, options: list[str], seconds: float) -> dict[str, Any]:
+        if name == "quality":
+            return self._quality(data, options, seconds)
+        part, _, ops = name.partition(" ")
+        request = {
+            "part": part,
+            "ops": ops,
+            "device": "cpu" if self.rehearse else "cuda",
+            "seconds": max(5.0, seconds - 15),  # less what it takes to start
+            "data": str(data),
+            "downscale_factor": self.downscale_factor,
+            "work": str(self.work.resolve()),
+            "options": options,
+            "rehearse": self.rehearse,
+        }
+        folder = self.work / name.replace(" ", "-")
+        return run_apart("mmpi_ns.bench.gpu_parts", request, folder, self._threads, seconds + GRACE)
+
+    @property
+    def _threads(self) -> int:
+        return 1 if self.rehearse else os.cpu_count() or 1
+
+    def _quality(self, data: Path, options: list[str], seconds: float) -> dict[str, Any]:
+        """PSNR of test views against seconds of training: ours, nerfacto and splatfacto."""
+        rows: dict[str, Any] = {}
+        names = ("mmpi",) if self.rehearse else tuple(PEERS)
+        for number, name in enumerate(names):
+            begin, method = time.monotonic(), METHODS[name]
+            if method.ours:
+                method = Method(name, name, (*JOINT, *options, *(TINY if self.rehearse else ())))
+            reason = method.why_not()
+            if reason is not None:
+                rows[name] = {"not_run": reason}
+                continue
+            folder = self.work / f"quality-{name}"
+            request = self._training(method, data, folder, 4 if self.rehearse else PEERS[name])
+            limit = seconds / (len(names) - number) + (GRACE if self.rehearse else 0)
+            row = run_apart("mmpi_ns.bench.trainings", asdict(request), folder, self._threads, limit)
+            rows[name] = row if "not_run" not in row else {**row, "curve": told_curve(folder / "output.log")}
+            seconds -= time.monotonic() - begin
+        return (
+            {"methods": rows} if any("curve" in r for r in rows.values()) else {"not_run": str(rows), "methods": rows}
+        )
+
+    def _training(self, method: Method, data: Path, folder: Path, steps: int) -> Request:
+        device = "cpu" if self.rehearse else "cuda"
+        words = method.words(Scene(data, self.downscale_factor), folder, steps, None, 0, device)
+        checks = sorted({max(1, round(steps * 2.0**-i)) for i in range(9)} | {round(steps * 3 / 4)})
+        return Request(
+            words=tuple(words),
+            data=str(data),
+            downscale_factor=self.downscale_factor,
+            work=str(folder),
+            checks=tuple(checks),
+            check_images=4,
+            check_pixels=4096,
+            final_images=4,
+            whole_images=method.whole_images,
+            keep=False,
+        )
+
+
+TINY = (
+    *("--pipeline.datamanager.train-num-rays-per-batch", "16", "--pipeline.datamanager.keypoint-rays", "4"),
+    *("--pipeline.model.placement.max-planes", "12", "--pipeline.model.placement.max-texels", "20000"),
+    *("--pipeline.model.hidden-width", "8"),
+)
+"""For a rehearsal."""
+
+
+def told_curve(log: Path) -> list[dict[str, float]]:
+    """What a training that was ended early had said of itself."""
+    text = log.read_text(encoding="utf-8", errors="replace") if log.is_file() else ""
+    found = re.findall(r"step (\d+): (\d+) s of training, ([\d.]+) dB", text)
+    return [{"step": int(a), "seconds": float(b), "psnr": float(c)} for a, b, c in found]

@@ -1,0 +1,261 @@
+"""Correctness on the device: every Triton kernel against float64, before anything is timed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from nerfstudio.field_components.field_heads import FieldHeadNames
+from torch import Tensor
+
+from mmpi_ns import compositing
+from mmpi_ns.bench.cases_rays import CLEAR, CUBE, Scene, scene
+from mmpi_ns.bench.exact_ray import ExactField, ExactRay, Gradients
+from mmpi_ns.bench.rendering import bundle_of
+from mmpi_ns.compositing import BlendForm
+from mmpi_ns.mmpi_field import MMPIField
+from mmpi_ns.mmpi_sampler import MMPISampler
+from mmpi_ns.mmpi_samples import metadata_of
+from mmpi_ns.ops import native
+from mmpi_ns.ops.composite import composite_weights
+from mmpi_ns.ops.interpolate import add_rows, index_rows, interpolate, interpolate_reference
+from mmpi_ns.ops.variation import total_variation, total_variation_reference
+from mmpi_ns.placement.plan import CubePlan
+from mmpi_ns.touched_adam import TouchedAdam
+
+
+@dataclass(frozen=True)
+class Check:
+    """One comparison with float64."""
+
+    name: str
+    error: float
+    """Largest difference, relative to the largest number compared; or how many things are wrong."""
+    bound: float
+
+    @property
+    def ok(self) -> bool:
+        return self.error <= self.bound
+
+
+def _relative(found: Tensor, wanted: Tensor) -> float:
+    """Largest difference relative to the largest wanted number; infinite where something is not finite."""
+    found, wanted = found.double().cpu(), wanted.double().cpu()
+    if found.shape != wanted.shape or not bool(torch.isfinite(found).all()):
+        return float("inf")
+    return float((found - wanted).abs().max() / wanted.abs().max().clamp(min=1e-12)) if wanted.numel() else 0.0
+
+
+def _draw(device: str, *shape: int, seed: int = 0) -> Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed)).to(device)
+
+
+# Whole rays ----------------------------------------------------------------------------------------------------------
+
+
+def render_rays(field: MMPIField, s: Scene, device: str, known_lookup: bool = True) -> tuple[Tensor, Tensor]:
+    """Colours of a scene's rays, and how many samples each keeps: all.
+
+    Args:
+        field: the scene's, on the device.
+        s: rays and form of blending.
+        device: where to render.
+        known_lookup: colours by what the densities were looked up with, as in training; else as in rendering.
+    """
+    rays = bundle_of(s.origins, s.directions).to(device)
+    samples, report = MMPISampler()(rays, field=field, threshold=0.0, blend_form=s.form)
+    tau, lookup = field.get_density(samples)
+    tau, meta = tau[..., 0], metadata_of(samples)
+    if s.form is not None and lookup.index.numel():
+        shares = field.sample_shares(samples, lookup)
+        flat = compositing.blended_optical_depth(tau.reshape(-1)[lookup.index], *shares, s.form)
+        tau = tau.new_zeros(tau.numel()).index_put((lookup.index,), flat).view(tau.shape)
+    made = composite_weights(tau, meta["valid"][..., 0], meta["skipped_before"][..., 0], report.skipped_total)
+    colors = field.get_outputs(samples, lookup if known_lookup else None)[FieldHeadNames.RGB]
+    return compositing.render_colors(made, colors), meta["valid"][..., 0].sum(-1)
+
+
+def whole_rays(s: Scene, name: str, device: str) -> list[Check]:
+    """March, interpolation and compositing together, values and gradients, against exact arithmetic."""
+    field, known = s.field.to(device), ExactField.of(s.field)
+    exact = [ExactRay(known, o, d) for o, d in zip(s.origins, s.directions, strict=True)]
+    clear = [i for i, ray in enumerate(exact) if ray.margin > CLEAR]
+    upstream = np.random.default_rng(0).normal(size=(len(exact), 3))
+    wanted, slopes, sizes = [], known.zeros(), known.zeros()
+    for i in clear:
+        wanted.append(torch.tensor(exact[i].render(s.form)[0]))
+        exact[i].add_gradient(upstream[i], s.form, slopes, sizes)
+    rgb, kept = render_rays(field, s, device)
+    by = torch.tensor(upstream, dtype=torch.float32, device=device)
+    (rgb[clear] * by[clear]).sum().backward()
+    wrong = sum(int(kept[i]) != len(exact[i].samples) for i in clear)
+    with torch.no_grad():
+        shaded = render_rays(field, s, device, known_lookup=False)[0]
+    checks = [
+        *marched(s, name, field, device, exact, clear),
+        Check(f"{name}: rays with a wrong number of samples, of {len(clear)}", wrong, 0),
+        Check(f"{name}: colours", _relative(rgb[clear].detach(), torch.stack(wanted)), 2e-4),
+        Check(f"{name}: colours without gradients", _relative(shaded[clear], torch.stack(wanted)), 2e-4),
+    ]
+    for kind in ("density", "features", *(["reliability"] if s.form else [])):
+        checks.append(Check(f"{name}: gradient of {kind}", _slope_error(field, kind, slopes), 1e-3))
+    return checks
+
+
+@torch.no_grad()
+def marched(s: Scene, name: str, field: MMPIField, device: str, exact: list[ExactRay], clear: list[int]) -> list[Check]:
+    """What the march itself says: optical depths, and which samples it keeps at a threshold."""
+    rays, threshold = bundle_of(s.origins, s.directions).to(device), 0.02
+    samples, _ = MMPISampler()(rays, field=field, threshold=0.0, blend_form=s.form)
+    depth = metadata_of(samples)["tau"][..., 0].sum(-1)[clear]
+    wanted = torch.tensor([sum(b.depth for b in exact[i].blended(s.form)) for i in clear])
+    samples, report = MMPISampler()(rays, field=field, threshold=threshold, blend_form=s.form)
+    kept, wrong, lost = metadata_of(samples)["valid"][..., 0].sum(-1), 0, []
+    for i in clear:
+        weights = exact[i].render(s.form)[1].weights
+        lost.append(float(weights[weights <= threshold].sum()))
+        sure = [int((weights > threshold * (1 + sign * 1e-3)).sum()) for sign in (1, -1)]
+        wrong += not sure[0] <= int(kept[i]) <= sure[1]
+    return [
+        Check(f"{name}: optical depths by the march", _relative(depth, wanted), 1e-4),
+        Check(f"{name}: rays that keep other samples than they should", wrong, 0),
+        Check(f"{name}: mass of what is dropped", _relative(report.dropped_mass[clear, 0], torch.tensor(lost)), 1e-2),
+    ]
+
+
+def _slope_error(field: MMPIField, kind: str, slopes: Gradients) -> float:
+    found = getattr(field, kind).grad
+    return _relative(found.to_dense() if found.is_sparse else found, torch.tensor(slopes.flat(kind)))
+
+
+def marches(device: str, rehearse: bool) -> list[Check]:
+    """One, four and nine heads, with and without the cube, in every form of blending."""
+    cases: tuple[tuple[int, BlendForm | None, CubePlan | None], ...]
+    found, cases = [], ((4, "paper", CUBE), (1, None, None), (4, None, None), (4, "opacity", None), (9, None, CUBE))
+    for count, form, cube in cases[: 1 if rehearse else None]:
+        name = f"{count} MPIs{' and the cube' if cube else ''}, {form or 'no'} blending"
+        found += whole_rays(scene(count, 4 if rehearse else 24, form, seed=count, cube=cube), name, device)
+    return found
+
+
+# Kernels by themselves -----------------------------------------------------------------------------------------------
+
+
+def interpolation(device: str, samples: int) -> list[Check]:
+    """Values and row gradients of 9 channels; many samples share rows."""
+    g = torch.Generator().manual_seed(1)
+    texels = max(10, samples // 3)
+    rows = torch.randint(0, texels, (samples, 4), generator=g).to(device)
+    weights, upstream = torch.rand(samples, 4, generator=g).to(device), _draw(device, samples, 9, seed=2)
+    table, exact = _draw(device, texels, 9).requires_grad_(), _draw(device, texels, 9).double().requires_grad_()
+    read, wanted = interpolate(table, rows, weights), interpolate_reference(exact, rows, weights.double())
+    (read * upstream).sum().backward()
+    (wanted * upstream).sum().backward()
+    assert table.grad is not None and exact.grad is not None
+    return [
+        Check("interpolation", _relative(read.detach(), wanted.detach()), 1e-6),
+        Check("interpolation: row gradients", _relative(table.grad.to_dense(), exact.grad), 5e-6),
+    ]
+
+
+def distinct_rows(device: str, samples: int) -> list[Check]:
+    """Rows that share slots of the hash table, and what is summed over them."""
+    g = torch.Generator().manual_seed(2)
+    pool = torch.randint(0, 2**40, (max(1, samples // 3),), generator=g)
+    rows = pool[torch.randint(0, len(pool), (samples, 4), generator=g)].to(device)
+    index, wanted = index_rows(rows), rows.unique()
+    wrong = int(len(index.unique) != len(wanted)) or int((index.unique.sort()[0] != wanted).sum())
+    wrong += int((index.unique[index.position.long()] != rows).sum())
+    values, weights = _draw(device, samples, 9), torch.rand(samples, 4, generator=g).to(device)
+    total = add_rows(index, values, weights)
+    each = (values[:, None].double() * weights[..., None]).reshape(-1, 9)
+    exact = torch.zeros(len(index.unique), 9, dtype=torch.float64, device=device)
+    exact.index_add_(0, index.position.reshape(-1).long(), each)
+    return [Check("distinct rows: wrong", wrong, 0), Check("distinct rows: sums", _relative(total, exact), 5e-6)]
+
+
+def variation(device: str, texels: int) -> list[Check]:
+    """Total variation of MPIs and a cube with its gradient."""
+    field = scene(3, 1, None, cube=CUBE).field.to(device)
+    table = _draw(device, len(field.density), 9) * 2
+    rows = torch.randperm(len(table), generator=torch.Generator().manual_seed(1))[:texels].to(device)
+    scales, found = [(0.5, 2.0, 1.0)] * len(field.grids), []
+    for function, dtype in ((total_variation, torch.float32), (total_variation_reference, torch.float64)):
+        values = table[rows].to(dtype).requires_grad_()
+        value = function(values, table.to(dtype), rows, field.grids, scales)
+        value.backward()
+        found.append((value.detach()[None], values.grad))
+    (value, slope), (exact, exact_slope) = found
+    return [
+        Check("total variation", _relative(value, exact), 1e-5),
+        Check("total variation: gradient", _relative(slope, exact_slope), 1e-5),
+    ]
+
+
+def compositing_kernels(device: str, rays: int, slots: int) -> list[Check]:
+    """Thin, ordinary and opaque samples, and rays without any."""
+    g = torch.Generator().manual_seed(3)
+    tau = (10 ** (torch.rand(rays, slots, generator=g) * 6 - 5)).to(device)
+    valid = (torch.arange(slots) < torch.randint(0, slots + 1, (rays, 1), generator=g)).to(device)
+    before = (torch.rand(rays, slots, generator=g).cumsum(1) * 0.02).to(device)
+    upstream, found = _draw(device, rays, slots), []
+    for function, dtype in ((composite_weights, torch.float32), (compositing.composite_weights, torch.float64)):
+        leaf = tau.to(dtype, copy=True).requires_grad_()
+        made = function(leaf, valid, before.to(dtype), before[:, -1:].to(dtype))
+        ((made.weights * upstream).sum() + made.accumulation.sum()).backward()
+        found.append((made.weights.detach(), made.transmittance.detach(), leaf.grad))
+    names = ("weights", "transmittance", "gradient")
+    return [
+        Check(f"compositing: {name}", _relative(a, b), 5e-6) for name, a, b in zip(names, *found, strict=True)
+    ]  # fmt: skip
+
+
+def adam(device: str, rows: int) -> list[Check]:
+    """Four steps on touched rows."""
+    found = []
+    for dtype in (torch.float32, torch.float64):
+        param = torch.nn.Parameter(_draw(device, rows, 9).to(dtype))
+        optimizer = TouchedAdam([param], lr=0.1)
+        for step in range(4):
+            chosen = torch.randint(0, rows, (rows // 2,), generator=torch.Generator().manual_seed(step)).to(device)
+            values = _draw(device, rows // 2, 9, seed=step).to(dtype)
+            param.grad = torch.sparse_coo_tensor(chosen[None], values, param.shape)
+            optimizer.step()
+        found.append(param.data)
+    # A gradient near 0 is divided by its own size, so its roundings count in full.
+    return [Check("Adam on rows", _relative(*found), 1e-4)]
+
+
+def everything(device: str, rehearse: bool) -> list[Callable[[], list[Check]]]:
+    """All comparisons, at the sizes of a training step (or small)."""
+    size = 500 if rehearse else 200_000
+    return [
+        lambda: interpolation(device, size),
+        lambda: distinct_rows(device, size),
+        lambda: compositing_kernels(device, 20 if rehearse else 4096, 37 if rehearse else 150),
+        lambda: variation(device, 200 if rehearse else 100_000),
+        lambda: adam(device, size),
+        lambda: marches(device, rehearse),
+    ]
+
+
+def run_checks(device: str, rehearse: bool) -> dict[str, Any]:
+    """Every check; one that raises has failed.
+
+    Raises:
+        RuntimeError: the kernels are not there to be checked.
+    """
+    if not native.takes_triton(torch.zeros(1, device=device)):
+        raise RuntimeError("the Triton kernels do not run here: nothing can be checked (the log says why)")
+    rows: list[dict[str, Any]] = []
+    for number, work in enumerate(everything(device, rehearse)):
+        try:
+            rows += [{**asdict(c), "ok": c.ok} for c in work()]
+        except Exception as error:  # the others are still worth knowing
+            rows.append(
+                {"name": f"group {number}", "error": None, "bound": 0.0, "ok": False, "raised": repr(error)[:400]}
+            )
+    return {"checks": rows, "failed": sum(not r["ok"] for r in rows)}

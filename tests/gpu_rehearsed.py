@@ -1,0 +1,55 @@
+"""``mmpi-bench gpu --rehearse`` in one process: run by test_bench_gpu.py with TRITON_INTERPRET=1."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import torch
+from nerfstudio.engine import trainer as nerfstudio_trainer
+
+from mmpi_ns.bench import gpu, gpu_checks, gpu_parts, trainings
+from mmpi_ns.bench.cases_rays import scene
+from mmpi_ns.bench.exact_ray import ExactField, ExactRay
+from mmpi_ns.bench.gpu import SHARES, Gpu
+from mmpi_ns.ops import native, triton_march, triton_tables
+
+
+def part_here(module, request, folder, threads, seconds):
+    assert seconds > 0
+    nerfstudio_trainer.writer.EVENT_WRITERS.clear()
+    native.choose("auto")
+    if module == "mmpi_ns.bench.gpu_parts":
+        return gpu_parts.run(request, lambda text: None)
+    return trainings._answer(request, lambda text: None)
+
+
+def test_all_parts_end_to_end(tmp_path, monkeypatch):
+    monkeypatch.setattr(gpu, "run_apart", part_here)
+    Gpu(output=tmp_path / "results", work=tmp_path / "work", rehearse=True).run()
+    found = json.loads((tmp_path / "results" / "gpu.json").read_text())
+    assert set(found["parts"]) == set(SHARES) and found["rehearsal"]
+    assert not [p for p in found["parts"].values() if "not_run" in p]
+    print({name: round(part["wall_s"], 1) for name, part in found["parts"].items()})
+    head = found["headline"]
+    wanted = {"checks", "failed_checks", "copy_gb_per_s", "march_batch_gb_per_s", "march_batch_share_of_copy"}
+    wanted |= {"rays_per_s", "torch_rays_per_s", "frame_ms", "torch_frame_ms", "full_frame_ms", "psnr_delta_db"}
+    wanted |= {"kitti_split_steps_per_s", "kitti_all_minutes_of_40000_steps", "mmpi_psnr_db", "mmpi_seconds"}
+    assert wanted <= set(head) and all(math.isfinite(v) for v in head.values())
+    assert head["failed_checks"] == 0 and head["checks"] > 12 and abs(head["psnr_delta_db"]) < 0.01
+    text = (tmp_path / "results" / "gpu.md").read_text()
+    assert "no number here is a measurement" in text and "Not run" not in text
+    assert (tmp_path / "results" / "gpu.png").stat().st_size > 1000
+
+
+def test_wrong_kernels_are_found(monkeypatch):
+    native.interpret(True)
+    assert all(c.ok for c in gpu_checks.interpolation("cpu", 50))
+    monkeypatch.setattr(
+        triton_tables, "sum_by_position", lambda _, values, w, count: torch.zeros(count, values.shape[1])
+    )
+    assert [c.ok for c in gpu_checks.interpolation("cpu", 50)] == [True, False]
+    s = scene(2, 2, "paper")
+    exact = [ExactRay(ExactField.of(s.field), o, d) for o, d in zip(s.origins, s.directions, strict=True)]
+    monkeypatch.setattr(triton_march, "FORMS", {None: 0, "paper": 2, "opacity": 1})
+    assert not all(c.ok for c in gpu_checks.marched(s, "wrong", s.field, "cpu", exact, [0, 1]))
