@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,8 @@ from jaxtyping import Float, Int
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager, VanillaDataManagerConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader, RandIndicesEvalDataloader
+from nerfstudio.data.utils.nerfstudio_collate import nerfstudio_collate
 from nerfstudio.model_components.ray_generators import RayGenerator
 from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
@@ -47,6 +50,8 @@ class MMPIDataManagerConfig(VanillaDataManagerConfig):
     """COLMAP model with the tracks, relative to the data, in the frame of transforms.json (colmap parser: its own)."""
     triangulate: bool = True
     """Scenes without tracks: match and triangulate the training images' features at the start (a second or so each)."""
+    resident_pixels: float = 60e6
+    """Training pixels held in memory at once (15 bytes each); those of a longer capture are read window by window."""
     seed: int = 0
     """Batches depend on this seed and the step alone, so a resumed run draws what an uninterrupted one would."""
 
@@ -61,14 +66,16 @@ class PixelPool:
     """(image, row, column) of each pixel."""
 
     @staticmethod
-    def from_dataset(dataset: MMPIDataset, device: str | torch.device) -> PixelPool:
-        """Reads every image once; masked pixels are left out.
+    def from_dataset(
+        dataset: MMPIDataset, device: str | torch.device, images: Iterable[int] | None = None
+    ) -> PixelPool:
+        """Reads every image, or some, once; masked pixels are left out.
 
         Raises:
             ValueError: an image or mask cannot be used (names the file), or the masks leave nothing.
         """
         colors, indices = [], []
-        for i in range(len(dataset)):
+        for i in range(len(dataset)) if images is None else images:
             data = dataset.get_data(i, image_type="uint8")
             image = data["image"]
             keep = torch.ones(image.shape[:2], dtype=torch.bool)
@@ -138,7 +145,10 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
     def setup_train(self) -> None:
         """Loads the pixel pool instead of nerfstudio's image cache."""
         CONSOLE.print("Setting up training dataset...")
-        self.pool = PixelPool.from_dataset(self.train_dataset, self.device)
+        sizes = self.train_dataset.cameras.width * self.train_dataset.cameras.height
+        self._reads_by_window = bool(sizes.sum() > self.config.resident_pixels)
+        if not self._reads_by_window:
+            self.pool = PixelPool.from_dataset(self.train_dataset, self.device)
         # Samples nothing: ns-export sets its batches' size here.
         self.train_pixel_sampler = self._get_pixel_sampler(self.train_dataset, self.config.train_num_rays_per_batch)
         cameras = self.train_dataset.cameras
@@ -154,11 +164,32 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         """
         self._keypoints = _keypoint_targets(self.observations, self.device, cameras)
         self._allowed = None
-        if cameras is not None:
+        if cameras is not None and self._reads_by_window:
+            self.pool = PixelPool.from_dataset(self.train_dataset, self.device, cameras.tolist())
+        elif cameras is not None:
             assert self.pool is not None
             self._allowed = self.pool.places_of(torch.from_numpy(cameras))
             if not len(self._allowed):
                 raise ValueError("The masks leave no training pixel in one stretch of the capture: use longer windows.")
+
+    def setup_eval(self) -> None:
+        """nerfstudio's loaders, but for the one that holds every evaluation image in memory."""
+        assert self.eval_dataset is not None
+        CONSOLE.print("Setting up evaluation dataset...")
+        self.eval_pixel_sampler = self._get_pixel_sampler(self.eval_dataset, self.config.eval_num_rays_per_batch)
+        self.eval_ray_generator = RayGenerator(self.eval_dataset.cameras.to(self.device))
+        loaders = {"input_dataset": self.eval_dataset, "device": self.device, "num_workers": 4}
+        self.fixed_indices_eval_dataloader = FixedIndicesEvalDataloader(**loaders)
+        self.eval_dataloader = RandIndicesEvalDataloader(**loaders)
+
+    def next_eval(self, step: int) -> tuple[RayBundle, dict]:
+        """Pixels of one evaluation image, keyed on (seed, step)."""
+        self.eval_count += 1
+        assert self.eval_dataset is not None and self.eval_pixel_sampler is not None
+        g = generator(self.config.seed, step, "evaluation", "cpu")
+        data = self.eval_dataset[int(torch.randint(len(self.eval_dataset), (1,), generator=g))]
+        batch = self.eval_pixel_sampler.sample(nerfstudio_collate([data]))
+        return self.eval_ray_generator(batch["indices"]), batch
 
     def next_train(self, step: int) -> tuple[RayBundle, dict]:
         """Pixel rays first, then keypoint rays (marked in the bundle's metadata), keyed on (seed, step).
@@ -166,7 +197,8 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         Outside training (ns-export asks for step 0 again and again) pixel rays alone, others with each call.
         """
         self.train_count += 1
-        assert self.pool is not None
+        if self.pool is None:  # nobody said which window
+            self.pool = PixelPool.from_dataset(self.train_dataset, self.device)
         g = generator(self.config.seed, step if self.training else self.train_count, "pixels", self.device)
         colors, indices = self.pool.draw(self.get_train_rays_per_batch(), g, self._allowed)
         bundle = self.train_ray_generator(indices)

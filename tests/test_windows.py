@@ -473,3 +473,38 @@ def test_a_process_that_is_killed_ends_the_run_and_leaves_what_is_finished(scene
     status, said = torchrun(scene, windows_file, tmp_path / "again", 2, "--load-dir", str(run / "nerfstudio_models"))
     assert status == 0, said[-2000:]
     assert (tmp_path / "again" / "tiny" / "mmpi-small" / "run" / "windows" / "window-00001.pt").is_file()
+
+
+# Long captures in little memory --------------------------------------------------------------------------------------
+
+
+def test_a_capture_too_large_for_memory_is_read_window_by_window_with_the_same_draws(scene):
+    cameras = np.array([1, 2, 5])
+    at_once, by_window = (datamanager(scene, resident_pixels=limit) for limit in (60e6, 0))
+    assert at_once.pool is not None and by_window.pool is None
+    for manager in (at_once, by_window):
+        manager.use_cameras(cameras)
+        manager.train()
+    assert set(by_window.pool.indices[:, 0].tolist()) == {1, 2, 5} < set(at_once.pool.indices[:, 0].tolist())
+    for step in range(3):
+        (ours, a), (theirs, b) = (m.next_train(step) for m in (at_once, by_window))
+        assert torch.equal(a["image"], b["image"]) and torch.equal(a["indices"], b["indices"])
+        assert torch.equal(ours.directions, theirs.directions)
+        assert set(a["indices"][:, 0].tolist()) <= {1, 2, 5}
+
+
+def test_without_windows_a_large_capture_is_read_when_it_is_first_drawn_from(scene):
+    at_once, late = (datamanager(scene, resident_pixels=limit) for limit in (60e6, 0))
+    assert torch.equal(at_once.next_train(0)[1]["image"], late.next_train(0)[1]["image"])
+
+
+def test_evaluation_batches_are_pixels_of_one_image_drawn_by_the_step(scene):
+    manager = datamanager(scene)
+    bundle, batch = manager.next_eval(3)
+    assert int(manager.next_eval(3)[0].camera_indices[0]) == int(bundle.camera_indices[0])
+    assert len(bundle) == len(batch["image"]) == manager.config.eval_num_rays_per_batch
+    assert len(set(batch["indices"][:, 0].tolist())) == 1
+    assert {int(manager.next_eval(s)[0].camera_indices[0]) for s in range(20)} == {0, 1}
+    image = manager.eval_dataset[int(batch["indices"][0, 0])]["image"]
+    expected = image[batch["indices"][:, 1], batch["indices"][:, 2]]
+    assert torch.equal(batch["image"], expected)
