@@ -14,6 +14,7 @@ from mmpi_ns.bench.ops import Ops
 from mmpi_ns.bench.regions import Regions
 from mmpi_ns.bench.render import Render
 from mmpi_ns.bench.results import Results
+from mmpi_ns.bench.roads import Roads
 from mmpi_ns.bench.scaling import Scaling
 from mmpi_ns.bench.speed import Speed
 from mmpi_ns.bench.stability import Stability
@@ -22,7 +23,7 @@ from mmpi_ns.bench.train import Train
 
 def entrypoint() -> None:
     """The command ``mmpi-bench``; a mistake is one sentence and exit status 1."""
-    measures = Train | Render | Speed | Ops | Scaling | Ablate | Gpu
+    measures = Train | Render | Speed | Ops | Scaling | Roads | Ablate | Gpu
     command = tyro.cli(measures | Stability | Accuracy | Results | Dense | Regions, prog="mmpi-bench")  # type: ignore[arg-type]
     try:
         command.run()

@@ -1,0 +1,258 @@
+"""``mmpi-bench roads``: what a road costs by its length. A step, a frame and memory should not know how long it is."""
+
+from __future__ import annotations
+
+import copy
+import resource
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from mmpi_ns.bench.apart import answer, run_apart
+from mmpi_ns.bench.provenance import fingerprint, read_json, stamp, stamp_line, write_json
+
+BYTES_A_TEXEL = 4 * (1 + 9 + 1) + 1
+"""Density, features, reliability and the mark of having been trained."""
+RAYS = 1024
+
+
+@dataclass
+class Roads:
+    """Procedural roads of several lengths: planning time and disk, and step, frame and memory in a window half way."""
+
+    lengths: tuple[float, ...] = (100.0, 1000.0, 10000.0)
+    """Metres."""
+    steps: int = 200
+    """Training steps of the window half way."""
+    threads: int = 1
+    """Of each process."""
+    output: Path = Path("docs/results")
+    """Where roads.json, roads.md and roads.png go."""
+    work: Path = Path("outputs/roads")
+    """Where scenes, runs and logs go."""
+
+    def run(self) -> None:
+        made, path = stamp("roads", self), self.output / "roads.json"
+        made["threads"] = self.threads
+        key = f"{fingerprint()} {self.steps} {self.threads}"
+        before = read_json(path)
+        rows = before.get("rows", {}) if before.get("key") == key else {}
+        content: dict[str, Any] = {"headline": {}, "made": made, "key": key, "rows": rows}
+        for length in self.lengths:
+            name = f"{length:g} m"
+            if name not in rows:
+                row: dict[str, Any] = {"length": length}
+                for part in ("plan", "train"):
+                    request = {"part": part, "length": length, "steps": self.steps, "folder": str(self.work / name)}
+                    found = run_apart("mmpi_ns.bench.roads", request, self.work / f"{name} {part}", self.threads)
+                    if "not_run" in found:
+                        raise ValueError(f"{name}, {part}: {found['not_run']}")
+                    row |= found
+                rows[name] = row
+                write_json(path, content)
+            r = rows[name]
+            print(
+                f"{name}: {r['windows']} windows, plan {r['plan_s']:.0f} s, step {r['step_ms']:.0f} ms, "
+                f"frame {r['frame_ms']:.0f} ms, {r['peak_gib']:.2f} GiB",
+                flush=True,
+            )
+        content["headline"] = headline(list(rows.values()))
+        write_json(path, content)
+        (self.output / "roads.md").write_text(table(content), encoding="utf-8")
+        draw(self.output / "roads.png", list(rows.values()))
+        print(content["headline"])
+
+
+def measure(request: dict[str, Any], tell: Callable[[str], None]) -> dict[str, Any]:
+    """One part of one road, in a process of its own."""
+    part = plan_road if request["part"] == "plan" else train_window
+    return part(Path(request["folder"]), request["length"], request["steps"])
+
+
+def plan_road(folder: Path, length: float, steps: int) -> dict[str, Any]:
+    """Makes the scene (the images of the window half way alone) and its plan.
+
+    Returns:
+        Seconds of planning, windows, MPIs of all and of the largest, texels of all and of the largest, cameras.
+    """
+    from mmpi_ns.mmpi_scene import load_observations
+    from mmpi_ns.placement.split import place_windows
+    from mmpi_ns.scenes.catalogue import make_scene
+    from mmpi_ns.scenes.dataset import write_dataset
+
+    scene = make_scene("long-road", length=length)
+    data = folder / "data"
+    write_dataset(scene, data, max(4000, 4 * round(length)), images=False, overwrite=True)
+    observations = load_observations(data, downscale_factor=1)
+    config = _config(folder, steps).pipeline.model.placement
+    start = time.perf_counter()
+    plan = place_windows(observations, config, steps * RAYS)
+    seconds = time.perf_counter() - start
+    (folder / "plan.json").write_text(plan.to_json(), encoding="utf-8")
+    _write_images(scene, data, plan)
+    return {
+        "cameras": len(scene.cameras),
+        "plan_s": seconds,
+        "windows": len(plan),
+        "mpis": sum(len(p.mpis) for p in plan.plans),
+        "most_mpis": max(len(p.mpis) for p in plan.plans),
+        "texels": sum(p.texels for p in plan.plans),
+        "most_texels": max(p.texels for p in plan.plans),
+    }
+
+
+def _write_images(scene: Any, data: Path, plan: Any) -> None:
+    """Renders what the cameras about the window half way see: those that it trains with and is looked at from."""
+    from PIL import Image
+
+    from mmpi_ns.scenes.dataset import image_name
+    from mmpi_ns.scenes.scene import render
+
+    manager = _setup(_config(data.parent, 10), reads_images=False).pipeline.datamanager
+    outputs = manager.train_dataparser_outputs
+    transform = outputs.dataparser_transform.double().numpy()
+    centers = (
+        scene.cameras.camera_to_worlds[:, :, 3] @ transform[:, :3].T + transform[:, 3]
+    ) * outputs.dataparser_scale
+    window = plan.windows[len(plan) // 2]
+    near = np.linalg.norm(centers - np.asarray(window.center), axis=-1) < 1.01 * (window.radius + window.margin)
+    (data / "images").mkdir(exist_ok=True)
+    for i in np.nonzero(near)[0]:
+        colors, _ = render(scene, int(i))
+        Image.fromarray((colors * 255).round().astype(np.uint8)).save(data / "images" / image_name(int(i)))
+
+
+def train_window(folder: Path, length: float, steps: int) -> dict[str, Any]:
+    """Trains the window half way as a run over all of them would, and renders a frame there.
+
+    Returns:
+        Milliseconds of a step after growth and of a frame (medians), MPIs and texels of the window, PSNR of the frame,
+        and how much memory the process held at most (GiB).
+    """
+    trainer = _setup(_config(folder, steps, folder / "plan.json"))
+    model, times = trainer._model, []
+    step_once = trainer.train_iteration
+
+    def timed(step: int) -> Any:
+        start = time.perf_counter()
+        result = step_once(step)
+        times.append(time.perf_counter() - start)
+        return result
+
+    trainer.train_iteration = timed
+    window = len(model.windows) // 2
+    trainer._train_window(window) if len(model.windows) > 1 else trainer.train()
+    data_set = trainer.pipeline.datamanager.eval_dataset
+    centers = data_set.cameras.camera_to_worlds[:, :, 3].double()
+    middle = torch.tensor(model.windows.windows[window].center, dtype=torch.float64)
+    nearest = int((centers - middle).norm(dim=-1).argmin())
+    model.eval()
+    camera, frames = data_set.cameras[nearest : nearest + 1], []
+    outputs = model.get_outputs_for_camera(camera)
+    for _ in range(3):
+        start = time.perf_counter()
+        model.get_outputs_for_camera(camera)
+        frames.append(time.perf_counter() - start)
+    truth = data_set.get_data(nearest)["image"][..., :3]
+    return {
+        "step_ms": 1e3 * statistics.median(times[steps // 2 :]),
+        "frame_ms": 1e3 * statistics.median(frames),
+        "window_mpis": len(model.windows.plans[window].mpis),
+        "window_texels": model.windows.plans[window].texels,
+        "psnr_db": float(-10 * torch.log10(((outputs["rgb"] - truth) ** 2).mean())),
+        "peak_gib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20,
+    }
+
+
+def _config(folder: Path, steps: int, plan: Path | None = None) -> Any:
+    from mmpi_ns.mmpi_config import mmpi_small
+
+    config: Any = copy.deepcopy(mmpi_small.config)
+    config.output_dir, config.experiment_name, config.timestamp = folder / "run", "road", "a"
+    config.max_num_iterations, config.steps_per_save, config.vis = steps, 10 * steps, "tensorboard"
+    config.machine.device_type = "cpu"
+    config.logging.local_writer.enable, config.logging.profiler = False, "none"
+    config.data = config.pipeline.datamanager.data = folder / "data"
+    config.pipeline.datamanager.dataparser.downscale_factor = 1
+    config.pipeline.datamanager.resident_pixels = 0
+    config.pipeline.model.plan_file = plan
+    return config
+
+
+def _setup(config: Any, reads_images: bool = True) -> Any:
+    """A trainer; without images only as much of one as knows the scene's frame."""
+    if not reads_images:
+        from types import SimpleNamespace
+
+        manager = config.pipeline.datamanager.setup(device="cpu", test_mode="inference")
+        return SimpleNamespace(pipeline=SimpleNamespace(datamanager=manager))
+    trainer = config.setup(local_rank=0, world_size=1)
+    trainer.setup()
+    return trainer
+
+
+def headline(rows: list[dict[str, Any]]) -> dict[str, float]:
+    """Longest over shortest: what should stay is near 1, what should grow is near the ratio of lengths."""
+    first, last = min(rows, key=lambda r: r["length"]), max(rows, key=lambda r: r["length"])
+    found = {"length_ratio": last["length"] / first["length"]}
+    for name in ("step_ms", "frame_ms", "peak_gib", "plan_s", "texels", "windows"):
+        found[f"{name}_ratio"] = last[name] / first[name]
+    return found
+
+
+def table(content: dict[str, Any]) -> str:
+    """The Markdown page."""
+    lines = [
+        "# Roads",
+        "",
+        stamp_line(content["made"]),
+        "",
+        "Procedural bending roads (`mmpi-scene long-road`), an image of 320 x 96 pixels every 1.5 m. The whole road is",
+        "planned; the window half way is trained as a run through all windows would train it, and a frame is rendered",
+        "there. Disk is what all windows take when they are finished; the two longest roads are trained in part only.",
+        "",
+        "![By length](roads.png)",
+        "",
+        "| road | cameras | windows | MPIs in all | plan, s | disk, GB | MPIs of the window | step, ms | frame, ms "
+        "| PSNR | memory, GiB |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    for name, r in content["rows"].items():
+        cells = [name, r["cameras"], r["windows"], r["mpis"], f"{r['plan_s']:.0f}"]
+        cells += [f"{r['texels'] * BYTES_A_TEXEL / 1e9:.2f}", r["window_mpis"], f"{r['step_ms']:.0f}"]
+        cells += [f"{r['frame_ms']:.0f}", f"{r['psnr_db']:.1f}", f"{r['peak_gib']:.2f}"]
+        lines.append("| " + " | ".join(map(str, cells)) + " |")
+    return "\n".join([*lines, ""])
+
+
+def draw(path: Path, rows: list[dict[str, Any]]) -> None:
+    """What should stay, and what should grow, over the length."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11, 4), layout="constrained")
+    FigureCanvasAgg(figure)
+    stay, grow = figure.subplots(1, 2)
+    lengths = [r["length"] for r in rows]
+    for name, label in (("step_ms", "step"), ("frame_ms", "frame"), ("peak_gib", "memory")):
+        stay.plot(lengths, [r[name] / rows[0][name] for r in rows], "o-", label=label)
+    for name, label in (("plan_s", "planning time"), ("texels", "disk"), ("windows", "windows")):
+        grow.plot(lengths, [r[name] / rows[0][name] for r in rows], "o-", label=label)
+    grow.plot(lengths, [x / lengths[0] for x in lengths], color="0.7", label="linear")
+    stay.axhspan(0.8, 1.2, color="0.9")
+    stay.set(xscale="log", ylim=(0, None), xlabel="metres", ylabel="relative to the shortest")
+    grow.set(xscale="log", yscale="log", xlabel="metres")
+    for axes in (stay, grow):
+        axes.legend(fontsize=8)
+        axes.grid(alpha=0.3)
+    figure.savefig(path, dpi=110)
+
+
+if __name__ == "__main__":
+    answer(measure)
