@@ -36,18 +36,16 @@ class PinholeRays:
         return PinholeRays(*(x.to(device) for x in (cameras.camera_to_worlds, focal, principal)))
 
     def __call__(self, ray_indices: Int[Tensor, "R 3"]) -> RayBundle:
-        """Rays through pixel centres.
+        """Rays through pixel centres. Their pixels' areas, which nobody here reads, are left at 1.
 
         Args:
             ray_indices: camera, row and column of each.
         """
         camera, pixel = ray_indices[:, 0], ray_indices[:, 1:].flip(-1) + 0.5
-        poses, step = self.poses[camera], 1 / self.focal[camera]
-        u, v = ((pixel - self.principal[camera]) * step).unbind(-1)
-        ahead = -torch.ones_like(u)
-        views = [(u, -v, ahead), (u + step[:, 0], -v, ahead), (u, -v - step[:, 1], ahead)]
-        here, right, below = (
-            torch.nn.functional.normalize(rotate(poses[:, :, :3], torch.stack(x, -1)), dim=-1) for x in views
+        poses = self.poses[camera]
+        u, v = ((pixel - self.principal[camera]) / self.focal[camera]).unbind(-1)
+        directions = torch.nn.functional.normalize(
+            rotate(poses[:, :, :3], torch.stack([u, -v, -torch.ones_like(u)], -1)), dim=-1
         )
-        area = (here - right).norm(dim=-1) * (here - below).norm(dim=-1)
-        return RayBundle(poses[:, :, 3], here, area[:, None], camera_indices=camera[:, None], metadata={})
+        one = torch.ones_like(u)[:, None]
+        return RayBundle(poses[:, :, 3], directions, pixel_area=one, camera_indices=camera[:, None], metadata={})

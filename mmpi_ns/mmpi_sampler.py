@@ -15,7 +15,7 @@ from nerfstudio.model_components.ray_samplers import Sampler
 from torch import Tensor
 
 from mmpi_ns.compositing import BlendForm
-from mmpi_ns.geometry import PlaneHits, cube_hits, inverse_distance, plane_hits, sample_disparity
+from mmpi_ns.geometry import PlaneHits, cube_hits, inverse_distance, sample_disparity
 from mmpi_ns.mmpi_field import MMPIField
 from mmpi_ns.mmpi_samples import LocalRays
 from mmpi_ns.ops import native
@@ -89,7 +89,7 @@ class MMPISampler(Sampler):
         """
         assert ray_bundle is not None and ray_bundle.nears is not None and ray_bundle.fars is not None
         origins, directions = ray_bundle.origins, ray_bundle.directions
-        hits = plane_hits(origins, directions, ray_bundle.nears, ray_bundle.fars, field.frames)
+        hits = field.plane_hits(origins, directions, ray_bundle.nears, ray_bundle.fars)
         counts, cube_first = self._counts(ray_bundle, field, hits, head_mask, choose)
         explained = (counts > 0).any(-1, keepdim=True)
         if head_mask is not None or choose is not None:

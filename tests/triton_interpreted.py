@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import oracle
 import pytest
 import torch
-from hand_made import make_mpi, unit
+from hand_made import make_mpi, random_mpi, unit
 from random_fields import OracleRay, bundle, fill, random_field, random_rays, render
 
 from mmpi_ns import compositing, mmpi_sampler
@@ -44,6 +45,42 @@ def by_torch(work):
 
 def normal(*shape, seed=0, dtype=torch.float32):
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=dtype)
+
+
+# Hits ----------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("far", [math.inf, 6.0])
+def test_rays_cross_the_planes_that_the_oracle_has(far):
+    rng, checked = np.random.default_rng(1), 0
+    plan = ScenePlan((*(random_mpi(rng, f"{k}", deep=d) for k, d in enumerate((math.inf, 1.01, 8.0))),), None, 0.3, 1.0)
+    field = MMPIField(plan)
+    origins, directions = random_rays(plan, 60, seed=2)
+    rays = bundle(origins, directions, near=0.3, far=far)
+    hits = field.plane_hits(rays.origins, rays.directions, rays.nears, rays.fars)
+    assert hits.count.dtype == hits.m_first.dtype == torch.int64 and (hits.count == 0).any()
+    for i in range(60):
+        for k, mpi in enumerate(plan.mpis):
+            found = oracle.crossings(mpi, origins[i], directions[i], 0.3, far)
+            if min(c.margin for c in found) < 1e-5:
+                continue
+            live, checked = [c.plane for c in found if c.live], checked + 1
+            assert hits.count[i, k] == len(live)
+            assert not live or mpi.planes - 1 - int(hits.m_first[i, k]) == min(live)
+    assert checked > 100
+
+
+def test_hits_of_hard_rays_are_those_of_the_reference():
+    plan = hard_plan()
+    field, (origins, directions) = MMPIField(plan), (np.array(x, float) for x in zip(*HARD_RAYS.values(), strict=True))
+    rays = bundle(origins, np.stack([unit(d) for d in directions]))
+    found = field.plane_hits(rays.origins, rays.directions, rays.nears, rays.fars)
+    wanted = by_torch(lambda: field.plane_hits(rays.origins, rays.directions, rays.nears, rays.fars))
+    assert torch.equal(found.count, wanted.count) and (wanted.count > 0).any()
+    live = wanted.count > 0
+    assert torch.equal(found.m_first[live], wanted.m_first[live])
+    for name in ("u", "v", "local_origins", "local_directions"):
+        assert torch.allclose(getattr(found, name), getattr(wanted, name), rtol=1e-5, atol=1e-5), name
 
 
 # March ---------------------------------------------------------------------------------------------------------------

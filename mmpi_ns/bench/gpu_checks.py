@@ -133,8 +133,9 @@ def _slope_error(field: MMPIField, kind: str, slopes: Gradients) -> float:
 
 def marches(device: str, rehearse: bool) -> list[Check]:
     """One, four and nine heads, with and without the cube, in every form of blending."""
-    cases: tuple[tuple[int, BlendForm | None, CubePlan | None], ...]
-    found, cases = [], ((4, "paper", CUBE), (1, None, None), (4, None, None), (4, "opacity", None), (9, None, CUBE))
+    cases: list[tuple[int, BlendForm | None, CubePlan | None]]
+    cases = [(4, "paper", CUBE), (1, None, None), (4, None, None), (4, "opacity", None), (9, None, CUBE)]
+    found = []
     for count, form, cube in cases[: 1 if rehearse else None]:
         name = f"{count} MPIs{' and the cube' if cube else ''}, {form or 'no'} blending"
         found += whole_rays(scene(count, 4 if rehearse else 24, form, seed=count, cube=cube), name, device)
