@@ -26,11 +26,14 @@ from mmpi_ns.mmpi_observations import observe, sfm_folder
 from mmpi_ns.mmpi_rays import PinholeRays
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.random_draws import generator
+from mmpi_ns.reachable import TrainingViews
 
 OBSERVATIONS = "mmpi_observations"
 """Key under which the model finds the scene's Observations in the data set's metadata."""
 RAYS_PER_STEP = "mmpi_rays_per_step"
 """Key under which it finds the pixel rays of a training step."""
+TRAINING_VIEWS = "mmpi_training_views"
+"""Key under which it finds where the training cameras stand and what they can see (``TrainingViews``)."""
 KEYPOINT_DEPTH = "keypoint_inverse_distance"
 """Ray-bundle metadata: inverse distance of the SfM point on a keypoint ray, 0 on ordinary rays."""
 
@@ -131,6 +134,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         )
         dataset.metadata[RAYS_PER_STEP] = self.config.train_num_rays_per_batch
         dataset.metadata[OBSERVATIONS] = self.observations
+        dataset.metadata[TRAINING_VIEWS] = TrainingViews.of(dataset.cameras)
         return dataset
 
     def create_eval_dataset(self) -> MMPIDataset:

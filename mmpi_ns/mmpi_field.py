@@ -1,7 +1,6 @@
 """The field: K MPI heads and the cube, their densities, colours and reliabilities (paper sec. III-B to III-D).
 
-One pooled Parameter a kind, with a block of rows per head (``texels.py``), so that K, growth and storage never change
-the parameter list, which nerfstudio fixes before K is known.
+Its tables are in ``mmpi_tables.py``.
 """
 
 from __future__ import annotations
@@ -15,23 +14,22 @@ import torch
 from jaxtyping import Bool, Float, Int
 from nerfstudio.cameras.rays import RaySamples
 from nerfstudio.field_components.field_heads import FieldHeadNames
-from nerfstudio.fields.base_field import Field
 from torch import Tensor, nn
 
 from mmpi_ns import geometry
 from mmpi_ns.color_network import ColorNetworks
 from mmpi_ns.compositing import BlendForm, blend_shares, blended_optical_depth
 from mmpi_ns.mmpi_samples import Gathered, LocalRays, Lookup, Taps, by_head, head_spans, metadata_of
+from mmpi_ns.mmpi_tables import TexelTables, replace_data
 from mmpi_ns.ops import native
-from mmpi_ns.ops.interpolate import gather_rows, index_rows, interpolate, interpolate_gathered
+from mmpi_ns.ops.interpolate import bilinear_rows, gather_rows, index_rows, interpolate, interpolate_gathered
 from mmpi_ns.ops.march import MarchScene, SceneTables
 from mmpi_ns.ops.shade import shade
 from mmpi_ns.ops.variation import total_variation
 from mmpi_ns.placement.plan import ScenePlan
-from mmpi_ns.texels import TexelGrid, head_grids, resample
+from mmpi_ns.reachable import TrainingViews
+from mmpi_ns.texels import BRICK
 
-RELEASED_DENSITY = -20.0
-"""Raw density of texels that no ray trained: their alpha is below 1e-7."""
 NEGLIGIBLE_DEPTH = 1e-4
 """Samples thinner than this are given an equal share instead of a reliability lookup when choosing survivors."""
 
@@ -49,7 +47,7 @@ def plane_biases(planes: int, missing: float = 0.0) -> tuple[Float[Tensor, "L"],
     return torch.log(torch.expm1(-torch.log1p(-alpha) / interval)).float(), interval
 
 
-class MMPIField(Field):
+class MMPIField(TexelTables):
     """Density, colour and reliability of all heads.
 
     Args:
@@ -62,6 +60,8 @@ class MMPIField(Field):
         shares_depth: K MPIs train jointly from the start, so each has 1/K of the optical depth.
         samples_per_voxel: samples along a ray per voxel side of the cube.
         cube_alpha: initial alpha of a cube sample.
+        factor: texels in use, as a share of the plan's.
+        views: training images; what none of them can reach is not stored. None stores everything.
     """
 
     def __init__(
@@ -76,22 +76,15 @@ class MMPIField(Field):
         shares_depth: bool = False,
         samples_per_voxel: float = 1.0,
         cube_alpha: float = 1e-3,
+        factor: float = 1.0,
+        views: TrainingViews | None = None,
     ) -> None:
-        super().__init__()
-        self.feature_channels = feature_channels
+        super().__init__(plan, feature_channels, factor, views)
         self.shares_depth = shares_depth
         self.samples_per_voxel = samples_per_voxel
         self.cube_alpha = cube_alpha
-        self.full_plan = self.plan = plan
-        self.factor = 1.0
-        """Share of the plan's texels in use: ``texel_factor``, where reading it does not wait for a device."""
         self.learns_cover = True
         """Whether training rays mark the texels they train; off once blending has begun, so that P cannot jump."""
-        self.grids: list[TexelGrid] = []
-        self._packed: dict[Any, Any] = {}
-        self.density = nn.Parameter(torch.empty(0, 1))
-        self.features = nn.Parameter(torch.empty(0, feature_channels))
-        self.reliability = nn.Parameter(torch.empty(0, 1))
         self.networks = ColorNetworks(
             1 if shared_colour else plan.num_heads,
             feature_channels,
@@ -99,74 +92,20 @@ class MMPIField(Field):
             position_frequencies,
             direction_frequencies,
         )
-        self.register_buffer("touched", torch.empty(0, dtype=torch.uint8))
-        self.register_buffer("plan_bytes", torch.empty(0, dtype=torch.uint8))
-        self.register_buffer("texel_factor", torch.tensor(1.0, dtype=torch.float64))
-        self.touched: Tensor
-        self.plan_bytes: Tensor
-        self.texel_factor: Tensor
-        self.build(plan, 1.0)
-
-    # Storage ---------------------------------------------------------------------------------------------------
-
-    def build(self, plan: ScenePlan, factor: float) -> None:
-        """Allocates all tables afresh for ``plan`` at ``factor`` times its texels. Parameters stay the same objects."""
-        self.full_plan, self.plan, self.factor = plan, plan.scaled(factor), factor
-        self.grids = head_grids(self.plan)
-        texels = self.plan.texels
-        device = self.density.device
-        for table, channels in ((self.density, 1), (self.features, self.feature_channels), (self.reliability, 1)):
-            _replace_data(table, torch.zeros(texels, channels, device=device))
-        self.touched = torch.zeros(texels, dtype=torch.uint8, device=device)
-        self.plan_bytes = torch.frombuffer(bytearray(plan.to_json().encode()), dtype=torch.uint8).to(device)
-        self.texel_factor = torch.tensor(factor, dtype=torch.float64, device=device)
-        self._packed = {}
-
-    @torch.no_grad()
-    def grow(self, factor: float) -> None:
-        """Resamples every table to ``factor`` times the plan's texels (paper sec. IV; bilinear on each plane)."""
-        old, self.plan, self.factor = self.grids, self.full_plan.scaled(factor), factor
-        self.grids = head_grids(self.plan)
-        is_cube = [k >= len(self.plan.mpis) for k in range(self.plan.num_heads)]
-        for table in (self.density, self.features, self.reliability):
-            _replace_data(table, resample(table.data, old, self.grids, is_cube))
-        touched = resample(self.touched[:, None].float(), old, self.grids, is_cube)
-        self.touched = (touched[:, 0] > 0).to(torch.uint8)
-        self.texel_factor.fill_(factor)
-        self._packed = {}
 
     def renew_networks(self, count: int) -> None:
         """``count`` fresh colour networks in the same Parameter."""
         weights = self.networks.weights
-        _replace_data(weights, self.networks.fresh(count).to(weights.device))
-
-    @torch.no_grad()
-    def release_untouched(self) -> None:
-        """Empties the texels that no ray trained: alpha 0, no vote in the blending."""
-        self.density.data[self.touched == 0] = RELEASED_DENSITY
+        replace_data(weights, self.networks.fresh(count).to(weights.device))
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
-        """Takes plan and resolution from the checkpoint first, so that all shapes fit."""
-        plan_bytes = state_dict.get(prefix + "plan_bytes")
-        if plan_bytes is None:
-            if not any(key.startswith(prefix) for key in state_dict):
-                return  # nerfstudio loads the pipeline's own, empty state in a second pass
-            raise ValueError("The checkpoint holds no scene plan: it was not written by this method.")
-        plan = ScenePlan.from_json(bytes(plan_bytes.cpu().numpy().tolist()).decode())
+        """Takes the number of colour networks from the checkpoint first."""
         stored = state_dict.get(prefix + "networks.weights")
         if stored is not None and stored.shape[0] != self.networks.count:
             self.networks.resize(stored.shape[0])
-        self.build(plan, float(state_dict[prefix + "texel_factor"]))
-        self.plan_bytes = plan_bytes.clone().to(self.density.device)  # as it was written, whatever a plan has now
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
     # Constants of the plan, on the parameters' device ---------------------------------------------------------
-
-    def _cached(self, name: str, make: Any) -> Any:
-        key = (name, self.density.device)
-        if key not in self._packed:
-            self._packed[key] = make()
-        return self._packed[key]
 
     @property
     def frames(self) -> geometry.Frames:
@@ -318,6 +257,7 @@ class MMPIField(Field):
         for taps in lookup.groups:
             if self.training and self.learns_cover:
                 self.touched.index_fill_(0, lookup.gathered.rows if lookup.gathered else taps.rows.reshape(-1), 1)
+                self.touched[:BRICK] = 0
             raw.append(_read(self.density, lookup.gathered and lookup.gathered.density, taps)[:, 0])
         out = lookup.ndc.new_zeros(lookup.shape.numel())
         if raw:
@@ -353,7 +293,7 @@ class MMPIField(Field):
 
             end = spans[-1][1].stop
             return taps(self.triton_scene()[0], heads[:end], planes[:end], ndc[:end], in_cube=False)
-        parts = [self.grids[k].bilinear(planes[own], ndc[own]) for k, own in spans]
+        parts = [bilinear_rows(self.grids[k], planes[own], ndc[own]) for k, own in spans]
         rows, weights = (torch.cat(p) for p in zip(*parts, strict=True))
         return rows, weights
 
@@ -437,14 +377,3 @@ def _read(table: Tensor, gathered: Tensor | None, taps: Taps) -> Tensor:
     if gathered is None or taps.position is None:
         return interpolate(table, taps.rows, taps.weights)
     return interpolate_gathered(gathered, taps.position, taps.weights)
-
-
-def _replace_data(parameter: nn.Parameter, data: Tensor) -> None:
-    """Gives a parameter data of another shape.
-
-    A graph of an earlier step that is still referenced keeps the parameter's gradient accumulator, and with it the old
-    shape, alive. Torch renews the accumulator when the dtype changes, so the data goes through another dtype.
-    """
-    parameter.grad = None
-    parameter.data = torch.empty(0, dtype=torch.float64, device=data.device)
-    parameter.data = data

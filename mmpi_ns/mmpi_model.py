@@ -16,6 +16,7 @@ from nerfstudio.field_components.field_heads import FieldHeadNames
 from nerfstudio.model_components import renderers
 from nerfstudio.models.base_model import Model
 from nerfstudio.viewer.viewer_elements import ViewerDropdown
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import Parameter
 
@@ -29,7 +30,7 @@ from mmpi_ns.compositing import (
 )
 from mmpi_ns.files import to_bytes, to_text
 from mmpi_ns.metrics import ImageMetrics, head_palette
-from mmpi_ns.mmpi_datamanager import OBSERVATIONS, RAYS_PER_STEP, MMPIDataManager
+from mmpi_ns.mmpi_datamanager import OBSERVATIONS, RAYS_PER_STEP, TRAINING_VIEWS, MMPIDataManager
 from mmpi_ns.mmpi_field import MMPIField
 from mmpi_ns.mmpi_losses import TrainingRays, is_pixel_ray, over_background
 from mmpi_ns.mmpi_sampler import MergeReport, MMPISampler
@@ -41,6 +42,7 @@ from mmpi_ns.ops.composite import composite_weights
 from mmpi_ns.phases import TRAINS, Schedule
 from mmpi_ns.placement.split import cameras_in, place_windows
 from mmpi_ns.random_draws import generator
+from mmpi_ns.reachable import TrainingViews
 from mmpi_ns.windows import WindowedPlan, window_shares
 
 FAIR_SHARE = 0.1
@@ -62,8 +64,7 @@ class MMPIModel(Model):
         # One head has nothing to blend with, so it trains in one go.
         joint = self.config.training == "joint" or all(plan.num_heads == 1 for plan in self.windows.plans)
         self.schedule = self.config.schedule("joint" if joint else "two-phase", len(self.windows))
-        self.field = self._new_field()
-        self.field.build(self.windows.plans[0], self.schedule.texel_factor(0))
+        self.field = self._new_field(self._views(0))
         self.sampler = MMPISampler()
         self.metrics = ImageMetrics(self.config.lpips_net)
         self.register_buffer("schedule_bytes", to_bytes(self.schedule.to_json()))
@@ -75,10 +76,27 @@ class MMPIModel(Model):
         self.show = ViewerDropdown("Show MPI", "all", ["all", *self.windows.names], hint="One MPI alone, or all")
         self.register_load_state_dict_post_hook(lambda *_: self._after_loading())
 
-    def _new_field(self) -> MMPIField:
+    def _new_field(self, views: TrainingViews | None = None) -> MMPIField:
         """A field of this run's settings, with the smallest of plans: to build on or to load into."""
         shares_depth = self.schedule.phase_at(0).name == "joint"
-        return MMPIField(self.windows.plans[self.window], shares_depth=shares_depth, **self.config.field_settings())
+        return MMPIField(
+            self.windows.plans[self.window],
+            shares_depth=shares_depth,
+            factor=self.schedule.texel_factor(0),
+            views=views,
+            **self.config.field_settings(),
+        )
+
+    def _views(self, window: int) -> TrainingViews | None:
+        """The training images that ask a window."""
+        views: TrainingViews | None = self.kwargs.get("metadata", {}).get(TRAINING_VIEWS)
+        if views is None or len(self.windows) == 1:
+            return views
+        return views.some(self._cameras_of(views.origins.numpy(), window))
+
+    def _cameras_of(self, centers: NDArray[np.float64], number: int) -> NDArray[np.int64]:
+        window = self.windows.windows[number]
+        return cameras_in(centers, np.asarray(window.center), window.radius + window.margin)
 
     def _initial_plan(self) -> WindowedPlan:
         if self.config.plan_file is not None:
@@ -126,30 +144,22 @@ class MMPIModel(Model):
         ]
 
     def prepare_step(self, attributes: TrainingCallbackAttributes | None, step: int) -> None:
-        """Brings resolution, freezing and released texels to what the schedule says of this step."""
+        """Brings resolution, freezing and what is stored to what the schedule says of this step."""
         self.step = step
         phase = self.schedule.phase_at(step)
-        factor = self.schedule.texel_factor(step)
+        optimizers = attributes.optimizers.optimizers if attributes and attributes.optimizers else {}
         if self.schedule.window_at(step) != self.window:
-            self._enter_window(self.schedule.window_at(step), factor)
-            self._reset_moments(attributes, ("density", "features", "colour", "reliability"))
-        elif factor != self.field.factor:
-            self.field.grow(factor)
-            self._reset_moments(attributes, ("density", "features", "reliability"))
+            self._enter_window(self.schedule.window_at(step), self.schedule.texel_factor(step))
+            for kind, params in self.get_param_groups().items():
+                if kind in optimizers:
+                    optimizers[kind].reset_moments(params[0])
+        self.field.prepare_storage(self.schedule, step, self.config.release_weight, optimizers)
         if len(self.windows) > 1 and attributes is not None and self._fed != self.window:
             self._feed_window(attributes)
-        if phase.name == "blend" and step == phase.start:
-            self.field.release_untouched()
         self.field.learns_cover = phase.name in ("individual", "joint")
         for kind, params in self.get_param_groups().items():
             for p in params:
                 p.requires_grad_(kind in TRAINS[phase.name])
-
-    def _reset_moments(self, attributes: TrainingCallbackAttributes | None, kinds: tuple[str, ...]) -> None:
-        optimizers = attributes.optimizers.optimizers if attributes and attributes.optimizers else {}
-        for kind in kinds:
-            if kind in optimizers:
-                optimizers[kind].reset_moments(self.get_param_groups()[kind][0])
 
     def _enter_window(self, window: int, factor: float) -> None:
         """Begins another window with fresh tables and networks; the trainer has put the one before away."""
@@ -157,6 +167,7 @@ class MMPIModel(Model):
         self.window_number.fill_(window)
         self.store.forget(window)
         plan = self.windows.plans[window]
+        self.field.views = self._views(window)
         self.field.build(plan, factor)
         self.field.renew_networks(1 if self.config.shared_colour else plan.num_heads)
 
@@ -164,9 +175,7 @@ class MMPIModel(Model):
         """Has the data manager draw from the cameras that ask this window."""
         manager = attributes.pipeline.datamanager if attributes.pipeline else None
         assert isinstance(manager, MMPIDataManager), "windows need MMPIDataManager"
-        window = self.windows.windows[self.window]
-        centers = manager.observations.centers
-        manager.use_cameras(cameras_in(centers, np.asarray(window.center), window.radius + window.margin))
+        manager.use_cameras(self._cameras_of(manager.observations.centers, self.window))
         self._fed = self.window
 
     @property
@@ -228,6 +237,8 @@ class MMPIModel(Model):
         tau, lookup = self._optical_depth(samples, blend_form)
         valid = metadata_of(samples)["valid"][..., 0]
         composite = composite_weights(tau, valid, metadata_of(samples)["skipped_before"][..., 0], report.skipped_total)
+        if self.training and lookup and self.schedule.watches(self.step):
+            self.field.note_use(lookup, composite.weights, report.live)
         # Keypoint rays are supervised in depth alone: no colours for them.
         colored = lookup.of_rays(is_pixel_ray(bundle)) if lookup and self.training else lookup
         colors = self.field.get_outputs(samples, colored)[FieldHeadNames.RGB]

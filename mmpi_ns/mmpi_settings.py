@@ -52,6 +52,10 @@ class MMPIModelConfig(ModelConfig):
     """Decades that learning rates fall over a phase."""
     growth_shares: tuple[float, ...] = (1 / 15, 2 / 15, 3 / 15, 4 / 15)
     """When the texels of a plane double, as shares of the first phase."""
+    release_shares: tuple[float, ...] = (0.5, 0.75, 0.95)
+    """When bricks (8 x 8 texels of a plane) in which nothing is seen are given up, as shares of the first phase."""
+    release_weight: float = 5e-3
+    """Bricks in which no sample of a training ray weighs this much are given up; 0 keeps all that rays can reach."""
     rays_per_mpi: Literal["split", "all"] = "split"
     """Individual phase: the MPIs share a batch's rays, or each renders all of them (K times the work a step)."""
     blend_form: BlendForm = "paper"
@@ -97,6 +101,7 @@ class MMPIModelConfig(ModelConfig):
             decay_decades=self.decay_decades,
             finetune_rate=self.finetune_rate,
             windows=windows,
+            release_shares=self.release_shares if self.release_weight > 0 else (),
         )
 
     def field_settings(self) -> dict[str, Any]:

@@ -229,6 +229,11 @@ class MMPITrainer(Trainer):
         stored = pipeline_state.get("_model.windows_bytes", pipeline_state.get("_model.field.plan_bytes"))
         if stored is None:
             raise ValueError(f"{path} holds no scene plan: it was not written by this method.")
+        if "_model.field.tiles" not in pipeline_state:
+            raise ValueError(
+                f"{path} is from before tables were stored in bricks: it can be rendered and evaluated, not resumed: "
+                "train anew."
+            )
         theirs, ours = WindowedPlan.from_json(bytes(stored.numpy().tolist()).decode()), self._model.windows
         if theirs != ours:
             raise ValueError(

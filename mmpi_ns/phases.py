@@ -7,7 +7,7 @@ Source: paper sec. III-C ("two-stage reliability learning scheme") and sec. IV (
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from typing import Literal
 
@@ -45,6 +45,9 @@ class Schedule:
     """Learning rates at the start of the fine-tune, relative to those of the first phase."""
     windows: int = 1
     """Windows of a long capture, which walk through all of this one after the other."""
+    release: tuple[int, ...] = ()
+    """Steps before which bricks are given up in which nothing was seen since the last such step, or since surfaces
+    formed."""
 
     @property
     def window_steps(self) -> int:
@@ -77,7 +80,19 @@ class Schedule:
 
     def sharpened(self, step: int) -> bool:
         """Whether surfaces have formed: resolution has stopped growing (without growth: a tenth of the first phase)."""
-        return self._local(step) >= (self.growth[-1] if self.growth else self.phases[0].end // 10)
+        return self._local(step) >= self._sharp_from
+
+    @property
+    def _sharp_from(self) -> int:
+        return self.growth[-1] if self.growth else self.phases[0].end // 10
+
+    def releases_at(self, step: int) -> bool:
+        """Whether bricks are given up before this step."""
+        return self._local(step) in self.release
+
+    def watches(self, step: int) -> bool:
+        """Whether what a step sees counts for the next release of bricks."""
+        return bool(self.release) and self._sharp_from <= self._local(step) < self.release[-1]
 
     def rate_factor(self, kind: str, step: int) -> float:
         """Learning rate of a parameter kind relative to its start value; 0 where it is frozen."""
@@ -95,7 +110,8 @@ class Schedule:
     def from_json(text: str) -> Schedule:
         data = json.loads(text)
         phases = tuple(Phase(**p) for p in data.pop("phases"))
-        return Schedule(phases=phases, growth=tuple(data.pop("growth")), **data)
+        lists = {name: tuple(data.pop(name, ())) for name in ("growth", "release")}
+        return Schedule(phases=phases, **lists, **data)
 
 
 def make_schedule(
@@ -108,6 +124,7 @@ def make_schedule(
     decay_decades: float = 1.5,
     finetune_rate: float = 0.1,
     windows: int = 1,
+    release_shares: tuple[float, ...] = (),
 ) -> Schedule:
     """The schedule of a run of ``total_steps`` steps a window.
 
@@ -120,6 +137,8 @@ def make_schedule(
         decay_decades: decades that learning rates fall over a phase (paper: x0.1 per 20k of 30k steps = 1.5).
         finetune_rate: learning rates at the start of the fine-tune relative to the first phase's.
         windows: windows of a long capture, trained one after the other.
+        release_shares: when bricks in which nothing is seen are given up, as shares of the first phase; not before
+            surfaces have formed.
 
     Raises:
         ValueError: the shares leave no step for the first phase.
@@ -142,4 +161,6 @@ def make_schedule(
     growth = tuple(max(1, round(s * phases[0].end)) for s in growth_shares)
     if any(a > b for a, b in pairwise(growth)):
         raise ValueError("growth-shares must not decrease.")
-    return Schedule(phases, growth, float(decay_decades), float(finetune_rate), windows)
+    schedule = Schedule(phases, growth, float(decay_decades), float(finetune_rate), windows)
+    release = sorted({round(s * phases[0].end) for s in release_shares})
+    return replace(schedule, release=tuple(s for s in release if s > schedule._sharp_from))

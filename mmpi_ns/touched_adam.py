@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from nerfstudio.engine.optimizers import OptimizerConfig
 from torch import Tensor
@@ -42,8 +43,7 @@ class TouchedAdam(torch.optim.Optimizer):
                 state = self.state[param]
                 if not state:
                     state["step"] = 0
-                    state["exp_avg"] = torch.zeros_like(param)
-                    state["exp_avg_sq"] = torch.zeros_like(param)
+                    state["exp_avg"], state["exp_avg_sq"] = _zeros_like(param), _zeros_like(param)
                 state["step"] += 1
                 update = _sparse_update if param.grad.is_sparse else _dense_update
                 update(param, param.grad, state, group)
@@ -51,6 +51,20 @@ class TouchedAdam(torch.optim.Optimizer):
     def reset_moments(self, param: Parameter) -> None:
         """Forgets the moments of a parameter whose data was resized or redefined."""
         self.state.pop(param, None)
+
+    def keep_blocks(self, param: Parameter, kept: Tensor, size: int) -> None:
+        """Moments of a table of which only the blocks ``kept`` [K], of ``size`` rows each, are left, in that order."""
+        state = self.state.get(param, {})
+        for name in ("exp_avg", "exp_avg_sq"):
+            if name in state:
+                state[name] = state[name].view(-1, size, *param.shape[1:])[kept].flatten(0, 1)
+
+
+def _zeros_like(param: Tensor) -> Tensor:
+    """Zeros that take no memory on a CPU until they are written to: most rows of a table may never be."""
+    if param.device.type != "cpu" or param.dtype not in (torch.float32, torch.float64):
+        return torch.zeros_like(param)
+    return torch.from_numpy(np.zeros(param.shape, dtype=str(param.dtype).removeprefix("torch.")))
 
 
 def _adam(

@@ -89,7 +89,8 @@ def test_growing_keeps_the_parameters_and_a_bilinear_field():
     field.grow(1.0)
     assert [getattr(field, name) for name in TABLES] == before and all(a is b for a, b in zip(
         before, (field.density, field.features, field.reliability), strict=True))  # fmt: skip
-    assert field.density.shape == (plan.texels, 1) and field.plan == plan and field.touched.shape == (plan.texels,)
+    rows = sum(len(g.own_tiles.reshape(-1)) for g in field.grids) * 64 + 64
+    assert field.density.shape == (rows, 1) and field.plan == plan and field.touched.shape == (rows,)
     assert float(field.texel_factor) == 1.0 and [g.width for g in field.grids] == [7, 7, 4]
     fine = render(field, rays)
     assert (coarse.report.live > 3).any()
@@ -120,14 +121,14 @@ def test_growing_marks_a_texel_as_trained_when_one_that_it_came_from_was():
     field.build(plan, 1 / 4)
     field.touched[field.grids[0].nearest(torch.tensor([[-1.0, -1.0, -1.0]]))] = 1
     field.grow(1.0)
-    grown = field.touched.view(2, 8, 8)
+    grown = field.touched[field.grids[0].rows].view(2, 8, 8)
     assert grown[0, 0, 0] == 1 and grown[0, 2, 2] == 1
     assert grown[0, 3:].sum() == 0 and grown[0, :, 3:].sum() == 0 and grown[1].sum() == 0
 
 
 def test_released_texels_are_empty_and_the_others_stay_as_they_are(plan):
     field = fill(MMPIField(plan), seed=3)
-    untouched = torch.rand(plan.texels, generator=torch.Generator().manual_seed(0)) < 0.5
+    untouched = torch.rand(len(field.density), generator=torch.Generator().manual_seed(0)) < 0.5
     field.touched[untouched] = 0
     before = field.density.detach().clone()
     field.release_untouched()
@@ -226,15 +227,16 @@ def test_total_variation_is_the_sum_over_touched_texels_and_their_neighbours(wit
         shape = (grid.depth, grid.height, grid.width)
         side = max(shape[1:])
         scales = (shape[0], side, side) if k < 2 else shape
-        for row in touched & set(range(grid.offset, grid.offset + grid.texels)):
-            z, y, x = np.unravel_index(row - grid.offset, shape)
+        places = {row: i for i, row in enumerate(grid.rows.tolist())}
+        for row in touched & set(places):
+            z, y, x = np.unravel_index(places[row], shape)
             for axis in range(3):
                 for step in (-1, 1):
                     other = np.array([z, y, x])
                     other[axis] += step
                     if not 0 <= other[axis] < shape[axis]:
                         continue
-                    neighbour = grid.offset + np.ravel_multi_index(tuple(other), shape)
+                    neighbour = int(grid.rows[np.ravel_multi_index(tuple(other), shape)])
                     scale = scales[axis] / 128 / 6
                     for table, weight in ((field.density, 2.0), (field.features, 0.5)):
                         for a, b in zip(table[row].tolist(), table[neighbour].tolist(), strict=True):

@@ -73,7 +73,7 @@ def test_the_march_keeps_what_the_reference_keeps(monkeypatch, num_mpis, with_cu
 
 def test_behind_an_opaque_plane_the_march_visits_nothing_and_loses_a_hundred_thousandth():
     field = MMPIField(ScenePlan((make_mpi(planes=64),), None, 0.05, 1.0)).eval()
-    field.density.data[: 10 * field.grids[0].height * field.grids[0].width] = 30.0
+    field.density.data[field.grids[0].rows[: 10 * field.grids[0].height * field.grids[0].width]] = 30.0
     found = render(field, bundle([[0, 0, 0]], [[0, 0, 1]]), threshold=1e-3)
     assert found.report.live.item() == 64 and found.samples.metadata["valid"].sum() == 1
     assert found.report.skipped_total.item() == 0 and found.report.dropped_mass.item() <= 1e-5
@@ -189,8 +189,9 @@ def test_variation_equals_the_reference_with_its_gradient(channels):
     cube = CubePlan((-1.0, -1.0, 2.0), (1.0, 1.0, 5.0), (3, 2, 4))
     plan = ScenePlan((make_mpi("a", height=5, width=4, planes=3), make_mpi("b", height=2, width=3)), cube, 0.05, 1.0)
     grids = MMPIField(plan).grids
-    table = normal(plan.texels, channels) * 2
-    rows = torch.randperm(plan.texels, generator=torch.Generator().manual_seed(1))[: plan.texels - 9]
+    texels = torch.cat([g.rows for g in grids])
+    table = normal(len(grids[0].places) * 64, channels) * 2
+    rows = texels[torch.randperm(plan.texels, generator=torch.Generator().manual_seed(1))[: plan.texels - 9]]
     found = []
     for function in (total_variation, total_variation_reference):
         values = table[rows].requires_grad_()

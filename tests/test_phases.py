@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 
@@ -104,6 +106,22 @@ def test_without_growth_all_texels_are_there_from_the_start():
     assert make_schedule("joint", 10, growth_shares=()).texel_factor(0) == 1
 
 
+def test_bricks_are_given_up_after_growth_and_what_is_seen_before_does_not_count():
+    schedule = make_schedule("joint", 1_000, release_shares=(0.1, 0.5, 0.75, 0.5), windows=2)
+    assert schedule.growth[-1] == 267 and schedule.release == (500, 750), "not before surfaces have formed, and once"
+    assert [s for s in range(2_000) if schedule.releases_at(s)] == [500, 750, 1_500, 1_750]
+    watched = [s for s in range(2_000) if schedule.watches(s)]
+    assert watched == [*range(267, 750), *range(1_267, 1_750)]
+    assert not any(make_schedule("joint", 100).watches(s) for s in range(100))
+    assert make_schedule("two-phase", 1_000, release_shares=(1.0,)).release == (750,), "shares of the first phase"
+
+
+def test_a_schedule_from_before_there_were_releases_has_none():
+    text = json.loads(make_schedule("joint", 100, release_shares=(0.5,)).to_json())
+    del text["release"]
+    assert Schedule.from_json(json.dumps(text)) == make_schedule("joint", 100)
+
+
 def test_phases_without_steps_are_left_out():
     assert [p.name for p in make_schedule("two-phase", 100, blend_share=0.0).phases] == ["individual"]
     assert make_schedule("two-phase", 1).phases == (Phase("individual", 0, 1),)
@@ -111,7 +129,7 @@ def test_phases_without_steps_are_left_out():
 
 @pytest.mark.parametrize("training", ["two-phase", "joint"])
 def test_schedule_survives_json(training):
-    schedule = make_schedule(training, 1234, decay_decades=0.7, finetune_rate=0.2)
+    schedule = make_schedule(training, 1234, decay_decades=0.7, finetune_rate=0.2, release_shares=(0.5, 0.9))
     assert Schedule.from_json(schedule.to_json()) == schedule
     assert hash(Schedule.from_json(schedule.to_json())) == hash(schedule)
 

@@ -10,7 +10,8 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocati
 from training_runs import ready, trainer_config, write_plan
 
 STEPS = 24
-"""individual 0-11 with doublings at 3 and 6, blend 12-17, finetune 18-23; joint 0-23 with doublings at 6 and 12."""
+"""individual 0-11 with doublings at 3 and 6 and a release of bricks before 11, blend 12-17, finetune 18-23; joint 0-23
+with doublings at 6 and 12 and a release before 22."""
 BOUNDARIES = (3, 6, 12, 18)
 
 
@@ -58,13 +59,27 @@ def resumed(whole, scene, plan_file, tmp_path):
     return run
 
 
-@pytest.mark.parametrize("step", [*(b + d for b in BOUNDARIES for d in (-2, -1, 0)), STEPS - 2])
+@pytest.mark.parametrize("step", [*(b + d for b in BOUNDARIES for d in (-2, -1, 0)), STEPS - 3, STEPS - 2])
 def test_a_resumed_run_ends_as_the_uninterrupted_one(whole, resumed, step):
     folder = resumed(step)
     wanted, found = load(whole[1], STEPS - 1), load(folder, STEPS - 1)
     assert differences(compared(wanted), compared(found)) == []
     assert sorted(int(p.stem[5:]) for p in folder.iterdir()) == list(range(step + 1, STEPS))
     assert set(found["optimizers"]["density"]["state"][0]) == {"step", "exp_avg", "exp_avg_sq"}
+
+
+def test_bricks_were_given_up_on_the_way_and_checkpoints_hold_the_others_alone(whole):
+    """Between steps 6 or 12, when resolution stops growing, and the end of the first phase."""
+    steps = range(12, STEPS) if "training" in whole[0] else range(6, 14)
+    states = [load(whole[1], step) for step in steps]
+    rows = [len(state["pipeline"]["_model.field.density"]) for state in states]
+    assert rows == sorted(rows, reverse=True) and rows[-1] < rows[0]
+    for state, count in zip(states, rows, strict=True):
+        field = {k.removeprefix("_model.field."): v for k, v in state["pipeline"].items()}
+        assert count == 64 * ((field["tiles"] > 0).sum() + 1)
+        assert {len(field[k]) for k in ("features", "reliability", "touched")} == {count}
+        moments = state["optimizers"]["features"]["state"]
+        assert all(len(moments[0][k]) == count for k in ("exp_avg", "exp_avg_sq"))
 
 
 def test_steps_differ_so_the_comparison_can_fail(whole):
@@ -224,6 +239,17 @@ def test_a_checkpoint_of_another_method_is_refused(whole, scene, plan_file, tmp_
     torch.save(state, folder / "step-000000005.ckpt")
     with pytest.raises(ValueError, match="not written by this method"):
         ready(trainer_config(scene, plan_file, tmp_path / "out", STEPS), load_dir=folder)
+
+
+def test_a_checkpoint_from_before_there_were_bricks_is_not_trained_on(whole, scene, plan_file, tmp_path):
+    state = load(whole[1], 5)
+    del state["pipeline"]["_model.field.tiles"]
+    folder = tmp_path / "models"
+    folder.mkdir()
+    torch.save(state, folder / "step-000000005.ckpt")
+    with pytest.raises(ValueError, match="before tables were stored in bricks: it can be rendered") as error:
+        ready(trainer_config(scene, plan_file, tmp_path / "out", STEPS, **whole[0]), load_dir=folder)
+    assert "\n" not in str(error.value)
 
 
 def test_a_folder_without_checkpoints_is_named(scene, plan_file, tmp_path):

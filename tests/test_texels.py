@@ -7,15 +7,16 @@ import oracle
 import pytest
 import torch
 
+from mmpi_ns.bricks import resample
 from mmpi_ns.ops.interpolate import interpolate_reference
-from mmpi_ns.texels import TexelGrid, head_grids, resample
+from mmpi_ns.texels import BRICK, head_grids, make_grids
 
 F64 = torch.float64
 
 
 @pytest.fixture
 def table(plan):
-    return torch.tensor(np.random.default_rng(0).normal(size=(plan.texels, 3)), dtype=F64)
+    return torch.tensor(np.random.default_rng(0).normal(size=(len(head_grids(plan)[0].places) * BRICK, 3)), dtype=F64)
 
 
 def block(table, grid):
@@ -30,10 +31,13 @@ def positions(count, dims):
     return torch.tensor(coordinates, dtype=F64)
 
 
-def test_heads_own_consecutive_blocks_with_the_cube_last(plan):
-    grids = head_grids(plan)
-    assert [(g.offset, g.depth, g.height, g.width) for g in grids] == [(0, 9, 5, 7), (315, 9, 5, 7), (630, 7, 5, 5)]
-    assert grids[-1].rows.stop == plan.texels == sum(g.texels for g in grids)
+def test_heads_own_consecutive_tiles_with_the_cube_last_and_every_texel_a_row(plan):
+    grids = head_grids(plan.scaled(9))
+    sizes = [(g.first_tile, g.depth, g.height, g.width, g.down, g.across) for g in grids]
+    assert sizes == [(0, 9, 15, 21, 2, 3), (54, 9, 15, 21, 2, 3), (108, 15, 10, 10, 2, 2)]
+    rows = torch.cat([g.rows for g in grids])
+    assert len(rows.unique()) == len(rows) == plan.scaled(9).texels and rows.min() >= BRICK
+    assert rows.max() < len(grids[0].places) * BRICK == (108 + 60 + 1) * BRICK
 
 
 def test_bilinear_lookup_equals_the_loop_on_every_plane_of_every_mpi(plan, table):
@@ -80,17 +84,17 @@ def test_lookups_stay_in_their_own_block_and_weights_sum_to_one(plan):
         lookups = [grid.trilinear(ndc), (grid.nearest(ndc)[:, None], torch.ones(202, 1))]
         lookups += [grid.bilinear(torch.tensor(p).expand(202), ndc[:, :2]) for p in (0, grid.depth - 1)]
         for rows, weights in lookups:
-            assert rows.min() >= grid.rows.start and rows.max() < grid.rows.stop
+            assert torch.isin(rows, grid.rows).all() and grid.holds(rows.reshape(-1)).all()
             assert torch.allclose(weights.double().sum(-1), torch.ones(202, dtype=F64)) and (weights >= 0).all()
 
 
 @pytest.mark.parametrize("size", [270, 4096])
 def test_float32_lookups_are_off_by_a_small_share_of_a_texel(size):
-    grid = TexelGrid(0, 2, size, size)
+    (grid,) = make_grids([(2, size, size)])
     uv = positions(2000, 2).clamp(-1, 1)
     for i, dtype in ((0, F64), (1, torch.float32)):
         rows, weights = grid.bilinear(torch.zeros(2000, dtype=torch.int64), uv.to(dtype))
-        column = ((rows % size) * weights.double()).sum(-1)
+        column = (grid.texel(rows)[2] * weights.double()).sum(-1)
         if i == 0:
             exact = column
     # A coordinate in [-1, 1] rounds to 6e-8, which is size / 2 times that in texels.
@@ -119,7 +123,7 @@ def test_resampling_keeps_what_is_linear_and_lookups_of_it(plan):
     """A table that is linear over each grid reads the same at every resolution, in every head."""
 
     def linear(grids):
-        parts = []
+        table = torch.zeros(len(grids[0].places) * BRICK, 2, dtype=F64)
         for g in grids:
             z, y, x = torch.meshgrid(
                 torch.arange(g.depth, dtype=F64),
@@ -127,13 +131,14 @@ def test_resampling_keeps_what_is_linear_and_lookups_of_it(plan):
                 torch.linspace(-1, 1, g.width, dtype=F64),
                 indexing="ij",
             )
-            parts.append(torch.stack([3 * x - y, 0.5 * y + (z if g.depth == 9 else 0 * z)], -1).view(-1, 2))
-        return torch.cat(parts)
+            table[g.rows] = torch.stack([3 * x - y, 0.5 * y + (z if g.depth == 9 else 0 * z)], -1).view(-1, 2)
+        return table
 
     old, new = head_grids(plan), head_grids(plan.scaled(4))
     resampled = resample(linear(old), old, new, [False, False, True])
     assert [g.width for g in new] == [14, 14, 8]
-    assert torch.allclose(resampled, linear(new), atol=1e-12)
+    assert resampled.shape == linear(new).shape
+    assert all(torch.allclose(resampled[g.rows], linear(new)[g.rows], atol=1e-12) for g in new)
 
 
 def test_resampling_keeps_planes_apart_and_corners_exact(plan, table):
@@ -142,12 +147,13 @@ def test_resampling_keeps_planes_apart_and_corners_exact(plan, table):
     for a, b in zip(old, new, strict=True):
         before, after = block(table, a), block(resampled, b)
         assert np.array_equal(after[0, 0, 0], before[0, 0, 0]) and np.array_equal(after[-1, -1, -1], before[-1, -1, -1])
-    lonely = torch.zeros(plan.texels, 1, dtype=F64)
-    lonely[old[0].offset + 4 * 35 : old[0].offset + 5 * 35] = 1
+    lonely = torch.zeros(len(table), 1, dtype=F64)
+    lonely[old[0].rows[4 * 35 : 5 * 35]] = 1
     spread = block(resample(lonely, old, new, [False, False, True]), new[0])
     assert (spread[4] == 1).all() and spread.sum() == spread[4].size
 
 
 def test_resampling_to_the_same_size_changes_nothing(plan, table):
     grids = head_grids(plan)
-    assert torch.equal(resample(table, grids, grids, [False, False, True]), table)
+    found = resample(table, grids, grids, [False, False, True])
+    assert all(torch.equal(found[g.rows], table[g.rows]) for g in grids)

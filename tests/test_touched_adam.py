@@ -166,6 +166,19 @@ def test_resumed_run_equals_an_uninterrupted_one(layout, tmp_path):
     assert torch.equal(second, whole)
 
 
+def test_moments_follow_the_blocks_that_are_kept():
+    param, kept = Parameter(table()), torch.tensor([0, 2, 3])
+    optimizer = TouchedAdam([param], **SETTINGS)
+    run(param, gradients((8, 3), 3), optimizer)
+    before = copy.deepcopy(optimizer.state[param])
+    optimizer.keep_blocks(param, kept, 2)
+    rows = torch.tensor([0, 1, 4, 5, 6, 7])
+    state = optimizer.state[param]
+    assert all(torch.equal(state[m], before[m][rows]) for m in ("exp_avg", "exp_avg_sq"))
+    assert state["step"] == before["step"]
+    optimizer.keep_blocks(Parameter(torch.zeros(4, 1)), kept, 2)  # one that was never seen
+
+
 def test_forgotten_moments_start_afresh():
     param = Parameter(table())
     optimizer = TouchedAdam([param], **SETTINGS)

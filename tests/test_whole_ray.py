@@ -20,7 +20,7 @@ from mmpi_ns.compositing import (
 from mmpi_ns.geometry import Frames, inverse_distance, plane_hits, sample_disparity, samples_to_ndc
 from mmpi_ns.ops.interpolate import interpolate
 from mmpi_ns.placement.plan import ScenePlan
-from mmpi_ns.texels import head_grids
+from mmpi_ns.texels import BRICK, head_grids
 
 
 def test_oracle_crosses_planes_where_geometry_says():
@@ -53,8 +53,9 @@ def make_scene(num_mpis, seed):
     """A plan and random tables: optical depth, colour [3] and reliability of every texel."""
     rng = np.random.default_rng(seed)
     plan = ScenePlan(tuple(random_mpi(rng, f"mpi{k}", planes=12) for k in range(num_mpis)), None, 0.05, 1.0)
-    depth = torch.tensor(10 ** rng.uniform(-3, 1, size=(plan.texels, 1)))
-    return plan, depth, torch.tensor(rng.random((plan.texels, 3))), torch.tensor(rng.normal(size=(plan.texels, 1)) * 3)
+    rows = len(head_grids(plan)[0].places) * BRICK
+    depth = torch.tensor(10 ** rng.uniform(-3, 1, size=(rows, 1)))
+    return plan, depth, torch.tensor(rng.random((rows, 3))), torch.tensor(rng.normal(size=(rows, 1)) * 3)
 
 
 def render_by_oracle(scene, origin, direction, form):

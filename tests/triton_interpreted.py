@@ -10,6 +10,7 @@ import pytest
 import torch
 from hand_made import make_mpi, random_mpi, unit
 from random_fields import OracleRay, bundle, fill, random_field, random_rays, render
+from test_bricks import SHAPES, bricked_field, thinned
 
 from mmpi_ns import compositing, mmpi_sampler
 from mmpi_ns.mmpi_field import MMPIField
@@ -123,6 +124,11 @@ def test_the_march_keeps_what_the_reference_keeps(monkeypatch, form, threshold):
     assert (plain.report.dropped_mass > 1e-3).any() == (threshold > 0)
 
 
+def test_rays_pass_what_holds_nothing_like_the_reference():
+    field = bricked_field(0.4)
+    compare(field, bundle(*random_rays(field.plan, 40, seed=1)), 1e-3, "paper")
+
+
 def test_nine_heads_and_several_programs_march_like_the_reference(monkeypatch):
     monkeypatch.setattr(triton_march, "block_size", lambda wanted, device: 16)
     field = random_field(9, False, seed=9, planes=10)
@@ -197,7 +203,7 @@ def test_hard_rays_through_thin_and_opaque_planes_march_like_the_reference(monke
 
 def test_behind_an_opaque_plane_the_march_visits_nothing_and_loses_a_hundred_thousandth():
     field = MMPIField(ScenePlan((make_mpi(planes=64),), None, 0.05, 1.0)).eval()
-    field.density.data[: 10 * field.grids[0].height * field.grids[0].width] = 30.0
+    field.density.data[field.grids[0].rows[: 10 * field.grids[0].height * field.grids[0].width]] = 30.0
     found = render(field, bundle([[0, 0, 0]], [[0, 0, 1]]), threshold=1e-3)
     assert found.report.live.item() == 64 and found.samples.metadata["valid"].sum() == 1
     assert found.report.skipped_total.item() == 0 and found.report.dropped_mass.item() <= 1e-5
@@ -309,7 +315,7 @@ def test_rows_gather_what_their_entries_give(weighted):
 
 
 def test_taps_are_those_of_the_grids_also_at_borders_and_outside():
-    field = random_field(3, True, seed=4, planes=9)
+    field = bricked_field()
     g = torch.Generator().manual_seed(1)
     ndc = torch.rand(200, 3, generator=g) * 2.4 - 1.2
     ndc[:20] = ndc[:20].sign()
@@ -327,11 +333,11 @@ def test_taps_are_those_of_the_grids_also_at_borders_and_outside():
 
 @pytest.mark.parametrize("channels", [1, 9])
 def test_variation_equals_the_reference_with_its_gradient(channels):
-    cube = CubePlan((-1.0, -1.0, 2.0), (1.0, 1.0, 5.0), (3, 2, 4))
-    plan = ScenePlan((make_mpi("a", height=5, width=4, planes=3), make_mpi("b", height=2, width=3)), cube, 0.05, 1.0)
-    table, grids = normal(plan.texels, channels) * 2, MMPIField(plan).grids
-    rows = torch.randperm(plan.texels, generator=torch.Generator().manual_seed(1))[: plan.texels - 9]
-    scales, found = [(0.5, 2.0, 1.0), (1.0, 3.0, 0.3), (0.7, 1.0, 2.0)], []
+    grids, _, _ = thinned(SHAPES)
+    table = normal(len(grids[0].places) * 64, channels) * 2
+    texels = torch.cat([g.rows[g.rows >= 64] for g in grids] + [torch.arange(5)])  # and some of the empty brick
+    rows = texels[torch.randperm(len(texels), generator=torch.Generator().manual_seed(1))[:-9]]
+    scales, found = [(0.5 + k, 2.0, 1.0) for k in range(len(grids))], []
     for function, dtype in ((total_variation, torch.float32), (total_variation_reference, torch.float64)):
         values = table[rows].to(dtype).requires_grad_()
         value = function(values, table.to(dtype), rows, grids, scales)

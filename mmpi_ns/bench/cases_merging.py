@@ -14,7 +14,7 @@ from mmpi_ns.bench.cases import UNIT, Case, Error, Outcome, Precision, compare, 
 from mmpi_ns.bench.exact import Array
 from mmpi_ns.ops.interpolate import interpolate
 from mmpi_ns.ops.merge import Merged, keep_survivors, merge
-from mmpi_ns.texels import TexelGrid
+from mmpi_ns.texels import BRICK, make_grids
 from mmpi_ns.touched_adam import TouchedAdam
 
 # Lookups -------------------------------------------------------------------------------------------------------------
@@ -25,11 +25,13 @@ LOOKUP = "values to a rounding of the position times the texels across, gradient
 def _lookup(side: int, positions: Array, precision: Precision) -> Outcome:
     """Bilinear values on two planes and the gradient of the texels, whatever is read how often."""
     rng = np.random.default_rng(0)
-    grid = TexelGrid(0, 2, side, 3)
+    (grid,) = make_grids([(2, side, 3)])
     uv = single(positions)
     planes = np.arange(len(uv)) % 2
     values, by = single(rng.normal(size=(grid.texels, 2))), single(rng.normal(size=(len(uv), 2)))
-    table = torch.tensor(values, dtype=torch.float32, requires_grad=True)
+    table = torch.zeros(len(grid.places) * BRICK, 2)
+    table[grid.rows] = torch.tensor(values, dtype=torch.float32)
+    table.requires_grad_()
     rows, weights = grid.bilinear(torch.tensor(planes), torch.tensor(uv, dtype=torch.float32))
     with precision.context():
         found = interpolate(table, rows, weights)
@@ -50,7 +52,7 @@ def _lookup(side: int, positions: Array, precision: Precision) -> Outcome:
             # A position is known to a rounding; so is each weight, times the texels across.
             sizes[at] += np.abs(by[i]) * side / 4
             reads[at] += 1
-    found_slope = table.grad.to_dense().reshape(images.shape)
+    found_slope = table.grad.to_dense()[grid.rows].reshape(images.shape)
     # Sums of n terms one after the other: up to n roundings of their magnitudes.
     roundings = 8 + float(reads.max())
     return Outcome(

@@ -202,18 +202,23 @@ def measure(s: Scene, precision: Precision) -> Outcome:
         Error(float(np.abs(as_array(found.rgb[i]) - wanted[i]).max()), 2 * float(moved_color[i]) + 16 * UNIT)
         for i in range(len(clear))
     ]
+    texels = torch.cat([grid.rows for grid in s.field.grids])
+    rows_of = {name: None if name == "networks" else texels for name in TABLES}
     gradients = [
-        _gradient_error(table, slopes.flat(name), sizes.flat(name), moved_slope[name], precision)
+        _gradient_error(table, rows_of[name], slopes.flat(name), sizes.flat(name), moved_slope[name], precision)
         for name, table in zip(TABLES, tables, strict=True)
         if table.grad is not None and np.abs(sizes.flat(name)).max() > 0
     ]
     return Outcome(Error.worst(errors), Error.worst(gradients))
 
 
-def _gradient_error(table: torch.Tensor, slope: Array, size: Array, moved: float, precision: Precision) -> Error:
-    """Error of a table's gradient relative to the largest sum of magnitudes that an entry is made of."""
+def _gradient_error(
+    table: torch.Tensor, rows: torch.Tensor | None, slope: Array, size: Array, moved: float, precision: Precision
+) -> Error:
+    """Error of a table's gradient (of some rows) relative to the largest sum of magnitudes that an entry is made of."""
     assert table.grad is not None
-    found = as_array(table.grad.to_dense() if table.grad.is_sparse else table.grad).reshape(slope.shape)
+    gradient = table.grad.to_dense() if table.grad.is_sparse else table.grad
+    found = as_array(gradient if rows is None else gradient[rows]).reshape(slope.shape)
     largest = float(size.max())
     if not np.isfinite(found).all():
         return Error(math.inf, 0.0)

@@ -42,13 +42,10 @@ class ExactField:
     @staticmethod
     def of(source) -> ExactField:
         """The state of an ``MMPIField``, in float64."""
-        shapes = [(m.planes, m.height, m.width) for m in source.plan.mpis]
-        shapes += [source.plan.cube.shape] if source.plan.cube is not None else []
-        ends = np.cumsum([math.prod(s) for s in shapes])
 
         def split(table) -> list[Array]:
-            flat = table.detach().double().cpu().numpy().reshape(int(ends[-1]), -1)
-            return [part.reshape(*s, -1) for part, s in zip(np.split(flat, ends[:-1]), shapes, strict=True)]
+            flat = table.detach().double().cpu()
+            return [flat[g.rows].view(g.depth, g.height, g.width, -1).numpy() for g in source.grids]
 
         networks = source.networks
         return ExactField(
@@ -80,7 +77,7 @@ class Gradients:
     networks: Array
 
     def flat(self, name: str) -> Array:
-        """One table's derivatives, [rows, channels] as the pooled parameter holds them."""
+        """One table's derivatives, [texels, channels], head by head in reading order."""
         value = getattr(self, name)
         return value if name == "networks" else np.concatenate([t.reshape(-1, t.shape[-1]) for t in value])
 

@@ -66,9 +66,8 @@ def bake(solids: Solids, mpis: list[MPIPlan]) -> MMPIField:
         points = np.array(mpi.origin) + rays * depth[..., None]
         inside = np.clip(solids.depth_inside(points), -100, 100)
         color = solids.color(points)
-        rows = slice(grid.offset, grid.offset + grid.texels)
-        field.density.data[rows, 0] = torch.tensor(STEEPNESS * (inside + SKIN).reshape(-1), dtype=torch.float32)
+        field.density.data[grid.rows, 0] = torch.tensor(STEEPNESS * (inside + SKIN).reshape(-1), dtype=torch.float32)
         logit = np.log(color / (1 - color))
-        field.features.data[rows] = torch.tensor(logit.reshape(-1, 3), dtype=torch.float32)
+        field.features.data[grid.rows] = torch.tensor(logit.reshape(-1, 3), dtype=torch.float32)
     field.touched.fill_(1)
     return field

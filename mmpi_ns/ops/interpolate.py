@@ -16,6 +16,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from mmpi_ns.ops import native
+from mmpi_ns.ops.march import Grid
+from mmpi_ns.texels import TexelGrid
 
 
 @dataclass(frozen=True)
@@ -81,6 +83,26 @@ def sum_by_position(
 def add_rows(index: RowIndex, values: Float[Tensor, "N C"], weights: Float[Tensor, "N B"] | None) -> Tensor:
     """``sum_by_position`` for each distinct row [U, C]."""
     return sum_by_position(index.position, values, weights, index.unique.shape[0])
+
+
+def bilinear_rows(
+    grid: TexelGrid, planes: Int[Tensor, "N"], ndc: Float[Tensor, "N 3"]
+) -> tuple[Int[Tensor, "N 4"], Float[Tensor, "N 4"]]:
+    """``TexelGrid.bilinear``, compiled where it can be."""
+    lib = native.library(ndc)
+    if lib is None:
+        return grid.bilinear(planes, ndc)
+    planes, ndc = planes.contiguous(), ndc.contiguous()
+    rows, weights = torch.empty(len(planes), 4, dtype=torch.int64), torch.empty(len(planes), 4)
+    lib.mmpi_bilinear_rows(
+        ctypes.byref(Grid.of(grid)),
+        native.address(planes, torch.int64),
+        native.address(ndc),
+        ctypes.c_int64(len(planes)),
+        native.address(rows, torch.int64),
+        native.address(weights),
+    )
+    return rows, weights
 
 
 def interpolate_reference(

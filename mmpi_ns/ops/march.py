@@ -52,9 +52,18 @@ class _Mpi(ctypes.Structure):
 
 
 class Grid(ctypes.Structure):
-    """A head's block of the pooled tables."""
+    """A head's texels. The tiles must outlive it."""
 
-    _fields_ = [(n, ctypes.c_int64) for n in ("offset", "depth", "height", "width", "bias")]
+    _fields_ = [
+        *((n, ctypes.c_int64) for n in ("depth", "height", "width", "down", "across", "first_tile")),
+        ("tiles", ctypes.c_void_p),
+        ("bias", ctypes.c_int64),
+    ]
+
+    @staticmethod
+    def of(grid: TexelGrid, bias: int = 0) -> Grid:
+        sizes = (grid.depth, grid.height, grid.width, grid.down, grid.across, grid.first_tile)
+        return Grid(*sizes, native.address(grid.tiles, torch.int32), bias)
 
 
 class _Cube(ctypes.Structure):
@@ -85,7 +94,7 @@ class MarchScene:
 
     Args:
         mpis: the MPIs, at the resolution in use.
-        grids: texel blocks of all heads.
+        grids: texels of all heads.
         steps: disparity between the planes of each MPI.
         biases: of each MPI's planes.
         depth_scale: factor on every optical depth of an MPI.
@@ -103,9 +112,8 @@ class MarchScene:
     ) -> None:
         starts = [sum(len(b) for b in biases[:k]) for k in range(len(grids))]
         self._mpis = (_Mpi * len(mpis))(*(_mpi(m, float(s), depth_scale) for m, s in zip(mpis, steps, strict=True)))
-        self._grids = (Grid * len(grids))(
-            *(Grid(g.offset, g.depth, g.height, g.width, b) for g, b in zip(grids, starts, strict=True))
-        )
+        self._grids = (Grid * len(grids))(*(Grid.of(g, b) for g, b in zip(grids, starts, strict=True)))
+        self._tiles = [g.tiles for g in grids]  # alive as long as the kernel may read them
         self._biases = torch.cat(biases).float().contiguous()
         self._cube = None if cube is None else _cube(*cube)
         self.num_mpis, self.num_heads = len(mpis), len(grids)

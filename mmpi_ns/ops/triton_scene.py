@@ -31,13 +31,18 @@ V0 = tl.constexpr(6)
 V_SCALE = tl.constexpr(7)
 INTERVAL = tl.constexpr(8)
 FLOATS = tl.constexpr(9)
-# Columns of a head's block of the tables.
-OFFSET = tl.constexpr(0)
+# Columns of a head's layout. TILES and PLACES say where in the same tensor the brick of the head's first tile, and the
+# tile of the first brick of all, are.
+FIRST_TILE = tl.constexpr(0)
 DEPTH = tl.constexpr(1)
 HEIGHT = tl.constexpr(2)
 WIDTH = tl.constexpr(3)
 BIAS = tl.constexpr(4)
-INTS = tl.constexpr(5)
+DOWN = tl.constexpr(5)
+ACROSS = tl.constexpr(6)
+TILES = tl.constexpr(7)
+PLACES = tl.constexpr(8)
+INTS = tl.constexpr(9)
 
 
 @dataclass(frozen=True)
@@ -45,7 +50,8 @@ class TritonScene:
     """A plan's constants on the device (``MarchScene`` for the GPU)."""
 
     heads: Float[Tensor, "H 9"]
-    grids: Int[Tensor, "H 5"]
+    grids: Int[Tensor, "N"]
+    """See ``layout_of``."""
     biases: Float[Tensor, "P"]
     cube: Float[Tensor, "8"]
     """Lower corner, extent, step between samples, bias; zeros without a cube."""
@@ -87,16 +93,23 @@ class TritonScene:
         return self.heads, self.grids, self.biases, self.cube
 
 
-def layout_of(grids: list[TexelGrid], biases: list[int], device: torch.device) -> Int[Tensor, "H 5"]:
-    """Where the texels of every head are, for ``row_of`` and ``place_of``.
+def layout_of(grids: list[TexelGrid], biases: list[int], device: torch.device) -> Int[Tensor, "N"]:
+    """Where the texels of every head are, for ``row_of`` and ``place_of``: a row of numbers for each head, then the
+    brick of every tile and the tile of every brick.
 
     Args:
         grids: of all heads.
         biases: where those of each head's planes start.
         device: of the tables.
     """
-    rows = [(g.offset, g.depth, g.height, g.width, b) for g, b in zip(grids, biases, strict=True)]
-    return torch.tensor(rows, dtype=torch.int64, device=device)
+    tiles, places = grids[0].tiles, grids[0].places
+    start = len(grids) * INTS.value
+    rows = [
+        (g.first_tile, g.depth, g.height, g.width, b, g.down, g.across, start + g.first_tile, start + len(tiles))
+        for g, b in zip(grids, biases, strict=True)
+    ]
+    head = torch.tensor(rows, dtype=torch.int32, device=device).reshape(-1)
+    return torch.cat([head, tiles.to(device), places.to(device, torch.int32)])
 
 
 def _head_row(mpi: MPIPlan, depth_scale: float) -> list[float]:
@@ -121,26 +134,33 @@ def row_of(grids, head, plane, y, x, mask):
     Where masked, plane, y and x may be out of range, and so may the row.
     """
     grid = grids + head * INTS
-    return tl.load(grid + OFFSET) + (plane * tl.load(grid + HEIGHT) + y) * tl.load(grid + WIDTH) + x
+    plane, y, x = plane.to(tl.int32), y.to(tl.int32), x.to(tl.int32)
+    tile = (plane * tl.load(grid + DOWN) + (y >> 3)) * tl.load(grid + ACROSS) + (x >> 3)
+    brick = tl.load(grids + tl.load(grid + TILES) + tile, mask, 0)
+    return (brick * 64 + ((y & 7) << 3) + (x & 7)).to(tl.int64)
 
 
 @triton.jit
 def place_of(grids, row, mask, NUM_HEADS: tl.constexpr):
     """Head, plane, y and x of a row, the inverse of ``row_of``; and whether it is any head's."""
+    place = tl.load(grids + tl.load(grids + PLACES) + (row >> 6), mask, 0)
+    held = mask & (place >= 0)
+    place = tl.maximum(place, 0)
     head = row.to(tl.int32) * 0
     for k in tl.static_range(1, NUM_HEADS):
-        head += (row >= tl.load(grids + k * INTS + OFFSET)).to(tl.int32)
+        head += (place >= tl.load(grids + k * INTS + FIRST_TILE)).to(tl.int32)
     grid = grids + head * INTS
-    local, width = row - tl.load(grid + OFFSET), tl.load(grid + WIDTH)
-    layer = width * tl.load(grid + HEIGHT)
-    plane = local // layer
-    return head, plane, (local - plane * layer) // width, local % width, mask
+    tile, across = place - tl.load(grid + FIRST_TILE), tl.load(grid + ACROSS)
+    layer = across * tl.load(grid + DOWN)
+    plane = tile // layer
+    down = (tile - plane * layer) // across
+    return head, plane, down * 8 + ((row >> 3) & 7), tile % across * 8 + (row & 7), held
 
 
 @triton.jit
 def is_stored(row):
     """Whether the tables hold anything at a row that ``row_of`` found."""
-    return row >= 0
+    return row >= 64
 
 
 @triton.jit

@@ -31,12 +31,12 @@ def total_variation_reference(
         values: the texels, gathered from the table.
         table: the pooled table (held fixed).
         rows: where they came from.
-        grids: blocks of all heads.
+        grids: texels of all heads.
         scales: weight of a difference along x, y and z, of each head.
     """
     total = values.new_zeros(())
     for grid, each in zip(grids, scales, strict=True):
-        own = ((rows >= grid.offset) & (rows < grid.offset + grid.texels)).nonzero()[:, 0]
+        own = grid.holds(rows).nonzero()[:, 0]
         neighbours, exists = grid.neighbours(rows[own])
         weights = exists * torch.tensor([s for s in each for _ in range(2)], device=rows.device)
         around = table[neighbours.reshape(-1)].view(*neighbours.shape, -1)
@@ -64,7 +64,7 @@ class _Variation(torch.autograd.Function):
         scales: Scales,
     ) -> Tensor:
         gradient = torch.empty_like(values)
-        blocks = (Grid * len(grids))(*(Grid(g.offset, g.depth, g.height, g.width, 0) for g in grids))
+        blocks = (Grid * len(grids))(*(Grid.of(g) for g in grids))
         flat = [s for each in scales for s in each]
         total = lib.mmpi_total_variation(
             native.address(rows, torch.int64),
@@ -72,6 +72,7 @@ class _Variation(torch.autograd.Function):
             native.address(table),
             blocks,
             ctypes.c_int64(len(grids)),
+            native.address(grids[0].places, torch.int64),
             (ctypes.c_float * len(flat))(*flat),
             native.address(gradient),
         )

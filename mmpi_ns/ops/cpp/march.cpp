@@ -10,6 +10,7 @@ namespace {
 
 constexpr float OPAQUE = 1e-5f;      // light that may be lost behind the end of a ray
 constexpr float NEGLIGIBLE = 1e-4f;  // optical depths below this get an equal share without a lookup
+const Lanes IOTA = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
 constexpr float INFINITY_T = 1e-10f; // inverse distances are no less where a distance is needed
 
 struct Rays {
@@ -22,7 +23,7 @@ struct Rays {
 
 // One head's samples along one ray, looked up a block at a time.
 struct Run {
-    int64_t first, count, begin; // begin: samples before the block
+    int64_t first, count, begin; // begin: samples before the next block
     int size, at;
     float tau[WIDTH], pass[WIDTH]; // optical depth, and e^-tau
     float inverse_t[WIDTH], ndc[WIDTH][3];
@@ -40,52 +41,92 @@ void finish(Run& run, float interval) {
     store(run.pass, exp_lanes(-tau));
 }
 
-void fill_mpi(Run& run, const Scene& scene, const Rays& rays, int64_t ray, int64_t k) {
+// Lower texels and fractions of sixteen coordinates in [-1, 1] (as Cell).
+void cells(Lanes coordinate, int64_t size, int32_t* lower, float* fraction) {
+    const float last = float(size - 1);
+    const Lanes position = least(most((coordinate + 1.0f) * (0.5f * last), Lanes{}), splat(last));
+    IntLanes floor = __builtin_convertvector(position, IntLanes); // towards zero, and positions are not negative
+    const IntLanes highest = int32_t(size - 2) - IntLanes{};
+    floor = floor < highest ? floor : highest;
+    __builtin_memcpy(lower, &floor, sizeof floor);
+    store(fraction, position - __builtin_convertvector(floor, Lanes));
+}
+
+// The next samples of an MPI. Where nothing is stored there is nothing to see: with `skips` such samples are left out.
+void fill_mpi(Run& run, const Scene& scene, const Rays& rays, int64_t ray, int64_t k, bool skips) {
     const Mpi& mpi = scene.mpis[k];
     const Grid& grid = scene.grids[k];
     const int64_t i = ray * scene.num_mpis + k;
     const float u = rays.u[2 * i], u_slope = rays.u[2 * i + 1], v = rays.v[2 * i], v_slope = rays.v[2 * i + 1];
     const float oz = rays.local_origins[3 * i + 2], dz = rays.local_directions[3 * i + 2];
-    for (int j = 0; j < run.size; j++) {
-        const int64_t m = run.first - run.begin - j;
-        const float w = float(m) * mpi.step + mpi.end;
-        float* ndc = run.ndc[j];
-        run.plane[j] = int32_t(grid.depth - 1 - m);
-        ndc[0] = (u + w * u_slope - mpi.u0) * mpi.u_scale - 1;
-        ndc[1] = (v + w * v_slope - mpi.v0) * mpi.v_scale - 1;
-        ndc[2] = 1 - mpi.s_scale * (w - mpi.end);
-        run.inverse_t[j] = w * dz / (1 - w * oz);
-        run.tau[j] = bilinear(scene.density, grid, run.plane[j], Cell(ndc[0], grid.width), Cell(ndc[1], grid.height)) +
-                     scene.biases[grid.bias + run.plane[j]];
+    const float* biases = scene.biases + grid.bias;
+    int size = 0;
+    while (2 * size < WIDTH && run.begin < run.count) {
+        const int count = int(std::min<int64_t>(WIDTH - size, run.count - run.begin));
+        const int64_t m = run.first - run.begin;
+        const Lanes w = (float(m) - IOTA) * mpi.step + mpi.end;
+        const Lanes x = (u + w * u_slope - mpi.u0) * mpi.u_scale - 1.0f, y = (v + w * v_slope - mpi.v0) * mpi.v_scale - 1.0f;
+        float places[3][WIDTH], inverse_t[WIDTH], fx[WIDTH], fy[WIDTH];
+        int32_t across[WIDTH], down[WIDTH];
+        store(places[0], x), store(places[1], y), store(places[2], 1.0f - mpi.s_scale * (w - mpi.end));
+        store(inverse_t, w * dz / (1.0f - w * oz));
+        cells(x, grid.width, across, fx);
+        cells(y, grid.height, down, fy);
+        int chosen[WIDTH], wanted = 0;
+        int64_t rows[WIDTH][4];
+        for (int j = 0; j < count; j++) {
+            const Corners corners(grid, grid.depth - 1 - m + j, down[j], across[j]);
+            chosen[wanted] = j;
+            for (int a = 0; a < 4; a++) rows[wanted][a] = corners.row[a];
+            wanted += !skips || corners.stored;
+        }
+        for (int i = 0; i < wanted; i++, size++) {
+            const int j = chosen[i];
+            const int64_t plane = grid.depth - 1 - m + j, *row = rows[i];
+            const float gx = 1 - fx[j], gy = 1 - fy[j], *table = scene.density;
+            run.tau[size] = gx * gy * table[row[0]] + fx[j] * gy * table[row[1]] + gx * fy[j] * table[row[2]] +
+                            fx[j] * fy[j] * table[row[3]] + biases[plane];
+            run.plane[size] = int32_t(plane);
+            for (int a = 0; a < 3; a++) run.ndc[size][a] = places[a][j];
+            run.inverse_t[size] = inverse_t[j];
+        }
+        run.begin += count;
     }
+    run.size = size;
     finish(run, mpi.interval);
 }
 
-void fill_cube(Run& run, const Scene& scene, const Rays& rays, int64_t ray) {
+void fill_cube(Run& run, const Scene& scene, const Rays& rays, int64_t ray, bool skips) {
     const Cube& cube = *scene.cube;
-    for (int j = 0; j < run.size; j++) {
-        run.plane[j] = int32_t(run.first + run.begin + j);
-        const float t = (float(run.plane[j]) + 0.5f) * cube.step;
+    const Grid& grid = scene.grids[scene.num_mpis];
+    while (run.size < WIDTH && run.begin < run.count) {
+        const int32_t index = int32_t(run.first + run.begin++);
+        const float t = (float(index) + 0.5f) * cube.step;
+        const int j = run.size;
         for (int a = 0; a < 3; a++) {
             const float x = rays.origins[3 * ray + a] + rays.directions[3 * ray + a] * t;
             run.ndc[j][a] = 2 * (x - cube.lower[a]) / cube.extent[a] - 1;
         }
+        const Cell x(run.ndc[j][0], grid.width), y(run.ndc[j][1], grid.height), z(run.ndc[j][2], grid.depth);
+        const Corners front(grid, z.lower, y.lower, x.lower), back(grid, z.lower + 1, y.lower, x.lower);
+        if (skips && !front.stored && !back.stored) continue;
+        run.size++;
+        run.plane[j] = index;
         run.inverse_t[j] = 1 / t;
-        run.tau[j] = trilinear(scene.density, scene.grids[scene.num_mpis], run.ndc[j]) + cube.bias;
+        run.tau[j] = blend(scene.density, front, x, y) * (1 - z.fraction) +
+                     blend(scene.density, back, x, y) * z.fraction + cube.bias;
     }
     finish(run, cube.interval);
 }
 
-void advance(Run& run, const Scene& scene, const Rays& rays, int64_t ray, int64_t head) {
+void advance(Run& run, const Scene& scene, const Rays& rays, int64_t ray, int64_t head, bool skips) {
     if (++run.at < run.size) return;
-    run.begin += run.size;
-    run.size = int(std::min<int64_t>(WIDTH, run.count - run.begin));
-    run.at = 0;
-    if (run.size == 0) return;
+    run.size = run.at = 0;
+    if (run.begin == run.count) return;
     if (head < scene.num_mpis)
-        fill_mpi(run, scene, rays, ray, head);
+        fill_mpi(run, scene, rays, ray, head, skips);
     else
-        fill_cube(run, scene, rays, ray);
+        fill_cube(run, scene, rays, ray, skips);
 }
 
 // Where a sample lies in head j; false outside its frustum.
@@ -164,14 +205,14 @@ void mmpi_march(const Scene* scene, const Rays* rays, const int64_t* starts, int
             const int64_t count = rays->counts[ray * H + h];
             if (!count) continue;
             total += count;
-            live[alive++] = h;
             Run& run = runs[h];
             run.first = rays->first[ray * H + h];
             run.count = count;
             run.begin = 0;
             run.size = 0;
             run.at = -1;
-            advance(run, *scene, *rays, ray, h);
+            advance(run, *scene, *rays, ray, h, threshold > 0);
+            if (!run.done()) live[alive++] = h;
         }
         const float bound = threshold > 0 ? std::min(fair_share / float(std::max<int64_t>(total, 1)), threshold) : -1;
         const float end_of_light = threshold > 0 ? std::min(bound, OPAQUE) : -1;
@@ -207,7 +248,7 @@ void mmpi_march(const Scene* scene, const Rays* rays, const int64_t* starts, int
                 dropped += weight;
             }
             light *= pass;
-            advance(run, *scene, *rays, ray, h);
+            advance(run, *scene, *rays, ray, h, threshold > 0);
             if (run.done()) {
                 for (int64_t i = best; i + 1 < alive; i++) live[i] = live[i + 1];
                 alive--;

@@ -14,10 +14,28 @@ struct Mpi {
     float interval; // factor on softplus
 };
 
+// A head's texels, in bricks of 8 x 8 on one plane (texels.py).
 struct Grid {
-    int64_t offset, depth, height, width; // block of the pooled tables
-    int64_t bias;                         // where an MPI's plane biases start
+    int64_t depth, height, width;
+    int64_t down, across; // tiles of a plane
+    int64_t first_tile;   // where the head's tiles begin among those of all heads
+    const int32_t* tiles; // brick of every tile of all heads; 0 where nothing is stored
+    int64_t bias;         // where an MPI's plane biases start
+
+    const int32_t* tile(int64_t z, int64_t y, int64_t x) const {
+        return tiles + first_tile + (z * down + (y >> 3)) * across + (x >> 3);
+    }
 };
+
+constexpr int64_t BRICK = 64;
+
+inline int64_t row_in_brick(int32_t brick, int64_t y, int64_t x) {
+    return int64_t(brick) * BRICK + ((y & 7) << 3) + (x & 7);
+}
+
+inline int64_t row_of(const Grid& grid, int64_t z, int64_t y, int64_t x) {
+    return row_in_brick(*grid.tile(z, y, x), y, x);
+}
 
 struct Cube {
     float lower[3], extent[3]; // extent = upper - lower
@@ -49,11 +67,27 @@ struct Cell {
     }
 };
 
-inline float bilinear(const float* table, const Grid& grid, int64_t layer, const Cell& x, const Cell& y) {
-    const float* row = table + grid.offset + (layer * grid.height + y.lower) * grid.width + x.lower;
-    const float* next = row + grid.width;
+// Rows of the four texels around a place on a plane, and whether anything is stored there.
+struct Corners {
+    int64_t row[4]; // (y, x), (y, x + 1), (y + 1, x), (y + 1, x + 1)
+    bool stored;
+    Corners(const Grid& grid, int64_t layer, int64_t y, int64_t x) {
+        const int32_t* tile = grid.tile(layer, y, x);
+        const int64_t right = (x & 7) == 7, below = (y & 7) == 7 ? grid.across : 0;
+        const int32_t bricks[4] = {tile[0], tile[right], tile[below], tile[below + right]};
+        for (int i = 0; i < 4; i++) row[i] = row_in_brick(bricks[i], y + (i >> 1), x + (i & 1));
+        stored = bricks[0] | bricks[1] | bricks[2] | bricks[3];
+    }
+};
+
+inline float blend(const float* table, const Corners& corners, const Cell& x, const Cell& y) {
     const float fx = x.fraction, fy = y.fraction, gx = 1 - fx, gy = 1 - fy;
-    return gx * gy * row[0] + fx * gy * row[1] + gx * fy * next[0] + fx * fy * next[1];
+    const int64_t* row = corners.row;
+    return gx * gy * table[row[0]] + fx * gy * table[row[1]] + gx * fy * table[row[2]] + fx * fy * table[row[3]];
+}
+
+inline float bilinear(const float* table, const Grid& grid, int64_t layer, const Cell& x, const Cell& y) {
+    return blend(table, Corners(grid, layer, y.lower, x.lower), x, y);
 }
 
 inline float trilinear(const float* table, const Grid& grid, const float* ndc) {
@@ -69,5 +103,5 @@ inline int64_t nearest_texel(const Grid& grid, const float* ndc) {
         const float last = float(sizes[i] - 1);
         index[i] = int64_t(std::min(std::max(std::nearbyint((ndc[i] + 1) * (0.5f * last)), 0.0f), last));
     }
-    return grid.offset + (index[2] * grid.height + index[1]) * grid.width + index[0];
+    return row_of(grid, index[2], index[1], index[0]);
 }

@@ -51,26 +51,37 @@ void relu(Lanes* x, int64_t count) {
     for (int64_t i = 0; i < count; i++) x[i] = most(x[i], Lanes{});
 }
 
-// Features of the samples, channels first: lanes of x[c] are the batch's samples.
+// Features of the samples, channels first: lanes of x[c] are the batch's samples. Where they lie is found first, so
+// that memory is asked for all of them at once.
 void gather(const Scene& scene, const Shading& shading, int64_t channels, int64_t head, const Batch& batch, Lanes* x) {
     const Grid& grid = scene.grids[head];
-    for (int64_t c = 0; c < channels; c++) x[c] = Lanes{};
+    const bool in_cube = head >= scene.num_mpis;
+    const int taps = in_cube ? 8 : 4;
+    int64_t rows[WIDTH][8];
+    float weights[WIDTH][8];
     for (int lane = 0; lane < batch.size; lane++) {
         const int64_t slot = batch.slots[lane];
         const float* ndc = shading.ndc + 3 * slot;
         const Cell cx(ndc[0], grid.width), cy(ndc[1], grid.height);
-        const bool in_cube = head >= scene.num_mpis;
         const Cell cz(in_cube ? ndc[2] : -1, std::max<int64_t>(grid.depth, 2));
         const int64_t layer = in_cube ? cz.lower : shading.planes[slot];
-        for (int tap = 0; tap < (in_cube ? 8 : 4); tap++) {
-            const int right = tap & 1, down = tap >> 1 & 1, behind = tap >> 2;
-            const int64_t row = grid.offset + ((layer + behind) * grid.height + cy.lower + down) * grid.width + cx.lower + right;
-            const float weight = (right ? cx.fraction : 1 - cx.fraction) * (down ? cy.fraction : 1 - cy.fraction) *
-                                 (behind ? cz.fraction : 1 - cz.fraction);
-            const float* texel = shading.features + row * channels;
-            for (int64_t c = 0; c < channels; c++) x[c][lane] += weight * texel[c];
+        for (int first = 0; first < taps; first += 4) {
+            const Corners corners(grid, layer + first / 4, cy.lower, cx.lower);
+            for (int tap = 0; tap < 4; tap++) {
+                rows[lane][first + tap] = corners.row[tap] * channels;
+                weights[lane][first + tap] = (tap & 1 ? cx.fraction : 1 - cx.fraction) *
+                                             (tap >> 1 ? cy.fraction : 1 - cy.fraction) *
+                                             (first ? cz.fraction : 1 - cz.fraction);
+                __builtin_prefetch(shading.features + rows[lane][first + tap]);
+            }
         }
     }
+    for (int64_t c = 0; c < channels; c++) x[c] = Lanes{};
+    for (int lane = 0; lane < batch.size; lane++)
+        for (int tap = 0; tap < taps; tap++) {
+            const float *texel = shading.features + rows[lane][tap], weight = weights[lane][tap];
+            for (int64_t c = 0; c < channels; c++) x[c][lane] += weight * texel[c];
+        }
 }
 
 // (x, sin 2^i pi x, cos 2^i pi x) in the order of color_network.positional_encoding.

@@ -11,6 +11,15 @@ template <typename T> void prefetch_row(const T* row, int64_t channels) {
     for (const char* line = reinterpret_cast<const char*>(row); line < end; line += 64) __builtin_prefetch(line);
 }
 
+// Asks for a texel's lines and those of its neighbours above, below, before and behind; a prefetch may miss the table.
+void prefetch_around(const Grid& grid, const float* table, int64_t row, int64_t place, int64_t channels) {
+    for (int64_t beside = -8; beside <= 8; beside += 8) prefetch_row(table + (row + beside) * channels, channels);
+    const int64_t layer = grid.down * grid.across, first = grid.first_tile, end = first + grid.depth * layer;
+    for (int64_t tile = place - layer; tile <= place + layer; tile += 2 * layer)
+        if (tile >= first && tile < end)
+            prefetch_row(table + (grid.tiles[tile] * BRICK + row % BRICK) * channels, channels);
+}
+
 } // namespace
 
 extern "C" {
@@ -71,37 +80,57 @@ void mmpi_adam_rows(const int64_t* rows, int64_t begin, int64_t end, int64_t cha
     }
 }
 
-// Huber loss of the differences of texels with their neighbours (losses.total_variation), and its gradient. `scales`
-// are those of x, y and z of each head; neighbours are held fixed.
+// Rows and weights of bilinear lookups at (u, v, .) of `ndc` on planes of one head (TexelGrid.bilinear).
+void mmpi_bilinear_rows(const Grid* grid, const int64_t* planes, const float* ndc, int64_t count, int64_t* rows,
+                        float* weights) {
+    for (int64_t i = 0; i < count; i++) {
+        const Cell x(ndc[3 * i], grid->width), y(ndc[3 * i + 1], grid->height);
+        const Corners corners(*grid, planes[i], y.lower, x.lower);
+        const float fx = x.fraction, fy = y.fraction, gx = 1 - fx, gy = 1 - fy;
+        const float weight[4] = {gx * gy, fx * gy, gx * fy, fx * fy};
+        for (int k = 0; k < 4; k++) {
+            rows[4 * i + k] = corners.row[k];
+            weights[4 * i + k] = weight[k];
+        }
+    }
+}
+
+// Huber loss of the differences of texels with their stored neighbours (losses.total_variation), and its gradient.
+// `scales` are those of x, y and z of each head; neighbours are held fixed. `places` names the tile of every brick.
 double mmpi_total_variation(const int64_t* rows, int64_t count, int64_t channels, const float* table, const Grid* grids,
-                            int64_t num_heads, const float* scales, float* grad) {
+                            int64_t num_heads, const int64_t* places, const float* scales, float* grad) {
     double total = 0;
     int64_t head = 0;
     for (int64_t i = 0; i < count; i++) {
+        float* to = grad + i * channels;
+        for (int64_t c = 0; c < channels; c++) to[c] = 0;
+        const int64_t place = places[rows[i] / BRICK];
+        if (place < 0) continue; // the empty brick
         const auto holds = [&](const Grid& g) {
-            return rows[i] >= g.offset && rows[i] < g.offset + g.depth * g.height * g.width;
+            return place >= g.first_tile && place < g.first_tile + g.depth * g.down * g.across;
         };
         while (!holds(grids[head])) head = (head + 1) % num_heads; // rows come head by head, mostly
         const Grid& grid = grids[head];
+        if (i + AHEAD < count) prefetch_around(grid, table, rows[i + AHEAD], places[rows[i + AHEAD] / BRICK], channels);
+        const uint32_t tile = uint32_t(place - grid.first_tile), across = uint32_t(grid.across);
+        const uint32_t line = tile / across, down = uint32_t(grid.down);
+        const int in_brick[3] = {int(rows[i] & 7), int(rows[i] >> 3 & 7), 0};
+        const int64_t at[3] = {int64_t(tile % across) * 8 + in_brick[0], int64_t(line % down) * 8 + in_brick[1],
+                               line / down};
         const int64_t sizes[3] = {grid.width, grid.height, grid.depth};
-        const int64_t strides[3] = {1, grid.width, grid.width * grid.height};
-        if (i + AHEAD < count) { // the neighbours that lie in other cache lines; a prefetch may miss the table
-            const float* next = table + rows[i + AHEAD] * channels;
-            prefetch_row(next, channels);
-            for (int axis = 1; axis < 3; axis++) {
-                prefetch_row(next - strides[axis] * channels, channels);
-                prefetch_row(next + strides[axis] * channels, channels);
-            }
-        }
-        const int64_t local = rows[i] - grid.offset;
-        const int64_t at[3] = {local % sizes[0], local / strides[1] % sizes[1], local / strides[2]};
+        const int64_t tile_steps[3] = {1, grid.across, grid.across * grid.down}, row_steps[3] = {1, 8, 0};
         const float* own = table + rows[i] * channels;
-        float* to = grad + i * channels;
-        for (int64_t c = 0; c < channels; c++) to[c] = 0;
         for (int axis = 0; axis < 3; axis++)
             for (int side = -1; side <= 1; side += 2) {
                 if (at[axis] + side < 0 || at[axis] + side >= sizes[axis]) continue;
-                const float *other = own + side * strides[axis] * channels, scale = scales[3 * head + axis] / 6;
+                int64_t row = rows[i] + side * row_steps[axis];
+                const int edge = side < 0 ? 0 : 7;
+                if (axis == 2 || in_brick[axis] == edge) { // in another brick
+                    const int32_t brick = grid.tiles[place + side * tile_steps[axis]];
+                    if (!brick) continue;
+                    row = int64_t(brick) * BRICK + ((rows[i] & 63) - side * 7 * row_steps[axis]);
+                }
+                const float *other = table + row * channels, scale = scales[3 * head + axis] / 6;
                 float sum = 0;
                 for (int64_t c = 0; c < channels; c++) {
                     const float difference = own[c] - other[c], size = std::abs(difference);
