@@ -80,7 +80,7 @@ def render_rays(field: MMPIField, s: Scene, device: str, known_lookup: bool = Tr
 
 def whole_rays(s: Scene, name: str, device: str) -> list[Check]:
     """March, interpolation and compositing together, values and gradients, against exact arithmetic."""
-    field, known = s.field.to(device), ExactField.of(s.field)
+    known, field = ExactField.of(s.field), s.field.to(device)
     exact = [ExactRay(known, o, d) for o, d in zip(s.origins, s.directions, strict=True)]
     clear = [i for i, ray in enumerate(exact) if ray.margin > CLEAR]
     upstream = np.random.default_rng(0).normal(size=(len(exact), 3))
@@ -127,8 +127,9 @@ def marched(s: Scene, name: str, field: MMPIField, device: str, exact: list[Exac
 
 
 def _slope_error(field: MMPIField, kind: str, slopes: Gradients) -> float:
-    found = getattr(field, kind).grad
-    return _relative(found.to_dense() if found.is_sparse else found, torch.tensor(slopes.flat(kind)))
+    found, texels = getattr(field, kind).grad, torch.cat([grid.rows for grid in field.grids])
+    found = found.to_dense() if found.is_sparse else found
+    return _relative(found[texels], torch.tensor(slopes.flat(kind)))
 
 
 def marches(device: str, rehearse: bool) -> list[Check]:

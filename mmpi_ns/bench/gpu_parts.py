@@ -182,7 +182,8 @@ def measure_training(request: dict[str, Any], tell: Tell) -> dict[str, Any]:
     sizes = (16,) if small else (4096, 16_384)
     for rays in sizes:
         ends = time.monotonic() + request["seconds"] / len(sizes)
-        options = drive(8 if small else 256, rays, *route, *size)
+        few = ("--pipeline.datamanager.keypoint-rays", "4") if small else ()
+        options = drive(8 if small else 256, rays, *route, *size, *few)
         steps = steps_of(request, f"{request['ops']} {rays}", Method("mmpi", "mmpi", options), total)
         row = found[f"{rays} rays"] = train_for(steps, total, ends, tell)
         row |= {"rays_per_s": rays * row["late_steps_per_s"]}
@@ -239,14 +240,14 @@ def render_both(steps: Steps, ops: str, repeats: int) -> dict[str, Any]:
     truth = batch["image"][..., :3].to(pipeline.device)
     truth = truth.float() / 255 if truth.dtype == torch.uint8 else truth
 
-    def render() -> Tensor:
-        return pipeline.model.get_outputs_for_camera(camera)["rgb"]
+    def render(view: Any = camera) -> Tensor:
+        return pipeline.model.get_outputs_for_camera(view)["rgb"]
 
     frame_s, rgb = median_s(render, repeats), render()
     found = {"frame_ms": 1e3 * frame_s, "frame_pixels": rgb.shape[0] * rgb.shape[1], "psnr": _psnr(rgb, truth)}
     larger = copy.deepcopy(camera)
-    larger.rescale_output_resolution(FULL_WIDTH / rgb.shape[1] if repeats > 1 else 1.0)
-    found["full_frame_ms"] = 1e3 * median_s(lambda: pipeline.model.get_outputs_for_camera(larger)["rgb"], repeats)
+    larger.rescale_output_resolution(FULL_WIDTH / rgb.shape[1] if repeats > 1 else 0.5)
+    found["full_frame_ms"] = 1e3 * median_s(lambda: render(larger), repeats)
     found["full_frame_pixels"] = int(larger.width) * int(larger.height)
     if ops != "torch":
         native.choose("torch")

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mmpi_ns.compositing import Composite
-from mmpi_ns.ops.triton_scene import one_minus_exp
+from mmpi_ns.ops.triton_scene import block_size, one_minus_exp
 
 SLOTS = 2048
 """Samples of a program: as many rays as make that many."""
@@ -61,10 +61,10 @@ def composite_backward_kernel(
     tl.store(tau_grads + at, tl.where(has, grad, 0.0), inside)
 
 
-def _shape(slots: int) -> tuple[int, int]:
+def _shape(slots: int, device: torch.device) -> tuple[int, int]:
     """Rays and slots of a program."""
     width = triton.next_power_of_2(max(1, slots))
-    return max(1, SLOTS // width), width  # type: ignore[return-value]
+    return max(1, block_size(SLOTS, device) // width), width  # type: ignore[return-value]
 
 
 class _Weights(torch.autograd.Function):
@@ -72,7 +72,7 @@ class _Weights(torch.autograd.Function):
     def forward(ctx: Any, tau: Tensor, valid: Tensor, before: Tensor, total: Tensor) -> tuple[Tensor, Tensor]:
         num_rays, slots = tau.shape
         weights, depth = torch.empty_like(tau), torch.empty_like(total)
-        rays, width = _shape(slots)
+        rays, width = _shape(slots, tau.device)
         if num_rays:
             composite_kernel[(triton.cdiv(num_rays, rays),)](
                 tau, valid, before, total, weights, depth, num_rays, slots, RAYS=rays, SLOTS=width
@@ -84,7 +84,7 @@ class _Weights(torch.autograd.Function):
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor, None, None, None]:
         tau, valid, before, weights = ctx.saved_tensors
         num_rays, slots = tau.shape
-        grad, (rays, width) = torch.empty_like(tau), _shape(slots)
+        grad, (rays, width) = torch.empty_like(tau), _shape(slots, tau.device)
         if num_rays:
             composite_backward_kernel[(triton.cdiv(num_rays, rays),)](
                 tau, valid, before, weights, *(g.contiguous() for g in grad_outputs), grad, num_rays, slots,

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mmpi_ns.color_network import ColorNetworks, positional_encoding
-from mmpi_ns.ops.triton_scene import DEPTH, HEIGHT, INTS, WIDTH, TritonScene, cell, row_of, sin_turn
+from mmpi_ns.ops.triton_scene import DEPTH, HEIGHT, INTS, WIDTH, TritonScene, block_size, cell, row_of, sin_turn
 
 SAMPLES = 64
 """Of a program."""
@@ -124,11 +124,12 @@ def shade(
         w1, b1, w2, b2, w3, b3 = (x.detach() for x in networks.layers(k))
         encoded = positional_encoding(directions[k], networks.direction_frequencies)
         start = _padded(torch.addmm(b1, encoded, w1[:, split:].T), num_rays, hidden)
-        shade_kernel[(triton.cdiv(end - begin, SAMPLES),)](
+        samples = block_size(SAMPLES, features.device)
+        shade_kernel[(triton.cdiv(end - begin, samples),)](
             features, start, *parts, _padded(w1[:, :split].T, inputs, hidden), _padded(w2.T, hidden, hidden),
             _padded(b2[None], 1, hidden), _padded(w3.T, hidden, 16), _padded(b3[None], 1, 16), skip, colors,
             k, begin, end, slots, channels, octaves,
-            CUBE=k >= scene.num_mpis, INPUTS=inputs, HIDDEN=hidden, SAMPLES=SAMPLES, PRECISION=precision,
+            CUBE=k >= scene.num_mpis, INPUTS=inputs, HIDDEN=hidden, SAMPLES=samples, PRECISION=precision,
             num_warps=8,  # with 4 the registers do not suffice
         )  # fmt: skip
     return colors
