@@ -11,7 +11,7 @@ import pytest
 from mmpi_ns.bench import scaling
 from mmpi_ns.bench.scaling import Point, Scaling, fit, headline, measure, points
 
-SMALL = Point("s", mpis=2, planes=8, height=6, width=8, rays=32)
+SMALL = Point("s", mpis=2, planes=8, height=8, width=8, rays=32)
 
 
 def one(point):
@@ -21,15 +21,16 @@ def one(point):
 def test_mpis_that_face_away_are_allocated_but_not_live():
     alone, more = one(SMALL), one(replace(SMALL, elsewhere=3))
     assert alone["live"] == more["live"] > 4
-    assert alone["texels"] == 2 * 8 * 6 * 8 and more["texels"] == 5 * 8 * 6 * 8
+    # A plane of 8 x 8 texels is one brick; one more is empty.
+    assert alone["texels"] == (2 * 8 + 1) * 64 and more["texels"] == (5 * 8 + 1) * 64
     assert more["table_bytes"] > 2 * alone["table_bytes"]
 
 
 def test_more_planes_are_more_live_samples_and_more_texels_are_not():
     alone = one(SMALL)
     assert one(replace(SMALL, planes=16))["live"] == pytest.approx(2 * alone["live"], rel=0.15)
-    finer = one(replace(SMALL, height=12, width=16))
-    assert finer["live"] == alone["live"] and finer["texels"] == 4 * alone["texels"]
+    finer = one(replace(SMALL, height=16, width=16))
+    assert finer["live"] == alone["live"] and finer["texels"] == (4 * 2 * 8 + 1) * 64
     assert all(math.isfinite(v) for v in finer.values())
 
 
@@ -49,7 +50,8 @@ def test_a_line_is_fitted():
 
 def row(series, live, step_ms, texels, rays=1024, elsewhere=0):
     made = {"series": series, "live": live, "step_ms": step_ms, "march_ms": step_ms / 2, "texels": texels, "mpis": 4}
-    return {**made, "rays": rays, "elsewhere": elsewhere, "table_bytes": 100 + 36 * texels}
+    return {**made, "rays": rays, "elsewhere": elsewhere, "table_bytes": 100 + 36 * texels,
+            "gained_gib": texels / 2**20}  # fmt: skip
 
 
 def test_the_headline_is_slopes_at_equal_rays():
@@ -57,6 +59,7 @@ def test_the_headline_is_slopes_at_equal_rays():
     rows += [row("MPIs not met", 64, 74, 3200), row("MPIs not met", 64, 76, 12800, elsewhere=12)]
     rows += [row("rays", 64, 37, 3200, 512), row("rays", 64, 148, 3200, 2048)]
     found = headline(rows)
+    assert found["process_bytes_per_texel"] == pytest.approx(1024)
     assert found["bytes_per_texel"] == pytest.approx(36) and found["bytes_over_texels_r2"] == pytest.approx(1)
     # 48 live samples take 26 ms to (74 + 74 + 76) / 3 ms, over 1,024 rays.
     assert found["step_ns_per_live_sample"] == pytest.approx(1e6 / 1024 * (74 + 2 / 3 - 26) / 48, rel=1e-6)

@@ -131,9 +131,9 @@ def test_a_process_that_fails_says_why_and_where(tmp_path):
 
 @pytest.mark.commands
 def test_a_process_answers_with_the_threads_that_it_was_given(tmp_path, capsys):
-    point = {"planes": 8, "height": 6, "width": 8, "rays": 16, "mpis": 1, "steps": 1}
+    point = {"planes": 8, "height": 8, "width": 8, "rays": 16, "mpis": 1, "steps": 1}
     row = run_apart("mmpi_ns.bench.scaling", point, tmp_path, 1)
-    assert row["texels"] == 8 * 6 * 8 and row["threads"] == 1
+    assert row["texels"] == (8 + 1) * 64 and row["threads"] == 1
 
 
 def test_a_scene_whose_test_images_are_not_the_ones_evaluated_is_refused(scene):

@@ -117,8 +117,8 @@ def measure(request: dict[str, Any], tell: Callable[[str], None]) -> dict[str, f
     """One point, in this process.
 
     Returns:
-        Live and kept samples a ray, milliseconds of a step and of its sampler (medians), texels, bytes of tables and
-        moments, and how much memory the process gained at most (GiB).
+        Live and kept samples a ray, milliseconds of a step and of its sampler (medians), allocated texels, bytes of
+        tables and moments, and how much memory the process gained at most (GiB).
     """
     steps = request["steps"]
     point = Point(**{k: v for k, v in request.items() if k != "steps"})
@@ -179,6 +179,9 @@ def headline(rows: list[dict[str, Any]]) -> dict[str, float]:
         found |= {f"{what}_ns_per_live_sample": slope, f"{what}_over_live_r2": straight}
     slope, _, straight = fit([r["texels"] for r in rows], [r["table_bytes"] for r in rows])
     found |= {"bytes_per_texel": slope, "bytes_over_texels_r2": straight}
+    # Of moments only what was written to takes memory.
+    slope, _, straight = fit([r["texels"] for r in equal], [2**30 * r["gained_gib"] for r in equal])
+    found |= {"process_bytes_per_texel": slope, "process_bytes_over_texels_r2": straight}
     apart = sorted((r for r in rows if r["series"] == "MPIs not met"), key=lambda r: r["elsewhere"])
     found["march_with_unmet_over_without"] = apart[-1]["march_ms"] / apart[0]["march_ms"]
     found["heads_with_unmet_over_without"] = (apart[-1]["mpis"] + apart[-1]["elsewhere"]) / apart[0]["mpis"]
@@ -201,7 +204,9 @@ def table(content: dict[str, Any]) -> str:
         f"frustum. The sampler's time a ray grows by {h['march_ns_per_live_sample']:.0f} ns a live sample (a line",
         f"explains {100 * h['march_over_live_r2']:.0f} % of the variance at 1,024 rays), a step's by",
         f"{h['step_ns_per_live_sample']:.0f} ns ({100 * h['step_over_live_r2']:.0f} %); memory by "
-        f"{h['bytes_per_texel']:.0f} bytes a texel ({100 * h['bytes_over_texels_r2']:.0f} %).",
+        f"{h['bytes_per_texel']:.0f} bytes a texel that is allocated, moments included (where they were never written",
+        f"they take none: the process gained {h['process_bytes_per_texel']:.0f} bytes a texel, "
+        f"{100 * h['process_bytes_over_texels_r2']:.0f} %).",
         f"With {h['heads_with_unmet_over_without']:.0f} times the MPIs, of which the added ones are met by no ray, the",
         f"sampler takes {h['march_with_unmet_over_without']:.2f} times as long.",
         "",
