@@ -40,6 +40,7 @@ def compared(state):
 def whole(request, scene, plan_file, tmp_path_factory):
     """Settings, and the checkpoints of every step of an uninterrupted run."""
     settings = {"training": "joint"} if request.param == "joint" else {"rays_per_mpi": request.param}
+    settings |= {"release_shares": (0.9,), "release_weight": 0.06}
     config = trainer_config(scene, plan_file, tmp_path_factory.mktemp("whole"), STEPS, **settings)
     trainer = ready(config)
     trainer.train()

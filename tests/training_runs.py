@@ -62,7 +62,7 @@ def write_plan(data: Path, path: Path, **settings) -> Path:
 
 
 def trainer_config(data: Path, plan: Path, output: Path, steps=24, **model):
-    """mmpi-small on the tiny scene: individual, blend, finetune; two doublings of the texels, a release of bricks."""
+    """mmpi-small on the tiny scene: individual, blend and finetune, with two doublings of the texels; no bricks go."""
     config = copy.deepcopy(mmpi_small.config)
     config.output_dir, config.experiment_name, config.timestamp = output, "tiny", "run"
     config.max_num_iterations, config.steps_per_save, config.save_only_latest_checkpoint = steps, 1, False
@@ -80,8 +80,7 @@ def trainer_config(data: Path, plan: Path, output: Path, steps=24, **model):
         "blend_share": 0.25,
         "finetune_share": 0.25,
         "growth_shares": (1 / 4, 1 / 2),
-        "release_shares": (0.9,),
-        "release_weight": 0.06,
+        "release_weight": 0.0,
     }
     settings |= {"hidden_width": 8, "feature_channels": 4, "cube_alpha": 0.03}
     for name, value in (settings | model).items():
