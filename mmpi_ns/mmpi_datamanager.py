@@ -180,6 +180,10 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         """nerfstudio's loaders, but for the one that holds every evaluation image in memory."""
         assert self.eval_dataset is not None
         CONSOLE.print("Setting up evaluation dataset...")
+        sizes = self.eval_dataset.cameras.width * self.eval_dataset.cameras.height
+        # An image that cannot be used is named before training, not after it.
+        for i in range(len(self.eval_dataset)) if sizes.sum() <= self.config.resident_pixels else ():
+            self.eval_dataset.get_data(i, image_type="uint8")
         self.eval_pixel_sampler = self._get_pixel_sampler(self.eval_dataset, self.config.eval_num_rays_per_batch)
         self.eval_ray_generator = RayGenerator(self.eval_dataset.cameras.to(self.device))
         loaders = {"input_dataset": self.eval_dataset, "device": self.device, "num_workers": 4}
