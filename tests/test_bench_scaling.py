@@ -46,6 +46,7 @@ def test_a_line_is_fitted():
     slope, offset, straight = fit([1, 2, 3], [5, 7, 9])
     assert (slope, offset, straight) == (pytest.approx(2), pytest.approx(3), pytest.approx(1))
     assert fit([0, 1, 2, 3], [0, 1, 0, 1])[2] == pytest.approx(0.2)
+    assert fit([0, 1, 2], [0, 0, 0])[2] == 1, "nothing to explain"
 
 
 def row(series, live, step_ms, texels, rays=1024, elsewhere=0):

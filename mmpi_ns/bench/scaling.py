@@ -161,8 +161,8 @@ def fit(x: list[float], y: list[float]) -> tuple[float, float, float]:
     """Slope and offset of the straight line through points, and the share of the variance that it explains."""
     a, b = np.array(x), np.array(y)
     slope, offset = np.polyfit(a, b, 1)
-    rest = ((b - slope * a - offset) ** 2).sum()
-    return float(slope), float(offset), float(1 - rest / ((b - b.mean()) ** 2).sum())
+    rest, all_of_it = ((b - slope * a - offset) ** 2).sum(), ((b - b.mean()) ** 2).sum()
+    return float(slope), float(offset), float(1 - rest / all_of_it) if all_of_it > 0 else 1.0
 
 
 def _at_equal_rays(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
