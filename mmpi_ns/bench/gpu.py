@@ -164,9 +164,9 @@ class Gpu:
             downscale_factor=self.downscale_factor,
             work=str(folder),
             checks=tuple(checks),
-            check_images=4,
-            check_pixels=4096,
-            final_images=4,
+            check_images=1 if self.rehearse else 4,
+            check_pixels=64 if self.rehearse else 4096,
+            final_images=1 if self.rehearse else 4,
             whole_images=method.whole_images,
             keep=False,
         )
