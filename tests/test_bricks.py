@@ -256,6 +256,9 @@ def test_growth_equals_dense_growth_where_everything_around_is_stored_and_goes_o
     reached = grown_tiles(some, wide, is_cube, None)
     bricks = make_grids(wider, reached)
     found, wanted = resample(thin, some, bricks, is_cube, -20.0), resample(dense, full, wide, is_cube)
+    flat = torch.full_like(thin, 3.0)
+    flat[:BRICK] = -20.0
+    flat = resample(flat, some, bricks, is_cube, -20.0)
     exact = 0
     for k, (a, b) in enumerate(zip(bricks, wide, strict=True)):
         stored = (some[k].rows >= BRICK).float().view(*shapes[k], 1)
@@ -269,6 +272,7 @@ def test_growth_equals_dense_growth_where_everything_around_is_stored_and_goes_o
         assert torch.allclose(found[rows[alike]], wanted[b.rows[alike]], atol=1e-12)
         partly = (there > 1e-6) & ~alike
         assert found[rows[partly]].abs().max() <= dense.abs().max() + 1e-9, "no texel mixes with the empty brick"
+        assert torch.allclose(flat[rows[there > 1e-6]], torch.tensor(3.0, dtype=torch.float64), atol=1e-9)
         assert (found[rows[(there == 0) & (rows >= BRICK)]] == -20).all()
         exact += int(alike.sum())
         assert partly.any() and (rows < BRICK).any()
@@ -322,6 +326,7 @@ def test_nothing_is_given_up_before_enough_rays_were_seen():
 def test_moments_and_marks_follow_their_texels():
     field = bricked_field()
     optimizer, _ = train(field)
+    field.touched[BRICK:] = chance(len(field.touched) - BRICK, 0.5).to(torch.uint8)
     tables = {name: getattr(field, name) for name in TABLES}
     grids, count = field.grids, field.num_bricks
 

@@ -81,6 +81,8 @@ def test_bricks_were_given_up_on_the_way_and_checkpoints_hold_the_others_alone(w
         assert {len(field[k]) for k in ("features", "reliability", "touched")} == {count}
         moments = state["optimizers"]["features"]["state"]
         assert all(len(moments[0][k]) == count for k in ("exp_avg", "exp_avg_sq"))
+    counts = [state["optimizers"]["features"]["state"][0]["step"] for state in states]
+    assert counts == sorted(counts) and counts[0] == 1, "moments go on where bricks go"
 
 
 def test_steps_differ_so_the_comparison_can_fail(whole):
