@@ -275,7 +275,8 @@ def test_a_run_resumed_with_another_number_of_mpis_is_refused_and_changes_nothin
         "another scene plan (1 MPIs there, 2 MPIs here)", "config.yml", "--pipeline.model.plan-file",
     )  # fmt: skip
     after = contents(first.base_dir)
-    assert all(after[name] == data for name, data in before.items())
+    # TensorBoard writes what it still holds of the first run whenever it likes.
+    assert all(after[name] == data for name, data in before.items() if "tfevents" not in name.name)
     config(2).save_config()  # ns-train overwrites config.yml before anything of ours runs
     _, pipeline, _, step = eval_setup(first.base_dir / "config.yml")
     assert step == 3 and len(pipeline.model.field.plan.mpis) == 1
