@@ -139,7 +139,7 @@ def test_the_table_names_command_processor_commit_and_every_case(tmp_path, monke
     assert headline["cases"] == 2 and headline["failed"] == 0
     assert all(isinstance(v, int | float) for v in headline.values())
     text = (tmp_path / "stability.md").read_text()
-    for wanted in (f"mmpi-bench stability --output {tmp_path} --no-training", provenance.processor(),
+    for wanted in (f"mmpi-bench stability --output {tmp_path.name} --no-training", provenance.processor(),
                    content["made"]["commit"], content["made"]["date"], *(c.inputs for c in chosen)):  # fmt: skip
         assert wanted in text
     assert (tmp_path / "stability.png").stat().st_size > 1000

@@ -16,7 +16,9 @@ from mmpi_ns.placement.explain import describe_facing, explain, table
 from mmpi_ns.placement.plan import ScenePlan
 from mmpi_ns.placement.rule import PlacementConfig, place
 from mmpi_ns.scenes.catalogue import make_scene
+from mmpi_ns.scenes.dataset import write_dataset
 from mmpi_ns.scripts.plan import _defaults, entrypoint
+from mmpi_ns.windows import WindowedPlan
 
 
 def run(monkeypatch, *words):
@@ -79,3 +81,20 @@ def test_facings_are_named_in_the_cameras_frame():
     for direction, name in named.items():
         assert describe_facing(np.array(direction, float), base) == name
     assert describe_facing(np.array([0.5, 0, 0.8660254]), base) == "front, 30 deg off"
+
+
+def test_a_long_capture_is_planned_window_by_window_and_its_plan_goes_back_in(tmp_path, monkeypatch, capsys):
+    write_dataset(make_scene("long-road", length=180.0), tmp_path / "road", 3000, images=False)
+    words = (tmp_path / "road", "--downscale-factor", 1, "--placement.max-texels", 1e6)
+    run(monkeypatch, *words, "--output", tmp_path / "plan")
+    printed, plan = capsys.readouterr().out, WindowedPlan.load(tmp_path / "plan" / "plan.json")
+    assert len(plan) >= 2 and f"{len(plan)} windows, " in printed
+    for i, window in enumerate(plan.windows):
+        assert f"## Window {i}: " in printed and all(f"| {m.name} |" in printed for m in window.plan.mpis)
+        assert (tmp_path / "plan" / f"plan-{i}.png").is_file() and (tmp_path / "plan" / f"errors-{i}.png").is_file()
+    drawn = np.asarray(Image.open(tmp_path / "plan" / "plan.png").convert("RGB"))
+    assert len(np.unique(drawn.reshape(-1, 3), axis=0)) > 20
+    run(monkeypatch, *words, "--output", tmp_path / "again", "--plan-file", tmp_path / "plan" / "plan.json")
+    assert WindowedPlan.load(tmp_path / "again" / "plan.json") == plan
+    run(monkeypatch, *words, "--output", tmp_path / "one", "--placement.window-length", 0)
+    assert len(WindowedPlan.load(tmp_path / "one" / "plan.json")) == 1
