@@ -65,7 +65,7 @@ def test_mpis_a_ray_can_meet_do_not_grow_with_the_road():
     from test_windows import road
 
     config = PlacementConfig(max_texels=2e6, max_planes=32)
-    short, long = (place_windows(road(length, 2.0), config) for length in (220, 440))
+    short, long = (place_windows(road(length, 4.0), config) for length in (220, 440))
     most, total = ([f(len(p.mpis) for p in plan.plans) for plan in (short, long)] for f in (max, sum))
     assert len(long) >= 1.6 * len(short) >= 4
     assert 1.6 * total[0] <= total[1] <= 2.5 * total[0]

@@ -96,5 +96,3 @@ def test_a_long_capture_is_planned_window_by_window_and_its_plan_goes_back_in(tm
     assert len(np.unique(drawn.reshape(-1, 3), axis=0)) > 20
     run(monkeypatch, *words, "--output", tmp_path / "again", "--plan-file", tmp_path / "plan" / "plan.json")
     assert WindowedPlan.load(tmp_path / "again" / "plan.json") == plan
-    run(monkeypatch, *words, "--output", tmp_path / "one", "--placement.window-length", 0)
-    assert len(WindowedPlan.load(tmp_path / "one" / "plan.json")) == 1
