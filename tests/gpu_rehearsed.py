@@ -15,7 +15,7 @@ from mmpi_ns.bench.gpu import SHARES, Gpu
 from mmpi_ns.ops import native, triton_march, triton_tables
 
 
-def part_here(module, request, folder, threads, seconds):
+def part_here(module, request, folder, threads, seconds, extra=None):
     assert seconds > 0
     nerfstudio_trainer.writer.EVENT_WRITERS.clear()
     native.choose("auto")

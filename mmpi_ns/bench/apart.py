@@ -7,7 +7,7 @@ import os
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,12 @@ PROGRESS = "@ "
 
 
 def run_apart(
-    module: str, request: dict[str, Any], folder: Path, threads: int, seconds: float | None = None
+    module: str,
+    request: dict[str, Any],
+    folder: Path,
+    threads: int,
+    seconds: float | None = None,
+    extra: Mapping[str, str] | None = None,
 ) -> dict[str, Any]:
     """Calls ``python -m module`` with a request.
 
@@ -28,6 +33,7 @@ def run_apart(
         folder: where request, answer and everything that it prints (output.log) go.
         threads: of its arithmetic.
         seconds: after which it is ended; None: never.
+        extra: variables of its environment.
 
     Returns:
         Its answer, or why there is none (``not_run``): one that fails is no reason to lose the others.
@@ -36,7 +42,7 @@ def run_apart(
     source, target, log = folder / "request.json", folder / "answer.json", folder / "output.log"
     target.unlink(missing_ok=True)
     source.write_text(json.dumps(request, indent=1), encoding="utf-8")
-    environment = {**os.environ, "OMP_NUM_THREADS": str(threads), "OPENBLAS_NUM_THREADS": str(threads)}
+    environment = {**os.environ, "OMP_NUM_THREADS": str(threads), "OPENBLAS_NUM_THREADS": str(threads), **(extra or {})}
     last = ""
     with (
         log.open("w", encoding="utf-8") as stream,

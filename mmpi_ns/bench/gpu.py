@@ -90,9 +90,6 @@ class Gpu:
             raise ValueError(
                 "gpu measures a CUDA device, and torch sees none: run it where there is one, or --rehearse on a CPU."
             )
-        if self.rehearse:
-            os.environ["TRITON_INTERPRET"] = "1"  # for the parts' processes; this one runs no kernel
-            os.environ["CUDA_VISIBLE_DEVICES"] = ""
         if self.data is not None and not self.data.exists():
             raise ValueError(f"There is no scene at {self.data}: check --data.")
 
@@ -126,7 +123,12 @@ class Gpu:
             "rehearse": self.rehearse,
         }
         folder = self.work / name.replace(" ", "-")
-        return run_apart("mmpi_ns.bench.gpu_parts", request, folder, self._threads, seconds + GRACE)
+        return run_apart("mmpi_ns.bench.gpu_parts", request, folder, self._threads, seconds + GRACE, self._extra)
+
+    @property
+    def _extra(self) -> dict[str, str]:
+        """For the parts' processes: this one runs no kernel."""
+        return {"TRITON_INTERPRET": "1", "CUDA_VISIBLE_DEVICES": ""} if self.rehearse else {}
 
     @property
     def _threads(self) -> int:
@@ -147,7 +149,7 @@ class Gpu:
             folder = self.work / f"quality-{name}"
             request = self._training(method, data, folder, 4 if self.rehearse else PEERS[name])
             limit = seconds / (len(names) - number) + (GRACE if self.rehearse else 0)
-            row = run_apart("mmpi_ns.bench.trainings", asdict(request), folder, self._threads, limit)
+            row = run_apart("mmpi_ns.bench.trainings", asdict(request), folder, self._threads, limit, self._extra)
             rows[name] = row if "not_run" not in row else {**row, "curve": told_curve(folder / "output.log")}
             seconds -= time.monotonic() - begin
         return (

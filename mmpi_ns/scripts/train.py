@@ -47,12 +47,14 @@ def main() -> None:
 
 
 def _end_early(folder: Path) -> NoReturn:
-    """torchrun ends all processes when one dies."""
-    sys.exit(
+    """torchrun ends all processes when one dies, and gives them little time to say so."""
+    message = (
         "Ended early: another process died (see above) or the run was stopped. Finished windows lie in "
         f"{folder / 'windows'}; the same command with --load-dir {folder / 'nerfstudio_models'} goes on from them, "
         "with any number of processes."
     )
+    print(message, file=sys.stderr, flush=True)
+    sys.exit(1)
 
 
 def _wait_for_others(folder: Path) -> None:
