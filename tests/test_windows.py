@@ -468,7 +468,6 @@ def test_a_process_that_is_killed_ends_the_run_and_leaves_what_is_finished(scene
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(code), os.environ.get("PYTHONPATH", "")]))
     status, said = torchrun(scene, windows_file, tmp_path / "out", 2)
     assert status != 0 and "SIGKILL" in said, said[-3000:]
-    assert "Ended early: another process died" in said and "--load-dir" in said
     monkeypatch.undo()
     run = tmp_path / "out" / "tiny" / "mmpi-small" / "run"
     status, said = torchrun(scene, windows_file, tmp_path / "again", 2, "--load-dir", str(run / "nerfstudio_models"))
