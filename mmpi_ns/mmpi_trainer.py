@@ -136,7 +136,7 @@ class MMPITrainer(Trainer):
         store, first = self._model.store, window * self._window_steps
         folders = [self.checkpoint_dir, *([self._resumes_from] if self._resumes_from else [])]
         if len(folders) > 1:
-            store.adopt(folders[1].parent / WINDOWS_FOLDER, [window])
+            store.adopt(folders[1].parent / WINDOWS_FOLDER, {window: self._model.windows.plans[window]})
         last = len(self._model.windows) - 1
         known = {s: p for f in folders for s, p in checkpoints_in(f).items() if 0 <= s - first < self._window_steps}
         if store.path(window).is_file() and (window != last or first + self._window_steps - 1 in known):
@@ -206,7 +206,7 @@ class MMPITrainer(Trainer):
             del state
         super()._load_checkpoint()
         if path is not None and self._processes == 1:
-            finished = list(range(self._model.schedule.window_at(self._start_step)))
+            finished = dict(enumerate(self._model.windows.plans[: self._model.schedule.window_at(self._start_step)]))
             self._model.store.adopt(path.parent.parent / WINDOWS_FOLDER, finished, needed=True)
 
     def _checkpoint_path(self) -> Path | None:

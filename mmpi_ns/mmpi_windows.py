@@ -12,8 +12,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from mmpi_ns.checks import brief
-from mmpi_ns.files import write_atomically
+from mmpi_ns.files import to_text, write_atomically
 from mmpi_ns.mmpi_field import MMPIField
+from mmpi_ns.placement.plan import ScenePlan
 
 
 class WindowStore:
@@ -81,17 +82,23 @@ class WindowStore:
         self._fields[window] = field.to(device).eval()
         return self._fields[window]
 
-    def adopt(self, other: Path, windows: list[int], needed: bool = False) -> None:
+    def adopt(self, other: Path, plans: dict[int, ScenePlan], needed: bool = False) -> None:
         """Takes over finished windows of the run that this one goes on from.
 
+        Args:
+            other: that run's folder of windows.
+            plans: of the windows to take over, by their numbers.
+            needed: whether all must be there.
+
         Raises:
-            ValueError: one is missing there that is needed.
+            ValueError: one is missing there that is needed, is damaged, or was trained with another plan.
         """
-        if not windows or other.resolve() == Path(self.path(0)).parent.resolve():
+        if not plans or other.resolve() == self.path(0).parent.resolve():
             return
-        for window in windows:
+        for window, plan in plans.items():
             path, source = self.path(window), other / self.path(window).name
             if source.is_file():
+                _check_plan(source, plan)
                 path.parent.mkdir(parents=True, exist_ok=True)
                 write_atomically(path, lambda unfinished, source=source: shutil.copyfile(source, unfinished))
             elif needed:
@@ -99,6 +106,22 @@ class WindowStore:
                     f"Window {window} of the run to go on from is missing: {source} is not there. Put it back, or "
                     "resume from a checkpoint of before its end with --load-step."
                 )
+
+
+def _check_plan(source: Path, plan: ScenePlan) -> None:
+    """Raises ValueError where a window's file is damaged or holds another plan."""
+    try:
+        state = torch.load(source, map_location="cpu", weights_only=True, mmap=True)
+        stored = ScenePlan.from_json(to_text(state["field"]["plan_bytes"]))
+    except (OSError, RuntimeError, EOFError, KeyError, TypeError, pickle.UnpicklingError) as error:
+        raise ValueError(
+            f"{source} cannot be read ({brief(error)}): copy it anew, or remove it to train again."
+        ) from error
+    if stored != plan:
+        raise ValueError(
+            f"{source} was trained with another scene plan: resume with the settings in its run's config.yml, or give "
+            "that run's plan.json with --pipeline.model.plan-file."
+        )
 
 
 def mix_windows(

@@ -339,6 +339,21 @@ def test_resuming_without_the_finished_windows_is_refused_in_one_sentence(whole,
         ready(config, load_dir=folder)
 
 
+def test_a_window_of_another_plan_or_a_damaged_one_is_not_taken_over(whole, tmp_path):
+    model, store = whole.pipeline.model, WindowStore(tmp_path / "mine", resident=1)
+    ours, theirs = model.windows.plans
+    with pytest.raises(ValueError, match="another scene plan"):
+        store.adopt(model.store.path(0).parent, {0: theirs})
+    (tmp_path / "cut").mkdir()
+    content = model.store.path(0).read_bytes()
+    (tmp_path / "cut" / model.store.path(0).name).write_bytes(content[: len(content) // 2])
+    with pytest.raises(ValueError, match="cannot be read"):
+        store.adopt(tmp_path / "cut", {0: ours})
+    assert not (tmp_path / "mine").exists()
+    store.adopt(model.store.path(0).parent, {0: ours})
+    assert store.path(0).read_bytes() == content
+
+
 @pytest.mark.parametrize("harm, sentence", [("gone", "is missing"), ("cut", "is damaged")])
 def test_a_lost_window_is_named_and_nothing_else_is_touched(whole, harm, sentence):
     model = whole.pipeline.model
