@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -218,6 +219,31 @@ def test_a_sound_model_beats_a_bent_one_with_more_images_and_errors_are_judged_b
     models = [found_model(50, 0.9), found_model(30, 0.7), found_model(31, 0.7), found_model(31, 0.6)]
     ranked = sorted(range(4), key=lambda i: mapping._quality(models[i]))
     assert ranked == [0, 1, 2, 3]
+
+
+@pytest.mark.parametrize(
+    ("first", "starts"),
+    [
+        (found_model(60, 0.5), [None, Path("forward")]),  # sound, most images: gone on from
+        (found_model(40, 0.5), [None, None]),  # too few of them
+        (found_model(60, 0.9), [None, None]),  # bent
+        (found_model(96, 0.5), [None]),  # enough
+    ],
+)
+def test_looser_settings_go_on_from_a_sound_model_of_most_images(first, starts, tmp_path, monkeypatch):
+    seen = []
+
+    def run(attempt, database, images, folder, total, refine, threads, start):
+        seen.append(start)
+        return [(first if len(seen) == 1 else found_model(99, 0.6), Path(attempt.name))]
+
+    database = SimpleNamespace(num_images=lambda: 100)
+    monkeypatch.setattr(mapping.pycolmap.Database, "open", lambda path: nullcontext(database))
+    monkeypatch.setattr(mapping, "count_matching_pairs", lambda path: 500)
+    monkeypatch.setattr(mapping, "_run", run)
+    found = mapping.reconstruct(tmp_path / "database", tmp_path, tmp_path, True, 1, is_sequence=True)
+    assert seen == starts
+    assert found.models[0].num_reg_images() == (96 if len(starts) == 1 else 99)
 
 
 def test_given_intrinsics_are_left_alone_and_others_refined():

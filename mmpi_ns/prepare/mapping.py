@@ -14,6 +14,8 @@ from mmpi_ns.prepare.stages import CONSOLE, PrepareError, progress
 
 ENOUGH = 0.95
 """Share of the images that, once registered, ends the trying."""
+CARRIES = 0.5
+"""Share of the images from which a model is gone on from with looser settings instead of beginning anew."""
 BENT_PX = 0.8
 """Mean reprojection error from which another attempt is made even though the images are registered."""
 WORTH = 0.97
@@ -67,6 +69,9 @@ def reconstruct(
 ) -> Mapping:
     """Runs the attempts in order until one registers nearly all images; the best one counts.
 
+    An attempt goes on from the best model so far where that is sound and holds ``CARRIES`` of the images: what stopped
+    it is often one stretch with few matches, and the rest need not be found again.
+
     Args:
         database: features and matches.
         images: folder of the images, for the points' colours.
@@ -90,7 +95,8 @@ def reconstruct(
     best: Mapping | None = None
     tried: list[tuple[str, int]] = []
     for attempt in ATTEMPTS[1 if is_sequence else 0 :]:
-        models = _run(attempt, database, images, work / attempt.name, total, refine, threads)
+        start = best.folder if best is not None and _carries(best.models[0], total) else None
+        models = _run(attempt, database, images, work / attempt.name, total, refine, threads, start)
         size = models[0][0].num_reg_images() if models else 0
         tried.append((attempt.name, size))
         says = f", {models[0][0].compute_mean_reprojection_error():.2f} px" if models else ""
@@ -118,18 +124,33 @@ def is_bent(model: pycolmap.Reconstruction) -> bool:
     return _error(model) > BENT_PX
 
 
+def _carries(model: pycolmap.Reconstruction, total: int) -> bool:
+    """Whether another attempt had better go on from a model than begin anew."""
+    return not is_bent(model) and model.num_reg_images() >= CARRIES * total
+
+
 def _quality(model: pycolmap.Reconstruction) -> tuple[bool, int, float]:
     """Sorts models: sound ones first, then those with more images, then those that fit better."""
     return not is_bent(model), model.num_reg_images(), -_error(model)
 
 
 def _run(
-    attempt: Attempt, database: Path, images: Path, folder: Path, total: int, refine: bool, threads: int
+    attempt: Attempt,
+    database: Path,
+    images: Path,
+    folder: Path,
+    total: int,
+    refine: bool,
+    threads: int,
+    start: Path | None = None,
 ) -> list[tuple[pycolmap.Reconstruction, Path]]:
-    """Models of one attempt and their folders, most images first; read back where it was finished before."""
+    """Models of one attempt and their folders, most images first; read back where it was finished before.
+
+    It begins with the newest snapshot of an interrupted run, or else with the model in ``start``.
+    """
     done = folder / "done"
     if not done.exists():
-        start = _latest_snapshot(folder / "snapshots")
+        start = _latest_snapshot(folder / "snapshots") or start
         shutil.rmtree(folder / "models", ignore_errors=True)
         (folder / "models").mkdir(parents=True)
         (folder / "snapshots").mkdir(exist_ok=True)
