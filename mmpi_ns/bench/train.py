@@ -27,7 +27,7 @@ class Train:
 
     Every method gets the same images, sizes, poses and test images; cameras are not optimised. The clock starts when
     the trainer is set up (images are read, MPIs placed) and stands still while test views are rendered. Rows that are
-    finished are kept in train.json: run it again with other --data or --methods to add to them.
+    finished are kept in train.json: run it again with other --data or --methods, or beside this run, to add to them.
     """
 
     data: tuple[Path, ...]
@@ -62,8 +62,7 @@ class Train:
     def run(self) -> None:
         made, path = stamp("train", self), self.output / "train.json"
         made["threads"] = self.threads or os.cpu_count() or 1
-        before = read_json(path)
-        content: dict[str, Any] = {"headline": {}, "made": made, "rows": before.get("rows", {})}
+        content: dict[str, Any] = {"headline": {}, "made": made, "rows": {}}
         jobs = [
             (scene, method, steps, seed)
             for scene in self.data
@@ -74,8 +73,11 @@ class Train:
         for number, (scene, method, steps, seed) in enumerate(jobs, 1):
             key = self._key(scene, method, steps, seed)
             print(f"[{number}/{len(jobs)}] {key}", flush=True)
-            if "not_run" in content["rows"].get(key, {"not_run": ""}):
-                content["rows"][key] = self._row(key, scene, method, steps, seed)
+            row = read_json(path).get("rows", {}).get(key, {"not_run": ""})
+            if "not_run" in row:
+                row = self._row(key, scene, method, steps, seed)
+            # Another run may have added rows meanwhile.
+            content["rows"] = read_json(path).get("rows", {}) | {key: row}
             _check_equal_data(content["rows"])
             print(f"    {_said(content['rows'][key])}", flush=True)
             content["headline"] = headline(content["rows"])
