@@ -16,7 +16,7 @@ from mmpi_ns.placement.errors import WORST, PixelErrors, cube_errors, mpi_errors
 from mmpi_ns.placement.explain import explain, table
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.placement.plan import CubePlan, MPIPlan, ScenePlan
-from mmpi_ns.placement.rule import PlacementConfig, _Choice, _named
+from mmpi_ns.placement.rule import PlacementConfig, _Choice, _named, place
 
 FX, FY, WIDTH, HEIGHT = 150.0, 100.0, 200, 100
 AXES = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0))
@@ -249,6 +249,26 @@ def test_the_finest_plan_within_the_budget_is_kept_and_the_coarsest_where_none_i
         assert tried[int(found.name) - 1] == min(t for t in tried if t >= finest) == pytest.approx(wanted, abs=0.02)
     else:
         assert found.name == str(len(tried)) and tried[-1] == max(tried) > wanted
+
+
+def test_texels_in_all_follow_the_settings_and_the_rays_whichever_allow_fewer():
+    config = PlacementConfig(max_texels=2000, texels_per_ray=8)
+    wanted = {None: 2000, 1000: 2000, 100: 800}
+    assert {rays: rule.affordable_texels(config, rays) for rays in wanted} == wanted
+    assert rule.affordable_texels(replace(config, max_texels=0), 1000) == 8000
+    assert rule.affordable_texels(replace(config, texels_per_ray=0), 10) == 2000
+    assert rule.affordable_texels(replace(config, max_texels=0), None) == 0
+
+
+def test_a_short_training_gets_a_small_plan():
+    random = np.random.default_rng(0)
+    points = random.uniform([-8, -4, -40], [8, 4, -6], (300, 3))
+    cameras = observed(
+        [[x, y, 0] for x in range(3) for y in range(3)], np.tile(points, (9, 1)), np.arange(9).repeat(300)
+    )
+    config = PlacementConfig(rays_per_texel=0)
+    texels = {rays: place(cameras, config, rays).texels for rays in (2_000, 20_000, None)}
+    assert 12_000 < texels[2_000] <= 16_000 and 120_000 < texels[20_000] <= 160_000 < texels[None]
 
 
 def test_mpis_at_one_camera_have_different_names():

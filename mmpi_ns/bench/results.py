@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from mmpi_ns.bench.provenance import commit, processor
-from mmpi_ns.bench.suites import SUITES, Variant
+from mmpi_ns.bench.suites import DEFAULT, SUITES, Variant
 from mmpi_ns.mmpi_scene import load_observations
 from mmpi_ns.placement.content import find_content
 from mmpi_ns.placement.errors import pixel_errors
@@ -33,7 +33,8 @@ class Results:
     data: Path
     """The scene (a folder with transforms.json)."""
     suite: str
-    """Which variants: kitti-street, room-walk, fern or fox."""
+    """Which variants: kitti-street, room-walk, fern, fox; kitti-street-budgets and room-walk-budgets draw quality over
+    texels."""
     downscale_factor: int = 4
     """Image size to use."""
     output: Path = Path("docs/results")
@@ -58,6 +59,8 @@ class Results:
                 path.write_text(json.dumps(done, indent=1), encoding="utf-8")
                 print(json.dumps({_key(variant): row}), flush=True)
         (self.output / f"{self.suite}.md").write_text(self._table(done), encoding="utf-8")
+        if self.suite.endswith("-budgets"):
+            draw_budgets(self.output / f"{self.suite}.png", done)
 
     def _row(self, variant: Variant) -> dict[str, Any]:
         name = re.sub(r"[^a-z0-9]+", "-", _key(variant).lower()).strip("-")
@@ -138,6 +141,34 @@ def _line(name: str, r: dict[str, Any]) -> str:
         f"{r['e_t_50']:.2f} / {r['e_t_90']:.2f}",
     ]
     return "| " + " | ".join(cells) + " |"
+
+
+def draw_budgets(path: Path, rows: dict[str, Any]) -> None:
+    """PSNR and SSIM over millions of texels, the default apart.
+
+    Args:
+        path: of the picture.
+        rows: by name, with texels, psnr and ssim.
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    held = sorted((r for name, r in rows.items() if name != DEFAULT), key=lambda r: r["texels"])
+    figure, axes = plt.subplots(1, 2, figsize=(9, 3.2), layout="constrained")
+    for axis, what, label in zip(axes, ("psnr", "ssim"), ("PSNR, dB", "SSIM"), strict=True):
+        axis.plot(
+            [r["texels"] / 1e6 for r in held], [r[what] for r in held], "o-", color="0.4", label="held to a budget"
+        )
+        if DEFAULT in rows:
+            row = rows[DEFAULT]
+            axis.plot(row["texels"] / 1e6, row[what], "*", markersize=13, color="tab:red", label=DEFAULT)
+        axis.set(xscale="log", xlabel="million texels", ylabel=label)
+        axis.grid(alpha=0.3)
+    axes[0].legend()
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
 
 
 def _key(variant: Variant) -> str:

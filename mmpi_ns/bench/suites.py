@@ -47,7 +47,17 @@ def _shares(blend: float, finetune: float) -> tuple[str, ...]:
     return ("--pipeline.model.blend-share", str(blend), "--pipeline.model.finetune-share", str(finetune))
 
 
+DEFAULT = "the default"
+"""Of a suite of budgets: what is drawn apart."""
 ROOM = (P + "arrangement", "room", P + "width", "160", *JOINT)
+
+
+def _budgets(*millions: float) -> list[Variant]:
+    """Automatic placement held to so many texels, with nothing else that keeps them few, and as it is."""
+    free = (P + "rays-per-texel", "0", P + "texels-per-ray", "0")
+    held = [Variant(f"{m:g} M texels", (*free, P + "max-texels", f"{m * 1e6:g}"), steps=500) for m in millions]
+    return [*held, Variant(DEFAULT, (), steps=500)]
+
 
 SUITES: dict[str, list[Variant]] = {
     "kitti-street": [
@@ -67,6 +77,8 @@ SUITES: dict[str, list[Variant]] = {
     ],
     "fern": [Variant("automatic placement", (), steps=2000)],
     "fox": [Variant("automatic placement", (), steps=750)],
+    "kitti-street-budgets": _budgets(0.5, 1.0, 2.0, 4.0, 8.0),
+    "room-walk-budgets": _budgets(0.5, 1.0, 2.0, 4.0, 8.0),
 }
 
 

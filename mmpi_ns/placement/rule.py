@@ -50,6 +50,8 @@ class PlacementConfig:
     """Image pixels that a texel spans, seen from where the MPI stands (automatic)."""
     rays_per_texel: float = 2.5
     """Training rays that a texel's footprint should get: a short run on large images gets larger texels (automatic)."""
+    texels_per_ray: float = 8.0
+    """Texels in all for each training ray at most: more than it can train fit the noise; 0: no limit (automatic)."""
     height: int = 96
     """Texel rows of every MPI (drive, room)."""
     width: int = 256
@@ -93,6 +95,7 @@ def place(observations: Observations, config: PlacementConfig, training_rays: in
         near = max(0.5 * content.near, 1e-6)
         return room_plan(observations, config.planes, config.width, config.cube_voxels, near, half_size)
     texel_pixels = max(config.texel_pixels, trainable_texel(observations, config, training_rays))
+    config = replace(config, max_texels=affordable_texels(config, training_rays))
     chosen = _choose(observations, content, config, texel_pixels)
     mpis = tuple(h for h in chosen if isinstance(h, MPIPlan))
     cube = next((h for h in chosen if isinstance(h, CubePlan)), None)
@@ -105,6 +108,12 @@ def trainable_texel(observations: Observations, config: PlacementConfig, trainin
         return 0.0
     rays_per_pixel = training_rays / float(observations.sizes.prod(-1).sum())
     return (config.rays_per_texel / rays_per_pixel) ** 0.5
+
+
+def affordable_texels(config: PlacementConfig, training_rays: int | None) -> float:
+    """Texels in all that the settings and the rays of the training allow; 0 for any number."""
+    limits = [config.max_texels, config.texels_per_ray * (training_rays or 0)]
+    return min((limit for limit in limits if limit > 0), default=0.0)
 
 
 def _choose(
