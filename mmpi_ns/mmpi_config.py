@@ -16,7 +16,7 @@ from mmpi_ns.touched_adam import TouchedAdamConfig
 
 
 def _optimizers() -> dict:
-    rates = {"density": 0.1, "features": 0.1, "colour": 1e-3, "reliability": 0.1}
+    rates = {"density": 0.1, "features": 0.1, "colour": 1e-3, "reliability": 0.1, "exposure": 0.02}
     return {
         kind: {"optimizer": TouchedAdamConfig(lr=lr), "scheduler": PhaseSchedulerConfig(kind=kind)}
         for kind, lr in rates.items()

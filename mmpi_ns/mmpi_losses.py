@@ -35,6 +35,8 @@ class LossWeights:
     """Total variation of the features, likewise."""
     tv_every: int = 4
     """Total variation is added every so many steps, at so many times its weight."""
+    exposure: float = 1e-3
+    """Squared distance of gains and biases from 1 and 0 (where exposure is on)."""
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from threading import current_thread, main_thread
 from typing import Any
 
@@ -28,6 +29,7 @@ from mmpi_ns.compositing import (
     median_inverse_distance,
     render_colors,
 )
+from mmpi_ns.exposure import Exposure, departure
 from mmpi_ns.files import to_bytes, to_text
 from mmpi_ns.metrics import ImageMetrics, head_palette
 from mmpi_ns.mmpi_datamanager import OBSERVATIONS, RAYS_PER_STEP, TRAINING_VIEWS, MMPIDataManager
@@ -65,6 +67,7 @@ class MMPIModel(Model):
         joint = self.config.training == "joint" or all(plan.num_heads == 1 for plan in self.windows.plans)
         self.schedule = self.config.schedule("joint" if joint else "two-phase", len(self.windows))
         self.field = self._new_field(self._views(0))
+        self.exposure = Exposure(self.num_train_data) if self.config.exposure else None
         self.sampler = MMPISampler()
         self.metrics = ImageMetrics(self.config.lpips_net)
         self.register_buffer("schedule_bytes", to_bytes(self.schedule.to_json()))
@@ -131,12 +134,13 @@ class MMPIModel(Model):
         self.show.set_options(["all", *self.windows.names])
 
     def get_param_groups(self) -> dict[str, list[Parameter]]:
-        return {
+        groups = {
             "density": [self.field.density],
             "features": [self.field.features],
             "colour": [self.field.networks.weights],
             "reliability": [self.field.reliability],
         }
+        return groups if self.exposure is None else groups | {"exposure": [self.exposure.settings]}
 
     def get_training_callbacks(self, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:  # type: ignore[override]
         return [
@@ -170,12 +174,17 @@ class MMPIModel(Model):
         self.field.views = self._views(window)
         self.field.build(plan, factor)
         self.field.renew_networks(1 if self.config.shared_colour else plan.num_heads)
+        if self.exposure is not None:
+            self.exposure.reset()
 
     def _feed_window(self, attributes: TrainingCallbackAttributes) -> None:
         """Has the data manager draw from the cameras that ask this window."""
         manager = attributes.pipeline.datamanager if attributes.pipeline else None
         assert isinstance(manager, MMPIDataManager), "windows need MMPIDataManager"
-        manager.use_cameras(self._cameras_of(manager.observations.centers, self.window))
+        cameras = self._cameras_of(manager.observations.centers, self.window)
+        manager.use_cameras(cameras)
+        if self.exposure is not None:
+            self.exposure.images = torch.from_numpy(cameras).to(self.device)
         self._fed = self.window
 
     @property
@@ -370,8 +379,13 @@ class MMPIModel(Model):
             observed = over_background(image, torch.full_like(image[:, :3], BACKGROUNDS[self.config.background]))
             return {"rgb_loss": losses.photometric(outputs["rgb"], observed)}
         rays: TrainingRays = outputs["training"]
+        if self.exposure is not None:
+            assert rays.bundle.camera_indices is not None
+            rays = replace(rays, colors=self.exposure(rays.colors, rays.bundle.camera_indices[:, 0]))
         g = generator(self.config.seed, self.step, "background", self.device)
         total = rays.losses(self.field, image, self.config.loss, g, self.step)
+        if self.exposure is not None:
+            total["exposure"] = self.config.loss.exposure * departure(*self.exposure.gains_and_biases())
         # A batch that meets nothing that trains would have no gradient at all; this adds 0 with one.
         total["rgb_loss"] = total["rgb_loss"] + self.device_indicator_param.sum()
         return total

@@ -81,6 +81,9 @@ class MMPIModelConfig(ModelConfig):
     compiled where that can be done (auto)."""
     render_threshold: float = 3e-3
     """Samples of less weight are not coloured when rendering; the dropped mass is reported."""
+    exposure: bool = False
+    """A gain and a bias for each training image and colour channel, for captures whose exposure changes on the way.
+    Their means over the images of a window are 1 and 0; other views get none."""
     background: Literal["black", "gray", "white"] = "gray"
     """Behind everything, when rendering. Training uses random colours where the MPIs explain the whole ray."""
     loss: LossWeights = field(default_factory=LossWeights)

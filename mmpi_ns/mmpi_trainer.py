@@ -234,6 +234,12 @@ class MMPITrainer(Trainer):
                 f"{path} is from before tables were stored in bricks: it can be rendered and evaluated, not resumed: "
                 "train anew."
             )
+        exposed = "_model.exposure.settings" in pipeline_state
+        if exposed != (self._model.exposure is not None):
+            raise ValueError(
+                f"{path} was trained with{'' if exposed else 'out'} exposure: resume with --pipeline.model.exposure "
+                f"{exposed}."
+            )
         theirs, ours = WindowedPlan.from_json(bytes(stored.numpy().tolist()).decode()), self._model.windows
         if theirs != ours:
             raise ValueError(

@@ -12,14 +12,14 @@ from itertools import pairwise
 from typing import Literal
 
 PhaseName = Literal["individual", "blend", "finetune", "joint"]
-ParameterKind = Literal["density", "features", "colour", "reliability"]
+ParameterKind = Literal["density", "features", "colour", "reliability", "exposure"]
 Training = Literal["two-phase", "joint"]
 
 TRAINS: dict[str, frozenset[str]] = {
-    "individual": frozenset({"density", "features", "colour"}),
-    "joint": frozenset({"density", "features", "colour"}),
+    "individual": frozenset({"density", "features", "colour", "exposure"}),
+    "joint": frozenset({"density", "features", "colour", "exposure"}),
     "blend": frozenset({"reliability"}),
-    "finetune": frozenset({"density", "features", "colour", "reliability"}),
+    "finetune": frozenset({"density", "features", "colour", "reliability", "exposure"}),
 }
 """What trains in each phase; everything else is frozen, bit for bit."""
 

@@ -9,7 +9,7 @@ import pytest
 
 from mmpi_ns.phases import TRAINS, Phase, Schedule, make_schedule
 
-KINDS = ("density", "features", "colour", "reliability")
+KINDS = ("density", "features", "colour", "reliability", "exposure")
 
 
 def two_phase(**settings):
@@ -64,7 +64,7 @@ def test_rates_are_zero_exactly_where_a_kind_is_frozen(kind):
 
 def test_only_reliability_trains_in_blend_and_everything_else_before():
     assert TRAINS["blend"] == {"reliability"}
-    assert TRAINS["individual"] == TRAINS["joint"] == {"density", "features", "colour"}
+    assert TRAINS["individual"] == TRAINS["joint"] == {"density", "features", "colour", "exposure"}
     assert TRAINS["finetune"] == set(KINDS)
 
 
