@@ -22,6 +22,7 @@ from mmpi_ns.compositing import BlendForm, blend_shares, blended_optical_depth
 from mmpi_ns.mmpi_samples import Gathered, LocalRays, Lookup, Taps, by_head, head_spans, metadata_of
 from mmpi_ns.mmpi_tables import TexelTables, replace_data
 from mmpi_ns.ops import native
+from mmpi_ns.ops.colors import colors
 from mmpi_ns.ops.interpolate import bilinear_rows, gather_rows, index_rows, interpolate, interpolate_gathered
 from mmpi_ns.ops.march import MarchScene, SceneTables
 from mmpi_ns.ops.shade import shade
@@ -262,7 +263,9 @@ class MMPIField(TexelTables):
         out = lookup.ndc.new_zeros(lookup.shape.numel())
         if raw:
             flat = torch.cat(raw)
-            tau = torch.cat([self._head_tau(k, flat[own], lookup.planes[own]) for k, own in lookup.spans])
+            each = flat.split([own.stop - own.start for _, own in lookup.spans])
+            parts = zip(each, lookup.spans, strict=True)
+            tau = torch.cat([self._head_tau(k, part, lookup.planes[own]) for part, (k, own) in parts])
             out = out.index_put((lookup.index,), tau)
         return out.view(*lookup.shape, 1), lookup
 
@@ -322,11 +325,13 @@ class MMPIField(TexelTables):
         if lookup.groups:
             known = lookup.gathered and lookup.gathered.features
             features = torch.cat([_read(self.features, known, taps) for taps in lookup.groups])
-            colors = [
-                self.networks(k, features[own], lookup.ndc[own], geometry.rotate(self._axes(k), directions), rays[own])
-                for k, own in lookup.spans
+            # Split, not sliced: the gradient of a slice is as large as the whole.
+            each = features.split([own.stop - own.start for _, own in lookup.spans])
+            found = [
+                colors(self.networks, k, part, lookup.ndc[own], geometry.rotate(self._axes(k), directions), rays[own])
+                for part, (k, own) in zip(each, lookup.spans, strict=True)
             ]
-            out = out.index_put((lookup.index,), torch.cat(colors))
+            out = out.index_put((lookup.index,), torch.cat(found))
         return {FieldHeadNames.RGB: out.view(*lookup.shape, 3)}
 
     def _shade(self, lib: ctypes.CDLL | None, ray_samples: RaySamples) -> Float[Tensor, "R S 3"]:

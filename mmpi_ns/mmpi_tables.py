@@ -248,11 +248,13 @@ def _keep_empty_brick(grad: Tensor) -> Tensor:
     if not grad.is_sparse:
         return torch.cat([torch.zeros_like(grad[:BRICK]), grad[BRICK:]])
     rows, values = grad._indices(), grad._values()
-    empty = rows[0] < BRICK
-    if grad.device.type == "cpu" and not bool(empty.any()):
-        return grad
-    values = values.masked_fill(empty[:, None], 0)
-    return torch.sparse_coo_tensor(rows, values, grad.shape, is_coalesced=grad.is_coalesced(), check_invariants=False)
+    rises = grad.is_coalesced()
+    if rises:  # then the empty brick's rows come first (on a CPU; a device would wait for their number)
+        first = int(torch.searchsorted(rows[0], BRICK))
+        rows, values = rows[:, first:], values[first:]
+    else:
+        values = values.masked_fill((rows[0] < BRICK)[:, None], 0)
+    return torch.sparse_coo_tensor(rows, values, grad.shape, is_coalesced=rises, check_invariants=False)
 
 
 def replace_data(parameter: nn.Parameter, data: Tensor) -> None:

@@ -82,8 +82,10 @@ def _adam(
 
 
 def _sparse_update(param: Parameter, grad: Tensor, state: dict[str, Any], group: dict[str, Any]) -> None:
-    index = index_rows(grad._indices()[0])
-    rows, values = index.unique, add_rows(index, grad._values().to(param.dtype), None)
+    rows, values = grad._indices()[0], grad._values().to(param.dtype)
+    if not grad.is_coalesced():
+        index = index_rows(rows)
+        rows, values = index.unique, add_rows(index, values, None)
     if native.takes_triton(param.data) and param.data.is_contiguous() and param.ndim == 2:
         from mmpi_ns.ops.triton_tables import adam_rows
 

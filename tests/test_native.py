@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import subprocess
 
@@ -15,9 +16,12 @@ from mmpi_ns.color_network import ColorNetworks
 from mmpi_ns.mmpi_field import MMPIField
 from mmpi_ns.mmpi_sampler import MMPISampler
 from mmpi_ns.ops import native
+from mmpi_ns.ops.colors import PART as COLOUR_PART
+from mmpi_ns.ops.colors import colors
 from mmpi_ns.ops.interpolate import add_rows, gather_rows, index_rows, interpolate_gathered, interpolate_reference
-from mmpi_ns.ops.variation import total_variation, total_variation_reference
+from mmpi_ns.ops.variation import PART, total_variation, total_variation_reference
 from mmpi_ns.placement.plan import CubePlan, ScenePlan
+from mmpi_ns.texels import BRICK, make_grids
 from mmpi_ns.touched_adam import TouchedAdam
 
 
@@ -137,6 +141,72 @@ def test_encoded_once_a_ray_or_once_a_sample_a_direction_gives_the_same_colour()
     assert torch.allclose(once, each, atol=1e-7)
 
 
+def colour_batch(channels, width, octaves, count):
+    """Networks and samples of one head; the samples of a ray follow each other, and some rays have many, some none."""
+    networks = ColorNetworks(3, channels, width, *octaves)
+    networks.weights.data = normal(*networks.weights.shape, seed=1) * 0.4
+    g = torch.Generator().manual_seed(count)
+    rays = (torch.rand(count, generator=g) ** 3 * 60).long().sort()[0]
+    directions = torch.nn.functional.normalize(normal(60, 3, seed=2), dim=-1)
+    return networks, normal(count, channels, seed=3), torch.rand(count, 3, generator=g) * 2 - 1, directions, rays
+
+
+def colours_and_gradients(function, batch, dtype=torch.float32):
+    networks, features, ndc, directions, rays = batch
+    networks = copy.deepcopy(networks).to(dtype)
+    features = features.detach().to(dtype).requires_grad_()
+    found = function(networks, 1, features, ndc.to(dtype), directions.to(dtype), rays)
+    (found * normal(len(rays), 3, seed=4).to(dtype)).sum().backward()
+    return found.detach(), features.grad, networks.weights.grad
+
+
+@pytest.mark.parametrize("count", [1, 33, 5000])
+@pytest.mark.parametrize(
+    ("channels", "width", "octaves"), [(3, 5, (0, 0)), (9, 32, (2, 2)), (17, 64, (4, 1)), (4, 40, (1, 0))]
+)
+def test_colours_and_their_gradients_equal_float64(channels, width, octaves, count):
+    batch = colour_batch(channels, width, octaves, count)
+    found = colours_and_gradients(colors, batch)
+    wanted = colours_and_gradients(ColorNetworks.forward, batch, torch.float64)
+    assert wanted[0].std() > 0.05
+    for a, b in zip(found, wanted, strict=True):
+        assert (a.double() - b).abs().max() < 2e-6 * (1 + b.abs().max())
+    assert (wanted[2][1] != 0).float().mean() > 0.2 and not found[2][[0, 2]].any()
+
+
+def test_gradients_of_colours_do_not_depend_on_the_number_of_threads():
+    batch, threads, found = colour_batch(9, 32, (2, 2), 9000), torch.get_num_threads(), []
+    for count in (1, 3):
+        try:
+            torch.set_num_threads(count)
+            found.append(colours_and_gradients(colors, batch))
+        finally:
+            torch.set_num_threads(threads)
+    assert all(torch.equal(a, b) for a, b in zip(*found, strict=True))
+
+
+def test_one_ray_of_more_samples_than_a_part_has_all_its_gradient():
+    networks, features, ndc, directions, rays = colour_batch(9, 32, (2, 2), 9000)
+    batch = (networks, features, ndc, directions, torch.where(rays < 8, 2, rays).sort()[0])
+    assert (batch[4] == 2).sum() > 2 * COLOUR_PART
+    found = colours_and_gradients(colors, batch)
+    for a, b in zip(found, colours_and_gradients(ColorNetworks.forward, batch, torch.float64), strict=True):
+        assert (a.double() - b).abs().max() < 2e-6 * (1 + b.abs().max())
+
+
+def test_colours_say_where_a_feature_is_not_a_number():
+    networks, features, ndc, directions, rays = colour_batch(9, 32, (2, 2), 40)
+    features[7, 5] = math.nan
+    found, to_features, to_weights = colours_and_gradients(colors, (networks, features, ndc, directions, rays))
+    assert found.isnan().any(-1).nonzero().flatten().tolist() == [7]
+    assert to_features[7].isnan().all() and to_features.isnan().sum() == 9 and to_weights[1].isnan().any()
+
+
+def test_without_samples_colours_have_no_gradient():
+    found = colours_and_gradients(colors, colour_batch(9, 32, (2, 2), 0))
+    assert found[0].shape == (0, 3) and found[1].shape == (0, 9) and not found[2].any()
+
+
 # Rows ----------------------------------------------------------------------------------------------------------------
 
 
@@ -145,12 +215,18 @@ def test_encoded_once_a_ray_or_once_a_sample_a_direction_gives_the_same_colour()
 def test_distinct_rows_are_those_of_the_reference(monkeypatch, count, spread):
     g, different = torch.Generator().manual_seed(count), 1 + count // 3
     chosen = torch.randint(0, different, (count, 4), generator=g)
-    # Rows in even steps never share a slot of the hash table; rows anywhere do.
-    anywhere = torch.randint(0, 2**40, (different,), generator=g)
+    anywhere = torch.randint(0, 2**27, (different,), generator=g)
     rows = {"side by side": chosen, "4096 apart": chosen * 4096, "anywhere": anywhere[chosen]}[spread]
     fast, plain = both(monkeypatch, lambda: index_rows(rows))
-    assert torch.equal(fast.unique.sort()[0], plain.unique)
+    assert torch.equal(fast.unique, plain.unique)
     assert fast.position.shape == rows.shape and torch.equal(fast.unique[fast.position.long()], rows)
+
+
+def test_numbers_too_large_for_a_table_are_sorted():
+    rows = torch.tensor([2**40, 3, 2**40, 2**31])
+    index = index_rows(rows)
+    assert torch.equal(index.unique, torch.tensor([3, 2**31, 2**40]))
+    assert torch.equal(index.unique[index.position.long()], rows)
 
 
 @pytest.mark.parametrize("weighted", [True, False])
@@ -202,6 +278,43 @@ def test_variation_equals_the_reference_with_its_gradient(channels):
     assert torch.allclose(found[0][1], found[1][1], atol=1e-5)
 
 
+@pytest.mark.parametrize("channels", [1, 9])
+def test_variation_of_many_texels_does_not_depend_on_the_number_of_threads(channels):
+    grids = make_grids([(3, 70, 60), (2, 50, 41)])
+    table = normal(len(grids[0].places) * BRICK, channels) * 2
+    rows = torch.cat([g.rows for g in grids]).sort()[0]
+    assert len(rows) > 3 * PART
+    found, threads = [], torch.get_num_threads()
+    for count in (1, 3):
+        values = table[rows].requires_grad_()
+        try:
+            torch.set_num_threads(count)
+            value = total_variation(values, table, rows, grids, [(0.5, 2.0, 1.0), (1.0, 3.0, 0.3)])
+            value.backward()
+        finally:
+            torch.set_num_threads(threads)
+        found.append((value, values.grad))
+    assert torch.equal(found[0][0], found[1][0]) and torch.equal(found[0][1], found[1][1])
+    values = table[rows].double().requires_grad_()
+    wanted = total_variation_reference(values, table.double(), rows, grids, [(0.5, 2.0, 1.0), (1.0, 3.0, 0.3)])
+    wanted.backward()
+    assert found[0][0].item() == pytest.approx(wanted.item(), rel=1e-6)
+    assert torch.allclose(found[0][1].double(), values.grad, atol=2e-6)
+
+
+def test_variation_says_where_a_texel_is_not_a_number():
+    grids = make_grids([(2, 9, 9)])
+    table = normal(len(grids[0].places) * BRICK, 9)
+    broken = int(grids[0].row(torch.tensor([1]), torch.tensor([8]), torch.tensor([3])))
+    table[broken, 4] = math.nan
+    rows = grids[0].rows.sort()[0]
+    values = table[rows].requires_grad_()
+    value = total_variation(values, table, rows, grids, [(1.0, 1.0, 1.0)])
+    value.backward()
+    own = (rows == broken).nonzero().item()
+    assert value.isnan() and values.grad[own, 4].isnan() and values.grad.isnan().sum() == 1 + 4, "and its neighbours"
+
+
 def test_adam_on_rows_equals_the_plain_one_to_the_last_bits(monkeypatch):
     def work():
         param = torch.nn.Parameter(normal(500, 9))
@@ -211,6 +324,8 @@ def test_adam_on_rows_equals_the_plain_one_to_the_last_bits(monkeypatch):
             values = normal(300, 9, seed=step)
             values[:, step] = 0  # entries without a gradient within a touched row
             param.grad = torch.sparse_coo_tensor(rows[None], values, param.shape)
+            if step % 2:
+                param.grad = param.grad.coalesce()
             optimizer.step()
         return param.data, optimizer.state[param]["exp_avg"], optimizer.state[param]["exp_avg_sq"]
 

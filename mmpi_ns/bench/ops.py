@@ -18,6 +18,7 @@ from mmpi_ns.bench.provenance import fingerprint, read_json, stamp, stamp_line, 
 from mmpi_ns.compositing import composite_weights, render_colors
 from mmpi_ns.mmpi_model import FAIR_SHARE, MMPIModel
 from mmpi_ns.mmpi_samples import Gathered, Lookup, Taps, metadata_of
+from mmpi_ns.ops.colors import colors
 from mmpi_ns.ops.interpolate import gather_rows, index_rows, interpolate_gathered, sum_by_position
 from mmpi_ns.ops.merge import merge
 
@@ -201,7 +202,7 @@ def _colors(field: Any, samples: Any, lookup: Lookup, channels: int) -> list[Op]
     moved, sums = len(ndc) * (channels + 3 + 3) * 4, 2.0 * weights * len(ndc)
 
     def forward() -> Tensor:
-        return networks(k, features, ndc, directions, rays)
+        return colors(networks, k, features, ndc, directions, rays)
 
     def both() -> None:
         forward().sum().backward()

@@ -17,7 +17,10 @@ from torch import Tensor
 
 from mmpi_ns.ops import native
 from mmpi_ns.ops.march import Grid
-from mmpi_ns.texels import TexelGrid
+from mmpi_ns.texels import BRICK, TexelGrid
+
+MOST_ROWS = 2**31
+"""The compiled index of rows takes a quarter byte for every row up to the highest: beyond this, torch's sort."""
 
 
 @dataclass(frozen=True)
@@ -30,25 +33,24 @@ class RowIndex:
 
 
 def index_rows(rows: Int[Tensor, "..."]) -> RowIndex:
-    """The distinct rows (in the order of the reference: rising; of the compiled kernel: as they first occur; on a GPU
-    by Triton: in no particular order)."""
+    """The distinct rows of a table that a list names, rising (on a GPU by Triton: in no particular order)."""
     if native.takes_triton(rows):
         from mmpi_ns.ops import triton_tables
 
         return RowIndex(*triton_tables.index_rows(rows))
     count = rows.numel()
-    lib = native.library() if rows.device.type == "cpu" and 0 < count < 2**30 else None
-    if lib is None:
+    lib = native.library() if rows.device.type == "cpu" and 0 < count < 2**31 else None
+    highest = int(rows.max()) if lib is not None else 0
+    if lib is None or highest >= MOST_ROWS:
         unique, position = torch.unique(rows, return_inverse=True)
         return RowIndex(unique, position)
-    bits = max(4, (2 * count - 1).bit_length())
-    slots = torch.full((1 << bits,), -1, dtype=torch.int32)
+    bricks = torch.zeros(highest // BRICK + 1, 2, dtype=torch.int64)
     unique, position = torch.empty(count, dtype=torch.int64), torch.empty(rows.shape, dtype=torch.int32)
     found = lib.mmpi_index_rows(
         native.address(rows.contiguous(), torch.int64),
         ctypes.c_int64(count),
-        native.address(slots, torch.int32),
-        bits,
+        native.address(bricks, torch.int64),
+        ctypes.c_int64(len(bricks)),
         native.address(unique, torch.int64),
         native.address(position, torch.int32),
     )
@@ -160,7 +162,8 @@ class _Gather(torch.autograd.Function):
 
 
 def gather_rows(table: Float[Tensor, "T C"], rows: Int[Tensor, "U"]) -> Float[Tensor, "U C"]:
-    """table[rows], with a sparse gradient: whatever reads the rows adds its gradient densely, over U rows only."""
+    """table[rows] for the distinct rows of ``index_rows``, with a sparse gradient: whatever reads the rows adds its
+    gradient densely, over U rows only."""
     return _Gather.apply(table, rows)  # type: ignore[no-any-return]
 
 
@@ -185,4 +188,6 @@ def interpolate_gathered(
 
 
 def _row_gradient(rows: Int[Tensor, "U"], values: Float[Tensor, "U C"], shape: torch.Size) -> Tensor:
-    return torch.sparse_coo_tensor(rows[None], values, shape, check_invariants=False)
+    """A sparse gradient of the rows that ``index_rows`` found; where they rise, it is what torch calls coalesced."""
+    rises = not native.takes_triton(rows)
+    return torch.sparse_coo_tensor(rows[None], values, shape, is_coalesced=rises, check_invariants=False)

@@ -133,7 +133,6 @@ def _build() -> ctypes.CDLL | str:
     except (OSError, subprocess.TimeoutExpired) as error:
         return _unavailable(str(error))
     built.mmpi_index_rows.restype = ctypes.c_int64
-    built.mmpi_total_variation.restype = ctypes.c_double
     return built
 
 

@@ -10,18 +10,13 @@ from torch import Tensor
 
 from mmpi_ns.color_network import ColorNetworks, positional_encoding
 from mmpi_ns.ops import native
+from mmpi_ns.ops.colors import Network
 from mmpi_ns.ops.march import SceneTables
-
-
-class _Network(ctypes.Structure):
-    _fields_ = [(n, ctypes.c_int64) for n in ("channels", "frequencies", "width")] + [
-        (n, ctypes.c_void_p) for n in ("first", "second", "second_bias", "third", "third_bias")
-    ]
 
 
 class _Shading(ctypes.Structure):
     _fields_ = [(n, ctypes.c_void_p) for n in ("features", "start", "heads", "planes", "ndc", "valid")] + [
-        (n, ctypes.c_int64) for n in ("num_rays", "slots")
+        (n, ctypes.c_int64) for n in ("rows", "num_rays", "slots")
     ]
 
 
@@ -60,10 +55,12 @@ def shade(
         torch.addmm(b1, encoded, w1[:, split:].T, out=start[k])
         held.append([w1[:, :split].contiguous(), w2.contiguous(), b2, w3.contiguous(), b3])
         sizes = (channels, networks.position_frequencies, networks.width)
-        parts.append(_Network(*sizes, *(native.address(x) for x in held[-1])))
+        parts.append(Network(*sizes, *(native.address(x) for x in held[-1])))
     slots_held = [heads.contiguous(), planes.contiguous(), ndc.contiguous(), valid.contiguous()]
-    shading = _Shading(*(native.address(x, x.dtype) for x in (features, start, *slots_held)), num_rays, slots)
-    table = (_Network * num_heads)(*parts)
+    shading = _Shading(
+        *(native.address(x, x.dtype) for x in (features, start, *slots_held)), len(features), num_rays, slots
+    )
+    table = (Network * num_heads)(*parts)
     colors = torch.empty(num_rays, slots, 3)
 
     def part(begin: int, end: int) -> None:

@@ -16,6 +16,8 @@ from mmpi_ns.ops.march import Grid
 from mmpi_ns.texels import TexelGrid
 
 Scales = list[tuple[float, float, float]]
+PART = 4096
+"""Texels whose differences the compiled kernel sums together, so that a sum does not depend on the threads."""
 
 
 def total_variation_reference(
@@ -66,18 +68,25 @@ class _Variation(torch.autograd.Function):
         gradient = torch.empty_like(values)
         blocks = (Grid * len(grids))(*(Grid.of(g) for g in grids))
         flat = [s for each in scales for s in each]
-        total = lib.mmpi_total_variation(
-            native.address(rows, torch.int64),
-            *map(ctypes.c_int64, (len(rows), table.shape[1])),
-            native.address(table),
-            blocks,
-            ctypes.c_int64(len(grids)),
-            native.address(grids[0].places, torch.int64),
-            (ctypes.c_float * len(flat))(*flat),
-            native.address(gradient),
-        )
+        totals = torch.zeros(-(-len(rows) // PART), dtype=torch.float64)
+
+        def vary(begin: int, end: int) -> None:
+            lib.mmpi_total_variation(
+                native.address(rows, torch.int64),
+                *map(ctypes.c_int64, (len(rows), begin, end, table.shape[1])),
+                native.address(table),
+                ctypes.c_int64(len(table)),
+                blocks,
+                ctypes.c_int64(len(grids)),
+                native.address(grids[0].places, torch.int64),
+                (ctypes.c_float * len(flat))(*flat),
+                native.address(gradient),
+                native.address(totals, torch.float64),
+            )
+
+        native.in_parts(vary, len(totals), least=1)
         ctx.save_for_backward(gradient)
-        return values.new_tensor(total)
+        return totals.sum().to(values.dtype)
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:

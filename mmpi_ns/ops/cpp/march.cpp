@@ -10,7 +10,6 @@ namespace {
 
 constexpr float OPAQUE = 1e-5f;      // light that may be lost behind the end of a ray
 constexpr float NEGLIGIBLE = 1e-4f;  // optical depths below this get an equal share without a lookup
-const Lanes IOTA = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
 constexpr float INFINITY_T = 1e-10f; // inverse distances are no less where a distance is needed
 
 struct Rays {
@@ -42,15 +41,37 @@ void finish(Run& run, float interval) {
 }
 
 // Lower texels and fractions of sixteen coordinates in [-1, 1] (as Cell).
-void cells(Lanes coordinate, int64_t size, int32_t* lower, float* fraction) {
+void cells(Lanes coordinate, int64_t size, IntLanes& lower, Lanes& fraction) {
     const float last = float(size - 1);
     const Lanes position = least(most((coordinate + 1.0f) * (0.5f * last), Lanes{}), splat(last));
-    IntLanes floor = __builtin_convertvector(position, IntLanes); // towards zero, and positions are not negative
+    lower = __builtin_convertvector(position, IntLanes); // towards zero, and positions are not negative
     const IntLanes highest = int32_t(size - 2) - IntLanes{};
-    floor = floor < highest ? floor : highest;
-    __builtin_memcpy(lower, &floor, sizeof floor);
-    store(fraction, position - __builtin_convertvector(floor, Lanes));
+    lower = lower < highest ? lower : highest;
+    fraction = position - __builtin_convertvector(lower, Lanes);
 }
+
+// Sixteen places on consecutive planes of an MPI, from `first` on.
+struct Places {
+    int32_t column[WIDTH], line[WIDTH], tile[WIDTH], texel[WIDTH], edge[WIDTH]; // edge: corners lie in several bricks
+    float fx[WIDTH], fy[WIDTH];
+
+    Places(const Grid& grid, Lanes x, Lanes y, int64_t first) {
+        IntLanes lower_x, lower_y;
+        Lanes fraction_x, fraction_y;
+        cells(x, grid.width, lower_x, fraction_x);
+        cells(y, grid.height, lower_y, fraction_y);
+        const IntLanes plane = __builtin_convertvector(IOTA, IntLanes) + int32_t(first);
+        const IntLanes in_x = lower_x & 7, in_y = lower_y & 7;
+        store(column, lower_x), store(line, lower_y);
+        store(tile, (plane * int32_t(grid.down) + (lower_y >> 3)) * int32_t(grid.across) + (lower_x >> 3));
+        store(texel, (in_y << 3) + in_x);
+        store(edge, (in_x == 7) | (in_y == 7));
+        store(fx, fraction_x), store(fy, fraction_y);
+    }
+
+    static void store(int32_t* to, IntLanes x) { __builtin_memcpy(to, &x, sizeof x); }
+    static void store(float* to, Lanes x) { ::store(to, x); }
+};
 
 // The next samples of an MPI. Where nothing is stored there is nothing to see: with `skips` such samples are left out.
 void fill_mpi(Run& run, const Scene& scene, const Rays& rays, int64_t ray, int64_t k, bool skips) {
@@ -59,36 +80,37 @@ void fill_mpi(Run& run, const Scene& scene, const Rays& rays, int64_t ray, int64
     const int64_t i = ray * scene.num_mpis + k;
     const float u = rays.u[2 * i], u_slope = rays.u[2 * i + 1], v = rays.v[2 * i], v_slope = rays.v[2 * i + 1];
     const float oz = rays.local_origins[3 * i + 2], dz = rays.local_directions[3 * i + 2];
-    const float* biases = scene.biases + grid.bias;
+    const float *biases = scene.biases + grid.bias, *table = scene.density;
+    const int32_t* tiles = grid.tiles + grid.first_tile;
     int size = 0;
     while (2 * size < WIDTH && run.begin < run.count) {
         const int count = int(std::min<int64_t>(WIDTH - size, run.count - run.begin));
-        const int64_t m = run.first - run.begin;
+        const int64_t m = run.first - run.begin, first = grid.depth - 1 - m;
         const Lanes w = (float(m) - IOTA) * mpi.step + mpi.end;
         const Lanes x = (u + w * u_slope - mpi.u0) * mpi.u_scale - 1.0f, y = (v + w * v_slope - mpi.v0) * mpi.v_scale - 1.0f;
-        float places[3][WIDTH], inverse_t[WIDTH], fx[WIDTH], fy[WIDTH];
-        int32_t across[WIDTH], down[WIDTH];
-        store(places[0], x), store(places[1], y), store(places[2], 1.0f - mpi.s_scale * (w - mpi.end));
+        float ndc[3][WIDTH], inverse_t[WIDTH];
+        store(ndc[0], x), store(ndc[1], y), store(ndc[2], 1.0f - mpi.s_scale * (w - mpi.end));
         store(inverse_t, w * dz / (1.0f - w * oz));
-        cells(x, grid.width, across, fx);
-        cells(y, grid.height, down, fy);
-        int chosen[WIDTH], wanted = 0;
-        int64_t rows[WIDTH][4];
+        const Places at(grid, x, y, first);
         for (int j = 0; j < count; j++) {
-            const Corners corners(grid, grid.depth - 1 - m + j, down[j], across[j]);
-            chosen[wanted] = j;
-            for (int a = 0; a < 4; a++) rows[wanted][a] = corners.row[a];
-            wanted += !skips || corners.stored;
-        }
-        for (int i = 0; i < wanted; i++, size++) {
-            const int j = chosen[i];
-            const int64_t plane = grid.depth - 1 - m + j, *row = rows[i];
-            const float gx = 1 - fx[j], gy = 1 - fy[j], *table = scene.density;
-            run.tau[size] = gx * gy * table[row[0]] + fx[j] * gy * table[row[1]] + gx * fy[j] * table[row[2]] +
-                            fx[j] * fy[j] * table[row[3]] + biases[plane];
-            run.plane[size] = int32_t(plane);
-            for (int a = 0; a < 3; a++) run.ndc[size][a] = places[a][j];
+            float corners[4];
+            if (!at.edge[j]) {
+                const int32_t brick = tiles[at.tile[j]];
+                if (skips && !brick) continue;
+                const float* texel = table + int64_t(brick) * BRICK + at.texel[j];
+                corners[0] = texel[0], corners[1] = texel[1], corners[2] = texel[8], corners[3] = texel[9];
+            } else {
+                const Corners found(grid, first + j, at.line[j], at.column[j]);
+                if (skips && !found.stored) continue;
+                for (int a = 0; a < 4; a++) corners[a] = table[found.row[a]];
+            }
+            const float fx = at.fx[j], fy = at.fy[j], gx = 1 - fx, gy = 1 - fy;
+            run.tau[size] = gx * gy * corners[0] + fx * gy * corners[1] + gx * fy * corners[2] + fx * fy * corners[3] +
+                            biases[first + j];
+            run.plane[size] = int32_t(first + j);
+            for (int a = 0; a < 3; a++) run.ndc[size][a] = ndc[a][j];
             run.inverse_t[size] = inverse_t[j];
+            size++;
         }
         run.begin += count;
     }
@@ -197,7 +219,8 @@ void mmpi_march(const Scene* scene, const Rays* rays, const int64_t* starts, int
                 int32_t* heads, int32_t* planes, float* ndc, float* inverse_t, float* taus, float* skipped_before) {
     const int64_t H = scene->num_heads;
     std::vector<Run> runs(H);
-    std::vector<int64_t> live(H);
+    std::vector<int64_t> live(H);    // heads that have samples left,
+    std::vector<float> nearest(H);   // and the inverse distance of the next one of each
     std::vector<float> votes;
     for (int64_t ray = begin; ray < end; ray++) {
         int64_t total = 0, alive = 0;
@@ -212,7 +235,7 @@ void mmpi_march(const Scene* scene, const Rays* rays, const int64_t* starts, int
             run.size = 0;
             run.at = -1;
             advance(run, *scene, *rays, ray, h, threshold > 0);
-            if (!run.done()) live[alive++] = h;
+            if (!run.done()) nearest[alive] = run.next(), live[alive++] = h;
         }
         const float bound = threshold > 0 ? std::min(fair_share / float(std::max<int64_t>(total, 1)), threshold) : -1;
         const float end_of_light = threshold > 0 ? std::min(bound, OPAQUE) : -1;
@@ -221,7 +244,7 @@ void mmpi_march(const Scene* scene, const Rays* rays, const int64_t* starts, int
         while (alive) {
             int64_t best = 0;
             for (int64_t i = 1; i < alive; i++) // equal distances: the first head comes first
-                if (runs[live[i]].next() > runs[live[best]].next()) best = i;
+                best = nearest[i] > nearest[best] ? i : best;
             const int64_t h = live[best];
             Run& run = runs[h];
             const int at = run.at;
@@ -249,10 +272,12 @@ void mmpi_march(const Scene* scene, const Rays* rays, const int64_t* starts, int
             }
             light *= pass;
             advance(run, *scene, *rays, ray, h, threshold > 0);
-            if (run.done()) {
-                for (int64_t i = best; i + 1 < alive; i++) live[i] = live[i + 1];
-                alive--;
+            if (!run.done()) {
+                nearest[best] = run.next();
+                continue;
             }
+            alive--;
+            for (int64_t i = best; i < alive; i++) live[i] = live[i + 1], nearest[i] = nearest[i + 1];
         }
         kept[ray] = out - starts[ray];
         skipped_total[ray] = skipped;

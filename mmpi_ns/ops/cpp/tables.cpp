@@ -1,5 +1,5 @@
-// Rows of tables that a batch touched: which, their gradients, and Adam on them. References in ops/interpolate.py,
-// losses.py and touched_adam.py.
+// Rows of tables that a batch touched: which, their gradients, and Adam on them. References in ops/interpolate.py
+// and touched_adam.py.
 #include "scene.h"
 
 namespace {
@@ -11,34 +11,31 @@ template <typename T> void prefetch_row(const T* row, int64_t channels) {
     for (const char* line = reinterpret_cast<const char*>(row); line < end; line += 64) __builtin_prefetch(line);
 }
 
-// Asks for a texel's lines and those of its neighbours above, below, before and behind; a prefetch may miss the table.
-void prefetch_around(const Grid& grid, const float* table, int64_t row, int64_t place, int64_t channels) {
-    for (int64_t beside = -8; beside <= 8; beside += 8) prefetch_row(table + (row + beside) * channels, channels);
-    const int64_t layer = grid.down * grid.across, first = grid.first_tile, end = first + grid.depth * layer;
-    for (int64_t tile = place - layer; tile <= place + layer; tile += 2 * layer)
-        if (tile >= first && tile < end)
-            prefetch_row(table + (grid.tiles[tile] * BRICK + row % BRICK) * channels, channels);
-}
+// Which rows of a brick occur, and how many others come before them.
+struct Seen {
+    uint64_t rows;
+    int64_t before;
+};
 
 } // namespace
 
 extern "C" {
 
-// Numbers the distinct values of `rows` in the order of their first occurrence. `slots` holds 2^bits >= 2 count
-// entries of -1. Returns how many there are; `unique` and `position` have room for `count`.
-int64_t mmpi_index_rows(const int64_t* rows, int64_t count, int32_t* slots, int bits, int64_t* unique,
+// Numbers the distinct values of `rows`, none negative, in rising order. `bricks` holds as many bricks as the largest
+// value needs, all zero. Returns how many there are; `unique` and `position` have room for `count`.
+int64_t mmpi_index_rows(const int64_t* rows, int64_t count, Seen* bricks, int64_t num_bricks, int64_t* unique,
                         int32_t* position) {
-    const uint64_t mask = (uint64_t(1) << bits) - 1;
+    for (int64_t i = 0; i < count; i++) bricks[rows[i] >> 6].rows |= uint64_t(1) << (rows[i] & 63);
     int64_t found = 0;
+    for (int64_t b = 0; b < num_bricks; b++) {
+        bricks[b].before = found;
+        for (uint64_t left = bricks[b].rows; left; left &= left - 1)
+            unique[found++] = b * BRICK + __builtin_ctzll(left);
+    }
     for (int64_t i = 0; i < count; i++) {
-        const int64_t row = rows[i];
-        uint64_t slot = (uint64_t(row) * 0x9E3779B97F4A7C15ull) >> (64 - bits);
-        while (slots[slot] >= 0 && unique[slots[slot]] != row) slot = (slot + 1) & mask;
-        if (slots[slot] < 0) {
-            slots[slot] = int32_t(found);
-            unique[found++] = row;
-        }
-        position[i] = slots[slot];
+        const Seen& brick = bricks[rows[i] >> 6];
+        const uint64_t earlier = brick.rows & ((uint64_t(1) << (rows[i] & 63)) - 1);
+        position[i] = int32_t(brick.before + __builtin_popcountll(earlier));
     }
     return found;
 }
@@ -47,9 +44,9 @@ int64_t mmpi_index_rows(const int64_t* rows, int64_t count, int32_t* slots, int 
 void mmpi_scatter_rows(const int32_t* position, const float* weights, const float* grad, int64_t samples, int64_t taps,
                        int64_t channels, float* values) {
     for (int64_t n = 0; n < samples; n++) {
-        const float* from = grad + n * channels;
+        const float* __restrict from = grad + n * channels;
         for (int64_t b = 0; b < taps; b++) {
-            float* to = values + int64_t(position[n * taps + b]) * channels;
+            float* __restrict to = values + int64_t(position[n * taps + b]) * channels;
             const float weight = weights ? weights[n * taps + b] : 1.0f;
             for (int64_t c = 0; c < channels; c++) to[c] += weight * from[c];
         }
@@ -93,53 +90,5 @@ void mmpi_bilinear_rows(const Grid* grid, const int64_t* planes, const float* nd
             weights[4 * i + k] = weight[k];
         }
     }
-}
-
-// Huber loss of the differences of texels with their stored neighbours (losses.total_variation), and its gradient.
-// `scales` are those of x, y and z of each head; neighbours are held fixed. `places` names the tile of every brick.
-double mmpi_total_variation(const int64_t* rows, int64_t count, int64_t channels, const float* table, const Grid* grids,
-                            int64_t num_heads, const int64_t* places, const float* scales, float* grad) {
-    double total = 0;
-    int64_t head = 0;
-    for (int64_t i = 0; i < count; i++) {
-        float* to = grad + i * channels;
-        for (int64_t c = 0; c < channels; c++) to[c] = 0;
-        const int64_t place = places[rows[i] / BRICK];
-        if (place < 0) continue; // the empty brick
-        const auto holds = [&](const Grid& g) {
-            return place >= g.first_tile && place < g.first_tile + g.depth * g.down * g.across;
-        };
-        while (!holds(grids[head])) head = (head + 1) % num_heads; // rows come head by head, mostly
-        const Grid& grid = grids[head];
-        if (i + AHEAD < count) prefetch_around(grid, table, rows[i + AHEAD], places[rows[i + AHEAD] / BRICK], channels);
-        const uint32_t tile = uint32_t(place - grid.first_tile), across = uint32_t(grid.across);
-        const uint32_t line = tile / across, down = uint32_t(grid.down);
-        const int in_brick[3] = {int(rows[i] & 7), int(rows[i] >> 3 & 7), 0};
-        const int64_t at[3] = {int64_t(tile % across) * 8 + in_brick[0], int64_t(line % down) * 8 + in_brick[1],
-                               line / down};
-        const int64_t sizes[3] = {grid.width, grid.height, grid.depth};
-        const int64_t tile_steps[3] = {1, grid.across, grid.across * grid.down}, row_steps[3] = {1, 8, 0};
-        const float* own = table + rows[i] * channels;
-        for (int axis = 0; axis < 3; axis++)
-            for (int side = -1; side <= 1; side += 2) {
-                if (at[axis] + side < 0 || at[axis] + side >= sizes[axis]) continue;
-                int64_t row = rows[i] + side * row_steps[axis];
-                const int edge = side < 0 ? 0 : 7;
-                if (axis == 2 || in_brick[axis] == edge) { // in another brick
-                    const int32_t brick = grid.tiles[place + side * tile_steps[axis]];
-                    if (!brick) continue;
-                    row = int64_t(brick) * BRICK + ((rows[i] & 63) - side * 7 * row_steps[axis]);
-                }
-                const float *other = table + row * channels, scale = scales[3 * head + axis] / 6;
-                float sum = 0;
-                for (int64_t c = 0; c < channels; c++) {
-                    const float difference = own[c] - other[c], size = std::abs(difference);
-                    to[c] += scale * std::min(std::max(difference, -1.0f), 1.0f);
-                    sum += size <= 1 ? 0.5f * difference * difference : size - 0.5f;
-                }
-                total += scale * sum;
-            }
-    }
-    return total;
 }
 }
