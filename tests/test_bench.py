@@ -8,10 +8,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from mmpi_ns.bench import dense, regions, results
 from mmpi_ns.bench.regions import Regions, spearman
-from mmpi_ns.bench.suites import SUITES
+from mmpi_ns.bench.suites import DEFAULT, SUITES
 from mmpi_ns.mmpi_field import MMPIField
 from mmpi_ns.mmpi_sampler import MMPISampler
 from mmpi_ns.placement.plan import MPIPlan, ScenePlan
@@ -100,3 +101,14 @@ def test_a_row_of_results_says_what_was_run(tmp_path):
     header = next(x for x in lines if x.startswith("| variant |"))
     assert header.count("|") == line.count("|") == lines[lines.index(header) + 1].count("|")
     assert "2 cores of X" in lines[2] and "Commits: abc (2026-01-02)" in lines[-2 if not lines[-1] else -1]
+
+
+def test_budgets_are_drawn_with_the_default_apart(tmp_path):
+    assert [v.name for v in SUITES["kitti-street-budgets"]][-1] == DEFAULT
+    rows = {f"{m} M texels": {"texels": m * 1e6, "psnr": 19 + m / 10, "ssim": 0.5 + m / 100} for m in (1, 2, 4)}
+    pictures = []
+    for more in ({}, {DEFAULT: {"texels": 2e6, "psnr": 19.4, "ssim": 0.55}}):
+        results.draw_budgets(tmp_path / "budgets.png", rows | more)
+        pictures.append(np.asarray(Image.open(tmp_path / "budgets.png").convert("RGB"), np.int32))
+    star = (np.abs(pictures[1] - [214, 39, 40]).max(-1) < 8).sum()
+    assert star > 50 and not (np.abs(pictures[0] - [214, 39, 40]).max(-1) < 8).any()

@@ -157,6 +157,8 @@ def draw_budgets(path: Path, rows: dict[str, Any]) -> None:
 
     held = sorted((r for name, r in rows.items() if name != DEFAULT), key=lambda r: r["texels"])
     figure, axes = plt.subplots(1, 2, figsize=(9, 3.2), layout="constrained")
+    texels = [r["texels"] / 1e6 for r in held]
+    ticks = [m for m in (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50) if 0.7 * min(texels) <= m <= 1.4 * max(texels)]
     for axis, what, label in zip(axes, ("psnr", "ssim"), ("PSNR, dB", "SSIM"), strict=True):
         axis.plot(
             [r["texels"] / 1e6 for r in held], [r[what] for r in held], "o-", color="0.4", label="held to a budget"
@@ -165,6 +167,8 @@ def draw_budgets(path: Path, rows: dict[str, Any]) -> None:
             row = rows[DEFAULT]
             axis.plot(row["texels"] / 1e6, row[what], "*", markersize=13, color="tab:red", label=DEFAULT)
         axis.set(xscale="log", xlabel="million texels", ylabel=label)
+        axis.set_xticks(ticks, [f"{m:g}" for m in ticks])
+        axis.minorticks_off()
         axis.grid(alpha=0.3)
     axes[0].legend()
     figure.savefig(path, dpi=110)
