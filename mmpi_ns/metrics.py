@@ -49,6 +49,17 @@ class ImageMetrics:
         return self._lpips
 
 
+def pictures(observed: Float[Tensor, "H W 3"], outputs: dict[str, Tensor], num_heads: int) -> dict[str, Tensor]:
+    """What is worth looking at of a rendered image, in colours."""
+    near = 1 / outputs["depth"].clamp(min=1e-9)
+    return {
+        "img": torch.cat([observed, outputs["rgb"]], 1),
+        "accumulation": outputs["accumulation"].expand(-1, -1, 3),
+        "inverse_depth": (near / near.flatten().quantile(0.98).clamp(min=1e-9)).clamp(0, 1).expand(-1, -1, 3),
+        "winning_mpi": head_palette(num_heads, observed.device)[outputs["winning_mpi"][..., 0].long()],
+    }
+
+
 def head_palette(count: int, device: torch.device | str) -> Float[Tensor, "H 3"]:
     """Distinct colours, one a head."""
     hue = torch.arange(count, dtype=torch.float32, device=device) * 0.61803 % 1

@@ -38,6 +38,10 @@ KEYPOINT_DEPTH = "keypoint_inverse_distance"
 """Ray-bundle metadata: inverse distance of the SfM point on a keypoint ray, 0 on ordinary rays."""
 
 
+PIXEL_BYTES = 3 + 3 * 4
+"""Of a resident pixel: its colour, and its image, row and column."""
+
+
 @dataclass
 class MMPIDataManagerConfig(VanillaDataManagerConfig):
     """Settings of the data manager."""
@@ -175,6 +179,13 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
             self._allowed = self.pool.places_of(torch.from_numpy(cameras))
             if not len(self._allowed):
                 raise ValueError("The masks leave no training pixel in one stretch of the capture: use longer windows.")
+
+    def pixel_bytes(self, cameras: NDArray[np.int64] | None = None) -> int:
+        """Bytes of the training pixels in memory while these cameras are drawn from; where masks hide some, at most."""
+        if self.pool is not None and not self._reads_by_window:
+            return self.pool.colors.nbytes + self.pool.indices.nbytes
+        sizes = (self.train_dataset.cameras.width * self.train_dataset.cameras.height).reshape(-1).cpu().numpy()
+        return PIXEL_BYTES * int((sizes if cameras is None else sizes[cameras]).sum())
 
     def setup_eval(self) -> None:
         """nerfstudio's loaders, but for the one that holds every evaluation image in memory."""

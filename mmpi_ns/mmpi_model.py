@@ -31,12 +31,12 @@ from mmpi_ns.compositing import (
 )
 from mmpi_ns.exposure import Exposure, departure
 from mmpi_ns.files import to_bytes, to_text
-from mmpi_ns.metrics import ImageMetrics, head_palette
+from mmpi_ns.metrics import ImageMetrics, pictures
 from mmpi_ns.mmpi_datamanager import OBSERVATIONS, RAYS_PER_STEP, TRAINING_VIEWS, MMPIDataManager
 from mmpi_ns.mmpi_field import MMPIField
 from mmpi_ns.mmpi_losses import TrainingRays, is_pixel_ray, over_background
 from mmpi_ns.mmpi_sampler import MergeReport, MMPISampler
-from mmpi_ns.mmpi_samples import Lookup, metadata_of, repeat_rays
+from mmpi_ns.mmpi_samples import Lookup, individual_rays, metadata_of
 from mmpi_ns.mmpi_settings import MMPIModelConfig
 from mmpi_ns.mmpi_windows import WindowStore, mix_windows
 from mmpi_ns.ops import native
@@ -66,7 +66,7 @@ class MMPIModel(Model):
         # One head has nothing to blend with, so it trains in one go.
         joint = self.config.training == "joint" or all(plan.num_heads == 1 for plan in self.windows.plans)
         self.schedule = self.config.schedule("joint" if joint else "two-phase", len(self.windows))
-        self.field = self._new_field(self._views(0))
+        self.field = self._new_field(self.views_of(0))
         self.exposure = Exposure(self.num_train_data) if self.config.exposure else None
         self.sampler = MMPISampler()
         self.metrics = ImageMetrics(self.config.lpips_net)
@@ -90,14 +90,15 @@ class MMPIModel(Model):
             **self.config.field_settings(),
         )
 
-    def _views(self, window: int) -> TrainingViews | None:
+    def views_of(self, window: int) -> TrainingViews | None:
         """The training images that ask a window."""
         views: TrainingViews | None = self.kwargs.get("metadata", {}).get(TRAINING_VIEWS)
         if views is None or len(self.windows) == 1:
             return views
-        return views.some(self._cameras_of(views.origins.numpy(), window))
+        return views.some(self.cameras_of(views.origins.numpy(), window))
 
-    def _cameras_of(self, centers: NDArray[np.float64], number: int) -> NDArray[np.int64]:
+    def cameras_of(self, centers: NDArray[np.float64], number: int) -> NDArray[np.int64]:
+        """Those of the cameras that ask a window."""
         window = self.windows.windows[number]
         return cameras_in(centers, np.asarray(window.center), window.radius + window.margin)
 
@@ -171,7 +172,7 @@ class MMPIModel(Model):
         self.window_number.fill_(window)
         self.store.forget(window)
         plan = self.windows.plans[window]
-        self.field.views = self._views(window)
+        self.field.views = self.views_of(window)
         self.field.build(plan, factor)
         self.field.renew_networks(1 if self.config.shared_colour else plan.num_heads)
         if self.exposure is not None:
@@ -181,7 +182,7 @@ class MMPIModel(Model):
         """Has the data manager draw from the cameras that ask this window."""
         manager = attributes.pipeline.datamanager if attributes.pipeline else None
         assert isinstance(manager, MMPIDataManager), "windows need MMPIDataManager"
-        cameras = self._cameras_of(manager.observations.centers, self.window)
+        cameras = self.cameras_of(manager.observations.centers, self.window)
         manager.use_cameras(cameras)
         if self.exposure is not None:
             self.exposure.images = torch.from_numpy(cameras).to(self.device)
@@ -230,7 +231,8 @@ class MMPIModel(Model):
     def _render(self, ray_bundle: RayBundle) -> dict[str, Any]:
         bundle = self._bounded(ray_bundle)
         if self.training and self.schedule.phase_at(self.step).name == "individual":
-            bundle, head_mask, choose = self._individual(bundle)
+            g = generator(self.config.seed, self.step, "assignment", self.device)
+            bundle, head_mask, choose = individual_rays(bundle, self.field.plan, self.config.rays_per_mpi, g)
         else:
             head_mask, choose = self._shown(len(bundle)), None
         blend_form = self.config.blend_form if self.blends and head_mask is None else None
@@ -274,20 +276,6 @@ class MMPIModel(Model):
         bundle.nears = near if bundle.nears is None else torch.maximum(bundle.nears, near)
         bundle.fars = torch.full_like(near, torch.inf) if bundle.fars is None else bundle.fars
         return bundle
-
-    def _individual(self, bundle: RayBundle) -> tuple[RayBundle, Tensor | None, Tensor | None]:
-        """Gives each ray to one MPI (by random priorities), or to every MPI in turn; the cube joins each."""
-        num_mpis, heads = len(self.field.plan.mpis), self.field.plan.num_heads
-        if num_mpis == 1:
-            return bundle, None, None
-        if self.config.rays_per_mpi == "split":
-            g = generator(self.config.seed, self.step, "assignment", self.device)
-            return bundle, None, torch.rand(len(bundle), num_mpis, generator=g, device=self.device)
-        repeated = repeat_rays(bundle, num_mpis)
-        own = torch.arange(num_mpis, device=self.device).repeat_interleave(len(bundle))
-        mask = torch.arange(heads, device=self.device) == own[:, None]
-        mask[:, num_mpis:] = True
-        return repeated, mask, None
 
     def _shown(self, num_rays: int) -> Bool[Tensor, "R H"] | None:
         """The viewer's choice of one MPI, as a head mask."""
@@ -409,12 +397,4 @@ class MMPIModel(Model):
         observed = over_background(image, torch.full_like(image[..., :3], BACKGROUNDS[self.config.background]))
         values = self.metrics(outputs["rgb"], observed)
         values["dropped_mass"] = float(outputs["dropped_mass"].mean())
-        palette = head_palette(len(self.windows.names), outputs["rgb"].device)
-        near = 1 / outputs["depth"].clamp(min=1e-9)
-        images = {
-            "img": torch.cat([observed, outputs["rgb"]], 1),
-            "accumulation": outputs["accumulation"].expand(-1, -1, 3),
-            "inverse_depth": (near / near.flatten().quantile(0.98).clamp(min=1e-9)).clamp(0, 1).expand(-1, -1, 3),
-            "winning_mpi": palette[outputs["winning_mpi"][..., 0].long()],
-        }
-        return values, images
+        return values, pictures(observed, outputs, len(self.windows.names))

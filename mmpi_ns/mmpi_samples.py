@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -12,6 +12,7 @@ from nerfstudio.cameras.rays import RayBundle, RaySamples
 from torch import Tensor
 
 from mmpi_ns import geometry
+from mmpi_ns.placement.plan import ScenePlan
 
 
 @dataclass(frozen=True)
@@ -113,6 +114,25 @@ def by_head(heads: Int[Tensor, "N"]) -> Int[Tensor, "N"]:
     if heads.device.type != "cpu":  # one launch; a sort takes longer on a CPU
         return torch.sort(heads.to(torch.int16), stable=True).indices
     return torch.cat([(heads == k).nonzero()[:, 0] for k in range(int(heads.max()) + 1)])
+
+
+def individual_rays(
+    bundle: RayBundle, plan: ScenePlan, rays_per_mpi: Literal["split", "all"], g: torch.Generator
+) -> tuple[RayBundle, Bool[Tensor, "R H"] | None, Float[Tensor, "R K"] | None]:
+    """Gives each ray to one MPI of those it meets, or to every MPI in turn; the cube joins each.
+
+    Returns:
+        The rays, (all) the heads that each may meet, and (split) priorities of the MPIs.
+    """
+    num_mpis, device = len(plan.mpis), bundle.origins.device
+    if num_mpis == 1:
+        return bundle, None, None
+    if rays_per_mpi == "split":
+        return bundle, None, torch.rand(len(bundle), num_mpis, generator=g, device=device)
+    own = torch.arange(num_mpis, device=device).repeat_interleave(len(bundle))
+    mask = torch.arange(plan.num_heads, device=device) == own[:, None]
+    mask[:, num_mpis:] = True
+    return repeat_rays(bundle, num_mpis), mask, None
 
 
 def repeat_rays(bundle: RayBundle, times: int) -> RayBundle:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import time
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -18,9 +19,10 @@ from torch.optim.lr_scheduler import LambdaLR
 
 from mmpi_ns.checks import brief
 from mmpi_ns.files import write_atomically
+from mmpi_ns.forecast import Forecast, describe, training_bytes
+from mmpi_ns.mmpi_datamanager import MMPIDataManager
 from mmpi_ns.mmpi_model import MMPIModel
 from mmpi_ns.phases import Schedule
-from mmpi_ns.placement.plan import ScenePlan
 from mmpi_ns.windows import WindowedPlan
 
 PLAN_FILE = "plan.json"
@@ -66,6 +68,8 @@ class MMPITrainer(Trainer):
     """Trainer with phases, exact resume and atomic checkpoints."""
 
     config: MMPITrainerConfig
+    _forecast: Forecast | None = None
+    _last_step_ended: float | None = None
 
     @property
     def _model(self) -> MMPIModel:
@@ -88,12 +92,26 @@ class MMPITrainer(Trainer):
         plan = self._model.windows
         self.base_dir.mkdir(parents=True, exist_ok=True)
         write_atomically(self.base_dir / PLAN_FILE, lambda path: path.write_text(plan.to_json(), encoding="utf-8"))
-        CONSOLE.print(_describe(plan, self._window_steps))
+        CONSOLE.print(describe(plan, self._window_steps, *self._expected_memory()))
         if 1 < self._processes and len(plan) < self._processes:
             raise ValueError(
                 f"The capture has {len(plan)} window(s), too few to share out among {self._processes} processes: start "
                 "fewer, or make windows shorter with --pipeline.model.placement.window-length."
             )
+
+    def _expected_memory(self) -> tuple[list[int], list[int]]:
+        """Bytes that the training of each window holds: of tables with their moments, and of pixels."""
+        model, manager = self._model, self.pipeline.datamanager
+        blends = any(phase.name == "blend" for phase in model.schedule.phases)
+        tables = [
+            training_bytes(plan, model.views_of(w), model.config.feature_channels, blends)
+            for w, plan in enumerate(model.windows.plans)
+        ]
+        assert isinstance(manager, MMPIDataManager), "MMPITrainer trains from MMPIDataManager"
+        if len(tables) == 1:
+            return tables, [manager.pixel_bytes()]
+        centers = manager.observations.centers
+        return tables, [manager.pixel_bytes(model.cameras_of(centers, w)) for w in range(len(tables))]
 
     def setup_optimizers(self) -> Optimizers:
         """nerfstudio's optimisers, with schedulers that know the phases."""
@@ -115,10 +133,15 @@ class MMPITrainer(Trainer):
 
     def train(self) -> None:
         """Runs up to max-num-iterations in all (a window); 1.1.5 would run as many again after a resume."""
+        self._last_step_ended = None
         if self._processes > 1:
-            for window in range(self._process, len(self._model.windows), self._processes):
+            own = range(self._process, len(self._model.windows), self._processes)
+            left, length = [w for w in own if not self._is_finished(w)], self._window_steps
+            self._forecast = Forecast(self._model.schedule, [range(w * length, (w + 1) * length) for w in left])
+            for window in left:
                 self._train_window(window)
             return
+        self._forecast = Forecast(self._model.schedule, [range(self._start_step, self._total_steps)])
         self._last_step = self._start_step - 1
         self.config.max_num_iterations = max(0, self._total_steps - self._start_step)
         if self.config.max_num_iterations == 0:
@@ -131,17 +154,29 @@ class MMPITrainer(Trainer):
         finally:
             self.config.max_num_iterations = self._window_steps
 
-    def _train_window(self, window: int) -> None:
-        """Trains one window of several, from where another run left it; nothing where it is finished."""
-        store, first = self._model.store, window * self._window_steps
+    def _checkpoints_of(self, window: int) -> dict[int, Path]:
+        """Checkpoints of one window of several, here and in the run that this one goes on from."""
+        steps = range(window * self._window_steps, (window + 1) * self._window_steps)
         folders = [self.checkpoint_dir, *([self._resumes_from] if self._resumes_from else [])]
-        if len(folders) > 1:
-            store.adopt(folders[1].parent / WINDOWS_FOLDER, {window: self._model.windows.plans[window]})
-        last = len(self._model.windows) - 1
-        known = {s: p for f in folders for s, p in checkpoints_in(f).items() if 0 <= s - first < self._window_steps}
-        if store.path(window).is_file() and (window != last or first + self._window_steps - 1 in known):
+        return {step: path for folder in folders for step, path in checkpoints_in(folder, steps).items()}
+
+    def _is_finished(self, window: int) -> bool:
+        """Whether a window of several need not be trained; takes over its file where another run finished it."""
+        store = self._model.store
+        if self._resumes_from:
+            store.adopt(self._resumes_from.parent / WINDOWS_FOLDER, {window: self._model.windows.plans[window]})
+        # Of the last window the checkpoint is needed too: evaluation begins there.
+        is_last = window == len(self._model.windows) - 1
+        finished = store.path(window).is_file() and (
+            not is_last or (window + 1) * self._window_steps - 1 in self._checkpoints_of(window)
+        )
+        if finished:
             CONSOLE.print(f"Window {window} is finished already.")
-            return
+        return finished
+
+    def _train_window(self, window: int) -> None:
+        """Trains one window of several, from where another run left it."""
+        first, known = window * self._window_steps, self._checkpoints_of(window)
         self._start_step = first
         if known:
             self.config.load_checkpoint = known[max(known)]
@@ -153,7 +188,7 @@ class MMPITrainer(Trainer):
             super().train()
         finally:
             self.config.max_num_iterations = self._window_steps
-        if window != last:  # its file is all that is needed of it
+        if window != len(self._model.windows) - 1:  # its file is all that is needed of it
             for path in checkpoints_in(self.checkpoint_dir, range(first, first + self._window_steps)).values():
                 path.unlink()
 
@@ -161,6 +196,12 @@ class MMPITrainer(Trainer):
         """One step; remembers that it ran, and puts a window of several away when it was its last."""
         result = super().train_iteration(step)
         self._last_step = step
+        now = time.perf_counter()
+        if self._forecast is not None and self._last_step_ended is not None:
+            said = self._forecast.note(step, now - self._last_step_ended)
+            if said is not None:
+                CONSOLE.print(said)
+        self._last_step_ended = now
         model = self._model
         if len(model.windows) > 1 and (step + 1) % model.schedule.window_steps == 0:
             model.store.save(model.window, model.field)
@@ -275,31 +316,3 @@ def _read_checkpoint(path: Path) -> dict[str, Any]:
         raise ValueError(
             f"{path} cannot be read ({brief(error)}): resume from another one with --load-step."
         ) from error
-
-
-def _describe(windows: WindowedPlan, steps: int) -> str:
-    """What will be trained, and what it takes."""
-    if len(windows) == 1:
-        return "\n".join(_describe_plan(windows.plans[0]))
-    texels = [plan.texels for plan in windows.plans]
-    lines = [
-        f"A long capture: {len(windows)} windows of {steps} steps each, one after the other; {sum(texels) / 1e6:.1f} M "
-        f"texels on disk, at most {max(texels) / 1e6:.1f} M in training at a time."
-    ]
-    for i, window in enumerate(windows.windows):
-        lines.append(f"Window {i}, cameras within {window.radius:.3g} (and {window.margin:.3g} more to mix):")
-        lines += ["  " + line for line in _describe_plan(window.plan)]
-    return "\n".join(lines)
-
-
-def _describe_plan(plan: ScenePlan) -> list[str]:
-    lines = [f"Scene plan ({plan.origin_of_plan}): {len(plan.mpis)} MPIs, {plan.texels / 1e6:.1f} M texels"]
-    for m in plan.mpis:
-        tangents = " ".join(f"{t:.2f}" for t in m.extent)
-        lines.append(
-            f"  {m.name}: {m.planes} planes of {m.height} x {m.width}, "
-            f"depths {m.near:.3g} to {m.far:.3g}, tangents {tangents}"
-        )
-    if plan.cube is not None:
-        lines.append(f"  cube: {' x '.join(str(n) for n in plan.cube.shape)} voxels")
-    return lines

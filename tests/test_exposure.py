@@ -167,7 +167,7 @@ def test_each_window_has_a_gauge_of_its_own_and_begins_anew(scene, tmp_path):
     for window in (0, 1):
         state = load(trainer.checkpoint_dir, 6 * window + 5)
         moved = state["pipeline"]["_model.exposure.settings"].flatten(1).any(-1)
-        own = trainer.pipeline.model._cameras_of(observations.centers, window)
+        own = trainer.pipeline.model.cameras_of(observations.centers, window)
         assert moved.nonzero()[:, 0].tolist() == own.tolist() and 0 < len(own) < len(TRAIN)
         assert state["optimizers"]["exposure"]["state"][0]["step"] == 6
 
