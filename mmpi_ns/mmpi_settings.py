@@ -36,8 +36,9 @@ class MMPIModelConfig(ModelConfig):
     """A scene plan (JSON) to use instead of the placement rule."""
     windows_folder: Path | None = None
     """Set by the trainer: where the finished windows of a long capture lie."""
-    resident_windows: int = 2
-    """Windows of a long capture that rendering holds in memory at once."""
+    resident_gib: float = 2.0
+    """Device memory that rendering may take for the windows of a long capture, GiB, beside the one trained last: as
+    many are held as fit, at least one; the one not used for longest goes first."""
     training: Training = "joint"
     """Each MPI alone, then reliability (two-phase), or all together without reliability (joint)."""
     total_steps: int = 1

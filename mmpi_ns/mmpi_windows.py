@@ -22,12 +22,13 @@ class WindowStore:
 
     Args:
         folder: where the files lie; None where there is one window alone.
-        resident: windows held in memory at once to render.
+        budget: bytes that windows held to render may take. The one that is rendered is held whatever it takes.
     """
 
-    def __init__(self, folder: Path | None, resident: int) -> None:
-        self.folder, self.resident = folder, max(1, resident)
+    def __init__(self, folder: Path | None, budget: float) -> None:
+        self.folder, self.budget = folder, budget
         self._fields: dict[int, MMPIField] = {}
+        """Those that are held, the one used last at the end."""
 
     def path(self, window: int) -> Path:
         assert self.folder is not None, "several windows need a folder"
@@ -60,7 +61,7 @@ class WindowStore:
             ValueError: the file is missing or damaged (says which, and what to do).
         """
         if window in self._fields:
-            self._fields[window] = self._fields.pop(window)  # newest last
+            self._fields[window] = self._fields.pop(window)
             return self._fields[window]
         path = self.path(window)
         if not path.is_file():
@@ -68,8 +69,9 @@ class WindowStore:
                 f"Window {window} of this run is missing: {path} is not there. Put the run's folder 'windows' back, or "
                 "name where it is in config.yml (pipeline.model.windows_folder)."
             )
+        self._make_room(path.stat().st_size)  # a file holds the tables and little else
         try:
-            state = torch.load(path, map_location="cpu", weights_only=True)
+            state = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
             field = empty()
             field.load_state_dict(state["field"])
         except (OSError, RuntimeError, EOFError, KeyError, TypeError, pickle.UnpicklingError) as error:
@@ -77,10 +79,13 @@ class WindowStore:
                 f"Window {window} of this run is damaged: {path} cannot be read ({brief(error)}). Copy it anew, or "
                 "train it again: resume from a checkpoint of before its end with --load-step."
             ) from error
-        while len(self._fields) >= self.resident:
-            del self._fields[next(iter(self._fields))]
         self._fields[window] = field.to(device).eval()
         return self._fields[window]
+
+    def _make_room(self, needed: int) -> None:
+        """Lets windows go, the one that was not used for longest first, until ``needed`` bytes fit the budget too."""
+        while self._fields and needed + sum(map(_bytes_of, self._fields.values())) > self.budget:
+            del self._fields[next(iter(self._fields))]
 
     def adopt(self, other: Path, plans: dict[int, ScenePlan], needed: bool = False) -> None:
         """Takes over finished windows of the run that this one goes on from.
@@ -106,6 +111,10 @@ class WindowStore:
                     f"Window {window} of the run to go on from is missing: {source} is not there. Put it back, or "
                     "resume from a checkpoint of before its end with --load-step."
                 )
+
+
+def _bytes_of(field: MMPIField) -> int:
+    return sum(values.nbytes for values in field.state_dict().values())
 
 
 def _check_plan(source: Path, plan: ScenePlan) -> None:

@@ -185,7 +185,7 @@ def test_resuming_without_the_finished_windows_is_refused_in_one_sentence(whole,
 
 
 def test_a_window_of_another_plan_or_a_damaged_one_is_not_taken_over(whole, tmp_path):
-    model, store = whole.pipeline.model, WindowStore(tmp_path / "mine", resident=1)
+    model, store = whole.pipeline.model, WindowStore(tmp_path / "mine", budget=0)
     ours, theirs = model.windows.plans
     with pytest.raises(ValueError, match="another scene plan"):
         store.adopt(model.store.path(0).parent, {0: theirs})
@@ -236,14 +236,37 @@ def test_a_full_disk_at_a_windows_end_keeps_the_checkpoint(scene, windows_file, 
     assert load(trainer.checkpoint_dir, STEPS - 2)["step"] == STEPS - 2
 
 
-def test_no_more_windows_are_in_memory_than_asked(whole):
+@pytest.mark.parametrize(
+    "room, held",
+    [
+        (0.0, [[0], [1], [0], [2], [1], [1]]),
+        (2.5, [[0], [0, 1], [1, 0], [0, 2], [2, 1], [2, 1]]),
+        (9.0, [[0], [0, 1], [1, 0], [1, 0, 2], [0, 2, 1], [0, 2, 1]]),
+    ],
+)
+def test_as_many_windows_are_held_as_fit_the_budget(whole, tmp_path, room, held):
+    """Windows of one size; ``room`` is for so many of them. The one that was not used for longest goes first."""
     model = whole.pipeline.model
-    store = WindowStore(model.store.folder, resident=1)
-    for number in (0, 1, 0):
-        if number == 1:
-            store.save(1, model.field)
-        store.load(number, model._new_field, model.device)
-        assert list(store._fields) == [number]
+    size = model.store.path(1).stat().st_size
+    store = WindowStore(tmp_path, budget=room * size)
+    for number in range(3):
+        store.save(number, model.field)
+    for number, expected in zip((0, 1, 0, 2, 1, 1), held, strict=True):
+        field = store.load(number, model._new_field, model.device)
+        assert torch.equal(field.density, model.field.density) and list(store._fields) == expected
+        taken = sum(t.numel() * t.element_size() for f in store._fields.values() for t in f.state_dict().values())
+        assert len(store._fields) == 1 or taken <= room * size
+
+
+def test_a_config_from_when_windows_were_counted_goes_on_working(whole, tmp_path):
+    text = (whole.base_dir / "config.yml").read_text()
+    old = text.replace("resident_gib: 2.0", "resident_windows: 2")
+    assert old != text
+    (tmp_path / "config.yml").write_text(old)
+    _, pipeline, _, _ = eval_setup(tmp_path / "config.yml", test_mode="inference")
+    assert pipeline.model.store.budget == 2 * 2**30
+    origins = torch.stack([torch.tensor(w.center).float() for w in whole.pipeline.model.windows.windows])
+    assert torch.equal(rendered(pipeline.model, origins)["rgb"], rendered(whole.pipeline.model, origins)["rgb"])
 
 
 # Several processes ---------------------------------------------------------------------------------------------------
