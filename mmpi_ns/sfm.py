@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from threading import current_thread, main_thread
+from types import ModuleType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -50,13 +53,24 @@ def find_sfm_model(path: Path) -> SfmModel | None:
     """
     if not (path / "images.bin").is_file() and not (path / "images.txt").is_file():
         return None
-    import pycolmap  # slow to import, and only scenes with a model need it
-
     try:
-        model = pycolmap.Reconstruction(str(path))
+        model = load_pycolmap().Reconstruction(str(path))
     except (ValueError, RuntimeError, OSError) as error:
         raise ValueError(f"The COLMAP model in {path} cannot be read ({error}): repair or remove it.") from error
     return read_reconstruction(model)
+
+
+def load_pycolmap() -> ModuleType:
+    """pycolmap, which is slow to import, with SIGTERM left as it was.
+
+    It installs glog's handler, which prints a stack trace and may wait for ever, instead of whatever was there.
+    """
+    handler = signal.getsignal(signal.SIGTERM)
+    import pycolmap
+
+    if handler is not None and current_thread() is main_thread():
+        signal.signal(signal.SIGTERM, handler)
+    return pycolmap
 
 
 def read_reconstruction(model: pycolmap.Reconstruction, min_track: int = MIN_TRACK) -> SfmModel:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mmpi_ns.sfm import SfmModel, read_reconstruction
+from mmpi_ns.sfm import SfmModel, load_pycolmap, read_reconstruction
 
 NEIGHBOURS = 16
 """Images that each image is matched with at most: the nearest that look roughly the same way."""
@@ -103,8 +103,7 @@ def triangulate(images: PosedImages) -> SfmModel:
     Raises:
         ValueError: an image file cannot be read.
     """
-    import pycolmap  # slow to import, and only scenes without a model need it
-
+    pycolmap = load_pycolmap()
     level = pycolmap.logging.minloglevel
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.ERROR)
     try:

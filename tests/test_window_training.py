@@ -338,6 +338,21 @@ def test_more_processes_than_windows_are_refused(scene, windows_file, tmp_path):
         trainer.setup()
 
 
+def test_reading_a_colmap_model_leaves_the_answer_to_sigterm_as_it_was(scene):
+    """torchrun ends the other processes by SIGTERM; pycolmap brings a handler of its own, which hides what we say."""
+    code = (
+        "import os, signal, sys\n"
+        "from pathlib import Path\n"
+        "signal.signal(signal.SIGTERM, lambda *_: sys.exit('ours'))\n"
+        "from mmpi_ns.sfm import find_sfm_model\n"
+        "assert find_sfm_model(Path(sys.argv[1])) is not None\n"
+        "os.kill(os.getpid(), signal.SIGTERM)\n"
+    )
+    command = [sys.executable, "-c", code, str(scene / "colmap" / "sparse" / "0")]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=100)
+    assert (done.returncode, done.stderr) == (1, "ours\n")
+
+
 def test_a_process_that_is_killed_ends_the_run_and_leaves_what_is_finished(scene, windows_file, tmp_path, monkeypatch):
     """The second process dies in its first step; the first window is whole, or can be trained again."""
     code = tmp_path / "code"
@@ -351,6 +366,7 @@ def test_a_process_that_is_killed_ends_the_run_and_leaves_what_is_finished(scene
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(code), os.environ.get("PYTHONPATH", "")]))
     status, said = torchrun(scene, windows_file, tmp_path / "out", 2)
     assert status != 0 and "SIGKILL" in said, said[-3000:]
+    assert "Ended early: another process died" in said and "--load-dir" in said, said[-3000:]
     monkeypatch.undo()
     run = tmp_path / "out" / "tiny" / "mmpi-small" / "run"
     status, said = torchrun(scene, windows_file, tmp_path / "again", 2, "--load-dir", str(run / "nerfstudio_models"))
