@@ -80,7 +80,6 @@ SUITES: dict[str, list[Variant]] = {
     "object": [  # mmpi-scene object: cameras all round it
         Variant("MPIs placed automatically", (), steps=750),
         Variant("... and a cube where placement finds it worth it", (P + "max-voxels", "128"), steps=750),
-        Variant("... a coarser cube", (P + "max-voxels", "64"), steps=750),
     ],
     "kitti-street-budgets": _budgets(0.5, 1.0, 2.0, 4.0, 8.0),
     "room-walk-budgets": _budgets(0.5, 1.0, 2.0, 4.0, 8.0),
