@@ -130,9 +130,14 @@ def render_colors(composite: Composite, colors: Float[Tensor, "R S 3"]) -> Float
     The mass of dropped samples is given the mean colour of those kept (a constant factor per ray), so that dropping
     does not darken the image.
     """
+    return fill_up(composite, (composite.weights[..., None] * colors).sum(-2))
+
+
+def fill_up(composite: Composite, gathered: Float[Tensor, "R 3"]) -> Float[Tensor, "R 3"]:
+    """What the samples that were kept have gathered, for all that there are."""
     kept = composite.weights.sum(-1, keepdim=True)
     factor = torch.where(kept > 1e-6, composite.accumulation / kept.clamp(min=1e-6), torch.ones_like(kept))
-    return factor.detach() * (composite.weights[..., None] * colors).sum(-2)
+    return factor.detach() * gathered
 
 
 def median_inverse_distance(

@@ -21,7 +21,7 @@ from mmpi_ns.color_network import ColorNetworks
 from mmpi_ns.compositing import BlendForm, blend_shares, blended_optical_depth
 from mmpi_ns.mmpi_samples import Gathered, LocalRays, Lookup, Taps, by_head, head_spans, metadata_of
 from mmpi_ns.mmpi_tables import TexelTables, replace_data
-from mmpi_ns.ops import native
+from mmpi_ns.ops import hits, native
 from mmpi_ns.ops.colors import colors
 from mmpi_ns.ops.interpolate import bilinear_rows, gather_rows, index_rows, interpolate, interpolate_gathered
 from mmpi_ns.ops.march import MarchScene, SceneTables
@@ -167,13 +167,16 @@ class MMPIField(TexelTables):
         return self._cached("march", make).with_tables(self.density.data, self.reliability.data, self.touched)
 
     def plane_hits(self, origins: Tensor, directions: Tensor, nears: Tensor, fars: Tensor) -> geometry.PlaneHits:
-        """``geometry.plane_hits`` in the field's MPIs; on a GPU in one launch."""
-        if native.takes_triton(origins, self.density):
-            from mmpi_ns.ops import triton_hits
+        """``geometry.plane_hits`` in the field's MPIs, compiled where it can be; on a GPU in one launch."""
+        lib, on_gpu = native.library(origins, self.density), native.takes_triton(origins, self.density)
+        if lib is None and not on_gpu:
+            return geometry.plane_hits(origins, directions, nears, fars, self.frames)
+        frames = self._cached("hit frames", lambda: hits.pack_frames(self.frames))
+        if lib is not None:
+            return hits.plane_hits(lib, origins, directions, nears, fars, frames)
+        from mmpi_ns.ops import triton_hits
 
-            frames = self._cached("hit frames", lambda: triton_hits.pack_frames(self.frames))
-            return triton_hits.plane_hits(origins, directions, nears, fars, frames)
-        return geometry.plane_hits(origins, directions, nears, fars, self.frames)
+        return triton_hits.plane_hits(origins, directions, nears, fars, frames)
 
     def triton_scene(self) -> tuple[Any, tuple[Tensor, Tensor, Tensor]]:
         """The field as the Triton kernels read it: a ``TritonScene``, and density, reliability and touched texels."""
@@ -266,7 +269,7 @@ class MMPIField(TexelTables):
             each = flat.split([own.stop - own.start for _, own in lookup.spans])
             parts = zip(each, lookup.spans, strict=True)
             tau = torch.cat([self._head_tau(k, part, lookup.planes[own]) for part, (k, own) in parts])
-            out = out.index_put((lookup.index,), tau)
+            out = out.index_copy(0, lookup.index, tau)
         return out.view(*lookup.shape, 1), lookup
 
     def _head_tau(self, k: int, raw: Tensor, planes: Tensor) -> Tensor:
@@ -276,8 +279,8 @@ class MMPIField(TexelTables):
         meta = metadata_of(ray_samples)
         index = meta["valid"].reshape(-1).nonzero()[:, 0]
         index = index[by_head(meta["heads"].reshape(-1)[index])]
-        heads, planes = meta["heads"].reshape(-1)[index], meta["planes"].reshape(-1)[index]
-        ndc = meta["ndc"].reshape(-1, 3)[index]
+        heads, planes = (meta[name].reshape(-1).index_select(0, index) for name in ("heads", "planes"))
+        ndc = meta["ndc"].reshape(-1, 3).index_select(0, index)
         spans, num_mpis, groups = head_spans(heads, len(self.grids)), len(self.plan.mpis), []
         if in_mpis := [(k, own) for k, own in spans if k < num_mpis]:
             rows, weights = self._mpi_taps(in_mpis, heads, planes, ndc)
@@ -331,19 +334,20 @@ class MMPIField(TexelTables):
                 colors(self.networks, k, part, lookup.ndc[own], geometry.rotate(self._axes(k), directions), rays[own])
                 for part, (k, own) in zip(each, lookup.spans, strict=True)
             ]
-            out = out.index_put((lookup.index,), torch.cat(found))
+            out = out.index_copy(0, lookup.index, torch.cat(found))
         return {FieldHeadNames.RGB: out.view(*lookup.shape, 3)}
 
     def _shade(self, lib: ctypes.CDLL | None, ray_samples: RaySamples) -> Float[Tensor, "R S 3"]:
         meta, rays = metadata_of(ray_samples), ray_samples.frustums.directions[:, 0]
-        directions = torch.stack([geometry.rotate(self._axes(k), rays) for k in range(len(self.grids))])
+        axes = torch.stack([self._axes(k) for k in range(len(self.grids))])
         heads, planes, valid = (meta[name][..., 0] for name in ("heads", "planes", "valid"))
-        given = (self.features.data, self.networks, directions, heads, planes, meta["ndc"], valid)
+        samples = (heads, planes, meta["ndc"], valid)
         if lib is not None:
-            return shade(lib, self.march_scene(), *given)
+            return shade(lib, self.march_scene(), self.features.data, self.networks, axes, rays, *samples)
         from mmpi_ns.ops import triton_shade
 
-        return triton_shade.shade(self.triton_scene()[0], *given)
+        directions = geometry.rotate(axes[:, None], rays)
+        return triton_shade.shade(self.triton_scene()[0], self.features.data, self.networks, directions, *samples)
 
     def total_variation(self, lookup: Lookup, density_weight: float, feature_weight: float) -> Tensor:
         """Weighted total variation of the texels that the batch touched, in DVGO's normalisation (not yet per ray)."""

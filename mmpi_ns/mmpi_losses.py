@@ -10,11 +10,12 @@ from nerfstudio.cameras.rays import RayBundle, RaySamples
 from torch import Tensor
 
 from mmpi_ns import losses
-from mmpi_ns.compositing import Composite, render_colors
+from mmpi_ns.compositing import Composite
 from mmpi_ns.mmpi_datamanager import KEYPOINT_DEPTH
 from mmpi_ns.mmpi_field import MMPIField
 from mmpi_ns.mmpi_sampler import MergeReport
 from mmpi_ns.mmpi_samples import Lookup, metadata_of
+from mmpi_ns.ops.composite import render_colors
 
 
 @dataclass
@@ -65,7 +66,7 @@ class TrainingRays:
         # Where MPIs that train apart see a ray only in part, what they let through is not theirs to explain.
         explained = self.report.explained[pixels]
         background = random if image.shape[-1] == 4 else torch.where(explained, random, observed)
-        composite, colors = self._pixel_composite(pixels), self.colors[pixels]
+        composite, colors = self._pixel_composite(pixels), self.colors.index_select(0, pixels)
         rgb = render_colors(composite, colors) + composite.transmittance * background
         total = {
             "rgb_loss": losses.photometric(rgb, observed),
@@ -83,10 +84,10 @@ class TrainingRays:
 
     def _pixel_composite(self, pixels: Tensor) -> Composite:
         c = self.composite
-        return Composite(c.weights[pixels], c.accumulation[pixels], c.transmittance[pixels])
+        return Composite(*(x.index_select(0, pixels) for x in (c.weights, c.accumulation, c.transmittance)))
 
     def _distortion(self, pixels: Tensor, composite: Composite, scale: float) -> Tensor:
-        inverse_t = metadata_of(self.samples)["inverse_t"][..., 0][pixels]
+        inverse_t = metadata_of(self.samples)["inverse_t"][..., 0].index_select(0, pixels)
         positions = 1 / (1 + inverse_t * scale)
         intervals = (1 / self.report.live[pixels].clamp(min=1))[:, None].to(positions.dtype)
         return losses.distortion(composite.weights, positions, intervals.expand_as(positions))
@@ -94,10 +95,10 @@ class TrainingRays:
     def _keypoint_depth(self, chosen: Tensor, known: Tensor) -> Tensor:
         meta = metadata_of(self.samples)
         return losses.keypoint_depth(
-            self.composite.weights[chosen],
-            meta["inverse_t"][..., 0][chosen],
+            self.composite.weights.index_select(0, chosen),
+            meta["inverse_t"][..., 0].index_select(0, chosen),
             known[chosen],
-            meta["valid"][..., 0][chosen],
+            meta["valid"][..., 0].index_select(0, chosen),
         )
 
 

@@ -26,8 +26,6 @@ from mmpi_ns.compositing import (
     BlendForm,
     Composite,
     blended_optical_depth,
-    median_inverse_distance,
-    render_colors,
 )
 from mmpi_ns.exposure import Exposure, departure
 from mmpi_ns.files import to_bytes, to_text
@@ -40,7 +38,7 @@ from mmpi_ns.mmpi_samples import Lookup, individual_rays, metadata_of
 from mmpi_ns.mmpi_settings import MMPIModelConfig
 from mmpi_ns.mmpi_windows import WindowStore, mix_windows
 from mmpi_ns.ops import native
-from mmpi_ns.ops.composite import composite_weights
+from mmpi_ns.ops.composite import composite_weights, median_inverse_distance, render_colors, winning_heads
 from mmpi_ns.phases import TRAINS, Schedule
 from mmpi_ns.placement.split import cameras_in, place_windows
 from mmpi_ns.random_draws import generator
@@ -319,9 +317,8 @@ class MMPIModel(Model):
         }
         if not self.training:
             heads = metadata_of(samples)["heads"][..., 0]
-            mass = rgb.new_zeros(rgb.shape[0], self.field.plan.num_heads).scatter_add(1, heads, composite.weights)
             outputs["rgb"] = outputs["rgb"].clamp(0, 1)
-            outputs["winning_mpi"] = mass.argmax(-1, keepdim=True).to(rgb.dtype)
+            outputs["winning_mpi"] = winning_heads(composite.weights, heads, self.field.plan.num_heads)
             outputs["dropped_mass"] = report.dropped_mass
         return outputs
 

@@ -67,10 +67,11 @@ class Lookup:
         groups, start = [], 0
         for taps, stop in zip(self.groups, bounds.tolist(), strict=True):
             own = wanted[start:stop] - taps.samples.start
-            position = None if taps.position is None else taps.position[own]
-            groups.append(Taps(slice(start, stop), taps.rows[own], taps.weights[own], position))
+            position = None if taps.position is None else taps.position.index_select(0, own)
+            rows, weights = taps.rows.index_select(0, own), taps.weights.index_select(0, own)
+            groups.append(Taps(slice(start, stop), rows, weights, position))
             start = stop
-        samples = (self.index[wanted], heads, self.planes[wanted], self.ndc[wanted])
+        samples = (self.index[wanted], heads, self.planes[wanted], self.ndc.index_select(0, wanted))
         last = self.spans[-1][0] if self.spans else 0
         return Lookup(self.shape, *samples, head_spans(heads, last + 1), groups, self.gathered)
 

@@ -202,6 +202,14 @@ def test_colours_say_where_a_feature_is_not_a_number():
     assert to_features[7].isnan().all() and to_features.isnan().sum() == 9 and to_weights[1].isnan().any()
 
 
+def test_colours_and_gradients_stay_float32_under_autocast():
+    batch = colour_batch(9, 32, (2, 2), 300)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        found = colours_and_gradients(colors, batch)
+    assert all(a.dtype == torch.float32 for a in found)
+    assert (found[0] - colours_and_gradients(colors, batch)[0]).abs().max() < 0.03
+
+
 def test_without_samples_colours_have_no_gradient():
     found = colours_and_gradients(colors, colour_batch(9, 32, (2, 2), 0))
     assert found[0].shape == (0, 3) and found[1].shape == (0, 9) and not found[2].any()

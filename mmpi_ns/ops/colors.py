@@ -105,6 +105,7 @@ def colors(
         return networks(head, features, ndc, directions, rays)
     w1, b1, *rest = networks.layers(head)
     split = features.shape[1] + 3 * (1 + 2 * networks.position_frequencies)
-    start = torch.addmm(b1, positional_encoding(directions, networks.direction_frequencies), w1[:, split:].T)
+    encoded = positional_encoding(directions, networks.direction_frequencies)
+    start = torch.addmm(b1, encoded, w1[:, split:].T).float()  # autocast would have it in half precision
     given = (lib, networks.position_frequencies, ndc, rays, features, start)
     return _Colors.apply(*given, w1[:, :split], *rest)  # type: ignore[no-any-return]

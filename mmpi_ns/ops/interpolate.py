@@ -149,12 +149,29 @@ def interpolate(
     return _Interpolate.apply(table, rows, weights.to(table.dtype))  # type: ignore[no-any-return]
 
 
+def _gathered(table: Tensor, rows: Tensor) -> Tensor:
+    lib = native.library(table) if table.ndim == 2 and table.is_contiguous() else None
+    if lib is None:
+        return table.index_select(0, rows)
+    values, rows = torch.empty(len(rows), table.shape[1]), rows.contiguous()
+
+    def gather(begin: int, end: int) -> None:
+        lib.mmpi_gather_rows(
+            native.address(rows, torch.int64),
+            *map(ctypes.c_int64, (begin, end, table.shape[1])),
+            *map(native.address, (table, values)),
+        )
+
+    native.in_parts(gather, len(rows), least=4096)
+    return values
+
+
 class _Gather(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, table: Tensor, rows: Tensor) -> Tensor:
         ctx.save_for_backward(rows)
         ctx.table_shape = table.shape
-        return table.index_select(0, rows)
+        return _gathered(table, rows)
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor, None]:

@@ -1,4 +1,4 @@
-"""The fast paths. On a CPU: kernels in ``cpp``, compiled by the machine's own C++ compiler at first use (2 seconds).
+"""The fast paths. On a CPU: kernels in ``cpp``, compiled by the machine's own C++ compiler at first use (4 seconds).
 On a GPU: Triton kernels in ``triton_*.py``, compiled by Triton, which comes with torch on Linux.
 
 Which path runs is one setting of the process, ``choose``: ``auto`` takes the kernels where they can be had and says so

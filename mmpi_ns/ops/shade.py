@@ -8,16 +8,20 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from mmpi_ns.color_network import ColorNetworks, positional_encoding
+from mmpi_ns.color_network import ColorNetworks
 from mmpi_ns.ops import native
 from mmpi_ns.ops.colors import Network
 from mmpi_ns.ops.march import SceneTables
 
 
 class _Shading(ctypes.Structure):
-    _fields_ = [(n, ctypes.c_void_p) for n in ("features", "start", "heads", "planes", "ndc", "valid")] + [
-        (n, ctypes.c_int64) for n in ("rows", "num_rays", "slots")
+    _fields_ = [(n, ctypes.c_void_p) for n in ("features", "directions", "heads", "planes", "ndc", "valid")] + [
+        (n, ctypes.c_int64) for n in ("rows", "slots")
     ]
+
+
+class _Start(ctypes.Structure):
+    _fields_ = [(n, ctypes.c_void_p) for n in ("axes", "weights", "bias")] + [("frequencies", ctypes.c_int64)]
 
 
 def shade(
@@ -25,7 +29,8 @@ def shade(
     scene: SceneTables,
     features: Float[Tensor, "T C"],
     networks: ColorNetworks,
-    directions: Float[Tensor, "H R 3"],
+    axes: Float[Tensor, "H 3 3"],
+    directions: Float[Tensor, "R 3"],
     heads: Int[Tensor, "R S"],
     planes: Int[Tensor, "R S"],
     ndc: Float[Tensor, "R S 3"],
@@ -38,29 +43,28 @@ def shade(
         scene: the plan with its tables.
         features: colour features of all texels.
         networks: the colour networks.
-        directions: of each ray, in each head's axes.
+        axes: of each head, as rows.
+        directions: of each ray, world axes.
         heads: head of each sample.
         planes: its plane.
         ndc: its position in the head.
         valid: which slots hold a sample.
     """
     num_rays, slots = valid.shape
-    channels, num_heads = features.shape[1], directions.shape[0]
+    channels, axes = features.shape[1], axes.contiguous()
     split = channels + 3 * (1 + 2 * networks.position_frequencies)
-    start = torch.empty(num_heads, num_rays, networks.width)
-    held, parts = [], []
-    for k in range(num_heads):
+    held, nets, starts = [], [], []
+    for k in range(len(axes)):
         w1, b1, w2, b2, w3, b3 = networks.layers(k)
-        encoded = positional_encoding(directions[k], networks.direction_frequencies)
-        torch.addmm(b1, encoded, w1[:, split:].T, out=start[k])
-        held.append([w1[:, :split].contiguous(), w2.contiguous(), b2, w3.contiguous(), b3])
+        own = [w1[:, :split].contiguous(), w2.contiguous(), b2, w3.contiguous(), b3]
+        first = (axes[k], w1[:, split:].contiguous(), b1)
         sizes = (channels, networks.position_frequencies, networks.width)
-        parts.append(Network(*sizes, *(native.address(x) for x in held[-1])))
-    slots_held = [heads.contiguous(), planes.contiguous(), ndc.contiguous(), valid.contiguous()]
-    shading = _Shading(
-        *(native.address(x, x.dtype) for x in (features, start, *slots_held)), len(features), num_rays, slots
-    )
-    table = (Network * num_heads)(*parts)
+        nets.append(Network(*sizes, *(native.address(x) for x in own)))
+        starts.append(_Start(*(native.address(x) for x in first), networks.direction_frequencies))
+        held.append((own, first))
+    parts = [x.contiguous() for x in (features, directions, heads, planes, ndc, valid)]
+    shading = _Shading(*(native.address(x, x.dtype) for x in parts), len(features), slots)
+    table, rays = (Network * len(nets))(*nets), (_Start * len(starts))(*starts)
     colors = torch.empty(num_rays, slots, 3)
 
     def part(begin: int, end: int) -> None:
@@ -68,6 +72,7 @@ def shade(
             ctypes.byref(scene),
             ctypes.byref(shading),
             table,
+            rays,
             *map(ctypes.c_int64, (begin, end)),
             native.address(colors),
         )

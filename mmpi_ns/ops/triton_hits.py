@@ -10,11 +10,11 @@ import triton.language as tl
 from jaxtyping import Float
 from torch import Tensor
 
-from mmpi_ns.geometry import FACING_EPS, Frames, PlaneHits
+from mmpi_ns.geometry import FACING_EPS, PlaneHits
 from mmpi_ns.ops.triton_scene import block_size
 
 EPS = tl.constexpr(FACING_EPS)
-# Columns of an MPI's frame.
+# Columns of an MPI's frame (ops.hits.pack_frames).
 ORIGIN = tl.constexpr(0)
 AXES = tl.constexpr(3)
 EXTENT = tl.constexpr(12)
@@ -24,14 +24,6 @@ LAST = tl.constexpr(18)
 FLOATS = tl.constexpr(19)
 PAIRS = 128
 """Rays times MPIs of a program."""
-
-
-def pack_frames(frames: Frames) -> Float[Tensor, "K 19"]:
-    """Frames as the kernel reads them: origin, axes, extent, disparity step, last disparity, last plane."""
-    last = (frames.num_planes - 1).to(frames.nears.dtype)
-    columns = (frames.disparity_steps, frames.last_disparities, last)
-    parts = (frames.origins, frames.axes.flatten(1), frames.extents, torch.stack(columns, -1))
-    return torch.cat(parts, -1).float().contiguous()
 
 
 @triton.jit

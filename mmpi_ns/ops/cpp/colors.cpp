@@ -83,7 +83,10 @@ void go_back(const Layers& layers, Block& block, int64_t size, Gradients& g) {
     clear(block.second, ROWS); // what it held is no longer needed
     multiply(g.hidden.numbers, units, 1, g.back_second, width, block.second, size, units);
     gate(block.second, block.hidden, size, units);
-    multiply(block.x.numbers, 1, block.x.stride, block.second, size, g.first, layers.inputs, units);
+    const int64_t channels = layers.net.channels;
+    multiply(block.x.numbers, 1, block.x.stride, block.second, size, g.first, channels, units);
+    const Matrix rest{g.first.row(channels), units};
+    multiply(block.encoded.numbers, ROWS, 1, block.second, size, rest, layers.inputs - channels, units);
     clear(g.down, ROWS);
     multiply(block.second.numbers, units, 1, g.back_features, width, g.down, size, g.features);
     for (int64_t i = 0; i < size; i++)
@@ -116,7 +119,7 @@ extern "C" {
 // Colours [N, 3] of samples [begin, end).
 void mmpi_colors(const Network* net, const Samples* samples, int64_t begin, int64_t end, float* colors) {
     const Layers layers(*net);
-    Block block(layers.inputs, layers.units);
+    Block block(layers);
     for (int64_t first = begin; first < end; first += ROWS) {
         const int64_t size = std::min<int64_t>(ROWS, end - first);
         take(*samples, *net, first, size, block);
@@ -133,7 +136,7 @@ void mmpi_colors_back(const Network* net, const Samples* samples, const float* c
     const Layers layers(*net);
     const int64_t width = net->width, channels = net->channels;
     const int64_t numbers = width * layers.inputs + width * width + width + 3 * width + 3;
-    Block block(layers.inputs, layers.units);
+    Block block(layers);
     for (int64_t part = begin; part < end; part++) {
         Gradients g(layers);
         const int64_t stop = part_start(*samples, part + 1);

@@ -1,7 +1,6 @@
 // Rays through all heads at once: every head's samples come near to far, so the merge takes the nearest head at each
 // step, and a ray ends where nothing behind it can matter. The torch reference is in ops/march.py.
-#include "lanes.h"
-#include "scene.h"
+#include "places.h"
 
 #include <limits>
 #include <vector>
@@ -40,39 +39,6 @@ void finish(Run& run, float interval) {
     store(run.pass, exp_lanes(-tau));
 }
 
-// Lower texels and fractions of sixteen coordinates in [-1, 1] (as Cell).
-void cells(Lanes coordinate, int64_t size, IntLanes& lower, Lanes& fraction) {
-    const float last = float(size - 1);
-    const Lanes position = least(most((coordinate + 1.0f) * (0.5f * last), Lanes{}), splat(last));
-    lower = __builtin_convertvector(position, IntLanes); // towards zero, and positions are not negative
-    const IntLanes highest = int32_t(size - 2) - IntLanes{};
-    lower = lower < highest ? lower : highest;
-    fraction = position - __builtin_convertvector(lower, Lanes);
-}
-
-// Sixteen places on consecutive planes of an MPI, from `first` on.
-struct Places {
-    int32_t column[WIDTH], line[WIDTH], tile[WIDTH], texel[WIDTH], edge[WIDTH]; // edge: corners lie in several bricks
-    float fx[WIDTH], fy[WIDTH];
-
-    Places(const Grid& grid, Lanes x, Lanes y, int64_t first) {
-        IntLanes lower_x, lower_y;
-        Lanes fraction_x, fraction_y;
-        cells(x, grid.width, lower_x, fraction_x);
-        cells(y, grid.height, lower_y, fraction_y);
-        const IntLanes plane = __builtin_convertvector(IOTA, IntLanes) + int32_t(first);
-        const IntLanes in_x = lower_x & 7, in_y = lower_y & 7;
-        store(column, lower_x), store(line, lower_y);
-        store(tile, (plane * int32_t(grid.down) + (lower_y >> 3)) * int32_t(grid.across) + (lower_x >> 3));
-        store(texel, (in_y << 3) + in_x);
-        store(edge, (in_x == 7) | (in_y == 7));
-        store(fx, fraction_x), store(fy, fraction_y);
-    }
-
-    static void store(int32_t* to, IntLanes x) { __builtin_memcpy(to, &x, sizeof x); }
-    static void store(float* to, Lanes x) { ::store(to, x); }
-};
-
 // The next samples of an MPI. Where nothing is stored there is nothing to see: with `skips` such samples are left out.
 void fill_mpi(Run& run, const Scene& scene, const Rays& rays, int64_t ray, int64_t k, bool skips) {
     const Mpi& mpi = scene.mpis[k];
@@ -91,7 +57,7 @@ void fill_mpi(Run& run, const Scene& scene, const Rays& rays, int64_t ray, int64
         float ndc[3][WIDTH], inverse_t[WIDTH];
         store(ndc[0], x), store(ndc[1], y), store(ndc[2], 1.0f - mpi.s_scale * (w - mpi.end));
         store(inverse_t, w * dz / (1.0f - w * oz));
-        const Places at(grid, x, y, first);
+        const Places at(grid, x, y, __builtin_convertvector(IOTA, IntLanes) + int32_t(first));
         for (int j = 0; j < count; j++) {
             float corners[4];
             if (!at.edge[j]) {
@@ -212,9 +178,10 @@ float blended(const Scene& scene, const Rays& rays, int64_t ray, int64_t own, fl
 
 extern "C" {
 
-// Marches rays [begin, end). What a ray keeps is written from `starts[ray]` on; how much, to `kept[ray]`.
+// Marches rays [begin, end). What they keep is written one ray behind the other, from `starts[begin]` on; where a ray's
+// samples begin, to `starts[ray]`; how many, to `kept[ray]`.
 // form: 0 no blending, 1 the paper's, 2 opacity-keeping.
-void mmpi_march(const Scene* scene, const Rays* rays, const int64_t* starts, int64_t begin, int64_t end,
+void mmpi_march(const Scene* scene, const Rays* rays, int64_t* starts, int64_t begin, int64_t end,
                 float threshold, float fair_share, int form, int64_t* kept, float* skipped_total, float* dropped_mass,
                 int32_t* heads, int32_t* planes, float* ndc, float* inverse_t, float* taus, float* skipped_before) {
     const int64_t H = scene->num_heads;
@@ -222,6 +189,7 @@ void mmpi_march(const Scene* scene, const Rays* rays, const int64_t* starts, int
     std::vector<int64_t> live(H);    // heads that have samples left,
     std::vector<float> nearest(H);   // and the inverse distance of the next one of each
     std::vector<float> votes;
+    int64_t out = begin < end ? starts[begin] : 0;
     for (int64_t ray = begin; ray < end; ray++) {
         int64_t total = 0, alive = 0;
         for (int64_t h = 0; h < H; h++) {
@@ -239,7 +207,7 @@ void mmpi_march(const Scene* scene, const Rays* rays, const int64_t* starts, int
         }
         const float bound = threshold > 0 ? std::min(fair_share / float(std::max<int64_t>(total, 1)), threshold) : -1;
         const float end_of_light = threshold > 0 ? std::min(bound, OPAQUE) : -1;
-        int64_t out = starts[ray];
+        starts[ray] = out;
         float light = 1, skipped = 0, dropped = 0;
         while (alive) {
             int64_t best = 0;

@@ -28,7 +28,7 @@ struct Matrix {
 
 // to[m] += sum_k a(m, k) b[k] for M rows of L lanes, a(m, k) being a[m * down + k * along].
 template <int M, int L>
-inline void multiply_tile(const float* a, int64_t down, int64_t along, Matrix b, int64_t depth, Matrix to) {
+__attribute__((always_inline)) inline void multiply_tile(const float* a, int64_t down, int64_t along, Matrix b, int64_t depth, Matrix to) {
     Lanes sums[M][L];
     for (int m = 0; m < M; m++)
         for (int l = 0; l < L; l++) sums[m][l] = load(to.row(m) + l * WIDTH);
@@ -76,12 +76,12 @@ struct Layers {
     Network net;
     int64_t inputs, units;
     Buffer first_buffer, second_buffer, third_buffer, bias_buffer;
-    Matrix first, second, third; // [inputs, units], [units, units], [units, WIDTH]
+    Matrix first, second, third; // [inputs, units], [units, units], [units, 4]
 
     explicit Layers(const Network& net)
         : net(net), inputs(net.channels + 3 * (1 + 2 * net.frequencies)), units(padded(net.width)),
-          first_buffer(inputs * units), second_buffer(units * units), third_buffer(units * WIDTH), bias_buffer(units),
-          first{first_buffer.data(), units}, second{second_buffer.data(), units}, third{third_buffer.data(), WIDTH} {
+          first_buffer(inputs * units), second_buffer(units * units), third_buffer(units * 4), bias_buffer(units),
+          first{first_buffer.data(), units}, second{second_buffer.data(), units}, third{third_buffer.data(), 4} {
         for (int64_t j = 0; j < net.width; j++) {
             for (int64_t i = 0; i < inputs; i++) first.row(i)[j] = net.first[j * inputs + i];
             for (int64_t i = 0; i < net.width; i++) second.row(i)[j] = net.second[j * net.width + i];
@@ -92,32 +92,32 @@ struct Layers {
     Layers(const Layers&) = delete;
 };
 
-// What a block of samples passes through the layers. `x` has room for whole lanes of features and then the rest.
+// What a block of samples passes through the layers.
 struct Block {
     Buffer memory;
-    Matrix x, hidden, second; // [ROWS, inputs], [ROWS, units] twice
+    Matrix x, encoded, hidden, second; // [ROWS, whole lanes of features], [inputs - channels, ROWS], [ROWS, units] twice
     float position[3][ROWS] = {};
     float colors[3][ROWS] = {};
 
-    Block(int64_t inputs, int64_t units)
-        : memory(ROWS * (padded(inputs) + 2 * units)), x{memory.data(), padded(inputs)},
-          hidden{x.row(ROWS), units}, second{hidden.row(ROWS), units} {}
+    explicit Block(const Layers& layers)
+        : memory(ROWS * (padded(layers.net.channels) + layers.inputs - layers.net.channels + 2 * layers.units)),
+          x{memory.data(), padded(layers.net.channels)}, encoded{x.row(ROWS), ROWS},
+          hidden{encoded.row(layers.inputs - layers.net.channels), layers.units},
+          second{hidden.row(ROWS), layers.units} {}
 };
 
-// (x, sin 2^i pi x, cos 2^i pi x) in the order of color_network.positional_encoding, behind the features.
-inline void encode(const Network& net, Block& block) {
+// (x, sin 2^i pi x, cos 2^i pi x) in the order of color_network.positional_encoding, a row an input.
+inline void encode(int64_t frequencies, Block& block) {
     for (int a = 0; a < 3; a++)
         for (int first = 0; first < ROWS; first += WIDTH) {
             const Lanes position = load(block.position[a] + first);
+            const auto put = [&](int64_t place, Lanes numbers) { store(block.encoded.row(place + a) + first, numbers); };
             Lanes sine, cosine;
             sincos_turn(least(most(position, splat(-1)), splat(1)), sine, cosine);
-            const auto put = [&](int64_t place, Lanes numbers) {
-                for (int i = 0; i < WIDTH; i++) block.x.row(first + i)[net.channels + place + a] = numbers[i];
-            };
             put(0, position);
-            for (int64_t i = 0; i < net.frequencies; i++) {
+            for (int64_t i = 0; i < frequencies; i++) {
                 put(3 + 3 * i, sine);
-                put(3 + 3 * (net.frequencies + i), cosine);
+                put(3 + 3 * (frequencies + i), cosine);
                 const Lanes twice = 2.0f * sine * cosine;
                 cosine = 1.0f - 2.0f * sine * sine;
                 sine = twice;
@@ -136,9 +136,11 @@ inline void relu(Matrix x, int64_t columns) {
 
 // From features, positions and what `hidden` holds at first (directions and bias) to both hidden layers.
 inline void run_hidden(const Layers& layers, Block& block) {
-    const int64_t units = layers.units;
-    encode(layers.net, block);
-    multiply(block.x.numbers, block.x.stride, 1, layers.first, layers.inputs, block.hidden, ROWS, units);
+    const int64_t units = layers.units, channels = layers.net.channels;
+    encode(layers.net.frequencies, block);
+    multiply(block.x.numbers, block.x.stride, 1, layers.first, channels, block.hidden, ROWS, units);
+    const Matrix rest{layers.first.row(channels), units};
+    multiply(block.encoded.numbers, 1, ROWS, rest, layers.inputs - channels, block.hidden, ROWS, units);
     relu(block.hidden, units);
     for (int64_t i = 0; i < ROWS; i++)
         for (int64_t c = 0; c < units; c += WIDTH) store(block.second.row(i) + c, load(layers.bias_buffer.data() + c));
@@ -146,17 +148,31 @@ inline void run_hidden(const Layers& layers, Block& block) {
     relu(block.second, units);
 }
 
-// Colours of a block.
+typedef float Quad __attribute__((vector_size(16)));
+
+inline Quad load_quad(const float* from) {
+    Quad x;
+    __builtin_memcpy(&x, from, sizeof x);
+    return x;
+}
+
+// Colours of a block. The last layer has three outputs, so its lanes are few.
 inline void run(const Layers& layers, Block& block) {
     run_hidden(layers, block);
-    alignas(64) float last[ROWS * WIDTH] = {};
-    multiply(block.second.numbers, layers.units, 1, layers.third, layers.net.width, {last, WIDTH}, ROWS, WIDTH);
-    for (int a = 0; a < 3; a++) {
-        for (int i = 0; i < ROWS; i++)
-            block.colors[a][i] = block.x.row(i)[a] + layers.net.third_bias[a] + last[i * WIDTH + a];
+    constexpr int STEP = 8;
+    for (int first = 0; first < ROWS; first += STEP) {
+        Quad sums[STEP] = {};
+        for (int64_t k = 0; k < layers.net.width; k++) {
+            const Quad weights = load_quad(layers.third.row(k));
+            for (int i = 0; i < STEP; i++) sums[i] += block.second.row(first + i)[k] * weights;
+        }
+        for (int i = 0; i < STEP; i++)
+            for (int a = 0; a < 3; a++)
+                block.colors[a][first + i] = block.x.row(first + i)[a] + layers.net.third_bias[a] + sums[i][a];
+    }
+    for (int a = 0; a < 3; a++)
         for (int first = 0; first < ROWS; first += WIDTH) {
             const Lanes logit = load(block.colors[a] + first), color = 1.0f / (1.0f + exp_lanes(-logit));
             store(block.colors[a] + first, logit == logit ? color : logit);
         }
-    }
 }

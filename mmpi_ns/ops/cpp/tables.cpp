@@ -40,6 +40,17 @@ int64_t mmpi_index_rows(const int64_t* rows, int64_t count, Seen* bricks, int64_
     return found;
 }
 
+// Rows [begin, end) of a list, read from the table; those that follow each other as one stretch.
+void mmpi_gather_rows(const int64_t* rows, int64_t begin, int64_t end, int64_t channels, const float* table,
+                      float* values) {
+    for (int64_t i = begin, next; i < end; i = next) {
+        for (next = i + 1; next < end && rows[next] == rows[next - 1] + 1;) next++;
+        for (int64_t soon = std::min(end, i + 2 * AHEAD); soon < std::min(end, next + 2 * AHEAD); soon++)
+            prefetch_row(table + rows[soon] * channels, channels);
+        std::copy_n(table + rows[i] * channels, (next - i) * channels, values + i * channels);
+    }
+}
+
 // values[position[n, b]] += weights[n, b] * grad[n], with weights of 1 where none are given.
 void mmpi_scatter_rows(const int32_t* position, const float* weights, const float* grad, int64_t samples, int64_t taps,
                        int64_t channels, float* values) {

@@ -1,0 +1,135 @@
+// Rendering weights of rays and the colours that they gather, with their gradients. References in compositing.py.
+#include "lanes.h"
+
+#include <algorithm>
+#include <vector>
+
+namespace {
+
+// 1 - e^-x for x >= 0, exact also where it is small.
+Lanes absorbed(Lanes x) {
+    Lanes p = splat(1.0f / 40320);
+    p = p * x - 1.0f / 5040;
+    p = p * x + 1.0f / 720;
+    p = p * x - 1.0f / 120;
+    p = p * x + 1.0f / 24;
+    p = p * x - 1.0f / 6;
+    p = p * x + 0.5f;
+    const Lanes thin = x - x * x * p, thick = 1.0f - exp_lanes(-x);
+    return x > 0.25f ? thick : thin;
+}
+
+// Optical depths of one ray, padded with zeros to whole lanes, and what lies in front of each sample. Empty slots at the
+// end of a ray are left out.
+struct Ray {
+    int64_t size = 0;
+    std::vector<float> tau, before;
+
+    explicit Ray(int64_t slots) : tau(slots + WIDTH), before(slots + WIDTH) {}
+
+    // Returns the optical depth of all.
+    float take(const float* taus, const bool* valid, const float* skipped, int64_t slots) {
+        for (size = slots; size > 0 && !valid[size - 1];) size--;
+        std::fill(tau.begin() + size, tau.end(), 0.0f);
+        double depth = 0; // as torch sums
+        for (int64_t s = 0; s < size; s++) {
+            tau[s] = valid[s] ? taus[s] : 0;
+            before[s] = float(depth) + skipped[s];
+            depth += tau[s];
+        }
+        return float(depth);
+    }
+};
+
+} // namespace
+
+extern "C" {
+
+// Rays [begin, end): weights [R, S], and e^-depth of the whole ray [R].
+void mmpi_composite(const float* tau, const bool* valid, const float* skipped_before, const float* skipped_total,
+                    int64_t begin, int64_t end, int64_t slots, float* weights, float* depth) {
+    Ray ray(slots);
+    for (int64_t r = begin; r < end; r++) {
+        const int64_t first = r * slots;
+        depth[r] = ray.take(tau + first, valid + first, skipped_before + first, slots) + skipped_total[r];
+        for (int64_t s = 0; s < ray.size; s += WIDTH) {
+            const Lanes weight = exp_lanes(-load(&ray.before[s])) * absorbed(load(&ray.tau[s]));
+            store(&ray.tau[s], weight);
+        }
+        for (int64_t s = 0; s < slots; s++) weights[first + s] = valid[first + s] ? ray.tau[s] : 0;
+    }
+}
+
+// Gradient of the optical depths from that of the weights and of the whole depth.
+void mmpi_composite_back(const float* tau, const bool* valid, const float* skipped_before, const float* weights,
+                         const float* grad_weights, const float* grad_depth, int64_t begin, int64_t end, int64_t slots,
+                         float* grad) {
+    Ray ray(slots);
+    for (int64_t r = begin; r < end; r++) {
+        const int64_t first = r * slots;
+        ray.take(tau + first, valid + first, skipped_before + first, slots);
+        for (int64_t s = 0; s < ray.size; s += WIDTH)
+            store(&ray.before[s], exp_lanes(-load(&ray.before[s]) - load(&ray.tau[s])));
+        float behind = 0; // what the weights of later samples lose
+        std::fill(grad + first + ray.size, grad + first + slots, 0.0f);
+        for (int64_t s = ray.size; s-- > 0;) {
+            const int64_t i = first + s;
+            grad[i] = valid[i] ? grad_weights[i] * ray.before[s] - behind + grad_depth[r] : 0;
+            if (valid[i]) behind += grad_weights[i] * weights[i];
+        }
+    }
+}
+
+// Sums of weights [R, S] times colours [R, S, 3] of rays [begin, end).
+void mmpi_gather_colors(const float* weights, const float* colors, int64_t begin, int64_t end, int64_t slots,
+                        float* sums) {
+    for (int64_t r = begin; r < end; r++) {
+        float sum[3] = {};
+        for (int64_t i = r * slots; i < (r + 1) * slots; i++)
+            for (int a = 0; a < 3; a++) sum[a] += weights[i] * colors[3 * i + a];
+        for (int a = 0; a < 3; a++) sums[3 * r + a] = sum[a];
+    }
+}
+
+// The gradients of both from that of the sums.
+void mmpi_gather_colors_back(const float* weights, const float* colors, const float* grad, int64_t begin, int64_t end,
+                             int64_t slots, float* grad_weights, float* grad_colors) {
+    for (int64_t r = begin; r < end; r++)
+        for (int64_t i = r * slots; i < (r + 1) * slots; i++) {
+            float sum = 0;
+            for (int a = 0; a < 3; a++) {
+                sum += grad[3 * r + a] * colors[3 * i + a];
+                grad_colors[3 * i + a] = grad[3 * r + a] * weights[i];
+            }
+            grad_weights[i] = sum;
+        }
+}
+
+// Inverse distance of the sample at which each of rays [begin, end) has gathered half of what it gathers, or 0.
+void mmpi_median(const float* weights, const float* inverse_t, const bool* valid, int64_t begin, int64_t end,
+                 int64_t slots, float* median) {
+    for (int64_t r = begin; r < end; r++) {
+        const int64_t first = r * slots;
+        double total = 0, gathered = 0; // as torch sums
+        for (int64_t s = 0; s < slots; s++) total += weights[first + s];
+        median[r] = 0;
+        for (int64_t s = 0; s < slots && total > 0; s++) {
+            gathered += weights[first + s];
+            if (!(float(gathered) >= 0.5f * float(total) && valid[first + s])) continue;
+            median[r] = inverse_t[first + s];
+            break;
+        }
+    }
+}
+
+// Number of the head that gives each of rays [begin, end) most of its weight.
+void mmpi_winners(const float* weights, const int64_t* heads, int64_t begin, int64_t end, int64_t slots,
+                  int64_t num_heads, float* winners) {
+    std::vector<float> mass(num_heads);
+    for (int64_t r = begin; r < end; r++) {
+        std::fill(mass.begin(), mass.end(), 0.0f);
+        for (int64_t i = r * slots; i < (r + 1) * slots; i++) mass[heads[i]] += weights[i];
+        winners[r] = float(std::max_element(mass.begin(), mass.end()) - mass.begin());
+    }
+}
+}
