@@ -46,11 +46,16 @@ def groups(rows: dict[str, Any]) -> list[Group]:
     """All that ran, in the order in which methods were first named."""
     found: dict[tuple[str, str, str, int], Group] = {}
     for key, row in rows.items():
-        scene, setting = f"{row['scene']} /{row['downscale_factor']}", key.partition("; ")[2]
+        scene, setting = f"{row['scene']} /{row['downscale_factor']}", _in_words(key.partition("; ")[2])
         where = (scene, setting, row["method"], row["steps"])
         if "not_run" not in row:
             found.setdefault(where, Group(*where, [])).rows.append(row)
     return sorted(found.values(), key=lambda g: (g.scene, g.setting))
+
+
+def _in_words(setting: str) -> str:
+    """0 images stand for all of them."""
+    return setting.replace("of 0 images", "of every test image").replace(", 0 whole", ", all whole at the end")
 
 
 def headline(rows: dict[str, Any]) -> dict[str, float]:
