@@ -78,8 +78,8 @@ SUITES: dict[str, list[Variant]] = {
     "fern": [Variant("automatic placement", (), steps=2000)],
     "fox": [Variant("automatic placement", (), steps=750)],
     "object": [  # mmpi-scene object: cameras all round it
-        Variant("MPIs placed automatically", (), steps=750),
-        Variant("... and a cube where placement finds it worth it", (P + "max-voxels", "128"), steps=750),
+        Variant("MPIs placed automatically", (), steps=1500),
+        Variant("... and a cube where placement finds it worth it", (P + "max-voxels", "128"), steps=1500),
     ],
     "kitti-street-budgets": _budgets(0.5, 1.0, 2.0, 4.0, 8.0),
     "room-walk-budgets": _budgets(0.5, 1.0, 2.0, 4.0, 8.0),
