@@ -105,7 +105,7 @@ class Render:
         """Of what a measurement depends on beside the setting."""
         checkpoint = sorted((self.load_config.parent / "nerfstudio_models").glob("*.ckpt"))[-1]
         stat = checkpoint.stat()
-        return f"{fingerprint()} {checkpoint} {stat.st_size} {stat.st_mtime_ns} {self.images} {self.exact_rays}"
+        return f"{fingerprint()} {checkpoint.name} {stat.st_size} {stat.st_mtime_ns} {self.images} {self.exact_rays}"
 
     def _settings(self, default: Setting) -> list[Setting]:
         """The default, then one thing at a time, and every threshold under every ops."""

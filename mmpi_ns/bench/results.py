@@ -160,9 +160,7 @@ def draw_budgets(path: Path, rows: dict[str, Any]) -> None:
     texels = [r["texels"] / 1e6 for r in held]
     ticks = [m for m in (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50) if 0.7 * min(texels) <= m <= 1.4 * max(texels)]
     for axis, what, label in zip(axes, ("psnr", "ssim"), ("PSNR, dB", "SSIM"), strict=True):
-        axis.plot(
-            [r["texels"] / 1e6 for r in held], [r[what] for r in held], "o-", color="0.4", label="held to a budget"
-        )
+        axis.plot(texels, [r[what] for r in held], "o-", color="0.4", label="held to a budget")
         if DEFAULT in rows:
             row = rows[DEFAULT]
             axis.plot(row["texels"] / 1e6, row[what], "*", markersize=13, color="tab:red", label=DEFAULT)

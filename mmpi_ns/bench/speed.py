@@ -96,7 +96,8 @@ class Speed:
 
     def _key(self) -> dict[str, str]:
         """What a result depends on."""
-        return {k: str(v) for k, v in asdict(self).items() if k not in ("output", "work")}
+        own = {k: str(v) for k, v in asdict(self).items() if k not in ("output", "work")}
+        return own | {"data": self.data.resolve().name}
 
     def _words(self, method: Method, folder: Path) -> list[str]:
         scene = Scene(self.data, self.downscale_factor)
