@@ -22,11 +22,7 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from mmpi_ns import losses
-from mmpi_ns.compositing import (
-    BlendForm,
-    Composite,
-    blended_optical_depth,
-)
+from mmpi_ns.compositing import BlendForm, Composite, blended_optical_depth
 from mmpi_ns.exposure import Exposure, departure
 from mmpi_ns.files import to_bytes, to_text
 from mmpi_ns.metrics import ImageMetrics, pictures
@@ -42,6 +38,7 @@ from mmpi_ns.ops.composite import composite_weights, median_inverse_distance, re
 from mmpi_ns.phases import TRAINS, Schedule
 from mmpi_ns.placement.split import cameras_in, place_windows
 from mmpi_ns.random_draws import generator
+from mmpi_ns.rays_at_once import rays_at_once
 from mmpi_ns.reachable import TrainingViews
 from mmpi_ns.windows import WindowedPlan, window_shares
 
@@ -335,6 +332,21 @@ class MMPIModel(Model):
                 "three positive lengths, or leave the crop out."
             )
         return super().get_outputs_for_camera(camera, obb_box)
+
+    def get_outputs_for_camera_ray_bundle(self, camera_ray_bundle: RayBundle) -> dict[str, Tensor]:
+        """Renders an image, as many rays at once as asked for or as suit the device."""
+        asked = self.config.eval_num_rays_per_chunk
+        self.config.eval_num_rays_per_chunk = self.rays_at_once
+        try:
+            return super().get_outputs_for_camera_ray_bundle(camera_ray_bundle)
+        finally:
+            self.config.eval_num_rays_per_chunk = asked
+
+    @property
+    def rays_at_once(self) -> int:
+        """Rays of an image that are rendered together."""
+        most = max(plan.samples_per_ray for plan in self.windows.plans)
+        return self.config.eval_num_rays_per_chunk or rays_at_once(most, self.device)
 
     def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
         """Colours without their background, and how opaque each pixel is (ns-render's output "rgba")."""

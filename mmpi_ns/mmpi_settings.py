@@ -28,8 +28,8 @@ class MMPIModelConfig(ModelConfig):
     _target: type = field(default_factory=_model)
     enable_collider: bool = False
     """Must stay off: a finite far would drop the plane at infinity."""
-    eval_num_rays_per_chunk: int = 8192
-    """Rays rendered at once."""
+    eval_num_rays_per_chunk: int = 0
+    """Rays rendered at once; 0 for what suits the device (on a GPU: what half of its free memory holds)."""
     placement: PlacementConfig = field(default_factory=PlacementConfig)
     """Where the MPIs stand and how fine they are."""
     plan_file: Path | None = None

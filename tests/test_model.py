@@ -14,6 +14,7 @@ from nerfstudio.model_components import renderers
 from tiny_scene import HEIGHT, WIDTH, write_scene
 from training_runs import plan_of, ready, trainer_config, write_plan
 
+from mmpi_ns import mmpi_model
 from mmpi_ns.mmpi_config import mmpi_small
 from mmpi_ns.phases import TRAINS
 
@@ -207,6 +208,20 @@ def test_pictures_do_not_depend_on_the_chunk_size(model, camera, monkeypatch, th
         # Half of the mass may be reached a plane earlier where rounding decides.
         assert ((found[0]["depth"] - other["depth"]).abs() < 1e-3 * other["depth"]).float().mean() > 0.995
         assert (found[0]["winning_mpi"] == other["winning_mpi"]).float().mean() > 0.995
+
+
+def test_as_many_rays_at_once_as_suit_the_device_unless_a_number_is_asked_for(model, camera, monkeypatch):
+    sizes = []
+    monkeypatch.setattr(mmpi_model, "rays_at_once", lambda samples, device: 100)
+    monkeypatch.setattr(
+        model, "get_outputs", lambda bundle, get=model.get_outputs: sizes.append(len(bundle)) or get(bundle)
+    )
+    for asked, expected in ((0, 100), (17, 17)):
+        sizes.clear()
+        monkeypatch.setattr(model.config, "eval_num_rays_per_chunk", asked)
+        model.get_outputs_for_camera(camera)
+        assert max(sizes) == expected and sum(sizes) == WIDTH * HEIGHT
+        assert model.config.eval_num_rays_per_chunk == asked
 
 
 def test_depth_is_the_distance_along_the_ray_and_finite_at_infinity(model, camera):

@@ -59,7 +59,7 @@ class Render:
     """The run's config.yml."""
     thresholds: tuple[float, ...] = (0.0, 1e-4, 1e-3, 3e-3, 1e-2, 3e-2)
     """Weights below which samples are not coloured."""
-    chunks: tuple[int, ...] = (1024, 8192, 32768)
+    chunks: tuple[int, ...] = (1024, 2048, 4096, 8192, 32768)
     """Rays rendered at once."""
     ops: tuple[str, ...] = ("native", "torch")
     """Inner loops (on a CPU)."""
@@ -79,7 +79,7 @@ class Render:
         model, images = _load(self.load_config, self.images)
         before = read_json(path)
         known = before if before.get("key") == self._key(model) else {}
-        default = Setting(model.config.render_threshold, model.config.eval_num_rays_per_chunk, _ops_in_use(model))
+        default = Setting(model.config.render_threshold, model.rays_at_once, _ops_in_use(model))
         rays = _some_rays(images, self.exact_rays)
         exact = np.array(known["exact"]) if "exact" in known else exact_colors(model, images, rays)
         content: dict[str, Any] = {"headline": {}, "made": made, "key": self._key(model), "exact": exact.tolist()}

@@ -118,6 +118,11 @@ class ScenePlan:
     def texels(self) -> int:
         return sum(m.texels for m in self.mpis) + (self.cube.texels if self.cube else 0)
 
+    @property
+    def samples_per_ray(self) -> int:
+        """Samples of a ray that crosses every plane, and about as many of the cube as it can have."""
+        return sum(m.planes for m in self.mpis) + (sum(self.cube.shape) if self.cube else 0)
+
     def scaled(self, factor: float) -> ScenePlan:
         """The plan at another resolution: ``factor`` times the texels, equal frames and planes."""
         if factor == 1:
