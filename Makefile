@@ -17,6 +17,9 @@ PYTHON_OK := import sys, venv, ensurepip; sys.exit(not (3, 10) <= sys.version_in
 PYTHON ?= $(shell for p in python3.11 python3.12 python3.10 python3; do \
 	if "$$p" -c '$(PYTHON_OK)' >/dev/null 2>&1; then echo "$$p"; break; fi; done)
 
+# Processes that share the test files out; a test uses one thread.
+WORKERS ?= 2
+
 # Extra arguments for pytest or the demo: make test ARGS="-k geometry -x", make demo ARGS=--fresh
 ARGS ?=
 
@@ -46,7 +49,7 @@ demo: venv ## Make a street, learn it, evaluate it and show what came of it, in 
 	@$(BIN)/python -m mmpi_ns.scripts.demo $(ARGS)
 
 test: venv ## Run the tests (ARGS="..." goes to pytest)
-	$(BIN)/python -m pytest $(ARGS)
+	$(BIN)/python -m pytest --numprocesses $(WORKERS) --dist loadfile $(ARGS)
 
 lint: venv ## Check style, formatting and types
 	$(BIN)/python -m ruff check .

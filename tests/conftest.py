@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import hypothesis
 import pytest
 import torch
@@ -10,6 +12,8 @@ from tiny_scene import write_scene
 
 from mmpi_ns.placement.plan import CubePlan, ScenePlan
 
+# Of the processes that tests start too: test files run side by side, and threads that wait for each other spin.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 torch.set_num_threads(1)
 hypothesis.settings.register_profile("mmpi", deadline=None, derandomize=True, print_blob=True)
 hypothesis.settings.load_profile("mmpi")

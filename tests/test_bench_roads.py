@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from mmpi_ns.bench.roads import Roads, headline
+from mmpi_ns.bench.roads import Roads, headline, some_windows
 
 
 @pytest.fixture(scope="module")
@@ -16,13 +16,21 @@ def content(tmp_path_factory):
     return json.loads((output / "roads.json").read_text()), output
 
 
-def test_a_road_is_planned_trained_in_its_middle_and_rendered(content):
+@pytest.mark.parametrize(("count", "wanted", "expected"), [
+    (1, 5, [0]), (2, 5, [0, 1]), (9, 5, [1, 3, 4, 5, 7]), (92, 3, [23, 46, 68]),
+])  # fmt: skip
+def test_the_windows_trained_are_spread_over_the_road(count, wanted, expected):
+    assert some_windows(count, wanted) == expected
+
+
+def test_a_road_is_planned_and_some_of_its_windows_are_trained_and_rendered(content):
     rows = content[0]["rows"]
     row = rows["180 m"]
     assert row["cameras"] == 121 and row["windows"] >= 2 and row["mpis"] >= row["windows"]
     assert row["texels"] > row["window_texels"] > 0
     assert row["plan_s"] > 0 and row["step_ms"] > 0 and row["frame_ms"] > 0 and row["peak_gib"] > 0.1
-    assert row["psnr_db"] > 8
+    assert row["psnr_db"] > 8 and len(row["by_window"]) == 2
+    assert row["step_ms"] == pytest.approx(sum(r["step_ms"] for r in row["by_window"]) / 2)
     assert (content[1] / "roads.png").is_file() and "180 m" in (content[1] / "roads.md").read_text()
 
 

@@ -32,8 +32,8 @@ def python(*words, **environment):
 @needs_triton
 def test_kernels_by_the_interpreter():
     """The variable must be set before Triton is imported, so these tests have a process of their own."""
-    found = python("-m", "pytest", "-p", "no:cacheprovider", str(HERE / "triton_interpreted.py"),
-                   TRITON_INTERPRET="1")  # fmt: skip
+    files = [str(HERE / f"triton_interpreted{part}.py") for part in ("", "_tables")]
+    found = python("-m", "pytest", "-p", "no:cacheprovider", *files, TRITON_INTERPRET="1")
     assert found.returncode == 0, found.stdout[-6000:] + found.stderr[-2000:]
     passed = re.search(r"(\d+) passed", found.stdout)
     assert passed and int(passed[1]) > 30 and "skipped" not in found.stdout, found.stdout[-500:]

@@ -16,6 +16,7 @@ import torch
 
 from mmpi_ns.bench.apart import answer, run_apart
 from mmpi_ns.bench.provenance import fingerprint, read_json, stamp, stamp_line, write_json
+from mmpi_ns.windows import Window
 
 BYTES_A_TEXEL = 4 * (1 + 9 + 1) + 1
 """Density, features, reliability and the mark of having been trained."""
@@ -24,12 +25,14 @@ RAYS = 1024
 
 @dataclass
 class Roads:
-    """Procedural roads of several lengths: planning time and disk, and step, frame and memory in a window half way."""
+    """Procedural roads of several lengths: planning time and disk; step, frame and memory in some of their windows."""
 
     lengths: tuple[float, ...] = (100.0, 1000.0, 10000.0)
     """Metres."""
     steps: int = 200
-    """Training steps of the window half way."""
+    """Training steps of a window."""
+    windows: int = 5
+    """Windows of a road that are trained, spread evenly over it; medians count."""
     threads: int = 1
     """Of each process."""
     output: Path = Path("docs/results")
@@ -40,7 +43,7 @@ class Roads:
     def run(self) -> None:
         made, path = stamp("roads", self), self.output / "roads.json"
         made["threads"] = self.threads
-        key = f"{fingerprint()} {self.steps} {self.threads}"
+        key = f"{fingerprint()} {self.steps} {self.windows} {self.threads}"
         before = read_json(path)
         rows = before.get("rows", {}) if before.get("key") == key else {}
         content: dict[str, Any] = {"headline": {}, "made": made, "key": key, "rows": rows}
@@ -48,8 +51,9 @@ class Roads:
             name = f"{length:g} m"
             if name not in rows:
                 row: dict[str, Any] = {"length": length}
+                asked = {"length": length, "steps": self.steps, "windows": self.windows}
                 for part in ("plan", "train"):
-                    request = {"part": part, "length": length, "steps": self.steps, "folder": str(self.work / name)}
+                    request = {"part": part, **asked, "folder": str(self.work / name)}
                     found = run_apart("mmpi_ns.bench.roads", request, self.work / f"{name} {part}", self.threads)
                     if "not_run" in found:
                         raise ValueError(f"{name}, {part}: {found['not_run']}")
@@ -71,12 +75,21 @@ class Roads:
 
 def measure(request: dict[str, Any], tell: Callable[[str], None]) -> dict[str, Any]:
     """One part of one road, in a process of its own."""
-    part = plan_road if request["part"] == "plan" else train_window
-    return part(Path(request["folder"]), request["length"], request["steps"])
+    folder, steps, windows = Path(request["folder"]), request["steps"], request["windows"]
+    return (
+        plan_road(folder, request["length"], steps, windows)
+        if request["part"] == "plan"
+        else train_windows(folder, steps, windows)
+    )
 
 
-def plan_road(folder: Path, length: float, steps: int) -> dict[str, Any]:
-    """Makes the scene (the images of the window half way alone) and its plan.
+def some_windows(count: int, wanted: int) -> list[int]:
+    """Numbers of so many of the windows, spread evenly and away from the ends of the road."""
+    return sorted({round((i + 1) / (wanted + 1) * (count - 1)) for i in range(wanted)})
+
+
+def plan_road(folder: Path, length: float, steps: int, windows: int) -> dict[str, Any]:
+    """Makes the scene (the images of some windows alone) and its plan.
 
     Returns:
         Seconds of planning, windows, MPIs of all and of the largest, texels of all and of the largest, cameras.
@@ -95,7 +108,7 @@ def plan_road(folder: Path, length: float, steps: int) -> dict[str, Any]:
     plan = place_windows(observations, config, steps * RAYS)
     seconds = time.perf_counter() - start
     (folder / "plan.json").write_text(plan.to_json(), encoding="utf-8")
-    _write_images(scene, data, plan)
+    _write_images(scene, data, [plan.windows[w] for w in some_windows(len(plan), windows)])
     return {
         "cameras": len(scene.cameras),
         "plan_s": seconds,
@@ -107,8 +120,8 @@ def plan_road(folder: Path, length: float, steps: int) -> dict[str, Any]:
     }
 
 
-def _write_images(scene: Any, data: Path, plan: Any) -> None:
-    """Renders what the cameras about the window half way see: those that it trains with and is looked at from."""
+def _write_images(scene: Any, data: Path, windows: list[Window]) -> None:
+    """Renders what the cameras about some windows see: those that they train with and are looked at from."""
     from PIL import Image
 
     from mmpi_ns.scenes.dataset import image_name
@@ -120,20 +133,21 @@ def _write_images(scene: Any, data: Path, plan: Any) -> None:
     centers = (
         scene.cameras.camera_to_worlds[:, :, 3] @ transform[:, :3].T + transform[:, 3]
     ) * outputs.dataparser_scale
-    window = plan.windows[len(plan) // 2]
-    near = np.linalg.norm(centers - np.asarray(window.center), axis=-1) < 1.01 * (window.radius + window.margin)
+    near = np.zeros(len(centers), bool)
+    for w in windows:
+        near |= np.linalg.norm(centers - np.asarray(w.center), axis=-1) < 1.01 * (w.radius + w.margin)
     (data / "images").mkdir(exist_ok=True)
     for i in np.nonzero(near)[0]:
         colors, _ = render(scene, int(i))
         Image.fromarray((colors * 255).round().astype(np.uint8)).save(data / "images" / image_name(int(i)))
 
 
-def train_window(folder: Path, length: float, steps: int) -> dict[str, Any]:
-    """Trains the window half way as a run over all of them would, and renders a frame there.
+def train_windows(folder: Path, steps: int, windows: int) -> dict[str, Any]:
+    """Trains some windows as a run over all of them would, and renders a frame in the middle of each.
 
     Returns:
-        Milliseconds of a step after growth and of a frame (medians), MPIs and texels of the window, PSNR of the frame,
-        and how much memory the process held at most (GiB).
+        Medians over the windows (and lists of them): milliseconds of a step after growth and of a frame (medians in
+        themselves), MPIs and texels, PSNR of the frame; and how much memory the process held at most (GiB).
     """
     trainer = _setup(_config(folder, steps, folder / "plan.json"))
     model, times = trainer._model, []
@@ -146,9 +160,20 @@ def train_window(folder: Path, length: float, steps: int) -> dict[str, Any]:
         return result
 
     trainer.train_iteration = timed
-    window = len(model.windows) // 2
-    trainer._train_window(window) if len(model.windows) > 1 else trainer.train()
-    data_set = trainer.pipeline.datamanager.eval_dataset
+    rows = []
+    for window in some_windows(len(model.windows), windows):
+        times.clear()
+        trainer._train_window(window) if len(model.windows) > 1 else trainer.train()
+        plan = model.windows.plans[window]
+        row = {"step_ms": 1e3 * statistics.median(times[steps // 2 :]), **_look(trainer, window)}
+        rows.append(row | {"window_mpis": len(plan.mpis), "window_texels": plan.texels})
+    found: dict[str, Any] = {name: statistics.median(r[name] for r in rows) for name in rows[0]}
+    return found | {"by_window": rows, "peak_gib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20}
+
+
+def _look(trainer: Any, window: int) -> dict[str, float]:
+    """The test view nearest to the middle of a window: milliseconds of the frame (the median of three) and PSNR."""
+    model, data_set = trainer._model, trainer.pipeline.datamanager.eval_dataset
     centers = data_set.cameras.camera_to_worlds[:, :, 3].double()
     middle = torch.tensor(model.windows.windows[window].center, dtype=torch.float64)
     nearest = int((centers - middle).norm(dim=-1).argmin())
@@ -160,14 +185,8 @@ def train_window(folder: Path, length: float, steps: int) -> dict[str, Any]:
         model.get_outputs_for_camera(camera)
         frames.append(time.perf_counter() - start)
     truth = data_set.get_data(nearest)["image"][..., :3]
-    return {
-        "step_ms": 1e3 * statistics.median(times[steps // 2 :]),
-        "frame_ms": 1e3 * statistics.median(frames),
-        "window_mpis": len(model.windows.plans[window].mpis),
-        "window_texels": model.windows.plans[window].texels,
-        "psnr_db": float(-10 * torch.log10(((outputs["rgb"] - truth) ** 2).mean())),
-        "peak_gib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20,
-    }
+    psnr = float(-10 * torch.log10(((outputs["rgb"] - truth) ** 2).mean()))
+    return {"frame_ms": 1e3 * statistics.median(frames), "psnr_db": psnr}
 
 
 def _config(folder: Path, steps: int, plan: Path | None = None) -> Any:
@@ -214,18 +233,18 @@ def table(content: dict[str, Any]) -> str:
         stamp_line(content["made"]),
         "",
         "Procedural bending roads (`mmpi-scene long-road`), an image of 320 x 96 pixels every 1.5 m. The whole road is",
-        "planned; the window half way is trained as a run through all windows would train it, and a frame is rendered",
-        "there. Disk is what all windows take when they are finished; the two longest roads are trained in part only.",
+        "planned; some windows, spread evenly over it, are trained as a run through all would train them, and a frame",
+        "is rendered in the middle of each: medians. Disk is what all windows take when they are finished.",
         "",
         "![By length](roads.png)",
         "",
-        "| road | cameras | windows | MPIs in all | plan, s | disk, GB | MPIs of the window | step, ms | frame, ms "
+        "| road | cameras | windows | MPIs in all | plan, s | disk, GB | MPIs of a window | step, ms | frame, ms "
         "| PSNR | memory, GiB |",
         "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for name, r in content["rows"].items():
         cells = [name, r["cameras"], r["windows"], r["mpis"], f"{r['plan_s']:.0f}"]
-        cells += [f"{r['texels'] * BYTES_A_TEXEL / 1e9:.2f}", r["window_mpis"], f"{r['step_ms']:.0f}"]
+        cells += [f"{r['texels'] * BYTES_A_TEXEL / 1e9:.2f}", f"{r['window_mpis']:g}", f"{r['step_ms']:.0f}"]
         cells += [f"{r['frame_ms']:.0f}", f"{r['psnr_db']:.1f}", f"{r['peak_gib']:.2f}"]
         lines.append("| " + " | ".join(map(str, cells)) + " |")
     return "\n".join([*lines, ""])
