@@ -11,6 +11,7 @@ from mmpi_ns.bench.accuracy import Accuracy
 from mmpi_ns.bench.dense import Dense
 from mmpi_ns.bench.gpu import Gpu
 from mmpi_ns.bench.ops import Ops
+from mmpi_ns.bench.processes import Processes
 from mmpi_ns.bench.regions import Regions
 from mmpi_ns.bench.render import Render
 from mmpi_ns.bench.results import Results
@@ -23,7 +24,7 @@ from mmpi_ns.bench.train import Train
 
 def entrypoint() -> None:
     """The command ``mmpi-bench``; a mistake is one sentence and exit status 1."""
-    measures = Train | Render | Speed | Ops | Scaling | Roads | Ablate | Gpu
+    measures = Train | Render | Speed | Ops | Scaling | Roads | Processes | Ablate | Gpu
     command = tyro.cli(measures | Stability | Accuracy | Results | Dense | Regions, prog="mmpi-bench")  # type: ignore[arg-type]
     try:
         command.run()
