@@ -55,8 +55,8 @@ ROOM = (P + "arrangement", "room", P + "width", "160", *JOINT)
 def _budgets(*millions: float) -> list[Variant]:
     """Automatic placement held to so many texels, with nothing else that keeps them few, and as it is."""
     free = (P + "rays-per-texel", "0", P + "texels-per-ray", "0")
-    held = [Variant(f"{m:g} M texels", (*free, P + "max-texels", f"{m * 1e6:g}"), steps=500) for m in millions]
-    return [*held, Variant(DEFAULT, (), steps=500)]
+    held = [Variant(f"{m:g} M texels", (*free, P + "max-texels", f"{m * 1e6:g}"), steps=1500) for m in millions]
+    return [*held, Variant(DEFAULT, (), steps=1500)]
 
 
 SUITES: dict[str, list[Variant]] = {
@@ -81,8 +81,8 @@ SUITES: dict[str, list[Variant]] = {
         Variant("MPIs placed automatically", (), steps=1500),
         Variant("... and a cube where placement finds it worth it", (P + "max-voxels", "128"), steps=1500),
     ],
-    "kitti-street-budgets": _budgets(0.5, 1.0, 2.0, 4.0, 8.0),
-    "room-walk-budgets": _budgets(0.5, 1.0, 2.0, 4.0, 8.0),
+    "kitti-street-budgets": _budgets(1.0, 2.0, 4.0, 8.0, 16.0),
+    "room-walk-budgets": _budgets(1.0, 2.0, 4.0, 8.0, 16.0),
 }
 
 
