@@ -17,6 +17,7 @@ from nerfstudio.field_components.field_heads import FieldHeadNames
 from torch import Tensor, nn
 
 from mmpi_ns import geometry
+from mmpi_ns.baking import bake_shares, shares_at
 from mmpi_ns.color_network import ColorNetworks
 from mmpi_ns.compositing import BlendForm, blend_shares, blended_optical_depth
 from mmpi_ns.mmpi_samples import Gathered, LocalRays, Lookup, Taps, by_head, head_spans, metadata_of
@@ -156,15 +157,16 @@ class MMPIField(TexelTables):
         interval = 1.0 / self.samples_per_voxel
         return math.log(math.expm1(-math.log1p(-self.cube_alpha) / interval)), interval
 
-    def march_scene(self) -> SceneTables:
-        """The field as the compiled march reads it."""
+    def march_scene(self, shares: Tensor | None = None) -> SceneTables:
+        """The field as the compiled march reads it, with shares in place of reliability where they are given."""
 
         def make() -> MarchScene:
             cube = None if self.cube is None else (self.cube, *self._cube_density())
             biases = [self._biases(k) for k in range(len(self.plan.mpis))]
             return MarchScene(self.plan.mpis, self.grids, self.frames.disparity_steps, biases, self.depth_scale, cube)
 
-        return self._cached("march", make).with_tables(self.density.data, self.reliability.data, self.touched)
+        votes = self.reliability.data if shares is None else shares
+        return self._cached("march", make).with_tables(self.density.data, votes, self.touched)
 
     def plane_hits(self, origins: Tensor, directions: Tensor, nears: Tensor, fars: Tensor) -> geometry.PlaneHits:
         """``geometry.plane_hits`` in the field's MPIs, compiled where it can be; on a GPU in one launch."""
@@ -178,8 +180,9 @@ class MMPIField(TexelTables):
 
         return triton_hits.plane_hits(origins, directions, nears, fars, frames)
 
-    def triton_scene(self) -> tuple[Any, tuple[Tensor, Tensor, Tensor]]:
-        """The field as the Triton kernels read it: a ``TritonScene``, and density, reliability and touched texels."""
+    def triton_scene(self, shares: Tensor | None = None) -> tuple[Any, tuple[Tensor, Tensor, Tensor]]:
+        """The field as the Triton kernels read it: a ``TritonScene``, and density, reliability (or shares, where they
+        are given) and touched texels."""
         from mmpi_ns.ops.triton_scene import TritonScene
 
         def make() -> TritonScene:
@@ -187,7 +190,8 @@ class MMPIField(TexelTables):
             biases = [self._biases(k) for k in range(len(self.plan.mpis))]
             return TritonScene.pack(self.plan.mpis, self.grids, biases, self.depth_scale, cube, self.density.device)
 
-        return self._cached("triton", make), (self.density.data, self.reliability.data, self.touched)
+        votes = self.reliability.data if shares is None else shares
+        return self._cached("triton", make), (self.density.data, votes, self.touched)
 
     # Reliability -----------------------------------------------------------------------------------------------
 
@@ -242,12 +246,28 @@ class MMPIField(TexelTables):
         inverse_t: Float[Tensor, "N"],
         heads: Int[Tensor, "N"],
         form: BlendForm,
+        baked: tuple[Tensor, Float[Tensor, "N 3"]] | None = None,
     ) -> Float[Tensor, "N"]:
-        """Blended optical depth of many samples; those too thin to matter get an equal share without a lookup."""
+        """Blended optical depth of many samples; those too thin to matter get an equal share without a lookup.
+
+        With ``baked``, shares of all texels and the samples' places in their heads, no head is asked but their own.
+        """
         index = (tau > NEGLIGIBLE_DEPTH).nonzero()[:, 0]
-        share = self.shares(rays[index], local, inverse_t[index], heads[index])
+        if baked is not None:
+            found = shares_at(self, baked[0], baked[1][index], heads[index])
+            share = found.log(), torch.log1p(-found)
+        else:
+            share = self.shares(rays[index], local, inverse_t[index], heads[index])
         blended = tau / len(self.grids)
         return blended.index_copy(0, index, blended_optical_depth(tau[index], *share, form))
+
+    def baked_shares(self) -> Float[Tensor, "N 1"]:
+        """Shares of all texels, for rendering; made once, until ``forget_shares``."""
+        return self._cached("shares", lambda: bake_shares(self))
+
+    def forget_shares(self) -> None:
+        """What was baked no longer holds: the field is about to be trained."""
+        self._packed.pop(("shares", self.density.device), None)
 
     # nerfstudio's Field ------------------------------------------------------------------------------------------
 

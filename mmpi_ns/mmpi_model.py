@@ -146,6 +146,7 @@ class MMPIModel(Model):
     def prepare_step(self, attributes: TrainingCallbackAttributes | None, step: int) -> None:
         """Brings resolution, freezing and what is stored to what the schedule says of this step."""
         self.step = step
+        self.field.forget_shares()
         phase = self.schedule.phase_at(step)
         optimizers = attributes.optimizers.optimizers if attributes and attributes.optimizers else {}
         if self.schedule.window_at(step) != self.window:
@@ -231,6 +232,7 @@ class MMPIModel(Model):
         else:
             head_mask, choose = self._shown(len(bundle)), None
         blend_form = self.config.blend_form if self.blends and head_mask is None else None
+        bakes = self.config.render_shares == "baked" and blend_form is not None and not torch.is_grad_enabled()
         samples, report = self.sampler(
             bundle,
             field=self.field,
@@ -239,6 +241,7 @@ class MMPIModel(Model):
             head_mask=head_mask,
             choose=choose,
             blend_form=blend_form,
+            shares=self.field.baked_shares() if bakes else None,
         )
         tau, lookup = self._optical_depth(samples, blend_form)
         valid = metadata_of(samples)["valid"][..., 0]

@@ -70,6 +70,7 @@ class MMPISampler(Sampler):
         head_mask: Bool[Tensor, "R H"] | None = None,
         choose: Float[Tensor, "R K"] | None = None,
         blend_form: BlendForm | None = None,
+        shares: Float[Tensor, "N 1"] | None = None,
         **_: Any,
     ) -> tuple[RaySamples, MergeReport]:
         """Live samples of each ray that matter, nearest first.
@@ -82,6 +83,7 @@ class MMPISampler(Sampler):
             head_mask: heads that may answer each ray; None for all.
             choose: priorities; each ray is answered by the MPI of highest priority among those it meets (and the cube).
             blend_form: blend by reliability; None where reliability takes no part.
+            shares: baked ones (``baking.bake_shares``) to blend by instead.
 
         Returns:
             RaySamples [R, S] whose metadata holds ``heads``, ``planes``, ``ndc``, ``inverse_t``, ``valid``,
@@ -98,13 +100,13 @@ class MMPISampler(Sampler):
         first = hits.m_first if cube_first is None else torch.cat([hits.m_first, cube_first[:, None]], -1)
         given = (origins, directions, hits, first, counts, threshold, fair_share, blend_form)
         if lib is not None:
-            kept = march(lib, field.march_scene(), *given)
+            kept = march(lib, field.march_scene(shares), *given, baked=shares is not None)
         elif native.takes_triton(origins, field.density):
             from mmpi_ns.ops import triton_march
 
-            kept = triton_march.march(*field.triton_scene(), *given)
+            kept = triton_march.march(*field.triton_scene(shares), *given, baked=shares is not None)
         else:
-            kept = march_reference(ray_bundle, field, hits, cube_first, counts, threshold, fair_share, blend_form)
+            kept = march_reference(ray_bundle, field, hits, cube_first, *given[4:], shares)
         report = MergeReport(counts.sum(-1), kept.skipped_total, kept.dropped_mass, explained)
         return _ray_samples(ray_bundle, kept), report
 
@@ -136,6 +138,7 @@ def march_reference(
     threshold: float,
     fair_share: float,
     blend_form: BlendForm | None,
+    shares: Float[Tensor, "N 1"] | None = None,
 ) -> Kept:
     """``ops.march.march`` in plain torch: looks up and sorts all live samples, then drops."""
     samples = [_sample_mpi(k, counts[:, k], hits, field) for k in range(len(field.plan.mpis))]
@@ -145,7 +148,7 @@ def march_reference(
     tau = flat.tau
     if blend_form is not None and tau.numel():
         local = LocalRays(ray_bundle.origins, ray_bundle.directions, hits.local_origins, hits.local_directions)
-        tau = _blend_visible(merged, flat, heads, local, field, blend_form)
+        tau = _blend_visible(merged, flat, heads, local, field, blend_form, shares)
     survivors = keep_survivors(merged, tau, threshold, fair_share)
     order, valid = survivors.order, survivors.valid
 
@@ -226,6 +229,7 @@ def _blend_visible(
     local: LocalRays,
     field: MMPIField,
     form: BlendForm,
+    shares: Float[Tensor, "N 1"] | None,
 ) -> Float[Tensor, "N"]:
     """Blended optical depths, front to back, until a ray lets less than exp(-OPAQUE_DEPTH) through.
 
@@ -240,7 +244,9 @@ def _blend_visible(
         index = order[wanted]
         if not index.numel():
             break
-        tau[index] = field.blend(flat.tau[index], flat.rays[index], local, flat.inverse_t[index], heads[index], form)
+        baked = None if shares is None else (shares, flat.ndc[index])
+        given = (flat.tau[index], flat.rays[index], local, flat.inverse_t[index], heads[index], form)
+        tau[index] = field.blend(*given, baked)
         passed += torch.where(wanted, tau[order], 0.0).sum(-1)
     return tau
 

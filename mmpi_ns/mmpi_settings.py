@@ -82,6 +82,9 @@ class MMPIModelConfig(ModelConfig):
     compiled where that can be done (auto)."""
     render_threshold: float = 3e-3
     """Samples of less weight are not coloured when rendering; the dropped mass is reported."""
+    render_shares: Literal["exact", "baked"] = "exact"
+    """After two-phase training: a sample's share from the reliabilities of all MPIs that see it, or from its texels,
+    which keep theirs from the first rendering on (faster by the number of MPIs that overlap, and nearly the same)."""
     exposure: bool = False
     """A gain and a bias for each training image and colour channel, for captures whose exposure changes on the way.
     Their means over the images of a window are 1 and 0; other views get none."""

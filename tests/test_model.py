@@ -224,6 +224,21 @@ def test_as_many_rays_at_once_as_suit_the_device_unless_a_number_is_asked_for(mo
         assert model.config.eval_num_rays_per_chunk == asked
 
 
+def test_baked_shares_render_nearly_the_same_and_are_made_anew_after_a_step(model, camera, monkeypatch):
+    exact = model.get_outputs_for_camera(camera)["rgb"]
+    monkeypatch.setattr(model.config, "render_shares", "baked")
+    baked = model.get_outputs_for_camera(camera)["rgb"]
+    shares = model.field.baked_shares()
+    difference = (exact - baked).abs()
+    assert 0 < difference.max() and difference.mean() < 0.01
+    changed = model.field.reliability.data + torch.linspace(-4, 4, len(shares))[:, None]
+    monkeypatch.setattr(model.field.reliability, "data", changed)
+    model.get_outputs_for_camera(camera)
+    assert model.field.baked_shares() is shares
+    model.prepare_step(None, model.step)
+    assert not torch.equal(model.field.baked_shares(), shares)
+
+
 def test_depth_is_the_distance_along_the_ray_and_finite_at_infinity(model, camera):
     outputs = model.get_outputs_for_camera(camera)
     plan = model.field.plan

@@ -100,6 +100,21 @@ def test_the_march_keeps_what_the_reference_keeps(monkeypatch, form, threshold):
     assert (plain.report.dropped_mass > 1e-3).any() == (threshold > 0)
 
 
+@pytest.mark.parametrize("form", ["paper", "opacity"])
+def test_baked_shares_blend_like_the_reference(monkeypatch, form):
+    monkeypatch.setattr(mmpi_sampler, "OPAQUE_DEPTH", math.inf)
+    field = random_field(3, True, seed=4, planes=14, log_depths=(-5, 1.5))
+    rays = bundle(*random_rays(field.plan, 40, seed=1))
+    shares = torch.rand(len(field.density), 1, generator=torch.Generator().manual_seed(1)) * 1.4 - 0.2  # clamped
+    given = {"field": field, "threshold": 0.0, "blend_form": form, "shares": shares}
+    fast = MMPISampler()(rays, **given)[0].metadata
+    plain = by_torch(lambda: MMPISampler()(rays, **given)[0].metadata)
+    same = (fast["valid"].sum(1) == plain["valid"].sum(1))[:, 0]
+    a, b = (m["tau"][same][m["valid"][same]] for m in (fast, plain))
+    assert same.float().mean() > 0.9 and (a > 2).any()
+    assert ((a - b).abs() <= 2e-4 * b + 1e-6).float().mean() > 0.999
+
+
 def test_rays_pass_what_holds_nothing_like_the_reference():
     field = bricked_field(0.4)
     compare(field, bundle(*random_rays(field.plan, 40, seed=1)), 1e-3, "paper")

@@ -22,7 +22,8 @@ from mmpi_ns.placement.plan import MPIPlan
 from mmpi_ns.texels import TexelGrid
 
 FORMS: dict[BlendForm | None, int] = {None: 0, "paper": 1, "opacity": 2}
-"""How the kernels are told in which form reliability enters."""
+"""How the kernels are told in which form reliability enters; ``BAKED`` more where shares stand in its place."""
+BAKED = 2
 _SAMPLE_TYPES = (torch.int32, torch.int32, *[torch.float32] * 4)
 
 
@@ -155,6 +156,7 @@ def march(
     threshold: float,
     fair_share: float,
     form: BlendForm | None,
+    baked: bool = False,
 ) -> Kept:
     """The samples of each ray that matter.
 
@@ -169,6 +171,7 @@ def march(
         threshold: weight below which a sample is dropped; 0 keeps all and ends no ray early.
         fair_share: bound on the threshold relative to equal weights (``merge.keep_survivors``).
         form: how reliability enters; None for not at all.
+        baked: the scene's reliability holds shares (``baking.bake_shares``).
     """
     parts = (origins, directions, hits.local_origins, hits.local_directions, hits.u, hits.v)
     held: list[Tensor] = [x.contiguous() for x in (*parts, first, counts)]  # alive until the kernel has run
@@ -191,7 +194,7 @@ def march(
             ctypes.c_int64(end),
             ctypes.c_float(threshold),
             ctypes.c_float(fair_share),
-            FORMS[form],
+            FORMS[form] + BAKED * baked,
             *ends,
             *places,
         )

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from mmpi_ns.compositing import BlendForm
 from mmpi_ns.geometry import PlaneHits
-from mmpi_ns.ops.march import FORMS, Kept
+from mmpi_ns.ops.march import BAKED, FORMS, Kept
 from mmpi_ns.ops.triton_scene import (
     BIAS,
     DEPTH,
@@ -203,6 +203,23 @@ def _blend(rays, scene, ray, head, inverse_t, tau, wanted, K: tl.constexpr, HAS_
 
 
 @triton.jit
+def _blend_baked(scene, head, place, tau, wanted, K: tl.constexpr, HAS_CUBE: tl.constexpr, OPACITY: tl.constexpr):
+    """Optical depths after blending with the shares that stand where reliability does (``baking.shares_at``)."""
+    _, grids, _, _, _, shares, _ = scene
+    u, v, s = place
+    thick = wanted & (tau > NEGLIGIBLE)
+    share = tl.minimum(tl.maximum(trilinear(shares, grids, head, u, v, s, thick), 0.0), 1.0)
+    if OPACITY:
+        blended = tau * share
+    else:
+        alpha = one_minus_exp(tau) * share
+        left = tl.where(share < 1, 1 - share + share * tl.exp(-tau), 1.0)
+        blended = tl.where(alpha < 0.5, minus_log_of_rest(tl.minimum(alpha, 0.5)), -tl.log(left))
+        blended = tl.where(share < 1, blended, tau)
+    return tl.where(thick, blended, tau / (K + HAS_CUBE))
+
+
+@triton.jit
 def _before(values, STEPS: tl.constexpr):
     """Sum of the earlier columns. Summed, not subtracted: x - x loses what came before a large x."""
     i = tl.arange(0, STEPS)
@@ -243,7 +260,9 @@ def march_kernel(
         )
         met = (inverse_t >= 0) & (left > 0)[:, None]
         plane, u, v, s, tau = _look_up(rays, scene, ray, head, number, met, K, HAS_CUBE)
-        if FORM > 0:
+        if FORM > 2:
+            tau = _blend_baked(scene, head, (u, v, s), tau, met, K, HAS_CUBE, FORM == 4)
+        elif FORM > 0:
             tau = _blend(rays, scene, ray, head, inverse_t, tau, met, K, HAS_CUBE, FORM == 2)
         tau = tl.where(met, tau, 0.0)
         light = tl.exp(-(depth[:, None] + _before(tau, STEPS)))
@@ -310,6 +329,7 @@ def march(
     threshold: float,
     fair_share: float,
     form: BlendForm | None,
+    baked: bool = False,
 ) -> Kept:
     """The samples of each ray that matter; ``ops.march.march`` on a GPU.
 
@@ -335,8 +355,8 @@ def march(
         march_kernel[(triton.cdiv(num_rays, rays_at_once),)](
             *rays, *scene.constants(), *tables, kept, left[0], left[1], *slots,
             num_rays, room, float(threshold), float(fair_share),
-            K=scene.num_mpis, HEADS=triton.next_power_of_2(scene.num_heads), HAS_CUBE=has_cube, FORM=FORMS[form],
-            KEEP_ALL=threshold <= 0, RAYS=rays_at_once, STEPS=STEPS, num_warps=1,
+            K=scene.num_mpis, HEADS=triton.next_power_of_2(scene.num_heads), HAS_CUBE=has_cube,
+            FORM=FORMS[form] + BAKED * baked, KEEP_ALL=threshold <= 0, RAYS=rays_at_once, STEPS=STEPS, num_warps=1,
         )  # fmt: skip
     width = max(1, int(kept.max())) if num_rays else 1
     return Kept(*_pack(kept, slots, room, width), skipped_total=left[0], dropped_mass=left[1])

@@ -146,6 +146,16 @@ bool place(const Scene& scene, const Rays& rays, int64_t ray, int64_t j, float i
 
 float softplus(float x) { return x > 20 ? x : std::log1p(std::exp(x)); }
 
+// Optical depth of a sample after blending with the share that its texels hold (where reliability stands are shares).
+float blended_baked(const Scene& scene, int64_t own, const float* ndc, float tau, bool opacity) {
+    if (tau <= NEGLIGIBLE) return tau / float(scene.num_heads);
+    const float share = std::min(std::max(trilinear(scene.reliability, scene.grids[own], ndc), 0.0f), 1.0f);
+    if (share == 1) return tau; // the sole cover
+    if (opacity) return tau * share;
+    const float alpha = -std::expm1(-tau) * share;
+    return alpha < 0.5f ? -std::log1p(-alpha) : -std::log(1 - share + share * std::exp(-tau));
+}
+
 // Optical depth of a sample after blending (compositing.blend_shares and blended_optical_depth).
 float blended(const Scene& scene, const Rays& rays, int64_t ray, int64_t own, float inverse_t, float tau, bool opacity,
               std::vector<float>& votes) {
@@ -180,7 +190,7 @@ extern "C" {
 
 // Marches rays [begin, end). What they keep is written one ray behind the other, from `starts[begin]` on; where a ray's
 // samples begin, to `starts[ray]`; how many, to `kept[ray]`.
-// form: 0 no blending, 1 the paper's, 2 opacity-keeping.
+// form: 0 no blending, 1 the paper's, 2 opacity-keeping; 3 and 4 the same with baked shares in place of reliability.
 void mmpi_march(const Scene* scene, const Rays* rays, int64_t* starts, int64_t begin, int64_t end,
                 float threshold, float fair_share, int form, int64_t* kept, float* skipped_total, float* dropped_mass,
                 int32_t* heads, int32_t* planes, float* ndc, float* inverse_t, float* taus, float* skipped_before) {
@@ -222,7 +232,8 @@ void mmpi_march(const Scene* scene, const Rays* rays, int64_t* starts, int64_t b
             }
             float tau = run.tau[at], pass = run.pass[at];
             if (form) {
-                tau = blended(*scene, *rays, ray, h, run.inverse_t[at], tau, form == 2, votes);
+                tau = form > 2 ? blended_baked(*scene, h, run.ndc[at], tau, form == 4)
+                               : blended(*scene, *rays, ray, h, run.inverse_t[at], tau, form == 2, votes);
                 pass = std::exp(-tau);
             }
             const float weight = light * (1 - pass);
