@@ -57,7 +57,8 @@ class MMPIModel(Model):
         native.choose(self.config.ops)
         self.windows = self._initial_plan()
         self.window = 0
-        self.store = WindowStore(self.config.windows_folder, self.config.resident_gib * 2**30)
+        budget, half = self.config.resident_gib * 2**30, self.config.half_windows
+        self.store = WindowStore(self.config.windows_folder, budget, half)
         # One head has nothing to blend with, so it trains in one go.
         joint = self.config.training == "joint" or all(plan.num_heads == 1 for plan in self.windows.plans)
         self.schedule = self.config.schedule("joint" if joint else "two-phase", len(self.windows))

@@ -39,6 +39,9 @@ class MMPIModelConfig(ModelConfig):
     resident_gib: float = 2.0
     """Device memory that rendering may take for the windows of a long capture, GiB, beside the one trained last: as
     many are held as fit, at least one; the one not used for longest goes first."""
+    half_windows: bool = False
+    """Write the finished windows of a long capture in half precision: half of the disk, and the same pictures to a
+    fraction of a grey level."""
     training: Training = "joint"
     """Each MPI alone, then reliability (two-phase), or all together without reliability (joint)."""
     total_steps: int = 1

@@ -14,7 +14,11 @@ from torch import Tensor
 from mmpi_ns.checks import brief
 from mmpi_ns.files import to_text, write_atomically
 from mmpi_ns.mmpi_field import MMPIField
+from mmpi_ns.mmpi_tables import TABLES
 from mmpi_ns.placement.plan import ScenePlan
+
+_DAMAGED = (OSError, RuntimeError, EOFError, KeyError, TypeError, pickle.UnpicklingError)
+"""What reading a damaged file raises."""
 
 
 class WindowStore:
@@ -23,10 +27,11 @@ class WindowStore:
     Args:
         folder: where the files lie; None where there is one window alone.
         budget: bytes that windows held to render may take. The one that is rendered is held whatever it takes.
+        half: write tables in half precision.
     """
 
-    def __init__(self, folder: Path | None, budget: float) -> None:
-        self.folder, self.budget = folder, budget
+    def __init__(self, folder: Path | None, budget: float, half: bool = False) -> None:
+        self.folder, self.budget, self.half = folder, budget, half
         self._fields: dict[int, MMPIField] = {}
         """Those that are held, the one used last at the end."""
 
@@ -46,7 +51,10 @@ class WindowStore:
         """
         path = self.path(window)
         path.parent.mkdir(parents=True, exist_ok=True)
-        state = {"window": window, "field": field.state_dict()}
+        tables = field.state_dict()
+        if self.half:
+            tables |= {name: tables[name].half() for name in TABLES}
+        state = {"window": window, "field": tables}
         write_atomically(path, lambda unfinished: torch.save(state, unfinished))
 
     def load(self, window: int, empty: Callable[[], MMPIField], device: torch.device) -> MMPIField:
@@ -69,12 +77,12 @@ class WindowStore:
                 f"Window {window} of this run is missing: {path} is not there. Put the run's folder 'windows' back, or "
                 "name where it is in config.yml (pipeline.model.windows_folder)."
             )
-        self._make_room(path.stat().st_size)  # a file holds the tables and little else
         try:
-            state = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+            state = torch.load(path, map_location="cpu", weights_only=True, mmap=True)["field"]
+            self._make_room(sum(values.numel() * _itemsize(values) for values in state.values()))
             field = empty()
-            field.load_state_dict(state["field"])
-        except (OSError, RuntimeError, EOFError, KeyError, TypeError, pickle.UnpicklingError) as error:
+            field.load_state_dict({name: _widened(values) for name, values in state.items()})
+        except (*_DAMAGED, AttributeError) as error:
             raise ValueError(
                 f"Window {window} of this run is damaged: {path} cannot be read ({brief(error)}). Copy it anew, or "
                 "train it again: resume from a checkpoint of before its end with --load-step."
@@ -113,6 +121,15 @@ class WindowStore:
                 )
 
 
+def _itemsize(values: Tensor) -> int:
+    """Bytes of a number once it is read."""
+    return 4 if values.dtype == torch.float16 else values.element_size()
+
+
+def _widened(values: Tensor) -> Tensor:
+    return values.float() if values.dtype == torch.float16 else values
+
+
 def _bytes_of(field: MMPIField) -> int:
     return sum(values.nbytes for values in field.state_dict().values())
 
@@ -122,7 +139,7 @@ def _check_plan(source: Path, plan: ScenePlan) -> None:
     try:
         state = torch.load(source, map_location="cpu", weights_only=True, mmap=True)
         stored = ScenePlan.from_json(to_text(state["field"]["plan_bytes"]))
-    except (OSError, RuntimeError, EOFError, KeyError, TypeError, pickle.UnpicklingError) as error:
+    except _DAMAGED as error:
         raise ValueError(
             f"{source} cannot be read ({brief(error)}): copy it anew, or remove it to train again."
         ) from error

@@ -15,6 +15,7 @@ from nerfstudio.utils.eval_utils import eval_setup
 from test_resume import compared, differences, load
 from training_runs import datamanager, plan_of, ready, trainer_config
 
+from mmpi_ns.mmpi_tables import TABLES
 from mmpi_ns.mmpi_windows import WindowStore
 from mmpi_ns.windows import Window, WindowedPlan, window_shares
 
@@ -256,6 +257,24 @@ def test_as_many_windows_are_held_as_fit_the_budget(whole, tmp_path, room, held)
         assert torch.equal(field.density, model.field.density) and list(store._fields) == expected
         taken = sum(t.numel() * t.element_size() for f in store._fields.values() for t in f.state_dict().values())
         assert len(store._fields) == 1 or taken <= room * size
+
+
+def test_windows_in_half_precision_take_half_of_the_disk_and_are_read_as_they_were_rounded(
+    whole, scene, windows_file, tmp_path
+):
+    model = whole.pipeline.model
+    asked = ready(trainer_config(scene, windows_file, tmp_path, STEPS, half_windows=True)).pipeline.model.store
+    assert asked.half and not model.store.half
+    store = WindowStore(tmp_path, budget=0, half=asked.half)
+    store.save(1, model.field)
+    assert store.path(1).stat().st_size < 0.65 * model.store.path(1).stat().st_size
+    field = store.load(1, model._new_field, model.device)
+    for name, values in field.state_dict().items():
+        wanted = model.field.state_dict()[name]
+        assert values.dtype == wanted.dtype
+        rounded = wanted.half().float() if name in TABLES else wanted
+        assert torch.equal(values, rounded), name
+    assert not torch.equal(field.features, model.field.features)
 
 
 def test_a_config_from_when_windows_were_counted_goes_on_working(whole, tmp_path):
