@@ -56,7 +56,8 @@ void mmpi_composite(const float* tau, const bool* valid, const float* skipped_be
             const Lanes weight = exp_lanes(-load(&ray.before[s])) * absorbed(load(&ray.tau[s]));
             store(&ray.tau[s], weight);
         }
-        for (int64_t s = 0; s < slots; s++) weights[first + s] = valid[first + s] ? ray.tau[s] : 0;
+        for (int64_t s = 0; s < ray.size; s++) weights[first + s] = valid[first + s] ? ray.tau[s] : 0;
+        std::fill(weights + first + ray.size, weights + first + slots, 0.0f);
     }
 }
 

@@ -269,17 +269,21 @@ void mmpi_pack(const int64_t* starts, const int64_t* kept, int64_t begin, int64_
                const int32_t* heads, const int32_t* planes, const float* ndc, const float* inverse_t, const float* tau,
                const float* skipped_before, int64_t* to_heads, int64_t* to_planes, float* to_ndc, float* to_inverse_t,
                float* to_tau, float* to_skipped_before, bool* valid) {
-    for (int64_t ray = begin; ray < end; ray++)
-        for (int64_t i = 0; i < width; i++) {
-            const int64_t to = ray * width + i, from = starts[ray] + i;
-            const bool is_kept = i < kept[ray];
-            valid[to] = is_kept;
-            to_heads[to] = is_kept ? heads[from] : 0;
-            to_planes[to] = is_kept ? planes[from] : 0;
-            for (int a = 0; a < 3; a++) to_ndc[3 * to + a] = is_kept ? ndc[3 * from + a] : 0;
-            to_inverse_t[to] = is_kept ? inverse_t[from] : 0;
-            to_tau[to] = is_kept ? tau[from] : 0;
-            to_skipped_before[to] = is_kept ? skipped_before[from] : 0;
-        }
+    // Array by array, so that copies and zeros (most slots, where one ray keeps many) go a cache line at a time.
+    const auto pack = [](const auto* from, int64_t size, int64_t room, auto* to) {
+        std::copy_n(from, size, to);
+        std::fill_n(to + size, room - size, 0);
+    };
+    for (int64_t ray = begin; ray < end; ray++) {
+        const int64_t to = ray * width, from = starts[ray], size = kept[ray];
+        pack(heads + from, size, width, to_heads + to);
+        pack(planes + from, size, width, to_planes + to);
+        pack(ndc + 3 * from, 3 * size, 3 * width, to_ndc + 3 * to);
+        pack(inverse_t + from, size, width, to_inverse_t + to);
+        pack(tau + from, size, width, to_tau + to);
+        pack(skipped_before + from, size, width, to_skipped_before + to);
+        std::fill_n(valid + to, size, true);
+        std::fill_n(valid + to + size, width - size, false);
+    }
 }
 }
