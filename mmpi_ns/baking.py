@@ -15,6 +15,7 @@ from torch import Tensor
 
 from mmpi_ns import geometry
 from mmpi_ns.mmpi_samples import LocalRays
+from mmpi_ns.ops.interpolate import interpolate
 from mmpi_ns.texels import BRICK
 
 if TYPE_CHECKING:
@@ -73,8 +74,6 @@ def shares_at(
     field: MMPIField, shares: Float[Tensor, "N 1"], ndc: Float[Tensor, "S 3"], heads: Int[Tensor, "S"]
 ) -> Float[Tensor, "S"]:
     """Baked shares of samples, interpolated in the head that each was taken from."""
-    from mmpi_ns.ops.interpolate import interpolate
-
     found = ndc.new_zeros(len(heads))
     for k, grid in enumerate(field.grids):
         index = (heads == k).nonzero()[:, 0]
