@@ -115,13 +115,18 @@ def test_a_setting_is_off_the_front_where_another_is_faster_without_more_error()
     assert render.headline(content)["default_on_front"] == 1, "less error by one measure, more by the other"
 
 
-def test_a_further_setting_of_the_model_is_tried_with_its_own_type():
+def test_a_further_setting_of_the_model_is_tried_with_its_own_type_and_taken_back():
     class Model:
         class config:
             render_threshold, eval_num_rays_per_chunk, background, train_threshold = 0.0, 1, "gray", 1.0
+            ops = "auto"
 
-    Setting(0.25, 7, "torch", "train_threshold=0.5").apply(Model)  # type: ignore[arg-type]
-    assert (Model.config.render_threshold, Model.config.eval_num_rays_per_chunk) == (0.25, 7)
-    assert Model.config.train_threshold == 0.5 and native.library(torch.zeros(1)) is None
-    Setting(0.25, 7, "auto", "background=white").apply(Model)  # type: ignore[arg-type]
-    assert Model.config.background == "white"
+    config = Model.config
+    with Setting(0.25, 7, "torch", "train_threshold=0.5").applied(Model):  # type: ignore[arg-type]
+        assert (config.render_threshold, config.eval_num_rays_per_chunk) == (0.25, 7)
+        assert config.train_threshold == 0.5 and native.library(torch.zeros(1)) is None
+    assert (config.render_threshold, config.eval_num_rays_per_chunk, config.train_threshold) == (0.0, 1, 1.0)
+    assert native.library(torch.zeros(1)) is not None
+    with Setting(0.25, 7, "auto", "background=white").applied(Model):  # type: ignore[arg-type]
+        assert config.background == "white"
+    assert config.background == "gray"

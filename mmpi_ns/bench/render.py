@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import statistics
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -39,12 +41,23 @@ class Setting:
     def name(self) -> str:
         return f"threshold {self.threshold:g}, {self.chunk} rays at once, {self.ops}" + (self.also and f", {self.also}")
 
-    def apply(self, model: MMPIModel) -> None:
-        model.config.render_threshold, model.config.eval_num_rays_per_chunk = self.threshold, self.chunk
-        native.choose(self.ops)  # type: ignore[arg-type]
+    @contextmanager
+    def applied(self, model: MMPIModel) -> Iterator[None]:
+        """Renders so within the block, and as before after it."""
+        changes: dict[str, Any] = {"render_threshold": self.threshold, "eval_num_rays_per_chunk": self.chunk}
         if self.also:
             name, _, text = self.also.partition("=")
-            setattr(model.config, name, type(getattr(model.config, name))(text))
+            changes[name] = type(getattr(model.config, name))(text)
+        before = {name: getattr(model.config, name) for name in changes}
+        try:
+            for name, value in changes.items():
+                setattr(model.config, name, value)
+            native.choose(self.ops)  # type: ignore[arg-type]
+            yield
+        finally:
+            for name, value in before.items():
+                setattr(model.config, name, value)
+            native.choose(model.config.ops)
 
 
 @dataclass
@@ -89,12 +102,11 @@ class Render:
         wanted = [s for s in self._settings(default) if s.name not in content["settings"]]
         for number in range(self.rounds if wanted else 0):
             for setting in wanted:
-                setting.apply(model)
                 rows = content["settings"].setdefault(setting.name, {**asdict(setting), "frame_s": []})
-                rows |= measure(model, images, rays, exact, rows["frame_s"])
+                with setting.applied(model):
+                    rows |= measure(model, images, rays, exact, rows["frame_s"])
                 rate = 1 / statistics.median(rows["frame_s"])
                 print(f"[{number + 1}/{self.rounds}] {setting.name}: {rate:.2f} frames/s", flush=True)
-        default.apply(model)
         content["headline"] = headline(content)
         write_json(path, content)
         (self.output / "render.md").write_text(table(content), encoding="utf-8")
