@@ -79,7 +79,8 @@ def launches(monkeypatch):
     for num_mpis, with_cube, form, count in ((4, False, None, 20), (2, True, "paper", 1)):
         field = random_field(num_mpis, with_cube, seed=1)
         rays = bundle(*random_rays(field.plan, count, seed=1))
-        MMPISampler()(rays, field=field, threshold=1e-3, blend_form=form)
+        for shares in (None, field.density.data) if form else (None,):
+            MMPISampler()(rays, field=field, threshold=1e-3, blend_form=form, shares=shares)
     number = torch.zeros(50, dtype=torch.int64)
     rows, weights, values, table = (
         number[:, None].repeat(1, 4),

@@ -12,11 +12,12 @@ from nerfstudio.field_components.field_heads import FieldHeadNames
 from torch import Tensor
 
 from mmpi_ns import compositing
+from mmpi_ns.baking import shares_at
 from mmpi_ns.bench.cases_rays import CLEAR, CUBE, Scene, scene
 from mmpi_ns.bench.exact_ray import ExactField, ExactRay, Gradients
 from mmpi_ns.bench.rendering import bundle_of
 from mmpi_ns.compositing import BlendForm
-from mmpi_ns.mmpi_field import MMPIField
+from mmpi_ns.mmpi_field import NEGLIGIBLE_DEPTH, MMPIField
 from mmpi_ns.mmpi_sampler import MMPISampler
 from mmpi_ns.mmpi_samples import metadata_of
 from mmpi_ns.ops import native
@@ -25,6 +26,8 @@ from mmpi_ns.ops.interpolate import add_rows, index_rows, interpolate, interpola
 from mmpi_ns.ops.variation import total_variation, total_variation_reference
 from mmpi_ns.placement.plan import CubePlan
 from mmpi_ns.touched_adam import TouchedAdam
+
+FORMS: tuple[BlendForm, ...] = ("paper", "opacity")
 
 
 @dataclass(frozen=True)
@@ -143,6 +146,25 @@ def marches(device: str, rehearse: bool) -> list[Check]:
     return found
 
 
+@torch.no_grad()
+def baked_march(device: str, rehearse: bool) -> list[Check]:
+    """Optical depths blended by shares at texels, against the same blending of plain samples in float64."""
+    s, found = scene(3, 4 if rehearse else 200, "paper", seed=5, cube=CUBE), []
+    field, rays = s.field.to(device), bundle_of(s.origins, s.directions).to(device)
+    shares = field.baked_shares()
+    plain = metadata_of(MMPISampler()(rays, field=field, threshold=0.0)[0])
+    valid = plain["valid"][..., 0]
+    tau, ndc, heads = (plain[name][valid].double().cpu() for name in ("tau", "ndc", "heads"))
+    share = shares_at(field.cpu(), shares.double().cpu(), ndc, heads[:, 0].long())
+    field.to(device)
+    for form in FORMS[: 1 if rehearse else None]:
+        made = metadata_of(MMPISampler()(rays, field=field, threshold=0.0, blend_form=form, shares=shares)[0])
+        wanted = compositing.blended_optical_depth(tau[:, 0], share.log(), torch.log1p(-share), form)
+        wanted = torch.where(tau[:, 0] > NEGLIGIBLE_DEPTH, wanted, tau[:, 0] / len(field.grids))
+        found.append(Check(f"shares at texels, {form} blending", _relative(made["tau"][valid][:, 0], wanted), 1e-4))
+    return found
+
+
 # Kernels by themselves -----------------------------------------------------------------------------------------------
 
 
@@ -241,6 +263,7 @@ def everything(device: str, rehearse: bool) -> list[Callable[[], list[Check]]]:
         lambda: variation(device, 200 if rehearse else 100_000),
         lambda: adam(device, size),
         lambda: marches(device, rehearse),
+        lambda: baked_march(device, rehearse),
     ]
 
 
