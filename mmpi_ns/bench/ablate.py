@@ -58,7 +58,7 @@ class Ablate:
         made, path = stamp("ablate", self), self.output / f"ablate-{self.suite}.json"
         made["threads"] = self.threads or os.cpu_count() or 1
         key = f"{self.data.resolve().name} /{self.downscale_factor}, {self.steps} steps of {self.rays} rays"
-        key += f", {made['threads']} threads, {self.test_images} test images"
+        key += f", {made['threads']} threads, {self.test_images or 'all'} test images"
         before = read_json(path)
         content: dict[str, Any] = {"headline": {}, "made": made, "key": key}
         content["rows"] = before.get("rows", {}) if before.get("key") == key else {}
