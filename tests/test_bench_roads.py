@@ -29,6 +29,7 @@ def test_a_road_is_planned_and_some_of_its_windows_are_trained_and_rendered(cont
     assert row["cameras"] == 121 and row["windows"] >= 2 and row["mpis"] >= row["windows"]
     assert row["texels"] > row["window_texels"] > 0
     assert row["plan_s"] > 0 and row["step_ms"] > 0 and row["frame_ms"] > 0 and row["peak_gib"] > 0.1
+    assert row["live_samples"] > row["kept_samples"] > 1
     assert row["psnr_db"] > 8 and len(row["by_window"]) == 2
     assert row["step_ms"] == pytest.approx(sum(r["step_ms"] for r in row["by_window"]) / 2)
     assert (content[1] / "roads.png").is_file() and "180 m" in (content[1] / "roads.md").read_text()

@@ -172,7 +172,7 @@ def train_windows(folder: Path, steps: int, windows: int) -> dict[str, Any]:
 
 
 def _look(trainer: Any, window: int) -> dict[str, float]:
-    """The test view nearest to the middle of a window: milliseconds of the frame (the median of three) and PSNR."""
+    """The test view nearest to a window's middle: milliseconds of the frame (median of three), PSNR, samples."""
     model, data_set = trainer._model, trainer.pipeline.datamanager.eval_dataset
     centers = data_set.cameras.camera_to_worlds[:, :, 3].double()
     middle = torch.tensor(model.windows.windows[window].center, dtype=torch.float64)
@@ -186,7 +186,17 @@ def _look(trainer: Any, window: int) -> dict[str, float]:
         frames.append(time.perf_counter() - start)
     truth = data_set.get_data(nearest)["image"][..., :3]
     psnr = float(-10 * torch.log10(((outputs["rgb"] - truth) ** 2).mean()))
-    return {"frame_ms": 1e3 * statistics.median(frames), "psnr_db": psnr}
+    return {"frame_ms": 1e3 * statistics.median(frames), "psnr_db": psnr, **_samples(model, camera)}
+
+
+@torch.no_grad()
+def _samples(model: Any, camera: Any) -> dict[str, float]:
+    """What a frame's cost follows: samples that a ray of it meets, and those of them that are coloured."""
+    rays = camera.generate_rays(0, keep_shape=False)
+    some = model._bounded(rays[:: max(1, len(rays) // 4096)])
+    samples, report = model.sampler(some, field=model.field, threshold=model.config.render_threshold)
+    kept = samples.metadata["valid"].sum() / len(some)
+    return {"live_samples": float(report.live.float().mean()), "kept_samples": float(kept)}
 
 
 def _config(folder: Path, steps: int, plan: Path | None = None) -> Any:
@@ -239,13 +249,14 @@ def table(content: dict[str, Any]) -> str:
         "![By length](roads.png)",
         "",
         "| road | cameras | windows | MPIs in all | plan, s | disk, GB | MPIs of a window | step, ms | frame, ms "
-        "| PSNR | memory, GiB |",
-        "|---|---|---|---|---|---|---|---|---|---|---|",
+        "| samples a ray, coloured | PSNR | memory, GiB |",
+        "|---|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for name, r in content["rows"].items():
         cells = [name, r["cameras"], r["windows"], r["mpis"], f"{r['plan_s']:.0f}"]
         cells += [f"{r['texels'] * BYTES_A_TEXEL / 1e9:.2f}", f"{r['window_mpis']:g}", f"{r['step_ms']:.0f}"]
-        cells += [f"{r['frame_ms']:.0f}", f"{r['psnr_db']:.1f}", f"{r['peak_gib']:.2f}"]
+        cells += [f"{r['frame_ms']:.0f}", f"{r['live_samples']:.0f}, {r['kept_samples']:.0f}"]
+        cells += [f"{r['psnr_db']:.1f}", f"{r['peak_gib']:.2f}"]
         lines.append("| " + " | ".join(map(str, cells)) + " |")
     return "\n".join([*lines, ""])
 
