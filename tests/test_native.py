@@ -68,6 +68,8 @@ def test_the_march_keeps_what_the_reference_keeps(monkeypatch, num_mpis, with_cu
     assert torch.allclose(
         kept["skipped_before"][same, :width][valid], wanted["skipped_before"][same, :width][valid], atol=2e-5
     )
+    for name in ("heads", "planes", "ndc", "inverse_t", "tau", "skipped_before"):
+        assert (kept[name][~kept["valid"][..., 0]] == 0).all(), "empty slots are 0"
     assert torch.equal(fast.report.live, plain.report.live)
     assert (fast.composite.transmittance - plain.composite.transmittance).abs().max() < 1.2e-5
     difference = fast.report.dropped_mass - plain.report.dropped_mass

@@ -265,9 +265,12 @@ def test_windows_in_half_precision_take_half_of_the_disk_and_are_read_as_they_we
     model = whole.pipeline.model
     asked = ready(trainer_config(scene, windows_file, tmp_path, STEPS, half_windows=True)).pipeline.model.store
     assert asked.half and not model.store.half
-    store = WindowStore(tmp_path, budget=0, half=asked.half)
+    size = model.store.path(1).stat().st_size
+    store = WindowStore(tmp_path, budget=1.8 * size, half=asked.half)
+    store.save(0, model.field)
     store.save(1, model.field)
-    assert store.path(1).stat().st_size < 0.65 * model.store.path(1).stat().st_size
+    assert store.path(1).stat().st_size < 0.65 * size
+    store.load(0, model._new_field, model.device)
     field = store.load(1, model._new_field, model.device)
     for name, values in field.state_dict().items():
         wanted = model.field.state_dict()[name]
@@ -275,6 +278,7 @@ def test_windows_in_half_precision_take_half_of_the_disk_and_are_read_as_they_we
         rounded = wanted.half().float() if name in TABLES else wanted
         assert torch.equal(values, rounded), name
     assert not torch.equal(field.features, model.field.features)
+    assert list(store._fields) == [1], "what is held is counted as it lies in memory, not on disk"
 
 
 def test_a_config_from_when_windows_were_counted_goes_on_working(whole, tmp_path):
