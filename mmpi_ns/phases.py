@@ -149,11 +149,13 @@ def make_schedule(
     if training == "joint":
         lengths = [("joint", total_steps)]
     else:
-        blend, finetune = round(total_steps * blend_share), round(total_steps * finetune_share)
-        if min(blend, finetune) < 0:
+        if min(blend_share, finetune_share) < 0:
             raise ValueError("blend-share and finetune-share must not be negative.")
-        if total_steps - blend - finetune < 1:
+        if blend_share + finetune_share >= 1:
             raise ValueError("blend-share + finetune-share leave no step for the individual phase: lower them.")
+        # The first phase has a step even where so few are asked for that the others' are rounded up to all of them.
+        blend = min(round(total_steps * blend_share), total_steps - 1)
+        finetune = min(round(total_steps * finetune_share), total_steps - 1 - blend)
         lengths = [("individual", total_steps - blend - finetune), ("blend", blend), ("finetune", finetune)]
     lengths = [(name, n) for name, n in lengths if n > 0]
     ends = [sum(n for _, n in lengths[: i + 1]) for i in range(len(lengths))]

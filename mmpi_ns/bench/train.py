@@ -56,8 +56,14 @@ class Train:
     """Where train.json, train.md and train.png go."""
     work: Path = Path("outputs/train")
     """Where runs and their logs go."""
+    check_every: int = 0
+    """Look every so many steps too, beside the doubling ones; 0: no."""
+    quick_hashes: bool = False
+    """Give the hash tables of nerfstudio's methods our compiled lookups on a CPU (the same values to rounding, in a
+    half of the time of a step); else they run as they are."""
     keep: bool = False
-    """Keep checkpoints (a gigabyte each)."""
+    """Keep checkpoints (a gigabyte each). nerfstudio's methods are then saved at every check, and a longer run, or one
+    that was cut off, goes on from there."""
 
     def run(self) -> None:
         made, path = stamp("train", self), self.output / "train.json"
@@ -100,9 +106,9 @@ class Train:
         where = f"{self._device}, {self.threads or os.cpu_count()} threads"
         seen = f"{self.check_pixels} pixels of {self.check_images} images, {self.final_images} whole"
         name = scene.resolve().name
-        return (
-            f"{name} /{self.downscale_factor}: {method.name}, {steps} steps, {rays} rays, seed {seed}; {where}; {seen}"
-        )
+        quick = ", quick hashes" if self.quick_hashes and not method.ours else ""
+        run = f"{method.name}, {steps} steps, {rays} rays, seed {seed}{quick}"
+        return f"{name} /{self.downscale_factor}: {run}; {where}; {seen}"
 
     def _row(self, key: str, scene: Path, method: Method, steps: int, seed: int) -> dict[str, Any]:
         """Trains in a process of its own, so that memory and threads are the method's alone."""
@@ -119,7 +125,10 @@ class Train:
             reason = "it needs a CUDA device, and --device cpu was asked for"
         if reason is not None:
             return {**row, "not_run": reason}
-        folder = self.work / re.sub(r"[^a-z0-9]+", "-", key.lower()).strip("-")
+        go_on = self.keep and not method.ours
+        # Runs that can go on from shorter ones share a folder with them.
+        name = key.replace(f"{steps} steps, ", "", 1) if go_on else key
+        folder = self.work / re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")
         request = self._request(scene, method, steps, seed, folder)
         made = stamp("train", self)
         keep = ("command", "processor", "torch", "date")
@@ -137,13 +146,20 @@ class Train:
             data=str(scene),
             downscale_factor=self.downscale_factor,
             work=str(folder),
-            checks=tuple(sorted({max(1, round(steps * share)) for share in SHARES})),
+            checks=self._checks(steps),
             check_images=self.check_images,
             check_pixels=self.check_pixels,
             final_images=self.final_images,
             whole_images=method.whole_images,
             keep=self.keep,
+            go_on=self.keep and not method.ours,
+            quick_hashes=self.quick_hashes and not method.ours,
         )
+
+    def _checks(self, steps: int) -> tuple[int, ...]:
+        """Steps after which a run is looked at."""
+        often = range(self.check_every, steps, self.check_every) if self.check_every else ()
+        return tuple(sorted({max(1, round(steps * share)) for share in SHARES} | set(often)))
 
 
 def train_apart(request: Request, folder: Path, threads: int) -> dict[str, Any]:

@@ -22,7 +22,10 @@ import torch
 from torch import nn
 
 from mmpi_ns.bench.apart import answer
+from mmpi_ns.bench.provenance import read_json, write_json
 from mmpi_ns.metrics import ImageMetrics
+
+PROGRESS_FILE = "progress.json"
 
 
 @dataclass(frozen=True)
@@ -47,6 +50,11 @@ class Request:
     """The method renders no single pixels."""
     keep: bool
     """Keep checkpoints."""
+    go_on: bool = False
+    """Save at every check, and go on from the last one of a run in the same folder that was cut off or was shorter.
+    For methods whose schedule does not depend on how long they train."""
+    quick_hashes: bool = False
+    """Give nerfstudio's hash tables the compiled lookups of ``peers.look_up_quickly``."""
 
 
 class NoLPIPS(nn.Module):
@@ -72,6 +80,10 @@ class Stopwatch:
     def __init__(self) -> None:
         self._start = time.perf_counter()
         self._stopped = 0.0
+
+    def set(self, seconds: float) -> None:
+        """Makes it show so many seconds."""
+        self._stopped += self.seconds - seconds
 
     @property
     def seconds(self) -> float:
@@ -194,18 +206,27 @@ def run(request: Request, tell: Callable[[str], None] = print) -> dict[str, Any]
     from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
     from nerfstudio.scripts.train import _set_random_seed
 
-    from mmpi_ns.bench.peers import read_points_ourselves
+    from mmpi_ns.bench.peers import look_up_quickly, read_points_ourselves
 
     replace_lpips()
     read_points_ourselves()
+    if request.quick_hashes:
+        look_up_quickly()
     config: Any = tyro.cli(AnnotatedBaseConfigUnion, args=list(request.words))
     config.pipeline.datamanager.data = config.data
     config.save_config()
-    _set_random_seed(config.machine.seed)
+    earlier = _earlier(request)
+    if earlier is not None:
+        config.load_dir = Path(earlier["checkpoints"])
+        config.load_step = earlier["curve"][-1]["step"] - 1
+        config.max_num_iterations -= earlier["curve"][-1]["step"]  # nerfstudio's trainer makes so many more
+        tell(f"goes on from step {earlier['curve'][-1]['step']}")
+    # Random draws are not saved with a checkpoint: the second part must not repeat those of the first.
+    _set_random_seed(config.machine.seed + (0 if earlier is None else earlier["curve"][-1]["step"]))
     watch = Stopwatch()
     trainer = config.setup(local_rank=0, world_size=1)
     trainer.setup()
-    row = _follow(trainer, request, watch, tell)
+    row = _follow(trainer, request, watch, tell, earlier)
     for process in getattr(trainer.pipeline.datamanager, "data_procs", []):
         process.terminate()
     if not request.keep:
@@ -213,14 +234,39 @@ def run(request: Request, tell: Callable[[str], None] = print) -> dict[str, Any]
     return row
 
 
-def _follow(trainer: Any, request: Request, watch: Stopwatch, tell: Callable[[str], None]) -> dict[str, Any]:
+def _earlier(request: Request) -> dict[str, Any] | None:
+    """What a run that this one can go on from left at its last check."""
+    path = Path(request.work) / PROGRESS_FILE
+    if not request.go_on or not path.is_file():
+        return None
+    found = read_json(path)
+    same = found["words"] == _without_length(request.words)
+    step = found["curve"][-1]["step"]
+    saved = Path(found["checkpoints"]) / f"step-{step - 1:09d}.ckpt"
+    return found if same and step < request.checks[-1] and saved.is_file() else None
+
+
+def _without_length(words: tuple[str, ...]) -> list[str]:
+    return [w for i, w in enumerate(words) if i == 0 or words[i - 1] != "--max-num-iterations"]
+
+
+def _follow(
+    trainer: Any,
+    request: Request,
+    watch: Stopwatch,
+    tell: Callable[[str], None],
+    earlier: dict[str, Any] | None = None,
+) -> dict[str, Any]:
     """Trains with the callback that looks."""
     from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 
-    pipeline, curve = trainer.pipeline, []
+    pipeline = trainer.pipeline
     split = split_of(pipeline.datamanager)
     check_split(split, Path(request.data), request.downscale_factor)
-    count, rays, setup_seconds = len(split["test"]), 0, watch.seconds
+    count, rays, setup_seconds, curve = len(split["test"]), 0, watch.seconds, []
+    if earlier is not None:
+        rays, setup_seconds, curve = earlier["rays"], earlier["setup_seconds"], earlier["curve"]
+        watch.set(earlier["curve"][-1]["seconds"])
     final: dict[str, float] = {}
 
     def look(step: int) -> None:
@@ -233,8 +279,16 @@ def _follow(trainer: Any, request: Request, watch: Stopwatch, tell: Callable[[st
             found = score(pipeline, evenly(count, request.check_images), request.check_pixels, request.whole_images)
             curve.append({"step": step + 1, "rays": rays, "seconds": seconds, "psnr": found["psnr"]})
             tell(f"step {step + 1}: {seconds:.0f} s of training, {found['psnr']:.2f} dB")
+            if request.go_on:
+                save(step)
             if step + 1 == request.checks[-1]:
                 final.update(score(pipeline, evenly(count, request.final_images), 0, request.whole_images))
+
+    def save(step: int) -> None:
+        trainer.save_checkpoint(step)
+        kept = {"words": _without_length(request.words), "checkpoints": str(trainer.checkpoint_dir)}
+        kept |= {"curve": curve, "rays": rays, "setup_seconds": setup_seconds}
+        write_json(Path(request.work) / PROGRESS_FILE, kept)
 
     trainer.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], look))
     trainer.train()
