@@ -3,6 +3,7 @@ hash tables that are quick without a GPU."""
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 from typing import Any
 
@@ -63,6 +64,8 @@ def read_points_ourselves() -> None:
 
 HASH_FACTORS = (1, 2654435761, 805459861)
 """nerfstudio's, and Instant-NGP's (Mueller et al. 2022, eq. 4)."""
+AT_ONCE = 1024
+"""Positions whose rows are computed together, so that what lies between stays in the processor's cache."""
 
 
 def hash_lookups(self: Any, in_tensor: Tensor) -> Tensor:
@@ -76,17 +79,32 @@ def hash_lookups(self: Any, in_tensor: Tensor) -> Tensor:
     Returns:
         [..., levels x features] features.
     """
-    scaled = in_tensor.detach().reshape(-1, 1, 3) * self.scalings.view(-1, 1).to(in_tensor.device)
-    lower = torch.floor(scaled)
-    upper_share = scaled - lower
-    ends = torch.stack([lower, torch.ceil(scaled)], -1).long()  # [N, levels, 3, 2]
-    x, y, z = (ends * torch.tensor(HASH_FACTORS, device=ends.device)[:, None]).unbind(2)
-    rows = (x[..., :, None, None] ^ y[..., None, :, None] ^ z[..., None, None, :]) % self.hash_table_size
-    rows = (rows + self.hash_offset.to(rows.device).view(-1, 1, 1, 1)).int()
-    x, y, z = torch.stack([1 - upper_share, upper_share], -1).unbind(2)
-    weights = x[..., :, None, None] * y[..., None, :, None] * z[..., None, None, :]
-    found = interpolate_gathered(self.hash_table, rows.reshape(-1, 8), weights.reshape(-1, 8))
+    positions = in_tensor.detach().reshape(-1, 3)
+    shape = (len(positions), len(self.scalings), 8)
+    rows = torch.empty(shape, dtype=torch.int32, device=positions.device)
+    weights = torch.empty(shape, device=positions.device)
+    for begin in range(0, len(positions), AT_ONCE):
+        part = slice(begin, begin + AT_ONCE)
+        rows[part], weights[part] = hash_rows(self, positions[part])
+    found = interpolate_gathered(self.hash_table, rows.view(-1, 8), weights.view(-1, 8))
     return found.view(*in_tensor.shape[:-1], -1)
+
+
+def hash_rows(encoding: Any, positions: Tensor) -> tuple[Tensor, Tensor]:
+    """The table's rows [N, levels, 8] at the corners of each position's cells, and their weights."""
+    scaled = positions.T[..., None] * encoding.scalings.to(positions.device)  # [3, N, levels]
+    lower = torch.floor(scaled)
+    share = scaled - lower
+    # Only the low bits of the products matter, so that they may overflow.
+    factors = torch.tensor(HASH_FACTORS, device=lower.device).int()[:, None, None]
+    ends = [(e.int() * factors).unbind(0) for e in (lower, torch.ceil(scaled))]
+    parts = [p.unbind(0) for p in (1 - share, share)]
+    hashed, weights = [], []
+    for i, j, k in itertools.product((0, 1), repeat=3):
+        hashed.append(ends[i][0] ^ ends[j][1] ^ ends[k][2])
+        weights.append(parts[i][0] * parts[j][1] * parts[k][2])
+    rows = torch.stack(hashed, -1).bitwise_and_(encoding.hash_table_size - 1)
+    return rows.add_(encoding.hash_offset.to(rows.device).int()[:, None]), torch.stack(weights, -1)
 
 
 def look_up_quickly() -> None:

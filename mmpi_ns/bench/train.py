@@ -59,8 +59,8 @@ class Train:
     check_every: int = 0
     """Look every so many steps too, beside the doubling ones; 0: no."""
     quick_hashes: bool = False
-    """Give the hash tables of nerfstudio's methods our compiled lookups on a CPU (the same values to rounding, in a
-    half of the time of a step); else they run as they are."""
+    """Give the hash tables of nerfstudio's methods our compiled lookups (the same values to rounding), and let them keep
+    the memory that they free: half of the time of a step on a CPU. Else they run as they are."""
     keep: bool = False
     """Keep checkpoints (a gigabyte each). nerfstudio's methods are then saved at every check, and a longer run, or one
     that was cut off, goes on from there."""
@@ -164,7 +164,12 @@ class Train:
 
 def train_apart(request: Request, folder: Path, threads: int) -> dict[str, Any]:
     """The row of a training in a fresh process, or why there is none."""
-    return run_apart("mmpi_ns.bench.trainings", asdict(request), folder, threads)
+    extra = {}
+    if request.quick_hashes:  # else half of nerfacto's time goes into fetching the same pages from the system again
+        extra |= {"MALLOC_MMAP_THRESHOLD_": str(8 * 10**9), "MALLOC_TRIM_THRESHOLD_": str(16 * 10**9)}
+    if request.go_on:  # nerfstudio's checkpoints hold numpy scalars, which torch refuses unless told otherwise
+        extra["TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD"] = "1"
+    return run_apart("mmpi_ns.bench.trainings", asdict(request), folder, threads, extra=extra)
 
 
 def _by_name(words: tuple[str, ...], option: str) -> dict[str, list[int]]:
