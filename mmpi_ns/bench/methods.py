@@ -43,6 +43,8 @@ class Method:
     """The option that sets the rays of a step; None: has none."""
     camera_option: tuple[str, ...] = ()
     """What turns the optimisation of cameras off."""
+    hashes: bool = False
+    """Looks up hash tables in plain torch on a CPU, which ``peers.look_up_quickly`` can do instead."""
 
     @property
     def ours(self) -> bool:
@@ -97,7 +99,7 @@ METHODS = {
         Method("mmpi-kitti", "mmpi-kitti", steps=40_000),
         Method("mmpi-scannet", "mmpi-scannet", steps=30_000),
         Method("mmpi-scannet-short", "mmpi-scannet-short", steps=10_000),
-        Method("nerfacto", "nerfacto", _nerfacto_options(), camera_option=CAMERAS_OFF),
+        Method("nerfacto", "nerfacto", _nerfacto_options(), camera_option=CAMERAS_OFF, hashes=True),
         # It has no camera optimiser. Its batches adapt themselves to the samples of a ray.
         Method("instant-ngp", "instant-ngp", steps=10_000, needs=("cuda", "nerfacc"), batch_option=None),
         Method(

@@ -14,7 +14,7 @@ import torch
 from mmpi_ns.bench.apart import run_apart
 from mmpi_ns.bench.methods import Method, Scene, find_method
 from mmpi_ns.bench.provenance import commit, read_json, stamp, write_json
-from mmpi_ns.bench.train_report import draw, headline, table
+from mmpi_ns.bench.train_report import QUICK, draw, headline, table
 from mmpi_ns.bench.trainings import Request
 
 SHARES = (1 / 64, 1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 3 / 4, 1.0)
@@ -106,16 +106,22 @@ class Train:
         where = f"{self._device}, {self.threads or os.cpu_count()} threads"
         seen = f"{self.check_pixels} pixels of {self.check_images} images, {self.final_images} whole"
         name = scene.resolve().name
-        quick = ", quick hashes" if self.quick_hashes and not method.ours else ""
-        run = f"{method.name}, {steps} steps, {rays} rays, seed {seed}{quick}"
+        run = f"{self._called(method)}, {steps} steps, {rays} rays, seed {seed}"
         return f"{name} /{self.downscale_factor}: {run}; {where}; {seen}"
+
+    def _quick(self, method: Method) -> bool:
+        return self.quick_hashes and method.hashes
+
+    def _called(self, method: Method) -> str:
+        """The method's name in tables."""
+        return method.name + (QUICK if self._quick(method) else "")
 
     def _row(self, key: str, scene: Path, method: Method, steps: int, seed: int) -> dict[str, Any]:
         """Trains in a process of its own, so that memory and threads are the method's alone."""
         row: dict[str, Any] = {
             "scene": scene.resolve().name,
             "downscale_factor": self.downscale_factor,
-            "method": method.name,
+            "method": self._called(method),
             "ours": method.ours,
             "steps": steps,
             "seed": seed,
@@ -153,7 +159,7 @@ class Train:
             whole_images=method.whole_images,
             keep=self.keep,
             go_on=self.keep and not method.ours,
-            quick_hashes=self.quick_hashes and not method.ours,
+            quick_hashes=self._quick(method),
         )
 
     def _checks(self, steps: int) -> tuple[int, ...]:
