@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from nerfstudio.engine import trainer as nerfstudio_trainer
+from nerfstudio.field_components.encodings import HashEncoding
 from torchmetrics.image import lpip
 
 from mmpi_ns.bench import methods, peers, train, trainings
@@ -22,6 +23,7 @@ from mmpi_ns.bench.curves import Curve, compare
 from mmpi_ns.bench.methods import METHODS
 from mmpi_ns.bench.train import Train
 from mmpi_ns.bench.train_report import headline, table
+from mmpi_ns.ops import native
 
 
 def in_this_process(request, folder, threads):
@@ -120,6 +122,84 @@ def test_nerfacto_trains_through_nerfstudios_own_trainer(scene, tmp_path, monkey
     assert "--pipeline.model.camera-optimizer.mode off" in row["options"]
     assert not any("lpips" in k for k in row) and row["options"].startswith("nerfacto ")
     assert not list((tmp_path / "work").rglob("*.ckpt"))
+
+
+@pytest.mark.commands
+def test_a_peer_that_was_cut_off_or_was_shorter_goes_on_from_its_last_check(scene, tmp_path, monkeypatch):
+    monkeypatch.setenv("TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD", "1")  # as train_apart does
+    said = []
+
+    def here(request, folder, threads):
+        nerfstudio_trainer.writer.EVENT_WRITERS.clear()
+        said.append([])
+        return trainings.run(request, said[-1].append)
+
+    def nerfacto(steps: int, **settings) -> dict:
+        settings = {"methods": ("nerfacto",), "seeds": (0,), "keep": True} | settings
+        command(scene, tmp_path, steps=(f"nerfacto={steps}",), **settings).run()
+        return next(r for r in read(tmp_path)["rows"].values() if r["steps"] == steps)
+
+    monkeypatch.setattr(train, "train_apart", here)
+    short = nerfacto(2)
+    longer = nerfacto(5, check_every=2)
+    assert said[1][0] == "goes on from step 2" and [line.split(":")[0] for line in said[1][1:]] == ["step 4", "step 5"]
+    assert longer["curve"][: len(short["curve"])] == short["curve"]
+    assert [p["rays"] for p in longer["curve"]] == [64 * p["step"] for p in longer["curve"]] and longer["rays"] == 320
+    seconds = [p["seconds"] for p in longer["curve"]]
+    assert seconds == sorted(seconds) and longer["setup_seconds"] == short["setup_seconds"]
+    nerfacto(1)
+    assert said[2][0].startswith("step 1:"), "a longer run is no start for a shorter one"
+    nerfacto(4, keep=False)
+    assert said[3][0].startswith("step 1:"), "nothing goes on that was not asked to be kept"
+
+
+def test_what_a_run_goes_on_from_was_asked_for_in_the_same_words(tmp_path):
+    words = ("nerfacto", "--max-num-iterations", "5", "--machine.seed", "0")
+    saved = tmp_path / "step-000000001.ckpt"
+    saved.touch()
+    kept = {"words": trainings._without_length(words), "checkpoints": str(tmp_path), "curve": [{"step": 2}]}
+    (tmp_path / trainings.PROGRESS_FILE).write_text(json.dumps(kept))
+
+    def earlier(words=words, last=5, go_on=True):
+        request = trainings.Request(words, "", 1, str(tmp_path), (1, last), 0, 0, 0, False, True, go_on)
+        return trainings._earlier(request)
+
+    assert earlier() == kept and earlier((*words[:2], "9", *words[3:])) == kept
+    assert earlier((*words[:4], "1")) is None and earlier(last=2) is None and earlier(go_on=False) is None
+    saved.unlink()
+    assert earlier() is None
+
+
+@pytest.mark.parametrize("native_or_torch", ["auto", "torch"])
+@pytest.mark.parametrize(("levels", "size"), [(5, 8), (16, 12)])
+def test_quick_hash_lookups_are_nerfstudios_own(levels, size, native_or_torch, monkeypatch):
+    monkeypatch.setattr(native, "_chosen", native_or_torch)
+    torch.manual_seed(0)
+    encoding = HashEncoding(levels, 16, 512, size, implementation="torch")
+    positions = torch.rand(7, 300, 3)
+    positions[0] = (positions[0] * 16).round() / 16  # on the corners of cells, where both ends are one
+    positions[1, 0], positions[1, 1] = 0, 1
+    upstream = torch.randn(7, 300, 2 * levels)
+    found = []
+    for look_up in (HashEncoding.pytorch_fwd, peers.hash_lookups):
+        encoding.zero_grad()
+        features = look_up(encoding, positions)
+        features.backward(upstream)
+        assert encoding.hash_table.grad is not None
+        found.append((features.detach(), encoding.hash_table.grad.clone()))
+    scale = float(encoding.hash_table.abs().max())
+    torch.testing.assert_close(found[1][0], found[0][0], rtol=0, atol=1e-6 * scale)
+    torch.testing.assert_close(found[1][1], found[0][1], rtol=1e-5, atol=1e-4)
+    assert float(found[0][1].abs().max()) > 1
+
+
+def test_quick_hashes_are_for_hash_tables_and_have_rows_of_their_own(scene, tmp_path):
+    quick = command(scene, tmp_path, quick_hashes=True, keep=True)
+    asked = {name: quick._request(scene, METHODS[name], 3, 0, tmp_path) for name in ("nerfacto", "mmpi-small")}
+    assert asked["nerfacto"].quick_hashes and not asked["mmpi-small"].quick_hashes
+    assert asked["nerfacto"].go_on and not asked["mmpi-small"].go_on, "our schedules follow the length of a run"
+    keys = [c._key(scene, METHODS["nerfacto"], 3, 0) for c in (quick, command(scene, tmp_path))]
+    assert keys[0] == keys[1].replace("nerfacto", "nerfacto (quick hashes)")
 
 
 def test_a_process_that_fails_says_why_and_where(tmp_path):

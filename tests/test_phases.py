@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -100,6 +101,20 @@ def test_growth_is_over_within_the_first_phase_of_any_length():
         assert schedule.texel_factor(schedule.phases[0].end) == 1
         assert schedule.texel_factor(0) == 1 / 16
         assert list(schedule.growth) == sorted(schedule.growth)
+
+
+@pytest.mark.parametrize(("blend", "finetune"), [(0.05, 0.8), (0.6, 0.3), (0.0, 0.99), (0.99, 0.0)])
+def test_large_shares_of_few_steps_leave_one_for_the_first_phase(blend, finetune):
+    for steps in (1, 2, 3, 5, 1000):
+        phases = make_schedule("two-phase", steps, blend_share=blend, finetune_share=finetune).phases
+        assert phases[0].name == "individual" and phases[0].end >= 1 and phases[-1].end == steps
+        assert all(a.end == b.start and b.end > b.start for a, b in pairwise(phases))
+
+
+@pytest.mark.parametrize(("blend", "finetune"), [(0.5, 0.5), (0.9, 0.2), (-0.1, 0.3), (0.3, -0.1)])
+def test_shares_that_leave_nothing_for_the_first_phase_are_refused(blend, finetune):
+    with pytest.raises(ValueError, match=r"leave no step|must not be negative"):
+        make_schedule("two-phase", 1000, blend_share=blend, finetune_share=finetune)
 
 
 def test_without_growth_all_texels_are_there_from_the_start():
