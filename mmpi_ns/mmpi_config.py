@@ -72,6 +72,7 @@ mmpi_kitti = _method(
     model=MMPIModelConfig(
         placement=PlacementConfig(arrangement="drive", planes=256, height=270, width=270),
         training="two-phase",
+        rays_per_mpi="split",
         blend_share=0.25,
         finetune_share=0.0,
     ),

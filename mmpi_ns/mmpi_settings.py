@@ -46,11 +46,11 @@ class MMPIModelConfig(ModelConfig):
     """Each MPI alone, then reliability (two-phase), or all together without reliability (joint)."""
     total_steps: int = 1
     """Set by the trainer from --max-num-iterations; the phases are shares of it."""
-    blend_share: float = 0.1
+    blend_share: float = 0.05
     """Share of the steps in which only reliability trains."""
-    finetune_share: float = 0.3
+    finetune_share: float = 0.4
     """Share of the steps in which everything trains together at the end."""
-    finetune_rate: float = 0.3
+    finetune_rate: float = 1.0
     """Learning rates at the start of the fine-tune relative to those of the first phase."""
     decay_decades: float = 1.5
     """Decades that learning rates fall over a phase."""
@@ -60,8 +60,9 @@ class MMPIModelConfig(ModelConfig):
     """When bricks (8 x 8 texels of a plane) in which nothing is seen are given up, as shares of the first phase."""
     release_weight: float = 5e-3
     """Bricks in which no sample of a training ray weighs this much are given up; 0 keeps all that rays can reach."""
-    rays_per_mpi: Literal["split", "all"] = "split"
-    """Individual phase: the MPIs share a batch's rays, or each renders all of them (K times the work a step)."""
+    rays_per_mpi: Literal["split", "all"] = "all"
+    """Individual phase: each MPI renders all rays of a batch (K times the work of a step, about what joint training
+    takes), or the MPIs share them."""
     blend_form: BlendForm = "paper"
     """How reliability enters: P alpha (paper) or 1 - (1 - alpha)^P (opacity)."""
     shared_colour: bool = False
