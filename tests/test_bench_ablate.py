@@ -110,5 +110,5 @@ def test_every_ablation_is_made_of_lines_that_ns_train_takes(scene, tmp_path):
         for v in variants:
             words = Method(v.name, v.method, v.options).words(Scene(scene, 1), tmp_path, 5, 64, 0, "cpu")
             config = tyro.cli(AnnotatedBaseConfigUnion, args=words)
-            seen.append((config.pipeline.model, config.pipeline.datamanager))
+            seen.append((config.pipeline.model, config.pipeline.datamanager, config.optimizers))
         assert all(a != b for i, a in enumerate(seen) for b in seen[:i]), f"{suite}: two variants are the same"
