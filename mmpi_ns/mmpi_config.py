@@ -9,6 +9,7 @@ from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 from nerfstudio.plugins.types import MethodSpecification
 
 from mmpi_ns.mmpi_datamanager import MMPIDataManagerConfig
+from mmpi_ns.mmpi_losses import LossWeights
 from mmpi_ns.mmpi_model import MMPIModelConfig
 from mmpi_ns.mmpi_trainer import MMPITrainerConfig, PhaseSchedulerConfig
 from mmpi_ns.placement.rule import PlacementConfig
@@ -49,6 +50,11 @@ def _method(
     return MethodSpecification(config=config, description=description)
 
 
+def _paper_loss() -> LossWeights:
+    """DVGO's total variation, which the paper takes."""
+    return LossWeights(tv_density=1e-5, tv_features=1e-6)
+
+
 mmpi = _method(
     "mmpi",
     "MMPI: several multi-plane images, placed among the training cameras.",
@@ -75,6 +81,7 @@ mmpi_kitti = _method(
         rays_per_mpi="split",
         blend_share=0.25,
         finetune_share=0.0,
+        loss=_paper_loss(),
     ),
 )
 
@@ -83,6 +90,7 @@ def _scannet() -> MMPIModelConfig:
     return MMPIModelConfig(
         placement=PlacementConfig(arrangement="room", planes=128, height=192, width=192, cube_voxels=160),
         training="joint",
+        loss=_paper_loss(),
     )
 
 

@@ -30,10 +30,10 @@ class LossWeights:
     """Spread of a ray's mass over distance."""
     keypoint_depth: float = 0.02
     """-log of the mass near an SfM keypoint (scenes with tracks)."""
-    tv_density: float = 1e-5
-    """Total variation of the densities, in DVGO's normalisation."""
-    tv_features: float = 1e-6
-    """Total variation of the features, likewise."""
+    tv_density: float = 1e-4
+    """Total variation of the densities, in DVGO's normalisation (there: 1e-5)."""
+    tv_features: float = 1e-5
+    """Total variation of the features, likewise (there: 1e-6)."""
     tv_every: int = 4
     """Total variation is added every so many steps, at so many times its weight."""
     exposure: float = 1e-3

@@ -15,6 +15,8 @@ FRONT = (*DRIVE, *JOINT, P + "faces", "front")
 NO_DEPTH = ("--pipeline.datamanager.keypoint-rays", "0")
 OPACITY = ("--pipeline.model.blend-form", "opacity")
 EQUAL_SHARES = ("--optimizers.reliability.optimizer.lr", "1e-9")
+LITTLE_VARIATION = ("--pipeline.model.loss.tv-density", "1e-5", "--pipeline.model.loss.tv-features", "1e-6")
+"""DVGO's."""
 SHARED = ("--pipeline.model.shared-colour", "True")
 
 
@@ -124,6 +126,7 @@ def _ours() -> list[Variant]:
         Variant("placed among the cameras, joint", JOINT, group=placed),
         Variant("placed, one colour network for all", (*JOINT, *SHARED), group=placed),
         Variant("placed, no SfM depth", (*JOINT, *NO_DEPTH), group=placed),
+        Variant("placed, a tenth of the total variation", (*JOINT, *LITTLE_VARIATION), group=placed),
         Variant(
             "placed, each alone, reliability, fine-tune",
             (*TWO_PHASE, *SPLIT, *_shares(0.1, 0.4, 0.3)),
