@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import random
@@ -21,6 +22,7 @@ from mmpi_ns.bench.alternate import Steps
 from mmpi_ns.bench.apart import run_apart
 from mmpi_ns.bench.curves import Curve, compare
 from mmpi_ns.bench.methods import METHODS
+from mmpi_ns.bench.progress import Progress, without_length
 from mmpi_ns.bench.train import Train
 from mmpi_ns.bench.train_report import headline, table
 from mmpi_ns.ops import native
@@ -155,19 +157,19 @@ def test_a_peer_that_was_cut_off_or_was_shorter_goes_on_from_its_last_check(scen
 
 def test_what_a_run_goes_on_from_was_asked_for_in_the_same_words(tmp_path):
     words = ("nerfacto", "--max-num-iterations", "5", "--machine.seed", "0")
+    kept = Progress(without_length(words), [{"step": 1, "seconds": 2.0}, {"step": 2, "seconds": 3.5}], 128, 1.5)
     saved = tmp_path / "step-000000001.ckpt"
+    steps = []
+    kept.save(SimpleNamespace(save_checkpoint=steps.append, checkpoint_dir=tmp_path), tmp_path)
+    assert steps == [1] and Progress.before(words, tmp_path, 5).step == 0, "the trainer names checkpoints by this"
     saved.touch()
-    kept = {"words": trainings._without_length(words), "checkpoints": str(tmp_path), "curve": [{"step": 2}]}
-    (tmp_path / trainings.PROGRESS_FILE).write_text(json.dumps(kept))
-
-    def earlier(words=words, last=5, go_on=True):
-        request = trainings.Request(words, "", 1, str(tmp_path), (1, last), 0, 0, 0, False, True, go_on)
-        return trainings._earlier(request)
-
-    assert earlier() == kept and earlier((*words[:2], "9", *words[3:])) == kept
-    assert earlier((*words[:4], "1")) is None and earlier(last=2) is None and earlier(go_on=False) is None
+    assert Progress.before(words, tmp_path, 5) == kept and (kept.step, kept.seconds) == (2, 3.5)
+    assert Progress.before((*words[:2], "9", *words[3:]), tmp_path, 9) == kept
+    assert Progress.before((*words[:4], "1"), tmp_path, 5).step == 0, "another seed"
+    assert Progress.before(words, tmp_path, 2).step == 0, "a run as long has nothing to add"
+    assert Progress.before(words, tmp_path / "elsewhere", 5) == Progress(without_length(words))
     saved.unlink()
-    assert earlier() is None
+    assert Progress.before(words, tmp_path, 5).step == 0, "its checkpoint is gone"
 
 
 @pytest.mark.parametrize("native_or_torch", ["auto", "torch"])
@@ -191,6 +193,18 @@ def test_quick_hash_lookups_are_nerfstudios_own(levels, size, native_or_torch, m
     torch.testing.assert_close(found[1][0], found[0][0], rtol=0, atol=1e-6 * scale)
     torch.testing.assert_close(found[1][1], found[0][1], rtol=1e-5, atol=1e-4)
     assert float(found[0][1].abs().max()) > 1
+
+
+def test_a_process_is_told_what_its_request_needs(tmp_path, monkeypatch):
+    given = {}
+    monkeypatch.setattr(train, "run_apart", lambda *a, extra: given.update(extra) or {})
+    request = trainings.Request((), "", 1, str(tmp_path), (1,), 0, 0, 0, False, False)
+    train.train_apart(request, tmp_path, 1)
+    assert given == {}, "methods run as they are"
+    train.train_apart(dataclasses.replace(request, go_on=True), tmp_path, 1)
+    assert given == {"TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD": "1"}
+    train.train_apart(dataclasses.replace(request, quick_hashes=True), tmp_path, 1)
+    assert any(name.startswith("MALLOC_") for name in given)
 
 
 def test_quick_hashes_are_for_hash_tables_and_have_rows_of_their_own(scene, tmp_path):
@@ -303,6 +317,10 @@ def test_curves_are_means_over_seeds_read_over_the_logarithm_of_time():
     assert c.at(10**0.5) == pytest.approx(13) and c.at(0.5) is None and c.at(101) is None
     assert c.reaches(17.5) == pytest.approx(10**1.5) and c.reaches(9) == 1 and c.reaches(20.1) is None
     assert c.last_gain() == pytest.approx(50)
+    other = curve([1, 5, 100], [12, 13, 20])
+    other["curve"][1]["step"] = 150  # a run that went on from a shorter one was looked at more often
+    ragged = Curve.of([curve([1, 10, 100], [10, 14, 20]), other])
+    assert ragged.steps.tolist() == [100, 300] and ragged.psnr.tolist() == [11, 20]
 
 
 def test_a_comparison_takes_the_better_of_runs_of_several_lengths():

@@ -24,10 +24,12 @@ class Curve:
 
     @staticmethod
     def of(rows: list[dict[str, Any]]) -> Curve:
-        """The mean of the curves of rows that differ in their seed alone."""
+        """The mean of the curves of rows that differ in their seed alone, at the steps at which all were looked at."""
+        common = set.intersection(*({point["step"] for point in row["curve"]} for row in rows))
 
         def table(name: str) -> Array:
-            return np.array([[point[name] for point in row["curve"]] for row in rows], np.float64)
+            shown = [[point[name] for point in row["curve"] if point["step"] in common] for row in rows]
+            return np.array(shown, np.float64)
 
         psnr = table("psnr")
         seconds = table("seconds").mean(0)

@@ -22,10 +22,8 @@ import torch
 from torch import nn
 
 from mmpi_ns.bench.apart import answer
-from mmpi_ns.bench.provenance import read_json, write_json
+from mmpi_ns.bench.progress import Progress
 from mmpi_ns.metrics import ImageMetrics
-
-PROGRESS_FILE = "progress.json"
 
 
 @dataclass(frozen=True)
@@ -215,18 +213,23 @@ def run(request: Request, tell: Callable[[str], None] = print) -> dict[str, Any]
     config: Any = tyro.cli(AnnotatedBaseConfigUnion, args=list(request.words))
     config.pipeline.datamanager.data = config.data
     config.save_config()
-    earlier = _earlier(request)
-    if earlier is not None:
-        config.load_dir = Path(earlier["checkpoints"])
-        config.load_step = earlier["curve"][-1]["step"] - 1
-        config.max_num_iterations -= earlier["curve"][-1]["step"]  # nerfstudio's trainer makes so many more
-        tell(f"goes on from step {earlier['curve'][-1]['step']}")
+    folder = Path(request.work)
+    last = request.checks[-1] if request.go_on else 0
+    progress = Progress.before(request.words, folder, last)
+    if progress.step:
+        config.load_dir, config.load_step = Path(progress.checkpoints), progress.step - 1
+        config.max_num_iterations -= progress.step  # nerfstudio's trainer makes so many more
+        tell(f"goes on from step {progress.step}")
     # Random draws are not saved with a checkpoint: the second part must not repeat those of the first.
-    _set_random_seed(config.machine.seed + (0 if earlier is None else earlier["curve"][-1]["step"]))
+    _set_random_seed(config.machine.seed + progress.step)
     watch = Stopwatch()
     trainer = config.setup(local_rank=0, world_size=1)
     trainer.setup()
-    row = _follow(trainer, request, watch, tell, earlier)
+    if progress.step:
+        watch.set(progress.seconds)
+    else:
+        progress.setup_seconds = watch.seconds
+    row = _follow(trainer, request, watch, tell, progress)
     for process in getattr(trainer.pipeline.datamanager, "data_procs", []):
         process.terminate()
     if not request.keep:
@@ -234,28 +237,8 @@ def run(request: Request, tell: Callable[[str], None] = print) -> dict[str, Any]
     return row
 
 
-def _earlier(request: Request) -> dict[str, Any] | None:
-    """What a run that this one can go on from left at its last check."""
-    path = Path(request.work) / PROGRESS_FILE
-    if not request.go_on or not path.is_file():
-        return None
-    found = read_json(path)
-    same = found["words"] == _without_length(request.words)
-    step = found["curve"][-1]["step"]
-    saved = Path(found["checkpoints"]) / f"step-{step - 1:09d}.ckpt"
-    return found if same and step < request.checks[-1] and saved.is_file() else None
-
-
-def _without_length(words: tuple[str, ...]) -> list[str]:
-    return [w for i, w in enumerate(words) if i == 0 or words[i - 1] != "--max-num-iterations"]
-
-
 def _follow(
-    trainer: Any,
-    request: Request,
-    watch: Stopwatch,
-    tell: Callable[[str], None],
-    earlier: dict[str, Any] | None = None,
+    trainer: Any, request: Request, watch: Stopwatch, tell: Callable[[str], None], progress: Progress
 ) -> dict[str, Any]:
     """Trains with the callback that looks."""
     from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
@@ -263,46 +246,36 @@ def _follow(
     pipeline = trainer.pipeline
     split = split_of(pipeline.datamanager)
     check_split(split, Path(request.data), request.downscale_factor)
-    count, rays, setup_seconds, curve = len(split["test"]), 0, watch.seconds, []
-    if earlier is not None:
-        rays, setup_seconds, curve = earlier["rays"], earlier["setup_seconds"], earlier["curve"]
-        watch.set(earlier["curve"][-1]["seconds"])
+    count = len(split["test"])
     final: dict[str, float] = {}
 
     def look(step: int) -> None:
-        nonlocal rays
-        rays += pixels_of_step(pipeline)
+        progress.rays += pixels_of_step(pipeline)
         if step + 1 not in request.checks:
             return
         seconds = watch.seconds
         with watch.stopped():
             found = score(pipeline, evenly(count, request.check_images), request.check_pixels, request.whole_images)
-            curve.append({"step": step + 1, "rays": rays, "seconds": seconds, "psnr": found["psnr"]})
+            point = {"step": step + 1, "rays": progress.rays, "seconds": seconds, "psnr": found["psnr"]}
+            progress.curve.append(point)
             tell(f"step {step + 1}: {seconds:.0f} s of training, {found['psnr']:.2f} dB")
             if request.go_on:
-                save(step)
+                progress.save(trainer, Path(request.work))
             if step + 1 == request.checks[-1]:
                 final.update(score(pipeline, evenly(count, request.final_images), 0, request.whole_images))
-
-    def save(step: int) -> None:
-        trainer.save_checkpoint(step)
-        kept = {"words": _without_length(request.words), "checkpoints": str(trainer.checkpoint_dir)}
-        kept |= {"curve": curve, "rays": rays, "setup_seconds": setup_seconds}
-        write_json(Path(request.work) / PROGRESS_FILE, kept)
 
     trainer.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], look))
     trainer.train()
     peak = {"peak_gib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20}
     if torch.cuda.is_available():
         peak["peak_gpu_gib"] = torch.cuda.max_memory_allocated() / 2**30
-    parameters = sum(p.numel() for p in pipeline.model.parameters())
     return {
-        "curve": curve,
+        "curve": progress.curve,
         **final,
-        "setup_seconds": setup_seconds,
-        "seconds": curve[-1]["seconds"],
-        "rays": rays,
-        "parameters": parameters,
+        "setup_seconds": progress.setup_seconds,
+        "seconds": progress.seconds,
+        "rays": progress.rays,
+        "parameters": sum(p.numel() for p in pipeline.model.parameters()),
         **peak,
         "split": {**{k: len(split[k]) for k in ("train", "test")}, "size": split["size"], "digest": split["digest"]},
     }
