@@ -98,7 +98,8 @@ def _of_table(table: list[Group]) -> dict[str, float]:
             best = max(g.mean("psnr") for g in ours)
             compared["delta_at_end_db"] = best - longest.mean("psnr")
             # The peer that runs everywhere has the plain names.
-            found |= compared if peer == "nerfacto" else {f"{_slug(peer)}_{k}": v for k, v in compared.items()}
+            named = {k if _slug(peer) in k else f"{_slug(peer)}_{k}": v for k, v in compared.items()}
+            found |= compared if peer == "nerfacto" else named
     return found
 
 
