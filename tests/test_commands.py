@@ -110,6 +110,24 @@ def test_there_are_five_methods():
     assert METHODS == ["mmpi", "mmpi-kitti", "mmpi-scannet", "mmpi-scannet-short", "mmpi-small"]
 
 
+def test_the_papers_methods_keep_its_settings_and_ours_have_their_own():
+    from mmpi_ns import mmpi_config
+
+    models = {n: getattr(mmpi_config, n).config.pipeline.model for n in ("mmpi", "mmpi_small", "mmpi_kitti")}
+    models |= {n: getattr(mmpi_config, n).config.pipeline.model for n in ("mmpi_scannet", "mmpi_scannet_short")}
+    for name, model in models.items():
+        ours = name in ("mmpi", "mmpi_small")
+        assert (model.loss.tv_density, model.loss.tv_features) == ((1e-4, 1e-5) if ours else (1e-5, 1e-6)), name
+    kitti = models["mmpi_kitti"]
+    assert (kitti.training, kitti.rays_per_mpi, kitti.blend_share, kitti.finetune_share) == (
+        "two-phase",
+        "split",
+        0.25,
+        0.0,
+    )
+    assert len({id(m.loss) for m in models.values()}) == len(models), "a change of one must not reach another"
+
+
 def test_training_leaves_a_config_a_plan_and_checkpoints(run_folder, plan_file):
     assert sorted(p.name for p in (run_folder / "nerfstudio_models").iterdir()) == [
         f"step-{s:09d}.ckpt" for s in (SAVED, 2 * SAVED, STEPS - 1)
