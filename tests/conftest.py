@@ -10,7 +10,7 @@ import torch
 from hand_made import make_mpi
 from tiny_scene import write_scene
 
-from mmpi_ns.placement.plan import CubePlan, ScenePlan
+from mmpi_ns.scene.plan import CubePlan, ScenePlan
 
 # Of the processes that tests start too: test files run side by side, and threads that wait for each other spin.
 os.environ.setdefault("OMP_NUM_THREADS", "1")

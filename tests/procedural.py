@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from mmpi_ns.placement.observations import Observations
@@ -45,4 +47,14 @@ def observations_of(scene, per_camera=40, seed=0, limit=None):
         seen_by=np.concatenate(seen_by),
         seen_point=np.concatenate(seen_point),
         seen_at=np.concatenate(seen_at),
+    )
+
+
+def moved(observations: Observations, turn: np.ndarray, shift: np.ndarray, scale: float) -> Observations:
+    poses = observations.camera_to_worlds
+    centers = scale * (poses[:, :, 3] @ turn.T) + shift
+    return replace(
+        observations,
+        camera_to_worlds=np.concatenate([turn @ poses[:, :, :3], centers[:, :, None]], -1),
+        points=scale * (observations.points @ turn.T) + shift,
     )

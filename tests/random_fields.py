@@ -8,15 +8,16 @@ from itertools import pairwise
 
 import numpy as np
 import oracle
+import pytest
 import torch
 from hand_made import random_mpi, unit
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.field_components.field_heads import FieldHeadNames
 
-from mmpi_ns.compositing import blended_optical_depth, composite_weights, render_colors
-from mmpi_ns.mmpi_field import MMPIField
-from mmpi_ns.mmpi_sampler import MMPISampler
-from mmpi_ns.placement.plan import CubePlan, ScenePlan
+from mmpi_ns.field.mmpi_field import MMPIField
+from mmpi_ns.ops.compositing import blended_optical_depth, composite_weights, render_colors
+from mmpi_ns.rendering.sampler import MMPISampler
+from mmpi_ns.scene.plan import CubePlan, ScenePlan
 
 
 def random_plan(num_mpis, with_cube, seed, planes=12):
@@ -192,3 +193,33 @@ class OracleRay:
     def render(self, form=None, heads=None):
         chosen = self.heads if heads is None else [s if k in heads else [] for k, s in enumerate(self.heads)]
         return oracle.render_ray(chosen, form)
+
+
+ERROR = 3e-5
+"""float32 against float64."""
+CLEAR = 2e-5
+"""Rays on which any decision is closer than this may differ in float32 and are left out."""
+
+
+def compare(field, origins, directions, form=None, heads_of=None, near=0.05, far=math.inf, error=ERROR, **chosen):
+    """Renders all rays at once and each by the oracle; returns the number of clear rays that met something."""
+    found = render(field, bundle(origins, directions, near, far), blend_form=form, **chosen)
+    met = 0
+    for i in range(len(origins)):
+        ray = OracleRay(field, origins[i], directions[i], near, far)
+        if ray.margin < CLEAR:
+            continue
+        wanted = ray.render(form, heads_of(i, ray) if heads_of else None)
+        count = len(wanted.samples)
+        assert found.report.live[i] == count
+        valid = found.samples.metadata["valid"][i, :, 0]
+        assert valid.sum() == count and valid[:count].all()
+        assert found.samples.metadata["heads"][i, :count, 0].tolist() == [s.head for s in wanted.samples]
+        assert found.samples.metadata["planes"][i, :count, 0].tolist() == [s.plane for s in wanted.samples]
+        inverse_t = found.samples.metadata["inverse_t"][i, :count, 0].tolist()
+        assert inverse_t == pytest.approx([s.inverse_t for s in wanted.samples], rel=1e-4, abs=1e-6)
+        assert np.abs(found.composite.weights[i, :count].numpy() - wanted.weights).max(initial=0) < error
+        assert np.abs(found.rgb[i].numpy() - wanted.color).max() < error
+        assert abs(found.composite.transmittance[i].item() - wanted.transmittance) < error
+        met += count > 0
+    return met

@@ -6,11 +6,12 @@ import copy
 from pathlib import Path
 
 import numpy as np
+import torch
 from nerfstudio.engine import trainer as nerfstudio_trainer
 
-from mmpi_ns.mmpi_config import mmpi_small
-from mmpi_ns.mmpi_datamanager import MMPIDataManagerConfig
-from mmpi_ns.placement.plan import CubePlan, MPIPlan, ScenePlan
+from mmpi_ns.capture.datamanager import MMPIDataManagerConfig
+from mmpi_ns.config import mmpi_small
+from mmpi_ns.scene.plan import CubePlan, MPIPlan, ScenePlan
 
 
 def datamanager(data: Path, test_mode="val", **settings):
@@ -97,3 +98,24 @@ def ready(config, **changes):
     trainer = config.setup(local_rank=0, world_size=1)
     trainer.setup()
     return trainer
+
+
+def differences(a, b, path=""):
+    """Where two nested states differ."""
+    if isinstance(a, dict) and isinstance(b, dict):
+        if set(map(str, a)) != set(map(str, b)):
+            return [f"{path}: {sorted(map(str, a))} and {sorted(map(str, b))}"]
+        return [d for k in a for d in differences(a[k], b[k], f"{path}/{k}")]
+    if isinstance(a, (list, tuple)):
+        return [d for i, (x, y) in enumerate(zip(a, b, strict=True)) for d in differences(x, y, f"{path}/{i}")]
+    if isinstance(a, torch.Tensor):
+        return [] if a.shape == b.shape and torch.equal(a, b) else [path]
+    return [] if a == b else [f"{path}: {a} and {b}"]
+
+
+def load(folder, step):
+    return torch.load(folder / f"step-{step:09d}.ckpt", map_location="cpu", weights_only=True)
+
+
+def compared(state):
+    return {k: state[k] for k in ("step", "pipeline", "optimizers", "schedulers", "scalers")}

@@ -13,9 +13,9 @@ from random_fields import bundle, random_field, random_rays
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 
-from mmpi_ns.color_network import ColorNetworks
-from mmpi_ns.mmpi_sampler import MMPISampler
+from mmpi_ns.field.color_network import ColorNetworks
 from mmpi_ns.ops import triton_composite, triton_march, triton_shade, triton_tables
+from mmpi_ns.rendering.sampler import MMPISampler
 
 TARGET = GPUTarget("cuda", 90, 32)
 NAMES = {

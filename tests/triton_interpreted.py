@@ -8,17 +8,17 @@ import numpy as np
 import oracle
 import pytest
 import torch
+from bricked import bricked_field
 from hand_made import make_mpi, random_mpi, unit
 from interpreting import by_torch, interpreted, normal  # noqa: F401
 from random_fields import OracleRay, bundle, fill, random_field, random_rays, render
-from test_bricks import bricked_field
 
-from mmpi_ns import compositing, mmpi_sampler
-from mmpi_ns.mmpi_field import MMPIField
-from mmpi_ns.mmpi_sampler import MMPISampler
-from mmpi_ns.mmpi_samples import metadata_of
-from mmpi_ns.ops import composite
-from mmpi_ns.placement.plan import CubePlan, ScenePlan
+from mmpi_ns.field.mmpi_field import MMPIField
+from mmpi_ns.field.samples import metadata_of
+from mmpi_ns.ops import composite, compositing
+from mmpi_ns.rendering import sampler as mmpi_sampler
+from mmpi_ns.rendering.sampler import MMPISampler
+from mmpi_ns.scene.plan import CubePlan, ScenePlan
 
 triton_march = pytest.importorskip("mmpi_ns.ops.triton_march")
 triton_tables = pytest.importorskip("mmpi_ns.ops.triton_tables")

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import pytest
 import torch
+from bricked import SHAPES, bricked_field, thinned
 from interpreting import by_torch, interpreted, normal  # noqa: F401
 from random_fields import bundle, random_field, random_rays
-from test_bricks import SHAPES, bricked_field, thinned
 
-from mmpi_ns import compositing
-from mmpi_ns.mmpi_field import MMPIField
-from mmpi_ns.mmpi_sampler import MMPISampler
-from mmpi_ns.ops import composite, interpolate
+from mmpi_ns.field.mmpi_field import MMPIField
+from mmpi_ns.ops import composite, compositing, interpolate
 from mmpi_ns.ops.variation import total_variation, total_variation_reference
-from mmpi_ns.touched_adam import TouchedAdam
+from mmpi_ns.rendering.sampler import MMPISampler
+from mmpi_ns.training.touched_adam import TouchedAdam
 
 triton_march = pytest.importorskip("mmpi_ns.ops.triton_march")
 triton_tables = pytest.importorskip("mmpi_ns.ops.triton_tables")

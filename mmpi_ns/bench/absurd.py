@@ -16,11 +16,11 @@ import torch
 from nerfstudio.engine import trainer as nerfstudio_trainer
 
 from mmpi_ns.bench.provenance import commit
-from mmpi_ns.mmpi_config import mmpi_small
-from mmpi_ns.mmpi_trainer import MMPITrainer
-from mmpi_ns.placement.plan import MPIPlan, ScenePlan
-from mmpi_ns.scenes.catalogue import make_scene
-from mmpi_ns.scenes.dataset import write_dataset
+from mmpi_ns.config import mmpi_small
+from mmpi_ns.scene.plan import MPIPlan, ScenePlan
+from mmpi_ns.synthetic.catalogue import make_scene
+from mmpi_ns.synthetic.dataset import write_dataset
+from mmpi_ns.training.trainer import MMPITrainer
 
 WIDTH, HEIGHT, IMAGES = 32, 24, 9
 RAYS = 64

@@ -13,8 +13,8 @@ from mmpi_ns.bench.exact import Array
 from mmpi_ns.bench.provenance import stamp, stamp_line, write_json
 from mmpi_ns.bench.rendering import bundle_of, render
 from mmpi_ns.bench.solids import Solids, bake
-from mmpi_ns.compositing import BlendForm
-from mmpi_ns.placement.plan import MPIPlan
+from mmpi_ns.ops.compositing import BlendForm
+from mmpi_ns.scene.plan import MPIPlan
 
 SLANTED = Solids((-0.3, 0.2, 1.0), 6.0, ball=(-0.4, 0.3, 4.2, 0.9))
 """A slanted wall with a ball before it."""

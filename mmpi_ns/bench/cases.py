@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from mmpi_ns.bench.exact import Array
-from mmpi_ns.placement.plan import CubePlan, MPIPlan, ScenePlan
+from mmpi_ns.scene.plan import CubePlan, MPIPlan, ScenePlan
 
 UNIT = 2.0**-24
 """Unit roundoff of float32: the largest relative error of one rounding."""

@@ -11,7 +11,8 @@ import torch
 from mmpi_ns.bench import exact
 from mmpi_ns.bench.cases import Case, Error, Outcome, Precision, compare, plan_of, random_mpi, single
 from mmpi_ns.bench.exact import Array
-from mmpi_ns.compositing import (
+from mmpi_ns.field.mmpi_field import MMPIField
+from mmpi_ns.ops.compositing import (
     BlendForm,
     blend_shares,
     blended_optical_depth,
@@ -19,7 +20,6 @@ from mmpi_ns.compositing import (
     median_inverse_distance,
     render_colors,
 )
-from mmpi_ns.mmpi_field import MMPIField
 
 # Densities -----------------------------------------------------------------------------------------------------------
 

@@ -25,7 +25,7 @@ from mmpi_ns.bench.cases import (
     snap,
 )
 from mmpi_ns.bench.exact import Array
-from mmpi_ns.geometry import (
+from mmpi_ns.scene.geometry import (
     Cube,
     Frames,
     PlaneHits,
@@ -35,7 +35,7 @@ from mmpi_ns.geometry import (
     sample_disparity,
     samples_to_ndc,
 )
-from mmpi_ns.placement.plan import CubePlan, MPIPlan, Vector
+from mmpi_ns.scene.plan import CubePlan, MPIPlan, Vector
 
 GROUP = "geometry"
 ROUNDINGS = 16

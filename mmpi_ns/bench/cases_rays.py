@@ -28,10 +28,10 @@ from mmpi_ns.bench.cases import (
 from mmpi_ns.bench.exact import Array, Jitter
 from mmpi_ns.bench.exact_ray import TABLES, ExactField, ExactRay, Gradients
 from mmpi_ns.bench.rendering import Rendered, bundle_of, render
-from mmpi_ns.compositing import BlendForm
-from mmpi_ns.mmpi_field import MMPIField
-from mmpi_ns.mmpi_samples import metadata_of
-from mmpi_ns.placement.plan import CubePlan, MPIPlan, ScenePlan
+from mmpi_ns.field.mmpi_field import MMPIField
+from mmpi_ns.field.samples import metadata_of
+from mmpi_ns.ops.compositing import BlendForm
+from mmpi_ns.scene.plan import CubePlan, MPIPlan, ScenePlan
 
 GROUP = "whole rays"
 DRAWS = 4

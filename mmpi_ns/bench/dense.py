@@ -16,13 +16,13 @@ from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.field_components.field_heads import FieldHeadNames
 from torch import Tensor
 
-from mmpi_ns.compositing import composite_weights, render_colors
-from mmpi_ns.geometry import inverse_distance, plane_hits, sample_disparity
-from mmpi_ns.mmpi_field import MMPIField
-from mmpi_ns.mmpi_sampler import MMPISampler
+from mmpi_ns.field.mmpi_field import MMPIField
+from mmpi_ns.ops.compositing import composite_weights, render_colors
 from mmpi_ns.ops.interpolate import interpolate_reference
-from mmpi_ns.placement.plan import MPIPlan, ScenePlan
-from mmpi_ns.touched_adam import TouchedAdam
+from mmpi_ns.rendering.sampler import MMPISampler
+from mmpi_ns.scene.geometry import inverse_distance, plane_hits, sample_disparity
+from mmpi_ns.scene.plan import MPIPlan, ScenePlan
+from mmpi_ns.training.touched_adam import TouchedAdam
 
 
 @dataclass

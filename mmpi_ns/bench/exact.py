@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mmpi_ns.placement.plan import CubePlan, MPIPlan
+from mmpi_ns.scene.plan import CubePlan, MPIPlan
 
 Array = NDArray[Any]
 """Of float64; numpy's stubs lose that in too many operations to say so."""

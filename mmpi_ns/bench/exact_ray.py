@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from mmpi_ns.bench import exact
 from mmpi_ns.bench.exact import STILL, Array, Jitter
-from mmpi_ns.placement.plan import MPIPlan, ScenePlan
+from mmpi_ns.scene.plan import MPIPlan, ScenePlan
 
 TABLES = ("density", "features", "reliability", "networks")
 

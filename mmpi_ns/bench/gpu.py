@@ -97,8 +97,8 @@ class Gpu:
         """The data set, or a street that is made now."""
         if self.data is not None:
             return self.data.resolve()
-        from mmpi_ns.scenes.catalogue import make_scene
-        from mmpi_ns.scenes.dataset import write_dataset
+        from mmpi_ns.synthetic.catalogue import make_scene
+        from mmpi_ns.synthetic.dataset import write_dataset
 
         folder, (width, height) = (self.work / "street").resolve(), (40, 12) if self.rehearse else (621, 188)
         if not (folder / "transforms.json").is_file():

@@ -11,21 +11,20 @@ import torch
 from nerfstudio.field_components.field_heads import FieldHeadNames
 from torch import Tensor
 
-from mmpi_ns import compositing
-from mmpi_ns.baking import shares_at
 from mmpi_ns.bench.cases_rays import CLEAR, CUBE, Scene, scene
 from mmpi_ns.bench.exact_ray import ExactField, ExactRay, Gradients
 from mmpi_ns.bench.rendering import bundle_of
-from mmpi_ns.compositing import BlendForm
-from mmpi_ns.mmpi_field import NEGLIGIBLE_DEPTH, MMPIField
-from mmpi_ns.mmpi_sampler import MMPISampler
-from mmpi_ns.mmpi_samples import metadata_of
-from mmpi_ns.ops import native
+from mmpi_ns.field.baking import shares_at
+from mmpi_ns.field.mmpi_field import NEGLIGIBLE_DEPTH, MMPIField
+from mmpi_ns.field.samples import metadata_of
+from mmpi_ns.ops import compositing, native
 from mmpi_ns.ops.composite import composite_weights
+from mmpi_ns.ops.compositing import BlendForm
 from mmpi_ns.ops.interpolate import add_rows, index_rows, interpolate, interpolate_reference
 from mmpi_ns.ops.variation import total_variation, total_variation_reference
-from mmpi_ns.placement.plan import CubePlan
-from mmpi_ns.touched_adam import TouchedAdam
+from mmpi_ns.rendering.sampler import MMPISampler
+from mmpi_ns.scene.plan import CubePlan
+from mmpi_ns.training.touched_adam import TouchedAdam
 
 FORMS: tuple[BlendForm, ...] = ("paper", "opacity")
 

@@ -22,10 +22,10 @@ from mmpi_ns.bench.apart import answer
 from mmpi_ns.bench.gpu_checks import run_checks
 from mmpi_ns.bench.methods import Method, Scene
 from mmpi_ns.bench.suites import JOINT, TWO_PHASE, P
-from mmpi_ns.mmpi_field import MMPIField
-from mmpi_ns.mmpi_model import MMPIModel
+from mmpi_ns.field.mmpi_field import MMPIField
+from mmpi_ns.model import MMPIModel
 from mmpi_ns.ops import interpolate, native
-from mmpi_ns.placement.plan import MPIPlan, ScenePlan
+from mmpi_ns.scene.plan import MPIPlan, ScenePlan
 
 Tell = Callable[[str], None]
 SECTOR = 32
@@ -113,8 +113,8 @@ def measure_operations(request: dict[str, Any], tell: Tell) -> dict[str, Any]:
 @torch.no_grad()
 def _measure_march(field: MMPIField, rays: dict[str, Tensor], repeats: int) -> dict[str, float]:
     """The kernel alone on rays that nothing stops and that keep nothing: it looks up every live sample."""
-    from mmpi_ns.geometry import plane_hits
     from mmpi_ns.ops import triton_march
+    from mmpi_ns.scene.geometry import plane_hits
 
     hits = plane_hits(rays["origins"], rays["directions"], rays["nears"], rays["fars"], field.frames)
     live = int(hits.count.sum())

@@ -15,10 +15,10 @@ from torch import Tensor
 from mmpi_ns.bench.alternate import Steps, clock
 from mmpi_ns.bench.methods import METHODS, Scene
 from mmpi_ns.bench.provenance import fingerprint, read_json, stamp, stamp_line, write_json
-from mmpi_ns.compositing import composite_weights, render_colors
-from mmpi_ns.mmpi_model import FAIR_SHARE, MMPIModel
-from mmpi_ns.mmpi_samples import Gathered, Lookup, Taps, metadata_of
+from mmpi_ns.field.samples import Gathered, Lookup, Taps, metadata_of
+from mmpi_ns.model import FAIR_SHARE, MMPIModel
 from mmpi_ns.ops.colors import colors
+from mmpi_ns.ops.compositing import composite_weights, render_colors
 from mmpi_ns.ops.interpolate import gather_rows, index_rows, interpolate_gathered, sum_by_position
 from mmpi_ns.ops.merge import merge
 

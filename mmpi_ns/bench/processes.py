@@ -63,8 +63,8 @@ class Processes:
 
     def _plan(self) -> int:
         """Places MPIs for the steps of the longer run; returns how many windows there are."""
-        from mmpi_ns.mmpi_config import mmpi_small
-        from mmpi_ns.mmpi_scene import load_observations
+        from mmpi_ns.capture.load import load_observations
+        from mmpi_ns.config import mmpi_small
         from mmpi_ns.placement.split import place_windows
 
         manager: Any = mmpi_small.config.pipeline.datamanager

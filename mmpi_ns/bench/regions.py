@@ -10,11 +10,11 @@ import numpy as np
 import torch
 from nerfstudio.utils.eval_utils import eval_setup
 
-from mmpi_ns.mmpi_datamanager import MMPIDataManager
-from mmpi_ns.mmpi_model import MMPIModel
+from mmpi_ns.capture.datamanager import MMPIDataManager
+from mmpi_ns.model import MMPIModel
 from mmpi_ns.placement.errors import WORST, pixel_errors
 from mmpi_ns.placement.observations import Array, Observations
-from mmpi_ns.placement.plan import ScenePlan
+from mmpi_ns.scene.plan import ScenePlan
 
 MIN_POINTS = 5
 """SfM points that a region must hold for its expected error to count."""

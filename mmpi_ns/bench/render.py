@@ -17,9 +17,9 @@ from mmpi_ns.bench.exact import Array
 from mmpi_ns.bench.exact_ray import ExactField, ExactRay
 from mmpi_ns.bench.provenance import fingerprint, read_json, stamp, stamp_line, write_json
 from mmpi_ns.bench.trainings import evenly
-from mmpi_ns.metrics import ImageMetrics
-from mmpi_ns.mmpi_model import BACKGROUNDS, MMPIModel
+from mmpi_ns.model import BACKGROUNDS, MMPIModel
 from mmpi_ns.ops import native
+from mmpi_ns.rendering.metrics import ImageMetrics
 
 NOISE = 1.05
 """A setting must be so much faster than another to count as faster."""

@@ -12,7 +12,9 @@ from nerfstudio.field_components.field_heads import FieldHeadNames
 from torch import Tensor
 
 from mmpi_ns.bench.exact import Array
-from mmpi_ns.compositing import (
+from mmpi_ns.field.mmpi_field import MMPIField
+from mmpi_ns.field.samples import metadata_of
+from mmpi_ns.ops.compositing import (
     BlendForm,
     Composite,
     blended_optical_depth,
@@ -20,9 +22,7 @@ from mmpi_ns.compositing import (
     median_inverse_distance,
     render_colors,
 )
-from mmpi_ns.mmpi_field import MMPIField
-from mmpi_ns.mmpi_sampler import MergeReport, MMPISampler
-from mmpi_ns.mmpi_samples import metadata_of
+from mmpi_ns.rendering.sampler import MergeReport, MMPISampler
 
 
 @dataclass(frozen=True)

@@ -17,11 +17,11 @@ from typing import Any
 
 from mmpi_ns.bench.provenance import commit, processor
 from mmpi_ns.bench.suites import DEFAULT, SUITES, Variant
-from mmpi_ns.mmpi_scene import load_observations
-from mmpi_ns.placement.content import find_content
+from mmpi_ns.capture.load import load_observations
 from mmpi_ns.placement.errors import pixel_errors
 from mmpi_ns.placement.observations import Observations
-from mmpi_ns.placement.plan import ScenePlan
+from mmpi_ns.placement.visibility import find_content
+from mmpi_ns.scene.plan import ScenePlan
 
 RAYS_PER_STEP = 1024
 

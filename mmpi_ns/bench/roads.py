@@ -16,7 +16,7 @@ import torch
 
 from mmpi_ns.bench.apart import answer, run_apart
 from mmpi_ns.bench.provenance import fingerprint, read_json, stamp, stamp_line, write_json
-from mmpi_ns.windows import Window
+from mmpi_ns.scene.windows import Window
 
 BYTES_A_TEXEL = 4 * (1 + 9 + 1) + 1
 """Density, features, reliability and the mark of having been trained."""
@@ -94,10 +94,10 @@ def plan_road(folder: Path, length: float, steps: int, windows: int) -> dict[str
     Returns:
         Seconds of planning, windows, MPIs of all and of the largest, texels of all and of the largest, cameras.
     """
-    from mmpi_ns.mmpi_scene import load_observations
+    from mmpi_ns.capture.load import load_observations
     from mmpi_ns.placement.split import place_windows
-    from mmpi_ns.scenes.catalogue import make_scene
-    from mmpi_ns.scenes.dataset import write_dataset
+    from mmpi_ns.synthetic.catalogue import make_scene
+    from mmpi_ns.synthetic.dataset import write_dataset
 
     scene = make_scene("long-road", length=length)
     data = folder / "data"
@@ -124,8 +124,8 @@ def _write_images(scene: Any, data: Path, windows: list[Window]) -> None:
     """Renders what the cameras about some windows see: those that they train with and are looked at from."""
     from PIL import Image
 
-    from mmpi_ns.scenes.dataset import image_name
-    from mmpi_ns.scenes.scene import render
+    from mmpi_ns.synthetic.dataset import image_name
+    from mmpi_ns.synthetic.scene import render
 
     manager = _setup(_config(data.parent, 10), reads_images=False).pipeline.datamanager
     outputs = manager.train_dataparser_outputs
@@ -200,7 +200,7 @@ def _samples(model: Any, camera: Any) -> dict[str, float]:
 
 
 def _config(folder: Path, steps: int, plan: Path | None = None) -> Any:
-    from mmpi_ns.mmpi_config import mmpi_small
+    from mmpi_ns.config import mmpi_small
 
     config: Any = copy.deepcopy(mmpi_small.config)
     config.output_dir, config.experiment_name, config.timestamp = folder / "run", "road", "a"

@@ -19,10 +19,10 @@ from mmpi_ns.bench.apart import answer, run_apart
 from mmpi_ns.bench.dense import _batch as make_batch
 from mmpi_ns.bench.dense import _ours as render_rays
 from mmpi_ns.bench.provenance import fingerprint, read_json, stamp, stamp_line, write_json
-from mmpi_ns.mmpi_field import MMPIField
-from mmpi_ns.mmpi_sampler import MMPISampler
-from mmpi_ns.placement.plan import MPIPlan, ScenePlan
-from mmpi_ns.touched_adam import TouchedAdam
+from mmpi_ns.field.mmpi_field import MMPIField
+from mmpi_ns.rendering.sampler import MMPISampler
+from mmpi_ns.scene.plan import MPIPlan, ScenePlan
+from mmpi_ns.training.touched_adam import TouchedAdam
 
 TRAVEL = 40.0
 """Units over which the MPIs stand, one behind the other; the cameras are among them."""

@@ -8,8 +8,8 @@ import numpy as np
 import torch
 
 from mmpi_ns.bench.exact import Array, disparities
-from mmpi_ns.mmpi_field import MMPIField
-from mmpi_ns.placement.plan import MPIPlan, ScenePlan
+from mmpi_ns.field.mmpi_field import MMPIField
+from mmpi_ns.scene.plan import MPIPlan, ScenePlan
 
 STEEPNESS = 1e6
 """Raw density per unit of depth inside a solid: from empty to opaque within 1e-5 units, and affine, so that bilinear

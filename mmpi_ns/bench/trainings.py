@@ -23,7 +23,7 @@ from torch import nn
 
 from mmpi_ns.bench.apart import answer
 from mmpi_ns.bench.progress import Progress
-from mmpi_ns.metrics import ImageMetrics
+from mmpi_ns.rendering.metrics import ImageMetrics
 
 
 @dataclass(frozen=True)

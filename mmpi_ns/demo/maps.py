@@ -9,7 +9,7 @@ from PIL import Image, ImageDraw
 
 from mmpi_ns.demo.painting import font, rgb8
 from mmpi_ns.placement.observations import Array, Observations
-from mmpi_ns.placement.plan import CubePlan, MPIPlan
+from mmpi_ns.scene.plan import CubePlan, MPIPlan
 
 FINER = 3
 """Drawn so many times larger, then averaged."""

@@ -22,9 +22,9 @@ from mmpi_ns.demo.painting import (
     write,
 )
 from mmpi_ns.demo.views import Picture, Run, View, render_alone, render_view, truth_of
-from mmpi_ns.placement.explain import describe_facing
 from mmpi_ns.placement.observations import Array
-from mmpi_ns.placement.plan import CubePlan, MPIPlan
+from mmpi_ns.placement.show.explain import describe_facing
+from mmpi_ns.scene.plan import CubePlan, MPIPlan
 
 LABELS, VIEW, GAP = 400, 360, 6
 """Widths of the column of labels and of a view, and the space between pictures; pixels."""

@@ -12,11 +12,11 @@ from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.utils.eval_utils import eval_setup
 from numpy.typing import NDArray
 
-from mmpi_ns.metrics import head_palette
-from mmpi_ns.mmpi_datamanager import MMPIDataManager
-from mmpi_ns.mmpi_model import MMPIModel
+from mmpi_ns.capture.datamanager import MMPIDataManager
+from mmpi_ns.model import MMPIModel
 from mmpi_ns.placement.observations import Observations
-from mmpi_ns.placement.plan import ScenePlan
+from mmpi_ns.rendering.metrics import head_palette
+from mmpi_ns.scene.plan import ScenePlan
 
 Picture = NDArray[np.float32]
 

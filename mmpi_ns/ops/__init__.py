@@ -1,0 +1,1 @@
+"""Inner loops: for each operation a plain torch reference, a compiled CPU form and a GPU form."""

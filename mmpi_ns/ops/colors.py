@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from mmpi_ns.color_network import ColorNetworks, positional_encoding
+from mmpi_ns.field.color_network import ColorNetworks, positional_encoding
 from mmpi_ns.ops import native
 
 PART = 2048

@@ -9,9 +9,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from mmpi_ns import compositing
-from mmpi_ns.compositing import Composite
-from mmpi_ns.ops import native
+from mmpi_ns.ops import compositing, native
+from mmpi_ns.ops.compositing import Composite
 
 
 class _Weights(torch.autograd.Function):

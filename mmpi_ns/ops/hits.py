@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mmpi_ns.geometry import FACING_EPS, Frames, PlaneHits
 from mmpi_ns.ops import native
+from mmpi_ns.scene.geometry import FACING_EPS, Frames, PlaneHits
 
 
 def pack_frames(frames: Frames) -> Float[Tensor, "K 19"]:

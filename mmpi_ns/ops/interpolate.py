@@ -17,7 +17,7 @@ from torch import Tensor
 
 from mmpi_ns.ops import native
 from mmpi_ns.ops.march import Grid
-from mmpi_ns.texels import BRICK, TexelGrid
+from mmpi_ns.scene.texels import BRICK, TexelGrid
 
 MOST_ROWS = 2**31
 """The compiled index of rows takes a quarter byte for every row up to the highest: beyond this, torch's sort."""

@@ -15,11 +15,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from mmpi_ns.compositing import BlendForm
-from mmpi_ns.geometry import Cube, PlaneHits
 from mmpi_ns.ops import native
-from mmpi_ns.placement.plan import MPIPlan
-from mmpi_ns.texels import TexelGrid
+from mmpi_ns.ops.compositing import BlendForm
+from mmpi_ns.scene.geometry import Cube, PlaneHits
+from mmpi_ns.scene.plan import MPIPlan
+from mmpi_ns.scene.texels import TexelGrid
 
 FORMS: dict[BlendForm | None, int] = {None: 0, "paper": 1, "opacity": 2}
 """How the kernels are told in which form reliability enters; ``BAKED`` more where shares stand in its place."""

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from mmpi_ns.compositing import exclusive_cumsum
+from mmpi_ns.ops.compositing import exclusive_cumsum
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from mmpi_ns.color_network import ColorNetworks
+from mmpi_ns.field.color_network import ColorNetworks
 from mmpi_ns.ops import native
 from mmpi_ns.ops.colors import Network
 from mmpi_ns.ops.march import SceneTables

@@ -12,7 +12,7 @@ import triton.language as tl
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mmpi_ns.compositing import Composite
+from mmpi_ns.ops.compositing import Composite
 from mmpi_ns.ops.triton_scene import block_size, one_minus_exp
 
 SLOTS = 2048

@@ -10,8 +10,8 @@ import triton.language as tl
 from jaxtyping import Float
 from torch import Tensor
 
-from mmpi_ns.geometry import FACING_EPS, PlaneHits
 from mmpi_ns.ops.triton_scene import block_size
+from mmpi_ns.scene.geometry import FACING_EPS, PlaneHits
 
 EPS = tl.constexpr(FACING_EPS)
 # Columns of an MPI's frame (ops.hits.pack_frames).

@@ -16,8 +16,7 @@ import triton.language as tl
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from mmpi_ns.compositing import BlendForm
-from mmpi_ns.geometry import PlaneHits
+from mmpi_ns.ops.compositing import BlendForm
 from mmpi_ns.ops.march import BAKED, FORMS, Kept
 from mmpi_ns.ops.triton_scene import (
     BIAS,
@@ -42,6 +41,7 @@ from mmpi_ns.ops.triton_scene import (
     softplus,
     trilinear,
 )
+from mmpi_ns.scene.geometry import PlaneHits
 
 OPAQUE = tl.constexpr(1e-5)
 """Light that may be lost behind the end of a ray."""

@@ -16,9 +16,9 @@ import triton.language as tl
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from mmpi_ns.geometry import Cube
-from mmpi_ns.placement.plan import MPIPlan
-from mmpi_ns.texels import TexelGrid
+from mmpi_ns.scene.geometry import Cube
+from mmpi_ns.scene.plan import MPIPlan
+from mmpi_ns.scene.texels import TexelGrid
 
 # Columns of the constants of a head; the cube's row holds its interval alone.
 STEP = tl.constexpr(0)

@@ -14,7 +14,7 @@ import triton.language as tl
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from mmpi_ns.color_network import ColorNetworks, positional_encoding
+from mmpi_ns.field.color_network import ColorNetworks, positional_encoding
 from mmpi_ns.ops.triton_scene import DEPTH, HEIGHT, INTS, WIDTH, TritonScene, block_size, cell, row_of, sin_turn
 
 SAMPLES = 64

@@ -10,10 +10,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from mmpi_ns import losses
 from mmpi_ns.ops import native
 from mmpi_ns.ops.march import Grid
-from mmpi_ns.texels import TexelGrid
+from mmpi_ns.scene.texels import TexelGrid
+from mmpi_ns.training import losses
 
 Scales = list[tuple[float, float, float]]
 PART = 4096

@@ -1,0 +1,1 @@
+"""Where MPIs stand: observations, candidates, expected pixel errors, choice, plan."""

@@ -13,11 +13,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mmpi_ns.placement.content import Content
 from mmpi_ns.placement.errors import cube_errors, pixel_slopes
 from mmpi_ns.placement.hand_made import vector
 from mmpi_ns.placement.observations import Array, Observations
-from mmpi_ns.placement.plan import CubePlan, MPIPlan
+from mmpi_ns.placement.visibility import Content
+from mmpi_ns.scene.plan import CubePlan, MPIPlan
 
 MAX_VIEWS = 96
 """Training cameras that candidates start from, spread over all of them."""

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mmpi_ns.placement.observations import Array, Observations
-from mmpi_ns.placement.plan import CubePlan, MPIPlan, ScenePlan
+from mmpi_ns.scene.plan import CubePlan, MPIPlan, ScenePlan
 
 WORST = 64.0
 """Pixels: what an observation costs that nothing holds; worse errors count no more than this."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from mmpi_ns.placement.observations import Array, Observations
-from mmpi_ns.placement.plan import CubePlan, MPIPlan, ScenePlan, Vector
+from mmpi_ns.scene.plan import CubePlan, MPIPlan, ScenePlan, Vector
 
 
 def vector(v: Array) -> Vector:

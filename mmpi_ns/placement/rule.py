@@ -14,14 +14,14 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from mmpi_ns.placement.borders import widened
 from mmpi_ns.placement.candidates import Candidate, find_candidates
-from mmpi_ns.placement.content import Content, find_content
-from mmpi_ns.placement.coverage import widened
 from mmpi_ns.placement.errors import WORST
+from mmpi_ns.placement.far_ends import with_far_ends
 from mmpi_ns.placement.hand_made import drive_plan, room_plan
 from mmpi_ns.placement.observations import Observations
-from mmpi_ns.placement.plan import CubePlan, MPIPlan, ScenePlan
-from mmpi_ns.placement.reach import with_far_ends
+from mmpi_ns.placement.visibility import Content, find_content
+from mmpi_ns.scene.plan import CubePlan, MPIPlan, ScenePlan
 
 MIN_PLANES = 16
 BUDGET_ROUNDS = 8

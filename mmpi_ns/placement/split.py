@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mmpi_ns.placement.content import find_content
 from mmpi_ns.placement.observations import Array, Observations
 from mmpi_ns.placement.rule import PlacementConfig, place
-from mmpi_ns.windows import Window, WindowedPlan
+from mmpi_ns.placement.visibility import find_content
+from mmpi_ns.scene.windows import Window, WindowedPlan
 
 MARGIN = 0.08
 """Distance over which a window's part falls off, as a share of the windows' length."""

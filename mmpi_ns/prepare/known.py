@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
+from mmpi_ns.capture.tracks import MIN_ANGLE
 from mmpi_ns.prepare.features import SEED, matched_keypoints, quiet
 from mmpi_ns.prepare.frame import camera_poses, similarity_between
 from mmpi_ns.prepare.mapping import adjust, bundle_options
 from mmpi_ns.prepare.stages import CONSOLE, PrepareError
-from mmpi_ns.triangulation import MIN_ANGLE
 
 ROUNDS = 3
 """Times that poses are refined and the points triangulated anew."""

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
+from mmpi_ns.capture.tracks import near_pairs
 from mmpi_ns.prepare import checks, export, features, images, mapping, pairs, report
 from mmpi_ns.prepare.cameras import Intrinsics, make_cameras, parse_camera, share
 from mmpi_ns.prepare.frame import SceneFrame, camera_poses, choose_frame
@@ -23,7 +24,6 @@ from mmpi_ns.prepare.settings import Settings
 from mmpi_ns.prepare.stages import CONSOLE, PrepareError, Stages
 from mmpi_ns.prepare.undistort import undistort
 from mmpi_ns.prepare.video import select_frames
-from mmpi_ns.triangulation import near_pairs
 
 WORK = ".prepare"
 LEAST_SHARE = 0.5

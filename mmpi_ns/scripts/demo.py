@@ -90,8 +90,8 @@ class Demo:
         print(f"\n=== {number}/{PARTS} {what} ===", flush=True)
 
     def _make_street(self) -> None:
-        from mmpi_ns.scenes.catalogue import make_scene
-        from mmpi_ns.scenes.dataset import write_dataset
+        from mmpi_ns.synthetic.catalogue import make_scene
+        from mmpi_ns.synthetic.dataset import write_dataset
 
         transforms = self.scene / "transforms.json"
         if transforms.is_file() and len(json.loads(transforms.read_text(encoding="utf-8"))["frames"]) == self.images:

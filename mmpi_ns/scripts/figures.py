@@ -15,11 +15,11 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 from PIL import Image
 
-from mmpi_ns.compositing import blend_shares, blended_optical_depth, composite_weights
-from mmpi_ns.geometry import Frames, inverse_distance, plane_hits, sample_disparity
+from mmpi_ns.ops.compositing import blend_shares, blended_optical_depth, composite_weights
 from mmpi_ns.placement.errors import mpi_errors
 from mmpi_ns.placement.observations import Observations
-from mmpi_ns.placement.plan import MPIPlan
+from mmpi_ns.scene.geometry import Frames, inverse_distance, plane_hits, sample_disparity
+from mmpi_ns.scene.plan import MPIPlan
 
 COLORS = ("#2b66e8", "#dd8a00", "#2a9d3a")
 SHEET, README_PICTURE = "contact-sheet.png", "contact-sheet.jpg"

@@ -13,7 +13,7 @@ from mmpi_ns.placement.rule import PlacementConfig
 
 if TYPE_CHECKING:
     from mmpi_ns.placement.observations import Observations
-    from mmpi_ns.windows import WindowedPlan
+    from mmpi_ns.scene.windows import WindowedPlan
 
 
 @dataclass
@@ -42,9 +42,9 @@ class PlanCommand:
 
     def main(self) -> None:
         # Slow imports, which --help does not need.
-        from mmpi_ns.mmpi_scene import load_observations
+        from mmpi_ns.capture.load import load_observations
         from mmpi_ns.placement.split import place_windows
-        from mmpi_ns.windows import WindowedPlan
+        from mmpi_ns.scene.windows import WindowedPlan
 
         observations = load_observations(self.scene, self.downscale_factor, self.parser)
         if self.plan_file is not None:
@@ -62,10 +62,10 @@ class PlanCommand:
 
     def _explain(self, windows: WindowedPlan, observations: Observations) -> str:
         """Draws the pictures and returns the tables: of each window, over what its own cameras saw."""
-        from mmpi_ns.placement.content import find_content
-        from mmpi_ns.placement.explain import explain, table
-        from mmpi_ns.placement.pictures import draw_errors, draw_plan, draw_windows
+        from mmpi_ns.placement.show.explain import explain, table
+        from mmpi_ns.placement.show.pictures import draw_errors, draw_plan, draw_windows
         from mmpi_ns.placement.split import cameras_of
+        from mmpi_ns.placement.visibility import find_content
 
         self.output.mkdir(parents=True, exist_ok=True)
         parts = []
@@ -87,7 +87,7 @@ class PlanCommand:
 
 def _defaults(arguments: list[str]) -> PlanCommand:
     """The command with the placement and the rays of the method that the arguments name."""
-    from mmpi_ns.mmpi_config import mmpi, mmpi_small
+    from mmpi_ns.config import mmpi, mmpi_small
 
     words = [w for argument in arguments for w in argument.split("=", 1)]
     named = words[words.index("--method") + 1] if "--method" in words[:-1] else "mmpi-small"

@@ -44,8 +44,8 @@ class SceneCommand:
     """Replace a data set that is in the folder."""
 
     def main(self) -> None:
-        from mmpi_ns.scenes.catalogue import make_scene
-        from mmpi_ns.scenes.dataset import check_folder, write_dataset
+        from mmpi_ns.synthetic.catalogue import make_scene
+        from mmpi_ns.synthetic.dataset import check_folder, write_dataset
 
         check_folder(self.folder, self.overwrite)
         scene = make_scene(self.name, self.seed, self.count, self.width, self.height, self.length)

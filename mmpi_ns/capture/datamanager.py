@@ -1,0 +1,275 @@
+"""Pixels on the device, and the training cameras, SfM points and keypoints for the model."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager, VanillaDataManagerConfig
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader, RandIndicesEvalDataloader
+from nerfstudio.data.utils.nerfstudio_collate import nerfstudio_collate
+from nerfstudio.model_components.ray_generators import RayGenerator
+from nerfstudio.utils.rich_utils import CONSOLE
+from numpy.typing import NDArray
+from torch import Tensor
+
+from mmpi_ns.capture.checks import check_transforms
+from mmpi_ns.capture.dataset import MMPIDataset
+from mmpi_ns.capture.observe import observe, sfm_folder
+from mmpi_ns.capture.rays import PinholeRays
+from mmpi_ns.placement.observations import Observations
+from mmpi_ns.scene.visible_tiles import TrainingViews
+from mmpi_ns.utils.random_draws import generator
+
+OBSERVATIONS = "mmpi_observations"
+"""Key under which the model finds the scene's Observations in the data set's metadata."""
+RAYS_PER_STEP = "mmpi_rays_per_step"
+"""Key under which it finds the pixel rays of a training step."""
+TRAINING_VIEWS = "mmpi_training_views"
+"""Key under which it finds where the training cameras stand and what they can see (``TrainingViews``)."""
+KEYPOINT_DEPTH = "keypoint_inverse_distance"
+"""Ray-bundle metadata: inverse distance of the SfM point on a keypoint ray, 0 on ordinary rays."""
+
+
+PIXEL_BYTES = 3 + 3 * 4
+"""Of a resident pixel: its colour, and its image, row and column."""
+
+
+@dataclass
+class MMPIDataManagerConfig(VanillaDataManagerConfig):
+    """Settings of the data manager."""
+
+    _target: type = field(default_factory=lambda: MMPIDataManager)
+    train_num_rays_per_batch: int = 4096
+    """Pixel rays a training step."""
+    eval_num_rays_per_batch: int = 1024
+    """Rays of an evaluation batch during training."""
+    keypoint_rays: int = 384
+    """Extra rays a step through SfM keypoints of training images, for depth supervision (scenes with tracks only)."""
+    sfm_path: Path = Path("colmap/sparse/0")
+    """COLMAP model with the tracks, relative to the data, in the frame of transforms.json (colmap parser: its own)."""
+    triangulate: bool = True
+    """Scenes without tracks: match and triangulate the training images' features at the start (a second or so each)."""
+    resident_pixels: float = 60e6
+    """Training pixels held in memory at once (15 bytes each); those of a longer capture are read window by window."""
+    seed: int = 0
+    """Batches depend on this seed and the step alone, so a resumed run draws what an uninterrupted one would."""
+
+
+@dataclass(frozen=True)
+class PixelPool:
+    """All training pixels that may be drawn, resident on the device."""
+
+    colors: Tensor
+    """[P, C] uint8 or float, C = 3 or 4."""
+    indices: Int[Tensor, "P 3"]
+    """(image, row, column) of each pixel."""
+
+    @staticmethod
+    def from_dataset(
+        dataset: MMPIDataset, device: str | torch.device, images: Iterable[int] | None = None
+    ) -> PixelPool:
+        """Reads every image, or some, once; masked pixels are left out.
+
+        Raises:
+            ValueError: an image or mask cannot be used (names the file), or the masks leave nothing.
+        """
+        colors, indices = [], []
+        for i in range(len(dataset)) if images is None else images:
+            data = dataset.get_data(i, image_type="uint8")
+            image = data["image"]
+            keep = torch.ones(image.shape[:2], dtype=torch.bool)
+            if "mask" in data:
+                keep = data["mask"][..., 0].bool()
+            rows, columns = keep.nonzero(as_tuple=True)
+            colors.append(image[rows, columns])
+            indices.append(torch.stack([torch.full_like(rows, i), rows, columns], -1).to(torch.int32))
+        if not sum(len(c) for c in colors):
+            raise ValueError("The masks leave no training pixel: white (non-zero) mask pixels are the ones used.")
+        return PixelPool(torch.cat(colors).to(device), torch.cat(indices).to(device))
+
+    def draw(
+        self, count: int, g: torch.Generator, allowed: Int[Tensor, "A"] | None = None
+    ) -> tuple[Float[Tensor, "R C"], Int[Tensor, "R 3"]]:
+        """Colours and indices of random pixels, of all or of those at the ``allowed`` places."""
+        size = self.colors.shape[0] if allowed is None else len(allowed)
+        chosen = torch.randint(size, (count,), generator=g, device=g.device).to(self.colors.device)
+        chosen = chosen if allowed is None else allowed[chosen].long()
+        return self.colors[chosen].float() / 255, self.indices[chosen].long()
+
+    def places_of(self, images: Int[Tensor, "I"]) -> Int[Tensor, "A"]:
+        """Where the pixels of some images lie in the pool."""
+        return torch.isin(self.indices[:, 0], images.to(self.indices)).nonzero()[:, 0].to(torch.int32)
+
+
+class MMPIDataManager(VanillaDataManager[MMPIDataset]):
+    """Draws training batches from a resident pixel pool and hands the scene's observations to the model."""
+
+    config: MMPIDataManagerConfig
+
+    def __init__(self, config: MMPIDataManagerConfig, **kwargs: Any) -> None:
+        self.pool: PixelPool | None = None
+        self._allowed: Tensor | None = None
+        parser = config.dataparser
+        if isinstance(parser, NerfstudioDataParserConfig):
+            check_transforms(
+                Path(config.data or parser.data),
+                auto_scale=parser.auto_scale_poses,
+                opens_first_image=parser.downscale_factor is None and kwargs.get("test_mode") != "inference",
+            )
+        super().__init__(config, **kwargs)
+
+    def create_train_dataset(self) -> MMPIDataset:
+        dataset = super().create_train_dataset()
+        # Elsewhere than in training the plan comes from a checkpoint, and images may be absent.
+        self.observations = observe(
+            self.train_dataparser_outputs,
+            dataset,
+            sfm_folder(self.dataparser.config, self.config.sfm_path),
+            find_points=self.test_mode == "val",
+            triangulates=self.config.triangulate,
+        )
+        dataset.metadata[RAYS_PER_STEP] = self.config.train_num_rays_per_batch
+        dataset.metadata[OBSERVATIONS] = self.observations
+        dataset.metadata[TRAINING_VIEWS] = TrainingViews.of(dataset.cameras)
+        return dataset
+
+    def create_eval_dataset(self) -> MMPIDataset:
+        dataset = super().create_eval_dataset()
+        if not len(dataset):
+            raise ValueError(
+                f"No image of {self.config.data} is left for evaluation: give more images, or --eval-mode all after "
+                "the name of the data parser."
+            )
+        return dataset
+
+    def setup_train(self) -> None:
+        """Loads the pixel pool instead of nerfstudio's image cache."""
+        CONSOLE.print("Setting up training dataset...")
+        sizes = self.train_dataset.cameras.width * self.train_dataset.cameras.height
+        self._reads_by_window = bool(sizes.sum() > self.config.resident_pixels)
+        if not self._reads_by_window:
+            self.pool = PixelPool.from_dataset(self.train_dataset, self.device)
+        # Samples nothing: ns-export sets its batches' size here.
+        self.train_pixel_sampler = self._get_pixel_sampler(self.train_dataset, self.config.train_num_rays_per_batch)
+        cameras = self.train_dataset.cameras
+        pinhole = PinholeRays.of(cameras, self.device) if torch.device(self.device).type == "cuda" else None
+        self.train_ray_generator: Any = pinhole or RayGenerator(cameras.to(self.device))
+        self._keypoints = _keypoint_targets(self.observations, self.device)
+
+    def use_cameras(self, cameras: NDArray[np.int64] | None) -> None:
+        """Draws pixels and keypoints of these training cameras alone from now on; None for all.
+
+        Raises:
+            ValueError: the masks leave them no pixel.
+        """
+        self._keypoints = _keypoint_targets(self.observations, self.device, cameras)
+        self._allowed = None
+        if cameras is not None and self._reads_by_window:
+            self.pool = PixelPool.from_dataset(self.train_dataset, self.device, cameras.tolist())
+        elif cameras is not None:
+            assert self.pool is not None
+            self._allowed = self.pool.places_of(torch.from_numpy(cameras))
+            if not len(self._allowed):
+                raise ValueError("The masks leave no training pixel in one stretch of the capture: use longer windows.")
+
+    def pixel_bytes(self, cameras: NDArray[np.int64] | None = None) -> int:
+        """Bytes of the training pixels in memory while these cameras are drawn from; where masks hide some, at most."""
+        if self.pool is not None and not self._reads_by_window:
+            return self.pool.colors.nbytes + self.pool.indices.nbytes
+        sizes = (self.train_dataset.cameras.width * self.train_dataset.cameras.height).reshape(-1).cpu().numpy()
+        return PIXEL_BYTES * int((sizes if cameras is None else sizes[cameras]).sum())
+
+    def setup_eval(self) -> None:
+        """nerfstudio's loaders, but for the one that holds every evaluation image in memory."""
+        assert self.eval_dataset is not None
+        CONSOLE.print("Setting up evaluation dataset...")
+        sizes = self.eval_dataset.cameras.width * self.eval_dataset.cameras.height
+        # An image that cannot be used is named before training, not after it.
+        for i in range(len(self.eval_dataset)) if sizes.sum() <= self.config.resident_pixels else ():
+            self.eval_dataset.get_data(i, image_type="uint8")
+        self.eval_pixel_sampler = self._get_pixel_sampler(self.eval_dataset, self.config.eval_num_rays_per_batch)
+        self.eval_ray_generator = RayGenerator(self.eval_dataset.cameras.to(self.device))
+        loaders = {"input_dataset": self.eval_dataset, "device": self.device, "num_workers": 4}
+        self.fixed_indices_eval_dataloader = FixedIndicesEvalDataloader(**loaders)
+        self.eval_dataloader = RandIndicesEvalDataloader(**loaders)
+
+    def next_eval(self, step: int) -> tuple[RayBundle, dict]:
+        """Pixels of one evaluation image, keyed on (seed, step)."""
+        self.eval_count += 1
+        assert self.eval_dataset is not None and self.eval_pixel_sampler is not None
+        g = generator(self.config.seed, step, "evaluation", "cpu")
+        data = self.eval_dataset[int(torch.randint(len(self.eval_dataset), (1,), generator=g))]
+        batch = self.eval_pixel_sampler.sample(nerfstudio_collate([data]))
+        return self.eval_ray_generator(batch["indices"]), batch
+
+    def next_train(self, step: int) -> tuple[RayBundle, dict]:
+        """Pixel rays first, then keypoint rays (marked in the bundle's metadata), keyed on (seed, step).
+
+        Outside training (ns-export asks for step 0 again and again) pixel rays alone, others with each call.
+        """
+        self.train_count += 1
+        if self.pool is None:  # nobody said which window
+            self.pool = PixelPool.from_dataset(self.train_dataset, self.device)
+        g = generator(self.config.seed, step if self.training else self.train_count, "pixels", self.device)
+        colors, indices = self.pool.draw(self.get_train_rays_per_batch(), g, self._allowed)
+        bundle = self.train_ray_generator(indices)
+        depths = torch.zeros(len(bundle), 1, device=self.device)
+        if self.training and self._keypoints is not None and self.config.keypoint_rays > 0:
+            keypoint_bundle, keypoint_depths = self._keypoint_rays(g)
+            bundle, depths = _join(bundle, keypoint_bundle), torch.cat([depths, keypoint_depths])
+        bundle.metadata[KEYPOINT_DEPTH] = depths
+        return bundle, {"image": colors, "indices": indices}
+
+    def _keypoint_rays(self, g: torch.Generator) -> tuple[RayBundle, Float[Tensor, "Q 1"]]:
+        """Rays from training cameras straight at SfM points that they saw, and the inverse distances of those."""
+        assert self._keypoints is not None
+        cameras, origins, directions, inverse = self._keypoints
+        chosen = torch.randint(cameras.shape[0], (self.config.keypoint_rays,), generator=g, device=g.device)
+        chosen = chosen.to(cameras.device)
+        bundle = RayBundle(
+            origins=origins[chosen],
+            directions=directions[chosen],
+            pixel_area=torch.ones_like(inverse[chosen][:, None]),
+            camera_indices=cameras[chosen][:, None],
+        )
+        return bundle, inverse[chosen][:, None]
+
+
+def _join(a: RayBundle, b: RayBundle) -> RayBundle:
+    assert a.camera_indices is not None and b.camera_indices is not None
+    return RayBundle(
+        origins=torch.cat([a.origins, b.origins]),
+        directions=torch.cat([a.directions, b.directions]),
+        pixel_area=torch.cat([a.pixel_area, b.pixel_area]),
+        camera_indices=torch.cat([a.camera_indices, b.camera_indices]),
+        metadata={},
+    )
+
+
+def _keypoint_targets(
+    observations: Observations, device: str | torch.device, cameras: NDArray[np.int64] | None = None
+) -> tuple[Tensor, ...] | None:
+    """Camera, origin, unit direction and inverse distance of every keypoint of the training images, or of some.
+
+    The ray goes to the point itself, a fraction of a pixel from the keypoint: no lens model enters.
+    """
+    # Points of a plane sweep come after those of the tracks: too rough to supervise depth.
+    tracked = np.arange(len(observations.seen_at))
+    if cameras is not None:
+        tracked = tracked[np.isin(observations.seen_by[tracked], cameras)]
+    if not len(tracked):
+        return None
+    origins = observations.centers[observations.seen_by[tracked]]
+    offsets = observations.points[observations.seen_point[tracked]] - origins
+    distance = np.maximum(np.linalg.norm(offsets, axis=-1, keepdims=True), 1e-12)
+    parts = (origins, offsets / distance, 1 / distance[:, 0])
+    seen_by = torch.from_numpy(observations.seen_by[tracked]).to(device)
+    return seen_by, *(torch.from_numpy(x).float().to(device) for x in parts)

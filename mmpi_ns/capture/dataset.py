@@ -1,0 +1,54 @@
+"""nerfstudio's data set of images, with errors that name the file and the remedy."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import numpy as np
+from nerfstudio.data.datasets.base_dataset import InputDataset
+from numpy.typing import NDArray
+
+from mmpi_ns.capture.checks import brief
+
+# Pillow reports damaged files by any of these (SyntaxError: a broken PNG chunk), nerfstudio odd shapes by assertions.
+UNREADABLE = (OSError, SyntaxError, ValueError, AssertionError)
+
+
+class UnusableFile(ValueError):
+    """One sentence with the image or mask file that cannot be used, and what to do."""
+
+
+class MMPIDataset(InputDataset):
+    """Images and masks of the size of their cameras; raises ``UnusableFile`` where one cannot be read or fit."""
+
+    def get_numpy_image(self, image_idx: int) -> NDArray[np.uint8]:
+        """Image [H, W, 3 or 4] as it is in the file."""
+        try:
+            return super().get_numpy_image(image_idx)
+        except UNREADABLE as error:
+            name = self.image_filenames[image_idx]
+            raise UnusableFile(
+                f"Image {name} cannot be read ({brief(error)}): repair it or remove its frame."
+            ) from error
+
+    def get_data(self, image_idx: int, image_type: Literal["uint8", "float32"] = "float32") -> dict[str, Any]:
+        """The image, and its mask where there are masks."""
+        try:
+            data = super().get_data(image_idx, image_type)
+        except UnusableFile:
+            raise
+        except UNREADABLE as error:
+            masks = self._dataparser_outputs.mask_filenames
+            name = masks[image_idx] if masks is not None else self.image_filenames[image_idx]
+            raise UnusableFile(
+                f"Mask {name} cannot be used ({brief(error)}): give one channel of the image's size, white where used."
+            ) from error
+        height, width = (int(n.reshape(-1)[image_idx]) for n in (self.cameras.height, self.cameras.width))
+        rows, columns = data["image"].shape[:2]
+        # Downscaled images may have been rounded up where cameras are rounded down: one pixel is cut off.
+        if not (0 <= rows - height <= 1 and 0 <= columns - width <= 1):
+            raise UnusableFile(
+                f"Image {self.image_filenames[image_idx]} has {columns} x {rows} pixels and its camera {width} x "
+                f"{height}: correct the camera's size or give the images that the cameras belong to."
+            )
+        return data | {k: data[k][:height, :width] for k in ("image", "mask") if k in data}

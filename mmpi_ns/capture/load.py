@@ -1,0 +1,52 @@
+"""A scene's observations outside training: what ``ns-train`` would hand to placement."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+from typing import Literal
+
+from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+
+from mmpi_ns.capture.checks import check_transforms
+from mmpi_ns.capture.datamanager import MMPIDataManagerConfig
+from mmpi_ns.capture.dataset import MMPIDataset
+from mmpi_ns.capture.observe import observe, sfm_folder
+from mmpi_ns.config import mmpi_small
+from mmpi_ns.placement.observations import Observations
+
+Parser = Literal["auto", "nerfstudio", "colmap"]
+
+
+def load_observations(data: Path, downscale_factor: int | None = None, parser: Parser = "auto") -> Observations:
+    """The observations that training on a scene would use.
+
+    Args:
+        data: the scene's folder.
+        downscale_factor: size of the images, as for the data parser; None leaves it to the parser.
+        parser: how the scene is stored; auto takes nerfstudio's format where there is a transforms.json.
+
+    Raises:
+        ValueError: the folder holds no scene.
+    """
+    if not data.exists():
+        raise ValueError(f"There is no scene at {data}: check the path.")
+    config = copy.deepcopy(mmpi_small.config.pipeline.datamanager)
+    assert isinstance(config, MMPIDataManagerConfig)
+    is_nerfstudio = data.suffix == ".json" or (data / "transforms.json").is_file()
+    if parser == "colmap" or (parser == "auto" and not is_nerfstudio):
+        model = next((p for p in ("colmap/sparse/0", "sparse/0", "sparse") if (data / p).is_dir()), None)
+        if model is None:
+            raise ValueError(f"{data} holds neither a transforms.json nor a COLMAP model: it is not a scene.")
+        config.dataparser = ColmapDataParserConfig(colmap_path=Path(model))
+        config.sfm_path = Path(model)
+    parser_config = config.dataparser
+    parser_config.data = data
+    parser_config.downscale_factor = downscale_factor  # type: ignore[attr-defined]
+    if isinstance(parser_config, NerfstudioDataParserConfig):
+        check_transforms(data, auto_scale=parser_config.auto_scale_poses, opens_first_image=downscale_factor is None)
+    outputs = parser_config.setup().get_dataparser_outputs(split="train")
+    dataset = MMPIDataset(outputs)
+    folder = sfm_folder(parser_config, config.sfm_path)
+    return observe(outputs, dataset, folder, find_points=True, triangulates=config.triangulate)

@@ -1,0 +1,199 @@
+"""What the data set knows of a scene, as placement's Observations: cameras, points, and who saw what."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from nerfstudio.cameras.cameras import Cameras, CameraType
+from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig, DataparserOutputs
+from nerfstudio.utils.rich_utils import CONSOLE
+from numpy.typing import NDArray
+
+from mmpi_ns.capture.checks import in_one_place
+from mmpi_ns.capture.dataset import MMPIDataset
+from mmpi_ns.capture.sfm import SfmModel, find_sfm_model
+from mmpi_ns.capture.tracks import PosedImages, triangulate
+from mmpi_ns.placement.observations import Observations
+from mmpi_ns.placement.sweep import add_swept_points
+
+MAX_REPROJECTION = 0.02
+"""Median angle between keypoints and points, as a share of the image, beyond which a model is in another frame."""
+ENOUGH_KEYPOINTS = 20
+"""Keypoints an image, on average, that need no plane sweep beside them."""
+
+
+def sfm_folder(parser: DataParserConfig, default: Path) -> Path:
+    """Where a scene's COLMAP model would be: where its data parser looks, else ``default`` beside its frames."""
+    data = Path(parser.data)
+    folder = data.parent if data.suffix == ".json" else data
+    return folder / getattr(parser, "colmap_path", default)
+
+
+def observe(
+    outputs: DataparserOutputs, dataset: MMPIDataset, sfm: Path, *, find_points: bool, triangulates: bool
+) -> Observations:
+    """The observations of a training data set.
+
+    Args:
+        outputs: what the data parser said of the training images.
+        dataset: the training images.
+        sfm: folder of a COLMAP model; there need not be one.
+        find_points: whether to look for points in the images where there are no tracks. Reads the images.
+        triangulates: whether to look for them by matching features, before a plane sweep.
+
+    Raises:
+        ValueError: poses or intrinsics that cannot be used.
+    """
+    observations = read_observations(outputs, dataset.cameras, find_sfm_model(sfm))
+    if in_one_place(observations.centers):
+        CONSOLE.print("[bold yellow]All training cameras stand in one place: no distance can be learned.")
+    if find_points:
+        if not len(observations.seen_by):
+            observations = _find_points(observations, dataset, triangulates)
+        observations = drop_masked(observations, dataset)
+    return observations
+
+
+def _find_points(observations: Observations, dataset: MMPIDataset, triangulates: bool) -> Observations:
+    """Points for a scene without tracks: triangulated, and swept where triangulation finds too few."""
+    if triangulates and (images := posed_images(observations, dataset)) is not None:
+        CONSOLE.print(f"No SfM tracks: matching the features of {len(dataset)} training images.")
+        observations = with_tracks(observations, triangulate(images))
+        CONSOLE.print(f"Triangulated {len(observations.points)} points seen {len(observations.seen_by)} times.")
+    if len(observations.seen_by) < ENOUGH_KEYPOINTS * len(dataset):
+        CONSOLE.print("Few or no tracks: a quick plane sweep finds out where the content lies.")
+        observations = add_swept_points(observations, [_thumbnail(dataset, i) for i in range(len(dataset))])
+    return observations
+
+
+def _thumbnail(dataset: MMPIDataset, index: int, side: int = 128) -> NDArray[np.float64]:
+    """Gray image of at most ``side`` pixels a side, box-filtered."""
+    image = dataset.get_data(index, image_type="uint8")["image"][..., :3].float().mean(-1) / 255
+    scale = max(1.0, max(image.shape) / side)
+    size = [max(8, round(n / scale)) for n in image.shape]
+    return torch.nn.functional.interpolate(image[None, None], size=size, mode="area")[0, 0].double().numpy()
+
+
+def read_observations(outputs: DataparserOutputs, cameras: Cameras, sfm: SfmModel | None) -> Observations:
+    """Training cameras as they are used, with the SfM points and keypoints moved into their frame.
+
+    Raises:
+        ValueError: poses are missing, or poses or intrinsics cannot be used; names the image.
+    """
+    if not len(outputs.image_filenames):
+        raise ValueError("The capture holds no training image: check the split that the data parser made.")
+    poses = cameras.camera_to_worlds.double().cpu().numpy()
+    flat = [x.double().cpu().numpy().reshape(-1) for x in (cameras.fx, cameras.fy, cameras.cx, cameras.cy)]
+    usable = np.isfinite(poses).all((1, 2)) & np.isfinite(flat).all(0) & (flat[0] > 0) & (flat[1] > 0)
+    if not usable.all():
+        raise ValueError(
+            f"The camera of {outputs.image_filenames[usable.argmin()]} has a pose or focal length that is no finite "
+            "number or not positive: correct it or remove the frame."
+        )
+    sizes = np.stack([cameras.width.cpu().numpy().reshape(-1), cameras.height.cpu().numpy().reshape(-1)], -1)
+    empty = np.zeros(0, dtype=np.int64)
+    result: Mapping[str, Any] = {"points": np.zeros((0, 3)), "seen_by": empty, "seen_point": empty}
+    seen_at = np.zeros((0, 2))
+    if sfm is not None:
+        transform = torch.eye(4, dtype=torch.float64)
+        transform[:3] = outputs.dataparser_transform.double()[:3]
+        moved = sfm.points @ transform[:3, :3].numpy().T + transform[:3, 3].numpy()
+        tracks = sfm.keypoints_of([Path(p).name for p in outputs.image_filenames])
+        result = {"points": moved * outputs.dataparser_scale, "seen_by": tracks[0], "seen_point": tracks[1]}
+        seen_at = tracks[2] * sizes[tracks[0]]
+    elif "points3D_xyz" in outputs.metadata:
+        result = {**result, "points": outputs.metadata["points3D_xyz"].double().numpy()}
+    observations = Observations(
+        camera_to_worlds=poses, intrinsics=np.stack(flat, -1), sizes=sizes.astype(np.float64), seen_at=seen_at, **result
+    )
+    return _fitting_tracks(observations, cameras) if len(seen_at) else observations
+
+
+def _fitting_tracks(observations: Observations, cameras: Cameras) -> Observations:
+    """Leaves out points behind the camera that saw them, and all tracks where the model is in another frame."""
+    angles = keypoint_angles(observations, cameras)
+    width = np.arctan(0.5 * observations.sizes[:, 0] / observations.intrinsics[:, 0]) * 2
+    if np.median(angles / width[observations.seen_by]) > MAX_REPROJECTION:
+        CONSOLE.print(
+            "[bold yellow]The COLMAP model does not fit the cameras (its points project elsewhere), so its tracks are "
+            "not used: state its frame as applied_transform in transforms.json."
+        )
+        empty = np.zeros(0, dtype=np.int64)
+        return replace(observations, points=np.zeros((0, 3)), seen_by=empty, seen_point=empty, seen_at=np.zeros((0, 2)))
+    ahead = angles < np.pi / 2
+    if not ahead.all():
+        CONSOLE.print(
+            f"[bold yellow]{(~ahead).sum()} of {len(ahead)} keypoints have their point behind the camera and are not "
+            "used: check the COLMAP model."
+        )
+    return _keep_keypoints(observations, ahead)
+
+
+def keypoint_angles(observations: Observations, cameras: Cameras) -> NDArray[np.float64]:
+    """Radians [Q] between each keypoint's ray, lens included, and the direction to its point."""
+    seen_by = torch.from_numpy(observations.seen_by).to(cameras.device)
+    coords = torch.from_numpy(observations.seen_at[:, ::-1].copy()).float().to(cameras.device)
+    rays = cameras.generate_rays(camera_indices=seen_by[:, None], coords=coords)
+    directions = rays.directions.double().cpu().numpy()
+    offsets = observations.points[observations.seen_point] - observations.centers[observations.seen_by]
+    across = np.linalg.norm(np.cross(directions, offsets), axis=-1)
+    return np.arctan2(across, (directions * offsets).sum(-1))
+
+
+def _keep_keypoints(observations: Observations, keep: NDArray[np.bool_]) -> Observations:
+    return replace(
+        observations,
+        seen_by=observations.seen_by[keep],
+        seen_point=observations.seen_point[keep],
+        seen_at=observations.seen_at[keep[: len(observations.seen_at)]],
+    )
+
+
+def posed_images(observations: Observations, dataset: MMPIDataset) -> PosedImages | None:
+    """The training images with their cameras and lenses; None where a camera is neither perspective nor fisheye."""
+    cameras = dataset.cameras
+    types = set(cameras.camera_type.reshape(-1).tolist())
+    if types not in ({CameraType.PERSPECTIVE.value}, {CameraType.FISHEYE.value}):
+        return None
+    fisheye = types == {CameraType.FISHEYE.value}
+    lens = cameras.distortion_params  # k1, k2, k3, k4, p1, p2
+    lens = torch.zeros(len(dataset), 6) if lens is None else lens.reshape(len(dataset), 6).cpu()
+    used = [0, 1, 2, 3] if fisheye else [0, 1, 4, 5]
+    return PosedImages(
+        files=tuple(Path(name) for name in dataset.image_filenames),
+        camera_to_worlds=observations.camera_to_worlds,
+        intrinsics=observations.intrinsics,
+        sizes=observations.sizes,
+        distortion=lens[:, used].double().numpy(),
+        fisheye=fisheye,
+    )
+
+
+def with_tracks(observations: Observations, model: SfmModel) -> Observations:
+    """The observations with the points of a model whose image names are the places of the training images."""
+    seen_by, seen_point, relative = model.keypoints_of([str(i) for i in range(len(observations.centers))])
+    return replace(
+        observations,
+        points=model.points,
+        seen_by=seen_by,
+        seen_point=seen_point,
+        seen_at=relative * observations.sizes[seen_by],
+    )
+
+
+def drop_masked(observations: Observations, dataset: MMPIDataset) -> Observations:
+    """Leaves out keypoints on masked pixels: what moves there has no depth to learn from."""
+    if not len(observations.seen_at) or dataset._dataparser_outputs.mask_filenames is None:
+        return observations
+    keep = np.ones(len(observations.seen_by), dtype=bool)
+    for i in range(len(dataset)):
+        mask = dataset.get_data(i, image_type="uint8")["mask"][..., 0].numpy().astype(bool)
+        own = np.nonzero(observations.seen_by[: len(observations.seen_at)] == i)[0]
+        x, y = observations.seen_at[own].astype(int).T
+        keep[own] = mask[y.clip(0, mask.shape[0] - 1), x.clip(0, mask.shape[1] - 1)]
+    return _keep_keypoints(observations, keep)

@@ -1,0 +1,51 @@
+"""Rays of undistorted perspective cameras in one go, for training on a GPU.
+
+nerfstudio's ray generator handles every kind of camera, and asks the device some twenty times a batch which kinds and
+distortions there are; each answer is waited for.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from nerfstudio.cameras.cameras import Cameras, CameraType
+from nerfstudio.cameras.rays import RayBundle
+from torch import Tensor
+
+from mmpi_ns.scene.geometry import rotate
+
+
+@dataclass(frozen=True)
+class PinholeRays:
+    """Takes the place of nerfstudio's ``RayGenerator`` for N such cameras."""
+
+    poses: Float[Tensor, "N 3 4"]
+    focal: Float[Tensor, "N 2"]
+    principal: Float[Tensor, "N 2"]
+
+    @staticmethod
+    def of(cameras: Cameras, device: torch.device | str) -> PinholeRays | None:
+        """None where a camera is of another kind, distorted, or has a time."""
+        distortion = cameras.distortion_params
+        plain = bool((cameras.camera_type == CameraType.PERSPECTIVE.value).all()) and cameras.times is None
+        if not plain or (distortion is not None and bool((distortion != 0).any())):
+            return None
+        focal, principal = torch.cat([cameras.fx, cameras.fy], -1), torch.cat([cameras.cx, cameras.cy], -1)
+        return PinholeRays(*(x.to(device) for x in (cameras.camera_to_worlds, focal, principal)))
+
+    def __call__(self, ray_indices: Int[Tensor, "R 3"]) -> RayBundle:
+        """Rays through pixel centres. Their pixels' areas, which nobody here reads, are left at 1.
+
+        Args:
+            ray_indices: camera, row and column of each.
+        """
+        camera, pixel = ray_indices[:, 0], ray_indices[:, 1:].flip(-1) + 0.5
+        poses = self.poses[camera]
+        u, v = ((pixel - self.principal[camera]) / self.focal[camera]).unbind(-1)
+        directions = torch.nn.functional.normalize(
+            rotate(poses[:, :, :3], torch.stack([u, -v, -torch.ones_like(u)], -1)), dim=-1
+        )
+        one = torch.ones_like(u)[:, None]
+        return RayBundle(poses[:, :, 3], directions, pixel_area=one, camera_indices=camera[:, None], metadata={})

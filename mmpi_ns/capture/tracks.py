@@ -1,0 +1,226 @@
+"""Tracks for scenes that come with poses alone: features of the training images, matched and triangulated by pycolmap.
+
+Poses and intrinsics are taken as given and stay as they are. What comes out is what a COLMAP model would have held:
+points, and which training image saw which point where. They tell placement where content lies, and supervise depth.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mmpi_ns.capture.sfm import SfmModel, load_pycolmap, read_reconstruction
+
+NEIGHBOURS = 16
+"""Images that each image is matched with at most: the nearest that look roughly the same way."""
+MAX_ANGLE = 60.0
+"""Degrees between the facing directions of two images worth matching."""
+MIN_ANGLE = 0.5
+"""Degrees between the rays of a point, at least: driving forward gives little more."""
+MIN_TRACK = 2
+"""Images that see a point, at least: with poses given, two that agree are enough."""
+ENOUGH = 100
+"""Keypoints an image, on average, that make the thorough search unnecessary."""
+SEED = 0
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How hard to look for matches."""
+
+    peak_threshold: float
+    """Contrast of the faintest features (SIFT)."""
+    guided: bool
+    """Whether a pair is matched again along the epipolar lines of its first matches."""
+    min_matches: int
+    """Matches that agree, at least, for a pair to count."""
+
+
+EFFORTS = (Effort(0.0067, False, 15), Effort(0.002, True, 8))
+"""What textured images need, and what rooms at low resolution do (two to four times the time)."""
+
+
+@dataclass(frozen=True)
+class PosedImages:
+    """Images and their cameras."""
+
+    files: tuple[Path, ...]
+    camera_to_worlds: NDArray[np.float64]
+    """[M, 3, 4], OpenGL axes."""
+    intrinsics: NDArray[np.float64]
+    """[M, 4]: fx, fy, cx, cy in pixels."""
+    sizes: NDArray[np.float64]
+    """[M, 2]: width, height in pixels."""
+    distortion: NDArray[np.float64]
+    """[M, 4]: k1, k2, p1, p2 (OpenCV), or k1 to k4 of a fisheye lens."""
+    fisheye: bool = False
+
+    def pairs(self) -> list[tuple[int, int]]:
+        """Images worth matching."""
+        return near_pairs(self.camera_to_worlds[:, :, 3], -self.camera_to_worlds[:, :, 2], NEIGHBOURS)
+
+
+def near_pairs(centers: NDArray[np.float64], facing: NDArray[np.float64], neighbours: int) -> list[tuple[int, int]]:
+    """Each camera with the nearest that look roughly its way.
+
+    Args:
+        centers: camera centres. [M, 3]
+        facing: unit viewing directions. [M, 3]
+        neighbours: most cameras that one chooses.
+
+    Returns:
+        Pairs (i, j) with i < j, in order.
+    """
+    wanted = set()
+    for i, (center, axis) in enumerate(zip(centers, facing, strict=True)):
+        distance = np.linalg.norm(centers - center, axis=-1)
+        usable = facing @ axis > np.cos(np.radians(MAX_ANGLE))
+        usable[i] = False
+        order = np.argsort(np.where(usable, distance, np.inf), kind="stable")
+        wanted |= {(min(i, int(j)), max(i, int(j))) for j in order[: min(neighbours, int(usable.sum()))]}
+    return sorted(wanted)
+
+
+def triangulate(images: PosedImages) -> SfmModel:
+    """Points seen from several of the images, and where each saw them.
+
+    Deterministic for equal images and poses. A quick search comes first, a thorough one where that finds little.
+    Takes about a third of a second an image and core, the thorough search a second.
+
+    Args:
+        images: image files with their cameras, whose poses are in any one frame.
+
+    Returns:
+        Points in the frame of the poses; none where nothing matches. Image names are their places in ``images``.
+
+    Raises:
+        ValueError: an image file cannot be read.
+    """
+    pycolmap = load_pycolmap()
+    level = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = int(pycolmap.logging.Level.ERROR)
+    try:
+        tracks = None
+        for effort in EFFORTS:
+            tracks = _attempt(pycolmap, images, effort)
+            if sum(len(points) for points, _ in tracks.keypoints) >= ENOUGH * len(images.files):
+                break
+        assert tracks is not None
+        return tracks
+    finally:
+        pycolmap.logging.minloglevel = level
+
+
+def _attempt(pycolmap: Any, images: PosedImages, effort: Effort) -> SfmModel:
+    pairs = images.pairs()
+    with tempfile.TemporaryDirectory(prefix="mmpi-tracks-") as folder:
+        work = Path(folder)
+        names = _link(images.files, work / "images")
+        _extract(pycolmap, work, names, effort)
+        model = _posed_model(pycolmap, work, names, images)
+        if pairs:
+            _match(pycolmap, work, [(names[i], names[j]) for i, j in pairs], effort)
+            (work / "model").mkdir()
+            model = pycolmap.triangulate_points(
+                model, work / "database.db", work / "images", work / "model", options=_triangulation(pycolmap)
+            )
+        tracks = read_reconstruction(model, MIN_TRACK)
+        return replace(tracks, names=tuple(str(names.index(name)) for name in tracks.names))
+
+
+def _link(files: Sequence[Path], folder: Path) -> list[str]:
+    """Links the images under names that are their places, since two folders may hold files of one name."""
+    folder.mkdir()
+    names = []
+    for i, file in enumerate(files):
+        names.append(f"{i:06d}{file.suffix.lower()}")
+        os.symlink(file.resolve(), folder / names[-1])
+    return names
+
+
+def _extract(pycolmap: Any, work: Path, names: list[str], effort: Effort) -> None:
+    options = pycolmap.FeatureExtractionOptions()
+    options.sift.peak_threshold = effort.peak_threshold
+    pycolmap.extract_features(
+        work / "features.db",
+        work / "images",
+        image_names=names,
+        camera_mode=pycolmap.CameraMode.PER_IMAGE,
+        extraction_options=options,
+    )
+
+
+def _match(pycolmap: Any, work: Path, pairs: list[tuple[str, str]], effort: Effort) -> None:
+    listing = work / "pairs.txt"
+    listing.write_text("".join(f"{a} {b}\n" for a, b in pairs), encoding="utf-8")
+    matching = pycolmap.FeatureMatchingOptions()
+    matching.guided_matching = effort.guided
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = SEED
+    verification.min_num_inliers = effort.min_matches
+    pairing = pycolmap.ImportedPairingOptions()
+    pairing.match_list_path = listing
+    pycolmap.match_image_pairs(
+        work / "database.db",
+        matching_options=matching,
+        pairing_options=pairing,
+        verification_options=verification,
+    )
+
+
+def _triangulation(pycolmap: Any) -> Any:
+    options = pycolmap.IncrementalPipelineOptions()
+    options.triangulation.min_angle = options.mapper.filter_min_tri_angle = MIN_ANGLE
+    options.triangulation.ignore_two_view_tracks = False
+    options.triangulation.random_seed = SEED
+    options.ba_refine_focal_length = options.ba_refine_principal_point = options.ba_refine_extra_params = False
+    return options
+
+
+def _posed_model(pycolmap: Any, work: Path, names: list[str], images: PosedImages) -> Any:
+    """A model of the given cameras without points, and a database of the features in the order of the images.
+
+    Extraction numbers the images as its threads finish; the second database makes equal images give equal tracks.
+    """
+    model = pycolmap.Reconstruction()
+    with (
+        pycolmap.Database.open(work / "features.db") as features,
+        pycolmap.Database.open(work / "database.db") as database,
+    ):
+        found = {image.name: image.image_id for image in features.read_all_images()}
+        for i, name in enumerate(names):
+            if name not in found:
+                raise ValueError(f"Training image {images.files[i]} cannot be read: repair or remove it.")
+            camera = _camera(pycolmap, images, i)
+            model.add_camera_with_trivial_rig(camera)
+            image = pycolmap.Image(name=name, camera_id=camera.camera_id, image_id=i + 1)
+            model.add_image_with_trivial_frame(image, _world_to_camera(pycolmap, images.camera_to_worlds[i]))
+            database.write_camera(camera, use_camera_id=True)
+            database.write_rig(model.rigs[model.frames[model.images[i + 1].frame_id].rig_id], use_rig_id=True)
+            database.write_frame(model.frames[model.images[i + 1].frame_id], use_frame_id=True)
+            database.write_image(model.images[i + 1], use_image_id=True)
+            database.write_keypoints(i + 1, features.read_keypoints(found[name]))
+            database.write_descriptors(i + 1, features.read_descriptors(found[name]))
+    return model
+
+
+def _camera(pycolmap: Any, images: PosedImages, i: int) -> Any:
+    width, height = (int(n) for n in images.sizes[i])
+    params = [*images.intrinsics[i], *images.distortion[i]]
+    model = "OPENCV_FISHEYE" if images.fisheye else "OPENCV"
+    camera = pycolmap.Camera(model=model, width=width, height=height, params=params, camera_id=i + 1)
+    camera.has_prior_focal_length = True
+    return camera
+
+
+def _world_to_camera(pycolmap: Any, camera_to_world: NDArray[np.float64]) -> Any:
+    """COLMAP's pose: world to camera, with y down and z forward."""
+    rotation = camera_to_world[:, :3] * [1, -1, -1]
+    return pycolmap.Rigid3d(pycolmap.Rotation3d(rotation.T), -rotation.T @ camera_to_world[:, 3])

@@ -1,0 +1,112 @@
+"""The registered methods (paper settings: sec. IV; ours: docs/results)."""
+
+from __future__ import annotations
+
+import torch
+from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
+from nerfstudio.plugins.types import MethodSpecification
+
+from mmpi_ns.capture.datamanager import MMPIDataManagerConfig
+from mmpi_ns.model import MMPIModelConfig
+from mmpi_ns.placement.rule import PlacementConfig
+from mmpi_ns.training.loss_terms import LossWeights
+from mmpi_ns.training.touched_adam import TouchedAdamConfig
+from mmpi_ns.training.trainer import MMPITrainerConfig, PhaseSchedulerConfig
+
+
+def _optimizers() -> dict:
+    rates = {"density": 0.1, "features": 0.1, "colour": 1e-3, "reliability": 0.1, "exposure": 0.02}
+    return {
+        kind: {"optimizer": TouchedAdamConfig(lr=lr), "scheduler": PhaseSchedulerConfig(kind=kind)}
+        for kind, lr in rates.items()
+    }
+
+
+def _method(
+    name: str, description: str, *, steps: int, rays: int, model: MMPIModelConfig, keypoint_rays: int = 384
+) -> MethodSpecification:
+    config = MMPITrainerConfig(
+        method_name=name,
+        max_num_iterations=steps,
+        machine=MachineConfig(device_type="cuda" if torch.cuda.is_available() else "cpu"),
+        steps_per_save=max(500, steps // 4),
+        steps_per_eval_batch=0,
+        steps_per_eval_image=0,
+        steps_per_eval_all_images=0,
+        pipeline=VanillaPipelineConfig(
+            datamanager=MMPIDataManagerConfig(
+                dataparser=NerfstudioDataParserConfig(),
+                train_num_rays_per_batch=rays,
+                keypoint_rays=keypoint_rays,
+            ),
+            model=model,
+        ),
+        optimizers=_optimizers(),
+        viewer=ViewerConfig(num_rays_per_chunk=1 << 14, quit_on_train_completion=True),
+        vis="viewer+tensorboard",
+    )
+    return MethodSpecification(config=config, description=description)
+
+
+def _paper_loss() -> LossWeights:
+    """DVGO's total variation, which the paper takes."""
+    return LossWeights(tv_density=1e-5, tv_features=1e-6)
+
+
+mmpi = _method(
+    "mmpi",
+    "MMPI: several multi-plane images, placed among the training cameras.",
+    steps=20000,
+    rays=4096,
+    model=MMPIModelConfig(placement=PlacementConfig(texel_pixels=1.2, max_planes=256, max_texels=200e6)),
+)
+mmpi_small = _method(
+    "mmpi-small",
+    "MMPI in a size that a two-core CPU trains in minutes.",
+    steps=4000,
+    rays=1024,
+    model=MMPIModelConfig(placement=PlacementConfig(texel_pixels=1.2), hidden_width=32),
+)
+mmpi_kitti = _method(
+    "mmpi-kitti",
+    "MMPI with the paper's KITTI settings: front, left, right, below; each alone, then reliability.",
+    steps=40000,
+    rays=4096,
+    keypoint_rays=0,
+    model=MMPIModelConfig(
+        placement=PlacementConfig(arrangement="drive", planes=256, height=270, width=270),
+        training="two-phase",
+        rays_per_mpi="split",
+        blend_share=0.25,
+        finetune_share=0.0,
+        loss=_paper_loss(),
+    ),
+)
+
+
+def _scannet() -> MMPIModelConfig:
+    return MMPIModelConfig(
+        placement=PlacementConfig(arrangement="room", planes=128, height=192, width=192, cube_voxels=160),
+        training="joint",
+        loss=_paper_loss(),
+    )
+
+
+mmpi_scannet = _method(
+    "mmpi-scannet",
+    "MMPI with the paper's ScanNet settings: five MPIs and a cube, all together.",
+    steps=30000,
+    rays=4096,
+    keypoint_rays=0,
+    model=_scannet(),
+)
+mmpi_scannet_short = _method(
+    "mmpi-scannet-short",
+    "MMPI with the paper's ScanNet settings and a third of the steps.",
+    steps=10000,
+    rays=4096,
+    keypoint_rays=0,
+    model=_scannet(),
+)

@@ -1,0 +1,1 @@
+"""The radiance field: tables of texels, densities, colours and reliability."""

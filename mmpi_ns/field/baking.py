@@ -1,0 +1,81 @@
+"""Reliability baked at texels: the share of every texel, computed once, so that a sample asks one head instead of all.
+
+Blending asks, for every sample, how reliable each head that covers the place is (paper sec. III-C). What comes of it is
+nearly a function of the place alone, so a texel can keep it: between texels shares are interpolated instead of the
+reliabilities that they are made of. For rendering only; docs/performance.md has time and error.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from mmpi_ns.field.samples import LocalRays
+from mmpi_ns.ops.interpolate import interpolate
+from mmpi_ns.scene import geometry
+from mmpi_ns.scene.texels import BRICK
+
+if TYPE_CHECKING:
+    from mmpi_ns.field.mmpi_field import MMPIField
+
+AT_ONCE = 1 << 18
+"""Texels whose shares are computed together."""
+
+
+@torch.no_grad()
+def bake_shares(field: MMPIField) -> Float[Tensor, "N 1"]:
+    """Shares P of all rows of a field's tables, among the heads that cover the places of their texels; 1 elsewhere."""
+    shares = torch.ones_like(field.density)
+    rows = torch.arange(BRICK, len(shares), device=shares.device)
+    for k, grid in enumerate(field.grids):
+        own = rows[grid.holds(rows)]
+        z, y, x = grid.texel(own)
+        exists = (y < grid.height) & (x < grid.width)  # tiles reach over the borders of a plane
+        sizes = torch.tensor([grid.width, grid.height, grid.depth], device=own.device)
+        ndc = (2 * torch.stack([x, y, z], -1)[exists] / (sizes - 1) - 1).to(shares.dtype)
+        for part, places in zip(own[exists].split(AT_ONCE), ndc.split(AT_ONCE), strict=True):
+            origins, directions, inverse_t = rays_to(field, k, places)
+            local = LocalRays.of(origins, directions, field.frames)
+            numbers = torch.arange(len(part), device=part.device)
+            log_share, _ = field.shares(numbers, local, inverse_t, torch.full_like(numbers, k))
+            shares[part, 0] = log_share.exp()
+    return shares
+
+
+def rays_to(
+    field: MMPIField, k: int, ndc: Float[Tensor, "N 3"]
+) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 3"], Float[Tensor, "N"]]:
+    """Rays from a head's own origin to places in it, so that nothing is lost far from the world's.
+
+    Args:
+        field: whose head.
+        k: its number.
+        ndc: places in it.
+
+    Returns:
+        Origins, directions (not of unit length), and inverse distances in units of those.
+    """
+    cube = field.cube
+    if k == len(field.plan.mpis):
+        assert cube is not None
+        return cube.lower.expand_as(ndc), (ndc + 1) / 2 * (cube.upper - cube.lower), torch.ones_like(ndc[:, 0])
+    mpi, frames = field.plan.mpis[k], field.frames
+    u0, u1, v0, v1 = mpi.extent
+    u, v = u0 + (ndc[:, 0] + 1) / 2 * (u1 - u0), v0 + (ndc[:, 1] + 1) / 2 * (v1 - v0)
+    disparity = (1 - ndc[:, 2]) / 2 / mpi.near * mpi.depth_share + mpi.last_disparity
+    directions = geometry.rotate(frames.axes[k].T, torch.stack([u, v, torch.ones_like(u)], -1))
+    return frames.origins[k].expand_as(ndc), directions, disparity
+
+
+def shares_at(
+    field: MMPIField, shares: Float[Tensor, "N 1"], ndc: Float[Tensor, "S 3"], heads: Int[Tensor, "S"]
+) -> Float[Tensor, "S"]:
+    """Baked shares of samples, interpolated in the head that each was taken from."""
+    found = ndc.new_zeros(len(heads))
+    for k, grid in enumerate(field.grids):
+        index = (heads == k).nonzero()[:, 0]
+        found = found.index_copy(0, index, interpolate(shares, *grid.trilinear(ndc[index]))[:, 0])
+    return found.clamp(0, 1)

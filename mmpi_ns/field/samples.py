@@ -1,0 +1,153 @@
+"""Merged samples: what the sampler knows about them and where the field looks them up."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, Literal
+
+import torch
+from jaxtyping import Bool, Float, Int
+from nerfstudio.cameras.rays import RayBundle, RaySamples
+from torch import Tensor
+
+from mmpi_ns.scene import geometry
+from mmpi_ns.scene.plan import ScenePlan
+
+
+@dataclass(frozen=True)
+class Taps:
+    """Texels that a range of samples reads: 4 each in the MPIs, 8 in the cube."""
+
+    samples: slice
+    rows: Int[Tensor, "N B"]
+    weights: Float[Tensor, "N B"]
+    position: Int[Tensor, "N B"] | None = None
+    """Of each row among the batch's distinct rows, where gradients are wanted."""
+
+
+@dataclass(frozen=True)
+class Gathered:
+    """The distinct rows that a batch reads. Gradients meet here, so that each row has one."""
+
+    rows: Int[Tensor, "U"]
+    density: Float[Tensor, "U 1"]
+    features: Float[Tensor, "U C"]
+
+
+@dataclass(frozen=True)
+class Lookup:
+    """Where the valid samples of a merged batch read the tables. Samples are ordered by head, then by slot."""
+
+    shape: torch.Size
+    """(R, S) of the batch."""
+    index: Int[Tensor, "N"]
+    """Flat slots of the samples."""
+    heads: Int[Tensor, "N"]
+    planes: Int[Tensor, "N"]
+    ndc: Float[Tensor, "N 3"]
+    spans: list[tuple[int, slice]]
+    """(head, its samples) for every head that occurs."""
+    groups: list[Taps]
+    """All MPIs together, then the cube."""
+    gathered: Gathered | None
+    """What the groups read, where gradients are wanted."""
+
+    @property
+    def rays(self) -> Int[Tensor, "N"]:
+        return self.index // self.shape[1]
+
+    def of_rays(self, chosen: Bool[Tensor, "R"]) -> Lookup:
+        """The samples of the chosen rays. Gathered rows stay those of all rays."""
+        if bool(chosen.all()):
+            return self
+        wanted = chosen[self.rays].nonzero()[:, 0]
+        heads = self.heads[wanted]
+        bounds = torch.searchsorted(wanted, torch.tensor([g.samples.stop for g in self.groups], device=wanted.device))
+        groups, start = [], 0
+        for taps, stop in zip(self.groups, bounds.tolist(), strict=True):
+            own = wanted[start:stop] - taps.samples.start
+            position = None if taps.position is None else taps.position.index_select(0, own)
+            rows, weights = taps.rows.index_select(0, own), taps.weights.index_select(0, own)
+            groups.append(Taps(slice(start, stop), rows, weights, position))
+            start = stop
+        samples = (self.index[wanted], heads, self.planes[wanted], self.ndc.index_select(0, wanted))
+        last = self.spans[-1][0] if self.spans else 0
+        return Lookup(self.shape, *samples, head_spans(heads, last + 1), groups, self.gathered)
+
+
+def head_spans(heads: Int[Tensor, "N"], num_heads: int) -> list[tuple[int, slice]]:
+    """(head, range of its samples) for every head that occurs among samples ordered by head."""
+    edges = torch.searchsorted(heads, torch.arange(num_heads + 1, device=heads.device)).tolist()
+    return [(k, slice(a, b)) for k, (a, b) in enumerate(pairwise(edges)) if a < b]
+
+
+@dataclass(frozen=True)
+class LocalRays:
+    """R rays in world axes and in every MPI's axes."""
+
+    origins: Float[Tensor, "R 3"]
+    directions: Float[Tensor, "R 3"]
+    local_origins: Float[Tensor, "R K 3"]
+    local_directions: Float[Tensor, "R K 3"]
+
+    @staticmethod
+    def of(origins: Tensor, directions: Tensor, frames: geometry.Frames) -> LocalRays:
+        return LocalRays(origins, directions, *geometry.rays_in_frames(origins, directions, frames))
+
+    def table(self, k: int) -> Float[Tensor, "R 6"]:
+        """Origins and directions in MPI k, or in the world for the cube behind the last MPI."""
+        if k < self.local_origins.shape[1]:
+            return torch.cat([self.local_origins[:, k], self.local_directions[:, k]], -1)
+        return torch.cat([self.origins, self.directions], -1)
+
+
+def metadata_of(ray_samples: RaySamples) -> dict[str, Tensor]:
+    """What the sampler knows about each merged sample (see ``MMPISampler``)."""
+    assert ray_samples.metadata is not None, "these samples do not come from MMPISampler"
+    return ray_samples.metadata
+
+
+def by_head(heads: Int[Tensor, "N"]) -> Int[Tensor, "N"]:
+    """The order that puts samples of a head together, heads rising, and otherwise keeps their order."""
+    if not heads.numel():
+        return heads
+    if heads.device.type != "cpu":  # one launch; a sort takes longer on a CPU
+        return torch.sort(heads.to(torch.int16), stable=True).indices
+    return torch.cat([(heads == k).nonzero()[:, 0] for k in range(int(heads.max()) + 1)])
+
+
+def individual_rays(
+    bundle: RayBundle, plan: ScenePlan, rays_per_mpi: Literal["split", "all"], g: torch.Generator
+) -> tuple[RayBundle, Bool[Tensor, "R H"] | None, Float[Tensor, "R K"] | None]:
+    """Gives each ray to one MPI of those it meets, or to every MPI in turn; the cube joins each.
+
+    Returns:
+        The rays, (all) the heads that each may meet, and (split) priorities of the MPIs.
+    """
+    num_mpis, device = len(plan.mpis), bundle.origins.device
+    if num_mpis == 1:
+        return bundle, None, None
+    if rays_per_mpi == "split":
+        return bundle, None, torch.rand(len(bundle), num_mpis, generator=g, device=device)
+    own = torch.arange(num_mpis, device=device).repeat_interleave(len(bundle))
+    mask = torch.arange(plan.num_heads, device=device) == own[:, None]
+    mask[:, num_mpis:] = True
+    return repeat_rays(bundle, num_mpis), mask, None
+
+
+def repeat_rays(bundle: RayBundle, times: int) -> RayBundle:
+    """All rays, ``times`` times one after the other."""
+
+    def repeat(x: Tensor | None) -> Any:
+        return None if x is None else x.repeat(times, *([1] * (x.ndim - 1)))
+
+    return RayBundle(
+        origins=repeat(bundle.origins),
+        directions=repeat(bundle.directions),
+        pixel_area=repeat(bundle.pixel_area),
+        camera_indices=repeat(bundle.camera_indices),
+        nears=repeat(bundle.nears),
+        fars=repeat(bundle.fars),
+        metadata={k: repeat(v) for k, v in bundle.metadata.items()},
+    )

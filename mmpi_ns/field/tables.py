@@ -1,0 +1,268 @@
+"""The field's tables: one pooled Parameter a kind, in bricks; how they are allocated, grown, released and restored.
+
+Parameters stay the same objects whatever their size, so that K, growth and storage never change the parameter list,
+which nerfstudio fixes before K is known. Row arithmetic is in ``texels.py``, work on whole tables in ``bricks.py``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float, Int
+from nerfstudio.fields.base_field import Field
+from torch import Tensor, nn
+
+from mmpi_ns.field.samples import Lookup
+from mmpi_ns.scene.bricks import from_dense, grown_tiles, keep_bricks, new_table, resample, take_bricks
+from mmpi_ns.scene.plan import ScenePlan
+from mmpi_ns.scene.texels import BRICK, TexelGrid, head_grids, number_tiles
+from mmpi_ns.scene.visible_tiles import TrainingViews, reachable_tiles
+from mmpi_ns.training.phases import Schedule
+
+RELEASED_DENSITY = -20.0
+"""Raw density of texels that no ray trained: their alpha is below 1e-7."""
+TABLES = ("density", "features", "reliability")
+"""The parameters that have a row for every texel."""
+ENOUGH_CROSSINGS = 32
+"""Samples of training rays for each brick that there must have been, on average, before any is given up."""
+
+
+class TexelTables(Field):
+    """Density, features and reliability of every texel that is stored.
+
+    Args:
+        plan: frames and resolutions.
+        feature_channels: channels of the colour features.
+        factor: texels in use, as a share of the plan's.
+        views: training images; what none of them can reach is not stored. None stores everything.
+    """
+
+    def __init__(
+        self, plan: ScenePlan, feature_channels: int, factor: float = 1.0, views: TrainingViews | None = None
+    ) -> None:
+        super().__init__()
+        self.feature_channels = feature_channels
+        self.full_plan = self.plan = plan
+        self.factor = 1.0
+        """Share of the plan's texels in use: ``texel_factor``, where reading it does not wait for a device."""
+        self.views = views
+        self._packed: dict[Any, Any] = {}
+        self.density = nn.Parameter(torch.empty(0, 1))
+        self.features = nn.Parameter(torch.empty(0, feature_channels))
+        self.reliability = nn.Parameter(torch.empty(0, 1))
+        for name in TABLES:
+            getattr(self, name).register_hook(_keep_empty_brick)
+        for name, dtype in (
+            ("tiles", torch.int32),
+            ("touched", torch.uint8),
+            ("peak", torch.float32),
+            ("plan_bytes", torch.uint8),
+        ):
+            self.register_buffer(name, torch.empty(0, dtype=dtype))
+        self.register_buffer("crossings", torch.tensor(0.0, dtype=torch.float64))
+        self.register_buffer("texel_factor", torch.tensor(1.0, dtype=torch.float64))
+        self.tiles: Tensor
+        """Brick of every tile of all heads (``texels.py``)."""
+        self.touched: Tensor
+        """Of every row: 1 where a training ray read it."""
+        self.peak: Tensor
+        """Of every brick: the largest weight that a training sample had in it since the last look."""
+        self.crossings: Tensor
+        """Samples of training rays since the last look."""
+        self.plan_bytes: Tensor
+        self.texel_factor: Tensor
+        self.build(plan, factor)
+
+    @property
+    def grids(self) -> list[TexelGrid]:
+        """The texels of every head, MPIs first, the cube last."""
+        return self._cached("grids", lambda: head_grids(self.plan, self.tiles))
+
+    @property
+    def num_bricks(self) -> int:
+        """Bricks that are stored, without the empty one."""
+        return len(self.density) // BRICK - 1
+
+    def _cached(self, name: str, make: Any) -> Any:
+        """A constant of the plan, made once for the device that the parameters are on."""
+        key = (name, self.density.device)
+        if key not in self._packed:
+            self._packed[key] = make()
+        return self._packed[key]
+
+    def build(self, plan: ScenePlan, factor: float, tiles: Int[Tensor, "T"] | None = None) -> None:
+        """Allocates all tables afresh for ``plan`` at ``factor`` times its texels. Parameters stay the same objects.
+
+        Args:
+            plan: frames and resolutions.
+            factor: texels in use, as a share of the plan's.
+            tiles: which are stored; None for those that training rays can reach.
+        """
+        self.full_plan, self.plan, self.factor = plan, plan.scaled(factor), factor
+        device = self.density.device
+        if tiles is None:
+            reached = self._reachable()
+            tiles = head_grids(self.plan)[0].tiles if reached is None else number_tiles(reached)
+        self.tiles = tiles.to(device, copy=True)
+        for name in TABLES:
+            table = getattr(self, name)
+            replace_data(table, new_table(self.tiles, self._channels(name), _empty_value(name)))
+        self.touched = torch.zeros(len(self.density), dtype=torch.uint8, device=device)
+        self.plan_bytes = torch.frombuffer(bytearray(plan.to_json().encode()), dtype=torch.uint8).to(device)
+        self.texel_factor = torch.tensor(factor, dtype=torch.float64, device=device)
+        self._forget()
+
+    def prepare_storage(self, schedule: Schedule, step: int, least: float, optimizers: Mapping[str, Any]) -> None:
+        """Grows and gives up what the schedule says of this step.
+
+        Args:
+            schedule: of the whole run.
+            step: that is about to run.
+            least: see ``release_unused``.
+            optimizers: of the tables, by their names, where there are any; their moments follow.
+        """
+        own = [(optimizers[name], getattr(self, name)) for name in TABLES if name in optimizers]
+        factor = schedule.texel_factor(step)
+        if factor != self.factor:
+            for optimizer, table in own:
+                optimizer.reset_moments(table)
+            self.grow(factor)
+        phase, left = schedule.phase_at(step), []
+        if schedule.releases_at(step):
+            left.append(self.release_unused(least))
+        elif schedule.sharpened(step) and not schedule.sharpened(step - 1):
+            self.look_afresh()
+        if phase.name == "blend" and step == phase.start:
+            left.append(self.release_untouched())
+        for kept in left:
+            for optimizer, table in own if kept is not None else ():
+                optimizer.keep_blocks(table, kept, BRICK)
+
+    @torch.no_grad()
+    def grow(self, factor: float) -> None:
+        """Resamples every table to ``factor`` times the plan's texels (paper sec. IV; bilinear on each plane)."""
+        old, self.plan, self.factor = self.grids, self.full_plan.scaled(factor), factor
+        is_cube = [k >= len(self.plan.mpis) for k in range(self.plan.num_heads)]
+        reached = self._reachable()
+        tiles = grown_tiles(old, head_grids(self.plan), is_cube, reached).to(self.density.device)
+        new = head_grids(self.plan, tiles)
+        for name in TABLES:
+            table = getattr(self, name)
+            replace_data(table, resample(table.data, old, new, is_cube, _empty_value(name)))
+        touched = resample(self.touched[:, None].float(), old, new, is_cube)
+        self.tiles, self.touched = tiles, (touched[:, 0] > 0).to(torch.uint8)
+        self.texel_factor.fill_(factor)
+        self._forget()
+
+    @torch.no_grad()
+    def note_use(self, lookup: Lookup, weights: Float[Tensor, "R S"], live: Int[Tensor, "R"]) -> None:
+        """Notes which bricks the samples of a training batch read and what those weighed, and how many there were."""
+        weight = weights.reshape(-1)[lookup.index]
+        for taps in lookup.groups:
+            bricks = (taps.rows >> 6).reshape(-1)
+            self.peak.scatter_reduce_(0, bricks, weight[taps.samples].repeat_interleave(taps.rows.shape[1]), "amax")
+        self.crossings += live.sum()
+
+    @torch.no_grad()
+    def release_unused(self, least: float) -> Int[Tensor, "K"] | None:
+        """Gives up the bricks in which no training sample weighed ``least`` since the last look, and looks afresh.
+
+        Returns:
+            Numbers that the bricks left had before (for ``TouchedAdam.keep_blocks``); None where nothing changed,
+            as when too few rays were seen to tell.
+        """
+        enough = float(self.crossings) >= ENOUGH_CROSSINGS * self.num_bricks
+        kept = self._keep(self.peak >= least) if enough else None
+        self.look_afresh()
+        return kept
+
+    def look_afresh(self) -> None:
+        """Forgets what was noted about the use of bricks."""
+        self.peak = torch.zeros(self.num_bricks + 1, device=self.density.device)
+        self.crossings = torch.zeros_like(self.crossings)
+
+    @torch.no_grad()
+    def release_untouched(self) -> Int[Tensor, "K"] | None:
+        """Empties the texels that no ray trained: alpha 0, no vote in the blending. Returns as ``release_unused``."""
+        self.density.data[self.touched == 0] = RELEASED_DENSITY
+        return self._keep(self.touched.view(-1, BRICK).any(-1))
+
+    def _keep(self, keep: Bool[Tensor, "B"]) -> Int[Tensor, "K"] | None:
+        self.tiles, kept = keep_bricks(self.tiles, keep)
+        if len(kept) == len(keep):
+            return None
+        for name in TABLES:
+            table = getattr(self, name)
+            replace_data(table, take_bricks(table.data, kept))
+        self.touched, self.peak = take_bricks(self.touched, kept), self.peak[kept]
+        self._packed = {}
+        return kept
+
+    def _forget(self) -> None:
+        """After a change of resolution."""
+        self._packed = {}
+        self.look_afresh()
+
+    def _reachable(self) -> Bool[Tensor, "T"] | None:
+        return None if self.views is None else reachable_tiles(self.views, self.plan)
+
+    def _channels(self, name: str) -> int:
+        return self.feature_channels if name == "features" else 1
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
+        """Takes plan, resolution and tiles from the checkpoint first, so that all shapes fit."""
+        plan_bytes = state_dict.get(prefix + "plan_bytes")
+        if plan_bytes is None:
+            if not any(key.startswith(prefix) for key in state_dict):
+                return  # nerfstudio loads the pipeline's own, empty state in a second pass
+            raise ValueError("The checkpoint holds no scene plan: it was not written by this method.")
+        plan = ScenePlan.from_json(bytes(plan_bytes.cpu().numpy().tolist()).decode())
+        factor = float(state_dict[prefix + "texel_factor"])
+        tiles = state_dict.get(prefix + "tiles")
+        self.build(plan, factor, head_grids(plan.scaled(factor))[0].tiles if tiles is None else tiles)
+        if tiles is None:
+            self._store_in_bricks(state_dict, prefix)
+        self.plan_bytes = plan_bytes.clone().to(self.density.device)  # as it was written, whatever a plan has now
+        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
+
+    def _store_in_bricks(self, state_dict: dict[str, Any], prefix: str) -> None:
+        """Rewrites the state of a checkpoint from before there were bricks."""
+        for name in (*TABLES, "touched"):
+            dense = state_dict[prefix + name]
+            flat = dense.view(len(dense), -1).to(self.density.device)
+            table = from_dense(flat, self.grids, _empty_value(name))
+            state_dict[prefix + name] = table.view(-1, *dense.shape[1:])
+        for name in ("tiles", "peak", "crossings"):
+            state_dict[prefix + name] = getattr(self, name)
+
+
+def _empty_value(name: str) -> float:
+    """What the empty brick holds."""
+    return RELEASED_DENSITY if name == "density" else 0.0
+
+
+def _keep_empty_brick(grad: Tensor) -> Tensor:
+    """A table's gradient without the rows of the empty brick: samples beside a released tile read them as well."""
+    if not grad.is_sparse:
+        return torch.cat([torch.zeros_like(grad[:BRICK]), grad[BRICK:]])
+    rows, values = grad._indices(), grad._values()
+    rises = grad.is_coalesced()
+    if rises:  # then the empty brick's rows come first (on a CPU; a device would wait for their number)
+        first = int(torch.searchsorted(rows[0], BRICK))
+        rows, values = rows[:, first:], values[first:]
+    else:
+        values = values.masked_fill((rows[0] < BRICK)[:, None], 0)
+    return torch.sparse_coo_tensor(rows, values, grad.shape, is_coalesced=rises, check_invariants=False)
+
+
+def replace_data(parameter: nn.Parameter, data: Tensor) -> None:
+    """Gives a parameter data of another shape.
+
+    A graph of an earlier step that is still referenced keeps the parameter's gradient accumulator, and with it the old
+    shape, alive. Torch renews the accumulator when the dtype changes, so the data goes through another dtype.
+    """
+    parameter.grad = None
+    parameter.data = torch.empty(0, dtype=torch.float64, device=data.device)
+    parameter.data = data

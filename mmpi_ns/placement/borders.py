@@ -1,0 +1,86 @@
+"""No holes: MPIs are widened until some MPI holds every view's borders, and a little beyond."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mmpi_ns.placement.observations import Array, Observations
+from mmpi_ns.placement.visibility import Content
+from mmpi_ns.scene.plan import MPIPlan
+
+BEYOND = 0.05
+"""How far beyond an image's borders there should be texels, as a share of its sides: other views look there."""
+WIDEST, FARTHEST = 3.0, 0.5
+"""No tangent is widened beyond the one, nor by more than the other: a border far from all MPIs would cost too much."""
+
+
+def widened(mpis: list[MPIPlan], observations: Observations, content: Content) -> list[MPIPlan]:
+    """The MPIs, widened where the borders of an image are in none of them; texels keep their size.
+
+    A border counts at the depths between which content lies. Each border point that nothing holds goes to the MPI that
+    must grow least for it.
+
+    Args:
+        mpis: the chosen MPIs.
+        observations: the training cameras.
+        content: where their content lies.
+    """
+    points = border_points(observations, content)
+    tangents, depths = _in_frames(mpis, points)
+    extents = np.array([m.extent for m in mpis])
+    ahead = (depths >= np.array([[m.near] for m in mpis])) & (depths <= np.array([[m.far] for m in mpis]))
+    held = ahead & (_outside(tangents, extents).max(-1) <= 0)
+    able = ahead & (np.abs(tangents).max(-1) <= WIDEST) & (_outside(tangents, extents).max(-1) <= FARTHEST)
+    for p in np.nonzero(~held.any(0) & able.any(0))[0]:
+        missing = np.maximum(_outside(tangents[:, p], extents), 0)
+        k = int(np.where(able[:, p], missing.sum(-1), np.inf).argmin())
+        u, v = tangents[k, p]
+        u0, u1, v0, v1 = extents[k]
+        extents[k] = min(u0, u), max(u1, u), min(v0, v), max(v1, v)
+    return [_resized(m, extent) for m, extent in zip(mpis, extents, strict=True)]
+
+
+def border_points(observations: Observations, content: Content) -> Array:
+    """[M * 32, 3] points around every image's border, at the depths where a quarter and most of its content begins."""
+    steps = (0.0, 0.25, 0.5, 0.75, 1.0)
+    rim = np.array([(a, b) for a in steps for b in steps if a in (0.0, 1.0) or b in (0.0, 1.0)])
+    shares = -BEYOND + (1 + 2 * BEYOND) * rim
+    clouds = []
+    for pose, (fx, fy, cx, cy), (w, h), depths in zip(
+        observations.camera_to_worlds, observations.intrinsics, observations.sizes, content.typical, strict=True
+    ):
+        x, y = (shares[:, 0] * w - cx) / fx, (shares[:, 1] * h - cy) / fy
+        directions = np.stack([x, -y, -np.ones_like(x)], -1) @ pose[:, :3].T
+        clouds += [pose[:, 3] + depth * directions for depth in depths]
+    return np.concatenate(clouds)
+
+
+def _in_frames(mpis: list[MPIPlan], points: Array) -> tuple[Array, Array]:
+    """Tangents [K, P, 2] and depths [K, P] of points in every MPI."""
+    origins = np.array([m.origin for m in mpis], dtype=np.float64)
+    axes = np.array([m.axes for m in mpis], dtype=np.float64)
+    local = np.einsum("kij,kpj->kpi", axes, points - origins[:, None])
+    depth = local[..., 2]
+    return local[..., :2] / np.where(depth > 0, depth, np.nan)[..., None], depth
+
+
+def _outside(tangents: Array, extents: Array) -> Array:
+    """[K, ..., 2] how far tangents lie outside the extents [K, 4]; negative inside, not a number behind."""
+    shape = (len(extents), *(1,) * (tangents.ndim - 2))
+    u0, u1, v0, v1 = (extents[:, i].reshape(shape) for i in range(4))
+    u, v = tangents[..., 0], tangents[..., 1]
+    return np.stack([np.maximum(u0 - u, u - u1), np.maximum(v0 - v, v - v1)], -1)
+
+
+def _resized(mpi: MPIPlan, extent: NDArray[np.float64]) -> MPIPlan:
+    u0, u1, v0, v1 = (float(x) for x in extent)
+    across, down = ((u1 - u0) / (mpi.extent[1] - mpi.extent[0]), (v1 - v0) / (mpi.extent[3] - mpi.extent[2]))
+    return replace(
+        mpi,
+        extent=(u0, u1, v0, v1),
+        width=round((mpi.width - 1) * across) + 1,
+        height=round((mpi.height - 1) * down) + 1,
+    )

@@ -1,0 +1,151 @@
+"""Pictures of a plan: the scene from above and from the side, and a histogram of expected pixel errors."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle
+from numpy.typing import NDArray
+
+from mmpi_ns.placement.errors import WORST
+from mmpi_ns.placement.observations import Array, Observations
+from mmpi_ns.placement.show.explain import PlanReport
+from mmpi_ns.placement.visibility import Content
+from mmpi_ns.scene.plan import MPIPlan, ScenePlan
+from mmpi_ns.scene.windows import WindowedPlan
+
+COLORS = ("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b", "#e377c2", "#17becf", "#bcbd22", "#7f7f7f")
+SHOWN_POINTS = 6000
+SHOWN_PLANES = 12
+
+
+def draw_plan(path: Path, plan: ScenePlan, observations: Observations, content: Content) -> None:
+    """Writes a picture (PNG) of cameras, points, frusta and planes, from above and from the side.
+
+    The picture's axes are the cameras' mean right, up and forward, in scene units.
+    """
+    base = observations.mean_axes * np.array([[1.0], [-1.0], [1.0]])  # right, up, forward
+    middle = observations.centers.mean(0)
+    points = content.points[_nearby(content, observations)]
+    points = (points[:: max(1, len(points) // SHOWN_POINTS)] - middle) @ base.T
+    centers = (observations.centers - middle) @ base.T
+    low, high = np.percentile(points, [1, 99], axis=0) if len(points) else (centers.min(0), centers.max(0))
+    low, high = np.minimum(low, centers.min(0)), np.maximum(high, centers.max(0))
+    reach = float(np.linalg.norm(high - low))
+    low, high = low - 0.05 * reach, high + 0.05 * reach
+    facing = -observations.camera_to_worlds[:, :, 2] @ base.T * 0.025 * reach
+    figure = Figure(figsize=(13, 8), layout="constrained")
+    FigureCanvasAgg(figure)
+    # Forward to the right in both, so that a drive fills the width; seen from above, left is then up.
+    for row, (title, up, name) in enumerate((("from above", 0, "left"), ("from the side", 1, "up"))):
+        sign = -1.0 if up == 0 else 1.0
+        flip = np.array([[0.0, 0.0, 1.0], sign * np.eye(3)[up]])
+        heights = sorted((sign * low[up], sign * high[up]))
+        axes = figure.add_subplot(2, 1, row + 1, aspect="equal", title=title, xlabel="forward", ylabel=name)
+        axes.scatter(*(points @ flip.T).T, s=2, c="0.75", linewidths=0, zorder=1)
+        for k, mpi in enumerate(plan.mpis):
+            _draw_mpi(axes, mpi, flip @ base, middle, reach, COLORS[k % len(COLORS)])
+        if plan.cube is not None:
+            edges = (_box_edges(np.asarray(plan.cube.lower), np.asarray(plan.cube.upper)) - middle) @ (flip @ base).T
+            axes.add_collection(LineCollection(list(edges), colors="black", linewidths=0.8, zorder=3, label="cube"))
+        axes.scatter(*(centers @ flip.T).T, s=10, c="black", zorder=4)
+        looks = np.stack([centers, centers + facing], 1) @ flip.T
+        axes.add_collection(LineCollection(list(looks), colors="black", linewidths=0.7, zorder=4))
+        axes.set_xlim(low[2], high[2])
+        axes.set_ylim(*heights)
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside right upper", fontsize=8)
+    figure.savefig(path, dpi=110)
+
+
+def draw_windows(path: Path, windows: WindowedPlan, observations: Observations) -> None:
+    """Writes a map (PNG) of a long capture: cameras, windows with their margins, and where MPIs stand and look."""
+    base = observations.mean_axes
+    map_axes = np.stack([base[2], -base[0]])  # forward to the right, left up
+    middle = observations.centers.mean(0)
+    centers = (observations.centers - middle) @ map_axes.T
+    figure = Figure(figsize=(13, 8), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot(aspect="equal", title="windows, from above", xlabel="forward", ylabel="left")
+    points = (observations.points[:: max(1, len(observations.points) // SHOWN_POINTS)] - middle) @ map_axes.T
+    axes.scatter(*points.T, s=1, c="0.8", linewidths=0)
+    for i, window in enumerate(windows.windows):
+        color = COLORS[i % len(COLORS)]
+        at = (np.asarray(window.center) - middle) @ map_axes.T
+        axes.add_patch(Circle(at, window.radius, fill=False, color=color, label=f"window {i}"))
+        axes.add_patch(Circle(at, window.radius + window.margin, fill=False, color=color, linestyle=":"))
+        for mpi in window.plan.mpis:
+            origin = (np.asarray(mpi.origin) - middle) @ map_axes.T
+            ahead = np.asarray(mpi.axes[2]) @ map_axes.T * 0.4 * window.radius
+            axes.annotate("", origin + ahead, origin, arrowprops={"arrowstyle": "->", "color": color})
+    axes.scatter(*centers.T, s=6, c="black", zorder=4)
+    reach = 0.6 * max(w.radius for w in windows.windows)
+    axes.set_xlim(centers[:, 0].min() - reach, centers[:, 0].max() + reach)
+    axes.set_ylim(centers[:, 1].min() - reach, centers[:, 1].max() + reach)
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside right upper", fontsize=8)
+    figure.savefig(path, dpi=110)
+
+
+def draw_errors(path: Path, plan: ScenePlan, report: PlanReport) -> None:
+    """Writes a histogram (PNG) of the expected pixel error, coloured by the MPI that serves each observation."""
+    figure = Figure(figsize=(8, 4), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot(xlabel="expected error, pixels", ylabel="observations", xscale="log")
+    errors, best = report.served_errors, report.errors.best
+    bins = np.geomspace(0.1, WORST, 49)
+    values = [np.clip(errors[best == k], bins[0], WORST) for k in range(len(plan.names))]
+    colors = [COLORS[k % len(COLORS)] if k < len(plan.mpis) else "black" for k in range(len(plan.names))]
+    axes.hist(values, bins=bins.tolist(), stacked=True, color=colors, label=list(plan.names))
+    axes.axvline(float(np.median(errors)), color="black", linestyle="--", linewidth=0.8)
+    axes.set_title(f"median {np.median(errors):.2f} px; what nothing holds counts {WORST:.0f} px")
+    axes.legend(fontsize=7)
+    figure.savefig(path, dpi=110)
+
+
+def _nearby(content: Content, observations: Observations) -> NDArray[np.bool_]:
+    """Points near enough to be drawn: the far ones would shrink everything else to a dot."""
+    distance = np.linalg.norm(content.points - observations.centers[content.cameras], axis=-1)
+    return distance < 40 * content.near
+
+
+def _draw_mpi(axes: Axes, mpi: MPIPlan, picture: Array, middle: Array, reach: float, color: str) -> None:
+    """The outline of a frustum and some of its planes, seen along the picture's third axis.
+
+    Args:
+        axes: where to draw.
+        mpi: the MPI.
+        picture: rows are the picture's two axes in world coordinates. [2, 3]
+        middle: world point at the picture's origin. [3]
+        reach: how far to draw, scene units.
+        color: of its lines.
+    """
+    u0, u1, v0, v1 = mpi.extent
+    origin = (np.asarray(mpi.origin) - middle) @ picture.T
+    shown = np.linspace(0, 1, min(SHOWN_PLANES, mpi.planes), endpoint=False)
+    depths = mpi.near / (1 - mpi.depth_share * shown)
+    end = min(mpi.far, reach)
+    depths = np.append(depths[depths < end], end)
+    corners = np.array([[u, v, 1.0] for u in (u0, u1) for v in (v0, v1)]) @ np.asarray(mpi.axes) @ picture.T
+    planes = np.array([_widest(origin + depth * corners) for depth in depths])
+    axes.add_collection(LineCollection(list(planes), colors=color, linewidths=0.6, zorder=2))
+    borders = [np.stack([origin, end]) for end in planes[-1]]
+    axes.add_collection(LineCollection(borders, colors=color, linewidths=1.2, zorder=2, label=mpi.name))
+    axes.plot(*origin, marker="x", color=color, zorder=5)
+
+
+def _widest(outline: Array) -> Array:
+    """[2, 2] the two of a plane's corners that lie farthest apart in the picture."""
+    apart = np.linalg.norm(outline[:, None] - outline[None], axis=-1)
+    return outline[list(np.unravel_index(int(apart.argmax()), apart.shape))]
+
+
+def _box_edges(lower: Array, upper: Array) -> Array:
+    """[12, 2, 3] the edges of a box."""
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
+    pairs = [(i, j) for i in range(8) for j in range(i) if np.abs(corners[i] - corners[j]).sum() == 1]
+    at = lower + corners * (upper - lower)
+    return np.array([[at[i], at[j]] for i, j in pairs])

@@ -1,0 +1,170 @@
+"""The finished windows of a long capture: on disk, and a few of them in memory to render."""
+
+from __future__ import annotations
+
+import pickle
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from mmpi_ns.capture.checks import brief
+from mmpi_ns.field.mmpi_field import MMPIField
+from mmpi_ns.field.tables import TABLES
+from mmpi_ns.scene.plan import ScenePlan
+from mmpi_ns.utils.files import to_text, write_atomically
+
+_DAMAGED = (OSError, RuntimeError, EOFError, KeyError, TypeError, pickle.UnpicklingError)
+"""What reading a damaged file raises."""
+
+
+class WindowStore:
+    """Finished windows, one file each.
+
+    Args:
+        folder: where the files lie; None where there is one window alone.
+        budget: bytes that windows held to render may take. The one that is rendered is held whatever it takes.
+        half: write tables in half precision.
+    """
+
+    def __init__(self, folder: Path | None, budget: float, half: bool = False) -> None:
+        self.folder, self.budget, self.half = folder, budget, half
+        self._fields: dict[int, MMPIField] = {}
+        """Those that are held, the one used last at the end."""
+
+    def path(self, window: int) -> Path:
+        assert self.folder is not None, "several windows need a folder"
+        return self.folder / f"window-{window:05d}.pt"
+
+    def forget(self, window: int) -> None:
+        """Leaves the file alone: the window is about to be trained, and will be written anew."""
+        self._fields.pop(window, None)
+
+    def save(self, window: int, field: MMPIField) -> None:
+        """Writes a finished window: whole, or not at all.
+
+        Raises:
+            OSError: the disk is full or cannot be written.
+        """
+        path = self.path(window)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        tables = field.state_dict()
+        if self.half:
+            tables |= {name: tables[name].half() for name in TABLES}
+        state = {"window": window, "field": tables}
+        write_atomically(path, lambda unfinished: torch.save(state, unfinished))
+
+    def load(self, window: int, empty: Callable[[], MMPIField], device: torch.device) -> MMPIField:
+        """A finished window, ready to render.
+
+        Args:
+            window: its number.
+            empty: makes a field of the run's settings to load into.
+            device: where to.
+
+        Raises:
+            ValueError: the file is missing or damaged (says which, and what to do).
+        """
+        if window in self._fields:
+            self._fields[window] = self._fields.pop(window)
+            return self._fields[window]
+        path = self.path(window)
+        if not path.is_file():
+            raise ValueError(
+                f"Window {window} of this run is missing: {path} is not there. Put the run's folder 'windows' back, or "
+                "name where it is in config.yml (pipeline.model.windows_folder)."
+            )
+        try:
+            state = torch.load(path, map_location="cpu", weights_only=True, mmap=True)["field"]
+            self._make_room(sum(values.numel() * _itemsize(values) for values in state.values()))
+            field = empty()
+            field.load_state_dict({name: _widened(values) for name, values in state.items()})
+        except (*_DAMAGED, AttributeError) as error:
+            raise ValueError(
+                f"Window {window} of this run is damaged: {path} cannot be read ({brief(error)}). Copy it anew, or "
+                "train it again: resume from a checkpoint of before its end with --load-step."
+            ) from error
+        self._fields[window] = field.to(device).eval()
+        return self._fields[window]
+
+    def _make_room(self, needed: int) -> None:
+        """Lets windows go, the one that was not used for longest first, until ``needed`` bytes fit the budget too."""
+        while self._fields and needed + sum(map(_bytes_of, self._fields.values())) > self.budget:
+            del self._fields[next(iter(self._fields))]
+
+    def adopt(self, other: Path, plans: dict[int, ScenePlan], needed: bool = False) -> None:
+        """Takes over finished windows of the run that this one goes on from.
+
+        Args:
+            other: that run's folder of windows.
+            plans: of the windows to take over, by their numbers.
+            needed: whether all must be there.
+
+        Raises:
+            ValueError: one is missing there that is needed, is damaged, or was trained with another plan.
+        """
+        if not plans or other.resolve() == self.path(0).parent.resolve():
+            return
+        for window, plan in plans.items():
+            path, source = self.path(window), other / self.path(window).name
+            if source.is_file():
+                _check_plan(source, plan)
+                path.parent.mkdir(parents=True, exist_ok=True)
+                write_atomically(path, lambda unfinished, source=source: shutil.copyfile(source, unfinished))
+            elif needed:
+                raise ValueError(
+                    f"Window {window} of the run to go on from is missing: {source} is not there. Put it back, or "
+                    "resume from a checkpoint of before its end with --load-step."
+                )
+
+
+def _itemsize(values: Tensor) -> int:
+    """Bytes of a number once it is read."""
+    return 4 if values.dtype == torch.float16 else values.element_size()
+
+
+def _widened(values: Tensor) -> Tensor:
+    return values.float() if values.dtype == torch.float16 else values
+
+
+def _bytes_of(field: MMPIField) -> int:
+    return sum(values.nbytes for values in field.state_dict().values())
+
+
+def _check_plan(source: Path, plan: ScenePlan) -> None:
+    """Raises ValueError where a window's file is damaged or holds another plan."""
+    try:
+        state = torch.load(source, map_location="cpu", weights_only=True, mmap=True)
+        stored = ScenePlan.from_json(to_text(state["field"]["plan_bytes"]))
+    except _DAMAGED as error:
+        raise ValueError(
+            f"{source} cannot be read ({brief(error)}): copy it anew, or remove it to train again."
+        ) from error
+    if stored != plan:
+        raise ValueError(
+            f"{source} was trained with another scene plan: resume with the settings in its run's config.yml, or give "
+            "that run's plan.json with --pipeline.model.plan-file."
+        )
+
+
+def mix_windows(
+    shares: Float[Tensor, "R W"], parts: dict[int, tuple[Int[Tensor, "P"], dict[str, Tensor]]]
+) -> dict[str, Tensor]:
+    """One rendering of several windows': colours by their shares, depth and winner of the window of most share.
+
+    Args:
+        shares: of each ray and window.
+        parts: for each window that was asked, which rays, and what it shows of them.
+    """
+    mixed: dict[str, Tensor] = {}
+    most = shares.argmax(-1)
+    for w, (rays, outputs) in parts.items():
+        own = (most[rays] == w)[:, None]
+        for name, values in outputs.items():
+            whole = mixed.setdefault(name, values.new_zeros(len(shares), *values.shape[1:]))
+            chooses = name in ("depth", "winning_mpi")
+            whole[rays] += values * (own if chooses else shares[rays, w][:, None])
+    return mixed

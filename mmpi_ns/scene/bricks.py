@@ -1,0 +1,132 @@
+"""Tables of bricks as a whole: allocating, filling, growing and compacting them. Row arithmetic is in ``texels.py``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torch.nn.functional import interpolate, max_pool2d, pad
+
+from mmpi_ns.scene.texels import BRICK, SIDE, TexelGrid, number_tiles
+
+CHUNK = 1 << 20
+"""Texels of an MPI that are resampled at once."""
+
+
+def new_table(tiles: Int[Tensor, "T"], channels: int, empty: float = 0.0, dtype=torch.float32) -> Float[Tensor, "N C"]:
+    """A table of zeros with a brick for every stored tile; the empty brick holds ``empty``."""
+    bricks = int((tiles > 0).sum()) + 1
+    table = torch.zeros(bricks * BRICK, channels, dtype=dtype, device=tiles.device)
+    table[:BRICK] = empty
+    return table
+
+
+def read_planes(table: Float[Tensor, "N C"], grid: TexelGrid, planes: slice) -> Float[Tensor, "P H W C"]:
+    """Texels of some planes of one head, as images."""
+    tiles = grid.own_tiles[planes]
+    blocks = table.view(-1, SIDE, SIDE, table.shape[-1])[tiles.to(torch.int64)]
+    images = blocks.permute(0, 1, 3, 2, 4, 5).reshape(len(tiles), grid.down * SIDE, grid.across * SIDE, -1)
+    return images[:, : grid.height, : grid.width]
+
+
+def write_planes(table: Float[Tensor, "N C"], grid: TexelGrid, planes: slice, images: Float[Tensor, "P H W C"]) -> None:
+    """Stores images in the bricks that there are; texels of other tiles are left out."""
+    tiles = grid.own_tiles[planes]
+    stored = tiles > 0
+    below, right = grid.down * SIDE - grid.height, grid.across * SIDE - grid.width
+    padded = pad(images, (0, 0, 0, right, 0, below))
+    blocks = padded.view(len(tiles), grid.down, SIDE, grid.across, SIDE, -1).permute(0, 1, 3, 2, 4, 5)
+    table.view(-1, SIDE, SIDE, table.shape[-1])[tiles[stored].to(torch.int64)] = blocks[stored]
+
+
+def from_dense(dense: Float[Tensor, "D C"], grids: list[TexelGrid], empty: float = 0.0) -> Float[Tensor, "N C"]:
+    """A table of bricks from one that holds every texel, head by head in reading order (checkpoints before bricks)."""
+    table, start = new_table(grids[0].tiles, dense.shape[-1], empty, dense.dtype), 0
+    for grid in grids:
+        block = dense[start : start + grid.texels].view(grid.depth, grid.height, grid.width, -1)
+        write_planes(table, grid, slice(None), block)
+        start += grid.texels
+    return table
+
+
+def keep_bricks(tiles: Int[Tensor, "T"], keep: Bool[Tensor, "B"]) -> tuple[Int[Tensor, "T"], Int[Tensor, "K"]]:
+    """``tiles`` without the bricks that are given up, and the numbers that the others had before (0 among them)."""
+    keep = keep.clone()
+    keep[0] = True
+    numbers = (keep.cumsum(0) - 1) * keep
+    return numbers[tiles.to(torch.int64)].to(torch.int32), keep.nonzero()[:, 0]
+
+
+def take_bricks(table: Float[Tensor, "N C"], kept: Int[Tensor, "K"]) -> Float[Tensor, "M C"]:
+    """The chosen bricks of a table."""
+    return table.view(-1, BRICK, *table.shape[1:])[kept].flatten(0, 1)
+
+
+def grown_tiles(
+    old: list[TexelGrid], new: list[TexelGrid], is_cube: list[bool], reachable: Bool[Tensor, "T"] | None
+) -> Int[Tensor, "T"]:
+    """``tiles`` at another resolution: those that a stored texel of the old one reaches, and a training ray too.
+
+    Args:
+        old: heads as they are.
+        new: heads as they will be; their tiles are not read.
+        is_cube: which of them is the cube.
+        reachable: tiles that training rays cross; None for all.
+    """
+    stored = torch.zeros_like(new[0].tiles, dtype=torch.bool)
+    for source, target, cube in zip(old, new, is_cube, strict=True):
+        for own, planes in _chunks(target, cube):
+            there = _resize(_stored(source, own).float(), target, cube)[..., 0] > 0
+            reached = pad(there.float(), (0, -target.width % SIDE, 0, -target.height % SIDE))
+            tiles = max_pool2d(reached[:, None], SIDE)[:, 0] > 0
+            first = target.first_tile + planes.start * target.down * target.across
+            stored[first : first + tiles.numel()] = tiles.reshape(-1).cpu()
+    return number_tiles(stored if reachable is None else stored & reachable)
+
+
+def resample(
+    table: Float[Tensor, "N C"], old: list[TexelGrid], new: list[TexelGrid], is_cube: list[bool], empty: float = 0.0
+) -> Float[Tensor, "M C"]:
+    """The table at another resolution: bilinear on every plane of an MPI, trilinear in the cube (paper growth).
+
+    Texels beside a tile that holds nothing go on as the stored ones are. Planes are worked on a few at a time, so the
+    old table and the new one are all that is held.
+    """
+    out = new_table(new[0].tiles, table.shape[-1], empty, table.dtype)
+    for source, target, cube in zip(old, new, is_cube, strict=True):
+        for own, planes in _chunks(target, cube):
+            images = read_planes(table, source, own)
+            stored = _stored(source, own).to(table.dtype)
+            if bool(stored.all()):
+                write_planes(out, target, planes, _resize(images, target, cube))
+                continue
+            there, value = _resize(stored, target, cube), _resize(images * stored, target, cube)
+            value = torch.where(there > 1 - 1e-6, value, value / there.clamp(min=1e-12))
+            write_planes(out, target, planes, torch.where(there > 0, value, empty))
+    return out
+
+
+def _chunks(target: TexelGrid, is_cube: bool) -> Iterator[tuple[slice, slice]]:
+    """A few planes at a time: where they come from and where they go. The cube's layers go together."""
+    step = target.depth if is_cube else max(1, CHUNK // (target.height * target.width))
+    for start in range(0, target.depth, step):
+        planes = slice(start, min(start + step, target.depth))
+        yield (slice(None) if is_cube else planes), planes
+
+
+def _stored(grid: TexelGrid, planes: slice) -> Bool[Tensor, "P h w 1"]:
+    """Which texels of some planes are stored."""
+    wide = (grid.own_tiles[planes] > 0).repeat_interleave(SIDE, 1).repeat_interleave(SIDE, 2)
+    return wide[:, : grid.height, : grid.width, None]
+
+
+def _resize(images: Float[Tensor, "P h w C"], target: TexelGrid, is_cube: bool) -> Float[Tensor, "Q H W C"]:
+    """Images of another size, corners on corners; the layers of a cube are resized as well."""
+    if is_cube:
+        size = (target.depth, target.height, target.width)
+        out = interpolate(images.permute(3, 0, 1, 2)[None], size=size, mode="trilinear", align_corners=True)
+        return out[0].permute(1, 2, 3, 0)
+    size = (target.height, target.width)
+    return interpolate(images.permute(0, 3, 1, 2), size=size, mode="bilinear", align_corners=True).permute(0, 2, 3, 1)

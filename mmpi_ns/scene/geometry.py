@@ -1,0 +1,291 @@
+"""The MPI frame: world <-> NDC, plane hits and the live interval of a ray (docs/how_it_works.md, "Geometry").
+
+Everything here is affine in disparity w = 1/depth, so a plane at infinity (w = 0) is an ordinary plane.
+Points travel as homogeneous pairs ``(o/t + d, 1/t)``, which are finite and exact at infinity.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from mmpi_ns.scene.plan import CubePlan, MPIPlan
+
+FACING_EPS = 1e-6
+"""A ray with a smaller facing component (cosine) runs along the planes and hits none of them."""
+
+
+@dataclass(frozen=True)
+class Frames:
+    """K MPI frames as tensors. ``axes`` rows are x (right), y (down), z (facing) in world coordinates."""
+
+    origins: Float[Tensor, "K 3"]
+    axes: Float[Tensor, "K 3 3"]
+    nears: Float[Tensor, "K"]
+    extents: Float[Tensor, "K 4"]
+    num_planes: Int[Tensor, "K"]
+    last_disparities: Float[Tensor, "K"]
+    """Disparity of the last plane, 1 / far; 0 where an MPI reaches to infinity."""
+
+    @staticmethod
+    def pack(mpis: Sequence[MPIPlan], dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Frames:
+        def tensor(values) -> Tensor:
+            return torch.tensor(values, dtype=dtype, device=device)
+
+        return Frames(
+            origins=tensor([m.origin for m in mpis]),
+            axes=tensor([m.axes for m in mpis]),
+            nears=tensor([m.near for m in mpis]),
+            extents=tensor([m.extent for m in mpis]),
+            num_planes=torch.tensor([m.planes for m in mpis], device=device),
+            last_disparities=tensor([m.last_disparity for m in mpis]),
+        )
+
+    @property
+    def disparity_steps(self) -> Float[Tensor, "K"]:
+        """Disparity between neighbouring planes, (1/near - 1/far) / (L - 1), in 1 / scene units."""
+        return self.depth_shares / (self.nears * (self.num_planes - 1).to(self.nears.dtype))
+
+    @property
+    def depth_shares(self) -> Float[Tensor, "K"]:
+        """1 - near / far: the share of all disparities beyond the near plane that an MPI spans; 1 to infinity."""
+        return 1.0 - self.nears * self.last_disparities
+
+    def to(self, device: torch.device | str) -> Frames:
+        return Frames(*(getattr(self, f.name).to(device) for f in fields(self)))
+
+
+@dataclass(frozen=True)
+class PlaneHits:
+    """Where R rays cross the planes of K MPIs.
+
+    Planes are counted by m = L - 1 - l, so m = 0 is the last one and the disparity is w = 1/far + m * step.
+    The live planes of a ray are m_first, m_first - 1, ..., ``count`` of them, near to far.
+    """
+
+    m_first: Int[Tensor, "R K"]
+    """m of the nearest live plane."""
+    count: Int[Tensor, "R K"]
+    """Number of live planes; 0 where the ray meets none."""
+    u: Float[Tensor, "R K 2"]
+    """u(w) = u[0] + w u[1], tangent along the frame's x."""
+    v: Float[Tensor, "R K 2"]
+    """v(w) = v[0] + w v[1], tangent along the frame's y."""
+    local_origins: Float[Tensor, "R K 3"]
+    local_directions: Float[Tensor, "R K 3"]
+
+
+def rotate(axes: Float[Tensor, "*#N 3 3"], vectors: Float[Tensor, "*#N 3"]) -> Float[Tensor, "*N 3"]:
+    """axes @ vector by single products: a matrix product would run in bfloat16 under autocast."""
+    return (axes * vectors[..., None, :]).sum(-1)
+
+
+def rays_in_frames(
+    origins: Float[Tensor, "R 3"], directions: Float[Tensor, "R 3"], frames: Frames
+) -> tuple[Float[Tensor, "R K 3"], Float[Tensor, "R K 3"]]:
+    """Ray origins and directions in each MPI's axes, relative to the MPI's origin (differences first: far from the
+    world's origin nothing is lost)."""
+    offsets = origins[:, None, :] - frames.origins
+    local_origins = rotate(frames.axes, offsets)
+    return local_origins, rotate(frames.axes, directions[:, None, :])
+
+
+def plane_hits(
+    origins: Float[Tensor, "R 3"],
+    directions: Float[Tensor, "R 3"],
+    nears: Float[Tensor, "R 1"],
+    fars: Float[Tensor, "R 1"],
+    frames: Frames,
+) -> PlaneHits:
+    """The live planes of each ray in each MPI, in closed form.
+
+    A plane is live when it faces the ray, lies ahead of the camera, between near and far, and is crossed inside
+    the MPI's extent. Each condition is a half-space p w <= q in disparity, so the live planes are one range.
+
+    Args:
+        origins: ray origins, world axes, scene units.
+        directions: unit ray directions, world axes.
+        nears: distance at which rays start.
+        fars: distance at which rays end; may be inf.
+        frames: the K MPI frames.
+
+    Returns:
+        The live range of every ray in every MPI and the affine maps from disparity to (u, v).
+
+    Source: MMPI paper, sec. III-B ("sample and merge", forward-facing check); docs/how_it_works.md, "Live interval".
+    """
+    o, d = rays_in_frames(origins, directions, frames)
+    dz, oz = d[..., 2], o[..., 2]
+    facing = dz > FACING_EPS
+    safe_dz = torch.where(facing, dz, torch.ones_like(dz))
+    slope_u, slope_v = d[..., 0] / safe_dz, d[..., 1] / safe_dz
+    bend_u, bend_v = o[..., 0] - oz * slope_u, o[..., 1] - oz * slope_v
+    u0, u1, v0, v1 = frames.extents.unbind(-1)
+    inverse_far = 1.0 / fars
+    one = torch.ones_like(oz)
+    p = torch.stack([dz * nears + oz, -(dz + oz * inverse_far), bend_u, -bend_u, bend_v, -bend_v])
+    q = torch.stack([one, -inverse_far * one, u1 - slope_u, slope_u - u0, v1 - slope_v, slope_v - v0])
+
+    last = (frames.num_planes - 1).to(oz.dtype)
+    step, end = frames.disparity_steps, frames.last_disparities
+    low, high = _half_space_range(p, q - p * end, step, last)
+    live = _live_test(p, q, oz, step, end, last)
+    # The division may be off by one plane at a border: the half-space test itself decides.
+    high = torch.where(live(high + 1), high + 1, torch.where(live(high), high, high - 1))
+    low = torch.where(live(low - 1), low - 1, torch.where(live(low), low, low + 1))
+    count = torch.where(facing, (high - low + 1).clamp(min=0), torch.zeros_like(high))
+    return PlaneHits(
+        m_first=high.to(torch.int64),
+        count=count.to(torch.int64),
+        u=torch.stack([slope_u, bend_u], -1),
+        v=torch.stack([slope_v, bend_v], -1),
+        local_origins=o,
+        local_directions=d,
+    )
+
+
+def _half_space_range(
+    p: Float[Tensor, "C R K"], q: Float[Tensor, "C R K"], step: Float[Tensor, "K"], last: Float[Tensor, "K"]
+) -> tuple[Float[Tensor, "R K"], Float[Tensor, "R K"]]:
+    """Smallest and largest integer m in [0, last] with p m step <= q for all C conditions (low > high: none)."""
+    slope = p * step
+    bound = q / torch.where(slope == 0, torch.ones_like(slope), slope)
+    upper = torch.where(slope > 0, bound, torch.full_like(bound, torch.inf)).amin(0)
+    lower = torch.where(slope < 0, bound, torch.full_like(bound, -torch.inf)).amax(0)
+    never = ((slope == 0) & (q < 0)).any(0)
+    high = torch.minimum(upper.floor(), last).clamp(min=-1)
+    low = torch.minimum(lower.ceil().clamp(min=0), last + 1)
+    return torch.where(never, last + 1, low), torch.where(never, torch.full_like(high, -1), high)
+
+
+def _live_test(p: Tensor, q: Tensor, oz: Tensor, step: Tensor, end: Tensor, last: Tensor):
+    def live(m: Float[Tensor, "R K"]) -> Bool[Tensor, "R K"]:
+        w = sample_disparity(m, step, end)
+        return (p * w <= q).all(0) & (w * oz < 1) & (m >= 0) & (m <= last)
+
+    return live
+
+
+def sample_disparity(m: Tensor, step: Tensor, end: Tensor) -> Tensor:
+    """Disparity of plane m = L - 1 - l: ``end`` (1 / far) for the last one, exactly 0 at infinity."""
+    return m.to(step.dtype) * step + end
+
+
+def inverse_distance(w: Tensor, oz: Tensor, dz: Tensor) -> Tensor:
+    """1/t at which a ray (local z of origin and direction) reaches disparity w; finite, and 0 at infinity."""
+    return w * dz / (1 - w * oz)
+
+
+def world_to_ndc(
+    points: Float[Tensor, "N 3"], inverse_t: Float[Tensor, "N"], frames: Frames
+) -> tuple[Float[Tensor, "N K 3"], Bool[Tensor, "N K"]]:
+    """NDC of homogeneous world points (x/t, 1/t) in each MPI, and whether they lie inside its frustum.
+
+    Args:
+        points: x / t for a finite point x, or a direction for a point at infinity.
+        inverse_t: 1 / t, 0 at infinity.
+        frames: the K MPI frames.
+
+    Returns:
+        NDC (u, v, s), each normalised to [-1, 1] over the frustum (s: near plane -1, last plane +1), and the inside
+        mask. Where a point lies behind an MPI its NDC is meaningless (finite) and the mask is False.
+    """
+    relative = points[:, None, :] - frames.origins * inverse_t[:, None, None]
+    local = rotate(frames.axes, relative)
+    return local_to_ndc(local, inverse_t[:, None], frames)
+
+
+def local_to_ndc(
+    local: Float[Tensor, "N K 3"], inverse_t: Float[Tensor, "N 1"], frames: Frames
+) -> tuple[Float[Tensor, "N K 3"], Bool[Tensor, "N K"]]:
+    """``world_to_ndc`` for points already in each MPI's axes, relative to its origin."""
+    z = local[..., 2]
+    ahead = z > 0
+    safe_z = torch.where(ahead, z, torch.ones_like(z))
+    u0, u1, v0, v1 = frames.extents.unbind(-1)
+    u = 2 * (local[..., 0] / safe_z - u0) / (u1 - u0) - 1
+    v = 2 * (local[..., 1] / safe_z - v0) / (v1 - v0) - 1
+    scale = frames.nears / frames.depth_shares
+    s = 1 - (2 * scale * inverse_t / safe_z - 2 * scale * frames.last_disparities)
+    ndc = torch.stack([u, v, s], -1)
+    # A few ulps of slack: a sample on the border of its own MPI stays inside after the round trip. In s those are ulps
+    # of 1 / near over the disparities between near and far.
+    slack = torch.stack([torch.ones_like(scale), torch.ones_like(scale), 1 / frames.depth_shares], -1)
+    inside = ahead & (ndc.abs() <= 1 + 16 * torch.finfo(ndc.dtype).eps * slack).all(-1)
+    return torch.where(ahead[..., None], ndc, torch.zeros_like(ndc)), inside
+
+
+def samples_to_ndc(
+    origins: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"], inverse_t: Float[Tensor, "N"], frames: Frames
+) -> tuple[Float[Tensor, "N K 3"], Bool[Tensor, "N K"]]:
+    """``world_to_ndc`` of the points origins + t directions, from differences to each MPI's origin (exact far away)."""
+    local_origins, local_directions = rays_in_frames(origins, directions, frames)
+    return local_to_ndc(local_origins * inverse_t[:, None, None] + local_directions, inverse_t[:, None], frames)
+
+
+def ndc_to_world(
+    ndc: Float[Tensor, "N 3"], heads: Int[Tensor, "N"], frames: Frames
+) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N"]]:
+    """Homogeneous world points (X, W): the finite point is X / W, and W = 0 is the direction X at infinity."""
+    u0, u1, v0, v1 = frames.extents[heads].unbind(-1)
+    u = u0 + (ndc[:, 0] + 1) / 2 * (u1 - u0)
+    v = v0 + (ndc[:, 1] + 1) / 2 * (v1 - v0)
+    w = (1 - ndc[:, 2]) / 2 / frames.nears[heads] * frames.depth_shares[heads] + frames.last_disparities[heads]
+    rays = torch.stack([u, v, torch.ones_like(u)], -1)
+    directions = rotate(frames.axes[heads].mT, rays)
+    return directions + frames.origins[heads] * w[:, None], w
+
+
+@dataclass(frozen=True)
+class Cube:
+    """The centred cube as tensors: bounds, voxels a side (z, y, x order) and the distance between samples."""
+
+    lower: Float[Tensor, "3"]
+    upper: Float[Tensor, "3"]
+    shape: Int[Tensor, "3"]
+    step: float
+
+    @staticmethod
+    def pack(
+        plan: CubePlan, samples_per_voxel: float, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu"
+    ) -> Cube:
+        lower = torch.tensor(plan.lower, dtype=dtype, device=device)
+        upper = torch.tensor(plan.upper, dtype=dtype, device=device)
+        sides = [(b - a) / (n - 1) for a, b, n in zip(plan.lower, plan.upper, reversed(plan.shape), strict=True)]
+        shape = torch.tensor(plan.shape, device=device)
+        return Cube(lower, upper, shape, min(sides) / samples_per_voxel)
+
+    def normalised(self, points: Float[Tensor, "*N 3"]) -> Float[Tensor, "*N 3"]:
+        """World points to [-1, 1]^3 over the cube."""
+        return 2 * (points - self.lower) / (self.upper - self.lower) - 1
+
+
+def cube_hits(
+    origins: Float[Tensor, "R 3"],
+    directions: Float[Tensor, "R 3"],
+    nears: Float[Tensor, "R 1"],
+    fars: Float[Tensor, "R 1"],
+    cube: Cube,
+) -> tuple[Int[Tensor, "R"], Int[Tensor, "R"]]:
+    """First sample index and number of samples inside the cube; sample i lies at distance (i + 1/2) step.
+
+    Slab test; a direction component of 0 inside its slab puts no bound, outside it there is no hit.
+    """
+    flat = directions == 0
+    safe = torch.where(flat, torch.ones_like(directions), directions)
+    t_a, t_b = (cube.lower - origins) / safe, (cube.upper - origins) / safe
+    inside = (origins >= cube.lower) & (origins <= cube.upper)
+    enter = torch.where(flat, torch.where(inside, -torch.inf, torch.inf), torch.minimum(t_a, t_b)).amax(-1)
+    leave = torch.where(flat, torch.where(inside, torch.inf, -torch.inf), torch.maximum(t_a, t_b)).amin(-1)
+    enter = torch.maximum(enter, nears[:, 0])
+    leave = torch.minimum(leave, fars[:, 0])
+    longest = 2 * torch.linalg.vector_norm(cube.upper - cube.lower) / cube.step
+    first = (enter / cube.step - 0.5).ceil()
+    count = ((leave / cube.step - 0.5).floor() - first + 1).clamp(min=0)
+    hit = (enter <= leave) & torch.isfinite(first) & (count <= longest)
+    first, count = torch.where(hit, first, torch.zeros_like(first)), torch.where(hit, count, torch.zeros_like(count))
+    return first.to(torch.int64), count.to(torch.int64)

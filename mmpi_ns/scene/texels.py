@@ -1,0 +1,173 @@
+"""Which texels a lookup reads, and with which weights. Pure index arithmetic over one pooled table.
+
+All heads share one table a kind (density, features, reliability). A table is a list of bricks of ``BRICK`` rows, each
+the ``SIDE`` x ``SIDE`` texels of one tile of a plane (row by row), and ``tiles`` says which brick a tile is: head by
+head, plane by plane from near to far (in the cube: layer by layer), tile row by tile row. Brick 0 is shared by all
+tiles that hold nothing.
+
+    row of texel (plane, y, x) = tiles[first_tile + (plane * down + y // 8) * across + x // 8] * 64 + y % 8 * 8 + x % 8
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from mmpi_ns.scene.plan import ScenePlan
+
+SIDE = 8
+"""Texels along each side of a brick."""
+BRICK = SIDE * SIDE
+"""Rows of a brick. The first so many rows of every table are the empty brick, which nothing may change."""
+
+
+@dataclass(frozen=True, eq=False)
+class TexelGrid:
+    """One head's texels: ``depth`` planes (or z layers) of ``height`` x ``width``."""
+
+    depth: int
+    height: int
+    width: int
+    first_tile: int
+    """Where the head's tiles begin among those of all heads."""
+    tiles: Int[Tensor, "T"]
+    """Brick of every tile of all heads (int32); 0 where nothing is stored."""
+    places: Int[Tensor, "B"]
+    """Tile of every brick (int64); -1 for the empty one."""
+
+    @property
+    def down(self) -> int:
+        return -(-self.height // SIDE)
+
+    @property
+    def across(self) -> int:
+        return -(-self.width // SIDE)
+
+    @property
+    def num_tiles(self) -> int:
+        return self.depth * self.down * self.across
+
+    @property
+    def texels(self) -> int:
+        return self.depth * self.height * self.width
+
+    @property
+    def own_tiles(self) -> Int[Tensor, "D Y X"]:
+        """Brick of each of the head's tiles."""
+        own = self.tiles[self.first_tile : self.first_tile + self.num_tiles]
+        return own.view(self.depth, self.down, self.across)
+
+    @property
+    def rows(self) -> Int[Tensor, "D*H*W"]:
+        """Row of every texel, in reading order: ``table[grid.rows].view(depth, height, width, -1)`` is the block."""
+        z, y, x = (torch.arange(n, device=self.tiles.device) for n in (self.depth, self.height, self.width))
+        return self.row(z[:, None, None], y[:, None], x).reshape(-1)
+
+    def row(self, z: Int[Tensor, "*#N"], y: Int[Tensor, "*#N"], x: Int[Tensor, "*#N"]) -> Int[Tensor, "*N"]:
+        """Row of the texel in column x and row y of plane z."""
+        tile = self.first_tile + (z * self.down + (y >> 3)) * self.across + (x >> 3)
+        brick = self.tiles.index_select(0, tile.reshape(-1)).view(tile.shape)
+        return (brick.to(torch.int64) << 6) + ((y & 7) << 3) + (x & 7)
+
+    def bilinear(
+        self, plane: Int[Tensor, "N"], uv: Float[Tensor, "N 2"]
+    ) -> tuple[Int[Tensor, "N 4"], Float[Tensor, "N 4"]]:
+        """Rows and weights at NDC ``uv`` on plane index ``plane`` (0 is the nearest). Corners are texel centres."""
+        x, fx = _cell(uv[:, 0], self.width)
+        y, fy = _cell(uv[:, 1], self.height)
+        gx, gy = 1 - fx, 1 - fy
+        return self._corners(plane, y, x), torch.stack([gx * gy, fx * gy, gx * fy, fx * fy], -1)
+
+    def trilinear(self, ndc: Float[Tensor, "N 3"]) -> tuple[Int[Tensor, "N 8"], Float[Tensor, "N 8"]]:
+        """Rows and weights at NDC (u, v, s) in [-1, 1]^3, s running over planes (or z layers)."""
+        z, fz = _cell(ndc[:, 2], self.depth)
+        rows, weights = self.bilinear(z, ndc)
+        x, y = _cell(ndc[:, 0], self.width)[0], _cell(ndc[:, 1], self.height)[0]
+        rows = torch.cat([rows, self._corners(z + 1, y, x)], -1)
+        return rows, torch.cat([weights * (1 - fz)[:, None], weights * fz[:, None]], -1)
+
+    def nearest(self, ndc: Float[Tensor, "N 3"]) -> Int[Tensor, "N"]:
+        """Row of the texel nearest to NDC (u, v, s)."""
+        x, y, z = (
+            ((ndc[:, i] + 1) * (0.5 * (n - 1))).round().clamp(0, n - 1).to(torch.int64)
+            for i, n in enumerate((self.width, self.height, self.depth))
+        )
+        return self.row(z, y, x)
+
+    def holds(self, rows: Int[Tensor, "N"]) -> Bool[Tensor, "N"]:
+        """Which rows are this head's; those of the empty brick are nobody's."""
+        place = self.places[rows >> 6]
+        return (place >= self.first_tile) & (place < self.first_tile + self.num_tiles)
+
+    def texel(self, rows: Int[Tensor, "N"]) -> tuple[Int[Tensor, "N"], Int[Tensor, "N"], Int[Tensor, "N"]]:
+        """(plane, y, x) of rows that this head ``holds``: the way back from ``row``."""
+        tile = self.places[rows >> 6] - self.first_tile
+        x = (tile % self.across) * SIDE + (rows & 7)
+        y = (tile // self.across % self.down) * SIDE + (rows >> 3 & 7)
+        return tile // (self.across * self.down), y, x
+
+    def neighbours(self, rows: Int[Tensor, "N"]) -> tuple[Int[Tensor, "N 6"], Float[Tensor, "N 6"]]:
+        """Rows of the texels beside each row along x, y and z (-, +); 1 where one is stored, else the row itself."""
+        z, y, x = self.texel(rows)
+        found, exists = [], []
+        for dz, dy, dx in ((0, 0, -1), (0, 0, 1), (0, -1, 0), (0, 1, 0), (-1, 0, 0), (1, 0, 0)):
+            beside = (z + dz, y + dy, x + dx)
+            inside = torch.ones_like(rows, dtype=torch.bool)
+            for i, n in zip(beside, (self.depth, self.height, self.width), strict=True):
+                inside &= (i >= 0) & (i < n)
+            other = self.row(*(torch.where(inside, i, j) for i, j in zip(beside, (z, y, x), strict=True)))
+            inside &= other >= BRICK
+            found.append(torch.where(inside, other, rows))
+            exists.append(inside)
+        return torch.stack(found, -1), torch.stack(exists, -1).to(torch.float32)
+
+    def _corners(self, z: Tensor, y: Tensor, x: Tensor) -> Tensor:
+        return torch.stack([self.row(z, y + dy, x + dx) for dy in (0, 1) for dx in (0, 1)], -1)
+
+
+def _cell(coordinate: Float[Tensor, "N"], size: int) -> tuple[Int[Tensor, "N"], Float[Tensor, "N"]]:
+    """Lower texel and fraction of a coordinate in [-1, 1] over ``size`` texels; outside it clamps to the border."""
+    position = ((coordinate + 1) * (0.5 * (size - 1))).clamp(0, size - 1)
+    lower = position.floor().clamp(max=size - 2)
+    return lower.to(torch.int64), position - lower
+
+
+def head_grids(plan: ScenePlan, tiles: Int[Tensor, "T"] | None = None) -> list[TexelGrid]:
+    """The texels of every head, MPIs first, the cube last.
+
+    Args:
+        plan: sizes of the heads.
+        tiles: brick of every tile; None stores all of them in order.
+    """
+    return make_grids(head_shapes(plan), tiles)
+
+
+def head_shapes(plan: ScenePlan) -> list[tuple[int, int, int]]:
+    """Planes (or layers), rows and columns of every head, the cube last."""
+    return [(m.planes, m.height, m.width) for m in plan.mpis] + ([plan.cube.shape] if plan.cube is not None else [])
+
+
+def make_grids(shapes: list[tuple[int, int, int]], tiles: Int[Tensor, "T"] | None = None) -> list[TexelGrid]:
+    """Grids of the given sizes, one behind the other."""
+    counts = [depth * -(-height // SIDE) * -(-width // SIDE) for depth, height, width in shapes]
+    if tiles is None:
+        tiles = torch.arange(1, sum(counts) + 1, dtype=torch.int32)
+    assert len(tiles) == sum(counts), (len(tiles), shapes)
+    places = brick_places(tiles)
+    return [TexelGrid(*s, sum(counts[:k]), tiles, places) for k, s in enumerate(shapes)]
+
+
+def number_tiles(stored: Bool[Tensor, "T"]) -> Int[Tensor, "T"]:
+    """``tiles`` in which the chosen tiles have a brick each."""
+    return torch.where(stored, stored.cumsum(0), 0).to(torch.int32)
+
+
+def brick_places(tiles: Int[Tensor, "T"]) -> Int[Tensor, "B"]:
+    """Tile of every brick; -1 for the empty one."""
+    stored = tiles.nonzero()[:, 0]
+    places = torch.full((len(stored) + 1,), -1, dtype=torch.int64, device=tiles.device)
+    places[tiles[stored].to(torch.int64)] = stored
+    return places

@@ -1,0 +1,127 @@
+"""Windows: stretches of a long capture, each with MPIs of its own, asked only by rays that start there.
+
+A ray's camera decides which windows it asks. Where balls of cameras overlap the renderings are mixed, with shares that
+change continuously along the way, so no seam is seen (Block-NeRF, Tancik et al. 2022, mixes by camera distance too).
+Cost a ray, a step and memory are those of one window, however long the capture is; docs/how_it_works.md, "Windows".
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from numbers import Real
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mmpi_ns.scene.plan import ScenePlan, Vector, read_object
+
+
+@dataclass(frozen=True)
+class Window:
+    """The cameras in a ball, and the plan that shows what they see."""
+
+    center: Vector
+    """Middle of the ball, world axes, scene units."""
+    radius: float
+    """Cameras within ask this window fully; inf (in JSON: null) where there is one window alone."""
+    margin: float
+    """Beyond the radius the window's share falls to nothing over this distance."""
+    plan: ScenePlan
+
+
+@dataclass(frozen=True)
+class WindowedPlan:
+    """A capture's windows, in the order in which they are trained."""
+
+    windows: tuple[Window, ...]
+
+    def __post_init__(self) -> None:
+        if not self.windows:
+            raise ValueError("A scene plan needs at least one window, this one has none: add one to its list.")
+        if len(self.windows) == 1:
+            return
+        for i, w in enumerate(self.windows):
+            numbers = [*w.center, w.radius, w.margin]
+            are_numbers = len(numbers) == 5 and all(isinstance(x, Real) and math.isfinite(x) for x in numbers)
+            if not are_numbers or w.radius < 0 or w.margin <= 0:
+                raise ValueError(f"Window {i} of the plan needs a centre, a radius and a margin > 0, all finite.")
+
+    def __len__(self) -> int:
+        return len(self.windows)
+
+    @property
+    def plans(self) -> tuple[ScenePlan, ...]:
+        return tuple(w.plan for w in self.windows)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of all heads, window after window."""
+        if len(self) == 1:
+            return self.plans[0].names
+        return tuple(f"window {i}: {name}" for i, plan in enumerate(self.plans) for name in plan.names)
+
+    def first_head(self, window: int) -> int:
+        """Heads of the windows before."""
+        return sum(plan.num_heads for plan in self.plans[:window])
+
+    @staticmethod
+    def single(plan: ScenePlan) -> WindowedPlan:
+        return WindowedPlan((Window((0.0, 0.0, 0.0), math.inf, 1.0, plan),))
+
+    def to_json(self) -> str:
+        """Standard JSON; a single window is written as its plan alone."""
+        if len(self) == 1:
+            return self.plans[0].to_json()
+        rows = [
+            {"center": w.center, "radius": w.radius, "margin": w.margin, "plan": json.loads(w.plan.to_json())}
+            for w in self.windows
+        ]
+        return json.dumps({"windows": rows}, indent=1, allow_nan=False)
+
+    @staticmethod
+    def from_json(text: str) -> WindowedPlan:
+        """Reads what ``to_json`` wrote. Raises ValueError with one sentence about what is wrong."""
+        data = read_object(text)
+        if "windows" not in data:
+            return WindowedPlan.single(ScenePlan.from_json(text))
+        rows = data["windows"]
+        fields = {"center", "radius", "margin", "plan"}
+        if not isinstance(rows, list) or not all(isinstance(r, dict) and set(r) == fields for r in rows):
+            raise ValueError(f"Every window of a scene plan needs {sorted(fields)} and nothing else: correct it.")
+        windows = (
+            Window(tuple(r["center"]), r["radius"], r["margin"], ScenePlan.from_json(json.dumps(r["plan"])))
+            for r in rows
+        )
+        return WindowedPlan(tuple(windows))
+
+    @staticmethod
+    def load(path: Path) -> WindowedPlan:
+        if not path.is_file():
+            raise ValueError(f"There is no scene plan at {path}: check the path given to --pipeline.model.plan-file.")
+        return WindowedPlan.from_json(path.read_text(encoding="utf-8"))
+
+
+def window_shares(origins: Float[Tensor, "R 3"], windows: tuple[Window, ...]) -> Float[Tensor, "R W"]:
+    """How much each window says of rays that start at ``origins``; every row sums to 1.
+
+    Inside its ball a window counts fully, and beyond it falls off linearly over its margin; shares are normalised. A
+    ray that starts in no ball asks the nearest.
+
+    Args:
+        origins: where rays start.
+        windows: those that can be asked.
+    """
+    centers = torch.tensor([w.center for w in windows], dtype=torch.float64, device=origins.device)
+    radii, margins = (
+        torch.tensor([getattr(w, name) for w in windows], dtype=torch.float64, device=origins.device)
+        for name in ("radius", "margin")
+    )
+    beyond = (origins.double()[:, None] - centers).norm(dim=-1) - radii
+    counts = (1 - beyond / margins).clamp(0, 1)
+    nearest = torch.nn.functional.one_hot(beyond.argmin(-1), len(windows)).to(counts)
+    counts = torch.where(counts.sum(-1, keepdim=True) > 0, counts, nearest)
+    return (counts / counts.sum(-1, keepdim=True)).to(origins.dtype)

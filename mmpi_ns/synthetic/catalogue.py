@@ -1,0 +1,70 @@
+"""The scenes by name."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from mmpi_ns.synthetic import indoor, street
+from mmpi_ns.synthetic.scene import Scene
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A kind of scene and what it is made with unless told otherwise."""
+
+    make: Any
+    """(seed, count, width, height[, length]) -> Scene."""
+    width: int = 240
+    height: int = 160
+    count: int = 64
+    length: float | None = None
+    """Metres driven; None: not a drive."""
+
+
+SCENES: dict[str, Entry] = {
+    "street": Entry(street.street, 320, 96, 64, 40.0),
+    "long-road": Entry(street.long_road, 320, 96, 0, 1000.0),
+    "room": Entry(indoor.room),
+    "look-round": Entry(indoor.look_round, count=36),
+    "object": Entry(indoor.orbited, count=48),
+    "still-life": Entry(indoor.still_life, count=25),
+}
+FRAME_SPACING = 1.5
+"""Metres between the images of a long road."""
+
+
+def make_scene(
+    name: str,
+    seed: int = 0,
+    count: int | None = None,
+    width: int | None = None,
+    height: int | None = None,
+    length: float | None = None,
+) -> Scene:
+    """A scene of the catalogue; equal arguments give equal scenes.
+
+    Args:
+        name: one of ``SCENES``.
+        seed: of everything random in it.
+        count: of its images; a long road has one every 1.5 m unless told otherwise.
+        width, height: of its images, pixels.
+        length: of a drive, metres.
+
+    Raises:
+        ValueError: there is no such scene, or it cannot be made like this.
+    """
+    if name not in SCENES:
+        raise ValueError(f"There is no scene {name!r}: choose one of {', '.join(SCENES)}.")
+    entry = SCENES[name]
+    sizes = {"width": width or entry.width, "height": height or entry.height}
+    if length is not None and entry.length is None:
+        raise ValueError(f"The scene {name} has no length: leave it out, or choose street or long-road.")
+    drive: dict[str, float] = {}
+    if entry.length is not None:
+        drive["length"] = entry.length if length is None else length
+    images = count if count is not None else entry.count or int(drive["length"] / FRAME_SPACING) + 1
+    for what, value in {"count": images, **sizes, **drive}.items():
+        if not value > 0:
+            raise ValueError(f"The {what} of a scene must be positive, not {value}.")
+    return entry.make(seed, images, *sizes.values(), *drive.values())

@@ -1,0 +1,273 @@
+"""A scene: solids, a ground plane, a sky at infinity, a light and cameras. Colour and distance of any ray."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mmpi_ns.synthetic.materials import MATERIALS, Surface
+from mmpi_ns.synthetic.primitives import CYLINDER, PACKET, SPHERE, Array, Primitives, Tracer, dot, to_local
+from mmpi_ns.synthetic.textures import Noise
+
+Colors = NDArray[np.float32]
+Ground = Callable[[Array, Array, Array, Noise], Colors]
+"""Colours [N, 3] of points [N, 2] on z = 0, seen along unit directions [N, 3] with pixels [N] metres wide."""
+Sky = Callable[[Array, float, Noise], Colors]
+"""Colours [N, 3] of unit directions [N, 3], for pixels so many radians wide."""
+TILE = 64
+"""Side of the image tiles whose rays are traced together, pixels."""
+
+
+@dataclass(frozen=True)
+class Cameras:
+    """M pinhole cameras that share their intrinsics."""
+
+    camera_to_worlds: Array
+    """[M, 3, 4], OpenGL axes (x right, y up, z backwards), metres."""
+    focal: float
+    """Pixels."""
+    width: int
+    height: int
+    test_every: int
+    """One image in so many is held out."""
+
+    def __len__(self) -> int:
+        return len(self.camera_to_worlds)
+
+    @property
+    def center(self) -> tuple[float, float]:
+        """(cx, cy), pixels."""
+        return self.width / 2, self.height / 2
+
+    @property
+    def is_test(self) -> NDArray[np.bool_]:
+        """[M] held out for testing."""
+        return np.arange(len(self)) % self.test_every == self.test_every // 2
+
+    def rays(self, camera: int, pixels: Array) -> tuple[Array, Array]:
+        """Origins and unit directions [N, 3] of the rays through pixels [N, 2] (x, y; centres at half integers)."""
+        pose, (cx, cy) = self.camera_to_worlds[camera], self.center
+        x, y = (pixels[:, 0] - cx) / self.focal, -(pixels[:, 1] - cy) / self.focal
+        local = np.stack([x, y, -np.ones_like(x)], -1)
+        directions = local @ pose[:, :3].T / np.sqrt((local**2).sum(-1, keepdims=True))
+        return np.broadcast_to(pose[:, 3], directions.shape), directions
+
+    def project(self, camera: int | NDArray[np.int64], points: Array) -> tuple[Array, Array]:
+        """Pixels [N, 2] of world points [N, 3] in a camera, or each in its own [N], and their depths [N] along the
+        optical axis (negative: behind)."""
+        poses = self.camera_to_worlds[camera]
+        local = np.einsum("...ji,...j->...i", poses[..., :3], points - poses[..., 3])
+        depth = -local[:, 2]
+        safe = np.where(np.abs(depth) < 1e-9, 1e-9, depth)
+        return np.stack([local[:, 0], -local[:, 1]], -1) / safe[:, None] * self.focal + self.center, depth
+
+
+@dataclass(frozen=True)
+class Light:
+    """A sun or a lamp, and what comes from all round."""
+
+    toward: tuple[float, float, float]
+    """Direction of the sun, or place of the lamp."""
+    is_lamp: bool = False
+    strength: float = 0.55
+    ambient: float = 0.55
+    casts_shadows: bool = True
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A procedural scene. World axes: z up; the ground is z = 0; metres."""
+
+    name: str
+    seed: int
+    primitives: Primitives
+    ground: Ground
+    sky: Sky
+    light: Light
+    cameras: Cameras
+    reach: float = 300.0
+    """Solids farther from a ray's origin do not count, so the cost of an image does not grow with the scene."""
+    track_range: float = 60.0
+    """SfM points are matched no farther away than this."""
+    noise: Noise = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "noise", Noise(self.seed))
+
+    @cached_property
+    def tracer(self) -> Tracer:
+        return Tracer(self.primitives, self.reach)
+
+    def hit(self, origins: Array, directions: Array) -> tuple[Array, NDArray[np.int64]]:
+        """Distance [R] (inf: the sky) and what is there [R]: a row of the primitives, or -1 for ground and sky."""
+        distance, row = self.tracer(origins, directions)
+        down = directions[:, 2]
+        ground = np.where(down < -1e-12, -origins[:, 2] / np.where(down < -1e-12, down, -1.0), np.inf)
+        below = (ground > 1e-6) & (ground < distance)
+        return np.where(below, ground, distance), np.where(below, -1, row)
+
+    def trace(self, origins: Array, directions: Array, pixel: float = 0.0) -> tuple[Array, Colors]:
+        """Distance [R] of what each ray meets first, inf for the sky, and its colour [R, 3] in [0, 1].
+
+        Args:
+            origins: [R, 3] metres.
+            directions: [R, 3] unit vectors.
+            pixel: angle that a ray stands for, radians; textures are averaged over it.
+        """
+        distance, colors = np.empty(len(directions)), np.empty((len(directions), 3), np.float32)
+        for start in range(0, len(directions), PACKET):
+            s = slice(start, start + PACKET)
+            distance[s], row = self.hit(origins[s], directions[s])
+            colors[s] = self.shade(origins[s], directions[s], distance[s], row, pixel)[0]
+        return distance, colors
+
+    def shade(
+        self, origins: Array, directions: Array, distance: Array, row: NDArray, pixel: float
+    ) -> tuple[Colors, NDArray]:
+        """Colours [R, 3] in [0, 1] of hits, and a number [R] for each lit or shaded face; ``pixel`` as in ``trace``."""
+        finite = np.isfinite(distance)
+        colors = np.empty((len(directions), 3), np.float32)
+        if not finite.all():
+            colors[~finite] = self.sky(directions[~finite], pixel, self.noise)
+        points = origins + np.where(finite, distance, 0)[:, None] * directions
+        normals = np.broadcast_to(np.array([0.0, 0.0, 1.0]), points.shape).copy()
+        floor, solid = finite & (row < 0), row >= 0
+        patch = 8 * row + 2 * finite
+        if floor.any():
+            colors[floor] = self.ground(points[floor, :2], directions[floor], distance[floor] * pixel, self.noise)
+        if solid.any():
+            these = self.primitives.take(row[solid])
+            surface, normals[solid] = surface_of(these, points[solid], directions[solid], distance[solid] * pixel)
+            colors[solid] = self._albedo(these.material, surface)
+            patch[solid] = 8 * row[solid] + 2 * surface.side
+        light, in_sun = self._lit(points[finite], normals[finite])
+        colors[finite] *= light[:, None]
+        patch[finite] += in_sun
+        return colors.clip(0, 1), patch
+
+    def _albedo(self, material: NDArray[np.int64], surface: Surface) -> Colors:
+        colors = np.empty((len(material), 3), np.float32)
+        functions = list(MATERIALS.values())
+        for m in np.unique(material):
+            rows = material == m
+            colors[rows] = functions[m](surface.take(rows), self.noise)
+        return colors
+
+    def _lit(self, points: Array, normals: Array) -> tuple[Colors, NDArray[np.bool_]]:
+        """Light [N] that falls on points, and whether the sun or lamp reaches them [N]."""
+        light = self.light
+        toward = np.array(light.toward) - (points if light.is_lamp else 0.0) + np.zeros_like(points)
+        far = np.sqrt(dot(toward, toward))
+        toward /= far[:, None]
+        cosine = dot(normals, toward)
+        facing = cosine > 1e-3
+        if light.casts_shadows and facing.any():
+            facing[facing] = self._sees_light(points[facing] + 1e-4 * normals[facing], toward[facing], far[facing])
+        direct = np.where(facing, cosine, 0) * light.strength
+        return (light.ambient * (0.85 + 0.15 * normals[:, 2]) + direct).astype(np.float32), facing
+
+    def _sees_light(self, points: Array, toward: Array, far: Array) -> NDArray[np.bool_]:
+        """Whether nothing stands between points [N, 3] and the light [N], ``far`` [N] away."""
+        if self.light.is_lamp:
+            limit = float(far.max())
+        else:
+            far = np.full(len(points), np.inf)
+            limit = max(self.tracer.top / max(float(toward[0, 2]), 0.05), 1e-3)
+        # Neighbours in space go into one packet.
+        order = np.argsort(points[:, np.argmax(np.ptp(points, axis=0))], kind="stable")
+        visible = np.empty(len(points), bool)
+        visible[order] = self.tracer(points[order], toward[order], limit)[0] >= far[order] * (1 - 1e-6)
+        return visible
+
+
+def surface_of(these: Primitives, points: Array, directions: Array, pixel: Array) -> tuple[Surface, Array]:
+    """Coordinates on the faces of the solids hit, and the normals [N, 3] there.
+
+    Args:
+        these: the solid that each point lies on.
+        points, directions: [N, 3] hits and the rays that met them.
+        pixel: width of a pixel at each point, across the ray. [N] metres
+    """
+    n = np.arange(len(points))
+    q, d = to_local(points - these.center, these.yaw), to_local(directions, these.yaw)
+    h = these.half
+    # How far outside each pair of faces: the face hit is the one where the point is on the border.
+    side = np.argmax(np.abs(q) - h, -1)
+    curved = (these.kind == SPHERE) | ((these.kind == CYLINDER) & (np.abs(q[:, 2]) < h[:, 2] * (1 - 1e-9)))
+    side = np.where(these.kind == CYLINDER, 2, side)
+    normal = np.zeros_like(q)
+    normal[n, side] = np.sign(q[n, side])
+    radial = q / h[:, :1] * np.where(these.kind == CYLINDER, [[1.0], [1.0], [0.0]], 1.0).T
+    normal[curved] = radial[curved]
+    a, b = np.where(side == 0, 1, 0), np.where(side == 2, 1, 2)
+    u, v, width, height = q[n, a] + h[n, a], q[n, b] + h[n, b], 2 * h[n, a], 2 * h[n, b]
+    across = np.abs(d[n, side])
+    du, dv = (pixel * np.hypot(1, d[n, k] / np.maximum(across, 0.01)) for k in (a, b))
+    if curved.any():
+        # Sixteen metres of noise go round a whole number of times, so that there is no seam.
+        turns = np.maximum(np.round(2 * np.pi * h[:, 0] / 16.0), 1)
+        scale = 16.0 * turns / (2 * np.pi * h[:, 0])
+        up = np.where(these.kind == SPHERE, np.arccos(np.clip(-radial[:, 2], -1, 1)) * h[:, 0], q[:, 2] + h[:, 2])
+        cosine = np.maximum(np.abs(dot(normal, d)), 0.1)
+        round_ = np.arctan2(q[:, 1], q[:, 0]) / (2 * np.pi) * 16.0 * turns
+        u, v = np.where(curved, round_, u), np.where(curved, up * scale, v)
+        du, dv = (np.where(curved, pixel * scale / cosine, x) for x in (du, dv))
+        width, height = np.where(curved, 16.0 * turns, width), np.where(curved, 2 * h[:, 2] * scale, height)
+    u, v, du, dv, width, height = (x.astype(np.float32) for x in (u, v, du, dv, width, height))
+    colors, offset = these.colors.astype(np.float32), these.offset.astype(np.float32)
+    surface = Surface(u, v, du, dv, width, height, np.where(curved, 3, side).astype(np.int8), colors, offset)
+    return surface, to_local(normal, -these.yaw)
+
+
+def render(scene: Scene, camera: int, supersample: int = 2, contrast: float = 0.25) -> tuple[Colors, Colors]:
+    """One image [H, W, 3] in [0, 1] and the exact distance [H, W] along the pixels' central rays, inf for the sky.
+
+    Textures are averaged over the pixel, so one ray shows the inside of a face; pixels that differ from a neighbour
+    (another face, a shadow, another colour) are supersampled.
+
+    Args:
+        supersample: rays along each side of a pixel at such places.
+        contrast: difference of colour from which a pixel is supersampled; 0 supersamples all.
+    """
+    cameras = scene.cameras
+    h, w = cameras.height, cameras.width
+    colors, depths, patch = np.empty((h * w, 3), np.float32), np.empty(h * w), np.empty(h * w, np.int64)
+    x, y = np.meshgrid(np.arange(w) + 0.5, np.arange(h) + 0.5)
+    pixels = np.stack([x, y], -1).reshape(-1, 2)
+    order = _by_tile(h, w)
+    for start in range(0, h * w, PACKET):
+        these = order[start : start + PACKET]
+        rays = cameras.rays(camera, pixels[these])
+        depths[these], row = scene.hit(*rays)
+        colors[these], patch[these] = scene.shade(*rays, depths[these], row, 1 / cameras.focal)
+    edges = order[_differs(colors.reshape(h, w, 3), patch.reshape(h, w), contrast).reshape(-1)[order]]
+    inner = (np.arange(supersample) + 0.5) / supersample - 0.5
+    shifts: Array = np.stack(np.meshgrid(inner, inner), -1).reshape(-1, 2)
+    per_packet = max(PACKET // len(shifts), 1)
+    for start in range(0, len(edges), per_packet):
+        these = edges[start : start + per_packet]
+        rays = cameras.rays(camera, (pixels[these][:, None] + shifts).reshape(-1, 2))
+        found = scene.trace(*rays, pixel=1 / (cameras.focal * supersample))[1]
+        colors[these] = found.reshape(len(these), -1, 3).mean(1)
+    return colors.reshape(h, w, 3), depths.reshape(h, w).astype(np.float32)
+
+
+def _by_tile(height: int, width: int) -> NDArray[np.int64]:
+    """Flat pixel indices tile by tile, so that packets of rays lie close together."""
+    y, x = np.divmod(np.arange(height * width), width)
+    return np.lexsort((x, y, x // TILE, y // TILE))
+
+
+def _differs(colors: Colors, patch: NDArray[np.int64], contrast: float) -> NDArray[np.bool_]:
+    """[H, W] pixels that show another face or another colour than one of their neighbours."""
+    result = np.full(patch.shape, contrast <= 0)
+    for axis in (0, 1):
+        change = (np.diff(patch, axis=axis) != 0) | (np.abs(np.diff(colors, axis=axis)).max(-1) > contrast)
+        before = [(1, 0) if k == axis else (0, 0) for k in (0, 1)]
+        after = [(0, 1) if k == axis else (0, 0) for k in (0, 1)]
+        result |= np.pad(change, before) | np.pad(change, after)
+    return result

@@ -1,0 +1,201 @@
+"""Points and tracks as structure from motion would find them, with as much noise and as many outliers as asked.
+
+A track holds the cameras that really see its point (by the exact distance along the ray), its keypoints carry the
+noise, and its point is triangulated from them: uncertain along the road, as in a real capture.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mmpi_ns.synthetic.primitives import Array, dot
+from mmpi_ns.synthetic.scene import Scene
+
+MIN_TRACK = 3
+"""Cameras that must see a point."""
+MIN_ANGLE = 0.5
+"""Degrees between two of a point's rays, without which it cannot be triangulated."""
+ROUNDS = 6
+"""Times that more points are drawn where too few were seen well enough."""
+
+
+@dataclass(frozen=True)
+class SfmPoints:
+    """P points and their Q keypoints, sorted by point and then by camera."""
+
+    points: Array
+    """[P, 3] as triangulated from the noisy keypoints, metres."""
+    true_points: Array
+    """[P, 3] on the surfaces that the cameras saw."""
+    colors: NDArray[np.uint8]
+    """[P, 3]"""
+    outlier: NDArray[np.bool_]
+    """[P] matched wrongly: far from the surface, yet its keypoints agree with it."""
+    camera: NDArray[np.int64]
+    """[Q]"""
+    point: NDArray[np.int64]
+    """[Q]"""
+    pixel: Array
+    """[Q, 2] (x, y)"""
+
+    def errors(self, scene: Scene) -> Array:
+        """Distance [Q] between each keypoint and where its point projects to, pixels."""
+        return np.linalg.norm(scene.cameras.project(self.camera, self.points[self.point])[0] - self.pixel, axis=-1)
+
+
+def sfm_points(scene: Scene, count: int, noise_pixels: float = 0.3, outliers: float = 0.02) -> SfmPoints:
+    """Points on what the cameras see, and who saw them where.
+
+    Args:
+        count: points wanted; fewer come back where the cameras do not see so many from enough sides.
+        noise_pixels: standard deviation of the keypoints' noise along x and along y.
+        outliers: share of the points that are wrong.
+
+    Raises:
+        ValueError: a number is out of range.
+    """
+    if count < 0 or noise_pixels < 0 or not 0 <= outliers < 1:
+        raise ValueError(
+            f"Points ({count}) and noise ({noise_pixels}) must not be negative, outliers ({outliers}) lie in [0, 1)."
+        )
+    random = np.random.default_rng([scene.seed, 5])
+    found: list[tuple] = []
+    for _ in range(ROUNDS):
+        missing = count - sum(len(f[0]) for f in found)
+        if missing <= 0:
+            break
+        found.append(_tracked(scene, int(missing * 1.5) + 16, random))
+    points, colors, tracks = _joined(found, count)
+    camera, point, exact = tracks
+    pixel = exact + noise_pixels * random.standard_normal(exact.shape)
+    moved, outlier, keep, pixel = _misled(scene, points, tracks, pixel, outliers, random)
+    placed = _triangulated(scene, moved, camera[keep], point[keep], pixel[keep])
+    return SfmPoints(placed, points, colors, outlier, camera[keep], point[keep], pixel[keep])
+
+
+def visible(scene: Scene, camera: int, points: Array) -> tuple[NDArray[np.bool_], Array]:
+    """Whether a camera sees points [N, 3] (in the image, in range, nothing in front), and where [N, 2]."""
+    cameras = scene.cameras
+    pixel, depth = cameras.project(camera, points)
+    offset = points - cameras.camera_to_worlds[camera, :, 3]
+    distance = np.sqrt(dot(offset, offset))
+    seen = (depth > 1e-6) & (distance < scene.track_range)
+    seen &= ((pixel > 0) & (pixel < [cameras.width, cameras.height])).all(-1)
+    rows = np.flatnonzero(seen)
+    directions = offset[rows] / distance[rows, None]
+    hit = scene.hit(np.broadcast_to(cameras.camera_to_worlds[camera, :, 3], directions.shape), directions)[0]
+    seen[rows] = hit >= distance[rows] - 1e-5 * (1 + distance[rows])
+    return seen, pixel
+
+
+def _tracked(scene: Scene, count: int, random: np.random.Generator) -> tuple:
+    """Points [P, 3] at random pixels, their colours, and the (camera, point, exact pixel) of tracks worth keeping."""
+    points, colors = _drawn(scene, count, random)
+    order = np.argsort(points[:, 0], kind="stable")
+    points, colors = points[order], colors[order]
+    cameras, rows, pixels = [], [], []
+    for i, x in enumerate(scene.cameras.camera_to_worlds[:, 0, 3]):
+        near = slice(*np.searchsorted(points[:, 0], [x - scene.track_range, x + scene.track_range]))
+        seen, pixel = visible(scene, i, points[near])
+        cameras.append(np.full(seen.sum(), i))
+        rows.append(np.flatnonzero(seen) + near.start)
+        pixels.append(pixel[seen])
+    camera, point, pixel = (np.concatenate(x) for x in (cameras, rows, pixels))
+    order = np.lexsort((camera, point))
+    camera, point, pixel = camera[order], point[order], pixel[order]
+    good = _long_and_wide(scene, points, camera, point)
+    kept = good[point]
+    return points[good], colors[good], (camera[kept], (np.cumsum(good) - 1)[point[kept]], pixel[kept])
+
+
+def _drawn(scene: Scene, count: int, random: np.random.Generator) -> tuple[Array, NDArray[np.uint8]]:
+    """Surface points [P, 3] behind random pixels of random cameras, and their colours."""
+    cameras = scene.cameras
+    chosen = np.sort(random.integers(len(cameras), size=count))
+    pixels = random.uniform(0, 1, (count, 2)) * [cameras.width, cameras.height]
+    points, colors = [], []
+    for i in np.unique(chosen):
+        origins, directions = cameras.rays(i, pixels[chosen == i])
+        distance, color = scene.trace(origins, directions, 1 / cameras.focal)
+        near = distance < scene.track_range
+        points.append(origins[near] + distance[near, None] * directions[near])
+        colors.append((color[near] * 255).round().astype(np.uint8))
+    return np.concatenate(points), np.concatenate(colors)
+
+
+def _long_and_wide(scene: Scene, points: Array, camera: NDArray, point: NDArray) -> NDArray[np.bool_]:
+    """[P] points with enough keypoints and rays that are far enough apart."""
+    length = np.bincount(point, minlength=len(points))
+    rays = scene.cameras.camera_to_worlds[camera, :, 3] - points[point]
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    first = np.searchsorted(point, np.arange(len(points)))
+    apart = np.full(len(points), 1.0)
+    np.minimum.at(apart, point, dot(rays, rays[first[point]]))
+    return (length >= MIN_TRACK) & (apart <= np.cos(np.radians(MIN_ANGLE)))
+
+
+def _joined(found: list[tuple], count: int) -> tuple[Array, NDArray[np.uint8], tuple[NDArray, NDArray, Array]]:
+    """The rounds as one, evenly thinned to ``count`` points."""
+    if not found:
+        none = np.zeros(0, np.int64)
+        return np.zeros((0, 3)), np.zeros((0, 3), np.uint8), (none, none, np.zeros((0, 2)))
+    before = np.cumsum([0, *(len(f[0]) for f in found)])
+    points, colors = np.concatenate([f[0] for f in found]), np.concatenate([f[1] for f in found])
+    camera, pixel = np.concatenate([f[2][0] for f in found]), np.concatenate([f[2][2] for f in found])
+    point = np.concatenate([f[2][1] + b for f, b in zip(found, before[:-1], strict=True)])
+    keep = np.zeros(len(points), bool)
+    keep[np.linspace(0, len(points) - 1, min(count, len(points))).round().astype(int)] = True
+    kept = keep[point]
+    return points[keep], colors[keep], (camera[kept], (np.cumsum(keep) - 1)[point[kept]], pixel[kept])
+
+
+def _misled(scene: Scene, points: Array, tracks: tuple, pixel: Array, share: float, random: np.random.Generator):
+    """Moves a share of the points along a camera's ray, with keypoints that agree: what a repeated pattern does.
+
+    Returns:
+        Points [P, 3], which are outliers [P], which keypoints remain [Q] and where they are [Q, 2].
+    """
+    camera, point, exact = tracks
+    moved, outlier, keep = points.copy(), np.zeros(len(points), bool), np.ones(len(point), bool)
+    wanted = round(share * len(points))
+    if not wanted:
+        return moved, outlier, keep, pixel
+    first = camera[np.searchsorted(point, np.arange(len(points)))]
+    center = scene.cameras.camera_to_worlds[first, :, 3]
+    stretch = np.exp(random.uniform(0.25, 0.9, len(points)) * random.choice([-1, 1], len(points)))
+    wrong = center + (points - center) * stretch[:, None]
+    where, depth = scene.cameras.project(camera, wrong[point])
+    size = [scene.cameras.width, scene.cameras.height]
+    inside = (depth > 0) & ((where > 0) & (where < size)).all(-1)
+    able = np.flatnonzero(np.bincount(point, inside, minlength=len(points)) >= MIN_TRACK)
+    outlier[random.permutation(able)[:wanted]] = True
+    moved[outlier] = wrong[outlier]
+    of_outlier = outlier[point]
+    return moved, outlier, ~of_outlier | inside, np.where(of_outlier[:, None], where + pixel - exact, pixel)
+
+
+def _triangulated(scene: Scene, points: Array, camera: NDArray, point: NDArray, pixel: Array) -> Array:
+    """Points [P, 3] of least squared reprojection error, by Gauss-Newton from the true ones."""
+    if not len(points):
+        return points
+    axes = scene.cameras.camera_to_worlds[camera, :, :3]
+    starts = np.searchsorted(point, np.arange(len(points)))
+    points = points.copy()
+    for _ in range(4):
+        where, depth = scene.cameras.project(camera, points[point])
+        slope = (where - scene.cameras.center) / scene.cameras.focal
+        # d(x, y)/d(point): the image axes less what moving along the optical axis does.
+        right, down, ahead = axes[:, :, 0], -axes[:, :, 1], -axes[:, :, 2]
+        jacobian = np.stack([right - slope[:, :1] * ahead, down - slope[:, 1:] * ahead], 1)
+        jacobian *= scene.cameras.focal / depth[:, None, None]
+        normal = np.add.reduceat(np.einsum("qki,qkj->qij", jacobian, jacobian), starts)
+        gradient = np.add.reduceat(np.einsum("qki,qk->qi", jacobian, pixel - where), starts)
+        step = np.linalg.solve(normal, gradient[..., None])[..., 0]
+        # A step of more than a tenth of the distance leaves where the linearisation holds.
+        far = np.linalg.norm(points - scene.cameras.camera_to_worlds[camera[starts], :, 3], axis=-1)
+        size = np.linalg.norm(step, axis=-1)
+        points += step * np.minimum(1, 0.1 * far / np.maximum(size, 1e-12))[:, None]
+    return points

@@ -1,0 +1,1 @@
+"""Training: phases, losses, optimiser, trainer."""

@@ -1,0 +1,1 @@
+"""Small helpers that know nothing of scenes: files, messages, keyed random draws."""

@@ -1,0 +1,51 @@
+"""Files that are whole or not there at all, and text in a checkpoint."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from jaxtyping import UInt8
+from torch import Tensor
+
+from mmpi_ns.capture.checks import brief
+
+
+def write_atomically(path: Path, write: Callable[[Path], object], folder: Path | None = None) -> None:
+    """Writes to a temporary file on the same disk and renames it; removes it when writing fails.
+
+    Args:
+        path: the finished file.
+        write: writes to the path it is given.
+        folder: where the unfinished file lies; beside the finished one unless given.
+
+    Raises:
+        OSError: it could not be written (says why and what is left).
+    """
+    temporary = (folder or path.parent) / f".{path.name}.{os.getpid()}.tmp"
+    try:
+        write(temporary)
+        os.replace(temporary, path)
+    except (OSError, RuntimeError) as error:  # torch.save has a RuntimeError, without a reason, for a full disk
+        free = shutil.disk_usage(temporary.parent).free / 2**20
+        temporary.unlink(missing_ok=True)
+        raise OSError(
+            f"{path} could not be written ({brief(error)}; {free:.0f} MB free): earlier files are "
+            "untouched, so make room and start again (--load-dir goes on from the last checkpoint)."
+        ) from error
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def to_bytes(text: str) -> UInt8[Tensor, "B"]:
+    """Text as a buffer of a module."""
+    return torch.frombuffer(bytearray(text.encode()), dtype=torch.uint8)
+
+
+def to_text(data: UInt8[Tensor, "B"]) -> str:
+    """What ``to_bytes`` made of a text."""
+    return bytes(data.cpu().numpy().tolist()).decode()

@@ -1,0 +1,214 @@
+"""The stability benchmark finds what is wrong, and says what it found."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import pytest
+import torch
+
+from mmpi_ns.bench import absurd, cases_blending, cases_geometry, cases_merging, cases_rays, provenance, stability
+from mmpi_ns.bench.cases import PRECISIONS, Case, Error, Outcome, compare
+from mmpi_ns.ops import compositing
+from mmpi_ns.scene import geometry
+
+FLOAT32 = PRECISIONS[0]
+
+
+def named(part, group):
+    found = [c for c in group.cases() if part in c.inputs]
+    assert len(found) == 1, [c.inputs for c in found]
+    return found[0]
+
+
+def failures(cases, precision=FLOAT32):
+    return [c.inputs for c in cases if not c.measure(precision).holds]
+
+
+def test_there_are_at_least_60_cases_with_names_of_their_own():
+    cases = stability.all_cases()
+    names = [(c.group, c.inputs) for c in cases]
+    assert len(cases) >= 60 and len(set(names)) == len(names)
+
+
+def test_compositing_in_half_precision_fails_its_cases(monkeypatch):
+    """A kernel that rounds its optical depths to bfloat16 is wrong by 2^-9; every case of thin samples must see it."""
+    right = compositing.composite_weights
+
+    def rounded(tau, *rest):
+        return right(tau.bfloat16().float(), *rest)
+
+    chosen = [c for c in cases_blending.cases() if c.group == "compositing" and "depths" in c.inputs]
+    assert len(chosen) >= 3 and not failures(chosen)
+    monkeypatch.setattr(cases_blending, "composite_weights", rounded)
+    assert len(failures(chosen)) == len(chosen)
+
+
+def test_a_transmittance_taken_from_alpha_fails_where_it_is_1e_minus_30(monkeypatch):
+    def from_alpha(tau, valid, before, total):
+        alpha = -torch.expm1(-tau)
+        left = torch.cumprod(1 - alpha, -1)
+        front = torch.cat([torch.ones_like(left[:, :1]), left[:, :-1]], -1)
+        return compositing.Composite(front * alpha, 1 - left[:, -1:], left[:, -1:])
+
+    chosen = [c for c in cases_blending.cases() if "1e-30" in c.inputs and c.group == "compositing"]
+    assert len(chosen) == 3 and not failures(chosen)
+    monkeypatch.setattr(cases_blending, "composite_weights", from_alpha)
+    assert len(failures(chosen)) >= 2
+
+
+def test_shares_from_log_softmax_alone_fail_where_reliability_is_saturated(monkeypatch):
+    def plain(reliability, cover, own):
+        share = torch.where(cover, reliability, -math.inf).log_softmax(-1).gather(1, own[:, None])[:, 0]
+        return share, torch.log1p(-share.exp())
+
+    case = named("12 MPIs, reliabilities +-1000, tau 0 to 1e4, paper form", cases_blending)
+    assert case.measure(FLOAT32).holds
+    monkeypatch.setattr(cases_blending, "blend_shares", plain)
+    assert not case.measure(FLOAT32).holds
+
+
+@pytest.mark.parametrize("inputs", ["12 random MPIs, 200 rays", "1e6 units from the world's origin"])
+def test_geometry_by_matrix_products_fails_under_autocast_and_by_single_products_holds(monkeypatch, inputs):
+    case = next(c for c in cases_geometry.cases() if inputs in c.inputs)
+    assert all(case.measure(p).holds for p in PRECISIONS)
+    monkeypatch.setattr(geometry, "rotate", lambda axes, v: (axes @ v[..., None])[..., 0])
+    assert case.measure(FLOAT32).holds and not case.measure(PRECISIONS[1]).holds
+
+
+def test_a_live_range_that_is_one_plane_short_is_counted(monkeypatch):
+    right = cases_geometry.plane_hits
+
+    def short(*args):
+        hits = right(*args)
+        return type(hits)(hits.m_first, (hits.count - 1).clamp(min=0), hits.u, hits.v, hits.local_origins,
+                          hits.local_directions)  # fmt: skip
+
+    monkeypatch.setattr(cases_geometry, "plane_hits", short)
+    outcome = named("12 random MPIs, 200 rays", cases_geometry).measure(FLOAT32)
+    assert outcome.value.error > 100 and outcome.value.bound == 0
+
+
+def test_an_unstable_sort_fails_the_ties(monkeypatch):
+    case = named("nearly all tie", cases_merging)
+    assert case.measure(FLOAT32).holds
+    right = torch.sort
+
+    def last_comes_first(keys, **how):
+        values, order = right(keys.flip(-1), **how)
+        return values, keys.shape[-1] - 1 - order
+
+    monkeypatch.setattr(torch, "sort", last_comes_first)
+    assert not case.measure(FLOAT32).holds
+
+
+def test_a_whole_ray_with_a_wrong_gradient_fails(monkeypatch):
+    """Colours are right, but the reliability's gradient is 0.1 % too large."""
+    case = named("4 MPIs, paper form", cases_rays)
+    assert case.measure(FLOAT32).holds
+
+    class Scaled(torch.autograd.Function):
+        @staticmethod
+        def forward(ctx, x):
+            return x.clone()
+
+        @staticmethod
+        def backward(ctx, grad):
+            return 1.001 * grad
+
+    right = compositing.blend_shares
+    monkeypatch.setattr("mmpi_ns.field.mmpi_field.blend_shares", lambda r, *rest: right(Scaled.apply(r), *rest))
+    outcome = case.measure(FLOAT32)
+    assert outcome.value.holds and not outcome.gradient.holds
+
+
+def test_results_that_are_not_finite_fail():
+    assert not compare(torch.tensor([math.nan]), [0.0], 1.0, 4).holds
+    assert not compare(torch.tensor([math.inf]), [1.0], math.inf, 4).holds
+    assert Error.worst([Error(0.1, 1.0), Error(math.inf, 1.0)]).error == math.inf
+    assert Error.worst([Error(0.1, 1.0), Error(1e-7, 1e-8)]).bound == 1e-8
+
+
+def test_the_table_names_command_processor_commit_and_every_case(tmp_path, monkeypatch):
+    chosen = [named("2 planes, released", cases_blending), named("planes of 2 texels", cases_merging)]
+    monkeypatch.setattr(stability, "all_cases", lambda: chosen)
+    command = stability.Stability(output=tmp_path, training=False)
+    command.run()
+    content = json.loads((tmp_path / "stability.json").read_text())
+    headline = content["headline"]
+    assert headline["cases"] == 2 and headline["failed"] == 0
+    assert all(isinstance(v, int | float) for v in headline.values())
+    text = (tmp_path / "stability.md").read_text()
+    for wanted in (f"mmpi-bench stability --output {tmp_path.name} --no-training", provenance.processor(),
+                   content["made"]["commit"], content["made"]["date"], *(c.inputs for c in chosen)):  # fmt: skip
+        assert wanted in text
+    assert (tmp_path / "stability.png").stat().st_size > 1000
+
+
+def test_cases_are_measured_once_and_again_only_when_the_sources_change(tmp_path, monkeypatch):
+    measured = []
+    case = Case("group", "input", "nothing", lambda p: measured.append(p.name) or Outcome(Error(0.5, 1.0)))
+    monkeypatch.setattr(stability, "all_cases", lambda: [case])
+    command = stability.Stability(output=tmp_path, training=False)
+    command.run()
+    command.run()
+    assert measured == [p.name for p in PRECISIONS]
+    monkeypatch.setattr(stability, "fingerprint", lambda: "other sources")
+    command.run()
+    assert len(measured) == 2 * len(PRECISIONS)
+
+
+def test_a_case_that_raises_fails_and_the_next_one_runs(tmp_path, monkeypatch):
+    def fall(precision):
+        raise RuntimeError("out of range")
+
+    cases = [
+        Case("group", "bad", "nothing", fall),
+        Case("group", "good", "nothing", lambda p: Outcome(Error(0.5, 1.0))),
+    ]
+    monkeypatch.setattr(stability, "all_cases", lambda: cases)
+    with pytest.raises(SystemExit):
+        stability.Stability(output=tmp_path, training=False).run()
+    content = json.loads((tmp_path / "stability.json").read_text())
+    assert [row["ok"] for row in content["rows"]] == [False, True] and content["headline"]["failed"] == 1
+    assert "out of range" in content["rows"][0]["paths"]["float32"]["raised"]
+
+
+@pytest.mark.parametrize("group", [cases_geometry, cases_blending, cases_merging])
+@pytest.mark.parametrize("precision", PRECISIONS, ids=lambda p: p.name)
+def test_every_case_holds(group, precision):
+    """Whole rays take longer: some of them are above, all of them in docs/results/stability.md."""
+    assert failures(group.cases(), precision) == []
+
+
+def test_a_case_that_fails_is_counted_and_ends_the_command_with_an_error(tmp_path, monkeypatch):
+    case = named("alpha 0 everywhere", cases_blending)
+    monkeypatch.setattr(stability, "all_cases", lambda: [case])
+    right = compositing.composite_weights
+    monkeypatch.setattr(cases_blending, "composite_weights", lambda tau, *rest: right(tau + 1e-3, *rest))
+    with pytest.raises(SystemExit, match="fails its bound"):
+        stability.Stability(output=tmp_path, training=False).run()
+    assert json.loads((tmp_path / "stability.json").read_text())["headline"]["failed"] == 1
+    assert "**FAIL**" in (tmp_path / "stability.md").read_text()
+
+
+def test_absurd_trainings_end_well_and_are_not_run_twice(tmp_path, monkeypatch):
+    chosen = tuple(a for a in absurd.ABSURDITIES if a.name in ("learning rates x 100", "one of two MPIs faces away"))
+    monkeypatch.setattr(absurd, "ABSURDITIES", chosen)
+    monkeypatch.setattr(stability, "all_cases", list)
+    command = stability.Stability(output=tmp_path / "results", work=tmp_path / "work", steps=6)
+    command.run()
+    trainings = json.loads((tmp_path / "results" / "stability.json").read_text())["trainings"]
+    assert [row["ok"] for row in trainings.values()] == [True, True]
+    assert all(row["outcome"] == "finite weights" and row["largest"] > 0 for row in trainings.values())
+    monkeypatch.setattr(absurd, "train", lambda *args: pytest.fail("run again"))
+    command.run()
+
+
+def test_a_training_that_ends_in_nan_fails(tmp_path, monkeypatch):
+    def poison(trainer):
+        trainer._model.field.features.data[64] = math.nan  # the first texel: the rows before it hold nothing
+
+    row = absurd.train(absurd.Absurdity("poisoned", absurd.FINITE, lambda c, s: None, poison), tmp_path, 2)
+    assert not row["ok"] and "field.features" in row["outcome"]

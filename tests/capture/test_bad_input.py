@@ -1,0 +1,306 @@
+"""Bad input is refused with one sentence (what, where, what to do), and nothing is lost (docs/errors.md)."""
+
+from __future__ import annotations
+
+import json
+import resource
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from nerfstudio.data.scene_box import OrientedBox
+from nerfstudio.utils.eval_utils import eval_setup
+from PIL import Image
+from tiny_scene import HEIGHT, TEST, TRAIN, WIDTH, name_of, write_scene
+from training_runs import datamanager, ready, trainer_config, write_plan
+
+from mmpi_ns.capture.observe import ENOUGH_KEYPOINTS
+from mmpi_ns.placement.rule import PlacementConfig, place
+
+
+@pytest.fixture
+def data(tmp_path):
+    """A tiny scene to be damaged; it has a COLMAP model."""
+    return write_scene(tmp_path / "data")
+
+
+def edit(data, change):
+    """Changes the contents of transforms.json."""
+    meta = json.loads((data / "transforms.json").read_text())
+    change(meta)
+    (data / "transforms.json").write_text(json.dumps(meta))
+
+
+def refusal(action, *words, error=ValueError):
+    """The sentence with which an action is refused; it must hold these words."""
+    with pytest.raises(error) as caught:
+        action()
+    message = str(caught.value)
+    assert all(str(w) in message for w in words), message
+    assert "\n" not in message and ". " not in message and message.endswith("."), message
+
+
+def stand_still(meta):
+    for frame in meta["frames"]:
+        frame["transform_matrix"] = meta["frames"][0]["transform_matrix"]
+
+
+def keep_one(meta):
+    for key in ("train", "val", "test"):
+        del meta[f"{key}_filenames"]
+    meta["frames"] = meta["frames"][:1]
+
+
+def set_pose(value):
+    def change(meta):
+        meta["frames"][3]["transform_matrix"] = value
+
+    return change
+
+
+# The capture ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_folder_without_transforms_is_named_with_what_to_do(tmp_path):
+    refusal(lambda: datamanager(tmp_path), tmp_path / "transforms.json", "--data", "mmpi-prepare", "colmap")
+
+
+@pytest.mark.parametrize("text", ["", "{ frames: ", "[1, 2]", "{}", '{"frames": []}', '{"frames": [3]}'])
+def test_transforms_that_hold_no_frames_are_refused(data, text):
+    (data / "transforms.json").write_text(text)
+    refusal(lambda: datamanager(data), data / "transforms.json")
+
+
+@pytest.mark.parametrize("missing", ["transform_matrix", "file_path"])
+def test_a_frame_without_pose_or_image_is_named(data, missing):
+    edit(data, lambda meta: meta["frames"][3].pop(missing))
+    refusal(lambda: datamanager(data), "4" if missing == "file_path" else name_of(3), missing, "remove the frame")
+
+
+@pytest.mark.parametrize(
+    "pose", [[[1.0, 0, 0, float("nan")], *np.eye(4)[1:].tolist()], [[1, 2], [3, 4]], "none", [["a"] * 4] * 4, None]
+)
+def test_a_pose_that_is_no_finite_matrix_is_named(data, pose):
+    edit(data, set_pose(pose))
+    refusal(lambda: datamanager(data), name_of(3), data / "transforms.json", "4 x 4")
+
+
+def test_a_focal_length_that_is_not_positive_is_refused(data):
+    edit(data, lambda meta: meta.update(fl_x=0.0))
+    refusal(lambda: datamanager(data), name_of(TRAIN[0]), "focal length")
+
+
+@pytest.mark.parametrize("change", [stand_still, keep_one])
+def test_cameras_in_one_place_are_refused_with_what_can_be_done(data, change):
+    edit(data, change)
+    refusal(lambda: datamanager(data), data / "transforms.json", "one place", "--auto-scale-poses False")
+
+
+@pytest.mark.parametrize("change", [stand_still, keep_one])
+def test_one_place_can_be_trained_on_request_and_says_what_it_cannot_learn(data, tmp_path, capsys, change):
+    edit(data, change)
+    shutil.rmtree(data / "colmap")
+    config = trainer_config(data, None, tmp_path, 4, training="joint")
+    config.pipeline.datamanager.dataparser = NerfstudioDataParserConfig(auto_scale_poses=False, eval_mode="all")
+    trainer = ready(config)
+    assert "one place: no distance can be learned" in " ".join(capsys.readouterr().out.split())
+    trainer.train()
+    assert len(trainer.pipeline.model.field.full_plan.mpis) == 1
+    assert all(torch.isfinite(p).all() for p in trainer.pipeline.model.parameters())
+
+
+def test_a_capture_that_leaves_no_image_for_evaluation_says_so(data):
+    edit(data, keep_one)
+    parser = NerfstudioDataParserConfig(auto_scale_poses=False)
+    refusal(lambda: datamanager(data, dataparser=parser), "evaluation", "--eval-mode all")
+
+
+# Images and masks ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("i", [0, TRAIN[2], TEST[1]])
+@pytest.mark.parametrize("damage", ["missing", "truncated", "no image"])
+def test_an_image_that_is_missing_or_cannot_be_read_is_named(data, i, damage):
+    path = data / "images" / name_of(i)
+    if damage == "missing":
+        path.unlink()
+    else:
+        path.write_bytes(path.read_bytes()[:300] if damage == "truncated" else b"hello")
+    refusal(lambda: datamanager(data), path, "cannot be read", "repair it or remove its frame")
+
+
+def test_an_image_of_another_size_than_its_camera_is_named(data):
+    path = data / "images" / name_of(3)
+    Image.fromarray(np.zeros((HEIGHT + 2, WIDTH, 3), np.uint8)).save(path)
+    refusal(lambda: datamanager(data), path, f"{WIDTH} x {HEIGHT + 2}", f"{WIDTH} x {HEIGHT}")
+
+
+def test_an_image_that_was_rounded_up_by_a_pixel_is_cut_to_its_camera(data):
+    for i in range(8):
+        Image.fromarray(np.zeros((HEIGHT + 1, WIDTH + 1, 3), np.uint8)).save(data / "images" / name_of(i))
+    manager = datamanager(data)
+    assert len(manager.pool.colors) == len(TRAIN) * WIDTH * HEIGHT
+    assert manager.eval_dataset[0]["image"].shape == (HEIGHT, WIDTH, 3)
+
+
+@pytest.mark.parametrize("i", [TRAIN[2], TEST[1]])
+@pytest.mark.parametrize("damage", ["size", "channels", "missing"])
+def test_a_mask_that_does_not_fit_is_named(tmp_path, i, damage):
+    data = write_scene(tmp_path / "masked", masks=True)
+    path = data / "masks" / name_of(i)
+    shape = {"size": (HEIGHT // 2, WIDTH), "channels": (HEIGHT, WIDTH, 3)}.get(damage)
+    if shape is None:
+        path.unlink()
+    else:
+        Image.fromarray(np.full(shape, 255, np.uint8)).save(path)
+    refusal(lambda: datamanager(data), path, "cannot be used", "one channel of the image's size")
+
+
+# Points --------------------------------------------------------------------------------------------------------------
+
+
+def move_points(data, move):
+    """Moves the points of the COLMAP model, and leaves the keypoints."""
+    path = data / "colmap/sparse/0/points3D.txt"
+    rows = [line.split() for line in path.read_text().splitlines()]
+    moved = [[r[0], *(str(v) for v in move(n, np.array(r[1:4], float))), *r[4:]] for n, r in enumerate(rows)]
+    path.write_text("\n".join(" ".join(r) for r in moved) + "\n")
+
+
+def test_a_scene_without_points_says_how_it_finds_some(tmp_path, capsys):
+    manager = datamanager(write_scene(tmp_path / "bare", sfm=False))
+    said = " ".join(capsys.readouterr().out.split())
+    assert "No SfM tracks: matching the features" in said and "a quick plane sweep finds out" in said
+    assert len(place(manager.observations, PlacementConfig()).mpis) >= 1
+
+
+def test_a_model_whose_points_are_all_behind_the_cameras_is_not_used(data, capsys):
+    move_points(data, lambda n, p: p * [1, 1, -1])
+    observations = datamanager(data, test_mode="test").observations
+    assert "does not fit the cameras" in capsys.readouterr().out
+    assert not len(observations.seen_at)
+
+
+def test_single_points_behind_their_cameras_are_left_out(data, capsys):
+    whole = datamanager(data).observations
+    move_points(data, lambda n, p: p * [1, 1, -1] if n % 9 == 4 else p)
+    found = datamanager(data).observations
+    said = " ".join(capsys.readouterr().out.split())
+    lost = len(whole.seen_at) - len(found.seen_at)
+    assert f"{lost} of {len(whole.seen_at)} keypoints have their point behind the camera" in said
+    assert 0 < lost < len(whole.seen_at) / 4 and len(found.seen_at) == len(found.seen_by) == len(found.seen_point)
+    ahead = found.points[found.seen_point] - found.centers[found.seen_by]
+    assert (np.einsum("qi,qi->q", ahead, -found.camera_to_worlds[found.seen_by][:, :, 2]) > 0).all()
+
+
+def test_placement_refuses_points_behind_every_camera(scene):
+    observations = datamanager(scene).observations
+    turned = replace(observations, camera_to_worlds=observations.camera_to_worlds * np.array([-1, 1, -1, 1]))
+    refusal(lambda: place(turned, PlacementConfig()), "in front", "check the poses")
+    assert len(observations.seen_by) > ENOUGH_KEYPOINTS
+
+
+# Crops ---------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def trained(scene, plan_file, tmp_path_factory):
+    """A short run with a checkpoint."""
+    trainer = ready(trainer_config(scene, plan_file, tmp_path_factory.mktemp("run"), 6))
+    trainer.train()
+    return trainer
+
+
+@pytest.mark.parametrize("scale", [(0.0, 0.0, 0.0), (1.0, -1.0, 1.0), (1.0, float("nan"), 1.0)])
+def test_a_crop_without_size_is_refused(trained, scale):
+    camera = trained.pipeline.datamanager.eval_dataset.cameras[:1]
+    box = OrientedBox.from_params((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), scale)
+    model = trained.pipeline.model.eval()
+    refusal(lambda: model.get_outputs_for_camera(camera, obb_box=box), "no size", "crop_scale")
+    model.train()
+
+
+# Checkpoints ---------------------------------------------------------------------------------------------------------
+
+
+def contents(folder):
+    return {p.relative_to(folder): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def test_a_disk_that_is_full_while_saving_leaves_the_last_checkpoint(trained, scene, plan_file, tmp_path):
+    trainer = ready(trainer_config(scene, plan_file, tmp_path, 6))
+    trainer.config.save_only_latest_checkpoint = True
+    trainer.save_checkpoint(2)
+    before = contents(trainer.base_dir)
+    size = trainer.checkpoint_dir.joinpath("step-000000002.ckpt").stat().st_size
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size // 2, limits[1]))  # the real writer fails half way through
+    try:
+        for step in (2, 3):
+            words = (f"step-{step:09d}.ckpt could not be written", "MB free", "make room", "--load-dir")
+            refusal(lambda step=step: trainer.save_checkpoint(step), *words, error=OSError)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert contents(trainer.base_dir) == before
+    again = ready(trainer_config(scene, plan_file, tmp_path / "again", 6), load_dir=trainer.checkpoint_dir)
+    assert again._start_step == 3
+
+
+def test_a_checkpoint_cut_short_is_named(trained, scene, plan_file, tmp_path):
+    folder = tmp_path / "models"
+    folder.mkdir()
+    whole = (trained.checkpoint_dir / "step-000000005.ckpt").read_bytes()
+    (folder / "step-000000005.ckpt").write_bytes(whole[: len(whole) // 2])
+    config = trainer_config(scene, plan_file, tmp_path / "out", 6)
+    refusal(lambda: ready(config, load_dir=folder), folder / "step-000000005.ckpt", "cannot be read", "--load-step")
+
+
+def test_a_run_resumed_with_another_number_of_mpis_is_refused_and_changes_nothing(scene, tmp_path):
+    def config(num_mpis):
+        plan = write_plan(scene, tmp_path / "plan.json", num_mpis=num_mpis)
+        return trainer_config(scene, plan, tmp_path, 4)
+
+    config(1).save_config()
+    first = ready(config(1))
+    first.train()
+    before = contents(first.base_dir)
+    refusal(
+        lambda: ready(config(2), load_dir=first.checkpoint_dir),
+        "another scene plan (1 MPIs there, 2 MPIs here)", "config.yml", "--pipeline.model.plan-file",
+    )  # fmt: skip
+    after = contents(first.base_dir)
+    # TensorBoard writes what it still holds of the first run whenever it likes.
+    assert all(after[name] == data for name, data in before.items() if "tfevents" not in name.name)
+    config(2).save_config()  # ns-train overwrites config.yml before anything of ours runs
+    _, pipeline, _, step = eval_setup(first.base_dir / "config.yml")
+    assert step == 3 and len(pipeline.model.field.plan.mpis) == 1
+
+
+# Devices, and the command as a whole ---------------------------------------------------------------------------------
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without a GPU")
+def test_a_gpu_asked_for_where_there_is_none(scene, plan_file, tmp_path):
+    config = trainer_config(scene, plan_file, tmp_path, 4)
+    config.machine.device_type = "cuda"
+    refusal(lambda: ready(config), "--machine.device-type cuda", "torch sees none", "--machine.device-type cpu")
+    assert not list(tmp_path.rglob("*.ckpt"))
+
+
+def test_the_command_ends_with_the_sentence_and_a_status_that_is_not_0(data, tmp_path):
+    edit(data, lambda meta: meta["frames"][3].pop("transform_matrix"))
+    env = {"COLUMNS": "200", "PATH": "/usr/bin:/bin", "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(
+        [str(Path(sys.executable).with_name("ns-train")), "mmpi-small", "--data", str(data), "--output-dir",
+         str(tmp_path / "out"), "--machine.device-type", "cpu", "--vis", "tensorboard"],
+        capture_output=True, text=True, timeout=100, env=env,
+    )  # fmt: skip
+    assert done.returncode != 0
+    last = done.stderr.strip().splitlines()[-1]
+    assert last.startswith("ValueError: Frame") and name_of(3) in last and last.endswith("remove the frame.")

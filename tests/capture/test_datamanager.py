@@ -1,0 +1,191 @@
+"""What the data manager draws and what it hands to the model, on the tiny scene."""
+
+from __future__ import annotations
+
+import copy
+import json
+
+import numpy as np
+import pytest
+import torch
+from nerfstudio.cameras.cameras import CameraType
+from nerfstudio.model_components.ray_generators import RayGenerator
+from PIL import Image
+from tiny_scene import HEIGHT, TRAIN, WIDTH, image_of, name_of, project, wall_points, write_scene
+from training_runs import datamanager, plan_of
+
+from mmpi_ns.capture.datamanager import KEYPOINT_DEPTH, OBSERVATIONS
+from mmpi_ns.capture.rays import PinholeRays
+from mmpi_ns.capture.sfm import MIN_TRACK
+from mmpi_ns.placement.rule import PlacementConfig, place
+from mmpi_ns.scene.plan import ScenePlan
+
+TRACKED = sum(project(i, wall_points())[1].astype(int) for i in range(8)) >= MIN_TRACK
+
+
+@pytest.fixture(scope="module")
+def manager(scene):
+    return datamanager(scene)
+
+
+def wall_in_scene_units(manager):
+    """Points of the wall in the data parser's frame."""
+    outputs = manager.train_dataparser_outputs
+    transform = outputs.dataparser_transform.double().numpy()
+    return (wall_points() @ transform[:, :3].T + transform[:, 3]) * outputs.dataparser_scale
+
+
+def same(a, b):
+    return torch.equal(a[1]["indices"], b[1]["indices"]) and torch.equal(a[0].directions, b[0].directions)
+
+
+def test_a_batch_depends_on_the_seed_and_the_step_and_on_nothing_else(scene, manager):
+    first = manager.next_train(7)
+    manager.next_train(8)
+    torch.rand(3)
+    assert same(first, manager.next_train(7))
+    assert not same(first, manager.next_train(8))
+    assert same(first, datamanager(scene).next_train(7))
+    assert not same(first, datamanager(scene, seed=1).next_train(7))
+
+
+def test_a_batch_holds_the_colours_of_the_pixels_that_its_rays_pass(manager):
+    rays, batch = manager.next_train(0)
+    assert len(rays) == 64 + 16 and batch["image"].shape == (64, 3)
+    for color, (camera, row, column) in zip(batch["image"], batch["indices"].tolist(), strict=True):
+        assert np.abs(color.numpy() - image_of(TRAIN[camera])[row, column]).max() < 0.5 / 255 + 1e-6
+    wanted = manager.train_dataset.cameras.generate_rays(
+        batch["indices"][:, :1], coords=batch["indices"][:, 1:].float() + 0.5
+    )
+    assert torch.allclose(rays.directions[:64], wanted.directions, atol=1e-6)
+    assert torch.allclose(rays.origins[:64], wanted.origins)
+    assert (rays.metadata[KEYPOINT_DEPTH][:64] == 0).all() and (rays.metadata[KEYPOINT_DEPTH][64:] > 0).all()
+
+
+def test_every_training_pixel_can_be_drawn(manager):
+    assert len(manager.pool.colors) == len(TRAIN) * WIDTH * HEIGHT
+    drawn = torch.cat([manager.next_train(step)[1]["indices"] for step in range(30)])
+    assert set(drawn[:, 0].tolist()) == set(range(6)) and drawn[:, 1].max() > 20 and drawn[:, 2].max() > 28
+
+
+def test_masked_pixels_are_never_drawn(tmp_path):
+    manager = datamanager(write_scene(tmp_path / "masked", masks=True))
+    assert len(manager.pool.colors) == len(TRAIN) * WIDTH * HEIGHT / 2
+    columns = torch.cat([manager.next_train(step)[1]["indices"][:, 2] for step in range(20)])
+    assert columns.max() == WIDTH / 2 - 1 and columns.min() == 0
+
+
+def test_masks_that_leave_nothing_are_refused(tmp_path):
+    data = write_scene(tmp_path / "black", masks=True)
+    for i in range(8):
+        Image.fromarray(np.zeros((HEIGHT, WIDTH), np.uint8)).save(data / "masks" / name_of(i))
+    with pytest.raises(ValueError, match="masks leave no training pixel"):
+        datamanager(data)
+
+
+def test_an_image_that_cannot_be_read_is_named(tmp_path):
+    data = write_scene(tmp_path / "broken")
+    path = data / "images" / name_of(3)
+    path.write_bytes(path.read_bytes()[:60])
+    with pytest.raises(ValueError, match=name_of(3)):
+        datamanager(data)
+
+
+def test_transparency_reaches_the_batch(tmp_path):
+    manager = datamanager(write_scene(tmp_path / "alpha", alpha=True))
+    batch = manager.next_train(0)[1]
+    assert batch["image"].shape == (64, 4)
+    assert torch.equal(batch["image"][:, 3] == 0, batch["indices"][:, 1] < HEIGHT // 4)
+
+
+def test_keypoints_are_those_of_training_images_and_lie_on_the_wall(manager):
+    observations = manager.observations
+    assert manager.train_dataset.metadata[OBSERVATIONS] is observations
+    wall = wall_in_scene_units(manager)
+    assert len(observations.points) == TRACKED.sum() > 20
+    gaps = np.linalg.norm(observations.points[:, None] - wall[TRACKED][None], axis=-1)
+    row = gaps.argmin(1)  # COLMAP's order is its own
+    assert gaps.min(1).max() < 1e-4 and len(set(row)) == len(row)
+    wanted = sum((project(i, wall_points())[1] & TRACKED).sum() for i in TRAIN)
+    assert len(observations.seen_by) == wanted and set(observations.seen_by) == set(range(6))
+    for camera, point, at in zip(observations.seen_by, observations.seen_point, observations.seen_at, strict=True):
+        pixels, _ = project(TRAIN[camera], wall_points()[TRACKED])
+        assert np.abs(pixels[row[point]] - at).max() < 1e-6
+
+
+def test_a_keypoint_ray_ends_on_its_point_at_the_known_distance(manager):
+    rays, _ = manager.next_train(3)
+    ends = rays.origins[64:] + rays.directions[64:] / rays.metadata[KEYPOINT_DEPTH][64:]
+    gaps = np.linalg.norm(ends.numpy()[:, None] - wall_in_scene_units(manager)[None], axis=-1).min(1)
+    assert gaps.max() < 2e-3
+
+
+def test_without_a_colmap_model_or_on_request_there_are_no_keypoint_rays(scene, tmp_path):
+    bare = datamanager(write_scene(tmp_path / "bare", sfm=False))
+    rays, _ = bare.next_train(0)
+    assert len(rays) == 64 and (rays.metadata[KEYPOINT_DEPTH] == 0).all()
+    assert len(datamanager(scene, keypoint_rays=0).next_train(0)[0]) == 64
+
+
+def test_a_colmap_model_that_cannot_be_read_is_named(tmp_path):
+    data = write_scene(tmp_path / "broken")
+    (data / "colmap/sparse/0/images.txt").write_text("1 2 three\nfour\n")
+    with pytest.raises(ValueError, match=r"COLMAP model in .* cannot be read"):
+        datamanager(data)
+
+
+def test_poses_that_are_not_finite_are_refused(tmp_path):
+    data = write_scene(tmp_path / "nan", sfm=False)
+    meta = json.loads((data / "transforms.json").read_text())
+    meta["frames"][0]["transform_matrix"][0][3] = float("nan")
+    (data / "transforms.json").write_text(json.dumps(meta))
+    with pytest.raises(ValueError, match="pose"):
+        datamanager(data)
+
+
+def test_the_placement_rule_makes_a_plan_for_the_scene(manager):
+    plan = place(manager.observations, PlacementConfig())
+    assert isinstance(plan, ScenePlan) and plan == place(manager.observations, PlacementConfig())
+    assert ScenePlan.from_json(plan.to_json()) == plan
+
+
+def test_a_hand_written_plan_covers_the_wall(manager):
+    plan = plan_of(manager.observations)
+    for mpi in plan.mpis:
+        local = (wall_in_scene_units(manager) - mpi.origin) @ np.array(mpi.axes).T
+        assert (local[:, 2] > mpi.near).all() and (np.abs(local[:, 0] / local[:, 2]) < 1).mean() > 0.9
+
+
+def test_keypoints_on_masked_pixels_are_left_out(tmp_path, manager):
+    masked = datamanager(write_scene(tmp_path, masks=True)).observations
+    open_ = manager.observations
+    assert (open_.seen_at[:, 0] >= WIDTH / 2).any()
+    wanted = open_.seen_at[:, 0] < WIDTH / 2
+    assert np.array_equal(masked.seen_at, open_.seen_at[wanted])
+    assert np.array_equal(masked.seen_by, open_.seen_by[wanted])
+    assert np.array_equal(masked.seen_point, open_.seen_point[wanted])
+
+
+def test_rays_of_pinhole_cameras_are_nerfstudios(scene):
+    manager = datamanager(scene)
+    cameras = manager.train_dataset.cameras
+    g = torch.Generator().manual_seed(1)
+    sizes = torch.stack([cameras.height[:, 0], cameras.width[:, 0]], -1)
+    camera = torch.randint(0, len(cameras), (50,), generator=g)
+    indices = torch.cat([camera[:, None], (torch.rand(50, 2, generator=g) * sizes[camera]).long()], -1)
+    made = PinholeRays.of(cameras, "cpu")
+    assert made is not None
+    ours, theirs = made(indices), RayGenerator(cameras)(indices)
+    for name in ("origins", "directions", "camera_indices"):
+        assert torch.allclose(getattr(ours, name), getattr(theirs, name), atol=1e-6), name
+    assert ours.pixel_area.shape == theirs.pixel_area.shape
+
+
+def test_other_cameras_are_left_to_nerfstudio(scene):
+    cameras = datamanager(scene).train_dataset.cameras
+    bent, round_ = copy.deepcopy(cameras), copy.deepcopy(cameras)
+    bent.distortion_params = torch.zeros(len(cameras), 6)
+    assert PinholeRays.of(bent, "cpu") is not None, "a lens model without effect"
+    bent.distortion_params[1, 0] = 0.1
+    round_.camera_type[2] = CameraType.FISHEYE.value
+    assert PinholeRays.of(bent, "cpu") is None and PinholeRays.of(round_, "cpu") is None

@@ -1,0 +1,127 @@
+"""What of a data set becomes observations: cameras with their lenses, tracks, and which points are good enough."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from nerfstudio.cameras.cameras import Cameras, CameraType
+from tiny_scene import write_colmap
+
+from mmpi_ns.capture import observe as mmpi_observations
+from mmpi_ns.capture.observe import ENOUGH_KEYPOINTS, drop_masked, posed_images, read_observations, with_tracks
+from mmpi_ns.capture.sfm import SfmModel, find_sfm_model
+from mmpi_ns.placement.observations import Observations
+
+SIZES = np.array([[40.0, 20.0], [80.0, 60.0]])
+
+
+def bare() -> Observations:
+    """Two cameras of different sizes."""
+    none = np.zeros(0, np.int64)
+    return Observations(
+        camera_to_worlds=np.tile(np.eye(4)[:3], (2, 1, 1)),
+        intrinsics=np.array([[30.0, 31, 20, 10], [60, 61, 40, 30]]),
+        sizes=SIZES,
+        points=np.zeros((0, 3)),
+        seen_by=none,
+        seen_point=none,
+        seen_at=np.zeros((0, 2)),
+    )
+
+
+class Data(SimpleNamespace):
+    """As much of a data set of two images as is asked for."""
+
+    def __len__(self):
+        return 2
+
+
+def as_data(kind=CameraType.PERSPECTIVE, lens=None, **more):
+    poses = torch.eye(4)[None, :3].repeat(2, 1, 1)
+    cameras = Cameras(poses, 30.0, 30.0, 20.0, 10.0, 40, 20, distortion_params=lens, camera_type=kind)
+    return Data(cameras=cameras, image_filenames=["a/x.png", "b/x.png"], **more)
+
+
+LENS = torch.tensor([[0.1, 0.2, 0.3, 0.4, 0.5, 0.6], [1.1, 1.2, 1.3, 1.4, 1.5, 1.6]])  # nerfstudio's k1 k2 k3 k4 p1 p2
+
+
+@pytest.mark.parametrize(
+    ("kind", "used"), [(CameraType.PERSPECTIVE, (0.1, 0.2, 0.5, 0.6)), (CameraType.FISHEYE, (0.1, 0.2, 0.3, 0.4))]
+)
+def test_a_lens_goes_to_colmap_in_its_order(kind, used):
+    images = posed_images(bare(), as_data(kind=kind, lens=LENS))
+    assert images is not None and images.fisheye == (kind is CameraType.FISHEYE)
+    assert images.distortion == pytest.approx(np.array([used, np.add(used, 1)]))
+    assert [str(f) for f in images.files] == ["a/x.png", "b/x.png"] and np.array_equal(images.sizes, SIZES)
+    assert not posed_images(bare(), as_data(kind=kind)).distortion.any()
+
+
+def test_other_cameras_are_not_triangulated():
+    assert posed_images(bare(), as_data(kind=CameraType.EQUIRECTANGULAR)) is None
+
+
+def test_points_of_the_data_parser_stand_in_where_there_is_no_model():
+    points = torch.tensor([[1.0, 2, 3], [4, 5, 6]])
+    outputs: Any = SimpleNamespace(image_filenames=["a.png", "b.png"], metadata={"points3D_xyz": points})
+    found = read_observations(outputs, as_data().cameras, None)
+    assert found.points.tolist() == points.tolist() and not len(found.seen_by) and not len(found.seen_at)
+    assert found.intrinsics.tolist() == [[30, 30, 20, 10]] * 2 and found.sizes.tolist() == [[40, 20]] * 2
+    outputs.metadata = {}
+    assert not len(read_observations(outputs, as_data().cameras, None).points)
+
+
+def model(*keypoints) -> SfmModel:
+    """Tracks (camera, point, share of the width, share of the height) of four points."""
+    names = ("1", "0")
+    own = [np.array([k[1:] for k in keypoints if k[0] == name]).reshape(-1, 3) for name in (1, 0)]
+    return SfmModel(np.arange(12.0).reshape(4, 3), names, tuple((k[:, 0].astype(np.int64), k[:, 1:]) for k in own))
+
+
+def test_tracks_come_in_pixels_of_the_camera_whose_place_names_them():
+    found = with_tracks(bare(), model((0, 2, 0.25, 0.5), (1, 3, 0.75, 0.1), (1, 2, 0.5, 0.5)))
+    assert found.seen_by.tolist() == [0, 1, 1] and found.seen_point.tolist() == [2, 3, 2]
+    assert found.seen_at == pytest.approx(np.array([[10, 10], [60, 6], [40, 30]]))
+    assert np.array_equal(found.points, np.arange(12.0).reshape(4, 3))
+
+
+@pytest.mark.parametrize(("each", "swept"), [(ENOUGH_KEYPOINTS, False), (ENOUGH_KEYPOINTS - 1, True)])
+def test_images_are_swept_only_where_triangulation_finds_too_few_keypoints(monkeypatch, each, swept):
+    tracks = [(camera, 0, 0.5, 0.5) for camera in (0, 1) for _ in range(each)]
+    monkeypatch.setattr(mmpi_observations, "triangulate", lambda images: model(*tracks))
+    calls = []
+    monkeypatch.setattr(mmpi_observations, "add_swept_points", lambda found, images: calls.append(images) or found)
+    image = {"image": torch.zeros(20, 40, 3, dtype=torch.uint8)}
+    data = as_data(get_data=lambda i, image_type: image)
+    found = mmpi_observations._find_points(bare(), data, triangulates=True)
+    assert len(found.seen_by) == 2 * each and len(calls) == swept
+    mmpi_observations._find_points(bare(), data, triangulates=False)
+    assert len(calls) == swept + 1 and [i.shape for i in calls[-1]] == [(20, 40)] * 2
+
+
+def test_a_mask_leaves_out_the_keypoints_on_its_black_pixels():
+    """Rows and columns differ, so that neither can stand for the other; what the sweep found has no keypoint."""
+    tracks = with_tracks(bare(), model((0, 0, 0.7, 0.1), (0, 1, 0.1, 0.7), (1, 2, 0.7, 0.1), (1, 3, 0.999, 0.999)))
+    mask = torch.ones(20, 40, 1, dtype=torch.uint8)
+    mask[10:, :20] = 0
+    masks = [{"mask": mask}, {"mask": torch.ones(60, 80, 1, dtype=torch.uint8)}]
+    data = as_data(get_data=lambda i, image_type: masks[i], _dataparser_outputs=SimpleNamespace(mask_filenames=[1]))
+    found = drop_masked(tracks, data)
+    assert found.seen_point.tolist() == [0, 2, 3] and len(found.seen_at) == 3
+
+
+def test_points_that_project_badly_or_that_few_images_see_are_left_out(tmp_path):
+    write_colmap(tmp_path / "model")
+    path = tmp_path / "model/points3D.txt"
+    rows = [line.split() for line in path.read_text().splitlines()]
+    whole = find_sfm_model(tmp_path / "model")
+    long = [r for r in rows if len(r[8:]) / 2 >= 3]
+    assert whole is not None and len(whole.points) == len(long) < len(rows)
+    long[3][7], long[5][7] = "2.01", "1.99"
+    path.write_text("\n".join(" ".join(r) for r in rows) + "\n")
+    found = find_sfm_model(tmp_path / "model")
+    assert found is not None and np.array_equal(found.points, np.delete(whole.points, 3, 0))
+    assert sum(len(p) for p, _ in found.keypoints) == sum(len(p) for p, _ in whole.keypoints) - len(long[3][8:]) / 2

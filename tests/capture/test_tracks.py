@@ -1,0 +1,226 @@
+"""Tracks found among posed images, on rendered walls whose every point is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pycolmap
+import pytest
+from PIL import Image
+from value_noise import noise
+
+from mmpi_ns.capture import tracks as triangulation
+from mmpi_ns.capture.tracks import EFFORTS, NEIGHBOURS, PosedImages, triangulate
+
+WIDTH, HEIGHT, FOCAL = 200, 150, 180.0
+LENS = (0.05, -0.02, 0.001, -0.002)
+
+
+def pose_at(x, turn=0.0):
+    c, s = np.cos(turn), np.sin(turn)
+    return np.array([[c, 0, s, x], [0, 1, 0, 0.03 * x], [-s, 0, c, 0.1 * x]])
+
+
+def undistort(x, y, lens):
+    """Directions whose OpenCV distortion falls on (x, y), by fixed-point iteration."""
+    k1, k2, p1, p2 = lens
+    u, v = x.copy(), y.copy()
+    for _ in range(30):
+        r2 = u * u + v * v
+        radial = 1 + k1 * r2 + k2 * r2 * r2
+        u = (x - 2 * p1 * u * v - p2 * (r2 + 2 * u * u)) / radial
+        v = (y - p1 * (r2 + 2 * v * v) - 2 * p2 * u * v) / radial
+    return u, v
+
+
+def texture(x, y, seed):
+    return noise(x, y, np.random.default_rng(seed).random((2, 64, 64)), ((6.0, 0.5), (14.0, 0.5)))
+
+
+def is_near_wall(points):
+    return points[:, 0] < 0.2
+
+
+def undistort_fisheye(x, y, lens):
+    """Directions whose fisheye projection (angle a at radius a (1 + k1 a^2 + ... + k4 a^8)) falls on (x, y)."""
+    radius = np.hypot(x, y)
+    angle = radius.copy()
+    for _ in range(30):
+        angle = radius / (1 + sum(k * angle ** (2 * n + 2) for n, k in enumerate(lens)))
+    stretch = np.tan(angle) / radius
+    return x * stretch, y * stretch
+
+
+def picture(pose, lens, fisheye=False):
+    """Gray image of a near wall (z = -3, x < 0.2) before a far one (z = -5)."""
+    xs, ys = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    inverse = undistort_fisheye if fisheye else undistort
+    u, v = inverse((xs - WIDTH / 2) / FOCAL, (ys - HEIGHT / 2) / FOCAL, lens)
+    d = np.stack([u, -v, -np.ones_like(u)], -1).reshape(-1, 3) @ pose[:, :3].T
+    near, far = ((z - pose[2, 3]) / d[:, 2] for z in (-3.0, -5.0))
+    a, b = pose[:, 3] + near[:, None] * d, pose[:, 3] + far[:, None] * d
+    gray = np.where(is_near_wall(a), texture(a[:, 0], a[:, 1], 1), texture(b[:, 0], b[:, 1], 2))
+    return gray.reshape(HEIGHT, WIDTH)
+
+
+def scene_of(folder, poses, lens=(0.0, 0.0, 0.0, 0.0), fisheye=False, contrast=1.0):
+    folder.mkdir(exist_ok=True)
+    files = []
+    for i, pose in enumerate(poses):
+        files.append(folder / f"view{i}.png")
+        gray = 0.5 + contrast * (picture(pose, lens, fisheye) - 0.5)
+        Image.fromarray((gray * 255).round().astype(np.uint8)).save(files[-1])
+    count = len(poses)
+    return PosedImages(
+        files=tuple(files),
+        camera_to_worlds=np.stack(poses),
+        intrinsics=np.tile([FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2], (count, 1)),
+        sizes=np.tile([float(WIDTH), HEIGHT], (count, 1)),
+        distortion=np.tile(lens, (count, 1)),
+        fisheye=fisheye,
+    )
+
+
+POSES = [pose_at(0.12 * i, 0.02 * i) for i in range(5)]
+
+
+@pytest.fixture(scope="module")
+def images(tmp_path_factory):
+    return scene_of(tmp_path_factory.mktemp("walls"), POSES, LENS)
+
+
+@pytest.fixture(scope="module")
+def model(images):
+    return triangulate(images)
+
+
+def depth_error(points):
+    """How far points lie from the nearer of the two walls, relative to its depth."""
+    return np.minimum(np.abs(points[:, 2] + 3) / 3, np.abs(points[:, 2] + 5) / 5)
+
+
+def test_points_lie_on_the_walls(model):
+    assert len(model.points) > 100
+    assert np.median(depth_error(model.points)) < 0.005
+    assert np.quantile(depth_error(model.points), 0.95) < 0.05
+    near = np.abs(model.points[:, 2] + 3) < 0.3
+    assert 0.1 < near.mean() < 0.9
+    assert is_near_wall(model.points[near]).mean() > 0.97
+
+
+def test_ignoring_the_lens_would_misplace_the_points(images, model):
+    pinhole = triangulate(replace(images, distortion=np.zeros_like(images.distortion)))
+    assert np.median(depth_error(model.points)) < 0.5 * np.median(depth_error(pinhole.points))
+
+
+def test_a_fisheye_lens_is_taken_for_what_it_is(tmp_path):
+    images = scene_of(tmp_path, POSES, (0.08, -0.03, 0.02, 0.01), fisheye=True)
+    points = triangulate(images).points
+    assert len(points) > 100 and np.median(depth_error(points)) < 0.005
+    others = triangulate(replace(images, fisheye=False)).points
+    assert not len(others) or np.median(depth_error(others)) > 0.01
+
+
+def test_faint_images_are_searched_more_thoroughly_and_others_are_not(tmp_path, images, monkeypatch):
+    efforts, attempt = [], triangulation._attempt
+
+    def spy(pycolmap, images, effort):
+        efforts.append(effort)
+        return attempt(pycolmap, images, effort)
+
+    match, guided = pycolmap.match_image_pairs, []
+
+    def spy_match(*args, matching_options, **options):
+        guided.append(matching_options.guided_matching)
+        return match(*args, matching_options=matching_options, **options)
+
+    monkeypatch.setattr(triangulation, "_attempt", spy)
+    monkeypatch.setattr(pycolmap, "match_image_pairs", spy_match)
+    faint = scene_of(tmp_path, POSES[:4], contrast=0.12)
+    points = triangulate(faint).points
+    assert efforts == list(EFFORTS) and guided == [False, True] and np.median(depth_error(points)) < 0.02
+    monkeypatch.setattr(triangulation, "EFFORTS", EFFORTS[:1])
+    assert len(triangulate(faint).points) < 0.5 * len(points)
+    monkeypatch.setattr(triangulation, "EFFORTS", (EFFORTS[1], EFFORTS[0]))
+    efforts.clear()
+    triangulate(images)
+    assert efforts == [EFFORTS[1]]
+
+
+def test_keypoints_are_where_the_points_project(images, model):
+    cameras, points, relative = model.keypoints_of([str(i) for i in range(len(POSES))])
+    assert len(cameras) >= 3 * len(model.points)
+    poses = images.camera_to_worlds[cameras]
+    local = np.einsum("qji,qj->qi", poses[:, :, :3], model.points[points] - poses[:, :, 3])
+    x, y = local[:, 0] / -local[:, 2], local[:, 1] / local[:, 2]
+    k1, k2, p1, p2 = LENS
+    r2 = x * x + y * y
+    radial = 1 + k1 * r2 + k2 * r2 * r2
+    u = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    v = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+    pixels = np.stack([u * FOCAL + WIDTH / 2, v * FOCAL + HEIGHT / 2], -1)
+    error = np.linalg.norm(pixels - relative * [WIDTH, HEIGHT], axis=-1)
+    assert np.median(error) < 0.5 and error.max() < 6
+
+
+def test_equal_images_give_equal_tracks(images, model):
+    again = triangulate(images)
+    assert np.array_equal(model.points, again.points) and model.names == again.names
+    for (p, xy), (q, uv) in zip(model.keypoints, again.keypoints, strict=True):
+        assert np.array_equal(p, q) and np.array_equal(xy, uv)
+
+
+def test_files_of_one_name_in_several_folders_stay_apart(tmp_path, model):
+    moved = scene_of(tmp_path, POSES, LENS)
+    files = []
+    for i, file in enumerate(moved.files):
+        (tmp_path / str(i)).mkdir()
+        files.append(file.rename(tmp_path / str(i) / "same.png"))
+    found = triangulate(replace(moved, files=tuple(files)))
+    assert np.array_equal(found.points, model.points)
+
+
+def test_one_image_gives_no_tracks(images):
+    rows = {f: getattr(images, f)[:1] for f in ("files", "camera_to_worlds", "intrinsics", "sizes", "distortion")}
+    assert len(triangulate(PosedImages(**rows)).points) == 0
+
+
+def test_images_that_show_nothing_in_common_give_no_tracks(tmp_path):
+    images = scene_of(tmp_path, POSES[:3])
+    for seed, file in enumerate(images.files):
+        gray = np.random.default_rng(seed).integers(0, 256, (HEIGHT // 4, WIDTH // 4), dtype=np.uint8)
+        Image.fromarray(gray).resize((WIDTH, HEIGHT), Image.Resampling.BICUBIC).save(file)
+    assert len(triangulate(images).points) == 0
+
+
+def test_two_images_that_agree_are_enough(images):
+    two = {f: getattr(images, f)[:2] for f in ("files", "camera_to_worlds", "intrinsics", "sizes", "distortion")}
+    points = triangulate(PosedImages(**two)).points
+    assert len(points) > 30 and np.median(depth_error(points)) < 0.02
+
+
+def test_rays_half_a_degree_apart_are_enough_and_less_is_not(tmp_path):
+    """The near wall is three away, the far one five: angles of 1.1 and 0.7 degrees, or of 0.4 and 0.2."""
+    for step, least, most in ((0.06, 30, 1000), (0.02, 0, 0)):
+        found = triangulate(scene_of(tmp_path / str(step), [pose_at(0.0), pose_at(step)])).points
+        assert least <= len(found) <= most
+
+
+def test_an_unreadable_image_is_named(tmp_path):
+    images = scene_of(tmp_path, POSES[:2])
+    images.files[1].write_text("not an image")
+    with pytest.raises(ValueError, match=r"view1\.png cannot be read"):
+        triangulate(images)
+
+
+def test_pairs_are_near_and_look_the_same_way():
+    def posed(poses):
+        many = len(poses)
+        return PosedImages((), np.stack(poses), np.ones((many, 4)), np.ones((many, 2)), np.zeros((many, 4)))
+
+    track = posed([pose_at(float(i)) for i in range(60)])
+    assert all(abs(i - j) <= NEIGHBOURS for i, j in track.pairs())
+    assert all((i, i + 1) in track.pairs() for i in range(59))
+    around = posed([pose_at(0.0, np.radians(45.0 * i)) for i in range(8)])
+    assert around.pairs() == sorted({(min(i, (i + 1) % 8), max(i, (i + 1) % 8)) for i in range(8)})

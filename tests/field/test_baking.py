@@ -1,0 +1,149 @@
+"""Shares baked at texels: against the oracle, on every path, and where they must equal blending itself."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import oracle
+import pytest
+import torch
+from hand_made import make_mpi
+from random_fields import _places, _table, bundle, fill, random_field, random_rays
+
+from mmpi_ns.field.baking import bake_shares, rays_to, shares_at
+from mmpi_ns.field.mmpi_field import MMPIField
+from mmpi_ns.ops import native
+from mmpi_ns.rendering import sampler as mmpi_sampler
+from mmpi_ns.rendering.sampler import MMPISampler
+from mmpi_ns.scene.plan import CubePlan, ScenePlan
+from mmpi_ns.scene.texels import BRICK
+
+
+def oracle_share(field, k, z, y, x):
+    """P of one texel in float64, and how close a decision was."""
+    grid, plan = field.grids[k], field.plan
+    ndc = np.array([2 * i / (n - 1) - 1 for i, n in zip((x, y, z), (grid.width, grid.height, grid.depth), strict=True)])
+    if k < len(plan.mpis):
+        point, far = oracle.ndc_to_world(plan.mpis[k], ndc)
+        places = _places(plan, np.zeros(3), point, 0.0 if far else 1.0)
+    else:
+        lower, upper = np.array(plan.cube.lower), np.array(plan.cube.upper)
+        places = _places(plan, np.zeros(3), lower + (ndc + 1) / 2 * (upper - lower), 1.0)
+    votes, cover, margin = np.zeros(len(places)), np.zeros(len(places), bool), math.inf
+    for j, place in enumerate(places):
+        if j == k:
+            place, cover[j] = ndc, True
+        elif place is None:
+            continue
+        else:
+            margin = min(margin, float(np.abs(np.abs(place) - 1).min()))
+            touched = _table(field, field.touched, j)[..., 0]
+            at = [(c + 1) / 2 * (n - 1) for c, n in zip(place[::-1], touched.shape, strict=True)]
+            margin = min([margin, *(abs(a % 1 - 0.5) for a in at)])
+            nearest = tuple(min(max(round(a), 0), n - 1) for a, n in zip(at, touched.shape, strict=True))
+            cover[j] = bool((np.abs(place) <= 1).all()) and bool(touched[nearest])
+        votes[j] = oracle.trilinear(_table(field, field.reliability, j), np.clip(place, -1, 1))[0]
+    return math.exp(oracle.log_shares(votes, cover, k)[0]), margin
+
+
+@pytest.mark.parametrize("with_cube", [False, True])
+def test_every_texel_has_the_share_that_the_oracle_has(with_cube):
+    field, rng = random_field(3, with_cube, seed=7, planes=9), np.random.default_rng(0)
+    field.touched.copy_(torch.tensor(rng.uniform(size=len(field.touched)) < 0.8))
+    shares, checked, seen = bake_shares(field), 0, set()
+    for _ in range(300):
+        k = int(rng.integers(len(field.grids)))
+        grid = field.grids[k]
+        z, y, x = (int(rng.integers(n)) for n in (grid.depth, grid.height, grid.width))
+        wanted, margin = oracle_share(field, k, z, y, x)
+        if margin < 1e-5:
+            continue
+        row = int(grid.row(*(torch.tensor([i]) for i in (z, y, x))))
+        assert float(shares[row]) == pytest.approx(wanted, abs=2e-5), (k, z, y, x)
+        checked, seen = checked + 1, seen | {round(wanted, 3)}
+    assert checked > 200 and len(seen) > 30
+    assert (shares[:BRICK] == 1).all(), "nothing is stored there"
+
+
+def test_rays_to_texels_lose_nothing_far_from_the_worlds_origin():
+    far = (3e6, -2e6, 1e6)
+    plan = ScenePlan((make_mpi(origin=far), make_mpi("twin", origin=(far[0] + 0.5, far[1], far[2]))), None, 0.05, 1.0)
+    near = ScenePlan((make_mpi(), make_mpi("twin", origin=(0.5, 0.0, 0.0))), None, 0.05, 1.0)
+    there, here = (bake_shares(fill(MMPIField(p, feature_channels=5, hidden_width=6), 3)) for p in (plan, near))
+    assert torch.allclose(there, here, atol=1e-5) and here.std() > 0.1
+
+
+def rendered(field, rays, form, shares, threshold=0.0):
+    samples, report = MMPISampler()(rays, field=field, threshold=threshold, blend_form=form, shares=shares)
+    return samples.metadata, report
+
+
+@pytest.mark.parametrize("form", ["paper", "opacity"])
+@pytest.mark.parametrize(("num_mpis", "with_cube"), [(1, False), (3, True)])
+def test_the_compiled_march_blends_like_the_reference(monkeypatch, form, num_mpis, with_cube):
+    monkeypatch.setattr(mmpi_sampler, "OPAQUE_DEPTH", math.inf)
+    field = random_field(num_mpis, with_cube, seed=4, planes=20, log_depths=(-5, 1.5))
+    rays = bundle(*random_rays(field.plan, 150, seed=2))
+    shares = torch.rand(len(field.density), 1, generator=torch.Generator().manual_seed(1)) * 1.4 - 0.2  # clamped
+    monkeypatch.setattr(native, "_chosen", "native")
+    fast, fast_report = rendered(field, rays, form, shares)
+    monkeypatch.setattr(native, "_chosen", "torch")
+    plain, plain_report = rendered(field, rays, form, shares)
+    same = (fast["valid"].sum(1) == plain["valid"].sum(1))[:, 0]
+    assert same.float().mean() > 0.95
+    a, b = (m["tau"][same][m["valid"][same]].double() for m in (fast, plain))
+    assert ((a - b).abs() <= 2e-4 * b + 1e-6).float().mean() > 0.999
+    assert (a > 2).any() and ((b > 0) & (b < 1e-4)).any()
+    assert torch.allclose(fast_report.skipped_total[same], plain_report.skipped_total[same], atol=1e-4)
+
+
+def test_samples_are_blended_by_the_interpolated_share():
+    field = random_field(2, True, seed=5)
+    shares, rng = bake_shares(field), np.random.default_rng(3)
+    for k, grid in enumerate(field.grids):
+        ndc = rng.uniform(-1, 1, size=(20, 3))
+        found = shares_at(field, shares, torch.tensor(ndc, dtype=torch.float32), torch.full((20,), k))
+        wanted = [oracle.trilinear(_table(field, shares, k), place)[0] for place in ndc]
+        assert np.allclose(found.numpy(), wanted, atol=1e-5)
+        assert grid.depth > 1
+
+
+def test_blending_that_is_the_same_everywhere_loses_nothing_by_baking():
+    """Two equal frusta that believe in nothing more than in each other: P is 1/2 at every place."""
+    field = fill(MMPIField(ScenePlan((make_mpi(), make_mpi("twin")), None, 0.05, 1.0), feature_channels=5), 1)
+    field.reliability.data.fill_(0.7)
+    rays = bundle(*random_rays(field.plan, 60, seed=3))
+    shares = field.baked_shares()
+    for grid in field.grids:
+        assert torch.allclose(shares[grid.rows], torch.tensor(0.5), atol=1e-6)
+    exact, baked = (rendered(field, rays, "paper", s)[0] for s in (None, shares))
+    assert torch.allclose(exact["tau"], baked["tau"], rtol=1e-4, atol=1e-6) and exact["tau"].max() > 0.5
+
+
+def test_a_single_head_keeps_its_optical_depths():
+    field = random_field(1, seed=2)
+    rays = bundle(*random_rays(field.plan, 40, seed=3))
+    exact, baked = (rendered(field, rays, form, s)[0] for form, s in ((None, None), ("paper", field.baked_shares())))
+    assert torch.equal(exact["tau"] > 1e-4, baked["tau"] > 1e-4)
+    assert torch.allclose(exact["tau"], baked["tau"], rtol=1e-5)
+
+
+def test_shares_are_kept_until_they_are_forgotten():
+    field = random_field(2, seed=2)
+    first = field.baked_shares()
+    field.reliability.data.normal_(generator=torch.Generator().manual_seed(5))
+    assert field.baked_shares() is first
+    field.forget_shares()
+    assert not torch.equal(field.baked_shares(), first)
+
+
+def test_a_texel_on_the_border_of_the_cube_and_one_at_infinity_have_rays():
+    field = fill(
+        MMPIField(ScenePlan((make_mpi(),), CubePlan((-1.0, -1.0, 2.0), (1.0, 1.0, 4.0), (4, 4, 4)), 0.05, 1.0)), 1
+    )
+    corner = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
+    origins, directions, inverse_t = rays_to(field, 1, corner)
+    assert torch.equal(origins + directions / inverse_t[:, None], torch.tensor([[-1.0, -1.0, 2.0], [1.0, 1.0, 4.0]]))
+    assert rays_to(field, 0, corner)[2].tolist() == [1.0, 0.0]
+    assert torch.isfinite(bake_shares(field)).all()

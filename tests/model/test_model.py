@@ -1,0 +1,373 @@
+"""The model on the tiny scene: what every phase trains, and what comes out when it renders."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+import torchmetrics.image.lpip
+from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.data.scene_box import OrientedBox
+from nerfstudio.model_components import renderers
+from tiny_scene import HEIGHT, WIDTH, write_scene
+from training_runs import plan_of, ready, trainer_config, write_plan
+
+from mmpi_ns import model as mmpi_model
+from mmpi_ns.config import mmpi_small
+from mmpi_ns.training.phases import TRAINS
+
+KINDS = ("density", "features", "colour", "reliability")
+
+
+def trainer_of(scene, plan_file, folder, **settings):
+    return ready(trainer_config(scene, plan_file, folder, **settings))
+
+
+def run_step(trainer, step):
+    """Losses of one step, before the optimisers act."""
+    trainer.pipeline.model.prepare_step(None, step)
+    trainer.pipeline.train()
+    outputs, losses, metrics = trainer.pipeline.get_train_loss_dict(step)
+    return outputs["training"], losses, metrics
+
+
+@pytest.fixture(scope="module")
+def trained(scene, plan_file, tmp_path_factory):
+    """A trainer after a whole short run with all phases."""
+    trainer = trainer_of(scene, plan_file, tmp_path_factory.mktemp("trained"), steps=60)
+    trainer.train()
+    return trainer
+
+
+@pytest.fixture
+def model(trained):
+    trained.pipeline.eval()
+    yield trained.pipeline.model
+    trained.pipeline.model.show.value = "all"
+
+
+@pytest.fixture
+def camera(trained):
+    return trained.pipeline.datamanager.eval_dataset.cameras[0:1]
+
+
+# Training ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("settings", [{"rays_per_mpi": "split"}, {"rays_per_mpi": "all"}, {"training": "joint"},
+                                      {"shared_colour": True}, {"blend_form": "opacity"}])  # fmt: skip
+def test_every_phase_has_finite_losses_and_trains_what_it_says(scene, plan_file, tmp_path, settings):
+    trainer = trainer_of(scene, plan_file, tmp_path, steps=24, **settings)
+    schedule = trainer.pipeline.model.schedule
+    names = [p.name for p in schedule.phases]
+    assert names == (["joint"] if "training" in settings else ["individual", "blend", "finetune"])
+    for phase in schedule.phases:
+        _, losses, metrics = run_step(trainer, phase.start)
+        assert {"rgb_loss", "point_color", "entropy", "distortion", "keypoint_depth"} <= set(losses)
+        assert all(torch.isfinite(v) and v.ndim == 0 for v in losses.values())
+        assert metrics["live_samples"] > 8 and 0 < metrics["kept_samples"] <= metrics["live_samples"]
+        groups = trainer.pipeline.model.get_param_groups()
+        assert {k for k in KINDS if groups[k][0].requires_grad} == TRAINS[phase.name] & set(KINDS)
+        trainer.optimizers.zero_grad_all()
+        sum(losses.values()).backward()
+        with_gradient = {k for k in KINDS if groups[k][0].grad is not None}
+        assert with_gradient == TRAINS[phase.name] & set(KINDS)
+        for k in with_gradient:
+            grad = groups[k][0].grad
+            assert torch.isfinite(grad.coalesce().values() if grad.is_sparse else grad).all()
+
+
+def test_total_variation_is_added_every_few_steps_while_densities_train(scene, plan_file, tmp_path):
+    trainer = trainer_of(scene, plan_file, tmp_path)
+    every = trainer.config.pipeline.model.loss.tv_every
+    blend = trainer.pipeline.model.schedule.phases[1].start
+    assert [("tv" in run_step(trainer, s)[1]) for s in (0, 1, every)] == [True, every == 1, True]
+    assert "tv" not in run_step(trainer, -(-blend // every) * every)[1]
+
+
+def test_in_the_individual_phase_a_ray_goes_to_one_mpi_and_the_cube(scene, plan_file, tmp_path):
+    trainer = trainer_of(scene, plan_file, tmp_path, train_threshold=0.0)
+
+    def heads_of_rays(step):
+        meta = run_step(trainer, step)[0].samples.metadata
+        return [tuple(sorted(set(h[v].tolist()) - {2})) for h, v in zip(meta["heads"], meta["valid"], strict=True)]
+
+    found = heads_of_rays(0)
+    assert len(found) == 80 and set(found) == {(0,), (1,)}
+    assert 20 < found.count((0,)) < 60 and found == heads_of_rays(0) and found != heads_of_rays(1)
+    blend = trainer.pipeline.model.schedule.phases[1].start
+    assert set(heads_of_rays(blend)) == {(0, 1)}
+
+
+def test_with_rays_per_mpi_all_every_mpi_renders_every_ray_alone_with_the_cube(scene, tmp_path):
+    plan = write_plan(scene, tmp_path / "plan.json", num_mpis=3, with_cube=True)
+    trainer = trainer_of(scene, plan, tmp_path, rays_per_mpi="all", train_threshold=0.0)
+    rays, losses, _ = run_step(trainer, 0)
+    heads, valid = rays.samples.metadata["heads"], rays.samples.metadata["valid"]
+    assert len(rays.bundle) == 3 * 80
+    for k in range(3):
+        part = slice(80 * k, 80 * (k + 1))
+        assert set(heads[part][valid[part]].tolist()) == {k, 3}
+    assert torch.equal(rays.bundle.origins[:80], rays.bundle.origins[160:])
+    assert all(torch.isfinite(v) for v in losses.values())
+
+
+def test_three_equal_mpis_that_render_all_rays_have_the_losses_of_one(scene, tmp_path, trained):
+    one = plan_of(trained.pipeline.datamanager.observations, num_mpis=1)
+    losses = []
+    for count in (1, 3):
+        mpis = tuple(one.mpis[0].__class__(**{**vars(one.mpis[0]), "name": f"mpi{k}"}) for k in range(count))
+        path = tmp_path / f"{count}.json"
+        path.write_text(one.__class__(mpis, None, one.ray_near, one.content_near).to_json())
+        losses.append(run_step(trainer_of(scene, path, tmp_path / str(count), rays_per_mpi="all"), 0)[1])
+    for name in ("rgb_loss", "point_color", "distortion", "keypoint_depth"):
+        assert losses[1][name].item() == pytest.approx(losses[0][name].item(), rel=1e-2), name
+
+
+def test_one_mpi_has_nothing_to_blend_with_and_trains_in_one_go(scene, tmp_path):
+    plan = write_plan(scene, tmp_path / "plan.json", num_mpis=1)
+    trainer = trainer_of(scene, plan, tmp_path, training="two-phase")
+    model = trainer.pipeline.model
+    assert [p.name for p in model.schedule.phases] == ["joint"]
+    assert model.field.depth_scale == 1
+    for step in (0, 12, 23):
+        _, losses, _ = run_step(trainer, step)
+        assert all(torch.isfinite(v) for v in losses.values())
+
+
+@pytest.mark.parametrize("training", ["two-phase", "joint"])
+def test_the_cube_learns_from_the_first_step_at_the_default_settings(scene, plan_file, tmp_path, training):
+    config = mmpi_small.config.pipeline.model
+    trainer = trainer_of(
+        scene, plan_file, tmp_path, training=training,
+        cube_alpha=config.cube_alpha, train_threshold=config.train_threshold,
+    )  # fmt: skip
+    rays, losses, _ = run_step(trainer, 0)
+    live = rays.report.live.sum() - (rays.samples.metadata["heads"][rays.samples.metadata["valid"]] < 2).sum()
+    kept = (rays.samples.metadata["heads"][rays.samples.metadata["valid"]] == 2).sum()
+    assert live > 100 and kept > 0.5 * live
+    sum(losses.values()).backward()
+    field = trainer.pipeline.model.field
+    assert field.density.grad.to_dense()[field.grids[-1].rows].abs().sum() > 0
+
+
+def test_transparent_pixels_are_trained_and_measured_over_a_background(tmp_path):
+    data = write_scene(tmp_path / "alpha", alpha=True)
+    plan = write_plan(data, tmp_path / "plan.json")
+    trainer = trainer_of(data, plan, tmp_path, steps=4, background="white")
+    trainer.train()
+    trainer.pipeline.eval()
+    model = trainer.pipeline.model
+    camera, batch = trainer.pipeline.datamanager.next_eval_image(0)
+    assert batch["image"].shape[-1] == 4
+    _, images = model.get_image_metrics_and_images(model.get_outputs_for_camera(camera), batch)
+    observed = images["img"][:, :WIDTH]
+    assert (observed[: HEIGHT // 4] == 1).all() and observed[HEIGHT // 4 :].mean() < 0.9
+
+
+def test_training_lowers_the_error(trained, model):
+    camera, batch = trained.pipeline.datamanager.next_eval_image(0)
+    outputs = model.get_outputs_for_camera(camera)
+    error = ((outputs["rgb"] - batch["image"][..., :3]) ** 2).mean()
+    assert error < 0.7 * batch["image"].var(), "no better than one colour for all"
+
+
+def test_an_evaluation_batch_during_training_has_a_loss(trained):
+    _, losses, metrics = trained.pipeline.get_eval_loss_dict(step=3)
+    assert set(losses) == {"rgb_loss"} and torch.isfinite(losses["rgb_loss"]) and metrics["psnr"] > 5
+
+
+# Rendering -----------------------------------------------------------------------------------------------------------
+
+
+def test_outputs_are_one_row_a_ray(model, camera):
+    rays = camera.generate_rays(0, keep_shape=False)
+    outputs = model(rays)
+    shapes = {name: tuple(value.shape) for name, value in outputs.items()}
+    count = WIDTH * HEIGHT
+    assert shapes == {"rgb": (count, 3)} | {
+        name: (count, 1) for name in ("accumulation", "depth", "winning_mpi", "dropped_mass")
+    }
+    assert all(torch.isfinite(v).all() for v in outputs.values())
+    assert 0 <= outputs["rgb"].min() and outputs["rgb"].max() <= 1 and outputs["accumulation"].max() <= 1
+    assert outputs["dropped_mass"].max() < 0.3 and (outputs["depth"] > 0).all()
+
+
+@pytest.mark.parametrize("threshold", [0.0, 1e-3])
+def test_pictures_do_not_depend_on_the_chunk_size(model, camera, monkeypatch, threshold):
+    monkeypatch.setattr(model.config, "render_threshold", threshold)
+    found = []
+    for size in (WIDTH * HEIGHT, 100, 17):
+        monkeypatch.setattr(model.config, "eval_num_rays_per_chunk", size)
+        found.append(model.get_outputs_for_camera(camera))
+    for other in found[1:]:
+        for name in ("rgb", "accumulation", "dropped_mass"):
+            assert torch.allclose(found[0][name], other[name], atol=1e-5), name
+        # Half of the mass may be reached a plane earlier where rounding decides.
+        assert ((found[0]["depth"] - other["depth"]).abs() < 1e-3 * other["depth"]).float().mean() > 0.995
+        assert (found[0]["winning_mpi"] == other["winning_mpi"]).float().mean() > 0.995
+
+
+def test_as_many_rays_at_once_as_suit_the_device_unless_a_number_is_asked_for(model, camera, monkeypatch):
+    sizes = []
+    monkeypatch.setattr(mmpi_model, "rays_at_once", lambda samples, device: 100)
+    monkeypatch.setattr(
+        model, "get_outputs", lambda bundle, get=model.get_outputs: sizes.append(len(bundle)) or get(bundle)
+    )
+    for asked, expected in ((0, 100), (17, 17)):
+        sizes.clear()
+        monkeypatch.setattr(model.config, "eval_num_rays_per_chunk", asked)
+        model.get_outputs_for_camera(camera)
+        assert max(sizes) == expected and sum(sizes) == WIDTH * HEIGHT
+        assert model.config.eval_num_rays_per_chunk == asked
+
+
+def test_baked_shares_render_nearly_the_same_and_are_made_anew_after_a_step(model, camera, monkeypatch):
+    exact = model.get_outputs_for_camera(camera)["rgb"]
+    monkeypatch.setattr(model.config, "render_shares", "baked")
+    baked = model.get_outputs_for_camera(camera)["rgb"]
+    shares = model.field.baked_shares()
+    difference = (exact - baked).abs()
+    assert 0 < difference.max() and difference.mean() < 0.01
+    changed = model.field.reliability.data + torch.linspace(-4, 4, len(shares))[:, None]
+    monkeypatch.setattr(model.field.reliability, "data", changed)
+    model.get_outputs_for_camera(camera)
+    assert model.field.baked_shares() is shares
+    model.prepare_step(None, model.step)
+    assert not torch.equal(model.field.baked_shares(), shares)
+
+
+def test_depth_is_the_distance_along_the_ray_and_finite_at_infinity(model, camera):
+    outputs = model.get_outputs_for_camera(camera)
+    plan = model.field.plan
+    farthest = 10 * max(m.near * (m.planes - 1) for m in plan.mpis)
+    assert outputs["depth"].max() <= farthest * 1.001 and outputs["depth"].min() >= plan.ray_near
+
+
+@pytest.mark.parametrize(("near", "far"), [(0.5, 3.0), (3.0, 5.0), (4.0, math.inf)])
+def test_nears_and_fars_that_are_preset_cut_the_scene(model, camera, near, far):
+    rays = camera.generate_rays(0, keep_shape=False)
+    whole = model(rays)
+    rays.nears, rays.fars = torch.full_like(rays.pixel_area, near), torch.full_like(rays.pixel_area, far)
+    cut = model(rays)
+    kept = cut["accumulation"] > 1e-3
+    assert (cut["depth"][kept] >= near - 1e-3).all() and (cut["depth"][kept] <= far + 1e-3).all()
+    assert (cut["accumulation"] <= whole["accumulation"] + 1e-4).all()
+    assert (cut["rgb"] - whole["rgb"]).abs().max() > 0.01
+
+
+def test_a_crop_shows_the_background_around_a_box(model, camera):
+    outputs = model.get_outputs_for_camera(camera)
+    middle = camera.camera_to_worlds[0, :, 3] - 4 * camera.camera_to_worlds[0, :, 2]
+    box = OrientedBox.from_params(tuple(middle.tolist()), (0.0, 0.0, 0.0), (1.5, 3.0, 1.5))
+    cropped = model.get_outputs_for_camera(camera, obb_box=box)
+    rays = camera.generate_rays(0, keep_shape=True, obb_box=box)
+    misses = rays.nears[..., 0] >= 1e10
+    assert 0.1 < misses.float().mean() < 0.95
+    assert (cropped["accumulation"][misses] == 0).all() and (cropped["rgb"][misses] == 0.5).all()
+    assert cropped["accumulation"][~misses].max() > 0.05 and torch.isfinite(cropped["depth"]).all()
+    assert (cropped["accumulation"] <= outputs["accumulation"] + 1e-4).all()
+
+
+def test_a_colour_asked_for_by_the_viewer_or_a_crop_is_the_background(model, camera):
+    rays = camera.generate_rays(0, keep_shape=False)
+    rays.nears = rays.fars = torch.full_like(rays.pixel_area, 1e10)
+    assert (model(rays)["rgb"] == 0.5).all()
+    with renderers.background_color_override_context(torch.tensor([1.0, 0.0, 0.25])):
+        assert torch.equal(model(rays)["rgb"], torch.tensor([[1.0, 0.0, 0.25]]).expand(len(rays), 3))
+
+
+def test_a_picture_with_transparency_can_be_asked_for(model, camera):
+    outputs = model.get_outputs_for_camera(camera)
+    rgba = model.get_rgba_image(outputs)
+    assert rgba.shape == (HEIGHT, WIDTH, 4) and torch.equal(rgba[..., 3:], outputs["accumulation"])
+    over_gray = rgba[..., :3] * rgba[..., 3:] + 0.5 * (1 - rgba[..., 3:])
+    assert torch.allclose(over_gray, outputs["rgb"], atol=1e-4)
+
+
+def test_a_bare_ray_bundle_is_rendered(model):
+    """As ns-render's nearest camera passes it: no metadata, one ray, finite far."""
+    one = torch.ones(1, 1)
+    rays = RayBundle(
+        origins=torch.zeros(1, 3), directions=torch.tensor([[0.0, 1.0, 0.0]]), pixel_area=one,
+        nears=0.05 * one, fars=100 * one, camera_indices=one.long(), metadata={},
+    )  # fmt: skip
+    outputs = model.get_outputs(rays)
+    assert outputs["depth"].shape == (1, 1) and torch.isfinite(outputs["rgb"]).all()
+
+
+def test_the_viewer_can_show_one_mpi_alone(model, camera):
+    everything = model.get_outputs_for_camera(camera)
+    assert list(model.show.options) == ["all", "mpi0", "mpi1", "cube"]
+    pictures = [everything["rgb"]]
+    for i, name in enumerate(model.field.plan.names):
+        model.show.value = name
+        alone = model.get_outputs_for_camera(camera)
+        assert (alone["winning_mpi"][alone["accumulation"] > 1e-6] == i).all()
+        assert alone["accumulation"].max() > 0.01
+        assert all((alone["rgb"] - p).abs().max() > 0.01 for p in pictures)
+        pictures.append(alone["rgb"])
+    model.show.value = "all"
+    assert torch.equal(model.get_outputs_for_camera(camera)["rgb"], everything["rgb"])
+
+
+def test_the_winning_mpi_is_the_one_that_gives_most_of_the_light(model, camera):
+    with torch.no_grad():
+        for k in range(2):
+            rows = [model.field.grids[j].rows for j in range(3)]
+            before = model.field.reliability.data.clone()
+            model.field.reliability.data[rows[k]] = 30.0
+            for other in {0, 1, 2} - {k}:
+                model.field.reliability.data[rows[other]] = -30.0
+            outputs = model.get_outputs_for_camera(camera)
+            model.field.reliability.data.copy_(before)
+            assert (outputs["winning_mpi"] == k).float().mean() > 0.9
+
+
+# Metrics -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("error", [OSError("no route"), RuntimeError("broken file"), ModuleNotFoundError("lpips")])
+def test_lpips_is_left_out_with_a_message_where_its_weights_cannot_be_had(trained, model, monkeypatch, capsys, error):
+    calls = []
+
+    def refuse(*args, **kwargs):
+        calls.append(kwargs)
+        raise error
+
+    monkeypatch.setattr(torchmetrics.image.lpip, "LearnedPerceptualImagePatchSimilarity", refuse)
+    monkeypatch.setattr(model.metrics, "_lpips_tried", False)
+    monkeypatch.setattr(model.metrics, "_lpips", None)
+    camera, batch = trained.pipeline.datamanager.next_eval_image(0)
+    outputs = model.get_outputs_for_camera(camera)
+    for _ in range(2):
+        values, images = model.get_image_metrics_and_images(outputs, batch)
+        assert set(values) == {"psnr", "ssim", "dropped_mass"}
+        assert all(isinstance(v, float) and np.isfinite(v) for v in values.values())
+    assert len(calls) == 1, "one attempt is enough"
+    assert "LPIPS is left out" in " ".join(capsys.readouterr().out.split())
+    assert set(images) == {"img", "accumulation", "inverse_depth", "winning_mpi"}
+    for name, image in images.items():
+        assert image.shape == (HEIGHT, WIDTH * (2 if name == "img" else 1), 3), name
+        assert image.min() >= 0 and image.max() <= 1
+
+
+# A checkpoint's own plan ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("training", ["joint", "two-phase"])
+def test_a_checkpoint_renders_the_same_in_a_model_that_was_placed_otherwise(
+    scene, plan_file, tmp_path, camera, training
+):
+    """As in evaluation without the images: placement finds less there, so K differs until the checkpoint is read."""
+    trained = trainer_of(scene, plan_file, tmp_path, steps=8, training=training).pipeline.model.eval()
+    other = write_plan(scene, tmp_path / "other.json", num_mpis=1, planes=20)
+    read = trainer_of(scene, other, tmp_path, steps=8, training=training).pipeline.model.eval()
+    read.load_state_dict(trained.state_dict())
+    for name in ("rgb", "accumulation", "depth"):
+        expected, found = (m.get_outputs_for_camera(camera)[name] for m in (trained, read))
+        assert torch.equal(expected, found), name
+    assert read.show.options == ["all", *trained.field.full_plan.names]
+    assert read.blends == trained.blends

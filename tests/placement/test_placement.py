@@ -1,0 +1,195 @@
+"""Placement: expected pixel errors, the choice of MPIs, and the plane sweep."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from reprojection import median_reprojection_error
+
+from mmpi_ns.placement.errors import mpi_errors, pixel_errors
+from mmpi_ns.placement.observations import Observations
+from mmpi_ns.placement.rule import PlacementConfig, place
+from mmpi_ns.placement.sweep import add_swept_points
+from mmpi_ns.scene.plan import MPIPlan, ScenePlan
+
+FOCAL, WIDTH, HEIGHT = 180.0, 310.0, 94.0
+OPENGL = np.diag([1.0, -1.0, -1.0])  # camera axes of a camera that looks along +z with y down
+
+
+def cameras(centers: np.ndarray, axes: np.ndarray = OPENGL) -> np.ndarray:
+    return np.stack([np.concatenate([axes, c[:, None]], 1) for c in centers])
+
+
+def observed(centers: np.ndarray, points: np.ndarray, axes: np.ndarray = OPENGL) -> Observations:
+    """Cameras that see every point in front of them that falls into their image."""
+    poses = cameras(centers, axes)
+    seen_by, seen_point, seen_at = [], [], []
+    for i, pose in enumerate(poses):
+        local = (points - pose[:, 3]) @ pose[:, :3]
+        x = WIDTH / 2 - FOCAL * local[:, 0] / local[:, 2]
+        y = HEIGHT / 2 + FOCAL * local[:, 1] / local[:, 2]
+        index = np.nonzero((local[:, 2] < -0.5) & (x > 0) & (x < WIDTH) & (y > 0) & (y < HEIGHT))[0]
+        seen_by.append(np.full(len(index), i))
+        seen_point.append(index)
+        seen_at.append(np.stack([x, y], -1)[index])
+    count = len(centers)
+    return Observations(
+        camera_to_worlds=poses,
+        intrinsics=np.tile([FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2], (count, 1)),
+        sizes=np.tile([WIDTH, HEIGHT], (count, 1)),
+        points=points,
+        seen_by=np.concatenate(seen_by),
+        seen_point=np.concatenate(seen_point),
+        seen_at=np.concatenate(seen_at),
+    )
+
+
+def street(count: int = 21, length: float = 40.0) -> Observations:
+    rng = np.random.default_rng(0)
+    side = rng.choice([-6.0, 6.0], 3000)
+    points = np.stack([side, rng.uniform(-6, 1.6, 3000), rng.uniform(2, length + 80, 3000)], -1)
+    centers = np.stack([np.zeros(count), np.zeros(count), np.linspace(0, length, count)], -1)
+    return observed(centers, points)
+
+
+def front(near: float = 3.0) -> MPIPlan:
+    axes = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    return MPIPlan("front", (0.0, 0.0, 0.0), axes, near, (-1.0, 1.0, -0.4, 0.4), 64, 96, 256)
+
+
+@pytest.mark.parametrize(("b_perp", "b_z"), [(0.0, 5.0), (0.3, 0.0), (0.5, 7.0), (-0.4, -3.0)])
+def test_errors_of_a_parallel_camera_follow_the_documented_formulas(b_perp, b_z):
+    depth, tangent = 20.0, 0.3
+    point = np.array([[tangent * depth, 0.0, depth]])
+    observations = observed(np.array([[b_perp, 0.0, b_z]]), np.array([[0.0, 0.0, 30.0]]))
+    mpi = replace(front(), height=1000)
+    plane, texel = mpi_errors(mpi, observations, np.array([0]), point)
+    step = 1 / (mpi.near * (mpi.planes - 1))
+    stretch = depth / (depth - b_z)
+    assert plane[0] == pytest.approx(0.5 * FOCAL * abs(b_perp - tangent * b_z) * step * stretch**2, rel=1e-9)
+    assert texel[0] == pytest.approx(FOCAL * 2.0 / (mpi.width - 1) * stretch, rel=1e-9)
+
+
+def test_errors_of_a_turned_camera_equal_the_projected_displacement():
+    angle = 0.3
+    turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+    observations = observed(np.array([[0.4, 0.1, 2.0]]), np.array([[0.0, 0.0, 30.0]]), turn @ OPENGL)
+    mpi, point = front(), np.array([2.0, -1.0, 15.0])
+    pose = observations.camera_to_worlds[0]
+
+    def project(w: float) -> np.ndarray:
+        local = (np.array([point[0] / point[2], point[1] / point[2], 1]) / w - pose[:, 3]) @ pose[:, :3]
+        return FOCAL * local[:2] / local[2]
+
+    step, w = 1 / (mpi.near * (mpi.planes - 1)), 1 / point[2]
+    tiny = 1e-4 * step
+    slope = np.linalg.norm(project(w + tiny) - project(w - tiny)) / (2 * tiny)
+    plane, _ = mpi_errors(mpi, observations, np.array([0]), point[None])
+    assert plane[0] == pytest.approx(0.5 * step * slope, rel=1e-5)
+
+
+def test_an_mpi_seen_from_its_own_origin_has_no_plane_error():
+    observations = observed(np.zeros((1, 3)), np.array([[0.0, 0.0, 30.0]]))
+    plane, _ = mpi_errors(front(), observations, np.array([0]), np.array([[1.0, 0.5, 9.0]]))
+    assert plane[0] == pytest.approx(0, abs=1e-9)
+
+
+@pytest.mark.parametrize("point", [[0.0, 0.0, 2.9], [0.0, 0.0, -5.0], [30.0, 0.0, 20.0]])
+def test_a_point_outside_the_frustum_is_unserved(point):
+    observations = observed(np.zeros((1, 3)), np.array([[0.0, 0.0, 30.0]]))
+    plan = ScenePlan((front(),), None, 0.1, 1.0)
+    errors = pixel_errors(plan, observations, np.array([0]), np.array([point]))
+    assert np.isinf(errors.combined).all()
+    assert errors.summary()["unserved"] == 1
+
+
+def test_still_cameras_side_by_side_get_one_mpi():
+    rng = np.random.default_rng(1)
+    points = np.stack([rng.uniform(-8, 8, 2000), rng.uniform(-3, 3, 2000), rng.uniform(10, 40, 2000)], -1)
+    grid = np.array([[x, y, 0.0] for x in (-0.3, 0, 0.3) for y in (-0.2, 0.2)])
+    assert len(place(observed(grid, points), PlacementConfig()).mpis) == 1
+
+
+def test_texels_are_no_finer_than_the_rays_of_a_run_can_train():
+    observations = street()
+    pixels = int(observations.sizes.prod(-1).sum())
+    fine, enough, short = (place(observations, PlacementConfig(), rays) for rays in (None, 10 * pixels, pixels // 10))
+    assert [m.width for m in enough.mpis] == [m.width for m in fine.mpis]
+    tangents = short.mpis[0].extent[1] - short.mpis[0].extent[0]
+    assert tangents * FOCAL / (short.mpis[0].width - 1) == pytest.approx(5.0, rel=0.02)  # (2.5 / 0.1) ** 0.5 pixels
+
+
+def test_every_chosen_mpi_lowers_the_expected_error():
+    observations = street()
+    plan = place(observations, PlacementConfig())
+    points = observations.points[observations.seen_point]
+    whole = np.minimum(pixel_errors(plan, observations, observations.seen_by, points).combined.min(-1), 64).mean()
+    for k in range(len(plan.mpis)):
+        rest = replace(plan, mpis=plan.mpis[:k] + plan.mpis[k + 1 :])
+        left = np.minimum(pixel_errors(rest, observations, observations.seen_by, points).combined.min(-1), 64).mean()
+        assert left > whole
+
+
+def test_points_that_are_not_finite_or_behind_their_camera_are_left_out():
+    observations = street()
+    points = observations.points.copy()
+    points[:100] = np.nan
+    points[100:200, 2] = -50
+    plan = place(replace(observations, points=points), PlacementConfig())
+    assert np.isfinite([m.near for m in plan.mpis]).all()
+
+
+def test_no_point_in_front_of_any_camera_is_an_error():
+    observations = street()
+    with pytest.raises(ValueError, match="in front of the camera"):
+        place(replace(observations, points=-observations.points - 1000), PlacementConfig())
+
+
+def test_without_points_the_cameras_frusta_stand_in():
+    observations = street()
+    empty = np.zeros(0, np.int64)
+    bare = replace(observations, points=np.zeros((0, 3)), seen_by=empty, seen_point=empty, seen_at=np.zeros((0, 2)))
+    plan = place(bare, PlacementConfig())
+    assert plan.mpis and plan.content_near > 0
+
+
+def test_points_project_to_where_they_were_seen_and_behind_the_camera_to_nowhere():
+    observations = street()
+    seen, points = observations.seen_by, observations.points[observations.seen_point]
+    pixels, ahead = observations.project(seen, points)
+    assert ahead.all()
+    np.testing.assert_allclose(pixels, observations.seen_at, atol=1e-6)
+    assert median_reprojection_error(observations) < 1e-9
+    behind = 2 * observations.centers[seen] - points
+    assert not observations.project(seen, behind)[1].any()
+
+
+def test_the_plane_sweep_finds_the_depth_of_a_textured_wall():
+    depth, count = 12.0, 5
+    centers = np.stack([np.linspace(-1, 1, count), np.zeros(count), np.zeros(count)], -1)
+    observations = observed(centers, np.array([[0.0, 0.0, depth]]))
+    empty = np.zeros(0, np.int64)
+    observations = replace(
+        observations, points=np.zeros((0, 3)), seen_by=empty, seen_point=empty, seen_at=np.zeros((0, 2))
+    )
+    rng = np.random.default_rng(3)
+    waves = rng.normal(size=(12, 2)) * 1.5
+    phases = rng.uniform(0, 6, 12)
+    width, height = 124, 38
+    scale = width / WIDTH
+    ys, xs = np.mgrid[0:height, 0:width] + 0.5
+    images = []
+    for c in centers:
+        wall = np.stack([(xs / scale - WIDTH / 2) / FOCAL, (ys / scale - HEIGHT / 2) / FOCAL], -1) * depth + c[:2]
+        images.append(0.5 + 0.04 * np.sin(wall @ waves.T + phases).sum(-1))
+    found = add_swept_points(observations, images)
+    assert len(found.points) > 50
+    assert np.percentile(np.abs(found.points[:, 2] - depth), 80) < 0.08 * depth
+    # Every view counts for a point that falls on its image, and no other does.
+    local = found.points - centers[:, None]
+    shown = np.abs(FOCAL * local[..., :2] / local[..., 2:]) < [WIDTH / 2, HEIGHT / 2]
+    wanted = {(int(i), int(p)) for i, p in np.argwhere(shown.all(-1))}
+    assert set(zip(found.seen_by.tolist(), found.seen_point.tolist(), strict=True)) == wanted
+    assert len(found.seen_by) == len(wanted) > 2 * len(found.points) and not shown.all()

@@ -1,0 +1,360 @@
+"""The parts of placement by themselves, against figures worked out by hand or by slow loops."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mmpi_ns.placement import rule
+from mmpi_ns.placement.borders import widened
+from mmpi_ns.placement.candidates import Candidate, find_candidates, spread_cameras
+from mmpi_ns.placement.errors import WORST, PixelErrors, cube_errors, mpi_errors, pixel_errors
+from mmpi_ns.placement.observations import Observations
+from mmpi_ns.placement.rule import PlacementConfig, _Choice, _named, place
+from mmpi_ns.placement.show.explain import explain, table
+from mmpi_ns.placement.visibility import find_content
+from mmpi_ns.scene.plan import CubePlan, MPIPlan, ScenePlan
+
+FX, FY, WIDTH, HEIGHT = 150.0, 100.0, 200, 100
+AXES = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0))
+"""Of an MPI that looks as a camera without rotation does: along -z, y up."""
+
+
+def observed(centers, points=(), seen_by=(), seen_point=None, turns=None) -> Observations:
+    """Cameras that look along -z unless turned; point q is keypoint q unless said otherwise."""
+    centers = np.asarray(centers, dtype=np.float64)
+    turns = np.tile(np.eye(3), (len(centers), 1, 1)) if turns is None else turns
+    count = len(centers)
+    return Observations(
+        camera_to_worlds=np.concatenate([turns, centers[:, :, None]], -1),
+        intrinsics=np.tile([FX, FY, WIDTH / 2, HEIGHT / 2], (count, 1)),
+        sizes=np.tile([float(WIDTH), HEIGHT], (count, 1)),
+        points=np.asarray(points, dtype=np.float64).reshape(-1, 3),
+        seen_by=np.asarray(seen_by, np.int64),
+        seen_point=np.arange(len(seen_by)) if seen_point is None else seen_point,
+        seen_at=np.zeros((len(seen_by), 2)),
+    )
+
+
+def mpi(**changes) -> MPIPlan:
+    return replace(MPIPlan("front", (0.0, 0.0, 0.0), AXES, 2.0, (-0.8, 0.8, -0.6, 0.6), 33, 61, 81), **changes)
+
+
+def test_content_starts_for_each_camera_where_its_own_points_do():
+    depths = [np.linspace(10, 20, 40), np.linspace(100, 200, 40), np.full(5, 40.0)]
+    centers = np.array([[0.0, 0, 0], [30, 0, 0], [60, 0, 0]])
+    points = np.concatenate([c - d[:, None] * [0, 0, 1] for c, d in zip(centers, depths, strict=True)])
+    content = find_content(observed(centers, points, np.repeat([0, 1, 2], [40, 40, 5])))
+    assert content.near == pytest.approx(55)  # the median of 10 and 100; the third camera has too few of its own
+    assert content.nearest == pytest.approx([10, 100, 55])
+    # The third takes the quantiles of all 85: the 22nd, and 0.6 beyond the 31st of the second's.
+    assert content.typical == pytest.approx(
+        np.array([[12.5, 19], [125, 190], [10 + 21 * 10 / 39, 100 + 30.6 * 100 / 39]])
+    )
+    assert np.bincount(content.cameras, content.weights) == pytest.approx([1, 1, 1])
+    # 0.85 of the weight at most, and half of that for ten keypoints.
+    assert content.weights[:85] == pytest.approx(np.array([0.85 / 50, 0.85 / 50, 0.85 / 15])[content.cameras[:85]])
+
+
+def test_what_is_weighed_of_many_keypoints_is_spread_over_all_depths():
+    depth = np.random.default_rng(0).permutation(np.linspace(1, 100, 20_000))
+    content = find_content(observed([[0.0, 0, 0]], -depth[:, None] * [0, 0, 1], np.zeros(20_000)))
+    assert len(content.points) == 6000 + 24
+    kept = -content.points[:6000, 2]
+    assert np.quantile(kept, [0, 0.25, 0.5, 0.75, 1]) == pytest.approx([1, 25.75, 50.5, 75.25, 100], rel=1e-3)
+
+
+def test_without_points_content_starts_at_a_tenth_of_the_cameras_spread():
+    assert find_content(observed([[0.0, 0, 0], [10, 0, 0]])).near == pytest.approx(0.5)
+
+
+def test_planes_begin_a_little_before_the_content_of_the_camera_or_of_all_where_that_is_nearer():
+    depths = np.repeat([10.0, 100.0], 40)
+    observations = observed([[0.0, 0, 0], [30, 0, 0]], [[0, 0, -d] for d in depths], np.repeat([0, 1], 40))
+    content = find_content(observations)
+    assert content.near == 55
+    found = {(c.frame.name, c.frame.origin[2]): c.frame.near for c in find_candidates(observations, content, False)}
+    assert found == pytest.approx({
+        ("view 1", 0.0): 6, ("view 1", 55.0): 61, ("view 1", 110.0): 116,
+        ("view 2", 0.0): 33, ("view 2", 55.0): 88, ("view 2", 110.0): 143,
+    })  # fmt: skip
+
+
+def turned_about_y(angles):
+    return np.array([[[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]] for a in angles])
+
+
+def test_candidates_start_from_cameras_far_apart_in_direction_too():
+    turns = turned_about_y(np.radians(45 * np.arange(8)))
+    observations = observed(np.zeros((8, 3)), turns=turns)
+    chosen = sorted(spread_cameras(observations, find_content(observations), 4))
+    assert np.diff(chosen).tolist() == [2, 2, 2]
+
+
+def orbit(inwards: int = 16) -> Observations:
+    """Sixteen cameras on a circle of radius 4; so many look at keypoints around its centre, the others away from it."""
+    turns = turned_about_y(2 * np.pi * np.arange(16) / 16)
+    centers = 4 * turns[:, :, 2]
+    turns[inwards:] *= [-1, 1, -1]
+    points = np.random.default_rng(0).uniform(-1, 1, (40, 3))
+    return observed(centers, points, np.repeat(np.arange(inwards), 40), np.tile(np.arange(40), inwards), turns)
+
+
+def test_cubes_stand_where_the_cameras_look_and_nowhere_if_many_look_elsewhere():
+    def cubes(observations):
+        found = find_candidates(observations, find_content(observations), with_cubes=True)
+        return [c.frame for c in found if isinstance(c.frame, CubePlan)]
+
+    found = cubes(orbit())
+    assert [c.upper[0] for c in found] == pytest.approx([1.6, 2.8, 4.0])
+    assert np.allclose(np.add([c.lower for c in found], [c.upper for c in found]), 0, atol=1e-9)
+    assert len(cubes(orbit(inwards=13))) == 3 and cubes(orbit(inwards=12)) == []
+
+
+def test_a_candidates_errors_are_those_of_the_mpi_or_cube_made_of_it():
+    observations = orbit()
+    content = find_content(observations)
+    candidates = find_candidates(observations, content, with_cubes=True)
+    seen = {CubePlan: 0, MPIPlan: 0}
+    for candidate in candidates[::17] + candidates[-3:]:
+        head = candidate.at(0.5, 40, 10_000)
+        if isinstance(head, MPIPlan):
+            plane, texel = mpi_errors(head, observations, content.cameras, content.points)
+            assert (head.extent[1] - head.extent[0]) / (head.width - 1) == pytest.approx(0.5 / FX, rel=0.01)
+            assert (head.extent[3] - head.extent[2]) / (head.height - 1) == pytest.approx(0.5 / FY, rel=0.01)
+        else:
+            texel = cube_errors(head, observations, content.cameras, content.points)
+            plane = np.where(np.isfinite(texel), 0, np.inf)
+        held = np.isfinite(texel)
+        assert np.array_equal(np.isfinite(candidate.texel), held)
+        assert candidate.plane[held] / 39 == pytest.approx(plane[held], rel=1e-4, abs=1e-6)
+        assert 0.5 * candidate.texel[held] == pytest.approx(texel[held], rel=0.02)
+        seen[type(head)] += held.sum()
+    assert min(seen.values()) > 50
+
+
+def test_a_cube_costs_what_its_largest_grid_can_show():
+    cube = CubePlan((0.0,) * 3, (1.0,) * 3, (2, 2, 2))
+    candidate = Candidate(cube, 400.0, 400.0, np.zeros(1, np.float32), np.ones(1, np.float32))
+    assert candidate.coarsest(100) == 4 and candidate.at(1.0, 0, 100).texels == 100**3
+    assert candidate.at(8.0, 0, 100).texels == 50**3
+    assert Candidate(mpi(), 400.0, 400.0, np.zeros(1), np.ones(1)).coarsest(100) == 0
+
+
+def test_texel_error_takes_the_worse_side_and_each_side_its_own_focal_length():
+    observations, point = observed([[0.0, 0, 0]]), np.array([[1.0, -0.5, -10.0]])
+    zero = np.zeros(1, np.int64)
+    wide, high = mpi(width=17), mpi(height=7)
+    assert mpi_errors(wide, observations, zero, point)[1] == pytest.approx(1.6 / 16 * FX)
+    assert mpi_errors(high, observations, zero, point)[1] == pytest.approx(1.2 / 6 * FY)
+
+
+def test_a_cubes_error_is_the_longest_side_of_a_voxel_at_the_points_depth():
+    observations = observed([[0.0, 0, 4]])
+    cube = CubePlan((-1.0, -2.0, -3.0), (1.0, 2.0, 3.0), (10, 40, 20))  # z, y, x: voxels of 0.1, 0.1, 0.6
+    points = np.array([[0.5, 1.5, -1.0], [0.5, 1.5, 2.0], [0.5, 2.1, 2.0]])
+    found = cube_errors(cube, observations, np.zeros(3, np.int64), points)
+    assert found == pytest.approx([0.6 * FX / 5, 0.6 * FX / 2, np.inf])
+
+
+def test_both_errors_count_as_one_and_a_summary_takes_the_head_that_serves_best():
+    inf = math.inf
+    errors = PixelErrors(
+        np.array([[3.0, 0.0], [9.0, 4.0], [inf, 1.0], [inf, inf]]),
+        np.array([[8.0, 12.0], [0.0, 6.0], [inf, 2.0], [inf, inf]]),
+    )
+    assert errors.combined[:2] == pytest.approx(np.array([[5, 6], [9, 5]])) and errors.best[:3].tolist() == [0, 1, 1]
+    found = errors.summary()
+    assert found["unserved"] == 0.25 and found["e_p_50"] == 3 and found["e_t_50"] == 6
+    assert found["e_p_90"] == pytest.approx(3.8) and found["e_t_90"] == pytest.approx(7.6)
+
+
+# The choice, among candidates made by hand ---------------------------------------------------------------------------
+
+
+def candidate(texel, plane=None, rows=100.0, frame=None) -> Candidate:
+    """What it costs each observation: pixels of a texel, and of two planes."""
+    texel = np.asarray(texel, np.float32)
+    plane = np.zeros(len(texel), np.float32) if plane is None else np.asarray(plane, np.float32)
+    return Candidate(frame or mpi(), rows, rows, plane, texel)
+
+
+def chosen(candidates, weight=10.0, **changes):
+    """The heads, with texels of two pixels, planes for one pixel, and so much weight for every observation."""
+    config = PlacementConfig(plane_pixels=0.5, texel_pixels=2.0, max_voxels=128, **changes)
+    return _Choice(candidates, np.full(len(candidates[0].texel), weight), config, 2.0).run()
+
+
+def marked(number):
+    return mpi(name=str(number))
+
+
+def test_planes_are_as_many_as_four_fifths_of_what_is_served_ask_for():
+    error = np.random.default_rng(0).permutation(np.arange(101.0))  # 80 at four fifths, one pixel is allowed
+    assert chosen([candidate(np.ones(101), error)])[0].planes == 80
+    assert chosen([candidate(np.ones(101), 20 * error)])[0].planes == 128
+    assert chosen([candidate(np.ones(101), 0.01 * error)])[0].planes == 16
+    assert chosen([candidate(np.ones(101), 20 * error)], max_planes=64)[0].planes == 64
+
+
+def test_what_two_better_ones_serve_makes_the_first_superfluous():
+    both = candidate([3.0, 3, 3, 3], frame=marked(0))
+    halves = [candidate([1.0, 1, 99, 99], frame=marked(1)), candidate([99.0, 99, 1, 1], frame=marked(2))]
+    assert chosen([both])[0].name == "0"
+    assert sorted(m.name for m in chosen([both, *halves])) == ["1", "2"]
+
+
+def test_of_two_that_show_as_much_the_one_with_fewer_texels_is_taken():
+    large, small = candidate(np.ones(4), rows=300.0, frame=marked(0)), candidate(np.ones(4), frame=marked(1))
+    worse = candidate(np.full(4, 9.0), frame=marked(2))
+    assert [m.name for m in chosen([large, small, worse])] == ["1"]
+
+
+def test_where_all_candidates_show_everything_well_enough_one_is_taken():
+    assert [m.name for m in chosen([candidate(np.ones(4), frame=marked(0))] * 2)] == ["0"]
+
+
+def test_there_is_one_cube_at_most_and_never_a_cube_alone():
+    box = CubePlan((-1.0,) * 3, (1.0,) * 3, (2, 2, 2))
+    cubes = [candidate([1.0, 99, 99], frame=box), candidate([99.0, 1, 99], frame=box)]
+    found = chosen([*cubes, candidate([40.0, 40, 1])])
+    assert [type(h) for h in found].count(CubePlan) == 1 and len(found) == 2
+    alone = chosen([candidate(np.ones(3), frame=box), candidate([2.0, 2, 2])])
+    assert any(isinstance(h, MPIPlan) for h in alone)
+
+
+@pytest.mark.parametrize(("finest", "wanted"), [(3.1, 3.22), (1000.0, 10.0)])
+def test_the_finest_plan_within_the_budget_is_kept_and_the_coarsest_where_none_is(monkeypatch, finest, wanted):
+    """Texels here are few from a size on; the last of the eight attempts is too fine again."""
+    tried = []
+
+    class Few:
+        def __init__(self, candidates, weights, config, texel_pixels):
+            tried.append(texel_pixels)
+
+        def run(self):
+            side = 10 if tried[-1] >= finest else 100
+            return [mpi(name=str(len(tried)), planes=2, height=side, width=side)]
+
+    monkeypatch.setattr(rule, "_Choice", Few)
+    monkeypatch.setattr(rule, "widened", lambda mpis, *_: mpis)
+    observations = orbit()
+    config = PlacementConfig(max_texels=2000, texel_pixels=1.5)
+    (found,) = rule._choose(observations, find_content(observations), config, 1.5)
+    if finest < 100:
+        assert found.texels == 200 and len(tried) == rule.BUDGET_ROUNDS and tried[-1] < finest
+        assert tried[int(found.name) - 1] == min(t for t in tried if t >= finest) == pytest.approx(wanted, abs=0.02)
+    else:
+        assert found.name == str(len(tried)) and tried[-1] == max(tried) > wanted
+
+
+def test_texels_in_all_follow_the_settings_and_the_rays_whichever_allow_fewer():
+    config = PlacementConfig(max_texels=2000, texels_per_ray=8)
+    wanted = {None: 2000, 1000: 2000, 100: 800}
+    assert {rays: rule.affordable_texels(config, rays) for rays in wanted} == wanted
+    assert rule.affordable_texels(replace(config, max_texels=0), 1000) == 8000
+    assert rule.affordable_texels(replace(config, texels_per_ray=0), 10) == 2000
+    assert rule.affordable_texels(replace(config, max_texels=0), None) == 0
+
+
+def test_a_short_training_gets_a_small_plan():
+    random = np.random.default_rng(0)
+    points = random.uniform([-8, -4, -40], [8, 4, -6], (300, 3))
+    cameras = observed(
+        [[x, y, 0] for x in range(3) for y in range(3)], np.tile(points, (9, 1)), np.arange(9).repeat(300)
+    )
+    config = PlacementConfig(rays_per_texel=0)
+    texels = {rays: place(cameras, config, rays).texels for rays in (2_000, 20_000, None)}
+    assert 12_000 < texels[2_000] <= 16_000 and 120_000 < texels[20_000] <= 160_000 < texels[None]
+
+
+def test_mpis_at_one_camera_have_different_names():
+    assert [m.name for m in _named((marked(7), marked(7)))] == ["7 (0)", "7 (1)"]
+
+
+def test_rays_start_at_a_fifth_of_the_way_to_the_content():
+    observations = orbit()
+    plan = rule.place(observations, PlacementConfig())
+    near = find_content(observations).near
+    assert 2 < near < 4 and plan.content_near == near and plan.ray_near == pytest.approx(near / 5)
+
+
+# Coverage and the table ----------------------------------------------------------------------------------------------
+
+
+def test_a_border_goes_to_the_mpi_that_must_grow_least_and_texels_keep_their_size_both_ways():
+    observations = observed([[0.0, 0, 0]], [[0.0, 0, -10]] * 30, np.zeros(30))
+    whole = (-WIDTH / 2 / FX, WIDTH / 2 / FX, -HEIGHT / 2 / FY, HEIGHT / 2 / FY)
+    close, narrow = mpi(extent=whole), mpi(extent=tuple(0.7 * x for x in whole))
+    got = widened([narrow, close], observations, find_content(observations))
+    assert got[0] == narrow
+    assert got[1].extent == pytest.approx([1.1 * x for x in whole])
+    assert (got[1].height - 1) / (close.height - 1) == pytest.approx(1.1, rel=0.01)
+    far = replace(close, near=11.0)  # begins behind the content, so it holds none of it
+    got = widened([narrow, far], observations, find_content(observations))
+    assert got[1] == far and got[0].extent == pytest.approx([1.1 * x for x in whole])
+
+
+def test_only_one_side_that_is_missing_is_widened():
+    observations = observed([[0.0, 0, 0]], [[0.0, 0, -10]] * 30, np.zeros(30))
+    (got,) = widened([mpi(extent=(-2.0, 2.0, -0.3, 2.0))], observations, find_content(observations))
+    assert got.extent == pytest.approx([-2, 2, -0.55, 2]) and got.width == 81
+    assert got.height == round(60 * 2.55 / 2.3) + 1
+
+
+def looking_aside(degrees) -> Observations:
+    turns = turned_about_y([np.radians(degrees)])
+    return observed([[0.0, 0, 0]], np.tile(-10 * turns[0][:, 2], (30, 1)), np.zeros(30), turns=turns)
+
+
+def test_nothing_is_widened_far_or_beyond_the_widest_tangent():
+    # Border points lie at -1.1, -0.55, 0, ... times 2/3 from the image's middle, whose tangent is -1.73 here.
+    observations = looking_aside(60)
+    (got,) = widened([mpi(extent=(-0.6, 0.6, -3.0, 3.0))], observations, find_content(observations))
+    aside = np.tan(np.radians(60) - np.arctan(1.1 / 3))
+    assert got.extent == pytest.approx([-aside, 0.6, -3, 3])  # -0.83; -1.73 would be too far
+    wide, middle = mpi(extent=(-2.9, 0.6, -3.0, 3.0)), looking_aside(np.degrees(np.arctan(2.95)))
+    assert widened([wide], middle, find_content(middle))[0].extent[0] == pytest.approx(-2.95)
+    middle = looking_aside(np.degrees(np.arctan(3.05)))
+    assert widened([wide], middle, find_content(middle)) == [wide]
+
+
+def test_the_table_says_what_a_slow_count_finds():
+    rng = np.random.default_rng(2)
+    centers = np.array([[0.0, 0, 0], [1.0, 0, -2], [0.5, 0, -5]])
+    points = np.stack([rng.uniform(-6, 6, 90), rng.uniform(-3, 3, 90), rng.uniform(-40, -8, 90)], -1)
+    observations = observed(centers, points, np.repeat([0, 1, 2], 30))
+    content = find_content(observations)
+    heads = (
+        mpi(extent=(-0.3, 0.3, -0.3, 0.3)),
+        mpi(name="right", origin=(1.0, 0.0, -2.0), extent=(-0.1, 0.5, -0.4, 0.4), planes=12),
+    )
+    plan = ScenePlan(heads, CubePlan((-6.0, -3.0, -25.0), (6.0, 3.0, -9.0), (20, 30, 40)), 0.1, 1.0)
+    report, errors = (
+        explain(plan, observations, content),
+        pixel_errors(plan, observations, content.cameras, content.points),
+    )
+    total, own, holders, best_errors = sum(content.weights), [[], [], []], 0.0, []
+    for q, row in enumerate(errors.combined.tolist()):
+        held = [k for k in range(3) if row[k] < math.inf]
+        holders += len(held) * content.weights[q]
+        best_errors.append(min(*row, WORST))
+        if held:
+            own[min(held, key=lambda k: row[k])].append(q)
+    assert min(map(len, own)) >= 5 and sum(map(len, own)) < len(content.weights)
+    for k, head in enumerate(report.heads):
+        rest = [min([WORST, *(e for j, e in enumerate(errors.combined[q]) if j != k)]) for q in own[k]]
+        assert head.share == pytest.approx(sum(content.weights[q] for q in own[k]) / total)
+        assert head.error_with == pytest.approx(np.median([min(errors.combined[q][k], WORST) for q in own[k]]))
+        assert head.error_without == pytest.approx(np.median(rest)) and head.error_without > head.error_with
+    assert report.unserved == pytest.approx(1 - sum(content.weights[q] for qs in own for q in qs) / total)
+    assert report.overlap == pytest.approx(holders / total)
+    assert [h.size for h in report.heads] == [(33, 61, 81), (12, 61, 81), (20, 30, 40)]
+    ordered, last = sorted(best_errors), len(best_errors) - 1
+    said = table(report).splitlines()[-1]
+    assert f"Expected error {np.median(ordered):.2f} px in the median" in said
+    between = ordered[int(0.9 * last)] + (0.9 * last % 1) * (ordered[int(0.9 * last) + 1] - ordered[int(0.9 * last)])
+    assert f"{between:.2f} px at nine tenths" in said

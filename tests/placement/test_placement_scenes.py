@@ -1,0 +1,196 @@
+"""What automatic placement does on procedural scenes, and what must not change its mind."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from procedural import moved, observations_of
+
+from mmpi_ns.placement.candidates import find_candidates
+from mmpi_ns.placement.errors import WORST, cube_errors, mpi_errors
+from mmpi_ns.placement.observations import Observations
+from mmpi_ns.placement.rule import PlacementConfig, place
+from mmpi_ns.placement.visibility import find_content
+from mmpi_ns.scene.plan import CubePlan, ScenePlan
+from mmpi_ns.synthetic.catalogue import make_scene
+
+CONFIG = PlacementConfig(max_texels=0, max_voxels=128)
+"""As fine as asked, and with cubes where they look worth it."""
+
+
+def facing(plan: ScenePlan) -> np.ndarray:
+    return np.array([m.axes[2] for m in plan.mpis])
+
+
+@pytest.fixture(scope="module")
+def street() -> Observations:
+    return observations_of(make_scene("street"), per_camera=30)
+
+
+@pytest.fixture(scope="module")
+def street_plan(street) -> ScenePlan:
+    return place(street, CONFIG)
+
+
+def bits(plan: ScenePlan, observations: Observations, config: PlacementConfig = CONFIG) -> float:
+    """Expected error that a plan leaves, in bits, summed over images: the rule's own aim, worked out afresh."""
+    content = find_content(observations)
+    errors = [mpi_errors(m, observations, content.cameras, content.points) for m in plan.mpis]
+    if plan.cube is not None:
+        errors.append((np.zeros(1), cube_errors(plan.cube, observations, content.cameras, content.points)))
+    least = np.min([np.hypot(plane, 0.5 * texel) for plane, texel in errors], axis=0)
+    enough = config.enough * config.texel_pixels
+    return float(np.log2(np.clip(least, enough, WORST) / enough) @ content.weights)
+
+
+def test_a_forward_facing_grid_gets_one_mpi_and_no_cube():
+    plan = place(observations_of(make_scene("still-life")), CONFIG)
+    assert len(plan.mpis) == 1 and plan.cube is None
+
+
+def test_a_straight_street_gets_mpis_one_further_on_than_the_other_and_nothing_behind(street, street_plan):
+    forward = street.mean_axes[2]
+    places = np.array([m.origin for m in street_plan.mpis]) @ forward
+    driven = np.ptp(street.centers @ forward)
+    assert street_plan.cube is None and 3 <= len(street_plan.mpis) <= 8
+    assert (facing(street_plan) @ forward > -0.2).all()
+    assert np.ptp(places) > 0.4 * driven
+
+
+def test_looking_round_from_one_spot_gets_mpis_all_round_and_no_cube():
+    observations = observations_of(make_scene("look-round"), per_camera=30)
+    plan = place(observations, CONFIG)
+    level = facing(plan)[:, :2]
+    level = level[np.linalg.norm(level, axis=-1) > 0.5]
+    azimuth = np.sort(np.degrees(np.arctan2(level[:, 1], level[:, 0])))
+    gaps = np.diff(np.append(azimuth, azimuth[0] + 360))
+    assert plan.cube is None and len(plan.mpis) >= 5
+    assert gaps.max() < 125  # an MPI is up to 90 degrees wide and the cameras' views overlap
+
+
+def test_cameras_round_an_object_get_a_cube_and_mpis_for_what_lies_behind_it():
+    plan = place(observations_of(make_scene("object"), per_camera=30), CONFIG)
+    assert plan.cube is not None and np.abs(np.add(plan.cube.lower, plan.cube.upper)[:2] / 2).max() < 0.3
+    assert len(plan.mpis) >= 3
+    without = place(observations_of(make_scene("object"), per_camera=30), replace(CONFIG, max_voxels=0))
+    assert without.cube is None and len(without.mpis) >= 5
+
+
+def test_mpis_grow_with_the_length_of_a_road():
+    def mpis(length):
+        road = observations_of(make_scene("long-road", length=length), per_camera=12)
+        return len(place(road, replace(CONFIG, max_mpis=1000)).mpis)
+
+    short, long = mpis(200.0), mpis(500.0)
+    assert 1.7 <= long / short <= 3.3
+
+
+def test_a_moved_scene_gets_the_moved_plan(street, street_plan):
+    q, _ = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))
+    turn = q * np.sign(np.linalg.det(q))
+    shift, scale = np.array([100.0, -7.0, 3.0]), 0.037
+    plan = place(moved(street, turn, shift, scale), CONFIG)
+    assert len(plan.mpis) == len(street_plan.mpis)
+    assert plan.content_near == pytest.approx(scale * street_plan.content_near, rel=1e-6)
+    for got, wanted in zip(plan.mpis, street_plan.mpis, strict=True):
+        assert got.name == wanted.name and got.planes == wanted.planes
+        assert (got.height, got.width) == (wanted.height, wanted.width)
+        assert np.allclose(got.origin, scale * (turn @ wanted.origin) + shift, atol=1e-6)
+        assert np.allclose(got.axes, np.asarray(wanted.axes) @ turn.T, atol=1e-9)
+        assert got.near == pytest.approx(scale * wanted.near, rel=1e-6)
+        assert np.allclose(got.extent, wanted.extent)
+
+
+def test_the_numbering_of_cameras_points_and_keypoints_does_not_matter(street, street_plan):
+    rng = np.random.default_rng(4)
+    cameras = rng.permutation(len(street.centers))
+    points = rng.permutation(len(street.points))
+    keypoints = rng.permutation(len(street.seen_by))
+    shuffled = Observations(
+        camera_to_worlds=street.camera_to_worlds[cameras],
+        intrinsics=street.intrinsics[cameras],
+        sizes=street.sizes[cameras],
+        points=street.points[points],
+        seen_by=np.argsort(cameras)[street.seen_by][keypoints],
+        seen_point=np.argsort(points)[street.seen_point][keypoints],
+        seen_at=street.seen_at[keypoints],
+    )
+    got, wanted = ([m.origin for m in plan.mpis] for plan in (place(shuffled, CONFIG), street_plan))
+    assert np.allclose(sorted(got), sorted(wanted))
+
+
+def test_gross_outliers_change_little(street, street_plan):
+    rng = np.random.default_rng(5)
+    points = street.points.copy()
+    wrong = rng.choice(len(points), len(points) // 10, replace=False)
+    camera = street.seen_by[np.unique(street.seen_point, return_index=True)[1]][: len(wrong)]
+    directions = points[wrong] - street.centers[camera]
+    points[wrong] = street.centers[camera] + directions * np.exp(rng.uniform(-3, 3, (len(wrong), 1)))
+    plan = place(replace(street, points=points), CONFIG)
+    assert abs(len(plan.mpis) - len(street_plan.mpis)) <= 2
+    assert plan.content_near == pytest.approx(street_plan.content_near, rel=0.25)
+    assert bits(plan, street) < bits(street_plan, street) + 0.15 * len(street.centers)
+
+
+def test_points_that_cannot_be_used_change_nothing(street, street_plan):
+    bad = np.array([[np.nan, 0, 0], [np.inf, 1, 1], street.centers[0] - 5 * street.mean_axes[2]])
+    many = len(street.points)
+    spoilt = replace(
+        street,
+        points=np.concatenate([street.points, bad]),
+        seen_by=np.concatenate([street.seen_by, [0, 0, 0]]),
+        seen_point=np.concatenate([street.seen_point, [many, many + 1, many + 2]]),
+        seen_at=np.concatenate([street.seen_at, np.zeros((3, 2))]),
+    )
+    assert place(spoilt, CONFIG) == street_plan
+
+
+def test_duplicate_keypoints_change_little(street, street_plan):
+    doubled = replace(
+        street,
+        seen_by=np.tile(street.seen_by, 2),
+        seen_point=np.tile(street.seen_point, 2),
+        seen_at=np.tile(street.seen_at, (2, 1)),
+    )
+    plan = place(doubled, CONFIG)
+    assert abs(len(plan.mpis) - len(street_plan.mpis)) <= 1
+    assert bits(plan, street) == pytest.approx(bits(street_plan, street), abs=0.1 * len(street.centers))
+
+
+def test_every_chosen_mpi_is_needed_and_no_other_would_add_enough(street, street_plan):
+    whole = bits(street_plan, street)
+    for k in range(len(street_plan.mpis)):
+        rest = tuple(m for i, m in enumerate(street_plan.mpis) if i != k)
+        assert bits(replace(street_plan, mpis=rest), street) > whole + 0.5 * CONFIG.min_gain
+    finest = replace(street_plan, mpis=tuple(replace(m, planes=CONFIG.max_planes) for m in street_plan.mpis))
+    floor = bits(finest, street)
+    content = find_content(street)
+    for candidate in find_candidates(street, content, with_cubes=False)[::7]:
+        mpi = candidate.at(CONFIG.texel_pixels, CONFIG.max_planes, CONFIG.max_voxels)
+        assert not isinstance(mpi, CubePlan)
+        assert bits(replace(finest, mpis=(*finest.mpis, mpi)), street) > floor - 1.1 * CONFIG.min_gain
+
+
+def test_a_budget_of_texels_is_kept_to_and_used(street):
+    plan = place(street, replace(CONFIG, max_texels=2e6))
+    assert 0.5e6 < plan.texels <= 2e6
+
+
+def test_three_hundred_cameras_and_fifty_thousand_points_are_placed_in_seconds():
+    road = observations_of(make_scene("long-road", count=600, length=600.0), per_camera=20)
+    copies = 50_000 // len(road.points) + 1
+    shifts = np.random.default_rng(6).normal(size=(copies, 1, 3)) * 0.05
+    many = replace(
+        road,
+        points=(road.points + shifts).reshape(-1, 3),
+        seen_by=np.tile(road.seen_by, copies),
+        seen_point=np.concatenate([road.seen_point + i * len(road.points) for i in range(copies)]),
+        seen_at=np.tile(road.seen_at, (copies, 1)),
+    )
+    assert len(many.centers) >= 300 and len(many.points) >= 50_000
+    start = time.process_time()
+    place(many, PlacementConfig(), 4_000_000)
+    assert time.process_time() - start < 40  # of processor time: 20 s on two cores

@@ -1,0 +1,98 @@
+"""``mmpi-plan`` on the tiny scene: what it prints and writes is what training would do."""
+
+from __future__ import annotations
+
+import json
+import sys
+
+import numpy as np
+import pytest
+from PIL import Image
+from procedural import observations_of
+
+from mmpi_ns.config import mmpi, mmpi_small
+from mmpi_ns.placement.rule import PlacementConfig, place
+from mmpi_ns.placement.show.explain import describe_facing, explain, table
+from mmpi_ns.placement.visibility import find_content
+from mmpi_ns.scene.plan import ScenePlan
+from mmpi_ns.scene.windows import WindowedPlan
+from mmpi_ns.scripts.plan import _defaults, entrypoint
+from mmpi_ns.synthetic.catalogue import make_scene
+from mmpi_ns.synthetic.dataset import write_dataset
+
+
+def run(monkeypatch, *words):
+    monkeypatch.setattr(sys, "argv", ["mmpi-plan", *map(str, words)])
+    entrypoint()
+
+
+def test_it_writes_a_plan_a_table_and_pictures(scene, tmp_path, monkeypatch, capsys):
+    run(monkeypatch, scene, "--output", tmp_path / "plan", "--placement.max-mpis", 2)
+    plan = ScenePlan.load(tmp_path / "plan" / "plan.json")
+    printed = capsys.readouterr().out
+    assert all(f"| {m.name} |" in printed for m in plan.mpis) and 1 <= len(plan.mpis) <= 2
+    assert printed.split("\n\nWrote")[0].strip().endswith((tmp_path / "plan" / "plan.md").read_text().strip()[-200:])
+    for name in ("plan.png", "errors.png"):
+        picture = np.asarray(Image.open(tmp_path / "plan" / name).convert("RGB"))
+        assert min(picture.shape[:2]) > 200 and len(np.unique(picture.reshape(-1, 3), axis=0)) > 20
+
+
+def test_an_edited_plan_is_explained_and_kept(scene, tmp_path, monkeypatch, capsys):
+    run(monkeypatch, scene, "--output", tmp_path / "a")
+    data = json.loads((tmp_path / "a" / "plan.json").read_text())
+    data["mpis"][0] |= {"name": "moved by hand", "planes": 17}
+    (tmp_path / "edited.json").write_text(json.dumps(data))
+    run(monkeypatch, scene, "--output", tmp_path / "b", "--plan-file", tmp_path / "edited.json")
+    assert "| moved by hand |" in capsys.readouterr().out
+    assert ScenePlan.load(tmp_path / "b" / "plan.json") == ScenePlan.load(tmp_path / "edited.json")
+
+
+def test_the_defaults_are_those_of_the_method():
+    for name, method in (("mmpi", mmpi), ("mmpi-small", mmpi_small)):
+        for words in (["scene", "--method", name], [f"--method={name}", "scene"]):
+            command = _defaults(words)
+            assert command.placement == method.config.pipeline.model.placement
+            rays = method.config.max_num_iterations * method.config.pipeline.datamanager.train_num_rays_per_batch
+            assert command.training_rays == rays
+    assert _defaults(["scene"]).placement == mmpi_small.config.pipeline.model.placement
+
+
+def test_a_missing_scene_is_one_sentence(tmp_path, monkeypatch):
+    with pytest.raises(SystemExit, match="There is no scene at"):
+        run(monkeypatch, tmp_path / "nowhere", "--output", tmp_path / "plan")
+    assert not (tmp_path / "plan").exists()
+
+
+def test_the_table_adds_up():
+    observations = observations_of(make_scene("object"), per_camera=25)
+    plan = place(observations, PlacementConfig(max_texels=0, max_voxels=128))
+    report = explain(plan, observations, find_content(observations))
+    assert plan.cube is not None and len(report.heads) == len(plan.mpis) + 1
+    assert sum(h.share for h in report.heads) + report.unserved == pytest.approx(1)
+    assert sum(h.texels for h in report.heads) == plan.texels
+    assert all(h.error_without >= h.error_with for h in report.heads)
+    assert 1 <= report.overlap <= len(report.heads)
+    assert len(table(report).splitlines()) == len(report.heads) + 4
+
+
+def test_facings_are_named_in_the_cameras_frame():
+    base = np.eye(3)  # right, down, forward
+    named = {(0, 0, 1): "front", (1, 0, 0): "right", (-1, 0, 0): "left", (0, 1, 0): "below", (0, 0, -1): "back"}
+    for direction, name in named.items():
+        assert describe_facing(np.array(direction, float), base) == name
+    assert describe_facing(np.array([0.5, 0, 0.8660254]), base) == "front, 30 deg off"
+
+
+def test_a_long_capture_is_planned_window_by_window_and_its_plan_goes_back_in(tmp_path, monkeypatch, capsys):
+    write_dataset(make_scene("long-road", length=180.0), tmp_path / "road", 3000, images=False)
+    words = (tmp_path / "road", "--downscale-factor", 1, "--placement.max-texels", 1e6)
+    run(monkeypatch, *words, "--output", tmp_path / "plan")
+    printed, plan = capsys.readouterr().out, WindowedPlan.load(tmp_path / "plan" / "plan.json")
+    assert len(plan) >= 2 and f"{len(plan)} windows, " in printed
+    for i, window in enumerate(plan.windows):
+        assert f"## Window {i}: " in printed and all(f"| {m.name} |" in printed for m in window.plan.mpis)
+        assert (tmp_path / "plan" / f"plan-{i}.png").is_file() and (tmp_path / "plan" / f"errors-{i}.png").is_file()
+    drawn = np.asarray(Image.open(tmp_path / "plan" / "plan.png").convert("RGB"))
+    assert len(np.unique(drawn.reshape(-1, 3), axis=0)) > 20
+    run(monkeypatch, *words, "--output", tmp_path / "again", "--plan-file", tmp_path / "plan" / "plan.json")
+    assert WindowedPlan.load(tmp_path / "again" / "plan.json") == plan

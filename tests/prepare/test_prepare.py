@@ -1,0 +1,219 @@
+"""mmpi-prepare on a drive down a rendered corridor whose poses are known."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import corridor
+import numpy as np
+import pycolmap
+import pytest
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from PIL import Image
+from reprojection import median_reprojection_error
+
+from mmpi_ns.capture.observe import read_observations
+from mmpi_ns.capture.sfm import find_sfm_model
+from mmpi_ns.prepare import features, mapping
+from mmpi_ns.prepare.frame import camera_poses, similarity_between
+from mmpi_ns.prepare.pipeline import WORK, prepare
+from mmpi_ns.prepare.settings import Settings
+
+COUNT = 12
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    """A folder of frames, and masks that hide the lower left corner."""
+    folder = tmp_path_factory.mktemp("capture")
+    corridor.write_images(folder / "frames", COUNT)
+    (folder / "masks").mkdir()
+    mask = np.full((corridor.HEIGHT, corridor.WIDTH), 255, np.uint8)
+    mask[100:, :60] = 0
+    for file in (folder / "frames").iterdir():
+        Image.fromarray(mask).save(folder / "masks" / file.name)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def scene(capture):
+    """What mmpi-prepare makes of the bare frames."""
+    settings = Settings(
+        capture / "frames", capture / "scene", masks=capture / "masks", camera_height=corridor.EYE, threads=1
+    )
+    prepare(settings)
+    return capture / "scene"
+
+
+def read_json(scene):
+    return json.loads((scene / "transforms.json").read_text())
+
+
+def error_after_alignment(scene, given):
+    """Largest distance of the centres from the given ones, as a share of the track."""
+    frames = sorted(read_json(scene)["frames"], key=lambda f: f["file_path"])
+    found = np.array([f["transform_matrix"] for f in frames]) @ np.diag([1.0, -1, -1, 1])
+    moved = similarity_between(found, given)
+    centers = np.array([moved * p for p in found[:, :3, 3]])
+    track = np.linalg.norm(np.diff(given[:, :3, 3], axis=0), axis=-1).sum()
+    return np.linalg.norm(centers - given[:, :3, 3], axis=-1).max() / track
+
+
+def test_all_frames_are_registered_within_one_percent_of_the_true_track(scene):
+    assert len(read_json(scene)["frames"]) == COUNT
+    assert error_after_alignment(scene, corridor.poses(COUNT)) < 0.01
+
+
+def test_camera_height_gives_metres_and_gravity(scene):
+    poses = np.array([f["transform_matrix"] for f in read_json(scene)["frames"]])
+    track = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=-1).sum()
+    truth = np.linalg.norm(np.diff(corridor.poses(COUNT)[:, :3, 3], axis=0), axis=-1).sum()
+    assert track == pytest.approx(truth, rel=0.03)
+    assert np.degrees(np.arccos(poses[:, 2, 1])).max() < 1.5  # up in the image is up in the scene
+
+
+def test_nerfstudio_reads_the_scene_and_its_tracks_in_one_frame(scene):
+    parser = NerfstudioDataParserConfig(data=scene, downscale_factor=2).setup()
+    outputs = parser.get_dataparser_outputs("train")
+    observations = read_observations(outputs, outputs.cameras, find_sfm_model(scene / "colmap/sparse/0"))
+    assert len(observations.seen_at) > 100 * len(outputs.image_filenames)
+    error = median_reprojection_error(observations) * corridor.WIDTH
+    assert error < 0.3
+
+
+def test_points_file_holds_the_models_points(scene):
+    model = pycolmap.Reconstruction(scene / "colmap/sparse/0")
+    data = (scene / "sparse_pc.ply").read_bytes()
+    header, body = data.split(b"end_header\n", 1)
+    assert f"element vertex {model.num_points3D()}".encode() in header
+    layout = np.dtype([("xyz", "<f4", 3), ("rgb", "u1", 3)])
+    table = np.frombuffer(body, layout)
+    first = model.points3D[min(model.points3D)]
+    assert table["xyz"][0] == pytest.approx(first.xyz, rel=1e-5)
+    assert (table["rgb"][0] == first.color).all()
+
+
+def test_split_is_stated_and_covers_all_images(scene):
+    content = read_json(scene)
+    train, test = set(content["train_filenames"]), set(content["test_filenames"])
+    assert not train & test and len(train | test) == COUNT
+    assert content["applied_transform"] == [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]
+    assert "one image in 8 tests" in (scene / "report.md").read_text()
+
+
+def test_downscaled_copies_are_box_averages(scene):
+    whole = np.asarray(Image.open(scene / "images/frame_003.png")).astype(float)
+    small = np.asarray(Image.open(scene / "images_4/frame_003.png")).astype(float)
+    assert small.shape == (corridor.HEIGHT // 4, corridor.WIDTH // 4, 3)
+    assert small[2, 5] == pytest.approx(whole[8:12, 20:24].mean((0, 1)), abs=0.6)
+
+
+def test_masks_are_carried_along_and_keep_features_away(scene):
+    frame = read_json(scene)["frames"][0]
+    small = np.asarray(Image.open(scene / frame["mask_path"].replace("masks/", "masks_4/")))
+    assert small[-1, 0] == 0 and small[0, 0] == 255
+    for image in pycolmap.Reconstruction(scene / "colmap/sparse/0").images.values():
+        points = np.array([p.xy for p in image.points2D])
+        assert not ((points[:, 0] < 59) & (points[:, 1] > 101)).any()
+
+
+def test_report_states_the_figures(scene):
+    report = (scene / "report.md").read_text()
+    for words in (f"{COUNT} of {COUNT}", "reprojection error", "track length", "coverage", "1 metre", "exhaustive"):
+        assert words in report
+    assert (scene / "report/track.png").stat().st_size > 5000
+    assert not (scene / WORK).exists()
+
+
+def test_existing_scene_is_refused_and_left_alone(scene, capture):
+    from mmpi_ns.prepare.stages import PrepareError
+
+    before = (scene / "transforms.json").read_bytes()
+    with pytest.raises(PrepareError, match="already holds"):
+        prepare(Settings(capture / "frames", scene, threads=1))
+    assert (scene / "transforms.json").read_bytes() == before
+
+
+def test_interrupted_run_goes_on_without_redoing_what_was_done(capture, tmp_path, monkeypatch):
+    settings = Settings(capture / "frames", tmp_path / "scene", threads=1, keep_work=True)
+
+    def interrupt(*args):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(mapping, "reconstruct", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            prepare(settings)
+    assert not (tmp_path / "scene/transforms.json").exists()
+    with monkeypatch.context() as patched:
+        patched.setattr(features, "extract", interrupt)
+        patched.setattr(features, "match", interrupt)
+        prepare(settings)
+        assert len(read_json(tmp_path / "scene")["frames"]) == COUNT
+        with pytest.raises(KeyboardInterrupt):  # other features: what was kept does not fit
+            prepare(replace(settings, max_features=500, overwrite=True))
+
+
+def test_undistorted_scene_has_no_lens_and_straight_images(capture, tmp_path):
+    """Frames bent by a known lens come out as the pinhole saw them."""
+    camera = pycolmap.Camera(
+        model="OPENCV", width=corridor.WIDTH, height=corridor.HEIGHT, camera_id=1,
+        params=[corridor.FOCAL, corridor.FOCAL, 120, 80, 0.08, 0.0, 0.0, 0.0],
+    )  # fmt: skip
+    columns, rows = np.meshgrid(np.arange(corridor.WIDTH) + 0.5, np.arange(corridor.HEIGHT) + 0.5)
+    rays = camera.cam_from_img(np.stack([columns.ravel(), rows.ravel()], -1)) * corridor.FOCAL + [119.5, 79.5]
+    import cv2
+
+    bent = rays.reshape(corridor.HEIGHT, corridor.WIDTH, 2).astype(np.float32)
+    (tmp_path / "bent").mkdir()
+    for i in range(5):
+        straight = np.asarray(Image.open(capture / f"frames/frame_{i + 1:03d}.png"))
+        image = cv2.remap(straight, bent[..., 0], bent[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+        Image.fromarray(image).save(tmp_path / f"bent/frame_{i + 1:03d}.png")
+    lens = (corridor.FOCAL, corridor.FOCAL, 120.0, 80.0, 0.08, 0.0, 0.0, 0.0)
+    prepare(Settings(tmp_path / "bent", tmp_path / "scene", camera=lens, undistort=True, test_every=4, threads=1))
+    content = read_json(tmp_path / "scene")
+    assert content["k1"] == content["k2"] == content["p1"] == content["p2"] == 0
+    assert pycolmap.Reconstruction(tmp_path / "scene/colmap/sparse/0").compute_mean_reprojection_error() < 0.4
+    flat = np.asarray(Image.open(tmp_path / "scene/images/frame_001.png")).astype(float)
+    height, width = flat.shape[:2]
+    straight = np.asarray(Image.open(capture / "frames/frame_001.png")).astype(np.float32)
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    u = (x - content["cx"]) / content["fl_x"] * corridor.FOCAL + 119.5
+    v = (y - content["cy"]) / content["fl_y"] * corridor.FOCAL + 79.5
+    expected = cv2.remap(straight, u.astype(np.float32), v.astype(np.float32), cv2.INTER_LINEAR)
+    inner = np.s_[15:-15, 15:-15]
+    assert np.abs(flat[inner] - expected[inner]).mean() < 4
+
+
+def test_ordered_poses_come_back_in_the_order_of_the_images(scene):
+    names, _ = camera_poses(pycolmap.Reconstruction(scene / "colmap/sparse/0"))
+    assert names == [f"frame_{i + 1:03d}.png" for i in range(COUNT)]
+
+
+def test_interrupted_mapping_goes_on_from_its_snapshot(capture, tmp_path, monkeypatch):
+    settings = Settings(capture / "frames", tmp_path / "scene", threads=1)
+    registered = []
+
+    def count_to(most):
+        def make(advance, count):
+            def step():
+                registered.append(count)
+                if sum(registered) > most:
+                    raise KeyboardInterrupt
+
+            return step
+
+        return make
+
+    monkeypatch.setattr(mapping, "SNAPSHOT", 3)
+    monkeypatch.setattr(mapping, "_step", count_to(8))
+    with pytest.raises(KeyboardInterrupt):
+        prepare(settings)
+    registered.clear()
+    monkeypatch.setattr(mapping, "_step", count_to(1000))
+    prepare(settings)
+    assert 0 < sum(registered) <= COUNT - 4  # the others came with the snapshot
+    assert len(read_json(tmp_path / "scene")["frames"]) == COUNT
+    assert error_after_alignment(tmp_path / "scene", corridor.poses(COUNT)) < 0.01

@@ -1,0 +1,242 @@
+"""Sampler, field and compositing together against the slow oracle, and what the sampler promises about its samples."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hand_made import IDENTITY, make_mpi, unit
+from random_fields import bundle, compare, fill, random_field, random_rays, render
+
+from mmpi_ns.field.mmpi_field import MMPIField
+from mmpi_ns.ops import native
+from mmpi_ns.rendering import sampler as mmpi_sampler
+from mmpi_ns.scene.plan import CubePlan, ScenePlan
+
+
+@pytest.mark.parametrize("form", ["paper", "opacity", None])
+@pytest.mark.parametrize("with_cube", [False, True])
+@pytest.mark.parametrize(("num_mpis", "rays"), [(1, 24), (4, 12), (12, 5)])
+def test_with_threshold_0_rays_look_as_the_oracle_says(num_mpis, rays, with_cube, form):
+    field = random_field(num_mpis, with_cube, seed=num_mpis)
+    assert compare(field, *random_rays(field.plan, rays, seed=5), form) >= 0.6 * rays
+
+
+@pytest.mark.parametrize("form", ["paper", "opacity"])
+def test_texels_that_no_ray_trained_do_not_vote(form):
+    field = random_field(4, True, seed=4)
+    rays = random_rays(field.plan, 10, seed=6)
+    everyone = render(field, bundle(*rays), blend_form=form).composite.weights
+    field.touched[torch.rand(len(field.touched), generator=torch.Generator().manual_seed(0)) < 0.6] = 0
+    assert compare(field, *rays, form) >= 5
+    assert (render(field, bundle(*rays), blend_form=form).composite.weights - everyone).abs().max() > 0.01
+
+
+@pytest.mark.parametrize("with_cube", [False, True])
+def test_a_head_mask_leaves_only_the_heads_it_names(with_cube):
+    field = random_field(4, with_cube, seed=8)
+    mask = torch.rand(12, field.plan.num_heads, generator=torch.Generator().manual_seed(1)) < 0.5
+    origins, directions = random_rays(field.plan, 12, seed=7)
+    named = [set(row.nonzero()[:, 0].tolist()) for row in mask]
+    assert compare(field, origins, directions, None, lambda i, _: named[i], head_mask=mask) >= 3
+
+
+def test_each_ray_goes_to_its_first_choice_among_the_mpis_that_it_meets_and_to_the_cube():
+    field = random_field(4, True, seed=9)
+    origins, directions = random_rays(field.plan, 16, seed=9)
+    choose = torch.rand(16, 4, generator=torch.Generator().manual_seed(2))
+    second_choices = []
+
+    def heads_of(i, ray):
+        order = choose[i].argsort(descending=True).tolist()
+        meets = [k for k in order if ray.heads[k]]
+        second_choices.append(bool(meets) and meets[0] != order[0])
+        return {*meets[:1], 4}
+
+    assert compare(field, origins, directions, None, heads_of, choose=choose) >= 9
+    assert any(second_choices), "no ray misses its first choice"
+
+
+@pytest.mark.parametrize("form", ["paper", "opacity", None])
+def test_samples_of_two_identical_mpis_tie_and_the_first_mpi_comes_first(form):
+    twin = make_mpi("a", (0.3, 0.1, -0.2), IDENTITY), make_mpi("b", (0.3, 0.1, -0.2), IDENTITY)
+    field = fill(MMPIField(ScenePlan(twin, None, 0.05, 1.0), feature_channels=5, hidden_width=6), seed=1)
+    assert compare(field, *random_rays(field.plan, 10, seed=3), form) >= 8
+    samples = render(field, bundle([[0, 0, 0]], [[0, 0, 1]]), blend_form=form).samples
+    assert samples.metadata["heads"][0, :, 0].tolist() == [0, 1] * 9
+    assert (samples.metadata["inverse_t"][0, ::2] == samples.metadata["inverse_t"][0, 1::2]).all()
+
+
+@pytest.mark.parametrize("form", ["paper", None])
+@pytest.mark.parametrize("threshold", [1e-3, 1e-2, 0.3])
+def test_dropping_samples_changes_a_ray_by_no_more_than_the_dropped_mass(threshold, form):
+    field = random_field(4, True, seed=10, planes=40)
+    rays = bundle(*random_rays(field.plan, 64, seed=11))
+    whole, part = render(field, rays, 0.0, form), render(field, rays, threshold, form)
+    dropped = part.report.dropped_mass
+    assert ((part.rgb - whole.rgb).abs() <= dropped + 1e-5).all()
+    assert ((part.composite.accumulation - whole.composite.accumulation).abs() <= 1e-5).all()
+    assert (dropped > 1e-4).any() and whole.report.dropped_mass.max() == 0
+    assert torch.equal(part.report.live, whole.report.live)
+    kept = part.samples.metadata["valid"].sum()
+    assert kept < whole.samples.metadata["valid"].sum() and kept > 0
+    missing = whole.composite.weights.sum(-1) - part.composite.weights.sum(-1)
+    assert torch.allclose(missing, dropped[:, 0], atol=2e-5)
+
+
+def test_with_a_fair_share_nothing_is_dropped_at_the_start_where_all_weights_are_equal():
+    plan = ScenePlan((make_mpi(planes=64),), None, 0.05, 1.0)
+    found = render(MMPIField(plan).eval(), bundle([[0, 0, 0]], [[0, 0, 1]]), threshold=0.5, fair_share=0.1)
+    assert found.samples.shape == (1, 64) and found.samples.metadata["valid"].all()
+    assert torch.allclose(found.composite.weights, torch.tensor(1 / 64), rtol=0.01)
+
+
+@pytest.mark.parametrize("form", ["paper", None])
+def test_rays_that_meet_nothing_are_empty(plan, form):
+    """Away from every head, alone in a batch, beside a ray that meets planes, and in a batch of no rays."""
+    field = fill(MMPIField(plan), seed=0)
+    backwards, forwards = [0.0, 0, -1], [0.0, 0, 1]
+    for directions in ([backwards], [backwards, forwards], np.zeros((0, 3))):
+        found = render(field, bundle(np.zeros((len(directions), 3)), directions), blend_form=form)
+        count = len(directions)
+        assert found.rgb.shape == (count, 3) and found.samples.shape[0] == count
+        assert torch.isfinite(found.rgb).all()
+        if count:
+            assert (found.rgb[0] == 0).all() and found.composite.transmittance[0] == 1
+            assert found.report.live[0] == 0 and not found.report.explained[0]
+            assert not found.samples.metadata["valid"][0].any()
+        if count == 2:
+            assert found.composite.transmittance[1] < 0.5
+
+
+@pytest.mark.parametrize(("near", "far"), [(0.05, 9.1), (5.1, math.inf), (3.1, 12.3)])
+def test_samples_lie_between_near_and_far(near, far):
+    field = random_field(4, True, seed=12)
+    origins, directions = random_rays(field.plan, 12, seed=13)
+    assert compare(field, origins, directions, "paper", near=near, far=far) >= 4
+    meta = render(field, bundle(origins, directions, near, far)).samples.metadata
+    t = 1 / meta["inverse_t"][meta["valid"]]
+    assert t.min() >= near * (1 - 1e-5) and t.max() <= far * (1 + 1e-5)
+
+
+def test_the_plane_at_infinity_is_sampled_where_the_ray_points_and_not_where_it_starts():
+    field = fill(MMPIField(ScenePlan((make_mpi(),), None, 0.05, 1.0), feature_channels=5, hidden_width=6), seed=2)
+    direction = unit([0.3, -0.2, 1.0])
+    origins = np.array([[0, 0, 0], [0.2, 0.1, 500.0]])
+    found = render(field, bundle(origins, [direction, direction]))
+    last = [int(v.sum()) - 1 for v in found.samples.metadata["valid"]]
+    assert last[1] == 0, "beyond all finite planes only infinity is left"
+    for i in range(2):
+        assert found.samples.metadata["planes"][i, last[i]] == 8
+        assert found.samples.metadata["inverse_t"][i, last[i]] == 0
+        assert found.samples.metadata["ndc"][i, last[i]].tolist() == pytest.approx([0.3, -0.4, 1.0], abs=1e-6)
+        assert found.samples.frustums.starts[i, last[i]] == pytest.approx(1e10)
+    assert torch.isfinite(found.rgb).all() and found.composite.weights[1, 0] > 0
+    assert render(field, bundle(origins, [direction, direction], far=1e6)).report.live.tolist() == [8, 0]
+
+
+@pytest.mark.parametrize("form", ["paper", None])
+@pytest.mark.parametrize("threshold", [0.0, 1e-3])
+def test_a_ray_does_not_depend_on_its_batch(form, threshold):
+    field = random_field(4, True, seed=14, planes=30)
+    origins, directions = random_rays(field.plan, 60, seed=15)
+    order = np.random.default_rng(0).permutation(60)
+    whole = render(field, bundle(origins, directions), threshold, form)
+    shuffled = render(field, bundle(origins[order], directions[order]), threshold, form)
+    assert torch.equal(whole.report.live[order], shuffled.report.live)
+    assert torch.allclose(whole.rgb[order], shuffled.rgb, atol=1e-6)
+    for size in (1, 7, 59):
+        parts = [render(field, bundle(origins[i : i + size], directions[i : i + size]), threshold, form)
+                 for i in range(0, 60, size)]  # fmt: skip
+        assert torch.allclose(whole.rgb, torch.cat([p.rgb for p in parts]), atol=1e-6)
+        dropped = torch.cat([p.report.dropped_mass for p in parts])
+        assert torch.allclose(whole.report.dropped_mass, dropped, atol=1e-6)
+
+
+def ray_explained(plan, origin, direction, alone=True):
+    """Alone: all heads of the plan, asked as one of several groups of heads that train apart."""
+    mask = torch.ones(1, plan.num_heads, dtype=torch.bool) if alone else None
+    rays = bundle([origin], [unit(direction)])
+    return bool(render(MMPIField(plan).eval(), rays, head_mask=mask).report.explained)
+
+
+def test_a_ray_is_explained_when_it_enters_before_the_first_content_and_stays_to_infinity():
+    one = ScenePlan((make_mpi(near=1.0, extent=(-1.0, 1.0, -0.5, 0.5)),), None, 0.05, content_near=1.5)
+    assert ray_explained(one, [0, 0, 0], [0, 0, 1])
+    assert ray_explained(one, [0.4, 0.1, 3.0], [0.5, -0.2, 1]), "starts inside"
+    assert not ray_explained(one, [0, 0, 0], [0, 0, -1]), "meets nothing"
+    assert not ray_explained(one, [0, 0, 1.5], [1.3, 0, 1]), "leaves the frustum before infinity"
+    assert not ray_explained(one, [-10, 0, 0], [0.9, 0, 1]), "enters far behind the first content"
+    assert not ray_explained(one, [0, 0, -3], [0, 0, 1]), "reaches the first plane far behind the first content"
+
+
+def test_two_mpis_explain_a_ray_together():
+    side = make_mpi("right", (0.0, 0.0, 0.0), ((0.0, 0.0, -1.0), (0.0, 1.0, 0.0), (1.0, 0.0, 0.0)))
+    front = make_mpi()
+    both, alone = (ScenePlan(m, None, 0.05, content_near=2.0) for m in ((front, side), (front,)))
+    start, direction = [0, 0, 1.5], [1.5, 0, 1]
+    assert ray_explained(both, start, direction) and not ray_explained(alone, start, direction)
+    assert ray_explained(alone, [0, 0, 0], [0, 0, 1]) and ray_explained(both, [0, 0, 0], [0, 0, 1])
+
+
+def test_the_cube_explains_no_ray():
+    cube = CubePlan((-5.0, -5.0, -5.0), (5.0, 5.0, 5.0), (4, 4, 4))
+    plan = ScenePlan((make_mpi(),), cube, 0.05, 1.5)
+    assert not ray_explained(plan, [0, 0, 0], [0, 0, -1])
+
+
+def test_without_other_heads_all_that_a_ray_shows_is_to_be_explained():
+    one = ScenePlan((make_mpi(near=1.0, extent=(-1.0, 1.0, -0.5, 0.5)),), None, 0.05, content_near=1.5)
+    partly = [0, 0, 1.5], [1.3, 0, 1]
+    assert ray_explained(one, *partly, alone=False) and not ray_explained(one, *partly)
+    assert not ray_explained(one, [0, 0, 0], [0, 0, -1], alone=False), "meets nothing"
+    cube = CubePlan((-5.0, -5.0, -5.0), (5.0, 5.0, 5.0), (4, 4, 4))
+    assert ray_explained(ScenePlan((make_mpi(),), cube, 0.05, 1.5), [0, 0, 0], [0, 0, -1], alone=False), "the cube"
+
+
+def test_stopping_where_a_ray_is_opaque_changes_nothing_visible(monkeypatch):
+    monkeypatch.setattr(native, "_chosen", "torch")
+    field = random_field(6, True, seed=16, planes=60, log_depths=(-3, 1.2))
+    rays = bundle(*random_rays(field.plan, 80, seed=17))
+    looked_up = []
+    blend = field.blend
+    monkeypatch.setattr(field, "blend", lambda tau, *rest: looked_up.append(len(tau)) or blend(tau, *rest))
+    stopped = render(field, rays, 1e-3, "paper")
+    count = sum(looked_up)
+    monkeypatch.setattr(mmpi_sampler, "OPAQUE_DEPTH", math.inf)
+    whole = render(field, rays, 1e-3, "paper")
+    assert count < 0.8 * (sum(looked_up) - count), "nothing was stopped"
+    assert (stopped.rgb - whole.rgb).abs().max() < 1e-4
+    assert (stopped.composite.accumulation - whole.composite.accumulation).abs().max() < 1e-4
+
+
+def test_ray_samples_hold_what_the_field_needs():
+    field = random_field(4, True, seed=18)
+    found = render(field, bundle(*random_rays(field.plan, 9, seed=19)), blend_form="paper").samples
+    width, valid = found.shape[1], found.metadata["valid"]
+    assert found.shape == (9, width) and width == valid.sum(1).max()
+    shapes = {name: tuple(value.shape) for name, value in found.metadata.items()}
+    assert shapes.pop("ndc") == (9, width, 3)
+    assert set(shapes) == {"heads", "planes", "inverse_t", "valid", "skipped_before", "tau"}
+    assert set(shapes.values()) == {(9, width, 1)} and valid.dtype == torch.bool
+    assert (valid[:, :-1] | ~valid[:, 1:]).all(), "samples are packed to the left"
+    inverse_t = found.metadata["inverse_t"]
+    assert (inverse_t[:, :-1] >= inverse_t[:, 1:]).all() and (inverse_t[~valid] == 0).all()
+    frustums = found.frustums
+    assert torch.equal(frustums.starts, frustums.ends) and frustums.starts.shape == (9, width, 1)
+    finite = valid & (inverse_t > 0)
+    assert torch.allclose(frustums.starts[finite], 1 / inverse_t[finite])
+    assert frustums.origins.shape == frustums.directions.shape == (9, width, 3)
+    assert frustums.pixel_area.shape == (9, width, 1)
+    assert (found.metadata["ndc"][valid[..., 0]].abs() <= 1 + 1e-5).all()
+
+
+def test_the_sampler_builds_no_graph():
+    field = random_field(2, True, seed=20).train()
+    samples, report = mmpi_sampler.MMPISampler()(
+        bundle(*random_rays(field.plan, 4, seed=21)), field=field, threshold=0.0, blend_form="paper"
+    )
+    tensors = [*samples.metadata.values(), report.skipped_total, report.dropped_mass]
+    assert not any(t.requires_grad for t in tensors)

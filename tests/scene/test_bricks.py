@@ -1,0 +1,355 @@
+"""Tables of bricks: the same arithmetic as dense tables, an empty brick that never changes, growth and release."""
+
+from __future__ import annotations
+
+import numpy as np
+import oracle
+import pytest
+import torch
+from bricked import SHAPES, big_plan, bricked_field, chance, thinned
+from nerfstudio.field_components.field_heads import FieldHeadNames
+from random_fields import bundle, compare, fill, random_rays, render
+
+from mmpi_ns.field.mmpi_field import MMPIField
+from mmpi_ns.field.tables import ENOUGH_CROSSINGS, RELEASED_DENSITY, TABLES
+from mmpi_ns.ops import native
+from mmpi_ns.ops.interpolate import bilinear_rows, interpolate_reference
+from mmpi_ns.ops.variation import total_variation, total_variation_reference
+from mmpi_ns.rendering.sampler import MMPISampler
+from mmpi_ns.scene.bricks import from_dense, grown_tiles, keep_bricks, new_table, read_planes, resample, write_planes
+from mmpi_ns.scene.texels import BRICK, head_grids, make_grids
+from mmpi_ns.training.touched_adam import TouchedAdam
+
+# Rows ----------------------------------------------------------------------------------------------------------------
+
+
+def test_lookups_read_what_dense_tables_would_give():
+    grids, table, blocks = thinned(SHAPES[:3] + SHAPES[4:])
+    ndc = torch.tensor(np.random.default_rng(1).uniform(-1.1, 1.1, size=(150, 3)))
+    for grid, block in zip(grids, blocks, strict=True):
+        planes = torch.arange(150) % grid.depth
+        flat = interpolate_reference(table, *grid.bilinear(planes, ndc))
+        solid = interpolate_reference(table, *grid.trilinear(ndc))
+        assert (flat < -1).any() and (flat > -1).any()
+        for i in range(150):
+            u, v, _ = ndc[i].tolist()
+            assert np.allclose(flat[i], oracle.bilinear(block[i % grid.depth], u, v), atol=1e-12)
+            assert np.allclose(solid[i], oracle.trilinear(block, ndc[i].tolist()), atol=1e-12)
+        z, y, x = (((ndc[:, a] + 1) / 2 * (n - 1)).round().clamp(0, n - 1).long().numpy()
+                   for a, n in ((2, grid.depth), (1, grid.height), (0, grid.width)))  # fmt: skip
+        assert np.array_equal(table[grid.nearest(ndc)], block[z, y, x])
+
+
+def test_the_compiled_lookup_reads_the_same_rows_with_the_same_weights(monkeypatch):
+    grids, _, _ = thinned(SHAPES)
+    ndc = torch.tensor(np.random.default_rng(1).uniform(-1.1, 1.1, size=(500, 3)), dtype=torch.float32)
+    ndc[:9] = torch.tensor([-1.0, 0.0, 1.0])[torch.arange(9) % 3, None]
+    monkeypatch.setattr(native, "_chosen", "native")
+    for grid in grids:
+        planes = torch.arange(500) % grid.depth
+        for fast, plain in zip(bilinear_rows(grid, planes, ndc), grid.bilinear(planes, ndc), strict=True):
+            assert torch.equal(fast, plain)
+
+
+def test_rows_and_texels_are_each_others_way_back():
+    grids, table, _ = thinned(SHAPES)
+    held = torch.zeros(len(table), dtype=torch.bool)
+    for grid in grids:
+        z, y, x = torch.meshgrid(*(torch.arange(n) for n in (grid.depth, grid.height, grid.width)), indexing="ij")
+        rows = grid.row(z, y, x)
+        stored = rows >= BRICK
+        assert torch.equal(rows.reshape(-1), grid.rows) and torch.equal(grid.holds(rows), stored)
+        for a, b in zip(grid.texel(rows[stored]), (z, y, x), strict=True):
+            assert torch.equal(a, b[stored])
+        assert not held[rows[stored]].any() and len(rows[stored].unique()) == stored.sum()
+        held[rows[stored]] = True
+    assert not held[:BRICK].any() and not any(grid.holds(torch.arange(BRICK)).any() for grid in grids)
+
+
+def test_neighbours_are_the_stored_texels_beside_a_texel():
+    grids, _, _ = thinned(SHAPES)
+    for grid in grids:
+        z, y, x = torch.meshgrid(*(torch.arange(n) for n in (grid.depth, grid.height, grid.width)), indexing="ij")
+        block = grid.row(z, y, x).numpy()
+        padded = np.pad(block, 1)
+        rows = grid.rows[grid.rows >= BRICK]
+        found, exists = grid.neighbours(rows)
+        for row, near, there in zip(rows.tolist(), found.tolist(), exists.tolist(), strict=True):
+            k, j, i = (int(a[0]) + 1 for a in np.nonzero(block == row))
+            wanted = [padded[k, j, i - 1], padded[k, j, i + 1], padded[k, j - 1, i], padded[k, j + 1, i],
+                      padded[k - 1, j, i], padded[k + 1, j, i]]  # fmt: skip
+            assert near == [w if w >= BRICK else row for w in wanted]
+            assert there == [float(w >= BRICK) for w in wanted]
+
+
+def test_planes_are_read_and_written_as_images():
+    grids, table, blocks = thinned(SHAPES)
+    copy = table.clone()
+    for grid, block in zip(grids, blocks, strict=True):
+        for planes in (slice(None), slice(grid.depth - 1, grid.depth)):
+            assert np.array_equal(read_planes(table, grid, planes), block[planes])
+            write_planes(copy, grid, planes, torch.tensor(-block[planes]))
+        stored = grid.rows[grid.rows >= BRICK]
+        assert torch.equal(copy[stored], -table[stored])
+    assert torch.equal(copy[:BRICK], table[:BRICK]), "images of tiles that hold nothing go nowhere"
+
+
+# Rays ----------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("form", ["paper", "opacity", None])
+@pytest.mark.parametrize("route", ["torch", "native"])
+def test_rays_through_released_bricks_look_as_the_oracle_says(monkeypatch, route, form):
+    monkeypatch.setattr(native, "_chosen", route)
+    field = bricked_field()
+    assert compare(field, *random_rays(field.plan, 12, seed=5), form) >= 8
+
+
+@pytest.mark.parametrize("form", ["paper", None])
+def test_the_march_leaves_out_what_holds_nothing_and_keeps_the_rest(monkeypatch, form):
+    field, rays = bricked_field(0.4), None
+    rays = bundle(*random_rays(field.plan, 200, seed=1))
+    found = []
+    for route in ("native", "torch"):
+        monkeypatch.setattr(native, "_chosen", route)
+        found.append(render(field, rays, 1e-3, form))
+    fast, plain = found
+    same = (fast.samples.metadata["valid"].sum(1) == plain.samples.metadata["valid"].sum(1))[:, 0]
+    assert same.float().mean() > 0.97
+    assert (fast.rgb - plain.rgb).abs()[same].max() < 3e-5
+    assert (fast.composite.transmittance - plain.composite.transmittance).abs().max() < 1.2e-5
+    assert torch.equal(fast.report.live, plain.report.live)
+
+
+def test_colours_without_gradients_equal_those_with():
+    field = bricked_field().eval()
+    samples, _ = MMPISampler()(bundle(*random_rays(field.plan, 60, seed=8)), field=field, threshold=0.0)
+    with torch.no_grad():
+        fast = field.get_outputs(samples)[FieldHeadNames.RGB]
+    plain = field.get_outputs(samples, field.get_density(samples)[1])[FieldHeadNames.RGB]
+    assert plain.std() > 0.05 and (fast - plain).abs().max() < 1e-5
+
+
+@pytest.mark.parametrize("order", ["rising", "anyhow"])
+@pytest.mark.parametrize("channels", [1, 5, 9, 21])
+def test_variation_beside_released_bricks_equals_float64(channels, order):
+    grids, _, _ = thinned(SHAPES)
+    rows = torch.cat([grid.rows[grid.rows >= BRICK] for grid in grids] + [torch.arange(3)])
+    mixed = rows[torch.randperm(len(rows), generator=torch.Generator().manual_seed(3))]
+    rows = rows.sort()[0] if order == "rising" else mixed
+    table = torch.randn(len(grids[0].places) * BRICK, channels, generator=torch.Generator().manual_seed(0)) * 2
+    scales, found = [(0.5 + k, 2.0, 1.0) for k in range(len(grids))], []
+    for function, dtype in ((total_variation, torch.float32), (total_variation_reference, torch.float64)):
+        values = table[rows].to(dtype).requires_grad_()
+        value = function(values, table.to(dtype), rows, grids, scales)
+        value.backward()
+        found.append((value.item(), values.grad.double()))
+    assert found[0][0] == pytest.approx(found[1][0], rel=1e-6) and found[0][0] > 1
+    assert torch.allclose(found[0][1], found[1][1], atol=2e-6) and not found[0][1][rows < BRICK].any()
+    assert (found[1][1] != 0).float().mean() > 0.9
+
+
+# The empty brick -----------------------------------------------------------------------------------------------------
+
+
+def train(field, steps=4, blends=False):
+    """Steps of everything that learns, with moments, on rays that read bricks and what lies beside them."""
+    tables = [getattr(field, name) for name in TABLES]
+    optimizer = TouchedAdam([*tables, field.networks.weights], lr=0.1)
+    field.train()
+    read = 0
+    for step in range(steps):
+        rays = bundle(*random_rays(field.plan, 60, seed=step))
+        samples, _ = MMPISampler()(rays, field=field, threshold=0.0)
+        tau, lookup = field.get_density(samples)
+        read += sum(int((taps.rows < BRICK).sum()) for taps in lookup.groups)
+        rgb = field.get_outputs(samples, lookup)[FieldHeadNames.RGB]
+        loss = (rgb * torch.tanh(tau)).sum() + field.total_variation(lookup, 1.0, 1.0)
+        loss = loss + field.sample_shares(samples, lookup)[0].square().sum()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    return optimizer, read
+
+
+@pytest.mark.parametrize("route", ["torch", "native"])
+def test_the_empty_brick_never_changes(monkeypatch, route):
+    monkeypatch.setattr(native, "_chosen", route)
+    field = bricked_field()
+    before = {name: getattr(field, name).detach().clone() for name in TABLES}
+    optimizer, read = train(field)
+    assert read > 1000, "rays do read it"
+    for name, empty in zip(TABLES, (RELEASED_DENSITY, 0.0, 0.0), strict=True):
+        table = getattr(field, name)
+        assert (table[:BRICK] == empty).all() and not torch.equal(table, before[name])
+        assert not table.grad.to_dense()[:BRICK].any()
+        assert not optimizer.state[table]["exp_avg"][:BRICK].any()
+    assert not field.touched[:BRICK].any() and field.touched.any()
+
+
+def test_a_dense_gradient_leaves_the_empty_brick_alone_too():
+    field = bricked_field()
+    interpolate_reference(
+        field.density, *field.grids[0].bilinear(torch.zeros(9).long(), torch.rand(9, 2))
+    ).sum().backward()
+    assert not field.density.grad[:BRICK].any() and field.density.grad.shape == field.density.shape
+
+
+# Growth --------------------------------------------------------------------------------------------------------------
+
+
+def test_growth_equals_dense_growth_where_everything_around_is_stored_and_goes_on_from_there():
+    shapes, wider = [(3, 16, 21), (2, 24, 30), (4, 9, 17)], [(3, 23, 30), (2, 34, 42), (6, 13, 24)]
+    is_cube = [False, False, True]
+    full = make_grids(shapes)
+    dense = new_table(full[0].tiles, 2, dtype=torch.float64).normal_(generator=torch.Generator().manual_seed(0))
+    tiles, kept = keep_bricks(full[0].tiles, chance(len(full[0].places), 0.7))
+    some, thin = make_grids(shapes, tiles), dense.view(-1, BRICK, 2)[kept].reshape(-1, 2)
+    thin[:BRICK] = -20.0
+    wide = make_grids(wider)
+    reached = grown_tiles(some, wide, is_cube, None)
+    bricks = make_grids(wider, reached)
+    found, wanted = resample(thin, some, bricks, is_cube, -20.0), resample(dense, full, wide, is_cube)
+    flat = torch.full_like(thin, 3.0)
+    flat[:BRICK] = -20.0
+    flat = resample(flat, some, bricks, is_cube, -20.0)
+    exact = 0
+    for k, (a, b) in enumerate(zip(bricks, wide, strict=True)):
+        stored = (some[k].rows >= BRICK).float().view(*shapes[k], 1)
+        mode = {"size": wider[k], "mode": "trilinear"} if is_cube[k] else {"size": wider[k][1:], "mode": "bilinear"}
+        axes = (3, 0, 1, 2) if is_cube[k] else (0, 3, 1, 2)
+        images = stored.permute(*axes)[None] if is_cube[k] else stored.permute(*axes)
+        there = torch.nn.functional.interpolate(images, align_corners=True, **mode).reshape(-1)
+        rows = a.rows
+        assert (rows[there > 1e-6] >= BRICK).all(), "whatever has a stored source is stored"
+        alike = (there > 1 - 1e-6) & (rows >= BRICK)
+        assert torch.allclose(found[rows[alike]], wanted[b.rows[alike]], atol=1e-12)
+        partly = (there > 1e-6) & ~alike
+        assert found[rows[partly]].abs().max() <= dense.abs().max() + 1e-9, "no texel mixes with the empty brick"
+        assert torch.allclose(flat[rows[there > 1e-6]], torch.tensor(3.0, dtype=torch.float64), atol=1e-9)
+        assert (found[rows[(there == 0) & (rows >= BRICK)]] == -20).all()
+        exact += int(alike.sum())
+        assert partly.any() and (rows < BRICK).any()
+    assert exact > 500
+
+
+def test_growth_stores_only_what_training_rays_reach():
+    old, new = make_grids([(2, 16, 16)]), make_grids([(2, 32, 32)])
+    reachable = chance(32, 0.5)
+    assert torch.equal(grown_tiles(old, new, [False], reachable) > 0, reachable)
+
+
+# Release -------------------------------------------------------------------------------------------------------------
+
+
+def used(field, rays, least):
+    """Notes what rays see, and releases."""
+    field.look_afresh()
+    samples, report = MMPISampler()(rays, field=field, threshold=0.0)
+    _, lookup = field.get_density(samples)
+    weights = render(field, rays).composite.weights
+    field.note_use(lookup, weights, report.live)
+    return weights, field.release_unused(least)
+
+
+def test_a_release_changes_images_by_no_more_than_what_it_gives_up():
+    field = bricked_field(share=1.0, log_depths=(-4, 1))
+    rays = bundle(*random_rays(field.plan, 900, seed=3))
+    before, bricks = render(field, rays), field.num_bricks
+    weights, kept = used(field, rays, least := 0.02)
+    assert kept is not None and 0.1 * bricks < field.num_bricks < 0.9 * bricks
+    after = render(field, rays)
+    assert torch.equal(before.report.live, after.report.live)
+    # Only samples that weigh less than the bound get thinner, so what they weighed is all that others can gain.
+    given_up = torch.where(weights < least, weights, 0.0).sum(-1)
+    change = (after.rgb - before.rgb).abs().amax(-1)
+    assert (change <= 2 * given_up + 1e-5).all() and change.max() > 1e-4
+    heavy = before.composite.weights >= least
+    assert (after.composite.weights[heavy] >= before.composite.weights[heavy] - 1e-5).all()
+
+
+def test_nothing_is_given_up_before_enough_rays_were_seen():
+    field = bricked_field()
+    few = bundle(*random_rays(field.plan, 5, seed=3))
+    _, kept = used(field, few, least=0.5)
+    assert kept is None and float(field.crossings) == 0 and not field.peak.any(), "the next look starts afresh"
+    field.crossings.fill_(ENOUGH_CROSSINGS * field.num_bricks)
+    assert field.release_unused(0.5) is not None and field.num_bricks == 0
+
+
+def test_moments_and_marks_follow_their_texels():
+    field = bricked_field()
+    optimizer, _ = train(field)
+    field.touched[BRICK:] = chance(len(field.touched) - BRICK, 0.5).to(torch.uint8)
+    tables = {name: getattr(field, name) for name in TABLES}
+    grids, count = field.grids, field.num_bricks
+
+    def by_texel(grids, table):
+        return torch.cat([table.detach()[grid.rows] for grid in grids])
+
+    states = [optimizer.state[t][m] for t in tables.values() for m in ("exp_avg", "exp_avg_sq")]
+    before = [by_texel(grids, t) for t in (*tables.values(), *states, field.touched)]
+    field.peak = torch.rand(count + 1, generator=torch.Generator().manual_seed(0))
+    field.crossings.fill_(1e9)
+    old_rows = torch.cat([g.rows for g in grids])
+    stays = field.peak[old_rows // BRICK] >= 0.5
+    kept = field.release_unused(0.5)
+    for table in tables.values():
+        optimizer.keep_blocks(table, kept, BRICK)
+    states = [optimizer.state[t][m] for t in tables.values() for m in ("exp_avg", "exp_avg_sq")]
+    after = [by_texel(field.grids, t) for t in (*tables.values(), *states, field.touched)]
+    assert 0 < field.num_bricks < count and all(tables[n] is getattr(field, n) for n in TABLES)
+    for a, b in zip(before, after, strict=True):
+        assert torch.equal(a[stays & (old_rows >= BRICK)], b[stays & (old_rows >= BRICK)])
+    rows = torch.cat([g.rows for g in field.grids])
+    assert (rows[~stays] < BRICK).all() and (rows[stays & (old_rows >= BRICK)] >= BRICK).all()
+    train(field, steps=1)  # and goes on
+
+
+def test_bricks_without_a_trained_texel_go_before_blending_and_change_nothing():
+    field = bricked_field()
+    field.touched[torch.cat([g.rows for g in field.grids[1:2]])] = 0
+    field.reliability.data[field.touched == 0] = 0  # never trained: as it started
+    rays = bundle(*random_rays(field.plan, 40, seed=2))
+    field.density.data[field.touched == 0] = RELEASED_DENSITY
+    before, count = render(field, rays, blend_form="paper"), field.num_bricks
+    assert field.release_untouched() is not None and field.num_bricks < count
+    after = render(field, rays, blend_form="paper")
+    assert (field.grids[1].rows < BRICK).all()
+    assert (after.composite.weights - before.composite.weights).abs().max() < 1e-6
+    assert (after.rgb - before.rgb).abs().max() < 1e-6
+
+
+# State ---------------------------------------------------------------------------------------------------------------
+
+
+def test_a_state_dict_holds_the_stored_bricks_alone_and_comes_back_as_it_was():
+    written, read = bricked_field(0.3), MMPIField(big_plan(4), feature_channels=5, hidden_width=6)
+    written.peak.uniform_()
+    state = written.state_dict()
+    assert len(state["density"]) == BRICK * (written.num_bricks + 1) < 0.4 * BRICK * len(state["tiles"])
+    read.samples_per_voxel = written.samples_per_voxel
+    read.load_state_dict(state)
+    for name, value in state.items():
+        assert torch.equal(read.state_dict()[name], value), name
+    read.tiles[0] += 1
+    assert not torch.equal(read.tiles, state["tiles"]), "nothing is shared with what was read"
+    read.tiles[0] -= 1
+    rays = bundle(*random_rays(written.plan, 20, seed=3))
+    assert torch.equal(render(read.eval(), rays).rgb, render(written.eval(), rays).rgb)
+
+
+def test_a_state_dict_of_dense_tables_is_put_into_bricks():
+    """As they were written before there were bricks: head by head, plane by plane, row by row."""
+    field = fill(MMPIField(big_plan(), feature_channels=5, hidden_width=6), seed=0)
+    field.touched[::3] = 0
+    rows = torch.cat([g.rows for g in field.grids])
+    state = {k: v for k, v in field.state_dict().items() if k not in ("tiles", "peak", "crossings")}
+    dense = {**state, **{name: state[name][rows] for name in (*TABLES, "touched")}}
+    assert len(dense["density"]) == field.plan.texels
+    read = MMPIField(big_plan(4), feature_channels=5, hidden_width=6)
+    read.load_state_dict(dense)
+    rays = bundle(*random_rays(field.plan, 20, seed=3))
+    assert torch.equal(render(read.eval(), rays, 0.0, "paper").rgb, render(field.eval(), rays, 0.0, "paper").rgb)
+    assert torch.equal(read.touched[rows], field.touched[rows])
+    assert from_dense(dense["density"], head_grids(field.plan)).shape == read.density.shape

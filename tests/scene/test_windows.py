@@ -1,0 +1,176 @@
+"""Long captures: split into windows, whose shares change along the way; read window by window."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hand_made import make_mpi
+from long_road import road
+from training_runs import datamanager
+
+from mmpi_ns.placement.rule import PlacementConfig
+from mmpi_ns.placement.split import FEWEST, find_balls, of_cameras, place_windows
+from mmpi_ns.scene.plan import ScenePlan
+from mmpi_ns.scene.windows import Window, WindowedPlan, window_shares
+from mmpi_ns.training.phases import make_schedule
+
+# Splitting -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_short_capture_is_one_window_and_its_plan_is_written_as_before():
+    plan = place_windows(road(30), PlacementConfig(max_texels=1e5))
+    assert len(plan) == 1 and plan.windows[0].radius == math.inf
+    assert "windows" not in json.loads(plan.to_json())
+    assert ScenePlan.from_json(plan.to_json()) == plan.plans[0]
+
+
+def test_windows_hold_every_camera_are_no_longer_than_asked_and_grow_with_the_road():
+    counts = []
+    for length in (200, 400, 800):
+        seen = road(length)
+        balls = find_balls(seen, 4.0)
+        distance = np.stack([np.linalg.norm(seen.centers - c, axis=-1) for c, _, _ in balls], -1)
+        radii = np.array([r for _, r, _ in balls])
+        assert (distance <= radii + 1e-9).any(-1).all()
+        median = np.median(np.linalg.norm(seen.points - seen.centers[seen.seen_by], axis=-1))
+        assert radii.max() < 0.75 * 4.0 * median
+        order = np.array([c for c, _, _ in balls])[:, 0]
+        assert (np.diff(order) > 0).all() or (np.diff(order) < 0).all()  # along the road
+        counts.append(len(balls))
+    assert counts[0] >= 3
+    assert 1.6 * counts[0] <= counts[1] <= 2.4 * counts[0] and 1.6 * counts[1] <= counts[2] <= 2.4 * counts[1]
+
+
+def test_windows_do_not_depend_on_the_order_of_the_cameras():
+    seen = road(200)
+    shuffled = of_cameras(seen, np.random.default_rng(3).permutation(len(seen.centers)))
+    for (a, ra, ma), (b, rb, mb) in zip(find_balls(seen, 4.0), find_balls(shuffled, 4.0), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-9)
+        np.testing.assert_allclose([ra, ma], [rb, mb], rtol=1e-2)
+
+
+def test_no_window_has_too_few_cameras():
+    seen = road(120)
+    lone = of_cameras(seen, np.array([*range(60), 118, 119]))
+    centers = lone.centers
+    for center, radius, _ in find_balls(lone, 3.0):
+        assert (np.linalg.norm(centers - center, axis=-1) <= radius + 1e-9).sum() >= FEWEST
+
+
+def test_some_cameras_observations_are_those_of_the_whole():
+    seen = road(40)
+    chosen = np.array([7, 3, 20])
+    part = of_cameras(seen, chosen)
+    assert len(part.centers) == 3 and len(part.seen_by) == 90
+    for new, old in enumerate(chosen):
+        np.testing.assert_array_equal(part.centers[new], seen.centers[old])
+        np.testing.assert_array_equal(
+            np.sort(part.seen_point[part.seen_by == new]), np.sort(seen.seen_point[seen.seen_by == old])
+        )
+
+
+# Shares --------------------------------------------------------------------------------------------------------------
+
+
+def line_of(*places: float, radius=1.0, margin=0.5) -> tuple[Window, ...]:
+    plan = ScenePlan((make_mpi(),), None, 0.05, 1.5)
+    return tuple(Window((x, 0.0, 0.0), radius, margin, plan) for x in places)
+
+
+def along(*x: float) -> torch.Tensor:
+    return torch.tensor([[v, 0.0, 0.0] for v in x])
+
+
+def test_shares_are_whole_inside_alone_and_even_in_the_middle_of_an_overlap():
+    windows = line_of(0.0, 2.5)
+    shares = window_shares(along(0.0, 0.5, 1.25, 2.5, 9.0, -7.0), windows)
+    expected = [[1, 0], [1, 0], [0.5, 0.5], [0, 1], [0, 1], [1, 0]]
+    torch.testing.assert_close(shares, torch.tensor(expected).float())
+
+
+def test_shares_change_steadily_along_the_way():
+    windows = line_of(0.0, 2.2, 4.0)
+    shares = window_shares(along(*np.linspace(-1, 5, 6001).tolist()), windows)
+    torch.testing.assert_close(shares.sum(-1), torch.ones(6001))
+    assert shares.diff(dim=0).abs().max() < 0.001 / 0.5 * 1.01
+
+
+# Plans ---------------------------------------------------------------------------------------------------------------
+
+
+def test_a_windowed_plan_survives_json():
+    plan = WindowedPlan(line_of(0.0, 2.5))
+    assert WindowedPlan.from_json(plan.to_json()) == plan
+    assert plan.names[0].startswith("window 0: ") and plan.first_head(1) == 1
+
+
+@pytest.mark.parametrize(
+    "change, sentence",
+    [
+        (lambda d: d["windows"][1].pop("margin"), "Every window of a scene plan needs"),
+        (lambda d: d["windows"][1].update(radius=None), "radius"),
+        (lambda d: d["windows"][0].update(margin=0.0), "margin > 0"),
+        (lambda d: d.update(windows=[]), "at least one window"),
+    ],
+)
+def test_a_windowed_plan_that_cannot_be_used_is_refused(change, sentence):
+    data = json.loads(WindowedPlan(line_of(0.0, 2.5)).to_json())
+    change(data)
+    with pytest.raises(ValueError, match=sentence):
+        WindowedPlan.from_json(json.dumps(data))
+
+
+def test_a_schedule_walks_through_each_window_anew():
+    one = make_schedule("two-phase", 20, blend_share=0.25, finetune_share=0.25)
+    three = replace(one, windows=3)
+    assert three.total_steps == 60
+    for step in range(60):
+        window, local = divmod(step, 20)
+        assert three.window_at(step) == window
+        assert three.phase_at(step).name == one.phase_at(local).name
+        assert three.phase_at(step).start <= step < three.phase_at(step).end
+        assert three.texel_factor(step) == one.texel_factor(local)
+        assert three.sharpened(step) == one.sharpened(local)
+        assert three.rate_factor("density", step) == pytest.approx(one.rate_factor("density", local))
+    assert three.window_at(60) == 2
+
+
+# Long captures in little memory --------------------------------------------------------------------------------------
+
+
+def test_a_capture_too_large_for_memory_is_read_window_by_window_with_the_same_draws(scene):
+    cameras = np.array([1, 2, 5])
+    at_once, by_window = (datamanager(scene, resident_pixels=limit) for limit in (60e6, 0))
+    assert at_once.pool is not None and by_window.pool is None
+    for manager in (at_once, by_window):
+        manager.use_cameras(cameras)
+        manager.train()
+    assert by_window.pool is not None
+    assert set(by_window.pool.indices[:, 0].tolist()) == {1, 2, 5} < set(at_once.pool.indices[:, 0].tolist())
+    for step in range(3):
+        (ours, a), (theirs, b) = (m.next_train(step) for m in (at_once, by_window))
+        assert torch.equal(a["image"], b["image"]) and torch.equal(a["indices"], b["indices"])
+        assert torch.equal(ours.directions, theirs.directions)
+        assert set(a["indices"][:, 0].tolist()) <= {1, 2, 5}
+
+
+def test_without_windows_a_large_capture_is_read_when_it_is_first_drawn_from(scene):
+    at_once, late = (datamanager(scene, resident_pixels=limit) for limit in (60e6, 0))
+    assert torch.equal(at_once.next_train(0)[1]["image"], late.next_train(0)[1]["image"])
+
+
+def test_evaluation_batches_are_pixels_of_one_image_drawn_by_the_step(scene):
+    manager = datamanager(scene)
+    bundle, batch = manager.next_eval(3)
+    assert int(manager.next_eval(3)[0].camera_indices[0]) == int(bundle.camera_indices[0])
+    assert len(bundle) == len(batch["image"]) == manager.config.eval_num_rays_per_batch
+    assert len(set(batch["indices"][:, 0].tolist())) == 1
+    assert {int(manager.next_eval(s)[0].camera_indices[0]) for s in range(20)} == {0, 1}
+    image = manager.eval_dataset[int(batch["indices"][0, 0])]["image"]
+    expected = image[batch["indices"][:, 1], batch["indices"][:, 2]]
+    assert torch.equal(batch["image"], expected)

@@ -1,0 +1,178 @@
+"""Each loss against a value worked out by hand, and its gradient (losses.py)."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from mmpi_ns.training import losses
+
+F64 = torch.float64
+
+
+def tensor(values, dtype=F64):
+    return torch.tensor(np.asarray(values), dtype=dtype)
+
+
+def test_photometric_is_the_mean_squared_error():
+    predicted, observed = tensor([[0.0, 0.5, 1.0], [1.0, 1.0, 1.0]]), tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 0.0]])
+    assert losses.photometric(predicted, observed).item() == pytest.approx((0.25 + 1 + 1) / 6)
+
+
+def test_point_color_weighs_each_samples_error_by_its_weight():
+    colors = tensor([[[1.0, 0.0, 0.0], [0.0, 0.0, 0.5]], [[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]]])
+    weights = tensor([[0.5, 0.25], [0.0, 1.0]])
+    observed = tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 0.0]])
+    # Ray 1: 0.5 * 1 + 0.25 * 0.25; ray 2: 1 * 1; mean over two rays.
+    assert losses.point_color(colors, weights, observed).item() == pytest.approx((0.5 + 0.0625 + 1.0) / 2)
+
+
+def test_point_color_moves_colours_but_never_weights():
+    colors, weights = torch.rand(2, 3, 3, requires_grad=True), torch.rand(2, 3, requires_grad=True)
+    losses.point_color(colors, weights, torch.rand(2, 3)).backward()
+    assert weights.grad is None and colors.grad.abs().min() > 0
+
+
+def test_point_color_of_no_rays_is_zero():
+    assert losses.point_color(torch.zeros(0, 2, 3), torch.zeros(0, 2), torch.zeros(0, 3)).item() == 0
+
+
+def test_background_entropy_is_largest_for_a_coin_flip_and_nothing_for_a_decision():
+    assert losses.background_entropy(tensor([[0.5]])).item() == pytest.approx(math.log(2))
+    quarter = -(0.25 * math.log(0.25) + 0.75 * math.log(0.75))
+    assert losses.background_entropy(tensor([[0.25], [0.5]])).item() == pytest.approx((quarter + math.log(2)) / 2)
+    assert losses.background_entropy(tensor([[0.0], [1.0]])).item() < 2e-5
+
+
+def test_distortion_of_two_samples_by_hand():
+    weights, positions, intervals = tensor([[0.6, 0.2]]), tensor([[0.1, 0.5]]), tensor([[0.03, 0.06]])
+    expected = 2 * 0.6 * 0.2 * 0.4 + (0.36 * 0.03 + 0.04 * 0.06) / 3
+    assert losses.distortion(weights, positions, intervals).item() == pytest.approx(expected)
+
+
+def distortion_pairwise(weights, positions, intervals):
+    """Every pair of samples, as in mip-NeRF 360 eq. (15)."""
+    total = 0.0
+    for w, s, delta in zip(weights.tolist(), positions.tolist(), intervals.tolist(), strict=True):
+        for i in range(len(w)):
+            for j in range(len(w)):
+                total += w[i] * w[j] * abs(s[i] - s[j])
+            total += w[i] ** 2 * delta[i] / 3
+    return total / len(weights)
+
+
+@pytest.mark.parametrize(("dtype", "error"), [(torch.float32, 1e-5), (F64, 1e-12)])
+def test_distortion_equals_the_double_loop(dtype, error):
+    rng = np.random.default_rng(0)
+    weights = tensor(rng.dirichlet(np.full(60, 0.2), size=4), dtype)
+    weights[1, 30:] = 0  # empty slots
+    positions = tensor(np.sort(rng.random((4, 60)), -1), dtype)
+    positions[2] = positions[2].round(decimals=1)  # ties
+    intervals = tensor(rng.random((4, 60)) / 60, dtype)
+    wanted = distortion_pairwise(weights.double(), positions.double(), intervals.double())
+    assert losses.distortion(weights, positions, intervals).item() == pytest.approx(wanted, rel=error)
+
+
+def test_distortion_does_not_change_when_the_ray_is_moved():
+    rng = np.random.default_rng(1)
+    weights, positions = tensor(rng.random((2, 10))), tensor(np.sort(rng.random((2, 10)), -1) / 2)
+    intervals = torch.zeros_like(weights)
+    here, there = (losses.distortion(weights, positions + shift, intervals).item() for shift in (0.0, 0.5))
+    assert here == pytest.approx(there)
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.3, 2.0])
+def test_total_variation_has_dvgos_gradient(scale):
+    rng = np.random.default_rng(2)
+    values = tensor(rng.normal(size=(20, 3)) * 2).requires_grad_()
+    neighbours = tensor(rng.normal(size=(20, 4, 3)) * 2).requires_grad_()
+    scales = tensor(rng.random((20, 4)) < 0.8) * scale
+    losses.total_variation(values, neighbours, scales).backward()
+    expected = np.zeros((20, 3))
+    for n in range(20):
+        for m in range(4):
+            difference = values.detach().numpy()[n] - neighbours.detach().numpy()[n, m]
+            expected[n] += float(scales[n, m]) / 6 * np.clip(difference, -1, 1)
+    assert np.allclose(values.grad, expected, rtol=1e-12, atol=1e-14)
+    assert neighbours.grad is None
+
+
+def test_total_variation_by_hand():
+    # Differences 0.5 (quadratic: 0.125) and 3 (linear: 2.5), scales 1 and 0.5.
+    loss = losses.total_variation(tensor([[1.0]]), tensor([[[0.5], [-2.0]]]), tensor([[1.0, 0.5]]))
+    assert loss.item() == pytest.approx((0.125 + 0.5 * 2.5) / 6)
+    assert losses.total_variation(tensor([[1.0]]), tensor([[[9.0]]]), tensor([[0.0]])).item() == 0
+
+
+def test_keypoint_depth_by_hand():
+    # Known at 1/t = 2, width 0.1: samples at 0, 1 and 2 standard deviations (0.2 each), one far away.
+    weights, inverse_t = tensor([[0.1, 0.4, 0.2, 0.3]]), tensor([[2.4, 2.2, 2.0, 0.5]])
+    valid = torch.ones(1, 4, dtype=torch.bool)
+    mass = 0.1 * math.exp(-2) + 0.4 * math.exp(-0.5) + 0.2
+    loss = losses.keypoint_depth(weights, inverse_t, tensor([[2.0]]), valid, relative_width=0.1)
+    assert loss.item() == pytest.approx(-math.log(mass + 1e-4), abs=1e-9)
+
+
+def test_keypoint_depth_leaves_out_rays_that_cannot_reach_their_point():
+    weights = torch.full((4, 2), 0.5, dtype=F64)
+    inverse_t = tensor([[1.0, 0.0], [1.0, 0.0], [1.0, 0.0], [1.0, 0.0]])
+    valid = torch.tensor([[True, True], [True, True], [False, True], [True, True]])
+    known = tensor([[1.0], [3.0], [1.0], [0.0]])  # reached, too near, sample in an empty slot, no point
+    both = losses.keypoint_depth(weights, inverse_t, known, valid)
+    alone = losses.keypoint_depth(weights[:1], inverse_t[:1], known[:1], valid[:1])
+    assert both.item() == alone.item() == pytest.approx(-math.log(0.5 + 1e-4))
+    none = losses.keypoint_depth(weights[1:], inverse_t[1:], known[1:], valid[1:])
+    assert none.item() == 0
+
+
+def test_keypoint_depth_gathers_nothing_from_empty_slots():
+    weights, inverse_t = tensor([[0.25, 0.5]]), tensor([[1.0, 1.0]])
+    loss = losses.keypoint_depth(weights, inverse_t, tensor([[1.0]]), torch.tensor([[True, False]]))
+    assert loss.item() == pytest.approx(-math.log(0.25 + 1e-4))
+
+
+@pytest.mark.parametrize("scale", [1e-4, 1e5])
+def test_keypoint_depth_does_not_depend_on_the_scene_scale(scale):
+    weights, inverse_t, known = tensor([[0.2, 0.5, 0.3]]), tensor([[1.1, 1.0, 0.9]]), tensor([[1.02]])
+    valid = torch.ones(1, 3, dtype=torch.bool)
+    loss = losses.keypoint_depth(weights, inverse_t, known, valid)
+    scaled = losses.keypoint_depth(weights, inverse_t / scale, known / scale, valid)
+    assert loss.item() == pytest.approx(scaled.item()) and loss.item() > 0.1
+
+
+def test_losses_have_the_gradient_of_finite_differences():
+    rng = np.random.default_rng(5)
+    weights, colors = (tensor(rng.random(s) + 0.05).requires_grad_() for s in ((3, 5), (3, 5, 3)))
+    positions = tensor(np.sort(rng.random((3, 5)), -1)).requires_grad_()
+    intervals, observed = tensor(rng.random((3, 5))), tensor(rng.random((3, 3)))
+    valid = torch.ones(3, 5, dtype=torch.bool)
+    known, inverse_t = tensor([[1.0], [2.0], [0.0]]), tensor(1 + rng.random((3, 5)) * 0.2)
+    transmittance = tensor([[0.2], [0.7], [0.5]]).requires_grad_()
+    values, scales = tensor([[0.3], [2.5]]).requires_grad_(), tensor([[1.0, 0.5]] * 2)
+    neighbours = tensor([[[0.1], [5.0]], [[0.0], [2.0]]])
+    check = torch.autograd.gradcheck
+    assert check(lambda c: losses.photometric(c[:, 0], observed), (colors,))
+    assert check(lambda c: losses.point_color(c, weights, observed), (colors,))
+    assert check(losses.background_entropy, (transmittance,))
+    assert check(lambda w, s: losses.distortion(w, s, intervals), (weights, positions))
+    assert check(lambda w: losses.keypoint_depth(w, inverse_t, known, valid, 0.1), (weights,))
+    assert check(lambda v: losses.total_variation(v, neighbours, scales), (values,))
+
+
+def test_gradients_are_finite_for_empty_and_opaque_rays():
+    weights = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], requires_grad=True)
+    transmittance = torch.tensor([[1.0], [0.0], [0.0]], requires_grad=True)
+    inverse_t = torch.tensor([[1e30, 1.0, 0.0], [5.0, 0.0, 0.0], [1.0, 1e-20, 0.0]])
+    known = torch.tensor([[0.0], [5.0], [1e-20]])
+    valid = torch.tensor([[True, True, False]] * 3)
+    loss = (
+        losses.background_entropy(transmittance)
+        + losses.distortion(weights, torch.tensor([[0.0, 0.5, 1.0]] * 3), torch.zeros(3, 3))
+        + losses.keypoint_depth(weights, inverse_t, known, valid)
+    )
+    loss.backward()
+    assert torch.isfinite(loss)
+    assert torch.isfinite(weights.grad).all() and torch.isfinite(transmittance.grad).all()

@@ -1,0 +1,172 @@
+"""Which phase a step is in, and what trains there (phases.py)."""
+
+from __future__ import annotations
+
+import json
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from mmpi_ns.training.phases import TRAINS, Phase, Schedule, make_schedule
+
+KINDS = ("density", "features", "colour", "reliability", "exposure")
+
+
+def two_phase(**settings):
+    return make_schedule("two-phase", 40_000, **settings)
+
+
+def test_phases_follow_each_other_and_end_with_the_run():
+    schedule = two_phase(blend_share=0.25, finetune_share=0.125)
+    assert schedule.phases == (
+        Phase("individual", 0, 25_000),
+        Phase("blend", 25_000, 35_000),
+        Phase("finetune", 35_000, 40_000),
+    )
+    assert schedule.total_steps == 40_000
+
+
+def test_paper_schedule_is_30k_individual_and_10k_blend():
+    assert two_phase().phases == (Phase("individual", 0, 30_000), Phase("blend", 30_000, 40_000))
+    assert make_schedule("joint", 30_000).phases == (Phase("joint", 0, 30_000),)
+
+
+@pytest.mark.parametrize(
+    ("step", "name"),
+    [
+        (0, "individual"),
+        (29_999, "individual"),
+        (30_000, "blend"),
+        (39_999, "blend"),
+        (40_000, "blend"),
+        (10**9, "blend"),
+    ],
+)
+def test_a_phase_ends_just_before_the_next_begins(step, name):
+    assert two_phase().phase_at(step).name == name
+
+
+def test_reliability_takes_part_from_the_first_blend_step_on():
+    schedule = two_phase(finetune_share=0.25)
+    assert [schedule.blends_at(s) for s in (0, 19_999, 20_000, 29_999, 30_000, 40_000)] == [False] * 2 + [True] * 4
+    assert not make_schedule("joint", 100).blends_at(100)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_rates_are_zero_exactly_where_a_kind_is_frozen(kind):
+    for schedule in (two_phase(finetune_share=0.25), make_schedule("joint", 100)):
+        for phase in schedule.phases:
+            for step in (phase.start, phase.end - 1):
+                rate = schedule.rate_factor(kind, step)
+                assert type(rate) is float
+                assert (rate > 0) == (kind in TRAINS[phase.name])
+
+
+def test_only_reliability_trains_in_blend_and_everything_else_before():
+    assert TRAINS["blend"] == {"reliability"}
+    assert TRAINS["individual"] == TRAINS["joint"] == {"density", "features", "colour", "exposure"}
+    assert TRAINS["finetune"] == set(KINDS)
+
+
+def test_rates_fall_by_the_given_decades_over_each_phase():
+    schedule = two_phase(decay_decades=2.0, finetune_share=0.25, finetune_rate=0.3)
+    assert schedule.rate_factor("density", 0) == 1.0
+    assert schedule.rate_factor("density", 10_000) == pytest.approx(0.1)
+    assert schedule.rate_factor("density", 19_999) == pytest.approx(0.01, rel=1e-3)
+    assert schedule.rate_factor("reliability", 20_000) == 1.0
+    assert schedule.rate_factor("density", 30_000) == pytest.approx(0.3)
+    assert schedule.rate_factor("reliability", 35_000) == pytest.approx(0.03)
+    assert schedule.rate_factor("density", 50_000) == pytest.approx(0.003)  # no further decay after the run
+
+
+def test_paper_rates_fall_tenfold_in_20k_of_30k_steps():
+    assert make_schedule("joint", 30_000).rate_factor("density", 20_000) == pytest.approx(0.1)
+
+
+def test_texels_double_at_each_growth_step():
+    schedule = make_schedule("joint", 30_000)
+    assert schedule.growth == (2_000, 4_000, 6_000, 8_000)
+    steps = (0, 1_999, 2_000, 3_999, 4_000, 6_000, 7_999, 8_000, 30_000)
+    assert [schedule.texel_factor(s) for s in steps] == [1 / 16, 1 / 16, 1 / 8, 1 / 8, 1 / 4, 1 / 2, 1 / 2, 1, 1]
+
+
+def test_growth_follows_the_first_phase_and_not_the_whole_run():
+    assert two_phase().growth == (2_000, 4_000, 6_000, 8_000)
+
+
+def test_growth_is_over_within_the_first_phase_of_any_length():
+    for steps in (1, 2, 7, 100, 1600):
+        schedule = make_schedule("two-phase", steps)
+        assert schedule.texel_factor(schedule.phases[0].end) == 1
+        assert schedule.texel_factor(0) == 1 / 16
+        assert list(schedule.growth) == sorted(schedule.growth)
+
+
+@pytest.mark.parametrize(("blend", "finetune"), [(0.05, 0.8), (0.6, 0.3), (0.0, 0.99), (0.99, 0.0)])
+def test_large_shares_of_few_steps_leave_one_for_the_first_phase(blend, finetune):
+    for steps in (1, 2, 3, 5, 1000):
+        phases = make_schedule("two-phase", steps, blend_share=blend, finetune_share=finetune).phases
+        assert phases[0].name == "individual" and phases[0].end >= 1 and phases[-1].end == steps
+        assert all(a.end == b.start and b.end > b.start for a, b in pairwise(phases))
+
+
+@pytest.mark.parametrize(("blend", "finetune"), [(0.5, 0.5), (0.9, 0.2), (-0.1, 0.3), (0.3, -0.1)])
+def test_shares_that_leave_nothing_for_the_first_phase_are_refused(blend, finetune):
+    with pytest.raises(ValueError, match=r"leave no step|must not be negative"):
+        make_schedule("two-phase", 1000, blend_share=blend, finetune_share=finetune)
+
+
+def test_without_growth_all_texels_are_there_from_the_start():
+    assert make_schedule("joint", 10, growth_shares=()).texel_factor(0) == 1
+
+
+def test_bricks_are_given_up_after_growth_and_what_is_seen_before_does_not_count():
+    schedule = make_schedule("joint", 1_000, release_shares=(0.1, 0.5, 0.75, 0.5), windows=2)
+    assert schedule.growth[-1] == 267 and schedule.release == (500, 750), "not before surfaces have formed, and once"
+    assert [s for s in range(2_000) if schedule.releases_at(s)] == [500, 750, 1_500, 1_750]
+    watched = [s for s in range(2_000) if schedule.watches(s)]
+    assert watched == [*range(267, 750), *range(1_267, 1_750)]
+    assert not any(make_schedule("joint", 100).watches(s) for s in range(100))
+    assert make_schedule("two-phase", 1_000, release_shares=(1.0,)).release == (750,), "shares of the first phase"
+
+
+def test_a_schedule_from_before_there_were_releases_has_none():
+    text = json.loads(make_schedule("joint", 100, release_shares=(0.5,)).to_json())
+    del text["release"]
+    assert Schedule.from_json(json.dumps(text)) == make_schedule("joint", 100)
+
+
+def test_phases_without_steps_are_left_out():
+    assert [p.name for p in make_schedule("two-phase", 100, blend_share=0.0).phases] == ["individual"]
+    assert make_schedule("two-phase", 1).phases == (Phase("individual", 0, 1),)
+
+
+@pytest.mark.parametrize("training", ["two-phase", "joint"])
+def test_schedule_survives_json(training):
+    schedule = make_schedule(training, 1234, decay_decades=0.7, finetune_rate=0.2, release_shares=(0.5, 0.9))
+    assert Schedule.from_json(schedule.to_json()) == schedule
+    assert hash(Schedule.from_json(schedule.to_json())) == hash(schedule)
+
+
+def test_numpy_settings_do_not_leak_into_rates():
+    """A numpy scalar in an optimiser's rate makes checkpoints unreadable for torch's safe loader."""
+    schedule = make_schedule("two-phase", 100, decay_decades=np.float64(1.5), finetune_rate=np.float64(0.1))
+    assert type(schedule.decay_decades) is float and type(schedule.finetune_rate) is float
+    schedule.to_json()
+    by_hand = Schedule((Phase("joint", 0, 10),), (), np.float64(1.5), np.float64(0.1))
+    assert type(schedule.rate_factor("density", 10)) is type(by_hand.rate_factor("density", 10)) is float
+
+
+@pytest.mark.parametrize(
+    ("settings", "word"),
+    [
+        ({"total_steps": 0}, "max-num-iterations"),
+        ({"total_steps": 100, "blend_share": 0.7, "finetune_share": 0.3}, "blend-share"),
+        ({"total_steps": 100, "blend_share": -0.25}, "blend-share"),
+        ({"total_steps": 100, "growth_shares": (0.5, 0.25)}, "growth-shares"),
+    ],
+)
+def test_impossible_schedules_name_the_setting(settings, word):
+    with pytest.raises(ValueError, match=word):
+        make_schedule("two-phase", **settings)

@@ -1,0 +1,262 @@
+"""A run that was interrupted ends as the uninterrupted one does, bit for bit; checkpoints are never half written."""
+
+from __future__ import annotations
+
+import shutil
+
+import pytest
+import torch
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
+from training_runs import compared, differences, load, ready, trainer_config, write_plan
+
+STEPS = 24
+"""individual 0-11 with doublings at 3 and 6 and a release of bricks before 11, blend 12-17, finetune 18-23; joint 0-23
+with doublings at 6 and 12 and a release before 22."""
+BOUNDARIES = (3, 6, 12, 18)
+
+
+@pytest.fixture(scope="module", params=["split", "all", "joint"])
+def whole(request, scene, plan_file, tmp_path_factory):
+    """Settings, and the checkpoints of every step of an uninterrupted run."""
+    settings = {"training": "joint"} if request.param == "joint" else {"rays_per_mpi": request.param}
+    settings |= {"release_shares": (0.9,), "release_weight": 0.06}
+    config = trainer_config(scene, plan_file, tmp_path_factory.mktemp("whole"), STEPS, **settings)
+    trainer = ready(config)
+    trainer.train()
+    return settings, trainer.checkpoint_dir
+
+
+@pytest.fixture
+def resumed(whole, scene, plan_file, tmp_path):
+    def run(step, **changes):
+        """Resumes the run from the checkpoint of a step and returns the new checkpoint folder."""
+        config = trainer_config(scene, plan_file, tmp_path / f"from{step}", STEPS, **whole[0])
+        trainer = ready(config, load_dir=whole[1], load_step=step, **changes)
+        torch.rand(5)  # a resumed process has drawn other numbers before
+        trainer.train()
+        return trainer.checkpoint_dir
+
+    return run
+
+
+@pytest.mark.parametrize("step", [*(b + d for b in BOUNDARIES for d in (-2, -1, 0)), STEPS - 3, STEPS - 2])
+def test_a_resumed_run_ends_as_the_uninterrupted_one(whole, resumed, step):
+    folder = resumed(step)
+    wanted, found = load(whole[1], STEPS - 1), load(folder, STEPS - 1)
+    assert differences(compared(wanted), compared(found)) == []
+    assert sorted(int(p.stem[5:]) for p in folder.iterdir()) == list(range(step + 1, STEPS))
+    assert set(found["optimizers"]["density"]["state"][0]) == {"step", "exp_avg", "exp_avg_sq"}
+
+
+def test_bricks_were_given_up_on_the_way_and_checkpoints_hold_the_others_alone(whole):
+    """Between steps 6 or 12, when resolution stops growing, and the end of the first phase."""
+    steps = range(12, STEPS) if "training" in whole[0] else range(6, 14)
+    states = [load(whole[1], step) for step in steps]
+    rows = [len(state["pipeline"]["_model.field.density"]) for state in states]
+    assert rows == sorted(rows, reverse=True) and rows[-1] < rows[0]
+    for state, count in zip(states, rows, strict=True):
+        field = {k.removeprefix("_model.field."): v for k, v in state["pipeline"].items()}
+        assert count == 64 * ((field["tiles"] > 0).sum() + 1)
+        assert {len(field[k]) for k in ("features", "reliability", "touched")} == {count}
+        moments = state["optimizers"]["features"]["state"]
+        assert all(len(moments[0][k]) == count for k in ("exp_avg", "exp_avg_sq"))
+    counts = [state["optimizers"]["features"]["state"][0]["step"] for state in states]
+    assert counts == sorted(counts) and counts[0] == 1, "moments go on where bricks go"
+
+
+def test_steps_differ_so_the_comparison_can_fail(whole):
+    assert len(differences(compared(load(whole[1], STEPS - 1)), compared(load(whole[1], STEPS - 2)))) > 5
+
+
+def test_a_finished_run_has_nothing_to_do(whole, resumed):
+    folder = resumed(STEPS - 1)
+    assert not folder.exists() or not list(folder.iterdir())
+
+
+def test_frozen_parameters_stay_bit_identical(whole):
+    """Steps 12 to 17 are the blend phase: only reliability learns. Joint training never learns it."""
+    before, first, last, after = (load(whole[1], step)["pipeline"] for step in (11, 12, 17, 18))
+
+    def changed(a, b):
+        return {k.removeprefix("_model.field.") for k in a if not torch.equal(a[k], b[k])}
+
+    assert not before["_model.field.reliability"].any()
+    if "training" in whole[0]:
+        assert not load(whole[1], STEPS - 1)["pipeline"]["_model.field.reliability"].any()
+        assert changed(first, last) >= {"density", "features", "networks.weights"}
+    else:
+        assert changed(first, last) == {"reliability"}
+        assert changed(last, after) >= {"density", "features", "reliability", "networks.weights"}
+
+
+def test_checkpoints_load_as_plain_data_and_hold_plan_schedule_and_resolution(whole):
+    state = load(whole[1], 4)
+    assert state["step"] == 4 and float(state["pipeline"]["_model.field.texel_factor"]) < 1
+    assert {"_model.field.plan_bytes", "_model.schedule_bytes"} <= set(state["pipeline"])
+    rates = [g["lr"] for o in state["optimizers"].values() for g in o["param_groups"]]
+    assert all(type(r) is float for r in rates)
+    assert (whole[1].parent / "plan.json").is_file()
+
+
+# Interruptions -------------------------------------------------------------------------------------------------------
+
+
+class Interrupted(Exception):
+    pass
+
+
+def call_before(trainer, step, function):
+    """Calls a function before a step of the trainer."""
+
+    def check(step_now):
+        if step_now == step:
+            function()
+
+    def run(step):
+        check(step)
+
+    trainer.callbacks.insert(0, TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], run))
+
+
+@pytest.mark.parametrize("step", [11, 12, 13])
+def test_a_run_that_died_goes_on_from_its_last_checkpoint(whole, scene, plan_file, tmp_path, step):
+    config = trainer_config(scene, plan_file, tmp_path / "a", STEPS, **whole[0])
+    config.save_only_latest_checkpoint = True
+    trainer = ready(config)
+
+    def die():
+        raise Interrupted
+
+    call_before(trainer, step, die)
+    with pytest.raises(Interrupted):
+        trainer.train()
+    assert [p.name for p in trainer.checkpoint_dir.iterdir()] == [f"step-{step - 1:09d}.ckpt"]
+    again = ready(trainer_config(scene, plan_file, tmp_path / "b", STEPS, **whole[0]), load_dir=trainer.checkpoint_dir)
+    again.train()
+    found = load(again.checkpoint_dir, STEPS - 1)
+    assert differences(compared(load(whole[1], STEPS - 1)), compared(found)) == []
+
+
+@pytest.mark.parametrize("step", [5, 11, 12, 17])
+def test_a_run_that_was_asked_to_stop_saves_the_step_it_did_last(whole, scene, plan_file, tmp_path, step):
+    """Stopping from the viewer: the step after the request does not run, so it must not be counted."""
+    config = trainer_config(scene, plan_file, tmp_path / "a", STEPS, **whole[0])
+    config.steps_per_save = 1000
+    trainer = ready(config)
+
+    def stop():
+        trainer.stop_training = True
+
+    call_before(trainer, step, stop)
+    trainer.train()
+    steps = [int(p.stem[5:]) for p in trainer.checkpoint_dir.iterdir()]
+    assert steps[-1:] == [step]
+    assert differences(compared(load(whole[1], step)), compared(load(trainer.checkpoint_dir, step))) == []
+    again = ready(trainer_config(scene, plan_file, tmp_path / "b", STEPS, **whole[0]), load_dir=trainer.checkpoint_dir)
+    again.train()
+    found = load(again.checkpoint_dir, STEPS - 1)
+    assert differences(compared(load(whole[1], STEPS - 1)), compared(found)) == []
+
+
+def test_a_full_disk_leaves_the_old_checkpoint_and_nothing_else(scene, plan_file, tmp_path, monkeypatch):
+    config = trainer_config(scene, plan_file, tmp_path, STEPS)
+    config.save_only_latest_checkpoint = True
+    trainer = ready(config)
+    save, calls = torch.save, []
+
+    def full(state, path, *args, **kwargs):
+        calls.append(path)
+        save(state, path, *args, **kwargs)
+        if len(calls) > 3:
+            with open(path, "r+b") as file:
+                file.truncate(file.seek(0, 2) // 2)
+            raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(torch, "save", full)
+    with pytest.raises(OSError, match="No space"):
+        trainer.train()
+    folder = trainer.checkpoint_dir
+    assert [p.name for p in folder.iterdir()] == ["step-000000003.ckpt"] and load(folder, 3)["step"] == 3
+    assert not [p for p in folder.parent.iterdir() if "ckpt" in p.name], "the unfinished file is gone"
+    monkeypatch.undo()
+    again = ready(trainer_config(scene, plan_file, tmp_path / "b", STEPS), load_dir=folder)
+    assert again._start_step == 4
+
+
+def test_checkpoints_are_written_outside_their_folder(whole, scene, plan_file, tmp_path, monkeypatch):
+    """nerfstudio takes every file name in the folder for a step, so an unfinished one there would break resuming."""
+    trainer = ready(trainer_config(scene, plan_file, tmp_path, 2))
+    save, seen = torch.save, []
+
+    def spy(state, path, *args, **kwargs):
+        save(state, path, *args, **kwargs)
+        seen.append((path.parent, [p.name for p in trainer.checkpoint_dir.iterdir()]))
+
+    monkeypatch.setattr(torch, "save", spy)
+    trainer.train()
+    assert len(seen) >= 2
+    for parent, names in seen:
+        assert parent != trainer.checkpoint_dir and all(n.endswith(".ckpt") for n in names)
+
+
+# What does not fit ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "settings", [{"num_mpis": 3, "with_cube": True}, {"num_mpis": 2}, {"planes": 13, "with_cube": True}]
+)
+def test_a_checkpoint_of_another_plan_is_refused_in_one_sentence(whole, scene, tmp_path, settings):
+    plan = write_plan(scene, tmp_path / "plan.json", **settings)
+    config = trainer_config(scene, plan, tmp_path / "out", STEPS, **whole[0])
+    with pytest.raises(ValueError, match="another scene plan") as error:
+        ready(config, load_dir=whole[1], load_step=5)
+    assert "\n" not in str(error.value) and str(whole[1]) in str(error.value)
+
+
+def test_a_checkpoint_of_another_method_is_refused(whole, scene, plan_file, tmp_path):
+    state = load(whole[1], 5)
+    del state["pipeline"]["_model.field.plan_bytes"]
+    folder = tmp_path / "models"
+    folder.mkdir()
+    torch.save(state, folder / "step-000000005.ckpt")
+    with pytest.raises(ValueError, match="not written by this method"):
+        ready(trainer_config(scene, plan_file, tmp_path / "out", STEPS), load_dir=folder)
+
+
+def test_a_checkpoint_from_before_there_were_bricks_is_not_trained_on(whole, scene, plan_file, tmp_path):
+    state = load(whole[1], 5)
+    del state["pipeline"]["_model.field.tiles"]
+    folder = tmp_path / "models"
+    folder.mkdir()
+    torch.save(state, folder / "step-000000005.ckpt")
+    with pytest.raises(ValueError, match="before tables were stored in bricks: it can be rendered") as error:
+        ready(trainer_config(scene, plan_file, tmp_path / "out", STEPS, **whole[0]), load_dir=folder)
+    assert "\n" not in str(error.value)
+
+
+def test_a_folder_without_checkpoints_is_named(scene, plan_file, tmp_path):
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ValueError, match="no checkpoint in"):
+        ready(trainer_config(scene, plan_file, tmp_path / "out", STEPS), load_dir=tmp_path / "empty")
+
+
+def test_one_checkpoint_file_can_be_named_instead_of_a_folder(whole, scene, plan_file, tmp_path):
+    copy = tmp_path / "mine.ckpt"
+    shutil.copy(whole[1] / "step-000000020.ckpt", copy)
+    trainer = ready(trainer_config(scene, plan_file, tmp_path / "out", STEPS, **whole[0]), load_checkpoint=copy)
+    trainer.train()
+    found = load(trainer.checkpoint_dir, STEPS - 1)
+    assert differences(compared(load(whole[1], STEPS - 1)), compared(found)) == []
+
+
+def test_a_longer_run_keeps_the_schedule_of_the_checkpoint_in_model_and_learning_rates(
+    whole, scene, plan_file, tmp_path
+):
+    config = trainer_config(scene, plan_file, tmp_path / "out", STEPS + 6, **whole[0])
+    trainer = ready(config, load_dir=whole[1], load_step=STEPS - 4)
+    schedule = trainer.pipeline.model.schedule
+    assert schedule.total_steps == STEPS
+    trainer.train()
+    assert sorted(int(p.stem[5:]) for p in trainer.checkpoint_dir.iterdir())[-1] == STEPS + 5
+    state = load(trainer.checkpoint_dir, STEPS - 1)
+    assert differences(compared(load(whole[1], STEPS - 1)), compared(state)) == []

@@ -1,0 +1,396 @@
+"""Windows trained one after the other, or shared out among processes, and mixed where they overlap."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.utils.eval_utils import eval_setup
+from training_runs import compared, datamanager, differences, load, plan_of, ready, trainer_config
+
+from mmpi_ns.field.tables import TABLES
+from mmpi_ns.rendering.window_store import WindowStore
+from mmpi_ns.scene.windows import Window, WindowedPlan, window_shares
+
+STEPS = 6
+
+
+# Training and rendering ----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def windows_file(scene, tmp_path_factory):
+    """Two windows of the tiny scene's walk, one with two MPIs and one with one."""
+    seen = datamanager(scene, test_mode="inference").observations
+    centers = seen.centers[np.argsort(seen.centers @ seen.mean_axes[0])]
+    length = np.linalg.norm(centers[-1] - centers[0])
+    middles = [centers[0] + (centers[-1] - centers[0]) * share for share in (0.25, 0.75)]
+    windows = tuple(
+        Window(tuple(m.tolist()), 0.3 * float(length), 0.1 * float(length), plan_of(seen, num_mpis=k))
+        for m, k in zip(middles, (2, 1), strict=True)
+    )
+    path = tmp_path_factory.mktemp("windows") / "plan.json"
+    path.write_text(WindowedPlan(windows).to_json())
+    return path
+
+
+@pytest.fixture(scope="module")
+def whole(scene, windows_file, tmp_path_factory):
+    """An uninterrupted run through both windows."""
+    config = trainer_config(scene, windows_file, tmp_path_factory.mktemp("whole"), STEPS, training="joint")
+    config.save_config()
+    trainer = ready(config)
+    trainer.train()
+    return trainer
+
+
+def test_each_window_gets_all_steps_and_a_file(whole):
+    steps = sorted(int(p.stem[5:]) for p in whole.checkpoint_dir.iterdir())
+    assert steps == list(range(1, 2 * STEPS))
+    assert sorted(p.name for p in (whole.base_dir / "windows").iterdir()) == ["window-00000.pt", "window-00001.pt"]
+    assert len(load(whole.checkpoint_dir, STEPS - 1)["pipeline"]["_model.field.networks.weights"]) == 2
+    assert len(load(whole.checkpoint_dir, STEPS)["pipeline"]["_model.field.networks.weights"]) == 1
+
+
+def test_a_window_draws_from_its_own_cameras_alone(whole):
+    manager, model = whole.pipeline.datamanager, whole.pipeline.model
+    window = model.windows.windows[1]
+    manager.train()
+    bundle, _ = manager.next_train(2 * STEPS)
+    beyond = (bundle.origins - torch.tensor(window.center)).norm(dim=-1)
+    assert len(bundle) == 80 and beyond.max() < window.radius + window.margin
+    centers = torch.from_numpy(manager.observations.centers)
+    assert ((centers - torch.tensor(window.center)).norm(dim=-1) > window.radius + window.margin).any()
+
+
+def test_a_finished_window_is_the_model_of_the_checkpoint_at_its_end(whole):
+    state = torch.load(whole.base_dir / "windows" / "window-00000.pt", weights_only=True)
+    at_end = load(whole.checkpoint_dir, STEPS - 1)["pipeline"]
+    for name, value in state["field"].items():
+        assert torch.equal(value, at_end[f"_model.field.{name}"]), name
+
+
+def test_the_second_window_learns_as_it_would_alone(whole, scene, tmp_path):
+    """Nothing of the first one is left in tables, networks, moments, rates or growth."""
+    alone = WindowedPlan.single(whole.pipeline.model.windows.plans[1])
+    path = tmp_path / "plan.json"
+    path.write_text(alone.to_json())
+    trainer = ready(trainer_config(scene, path, tmp_path, STEPS, training="joint"))
+    window = whole.pipeline.model.windows.windows[1]
+    manager = trainer.pipeline.datamanager
+    near = np.linalg.norm(manager.observations.centers - np.asarray(window.center), axis=-1)
+    manager.use_cameras(np.nonzero(near < window.radius + window.margin)[0])
+    model, draw = trainer.pipeline.model, manager.next_train
+    manager.next_train = lambda step: draw(step + STEPS)  # the draws of the later steps
+    losses = model.get_loss_dict
+
+    def later(*args, **kwargs):
+        model.step += STEPS
+        try:
+            return losses(*args, **kwargs)
+        finally:
+            model.step -= STEPS
+
+    model.get_loss_dict = later
+    trainer.train()
+    expected = whole.pipeline.model.field
+    assert torch.equal(model.field.density, expected.density)
+    assert torch.equal(model.field.networks.weights, expected.networks.weights)
+
+
+def rendered(model, origins) -> dict[str, torch.Tensor]:
+    facing = np.asarray(model.windows.plans[0].mpis[0].axes)[2]
+    directions = torch.tensor(facing).float().expand(len(origins), 3)
+    bundle = RayBundle(origins, directions, torch.ones(len(origins), 1), torch.zeros(len(origins), 1).long())
+    with torch.no_grad():
+        return model.eval().get_outputs(bundle)
+
+
+def test_rays_are_mixed_by_where_they_start(whole):
+    model = whole.pipeline.model
+    first, second = (torch.tensor(w.center).float() for w in model.windows.windows)
+    origins = torch.stack([first, first + 0.5 * (second - first), second])
+    mixed = rendered(model, origins)
+    shares = window_shares(origins, model.windows.windows)
+    assert 0 < shares[1, 0] < 1
+    each = []
+    for w in (0, 1):
+        field = model.field if w == 1 else model.store.load(0, model._new_field, model.device)
+        trained, model.field, model.window = model.field, field, w
+        windows, model.windows = model.windows, WindowedPlan.single(model.windows.plans[w])
+        each.append(rendered(model, origins))
+        model.field, model.windows, model.window = trained, windows, 1
+    expected = shares[:, :1] * each[0]["rgb"] + shares[:, 1:] * each[1]["rgb"]
+    torch.testing.assert_close(mixed["rgb"], expected)
+    assert not torch.allclose(each[0]["rgb"], each[1]["rgb"], atol=1e-4)
+    assert torch.equal(mixed["depth"][[0, 2]], torch.stack([each[0]["depth"][0], each[1]["depth"][2]]))
+    assert mixed["winning_mpi"][2] == 2 and mixed["winning_mpi"][0] < 2
+
+
+def test_one_mpi_can_be_shown_alone(whole):
+    model = whole.pipeline.model
+    origins = torch.tensor([model.windows.windows[1].center]).float()
+    model.show.value = model.windows.names[0]
+    try:
+        shown = rendered(model, origins)
+    finally:
+        model.show.value = "all"
+    assert shown["winning_mpi"].item() == 0
+    assert not torch.allclose(shown["rgb"], rendered(model, origins)["rgb"])
+
+
+def test_windows_that_are_not_trained_yet_are_not_asked(scene, windows_file, tmp_path):
+    model = ready(trainer_config(scene, windows_file, tmp_path, STEPS, training="joint")).pipeline.model
+    origins = torch.stack([torch.tensor(w.center).float() for w in model.windows.windows])
+    assert (rendered(model, origins)["winning_mpi"] < 2).all()
+
+
+def test_evaluation_reads_the_windows_back(whole):
+    _, pipeline, _, _ = eval_setup(whole.base_dir / "config.yml", test_mode="inference")
+    model = whole.pipeline.model
+    origins = torch.stack([torch.tensor(w.center).float() for w in model.windows.windows])
+    a, b = rendered(model, origins), rendered(pipeline.model, origins)
+    for name in ("rgb", "depth", "winning_mpi"):
+        assert torch.equal(a[name], b[name]), name
+
+
+@pytest.mark.parametrize("step", [STEPS - 2, STEPS - 1, STEPS, STEPS + 2])
+def test_a_resumed_run_ends_as_the_uninterrupted_one(whole, scene, windows_file, tmp_path, step):
+    config = trainer_config(scene, windows_file, tmp_path, STEPS, training="joint")
+    trainer = ready(config, load_dir=whole.checkpoint_dir, load_step=step)
+    torch.rand(5)
+    trainer.train()
+    found, wanted = (load(t.checkpoint_dir, 2 * STEPS - 1) for t in (trainer, whole))
+    assert differences(compared(wanted), compared(found)) == []
+    ours, theirs = (
+        torch.load(t.base_dir / "windows" / "window-00000.pt", weights_only=True)["field"] for t in (trainer, whole)
+    )
+    assert differences(ours, theirs) == []
+
+
+def test_resuming_without_the_finished_windows_is_refused_in_one_sentence(whole, scene, windows_file, tmp_path):
+    folder = tmp_path / "moved" / "nerfstudio_models"
+    folder.mkdir(parents=True)
+    name = f"step-{STEPS:09d}.ckpt"
+    (folder / name).write_bytes((whole.checkpoint_dir / name).read_bytes())
+    config = trainer_config(scene, windows_file, tmp_path / "new", STEPS, training="joint")
+    with pytest.raises(ValueError, match="Window 0 of the run to go on from is missing"):
+        ready(config, load_dir=folder)
+
+
+def test_a_window_of_another_plan_or_a_damaged_one_is_not_taken_over(whole, tmp_path):
+    model, store = whole.pipeline.model, WindowStore(tmp_path / "mine", budget=0)
+    ours, theirs = model.windows.plans
+    with pytest.raises(ValueError, match="another scene plan"):
+        store.adopt(model.store.path(0).parent, {0: theirs})
+    (tmp_path / "cut").mkdir()
+    content = model.store.path(0).read_bytes()
+    (tmp_path / "cut" / model.store.path(0).name).write_bytes(content[: len(content) // 2])
+    with pytest.raises(ValueError, match="cannot be read"):
+        store.adopt(tmp_path / "cut", {0: ours})
+    assert not (tmp_path / "mine").exists()
+    store.adopt(model.store.path(0).parent, {0: ours})
+    assert store.path(0).read_bytes() == content
+
+
+@pytest.mark.parametrize("harm, sentence", [("gone", "is missing"), ("cut", "is damaged")])
+def test_a_lost_window_is_named_and_nothing_else_is_touched(whole, harm, sentence):
+    model = whole.pipeline.model
+    path = model.store.path(0)
+    kept = path.read_bytes()
+    model.store._fields.clear()
+    origins = torch.tensor([model.windows.windows[0].center]).float()
+    before = model.field.density.clone()
+    try:
+        if harm == "gone":
+            path.unlink()
+        else:
+            path.write_bytes(kept[: len(kept) // 2])
+        with pytest.raises(ValueError, match=sentence):
+            rendered(model, origins)
+    finally:
+        path.write_bytes(kept)
+    assert model.window == 1 and torch.equal(model.field.density, before)
+
+
+def test_a_full_disk_at_a_windows_end_keeps_the_checkpoint(scene, windows_file, tmp_path, monkeypatch):
+    trainer = ready(trainer_config(scene, windows_file, tmp_path, STEPS, training="joint"))
+    save = torch.save
+
+    def full(state, path, **settings):
+        if "window" in path.name:
+            path.write_bytes(b"half")
+            raise RuntimeError("[enforce fail at inline_container.cc] PytorchStreamWriter failed")
+        return save(state, path, **settings)
+
+    monkeypatch.setattr(torch, "save", full)
+    with pytest.raises(OSError, match="could not be written"):
+        trainer.train()
+    assert not list((trainer.base_dir / "windows").glob("*"))
+    assert load(trainer.checkpoint_dir, STEPS - 2)["step"] == STEPS - 2
+
+
+@pytest.mark.parametrize(
+    "room, held",
+    [
+        (0.0, [[0], [1], [0], [2], [1], [1]]),
+        (2.5, [[0], [0, 1], [1, 0], [0, 2], [2, 1], [2, 1]]),
+        (9.0, [[0], [0, 1], [1, 0], [1, 0, 2], [0, 2, 1], [0, 2, 1]]),
+    ],
+)
+def test_as_many_windows_are_held_as_fit_the_budget(whole, tmp_path, room, held):
+    """Windows of one size; ``room`` is for so many of them. The one that was not used for longest goes first."""
+    model = whole.pipeline.model
+    size = model.store.path(1).stat().st_size
+    store = WindowStore(tmp_path, budget=room * size)
+    for number in range(3):
+        store.save(number, model.field)
+    for number, expected in zip((0, 1, 0, 2, 1, 1), held, strict=True):
+        field = store.load(number, model._new_field, model.device)
+        assert torch.equal(field.density, model.field.density) and list(store._fields) == expected
+        taken = sum(t.numel() * t.element_size() for f in store._fields.values() for t in f.state_dict().values())
+        assert len(store._fields) == 1 or taken <= room * size
+
+
+def test_windows_in_half_precision_take_half_of_the_disk_and_are_read_as_they_were_rounded(
+    whole, scene, windows_file, tmp_path
+):
+    model = whole.pipeline.model
+    asked = ready(trainer_config(scene, windows_file, tmp_path, STEPS, half_windows=True)).pipeline.model.store
+    assert asked.half and not model.store.half
+    size = model.store.path(1).stat().st_size
+    store = WindowStore(tmp_path, budget=1.8 * size, half=asked.half)
+    store.save(0, model.field)
+    store.save(1, model.field)
+    assert store.path(1).stat().st_size < 0.65 * size
+    store.load(0, model._new_field, model.device)
+    field = store.load(1, model._new_field, model.device)
+    for name, values in field.state_dict().items():
+        wanted = model.field.state_dict()[name]
+        assert values.dtype == wanted.dtype
+        rounded = wanted.half().float() if name in TABLES else wanted
+        assert torch.equal(values, rounded), name
+    assert not torch.equal(field.features, model.field.features)
+    assert list(store._fields) == [1], "what is held is counted as it lies in memory, not on disk"
+
+
+def test_a_config_from_when_windows_were_counted_goes_on_working(whole, tmp_path):
+    text = (whole.base_dir / "config.yml").read_text()
+    old = text.replace("resident_gib: 2.0", "resident_windows: 2")
+    assert old != text
+    (tmp_path / "config.yml").write_text(old)
+    _, pipeline, _, _ = eval_setup(tmp_path / "config.yml", test_mode="inference")
+    assert pipeline.model.store.budget == 2 * 2**30
+    origins = torch.stack([torch.tensor(w.center).float() for w in whole.pipeline.model.windows.windows])
+    assert torch.equal(rendered(pipeline.model, origins)["rgb"], rendered(whole.pipeline.model, origins)["rgb"])
+
+
+# Several processes ---------------------------------------------------------------------------------------------------
+
+
+def torchrun(scene, windows_file, output, processes, *options):
+    """The command a user would type; returns its exit status and what it said."""
+    command = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", str(processes), "--standalone"]
+    command += ["-m", "mmpi_ns.scripts.train", "mmpi-small", "--data", str(scene), "--output-dir", str(output)]
+    command += ["--experiment-name", "tiny", "--timestamp", "run", "--max-num-iterations", str(STEPS)]
+    command += ["--machine.device-type", "cpu", "--vis", "tensorboard", "--pipeline.model.plan-file", str(windows_file)]
+    command += ["--pipeline.datamanager.train-num-rays-per-batch", "64", "--pipeline.datamanager.keypoint-rays", "16"]
+    command += ["--pipeline.model.hidden-width", "8", "--pipeline.model.feature-channels", "4"]
+    command += ["--pipeline.model.growth-shares", "0.25", "0.5", "--pipeline.model.release-weight", "0.0"]
+    command += ["--steps-per-save", "2", *options]
+    done = subprocess.run(
+        command, capture_output=True, text=True, timeout=300, env={**os.environ, "OMP_NUM_THREADS": "1"}
+    )
+    return done.returncode, done.stdout + done.stderr
+
+
+@pytest.fixture(scope="module")
+def shared(scene, windows_file, tmp_path_factory):
+    output = tmp_path_factory.mktemp("shared")
+    status, said = torchrun(scene, windows_file, output, 2)
+    assert status == 0, said[-2000:]
+    return output / "tiny" / "mmpi-small" / "run", said
+
+
+def test_two_processes_end_as_one_does(whole, shared):
+    """Same windows, bit for bit: draws depend on seed and step alone."""
+    folder, said = shared
+    for name in ("window-00000.pt", "window-00001.pt"):
+        ours, theirs = (torch.load(f / "windows" / name, weights_only=True) for f in (folder, whole.base_dir))
+        assert differences(ours, theirs) == [], name
+    wanted = load(whole.checkpoint_dir, 2 * STEPS - 1)["pipeline"]
+    assert differences(load(folder / "nerfstudio_models", 2 * STEPS - 1)["pipeline"], wanted) == []
+    assert [p.name for p in (folder / "nerfstudio_models").iterdir()] == [f"step-{2 * STEPS - 1:09d}.ckpt"]
+    assert "All windows are trained" in said
+
+
+def test_what_two_processes_trained_is_evaluated_as_any_run(whole, shared):
+    _, pipeline, _, _ = eval_setup(shared[0] / "config.yml", test_mode="inference")
+    origins = torch.stack([torch.tensor(w.center).float() for w in whole.pipeline.model.windows.windows])
+    assert torch.equal(rendered(pipeline.model, origins)["rgb"], rendered(whole.pipeline.model, origins)["rgb"])
+
+
+def test_another_number_of_processes_goes_on_from_the_windows_that_are_finished(
+    whole, shared, scene, windows_file, tmp_path
+):
+    """Window 1 was cut off in the middle; its checkpoint and the file of window 0 are all that is left."""
+    left = tmp_path / "left"
+    (left / "windows").mkdir(parents=True)
+    (left / "nerfstudio_models").mkdir()
+    shutil.copy(shared[0] / "windows" / "window-00000.pt", left / "windows")
+    name = f"step-{STEPS + 2:09d}.ckpt"
+    shutil.copy(whole.checkpoint_dir / name, left / "nerfstudio_models")
+    load_dir = ("--load-dir", str(left / "nerfstudio_models"))
+    status, said = torchrun(scene, windows_file, tmp_path / "out", 1, *load_dir)
+    assert status == 0, said[-2000:]
+    folder = tmp_path / "out" / "tiny" / "mmpi-small" / "run"
+    ours, theirs = (torch.load(f / "windows" / "window-00001.pt", weights_only=True) for f in (folder, shared[0]))
+    assert differences(ours, theirs) == []
+
+
+def test_more_processes_than_windows_are_refused(scene, windows_file, tmp_path):
+    trainer = trainer_config(scene, windows_file, tmp_path, STEPS).setup(local_rank=0, world_size=3)
+    with pytest.raises(ValueError, match=r"2 window\(s\), too few to share out among 3 processes"):
+        trainer.setup()
+
+
+def test_reading_a_colmap_model_leaves_the_answer_to_sigterm_as_it_was(scene):
+    """torchrun ends the other processes by SIGTERM; pycolmap brings a handler of its own, which hides what we say."""
+    code = (
+        "import os, signal, sys\n"
+        "from pathlib import Path\n"
+        "signal.signal(signal.SIGTERM, lambda *_: sys.exit('ours'))\n"
+        "from mmpi_ns.capture.sfm import find_sfm_model\n"
+        "assert find_sfm_model(Path(sys.argv[1])) is not None\n"
+        "os.kill(os.getpid(), signal.SIGTERM)\n"
+    )
+    command = [sys.executable, "-c", code, str(scene / "colmap" / "sparse" / "0")]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=100)
+    assert (done.returncode, done.stderr) == (1, "ours\n")
+
+
+def test_a_process_that_is_killed_ends_the_run_and_leaves_what_is_finished(scene, windows_file, tmp_path, monkeypatch):
+    """The second process dies in its first step; the first window is whole, or can be trained again."""
+    code = tmp_path / "code"
+    code.mkdir()
+    (code / "sitecustomize.py").write_text(
+        "import os\n"
+        "if os.environ.get('RANK') == '1':\n"
+        "    import mmpi_ns.model as m, signal\n"
+        "    m.MMPIModel.prepare_step = lambda self, attributes, step: os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(code), os.environ.get("PYTHONPATH", "")]))
+    status, said = torchrun(scene, windows_file, tmp_path / "out", 2)
+    assert status != 0 and "SIGKILL" in said, said[-3000:]
+    assert "Ended early: another process died" in said and "--load-dir" in said, said[-3000:]
+    monkeypatch.undo()
+    run = tmp_path / "out" / "tiny" / "mmpi-small" / "run"
+    status, said = torchrun(scene, windows_file, tmp_path / "again", 2, "--load-dir", str(run / "nerfstudio_models"))
+    assert status == 0, said[-2000:]
+    assert (tmp_path / "again" / "tiny" / "mmpi-small" / "run" / "windows" / "window-00001.pt").is_file()
