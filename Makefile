@@ -23,7 +23,7 @@ WORKERS ?= 2
 # Extra arguments for pytest or the demo: make test ARGS="-k geometry -x", make demo ARGS=--fresh
 ARGS ?=
 
-.PHONY: help venv demo test lint build wheel figures clean
+.PHONY: help venv demo test lint docs build wheel figures clean
 
 help: ## List these commands
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -55,6 +55,10 @@ lint: venv ## Check style, formatting and types
 	$(BIN)/python -m ruff check .
 	$(BIN)/python -m ruff format --check .
 	$(BIN)/python -m pyright
+
+docs: venv ## Build the documentation site in site/
+	@$(BIN)/python -m pip install -q --disable-pip-version-check -c constraints.txt -e '.[docs]'
+	$(BIN)/python -m mkdocs build --quiet --strict
 
 build: venv ## Build the sdist and the wheel in dist/
 	rm -rf dist
