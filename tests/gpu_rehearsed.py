@@ -8,10 +8,13 @@ import math
 import torch
 from nerfstudio.engine import trainer as nerfstudio_trainer
 
-from mmpi_ns.bench import gpu, gpu_checks, gpu_parts, trainings
-from mmpi_ns.bench.cases_rays import scene
-from mmpi_ns.bench.exact_ray import ExactField, ExactRay
-from mmpi_ns.bench.gpu import SHARES, Gpu
+from mmpi_ns.bench import trainings
+from mmpi_ns.bench.gpu import checks as gpu_checks
+from mmpi_ns.bench.gpu import command as gpu
+from mmpi_ns.bench.gpu import parts as gpu_parts
+from mmpi_ns.bench.gpu.command import SHARES, Gpu
+from mmpi_ns.bench.stability.exact_ray import ExactField, ExactRay
+from mmpi_ns.bench.stability.rays import scene
 from mmpi_ns.ops import native, triton_march, triton_tables
 
 
@@ -19,7 +22,7 @@ def part_here(module, request, folder, threads, seconds, extra=None):
     assert seconds > 0
     nerfstudio_trainer.writer.EVENT_WRITERS.clear()
     native.choose("auto")
-    if module == "mmpi_ns.bench.gpu_parts":
+    if module == "mmpi_ns.bench.gpu.parts":
         return gpu_parts.run(request, lambda text: None)
     return trainings._answer(request, lambda text: None)
 

@@ -6,20 +6,20 @@ import sys
 
 import tyro
 
-from mmpi_ns.bench.ablate import Ablate
-from mmpi_ns.bench.accuracy import Accuracy
-from mmpi_ns.bench.dense import Dense
-from mmpi_ns.bench.gpu import Gpu
-from mmpi_ns.bench.ops import Ops
-from mmpi_ns.bench.processes import Processes
-from mmpi_ns.bench.regions import Regions
-from mmpi_ns.bench.render import Render
-from mmpi_ns.bench.results import Results
-from mmpi_ns.bench.roads import Roads
-from mmpi_ns.bench.scaling import Scaling
-from mmpi_ns.bench.speed import Speed
-from mmpi_ns.bench.stability import Stability
-from mmpi_ns.bench.train import Train
+from mmpi_ns.bench.gpu.command import Gpu
+from mmpi_ns.bench.quality.ablate import Ablate
+from mmpi_ns.bench.quality.accuracy import Accuracy
+from mmpi_ns.bench.quality.regions import Regions
+from mmpi_ns.bench.quality.results import Results
+from mmpi_ns.bench.quality.train import Train
+from mmpi_ns.bench.speed.against_peers import Speed
+from mmpi_ns.bench.speed.dense import Dense
+from mmpi_ns.bench.speed.ops import Ops
+from mmpi_ns.bench.speed.processes import Processes
+from mmpi_ns.bench.speed.render import Render
+from mmpi_ns.bench.speed.roads import Roads
+from mmpi_ns.bench.speed.scaling import Scaling
+from mmpi_ns.bench.stability.command import Stability
 
 
 def entrypoint() -> None:

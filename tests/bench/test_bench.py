@@ -10,8 +10,9 @@ import pytest
 import torch
 from PIL import Image
 
-from mmpi_ns.bench import dense, regions, results
-from mmpi_ns.bench.regions import Regions, spearman
+from mmpi_ns.bench.quality import regions, results
+from mmpi_ns.bench.quality.regions import Regions, spearman
+from mmpi_ns.bench.speed import dense
 from mmpi_ns.bench.suites import DEFAULT, SUITES
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.rendering.sampler import MMPISampler

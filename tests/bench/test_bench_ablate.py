@@ -8,8 +8,9 @@ import math
 import pytest
 from nerfstudio.engine import trainer as nerfstudio_trainer
 
-from mmpi_ns.bench import ablate, trainings
-from mmpi_ns.bench.ablate import Ablate, equal_time_steps
+from mmpi_ns.bench import trainings
+from mmpi_ns.bench.quality import ablate
+from mmpi_ns.bench.quality.ablate import Ablate, equal_time_steps
 from mmpi_ns.bench.suites import ABLATIONS, JOINT, P, Variant
 
 NAMES = ("reference", "twice as slow", "about as fast")

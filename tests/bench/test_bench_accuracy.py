@@ -7,8 +7,8 @@ import json
 import numpy as np
 import pytest
 
-from mmpi_ns.bench import accuracy
-from mmpi_ns.bench.solids import Solids
+from mmpi_ns.bench.quality import accuracy
+from mmpi_ns.bench.quality.solids import Solids
 
 
 def test_rays_enter_the_solids_where_a_fine_march_first_finds_itself_inside():

@@ -10,8 +10,8 @@ import pytest
 from hand_made import random_mpi, random_votes, unit
 from random_fields import OracleRay, random_field, random_rays
 
-from mmpi_ns.bench import exact
-from mmpi_ns.bench.exact_ray import ExactField, ExactRay
+from mmpi_ns.bench.stability import exact
+from mmpi_ns.bench.stability.exact_ray import ExactField, ExactRay
 
 FORMS = ["paper", "opacity", None]
 

@@ -8,10 +8,10 @@ import pytest
 import torch
 from triton_processes import HERE, needs_triton, python
 
-from mmpi_ns.bench import gpu
 from mmpi_ns.bench.apart import run_apart
-from mmpi_ns.bench.gpu import Gpu, told_curve
-from mmpi_ns.bench.gpu_report import headline, table
+from mmpi_ns.bench.gpu import command as gpu
+from mmpi_ns.bench.gpu.command import Gpu, told_curve
+from mmpi_ns.bench.gpu.report import headline, table
 
 
 @needs_triton

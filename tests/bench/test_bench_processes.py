@@ -7,7 +7,7 @@ import json
 import pytest
 import torch
 
-from mmpi_ns.bench.processes import Processes, headline
+from mmpi_ns.bench.speed.processes import Processes, headline
 from mmpi_ns.scene.windows import WindowedPlan
 from mmpi_ns.synthetic.catalogue import make_scene
 from mmpi_ns.synthetic.dataset import write_dataset

@@ -10,8 +10,8 @@ import pytest
 import torch
 from training_runs import ready, trainer_config
 
-from mmpi_ns.bench import render
-from mmpi_ns.bench.render import Render, Setting
+from mmpi_ns.bench.speed import render
+from mmpi_ns.bench.speed.render import Render, Setting
 from mmpi_ns.ops import native
 
 

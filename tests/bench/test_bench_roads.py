@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from mmpi_ns.bench.roads import Roads, headline, some_windows
+from mmpi_ns.bench.speed.roads import Roads, headline, some_windows
 
 
 @pytest.fixture(scope="module")

@@ -8,8 +8,8 @@ from dataclasses import asdict, replace
 
 import pytest
 
-from mmpi_ns.bench import scaling
-from mmpi_ns.bench.scaling import Point, Scaling, fit, headline, measure, points
+from mmpi_ns.bench.speed import scaling
+from mmpi_ns.bench.speed.scaling import Point, Scaling, fit, headline, measure, points
 
 SMALL = Point("s", mpis=2, planes=8, height=8, width=8, rays=32)
 

@@ -10,10 +10,12 @@ import torch
 from nerfstudio.engine import trainer as nerfstudio_trainer
 from torchmetrics.image import lpip
 
-from mmpi_ns.bench import alternate, ops, speed, trainings
+from mmpi_ns.bench import trainings
 from mmpi_ns.bench.methods import METHODS, Scene
-from mmpi_ns.bench.ops import Ops
-from mmpi_ns.bench.speed import Speed
+from mmpi_ns.bench.speed import against_peers as speed
+from mmpi_ns.bench.speed import alternate, ops
+from mmpi_ns.bench.speed.against_peers import Speed
+from mmpi_ns.bench.speed.ops import Ops
 
 
 def train_here(request, folder, threads):
@@ -22,7 +24,7 @@ def train_here(request, folder, threads):
 
 
 def rounds_here(module, request, folder, threads):
-    assert module == "mmpi_ns.bench.alternate"
+    assert module == "mmpi_ns.bench.speed.alternate"
     return alternate.run(alternate.Request(**request), lambda text: None)
 
 

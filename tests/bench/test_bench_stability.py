@@ -8,8 +8,14 @@ import math
 import pytest
 import torch
 
-from mmpi_ns.bench import absurd, cases_blending, cases_geometry, cases_merging, cases_rays, provenance, stability
-from mmpi_ns.bench.cases import PRECISIONS, Case, Error, Outcome, compare
+from mmpi_ns.bench import provenance
+from mmpi_ns.bench.stability import absurd
+from mmpi_ns.bench.stability import blending as cases_blending
+from mmpi_ns.bench.stability import command as stability
+from mmpi_ns.bench.stability import geometry as cases_geometry
+from mmpi_ns.bench.stability import merging as cases_merging
+from mmpi_ns.bench.stability import rays as cases_rays
+from mmpi_ns.bench.stability.cases import PRECISIONS, Case, Error, Outcome, compare
 from mmpi_ns.ops import compositing
 from mmpi_ns.scene import geometry
 

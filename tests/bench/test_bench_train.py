@@ -15,13 +15,14 @@ import torch
 from nerfstudio.engine import trainer as nerfstudio_trainer
 from torchmetrics.image import lpip
 
-from mmpi_ns.bench import methods, train, trainings
-from mmpi_ns.bench.alternate import Steps
+from mmpi_ns.bench import methods, trainings
 from mmpi_ns.bench.apart import run_apart
-from mmpi_ns.bench.curves import Curve, compare
 from mmpi_ns.bench.methods import METHODS
-from mmpi_ns.bench.train import Train
-from mmpi_ns.bench.train_report import headline, table
+from mmpi_ns.bench.quality import train
+from mmpi_ns.bench.quality.curves import Curve, compare
+from mmpi_ns.bench.quality.train import Train
+from mmpi_ns.bench.quality.train_report import headline, table
+from mmpi_ns.bench.speed.alternate import Steps
 
 
 def in_this_process(request, folder, threads):
@@ -182,7 +183,7 @@ def test_a_process_that_fails_says_why_and_where(tmp_path):
 @pytest.mark.commands
 def test_a_process_answers_with_the_threads_that_it_was_given(tmp_path, capsys):
     point = {"planes": 8, "height": 8, "width": 8, "rays": 16, "mpis": 1, "steps": 1}
-    row = run_apart("mmpi_ns.bench.scaling", point, tmp_path, 1)
+    row = run_apart("mmpi_ns.bench.speed.scaling", point, tmp_path, 1)
     assert row["texels"] == (8 + 1) * 64 and row["threads"] == 1
 
 

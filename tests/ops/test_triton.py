@@ -53,7 +53,7 @@ def test_kernels_compile_for_a_gpu_without_spilling_registers(monkeypatch):
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 def test_kernels_on_a_gpu():
-    from mmpi_ns.bench.gpu_checks import run_checks
+    from mmpi_ns.bench.gpu.checks import run_checks
 
     found = run_checks("cuda", rehearse=False)
     assert found["failed"] == 0 and len(found["checks"]) > 30, [c for c in found["checks"] if not c["ok"]]
@@ -64,7 +64,7 @@ def test_importing_the_package_imports_no_kernel():
     code = (
         "import sys\n"
         "sys.modules |= dict.fromkeys(('triton', 'open3d', 'pymeshlab', 'pycolmap', 'wandb', 'comet_ml'))\n"
-        "import nerfstudio.configs.method_configs, mmpi_ns.scripts.bench, mmpi_ns.bench.gpu_parts\n"
+        "import nerfstudio.configs.method_configs, mmpi_ns.scripts.bench, mmpi_ns.bench.gpu.parts\n"
         "assert not [m for m in sys.modules if m.startswith('mmpi_ns.ops.triton')]"
     )
     found = python("-c", code)

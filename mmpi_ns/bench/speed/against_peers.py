@@ -9,12 +9,12 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from mmpi_ns.bench.alternate import Request as Rounds
 from mmpi_ns.bench.apart import run_apart
 from mmpi_ns.bench.methods import METHODS, Method, Scene
 from mmpi_ns.bench.provenance import fingerprint, read_json, stamp, stamp_line, write_json
+from mmpi_ns.bench.quality.train import train_apart
+from mmpi_ns.bench.speed.alternate import Request as Rounds
 from mmpi_ns.bench.suites import P
-from mmpi_ns.bench.train import train_apart
 from mmpi_ns.bench.trainings import Request
 
 KEEP_ALL = ("--pipeline.model.train-threshold", "0", "--pipeline.model.render-threshold", "0")
@@ -129,7 +129,7 @@ class Speed:
             full_size=self.full_size,
             nerfacto_rays=2048,
         )
-        return run_apart("mmpi_ns.bench.alternate", asdict(request), folder, threads)
+        return run_apart("mmpi_ns.bench.speed.alternate", asdict(request), folder, threads)
 
 
 def headline(rows: dict[str, Any]) -> dict[str, float]:

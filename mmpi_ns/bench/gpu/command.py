@@ -13,7 +13,7 @@ from typing import Any
 import torch
 
 from mmpi_ns.bench.apart import run_apart
-from mmpi_ns.bench.gpu_report import draw, headline, table
+from mmpi_ns.bench.gpu.report import draw, headline, table
 from mmpi_ns.bench.methods import METHODS, Method, Scene
 from mmpi_ns.bench.provenance import stamp, write_json
 from mmpi_ns.bench.suites import JOINT
@@ -123,7 +123,7 @@ class Gpu:
             "rehearse": self.rehearse,
         }
         folder = self.work / name.replace(" ", "-")
-        return run_apart("mmpi_ns.bench.gpu_parts", request, folder, self._threads, seconds + GRACE, self._extra)
+        return run_apart("mmpi_ns.bench.gpu.parts", request, folder, self._threads, seconds + GRACE, self._extra)
 
     @property
     def _extra(self) -> dict[str, str]:

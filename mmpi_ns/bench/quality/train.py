@@ -14,7 +14,7 @@ import torch
 from mmpi_ns.bench.apart import run_apart
 from mmpi_ns.bench.methods import Method, Scene, find_method
 from mmpi_ns.bench.provenance import commit, read_json, stamp, write_json
-from mmpi_ns.bench.train_report import QUICK, draw, headline, table
+from mmpi_ns.bench.quality.train_report import QUICK, draw, headline, table
 from mmpi_ns.bench.trainings import Request
 
 SHARES = (1 / 64, 1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 3 / 4, 1.0)

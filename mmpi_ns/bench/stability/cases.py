@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mmpi_ns.bench.exact import Array
+from mmpi_ns.bench.stability.exact import Array
 from mmpi_ns.scene.plan import CubePlan, MPIPlan, ScenePlan
 
 UNIT = 2.0**-24

@@ -17,10 +17,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mmpi_ns.bench.alternate import Steps, clock
 from mmpi_ns.bench.apart import answer
-from mmpi_ns.bench.gpu_checks import run_checks
+from mmpi_ns.bench.gpu.checks import run_checks
 from mmpi_ns.bench.methods import Method, Scene
+from mmpi_ns.bench.speed.alternate import Steps, clock
 from mmpi_ns.bench.suites import JOINT, TWO_PHASE, P
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.model import MMPIModel

@@ -8,9 +8,9 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from mmpi_ns.bench import exact
-from mmpi_ns.bench.cases import Case, Error, Outcome, Precision, compare, plan_of, random_mpi, single
-from mmpi_ns.bench.exact import Array
+from mmpi_ns.bench.stability import exact
+from mmpi_ns.bench.stability.cases import Case, Error, Outcome, Precision, compare, plan_of, random_mpi, single
+from mmpi_ns.bench.stability.exact import Array
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.ops.compositing import (
     BlendForm,

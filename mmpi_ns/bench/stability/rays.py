@@ -9,7 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from mmpi_ns.bench.cases import (
+from mmpi_ns.bench.rendering import Rendered, bundle_of, render
+from mmpi_ns.bench.stability.cases import (
     UNIT,
     Case,
     Error,
@@ -25,9 +26,8 @@ from mmpi_ns.bench.cases import (
     single,
     snap,
 )
-from mmpi_ns.bench.exact import Array, Jitter
-from mmpi_ns.bench.exact_ray import TABLES, ExactField, ExactRay, Gradients
-from mmpi_ns.bench.rendering import Rendered, bundle_of, render
+from mmpi_ns.bench.stability.exact import Array, Jitter
+from mmpi_ns.bench.stability.exact_ray import TABLES, ExactField, ExactRay, Gradients
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.samples import metadata_of
 from mmpi_ns.ops.compositing import BlendForm

@@ -12,9 +12,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mmpi_ns.bench.alternate import Steps, clock
 from mmpi_ns.bench.methods import METHODS, Scene
 from mmpi_ns.bench.provenance import fingerprint, read_json, stamp, stamp_line, write_json
+from mmpi_ns.bench.speed.alternate import Steps, clock
 from mmpi_ns.field.samples import Gathered, Lookup, Taps, metadata_of
 from mmpi_ns.model import FAIR_SHARE, MMPIModel
 from mmpi_ns.ops.colors import colors

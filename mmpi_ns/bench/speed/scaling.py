@@ -16,9 +16,9 @@ import numpy as np
 import torch
 
 from mmpi_ns.bench.apart import answer, run_apart
-from mmpi_ns.bench.dense import _batch as make_batch
-from mmpi_ns.bench.dense import _ours as render_rays
 from mmpi_ns.bench.provenance import fingerprint, read_json, stamp, stamp_line, write_json
+from mmpi_ns.bench.speed.dense import _batch as make_batch
+from mmpi_ns.bench.speed.dense import _ours as render_rays
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.rendering.sampler import MMPISampler
 from mmpi_ns.scene.plan import MPIPlan, ScenePlan
@@ -99,7 +99,7 @@ class Scaling:
             name = f"{point.series}: {point.name}"
             if name not in rows:
                 request = {**asdict(point), "steps": self.steps}
-                row = run_apart("mmpi_ns.bench.scaling", request, self.work, threads)
+                row = run_apart("mmpi_ns.bench.speed.scaling", request, self.work, threads)
                 if "not_run" in row:
                     raise ValueError(f"{name}: {row['not_run']}")
                 rows[name] = {**asdict(point), **row}

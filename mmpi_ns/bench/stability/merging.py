@@ -8,9 +8,9 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from mmpi_ns.bench import exact
-from mmpi_ns.bench.cases import UNIT, Case, Error, Outcome, Precision, compare, count_wrong, single
-from mmpi_ns.bench.exact import Array
+from mmpi_ns.bench.stability import exact
+from mmpi_ns.bench.stability.cases import UNIT, Case, Error, Outcome, Precision, compare, count_wrong, single
+from mmpi_ns.bench.stability.exact import Array
 from mmpi_ns.ops.interpolate import interpolate
 from mmpi_ns.ops.merge import Merged, keep_survivors, merge
 from mmpi_ns.scene.texels import BRICK, make_grids

@@ -11,7 +11,7 @@ import torch
 from nerfstudio.cameras.rays import RayBundle
 
 from mmpi_ns.bench.apart import answer
-from mmpi_ns.bench.dense import _dense as dense_colors
+from mmpi_ns.bench.speed.dense import _dense as dense_colors
 from mmpi_ns.bench.trainings import replace_lpips
 from mmpi_ns.field.mmpi_field import MMPIField
 

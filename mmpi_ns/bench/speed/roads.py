@@ -54,7 +54,7 @@ class Roads:
                 asked = {"length": length, "steps": self.steps, "windows": self.windows}
                 for part in ("plan", "train"):
                     request = {"part": part, **asked, "folder": str(self.work / name)}
-                    found = run_apart("mmpi_ns.bench.roads", request, self.work / f"{name} {part}", self.threads)
+                    found = run_apart("mmpi_ns.bench.speed.roads", request, self.work / f"{name} {part}", self.threads)
                     if "not_run" in found:
                         raise ValueError(f"{name}, {part}: {found['not_run']}")
                     row |= found

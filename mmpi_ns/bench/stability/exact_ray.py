@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mmpi_ns.bench import exact
-from mmpi_ns.bench.exact import STILL, Array, Jitter
+from mmpi_ns.bench.stability import exact
+from mmpi_ns.bench.stability.exact import STILL, Array, Jitter
 from mmpi_ns.scene.plan import MPIPlan, ScenePlan
 
 TABLES = ("density", "features", "reliability", "networks")

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from mmpi_ns.bench.curves import Curve, compare
 from mmpi_ns.bench.provenance import stamp_line
+from mmpi_ns.bench.quality.curves import Curve, compare
 
 TIMES = (10, 30, 60, 120, 300, 600, 1200, 1800, 3600)
 """Seconds at which the second table compares."""

@@ -9,8 +9,8 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from mmpi_ns.bench import exact
-from mmpi_ns.bench.cases import (
+from mmpi_ns.bench.stability import exact
+from mmpi_ns.bench.stability.cases import (
     UNIT,
     Case,
     Error,
@@ -24,7 +24,7 @@ from mmpi_ns.bench.cases import (
     single,
     snap,
 )
-from mmpi_ns.bench.exact import Array
+from mmpi_ns.bench.stability.exact import Array
 from mmpi_ns.scene.geometry import (
     Cube,
     Frames,

@@ -14,8 +14,8 @@ import numpy as np
 
 from mmpi_ns.bench.methods import Method, Scene
 from mmpi_ns.bench.provenance import commit, read_json, stamp, stamp_line, write_json
+from mmpi_ns.bench.quality.train import shown, train_apart
 from mmpi_ns.bench.suites import ABLATIONS, Variant
-from mmpi_ns.bench.train import shown, train_apart
 from mmpi_ns.bench.trainings import Request
 
 NEAR = 0.1

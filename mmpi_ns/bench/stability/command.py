@@ -11,9 +11,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mmpi_ns.bench import cases_blending, cases_geometry, cases_merging, cases_rays
-from mmpi_ns.bench.cases import PRECISIONS, Case, Error, Precision
 from mmpi_ns.bench.provenance import fingerprint, read_json, stamp, stamp_line, write_json
+from mmpi_ns.bench.stability import blending as cases_blending
+from mmpi_ns.bench.stability import geometry as cases_geometry
+from mmpi_ns.bench.stability import merging as cases_merging
+from mmpi_ns.bench.stability import rays as cases_rays
+from mmpi_ns.bench.stability.cases import PRECISIONS, Case, Error, Precision
 
 GROUPS = (cases_geometry, cases_blending, cases_merging, cases_rays)
 
@@ -62,7 +65,7 @@ class Stability:
             raise SystemExit("mmpi-bench: a case fails its bound; see the lines above that say FAIL.")
 
     def _train(self, done: dict[str, Any], save: Callable[[], None]) -> None:
-        from mmpi_ns.bench.absurd import ABSURDITIES, train
+        from mmpi_ns.bench.stability.absurd import ABSURDITIES, train
 
         for number, absurdity in enumerate(ABSURDITIES, 1):
             if self.only not in f"training: {absurdity.name}":

@@ -11,9 +11,9 @@ import torch
 from nerfstudio.field_components.field_heads import FieldHeadNames
 from torch import Tensor
 
-from mmpi_ns.bench.cases_rays import CLEAR, CUBE, Scene, scene
-from mmpi_ns.bench.exact_ray import ExactField, ExactRay, Gradients
 from mmpi_ns.bench.rendering import bundle_of
+from mmpi_ns.bench.stability.exact_ray import ExactField, ExactRay, Gradients
+from mmpi_ns.bench.stability.rays import CLEAR, CUBE, Scene, scene
 from mmpi_ns.field.baking import shares_at
 from mmpi_ns.field.mmpi_field import NEGLIGIBLE_DEPTH, MMPIField
 from mmpi_ns.field.samples import metadata_of

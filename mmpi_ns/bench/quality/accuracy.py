@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from mmpi_ns.bench.exact import Array
 from mmpi_ns.bench.provenance import stamp, stamp_line, write_json
+from mmpi_ns.bench.quality.solids import Solids, bake
 from mmpi_ns.bench.rendering import bundle_of, render
-from mmpi_ns.bench.solids import Solids, bake
+from mmpi_ns.bench.stability.exact import Array
 from mmpi_ns.ops.compositing import BlendForm
 from mmpi_ns.scene.plan import MPIPlan
 

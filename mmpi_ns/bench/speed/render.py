@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from mmpi_ns.bench.exact import Array
-from mmpi_ns.bench.exact_ray import ExactField, ExactRay
 from mmpi_ns.bench.provenance import fingerprint, read_json, stamp, stamp_line, write_json
+from mmpi_ns.bench.stability.exact import Array
+from mmpi_ns.bench.stability.exact_ray import ExactField, ExactRay
 from mmpi_ns.bench.trainings import evenly
 from mmpi_ns.model import BACKGROUNDS, MMPIModel
 from mmpi_ns.ops import native
