@@ -10,6 +10,7 @@ from nerfstudio.plugins.types import MethodSpecification
 
 from mmpi_ns.capture.datamanager import MMPIDataManagerConfig
 from mmpi_ns.model import MMPIModelConfig
+from mmpi_ns.placement.defaults import DEFAULTS
 from mmpi_ns.placement.rule import PlacementConfig
 from mmpi_ns.training.loss_terms import LossWeights
 from mmpi_ns.training.touched_adam import TouchedAdamConfig
@@ -58,16 +59,16 @@ def _paper_loss() -> LossWeights:
 mmpi = _method(
     "mmpi",
     "MMPI: several multi-plane images, placed among the training cameras.",
-    steps=20000,
-    rays=4096,
-    model=MMPIModelConfig(placement=PlacementConfig(texel_pixels=1.2, max_planes=256, max_texels=200e6)),
+    steps=DEFAULTS["mmpi"].steps,
+    rays=DEFAULTS["mmpi"].rays,
+    model=MMPIModelConfig(placement=DEFAULTS["mmpi"].placement),
 )
 mmpi_small = _method(
     "mmpi-small",
     "MMPI in a size that a two-core CPU trains in minutes.",
-    steps=4000,
-    rays=1024,
-    model=MMPIModelConfig(placement=PlacementConfig(texel_pixels=1.2), hidden_width=32),
+    steps=DEFAULTS["mmpi-small"].steps,
+    rays=DEFAULTS["mmpi-small"].rays,
+    model=MMPIModelConfig(placement=DEFAULTS["mmpi-small"].placement, hidden_width=32),
 )
 mmpi_kitti = _method(
     "mmpi-kitti",

@@ -1,4 +1,4 @@
-"""No holes: MPIs are widened until some MPI holds every view's borders, and a little beyond."""
+"""Image borders: MPIs are widened until some MPI holds the borders of every image, and a little beyond."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mmpi_ns.placement.observations import Array, Observations
-from mmpi_ns.placement.visibility import Content
+from mmpi_ns.placement.visibility import VisiblePoints
 from mmpi_ns.scene.plan import MPIPlan
 
 BEYOND = 0.05
@@ -17,18 +17,18 @@ WIDEST, FARTHEST = 3.0, 0.5
 """No tangent is widened beyond the one, nor by more than the other: a border far from all MPIs would cost too much."""
 
 
-def widened(mpis: list[MPIPlan], observations: Observations, content: Content) -> list[MPIPlan]:
+def widened(mpis: list[MPIPlan], observations: Observations, visible: VisiblePoints) -> list[MPIPlan]:
     """The MPIs, widened where the borders of an image are in none of them; texels keep their size.
 
-    A border counts at the depths between which content lies. Each border point that nothing holds goes to the MPI that
-    must grow least for it.
+    A border counts at the depths between which its points lie. Each border point that nothing holds goes to the MPI
+    that must grow least for it.
 
     Args:
         mpis: the chosen MPIs.
         observations: the training cameras.
-        content: where their content lies.
+        visible: what they see.
     """
-    points = border_points(observations, content)
+    points = border_points(observations, visible)
     tangents, depths = _in_frames(mpis, points)
     extents = np.array([m.extent for m in mpis])
     ahead = (depths >= np.array([[m.near] for m in mpis])) & (depths <= np.array([[m.far] for m in mpis]))
@@ -43,14 +43,14 @@ def widened(mpis: list[MPIPlan], observations: Observations, content: Content) -
     return [_resized(m, extent) for m, extent in zip(mpis, extents, strict=True)]
 
 
-def border_points(observations: Observations, content: Content) -> Array:
-    """[M * 32, 3] points around every image's border, at the depths where a quarter and most of its content begins."""
+def border_points(observations: Observations, visible: VisiblePoints) -> Array:
+    """[M * 32, 3] points around every image's border, at the depths where a quarter and most of its points begin."""
     steps = (0.0, 0.25, 0.5, 0.75, 1.0)
     rim = np.array([(a, b) for a in steps for b in steps if a in (0.0, 1.0) or b in (0.0, 1.0)])
     shares = -BEYOND + (1 + 2 * BEYOND) * rim
     clouds = []
     for pose, (fx, fy, cx, cy), (w, h), depths in zip(
-        observations.camera_to_worlds, observations.intrinsics, observations.sizes, content.typical, strict=True
+        observations.camera_to_worlds, observations.intrinsics, observations.sizes, visible.typical, strict=True
     ):
         x, y = (shares[:, 0] * w - cx) / fx, (shares[:, 1] * h - cy) / fy
         directions = np.stack([x, -y, -np.ones_like(x)], -1) @ pose[:, :3].T

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from mmpi_ns.placement.errors import cube_errors, pixel_slopes
 from mmpi_ns.placement.hand_made import vector
 from mmpi_ns.placement.observations import Array, Observations
-from mmpi_ns.placement.visibility import Content
+from mmpi_ns.placement.visibility import VisiblePoints
 from mmpi_ns.scene.plan import CubePlan, MPIPlan
 
 MAX_VIEWS = 96
@@ -24,9 +24,9 @@ MAX_VIEWS = 96
 MARGINS = (1.12, 1.4, 1.75)
 """Frusta of views, relative to the camera's own."""
 PULL_BACKS = (0.0, 1.0, 2.0)
-"""How far behind the camera an MPI may stand, relative to where content starts."""
+"""How far behind the camera an MPI may stand, relative to where points start."""
 NEAR_SHARE = 0.6
-"""First plane, relative to where content starts."""
+"""First plane, relative to where points start."""
 CUBE_SIZES = (0.4, 0.7, 1.0)
 """Half a cube's side, relative to the cameras' distance from what they look at."""
 
@@ -58,24 +58,24 @@ class Candidate:
         return replace(self.frame, planes=planes, height=height, width=width)
 
 
-def find_candidates(observations: Observations, content: Content, with_cubes: bool) -> list[Candidate]:
+def find_candidates(observations: Observations, visible: VisiblePoints, with_cubes: bool) -> list[Candidate]:
     """Views of training cameras that are spread over the capture, and cubes."""
-    spread = spread_cameras(observations, content, MAX_VIEWS)
+    spread = spread_cameras(observations, visible, MAX_VIEWS)
     views = [
         view
         for i in spread
         for pull_back in PULL_BACKS
-        for view in _views(observations, content, i, pull_back * content.near)
+        for view in _views(observations, visible, i, pull_back * visible.near)
     ]
-    return [*views, *(_cubes(observations, content) if with_cubes else [])]
+    return [*views, *(_cubes(observations, visible) if with_cubes else [])]
 
 
-def spread_cameras(observations: Observations, content: Content, wanted: int) -> list[int]:
+def spread_cameras(observations: Observations, visible: VisiblePoints, wanted: int) -> list[int]:
     """Cameras far apart in place or direction, each the farthest from those before it.
 
     Starts at the camera farthest from the middle, so the numbering of the cameras does not matter.
     """
-    reach = max(content.near, 1e-12)
+    reach = max(visible.near, 1e-12)
     place = np.concatenate([observations.centers / reach, observations.camera_to_worlds[:, :, 2] * 2], -1)
     distance = -np.linalg.norm(place - place.mean(0), axis=-1)
     chosen = [int(distance.argmin())]
@@ -86,7 +86,7 @@ def spread_cameras(observations: Observations, content: Content, wanted: int) ->
     return chosen
 
 
-def _views(observations: Observations, content: Content, i: int, pull_back: float) -> Iterator[Candidate]:
+def _views(observations: Observations, visible: VisiblePoints, i: int, pull_back: float) -> Iterator[Candidate]:
     """One MPI for each margin. They differ in extent alone, so the errors are worked out once, in the widest."""
     right, up, back = observations.camera_to_worlds[i, :, :3].T
     fx, fy, cx, cy = observations.intrinsics[i]
@@ -97,15 +97,15 @@ def _views(observations: Observations, content: Content, i: int, pull_back: floa
         name=f"view {i + 1}",
         origin=vector(origin),
         axes=(vector(right), vector(-up), vector(-back)),
-        near=float(NEAR_SHARE * min(content.nearest[i], content.near) + pull_back),
+        near=float(NEAR_SHARE * min(visible.nearest[i], visible.near) + pull_back),
         extent=_widened(u, v, max(MARGINS)),
         planes=2,
         height=2,
         width=2,
     )
-    plane, across, down = pixel_slopes(frame, observations, content.cameras, content.points)
+    plane, across, down = pixel_slopes(frame, observations, visible.cameras, visible.points)
     plane, texel = 0.5 / frame.near * plane, np.maximum(across / fx, down / fy)
-    local = (content.points - origin) @ axes.T
+    local = (visible.points - origin) @ axes.T
     for margin in MARGINS:
         u0, u1, v0, v1 = extent = _widened(u, v, margin)
         x, y, z = local.T
@@ -120,7 +120,7 @@ def _widened(u: Array, v: Array, margin: float) -> tuple[float, float, float, fl
     return u0, u1, v0, v1
 
 
-def _cubes(observations: Observations, content: Content) -> Iterator[Candidate]:
+def _cubes(observations: Observations, visible: VisiblePoints) -> Iterator[Candidate]:
     """Cubes around the point that the cameras look at; none where they look elsewhere.
 
     Their voxels span the wanted number of pixels in the median over the observations inside.
@@ -131,7 +131,7 @@ def _cubes(observations: Observations, content: Content) -> Iterator[Candidate]:
     for half in (size * distance for size in CUBE_SIZES):
         frame = CubePlan(vector(center - half), vector(center + half), (2, 2, 2))
         # A voxel as large as half the cube spans this many pixels.
-        pixels = cube_errors(frame, observations, content.cameras, content.points)
+        pixels = cube_errors(frame, observations, visible.cameras, visible.points)
         inside = np.isfinite(pixels)
         if inside.any():
             side = 2 * float(np.median(pixels[inside]))

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from mmpi_ns.placement.errors import WORST, mpi_errors
 from mmpi_ns.placement.observations import Array, Observations
-from mmpi_ns.placement.visibility import Content
+from mmpi_ns.placement.visibility import VisiblePoints
 from mmpi_ns.scene.geometry import Frames, plane_hits
 from mmpi_ns.scene.plan import MPIPlan
 
@@ -34,7 +34,12 @@ LEAST_SPARED = 0.1
 
 
 def with_far_ends(
-    mpis: list[MPIPlan], observations: Observations, content: Content, enough: float, max_planes: int, min_gain: float
+    mpis: list[MPIPlan],
+    observations: Observations,
+    visible: VisiblePoints,
+    enough: float,
+    max_planes: int,
+    min_gain: float,
 ) -> list[MPIPlan]:
     """The MPIs, each with the depth at which it ends; poses, extents, planes and texels as they were.
 
@@ -44,24 +49,24 @@ def with_far_ends(
     Args:
         mpis: the chosen MPIs, all to infinity.
         observations: the training cameras.
-        content: what they see.
+        visible: what they see.
         enough: expected error that is small enough, in pixels.
         max_planes: planes with which expected errors are worked out.
         min_gain: bits that an MPI must gain.
     """
     if len(mpis) == 1:
         return mpis
-    lattice_cameras, lattice, directions = lattice_points(observations, content)
-    bits, reach = _costs(mpis, observations, content, (content.cameras, content.points), enough, max_planes)
-    held, lattice_reach = _costs(mpis, observations, content, (lattice_cameras, lattice), enough, max_planes)
-    met = _rays_met(mpis, observations, content, directions)
-    least = np.searchsorted(ENDS * content.near, LEAST_DEPTH * np.array([m.near for m in mpis]))
-    choice = _Ends(bits, reach, content.weights, lattice_reach, np.isfinite(held), met, least, min_gain)
-    ends = np.append(ENDS * content.near, np.inf)
+    lattice_cameras, lattice, directions = lattice_points(observations, visible)
+    bits, reach = _costs(mpis, observations, visible, (visible.cameras, visible.points), enough, max_planes)
+    held, lattice_reach = _costs(mpis, observations, visible, (lattice_cameras, lattice), enough, max_planes)
+    met = _rays_met(mpis, observations, visible, directions)
+    least = np.searchsorted(ENDS * visible.near, LEAST_DEPTH * np.array([m.near for m in mpis]))
+    choice = _Ends(bits, reach, visible.weights, lattice_reach, np.isfinite(held), met, least, min_gain)
+    ends = np.append(ENDS * visible.near, np.inf)
     return [replace(m, far=float(ends[level])) for m, level in zip(mpis, choice.run(), strict=True)]
 
 
-def lattice_points(observations: Observations, content: Content) -> tuple[NDArray[np.int64], Array, Array]:
+def lattice_points(observations: Observations, visible: VisiblePoints) -> tuple[NDArray[np.int64], Array, Array]:
     """Cameras [P] and places [P, 3] of points that fill each image's frustum, and directions [M, N, 3] to them."""
     columns, rows, depths = LATTICE
     shares = np.array([(a, b) for a in columns for b in rows])
@@ -70,7 +75,7 @@ def lattice_points(observations: Observations, content: Content) -> tuple[NDArra
     y = (shares[:, 1] * observations.sizes[:, 1:] - cy) / fy
     local = np.stack([x, -y, -np.ones_like(x)], -1)
     directions = np.einsum("mij,mnj->mni", observations.camera_to_worlds[:, :, :3], local)
-    offsets = directions[:, None] * (content.nearest[:, None] * np.array(depths))[:, :, None, None]
+    offsets = directions[:, None] * (visible.nearest[:, None] * np.array(depths))[:, :, None, None]
     points = observations.centers[:, None, None] + offsets
     cameras = np.repeat(np.arange(len(points)), points.shape[1] * points.shape[2])
     return cameras, points.reshape(-1, 3), directions
@@ -79,7 +84,7 @@ def lattice_points(observations: Observations, content: Content) -> tuple[NDArra
 def _costs(
     mpis: list[MPIPlan],
     observations: Observations,
-    content: Content,
+    visible: VisiblePoints,
     seen: tuple[NDArray[np.int64], Array],
     enough: float,
     max_planes: int,
@@ -87,7 +92,7 @@ def _costs(
     """Bits [K, P] that each point costs in each MPI (inf where it is not held), and the least end that holds it."""
     cameras, points = seen
     bits, levels = [], []
-    far_off = np.linalg.norm(points - observations.centers[cameras], axis=-1) > 0.5 * INFINITE * content.near
+    far_off = np.linalg.norm(points - observations.centers[cameras], axis=-1) > 0.5 * INFINITE * visible.near
     for mpi in mpis:
         plane, texel = mpi_errors(replace(mpi, planes=max_planes), observations, cameras, points)
         depth = (points - np.asarray(mpi.origin)) @ np.asarray(mpi.axes[2])
@@ -98,11 +103,11 @@ def _costs(
         error = np.hypot(np.where(held, plane, 0.0) * nearer, 0.5 * np.where(held, texel, 0.0))
         clipped = np.log2(np.clip(error, enough, max(WORST, 2 * enough)) / enough)
         bits.append(np.where(held, clipped, np.inf))
-        levels.append(np.searchsorted(ENDS * content.near, depth))
+        levels.append(np.searchsorted(ENDS * visible.near, depth))
     return np.stack(bits), np.stack(levels)
 
 
-def _rays_met(mpis: list[MPIPlan], observations: Observations, content: Content, directions: Array) -> Array:
+def _rays_met(mpis: list[MPIPlan], observations: Observations, visible: VisiblePoints, directions: Array) -> Array:
     """[K, ends] how many of the lattice's rays meet each MPI if it ends there."""
     origins = np.repeat(observations.centers, directions.shape[1], 0)
     unit = directions.reshape(-1, 3) / np.linalg.norm(directions.reshape(-1, 3), axis=-1, keepdims=True)
@@ -110,7 +115,7 @@ def _rays_met(mpis: list[MPIPlan], observations: Observations, content: Content,
     near = torch.zeros(len(unit), 1, dtype=torch.float64)
     hits = plane_hits(torch.from_numpy(origins), torch.from_numpy(unit), near, near + torch.inf, frames)
     nearest = (hits.m_first * frames.disparity_steps).numpy()
-    first = np.searchsorted(ENDS * content.near, 1 / np.maximum(nearest, 1e-300))
+    first = np.searchsorted(ENDS * visible.near, 1 / np.maximum(nearest, 1e-300))
     met = (hits.count > 0).numpy()
     return np.stack(
         [np.cumsum(np.bincount(first[met[:, k], k], minlength=len(ENDS) + 1)) for k in range(len(mpis))]

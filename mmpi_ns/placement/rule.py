@@ -3,7 +3,7 @@
 Greedy facility location (Nemhauser et al. 1978) over ``candidates.py``: every observation is served by the chosen head
 that shows it with the least expected error (``errors.py``), and the candidate that lowers the mean of log2(error) most
 for its texels is taken, until the next would add too little. Heads that later ones have made superfluous are put back.
-Then each MPI gets the planes that what it serves asks for, and is widened where there would be holes (``coverage.py``).
+Then each MPI gets the planes that what it serves asks for, and is widened where there would be holes (``borders.py``).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from mmpi_ns.placement.errors import WORST
 from mmpi_ns.placement.far_ends import with_far_ends
 from mmpi_ns.placement.hand_made import drive_plan, room_plan
 from mmpi_ns.placement.observations import Observations
-from mmpi_ns.placement.visibility import Content, find_content
+from mmpi_ns.placement.visibility import VisiblePoints, find_visible_points
 from mmpi_ns.scene.plan import CubePlan, MPIPlan, ScenePlan
 
 MIN_PLANES = 16
@@ -39,11 +39,11 @@ class PlacementConfig:
     max_texels: float = 16e6
     """Texels and voxels in all, about: beyond, all of them are made larger; 0 for no limit (automatic)."""
     min_gain: float = 1.5
-    """Bits: a further MPI must halve the expected error of one training image's content this often (automatic)."""
+    """Bits: a further MPI must halve the expected error of one training image's points this often (automatic)."""
     planes: int = 64
     """Planes of every MPI (drive, room)."""
     max_planes: int = 128
-    """Planes of an MPI at most; each gets those that its content needs (automatic)."""
+    """Planes of an MPI at most; each gets those that the points it serves need (automatic)."""
     plane_pixels: float = 0.5
     """Error for lack of planes to allow four fifths of what an MPI serves, relative to a texel's pixels (automatic)."""
     texel_pixels: float = 1.5
@@ -85,21 +85,21 @@ def place(observations: Observations, config: PlacementConfig, training_rays: in
     Raises:
         ValueError: the cameras leave nothing to place, e.g. all observations are behind their cameras.
     """
-    content = find_content(observations)
+    visible = find_visible_points(observations)
     if config.arrangement == "drive":
-        # The hand-made rule is in metres; it was made where the nearest content lies 5 m away.
+        # The hand-made rule is in metres; it was made where the nearest point lies 5 m away.
         size = (config.planes, config.height, config.width)
-        return drive_plan(observations, content.near / 5, *size, config.faces, config.drive_pull_back)
+        return drive_plan(observations, visible.near / 5, *size, config.faces, config.drive_pull_back)
     if config.arrangement == "room":
-        half_size = float(np.abs(observations.centers - observations.centers.mean(0)).max()) + content.near
-        near = max(0.5 * content.near, 1e-6)
+        half_size = float(np.abs(observations.centers - observations.centers.mean(0)).max()) + visible.near
+        near = max(0.5 * visible.near, 1e-6)
         return room_plan(observations, config.planes, config.width, config.cube_voxels, near, half_size)
     texel_pixels = max(config.texel_pixels, trainable_texel(observations, config, training_rays))
     config = replace(config, max_texels=affordable_texels(config, training_rays))
-    chosen = _choose(observations, content, config, texel_pixels)
+    chosen = _choose(observations, visible, config, texel_pixels)
     mpis = tuple(h for h in chosen if isinstance(h, MPIPlan))
     cube = next((h for h in chosen if isinstance(h, CubePlan)), None)
-    return ScenePlan(_named(mpis), cube, 0.2 * content.near, content.near, "automatic placement")
+    return ScenePlan(_named(mpis), cube, 0.2 * visible.near, visible.near, "automatic placement")
 
 
 def trainable_texel(observations: Observations, config: PlacementConfig, training_rays: int | None) -> float:
@@ -117,17 +117,17 @@ def affordable_texels(config: PlacementConfig, training_rays: int | None) -> flo
 
 
 def _choose(
-    observations: Observations, content: Content, config: PlacementConfig, texel_pixels: float
+    observations: Observations, visible: VisiblePoints, config: PlacementConfig, texel_pixels: float
 ) -> list[MPIPlan | CubePlan]:
     """The heads that a scene needs, with texels no finer than the budget allows."""
-    candidates = find_candidates(observations, content, with_cubes=config.max_voxels > 0)
+    candidates = find_candidates(observations, visible, with_cubes=config.max_voxels > 0)
     best: list[MPIPlan | CubePlan] | None = None
     size = texel_pixels
     chosen: list[MPIPlan | CubePlan] = []
     too_fine = None
     for _ in range(BUDGET_ROUNDS):
-        chosen = _Choice(candidates, content.weights, config, texel_pixels).run()
-        mpis = widened([h for h in chosen if isinstance(h, MPIPlan)], observations, content)
+        chosen = _Choice(candidates, visible.weights, config, texel_pixels).run()
+        mpis = widened([h for h in chosen if isinstance(h, MPIPlan)], observations, visible)
         chosen = [*mpis, *(h for h in chosen if isinstance(h, CubePlan))]
         excess = sum(h.texels for h in chosen) / config.max_texels if config.max_texels else 0.0
         if excess <= 1.0:
@@ -145,7 +145,7 @@ def _choose(
         return best
     mpis = [h for h in best if isinstance(h, MPIPlan)]
     enough = config.enough * size
-    mpis = with_far_ends(mpis, observations, content, enough, config.max_planes, config.min_gain)
+    mpis = with_far_ends(mpis, observations, visible, enough, config.max_planes, config.min_gain)
     return [*mpis, *(h for h in best if isinstance(h, CubePlan))]
 
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mmpi_ns.placement.observations import Array, Observations
 from mmpi_ns.placement.rule import PlacementConfig, place
-from mmpi_ns.placement.visibility import find_content
+from mmpi_ns.placement.visibility import find_visible_points
 from mmpi_ns.scene.windows import Window, WindowedPlan
 
 MARGIN = 0.08
@@ -52,8 +52,8 @@ def find_balls(observations: Observations, length: float) -> list[tuple[Array, f
         observations: the cameras.
         length: how long a window may be, in median distances of what the cameras saw.
     """
-    content = find_content(observations)
-    longest = length * float(np.median(np.linalg.norm(content.points - observations.centers[content.cameras], axis=-1)))
+    visible = find_visible_points(observations)
+    longest = length * float(np.median(np.linalg.norm(visible.points - observations.centers[visible.cameras], axis=-1)))
     centers = observations.centers
     spread = np.linalg.norm(centers - centers.mean(0), axis=-1)
     if 2 * spread.max() <= longest:

@@ -1,7 +1,7 @@
 """A quick plane sweep: rough points for scenes that come with poses but without structure from motion.
 
-Placement needs to know roughly where content lies, no more. Some views are compared with their neighbours over a range
-of disparities at low resolution; pixels with one clear match become points. Pure NumPy, a few seconds.
+Placement needs to know the depths roughly, no more. Some views are compared with their neighbours over a range
+of disparities at low resolution; pixels with one clear match become points. A few seconds.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates, uniform_filter
 
 from mmpi_ns.placement.observations import Array, Observations
 
@@ -51,7 +52,7 @@ def add_swept_points(observations: Observations, images: list[Array], num_refere
         found = _sweep(views[i], [views[j] for j in neighbours[:4]])
         points.append(found)
         for j in (int(i), *neighbours):
-            seen = np.nonzero(_in_image(views[j], found))[0]
+            seen = np.nonzero(_in_image(observations, j, found))[0]
             cameras.append(np.full(len(seen), j, np.int64))
             indices.append(total + seen)
         total += len(found)
@@ -63,13 +64,9 @@ def add_swept_points(observations: Observations, images: list[Array], num_refere
     )
 
 
-def _in_image(view: _View, points: Array) -> NDArray[np.bool_]:
-    local = (points - view.pose[:, 3]) @ view.pose[:, :3]
-    depth = np.where(local[:, 2] < 0, -local[:, 2], np.inf)
-    fx, fy, cx, cy = view.intrinsics
-    x, y = fx * local[:, 0] / depth + cx, -fy * local[:, 1] / depth + cy
-    height, width = view.image.shape
-    return np.isfinite(depth) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
+def _in_image(observations: Observations, camera: int, points: Array) -> NDArray[np.bool_]:
+    pixels, ahead = observations.project(np.full(len(points), camera), points)
+    return ahead & ((pixels >= 0) & (pixels < observations.sizes[camera])).all(-1)
 
 
 def _view(observations: Observations, index: int, image: Array) -> _View:
@@ -94,7 +91,7 @@ def _sweep(reference: _View, neighbours: list[_View]) -> Array:
     ys, xs = np.mgrid[0:height, 0:width] + 0.5
     rays = np.stack([(xs - cx) / fx, -(ys - cy) / fy, -np.ones_like(xs)], -1)
     distances = [float(np.linalg.norm(n.pose[:, 3] - reference.pose[:, 3])) for n in neighbours]
-    # The nearest neighbour sets how near content may be: on a walk the others have long turned away from it.
+    # The nearest neighbour sets how near points may be: on a walk the others have long turned away from it.
     baseline = max(min(distances), 0.1 * max(distances))
     disparities = np.linspace(0, 0.35 * width / (fx * baseline), HYPOTHESES)
     scores = np.stack([_score(reference, neighbours, rays, w) for w in disparities])
@@ -138,28 +135,19 @@ def _warp(reference: _View, neighbour: _View, rays: Array, disparity: float) -> 
     x, y = fx * local[..., 0] / safe + cx - 0.5, -fy * local[..., 1] / safe + cy - 0.5
     height, width = neighbour.image.shape
     inside = ahead & (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
-    x, y = np.where(inside, x, 0), np.where(inside, y, 0)
-    x0, y0 = np.minimum(x.astype(int), width - 2), np.minimum(y.astype(int), height - 2)
-    fx_, fy_ = x - x0, y - y0
-    im = neighbour.image
-    top = im[y0, x0] * (1 - fx_) + im[y0, x0 + 1] * fx_
-    bottom = im[y0 + 1, x0] * (1 - fx_) + im[y0 + 1, x0 + 1] * fx_
-    return top * (1 - fy_) + bottom * fy_, inside
+    return map_coordinates(neighbour.image, np.where(inside, [y, x], 0.0), order=1), inside
 
 
 def _correlation(a: Array, b: Array, inside: NDArray[np.bool_]) -> Array:
     """Zero-mean normalised correlation over windows; -1 where a window leaves the image or holds no texture."""
     b = np.where(inside, b, 0.0)
-    mean_a, mean_b = _box(a), _box(b)
-    variance_a, variance_b = _box(a * a) - mean_a**2, _box(b * b) - mean_b**2
-    covariance = _box(a * b) - mean_a * mean_b
-    textured = (variance_a > 1e-4) & (variance_b > 1e-4) & (_box(inside.astype(float)) > 0.999)
+    mean_a, mean_b = _mean(a), _mean(b)
+    variance_a, variance_b = _mean(a * a) - mean_a**2, _mean(b * b) - mean_b**2
+    covariance = _mean(a * b) - mean_a * mean_b
+    textured = (variance_a > 1e-4) & (variance_b > 1e-4) & (_mean(inside.astype(float)) > 0.999)
     return np.where(textured, covariance / np.sqrt(np.maximum(variance_a * variance_b, 1e-12)), -1.0)
 
 
-def _box(image: Array) -> Array:
-    """Mean over WINDOW x WINDOW pixels, edges padded."""
-    r = WINDOW // 2
-    total = np.pad(image, ((r + 1, r), (r + 1, r)), mode="edge").cumsum(0).cumsum(1)
-    n = WINDOW
-    return (total[n:, n:] - total[:-n, n:] - total[n:, :-n] + total[:-n, :-n]) / n**2
+def _mean(image: Array) -> Array:
+    """Mean over WINDOW x WINDOW pixels, edges repeated."""
+    return uniform_filter(image, WINDOW, mode="nearest")

@@ -1,4 +1,4 @@
-"""What placement weighs: which camera sees what, how far away, robust to outliers, and independent of any order."""
+"""Visibility: which camera sees which points and how far away; robust to outliers, and independent of any order."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ FRUSTUM_SHARE, FEW = 0.15, 10
 """Weight, in every image, of points that fill its frustum: a share, and most of it where there are so FEW keypoints.
 Where an image has no keypoints (sky, a white wall) there must be planes all the same."""
 SPAN = (0.25, 0.9)
-"""Between these quantiles of depth an image's content is said to lie."""
+"""Between these quantiles of depth the points of an image are said to lie."""
 WINDOW, SUPPORT = 1.5, 0.04
-"""Content starts where so many of a camera's observations lie within a factor of WINDOW in depth."""
+"""What a camera sees starts where so many of its observations lie within a factor of WINDOW in depth."""
 
 
 @dataclass(frozen=True)
-class Content:
-    """Where the content of a scene lies, as placement sees it."""
+class VisiblePoints:
+    """The points that placement weighs, and the cameras that see them."""
 
     cameras: NDArray[np.int64]
     """[Q] camera of each observation."""
@@ -31,17 +31,17 @@ class Content:
     weights: Array
     """[Q] what an observation counts; those of a camera sum to 1."""
     nearest: Array
-    """[M] depth, along each camera's axis, at which its content starts."""
+    """[M] depth, along each camera's axis, at which its points start."""
     typical: Array
-    """[M, 2] depths before which a quarter and nine tenths of each camera's content lie."""
+    """[M, 2] depths before which a quarter and nine tenths of each camera's points lie."""
     near: float
-    """Depth at which content starts for the cameras in general."""
+    """Depth at which points start for the cameras in general."""
 
 
-def find_content(observations: Observations) -> Content:
+def find_visible_points(observations: Observations) -> VisiblePoints:
     """The observations that placement weighs: keypoints, and points that fill the cameras' frusta.
 
-    Keypoints that are not finite or lie behind their camera are left out. Without any the nearest content is taken to
+    Keypoints that are not finite or lie behind their camera are left out. Without any the nearest point is taken to
     lie at a tenth of the cameras' spread.
 
     Raises:
@@ -76,7 +76,7 @@ def _start(depth: Array) -> float:
 
 def _weighed(
     observations: Observations, cameras: NDArray[np.int64], points: Array, nearest: Array, typical: Array, near: float
-) -> Content:
+) -> VisiblePoints:
     count = len(observations.centers)
     # Evenly spaced in an order that no numbering, pose or unit enters: by depth.
     order = np.argsort(observations.depths(cameras, points) / near, kind="stable")
@@ -87,7 +87,7 @@ def _weighed(
     share = (1 - FRUSTUM_SHARE) * seen / (seen + FEW)
     filling = frustum_points(observations, nearest)
     each = len(filling) // count
-    return Content(
+    return VisiblePoints(
         cameras=np.concatenate([cameras, np.repeat(np.arange(count), each)]),
         points=np.concatenate([points, filling]),
         weights=np.concatenate([(share / np.maximum(seen, 1))[cameras], np.repeat((1 - share) / each, each)]),

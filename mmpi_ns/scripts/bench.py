@@ -2,30 +2,49 @@
 
 from __future__ import annotations
 
+import ast
 import sys
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
 
-import tyro
+COMMANDS = {
+    "train": "quality.train",
+    "render": "speed.render",
+    "speed": "speed.against_peers",
+    "ops": "speed.ops",
+    "scaling": "speed.scaling",
+    "roads": "speed.roads",
+    "processes": "speed.processes",
+    "ablate": "quality.ablate",
+    "gpu": "gpu.command",
+    "stability": "stability.command",
+    "accuracy": "quality.accuracy",
+    "results": "quality.results",
+    "dense": "speed.dense",
+    "regions": "quality.regions",
+}
+"""Module below mmpi_ns.bench that holds the command, as a class of its name. Only what is asked for is imported."""
 
-from mmpi_ns.bench.gpu.command import Gpu
-from mmpi_ns.bench.quality.ablate import Ablate
-from mmpi_ns.bench.quality.accuracy import Accuracy
-from mmpi_ns.bench.quality.regions import Regions
-from mmpi_ns.bench.quality.results import Results
-from mmpi_ns.bench.quality.train import Train
-from mmpi_ns.bench.speed.against_peers import Speed
-from mmpi_ns.bench.speed.dense import Dense
-from mmpi_ns.bench.speed.ops import Ops
-from mmpi_ns.bench.speed.processes import Processes
-from mmpi_ns.bench.speed.render import Render
-from mmpi_ns.bench.speed.roads import Roads
-from mmpi_ns.bench.speed.scaling import Scaling
-from mmpi_ns.bench.stability.command import Stability
+
+def _purpose(module: str) -> str:
+    """First line of a module's docstring, read without importing it."""
+    origin = getattr(find_spec(f"mmpi_ns.bench.{module}"), "origin", None)
+    source = Path(origin).read_text(encoding="utf-8") if origin else ""
+    return (ast.get_docstring(ast.parse(source)) or "").partition("\n")[0].rpartition("``: ")[2]
 
 
 def entrypoint() -> None:
     """The command ``mmpi-bench``; a mistake is one sentence and exit status 1."""
-    measures = Train | Render | Speed | Ops | Scaling | Roads | Processes | Ablate | Gpu
-    command = tyro.cli(measures | Stability | Accuracy | Results | Dense | Regions, prog="mmpi-bench")  # type: ignore[arg-type]
+    name = sys.argv[1] if len(sys.argv) > 1 else "--help"
+    if name not in COMMANDS:
+        print("usage: mmpi-bench COMMAND [OPTIONS] (mmpi-bench COMMAND --help)\n")
+        print("\n".join(f"  {command:10} {_purpose(module)}" for command, module in COMMANDS.items()))
+        sys.exit(0 if name in ("-h", "--help") else f"mmpi-bench: there is no command {name!r}.")
+    import tyro
+
+    measure = getattr(import_module(f"mmpi_ns.bench.{COMMANDS[name]}"), name.capitalize())
+    command = tyro.cli(measure, prog=f"mmpi-bench {name}", args=sys.argv[2:])
     try:
         command.run()
     except (ValueError, OSError) as error:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal
 
 import tyro
 
+from mmpi_ns.placement.defaults import DEFAULTS
 from mmpi_ns.placement.rule import PlacementConfig
 
 if TYPE_CHECKING:
@@ -65,16 +66,16 @@ class PlanCommand:
         from mmpi_ns.placement.show.explain import explain, table
         from mmpi_ns.placement.show.pictures import draw_errors, draw_plan, draw_windows
         from mmpi_ns.placement.split import cameras_of
-        from mmpi_ns.placement.visibility import find_content
+        from mmpi_ns.placement.visibility import find_visible_points
 
         self.output.mkdir(parents=True, exist_ok=True)
         parts = []
         for i, window in enumerate(windows.windows):
             own = cameras_of(window, observations)
-            content = find_content(own)
-            report = explain(window.plan, own, content)
+            visible = find_visible_points(own)
+            report = explain(window.plan, own, visible)
             suffix = f"-{i}" if len(windows) > 1 else ""
-            draw_plan(self.output / f"plan{suffix}.png", window.plan, own, content)
+            draw_plan(self.output / f"plan{suffix}.png", window.plan, own, visible)
             draw_errors(self.output / f"errors{suffix}.png", window.plan, report)
             title = f"## Window {i}: {len(own.centers)} training cameras\n\n" if len(windows) > 1 else ""
             parts.append(title + table(report))
@@ -87,15 +88,11 @@ class PlanCommand:
 
 def _defaults(arguments: list[str]) -> PlanCommand:
     """The command with the placement and the rays of the method that the arguments name."""
-    from mmpi_ns.config import mmpi, mmpi_small
-
     words = [w for argument in arguments for w in argument.split("=", 1)]
-    named = words[words.index("--method") + 1] if "--method" in words[:-1] else "mmpi-small"
-    config = (mmpi if named == "mmpi" else mmpi_small).config
-    rays = config.max_num_iterations * config.pipeline.datamanager.train_num_rays_per_batch  # type: ignore
-    placement = config.pipeline.model.placement  # type: ignore
-    missing = tyro.MISSING
-    return PlanCommand(scene=missing, output=missing, training_rays=rays, placement=placement)
+    named = words[words.index("--method") + 1] if "--method" in words[:-1] else ""
+    default = DEFAULTS.get(named, DEFAULTS["mmpi-small"])
+    rays = default.steps * default.rays
+    return PlanCommand(tyro.MISSING, tyro.MISSING, training_rays=rays, placement=default.placement)
 
 
 def entrypoint() -> None:

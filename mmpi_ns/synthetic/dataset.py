@@ -8,9 +8,9 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 from PIL import Image
 
-from mmpi_ns.synthetic.primitives import Array
 from mmpi_ns.synthetic.scene import Colors, Scene, render
 from mmpi_ns.synthetic.sfm_like import SfmPoints, sfm_points
 
@@ -51,8 +51,10 @@ def write_dataset(
     check_folder(folder, overwrite)
     found = sfm_points(scene, points, noise_pixels, outliers)
     clear(folder)
-    write_colmap(scene, found, folder / "colmap" / "sparse" / "0")
-    _write_ply(found, folder / "sparse_pc.ply")
+    model = colmap_model(scene, found)
+    (folder / "colmap" / "sparse" / "0").mkdir(parents=True)
+    model.write(folder / "colmap" / "sparse" / "0")
+    model.export_PLY(folder / "sparse_pc.ply")
     for part in ("images", "depths") if images else ():
         (folder / part).mkdir()
     for i in progress(range(len(scene.cameras))) if images else ():
@@ -117,56 +119,29 @@ def _transforms(scene: Scene, images: bool) -> dict:
     }  # fmt: skip
 
 
-def _write_ply(found: SfmPoints, path: Path) -> None:
-    names = [f"property float {c}" for c in "xyz"] + [f"property uchar {c}" for c in ("red", "green", "blue")]
-    head = ["ply", "format ascii 1.0", f"element vertex {len(found.points)}", *names, "end_header"]
-    rows = [
-        f"{x:.6f} {y:.6f} {z:.6f} {r} {g} {b}"
-        for (x, y, z), (r, g, b) in zip(found.points.tolist(), found.colors.tolist(), strict=True)
-    ]
-    path.write_text("\n".join([*head, *rows]) + "\n")
-
-
-def write_colmap(scene: Scene, found: SfmPoints, folder: Path) -> None:
-    """The cameras, points and tracks as a COLMAP text model."""
-    folder.mkdir(parents=True)
-    cameras, (cx, cy) = scene.cameras, scene.cameras.center
-    head = f"1 PINHOLE {cameras.width} {cameras.height} {cameras.focal} {cameras.focal} {cx} {cy}\n"
-    (folder / "cameras.txt").write_text(head)
+def colmap_model(scene: Scene, found: SfmPoints) -> pycolmap.Reconstruction:
+    """The cameras, points and tracks as a COLMAP model; image and point ids count from 1."""
+    cameras, points = scene.cameras, found.points
+    model = pycolmap.Reconstruction()
+    intrinsics = [cameras.focal, cameras.focal, *cameras.center]
+    model.add_camera_with_trivial_rig(
+        pycolmap.Camera(model="PINHOLE", width=cameras.width, height=cameras.height, params=intrinsics, camera_id=1)
+    )
     by_camera = np.argsort(found.camera, kind="stable")
     bounds = np.searchsorted(found.camera[by_camera], np.arange(len(cameras) + 1))
     slot = np.empty(len(by_camera), np.int64)
-    lines = []
     for i, pose in enumerate(cameras.camera_to_worlds):
         these = by_camera[bounds[i] : bounds[i + 1]]
         slot[these] = np.arange(len(these))
         # World to camera, with y down and z ahead.
         rotation = np.diag([1.0, -1.0, -1.0]) @ pose[:, :3].T
-        numbers = [*quaternion(rotation), *(-rotation @ pose[:, 3])]
-        lines.append(f"{i + 1} {' '.join(repr(float(n)) for n in numbers)} 1 {image_name(i)}")
-        keypoints = zip(found.pixel[these].tolist(), found.point[these].tolist(), strict=True)
-        lines.append(" ".join(f"{x:.4f} {y:.4f} {p + 1}" for (x, y), p in keypoints))
-    (folder / "images.txt").write_text("\n".join(lines) + "\n")
-    _write_points(found, found.errors(scene), slot, folder / "points3D.txt")
-
-
-def _write_points(found: SfmPoints, errors: Array, slot: np.ndarray, path: Path) -> None:
-    starts = np.searchsorted(found.point, np.arange(len(found.points) + 1))
-    pairs = np.stack([found.camera + 1, slot], -1).tolist()
-    rows = []
-    for p, (xyz, rgb) in enumerate(zip(found.points.tolist(), found.colors.tolist(), strict=True)):
-        track = slice(starts[p], starts[p + 1])
-        seen = " ".join(f"{i} {k}" for i, k in pairs[track])
-        rows.append(f"{p + 1} {' '.join(map(repr, xyz))} {' '.join(map(str, rgb))} {errors[track].mean():.4f} {seen}")
-    path.write_text("\n".join(rows) + "\n")
-
-
-def quaternion(rotation: Array) -> Array:
-    """(w, x, y, z) of a rotation matrix [3, 3], w >= 0: the top eigenvector of Bar-Itzhack's matrix."""
-    (a, b, c), (d, e, f), (g, h, i) = rotation
-    matrix = np.array(
-        [[a + e + i, h - f, c - g, d - b], [h - f, a - e - i, b + d, c + g],
-         [c - g, b + d, e - a - i, f + h], [d - b, c + g, f + h, i - a - e]]
-    )  # fmt: skip
-    q = np.linalg.eigh(matrix)[1][:, -1]
-    return q if q[0] >= 0 else -q
+        pixels = found.pixel[these]
+        image = pycolmap.Image(name=image_name(i), camera_id=1, image_id=i + 1, keypoints=pixels)
+        rigid = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -rotation @ pose[:, 3])
+        model.add_image_with_trivial_frame(image, rigid)
+    starts = np.searchsorted(found.point, np.arange(len(points) + 1))
+    elements = [pycolmap.TrackElement(i, k) for i, k in np.stack([found.camera + 1, slot], -1).tolist()]
+    for p, (xyz, color) in enumerate(zip(points, found.colors, strict=True)):
+        model.add_point3D(xyz, pycolmap.Track(elements[starts[p] : starts[p + 1]]), color)
+    model.update_point_3d_errors()
+    return model

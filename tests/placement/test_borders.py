@@ -10,7 +10,7 @@ from procedural import observations_of
 
 from mmpi_ns.placement.borders import WIDEST, border_points, widened
 from mmpi_ns.placement.rule import PlacementConfig, place
-from mmpi_ns.placement.visibility import find_content
+from mmpi_ns.placement.visibility import find_visible_points
 from mmpi_ns.scene.plan import MPIPlan
 from mmpi_ns.synthetic.catalogue import make_scene
 
@@ -25,22 +25,22 @@ def holds(mpi: MPIPlan, points: np.ndarray) -> np.ndarray:
 @pytest.fixture(scope="module")
 def scene():
     observations = observations_of(make_scene("still-life"), per_camera=30)
-    return observations, find_content(observations)
+    return observations, find_visible_points(observations)
 
 
 @pytest.mark.parametrize("name", ["street", "still-life", "look-round"])
 def test_a_plan_holds_the_borders_of_every_image(name):
     observations = observations_of(make_scene(name), per_camera=30)
     plan = place(observations, PlacementConfig())
-    points = border_points(observations, find_content(observations))
+    points = border_points(observations, find_visible_points(observations))
     assert np.any([holds(m, points) for m in plan.mpis], axis=0).mean() > 0.995
 
 
 def test_border_points_surround_what_a_camera_sees(scene):
-    observations, content = scene
-    each = len(border_points(observations, content)) // len(observations.centers)
+    observations, visible = scene
+    each = len(border_points(observations, visible)) // len(observations.centers)
     for i in (0, 5):
-        points = border_points(observations, content)[i * each : (i + 1) * each]
+        points = border_points(observations, visible)[i * each : (i + 1) * each]
         pose, (fx, fy, cx, cy) = observations.camera_to_worlds[i], observations.intrinsics[i]
         local = (points - pose[:, 3]) @ pose[:, :3]
         depth = -local[:, 2]
@@ -48,15 +48,15 @@ def test_border_points_surround_what_a_camera_sees(scene):
         width, height = observations.sizes[i]
         outside = (x < 0) | (x > width) | (y < 0) | (y > height)
         assert outside.all() and x.min() < -0.04 * width and y.max() > 1.04 * height
-        assert np.allclose(np.unique(depth.round(6)), content.typical[i], rtol=1e-5)
+        assert np.allclose(np.unique(depth.round(6)), visible.typical[i], rtol=1e-5)
 
 
 def test_texels_keep_their_size_and_nothing_else_changes(scene):
-    observations, content = scene
+    observations, visible = scene
     whole = place(observations, PlacementConfig()).mpis[0]
     u0, u1, v0, v1 = whole.extent
     small = replace(whole, extent=(u0 / 2, u1 / 2, v0 / 2, v1 / 2), width=whole.width // 2, height=whole.height // 2)
-    (got,) = widened([small], observations, content)
+    (got,) = widened([small], observations, visible)
     assert got.extent[0] < small.extent[0] and got.extent[3] > small.extent[3]
     pitch = [(m.extent[1] - m.extent[0]) / (m.width - 1) for m in (small, got)]
     assert pitch[1] == pytest.approx(pitch[0], rel=0.02)
@@ -64,17 +64,17 @@ def test_texels_keep_their_size_and_nothing_else_changes(scene):
 
 
 def test_an_mpi_that_holds_everything_stays_as_it_is(scene):
-    observations, content = scene
+    observations, visible = scene
     (mpi,) = place(observations, PlacementConfig()).mpis
-    assert widened([mpi], observations, content) == [mpi]
+    assert widened([mpi], observations, visible) == [mpi]
 
 
 def test_what_would_need_too_wide_a_frustum_is_left_out(scene):
-    observations, content = scene
+    observations, visible = scene
     (mpi,) = place(observations, PlacementConfig()).mpis
     back = tuple(tuple(-x for x in row) for row in (mpi.axes[0], mpi.axes[2]))
     turned = replace(mpi, axes=(back[0], mpi.axes[1], back[1]))  # looks the other way
-    assert widened([turned], observations, content) == [turned]
+    assert widened([turned], observations, visible) == [turned]
     sideways = replace(mpi, axes=(tuple(-x for x in mpi.axes[2]), mpi.axes[1], mpi.axes[0]))
-    (got,) = widened([sideways], observations, content)
+    (got,) = widened([sideways], observations, visible)
     assert np.abs(got.extent).max() <= WIDEST

@@ -18,7 +18,7 @@ from mmpi_ns.placement.errors import pixel_errors
 from mmpi_ns.placement.far_ends import _Ends, lattice_points, with_far_ends
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.placement.rule import PlacementConfig, place
-from mmpi_ns.placement.visibility import find_content
+from mmpi_ns.placement.visibility import find_visible_points
 from mmpi_ns.scene.geometry import Frames, plane_hits
 from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.synthetic.catalogue import make_scene
@@ -123,7 +123,7 @@ def test_an_end_that_spares_hardly_any_ray_is_not_made():
 
 def mpis_met(plan: ScenePlan, observations: Observations) -> np.ndarray:
     """How many MPIs the rays of a lattice of pixels of every camera meet."""
-    directions = lattice_points(observations, find_content(observations))[2]
+    directions = lattice_points(observations, find_visible_points(observations))[2]
     origins = torch.from_numpy(np.repeat(observations.centers, directions.shape[1], 0))
     rays = torch.nn.functional.normalize(torch.from_numpy(directions.reshape(-1, 3)), dim=-1)
     near = torch.full((len(rays), 1), plan.ray_near, dtype=torch.float64)
@@ -133,7 +133,9 @@ def mpis_met(plan: ScenePlan, observations: Observations) -> np.ndarray:
 
 def ended(plan: ScenePlan, observations: Observations) -> ScenePlan:
     size = (ENOUGH, CONFIG.max_planes, CONFIG.min_gain)
-    return replace(plan, mpis=tuple(with_far_ends(list(plan.mpis), observations, find_content(observations), *size)))
+    return replace(
+        plan, mpis=tuple(with_far_ends(list(plan.mpis), observations, find_visible_points(observations), *size))
+    )
 
 
 @pytest.fixture(scope="module")
@@ -162,15 +164,15 @@ def test_mpis_met_grow_much_less_than_the_road(roads):
 
 def test_ends_leave_nothing_unheld_and_cost_little(roads):
     for road, plan, ends in roads.values():
-        content = find_content(road)
-        cameras, lattice, _ = lattice_points(road, content)
-        for where in ((content.cameras, content.points), (cameras, lattice)):
+        visible = find_visible_points(road)
+        cameras, lattice, _ = lattice_points(road, visible)
+        for where in ((visible.cameras, visible.points), (cameras, lattice)):
             held = [np.isfinite(pixel_errors(p, road, *where).combined.min(-1)) for p in (plan, ends)]
             assert (held[1] | ~held[0]).all()
         bits = []
         for p in (plan, ends):
-            error = pixel_errors(p, road, content.cameras, content.points).combined.min(-1)
-            bits.append(float(np.log2(np.clip(error, ENOUGH, 64) / ENOUGH) @ content.weights))
+            error = pixel_errors(p, road, visible.cameras, visible.points).combined.min(-1)
+            bits.append(float(np.log2(np.clip(error, ENOUGH, 64) / ENOUGH) @ visible.weights))
         assert bits[1] - bits[0] < 0.05 * len(road.centers)
         assert bits[1] - bits[0] < CONFIG.min_gain * len(plan.mpis)
 

@@ -15,7 +15,7 @@ from mmpi_ns.placement.errors import WORST, PixelErrors, cube_errors, mpi_errors
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.placement.rule import PlacementConfig, _Choice, _named, place
 from mmpi_ns.placement.show.explain import explain, table
-from mmpi_ns.placement.visibility import find_content
+from mmpi_ns.placement.visibility import find_visible_points
 from mmpi_ns.scene.plan import CubePlan, MPIPlan, ScenePlan
 
 FX, FY, WIDTH, HEIGHT = 150.0, 100.0, 200, 100
@@ -47,36 +47,36 @@ def test_content_starts_for_each_camera_where_its_own_points_do():
     depths = [np.linspace(10, 20, 40), np.linspace(100, 200, 40), np.full(5, 40.0)]
     centers = np.array([[0.0, 0, 0], [30, 0, 0], [60, 0, 0]])
     points = np.concatenate([c - d[:, None] * [0, 0, 1] for c, d in zip(centers, depths, strict=True)])
-    content = find_content(observed(centers, points, np.repeat([0, 1, 2], [40, 40, 5])))
-    assert content.near == pytest.approx(55)  # the median of 10 and 100; the third camera has too few of its own
-    assert content.nearest == pytest.approx([10, 100, 55])
+    visible = find_visible_points(observed(centers, points, np.repeat([0, 1, 2], [40, 40, 5])))
+    assert visible.near == pytest.approx(55)  # the median of 10 and 100; the third camera has too few of its own
+    assert visible.nearest == pytest.approx([10, 100, 55])
     # The third takes the quantiles of all 85: the 22nd, and 0.6 beyond the 31st of the second's.
-    assert content.typical == pytest.approx(
+    assert visible.typical == pytest.approx(
         np.array([[12.5, 19], [125, 190], [10 + 21 * 10 / 39, 100 + 30.6 * 100 / 39]])
     )
-    assert np.bincount(content.cameras, content.weights) == pytest.approx([1, 1, 1])
+    assert np.bincount(visible.cameras, visible.weights) == pytest.approx([1, 1, 1])
     # 0.85 of the weight at most, and half of that for ten keypoints.
-    assert content.weights[:85] == pytest.approx(np.array([0.85 / 50, 0.85 / 50, 0.85 / 15])[content.cameras[:85]])
+    assert visible.weights[:85] == pytest.approx(np.array([0.85 / 50, 0.85 / 50, 0.85 / 15])[visible.cameras[:85]])
 
 
 def test_what_is_weighed_of_many_keypoints_is_spread_over_all_depths():
     depth = np.random.default_rng(0).permutation(np.linspace(1, 100, 20_000))
-    content = find_content(observed([[0.0, 0, 0]], -depth[:, None] * [0, 0, 1], np.zeros(20_000)))
-    assert len(content.points) == 6000 + 24
-    kept = -content.points[:6000, 2]
+    visible = find_visible_points(observed([[0.0, 0, 0]], -depth[:, None] * [0, 0, 1], np.zeros(20_000)))
+    assert len(visible.points) == 6000 + 24
+    kept = -visible.points[:6000, 2]
     assert np.quantile(kept, [0, 0.25, 0.5, 0.75, 1]) == pytest.approx([1, 25.75, 50.5, 75.25, 100], rel=1e-3)
 
 
 def test_without_points_content_starts_at_a_tenth_of_the_cameras_spread():
-    assert find_content(observed([[0.0, 0, 0], [10, 0, 0]])).near == pytest.approx(0.5)
+    assert find_visible_points(observed([[0.0, 0, 0], [10, 0, 0]])).near == pytest.approx(0.5)
 
 
 def test_planes_begin_a_little_before_the_content_of_the_camera_or_of_all_where_that_is_nearer():
     depths = np.repeat([10.0, 100.0], 40)
     observations = observed([[0.0, 0, 0], [30, 0, 0]], [[0, 0, -d] for d in depths], np.repeat([0, 1], 40))
-    content = find_content(observations)
-    assert content.near == 55
-    found = {(c.frame.name, c.frame.origin[2]): c.frame.near for c in find_candidates(observations, content, False)}
+    visible = find_visible_points(observations)
+    assert visible.near == 55
+    found = {(c.frame.name, c.frame.origin[2]): c.frame.near for c in find_candidates(observations, visible, False)}
     assert found == pytest.approx({
         ("view 1", 0.0): 6, ("view 1", 55.0): 61, ("view 1", 110.0): 116,
         ("view 2", 0.0): 33, ("view 2", 55.0): 88, ("view 2", 110.0): 143,
@@ -90,7 +90,7 @@ def turned_about_y(angles):
 def test_candidates_start_from_cameras_far_apart_in_direction_too():
     turns = turned_about_y(np.radians(45 * np.arange(8)))
     observations = observed(np.zeros((8, 3)), turns=turns)
-    chosen = sorted(spread_cameras(observations, find_content(observations), 4))
+    chosen = sorted(spread_cameras(observations, find_visible_points(observations), 4))
     assert np.diff(chosen).tolist() == [2, 2, 2]
 
 
@@ -105,7 +105,7 @@ def orbit(inwards: int = 16) -> Observations:
 
 def test_cubes_stand_where_the_cameras_look_and_nowhere_if_many_look_elsewhere():
     def cubes(observations):
-        found = find_candidates(observations, find_content(observations), with_cubes=True)
+        found = find_candidates(observations, find_visible_points(observations), with_cubes=True)
         return [c.frame for c in found if isinstance(c.frame, CubePlan)]
 
     found = cubes(orbit())
@@ -116,17 +116,17 @@ def test_cubes_stand_where_the_cameras_look_and_nowhere_if_many_look_elsewhere()
 
 def test_a_candidates_errors_are_those_of_the_mpi_or_cube_made_of_it():
     observations = orbit()
-    content = find_content(observations)
-    candidates = find_candidates(observations, content, with_cubes=True)
+    visible = find_visible_points(observations)
+    candidates = find_candidates(observations, visible, with_cubes=True)
     seen = {CubePlan: 0, MPIPlan: 0}
     for candidate in candidates[::17] + candidates[-3:]:
         head = candidate.at(0.5, 40, 10_000)
         if isinstance(head, MPIPlan):
-            plane, texel = mpi_errors(head, observations, content.cameras, content.points)
+            plane, texel = mpi_errors(head, observations, visible.cameras, visible.points)
             assert (head.extent[1] - head.extent[0]) / (head.width - 1) == pytest.approx(0.5 / FX, rel=0.01)
             assert (head.extent[3] - head.extent[2]) / (head.height - 1) == pytest.approx(0.5 / FY, rel=0.01)
         else:
-            texel = cube_errors(head, observations, content.cameras, content.points)
+            texel = cube_errors(head, observations, visible.cameras, visible.points)
             plane = np.where(np.isfinite(texel), 0, np.inf)
         held = np.isfinite(texel)
         assert np.array_equal(np.isfinite(candidate.texel), held)
@@ -243,7 +243,7 @@ def test_the_finest_plan_within_the_budget_is_kept_and_the_coarsest_where_none_i
     monkeypatch.setattr(rule, "widened", lambda mpis, *_: mpis)
     observations = orbit()
     config = PlacementConfig(max_texels=2000, texel_pixels=1.5)
-    (found,) = rule._choose(observations, find_content(observations), config, 1.5)
+    (found,) = rule._choose(observations, find_visible_points(observations), config, 1.5)
     if finest < 100:
         assert found.texels == 200 and len(tried) == rule.BUDGET_ROUNDS and tried[-1] < finest
         assert tried[int(found.name) - 1] == min(t for t in tried if t >= finest) == pytest.approx(wanted, abs=0.02)
@@ -278,7 +278,7 @@ def test_mpis_at_one_camera_have_different_names():
 def test_rays_start_at_a_fifth_of_the_way_to_the_content():
     observations = orbit()
     plan = rule.place(observations, PlacementConfig())
-    near = find_content(observations).near
+    near = find_visible_points(observations).near
     assert 2 < near < 4 and plan.content_near == near and plan.ray_near == pytest.approx(near / 5)
 
 
@@ -289,18 +289,18 @@ def test_a_border_goes_to_the_mpi_that_must_grow_least_and_texels_keep_their_siz
     observations = observed([[0.0, 0, 0]], [[0.0, 0, -10]] * 30, np.zeros(30))
     whole = (-WIDTH / 2 / FX, WIDTH / 2 / FX, -HEIGHT / 2 / FY, HEIGHT / 2 / FY)
     close, narrow = mpi(extent=whole), mpi(extent=tuple(0.7 * x for x in whole))
-    got = widened([narrow, close], observations, find_content(observations))
+    got = widened([narrow, close], observations, find_visible_points(observations))
     assert got[0] == narrow
     assert got[1].extent == pytest.approx([1.1 * x for x in whole])
     assert (got[1].height - 1) / (close.height - 1) == pytest.approx(1.1, rel=0.01)
     far = replace(close, near=11.0)  # begins behind the content, so it holds none of it
-    got = widened([narrow, far], observations, find_content(observations))
+    got = widened([narrow, far], observations, find_visible_points(observations))
     assert got[1] == far and got[0].extent == pytest.approx([1.1 * x for x in whole])
 
 
 def test_only_one_side_that_is_missing_is_widened():
     observations = observed([[0.0, 0, 0]], [[0.0, 0, -10]] * 30, np.zeros(30))
-    (got,) = widened([mpi(extent=(-2.0, 2.0, -0.3, 2.0))], observations, find_content(observations))
+    (got,) = widened([mpi(extent=(-2.0, 2.0, -0.3, 2.0))], observations, find_visible_points(observations))
     assert got.extent == pytest.approx([-2, 2, -0.55, 2]) and got.width == 81
     assert got.height == round(60 * 2.55 / 2.3) + 1
 
@@ -313,13 +313,13 @@ def looking_aside(degrees) -> Observations:
 def test_nothing_is_widened_far_or_beyond_the_widest_tangent():
     # Border points lie at -1.1, -0.55, 0, ... times 2/3 from the image's middle, whose tangent is -1.73 here.
     observations = looking_aside(60)
-    (got,) = widened([mpi(extent=(-0.6, 0.6, -3.0, 3.0))], observations, find_content(observations))
+    (got,) = widened([mpi(extent=(-0.6, 0.6, -3.0, 3.0))], observations, find_visible_points(observations))
     aside = np.tan(np.radians(60) - np.arctan(1.1 / 3))
     assert got.extent == pytest.approx([-aside, 0.6, -3, 3])  # -0.83; -1.73 would be too far
     wide, middle = mpi(extent=(-2.9, 0.6, -3.0, 3.0)), looking_aside(np.degrees(np.arctan(2.95)))
-    assert widened([wide], middle, find_content(middle))[0].extent[0] == pytest.approx(-2.95)
+    assert widened([wide], middle, find_visible_points(middle))[0].extent[0] == pytest.approx(-2.95)
     middle = looking_aside(np.degrees(np.arctan(3.05)))
-    assert widened([wide], middle, find_content(middle)) == [wide]
+    assert widened([wide], middle, find_visible_points(middle)) == [wide]
 
 
 def test_the_table_says_what_a_slow_count_finds():
@@ -327,30 +327,30 @@ def test_the_table_says_what_a_slow_count_finds():
     centers = np.array([[0.0, 0, 0], [1.0, 0, -2], [0.5, 0, -5]])
     points = np.stack([rng.uniform(-6, 6, 90), rng.uniform(-3, 3, 90), rng.uniform(-40, -8, 90)], -1)
     observations = observed(centers, points, np.repeat([0, 1, 2], 30))
-    content = find_content(observations)
+    visible = find_visible_points(observations)
     heads = (
         mpi(extent=(-0.3, 0.3, -0.3, 0.3)),
         mpi(name="right", origin=(1.0, 0.0, -2.0), extent=(-0.1, 0.5, -0.4, 0.4), planes=12),
     )
     plan = ScenePlan(heads, CubePlan((-6.0, -3.0, -25.0), (6.0, 3.0, -9.0), (20, 30, 40)), 0.1, 1.0)
     report, errors = (
-        explain(plan, observations, content),
-        pixel_errors(plan, observations, content.cameras, content.points),
+        explain(plan, observations, visible),
+        pixel_errors(plan, observations, visible.cameras, visible.points),
     )
-    total, own, holders, best_errors = sum(content.weights), [[], [], []], 0.0, []
+    total, own, holders, best_errors = sum(visible.weights), [[], [], []], 0.0, []
     for q, row in enumerate(errors.combined.tolist()):
         held = [k for k in range(3) if row[k] < math.inf]
-        holders += len(held) * content.weights[q]
+        holders += len(held) * visible.weights[q]
         best_errors.append(min(*row, WORST))
         if held:
             own[min(held, key=lambda k: row[k])].append(q)
-    assert min(map(len, own)) >= 5 and sum(map(len, own)) < len(content.weights)
+    assert min(map(len, own)) >= 5 and sum(map(len, own)) < len(visible.weights)
     for k, head in enumerate(report.heads):
         rest = [min([WORST, *(e for j, e in enumerate(errors.combined[q]) if j != k)]) for q in own[k]]
-        assert head.share == pytest.approx(sum(content.weights[q] for q in own[k]) / total)
+        assert head.share == pytest.approx(sum(visible.weights[q] for q in own[k]) / total)
         assert head.error_with == pytest.approx(np.median([min(errors.combined[q][k], WORST) for q in own[k]]))
         assert head.error_without == pytest.approx(np.median(rest)) and head.error_without > head.error_with
-    assert report.unserved == pytest.approx(1 - sum(content.weights[q] for qs in own for q in qs) / total)
+    assert report.unserved == pytest.approx(1 - sum(visible.weights[q] for qs in own for q in qs) / total)
     assert report.overlap == pytest.approx(holders / total)
     assert [h.size for h in report.heads] == [(33, 61, 81), (12, 61, 81), (20, 30, 40)]
     ordered, last = sorted(best_errors), len(best_errors) - 1

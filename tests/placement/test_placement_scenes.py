@@ -13,7 +13,7 @@ from mmpi_ns.placement.candidates import find_candidates
 from mmpi_ns.placement.errors import WORST, cube_errors, mpi_errors
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.placement.rule import PlacementConfig, place
-from mmpi_ns.placement.visibility import find_content
+from mmpi_ns.placement.visibility import find_visible_points
 from mmpi_ns.scene.plan import CubePlan, ScenePlan
 from mmpi_ns.synthetic.catalogue import make_scene
 
@@ -37,13 +37,13 @@ def street_plan(street) -> ScenePlan:
 
 def bits(plan: ScenePlan, observations: Observations, config: PlacementConfig = CONFIG) -> float:
     """Expected error that a plan leaves, in bits, summed over images: the rule's own aim, worked out afresh."""
-    content = find_content(observations)
-    errors = [mpi_errors(m, observations, content.cameras, content.points) for m in plan.mpis]
+    visible = find_visible_points(observations)
+    errors = [mpi_errors(m, observations, visible.cameras, visible.points) for m in plan.mpis]
     if plan.cube is not None:
-        errors.append((np.zeros(1), cube_errors(plan.cube, observations, content.cameras, content.points)))
+        errors.append((np.zeros(1), cube_errors(plan.cube, observations, visible.cameras, visible.points)))
     least = np.min([np.hypot(plane, 0.5 * texel) for plane, texel in errors], axis=0)
     enough = config.enough * config.texel_pixels
-    return float(np.log2(np.clip(least, enough, WORST) / enough) @ content.weights)
+    return float(np.log2(np.clip(least, enough, WORST) / enough) @ visible.weights)
 
 
 def test_a_forward_facing_grid_gets_one_mpi_and_no_cube():
@@ -167,8 +167,8 @@ def test_every_chosen_mpi_is_needed_and_no_other_would_add_enough(street, street
         assert bits(replace(street_plan, mpis=rest), street) > whole + 0.5 * CONFIG.min_gain
     finest = replace(street_plan, mpis=tuple(replace(m, planes=CONFIG.max_planes) for m in street_plan.mpis))
     floor = bits(finest, street)
-    content = find_content(street)
-    for candidate in find_candidates(street, content, with_cubes=False)[::7]:
+    visible = find_visible_points(street)
+    for candidate in find_candidates(street, visible, with_cubes=False)[::7]:
         mpi = candidate.at(CONFIG.texel_pixels, CONFIG.max_planes, CONFIG.max_voxels)
         assert not isinstance(mpi, CubePlan)
         assert bits(replace(finest, mpis=(*finest.mpis, mpi)), street) > floor - 1.1 * CONFIG.min_gain

@@ -13,7 +13,7 @@ from procedural import observations_of
 from mmpi_ns.config import mmpi, mmpi_small
 from mmpi_ns.placement.rule import PlacementConfig, place
 from mmpi_ns.placement.show.explain import describe_facing, explain, table
-from mmpi_ns.placement.visibility import find_content
+from mmpi_ns.placement.visibility import find_visible_points
 from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.scene.windows import WindowedPlan
 from mmpi_ns.scripts.plan import _defaults, entrypoint
@@ -66,7 +66,7 @@ def test_a_missing_scene_is_one_sentence(tmp_path, monkeypatch):
 def test_the_table_adds_up():
     observations = observations_of(make_scene("object"), per_camera=25)
     plan = place(observations, PlacementConfig(max_texels=0, max_voxels=128))
-    report = explain(plan, observations, find_content(observations))
+    report = explain(plan, observations, find_visible_points(observations))
     assert plan.cube is not None and len(report.heads) == len(plan.mpis) + 1
     assert sum(h.share for h in report.heads) + report.unserved == pytest.approx(1)
     assert sum(h.texels for h in report.heads) == plan.texels

@@ -15,7 +15,7 @@ from tiny_scene import HEIGHT, TEST, WIDTH, image_of
 from torch.utils.tensorboard import SummaryWriter
 from training_runs import ready, trainer_config
 
-from mmpi_ns.demo import film, painting
+from mmpi_ns.demo import drawings, film, painting
 from mmpi_ns.demo.curve import TEST as TEST_PSNR
 from mmpi_ns.demo.curve import draw_curve, psnr_of_squared_error, read_curve
 from mmpi_ns.demo.maps import FINER, Map, plane_depths
@@ -278,8 +278,8 @@ def test_a_full_disk_is_one_sentence_and_status_1(tmp_path, monkeypatch, capsys)
 
 
 def test_the_ray_of_the_figure_crosses_planes_where_geometry_says():
-    mpi = figures._front("front", 0.0)
-    (found,) = figures._distances([mpi], np.array([6.0, 0, 0]), np.array([1.0, 0, 0]))
+    mpi = drawings._front("front", 0.0)
+    (found,) = drawings._distances([mpi], np.array([6.0, 0, 0]), np.array([1.0, 0, 0]))
     depths = mpi.near / (1 - np.arange(mpi.planes - 1) / (mpi.planes - 1))
     np.testing.assert_allclose(found[:-1], [d - 6 for d in depths if d > 6.5], rtol=1e-9)
     assert np.isinf(found[-1])

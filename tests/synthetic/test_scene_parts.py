@@ -105,11 +105,13 @@ def test_rays_of_a_track_lie_apart():
 
 def test_files_hold_the_points_their_colours_and_tracks(street, tmp_path):
     found = write_dataset(street, tmp_path / "out", points=120, images=False)
-    head, body = (tmp_path / "out/sparse_pc.ply").read_text().split("end_header\n")
-    table = np.array([line.split() for line in body.splitlines()], float)
-    names = [line.split()[-1] for line in head.splitlines() if line.startswith("property")]
+    head, _, body = (tmp_path / "out/sparse_pc.ply").read_bytes().partition(b"end_header\n")
+    names = [line.split()[-1] for line in head.decode().splitlines() if line.startswith("property")]
     assert names == ["x", "y", "z", "red", "green", "blue"]
-    assert np.allclose(table[:, :3], found.points, atol=1e-6) and np.array_equal(table[:, 3:], found.colors)
+    table = np.frombuffer(body, [("xyz", "<f4", 3), ("rgb", "u1", 3)])
+    order = np.lexsort(table["xyz"].T), np.lexsort(found.points.astype(np.float32).T)
+    assert np.allclose(table["xyz"][order[0]], found.points[order[1]], rtol=1e-6)
+    assert np.array_equal(table["rgb"][order[0]], found.colors[order[1]])
     model = pycolmap.Reconstruction(str(tmp_path / "out/colmap/sparse/0"))
     for p in range(120):
         point = model.points3D[p + 1]

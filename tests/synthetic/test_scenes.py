@@ -14,7 +14,7 @@ from reprojection import median_reprojection_error
 from mmpi_ns.capture.sfm import find_sfm_model
 from mmpi_ns.scripts.scene import SceneCommand
 from mmpi_ns.synthetic import SCENES, Cameras, Scene, make_scene, render, sfm_points, write_dataset
-from mmpi_ns.synthetic.dataset import PARTS, quaternion
+from mmpi_ns.synthetic.dataset import PARTS
 from mmpi_ns.synthetic.kit import Kit, look
 from mmpi_ns.synthetic.road import Road
 from mmpi_ns.synthetic.scene import Light
@@ -134,7 +134,7 @@ def test_equal_seeds_give_equal_bytes_and_others_do_not(tmp_path):
     for folder, seed in (("a", 3), ("b", 3), ("c", 4)):
         write_dataset(make_scene("room", seed=seed, count=3, width=32, height=24), tmp_path / folder, points=60)
     files = sorted(p.relative_to(tmp_path / "a") for p in (tmp_path / "a").rglob("*") if p.is_file())
-    assert len(files) == 3 + 3 + 3 + 2
+    assert sum(p.parts[0] != "colmap" for p in files) == 3 + 3 + 2 and len(files) >= 3 + 3 + 2 + 3
     assert all((tmp_path / "a" / f).read_bytes() == (tmp_path / "b" / f).read_bytes() for f in files)
     assert all(
         (tmp_path / "a" / f).read_bytes() != (tmp_path / "c" / f).read_bytes() for f in files if f.suffix == ".png"
@@ -341,17 +341,6 @@ def test_colmap_model_has_the_cameras_and_the_errors_it_states(dataset, street):
             assert np.linalg.norm(street.cameras.project(i, p.xyz[None])[0][0] - point.xy) < 2.5
             assert np.linalg.norm(image.project_point(p.xyz) - point.xy) < 2.5
     assert 0.1 < np.mean([p.error for p in model.points3D.values()]) < 0.5
-
-
-def test_quaternion_turns_like_its_matrix():
-    for _ in range(20):
-        q = np.random.default_rng(_).normal(size=4)
-        w, x, y, z = q = q / np.linalg.norm(q) * np.sign(q[0])
-        matrix = np.eye(3) + 2 * np.array(
-            [[-y * y - z * z, x * y - w * z, x * z + w * y], [x * y + w * z, -x * x - z * z, y * z - w * x],
-             [x * z - w * y, y * z + w * x, -x * x - y * y]]
-        )  # fmt: skip
-        assert np.allclose(quaternion(matrix), q)
 
 
 def test_a_folder_in_use_is_left_as_it_is(tmp_path, monkeypatch, capsys):

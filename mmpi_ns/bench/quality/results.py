@@ -20,7 +20,7 @@ from mmpi_ns.bench.suites import DEFAULT, SUITES, Variant
 from mmpi_ns.capture.load import load_observations
 from mmpi_ns.placement.errors import pixel_errors
 from mmpi_ns.placement.observations import Observations
-from mmpi_ns.placement.visibility import find_content
+from mmpi_ns.placement.visibility import find_visible_points
 from mmpi_ns.scene.plan import ScenePlan
 
 RAYS_PER_STEP = 1024
@@ -97,8 +97,8 @@ class Results:
         """MPIs, texels and expected pixel errors of the plan that a run used."""
         plan = ScenePlan.load(run / "plan.json")
         observations = _observations(self.data, self.downscale_factor)
-        content = find_content(observations)
-        errors = pixel_errors(plan, observations, content.cameras, content.points).summary()
+        visible = find_visible_points(observations)
+        errors = pixel_errors(plan, observations, visible.cameras, visible.points).summary()
         return {"mpis": len(plan.mpis), "texels": plan.texels, **errors}
 
     def _table(self, rows: dict[str, Any]) -> str:

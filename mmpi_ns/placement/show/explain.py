@@ -8,7 +8,7 @@ import numpy as np
 
 from mmpi_ns.placement.errors import WORST, PixelErrors, pixel_errors
 from mmpi_ns.placement.observations import Array, Observations
-from mmpi_ns.placement.visibility import Content
+from mmpi_ns.placement.visibility import VisiblePoints
 from mmpi_ns.scene.plan import CubePlan, MPIPlan, ScenePlan
 
 
@@ -54,11 +54,11 @@ class PlanReport:
         return np.minimum(self.errors.combined.min(-1), WORST)
 
 
-def explain(plan: ScenePlan, observations: Observations, content: Content) -> PlanReport:
+def explain(plan: ScenePlan, observations: Observations, visible: VisiblePoints) -> PlanReport:
     """Shares and expected errors of every head, over the observations that placement weighs."""
-    errors = pixel_errors(plan, observations, content.cameras, content.points)
+    errors = pixel_errors(plan, observations, visible.cameras, visible.points)
     combined = np.minimum(errors.combined, WORST)
-    best, weights = errors.best, content.weights
+    best, weights = errors.best, visible.weights
     held = np.isfinite(errors.combined)
     heads: list[MPIPlan | CubePlan] = [*plan.mpis, *([plan.cube] if plan.cube else [])]
     reports = []

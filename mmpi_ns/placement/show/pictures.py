@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from mmpi_ns.placement.errors import WORST
 from mmpi_ns.placement.observations import Array, Observations
 from mmpi_ns.placement.show.explain import PlanReport
-from mmpi_ns.placement.visibility import Content
+from mmpi_ns.placement.visibility import VisiblePoints
 from mmpi_ns.scene.plan import MPIPlan, ScenePlan
 from mmpi_ns.scene.windows import WindowedPlan
 
@@ -24,14 +24,14 @@ SHOWN_POINTS = 6000
 SHOWN_PLANES = 12
 
 
-def draw_plan(path: Path, plan: ScenePlan, observations: Observations, content: Content) -> None:
+def draw_plan(path: Path, plan: ScenePlan, observations: Observations, visible: VisiblePoints) -> None:
     """Writes a picture (PNG) of cameras, points, frusta and planes, from above and from the side.
 
     The picture's axes are the cameras' mean right, up and forward, in scene units.
     """
     base = observations.mean_axes * np.array([[1.0], [-1.0], [1.0]])  # right, up, forward
     middle = observations.centers.mean(0)
-    points = content.points[_nearby(content, observations)]
+    points = visible.points[_nearby(visible, observations)]
     points = (points[:: max(1, len(points) // SHOWN_POINTS)] - middle) @ base.T
     centers = (observations.centers - middle) @ base.T
     low, high = np.percentile(points, [1, 99], axis=0) if len(points) else (centers.min(0), centers.max(0))
@@ -106,10 +106,10 @@ def draw_errors(path: Path, plan: ScenePlan, report: PlanReport) -> None:
     figure.savefig(path, dpi=110)
 
 
-def _nearby(content: Content, observations: Observations) -> NDArray[np.bool_]:
+def _nearby(visible: VisiblePoints, observations: Observations) -> NDArray[np.bool_]:
     """Points near enough to be drawn: the far ones would shrink everything else to a dot."""
-    distance = np.linalg.norm(content.points - observations.centers[content.cameras], axis=-1)
-    return distance < 40 * content.near
+    distance = np.linalg.norm(visible.points - observations.centers[visible.cameras], axis=-1)
+    return distance < 40 * visible.near
 
 
 def _draw_mpi(axes: Axes, mpi: MPIPlan, picture: Array, middle: Array, reach: float, color: str) -> None:
