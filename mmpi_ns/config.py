@@ -78,6 +78,7 @@ mmpi_kitti = _method(
     keypoint_rays=0,
     model=MMPIModelConfig(
         placement=PlacementConfig(arrangement="drive", planes=256, height=270, width=270),
+        shading="sample",
         training="two-phase",
         rays_per_mpi="split",
         blend_share=0.25,
@@ -90,6 +91,7 @@ mmpi_kitti = _method(
 def _scannet() -> MMPIModelConfig:
     return MMPIModelConfig(
         placement=PlacementConfig(arrangement="room", planes=128, height=192, width=192, cube_voxels=160),
+        shading="sample",
         training="joint",
         loss=_paper_loss(),
     )

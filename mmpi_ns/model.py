@@ -13,7 +13,6 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle, RaySamples
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
-from nerfstudio.field_components.field_heads import FieldHeadNames
 from nerfstudio.model_components import renderers
 from nerfstudio.models.base_model import Model
 from nerfstudio.viewer.viewer_elements import ViewerDropdown
@@ -25,7 +24,7 @@ from mmpi_ns.capture.datamanager import OBSERVATIONS, RAYS_PER_STEP, TRAINING_VI
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.samples import Lookup, individual_rays, metadata_of
 from mmpi_ns.ops import native
-from mmpi_ns.ops.composite import composite_weights, median_inverse_distance, render_colors, winning_heads
+from mmpi_ns.ops.composite import composite_weights, median_inverse_distance, winning_heads
 from mmpi_ns.ops.compositing import BlendForm, Composite, blended_optical_depth
 from mmpi_ns.placement.split import cameras_in, place_windows
 from mmpi_ns.rendering.chunks import rays_at_once
@@ -171,7 +170,7 @@ class MMPIModel(Model):
         plan = self.windows.plans[window]
         self.field.views = self.views_of(window)
         self.field.build(plan, factor)
-        self.field.renew_networks(1 if self.config.shared_colour else plan.num_heads)
+        self.field.renew_networks()
         if self.exposure is not None:
             self.exposure.reset()
 
@@ -250,9 +249,9 @@ class MMPIModel(Model):
         if self.training and lookup and self.schedule.watches(self.step):
             self.field.note_use(lookup, composite.weights, report.live)
         # Keypoint rays are supervised in depth alone: no colours for them.
-        colored = lookup.of_rays(is_pixel_ray(bundle)) if lookup and self.training else lookup
-        colors = self.field.get_outputs(samples, colored)[FieldHeadNames.RGB]
-        outputs = self._outputs(composite, colors, samples, report)
+        wanted = is_pixel_ray(bundle) if self.training else None
+        colors = self.field.render_colors(samples, lookup, composite, wanted)
+        outputs = self._outputs(composite, colors.rgb, samples, report)
         if self.training:
             outputs["training"] = TrainingRays(bundle, samples, composite, colors, report, lookup)  # type: ignore
         return outputs
@@ -308,9 +307,8 @@ class MMPIModel(Model):
         return tau.new_zeros(tau.numel()).index_put((lookup.index,), flat).view(tau.shape)
 
     def _outputs(
-        self, composite: Composite, colors: Tensor, samples: RaySamples, report: MergeReport
+        self, composite: Composite, rgb: Tensor, samples: RaySamples, report: MergeReport
     ) -> dict[str, Tensor]:
-        rgb = render_colors(composite, colors)
         outputs = {
             "rgb": rgb + composite.transmittance * self._background(rgb) if not self.training else rgb,
             "accumulation": composite.accumulation,
@@ -382,7 +380,8 @@ class MMPIModel(Model):
         rays: TrainingRays = outputs["training"]
         if self.exposure is not None:
             assert rays.bundle.camera_indices is not None
-            rays = replace(rays, colors=self.exposure(rays.colors, rays.bundle.camera_indices[:, 0]))
+            exposed = self.exposure(rays.colors, rays.composite.accumulation, rays.bundle.camera_indices[:, 0])
+            rays = replace(rays, colors=exposed)
         g = generator(self.config.seed, self.step, "background", self.device)
         total = rays.losses(self.field, image, self.config.loss, g, self.step)
         if self.exposure is not None:

@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 from nerfstudio.models.base_model import ModelConfig
 
+from mmpi_ns.field.shading import Shading
 from mmpi_ns.ops import native
 from mmpi_ns.ops.compositing import BlendForm
 from mmpi_ns.placement.rule import PlacementConfig
@@ -65,8 +66,10 @@ class MMPIModelConfig(ModelConfig):
     takes), or the MPIs share them."""
     blend_form: BlendForm = "paper"
     """How reliability enters: P alpha (paper) or 1 - (1 - alpha)^P (opacity)."""
+    shading: Shading = "ray"
+    """Whether a network looks at what a ray has gathered, once, or colours every sample as in the paper."""
     shared_colour: bool = False
-    """One colour network for all MPIs instead of one each."""
+    """Shading of samples: one colour network for all MPIs instead of one each."""
     feature_channels: int = 9
     """Colour features of a texel."""
     hidden_width: int = 64
@@ -117,5 +120,12 @@ class MMPIModelConfig(ModelConfig):
 
     def field_settings(self) -> dict[str, Any]:
         """What a field takes from here, by its arguments' names."""
-        names = ("feature_channels", "hidden_width", "position_frequencies", "direction_frequencies", "shared_colour")
+        names = (
+            "shading",
+            "feature_channels",
+            "hidden_width",
+            "position_frequencies",
+            "direction_frequencies",
+            "shared_colour",
+        )
         return {name: getattr(self, name) for name in (*names, "samples_per_voxel", "cube_alpha")}

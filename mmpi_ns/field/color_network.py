@@ -1,4 +1,4 @@
-"""Shallow colour networks, one per head or one for all (paper eq. for MLP^(rgb))."""
+"""Shallow networks, and the paper's use of them: a colour for every sample (eq. for MLP^(rgb))."""
 
 from __future__ import annotations
 
@@ -18,17 +18,14 @@ def positional_encoding(x: Float[Tensor, "N 3"], frequencies: int) -> Float[Tens
     return torch.cat([x, angles.sin(), angles.cos()], -1)
 
 
-class ColorNetworks(nn.Module):
-    """``count`` networks (features, PE(position), PE(direction)) -> rgb in one pooled parameter.
+class Networks(nn.Module):
+    """``count`` networks of two hidden layers, inputs -> three numbers, in one pooled parameter.
 
-    The first three features are colour logits, to which the network adds what the view changes; its last layer starts
-    at zero, so colours learn at the grids' rate from the first step.
+    Their last layer starts at zero, so what they correct learns at the tables' rate from the first step.
     """
 
-    def __init__(self, count: int, channels: int, width: int, position_frequencies: int, direction_frequencies: int):
+    def __init__(self, count: int, inputs: int, width: int) -> None:
         super().__init__()
-        self.position_frequencies, self.direction_frequencies = position_frequencies, direction_frequencies
-        inputs = channels + 3 * (1 + 2 * position_frequencies) + 3 * (1 + 2 * direction_frequencies)
         self.width = width
         self.shapes = [(width, inputs), (width,), (width, width), (width,), (3, width), (3,)]
         self.weights = nn.Parameter(torch.empty(0, sum(math.prod(s) for s in self.shapes)))
@@ -52,6 +49,31 @@ class ColorNetworks(nn.Module):
             parts.append((torch.rand(math.prod(shape), generator=generator) * 2 - 1) * bound)
         return torch.cat(parts).repeat(count, 1)
 
+    def layers(self, head: int) -> list[Tensor]:
+        """Weights [out, in] and biases of one head's three layers."""
+        index = head if self.count > 1 else 0
+        sizes = [math.prod(s) for s in self.shapes]
+        return [p.view(s) for p, s in zip(self.weights[index].split(sizes), self.shapes, strict=True)]
+
+    def run(self, head: int, inputs: Float[Tensor, "N I"]) -> Float[Tensor, "N 3"]:
+        """What one head's network makes of its inputs."""
+        w1, b1, w2, b2, w3, b3 = self.layers(head)
+        hidden = nn.functional.relu(nn.functional.linear(inputs, w1, b1))
+        hidden = nn.functional.relu(nn.functional.linear(hidden, w2, b2))
+        return nn.functional.linear(hidden, w3, b3)
+
+
+class ColorNetworks(Networks):
+    """Networks (features, PE(position), PE(direction)) -> rgb, one per head or one for all, that every sample asks.
+
+    The first three features are colour logits, to which the network adds what the view changes.
+    """
+
+    def __init__(self, count: int, channels: int, width: int, position_frequencies: int, direction_frequencies: int):
+        inputs = channels + 3 * (1 + 2 * position_frequencies) + 3 * (1 + 2 * direction_frequencies)
+        super().__init__(count, inputs, width)
+        self.position_frequencies, self.direction_frequencies = position_frequencies, direction_frequencies
+
     def forward(
         self,
         head: int,
@@ -69,19 +91,10 @@ class ColorNetworks(nn.Module):
             directions: of each ray, in the head's axes; encoded once a ray.
             rays: ray of each sample; None where samples and rays are one.
         """
-        w1, b1, w2, b2, w3, b3 = self.layers(head)
         encoded = positional_encoding(directions, self.direction_frequencies)
         inputs = [
             features,
             positional_encoding(ndc, self.position_frequencies),
             encoded if rays is None else encoded.index_select(0, rays),
         ]
-        hidden = nn.functional.relu(nn.functional.linear(torch.cat(inputs, -1), w1, b1))
-        hidden = nn.functional.relu(nn.functional.linear(hidden, w2, b2))
-        return torch.sigmoid(features[:, :3] + nn.functional.linear(hidden, w3, b3))
-
-    def layers(self, head: int) -> list[Tensor]:
-        """Weights [out, in] and biases of one head's three layers."""
-        index = head if self.count > 1 else 0
-        sizes = [math.prod(s) for s in self.shapes]
-        return [p.view(s) for p, s in zip(self.weights[index].split(sizes), self.shapes, strict=True)]
+        return torch.sigmoid(features[:, :3] + self.run(head, torch.cat(inputs, -1)))

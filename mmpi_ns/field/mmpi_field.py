@@ -19,10 +19,13 @@ from torch import Tensor, nn
 from mmpi_ns.field.baking import bake_shares, shares_at
 from mmpi_ns.field.color_network import ColorNetworks
 from mmpi_ns.field.samples import Gathered, LocalRays, Lookup, Taps, by_head, head_spans, metadata_of
+from mmpi_ns.field.shading import RayColors, RayShader, Shading
 from mmpi_ns.field.tables import TexelTables, replace_data
 from mmpi_ns.ops import hits, native
 from mmpi_ns.ops.colors import colors
-from mmpi_ns.ops.compositing import BlendForm, blend_shares, blended_optical_depth
+from mmpi_ns.ops.composite import render_colors
+from mmpi_ns.ops.compositing import BlendForm, Composite, blend_shares, blended_optical_depth
+from mmpi_ns.ops.gather import KnownTaps, gather_places, gather_taps
 from mmpi_ns.ops.interpolate import bilinear_rows, gather_rows, index_rows, interpolate, interpolate_gathered
 from mmpi_ns.ops.march import MarchScene, SceneTables
 from mmpi_ns.ops.shade import shade
@@ -54,7 +57,8 @@ class MMPIField(TexelTables):
 
     Args:
         plan: frames and resolutions.
-        feature_channels: channels of the colour features; the first three are added to the colour logits.
+        shading: whether a network is asked once a ray or for every sample (``shading.py``).
+        feature_channels: channels of the colour features; the first three are colour logits.
         hidden_width: width of the colour networks' hidden layers.
         position_frequencies: octaves of the positional encoding of NDC positions.
         direction_frequencies: octaves of the positional encoding of directions in the MPI's frame.
@@ -70,6 +74,7 @@ class MMPIField(TexelTables):
         self,
         plan: ScenePlan,
         *,
+        shading: Shading = "sample",
         feature_channels: int = 9,
         hidden_width: int = 64,
         position_frequencies: int = 2,
@@ -87,18 +92,19 @@ class MMPIField(TexelTables):
         self.cube_alpha = cube_alpha
         self.learns_cover = True
         """Whether training rays mark the texels they train; off once blending has begun, so that P cannot jump."""
-        self.networks = ColorNetworks(
-            1 if shared_colour else plan.num_heads,
-            feature_channels,
-            hidden_width,
-            position_frequencies,
-            direction_frequencies,
-        )
+        self.shading = shading
+        self.shared_colour = shared_colour
+        if shading == "ray":
+            self.networks = RayShader(feature_channels, hidden_width, direction_frequencies)
+        else:
+            sizes = (feature_channels, hidden_width, position_frequencies, direction_frequencies)
+            self.networks = ColorNetworks(1 if shared_colour else plan.num_heads, *sizes)
 
-    def renew_networks(self, count: int) -> None:
-        """``count`` fresh colour networks in the same Parameter."""
+    def renew_networks(self) -> None:
+        """Fresh networks for the plan at hand in the same Parameter."""
+        one = self.shading == "ray" or self.shared_colour
         weights = self.networks.weights
-        replace_data(weights, self.networks.fresh(count).to(weights.device))
+        replace_data(weights, self.networks.fresh(1 if one else self.full_plan.num_heads).to(weights.device))
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
         """Takes the number of colour networks from the checkpoint first."""
@@ -337,27 +343,69 @@ class MMPIField(TexelTables):
     def get_outputs(  # type: ignore[override]
         self, ray_samples: RaySamples, density_embedding: Lookup | None = None
     ) -> dict[FieldHeadNames, Tensor]:
-        """Colours of the valid samples; empty slots are black."""
-        if not torch.is_grad_enabled() and density_embedding is None:
+        """Colours of the valid samples (diffuse ones where a ray is shaded once); empty slots are black."""
+        sampled = self.shading == "sample"
+        if sampled and not torch.is_grad_enabled() and density_embedding is None:
             lib = native.library(self.features, ray_samples.frustums.directions)
             if lib is not None or native.takes_triton(self.features, ray_samples.frustums.directions):
                 return {FieldHeadNames.RGB: self._shade(lib, ray_samples)}
         lookup = density_embedding or self._lookup(ray_samples)
-        directions, rays = ray_samples.frustums.directions[:, 0], lookup.rays
-        out = lookup.ndc.new_zeros(lookup.shape.numel(), 3)
-        if lookup.groups:
-            known = lookup.gathered and lookup.gathered.features
-            features = torch.cat([_read(self.features, known, taps) for taps in lookup.groups])
-            # Split, not sliced: the gradient of a slice is as large as the whole.
-            each = features.split([own.stop - own.start for _, own in lookup.spans])
-            found = [
-                colors(self.networks, k, part, lookup.ndc[own], geometry.rotate(self._axes(k), directions), rays[own])
-                for part, (k, own) in zip(each, lookup.spans, strict=True)
-            ]
-            out = out.index_copy(0, lookup.index, torch.cat(found))
+        features = self._features(lookup)
+        found = self._sample_colors(features, lookup, ray_samples) if sampled else features[:, :3].sigmoid()
+        out = lookup.ndc.new_zeros(lookup.shape.numel(), 3).index_copy(0, lookup.index, found)
         return {FieldHeadNames.RGB: out.view(*lookup.shape, 3)}
 
+    def _features(self, lookup: Lookup) -> Float[Tensor, "N C"]:
+        known = lookup.gathered and lookup.gathered.features
+        parts = [_read(self.features, known, taps) for taps in lookup.groups]
+        return torch.cat(parts) if parts else lookup.ndc.new_zeros(0, self.feature_channels)
+
+    def _sample_colors(self, features: Tensor, lookup: Lookup, ray_samples: RaySamples) -> Float[Tensor, "N 3"]:
+        """What the networks make of every sample."""
+        assert isinstance(self.networks, ColorNetworks)
+        directions, rays = ray_samples.frustums.directions[:, 0], lookup.rays
+        # Split, not sliced: the gradient of a slice is as large as the whole.
+        each = features.split([own.stop - own.start for _, own in lookup.spans])
+        found = [
+            colors(self.networks, k, part, lookup.ndc[own], geometry.rotate(self._axes(k), directions), rays[own])
+            for part, (k, own) in zip(each, lookup.spans, strict=True)
+        ]
+        return torch.cat(found) if found else lookup.ndc.new_zeros(0, 3)
+
+    def render_colors(
+        self,
+        ray_samples: RaySamples,
+        lookup: Lookup | None,
+        composite: Composite,
+        wanted: Bool[Tensor, "R"] | None = None,
+    ) -> RayColors:
+        """What rays show.
+
+        Args:
+            ray_samples: merged samples.
+            lookup: where they read the tables; None where no gradients are wanted.
+            composite: weights of the samples.
+            wanted: the rays that colours are wanted of, as far as leaving others out saves time; None for all.
+        """
+        if not isinstance(self.networks, RayShader):
+            lookup = lookup if lookup is None or wanted is None else lookup.of_rays(wanted)
+            found = self.get_outputs(ray_samples, lookup)[FieldHeadNames.RGB]
+            return RayColors.of_samples(composite, render_colors(composite, found), found)
+        if lookup is None:
+            meta = metadata_of(ray_samples)
+            heads, planes, valid = (meta[name][..., 0] for name in ("heads", "planes", "valid"))
+            places = (heads, planes, meta["ndc"], valid)
+            sums = gather_places(self.grids, len(self.plan.mpis), self.features.data, *places, composite.weights)
+        else:
+            known = lookup.gathered and lookup.gathered.features
+            groups = [KnownTaps(t.rows if t.position is None else t.position, t.weights) for t in lookup.groups]
+            wanted = torch.ones(lookup.shape[0], dtype=torch.bool) if wanted is None else wanted
+            values = self.features if known is None else known
+            sums = gather_taps(values, groups, lookup.index, composite.weights, wanted.to(values.device))
+        return self.networks(sums, composite, ray_samples.frustums.directions[:, 0])
+
     def _shade(self, lib: ctypes.CDLL | None, ray_samples: RaySamples) -> Float[Tensor, "R S 3"]:
+        assert isinstance(self.networks, ColorNetworks)
         meta, rays = metadata_of(ray_samples), ray_samples.frustums.directions[:, 0]
         axes = torch.stack([self._axes(k) for k in range(len(self.grids))])
         heads, planes, valid = (meta[name][..., 0] for name in ("heads", "planes", "valid"))

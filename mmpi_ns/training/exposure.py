@@ -12,6 +12,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from mmpi_ns.field.shading import RayColors
+
 
 def gains_and_biases(settings: Float[Tensor, "I 2 3"]) -> tuple[Float[Tensor, "I 3"], Float[Tensor, "I 3"]]:
     """What images do to colours: gain = I softmax(settings_0) > 0 and bias = settings_1 - mean, over the images.
@@ -20,17 +22,6 @@ def gains_and_biases(settings: Float[Tensor, "I 2 3"]) -> tuple[Float[Tensor, "I
     """
     gains = len(settings) * settings[:, 0].softmax(0)
     return gains, settings[:, 1] - settings[:, 1].mean(0)
-
-
-def expose(
-    colors: Float[Tensor, "R S 3"], gains: Float[Tensor, "R 3"], biases: Float[Tensor, "R 3"]
-) -> Float[Tensor, "R S 3"]:
-    """Colours of samples as each ray's image shows them: gain c + bias.
-
-    Composited, that is gain C + bias A with the colour C and the mass A that a ray has gathered: what lies behind (a
-    random background, an observed colour) is not changed, and a ray that gathers nothing is given nothing.
-    """
-    return gains[:, None] * colors + biases[:, None]
 
 
 def departure(gains: Float[Tensor, "I 3"], biases: Float[Tensor, "I 3"]) -> Float[Tensor, ""]:
@@ -60,13 +51,17 @@ class Exposure(nn.Module):
         """Of the images in use."""
         return gains_and_biases(self.settings if self.images is None else self.settings[self.images])
 
-    def forward(self, colors: Float[Tensor, "R S 3"], images: Int[Tensor, "R"]) -> Float[Tensor, "R S 3"]:
-        """Colours of samples as each ray's training image shows them."""
+    def forward(self, colors: RayColors, accumulation: Float[Tensor, "R 1"], images: Int[Tensor, "R"]) -> RayColors:
+        """Colours as each ray's training image shows them: gain c + bias for every colour c, so gain C + bias A.
+
+        What lies behind (a random background, an observed colour) is not changed, and a ray that gathers nothing is
+        given nothing.
+        """
         gains, biases = self.gains_and_biases()
         if self.images is not None:
             gains = torch.ones_like(self.settings[:, 0]).index_copy(0, self.images, gains)
             biases = torch.zeros_like(self.settings[:, 1]).index_copy(0, self.images, biases)
-        return expose(colors, gains.index_select(0, images), biases.index_select(0, images))
+        return colors.exposed(accumulation, gains.index_select(0, images), biases.index_select(0, images))
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
         """Takes the number of images from the checkpoint: a capture looked at elsewhere may hold fewer."""

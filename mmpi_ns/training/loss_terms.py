@@ -5,14 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from nerfstudio.cameras.rays import RayBundle, RaySamples
 from torch import Tensor
 
 from mmpi_ns.capture.datamanager import KEYPOINT_DEPTH
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.samples import Lookup, metadata_of
-from mmpi_ns.ops.composite import render_colors
+from mmpi_ns.field.shading import RayColors
 from mmpi_ns.ops.compositing import Composite
 from mmpi_ns.rendering.sampler import MergeReport
 from mmpi_ns.training import losses
@@ -47,7 +47,7 @@ class TrainingRays:
     bundle: RayBundle
     samples: RaySamples
     composite: Composite
-    colors: Float[Tensor, "R S 3"]
+    colors: RayColors
     report: MergeReport
     lookup: Lookup
 
@@ -66,11 +66,11 @@ class TrainingRays:
         # Where MPIs that train apart see a ray only in part, what they let through is not theirs to explain.
         explained = self.report.explained[pixels]
         background = random if image.shape[-1] == 4 else torch.where(explained, random, observed)
-        composite, colors = self._pixel_composite(pixels), self.colors.index_select(0, pixels)
-        rgb = render_colors(composite, colors) + composite.transmittance * background
+        composite, colors = self._pixel_composite(pixels), self.colors.of_rays(pixels)
+        rgb = colors.rgb + composite.transmittance * background
         total = {
             "rgb_loss": losses.photometric(rgb, observed),
-            "point_color": weight.point_color * losses.point_color(colors, composite.weights, observed),
+            "point_color": weight.point_color * losses.point_color(colors.mass, colors.first, colors.second, observed),
             "entropy": weight.background_entropy * losses.background_entropy(composite.transmittance),
             "distortion": weight.distortion * self._distortion(pixels, composite, field.plan.content_near),
         }

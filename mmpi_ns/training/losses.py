@@ -15,11 +15,17 @@ def photometric(predicted: Float[Tensor, "R 3"], observed: Float[Tensor, "R 3"])
 
 
 def point_color(
-    colors: Float[Tensor, "R S 3"], weights: Float[Tensor, "R S"], observed: Float[Tensor, "R 3"]
+    mass: Float[Tensor, "R 1"],
+    first: Float[Tensor, "R 3"],
+    second: Float[Tensor, "R 3"],
+    observed: Float[Tensor, "R 3"],
 ) -> Float[Tensor, ""]:
-    """Each sample's own colour against its ray's, weighted by what it contributes (L_pt_rgb; weights detached)."""
-    error = ((colors - observed[:, None, :]) ** 2).sum(-1)
-    return (weights.detach() * error).sum() / max(1, observed.shape[0])
+    """Each sample's own colour against its ray's, weighted by what it contributes (L_pt_rgb; weights held fixed).
+
+    sum_s w_s |c_s - o|^2, mean over rays, from the sums over each ray's samples of w, w c and w c^2.
+    """
+    error = second - 2 * observed * first + observed**2 * mass
+    return error.sum() / max(1, observed.shape[0])
 
 
 def background_entropy(transmittance: Float[Tensor, "R 1"]) -> Float[Tensor, ""]:

@@ -12,9 +12,10 @@ from PIL import Image
 from tiny_scene import TEST, TRAIN, name_of, write_scene
 from training_runs import compared, datamanager, differences, load, plan_of, ready, trainer_config, write_plan
 
-from mmpi_ns.ops.compositing import composite_weights, render_colors
+from mmpi_ns.field.shading import RayColors
+from mmpi_ns.ops.compositing import Composite, composite_weights, render_colors
 from mmpi_ns.scene.windows import Window, WindowedPlan
-from mmpi_ns.training.exposure import Exposure, departure, expose, gains_and_biases
+from mmpi_ns.training.exposure import Exposure, departure, gains_and_biases
 from mmpi_ns.training.phases import TRAINS
 
 F64 = torch.float64
@@ -41,6 +42,14 @@ def exposed_by_hand(settings, colors, cameras, images):
     return found
 
 
+def gathered(share, behind, colors):
+    """What rays have gathered of samples, ``behind`` times as much of it unseen, and the mass of all."""
+    share, behind, colors = (torch.from_numpy(x) for x in (share, behind, colors))
+    rgb = (share[..., None] * colors).sum(1) * (1 + behind)
+    mass = share.sum(1, keepdim=True) + behind
+    return RayColors.of_samples(Composite(share, mass, 1 - mass), rgb, colors), mass
+
+
 @pytest.mark.parametrize("images", [None, [1, 2, 4]])
 def test_colours_and_gradients_are_those_of_the_formula(images):
     rng = np.random.default_rng(0)
@@ -49,17 +58,28 @@ def test_colours_and_gradients_are_those_of_the_formula(images):
     exposure = Exposure(5).double()
     exposure.settings.data = torch.from_numpy(settings)
     exposure.images = None if images is None else torch.tensor(images)
-    found = exposure(torch.from_numpy(colors), torch.from_numpy(cameras))
+    share, behind = rng.dirichlet(np.ones(5), 6)[:, :4], rng.random((6, 1)) * 0.1
+    found = exposure(*gathered(share, behind, colors), torch.from_numpy(cameras))
     used = range(5) if images is None else images
-    np.testing.assert_allclose(found.detach(), exposed_by_hand(settings, colors, cameras, used), rtol=1e-12)
-    weights = rng.normal(size=found.shape)
-    (found * torch.from_numpy(weights)).sum().backward()
+
+    def by_hand(settings):
+        """What the samples' own colours come to: what rays show, and both sums for the loss of points."""
+        exposed, w = exposed_by_hand(settings, colors, cameras, used), share[..., None]
+        ones = exposed_by_hand(settings, np.ones_like(colors), cameras, used)[:, 0]
+        zeros = exposed_by_hand(settings, np.zeros_like(colors), cameras, used)[:, 0]
+        shown = (w * colors).sum(1) * (1 + behind) * (ones - zeros) + zeros * (share.sum(1, keepdims=True) + behind)
+        return np.concatenate([shown, (w * exposed).sum(1), (w * exposed**2).sum(1)], -1)
+
+    values = torch.cat([found.rgb, found.first, found.second], -1)
+    np.testing.assert_allclose(values.detach(), by_hand(settings), rtol=1e-12)
+    weights = rng.normal(size=values.shape)
+    (values * torch.from_numpy(weights)).sum().backward()
     for place in np.ndindex(5, 2, 3):
         sides = []
         for shift in (1e-6, -1e-6):
             moved = settings.copy()
             moved[place] += shift
-            sides.append((exposed_by_hand(moved, colors, cameras, used) * weights).sum())
+            sides.append((by_hand(moved) * weights).sum())
         assert exposure.settings.grad[place].item() == pytest.approx((sides[0] - sides[1]) / 2e-6, abs=1e-7)
 
 
@@ -76,7 +96,8 @@ def test_images_of_other_windows_are_outside_the_gauge_and_get_no_gradient():
     exposure.images = torch.tensor([0, 3])
     gains, biases = exposure.gains_and_biases()
     assert torch.allclose(gains.mean(0), torch.ones(3)) and torch.allclose(biases.mean(0), torch.zeros(3), atol=1e-6)
-    exposure(torch.rand(5, 2, 3), torch.tensor([0, 3, 3, 0, 0])).square().sum().backward()
+    colors, mass = gathered(np.full((5, 2), 0.3), np.full((5, 1), 0.1), np.random.default_rng(0).random((5, 2, 3)))
+    exposure(colors, mass, torch.tensor([0, 3, 3, 0, 0])).rgb.square().sum().backward()
     assert (exposure.settings.grad[[0, 3]] != 0).all() and not exposure.settings.grad[[1, 2]].any()
 
 
@@ -85,7 +106,8 @@ def test_what_lies_behind_a_ray_is_not_exposed():
     tau = torch.tensor([[0.0, 0.0], [0.4, 0.9], [30.0, 0.1]], dtype=F64)
     composite = composite_weights(tau, tau > 0, torch.zeros_like(tau), torch.zeros(3, 1, dtype=F64))
     colors, gains, biases = torch.rand(3, 2, 3, dtype=F64), torch.full((3, 3), 1.7, dtype=F64), torch.full((3, 3), 0.2)
-    plain, exposed = (render_colors(composite, c) for c in (colors, expose(colors, gains, biases.double())))
+    plain = render_colors(composite, colors)
+    exposed = RayColors.of_samples(composite, plain, colors).exposed(composite.accumulation, gains, biases.double()).rgb
     torch.testing.assert_close(exposed, 1.7 * plain + 0.2 * composite.accumulation)
     assert not exposed[0].any()
 

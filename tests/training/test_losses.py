@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 import torch
 
+from mmpi_ns.field.shading import RayColors
+from mmpi_ns.ops.compositing import Composite
 from mmpi_ns.training import losses
 
 F64 = torch.float64
@@ -22,22 +24,28 @@ def test_photometric_is_the_mean_squared_error():
     assert losses.photometric(predicted, observed).item() == pytest.approx((0.25 + 1 + 1) / 6)
 
 
+def point_color(colors, weights, observed):
+    """The loss from samples, through the sums that a ray keeps of them."""
+    samples = RayColors.of_samples(Composite(weights, weights[:, :1], weights[:, :1]), observed, colors)
+    return losses.point_color(samples.mass, samples.first, samples.second, observed)
+
+
 def test_point_color_weighs_each_samples_error_by_its_weight():
     colors = tensor([[[1.0, 0.0, 0.0], [0.0, 0.0, 0.5]], [[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]]])
     weights = tensor([[0.5, 0.25], [0.0, 1.0]])
     observed = tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 0.0]])
     # Ray 1: 0.5 * 1 + 0.25 * 0.25; ray 2: 1 * 1; mean over two rays.
-    assert losses.point_color(colors, weights, observed).item() == pytest.approx((0.5 + 0.0625 + 1.0) / 2)
+    assert point_color(colors, weights, observed).item() == pytest.approx((0.5 + 0.0625 + 1.0) / 2)
 
 
 def test_point_color_moves_colours_but_never_weights():
     colors, weights = torch.rand(2, 3, 3, requires_grad=True), torch.rand(2, 3, requires_grad=True)
-    losses.point_color(colors, weights, torch.rand(2, 3)).backward()
+    point_color(colors, weights, torch.rand(2, 3)).backward()
     assert weights.grad is None and colors.grad.abs().min() > 0
 
 
 def test_point_color_of_no_rays_is_zero():
-    assert losses.point_color(torch.zeros(0, 2, 3), torch.zeros(0, 2), torch.zeros(0, 3)).item() == 0
+    assert point_color(torch.zeros(0, 2, 3), torch.zeros(0, 2), torch.zeros(0, 3)).item() == 0
 
 
 def test_background_entropy_is_largest_for_a_coin_flip_and_nothing_for_a_decision():
@@ -155,7 +163,7 @@ def test_losses_have_the_gradient_of_finite_differences():
     neighbours = tensor([[[0.1], [5.0]], [[0.0], [2.0]]])
     check = torch.autograd.gradcheck
     assert check(lambda c: losses.photometric(c[:, 0], observed), (colors,))
-    assert check(lambda c: losses.point_color(c, weights, observed), (colors,))
+    assert check(lambda c: point_color(c, weights, observed), (colors,))
     assert check(losses.background_entropy, (transmittance,))
     assert check(lambda w, s: losses.distortion(w, s, intervals), (weights, positions))
     assert check(lambda w: losses.keypoint_depth(w, inverse_t, known, valid, 0.1), (weights,))

@@ -1,0 +1,186 @@
+// What rays gather of the texels along them, and its gradients. References in ops/gather/reference.py.
+#include "scene.h"
+#include "table.h"
+
+#include <vector>
+
+namespace {
+
+constexpr int COLORS = 3; // channels that are colours; the others are features
+
+// What a sample reads, and what it weighs.
+struct Sample {
+    int64_t rows[8];
+    float shares[8];
+    int taps;
+    float weight;
+};
+
+// Taps of samples that are known: those of planes first, then those of the cube.
+struct Taps {
+    const int32_t* positions;
+    const float* shares;
+    int64_t count;
+};
+
+struct Texel {
+    Lanes value, slope;
+};
+
+// Colours are sigmoids and features hyperbolic tangents, of sixteen channels from `first` on. What is not a number stays so.
+inline Texel activate(Lanes raw, int64_t first) {
+    const auto is_color = IOTA + float(first) < float(COLORS);
+    const Lanes share = 1.0f / (1.0f + exp_lanes(is_color ? -raw : -2.0f * raw));
+    const Lanes rest = share * (1.0f - share), value = is_color ? share : 2.0f * share - 1.0f;
+    return {raw == raw ? value : raw, is_color ? rest : 4.0f * rest};
+}
+
+inline Lanes interpolate(const Table& table, const Sample& sample, int64_t first) {
+    Lanes sum{};
+    for (int tap = 0; tap < sample.taps; tap++)
+        sum += sample.shares[tap] * table.read(sample.rows[tap] * table.channels + first);
+    return sum;
+}
+
+// Sums over a ray's samples: weight times what their texels hold, weight, weight times squared colour.
+void gather(const Table& table, const std::vector<Sample>& samples, float* sums) {
+    float mass = 0;
+    Lanes squares{};
+    for (int64_t first = 0; first < table.channels; first += WIDTH) {
+        Lanes sum{};
+        for (const Sample& sample : samples) {
+            const Lanes value = activate(interpolate(table, sample, first), first).value;
+            sum += sample.weight * value;
+            if (first == 0) squares += sample.weight * value * value, mass += sample.weight;
+        }
+        for (int64_t c = first; c < std::min(table.channels, first + WIDTH); c++) sums[c] = sum[c - first];
+    }
+    sums[table.channels] = mass;
+    for (int c = 0; c < COLORS; c++) sums[table.channels + 1 + c] = squares[c];
+}
+
+// Rays [begin, end), whose samples `find(ray, samples)` finds. The next ray's memory is asked for before one is summed.
+template <typename Find>
+void gather_rays(const Table& table, int64_t begin, int64_t end, const Find& find, float* sums) {
+    std::vector<Sample> samples[2];
+    const auto prepare = [&](int64_t ray) {
+        std::vector<Sample>& found = samples[ray & 1];
+        found.clear();
+        find(ray, found);
+        for (const Sample& sample : found)
+            for (int tap = 0; tap < sample.taps; tap++) table.prefetch(sample.rows[tap]);
+    };
+    if (begin < end) prepare(begin);
+    for (int64_t ray = begin; ray < end; ray++) {
+        if (ray + 1 < end) prepare(ray + 1);
+        gather(table, samples[ray & 1], sums + ray * (table.channels + 1 + COLORS));
+    }
+}
+
+void put_plane(Sample& sample, const Grid& grid, int64_t layer, const Cell& x, const Cell& y, float share) {
+    const Corners corners(grid, layer, y.lower, x.lower);
+    for (int i = 0; i < 4; i++) {
+        sample.rows[sample.taps] = corners.row[i];
+        sample.shares[sample.taps++] =
+            (i & 1 ? x.fraction : 1 - x.fraction) * (i >> 1 ? y.fraction : 1 - y.fraction) * share;
+    }
+}
+
+void put_known(Sample& sample, const Taps* groups, int64_t number) {
+    const bool in_cube = number >= groups[0].count;
+    const Taps& group = groups[in_cube];
+    sample.taps = in_cube ? 8 : 4;
+    const int64_t at = (number - (in_cube ? groups[0].count : 0)) * sample.taps;
+    for (int tap = 0; tap < sample.taps; tap++)
+        sample.rows[tap] = group.positions[at + tap], sample.shares[tap] = group.shares[at + tap];
+}
+
+} // namespace
+
+extern "C" {
+
+// Sums [R, channels + 4] of rays [begin, end) at samples whose places are given, without gradients.
+void mmpi_gather_places(const Grid* grids, int64_t num_mpis, const float* features, int64_t rows, int64_t channels,
+                        const int64_t* heads, const int64_t* planes, const float* ndc, const bool* valid,
+                        const float* weights, int64_t begin, int64_t end, int64_t slots, float* sums) {
+    const auto find = [&](int64_t ray, std::vector<Sample>& samples) {
+        for (int64_t slot = ray * slots; slot < (ray + 1) * slots; slot++) {
+            if (!valid[slot]) continue;
+            const Grid& grid = grids[heads[slot]];
+            const float* place = ndc + 3 * slot;
+            const Cell x(place[0], grid.width), y(place[1], grid.height);
+            Sample sample;
+            sample.taps = 0, sample.weight = weights[slot];
+            if (heads[slot] < num_mpis) {
+                put_plane(sample, grid, planes[slot], x, y, 1);
+            } else {
+                const Cell z(place[2], grid.depth);
+                put_plane(sample, grid, z.lower, x, y, 1 - z.fraction);
+                put_plane(sample, grid, z.lower + 1, x, y, z.fraction);
+            }
+            samples.push_back(sample);
+        }
+    };
+    gather_rays({features, rows, channels}, begin, end, find, sums);
+}
+
+// The same at samples whose taps are known: `numbers` [R, S] says which are whose, -1 for none.
+void mmpi_gather_taps(const float* values, int64_t rows, int64_t channels, const Taps* groups, const int32_t* numbers,
+                      const float* weights, int64_t begin, int64_t end, int64_t slots, float* sums) {
+    const auto find = [&](int64_t ray, std::vector<Sample>& samples) {
+        for (int64_t slot = ray * slots; slot < (ray + 1) * slots; slot++) {
+            if (numbers[slot] < 0) continue;
+            Sample sample;
+            put_known(sample, groups, numbers[slot]);
+            sample.weight = weights[slot];
+            samples.push_back(sample);
+        }
+    };
+    gather_rays({values, rows, channels}, begin, end, find, sums);
+}
+
+// Gradients of values [rows, channels] (added to what is there; null where not wanted) and weights [R, S] from those of the sums [R, padded]
+// and, for the values alone, of the sums of colours and twice those of squared colours [R, 16], padded with zeros.
+// Samples are taken in the order of `slots`, so sums do not depend on threads.
+void mmpi_gather_back(const float* values, int64_t rows, int64_t channels, const Taps* groups, const int64_t* slots,
+                      const bool* wanted, const float* weights, const float* grad_sums, const float* grad_colors,
+                      const float* grad_squares, int64_t slots_per_ray, float* grad_values, float* grad_weights) {
+    const Table table{values, rows, channels};
+    const int64_t padded = (channels + WIDTH - 1) / WIDTH * WIDTH, count = groups[0].count + groups[1].count;
+    constexpr int64_t AHEAD = 6;
+    for (int64_t n = 0; n < count; n++) {
+        if (n + AHEAD < count) {
+            Sample soon;
+            put_known(soon, groups, n + AHEAD);
+            for (int tap = 0; tap < soon.taps; tap++) {
+                table.prefetch(soon.rows[tap]);
+                if (!grad_values) continue;
+                __builtin_prefetch(grad_values + soon.rows[tap] * channels, 1);
+                __builtin_prefetch(grad_values + (soon.rows[tap] + 1) * channels - 1, 1);
+            }
+        }
+        const int64_t slot = slots[n], ray = slot / slots_per_ray;
+        if (!wanted[ray]) continue;
+        Sample sample;
+        put_known(sample, groups, n);
+        const float weight = weights[slot];
+        Lanes total{};
+        for (int64_t first = 0; first < channels; first += WIDTH) {
+            const Texel texel = activate(interpolate(table, sample, first), first);
+            Lanes slope = load(grad_sums + ray * padded + first);
+            total += IOTA < float(channels - first) ? slope * texel.value : Lanes{};
+            if (first == 0) slope += load(grad_colors + ray * WIDTH) + load(grad_squares + ray * WIDTH) * texel.value;
+            float down[WIDTH];
+            store(down, weight * slope * texel.slope);
+            const int64_t size = std::min<int64_t>(WIDTH, channels - first);
+            for (int tap = 0; grad_values && tap < sample.taps; tap++) {
+                float* to = grad_values + sample.rows[tap] * channels + first;
+                for (int64_t c = 0; c < size; c++) to[c] += sample.shares[tap] * down[c];
+            }
+        }
+        float sum = 0;
+        for (int i = 0; i < WIDTH; i++) sum += total[i];
+        grad_weights[slot] = sum;
+    }
+}
+}

@@ -1,0 +1,211 @@
+"""What rays gather of texels, and its gradients: compiled and plain against float64 (ops/gather)."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from random_fields import bundle, random_field, random_rays
+
+from mmpi_ns.field.samples import metadata_of
+from mmpi_ns.ops import native
+from mmpi_ns.ops.gather import KnownTaps, gather_places, gather_taps, reference
+from mmpi_ns.rendering.sampler import MMPISampler
+
+CHANNELS = (3, 9, 16, 20)
+
+
+def values_by_hand(raw):
+    return np.array([1 / (1 + math.exp(-x)) if c < 3 else math.tanh(x) for c, x in enumerate(raw)])
+
+
+def sums_by_hand(values, samples, slots, weights, wanted):
+    """(gathered, mass, first, second) of every ray; samples are lists of (row, share)."""
+    rays, channels = weights.shape[0], values.shape[1]
+    out = [np.zeros((rays, n)) for n in (channels, 1, 3, 3)]
+    for taps, slot in zip(samples, slots, strict=True):
+        ray, weight = slot // weights.shape[1], weights.flat[slot]
+        if not wanted[ray]:
+            continue
+        value = values_by_hand(sum(share * values[row] for row, share in taps))
+        for total, part in zip(out, (value, np.ones(1), value[:3], value[:3] ** 2), strict=True):
+            total[ray] += weight * part
+    return out
+
+
+def batch(channels, seed=0, rays=7, width=6, in_cube=True):
+    """Values, groups, slots, weights and wanted rays in float64; slots of a group rise, as in a lookup."""
+    rng = np.random.default_rng(seed)
+    taken = rng.permutation(rays * width)[: rays * width * 2 // 3]
+    cut = len(taken) * 3 // 4 if in_cube else len(taken)
+    parts = [np.sort(taken[:cut]), np.sort(taken[cut:])]
+    values = torch.tensor(rng.normal(size=(30, channels)) * 2)
+    groups = [
+        KnownTaps(torch.tensor(rng.integers(0, 30, (len(p), taps))), torch.tensor(rng.dirichlet(np.ones(taps), len(p))))
+        for p, taps in zip(parts, (4, 8), strict=True)
+        if len(p)
+    ]
+    weights = torch.tensor(rng.dirichlet(np.ones(width), rays))
+    wanted = torch.tensor(rng.permutation(rays) > rays // 4)
+    return values, groups, torch.tensor(np.concatenate(parts)), weights, wanted
+
+
+def parts_of(sums):
+    return sums.gathered, sums.mass, sums.first, sums.second
+
+
+def in_float32(given):
+    values, groups, slots, weights, wanted = given
+    return values.float(), [KnownTaps(g.positions, g.shares.float()) for g in groups], slots, weights.float(), wanted
+
+
+def with_gradients(function, given, upstream):
+    values, weights = (x.clone().requires_grad_() for x in (given[0], given[3]))
+    sums = function(values, given[1], given[2], weights, given[4])
+    chosen = [s for s in parts_of(sums) if s.requires_grad]
+    grads = [u for u, s in zip(upstream, parts_of(sums), strict=True) if s.requires_grad]
+    torch.autograd.backward(chosen, [g.to(s.dtype) for g, s in zip(grads, chosen, strict=True)])
+    return [x.double() for x in (*(s.detach() for s in parts_of(sums)), values.grad, weights.grad)]
+
+
+@pytest.mark.parametrize("function", [gather_taps, reference.gather_taps])
+@pytest.mark.parametrize("channels", CHANNELS)
+@pytest.mark.parametrize("in_cube", [False, True])
+def test_sums_are_those_of_loops(function, channels, in_cube):
+    given = batch(channels, in_cube=in_cube)
+    values, groups, slots, weights, wanted = given
+    samples = [
+        list(zip(p.tolist(), s.tolist(), strict=True))
+        for g in groups
+        for p, s in zip(g.positions, g.shares, strict=True)
+    ]
+    wanted_sums = sums_by_hand(values.numpy(), samples, slots.tolist(), weights.numpy(), wanted.tolist())
+    found = function(*in_float32(given))
+    for a, b in zip(parts_of(found), wanted_sums, strict=True):
+        assert np.abs(a.numpy() - b).max() < 1e-6
+    assert wanted_sums[1].max() > 0.5 and not wanted.all()
+
+
+@pytest.mark.parametrize("channels", CHANNELS)
+@pytest.mark.parametrize("seed", [0, 1])
+def test_gradients_are_those_of_float64(channels, seed):
+    given = batch(channels, seed)
+    g = torch.Generator().manual_seed(seed)
+    upstream = [torch.randn(7, n, generator=g, dtype=torch.float64) for n in (channels, 1, 3, 3)]
+    fast, exact = (
+        with_gradients(f, x, upstream) for f, x in ((gather_taps, in_float32(given)), (reference.gather_taps, given))
+    )
+    for a, b in zip(fast, exact, strict=True):
+        assert b.abs().max() > 0.05 and (a - b).abs().max() < 3e-6 * (1 + b.abs().max())
+
+
+def test_reference_gradients_are_finite_differences():
+    values, groups, slots, weights, wanted = batch(5)
+
+    def sums(values, weights):
+        return reference.gather_taps(values, groups, slots, weights, wanted).gathered
+
+    def moments(values):
+        found = reference.gather_taps(values, groups, slots, weights, wanted)
+        return found.first, found.second
+
+    assert torch.autograd.gradcheck(sums, (values.requires_grad_(), weights.clone().requires_grad_()))
+    assert torch.autograd.gradcheck(moments, (values,))
+
+
+@pytest.mark.parametrize("form", [gather_taps, reference.gather_taps])
+def test_moments_hold_the_weights_fixed(form):
+    values, groups, slots, weights, wanted = in_float32(batch(9))
+    weights.requires_grad_()
+    sums = form(values.requires_grad_(), groups, slots, weights, wanted)
+    grad = torch.autograd.grad(sums.first.sum() + sums.second.sum(), weights, allow_unused=True)[0]
+    assert not sums.mass.requires_grad and (grad is None or not grad.any())
+
+
+def test_values_that_do_not_train_get_no_gradient_and_weights_do():
+    values, groups, slots, weights, wanted = in_float32(batch(9))
+    exact = with_gradients(reference.gather_taps, batch(9), [torch.ones(7, n) for n in (9, 1, 3, 3)])[-1]
+    gather_taps(values, groups, slots, weights.requires_grad_(), wanted).gathered.sum().backward()
+    assert values.grad is None and (weights.grad - exact).abs().max() < 1e-5
+
+
+@pytest.mark.parametrize("threads", [1, 2, 5])
+def test_bits_do_not_depend_on_threads(threads):
+    given = in_float32(batch(9, rays=1500))
+    upstream = [torch.randn(1500, n, generator=torch.Generator().manual_seed(1)) for n in (9, 1, 3, 3)]
+    one = with_gradients(gather_taps, given, upstream)
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(threads)
+        for a, b in zip(with_gradients(gather_taps, given, upstream), one, strict=True):
+            assert torch.equal(a, b)
+    finally:
+        torch.set_num_threads(before)
+
+
+# At places -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("with_cube", [False, True])
+def test_at_places_sums_are_those_at_their_taps(with_cube):
+    field = random_field(3, with_cube, seed=7)
+    samples, _ = MMPISampler()(bundle(*random_rays(field.plan, 60, seed=8)), field=field, threshold=0.0)
+    meta, lookup = metadata_of(samples), field.get_density(samples)[1]
+    valid, weights = meta["valid"][..., 0], torch.rand(lookup.shape, generator=torch.Generator().manual_seed(0))
+    places = (meta["heads"][..., 0], meta["planes"][..., 0], meta["ndc"], valid)
+    table, everything = field.features.data, torch.ones(60, dtype=torch.bool)
+    taps = [KnownTaps(t.rows, t.weights.double()) for t in lookup.groups]
+    exact = reference.gather_taps(table.double(), taps, lookup.index, weights.double(), everything)
+    for function in (gather_places, reference.gather_places):
+        found = function(field.grids, 3, table, *places, weights)
+        for a, b in zip(parts_of(found), parts_of(exact), strict=True):
+            assert b.abs().max() > 1 and (a - b).abs().max() < 2e-5
+    assert meta["heads"].unique().numel() == 3 + with_cube
+
+
+def test_at_places_and_at_taps_give_the_same_bits():
+    field = random_field(3, True, seed=7)
+    samples, _ = MMPISampler()(bundle(*random_rays(field.plan, 60, seed=8)), field=field, threshold=0.0)
+    meta, lookup = metadata_of(samples), field.get_density(samples)[1]
+    places = [meta[n][..., 0] for n in ("heads", "planes")] + [meta["ndc"], meta["valid"][..., 0]]
+    weights = torch.rand(lookup.shape, generator=torch.Generator().manual_seed(0))
+    a = gather_places(field.grids, 3, field.features.data, *places, weights)
+    taps = [KnownTaps(t.rows, t.weights) for t in lookup.groups]
+    b = gather_taps(field.features.data, taps, lookup.index, weights, torch.ones(60, dtype=torch.bool))
+    assert native.library() is not None and torch.equal(a.gathered, b.gathered)
+
+
+# Hard inputs ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("form", [gather_taps, reference.gather_taps])
+def test_no_samples_gather_nothing(form):
+    weights = torch.zeros(3, 2, requires_grad=True)
+    sums = form(torch.zeros(0, 9), [], torch.zeros(0, dtype=torch.int64), weights, torch.ones(3, dtype=torch.bool))
+    assert all(s.shape[0] == 3 and not s.any() for s in parts_of(sums))
+
+
+@pytest.mark.parametrize("form", [gather_taps, reference.gather_taps])
+def test_saturated_texels_are_colours_and_features_of_0_and_1_with_finite_gradients(form):
+    values = torch.tensor([[200.0, -200.0, 30.0, 200.0, -200.0]], requires_grad=True)
+    taps = [KnownTaps(torch.zeros(1, 4, dtype=torch.int64), torch.full((1, 4), 0.25))]
+    weights = torch.ones(1, 1, requires_grad=True)
+    sums = form(values, taps, torch.zeros(1, dtype=torch.int64), weights, torch.ones(1, dtype=torch.bool))
+    assert sums.gathered.tolist() == [pytest.approx([1, 0, 1, 1, -1], abs=1e-12)]
+    (sums.gathered.sum() + sums.second.sum()).backward()
+    assert values.grad.isfinite().all() and weights.grad.isfinite().all()
+
+
+def test_what_is_not_a_number_stays_in_its_own_sample():
+    values, groups, slots, weights, wanted = in_float32(batch(9, in_cube=False))
+    wanted[:] = True
+    plain = gather_taps(values, groups, slots, weights, wanted).gathered
+    hit = (groups[0].positions == 4).any(-1)
+    rays = torch.zeros(7, dtype=torch.bool)
+    rays[slots[hit] // 6] = True
+    values[4] = torch.nan
+    found = gather_taps(values, groups, slots, weights, wanted).gathered
+    assert rays.any() and not rays.all()
+    assert found[rays].isnan().all() and torch.equal(found[~rays], plain[~rays])
