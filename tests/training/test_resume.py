@@ -19,6 +19,7 @@ BOUNDARIES = (3, 6, 12, 18)
 def whole(request, scene, plan_file, tmp_path_factory):
     """Settings, and the checkpoints of every step of an uninterrupted run."""
     settings = {"training": "joint"} if request.param == "joint" else {"rays_per_mpi": request.param}
+    settings |= {"shading": "sample" if request.param == "all" else "ray"}
     settings |= {"release_shares": (0.9,), "release_weight": 0.06}
     config = trainer_config(scene, plan_file, tmp_path_factory.mktemp("whole"), STEPS, **settings)
     trainer = ready(config)

@@ -54,8 +54,16 @@ def test_each_window_gets_all_steps_and_a_file(whole):
     steps = sorted(int(p.stem[5:]) for p in whole.checkpoint_dir.iterdir())
     assert steps == list(range(1, 2 * STEPS))
     assert sorted(p.name for p in (whole.base_dir / "windows").iterdir()) == ["window-00000.pt", "window-00001.pt"]
-    assert len(load(whole.checkpoint_dir, STEPS - 1)["pipeline"]["_model.field.networks.weights"]) == 2
-    assert len(load(whole.checkpoint_dir, STEPS)["pipeline"]["_model.field.networks.weights"]) == 1
+
+
+@pytest.mark.parametrize(("shading", "counts"), [("ray", [1, 1]), ("sample", [2, 1])])
+def test_each_window_has_networks_of_its_own(scene, windows_file, tmp_path, shading, counts):
+    trainer = ready(trainer_config(scene, windows_file, tmp_path, 2, training="joint", shading=shading))
+    trainer.train()
+    states = [load(trainer.checkpoint_dir, step)["pipeline"] for step in (1, 2)]
+    assert [len(s["_model.field.networks.weights"]) for s in states] == counts
+    fresh = trainer.pipeline.model.field.networks.fresh(1)
+    assert (states[1]["_model.field.networks.weights"] - fresh).abs().max() < 0.01, "the first window's went on"
 
 
 def test_a_window_draws_from_its_own_cameras_alone(whole):
