@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import tempfile
 
 import hypothesis
 import pytest
@@ -14,6 +15,8 @@ from mmpi_ns.scene.plan import CubePlan, ScenePlan
 
 # Of the processes that tests start too: test files run side by side, and threads that wait for each other spin.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+# Depths that tests find are no business of the user's cache.
+os.environ["XDG_CACHE_HOME"] = tempfile.mkdtemp(prefix="mmpi-cache-")
 torch.set_num_threads(1)
 hypothesis.settings.register_profile("mmpi", deadline=None, derandomize=True, print_blob=True)
 hypothesis.settings.load_profile("mmpi")

@@ -14,8 +14,10 @@ from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig, Datapa
 from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
 
+from mmpi_ns.capture.cache import Arrays, digest, remembered
 from mmpi_ns.capture.checks import in_one_place
 from mmpi_ns.capture.dataset import MMPIDataset
+from mmpi_ns.capture.originals import at_full_size
 from mmpi_ns.capture.sfm import SfmModel, find_sfm_model
 from mmpi_ns.capture.tracks import PosedImages, triangulate
 from mmpi_ns.placement.observations import Observations
@@ -23,6 +25,8 @@ from mmpi_ns.placement.sweep import add_swept_points
 
 MAX_REPROJECTION = 0.02
 """Median angle between keypoints and points, as a share of the image, beyond which a model is in another frame."""
+TRACKS_VERSION = 1
+"""Of the way tracks are found: kept ones of another version are found anew."""
 ENOUGH_KEYPOINTS = 20
 """Keypoints an image, on average, that need no plane sweep beside them."""
 
@@ -62,13 +66,32 @@ def observe(
 def _find_points(observations: Observations, dataset: MMPIDataset, triangulates: bool) -> Observations:
     """Points for a scene without tracks: triangulated, and swept where triangulation finds too few."""
     if triangulates and (images := posed_images(observations, dataset)) is not None:
-        CONSOLE.print(f"No SfM tracks: matching the features of {len(dataset)} training images.")
-        observations = with_tracks(observations, triangulate(images))
-        CONSOLE.print(f"Triangulated {len(observations.points)} points seen {len(observations.seen_by)} times.")
+        observations = with_tracks(observations, _remembered_tracks(at_full_size(images)))
     if len(observations.seen_by) < ENOUGH_KEYPOINTS * len(dataset):
         CONSOLE.print("Few or no tracks: a quick plane sweep finds out where the content lies.")
         observations = add_swept_points(observations, [_thumbnail(dataset, i) for i in range(len(dataset))])
     return observations
+
+
+def _remembered_tracks(images: PosedImages) -> SfmModel:
+    """The tracks of posed images, found once."""
+
+    def find() -> Arrays:
+        width, height = images.sizes.max(0).astype(int)
+        CONSOLE.print(f"No SfM tracks: matching the features of {len(images.files)} images of {width} x {height}.")
+        model = triangulate(images)
+        keypoints = [np.concatenate([points[:, None], at], -1) for points, at in model.keypoints]
+        sizes = np.array([len(k) for k in keypoints], np.int64)
+        table = np.concatenate(keypoints) if keypoints else np.zeros((0, 3))
+        return {"points": model.points, "names": np.array(model.names, "U16"), "keypoints": table, "sizes": sizes}
+
+    cameras = images.camera_to_worlds, images.intrinsics, images.distortion, images.fisheye
+    stored = remembered(digest(images.files, "tracks", TRACKS_VERSION, *cameras), find)
+    tables = np.split(stored["keypoints"], np.cumsum(stored["sizes"].astype(np.int64))[:-1])
+    keypoints = tuple((t[:, 0].astype(np.int64), t[:, 1:]) for t in tables) if len(stored["sizes"]) else ()
+    model = SfmModel(stored["points"], tuple(str(name) for name in stored["names"]), keypoints)  # type: ignore[arg-type]
+    CONSOLE.print(f"{len(model.points)} triangulated points, seen {len(stored['keypoints'])} times.")
+    return model
 
 
 def _thumbnail(dataset: MMPIDataset, index: int, side: int = 128) -> NDArray[np.float64]:

@@ -18,8 +18,10 @@ from numpy.typing import NDArray
 
 from mmpi_ns.capture.sfm import SfmModel, load_pycolmap, read_reconstruction
 
-NEIGHBOURS = 16
+NEIGHBOURS = 8
 """Images that each image is matched with at most: the nearest that look roughly the same way."""
+SMALL, LARGE = 800, 1600
+"""Images no wider or higher than the first are doubled to find fine features, larger ones than the second shrunk."""
 MAX_ANGLE = 60.0
 """Degrees between the facing directions of two images worth matching."""
 MIN_ANGLE = 0.5
@@ -123,7 +125,7 @@ def _attempt(pycolmap: Any, images: PosedImages, effort: Effort) -> SfmModel:
     with tempfile.TemporaryDirectory(prefix="mmpi-tracks-") as folder:
         work = Path(folder)
         names = _link(images.files, work / "images")
-        _extract(pycolmap, work, names, effort)
+        _extract(pycolmap, work, names, effort, doubled=images.sizes.max() <= SMALL)
         model = _posed_model(pycolmap, work, names, images)
         if pairs:
             _match(pycolmap, work, [(names[i], names[j]) for i, j in pairs], effort)
@@ -145,8 +147,10 @@ def _link(files: Sequence[Path], folder: Path) -> list[str]:
     return names
 
 
-def _extract(pycolmap: Any, work: Path, names: list[str], effort: Effort) -> None:
+def _extract(pycolmap: Any, work: Path, names: list[str], effort: Effort, doubled: bool) -> None:
     options = pycolmap.FeatureExtractionOptions()
+    options.max_image_size = LARGE
+    options.sift.first_octave = -1 if doubled else 0
     options.sift.peak_threshold = effort.peak_threshold
     pycolmap.extract_features(
         work / "features.db",
