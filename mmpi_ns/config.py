@@ -12,13 +12,14 @@ from mmpi_ns.capture.datamanager import MMPIDataManagerConfig
 from mmpi_ns.model import MMPIModelConfig
 from mmpi_ns.placement.defaults import DEFAULTS
 from mmpi_ns.placement.rule import PlacementConfig
-from mmpi_ns.training.loss_terms import LossWeights
+from mmpi_ns.training.learning_rates import PhaseSchedulerConfig
+from mmpi_ns.training.losses import LossWeights
 from mmpi_ns.training.touched_adam import TouchedAdamConfig
-from mmpi_ns.training.trainer import MMPITrainerConfig, PhaseSchedulerConfig
+from mmpi_ns.training.trainer import MMPITrainerConfig
 
 
 def _optimizers() -> dict:
-    rates = {"density": 0.1, "features": 0.1, "colour": 1e-3, "reliability": 0.1, "exposure": 0.02}
+    rates = {"density": 0.1, "features": 0.1, "colour": 1e-3, "reliability": 0.1}
     return {
         kind: {"optimizer": TouchedAdamConfig(lr=lr), "scheduler": PhaseSchedulerConfig(kind=kind)}
         for kind, lr in rates.items()

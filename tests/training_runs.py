@@ -12,6 +12,7 @@ from nerfstudio.engine import trainer as nerfstudio_trainer
 from mmpi_ns.capture.datamanager import MMPIDataManagerConfig
 from mmpi_ns.config import mmpi_small
 from mmpi_ns.scene.plan import CubePlan, MPIPlan, ScenePlan
+from mmpi_ns.scene.windows import Window, WindowedPlan
 
 
 def datamanager(data: Path, test_mode="val", **settings):
@@ -59,6 +60,20 @@ def plan_of(observations, num_mpis=2, with_cube=False, planes=12) -> ScenePlan:
 
 def write_plan(data: Path, path: Path, **settings) -> Path:
     path.write_text(plan_of(datamanager(data, test_mode="inference").observations, **settings).to_json())
+    return path
+
+
+def write_windows(data: Path, path: Path) -> Path:
+    """Two windows of the tiny scene's walk, one with two MPIs and one with one."""
+    seen = datamanager(data, test_mode="inference").observations
+    centers = seen.centers[np.argsort(seen.centers @ seen.mean_axes[0])]
+    length = np.linalg.norm(centers[-1] - centers[0])
+    middles = [centers[0] + (centers[-1] - centers[0]) * share for share in (0.25, 0.75)]
+    windows = tuple(
+        Window(tuple(m.tolist()), 0.3 * float(length), 0.1 * float(length), plan_of(seen, num_mpis=k))
+        for m, k in zip(middles, (2, 1), strict=True)
+    )
+    path.write_text(WindowedPlan(windows).to_json())
     return path
 
 

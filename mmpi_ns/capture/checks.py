@@ -13,6 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from mmpi_ns.utils.messages import brief
+
 SAME_PLACE = 1e-6
 """Cameras nearer to each other than this share of their distance from the origin stand in one place."""
 
@@ -43,11 +45,6 @@ def check_transforms(data: Path, *, auto_scale: bool, opens_first_image: bool) -
 def in_one_place(centers: NDArray[np.float64]) -> bool:
     """Whether camera centres [M, 3] are the same but for rounding."""
     return float(np.ptp(centers, axis=0).max()) <= SAME_PLACE * max(1.0, float(np.abs(centers).max()))
-
-
-def brief(error: BaseException) -> str:
-    """What an error says, cut after its first sentence: it goes in brackets into a sentence of ours."""
-    return str(error).strip().split("\n")[0].split(". ")[0].rstrip(" .")
 
 
 def _frames(path: Path) -> list[dict[str, Any]]:

@@ -8,7 +8,7 @@ import numpy as np
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from numpy.typing import NDArray
 
-from mmpi_ns.capture.checks import brief
+from mmpi_ns.utils.messages import brief
 
 # Pillow reports damaged files by any of these (SyntaxError: a broken PNG chunk), nerfstudio odd shapes by assertions.
 UNREADABLE = (OSError, SyntaxError, ValueError, AssertionError)

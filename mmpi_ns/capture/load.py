@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from pathlib import Path
 from typing import Literal
 
@@ -13,7 +12,6 @@ from mmpi_ns.capture.checks import check_transforms
 from mmpi_ns.capture.datamanager import MMPIDataManagerConfig
 from mmpi_ns.capture.dataset import MMPIDataset
 from mmpi_ns.capture.observe import observe, sfm_folder
-from mmpi_ns.config import mmpi_small
 from mmpi_ns.placement.observations import Observations
 
 Parser = Literal["auto", "nerfstudio", "colmap"]
@@ -32,8 +30,7 @@ def load_observations(data: Path, downscale_factor: int | None = None, parser: P
     """
     if not data.exists():
         raise ValueError(f"There is no scene at {data}: check the path.")
-    config = copy.deepcopy(mmpi_small.config.pipeline.datamanager)
-    assert isinstance(config, MMPIDataManagerConfig)
+    config = MMPIDataManagerConfig(dataparser=NerfstudioDataParserConfig())
     is_nerfstudio = data.suffix == ".json" or (data / "transforms.json").is_file()
     if parser == "colmap" or (parser == "auto" and not is_nerfstudio):
         model = next((p for p in ("colmap/sparse/0", "sparse/0", "sparse") if (data / p).is_dir()), None)

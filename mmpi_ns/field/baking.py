@@ -7,22 +7,22 @@ reliabilities that they are made of. For rendering only; docs/performance.md has
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
+from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.samples import LocalRays
-from mmpi_ns.ops.interpolate import interpolate
 from mmpi_ns.scene import geometry
 from mmpi_ns.scene.texels import BRICK
 
-if TYPE_CHECKING:
-    from mmpi_ns.field.mmpi_field import MMPIField
-
 AT_ONCE = 1 << 18
 """Texels whose shares are computed together."""
+
+
+def baked_shares(field: MMPIField) -> Float[Tensor, "N 1"]:
+    """``bake_shares`` of a field, made once, until it is trained on (``MMPIField.forget_shares``)."""
+    return field.cached("shares", lambda: bake_shares(field))
 
 
 @torch.no_grad()
@@ -68,14 +68,3 @@ def rays_to(
     disparity = (1 - ndc[:, 2]) / 2 / mpi.near * mpi.depth_share + mpi.last_disparity
     directions = geometry.rotate(frames.axes[k].T, torch.stack([u, v, torch.ones_like(u)], -1))
     return frames.origins[k].expand_as(ndc), directions, disparity
-
-
-def shares_at(
-    field: MMPIField, shares: Float[Tensor, "N 1"], ndc: Float[Tensor, "S 3"], heads: Int[Tensor, "S"]
-) -> Float[Tensor, "S"]:
-    """Baked shares of samples, interpolated in the head that each was taken from."""
-    found = ndc.new_zeros(len(heads))
-    for k, grid in enumerate(field.grids):
-        index = (heads == k).nonzero()[:, 0]
-        found = found.index_copy(0, index, interpolate(shares, *grid.trilinear(ndc[index]))[:, 0])
-    return found.clamp(0, 1)

@@ -16,7 +16,6 @@ from nerfstudio.cameras.rays import RaySamples
 from nerfstudio.field_components.field_heads import FieldHeadNames
 from torch import Tensor, nn
 
-from mmpi_ns.field.baking import bake_shares, shares_at
 from mmpi_ns.field.color_network import ColorNetworks
 from mmpi_ns.field.samples import Gathered, LocalRays, Lookup, Taps, by_head, head_spans, metadata_of
 from mmpi_ns.field.shading import RayColors, RayShader, Shading
@@ -117,14 +116,14 @@ class MMPIField(TexelTables):
 
     @property
     def frames(self) -> geometry.Frames:
-        return self._cached("frames", lambda: geometry.Frames.pack(self.plan.mpis, device=self.density.device))
+        return self.cached("frames", lambda: geometry.Frames.pack(self.plan.mpis, device=self.density.device))
 
     @property
     def cube(self) -> geometry.Cube | None:
         plan, device = self.plan.cube, self.density.device
         if plan is None:
             return None
-        return self._cached("cube", lambda: geometry.Cube.pack(plan, self.samples_per_voxel, device=device))
+        return self.cached("cube", lambda: geometry.Cube.pack(plan, self.samples_per_voxel, device=device))
 
     @property
     def depth_scale(self) -> float:
@@ -134,7 +133,7 @@ class MMPIField(TexelTables):
     def _biases(self, k: int) -> Tensor:
         mpi, device = self.plan.mpis[k], self.density.device
         missing = mpi.last_disparity / mpi.disparity_step
-        return self._cached(f"bias{k}", lambda: plane_biases(mpi.planes, missing)[0].to(device))
+        return self.cached(f"bias{k}", lambda: plane_biases(mpi.planes, missing)[0].to(device))
 
     # Density ---------------------------------------------------------------------------------------------------
 
@@ -172,14 +171,14 @@ class MMPIField(TexelTables):
             return MarchScene(self.plan.mpis, self.grids, self.frames.disparity_steps, biases, self.depth_scale, cube)
 
         votes = self.reliability.data if shares is None else shares
-        return self._cached("march", make).with_tables(self.density.data, votes, self.touched)
+        return self.cached("march", make).with_tables(self.density.data, votes, self.touched)
 
     def plane_hits(self, origins: Tensor, directions: Tensor, nears: Tensor, fars: Tensor) -> geometry.PlaneHits:
         """``geometry.plane_hits`` in the field's MPIs, compiled where it can be; on a GPU in one launch."""
         lib, on_gpu = native.library(origins, self.density), native.takes_triton(origins, self.density)
         if lib is None and not on_gpu:
             return geometry.plane_hits(origins, directions, nears, fars, self.frames)
-        frames = self._cached("hit frames", lambda: hits.pack_frames(self.frames))
+        frames = self.cached("hit frames", lambda: hits.pack_frames(self.frames))
         if lib is not None:
             return hits.plane_hits(lib, origins, directions, nears, fars, frames)
         from mmpi_ns.ops import triton_hits
@@ -197,7 +196,7 @@ class MMPIField(TexelTables):
             return TritonScene.pack(self.plan.mpis, self.grids, biases, self.depth_scale, cube, self.density.device)
 
         votes = self.reliability.data if shares is None else shares
-        return self._cached("triton", make), (self.density.data, votes, self.touched)
+        return self.cached("triton", make), (self.density.data, votes, self.touched)
 
     # Reliability -----------------------------------------------------------------------------------------------
 
@@ -242,7 +241,7 @@ class MMPIField(TexelTables):
         return ndc.clamp(-1, 1), (ndc.abs() <= 1).all(-1) & (inverse_t > 0)
 
     def _frame(self, k: int) -> geometry.Frames:
-        return self._cached(f"frame{k}", lambda: geometry.Frames.pack([self.plan.mpis[k]], device=self.density.device))
+        return self.cached(f"frame{k}", lambda: geometry.Frames.pack([self.plan.mpis[k]], device=self.density.device))
 
     def blend(
         self,
@@ -260,16 +259,22 @@ class MMPIField(TexelTables):
         """
         index = (tau > NEGLIGIBLE_DEPTH).nonzero()[:, 0]
         if baked is not None:
-            found = shares_at(self, baked[0], baked[1][index], heads[index])
+            found = self.shares_at(baked[0], baked[1][index], heads[index])
             share = found.log(), torch.log1p(-found)
         else:
             share = self.shares(rays[index], local, inverse_t[index], heads[index])
         blended = tau / len(self.grids)
         return blended.index_copy(0, index, blended_optical_depth(tau[index], *share, form))
 
-    def baked_shares(self) -> Float[Tensor, "N 1"]:
-        """Shares of all texels, for rendering; made once, until ``forget_shares``."""
-        return self._cached("shares", lambda: bake_shares(self))
+    def shares_at(
+        self, shares: Float[Tensor, "N 1"], ndc: Float[Tensor, "S 3"], heads: Int[Tensor, "S"]
+    ) -> Float[Tensor, "S"]:
+        """Baked shares of samples, interpolated in the head that each was taken from."""
+        found = ndc.new_zeros(len(heads))
+        for k, grid in enumerate(self.grids):
+            index = (heads == k).nonzero()[:, 0]
+            found = found.index_copy(0, index, interpolate(shares, *grid.trilinear(ndc[index]))[:, 0])
+        return found.clamp(0, 1)
 
     def forget_shares(self) -> None:
         """What was baked no longer holds: the field is about to be trained."""

@@ -50,14 +50,6 @@ class RayColors:
         """Those of the chosen rays."""
         return RayColors(*(x.index_select(0, rays) for x in (self.rgb, self.mass, self.first, self.second)))
 
-    def exposed(
-        self, accumulation: Float[Tensor, "R 1"], gains: Float[Tensor, "R 3"], biases: Float[Tensor, "R 3"]
-    ) -> RayColors:
-        """The same with gain c + bias in place of every colour c."""
-        first = gains * self.first + biases * self.mass
-        second = gains**2 * self.second + biases * (gains * self.first + first)
-        return RayColors(gains * self.rgb + biases * accumulation, self.mass, first, second)
-
 
 class RayShader(Networks):
     """One network (colour, features, PE(direction)) -> what the view changes in the colour that a ray has gathered.

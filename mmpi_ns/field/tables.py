@@ -6,7 +6,6 @@ which nerfstudio fixes before K is known. Row arithmetic is in ``texels.py``, wo
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -15,11 +14,11 @@ from nerfstudio.fields.base_field import Field
 from torch import Tensor, nn
 
 from mmpi_ns.field.samples import Lookup
-from mmpi_ns.scene.bricks import from_dense, grown_tiles, keep_bricks, new_table, resample, take_bricks
+from mmpi_ns.scene.bricks import grown_tiles, keep_bricks, new_table, resample, take_bricks
 from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.scene.texels import BRICK, TexelGrid, head_grids, number_tiles
 from mmpi_ns.scene.visible_tiles import TrainingViews, reachable_tiles
-from mmpi_ns.training.phases import Schedule
+from mmpi_ns.utils.files import to_bytes, to_text
 
 RELEASED_DENSITY = -20.0
 """Raw density of texels that no ray trained: their alpha is below 1e-7."""
@@ -78,19 +77,19 @@ class TexelTables(Field):
     @property
     def grids(self) -> list[TexelGrid]:
         """The texels of every head, MPIs first, the cube last."""
-        return self._cached("grids", lambda: head_grids(self.plan, self.tiles))
+        return self.cached("grids", lambda: head_grids(self.plan, self.tiles))
 
     @property
     def num_bricks(self) -> int:
         """Bricks that are stored, without the empty one."""
         return len(self.density) // BRICK - 1
 
-    def _cached(self, name: str, make: Any) -> Any:
+    def cached(self, name: str, make: Any) -> Any:
         """A constant of the plan, made once for the device that the parameters are on."""
         key = (name, self.density.device)
-        if key not in self._packed:
-            self._packed[key] = make()
-        return self._packed[key]
+        found = self._packed.get(key)
+        # Where threads make it at once the first one's stays: kernels hold addresses in it, not references.
+        return self._packed.setdefault(key, make()) if found is None else found
 
     def build(self, plan: ScenePlan, factor: float, tiles: Int[Tensor, "T"] | None = None) -> None:
         """Allocates all tables afresh for ``plan`` at ``factor`` times its texels. Parameters stay the same objects.
@@ -110,35 +109,9 @@ class TexelTables(Field):
             table = getattr(self, name)
             replace_data(table, new_table(self.tiles, self._channels(name), _empty_value(name)))
         self.touched = torch.zeros(len(self.density), dtype=torch.uint8, device=device)
-        self.plan_bytes = torch.frombuffer(bytearray(plan.to_json().encode()), dtype=torch.uint8).to(device)
+        self.plan_bytes = to_bytes(plan.to_json()).to(device)
         self.texel_factor = torch.tensor(factor, dtype=torch.float64, device=device)
         self._forget()
-
-    def prepare_storage(self, schedule: Schedule, step: int, least: float, optimizers: Mapping[str, Any]) -> None:
-        """Grows and gives up what the schedule says of this step.
-
-        Args:
-            schedule: of the whole run.
-            step: that is about to run.
-            least: see ``release_unused``.
-            optimizers: of the tables, by their names, where there are any; their moments follow.
-        """
-        own = [(optimizers[name], getattr(self, name)) for name in TABLES if name in optimizers]
-        factor = schedule.texel_factor(step)
-        if factor != self.factor:
-            for optimizer, table in own:
-                optimizer.reset_moments(table)
-            self.grow(factor)
-        phase, left = schedule.phase_at(step), []
-        if schedule.releases_at(step):
-            left.append(self.release_unused(least))
-        elif schedule.sharpened(step) and not schedule.sharpened(step - 1):
-            self.look_afresh()
-        if phase.name == "blend" and step == phase.start:
-            left.append(self.release_untouched())
-        for kept in left:
-            for optimizer, table in own if kept is not None else ():
-                optimizer.keep_blocks(table, kept, BRICK)
 
     @torch.no_grad()
     def grow(self, factor: float) -> None:
@@ -218,24 +191,10 @@ class TexelTables(Field):
             if not any(key.startswith(prefix) for key in state_dict):
                 return  # nerfstudio loads the pipeline's own, empty state in a second pass
             raise ValueError("The checkpoint holds no scene plan: it was not written by this method.")
-        plan = ScenePlan.from_json(bytes(plan_bytes.cpu().numpy().tolist()).decode())
-        factor = float(state_dict[prefix + "texel_factor"])
-        tiles = state_dict.get(prefix + "tiles")
-        self.build(plan, factor, head_grids(plan.scaled(factor))[0].tiles if tiles is None else tiles)
-        if tiles is None:
-            self._store_in_bricks(state_dict, prefix)
+        plan = ScenePlan.from_json(to_text(plan_bytes))
+        self.build(plan, float(state_dict[prefix + "texel_factor"]), state_dict[prefix + "tiles"])
         self.plan_bytes = plan_bytes.clone().to(self.density.device)  # as it was written, whatever a plan has now
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
-
-    def _store_in_bricks(self, state_dict: dict[str, Any], prefix: str) -> None:
-        """Rewrites the state of a checkpoint from before there were bricks."""
-        for name in (*TABLES, "touched"):
-            dense = state_dict[prefix + name]
-            flat = dense.view(len(dense), -1).to(self.density.device)
-            table = from_dense(flat, self.grids, _empty_value(name))
-            state_dict[prefix + name] = table.view(-1, *dense.shape[1:])
-        for name in ("tiles", "peak", "crossings"):
-            state_dict[prefix + name] = getattr(self, name)
 
 
 def _empty_value(name: str) -> float:

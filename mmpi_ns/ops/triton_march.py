@@ -204,7 +204,7 @@ def _blend(rays, scene, ray, head, inverse_t, tau, wanted, K: tl.constexpr, HAS_
 
 @triton.jit
 def _blend_baked(scene, head, place, tau, wanted, K: tl.constexpr, HAS_CUBE: tl.constexpr, OPACITY: tl.constexpr):
-    """Optical depths after blending with the shares that stand where reliability does (``baking.shares_at``)."""
+    """Optical depths after blending with the shares that stand where reliability does (``MMPIField.shares_at``)."""
     _, grids, _, _, _, shares, _ = scene
     u, v, s = place
     thick = wanted & (tau > NEGLIGIBLE)

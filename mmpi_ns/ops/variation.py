@@ -13,11 +13,29 @@ from torch import Tensor
 from mmpi_ns.ops import native
 from mmpi_ns.ops.march import Grid
 from mmpi_ns.scene.texels import TexelGrid
-from mmpi_ns.training import losses
 
 Scales = list[tuple[float, float, float]]
 PART = 4096
 """Texels whose differences the compiled kernel sums together, so that a sum does not depend on the threads."""
+
+
+def clamped_differences(
+    values: Float[Tensor, "N C"], neighbours: Float[Tensor, "N M C"], scales: Float[Tensor, "N M"]
+) -> Float[Tensor, ""]:
+    """Total variation of texels with given neighbours: clamped differences, whose gradient is DVGO's (L_TV).
+
+    DVGO adds ``scale / 6 * clamp(v - v_neighbour, -1, 1)`` to the gradient of each touched texel. That is the gradient
+    of a Huber function of the difference with the neighbour held fixed, so it is an ordinary loss here.
+
+    Args:
+        values: texels that the batch touched, one row each.
+        neighbours: their neighbours along each axis (held fixed).
+        scales: weight of each difference (resolution / 128, 0 where there is no neighbour).
+    """
+    difference = values[:, None, :] - neighbours.detach()
+    size = difference.abs()
+    huber = torch.where(size <= 1, 0.5 * difference**2, size - 0.5)
+    return (scales[..., None] * huber).sum() / 6
 
 
 def total_variation_reference(
@@ -27,7 +45,7 @@ def total_variation_reference(
     grids: list[TexelGrid],
     scales: Scales,
 ) -> Float[Tensor, ""]:
-    """``losses.total_variation`` of distinct texels with their neighbours of the same head.
+    """``clamped_differences`` of distinct texels with their neighbours of the same head.
 
     Args:
         values: the texels, gathered from the table.
@@ -42,7 +60,7 @@ def total_variation_reference(
         neighbours, exists = grid.neighbours(rows[own])
         weights = exists * torch.tensor([s for s in each for _ in range(2)], device=rows.device)
         around = table[neighbours.reshape(-1)].view(*neighbours.shape, -1)
-        total = total + losses.total_variation(values[own], around, weights)
+        total = total + clamped_differences(values[own], around, weights)
     return total
 
 

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from mmpi_ns.placement.borders import widened
 from mmpi_ns.placement.candidates import Candidate, find_candidates
 from mmpi_ns.placement.errors import WORST
-from mmpi_ns.placement.far_ends import with_far_ends
 from mmpi_ns.placement.hand_made import drive_plan, room_plan
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.placement.visibility import VisiblePoints, find_visible_points
@@ -64,8 +63,6 @@ class PlacementConfig:
     """Voxels along a side of a cube at most, where one is worth it; 0 for none (automatic)."""
     window_length: float = 5.0
     """A longer capture is split into windows of this length, in median distances of what was seen; 0: never."""
-    far_ends: bool = False
-    """Let MPIs end where others show what lies beyond, so that a ray on a long road meets fewer of them (automatic)."""
     faces: tuple[str, ...] = ("front", "left", "right", "below")
     """Which MPIs of the drive to use (drive)."""
     drive_pull_back: float = 0.45
@@ -122,7 +119,6 @@ def _choose(
     """The heads that a scene needs, with texels no finer than the budget allows."""
     candidates = find_candidates(observations, visible, with_cubes=config.max_voxels > 0)
     best: list[MPIPlan | CubePlan] | None = None
-    size = texel_pixels
     chosen: list[MPIPlan | CubePlan] = []
     too_fine = None
     for _ in range(BUDGET_ROUNDS):
@@ -131,7 +127,7 @@ def _choose(
         chosen = [*mpis, *(h for h in chosen if isinstance(h, CubePlan))]
         excess = sum(h.texels for h in chosen) / config.max_texels if config.max_texels else 0.0
         if excess <= 1.0:
-            best, size = chosen, texel_pixels
+            best = chosen
             if too_fine is None or excess > 0.8:
                 break
             texel_pixels = (too_fine * texel_pixels) ** 0.5
@@ -139,14 +135,7 @@ def _choose(
             too_fine = texel_pixels
             # Coarser texels have fewer rows and columns and ask for fewer planes: a third power, nearly.
             texel_pixels *= max(1.04, excess ** (1 / 3)) if best is None else 1.1
-    if best is None:
-        best, size = chosen, texel_pixels
-    if not config.far_ends:
-        return best
-    mpis = [h for h in best if isinstance(h, MPIPlan)]
-    enough = config.enough * size
-    mpis = with_far_ends(mpis, observations, visible, enough, config.max_planes, config.min_gain)
-    return [*mpis, *(h for h in best if isinstance(h, CubePlan))]
+    return chosen if best is None else best
 
 
 class _Choice:

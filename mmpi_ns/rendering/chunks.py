@@ -1,8 +1,13 @@
-"""How many rays are rendered at once: as many as suit the caches of a CPU, or as fit into the memory of a GPU."""
+"""Images in chunks of rays: as many at once as suit the caches of a CPU, or as fit into the memory of a GPU."""
 
 from __future__ import annotations
 
+from collections import defaultdict
+from collections.abc import Callable
+
 import torch
+from nerfstudio.cameras.rays import RayBundle
+from torch import Tensor
 
 CPU_RAYS = 4096
 """Their samples stay in the caches' reach and below what the C library gives back to the system after each use."""
@@ -14,8 +19,8 @@ FREE_SHARE = 0.5
 """Of the device's free memory; the rest is for what else runs there."""
 
 
-def rays_at_once(samples_per_ray: int, device: torch.device) -> int:
-    """Rays to render at once where no number is asked for.
+def rays_per_chunk(samples_per_ray: int, device: torch.device) -> int:
+    """Rays of a chunk where no number is asked for.
 
     Args:
         samples_per_ray: samples that a ray has at most: the planes of all MPIs and the steps through the cube.
@@ -29,3 +34,24 @@ def rays_at_once(samples_per_ray: int, device: torch.device) -> int:
     free = torch.cuda.mem_get_info(device)[0] + torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
     fit = int(FREE_SHARE * free / (BYTES_PER_SAMPLE * max(samples_per_ray, 1)))
     return min(max(1 << max(fit, 1).bit_length() - 1, CPU_RAYS), GPU_RAYS)
+
+
+def render_in_chunks(
+    bundle: RayBundle, size: int, device: torch.device, render: Callable[[RayBundle], dict[str, Tensor]]
+) -> dict[str, Tensor]:
+    """Outputs [H, W, C] of an image's rays [H, W], rendered ``size`` at a time, on the device where the rays are.
+
+    nerfstudio's own loop reads the size from the config, which threads share.
+
+    Args:
+        bundle: the rays of an image.
+        size: of a chunk.
+        device: where they are rendered.
+        render: outputs [R, C] of some of the rays.
+    """
+    parts: dict[str, list[Tensor]] = defaultdict(list)
+    for start in range(0, len(bundle), size):
+        chunk = bundle.get_row_major_sliced_ray_bundle(start, start + size).to(device)
+        for name, values in render(chunk).items():
+            parts[name].append(values.to(bundle.origins.device))
+    return {name: torch.cat(values).view(*bundle.origins.shape[:2], -1) for name, values in parts.items()}

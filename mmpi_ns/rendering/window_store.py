@@ -6,34 +6,42 @@ import pickle
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from threading import Lock
+from weakref import WeakValueDictionary
 
 import torch
-from jaxtyping import Float, Int
 from torch import Tensor
 
-from mmpi_ns.capture.checks import brief
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.tables import TABLES
 from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.utils.files import to_text, write_atomically
+from mmpi_ns.utils.messages import brief
+from mmpi_ns.utils.threads import Uninterrupted
 
 _DAMAGED = (OSError, RuntimeError, EOFError, KeyError, TypeError, pickle.UnpicklingError)
 """What reading a damaged file raises."""
 
 
 class WindowStore:
-    """Finished windows, one file each.
+    """Finished windows, one file each. Several threads may render from one store.
 
     Args:
         folder: where the files lie; None where there is one window alone.
+        empty: makes a field of the run's settings to load into.
         budget: bytes that windows held to render may take. The one that is rendered is held whatever it takes.
         half: write tables in half precision.
     """
 
-    def __init__(self, folder: Path | None, budget: float, half: bool = False) -> None:
+    def __init__(
+        self, folder: Path | None, empty: Callable[[], MMPIField], budget: float = 0.0, half: bool = False
+    ) -> None:
         self.folder, self.budget, self.half = folder, budget, half
-        self._fields: dict[int, MMPIField] = {}
+        self._empty, self._lock = empty, Lock()
+        self._held: dict[int, MMPIField] = {}
         """Those that are held, the one used last at the end."""
+        self._alive: WeakValueDictionary[int, MMPIField] = WeakValueDictionary()
+        """Those and what a rendering still works on: letting a window go takes it from nobody who has it."""
 
     def path(self, window: int) -> Path:
         assert self.folder is not None, "several windows need a folder"
@@ -41,7 +49,9 @@ class WindowStore:
 
     def forget(self, window: int) -> None:
         """Leaves the file alone: the window is about to be trained, and will be written anew."""
-        self._fields.pop(window, None)
+        with Uninterrupted(), self._lock:
+            self._held.pop(window, None)
+            self._alive.pop(window, None)
 
     def save(self, window: int, field: MMPIField) -> None:
         """Writes a finished window: whole, or not at all.
@@ -57,20 +67,25 @@ class WindowStore:
         state = {"window": window, "field": tables}
         write_atomically(path, lambda unfinished: torch.save(state, unfinished))
 
-    def load(self, window: int, empty: Callable[[], MMPIField], device: torch.device) -> MMPIField:
-        """A finished window, ready to render.
+    def load(self, window: int, device: torch.device) -> MMPIField:
+        """A finished window, ready to render. It stays whole for whoever holds it, whatever the store lets go.
 
         Args:
             window: its number.
-            empty: makes a field of the run's settings to load into.
             device: where to.
 
         Raises:
             ValueError: the file is missing or damaged (says which, and what to do).
         """
-        if window in self._fields:
-            self._fields[window] = self._fields.pop(window)
-            return self._fields[window]
+        with Uninterrupted(), self._lock:
+            field = self._alive.get(window)
+            if field is None:
+                field = self._read(window).to(device).eval()
+            self._held.pop(window, None)
+            self._held[window] = self._alive[window] = field
+            return field
+
+    def _read(self, window: int) -> MMPIField:
         path = self.path(window)
         if not path.is_file():
             raise ValueError(
@@ -80,20 +95,19 @@ class WindowStore:
         try:
             state = torch.load(path, map_location="cpu", weights_only=True, mmap=True)["field"]
             self._make_room(sum(values.numel() * _itemsize(values) for values in state.values()))
-            field = empty()
+            field = self._empty()
             field.load_state_dict({name: _widened(values) for name, values in state.items()})
         except (*_DAMAGED, AttributeError) as error:
             raise ValueError(
                 f"Window {window} of this run is damaged: {path} cannot be read ({brief(error)}). Copy it anew, or "
                 "train it again: resume from a checkpoint of before its end with --load-step."
             ) from error
-        self._fields[window] = field.to(device).eval()
-        return self._fields[window]
+        return field
 
     def _make_room(self, needed: int) -> None:
         """Lets windows go, the one that was not used for longest first, until ``needed`` bytes fit the budget too."""
-        while self._fields and needed + sum(map(_bytes_of, self._fields.values())) > self.budget:
-            del self._fields[next(iter(self._fields))]
+        while self._held and needed + sum(map(_bytes_of, self._held.values())) > self.budget:
+            del self._held[next(iter(self._held))]
 
     def adopt(self, other: Path, plans: dict[int, ScenePlan], needed: bool = False) -> None:
         """Takes over finished windows of the run that this one goes on from.
@@ -148,23 +162,3 @@ def _check_plan(source: Path, plan: ScenePlan) -> None:
             f"{source} was trained with another scene plan: resume with the settings in its run's config.yml, or give "
             "that run's plan.json with --pipeline.model.plan-file."
         )
-
-
-def mix_windows(
-    shares: Float[Tensor, "R W"], parts: dict[int, tuple[Int[Tensor, "P"], dict[str, Tensor]]]
-) -> dict[str, Tensor]:
-    """One rendering of several windows': colours by their shares, depth and winner of the window of most share.
-
-    Args:
-        shares: of each ray and window.
-        parts: for each window that was asked, which rays, and what it shows of them.
-    """
-    mixed: dict[str, Tensor] = {}
-    most = shares.argmax(-1)
-    for w, (rays, outputs) in parts.items():
-        own = (most[rays] == w)[:, None]
-        for name, values in outputs.items():
-            whole = mixed.setdefault(name, values.new_zeros(len(shares), *values.shape[1:]))
-            chooses = name in ("depth", "winning_mpi")
-            whole[rays] += values * (own if chooses else shares[rays, w][:, None])
-    return mixed

@@ -41,16 +41,6 @@ def write_planes(table: Float[Tensor, "N C"], grid: TexelGrid, planes: slice, im
     table.view(-1, SIDE, SIDE, table.shape[-1])[tiles[stored].to(torch.int64)] = blocks[stored]
 
 
-def from_dense(dense: Float[Tensor, "D C"], grids: list[TexelGrid], empty: float = 0.0) -> Float[Tensor, "N C"]:
-    """A table of bricks from one that holds every texel, head by head in reading order (checkpoints before bricks)."""
-    table, start = new_table(grids[0].tiles, dense.shape[-1], empty, dense.dtype), 0
-    for grid in grids:
-        block = dense[start : start + grid.texels].view(grid.depth, grid.height, grid.width, -1)
-        write_planes(table, grid, slice(None), block)
-        start += grid.texels
-    return table
-
-
 def keep_bricks(tiles: Int[Tensor, "T"], keep: Bool[Tensor, "B"]) -> tuple[Int[Tensor, "T"], Int[Tensor, "K"]]:
     """``tiles`` without the bricks that are given up, and the numbers that the others had before (0 among them)."""
     keep = keep.clone()

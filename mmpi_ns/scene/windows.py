@@ -68,6 +68,15 @@ class WindowedPlan:
         """Heads of the windows before."""
         return sum(plan.num_heads for plan in self.plans[:window])
 
+    def find(self, name: str) -> tuple[int, int] | None:
+        """Window and head that one of ``names`` stands for; None for any other name."""
+        names = self.names
+        if name not in names:
+            return None
+        number = names.index(name)
+        window = max(w for w in range(len(self)) if self.first_head(w) <= number)
+        return window, number - self.first_head(window)
+
     @staticmethod
     def single(plan: ScenePlan) -> WindowedPlan:
         return WindowedPlan((Window((0.0, 0.0, 0.0), math.inf, 1.0, plan),))

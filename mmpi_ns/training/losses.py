@@ -1,12 +1,42 @@
-"""One small pure function a loss (paper sec. III-E; weights and normalisations in docs/how_it_works.md)."""
+"""The losses: each a small pure function, and their weighted sum for a training batch (paper sec. III-E, SfM depth).
+
+Weights and normalisations: docs/how_it_works.md. Total variation is computed on the tables (``ops/variation.py``).
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from jaxtyping import Bool, Float
+from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 
-from mmpi_ns.ops.compositing import exclusive_cumsum
+from mmpi_ns.capture.datamanager import KEYPOINT_DEPTH
+from mmpi_ns.field.mmpi_field import MMPIField
+from mmpi_ns.field.samples import metadata_of
+from mmpi_ns.ops.compositing import Composite, exclusive_cumsum
+from mmpi_ns.rendering.rendered import RenderedRays
+
+
+@dataclass
+class LossWeights:
+    """Weights of the losses beside the photometric one."""
+
+    point_color: float = 0.01
+    """Colour of each sample against its ray's."""
+    background_entropy: float = 0.001
+    """Entropy of what passes a ray."""
+    distortion: float = 0.01
+    """Spread of a ray's mass over distance."""
+    keypoint_depth: float = 0.02
+    """-log of the mass near an SfM keypoint (scenes with tracks)."""
+    tv_density: float = 1e-4
+    """Total variation of the densities, in DVGO's normalisation (there: 1e-5)."""
+    tv_features: float = 1e-5
+    """Total variation of the features, likewise (there: 1e-6)."""
+    tv_every: int = 4
+    """Total variation is added every so many steps, at so many times its weight."""
 
 
 def photometric(predicted: Float[Tensor, "R 3"], observed: Float[Tensor, "R 3"]) -> Float[Tensor, ""]:
@@ -55,25 +85,6 @@ def distortion(
     return (between + within).mean()
 
 
-def total_variation(
-    values: Float[Tensor, "N C"], neighbours: Float[Tensor, "N M C"], scales: Float[Tensor, "N M"]
-) -> Float[Tensor, ""]:
-    """Sum of clamped neighbour differences, whose gradient is DVGO's (L_TV).
-
-    DVGO adds ``scale / 6 * clamp(v - v_neighbour, -1, 1)`` to the gradient of each touched texel. That is the gradient
-    of a Huber function of the difference with the neighbour held fixed, so it is an ordinary loss here.
-
-    Args:
-        values: texels that the batch touched, one row each.
-        neighbours: their neighbours along each axis (held fixed).
-        scales: weight of each difference (resolution / 128, 0 where there is no neighbour).
-    """
-    difference = values[:, None, :] - neighbours.detach()
-    size = difference.abs()
-    huber = torch.where(size <= 1, 0.5 * difference**2, size - 0.5)
-    return (scales[..., None] * huber).sum() / 6
-
-
 def keypoint_depth(
     weights: Float[Tensor, "R S"],
     inverse_t: Float[Tensor, "R S"],
@@ -100,3 +111,75 @@ def keypoint_depth(
     nll = -torch.log(mass + 1e-4)
     count = reachable.sum().clamp(min=1)
     return torch.where(reachable, nll, torch.zeros_like(nll)).sum() / count
+
+
+def batch_losses(
+    rays: RenderedRays, field: MMPIField, image: Tensor, weight: LossWeights, g: torch.Generator, step: int
+) -> dict[str, Tensor]:
+    """All losses of a training batch, each times its weight.
+
+    Args:
+        rays: pixel rays, then keypoint rays.
+        field: that they were rendered from.
+        image: [P, 3 or 4] colours of the pixels.
+        weight: of each loss.
+        g: draws the colours behind the pixels.
+        step: of the training.
+    """
+    known = rays.bundle.metadata.get(KEYPOINT_DEPTH)
+    is_pixel = is_pixel_ray(rays.bundle)
+    pixels = is_pixel.nonzero()[:, 0]  # once: every use of a mask would wait for the device
+    image = image.repeat(len(pixels) // len(image), 1)
+    random = torch.rand(image.shape[0], 3, generator=g, device=image.device)
+    observed = over_background(image, random)
+    # Where MPIs that train apart see a ray only in part, what they let through is not theirs to explain.
+    explained = rays.report.explained[pixels]
+    background = random if image.shape[-1] == 4 else torch.where(explained, random, observed)
+    c, colors = rays.composite, rays.colors.of_rays(pixels)
+    composite = Composite(*(x.index_select(0, pixels) for x in (c.weights, c.accumulation, c.transmittance)))
+    rgb = colors.rgb + composite.transmittance * background
+    total = {
+        "rgb_loss": photometric(rgb, observed),
+        "point_color": weight.point_color * point_color(colors.mass, colors.first, colors.second, observed),
+        "entropy": weight.background_entropy * background_entropy(composite.transmittance),
+        "distortion": weight.distortion * _distortion(rays, pixels, composite, field.plan.content_near),
+    }
+    if known is not None and len(pixels) < len(is_pixel):
+        total["keypoint_depth"] = weight.keypoint_depth * _keypoint_depth(rays, (~is_pixel).nonzero()[:, 0], known)
+    if rays.lookup is not None and step % weight.tv_every == 0 and field.density.requires_grad:
+        total["tv"] = field.total_variation(rays.lookup, weight.tv_density, weight.tv_features) * (
+            weight.tv_every / max(1, image.shape[0])
+        )
+    return total
+
+
+def _distortion(rays: RenderedRays, pixels: Tensor, composite: Composite, scale: float) -> Tensor:
+    inverse_t = metadata_of(rays.samples)["inverse_t"][..., 0].index_select(0, pixels)
+    positions = 1 / (1 + inverse_t * scale)
+    intervals = (1 / rays.report.live[pixels].clamp(min=1))[:, None].to(positions.dtype)
+    return distortion(composite.weights, positions, intervals.expand_as(positions))
+
+
+def _keypoint_depth(rays: RenderedRays, chosen: Tensor, known: Tensor) -> Tensor:
+    meta = metadata_of(rays.samples)
+    return keypoint_depth(
+        rays.composite.weights.index_select(0, chosen),
+        meta["inverse_t"][..., 0].index_select(0, chosen),
+        known[chosen],
+        meta["valid"][..., 0].index_select(0, chosen),
+    )
+
+
+def is_pixel_ray(bundle: RayBundle) -> Bool[Tensor, "R"]:
+    """Rays through pixels, as opposed to rays through SfM keypoints, which have a known depth but no pixel."""
+    known = bundle.metadata.get(KEYPOINT_DEPTH)
+    if known is None:
+        return torch.ones(len(bundle), dtype=torch.bool, device=bundle.origins.device)
+    return known[:, 0] == 0
+
+
+def over_background(image: Tensor, background: Tensor) -> Tensor:
+    """RGBA over a background; RGB as it is."""
+    if image.shape[-1] == 4:
+        return image[..., :3] * image[..., 3:] + background * (1 - image[..., 3:])
+    return image

@@ -12,14 +12,14 @@ from itertools import pairwise
 from typing import Literal
 
 PhaseName = Literal["individual", "blend", "finetune", "joint"]
-ParameterKind = Literal["density", "features", "colour", "reliability", "exposure"]
+ParameterKind = Literal["density", "features", "colour", "reliability"]
 Training = Literal["two-phase", "joint"]
 
 TRAINS: dict[str, frozenset[str]] = {
-    "individual": frozenset({"density", "features", "colour", "exposure"}),
-    "joint": frozenset({"density", "features", "colour", "exposure"}),
+    "individual": frozenset({"density", "features", "colour"}),
+    "joint": frozenset({"density", "features", "colour"}),
     "blend": frozenset({"reliability"}),
-    "finetune": frozenset({"density", "features", "colour", "reliability", "exposure"}),
+    "finetune": frozenset({"density", "features", "colour", "reliability"}),
 }
 """What trains in each phase; everything else is frozen, bit for bit."""
 
@@ -48,6 +48,11 @@ class Schedule:
     release: tuple[int, ...] = ()
     """Steps before which bricks are given up in which nothing was seen since the last such step, or since surfaces
     formed."""
+
+    @property
+    def is_joint(self) -> bool:
+        """Whether all MPIs train together from the start, so that each has a share of the optical depth."""
+        return self.phases[0].name == "joint"
 
     @property
     def window_steps(self) -> int:

@@ -1,52 +1,26 @@
-"""Our trainer: phases in the optimisers' schedulers, plan files, atomic checkpoints that resume exactly."""
+"""nerfstudio's trainer with phases, one window after the other, and checkpoints that resume exactly."""
 
 from __future__ import annotations
 
-import pickle
-import time
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
 from nerfstudio.engine.optimizers import Optimizers
-from nerfstudio.engine.schedulers import Scheduler, SchedulerConfig
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils import comms
 from nerfstudio.utils.rich_utils import CONSOLE
-from torch.optim import Optimizer
-from torch.optim.lr_scheduler import LambdaLR
 
-from mmpi_ns.capture.checks import brief
 from mmpi_ns.capture.datamanager import MMPIDataManager
-from mmpi_ns.model import MMPIModel
-from mmpi_ns.scene.windows import WindowedPlan
-from mmpi_ns.training.forecast import Forecast, describe, training_bytes
-from mmpi_ns.training.phases import Schedule
+from mmpi_ns.training.checkpoints import check_same_plan, checkpoint_to_load, checkpoints_in, read_checkpoint
+from mmpi_ns.training.learning_rates import following
+from mmpi_ns.training.memory import describe, training_bytes
+from mmpi_ns.training.run import TrainingRun
 from mmpi_ns.utils.files import write_atomically
 
 PLAN_FILE = "plan.json"
 WINDOWS_FOLDER = "windows"
-
-
-@dataclass
-class PhaseSchedulerConfig(SchedulerConfig):
-    """Learning rate of one parameter kind: 0 where it is frozen, decaying over each phase in which it trains."""
-
-    _target: type = field(default_factory=lambda: PhaseScheduler)
-    kind: str = "density"
-    """Which parameter kind the group holds."""
-
-
-class PhaseScheduler(Scheduler):
-    """Follows a ``Schedule``; without one (a config used outside our trainer) the rate stays constant."""
-
-    config: PhaseSchedulerConfig
-    schedule: Schedule | None = None
-
-    def get_scheduler(self, optimizer: Optimizer, lr_init: float) -> LambdaLR:
-        kind = self.config.kind
-        return LambdaLR(optimizer, lambda step: self.schedule.rate_factor(kind, step) if self.schedule else 1.0)
 
 
 @dataclass
@@ -68,14 +42,12 @@ class MMPITrainer(Trainer):
     """Trainer with phases, exact resume and atomic checkpoints."""
 
     config: MMPITrainerConfig
-    _forecast: Forecast | None = None
-    _last_step_ended: float | None = None
 
     @property
-    def _model(self) -> MMPIModel:
-        model = self.pipeline.model
-        assert isinstance(model, MMPIModel), "MMPITrainer trains MMPIModel only"
-        return model
+    def _run(self) -> TrainingRun:
+        run = getattr(self.pipeline.model, "run", None)
+        assert isinstance(run, TrainingRun), "MMPITrainer trains MMPIModel only"
+        return run
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         _check_device(self.config.machine.device_type)
@@ -89,7 +61,7 @@ class MMPITrainer(Trainer):
             self.config.load_dir = None
         super().setup(test_mode)
         self.config.max_num_iterations = self._window_steps
-        plan = self._model.windows
+        plan = self._run.progress.windows
         self.base_dir.mkdir(parents=True, exist_ok=True)
         write_atomically(self.base_dir / PLAN_FILE, lambda path: path.write_text(plan.to_json(), encoding="utf-8"))
         CONSOLE.print(describe(plan, self._window_steps, *self._expected_memory()))
@@ -101,47 +73,36 @@ class MMPITrainer(Trainer):
 
     def _expected_memory(self) -> tuple[list[int], list[int]]:
         """Bytes that the training of each window holds: of tables with their moments, and of pixels."""
-        model, manager = self._model, self.pipeline.datamanager
-        blends = any(phase.name == "blend" for phase in model.schedule.phases)
+        run, manager = self._run, self.pipeline.datamanager
+        blends = any(phase.name == "blend" for phase in run.progress.schedule.phases)
         tables = [
-            training_bytes(plan, model.views_of(w), model.config.feature_channels, blends)
-            for w, plan in enumerate(model.windows.plans)
+            training_bytes(plan, run.views_of(w), run.field.feature_channels, blends)
+            for w, plan in enumerate(run.progress.windows.plans)
         ]
         assert isinstance(manager, MMPIDataManager), "MMPITrainer trains from MMPIDataManager"
         if len(tables) == 1:
             return tables, [manager.pixel_bytes()]
         centers = manager.observations.centers
-        return tables, [manager.pixel_bytes(model.cameras_of(centers, w)) for w in range(len(tables))]
+        return tables, [manager.pixel_bytes(run.cameras_of(centers, w)) for w in range(len(tables))]
 
     def setup_optimizers(self) -> Optimizers:
         """nerfstudio's optimisers, with schedulers that know the phases."""
-        model = self._model
-        self._total_steps = self.config.max_num_iterations = model.schedule.total_steps  # nerfstudio shows what is left
-
-        class Bound(PhaseScheduler):
-            @property
-            def schedule(self) -> Schedule:  # type: ignore[override]
-                return model.schedule  # a checkpoint that is loaded later brings its own
-
-        config: dict[str, Any] = {}
-        for name, entry in self.config.optimizers.items():
-            scheduler = entry["scheduler"]
-            if isinstance(scheduler, PhaseSchedulerConfig):
-                scheduler = PhaseSchedulerConfig(_target=Bound, kind=scheduler.kind)
-            config[name] = {"optimizer": entry["optimizer"], "scheduler": scheduler}
+        progress = self._run.progress
+        # nerfstudio shows what is left
+        self._total_steps = self.config.max_num_iterations = progress.schedule.total_steps
+        config: dict[str, Any] = {
+            name: {"optimizer": entry["optimizer"], "scheduler": following(entry["scheduler"], progress)}
+            for name, entry in self.config.optimizers.items()
+        }
         return Optimizers(config, self.pipeline.get_param_groups())
 
     def train(self) -> None:
         """Runs up to max-num-iterations in all (a window); 1.1.5 would run as many again after a resume."""
-        self._last_step_ended = None
         if self._processes > 1:
-            own = range(self._process, len(self._model.windows), self._processes)
-            left, length = [w for w in own if not self._is_finished(w)], self._window_steps
-            self._forecast = Forecast(self._model.schedule, [range(w * length, (w + 1) * length) for w in left])
-            for window in left:
+            own = range(self._process, len(self._run.progress.windows), self._processes)
+            for window in [w for w in own if not self._is_finished(w)]:
                 self._train_window(window)
             return
-        self._forecast = Forecast(self._model.schedule, [range(self._start_step, self._total_steps)])
         self._last_step = self._start_step - 1
         self.config.max_num_iterations = max(0, self._total_steps - self._start_step)
         if self.config.max_num_iterations == 0:
@@ -162,11 +123,11 @@ class MMPITrainer(Trainer):
 
     def _is_finished(self, window: int) -> bool:
         """Whether a window of several need not be trained; takes over its file where another run finished it."""
-        store = self._model.store
+        store, windows = self._run.store, self._run.progress.windows
         if self._resumes_from:
-            store.adopt(self._resumes_from.parent / WINDOWS_FOLDER, {window: self._model.windows.plans[window]})
+            store.adopt(self._resumes_from.parent / WINDOWS_FOLDER, {window: windows.plans[window]})
         # Of the last window the checkpoint is needed too: evaluation begins there.
-        is_last = window == len(self._model.windows) - 1
+        is_last = window == len(windows) - 1
         finished = store.path(window).is_file() and (
             not is_last or (window + 1) * self._window_steps - 1 in self._checkpoints_of(window)
         )
@@ -188,7 +149,7 @@ class MMPITrainer(Trainer):
             super().train()
         finally:
             self.config.max_num_iterations = self._window_steps
-        if window != len(self._model.windows) - 1:  # its file is all that is needed of it
+        if window != len(self._run.progress.windows) - 1:  # its file is all that is needed of it
             for path in checkpoints_in(self.checkpoint_dir, range(first, first + self._window_steps)).values():
                 path.unlink()
 
@@ -196,15 +157,9 @@ class MMPITrainer(Trainer):
         """One step; remembers that it ran, and puts a window of several away when it was its last."""
         result = super().train_iteration(step)
         self._last_step = step
-        now = time.perf_counter()
-        if self._forecast is not None and self._last_step_ended is not None:
-            said = self._forecast.note(step, now - self._last_step_ended)
-            if said is not None:
-                CONSOLE.print(said)
-        self._last_step_ended = now
-        model = self._model
-        if len(model.windows) > 1 and (step + 1) % model.schedule.window_steps == 0:
-            model.store.save(model.window, model.field)
+        run, progress = self._run, self._run.progress
+        if len(progress.windows) > 1 and (step + 1) % progress.schedule.window_steps == 0:
+            run.store.save(progress.window, run.field)
         return result
 
     def _after_train(self) -> None:
@@ -238,66 +193,17 @@ class MMPITrainer(Trainer):
                     old.unlink()
 
     def _load_checkpoint(self) -> None:
-        path = self._checkpoint_path()
+        path, run = checkpoint_to_load(self.config), self._run
         if path is not None:
-            state = _read_checkpoint(path)
-            self._check_same_plan(state["pipeline"], path)
-            if "rng" in state:
-                torch.set_rng_state(state["rng"]["torch"])
+            state = read_checkpoint(path)
+            check_same_plan(state["pipeline"], path, run.progress.windows, PLAN_FILE)
+            torch.set_rng_state(state["rng"]["torch"])
             del state
         super()._load_checkpoint()
         if path is not None and self._processes == 1:
-            finished = dict(enumerate(self._model.windows.plans[: self._model.schedule.window_at(self._start_step)]))
-            self._model.store.adopt(path.parent.parent / WINDOWS_FOLDER, finished, needed=True)
-
-    def _checkpoint_path(self) -> Path | None:
-        path = self.config.load_checkpoint
-        if path is not None:
-            if not path.is_file():
-                raise ValueError(f"There is no checkpoint at {path}: check --load-checkpoint.")
-            return path
-        if self.config.load_dir is None:
-            return None
-        steps = checkpoints_in(self.config.load_dir)
-        if not steps:
-            raise ValueError(f"There is no checkpoint in {self.config.load_dir}: give the nerfstudio_models folder.")
-        step = self.config.load_step if self.config.load_step is not None else max(steps)
-        if step not in steps:
-            raise ValueError(f"There is no step {step} in {self.config.load_dir}: it holds {sorted(steps)}.")
-        return steps[step]
-
-    def _check_same_plan(self, pipeline_state: dict[str, Any], path: Path) -> None:
-        stored = pipeline_state.get("_model.windows_bytes", pipeline_state.get("_model.field.plan_bytes"))
-        if stored is None:
-            raise ValueError(f"{path} holds no scene plan: it was not written by this method.")
-        if "_model.field.tiles" not in pipeline_state:
-            raise ValueError(
-                f"{path} is from before tables were stored in bricks: it can be rendered and evaluated, not resumed: "
-                "train anew."
-            )
-        exposed = "_model.exposure.settings" in pipeline_state
-        if exposed != (self._model.exposure is not None):
-            raise ValueError(
-                f"{path} was trained with{'' if exposed else 'out'} exposure: resume with --pipeline.model.exposure "
-                f"{exposed}."
-            )
-        theirs, ours = WindowedPlan.from_json(bytes(stored.numpy().tolist()).decode()), self._model.windows
-        if theirs != ours:
-            raise ValueError(
-                f"{path} was trained with another scene plan ({_in_short(theirs)} there, {_in_short(ours)} here): "
-                f"resume with the settings in its config.yml, or give its {PLAN_FILE} with --pipeline.model.plan-file."
-            )
-
-
-def _in_short(windows: WindowedPlan) -> str:
-    mpis = f"{sum(len(plan.mpis) for plan in windows.plans)} MPIs"
-    return mpis if len(windows) == 1 else f"{len(windows)} windows with {mpis}"
-
-
-def checkpoints_in(folder: Path, steps: range | None = None) -> dict[int, Path]:
-    """The checkpoints in a folder by their steps, all or those of some steps."""
-    found = {int(p.stem.split("-")[1]): p for p in folder.glob("step-*.ckpt")}
-    return {step: path for step, path in found.items() if steps is None or step in steps}
+            progress = run.progress
+            finished = dict(enumerate(progress.windows.plans[: progress.schedule.window_at(self._start_step)]))
+            run.store.adopt(path.parent.parent / WINDOWS_FOLDER, finished, needed=True)
 
 
 def _check_device(device_type: str) -> None:
@@ -307,12 +213,3 @@ def _check_device(device_type: str) -> None:
             f"--machine.device-type {device_type} asks for a GPU and torch sees none: check the driver and torch's "
             "build, or train with --machine.device-type cpu."
         )
-
-
-def _read_checkpoint(path: Path) -> dict[str, Any]:
-    try:
-        return torch.load(path, map_location="cpu", weights_only=True)
-    except (OSError, RuntimeError, EOFError, pickle.UnpicklingError) as error:
-        raise ValueError(
-            f"{path} cannot be read ({brief(error)}): resume from another one with --load-step."
-        ) from error

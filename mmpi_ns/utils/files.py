@@ -11,7 +11,7 @@ import torch
 from jaxtyping import UInt8
 from torch import Tensor
 
-from mmpi_ns.capture.checks import brief
+from mmpi_ns.utils.messages import brief
 
 
 def write_atomically(path: Path, write: Callable[[Path], object], folder: Path | None = None) -> None:

@@ -11,7 +11,7 @@ import torch
 from hand_made import make_mpi
 from random_fields import _places, _table, bundle, fill, random_field, random_rays
 
-from mmpi_ns.field.baking import bake_shares, rays_to, shares_at
+from mmpi_ns.field.baking import bake_shares, baked_shares, rays_to
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.ops import native
 from mmpi_ns.rendering import sampler as mmpi_sampler
@@ -103,7 +103,7 @@ def test_samples_are_blended_by_the_interpolated_share():
     shares, rng = bake_shares(field), np.random.default_rng(3)
     for k, grid in enumerate(field.grids):
         ndc = rng.uniform(-1, 1, size=(20, 3))
-        found = shares_at(field, shares, torch.tensor(ndc, dtype=torch.float32), torch.full((20,), k))
+        found = field.shares_at(shares, torch.tensor(ndc, dtype=torch.float32), torch.full((20,), k))
         wanted = [oracle.trilinear(_table(field, shares, k), place)[0] for place in ndc]
         assert np.allclose(found.numpy(), wanted, atol=1e-5)
         assert grid.depth > 1
@@ -114,7 +114,7 @@ def test_blending_that_is_the_same_everywhere_loses_nothing_by_baking():
     field = fill(MMPIField(ScenePlan((make_mpi(), make_mpi("twin")), None, 0.05, 1.0), feature_channels=5), 1)
     field.reliability.data.fill_(0.7)
     rays = bundle(*random_rays(field.plan, 60, seed=3))
-    shares = field.baked_shares()
+    shares = baked_shares(field)
     for grid in field.grids:
         assert torch.allclose(shares[grid.rows], torch.tensor(0.5), atol=1e-6)
     exact, baked = (rendered(field, rays, "paper", s)[0] for s in (None, shares))
@@ -124,18 +124,18 @@ def test_blending_that_is_the_same_everywhere_loses_nothing_by_baking():
 def test_a_single_head_keeps_its_optical_depths():
     field = random_field(1, seed=2)
     rays = bundle(*random_rays(field.plan, 40, seed=3))
-    exact, baked = (rendered(field, rays, form, s)[0] for form, s in ((None, None), ("paper", field.baked_shares())))
+    exact, baked = (rendered(field, rays, form, s)[0] for form, s in ((None, None), ("paper", baked_shares(field))))
     assert torch.equal(exact["tau"] > 1e-4, baked["tau"] > 1e-4)
     assert torch.allclose(exact["tau"], baked["tau"], rtol=1e-5)
 
 
 def test_shares_are_kept_until_they_are_forgotten():
     field = random_field(2, seed=2)
-    first = field.baked_shares()
+    first = baked_shares(field)
     field.reliability.data.normal_(generator=torch.Generator().manual_seed(5))
-    assert field.baked_shares() is first
+    assert baked_shares(field) is first
     field.forget_shares()
-    assert not torch.equal(field.baked_shares(), first)
+    assert not torch.equal(baked_shares(field), first)
 
 
 def test_a_texel_on_the_border_of_the_cube_and_one_at_infinity_have_rays():

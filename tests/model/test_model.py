@@ -16,6 +16,7 @@ from training_runs import plan_of, ready, trainer_config, write_plan
 
 from mmpi_ns import model as mmpi_model
 from mmpi_ns.config import mmpi_small
+from mmpi_ns.field.baking import baked_shares
 from mmpi_ns.training.phases import TRAINS
 
 KINDS = ("density", "features", "colour", "reliability")
@@ -27,7 +28,7 @@ def trainer_of(scene, plan_file, folder, **settings):
 
 def run_step(trainer, step):
     """Losses of one step, before the optimisers act."""
-    trainer.pipeline.model.prepare_step(None, step)
+    trainer.pipeline.model.run.prepare_step(None, step)
     trainer.pipeline.train()
     outputs, losses, metrics = trainer.pipeline.get_train_loss_dict(step)
     return outputs["training"], losses, metrics
@@ -60,7 +61,7 @@ def camera(trained):
                                       {"shared_colour": True}, {"blend_form": "opacity"}])  # fmt: skip
 def test_every_phase_has_finite_losses_and_trains_what_it_says(scene, plan_file, tmp_path, settings):
     trainer = trainer_of(scene, plan_file, tmp_path, steps=24, **settings)
-    schedule = trainer.pipeline.model.schedule
+    schedule = trainer.pipeline.model.progress.schedule
     names = [p.name for p in schedule.phases]
     assert names == (["joint"] if "training" in settings else ["individual", "blend", "finetune"])
     for phase in schedule.phases:
@@ -82,7 +83,7 @@ def test_every_phase_has_finite_losses_and_trains_what_it_says(scene, plan_file,
 def test_total_variation_is_added_every_few_steps_while_densities_train(scene, plan_file, tmp_path):
     trainer = trainer_of(scene, plan_file, tmp_path)
     every = trainer.config.pipeline.model.loss.tv_every
-    blend = trainer.pipeline.model.schedule.phases[1].start
+    blend = trainer.pipeline.model.progress.schedule.phases[1].start
     assert [("tv" in run_step(trainer, s)[1]) for s in (0, 1, every)] == [True, every == 1, True]
     assert "tv" not in run_step(trainer, -(-blend // every) * every)[1]
 
@@ -97,7 +98,7 @@ def test_in_the_individual_phase_a_ray_goes_to_one_mpi_and_the_cube(scene, plan_
     found = heads_of_rays(0)
     assert len(found) == 80 and set(found) == {(0,), (1,)}
     assert 20 < found.count((0,)) < 60 and found == heads_of_rays(0) and found != heads_of_rays(1)
-    blend = trainer.pipeline.model.schedule.phases[1].start
+    blend = trainer.pipeline.model.progress.schedule.phases[1].start
     assert set(heads_of_rays(blend)) == {(0, 1)}
 
 
@@ -130,7 +131,7 @@ def test_one_mpi_has_nothing_to_blend_with_and_trains_in_one_go(scene, tmp_path)
     plan = write_plan(scene, tmp_path / "plan.json", num_mpis=1)
     trainer = trainer_of(scene, plan, tmp_path, training="two-phase")
     model = trainer.pipeline.model
-    assert [p.name for p in model.schedule.phases] == ["joint"]
+    assert [p.name for p in model.progress.schedule.phases] == ["joint"]
     assert model.field.depth_scale == 1
     for step in (0, 12, 23):
         _, losses, _ = run_step(trainer, step)
@@ -210,11 +211,11 @@ def test_pictures_do_not_depend_on_the_chunk_size(model, camera, monkeypatch, th
         assert (found[0]["winning_mpi"] == other["winning_mpi"]).float().mean() > 0.995
 
 
-def test_as_many_rays_at_once_as_suit_the_device_unless_a_number_is_asked_for(model, camera, monkeypatch):
+def test_chunks_have_the_size_that_suits_the_device_unless_another_is_asked_for(model, camera, monkeypatch):
     sizes = []
-    monkeypatch.setattr(mmpi_model, "rays_at_once", lambda samples, device: 100)
+    monkeypatch.setattr(mmpi_model, "rays_per_chunk", lambda samples, device: 100)
     monkeypatch.setattr(
-        model, "get_outputs", lambda bundle, get=model.get_outputs: sizes.append(len(bundle)) or get(bundle)
+        model, "image_outputs", lambda bundle, get=model.image_outputs: sizes.append(len(bundle)) or get(bundle)
     )
     for asked, expected in ((0, 100), (17, 17)):
         sizes.clear()
@@ -228,15 +229,15 @@ def test_baked_shares_render_nearly_the_same_and_are_made_anew_after_a_step(mode
     exact = model.get_outputs_for_camera(camera)["rgb"]
     monkeypatch.setattr(model.config, "render_shares", "baked")
     baked = model.get_outputs_for_camera(camera)["rgb"]
-    shares = model.field.baked_shares()
+    shares = baked_shares(model.field)
     difference = (exact - baked).abs()
     assert 0 < difference.max() and difference.mean() < 0.01
     changed = model.field.reliability.data + torch.linspace(-4, 4, len(shares))[:, None]
     monkeypatch.setattr(model.field.reliability, "data", changed)
     model.get_outputs_for_camera(camera)
-    assert model.field.baked_shares() is shares
-    model.prepare_step(None, model.step)
-    assert not torch.equal(model.field.baked_shares(), shares)
+    assert baked_shares(model.field) is shares
+    model.run.prepare_step(None, model.progress.step)
+    assert not torch.equal(baked_shares(model.field), shares)
 
 
 def test_depth_is_the_distance_along_the_ray_and_finite_at_infinity(model, camera):
@@ -370,4 +371,4 @@ def test_a_checkpoint_renders_the_same_in_a_model_that_was_placed_otherwise(
         expected, found = (m.get_outputs_for_camera(camera)[name] for m in (trained, read))
         assert torch.equal(expected, found), name
     assert read.show.options == ["all", *trained.field.full_plan.names]
-    assert read.blends == trained.blends
+    assert read.blend_form(read.field) == trained.blend_form(trained.field)

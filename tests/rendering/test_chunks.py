@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from mmpi_ns.rendering.chunks import BYTES_PER_SAMPLE, CPU_RAYS, FREE_SHARE, GPU_RAYS, rays_at_once
+from mmpi_ns.rendering.chunks import BYTES_PER_SAMPLE, CPU_RAYS, FREE_SHARE, GPU_RAYS, rays_per_chunk
 
 GIB = 2**30
 
@@ -20,13 +20,13 @@ def gpu_with(monkeypatch, free: float, cached: float = 0.0) -> torch.device:
 
 @pytest.mark.parametrize("samples", [0, 1, 1024])
 def test_a_cpu_has_chunks_of_one_size(samples):
-    assert rays_at_once(samples, torch.device("cpu")) == CPU_RAYS
+    assert rays_per_chunk(samples, torch.device("cpu")) == CPU_RAYS
 
 
 @pytest.mark.parametrize("free", [0.5, 2.0, 7.0, 24.0])
 @pytest.mark.parametrize("samples", [64, 256, 1024])
 def test_a_gpu_renders_what_half_of_its_free_memory_holds(monkeypatch, free, samples):
-    found = rays_at_once(samples, gpu_with(monkeypatch, free))
+    found = rays_per_chunk(samples, gpu_with(monkeypatch, free))
     room = FREE_SHARE * free * GIB / (BYTES_PER_SAMPLE * samples)
     assert found == GPU_RAYS or found == CPU_RAYS or found <= room < 2 * found
     assert found > CPU_RAYS or room < 2 * CPU_RAYS
@@ -34,10 +34,10 @@ def test_a_gpu_renders_what_half_of_its_free_memory_holds(monkeypatch, free, sam
 
 
 def test_what_torch_holds_unused_counts_as_free(monkeypatch):
-    without = rays_at_once(1024, gpu_with(monkeypatch, 1.0))
-    assert rays_at_once(1024, gpu_with(monkeypatch, 1.0, cached=3.0)) == 4 * without
+    without = rays_per_chunk(1024, gpu_with(monkeypatch, 1.0))
+    assert rays_per_chunk(1024, gpu_with(monkeypatch, 1.0, cached=3.0)) == 4 * without
 
 
 def test_bounds(monkeypatch):
-    assert rays_at_once(1024, gpu_with(monkeypatch, 0.0)) == CPU_RAYS
-    assert rays_at_once(0, gpu_with(monkeypatch, 80.0)) == GPU_RAYS
+    assert rays_per_chunk(1024, gpu_with(monkeypatch, 0.0)) == CPU_RAYS
+    assert rays_per_chunk(0, gpu_with(monkeypatch, 80.0)) == GPU_RAYS

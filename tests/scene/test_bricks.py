@@ -8,7 +8,7 @@ import pytest
 import torch
 from bricked import SHAPES, big_plan, bricked_field, chance, thinned
 from nerfstudio.field_components.field_heads import FieldHeadNames
-from random_fields import bundle, compare, fill, random_rays, render
+from random_fields import bundle, compare, random_rays, render
 
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.tables import ENOUGH_CROSSINGS, RELEASED_DENSITY, TABLES
@@ -16,8 +16,8 @@ from mmpi_ns.ops import native
 from mmpi_ns.ops.interpolate import bilinear_rows, interpolate_reference
 from mmpi_ns.ops.variation import total_variation, total_variation_reference
 from mmpi_ns.rendering.sampler import MMPISampler
-from mmpi_ns.scene.bricks import from_dense, grown_tiles, keep_bricks, new_table, read_planes, resample, write_planes
-from mmpi_ns.scene.texels import BRICK, head_grids, make_grids
+from mmpi_ns.scene.bricks import grown_tiles, keep_bricks, new_table, read_planes, resample, write_planes
+from mmpi_ns.scene.texels import BRICK, make_grids
 from mmpi_ns.training.touched_adam import TouchedAdam
 
 # Rows ----------------------------------------------------------------------------------------------------------------
@@ -337,19 +337,3 @@ def test_a_state_dict_holds_the_stored_bricks_alone_and_comes_back_as_it_was():
     read.tiles[0] -= 1
     rays = bundle(*random_rays(written.plan, 20, seed=3))
     assert torch.equal(render(read.eval(), rays).rgb, render(written.eval(), rays).rgb)
-
-
-def test_a_state_dict_of_dense_tables_is_put_into_bricks():
-    """As they were written before there were bricks: head by head, plane by plane, row by row."""
-    field = fill(MMPIField(big_plan(), feature_channels=5, hidden_width=6), seed=0)
-    field.touched[::3] = 0
-    rows = torch.cat([g.rows for g in field.grids])
-    state = {k: v for k, v in field.state_dict().items() if k not in ("tiles", "peak", "crossings")}
-    dense = {**state, **{name: state[name][rows] for name in (*TABLES, "touched")}}
-    assert len(dense["density"]) == field.plan.texels
-    read = MMPIField(big_plan(4), feature_channels=5, hidden_width=6)
-    read.load_state_dict(dense)
-    rays = bundle(*random_rays(field.plan, 20, seed=3))
-    assert torch.equal(render(read.eval(), rays, 0.0, "paper").rgb, render(field.eval(), rays, 0.0, "paper").rgb)
-    assert torch.equal(read.touched[rows], field.touched[rows])
-    assert from_dense(dense["density"], head_grids(field.plan)).shape == read.density.shape

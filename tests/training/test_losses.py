@@ -10,6 +10,7 @@ import torch
 
 from mmpi_ns.field.shading import RayColors
 from mmpi_ns.ops.compositing import Composite
+from mmpi_ns.ops.variation import clamped_differences
 from mmpi_ns.training import losses
 
 F64 = torch.float64
@@ -98,7 +99,7 @@ def test_total_variation_has_dvgos_gradient(scale):
     values = tensor(rng.normal(size=(20, 3)) * 2).requires_grad_()
     neighbours = tensor(rng.normal(size=(20, 4, 3)) * 2).requires_grad_()
     scales = tensor(rng.random((20, 4)) < 0.8) * scale
-    losses.total_variation(values, neighbours, scales).backward()
+    clamped_differences(values, neighbours, scales).backward()
     expected = np.zeros((20, 3))
     for n in range(20):
         for m in range(4):
@@ -110,9 +111,9 @@ def test_total_variation_has_dvgos_gradient(scale):
 
 def test_total_variation_by_hand():
     # Differences 0.5 (quadratic: 0.125) and 3 (linear: 2.5), scales 1 and 0.5.
-    loss = losses.total_variation(tensor([[1.0]]), tensor([[[0.5], [-2.0]]]), tensor([[1.0, 0.5]]))
+    loss = clamped_differences(tensor([[1.0]]), tensor([[[0.5], [-2.0]]]), tensor([[1.0, 0.5]]))
     assert loss.item() == pytest.approx((0.125 + 0.5 * 2.5) / 6)
-    assert losses.total_variation(tensor([[1.0]]), tensor([[[9.0]]]), tensor([[0.0]])).item() == 0
+    assert clamped_differences(tensor([[1.0]]), tensor([[[9.0]]]), tensor([[0.0]])).item() == 0
 
 
 def test_keypoint_depth_by_hand():
@@ -167,7 +168,7 @@ def test_losses_have_the_gradient_of_finite_differences():
     assert check(losses.background_entropy, (transmittance,))
     assert check(lambda w, s: losses.distortion(w, s, intervals), (weights, positions))
     assert check(lambda w: losses.keypoint_depth(w, inverse_t, known, valid, 0.1), (weights,))
-    assert check(lambda v: losses.total_variation(v, neighbours, scales), (values,))
+    assert check(lambda v: clamped_differences(v, neighbours, scales), (values,))
 
 
 def test_gradients_are_finite_for_empty_and_opaque_rays():

@@ -10,7 +10,7 @@ import pytest
 
 from mmpi_ns.training.phases import TRAINS, Phase, Schedule, make_schedule
 
-KINDS = ("density", "features", "colour", "reliability", "exposure")
+KINDS = ("density", "features", "colour", "reliability")
 
 
 def two_phase(**settings):
@@ -65,7 +65,7 @@ def test_rates_are_zero_exactly_where_a_kind_is_frozen(kind):
 
 def test_only_reliability_trains_in_blend_and_everything_else_before():
     assert TRAINS["blend"] == {"reliability"}
-    assert TRAINS["individual"] == TRAINS["joint"] == {"density", "features", "colour", "exposure"}
+    assert TRAINS["individual"] == TRAINS["joint"] == {"density", "features", "colour"}
     assert TRAINS["finetune"] == set(KINDS)
 
 

@@ -93,7 +93,7 @@ def test_frozen_parameters_stay_bit_identical(whole):
 def test_checkpoints_load_as_plain_data_and_hold_plan_schedule_and_resolution(whole):
     state = load(whole[1], 4)
     assert state["step"] == 4 and float(state["pipeline"]["_model.field.texel_factor"]) < 1
-    assert {"_model.field.plan_bytes", "_model.schedule_bytes"} <= set(state["pipeline"])
+    assert {"_model.field.plan_bytes", "_model.progress.schedule_bytes"} <= set(state["pipeline"])
     rates = [g["lr"] for o in state["optimizers"].values() for g in o["param_groups"]]
     assert all(type(r) is float for r in rates)
     assert (whole[1].parent / "plan.json").is_file()
@@ -224,17 +224,6 @@ def test_a_checkpoint_of_another_method_is_refused(whole, scene, plan_file, tmp_
         ready(trainer_config(scene, plan_file, tmp_path / "out", STEPS), load_dir=folder)
 
 
-def test_a_checkpoint_from_before_there_were_bricks_is_not_trained_on(whole, scene, plan_file, tmp_path):
-    state = load(whole[1], 5)
-    del state["pipeline"]["_model.field.tiles"]
-    folder = tmp_path / "models"
-    folder.mkdir()
-    torch.save(state, folder / "step-000000005.ckpt")
-    with pytest.raises(ValueError, match="before tables were stored in bricks: it can be rendered") as error:
-        ready(trainer_config(scene, plan_file, tmp_path / "out", STEPS, **whole[0]), load_dir=folder)
-    assert "\n" not in str(error.value)
-
-
 def test_a_folder_without_checkpoints_is_named(scene, plan_file, tmp_path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(ValueError, match="no checkpoint in"):
@@ -255,7 +244,7 @@ def test_a_longer_run_keeps_the_schedule_of_the_checkpoint_in_model_and_learning
 ):
     config = trainer_config(scene, plan_file, tmp_path / "out", STEPS + 6, **whole[0])
     trainer = ready(config, load_dir=whole[1], load_step=STEPS - 4)
-    schedule = trainer.pipeline.model.schedule
+    schedule = trainer.pipeline.model.progress.schedule
     assert schedule.total_steps == STEPS
     trainer.train()
     assert sorted(int(p.stem[5:]) for p in trainer.checkpoint_dir.iterdir())[-1] == STEPS + 5

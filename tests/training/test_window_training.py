@@ -12,11 +12,11 @@ import pytest
 import torch
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.utils.eval_utils import eval_setup
-from training_runs import compared, datamanager, differences, load, plan_of, ready, trainer_config
+from training_runs import compared, differences, load, ready, trainer_config, write_windows
 
 from mmpi_ns.field.tables import TABLES
 from mmpi_ns.rendering.window_store import WindowStore
-from mmpi_ns.scene.windows import Window, WindowedPlan, window_shares
+from mmpi_ns.scene.windows import WindowedPlan, window_shares
 
 STEPS = 6
 
@@ -26,18 +26,7 @@ STEPS = 6
 
 @pytest.fixture(scope="module")
 def windows_file(scene, tmp_path_factory):
-    """Two windows of the tiny scene's walk, one with two MPIs and one with one."""
-    seen = datamanager(scene, test_mode="inference").observations
-    centers = seen.centers[np.argsort(seen.centers @ seen.mean_axes[0])]
-    length = np.linalg.norm(centers[-1] - centers[0])
-    middles = [centers[0] + (centers[-1] - centers[0]) * share for share in (0.25, 0.75)]
-    windows = tuple(
-        Window(tuple(m.tolist()), 0.3 * float(length), 0.1 * float(length), plan_of(seen, num_mpis=k))
-        for m, k in zip(middles, (2, 1), strict=True)
-    )
-    path = tmp_path_factory.mktemp("windows") / "plan.json"
-    path.write_text(WindowedPlan(windows).to_json())
-    return path
+    return write_windows(scene, tmp_path_factory.mktemp("windows") / "plan.json")
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +57,7 @@ def test_each_window_has_networks_of_its_own(scene, windows_file, tmp_path, shad
 
 def test_a_window_draws_from_its_own_cameras_alone(whole):
     manager, model = whole.pipeline.datamanager, whole.pipeline.model
-    window = model.windows.windows[1]
+    window = model.progress.windows.windows[1]
     manager.train()
     bundle, _ = manager.next_train(2 * STEPS)
     beyond = (bundle.origins - torch.tensor(window.center)).norm(dim=-1)
@@ -86,11 +75,11 @@ def test_a_finished_window_is_the_model_of_the_checkpoint_at_its_end(whole):
 
 def test_the_second_window_learns_as_it_would_alone(whole, scene, tmp_path):
     """Nothing of the first one is left in tables, networks, moments, rates or growth."""
-    alone = WindowedPlan.single(whole.pipeline.model.windows.plans[1])
+    alone = WindowedPlan.single(whole.pipeline.model.progress.windows.plans[1])
     path = tmp_path / "plan.json"
     path.write_text(alone.to_json())
     trainer = ready(trainer_config(scene, path, tmp_path, STEPS, training="joint"))
-    window = whole.pipeline.model.windows.windows[1]
+    window = whole.pipeline.model.progress.windows.windows[1]
     manager = trainer.pipeline.datamanager
     near = np.linalg.norm(manager.observations.centers - np.asarray(window.center), axis=-1)
     manager.use_cameras(np.nonzero(near < window.radius + window.margin)[0])
@@ -99,11 +88,11 @@ def test_the_second_window_learns_as_it_would_alone(whole, scene, tmp_path):
     losses = model.get_loss_dict
 
     def later(*args, **kwargs):
-        model.step += STEPS
+        model.progress.step += STEPS
         try:
             return losses(*args, **kwargs)
         finally:
-            model.step -= STEPS
+            model.progress.step -= STEPS
 
     model.get_loss_dict = later
     trainer.train()
@@ -112,28 +101,32 @@ def test_the_second_window_learns_as_it_would_alone(whole, scene, tmp_path):
     assert torch.equal(model.field.networks.weights, expected.networks.weights)
 
 
+def facing(model, origins) -> torch.Tensor:
+    """Rays along the axis of the first MPI."""
+    axis = np.asarray(model.progress.windows.plans[0].mpis[0].axes)[2]
+    return torch.tensor(axis).float().expand(len(origins), 3)
+
+
 def rendered(model, origins) -> dict[str, torch.Tensor]:
-    facing = np.asarray(model.windows.plans[0].mpis[0].axes)[2]
-    directions = torch.tensor(facing).float().expand(len(origins), 3)
-    bundle = RayBundle(origins, directions, torch.ones(len(origins), 1), torch.zeros(len(origins), 1).long())
+    ones = torch.ones(len(origins), 1)
+    bundle = RayBundle(origins, facing(model, origins), ones, torch.zeros_like(ones).long())
     with torch.no_grad():
         return model.eval().get_outputs(bundle)
 
 
 def test_rays_are_mixed_by_where_they_start(whole):
     model = whole.pipeline.model
-    first, second = (torch.tensor(w.center).float() for w in model.windows.windows)
+    first, second = (torch.tensor(w.center).float() for w in model.progress.windows.windows)
     origins = torch.stack([first, first + 0.5 * (second - first), second])
     mixed = rendered(model, origins)
-    shares = window_shares(origins, model.windows.windows)
+    shares = window_shares(origins, model.progress.windows.windows)
     assert 0 < shares[1, 0] < 1
     each = []
     for w in (0, 1):
-        field = model.field if w == 1 else model.store.load(0, model._new_field, model.device)
-        trained, model.field, model.window = model.field, field, w
-        windows, model.windows = model.windows, WindowedPlan.single(model.windows.plans[w])
-        each.append(rendered(model, origins))
-        model.field, model.windows, model.window = trained, windows, 1
+        field = model.field if w == 1 else model.store.load(0, model.device)
+        bundle = RayBundle(origins, facing(model, origins), torch.ones(3, 1), torch.zeros(3, 1).long())
+        with torch.no_grad():
+            each.append(model.window_outputs(w, field, bundle))
     expected = shares[:, :1] * each[0]["rgb"] + shares[:, 1:] * each[1]["rgb"]
     torch.testing.assert_close(mixed["rgb"], expected)
     assert not torch.allclose(each[0]["rgb"], each[1]["rgb"], atol=1e-4)
@@ -143,8 +136,8 @@ def test_rays_are_mixed_by_where_they_start(whole):
 
 def test_one_mpi_can_be_shown_alone(whole):
     model = whole.pipeline.model
-    origins = torch.tensor([model.windows.windows[1].center]).float()
-    model.show.value = model.windows.names[0]
+    origins = torch.tensor([model.progress.windows.windows[1].center]).float()
+    model.show.value = model.progress.windows.names[0]
     try:
         shown = rendered(model, origins)
     finally:
@@ -155,14 +148,14 @@ def test_one_mpi_can_be_shown_alone(whole):
 
 def test_windows_that_are_not_trained_yet_are_not_asked(scene, windows_file, tmp_path):
     model = ready(trainer_config(scene, windows_file, tmp_path, STEPS, training="joint")).pipeline.model
-    origins = torch.stack([torch.tensor(w.center).float() for w in model.windows.windows])
+    origins = torch.stack([torch.tensor(w.center).float() for w in model.progress.windows.windows])
     assert (rendered(model, origins)["winning_mpi"] < 2).all()
 
 
 def test_evaluation_reads_the_windows_back(whole):
     _, pipeline, _, _ = eval_setup(whole.base_dir / "config.yml", test_mode="inference")
     model = whole.pipeline.model
-    origins = torch.stack([torch.tensor(w.center).float() for w in model.windows.windows])
+    origins = torch.stack([torch.tensor(w.center).float() for w in model.progress.windows.windows])
     a, b = rendered(model, origins), rendered(pipeline.model, origins)
     for name in ("rgb", "depth", "winning_mpi"):
         assert torch.equal(a[name], b[name]), name
@@ -193,8 +186,8 @@ def test_resuming_without_the_finished_windows_is_refused_in_one_sentence(whole,
 
 
 def test_a_window_of_another_plan_or_a_damaged_one_is_not_taken_over(whole, tmp_path):
-    model, store = whole.pipeline.model, WindowStore(tmp_path / "mine", budget=0)
-    ours, theirs = model.windows.plans
+    model, store = whole.pipeline.model, WindowStore(tmp_path / "mine", whole.pipeline.model._new_field)
+    ours, theirs = model.progress.windows.plans
     with pytest.raises(ValueError, match="another scene plan"):
         store.adopt(model.store.path(0).parent, {0: theirs})
     (tmp_path / "cut").mkdir()
@@ -212,8 +205,8 @@ def test_a_lost_window_is_named_and_nothing_else_is_touched(whole, harm, sentenc
     model = whole.pipeline.model
     path = model.store.path(0)
     kept = path.read_bytes()
-    model.store._fields.clear()
-    origins = torch.tensor([model.windows.windows[0].center]).float()
+    model.store.forget(0)
+    origins = torch.tensor([model.progress.windows.windows[0].center]).float()
     before = model.field.density.clone()
     try:
         if harm == "gone":
@@ -224,7 +217,7 @@ def test_a_lost_window_is_named_and_nothing_else_is_touched(whole, harm, sentenc
             rendered(model, origins)
     finally:
         path.write_bytes(kept)
-    assert model.window == 1 and torch.equal(model.field.density, before)
+    assert model.progress.window == 1 and torch.equal(model.field.density, before)
 
 
 def test_a_full_disk_at_a_windows_end_keeps_the_checkpoint(scene, windows_file, tmp_path, monkeypatch):
@@ -256,14 +249,14 @@ def test_as_many_windows_are_held_as_fit_the_budget(whole, tmp_path, room, held)
     """Windows of one size; ``room`` is for so many of them. The one that was not used for longest goes first."""
     model = whole.pipeline.model
     size = model.store.path(1).stat().st_size
-    store = WindowStore(tmp_path, budget=room * size)
+    store = WindowStore(tmp_path, model._new_field, budget=room * size)
     for number in range(3):
         store.save(number, model.field)
     for number, expected in zip((0, 1, 0, 2, 1, 1), held, strict=True):
-        field = store.load(number, model._new_field, model.device)
-        assert torch.equal(field.density, model.field.density) and list(store._fields) == expected
-        taken = sum(t.numel() * t.element_size() for f in store._fields.values() for t in f.state_dict().values())
-        assert len(store._fields) == 1 or taken <= room * size
+        field = store.load(number, model.device)
+        assert torch.equal(field.density, model.field.density) and list(store._held) == expected
+        taken = sum(t.numel() * t.element_size() for f in store._held.values() for t in f.state_dict().values())
+        assert len(store._held) == 1 or taken <= room * size
 
 
 def test_windows_in_half_precision_take_half_of_the_disk_and_are_read_as_they_were_rounded(
@@ -273,30 +266,19 @@ def test_windows_in_half_precision_take_half_of_the_disk_and_are_read_as_they_we
     asked = ready(trainer_config(scene, windows_file, tmp_path, STEPS, half_windows=True)).pipeline.model.store
     assert asked.half and not model.store.half
     size = model.store.path(1).stat().st_size
-    store = WindowStore(tmp_path, budget=1.8 * size, half=asked.half)
+    store = WindowStore(tmp_path, model._new_field, budget=1.8 * size, half=asked.half)
     store.save(0, model.field)
     store.save(1, model.field)
     assert store.path(1).stat().st_size < 0.65 * size
-    store.load(0, model._new_field, model.device)
-    field = store.load(1, model._new_field, model.device)
+    store.load(0, model.device)
+    field = store.load(1, model.device)
     for name, values in field.state_dict().items():
         wanted = model.field.state_dict()[name]
         assert values.dtype == wanted.dtype
         rounded = wanted.half().float() if name in TABLES else wanted
         assert torch.equal(values, rounded), name
     assert not torch.equal(field.features, model.field.features)
-    assert list(store._fields) == [1], "what is held is counted as it lies in memory, not on disk"
-
-
-def test_a_config_from_when_windows_were_counted_goes_on_working(whole, tmp_path):
-    text = (whole.base_dir / "config.yml").read_text()
-    old = text.replace("resident_gib: 2.0", "resident_windows: 2")
-    assert old != text
-    (tmp_path / "config.yml").write_text(old)
-    _, pipeline, _, _ = eval_setup(tmp_path / "config.yml", test_mode="inference")
-    assert pipeline.model.store.budget == 2 * 2**30
-    origins = torch.stack([torch.tensor(w.center).float() for w in whole.pipeline.model.windows.windows])
-    assert torch.equal(rendered(pipeline.model, origins)["rgb"], rendered(whole.pipeline.model, origins)["rgb"])
+    assert list(store._held) == [1], "what is held is counted as it lies in memory, not on disk"
 
 
 # Several processes ---------------------------------------------------------------------------------------------------
@@ -340,7 +322,7 @@ def test_two_processes_end_as_one_does(whole, shared):
 
 def test_what_two_processes_trained_is_evaluated_as_any_run(whole, shared):
     _, pipeline, _, _ = eval_setup(shared[0] / "config.yml", test_mode="inference")
-    origins = torch.stack([torch.tensor(w.center).float() for w in whole.pipeline.model.windows.windows])
+    origins = torch.stack([torch.tensor(w.center).float() for w in whole.pipeline.model.progress.windows.windows])
     assert torch.equal(rendered(pipeline.model, origins)["rgb"], rendered(whole.pipeline.model, origins)["rgb"])
 
 
@@ -390,8 +372,8 @@ def test_a_process_that_is_killed_ends_the_run_and_leaves_what_is_finished(scene
     (code / "sitecustomize.py").write_text(
         "import os\n"
         "if os.environ.get('RANK') == '1':\n"
-        "    import mmpi_ns.model as m, signal\n"
-        "    m.MMPIModel.prepare_step = lambda self, attributes, step: os.kill(os.getpid(), signal.SIGKILL)\n"
+        "    import mmpi_ns.training.run as m, signal\n"
+        "    m.TrainingRun.prepare_step = lambda self, attributes, step: os.kill(os.getpid(), signal.SIGKILL)\n"
     )
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(code), os.environ.get("PYTHONPATH", "")]))
     status, said = torchrun(scene, windows_file, tmp_path / "out", 2)

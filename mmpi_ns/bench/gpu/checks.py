@@ -14,7 +14,7 @@ from torch import Tensor
 from mmpi_ns.bench.rendering import bundle_of
 from mmpi_ns.bench.stability.exact_ray import ExactField, ExactRay, Gradients
 from mmpi_ns.bench.stability.rays import CLEAR, CUBE, Scene, scene
-from mmpi_ns.field.baking import shares_at
+from mmpi_ns.field.baking import baked_shares
 from mmpi_ns.field.mmpi_field import NEGLIGIBLE_DEPTH, MMPIField
 from mmpi_ns.field.samples import metadata_of
 from mmpi_ns.ops import compositing, native
@@ -150,11 +150,11 @@ def baked_march(device: str, rehearse: bool) -> list[Check]:
     """Optical depths blended by shares at texels, against the same blending of plain samples in float64."""
     s, found = scene(3, 4 if rehearse else 200, "paper", seed=5, cube=CUBE), []
     field, rays = s.field.to(device), bundle_of(s.origins, s.directions).to(device)
-    shares = field.baked_shares()
+    shares = baked_shares(field)
     plain = metadata_of(MMPISampler()(rays, field=field, threshold=0.0)[0])
     valid = plain["valid"][..., 0]
     tau, ndc, heads = (plain[name][valid].double().cpu() for name in ("tau", "ndc", "heads"))
-    share = shares_at(field.cpu(), shares.double().cpu(), ndc, heads[:, 0].long())
+    share = field.cpu().shares_at(shares.double().cpu(), ndc, heads[:, 0].long())
     field.to(device)
     for form in FORMS[: 1 if rehearse else None]:
         made = metadata_of(MMPISampler()(rays, field=field, threshold=0.0, blend_form=form, shares=shares)[0])

@@ -202,7 +202,7 @@ def train_for(steps: Steps, total: int, ends: float, tell: Tell) -> dict[str, An
     steps.run(2)  # compiles
     block, rows = max(1, total // 40), []
     while steps.step + block <= total and time.monotonic() < ends:
-        young = not model.schedule.sharpened(steps.step)
+        young = not model.progress.schedule.sharpened(steps.step)
         rows.append((young, block / steps.run(block)))
     late = [rate for young, rate in rows if not young]
     early = [rate for young, rate in rows if young]
@@ -289,7 +289,7 @@ def time_phases(steps: Steps, total: int, ends: float) -> dict[str, Any]:
     A step whose stage was not reached within the time is given the mean of the last stage that was.
     """
     model, times = steps.pipeline.model, {}
-    schedule = model.schedule
+    schedule = model.progress.schedule
     stages = [(schedule.phase_at(s).name, schedule.texel_factor(s)) for s in range(total)]
     steps.run(1)
     block = max(1, total // 100)

@@ -14,6 +14,7 @@ from mmpi_ns.bench.apart import answer
 from mmpi_ns.bench.speed.dense import _dense as dense_colors
 from mmpi_ns.bench.trainings import replace_lpips
 from mmpi_ns.field.mmpi_field import MMPIField
+from mmpi_ns.rendering.rendered import bounded
 
 
 @dataclass(frozen=True)
@@ -118,7 +119,7 @@ class DenseSteps:
         for step in range(self.step, self.step + count):
             bundle, batch = self.like.pipeline.datamanager.next_train(step)
             image = batch["image"].to(self.model.device)
-            bundle = self.model._bounded(_first(bundle, len(image)))  # rays to keypoints come last
+            bundle = bounded(_first(bundle, len(image)), self.model.field.plan)  # rays to keypoints come last
             rgb, self.samples = dense_colors(self.field, bundle)
             self.optimizer.zero_grad()
             ((rgb - image[:, :3]) ** 2).mean().backward()

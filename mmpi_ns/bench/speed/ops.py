@@ -16,11 +16,12 @@ from mmpi_ns.bench.methods import METHODS, Scene
 from mmpi_ns.bench.provenance import fingerprint, read_json, stamp, stamp_line, write_json
 from mmpi_ns.bench.speed.alternate import Steps, clock
 from mmpi_ns.field.samples import Gathered, Lookup, Taps, metadata_of
-from mmpi_ns.model import FAIR_SHARE, MMPIModel
+from mmpi_ns.model import MMPIModel
 from mmpi_ns.ops.colors import colors
 from mmpi_ns.ops.compositing import composite_weights, render_colors
 from mmpi_ns.ops.interpolate import gather_rows, index_rows, interpolate_gathered, sum_by_position
 from mmpi_ns.ops.merge import merge
+from mmpi_ns.rendering.rendered import bounded
 
 COPIED = 1 << 26
 """Numbers copied to measure bandwidth: 256 MiB, beyond any cache."""
@@ -136,11 +137,11 @@ def measure(steps: Steps, repeats: int) -> dict[str, Any]:
 def operations(model: MMPIModel, steps: Steps) -> tuple[list[Op], dict[str, float]]:
     """The operations of a training step on one batch, and how much there is of everything."""
     bundle, batch = steps.pipeline.datamanager.next_train(steps.step)
-    bundle, field = model._bounded(bundle), model.field
-    share = FAIR_SHARE if model._sharpening else float("inf")
+    field = model.field
+    bundle = bounded(bundle, field.plan)
 
     def sample():
-        return model.sampler(bundle, field=field, threshold=model._threshold(), fair_share=share)
+        return model.sampler(bundle, field=field, **model.training_bounds())
 
     samples, report = sample()
     lookup = field._lookup(samples)

@@ -92,7 +92,7 @@ class Render:
         model, images = _load(self.load_config, self.images)
         before = read_json(path)
         known = before if before.get("key") == self._key(model) else {}
-        default = Setting(model.config.render_threshold, model.rays_at_once, _ops_in_use(model))
+        default = Setting(model.config.render_threshold, model.chunk_size, _ops_in_use(model))
         rays = _some_rays(images, self.exact_rays)
         exact = np.array(known["exact"]) if "exact" in known else exact_colors(model, images, rays)
         content: dict[str, Any] = {"headline": {}, "made": made, "key": self._key(model), "exact": exact.tolist()}
@@ -169,7 +169,7 @@ def _some_rays(images: list[Image], count: int) -> list[Array]:
 def exact_colors(model: MMPIModel, images: list[Image], rays: list[Array]) -> Array:
     """Colours [N, 3] of some pixels, in float64, without dropping anything, over the model's background."""
     field = ExactField.of(model.field)
-    form = model.config.blend_form if model.blends else None
+    form = model.blend_form(model.field)
     near, background = float(np.float32(model.field.plan.ray_near)), BACKGROUNDS[model.config.background]
     colors, kind = [], ExactRay if form is not None else _Unblended
     for number, ((camera, _), pixels) in enumerate(zip(images, rays, strict=True), 1):

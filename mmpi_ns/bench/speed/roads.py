@@ -16,6 +16,7 @@ import torch
 
 from mmpi_ns.bench.apart import answer, run_apart
 from mmpi_ns.bench.provenance import fingerprint, read_json, stamp, stamp_line, write_json
+from mmpi_ns.rendering.rendered import bounded
 from mmpi_ns.scene.windows import Window
 
 BYTES_A_TEXEL = 4 * (1 + 9 + 1) + 1
@@ -150,7 +151,7 @@ def train_windows(folder: Path, steps: int, windows: int) -> dict[str, Any]:
         themselves), MPIs and texels, PSNR of the frame; and how much memory the process held at most (GiB).
     """
     trainer = _setup(_config(folder, steps, folder / "plan.json"))
-    model, times = trainer._model, []
+    plans, times = trainer._run.progress.windows.plans, []
     step_once = trainer.train_iteration
 
     def timed(step: int) -> Any:
@@ -161,10 +162,10 @@ def train_windows(folder: Path, steps: int, windows: int) -> dict[str, Any]:
 
     trainer.train_iteration = timed
     rows = []
-    for window in some_windows(len(model.windows), windows):
+    for window in some_windows(len(plans), windows):
         times.clear()
-        trainer._train_window(window) if len(model.windows) > 1 else trainer.train()
-        plan = model.windows.plans[window]
+        trainer._train_window(window) if len(plans) > 1 else trainer.train()
+        plan = plans[window]
         row = {"step_ms": 1e3 * statistics.median(times[steps // 2 :]), **_look(trainer, window)}
         rows.append(row | {"window_mpis": len(plan.mpis), "window_texels": plan.texels})
     found: dict[str, Any] = {name: statistics.median(r[name] for r in rows) for name in rows[0]}
@@ -173,9 +174,9 @@ def train_windows(folder: Path, steps: int, windows: int) -> dict[str, Any]:
 
 def _look(trainer: Any, window: int) -> dict[str, float]:
     """The test view nearest to a window's middle: milliseconds of the frame (median of three), PSNR, samples."""
-    model, data_set = trainer._model, trainer.pipeline.datamanager.eval_dataset
+    model, data_set = trainer.pipeline.model, trainer.pipeline.datamanager.eval_dataset
     centers = data_set.cameras.camera_to_worlds[:, :, 3].double()
-    middle = torch.tensor(model.windows.windows[window].center, dtype=torch.float64)
+    middle = torch.tensor(model.progress.windows.windows[window].center, dtype=torch.float64)
     nearest = int((centers - middle).norm(dim=-1).argmin())
     model.eval()
     camera, frames = data_set.cameras[nearest : nearest + 1], []
@@ -193,7 +194,7 @@ def _look(trainer: Any, window: int) -> dict[str, float]:
 def _samples(model: Any, camera: Any) -> dict[str, float]:
     """What a frame's cost follows: samples that a ray of it meets, and those of them that are coloured."""
     rays = camera.generate_rays(0, keep_shape=False)
-    some = model._bounded(rays[:: max(1, len(rays) // 4096)])
+    some = bounded(rays[:: max(1, len(rays) // 4096)], model.field.plan)
     samples, report = model.sampler(some, field=model.field, threshold=model.config.render_threshold)
     kept = samples.metadata["valid"].sum() / len(some)
     return {"live_samples": float(report.live.float().mean()), "kept_samples": float(kept)}

@@ -57,7 +57,7 @@ def _rates(factor: float) -> Callable[[Any, Path], None]:
 
 def _dense(factor: float) -> Callable[[MMPITrainer], None]:
     def start(trainer: MMPITrainer) -> None:
-        field = trainer._model.field
+        field = trainer._run.field
         field.density.data.normal_(generator=torch.Generator().manual_seed(0)).mul_(factor)
 
     return start
@@ -141,7 +141,7 @@ def prepare(work: Path) -> Path:
     scene = write_scene(work / "scene")
     if not (scene / "plan.json").is_file():
         with _quiet():
-            plan = _setup(_config(scene, work / "plan", 1))._model.field.full_plan
+            plan = _setup(_config(scene, work / "plan", 1))._run.field.full_plan
         (scene / "plan.json").write_text(plan.to_json(), encoding="utf-8")
     return scene
 
@@ -179,7 +179,7 @@ def _is_one_sentence(text: str) -> bool:
 
 def _weights(trainer: MMPITrainer, steps: int) -> dict[str, Any]:
     """Whether every step ran, every number is finite, and what a test image gets."""
-    model, test_images = trainer._model.eval(), trainer.pipeline.datamanager.eval_dataset
+    model, test_images = trainer.pipeline.model.eval(), trainer.pipeline.datamanager.eval_dataset
     assert test_images is not None
     state = {k: v for k, v in model.state_dict().items() if v.is_floating_point()}
     broken = sorted(k for k, v in state.items() if not bool(torch.isfinite(v).all()))

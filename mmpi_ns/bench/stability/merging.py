@@ -13,6 +13,7 @@ from mmpi_ns.bench.stability.cases import UNIT, Case, Error, Outcome, Precision,
 from mmpi_ns.bench.stability.exact import Array
 from mmpi_ns.ops.interpolate import interpolate
 from mmpi_ns.ops.merge import Merged, keep_survivors, merge
+from mmpi_ns.ops.variation import clamped_differences
 from mmpi_ns.scene.texels import BRICK, make_grids
 from mmpi_ns.training import losses
 from mmpi_ns.training.touched_adam import TouchedAdam
@@ -226,7 +227,7 @@ def _variation(precision: Precision) -> Outcome:
         return float((scales[..., None] * huber).sum() / 6), slope, np.abs(slope) + 1e-35
 
     tensors = [torch.tensor(x, dtype=torch.float32) for x in (around, scales)]
-    return _loss(lambda v: losses.total_variation(v, *tensors), values, wanted, 2e4, 16, precision)
+    return _loss(lambda v: clamped_differences(v, *tensors), values, wanted, 2e4, 16, precision)
 
 
 def _adam(precision: Precision) -> Outcome:

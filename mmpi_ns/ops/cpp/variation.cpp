@@ -1,4 +1,4 @@
-// Total variation of texels with its gradient. The reference is losses.total_variation on TexelGrid.neighbours.
+// Total variation of texels with its gradient. The reference is clamped_differences on TexelGrid.neighbours.
 #include "scene.h"
 #include "table.h"
 

@@ -1,0 +1,47 @@
+"""Rays after rendering: their samples, and what each of those has given."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from nerfstudio.cameras.rays import RayBundle, RaySamples
+from torch import Tensor
+
+from mmpi_ns.field.samples import Lookup, metadata_of
+from mmpi_ns.field.shading import RayColors
+from mmpi_ns.ops.composite import median_inverse_distance
+from mmpi_ns.ops.compositing import Composite
+from mmpi_ns.rendering.sampler import MergeReport
+from mmpi_ns.scene.plan import ScenePlan
+
+
+@dataclass(frozen=True)
+class RenderedRays:
+    """R rays with S merged samples each. In training pixel rays, then keypoint rays (both once for every MPI that they
+    went to)."""
+
+    bundle: RayBundle
+    samples: RaySamples
+    composite: Composite
+    colors: RayColors
+    report: MergeReport
+    lookup: Lookup | None
+    """Where the field was read; None without gradients."""
+
+
+def bounded(bundle: RayBundle, plan: ScenePlan) -> RayBundle:
+    """The rays with nears and fars: the plan's start of rays, and no end, unless a crop has set tighter ones."""
+    near = torch.full_like(bundle.origins[:, :1], plan.ray_near)
+    bundle.nears = near if bundle.nears is None else torch.maximum(bundle.nears, near)
+    bundle.fars = torch.full_like(near, torch.inf) if bundle.fars is None else bundle.fars
+    return bundle
+
+
+@torch.no_grad()
+def median_distance(composite: Composite, samples: RaySamples, plan: ScenePlan) -> Float[Tensor, "R 1"]:
+    """Euclidean distance at half the gathered mass; infinity is shown as ten times the farthest finite plane."""
+    inverse_t, valid = metadata_of(samples)["inverse_t"][..., 0], metadata_of(samples)["valid"][..., 0]
+    farthest = 10 * max(m.farthest for m in plan.mpis)
+    return 1 / median_inverse_distance(composite.weights, inverse_t, valid).clamp(min=1 / farthest)

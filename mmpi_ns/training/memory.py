@@ -1,0 +1,68 @@
+"""How much memory a run takes, and what it trains: told before it starts."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from mmpi_ns.scene.plan import ScenePlan
+from mmpi_ns.scene.texels import BRICK, SIDE, head_shapes
+from mmpi_ns.scene.visible_tiles import TrainingViews, reachable_tiles
+from mmpi_ns.scene.windows import WindowedPlan
+
+GIB = 2**30
+
+
+def training_bytes(plan: ScenePlan, views: TrainingViews | None, feature_channels: int, two_phase: bool) -> int:
+    """Bytes of the tables of one window at full resolution, and of their moments; at most, as bricks may be given up.
+
+    Args:
+        plan: MPIs and cube.
+        views: training images; what none can reach is not stored. None: everything is.
+        feature_channels: colour features of a texel.
+        two_phase: whether reliability is trained, so that it has moments.
+    """
+    tiles = sum(depth * -(-height // SIDE) * -(-width // SIDE) for depth, height, width in head_shapes(plan))
+    stored = tiles if views is None else int(reachable_tiles(views, plan).sum())
+    learned = 1 + feature_channels + two_phase
+    numbers = 1 + feature_channels + 1 + 2 * learned  # density, features, reliability, two moments
+    return (stored + 1) * (BRICK * (4 * numbers + 1) + 4) + 4 * tiles  # and what is touched, peaks, where tiles lie
+
+
+def describe(windows: WindowedPlan, steps: int, tables: Sequence[int], pixels: Sequence[int]) -> str:
+    """What will be trained, and what it takes.
+
+    Args:
+        windows: of the capture.
+        steps: of each window.
+        tables: ``training_bytes`` of each window.
+        pixels: bytes of training pixels that are held while each window trains.
+    """
+    most = max(range(len(windows)), key=lambda w: tables[w] + pixels[w])
+    memory = (
+        f"Memory in training: at most {(tables[most] + pixels[most]) / GIB:.2f} GiB (tables and moments "
+        f"{tables[most] / GIB:.2f}, pixels {pixels[most] / GIB:.2f}), beside the program and the work of a step."
+    )
+    if len(windows) == 1:
+        return "\n".join([*_describe_plan(windows.plans[0]), memory])
+    texels = [plan.texels for plan in windows.plans]
+    lines = [
+        f"A long capture: {len(windows)} windows of {steps} steps each, one after the other; {sum(texels) / 1e6:.1f} M "
+        f"texels on disk, at most {max(texels) / 1e6:.1f} M in training at a time."
+    ]
+    for i, window in enumerate(windows.windows):
+        lines.append(f"Window {i}, cameras within {window.radius:.3g} (and {window.margin:.3g} more to mix):")
+        lines += ["  " + line for line in _describe_plan(window.plan)]
+    return "\n".join([*lines, memory])
+
+
+def _describe_plan(plan: ScenePlan) -> list[str]:
+    lines = [f"Scene plan ({plan.origin_of_plan}): {len(plan.mpis)} MPIs, {plan.texels / 1e6:.1f} M texels"]
+    for m in plan.mpis:
+        tangents = " ".join(f"{t:.2f}" for t in m.extent)
+        lines.append(
+            f"  {m.name}: {m.planes} planes of {m.height} x {m.width}, "
+            f"depths {m.near:.3g} to {m.far:.3g}, tangents {tangents}"
+        )
+    if plan.cube is not None:
+        lines.append(f"  cube: {' x '.join(str(n) for n in plan.cube.shape)} voxels")
+    return lines

@@ -1,0 +1,57 @@
+"""How far a run is: its windows and its schedule, the step, and the window that is being trained.
+
+Windows, schedule and the window's number travel in checkpoints.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from mmpi_ns.scene.windows import WindowedPlan
+from mmpi_ns.training.phases import Phase, Schedule
+from mmpi_ns.utils.files import to_bytes, to_text
+
+
+class Progress(nn.Module):
+    """The state of a run beside its field.
+
+    Args:
+        windows: of the capture.
+        schedule: of the whole run.
+    """
+
+    def __init__(self, windows: WindowedPlan, schedule: Schedule) -> None:
+        super().__init__()
+        self.windows, self.schedule = windows, schedule
+        self.step = 0
+        self.window = 0
+        """The window that is being trained; those before it are finished, those after it are not there yet."""
+        self.windows_bytes: Tensor
+        self.schedule_bytes: Tensor
+        self.window_number: Tensor
+        self.register_buffer("windows_bytes", to_bytes(windows.to_json()))
+        self.register_buffer("schedule_bytes", to_bytes(schedule.to_json()))
+        self.register_buffer("window_number", torch.tensor(0))
+
+    @property
+    def phase(self) -> Phase:
+        return self.schedule.phase_at(self.step)
+
+    def begin(self, window: int) -> None:
+        """Another window is trained from now on."""
+        self.window_number.fill_(window)
+        self.window = window
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
+        """The plan and the schedule of a run are its checkpoint's, whatever config and capture say now."""
+        for name in ("windows_bytes", "schedule_bytes"):
+            stored = state_dict.get(prefix + name)
+            if stored is not None:  # nerfstudio loads the pipeline's own, empty state in a second pass
+                setattr(self, name, torch.empty_like(stored, device=self.window_number.device))
+        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
+        self.windows = WindowedPlan.from_json(to_text(self.windows_bytes))
+        self.schedule = Schedule.from_json(to_text(self.schedule_bytes))
+        self.window = int(self.window_number)

@@ -1,0 +1,112 @@
+"""A training run between two steps: which window, at which resolution, from which pixels, and what trains."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from nerfstudio.engine.callbacks import TrainingCallbackAttributes
+from numpy.typing import NDArray
+from torch.nn import Parameter
+
+from mmpi_ns.capture.datamanager import MMPIDataManager
+from mmpi_ns.field.mmpi_field import MMPIField
+from mmpi_ns.placement.split import cameras_in
+from mmpi_ns.rendering.window_store import WindowStore
+from mmpi_ns.scene.visible_tiles import TrainingViews
+from mmpi_ns.scene.windows import Window
+from mmpi_ns.training.phases import TRAINS
+from mmpi_ns.training.progress import Progress
+from mmpi_ns.training.storage import prepare_storage
+
+
+def parameters_by_kind(field: MMPIField) -> dict[str, list[Parameter]]:
+    """What has a learning rate of its own (``phases.ParameterKind``)."""
+    return {
+        "density": [field.density],
+        "features": [field.features],
+        "colour": [field.networks.weights],
+        "reliability": [field.reliability],
+    }
+
+
+def cameras_of(window: Window, centers: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Those of the cameras that ask a window; all where there is one window alone."""
+    return cameras_in(centers, np.asarray(window.center), window.radius + window.margin)
+
+
+def views_of(window: Window, views: TrainingViews | None) -> TrainingViews | None:
+    """The training images that ask a window."""
+    return None if views is None else views.some(cameras_of(window, views.origins.numpy()))
+
+
+class TrainingRun:
+    """What is trained, and how it is brought from one step to the next.
+
+    Args:
+        progress: windows, schedule and step.
+        field: of the window that is trained, one after the other.
+        store: where finished windows go.
+        views: the training images; None: every texel is stored.
+        release_weight: bricks in which no sample weighs this much are given up.
+    """
+
+    def __init__(
+        self,
+        progress: Progress,
+        field: MMPIField,
+        store: WindowStore,
+        views: TrainingViews | None,
+        release_weight: float,
+    ) -> None:
+        self.progress, self.field, self.store = progress, field, store
+        self.views, self.release_weight = views, release_weight
+        self._drawn_from: int | None = None
+
+    def cameras_of(self, centers: NDArray[np.float64], window: int) -> NDArray[np.int64]:
+        """Those of the cameras that ask a window."""
+        return cameras_of(self.progress.windows.windows[window], centers)
+
+    def views_of(self, window: int) -> TrainingViews | None:
+        """The training images that ask a window."""
+        return views_of(self.progress.windows.windows[window], self.views)
+
+    def prepare_step(self, attributes: TrainingCallbackAttributes | None, step: int) -> None:
+        """Brings window, resolution, storage and freezing to what the schedule says of a step.
+
+        Args:
+            attributes: the trainer's optimisers and data manager; None where there is no trainer.
+            step: that is about to run.
+        """
+        progress, field = self.progress, self.field
+        progress.step = step
+        field.forget_shares()
+        optimizers = attributes.optimizers.optimizers if attributes and attributes.optimizers else {}
+        groups = parameters_by_kind(field)
+        if progress.schedule.window_at(step) != progress.window:
+            self._begin_window(progress.schedule.window_at(step), progress.schedule.texel_factor(step))
+            for kind, params in groups.items():
+                if kind in optimizers:
+                    optimizers[kind].reset_moments(params[0])
+        prepare_storage(field, progress.schedule, step, self.release_weight, optimizers)
+        if len(progress.windows) > 1 and attributes is not None and self._drawn_from != progress.window:
+            self._draw_from_window(attributes.pipeline.datamanager if attributes.pipeline else None)
+        phase = progress.phase.name
+        field.learns_cover = phase in ("individual", "joint")
+        for kind, params in groups.items():
+            params[0].requires_grad_(kind in TRAINS[phase])
+
+    def _begin_window(self, window: int, factor: float) -> None:
+        """Another window with fresh tables and networks; the trainer has put the one before away."""
+        field = self.field
+        self.store.forget(window)
+        field.views = self.views_of(window)
+        field.build(self.progress.windows.plans[window], factor)
+        field.renew_networks()
+        self.progress.begin(window)
+
+    def _draw_from_window(self, manager: Any) -> None:
+        """Has the data manager draw from the cameras that ask the window at hand."""
+        assert isinstance(manager, MMPIDataManager), "windows need MMPIDataManager"
+        manager.use_cameras(self.cameras_of(manager.observations.centers, self.progress.window))
+        self._drawn_from = self.progress.window

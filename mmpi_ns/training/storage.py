@@ -1,0 +1,40 @@
+"""When a field's tables grow and which bricks they give up, by the schedule; the optimisers' moments follow."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from mmpi_ns.field.tables import TABLES, TexelTables
+from mmpi_ns.scene.texels import BRICK
+from mmpi_ns.training.phases import Schedule
+
+
+def prepare_storage(
+    field: TexelTables, schedule: Schedule, step: int, least: float, optimizers: Mapping[str, Any]
+) -> None:
+    """Grows and gives up what the schedule says of a step.
+
+    Args:
+        field: the field that is trained.
+        schedule: of the whole run.
+        step: that is about to run.
+        least: see ``TexelTables.release_unused``.
+        optimizers: of the tables, by their names, where there are any; their moments follow.
+    """
+    own = [(optimizers[name], getattr(field, name)) for name in TABLES if name in optimizers]
+    factor = schedule.texel_factor(step)
+    if factor != field.factor:
+        for optimizer, table in own:
+            optimizer.reset_moments(table)
+        field.grow(factor)
+    phase, left = schedule.phase_at(step), []
+    if schedule.releases_at(step):
+        left.append(field.release_unused(least))
+    elif schedule.sharpened(step) and not schedule.sharpened(step - 1):
+        field.look_afresh()
+    if phase.name == "blend" and step == phase.start:
+        left.append(field.release_untouched())
+    for kept in left:
+        for optimizer, table in own if kept is not None else ():
+            optimizer.keep_blocks(table, kept, BRICK)

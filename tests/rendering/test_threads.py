@@ -1,0 +1,159 @@
+"""Rendering a run of two windows from several threads, interrupted, and while checkpoints are saved.
+
+nerfstudio renders each viewer tab in a thread of its own, stops it by a trace function that raises before any line,
+and saves checkpoints without waiting for either.
+"""
+
+from __future__ import annotations
+
+import sys
+from threading import Thread
+
+import pytest
+import torch
+from nerfstudio.viewer_legacy.server.viewer_utils import IOChangeException, SetTrace
+from training_runs import differences, ready, trainer_config, write_windows
+
+STEPS = 6
+
+
+@pytest.fixture(scope="module")
+def run(scene, tmp_path_factory):
+    """A trainer after both windows, and cameras that ask one window, the other and both."""
+    folder = tmp_path_factory.mktemp("threads")
+    config = trainer_config(scene, write_windows(scene, folder / "plan.json"), folder, STEPS, training="joint")
+    trainer = ready(config)
+    trainer.train()
+    trainer.pipeline.eval()
+    return trainer
+
+
+@pytest.fixture
+def model(run):
+    model = run.pipeline.model
+    model.store.budget = 0  # every window that is not the last one asked for is let go at once
+    model.store.forget(0)
+    return model
+
+
+def cameras_of(run):
+    """One by each window's middle, and one between."""
+    centers = [torch.tensor(w.center) for w in run.pipeline.model.progress.windows.windows]
+    camera = run.pipeline.datamanager.train_dataset.cameras[0:1]
+    found = []
+    for center in (centers[0], 0.5 * (centers[0] + centers[1]), centers[1]):
+        moved = camera.to("cpu")
+        moved.camera_to_worlds = camera.camera_to_worlds.clone()
+        moved.camera_to_worlds[0, :, 3] = center.float()
+        found.append(moved)
+    return found
+
+
+def copied(state):
+    return {name: value.clone() for name, value in state.items()}
+
+
+def test_three_threads_render_while_checkpoints_are_saved(run, model, tmp_path):
+    """Every picture is the one that a single thread makes, and every state that is saved is the trained one."""
+    cameras = cameras_of(run)
+    alone = [model.get_outputs_for_camera(camera) for camera in cameras]
+    trained, wrong = copied(model.state_dict()), []
+
+    def render(first: int) -> None:
+        try:
+            for i in range(first, first + 9):
+                outputs = model.get_outputs_for_camera(cameras[i % 3])
+                wrong.extend(name for name, v in outputs.items() if not torch.equal(v, alone[i % 3][name]))
+                model.store.forget(0)  # the next one reads it again, while others still work on it
+        except Exception as error:
+            wrong.append(repr(error))
+
+    threads = [Thread(target=render, args=(first,)) for first in range(3)]
+    for thread in threads:
+        thread.start()
+    saved = 0
+    while any(thread.is_alive() for thread in threads) or not saved:
+        run.save_checkpoint(2 * STEPS - 1)
+        path = run.checkpoint_dir / f"step-{2 * STEPS - 1:09d}.ckpt"
+        state = torch.load(path, weights_only=True)["pipeline"]
+        assert differences({k.removeprefix("_model."): v for k, v in state.items()}, trained) == []
+        saved += 1
+    for thread in threads:
+        thread.join()
+    assert wrong == [] and saved > 1
+    assert differences(dict(model.state_dict()), trained) == []
+
+
+class Interrupt:
+    """Raises before the n-th line of ours that runs, as the viewer does when somebody moves the camera."""
+
+    def __init__(self, number: int) -> None:
+        self.left, self.line = number, None
+
+    def __call__(self, frame, event, arg):
+        if event == "line" and "mmpi_ns" in frame.f_code.co_filename:
+            self.left -= 1
+            if self.left == 0:
+                self.line = f"{frame.f_code.co_filename}:{frame.f_lineno}"
+                raise IOChangeException
+        return self
+
+
+def interrupted(model, camera, number) -> str | None:
+    """Renders in a thread until the n-th line; where that was, None where rendering ended before."""
+    trace = Interrupt(number)
+
+    def render() -> None:
+        try:
+            with torch.no_grad(), SetTrace(trace):
+                model.get_outputs_for_camera(camera)
+        except IOChangeException:
+            pass
+
+    thread = Thread(target=render)
+    thread.start()
+    thread.join(60)
+    assert not thread.is_alive(), "it waits for a lock that nobody gives back"
+    return trace.line
+
+
+def test_a_rendering_that_is_interrupted_anywhere_changes_nothing_and_holds_no_lock(run, model):
+    """The window in use stays, the next step goes on with the trained field, and other threads render on."""
+    camera = cameras_of(run)[1]
+    expected, trained = model.get_outputs_for_camera(camera), copied(model.state_dict())
+    number, lines = 1, set()
+    while True:
+        model.store.forget(0)
+        line = interrupted(model, camera, number)
+        if line is None:
+            break
+        lines.add(line)
+        assert not model.store._lock.locked(), line
+        number += 1 + number // 12
+    assert len(lines) > 20 and any("window_store" in line for line in lines)
+    assert differences(dict(model.state_dict()), trained) == []
+    outputs = model.get_outputs_for_camera(camera)
+    assert all(torch.equal(outputs[name], values) for name, values in expected.items())
+    before = copied(model.field.state_dict())
+    model.run.prepare_step(None, 2 * STEPS - 1)
+    assert differences(dict(model.field.state_dict()), before) == [], "the next step trains what was trained"
+
+
+def test_an_interrupt_at_any_line_of_the_store_leaves_its_lock_free(run, model):
+    """Line by line: at the end of a ``with lock`` an exception would come before the lock is given back."""
+    found = set()
+    for number in range(1, 400):
+        model.store.forget(0)
+        trace = Interrupt(number)
+        try:
+            with SetTrace(trace):
+                model.store.load(0, model.device)
+        except IOChangeException:
+            pass
+        finally:
+            sys.settrace(None)
+        assert not model.store._lock.locked(), trace.line
+        if trace.line is None:
+            break
+        found.add(trace.line)
+    assert trace.line is None and any("window_store" in line for line in found)
