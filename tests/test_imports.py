@@ -1,0 +1,97 @@
+"""Imports run one way: who may import whom, no circle, and nothing hidden."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+import mmpi_ns
+
+ROOT = Path(mmpi_ns.__file__).parent
+METHOD = ["utils", "scene", "ops", "placement", "capture", "field", "rendering", "training", "model", "config"]
+"""Each may import itself and what comes before it."""
+COMMANDS = {
+    "prepare": {"utils", "scene", "placement", "capture"},
+    "synthetic": {"utils"},
+    "demo": set(METHOD) | {"synthetic"},
+    "bench": set(METHOD) | {"synthetic", "prepare", "demo"},
+    "scripts": set(METHOD) | {"prepare", "synthetic", "demo", "bench", "placement"},
+}
+"""The method never imports these."""
+MAY_IMPORT = {wing: set(METHOD[: i + 1]) for i, wing in enumerate(METHOD)}
+MAY_IMPORT |= {wing: others | {wing} for wing, others in COMMANDS.items()}
+
+NOT_YET = {("mmpi_ns.ops.colors", "field"), ("mmpi_ns.ops.shade", "field"), ("mmpi_ns.ops.triton_shade", "field")}
+"""Operations that name the colour networks of the field, which are their reference: to be moved below ``ops``."""
+
+MODULES = {
+    ".".join(path.relative_to(ROOT.parent).with_suffix("").parts).removesuffix(".__init__"): path
+    for path in ROOT.rglob("*.py")
+}
+
+
+def imported(node: ast.AST, name: str) -> list[str]:
+    """Modules of this package that an import statement reads."""
+    if isinstance(node, ast.Import):
+        found = [alias.name for alias in node.names]
+    elif isinstance(node, ast.ImportFrom):
+        assert node.level == 0, f"{name}: write imports in full"
+        inside = [f"{node.module}.{alias.name}" for alias in node.names]
+        found = [each if each in MODULES else str(node.module) for each in inside]
+    else:
+        found = []
+    return [each for each in found if each.split(".")[0] == "mmpi_ns"]
+
+
+def imports(name: str) -> set[str]:
+    tree = ast.parse(MODULES[name].read_text(encoding="utf-8"))
+    return {each for node in ast.walk(tree) for each in imported(node, name)}
+
+
+def wing(name: str) -> str:
+    if name.endswith(".__main__"):  # a command
+        return "scripts"
+    return name.split(".")[1] if "." in name else ""
+
+
+@pytest.mark.parametrize("name", sorted(MODULES))
+def test_a_module_imports_only_wings_before_its_own(name):
+    allowed = MAY_IMPORT.get(wing(name), set())
+    found = {wing(each) for each in imports(name)} - {""} - allowed
+    assert {(name, each) for each in found} == {pair for pair in NOT_YET if pair[0] == name}
+
+
+def test_no_import_goes_in_a_circle():
+    graph, finished = {name: imports(name) & MODULES.keys() for name in MODULES}, set()
+
+    def visit(name: str, path: tuple[str, ...]) -> None:
+        assert name not in path, " -> ".join([*path[path.index(name) :], name])
+        if name not in finished:
+            for each in sorted(graph[name] - {name}):
+                visit(each, (*path, name))
+            finished.add(name)
+
+    for name in graph:
+        visit(name, ())
+
+
+@pytest.mark.parametrize("name", sorted(n for n in MODULES if wing(n) != "scripts"))
+def test_nothing_of_ours_is_imported_for_types_alone(name):
+    """Commands may: they answer --help before anything large is read."""
+    tree = ast.parse(MODULES[name].read_text(encoding="utf-8"))
+    for_types = [node for node in ast.walk(tree) if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test)]
+    assert [each for block in for_types for node in ast.walk(block) for each in imported(node, name)] == []
+
+
+@pytest.mark.parametrize("name", sorted(n for n in MODULES if wing(n) in METHOD))
+def test_only_triton_is_imported_within_a_function(name):
+    tree = ast.parse(MODULES[name].read_text(encoding="utf-8"))
+    functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)]
+    inner = [each for function in functions for node in ast.walk(function) for each in imported(node, name)]
+    assert [each for each in inner if "triton" not in each] == []
+
+
+def test_the_root_holds_the_model_and_the_registered_methods_alone():
+    assert {path.name for path in ROOT.glob("*.py")} == {"__init__.py", "config.py", "model.py"}
