@@ -15,6 +15,8 @@ from triton.compiler import ASTSource
 
 from mmpi_ns.field.color_network import ColorNetworks
 from mmpi_ns.ops import triton_composite, triton_march, triton_shade, triton_tables
+from mmpi_ns.ops.gather import KnownTaps
+from mmpi_ns.ops.gather import gpu as gather_gpu
 from mmpi_ns.rendering.sampler import MMPISampler
 
 TARGET = GPUTarget("cuda", 90, 32)
@@ -74,7 +76,7 @@ def resources(kernel):
 
 def launches(monkeypatch):
     """Launches every kernel as on a GPU."""
-    for module in (triton_march, triton_tables):
+    for module in (triton_march, triton_tables, gather_gpu):
         monkeypatch.setattr(module, "block_size", lambda wanted, device: wanted)
     for num_mpis, with_cube, form, count in ((4, False, None, 20), (2, True, "paper", 1)):
         field = random_field(num_mpis, with_cube, seed=1)
@@ -98,6 +100,18 @@ def launches(monkeypatch):
     scene = random_field(2, True, seed=1).triton_scene()[0]
     for in_cube in (False, True):
         triton_tables.taps(scene, number, number, torch.zeros(50, 3), in_cube)
+    everything = torch.ones(10, dtype=torch.bool)
+    for taps in ([4], [8], [4, 8]):
+        own = [KnownTaps(number[:20, None].repeat(1, n).int(), torch.zeros(20, n)) for n in taps]
+        slots, weights_of_rays = number[: 20 * len(taps)], torch.zeros(10, 5, requires_grad=True)
+        for channels in (9, 20):
+            read = torch.zeros(7, channels, requires_grad=True)
+            for texels in (read, read.detach()):
+                gather_gpu.gather_taps(texels, own, slots, weights_of_rays, everything).gathered.sum().backward()
+    places = (number.view(10, 5), number.view(10, 5), torch.zeros(10, 5, 3), number.view(10, 5) >= 0)
+    for with_cube in (False, True):
+        there = random_field(2, with_cube, seed=1).triton_scene()[0]
+        gather_gpu.gather_places(there, table, *places, torch.zeros(10, 5))
     networks, grid = ColorNetworks(3, 9, 64, 2, 2), torch.arange(60).view(20, 3)
     with monkeypatch.context() as edges:
         edges.setattr(torch.Tensor, "tolist", lambda self: [0, 20, 40, 60])

@@ -5,11 +5,12 @@ from __future__ import annotations
 import pytest
 import torch
 from bricked import SHAPES, bricked_field, thinned
+from gather_batches import batch, in_float32, with_gradients
 from interpreting import by_torch, interpreted, normal  # noqa: F401
 from random_fields import bundle, random_field, random_rays
 
 from mmpi_ns.field.mmpi_field import MMPIField
-from mmpi_ns.ops import composite, compositing, interpolate
+from mmpi_ns.ops import composite, compositing, gather, interpolate
 from mmpi_ns.ops.variation import total_variation, total_variation_reference
 from mmpi_ns.rendering.sampler import MMPISampler
 from mmpi_ns.training.touched_adam import TouchedAdam
@@ -156,6 +157,51 @@ def test_shading_equals_the_colour_networks(channels, width, octaves, shared):
         plain = by_torch(lambda: next(iter(field.get_outputs(samples).values())))
     assert plain.std() > 0.05 and (fast - plain).abs().max() < 5e-6
     assert (fast[~samples.metadata["valid"][..., 0]] == 0).all()
+
+
+def gathered_at_places(channels, with_cube):
+    """What rays gather without gradients, and what the reference in float64 says."""
+    field = MMPIField(random_field(3, with_cube, seed=7).plan, feature_channels=channels).eval()
+    field.features.data = normal(*field.features.shape, seed=1) * 2
+    samples, _ = MMPISampler()(bundle(*random_rays(field.plan, 40, seed=8)), field=field, threshold=0.0)
+    meta = samples.metadata
+    places = [meta[n][..., 0] for n in ("heads", "planes")] + [meta["ndc"], meta["valid"][..., 0]]
+    weights = torch.rand(places[-1].shape, generator=torch.Generator().manual_seed(3))
+    found = gather.gather_places(field.grids, 3, lambda: field.triton_scene()[0], field.features.data, *places, weights)
+    return found, gather.reference.gather_places(field.grids, 3, field.features.data, *places, weights)
+
+
+@pytest.mark.parametrize(("channels", "with_cube"), [(3, False), (9, True), (20, True)])
+def test_rays_gather_what_the_reference_says(channels, with_cube):
+    for a, b in zip(*(vars(s).values() for s in gathered_at_places(channels, with_cube)), strict=True):
+        assert b.abs().max() > 1 and (a - b).abs().max() < 2e-5
+
+
+@pytest.mark.parametrize("trains", [True, False])
+@pytest.mark.parametrize(("channels", "in_cube"), [(3, False), (9, True), (20, True)])
+def test_gathered_sums_and_their_gradients_are_those_of_float64(channels, in_cube, trains):
+    given, upstream = batch(channels, rays=40, in_cube=in_cube), [normal(40, n) for n in (channels, 1, 3, 3)]
+    if trains:
+        found = with_gradients(gather.gather_taps, in_float32(given), upstream)
+        wanted = with_gradients(gather.reference.gather_taps, given, upstream)
+    else:
+        values, groups, slots, weights, wanted_rays = in_float32(given)
+        sums = gather.gather_taps(values, groups, slots, weights.requires_grad_(), wanted_rays)
+        (sums.gathered * upstream[0]).sum().backward()
+        found = [weights.grad.double()]
+        wanted = with_gradients(gather.reference.gather_taps, given, [upstream[0], *(0 * u for u in upstream[1:])])[-1:]
+    for a, b in zip(found, wanted, strict=True):
+        assert b.abs().max() > 0.05 and (a - b).abs().max() < 3e-6 * (1 + b.abs().max())
+
+
+def test_without_samples_rays_gather_nothing():
+    weights = torch.zeros(3, 2, requires_grad=True)
+    sums = gather.gather_taps(
+        torch.zeros(0, 9), [], torch.zeros(0, dtype=torch.int64), weights, torch.ones(3, dtype=torch.bool)
+    )
+    assert all(s.shape[0] == 3 and not s.any() for s in vars(sums).values())
+    sums.gathered.sum().backward()
+    assert not weights.grad.any()
 
 
 def test_without_samples_there_are_no_colours():

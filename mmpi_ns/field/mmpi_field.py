@@ -399,8 +399,8 @@ class MMPIField(TexelTables):
         if lookup is None:
             meta = metadata_of(ray_samples)
             heads, planes, valid = (meta[name][..., 0] for name in ("heads", "planes", "valid"))
-            places = (heads, planes, meta["ndc"], valid)
-            sums = gather_places(self.grids, len(self.plan.mpis), self.features.data, *places, composite.weights)
+            here = (self.grids, len(self.plan.mpis), lambda: self.triton_scene()[0], self.features.data)
+            sums = gather_places(*here, heads, planes, meta["ndc"], valid, composite.weights)
         else:
             known = lookup.gathered and lookup.gathered.features
             groups = [KnownTaps(t.rows if t.position is None else t.position, t.weights) for t in lookup.groups]

@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from gather_batches import batch, in_float32, parts_of, with_gradients
 from random_fields import bundle, random_field, random_rays
 
 from mmpi_ns.field.samples import metadata_of
@@ -33,41 +34,6 @@ def sums_by_hand(values, samples, slots, weights, wanted):
         for total, part in zip(out, (value, np.ones(1), value[:3], value[:3] ** 2), strict=True):
             total[ray] += weight * part
     return out
-
-
-def batch(channels, seed=0, rays=7, width=6, in_cube=True):
-    """Values, groups, slots, weights and wanted rays in float64; slots of a group rise, as in a lookup."""
-    rng = np.random.default_rng(seed)
-    taken = rng.permutation(rays * width)[: rays * width * 2 // 3]
-    cut = len(taken) * 3 // 4 if in_cube else len(taken)
-    parts = [np.sort(taken[:cut]), np.sort(taken[cut:])]
-    values = torch.tensor(rng.normal(size=(30, channels)) * 2)
-    groups = [
-        KnownTaps(torch.tensor(rng.integers(0, 30, (len(p), taps))), torch.tensor(rng.dirichlet(np.ones(taps), len(p))))
-        for p, taps in zip(parts, (4, 8), strict=True)
-        if len(p)
-    ]
-    weights = torch.tensor(rng.dirichlet(np.ones(width), rays))
-    wanted = torch.tensor(rng.permutation(rays) > rays // 4)
-    return values, groups, torch.tensor(np.concatenate(parts)), weights, wanted
-
-
-def parts_of(sums):
-    return sums.gathered, sums.mass, sums.first, sums.second
-
-
-def in_float32(given):
-    values, groups, slots, weights, wanted = given
-    return values.float(), [KnownTaps(g.positions, g.shares.float()) for g in groups], slots, weights.float(), wanted
-
-
-def with_gradients(function, given, upstream):
-    values, weights = (x.clone().requires_grad_() for x in (given[0], given[3]))
-    sums = function(values, given[1], given[2], weights, given[4])
-    chosen = [s for s in parts_of(sums) if s.requires_grad]
-    grads = [u for u, s in zip(upstream, parts_of(sums), strict=True) if s.requires_grad]
-    torch.autograd.backward(chosen, [g.to(s.dtype) for g, s in zip(grads, chosen, strict=True)])
-    return [x.double() for x in (*(s.detach() for s in parts_of(sums)), values.grad, weights.grad)]
 
 
 @pytest.mark.parametrize("function", [gather_taps, reference.gather_taps])
@@ -158,8 +124,10 @@ def test_at_places_sums_are_those_at_their_taps(with_cube):
     table, everything = field.features.data, torch.ones(60, dtype=torch.bool)
     taps = [KnownTaps(t.rows, t.weights.double()) for t in lookup.groups]
     exact = reference.gather_taps(table.double(), taps, lookup.index, weights.double(), everything)
-    for function in (gather_places, reference.gather_places):
-        found = function(field.grids, 3, table, *places, weights)
+    for found in (
+        gather_places(field.grids, 3, field.triton_scene, table, *places, weights),
+        reference.gather_places(field.grids, 3, table, *places, weights),
+    ):
         for a, b in zip(parts_of(found), parts_of(exact), strict=True):
             assert b.abs().max() > 1 and (a - b).abs().max() < 2e-5
     assert meta["heads"].unique().numel() == 3 + with_cube
@@ -171,7 +139,7 @@ def test_at_places_and_at_taps_give_the_same_bits():
     meta, lookup = metadata_of(samples), field.get_density(samples)[1]
     places = [meta[n][..., 0] for n in ("heads", "planes")] + [meta["ndc"], meta["valid"][..., 0]]
     weights = torch.rand(lookup.shape, generator=torch.Generator().manual_seed(0))
-    a = gather_places(field.grids, 3, field.features.data, *places, weights)
+    a = gather_places(field.grids, 3, field.triton_scene, field.features.data, *places, weights)
     taps = [KnownTaps(t.rows, t.weights) for t in lookup.groups]
     b = gather_taps(field.features.data, taps, lookup.index, weights, torch.ones(60, dtype=torch.bool))
     assert native.library() is not None and torch.equal(a.gathered, b.gathered)

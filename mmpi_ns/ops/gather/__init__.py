@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from torch import Tensor
@@ -9,22 +10,37 @@ from torch import Tensor
 from mmpi_ns.ops import native
 from mmpi_ns.ops.gather import cpu, reference
 from mmpi_ns.ops.gather.reference import COLORS, KnownTaps, RaySums
+from mmpi_ns.scene.texels import TexelGrid
 
 __all__ = ["COLORS", "KnownTaps", "RaySums", "gather_places", "gather_taps"]
 
 
-def _form(*tensors: Tensor) -> Any:
-    return reference if native.library(*tensors) is None else cpu
-
-
 def gather_taps(values: Tensor, groups: list[KnownTaps], slots: Tensor, weights: Tensor, wanted: Tensor) -> RaySums:
     """See ``reference.gather_taps``."""
-    return _form(values, weights).gather_taps(values, groups, slots, weights, wanted)
+    given = (values, groups, slots, weights, wanted)
+    if native.takes_triton(values, weights):
+        from mmpi_ns.ops.gather import gpu
+
+        return gpu.gather_taps(*given)
+    return (reference if native.library(values, weights) is None else cpu).gather_taps(*given)
 
 
 def gather_places(
-    grids: list[Any], num_mpis: int, table: Tensor, heads: Tensor, planes: Tensor, ndc: Tensor, valid: Tensor,
+    grids: list[TexelGrid],
+    num_mpis: int,
+    triton_scene: Callable[[], Any],
+    table: Tensor,
+    heads: Tensor,
+    planes: Tensor,
+    ndc: Tensor,
+    valid: Tensor,
     weights: Tensor,
-) -> RaySums:  # fmt: skip
-    """See ``reference.gather_places``."""
-    return _form(table, ndc, weights).gather_places(grids, num_mpis, table, heads, planes, ndc, valid, weights)
+) -> RaySums:
+    """See ``reference.gather_places``; ``triton_scene`` gives the scene as kernels on a GPU take it."""
+    given = (table, heads, planes, ndc, valid, weights)
+    if native.takes_triton(table, ndc, weights):
+        from mmpi_ns.ops.gather import gpu
+
+        return gpu.gather_places(triton_scene(), *given)
+    form = reference if native.library(table, ndc, weights) is None else cpu
+    return form.gather_places(grids, num_mpis, *given)

@@ -1,0 +1,226 @@
+"""What rays gather of the texels along them, on a GPU. Gradients of texels are atomic sums: their last bits may differ
+from run to run."""
+
+# Triton's language has no types that pyright knows: a kernel's functions seem to return nothing.
+# pyright: reportGeneralTypeIssues=false, reportCallIssue=false, reportArgumentType=false
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+import triton
+import triton.language as tl
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from mmpi_ns.ops.gather.reference import COLORS, KnownTaps, RaySums
+from mmpi_ns.ops.triton_scene import DEPTH, HEIGHT, INTS, WIDTH, TritonScene, block_size, cell, row_of
+
+NUMBERS = 512
+"""Rays, or samples, of a program, times their channels: what its registers hold."""
+
+
+@triton.jit
+def activate(raw, column):
+    """Colours and features of samples."""
+    share = 1 / (1 + tl.exp(-tl.where(column < 3, raw, 2 * raw)))
+    return tl.where(column < 3, share, 2 * share - 1)
+
+
+@triton.jit
+def store_sums(sums, ray, inside, channels, total, mass, squares, column):
+    """A ray's sums: weight times texel, weight, weight times squared colour."""
+    to = sums + ray[:, None] * (channels + 4)
+    tl.store(to + column, total, inside[:, None] & (column < channels))
+    tl.store(sums + ray * (channels + 4) + channels, mass, inside)
+    tl.store(to + channels + 1 + column, squares, inside[:, None] & (column < 3))
+
+
+@triton.jit
+def gather_places_kernel(
+    table, heads, planes, places, valid, weights, grids, sums, num_rays, slots, channels, num_mpis,
+    HAS_CUBE: tl.constexpr, CHANNELS: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Sums over samples at places in the heads; a lane a ray."""
+    ray, column = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK), tl.arange(0, CHANNELS)[None, :]
+    inside = ray < num_rays
+    mass = ray * 0.0
+    total = mass[:, None] * column
+    squares = total
+    for s in range(slots):
+        slot = ray.to(tl.int64) * slots + s
+        known = tl.load(valid + slot, inside, 0) != 0
+        head, z = tl.load(heads + slot, known, 0), tl.load(planes + slot, known, 0).to(tl.int64)
+        weight, grid = tl.load(weights + slot, known, 0.0), grids + head * INTS
+        x, fx = cell(tl.load(places + 3 * slot, known, 0.0), tl.load(grid + WIDTH))
+        y, fy = cell(tl.load(places + 3 * slot + 1, known, 0.0), tl.load(grid + HEIGHT))
+        in_cube, fz = head >= num_mpis, fx * 0
+        if HAS_CUBE:
+            lower, fraction = cell(tl.load(places + 3 * slot + 2, known, 0.0), tl.load(grid + DEPTH))
+            z, fz = tl.where(in_cube, lower, z), tl.where(in_cube, fraction, 0.0)
+        raw = total * 0
+        for tap in tl.static_range(8 if HAS_CUBE else 4):
+            dx, dy, dz = tap % 2, tap // 2 % 2, tap // 4
+            share = (fx if dx else 1 - fx) * (fy if dy else 1 - fy) * (fz if dz else 1 - fz)
+            reads = known & (in_cube | (dz == 0))
+            row = row_of(grids, head, z + dz, y + dy, x + dx, reads)
+            read = tl.load(table + row[:, None] * channels + column, reads[:, None] & (column < channels), 0.0)
+            raw += tl.where(reads, share, 0.0)[:, None] * read
+        value = weight[:, None] * activate(raw, column)
+        total += value
+        squares += value * activate(raw, column)
+        mass += weight
+    store_sums(sums, ray, inside, channels, total, mass, squares, column)
+
+
+@triton.jit
+def read_taps(values, positions, shares, number, known, channels, column, TAPS: tl.constexpr):
+    """Interpolated texels of samples."""
+    raw = number[:, None] * column * 0.0
+    for tap in tl.static_range(TAPS):
+        row = tl.load(positions + number * TAPS + tap, known, 0).to(tl.int64)
+        share = tl.load(shares + number * TAPS + tap, known, 0.0)
+        read = tl.load(values + row[:, None] * channels + column, known[:, None] & (column < channels), 0.0)
+        raw += share[:, None] * read
+    return raw
+
+
+@triton.jit
+def gather_kernel(
+    values, numbers, weights, positions, shares, cube_positions, cube_shares, sums, num_rays, slots, channels, planar,
+    HAS_CUBE: tl.constexpr, CHANNELS: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Sums over samples of known taps: ``numbers`` says which sample a slot holds; ``planar`` are on planes."""
+    ray, column = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK), tl.arange(0, CHANNELS)[None, :]
+    inside = ray < num_rays
+    mass = ray * 0.0
+    total = mass[:, None] * column
+    squares = total
+    for s in range(slots):
+        slot = ray.to(tl.int64) * slots + s
+        number = tl.load(numbers + slot, inside, -1)
+        on_plane, in_cube = (number >= 0) & (number < planar), number >= planar
+        raw = read_taps(values, positions, shares, number, on_plane, channels, column, 4)
+        if HAS_CUBE:
+            raw += read_taps(values, cube_positions, cube_shares, number - planar, in_cube, channels, column, 8)
+        weight = tl.load(weights + slot, number >= 0, 0.0)
+        value = weight[:, None] * activate(raw, column)
+        total += value
+        squares += value * activate(raw, column)
+        mass += weight
+    store_sums(sums, ray, inside, channels, total, mass, squares, column)
+
+
+@triton.jit
+def gather_back_kernel(
+    values, slots, wanted, weights, positions, shares, to_sums, to_first, to_second, to_values, to_weights,
+    count, slots_per_ray, channels, NEEDED: tl.constexpr, TAPS: tl.constexpr, CHANNELS: tl.constexpr,
+    BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Gradients of texels (added to what is there) and weights; a lane a sample."""
+    number, column = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK), tl.arange(0, CHANNELS)[None, :]
+    inside = number < count
+    slot = tl.load(slots + number, inside, 0)
+    ray = slot // slots_per_ray
+    inside = inside & (tl.load(wanted + ray, inside, 0) != 0)
+    value = activate(read_taps(values, positions, shares, number, inside, channels, column, TAPS), column)
+    filled, is_color = inside[:, None] & (column < channels), inside[:, None] & (column < 3)
+    slope = tl.load(to_sums + ray[:, None] * channels + column, filled, 0.0)
+    tl.store(to_weights + slot, tl.sum(slope * value, 1), inside)
+    if NEEDED:
+        slope += tl.load(to_first + ray[:, None] * 3 + column, is_color, 0.0)
+        slope += 2 * value * tl.load(to_second + ray[:, None] * 3 + column, is_color, 0.0)
+        inner = tl.where(column < 3, value * (1 - value), 1 - value * value)
+        down = tl.load(weights + slot, inside, 0.0)[:, None] * slope * inner
+        for tap in tl.static_range(TAPS):
+            row = tl.load(positions + number * TAPS + tap, inside, 0).to(tl.int64)
+            share = tl.load(shares + number * TAPS + tap, inside, 0.0)
+            tl.atomic_add(to_values + row[:, None] * channels + column, share[:, None] * down, filled, sem="relaxed")
+
+
+def _split(sums: Float[Tensor, "R N"], channels: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    gathered, mass, second = sums.split([channels, 1, COLORS], -1)
+    return gathered, mass, gathered[:, :COLORS].clone(), second
+
+
+def _sizes(channels: int, device: torch.device) -> tuple[int, int]:
+    """Columns, and rays or samples, of a program."""
+    columns = max(4, triton.next_power_of_2(channels))  # colours take three, however few there are
+    return columns, block_size(max(8, NUMBERS // columns), device)
+
+
+class _GatherTaps(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, values: Tensor, weights: Tensor, slots: Tensor, wanted: Tensor, *taps: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        held = [x.contiguous() for x in (values, weights, slots, wanted, *taps)]
+        values, weights, slots, wanted, positions, shares, cube_positions, cube_shares = held
+        (num_rays, width), channels, device = weights.shape, values.shape[1], values.device
+        numbers = torch.full((num_rays, width), -1, dtype=torch.int32, device=device)
+        numbers.view(-1)[slots] = torch.arange(len(slots), dtype=torch.int32, device=device)
+        numbers.masked_fill_(~wanted[:, None], -1)
+        sums, (columns, block) = torch.zeros(num_rays, channels + 1 + COLORS, device=device), _sizes(channels, device)
+        if len(slots):
+            gather_kernel[(triton.cdiv(num_rays, block),)](
+                values, numbers, weights, positions, shares, cube_positions, cube_shares, sums,
+                num_rays, width, channels, len(positions),
+                HAS_CUBE=len(cube_positions) > 0, CHANNELS=columns, BLOCK=block,
+            )  # fmt: skip
+        ctx.save_for_backward(*held)
+        found = _split(sums, channels)
+        ctx.mark_non_differentiable(found[1])
+        return found
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
+        values, weights, slots, wanted, *taps = ctx.saved_tensors
+        to_sums, _, to_first, to_second = (g.contiguous() for g in grad_outputs)
+        needed, channels = ctx.needs_input_grad[0], values.shape[1]
+        to_values, to_weights = torch.zeros_like(values) if needed else values, torch.zeros_like(weights)
+        columns, block = _sizes(channels, values.device)
+        for own, positions, shares in zip(
+            slots.split([len(taps[0]), len(taps[2])]), taps[::2], taps[1::2], strict=True
+        ):
+            if len(own):
+                gather_back_kernel[(triton.cdiv(len(own), block),)](
+                    values, own, wanted, weights, positions, shares, to_sums, to_first, to_second, to_values,
+                    to_weights, len(own), weights.shape[1], channels,
+                    NEEDED=needed, TAPS=shares.shape[1], CHANNELS=columns, BLOCK=block,
+                )  # fmt: skip
+        return to_values if needed else None, to_weights, None, None, None, None, None, None
+
+
+def gather_taps(
+    values: Float[Tensor, "U C"],
+    groups: list[KnownTaps],
+    slots: Int[Tensor, "N"],
+    weights: Float[Tensor, "R S"],
+    wanted: Bool[Tensor, "R"],
+) -> RaySums:
+    """See ``reference.gather_taps``."""
+    found = {g.shares.shape[1]: (g.positions, g.shares) for g in groups}
+    none = {n: (slots.new_zeros(0, n), weights.new_zeros(0, n)) for n in (4, 8)}
+    taps = [x for pair in (none | found).values() for x in pair]
+    return RaySums(*_GatherTaps.apply(values, weights, slots, wanted, *taps))  # type: ignore[misc]
+
+
+def gather_places(
+    scene: TritonScene,
+    table: Float[Tensor, "T C"],
+    heads: Int[Tensor, "R S"],
+    planes: Int[Tensor, "R S"],
+    ndc: Float[Tensor, "R S 3"],
+    valid: Bool[Tensor, "R S"],
+    weights: Float[Tensor, "R S"],
+) -> RaySums:
+    """See ``reference.gather_places``."""
+    (num_rays, slots), channels, device = weights.shape, table.shape[1], table.device
+    held = [x.detach().contiguous() for x in (table, heads, planes, ndc, valid, weights)]
+    sums, (columns, block) = torch.empty(num_rays, channels + 1 + COLORS, device=device), _sizes(channels, device)
+    if num_rays:
+        gather_places_kernel[(triton.cdiv(num_rays, block),)](
+            *held, scene.grids, sums, num_rays, slots, channels, scene.num_mpis,
+            HAS_CUBE=scene.num_heads > scene.num_mpis, CHANNELS=columns, BLOCK=block,
+        )  # fmt: skip
+    return RaySums(*_split(sums, channels))
