@@ -21,8 +21,10 @@ Shading = Literal["ray", "sample"]
 """Whether a network is asked once a ray or for every sample."""
 
 
+CHANGE = 4.0
+"""Change of the logarithm of a colour's odds for each unit that the network says: a middle grey then changes by one."""
 MOST_CHANGE = 8.0
-"""Bound of the network's change of the logarithm of a colour's odds."""
+"""Bound of that change."""
 LEAST_MASS = 1e-6
 """Rays whose samples weigh less show next to nothing, whatever colour that is."""
 
@@ -78,11 +80,11 @@ class RayShader(Networks):
         return RayColors(composite.accumulation * shaded, sums.mass, sums.first, sums.second)
 
 
-def change_odds(color: Float[Tensor, "R 3"], change: Float[Tensor, "R 3"]) -> Float[Tensor, "R 3"]:
+def change_odds(color: Float[Tensor, "R 3"], said: Float[Tensor, "R 3"]) -> Float[Tensor, "R 3"]:
     """Colours whose odds c / (1 - c) are e^change times those given: sigmoid(logit(c) + change), without the logit.
 
     So black and white are colours like others, and gradients pass where a clipped sum would end them. The change is
-    bounded, as factors beyond e^8 would magnify the rounding of the colour.
+    ``CHANGE`` times what the network says, and bounded: larger factors would magnify the rounding of the colour.
     """
-    factor = torch.exp(-MOST_CHANGE * torch.tanh(change / MOST_CHANGE))
+    factor = torch.exp(-MOST_CHANGE * torch.tanh(said * (CHANGE / MOST_CHANGE)))
     return color / (color + (1 - color) * factor)

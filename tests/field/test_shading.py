@@ -53,7 +53,7 @@ def shaded_by_hand(networks, mean, direction):
     hidden = np.maximum(layers[0] @ x + layers[1], 0)
     hidden = np.maximum(layers[2] @ hidden + layers[3], 0)
     change = layers[4] @ hidden + layers[5]
-    return 1 / (1 + np.exp(-(np.log(mean[:3] / (1 - mean[:3])) + 8 * np.tanh(change / 8))))
+    return 1 / (1 + np.exp(-(np.log(mean[:3] / (1 - mean[:3])) + 8 * np.tanh(change / 2))))
 
 
 class RawTexels(OracleRay):
@@ -201,6 +201,6 @@ def test_colours_stay_between_0_and_1_whatever_the_network_says(change):
 def test_changed_odds_and_their_gradients_are_those_of_the_formula():
     color = torch.tensor([[0.1, 0.5, 0.97]], dtype=F64, requires_grad=True)
     change = torch.tensor([[1.5, -2.0, 0.3]], dtype=F64, requires_grad=True)
-    wanted = torch.sigmoid(torch.logit(color) + 8 * torch.tanh(change / 8))
+    wanted = torch.sigmoid(torch.logit(color) + 8 * torch.tanh(change / 2))
     assert torch.allclose(change_odds(color, change), wanted, atol=1e-12)
     assert torch.autograd.gradcheck(change_odds, (color, change))
