@@ -145,7 +145,7 @@ def _split(sums: Float[Tensor, "R N"], channels: int) -> tuple[Tensor, Tensor, T
 
 def _sizes(channels: int, device: torch.device) -> tuple[int, int]:
     """Columns, and rays or samples, of a program."""
-    columns = max(4, triton.next_power_of_2(channels))  # colours take three, however few there are
+    columns = max(4, int(triton.next_power_of_2(channels)))  # colours take three, however few there are
     return columns, block_size(max(8, NUMBERS // columns), device)
 
 
