@@ -16,7 +16,7 @@ import shutil
 import subprocess
 import tempfile
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from itertools import pairwise
 from pathlib import Path
 from typing import Literal
@@ -97,8 +97,12 @@ def in_parts(work: Callable[[int, int], None], count: int, least: int = 256) -> 
     if threads == 1:
         return work(0, count)
     bounds = [count * i // threads for i in range(threads + 1)]
-    for done in [_pool(threads).submit(work, a, b) for a, b in pairwise(bounds)]:
-        done.result()
+    parts = [_pool(threads).submit(work, a, b) for a, b in pairwise(bounds)]
+    try:
+        for part in parts:
+            part.result()
+    finally:
+        wait(parts)  # also when interrupted: the caller's tensors are freed then, and the kernels write to them
 
 
 @functools.cache
