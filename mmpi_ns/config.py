@@ -69,7 +69,7 @@ mmpi_small = _method(
     "MMPI in a size that a two-core CPU trains in minutes.",
     steps=DEFAULTS["mmpi-small"].steps,
     rays=DEFAULTS["mmpi-small"].rays,
-    model=MMPIModelConfig(placement=DEFAULTS["mmpi-small"].placement, hidden_width=32),
+    model=MMPIModelConfig(placement=DEFAULTS["mmpi-small"].placement),
 )
 mmpi_kitti = _method(
     "mmpi-kitti",

@@ -94,11 +94,11 @@ class MMPIModelConfig(ModelConfig):
     shared_colour: bool = False
     """Shading of samples: one colour network for all MPIs instead of one each."""
     feature_channels: int = 9
-    """Colour features of a texel."""
+    """Numbers of a texel beside its density: three of a colour, the others of what depends on the view."""
     hidden_width: int = 64
-    """Width of the colour networks."""
+    """Width of the networks."""
     position_frequencies: int = 2
-    """Octaves of the positional encoding of NDC positions."""
+    """Shading of samples: octaves of the positional encoding of NDC positions."""
     direction_frequencies: int = 2
     """Octaves of the positional encoding of directions."""
     samples_per_voxel: float = 1.0
