@@ -78,8 +78,6 @@ def make_cameras(
         focal: focal length in pixels, from the command line.
         lens: distortion model where none is given.
     """
-    if focal is not None and focal <= 0:
-        raise PrepareError("--focal must be positive, in pixels.")
     cameras: dict[int, pycolmap.Camera] = {}
     for photo, number in zip(photos, numbers, strict=True):
         if number in cameras:

@@ -12,6 +12,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from mmpi_ns.prepare.images import in_short
 from mmpi_ns.prepare.mapping import adjust, bundle_options, is_bent
 from mmpi_ns.prepare.stages import PrepareError
 
@@ -36,9 +37,26 @@ FOCAL_OFF = 0.03
 class Finding:
     """Something to look at."""
 
+    kind: str
+    """One word and a question mark: what may be the matter."""
     image: str
     """Empty for the scene as a whole."""
     says: str
+    badness: float = 1.0
+    """Sorts findings of a kind."""
+
+
+def by_kind(findings: Sequence[Finding]) -> list[str]:
+    """A line for each kind: the worst finding in words, and the other images, worst first."""
+    kinds: dict[str, list[Finding]] = {}
+    for finding in sorted(findings, key=lambda f: -f.badness):
+        kinds.setdefault(finding.kind, []).append(finding)
+    lines = []
+    for kind, (worst, *others) in kinds.items():
+        image = f"{worst.image}: " if worst.image else ""
+        rest = f"; then {in_short([f.image or f.says for f in others], 6)}" if others else ""
+        lines.append(f"{kind} {image}{worst.says}{rest}")
+    return lines
 
 
 def sharpness(gray: NDArray[np.uint8]) -> float:
@@ -74,7 +92,7 @@ def blurred(names: Sequence[str], sharp: Array, ordered: bool) -> list[Finding]:
     share = sharp / np.maximum(usual, 1e-12)
     what = "its neighbours" if ordered else "the others"
     return [
-        Finding(names[i], f"blurred? {share[i]:.0%} as sharp as {what}")
+        Finding("blurred?", names[i], f"{share[i]:.0%} as sharp as {what}", -share[i])
         for i in range(len(names))
         if share[i] < BLURRED
     ]
@@ -100,11 +118,10 @@ def misplaced(names: Sequence[str], places: Sequence[int], poses: Array) -> list
     for i in range(len(steps)):
         where = f"between {names[i]} and {names[i + 1]}"
         if steps[i] > JUMP * usual_step[i] + floor:
-            found.append(
-                Finding(names[i + 1], f"misplaced? a step of {steps[i] / usual_step[i]:.0f} usual ones {where}")
-            )
+            times = steps[i] / max(usual_step[i], 1e-12)
+            found.append(Finding("misplaced?", names[i + 1], f"a step of {times:.0f} usual ones {where}", times))
         elif turns[i] > JUMP * usual_turn[i] + TURN:
-            found.append(Finding(names[i + 1], f"misplaced? a turn of {turns[i]:.0f} degrees {where}"))
+            found.append(Finding("misplaced?", names[i + 1], f"a turn of {turns[i]:.0f} degrees {where}", turns[i]))
     return found
 
 
@@ -147,9 +164,8 @@ def moving(model: pycolmap.Reconstruction, database: Path, names: Sequence[str])
                 continue
             share = _moving_share(model, pair, matches)
             if share > 0:
-                found.append(
-                    Finding(name, f"moving? {share:.0%} of the image's cells do not follow the camera's motion")
-                )
+                says = f"{share:.0%} of the image's cells do not follow the camera's motion: mask it (--masks)"
+                found.append(Finding("moving?", name, says, share))
     return found
 
 
@@ -188,7 +204,7 @@ def doubtful_intrinsics(model: pycolmap.Reconstruction, fixed: bool, copy: Path,
     found = []
     if is_bent(model):
         error = model.compute_mean_reprojection_error()
-        found.append(Finding("", f"bent? a reprojection error of {error:.2f} px is high: the track may be wrong"))
+        found.append(Finding("bent?", "", f"a reprojection error of {error:.2f} px is high: the track may be wrong"))
     if fixed:
         free = pycolmap.Reconstruction(copy)
         before = free.compute_mean_reprojection_error()
@@ -198,9 +214,9 @@ def doubtful_intrinsics(model: pycolmap.Reconstruction, fixed: bool, copy: Path,
             given, fits = camera.mean_focal_length(), free.cameras[number].mean_focal_length()
             if abs(fits / given - 1) > FOCAL_OFF and after < 0.9 * before:
                 says = f"the given focal length {given:.1f} px does not fit: {fits:.1f} px would bring the error"
-                found.append(Finding("", f"intrinsics? {says} from {before:.2f} to {after:.2f} px"))
+                found.append(Finding("intrinsics?", "", f"{says} from {before:.2f} to {after:.2f} px"))
     for camera in model.cameras.values():
         ratio = camera.mean_focal_length() / max(camera.width, camera.height)
         if not 0.3 < ratio < 4:
-            found.append(Finding("", f"intrinsics? a focal length of {ratio:.2f} image sides is unusual"))
+            found.append(Finding("intrinsics?", "", f"a focal length of {ratio:.2f} image sides is unusual"))
     return found

@@ -16,7 +16,7 @@ from PIL import Image
 from mmpi_ns.prepare.cameras import Intrinsics, read_intrinsics
 from mmpi_ns.prepare.frame import camera_poses
 from mmpi_ns.prepare.images import Photo
-from mmpi_ns.prepare.stages import PrepareError, progress, write_text
+from mmpi_ns.prepare.stages import PrepareError, progress, whole, write_text
 
 IDENTITY = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]]
 """Stated outright: nerfstudio-data invents an axis swap where colmap/sparse/0 exists without it."""
@@ -41,7 +41,7 @@ def split_by_count(names: Sequence[str], test_every: int | None, train_every: in
     """
     if test_every == 0:
         return Split(tuple(names), tuple(names), "every image trains and tests (--test-every 0): scores mean nothing")
-    every = train_every or test_every or 8
+    every = train_every or test_every or min(8, len(names))
     picked = {n for i, n in enumerate(names) if i % every == every // 2}
     rest = {n for n in names if n not in picked}
     train, test = (picked, rest) if train_every else (rest, picked)
@@ -56,12 +56,10 @@ def split_from(lists: dict[str, Any], names: Sequence[str], source: str) -> Spli
     """The split of another scene's transforms.json; images it does not list are left out of both.
 
     Raises:
-        PrepareError: the file has no lists, or they name none of the images.
+        PrepareError: the lists name none of the images.
     """
     sides = []
     for key in ("train_filenames", "test_filenames"):
-        if key not in lists:
-            raise PrepareError(f"{source} has no {key}: it needs train_filenames and test_filenames.")
         wanted = {Path(str(n)).name for n in lists[key]}
         sides.append(tuple(n for n in names if n in wanted))
         if not sides[-1]:
@@ -115,17 +113,6 @@ def _camera_entry(lens: Intrinsics, camera: pycolmap.Camera) -> dict[str, Any]:
     return entry | dict(zip(keys, lens.distortion, strict=True))
 
 
-def write_points(model: pycolmap.Reconstruction, path: Path) -> None:
-    """sparse_pc.ply: positions and colours, binary."""
-    table = np.zeros(len(model.points3D), [(a, "<f4") for a in "xyz"] + [(c, "u1") for c in ("red", "green", "blue")])
-    for row, (_, point) in zip(table, sorted(model.points3D.items()), strict=True):
-        row["x"], row["y"], row["z"] = point.xyz
-        row["red"], row["green"], row["blue"] = point.color
-    properties = [f"property float {a}" for a in "xyz"] + [f"property uchar {c}" for c in ("red", "green", "blue")]
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}", *properties, "end_header", ""]
-    path.write_bytes("\n".join(header).encode() + table.tobytes())
-
-
 def write_images(source: Path, photos: Sequence[Photo], scene: Path, factors: Sequence[int]) -> None:
     """Images and their downscaled copies. Copies that are whole are kept."""
     with progress("Writing images", len(photos)) as advance:
@@ -148,17 +135,14 @@ def write_masks(source: Path, photos: Sequence[Photo], scene: Path, factors: Seq
 def copy_once(source: Path, target: Path) -> None:
     if target.exists():
         return
-    target.parent.mkdir(parents=True, exist_ok=True)
-    partial = target.with_name(target.name + ".partial")
-    shutil.copyfile(source, partial)
-    partial.replace(target)
+    with whole(target) as partial:
+        shutil.copyfile(source, partial)
 
 
 def downscale(source: Path, target: Path, factor: int, mask: bool = False) -> None:
     """Box-filtered copy of floor(size / factor) pixels, cut at the far edges so that cameras scale by 1 / factor."""
     if target.exists():
         return
-    target.parent.mkdir(parents=True, exist_ok=True)
     with Image.open(source) as image:
         width, height = (n // factor * factor for n in image.size)
         image = image.crop((0, 0, width, height))
@@ -172,19 +156,18 @@ def downscale(source: Path, target: Path, factor: int, mask: bool = False) -> No
 
 def save_like(image: Image.Image, target: Path) -> None:
     """Writes an image whole or not at all, JPEG at high quality."""
-    partial = target.with_name(target.name + ".partial")
-    if target.suffix.lower() == ".png":
-        image.save(partial, format="PNG")
-    else:
-        image.convert("L" if image.mode == "L" else "RGB").save(partial, format="JPEG", quality=97, subsampling=0)
-    partial.replace(target)
+    with whole(target) as partial:
+        if target.suffix.lower() == ".png":
+            image.save(partial, format="PNG")
+        else:
+            image.convert("L" if image.mode == "L" else "RGB").save(partial, format="JPEG", quality=97, subsampling=0)
 
 
 def write_scene(model: pycolmap.Reconstruction, scene: Path, content: dict[str, Any]) -> None:
     """Everything that is derived from the model; transforms.json last."""
     (scene / "colmap" / "sparse" / "0").mkdir(parents=True, exist_ok=True)
     model.write(scene / "colmap" / "sparse" / "0")
-    write_points(model, scene / "sparse_pc.ply")
+    model.export_PLY(scene / "sparse_pc.ply")
     write_text(scene / "transforms.json", json.dumps(content, indent=1))
 
 

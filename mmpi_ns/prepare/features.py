@@ -10,7 +10,7 @@ from pathlib import Path
 import pycolmap
 
 from mmpi_ns.prepare.images import Photo
-from mmpi_ns.prepare.stages import PrepareError, progress
+from mmpi_ns.prepare.stages import PrepareError, progress, whole
 
 SEED = 0
 BATCH = 8
@@ -41,10 +41,9 @@ def create_database(
     """A database of the images and cameras; image ids follow the images' order, whatever the threads do later."""
     if path.exists():
         return
-    partial = path.with_suffix(".partial")
-    partial.unlink(missing_ok=True)
+    path.with_name(path.name + ".partial").unlink(missing_ok=True)
     model = empty_model(photos, numbers, cameras)
-    with pycolmap.Database.open(partial) as database:
+    with whole(path) as partial, pycolmap.Database.open(partial) as database:
         for camera in cameras:
             database.write_camera(camera, use_camera_id=True)
         for rig in model.rigs.values():
@@ -52,7 +51,6 @@ def create_database(
         for image_id in range(1, len(photos) + 1):
             database.write_frame(model.frames[model.images[image_id].frame_id], use_frame_id=True)
             database.write_image(model.images[image_id], use_image_id=True)
-    partial.rename(path)
 
 
 def empty_model(

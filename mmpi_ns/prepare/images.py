@@ -12,9 +12,11 @@ from pathlib import Path
 import numpy as np
 from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 
-from mmpi_ns.prepare.stages import CONSOLE, PrepareError, progress, write_text
+from mmpi_ns.prepare.stages import PrepareError, progress, say, whole, write_text
 
 IMAGES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
+HEIF = (".heic", ".heif")
+"""What telephones write; read where pillow-heif is installed."""
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg")
 KEPT = {"JPEG": (".jpg", ".jpeg"), "PNG": (".png",)}
 """Formats that are copied as they are; others become PNG."""
@@ -46,14 +48,46 @@ def find_images(folder: Path) -> list[Path]:
     """
     if not folder.is_dir():
         raise PrepareError(f"{folder} is no folder of images and no video ({', '.join(VIDEOS)}).")
-    found = [p for p in folder.iterdir() if p.suffix.lower() in IMAGES and p.is_file()]
-    found = found or [p for p in folder.rglob("*") if p.suffix.lower() in IMAGES and p.is_file()]
+    readable = (*IMAGES, *(HEIF if reads_heif() else ()))
+    files = [p for p in folder.rglob("*") if p.is_file() and not p.name.startswith(".")]
+    images = [p for p in files if p.suffix.lower() in readable]
+    found = [p for p in images if p.parent == folder] or images
+    _tell_unread(sorted(set(files) - set(found)), folder)
     if len(found) < 2:
         count = "no image" if not found else f"one image only ({found[0].name})"
         raise PrepareError(
-            f"{folder} holds {count} ({', '.join(IMAGES)}): a scene needs at least two views, and rather twenty."
+            f"{folder} holds {count} ({', '.join(readable)}): a scene needs at least two views, and rather twenty."
         )
     return sorted(found, key=lambda p: natural_key(str(p.relative_to(folder))))
+
+
+def reads_heif() -> bool:
+    """Whether Pillow reads HEIC, which pillow-heif teaches it."""
+    try:
+        from pillow_heif import register_heif_opener  # type: ignore[import-not-found]
+    except ImportError:
+        return False
+    register_heif_opener()
+    return True
+
+
+def _tell_unread(files: Sequence[Path], folder: Path) -> None:
+    """Counts and names what is left out, by kind."""
+    kinds: dict[str, list[str]] = {}
+    for file in files:
+        kinds.setdefault(file.suffix.lower() or "no suffix", []).append(str(file.relative_to(folder)))
+    for kind, names in sorted(kinds.items()):
+        why = "are not read"
+        if kind in HEIF:
+            why = "are not read: pip install pillow-heif, and start again"
+        elif kind in IMAGES:
+            why = "are in subfolders and left out, as the folder has images of its own"
+        say(f"{len(names)} {kind} files {why} ({in_short(names)}).", "yellow")
+
+
+def in_short(names: Sequence[str], most: int = 4) -> str:
+    """The first names, and how many more there are."""
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 def natural_key(text: str) -> list[tuple[int, int | str]]:
@@ -67,10 +101,10 @@ def scene_names(files: Sequence[Path], folder: Path) -> list[str]:
     for file in files:
         # COLMAP's list of pairs is split at blanks
         stem = re.sub(r"\s+", "_", "-".join(file.relative_to(folder).with_suffix("").parts))
-        suffix = file.suffix.lower() if file.suffix.lower() in (".jpg", ".jpeg", ".png") else ".png"
-        name = stem + (file.suffix if suffix == file.suffix.lower() else suffix)
+        kind = file.suffix.lower()
+        name = stem + (file.suffix if kind in (".jpg", ".jpeg", ".png") else ".jpg" if kind in HEIF else ".png")
         while Path(name).stem.lower() in used:  # masks and downscaled copies go by the stem
-            name = Path(name).stem + "_" + suffix
+            name = Path(name).stem + "_" + Path(name).suffix
         used.add(Path(name).stem.lower())
         names.append(name)
     return names
@@ -103,25 +137,33 @@ def read_photos(target: Path) -> list[Photo]:
 
 
 def _gather_one(source: Path, copy: Path, shown: str) -> Photo:
-    try:
-        with Image.open(source) as image:
-            image.load()
-            exif = image.getexif()
-            turned = exif.get(ExifTags.Base.Orientation, 1) not in (0, 1)
-            keep = not turned and source.suffix.lower() in KEPT.get(image.format or "", ())
-            keep = keep and image.mode in ("L", "RGB", "RGBA")
-            width, height = ImageOps.exif_transpose(image).size if turned else image.size
-            partial = copy.with_name(copy.name + ".partial")
-            if not copy.exists():
-                if keep:
-                    shutil.copyfile(source, partial)
-                else:
-                    _convert(image, partial, copy.suffix.lower())
-                partial.replace(copy)
-    except (OSError, UnidentifiedImageError, SyntaxError, ValueError) as error:
-        raise PrepareError(f"{source} cannot be read ({error}): repair or remove it.") from error
+    image = open_image(source)
+    exif = image.getexif()
+    turned = exif.get(ExifTags.Base.Orientation, 1) not in (0, 1)
+    keep = not turned and source.suffix.lower() in KEPT.get(image.format or "", ())
+    width, height = ImageOps.exif_transpose(image).size if turned else image.size
+    if not copy.exists():
+        with whole(copy) as partial:
+            if keep and image.mode in ("L", "RGB", "RGBA"):
+                shutil.copyfile(source, partial)
+            else:
+                _convert(image, partial, copy.suffix.lower())
     lens, focal = _read_exif(exif, max(width, height))
     return Photo(copy.name, width, height, lens, focal, shown)
+
+
+def open_image(path: Path) -> Image.Image:
+    """An image, decoded.
+
+    Raises:
+        PrepareError: it cannot be read; names the file.
+    """
+    try:
+        with Image.open(path) as image:
+            image.load()
+            return image
+    except (OSError, UnidentifiedImageError, SyntaxError, ValueError) as error:
+        raise PrepareError(f"{path} cannot be read ({error}): repair or remove it.") from error
 
 
 def _convert(image: Image.Image, path: Path, suffix: str) -> None:
@@ -159,8 +201,6 @@ def gather_masks(folder: Path, photos: Sequence[Photo], target: Path) -> int:
     Raises:
         PrepareError: no mask fits an image, or one has another size.
     """
-    if not folder.is_dir():
-        raise PrepareError(f"--masks {folder} is no folder.")
     by_name = _masks_by_name(folder)
     target.mkdir(parents=True, exist_ok=True)
     found = 0
@@ -170,8 +210,7 @@ def gather_masks(folder: Path, photos: Sequence[Photo], target: Path) -> int:
         mask = Image.new("L", (photo.width, photo.height), 255)
         if source is not None:
             found += 1
-            with Image.open(source) as image:
-                mask = ImageOps.exif_transpose(image).convert("L").point(lambda v: 255 if v else 0)
+            mask = ImageOps.exif_transpose(open_image(source)).convert("L").point(lambda v: 255 if v else 0)
             if mask.size != (photo.width, photo.height):
                 raise PrepareError(
                     f"Mask {source} is {mask.size[0]}x{mask.size[1]}, its image {photo.name} "
@@ -181,7 +220,7 @@ def gather_masks(folder: Path, photos: Sequence[Photo], target: Path) -> int:
     if not found:
         raise PrepareError(f"No mask in {folder} is named like an image (a.png or a.jpg.png for a.jpg).")
     if found < len(photos):
-        CONSOLE.print(f"[yellow]{len(photos) - found} of {len(photos)} images have no mask: all of them is used.")
+        say(f"{len(photos) - found} of {len(photos)} images have no mask: all of them is used.", "yellow")
     return found
 
 
@@ -189,9 +228,9 @@ def _masks_by_name(folder: Path) -> dict[str, Path]:
     """Masks by their path below the folder without suffix, and by their stem where no other has it."""
     files = [p for p in sorted(folder.rglob("*")) if p.suffix.lower() in IMAGES]
     by_name: dict[str, Path] = {}
-    for whole in (True, False):
-        keys = [_bare(p.relative_to(folder)).as_posix() if whole else _bare(p).name for p in files]
-        by_name |= {k: p for k, p in zip(keys, files, strict=True) if whole or keys.count(k) == 1}
+    for with_folder in (True, False):
+        keys = [_bare(p.relative_to(folder)).as_posix() if with_folder else _bare(p).name for p in files]
+        by_name |= {k: p for k, p in zip(keys, files, strict=True) if with_folder or keys.count(k) == 1}
     return by_name
 
 

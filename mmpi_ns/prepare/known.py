@@ -12,7 +12,7 @@ from mmpi_ns.capture.tracks import MIN_ANGLE
 from mmpi_ns.prepare.features import SEED, matched_keypoints, quiet
 from mmpi_ns.prepare.frame import camera_poses, similarity_between
 from mmpi_ns.prepare.mapping import adjust, bundle_options
-from mmpi_ns.prepare.stages import CONSOLE, PrepareError
+from mmpi_ns.prepare.stages import PrepareError, say
 
 ROUNDS = 3
 """Times that poses are refined and the points triangulated anew."""
@@ -70,7 +70,7 @@ def solve_known(
         _, refined = camera_poses(model)
         model.transform(similarity_between(refined, given))
         says = f"{says}; refined, {model.compute_mean_reprojection_error():.2f} px; {_changes(given, model)}"
-    CONSOLE.print(says)
+    say(says)
     return KnownModel(model, says)
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pycolmap
 
 from mmpi_ns.prepare.features import SEED, count_matching_pairs, quiet
-from mmpi_ns.prepare.stages import CONSOLE, PrepareError, progress
+from mmpi_ns.prepare.stages import PrepareError, progress, say
 
 ENOUGH = 0.95
 """Share of the images that, once registered, ends the trying."""
@@ -100,7 +100,7 @@ def reconstruct(
         size = models[0][0].num_reg_images() if models else 0
         tried.append((attempt.name, size))
         says = f", {models[0][0].compute_mean_reprojection_error():.2f} px" if models else ""
-        CONSOLE.print(f"Mapping, {attempt.name} ({attempt.says}): {size} of {total} images{says}.")
+        say(f"Mapping, {attempt.name} ({attempt.says}): {size} of {total} images{says}.")
         if models and (best is None or _quality(models[0][0]) > _quality(best.models[0])):
             best = Mapping(tuple(m for m, _ in models), models[0][1], attempt.name, ())
         if size >= ENOUGH * total and not is_bent(models[0][0]):
@@ -156,16 +156,18 @@ def _run(
         (folder / "snapshots").mkdir(exist_ok=True)
         options = mapper_options(attempt, refine, threads, total > MANY)
         options.snapshot_path, options.snapshot_frames_freq = folder / "snapshots", SNAPSHOT
-        if start is not None:
-            CONSOLE.print(f"Mapping, {attempt.name}: goes on from {pycolmap.Reconstruction(start).num_reg_images()}.")
+        known = pycolmap.Reconstruction(start).num_reg_images() if start is not None else 0
+        if known:
+            say(f"Mapping, {attempt.name}: goes on from {known} images.")
         with progress(f"Mapping, {attempt.name}", total) as advance, quiet():
+            advance(known)
             found = pycolmap.incremental_mapping(
                 database,
                 images,
                 folder / "models",
                 options,
                 input_path=start or "",
-                initial_image_pair_callback=_step(advance, 2),
+                initial_image_pair_callback=_step(advance, 2, 0),
                 next_image_callback=_step(advance, 1),
             )
         for number, model in found.items():  # COLMAP itself leaves out a model that it went on from
@@ -177,8 +179,8 @@ def _run(
     return sorted(models, key=lambda m: -m[0].num_reg_images())
 
 
-def _step(advance: Callable[[int], None], count: int) -> Callable[[], None]:
-    return lambda: advance(count)
+def _step(advance: Callable[..., None], count: int, start: int | None = None) -> Callable[[], None]:
+    return lambda: advance(count, start)
 
 
 def _latest_snapshot(folder: Path) -> Path | None:
@@ -253,20 +255,24 @@ def polish(
     Returns:
         The model to use.
     """
-    if principal_point:
-        adjust(model, bundle_options(True, True, True, threads))
-    if not full_lens or not any(c.model.name == "SIMPLE_RADIAL" for c in model.cameras.values()):
-        return model
-    full = pycolmap.Reconstruction(folder)
-    for camera in full.cameras.values():
-        if camera.model.name == "SIMPLE_RADIAL":
-            f, cx, cy, k = camera.params
-            camera.model = pycolmap.CameraModelId.OPENCV
-            camera.params = [f, f, cx, cy, k, 0.0, 0.0, 0.0]
-    adjust(full, bundle_options(True, True, principal_point, threads))
+    full_lens = full_lens and any(c.model.name == "SIMPLE_RADIAL" for c in model.cameras.values())
+    with progress("Fitting the lens", principal_point + full_lens) as advance:
+        if principal_point:
+            adjust(model, bundle_options(True, True, True, threads))
+            advance()
+        if not full_lens:
+            return model
+        full = pycolmap.Reconstruction(folder)
+        for camera in full.cameras.values():
+            if camera.model.name == "SIMPLE_RADIAL":
+                f, cx, cy, k = camera.params
+                camera.model = pycolmap.CameraModelId.OPENCV
+                camera.params = [f, f, cx, cy, k, 0.0, 0.0, 0.0]
+        adjust(full, bundle_options(True, True, principal_point, threads))
+        advance()
     before, after = model.compute_mean_reprojection_error(), full.compute_mean_reprojection_error()
     chosen = "OpenCV's four terms" if after < WORTH * before else "one radial term"
-    CONSOLE.print(f"Lens: {before:.3f} px with one radial term, {after:.3f} px with OpenCV's four: {chosen}.")
+    say(f"Lens: {before:.3f} px with one radial term, {after:.3f} px with OpenCV's four: {chosen}.")
     return full if after < WORTH * before else model
 
 

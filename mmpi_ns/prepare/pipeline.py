@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import shutil
 import time
 from collections.abc import Iterator, Sequence
@@ -20,8 +21,8 @@ from mmpi_ns.prepare.frame import SceneFrame, camera_poses, choose_frame
 from mmpi_ns.prepare.images import Photo
 from mmpi_ns.prepare.known import solve_known
 from mmpi_ns.prepare.poses import read_poses, rigid3d
-from mmpi_ns.prepare.settings import Settings
-from mmpi_ns.prepare.stages import CONSOLE, PrepareError, Stages
+from mmpi_ns.prepare.settings import Settings, check_options, read_lists
+from mmpi_ns.prepare.stages import PrepareError, Stages, only_one, progress, say, whole
 from mmpi_ns.prepare.undistort import undistort
 from mmpi_ns.prepare.video import select_frames
 
@@ -47,7 +48,6 @@ class Preparation:
         self.work = settings.scene / WORK
         self.times: dict[str, float] = {}
         self.notes: list[str] = []
-        check_folders(settings)
         self.stages = Stages(self.work)
 
     def run(self) -> None:
@@ -57,6 +57,7 @@ class Preparation:
             self.photos = self._read_input()
             self.masks = self._read_masks()
             self.known = read_poses(s.poses, s.poses_format, s.poses_axes, self.photos) if s.poses else None
+            self._split([p.name for p in self.photos])  # what cannot be split is better refused now
         self.is_fixed = self._set_cameras()
         with self._timed("features"):
             database = self._features()
@@ -142,9 +143,8 @@ class Preparation:
         def stage(folder: Path) -> Path:
             path = folder / "database.db"
             if not path.exists():
-                partial = path.with_suffix(".partial")
-                shutil.copyfile(database, partial)
-                partial.rename(path)
+                with whole(path) as partial:
+                    shutil.copyfile(database, partial)
             wanted, says = self._pairs(path)
             verified = features.match(path, self.photos, wanted, s.threads)
             says = f"{says}; {verified} of {len(wanted)} pairs match"
@@ -154,7 +154,7 @@ class Preparation:
         poses = {n: p.tolist() for n, p in self.known.poses.items()} if self.known else None
         path = self.stages.run("matches", [s.matching, s.overlap, poses], stage, lambda folder: folder / "database.db")
         self.matching = (path.parent / "says.txt").read_text(encoding="utf-8")
-        CONSOLE.print(f"Matching: {self.matching}.")
+        say(f"Matching: {self.matching}.")
         return path
 
     def _pairs(self, database: Path) -> tuple[pairs.Pairs, str]:
@@ -208,9 +208,8 @@ class Preparation:
         assert self.known is not None
         poses = {n: rigid3d(p) for n, p in self.known.poses.items()}
         model = features.empty_model(self.photos, self.numbers, self.cameras, poses)
-        result = solve_known(
-            model, database, self.image_folder, s.refine_poses, not self.is_fixed and s.refine_intrinsics, s.threads
-        )
+        refine = not self.is_fixed and s.refine_intrinsics
+        result = solve_known(model, database, self.image_folder, s.refine_poses, refine, s.threads)
         return Solved(result.model, f"{self.known.says}; {result.says}")
 
     def _move(self, model: pycolmap.Reconstruction) -> SceneFrame:
@@ -267,11 +266,7 @@ class Preparation:
     def _split(self, names: Sequence[str]) -> export.Split:
         s = self.settings
         if s.split_from is not None:
-            try:
-                lists = json.loads(s.split_from.read_text(encoding="utf-8"))
-            except (OSError, ValueError) as error:
-                raise PrepareError(f"--split-from {s.split_from} cannot be read ({error}).") from error
-            return export.split_from(lists, names, str(s.split_from.name))
+            return export.split_from(read_lists(s.split_from), names, s.split_from.name)
         if self.known is not None and self.known.split and s.test_every is None and s.train_every is None:
             return export.split_from(self.known.split, names, f"{s.poses}")
         return export.split_by_count(names, s.test_every, s.train_every)
@@ -282,7 +277,11 @@ class Preparation:
         names = [p.name for p in photos]
         is_ordered = self.is_video or pairs.are_numbered(names)
         found = checks.doubtful_intrinsics(model, self.is_fixed, self.work / "model" / "model", self.settings.threads)
-        sharp = np.array([checks.sharpness(checks.read_gray(self.image_folder / n)) for n in names])
+        sharp = np.zeros(len(names))
+        with progress("Checking images", len(names)) as advance:
+            for i, name in enumerate(names):
+                sharp[i] = checks.sharpness(checks.read_gray(self.image_folder / name))
+                advance(1)
         found += checks.blurred(names, sharp, is_ordered)
         if is_ordered:
             order, poses = camera_poses(model)
@@ -324,14 +323,17 @@ def publish(
     aside = scene / next(f"previous-{i}" for i in range(1, 10_000) if not (scene / f"previous-{i}").exists())
     export.publish(built, scene, aside)
     if aside.exists():
-        CONSOLE.print(f"What {scene} held is in {aside}.")
+        say(f"What {scene} held is in {aside}.")
     if not settings.keep_work:
         shutil.rmtree(scene / WORK)
-    CONSOLE.print(
-        f"[bold green]{scene}[/bold green]: {model.num_reg_images()} images, "
-        f"{model.compute_mean_reprojection_error():.2f} px, {len(split.train)} train, {len(split.test)} test, "
-        f"{len(findings)} warnings in report.md. Train with: ns-train mmpi --data {scene}"
+    for line in checks.by_kind(findings):
+        say(line, "yellow")
+    say(
+        f"{scene}: {model.num_reg_images()} images, {model.compute_mean_reprojection_error():.2f} px, "
+        f"{len(split.train)} train, {len(split.test)} test; report.md says more. Train with:",
+        "" if findings else "green",
     )
+    say(f"ns-train mmpi-small --data {shlex.quote(str(scene))}")
 
 
 def prepare(settings: Settings) -> None:
@@ -340,4 +342,7 @@ def prepare(settings: Settings) -> None:
     Raises:
         PrepareError: the input cannot be made into a scene.
     """
-    Preparation(settings).run()
+    check_options(settings)
+    check_folders(settings)
+    with only_one(settings.scene / WORK):
+        Preparation(settings).run()

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from mmpi_ns.prepare.cameras import Intrinsics
 from mmpi_ns.prepare.images import IMAGES, Photo, natural_key
-from mmpi_ns.prepare.stages import CONSOLE, PrepareError
+from mmpi_ns.prepare.stages import PrepareError, say
 
 Array = NDArray[np.float64]
 MAX_LAG = 0.05
@@ -49,8 +49,6 @@ def read_poses(path: Path, form: str, axes: str, photos: Sequence[Photo]) -> Kno
     Raises:
         PrepareError: the file is not understood, or fits fewer than two images.
     """
-    if not path.exists():
-        raise PrepareError(f"--poses {path} does not exist.")
     form = _guess_format(path) if form == "auto" else form
     if form == "transforms":
         known = _read_transforms(path, photos)
@@ -65,7 +63,7 @@ def read_poses(path: Path, form: str, axes: str, photos: Sequence[Photo]) -> Kno
     if len(poses) < 2:
         raise PrepareError(f"--poses {path} has finite poses for {len(poses)} images: at least two are needed.")
     if len(poses) < len(photos):
-        CONSOLE.print(f"[yellow]{len(photos) - len(poses)} of {len(photos)} images have no pose: left out.")
+        say(f"{len(photos) - len(poses)} of {len(photos)} images have no pose: left out.", "yellow")
     return KnownPoses(poses, known.says, known.intrinsics, known.split)
 
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from mmpi_ns.prepare.checks import Finding, coverage
 from mmpi_ns.prepare.export import Split
 from mmpi_ns.prepare.frame import camera_poses
+from mmpi_ns.prepare.images import in_short
 from mmpi_ns.prepare.stages import write_text
 
 WORST = 5
@@ -87,17 +88,14 @@ def _table(model: pycolmap.Reconstruction, facts: Facts, covered: dict[str, floa
 def _warnings(facts: Facts) -> list[str]:
     lines = []
     if facts.missing:
-        lines.append(f"- {len(facts.missing)} images have no pose and are left out: {in_short(facts.missing)}")
+        lines.append(f"- {len(facts.missing)} images have no pose and are left out: {in_short(facts.missing, 8)}")
     for group in facts.groups:
-        lines.append(f"- {len(group)} images form a group of their own, not connected to the scene: {in_short(group)}")
-    for finding in facts.findings:
-        lines.append(f"- {finding.image + ': ' if finding.image else ''}{finding.says}")
+        lines.append(
+            f"- {len(group)} images form a group of their own, not connected to the scene: {in_short(group, 8)}"
+        )
+    for finding in sorted(facts.findings, key=lambda f: (f.kind, -f.badness)):
+        lines.append(f"- {finding.kind} {finding.image + ': ' if finding.image else ''}{finding.says}")
     return lines
-
-
-def in_short(names: Sequence[str], most: int = 8) -> str:
-    listed = ", ".join(sorted(names)[:most])
-    return listed + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 def camera_in_words(camera: pycolmap.Camera) -> str:
@@ -118,7 +116,7 @@ def _draw_track(model: pycolmap.Reconstruction, findings: Sequence[Finding], pat
     plot.plot(*points.T, ",", color="0.55")
     plot.plot(*centers.T, "-", color="tab:blue", linewidth=1)
     plot.quiver(*centers.T, *facing.T, color="tab:blue", angles="xy", width=0.002, scale=40)
-    marked = [names.index(f.image) for f in findings if f.image in names and f.says.startswith("misplaced")]
+    marked = [names.index(f.image) for f in findings if f.image in names and f.kind == "misplaced?"]
     plot.plot(*centers[marked].T, "o", color="tab:red", fillstyle="none", label="misplaced?")
     plot.annotate(names[0], centers[0])
     plot.annotate(names[-1], centers[-1])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
@@ -11,12 +12,16 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
+from filelock import FileLock, Timeout
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 T = TypeVar("T")
 
 CONSOLE = Console(width=120)
+FULL = (errno.ENOSPC, errno.EDQUOT)
+LEFT = 1 << 20
+"""Bytes free below which a failure to write is put down to a full disk: COLMAP's errors do not say why."""
 
 
 class PrepareError(Exception):
@@ -68,17 +73,58 @@ def _read_json(path: Path) -> dict[str, Any]:
         return {}  # never written, or cut off while being written: the stage starts over
 
 
-def write_text(path: Path, text: str) -> None:
-    """Writes a file whole or not at all."""
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text(text, encoding="utf-8")
-    os.replace(partial, path)
+def say(text: str, style: str = "") -> None:
+    """Prints a line as it is, not wrapped: names may hold brackets, and commands are copied."""
+    CONSOLE.print(text, style=style, markup=False, highlight=False, soft_wrap=True)
 
 
 @contextmanager
-def progress(what: str, total: int | None) -> Iterator[Callable[[int], None]]:
-    """A progress bar; yields a function that advances it by so many."""
+def whole(path: Path) -> Iterator[Path]:
+    """A path to write to; what was written takes the file's place at the end, so that it is whole or not there."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(path.name + ".partial")
+    yield partial
+    os.replace(partial, path)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Writes a file whole or not at all."""
+    with whole(path) as partial:
+        partial.write_text(text, encoding="utf-8")
+
+
+@contextmanager
+def only_one(work: Path) -> Iterator[None]:
+    """Keeps a second run out of a work folder, and calls a full disk a full disk.
+
+    Raises:
+        PrepareError: another run is at work there, or the disk is full.
+    """
+    work.mkdir(parents=True, exist_ok=True)
+    try:
+        with FileLock(work / "lock", blocking=False):
+            yield
+    except Timeout as error:
+        raise PrepareError(f"Another mmpi-prepare is making {work.parent}: wait for it, or name another.") from error
+    except (OSError, RuntimeError, ValueError) as error:
+        free = shutil.disk_usage(work.parent).free
+        if getattr(error, "errno", None) in FULL or free < LEFT:
+            says = (
+                f"The disk of {work.parent} is full ({free / 2**20:.0f} MB free): make room; the same command goes on."
+            )
+            raise PrepareError(says) from error
+        raise
+
+
+@contextmanager
+def progress(what: str, total: int | None) -> Iterator[Callable[..., None]]:
+    """A progress bar; yields a function that advances it by so many, from ``start`` where it begins anew."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*columns, console=CONSOLE) as bar:
         task = bar.add_task(what, total=total)
-        yield lambda count=1: bar.advance(task, count)
+
+        def advance(count: int = 1, start: float | None = None) -> None:
+            done = count + (bar.tasks[task].completed if start is None else start)
+            bar.update(task, completed=done if total is None else min(done, total))
+
+        yield advance

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mmpi_ns.prepare.checks import sharpness
 from mmpi_ns.prepare.images import Photo, write_photos
-from mmpi_ns.prepare.stages import CONSOLE, PrepareError, progress, write_text
+from mmpi_ns.prepare.stages import PrepareError, progress, say, whole, write_text
 
 TRACK_WIDTH = 320
 """Width at which motion is measured."""
@@ -48,15 +48,11 @@ def select_frames(video: Path, target: Path, max_frames: int, step: float) -> li
     chosen, used = choose_frames(measured, max_frames, step)
     if len(chosen) < 2:
         raise PrepareError(f"{video} shows no motion in {len(measured.motion)} frames: there is no second view.")
-    CONSOLE.print(
-        f"{len(chosen)} of {len(measured.motion)} frames taken: "
-        f"the sharpest for every {used:.1%} of the width of motion."
-    )
+    frames = len(measured.motion)
+    say(f"{len(chosen)} of {frames} frames taken: the sharpest for every {used:.1%} of the width of motion.")
     if used > MOST_MOTION:
-        CONSOLE.print(
-            f"[yellow]{used:.0%} of the width between frames is much: raise --max-frames above {max_frames} "
-            "or cut the video into shorter ones."
-        )
+        remedy = f"raise --max-frames above {max_frames} or cut the video into shorter ones"
+        say(f"{used:.0%} of the width between frames is much: {remedy}.", "yellow")
     photos = _write_frames(video, target, chosen)
     write_photos(photos, target)
     return photos
@@ -87,7 +83,7 @@ def measure(video: Path) -> Measured:
     if not motion:
         raise PrepareError(f"{video} holds no frame that can be read: it is damaged, or its codec is unknown here.")
     if total and len(motion) < 0.9 * total:
-        CONSOLE.print(f"[yellow]{video.name} breaks off after {len(motion)} of {total} frames: the rest is left out.")
+        say(f"{video.name} breaks off after {len(motion)} of {total} frames: the rest is left out.", "yellow")
     return Measured(np.array(motion), np.array(sharp))
 
 
@@ -153,9 +149,8 @@ def _write_frames(video: Path, target: Path, chosen: list[int]) -> list[Photo]:
                 ok, data = cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, 97])
                 if not ok:
                     raise PrepareError(f"Frame {index} of {video} cannot be written.")
-                partial = path.with_suffix(".partial")
-                partial.write_bytes(data.tobytes())
-                partial.replace(path)
+                with whole(path) as partial:
+                    partial.write_bytes(data.tobytes())
             photos.append(Photo(name, frame.shape[1], frame.shape[0], source=name))
             advance(1)
     capture.release()

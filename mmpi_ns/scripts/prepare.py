@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
+import threading
+
+INTERRUPTED = "mmpi-prepare: interrupted; the same command goes on from here."
 
 
 def main() -> int:
@@ -13,24 +17,39 @@ def main() -> int:
         os.environ.setdefault(f"{library}_NUM_THREADS", "1")
     import tyro
 
-    from mmpi_ns.prepare.pipeline import prepare
     from mmpi_ns.prepare.settings import Settings
-    from mmpi_ns.prepare.stages import CONSOLE, PrepareError
+    from mmpi_ns.prepare.stages import PrepareError, say
 
     settings = tyro.cli(Settings, description=Settings.__doc__)
+    from mmpi_ns.prepare.pipeline import prepare
+
     try:
         prepare(settings)
     except PrepareError as error:
-        CONSOLE.print(f"[bold red]mmpi-prepare:[/bold red] {error}", soft_wrap=True)
+        say(f"mmpi-prepare: {error}", "bold red")
         return 1
-    except KeyboardInterrupt:
-        CONSOLE.print("Interrupted: the same command goes on from here.")
-        return 130
     return 0
+
+
+def end_at_once_on_signals() -> None:
+    """SIGINT and SIGTERM end the command with one sentence, also in the middle of COLMAP's work.
+
+    A thread waits for them: a handler would wait until COLMAP returns, and COLMAP's own prints a stack trace.
+    """
+    ends = {signal.SIGINT, signal.SIGTERM}
+    signal.pthread_sigmask(signal.SIG_BLOCK, ends)  # inherited by every thread that starts from now on
+
+    def wait() -> None:
+        number = signal.sigwait(ends)
+        os.write(2, f"\x1b[?25h\n{INTERRUPTED}\n".encode())  # the cursor that the bar hid; no lock is taken
+        os._exit(128 + number)
+
+    threading.Thread(target=wait, daemon=True).start()
 
 
 def entrypoint() -> None:
     """The command ``mmpi-prepare``."""
+    end_at_once_on_signals()
     sys.exit(main())
 
 

@@ -166,8 +166,8 @@ def test_split_by_count_and_by_list():
     assert split.train == ("1.jpg", "4.jpg", "7.jpg") and len(split.test) == 6
     lists = {"train_filenames": ["x/2.jpg"], "test_filenames": ["x/3.jpg", "x/99.jpg"]}
     assert export.split_from(lists, names, "s").test == ("3.jpg",)
-    with pytest.raises(PrepareError, match="test_filenames"):
-        export.split_from({"train_filenames": ["2.jpg"]}, names, "s")
+    with pytest.raises(PrepareError, match="among the registered"):
+        export.split_from({"train_filenames": ["2.jpg"], "test_filenames": ["77.jpg"]}, names, "s")
 
 
 def write_video(path, frames):

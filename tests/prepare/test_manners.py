@@ -1,0 +1,148 @@
+"""What mmpi-prepare says and when: options before any work, one sentence at the end, nothing left out in silence."""
+
+from __future__ import annotations
+
+import errno
+import os
+import shlex
+import signal
+import subprocess
+import sys
+import time
+
+import corridor
+import numpy as np
+import pytest
+from PIL import Image
+
+from mmpi_ns.prepare import images
+from mmpi_ns.prepare.checks import Finding, by_kind
+from mmpi_ns.prepare.pipeline import WORK, prepare
+from mmpi_ns.prepare.settings import Settings
+from mmpi_ns.prepare.stages import PrepareError, only_one, progress
+
+NAN = float("nan")
+
+
+@pytest.fixture
+def frames(tmp_path):
+    corridor.write_images(tmp_path / "frames", 3)
+    return tmp_path / "frames"
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"focal": NAN}, "--focal"), ({"focal": -3.0}, "--focal"), ({"camera_height": 0.0}, "--camera-height"),
+        ({"camera": (NAN, 1.0, 1.0)}, "--camera"), ({"camera": (9.0, 1.0, 1.0), "focal": 9.0}, "leave one out"),
+        ({"test_every": 1}, "--test-every"), ({"test_every": -4}, "--test-every"), ({"train_every": 0}, "takes 2"),
+        ({"test_every": 4, "train_every": 4}, "contradict"), ({"downscales": (2, 0)}, "--downscales"),
+        ({"downscales": (2, 2)}, "--downscales"), ({"refine_poses": True}, "--poses"), ({"overlap": 0}, "--overlap"),
+        ({"threads": 0}, "--threads"), ({"max_frames": 1}, "--max-frames"),
+    ],
+)  # fmt: skip
+def test_options_are_judged_before_any_work(options, words, frames, tmp_path):
+    with pytest.raises(PrepareError, match=words):
+        prepare(Settings(frames, tmp_path / "scene", **options))
+    assert not (tmp_path / "scene").exists()
+
+
+def test_files_that_options_name_are_read_before_any_work(frames, tmp_path):
+    scene, lists = tmp_path / "scene", tmp_path / "lists.json"
+    for text, words in (("{", "cannot be read"), ('{"train_filenames": []}', "test_filenames")):
+        lists.write_text(text)
+        with pytest.raises(PrepareError, match=words):
+            prepare(Settings(frames, scene, split_from=lists))
+    for options in ({"poses": tmp_path / "none.txt"}, {"masks": tmp_path / "none"}, {"split_from": tmp_path / "no"}):
+        with pytest.raises(PrepareError, match=r"none|no"):
+            prepare(Settings(frames, scene, **options))
+    assert not scene.exists()
+    lists.write_text('{"train_filenames": ["frame_001.png"], "test_filenames": ["frame_999.png"]}')
+    with pytest.raises(PrepareError, match="None of the 1 test_filenames"):
+        prepare(Settings(frames, scene, split_from=lists))
+    assert not (scene / WORK / "features").exists()
+
+
+def test_a_second_run_into_a_scene_says_so_and_ends(frames, tmp_path):
+    with only_one(tmp_path / "scene" / WORK), pytest.raises(PrepareError, match=r"Another mmpi-prepare is making"):
+        prepare(Settings(frames, tmp_path / "scene"))
+    with only_one(tmp_path / "scene" / WORK):
+        pass  # free again
+
+
+def test_a_full_disk_is_called_a_full_disk(frames, tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(images.shutil, "copyfile", full)
+    with pytest.raises(PrepareError, match=r"disk of .*scene is full"):
+        prepare(Settings(frames, tmp_path / "scene"))
+
+
+def test_what_is_not_read_is_counted_and_named(frames, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pillow_heif", None)
+    for name in ("IMG_1.HEIC", "IMG_2.heic", "clip.mov", "more/other.png", ".hidden"):
+        (frames / name).parent.mkdir(exist_ok=True)
+        (frames / name).write_bytes(b"")
+    assert len(images.find_images(frames)) == 3
+    said = capsys.readouterr().out
+    assert "2 .heic files are not read: pip install pillow-heif" in said and "IMG_1.HEIC, IMG_2.heic" in said
+    assert "1 .mov files are not read (clip.mov)" in said and "1 .png files are in subfolders" in said
+    assert "hidden" not in said
+
+
+def test_a_photo_of_a_telephone_is_read(tmp_path):
+    heif = pytest.importorskip("pillow_heif", reason="pillow-heif is an extra: pip install 'mmpi-ns[heic]'")
+    heif.register_heif_opener()
+    (tmp_path / "in").mkdir()
+    exif = Image.Exif()
+    exif.get_ifd(0x8769)[0xA405] = 36
+    picture = Image.fromarray(corridor.picture(corridor.poses(1)[0]))
+    for n in range(2):
+        picture.save(tmp_path / "in" / f"IMG_{n}.HEIC", quality=95, exif=exif)
+    photos = images.gather(tmp_path / "in", images.find_images(tmp_path / "in"), tmp_path / "out")
+    assert [p.name for p in photos] == ["IMG_0.jpg", "IMG_1.jpg"]
+    assert photos[0].exif_focal == pytest.approx(corridor.WIDTH)
+    copy = np.asarray(Image.open(tmp_path / "out/images/IMG_0.jpg"), float)
+    assert np.abs(copy - np.asarray(picture, float)).mean() < 4
+
+
+def test_a_bar_counts_no_more_than_there_are():
+    with progress("Mapping", 10) as advance:
+        bar = advance.__closure__
+        tasks = next(c.cell_contents for c in bar if hasattr(c.cell_contents, "tasks")).tasks
+        advance(2, 0)
+        for _ in range(20):
+            advance(1)
+        assert tasks[0].completed == 10
+        advance(2, 0)  # another initial pair
+        assert tasks[0].completed == 2
+
+
+def test_findings_of_a_kind_share_a_line_worst_first():
+    found = [Finding("moving?", f"f{i}", f"{i} %", i) for i in (3, 9, 5)] + [Finding("bent?", "", "2 px")]
+    assert by_kind(found) == ["moving? f9: 9 %; then f5, f3", "bent? 2 px"]
+
+
+def test_the_last_line_is_a_command_to_copy(tmp_path, capsys):
+    corridor.write_images(tmp_path / "frames", 8)
+    scene = tmp_path / ("a [long] name " * 9).strip()
+    prepare(Settings(tmp_path / "frames", scene, focal=corridor.FOCAL, threads=1))
+    *_, last = capsys.readouterr().out.splitlines()
+    assert shlex.split(last) == ["ns-train", "mmpi-small", "--data", str(scene)]
+    assert (scene / "transforms.json").is_file() and not (scene / WORK).exists()
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_ends_it_with_one_sentence(number, tmp_path):
+    corridor.write_images(tmp_path / "frames", 14)
+    command = [sys.executable, "-m", "mmpi_ns.scripts.prepare", str(tmp_path / "frames"), str(tmp_path / "scene")]
+    run = subprocess.Popen([*command, "--threads", "1"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    while not (tmp_path / "scene" / WORK / "features").is_dir() and run.poll() is None:
+        time.sleep(0.05)
+    run.send_signal(number)
+    _, said = run.communicate(timeout=60)
+    assert run.returncode == 128 + number
+    assert said.replace("\x1b[?25h", "").strip() == "mmpi-prepare: interrupted; the same command goes on from here."
+    prepare(Settings(tmp_path / "frames", tmp_path / "scene", threads=1))
+    assert (tmp_path / "scene" / "transforms.json").is_file()
