@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable
 from typing import Any
 
@@ -15,13 +16,16 @@ from mmpi_ns.scene.texels import TexelGrid
 __all__ = ["COLORS", "KnownTaps", "RaySums", "gather_places", "gather_taps"]
 
 
+def _gpu() -> Any:
+    """The form that needs Triton."""
+    return importlib.import_module("mmpi_ns.ops.gather.gpu")
+
+
 def gather_taps(values: Tensor, groups: list[KnownTaps], slots: Tensor, weights: Tensor, wanted: Tensor) -> RaySums:
     """See ``reference.gather_taps``."""
     given = (values, groups, slots, weights, wanted)
     if native.takes_triton(values, weights):
-        from mmpi_ns.ops.gather import gpu
-
-        return gpu.gather_taps(*given)
+        return _gpu().gather_taps(*given)
     return (reference if native.library(values, weights) is None else cpu).gather_taps(*given)
 
 
@@ -39,8 +43,6 @@ def gather_places(
     """See ``reference.gather_places``; ``triton_scene`` gives the scene as kernels on a GPU take it."""
     given = (table, heads, planes, ndc, valid, weights)
     if native.takes_triton(table, ndc, weights):
-        from mmpi_ns.ops.gather import gpu
-
-        return gpu.gather_places(triton_scene(), *given)
+        return _gpu().gather_places(triton_scene(), *given)
     form = reference if native.library(table, ndc, weights) is None else cpu
     return form.gather_places(grids, num_mpis, *given)
