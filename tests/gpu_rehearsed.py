@@ -6,34 +6,30 @@ import json
 import math
 
 import torch
-from nerfstudio.engine import trainer as nerfstudio_trainer
 
 from mmpi_ns.bench import trainings
 from mmpi_ns.bench.gpu import checks as gpu_checks
 from mmpi_ns.bench.gpu import command as gpu
-from mmpi_ns.bench.gpu import parts as gpu_parts
 from mmpi_ns.bench.gpu.command import SHARES, Gpu
 from mmpi_ns.bench.stability.exact_ray import ExactField, ExactRay
 from mmpi_ns.bench.stability.rays import scene
 from mmpi_ns.ops import native, triton_march, triton_tables
 
 
-def part_here(module, request, folder, threads, seconds, extra=None):
-    assert seconds > 0
-    nerfstudio_trainer.writer.EVENT_WRITERS.clear()
+def part_here(work, request, folder, threads, seconds, extra):
+    assert seconds > 0 and extra["TRITON_INTERPRET"] == "1"
     native.choose("auto")
-    if module == "mmpi_ns.bench.gpu.parts":
-        return gpu_parts.run(request, lambda text: None)
-    return trainings._answer(request, lambda text: None)
+    return work(request, lambda text: None)
 
 
 def test_all_parts_end_to_end(tmp_path, monkeypatch):
     monkeypatch.setattr(gpu, "run_apart", part_here)
+    monkeypatch.setattr(trainings, "run_apart", part_here)
     Gpu(output=tmp_path / "results", work=tmp_path / "work", rehearse=True).run()
     found = json.loads((tmp_path / "results" / "gpu.json").read_text())
-    assert set(found["parts"]) == set(SHARES) and found["rehearsal"]
-    assert not [p for p in found["parts"].values() if "not_run" in p]
-    print({name: round(part["wall_s"], 1) for name, part in found["parts"].items()})
+    assert set(found["rows"]) == set(SHARES) and found["rehearsal"]
+    assert not [p for p in found["rows"].values() if "not_run" in p]
+    print({name: round(part["wall_s"], 1) for name, part in found["rows"].items()})
     head = found["headline"]
     wanted = {"checks", "failed_checks", "copy_gb_per_s", "march_batch_gb_per_s", "march_batch_share_of_copy"}
     wanted |= {"rays_per_s", "torch_rays_per_s", "frame_ms", "torch_frame_ms", "full_frame_ms", "psnr_delta_db"}

@@ -1,7 +1,8 @@
-"""Runs a module of the benchmarks in a process of its own: memory, threads and crashes are then its alone."""
+"""Calls a function of the benchmarks in a process of its own: memory, threads and crashes are then its alone."""
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import subprocess
@@ -11,24 +12,28 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from mmpi_ns.bench.provenance import read_json
+from mmpi_ns.bench.report import read_json
 
+Tell = Callable[[str], None]
+"""Says how far it is."""
+Work = Callable[[dict[str, Any], Tell], dict[str, Any]]
+"""A function at the top of a module, from a request that JSON can hold to such an answer."""
 PROGRESS = "@ "
 """Lines that start so are shown while it runs."""
 
 
 def run_apart(
-    module: str,
+    work: Work,
     request: dict[str, Any],
     folder: Path,
     threads: int,
     seconds: float | None = None,
     extra: Mapping[str, str] | None = None,
 ) -> dict[str, Any]:
-    """Calls ``python -m module`` with a request.
+    """``work(request, tell)`` in a fresh process.
 
     Args:
-        module: one that ends with ``answer(...)``.
+        work: the function.
         request: what it is asked.
         folder: where request, answer and everything that it prints (output.log) go.
         threads: of its arithmetic.
@@ -43,22 +48,16 @@ def run_apart(
     target.unlink(missing_ok=True)
     source.write_text(json.dumps(request, indent=1), encoding="utf-8")
     environment = {**os.environ, "OMP_NUM_THREADS": str(threads), "OPENBLAS_NUM_THREADS": str(threads), **(extra or {})}
+    words = [sys.executable, "-m", "mmpi_ns.bench.apart", work.__module__, work.__qualname__, str(source), str(target)]
+    pipes: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
     last = ""
     with (
         log.open("w", encoding="utf-8") as stream,
-        subprocess.Popen(
-            [sys.executable, "-m", module, str(source), str(target)],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            env=environment,
-            text=True,
-            errors="replace",
-        ) as process,
+        subprocess.Popen(words, **pipes, env=environment, text=True, errors="replace") as process,
     ):
         assert process.stdout is not None
-        alarm = threading.Timer(seconds, process.kill) if seconds is not None else None
-        if alarm is not None:
+        alarm = threading.Timer(seconds or 0.0, process.kill)
+        if seconds is not None:
             alarm.start()
         for line in process.stdout:
             stream.write(line)
@@ -66,19 +65,18 @@ def run_apart(
                 print(f"    {line[len(PROGRESS) :].rstrip()}", flush=True)
             last = line.strip() or last
         process.wait()
-        if alarm is not None:
-            alarm.cancel()
+        alarm.cancel()
     if process.returncode or not target.is_file():
         return {"not_run": f"it failed with status {process.returncode} ({last[:300]}); see {log}"}
     return read_json(target)
 
 
-def answer(work: Callable[[dict[str, Any], Callable[[str], None]], dict[str, Any]]) -> None:
-    """The other end: does the work that the command line names, and writes what it returns.
+def main(module: str, function: str, source: str, target: str) -> None:
+    """The other end: does the work and writes what it returns."""
+    work: Work = getattr(importlib.import_module(module), function)
+    found = work(read_json(Path(source)), lambda text: print(f"{PROGRESS}{text}", flush=True))
+    Path(target).write_text(json.dumps(found), encoding="utf-8")
 
-    Args:
-        work: from a request and a way to tell of progress to the answer.
-    """
-    source, target = (Path(p) for p in sys.argv[1:3])
-    found = work(json.loads(source.read_text(encoding="utf-8")), lambda text: print(f"{PROGRESS}{text}", flush=True))
-    target.write_text(json.dumps(found), encoding="utf-8")
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

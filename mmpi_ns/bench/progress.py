@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from mmpi_ns.bench.provenance import read_json, write_json
+from mmpi_ns.bench.report import read_json, write_json
 
 FILE = "progress.json"
 

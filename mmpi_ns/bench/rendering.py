@@ -49,9 +49,25 @@ def bundle_of(origins: Array, directions: Array, near: float = 0.05, far: float 
     return RayBundle(origins=o, directions=d, pixel_area=column * 1e-4, nears=near * column, fars=far * column)
 
 
-def render(field: MMPIField, rays: RayBundle, threshold: float = 0.0, form: BlendForm | None = None) -> Rendered:
-    """Colour of rays; differentiable by the field's tables."""
-    samples, report = MMPISampler()(rays, field=field, threshold=threshold, blend_form=form)
+def render(
+    field: MMPIField,
+    rays: RayBundle,
+    threshold: float = 0.0,
+    form: BlendForm | None = None,
+    fair_share: float = math.inf,
+    known_lookup: bool = True,
+) -> Rendered:
+    """Colour of rays; differentiable by the field's tables.
+
+    Args:
+        field: what is rendered.
+        rays: R of them.
+        threshold: weight below which samples are not coloured.
+        form: of blending; None: no reliability.
+        fair_share: of a ray's samples, as for the sampler.
+        known_lookup: colours by what the densities were looked up with, as in training; else as in rendering.
+    """
+    samples, report = MMPISampler()(rays, field=field, threshold=threshold, fair_share=fair_share, blend_form=form)
     tau, lookup = field.get_density(samples)
     tau = tau[..., 0]
     if form is not None and lookup.index.numel():
@@ -59,5 +75,5 @@ def render(field: MMPIField, rays: RayBundle, threshold: float = 0.0, form: Blen
         tau = tau.new_zeros(tau.numel()).index_put((lookup.index,), blended).view(tau.shape)
     meta = metadata_of(samples)
     made = composite_weights(tau, meta["valid"][..., 0], meta["skipped_before"][..., 0], report.skipped_total)
-    colors = field.get_outputs(samples, lookup)[FieldHeadNames.RGB]
+    colors = field.get_outputs(samples, lookup if known_lookup else None)[FieldHeadNames.RGB]
     return Rendered(render_colors(made, colors), made, samples, report)

@@ -32,6 +32,11 @@ class Variant:
     group: str = ""
     """Rows of one group share a table."""
 
+    @property
+    def key(self) -> str:
+        """Of its row in a suite."""
+        return f"{self.group}: {self.name}" if self.group else self.name
+
 
 def _paper_ladder(depth: bool) -> list[Variant]:
     """Single, joint, two phases: the paper's ablation on the hand-made drive, with SfM depth in all rows or in none."""

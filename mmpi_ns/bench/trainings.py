@@ -1,4 +1,4 @@
-"""One training by nerfstudio's own trainer, evaluated on the way: a process of its own, ``python -m`` this module.
+"""One training by nerfstudio's own trainer, evaluated on the way, in a process of its own.
 
 The trainer is untouched but for a callback after each step, which counts rays and, at given steps, stops the clock,
 renders test pixels and starts it again. Whatever draws random numbers meanwhile is given its old state back.
@@ -10,19 +10,21 @@ import contextlib
 import hashlib
 import json
 import resource
+import shlex
 import shutil
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from torch import nn
 
-from mmpi_ns.bench.apart import answer
+from mmpi_ns.bench.apart import Tell, run_apart
+from mmpi_ns.bench.methods import Method, Scene
 from mmpi_ns.bench.progress import Progress
+from mmpi_ns.bench.trainers import clock, config_of, end_helpers, trainer_of
 from mmpi_ns.rendering.metrics import ImageMetrics
 
 
@@ -38,15 +40,15 @@ class Request:
     """Folder of the run."""
     checks: tuple[int, ...]
     """Evaluate after so many steps; the last is the length of the run."""
-    check_images: int
+    check_images: int = 0
     """Test images, evenly spaced, that are looked at on the way; 0 for all."""
-    check_pixels: int
+    check_pixels: int = 64
     """Pixels of each, drawn once; 0 for all. Methods that splat whole images render all and are scored on these."""
-    final_images: int
+    final_images: int = 0
     """Test images, evenly spaced, that are rendered whole at the end; 0 for all."""
-    whole_images: bool
+    whole_images: bool = False
     """The method renders no single pixels."""
-    keep: bool
+    keep: bool = False
     """Keep checkpoints."""
     go_on: bool = False
     """Save at every check, and go on from the last one of a run in the same folder that was cut off or was shorter.
@@ -54,30 +56,40 @@ class Request:
     quick_hashes: bool = False
     """Give nerfstudio's hash tables the compiled lookups of ``peers.look_up_quickly``."""
 
+    @staticmethod
+    def of(
+        method: Method, scene: Scene, work: Path, steps: int, rays: int | None = None, seed: int = 0,
+        device: str = "cpu", **looks: Any,
+    ) -> Request:  # fmt: skip
+        """A training of a method; looked at when it ends unless ``looks`` says otherwise."""
+        words = method.words(scene, work, steps, rays, seed, device)
+        own = {"checks": (steps,), "whole_images": method.whole_images} | looks
+        return Request(tuple(words), str(scene.data), scene.downscale_factor, str(work), **own)
 
-class NoLPIPS(nn.Module):
-    """Stands in for the metric that peers build in their constructors, whose weights may be out of reach."""
-
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__()
-
-    def forward(self, *args: Any) -> torch.Tensor:
-        return torch.tensor(float("nan"))
+    @property
+    def shown(self) -> str:
+        """The words without where things lie on this machine."""
+        hidden = {"--output-dir", "--data", "--experiment-name", "--timestamp"}
+        return shlex.join(w for i, w in enumerate(self.words) if not {w, *self.words[max(i - 1, 0) : i]} & hidden)
 
 
-def replace_lpips() -> None:
-    """Makes models that are built from now on in this process take ``NoLPIPS``."""
-    import torchmetrics.image.lpip as home
-
-    home.LearnedPerceptualImagePatchSimilarity = NoLPIPS  # type: ignore[misc]
+def train_apart(
+    request: Request, threads: int, seconds: float | None = None, extra: Mapping[str, str] | None = None
+) -> dict[str, Any]:
+    """The row of a training in a fresh process, or why there is none; the rest as for ``run_apart``."""
+    variables = dict(extra or {})
+    if request.quick_hashes:  # else half of nerfacto's time goes into fetching the same pages from the system again
+        variables |= {"MALLOC_MMAP_THRESHOLD_": str(8 * 10**9), "MALLOC_TRIM_THRESHOLD_": str(16 * 10**9)}
+    if request.go_on:  # nerfstudio's checkpoints hold numpy scalars, which torch refuses unless told otherwise
+        variables["TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD"] = "1"
+    return run_apart(train, asdict(request), Path(request.work), threads, seconds, variables)
 
 
 class Stopwatch:
     """Seconds that training took, without what it was stopped for."""
 
     def __init__(self) -> None:
-        self._start = time.perf_counter()
-        self._stopped = 0.0
+        self._start, self._stopped = clock(), 0.0
 
     def set(self, seconds: float) -> None:
         """Makes it show so many seconds."""
@@ -85,24 +97,16 @@ class Stopwatch:
 
     @property
     def seconds(self) -> float:
-        if torch.cuda.is_available():
-            torch.cuda.synchronize()
-        return time.perf_counter() - self._start - self._stopped
+        return clock() - self._start - self._stopped
 
     @contextlib.contextmanager
     def stopped(self) -> Iterator[None]:
         """Does not count what runs inside, nor lets it change random draws outside."""
-        if torch.cuda.is_available():
-            torch.cuda.synchronize()
-        begin, states = time.perf_counter(), (torch.get_rng_state(), np.random.get_state())  # noqa: NPY002
-        gpu = torch.cuda.get_rng_state_all() if torch.cuda.is_available() else []
-        yield
-        torch.set_rng_state(states[0])
-        np.random.set_state(states[1])  # noqa: NPY002
-        if gpu:
-            torch.cuda.synchronize()
-            torch.cuda.set_rng_state_all(gpu)
-        self._stopped += time.perf_counter() - begin
+        begin, numpy_state = clock(), np.random.get_state()  # noqa: NPY002
+        with torch.random.fork_rng():  # of all devices
+            yield
+        np.random.set_state(numpy_state)  # noqa: NPY002
+        self._stopped += clock() - begin
 
 
 def evenly(count: int, wanted: int) -> list[int]:
@@ -192,54 +196,47 @@ def check_split(split: dict[str, Any], data: Path, downscale_factor: int) -> Non
         raise ValueError(f"{data}: {sorted(set(split['train']) & set(split['test']))[0]} is in both lists.")
 
 
-def run(request: Request, tell: Callable[[str], None] = print) -> dict[str, Any]:
+def train(asked: dict[str, Any], tell: Tell = print) -> dict[str, Any]:
     """Trains as ``ns-train`` with these words would, and says how good it was when.
+
+    Args:
+        asked: the fields of a ``Request``.
+        tell: of progress.
 
     Returns:
         curve: for each check step, rays, seconds since the trainer was set up (placement and loading included,
         evaluation not) and PSNR; psnr, ssim, rays_per_s, frame_s over whole test images; setup_seconds, seconds,
         rays, parameters, peak_gib, split.
     """
-    import tyro
-    from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
-    from nerfstudio.scripts.train import _set_random_seed
-
     from mmpi_ns.bench.peers import look_up_quickly, read_points_ourselves
 
-    replace_lpips()
+    plain: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in asked.items()}
+    request = Request(**plain)
     read_points_ourselves()
     if request.quick_hashes:
         look_up_quickly()
-    config: Any = tyro.cli(AnnotatedBaseConfigUnion, args=list(request.words))
-    config.pipeline.datamanager.data = config.data
+    config = config_of(request.words)
     config.save_config()
-    folder = Path(request.work)
-    last = request.checks[-1] if request.go_on else 0
-    progress = Progress.before(request.words, folder, last)
+    progress = Progress.before(request.words, Path(request.work), request.checks[-1] if request.go_on else 0)
     if progress.step:
         config.load_dir, config.load_step = Path(progress.checkpoints), progress.step - 1
         config.max_num_iterations -= progress.step  # nerfstudio's trainer makes so many more
         tell(f"goes on from step {progress.step}")
-    # Random draws are not saved with a checkpoint: the second part must not repeat those of the first.
-    _set_random_seed(config.machine.seed + progress.step)
     watch = Stopwatch()
-    trainer = config.setup(local_rank=0, world_size=1)
-    trainer.setup()
+    # Random draws are not saved with a checkpoint: the second part must not repeat those of the first.
+    trainer = trainer_of(config, progress.step)
     if progress.step:
         watch.set(progress.seconds)
     else:
         progress.setup_seconds = watch.seconds
     row = _follow(trainer, request, watch, tell, progress)
-    for process in getattr(trainer.pipeline.datamanager, "data_procs", []):
-        process.terminate()
+    end_helpers(trainer)
     if not request.keep:
         shutil.rmtree(trainer.checkpoint_dir)
     return row
 
 
-def _follow(
-    trainer: Any, request: Request, watch: Stopwatch, tell: Callable[[str], None], progress: Progress
-) -> dict[str, Any]:
+def _follow(trainer: Any, request: Request, watch: Stopwatch, tell: Tell, progress: Progress) -> dict[str, Any]:
     """Trains with the callback that looks."""
     from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 
@@ -286,12 +283,3 @@ def pixels_of_step(pipeline: Any) -> int:
     pixels = int(pipeline.datamanager.get_train_rays_per_batch())
     shrink = getattr(pipeline.model, "_get_downscale_factor", None)
     return pixels if shrink is None else pixels // int(shrink()) ** 2
-
-
-def _answer(request: dict[str, Any], tell: Callable[[str], None]) -> dict[str, Any]:
-    words: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in request.items()}
-    return run(Request(**words), tell)
-
-
-if __name__ == "__main__":
-    answer(_answer)

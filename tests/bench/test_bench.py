@@ -12,29 +12,22 @@ from PIL import Image
 
 from mmpi_ns.bench.quality import regions, results
 from mmpi_ns.bench.quality.regions import Regions, spearman
-from mmpi_ns.bench.speed import dense
+from mmpi_ns.bench.speed.all_planes import render_densely
+from mmpi_ns.bench.speed.scaling import BASE, made_up_batch, render_ours
 from mmpi_ns.bench.suites import DEFAULT, SUITES
 from mmpi_ns.field.mmpi_field import MMPIField
-from mmpi_ns.rendering.sampler import MMPISampler
 from mmpi_ns.scene.plan import MPIPlan, ScenePlan
 
 
-def test_the_dense_reference_renders_what_the_sampler_renders(monkeypatch):
+def test_the_dense_reference_renders_what_the_sampler_renders():
     torch.manual_seed(0)
-    field = MMPIField(dense._plan().scaled(1 / 64), hidden_width=8, shares_depth=True)
+    field = MMPIField(BASE.plan().scaled(1 / 64), hidden_width=8, shares_depth=True)
     with torch.no_grad():
         field.density.normal_(std=3)
         field.features.normal_()
-    bundle, _ = dense._batch(64)
-    sampler = MMPISampler()
-    whole = sampler.generate_ray_samples
-
-    def keep_all(*args, **kwargs):
-        return whole(*args, **{**kwargs, "threshold": 0.0})
-
-    monkeypatch.setattr(sampler, "generate_ray_samples", keep_all)
-    ours, _ = dense._ours(field, sampler, bundle, young=False)
-    reference, _ = dense._dense(field, bundle)
+    bundle, _ = made_up_batch(64)
+    ours, _ = render_ours(field, bundle, young=False, threshold=0.0)
+    reference, _ = render_densely(field, bundle)
     # The reference leaves out colours below alpha = 1e-4, so they may differ by that much a sample.
     assert float((ours - reference).abs().max()) < 5e-3
     assert float(ours.std()) > 0.05
@@ -86,22 +79,23 @@ def test_a_row_of_results_says_what_was_run(tmp_path):
     models.mkdir()
     for step in (999, 1999, 10):
         (models / f"step-{step:09d}.ckpt").touch()
-    assert results._steps(tmp_path) == 2000
+    assert results.steps_of(tmp_path) == 2000
     suite = SUITES["fox"]
     row = {
         "psnr": 21.237, "ssim": 0.81, "lpips_vgg": 0.4567, "num_rays_per_sec": 1234.5, "train_seconds": 99.6,
         "steps": 2000, "threads": 2, "mpis": 7, "texels": 12_345_678, "e_p_50": 0.1, "e_p_90": 0.2, "e_t_50": 1.5,
         "e_t_90": 2.5, "processor": "2 cores of X", "commit": "abc", "date": "2026-01-02",
     }  # fmt: skip
-    rows = {results._key(suite[0]): row}
-    lines = results.Results(Path(), "fox", 2)._table(rows).splitlines()
+    rows = {suite[0].key: row}
+    made = {k: "" for k in ("command", "processor", "threads", "torch", "commit", "date")}
+    lines = results.markdown("fox", {"rows": rows, "made": made}).splitlines()
     (line,) = [x for x in lines if x.startswith(f"| {suite[0].name} |")]
     wanted = [suite[0].name, "21.24", "0.810", "0.457", "2.05 M", "100", "2", "1234", "7", "12.3", "0.10 / 0.20",
               "1.50 / 2.50"]  # fmt: skip
     assert [c.strip() for c in line.strip("|").split("|")] == wanted
     header = next(x for x in lines if x.startswith("| variant |"))
     assert header.count("|") == line.count("|") == lines[lines.index(header) + 1].count("|")
-    assert "2 cores of X" in lines[2] and "Commits: abc (2026-01-02)" in lines[-2 if not lines[-1] else -1]
+    assert "2 cores of X" in lines[4] and "Commits: abc (2026-01-02)" in lines[-1]
 
 
 def test_budgets_are_drawn_with_the_default_apart(tmp_path):

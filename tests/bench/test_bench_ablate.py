@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import asdict
 
 import pytest
-from nerfstudio.engine import trainer as nerfstudio_trainer
 
 from mmpi_ns.bench import trainings
 from mmpi_ns.bench.quality import ablate
@@ -23,7 +23,7 @@ def three(monkeypatch):
     monkeypatch.setitem(ABLATIONS, "drive", variants)
     asked = []
 
-    def pretend(request, folder, threads):
+    def pretend(request, threads):
         which, steps = int(request.words[request.words.index(P + "planes") + 1]), request.checks[-1]
         asked.append((NAMES[which], steps))
         pace, quality = [(0.1, 20.0), (0.2, 21.0), (0.101, 19.0)][which]
@@ -62,10 +62,10 @@ def test_a_slower_variant_is_run_again_for_the_seconds_of_the_reference(scene, t
 def test_a_variant_that_fails_is_named_and_tried_again(scene, tmp_path, three, monkeypatch):
     pretend = ablate.train_apart
 
-    def fail(request, folder, threads):
+    def fail(request, threads):
         if "2" in request.words[request.words.index(P + "planes") + 1]:
             return {"not_run": "it failed"}
-        return pretend(request, folder, threads)
+        return pretend(request, threads)
 
     monkeypatch.setattr(ablate, "train_apart", fail)
     command(scene, tmp_path).run()
@@ -83,9 +83,8 @@ def test_setting_up_counts_as_time():
 
 
 def test_ablate_end_to_end(scene, tmp_path, monkeypatch):
-    def here(request, folder, threads):
-        nerfstudio_trainer.writer.EVENT_WRITERS.clear()
-        return trainings.run(request, lambda text: None)
+    def here(request, threads):
+        return trainings.train(asdict(request), lambda text: None)
 
     small = (*JOINT, P + "max-planes", "16")
     variants = [Variant("placed", small, group="g"), Variant("one", (*small, P + "max-mpis", "1"), group="g")]

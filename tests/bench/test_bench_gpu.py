@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -11,7 +12,7 @@ from triton_processes import HERE, needs_triton, python
 from mmpi_ns.bench.apart import run_apart
 from mmpi_ns.bench.gpu import command as gpu
 from mmpi_ns.bench.gpu.command import Gpu, told_curve
-from mmpi_ns.bench.gpu.report import headline, table
+from mmpi_ns.bench.gpu.report import headline, markdown
 
 
 @needs_triton
@@ -42,7 +43,7 @@ def test_a_part_that_fails_takes_no_other_with_it(tmp_path, monkeypatch):
         "checks": {"not_run": "it failed with status 1"},
         "operations": {"copy_gb_per_s": 5.0, "march": {}, "ops": {}},
     }
-    monkeypatch.setattr(gpu, "run_apart", lambda module, request, *_: answers[request["part"]])
+    monkeypatch.setattr(gpu, "run_apart", lambda work, request, *_: answers[request["part"]])
     Gpu(data=tmp_path, output=tmp_path, work=tmp_path, parts=("checks", "operations")).run()
     text = (tmp_path / "gpu.md").read_text()
     assert "Not run: it failed with status 1" in text and "5 GB/s" in text
@@ -58,13 +59,14 @@ def test_a_kernel_that_is_wrong_ends_with_a_status(tmp_path, monkeypatch):
 
 
 def test_a_process_that_outlasts_its_time_is_ended(tmp_path, monkeypatch):
-    lines = ("import time", "print('@ step 3: 7 s of training, 12.50 dB', flush=True)", "time.sleep(60)")
+    lines = ("import time", "print('@ step 3: 7 s of training, 12.50 dB', flush=True)", "time.sleep(90)")
     (tmp_path / "sleeper.py").write_text("\n".join(lines))
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    found = run_apart("sleeper", {}, tmp_path / "run", 1, seconds=3.0)
+    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}:{HERE.parent}")
+    sleep = SimpleNamespace(__module__="sleeper", __qualname__="sleep")
+    found = run_apart(sleep, {}, tmp_path / "run", 1, seconds=20.0)
     assert "failed with status" in found["not_run"]
-    assert told_curve(tmp_path / "run" / "output.log") == [{"step": 3, "seconds": 7.0, "psnr": 12.5}]
-    assert told_curve(tmp_path / "nothing.log") == []
+    assert told_curve(tmp_path / "run") == [{"step": 3, "seconds": 7.0, "psnr": 12.5}]
+    assert told_curve(tmp_path / "nothing") == []
 
 
 def test_headline_holds_what_was_measured_and_nothing_else():
@@ -76,5 +78,5 @@ def test_headline_holds_what_was_measured_and_nothing_else():
     quality = {"methods": {"mmpi": {"curve": curve}, "nerfacto": {"not_run": "no"}}}
     assert headline({"quality": quality}) == {"mmpi_psnr_db": 20.0, "mmpi_seconds": 2.0}
     made = {"command": "mmpi-bench gpu", "processor": "x", "threads": 1, "torch": "2", "commit": "c", "date": "d"}
-    content = {"parts": {"quality": {**quality, "wall_s": 1.0}}, "made": made, "rehearsal": False, "headline": {}}
-    assert "| nerfacto | - | - | not run: no |" in table(content) and "rehearsal" not in table(content)
+    content = {"rows": {"quality": {**quality, "wall_s": 1.0}}, "made": made, "rehearsal": False}
+    assert "| nerfacto | - | - | not run: no |" in markdown(content, {}) and "rehearsal" not in markdown(content, {})

@@ -40,7 +40,7 @@ def test_every_setting_is_timed_and_compared_with_exact_rays(run, tmp_path):
     found = json.loads((tmp_path / "render.json").read_text())
     assert all(isinstance(v, int | float) and math.isfinite(v) for v in found["headline"].values())
     assert found["headline"]["exact_rays"] == len(found["exact"]) == 60
-    rows = found["settings"]
+    rows = found["rows"]
     assert {r["threshold"] for r in rows.values()} == {0.0, 1e-4, 1e-3, 3e-3, 1e-2, 3e-2}
     assert {r["chunk"] for r in rows.values()} == {100, 4096} and {r["ops"] for r in rows.values()} == {
         "native",
@@ -71,7 +71,7 @@ def test_what_was_measured_is_kept(run, tmp_path, monkeypatch):
     monkeypatch.setattr(render, "exact_colors", lambda *_: pytest.fail("rendered exactly again"))
     Render(run, **settings(tmp_path, thresholds=(0.0, 0.5), rounds=1)).run()
     after = json.loads((tmp_path / "render.json").read_text())
-    assert measured == [0.5] and {k: after["settings"][k] for k in before["settings"]} == before["settings"]
+    assert measured == [0.5] and {k: after["rows"][k] for k in before["rows"]} == before["rows"]
 
 
 def test_exact_rays_without_votes_equal_those_with_them(run):
@@ -103,7 +103,7 @@ def test_a_setting_is_off_the_front_where_another_is_faster_without_more_error()
         "a little faster": row(1e-3, 2.05, 19.99, 1e-3),
         "coarse": row(1e-2, 4.0, 19.5, 1e-2),
     }
-    content = {"settings": rows, "pixels": 10, "default": "default", "exact": [0] * 7}
+    content = {"rows": rows, "pixels": 10, "default": "default", "exact": [0] * 7}
     found = {r["name"]: r for r in render._rows(content)}
     assert [r["on_front"] for r in found.values()] == [True] * 4, "2.5 % are noise"
     assert found["coarse"]["loss"] == pytest.approx(0.5) and found["coarse"]["rays_per_s"] == pytest.approx(40)

@@ -73,7 +73,7 @@ def test_scaling_end_to_end_and_again(tmp_path, monkeypatch):
     sizes += [("rays", {}), ("rays", {"rays": 64})]
     chosen = [replace(SMALL, series=series, **changes) for series, changes in sizes]
     monkeypatch.setattr(scaling, "points", lambda: chosen)
-    monkeypatch.setattr(scaling, "run_apart", lambda module, request, folder, threads: measure(request, print))
+    monkeypatch.setattr(scaling, "run_apart", lambda work, request, folder, threads: work(request, print))
     monkeypatch.setattr(scaling, "BASE", SMALL)
     Scaling(steps=1, threads=1, output=tmp_path, work=tmp_path).run()
     found = json.loads((tmp_path / "scaling.json").read_text())

@@ -4,28 +4,28 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import asdict
 
 import pytest
 import torch
-from nerfstudio.engine import trainer as nerfstudio_trainer
 from torchmetrics.image import lpip
 
 from mmpi_ns.bench import trainings
 from mmpi_ns.bench.methods import METHODS, Scene
 from mmpi_ns.bench.speed import against_peers as speed
-from mmpi_ns.bench.speed import alternate, ops
+from mmpi_ns.bench.speed import ops
 from mmpi_ns.bench.speed.against_peers import Speed
+from mmpi_ns.bench.speed.all_planes import DenseSteps
 from mmpi_ns.bench.speed.ops import Ops
+from mmpi_ns.bench.trainers import Steps
 
 
-def train_here(request, folder, threads):
-    nerfstudio_trainer.writer.EVENT_WRITERS.clear()
-    return trainings.run(request, lambda text: None)
+def train_here(request, threads):
+    return trainings.train(asdict(request), lambda text: None)
 
 
-def rounds_here(module, request, folder, threads):
-    assert module == "mmpi_ns.bench.speed.alternate"
-    return alternate.run(alternate.Request(**request), lambda text: None)
+def rounds_here(work, request, folder, threads):
+    return work(request, lambda text: None)
 
 
 def command(scene, folder, **changes):
@@ -68,11 +68,11 @@ def test_medians_are_of_neighbours_in_time():
 @pytest.fixture(scope="module")
 def steps(scene, tmp_path_factory):
     words = METHODS["mmpi-small"].words(Scene(scene, 1), tmp_path_factory.mktemp("steps"), 20, 64, 0, "cpu")
-    return alternate.Steps([*words[:1], "--pipeline.model.placement.max-planes", "16", *words[1:]])
+    return Steps([*words[:1], "--pipeline.model.placement.max-planes", "16", *words[1:]])
 
 
 def test_dense_steps_learn_and_train_on_every_plane(steps):
-    dense = alternate.DenseSteps(steps)
+    dense = DenseSteps(steps)
     before = dense.field.features.detach().clone()
     assert dense.run(2) > 0 and dense.step == 2
     assert dense.samples == sum(m.planes for m in dense.field.plan.mpis)
@@ -85,7 +85,7 @@ def test_steps_are_those_of_nerfstudios_loop(steps, scene, tmp_path):
     step = steps.step
     steps.run(6 - step)
     words = METHODS["mmpi-small"].words(Scene(scene, 1), tmp_path, 20, 64, 0, "cpu")
-    other = alternate.Steps([*words[:1], "--pipeline.model.placement.max-planes", "16", *words[1:]])
+    other = Steps([*words[:1], "--pipeline.model.placement.max-planes", "16", *words[1:]])
     other.trainer._total_steps = 6  # its schedule stays that of 20
     other.trainer.train()
     for a, b in zip(steps.pipeline.model.parameters(), other.pipeline.model.parameters(), strict=True):
@@ -102,7 +102,7 @@ def test_ops_end_to_end_and_again(scene, tmp_path, monkeypatch):
     found = json.loads((tmp_path / "ops.json").read_text())
     assert all(isinstance(v, int | float) and math.isfinite(v) and v > 0 for v in found["headline"].values())
     for stage in ("early", "late"):
-        counts, rows = found["stages"][stage]["counts"], found["stages"][stage]["ops"]
+        counts, rows = found["rows"][stage]["counts"], found["rows"][stage]["ops"]
         assert counts["pixels"] == 64 and 0 < counts["kept"] <= counts["live"] and len(rows) == 12
         assert counts["rows"] <= 4 * counts["kept"]
         assert f"{stage}_interpolation_backward_ms" in found["headline"]
@@ -136,5 +136,5 @@ def test_operations_do_what_their_names_say(steps):
 
 def test_an_operation_is_held_to_its_bytes_or_its_sums():
     limits = {"copy_gb_per_s": 10.0, "matmul_gflop_per_s": 100.0}
-    assert ops._limit({"mb": 20.0, "mflop": 0.0}, limits) == 2.0
-    assert ops._limit({"mb": 20.0, "mflop": 400.0}, limits) == 4.0
+    assert ops.limit_ms({"mb": 20.0, "mflop": 0.0}, limits) == 2.0
+    assert ops.limit_ms({"mb": 20.0, "mflop": 400.0}, limits) == 4.0

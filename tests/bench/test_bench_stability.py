@@ -8,7 +8,7 @@ import math
 import pytest
 import torch
 
-from mmpi_ns.bench import provenance
+from mmpi_ns.bench import report
 from mmpi_ns.bench.stability import absurd
 from mmpi_ns.bench.stability import blending as cases_blending
 from mmpi_ns.bench.stability import command as stability
@@ -146,7 +146,7 @@ def test_the_table_names_command_processor_commit_and_every_case(tmp_path, monke
     assert headline["cases"] == 2 and headline["failed"] == 0
     assert all(isinstance(v, int | float) for v in headline.values())
     text = (tmp_path / "stability.md").read_text()
-    for wanted in (f"mmpi-bench stability --output {tmp_path.name} --no-training", provenance.processor(),
+    for wanted in (f"mmpi-bench stability --output {tmp_path.name} --no-training", report.processor(),
                    content["made"]["commit"], content["made"]["date"], *(c.inputs for c in chosen)):  # fmt: skip
         assert wanted in text
     assert (tmp_path / "stability.png").stat().st_size > 1000
@@ -177,8 +177,8 @@ def test_a_case_that_raises_fails_and_the_next_one_runs(tmp_path, monkeypatch):
     with pytest.raises(SystemExit):
         stability.Stability(output=tmp_path, training=False).run()
     content = json.loads((tmp_path / "stability.json").read_text())
-    assert [row["ok"] for row in content["rows"]] == [False, True] and content["headline"]["failed"] == 1
-    assert "out of range" in content["rows"][0]["paths"]["float32"]["raised"]
+    assert [row["ok"] for row in content["rows"].values()] == [False, True] and content["headline"]["failed"] == 1
+    assert "out of range" in content["rows"]["group: bad"]["paths"]["float32"]["raised"]
 
 
 @pytest.mark.parametrize("group", [cases_geometry, cases_blending, cases_merging])
@@ -216,5 +216,5 @@ def test_a_training_that_ends_in_nan_fails(tmp_path, monkeypatch):
     def poison(trainer):
         trainer._model.field.features.data[64] = math.nan  # the first texel: the rows before it hold nothing
 
-    row = absurd.train(absurd.Absurdity("poisoned", absurd.FINITE, lambda c, s: None, poison), tmp_path, 2)
+    row = absurd.train(absurd.Absurdity("poisoned", start=poison), tmp_path, 2)
     assert not row["ok"] and "field.features" in row["outcome"]

@@ -12,7 +12,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from nerfstudio.engine import trainer as nerfstudio_trainer
 from torchmetrics.image import lpip
 
 from mmpi_ns.bench import methods, trainings
@@ -21,15 +20,15 @@ from mmpi_ns.bench.methods import METHODS
 from mmpi_ns.bench.quality import train
 from mmpi_ns.bench.quality.curves import Curve, compare
 from mmpi_ns.bench.quality.train import Train
-from mmpi_ns.bench.quality.train_report import headline, table
-from mmpi_ns.bench.speed.alternate import Steps
+from mmpi_ns.bench.quality.train_report import headline, markdown
+from mmpi_ns.bench.speed import scaling
+from mmpi_ns.bench.trainers import Steps
 
 
-def in_this_process(request, folder, threads):
+def in_this_process(request, threads):
     """Instead of a fresh one, which takes seconds to import everything."""
-    nerfstudio_trainer.writer.EVENT_WRITERS.clear()
     said = []
-    row = trainings.run(request, said.append)
+    row = trainings.train(dataclasses.asdict(request), said.append)
     assert [line.split(":")[0] for line in said] == [f"step {n}" for n in request.checks]
     return row
 
@@ -96,7 +95,7 @@ def test_what_cannot_run_is_named_with_the_reason(trained):
 def test_finished_rows_are_kept_and_others_are_run_again(scene, trained, monkeypatch):
     before, asked = read(trained)["rows"], []
 
-    def refuse(request, folder, threads):
+    def refuse(request, threads):
         asked.append(request.words[0])
         return {"not_run": "it failed"}
 
@@ -128,10 +127,9 @@ def test_a_peer_that_was_cut_off_or_was_shorter_goes_on_from_its_last_check(scen
     monkeypatch.setenv("TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD", "1")  # as train_apart does
     said = []
 
-    def here(request, folder, threads):
-        nerfstudio_trainer.writer.EVENT_WRITERS.clear()
+    def here(request, threads):
         said.append([])
-        return trainings.run(request, said[-1].append)
+        return trainings.train(dataclasses.asdict(request), said[-1].append)
 
     def nerfacto(steps: int, **settings) -> dict:
         settings = {"methods": ("nerfacto",), "seeds": (0,), "keep": True} | settings
@@ -154,13 +152,13 @@ def test_a_peer_that_was_cut_off_or_was_shorter_goes_on_from_its_last_check(scen
 
 def test_a_process_is_told_what_its_request_needs(tmp_path, monkeypatch):
     given = {}
-    monkeypatch.setattr(train, "run_apart", lambda *a, extra: given.update(extra) or {})
-    request = trainings.Request((), "", 1, str(tmp_path), (1,), 0, 0, 0, False, False)
-    train.train_apart(request, tmp_path, 1)
+    monkeypatch.setattr(trainings, "run_apart", lambda *a: given.update(a[-1]) or {})
+    request = trainings.Request((), "", 1, str(tmp_path), (1,))
+    trainings.train_apart(request, 1)
     assert given == {}, "methods run as they are"
-    train.train_apart(dataclasses.replace(request, go_on=True), tmp_path, 1)
+    trainings.train_apart(dataclasses.replace(request, go_on=True), 1)
     assert given == {"TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD": "1"}
-    train.train_apart(dataclasses.replace(request, quick_hashes=True), tmp_path, 1)
+    trainings.train_apart(dataclasses.replace(request, quick_hashes=True), 1)
     assert any(name.startswith("MALLOC_") for name in given)
 
 
@@ -174,7 +172,8 @@ def test_quick_hashes_are_for_hash_tables_and_have_rows_of_their_own(scene, tmp_
 
 
 def test_a_process_that_fails_says_why_and_where(tmp_path):
-    row = run_apart("mmpi_ns.bench.nothing", {}, tmp_path, 1)
+    nothing = SimpleNamespace(__module__="mmpi_ns.bench.nothing", __qualname__="measure")
+    row = run_apart(nothing, {}, tmp_path, 1)
     assert row["not_run"].startswith("it failed with status 1 (") and "No module named" in row["not_run"]
     assert row["not_run"].endswith(f"see {tmp_path / 'output.log'}")
     assert "nothing" in (tmp_path / "output.log").read_text()
@@ -183,7 +182,7 @@ def test_a_process_that_fails_says_why_and_where(tmp_path):
 @pytest.mark.commands
 def test_a_process_answers_with_the_threads_that_it_was_given(tmp_path, capsys):
     point = {"planes": 8, "height": 8, "width": 8, "rays": 16, "mpis": 1, "steps": 1}
-    row = run_apart("mmpi_ns.bench.speed.scaling", point, tmp_path, 1)
+    row = run_apart(scaling.measure, point, tmp_path, 1)
     assert row["texels"] == (8 + 1) * 64 and row["threads"] == 1
 
 
@@ -200,15 +199,15 @@ def test_rows_with_different_images_cannot_stand_in_one_table():
         name: {"scene": "a", "downscale_factor": 4, "split": {"digest": digest}}
         for name, digest in (("x", "1"), ("y", "1"))
     }
-    train._check_equal_data(rows)
+    train.check_equal_data(rows)
     rows["y"]["split"]["digest"] = "2"
     with pytest.raises(RuntimeError, match="y and x"):
-        train._check_equal_data(rows)
+        train.check_equal_data(rows)
 
 
 def test_the_clock_stands_still_and_random_draws_go_on_as_if_nothing_was(monkeypatch):
     now = [10.0]
-    monkeypatch.setattr(trainings.time, "perf_counter", lambda: now[0])
+    monkeypatch.setattr(trainings, "clock", lambda: now[0])
     watch = trainings.Stopwatch()
     torch.manual_seed(3)
     np.random.seed(3)  # noqa: NPY002
@@ -312,7 +311,7 @@ def test_a_report_compares_with_the_peer_and_tells_scenes_apart():
     rows["b /4: mmpi-small; cpu"] = row("mmpi-small", "b", [1, 2, 3], [1, 10, 100])
     assert headline(rows)["a_4_delta_at_end_db"] == 2 and headline(rows)["b_4_mmpi_small_psnr_db"] == 3
     content = {"rows": rows, "made": {k: "" for k in ("command", "processor", "threads", "torch", "commit", "date")}}
-    lines = table(content).splitlines()
+    lines = markdown(content).splitlines()
     assert "| mmpi-small, 300 steps | 15.00 | 17.39 | 18.89 |  |  |  | 20.00 (100 s) |" in lines
 
 

@@ -8,10 +8,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from nerfstudio.field_components.field_heads import FieldHeadNames
 from torch import Tensor
 
-from mmpi_ns.bench.rendering import bundle_of
+from mmpi_ns.bench.rendering import bundle_of, render
 from mmpi_ns.bench.stability.exact_ray import ExactField, ExactRay, Gradients
 from mmpi_ns.bench.stability.rays import CLEAR, CUBE, Scene, scene
 from mmpi_ns.field.baking import baked_shares
@@ -58,28 +57,6 @@ def _draw(device: str, *shape: int, seed: int = 0) -> Tensor:
 # Whole rays ----------------------------------------------------------------------------------------------------------
 
 
-def render_rays(field: MMPIField, s: Scene, device: str, known_lookup: bool = True) -> tuple[Tensor, Tensor]:
-    """Colours of a scene's rays, and how many samples each keeps: all.
-
-    Args:
-        field: the scene's, on the device.
-        s: rays and form of blending.
-        device: where to render.
-        known_lookup: colours by what the densities were looked up with, as in training; else as in rendering.
-    """
-    rays = bundle_of(s.origins, s.directions).to(device)
-    samples, report = MMPISampler()(rays, field=field, threshold=0.0, blend_form=s.form)
-    tau, lookup = field.get_density(samples)
-    tau, meta = tau[..., 0], metadata_of(samples)
-    if s.form is not None and lookup.index.numel():
-        shares = field.sample_shares(samples, lookup)
-        flat = compositing.blended_optical_depth(tau.reshape(-1)[lookup.index], *shares, s.form)
-        tau = tau.new_zeros(tau.numel()).index_put((lookup.index,), flat).view(tau.shape)
-    made = composite_weights(tau, meta["valid"][..., 0], meta["skipped_before"][..., 0], report.skipped_total)
-    colors = field.get_outputs(samples, lookup if known_lookup else None)[FieldHeadNames.RGB]
-    return compositing.render_colors(made, colors), meta["valid"][..., 0].sum(-1)
-
-
 def whole_rays(s: Scene, name: str, device: str) -> list[Check]:
     """March, interpolation and compositing together, values and gradients, against exact arithmetic."""
     known, field = ExactField.of(s.field), s.field.to(device)
@@ -90,12 +67,14 @@ def whole_rays(s: Scene, name: str, device: str) -> list[Check]:
     for i in clear:
         wanted.append(torch.tensor(exact[i].render(s.form)[0]))
         exact[i].add_gradient(upstream[i], s.form, slopes, sizes)
-    rgb, kept = render_rays(field, s, device)
+    rays = bundle_of(s.origins, s.directions).to(device)
+    found = render(field, rays, form=s.form)
+    rgb, kept = found.rgb, metadata_of(found.samples)["valid"].sum((1, 2))
     by = torch.tensor(upstream, dtype=torch.float32, device=device)
     (rgb[clear] * by[clear]).sum().backward()
     wrong = sum(int(kept[i]) != len(exact[i].samples) for i in clear)
     with torch.no_grad():
-        shaded = render_rays(field, s, device, known_lookup=False)[0]
+        shaded = render(field, rays, form=s.form, known_lookup=False).rgb
     checks = [
         *marched(s, name, field, device, exact, clear),
         Check(f"{name}: rays with a wrong number of samples, of {len(clear)}", wrong, 0),

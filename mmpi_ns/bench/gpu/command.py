@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import importlib.util
-import os
 import re
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 
 from mmpi_ns.bench.apart import run_apart
-from mmpi_ns.bench.gpu.report import draw, headline, table
+from mmpi_ns.bench.gpu.parts import run_part
+from mmpi_ns.bench.gpu.report import draw, headline, markdown
 from mmpi_ns.bench.methods import METHODS, Method, Scene
-from mmpi_ns.bench.provenance import stamp, write_json
+from mmpi_ns.bench.report import Bench, Report, Row
 from mmpi_ns.bench.suites import JOINT
-from mmpi_ns.bench.trainings import Request
+from mmpi_ns.bench.trainings import Request, train_apart
 
 SHARES = {
     "checks": 0.15,
@@ -35,7 +34,7 @@ GRACE = 60.0
 
 
 @dataclass
-class Gpu:
+class Gpu(Bench):
     """Kernels against float64, then training, frames, the paper's KITTI size, and error over time, on one GPU.
 
     Every part runs in a process of its own within its share of the time: one that fails is recorded, and the others go
@@ -46,10 +45,6 @@ class Gpu:
     """A drive (a folder with transforms.json); a procedural street is made where none is given."""
     downscale_factor: int = 1
     """Image size to use."""
-    output: Path = Path("docs/results")
-    """Where gpu.json, gpu.md and gpu.png go."""
-    work: Path = Path("outputs/gpu")
-    """Where the street, runs and logs go."""
     seconds: float = 560.0
     """For everything."""
     parts: tuple[str, ...] = tuple(SHARES)
@@ -57,12 +52,15 @@ class Gpu:
     rehearse: bool = False
     """Run everything in miniature on a CPU, the kernels by Triton's interpreter: to see that it runs, not how fast."""
 
+    name = "gpu"
+
     def run(self) -> None:
         self._check()
-        start, made = time.monotonic(), stamp("gpu", self)
-        content: dict[str, Any] = {"headline": {}, "made": made, "rehearsal": self.rehearse, "parts": {}}
-        data, made["scene_seconds"] = self._scene(), time.monotonic() - start
+        start, report = time.monotonic(), Report(self, key=None)
+        made, rows = report.content["made"], report.rows
+        data, report.content["rehearsal"] = self._scene(), self.rehearse
         options = [] if importlib.util.find_spec("pycolmap") else ["--pipeline.datamanager.sfm-path", "none"]
+        made["scene_seconds"] = time.monotonic() - start
         made["tracks"] = "of the data set" if not options else "triangulated from images: pycolmap is not installed"
         for number, name in enumerate(self.parts):
             left = self.seconds - (time.monotonic() - start)
@@ -70,14 +68,13 @@ class Gpu:
             print(f"{name}: {max(0.0, left * share):.0f} s ...", flush=True)
             begin = time.monotonic()
             found = self._part(name, data, options, left * share) if left > 0 else {"not_run": "no time was left"}
-            content["parts"][name] = {**found, "wall_s": time.monotonic() - begin}
-            content["headline"] = headline(content["parts"])
-            write_json(self.output / "gpu.json", content)
-            (self.output / "gpu.md").write_text(table(content), encoding="utf-8")
-        draw(self.output / "gpu.png", content["parts"].get("quality", {}))
-        print(content["headline"])
-        wrong = [name for name, part in content["parts"].items() if "not_run" in part] if self.rehearse else []
-        if content["headline"].get("failed_checks") or wrong:
+            rows[name] = {**found, "wall_s": time.monotonic() - begin}
+            head = headline(rows)
+            report.finish(head, markdown(report.content, head), lambda path: draw(path, rows.get("quality", {})))
+        head = report.content["headline"]
+        print(head)
+        wrong = [name for name, part in rows.items() if "not_run" in part] if self.rehearse else []
+        if head.get("failed_checks") or wrong:
             raise SystemExit(
                 f"mmpi-bench: a kernel is wrong or a rehearsed part failed ({', '.join(wrong) or 'checks'})."
             )
@@ -100,30 +97,26 @@ class Gpu:
         from mmpi_ns.synthetic.catalogue import make_scene
         from mmpi_ns.synthetic.dataset import write_dataset
 
-        folder, (width, height) = (self.work / "street").resolve(), (40, 12) if self.rehearse else (621, 188)
+        folder, (width, height) = (self.folder / "street").resolve(), (40, 12) if self.rehearse else (621, 188)
         if not (folder / "transforms.json").is_file():
             print(f"No --data: making a street of {width} x {height} pixels ...", flush=True)
             scene = make_scene("street", count=10 if self.rehearse else 40, width=width, height=height)
             write_dataset(scene, folder, points=150 if self.rehearse else 4000, overwrite=True)
         return folder
 
-    def _part(self, name: str, data: Path, options: list[str], seconds: float) -> dict[str, Any]:
+    def _part(self, name: str, data: Path, options: list[str], seconds: float) -> Row:
         if name == "quality":
             return self._quality(data, options, seconds)
         part, _, ops = name.partition(" ")
-        request = {
-            "part": part,
-            "ops": ops,
-            "device": "cpu" if self.rehearse else "cuda",
-            "seconds": max(5.0, seconds - 15),  # less what it takes to start
-            "data": str(data),
-            "downscale_factor": self.downscale_factor,
-            "work": str(self.work.resolve()),
-            "options": options,
-            "rehearse": self.rehearse,
-        }
-        folder = self.work / name.replace(" ", "-")
-        return run_apart("mmpi_ns.bench.gpu.parts", request, folder, self._threads, seconds + GRACE, self._extra)
+        request = {"part": part, "ops": ops, "device": self._device, "rehearse": self.rehearse, "options": options}
+        request |= {"data": str(data), "downscale_factor": self.downscale_factor, "work": str(self.folder.resolve())}
+        request["seconds"] = max(5.0, seconds - 15)  # less what it takes to start
+        folder = self.folder / name.replace(" ", "-")
+        return run_apart(run_part, request, folder, self._cores, seconds + GRACE, self._extra)
+
+    @property
+    def _device(self) -> str:
+        return "cpu" if self.rehearse else "cuda"
 
     @property
     def _extra(self) -> dict[str, str]:
@@ -131,12 +124,12 @@ class Gpu:
         return {"TRITON_INTERPRET": "1", "CUDA_VISIBLE_DEVICES": ""} if self.rehearse else {}
 
     @property
-    def _threads(self) -> int:
-        return 1 if self.rehearse else os.cpu_count() or 1
+    def _cores(self) -> int:
+        return 1 if self.rehearse else self.cores
 
-    def _quality(self, data: Path, options: list[str], seconds: float) -> dict[str, Any]:
+    def _quality(self, data: Path, options: list[str], seconds: float) -> Row:
         """PSNR of test views against seconds of training: ours, nerfacto and splatfacto."""
-        rows: dict[str, Any] = {}
+        rows: dict[str, Row] = {}
         names = ("mmpi",) if self.rehearse else tuple(PEERS)
         for number, name in enumerate(names):
             begin, method = time.monotonic(), METHODS[name]
@@ -146,32 +139,20 @@ class Gpu:
             if reason is not None:
                 rows[name] = {"not_run": reason}
                 continue
-            folder = self.work / f"quality-{name}"
-            request = self._training(method, data, folder, 4 if self.rehearse else PEERS[name])
             limit = seconds / (len(names) - number) + (GRACE if self.rehearse else 0)
-            row = run_apart("mmpi_ns.bench.trainings", asdict(request), folder, self._threads, limit, self._extra)
-            rows[name] = row if "not_run" not in row else {**row, "curve": told_curve(folder / "output.log")}
+            request = self._training(method, data, self.folder / f"quality-{name}")
+            row = train_apart(request, self._cores, limit, self._extra)
+            rows[name] = row if "not_run" not in row else {**row, "curve": told_curve(Path(request.work))}
             seconds -= time.monotonic() - begin
-        return (
-            {"methods": rows} if any("curve" in r for r in rows.values()) else {"not_run": str(rows), "methods": rows}
-        )
+        ran = any("curve" in row for row in rows.values())
+        return {"methods": rows} if ran else {"not_run": str(rows), "methods": rows}
 
-    def _training(self, method: Method, data: Path, folder: Path, steps: int) -> Request:
-        device = "cpu" if self.rehearse else "cuda"
-        words = method.words(Scene(data, self.downscale_factor), folder, steps, None, 0, device)
+    def _training(self, method: Method, data: Path, folder: Path) -> Request:
+        steps = 4 if self.rehearse else PEERS[method.name]
+        few = 1 if self.rehearse else 4
         checks = sorted({max(1, round(steps * 2.0**-i)) for i in range(9)} | {round(steps * 3 / 4)})
-        return Request(
-            words=tuple(words),
-            data=str(data),
-            downscale_factor=self.downscale_factor,
-            work=str(folder),
-            checks=tuple(checks),
-            check_images=1 if self.rehearse else 4,
-            check_pixels=64 if self.rehearse else 4096,
-            final_images=1 if self.rehearse else 4,
-            whole_images=method.whole_images,
-            keep=False,
-        )
+        looks = {"checks": tuple(checks), "check_images": few, "check_pixels": 1024 * few, "final_images": few}
+        return Request.of(method, Scene(data, self.downscale_factor), folder, steps, device=self._device, **looks)
 
 
 TINY = (
@@ -182,8 +163,9 @@ TINY = (
 """For a rehearsal."""
 
 
-def told_curve(log: Path) -> list[dict[str, float]]:
+def told_curve(folder: Path) -> list[dict[str, float]]:
     """What a training that was ended early had said of itself."""
+    log = folder / "output.log"
     text = log.read_text(encoding="utf-8", errors="replace") if log.is_file() else ""
     found = re.findall(r"step (\d+): (\d+) s of training, ([\d.]+) dB", text)
     return [{"step": int(a), "seconds": float(b), "psnr": float(c)} for a, b, c in found]

@@ -1,4 +1,4 @@
-"""What ``mmpi-bench gpu`` times, each part in a process of its own: ``python -m`` this module.
+"""What ``mmpi-bench gpu`` times, each part in a process of its own.
 
 A part that fails, or breaks the device's context, takes no other with it. Parts look at the clock between measurements
 and return what they have when their time is up.
@@ -17,17 +17,17 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mmpi_ns.bench.apart import answer
+from mmpi_ns.bench.apart import Tell
 from mmpi_ns.bench.gpu.checks import run_checks
 from mmpi_ns.bench.methods import Method, Scene
-from mmpi_ns.bench.speed.alternate import Steps, clock
+from mmpi_ns.bench.speed.ops import copy_rate, median_s
+from mmpi_ns.bench.speed.scaling import Point
 from mmpi_ns.bench.suites import JOINT, TWO_PHASE, P
+from mmpi_ns.bench.trainers import Steps
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.model import MMPIModel
 from mmpi_ns.ops import interpolate, native
-from mmpi_ns.scene.plan import MPIPlan, ScenePlan
 
-Tell = Callable[[str], None]
 SECTOR = 32
 """Bytes that a GPU fetches at least: a bilinear lookup of one channel touches two sectors, one in each row."""
 TRANSPARENT = -30.0
@@ -38,36 +38,7 @@ FULL_WIDTH = 1242
 """Pixels across a frame of KITTI (375 down)."""
 
 
-def median_s(work: Callable[[], Any], repeats: int) -> float:
-    """Median seconds, the device waited for, after two untimed calls (which compile) unless one will do."""
-    for _ in range(2 if repeats > 1 else 0):
-        work()
-    times = []
-    for _ in range(repeats):
-        start = clock()
-        work()
-        times.append(clock() - start)
-    return statistics.median(times)
-
-
-def copy_rate(device: str, size: int) -> float:
-    """Bytes a second of a copy within the device, read and written."""
-    a = torch.ones(size, device=device)
-    b = torch.empty_like(a)
-    return 8 * size / median_s(lambda: b.copy_(a), 10)
-
-
 # Operations ----------------------------------------------------------------------------------------------------------
-
-
-def row_of_mpis(count: int, planes: int, side: int) -> ScenePlan:
-    """MPIs that stand 10 units apart and face the same way."""
-    axes = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-    mpis = [
-        MPIPlan(str(k), (0.0, 0.0, 10.0 * k - 5), axes, 3.0, (-1.0, 1.0, -0.35, 0.35), planes, side, side)
-        for k in range(count)
-    ]
-    return ScenePlan(tuple(mpis), None, 1.0, 5.0, "benchmark")
 
 
 def rays_of(count: int, coherent: bool, device: str) -> dict[str, Tensor]:
@@ -92,7 +63,9 @@ def measure_operations(request: dict[str, Any], tell: Tell) -> dict[str, Any]:
     device, small = request["device"], request["rehearse"]
     found: dict[str, Any] = {"copy_gb_per_s": copy_rate(device, 1 << (12 if small else 28)) / 1e9, "march": {}}
     tell(f"copy: {found['copy_gb_per_s']:.0f} GB/s")
-    field = MMPIField(row_of_mpis(*((2, 8, 12) if small else KITTI)), feature_channels=1, hidden_width=2).eval()
+    mpis, planes, side = (2, 8, 12) if small else KITTI
+    plan = Point(mpis=mpis, planes=planes, height=side, width=side).plan()
+    field = MMPIField(plan, feature_channels=1, hidden_width=2).eval()
     field = field.to(device)
     field.density.data.fill_(TRANSPARENT)
     repeats = 1 if small else 20
@@ -332,7 +305,7 @@ PARTS: dict[str, Callable[[dict[str, Any], Tell], dict[str, Any]]] = {
 }
 
 
-def run(request: dict[str, Any], tell: Tell) -> dict[str, Any]:
+def run_part(request: dict[str, Any], tell: Tell) -> dict[str, Any]:
     """One part, as asked."""
     if request["rehearse"]:
         torch.set_num_threads(1)
@@ -343,7 +316,3 @@ def run(request: dict[str, Any], tell: Tell) -> dict[str, Any]:
 
 def _device_name() -> str:
     return torch.cuda.get_device_name() if torch.cuda.is_available() else "CPU (rehearsal by Triton's interpreter)"
-
-
-if __name__ == "__main__":
-    answer(run)

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import Any
 
-from mmpi_ns.bench.provenance import stamp_line
+from mmpi_ns.bench.report import Row, figure, page, table, title
 
 
-def headline(parts: dict[str, Any]) -> dict[str, float]:
+def headline(parts: Row) -> dict[str, float]:
     """Named numbers of all parts that ran; those that are not there were not measured."""
-    found: dict[str, Any] = {}
+    found: Row = {}
     if "checks" in parts.get("checks", {}):
         found |= {"checks": len(parts["checks"]["checks"]), "failed_checks": parts["checks"]["failed"]}
     operations = parts.get("operations", {})
@@ -38,24 +37,24 @@ def headline(parts: dict[str, Any]) -> dict[str, float]:
         if row.get("curve"):
             best = max(row["curve"], key=lambda point: point["psnr"])
             found |= {f"{name}_psnr_db": best["psnr"], f"{name}_seconds": best["seconds"]}
-    return {k: v for k, v in found.items() if isinstance(v, int | float) and math.isfinite(v)}
+    return {k: v for k, v in found.items() if v is not None}
 
 
-def table(content: dict[str, Any]) -> str:
-    """The Markdown page."""
-    parts, device = content["parts"], "no part has run"
+def markdown(content: Row, head: Row) -> str:
+    """The page."""
+    parts, device = content["rows"], "no part has run"
     for part in parts.values():
         device = part.get("device", device)
-    lines = ["# On a GPU", "", f"{device}. {stamp_line(content['made'])}", ""]
+    blocks = [f"On: {device}."]
     if content["rehearsal"]:
-        lines += ["**A rehearsal in miniature on a CPU: no number here is a measurement.**", ""]
+        blocks.append("**A rehearsal in miniature on a CPU: no number here is a measurement.**")
     for name, part in parts.items():
-        lines += [f"## {name[0].upper()}{name[1:]} ({part['wall_s']:.0f} s)", ""]
-        if "not_run" in part:
-            lines += [f"Not run: {part['not_run']}", ""]
-        lines += [*_SECTIONS[name.split()[0]](part), ""]
-    lines += ["## Headline", "", "| | |", "|---|---|"]
-    return "\n".join([*lines, *(f"| {k} | {_number(v)} |" for k, v in content["headline"].items()), ""])
+        blocks += [f"## {title(name)} ({part['wall_s']:.0f} s)"]
+        blocks += [f"Not run: {part['not_run']}"] if "not_run" in part else []
+        blocks += _SECTIONS[name.split()[0]](part)
+    numbers = ({"name": name, "value": _number(value)} for name, value in head.items())
+    blocks += ["## Headline", table({"": "{name}", "value": "{value}"}, numbers)]
+    return page("On a GPU", content["made"], blocks)
 
 
 def _number(value: Any) -> str:
@@ -64,61 +63,53 @@ def _number(value: Any) -> str:
     return f"{value:,}" if isinstance(value, int) else f"{value:.4g}"
 
 
-def _rows(rows: dict[str, dict[str, Any]], first: str) -> list[str]:
-    """A table of rows with equal columns."""
-    names = list(dict.fromkeys(k for row in rows.values() for k in row))
-    lines = [f"| {first} | " + " | ".join(n.replace("_", " ") for n in names) + " |", "|---" * (len(names) + 1) + "|"]
-    return lines + [f"| {k} | " + " | ".join(_number(r.get(n)) for n in names) + " |" for k, r in rows.items()]
+def _all_columns(rows: dict[str, Row], first: str) -> str:
+    """A table of everything in the rows."""
+    names = dict.fromkeys(k for row in rows.values() for k in row)
+    columns = {first: lambda r: r["row"]} | {n.replace("_", " "): lambda r, n=n: _number(r.get(n)) for n in names}
+    return table(columns, ({"row": name, **row} for name, row in rows.items()))
 
 
-def _checks(part: dict[str, Any]) -> list[str]:
+def _checks(part: Row) -> list[str]:
     rows = part.get("checks", [])
-    lines = [f"{len(rows)} comparisons with float64, {part.get('failed', 0)} failed.", ""]
-    lines += ["| comparison | error | bound | |", "|---|---|---|---|"]
-    for r in rows:
-        lines.append(f"| {r['name']} | {_number(r['error'])} | {_number(r['bound'])} | {'ok' if r['ok'] else 'FAIL'} |")
-    return lines
+    columns = {"comparison": "{name}", "error": lambda r: _number(r["error"]), "bound": lambda r: _number(r["bound"])}
+    columns |= {"": lambda r: "ok" if r["ok"] else "FAIL"}
+    said = f"{len(rows)} comparisons with float64, {part.get('failed', 0)} failed."
+    return [said, table(columns, rows)]
 
 
-def _operations(part: dict[str, Any]) -> list[str]:
+def _operations(part: Row) -> list[str]:
     if "march" not in part:
         return []
-    return [
-        f"A copy within the device moves {part['copy_gb_per_s']:.0f} GB/s, read and written. The march looks up every",
-        "live sample of 4 MPIs of 256 planes, one sector (32 bytes) in each of two rows of texels; 16 of the 64 bytes",
-        "are used.",
-        "",
-        *_rows(part["march"], "rays"),
-        "",
-        *_rows(part["ops"], "operation"),
-    ]
+    said = f"""\
+A copy within the device moves {part["copy_gb_per_s"]:.0f} GB/s, read and written. The march looks up every live sample
+of 4 MPIs of 256 planes, one sector (32 bytes) in each of two rows of texels; 16 of the 64 bytes are used."""
+    return [said, _all_columns(part["march"], "rays"), _all_columns(part["ops"], "operation")]
 
 
-def _training(part: dict[str, Any]) -> list[str]:
+def _training(part: Row) -> list[str]:
     rows = {k: v for k, v in part.items() if isinstance(v, dict)}
-    return ["`mmpi`, four MPIs by hand, 256 planes, trained together.", "", *_rows(rows, "a step")] if rows else []
+    return ["`mmpi`, four MPIs by hand, 256 planes, trained together.", _all_columns(rows, "a step")] if rows else []
 
 
-def _kitti(part: dict[str, Any]) -> list[str]:
-    lines = []
-    for reading in ("split", "all"):
-        if reading in part:
-            row = dict(part[reading])
-            stages = row.pop("step_ms")
-            lines += [f"`rays-per-mpi {reading}`: " + ", ".join(f"{k} {_number(v)}" for k, v in row.items()) + ".", ""]
-            lines += ["| stage | ms a step |", "|---|---|", *(f"| {k} | {_number(v)} |" for k, v in stages.items()), ""]
-    return lines
+def _kitti(part: Row) -> list[str]:
+    blocks = []
+    for reading in {"split", "all"} & set(part):
+        facts = ", ".join(f"{k} {_number(v)}" for k, v in part[reading].items() if k != "step_ms")
+        stages = {name: {"ms a step": ms} for name, ms in part[reading]["step_ms"].items()}
+        blocks += [f"`rays-per-mpi {reading}`: {facts}.", _all_columns(stages, "stage")]
+    return blocks
 
 
-def _quality(part: dict[str, Any]) -> list[str]:
-    lines = ["| method | PSNR at the end | s | curve (s: dB) |", "|---|---|---|---|"]
+def _quality(part: Row) -> list[str]:
+    rows = {}
     for name, row in part.get("methods", {}).items():
         curve = row.get("curve") or []
-        points = ", ".join(f"{p['seconds']:.0f}: {p['psnr']:.2f}" for p in curve)
+        said = ", ".join(f"{p['seconds']:.0f}: {p['psnr']:.2f}" for p in curve)
         end = curve[-1] if curve else {}
-        said = points or f"not run: {row.get('not_run')}"
-        lines.append(f"| {name} | {_number(end.get('psnr'))} | {_number(end.get('seconds'))} | {said} |")
-    return lines
+        rows[name] = {"PSNR at the end": end.get("psnr"), "s": end.get("seconds")}
+        rows[name]["curve (s: dB)"] = said or f"not run: {row.get('not_run')}"
+    return [_all_columns(rows, "method")]
 
 
 _SECTIONS = {
@@ -130,22 +121,13 @@ _SECTIONS = {
 }
 
 
-def draw(path: Path, quality: dict[str, Any]) -> None:
+def draw(path: Path, quality: Row) -> None:
     """PSNR against seconds, one line a method; nothing where none was trained."""
     curves = {k: r["curve"] for k, r in quality.get("methods", {}).items() if r.get("curve")}
     if not curves:
         return
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    figure, axes = pyplot.subplots(figsize=(6, 4), layout="constrained")
-    for name, curve in curves.items():
-        axes.plot([max(p["seconds"], 0.1) for p in curve], [p["psnr"] for p in curve], marker="o", label=name)
-    axes.set(
-        xscale="log", xlabel="seconds of training, placement and loading included", ylabel="PSNR of test views, dB"
-    )
-    axes.legend()
-    figure.savefig(path, dpi=120)
-    pyplot.close(figure)
+    with figure(path, 1, 1, (6, 4)) as ((axis,),):
+        for name, curve in curves.items():
+            axis.plot([max(p["seconds"], 0.1) for p in curve], [p["psnr"] for p in curve], marker="o", label=name)
+        along = "seconds of training, placement and loading included"
+        axis.set(xscale="log", xlabel=along, ylabel="PSNR of test views, dB")

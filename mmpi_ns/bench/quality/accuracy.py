@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 
-from mmpi_ns.bench.provenance import stamp, stamp_line, write_json
 from mmpi_ns.bench.quality.solids import Solids, bake
 from mmpi_ns.bench.rendering import bundle_of, render
+from mmpi_ns.bench.report import Bench, Report, Row, figure, page, table
 from mmpi_ns.bench.stability.exact import Array
 from mmpi_ns.ops.compositing import BlendForm
 from mmpi_ns.scene.plan import MPIPlan
@@ -28,20 +28,17 @@ FORMS: tuple[BlendForm | None, ...] = (None, "paper", "opacity")
 
 
 @dataclass
-class Accuracy:
+class Accuracy(Bench):
     """Depth and colour error of exact tables against exact images, over planes, texels and number of MPIs."""
 
-    output: Path = Path("docs/results")
-    """Where accuracy.json, accuracy.md and accuracy.png go."""
+    name = "accuracy"
 
     def run(self) -> None:
-        made = stamp("accuracy", self)
-        rows = {"planes": by_planes(), "texels": by_texels(), "mpis": by_count()}
-        content = {"headline": headline(rows), "made": made, **rows}
-        write_json(self.output / "accuracy.json", content)
-        (self.output / "accuracy.md").write_text(table(content), encoding="utf-8")
-        draw(self.output / "accuracy.png", content)
-        print(content["headline"])
+        report = Report(self, key=None)
+        report.content["rows"] = rows = {"planes": by_planes(), "texels": by_texels(), "mpis": by_count()}
+        head = headline(rows)
+        report.finish(head, markdown(rows, head, report.content["made"]), lambda path: draw(path, rows))
+        print(head)
 
 
 def cameras() -> tuple[Array, Array]:
@@ -82,27 +79,25 @@ def expected_depth_error(solids: Solids, mpi: MPIPlan) -> float:
     return float((0.5 * step * directions[:, 2] / (1 - w * origins[:, 2]) ** 2).mean())
 
 
-def by_planes() -> list[dict[str, Any]]:
+def by_planes() -> list[Row]:
     """One MPI, ever more planes."""
     rows = []
     for planes in PLANES:
         mpi = front(planes, 97, 121)
         row = {"planes": planes, **measure(SLANTED, [mpi]), "expected_depth_error": expected_depth_error(SLANTED, mpi)}
-        print(f"{planes} planes: depth {row['depth_error']:.2e}, colour {row['color_error']:.2e}", flush=True)
+        print("{planes} planes: depth {depth_error:.2e}, colour {color_error:.2e}".format(**row), flush=True)
         rows.append(row)
-    return rows
+    return with_orders(rows, "planes", "depth_error", "color_error")
 
 
-def by_texels() -> list[dict[str, Any]]:
+def by_texels() -> list[Row]:
     """One MPI with a plane in a flat wall: no depth error, the texture's interpolation alone."""
     rows = []
     for texels in TEXELS:
-        mpi = front(9, texels, texels)
         wall = Solids((0.0, 0.0, 1.0), 2.5 * 8 / 3)  # the plane with disparity 3 steps above infinity
-        row = {"texels": texels, **measure(wall, [mpi])}
-        print(f"{texels} x {texels} texels: colour {row['color_error']:.2e}", flush=True)
-        rows.append(row)
-    return rows
+        rows.append({"texels": texels, **measure(wall, [front(9, texels, texels)])})
+        print("{texels} x {texels} texels: colour {color_error:.2e}".format(**rows[-1]), flush=True)
+    return with_orders(rows, "texels", "color_error")
 
 
 def several(count: int, planes: int = 17) -> list[MPIPlan]:
@@ -119,17 +114,12 @@ def several(count: int, planes: int = 17) -> list[MPIPlan]:
     return mpis
 
 
-def by_count() -> list[dict[str, Any]]:
+def by_count() -> list[Row]:
     """Ever more MPIs of 17 planes each, merged without reliability and with equal reliability in both forms."""
     rows = []
     for count in COUNTS:
-        row: dict[str, Any] = {"mpis": count}
-        for form in FORMS:
-            row[form or "joint"] = measure(SLANTED, several(count), form)
-        print(
-            f"{count} MPIs: depth {row['joint']['depth_error']:.2e}, colour {row['joint']['color_error']:.2e}",
-            flush=True,
-        )
+        row: Row = {"mpis": count} | {form or "joint": measure(SLANTED, several(count), form) for form in FORMS}
+        print("{mpis} MPIs: depth {joint[depth_error]:.2e}, colour {joint[color_error]:.2e}".format(**row), flush=True)
         rows.append(row)
     return rows
 
@@ -139,13 +129,22 @@ def order(sizes: list[float], errors: list[float]) -> float:
     return float(np.polyfit(np.log(sizes), np.log(errors), 1)[0])
 
 
-def headline(rows: dict[str, list[dict[str, Any]]]) -> dict[str, float]:
+def with_orders(rows: list[Row], size: str, *errors: str) -> list[Row]:
+    """The rows with the order of each error that is observed between a row and the one before it."""
+    for before, row in itertools.pairwise(rows):
+        for what in errors:
+            both = [1 / (r[size] - 1) for r in (before, row)], [r[what] for r in (before, row)]
+            row[f"{what}_order"] = f"{order(*both):.2f}"
+    return [dict.fromkeys((f"{e}_order" for e in errors), "-") | row for row in rows]
+
+
+def headline(rows: dict[str, list[Row]]) -> dict[str, float]:
     """Observed orders, and by how much an added MPI ever raised an error."""
     spacing = [1 / (r["planes"] - 1) for r in rows["planes"]]
     width = [1 / (r["texels"] - 1) for r in rows["texels"]]
     rises = [
         b["joint"][what] / a["joint"][what] - 1
-        for a, b in zip(rows["mpis"], rows["mpis"][1:], strict=False)
+        for a, b in itertools.pairwise(rows["mpis"])
         for what in ("depth_error", "color_error")
     ]
     finest = rows["planes"][-1]
@@ -158,114 +157,64 @@ def headline(rows: dict[str, list[dict[str, Any]]]) -> dict[str, float]:
     }
 
 
-def table(content: dict[str, Any]) -> str:
-    """The Markdown page."""
-    head = content["headline"]
-    lines = [
-        "# Accuracy on exact geometry",
-        "",
-        stamp_line(content["made"]),
-        "",
-        "A slanted wall and a ball before it, both filled with a smooth texture, are written into the texels as they",
-        "are: a texel is opaque where its point lies inside a solid, and has that point's colour. No training. Five",
-        "cameras up to 0.53 units from the MPI, 432 rays each; errors are means over all rays. Depth is compared as",
-        "1/t, in which planes are evenly spaced.",
-        "",
-        "| error | falls with | expected order | observed |",
-        "|---|---|---|---|",
-        f"| depth | plane spacing | 1 | {head['depth_order_in_planes']:.2f} |",
-        f"| colour | plane spacing | 1 | {head['color_order_in_planes']:.2f} |",
-        f"| colour | texel size | 2 | {head['color_order_in_texels']:.2f} |",
-        "",
-        "The first plane inside a solid is hit, so the depth error should be half a plane's spacing along the ray: the",
-        f"finest is {head['depth_error_over_expected']:.2f} times that. Of all added MPIs the least helpful changed an "
-        f"error by {100 * head['largest_change_with_an_added_mpi']:+.0f} % (merged jointly).",
-        "",
-        "![Errors over planes, texels and MPIs](accuracy.png)",
-        "",
-        *_planes_table(content["planes"]),
-        *_texels_table(content["texels"]),
-        *_count_table(content["mpis"]),
+def markdown(rows: dict[str, list[Row]], head: dict[str, float], made: Row) -> str:
+    """The page."""
+    said = """\
+A slanted wall and a ball before it, both filled with a smooth texture, are written into the texels as they
+are: a texel is opaque where its point lies inside a solid, and has that point's colour. No training. Five
+cameras up to 0.53 units from the MPI, 432 rays each; errors are means over all rays. Depth is compared as
+1/t, in which planes are evenly spaced."""
+    orders = [
+        {"error": "depth", "with": "plane spacing", "expected": 1, "found": head["depth_order_in_planes"]},
+        {"error": "colour", "with": "plane spacing", "expected": 1, "found": head["color_order_in_planes"]},
+        {"error": "colour", "with": "texel size", "expected": 2, "found": head["color_order_in_texels"]},
     ]
-    return "\n".join([*lines, ""])
+    columns = {"error": "{error}", "falls with": "{with}", "expected order": "{expected}", "observed": "{found:.2f}"}
+    half = f"""\
+The first plane inside a solid is hit, so the depth error should be half a plane's spacing along the ray: the
+finest is {head["depth_error_over_expected"]:.2f} times that. Of all added MPIs the least helpful changed an error by \
+{100 * head["largest_change_with_an_added_mpi"]:+.0f} % (merged jointly)."""
+    planes = table(
+        {
+            "planes": "{planes}",
+            "depth error": "{depth_error:.2e}",
+            "half a spacing": "{expected_depth_error:.2e}",
+            "order": "{depth_error_order}",
+            "colour error": "{color_error:.2e}",
+            "order ": "{color_error_order}",
+        },
+        rows["planes"],
+    )
+    texels = {"texels": "{texels} x {texels}", "colour error": "{color_error:.2e}", "order": "{color_error_order}"}
+    by_form = {"K": "{mpis}"}
+    for form in (f or "joint" for f in FORMS):
+        by_form |= {f"{form}: depth": f"{{{form}[depth_error]:.2e}}", f"{form}: colour": f"{{{form}[color_error]:.2e}}"}
+    merged = """\
+K MPIs of 17 planes around the cameras. *Joint*: merged without reliability, as trained together. *Paper* and
+*opacity*: blended with equal reliability everywhere, before it has learned anything. The paper's form then
+lets (1 - 1/K)^K of the light through K opaque samples and mixes in what lies deeper."""
+    blocks = [said, table(columns, orders), half, "![Errors over planes, texels and MPIs](accuracy.png)"]
+    blocks += ["## Planes", "One MPI, 121 x 97 texels.", planes, "## Texels"]
+    blocks += ["A flat wall that lies in a plane of the MPI: only the texture is interpolated."]
+    blocks += [table(texels, rows["texels"]), "## MPIs", merged, table(by_form, rows["mpis"])]
+    return page("Accuracy on exact geometry", made, blocks)
 
 
-def _planes_table(rows: list[dict[str, Any]]) -> list[str]:
-    lines = ["## Planes", "", "One MPI, 121 x 97 texels.", ""]
-    lines += ["| planes | depth error | half a spacing | order | colour error | order |", "|---|---|---|---|---|---|"]
-    for row, before in zip(rows, [None, *rows], strict=False):
-        orders = [_step(before, row, what, "planes") for what in ("depth_error", "color_error")]
-        cells = f"{row['depth_error']:.2e} | {row['expected_depth_error']:.2e} | {orders[0]} | {row['color_error']:.2e}"
-        lines.append(f"| {row['planes']} | {cells} | {orders[1]} |")
-    return lines
-
-
-def _texels_table(rows: list[dict[str, Any]]) -> list[str]:
-    lines = ["", "## Texels", "", "A flat wall that lies in a plane of the MPI: only the texture is interpolated.", ""]
-    lines += ["| texels | colour error | order |", "|---|---|---|"]
-    for row, before in zip(rows, [None, *rows], strict=False):
-        cells = f"{row['color_error']:.2e} | {_step(before, row, 'color_error', 'texels')}"
-        lines.append(f"| {row['texels']} x {row['texels']} | {cells} |")
-    return lines
-
-
-def _count_table(rows: list[dict[str, Any]]) -> list[str]:
-    lines = [
-        "",
-        "## MPIs",
-        "",
-        "K MPIs of 17 planes around the cameras. *Joint*: merged without reliability, as trained together. *Paper* and",
-        "*opacity*: blended with equal reliability everywhere, before it has learned anything. The paper's form then",
-        "lets (1 - 1/K)^K of the light through K opaque samples and mixes in what lies deeper.",
-        "",
-    ]
-    lines += ["| K | joint: depth | colour | paper: depth | colour | opacity: depth | colour |", "|---" * 7 + "|"]
-    for row in rows:
-        cells = [f"{row[f or 'joint'][what]:.2e}" for f in FORMS for what in ("depth_error", "color_error")]
-        lines.append(f"| {row['mpis']} | {' | '.join(cells)} |")
-    return lines
-
-
-def _step(before: dict[str, Any] | None, row: dict[str, Any], what: str, size: str) -> str:
-    """Order observed between two neighbouring rows."""
-    if before is None:
-        return "-"
-    return f"{order([1 / (r[size] - 1) for r in (before, row)], [r[what] for r in (before, row)]):.2f}"
-
-
-def draw(path: Path, content: dict[str, Any]) -> None:
+def draw(path: Path, rows: dict[str, list[Row]]) -> None:
     """Three panels: planes, texels, MPIs."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, (left, middle, right) = plt.subplots(1, 3, figsize=(10, 3.2), layout="constrained")
-    planes, texels, mpis = content["planes"], content["texels"], content["mpis"]
-    x = np.array([r["planes"] - 1.0 for r in planes])
-    left.loglog(x, [r["depth_error"] for r in planes], "o-", label="depth (1/t)")
-    left.loglog(x, [r["color_error"] for r in planes], "s-", label="colour")
-    left.loglog(x, [r["expected_depth_error"] for r in planes], "k--", lw=1, label="half a spacing (order 1)")
-    left.set(xlabel="planes - 1", ylabel="mean error", title="one MPI, wall and ball")
-    x = np.array([r["texels"] - 1.0 for r in texels])
-    errors = np.array([r["color_error"] for r in texels])
-    middle.loglog(x, errors, "s-", color="C1", label="colour")
-    middle.loglog(x, errors[0] * (x[0] / x) ** 2, "k--", lw=1, label="order 2")
-    middle.set(xlabel="texels - 1", title="one MPI, wall in a plane")
-    for form, style in zip(FORMS, ("o-", "^:", "v:"), strict=True):
-        name = form or "joint"
-        right.plot(
-            [r["mpis"] for r in mpis], [r[name]["depth_error"] for r in mpis], style, color="C0", label=f"depth, {name}"
-        )
-        right.plot(
-            [r["mpis"] for r in mpis],
-            [r[name]["color_error"] for r in mpis],
-            style,
-            color="C1",
-            label=f"colour, {name}",
-        )
-    right.set(xlabel="MPIs of 17 planes", title="K MPIs", ylim=(0, None))
-    for axes in (left, middle, right):
-        axes.legend(fontsize=7)
-    figure.savefig(path, dpi=90)
-    plt.close(figure)
+    planes, texels, mpis = rows["planes"], rows["texels"], rows["mpis"]
+    with figure(path, 1, 3, (10, 3.2)) as ((left, middle, right),):
+        x = [r["planes"] - 1 for r in planes]
+        left.loglog(x, [r["depth_error"] for r in planes], "o-", label="depth (1/t)")
+        left.loglog(x, [r["color_error"] for r in planes], "s-", label="colour")
+        left.loglog(x, [r["expected_depth_error"] for r in planes], "k--", lw=1, label="half a spacing (order 1)")
+        left.set(xlabel="planes - 1", ylabel="mean error", title="one MPI, wall and ball")
+        x, errors = np.array([r["texels"] - 1.0 for r in texels]), np.array([r["color_error"] for r in texels])
+        middle.loglog(x, errors, "s-", color="C1", label="colour")
+        middle.loglog(x, errors[0] * (x[0] / x) ** 2, "k--", lw=1, label="order 2")
+        middle.set(xlabel="texels - 1", title="one MPI, wall in a plane")
+        for form, style in zip((f or "joint" for f in FORMS), ("o-", "^:", "v:"), strict=False):
+            for what, color in (("depth", "C0"), ("color", "C1")):
+                errors = [r[form][f"{what}_error"] for r in mpis]
+                right.plot([r["mpis"] for r in mpis], errors, style, color=color, label=f"{what}, {form}")
+        right.set(xlabel="MPIs of 17 planes", title="K MPIs", ylim=(0, None))

@@ -1,8 +1,7 @@
-"""Does the error that placement expects show up in the pictures? Rank correlation over regions of the test images."""
+"""``mmpi-bench regions``: does the error that placement expects show up in the pictures, region by region?"""
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import numpy as np
 import torch
 from nerfstudio.utils.eval_utils import eval_setup
 
+from mmpi_ns.bench.report import Bench, Report, page
 from mmpi_ns.capture.datamanager import MMPIDataManager
 from mmpi_ns.model import MMPIModel
 from mmpi_ns.placement.errors import WORST, pixel_errors
@@ -21,17 +21,17 @@ MIN_POINTS = 5
 
 
 @dataclass
-class Regions:
+class Regions(Bench):
     """Expected pixel error against measured colour error over regions of the test images of a trained run."""
 
     load_config: Path
     """The run's config.yml."""
-    output: Path = Path("docs/results/regions.json")
-    """Where the figures go."""
     rows: int = 3
     """Regions down an image."""
     columns: int = 8
     """Regions across an image."""
+
+    name = "regions"
 
     def run(self) -> None:
         _, pipeline, _, _ = eval_setup(self.load_config, test_mode="test")
@@ -55,14 +55,13 @@ class Regions:
             print(f"{i + 1} of {len(manager.eval_dataset)} images", flush=True)
         # A pixel of displacement costs what the image changes over a pixel: nothing on a plain wall.
         pixels = np.array(errors) / np.maximum(slopes, 1e-6)
-        result = {
-            "regions": len(expected),
-            "rank_correlation": spearman(np.array(expected), np.array(errors)),
-            "rank_correlation_in_pixels": spearman(np.array(expected), pixels),
-        }
-        self.output.parent.mkdir(parents=True, exist_ok=True)
-        self.output.write_text(json.dumps({"headline": result}, indent=1), encoding="utf-8")
-        print(json.dumps(result))
+        found = {"regions": len(expected), "rank_correlation": spearman(np.array(expected), np.array(errors))}
+        found["rank_correlation_in_pixels"] = spearman(np.array(expected), pixels)
+        report = Report(self, key=None)
+        said = "Rank correlation of the expected error with the error of colours in {regions} regions of test images:"
+        said += " {rank_correlation:.2f}; with that error in pixels {rank_correlation_in_pixels:.2f}."
+        report.finish(found, page("Expected and measured errors", report.content["made"], said.format(**found)))
+        print(found)
 
     def _regions(self, camera: Observations, points: Array, plan: ScenePlan, *squared: Array) -> list[list[float]]:
         """Median expected error, then the root means of maps of squares [H, W], of every region with enough points."""

@@ -2,32 +2,32 @@
 
 from __future__ import annotations
 
-import math
-import os
 import statistics
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from mmpi_ns.bench.apart import run_apart
+from mmpi_ns.bench.apart import Tell, run_apart
 from mmpi_ns.bench.methods import METHODS, Method, Scene
-from mmpi_ns.bench.provenance import fingerprint, read_json, stamp, stamp_line, write_json
-from mmpi_ns.bench.quality.train import train_apart
-from mmpi_ns.bench.speed.alternate import Request as Rounds
+from mmpi_ns.bench.report import Bench, Report, Row, figure, page, table
+from mmpi_ns.bench.speed.all_planes import DenseSteps
 from mmpi_ns.bench.suites import P
-from mmpi_ns.bench.trainings import Request
+from mmpi_ns.bench.trainers import Steps, end_helpers
+from mmpi_ns.bench.trainings import Request, train_apart
 
 KEEP_ALL = ("--pipeline.model.train-threshold", "0", "--pipeline.model.render-threshold", "0")
 """Every live sample is coloured and learns, as in a dense evaluation, with the same losses."""
+NERFACTO_RAYS = 2048
+"""Rays of a test image that nerfacto renders in each round."""
 
 
 @dataclass
-class Speed:
+class Speed(Bench):
     """Training rays/s, frames and memory on a CPU, alternating in one process; what leaving samples out costs in dB.
 
     The dense reference evaluates every plane of every MPI for every ray, sorts all samples and colours those whose
-    alpha exceeds 1e-4, with the photometric loss alone and plain Adam (frozen code, on the same batches and at all
-    texels). Its PSNR is that of our training when it keeps every sample, with the same losses and steps.
+    alpha exceeds 1e-4, with the photometric loss alone and plain Adam (on the same batches and at all texels). Its
+    PSNR is that of our training when it keeps every sample, with the same losses and steps.
     """
 
     data: Path
@@ -52,87 +52,83 @@ class Speed:
     """A full frame has so many times the width and height."""
     test_images: int = 8
     """Test images, evenly spaced, for PSNR; 0 for all."""
-    threads: int = 0
-    """0 for all cores."""
-    output: Path = Path("docs/results")
-    """Where speed.json, speed.md and speed.png go."""
-    work: Path = Path("outputs/speed")
-    """Where runs and their logs go."""
+
+    name = "speed"
 
     def run(self) -> None:
-        made, path = stamp("speed", self), self.output / "speed.json"
-        threads = made["threads"] = self.threads or os.cpu_count() or 1
-        key = f"{fingerprint()} {self._key()}"
-        before = read_json(path)
-        rows = before.get("rows", {}) if before.get("key") == key else {}
-        content: dict[str, Any] = {"headline": {}, "made": made, "key": key, "rows": rows}
-        place = (
-            P + "arrangement",
-            self.arrangement,
-            P + "planes",
-            str(self.planes),
-            P + "max-planes",
-            str(self.planes),
-        )
-        ours = replace(METHODS["mmpi-small"], options=place)
-        parts = {
-            "ours": lambda folder: self._train(ours, folder, threads),
-            "keep all": lambda folder: self._train(replace(ours, options=(*place, *KEEP_ALL)), folder, threads),
-            "rounds": lambda folder: self._rounds(ours, folder, threads),
-        }
-        for name, part in parts.items():
-            print(f"{name} ...", flush=True)
-            if name not in rows:
-                row = part(self.work / name.replace(" ", "-"))
-                if "not_run" in row:
-                    raise ValueError(f"{name}: {row['not_run']}")
-                rows[name] = row
-                write_json(path, content)
-        content["headline"] = headline(rows)
-        write_json(path, content)
-        (self.output / "speed.md").write_text(table(content), encoding="utf-8")
-        draw(self.output / "speed.png", content)
-        print(content["headline"])
+        report = Report(self, self.key())
+        place = (P + "arrangement", self.arrangement, P + "planes", str(self.planes))
+        ours = replace(METHODS["mmpi-small"], options=(*place, P + "max-planes", str(self.planes)))
+        all_kept = replace(ours, options=(*ours.options, *KEEP_ALL))
+        report.row("ours", lambda: self._train(ours, "ours"))
+        report.row("keep all", lambda: self._train(all_kept, "keep-all"))
+        report.row("rounds", lambda: self._rounds(ours))
+        head = headline(report.rows)
+        text = markdown(report.rows, head, report.content["made"])
+        report.finish(head, text, lambda path: draw(path, report.rows["rounds"]))
+        print(report.content["headline"])
 
-    def _key(self) -> dict[str, str]:
-        """What a result depends on."""
-        own = {k: str(v) for k, v in asdict(self).items() if k not in ("output", "work")}
-        return own | {"data": self.data.resolve().name}
-
-    def _words(self, method: Method, folder: Path) -> list[str]:
+    def _train(self, method: Method, folder: str) -> Row:
+        print(f"{folder} ...", flush=True)
+        looks: Row = {"check_images": self.test_images, "final_images": self.test_images}
         scene = Scene(self.data, self.downscale_factor)
-        return method.words(scene, folder, self.steps, self.rays, 0, "cpu")
+        request = Request.of(method, scene, self.folder / folder, self.steps, self.rays, 0, **looks)
+        return train_apart(request, self.cores)
 
-    def _train(self, method: Method, folder: Path, threads: int) -> dict[str, Any]:
-        request = Request(
-            words=tuple(self._words(method, folder)),
-            data=str(self.data),
-            downscale_factor=self.downscale_factor,
-            work=str(folder),
-            checks=(self.steps,),
-            check_images=self.test_images,
-            check_pixels=64,
-            final_images=self.test_images,
-            whole_images=False,
-            keep=False,
+    def _rounds(self, ours: Method) -> Row:
+        print("rounds ...", flush=True)
+        folder, scene = self.folder / "rounds", Scene(self.data, self.downscale_factor)
+        names = ("steps", "dense_steps", "nerfacto_steps", "rounds", "full_size")
+        request: dict[str, Any] = {name: getattr(self, name) for name in names}
+        for name, method in (("ours", ours), ("nerfacto", METHODS["nerfacto"])):
+            request[name] = method.words(scene, folder, self.steps, self.rays, 0, "cpu")
+        return run_apart(take_turns, request, folder, self.cores)
+
+
+def take_turns(request: dict[str, Any], tell: Tell) -> Row:
+    """Rounds of everything in turn, in one process.
+
+    Args:
+        request: words for ns-train of ours and nerfacto, and the command's steps, rounds and full_size.
+        tell: of progress.
+
+    Returns:
+        Rays/s of each round for ours, dense and nerfacto; after training, seconds of a frame and of a large one and
+        rays/s of nerfacto's rendering; pixels of the frames; samples a ray of the dense reference.
+    """
+    ours = Steps(request["ours"])
+    dense, nerfacto = DenseSteps(ours), Steps(request["nerfacto"])
+    assert nerfacto.rays == ours.rays
+    nerfacto.run(2)  # its process that prepares batches takes seconds to start
+    dense.run(1)
+    rounds, found = range(request["rounds"]), {}
+    steps, seconds = request["steps"] // len(rounds), 0.0
+
+    def add(**more: float) -> None:
+        for name, value in more.items():
+            found.setdefault(name, []).append(value)
+        tell(", ".join(f"{n} {v:.3g}" for n, v in more.items()))
+
+    for _ in rounds:
+        spent = ours.run(steps)
+        seconds += spent
+        add(
+            rays_per_s=steps * ours.rays / spent,
+            dense_rays_per_s=request["dense_steps"] * ours.rays / dense.run(request["dense_steps"]),
+            nerfacto_rays_per_s=request["nerfacto_steps"] * ours.rays / nerfacto.run(request["nerfacto_steps"]),
         )
-        return train_apart(request, folder, threads)
-
-    def _rounds(self, ours: Method, folder: Path, threads: int) -> dict[str, Any]:
-        request = Rounds(
-            ours=self._words(ours, folder),
-            nerfacto=self._words(METHODS["nerfacto"], folder),
-            steps=self.steps,
-            dense_steps=self.dense_steps,
-            nerfacto_steps=self.nerfacto_steps,
-            rounds=self.rounds,
-            full_size=self.full_size,
-            nerfacto_rays=2048,
-        )
-        return run_apart("mmpi_ns.bench.speed.alternate", asdict(request), folder, threads)
+    pixels = {}
+    for _ in rounds:  # frames of the trained model
+        frame_s, pixels["frame_pixels"] = ours.render()
+        full_s, pixels["frame_full_pixels"] = ours.render(request["full_size"])
+        render_s, rays = nerfacto.render(rays=NERFACTO_RAYS)
+        add(frame_s=frame_s, frame_full_s=full_s, nerfacto_render_rays_per_s=rays / render_s)
+    end_helpers(nerfacto.trainer)
+    whole_run = steps * len(rounds) * ours.rays / seconds
+    return {**found, **pixels, "whole_run_rays_per_s": whole_run, "dense_samples": dense.samples}
 
 
-def headline(rows: dict[str, Any]) -> dict[str, float]:
+def headline(rows: dict[str, Row]) -> dict[str, float]:
     """Medians over the rounds, their ratios, and what leaving samples out costs."""
     rounds = rows["rounds"]
     found = {k: statistics.median(v) for k, v in rounds.items() if isinstance(v, list)}
@@ -140,7 +136,7 @@ def headline(rows: dict[str, Any]) -> dict[str, float]:
     for peer in ("dense", "nerfacto"):
         pairs = zip(rounds["rays_per_s"], rounds[f"{peer}_rays_per_s"], strict=True)
         found[f"times_{peer}"] = statistics.median(a / b for a, b in pairs)
-    found |= {
+    return found | {
         "whole_run_rays_per_s": rounds["whole_run_rays_per_s"],
         "psnr_db": rows["ours"]["psnr"],
         "dense_psnr_db": rows["keep all"]["psnr"],
@@ -148,72 +144,52 @@ def headline(rows: dict[str, Any]) -> dict[str, float]:
         "peak_memory_gib": rows["ours"]["peak_gib"],
         "keep_all_peak_memory_gib": rows["keep all"]["peak_gib"],
     }
-    return {k: v for k, v in found.items() if math.isfinite(v)}
 
 
-def table(content: dict[str, Any]) -> str:
-    """The Markdown page."""
-    h, rows = content["headline"], content["rows"]
-    rounds = rows["rounds"]
+def markdown(rows: dict[str, Row], h: dict[str, float], made: Row) -> str:
+    """The page."""
+    rounds, ours = rows["rounds"], rows["ours"]
 
     def spread(name: str) -> str:
         middle, least, most = (_digits(x) for x in (h[name], min(rounds[name]), max(rounds[name])))
         return f"{middle} ({least} to {most})"
 
-    images = f"{rows['ours']['images']} test images"
+    small, large, steps = rounds["frame_pixels"], rounds["frame_full_pixels"], ours["curve"][-1]["step"]
     lines = [
-        "# Speed",
-        "",
-        stamp_line(content["made"]),
-        "",
-        f"Medians of {len(rounds['rays_per_s'])} rounds in one process (least to most in brackets), in which each has",
-        "its turn of training; frames are rendered in turn after that. Rays are pixel rays (ours trains on 384",
-        "keypoint rays a step besides, where there are SfM tracks). The dense reference evaluates all planes of all",
-        "MPIs and has the photometric loss alone.",
-        "",
-        "| | ours | dense | nerfacto |",
-        "|---|---|---|---|",
-        f"| training, rays/s | {' | '.join(spread(p + 'rays_per_s') for p in ('', 'dense_', 'nerfacto_'))} |",
-        f"| ours is faster by | | {h['times_dense']:.1f} | {h['times_nerfacto']:.1f} |",
-        f"| rendering, rays/s | {rounds['frame_pixels'] / h['frame_s']:.0f} | "
-        f"| {spread('nerfacto_render_rays_per_s')} |",
-        f"| a frame of {rounds['frame_pixels']} pixels, s | {spread('frame_s')} | | |",
-        f"| a frame of {rounds['frame_full_pixels']} pixels, s | {spread('frame_full_s')} | | |",
-        f"| PSNR after {rows['ours']['curve'][-1]['step']} steps, {images} | {h['psnr_db']:.3f} "
-        f"| {h['dense_psnr_db']:.3f} | |",
-        f"| peak memory, GiB | {h['peak_memory_gib']:.2f} | | |",
-        "",
-        f"Ours over the whole run, growth included: {h['whole_run_rays_per_s']:.0f} rays/s. The PSNR under dense is",
-        f"that of our training with every sample kept ({h['keep_all_peak_memory_gib']:.2f} GiB): leaving samples out",
-        f"costs {-h['psnr_delta_db']:.3f} dB.",
-        "",
-        "![Rays per second](speed.png)",
-        "",
-    ]
-    return "\n".join(lines)
+        ("training, rays/s", *(spread(p + "rays_per_s") for p in ("", "dense_", "nerfacto_"))),
+        ("ours is faster by", "", f"{h['times_dense']:.1f}", f"{h['times_nerfacto']:.1f}"),
+        ("rendering, rays/s", f"{small / h['frame_s']:.0f}", "", spread("nerfacto_render_rays_per_s")),
+        (f"a frame of {small} pixels, s", spread("frame_s"), "", ""),
+        (f"a frame of {large} pixels, s", spread("frame_full_s"), "", ""),
+        (f"PSNR after {steps} steps, {ours['images']} test images", f"{h['psnr_db']:.3f}", f"{h['dense_psnr_db']:.3f}",
+         ""),
+        ("peak memory, GiB", f"{h['peak_memory_gib']:.2f}", "", ""),
+    ]  # fmt: skip
+    columns = {name: f"{{cells[{i}]}}" for i, name in enumerate(("", "ours", "dense", "nerfacto"))}
+    said = f"""\
+Medians of {len(rounds["rays_per_s"])} rounds in one process (least to most in brackets), in which each has its turn of
+training; frames are rendered in turn after that. Rays are pixel rays (ours trains on 384 keypoint rays a step
+besides, where there are SfM tracks). The dense reference evaluates all planes of all MPIs and has the photometric
+loss alone."""
+    whole = f"""\
+Ours over the whole run, growth included: {h["whole_run_rays_per_s"]:.0f} rays/s. The PSNR under dense is that of our
+training with every sample kept ({h["keep_all_peak_memory_gib"]:.2f} GiB): leaving samples out costs
+{-h["psnr_delta_db"]:.3f} dB."""
+    return page("Speed", made, said, table(columns, ({"cells": x} for x in lines)), whole, "![Rays/s](speed.png)")
 
 
 def _digits(x: float) -> str:
     return f"{x:.0f}" if x >= 100 else f"{x:.3g}"
 
 
-def draw(path: Path, content: dict[str, Any]) -> None:
+def draw(path: Path, rounds: Row) -> None:
     """Training rays/s of every round, on a logarithmic axis."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    rounds = content["rows"]["rounds"]
-    names = {"ours": "rays_per_s", "dense": "dense_rays_per_s", "nerfacto": "nerfacto_rays_per_s"}
-    figure, axis = plt.subplots(figsize=(6, 3.5), layout="constrained")
-    for i, name in enumerate(names.values()):
-        middle = statistics.median(rounds[name])
-        axis.bar(i, middle, color=f"C{i}", alpha=0.5)
-        axis.plot([i] * len(rounds[name]), rounds[name], "k.", ms=4)
-        axis.text(i, middle, f"{middle:.0f}", ha="center", va="bottom")
-    axis.set_xticks(range(len(names)), list(names))
-    axis.set(yscale="log", ylabel="training rays/s")
-    axis.grid(alpha=0.3, axis="y")
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
+    with figure(path, 1, 1, (6, 3.5)) as ((axis,),):
+        for i, prefix in enumerate(("", "dense_", "nerfacto_")):
+            rates = rounds[prefix + "rays_per_s"]
+            middle = statistics.median(rates)
+            axis.bar(i, middle, color=f"C{i}", alpha=0.5)
+            axis.plot([i] * len(rates), rates, "k.", ms=4)
+            axis.text(i, middle, f"{middle:.0f}", ha="center", va="bottom")
+        axis.set_xticks(range(3), ["ours", "dense", "nerfacto"])
+        axis.set(yscale="log", ylabel="training rays/s")

@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from mmpi_ns.bench.methods import METHODS, Scene
-from mmpi_ns.bench.provenance import fingerprint, read_json, stamp, stamp_line, write_json
-from mmpi_ns.bench.speed.alternate import Steps, clock
+from mmpi_ns.bench.report import Bench, Report, Row, figure, page, slug, table, title
+from mmpi_ns.bench.trainers import Steps, clock
 from mmpi_ns.field.samples import Gathered, Lookup, Taps, metadata_of
 from mmpi_ns.model import MMPIModel
 from mmpi_ns.ops.colors import colors
@@ -40,7 +40,7 @@ class Op:
 
 
 @dataclass
-class Ops:
+class Ops(Bench):
     """Milliseconds of each operation of a training step, beside what bandwidth and arithmetic would allow.
 
     The limit of an operation is its bytes (each number that it reads or writes counts once, however often it is looked
@@ -59,58 +59,39 @@ class Ops:
     """Pixel rays of a step."""
     repeats: int = 5
     """Times that each operation runs; the median counts."""
-    threads: int = 0
-    """0 for all cores."""
-    output: Path = Path("docs/results")
-    """Where ops.json, ops.md and ops.png go."""
-    work: Path = Path("outputs/ops")
-    """Where the run goes."""
+
+    name = "ops"
 
     def run(self) -> None:
         if not 0 < self.early < self.steps:
             raise ValueError(f"--early {self.early}: give a number between 0 and --steps ({self.steps}).")
+        report = Report(self, self.key())
+        if not {"limits", "early", "late"} <= set(report.rows):
+            report.rows.update(self._measure())
+        head = headline(report.rows)
+        text = markdown(report.rows, report.content["made"])
+        report.finish(head, text, lambda path: draw(path, report.rows))
+        print(head)
+
+    def _measure(self) -> dict[str, Row]:
         if self.threads:
             torch.set_num_threads(self.threads)
-        made, path = stamp("ops", self), self.output / "ops.json"
-        key = f"{fingerprint()} {made['command']} {made['threads']}"
-        content = read_json(path)
-        if content.get("key") != key:
-            content = {"headline": {}, "made": made, "key": key, **self._measure()}
-            content["headline"] = headline(content)
-            write_json(path, content)
-        (self.output / "ops.md").write_text(table(content), encoding="utf-8")
-        draw(self.output / "ops.png", content)
-        print(content["headline"])
-
-    def _measure(self) -> dict[str, Any]:
         device = "cuda" if torch.cuda.is_available() else "cpu"
         scene = Scene(self.data, self.downscale_factor)
-        steps = Steps(METHODS["mmpi-small"].words(scene, self.work, self.steps, self.rays, 0, device))
-        limits = {"copy_gb_per_s": copy_rate(device) / 1e9, "matmul_gflop_per_s": matmul_rate(device) / 1e9}
+        steps = Steps(METHODS["mmpi-small"].words(scene, self.folder, self.steps, self.rays, 0, device))
+        limits = {"copy_gb_per_s": copy_rate(device, COPIED) / 1e9, "matmul_gflop_per_s": matmul_rate(device) / 1e9}
         print(limits, flush=True)
-        stages = {}
-        for name, until in (("early", self.early), ("late", self.steps)):
-            step_s = steps.run(until - steps.step) / (until - (0 if name == "early" else self.early))
-            stages[name] = {**measure(steps, self.repeats), "step_ms": 1e3 * step_s}
-        return {"limits": limits, "stages": stages}
+        rows: dict[str, Row] = {"limits": limits}
+        for name, count in (("early", self.early), ("late", self.steps - self.early)):
+            step_ms = 1e3 * steps.run(count) / count
+            rows[name] = {**measure(steps, self.repeats, limits), "step_ms": step_ms}
+        return rows
 
 
-def copy_rate(device: str) -> float:
-    """Bytes a second, read and written."""
-    a = torch.ones(COPIED, device=device)
-    b = torch.empty_like(a)
-    return 8 * COPIED / _seconds(lambda: b.copy_(a), 5)
-
-
-def matmul_rate(device: str) -> float:
-    """Multiplications and additions a second of a large product in float32."""
-    a = torch.rand(2048, 2048, device=device)
-    return 2 * 2048**3 / _seconds(lambda: a @ a, 5)
-
-
-def _seconds(work: Callable[[], Any], repeats: int) -> float:
-    """Median, after one untimed call."""
-    work()
+def median_s(work: Callable[[], Any], repeats: int, untimed: int = 1) -> float:
+    """Median seconds, the device waited for, after some untimed calls (which may compile)."""
+    for _ in range(untimed):
+        work()
     times = []
     for _ in range(repeats):
         start = clock()
@@ -119,19 +100,36 @@ def _seconds(work: Callable[[], Any], repeats: int) -> float:
     return statistics.median(times)
 
 
-def measure(steps: Steps, repeats: int) -> dict[str, Any]:
-    """All operations on the batch of the next step."""
+def copy_rate(device: str, size: int) -> float:
+    """Bytes a second of a copy of so many numbers, read and written."""
+    a = torch.ones(size, device=device)
+    b = torch.empty_like(a)
+    return 8 * size / median_s(lambda: b.copy_(a), 5)
+
+
+def matmul_rate(device: str) -> float:
+    """Multiplications and additions a second of a large product in float32."""
+    a = torch.rand(2048, 2048, device=device)
+    return 2 * 2048**3 / median_s(lambda: a @ a, 5)
+
+
+def measure(steps: Steps, repeats: int, limits: dict[str, float]) -> Row:
+    """All operations on the batch of the next step, each beside the milliseconds that it takes at least."""
     model = steps.pipeline.model
     assert isinstance(model, MMPIModel)
-    model.train()
-    ops, counts = operations(model, steps)
-    rows = {}
+    ops, counts = operations(model.train(), steps)
+    rows: dict[str, Row] = {}
     for op in ops:
         assert op.name not in rows, f"two operations are called {op.name}"
-        seconds = _seconds(op.work, repeats)
-        rows[op.name] = {"ms": 1e3 * seconds, "mb": op.bytes_ / 1e6, "mflop": op.flops / 1e6}
-        print(f"{op.name}: {1e3 * seconds:.2f} ms", flush=True)
+        row = {"ms": 1e3 * median_s(op.work, repeats), "mb": op.bytes_ / 1e6, "mflop": op.flops / 1e6}
+        rows[op.name] = row | {"limit_ms": limit_ms(row, limits)}
+        print(f"{op.name}: {row['ms']:.2f} ms", flush=True)
     return {"ops": rows, "counts": counts}
+
+
+def limit_ms(row: Row, limits: dict[str, float]) -> float:
+    """Milliseconds that an operation takes at least."""
+    return max(row["mb"] / limits["copy_gb_per_s"], row["mflop"] / limits["matmul_gflop_per_s"])
 
 
 def operations(model: MMPIModel, steps: Steps) -> tuple[list[Op], dict[str, float]]:
@@ -270,75 +268,54 @@ def _adam(model: MMPIModel, steps: Steps, moved: float) -> Op:
     return Op("Adam", work, moved)
 
 
-def _limit(row: dict[str, float], limits: dict[str, float]) -> float:
-    """Milliseconds that an operation takes at least."""
-    return max(row["mb"] / limits["copy_gb_per_s"], row["mflop"] / limits["matmul_gflop_per_s"])
-
-
-def headline(content: dict[str, Any]) -> dict[str, float]:
+def headline(rows: dict[str, Row]) -> dict[str, float]:
     """Rates of the machine, and of each operation its milliseconds and the share of its limit that it reaches."""
-    found: dict[str, float] = dict(content["limits"])
-    for stage, rows in content["stages"].items():
-        found[f"{stage}_step_ms"] = rows["step_ms"]
-        for name, row in rows["ops"].items():
-            slug = "_".join("".join(c if c.isalnum() else " " for c in name.lower()).split())
-            found[f"{stage}_{slug}_ms"] = row["ms"]
-            found[f"{stage}_{slug}_of_limit"] = _limit(row, content["limits"]) / row["ms"]
+    found: dict[str, float] = dict(rows["limits"])
+    for stage in ("early", "late"):
+        found[f"{stage}_step_ms"] = rows[stage]["step_ms"]
+        for name, row in rows[stage]["ops"].items():
+            found[f"{stage}_{slug(name)}_ms"] = row["ms"]
+            found[f"{stage}_{slug(name)}_of_limit"] = row["limit_ms"] / row["ms"]
     return found
 
 
-def table(content: dict[str, Any]) -> str:
-    """The Markdown page."""
-    limits = content["limits"]
-    lines = [
-        "# Operations of a training step against their limits",
-        "",
-        stamp_line(content["made"]),
-        "",
-        f"A copy moves {limits['copy_gb_per_s']:.1f} GB/s (read and written), a product of matrices makes",
-        f"{limits['matmul_gflop_per_s']:.0f} GFLOP/s. The limit of an operation is the time of its bytes (every",
-        "number that it reads or writes once) at the one rate or of its sums at the other, whichever is longer. Rows",
-        "are read by the cache line, so no lookup can reach it.",
-    ]
-    for stage, found in content["stages"].items():
-        c = found["counts"]
-        lines += [
-            "",
-            f"## {stage[0].upper()}{stage[1:]} in training",
-            "",
-            f"{c['rays']} rays ({c['pixels']} of pixels), {c['live'] / c['rays']:.0f} live samples a ray of which",
+def markdown(rows: dict[str, Row], made: Row) -> str:
+    """The page."""
+    limits = rows["limits"]
+    columns = {
+        "operation": "{name}",
+        "ms": "{ms:.2f}",
+        "MB": "{mb:.1f}",
+        "GB/s": lambda r: f"{r['mb'] / r['ms']:.1f}",
+        "of the copy": lambda r: f"{100 * r['mb'] / r['ms'] / limits['copy_gb_per_s']:.0f} %",
+        "GFLOP/s": lambda r: f"{r['mflop'] / r['ms']:.0f}" if r["mflop"] else "",
+        "limit, ms": "{limit_ms:.2f}",
+        "of the limit": lambda r: f"{100 * r['limit_ms'] / r['ms']:.0f} %",
+    }
+    said = f"""\
+A copy moves {limits["copy_gb_per_s"]:.1f} GB/s (read and written), a product of matrices makes
+{limits["matmul_gflop_per_s"]:.0f} GFLOP/s. The limit of an operation is the time of its bytes (every number that it
+reads or writes once) at the one rate or of its sums at the other, whichever is longer. Rows are read by the cache line,
+so no lookup can reach it."""
+    blocks = []
+    for stage in ("early", "late"):
+        c = rows[stage]["counts"]
+        blocks += [f"## {title(stage)} in training"]
+        blocks += [
+            f"{c['rays']} rays ({c['pixels']} of pixels), {c['live'] / c['rays']:.0f} live samples a ray of which "
             f"{c['kept'] / c['rays']:.0f} are kept, {c['rows'] / 1e3:.0f} thousand distinct rows. A step took "
-            f"{found['step_ms']:.0f} ms.",
-            "",
-            "| operation | ms | MB | GB/s | of the copy | GFLOP/s | limit, ms | of the limit |",
-            "|---|---|---|---|---|---|---|---|",
+            f"{rows[stage]['step_ms']:.0f} ms."
         ]
-        for name, r in found["ops"].items():
-            rate, limit = r["mb"] / r["ms"], _limit(r, limits)
-            flops = f"{r['mflop'] / r['ms']:.0f}" if r["mflop"] else ""
-            lines.append(
-                f"| {name} | {r['ms']:.2f} | {r['mb']:.1f} | {rate:.1f} | {100 * rate / limits['copy_gb_per_s']:.0f} % "
-                f"| {flops} | {limit:.2f} | {100 * limit / r['ms']:.0f} % |"
-            )
-    return "\n".join([*lines, "", "![Operations](ops.png)", ""])
+        blocks += [table(columns, ({"name": name, **r} for name, r in rows[stage]["ops"].items()))]
+    return page("Operations of a training step against their limits", made, said, blocks, "![Operations](ops.png)")
 
 
-def draw(path: Path, content: dict[str, Any]) -> None:
+def draw(path: Path, rows: dict[str, Row]) -> None:
     """Milliseconds of every operation, and its limit."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    stages = content["stages"]
-    figure, axes = plt.subplots(1, len(stages), figsize=(12, 4.5), layout="constrained", sharey=True)
-    for axis, (stage, found) in zip(axes, stages.items(), strict=True):
-        named = list(found["ops"].items())
-        axis.barh([n for n, _ in named], [r["ms"] for _, r in named], color="C0", alpha=0.6, label="measured")
-        axis.plot([_limit(r, content["limits"]) for _, r in named], range(len(named)), "k|", ms=12, label="limit")
-        axis.set(xscale="log", xlabel="milliseconds", title=f"{stage}: {found['step_ms']:.0f} ms a step")
-        axis.grid(alpha=0.3, axis="x")
-    axes[0].invert_yaxis()
-    axes[0].legend(fontsize=8)
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
+    with figure(path, 1, 2, (12, 4.5), sharey=True) as (axes,):
+        for axis, stage in zip(axes, ("early", "late"), strict=True):
+            ops = rows[stage]["ops"]
+            axis.barh(list(ops), [r["ms"] for r in ops.values()], color="C0", alpha=0.6, label="measured")
+            axis.plot([r["limit_ms"] for r in ops.values()], range(len(ops)), "k|", ms=12, label="limit")
+            axis.set(xscale="log", xlabel="milliseconds", title=f"{stage}: {rows[stage]['step_ms']:.0f} ms a step")
+        axes[0].invert_yaxis()

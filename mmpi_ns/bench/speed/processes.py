@@ -7,17 +7,17 @@ import shutil
 import subprocess
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from mmpi_ns.bench.provenance import fingerprint, read_json, stamp, stamp_line, write_json
+from mmpi_ns.bench.report import Bench, Report, Row, page, table
 
 
 @dataclass
-class Processes:
+class Processes(Bench):
     """Throughput of training in several processes (torchrun, gloo) beside one process that is held to one core.
 
     Every number of processes trains the same plan twice, for few steps a window and for more: the difference leaves
@@ -34,32 +34,25 @@ class Processes:
     """Steps of a window that are taken off."""
     steps: int = 240
     """Steps of a window."""
-    output: Path = Path("docs/results")
-    """Where processes.json and processes.md go."""
-    work: Path = Path("outputs/processes")
-    """Where runs and their logs go."""
+    threads: int = field(default=1, kw_only=True)
+    """Of each process."""
+
+    name = "processes"
 
     def run(self) -> None:
-        made, path = stamp("processes", self), self.output / "processes.json"
-        key = f"{fingerprint()} {self.data.resolve().name} /{self.downscale_factor} {self.few} to {self.steps} steps"
-        before = read_json(path)
-        rows = before.get("rows", {}) if before.get("key") == key else {}
-        content: dict[str, Any] = {"headline": {}, "made": made | {"threads": 1}, "key": key, "rows": rows}
-        content["windows"] = self._plan()
+        report = Report(self, self.key())
+        windows = self._plan()
         for count in (1, self.processes):
-            row = rows.setdefault(str(count), {})
-            for steps in (self.few, self.steps):
-                if str(steps) not in row:
-                    row[str(steps)] = self._train(count, steps)
-                    write_json(path, content)
-                print(f"{count} processes, {steps} steps a window: {row[str(steps)]:.1f} s", flush=True)
-        content["headline"] = {
-            **headline(rows, self.processes, content["windows"], self.few, self.steps),
-            "largest_difference": self._difference(content["windows"]),
-        }
-        write_json(path, content)
-        (self.output / "processes.md").write_text(self._table(content), encoding="utf-8")
-        print(content["headline"])
+            row = report.row(str(count), lambda count=count: self._times(count))
+            print(f"{count} processes: {row} s", flush=True)
+        rows = {int(count): {int(n): s for n, s in row.items()} for count, row in report.rows.items()}
+        head = headline(rows, self.processes, windows, self.few, self.steps)
+        head["largest_difference"] = self._difference(windows)
+        report.finish(head, self._markdown(rows, head, windows, report.content["made"]))
+        print(head)
+
+    def _times(self, count: int) -> Row:
+        return {str(n): self._train(count, n) for n in (self.few, self.steps)}
 
     def _plan(self) -> int:
         """Places MPIs for the steps of the longer run; returns how many windows there are."""
@@ -75,12 +68,12 @@ class Processes:
             raise ValueError(
                 f"{self.data} has {len(plan)} window(s), too few for {self.processes} processes: give a longer capture."
             )
-        self.work.mkdir(parents=True, exist_ok=True)
-        (self.work / "plan.json").write_text(plan.to_json(), encoding="utf-8")
+        self.folder.mkdir(parents=True, exist_ok=True)
+        (self.folder / "plan.json").write_text(plan.to_json(), encoding="utf-8")
         return len(plan)
 
     def _folder(self, count: int, steps: int) -> Path:
-        return self.work / f"{count} of {steps}"
+        return self.folder / f"{count} of {steps}"
 
     def _train(self, count: int, steps: int) -> float:
         """Trains all windows; returns seconds by the clock."""
@@ -90,7 +83,7 @@ class Processes:
         words = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(count)]
         words += ["-m", "mmpi_ns.scripts.train", "mmpi-small", "--max-num-iterations", str(steps)]
         words += ["--steps-per-save", str(100 * steps), "--vis", "tensorboard", "--machine.device-type", "cpu"]
-        words += ["--pipeline.model.plan-file", str(self.work / "plan.json"), "--output-dir", str(folder)]
+        words += ["--pipeline.model.plan-file", str(self.folder / "plan.json"), "--output-dir", str(folder)]
         words += ["--experiment-name", "road", "--timestamp", "run", "--data", str(self.data)]
         words += ["nerfstudio-data", "--downscale-factor", str(self.downscale_factor)]
         core = min(os.sched_getaffinity(0))
@@ -100,7 +93,7 @@ class Processes:
                 words,
                 stdout=log,
                 stderr=subprocess.STDOUT,
-                env={**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
+                env={**os.environ, "OMP_NUM_THREADS": str(self.threads), "OPENBLAS_NUM_THREADS": str(self.threads)},
                 preexec_fn=(lambda: os.sched_setaffinity(0, {core})) if count == 1 else None,
             ).returncode
         if status:
@@ -120,45 +113,33 @@ class Processes:
                     largest = max(largest, float((values - several[kind]).abs().max()) if values.numel() else 0.0)
         return largest
 
-    def _table(self, content: dict[str, Any]) -> str:
-        """The Markdown page."""
-        h = content["headline"]
-        lines = [
-            "# Several processes",
-            "",
-            stamp_line(content["made"]),
-            "",
-            f"{self.data.resolve().name} /{self.downscale_factor}, {content['windows']} windows, one thread for each "
-            "process; one process alone is held to one core.",
-            "",
-            f"| processes | {self.few} steps a window, s | {self.steps} steps, s | steps/s in between | times |",
-            "|---|---|---|---|---|",
-        ]
-        for count, rate, times in (
-            (1, h["one_steps_per_s"], 1.0),
-            (self.processes, h["several_steps_per_s"], h["throughput_ratio"]),
-        ):
-            row = content["rows"][str(count)]
-            few, all_ = row[str(self.few)], row[str(self.steps)]
-            lines.append(f"| {count} | {few:.1f} | {all_:.1f} | {rate:.1f} | {times:.2f} |")
-        lines += ["", f"The windows' tables differ by at most {h['largest_difference']:g}.", ""]
-        return "\n".join(lines)
+    def _markdown(self, rows: dict[int, dict[int, float]], h: Row, windows: int, made: Row) -> str:
+        columns = {
+            "processes": "{count}",
+            f"{self.few} steps a window, s": "{few:.1f}",
+            f"{self.steps} steps, s": "{steps:.1f}",
+            "steps/s in between": "{rate:.1f}",
+            "times": "{times:.2f}",
+        }
+        shown = [{"count": 1, "rate": h["one_steps_per_s"], "times": 1.0}]
+        shown += [{"count": self.processes, "rate": h["several_steps_per_s"], "times": h["throughput_ratio"]}]
+        for row in shown:
+            row |= {"few": rows[row["count"]][self.few], "steps": rows[row["count"]][self.steps]}
+        said = f"{self.data.resolve().name} /{self.downscale_factor}, {windows} windows, {self.threads} thread(s) for "
+        said += "each process; one process alone is held to one core."
+        last = f"The windows' tables differ by at most {h['largest_difference']:g}."
+        return page("Several processes", made, said, table(columns, shown), last)
 
 
-def headline(rows: dict[str, dict[str, float]], processes: int, windows: int, few: int, steps: int) -> dict[str, float]:
+def headline(rows: dict[int, dict[int, float]], processes: int, windows: int, few: int, steps: int) -> Row:
     """Steps per second beyond the first few, in one process and in several, and their ratio.
 
     Args:
-        rows: by number of processes and steps a window (as text): seconds.
+        rows: by number of processes and steps a window: seconds.
         processes: the larger number.
         windows: that all train.
         few: steps a window of the shorter runs.
         steps: of the longer ones.
     """
-
-    def rate(count: int) -> float:
-        row = rows[str(count)]
-        return windows * (steps - few) / (row[str(steps)] - row[str(few)])
-
-    one, several = rate(1), rate(processes)
+    one, several = (windows * (steps - few) / (rows[n][steps] - rows[n][few]) for n in (1, processes))
     return {"one_steps_per_s": one, "several_steps_per_s": several, "throughput_ratio": several / one}

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from mmpi_ns.bench.provenance import fingerprint, read_json, stamp, stamp_line, write_json
+from mmpi_ns.bench.report import Bench, Report, Row, figure, fingerprint, page, table
 from mmpi_ns.bench.stability.exact import Array
 from mmpi_ns.bench.stability.exact_ray import ExactField, ExactRay
 from mmpi_ns.bench.trainings import evenly
@@ -44,7 +44,7 @@ class Setting:
     @contextmanager
     def applied(self, model: MMPIModel) -> Iterator[None]:
         """Renders so within the block, and as before after it."""
-        changes: dict[str, Any] = {"render_threshold": self.threshold, "eval_num_rays_per_chunk": self.chunk}
+        changes: Row = {"render_threshold": self.threshold, "eval_num_rays_per_chunk": self.chunk}
         if self.also:
             name, _, text = self.also.partition("=")
             changes[name] = type(getattr(model.config, name))(text)
@@ -61,7 +61,7 @@ class Setting:
 
 
 @dataclass
-class Render:
+class Render(Bench):
     """Rays/s and frames/s against loss of PSNR and against error with respect to exact arithmetic.
 
     The exact image is made in float64, one ray and one sample after the other, with every sample kept, for some rays
@@ -84,34 +84,29 @@ class Render:
     """Times that every setting renders them; the median counts."""
     exact_rays: int = 1000
     """Random rays of those images that are rendered exactly (0.05 to 0.5 s each)."""
-    output: Path = Path("docs/results")
-    """Where render.json, render.md and render.png go."""
+
+    name = "render"
 
     def run(self) -> None:
-        made, path = stamp("render", self), self.output / "render.json"
         model, images = _load(self.load_config, self.images)
-        before = read_json(path)
-        known = before if before.get("key") == self._key(model) else {}
+        report = Report(self, self._key(model))
         default = Setting(model.config.render_threshold, model.chunk_size, _ops_in_use(model))
         rays = _some_rays(images, self.exact_rays)
-        exact = np.array(known["exact"]) if "exact" in known else exact_colors(model, images, rays)
-        content: dict[str, Any] = {"headline": {}, "made": made, "key": self._key(model), "exact": exact.tolist()}
-        content |= {"settings": known.get("settings", {}), "default": default.name}
-        content |= {"pixels": int(images[0][1].shape[0] * images[0][1].shape[1]), "device": str(model.device)}
-        write_json(path, content)
-        wanted = [s for s in self._settings(default) if s.name not in content["settings"]]
+        exact = report.kept.get("exact") or exact_colors(model, images, rays).tolist()
+        facts = {"exact": exact, "default": default.name, "device": str(model.device)}
+        report.content |= {**facts, "pixels": int(images[0][1].shape[0] * images[0][1].shape[1])}
+        report.save()
+        wanted = [s for s in self._settings(default) if s.name not in report.rows]
         for number in range(self.rounds if wanted else 0):
             for setting in wanted:
-                rows = content["settings"].setdefault(setting.name, {**asdict(setting), "frame_s": []})
+                row = report.rows.setdefault(setting.name, {**asdict(setting), "frame_s": []})
                 with setting.applied(model):
-                    rows |= measure(model, images, rays, exact, rows["frame_s"])
-                rate = 1 / statistics.median(rows["frame_s"])
+                    row |= measure(model, images, rays, np.array(exact), row["frame_s"])
+                rate = 1 / statistics.median(row["frame_s"])
                 print(f"[{number + 1}/{self.rounds}] {setting.name}: {rate:.2f} frames/s", flush=True)
-        content["headline"] = headline(content)
-        write_json(path, content)
-        (self.output / "render.md").write_text(table(content), encoding="utf-8")
-        draw(self.output / "render.png", content)
-        print(content["headline"])
+        head = headline(report.content)
+        report.finish(head, markdown(report.content, head), lambda path: draw(path, report.content))
+        print(head)
 
     def _key(self, model: MMPIModel) -> str:
         """Of what a measurement depends on beside the setting."""
@@ -192,9 +187,7 @@ class _Unblended(ExactRay):
 
 
 @torch.no_grad()
-def measure(
-    model: MMPIModel, images: list[Image], rays: list[Array], exact: Array, seconds: list[float]
-) -> dict[str, Any]:
+def measure(model: MMPIModel, images: list[Image], rays: list[Array], exact: Array, seconds: list[float]) -> Row:
     """Renders the images with the settings that the model has now.
 
     Returns:
@@ -212,29 +205,26 @@ def measure(
     return {"frame_s": spent, "psnr": float(np.mean(psnr)), **errors}
 
 
-def _rows(content: dict[str, Any]) -> list[dict[str, Any]]:
+def _rows(content: Row) -> list[Row]:
     """Settings with rays/s and what they lose against the best that keeps every sample."""
-    settings = content["settings"]
+    settings = content["rows"]
     best = next((r["psnr"] for r in settings.values() if r["threshold"] == 0 and not r["also"]), None)
     best = best if best is not None else max(r["psnr"] for r in settings.values())
-    rows = []
-    for name, row in settings.items():
-        fps = 1 / statistics.median(row["frame_s"])
-        rows.append(
-            {**row, "name": name, "fps": fps, "rays_per_s": fps * content["pixels"], "loss": best - row["psnr"]}
-        )
+    rows = [{**r, "name": n, "fps": 1 / statistics.median(r["frame_s"])} for n, r in settings.items()]
+    for row in rows:
+        row |= {"rays_per_s": row["fps"] * content["pixels"], "loss": best - row["psnr"]}
     for row in rows:
         row["on_front"] = not any(_beats(other, row) for other in rows)
     return rows
 
 
-def _beats(a: dict[str, Any], b: dict[str, Any]) -> bool:
+def _beats(a: Row, b: Row) -> bool:
     """Faster beyond noise, and no more error either way of measuring it."""
     faster = a["rays_per_s"] > NOISE * b["rays_per_s"]
     return faster and a["loss"] <= b["loss"] + SAME_DB and a["error_999"] <= 1.01 * b["error_999"]
 
 
-def headline(content: dict[str, Any]) -> dict[str, float]:
+def headline(content: Row) -> dict[str, float]:
     """Figures of the default settings."""
     rows = _rows(content)
     default = next(r for r in rows if r["name"] == content["default"])
@@ -251,61 +241,42 @@ def headline(content: dict[str, Any]) -> dict[str, float]:
     }
 
 
-def table(content: dict[str, Any]) -> str:
-    """The Markdown page."""
-    head, rows = content["headline"], sorted(_rows(content), key=lambda r: -r["rays_per_s"])
+def markdown(content: Row, head: Row) -> str:
+    """The page."""
+    columns = {
+        "setting": lambda r: f"**{r['name']}** (default)" if r["name"] == content["default"] else r["name"],
+        "rays/s": "{rays_per_s:.0f}",
+        "frames/s": "{fps:.2f}",
+        "PSNR": "{psnr:.3f}",
+        "loss, dB": "{loss:.4f}",
+        "99.9 % of errors below": "{error_999:.1e}",
+        "largest error": "{max_error:.1e}",
+        "front": lambda r: "yes" if r["on_front"] else "no",
+    }
     verdict = "is on" if head["default_on_front"] else "is **not** on"
-    lines = [
-        "# Rendering: speed against error",
-        "",
-        stamp_line(content["made"]),
-        "",
-        f"Images of {content['pixels']} pixels on {content['device']}. Loss of PSNR is against the same model with",
-        f"every sample kept; errors of colours (0 to 1) are against {head['exact_rays']} rays in float64 with every",
-        f"sample kept. The default {verdict} the front: a setting that is off it is beaten by one that is faster by",
-        f"more than {100 * (NOISE - 1):.0f} % and has no more error by PSNR nor by the 99.9 percentile.",
-        "",
-        "![Frames per second against error](render.png)",
-        "",
-        "| setting | rays/s | frames/s | PSNR | loss, dB | 99.9 % of errors below | largest error | front |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
-    for r in rows:
-        name = f"**{r['name']}** (default)" if r["name"] == content["default"] else r["name"]
-        cells = [
-            name,
-            f"{r['rays_per_s']:.0f}",
-            f"{r['fps']:.2f}",
-            f"{r['psnr']:.3f}",
-            f"{r['loss']:.4f}",
-            f"{r['error_999']:.1e}",
-            f"{r['max_error']:.1e}",
-            "yes" if r["on_front"] else "no",
-        ]
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join([*lines, ""])
+    said = f"""\
+Images of {content["pixels"]} pixels on {content["device"]}. Loss of PSNR is against the same model with every sample
+kept; errors of colours (0 to 1) are against {head["exact_rays"]} rays in float64 with every sample kept. The default
+{verdict} the front: a setting that is off it is beaten by one that is faster by more than {100 * (NOISE - 1):.0f} % and
+has no more error by PSNR nor by the 99.9 percentile."""
+    rows = sorted(_rows(content), key=lambda r: -r["rays_per_s"])
+    picture = "![Frames per second against error](render.png)"
+    return page("Rendering: speed against error", content["made"], said, picture, table(columns, rows))
 
 
-def draw(path: Path, content: dict[str, Any]) -> None:
+def draw(path: Path, content: Row) -> None:
     """Frames per second against loss of PSNR and against the two errors; the front is joined."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
     rows = _rows(content)
-    figure, axes = plt.subplots(1, 3, figsize=(15, 4.5), layout="constrained", sharey=True)
     titles = (("loss", "loss of PSNR, dB"), ("error_999", "99.9 % of errors below"), ("max_error", "largest error"))
-    for axis, (what, title) in zip(axes, titles, strict=True):
-        front = sorted((r[what], r["fps"]) for r in rows if r["on_front"])
-        axis.plot(*zip(*front, strict=True), color="0.8", lw=4, zorder=0, label="front")
-        for r in rows:
-            mark = "*" if r["name"] == content["default"] else "o"
-            axis.plot(r[what], r["fps"], mark, ms=14 if mark == "*" else 6, label=r["name"])
-        # Leaving out what training left out may gain PSNR.
-        axis.set(xscale="linear" if what == "loss" else "log", yscale="log", xlabel=title)
-        axis.grid(alpha=0.3)
-    axes[0].set_ylabel("frames/s")
-    axes[-1].legend(fontsize=6, loc="upper left", bbox_to_anchor=(1, 1))
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
+    with figure(path, 1, 3, (15, 4.5), sharey=True) as (axes,):
+        for axis, (what, along) in zip(axes, titles, strict=True):
+            front = sorted((r[what], r["fps"]) for r in rows if r["on_front"])
+            last = what == "max_error"
+            axis.plot(*zip(*front, strict=True), color="0.8", lw=4, zorder=0, label="front" if last else None)
+            for r in rows:
+                mark, size = ("*", 14) if r["name"] == content["default"] else ("o", 6)
+                axis.plot(r[what], r["fps"], mark, ms=size, label=r["name"] if last else None)
+            # Leaving out what training left out may gain PSNR.
+            axis.set(xscale="linear" if what == "loss" else "log", yscale="log", xlabel=along)
+        axes[0].set_ylabel("frames/s")
+        axes[-1].legend(fontsize=6, loc="upper left", bbox_to_anchor=(1, 1))

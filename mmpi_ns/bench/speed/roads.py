@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-import copy
 import resource
 import statistics
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
-from mmpi_ns.bench.apart import answer, run_apart
-from mmpi_ns.bench.provenance import fingerprint, read_json, stamp, stamp_line, write_json
+from mmpi_ns.bench.apart import Tell, run_apart
+from mmpi_ns.bench.methods import Method, Scene
+from mmpi_ns.bench.report import Bench, Report, Row, figure, page, table
+from mmpi_ns.bench.trainers import config_of, trainer_of
 from mmpi_ns.rendering.rendered import bounded
 from mmpi_ns.scene.windows import Window
 
@@ -25,7 +25,7 @@ RAYS = 1024
 
 
 @dataclass
-class Roads:
+class Roads(Bench):
     """Procedural roads of several lengths: planning time and disk; step, frame and memory in some of their windows."""
 
     lengths: tuple[float, ...] = (100.0, 1000.0, 10000.0)
@@ -34,54 +34,34 @@ class Roads:
     """Training steps of a window."""
     windows: int = 5
     """Windows of a road that are trained, spread evenly over it; medians count."""
-    threads: int = 1
+    threads: int = field(default=1, kw_only=True)
     """Of each process."""
-    output: Path = Path("docs/results")
-    """Where roads.json, roads.md and roads.png go."""
-    work: Path = Path("outputs/roads")
-    """Where scenes, runs and logs go."""
+
+    name = "roads"
 
     def run(self) -> None:
-        made, path = stamp("roads", self), self.output / "roads.json"
-        made["threads"] = self.threads
-        key = f"{fingerprint()} {self.steps} {self.windows} {self.threads}"
-        before = read_json(path)
-        rows = before.get("rows", {}) if before.get("key") == key else {}
-        content: dict[str, Any] = {"headline": {}, "made": made, "key": key, "rows": rows}
+        report = Report(self, self.key("lengths"))
         for length in self.lengths:
-            name = f"{length:g} m"
-            if name not in rows:
-                row: dict[str, Any] = {"length": length}
-                asked = {"length": length, "steps": self.steps, "windows": self.windows}
-                for part in ("plan", "train"):
-                    request = {"part": part, **asked, "folder": str(self.work / name)}
-                    found = run_apart("mmpi_ns.bench.speed.roads", request, self.work / f"{name} {part}", self.threads)
-                    if "not_run" in found:
-                        raise ValueError(f"{name}, {part}: {found['not_run']}")
-                    row |= found
-                rows[name] = row
-                write_json(path, content)
-            r = rows[name]
+            r = report.row(f"{length:g} m", lambda length=length: self._measure(length))
             print(
-                f"{name}: {r['windows']} windows, plan {r['plan_s']:.0f} s, step {r['step_ms']:.0f} ms, "
+                f"{length:g} m: {r['windows']} windows, plan {r['plan_s']:.0f} s, step {r['step_ms']:.0f} ms, "
                 f"frame {r['frame_ms']:.0f} ms, {r['peak_gib']:.2f} GiB",
                 flush=True,
             )
-        content["headline"] = headline(list(rows.values()))
-        write_json(path, content)
-        (self.output / "roads.md").write_text(table(content), encoding="utf-8")
-        draw(self.output / "roads.png", list(rows.values()))
-        print(content["headline"])
+        rows = list(report.rows.values())
+        head = headline(rows)
+        report.finish(head, markdown(report.content), lambda path: draw(path, rows))
+        print(head)
 
-
-def measure(request: dict[str, Any], tell: Callable[[str], None]) -> dict[str, Any]:
-    """One part of one road, in a process of its own."""
-    folder, steps, windows = Path(request["folder"]), request["steps"], request["windows"]
-    return (
-        plan_road(folder, request["length"], steps, windows)
-        if request["part"] == "plan"
-        else train_windows(folder, steps, windows)
-    )
+    def _measure(self, length: float) -> Row:
+        """One road: planned, and then trained, in two processes."""
+        folder, row = self.folder / f"{length:g} m", {"length": length}
+        request = {"length": length, "steps": self.steps, "windows": self.windows, "folder": str(folder)}
+        for work in (plan_road, train_windows):
+            row |= run_apart(work, request, folder / work.__name__, self.threads)
+            if "not_run" in row:
+                break
+        return row
 
 
 def some_windows(count: int, wanted: int) -> list[int]:
@@ -89,8 +69,12 @@ def some_windows(count: int, wanted: int) -> list[int]:
     return sorted({round((i + 1) / (wanted + 1) * (count - 1)) for i in range(wanted)})
 
 
-def plan_road(folder: Path, length: float, steps: int, windows: int) -> dict[str, Any]:
+def plan_road(request: dict[str, Any], tell: Tell) -> Row:
     """Makes the scene (the images of some windows alone) and its plan.
+
+    Args:
+        request: length, steps and windows of the command, and folder of the road.
+        tell: of progress.
 
     Returns:
         Seconds of planning, windows, MPIs of all and of the largest, texels of all and of the largest, cameras.
@@ -100,8 +84,9 @@ def plan_road(folder: Path, length: float, steps: int, windows: int) -> dict[str
     from mmpi_ns.synthetic.catalogue import make_scene
     from mmpi_ns.synthetic.dataset import write_dataset
 
+    folder, steps, windows = Path(request["folder"]), request["steps"], request["windows"]
+    length, data = request["length"], folder / "data"
     scene = make_scene("long-road", length=length)
-    data = folder / "data"
     write_dataset(scene, data, max(4000, 4 * round(length)), images=False, overwrite=True)
     observations = load_observations(data, downscale_factor=1)
     config = _config(folder, steps).pipeline.model.placement
@@ -128,7 +113,8 @@ def _write_images(scene: Any, data: Path, windows: list[Window]) -> None:
     from mmpi_ns.synthetic.dataset import image_name
     from mmpi_ns.synthetic.scene import render
 
-    manager = _setup(_config(data.parent, 10), reads_images=False).pipeline.datamanager
+    # Reads no images, but knows the scene's frame.
+    manager = _config(data.parent, 10).pipeline.datamanager.setup(device="cpu", test_mode="inference")
     outputs = manager.train_dataparser_outputs
     transform = outputs.dataparser_transform.double().numpy()
     centers = (
@@ -143,14 +129,19 @@ def _write_images(scene: Any, data: Path, windows: list[Window]) -> None:
         Image.fromarray((colors * 255).round().astype(np.uint8)).save(data / "images" / image_name(int(i)))
 
 
-def train_windows(folder: Path, steps: int, windows: int) -> dict[str, Any]:
+def train_windows(request: dict[str, Any], tell: Tell) -> Row:
     """Trains some windows as a run over all of them would, and renders a frame in the middle of each.
+
+    Args:
+        request: as for ``plan_road``.
+        tell: of progress.
 
     Returns:
         Medians over the windows (and lists of them): milliseconds of a step after growth and of a frame (medians in
         themselves), MPIs and texels, PSNR of the frame; and how much memory the process held at most (GiB).
     """
-    trainer = _setup(_config(folder, steps, folder / "plan.json"))
+    folder, steps, windows = Path(request["folder"]), request["steps"], request["windows"]
+    trainer = trainer_of(_config(folder, steps, "--pipeline.model.plan-file", str(folder / "plan.json")))
     plans, times = trainer._run.progress.windows.plans, []
     step_once = trainer.train_iteration
 
@@ -200,34 +191,13 @@ def _samples(model: Any, camera: Any) -> dict[str, float]:
     return {"live_samples": float(report.live.float().mean()), "kept_samples": float(kept)}
 
 
-def _config(folder: Path, steps: int, plan: Path | None = None) -> Any:
-    from mmpi_ns.config import mmpi_small
-
-    config: Any = copy.deepcopy(mmpi_small.config)
-    config.output_dir, config.experiment_name, config.timestamp = folder / "run", "road", "a"
-    config.max_num_iterations, config.steps_per_save, config.vis = steps, 10 * steps, "tensorboard"
-    config.machine.device_type = "cpu"
-    config.logging.local_writer.enable, config.logging.profiler = False, "none"
-    config.data = config.pipeline.datamanager.data = folder / "data"
-    config.pipeline.datamanager.dataparser.downscale_factor = 1
-    config.pipeline.datamanager.resident_pixels = 0
-    config.pipeline.model.plan_file = plan
-    return config
+def _config(folder: Path, steps: int, *options: str) -> Any:
+    """Of ``mmpi-small`` on the road in a folder, which holds no image in memory."""
+    method = Method("road", "mmpi-small", ("--pipeline.datamanager.resident-pixels", "0", *options))
+    return config_of(method.words(Scene(folder / "data", 1), folder / "run", steps, None, 0, "cpu"))
 
 
-def _setup(config: Any, reads_images: bool = True) -> Any:
-    """A trainer; without images only as much of one as knows the scene's frame."""
-    if not reads_images:
-        from types import SimpleNamespace
-
-        manager = config.pipeline.datamanager.setup(device="cpu", test_mode="inference")
-        return SimpleNamespace(pipeline=SimpleNamespace(datamanager=manager))
-    trainer = config.setup(local_rank=0, world_size=1)
-    trainer.setup()
-    return trainer
-
-
-def headline(rows: list[dict[str, Any]]) -> dict[str, float]:
+def headline(rows: list[Row]) -> dict[str, float]:
     """Longest over shortest: what should stay is near 1, what should grow is near the ratio of lengths."""
     first, last = min(rows, key=lambda r: r["length"]), max(rows, key=lambda r: r["length"])
     found = {"length_ratio": last["length"] / first["length"]}
@@ -236,54 +206,43 @@ def headline(rows: list[dict[str, Any]]) -> dict[str, float]:
     return found
 
 
-def table(content: dict[str, Any]) -> str:
-    """The Markdown page."""
-    lines = [
-        "# Roads",
-        "",
-        stamp_line(content["made"]),
-        "",
-        "Procedural bending roads (`mmpi-scene long-road`), an image of 320 x 96 pixels every 1.5 m. The whole road is",
-        "planned; some windows, spread evenly over it, are trained as a run through all would train them, and a frame",
-        "is rendered in the middle of each: medians. Disk is what all windows take when they are finished.",
-        "",
-        "![By length](roads.png)",
-        "",
-        "| road | cameras | windows | MPIs in all | plan, s | disk, GB | MPIs of a window | step, ms | frame, ms "
-        "| samples a ray, coloured | PSNR | memory, GiB |",
-        "|---|---|---|---|---|---|---|---|---|---|---|---|",
-    ]
-    for name, r in content["rows"].items():
-        cells = [name, r["cameras"], r["windows"], r["mpis"], f"{r['plan_s']:.0f}"]
-        cells += [f"{r['texels'] * BYTES_A_TEXEL / 1e9:.2f}", f"{r['window_mpis']:g}", f"{r['step_ms']:.0f}"]
-        cells += [f"{r['frame_ms']:.0f}", f"{r['live_samples']:.0f}, {r['kept_samples']:.0f}"]
-        cells += [f"{r['psnr_db']:.1f}", f"{r['peak_gib']:.2f}"]
-        lines.append("| " + " | ".join(map(str, cells)) + " |")
-    return "\n".join([*lines, ""])
+_COLUMNS = {
+    "road": "{name}",
+    "cameras": "{cameras}",
+    "windows": "{windows}",
+    "MPIs in all": "{mpis}",
+    "plan, s": "{plan_s:.0f}",
+    "disk, GB": lambda r: f"{r['texels'] * BYTES_A_TEXEL / 1e9:.2f}",
+    "MPIs of a window": "{window_mpis:g}",
+    "step, ms": "{step_ms:.0f}",
+    "frame, ms": "{frame_ms:.0f}",
+    "samples a ray, coloured": "{live_samples:.0f}, {kept_samples:.0f}",
+    "PSNR": "{psnr_db:.1f}",
+    "memory, GiB": "{peak_gib:.2f}",
+}
 
 
-def draw(path: Path, rows: list[dict[str, Any]]) -> None:
+def markdown(content: Row) -> str:
+    """The page."""
+    said = """\
+Procedural bending roads (`mmpi-scene long-road`), an image of 320 x 96 pixels every 1.5 m. The whole road is
+planned; some windows, spread evenly over it, are trained as a run through all would train them, and a frame
+is rendered in the middle of each: medians. Disk is what all windows take when they are finished."""
+    rows = ({"name": name, **r} for name, r in content["rows"].items())
+    return page("Roads", content["made"], said, "![By length](roads.png)", table(_COLUMNS, rows))
+
+
+def draw(path: Path, rows: list[Row]) -> None:
     """What should stay, and what should grow, over the length."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(11, 4), layout="constrained")
-    FigureCanvasAgg(figure)
-    stay, grow = figure.subplots(1, 2)
     lengths = [r["length"] for r in rows]
-    for name, label in (("step_ms", "step"), ("frame_ms", "frame"), ("peak_gib", "memory")):
-        stay.plot(lengths, [r[name] / rows[0][name] for r in rows], "o-", label=label)
-    for name, label in (("plan_s", "planning time"), ("texels", "disk"), ("windows", "windows")):
-        grow.plot(lengths, [r[name] / rows[0][name] for r in rows], "o-", label=label)
-    grow.plot(lengths, [x / lengths[0] for x in lengths], color="0.7", label="linear")
-    stay.axhspan(0.8, 1.2, color="0.9")
-    stay.set(xscale="log", ylim=(0, None), xlabel="metres", ylabel="relative to the shortest")
-    grow.set(xscale="log", yscale="log", xlabel="metres")
-    for axes in (stay, grow):
-        axes.legend(fontsize=8)
-        axes.grid(alpha=0.3)
-    figure.savefig(path, dpi=110)
-
-
-if __name__ == "__main__":
-    answer(measure)
+    with figure(path, 1, 2, (11, 4)) as ((stay, grow),):
+        for axis, names in (
+            (stay, {"step_ms": "step", "frame_ms": "frame", "peak_gib": "memory"}),
+            (grow, {"plan_s": "planning time", "texels": "disk", "windows": "windows"}),
+        ):
+            for name, label in names.items():
+                axis.plot(lengths, [r[name] / rows[0][name] for r in rows], "o-", label=label)
+        grow.plot(lengths, [x / lengths[0] for x in lengths], color="0.7", label="linear")
+        stay.axhspan(0.8, 1.2, color="0.9")
+        stay.set(xscale="log", ylim=(0, None), xlabel="metres", ylabel="relative to the shortest")
+        grow.set(xscale="log", yscale="log", xlabel="metres")

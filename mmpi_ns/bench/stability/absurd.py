@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import copy
 import io
 import json
 import time
@@ -13,10 +12,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from nerfstudio.engine import trainer as nerfstudio_trainer
 
-from mmpi_ns.bench.provenance import commit
-from mmpi_ns.config import mmpi_small
+from mmpi_ns.bench.methods import Method, Scene
+from mmpi_ns.bench.report import commit
+from mmpi_ns.bench.suites import TWO_PHASE
+from mmpi_ns.bench.trainers import config_of, trainer_of
 from mmpi_ns.scene.plan import MPIPlan, ScenePlan
 from mmpi_ns.synthetic.catalogue import make_scene
 from mmpi_ns.synthetic.dataset import write_dataset
@@ -28,12 +28,13 @@ RAYS = 64
 
 @dataclass(frozen=True)
 class Absurdity:
-    """One training that nobody should ask for."""
+    """One training that nobody should ask for, and that must end with finite weights."""
 
     name: str
-    expectation: str
-    change: Callable[[Any, Path], None]
+    change: Callable[[Any, Path], None] | None = None
     """Alters the config before the trainer is made; the folder is the scene's."""
+    mpis: Callable[[tuple[MPIPlan, ...]], tuple[MPIPlan, ...]] | None = None
+    """MPIs to train, from those that the scene would get."""
     start: Callable[[MMPITrainer], None] | None = None
     """Alters the model before the first step."""
 
@@ -47,20 +48,13 @@ def write_scene(folder: Path) -> Path:
     return folder
 
 
-def _rates(factor: float) -> Callable[[Any, Path], None]:
-    def change(config: Any, _: Path) -> None:
-        for entry in config.optimizers.values():
-            entry["optimizer"].lr *= factor
-
-    return change
+def _rates(config: Any, _: Path) -> None:
+    for entry in config.optimizers.values():
+        entry["optimizer"].lr *= 100
 
 
-def _dense(factor: float) -> Callable[[MMPITrainer], None]:
-    def start(trainer: MMPITrainer) -> None:
-        field = trainer._run.field
-        field.density.data.normal_(generator=torch.Generator().manual_seed(0)).mul_(factor)
-
-    return start
+def _dense(trainer: MMPITrainer) -> None:
+    trainer._run.field.density.data.normal_(generator=torch.Generator().manual_seed(0)).mul_(1e3)
 
 
 def _one_image(config: Any, scene: Path) -> None:
@@ -72,68 +66,30 @@ def _one_image(config: Any, scene: Path) -> None:
     config.pipeline.datamanager.dataparser.data = path
 
 
-def _with_plan(alter: Callable[[tuple[MPIPlan, ...]], tuple[MPIPlan, ...]]) -> Callable[[Any, Path], None]:
-    """Trains on a plan made of the one that the scene would get."""
-
-    def change(config: Any, scene: Path) -> None:
-        path = scene / f"plan-{alter.__name__.strip('_')}.json"
-        plan = ScenePlan.load(scene / "plan.json")
-        path.write_text(replace(plan, mpis=alter(plan.mpis)).to_json(), encoding="utf-8")
-        config.pipeline.model.plan_file = path
-
-    return change
-
-
-def _identical(mpis: tuple[MPIPlan, ...]) -> tuple[MPIPlan, ...]:
-    return mpis[0], replace(mpis[0], name="its twin")
-
-
 def _turned(mpi: MPIPlan) -> MPIPlan:
     x, y, z = mpi.axes
     back = tuple(tuple(-v for v in row) for row in (x, z))
     return replace(mpi, name="facing away", axes=(back[0], y, back[1]))  # type: ignore[arg-type]
 
 
-def _one_away(mpis: tuple[MPIPlan, ...]) -> tuple[MPIPlan, ...]:
-    return mpis[0], _turned(mpis[0])
-
-
-def _all_away(mpis: tuple[MPIPlan, ...]) -> tuple[MPIPlan, ...]:
-    return (_turned(mpis[0]),)
-
-
-FINITE = "finite weights"
 ABSURDITIES = (
-    Absurdity("learning rates x 100", FINITE, _rates(100.0)),
-    Absurdity("raw densities start at N(0, 1) x 1e3", FINITE, lambda config, scene: None, _dense(1e3)),
-    Absurdity("one training image", FINITE, _one_image),
-    Absurdity("two identical MPIs", FINITE, _with_plan(_identical)),
-    Absurdity("one of two MPIs faces away", FINITE, _with_plan(_one_away)),
-    Absurdity("the only MPI faces away", FINITE, _with_plan(_all_away)),
+    Absurdity("learning rates x 100", _rates),
+    Absurdity("raw densities start at N(0, 1) x 1e3", start=_dense),
+    Absurdity("one training image", _one_image),
+    Absurdity("two identical MPIs", mpis=lambda mpis: (mpis[0], replace(mpis[0], name="its twin"))),
+    Absurdity("one of two MPIs faces away", mpis=lambda mpis: (mpis[0], _turned(mpis[0]))),
+    Absurdity("the only MPI faces away", mpis=lambda mpis: (_turned(mpis[0]),)),
 )
+OPTIONS = (
+    *("--pipeline.datamanager.train-num-rays-per-batch", str(RAYS), "--pipeline.datamanager.keypoint-rays", "16"),
+    *(*TWO_PHASE, "--pipeline.model.hidden-width", "16", "--pipeline.model.placement.max-planes", "32"),
+)
+"""mmpi-small with both phases and a fine-tune, few rays and small networks."""
 
 
 def _config(scene: Path, output: Path, steps: int) -> Any:
-    """mmpi-small with both phases and a fine-tune, few rays and small networks."""
-    config: Any = copy.deepcopy(mmpi_small.config)
-    config.output_dir, config.experiment_name, config.timestamp = output, "absurd", "run"
-    config.max_num_iterations, config.steps_per_save = steps, steps
-    config.machine.device_type, config.machine.num_devices = "cpu", 1
-    config.logging.local_writer.enable, config.logging.profiler, config.vis = False, "none", "tensorboard"
-    config.data = config.pipeline.datamanager.data = scene
-    config.pipeline.datamanager.dataparser.downscale_factor = 1
-    config.pipeline.datamanager.train_num_rays_per_batch = RAYS
-    config.pipeline.datamanager.keypoint_rays = RAYS // 4
-    model = config.pipeline.model
-    model.training, model.hidden_width, model.placement.max_planes = "two-phase", 16, 32
-    return config
-
-
-def _setup(config: Any) -> MMPITrainer:
-    nerfstudio_trainer.writer.EVENT_WRITERS.clear()
-    trainer = config.setup(local_rank=0, world_size=1)
-    trainer.setup()
-    return trainer
+    words = Method("absurd", "mmpi-small", OPTIONS).words(Scene(scene, 1), output, steps, None, 0, "cpu")
+    return config_of(words)
 
 
 def prepare(work: Path) -> Path:
@@ -141,7 +97,7 @@ def prepare(work: Path) -> Path:
     scene = write_scene(work / "scene")
     if not (scene / "plan.json").is_file():
         with _quiet():
-            plan = _setup(_config(scene, work / "plan", 1))._run.field.full_plan
+            plan = trainer_of(_config(scene, work / "plan", 1))._run.field.full_plan
         (scene / "plan.json").write_text(plan.to_json(), encoding="utf-8")
     return scene
 
@@ -153,13 +109,20 @@ def _quiet() -> contextlib.AbstractContextManager:
 def train(absurdity: Absurdity, work: Path, steps: int) -> dict[str, Any]:
     """Trains to the end or to an error; which numbers of the model are not finite."""
     scene = prepare(work)
-    config = _config(scene, work / absurdity.name.replace(" ", "-"), steps)
-    row: dict[str, Any] = {"expectation": absurdity.expectation, "steps": steps, "commit": commit()}
+    folder = work / absurdity.name.replace(" ", "-")
+    config = _config(scene, folder, steps)
+    row: dict[str, Any] = {"expectation": "finite weights", "steps": steps, "commit": commit()}
     start = time.perf_counter()
     try:
         with _quiet():
-            absurdity.change(config, scene)
-            trainer = _setup(config)
+            if absurdity.change is not None:
+                absurdity.change(config, scene)
+            if absurdity.mpis is not None:
+                plan = ScenePlan.load(scene / "plan.json")
+                config.pipeline.model.plan_file = folder / "plan.json"
+                folder.mkdir(parents=True, exist_ok=True)
+                config.pipeline.model.plan_file.write_text(replace(plan, mpis=absurdity.mpis(plan.mpis)).to_json())
+            trainer = trainer_of(config)
             if absurdity.start is not None:
                 absurdity.start(trainer)
             trainer.train()

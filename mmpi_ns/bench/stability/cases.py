@@ -77,6 +77,10 @@ class Case:
     expectation: str
     measure: Callable[[Precision], Outcome]
 
+    @property
+    def name(self) -> str:
+        return f"{self.group}: {self.inputs}"
+
 
 def as_array(values: Tensor | Array) -> Array:
     return values.detach().double().cpu().numpy() if isinstance(values, Tensor) else np.asarray(values, np.float64)

@@ -207,12 +207,6 @@ def shares(reliability: Array, cover: NDArray[np.bool_], own: int) -> tuple[list
     return [_DIGITS.divide(w, total) for w in weights], _DIGITS.divide(rest, total)
 
 
-def log_shares(reliability: Array, cover: NDArray[np.bool_], own: int) -> tuple[float, float]:
-    """log P and log(1 - P); -inf for a sole cover."""
-    every, rest = shares(reliability, cover, own)
-    return float(_DIGITS.ln(every[own])), -math.inf if rest == 0 else float(_DIGITS.ln(rest))
-
-
 def blend(tau: float, reliability: Array, cover: NDArray[np.bool_], own: int, form: str | None) -> Blended:
     """-log(1 - alpha') with alpha' = P alpha (paper), 1 - (1 - alpha)^P (opacity), or tau itself (None)."""
     heads = len(cover)
@@ -267,13 +261,3 @@ def composite_gradient(taus: Array, by_weight: Array, by_transmittance: float) -
         gradient[i] = by_weight[i] * made.in_front[i] * math.exp(-float(taus[i])) - behind
         behind += by_weight[i] * made.weights[i]
     return gradient
-
-
-def median_inverse_distance(weights: Array, inverse_t: Array) -> float:
-    """1/t of the first sample at which half of all gathered weight is reached; 0 for an empty ray."""
-    total, so_far = math.fsum(weights), 0.0
-    for weight, inverse in zip(weights, inverse_t, strict=True):
-        so_far += weight
-        if total > 0 and so_far >= 0.5 * total:
-            return float(inverse)
-    return 0.0

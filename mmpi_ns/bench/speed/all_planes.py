@@ -1,0 +1,96 @@
+"""The plain way to render: all K x L planes of a field for every ray. What speed is measured against."""
+
+from __future__ import annotations
+
+import torch
+from nerfstudio.cameras.rays import RayBundle
+from torch import Tensor
+
+from mmpi_ns.bench.trainers import Steps, clock
+from mmpi_ns.field.mmpi_field import MMPIField
+from mmpi_ns.ops.compositing import composite_weights, render_colors
+from mmpi_ns.ops.interpolate import interpolate_reference
+from mmpi_ns.scene.geometry import inverse_distance, plane_hits, sample_disparity
+
+
+def render_densely(field: MMPIField, bundle: RayBundle) -> tuple[Tensor, float]:
+    """Every plane of every MPI for every ray, one sort, colours wherever alpha exceeds 1e-4, dense gradients.
+
+    Returns:
+        Colours over grey [R, 3], and samples a ray.
+    """
+    assert bundle.nears is not None and bundle.fars is not None
+    hits = plane_hits(bundle.origins, bundle.directions, bundle.nears, bundle.fars, field.frames)
+    taus, keys, colors = [], [], []
+    count = len(bundle)
+    for k, mpi in enumerate(field.plan.mpis):
+        m = torch.arange(mpi.planes - 1, -1, -1).expand(count, -1)
+        w = sample_disparity(m, field.frames.disparity_steps[k], field.frames.last_disparities[k])
+        live = (m <= hits.m_first[:, k : k + 1]) & (m > (hits.m_first - hits.count)[:, k : k + 1])
+        u0, u1, v0, v1 = mpi.extent
+        u = (hits.u[:, k, :1] + w * hits.u[:, k, 1:] - u0) * (2 / (u1 - u0)) - 1
+        v = (hits.v[:, k, :1] + w * hits.v[:, k, 1:] - v0) * (2 / (v1 - v0)) - 1
+        ndc = torch.stack([u, v, 1 - 2 * mpi.near / mpi.depth_share * (w - mpi.last_disparity)], -1).reshape(-1, 3)
+        planes = (mpi.planes - 1 - m).reshape(-1)
+        rows, weights = field.grids[k].bilinear(planes, ndc)
+        raw = interpolate_reference(field.density, rows, weights)[:, 0]
+        tau = torch.where(live.reshape(-1), field.mpi_tau(k, raw, planes), 0.0)
+        chosen = (tau > 1e-4).nonzero()[:, 0]
+        features = interpolate_reference(field.features, rows[chosen], weights[chosen])
+        local = hits.local_directions[:, k].repeat_interleave(mpi.planes, 0)[chosen]
+        color = field.networks(k, features, ndc[chosen], local)
+        colors.append(torch.zeros(tau.shape[0], 3).index_put((chosen,), color).view(count, -1, 3))
+        taus.append(tau.view(count, -1))
+        oz, dz = hits.local_origins[:, k, 2:], hits.local_directions[:, k, 2:]
+        keys.append(torch.where(live, inverse_distance(w, oz, dz), -1.0))
+    order = torch.sort(torch.cat(keys, -1), dim=-1, descending=True, stable=True)[1]
+    tau = torch.cat(taus, -1).gather(-1, order)
+    color = torch.cat(colors, 1).gather(1, order[..., None].expand(-1, -1, 3))
+    zero = torch.zeros_like(tau)
+    result = composite_weights(tau, tau > 0, zero, zero[:, :1])
+    return render_colors(result, color) + 0.5 * result.transmittance, float(tau.shape[1])
+
+
+def rates_of(field: MMPIField) -> list[dict]:
+    """Optimiser groups of a field that is trained without reliability."""
+    rates = {field.density: 0.1, field.features: 0.1, field.networks.weights: 1e-3}
+    return [{"params": [p], "lr": lr} for p, lr in rates.items()]
+
+
+class DenseSteps:
+    """Training by it on the same plan as ours, at all its texels, with the same batches: photometric loss, plain Adam.
+
+    Args:
+        like: ours.
+    """
+
+    def __init__(self, like: Steps) -> None:
+        model = like.pipeline.model
+        config = model.config
+        self.like, self.model, self.step = like, model, 0
+        self.field = MMPIField(
+            model.field.full_plan,
+            feature_channels=config.feature_channels,
+            hidden_width=config.hidden_width,
+            position_frequencies=config.position_frequencies,
+            direction_frequencies=config.direction_frequencies,
+            shared_colour=config.shared_colour,
+            shares_depth=True,
+        ).to(model.device)
+        self.optimizer = torch.optim.Adam(rates_of(self.field), betas=(0.9, 0.99))
+        self.samples = 0.0
+
+    def run(self, count: int) -> float:
+        """Trains; returns seconds."""
+        start = clock()
+        for step in range(self.step, self.step + count):
+            bundle, batch = self.like.pipeline.datamanager.next_train(step)
+            image = batch["image"].to(self.model.device)
+            n = len(image)  # rays to keypoints come last
+            bundle = RayBundle(bundle.origins[:n], bundle.directions[:n], bundle.pixel_area[:n])
+            rgb, self.samples = render_densely(self.field, self.model._bounded(bundle))
+            self.optimizer.zero_grad()
+            ((rgb - image[:, :3]) ** 2).mean().backward()
+            self.optimizer.step()
+        self.step += count
+        return clock() - start

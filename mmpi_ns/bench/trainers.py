@@ -1,0 +1,102 @@
+"""nerfstudio's trainer in this process: made from the words of an ``ns-train`` line, and driven a step at a time."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import nn
+
+
+class NoLPIPS(nn.Module):
+    """Stands in for the metric that peers build in their constructors, whose weights may be out of reach."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__()
+
+    def forward(self, *args: Any) -> torch.Tensor:
+        return torch.tensor(float("nan"))
+
+
+def config_of(words: Sequence[str]) -> Any:
+    """The config that ``ns-train`` would train with. Models that it makes take ``NoLPIPS``."""
+    import torchmetrics.image.lpip as home
+    import tyro
+    from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
+
+    home.LearnedPerceptualImagePatchSimilarity = NoLPIPS  # type: ignore[misc]
+    config: Any = tyro.cli(AnnotatedBaseConfigUnion, args=list(words))
+    config.pipeline.datamanager.data = config.data
+    return config
+
+
+def trainer_of(config: Any, seed_offset: int = 0) -> Any:
+    """A trainer that is set up. Random draws start from the config's seed plus ``seed_offset``."""
+    from nerfstudio.engine import trainer as nerfstudio_trainer
+    from nerfstudio.scripts.train import _set_random_seed
+
+    nerfstudio_trainer.writer.EVENT_WRITERS.clear()
+    _set_random_seed(config.machine.seed + seed_offset)
+    trainer = config.setup(local_rank=0, world_size=1)
+    trainer.setup()
+    return trainer
+
+
+def end_helpers(trainer: Any) -> None:
+    """Ends the processes that prepare nerfacto's batches."""
+    for process in getattr(trainer.pipeline.datamanager, "data_procs", []):
+        process.terminate()
+
+
+def clock() -> float:
+    """Seconds; on a GPU, once it has done all."""
+    if torch.cuda.is_available():
+        torch.cuda.synchronize()
+    return time.perf_counter()
+
+
+class Steps:
+    """A trainer a step at a time: what its own loop does in a step, without logging and saving.
+
+    Args:
+        words: an ``ns-train`` line.
+    """
+
+    def __init__(self, words: Sequence[str]) -> None:
+        self.trainer = trainer_of(config_of(words))
+        self.pipeline, self.step = self.trainer.pipeline, 0
+
+    def run(self, count: int) -> float:
+        """Trains; returns seconds."""
+        from nerfstudio.engine.callbacks import TrainingCallbackLocation as At
+
+        start = clock()
+        for step in range(self.step, self.step + count):
+            self.pipeline.train()
+            for callback in self.trainer.callbacks:
+                callback.run_callback_at_location(step, location=At.BEFORE_TRAIN_ITERATION)
+            self.trainer.train_iteration(step)
+            for callback in self.trainer.callbacks:
+                callback.run_callback_at_location(step, location=At.AFTER_TRAIN_ITERATION)
+        self.step += count
+        return clock() - start
+
+    @property
+    def rays(self) -> int:
+        """Pixel rays of a step."""
+        return self.pipeline.datamanager.get_train_rays_per_batch()
+
+    @torch.no_grad()
+    def render(self, larger: int = 1, rays: int = 0) -> tuple[float, int]:
+        """Renders a test view, or the first so many rays of it; returns seconds and pixels."""
+        self.pipeline.eval()
+        camera = self.pipeline.datamanager.eval_dataset.cameras[0:1].to(self.pipeline.device)
+        camera.rescale_output_resolution(larger)
+        bundle = camera.generate_rays(camera_indices=0, keep_shape=True)
+        if rays:
+            bundle = bundle.flatten()[:rays].reshape((min(rays, bundle.size), 1))
+        start = clock()
+        self.pipeline.model.get_outputs_for_camera_ray_bundle(bundle)
+        return clock() - start, bundle.size
