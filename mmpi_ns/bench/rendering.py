@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from nerfstudio.cameras.rays import RayBundle, RaySamples
-from nerfstudio.field_components.field_heads import FieldHeadNames
 from torch import Tensor
 
 from mmpi_ns.bench.stability.exact import Array
@@ -20,7 +19,6 @@ from mmpi_ns.ops.compositing import (
     blended_optical_depth,
     composite_weights,
     median_inverse_distance,
-    render_colors,
 )
 from mmpi_ns.rendering.sampler import MergeReport, MMPISampler
 
@@ -75,5 +73,4 @@ def render(
         tau = tau.new_zeros(tau.numel()).index_put((lookup.index,), blended).view(tau.shape)
     meta = metadata_of(samples)
     made = composite_weights(tau, meta["valid"][..., 0], meta["skipped_before"][..., 0], report.skipped_total)
-    colors = field.get_outputs(samples, lookup if known_lookup else None)[FieldHeadNames.RGB]
-    return Rendered(render_colors(made, colors), made, samples, report)
+    return Rendered(field.render_colors(samples, lookup if known_lookup else None, made).rgb, made, samples, report)

@@ -129,7 +129,7 @@ def test_operations_do_what_their_names_say(steps):
     values = work["interpolation"]()
     assert values.shape == (counts["kept"], field.feature_channels)
     assert work["index of rows"]().unique.numel() == counts["rows"]
-    assert work["compositing"]().shape == (counts["rays"], 3)
+    assert work["colours of rays"]().shape == (counts["rays"], 3)
     merged = work["merge by a sort"]()
     assert int(merged.valid.sum()) == counts["live"]
 

@@ -10,6 +10,7 @@ from mmpi_ns.bench.trainers import Steps, clock
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.ops.compositing import composite_weights, render_colors
 from mmpi_ns.ops.interpolate import interpolate_reference
+from mmpi_ns.rendering.rendered import bounded
 from mmpi_ns.scene.geometry import inverse_distance, plane_hits, sample_disparity
 
 
@@ -88,7 +89,7 @@ class DenseSteps:
             image = batch["image"].to(self.model.device)
             n = len(image)  # rays to keypoints come last
             bundle = RayBundle(bundle.origins[:n], bundle.directions[:n], bundle.pixel_area[:n])
-            rgb, self.samples = render_densely(self.field, self.model._bounded(bundle))
+            rgb, self.samples = render_densely(self.field, bounded(bundle, self.field.plan))
             self.optimizer.zero_grad()
             ((rgb - image[:, :3]) ** 2).mean().backward()
             self.optimizer.step()

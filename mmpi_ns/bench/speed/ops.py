@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +17,7 @@ from mmpi_ns.bench.report import Bench, Report, Row, figure, page, slug, table, 
 from mmpi_ns.bench.trainers import Steps, clock
 from mmpi_ns.field.samples import Gathered, Lookup, Taps, metadata_of
 from mmpi_ns.model import MMPIModel
-from mmpi_ns.ops.colors import colors
-from mmpi_ns.ops.compositing import composite_weights, render_colors
+from mmpi_ns.ops.compositing import composite_weights
 from mmpi_ns.ops.interpolate import gather_rows, index_rows, interpolate_gathered, sum_by_position
 from mmpi_ns.ops.merge import merge
 from mmpi_ns.rendering.rendered import bounded
@@ -144,7 +143,6 @@ def operations(model: MMPIModel, steps: Steps) -> tuple[list[Op], dict[str, floa
     samples, report = sample()
     lookup = field._lookup(samples)
     assert lookup.gathered is not None
-    meta = metadata_of(samples)
     (num_rays, slots), live, kept = lookup.shape, float(report.live.sum()), float(len(lookup.index))
     channels, rows, taps = field.feature_channels, float(len(lookup.gathered.rows)), lookup.groups[0]
     counts = {"rays": num_rays, "live": live, "kept": kept, "rows": rows, "pixels": len(batch["image"])}
@@ -155,8 +153,7 @@ def operations(model: MMPIModel, steps: Steps) -> tuple[list[Op], dict[str, floa
         Op("index of rows", lambda: index_rows(taps.rows), taps.rows.numel() * (8 + 4) + rows * 8),
     ]
     ops += _interpolation(field, taps, lookup.gathered, channels)
-    ops += _colors(field, samples, lookup, channels)
-    ops += _compositing(field, samples, meta, report)
+    ops += _shading(field, samples, lookup, report)
     ops.append(_variation(field, lookup, rows * (1 + channels) * 2 * 4))
     ops.append(_adam(model, steps, rows * (1 + channels) * 7 * 4))
     return ops, counts
@@ -191,42 +188,39 @@ def _interpolation(field: Any, taps: Taps, gathered: Gathered, channels: int) ->
     ]
 
 
-def _colors(field: Any, samples: Any, lookup: Lookup, channels: int) -> list[Op]:
-    """Colour networks on looked-up features, and back."""
-    networks, (k, own) = field.networks, max(lookup.spans, key=lambda s: s[1].stop - s[1].start)
-    ndc, rays = lookup.ndc[own], lookup.rays[own]
-    features = torch.rand(len(ndc), channels, device=ndc.device).requires_grad_()
-    directions = samples.frustums.directions[:, 0]
-    weights = sum(math.prod(s) for s in networks.shapes[::2])
-    moved, sums = len(ndc) * (channels + 3 + 3) * 4, 2.0 * weights * len(ndc)
-
-    def forward() -> Tensor:
-        return colors(networks, k, features, ndc, directions, rays)
-
-    def both() -> None:
-        forward().sum().backward()
-        features.grad = networks.weights.grad = None
-
-    return [
-        Op("colour network of one MPI", forward, moved, sums),
-        Op("colour network of one MPI, and backward", both, 2 * moved, 3 * sums),
-    ]
-
-
-def _compositing(field: Any, samples: Any, meta: dict[str, Tensor], report: Any) -> list[Op]:
+def _shading(field: Any, samples: Any, lookup: Lookup, report: Any) -> list[Op]:
+    """Weights of the samples, and what rays show by them: forwards, and back to texels and depths."""
+    meta = metadata_of(samples)
     valid, skipped = meta["valid"][..., 0], meta["skipped_before"][..., 0]
-    tau = meta["tau"][..., 0].clone().requires_grad_()
-    colors = torch.rand(*valid.shape, 3, device=tau.device).requires_grad_()
+    tau, known = meta["tau"][..., 0].clone().requires_grad_(), lookup.gathered
+    assert known is not None
+    features = known.features.detach().requires_grad_()
+    lookup = replace(lookup, gathered=Gathered(known.rows, known.density.detach(), features))
+    fixed = composite_weights(tau.detach(), valid, skipped, report.skipped_total)
 
-    def forward() -> Tensor:
-        return render_colors(composite_weights(tau, valid, skipped, report.skipped_total), colors)
+    def weigh() -> Tensor:
+        return composite_weights(tau, valid, skipped, report.skipped_total).weights
 
-    def both() -> None:
-        forward().sum().backward()
-        tau.grad = colors.grad = None
+    def show() -> Tensor:
+        return field.render_colors(samples, lookup, fixed).rgb
 
-    moved = valid.numel() * (4 + 4 + 1 + 3 * 4)
-    return [Op("compositing", forward, moved), Op("compositing, and backward", both, 2 * moved)]
+    def back(work: Callable[[], Tensor]) -> Callable[[], None]:
+        def both() -> None:
+            work().sum().backward()
+            tau.grad = features.grad = field.networks.weights.grad = None
+
+        return both
+
+    weights = sum(math.prod(s) for s in field.networks.shapes[::2])
+    asked = len(valid) if field.shading == "ray" else len(lookup.index)
+    depths, read = valid.numel() * (4 + 4 + 1 + 4), features.numel() * 4 + len(lookup.index) * 4 * (4 + 4)
+    sums = 2.0 * weights * asked
+    return [
+        Op("compositing", weigh, depths),
+        Op("compositing, and backward", back(weigh), 2 * depths),
+        Op("colours of rays", show, read, sums),
+        Op("colours of rays, and backward", back(show), 2 * read, 3 * sums),
+    ]
 
 
 def _variation(field: Any, lookup: Lookup, moved: float) -> Op:
@@ -240,7 +234,7 @@ def _variation(field: Any, lookup: Lookup, moved: float) -> Op:
         assert lookup.gathered is not None
         rows = lookup.gathered.rows
         density, features = (gather_rows(t, rows) for t in (field.density, field.features))
-        lookup = Lookup(**{**vars(lookup), "gathered": Gathered(rows, density, features)})
+        lookup = replace(lookup, gathered=Gathered(rows, density, features))
         work()
 
     return Op("total variation, forward and backward", fresh, moved)

@@ -35,6 +35,8 @@ class ExactField:
     layers: list[tuple[int, ...]]
     """Shapes of weights and biases in such a row."""
     frequencies: tuple[int, int]
+    shading: str
+    """Whether a network is asked once a ray or for every sample."""
     depth_scale: float
     samples_per_voxel: float
     cube_alpha: float
@@ -56,7 +58,8 @@ class ExactField:
             split(source.touched),
             networks.weights.detach().double().cpu().numpy(),
             list(networks.shapes),
-            (networks.position_frequencies, networks.direction_frequencies),
+            (getattr(networks, "position_frequencies", 0), networks.direction_frequencies),
+            source.shading,
             source.depth_scale,
             source.samples_per_voxel,
             source.cube_alpha,
@@ -169,9 +172,11 @@ class ExactRay:
         raw = self.jitter(_look_up(f.density[k], corners), _size(f.density[k], corners) + abs(bias))[0] + bias
         features = self.jitter(_look_up(f.features[k], corners), _size(f.features[k], corners))
         votes, cover, vote_corners = self._votes(k, inverse_t, ndc)
-        inputs = self._encode(ndc, axes @ self.direction, features)
         tau = float(self.jitter(exact.softplus(raw) * scale))
-        color = self._network(k, inputs, features)[0]
+        inputs, color = features, exact.sigmoid(features[:3])
+        if f.shading == "sample":
+            inputs = self._encode((ndc, axes @ self.direction), features)
+            color = exact.sigmoid(features[:3] + self._network(k, inputs)[0])
         return Sample(k, plane, inverse_t, size_q, raw, scale, tau, votes, cover, inputs, color, corners, vote_corners)
 
     def _votes(self, own: int, inverse_t: float, own_ndc: Array):
@@ -210,9 +215,10 @@ class ExactRay:
 
     # Colour networks -----------------------------------------------------------------------------------------
 
-    def _encode(self, ndc: Array, direction: Array, features: Array) -> Array:
-        parts = [features]
-        for x, count in zip((ndc, self.jitter(direction, 1.0)), self.field.frequencies, strict=True):
+    def _encode(self, vectors: tuple[Array, ...], features: Array) -> Array:
+        """Network inputs from features and positional encodings; the last of the vectors is a direction."""
+        parts, vectors = [features], (*vectors[:-1], self.jitter(vectors[-1], 1.0))
+        for x, count in zip(vectors, self.field.frequencies[-len(vectors) :], strict=True):
             angles = np.concatenate([x * math.pi * 2**i for i in range(count)]) if count else np.zeros(0)
             parts += [x, np.sin(angles), np.cos(angles)]
         return np.concatenate(parts)
@@ -222,15 +228,15 @@ class ExactRay:
         ends = np.cumsum([math.prod(s) for s in self.field.layers])
         return [part.reshape(s) for part, s in zip(np.split(row, ends[:-1]), self.field.layers, strict=True)]
 
-    def _network(self, head: int, inputs: Array, features: Array) -> tuple[Array, Array, Array, Array]:
-        """Colour, hidden layers, and the network's inputs as it may have rounded them."""
+    def _network(self, head: int, inputs: Array) -> tuple[Array, Array, Array, Array]:
+        """Three numbers, hidden layers, and the network's inputs as it may have rounded them."""
         w1, b1, w2, b2, w3, b3 = self._weights(head)
         move = self.jitter.network
         x = move(inputs)
         h1 = move(np.maximum(move(w1 @ x + b1, np.abs(w1) @ np.abs(x) + np.abs(b1)), 0))
         h2 = move(np.maximum(move(w2 @ h1 + b2, np.abs(w2) @ np.abs(h1) + np.abs(b2)), 0))
         logits = move(w3 @ h2 + b3, np.abs(w3) @ np.abs(h2) + np.abs(b3))
-        return exact.sigmoid(features[:3] + logits), h1, h2, x
+        return logits, h1, h2, x
 
     # Rendering -----------------------------------------------------------------------------------------------
 
@@ -240,10 +246,22 @@ class ExactRay:
     def render(self, form: str | None = None) -> tuple[Array, exact.Composited]:
         """Colour [3] without background, and weights and transmittance."""
         made = exact.composite(np.array([b.depth for b in self.blended(form)]))
+        if self.field.shading == "ray":
+            return self._shaded_once(made), made
         color = np.zeros(3)
         for weight, sample in zip(made.weights, self.samples, strict=True):
             color = color + weight * sample.color
         return color, made
+
+    def _shaded_once(self, made: exact.Composited) -> Array:
+        """What a ray shows whose colours and features are gathered before a network shades them."""
+        if not self.samples:
+            return np.zeros(3)
+        each = np.array([np.concatenate([s.color, np.tanh(s.inputs[3:])]) for s in self.samples])
+        mean = made.weights @ each / max(float(made.weights.sum()), 1e-6)
+        change = self._network(0, self._encode((self.direction,), mean))[0]
+        odds = np.exp(8 * np.tanh(change / 8)) * mean[:3]
+        return made.accumulation * odds / (odds + 1 - mean[:3])
 
     def add_gradient(self, by_color: Array, form: str | None, total: Gradients, size: Gradients) -> None:
         """Adds the derivatives of ``by_color`` . colour, and to ``size`` the magnitudes of all that is added."""
@@ -268,7 +286,8 @@ class ExactRay:
     def _add_color(self, s: Sample, by_color: Array, total: Gradients, size: Gradients) -> None:
         """Backwards through a colour network."""
         features = s.inputs[: self.field.features[s.head].shape[-1]]
-        color, h1, h2, x = self._network(s.head, s.inputs, features)
+        logits, h1, h2, x = self._network(s.head, s.inputs)
+        color = exact.sigmoid(features[:3] + logits)
         w1, _, w2, _, w3, _ = self._weights(s.head)
         by_logit = by_color * color * (1 - color)
         by_h2 = (w3.T @ by_logit) * (h2 > 0)
