@@ -94,7 +94,7 @@ def _training(part: Row) -> list[str]:
 
 def _kitti(part: Row) -> list[str]:
     blocks = []
-    for reading in {"split", "all"} & set(part):
+    for reading in (r for r in ("split", "all") if r in part):
         facts = ", ".join(f"{k} {_number(v)}" for k, v in part[reading].items() if k != "step_ms")
         stages = {name: {"ms a step": ms} for name, ms in part[reading]["step_ms"].items()}
         blocks += [f"`rays-per-mpi {reading}`: {facts}.", _all_columns(stages, "stage")]
