@@ -214,7 +214,7 @@ def test_absurd_trainings_end_well_and_are_not_run_twice(tmp_path, monkeypatch):
 
 def test_a_training_that_ends_in_nan_fails(tmp_path, monkeypatch):
     def poison(trainer):
-        trainer._model.field.features.data[64] = math.nan  # the first texel: the rows before it hold nothing
+        trainer._run.field.features.data[64] = math.nan  # the first texel: the rows before it hold nothing
 
     row = absurd.train(absurd.Absurdity("poisoned", start=poison), tmp_path, 2)
     assert not row["ok"] and "field.features" in row["outcome"]
