@@ -259,7 +259,7 @@ class ExactRay:
             return np.zeros(3)
         each = np.array([np.concatenate([s.color, np.tanh(s.inputs[3:])]) for s in self.samples])
         mean = made.weights @ each / max(float(made.weights.sum()), 1e-6)
-        change = self._network(0, self._encode((self.direction,), mean))[0]
+        change = 4 * self._network(0, self._encode((self.direction,), mean))[0]
         odds = np.exp(8 * np.tanh(change / 8)) * mean[:3]
         return made.accumulation * odds / (odds + 1 - mean[:3])
 
