@@ -30,7 +30,7 @@ from mmpi_ns.ops.compositing import BlendForm, blended_optical_depth
 from mmpi_ns.placement.rule import PlacementConfig
 from mmpi_ns.placement.split import place_windows
 from mmpi_ns.rendering.chunks import rays_per_chunk, render_in_chunks
-from mmpi_ns.rendering.metrics import ImageMetrics, pictures
+from mmpi_ns.rendering.metrics import ImageMetrics, depth_metrics, pictures
 from mmpi_ns.rendering.rendered import RenderedRays, bounded, median_distance
 from mmpi_ns.rendering.sampler import MMPISampler
 from mmpi_ns.rendering.window_store import WindowStore
@@ -397,6 +397,8 @@ class MMPIModel(Model):
         observed = self._observed(batch).to(outputs["rgb"].device)
         values = self.metrics(outputs["rgb"], observed)
         values["dropped_mass"] = float(outputs["dropped_mass"].mean())
+        if "distance" in batch:
+            values |= depth_metrics(outputs["depth"], batch["distance"].to(outputs["depth"]))
         return values, pictures(observed, outputs, len(self.progress.windows.names))
 
     def _observed(self, batch: dict[str, Tensor]) -> Tensor:

@@ -22,6 +22,7 @@ from torch import Tensor
 
 from mmpi_ns.capture.checks import check_transforms
 from mmpi_ns.capture.dataset import MMPIDataset
+from mmpi_ns.capture.known_depth import KnownDepth, know_depths
 from mmpi_ns.capture.observe import observe, sfm_folder
 from mmpi_ns.capture.rays import PinholeRays
 from mmpi_ns.placement.observations import Observations
@@ -36,10 +37,12 @@ TRAINING_VIEWS = "mmpi_training_views"
 """Key under which it finds where the training cameras stand and what they can see (``TrainingViews``)."""
 KEYPOINT_DEPTH = "keypoint_inverse_distance"
 """Ray-bundle metadata: inverse distance of the SfM point on a keypoint ray, 0 on ordinary rays."""
+PIXEL_DEPTH = "pixel_inverse_distance"
+"""Ray-bundle metadata [R, 2]: inverse distance of what a pixel shows and its expected error, 0 where not known."""
 
 
-PIXEL_BYTES = 3 + 3 * 4
-"""Of a resident pixel: its colour, and its image, row and column."""
+PIXEL_BYTES = 3 + 3 * 4 + 2 * 4
+"""Of a resident pixel: its colour, its image, row and column, and its depth with its error."""
 
 
 @dataclass
@@ -57,8 +60,13 @@ class MMPIDataManagerConfig(VanillaDataManagerConfig):
     """COLMAP model with the tracks, relative to the data, in the frame of transforms.json (colmap parser: its own)."""
     triangulate: bool = True
     """Scenes without tracks: match and triangulate the training images' features at the start (a second or so each)."""
+    dense_depth: bool = True
+    """Match the originals of neighbouring training images densely at the start, for the depth of most pixels (less
+    than a second an image; kept in ~/.cache/mmpi_ns for the next start)."""
+    depth_images: bool = True
+    """Use the depths of sensors that a data parser names (depth_file_path)."""
     resident_pixels: float = 60e6
-    """Training pixels held in memory at once (15 bytes each); those of a longer capture are read window by window."""
+    """Training pixels held in memory at once (23 bytes each); those of a longer capture are read window by window."""
     seed: int = 0
     """Batches depend on this seed and the step alone, so a resumed run draws what an uninterrupted one would."""
 
@@ -71,17 +79,22 @@ class PixelPool:
     """[P, C] uint8 or float, C = 3 or 4."""
     indices: Int[Tensor, "P 3"]
     """(image, row, column) of each pixel."""
+    depths: Float[Tensor, "P 2"]
+    """Inverse distance of each pixel and its expected error; 0 where not known."""
 
     @staticmethod
     def from_dataset(
-        dataset: MMPIDataset, device: str | torch.device, images: Iterable[int] | None = None
+        dataset: MMPIDataset,
+        device: str | torch.device,
+        images: Iterable[int] | None = None,
+        known: KnownDepth | None = None,
     ) -> PixelPool:
         """Reads every image, or some, once; masked pixels are left out.
 
         Raises:
             ValueError: an image or mask cannot be used (names the file), or the masks leave nothing.
         """
-        colors, indices = [], []
+        colors, indices, depths = [], [], []
         for i in range(len(dataset)) if images is None else images:
             data = dataset.get_data(i, image_type="uint8")
             image = data["image"]
@@ -91,18 +104,20 @@ class PixelPool:
             rows, columns = keep.nonzero(as_tuple=True)
             colors.append(image[rows, columns])
             indices.append(torch.stack([torch.full_like(rows, i), rows, columns], -1).to(torch.int32))
+            depth = torch.zeros(*keep.shape, 2) if known is None else torch.from_numpy(known.images[i])
+            depths.append(depth[rows, columns])
         if not sum(len(c) for c in colors):
             raise ValueError("The masks leave no training pixel: white (non-zero) mask pixels are the ones used.")
-        return PixelPool(torch.cat(colors).to(device), torch.cat(indices).to(device))
+        return PixelPool(*(torch.cat(parts).to(device) for parts in (colors, indices, depths)))
 
     def draw(
         self, count: int, g: torch.Generator, allowed: Int[Tensor, "A"] | None = None
-    ) -> tuple[Float[Tensor, "R C"], Int[Tensor, "R 3"]]:
-        """Colours and indices of random pixels, of all or of those at the ``allowed`` places."""
+    ) -> tuple[Float[Tensor, "R C"], Int[Tensor, "R 3"], Float[Tensor, "R 2"]]:
+        """Colours, indices and depths of random pixels, of all or of those at the ``allowed`` places."""
         size = self.colors.shape[0] if allowed is None else len(allowed)
         chosen = torch.randint(size, (count,), generator=g, device=g.device).to(self.colors.device)
         chosen = chosen if allowed is None else allowed[chosen].long()
-        return self.colors[chosen].float() / 255, self.indices[chosen].long()
+        return self.colors[chosen].float() / 255, self.indices[chosen].long(), self.depths[chosen]
 
     def places_of(self, images: Int[Tensor, "I"]) -> Int[Tensor, "A"]:
         """Where the pixels of some images lie in the pool."""
@@ -129,13 +144,18 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
     def create_train_dataset(self) -> MMPIDataset:
         dataset = super().create_train_dataset()
         # Elsewhere than in training the plan comes from a checkpoint, and images may be absent.
+        trains = self.test_mode == "val"
         self.observations = observe(
             self.train_dataparser_outputs,
             dataset,
             sfm_folder(self.dataparser.config, self.config.sfm_path),
-            find_points=self.test_mode == "val",
+            find_points=trains,
             triangulates=self.config.triangulate,
         )
+        self.known_depth = None
+        if trains and (self.config.dense_depth or self.config.depth_images):
+            parts = {"dense": self.config.dense_depth, "sensor": self.config.depth_images}
+            self.known_depth = know_depths(self.train_dataparser_outputs, self.observations, dataset, **parts)
         dataset.metadata[RAYS_PER_STEP] = self.config.train_num_rays_per_batch
         dataset.metadata[OBSERVATIONS] = self.observations
         dataset.metadata[TRAINING_VIEWS] = TrainingViews.of(dataset.cameras)
@@ -156,7 +176,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         sizes = self.train_dataset.cameras.width * self.train_dataset.cameras.height
         self._reads_by_window = bool(sizes.sum() > self.config.resident_pixels)
         if not self._reads_by_window:
-            self.pool = PixelPool.from_dataset(self.train_dataset, self.device)
+            self.pool = PixelPool.from_dataset(self.train_dataset, self.device, known=self.known_depth)
         # Samples nothing: ns-export sets its batches' size here.
         self.train_pixel_sampler = self._get_pixel_sampler(self.train_dataset, self.config.train_num_rays_per_batch)
         cameras = self.train_dataset.cameras
@@ -173,7 +193,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         self._keypoints = _keypoint_targets(self.observations, self.device, cameras)
         self._allowed = None
         if cameras is not None and self._reads_by_window:
-            self.pool = PixelPool.from_dataset(self.train_dataset, self.device, cameras.tolist())
+            self.pool = PixelPool.from_dataset(self.train_dataset, self.device, cameras.tolist(), self.known_depth)
         elif cameras is not None:
             assert self.pool is not None
             self._allowed = self.pool.places_of(torch.from_numpy(cameras))
@@ -183,7 +203,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
     def pixel_bytes(self, cameras: NDArray[np.int64] | None = None) -> int:
         """Bytes of the training pixels in memory while these cameras are drawn from; where masks hide some, at most."""
         if self.pool is not None and not self._reads_by_window:
-            return self.pool.colors.nbytes + self.pool.indices.nbytes
+            return self.pool.colors.nbytes + self.pool.indices.nbytes + self.pool.depths.nbytes
         sizes = (self.train_dataset.cameras.width * self.train_dataset.cameras.height).reshape(-1).cpu().numpy()
         return PIXEL_BYTES * int((sizes if cameras is None else sizes[cameras]).sum())
 
@@ -217,15 +237,17 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         """
         self.train_count += 1
         if self.pool is None:  # nobody said which window
-            self.pool = PixelPool.from_dataset(self.train_dataset, self.device)
+            self.pool = PixelPool.from_dataset(self.train_dataset, self.device, known=self.known_depth)
         g = generator(self.config.seed, step if self.training else self.train_count, "pixels", self.device)
-        colors, indices = self.pool.draw(self.get_train_rays_per_batch(), g, self._allowed)
+        colors, indices, pixel_depths = self.pool.draw(self.get_train_rays_per_batch(), g, self._allowed)
         bundle = self.train_ray_generator(indices)
         depths = torch.zeros(len(bundle), 1, device=self.device)
         if self.training and self._keypoints is not None and self.config.keypoint_rays > 0:
             keypoint_bundle, keypoint_depths = self._keypoint_rays(g)
             bundle, depths = _join(bundle, keypoint_bundle), torch.cat([depths, keypoint_depths])
+            pixel_depths = torch.cat([pixel_depths, pixel_depths.new_zeros(len(keypoint_depths), 2)])
         bundle.metadata[KEYPOINT_DEPTH] = depths
+        bundle.metadata[PIXEL_DEPTH] = pixel_depths
         return bundle, {"image": colors, "indices": indices}
 
     def _keypoint_rays(self, g: torch.Generator) -> tuple[RayBundle, Float[Tensor, "Q 1"]]:

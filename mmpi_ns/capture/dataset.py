@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any, Literal
 
+import cv2
 import numpy as np
+import torch
+from jaxtyping import Float
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from numpy.typing import NDArray
+from torch import Tensor
 
+from mmpi_ns.capture.depth_images import read_depth_image
 from mmpi_ns.utils.messages import brief
 
 # Pillow reports damaged files by any of these (SyntaxError: a broken PNG chunk), nerfstudio odd shapes by assertions.
@@ -19,7 +25,7 @@ class UnusableFile(ValueError):
 
 
 class MMPIDataset(InputDataset):
-    """Images and masks of the size of their cameras; raises ``UnusableFile`` where one cannot be read or fit."""
+    """Images, masks and distances of the size of their cameras; raises ``UnusableFile`` where one cannot be used."""
 
     def get_numpy_image(self, image_idx: int) -> NDArray[np.uint8]:
         """Image [H, W, 3 or 4] as it is in the file."""
@@ -51,4 +57,17 @@ class MMPIDataset(InputDataset):
                 f"Image {self.image_filenames[image_idx]} has {columns} x {rows} pixels and its camera {width} x "
                 f"{height}: correct the camera's size or give the images that the cameras belong to."
             )
-        return data | {k: data[k][:height, :width] for k in ("image", "mask") if k in data}
+        if image_type == "float32" and (files := self.metadata.get("depth_filenames")):
+            data["distance"] = self._distance(Path(files[image_idx]), image_idx, (rows, columns))
+        return data | {k: data[k][:height, :width] for k in ("image", "mask", "distance") if k in data}
+
+    def _distance(self, file: Path, image_idx: int, shape: tuple[int, int]) -> Float[Tensor, "H W 1"]:
+        """Distance of what each pixel of an evaluated image shows, from its depth image; 0 where unknown."""
+        unit = self.metadata.get("depth_unit_scale_factor", 1.0) * self._dataparser_outputs.dataparser_scale
+        depth = cv2.resize(read_depth_image(file, unit), shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
+        camera = self.cameras[image_idx : image_idx + 1]
+        y, x = torch.meshgrid(torch.arange(shape[0]) + 0.5, torch.arange(shape[1]) + 0.5, indexing="ij")
+        first = torch.zeros(*shape, 1, dtype=torch.long)
+        directions = camera.generate_rays(camera_indices=first, coords=torch.stack([y, x], -1)).directions
+        along_axis = -(directions * camera.camera_to_worlds[0, :, 2]).sum(-1)
+        return (torch.from_numpy(depth) / along_axis.clamp(min=1e-6))[..., None]

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from mmpi_ns.capture.cache import Arrays, digest, remembered
 from mmpi_ns.capture.checks import in_one_place
 from mmpi_ns.capture.dataset import MMPIDataset
+from mmpi_ns.capture.loose_points import with_visible_points
 from mmpi_ns.capture.originals import at_full_size
 from mmpi_ns.capture.sfm import SfmModel, find_sfm_model
 from mmpi_ns.capture.tracks import PosedImages, triangulate
@@ -134,6 +135,8 @@ def read_observations(outputs: DataparserOutputs, cameras: Cameras, sfm: SfmMode
     observations = Observations(
         camera_to_worlds=poses, intrinsics=np.stack(flat, -1), sizes=sizes.astype(np.float64), seen_at=seen_at, **result
     )
+    if len(observations.points) and not len(observations.seen_by):
+        return with_visible_points(observations)
     return _fitting_tracks(observations, cameras) if len(seen_at) else observations
 
 

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from mmpi_ns.capture.checks import brief
 from mmpi_ns.capture.tracks import PosedImages
+from mmpi_ns.utils.messages import brief
 
 COPIES = re.compile(r"(.+)_(\d+)")
 """Name of a folder of downscaled copies: that of the originals, and the factor."""

@@ -49,6 +49,16 @@ class ImageMetrics:
         return self._lpips
 
 
+def depth_metrics(predicted: Float[Tensor, "H W 1"], true: Float[Tensor, "H W 1"]) -> dict[str, float]:
+    """Error of rendered distances relative to the true ones, where those are known: its median, and the share over
+    a tenth."""
+    known = true > 0
+    if not bool(known.any()):
+        return {}
+    error = (predicted[known] / true[known] - 1).abs()
+    return {"depth_error": float(error.median()), "depth_outliers": float((error > 0.1).float().mean())}
+
+
 def pictures(observed: Float[Tensor, "H W 3"], outputs: dict[str, Tensor], num_heads: int) -> dict[str, Tensor]:
     """What is worth looking at of a rendered image, in colours."""
     near = 1 / outputs["depth"].clamp(min=1e-9)

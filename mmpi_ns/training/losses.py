@@ -12,11 +12,14 @@ from jaxtyping import Bool, Float
 from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 
-from mmpi_ns.capture.datamanager import KEYPOINT_DEPTH
+from mmpi_ns.capture.datamanager import KEYPOINT_DEPTH, PIXEL_DEPTH
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.samples import metadata_of
 from mmpi_ns.ops.compositing import Composite, exclusive_cumsum
 from mmpi_ns.rendering.rendered import RenderedRays
+
+PLANE_ERROR = 0.6
+"""Least error of a known depth, in spacings of planes."""
 
 
 @dataclass
@@ -31,6 +34,10 @@ class LossWeights:
     """Spread of a ray's mass over distance."""
     keypoint_depth: float = 0.02
     """-log of the mass near an SfM keypoint (scenes with tracks)."""
+    known_depth: float = 0.04
+    """-log of the likelihood of a pixel's known depth, which is dense matches', an SfM point's or a sensor's."""
+    depth_outliers: float = 0.02
+    """Likelihood of a known depth where nothing of a ray's mass is: the larger, the less false depths are followed."""
     tv_density: float = 1e-4
     """Total variation of the densities, in DVGO's normalisation (there: 1e-5)."""
     tv_features: float = 1e-5
@@ -113,6 +120,36 @@ def keypoint_depth(
     return torch.where(reachable, nll, torch.zeros_like(nll)).sum() / count
 
 
+def known_depth(
+    weights: Float[Tensor, "R S"],
+    inverse_t: Float[Tensor, "R S"],
+    known: Float[Tensor, "R 2"],
+    valid: Bool[Tensor, "R S"],
+    least_error: float,
+    outliers: float = 0.02,
+) -> Float[Tensor, ""]:
+    """-log of the likelihood of measured inverse distances under the mass along their rays, mean over all rays.
+
+    A measurement is right, and then the mass lies within its error, exp(-1/2 ((q - q0) / error)^2) of it; or it is one
+    of the outliers, and then the mass may lie anywhere: -log(mass + outliers). So what many views contradict is given
+    up instead of followed, as the gradient is at most 1 / outliers.
+
+    Args:
+        weights: rendering weights.
+        inverse_t: inverse distances of the samples.
+        known: measured inverse distance, 0 where there is none, and its expected error.
+        valid: which slots hold a sample.
+        least_error: error that all have at least: that of planes, which lie so far apart.
+        outliers: likelihood of any measurement beside the mass.
+    """
+    error = torch.hypot(known[:, 1:], torch.full_like(known[:, 1:], least_error)).clamp(min=1e-12)
+    scaled = (inverse_t - known[:, :1]) / error
+    window = torch.where(valid, torch.exp(-0.5 * scaled**2), torch.zeros_like(scaled))
+    reachable = (valid & (scaled.abs() < 3)).any(-1) & (known[:, 0] > 0)
+    nll = -torch.log((weights * window).sum(-1) + outliers)
+    return torch.where(reachable, nll, torch.zeros_like(nll)).mean() if len(nll) else weights.sum()
+
+
 def batch_losses(
     rays: RenderedRays, field: MMPIField, image: Tensor, weight: LossWeights, g: torch.Generator, step: int
 ) -> dict[str, Tensor]:
@@ -146,6 +183,8 @@ def batch_losses(
     }
     if known is not None and len(pixels) < len(is_pixel):
         total["keypoint_depth"] = weight.keypoint_depth * _keypoint_depth(rays, (~is_pixel).nonzero()[:, 0], known)
+    if PIXEL_DEPTH in rays.bundle.metadata and weight.known_depth > 0:
+        total["known_depth"] = weight.known_depth * _known_depth(rays, pixels, composite, field, weight.depth_outliers)
     if rays.lookup is not None and step % weight.tv_every == 0 and field.density.requires_grad:
         total["tv"] = field.total_variation(rays.lookup, weight.tv_density, weight.tv_features) * (
             weight.tv_every / max(1, image.shape[0])
@@ -158,6 +197,16 @@ def _distortion(rays: RenderedRays, pixels: Tensor, composite: Composite, scale:
     positions = 1 / (1 + inverse_t * scale)
     intervals = (1 / rays.report.live[pixels].clamp(min=1))[:, None].to(positions.dtype)
     return distortion(composite.weights, positions, intervals.expand_as(positions))
+
+
+def _known_depth(rays: RenderedRays, pixels: Tensor, composite: Composite, field: MMPIField, outliers: float) -> Tensor:
+    meta = metadata_of(rays.samples)
+    inverse_t, valid = (meta[name][..., 0].index_select(0, pixels) for name in ("inverse_t", "valid"))
+    known = rays.bundle.metadata[PIXEL_DEPTH].index_select(0, pixels)
+    # Planes lie so far apart in inverse distance, and a surface between two of them is shown by both.
+    spacings = [1 / (m.near * max(1, m.planes - 1)) for m in field.plan.mpis]
+    least = PLANE_ERROR * sum(spacings) / max(1, len(spacings))
+    return known_depth(composite.weights, inverse_t, known, valid, least, outliers)
 
 
 def _keypoint_depth(rays: RenderedRays, chosen: Tensor, known: Tensor) -> Tensor:

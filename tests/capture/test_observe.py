@@ -65,10 +65,12 @@ def test_other_cameras_are_not_triangulated():
 
 
 def test_points_of_the_data_parser_stand_in_where_there_is_no_model():
-    points = torch.tensor([[1.0, 2, 3], [4, 5, 6]])
+    points = torch.tensor([[0.0, 0.1, -3], [4, 5, 6]])  # ahead, and behind
     outputs: Any = SimpleNamespace(image_filenames=["a.png", "b.png"], metadata={"points3D_xyz": points})
     found = read_observations(outputs, as_data().cameras, None)
-    assert found.points.tolist() == points.tolist() and not len(found.seen_by) and not len(found.seen_at)
+    assert found.points.tolist() == points.double().tolist()
+    assert found.seen_by.tolist() == [0, 1] and found.seen_point.tolist() == [0, 0]
+    assert found.seen_at == pytest.approx(np.array([[20, 9]] * 2))
     assert found.intrinsics.tolist() == [[30, 30, 20, 10]] * 2 and found.sizes.tolist() == [[40, 20]] * 2
     outputs.metadata = {}
     assert not len(read_observations(outputs, as_data().cameras, None).points)

@@ -1,0 +1,229 @@
+"""What is known of the distance at each training pixel: inverse distance and expected error, from whatever gave it.
+
+Sources, the later over the earlier: dense matches (``dense.py``), SfM points, depth images of a sensor.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
+from nerfstudio.utils.rich_utils import CONSOLE
+from numpy.typing import NDArray
+from PIL import Image
+from rich.progress import track
+
+from mmpi_ns.capture.cache import Arrays, digest, remembered
+from mmpi_ns.capture.dataset import MMPIDataset
+from mmpi_ns.capture.dense import ROUNDS, Depth, Progress, View, camera_matrix, find_depths, look_up
+from mmpi_ns.capture.depth_images import read_depth_image
+from mmpi_ns.capture.observe import posed_images
+from mmpi_ns.capture.originals import at_full_size
+from mmpi_ns.capture.tracks import PosedImages
+from mmpi_ns.placement.observations import Observations
+
+Map = NDArray[np.float32]
+
+VERSION = 1
+"""Of the way depths are found: kept ones of another version are found anew."""
+FINER, WIDEST = 2, 1600
+"""Images are matched at so many times the training size, and no wider than this, where their originals are."""
+COVERED = 0.3
+"""Share of a training pixel's area in which working pixels must have a depth."""
+POINT_ERROR = 0.01
+"""Relative error of an SfM point's distance, at least."""
+SENSOR_ERROR = 0.01
+"""Relative error of a sensor's depth."""
+
+
+@dataclass(frozen=True)
+class KnownDepth:
+    """For every training image [H, W, 2]: inverse distance from the camera, 0 where unknown, and its expected error."""
+
+    images: tuple[Map, ...]
+
+    @staticmethod
+    def nothing(sizes: NDArray[np.float64]) -> KnownDepth:
+        """For images of these sizes (width, height)."""
+        return KnownDepth(tuple(np.zeros((int(h), int(w), 2), np.float32) for w, h in sizes))
+
+    @property
+    def share(self) -> float:
+        """Share of all pixels whose distance is known."""
+        return sum(int((m[..., 0] > 0).sum()) for m in self.images) / max(1, sum(m[..., 0].size for m in self.images))
+
+
+def know_depths(
+    outputs: DataparserOutputs, observations: Observations, dataset: MMPIDataset, *, dense: bool, sensor: bool
+) -> KnownDepth:
+    """What can be known of the training images' depths.
+
+    Args:
+        outputs: what the data parser said of them.
+        observations: their cameras and tracks.
+        dataset: the images.
+        dense: whether to match neighbouring images.
+        sensor: whether to read depth images.
+
+    Raises:
+        ValueError: an image or a depth image cannot be used (names it).
+    """
+    known = KnownDepth.nothing(observations.sizes)
+    posed = posed_images(observations, dataset)
+    files = outputs.metadata.get("depth_filenames") if sensor else None
+    if posed is None or not (dense or files):
+        return known
+    original = at_full_size(posed)
+    if dense:
+        known = _remembered_depths(original, posed, observations)
+    known = with_points(known, observations)
+    if files:
+        unit = outputs.metadata.get("depth_unit_scale_factor", 1.0) * outputs.dataparser_scale
+        known = with_sensor(known, [Path(f) for f in files], float(unit), original, posed)
+    CONSOLE.print(f"The distance of {100 * known.share:.0f} % of the training pixels is known.")
+    return known
+
+
+def _remembered_depths(original: PosedImages, posed: PosedImages, observations: Observations) -> KnownDepth:
+    """Depths by dense matching, found once."""
+    tracked = len(observations.seen_at)
+    seen_by, points = observations.seen_by[:tracked], observations.points[observations.seen_point[:tracked]]
+    shapes = [(int(h), int(w)) for w, h in observations.sizes]
+    file_shapes = [_file_shape(original, posed, i) for i in range(len(shapes))]
+    width = int(min(WIDEST, FINER * max(w for _, w in shapes)))
+
+    def find() -> Arrays:
+        progress: Progress = lambda n: track(n, description=f"Depths of {len(shapes)} images", console=CONSOLE)  # noqa: E731
+        found = find_depths(original, lambda i: points[seen_by == i], width, progress)
+        maps = [
+            at_training_pixels(view, depth, original, i, shapes[i], file_shapes[i])
+            for i, (view, depth) in enumerate(found)
+        ]
+        return {f"{i}": m for i, m in enumerate(maps)}
+
+    cameras = original.camera_to_worlds, original.intrinsics, original.distortion, original.fisheye
+    key = digest(original.files, "depths", VERSION, ROUNDS, width, shapes, *cameras, seen_by, points)
+    stored = remembered(key, find)
+    return KnownDepth(tuple(stored[f"{i}"] for i in range(len(shapes))))  # type: ignore[arg-type]
+
+
+def _file_shape(original: PosedImages, posed: PosedImages, i: int) -> tuple[int, int]:
+    """Height and width of a training image's file; its camera may have a row or column less."""
+    if original.files[i] == posed.files[i]:
+        return int(original.sizes[i, 1]), int(original.sizes[i, 0])
+    with Image.open(posed.files[i]) as image:
+        return image.height, image.width
+
+
+def with_sensor(
+    known: KnownDepth, files: list[Path], unit: float, original: PosedImages, posed: PosedImages
+) -> KnownDepth:
+    """Takes the depths of sensors where they know any."""
+    maps = []
+    for i, (file, image) in enumerate(zip(files, known.images, strict=True)):
+        shape = image.shape[0], image.shape[1]
+        measured = read_sensor(file, unit, original, i, shape, _file_shape(original, posed, i))
+        maps.append(np.where(measured[..., :1] > 0, measured, image))
+    return KnownDepth(tuple(maps))
+
+
+def at_training_pixels(
+    view: View, depth: Depth, original: PosedImages, i: int, shape: tuple[int, int], file_shape: tuple[int, int]
+) -> Map:
+    """Distances of a training image's pixels from the depths of its view at working size.
+
+    A training pixel takes the mean of what its area holds, weighted by certainty; where that differs within the area,
+    as on an edge, its error grows by it.
+
+    Args:
+        view: the image at working size.
+        depth: its depths.
+        original: cameras of the originals.
+        i: the image's place in them.
+        shape: height and width of the training image.
+        file_shape: height and width of its file, which may have a row or column more.
+
+    Returns:
+        [H, W, 2] inverse distance and expected error.
+    """
+    height, width = shape
+    small = (width, height)
+    mean, error = pooled(depth, (small[1], small[0]))
+    x, y = _straightened(original, i, shape, file_shape)
+    fx, fy, cx, cy = view.pinhole
+    scale_x, scale_y = small[0] / view.gray.shape[1], small[1] / view.gray.shape[0]
+    at = (((fx * x + cx) * scale_x).reshape(shape), ((fy * y + cy) * scale_y).reshape(shape))
+    longer = np.sqrt(x**2 + y**2 + 1).reshape(shape)
+    take = [look_up(m, *at, nearest=True) / longer for m in (mean, error)]
+    return np.stack(take, -1).astype(np.float32)
+
+
+def pooled(depth: Depth, shape: tuple[int, int]) -> tuple[Map, Map]:
+    """Inverse depth and error over the areas of a coarser grid [h, w]; 0 where too little of an area is known."""
+    known = (depth.inverse > 0).astype(np.float32)
+    weight = known / np.maximum(depth.error, 1e-12) ** 2
+    cover, total, first, second = (
+        cv2.resize(m.astype(np.float64), shape[::-1], interpolation=cv2.INTER_AREA)
+        for m in (known, weight, weight * depth.inverse, weight * depth.inverse**2)
+    )
+    mean = first / np.maximum(total, 1e-30)
+    spread = np.maximum(second / np.maximum(total, 1e-30) - mean**2, 0)
+    error = np.sqrt(cover / np.maximum(total, 1e-30) + spread)
+    kept = cover >= COVERED
+    return np.where(kept, mean, 0).astype(np.float32), np.where(kept, error, 0).astype(np.float32)
+
+
+def _straightened(
+    original: PosedImages, i: int, shape: tuple[int, int], file_shape: tuple[int, int]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Tangents (right, down) at which a training image's pixels look, lens taken out. [H * W] each"""
+    full_width, full_height = original.sizes[i]
+    columns, rows = np.meshgrid(np.arange(shape[1]) + 0.5, np.arange(shape[0]) + 0.5)
+    at = np.stack([columns * full_width / file_shape[1], rows * full_height / file_shape[0]], -1).reshape(-1, 1, 2)
+    if not original.distortion[i].any():
+        fx, fy, cx, cy = original.intrinsics[i]
+        return (at[:, 0, 0] - cx) / fx, (at[:, 0, 1] - cy) / fy
+    straighten = cv2.fisheye.undistortPoints if original.fisheye else cv2.undistortPoints
+    found = straighten(at, camera_matrix(original.intrinsics[i]), original.distortion[i])[:, 0]
+    return np.asarray(found[:, 0], np.float64), np.asarray(found[:, 1], np.float64)
+
+
+def with_points(known: KnownDepth, observations: Observations) -> KnownDepth:
+    """Adds the distances of SfM points at the pixels that saw them; the nearest where several fall on one."""
+    maps = [m.copy() for m in known.images]
+    count = len(observations.seen_at)
+    cameras, points = observations.seen_by[:count], observations.points[observations.seen_point[:count]]
+    distance = np.linalg.norm(points - observations.centers[cameras], axis=-1)
+    for k in np.argsort(-distance, kind="stable"):
+        image, (x, y) = maps[cameras[k]], observations.seen_at[k].astype(int)
+        if distance[k] > 0 and 0 <= y < image.shape[0] and 0 <= x < image.shape[1]:
+            image[y, x] = 1 / distance[k], POINT_ERROR / distance[k]
+    return KnownDepth(tuple(maps))
+
+
+def read_sensor(
+    file: Path, unit: float, original: PosedImages, i: int, shape: tuple[int, int], file_shape: tuple[int, int]
+) -> Map:
+    """Distances from a depth image (along the optical axis, 0 where unknown), for a training image's pixels.
+
+    Args:
+        file: 16-bit PNG or .npy.
+        unit: length of a depth of 1, scene units.
+        original: cameras of the originals.
+        i: the image's place in them.
+        shape: height and width of the training image.
+        file_shape: height and width of its file.
+
+    Raises:
+        ValueError: the file cannot be read (names it).
+    """
+    depth = read_depth_image(file, unit)
+    nearest = cv2.resize(depth, file_shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT)[: shape[0], : shape[1]]
+    x, y = _straightened(original, i, shape, file_shape)
+    longer = np.sqrt(x**2 + y**2 + 1).reshape(shape)
+    known = np.isfinite(nearest) & (nearest > 0)
+    inverse = np.where(known, 1 / (np.where(known, nearest, 1) * longer), 0)
+    return np.stack([inverse, SENSOR_ERROR * inverse], -1).astype(np.float32)

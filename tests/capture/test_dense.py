@@ -1,0 +1,173 @@
+"""Depths by dense matching, on rendered walls whose every depth is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_tracks import FOCAL, HEIGHT, LENS, POSES, WIDTH, is_near_wall, scene_of
+
+from mmpi_ns.capture import dense
+from mmpi_ns.capture.dense import Depth, confirmed, find_depths, fuse, load_view, without_fringes
+
+F32 = np.float32
+
+
+def true_depth(pose):
+    """Depth along the axis [HEIGHT, WIDTH] of the walls of ``test_tracks.picture``, and which pixels show the near."""
+    x, y = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    directions = np.stack([(x - WIDTH / 2) / FOCAL, (HEIGHT / 2 - y) / FOCAL, -np.ones_like(x)], -1)
+    d = directions @ pose[:, :3].T
+    near, far = ((z - pose[2, 3]) / d[..., 2] for z in (-3.0, -5.0))
+    shows_near = is_near_wall((pose[:, 3] + near[..., None] * d).reshape(-1, 3)).reshape(near.shape)
+    return np.where(shows_near, near, far), shows_near
+
+
+def points_on_walls(pose, count=40):
+    """Exact points that a view sees, few and far between."""
+    depth, _ = true_depth(pose)
+    rng = np.random.default_rng(3)
+    rows, columns = rng.integers(0, HEIGHT, count), rng.integers(0, WIDTH, count)
+    x, y = (columns + 0.5 - WIDTH / 2) / FOCAL, (HEIGHT / 2 - rows - 0.5) / FOCAL
+    local = np.stack([x, y, -np.ones_like(x)], -1) * depth[rows, columns, None]
+    return local @ pose[:, :3].T + pose[:, 3]
+
+
+def relative_errors(found, poses):
+    """Relative errors of the depths found, and errors over expected errors, of all views together."""
+    pairs = [(d, true_depth(p)[0]) for (_, d), p in zip(found, poses, strict=True)]
+    error = np.concatenate([(d.inverse * t - 1)[d.inverse > 0] for d, t in pairs])
+    scaled = np.concatenate([((d.inverse - 1 / t) / np.maximum(d.error, 1e-9))[d.inverse > 0] for d, t in pairs])
+    return np.abs(error), np.abs(scaled)
+
+
+@pytest.mark.parametrize("lens", [(0.0, 0.0, 0.0, 0.0), LENS])
+def test_most_pixels_get_their_depth_and_know_their_error(tmp_path, lens):
+    images = scene_of(tmp_path, POSES, lens)
+    found = list(find_depths(images, lambda i: points_on_walls(POSES[i]), WIDTH))
+    cover = np.mean([(d.inverse > 0).mean() for _, d in found])
+    error, scaled = relative_errors(found, POSES)
+    assert cover > 0.9
+    assert np.median(error) < 0.003 and np.quantile(error, 0.9) < 0.02 and (error > 0.1).mean() < 0.03
+    assert np.quantile(scaled, 0.9) < 2  # these walls are easier than the errors allow for
+    assert all((d.error[d.inverse > 0] > 0).all() and not d.error[d.inverse == 0].any() for _, d in found)
+
+
+def test_rough_points_are_no_more_than_a_start(tmp_path):
+    """Points a fifth too far: the depths found are those of the images."""
+    images = scene_of(tmp_path, POSES)
+
+    def too_far(i):
+        center = POSES[i][:, 3]
+        return center + 1.2 * (points_on_walls(POSES[i]) - center)
+
+    error, _ = relative_errors(list(find_depths(images, too_far, WIDTH)), POSES)
+    assert np.median(error) < 0.015
+
+
+def test_without_points_nothing_false_is_believed(tmp_path):
+    images = scene_of(tmp_path, POSES)
+    found = list(find_depths(images, lambda i: np.zeros((0, 3)), WIDTH))
+    error, _ = relative_errors(found, POSES)
+    assert not len(error) or (error > 0.1).mean() < 0.05
+
+
+def test_a_wall_without_texture_has_no_depth(tmp_path):
+    images = scene_of(tmp_path, POSES, contrast=0.0)
+    found = list(find_depths(images, lambda i: points_on_walls(POSES[i]), WIDTH))
+    assert not any(d.inverse.any() for _, d in found)
+
+
+def test_one_image_or_images_of_one_place_have_no_depth(tmp_path):
+    one = scene_of(tmp_path / "one", POSES[:1])
+    assert not any(d.inverse.any() for _, d in find_depths(one, lambda i: points_on_walls(POSES[i]), WIDTH))
+    same = scene_of(tmp_path / "same", [POSES[0]] * 3)
+    assert not any(d.inverse.any() for _, d in find_depths(same, lambda i: points_on_walls(POSES[0]), WIDTH))
+
+
+def test_a_wrong_pose_gives_few_depths(tmp_path):
+    """Epipolar lines that do not fit the images are noticed."""
+    images = scene_of(tmp_path, POSES)
+    right = list(find_depths(images, lambda i: points_on_walls(POSES[i]), WIDTH))
+    moved = images.camera_to_worlds.copy()
+    moved[:, 1, 3] += [0.15, -0.1, 0.22, -0.19, 0.04]
+    wrong = list(find_depths(replace(images, camera_to_worlds=moved), lambda i: points_on_walls(POSES[i]), WIDTH))
+    known = [sum((d.inverse > 0).sum() for _, d in f) for f in (right, wrong)]
+    assert known[1] < 0.3 * known[0]
+
+
+def test_equal_images_give_equal_depths(tmp_path):
+    images = scene_of(tmp_path, POSES[:3])
+    a, b = (list(find_depths(images, lambda i: points_on_walls(POSES[i]), WIDTH)) for _ in range(2))
+    assert all(
+        np.array_equal(x.inverse, y.inverse) and np.array_equal(x.error, y.error)
+        for (_, x), (_, y) in zip(a, b, strict=True)
+    )
+
+
+def stack(*values):
+    return np.array(values, F32).reshape(len(values), 1, 1)
+
+
+def test_measurements_that_agree_are_averaged_by_certainty():
+    found = fuse(stack(1.0, 1.005, 3.0), stack(1e4, 4e4, 1e8))
+    assert found.inverse[0, 0] == pytest.approx((1.0 + 4 * 1.005) / 5)
+    assert found.error[0, 0] == pytest.approx(np.sqrt(1 / 5e4))
+
+
+def test_an_error_is_never_less_than_the_scatter_says():
+    """Errors of 0.01 each, values 0.03 apart: they agree (2.5 of sqrt 2 times 0.01), and scatter by 4.5 variances."""
+    found = fuse(stack(1.0, 1.03), stack(1e4, 1e4))
+    assert found.error[0, 0] == pytest.approx(np.sqrt(4.5 / 2e4), rel=1e-4)
+
+
+@pytest.mark.parametrize("values", [(1.0, 1.2, 1.4), (1.0, 0.0, 0.0), (-1.0, -1.0, 0.0)])
+def test_what_no_two_measurements_say_is_not_known(values):
+    weights = np.where(stack(*values) != 0, F32(1e4), F32(0))
+    found = fuse(stack(*values), weights)
+    assert found.inverse[0, 0] == 0 and found.error[0, 0] == 0
+
+
+def test_a_depth_of_large_error_is_not_kept():
+    assert not fuse(stack(1.0, 1.0), stack(10.0, 10.0)).inverse.any()
+    assert fuse(stack(1.0, 1.0), stack(5000.0, 5000.0)).inverse.all()
+
+
+def flat_view(tmp_path, pose, gray=128):
+    view = load_view(scene_of(tmp_path, [pose]), 0, WIDTH)
+    return replace(view, gray=np.full_like(view.gray, gray))
+
+
+def test_the_fringe_of_a_foreground_goes_where_it_has_no_texture_of_its_own(tmp_path):
+    view = flat_view(tmp_path, POSES[0])
+    inverse = np.full(view.gray.shape, 0.1, F32)
+    inverse[:, 100:] = 0.5
+    depth = Depth(inverse, 0.001 * inverse)
+    kept = without_fringes(view, depth).inverse > 0
+    half = dense.EDGE // 2
+    assert kept[:, :100].all() and not kept[:, 100 : 100 + half].any() and kept[:, 100 + half :].all()
+    rng = np.random.default_rng(0)
+    textured = replace(view, gray=rng.integers(0, 255, view.gray.shape, dtype=np.uint8))
+    assert (without_fringes(textured, depth).inverse > 0).mean() > 0.99
+
+
+def test_a_depth_counts_where_another_image_confirms_it_and_no_more_see_through_it(tmp_path):
+    poses = [
+        np.eye(4)[:3] + np.eye(4)[:3] * 0 + np.pad(np.array([[0.05 * i], [0], [0]]), ((0, 0), (3, 0))) for i in range(4)
+    ]
+    views = [flat_view(tmp_path / str(i), p) for i, p in enumerate(poses)]
+
+    def at(depth):
+        inverse = np.full(views[0].gray.shape, 1 / depth, F32)
+        return Depth(inverse, 0.001 * inverse)
+
+    middle = (slice(60, 90), slice(80, 120))
+
+    def share(*depths):
+        others = [(view, at(d)) for view, d in zip(views[1:], depths, strict=False)]
+        return (confirmed(views[0], at(4.0), others).inverse[middle] > 0).mean()
+
+    assert share(4.0) == share(4.0, 4.0, 8.0) == 1  # confirmed; confirmed twice, seen through once
+    assert share(8.0) == share(4.0, 8.0) == share() == 0  # seen through; as often as confirmed; by nobody
+    assert share(4.0, 2.0, 2.0) == 1  # hidden in the others, which says nothing

@@ -1,0 +1,144 @@
+"""Distances at training pixels: from working size, through lenses, from points and from sensors."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+
+from mmpi_ns.capture.dense import Depth, View
+from mmpi_ns.capture.known_depth import (
+    POINT_ERROR,
+    SENSOR_ERROR,
+    KnownDepth,
+    at_training_pixels,
+    pooled,
+    read_sensor,
+    with_points,
+    with_sensor,
+)
+from mmpi_ns.capture.tracks import PosedImages
+from mmpi_ns.placement.observations import Observations
+
+F32 = np.float32
+WIDTH, HEIGHT = 80, 60
+
+
+def camera(lens=(0.0, 0.0, 0.0, 0.0), fisheye=False):
+    intrinsics = np.array([[60.0, 60.0, 40.0, 30.0]])
+    pose, sizes = np.eye(4)[None, :3], np.array([[float(WIDTH), HEIGHT]])
+    return PosedImages(("x.png",), pose, intrinsics, sizes, np.array([lens]), fisheye)  # type: ignore[arg-type]
+
+
+def slanted(pinhole, shape):
+    """Inverse depth of a slanted plane: affine in the pinhole's pixels."""
+    y, x = np.meshgrid(np.arange(shape[0]) + 0.5, np.arange(shape[1]) + 0.5, indexing="ij")
+    return 0.5 + 0.2 * (x - pinhole[2]) / pinhole[0] + 0.1 * (y - pinhole[3]) / pinhole[1]
+
+
+@pytest.mark.parametrize(("lens", "fisheye"), [((0, 0, 0, 0), False), ((0.1, -0.05, 0.002, -0.001), False),
+                                               ((0.08, -0.03, 0.02, 0.01), True)])  # fmt: skip
+def test_a_training_pixel_gets_the_distance_of_what_it_shows(lens, fisheye):
+    """Oracle: the training pixels' rays by OpenCV's own lens model, met with the plane."""
+    posed = camera(lens, fisheye)
+    pinhole, shape = posed.intrinsics[0], (HEIGHT, WIDTH)
+    inverse = slanted(pinhole, shape).astype(F32)
+    view = View(np.zeros(shape, np.uint8), pinhole, posed.camera_to_worlds[0], np.ones(shape, bool))
+    found = at_training_pixels(view, Depth(inverse, 0.01 * inverse), posed, 0, (15, 20), (15, 20))
+    rows, columns = np.meshgrid(np.arange(15) + 0.5, np.arange(20) + 0.5, indexing="ij")
+    at = np.stack([columns * 4, rows * 4], -1).reshape(-1, 1, 2)
+    matrix = np.array([[60.0, 0, 40], [0, 60.0, 30], [0, 0, 1]])
+    straight = (cv2.fisheye if fisheye else cv2).undistortPoints(at, matrix, np.array(lens, float))[:, 0]
+    u, v = straight.T.reshape(2, 15, 20)
+    expected = (0.5 + 0.2 * u + 0.1 * v) / np.sqrt(u**2 + v**2 + 1)
+    known = found[..., 0] > 0
+    assert known.mean() > 0.8
+    assert found[known][:, 0] == pytest.approx(expected[known], rel=0.04 if any(lens) else 1e-3)
+    assert (found[known][:, 1] > 0.009 * found[known][:, 0]).all()
+
+
+def test_a_copy_whose_size_was_rounded_shows_the_whole_original():
+    """1242 x 375 as 310 x 93: pixel 300 of the copy lies at 300.5 * 1242/310 of the original."""
+    posed = PosedImages(("x.png",), np.eye(4)[None, :3], np.array([[720.0, 720, 610, 170]]), np.array([[1242.0, 375]]),
+                        np.zeros((1, 4)))  # type: ignore[arg-type]  # fmt: skip
+    shape, pinhole = (188, 621), np.array([720.0 * 621 / 1242, 720.0 * 188 / 375, 610 * 621 / 1242, 170 * 188 / 375])
+    inverse = slanted(pinhole, shape).astype(F32)
+    view = View(np.zeros(shape, np.uint8), pinhole, np.eye(4)[:3], np.ones(shape, bool))
+    found = at_training_pixels(view, Depth(inverse, 0.01 * inverse), posed, 0, (93, 310), (93, 310))
+    u, v = (300.5 * 1242 / 310 - 610) / 720, (10.5 * 375 / 93 - 170) / 720
+    # The pixel that is looked up lies within half a training pixel of the exact place.
+    assert found[10, 300, 0] == pytest.approx((0.5 + 0.2 * u + 0.1 * v) / np.sqrt(u * u + v * v + 1), rel=3e-3)
+
+
+def test_areas_take_the_mean_by_certainty_and_edges_have_large_errors():
+    inverse, error = np.full((4, 8), 0.5, F32), np.full((4, 8), 0.01, F32)
+    inverse[:, 4:6], error[:, 5] = 0.1, 0.01  # an edge inside the third area of 2 x 2: none; inside the fourth: below
+    inverse[:2, 7] = 0.9
+    inverse[2:, :3], error[2:, :3] = 0, 0
+    mean, spread = pooled(Depth(inverse, error), (2, 4))
+    assert mean[0] == pytest.approx([0.5, 0.5, 0.1, 0.7]) and spread[0, :3] == pytest.approx([0.01] * 3, rel=1e-3)
+    assert spread[0, 3] == pytest.approx(np.hypot(0.2, 0.01), rel=1e-3)
+    assert mean[1, 0] == 0 and mean[1, 1] == pytest.approx(0.5)  # nothing known; half of the area known
+
+
+def seen(points, cameras, at):
+    """Observations of a camera at the origin and one a unit behind it."""
+    poses = np.tile(np.eye(4)[:3], (2, 1, 1))
+    poses[1, 2, 3] = 1
+    return Observations(
+        camera_to_worlds=poses,
+        intrinsics=np.tile([60.0, 60, 40, 30], (2, 1)),
+        sizes=np.tile([80.0, 60], (2, 1)),
+        points=np.array(points, float),
+        seen_by=np.array(cameras),
+        seen_point=np.arange(len(points)),
+        seen_at=np.array(at, float),
+    )
+
+
+def test_points_set_the_distance_of_the_pixels_that_saw_them_the_nearest_where_several_did():
+    observations = seen([[0, 0, -4], [0, 0, -2], [0, 0, -3]], [0, 0, 1], [[40.9, 30.2], [40.1, 30.7], [3, 5]])
+    nothing = KnownDepth.nothing(observations.sizes)
+    found = with_points(nothing, observations)
+    assert found.images[0][30, 40] == pytest.approx([0.5, POINT_ERROR / 2]) and (found.images[0][..., 0] > 0).sum() == 1
+    assert found.images[1][5, 3] == pytest.approx([0.25, POINT_ERROR / 4]) and nothing.share == 0
+    assert found.share == pytest.approx(2 / (2 * 80 * 60))
+
+
+@pytest.mark.parametrize("suffix", ["png", "npy"])
+def test_a_depth_image_of_a_sensor_is_along_the_axis_in_its_unit_and_0_is_unknown(tmp_path, suffix):
+    file = tmp_path / f"depth.{suffix}"
+    depth = np.full((HEIGHT, WIDTH), 3000, np.uint16)
+    depth[:, 40:] = 0
+    np.save(file, depth) if suffix == "npy" else cv2.imwrite(str(file), depth)
+    found = read_sensor(file, 0.002, camera(), 0, (30, 40), (30, 40))
+    u, v = (5.5 * 2 - 40) / 60, (3.5 * 2 - 30) / 60
+    assert found[3, 5] == pytest.approx(np.array([1, SENSOR_ERROR]) / (6 * np.sqrt(u * u + v * v + 1)), rel=1e-5)
+    assert not found[:, 20:].any()
+
+
+def test_a_sensor_goes_before_other_sources_where_it_knows_something(tmp_path):
+    depth = np.zeros((HEIGHT, WIDTH), np.uint16)
+    depth[:30] = 2000
+    cv2.imwrite(str(tmp_path / "d.png"), depth)
+    before = KnownDepth((np.full((HEIGHT, WIDTH, 2), 0.25, F32),))
+    found = with_sensor(before, [tmp_path / "d.png"], 1e-3, camera(), camera()).images[0]
+    assert (found[30:] == 0.25).all() and found[29, 40, 0] == pytest.approx(0.5, rel=1e-3)
+
+
+@pytest.mark.parametrize("content", [None, b"no image"])
+def test_a_depth_image_that_cannot_be_read_is_named(tmp_path, content):
+    file = tmp_path / "lost.png"
+    if content is not None:
+        file.write_bytes(content)
+    with pytest.raises(ValueError, match=r"lost\.png"):
+        read_sensor(file, 1e-3, camera(), 0, (30, 40), (30, 40))
+
+
+def test_the_observations_need_no_points():
+    observations = SimpleNamespace(
+        **vars(seen(np.zeros((0, 3)), np.zeros(0, int), np.zeros((0, 2)))), centers=np.zeros((2, 3))
+    )
+    assert with_points(KnownDepth.nothing(observations.sizes), observations).share == 0  # type: ignore[arg-type]
