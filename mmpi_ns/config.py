@@ -42,6 +42,8 @@ def _method(
                 dataparser=NerfstudioDataParserConfig(),
                 train_num_rays_per_batch=rays,
                 keypoint_rays=keypoint_rays,
+                dense_depth=keypoint_rays > 0,
+                depth_images=keypoint_rays > 0,
             ),
             model=model,
         ),

@@ -12,7 +12,11 @@ SPLIT = ("--pipeline.model.rays-per-mpi", "split")
 DRIVE = (P + "arrangement", "drive")
 PLACED = (*JOINT, P + "texel-pixels", "1.5")
 FRONT = (*DRIVE, *JOINT, P + "faces", "front")
-NO_DEPTH = ("--pipeline.datamanager.keypoint-rays", "0")
+NO_DEPTH = (
+    *("--pipeline.datamanager.keypoint-rays", "0"),
+    *("--pipeline.datamanager.dense-depth", "False"),
+    *("--pipeline.datamanager.depth-images", "False"),
+)
 OPACITY = ("--pipeline.model.blend-form", "opacity")
 EQUAL_SHARES = ("--optimizers.reliability.optimizer.lr", "1e-9")
 LITTLE_VARIATION = ("--pipeline.model.loss.tv-density", "1e-5", "--pipeline.model.loss.tv-features", "1e-6")
