@@ -24,9 +24,9 @@ from mmpi_ns.field.baking import baked_shares
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.samples import Lookup, metadata_of
 from mmpi_ns.field.shading import Shading
-from mmpi_ns.ops import native
+from mmpi_ns.ops import dispatch
+from mmpi_ns.ops.blending import BlendForm, blended_optical_depth
 from mmpi_ns.ops.composite import composite_weights, winning_heads
-from mmpi_ns.ops.compositing import BlendForm, blended_optical_depth
 from mmpi_ns.placement.rule import PlacementConfig
 from mmpi_ns.placement.split import place_windows
 from mmpi_ns.rendering.chunks import rays_per_chunk, render_in_chunks
@@ -107,7 +107,7 @@ class MMPIModelConfig(ModelConfig):
     """Initial alpha of a cube sample: 1e-2 for a small room to 1e-4."""
     train_threshold: float = 3e-3
     """Samples of less weight get no gradient (while resolution grows: nor more than a tenth of an equal share)."""
-    ops: native.Route = "auto"
+    ops: dispatch.Route = "auto"
     """Inner loops: compiled at first use (native; by a C++ compiler on a CPU, by Triton on a GPU), plain torch, or
     compiled where that can be done (auto)."""
     render_threshold: float = 3e-3
@@ -163,7 +163,7 @@ class MMPIModel(Model):
     def populate_modules(self) -> None:
         super().populate_modules()
         config = self.config
-        native.choose(config.ops)
+        dispatch.choose(config.ops)
         windows = self._plan()
         # One head has nothing to blend with, so it trains in one go.
         joint = config.training == "joint" or all(plan.num_heads == 1 for plan in windows.plans)
@@ -233,7 +233,7 @@ class MMPIModel(Model):
         return self._outputs(rays, field) | {"training": rays}
 
     def training_bounds(self) -> dict[str, float]:
-        """What a sample must weigh to be kept in training (``merge.keep_survivors``).
+        """What a sample must weigh to be kept in training (``march.reference.prune``).
 
         While surfaces form, samples of little weight must learn too, and the cube starts nearly empty.
         """

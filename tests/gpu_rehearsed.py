@@ -13,12 +13,12 @@ from mmpi_ns.bench.gpu import command as gpu
 from mmpi_ns.bench.gpu.command import SHARES, Gpu
 from mmpi_ns.bench.stability.exact_ray import ExactField, ExactRay
 from mmpi_ns.bench.stability.rays import scene
-from mmpi_ns.ops import native, triton_march, triton_tables
+from mmpi_ns.ops import dispatch
 
 
 def part_here(work, request, folder, threads, seconds, extra):
     assert seconds > 0 and extra["TRITON_INTERPRET"] == "1"
-    native.choose("auto")
+    dispatch.choose("auto")
     return work(request, lambda text: None)
 
 
@@ -42,13 +42,15 @@ def test_all_parts_end_to_end(tmp_path, monkeypatch):
 
 
 def test_wrong_kernels_are_found(monkeypatch):
-    native.interpret(True)
+    dispatch.interpret(True)
     assert all(c.ok for c in gpu_checks.interpolation("cpu", 50))
-    monkeypatch.setattr(
-        triton_tables, "sum_by_position", lambda _, values, w, count: torch.zeros(count, values.shape[1])
-    )
+    wrong = {
+        "sum_rows": lambda _, values, w, count: torch.zeros(count, values.shape[1]),
+        "march": lambda *given: march(*given[:-2], None, False),  # without blending
+    }
+    right, march = dispatch.function, dispatch.function("march", "gpu")
+    monkeypatch.setattr(dispatch, "function", lambda name, form: wrong.get(name) or right(name, form))
     assert [c.ok for c in gpu_checks.interpolation("cpu", 50)] == [True, False]
     s = scene(2, 2, "paper")
     exact = [ExactRay(ExactField.of(s.field), o, d) for o, d in zip(s.origins, s.directions, strict=True)]
-    monkeypatch.setattr(triton_march, "FORMS", {None: 0, "paper": 2, "opacity": 1})
     assert not all(c.ok for c in gpu_checks.marched(s, "wrong", s.field, "cpu", exact, [0, 1]))

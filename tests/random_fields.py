@@ -15,7 +15,8 @@ from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.field_components.field_heads import FieldHeadNames
 
 from mmpi_ns.field.mmpi_field import MMPIField
-from mmpi_ns.ops.compositing import blended_optical_depth, composite_weights, render_colors
+from mmpi_ns.ops.blending import blended_optical_depth
+from mmpi_ns.ops.composite.reference import composite_weights, render_colors
 from mmpi_ns.rendering.sampler import MMPISampler
 from mmpi_ns.scene.plan import CubePlan, ScenePlan
 

@@ -9,15 +9,10 @@ from pathlib import Path
 
 import torch
 import triton
-from random_fields import bundle, random_field, random_rays
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 
-from mmpi_ns.field.color_network import ColorNetworks
-from mmpi_ns.ops import triton_composite, triton_march, triton_shade, triton_tables
-from mmpi_ns.ops.gather import KnownTaps
-from mmpi_ns.ops.gather import gpu as gather_gpu
-from mmpi_ns.rendering.sampler import MMPISampler
+from mmpi_ns.ops import dispatch, trial
 
 TARGET = GPUTarget("cuda", 90, 32)
 NAMES = {
@@ -75,49 +70,10 @@ def resources(kernel):
 
 
 def launches(monkeypatch):
-    """Launches every kernel as on a GPU."""
-    for module in (triton_march, triton_tables, gather_gpu):
-        monkeypatch.setattr(module, "block_size", lambda wanted, device: wanted)
-    for num_mpis, with_cube, form, count in ((4, False, None, 20), (2, True, "paper", 1)):
-        field = random_field(num_mpis, with_cube, seed=1)
-        rays = bundle(*random_rays(field.plan, count, seed=1))
-        for shares in (None, field.density.data) if form else (None,):
-            MMPISampler()(rays, field=field, threshold=1e-3, blend_form=form, shares=shares)
-    number = torch.zeros(50, dtype=torch.int64)
-    rows, weights, values, table = (
-        number[:, None].repeat(1, 4),
-        torch.zeros(50, 4),
-        torch.zeros(50, 9),
-        torch.zeros(7, 9),
-    )
-    triton_tables.interpolate(table, rows, weights)
-    triton_tables.interpolate(table[:, :1].contiguous(), rows.int(), weights)
-    triton_tables.sum_by_position(rows.int(), values, weights, 3)
-    triton_tables.sum_by_position(rows.int()[:, :1], values, None, 3)
-    triton_tables.index_rows(rows)
-    triton_tables.adam_rows(table, table.clone(), table.clone(), number, values, (0.9, 0.99, 0.1, 1e-8, 0.1))
-    triton_tables.Variation.apply(values, table, number, torch.zeros(3, 5, dtype=torch.int64), torch.zeros(3, 3))
-    scene = random_field(2, True, seed=1).triton_scene()[0]
-    for in_cube in (False, True):
-        triton_tables.taps(scene, number, number, torch.zeros(50, 3), in_cube)
-    everything = torch.ones(10, dtype=torch.bool)
-    for taps in ([4], [8], [4, 8]):
-        own = [KnownTaps(number[:20, None].repeat(1, n).int(), torch.zeros(20, n)) for n in taps]
-        slots, weights_of_rays = number[: 20 * len(taps)], torch.zeros(10, 5, requires_grad=True)
-        for channels in (9, 20):
-            read = torch.zeros(7, channels, requires_grad=True)
-            for texels in (read, read.detach()):
-                gather_gpu.gather_taps(texels, own, slots, weights_of_rays, everything).gathered.sum().backward()
-    places = (number.view(10, 5), number.view(10, 5), torch.zeros(10, 5, 3), number.view(10, 5) >= 0)
-    for with_cube in (False, True):
-        there = random_field(2, with_cube, seed=1).triton_scene()[0]
-        gather_gpu.gather_places(there, table, *places, torch.zeros(10, 5))
-    networks, grid = ColorNetworks(3, 9, 64, 2, 2), torch.arange(60).view(20, 3)
-    with monkeypatch.context() as edges:
-        edges.setattr(torch.Tensor, "tolist", lambda self: [0, 20, 40, 60])
-        rays, places = torch.zeros(3, 20, 3), torch.zeros(20, 3, 3)
-        triton_shade.shade(scene, table, networks, rays, grid, grid, places, grid >= 0)
-    for shape in ((20, 40), (1, 1)):
-        tau = torch.zeros(*shape, requires_grad=True)
-        made = triton_composite.composite_weights(tau, tau >= 0, torch.zeros(*shape), torch.zeros(shape[0], 1))
-        made.weights.sum().backward()
+    """Launches every kernel as on a GPU: with the arguments of the trials."""
+    for name in [n for n, (_, forms) in dispatch.TABLE.items() if "gpu" in forms]:
+        module = importlib.import_module(f"mmpi_ns.ops.{dispatch.TABLE[name][0]}.gpu")
+        if hasattr(module, "block_size"):  # arrays on a CPU, but blocks of a GPU's size
+            monkeypatch.setattr(module, "block_size", lambda wanted, device: wanted)
+        for given in trial.CASES[name]("cpu"):
+            trial._outcome(name, "gpu", given)

@@ -13,13 +13,8 @@ from torch import Tensor
 from mmpi_ns.bench.stability.exact import Array
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.samples import metadata_of
-from mmpi_ns.ops.compositing import (
-    BlendForm,
-    Composite,
-    blended_optical_depth,
-    composite_weights,
-    median_inverse_distance,
-)
+from mmpi_ns.ops.blending import BlendForm, blended_optical_depth
+from mmpi_ns.ops.composite.reference import Composite, composite_weights, median_inverse_distance
 from mmpi_ns.rendering.sampler import MergeReport, MMPISampler
 
 

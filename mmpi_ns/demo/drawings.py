@@ -11,7 +11,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 
-from mmpi_ns.ops.compositing import blend_shares, blended_optical_depth, composite_weights
+from mmpi_ns.ops.blending import blend_shares, blended_optical_depth
+from mmpi_ns.ops.composite import composite_weights
 from mmpi_ns.placement.errors import mpi_errors
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.scene.geometry import Frames, inverse_distance, plane_hits, sample_disparity

@@ -12,7 +12,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mmpi_ns.field.mmpi_field import MMPIField
-from mmpi_ns.field.samples import LocalRays
 from mmpi_ns.scene import geometry
 from mmpi_ns.scene.texels import BRICK
 
@@ -38,9 +37,9 @@ def bake_shares(field: MMPIField) -> Float[Tensor, "N 1"]:
         ndc = (2 * torch.stack([x, y, z], -1)[exists] / (sizes - 1) - 1).to(shares.dtype)
         for part, places in zip(own[exists].split(AT_ONCE), ndc.split(AT_ONCE), strict=True):
             origins, directions, inverse_t = rays_to(field, k, places)
-            local = LocalRays.of(origins, directions, field.frames)
+            local = geometry.LocalRays.of(origins, directions, field.frames)
             numbers = torch.arange(len(part), device=part.device)
-            log_share, _ = field.shares(numbers, local, inverse_t, torch.full_like(numbers, k))
+            log_share, _ = field.log_shares(numbers, local, inverse_t, torch.full_like(numbers, k))
             shares[part, 0] = log_share.exp()
     return shares
 

@@ -10,8 +10,6 @@ from jaxtyping import Bool, Float, Int
 from nerfstudio.cameras.rays import RaySamples
 from torch import Tensor
 
-from mmpi_ns.scene import geometry
-
 
 @dataclass(frozen=True)
 class Taps:
@@ -78,26 +76,6 @@ def head_spans(heads: Int[Tensor, "N"], num_heads: int) -> list[tuple[int, slice
     """(head, range of its samples) for every head that occurs among samples ordered by head."""
     edges = torch.searchsorted(heads, torch.arange(num_heads + 1, device=heads.device)).tolist()
     return [(k, slice(a, b)) for k, (a, b) in enumerate(pairwise(edges)) if a < b]
-
-
-@dataclass(frozen=True)
-class LocalRays:
-    """R rays in world axes and in every MPI's axes."""
-
-    origins: Float[Tensor, "R 3"]
-    directions: Float[Tensor, "R 3"]
-    local_origins: Float[Tensor, "R K 3"]
-    local_directions: Float[Tensor, "R K 3"]
-
-    @staticmethod
-    def of(origins: Tensor, directions: Tensor, frames: geometry.Frames) -> LocalRays:
-        return LocalRays(origins, directions, *geometry.rays_in_frames(origins, directions, frames))
-
-    def table(self, k: int) -> Float[Tensor, "R 6"]:
-        """Origins and directions in MPI k, or in the world for the cube behind the last MPI."""
-        if k < self.local_origins.shape[1]:
-            return torch.cat([self.local_origins[:, k], self.local_directions[:, k]], -1)
-        return torch.cat([self.origins, self.directions], -1)
 
 
 def metadata_of(ray_samples: RaySamples) -> dict[str, Tensor]:

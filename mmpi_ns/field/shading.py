@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from mmpi_ns.field.color_network import Networks, positional_encoding
-from mmpi_ns.ops.compositing import Composite
+from mmpi_ns.ops.composite import Composite
 from mmpi_ns.ops.gather import COLORS, RaySums
 
 Shading = Literal["ray", "sample"]

@@ -208,7 +208,7 @@ def _keep_empty_brick(grad: Tensor) -> Tensor:
         return torch.cat([torch.zeros_like(grad[:BRICK]), grad[BRICK:]])
     rows, values = grad._indices(), grad._values()
     rises = grad.is_coalesced()
-    if rises:  # then the empty brick's rows come first (on a CPU; a device would wait for their number)
+    if rises and rows.device.type == "cpu":  # the empty brick's rows come first; a device would wait for their number
         first = int(torch.searchsorted(rows[0], BRICK))
         rows, values = rows[:, first:], values[first:]
     else:

@@ -10,7 +10,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from mmpi_ns.field.color_network import ColorNetworks, positional_encoding
-from mmpi_ns.ops import native
+from mmpi_ns.ops import build as native
+from mmpi_ns.ops import dispatch
 
 PART = 2048
 """Samples whose gradients the compiled kernel sums together, so that a sum does not depend on the threads."""
@@ -100,9 +101,9 @@ def colors(
     rays: Int[Tensor, "N"],
 ) -> Float[Tensor, "N 3"]:
     """``ColorNetworks.forward``, compiled where it can be; then samples of a ray must follow each other."""
-    lib = native.library(features, ndc, directions, networks.weights)
-    if lib is None:
+    if dispatch.form_of("colors", features, ndc, directions, networks.weights) != "cpu":
         return networks(head, features, ndc, directions, rays)
+    lib = native.library()
     w1, b1, *rest = networks.layers(head)
     split = features.shape[1] + 3 * (1 + 2 * networks.position_frequencies)
     encoded = positional_encoding(directions, networks.direction_frequencies)

@@ -9,9 +9,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mmpi_ns.field.color_network import ColorNetworks
-from mmpi_ns.ops import native
+from mmpi_ns.ops import build as native
 from mmpi_ns.ops.colors import Network
-from mmpi_ns.ops.march import SceneTables
+from mmpi_ns.ops.cpu_scene import CpuScene
+from mmpi_ns.ops.layout import SceneLayout, Tables
 
 
 class _Shading(ctypes.Structure):
@@ -25,8 +26,8 @@ class _Start(ctypes.Structure):
 
 
 def shade(
-    lib: ctypes.CDLL,
-    scene: SceneTables,
+    layout: SceneLayout,
+    tables: Tables,
     features: Float[Tensor, "T C"],
     networks: ColorNetworks,
     axes: Float[Tensor, "H 3 3"],
@@ -39,8 +40,8 @@ def shade(
     """Colours of the valid samples; empty slots are black.
 
     Args:
-        lib: the compiled kernels.
-        scene: the plan with its tables.
+        layout: of the scene.
+        tables: its tables.
         features: colour features of all texels.
         networks: the colour networks.
         axes: of each head, as rows.
@@ -50,6 +51,7 @@ def shade(
         ndc: its position in the head.
         valid: which slots hold a sample.
     """
+    scene, lib = CpuScene.of(layout).with_tables(tables), native.library()
     num_rays, slots = valid.shape
     channels, axes = features.shape[1], axes.contiguous()
     split = channels + 3 * (1 + 2 * networks.position_frequencies)

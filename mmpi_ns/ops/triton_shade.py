@@ -15,7 +15,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mmpi_ns.field.color_network import ColorNetworks, positional_encoding
-from mmpi_ns.ops.triton_scene import DEPTH, HEIGHT, INTS, WIDTH, TritonScene, block_size, cell, row_of, sin_turn
+from mmpi_ns.ops.gpu_scene import DEPTH, HEIGHT, INTS, WIDTH, GpuScene, block_size, cell, row_of, sin_turn
+from mmpi_ns.ops.layout import SceneLayout
 
 SAMPLES = 64
 """Of a program."""
@@ -88,7 +89,7 @@ def _padded(matrix: Tensor, rows: int, columns: int) -> Tensor:
 
 
 def shade(
-    scene: TritonScene,
+    layout: SceneLayout,
     features: Float[Tensor, "T C"],
     networks: ColorNetworks,
     directions: Float[Tensor, "H R 3"],
@@ -116,7 +117,7 @@ def shade(
     order, bounds = index[by], torch.arange(num_heads + 1, device=index.device, dtype=torch.int16)
     edges = torch.searchsorted(of_head, bounds).tolist()
     skip = _padded(torch.eye(3, device=features.device), inputs, 16)
-    parts = (planes.contiguous(), ndc.contiguous(), order, scene.grids)
+    parts = (planes.contiguous(), ndc.contiguous(), order, GpuScene.of(layout).grids)
     for k in range(num_heads):
         begin, end = edges[k], edges[k + 1]
         if begin == end:
@@ -129,7 +130,7 @@ def shade(
             features, start, *parts, _padded(w1[:, :split].T, inputs, hidden), _padded(w2.T, hidden, hidden),
             _padded(b2[None], 1, hidden), _padded(w3.T, hidden, 16), _padded(b3[None], 1, 16), skip, colors,
             k, begin, end, slots, channels, octaves,
-            CUBE=k >= scene.num_mpis, INPUTS=inputs, HIDDEN=hidden, SAMPLES=samples, PRECISION=precision,
+            CUBE=k >= len(layout.mpis), INPUTS=inputs, HIDDEN=hidden, SAMPLES=samples, PRECISION=precision,
             num_warps=8,  # with 4 the registers do not suffice
         )  # fmt: skip
     return colors

@@ -11,8 +11,7 @@ from torch import Tensor
 
 from mmpi_ns.field.samples import Lookup, metadata_of
 from mmpi_ns.field.shading import RayColors
-from mmpi_ns.ops.composite import median_inverse_distance
-from mmpi_ns.ops.compositing import Composite
+from mmpi_ns.ops.composite import Composite, median_inverse_distance
 from mmpi_ns.rendering.sampler import MergeReport
 from mmpi_ns.scene.plan import ScenePlan
 

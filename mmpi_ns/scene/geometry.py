@@ -55,8 +55,9 @@ class Frames:
         """1 - near / far: the share of all disparities beyond the near plane that an MPI spans; 1 to infinity."""
         return 1.0 - self.nears * self.last_disparities
 
-    def to(self, device: torch.device | str) -> Frames:
-        return Frames(*(getattr(self, f.name).to(device) for f in fields(self)))
+    def one(self, k: int) -> Frames:
+        """Frame k alone."""
+        return Frames(*(getattr(self, f.name)[k : k + 1] for f in fields(self)))
 
 
 @dataclass(frozen=True)
@@ -92,6 +93,26 @@ def rays_in_frames(
     offsets = origins[:, None, :] - frames.origins
     local_origins = rotate(frames.axes, offsets)
     return local_origins, rotate(frames.axes, directions[:, None, :])
+
+
+@dataclass(frozen=True)
+class LocalRays:
+    """R rays in world axes and in every MPI's axes."""
+
+    origins: Float[Tensor, "R 3"]
+    directions: Float[Tensor, "R 3"]
+    local_origins: Float[Tensor, "R K 3"]
+    local_directions: Float[Tensor, "R K 3"]
+
+    @staticmethod
+    def of(origins: Tensor, directions: Tensor, frames: Frames) -> LocalRays:
+        return LocalRays(origins, directions, *rays_in_frames(origins, directions, frames))
+
+    def table(self, k: int) -> Float[Tensor, "R 6"]:
+        """Origins and directions in MPI k, or in the world for the cube behind the last MPI."""
+        if k < self.local_origins.shape[1]:
+            return torch.cat([self.local_origins[:, k], self.local_directions[:, k]], -1)
+        return torch.cat([self.origins, self.directions], -1)
 
 
 def plane_hits(

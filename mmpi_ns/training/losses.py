@@ -15,7 +15,7 @@ from torch import Tensor
 from mmpi_ns.capture.datamanager import KEYPOINT_DEPTH, PIXEL_DEPTH
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.samples import metadata_of
-from mmpi_ns.ops.compositing import Composite, exclusive_cumsum
+from mmpi_ns.ops.composite.reference import Composite, exclusive_cumsum
 from mmpi_ns.rendering.rendered import RenderedRays
 
 PLANE_ERROR = 0.6

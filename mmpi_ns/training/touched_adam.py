@@ -5,7 +5,6 @@ Equal to dense Adam in which entries with no gradient are skipped: their values 
 
 from __future__ import annotations
 
-import ctypes
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -16,8 +15,9 @@ from nerfstudio.engine.optimizers import OptimizerConfig
 from torch import Tensor
 from torch.nn import Parameter
 
-from mmpi_ns.ops import native
-from mmpi_ns.ops.interpolate import add_rows, index_rows
+from mmpi_ns.ops.adam import AdamConstants, adam_rows
+from mmpi_ns.ops.adam.reference import adam
+from mmpi_ns.ops.interpolate import index_rows, sum_rows
 
 
 class TouchedAdam(torch.optim.Optimizer):
@@ -67,69 +67,24 @@ def _zeros_like(param: Tensor) -> Tensor:
     return torch.from_numpy(np.zeros(param.shape, dtype=str(param.dtype).removeprefix("torch.")))
 
 
-def _adam(
-    grad: Tensor, mean: Tensor, square: Tensor, state: dict[str, Any], group: dict[str, Any]
-) -> tuple[Tensor, Tensor, Tensor]:
-    """New moments and the step to subtract; all three unchanged (0) where the gradient is exactly 0."""
+def _constants(state: dict[str, Any], group: dict[str, Any]) -> AdamConstants:
     beta1, beta2 = group["betas"]
-    touched = grad != 0
-    mean = torch.where(touched, mean.lerp(grad, 1 - beta1), mean)
-    square = torch.where(touched, (square * beta2).addcmul_(grad, grad, value=1 - beta2), square)
     correction = (1 - beta2 ** state["step"]) ** 0.5
-    delta = mean / square.sqrt().div_(correction).add_(group["eps"])
-    delta = torch.where(touched, delta, torch.zeros_like(delta))
-    return mean, square, delta.mul_(group["lr"] / (1 - beta1 ** state["step"]))
+    return AdamConstants(beta1, beta2, correction, group["eps"], group["lr"] / (1 - beta1 ** state["step"]))
 
 
 def _sparse_update(param: Parameter, grad: Tensor, state: dict[str, Any], group: dict[str, Any]) -> None:
     rows, values = grad._indices()[0], grad._values().to(param.dtype)
     if not grad.is_coalesced():
-        index = index_rows(rows)
-        rows, values = index.unique, add_rows(index, values, None)
-    if native.takes_triton(param.data) and param.data.is_contiguous() and param.ndim == 2:
-        from mmpi_ns.ops.triton_tables import adam_rows
-
-        moments = state["exp_avg"], state["exp_avg_sq"]
-        return adam_rows(param.data, *moments, rows, values, _constants(state, group))
-    lib = native.library(param.data)
-    if lib is not None and param.data.is_contiguous() and param.ndim == 2:
-        return _compiled_update(lib, param, rows, values, state, group)
-    old_mean, old_square = state["exp_avg"].index_select(0, rows), state["exp_avg_sq"].index_select(0, rows)
-    mean, square, delta = _adam(values, old_mean, old_square, state, group)
-    fresh = param.data.index_select(0, rows).sub_(delta)
-    state["exp_avg"].index_copy_(0, rows, mean)
-    state["exp_avg_sq"].index_copy_(0, rows, square)
-    param.data.index_copy_(0, rows, fresh)
-
-
-def _constants(state: dict[str, Any], group: dict[str, Any]) -> tuple[float, float, float, float, float]:
-    """beta1, beta2, root of the second moment's correction, eps, and rate with the first one's correction."""
-    beta1, beta2 = group["betas"]
-    correction = (1 - beta2 ** state["step"]) ** 0.5
-    return beta1, beta2, correction, group["eps"], group["lr"] / (1 - beta1 ** state["step"])
-
-
-def _compiled_update(
-    lib: ctypes.CDLL, param: Parameter, rows: Tensor, values: Tensor, state: dict[str, Any], group: dict[str, Any]
-) -> None:
-    constants = _constants(state, group)
-
-    def update(begin: int, end: int) -> None:
-        lib.mmpi_adam_rows(
-            native.address(rows, torch.int64),
-            *map(ctypes.c_int64, (begin, end, param.shape[1])),
-            *map(native.address, (values, param.data, state["exp_avg"], state["exp_avg_sq"])),
-            *map(ctypes.c_float, constants),
-        )
-
-    native.in_parts(update, len(rows), least=4096)
+        index = index_rows(rows, len(param))
+        rows, values = index.unique, sum_rows(index.position, values, None, len(index.unique))
+    adam_rows(param.data, state["exp_avg"], state["exp_avg_sq"], rows, values, _constants(state, group))
 
 
 def _dense_update(param: Parameter, grad: Tensor, state: dict[str, Any], group: dict[str, Any]) -> None:
-    mean, square, delta = _adam(grad, state["exp_avg"], state["exp_avg_sq"], state, group)
-    param.data.sub_(delta)
-    state["exp_avg"].copy_(mean)
-    state["exp_avg_sq"].copy_(square)
+    old = (param.data, state["exp_avg"], state["exp_avg_sq"])
+    for tensor, new in zip(old, adam(*old, grad, _constants(state, group)), strict=True):
+        tensor.copy_(new)
 
 
 @dataclass

@@ -12,13 +12,13 @@ from nerfstudio.field_components.encodings import HashEncoding
 
 from mmpi_ns.bench import peers
 from mmpi_ns.bench.progress import Progress, without_length
-from mmpi_ns.ops import native
+from mmpi_ns.ops import dispatch
 
 
 @pytest.mark.parametrize("native_or_torch", ["auto", "torch"])
 @pytest.mark.parametrize(("levels", "size"), [(5, 8), (16, 12)])
 def test_quick_hash_lookups_are_nerfstudios_own(levels, size, native_or_torch, monkeypatch):
-    monkeypatch.setattr(native, "_chosen", native_or_torch)
+    monkeypatch.setattr(dispatch, "_chosen", native_or_torch)
     torch.manual_seed(0)
     encoding = HashEncoding(levels, 16, 512, size, implementation="torch")
     positions = torch.rand(7, 300, 3)

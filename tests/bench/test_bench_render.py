@@ -12,7 +12,7 @@ from training_runs import ready, trainer_config
 
 from mmpi_ns.bench.speed import render
 from mmpi_ns.bench.speed.render import Render, Setting
-from mmpi_ns.ops import native
+from mmpi_ns.ops import dispatch
 
 
 @pytest.fixture(scope="module", params=["two-phase", "joint"])
@@ -28,7 +28,7 @@ def run(request, scene, plan_file, tmp_path_factory):
 @pytest.fixture(autouse=True)
 def usual_ops():
     yield
-    native.choose("auto")
+    dispatch.choose("auto")
 
 
 def settings(output, **changes):
@@ -124,9 +124,9 @@ def test_a_further_setting_of_the_model_is_tried_with_its_own_type_and_taken_bac
     config = Model.config
     with Setting(0.25, 7, "torch", "train_threshold=0.5").applied(Model):  # type: ignore[arg-type]
         assert (config.render_threshold, config.eval_num_rays_per_chunk) == (0.25, 7)
-        assert config.train_threshold == 0.5 and native.library(torch.zeros(1)) is None
+        assert config.train_threshold == 0.5 and dispatch.form_of("march", torch.zeros(1)) == "reference"
     assert (config.render_threshold, config.eval_num_rays_per_chunk, config.train_threshold) == (0.0, 1, 1.0)
-    assert native.library(torch.zeros(1)) is not None
+    assert dispatch.form_of("march", torch.zeros(1)) == "cpu"
     with Setting(0.25, 7, "auto", "background=white").applied(Model):  # type: ignore[arg-type]
         assert config.background == "white"
     assert config.background == "gray"

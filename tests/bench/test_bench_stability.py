@@ -16,7 +16,7 @@ from mmpi_ns.bench.stability import geometry as cases_geometry
 from mmpi_ns.bench.stability import merging as cases_merging
 from mmpi_ns.bench.stability import rays as cases_rays
 from mmpi_ns.bench.stability.cases import PRECISIONS, Case, Error, Outcome, compare
-from mmpi_ns.ops import compositing
+from mmpi_ns.ops import blending, composite
 from mmpi_ns.scene import geometry
 
 FLOAT32 = PRECISIONS[0]
@@ -40,7 +40,7 @@ def test_there_are_at_least_60_cases_with_names_of_their_own():
 
 def test_compositing_in_half_precision_fails_its_cases(monkeypatch):
     """A kernel that rounds its optical depths to bfloat16 is wrong by 2^-9; every case of thin samples must see it."""
-    right = compositing.composite_weights
+    right = composite.composite_weights
 
     def rounded(tau, *rest):
         return right(tau.bfloat16().float(), *rest)
@@ -56,7 +56,7 @@ def test_a_transmittance_taken_from_alpha_fails_where_it_is_1e_minus_30(monkeypa
         alpha = -torch.expm1(-tau)
         left = torch.cumprod(1 - alpha, -1)
         front = torch.cat([torch.ones_like(left[:, :1]), left[:, :-1]], -1)
-        return compositing.Composite(front * alpha, 1 - left[:, -1:], left[:, -1:])
+        return composite.Composite(front * alpha, 1 - left[:, -1:], left[:, -1:])
 
     chosen = [c for c in cases_blending.cases() if "1e-30" in c.inputs and c.group == "compositing"]
     assert len(chosen) == 3 and not failures(chosen)
@@ -123,7 +123,7 @@ def test_a_whole_ray_with_a_wrong_gradient_fails(monkeypatch):
         def backward(ctx, grad):
             return 1.001 * grad
 
-    right = compositing.blend_shares
+    right = blending.blend_shares
     monkeypatch.setattr("mmpi_ns.field.mmpi_field.blend_shares", lambda r, *rest: right(Scaled.apply(r), *rest))
     outcome = case.measure(FLOAT32)
     assert outcome.value.holds and not outcome.gradient.holds
@@ -191,7 +191,7 @@ def test_every_case_holds(group, precision):
 def test_a_case_that_fails_is_counted_and_ends_the_command_with_an_error(tmp_path, monkeypatch):
     case = named("alpha 0 everywhere", cases_blending)
     monkeypatch.setattr(stability, "all_cases", lambda: [case])
-    right = compositing.composite_weights
+    right = composite.composite_weights
     monkeypatch.setattr(cases_blending, "composite_weights", lambda tau, *rest: right(tau + 1e-3, *rest))
     with pytest.raises(SystemExit, match="fails its bound"):
         stability.Stability(output=tmp_path, training=False).run()

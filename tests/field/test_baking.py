@@ -13,8 +13,9 @@ from random_fields import _places, _table, bundle, fill, random_field, random_ra
 
 from mmpi_ns.field.baking import bake_shares, baked_shares, rays_to
 from mmpi_ns.field.mmpi_field import MMPIField
-from mmpi_ns.ops import native
-from mmpi_ns.rendering import sampler as mmpi_sampler
+from mmpi_ns.ops import dispatch
+from mmpi_ns.ops.blending import interpolate_shares
+from mmpi_ns.ops.march import reference
 from mmpi_ns.rendering.sampler import MMPISampler
 from mmpi_ns.scene.plan import CubePlan, ScenePlan
 from mmpi_ns.scene.texels import BRICK
@@ -79,17 +80,16 @@ def rendered(field, rays, form, shares, threshold=0.0):
     return samples.metadata, report
 
 
-@pytest.mark.parametrize("form", ["paper", "opacity"])
 @pytest.mark.parametrize(("num_mpis", "with_cube"), [(1, False), (3, True)])
-def test_the_compiled_march_blends_like_the_reference(monkeypatch, form, num_mpis, with_cube):
-    monkeypatch.setattr(mmpi_sampler, "OPAQUE_DEPTH", math.inf)
+def test_the_compiled_march_blends_like_the_reference(monkeypatch, num_mpis, with_cube):
+    monkeypatch.setattr(reference, "OPAQUE_DEPTH", math.inf)
     field = random_field(num_mpis, with_cube, seed=4, planes=20, log_depths=(-5, 1.5))
     rays = bundle(*random_rays(field.plan, 150, seed=2))
     shares = torch.rand(len(field.density), 1, generator=torch.Generator().manual_seed(1)) * 1.4 - 0.2  # clamped
-    monkeypatch.setattr(native, "_chosen", "native")
-    fast, fast_report = rendered(field, rays, form, shares)
-    monkeypatch.setattr(native, "_chosen", "torch")
-    plain, plain_report = rendered(field, rays, form, shares)
+    monkeypatch.setattr(dispatch, "_chosen", "native")
+    fast, fast_report = rendered(field, rays, "paper", shares)
+    monkeypatch.setattr(dispatch, "_chosen", "torch")
+    plain, plain_report = rendered(field, rays, "paper", shares)
     same = (fast["valid"].sum(1) == plain["valid"].sum(1))[:, 0]
     assert same.float().mean() > 0.95
     a, b = (m["tau"][same][m["valid"][same]].double() for m in (fast, plain))
@@ -103,7 +103,7 @@ def test_samples_are_blended_by_the_interpolated_share():
     shares, rng = bake_shares(field), np.random.default_rng(3)
     for k, grid in enumerate(field.grids):
         ndc = rng.uniform(-1, 1, size=(20, 3))
-        found = field.shares_at(shares, torch.tensor(ndc, dtype=torch.float32), torch.full((20,), k))
+        found = interpolate_shares(field.layout, shares, torch.tensor(ndc, dtype=torch.float32), torch.full((20,), k))
         wanted = [oracle.trilinear(_table(field, shares, k), place)[0] for place in ndc]
         assert np.allclose(found.numpy(), wanted, atol=1e-5)
         assert grid.depth > 1

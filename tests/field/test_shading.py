@@ -12,9 +12,8 @@ from random_fields import CLEAR, ERROR, OracleRay, bundle, fill, random_plan, ra
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.samples import metadata_of
 from mmpi_ns.field.shading import RayShader, change_odds
-from mmpi_ns.ops import native
-from mmpi_ns.ops.composite import composite_weights
-from mmpi_ns.ops.compositing import Composite
+from mmpi_ns.ops import dispatch
+from mmpi_ns.ops.composite import Composite, composite_weights
 from mmpi_ns.ops.gather import RaySums
 from mmpi_ns.rendering.sampler import MMPISampler
 
@@ -104,7 +103,7 @@ def test_gradients_of_texels_densities_and_network_are_those_of_float64(path):
     rays, upstream = bundle(*random_rays(random_plan(3, True, 0), 30, seed=5)), torch.linspace(-1, 1, 90).view(30, 3)
     found = []
     for dtype in (torch.float32, F64):
-        native.choose(path)
+        dispatch.choose(path)
         try:
             field = ray_field().to(dtype)
             if dtype == F64:
@@ -115,7 +114,7 @@ def test_gradients_of_texels_densities_and_network_are_those_of_float64(path):
             loss = (colors.rgb * upstream).sum() + (colors.first * upstream).sum() + (colors.second * upstream).sum()
             loss.backward()
         finally:
-            native.choose("auto")
+            dispatch.choose("auto")
         tables = (field.density, field.features, field.networks.weights)
         found.append([p.grad.to_dense().double() if p.grad.is_sparse else p.grad.double() for p in tables])
     for a, b in zip(*found, strict=True):

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import pytest
 import torch
+from compiled import both, compiled, normal  # noqa: F401
 
-from mmpi_ns.ops.interpolate import interpolate, interpolate_reference
+from mmpi_ns.ops.interpolate import gather_rows, index_rows, interpolate, interpolate_gathered, reference, sum_rows
 
 F64 = torch.float64
 
@@ -34,7 +35,7 @@ class DenseGradient(torch.autograd.Function):
 def test_interpolation_by_hand():
     table = torch.tensor([[1.0, 10.0], [2.0, 20.0], [4.0, 40.0]])
     rows, weights = torch.tensor([[0, 2], [1, 1]]), torch.tensor([[0.25, 0.75], [0.5, 0.5]])
-    for function in (interpolate_reference, interpolate):
+    for function in (reference.interpolate, interpolate):
         assert function(table, rows, weights).tolist() == [[3.25, 32.5], [2.0, 20.0]]
 
 
@@ -44,7 +45,7 @@ def test_interpolation_by_hand():
 def test_fast_path_equals_the_reference_with_its_gradient(channels, corners, dtype, error):
     table, rows, weights = lookup(channels=channels, corners=corners, dtype=dtype)
     fast, plain = table.clone().requires_grad_(), table.clone().requires_grad_()
-    out, wanted = interpolate(fast, rows, weights), interpolate_reference(plain, rows, weights)
+    out, wanted = interpolate(fast, rows, weights), reference.interpolate(plain, rows, weights)
     assert out.shape == (50, channels) and torch.allclose(out, wanted, atol=error, rtol=error)
     upstream = torch.randn(50, channels, generator=torch.Generator().manual_seed(1), dtype=F64).to(dtype)
     out.backward(upstream)
@@ -73,7 +74,7 @@ def test_gradient_names_only_the_rows_that_were_read():
 def test_two_lookups_in_one_table_add_their_gradients():
     table, rows, weights = lookup()
     fast, plain = table.clone().requires_grad_(), table.clone().requires_grad_()
-    for t, function in ((fast, interpolate), (plain, interpolate_reference)):
+    for t, function in ((fast, interpolate), (plain, reference.interpolate)):
         (function(t, rows, weights).sum() + 2 * (function(t, rows.flip(0), weights) ** 2).sum()).backward()
     assert fast.grad.is_sparse and torch.allclose(fast.grad.to_dense(), plain.grad)
 
@@ -105,3 +106,58 @@ def test_weights_get_no_gradient():
     weights.requires_grad_()
     interpolate(table.requires_grad_(), rows, weights).sum().backward()
     assert weights.grad is None and table.grad is not None
+
+
+# Rows ----------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("spread", ["side by side", "4096 apart", "anywhere"])
+@pytest.mark.parametrize("count", [1, 7, 40_000])
+def test_distinct_rows_are_those_of_the_reference(count, spread):
+    g, different = torch.Generator().manual_seed(count), 1 + count // 3
+    chosen = torch.randint(0, different, (count, 4), generator=g)
+    anywhere = torch.randint(0, 2**27, (different,), generator=g)
+    rows = {"side by side": chosen, "4096 apart": chosen * 4096, "anywhere": anywhere[chosen]}[spread]
+    fast, plain = both(lambda: index_rows(rows, 2**27))
+    assert torch.equal(fast.unique, plain.unique)
+    assert fast.position.shape == rows.shape and torch.equal(fast.unique[fast.position.long()], rows)
+
+
+def test_rows_of_a_table_too_large_to_mark_are_sorted():
+    rows = torch.tensor([2**40, 3, 2**40, 2**31])
+    index = index_rows(rows, 2**40 + 1)
+    assert torch.equal(index.unique, torch.tensor([3, 2**31, 2**40]))
+    assert torch.equal(index.unique[index.position.long()], rows)
+
+
+@pytest.mark.parametrize("weighted", [True, False])
+@pytest.mark.parametrize("channels", [1, 9])
+def test_rows_gather_what_their_entries_give(channels, weighted):
+    rows = torch.randint(0, 40, (300, 4 if weighted else 1), generator=torch.Generator().manual_seed(1))
+    values, weights = normal(300, channels), torch.rand(300, 4) if weighted else None
+
+    def work():
+        index = index_rows(rows, 2**27)
+        return torch.zeros(40, channels).index_copy_(
+            0, index.unique, sum_rows(index.position, values, weights, len(index.unique))
+        )
+
+    fast, plain = both(work)
+    assert plain.abs().max() > 1 and torch.allclose(fast, plain, atol=1e-5)
+
+
+@pytest.mark.parametrize("channels", [1, 9])
+def test_gathered_rows_are_read_like_the_table_and_have_one_gradient_each(channels):
+    rows, weights = torch.randint(0, 50, (80, 4), generator=torch.Generator().manual_seed(1)), torch.rand(80, 4)
+    index = index_rows(rows, 2**27)
+    some, upstream = torch.arange(0, 80, 3), normal(80, channels, seed=2)
+    table, plain = (normal(50, channels).requires_grad_() for _ in range(2))
+    gathered = gather_rows(table, index.unique)
+    read = interpolate_gathered(gathered, index.position, weights)
+    part = interpolate_gathered(gathered, index.position[some], weights[some])
+    wanted = reference.interpolate(plain, rows, weights)
+    assert torch.allclose(read, wanted, atol=1e-6) and torch.allclose(part, wanted[some], atol=1e-6)
+    ((read * upstream).sum() + 2 * part.sum()).backward()
+    ((wanted * upstream).sum() + 2 * wanted[some].sum()).backward()
+    assert torch.equal(table.grad._indices()[0], index.unique)
+    assert torch.allclose(table.grad.to_dense(), plain.grad, atol=1e-5)

@@ -11,8 +11,9 @@ from hand_made import IDENTITY, make_mpi, unit
 from random_fields import bundle, compare, fill, random_field, random_rays, render
 
 from mmpi_ns.field.mmpi_field import MMPIField
-from mmpi_ns.ops import native
-from mmpi_ns.rendering import sampler as mmpi_sampler
+from mmpi_ns.ops import dispatch
+from mmpi_ns.ops.march import reference
+from mmpi_ns.rendering.sampler import MMPISampler
 from mmpi_ns.scene.plan import CubePlan, ScenePlan
 
 
@@ -197,15 +198,15 @@ def test_without_other_heads_all_that_a_ray_shows_is_to_be_explained():
 
 
 def test_stopping_where_a_ray_is_opaque_changes_nothing_visible(monkeypatch):
-    monkeypatch.setattr(native, "_chosen", "torch")
+    monkeypatch.setattr(dispatch, "_chosen", "torch")
     field = random_field(6, True, seed=16, planes=60, log_depths=(-3, 1.2))
     rays = bundle(*random_rays(field.plan, 80, seed=17))
     looked_up = []
-    blend = field.blend
-    monkeypatch.setattr(field, "blend", lambda tau, *rest: looked_up.append(len(tau)) or blend(tau, *rest))
+    blend = reference._blend
+    monkeypatch.setattr(reference, "_blend", lambda index, *rest: looked_up.append(len(index)) or blend(index, *rest))
     stopped = render(field, rays, 1e-3, "paper")
     count = sum(looked_up)
-    monkeypatch.setattr(mmpi_sampler, "OPAQUE_DEPTH", math.inf)
+    monkeypatch.setattr(reference, "OPAQUE_DEPTH", math.inf)
     whole = render(field, rays, 1e-3, "paper")
     assert count < 0.8 * (sum(looked_up) - count), "nothing was stopped"
     assert (stopped.rgb - whole.rgb).abs().max() < 1e-4
@@ -235,7 +236,7 @@ def test_ray_samples_hold_what_the_field_needs():
 
 def test_the_sampler_builds_no_graph():
     field = random_field(2, True, seed=20).train()
-    samples, report = mmpi_sampler.MMPISampler()(
+    samples, report = MMPISampler()(
         bundle(*random_rays(field.plan, 4, seed=21)), field=field, threshold=0.0, blend_form="paper"
     )
     tensors = [*samples.metadata.values(), report.skipped_total, report.dropped_mass]

@@ -6,15 +6,17 @@ import numpy as np
 import oracle
 import pytest
 import torch
-from bricked import SHAPES, big_plan, bricked_field, chance, thinned
+from bricked import SHAPES, big_plan, bricked_field, chance, layout_of, thinned
 from nerfstudio.field_components.field_heads import FieldHeadNames
 from random_fields import bundle, compare, random_rays, render
 
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.tables import ENOUGH_CROSSINGS, RELEASED_DENSITY, TABLES
-from mmpi_ns.ops import native
-from mmpi_ns.ops.interpolate import bilinear_rows, interpolate_reference
-from mmpi_ns.ops.variation import total_variation, total_variation_reference
+from mmpi_ns.ops import dispatch
+from mmpi_ns.ops.interpolate import texel_rows
+from mmpi_ns.ops.interpolate.reference import interpolate as interpolate_reference
+from mmpi_ns.ops.variation import reference as plain_variation
+from mmpi_ns.ops.variation import total_variation
 from mmpi_ns.rendering.sampler import MMPISampler
 from mmpi_ns.scene.bricks import grown_tiles, keep_bricks, new_table, read_planes, resample, write_planes
 from mmpi_ns.scene.texels import BRICK, make_grids
@@ -44,10 +46,12 @@ def test_the_compiled_lookup_reads_the_same_rows_with_the_same_weights(monkeypat
     grids, _, _ = thinned(SHAPES)
     ndc = torch.tensor(np.random.default_rng(1).uniform(-1.1, 1.1, size=(500, 3)), dtype=torch.float32)
     ndc[:9] = torch.tensor([-1.0, 0.0, 1.0])[torch.arange(9) % 3, None]
-    monkeypatch.setattr(native, "_chosen", "native")
-    for grid in grids:
+    monkeypatch.setattr(dispatch, "_chosen", "native")
+    layout = layout_of(SHAPES, grids[0].tiles)
+    for k, grid in enumerate(grids):
         planes = torch.arange(500) % grid.depth
-        for fast, plain in zip(bilinear_rows(grid, planes, ndc), grid.bilinear(planes, ndc), strict=True):
+        found = texel_rows(layout, torch.full_like(planes, k), planes, ndc)
+        for fast, plain in zip(found, grid.bilinear(planes, ndc), strict=True):
             assert torch.equal(fast, plain)
 
 
@@ -100,7 +104,7 @@ def test_planes_are_read_and_written_as_images():
 @pytest.mark.parametrize("form", ["paper", "opacity", None])
 @pytest.mark.parametrize("route", ["torch", "native"])
 def test_rays_through_released_bricks_look_as_the_oracle_says(monkeypatch, route, form):
-    monkeypatch.setattr(native, "_chosen", route)
+    monkeypatch.setattr(dispatch, "_chosen", route)
     field = bricked_field()
     assert compare(field, *random_rays(field.plan, 12, seed=5), form) >= 8
 
@@ -111,7 +115,7 @@ def test_the_march_leaves_out_what_holds_nothing_and_keeps_the_rest(monkeypatch,
     rays = bundle(*random_rays(field.plan, 200, seed=1))
     found = []
     for route in ("native", "torch"):
-        monkeypatch.setattr(native, "_chosen", route)
+        monkeypatch.setattr(dispatch, "_chosen", route)
         found.append(render(field, rays, 1e-3, form))
     fast, plain = found
     same = (fast.samples.metadata["valid"].sum(1) == plain.samples.metadata["valid"].sum(1))[:, 0]
@@ -134,14 +138,15 @@ def test_colours_without_gradients_equal_those_with():
 @pytest.mark.parametrize("channels", [1, 5, 9, 21])
 def test_variation_beside_released_bricks_equals_float64(channels, order):
     grids, _, _ = thinned(SHAPES)
+    layout = layout_of(SHAPES, grids[0].tiles)
     rows = torch.cat([grid.rows[grid.rows >= BRICK] for grid in grids] + [torch.arange(3)])
     mixed = rows[torch.randperm(len(rows), generator=torch.Generator().manual_seed(3))]
     rows = rows.sort()[0] if order == "rising" else mixed
     table = torch.randn(len(grids[0].places) * BRICK, channels, generator=torch.Generator().manual_seed(0)) * 2
     scales, found = [(0.5 + k, 2.0, 1.0) for k in range(len(grids))], []
-    for function, dtype in ((total_variation, torch.float32), (total_variation_reference, torch.float64)):
+    for function, dtype in ((total_variation, torch.float32), (plain_variation.total_variation, torch.float64)):
         values = table[rows].to(dtype).requires_grad_()
-        value = function(values, table.to(dtype), rows, grids, scales)
+        value = function(values, table.to(dtype), rows, layout, scales)
         value.backward()
         found.append((value.item(), values.grad.double()))
     assert found[0][0] == pytest.approx(found[1][0], rel=1e-6) and found[0][0] > 1
@@ -174,7 +179,7 @@ def train(field, steps=4, blends=False):
 
 @pytest.mark.parametrize("route", ["torch", "native"])
 def test_the_empty_brick_never_changes(monkeypatch, route):
-    monkeypatch.setattr(native, "_chosen", route)
+    monkeypatch.setattr(dispatch, "_chosen", route)
     field = bricked_field()
     before = {name: getattr(field, name).detach().clone() for name in TABLES}
     optimizer, read = train(field)

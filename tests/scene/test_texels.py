@@ -7,7 +7,7 @@ import oracle
 import pytest
 import torch
 
-from mmpi_ns.ops.interpolate import interpolate_reference
+from mmpi_ns.ops.interpolate.reference import interpolate as interpolate_reference
 from mmpi_ns.scene.bricks import resample
 from mmpi_ns.scene.texels import BRICK, head_grids, make_grids
 

@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from mmpi_ns.field.shading import RayColors
-from mmpi_ns.ops.compositing import Composite
-from mmpi_ns.ops.variation import clamped_differences
+from mmpi_ns.ops.composite import Composite
+from mmpi_ns.ops.variation.reference import clamped_differences
 from mmpi_ns.training import losses
 
 F64 = torch.float64

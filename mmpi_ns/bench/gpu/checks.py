@@ -14,13 +14,15 @@ from mmpi_ns.bench.rendering import bundle_of, render
 from mmpi_ns.bench.stability.exact_ray import ExactField, ExactRay, Gradients
 from mmpi_ns.bench.stability.rays import CLEAR, CUBE, Scene, scene
 from mmpi_ns.field.baking import baked_shares
-from mmpi_ns.field.mmpi_field import NEGLIGIBLE_DEPTH, MMPIField
+from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.samples import metadata_of
-from mmpi_ns.ops import compositing, native
+from mmpi_ns.ops import dispatch, interpolate, variation
+from mmpi_ns.ops.blending import BlendForm, blended_optical_depth, interpolate_shares
 from mmpi_ns.ops.composite import composite_weights
-from mmpi_ns.ops.compositing import BlendForm
-from mmpi_ns.ops.interpolate import add_rows, index_rows, interpolate, interpolate_reference
-from mmpi_ns.ops.variation import total_variation, total_variation_reference
+from mmpi_ns.ops.composite import reference as plain_composite
+from mmpi_ns.ops.interpolate import reference as plain_interpolate
+from mmpi_ns.ops.march.reference import NEGLIGIBLE_DEPTH
+from mmpi_ns.ops.variation import reference as plain_variation
 from mmpi_ns.rendering.sampler import MMPISampler
 from mmpi_ns.scene.plan import CubePlan
 from mmpi_ns.training.touched_adam import TouchedAdam
@@ -133,11 +135,11 @@ def baked_march(device: str, rehearse: bool) -> list[Check]:
     plain = metadata_of(MMPISampler()(rays, field=field, threshold=0.0)[0])
     valid = plain["valid"][..., 0]
     tau, ndc, heads = (plain[name][valid].double().cpu() for name in ("tau", "ndc", "heads"))
-    share = field.cpu().shares_at(shares.double().cpu(), ndc, heads[:, 0].long())
+    share = interpolate_shares(field.cpu().layout, shares.double().cpu(), ndc, heads[:, 0].long())
     field.to(device)
     for form in FORMS[: 1 if rehearse else None]:
         made = metadata_of(MMPISampler()(rays, field=field, threshold=0.0, blend_form=form, shares=shares)[0])
-        wanted = compositing.blended_optical_depth(tau[:, 0], share.log(), torch.log1p(-share), form)
+        wanted = blended_optical_depth(tau[:, 0], share.log(), torch.log1p(-share), form)
         wanted = torch.where(tau[:, 0] > NEGLIGIBLE_DEPTH, wanted, tau[:, 0] / len(field.grids))
         found.append(Check(f"shares at texels, {form} blending", _relative(made["tau"][valid][:, 0], wanted), 1e-4))
     return found
@@ -153,7 +155,8 @@ def interpolation(device: str, samples: int) -> list[Check]:
     rows = torch.randint(0, texels, (samples, 4), generator=g).to(device)
     weights, upstream = torch.rand(samples, 4, generator=g).to(device), _draw(device, samples, 9, seed=2)
     table, exact = _draw(device, texels, 9).requires_grad_(), _draw(device, texels, 9).double().requires_grad_()
-    read, wanted = interpolate(table, rows, weights), interpolate_reference(exact, rows, weights.double())
+    read = interpolate.interpolate(table, rows, weights)
+    wanted = plain_interpolate.interpolate(exact, rows, weights.double())
     (read * upstream).sum().backward()
     (wanted * upstream).sum().backward()
     assert table.grad is not None and exact.grad is not None
@@ -164,30 +167,31 @@ def interpolation(device: str, samples: int) -> list[Check]:
 
 
 def distinct_rows(device: str, samples: int) -> list[Check]:
-    """Rows that share slots of the hash table, and what is summed over them."""
+    """The rows of a batch, each once, and what is summed over them."""
     g = torch.Generator().manual_seed(2)
-    pool = torch.randint(0, 2**40, (max(1, samples // 3),), generator=g)
+    texels = 40 * samples
+    pool = torch.randint(0, texels, (max(1, samples // 3),), generator=g)
     rows = pool[torch.randint(0, len(pool), (samples, 4), generator=g)].to(device)
-    index, wanted = index_rows(rows), rows.unique()
-    wrong = int(len(index.unique) != len(wanted)) or int((index.unique.sort()[0] != wanted).sum())
+    index, wanted = interpolate.index_rows(rows, texels), rows.unique()
+    wrong = int(len(index.unique) != len(wanted)) or int((index.unique != wanted).sum())
     wrong += int((index.unique[index.position.long()] != rows).sum())
     values, weights = _draw(device, samples, 9), torch.rand(samples, 4, generator=g).to(device)
-    total = add_rows(index, values, weights)
+    total = interpolate.sum_rows(index.position, values, weights, len(wanted))
     each = (values[:, None].double() * weights[..., None]).reshape(-1, 9)
     exact = torch.zeros(len(index.unique), 9, dtype=torch.float64, device=device)
     exact.index_add_(0, index.position.reshape(-1).long(), each)
     return [Check("distinct rows: wrong", wrong, 0), Check("distinct rows: sums", _relative(total, exact), 5e-6)]
 
 
-def variation(device: str, texels: int) -> list[Check]:
+def variations(device: str, texels: int) -> list[Check]:
     """Total variation of MPIs and a cube with its gradient."""
     field = scene(3, 1, None, cube=CUBE).field.to(device)
     table = _draw(device, len(field.density), 9) * 2
     rows = torch.randperm(len(table), generator=torch.Generator().manual_seed(1))[:texels].to(device)
     scales, found = [(0.5, 2.0, 1.0)] * len(field.grids), []
-    for function, dtype in ((total_variation, torch.float32), (total_variation_reference, torch.float64)):
+    for form, dtype in ((variation, torch.float32), (plain_variation, torch.float64)):
         values = table[rows].to(dtype).requires_grad_()
-        value = function(values, table.to(dtype), rows, field.grids, scales)
+        value = form.total_variation(values, table.to(dtype), rows, field.layout, scales)
         value.backward()
         found.append((value.detach()[None], values.grad))
     (value, slope), (exact, exact_slope) = found
@@ -204,7 +208,7 @@ def compositing_kernels(device: str, rays: int, slots: int) -> list[Check]:
     valid = (torch.arange(slots) < torch.randint(0, slots + 1, (rays, 1), generator=g)).to(device)
     before = (torch.rand(rays, slots, generator=g).cumsum(1) * 0.02).to(device)
     upstream, found = _draw(device, rays, slots), []
-    for function, dtype in ((composite_weights, torch.float32), (compositing.composite_weights, torch.float64)):
+    for function, dtype in ((composite_weights, torch.float32), (plain_composite.composite_weights, torch.float64)):
         leaf = tau.to(dtype, copy=True).requires_grad_()
         made = function(leaf, valid, before.to(dtype), before[:, -1:].to(dtype))
         ((made.weights * upstream).sum() + made.accumulation.sum()).backward()
@@ -238,7 +242,7 @@ def everything(device: str, rehearse: bool) -> list[Callable[[], list[Check]]]:
         lambda: interpolation(device, size),
         lambda: distinct_rows(device, size),
         lambda: compositing_kernels(device, 20 if rehearse else 4096, 37 if rehearse else 150),
-        lambda: variation(device, 200 if rehearse else 100_000),
+        lambda: variations(device, 200 if rehearse else 100_000),
         lambda: adam(device, size),
         lambda: marches(device, rehearse),
         lambda: baked_march(device, rehearse),
@@ -251,8 +255,10 @@ def run_checks(device: str, rehearse: bool) -> dict[str, Any]:
     Raises:
         RuntimeError: the kernels are not there to be checked.
     """
-    if not native.takes_triton(torch.zeros(1, device=device)):
-        raise RuntimeError("the Triton kernels do not run here: nothing can be checked (the log says why)")
+    one = torch.zeros(1, device=device)
+    plain = [n for n, (_, forms) in dispatch.TABLE.items() if "gpu" in forms and dispatch.form_of(n, one) != "gpu"]
+    if plain:
+        raise RuntimeError(f"there are no kernels to be checked for {', '.join(plain)} (the log says why)")
     rows: list[dict[str, Any]] = []
     for number, work in enumerate(everything(device, rehearse)):
         try:

@@ -26,7 +26,7 @@ from mmpi_ns.bench.suites import JOINT, TWO_PHASE, P
 from mmpi_ns.bench.trainers import Steps
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.model import MMPIModel
-from mmpi_ns.ops import interpolate, native
+from mmpi_ns.ops import dispatch, interpolate
 
 SECTOR = 32
 """Bytes that a GPU fetches at least: a bilinear lookup of one channel touches two sectors, one in each row."""
@@ -77,7 +77,7 @@ def measure_operations(request: dict[str, Any], tell: Tell) -> dict[str, Any]:
     for name, work in _table_operations(device, 300 if small else 200_000).items():
         row = found["ops"][name] = {}
         for route in ("torch", "auto"):
-            native.choose(route)
+            dispatch.choose(route)
             row["torch_ms" if route == "torch" else "triton_ms"] = 1e3 * median_s(work, repeats)
         tell(f"{name}: {row}")
     return found
@@ -86,13 +86,13 @@ def measure_operations(request: dict[str, Any], tell: Tell) -> dict[str, Any]:
 @torch.no_grad()
 def _measure_march(field: MMPIField, rays: dict[str, Tensor], repeats: int) -> dict[str, float]:
     """The kernel alone on rays that nothing stops and that keep nothing: it looks up every live sample."""
-    from mmpi_ns.ops import triton_march
+    from mmpi_ns.ops.march import march
     from mmpi_ns.scene.geometry import plane_hits
 
     hits = plane_hits(rays["origins"], rays["directions"], rays["nears"], rays["fars"], field.frames)
     live = int(hits.count.sum())
     given = (rays["origins"], rays["directions"], hits, hits.m_first, hits.count, 0.9, float("inf"), None)
-    seconds = median_s(lambda: triton_march.march(*field.triton_scene(), *given), repeats)
+    seconds = median_s(lambda: march(field.layout, field.tables(), *given), repeats)
     gb = 2 * SECTOR * live / 1e9
     return {
         "ms": 1e3 * seconds,
@@ -115,11 +115,12 @@ def _table_operations(device: str, samples: int) -> dict[str, Callable[[], Any]]
     )
 
     def gradients() -> Tensor:
-        return interpolate.add_rows(interpolate.index_rows(rows), values, weights)
+        index = interpolate.index_rows(rows, texels)
+        return interpolate.sum_rows(index.position, values, weights, len(index.unique))
 
     return {
         "interpolate": lambda: interpolate.interpolate(table, rows, weights),
-        "distinct rows": lambda: interpolate.index_rows(rows),
+        "distinct rows": lambda: interpolate.index_rows(rows, texels),
         "distinct rows and their gradients": gradients,
     }
 
@@ -223,9 +224,9 @@ def render_both(steps: Steps, ops: str, repeats: int) -> dict[str, Any]:
     found["full_frame_ms"] = 1e3 * median_s(lambda: render(larger), repeats)
     found["full_frame_pixels"] = int(larger.width) * int(larger.height)
     if ops != "torch":
-        native.choose("torch")
+        dispatch.choose("torch")
         plain = render()
-        native.choose("auto")
+        dispatch.choose("auto")
         found["largest_difference"] = float((rgb - plain).abs().max())
         found["psnr_delta_db"] = found["psnr"] - _psnr(plain, truth)
     pipeline.train()
@@ -309,7 +310,7 @@ def run_part(request: dict[str, Any], tell: Tell) -> dict[str, Any]:
     """One part, as asked."""
     if request["rehearse"]:
         torch.set_num_threads(1)
-        native.interpret(True)
+        dispatch.interpret(True)
     found = PARTS[request["part"]](request, tell)
     return {**found, "device": _device_name()}
 

@@ -13,7 +13,7 @@ from mmpi_ns.bench.quality.solids import Solids, bake
 from mmpi_ns.bench.rendering import bundle_of, render
 from mmpi_ns.bench.report import Bench, Report, Row, figure, page, table
 from mmpi_ns.bench.stability.exact import Array
-from mmpi_ns.ops.compositing import BlendForm
+from mmpi_ns.ops.blending import BlendForm
 from mmpi_ns.scene.plan import MPIPlan
 
 SLANTED = Solids((-0.3, 0.2, 1.0), 6.0, ball=(-0.4, 0.3, 4.2, 0.9))

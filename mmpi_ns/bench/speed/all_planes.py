@@ -8,8 +8,8 @@ from torch import Tensor
 
 from mmpi_ns.bench.trainers import Steps, clock
 from mmpi_ns.field.mmpi_field import MMPIField
-from mmpi_ns.ops.compositing import composite_weights, render_colors
-from mmpi_ns.ops.interpolate import interpolate_reference
+from mmpi_ns.ops.composite.reference import composite_weights, render_colors
+from mmpi_ns.ops.interpolate.reference import interpolate as interpolate_reference
 from mmpi_ns.rendering.rendered import bounded
 from mmpi_ns.scene.geometry import inverse_distance, plane_hits, sample_disparity
 
@@ -35,7 +35,7 @@ def render_densely(field: MMPIField, bundle: RayBundle) -> tuple[Tensor, float]:
         planes = (mpi.planes - 1 - m).reshape(-1)
         rows, weights = field.grids[k].bilinear(planes, ndc)
         raw = interpolate_reference(field.density, rows, weights)[:, 0]
-        tau = torch.where(live.reshape(-1), field.mpi_tau(k, raw, planes), 0.0)
+        tau = torch.where(live.reshape(-1), field.layout.optical_depth(k, raw, planes), 0.0)
         chosen = (tau > 1e-4).nonzero()[:, 0]
         features = interpolate_reference(field.features, rows[chosen], weights[chosen])
         local = hits.local_directions[:, k].repeat_interleave(mpi.planes, 0)[chosen]

@@ -17,9 +17,9 @@ from mmpi_ns.bench.report import Bench, Report, Row, figure, page, slug, table, 
 from mmpi_ns.bench.trainers import Steps, clock
 from mmpi_ns.field.samples import Gathered, Lookup, Taps, metadata_of
 from mmpi_ns.model import MMPIModel
-from mmpi_ns.ops.compositing import composite_weights
-from mmpi_ns.ops.interpolate import gather_rows, index_rows, interpolate_gathered, sum_by_position
-from mmpi_ns.ops.merge import merge
+from mmpi_ns.ops.composite.reference import composite_weights
+from mmpi_ns.ops.interpolate import gather_rows, index_rows, interpolate_gathered, sum_rows
+from mmpi_ns.ops.march.reference import merge
 from mmpi_ns.rendering.rendered import bounded
 
 COPIED = 1 << 26
@@ -150,7 +150,7 @@ def operations(model: MMPIModel, steps: Steps) -> tuple[list[Op], dict[str, floa
     ops = [
         Op("march: look up, merge, keep", sample, live * 4 * 4 + kept * kept_bytes),
         _sort(report.live, slots),
-        Op("index of rows", lambda: index_rows(taps.rows), taps.rows.numel() * (8 + 4) + rows * 8),
+        Op("index of rows", lambda: index_rows(taps.rows, len(field.density)), taps.rows.numel() * (8 + 4) + rows * 8),
     ]
     ops += _interpolation(field, taps, lookup.gathered, channels)
     ops += _shading(field, samples, lookup, report)
@@ -182,7 +182,7 @@ def _interpolation(field: Any, taps: Taps, gathered: Gathered, channels: int) ->
         Op("interpolation", lambda: interpolate_gathered(known, position, weights), read + table + values),
         Op(
             "interpolation, backward",
-            lambda: sum_by_position(position, grad, weights, len(rows)),
+            lambda: sum_rows(position, grad, weights, len(rows)),
             read + table + values,
         ),
     ]

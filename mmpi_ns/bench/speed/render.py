@@ -18,7 +18,7 @@ from mmpi_ns.bench.stability.exact import Array
 from mmpi_ns.bench.stability.exact_ray import ExactField, ExactRay
 from mmpi_ns.bench.trainings import evenly
 from mmpi_ns.model import BACKGROUNDS, MMPIModel
-from mmpi_ns.ops import native
+from mmpi_ns.ops import dispatch
 from mmpi_ns.rendering.metrics import ImageMetrics
 
 NOISE = 1.05
@@ -52,12 +52,12 @@ class Setting:
         try:
             for name, value in changes.items():
                 setattr(model.config, name, value)
-            native.choose(self.ops)  # type: ignore[arg-type]
+            dispatch.choose(self.ops)  # type: ignore[arg-type]
             yield
         finally:
             for name, value in before.items():
                 setattr(model.config, name, value)
-            native.choose(model.config.ops)
+            dispatch.choose(model.config.ops)
 
 
 @dataclass
@@ -146,7 +146,7 @@ def _ops_in_use(model: MMPIModel) -> str:
     """What auto chose."""
     if model.device.type != "cpu":
         return "auto"
-    return "torch" if native.library(torch.zeros(1)) is None else "native"
+    return "native" if dispatch.form_of("march", torch.zeros(1)) == "cpu" else "torch"
 
 
 def _some_rays(images: list[Image], count: int) -> list[Array]:

@@ -12,14 +12,8 @@ from mmpi_ns.bench.stability import exact
 from mmpi_ns.bench.stability.cases import Case, Error, Outcome, Precision, compare, plan_of, random_mpi, single
 from mmpi_ns.bench.stability.exact import Array
 from mmpi_ns.field.mmpi_field import MMPIField
-from mmpi_ns.ops.compositing import (
-    BlendForm,
-    blend_shares,
-    blended_optical_depth,
-    composite_weights,
-    median_inverse_distance,
-    render_colors,
-)
+from mmpi_ns.ops.blending import BlendForm, blend_shares, blended_optical_depth
+from mmpi_ns.ops.composite.reference import composite_weights, median_inverse_distance, render_colors
 
 # Densities -----------------------------------------------------------------------------------------------------------
 
@@ -34,7 +28,7 @@ def _density(raw: Array, planes: int, precision: Precision) -> Outcome:
     index = np.repeat(np.arange(planes), len(raw))
     given = torch.tensor(values, dtype=torch.float32, requires_grad=True)
     with precision.context():
-        tau = field.mpi_tau(0, given, torch.tensor(index))
+        tau = field.layout.optical_depth(0, given, torch.tensor(index))
         tau.sum().backward()
     assert given.grad is not None
     bias, interval = exact.plane_bias(planes)
@@ -53,7 +47,7 @@ def _equal_start(planes: int, precision: Precision) -> Outcome:
     field = MMPIField(plan_of([random_mpi(rng, planes)]), feature_channels=3, hidden_width=4)
     index = torch.arange(planes)
     with precision.context():
-        tau = field.mpi_tau(0, torch.zeros(planes), index)[None]
+        tau = field.layout.optical_depth(0, torch.zeros(planes), index)[None]
         made = composite_weights(
             tau, torch.ones_like(tau, dtype=torch.bool), torch.zeros_like(tau), torch.zeros_like(tau[:, :1])
         )

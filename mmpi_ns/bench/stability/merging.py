@@ -12,8 +12,8 @@ from mmpi_ns.bench.stability import exact
 from mmpi_ns.bench.stability.cases import UNIT, Case, Error, Outcome, Precision, compare, count_wrong, single
 from mmpi_ns.bench.stability.exact import Array
 from mmpi_ns.ops.interpolate import interpolate
-from mmpi_ns.ops.merge import Merged, keep_survivors, merge
-from mmpi_ns.ops.variation import clamped_differences
+from mmpi_ns.ops.march.reference import merge, prune
+from mmpi_ns.ops.variation.reference import clamped_differences
 from mmpi_ns.scene.texels import BRICK, make_grids
 from mmpi_ns.training import losses
 from mmpi_ns.training.touched_adam import TouchedAdam
@@ -68,7 +68,7 @@ def _spread(count: int) -> Array:
 # Merging and dropping ------------------------------------------------------------------------------------------------
 
 
-def _merged(keys: Array, counts: Array) -> Merged:
+def _merged(keys: Array, counts: Array) -> tuple[torch.Tensor, torch.Tensor]:
     """Keys [R, H, S] of heads whose first ``counts`` [R, H] samples exist."""
     rays, heads, _ = keys.shape
     per_ray = counts.sum(-1)
@@ -90,7 +90,7 @@ def _merge_order(keys: Array, precision: Precision, empty: bool = False) -> Outc
     counts = rng.integers(0, samples + 1, (rays, heads))
     counts[::5] = 0 if empty else counts[::5]
     with precision.context():
-        merged = _merged(keys, counts)
+        index, valid = _merged(keys, counts)
     wrong, flat_of = 0, np.full((rays, heads, samples), -1)
     number = 0
     for k in range(heads):
@@ -100,7 +100,7 @@ def _merge_order(keys: Array, precision: Precision, empty: bool = False) -> Outc
     for r in range(rays):
         wanted = sorted((-keys[r, k, i], k, i) for k in range(heads) for i in range(counts[r, k]))
         order = [int(flat_of[r, k, i]) for _, k, i in wanted]
-        found = merged.order[r][merged.valid[r]].tolist()
+        found = index[r][valid[r]].tolist()
         wrong += sum(a != b for a, b in zip(found, order, strict=False)) + abs(len(found) - len(order))
     return Outcome(count_wrong(wrong))
 
@@ -109,9 +109,9 @@ def _dropping(taus: Array, threshold: float, share: float, precision: Precision,
     """What is kept, and mass and depth of what is dropped. Within 16 roundings of the bound either is right."""
     taus = single(taus)
     rays, samples = taus.shape
-    merged = Merged(torch.arange(rays * samples).view(rays, samples), torch.ones(rays, samples, dtype=torch.bool))
+    merged = (torch.arange(rays * samples).view(rays, samples), torch.ones(rays, samples, dtype=torch.bool))
     with precision.context():
-        found = keep_survivors(merged, torch.tensor(taus.ravel(), dtype=torch.float32), threshold, share)
+        found = prune(*merged, torch.tensor(taus.ravel(), dtype=torch.float32), threshold, share)
     errors, wrong = [], 0
     for r in range(rays):
         made = exact.composite(taus[r])

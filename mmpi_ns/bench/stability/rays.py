@@ -30,7 +30,7 @@ from mmpi_ns.bench.stability.exact import Array, Jitter
 from mmpi_ns.bench.stability.exact_ray import TABLES, ExactField, ExactRay, Gradients
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.samples import metadata_of
-from mmpi_ns.ops.compositing import BlendForm
+from mmpi_ns.ops.blending import BlendForm
 from mmpi_ns.scene.plan import CubePlan, MPIPlan, ScenePlan
 
 GROUP = "whole rays"
@@ -78,7 +78,7 @@ def filled(plan: ScenePlan, seed: int, log_depths=(-2.5, 0.5), density: float = 
         # The biases as the field has them: what softplus gives for raw = 0.
         scale = 256 / grid.depth
         with torch.no_grad():
-            start = field.mpi_tau(k, torch.zeros(grid.depth), planes).double().numpy() / scale
+            start = field.layout.optical_depth(k, torch.zeros(grid.depth), planes).double().numpy() / scale
         biases = np.log(np.expm1(start))
         wanted = 10 ** rng.uniform(*log_depths, size=(grid.depth, texels))
         raw = _raw(wanted, scale, biases) if not density else rng.uniform(-density, density, (grid.depth, texels))

@@ -1,7 +1,7 @@
 // Colours of samples, without gradients: features, position encoding and the colour network of a block of samples. The
 // reference is ColorNetworks.forward.
 #include "network.h"
-#include "places.h"
+#include "cells.h"
 #include "table.h"
 
 #include <memory>
@@ -94,7 +94,7 @@ void find_in_mpi(const Grid& grid, const int64_t* planes, const Head& head, Taps
         IntLanes plane{};
         const int count = std::min(WIDTH, head.size - first);
         for (int i = 0; i < count; i++) plane[i] = int32_t(planes[head.slots[first + i]]);
-        const Places at(grid, load(head.block.position[0] + first), load(head.block.position[1] + first), plane);
+        const PlaneCells at(grid, load(head.block.position[0] + first), load(head.block.position[1] + first), plane);
         for (int i = 0; i < count; i++) {
             if (at.edge[i]) {
                 const Corners corners(grid, plane[i], at.line[i], at.column[i]);

@@ -2,47 +2,22 @@
 
 from __future__ import annotations
 
-import importlib
-from collections.abc import Callable
-from typing import Any
-
 from torch import Tensor
 
-from mmpi_ns.ops import native
-from mmpi_ns.ops.gather import cpu, reference
+from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.gather.reference import COLORS, KnownTaps, RaySums
-from mmpi_ns.scene.texels import TexelGrid
+from mmpi_ns.ops.layout import SceneLayout
 
 __all__ = ["COLORS", "KnownTaps", "RaySums", "gather_places", "gather_taps"]
 
 
-def _gpu() -> Any:
-    """The form that needs Triton."""
-    return importlib.import_module("mmpi_ns.ops.gather.gpu")
-
-
 def gather_taps(values: Tensor, groups: list[KnownTaps], slots: Tensor, weights: Tensor, wanted: Tensor) -> RaySums:
     """See ``reference.gather_taps``."""
-    given = (values, groups, slots, weights, wanted)
-    if native.takes_triton(values, weights):
-        return _gpu().gather_taps(*given)
-    return (reference if native.library(values, weights) is None else cpu).gather_taps(*given)
+    return dispatch.run("gather_taps", values, groups, slots, weights, wanted)
 
 
 def gather_places(
-    grids: list[TexelGrid],
-    num_mpis: int,
-    triton_scene: Callable[[], Any],
-    table: Tensor,
-    heads: Tensor,
-    planes: Tensor,
-    ndc: Tensor,
-    valid: Tensor,
-    weights: Tensor,
+    layout: SceneLayout, table: Tensor, heads: Tensor, planes: Tensor, ndc: Tensor, valid: Tensor, weights: Tensor
 ) -> RaySums:
-    """See ``reference.gather_places``; ``triton_scene`` gives the scene as kernels on a GPU take it."""
-    given = (table, heads, planes, ndc, valid, weights)
-    if native.takes_triton(table, ndc, weights):
-        return _gpu().gather_places(triton_scene(), *given)
-    form = reference if native.library(table, ndc, weights) is None else cpu
-    return form.gather_places(grids, num_mpis, *given)
+    """See ``reference.gather_places``."""
+    return dispatch.run("gather_places", layout, table, heads, planes, ndc, valid, weights)

@@ -9,10 +9,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from mmpi_ns.ops import native
+from mmpi_ns.ops import build
+from mmpi_ns.ops.cpu_scene import CpuScene
 from mmpi_ns.ops.gather.reference import COLORS, KnownTaps, RaySums
-from mmpi_ns.ops.march import Grid
-from mmpi_ns.scene.texels import TexelGrid
+from mmpi_ns.ops.layout import SceneLayout
 
 LANES = 16
 """Gradients of sums are padded to multiples of this many channels."""
@@ -26,7 +26,7 @@ def _groups(positions: list[Tensor], shares: list[Tensor]) -> Any:
     """Taps of planes, then those of the cube, as the kernels take them."""
     found = (_Taps * 2)()
     for position, share in zip(positions, shares, strict=True):
-        given = (native.address(position, torch.int32), native.address(share), len(position))
+        given = (build.address(position, torch.int32), build.address(share), len(position))
         found[position.shape[1] // 8] = _Taps(*given)
     return found
 
@@ -62,16 +62,16 @@ class _GatherTaps(torch.autograd.Function):
 
         def part(begin: int, end: int) -> None:
             lib.mmpi_gather_taps(
-                native.address(values),
+                build.address(values),
                 *map(ctypes.c_int64, values.shape),
                 groups,
-                native.address(numbers, torch.int32),
-                native.address(weights),
+                build.address(numbers, torch.int32),
+                build.address(weights),
                 *map(ctypes.c_int64, (begin, end, width)),
-                native.address(sums),
+                build.address(sums),
             )
 
-        native.in_parts(part, num_rays)
+        build.in_parts(part, num_rays)
         ctx.save_for_backward(*held)
         ctx.lib = lib
         found = _split(sums, channels)
@@ -86,16 +86,16 @@ class _GatherTaps(torch.autograd.Function):
         to_weights = torch.zeros_like(weights)
         padded = [_pad(g) for g in (to_sums, to_first, 2 * to_second)]
         ctx.lib.mmpi_gather_back(
-            native.address(values),
+            build.address(values),
             *map(ctypes.c_int64, values.shape),
             _groups(taps[::2], taps[1::2]),
-            native.address(slots, torch.int64),
-            native.address(wanted, torch.bool),
-            native.address(weights),
-            *map(native.address, padded),
+            build.address(slots, torch.int64),
+            build.address(wanted, torch.bool),
+            build.address(weights),
+            *map(build.address, padded),
             ctypes.c_int64(weights.shape[1]),
-            None if to_values is None else native.address(to_values),
-            native.address(to_weights),
+            None if to_values is None else build.address(to_values),
+            build.address(to_weights),
         )
         return None, to_values, to_weights, None, None, *[None] * len(taps)
 
@@ -109,12 +109,11 @@ def gather_taps(
 ) -> RaySums:
     """See ``reference.gather_taps``. The sum of a gradient does not depend on the number of threads."""
     taps = [x for g in groups for x in (g.positions.to(torch.int32), g.shares)]
-    return RaySums(*_GatherTaps.apply(native.library(), values, weights, slots, wanted, *taps))  # type: ignore[misc]
+    return RaySums(*_GatherTaps.apply(build.library(), values, weights, slots, wanted, *taps))  # type: ignore[misc]
 
 
 def gather_places(
-    grids: list[TexelGrid],
-    num_mpis: int,
+    layout: SceneLayout,
     table: Float[Tensor, "T C"],
     heads: Int[Tensor, "R S"],
     planes: Int[Tensor, "R S"],
@@ -123,23 +122,22 @@ def gather_places(
     weights: Float[Tensor, "R S"],
 ) -> RaySums:
     """See ``reference.gather_places``."""
-    lib = native.library()
-    assert lib is not None
+    lib = build.library()
     (num_rays, slots), channels = weights.shape, table.shape[1]
     held = [x.detach().contiguous() for x in (table, heads, planes, ndc, valid, weights)]
-    addresses = [native.address(x, x.dtype) for x in held]
-    sums, blocks = torch.empty(num_rays, channels + 1 + COLORS), (Grid * len(grids))(*map(Grid.of, grids))
+    addresses = [build.address(x, x.dtype) for x in held]
+    sums = torch.empty(num_rays, channels + 1 + COLORS)
 
     def part(begin: int, end: int) -> None:
         lib.mmpi_gather_places(
-            blocks,
-            ctypes.c_int64(num_mpis),
+            CpuScene.of(layout).grids,
+            ctypes.c_int64(len(layout.mpis)),
             addresses[0],
             *map(ctypes.c_int64, table.shape),
             *addresses[1:],
             *map(ctypes.c_int64, (begin, end, slots)),
-            native.address(sums),
+            build.address(sums),
         )
 
-    native.in_parts(part, num_rays)
+    build.in_parts(part, num_rays)
     return RaySums(*_split(sums, channels))

@@ -14,7 +14,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mmpi_ns.ops.gather.reference import COLORS, KnownTaps, RaySums
-from mmpi_ns.ops.triton_scene import DEPTH, HEIGHT, INTS, WIDTH, TritonScene, block_size, cell, row_of
+from mmpi_ns.ops.gpu_scene import DEPTH, HEIGHT, INTS, WIDTH, GpuScene, block_size, cell, row_of
+from mmpi_ns.ops.layout import SceneLayout
 
 NUMBERS = 512
 """Rays, or samples, of a program, times their channels: what its registers hold."""
@@ -206,7 +207,7 @@ def gather_taps(
 
 
 def gather_places(
-    scene: TritonScene,
+    layout: SceneLayout,
     table: Float[Tensor, "T C"],
     heads: Int[Tensor, "R S"],
     planes: Int[Tensor, "R S"],
@@ -220,7 +221,7 @@ def gather_places(
     sums, (columns, block) = torch.empty(num_rays, channels + 1 + COLORS, device=device), _sizes(channels, device)
     if num_rays:
         gather_places_kernel[(triton.cdiv(num_rays, block),)](
-            *held, scene.grids, sums, num_rays, slots, channels, scene.num_mpis,
-            HAS_CUBE=scene.num_heads > scene.num_mpis, CHANNELS=columns, BLOCK=block,
+            *held, GpuScene.of(layout).grids, sums, num_rays, slots, channels, len(layout.mpis),
+            HAS_CUBE=layout.num_heads > len(layout.mpis), CHANNELS=columns, BLOCK=block,
         )  # fmt: skip
     return RaySums(*_split(sums, channels))

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from mmpi_ns.scene.texels import TexelGrid
+from mmpi_ns.ops.layout import SceneLayout
 
 COLORS = 3
 """Channels of a texel that are colours."""
@@ -70,8 +70,7 @@ def gather_taps(
 
 
 def gather_places(
-    grids: list[TexelGrid],
-    num_mpis: int,
+    layout: SceneLayout,
     table: Float[Tensor, "T C"],
     heads: Int[Tensor, "R S"],
     planes: Int[Tensor, "R S"],
@@ -82,8 +81,7 @@ def gather_places(
     """Sums over samples at places in the heads, without gradients.
 
     Args:
-        grids: texels of all heads.
-        num_mpis: how many of them are MPIs, which come first.
+        layout: of the scene.
         table: the pooled texels.
         heads: head of each sample.
         planes: its plane; of no meaning in the cube.
@@ -92,10 +90,10 @@ def gather_places(
         weights: rendering weights.
     """
     raw, slots = [table.new_zeros(0, table.shape[1])], [heads.new_zeros(0)]
-    for k, grid in enumerate(grids):
+    for k, grid in enumerate(layout.grids):
         own = (valid & (heads == k)).reshape(-1).nonzero()[:, 0]
         place = ndc.reshape(-1, 3)[own]
-        rows, shares = grid.bilinear(planes.reshape(-1)[own], place) if k < num_mpis else grid.trilinear(place)
+        rows, shares = grid.bilinear(planes.reshape(-1)[own], place) if k < len(layout.mpis) else grid.trilinear(place)
         raw.append((table[rows] * shares[..., None]).sum(1))
         slots.append(own)
     return _sums(torch.cat(raw), torch.cat(slots), weights)

@@ -1,0 +1,43 @@
+"""Adam on the rows of a table that a batch touched, in place."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from mmpi_ns.ops import dispatch
+
+
+class AdamConstants(NamedTuple):
+    """Of one step."""
+
+    beta1: float
+    beta2: float
+    correction: float
+    """Root of the second moment's: sqrt(1 - beta2^step)."""
+    eps: float
+    rate: float
+    """With the first moment's correction: lr / (1 - beta1^step)."""
+
+
+def adam_rows(
+    param: Float[Tensor, "T C"],
+    mean: Float[Tensor, "T C"],
+    square: Float[Tensor, "T C"],
+    rows: Int[Tensor, "U"],
+    grad: Float[Tensor, "U C"],
+    constants: AdamConstants,
+) -> None:
+    """One step of Adam on distinct rows; entries whose gradient is exactly 0 are left alone.
+
+    Args:
+        param: the table.
+        mean: its first moment.
+        square: its second moment.
+        rows: which rows, each once.
+        grad: their gradients.
+        constants: of the step.
+    """
+    dispatch.run("adam_rows", param, mean, square, rows, grad, constants)

@@ -1,0 +1,142 @@
+"""Blending by reliability: how much a sample is believed among the heads that cover its place (paper sec. III-C).
+
+Plain torch, with gradients. The compiled marches hold their own form of it, without.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from mmpi_ns.ops.interpolate import interpolate
+from mmpi_ns.ops.layout import SceneLayout
+from mmpi_ns.scene.geometry import LocalRays, local_to_ndc
+
+BlendForm = Literal["paper", "opacity"]
+"""paper: alpha' = P alpha. opacity: 1 - alpha' = (1 - alpha)^P, which keeps opaque copies opaque."""
+
+
+def blend_shares(
+    reliability: Float[Tensor, "N H"], cover: Bool[Tensor, "N H"], own: Int[Tensor, "N"]
+) -> tuple[Float[Tensor, "N"], Float[Tensor, "N"]]:
+    """log P and log(1 - P) of each sample's own head among the heads that cover it.
+
+    Args:
+        reliability: R of every head at the sample's position; what uncovered heads hold is ignored.
+        cover: which heads cover the position; a sample's own head must be among them.
+        own: the head a sample was taken from.
+
+    Returns:
+        log softmax over the covering heads at ``own``, and the log of its complement (-inf for a sole cover).
+
+    Source: paper sec. III-C, P_i = exp(R_i) / sum_j exp(R_j). log(1 - P) comes from the other heads directly:
+    from P itself it is wrong beyond R = 17 and has a NaN gradient at P = 1.
+    """
+    reliability = reliability.float() if reliability.dtype in (torch.float16, torch.bfloat16) else reliability
+    lowest = torch.finfo(reliability.dtype).min
+    # Only differences matter, and they are exact only where the numbers are small: the highest becomes 0.
+    highest = torch.where(cover, reliability, torch.full_like(reliability, lowest)).amax(-1, keepdim=True).detach()
+    reliability = reliability - highest
+    is_own = torch.arange(cover.shape[-1], device=cover.device) == own[:, None]
+    own_value = torch.where(is_own, reliability, torch.zeros_like(reliability)).sum(-1)
+    others = cover & ~is_own
+    has_others = others.any(-1)
+    # A row without others would be a logsumexp over nothing: give it a harmless row and mask the result.
+    other_values = torch.where(others, reliability, torch.full_like(reliability, lowest))
+    other_values = torch.where(has_others[:, None], other_values, torch.zeros_like(other_values))
+    odds = torch.logsumexp(other_values, -1) - own_value
+    # As softplus both logs and both slopes are exact at P near 0 and 1; differences with the sum of all cancel there.
+    log_share = torch.where(has_others, -_softplus(odds), torch.zeros_like(odds))
+    log_rest = torch.where(has_others, -_softplus(-odds), torch.full_like(odds, -torch.inf))
+    return log_share, log_rest
+
+
+def _softplus(x: Tensor) -> Tensor:
+    """log(1 + e^x); torch's own returns x from 20 on, which float64 can tell from it."""
+    return torch.nn.functional.softplus(x, threshold=50)
+
+
+def blended_optical_depth(
+    tau: Float[Tensor, "N"],
+    log_share: Float[Tensor, "N"],
+    log_rest: Float[Tensor, "N"],
+    form: BlendForm = "paper",
+) -> Float[Tensor, "N"]:
+    """-log(1 - alpha') of a sample after blending; exactly tau where it is the sole cover.
+
+    Source: paper sec. III-C, alpha' = P alpha, so 1 - alpha' = (1 - P) + P (1 - alpha).
+    """
+    if form == "opacity":
+        return tau * log_share.exp()
+    sole = torch.isneginf(log_rest)
+    # Two forms of one number: the first is exact for thin samples (and 0 for empty ones), the second for opaque ones.
+    alpha = -torch.expm1(-tau) * log_share.exp()
+    thin = alpha < 0.5
+    log1p = torch.log1p(-torch.where(thin, alpha, torch.zeros_like(alpha)))
+    safe_rest = torch.where(sole, torch.zeros_like(log_rest), log_rest)
+    blended = -torch.where(thin, log1p, torch.logaddexp(safe_rest, log_share - tau))
+    return torch.where(sole, tau, blended.clamp(min=0))
+
+
+def log_shares(
+    layout: SceneLayout,
+    reliability: Float[Tensor, "T 1"],
+    touched: Tensor,
+    rays: Int[Tensor, "N"],
+    local: LocalRays,
+    inverse_t: Float[Tensor, "N"],
+    heads: Int[Tensor, "N"],
+) -> tuple[Float[Tensor, "N"], Float[Tensor, "N"]]:
+    """log P and log(1 - P) of samples among the heads that cover them, with gradients to the reliability.
+
+    A head covers a point inside its frustum whose nearest texel was trained; a sample's own head always does.
+
+    Args:
+        layout: of the scene.
+        reliability: R of all texels.
+        touched: of every row [T]: 1 where a training ray read it.
+        rays: ray of each sample.
+        local: the rays in every head's axes.
+        inverse_t: inverse distance of each sample.
+        heads: head that each sample was taken from.
+    """
+    columns, cover = [], []
+    for j, grid in enumerate(layout.grids):
+        ndc, inside = _ndc_in_head(layout, j, rays, local, inverse_t)
+        is_own = heads == j
+        index = (inside | is_own).nonzero()[:, 0]
+        position = ndc[index]
+        value = interpolate(reliability, *grid.trilinear(position))[:, 0]
+        columns.append(value.new_zeros(heads.shape[0]).index_put((index,), value))
+        voting = torch.zeros_like(is_own)
+        voting[index] = touched[grid.nearest(position)] > 0
+        cover.append(voting | is_own)
+    return blend_shares(torch.stack(columns, -1), torch.stack(cover, -1), heads)
+
+
+def _ndc_in_head(
+    layout: SceneLayout, k: int, rays: Tensor, local: LocalRays, inverse_t: Tensor
+) -> tuple[Float[Tensor, "N 3"], Bool[Tensor, "N"]]:
+    """Where samples lie in one head, and whether inside it."""
+    moved = local.table(k).index_select(0, rays)
+    if k < len(layout.mpis):
+        point = moved[:, :3] * inverse_t[:, None] + moved[:, 3:]
+        ndc, inside = local_to_ndc(point[:, None], inverse_t[:, None], layout.frames.one(k))
+        return ndc[:, 0], inside[:, 0]
+    assert layout.cube is not None
+    ndc = layout.cube.normalised(moved[:, :3] + moved[:, 3:] / inverse_t.clamp(min=1e-10)[:, None])
+    return ndc.clamp(-1, 1), (ndc.abs() <= 1).all(-1) & (inverse_t > 0)
+
+
+def interpolate_shares(
+    layout: SceneLayout, shares: Float[Tensor, "T 1"], ndc: Float[Tensor, "N 3"], heads: Int[Tensor, "N"]
+) -> Float[Tensor, "N"]:
+    """Shares of samples from those of texels (``baking.bake_shares``), in the head that each was taken from."""
+    found = ndc.new_zeros(len(heads))
+    for k, grid in enumerate(layout.grids):
+        index = (heads == k).nonzero()[:, 0]
+        found = found.index_copy(0, index, interpolate(shares, *grid.trilinear(ndc[index]))[:, 0])
+    return found.clamp(0, 1)

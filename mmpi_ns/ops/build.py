@@ -1,0 +1,106 @@
+"""Compiles the C++ of all operations into one library: by the machine's own compiler, at first use (4 seconds)."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import hashlib
+import os
+import platform
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor, wait
+from itertools import pairwise
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+OPS = Path(__file__).parent
+HEADERS = OPS / "cpp"
+FLAGS = ["-std=c++17", "-O3", "-march=native", "-fno-math-errno", "-shared", "-fPIC", f"-I{HEADERS}"]
+"""Nothing that reorders sums: a result never depends on how the compiler groups them."""
+
+
+class CannotCompile(Exception):
+    """Why there is no library."""
+
+
+@functools.cache
+def library() -> ctypes.CDLL:
+    """All compiled functions, from the cache where they have been compiled before.
+
+    Raises:
+        CannotCompile: there is no compiler, or it fails.
+    """
+    compiler = os.environ.get("CXX") or shutil.which("g++") or shutil.which("clang++")
+    if compiler is None:
+        raise CannotCompile("no C++ compiler (g++ or clang++) is installed")
+    sources = sorted(OPS.glob("*/*.cpp"))
+    if not sources:
+        raise CannotCompile(f"{OPS} holds no C++ sources: install the package again")
+    texts = [p.read_bytes() for p in [*sources, *sorted(HEADERS.glob("*.h"))]]
+    key = hashlib.sha256(b"\0".join([*texts, " ".join([compiler, *FLAGS]).encode(), _processor()])).hexdigest()[:16]
+    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mmpi_ns"
+    target = folder / f"kernels-{key}.so"
+    try:
+        if not target.is_file():
+            folder.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryDirectory(dir=folder) as scratch:
+                made = Path(scratch) / target.name
+                command = [compiler, *FLAGS, "-o", str(made), *map(str, sources)]
+                subprocess.run(command, check=True, capture_output=True, text=True, timeout=120)
+                os.replace(made, target)
+        built = ctypes.CDLL(str(target))
+    except subprocess.CalledProcessError as error:
+        raise CannotCompile(f"{compiler} failed: {(error.stderr or '').strip().splitlines()[:1]}") from error
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise CannotCompile(str(error)) from error
+    built.mmpi_index_rows.restype = ctypes.c_int64
+    return built
+
+
+def _processor() -> bytes:
+    """What -march=native depends on: a home folder may be shared by machines that differ."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        return "".join(sorted({x for x in lines if x.startswith(("model name", "flags", "Features"))})).encode()
+    except OSError:
+        return f"{platform.machine()} {platform.processor()} {platform.node()}".encode()
+
+
+def address(tensor: Tensor, dtype: torch.dtype = torch.float32) -> ctypes.c_void_p:
+    """Where a tensor's numbers lie, for a function that expects them close together and of this type."""
+    assert tensor.dtype == dtype and tensor.is_contiguous(), (tensor.dtype, tensor.stride())
+    return ctypes.c_void_p(tensor.data_ptr())
+
+
+def addresses(tensors: Iterable[Tensor]) -> list[ctypes.c_void_p]:
+    """Where the numbers of several tensors lie, which have the types that they must have."""
+    return [address(t, t.dtype) for t in tensors]
+
+
+def sizes(*numbers: int) -> list[ctypes.c_int64]:
+    """Integers as the compiled functions take them."""
+    return [ctypes.c_int64(n) for n in numbers]
+
+
+def in_parts(work: Callable[[int, int], None], count: int, least: int = 256) -> None:
+    """Calls work(begin, end) for parts of 0..count, on as many threads as torch uses. Parts must not meet."""
+    threads = max(1, min(torch.get_num_threads(), count // least))
+    if threads == 1:
+        return work(0, count)
+    bounds = [count * i // threads for i in range(threads + 1)]
+    parts = [_pool(threads).submit(work, a, b) for a, b in pairwise(bounds)]
+    try:
+        for part in parts:
+            part.result()
+    finally:
+        wait(parts)  # also when interrupted: the caller's tensors are freed then, and the kernels write to them
+
+
+@functools.cache
+def _pool(threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads, thread_name_prefix="mmpi")

@@ -1,0 +1,99 @@
+"""Compositing on a GPU, forward and backward in one launch each; the reference is ``reference.composite_weights``."""
+
+# Triton's language has no types that pyright knows: a kernel's functions seem to return nothing.
+# pyright: reportGeneralTypeIssues=false, reportCallIssue=false, reportArgumentType=false
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from mmpi_ns.ops.composite.reference import Composite
+from mmpi_ns.ops.gpu_scene import block_size, one_minus_exp
+
+SLOTS = 2048
+"""Samples of a program: as many rays as make that many."""
+
+
+@triton.jit
+def composite_kernel(
+    taus, valid, befores, totals, weights, depths, num_rays, slots, RAYS: tl.constexpr, SLOTS: tl.constexpr
+):
+    """Weights of samples and optical depth of rays."""
+    ray, slot = tl.program_id(0) * RAYS + tl.arange(0, RAYS), tl.arange(0, SLOTS)
+    at = ray[:, None].to(tl.int64) * slots + slot[None, :]
+    inside = (ray < num_rays)[:, None] & (slot < slots)[None, :]
+    has = tl.load(valid + at, inside, 0) != 0
+    tau = tl.load(taus + at, has, 0.0)
+    # The samples before each one, loaded one slot off: a running sum minus the sample itself would lose small ones.
+    earlier = inside & (slot > 0)[None, :]
+    earlier = earlier & (tl.load(valid + at - 1, earlier, 0) != 0)
+    before = tl.cumsum(tl.load(taus + at - 1, earlier, 0.0), 1) + tl.load(befores + at, inside, 0.0)
+    tl.store(weights + at, tl.where(has, tl.exp(-before) * one_minus_exp(tau), 0.0), inside)
+    depth = tl.sum(tau, 1) + tl.load(totals + ray, ray < num_rays, 0.0)
+    tl.store(depths + ray, depth, ray < num_rays)
+
+
+@triton.jit
+def composite_backward_kernel(
+    taus, valid, befores, weights, weight_grads, depth_grads, tau_grads, num_rays, slots,
+    RAYS: tl.constexpr, SLOTS: tl.constexpr,
+):  # fmt: skip
+    """d/dtau_j = T_j e^-tau_j g_j - sum_{k > j} w_k g_k + d/ddepth."""
+    ray, slot = tl.program_id(0) * RAYS + tl.arange(0, RAYS), tl.arange(0, SLOTS)
+    at = ray[:, None].to(tl.int64) * slots + slot[None, :]
+    inside = (ray < num_rays)[:, None] & (slot < slots)[None, :]
+    has = tl.load(valid + at, inside, 0) != 0
+    tau = tl.load(taus + at, has, 0.0)
+    earlier = inside & (slot > 0)[None, :]
+    earlier = earlier & (tl.load(valid + at - 1, earlier, 0) != 0)
+    before = tl.cumsum(tl.load(taus + at - 1, earlier, 0.0), 1) + tl.load(befores + at, inside, 0.0)
+    own = tl.exp(-(before + tau)) * tl.load(weight_grads + at, has, 0.0)
+    later = inside & (slot + 1 < slots)[None, :]
+    later = later & (tl.load(valid + at + 1, later, 0) != 0)
+    behind = tl.load(weights + at + 1, later, 0.0) * tl.load(weight_grads + at + 1, later, 0.0)
+    depth = tl.load(depth_grads + ray, ray < num_rays, 0.0)[:, None]
+    grad = own - tl.cumsum(behind, 1, reverse=True) + depth
+    tl.store(tau_grads + at, tl.where(has, grad, 0.0), inside)
+
+
+def _shape(slots: int, device: torch.device) -> tuple[int, int]:
+    """Rays and slots of a program."""
+    width = triton.next_power_of_2(max(1, slots))
+    return max(1, block_size(SLOTS, device) // width), width  # type: ignore[return-value]
+
+
+class _Weights(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, tau: Tensor, valid: Tensor, before: Tensor, total: Tensor) -> tuple[Tensor, Tensor]:
+        num_rays, slots = tau.shape
+        weights, depth = torch.empty_like(tau), torch.empty_like(total)
+        rays, width = _shape(slots, tau.device)
+        if num_rays:
+            composite_kernel[(triton.cdiv(num_rays, rays),)](
+                tau, valid, before, total, weights, depth, num_rays, slots, RAYS=rays, SLOTS=width
+            )
+        ctx.save_for_backward(tau, valid, before, weights)
+        return weights, depth
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor, None, None, None]:
+        tau, valid, before, weights = ctx.saved_tensors
+        num_rays, slots = tau.shape
+        grad, (rays, width) = torch.empty_like(tau), _shape(slots, tau.device)
+        if num_rays:
+            composite_backward_kernel[(triton.cdiv(num_rays, rays),)](
+                tau, valid, before, weights, *(g.contiguous() for g in grad_outputs), grad, num_rays, slots,
+                RAYS=rays, SLOTS=width,
+            )  # fmt: skip
+        return grad, None, None, None
+
+
+def composite_weights(tau: Tensor, valid: Tensor, skipped_before: Tensor, skipped_total: Tensor) -> Composite:
+    """See ``ops.composite``."""
+    parts = (x.contiguous() for x in (tau, valid, skipped_before, skipped_total))
+    weights, depth = _Weights.apply(*parts)  # type: ignore[misc]
+    return Composite(weights, -torch.expm1(-depth), torch.exp(-depth))

@@ -1,0 +1,82 @@
+"""Volume rendering of merged samples in log space (paper sec. III-B): weights, colour, depth.
+
+A sample is carried by its optical depth tau = -log(1 - alpha), never by alpha: alpha = 1 is an infinite slope of
+log(1 - alpha), while tau is an ordinary number. All arithmetic is float32 or wider, also under autocast.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+
+def exclusive_cumsum(values: Float[Tensor, "R S"]) -> Float[Tensor, "R S"]:
+    """Sum of all earlier samples on the ray. Shifted, not subtracted: x - x loses what came before a large x."""
+    shifted = torch.nn.functional.pad(values[:, :-1], (1, 0))
+    return shifted.cumsum(-1)
+
+
+@dataclass(frozen=True)
+class Composite:
+    """What a ray has gathered. All values are per ray, weights per sample."""
+
+    weights: Float[Tensor, "R S"]
+    """T_k alpha'_k of the samples that were kept."""
+    accumulation: Float[Tensor, "R 1"]
+    """1 - transmittance behind the last sample, the dropped ones included."""
+    transmittance: Float[Tensor, "R 1"]
+    """What passes the whole ray."""
+
+
+def composite_weights(
+    tau: Float[Tensor, "R S"],
+    valid: Bool[Tensor, "R S"],
+    skipped_before: Float[Tensor, "R S"],
+    skipped_total: Float[Tensor, "R 1"],
+) -> Composite:
+    """See ``ops.composite``."""
+    tau = torch.where(valid, tau, torch.zeros_like(tau))
+    log_transmittance = -(exclusive_cumsum(tau) + skipped_before)
+    weights = torch.exp(log_transmittance) * -torch.expm1(-tau)
+    weights = torch.where(valid, weights, torch.zeros_like(weights))
+    depth = tau.sum(-1, keepdim=True) + skipped_total
+    return Composite(weights, -torch.expm1(-depth), torch.exp(-depth))
+
+
+def gather_colors(weights: Float[Tensor, "R S"], colors: Float[Tensor, "R S 3"]) -> Float[Tensor, "R 3"]:
+    """Sum of weights times colours along each ray."""
+    return (weights[..., None] * colors).sum(-2)
+
+
+def render_colors(composite: Composite, colors: Float[Tensor, "R S 3"]) -> Float[Tensor, "R 3"]:
+    """See ``ops.composite``."""
+    return fill_up(composite, gather_colors(composite.weights, colors))
+
+
+def fill_up(composite: Composite, gathered: Float[Tensor, "R 3"]) -> Float[Tensor, "R 3"]:
+    """Colour of rays whose kept samples have gathered this: the mass of the dropped ones is given the mean colour of
+    those (a constant factor per ray), so that dropping does not darken the image."""
+    kept = composite.weights.sum(-1, keepdim=True)
+    factor = torch.where(kept > 1e-6, composite.accumulation / kept.clamp(min=1e-6), torch.ones_like(kept))
+    return factor.detach() * gathered
+
+
+def median_inverse_distance(
+    weights: Float[Tensor, "R S"], inverse_t: Float[Tensor, "R S"], valid: Bool[Tensor, "R S"]
+) -> Float[Tensor, "R 1"]:
+    """See ``ops.composite``."""
+    gathered = weights.cumsum(-1)
+    total = gathered[:, -1:]
+    reached = (gathered >= 0.5 * total) & valid & (total > 0)
+    index = reached.to(torch.int8).argmax(-1, keepdim=True)
+    picked = inverse_t.gather(-1, index)
+    return torch.where(reached.any(-1, keepdim=True), picked, torch.zeros_like(picked))
+
+
+def winning_heads(weights: Float[Tensor, "R S"], heads: Int[Tensor, "R S"], num_heads: int) -> Float[Tensor, "R 1"]:
+    """See ``ops.composite``."""
+    mass = weights.new_zeros(len(weights), num_heads).scatter_add(1, heads, weights)
+    return mass.argmax(-1, keepdim=True).to(weights.dtype)

@@ -1,0 +1,179 @@
+"""Which form of an operation runs: its reference in plain torch, C++ on a CPU, or Triton kernels on a GPU.
+
+``--pipeline.model.ops`` chooses for the whole process. Where a compiled form cannot be had, or does not do on this
+device what the reference does (``trial.py``), that operation alone falls back to its reference, and the log says why.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import os
+import threading
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from typing import Any, Literal
+
+import torch
+from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor
+
+from mmpi_ns.ops import build
+
+Route = Literal["auto", "torch", "native"]
+Form = Literal["reference", "cpu", "gpu"]
+
+TABLE: dict[str, tuple[str, tuple[Form, ...]]] = {
+    # operation: its folder, and which compiled forms there are beside the reference
+    "plane_hits": ("hits", ("gpu",)),
+    "march": ("march", ("cpu", "gpu")),
+    "texel_rows": ("interpolate", ("cpu", "gpu")),
+    "weighted_rows": ("interpolate", ("gpu",)),
+    "take_rows": ("interpolate", ("cpu",)),
+    "index_rows": ("interpolate", ("cpu", "gpu")),
+    "sum_rows": ("interpolate", ("cpu", "gpu")),
+    "composite_weights": ("composite", ("cpu", "gpu")),
+    "gather_colors": ("composite", ("cpu",)),
+    "median_inverse_distance": ("composite", ("cpu",)),
+    "winning_heads": ("composite", ("cpu",)),
+    "total_variation": ("variation", ("cpu", "gpu")),
+    "adam_rows": ("adam", ("cpu", "gpu")),
+    "gather_taps": ("gather", ("cpu", "gpu")),
+    "gather_places": ("gather", ("cpu", "gpu")),
+    "colors": ("colors", ("cpu",)),
+    "shade": ("shade", ("cpu", "gpu")),
+}
+"""Every operation. Its function has the same name and signature in ``reference.py``, ``cpu.py`` and ``gpu.py``."""
+
+_chosen: Route = "auto"
+_interpreting = False
+_faults: dict[str, str | None] = {}
+"""What is known of the compiler ("C++"), of Triton, and of each operation's GPU form: None is well, else why not."""
+_trying = threading.RLock()
+
+
+def run(name: str, *given: Any) -> Any:
+    """What the operation makes of its arguments, by the form that suits the tensors among them."""
+    form = form_of(name, *_tensors(given))
+    if form != "gpu" or _chosen == "native":
+        return function(name, form)(*given)
+    try:
+        return function(name, "gpu")(*given)
+    except _triton_errors() as error:  # a shape that the trial did not have: it failed to compile, so nothing has run
+        _faults[name] = _say(f"{name} does not compile for this GPU ({_words(error)})", f"Plain torch for {name}")
+        return function(name, "reference")(*given)
+
+
+def _tensors(given: Iterable[Any]) -> Iterator[Tensor]:
+    for x in given:
+        if isinstance(x, Tensor):
+            yield x
+        elif isinstance(x, tuple):
+            yield from _tensors(x)
+
+
+def form_of(name: str, *tensors: Tensor) -> Form:
+    """The form that these tensors get: a compiled one takes float32 (and integers) of one device."""
+    compiled = TABLE[name][1]
+    devices = {t.device.type for t in tensors}
+    if _chosen == "torch" or any(t.is_floating_point() and t.dtype != torch.float32 for t in tensors):
+        return "reference"
+    if devices == {"cpu"} and not _interpreting:
+        return "cpu" if "cpu" in compiled and _fault("C++") is None else "reference"
+    if devices == ({"cpu"} if _interpreting else {"cuda"}) and "gpu" in compiled and _fault(name) is None:
+        return "gpu"
+    return "reference"
+
+
+@functools.cache
+def function(name: str, form: Form) -> Any:
+    """One form of an operation."""
+    return getattr(importlib.import_module(f"mmpi_ns.ops.{TABLE[name][0]}.{form}"), name)
+
+
+def choose(path: Route) -> None:
+    """Sets which forms the operations of this process take.
+
+    Raises:
+        ValueError: ``native`` is asked for, and an operation has no compiled form here (says why).
+    """
+    global _chosen
+    _chosen = path
+    if path != "native":
+        return
+    on_gpu = torch.cuda.is_available() or _interpreting
+    names = ["Triton", *(n for n in TABLE if "gpu" in TABLE[n][1])] if on_gpu else ["C++"]
+    if reason := next((r for n in names if (r := _fault(n)) is not None), None):
+        raise ValueError(f"The compiled operations cannot be had: {reason}. Use --pipeline.model.ops auto or torch.")
+
+
+@contextmanager
+def chosen(path: Route) -> Iterator[None]:
+    """Within, operations take these forms."""
+    global _chosen
+    with _trying:
+        before, _chosen = _chosen, path
+        try:
+            yield
+        finally:
+            _chosen = before
+
+
+def interpret(on: bool) -> None:
+    """Lets Triton's interpreter run the GPU's kernels on CPU tensors: for tests and rehearsals, and very slow.
+
+    Raises:
+        ValueError: TRITON_INTERPRET=1 was not in the environment when the process started, or there is no Triton.
+    """
+    global _interpreting
+    if on and os.environ.get("TRITON_INTERPRET") != "1":
+        raise ValueError("Triton's interpreter must be asked for before Python starts: set TRITON_INTERPRET=1.")
+    if on and (reason := _fault("Triton")) is not None:
+        raise ValueError(f"Triton cannot be had: {reason}.")
+    _interpreting = on
+
+
+def _fault(name: str) -> str | None:
+    """Why the compiler, Triton or an operation's GPU form cannot be used; found out once, and said in the log then."""
+    if name not in _faults:
+        with _trying:
+            if name not in _faults:
+                _faults[name] = _try(name)
+    return _faults[name]
+
+
+def _try(name: str) -> str | None:
+    if name == "C++":
+        try:
+            build.library()
+        except build.CannotCompile as error:
+            return _say(str(error))
+        return None
+    if name == "Triton":
+        try:
+            importlib.import_module("triton")
+        except ImportError as error:
+            return _say(f"Triton cannot be imported ({error})")
+        return None
+    if (reason := _fault("Triton")) is not None:
+        return reason
+    try:  # the module tries operations, so it comes after this one
+        importlib.import_module("mmpi_ns.ops.trial").run(name, "cpu" if _interpreting else "cuda")
+    except Exception as error:  # a driver, a compiler or a cache folder may fail in many ways: all mean plain torch
+        return _say(f"its Triton kernel fails on this device ({_words(error)})", f"Plain torch for {name}")
+    return None
+
+
+def _triton_errors() -> type[Exception]:
+    return importlib.import_module("triton.errors").TritonError
+
+
+def _words(error: Exception) -> str:
+    """An error's first line that says something."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return f"{type(error).__name__}: {lines[0][:200]}" if lines else type(error).__name__
+
+
+def _say(reason: str, instead: str = "Plain torch instead of the compiled operations") -> str:
+    CONSOLE.print(f"{instead}, several times slower: {reason}.")
+    return reason

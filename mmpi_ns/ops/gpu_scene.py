@@ -1,0 +1,256 @@
+"""What the Triton kernels know of a plan, and the functions they share. The counterpart of ``cpp/scene.h``.
+
+Imported only where Triton is wanted (``dispatch.py``): the package runs without it.
+"""
+
+# Triton's language has no types that pyright knows: a kernel's functions seem to return nothing.
+# pyright: reportGeneralTypeIssues=false, reportCallIssue=false, reportArgumentType=false
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+import triton
+import triton.language as tl
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from mmpi_ns.ops.layout import SceneLayout
+from mmpi_ns.scene.plan import MPIPlan
+
+# Columns of the constants of a head; the cube's row holds its interval alone.
+STEP = tl.constexpr(0)
+END = tl.constexpr(1)
+SLACK = tl.constexpr(2)
+S_SCALE = tl.constexpr(3)
+U0 = tl.constexpr(4)
+U_SCALE = tl.constexpr(5)
+V0 = tl.constexpr(6)
+V_SCALE = tl.constexpr(7)
+INTERVAL = tl.constexpr(8)
+FLOATS = tl.constexpr(9)
+# Columns of a head's layout. BRICK_OF_TILE and TILE_OF_BRICK say where in the same tensor the brick of the head's first
+# tile, and the tile of the first brick of all, are.
+FIRST_TILE = tl.constexpr(0)
+DEPTH = tl.constexpr(1)
+HEIGHT = tl.constexpr(2)
+WIDTH = tl.constexpr(3)
+BIAS = tl.constexpr(4)
+DOWN = tl.constexpr(5)
+ACROSS = tl.constexpr(6)
+BRICK_OF_TILE = tl.constexpr(7)
+TILE_OF_BRICK = tl.constexpr(8)
+INTS = tl.constexpr(9)
+
+
+@dataclass(frozen=True)
+class GpuScene:
+    """A layout on the device (``CpuScene`` for the GPU), made once by ``GpuScene.of``."""
+
+    heads: Float[Tensor, "H 9"]
+    grids: Int[Tensor, "N"]
+    """See ``_pack_grids``."""
+    biases: Float[Tensor, "P"]
+    cube: Float[Tensor, "8"]
+    """Lower corner, extent, step between samples, bias; zeros without a cube."""
+    most_samples: int
+    """No ray has more: planes of all MPIs, and the cube's diagonal in steps."""
+
+    @staticmethod
+    def of(layout: SceneLayout) -> GpuScene:
+        return layout.once("gpu", _pack)
+
+    def constants(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        return self.heads, self.grids, self.biases, self.cube
+
+
+def _pack(layout: SceneLayout) -> GpuScene:
+    device, cube, mpis = layout.frames.origins.device, layout.cube, layout.mpis
+    rows, most = [_head_row(m, layout.interval(k)) for k, m in enumerate(mpis)], sum(m.planes for m in mpis)
+    numbers = [0.0] * 8
+    if cube is not None:
+        extent = (cube.upper - cube.lower).tolist()
+        numbers = [*cube.lower.tolist(), *extent, cube.step, layout.cube_bias]
+        rows.append([0.0] * 8 + [layout.cube_interval])
+        most += int(2 * math.hypot(*extent) / cube.step) + 2
+    return GpuScene(
+        torch.tensor(rows, dtype=torch.float32, device=device),
+        _pack_grids(layout, device),
+        torch.cat(layout.biases).to(device, torch.float32).contiguous(),
+        torch.tensor(numbers, dtype=torch.float32, device=device),
+        most,
+    )
+
+
+def _pack_grids(layout: SceneLayout, device: torch.device) -> Int[Tensor, "N"]:
+    """Where the texels of every head are, for ``row_of`` and ``texel_of``: a row of numbers for each head, then the
+    brick of every tile and the tile of every brick."""
+    grids, start = layout.grids, layout.num_heads * INTS.value
+    tiles, places = grids[0].tiles, grids[0].places
+    starts = [sum(len(b) for b in layout.biases[:k]) for k in range(len(grids))]
+    rows = [
+        (g.first_tile, g.depth, g.height, g.width, b, g.down, g.across, start + g.first_tile, start + len(tiles))
+        for g, b in zip(grids, starts, strict=True)
+    ]
+    head = torch.tensor(rows, dtype=torch.int32, device=device).reshape(-1)
+    return torch.cat([head, tiles.to(device), places.to(device, torch.int32)])
+
+
+def _head_row(mpi: MPIPlan, interval: float) -> list[float]:
+    u0, u1, v0, v1 = mpi.extent
+    slack = 16 * torch.finfo(torch.float32).eps / mpi.depth_share  # as in geometry.local_to_ndc
+    depth = [mpi.disparity_step, mpi.last_disparity, slack, 2 * mpi.near / mpi.depth_share]
+    return [*depth, u0, 2 / (u1 - u0), v0, 2 / (v1 - v0), interval]
+
+
+def block_size(wanted: int, device: torch.device) -> int:
+    """Rays or rows of a program. The interpreter runs one program after the other, so there the fewer the better."""
+    return wanted if device.type == "cuda" else 16 * wanted
+
+
+# Texels -------------------------------------------------------------------------------------------------------------
+
+
+@triton.jit
+def row_of(grids, head, plane, y, x, mask):
+    """Row of a head's texel in the pooled tables: with ``texel_of``, all that knows how texels are stored.
+
+    Where masked, plane, y and x may be out of range, and so may the row.
+    """
+    grid = grids + head * INTS
+    plane, y, x = plane.to(tl.int32), y.to(tl.int32), x.to(tl.int32)
+    tile = (plane * tl.load(grid + DOWN) + (y >> 3)) * tl.load(grid + ACROSS) + (x >> 3)
+    brick = tl.load(grids + tl.load(grid + BRICK_OF_TILE) + tile, mask, 0)
+    return (brick * 64 + ((y & 7) << 3) + (x & 7)).to(tl.int64)
+
+
+@triton.jit
+def texel_of(grids, row, mask, NUM_HEADS: tl.constexpr):
+    """Head, plane, y and x of a row, the inverse of ``row_of``; and whether it is any head's."""
+    of_brick = tl.load(grids + tl.load(grids + TILE_OF_BRICK) + (row >> 6), mask, 0)
+    held = mask & (of_brick >= 0)
+    of_brick = tl.maximum(of_brick, 0)
+    head = row.to(tl.int32) * 0
+    for k in tl.static_range(1, NUM_HEADS):
+        head += (of_brick >= tl.load(grids + k * INTS + FIRST_TILE)).to(tl.int32)
+    grid = grids + head * INTS
+    tile, across = of_brick - tl.load(grid + FIRST_TILE), tl.load(grid + ACROSS)
+    layer = across * tl.load(grid + DOWN)
+    plane = tile // layer
+    down = (tile - plane * layer) // across
+    return head, plane, down * 8 + ((row >> 3) & 7), tile % across * 8 + (row & 7), held
+
+
+@triton.jit
+def is_stored(row):
+    """Whether the tables hold anything at a row that ``row_of`` found."""
+    return row >= 64
+
+
+@triton.jit
+def cell(coordinate, size):
+    """Lower texel and fraction of a coordinate in [-1, 1] over ``size`` texels; outside it clamps to the border."""
+    last = (size - 1).to(tl.float32)
+    position = tl.minimum(tl.maximum((coordinate + 1) * (0.5 * last), 0.0), last)
+    lower = tl.minimum(tl.floor(position), last - 1)
+    return lower.to(tl.int64), position - lower
+
+
+@triton.jit
+def bilinear(table, grids, head, plane, u, v, mask):
+    """A one-channel table at NDC (u, v) on a plane; 0 where masked."""
+    x, fx = cell(u, tl.load(grids + head * INTS + WIDTH))
+    y, fy = cell(v, tl.load(grids + head * INTS + HEIGHT))
+    a = tl.load(table + row_of(grids, head, plane, y, x, mask), mask, 0.0)
+    b = tl.load(table + row_of(grids, head, plane, y, x + 1, mask), mask, 0.0)
+    c = tl.load(table + row_of(grids, head, plane, y + 1, x, mask), mask, 0.0)
+    d = tl.load(table + row_of(grids, head, plane, y + 1, x + 1, mask), mask, 0.0)
+    return (1 - fx) * (1 - fy) * a + fx * (1 - fy) * b + (1 - fx) * fy * c + fx * fy * d
+
+
+@triton.jit
+def trilinear(table, grids, head, u, v, s, mask):
+    """A one-channel table at NDC (u, v, s), s running over planes or layers; 0 where masked."""
+    z, fz = cell(s, tl.load(grids + head * INTS + DEPTH))
+    near = bilinear(table, grids, head, z, u, v, mask)
+    return near * (1 - fz) + bilinear(table, grids, head, z + 1, u, v, mask) * fz
+
+
+@triton.jit
+def nearest(coordinate, size):
+    """Texel nearest to a coordinate in [-1, 1]; halves go to the even one, as torch.round has it."""
+    last = (size - 1).to(tl.float32)
+    position = tl.minimum(tl.maximum((coordinate + 1) * (0.5 * last), 0.0), last)
+    down = tl.floor(position)
+    odd = down - 2 * tl.floor(0.5 * down)
+    up = ((position - down > 0.5) | ((position - down == 0.5) & (odd == 1))).to(tl.float32)
+    return (down + up).to(tl.int64)
+
+
+@triton.jit
+def nearest_row(grids, head, u, v, s, mask):
+    """Row of the texel nearest to NDC (u, v, s)."""
+    grid = grids + head * INTS
+    x, y = nearest(u, tl.load(grid + WIDTH)), nearest(v, tl.load(grid + HEIGHT))
+    return row_of(grids, head, nearest(s, tl.load(grid + DEPTH)), y, x, mask)
+
+
+# Arithmetic that stays exact where its plain form cancels ---------------------------------------------------------
+
+
+@triton.jit
+def twice_atanh(z):
+    """log((1 + z) / (1 - z)) for |z| <= 1/3, to a few ulp."""
+    q = z * z
+    p = 1.0 / 15
+    p = p * q + 1.0 / 13
+    p = p * q + 1.0 / 11
+    p = p * q + 1.0 / 9
+    p = p * q + 1.0 / 7
+    p = p * q + 1.0 / 5
+    p = p * q + 1.0 / 3
+    return 2 * z * (p * q + 1.0)
+
+
+@triton.jit
+def softplus(x):
+    """log(1 + e^x)."""
+    y = tl.exp(-tl.abs(x))
+    return tl.maximum(x, 0.0) + twice_atanh(y / (2 + y))
+
+
+@triton.jit
+def one_minus_exp(tau):
+    """1 - e^-tau for tau >= 0, also of thin samples."""
+    t = tl.minimum(tau, 0.5)
+    p = 1 - t * (1.0 / 8)
+    p = 1 - t * (1.0 / 7) * p
+    p = 1 - t * (1.0 / 6) * p
+    p = 1 - t * (1.0 / 5) * p
+    p = 1 - t * (1.0 / 4) * p
+    p = 1 - t * (1.0 / 3) * p
+    p = 1 - t * (1.0 / 2) * p
+    return tl.where(tau < 0.5, t * p, 1 - tl.exp(-tau))
+
+
+@triton.jit
+def minus_log_of_rest(alpha):
+    """-log(1 - alpha) for alpha in [0, 1/2)."""
+    return twice_atanh(alpha / (2 - alpha))
+
+
+@triton.jit
+def sin_turn(t):
+    """sin(pi t), to 1e-7. The library's sine keeps a table for huge angles in memory; there are none here."""
+    t -= 2 * tl.floor(0.5 * t + 0.5)
+    size = tl.abs(t)
+    z = tl.minimum(size, 1 - size) * 3.14159265
+    q = z * z
+    p = -1.0 / 39916800
+    p = p * q + 1.0 / 362880
+    p = p * q - 1.0 / 5040
+    p = p * q + 1.0 / 120
+    p = p * q - 1.0 / 6
+    sine = z + z * q * p
+    return tl.where(t < 0, -sine, sine)

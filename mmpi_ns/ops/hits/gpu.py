@@ -1,0 +1,135 @@
+"""Where rays cross planes, in one launch; the reference is ``geometry.plane_hits``, some eighty."""
+
+# Triton's language has no types that pyright knows: a kernel's functions seem to return nothing.
+# pyright: reportGeneralTypeIssues=false, reportCallIssue=false, reportArgumentType=false
+from __future__ import annotations
+
+import torch
+import triton
+import triton.language as tl
+from jaxtyping import Float
+from torch import Tensor
+
+from mmpi_ns.ops.gpu_scene import block_size
+from mmpi_ns.ops.layout import SceneLayout
+from mmpi_ns.scene.geometry import FACING_EPS, PlaneHits
+
+EPS = tl.constexpr(FACING_EPS)
+# Columns of an MPI's frame (``_pack``).
+ORIGIN = tl.constexpr(0)
+AXES = tl.constexpr(3)
+EXTENT = tl.constexpr(12)
+STEP = tl.constexpr(16)
+END = tl.constexpr(17)
+LAST = tl.constexpr(18)
+FLOATS = tl.constexpr(19)
+PAIRS = 128
+"""Rays times MPIs of a program."""
+
+
+@triton.jit
+def _rotate(axes, x, y, z):
+    """The frame's axes times a vector, in the order of ``geometry.rotate``."""
+    a = tl.load(axes) * x + tl.load(axes + 1) * y + tl.load(axes + 2) * z
+    b = tl.load(axes + 3) * x + tl.load(axes + 4) * y + tl.load(axes + 5) * z
+    return a, b, tl.load(axes + 6) * x + tl.load(axes + 7) * y + tl.load(axes + 8) * z
+
+
+@triton.jit
+def _narrow(low, high, never, p, q, step, end):
+    """The range of m within p (m step + end) <= q too."""
+    slope, rest = p * step, q - p * end
+    bound = rest / tl.where(slope == 0, 1.0, slope)
+    high = tl.where(slope > 0, tl.minimum(high, bound), high)
+    low = tl.where(slope < 0, tl.maximum(low, bound), low)
+    return low, high, never | ((slope == 0) & (rest < 0))
+
+
+@triton.jit
+def _is_live(m, p, q, oz, step, end, last):
+    """Whether plane m meets all conditions: they decide where the division may be off by one."""
+    w = m * step + end
+    live = (w * oz < 1) & (m >= 0) & (m <= last)
+    for i in tl.static_range(6):
+        live = live & (p[i] * w <= q[i])
+    return live
+
+
+@triton.jit
+def hits_kernel(
+    origins, directions, nears, fars, frames, firsts, counts, us, vs, local_origins, local_directions, size,
+    K: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """The live range of each ray in each MPI, and the affine maps from disparity to (u, v)."""
+    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    exists = i < size
+    at = tl.where(exists, i, 0)
+    ray, frame = at // K, frames + at % K * FLOATS
+    x, y, z = tl.load(origins + 3 * ray), tl.load(origins + 3 * ray + 1), tl.load(origins + 3 * ray + 2)
+    x, y, z = x - tl.load(frame), y - tl.load(frame + 1), z - tl.load(frame + 2)
+    ox, oy, oz = _rotate(frame + AXES, x, y, z)
+    dx, dy, dz = _rotate(
+        frame + AXES,
+        tl.load(directions + 3 * ray),
+        tl.load(directions + 3 * ray + 1),
+        tl.load(directions + 3 * ray + 2),
+    )
+    facing = dz > EPS
+    depth = tl.where(facing, dz, 1.0)
+    u, v = dx / depth, dy / depth
+    bend_u, bend_v = ox - oz * u, oy - oz * v
+    far, extent = 1 / tl.load(fars + ray), frame + EXTENT
+    p = (dz * tl.load(nears + ray) + oz, -(dz + oz * far), bend_u, -bend_u, bend_v, -bend_v)
+    q = (
+        far * 0 + 1,
+        -far,
+        tl.load(extent + 1) - u,
+        u - tl.load(extent),
+        tl.load(extent + 3) - v,
+        v - tl.load(extent + 2),
+    )
+    step, end, last = tl.load(frame + STEP), tl.load(frame + END), tl.load(frame + LAST)
+    low, high, never = tl.zeros([BLOCK], tl.float32), last + 0 * oz, oz != oz
+    for c in tl.static_range(6):
+        low, high, never = _narrow(low, high, never, p[c], q[c], step, end)
+    high = tl.where(never, -1.0, tl.maximum(tl.floor(high), -1.0))
+    low = tl.where(never, last + 1, tl.minimum(tl.ceil(low), last + 1))
+    more, less = _is_live(high + 1, p, q, oz, step, end, last), _is_live(high, p, q, oz, step, end, last)
+    high = tl.where(more, high + 1, tl.where(less, high, high - 1))
+    more, less = _is_live(low - 1, p, q, oz, step, end, last), _is_live(low, p, q, oz, step, end, last)
+    low = tl.where(more, low - 1, tl.where(less, low, low + 1))
+    tl.store(firsts + i, high.to(tl.int64), exists)
+    tl.store(counts + i, tl.where(facing, tl.maximum(high - low + 1, 0.0), 0.0).to(tl.int64), exists)
+    _store(us, vs, local_origins, local_directions, i, exists, (u, bend_u), (v, bend_v), (ox, oy, oz), (dx, dy, dz))
+
+
+@triton.jit
+def _store(us, vs, local_origins, local_directions, i, exists, u, v, origin, direction):
+    for a in tl.static_range(2):
+        tl.store(us + 2 * i + a, u[a], exists)
+        tl.store(vs + 2 * i + a, v[a], exists)
+    for a in tl.static_range(3):
+        tl.store(local_origins + 3 * i + a, origin[a], exists)
+        tl.store(local_directions + 3 * i + a, direction[a], exists)
+
+
+def plane_hits(origins: Tensor, directions: Tensor, nears: Tensor, fars: Tensor, layout: SceneLayout) -> PlaneHits:
+    """See ``geometry.plane_hits``; in float32."""
+    frames, count, device = layout.once("frames", _pack), len(layout.mpis), origins.device
+    shape, size = (len(origins), count), len(origins) * count
+    ranges = [torch.empty(shape, dtype=torch.int64, device=device) for _ in range(2)]
+    parts = [torch.empty(*shape, width, device=device) for width in (2, 2, 3, 3)]
+    if size:
+        block = block_size(PAIRS, device)
+        rays = (x.contiguous() for x in (origins, directions, nears, fars))
+        hits_kernel[(triton.cdiv(size, block),)](*rays, frames, *ranges, *parts, size, K=count, BLOCK=block)
+    return PlaneHits(*ranges, *parts)
+
+
+def _pack(layout: SceneLayout) -> Float[Tensor, "K 19"]:
+    """Origin, axes, extent, disparity step, last disparity and last plane of each MPI."""
+    frames = layout.frames
+    last = (frames.num_planes - 1).to(frames.nears.dtype)
+    columns = (frames.disparity_steps, frames.last_disparities, last)
+    parts = (frames.origins, frames.axes.flatten(1), frames.extents, torch.stack(columns, -1))
+    return torch.cat(parts, -1).float().contiguous()

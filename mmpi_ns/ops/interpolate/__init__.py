@@ -1,0 +1,110 @@
+"""Weighted sums of table rows: the gather behind every bilinear and trilinear lookup.
+
+The table's gradient is sparse over its rows, so that backward and optimiser cost follow the rows a batch touched, never
+the size of the table.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from mmpi_ns.ops import dispatch
+from mmpi_ns.ops.interpolate.reference import RowIndex
+from mmpi_ns.ops.layout import SceneLayout
+
+
+def texel_rows(
+    layout: SceneLayout, heads: Int[Tensor, "N"], planes: Int[Tensor, "N"], ndc: Float[Tensor, "N 3"]
+) -> tuple[Int[Tensor, "N 4"], Float[Tensor, "N 4"]]:
+    """``TexelGrid.bilinear`` of samples in several MPIs: the rows that each reads, and their weights."""
+    return dispatch.run("texel_rows", layout, heads, planes, ndc)
+
+
+def index_rows(rows: Int[Tensor, "..."], table_rows: int) -> RowIndex:
+    """The distinct rows, rising, that a list names of a table of so many. On a GPU waits once, for their number."""
+    return dispatch.run("index_rows", rows, table_rows)
+
+
+def sum_rows(
+    position: Int[Tensor, "N B"], values: Float[Tensor, "N C"], weights: Float[Tensor, "N B"] | None, count: int
+) -> Float[Tensor, "U C"]:
+    """For each of ``count`` rows the sum of weights[n, b] values[n] over its entries (None: B = 1, weights of 1).
+
+    On a GPU sums are atomic, so their last bits may differ from run to run.
+    """
+    return dispatch.run("sum_rows", position, values, weights, count)
+
+
+def interpolate(
+    table: Float[Tensor, "T C"], rows: Int[Tensor, "N B"], weights: Float[Tensor, "N B"]
+) -> Float[Tensor, "N C"]:
+    """sum_b weights[n, b] table[rows[n, b]]. The table's gradient is sparse over rows; weights get none.
+
+    Args:
+        table: texels, channels last.
+        rows: rows to combine for each output.
+        weights: their weights (constants).
+    """
+    return _Interpolate.apply(table, rows, weights.to(table.dtype))  # type: ignore[no-any-return]
+
+
+def gather_rows(table: Float[Tensor, "T C"], rows: Int[Tensor, "U"]) -> Float[Tensor, "U C"]:
+    """table[rows] for the distinct rows of ``index_rows``, with a sparse gradient: whatever reads the rows adds its
+    gradient densely, over U rows only."""
+    return _Gather.apply(table, rows)  # type: ignore[no-any-return]
+
+
+def interpolate_gathered(
+    gathered: Float[Tensor, "U C"], position: Int[Tensor, "N B"], weights: Float[Tensor, "N B"]
+) -> Float[Tensor, "N C"]:
+    """``interpolate`` on gathered rows, of which ``position`` counts; with a dense gradient."""
+    return _InterpolateGathered.apply(gathered, position, weights.to(gathered.dtype))  # type: ignore[no-any-return]
+
+
+class _Interpolate(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
+        ctx.save_for_backward(rows, weights)
+        ctx.table_shape = table.shape
+        return dispatch.run("weighted_rows", table, rows, weights)
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, None, None]:
+        rows, weights = ctx.saved_tensors
+        index = index_rows(rows, ctx.table_shape[0])
+        values = sum_rows(index.position, grad_outputs[0], weights, len(index.unique))
+        return _row_gradient(index.unique, values, ctx.table_shape), None, None
+
+
+class _Gather(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, table: Tensor, rows: Tensor) -> Tensor:
+        ctx.save_for_backward(rows)
+        ctx.table_shape = table.shape
+        return dispatch.run("take_rows", table, rows)
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor, None]:
+        return _row_gradient(ctx.saved_tensors[0], grad_outputs[0], ctx.table_shape), None
+
+
+class _InterpolateGathered(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, gathered: Tensor, position: Tensor, weights: Tensor) -> Tensor:
+        ctx.save_for_backward(position, weights)
+        ctx.count = gathered.shape[0]
+        return dispatch.run("weighted_rows", gathered, position, weights)
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor, None, None]:
+        position, weights = ctx.saved_tensors
+        return sum_rows(position, grad_outputs[0], weights, ctx.count), None, None
+
+
+def _row_gradient(rows: Int[Tensor, "U"], values: Float[Tensor, "U C"], shape: torch.Size) -> Tensor:
+    """A sparse gradient of the rows that ``index_rows`` found: rising, so what torch calls coalesced."""
+    return torch.sparse_coo_tensor(rows[None], values, shape, is_coalesced=True, check_invariants=False)

@@ -1,0 +1,182 @@
+"""Rows of tables on a GPU: which a batch reads, what is there, and sums over the entries of each (atomic)."""
+
+# Triton's language has no types that pyright knows: a kernel's functions seem to return nothing.
+# pyright: reportGeneralTypeIssues=false, reportCallIssue=false, reportArgumentType=false
+from __future__ import annotations
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from mmpi_ns.ops.gpu_scene import HEIGHT, INTS, WIDTH, GpuScene, block_size, cell, row_of
+from mmpi_ns.ops.interpolate.reference import RowIndex
+from mmpi_ns.ops.layout import SceneLayout
+
+ROWS = 128
+"""Samples, or rows, of a program."""
+
+
+# Which rows ---------------------------------------------------------------------------------------------------------
+
+
+@triton.jit
+def texel_rows_kernel(heads, planes, ndc, grids, rows, weights, count, BLOCK: tl.constexpr):
+    """Rows and weights of the four texels around samples."""
+    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    inside = i < count
+    head, plane = tl.load(heads + i, inside, 0), tl.load(planes + i, inside, 0)
+    grid = grids + head * INTS
+    x, fx = cell(tl.load(ndc + 3 * i, inside, 0.0), tl.load(grid + WIDTH))
+    y, fy = cell(tl.load(ndc + 3 * i + 1, inside, 0.0), tl.load(grid + HEIGHT))
+    for tap in tl.static_range(4):
+        dx, dy = tap % 2, tap // 2
+        weight = (fx if dx else 1 - fx) * (fy if dy else 1 - fy)
+        tl.store(rows + i * 4 + tap, row_of(grids, head, plane, y + dy, x + dx, inside), inside)
+        tl.store(weights + i * 4 + tap, weight, inside)
+
+
+def texel_rows(layout: SceneLayout, heads: Tensor, planes: Tensor, ndc: Tensor) -> tuple[Tensor, Tensor]:
+    """See ``ops.interpolate``."""
+    count, scene = len(heads), GpuScene.of(layout)
+    rows = torch.empty(count, 4, dtype=torch.int64, device=ndc.device)
+    weights = torch.empty(count, 4, device=ndc.device)
+    if count:
+        block = block_size(ROWS, ndc.device)
+        texel_rows_kernel[(triton.cdiv(count, block),)](
+            heads.contiguous(), planes.contiguous(), ndc.contiguous(), scene.grids, rows, weights, count, BLOCK=block
+        )
+    return rows, weights
+
+
+# Interpolation ------------------------------------------------------------------------------------------------------
+
+
+@triton.jit
+def weighted_rows_kernel(
+    table, rows, weights, out, count, channels, TAPS: tl.constexpr, CHANNELS: tl.constexpr, BLOCK: tl.constexpr
+):
+    """out[n] = sum_b weights[n, b] table[rows[n, b]]."""
+    i, c = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK), tl.arange(0, CHANNELS)
+    inside = i < count
+    both = inside[:, None] & (c < channels)[None, :]
+    total = tl.zeros([BLOCK, CHANNELS], tl.float32)
+    for tap in tl.static_range(TAPS):
+        row = tl.load(rows + i * TAPS + tap, inside, 0).to(tl.int64)
+        weight = tl.load(weights + i * TAPS + tap, inside, 0.0)
+        total += weight[:, None] * tl.load(table + row[:, None] * channels + c[None, :], both, 0.0)
+    tl.store(out + i[:, None] * channels + c[None, :], total, both)
+
+
+def weighted_rows(table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
+    """See ``ops.interpolate.reference``."""
+    count, channels = len(rows), table.shape[1]
+    out = torch.empty(count, channels, device=table.device)
+    if count:
+        block = block_size(ROWS, table.device)
+        weighted_rows_kernel[(triton.cdiv(count, block),)](
+            table, rows.contiguous(), weights.contiguous(), out, count, channels,
+            TAPS=rows.shape[1], CHANNELS=triton.next_power_of_2(channels), BLOCK=block,
+        )  # fmt: skip
+    return out
+
+
+@triton.jit
+def sum_rows_kernel(
+    positions, weights, values, out, count, channels,
+    TAPS: tl.constexpr, WEIGHTED: tl.constexpr, CHANNELS: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """out[positions[n, b]] += weights[n, b] values[n]."""
+    i, c = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK), tl.arange(0, CHANNELS)
+    inside = i < count
+    both = inside[:, None] & (c < channels)[None, :]
+    value = tl.load(values + i[:, None] * channels + c[None, :], both, 0.0)
+    for tap in tl.static_range(TAPS):
+        row = tl.load(positions + i * TAPS + tap, inside, 0).to(tl.int64)
+        part = value
+        if WEIGHTED:
+            part = tl.load(weights + i * TAPS + tap, inside, 0.0)[:, None] * value
+        tl.atomic_add(out + row[:, None] * channels + c[None, :], part, both, sem="relaxed")
+
+
+def sum_rows(position: Tensor, values: Tensor, weights: Tensor | None, count: int) -> Tensor:
+    """See ``ops.interpolate``."""
+    entries, channels = values.shape
+    out = torch.zeros(count, channels, device=values.device)
+    if entries:
+        block = block_size(ROWS, values.device)
+        sum_rows_kernel[(triton.cdiv(entries, block),)](
+            position.contiguous(), values if weights is None else weights.contiguous(), values.contiguous(), out,
+            entries, channels, TAPS=1 if weights is None else weights.shape[1], WEIGHTED=weights is not None,
+            CHANNELS=triton.next_power_of_2(channels), BLOCK=block,
+        )  # fmt: skip
+    return out
+
+
+# Distinct rows ------------------------------------------------------------------------------------------------------
+
+
+@triton.jit
+def mark_kernel(rows, words, count, BLOCK: tl.constexpr):
+    """Sets the bit of every row in words of 32."""
+    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    row = tl.load(rows + i, i < count, 0)
+    tl.atomic_or(words + (row >> 5), 1 << (row & 31).to(tl.int32), i < count, sem="relaxed")
+
+
+@triton.jit
+def _bits(word):
+    """How many bits of a 32-bit word are set."""
+    word = word - ((word >> 1) & 0x55555555)
+    word = (word & 0x33333333) + ((word >> 2) & 0x33333333)
+    return ((((word + (word >> 4)) & 0x0F0F0F0F) * 0x01010101) >> 24) & 0xFF
+
+
+@triton.jit
+def count_kernel(words, counts, size, BLOCK: tl.constexpr):
+    """counts[i] = set bits of words[i]."""
+    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    tl.store(counts + i, _bits(tl.load(words + i, i < size, 0)), i < size)
+
+
+@triton.jit
+def list_kernel(words, ends, unique, size, BLOCK: tl.constexpr):
+    """Writes the rows whose bits are set, rising; ``ends`` counts them up to the end of each word."""
+    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    word = tl.load(words + i, i < size, 0)
+    at = tl.load(ends + i, i < size, 0) - _bits(word)
+    for bit in tl.static_range(32):
+        is_set = ((word >> bit) & 1) == 1
+        tl.store(unique + at, i.to(tl.int64) * 32 + bit, is_set)
+        at += is_set.to(tl.int32)
+
+
+@triton.jit
+def position_kernel(rows, words, ends, position, count, BLOCK: tl.constexpr):
+    """Which of the distinct rows every entry is."""
+    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    row = tl.load(rows + i, i < count, 0)
+    word = tl.load(words + (row >> 5), i < count, 0)
+    not_before = word & (-1 << (row & 31).to(tl.int32))  # the row's own bit and those above it
+    tl.store(position + i, tl.load(ends + (row >> 5), i < count, 0) - _bits(not_before), i < count)
+
+
+def index_rows(rows: Tensor, table_rows: int) -> RowIndex:
+    """See ``ops.interpolate``. A bit for every row of the table, and a running count of those that are set."""
+    flat, device, block = rows.reshape(-1).contiguous(), rows.device, block_size(ROWS, rows.device)
+    count, size = len(flat), -(-table_rows // 32)
+    position = torch.empty(rows.shape, dtype=torch.int32, device=device)
+    if not count:
+        return RowIndex(flat, position)
+    words, counts = (
+        torch.zeros(size, dtype=torch.int32, device=device),
+        torch.empty(size, dtype=torch.int32, device=device),
+    )
+    entries, of_words = (triton.cdiv(count, block),), (triton.cdiv(size, block),)
+    mark_kernel[entries](flat, words, count, BLOCK=block)
+    count_kernel[of_words](words, counts, size, BLOCK=block)
+    ends = counts.cumsum(0, dtype=torch.int32)
+    unique = torch.empty(int(ends[-1]), dtype=torch.int64, device=device)
+    list_kernel[of_words](words, ends, unique, size, BLOCK=block)
+    position_kernel[entries](flat, words, ends, position, count, BLOCK=block)
+    return RowIndex(unique, position)

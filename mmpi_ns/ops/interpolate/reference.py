@@ -1,0 +1,59 @@
+"""Rows of tables in plain torch: which a batch reads, what it reads there, and sums over the entries of each."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from mmpi_ns.ops.layout import SceneLayout
+
+
+@dataclass(frozen=True)
+class RowIndex:
+    """Which rows a list of lookups reads, each once, and which of those every entry is."""
+
+    unique: Int[Tensor, "U"]
+    """Rising."""
+    position: Int[Tensor, "..."]
+    """Of every entry in ``unique``; int32 or int64."""
+
+
+def texel_rows(layout: SceneLayout, heads: Tensor, planes: Tensor, ndc: Tensor) -> tuple[Tensor, Tensor]:
+    """See ``ops.interpolate``."""
+    rows, weights = planes.new_zeros(len(heads), 4), ndc.new_zeros(len(heads), 4)
+    for k, grid in enumerate(layout.grids[: len(layout.mpis)]):
+        own = (heads == k).nonzero()[:, 0]
+        rows[own], weights[own] = grid.bilinear(planes[own], ndc[own])
+    return rows, weights
+
+
+def index_rows(rows: Tensor, table_rows: int) -> RowIndex:
+    """See ``ops.interpolate``."""
+    return RowIndex(*torch.unique(rows, return_inverse=True))
+
+
+def sum_rows(position: Tensor, values: Tensor, weights: Tensor | None, count: int) -> Tensor:
+    """See ``ops.interpolate``."""
+    out = torch.zeros(count, values.shape[1], dtype=values.dtype, device=values.device)
+    each = values if weights is None else (values[:, None, :] * weights[..., None]).reshape(-1, values.shape[1])
+    return out.index_add_(0, position.reshape(-1), each)
+
+
+def weighted_rows(table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
+    """Values of ``ops.interpolate.interpolate``: torch's embedding bag, on a CPU 3 to 6 times faster than indexing."""
+    return torch.nn.functional.embedding_bag(rows, table, per_sample_weights=weights, mode="sum")
+
+
+def take_rows(table: Tensor, rows: Tensor) -> Tensor:
+    """Values of ``ops.interpolate.gather_rows``."""
+    return table.index_select(0, rows)
+
+
+def interpolate(
+    table: Float[Tensor, "T C"], rows: Int[Tensor, "N B"], weights: Float[Tensor, "N B"]
+) -> Float[Tensor, "N C"]:
+    """``ops.interpolate.interpolate`` as it is defined, with a dense gradient: for tests."""
+    return (table[rows] * weights[..., None]).sum(1)

@@ -1,0 +1,357 @@
+"""All heads of a ray at once, front to back, to the samples that matter: the sampler's inner loop on a GPU.
+
+The reference is ``reference.march``, the CPU's counterpart ``march.cpp``. A program marches a few rays
+side by side. Which samples come next is arithmetic alone (every head's planes come near to far, so the nearest of the
+heads' next ones is taken), so a chunk of samples is chosen first and then looked up at once: its loads do not wait for
+each other. A ray ends where less than 1e-5 of its light is left, and less than a sample must weigh to be kept.
+"""
+
+# Triton's language has no types that pyright knows: a kernel's functions seem to return nothing.
+# pyright: reportGeneralTypeIssues=false, reportCallIssue=false, reportArgumentType=false
+from __future__ import annotations
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from mmpi_ns.ops.blending import BlendForm
+from mmpi_ns.ops.gpu_scene import (
+    BIAS,
+    DEPTH,
+    END,
+    FLOATS,
+    INTERVAL,
+    INTS,
+    S_SCALE,
+    SLACK,
+    STEP,
+    U0,
+    U_SCALE,
+    V0,
+    V_SCALE,
+    GpuScene,
+    bilinear,
+    block_size,
+    minus_log_of_rest,
+    nearest_row,
+    one_minus_exp,
+    softplus,
+    trilinear,
+)
+from mmpi_ns.ops.layout import SceneLayout, Tables
+from mmpi_ns.ops.march.reference import MergedSamples
+from mmpi_ns.scene.geometry import PlaneHits
+
+OPAQUE = tl.constexpr(1e-5)
+"""Light that may be lost behind the end of a ray."""
+NEGLIGIBLE = tl.constexpr(1e-4)
+"""Optical depths below this get an equal share without a lookup."""
+FAR_AWAY = tl.constexpr(1e-10)
+"""Inverse distances are no less where a distance is needed."""
+ULPS = tl.constexpr(16 * 2.0**-23)
+"""Slack of the border test, as in ``geometry.local_to_ndc``."""
+RAYS, STEPS = 16, 8
+"""Rays of a program (one warp), and samples that a ray looks up at once."""
+
+
+@triton.jit
+def _numbers(state, K: tl.constexpr, HEADS: tl.constexpr):
+    """m of each head's next plane, or number of the cube's next sample."""
+    first, _, done = state
+    is_mpi = (tl.arange(0, HEADS) < K)[None, :]
+    return tl.where(is_mpi, first - done, first + done)
+
+
+@triton.jit
+def _next_distances(state, constants, cube, path, K: tl.constexpr, HEADS: tl.constexpr, HAS_CUBE: tl.constexpr):
+    """1/t of each head's next sample; -1 where it has none left."""
+    _, count, done = state
+    oz, dz = path
+    head = tl.arange(0, HEADS)
+    is_mpi = head < K
+    number = _numbers(state, K, HEADS).to(tl.float32)
+    step = tl.load(constants + head * FLOATS + STEP, is_mpi, 0.0)[None, :]
+    w = number * step + tl.load(constants + head * FLOATS + END, is_mpi, 0.0)[None, :]
+    inverse_t = w * dz / (1 - w * oz)
+    if HAS_CUBE:
+        in_cube = 1 / ((tl.maximum(number, 0.0) + 0.5) * tl.load(cube + 6))
+        inverse_t = tl.where(is_mpi[None, :], inverse_t, in_cube)
+    return tl.where(done < count, inverse_t, -1.0)
+
+
+@triton.jit
+def _choose(state, constants, cube, path, K: tl.constexpr, HEADS: tl.constexpr, HAS_CUBE: tl.constexpr,
+            RAYS: tl.constexpr, STEPS: tl.constexpr):  # fmt: skip
+    """The next samples of each ray in the order of distance: head, number, 1/t (-1: none). Equal ones by head."""
+    first, count, done = state
+    column, head = tl.arange(0, STEPS)[None, :], tl.arange(0, HEADS)[None, :]
+    heads, numbers = tl.zeros([RAYS, STEPS], tl.int32), tl.zeros([RAYS, STEPS], tl.int32)
+    inverse_ts = tl.full([RAYS, STEPS], -1.0, tl.float32)
+    for i in tl.static_range(STEPS):
+        at = (first, count, done)
+        top, best = tl.max(_next_distances(at, constants, cube, path, K, HEADS, HAS_CUBE), 1, return_indices=True)
+        is_best = (head == best[:, None]) & (done < count)
+        number = tl.sum(tl.where(is_best, _numbers(at, K, HEADS), 0), 1)
+        here = column == i
+        heads = tl.where(here, best[:, None].to(tl.int32), heads)
+        numbers = tl.where(here, number[:, None], numbers)
+        inverse_ts = tl.where(here, top[:, None], inverse_ts)
+        done += is_best.to(tl.int32)
+    return heads, numbers, inverse_ts, done
+
+
+@triton.jit
+def _look_up(rays, scene, ray, head, number, wanted, K: tl.constexpr, HAS_CUBE: tl.constexpr):
+    """Plane, NDC and optical depth of samples."""
+    origins, directions, _, _, us, vs = rays
+    constants, grids, biases, cube, density, _, _ = scene
+    is_mpi = head < K
+    own = tl.where(is_mpi, head, 0)
+    mpi, at, in_mpi = constants + own * FLOATS, 2 * (ray[:, None] * K + own), wanted & is_mpi
+    end = tl.load(mpi + END)
+    w = number.to(tl.float32) * tl.load(mpi + STEP) + end
+    u = tl.load(us + at, in_mpi, 0.0) + w * tl.load(us + at + 1, in_mpi, 0.0)
+    v = tl.load(vs + at, in_mpi, 0.0) + w * tl.load(vs + at + 1, in_mpi, 0.0)
+    u = (u - tl.load(mpi + U0)) * tl.load(mpi + U_SCALE) - 1
+    v = (v - tl.load(mpi + V0)) * tl.load(mpi + V_SCALE) - 1
+    s = 1 - tl.load(mpi + S_SCALE) * (w - end)
+    plane = tl.load(grids + own * INTS + DEPTH).to(tl.int32) - 1 - number
+    raw = bilinear(density, grids, own, plane, u, v, in_mpi)
+    raw += tl.load(biases + tl.load(grids + own * INTS + BIAS) + plane, in_mpi, 0.0)
+    tau = softplus(raw) * tl.load(mpi + INTERVAL)
+    if HAS_CUBE:
+        in_cube = wanted & (head == K)
+        t = (tl.where(in_cube, number, 0).to(tl.float32) + 0.5) * tl.load(cube + 6)
+        x, y, z = _in_cube(origins, directions, cube, ray, t)
+        thick = softplus(trilinear(density, grids, K, x, y, z, in_cube) + tl.load(cube + 7))
+        tau = tl.where(is_mpi, tau, thick * tl.load(constants + K * FLOATS + INTERVAL))
+        u, v, s = tl.where(is_mpi, u, x), tl.where(is_mpi, v, y), tl.where(is_mpi, s, z)
+        plane = tl.where(is_mpi, plane, number)
+    return plane, u, v, s, tau
+
+
+@triton.jit
+def _in_cube(origins, directions, cube, ray, t):
+    """Points in the cube at distances t, normalised to [-1, 1]^3."""
+    at = 3 * ray[:, None]
+    x = tl.load(origins + at) + tl.load(directions + at) * t
+    y = tl.load(origins + at + 1) + tl.load(directions + at + 1) * t
+    z = tl.load(origins + at + 2) + tl.load(directions + at + 2) * t
+    x = 2 * (x - tl.load(cube)) / tl.load(cube + 3) - 1
+    y = 2 * (y - tl.load(cube + 1)) / tl.load(cube + 4) - 1
+    return x, y, 2 * (z - tl.load(cube + 2)) / tl.load(cube + 5) - 1
+
+
+@triton.jit
+def _in_mpi(rays, constants, ray, k, inverse_t, K: tl.constexpr):
+    """Where samples lie in MPI k, and whether inside its frustum."""
+    at, mpi = 3 * (ray[:, None] * K + k), constants + k * FLOATS
+    origin, direction = rays[2] + at, rays[3] + at
+    z = tl.load(origin + 2) * inverse_t + tl.load(direction + 2)
+    ahead = z > 0
+    depth = tl.where(ahead, z, 1.0)
+    u = ((tl.load(origin) * inverse_t + tl.load(direction)) / depth - tl.load(mpi + U0)) * tl.load(mpi + U_SCALE) - 1
+    v = (tl.load(origin + 1) * inverse_t + tl.load(direction + 1)) / depth - tl.load(mpi + V0)
+    v = v * tl.load(mpi + V_SCALE) - 1
+    s = 1 - tl.load(mpi + S_SCALE) * (inverse_t / depth - tl.load(mpi + END))
+    inside = ahead & (tl.abs(u) <= 1 + ULPS) & (tl.abs(v) <= 1 + ULPS) & (tl.abs(s) <= 1 + tl.load(mpi + SLACK))
+    return tl.where(ahead, u, 0.0), tl.where(ahead, v, 0.0), tl.where(ahead, s, 0.0), inside
+
+
+@triton.jit
+def _count_vote(votes, scene, k, head, ndc, thick):
+    """Adds head k's vote on samples: (own vote, highest of the others, sum of e^(other - highest))."""
+    own_vote, highest, others = votes
+    u, v, s, inside = ndc
+    _, grids, _, _, _, reliability, touched = scene
+    is_own = head == k
+    asked = thick & (inside | is_own)
+    vote = trilinear(reliability, grids, k, u, v, s, asked)
+    counts = asked & (head != k)
+    counts = counts & (tl.load(touched + nearest_row(grids, k, u, v, s, counts), counts, 0) > 0)
+    higher = tl.where(counts, tl.maximum(highest, vote), highest)
+    # -1e30 instead of -infinity: differences of it are numbers.
+    others = tl.where(counts, others * tl.exp(highest - higher) + tl.exp(vote - higher), others)
+    return tl.where(is_own, vote, own_vote), higher, others
+
+
+@triton.jit
+def _blend(rays, scene, ray, head, inverse_t, tau, wanted, K: tl.constexpr, HAS_CUBE: tl.constexpr):
+    """Optical depths after blending (``blending.blend_shares`` and ``blended_optical_depth``)."""
+    thick = wanted & (tau > NEGLIGIBLE)
+    votes = (tau * 0, tau * 0 - 1e30, tau * 0)
+    for k in range(K):
+        votes = _count_vote(votes, scene, k, head, _in_mpi(rays, scene[0], ray, k, inverse_t, K), thick)
+    if HAS_CUBE:
+        x, y, z = _in_cube(rays[0], rays[1], scene[3], ray, 1 / tl.maximum(inverse_t, FAR_AWAY))
+        inside = (inverse_t > 0) & (tl.abs(x) <= 1) & (tl.abs(y) <= 1) & (tl.abs(z) <= 1)
+        votes = _count_vote(votes, scene, K, head, (x, y, z, inside), thick)
+    own_vote, highest, others = votes
+    sole = others == 0
+    odds = tl.where(sole, 0.0, highest - own_vote + tl.log(tl.where(sole, 1.0, others)))
+    log_share, log_rest = -softplus(odds), -softplus(-odds)
+    alpha, lower = one_minus_exp(tau) * tl.exp(log_share), log_share - tau
+    opaque = tl.maximum(log_rest, lower) + softplus(-tl.abs(log_rest - lower))
+    blended = tl.where(alpha < 0.5, minus_log_of_rest(tl.minimum(alpha, 0.5)), tl.maximum(-opaque, 0.0))
+    blended = tl.where(sole, tau, blended)
+    return tl.where(thick, blended, tau / (K + HAS_CUBE))
+
+
+@triton.jit
+def _blend_baked(scene, head, ndc, tau, wanted, K: tl.constexpr, HAS_CUBE: tl.constexpr):
+    """Optical depths after blending with the shares that stand where reliability does."""
+    _, grids, _, _, _, shares, _ = scene
+    u, v, s = ndc
+    thick = wanted & (tau > NEGLIGIBLE)
+    share = tl.minimum(tl.maximum(trilinear(shares, grids, head, u, v, s, thick), 0.0), 1.0)
+    alpha = one_minus_exp(tau) * share
+    left = tl.where(share < 1, 1 - share + share * tl.exp(-tau), 1.0)
+    blended = tl.where(alpha < 0.5, minus_log_of_rest(tl.minimum(alpha, 0.5)), -tl.log(left))
+    blended = tl.where(share < 1, blended, tau)
+    return tl.where(thick, blended, tau / (K + HAS_CUBE))
+
+
+@triton.jit
+def _before(values, STEPS: tl.constexpr):
+    """Sum of the earlier columns. Summed, not subtracted: x - x loses what came before a large x."""
+    i = tl.arange(0, STEPS)
+    earlier = (i[:, None] > i[None, :])[None, :, :]
+    return tl.sum(tl.where(earlier, values[:, None, :], 0), 2)
+
+
+@triton.jit
+def march_kernel(
+    origins, directions, local_origins, local_directions, us, vs, firsts, counts,
+    constants, grids, biases, cube, density, reliability, touched,
+    kept, skipped_total, dropped_mass, heads, planes, ndc, inverse_ts, taus, skipped_before,
+    num_rays, room, threshold, fair_share,
+    K: tl.constexpr, HEADS: tl.constexpr, HAS_CUBE: tl.constexpr, BLENDS: tl.constexpr, BAKED: tl.constexpr,
+    KEEP_ALL: tl.constexpr, RAYS: tl.constexpr, STEPS: tl.constexpr,
+):  # fmt: skip
+    """Marches RAYS rays. What ray r keeps is written from r * room on; how much, to kept[r]."""
+    rays = (origins, directions, local_origins, local_directions, us, vs)
+    scene = (constants, grids, biases, cube, density, reliability, touched)
+    row = tl.program_id(0) * RAYS + tl.arange(0, RAYS)
+    exists = row < num_rays
+    ray, head_of = tl.where(exists, row, 0), tl.arange(0, HEADS)
+    at = ray[:, None] * (K + HAS_CUBE) + head_of[None, :]
+    has = exists[:, None] & (head_of < K + HAS_CUBE)[None, :]
+    first, count = tl.load(firsts + at, has, 0).to(tl.int32), tl.load(counts + at, has, 0).to(tl.int32)
+    local_z, in_mpi = 3 * (ray[:, None] * K + head_of[None, :]) + 2, (head_of < K)[None, :]
+    path = (tl.load(local_origins + local_z, in_mpi, 0.0), tl.load(local_directions + local_z, in_mpi, 0.0))
+    left = tl.sum(count, 1)
+    bound = tl.minimum(fair_share / tl.maximum(left, 1).to(tl.float32), threshold)
+    end_of_light = tl.minimum(bound, OPAQUE)
+    if KEEP_ALL:
+        bound, end_of_light = bound * 0 - 1, bound * 0 - 1
+    done, number_kept = count * 0, left * 0
+    depth, skipped, dropped = bound * 0, bound * 0, bound * 0
+    while tl.max(left, 0) > 0:
+        head, number, inverse_t, done = _choose(
+            (first, count, done), constants, cube, path, K, HEADS, HAS_CUBE, RAYS, STEPS
+        )
+        met = (inverse_t >= 0) & (left > 0)[:, None]
+        plane, u, v, s, tau = _look_up(rays, scene, ray, head, number, met, K, HAS_CUBE)
+        if BAKED:
+            tau = _blend_baked(scene, head, (u, v, s), tau, met, K, HAS_CUBE)
+        elif BLENDS:
+            tau = _blend(rays, scene, ray, head, inverse_t, tau, met, K, HAS_CUBE)
+        tau = tl.where(met, tau, 0.0)
+        light = tl.exp(-(depth[:, None] + _before(tau, STEPS)))
+        seen = met & (light > end_of_light[:, None])
+        weight = light * one_minus_exp(tau)
+        keep = seen & (weight > bound[:, None])
+        skip = tl.where(seen & (weight <= bound[:, None]), tau, 0.0)
+        slot = number_kept[:, None] + _before(keep.to(tl.int32), STEPS)
+        keep = keep & (slot < room)
+        to = ray[:, None].to(tl.int64) * room + slot
+        tl.store(heads + to, head, keep)
+        tl.store(planes + to, plane, keep)
+        tl.store(ndc + 3 * to, u, keep)
+        tl.store(ndc + 3 * to + 1, v, keep)
+        tl.store(ndc + 3 * to + 2, s, keep)
+        tl.store(inverse_ts + to, inverse_t, keep)
+        tl.store(taus + to, tau, keep)
+        tl.store(skipped_before + to, skipped[:, None] + _before(skip, STEPS), keep)
+        number_kept += tl.sum(keep.to(tl.int32), 1)
+        skipped += tl.sum(skip, 1)
+        dropped += tl.sum(tl.where(skip > 0, weight, 0.0), 1)
+        depth += tl.sum(tl.where(seen, tau, 0.0), 1)
+        # Where a ray ends early, the light left there is no less than what all the rest weighs.
+        unseen = tl.max(tl.where(met & (light <= end_of_light[:, None]), light, -1.0), 1)
+        left = tl.where(unseen >= 0, 0, left - STEPS)  # by rounds, so that no odd number can keep the loop going
+        ends = (left > 0) & (tl.exp(-depth) <= end_of_light)
+        dropped += tl.where(unseen >= 0, unseen, tl.where(ends, tl.exp(-depth), 0.0))
+        left = tl.where(ends, 0, left)
+    tl.store(kept + row, number_kept, exists)
+    tl.store(skipped_total + row, skipped, exists)
+    tl.store(dropped_mass + row, dropped, exists)
+
+
+@triton.jit
+def pack_kernel(
+    kept, heads, planes, ndc, inverse_ts, taus, skipped_before,
+    to_heads, to_planes, to_ndc, to_inverse_ts, to_taus, to_skipped_before, valid,
+    size, width, room, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Copies what the rays kept into ``width`` slots each; the rest of the slots is 0."""
+    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    inside = i < size
+    ray, slot = i // width, i % width
+    has = inside & (slot < tl.load(kept + ray, inside, 0))
+    at = ray * room + slot
+    tl.store(valid + i, has, inside)
+    tl.store(to_heads + i, tl.load(heads + at, has, 0).to(tl.int64), inside)
+    tl.store(to_planes + i, tl.load(planes + at, has, 0).to(tl.int64), inside)
+    for a in tl.static_range(3):
+        tl.store(to_ndc + 3 * i + a, tl.load(ndc + 3 * at + a, has, 0.0), inside)
+    tl.store(to_inverse_ts + i, tl.load(inverse_ts + at, has, 0.0), inside)
+    tl.store(to_taus + i, tl.load(taus + at, has, 0.0), inside)
+    tl.store(to_skipped_before + i, tl.load(skipped_before + at, has, 0.0), inside)
+
+
+def march(
+    layout: SceneLayout,
+    tables: Tables,
+    origins: Tensor,
+    directions: Tensor,
+    hits: PlaneHits,
+    first: Tensor,
+    counts: Tensor,
+    threshold: float,
+    fair_share: float,
+    form: BlendForm | None,
+    baked: bool,
+) -> MergedSamples:
+    """See ``ops.march``. Waits for the device once, to size the result."""
+    scene, device, num_rays = GpuScene.of(layout), origins.device, len(origins)
+    parts = (origins, directions, hits.local_origins, hits.local_directions, hits.u, hits.v, first, counts)
+    rays = [x.contiguous() for x in parts]
+    # Weights sum to at most 1, which bounds how many exceed the least that a sample must weigh.
+    most = scene.most_samples
+    room = most if threshold <= 0 else min(most, int(1.01 / min(threshold, fair_share / most)) + 2)
+    kept = torch.empty(num_rays, dtype=torch.int32, device=device)
+    left = torch.empty(2, num_rays, 1, device=device)
+    slots = [torch.empty(num_rays, room, dtype=torch.int32, device=device) for _ in range(2)]
+    slots += [torch.empty(num_rays, room, width, device=device) for width in (3, 1, 1, 1)]
+    if num_rays:
+        rays_at_once = block_size(RAYS, device)
+        march_kernel[(triton.cdiv(num_rays, rays_at_once),)](
+            *rays, *scene.constants(), *tables, kept, left[0], left[1], *slots,
+            num_rays, room, float(threshold), float(fair_share),
+            K=len(layout.mpis), HEADS=triton.next_power_of_2(layout.num_heads), HAS_CUBE=layout.cube is not None,
+            BLENDS=form is not None, BAKED=baked, KEEP_ALL=threshold <= 0, RAYS=rays_at_once, STEPS=STEPS, num_warps=1,
+        )  # fmt: skip
+    width = max(1, int(kept.max())) if num_rays else 1
+    return MergedSamples(*_pack(kept, slots, room, width), skipped_total=left[0], dropped_mass=left[1])
+
+
+def _pack(kept: Tensor, slots: list[Tensor], room: int, width: int) -> list[Tensor]:
+    """What the rays kept in ``width`` slots each, packed to the left."""
+    shape, size = (len(kept), width), len(kept) * width
+    types = (torch.int64, torch.int64, *[torch.float32] * 4, torch.bool)
+    out = [torch.empty((*shape, 3) if i == 2 else shape, dtype=t, device=kept.device) for i, t in enumerate(types)]
+    if size:
+        pack_kernel[(triton.cdiv(size, 1024),)](kept, *slots, *out, size, width, room, BLOCK=1024)
+    return out

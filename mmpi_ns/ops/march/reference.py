@@ -1,0 +1,301 @@
+"""Sample and merge in plain torch: looks up and sorts all live samples of a ray, then drops those of little weight.
+
+What the compiled marches are compared with, and what runs where there are none.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from mmpi_ns.ops.blending import BlendForm, blended_optical_depth, interpolate_shares, log_shares
+from mmpi_ns.ops.composite.reference import exclusive_cumsum
+from mmpi_ns.ops.interpolate import interpolate
+from mmpi_ns.ops.layout import SceneLayout, Tables
+from mmpi_ns.scene.geometry import LocalRays, PlaneHits, inverse_distance, sample_disparity
+
+BLEND_BLOCK = 16
+"""Samples a ray between two checks whether it is opaque already."""
+OPAQUE_DEPTH = 9.2
+"""exp(-9.2) = 1e-4 of the light: far below what a sample must weigh to be kept."""
+NEGLIGIBLE_DEPTH = 1e-4
+"""Samples thinner than this get an equal share without a lookup of reliabilities."""
+
+
+@dataclass(frozen=True)
+class MergedSamples:
+    """The samples of R rays that matter, nearest first in S slots a ray, and what the dropped ones leave behind."""
+
+    heads: Int[Tensor, "R S"]
+    planes: Int[Tensor, "R S"]
+    ndc: Float[Tensor, "R S 3"]
+    inverse_t: Float[Tensor, "R S"]
+    """0 in empty slots."""
+    tau: Float[Tensor, "R S"]
+    """Optical depth, blended where reliability takes part."""
+    skipped_before: Float[Tensor, "R S"]
+    """Optical depth of the dropped samples in front of each sample."""
+    valid: Bool[Tensor, "R S"]
+    skipped_total: Float[Tensor, "R 1"]
+    dropped_mass: Float[Tensor, "R 1"]
+    """Sum of the weights of the dropped samples."""
+
+
+@dataclass(frozen=True)
+class LiveSamples:
+    """A flat list of live samples: head by head, ray by ray, near to far."""
+
+    rays: Int[Tensor, "N"]
+    heads: Int[Tensor, "N"]
+    planes: Int[Tensor, "N"]
+    ndc: Float[Tensor, "N 3"]
+    inverse_t: Float[Tensor, "N"]
+    tau: Float[Tensor, "N"]
+
+
+def march(
+    layout: SceneLayout,
+    tables: Tables,
+    origins: Tensor,
+    directions: Tensor,
+    hits: PlaneHits,
+    first: Tensor,
+    counts: Tensor,
+    threshold: float,
+    fair_share: float,
+    form: BlendForm | None,
+    baked: bool,
+) -> MergedSamples:
+    """See ``ops.march``."""
+    num_mpis = len(layout.mpis)
+    samples = [_sample_mpi(k, counts[:, k], hits, layout, tables) for k in range(num_mpis)]
+    if layout.cube is not None:
+        samples.append(_sample_cube(first[:, -1], counts[:, -1], origins, directions, layout, tables))
+    flat = LiveSamples(*(torch.cat([getattr(s, f) for s in samples]) for f in LiveSamples.__dataclass_fields__))
+    order, valid = _sort(flat, counts)
+    tau = flat.tau
+    if form is not None and tau.numel():
+        local = LocalRays(origins, directions, hits.local_origins, hits.local_directions)
+        tau = _blend_visible(order, valid, flat, local, layout, tables, form, baked)
+    pruned = prune(order, valid, tau, threshold, fair_share)
+    order, valid = pruned.order, pruned.valid
+
+    def pick(values: Tensor) -> Tensor:
+        empty = values.new_zeros((*order.shape, *values.shape[1:]))
+        return values[order] if values.shape[0] else empty
+
+    return MergedSamples(
+        heads=pick(flat.heads),
+        planes=pick(flat.planes),
+        ndc=pick(flat.ndc),
+        inverse_t=torch.where(valid, pick(flat.inverse_t), 0.0),
+        tau=pick(tau),
+        skipped_before=pruned.skipped_before,
+        valid=valid,
+        skipped_total=pruned.skipped_total,
+        dropped_mass=pruned.dropped_mass,
+    )
+
+
+# Sample --------------------------------------------------------------------------------------------------------------
+
+
+def _sample_mpi(k: int, counts: Int[Tensor, "R"], hits: PlaneHits, layout: SceneLayout, tables: Tables) -> LiveSamples:
+    """All live planes of MPI k on every ray."""
+    rays, index = _enumerate(counts)
+    m = hits.m_first[:, k][rays] - index
+    ray = torch.cat(
+        [hits.u[:, k], hits.v[:, k], hits.local_origins[:, k, 2:], hits.local_directions[:, k, 2:]], -1
+    ).index_select(0, rays)
+    w = sample_disparity(m, layout.frames.disparity_steps[k], layout.frames.last_disparities[k])
+    mpi = layout.mpis[k]
+    u0, u1, v0, v1 = mpi.extent
+    u = (ray[:, 0] + w * ray[:, 1] - u0) * (2 / (u1 - u0)) - 1
+    v = (ray[:, 2] + w * ray[:, 3] - v0) * (2 / (v1 - v0)) - 1
+    s = 1 - 2 * mpi.near / mpi.depth_share * (w - mpi.last_disparity)
+    ndc = torch.stack([u, v, s], -1)
+    planes = mpi.planes - 1 - m
+    raw = interpolate(tables.density, *layout.grids[k].bilinear(planes, ndc))[:, 0]
+    tau = layout.optical_depth(k, raw, planes)
+    return LiveSamples(rays, torch.full_like(rays, k), planes, ndc, inverse_distance(w, ray[:, 4], ray[:, 5]), tau)
+
+
+def _sample_cube(
+    first: Tensor, counts: Tensor, origins: Tensor, directions: Tensor, layout: SceneLayout, tables: Tables
+) -> LiveSamples:
+    """All samples inside the cube, at fixed distances from each camera."""
+    assert layout.cube is not None
+    rays, index = _enumerate(counts)
+    index, k = first[rays] + index, len(layout.mpis)
+    t = (index + 0.5).to(origins.dtype) * layout.cube.step
+    ndc = layout.cube.normalised(origins[rays] + directions[rays] * t[:, None])
+    raw = interpolate(tables.density, *layout.grids[k].trilinear(ndc))[:, 0]
+    return LiveSamples(rays, torch.full_like(rays, k), index, ndc, 1 / t, layout.optical_depth(k, raw, index))
+
+
+def _enumerate(counts: Int[Tensor, "R"]) -> tuple[Int[Tensor, "N"], Int[Tensor, "N"]]:
+    """(ray, 0..count-1) for every sample, ray by ray."""
+    rays = torch.repeat_interleave(torch.arange(counts.shape[0], device=counts.device), counts)
+    starts = counts.cumsum(0) - counts
+    return rays, torch.arange(rays.shape[0], device=counts.device) - starts[rays]
+
+
+# Merge ---------------------------------------------------------------------------------------------------------------
+
+
+def _sort(flat: LiveSamples, counts: Int[Tensor, "R H"]) -> tuple[Int[Tensor, "R S"], Bool[Tensor, "R S"]]:
+    """The order of all samples along their rays (see ``merge``)."""
+    per_ray = counts.sum(-1)
+    width = max(1, int(per_ray.max())) if per_ray.numel() else 1
+    before = counts.cumsum(-1) - counts
+    number = torch.cat([_enumerate(own)[1] for own in counts.unbind(-1)])
+    slots = flat.rays * width + before[flat.rays, flat.heads] + number
+    presorted = bool(((counts > 0).sum(-1) <= 1).all())
+    return merge(slots, flat.inverse_t, per_ray, presorted)
+
+
+def merge(
+    slots: Int[Tensor, "N"],
+    inverse_t: Float[Tensor, "N"],
+    counts: Int[Tensor, "R"],
+    presorted: bool,
+) -> tuple[Int[Tensor, "R S"], Bool[Tensor, "R S"]]:
+    """Sort flat samples along their rays, nearest first.
+
+    Ties keep the order of the slots, which run over (head, plane), so the result does not depend on the batch.
+
+    Args:
+        slots: for each flat sample ray * S + position, positions counting (head, plane) within the ray.
+        inverse_t: inverse distance of each flat sample.
+        counts: samples of each ray; S = counts.max().
+        presorted: every ray met one head only, whose planes already come near to far.
+
+    Returns:
+        Index of each slot's sample in the flat list (0 in empty slots), and which slots hold one.
+    """
+    width = max(1, int(counts.max())) if counts.numel() else 1
+    num_rays = counts.shape[0]
+    index = torch.zeros(num_rays * width, dtype=torch.int64, device=slots.device)
+    index[slots] = torch.arange(slots.shape[0], device=slots.device)
+    index = index.view(num_rays, width)
+    valid = torch.arange(width, device=slots.device) < counts[:, None]
+    if presorted:
+        return index, valid
+    keys = torch.full((num_rays * width,), -1.0, dtype=inverse_t.dtype, device=slots.device)
+    keys[slots] = inverse_t
+    _, permutation = torch.sort(keys.view(num_rays, width), dim=-1, descending=True, stable=True)
+    return index.gather(-1, permutation), valid
+
+
+# Blend ---------------------------------------------------------------------------------------------------------------
+
+
+def _blend_visible(
+    order: Int[Tensor, "R S"],
+    valid: Bool[Tensor, "R S"],
+    flat: LiveSamples,
+    local: LocalRays,
+    layout: SceneLayout,
+    tables: Tables,
+    form: BlendForm,
+    baked: bool,
+) -> Float[Tensor, "N"]:
+    """Blended optical depths, front to back, until a ray lets less than exp(-OPAQUE_DEPTH) through.
+
+    Reliability costs a lookup in every head, and most samples lie behind the first surface: those keep their own depth,
+    which changes weights by less than exp(-OPAQUE_DEPTH).
+    """
+    tau = flat.tau.clone()
+    passed = tau.new_zeros(order.shape[0])
+    for start in range(0, order.shape[1], BLEND_BLOCK):
+        block = order[:, start : start + BLEND_BLOCK]
+        wanted = valid[:, start : start + BLEND_BLOCK] & (passed < OPAQUE_DEPTH)[:, None]
+        index = block[wanted]
+        if not index.numel():
+            break
+        tau[index] = _blend(index, flat, local, layout, tables, form, baked)
+        passed += torch.where(wanted, tau[block], 0.0).sum(-1)
+    return tau
+
+
+def _blend(
+    index: Int[Tensor, "M"],
+    flat: LiveSamples,
+    local: LocalRays,
+    layout: SceneLayout,
+    tables: Tables,
+    form: BlendForm,
+    baked: bool,
+) -> Float[Tensor, "M"]:
+    """Blended optical depth of some samples; those too thin to matter get an equal share without a lookup."""
+    tau = flat.tau[index]
+    thick = (tau > NEGLIGIBLE_DEPTH).nonzero()[:, 0]
+    own = index[thick]
+    if baked:
+        found = interpolate_shares(layout, tables.reliability, flat.ndc[own], flat.heads[own])
+        share = found.log(), torch.log1p(-found)
+    else:
+        asked = (flat.rays[own], local, flat.inverse_t[own], flat.heads[own])
+        share = log_shares(layout, tables.reliability, tables.touched, *asked)
+    blended = tau / layout.num_heads
+    return blended.index_copy(0, thick, blended_optical_depth(tau[thick], *share, form))
+
+
+# Prune ---------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Pruned:
+    """The samples that matter, packed to the left, and what the dropped ones leave behind."""
+
+    order: Int[Tensor, "R S"]
+    """Index into the flat list (0 in empty slots)."""
+    valid: Bool[Tensor, "R S"]
+    skipped_before: Float[Tensor, "R S"]
+    """Optical depth of the dropped samples in front of each kept sample."""
+    skipped_total: Float[Tensor, "R 1"]
+    dropped_mass: Float[Tensor, "R 1"]
+    """Sum of the weights of the dropped samples."""
+
+
+def prune(
+    order: Int[Tensor, "R S"], valid: Bool[Tensor, "R S"], tau: Float[Tensor, "N"], threshold: float, fair_share: float
+) -> Pruned:
+    """Keep the samples whose weight exceeds min(threshold, fair_share / samples on the ray).
+
+    The second bound matters at the start, when all weights are 1/L: a fixed threshold would keep nothing, and what is
+    not kept never learns.
+
+    Args:
+        order: all samples, nearest first (see ``merge``).
+        valid: which slots hold one.
+        tau: blended optical depth of the flat samples.
+        threshold: weight below which a sample is dropped once the field has sharpened; 0 keeps all.
+        fair_share: the bound relative to equal weights; inf for the threshold alone.
+    """
+    depth = torch.where(valid, tau[order] if tau.numel() else 0.0, 0.0)
+    weights = torch.exp(-exclusive_cumsum(depth)) * -torch.expm1(-depth)
+    count = valid.sum(-1, keepdim=True).clamp(min=1)
+    bound = (fair_share / count).clamp(max=threshold)
+    kept = valid & (weights > bound) if threshold > 0 else valid
+    skipped = torch.where(kept, torch.zeros_like(depth), depth)
+    before = exclusive_cumsum(skipped)
+
+    number = kept.sum(-1)
+    width = max(1, int(number.max())) if number.numel() else 1
+    rays, positions = kept.nonzero(as_tuple=True)
+    target = rays * width + torch.arange(rays.shape[0], device=rays.device) - (number.cumsum(0) - number)[rays]
+    kept_order = torch.zeros(kept.shape[0] * width, dtype=torch.int64, device=tau.device)
+    kept_order[target] = order[rays, positions]
+    skipped_before = torch.zeros(kept.shape[0] * width, dtype=depth.dtype, device=tau.device)
+    skipped_before[target] = before[rays, positions]
+    return Pruned(
+        order=kept_order.view(-1, width),
+        valid=torch.arange(width, device=tau.device) < number[:, None],
+        skipped_before=skipped_before.view(-1, width),
+        skipped_total=skipped.sum(-1, keepdim=True),
+        dropped_mass=torch.where(kept, 0.0, weights).sum(-1, keepdim=True),
+    )

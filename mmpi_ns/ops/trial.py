@@ -1,0 +1,202 @@
+"""Tries an operation's GPU form on a toy scene: on the device at hand it must make what the reference makes there.
+
+Also compiles what is tried: where a Triton release, a driver or an architecture cannot, that shows here and not in the
+first step of a training.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import fields, is_dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from mmpi_ns.ops import dispatch
+from mmpi_ns.ops.adam import AdamConstants
+from mmpi_ns.ops.gather.reference import KnownTaps
+from mmpi_ns.ops.layout import SceneLayout, Tables
+from mmpi_ns.scene.geometry import Cube, Frames, cube_hits, plane_hits
+from mmpi_ns.scene.plan import CubePlan, MPIPlan
+from mmpi_ns.scene.texels import BRICK, make_grids
+
+CLOSE = 1e-3
+"""Largest difference relative to the largest number: a wrong kernel is off by more, another order of sums by less."""
+RAYS, CHANNELS, ROWS = 40, 5, 300
+AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+
+
+class Disagreement(Exception):
+    """A kernel ran and made something else than its reference."""
+
+
+def run(name: str, device: str) -> None:
+    """Tries one operation on a device.
+
+    Raises:
+        Exception: whatever Triton, its compiler or the driver finds amiss.
+        Disagreement: the results differ.
+    """
+    for given in CASES[name](device):
+        found = _outcome(name, "gpu", given)
+        with dispatch.chosen("torch"):
+            wanted = _outcome(name, "reference", given)
+        for a, b in zip(found, wanted, strict=True):
+            if a.shape != b.shape:
+                raise Disagreement(f"it makes {list(a.shape)} numbers where plain torch makes {list(b.shape)}")
+            error = float((a - b).abs().max() / b.abs().max().clamp(min=1e-6)) if b.numel() else 0.0
+            if not error <= CLOSE:
+                raise Disagreement(f"it is off by {error:.2g} of the largest number that plain torch makes")
+
+
+def _outcome(name: str, form: dispatch.Form, given: tuple) -> list[Tensor]:
+    """All numbers that come of an operation, and its gradients where it has them."""
+    copies = tuple(x.detach().clone() if isinstance(x, Tensor) else x for x in given)
+    leaves = [
+        c.requires_grad_() for c, x in zip(copies, given, strict=True) if isinstance(x, Tensor) and x.requires_grad
+    ]
+    with torch.set_grad_enabled(bool(leaves)):
+        made = dispatch.function(name, form)(*copies)
+    found = _numbers(copies if made is None else made)
+    if leaves:
+        loss = sum((x * torch.linspace(-1, 1, x.numel(), device=x.device).view(x.shape)).sum() for x in found)
+        found += list(torch.autograd.grad(loss, leaves))  # type: ignore[arg-type]
+    return [x.detach().double() for x in found]
+
+
+def _numbers(made: Any) -> list[Tensor]:
+    if isinstance(made, Tensor):
+        return [made]
+    parts = [getattr(made, f.name) for f in fields(made)] if is_dataclass(made) else made
+    return [x for part in parts if isinstance(part, Tensor | tuple) for x in _numbers(part)]
+
+
+# Toy inputs ----------------------------------------------------------------------------------------------------------
+
+
+def _random(device: str, *shape: int) -> Tensor:
+    return torch.rand(*shape, generator=torch.Generator().manual_seed(sum(shape))).to(device)
+
+
+def _scene(device: str, with_cube: bool) -> tuple[SceneLayout, Tables]:
+    """Two thin MPIs that face the same way, with all texels stored, and a cube among their planes."""
+    mpis = tuple(
+        MPIPlan(str(k), (0.3 * k, 0.0, -0.5 * k), AXES, 1.0, (-1.0, 1.0, -0.8, 0.8), 6, 9, 11) for k in range(2)
+    )
+    shapes, cube = [(m.planes, m.height, m.width) for m in mpis], None
+    if with_cube:
+        plan = CubePlan((-1.0, -1.0, 2.0), (1.0, 1.0, 4.0), (4, 5, 6))
+        shapes, cube = [*shapes, plan.shape], Cube.pack(plan, 1.0, device=device)
+    tiles = torch.arange(1, make_grids(shapes)[0].tiles.numel() + 1, dtype=torch.int32)
+    grids = make_grids(shapes, tiles.to(device))
+    frames, rows = Frames.pack(mpis, device=device), len(grids[0].places) * BRICK
+    biases = [torch.full((m.planes,), -5.0, device=device) for m in mpis]
+    layout = SceneLayout(mpis, frames, grids, biases, 1.0, cube, -5.0, 1.0)
+    touched = (_random(device, rows) > 0.2).to(torch.uint8)
+    return layout, Tables(_random(device, rows, 1) - 0.5, _random(device, rows, 1), touched)
+
+
+def _rays(device: str) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Origins, directions, nears and fars."""
+    origins = _random(device, RAYS, 3) * 0.4 - 0.2
+    directions = torch.cat([_random(device, RAYS, 2) - 0.5, torch.ones(RAYS, 1, device=device)], -1)
+    near = torch.full((RAYS, 1), 0.05, device=device)
+    return origins, torch.nn.functional.normalize(directions, dim=-1), near, torch.full_like(near, torch.inf)
+
+
+def _marches(device: str) -> list[tuple]:
+    cases = []
+    for with_cube, threshold, form, baked in (
+        (True, 0.0, None, False),
+        (True, 0.01, "paper", False),
+        (False, 0.01, "paper", True),
+    ):
+        layout, tables = _scene(device, with_cube)
+        rays = _rays(device)
+        hits = plane_hits(*rays, layout.frames)
+        first, counts = hits.m_first, hits.count
+        if layout.cube is not None:
+            start, number = cube_hits(*rays, layout.cube)
+            first, counts = torch.cat([first, start[:, None]], -1), torch.cat([counts, number[:, None]], -1)
+        cases.append((layout, tables, *rays[:2], hits, first, counts, threshold, float("inf"), form, baked))
+    return cases
+
+
+def _entries(device: str, *shape: int) -> Tensor:
+    """Rows of a table of ``ROWS``, many of them several times."""
+    return (_random(device, *shape) * (ROWS // 3)).long() * 3
+
+
+def _texels(device: str) -> list[tuple]:
+    heads = (torch.arange(RAYS, device=device) * 2) // RAYS
+    return [(_scene(device, True)[0], heads, heads + 2, 2 * _random(device, RAYS, 3) - 1)]
+
+
+def _sums(device: str) -> list[tuple]:
+    values, weights = _random(device, RAYS, CHANNELS), _random(device, RAYS, 4)
+    return [
+        (_entries(device, RAYS, 4).int(), values, weights, ROWS),
+        (_entries(device, RAYS, 1).int(), values, None, ROWS),
+    ]
+
+
+def _composites(device: str) -> list[tuple]:
+    tau, valid = _random(device, RAYS, 20) ** 3, torch.arange(20, device=device) < _entries(device, RAYS, 1)
+    return [(tau.requires_grad_(), valid, 0.01 * _random(device, RAYS, 20), _random(device, RAYS, 1))]
+
+
+def _variations(device: str) -> list[tuple]:
+    layout = _scene(device, True)[0]
+    table = 3 * _random(device, len(layout.grids[0].places) * BRICK, CHANNELS)
+    rows = torch.cat([grid.rows for grid in layout.grids])[::3]
+    return [(table[rows].requires_grad_(), table, rows, layout, [(0.5, 2.0, 1.0)] * layout.num_heads)]
+
+
+def _adams(device: str) -> list[tuple]:
+    tables = [_random(device, ROWS, CHANNELS) for _ in range(3)]
+    grad = _random(device, ROWS // 3, CHANNELS) - 0.5
+    rows = 3 * torch.arange(ROWS // 3, device=device)
+    return [(*tables, rows, grad * (grad.abs() > 0.1), AdamConstants(0.9, 0.99, 0.2, 1e-8, 0.1))]
+
+
+def _gathers(device: str) -> list[tuple]:
+    """Samples with known texels, of planes and of both planes and the cube; texels with gradients and without."""
+    weights, wanted = 0.1 * _random(device, RAYS, 4), torch.arange(RAYS, device=device) % 5 > 0
+    cases = []
+    for sizes, learns in (((4,), True), ((4, 8), False), ((4, 8), True)):
+        groups = [KnownTaps(_entries(device, RAYS, n).int(), _random(device, RAYS, n) / n) for n in sizes]
+        slots = torch.cat([4 * torch.arange(RAYS, device=device) + i for i in range(len(sizes))])
+        values = (2 * _random(device, ROWS, CHANNELS) - 1).requires_grad_(learns)
+        cases.append((values, groups, slots, weights.clone().requires_grad_(), wanted))
+    return cases
+
+
+def _places(device: str) -> list[tuple]:
+    cases = []
+    for with_cube in (False, True):
+        layout, shape = _scene(device, with_cube)[0], (RAYS, 6)
+        table = 2 * _random(device, len(layout.grids[0].places) * BRICK, CHANNELS) - 1
+        heads = (_random(device, *shape) * layout.num_heads).long()
+        places = (heads, (_random(device, *shape) * 4).long(), 2 * _random(device, *shape, 3) - 1)
+        cases.append((layout, table, *places, _random(device, *shape) > 0.3, 0.1 * _random(device, *shape)))
+    return cases
+
+
+CASES: dict[str, Callable[[str], list[tuple]]] = {
+    "plane_hits": lambda device: [(*_rays(device), _scene(device, False)[0])],
+    "march": _marches,
+    "texel_rows": _texels,
+    "weighted_rows": lambda device: [
+        (_random(device, ROWS, CHANNELS), _entries(device, RAYS, taps), _random(device, RAYS, taps)) for taps in (4, 8)
+    ],
+    "index_rows": lambda device: [(_entries(device, RAYS, 4), ROWS)],
+    "sum_rows": _sums,
+    "composite_weights": _composites,
+    "total_variation": _variations,
+    "adam_rows": _adams,
+    "gather_taps": _gathers,
+    "gather_places": _places,
+    "shade": lambda device: [],
+}
+"""Arguments for every operation that has a GPU form."""

@@ -1,0 +1,73 @@
+"""Total variation on a GPU: value and gradient in one launch."""
+
+# Triton's language has no types that pyright knows: a kernel's functions seem to return nothing.
+# pyright: reportGeneralTypeIssues=false, reportCallIssue=false, reportArgumentType=false
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from mmpi_ns.ops.gpu_scene import DEPTH, HEIGHT, INTS, WIDTH, GpuScene, block_size, is_stored, row_of, texel_of
+from mmpi_ns.ops.layout import SceneLayout
+from mmpi_ns.ops.variation.reference import Scales
+
+ROWS = 128
+"""Texels of a program."""
+
+
+@triton.jit
+def variation_kernel(
+    rows, values, table, grids, scales, gradient, totals, count, channels,
+    NUM_HEADS: tl.constexpr, CHANNELS: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Huber loss of the differences of texels with their neighbours, which are held fixed, and its gradient."""
+    i, c = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK), tl.arange(0, CHANNELS)
+    inside, is_channel = i < count, (c < channels)[None, :]
+    head, plane, y, x, inside = texel_of(grids, tl.load(rows + i, inside, 0), inside, NUM_HEADS)
+    grid = grids + head * INTS
+    own = tl.load(values + i[:, None] * channels + c[None, :], inside[:, None] & is_channel, 0.0)
+    slope, total = own * 0, own * 0
+    for way in tl.static_range(6):
+        axis, side = way // 2, way % 2 * 2 - 1
+        nx, ny, nz = x + (side if axis == 0 else 0), y + (side if axis == 1 else 0), plane + (side if axis == 2 else 0)
+        exists = inside & (nx >= 0) & (nx < tl.load(grid + WIDTH)) & (ny >= 0) & (ny < tl.load(grid + HEIGHT))
+        exists = exists & (nz >= 0) & (nz < tl.load(grid + DEPTH))
+        row = row_of(grids, head, nz, ny, nx, exists)
+        exists = (exists & is_stored(row))[:, None] & is_channel
+        difference = tl.where(exists, own - tl.load(table + row[:, None] * channels + c[None, :], exists, 0.0), 0.0)
+        size, scale = tl.abs(difference), tl.load(scales + 3 * head + axis)[:, None] / 6
+        slope += scale * tl.minimum(tl.maximum(difference, -1.0), 1.0)
+        total += scale * tl.where(size <= 1, 0.5 * difference * difference, size - 0.5)
+    tl.store(gradient + i[:, None] * channels + c[None, :], slope, (i < count)[:, None] & is_channel)
+    tl.store(totals + tl.program_id(0), tl.sum(tl.sum(total, 1), 0))
+
+
+class _Variation(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, table: Tensor, rows: Tensor, grids: Tensor, scales: Tensor) -> Tensor:
+        count, channels = values.shape
+        block = block_size(ROWS, values.device)
+        gradient, programs = torch.empty_like(values), triton.cdiv(count, block)
+        totals = torch.zeros(max(1, programs), device=values.device)
+        if count:
+            variation_kernel[(programs,)](
+                rows.contiguous(), values.contiguous(), table, grids, scales, gradient, totals, count, channels,
+                NUM_HEADS=len(scales), CHANNELS=triton.next_power_of_2(channels), BLOCK=block,
+            )  # fmt: skip
+        ctx.save_for_backward(gradient)
+        return totals.sum()
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
+        return ctx.saved_tensors[0] * grad_outputs[0], None, None, None, None
+
+
+def total_variation(values: Tensor, table: Tensor, rows: Tensor, layout: SceneLayout, scales: Scales) -> Tensor:
+    """See ``ops.variation``."""
+    device = values.device
+    weights = layout.once(f"scales {scales}", lambda _: torch.tensor(scales, dtype=torch.float32, device=device))
+    return _Variation.apply(values, table, rows, GpuScene.of(layout).grids, weights)  # type: ignore[no-any-return]

@@ -1,0 +1,248 @@
+"""The Triton kernels by Triton's interpreter, on a CPU: run by test_gpu.py in a process with TRITON_INTERPRET=1."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import oracle
+import pytest
+import torch
+from bricked import bricked_field
+from hand_made import make_mpi, random_mpi, unit
+from interpreting import by_torch, interpreted, normal  # noqa: F401
+from random_fields import OracleRay, bundle, fill, random_field, random_rays, render
+
+from mmpi_ns.field.mmpi_field import MMPIField
+from mmpi_ns.field.samples import metadata_of
+from mmpi_ns.ops import blending, composite
+from mmpi_ns.ops.hits import plane_hits
+from mmpi_ns.ops.march import gpu, reference
+from mmpi_ns.rendering.sampler import MMPISampler
+from mmpi_ns.scene.plan import CubePlan, ScenePlan
+
+# Hits ----------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("far", [math.inf, 6.0])
+def test_rays_cross_the_planes_that_the_oracle_has(far):
+    rng, checked = np.random.default_rng(1), 0
+    plan = ScenePlan((*(random_mpi(rng, f"{k}", deep=d) for k, d in enumerate((math.inf, 1.01, 8.0))),), None, 0.3, 1.0)
+    field = MMPIField(plan)
+    origins, directions = random_rays(plan, 60, seed=2)
+    rays = bundle(origins, directions, near=0.3, far=far)
+    hits = plane_hits(rays.origins, rays.directions, rays.nears, rays.fars, field.layout)
+    assert hits.count.dtype == hits.m_first.dtype == torch.int64 and (hits.count == 0).any()
+    for i in range(60):
+        for k, mpi in enumerate(plan.mpis):
+            found = oracle.crossings(mpi, origins[i], directions[i], 0.3, far)
+            if min(c.margin for c in found) < 1e-5:
+                continue
+            live, checked = [c.plane for c in found if c.live], checked + 1
+            assert hits.count[i, k] == len(live)
+            assert not live or mpi.planes - 1 - int(hits.m_first[i, k]) == min(live)
+    assert checked > 100
+
+
+def test_hits_of_hard_rays_are_those_of_the_reference():
+    plan = hard_plan()
+    field, (origins, directions) = MMPIField(plan), (np.array(x, float) for x in zip(*HARD_RAYS.values(), strict=True))
+    rays = bundle(origins, np.stack([unit(d) for d in directions]))
+    found = plane_hits(rays.origins, rays.directions, rays.nears, rays.fars, field.layout)
+    wanted = by_torch(lambda: plane_hits(rays.origins, rays.directions, rays.nears, rays.fars, field.layout))
+    assert torch.equal(found.count, wanted.count) and (wanted.count > 0).any()
+    live = wanted.count > 0
+    assert torch.equal(found.m_first[live], wanted.m_first[live])
+    for name in ("u", "v", "local_origins", "local_directions"):
+        assert torch.allclose(getattr(found, name), getattr(wanted, name), rtol=1e-5, atol=1e-5), name
+
+
+# March ---------------------------------------------------------------------------------------------------------------
+
+
+def compare(field, rays, threshold, form=None, **chosen):
+    """The kernel's samples are the reference's; returns the kernel's rendering and the reference's."""
+    fast = render(field, rays, threshold, form, **chosen)
+    plain = by_torch(lambda: render(field, rays, threshold, form, **chosen))
+    kept, wanted = fast.samples.metadata, plain.samples.metadata
+    assert kept["valid"].shape == wanted["valid"].shape
+    # A sample whose weight is the threshold's to the last bits may fall on either side of it.
+    same = (kept["valid"].sum(1) == wanted["valid"].sum(1))[:, 0]
+    assert same.float().mean() >= 0.95
+    valid = wanted["valid"][same][..., 0]
+    for name, error in (("heads", 0), ("planes", 0), ("ndc", 2e-6), ("inverse_t", 3e-5), ("tau", 2e-5)):
+        a, b = (m[name][same][valid].double() for m in (kept, wanted))
+        assert ((a - b).abs() <= error * (1 + b.abs())).all(), name
+        assert kept[name].dtype == wanted[name].dtype
+        assert (kept[name][~kept["valid"][..., 0]] == 0).all(), "empty slots are 0"
+    before = [m["skipped_before"][same][valid] for m in (kept, wanted)]
+    assert torch.allclose(*before, atol=2e-5)
+    assert torch.equal(fast.report.live, plain.report.live)
+    difference = (fast.report.dropped_mass - plain.report.dropped_mass)[same]
+    if difference.numel():
+        assert difference.min() > -2e-6 and difference.max() < 1.2e-5, "what is not visited counts as dropped"
+        assert (fast.composite.transmittance - plain.composite.transmittance).abs()[same].max() < 1.2e-5
+        assert (fast.rgb - plain.rgb).abs()[same].max() < 3e-5
+    return fast, plain
+
+
+@pytest.mark.parametrize("form", ["paper", None])
+@pytest.mark.parametrize("threshold", [0.0, 1e-2])
+def test_the_march_keeps_what_the_reference_keeps(monkeypatch, form, threshold):
+    monkeypatch.setattr(reference, "OPAQUE_DEPTH", math.inf)  # the reference stops blending at 1e-4 of the light
+    field = random_field(3, True, seed=3, planes=14)
+    _, plain = compare(field, bundle(*random_rays(field.plan, 40, seed=1)), threshold, form)
+    valid = plain.samples.metadata["valid"]
+    assert plain.samples.metadata["heads"][valid].unique().numel() == 4
+    assert (plain.report.dropped_mass > 1e-3).any() == (threshold > 0)
+
+
+def test_baked_shares_blend_like_the_reference(monkeypatch):
+    monkeypatch.setattr(reference, "OPAQUE_DEPTH", math.inf)
+    field = random_field(3, True, seed=4, planes=14, log_depths=(-5, 1.5))
+    rays = bundle(*random_rays(field.plan, 40, seed=1))
+    shares = torch.rand(len(field.density), 1, generator=torch.Generator().manual_seed(1)) * 1.4 - 0.2  # clamped
+    given = {"field": field, "threshold": 0.0, "blend_form": "paper", "shares": shares}
+    fast = MMPISampler()(rays, **given)[0].metadata
+    plain = by_torch(lambda: MMPISampler()(rays, **given)[0].metadata)
+    same = (fast["valid"].sum(1) == plain["valid"].sum(1))[:, 0]
+    a, b = (m["tau"][same][m["valid"][same]] for m in (fast, plain))
+    assert same.float().mean() > 0.9 and (a > 2).any()
+    assert ((a - b).abs() <= 2e-4 * b + 1e-6).float().mean() > 0.999
+
+
+def test_rays_pass_what_holds_nothing_like_the_reference():
+    field = bricked_field(0.4)
+    compare(field, bundle(*random_rays(field.plan, 40, seed=1)), 1e-3, "paper")
+
+
+def test_nine_heads_and_several_programs_march_like_the_reference(monkeypatch):
+    monkeypatch.setattr(gpu, "block_size", lambda wanted, device: 16)
+    field = random_field(9, False, seed=9, planes=10)
+    compare(field, bundle(*random_rays(field.plan, 37, seed=1)), 1e-3)
+
+
+def test_a_fair_share_keeps_what_a_threshold_alone_would_drop():
+    field = MMPIField(ScenePlan((make_mpi(planes=40),), None, 0.05, 1.0)).eval()  # all weights are 1/40
+    rays = bundle([[0, 0, 0]], [[0, 0, 1]])
+    assert compare(field, rays, 0.1)[0].samples.metadata["valid"].sum() == 0
+    assert compare(field, rays, 0.1, fair_share=0.1)[0].samples.metadata["valid"].sum() == 40
+
+
+def test_rays_render_as_the_oracle_has_them():
+    field = random_field(3, True, seed=5, planes=10)
+    origins, directions = random_rays(field.plan, 30, seed=6)
+    for form in ("paper", None):
+        fast, checked = render(field, bundle(origins, directions), blend_form=form), 0
+        for i in range(30):
+            exact = OracleRay(field, origins[i], directions[i])
+            if exact.margin < 1e-5:
+                continue
+            wanted, checked = exact.render(form), checked + 1
+            assert int(fast.samples.metadata["valid"][i].sum()) == len(wanted.samples)
+            assert np.abs(fast.rgb[i].double().numpy() - wanted.color).max() < 5e-5
+            weights = fast.composite.weights[i, : len(wanted.samples)].double().numpy()
+            assert np.abs(weights - wanted.weights).max() < 5e-5
+            assert fast.composite.transmittance[i].item() == pytest.approx(wanted.transmittance, abs=5e-5)
+        assert checked > 15
+
+
+def hard_plan(**changes):
+    twin = make_mpi("twin", planes=12)
+    cube = CubePlan((-1.0, -1.0, 2.0), (1.0, 1.0, 4.0), (4, 4, 4))
+    return ScenePlan((make_mpi(planes=12), twin, make_mpi("ends", near=0.5, far=3.0, planes=5)), cube, 0.05, 1.0)
+
+
+HARD_RAYS = {
+    "along the planes": ([0, 0, 1.5], [1, 0, 0]),
+    "nearly along the planes": ([0, 0, 2], [1, 0, 2e-6]),
+    "from a plane": ([0.1, 0.1, 1.0], [0, 0, 1]),
+    "from behind all finite planes": ([0, 0, 500.0], [0.1, 0, 1]),
+    "backwards": ([0, 0, 5], [0, 0, -1]),
+    "on the border of the frustum": ([0, 0, 0], [1, 0.5, 1]),
+    "on the axis": ([0, 0, 0], [0, 0, 1]),
+    "into a corner of the cube": ([0, 0, 0], [0.5, 0.5, 2.0]),
+    "from inside the cube": ([0.2, 0.1, 3.0], [0.3, 0.2, 1.0]),
+    "from far away": ([0, 0, -1e5], [0, 0, 1]),
+}
+
+
+@pytest.mark.parametrize("raw", [0.0, 1e4, -1e4])
+def test_hard_rays_through_thin_and_opaque_planes_march_like_the_reference(monkeypatch, raw):
+    """Two MPIs coincide, so that every distance is a tie; raw densities make alpha 1 or 0."""
+    monkeypatch.setattr(reference, "OPAQUE_DEPTH", math.inf)
+    field = MMPIField(hard_plan(), feature_channels=5, hidden_width=6)
+    field.reliability.data.normal_(generator=torch.Generator().manual_seed(1))
+    field.density.data.fill_(raw)
+    field.touched.fill_(1)
+    origins, directions = (np.array(x, float) for x in zip(*HARD_RAYS.values(), strict=True))
+    rays = bundle(origins, np.stack([unit(d) for d in directions]))
+    for form, threshold in ((None, 0.0), (None, 1e-3), ("paper", 1e-3)):
+        fast, _ = compare(field.eval(), rays, threshold, form)
+        found = fast.samples.metadata
+        tensors = [fast.rgb, fast.composite.weights, fast.report.dropped_mass, *found.values()]
+        assert all(torch.isfinite(t.float()).all() for t in tensors)
+    names = list(HARD_RAYS)
+    heads = found["heads"][names.index("on the axis")][found["valid"][names.index("on the axis")]]
+    assert raw != 0 or (heads == 1).any(), "equal distances: the twin's samples follow the first MPI's"
+    assert fast.report.live[names.index("along the planes")] == 0 and fast.report.live[names.index("backwards")] > 0
+
+
+def test_behind_an_opaque_plane_the_march_visits_nothing_and_loses_a_hundred_thousandth():
+    field = MMPIField(ScenePlan((make_mpi(planes=64),), None, 0.05, 1.0)).eval()
+    field.density.data[field.grids[0].rows[: 10 * field.grids[0].height * field.grids[0].width]] = 30.0
+    found = render(field, bundle([[0, 0, 0]], [[0, 0, 1]]), threshold=1e-3)
+    assert found.report.live.item() == 64 and found.samples.metadata["valid"].sum() == 1
+    assert found.report.skipped_total.item() == 0 and found.report.dropped_mass.item() <= 1e-5
+
+
+def test_without_rays_or_samples_there_is_nothing_to_march():
+    field = MMPIField(ScenePlan((make_mpi(),), None, 0.05, 1.0)).eval()
+    away = render(field, bundle([[0, 0, 0]], [[0, 0, -1]]), blend_form="paper")
+    assert away.samples.metadata["valid"].sum() == 0 and away.composite.accumulation.item() == 0
+    samples, report = MMPISampler()(bundle(torch.zeros(0, 3), torch.zeros(0, 3)), field=field, threshold=1e-3)
+    assert samples.shape[0] == 0 and report.live.shape == (0,)
+
+
+def test_densities_that_are_no_numbers_end_the_march_all_the_same():
+    field = random_field(2, False, seed=1, planes=10)
+    field.density.data.fill_(math.nan)
+    samples, _ = MMPISampler()(bundle(*random_rays(field.plan, 5, seed=1)), field=field, threshold=1e-3)
+    assert samples.shape[0] == 5
+
+
+def test_gradients_of_a_rendered_batch_are_those_of_plain_torch():
+    field = random_field(3, True, seed=7, planes=12).train()
+    rays, upstream = bundle(*random_rays(field.plan, 24, seed=8)), normal(24, 3, seed=9)
+    params = {n: p for n, p in field.named_parameters() if p.numel()}
+
+    def gradients():
+        field.zero_grad(set_to_none=True)
+        samples, report = MMPISampler()(rays, field=field, threshold=1e-3, blend_form="paper")
+        tau, lookup = field.get_density(samples)
+        share = field.sample_shares(samples, lookup)
+        flat = blending.blended_optical_depth(tau.reshape(-1)[lookup.index], *share, "paper")
+        tau = tau.new_zeros(tau[..., 0].numel()).index_put((lookup.index,), flat).view(tau.shape[:2])
+        meta = metadata_of(samples)
+        made = composite.composite_weights(
+            tau, meta["valid"][..., 0], meta["skipped_before"][..., 0], report.skipped_total
+        )  # fmt: skip
+        colors = next(iter(field.get_outputs(samples, lookup).values()))
+        loss = (composite.render_colors(made, colors) * upstream).sum() + made.accumulation.sum()
+        (loss + 0.1 * field.total_variation(lookup, 1.0, 1.0)).backward()
+        return {n: p.grad.to_dense() if p.grad.is_sparse else p.grad for n, p in params.items()}
+
+    fast, plain = gradients(), by_torch(gradients)
+    for name in ("density", "features", "reliability", "networks.weights"):
+        size = plain[name].abs().max()
+        assert size > 1e-3 and (fast[name] - plain[name]).abs().max() < 2e-4 * size, name
+
+
+# The whole -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_field_of_trained_and_untrained_texels_blends_like_the_reference(monkeypatch):
+    monkeypatch.setattr(reference, "OPAQUE_DEPTH", math.inf)
+    field = fill(MMPIField(random_field(3, True, seed=11).plan, feature_channels=5, hidden_width=6), 11)
+    field.touched.copy_(torch.rand(len(field.touched), generator=torch.Generator().manual_seed(1)) < 0.5)
+    compare(field, bundle(*random_rays(field.plan, 40, seed=2)), 1e-3, "paper")

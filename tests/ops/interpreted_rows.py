@@ -1,0 +1,249 @@
+"""The Triton kernels of tables, colours and compositing: run like interpreted_march.py."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from bricked import SHAPES, bricked_field, layout_of, thinned
+from gather_batches import batch, in_float32, with_gradients
+from interpreting import by_torch, interpreted, normal  # noqa: F401
+from random_fields import bundle, random_field, random_rays
+
+from mmpi_ns.field.mmpi_field import MMPIField
+from mmpi_ns.ops import composite, gather, interpolate
+from mmpi_ns.ops.composite import reference as plain_composite
+from mmpi_ns.ops.interpolate import reference as plain_interpolate
+from mmpi_ns.ops.variation import reference as plain_variation
+from mmpi_ns.ops.variation import total_variation
+from mmpi_ns.rendering.sampler import MMPISampler
+from mmpi_ns.training.touched_adam import TouchedAdam
+
+# Rows ----------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("channels", "taps"), [(1, 4), (9, 4), (9, 8)])
+def test_interpolation_and_its_gradient_are_those_of_float64(channels, taps):
+    g = torch.Generator().manual_seed(taps)
+    rows, weights = torch.randint(0, 40, (300, taps), generator=g), torch.rand(300, taps, generator=g)
+    table, exact = normal(50, channels).requires_grad_(), normal(50, channels).double().requires_grad_()
+    upstream = normal(300, channels, seed=2)
+    read = interpolate.interpolate(table, rows, weights)
+    wanted = plain_interpolate.interpolate(exact, rows, weights.double())
+    assert (read.double() - wanted).abs().max() < 2e-6
+    (read * upstream).sum().backward()
+    (wanted * upstream.double()).sum().backward()
+    assert table.grad.is_sparse and (table.grad.to_dense().double() - exact.grad).abs().max() < 2e-5
+    assert exact.grad[40:].abs().max() == 0 < exact.grad.abs().max()
+
+
+def test_gathered_rows_are_read_like_the_table_and_have_one_gradient_each():
+    rows, weights = torch.randint(0, 50, (80, 4), generator=torch.Generator().manual_seed(1)), torch.rand(80, 4)
+    index, some = interpolate.index_rows(rows, 50), torch.arange(0, 80, 3)
+    table, plain = (normal(50, 9).requires_grad_() for _ in range(2))
+    gathered = interpolate.gather_rows(table, index.unique)
+    read = interpolate.interpolate_gathered(gathered, index.position, weights)
+    part = interpolate.interpolate_gathered(gathered, index.position[some], weights[some])
+    wanted = plain_interpolate.interpolate(plain, rows, weights)
+    assert torch.allclose(read, wanted, atol=1e-6) and torch.allclose(part, wanted[some], atol=1e-6)
+    ((read**2).sum() + 2 * part.sum()).backward()
+    ((wanted**2).sum() + 2 * wanted[some].sum()).backward()
+    assert torch.allclose(table.grad.to_dense(), plain.grad, atol=1e-4)
+
+
+@pytest.mark.parametrize("spread", ["side by side", "4096 apart", "anywhere", "one"])
+@pytest.mark.parametrize("count", [1, 7, 3000])
+def test_distinct_rows_are_those_of_the_reference(count, spread):
+    g, different = torch.Generator().manual_seed(count), 1 + count // 3
+    chosen = torch.randint(0, different, (count, 4), generator=g)
+    anywhere = torch.randint(0, 2**24, (different,), generator=g)
+    rows = {"side by side": chosen, "4096 apart": chosen * 4096, "anywhere": anywhere[chosen], "one": chosen * 0}[
+        spread
+    ]
+    found = interpolate.index_rows(rows, 2**24)
+    assert torch.equal(found.unique, rows.unique())
+    assert found.position.shape == rows.shape and torch.equal(found.unique[found.position.long()], rows)
+
+
+def test_no_rows_are_no_distinct_rows():
+    found = interpolate.index_rows(torch.zeros(0, 4, dtype=torch.int64), 9)
+    assert found.unique.shape == (0,) and found.position.shape == (0, 4)
+    assert interpolate.sum_rows(found.position, torch.zeros(0, 3), torch.zeros(0, 4), 0).shape == (0, 3)
+
+
+@pytest.mark.parametrize("weighted", [True, False])
+def test_rows_gather_what_their_entries_give(weighted):
+    rows = torch.randint(0, 40, (300, 4 if weighted else 1), generator=torch.Generator().manual_seed(1))
+    values, weights = normal(300, 9), torch.rand(300, 4) if weighted else None
+    index = interpolate.index_rows(rows, 50)
+    found = torch.zeros(40, 9).index_copy_(
+        0, index.unique, interpolate.sum_rows(index.position, values, weights, len(index.unique))
+    )
+    each = values[:, None].double() * (torch.ones(300, 1) if weights is None else weights)[..., None].double()
+    wanted = torch.zeros(40, 9, dtype=torch.float64).index_add_(0, rows.reshape(-1), each.reshape(-1, 9))
+    assert wanted.abs().max() > 1 and (found.double() - wanted).abs().max() < 1e-5
+
+
+def test_texels_are_those_of_the_grids_also_at_borders_and_outside():
+    field = bricked_field()
+    g = torch.Generator().manual_seed(1)
+    ndc = torch.rand(200, 3, generator=g) * 2.4 - 1.2
+    ndc[:20] = ndc[:20].sign()
+    heads, planes = torch.randint(0, 3, (200,), generator=g), torch.randint(0, 9, (200,), generator=g)
+    rows, weights = interpolate.texel_rows(field.layout, heads, planes, ndc)
+    for k in range(3):
+        own = heads == k
+        wanted_rows, wanted_weights = field.grids[k].bilinear(planes[own], ndc[own])
+        assert torch.equal(rows[own], wanted_rows) and torch.allclose(weights[own], wanted_weights, atol=2e-6)
+
+
+@pytest.mark.parametrize("channels", [1, 9])
+def test_variation_equals_the_reference_with_its_gradient(channels):
+    grids, _, _ = thinned(SHAPES)
+    layout = layout_of(SHAPES, grids[0].tiles)
+    table = normal(len(grids[0].places) * 64, channels) * 2
+    texels = torch.cat([g.rows[g.rows >= 64] for g in grids] + [torch.arange(5)])  # and some of the empty brick
+    rows = texels[torch.randperm(len(texels), generator=torch.Generator().manual_seed(1))[:-9]]
+    scales, found = [(0.5 + k, 2.0, 1.0) for k in range(len(grids))], []
+    for function, dtype in ((total_variation, torch.float32), (plain_variation.total_variation, torch.float64)):
+        values = table[rows].to(dtype).requires_grad_()
+        value = function(values, table.to(dtype), rows, layout, scales)
+        (3 * value).backward()
+        found.append((value.item(), values.grad.double()))
+    assert found[0][0] == pytest.approx(found[1][0], rel=1e-5) and found[0][0] > 1
+    assert torch.allclose(found[0][1], found[1][1], atol=1e-5)
+
+
+def test_adam_on_rows_equals_the_plain_one():
+    def work():
+        param = torch.nn.Parameter(normal(500, 9))
+        optimizer = TouchedAdam([param], lr=0.1)
+        for step in range(4):
+            rows = torch.randint(0, 500, (300,), generator=torch.Generator().manual_seed(step))
+            values = normal(300, 9, seed=step)
+            values[:, step] = 0  # entries without a gradient within a touched row
+            param.grad = torch.sparse_coo_tensor(rows[None], values, param.shape)
+            optimizer.step()
+        return param.data, optimizer.state[param]["exp_avg"], optimizer.state[param]["exp_avg_sq"]
+
+    fast, plain = work(), by_torch(work)
+    assert (plain[0] - normal(500, 9)).abs().max() > 0.2
+    for a, b in zip(fast, plain, strict=True):
+        assert ((a - b).abs() <= 3e-6 * (1 + b.abs())).all()
+
+
+# Colours -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("shared", [False, True])
+@pytest.mark.parametrize(("channels", "width", "octaves"), [(3, 5, (0, 0)), (9, 32, (2, 2)), (4, 64, (4, 1))])
+def test_shading_equals_the_colour_networks(channels, width, octaves, shared):
+    plan = random_field(3, True, seed=7).plan
+    field = MMPIField(
+        plan,
+        feature_channels=channels,
+        hidden_width=width,
+        position_frequencies=octaves[0],
+        direction_frequencies=octaves[1],
+        shared_colour=shared,
+    ).eval()
+    field.features.data = normal(*field.features.shape, seed=1) * 2
+    field.networks.weights.data = normal(*field.networks.weights.shape, seed=2) * 0.3
+    samples, _ = MMPISampler()(bundle(*random_rays(plan, 30, seed=8)), field=field, threshold=0.0)
+    assert samples.metadata["heads"].unique().numel() == 4
+    with torch.no_grad():
+        fast = next(iter(field.get_outputs(samples).values()))
+        plain = by_torch(lambda: next(iter(field.get_outputs(samples).values())))
+    assert plain.std() > 0.05 and (fast - plain).abs().max() < 5e-6
+    assert (fast[~samples.metadata["valid"][..., 0]] == 0).all()
+
+
+def gathered_at_places(channels, with_cube):
+    """What rays gather without gradients, and what the reference in float64 says."""
+    field = MMPIField(random_field(3, with_cube, seed=7).plan, feature_channels=channels).eval()
+    field.features.data = normal(*field.features.shape, seed=1) * 2
+    samples, _ = MMPISampler()(bundle(*random_rays(field.plan, 40, seed=8)), field=field, threshold=0.0)
+    meta = samples.metadata
+    places = [meta[n][..., 0] for n in ("heads", "planes")] + [meta["ndc"], meta["valid"][..., 0]]
+    weights = torch.rand(places[-1].shape, generator=torch.Generator().manual_seed(3))
+    found = gather.gather_places(field.layout, field.features.data, *places, weights)
+    return found, gather.reference.gather_places(field.layout, field.features.data, *places, weights)
+
+
+@pytest.mark.parametrize(("channels", "with_cube"), [(3, False), (9, True), (20, True)])
+def test_rays_gather_what_the_reference_says(channels, with_cube):
+    for a, b in zip(*(vars(s).values() for s in gathered_at_places(channels, with_cube)), strict=True):
+        assert b.abs().max() > 1 and (a - b).abs().max() < 2e-5
+
+
+@pytest.mark.parametrize("trains", [True, False])
+@pytest.mark.parametrize(("channels", "in_cube"), [(3, False), (9, True), (20, True)])
+def test_gathered_sums_and_their_gradients_are_those_of_float64(channels, in_cube, trains):
+    given, upstream = batch(channels, rays=40, in_cube=in_cube), [normal(40, n) for n in (channels, 1, 3, 3)]
+    if trains:
+        found = with_gradients(gather.gather_taps, in_float32(given), upstream)
+        wanted = with_gradients(gather.reference.gather_taps, given, upstream)
+    else:
+        values, groups, slots, weights, wanted_rays = in_float32(given)
+        sums = gather.gather_taps(values, groups, slots, weights.requires_grad_(), wanted_rays)
+        (sums.gathered * upstream[0]).sum().backward()
+        found = [weights.grad.double()]
+        wanted = with_gradients(gather.reference.gather_taps, given, [upstream[0], *(0 * u for u in upstream[1:])])[-1:]
+    for a, b in zip(found, wanted, strict=True):
+        assert b.abs().max() > 0.05 and (a - b).abs().max() < 3e-6 * (1 + b.abs().max())
+
+
+def test_without_samples_rays_gather_nothing():
+    weights = torch.zeros(3, 2, requires_grad=True)
+    sums = gather.gather_taps(
+        torch.zeros(0, 9), [], torch.zeros(0, dtype=torch.int64), weights, torch.ones(3, dtype=torch.bool)
+    )
+    assert all(s.shape[0] == 3 and not s.any() for s in vars(sums).values())
+    sums.gathered.sum().backward()
+    assert not weights.grad.any()
+
+
+def test_without_samples_there_are_no_colours():
+    field = random_field(2, seed=1)
+    samples, _ = MMPISampler()(bundle([[0, 0, 0]], [[0, 0, 1]], far=1e-3), field=field, threshold=0.0)
+    with torch.no_grad():
+        assert (next(iter(field.get_outputs(samples).values())) == 0).all()
+
+
+# Compositing ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("slots", [1, 5, 70])
+def test_compositing_and_its_gradient_are_those_of_float64(slots):
+    g = torch.Generator().manual_seed(slots)
+    tau = 10 ** (torch.rand(40, slots, generator=g) * 6 - 5)
+    tau[0], tau[1], tau[2, : slots // 2] = 0.0, 1e4, 1e5
+    valid = torch.arange(slots) < torch.randint(0, slots + 1, (40, 1), generator=g)
+    before = torch.rand(40, slots, generator=g).cumsum(1) * 0.02
+    total = before[:, -1:] + 0.1
+    upstream = [normal(40, slots, seed=1), normal(40, 1, seed=2), normal(40, 1, seed=3)]
+
+    def work(function, dtype):
+        leaf = tau.detach().to(dtype, copy=True).requires_grad_()
+        made = function(leaf, valid, before.to(dtype), total.to(dtype))
+        parts = (made.weights, made.accumulation, made.transmittance)
+        sum((p * u.to(dtype)).sum() for p, u in zip(parts, upstream, strict=True)).backward()
+        return [x.double() for x in (*parts, leaf.grad)]
+
+    fast = work(composite.composite_weights, torch.float32)
+    exact = work(plain_composite.composite_weights, torch.float64)
+    for a, b in zip(fast, exact, strict=True):
+        assert ((a - b).abs() <= 3e-6 * (1 + b.abs().amax(1, keepdim=True))).all()
+    assert (fast[0][~valid] == 0).all() and (fast[3][~valid] == 0).all()
+
+
+def test_thin_samples_keep_their_digits():
+    tau = torch.full((1, 3), 1e-7)
+    made = composite.composite_weights(tau, tau > 0, tau * 0, tau[:, :1] * 0)
+    assert made.weights.tolist()[0] == pytest.approx([1e-7] * 3, rel=1e-6)
+
+
+def test_no_rays_are_composited_to_nothing():
+    tau = torch.zeros(0, 4, requires_grad=True)
+    made = composite.composite_weights(tau, tau > 0, tau * 0, torch.zeros(0, 1))
+    made.weights.sum().backward()
+    assert made.weights.shape == (0, 4) and made.accumulation.shape == (0, 1)

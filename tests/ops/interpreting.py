@@ -1,0 +1,28 @@
+"""What the tests of Triton kernels by its interpreter share."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from mmpi_ns.ops import dispatch
+
+
+@pytest.fixture(autouse=True)
+def interpreted(monkeypatch):
+    """Every test runs on the kernels; one that silently took plain torch would test nothing."""
+    monkeypatch.setattr(dispatch, "_chosen", "auto")
+    dispatch.interpret(True)
+    assert dispatch.form_of("march", torch.zeros(1)) == "gpu"
+    yield
+    dispatch.interpret(False)
+
+
+def by_torch(work):
+    """What ``work`` returns by plain torch."""
+    with dispatch.chosen("torch"):
+        return work()
+
+
+def normal(*shape, seed=0, dtype=torch.float32):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=dtype)

@@ -1,0 +1,117 @@
+"""The compiled compositing against its reference in float64: values and gradients, also where rays are hard."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from compiled import both, compiled  # noqa: F401
+
+from mmpi_ns.ops import composite
+from mmpi_ns.ops.composite import Composite, reference
+
+
+def batch(rays=60, slots=37):
+    """Optical depths from 1e-7 to 1e3, some exactly 0, in rays of 0 to all slots, with dropped samples between them."""
+    g = torch.Generator().manual_seed(rays)
+    tau = 10 ** (torch.rand(rays, slots, generator=g) * torch.linspace(1, 10, rays)[:, None] - 7)
+    tau[torch.rand(rays, slots, generator=g) < 0.05] = 0
+    count = torch.randint(0, slots + 1, (rays,), generator=g)
+    count[:2] = torch.tensor([0, slots])
+    valid = torch.arange(slots) < count[:, None]
+    skipped = 0.01 * torch.rand(rays, slots, generator=g).cumsum(-1)
+    return tau, valid, skipped, skipped[:, -1:] + 0.02
+
+
+def weights_and_gradient(function, given, dtype):
+    tau, valid, before, total = given
+    tau = tau.detach().to(dtype).requires_grad_()
+    made = function(tau, valid, before.to(dtype), total.to(dtype))
+    g = torch.Generator().manual_seed(1)
+    parts = (made.weights, made.accumulation, made.transmittance)
+    sum((p * torch.randn(p.shape, generator=g)).sum() for p in parts).backward()
+    return (*(p.detach() for p in parts), tau.grad)
+
+
+@pytest.mark.parametrize("slots", [1, 16, 37])
+def test_weights_and_their_gradient_equal_float64(slots):
+    given = batch(slots=slots)
+    found = weights_and_gradient(composite.composite_weights, given, torch.float32)
+    wanted = weights_and_gradient(reference.composite_weights, given, torch.float64)
+    for a, b in zip(found, wanted, strict=True):
+        assert ((a.double() - b).abs() <= 3e-6 * (1 + b.abs().amax(-1, keepdim=True))).all()
+    assert (found[0][~given[1]] == 0).all() and (found[3][~given[1]] == 0).all()
+    thin = (given[0] < 1e-4) & (wanted[0] > 0.5 * given[0]) & (given[0] > 0)
+    assert thin.any() and ((found[0].double() - wanted[0]).abs()[thin] <= 1e-5 * wanted[0][thin]).all()
+
+
+def test_opaque_and_infinite_samples_hide_what_lies_behind():
+    tau = torch.tensor([[0.1, 200.0, 3.0], [math.inf, 1.0, 1.0]], requires_grad=True)
+    made = composite.composite_weights(tau, torch.ones(2, 3, dtype=torch.bool), torch.zeros(2, 3), torch.zeros(2, 1))
+    wanted = torch.tensor([[1 - math.exp(-0.1), math.exp(-0.1), 0.0], [1.0, 0.0, 0.0]])
+    assert torch.allclose(made.weights, wanted, atol=1e-6)
+    assert made.transmittance.tolist() == [[0.0], [0.0]] and made.accumulation.tolist() == [[1.0], [1.0]]
+    made.weights[:, 2].sum().backward()
+    assert tau.grad.isfinite().all() and tau.grad.abs().max() < 1e-30
+
+
+def test_a_depth_that_is_not_a_number_is_not_hidden():
+    tau = torch.tensor([[0.1, math.nan, 0.3], [0.1, 0.2, 0.3]])
+    made = composite.composite_weights(tau, torch.ones(2, 3, dtype=torch.bool), torch.zeros(2, 3), torch.zeros(2, 1))
+    assert made.weights[0, 1].isnan() and made.accumulation[0].isnan() and made.transmittance[0].isnan()
+    assert made.weights[1].isfinite().all() and composite.render_colors(made, torch.ones(2, 3, 3))[0].isnan().all()
+
+
+def test_colours_of_rays_and_their_gradients_equal_float64():
+    given, g = batch(), torch.Generator().manual_seed(2)
+    colors, upstream = torch.rand(60, 37, 3, generator=g), torch.randn(60, 3, generator=g)
+    found = []
+    for dtype in (torch.float32, torch.float64):
+        made = reference.composite_weights(*(x.to(dtype) if x.is_floating_point() else x for x in given))
+        weights, own = made.weights.requires_grad_(), colors.detach().to(dtype).requires_grad_()
+        rgb = composite.render_colors(Composite(weights, made.accumulation, made.transmittance), own)
+        (rgb * upstream).sum().backward()
+        found.append((rgb.detach(), weights.grad, own.grad))
+    for a, b in zip(*found, strict=True):
+        assert b.abs().max() > 0.1 and ((a.double() - b).abs() <= 2e-5 * b.abs() + 2e-6).all()
+
+
+def test_the_median_distance_is_that_of_the_reference():
+    weights, valid, *_ = batch(rays=400)
+    weights = weights.clamp(max=1)
+    weights[7] = 0
+    inverse_t = torch.rand(weights.shape, generator=torch.Generator().manual_seed(3))
+    weights = torch.where(valid, weights, 0.0)
+    with torch.no_grad():
+        found = composite.median_inverse_distance(weights, inverse_t, valid)
+    wanted = reference.median_inverse_distance(weights, inverse_t, valid)
+    assert torch.equal(found, wanted) and (wanted == 0).any() and wanted.unique().numel() > 300
+
+
+def test_the_winning_head_is_the_one_of_most_weight():
+    weights, g = batch(rays=300)[0].clamp(max=1), torch.Generator().manual_seed(4)
+    heads = torch.randint(0, 5, weights.shape, generator=g)
+    weights[9] = 0
+    found, wanted = both(lambda: composite.winning_heads(weights, heads, 6))
+    assert torch.equal(found, wanted)
+    assert found[9] == 0 and sorted(found.unique().tolist()) == [0, 1, 2, 3, 4]
+
+
+def test_without_rays_or_slots_nothing_is_gathered():
+    for rays, slots in ((0, 5), (3, 1)):
+        given = torch.zeros(rays, slots), torch.zeros(rays, slots, dtype=torch.bool), torch.zeros(rays, slots)
+        made = composite.composite_weights(*given, torch.zeros(rays, 1))
+        assert made.weights.shape == (rays, slots) and not made.accumulation.any()
+        assert composite.render_colors(made, torch.ones(rays, slots, 3)).tolist() == [[0.0] * 3] * rays
+
+
+def test_rays_do_not_depend_on_the_number_of_threads():
+    given, threads, found = batch(rays=1500), torch.get_num_threads(), []
+    for count in (1, 3):
+        try:
+            torch.set_num_threads(count)
+            found.append(weights_and_gradient(composite.composite_weights, given, torch.float32))
+        finally:
+            torch.set_num_threads(threads)
+    assert all(torch.equal(a, b) for a, b in zip(*found, strict=True))

@@ -1,0 +1,80 @@
+"""Which form of an operation runs, and what happens where the compiled ones cannot be had."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import math
+import subprocess
+
+import pytest
+import torch
+from compiled import compiled  # noqa: F401
+from random_fields import bundle, random_field, random_rays, render
+
+from mmpi_ns.ops import build, dispatch, trial
+
+
+def test_every_operation_has_the_forms_of_the_table_under_one_signature():
+    for name, (folder, forms) in dispatch.TABLE.items():
+        if name in ("colors", "shade"):
+            continue
+        public = importlib.import_module(f"mmpi_ns.ops.{folder}.reference")
+        wanted = list(inspect.signature(getattr(public, name)).parameters)
+        for form in forms:
+            if form == "gpu" and importlib.util.find_spec("triton") is None:
+                continue
+            assert list(inspect.signature(dispatch.function(name, form)).parameters) == wanted, (name, form)
+
+
+def test_every_operation_with_a_gpu_form_has_a_trial():
+    assert set(trial.CASES) == {name for name, (_, forms) in dispatch.TABLE.items() if "gpu" in forms}
+
+
+@pytest.fixture
+def unbuilt(monkeypatch, tmp_path):
+    """A machine on which nothing has been compiled yet."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    build.library.cache_clear()
+    monkeypatch.setattr(dispatch, "_faults", {})
+    yield tmp_path
+    build.library.cache_clear()
+
+
+def test_without_a_compiler_plain_torch_runs_and_the_log_says_so(monkeypatch, unbuilt, capsys):
+    monkeypatch.delenv("CXX", raising=False)
+    monkeypatch.setattr(build.shutil, "which", lambda name: None)
+    field = random_field(2, seed=1)
+    rays = bundle(*random_rays(field.plan, 10, seed=1))
+    assert math.isfinite(render(field, rays).rgb.sum()) and dispatch.form_of("march", torch.zeros(1)) == "reference"
+    render(field, rays)
+    said = " ".join(capsys.readouterr().out.split())
+    assert said.count("no C++ compiler (g++ or clang++) is installed") == 1
+    with pytest.raises(ValueError, match="no C\\+\\+ compiler"):
+        dispatch.choose("native")
+
+
+def test_a_compiler_that_fails_is_named(monkeypatch, unbuilt, capsys):
+    broken = unbuilt / "broken-compiler"
+    broken.write_text("#!/bin/sh\necho 'no such flag' >&2\nexit 1\n")
+    broken.chmod(0o755)
+    monkeypatch.setenv("CXX", str(broken))
+    assert dispatch.form_of("march", torch.zeros(1)) == "reference"
+    said = "".join(capsys.readouterr().out.split())
+    assert "broken-compiler" in said and "nosuchflag" in said
+    assert not list(unbuilt.glob("mmpi_ns/*.so"))
+
+
+def test_what_was_compiled_is_used_again(monkeypatch, unbuilt):
+    assert dispatch.form_of("march", torch.zeros(1)) == "cpu"
+    assert [p.suffix for p in (unbuilt / "mmpi_ns").iterdir()] == [".so"]
+    build.library.cache_clear()
+    dispatch._faults.clear()
+    monkeypatch.setattr(subprocess, "run", lambda *a, **k: pytest.fail("compiled twice"))
+    assert dispatch.form_of("march", torch.zeros(1)) == "cpu"
+
+
+def test_other_precisions_and_the_users_choice_take_the_plain_path():
+    assert dispatch.form_of("march", torch.zeros(1, dtype=torch.float64)) == "reference"
+    dispatch.choose("torch")
+    assert dispatch.form_of("march", torch.zeros(1)) == "reference"

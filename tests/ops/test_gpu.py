@@ -1,0 +1,100 @@
+"""The Triton kernels without a GPU: interpreted in a process of their own, compiled for one that is not there."""
+
+from __future__ import annotations
+
+import re
+import sys
+
+import pytest
+import torch
+from random_fields import bundle, random_field, random_rays, render
+from triton_processes import HERE, needs_triton, python
+
+from mmpi_ns.ops import dispatch
+
+
+@needs_triton
+def test_kernels_by_the_interpreter():
+    """The variable must be set before Triton is imported, so these tests have a process of their own."""
+    files = [str(HERE / "ops" / f"interpreted_{part}.py") for part in ("march", "rows")]
+    found = python("-m", "pytest", "-p", "no:cacheprovider", *files, TRITON_INTERPRET="1")
+    assert found.returncode == 0, found.stdout[-6000:] + found.stderr[-2000:]
+    passed = re.search(r"(\d+) passed", found.stdout)
+    assert passed and int(passed[1]) > 30 and "skipped" not in found.stdout, found.stdout[-500:]
+
+
+@needs_triton
+def test_kernels_compile_for_a_gpu_without_spilling_registers(monkeypatch):
+    """The interpreter takes what the compiler does not: types, shapes, control flow."""
+    from triton_compiling import compiling, launches, resources
+
+    monkeypatch.setattr(dispatch, "_interpreting", True)
+    monkeypatch.setattr(dispatch, "_faults", dict.fromkeys(["Triton", *dispatch.TABLE]))
+    with compiling({}) as made:
+        launches(monkeypatch)
+    names = {name for name, *_ in made}
+    assert {
+        "march_kernel",
+        "pack_kernel",
+        "weighted_rows_kernel",
+        "sum_rows_kernel",
+        "mark_kernel",
+        "adam_kernel",
+    } < names
+    for (name, constants, _), kernel in made.items():
+        assert "STACK:0" in resources(kernel), (name, constants)
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+def test_kernels_on_a_gpu():
+    from mmpi_ns.bench.gpu.checks import run_checks
+
+    found = run_checks("cuda", rehearse=False)
+    assert found["failed"] == 0 and len(found["checks"]) > 30, [c for c in found["checks"] if not c["ok"]]
+
+
+def test_importing_the_package_imports_no_kernel():
+    """And where Triton is missing, or what a bare GPU machine lacks, all of it imports."""
+    code = (
+        "import sys\n"
+        "sys.modules |= dict.fromkeys(('triton', 'open3d', 'pymeshlab', 'pycolmap', 'wandb', 'comet_ml'))\n"
+        "import nerfstudio.configs.method_configs, mmpi_ns.scripts.bench, mmpi_ns.bench.gpu.parts\n"
+        "assert not [m for m in sys.modules if m.startswith('mmpi_ns.ops') and 'gpu' in m]"
+    )
+    found = python("-c", code)
+    assert found.returncode == 0, found.stderr
+
+
+@pytest.fixture
+def no_triton(monkeypatch):
+    """A machine with a GPU (whose tensors are the CPU's) and without Triton."""
+    dispatch.function.cache_clear()
+    monkeypatch.setattr(dispatch, "_faults", {})
+    monkeypatch.setattr(dispatch, "_chosen", "auto")
+    for name in [m for m in sys.modules if m.startswith("mmpi_ns.ops") and "gpu" in m]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "triton", None)
+    yield
+    dispatch.function.cache_clear()
+
+
+def test_without_triton_plain_torch_runs_and_the_log_says_so(monkeypatch, no_triton, capsys):
+    with pytest.raises(ValueError, match="TRITON_INTERPRET=1"):
+        dispatch.interpret(True)
+    monkeypatch.setenv("TRITON_INTERPRET", "1")
+    with pytest.raises(ValueError, match="Triton cannot be had"):
+        dispatch.interpret(True)
+    assert not dispatch._interpreting
+    said = " ".join(capsys.readouterr().out.split())
+    assert said.count("Plain torch instead of the compiled operations") == 1 and "Triton cannot be imported" in said
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    with pytest.raises(ValueError, match="Triton cannot be imported"):
+        dispatch.choose("native")
+    dispatch.choose("auto")
+    field = random_field(2, seed=1)
+    assert torch.isfinite(render(field, bundle(*random_rays(field.plan, 5, seed=1))).rgb).all()
+
+
+def test_on_a_cpu_nothing_takes_the_gpus_kernels():
+    assert all(dispatch.form_of(name, torch.zeros(1)) != "gpu" for name in dispatch.TABLE)

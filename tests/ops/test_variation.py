@@ -1,0 +1,75 @@
+"""The compiled total variation against its reference."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from bricked import layout_of
+from compiled import compiled, normal  # noqa: F401
+from hand_made import make_mpi
+
+from mmpi_ns.field.mmpi_field import MMPIField
+from mmpi_ns.ops.variation import reference, total_variation
+from mmpi_ns.ops.variation.cpu import PART
+from mmpi_ns.scene.plan import CubePlan, ScenePlan
+from mmpi_ns.scene.texels import BRICK
+
+
+@pytest.mark.parametrize("channels", [1, 9])
+def test_variation_equals_the_reference_with_its_gradient(channels):
+    cube = CubePlan((-1.0, -1.0, 2.0), (1.0, 1.0, 5.0), (3, 2, 4))
+    plan = ScenePlan((make_mpi("a", height=5, width=4, planes=3), make_mpi("b", height=2, width=3)), cube, 0.05, 1.0)
+    layout = MMPIField(plan).layout
+    grids = layout.grids
+    texels = torch.cat([g.rows for g in grids])
+    table = normal(len(grids[0].places) * 64, channels) * 2
+    rows = texels[torch.randperm(plan.texels, generator=torch.Generator().manual_seed(1))[: plan.texels - 9]]
+    found = []
+    for function in (total_variation, reference.total_variation):
+        values = table[rows].requires_grad_()
+        value = function(values, table, rows, layout, [(0.5, 2.0, 1.0), (1.0, 3.0, 0.3), (0.7, 1.0, 2.0)])
+        (3 * value).backward()
+        found.append((value.item(), values.grad))
+    assert found[0][0] == pytest.approx(found[1][0], rel=1e-5) and found[0][0] > 1
+    assert torch.allclose(found[0][1], found[1][1], atol=1e-5)
+
+
+@pytest.mark.parametrize("channels", [1, 9])
+def test_variation_of_many_texels_does_not_depend_on_the_number_of_threads(channels):
+    layout = layout_of([(3, 70, 60), (2, 50, 41)])
+    grids = layout.grids
+    table = normal(len(grids[0].places) * BRICK, channels) * 2
+    rows = torch.cat([g.rows for g in grids]).sort()[0]
+    assert len(rows) > 3 * PART
+    found, threads = [], torch.get_num_threads()
+    for count in (1, 3):
+        values = table[rows].requires_grad_()
+        try:
+            torch.set_num_threads(count)
+            value = total_variation(values, table, rows, layout, [(0.5, 2.0, 1.0), (1.0, 3.0, 0.3)])
+            value.backward()
+        finally:
+            torch.set_num_threads(threads)
+        found.append((value, values.grad))
+    assert torch.equal(found[0][0], found[1][0]) and torch.equal(found[0][1], found[1][1])
+    values = table[rows].double().requires_grad_()
+    wanted = reference.total_variation(values, table.double(), rows, layout, [(0.5, 2.0, 1.0), (1.0, 3.0, 0.3)])
+    wanted.backward()
+    assert found[0][0].item() == pytest.approx(wanted.item(), rel=1e-6)
+    assert torch.allclose(found[0][1].double(), values.grad, atol=2e-6)
+
+
+def test_variation_says_where_a_texel_is_not_a_number():
+    layout = layout_of([(2, 9, 9)])
+    grids = layout.grids
+    table = normal(len(grids[0].places) * BRICK, 9)
+    broken = int(grids[0].row(torch.tensor([1]), torch.tensor([8]), torch.tensor([3])))
+    table[broken, 4] = math.nan
+    rows = grids[0].rows.sort()[0]
+    values = table[rows].requires_grad_()
+    value = total_variation(values, table, rows, layout, [(1.0, 1.0, 1.0)])
+    value.backward()
+    own = (rows == broken).nonzero().item()
+    assert value.isnan() and values.grad[own, 4].isnan() and values.grad.isnan().sum() == 1 + 4, "and its neighbours"
