@@ -82,11 +82,11 @@ def _random(device: str, *shape: int) -> Tensor:
 def _scene(device: str, with_cube: bool) -> tuple[SceneLayout, Tables]:
     """Two thin MPIs that face the same way, with all texels stored, and a cube among their planes."""
     mpis = tuple(
-        MPIPlan(str(k), (0.3 * k, 0.0, -0.5 * k), AXES, 1.0, (-1.0, 1.0, -0.8, 0.8), 6, 9, 11) for k in range(2)
+        MPIPlan(str(k), (0.31 * k, 0.0, -0.53 * k), AXES, 1.0, (-1.0, 1.0, -0.8, 0.8), 6, 9, 11) for k in range(2)
     )
     shapes, cube = [(m.planes, m.height, m.width) for m in mpis], None
     if with_cube:
-        plan = CubePlan((-1.0, -1.0, 2.0), (1.0, 1.0, 4.0), (4, 5, 6))
+        plan = CubePlan((-1.1, -0.9, 1.9), (0.95, 1.05, 4.3), (4, 5, 6))
         shapes, cube = [*shapes, plan.shape], Cube.pack(plan, 1.0, device=device)
     tiles = torch.arange(1, make_grids(shapes)[0].tiles.numel() + 1, dtype=torch.int32)
     grids = make_grids(shapes, tiles.to(device))

@@ -30,10 +30,10 @@ class MergedSamples:
     """The samples of R rays that matter, nearest first in S slots a ray, and what the dropped ones leave behind."""
 
     heads: Int[Tensor, "R S"]
+    """0 in empty slots, as all of these."""
     planes: Int[Tensor, "R S"]
     ndc: Float[Tensor, "R S 3"]
     inverse_t: Float[Tensor, "R S"]
-    """0 in empty slots."""
     tau: Float[Tensor, "R S"]
     """Optical depth, blended where reliability takes part."""
     skipped_before: Float[Tensor, "R S"]
@@ -84,14 +84,14 @@ def march(
     order, valid = pruned.order, pruned.valid
 
     def pick(values: Tensor) -> Tensor:
-        empty = values.new_zeros((*order.shape, *values.shape[1:]))
-        return values[order] if values.shape[0] else empty
+        found = values[order] if len(values) else values.new_zeros((*order.shape, *values.shape[1:]))
+        return found.masked_fill(~(valid[..., None] if values.ndim > 1 else valid), 0)
 
     return MergedSamples(
         heads=pick(flat.heads),
         planes=pick(flat.planes),
         ndc=pick(flat.ndc),
-        inverse_t=torch.where(valid, pick(flat.inverse_t), 0.0),
+        inverse_t=pick(flat.inverse_t),
         tau=pick(tau),
         skipped_before=pruned.skipped_before,
         valid=valid,
