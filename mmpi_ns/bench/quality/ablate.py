@@ -26,7 +26,7 @@ class Ablate(Bench):
 
     data: Path
     """The scene (a folder with transforms.json)."""
-    suite: Literal["drive", "room"] = "drive"
+    suite: Literal["drive", "room", "depth"] = "drive"
     """drive: the paper's KITTI ablation and ours; room: its ScanNet one, with and without the cube."""
     downscale_factor: int = 4
     """Image size to use."""
