@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import subprocess
 import tempfile
 from contextlib import contextmanager
@@ -9,10 +10,12 @@ from pathlib import Path
 
 import torch
 import triton
+from random_fields import random_field
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 
-from mmpi_ns.ops import dispatch, trial
+from mmpi_ns.field.color_network import ColorNetworks
+from mmpi_ns.ops import dispatch, trial, triton_shade
 
 TARGET = GPUTarget("cuda", 90, 32)
 NAMES = {
@@ -71,9 +74,14 @@ def resources(kernel):
 
 def launches(monkeypatch):
     """Launches every kernel as on a GPU: with the arguments of the trials."""
-    for name in [n for n, (_, forms) in dispatch.TABLE.items() if "gpu" in forms]:
-        module = importlib.import_module(f"mmpi_ns.ops.{dispatch.TABLE[name][0]}.gpu")
+    for name, cases in trial.CASES.items():
+        folder = dispatch.TABLE[name][0]
+        module = triton_shade if name == "shade" else importlib.import_module(f"mmpi_ns.ops.{folder}.gpu")
         if hasattr(module, "block_size"):  # arrays on a CPU, but blocks of a GPU's size
             monkeypatch.setattr(module, "block_size", lambda wanted, device: wanted)
-        for given in trial.CASES[name]("cpu"):
+        for given in cases("cpu"):
             trial._outcome(name, "gpu", given)
+    networks, grid = ColorNetworks(3, 9, 64, 2, 2), torch.arange(60).view(20, 3)
+    layout, rays, places = random_field(2, True, seed=1).layout, torch.zeros(3, 20, 3), torch.zeros(20, 3, 3)
+    monkeypatch.setattr(torch.Tensor, "tolist", lambda self: [0, 20, 40, 60])
+    triton_shade.shade(layout, torch.zeros(7, 9), networks, rays, grid, grid, places, grid >= 0)
