@@ -143,7 +143,8 @@ class MMPIField(TexelTables):
 
     def forget_shares(self) -> None:
         """What was baked no longer holds: the field is about to be trained."""
-        self._packed.pop(("shares", self.density.device), None)
+        for name in ("shares", "baked"):
+            self._packed.pop((name, self.density.device), None)
 
     # nerfstudio's Field ------------------------------------------------------------------------------------------
 

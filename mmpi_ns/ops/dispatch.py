@@ -42,6 +42,8 @@ TABLE: dict[str, tuple[str, tuple[Form, ...]]] = {
     "gather_places": ("gather", ("cpu", "gpu")),
     "colors": ("colors", ("cpu",)),
     "shade": ("shade", ("cpu", "gpu")),
+    "march_baked": ("baked", ("cpu",)),
+    "shade_baked": ("baked", ("cpu",)),
 }
 """Every operation. Its function has the same name and signature in ``reference.py``, ``cpu.py`` and ``gpu.py``."""
 

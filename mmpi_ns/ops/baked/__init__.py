@@ -1,0 +1,52 @@
+"""Rays through baked multi-plane images: what each gathers, front to back, until it is opaque, and its colour."""
+
+from __future__ import annotations
+
+from jaxtyping import Float
+from torch import Tensor
+
+from mmpi_ns.ops import dispatch
+from mmpi_ns.ops.baked.reference import Gathered
+from mmpi_ns.scene.baked import BakedMpis, Codes, Shader
+
+
+def march_baked(
+    scene: BakedMpis,
+    origins: Float[Tensor, "R 3"],
+    directions: Float[Tensor, "R 3"],
+    nears: Float[Tensor, "R 1"],
+    fars: Float[Tensor, "R 1"],
+    threshold: float,
+    peaks: Float[Tensor, "B"] | None = None,
+) -> Gathered:
+    """What each ray gathers, front to back.
+
+    Args:
+        scene: the bricks.
+        origins: ray origins, world axes.
+        directions: unit ray directions.
+        nears: distance at which rays start.
+        fars: distance at which rays end; may be inf.
+        threshold: samples of less weight are left out of the sums.
+        peaks: of every brick, raised to the largest weight of a sample in it.
+    """
+    return dispatch.run("march_baked", scene, origins, directions, nears, fars, threshold, peaks)
+
+
+def shade_baked(
+    shader: Shader,
+    codes: tuple[Codes, ...],
+    sums: Float[Tensor, "R C"],
+    mass: Float[Tensor, "R 1"],
+    directions: Float[Tensor, "R 3"],
+) -> Float[Tensor, "R 3"]:
+    """Colours of rays from what they gathered.
+
+    Args:
+        shader: the network.
+        codes: what the channels' codes stand for.
+        sums: see ``Gathered``.
+        mass: likewise.
+        directions: unit, world axes.
+    """
+    return dispatch.run("shade_baked", shader, codes, sums, mass, directions)

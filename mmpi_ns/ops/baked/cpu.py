@@ -1,0 +1,126 @@
+"""Rays through baked multi-plane images, compiled (``baked.cpp``)."""
+
+from __future__ import annotations
+
+import ctypes
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import pad
+
+from mmpi_ns.ops import build
+from mmpi_ns.ops.baked.reference import Gathered
+from mmpi_ns.scene.baked import MOST_CHANNELS, BakedMpis, Codes, Shader, tiles_of
+
+
+class _Head(ctypes.Structure):
+    _fields_ = [
+        ("origin", ctypes.c_float * 3),
+        ("axes", ctypes.c_float * 9),
+        *((n, ctypes.c_float) for n in ("u0", "v0", "u1", "v1", "u_scale", "v_scale", "step", "end")),
+        *((n, ctypes.c_int32) for n in ("planes", "height", "width", "down", "across", "first_column")),
+        ("pass_", ctypes.c_void_p),
+    ]
+
+
+class _Scene(ctypes.Structure):
+    _fields_ = [
+        *((n, ctypes.c_int64) for n in ("num_heads", "channels")),
+        *((n, ctypes.c_void_p) for n in ("heads", "columns", "density", "texels")),
+    ]
+
+
+class _Layer(ctypes.Structure):
+    _fields_ = [
+        *((n, ctypes.c_int64) for n in ("outputs", "inputs")),
+        *((n, ctypes.c_void_p) for n in ("weights", "biases")),
+    ]
+
+
+class _Packed:
+    """A scene as the kernel reads it, with all that it points to."""
+
+    def __init__(self, scene: BakedMpis) -> None:
+        assert scene.texels.shape[-1] <= MOST_CHANNELS
+        self.passes = [scene.steps_of_depth(k) for k in range(len(scene.mpis))]
+        heads = []
+        for k, mpi in enumerate(scene.mpis):
+            u0, u1, v0, v1 = mpi.extent
+            _, down, across = tiles_of(mpi)
+            axes = (ctypes.c_float * 9)(*(x for row in mpi.axes for x in row))
+            scales = ((mpi.width - 1) / (u1 - u0), (mpi.height - 1) / (v1 - v0))
+            sizes = (mpi.planes, mpi.height, mpi.width, down, across, scene.first_column(k))
+            place = (ctypes.c_float * 3)(*mpi.origin), axes, u0, v0, u1, v1, *scales
+            heads.append(_Head(*place, mpi.disparity_step, mpi.last_disparity, *sizes, self.passes[k].data_ptr()))
+        self.heads = (_Head * len(heads))(*heads)
+        # Sixteen channels are read at once, also those of the last texel.
+        self.texels = pad(scene.texels.reshape(-1), (0, MOST_CHANNELS))
+        tables = (
+            build.address(scene.columns, torch.int32),
+            build.address(scene.density, torch.uint8),
+            build.address(self.texels, torch.uint8),
+        )
+        self.scene = _Scene(len(heads), scene.texels.shape[-1], ctypes.addressof(self.heads), *tables)
+
+
+def march_baked(
+    scene: BakedMpis,
+    origins: Float[Tensor, "R 3"],
+    directions: Float[Tensor, "R 3"],
+    nears: Float[Tensor, "R 1"],
+    fars: Float[Tensor, "R 1"],
+    threshold: float,
+    peaks: Float[Tensor, "B"] | None = None,
+) -> Gathered:
+    """See ``baked.march_baked``."""
+    if "cpu" not in scene.packed:
+        scene.packed["cpu"] = _Packed(scene)
+    packed: _Packed = scene.packed["cpu"]
+    held = [x.contiguous() for x in (origins, directions, nears, fars)]  # alive until the kernel has run
+    num_rays = len(origins)
+    sums = torch.empty(num_rays, scene.texels.shape[-1])
+    mass, passing, inverse_t = (torch.empty(num_rays, 1) for _ in range(3))
+    winner = torch.empty(num_rays, 1, dtype=torch.int64)
+    given = [build.address(x) for x in held]
+    made = [*(build.address(x) for x in (sums, mass, passing, inverse_t)), build.address(winner, torch.int64)]
+
+    def part(begin: int, end: int) -> None:
+        build.library().mmpi_march_baked(
+            ctypes.byref(packed.scene),
+            *given,
+            ctypes.c_float(threshold),
+            *map(ctypes.c_int64, (begin, end)),
+            *made,
+            None if peaks is None else build.address(peaks),
+        )
+
+    if peaks is None:
+        build.in_parts(part, num_rays)
+    else:  # one thread alone, for all write to the same peaks
+        part(0, num_rays)
+    return Gathered(sums, mass, passing, inverse_t, winner)
+
+
+def shade_baked(
+    shader: Shader,
+    codes: tuple[Codes, ...],
+    sums: Float[Tensor, "R C"],
+    mass: Float[Tensor, "R 1"],
+    directions: Float[Tensor, "R 3"],
+) -> Float[Tensor, "R 3"]:
+    """See ``baked.shade_baked``."""
+    numbers = [[x.contiguous() for x in layer] for layer in shader.layers]  # alive until the kernel has run
+    layers = (_Layer * len(numbers))(*(_Layer(*w.shape, build.address(w), build.address(b)) for w, b in numbers))
+    low, step = (torch.tensor([getattr(c, name) for c in codes], dtype=torch.float32) for name in ("low", "step"))
+    held = [x.contiguous() for x in (low, step, sums, mass, directions)]
+    rgb = torch.empty(len(sums), 3)
+    given = [build.address(x) for x in held]
+
+    def part(begin: int, end: int) -> None:
+        sizes = map(ctypes.c_int64, (len(numbers), len(codes), shader.direction_octaves))
+        bound, rays = ctypes.c_float(shader.bound), map(ctypes.c_int64, (begin, end))
+        build.library().mmpi_shade_baked(layers, *sizes, bound, *given, *rays, build.address(rgb))
+
+    build.in_parts(part, len(sums))
+    return rgb

@@ -1,0 +1,215 @@
+"""A baked window: a field in bricks of 8-bit codes with the network that shades its rays, and the images it gives."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
+from torch.nn.functional import pad
+
+from mmpi_ns.field.baking import baked_shares
+from mmpi_ns.field.mmpi_field import MMPIField
+from mmpi_ns.field.shading import CHANGE, MOST_CHANGE, RayShader
+from mmpi_ns.ops.baked import march_baked, shade_baked
+from mmpi_ns.ops.blending import BlendForm, blended_optical_depth
+from mmpi_ns.ops.march.reference import NEGLIGIBLE_DEPTH
+from mmpi_ns.scene.baked import (
+    CELLS,
+    MOST_CHANNELS,
+    SIDE,
+    BakedMpis,
+    Codes,
+    Shader,
+    brick_numbers,
+    columns_from,
+    columns_of,
+)
+from mmpi_ns.scene.bricks import read_planes
+from mmpi_ns.scene.texels import SIDE as STORED_SIDE
+from mmpi_ns.scene.texels import TexelGrid
+
+THINNEST = -12.0
+"""Raw density that the code 0 stands for at least: softplus of it is 6e-6."""
+
+
+@dataclass(frozen=True, eq=False)
+class BakedWindow:
+    """What one window shows, ready to render."""
+
+    mpis: BakedMpis
+    shader: Shader
+    ray_near: float
+    threshold: float
+    """Samples of less weight are not gathered."""
+    background: float = 0.5
+    """Grey level behind everything."""
+    farthest: float = 1e3
+    """Distance that stands for infinity in depth images."""
+
+    def render(
+        self,
+        origins: Float[Tensor, "R 3"],
+        directions: Float[Tensor, "R 3"],
+        nears: Float[Tensor, "R 1"],
+        fars: Float[Tensor, "R 1"],
+        background: Float[Tensor, "3"],
+    ) -> dict[str, Tensor]:
+        """rgb, accumulation, depth, winning MPI and dropped mass of rays, as the model gives them."""
+        found = march_baked(self.mpis, origins, directions, nears, fars, self.threshold)
+        rgb = shade_baked(self.shader, self.mpis.channel_codes, found.sums, found.mass, directions)
+        rgb = torch.where(found.mass > 0, rgb, 0.0)
+        return {
+            "rgb": (rgb * (1 - found.passing) + background * found.passing).clamp(0, 1),
+            "accumulation": 1 - found.passing,
+            "depth": 1 / found.inverse_t.clamp(min=1 / self.farthest),
+            "winning_mpi": found.winner,
+            "dropped_mass": (1 - found.passing - found.mass).clamp(min=0),
+        }
+
+    def keep(self, kept: Bool[Tensor, "B"]) -> BakedWindow:
+        """The same with some of the bricks alone."""
+        mpis, columns, first = self.mpis, [], 0
+        for k, mpi in enumerate(mpis.mpis):
+            start = mpis.first_column(k)
+            numbers = brick_numbers(mpis.columns[start : start + columns_of(mpi)], mpi)
+            found, bricks = columns_from((numbers >= 0) & kept[numbers.clamp(min=0)], first)
+            columns.append(found)
+            first += len(bricks)
+        tables = {"columns": torch.cat(columns), "density": mpis.density[kept], "texels": mpis.texels[kept]}
+        return replace(self, mpis=replace(mpis, **tables, packed={}))
+
+
+def shader_of(model_field: MMPIField) -> Shader:
+    """The network that shades a field's rays.
+
+    Raises:
+        ValueError: its samples are coloured one by one.
+    """
+    network = model_field.networks
+    if not isinstance(network, RayShader):
+        raise ValueError(
+            "A model whose samples are coloured one by one cannot be baked: train with --pipeline.model.shading ray."
+        )
+    numbers = [x.detach().cpu() for x in network.layers(0)]
+    numbers[-2:] = [CHANGE * x for x in numbers[-2:]]
+    return Shader(tuple(zip(numbers[::2], numbers[1::2], strict=True)), network.direction_frequencies, MOST_CHANGE)
+
+
+@torch.no_grad()
+def bake(model_field: MMPIField, threshold: float, background: float, form: BlendForm | None = None) -> BakedWindow:
+    """A field as bricks of 8-bit codes: all that hold something.
+
+    Args:
+        model_field: what to bake.
+        threshold: samples of less weight will not be gathered.
+        background: grey level behind everything.
+        form: how reliability enters, for which texels keep their blended optical depth; None where it takes no part.
+
+    Raises:
+        ValueError: the field has a cube, too many channels, or colours its samples one by one.
+    """
+    shader = shader_of(model_field)
+    if model_field.cube is not None:
+        raise ValueError("A model with a cube cannot be baked: train one of MPIs alone (placement.cube-voxels 0).")
+    if model_field.feature_channels > MOST_CHANNELS:
+        raise ValueError(
+            f"A model of {model_field.feature_channels} channels a texel cannot be baked: {MOST_CHANNELS} is the most."
+        )
+    plan = model_field.plan
+    shares = baked_shares(model_field) if form is not None else None
+    highest = max(float((_raw(model_field, k, p, form, shares)).max()) for k, p in _all_planes(model_field))
+    density_codes = Codes.spanning(THINNEST, max(highest, THINNEST + 1))
+    channels = _channel_codes(model_field)
+    columns, density, texels, count = [], [], [], 0
+    for k, _ in enumerate(plan.mpis):
+        raw = torch.cat([_raw(model_field, k, p, form, shares) for p in _planes(model_field, k)])
+        codes = density_codes.encode(raw)
+        blocks = _tiled(codes[..., None])[..., 0]
+        found, places = columns_from(_stored(model_field.grids[k]).cpu() & (blocks.amax((-1, -2)) > 0), count)
+        columns.append(found)
+        density.append(blocks[tuple(places.T)])
+        texels.append(_texel_codes(model_field, k, channels, places))
+        count += len(places)
+    mpis = BakedMpis(
+        plan.mpis,
+        tuple(model_field.layout.interval(k) for k in range(len(plan.mpis))),
+        torch.cat(columns),
+        torch.cat(density).contiguous(),
+        torch.cat(texels).contiguous(),
+        density_codes,
+        channels,
+    )
+    farthest = 10 * max(m.farthest for m in plan.mpis)
+    return BakedWindow(mpis, shader, plan.ray_near, threshold, background, farthest)
+
+
+def _planes(model_field: MMPIField, k: int) -> Iterator[slice]:
+    """A few planes at a time."""
+    for start in range(0, model_field.plan.mpis[k].planes, 16):
+        yield slice(start, min(start + 16, model_field.plan.mpis[k].planes))
+
+
+def _all_planes(model_field: MMPIField) -> Iterator[tuple[int, slice]]:
+    for k in range(len(model_field.plan.mpis)):
+        for planes in _planes(model_field, k):
+            yield k, planes
+
+
+def _raw(
+    model_field: MMPIField, k: int, planes: slice, form: BlendForm | None, shares: Tensor | None
+) -> Float[Tensor, "P H W"]:
+    """Raw densities with the planes' biases, such that softplus gives what a sample at a texel weighs when blended."""
+    grid = model_field.grids[k]
+    raw = read_planes(model_field.density.data, grid, planes)[..., 0] + model_field.layout.biases[k][planes, None, None]
+    if form is None or shares is None:
+        return raw.cpu()
+    interval = model_field.layout.interval(k)
+    share = read_planes(shares, grid, planes)[..., 0].clamp(0, 1)
+    tau = torch.nn.functional.softplus(raw) * interval
+    blended = blended_optical_depth(tau, share.log(), torch.log1p(-share), form)
+    tau = torch.where(tau > NEGLIGIBLE_DEPTH, blended, tau / len(model_field.grids)) / interval
+    return (tau + torch.log(-torch.expm1(-tau.clamp(min=1e-12)))).cpu()
+
+
+def _activated(values: Float[Tensor, "*N C"]) -> Float[Tensor, "*N C"]:
+    """Diffuse colours and features as rays gather them."""
+    return torch.cat([values[..., :3].sigmoid(), values[..., 3:].tanh()], -1)
+
+
+def _channel_codes(model_field: MMPIField) -> tuple[Codes, ...]:
+    """Ranges of the channels: colours span all, features what there is."""
+    values = model_field.features.data
+    low, high = values.amin(0)[3:].tanh().tolist(), values.amax(0)[3:].tanh().tolist()
+    return (*[Codes.spanning(0, 1)] * 3, *(Codes.spanning(a, b) for a, b in zip(low, high, strict=True)))
+
+
+def _texel_codes(
+    model_field: MMPIField, k: int, channels: tuple[Codes, ...], places: Tensor
+) -> UInt8[Tensor, "B 8 8 C"]:
+    """Codes of the channels in some bricks of one MPI."""
+    made = torch.empty(len(places), SIDE, SIDE, len(channels), dtype=torch.uint8)
+    for planes in _planes(model_field, k):
+        own = ((places[:, 0] >= planes.start) & (places[:, 0] < planes.stop)).nonzero()[:, 0]
+        values = _activated(read_planes(model_field.features.data, model_field.grids[k], planes)).cpu()
+        codes = torch.stack([c.encode(values[..., i]) for i, c in enumerate(channels)], -1)
+        plane, row, column = places[own].unbind(-1)
+        made[own] = _tiled(codes)[plane - planes.start, row, column]
+    return made
+
+
+def _tiled(images: Tensor) -> Tensor:
+    """Planes [P, H, W, C] in baked bricks [P, Y, X, 8, 8, C], neighbours sharing their border texels."""
+    _, height, width, _ = images.shape
+    below, right = -(height - 1) % CELLS, -(width - 1) % CELLS
+    padded = pad(images, (0, 0, 0, right, 0, below))
+    return padded.unfold(1, SIDE, CELLS).unfold(2, SIDE, CELLS).permute(0, 1, 2, 4, 5, 3)
+
+
+def _stored(grid: TexelGrid) -> Bool[Tensor, "P Y X"]:
+    """Baked tiles in which the field stores a texel."""
+    wide = (grid.own_tiles > 0).repeat_interleave(STORED_SIDE, 1).repeat_interleave(STORED_SIDE, 2)
+    texels = wide[:, : grid.height, : grid.width, None].to(torch.uint8)
+    return _tiled(texels)[..., 0].amax((-1, -2)) > 0

@@ -1,0 +1,146 @@
+"""Baked multi-plane images: bricks of 8-bit codes, and the columns that find them (docs/export.md has the format).
+
+A baked brick holds 8 x 8 texels of one plane and shares its border texels with its neighbours, so that it covers 7 x 7
+cells and a lookup reads one brick alone. A column is the bricks that lie behind each other in ``WORD`` planes of one
+tile: a bit for each plane that holds something, and the number of the first brick; the others follow it. So a ray knows
+from one word which of the next planes it can leave out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from jaxtyping import Float, Int, UInt8
+from torch import Tensor
+
+from mmpi_ns.scene.geometry import Frames
+from mmpi_ns.scene.plan import MPIPlan
+
+SIDE = 8
+"""Texels along each side of a baked brick."""
+CELLS = SIDE - 1
+"""Cells (squares between four texels) along each side of a baked brick."""
+WORD = 32
+"""Planes of a column."""
+FINENESS = 8
+"""Steps between two codes in which the optical depth of interpolated codes is told apart."""
+MOST_CHANNELS = 16
+"""Channels that a texel can have."""
+
+
+@dataclass(frozen=True)
+class Codes:
+    """What 8-bit codes stand for: low + step code."""
+
+    low: float
+    step: float
+
+    @staticmethod
+    def spanning(low: float, high: float) -> Codes:
+        return Codes(float(low), max(high - low, 1e-6) / 255)
+
+    def encode(self, values: Tensor) -> UInt8[Tensor, "..."]:
+        return ((values - self.low) / self.step).round().clamp(0, 255).to(torch.uint8)
+
+
+@dataclass(frozen=True, eq=False)
+class Shader:
+    """The network that is asked once a ray: mean colour, mean features, encoded direction -> change of the colour."""
+
+    layers: tuple[tuple[Float[Tensor, "O I"], Float[Tensor, "O"]], ...]
+    """Weights and biases, with max(0, .) between them."""
+    direction_octaves: int
+    """Frequencies of the direction's positional encoding."""
+    bound: float
+    """The network's output x changes the odds c / (1 - c) of the mean colour by e^(bound tanh(x / bound))."""
+
+
+@dataclass(frozen=True, eq=False)
+class BakedMpis:
+    """The bricks of K MPIs that merge along a ray.
+
+    Args:
+        mpis: frames and sizes, at the resolution that was baked.
+        intervals: factor on softplus of each MPI.
+        columns: of all MPIs one after the other, each [words, down, across]: bits of the planes, and the first brick.
+        density: codes of raw densities with the plane's bias.
+        texels: codes of the channels that are gathered along a ray: diffuse colour, then features.
+        density_codes: what the codes of ``density`` stand for.
+        channel_codes: what those of ``texels`` stand for.
+    """
+
+    mpis: tuple[MPIPlan, ...]
+    intervals: tuple[float, ...]
+    columns: Int[Tensor, "N 2"]
+    density: UInt8[Tensor, "B 8 8"]
+    texels: UInt8[Tensor, "B 8 8 C"]
+    density_codes: Codes
+    channel_codes: tuple[Codes, ...]
+    packed: dict[str, Any] = field(default_factory=dict)
+    """The same as a compiled operation reads it, made by it once."""
+
+    @property
+    def frames(self) -> Frames:
+        if "frames" not in self.packed:
+            self.packed["frames"] = Frames.pack(self.mpis)
+        return self.packed["frames"]
+
+    @property
+    def num_bricks(self) -> int:
+        return len(self.density)
+
+    @property
+    def nbytes(self) -> int:
+        return self.columns.nbytes + self.density.nbytes + self.texels.nbytes
+
+    def first_column(self, k: int) -> int:
+        return sum(columns_of(m) for m in self.mpis[:k])
+
+    def optical_depth(self, k: int, codes: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
+        """tau of head k from interpolated codes."""
+        raw = self.density_codes.low + self.density_codes.step * codes
+        return torch.nn.functional.softplus(raw) * self.intervals[k]
+
+    def steps_of_depth(self, k: int) -> Float[Tensor, "2041"]:
+        """e^-tau of head k at codes 0, 1/8, 2/8, ... 255."""
+        codes = torch.arange(255 * FINENESS + 1, dtype=torch.float64) / FINENESS
+        return torch.exp(-self.optical_depth(k, codes)).float()
+
+
+def tiles_of(mpi: MPIPlan) -> tuple[int, int, int]:
+    """Words of planes, and rows and columns of tiles, of an MPI."""
+    return -(-mpi.planes // WORD), -(-(mpi.height - 1) // CELLS), -(-(mpi.width - 1) // CELLS)
+
+
+def columns_of(mpi: MPIPlan) -> int:
+    words, down, across = tiles_of(mpi)
+    return words * down * across
+
+
+def brick_numbers(columns: Int[Tensor, "N 2"], mpi: MPIPlan) -> Int[Tensor, "P Y X"]:
+    """Brick of every tile of one MPI from its columns; -1 where nothing is stored."""
+    words, down, across = tiles_of(mpi)
+    bits = (columns[:, :1] >> torch.arange(WORD)) & 1
+    numbers = torch.where(bits > 0, columns[:, 1:] + bits.cumsum(1) - bits, -1)
+    return numbers.view(words, down, across, WORD).permute(0, 3, 1, 2).reshape(-1, down, across)[: mpi.planes]
+
+
+def columns_from(stored: Tensor, first: int) -> tuple[Int[Tensor, "N 2"], Int[Tensor, "B 3"]]:
+    """Columns of one MPI, and (plane, row, column) of its bricks in their order.
+
+    Args:
+        stored: bool [planes, down, across], which tiles hold something.
+        first: bricks of the MPIs before.
+    """
+    planes, down, across = stored.shape
+    padded = torch.nn.functional.pad(stored, (0, 0, 0, 0, 0, -planes % WORD))
+    bits = padded.view(-1, WORD, down, across).permute(0, 2, 3, 1).reshape(-1, WORD)
+    masks = (bits.to(torch.int64) << torch.arange(WORD)).sum(-1)
+    masks = torch.where(masks >= 2**31, masks - 2**32, masks)
+    counts = bits.sum(-1)
+    columns = torch.stack([masks, first + counts.cumsum(0) - counts], -1).to(torch.int32)
+    column, bit = bits.nonzero().unbind(-1)
+    word, place = column // (down * across), column % (down * across)
+    return columns, torch.stack([word * WORD + bit, place // across, place % across], -1)

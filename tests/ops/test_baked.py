@@ -1,0 +1,121 @@
+"""Marching through baked bricks: the compiled form and the torch reference against the NumPy reader, on hard rays."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+from random_bricks import random_window, rays_into, scene_of
+
+from mmpi_ns.export import reader
+from mmpi_ns.export.files import write_baked
+from mmpi_ns.ops import dispatch
+from mmpi_ns.ops.baked import cpu, reference
+from mmpi_ns.scene.baked import SIDE, Codes, Shader, brick_numbers, columns_from, columns_of
+
+FORMS = {"reference": reference, "cpu": cpu}
+
+
+def marched(form, window, rays, **given):
+    if form == "cpu" and dispatch.form_of("march_baked", torch.zeros(1)) != "cpu":
+        pytest.skip("no C++ compiler")
+    return FORMS[form].march_baked(window.mpis, *rays, window.threshold, **given)
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("settings", [
+    {"num_mpis": 1}, {"num_mpis": 3, "planes": 70}, {"channels": 3}, {"channels": 16}, {"stored": 0.02},
+    {"stored": 1.0}, {"density": (255, 255), "shares": (1e4, 1e4)}, {"density": (0, 0)},
+    {"density": (90, 160), "planes": 90},
+])  # fmt: skip
+def test_agrees_with_the_reader(form, settings, tmp_path):
+    """What a ray shows equals what a hundred lines of float64 NumPy make of the file."""
+    window = random_window(seed=len(str(settings)), **settings)
+    rays = rays_into(window)
+    write_baked(scene_of(window), tmp_path)
+    raw = reader.read(tmp_path)["windows"][0]
+    assert len(raw["network_array"]) == sum(o * (i + 1) for o, i in raw["shader"]["layers"])
+    lines = zip(rays[0].double().numpy(), rays[1].double().numpy(), strict=True)
+    expected = np.array([reader.render_ray(raw, o, d) for o, d in lines])
+    found = marched(form, window, rays)
+    shown = shaded(form, window, found, rays[1]).numpy()
+    # A ray that meets the border between stored and empty tiles to the last bit may read either.
+    wrong = np.abs(shown - expected).max(-1) > 5e-3
+    assert wrong.mean() <= 0.05, np.abs(shown - expected).max(-1)[wrong]
+    if settings.get("stored") == 1.0:
+        assert not wrong.any()
+    if settings.get("density") != (0, 0):
+        assert (found.mass > 0).any()
+
+
+def shaded(form, window, found, directions):
+    rgb = FORMS[form].shade_baked(window.shader, window.mpis.channel_codes, found.sums, found.mass, directions)
+    rgb = torch.where(found.mass > 0, rgb, 0.0)
+    return (rgb * (1 - found.passing) + 0.5 * found.passing).clamp(0, 1)
+
+
+@pytest.mark.parametrize("octaves", [0, 2, 5])
+@pytest.mark.parametrize("sizes", [(7, 3), (64, 64, 3), (5, 9, 6, 3)])
+def test_shading_agrees_with_the_reference(octaves, sizes):
+    """Any widths and depths, rays in no multiple of sixteen, black and white, and no mass at all."""
+    if dispatch.form_of("march_baked", torch.zeros(1)) != "cpu":
+        pytest.skip("no C++ compiler")
+    g = torch.Generator().manual_seed(octaves)
+    whole = (5 + 3 * (1 + 2 * octaves), *sizes)
+    layers = tuple((torch.randn(o, i, generator=g), torch.randn(o, generator=g)) for i, o in pairwise(whole))
+    shader, codes = Shader(layers, octaves, 8.0), (*[Codes.spanning(0, 1)] * 3, *[Codes.spanning(-1, 1)] * 2)
+    mass = torch.rand(101, 1, generator=g)
+    sums = mass * torch.rand(101, 5, generator=g) * 255
+    mass[3], sums[3], sums[4, :3], sums[5, :3] = 0, 0, 0, 255 * mass[5]
+    directions = torch.nn.functional.normalize(torch.randn(101, 3, generator=g), dim=-1)
+    found = cpu.shade_baked(shader, codes, sums, mass, directions)
+    expected = reference.shade_baked(shader, codes, sums.double(), mass.double(), directions.double())
+    # White to the last bit is not white, and odds may change by e^8.
+    torch.testing.assert_close(found.double(), expected, atol=1e-3, rtol=0)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_forms_agree(seed):
+    window = random_window(num_mpis=1 + seed, seed=seed, planes=33 + seed)
+    rays = rays_into(window, 200, seed)
+    compiled, plain = marched("cpu", window, rays), marched("reference", window, [r.double() for r in rays])
+    for name, a, b in zip(compiled._fields, compiled, plain, strict=True):
+        apart = (a.double() - b).abs() > 2e-3 * (1 + b.abs())
+        assert apart.float().mean() < 0.03, name
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_peaks_are_the_largest_weights(form):
+    """A brick's peak is reached, a brick that no ray reads keeps 0, and one ray alone weighs no more than 1."""
+    window = random_window(num_mpis=2, density=(150, 255))
+    peaks = torch.zeros(window.mpis.num_bricks)
+    found = marched(form, window, rays_into(window, 16), peaks=peaks)
+    assert float(peaks.max()) <= 1 and float(peaks.max()) >= float(found.mass.max()) / 80
+    assert (peaks == 0).any()
+    kept = window.keep(peaks > 0)
+    assert kept.mpis.num_bricks == int((peaks > 0).sum())
+    again = marched(form, kept, rays_into(window, 16))
+    torch.testing.assert_close(again.sums, found.sums, rtol=1e-4, atol=1e-3)
+
+
+def test_columns_find_every_brick():
+    """Numbers and places of bricks survive the way through columns, beyond 32 planes and with the sign bit set."""
+    window = random_window(num_mpis=1, planes=65, stored=0.7)
+    mpi = window.mpis.mpis[0]
+    numbers = brick_numbers(window.mpis.columns, mpi)
+    assert sorted(numbers[numbers >= 0].tolist()) == list(range(window.mpis.num_bricks))
+    columns, places = columns_from(numbers >= 0, 0)
+    assert torch.equal(columns, window.mpis.columns) and len(columns) == columns_of(mpi)
+    assert torch.equal(numbers[tuple(places.T)], torch.arange(len(places), dtype=numbers.dtype))
+    assert (window.mpis.columns[:, 0] < 0).any() and window.mpis.density.shape[1:] == (SIDE, SIDE)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_no_rays_and_no_bricks(form):
+    window = random_window(stored=0.0)
+    found = marched(form, window, rays_into(window, 20))
+    assert (found.mass == 0).all() and (found.passing == 1).all() and (found.inverse_t == 0).all()
+    none = marched(form, random_window(), [x[:0] for x in rays_into(window, 20)])
+    assert len(none.sums) == 0
