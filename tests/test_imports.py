@@ -17,7 +17,8 @@ COMMANDS = {
     "synthetic": {"utils"},
     "demo": set(METHOD) | {"synthetic"},
     "bench": set(METHOD) | {"synthetic", "prepare", "demo"},
-    "scripts": set(METHOD) | {"prepare", "synthetic", "demo", "bench", "placement"},
+    "export": set(METHOD),
+    "scripts": set(METHOD) | {"export", "prepare", "synthetic", "demo", "bench", "placement"},
 }
 """The method never imports these."""
 MAY_IMPORT = {wing: set(METHOD[: i + 1]) for i, wing in enumerate(METHOD)}

@@ -1,0 +1,137 @@
+"""A finished run baked: all its windows, with the bricks that its training views see, and the path of its cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from nerfstudio.cameras.cameras import Cameras
+from torch import Tensor
+
+from mmpi_ns.export.files import BakedScene, Pose
+from mmpi_ns.model import MMPIModel
+from mmpi_ns.ops.baked import march_baked
+from mmpi_ns.rendering.baked import BakedWindow
+from mmpi_ns.rendering.windows import mix_windows
+from mmpi_ns.scene.windows import window_shares
+
+Say = Callable[[str], None]
+
+
+def load_model(load_config: Path) -> Any:
+    """The pipeline of a finished run, ready to render.
+
+    Raises:
+        ValueError: it was not trained by this method.
+    """
+    from nerfstudio.utils.eval_utils import eval_setup
+
+    _, pipeline, _, _ = eval_setup(load_config, test_mode="test")
+    if not isinstance(pipeline.model, MMPIModel):
+        raise ValueError(f"The run of {load_config} was trained by another method: only those of mmpi can be exported.")
+    return pipeline
+
+
+def bake_run(pipeline: Any, least: float, say: Say = print) -> BakedScene:
+    """All windows of a run, baked.
+
+    Args:
+        pipeline: of a finished run.
+        least: bricks in which no training view sees this weight are left out; 0 keeps all.
+        say: told what is being done.
+
+    Raises:
+        ValueError: the model cannot be baked (says why).
+    """
+    model: MMPIModel = pipeline.model
+    cameras: Cameras = pipeline.datamanager.train_dataset.cameras
+    shares = window_shares(cameras.camera_to_worlds[:, :, 3], model.progress.windows.windows)
+    windows = []
+    for number, place in enumerate(model.progress.windows.windows):
+        own = (
+            (shares[:, number] > 0).nonzero()[:, 0].tolist() if len(model.progress.windows) > 1 else range(len(cameras))
+        )
+        whole = bake_window(model, number)
+        kept = prune(whole, (camera_rays(cameras, i) for i in own), least)
+        say(f"Window {number}: {kept.mpis.num_bricks} of {whole.mpis.num_bricks} bricks are seen ({least:g} or more).")
+        windows.append((replace(place, plan=replace(place.plan, mpis=kept.mpis.mpis, cube=None)), kept))
+    path = poses_of(pipeline)
+    ups = torch.tensor([pose.to_world for pose in path])[:, :, 1].mean(0)
+    name = Path(pipeline.datamanager.get_datapath()).resolve().name
+    return BakedScene(name, tuple((ups / ups.norm()).tolist()), path, windows)
+
+
+def prune(window: BakedWindow, rays: Iterable[tuple[Tensor, Tensor]], least: float) -> BakedWindow:
+    """A window without the bricks in which no sample of these rays weighs ``least``."""
+    if least <= 0:
+        return window
+    peaks = torch.zeros(window.mpis.num_bricks)
+    for origins, directions in rays:
+        nears = torch.full_like(origins[:, :1], window.ray_near)
+        march_baked(window.mpis, origins, directions, nears, torch.full_like(nears, torch.inf), window.threshold, peaks)
+    return window.keep(peaks >= least)
+
+
+def camera_rays(cameras: Cameras, index: int) -> tuple[Float[Tensor, "R 3"], Float[Tensor, "R 3"]]:
+    """Origins and unit directions of a camera's pixels."""
+    rays = cameras.generate_rays(index).flatten()
+    return rays.origins.contiguous(), rays.directions.contiguous()
+
+
+def bake_window(model: MMPIModel, number: int) -> BakedWindow:
+    """One window of a model with all its bricks."""
+    field = model.field if number == model.progress.window else model.store.load(number, model.device)
+    return model.baked(field)
+
+
+def poses_of(pipeline: Any) -> list[Pose]:
+    """All cameras of a capture in the order of their images' names, those held out too, as pinholes."""
+    poses = {}
+    for dataset, test in ((pipeline.datamanager.train_dataset, False), (pipeline.datamanager.eval_dataset, True)):
+        for i, name in enumerate(dataset.image_filenames):
+            camera = dataset.cameras[i]
+            focal, center = (float(camera.fx), float(camera.fy)), (float(camera.cx), float(camera.cy))
+            size = (int(camera.width), int(camera.height))
+            poses[str(name)] = Pose(camera.camera_to_worlds.tolist(), size, focal, center, test)
+    return [poses[name] for name in sorted(poses)]
+
+
+@torch.no_grad()
+def compare(pipeline: Any, scene: BakedScene, count: int) -> tuple[list[float], list[float], list[float]]:
+    """PSNR of test images: baked against exact, exact against the truth, and baked against the truth.
+
+    Args:
+        pipeline: of the run.
+        scene: its baked scene.
+        count: how many test images, evenly spaced; all where there are fewer.
+    """
+    dataset = pipeline.datamanager.eval_dataset
+    found: tuple[list[float], list[float], list[float]] = ([], [], [])
+    for i in torch.linspace(0, len(dataset) - 1, min(count, len(dataset))).long().tolist():
+        bundle, truth = dataset.cameras.generate_rays(i), dataset[i]["image"][..., :3]
+        exact = pipeline.model.get_outputs_for_camera_ray_bundle(bundle)["rgb"]
+        baked = render_scene(scene, *camera_rays(dataset.cameras, i))["rgb"].view(exact.shape)
+        for values, (a, b) in zip(found, ((baked, exact), (exact, truth), (baked, truth)), strict=True):
+            values.append(float(-10 * torch.log10((a - b).square().mean().clamp(min=1e-12))))
+    return found
+
+
+def render_scene(
+    scene: BakedScene, origins: Float[Tensor, "R 3"], directions: Float[Tensor, "R 3"]
+) -> dict[str, Tensor]:
+    """What a scene shows of rays: the windows that they start in, mixed as the model mixes them."""
+    shares = window_shares(origins, tuple(place for place, _ in scene.windows))
+    parts = {}
+    for w in (shares > 0).any(0).nonzero()[:, 0].tolist():
+        rays, window = (shares[:, w] > 0).nonzero()[:, 0], scene.windows[w][1]
+        nears = torch.full_like(origins[rays, :1], window.ray_near)
+        background = torch.full((3,), window.background)
+        parts[w] = (
+            rays,
+            window.render(origins[rays], directions[rays], nears, torch.full_like(nears, torch.inf), background),
+        )
+    return mix_windows(shares, parts)

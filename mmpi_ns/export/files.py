@@ -1,0 +1,226 @@
+"""Baked scenes on disk: a header ``scene.json`` and one file of arrays a window (docs/export.md has the format)."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from mmpi_ns.rendering.baked import BakedWindow
+from mmpi_ns.scene.baked import SIDE, BakedMpis, Codes, Shader
+from mmpi_ns.scene.plan import CubePlan, MPIPlan, ScenePlan
+from mmpi_ns.scene.windows import Window
+from mmpi_ns.utils.files import write_atomically
+
+FORMAT, VERSION = "mmpi-baked", 1
+HEADER = "scene.json"
+LEVEL = 6
+"""Of gzip: higher ones take twice as long for one hundredth."""
+
+
+@dataclass(frozen=True)
+class Pose:
+    """A camera of the captured path."""
+
+    to_world: list[list[float]]
+    """Rows of the 3 x 4 matrix from camera axes (x right, y up, looking along -z) to the world's."""
+    size: tuple[int, int]
+    """Width and height, pixels."""
+    focal: tuple[float, float]
+    """Pixels."""
+    center: tuple[float, float]
+    """Pixels."""
+    test: bool = False
+    """Held out from training."""
+
+
+@dataclass(frozen=True)
+class BakedScene:
+    """All windows of a run, the cameras' path, and where up is."""
+
+    name: str
+    up: tuple[float, float, float]
+    path: list[Pose]
+    windows: list[tuple[Window, BakedWindow]]
+    """Where a window is asked (its plan holds the MPIs as they were baked), and what it shows."""
+
+
+def write_baked(scene: BakedScene, folder: Path) -> int:
+    """Writes a scene into a folder, the header last, so that a scene with a header is whole.
+
+    Returns:
+        Bytes that were written.
+
+    Raises:
+        OSError: the disk is full or cannot be written.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / HEADER).unlink(missing_ok=True)
+    rows, total = [], 0
+    for i, (place, window) in enumerate(scene.windows):
+        blob, arrays = _pack(window)
+        name = f"window-{i:05d}.bin"
+        write_atomically(folder / name, lambda path, blob=blob: path.write_bytes(blob))
+        rows.append({"file": name, "bytes": len(blob), **_describe(place, window), "arrays": arrays})
+        total += len(blob)
+    header = {
+        "format": FORMAT,
+        "version": VERSION,
+        "name": scene.name,
+        "up": scene.up,
+        "path": [pose.__dict__ for pose in scene.path],
+        "windows": rows,
+    }
+    text = json.dumps(header, allow_nan=False)
+    write_atomically(folder / HEADER, lambda path: path.write_text(text, encoding="utf-8"))
+    return total + len(text)
+
+
+def _describe(place: Window, window: BakedWindow) -> dict[str, Any]:
+    """What a header says of a window beside its arrays."""
+    mpis, shader = window.mpis, window.shader
+    plan = json.loads(place.plan.to_json())
+    extra = [{"interval": interval, "first_column": mpis.first_column(k)} for k, interval in enumerate(mpis.intervals)]
+    return {
+        "center": place.center,
+        "radius": None if math.isinf(place.radius) else place.radius,
+        "margin": place.margin,
+        "ray_near": window.ray_near,
+        "threshold": window.threshold,
+        "background": window.background,
+        "farthest": window.farthest,
+        "content_near": place.plan.content_near,
+        "mpis": [m | e for m, e in zip(plan["mpis"], extra, strict=True)],
+        "density": mpis.density_codes.__dict__,
+        "channels": [c.__dict__ for c in mpis.channel_codes],
+        "shader": {
+            "inputs": ["colour", "features", "direction"],
+            "direction_octaves": shader.direction_octaves,
+            "layers": [list(weights.shape) for weights, _ in shader.layers],
+            "bound": shader.bound,
+        },
+    }
+
+
+def _pack(window: BakedWindow) -> tuple[bytes, dict[str, Any]]:
+    """A window's arrays one after the other, each compressed, and where each is."""
+    mpis = window.mpis
+    network = [x.detach().half().reshape(-1) for layer in window.shader.layers for x in layer]
+    arrays = {
+        "columns": mpis.columns.numpy().view(np.uint32),
+        "density": _differences(mpis.density.numpy().reshape(-1, SIDE * SIDE)),
+        "texels": _differences(
+            mpis.texels.permute(3, 0, 1, 2).numpy().reshape(len(mpis.channel_codes), -1, SIDE * SIDE)
+        ),
+        "network": torch.cat(network).numpy() if network else np.zeros(0, np.float16),
+    }
+    blob, rows = b"", {}
+    for name, array in arrays.items():
+        data = gzip.compress(np.ascontiguousarray(array).tobytes(), LEVEL, mtime=0)
+        rows[name] = {"type": str(array.dtype), "shape": array.shape, "offset": len(blob), "bytes": len(data)}
+        blob += data
+    return blob, rows
+
+
+def _differences(codes: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Each texel of a brick as the difference to the one before, which compresses better."""
+    return np.diff(codes, axis=-1, prepend=np.uint8(0))
+
+
+def read_baked(folder: Path) -> BakedScene:
+    """Reads what ``write_baked`` wrote.
+
+    Raises:
+        ValueError: it is missing, damaged or of another version (says which, and what to do).
+    """
+    header = read_header(folder)
+    try:
+        windows = [_read_window(folder, row) for row in header["windows"]]
+        path = [_read_pose(pose) for pose in header["path"]]
+        return BakedScene(header["name"], tuple(header["up"]), path, windows)
+    except (KeyError, TypeError) as error:
+        raise ValueError(f"{folder / HEADER} is damaged ({error!r}): bake the scene again.") from error
+
+
+def read_header(folder: Path) -> dict[str, Any]:
+    """The header of a baked scene. Raises ValueError as ``read_baked``."""
+    path = folder / HEADER
+    if not path.is_file():
+        raise ValueError(f"There is no baked scene in {folder} ({HEADER} is missing): make one with mmpi-export bake.")
+    try:
+        header = json.loads(path.read_text(encoding="utf-8"))
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path} is damaged ({error}): bake the scene again.") from error
+    if not isinstance(header, dict) or header.get("format") != FORMAT:
+        raise ValueError(f"{path} is not the header of a baked scene: give the folder that mmpi-export bake wrote.")
+    if header.get("version") != VERSION:
+        raise ValueError(
+            f"{path} is of version {header.get('version')}, and this program reads version {VERSION}: use the program "
+            "that wrote it, or bake the scene again."
+        )
+    return header
+
+
+def _read_window(folder: Path, row: dict[str, Any]) -> tuple[Window, BakedWindow]:
+    path = folder / row["file"]
+    blob = path.read_bytes() if path.is_file() else b""
+    if len(blob) != row["bytes"]:
+        raise ValueError(
+            f"{path} is cut short or missing ({len(blob)} of {row['bytes']} bytes): copy it anew, or bake again."
+        )
+
+    def array(name: str) -> NDArray[Any]:
+        spec = row["arrays"][name]
+        try:
+            data = gzip.decompress(blob[spec["offset"] : spec["offset"] + spec["bytes"]])
+            return np.frombuffer(data, spec["type"]).reshape(spec["shape"]).copy()
+        except (OSError, EOFError, ValueError) as error:
+            raise ValueError(
+                f"{path} is damaged ('{name}': {error}): copy it anew, or bake the scene again."
+            ) from error
+
+    names = [n for n in MPIPlan.__dataclass_fields__ if n != "far"]
+    fields = [{n: m[n] for n in names} | {"far": math.inf if m["far"] is None else m["far"]} for m in row["mpis"]]
+    mpis = tuple(MPIPlan(**{k: _tuples(v) for k, v in m.items()}) for m in fields)
+    no_cube: CubePlan | None = None
+    radius = math.inf if row["radius"] is None else row["radius"]
+    plan = ScenePlan(mpis, no_cube, row["ray_near"], row["content_near"], "baked")
+    sums: Callable[[str], NDArray[np.uint8]] = lambda name: np.cumsum(array(name), -1, dtype=np.uint8)  # noqa: E731
+    texels = torch.from_numpy(sums("texels")).view(len(row["channels"]), -1, SIDE, SIDE).permute(1, 2, 3, 0)
+    baked = BakedMpis(
+        mpis,
+        tuple(m["interval"] for m in row["mpis"]),
+        torch.from_numpy(array("columns").view(np.int32)),
+        torch.from_numpy(sums("density")).view(-1, SIDE, SIDE),
+        texels.contiguous(),
+        Codes(**row["density"]),
+        tuple(Codes(**c) for c in row["channels"]),
+    )
+    shader = _read_shader(row["shader"], torch.from_numpy(array("network")).float())
+    window = BakedWindow(baked, shader, row["ray_near"], row["threshold"], row["background"], row["farthest"])
+    return Window(tuple(row["center"]), radius, row["margin"], plan), window
+
+
+def _read_pose(row: dict[str, Any]) -> Pose:
+    return Pose(row["to_world"], *(tuple(row[name]) for name in ("size", "focal", "center")), test=row["test"])
+
+
+def _read_shader(row: dict[str, Any], numbers: torch.Tensor) -> Shader:
+    layers, at = [], 0
+    for outputs, inputs in row["layers"]:
+        weights, biases = numbers[at : at + outputs * inputs], numbers[at + outputs * inputs :][:outputs]
+        layers.append((weights.view(outputs, inputs), biases))
+        at += outputs * (inputs + 1)
+    return Shader(tuple(layers), row["direction_octaves"], row["bound"])
+
+
+def _tuples(value: Any) -> Any:
+    return tuple(_tuples(v) for v in value) if isinstance(value, list) else value

@@ -1,0 +1,265 @@
+// Reading a baked scene and drawing it with WebGL2. The format is in docs/export.md.
+"use strict";
+
+class Refusal extends Error {} // an error whose message is a sentence for the reader
+
+const CHUNK = 8, WORD_WIDTH = 2048;
+
+async function unpack(bytes, spec) {
+  const part = bytes.subarray(spec.offset, spec.offset + spec.bytes);
+  try {
+    const stream = new Blob([part]).stream().pipeThrough(new DecompressionStream("gzip"));
+    const data = await new Response(stream).arrayBuffer();
+    const size = { uint8: 1, uint32: 4, float16: 2 }[spec.type];
+    if (data.byteLength !== size * spec.shape.reduce((a, b) => a * b, 1)) throw new Error("wrong length");
+    return data;
+  } catch (error) {
+    throw new Refusal(`A file of this scene is damaged (${error.message}): copy it anew, or export the scene again.`);
+  }
+}
+
+function sumDifferences(codes) {
+  for (let brick = 0; brick < codes.length; brick += 64)
+    for (let i = brick + 1; i < brick + 64; i++) codes[i] += codes[i - 1];
+  return codes;
+}
+
+function halves(data) {
+  return Float32Array.from(new Uint16Array(data), (bits) => {
+    const exponent = (bits >> 10) & 31, fraction = bits & 1023, sign = bits >> 15 ? -1 : 1;
+    if (exponent === 0) return sign * fraction * 2 ** -24;
+    return exponent === 31 ? sign * Infinity : sign * (1 + fraction / 1024) * 2 ** (exponent - 15);
+  });
+}
+
+function checkHeader(header) {
+  if (!header || header.format !== "mmpi-baked") throw new Refusal("scene.json is not the header of a baked scene.");
+  if (header.version !== 1)
+    throw new Refusal(`This scene is of version ${header.version}, and this page reads version 1: export it again.`);
+  return header;
+}
+
+// Bricks side by side in a texture of 8 x 8 texels each; `channels` lists the code arrays that fill r, g, b, a.
+function atlas(channels, bricks, per, count) {
+  const rows = Math.max(1, Math.ceil(bricks / per)), width = per * 8;
+  const out = new Uint8Array(width * rows * 8 * count);
+  channels.forEach((codes, channel) => {
+    for (let brick = 0; brick < bricks; brick++) {
+      const corner = Math.floor(brick / per) * 8 * width + (brick % per) * 8;
+      for (let y = 0; y < 8; y++)
+        for (let x = 0; x < 8; x++)
+          out[(corner + y * width + x) * count + channel] = codes[brick * 64 + y * 8 + x];
+    }
+  });
+  return { out, width, height: rows * 8 };
+}
+
+// The network as GLSL, its numbers in a uniform block; weights of four inputs are one vec4.
+function networkSource(shader, channels) {
+  const inputs = channels + 3 * (1 + 2 * shader.direction_octaves);
+  const lines = [], quads = (n) => Math.ceil(n / 4);
+  let block = 0, from = "x0";
+  shader.layers.forEach(([outputs, given], layer) => {
+    const to = `x${layer + 1}`, width = quads(given);
+    lines.push(`float ${to}[${4 * quads(outputs)}];`);
+    lines.push(`for (int o = 0; o < ${4 * quads(outputs)}; o++) ${to}[o] = 0.0;`);
+    lines.push(`for (int o = 0; o < ${outputs}; o++) { int at = ${block} + o * ${width + 1};`);
+    lines.push(`  float sum = numbers[at + ${width}].x;`);
+    lines.push(`  for (int i = 0; i < ${width}; i++) sum += dot(numbers[at + i],`);
+    lines.push(`    vec4(${from}[4 * i], ${from}[4 * i + 1], ${from}[4 * i + 2], ${from}[4 * i + 3]));`);
+    lines.push(`  ${to}[o] = ${layer + 1 < shader.layers.length ? "max(sum, 0.0)" : "sum"}; }`);
+    block += outputs * (width + 1);
+    from = to;
+  });
+  const mean = [];
+  for (let c = 0; c < channels; c++)
+    mean.push(`x0[${c}] = low[${c}] + step_[${c}] * sums[${c >> 2}].${"xyzw"[c & 3]} / mass;`);
+  const encoded = [];
+  for (let a = 0; a < 3; a++) {
+    encoded.push(`x0[${channels + a}] = direction[${a}];`);
+    for (let i = 0; i < shader.direction_octaves; i++) {
+      const angle = `${(Math.PI * 2 ** i).toFixed(9)} * direction[${a}]`, at = channels + 3 + 3 * i + a;
+      encoded.push(`x0[${at}] = sin(${angle}); x0[${at + 3 * shader.direction_octaves}] = cos(${angle});`);
+    }
+  }
+  return {
+    size: block,
+    source: `layout(std140) uniform Network { vec4 numbers[${block}]; };
+vec3 shade(vec4 sums[GROUPS], float mass, vec3 direction) {
+  float x0[${4 * quads(inputs)}];
+  for (int i = 0; i < ${4 * quads(inputs)}; i++) x0[i] = 0.0;
+  ${mean.join("\n  ")}
+  vec3 mean = vec3(x0[0], x0[1], x0[2]);
+  ${encoded.join("\n  ")}
+  ${lines.join("\n  ")}
+  vec3 change = vec3(${from}[0], ${from}[1], ${from}[2]) / ${shader.bound.toFixed(6)};
+  return mean / (mean + (1.0 - mean) * exp(-${shader.bound.toFixed(6)} * tanh(clamp(change, -9.0, 9.0))));
+}`,
+  };
+}
+
+// The numbers of the block above, from the file's order: weights [outputs, inputs], then biases, layer by layer.
+function networkBlock(shader, numbers, size) {
+  const block = new Float32Array(4 * size);
+  let from = 0, to = 0;
+  for (const [outputs, inputs] of shader.layers) {
+    const width = Math.ceil(inputs / 4), biases = from + outputs * inputs;
+    for (let o = 0; o < outputs; o++) {
+      for (let i = 0; i < inputs; i++) block[4 * (to + o * (width + 1)) + i] = numbers[from + o * inputs + i];
+      block[4 * (to + o * (width + 1) + width)] = numbers[biases + o];
+    }
+    from = biases + outputs;
+    to += outputs * (width + 1);
+  }
+  return block;
+}
+
+// One window on the graphics card.
+class WindowOnCard {
+  static async load(gl, row, bytes) {
+    if (bytes.length !== row.bytes)
+      throw new Refusal(`${row.file} is cut short (${bytes.length} of ${row.bytes} bytes): copy it anew.`);
+    const own = new WindowOnCard();
+    Object.assign(own, { gl, row, textures: [], heads: row.mpis.length });
+    const arrays = row.arrays, channels = row.channels.length, bricks = arrays.density.shape[0];
+    const per = gl.getParameter(gl.MAX_TEXTURE_SIZE) >= 4096 ? 512 : 256;
+    if (Math.ceil(bricks / per) * 8 > gl.getParameter(gl.MAX_TEXTURE_SIZE))
+      throw new Refusal("This scene is larger than the textures of this graphics card: export fewer bricks (--least).");
+    const network = networkSource(row.shader, channels);
+    if (network.size * 16 > gl.getParameter(gl.MAX_UNIFORM_BLOCK_SIZE))
+      throw new Refusal("The network of this scene is too wide for this graphics card.");
+    own.groups = Math.ceil(channels / 4);
+    own.program = own.compile(network.source);
+    own.addColumns(new Uint32Array(await unpack(bytes, arrays.columns)));
+    const density = sumDifferences(new Uint8Array(await unpack(bytes, arrays.density)));
+    own.addAtlas([density], bricks, per, 1);
+    const texels = sumDifferences(new Uint8Array(await unpack(bytes, arrays.texels)));
+    for (let g = 0; g < own.groups; g++) {
+      const some = [];
+      for (let c = 4 * g; c < Math.min(channels, 4 * g + 4); c++)
+        some.push(texels.subarray(c * bricks * 64, (c + 1) * bricks * 64));
+      own.addAtlas(some, bricks, per, 4);
+    }
+    own.setConstants(networkBlock(row.shader, halves(await unpack(bytes, arrays.network)), network.size));
+    return own;
+  }
+
+  compile(network) {
+    const { gl } = this;
+    const gather = Array.from({ length: this.groups }, (_, g) => `sums[${g}] += (255.0 * weight) * textureLod(texels[${g}], uv, 0.0);`);
+    const fragment = "#version 300 es\n" + MARCH
+      .replace("NETWORK", network)
+      .replace("GATHER", gather.join("\n"))
+      .replace(/\/\*each\*\/([\s\S]*?)\/\*end\*\//g, (_, body) =>
+        Array.from({ length: this.heads }, (_, k) => body.replaceAll("K_", k)).join("\n"))
+      .replaceAll("GROUPS", this.groups).replaceAll("HEADS", this.heads).replaceAll("COLUMNS", WORD_WIDTH);
+    const vertex = `#version 300 es
+      void main() { gl_Position = vec4(vec2(gl_VertexID & 1, gl_VertexID >> 1) * 4.0 - 1.0, 0.0, 1.0); }`;
+    const program = gl.createProgram();
+    for (const [kind, text] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
+      const shader = gl.createShader(kind);
+      gl.shaderSource(shader, text);
+      gl.compileShader(shader);
+      gl.attachShader(program, shader);
+      if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS) && !gl.isContextLost())
+        throw new Refusal(`The graphics card does not take the page's program (${gl.getShaderInfoLog(shader)}).`);
+    }
+    gl.linkProgram(program);
+    if (!gl.getProgramParameter(program, gl.LINK_STATUS))
+      throw new Refusal(`The graphics card does not take the page's program (${gl.getProgramInfoLog(program)}).`);
+    return program;
+  }
+
+  addTexture(internal, width, height, format, type, data, filter) {
+    const { gl } = this, texture = gl.createTexture();
+    gl.bindTexture(gl.TEXTURE_2D, texture);
+    gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
+    gl.texImage2D(gl.TEXTURE_2D, 0, internal, width, height, 0, format, type, data);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, filter);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, filter);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_S, gl.CLAMP_TO_EDGE);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE);
+    this.textures.push(texture);
+  }
+
+  addColumns(columns) {
+    const { gl } = this, height = Math.max(1, Math.ceil(columns.length / 2 / WORD_WIDTH));
+    const padded = new Uint32Array(2 * WORD_WIDTH * height);
+    padded.set(columns);
+    this.addTexture(gl.RG32UI, WORD_WIDTH, height, gl.RG_INTEGER, gl.UNSIGNED_INT, padded, gl.NEAREST);
+  }
+
+  addAtlas(channels, bricks, per, count) {
+    const { gl } = this, { out, width, height } = atlas(channels, bricks, per, count);
+    const [internal, format] = count === 1 ? [gl.R8, gl.RED] : [gl.RGBA8, gl.RGBA];
+    this.addTexture(internal, width, height, format, gl.UNSIGNED_BYTE, out, gl.LINEAR);
+  }
+
+  uniform(name) { return this.gl.getUniformLocation(this.program, name); }
+
+  setConstants(network) {
+    const { gl, row } = this, flat = (f) => row.mpis.flatMap(f);
+    gl.useProgram(this.program);
+    const disparity = (m) => (m.far === null ? 0 : 1 / m.far);
+    gl.uniform3fv(this.uniform("origin"), flat((m) => m.origin));
+    gl.uniformMatrix3fv(this.uniform("axes"), false, flat((m) => m.axes.flat()));
+    gl.uniform4fv(this.uniform("extent"), flat((m) => m.extent));
+    gl.uniform4fv(this.uniform("planes"), flat((m) =>
+      [(1 / m.near - disparity(m)) / (m.planes - 1), disparity(m), m.interval, m.planes]));
+    gl.uniform4iv(this.uniform("sizes"), flat((m) =>
+      [m.height, m.width, Math.ceil((m.height - 1) / 7), Math.ceil((m.width - 1) / 7)]));
+    gl.uniform1iv(this.uniform("first"), row.mpis.map((m) => m.first_column));
+    gl.uniform1f(this.uniform("rayNear"), row.ray_near);
+    gl.uniform1f(this.uniform("threshold"), row.threshold);
+    gl.uniform1f(this.uniform("background"), row.background);
+    gl.uniform2f(this.uniform("densityCodes"), row.density.low, row.density.step);
+    const padded = (name) => Array.from({ length: 4 * this.groups }, (_, c) => row.channels[c]?.[name] ?? 0);
+    gl.uniform1fv(this.uniform("low"), padded("low"));
+    gl.uniform1fv(this.uniform("step_"), padded("step"));
+    const near = Math.log(row.content_near || row.ray_near || 1e-3);
+    gl.uniform2f(this.uniform("depthRange"), near, Math.max(near + 1, Math.log(row.farthest / 10)));
+    gl.uniform1i(this.uniform("columns"), 0);
+    gl.uniform1i(this.uniform("density"), 1);
+    gl.uniform1iv(this.uniform("texels"), Array.from({ length: this.groups }, (_, g) => 2 + g));
+    const block = gl.getUniformBlockIndex(this.program, "Network");
+    this.buffer = gl.createBuffer();
+    gl.bindBuffer(gl.UNIFORM_BUFFER, this.buffer);
+    gl.bufferData(gl.UNIFORM_BUFFER, network, gl.STATIC_DRAW);
+    gl.uniformBlockBinding(this.program, block, 0);
+  }
+
+  draw(view, share) {
+    const { gl } = this;
+    gl.useProgram(this.program);
+    this.textures.forEach((texture, i) => {
+      gl.activeTexture(gl.TEXTURE0 + i);
+      gl.bindTexture(gl.TEXTURE_2D, texture);
+    });
+    gl.bindBufferBase(gl.UNIFORM_BUFFER, 0, this.buffer);
+    gl.uniform3fv(this.uniform("eye"), view.eye);
+    gl.uniformMatrix3fv(this.uniform("turn"), false, view.turn);
+    gl.uniform4fv(this.uniform("lens"), view.lens);
+    gl.uniform1f(this.uniform("rows"), view.height);
+    gl.uniform1i(this.uniform("mode"), view.mode);
+    gl.uniform1i(this.uniform("alone"), view.alone);
+    gl.uniform1f(this.uniform("share"), share);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+  }
+
+  free() {
+    for (const texture of this.textures) this.gl.deleteTexture(texture);
+    this.gl.deleteProgram(this.program);
+    this.gl.deleteBuffer(this.buffer);
+  }
+}
+
+// How much each window says of a ray that starts at `eye` (as scene/windows.py): full in its ball, falling off beyond.
+function windowShares(rows, eye) {
+  if (rows.length === 1) return [1];
+  const beyond = rows.map((r) => Math.hypot(...r.center.map((c, a) => c - eye[a])) - r.radius);
+  const raw = rows.map((r, w) => Math.min(1, Math.max(0, 1 - beyond[w] / r.margin)));
+  const total = raw.reduce((a, b) => a + b, 0);
+  if (total > 0) return raw.map((x) => x / total);
+  const nearest = beyond.indexOf(Math.min(...beyond));
+  return rows.map((_, w) => (w === nearest ? 1 : 0));
+}

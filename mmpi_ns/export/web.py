@@ -1,0 +1,51 @@
+"""The page that flies through a baked scene: a folder for any static host, or one HTML file."""
+
+from __future__ import annotations
+
+import base64
+from pathlib import Path
+
+from mmpi_ns.export.files import HEADER, read_header
+from mmpi_ns.utils.files import write_atomically
+
+PAGE = Path(__file__).parent / "page"
+
+
+def write_page(folder: Path) -> Path:
+    """Writes ``index.html`` beside a baked scene."""
+    read_header(folder)
+    path = folder / "index.html"
+    html = _html("")
+    write_atomically(path, lambda unfinished: unfinished.write_text(html, encoding="utf-8"))
+    return path
+
+
+def write_single_file(folder: Path, path: Path) -> None:
+    """Writes one HTML file that holds a baked scene and opens by a double click.
+
+    Args:
+        folder: of the baked scene.
+        path: the file to write.
+
+    Raises:
+        ValueError: the scene is missing or of another version.
+        OSError: the disk is full or cannot be written.
+    """
+    header = read_header(folder)
+    blocks = [_block(HEADER, "application/json", (folder / HEADER).read_text(encoding="utf-8").replace("<", "\\u003c"))]
+    for row in header["windows"]:
+        data = base64.b64encode((folder / row["file"]).read_bytes()).decode()
+        blocks.append(_block(row["file"], "application/octet-stream", data))
+    html = _html("\n".join(blocks))
+    write_atomically(path, lambda unfinished: unfinished.write_text(html, encoding="utf-8"))
+
+
+def _html(data: str) -> str:
+    shader = (PAGE / "march.glsl").read_text(encoding="utf-8")
+    code = "\n".join((PAGE / name).read_text(encoding="utf-8") for name in ("scene.js", "page.js"))
+    page = (PAGE / "index.html").read_text(encoding="utf-8")
+    return page.replace("<!--data-->", data).replace("/*code*/", f"const MARCH = `{shader}`;\n{code}")
+
+
+def _block(name: str, kind: str, text: str) -> str:
+    return f'<script type="{kind}" id="{name}">{text}</script>'

@@ -1,0 +1,126 @@
+"""``mmpi-export``: a trained model for others to look at, as a baked scene or as a page for a browser."""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+if TYPE_CHECKING:
+    from mmpi_ns.export.files import BakedScene
+
+
+@dataclass
+class _Run:
+    load_config: Path
+    """config.yml of a finished run."""
+    least: float = 0.005
+    """Bricks in which no training view sees this rendering weight are left out; 0 keeps all."""
+    compare: int = 5
+    """Test images to compare with the exact renderer; 0 for none."""
+    overwrite: bool = False
+    """Replace an export that is at the output."""
+
+    def bake(self) -> BakedScene:
+        """The run's scene, with what baking cost in quality printed."""
+        # Slow imports, which --help and mistakes do not need.
+        from mmpi_ns.export.bake import bake_run, compare, load_model
+
+        pipeline = load_model(self.load_config)
+        scene = bake_run(pipeline, self.least)
+        if self.compare > 0:
+            means = [sum(values) / max(len(values), 1) for values in compare(pipeline, scene, self.compare)]
+            print(f"Baked images have {means[0]:.1f} dB to the exact renderer's;")
+            print(f"  against the truth {means[2]:.2f} dB in place of {means[1]:.2f} ({self.compare} test images).")
+        return scene
+
+
+@dataclass
+class Bake(_Run):
+    """Writes a baked scene: a folder with scene.json and the bricks of every window (docs/export.md)."""
+
+    output: Path | None = None
+    """Folder to write; unless given, 'baked' beside config.yml."""
+
+    def main(self) -> None:
+        _check_run(self.load_config)
+        folder = self.output or self.load_config.parent / "baked"
+        _check_output(folder, self.overwrite)
+        scene = self.bake()
+        from mmpi_ns.export.files import write_baked
+
+        size = write_baked(scene, folder)
+        print(f"Wrote {folder}: {size / 1e6:.1f} MB.")
+
+
+@dataclass
+class Web(_Run):
+    """Writes a page that flies through the scene in a browser with WebGL2: a folder for any web server, or one file."""
+
+    output: Path = Path("site")
+    """Folder to write; with --single-file the file."""
+    single_file: bool = False
+    """One HTML file that opens by a double click."""
+
+    def main(self) -> None:
+        _check_run(self.load_config)
+        path = self.output if self.output.suffix == ".html" or not self.single_file else self.output / "index.html"
+        if not self.single_file:
+            _check_output(self.output, self.overwrite)
+        elif path.exists() and not self.overwrite:
+            raise ValueError(f"{path} is there already: name another file, or give --overwrite.")
+        scene = self.bake()
+        from mmpi_ns.export.files import write_baked
+        from mmpi_ns.export.web import write_page, write_single_file
+
+        if self.single_file:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryDirectory(dir=path.parent) as folder:
+                write_baked(scene, Path(folder))
+                write_single_file(Path(folder), path)
+            print(f"Wrote {path}: {path.stat().st_size / 1e6:.1f} MB. Open it in a browser.")
+            return
+        size = write_baked(scene, self.output)
+        write_page(self.output)
+        print(f"Wrote {self.output}: {size / 1e6:.1f} MB. To look at it:")
+        print(f"  python -m http.server --directory {self.output}    # and open http://localhost:8000")
+
+
+def _check_run(load_config: Path) -> None:
+    """Raises ValueError where there is no run, or none with a checkpoint."""
+    if not load_config.is_file():
+        raise ValueError(f"There is no run at {load_config}: give the config.yml that ns-train wrote.")
+    checkpoints = load_config.parent / "nerfstudio_models"
+    if not any(checkpoints.glob("step-*.ckpt")):
+        raise ValueError(f"The run has no checkpoint in {checkpoints}: train it to its first save at least.")
+
+
+def _check_output(folder: Path, overwrite: bool) -> None:
+    """Raises ValueError where a folder holds something that an export would not replace."""
+    if folder.exists() and not folder.is_dir():
+        raise ValueError(f"{folder} is a file: name a folder to write.")
+    if not folder.is_dir() or not any(folder.iterdir()):
+        return
+    if not (folder / "scene.json").is_file():
+        raise ValueError(f"{folder} holds other files: name an empty folder, or one that does not exist.")
+    if not overwrite:
+        raise ValueError(f"{folder} holds an export already: name another folder, or give --overwrite.")
+
+
+Command = Annotated[Bake, tyro.conf.subcommand("bake")] | Annotated[Web, tyro.conf.subcommand("web")]
+
+
+def entrypoint() -> None:
+    """The command ``mmpi-export``; a mistake is one sentence and exit status 1."""
+    try:
+        tyro.cli(Command, description=__doc__).main()  # type: ignore[arg-type]
+    except (ValueError, OSError) as error:
+        sys.exit(f"mmpi-export: {error}")
+
+
+if __name__ == "__main__":
+    entrypoint()

@@ -1,0 +1,164 @@
+"""Baking a model: its images against the exact renderer's, in one window and several, blended and not; refusals."""
+
+from __future__ import annotations
+
+import copy
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from nerfstudio.cameras.rays import RayBundle
+from random_fields import random_rays
+from training_runs import ready, trainer_config, write_plan
+
+from mmpi_ns.export.bake import bake_run, compare, prune
+from mmpi_ns.export.files import read_baked, write_baked
+from mmpi_ns.field.shading import RayShader
+from mmpi_ns.scripts import export
+
+
+@pytest.fixture(scope="module")
+def trainer(scene, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("run")
+    plan = write_plan(scene, folder / "plan.json", planes=40)
+    return ready(trainer_config(scene, plan, folder, shading="ray"))
+
+
+def filled(trainer, seed=0):
+    """A model whose densities are random, and whose colours and features change from plane to plane alone: what is
+    interpolated within a plane is then the same before and after sigmoid and tanh."""
+    model = trainer.pipeline.model.eval()
+    field, g = model.field, torch.Generator().manual_seed(seed)
+    field.forget_shares()
+    field.density.data[64:] = torch.randn(len(field.density) - 64, 1, generator=g) * 2 + 1.5
+    for grid in field.grids:
+        rows = torch.arange(64, len(field.density))
+        own = rows[grid.holds(rows)]
+        values = torch.randn(grid.depth, field.feature_channels, generator=g) * 2
+        field.features.data[own] = values[grid.texel(own)[0]]
+    field.reliability.data = torch.randn(field.reliability.shape, generator=g)
+    field.touched.fill_(1)
+    field.networks.weights.data = torch.randn(field.networks.weights.shape, generator=g) * 0.2
+    return model
+
+
+def bundle_of(plan, count=400):
+    o, d = (torch.tensor(x, dtype=torch.float32) for x in random_rays(plan, count, 3))
+    return RayBundle(
+        origins=o, directions=d, pixel_area=torch.ones(count, 1), camera_indices=torch.zeros(count, 1).int()
+    )
+
+
+def outputs(model, how, rays):
+    model.config.render = how
+    with torch.no_grad():
+        found = model.get_outputs(copy.deepcopy(rays))
+    model.config.render = "exact"
+    return found
+
+
+def test_baked_images_are_the_exact_ones(trainer, monkeypatch):
+    """The same colours to the error of 8 bits, the same depths and winners nearly everywhere; joint, so not blended."""
+    model = filled(trainer)
+    monkeypatch.setattr(model.config, "training", "joint")
+    rays = bundle_of(model.field.plan)
+    exact, baked = outputs(model, "exact", rays), outputs(model, "baked", rays)
+    assert set(exact) == set(baked) and all(exact[n].shape == baked[n].shape for n in exact)
+    assert exact["rgb"].std() > 0.05
+    assert (exact["rgb"] - baked["rgb"]).square().mean() < 1e-4  # 40 dB
+    torch.testing.assert_close(exact["accumulation"], baked["accumulation"], atol=0.02, rtol=0)
+    assert ((exact["depth"] / baked["depth"]).log().abs() < 0.01).float().mean() > 0.9
+    assert (exact["winning_mpi"] == baked["winning_mpi"]).float().mean() > 0.95
+
+
+@pytest.mark.parametrize("form", ["paper", "opacity"])
+def test_blending_is_baked_into_the_bricks(trainer, form, monkeypatch):
+    """Two phases: bricks hold blended densities, and differ from those that are not; shares are interpolated."""
+    model = filled(trainer, 1)
+    monkeypatch.setattr(model.config, "blend_form", form)
+    model.field.reliability.data[:] = 0.0
+    for k, grid in enumerate(model.field.grids):  # one vote a head: shares change where covers end alone
+        rows = torch.arange(64, len(model.field.density))
+        model.field.reliability.data[rows[grid.holds(rows)]] = 1.5 * k
+    rays = bundle_of(model.field.plan)
+    exact, baked = outputs(model, "exact", rays), outputs(model, "baked", rays)
+    error = (exact["rgb"] - baked["rgb"]).square().mean()
+    model.field.forget_shares()
+    monkeypatch.setattr(model.config, "training", "joint")
+    unblended = outputs(model, "baked", rays)
+    assert error < 1e-3 and error < 0.2 * (exact["rgb"] - unblended["rgb"]).square().mean()
+
+
+def test_training_on_forgets_what_was_baked(trainer):
+    model = filled(trainer)
+    first = model.baked(model.field)
+    assert model.baked(model.field) is first
+    model.field.forget_shares()
+    assert model.baked(model.field) is not first
+
+
+def test_a_run_is_baked_and_read_again(trainer, tmp_path):
+    """What seen bricks show is what all show, and the file gives the same images."""
+    model = filled(trainer)
+    said = []
+    scene = bake_run(trainer.pipeline, 0.003, said.append)
+    whole = model.baked(model.field)
+    kept = scene.windows[0][1]
+    assert 0 < kept.mpis.num_bricks < whole.mpis.num_bricks and "bricks" in said[0]
+    assert len(scene.path) == 8 and sum(pose.test for pose in scene.path) == 2
+    write_baked(scene, tmp_path)
+    for which in (scene, read_baked(tmp_path)):
+        against_exact, exact, baked = compare(trainer.pipeline, which, 2)
+        assert len(exact) == 2 and min(against_exact) > 35
+        assert max(abs(a - b) for a, b in zip(exact, baked, strict=True)) < 0.3
+    assert prune(whole, [], 0).mpis.num_bricks == whole.mpis.num_bricks
+
+
+def test_what_cannot_be_baked_is_refused(trainer, monkeypatch):
+    model = filled(trainer)
+    model.field.forget_shares()
+    monkeypatch.setattr(model.field, "feature_channels", 17)
+    with pytest.raises(ValueError, match="16 is the most"):
+        model.baked(model.field)
+    monkeypatch.undo()
+    monkeypatch.setattr(type(model.field), "cube", property(lambda _: object()))
+    with pytest.raises(ValueError, match="cube"):
+        model.baked(model.field)
+    monkeypatch.undo()
+    assert isinstance(model.field.networks, RayShader)
+    model.field._modules["networks"] = torch.nn.Linear(1, 1)
+    try:
+        with pytest.raises(ValueError, match="shading ray"):
+            model.baked(model.field)
+    finally:
+        model.field._modules["networks"] = RayShader(4, 8, 2)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["bake", "--load-config", "nothing/config.yml"], "There is no run at nothing/config.yml"),
+        (["bake", "--load-config", "run/config.yml"], "The run has no checkpoint"),
+        (["web", "--load-config", "run2/config.yml", "--output", "used"], "used holds other files"),
+        (["web", "--load-config", "run2/config.yml", "--output", "export"], "give --overwrite"),
+        (["web", "--load-config", "run2/config.yml", "--output", "file"], "file is a file"),
+        (
+            ["web", "--load-config", "run2/config.yml", "--output", "one.html", "--single-file"],
+            "one.html is there already",
+        ),
+    ],
+)
+def test_mistakes_are_one_sentence(arguments, words, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for folder in ("run", "run2/nerfstudio_models", "used", "export"):
+        Path(folder).mkdir(parents=True)
+    files = ("run/config.yml", "run2/config.yml", "used/notes.txt", "export/scene.json", "file", "one.html")
+    for name in (*files, "run2/nerfstudio_models/step-000000001.ckpt"):
+        Path(name).write_text("{}")
+    monkeypatch.setattr(sys, "argv", ["mmpi-export", *arguments])
+    with pytest.raises(SystemExit) as caught:
+        export.entrypoint()
+    said = str(caught.value.code)
+    assert said.startswith("mmpi-export: ") and words in said and "\n" not in said
+    assert all(Path(name).read_text() == "{}" for name in files)

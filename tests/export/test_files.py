@@ -1,0 +1,135 @@
+"""Baked scenes on disk: what is written is read, by both readers, and damage is one sentence."""
+
+from __future__ import annotations
+
+import gzip
+import json
+
+import numpy as np
+import pytest
+import torch
+from random_bricks import random_window, rays_into, scene_of
+
+from mmpi_ns.export import reader
+from mmpi_ns.export.bake import render_scene
+from mmpi_ns.export.files import HEADER, read_baked, write_baked
+from mmpi_ns.ops.baked.reference import march_baked
+
+
+@pytest.fixture
+def folder(tmp_path):
+    write_baked(scene_of(random_window(), random_window(num_mpis=3, seed=5)), tmp_path / "baked")
+    return tmp_path / "baked"
+
+
+def test_what_is_written_is_read(folder):
+    """Bit for bit, but for the network, which is kept in half precision."""
+    scene = scene_of(random_window(), random_window(num_mpis=3, seed=5))
+    again = read_baked(folder)
+    assert (again.name, again.up, again.path) == (scene.name, scene.up, scene.path)
+    for (place, window), (other_place, other) in zip(scene.windows, again.windows, strict=True):
+        assert (place.center, place.radius, place.margin) == (
+            other_place.center,
+            other_place.radius,
+            other_place.margin,
+        )
+        for name in ("columns", "density", "texels"):
+            assert torch.equal(getattr(window.mpis, name), getattr(other.mpis, name)), name
+        for name in ("mpis", "intervals", "density_codes", "channel_codes"):
+            assert getattr(window.mpis, name) == getattr(other.mpis, name), name
+        assert (window.threshold, window.ray_near, window.farthest) == (other.threshold, other.ray_near, other.farthest)
+        for layer, other_layer in zip(window.shader.layers, other.shader.layers, strict=True):
+            for a, b in zip(layer, other_layer, strict=True):
+                assert torch.equal(a.half().float(), b)
+
+
+def test_an_unbounded_window_stays_unbounded(tmp_path):
+    write_baked(scene_of(random_window()), tmp_path)
+    assert read_baked(tmp_path).windows[0][0].radius == float("inf")
+    assert json.loads((tmp_path / HEADER).read_text())["windows"][0]["radius"] is None
+
+
+def test_the_reader_finds_the_same_codes(folder):
+    raw, scene = reader.read(folder), read_baked(folder)
+    for row, (_, window) in zip(raw["windows"], scene.windows, strict=True):
+        assert np.array_equal(row["density_array"], window.mpis.density.numpy().reshape(-1, 64))
+        texels = window.mpis.texels.permute(3, 0, 1, 2).numpy().reshape(len(row["channels"]), -1, 64)
+        assert np.array_equal(row["texels_array"], texels)
+
+
+def test_windows_are_mixed_by_their_shares():
+    """Midway between two windows a ray shows the mean of both, and inside a ball one alone."""
+    a, b = random_window(seed=3, stored=1.0), random_window(seed=4, stored=1.0)
+    scene = scene_of(a, b, radius=1.5)  # centres 4 apart, margins of 1: shares of a half in the middle
+    _, directions, nears, fars = rays_into(a, 12)
+    origins = torch.tensor([2.0, 0.0, 0.0]).expand(12, 3).contiguous()
+    shown = render_scene(scene, origins, directions)["rgb"]
+    parts = [w.render(origins, directions, nears, fars, torch.full((3,), 0.5))["rgb"] for w in (a, b)]
+    torch.testing.assert_close(shown, (parts[0] + parts[1]) / 2, atol=1e-5, rtol=0)
+    at_first = render_scene(scene, origins - 2, directions)["rgb"]
+    torch.testing.assert_close(at_first, a.render(origins - 2, directions, nears, fars, torch.full((3,), 0.5))["rgb"])
+
+
+def edit(folder, **changes):
+    header = json.loads((folder / HEADER).read_text())
+    (folder / HEADER).write_text(json.dumps(header | changes))
+
+
+def test_damage_is_one_sentence(folder):
+    """Each says what is wrong and what to do; a file is never half read."""
+
+    def refused(*words):
+        with pytest.raises(ValueError) as caught:
+            read_baked(folder)
+        assert "\n" not in str(caught.value) and all(w in str(caught.value) for w in words), str(caught.value)
+
+    blob = folder / "window-00001.bin"
+    whole = blob.read_bytes()
+    blob.write_bytes(whole[:-7])
+    refused("window-00001.bin", "cut short", "copy it anew")
+    damaged = bytearray(whole)
+    damaged[200:260] = bytes(60)
+    blob.write_bytes(damaged)
+    refused("window-00001.bin", "damaged")
+    blob.unlink()
+    refused("missing")
+    blob.write_bytes(whole)
+    edit(folder, version=2)
+    refused("version 2", "reads version 1")
+    edit(folder, version=1, windows=[{"file": "window-00001.bin", "bytes": len(whole)}])
+    refused("damaged", "bake the scene again")
+    edit(folder, format="something")
+    refused("not the header")
+    (folder / HEADER).write_text("{")
+    refused("damaged")
+    (folder / HEADER).unlink()
+    refused("no baked scene", "mmpi-export bake")
+
+
+def test_a_full_disk_leaves_no_header(folder, monkeypatch):
+    """Writing over an export that fails half way leaves nothing that looks whole."""
+    import mmpi_ns.export.files as files
+
+    monkeypatch.setattr(files.gzip, "compress", lambda *_, **__: b"x" * 10)
+    monkeypatch.setattr(files, "write_atomically", full_disk)
+    with pytest.raises(OSError, match="No space left"):
+        write_baked(scene_of(random_window()), folder)
+    assert not (folder / HEADER).is_file()
+
+
+def full_disk(path, write, folder=None):
+    raise OSError(28, "No space left on device", str(path))
+
+
+def test_arrays_are_plain_gzip(folder):
+    """Any gzip reads an array at its offset."""
+    row = json.loads((folder / HEADER).read_text())["windows"][0]
+    spec = row["arrays"]["columns"]
+    data = (folder / row["file"]).read_bytes()[spec["offset"] : spec["offset"] + spec["bytes"]]
+    assert len(gzip.decompress(data)) == 4 * int(np.prod(spec["shape"]))
+
+
+def test_the_reference_takes_any_window(folder):
+    """A scene that was read renders as it stands (the torch reference is the form without a compiler)."""
+    window = read_baked(folder).windows[1][1]
+    assert (march_baked(window.mpis, *rays_into(window, 30), window.threshold).mass > 0).any()

@@ -1,0 +1,200 @@
+"""The page in a real browser: its canvas against our renderer, its controls, its console, and its refusals."""
+
+from __future__ import annotations
+
+import json
+import time
+
+import numpy as np
+import pytest
+import torch
+from browser import CHROMIUM, browser, served
+from random_bricks import random_window, scene_of
+
+from mmpi_ns.export.bake import render_scene
+from mmpi_ns.export.files import HEADER, read_baked, write_baked
+from mmpi_ns.export.reader import camera_rays
+from mmpi_ns.export.web import write_page, write_single_file
+
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium to open the page with (apt-get install chromium)")
+CLOSE = 48.0
+"""dB between the canvas and our renderer: a canvas holds 8 bits, and a card interpolates codes with 8 bits too."""
+
+
+def smooth_window(seed, **settings):
+    """A window whose codes change from brick to brick alone, for a card interpolates with 8 bits."""
+    window = random_window(seed=seed, density=(120, 200), **settings)
+    for table in (window.mpis.density, window.mpis.texels):
+        table[:] = table[:, :1, :1]
+    return window
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("site")
+    write_baked(scene_of(smooth_window(1, num_mpis=3, planes=40), smooth_window(2), radius=1.9), folder)
+    write_page(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def tab(tmp_path_factory):
+    with browser(tmp_path_factory.mktemp("profile")) as tab:
+        yield tab
+
+
+@pytest.fixture(scope="module")
+def opened(tab, site):
+    with served(site) as address:
+        assert tab.open(f"{address}/index.html") == "ready", tab.evaluate("document.body.innerText")
+        yield tab
+
+
+def ours(site, pose):
+    scene = read_baked(site)
+    origins, directions = camera_rays(pose.__dict__)
+    shown = render_scene(scene, *(torch.tensor(np.array(x), dtype=torch.float32) for x in (origins, directions)))
+    return shown["rgb"].view(pose.size[1], pose.size[0], 3).numpy()
+
+
+def shown(tab, number):
+    return tab.picture(f"(mmpi.draw(mmpi.path[{number}], ...mmpi.path[{number}].size), mmpi.gl.canvas.toDataURL())")
+
+
+def test_the_canvas_shows_what_we_render(opened, site):
+    for number, pose in enumerate(read_baked(site).path):
+        a, b = shown(opened, number), ours(site, pose)
+        assert b.std() > 0.02  # there is something to see
+        psnr = -10 * np.log10(np.square(a - b).mean())
+        assert psnr > CLOSE, (number, psnr)
+
+
+def test_windows_are_mixed(opened, site):
+    """Between two windows the page fetches both and mixes them as we do."""
+    scene = read_baked(site)
+    middle = np.add(scene.windows[0][0].center, (2.0, 0.0, 0.0))
+    opened.evaluate(f"mmpi.path[0].eye = {middle.tolist()}; mmpi.camera = structuredClone(mmpi.path[0]); mmpi.feed()")
+    opened.until("mmpi.windows.get(0) && mmpi.windows.get(1)")
+    pose = scene.path[0]
+    for row, value in zip(pose.to_world, middle, strict=True):
+        row[3] = float(value)
+    psnr = -10 * np.log10(np.square(shown(opened, 0) - ours(site, pose)).mean())
+    opened.evaluate("mmpi.press('r')")
+    assert psnr > CLOSE - 4  # each window's part is rounded to 8 bits
+
+
+def until(happened, wait=30):
+    """Waits for what an event brings about: the page handles it when it comes to it."""
+    end = time.monotonic() + wait
+    while not happened():
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
+def eye(tab):
+    return np.array(tab.evaluate("mmpi.camera.eye"))
+
+
+def test_controls_move_the_camera(opened):
+    """Keys, wheel, dragging, and the captured path; each frame is drawn."""
+    opened.evaluate("mmpi.press('r')")
+    before, back = eye(opened), np.array(opened.evaluate("mmpi.camera.axes[2]"))
+    opened.key("keyDown", "w")
+    until(lambda: np.linalg.norm(eye(opened) - before) > 0)
+    opened.key("keyUp", "w")
+    opened.until("mmpi.keys.size === 0")
+    walked = eye(opened) - before
+    assert walked @ back < 0 and np.linalg.norm(walked - (walked @ back) * back) < 1e-6
+    stopped = eye(opened)
+    opened.mouse("mouseWheel", 100, 80, deltaX=0, deltaY=100)
+    until(lambda: (eye(opened) - stopped) @ back > 0)
+    opened.mouse("mousePressed", 100, 80, button="left", clickCount=1)
+    opened.mouse("mouseMoved", 140, 80, button="left")
+    opened.mouse("mouseReleased", 140, 80, button="left", clickCount=1)
+    until(lambda: 0.5 < np.array(opened.evaluate("mmpi.camera.axes[2]")) @ back < 0.9999)
+    opened.evaluate("mmpi.press('p')")
+    opened.until("mmpi.playing === null")
+    assert np.allclose(eye(opened), opened.evaluate("mmpi.path[1].eye"))
+    opened.evaluate("mmpi.press('r')")
+    assert np.allclose(eye(opened), before)
+
+
+def test_two_fingers_move_forward(opened):
+    opened.evaluate("mmpi.press('r')")
+    before = eye(opened)
+    points = lambda gap: [{"x": 100 - gap, "y": 80, "id": 0}, {"x": 100 + gap, "y": 80, "id": 1}]  # noqa: E731
+    opened.send("Input.dispatchTouchEvent", type="touchStart", touchPoints=points(10))
+    opened.send("Input.dispatchTouchEvent", type="touchMove", touchPoints=points(40))
+    opened.send("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
+    until(lambda: (eye(opened) - before) @ np.array(opened.evaluate("mmpi.camera.axes[2]")) < 0)
+
+
+def test_keys_choose_what_is_shown(opened):
+    """Depth, winning MPI and one MPI alone differ from the colours, and colours come back."""
+    colors = shown(opened, 1)
+    pictures = []
+    for key in ("2", "3"):
+        opened.evaluate(f"mmpi.press('{key}')")
+        pictures.append(shown(opened, 1))
+    opened.evaluate("mmpi.press('1')")
+    alone = []
+    for _ in range(3):
+        opened.evaluate("mmpi.press('m')")
+        assert "alone" in opened.evaluate("document.getElementById('status').textContent")
+        alone.append(shown(opened, 1))
+    pictures.append(max(alone, key=lambda p: np.abs(p - colors).mean()))  # one may be all that is seen
+    assert all(np.abs(p - colors).mean() > 0.01 for p in pictures)
+    opened.evaluate("mmpi.press('m')")
+    assert opened.evaluate("mmpi.alone") == -1
+    assert np.array_equal(shown(opened, 1), colors)
+
+
+def test_resolution_follows_the_time_of_a_frame(opened):
+    """A camera that moves is drawn with fewer pixels where a frame costs too much, and sharply again at rest."""
+    opened.evaluate("mmpi.cost = 1e-4; mmpi.touched()")
+    small = opened.until("mmpi.drawn < 1 && mmpi.gl.canvas.width")
+    assert small < opened.evaluate("innerWidth")
+
+
+def test_the_console_stays_empty(opened):
+    assert opened.messages == []
+
+
+def test_one_file_opens_from_the_disk(tab, site, tmp_path):
+    write_single_file(site, tmp_path / "one.html")
+    assert tab.open((tmp_path / "one.html").as_uri()) == "ready"
+    assert shown(tab, 0).std() > 0.02
+
+
+def refusal(tab, address):
+    assert tab.open(address) == "failed"
+    text = tab.evaluate("document.getElementById('status').textContent")
+    assert text.endswith(".") and "Error" not in text, text
+    return text
+
+
+def test_damage_is_a_sentence_on_the_page(tab, tmp_path):
+    write_baked(scene_of(smooth_window(3)), tmp_path)
+    write_page(tmp_path)
+    blob, header = tmp_path / "window-00000.bin", tmp_path / HEADER
+    whole, text = blob.read_bytes(), header.read_text()
+    with served(tmp_path) as address:
+        page = f"{address}/index.html"
+        blob.write_bytes(whole[:-5])
+        assert "cut short" in refusal(tab, page)
+        blob.write_bytes(whole[:200] + bytes(60) + whole[260:])
+        assert "damaged" in refusal(tab, page)
+        blob.write_bytes(whole)
+        header.write_text(json.dumps(json.loads(text) | {"version": 7}))
+        assert "version 7" in refusal(tab, page)
+        header.write_text("{")
+        assert "damaged" in refusal(tab, page)
+        header.unlink()
+        assert "missing" in refusal(tab, page)
+    header.write_text(text)
+    assert "--single-file" in refusal(tab, (tmp_path / "index.html").as_uri())
+
+
+def test_a_browser_without_webgl2_is_told(site, tmp_path):
+    with served(site) as address, browser(tmp_path / "profile", "--disable-3d-apis") as plain:
+        assert "WebGL2" in refusal(plain, f"{address}/index.html")
