@@ -69,6 +69,7 @@ class Tab:
 
     def open(self, address: str, wait: float = 60) -> str:
         """Opens a page and waits until it is ready or has refused: returns which."""
+        self.evaluate("document.body && delete document.body.dataset.state")  # what is waited for is the new page's
         self.send("Page.navigate", url=address)
         return self.until("document.body && document.body.dataset.state", wait)
 
@@ -127,6 +128,10 @@ def served(folder: Path) -> Iterator[str]:
     class Quiet(SimpleHTTPRequestHandler):
         def log_message(self, *_: Any) -> None:
             pass
+
+        def end_headers(self) -> None:
+            self.send_header("Cache-Control", "no-store")
+            super().end_headers()
 
     server = ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=str(folder)))
     Thread(target=server.serve_forever, daemon=True).start()

@@ -213,7 +213,7 @@ async function fetchWindow(row, progress) {
     for (let i = 0; i < text.length; i++) bytes[i] = text.charCodeAt(i);
     return bytes;
   }
-  const response = await fetch(row.file);
+  const response = await fetch(row.file, { cache: "no-cache" });
   if (!response.ok) throw new Refusal(`${row.file} is missing beside this page: copy the whole folder.`);
   const reader = response.body.getReader(), bytes = new Uint8Array(row.bytes);
   let at = 0;
@@ -233,7 +233,7 @@ async function fetchHeader() {
   if (location.protocol === "file:")
     throw new Refusal("A browser does not read files beside a page that was opened from the disk: serve this folder " +
       "(python -m http.server), or export one file with mmpi-export web --single-file.");
-  const response = await fetch("scene.json");
+  const response = await fetch("scene.json", { cache: "no-cache" });
   if (!response.ok) throw new Refusal("scene.json is missing beside this page: copy the whole folder.");
   return response.json().catch(() => { throw new Refusal("scene.json is damaged: copy it anew, or export the scene again."); });
 }
