@@ -299,10 +299,9 @@ class MMPIModel(Model):
 
     def _baked_outputs(self, window: int, field: MMPIField, bundle: RayBundle) -> dict[str, Tensor]:
         """``window_outputs`` of a field's baked bricks, which are read on the CPU."""
-        outputs = self.baked(field).render(
-            *(x.cpu() for x in (bundle.origins, bundle.directions, bundle.nears, bundle.fars) if x is not None),
-            self._background(bundle.origins).cpu(),
-        )
+        assert bundle.nears is not None and bundle.fars is not None
+        rays = bundle.origins.cpu(), bundle.directions.cpu(), bundle.nears.cpu(), bundle.fars.cpu()
+        outputs = self.baked(field).render(*rays, self._background(bundle.origins).cpu())
         outputs["winning_mpi"] = outputs["winning_mpi"] + self.progress.windows.first_head(window)
         return {name: values.to(self.device) for name, values in outputs.items()}
 
