@@ -32,7 +32,7 @@ def _method(
     config = MMPITrainerConfig(
         method_name=name,
         max_num_iterations=steps,
-        machine=MachineConfig(device_type="cuda" if torch.cuda.is_available() else "cpu"),
+        machine=MachineConfig(seed=0, device_type="cuda" if torch.cuda.is_available() else "cpu"),
         steps_per_save=max(500, steps // 4),
         steps_per_eval_batch=0,
         steps_per_eval_image=0,
@@ -48,7 +48,7 @@ def _method(
             model=model,
         ),
         optimizers=_optimizers(),
-        viewer=ViewerConfig(num_rays_per_chunk=1 << 14, quit_on_train_completion=True),
+        viewer=ViewerConfig(websocket_host="127.0.0.1", num_rays_per_chunk=1 << 14, quit_on_train_completion=True),
         vis="viewer+tensorboard",
     )
     return MethodSpecification(config=config, description=description)
@@ -80,23 +80,27 @@ mmpi_kitti = _method(
     rays=4096,
     keypoint_rays=0,
     model=MMPIModelConfig(
-        placement=PlacementConfig(arrangement="drive", planes=256, height=270, width=270),
+        placement=PlacementConfig(arrangement="drive", window_length=0.0, planes=256, height=270, width=270),
         shading="sample",
         training="two-phase",
         rays_per_mpi="split",
         blend_share=0.25,
         finetune_share=0.0,
         loss=_paper_loss(),
+        release_weight=0.0,
     ),
 )
 
 
 def _scannet() -> MMPIModelConfig:
     return MMPIModelConfig(
-        placement=PlacementConfig(arrangement="room", planes=128, height=192, width=192, cube_voxels=160),
+        placement=PlacementConfig(
+            arrangement="room", window_length=0.0, planes=128, height=192, width=192, cube_voxels=160
+        ),
         shading="sample",
         training="joint",
         loss=_paper_loss(),
+        release_weight=0.0,
     )
 
 

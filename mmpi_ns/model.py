@@ -36,17 +36,38 @@ from mmpi_ns.rendering.rendered import RenderedRays, bounded, median_distance
 from mmpi_ns.rendering.sampler import MMPISampler
 from mmpi_ns.rendering.window_store import WindowStore
 from mmpi_ns.rendering.windows import render_windows
+from mmpi_ns.scene.plan import MPIPlan, ScenePlan
 from mmpi_ns.scene.visible_tiles import TrainingViews
 from mmpi_ns.scene.windows import WindowedPlan
 from mmpi_ns.training.individual import individual_rays
 from mmpi_ns.training.losses import LossWeights, batch_losses, is_pixel_ray, over_background, photometric
+from mmpi_ns.training.memory import check_memory
 from mmpi_ns.training.phases import Schedule, Training, make_schedule
 from mmpi_ns.training.progress import Progress
 from mmpi_ns.training.run import TrainingRun, parameters_by_kind, views_of
+from mmpi_ns.utils.errors import InputError
 from mmpi_ns.utils.random_draws import generator
 
 FAIR_SHARE = 0.1
 """Until the field has sharpened, samples of more than this part of an equal weight are kept."""
+UNTIL_LOADED = ScenePlan(
+    (
+        MPIPlan(
+            "none",
+            (0.0, 0.0, 0.0),
+            ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+            1.0,
+            (-1.0, 1.0, -1.0, 1.0),
+            2,
+            2,
+            2,
+        ),
+    ),
+    None,
+    0.0,
+    1.0,
+)
+"""The plan of a model that only loads a checkpoint, which brings its own."""
 BACKGROUNDS = {"black": 0.0, "gray": 0.5, "white": 1.0}
 
 
@@ -125,8 +146,8 @@ class MMPIModelConfig(ModelConfig):
     """Weights of the losses."""
     lpips_net: Literal["vgg", "alex", "none"] = "vgg"
     """Network of the LPIPS metric (the paper: VGG); left out where its weights (0.5 GB for VGG) cannot be had."""
-    seed: int = 0
-    """Seed of the model's own random draws."""
+    seed: int = field(default=0, init=False)
+    """Not an option: the trainer sets it from --machine.seed."""
     total_steps: int = field(default=1, init=False)
     """Not an option: the trainer sets it from --max-num-iterations; the phases are shares of it."""
     windows_folder: Path | None = field(default=None, init=False)
@@ -173,6 +194,9 @@ class MMPIModel(Model):
         joint = config.training == "joint" or all(plan.num_heads == 1 for plan in windows.plans)
         self.progress = Progress(windows, config.schedule("joint" if joint else "two-phase", len(windows)))
         views = self.kwargs.get("metadata", {}).get(TRAINING_VIEWS)
+        if OBSERVATIONS in self.kwargs.get("metadata", {}):  # it is going to be trained
+            seen, device = [views_of(window, views) for window in windows.windows], self.kwargs.get("device", "cpu")
+            check_memory(windows, seen, config.feature_channels, not joint, device)
         self.field = self._new_field(views_of(windows.windows[0], views))
         budget = config.resident_gib * 2**30
         self.store = WindowStore(config.windows_folder, self._new_field, budget, config.half_windows)
@@ -184,14 +208,13 @@ class MMPIModel(Model):
 
     def _plan(self) -> WindowedPlan:
         """The plan that is asked for, or the one that the placement rule makes of what the training cameras saw."""
-        if self.config.plan_file is not None:
-            return WindowedPlan.load(self.config.plan_file)
-        metadata = self.kwargs.get("metadata", {})
+        metadata, path = self.kwargs.get("metadata", {}), self.config.plan_file
         observations = metadata.get(OBSERVATIONS)
+        if path is not None and (observations is not None or path.is_file()):
+            return WindowedPlan.load(path)
         if observations is None:
-            raise ValueError("The data manager gave no observations: use MMPIDataManager, or name a plan file.")
-        steps = self.config.total_steps  # 1 unless a trainer has set it: then the plan comes from a checkpoint
-        rays = steps * metadata[RAYS_PER_STEP] if steps > 1 and RAYS_PER_STEP in metadata else None
+            return WindowedPlan.single(UNTIL_LOADED)
+        rays = self.config.total_steps * metadata[RAYS_PER_STEP]
         return place_windows(observations, self.config.placement, rays)
 
     def _new_field(self, views: TrainingViews | None = None) -> MMPIField:
@@ -355,11 +378,11 @@ class MMPIModel(Model):
         """Renders a camera's image, or what of it lies in a box.
 
         Raises:
-            ValueError: the box has no size. Not so in the viewer, whose render thread an error would end while
+            InputError: the box has no size. Not so in the viewer, whose render thread an error would end while
                 somebody types a size: there it shows the background.
         """
         if obb_box is not None and not bool((obb_box.S > 0).all()) and current_thread() is main_thread():
-            raise ValueError(
+            raise InputError(
                 f"The crop box has no size (its sides are {[round(float(s), 6) for s in obb_box.S]}): give crop_scale "
                 "three positive lengths, or leave the crop out."
             )

@@ -73,8 +73,6 @@ class Method:
         words = [self.registered, *self.options, *self.camera_option, "--machine.seed", str(seed)]
         if rays is not None and self.batch_option is not None:
             words += [self.batch_option, str(rays)]
-        if self.ours:
-            words += ["--pipeline.datamanager.seed", str(seed), "--pipeline.model.seed", str(seed)]
         words += ["--output-dir", str(folder), "--experiment-name", "run", "--timestamp", "1", "--vis", "tensorboard"]
         words += ["--machine.device-type", device, "--max-num-iterations", str(steps), "--steps-per-save", str(10**9)]
         words += [word for what in ("batch", "image", "all-images") for word in (f"--steps-per-eval-{what}", "0")]

@@ -216,12 +216,12 @@ def train(asked: dict[str, Any], tell: Tell = print) -> dict[str, Any]:
     if request.quick_hashes:
         look_up_quickly()
     config = config_of(request.words)
-    config.save_config()
     progress = Progress.before(request.words, Path(request.work), request.checks[-1] if request.go_on else 0)
     if progress.step:
         config.load_dir, config.load_step = Path(progress.checkpoints), progress.step - 1
         config.max_num_iterations -= progress.step  # nerfstudio's trainer makes so many more
         tell(f"goes on from step {progress.step}")
+    config.save_config()
     watch = Stopwatch()
     # Random draws are not saved with a checkpoint: the second part must not repeat those of the first.
     trainer = trainer_of(config, progress.step)

@@ -6,83 +6,227 @@ The sentences are listed in docs/errors.md.
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
 from PIL import Image
 
-from mmpi_ns.utils.messages import brief
+from mmpi_ns.capture.lenses import check_lenses
+from mmpi_ns.utils.errors import InputError, brief
+from mmpi_ns.utils.values import Number, check_number, check_row, shown
 
 SAME_PLACE = 1e-6
-"""Cameras nearer to each other than this share of their distance from the origin stand in one place."""
+"""Cameras nearer to each other than this share of their distance from the origin stand in one place, in float32."""
+FLOAT64_SAME = 1e-12
+"""The same of numbers as they are in a file."""
+ROTATION_SLACK = 0.01
+"""How much longer or shorter than 1 the axes of a pose may be."""
+FAR_OFF = 1000.0
+"""A camera that is so many times as far off as all but a few others is a mistake."""
+FEW = 0.1
+"""Share of the cameras that are a few."""
+FLOAT32_STEP = 2.0**-23
+LEAST_DIGITS = 0.01
+"""Share of the usual distance between two cameras that float32 must be able to tell apart."""
+ORIENTATIONS = ("pca", "up", "vertical", "none")
+
+Frames = Sequence[Mapping[str, Any]]
 
 
-def check_transforms(data: Path, *, auto_scale: bool, opens_first_image: bool) -> None:
-    """Reads the frames of a capture and their poses.
+def check_transforms(parser: NerfstudioDataParserConfig, data: Path, splits: Sequence[str], *, opens: bool) -> None:
+    """Reads a transforms.json and judges all that nerfstudio's parser takes from it.
 
     Args:
+        parser: its settings.
         data: folder with a transforms.json, or a file of that kind.
-        auto_scale: the data parser divides by the extent of the cameras, which one place does not have.
-        opens_first_image: the data parser takes its downscale factor from the size of the first image.
+        splits: which of train, val and test the parser will be asked for.
+        opens: the parser takes its downscale factor from the first image, unless one is given, or from its copies.
 
     Raises:
-        ValueError: one sentence with the file, the frame where there is one, and what to do.
+        InputError: one sentence with the file, the frame where there is one, and what to do.
     """
     path = data if data.suffix == ".json" else data / "transforms.json"
-    frames = _frames(path)
-    centers = np.stack([_pose(frame, i, path)[:3, 3] for i, frame in enumerate(frames)])
-    if opens_first_image:
-        _check_image(path.parent / frames[0]["file_path"])
-    if auto_scale and in_one_place(centers):
-        raise ValueError(
-            f"All {len(centers)} camera(s) of {path} stand in one place, so no distance can be learned: give images "
-            "from two places, or learn colours alone (nerfstudio-data --auto-scale-poses False --eval-mode all)."
-        )
+    meta, frames = _read(path)
+    for i, frame in enumerate(frames):
+        _check_paths(frame, i, path)
+    poses = np.stack([_pose(frame, path) for frame in frames])
+    _check_whole_file(meta, path)
+    check_lenses(meta, frames, path)
+    _check_same_for_all(frames, path)
+    _check_splits(meta, frames, splits, path, by_name=(parser.downscale_factor or 1) > 1)
+    if opens:
+        _check_first_image(parser.downscale_factor, path.parent, frames[0]["file_path"])
+    names = [str(frame["file_path"]) for frame in frames]
+    _check_places(poses[:, :3, 3], names, path, auto_scale=parser.auto_scale_poses)
+    outside = [n for n in names if not (path.parent / n).resolve().is_relative_to(path.parent.resolve())]
+    if outside:
+        CONSOLE.print(f"{len(outside)} image(s) of {path} lie outside its folder, for example {outside[0]}.")
 
 
-def in_one_place(centers: NDArray[np.float64]) -> bool:
-    """Whether camera centres [M, 3] are the same but for rounding."""
-    return float(np.ptp(centers, axis=0).max()) <= SAME_PLACE * max(1.0, float(np.abs(centers).max()))
+def in_one_place(centers: NDArray[np.float64], share: float = SAME_PLACE) -> bool:
+    """Whether camera centres [M, 3] are the same but for rounding: a share of their distance from the origin."""
+    return float(np.ptp(centers, axis=0).max()) <= share * max(1.0, float(np.abs(centers).max()))
 
 
-def _frames(path: Path) -> list[dict[str, Any]]:
+def _read(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     if not path.is_file():
-        raise ValueError(
+        raise InputError(
             f"There is no {path}: check --data, make one with mmpi-prepare, or name the data parser of another "
             "format after the options (for example: ns-train mmpi-small --data FOLDER colmap)."
         )
     try:
         meta = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise ValueError(f"{path} cannot be read as JSON ({brief(error)}): repair it or make it again.") from error
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(f"{path} cannot be read as JSON ({brief(error)}): repair it or make it again.") from error
     frames = meta.get("frames") if isinstance(meta, dict) else None
     if not isinstance(frames, list) or not frames or not all(isinstance(f, dict) for f in frames):
-        raise ValueError(f"{path} lists no frames: it needs 'frames', each with file_path and transform_matrix.")
-    return frames
+        raise InputError(f"{path} lists no frames: it needs 'frames', each with file_path and transform_matrix.")
+    return meta, frames
 
 
-def _pose(frame: dict[str, Any], index: int, path: Path) -> NDArray[np.float64]:
-    name = frame.get("file_path", f"number {index + 1}")
-    if "file_path" not in frame or "transform_matrix" not in frame:
-        missing = "file_path" if "file_path" not in frame else "transform_matrix"
-        raise ValueError(f"Frame {name} of {path} has no {missing}: add it or remove the frame.")
-    try:
-        pose = np.array(frame["transform_matrix"], dtype=np.float64)
-    except (TypeError, ValueError):
-        pose = np.zeros(0)
-    if pose.shape != (4, 4) or not np.isfinite(pose).all():
-        raise ValueError(
+def _check_paths(frame: Mapping[str, Any], index: int, path: Path) -> None:
+    for key in ("file_path", "transform_matrix"):
+        if key not in frame:
+            name = frame.get("file_path", f"number {index + 1}")
+            raise InputError(f"Frame {name} of {path} has no {key}: add it or remove the frame.")
+    for key in ("file_path", "mask_path", "depth_file_path"):
+        value = frame.get(key, "given")
+        if not isinstance(value, str) or not value.strip() or "\0" in value:
+            raise InputError(
+                f"The {key} of frame number {index + 1} of {path} is {shown(value)}: give the path of a file as text."
+            )
+
+
+def _pose(frame: Mapping[str, Any], path: Path) -> NDArray[np.float64]:
+    """The 4 x 4 matrix of a frame: a rotation and a translation."""
+    name, rows = frame["file_path"], frame["transform_matrix"]
+    number = Number(-1e18, 1e18)
+    is_matrix = isinstance(rows, list) and len(rows) == 4 and all(isinstance(r, list) and len(r) == 4 for r in rows)
+    if not is_matrix or not all(number.holds(x) for row in rows for x in row):
+        raise InputError(
             f"The transform_matrix of frame {name} of {path} is not a 4 x 4 matrix of finite numbers: correct it or "
+            "remove the frame."
+        )
+    pose = np.array(rows, dtype=np.float64)
+    sizes = np.linalg.svd(pose[:3, :3], compute_uv=False)
+    wrong = None
+    if np.abs(sizes - 1).max() > ROTATION_SLACK:
+        wrong = f"no rotation and translation (its axes have singular values {', '.join(f'{s:.3g}' for s in sizes)})"
+    elif np.linalg.det(pose[:3, :3]) < 0:
+        wrong = "mirrored (its determinant is negative)"
+    elif np.abs(pose[3] - [0, 0, 0, 1]).max() > 1e-6:
+        wrong = f"no pose (its last row is {shown(rows[3])} and not 0, 0, 0, 1), transposed perhaps"
+    if wrong is not None:
+        raise InputError(
+            f"The transform_matrix of frame {name} of {path} is {wrong}: give camera to world with OpenGL axes, or "
             "remove the frame."
         )
     return pose
 
 
-def _check_image(path: Path) -> None:
+def _check_whole_file(meta: Mapping[str, Any], path: Path) -> None:
+    """Fields that hold for all frames."""
+    if "applied_transform" in meta:
+        rows = meta["applied_transform"]
+        if not isinstance(rows, list) or len(rows) != 3:
+            raise InputError(f"applied_transform of {path} must be 3 rows of 4 numbers, not {shown(rows)}.")
+        for i, row in enumerate(rows):
+            check_row(f"Row {i + 1} of applied_transform of {path}", row, 4, Number(-1e18, 1e18))
+        if abs(np.linalg.det(np.array(rows, dtype=np.float64)[:, :3])) < 1e-12:
+            raise InputError(f"applied_transform of {path} is singular: give a rotation and a translation.")
+    if "applied_scale" in meta:
+        check_number(f"applied_scale of {path}", meta["applied_scale"], Number(0, 1e18, above=True))
+    turned = meta.get("orientation_override", "none")
+    if turned not in ORIENTATIONS:
+        raise InputError(
+            f"orientation_override of {path} is {shown(turned)}: leave it out or give one of {', '.join(ORIENTATIONS)}."
+        )
+
+
+def _check_same_for_all(frames: Frames, path: Path) -> None:
+    for key in ("mask_path", "depth_file_path"):
+        having = [key in frame for frame in frames]
+        if any(having) and not all(having):
+            name = frames[having.index(False)]["file_path"]
+            raise InputError(f"Frame {name} of {path} has no {key} and others have one: give all frames one, or none.")
+
+
+def _check_splits(meta: Mapping[str, Any], frames: Frames, splits: Sequence[str], path: Path, *, by_name: bool) -> None:
+    """Lists of training and evaluation frames: where one is there, those of all splits asked for must be."""
+    keys = [f"{split}_filenames" for split in ("train", "val", "test")]
+    if not any(key in meta for key in keys):
+        return
+
+    def known(name: str) -> str | Path:
+        return Path(name).name if by_name else Path(name)
+
+    names = {known(frame["file_path"]) for frame in frames}
+    for key in dict.fromkeys(f"{split}_filenames" for split in splits):
+        listed = meta.get(key)
+        if not isinstance(listed, list) or not listed or not all(isinstance(x, str) for x in listed):
+            others = ", ".join(k for k in keys if k in meta and k != key) or "one of them"
+            raise InputError(
+                f"{path} has {others} and {'no list ' if listed is None else 'an unusable '}{key}: list the file_path "
+                "of every frame in it, or remove the three lists."
+            )
+        lost = [x for x in listed if known(x) not in names]
+        if lost:
+            raise InputError(
+                f"{shown(lost[0])}, listed in {key} of {path}, is the file_path of no frame ({len(lost)} such in "
+                "all): correct the list."
+            )
+
+
+def _check_first_image(factor: int | None, folder: Path, first: str) -> None:
+    if factor is not None and not Number(1, 1024, whole=True).holds(factor):
+        raise InputError(f"--downscale-factor must be a whole number of at least 1, not {factor}.")
+    copy = folder / f"images_{factor}" / Path(first).name
+    if factor is not None and factor > 1 and not copy.is_file():
+        there = sorted(p.name for p in folder.glob("images_*") if p.is_dir())
+        raise InputError(
+            f"There is no {copy}, a copy at 1/{factor} of its size: make copies (mmpi-prepare does) or give another "
+            f"--downscale-factor (there are {', '.join(there) or 'no copies'})."
+        )
+    if factor is not None:
+        return
     try:
-        with Image.open(path):
+        with Image.open(folder / first):
             pass
-    except OSError as error:
-        raise ValueError(f"Image {path} cannot be read ({brief(error)}): repair it or remove its frame.") from error
+    except (OSError, ValueError, Image.DecompressionBombError) as error:
+        raise InputError(
+            f"Image {folder / first} cannot be read ({brief(error)}): repair it or remove its frame."
+        ) from error
+
+
+def _check_places(centers: NDArray[np.float64], names: Sequence[str], path: Path, *, auto_scale: bool) -> None:
+    """Places that float32, in which nerfstudio holds them, can tell apart."""
+    if in_one_place(centers, FLOAT64_SAME):
+        if not auto_scale:
+            return
+        raise InputError(
+            f"All {len(centers)} camera(s) of {path} stand in one place, so no distance can be learned: give images "
+            "from two places, or learn colours alone (nerfstudio-data --auto-scale-poses False --eval-mode all)."
+        )
+    middle = np.median(centers, axis=0)
+    off = np.linalg.norm(centers - middle, axis=-1)
+    order = np.argsort(off)
+    most = max(len(off) - 1 - int(FEW * len(off)), 0)
+    usual = off[order[max(min(most, len(off) - 2), 0)]]
+    if usual > 0 and off[order[-1]] > FAR_OFF * usual:
+        raise InputError(
+            f"The camera of frame {names[order[-1]]} of {path} stands {off[order[-1]]:.3g} from the others, which lie "
+            f"within {usual:.3g}: correct its transform_matrix or remove the frame."
+        )
+    extent = float(np.ptp(centers, axis=0).max())
+    if np.abs(centers).max() * FLOAT32_STEP > LEAST_DIGITS * extent / len(centers):
+        offset = ", ".join(f"{x:.6g}" for x in middle)
+        raise InputError(
+            f"The cameras of {path} stand {np.abs(centers).max():.3g} from the origin and within {extent:.3g} of each "
+            f"other, more digits than float32 has: subtract a common offset, for example ({offset}), from the last "
+            "column of every transform_matrix and from the points of a COLMAP model beside it."
+        )

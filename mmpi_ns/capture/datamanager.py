@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager, VanillaDataManagerConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
@@ -27,6 +28,7 @@ from mmpi_ns.capture.observe import observe, sfm_folder
 from mmpi_ns.capture.rays import PinholeRays
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.scene.visible_tiles import TrainingViews
+from mmpi_ns.utils.errors import InputError
 from mmpi_ns.utils.random_draws import generator
 
 OBSERVATIONS = "mmpi_observations"
@@ -67,8 +69,9 @@ class MMPIDataManagerConfig(VanillaDataManagerConfig):
     """Use the depths of sensors that a data parser names (depth_file_path)."""
     resident_pixels: float = 60e6
     """Training pixels held in memory at once (23 bytes each); those of a longer capture are read window by window."""
-    seed: int = 0
-    """Batches depend on this seed and the step alone, so a resumed run draws what an uninterrupted one would."""
+    seed: int = field(default=0, init=False)
+    """Not an option: the trainer sets it from --machine.seed. Batches depend on it and the step alone, so a resumed run
+    draws what an uninterrupted one would."""
 
 
 @dataclass(frozen=True)
@@ -92,9 +95,10 @@ class PixelPool:
         """Reads every image, or some, once; masked pixels are left out.
 
         Raises:
-            ValueError: an image or mask cannot be used (names the file), or the masks leave nothing.
+            InputError: an image or mask cannot be used (names the file), or the masks leave nothing.
         """
         colors, indices, depths = [], [], []
+        alpha = dataset.has_alpha
         for i in range(len(dataset)) if images is None else images:
             data = dataset.get_data(i, image_type="uint8")
             image = data["image"]
@@ -102,12 +106,12 @@ class PixelPool:
             if "mask" in data:
                 keep = data["mask"][..., 0].bool()
             rows, columns = keep.nonzero(as_tuple=True)
-            colors.append(image[rows, columns])
+            colors.append(_with_alpha(image[rows, columns]) if alpha else image[rows, columns])
             indices.append(torch.stack([torch.full_like(rows, i), rows, columns], -1).to(torch.int32))
             depth = torch.zeros(*keep.shape, 2) if known is None else torch.from_numpy(known.images[i])
             depths.append(depth[rows, columns])
         if not sum(len(c) for c in colors):
-            raise ValueError("The masks leave no training pixel: white (non-zero) mask pixels are the ones used.")
+            raise InputError("The masks leave no training pixel: white (non-zero) mask pixels are the ones used.")
         return PixelPool(*(torch.cat(parts).to(device) for parts in (colors, indices, depths)))
 
     def draw(
@@ -124,6 +128,11 @@ class PixelPool:
         return torch.isin(self.indices[:, 0], images.to(self.indices)).nonzero()[:, 0].to(torch.int32)
 
 
+def _with_alpha(colors: UInt8[Tensor, "P C"]) -> UInt8[Tensor, "P 4"]:
+    """Opaque where the image has no alpha and another one has."""
+    return torch.cat([colors, torch.full_like(colors[:, :1], 255)], -1) if colors.shape[1] == 3 else colors
+
+
 class MMPIDataManager(VanillaDataManager[MMPIDataset]):
     """Draws training batches from a resident pixel pool and hands the scene's observations to the model."""
 
@@ -131,40 +140,46 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
 
     def __init__(self, config: MMPIDataManagerConfig, **kwargs: Any) -> None:
         self.pool: PixelPool | None = None
+        self.known_depth: KnownDepth | None = None
         self._allowed: Tensor | None = None
         parser = config.dataparser
         if isinstance(parser, NerfstudioDataParserConfig):
-            check_transforms(
-                Path(config.data or parser.data),
-                auto_scale=parser.auto_scale_poses,
-                opens_first_image=parser.downscale_factor is None and kwargs.get("test_mode") != "inference",
-            )
+            mode = kwargs.get("test_mode", "val")
+            splits = ("train", "val" if mode == "val" else "test")
+            check_transforms(parser, Path(config.data or parser.data), splits, opens=mode != "inference")
         super().__init__(config, **kwargs)
 
     def create_train_dataset(self) -> MMPIDataset:
-        dataset = super().create_train_dataset()
-        # Elsewhere than in training the plan comes from a checkpoint, and images may be absent.
-        trains = self.test_mode == "val"
-        self.observations = observe(
+        self.train_dataset = dataset = super().create_train_dataset()
+        dataset.metadata[RAYS_PER_STEP] = self.config.train_num_rays_per_batch
+        dataset.metadata[TRAINING_VIEWS] = TrainingViews.of(dataset.cameras)
+        if self.test_mode == "val":  # elsewhere the plan comes from a checkpoint
+            dataset.metadata[OBSERVATIONS] = self.observations
+            self.known_depth = self._known_depth(dataset)
+        return dataset
+
+    def _known_depth(self, dataset: MMPIDataset) -> KnownDepth | None:
+        """Depths of pixels, matched or measured, where they are asked for."""
+        parts = {"dense": self.config.dense_depth, "sensor": self.config.depth_images}
+        if not any(parts.values()):
+            return None
+        return know_depths(self.train_dataparser_outputs, self.observations, dataset, **parts)
+
+    @cached_property
+    def observations(self) -> Observations:
+        """What the training cameras saw; only training looks for points in the images, which may be absent."""
+        return observe(
             self.train_dataparser_outputs,
-            dataset,
+            self.train_dataset,
             sfm_folder(self.dataparser.config, self.config.sfm_path),
-            find_points=trains,
+            find_points=self.test_mode == "val",
             triangulates=self.config.triangulate,
         )
-        self.known_depth = None
-        if trains and (self.config.dense_depth or self.config.depth_images):
-            parts = {"dense": self.config.dense_depth, "sensor": self.config.depth_images}
-            self.known_depth = know_depths(self.train_dataparser_outputs, self.observations, dataset, **parts)
-        dataset.metadata[RAYS_PER_STEP] = self.config.train_num_rays_per_batch
-        dataset.metadata[OBSERVATIONS] = self.observations
-        dataset.metadata[TRAINING_VIEWS] = TrainingViews.of(dataset.cameras)
-        return dataset
 
     def create_eval_dataset(self) -> MMPIDataset:
         dataset = super().create_eval_dataset()
         if not len(dataset):
-            raise ValueError(
+            raise InputError(
                 f"No image of {self.config.data} is left for evaluation: give more images, or --eval-mode all after "
                 "the name of the data parser."
             )
@@ -175,20 +190,20 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         CONSOLE.print("Setting up training dataset...")
         sizes = self.train_dataset.cameras.width * self.train_dataset.cameras.height
         self._reads_by_window = bool(sizes.sum() > self.config.resident_pixels)
-        if not self._reads_by_window:
+        if not self._reads_by_window and self.test_mode == "val":
             self.pool = PixelPool.from_dataset(self.train_dataset, self.device, known=self.known_depth)
         # Samples nothing: ns-export sets its batches' size here.
         self.train_pixel_sampler = self._get_pixel_sampler(self.train_dataset, self.config.train_num_rays_per_batch)
         cameras = self.train_dataset.cameras
         pinhole = PinholeRays.of(cameras, self.device) if torch.device(self.device).type == "cuda" else None
         self.train_ray_generator: Any = pinhole or RayGenerator(cameras.to(self.device))
-        self._keypoints = _keypoint_targets(self.observations, self.device)
+        self._keypoints = _keypoint_targets(self.observations, self.device) if self.test_mode == "val" else None
 
     def use_cameras(self, cameras: NDArray[np.int64] | None) -> None:
         """Draws pixels and keypoints of these training cameras alone from now on; None for all.
 
         Raises:
-            ValueError: the masks leave them no pixel.
+            InputError: the masks leave them no pixel.
         """
         self._keypoints = _keypoint_targets(self.observations, self.device, cameras)
         self._allowed = None
@@ -198,7 +213,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
             assert self.pool is not None
             self._allowed = self.pool.places_of(torch.from_numpy(cameras))
             if not len(self._allowed):
-                raise ValueError("The masks leave no training pixel in one stretch of the capture: use longer windows.")
+                raise InputError("The masks leave no training pixel in one stretch of the capture: use longer windows.")
 
     def pixel_bytes(self, cameras: NDArray[np.int64] | None = None) -> int:
         """Bytes of the training pixels in memory while these cameras are drawn from; where masks hide some, at most."""
@@ -213,7 +228,8 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         CONSOLE.print("Setting up evaluation dataset...")
         sizes = self.eval_dataset.cameras.width * self.eval_dataset.cameras.height
         # An image that cannot be used is named before training, not after it.
-        for i in range(len(self.eval_dataset)) if sizes.sum() <= self.config.resident_pixels else ():
+        reads = self.test_mode == "val" and sizes.sum() <= self.config.resident_pixels
+        for i in range(len(self.eval_dataset)) if reads else ():
             self.eval_dataset.get_data(i, image_type="uint8")
         self.eval_pixel_sampler = self._get_pixel_sampler(self.eval_dataset, self.config.eval_num_rays_per_batch)
         self.eval_ray_generator = RayGenerator(self.eval_dataset.cameras.to(self.device))

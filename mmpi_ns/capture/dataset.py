@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -11,31 +12,44 @@ import torch
 from jaxtyping import Float
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from numpy.typing import NDArray
+from PIL import Image
 from torch import Tensor
 
 from mmpi_ns.capture.depth_images import read_depth_image
-from mmpi_ns.utils.messages import brief
+from mmpi_ns.utils.errors import InputError, brief
 
 # Pillow reports damaged files by any of these (SyntaxError: a broken PNG chunk), nerfstudio odd shapes by assertions.
-UNREADABLE = (OSError, SyntaxError, ValueError, AssertionError)
+UNREADABLE = (OSError, SyntaxError, ValueError, AssertionError, EOFError, Image.DecompressionBombError)
+SIXTEEN_BIT = ("I", "I;16", "I;16B", "I;16L", "I;16N")
+"""Pillow's modes of gray images with up to 16 bits a pixel."""
 
 
-class UnusableFile(ValueError):
+class UnusableFile(InputError):
     """One sentence with the image or mask file that cannot be used, and what to do."""
 
 
 class MMPIDataset(InputDataset):
     """Images, masks and distances of the size of their cameras; raises ``UnusableFile`` where one cannot be used."""
 
+    @cached_property
+    def has_alpha(self) -> bool:
+        """Whether any image has an alpha channel; files that cannot be read are named when they are needed."""
+        return any(_header(name)[1] for name in self.image_filenames)
+
     def get_numpy_image(self, image_idx: int) -> NDArray[np.uint8]:
-        """Image [H, W, 3 or 4] as it is in the file."""
+        """Image [H, W, 3 or 4]: red, green, blue, and alpha where the file has it, in 8 bits."""
+        name = self.image_filenames[image_idx]
         try:
-            return super().get_numpy_image(image_idx)
+            with Image.open(name) as image:
+                pixels = _eight_bits(image)
         except UNREADABLE as error:
-            name = self.image_filenames[image_idx]
             raise UnusableFile(
                 f"Image {name} cannot be read ({brief(error)}): repair it or remove its frame."
             ) from error
+        if self.scale_factor == 1.0:
+            return pixels
+        size = [int(side * self.scale_factor) for side in pixels.shape[1::-1]]
+        return np.array(Image.fromarray(pixels).resize(size, resample=Image.Resampling.BILINEAR))
 
     def get_data(self, image_idx: int, image_type: Literal["uint8", "float32"] = "float32") -> dict[str, Any]:
         """The image, and its mask where there are masks."""
@@ -71,3 +85,25 @@ class MMPIDataset(InputDataset):
         directions = camera.generate_rays(camera_indices=first, coords=torch.stack([y, x], -1)).directions
         along_axis = -(directions * camera.camera_to_worlds[0, :, 2]).sum(-1)
         return (torch.from_numpy(depth) / along_axis.clamp(min=1e-6))[..., None]
+
+
+def _header(name: Path) -> tuple[tuple[int, int], bool]:
+    """(width, height) of an image and whether it has alpha, without reading its pixels."""
+    try:
+        with Image.open(name) as image:
+            return image.size, image.has_transparency_data
+    except UNREADABLE:
+        return (0, 0), False
+
+
+def _eight_bits(image: Image.Image) -> NDArray[np.uint8]:
+    """[H, W, 3 or 4] of whatever Pillow reads: gray, palettes, CMYK, 16 bits."""
+    if image.mode in SIXTEEN_BIT:
+        deep = np.asarray(image).astype(np.int64)
+        if deep.min() < 0 or deep.max() > 65535:
+            raise ValueError("its pixels have more than 16 bits")
+        gray = (deep // 257).astype(np.uint8)  # 65535 becomes 255
+        return np.repeat(gray[..., None], 3, axis=-1)
+    if image.mode == "F":
+        raise ValueError("its pixels are floating-point numbers")
+    return np.array(image.convert("RGBA" if image.has_transparency_data else "RGB"))

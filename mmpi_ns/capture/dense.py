@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 
 from mmpi_ns.capture.tracks import PosedImages
+from mmpi_ns.utils.errors import InputError
 
 Map = NDArray[np.float32]
 Progress = Callable[[Iterable[int]], Iterable[int]]
@@ -82,7 +83,7 @@ def load_view(images: PosedImages, i: int, width: int) -> View:
     """Image i in gray, at most ``width`` pixels wide, its lens distortion taken out."""
     gray = cv2.imread(str(images.files[i]), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
     if gray is None:
-        raise ValueError(f"Training image {images.files[i]} cannot be read: repair it or remove its frame.")
+        raise InputError(f"Training image {images.files[i]} cannot be read: repair it or remove its frame.")
     full_height, full_width = gray.shape
     if full_width > width:
         height = max(1, round(full_height * width / full_width))

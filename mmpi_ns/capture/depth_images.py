@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mmpi_ns.utils.messages import brief
+from mmpi_ns.utils.errors import InputError, brief
 
 
 def read_depth_image(file: Path, unit: float) -> NDArray[np.float32]:
@@ -19,13 +19,13 @@ def read_depth_image(file: Path, unit: float) -> NDArray[np.float32]:
         unit: length of a depth of 1, scene units.
 
     Raises:
-        ValueError: the file cannot be read or holds something else (names it).
+        InputError: the file cannot be read or holds something else (names it).
     """
     try:
         depth = np.load(file) if file.suffix == ".npy" else cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
     except (OSError, ValueError) as error:
-        raise ValueError(f"Depth image {file} cannot be read ({brief(error)}): repair or remove it.") from error
+        raise InputError(f"Depth image {file} cannot be read ({brief(error)}): repair or remove it.") from error
     if depth is None or np.squeeze(depth).ndim != 2:
-        raise ValueError(f"Depth image {file} is not one channel of depths: give a 16-bit PNG or a .npy file.")
+        raise InputError(f"Depth image {file} is not one channel of depths: give a 16-bit PNG or a .npy file.")
     depth = np.squeeze(depth).astype(np.float32) * unit
     return np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)

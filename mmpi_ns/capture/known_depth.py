@@ -69,7 +69,7 @@ def know_depths(
         sensor: whether to read depth images.
 
     Raises:
-        ValueError: an image or a depth image cannot be used (names it).
+        InputError: an image or a depth image cannot be used (names it).
     """
     known = KnownDepth.nothing(observations.sizes)
     posed = posed_images(observations, dataset)
@@ -218,7 +218,7 @@ def read_sensor(
         file_shape: height and width of its file.
 
     Raises:
-        ValueError: the file cannot be read (names it).
+        InputError: the file cannot be read (names it).
     """
     depth = read_depth_image(file, unit)
     nearest = cv2.resize(depth, file_shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT)[: shape[0], : shape[1]]

@@ -7,12 +7,14 @@ from typing import Literal
 
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from nerfstudio.utils.rich_utils import CONSOLE
 
 from mmpi_ns.capture.checks import check_transforms
 from mmpi_ns.capture.datamanager import MMPIDataManagerConfig
 from mmpi_ns.capture.dataset import MMPIDataset
 from mmpi_ns.capture.observe import observe, sfm_folder
 from mmpi_ns.placement.observations import Observations
+from mmpi_ns.utils.errors import InputError
 
 Parser = Literal["auto", "nerfstudio", "colmap"]
 
@@ -26,24 +28,28 @@ def load_observations(data: Path, downscale_factor: int | None = None, parser: P
         parser: how the scene is stored; auto takes nerfstudio's format where there is a transforms.json.
 
     Raises:
-        ValueError: the folder holds no scene.
+        InputError: the folder holds no scene, or one that cannot be trained.
     """
     if not data.exists():
-        raise ValueError(f"There is no scene at {data}: check the path.")
+        raise InputError(f"There is no scene at {data}: check the path.")
     config = MMPIDataManagerConfig(dataparser=NerfstudioDataParserConfig())
     is_nerfstudio = data.suffix == ".json" or (data / "transforms.json").is_file()
     if parser == "colmap" or (parser == "auto" and not is_nerfstudio):
         model = next((p for p in ("colmap/sparse/0", "sparse/0", "sparse") if (data / p).is_dir()), None)
         if model is None:
-            raise ValueError(f"{data} holds neither a transforms.json nor a COLMAP model: it is not a scene.")
+            raise InputError(f"{data} holds neither a transforms.json nor a COLMAP model: it is not a scene.")
         config.dataparser = ColmapDataParserConfig(colmap_path=Path(model))
         config.sfm_path = Path(model)
     parser_config = config.dataparser
-    parser_config.data = data
+    config.data = parser_config.data = data
     parser_config.downscale_factor = downscale_factor  # type: ignore[attr-defined]
     if isinstance(parser_config, NerfstudioDataParserConfig):
-        check_transforms(data, auto_scale=parser_config.auto_scale_poses, opens_first_image=downscale_factor is None)
+        check_transforms(parser_config, data, ("train",), opens=True)
     outputs = parser_config.setup().get_dataparser_outputs(split="train")
-    dataset = MMPIDataset(outputs)
+    if any(Path(name).is_file() for name in outputs.image_filenames):
+        # As ns-train does, so that it refuses what ns-train would refuse; placement asks for no depths of pixels.
+        config.dense_depth = config.depth_images = False
+        return config.setup(device="cpu", test_mode="val").observations
+    CONSOLE.print(f"The images of {data} are not there: its cameras and points alone are judged.")
     folder = sfm_folder(parser_config, config.sfm_path)
-    return observe(outputs, dataset, folder, find_points=True, triangulates=config.triangulate)
+    return observe(outputs, MMPIDataset(outputs), folder, find_points=True, triangulates=config.triangulate)

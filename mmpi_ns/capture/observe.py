@@ -23,6 +23,7 @@ from mmpi_ns.capture.sfm import SfmModel, find_sfm_model
 from mmpi_ns.capture.tracks import PosedImages, triangulate
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.placement.sweep import add_swept_points
+from mmpi_ns.utils.errors import InputError
 
 MAX_REPROJECTION = 0.02
 """Median angle between keypoints and points, as a share of the image, beyond which a model is in another frame."""
@@ -52,7 +53,7 @@ def observe(
         triangulates: whether to look for them by matching features, before a plane sweep.
 
     Raises:
-        ValueError: poses or intrinsics that cannot be used.
+        InputError: poses or intrinsics that cannot be used.
     """
     observations = read_observations(outputs, dataset.cameras, find_sfm_model(sfm))
     if in_one_place(observations.centers):
@@ -107,18 +108,21 @@ def read_observations(outputs: DataparserOutputs, cameras: Cameras, sfm: SfmMode
     """Training cameras as they are used, with the SfM points and keypoints moved into their frame.
 
     Raises:
-        ValueError: poses are missing, or poses or intrinsics cannot be used; names the image.
+        InputError: poses are missing, or poses or intrinsics cannot be used; names the image.
     """
     if not len(outputs.image_filenames):
-        raise ValueError("The capture holds no training image: check the split that the data parser made.")
-    poses = cameras.camera_to_worlds.double().cpu().numpy()
+        raise InputError("The capture holds no training image: check the split that the data parser made.")
+    poses = np.array(cameras.camera_to_worlds.double().cpu())
     flat = [x.double().cpu().numpy().reshape(-1) for x in (cameras.fx, cameras.fy, cameras.cx, cameras.cy)]
     usable = np.isfinite(poses).all((1, 2)) & np.isfinite(flat).all(0) & (flat[0] > 0) & (flat[1] > 0)
     if not usable.all():
-        raise ValueError(
+        raise InputError(
             f"The camera of {outputs.image_filenames[usable.argmin()]} has a pose or focal length that is no finite "
             "number or not positive: correct it or remove the frame."
         )
+    # An MPI that faces as a camera does needs axes that are orthonormal to more digits than captures have.
+    left, _, right = np.linalg.svd(poses[:, :, :3])
+    poses[:, :, :3] = left @ right
     sizes = np.stack([cameras.width.cpu().numpy().reshape(-1), cameras.height.cpu().numpy().reshape(-1)], -1)
     empty = np.zeros(0, dtype=np.int64)
     result: Mapping[str, Any] = {"points": np.zeros((0, 3)), "seen_by": empty, "seen_point": empty}

@@ -14,7 +14,7 @@ import numpy as np
 from PIL import Image
 
 from mmpi_ns.capture.tracks import PosedImages
-from mmpi_ns.utils.messages import brief
+from mmpi_ns.utils.errors import InputError, brief
 
 COPIES = re.compile(r"(.+)_(\d+)")
 """Name of a folder of downscaled copies: that of the originals, and the factor."""
@@ -38,7 +38,7 @@ def at_full_size(images: PosedImages) -> PosedImages:
     is the same in both. Focal lengths are those of the copy times the factor, as nerfstudio divided them by it.
 
     Raises:
-        ValueError: an image file cannot be read (names it).
+        InputError: an image file cannot be read (names it).
     """
     files, sizes, intrinsics = [], images.sizes.copy(), images.intrinsics.copy()
     for i, file in enumerate(images.files):
@@ -57,6 +57,6 @@ def _size(file: Path) -> tuple[int, int]:
         with Image.open(file) as image:
             return image.size
     except OSError as error:
-        raise ValueError(
+        raise InputError(
             f"Training image {file} cannot be read ({brief(error)}): repair it or remove its frame."
         ) from error

@@ -13,6 +13,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from mmpi_ns.capture.sfm_files import check_model_files
+from mmpi_ns.utils.errors import InputError, brief
+
 if TYPE_CHECKING:
     import pycolmap
 
@@ -49,15 +52,15 @@ def find_sfm_model(path: Path) -> SfmModel | None:
     """The COLMAP model in a folder; None where there is none.
 
     Raises:
-        ValueError: the folder holds a model that cannot be read.
+        InputError: the folder holds a model that cannot be read.
     """
     if not (path / "images.bin").is_file() and not (path / "images.txt").is_file():
         return None
     try:
-        model = load_pycolmap().Reconstruction(str(path))
-    except (ValueError, RuntimeError, OSError) as error:
-        raise ValueError(f"The COLMAP model in {path} cannot be read ({error}): repair or remove it.") from error
-    return read_reconstruction(model)
+        check_model_files(path)
+        return read_reconstruction(load_pycolmap().Reconstruction(str(path)))
+    except (ValueError, RuntimeError, OSError, LookupError, MemoryError) as error:
+        raise InputError(f"The COLMAP model in {path} cannot be read ({brief(error)}): repair or remove it.") from error
 
 
 def load_pycolmap() -> ModuleType:

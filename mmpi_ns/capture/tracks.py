@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mmpi_ns.capture.sfm import SfmModel, load_pycolmap, read_reconstruction
+from mmpi_ns.utils.errors import InputError
 
 NEIGHBOURS = 8
 """Images that each image is matched with at most: the nearest that look roughly the same way."""
@@ -103,7 +104,7 @@ def triangulate(images: PosedImages) -> SfmModel:
         Points in the frame of the poses; none where nothing matches. Image names are their places in ``images``.
 
     Raises:
-        ValueError: an image file cannot be read.
+        InputError: an image file cannot be read.
     """
     pycolmap = load_pycolmap()
     level = pycolmap.logging.minloglevel
@@ -201,7 +202,7 @@ def _posed_model(pycolmap: Any, work: Path, names: list[str], images: PosedImage
         found = {image.name: image.image_id for image in features.read_all_images()}
         for i, name in enumerate(names):
             if name not in found:
-                raise ValueError(f"Training image {images.files[i]} cannot be read: repair or remove it.")
+                raise InputError(f"Training image {images.files[i]} cannot be read: repair or remove it.")
             camera = _camera(pycolmap, images, i)
             model.add_camera_with_trivial_rig(camera)
             image = pycolmap.Image(name=name, camera_id=camera.camera_id, image_id=i + 1)

@@ -7,6 +7,7 @@ import functools
 import hashlib
 import os
 import platform
+import shlex
 import shutil
 import subprocess
 import tempfile
@@ -35,14 +36,15 @@ def library() -> ctypes.CDLL:
     Raises:
         CannotCompile: there is no compiler, or it fails.
     """
-    compiler = os.environ.get("CXX") or shutil.which("g++") or shutil.which("clang++")
-    if compiler is None:
+    asked = shlex.split(os.environ.get("CXX", ""))  # a program and its arguments, ccache g++ for example
+    compiler = asked or [found for name in ("g++", "clang++") if (found := shutil.which(name))][:1]
+    if not compiler:
         raise CannotCompile("no C++ compiler (g++ or clang++) is installed")
     sources = sorted(OPS.glob("*/*.cpp"))
     if not sources:
         raise CannotCompile(f"{OPS} holds no C++ sources: install the package again")
     texts = [p.read_bytes() for p in [*sources, *sorted(HEADERS.glob("*.h"))]]
-    key = hashlib.sha256(b"\0".join([*texts, " ".join([compiler, *FLAGS]).encode(), _processor()])).hexdigest()[:16]
+    key = hashlib.sha256(b"\0".join([*texts, " ".join([*compiler, *FLAGS]).encode(), _processor()])).hexdigest()[:16]
     folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mmpi_ns"
     target = folder / f"kernels-{key}.so"
     try:
@@ -50,12 +52,12 @@ def library() -> ctypes.CDLL:
             folder.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryDirectory(dir=folder) as scratch:
                 made = Path(scratch) / target.name
-                command = [compiler, *FLAGS, "-o", str(made), *map(str, sources)]
+                command = [*compiler, *FLAGS, "-o", str(made), *map(str, sources)]
                 subprocess.run(command, check=True, capture_output=True, text=True, timeout=120)
                 os.replace(made, target)
         built = ctypes.CDLL(str(target))
     except subprocess.CalledProcessError as error:
-        raise CannotCompile(f"{compiler} failed: {(error.stderr or '').strip().splitlines()[:1]}") from error
+        raise CannotCompile(f"{compiler[0]} failed: {(error.stderr or '').strip().splitlines()[:1]}") from error
     except (OSError, subprocess.TimeoutExpired) as error:
         raise CannotCompile(str(error)) from error
     built.mmpi_index_rows.restype = ctypes.c_int64

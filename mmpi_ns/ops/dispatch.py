@@ -19,6 +19,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from mmpi_ns.ops import build
+from mmpi_ns.utils.errors import InputError
 
 Route = Literal["auto", "torch", "native"]
 Form = Literal["reference", "cpu", "gpu"]
@@ -106,7 +107,7 @@ def choose(path: Route) -> None:
     on_gpu = torch.cuda.is_available() or _interpreting
     names = ["Triton", *(n for n in TABLE if "gpu" in TABLE[n][1])] if on_gpu else ["C++"]
     if reason := next((r for n in names if (r := _fault(n)) is not None), None):
-        raise ValueError(f"The compiled operations cannot be had: {reason}. Use --pipeline.model.ops auto or torch.")
+        raise InputError(f"The compiled operations cannot be had ({reason}): use --pipeline.model.ops auto or torch.")
 
 
 @contextmanager

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mmpi_ns.placement.observations import Array, Observations, frustum_points
+from mmpi_ns.utils.errors import InputError
 
 SAMPLED, SAMPLED_PER_CAMERA = 6000, 16
 """Observations that the choice is based on: so many, or so many a camera where that is more."""
@@ -45,7 +46,7 @@ def find_visible_points(observations: Observations) -> VisiblePoints:
     lie at a tenth of the cameras' spread.
 
     Raises:
-        ValueError: there are keypoints, and none of them can be used.
+        InputError: there are keypoints, and none of them can be used.
     """
     centers = observations.centers
     cameras, points = observations.seen_by, observations.points[observations.seen_point]
@@ -55,7 +56,7 @@ def find_visible_points(observations: Observations) -> VisiblePoints:
     cameras, points, depth = cameras[depth > 0], points[depth > 0], depth[depth > 0]
     if not len(points):
         if len(observations.seen_by):
-            raise ValueError("No point lies in front of the camera that saw it: check the poses and the points' frame.")
+            raise InputError("No point lies in front of the camera that saw it: check the poses and the points' frame.")
         spread = float(np.linalg.norm(centers - centers.mean(0), axis=-1).max())
         depth = np.array([max(0.1 * spread, 1e-3)])
     starts = {i: _start(depth[cameras == i]) for i in range(len(centers)) if (cameras == i).sum() >= 20}

@@ -15,8 +15,8 @@ from torch import Tensor
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.tables import TABLES
 from mmpi_ns.scene.plan import ScenePlan
+from mmpi_ns.utils.errors import InputError, brief
 from mmpi_ns.utils.files import to_text, write_atomically
-from mmpi_ns.utils.messages import brief
 from mmpi_ns.utils.threads import Uninterrupted
 
 _DAMAGED = (OSError, RuntimeError, EOFError, KeyError, TypeError, pickle.UnpicklingError)
@@ -75,7 +75,7 @@ class WindowStore:
             device: where to.
 
         Raises:
-            ValueError: the file is missing or damaged (says which, and what to do).
+            InputError: the file is missing or damaged (says which, and what to do).
         """
         with Uninterrupted(), self._lock:
             field = self._alive.get(window)
@@ -88,7 +88,7 @@ class WindowStore:
     def _read(self, window: int) -> MMPIField:
         path = self.path(window)
         if not path.is_file():
-            raise ValueError(
+            raise InputError(
                 f"Window {window} of this run is missing: {path} is not there. Put the run's folder 'windows' back, or "
                 "name where it is in config.yml (pipeline.model.windows_folder)."
             )
@@ -98,7 +98,7 @@ class WindowStore:
             field = self._empty()
             field.load_state_dict({name: _widened(values) for name, values in state.items()})
         except (*_DAMAGED, AttributeError) as error:
-            raise ValueError(
+            raise InputError(
                 f"Window {window} of this run is damaged: {path} cannot be read ({brief(error)}). Copy it anew, or "
                 "train it again: resume from a checkpoint of before its end with --load-step."
             ) from error
@@ -118,7 +118,7 @@ class WindowStore:
             needed: whether all must be there.
 
         Raises:
-            ValueError: one is missing there that is needed, is damaged, or was trained with another plan.
+            InputError: one is missing there that is needed, is damaged, or was trained with another plan.
         """
         if not plans or other.resolve() == self.path(0).parent.resolve():
             return
@@ -129,7 +129,7 @@ class WindowStore:
                 path.parent.mkdir(parents=True, exist_ok=True)
                 write_atomically(path, lambda unfinished, source=source: shutil.copyfile(source, unfinished))
             elif needed:
-                raise ValueError(
+                raise InputError(
                     f"Window {window} of the run to go on from is missing: {source} is not there. Put it back, or "
                     "resume from a checkpoint of before its end with --load-step."
                 )
@@ -149,16 +149,16 @@ def _bytes_of(field: MMPIField) -> int:
 
 
 def _check_plan(source: Path, plan: ScenePlan) -> None:
-    """Raises ValueError where a window's file is damaged or holds another plan."""
+    """Raises InputError where a window's file is damaged or holds another plan."""
     try:
         state = torch.load(source, map_location="cpu", weights_only=True, mmap=True)
         stored = ScenePlan.from_json(to_text(state["field"]["plan_bytes"]))
     except _DAMAGED as error:
-        raise ValueError(
+        raise InputError(
             f"{source} cannot be read ({brief(error)}): copy it anew, or remove it to train again."
         ) from error
     if stored != plan:
-        raise ValueError(
+        raise InputError(
             f"{source} was trained with another scene plan: resume with the settings in its run's config.yml, or give "
             "that run's plan.json with --pipeline.model.plan-file."
         )

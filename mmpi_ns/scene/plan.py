@@ -8,14 +8,27 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Callable
 from dataclasses import MISSING, asdict, dataclass, fields, replace
-from numbers import Real
 from pathlib import Path
+from typing import Any, TypeVar
+
+from mmpi_ns.utils.errors import InputError, brief
+from mmpi_ns.utils.values import Number, check_number, check_row, check_text, shown
 
 Vector = tuple[float, float, float]
+Plan = TypeVar("Plan")
 
 SHALLOWEST = 1.001
 """An MPI's last plane lies at least so many times as deep as its first: closer, float32 could not tell them apart."""
+
+HUGE = 1e18
+"""Longest length of a plan, scene units: float32 still holds its square."""
+LENGTH = Number(-HUGE, HUGE)
+WIDEST = 1e6
+"""Largest tangent of a frustum."""
+MOST_PLANES, MOST_TEXELS, MOST_VOXELS = 4096, 16384, 4096
+"""Planes of an MPI, texels along a side of a plane, voxels along a side of the cube."""
 
 
 @dataclass(frozen=True)
@@ -131,17 +144,16 @@ class ScenePlan:
         return replace(self, mpis=tuple(m.scaled(factor) for m in self.mpis), cube=cube)
 
     def validate(self) -> None:
-        """Raises ValueError with one sentence that names the MPI and the field that cannot be used."""
+        """Raises InputError with one sentence that names the MPI and the field that cannot be used."""
         if not self.mpis:
-            raise ValueError("A scene plan needs at least one MPI, this one has none: add one to its list 'mpis'.")
-        for mpi in self.mpis:
-            _validate_mpi(mpi)
+            raise InputError("A scene plan needs at least one MPI, this one has none: add one to its list 'mpis'.")
+        for i, mpi in enumerate(self.mpis):
+            _validate_mpi(mpi, i)
         if self.cube is not None:
-            sides = [b - a for a, b in zip(self.cube.lower, self.cube.upper, strict=True)]
-            if not all(math.isfinite(s) and s > 0 for s in sides) or min(self.cube.shape) < 2:
-                raise ValueError("The plan's cube needs upper > lower on every axis and at least 2 voxels a side.")
-        if not (math.isfinite(self.ray_near) and self.ray_near >= 0 and 0 <= self.content_near < math.inf):
-            raise ValueError("The plan's ray_near and content_near must be finite and not negative.")
+            _validate_cube(self.cube)
+        check_number("The plan's 'ray_near'", self.ray_near, Number(0, HUGE))
+        check_number("The plan's 'content_near'", self.content_near, Number(0, HUGE))
+        check_text("The plan's 'origin_of_plan'", self.origin_of_plan)
 
     def to_json(self) -> str:
         """Standard JSON: a ``far`` at infinity is written as null."""
@@ -152,77 +164,115 @@ class ScenePlan:
 
     @staticmethod
     def from_json(text: str) -> ScenePlan:
-        """Reads what ``to_json`` wrote. Raises ValueError naming the field when a field is missing or unknown."""
-        data = read_object(text)
-        if not isinstance(data.get("mpis", []), list):
-            raise ValueError("The scene plan's 'mpis' is not a list: compare it with docs/how_it_works.md.")
-        mpis = tuple(_build(MPIPlan, _with_far(m)) for m in data.get("mpis", []))
-        cube = _build(CubePlan, data["cube"]) if data.get("cube") else None
-        return _build(ScenePlan, {**data, "mpis": mpis, "cube": cube})
+        """Reads what ``to_json`` wrote. Raises InputError naming the field that is missing, unknown or unusable."""
+        return ScenePlan.from_object(read_object(text))
+
+    @staticmethod
+    def from_object(data: Any) -> ScenePlan:
+        """The plan that a JSON object describes. Raises as ``from_json``."""
+        if isinstance(data, dict) and not isinstance(data.get("mpis", []), list):
+            raise InputError("The scene plan's 'mpis' is not a list: compare it with docs/how_it_works.md.")
+        check_fields(ScenePlan, data, "The scene plan")
+        mpis = tuple(_build(MPIPlan, _with_far(m), _mpi_name(m, i)) for i, m in enumerate(data["mpis"]))
+        cube = None if data["cube"] is None else _build(CubePlan, data["cube"], "The plan's cube")
+        return ScenePlan(**{**data, "mpis": mpis, "cube": cube})
 
     @staticmethod
     def load(path: Path) -> ScenePlan:
-        if not path.is_file():
-            raise ValueError(f"There is no scene plan at {path}: check the path given to --pipeline.model.plan-file.")
-        return ScenePlan.from_json(path.read_text(encoding="utf-8"))
+        """Reads a file. Raises InputError naming the file and what is wrong in it."""
+        return load_plan(path, ScenePlan.from_json)
 
 
-def _validate_mpi(mpi: MPIPlan) -> None:
-    rows = {"origin": (mpi.origin, 3), "extent": (mpi.extent, 4), "near": ((mpi.near,), 1), "far": ((mpi.far,), 1)}
-    rows |= {f"axes row {i}": (row, 3) for i, row in enumerate(mpi.axes)} if len(mpi.axes) == 3 else {"axes": ((), 3)}
-    for field, (row, length) in rows.items():
-        if len(row) != length or not all(isinstance(x, Real) for x in row):
-            raise ValueError(f"MPI '{mpi.name}' of the plan needs {length} number(s) in '{field}'.")
-    numbers = [*mpi.origin, *mpi.extent, mpi.near, *(x for row in mpi.axes for x in row)]
-    if not all(math.isfinite(x) for x in numbers):
-        raise ValueError(f"MPI '{mpi.name}' of the plan holds a number that is not finite: correct or remove it.")
-    dots = [sum(a * b for a, b in zip(p, q, strict=True)) for p in mpi.axes for q in mpi.axes]
+def load_plan(path: Path, read: Callable[[str], Plan]) -> Plan:
+    """Reads the text of a plan file, and names the file in whatever is said about it."""
+    if not path.is_file():
+        raise InputError(f"There is no scene plan at {path}: check the path given to --pipeline.model.plan-file.")
+    try:
+        return read(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path} cannot be read ({brief(error)}): save it as UTF-8 text.") from error
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+def _mpi_name(mpi: Any, index: int) -> str:
+    name = mpi.get("name") if isinstance(mpi, dict) else getattr(mpi, "name", None)
+    return f"MPI {shown(name)}" if isinstance(name, str) and name else f"MPI number {index + 1}"
+
+
+def _validate_mpi(mpi: MPIPlan, index: int) -> None:
+    where = _mpi_name(mpi, index)
+    check_text(f"The name of {where}", mpi.name)
+    check_row(f"The 'origin' of {where}", mpi.origin, 3, LENGTH)
+    check_number(f"The 'near' of {where}", mpi.near, Number(1 / HUGE, HUGE))
+    check_row(f"The 'extent' of {where}", mpi.extent, 4, Number(-WIDEST, WIDEST))
+    check_number(f"The 'planes' of {where}", mpi.planes, Number(2, MOST_PLANES, whole=True))
+    for name in ("height", "width"):
+        check_number(f"The '{name}' (texels) of {where}", getattr(mpi, name), Number(2, MOST_TEXELS, whole=True))
+    if not isinstance(mpi.axes, (list, tuple)) or len(mpi.axes) != 3:
+        raise InputError(f"The 'axes' of {where} must be three rows of three numbers, not {shown(mpi.axes)}.")
+    for i, row in enumerate(mpi.axes):
+        check_row(f"Row {i + 1} of the 'axes' of {where}", row, 3, Number(-2, 2))
+    _validate_axes(mpi.axes, where)
+    u0, u1, v0, v1 = mpi.extent
+    if u0 >= u1 or v0 >= v1:
+        raise InputError(f"{where} needs an 'extent' (u0, u1, v0, v1) with u0 < u1 and v0 < v1.")
+    far = mpi.far
+    if far != math.inf and not Number(SHALLOWEST * mpi.near, HUGE).holds(far):
+        raise InputError(f"{where} needs a 'far' beyond its 'near', or null in 'far' for infinity, not {shown(far)}.")
+
+
+def _validate_axes(axes: tuple[Vector, Vector, Vector], where: str) -> None:
+    dots = [sum(a * b for a, b in zip(p, q, strict=True)) for p in axes for q in axes]
     if max(abs(d - float(i % 4 == 0)) for i, d in enumerate(dots)) > 1e-4:
-        raise ValueError(f"The axes of MPI '{mpi.name}' are not orthonormal: give three perpendicular unit rows.")
-    (a, b, c), (d, e, f), (g, h, i) = mpi.axes
+        raise InputError(f"The axes of {where} are not orthonormal: give three perpendicular unit rows.")
+    (a, b, c), (d, e, f), (g, h, i) = axes
     if a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) < 0:
-        raise ValueError(
-            f"The axes of MPI '{mpi.name}' are left-handed: negate one row, or give x right, y down, z facing."
-        )
-    if mpi.near <= 0 or mpi.extent[0] >= mpi.extent[1] or mpi.extent[2] >= mpi.extent[3]:
-        raise ValueError(f"MPI '{mpi.name}' needs near > 0 and an extent (u0, u1, v0, v1) with u0 < u1 and v0 < v1.")
-    if not mpi.far >= SHALLOWEST * mpi.near:
-        raise ValueError(f"MPI '{mpi.name}' needs a far end beyond its near plane, or null in 'far' for infinity.")
-    if mpi.planes < 2 or mpi.height < 2 or mpi.width < 2:
-        raise ValueError(f"MPI '{mpi.name}' needs at least 2 planes and 2 x 2 texels.")
+        raise InputError(f"The axes of {where} are left-handed: negate one row, or give x right, y down, z facing.")
+
+
+def _validate_cube(cube: CubePlan) -> None:
+    for name in ("lower", "upper"):
+        check_row(f"The '{name}' of the plan's cube", getattr(cube, name), 3, LENGTH)
+    check_row("The 'shape' of the plan's cube", cube.shape, 3, Number(2, MOST_VOXELS, whole=True))
+    if not all(a < b for a, b in zip(cube.lower, cube.upper, strict=True)):
+        raise InputError("The plan's cube needs 'upper' > 'lower' on every axis.")
 
 
 def read_object(text: str) -> dict:
-    """The JSON object of a plan. Raises ValueError with one sentence where there is none."""
+    """The JSON object of a plan. Raises InputError with one sentence where there is none."""
     try:
         data = json.loads(text)
-    except json.JSONDecodeError as error:
-        raise ValueError(f"The scene plan is not valid JSON ({error}): fix it or leave it out.") from error
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"The scene plan is not valid JSON ({brief(error)}): fix it or leave it out.") from error
     if not isinstance(data, dict):
-        raise ValueError(
+        raise InputError(
             "The scene plan is not a JSON object with a list 'mpis': compare it with docs/how_it_works.md."
         )
     return data
 
 
-def _build(cls, data: dict):
+def check_fields(cls: type, data: Any, where: str) -> None:
+    """Raises InputError where ``data`` is no JSON object with the fields of a class."""
     if not isinstance(data, dict):
-        raise ValueError(
-            f"A {cls.__name__} in the scene plan is not a JSON object: compare it with docs/how_it_works.md."
-        )
+        raise InputError(f"{where} is not a JSON object: compare it with docs/how_it_works.md.")
     names = {f.name for f in fields(cls)}
     optional = {f.name for f in fields(cls) if f.default is not MISSING}
     unknown, missing = set(data) - names, names - set(data) - optional
     if unknown or missing:
-        wrong = f"lacks {sorted(missing)}" if missing else f"has unknown fields {sorted(unknown)}"
-        raise ValueError(f"A {cls.__name__} in the scene plan {wrong}: compare it with docs/how_it_works.md.")
+        wrong = f"lacks {sorted(missing)}" if missing else f"has unknown fields {shown(sorted(unknown))}"
+        raise InputError(f"{where} {wrong}: compare it with docs/how_it_works.md.")
+
+
+def _build(cls: type, data: Any, where: str) -> Any:
+    check_fields(cls, data, where)
     return cls(**{k: _tuples(v) for k, v in data.items()})
 
 
-def _with_far(mpi):
-    """Null, or nothing as in plans of before MPIs could end, stands for infinity."""
+def _with_far(mpi: Any) -> Any:
+    """Null, or nothing, stands for infinity."""
     return {**mpi, "far": math.inf if mpi.get("far") is None else mpi["far"]} if isinstance(mpi, dict) else mpi
 
 
-def _tuples(value):
+def _tuples(value: Any) -> Any:
     return tuple(_tuples(v) for v in value) if isinstance(value, list) else value

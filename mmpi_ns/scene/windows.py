@@ -10,14 +10,16 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import dataclass
-from numbers import Real
 from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mmpi_ns.scene.plan import ScenePlan, Vector, read_object
+from mmpi_ns.scene.plan import HUGE, LENGTH, ScenePlan, Vector, check_fields, load_plan, read_object
+from mmpi_ns.utils.errors import InputError
+from mmpi_ns.utils.values import Number, check_number, check_row
 
 
 @dataclass(frozen=True)
@@ -41,14 +43,13 @@ class WindowedPlan:
 
     def __post_init__(self) -> None:
         if not self.windows:
-            raise ValueError("A scene plan needs at least one window, this one has none: add one to its list.")
+            raise InputError("A scene plan needs at least one window, this one has none: add one to its list.")
         if len(self.windows) == 1:
             return
         for i, w in enumerate(self.windows):
-            numbers = [*w.center, w.radius, w.margin]
-            are_numbers = len(numbers) == 5 and all(isinstance(x, Real) and math.isfinite(x) for x in numbers)
-            if not are_numbers or w.radius < 0 or w.margin <= 0:
-                raise ValueError(f"Window {i} of the plan needs a centre, a radius and a margin > 0, all finite.")
+            check_row(f"The 'center' of window {i} of the plan", w.center, 3, LENGTH)
+            check_number(f"The 'radius' of window {i} of the plan", w.radius, Number(0, HUGE))
+            check_number(f"The 'margin' of window {i} of the plan", w.margin, Number(0, HUGE, above=True))
 
     def __len__(self) -> int:
         return len(self.windows)
@@ -93,25 +94,29 @@ class WindowedPlan:
 
     @staticmethod
     def from_json(text: str) -> WindowedPlan:
-        """Reads what ``to_json`` wrote. Raises ValueError with one sentence about what is wrong."""
+        """Reads what ``to_json`` wrote. Raises InputError with one sentence about what is wrong."""
         data = read_object(text)
         if "windows" not in data:
-            return WindowedPlan.single(ScenePlan.from_json(text))
+            return WindowedPlan.single(ScenePlan.from_object(data))
         rows = data["windows"]
-        fields = {"center", "radius", "margin", "plan"}
-        if not isinstance(rows, list) or not all(isinstance(r, dict) and set(r) == fields for r in rows):
-            raise ValueError(f"Every window of a scene plan needs {sorted(fields)} and nothing else: correct it.")
-        windows = (
-            Window(tuple(r["center"]), r["radius"], r["margin"], ScenePlan.from_json(json.dumps(r["plan"])))
-            for r in rows
-        )
-        return WindowedPlan(tuple(windows))
+        if set(data) != {"windows"} or not isinstance(rows, list):
+            raise InputError("A plan of several windows needs one list 'windows' and nothing else: correct it.")
+        return WindowedPlan(tuple(_read_window(row, i) for i, row in enumerate(rows)))
 
     @staticmethod
     def load(path: Path) -> WindowedPlan:
-        if not path.is_file():
-            raise ValueError(f"There is no scene plan at {path}: check the path given to --pipeline.model.plan-file.")
-        return WindowedPlan.from_json(path.read_text(encoding="utf-8"))
+        """Reads a file. Raises InputError naming the file and what is wrong in it."""
+        return load_plan(path, WindowedPlan.from_json)
+
+
+def _read_window(row: Any, index: int) -> Window:
+    check_fields(Window, row, f"Window {index} of the plan")
+    try:
+        plan = ScenePlan.from_object(row["plan"])
+    except InputError as error:
+        raise InputError(f"Window {index} of the plan: {error}") from error
+    center = row["center"]
+    return Window(tuple(center) if isinstance(center, list) else center, row["radius"], row["margin"], plan)
 
 
 def window_shares(origins: Float[Tensor, "R 3"], windows: tuple[Window, ...]) -> Float[Tensor, "R W"]:

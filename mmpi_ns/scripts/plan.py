@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,7 +11,9 @@ from typing import TYPE_CHECKING, Literal
 import tyro
 
 from mmpi_ns.placement.defaults import DEFAULTS
+from mmpi_ns.placement.options import check_placement
 from mmpi_ns.placement.rule import PlacementConfig
+from mmpi_ns.utils.errors import InputError, speak_plainly
 
 if TYPE_CHECKING:
     from mmpi_ns.placement.observations import Observations
@@ -47,14 +50,20 @@ class PlanCommand:
         from mmpi_ns.placement.split import place_windows
         from mmpi_ns.scene.windows import WindowedPlan
 
+        check_placement(self.placement, "--placement.")
+        if self.plan_file is not None:  # a mistake in it is said before the images are read
+            WindowedPlan.load(self.plan_file)
+        _check_not_edited(self.output / "plan.json")
         observations = load_observations(self.scene, self.downscale_factor, self.parser)
         if self.plan_file is not None:
             windows = WindowedPlan.load(self.plan_file)
         else:
             windows = place_windows(observations, self.placement, self.training_rays or None)
         text = self._explain(windows, observations)
+        title = f"# Plan of {self.scene.resolve().name}"
         (self.output / "plan.json").write_text(windows.to_json(), encoding="utf-8")
-        (self.output / "plan.md").write_text(f"# Plan of {self.scene.resolve().name}\n\n{text}\n", encoding="utf-8")
+        mark = _mark(self.output / "plan.json")
+        (self.output / "plan.md").write_text(f"{title}\n\n{mark}\n\n{text}\n", encoding="utf-8")
         print(text)
         print(f"\nWrote plan.json, plan.md and pictures in {self.output}.")
         print(
@@ -86,6 +95,20 @@ class PlanCommand:
         return "\n\n".join(parts)
 
 
+def _mark(plan: Path) -> str:
+    """Tells a plan that was edited later from one that was not; a reader of plan.md does not see it."""
+    return f"<!-- plan.json: {hashlib.sha256(plan.read_bytes()).hexdigest()} -->"
+
+
+def _check_not_edited(plan: Path) -> None:
+    """Raises InputError where a plan lies that this command did not write as it is."""
+    told = plan.with_suffix(".md")
+    if plan.is_file() and not (told.is_file() and _mark(plan) in told.read_text(encoding="utf-8", errors="replace")):
+        raise InputError(
+            f"{plan} was edited since mmpi-plan wrote it, or is not from there: give another --output, or remove it."
+        )
+
+
 def _defaults(arguments: list[str]) -> PlanCommand:
     """The command with the placement and the rays of the method that the arguments name."""
     words = [w for argument in arguments for w in argument.split("=", 1)]
@@ -98,10 +121,8 @@ def _defaults(arguments: list[str]) -> PlanCommand:
 def entrypoint() -> None:
     """The command ``mmpi-plan``; a problem with the scene or the plan ends it with one sentence and status 1."""
     command = tyro.cli(PlanCommand, default=_defaults(sys.argv[1:]), description=PlanCommand.__doc__)
-    try:
-        command.main()
-    except ValueError as error:
-        sys.exit(f"mmpi-plan: {error}")
+    speak_plainly()
+    command.main()
 
 
 if __name__ == "__main__":

@@ -3,20 +3,31 @@
 from __future__ import annotations
 
 import pickle
+import re
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from jaxtyping import Float
 from nerfstudio.engine.trainer import TrainerConfig
+from torch import Tensor
 
+from mmpi_ns.placement.observations import Observations
 from mmpi_ns.scene.windows import WindowedPlan
+from mmpi_ns.utils.errors import InputError, brief
 from mmpi_ns.utils.files import to_text
-from mmpi_ns.utils.messages import brief
+from mmpi_ns.utils.values import shown
+
+HOLDS = {"step", "pipeline", "optimizers", "schedulers", "scalers", "rng", "capture"}
+"""What every checkpoint of ours has."""
 
 
 def checkpoints_in(folder: Path, steps: range | None = None) -> dict[int, Path]:
     """The checkpoints in a folder by their steps, all or those of some steps."""
-    found = {int(p.stem.split("-")[1]): p for p in folder.glob("step-*.ckpt")}
+    named = ((re.fullmatch(r"step-(\d+)\.ckpt", path.name), path) for path in folder.glob("step-*.ckpt"))
+    found = {int(name[1]): path for name, path in named if name and path.is_file()}
     return {step: path for step, path in found.items() if steps is None or step in steps}
 
 
@@ -24,21 +35,21 @@ def checkpoint_to_load(config: TrainerConfig) -> Path | None:
     """The checkpoint that a run is to go on from; None for a new one.
 
     Raises:
-        ValueError: it is not there.
+        InputError: it is not there.
     """
     path = config.load_checkpoint
     if path is not None:
         if not path.is_file():
-            raise ValueError(f"There is no checkpoint at {path}: check --load-checkpoint.")
+            raise InputError(f"There is no checkpoint at {path}: check --load-checkpoint.")
         return path
     if config.load_dir is None:
         return None
     steps = checkpoints_in(config.load_dir)
     if not steps:
-        raise ValueError(f"There is no checkpoint in {config.load_dir}: give the nerfstudio_models folder.")
+        raise InputError(f"There is no checkpoint in {config.load_dir}: give the nerfstudio_models folder.")
     step = config.load_step if config.load_step is not None else max(steps)
     if step not in steps:
-        raise ValueError(f"There is no step {step} in {config.load_dir}: it holds {sorted(steps)}.")
+        raise InputError(f"There is no step {step} in {config.load_dir}: it holds {sorted(steps)}.")
     return steps[step]
 
 
@@ -46,18 +57,46 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     """What a checkpoint holds.
 
     Raises:
-        ValueError: it is damaged.
+        InputError: it is damaged.
     """
     try:
-        return torch.load(path, map_location="cpu", weights_only=True)
-    except (OSError, RuntimeError, EOFError, pickle.UnpicklingError) as error:
-        raise ValueError(
-            f"{path} cannot be read ({brief(error)}): resume from another one with --load-step."
+        # Mapped: what is looked at is read, and a file that was cut short is found all the same.
+        state = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+    except (OSError, RuntimeError, ValueError, EOFError, pickle.UnpicklingError) as error:
+        raise InputError(
+            f"{path} cannot be read ({brief(error)}): resume from another one with --load-step, or copy it anew."
         ) from error
+    is_ours = isinstance(state, dict) and HOLDS <= set(state) and isinstance(state["pipeline"], dict)
+    if not is_ours or "_model.progress.windows_bytes" not in state["pipeline"]:
+        raise InputError(f"{path} holds no scene plan: it was not written by this method.")
+    return state
+
+
+def cameras_in_short(observations: Observations) -> Float[Tensor, "M 18"]:
+    """Poses, intrinsics and sizes of the training cameras, by which a capture is known wherever its files lie."""
+    poses = observations.camera_to_worlds.reshape(-1, 12)
+    return torch.from_numpy(np.concatenate([poses, observations.intrinsics, observations.sizes], -1)).float()
+
+
+def check_same_capture(state: dict[str, Any], path: Path, data: Path, observations: Observations) -> None:
+    """Raises InputError where a checkpoint was trained on another capture than this run's.
+
+    Args:
+        state: the checkpoint.
+        path: of its file.
+        data: the capture of this run.
+        observations: its training cameras.
+    """
+    theirs, ours = state["capture"]["cameras"], cameras_in_short(observations)
+    if theirs.shape != ours.shape or not torch.allclose(theirs, ours, rtol=1e-4, atol=1e-4):
+        raise InputError(
+            f"{path} was trained on another capture ({state['capture']['data']}, and {data} here, whose training "
+            "cameras are not the same): resume with the same --data, or train anew."
+        )
 
 
 def check_same_plan(state: dict[str, Any], path: Path, ours: WindowedPlan, plan_file: str) -> None:
-    """Raises ValueError where a checkpoint was trained with another plan than this run has.
+    """Raises InputError where a checkpoint was trained with another plan than this run has.
 
     Args:
         state: of the pipeline, in the checkpoint.
@@ -65,17 +104,26 @@ def check_same_plan(state: dict[str, Any], path: Path, ours: WindowedPlan, plan_
         ours: the plan of this run.
         plan_file: what a run calls the file of its plan.
     """
-    stored = state.get("_model.progress.windows_bytes")
-    if stored is None:
-        raise ValueError(f"{path} holds no scene plan: it was not written by this method.")
-    theirs = WindowedPlan.from_json(to_text(stored))
+    theirs = WindowedPlan.from_json(to_text(state["_model.progress.windows_bytes"]))
     if theirs != ours:
-        raise ValueError(
-            f"{path} was trained with another scene plan ({_in_short(theirs)} there, {_in_short(ours)} here): "
+        raise InputError(
+            f"{path} was trained with another scene plan ({_difference(theirs, ours)}): "
             f"resume with the settings in its config.yml, or give its {plan_file} with --pipeline.model.plan-file."
         )
 
 
-def _in_short(windows: WindowedPlan) -> str:
-    mpis = f"{sum(len(plan.mpis) for plan in windows.plans)} MPIs"
-    return mpis if len(windows) == 1 else f"{len(windows)} windows with {mpis}"
+def _difference(theirs: WindowedPlan, ours: WindowedPlan) -> str:
+    """What differs first between two plans."""
+    shapes = [(len(p), sum(len(plan.mpis) for plan in p.plans)) for p in (theirs, ours)]
+    if shapes[0] != shapes[1]:
+        there, here = (f"{mpis} MPIs" if w == 1 else f"{w} windows with {mpis} MPIs" for w, mpis in shapes)
+        return f"{there} there, {here} here"
+    for w, (a, b) in enumerate(zip(theirs.plans, ours.plans, strict=True)):
+        pairs = [*zip(a.mpis, b.mpis, strict=False), (a, b)]
+        for one, other in pairs:
+            for f in fields(one):
+                if f.name != "mpis" and getattr(one, f.name) != getattr(other, f.name):
+                    where = f" of MPI {one.name!r}" if one is not a else ""
+                    there, here = shown(getattr(one, f.name)), shown(getattr(other, f.name))
+                    return f"{f.name!r}{where}{f' in window {w}' if len(ours) > 1 else ''}: {there} there, {here} here"
+    return "other borders of windows"

@@ -4,12 +4,55 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import torch
+
 from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.scene.texels import BRICK, SIDE, head_shapes
 from mmpi_ns.scene.visible_tiles import TrainingViews, reachable_tiles
 from mmpi_ns.scene.windows import WindowedPlan
+from mmpi_ns.utils.errors import InputError
+from mmpi_ns.utils.machine import free_memory
 
 GIB = 2**30
+TILE_BYTES = 8
+"""Of every tile, stored or not, while it is found out which ones training rays can reach."""
+
+
+def check_memory(
+    windows: WindowedPlan,
+    views: Sequence[TrainingViews | None],
+    feature_channels: int,
+    two_phase: bool,
+    device: str | torch.device,
+) -> None:
+    """Compares what the largest window takes in training with what the machine has, before anything is allocated.
+
+    Args:
+        windows: of the capture.
+        views: training images of each window.
+        feature_channels, two_phase: see ``training_bytes``.
+        device: on which it will be trained.
+
+    Raises:
+        InputError: it has less.
+    """
+    free = free_memory(device)
+    for plan, seen in zip(windows.plans, views, strict=True):
+        # Which tiles can be reached takes memory to find out as well.
+        needed = TILE_BYTES * count_tiles(plan)
+        if needed <= free:
+            needed = training_bytes(plan, seen, feature_channels, two_phase)
+        if needed > free:
+            raise InputError(
+                f"The tables of this plan ({plan.texels / 1e6:.0f} M texels) take at least {needed / GIB:.1f} GiB in "
+                f"training and {free / GIB:.1f} GiB are free: give fewer texels, in the plan or with "
+                "--pipeline.model.placement.max-texels."
+            )
+
+
+def count_tiles(plan: ScenePlan) -> int:
+    """Tiles of 8 x 8 texels of all planes, stored or not."""
+    return sum(depth * -(-height // SIDE) * -(-width // SIDE) for depth, height, width in head_shapes(plan))
 
 
 def training_bytes(plan: ScenePlan, views: TrainingViews | None, feature_channels: int, two_phase: bool) -> int:
@@ -21,7 +64,7 @@ def training_bytes(plan: ScenePlan, views: TrainingViews | None, feature_channel
         feature_channels: colour features of a texel.
         two_phase: whether reliability is trained, so that it has moments.
     """
-    tiles = sum(depth * -(-height // SIDE) * -(-width // SIDE) for depth, height, width in head_shapes(plan))
+    tiles = count_tiles(plan)
     stored = tiles if views is None else int(reachable_tiles(views, plan).sum())
     learned = 1 + feature_channels + two_phase
     numbers = 1 + feature_channels + 1 + 2 * learned  # density, features, reliability, two moments

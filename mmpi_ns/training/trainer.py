@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -13,10 +14,22 @@ from nerfstudio.utils import comms
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from mmpi_ns.capture.datamanager import MMPIDataManager
-from mmpi_ns.training.checkpoints import check_same_plan, checkpoint_to_load, checkpoints_in, read_checkpoint
+from mmpi_ns.scene.windows import WindowedPlan
+from mmpi_ns.training.checkpoints import (
+    cameras_in_short,
+    check_same_capture,
+    check_same_plan,
+    checkpoint_to_load,
+    checkpoints_in,
+    read_checkpoint,
+)
 from mmpi_ns.training.learning_rates import following
 from mmpi_ns.training.memory import describe, training_bytes
+from mmpi_ns.training.options import check_run
 from mmpi_ns.training.run import TrainingRun
+from mmpi_ns.training.run_folder import claim
+from mmpi_ns.training.stopping import end, end_before_training, signals_go_to
+from mmpi_ns.utils.errors import InputError, speak_plainly
 from mmpi_ns.utils.files import write_atomically
 
 PLAN_FILE = "plan.json"
@@ -32,10 +45,44 @@ class MMPITrainerConfig(TrainerConfig):
 
     _target: type = field(default_factory=lambda: MMPITrainer)
 
+    def set_timestamp(self) -> None:
+        """The first of ours that ns-train runs."""
+        speak_plainly()
+        super().set_timestamp()
+
+    def get_checkpoint_dir(self) -> Path:
+        """The first of ours that ns-eval, ns-render and ns-viewer run.
+
+        They take every file in this folder for a checkpoint, and so they are told which is the last.
+        """
+        speak_plainly()
+        folder = super().get_checkpoint_dir()
+        steps = checkpoints_in(folder)
+        if steps and self.load_dir in (None, folder) and self.load_step is None and self.load_checkpoint is None:
+            self.load_step = max(steps)
+            read_checkpoint(steps[self.load_step])
+        return folder
+
+    def print_to_terminal(self) -> None:
+        """Says where all settings are; there are more of them than a terminal has lines."""
+        CONSOLE.print(f"All settings of this run: {self.get_base_dir() / 'config.yml'}", soft_wrap=True)
+
     def save_config(self) -> None:
-        """Writes config.yml, from which ns-eval and ns-render learn where the windows of a long capture lie."""
-        self.pipeline.model.windows_folder = self.get_base_dir() / WINDOWS_FOLDER  # type: ignore[attr-defined]
-        super().save_config()
+        """Judges the options, takes the run's folder, and writes config.yml.
+
+        From that ns-eval and ns-render learn where the windows of a long capture lie. What the run goes on from is not
+        theirs to load.
+        """
+        check_run(self)
+        folder = self.get_base_dir()
+        claim(folder, self.get_checkpoint_dir(), self.load_checkpoint or self.load_dir)
+        self.pipeline.model.windows_folder = folder / WINDOWS_FOLDER  # type: ignore[attr-defined]
+        resumes = {name: getattr(self, name) for name in ("load_dir", "load_step", "load_checkpoint")}
+        try:
+            vars(self).update(dict.fromkeys(resumes))
+            super().save_config()
+        finally:
+            vars(self).update(resumes)
 
 
 class MMPITrainer(Trainer):
@@ -50,8 +97,15 @@ class MMPITrainer(Trainer):
         return run
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
+        """Prepares the run; a signal in the meantime ends it with a sentence (of several processes: torchrun's)."""
+        with signals_go_to(end_before_training) if self.world_size == 1 else nullcontext():
+            self._prepare(test_mode)
+
+    def _prepare(self, test_mode: Literal["test", "val", "inference"]) -> None:
         _check_device(self.config.machine.device_type)
+        self._stopped_by: int | None = None
         model_config: Any = self.config.pipeline.model
+        model_config.seed = self.config.pipeline.datamanager.seed = self.config.machine.seed  # type: ignore[attr-defined]
         self._window_steps = model_config.total_steps = self.config.max_num_iterations
         model_config.windows_folder = self.base_dir / WINDOWS_FOLDER
         # Processes share the windows out among them; nerfstudio would have all of them average their gradients.
@@ -63,23 +117,28 @@ class MMPITrainer(Trainer):
         self.config.max_num_iterations = self._window_steps
         plan = self._run.progress.windows
         self.base_dir.mkdir(parents=True, exist_ok=True)
-        write_atomically(self.base_dir / PLAN_FILE, lambda path: path.write_text(plan.to_json(), encoding="utf-8"))
+        _write_plan(self.base_dir / PLAN_FILE, plan)
         CONSOLE.print(describe(plan, self._window_steps, *self._expected_memory()))
         if 1 < self._processes and len(plan) < self._processes:
-            raise ValueError(
+            raise InputError(
                 f"The capture has {len(plan)} window(s), too few to share out among {self._processes} processes: start "
                 "fewer, or make windows shorter with --pipeline.model.placement.window-length."
             )
 
+    @property
+    def _manager(self) -> MMPIDataManager:
+        manager = self.pipeline.datamanager
+        assert isinstance(manager, MMPIDataManager), "MMPITrainer trains from MMPIDataManager"
+        return manager
+
     def _expected_memory(self) -> tuple[list[int], list[int]]:
         """Bytes that the training of each window holds: of tables with their moments, and of pixels."""
-        run, manager = self._run, self.pipeline.datamanager
+        run, manager = self._run, self._manager
         blends = any(phase.name == "blend" for phase in run.progress.schedule.phases)
         tables = [
             training_bytes(plan, run.views_of(w), run.field.feature_channels, blends)
             for w, plan in enumerate(run.progress.windows.plans)
         ]
-        assert isinstance(manager, MMPIDataManager), "MMPITrainer trains from MMPIDataManager"
         if len(tables) == 1:
             return tables, [manager.pixel_bytes()]
         centers = manager.observations.centers
@@ -111,9 +170,24 @@ class MMPITrainer(Trainer):
             )
             return
         try:
-            super().train()
+            with signals_go_to(self._stop):
+                super().train()
         finally:
             self.config.max_num_iterations = self._window_steps
+        if self._stopped_by is not None:
+            self.config.logging.profiler = "none"  # nothing more is said
+            path = checkpoints_in(self.checkpoint_dir).get(self._last_step)
+            if path is None:  # training was paused
+                end_before_training(self._stopped_by)
+            end(
+                self._stopped_by,
+                f"Stopped after step {self._last_step + 1} of {self._total_steps}, which is in {path}: the same "
+                f"command with --load-dir {self.checkpoint_dir} goes on from there.",
+            )
+
+    def _stop(self, number: int) -> None:
+        """Has nerfstudio's loop end after the step at hand, also where training is paused."""
+        self._stopped_by, self.stop_training = number, True
 
     def _checkpoints_of(self, window: int) -> dict[int, Path]:
         """Checkpoints of one window of several, here and in the run that this one goes on from."""
@@ -155,17 +229,22 @@ class MMPITrainer(Trainer):
 
     def train_iteration(self, step: int) -> Any:
         """One step; remembers that it ran, and puts a window of several away when it was its last."""
-        result = super().train_iteration(step)
+        loss, *others = super().train_iteration(step)
         self._last_step = step
+        if self._stopped_by is not None:  # nerfstudio forgets what was said before its loop
+            self.stop_training = True
         run, progress = self._run, self._run.progress
         if len(progress.windows) > 1 and (step + 1) % progress.schedule.window_steps == 0:
             run.store.save(progress.window, run.field)
-        return result
+        return loss.detach(), *({k: _detached(v) for k, v in values.items()} for values in others)
 
     def _after_train(self) -> None:
         """Saves the last step that ran; 1.1.5 would save the next one's number when training is stopped."""
         self.step = self._last_step
-        super()._after_train()
+        if self._stopped_by is None:
+            return super()._after_train()
+        self.training_state = "completed"
+        self.save_checkpoint(self.step)
 
     def save_checkpoint(self, step: int) -> None:
         """Writes beside the checkpoint folder, then moves the finished file in: a kill or a full disk loses nothing.
@@ -183,6 +262,10 @@ class MMPITrainer(Trainer):
             "schedulers": {k: v.state_dict() for k, v in self.optimizers.schedulers.items()},
             "scalers": self.grad_scaler.state_dict(),
             "rng": {"torch": torch.get_rng_state()},
+            "capture": {
+                "data": str(self._manager.get_datapath()),
+                "cameras": cameras_in_short(self._manager.observations),
+            },
         }
         write_atomically(path, lambda p: torch.save(state, p), self.base_dir)
         if self.config.save_only_latest_checkpoint:
@@ -196,20 +279,39 @@ class MMPITrainer(Trainer):
         path, run = checkpoint_to_load(self.config), self._run
         if path is not None:
             state = read_checkpoint(path)
+            check_same_capture(state, path, self._manager.get_datapath(), self._manager.observations)
             check_same_plan(state["pipeline"], path, run.progress.windows, PLAN_FILE)
             torch.set_rng_state(state["rng"]["torch"])
             del state
+        # nerfstudio takes every file in load_dir for a checkpoint.
+        asked, self.config.load_dir = self.config.load_dir, None
+        asked_for, self.config.load_checkpoint = self.config.load_checkpoint, path
         super()._load_checkpoint()
+        self.config.load_dir, self.config.load_checkpoint = asked, asked_for
         if path is not None and self._processes == 1:
             progress = run.progress
             finished = dict(enumerate(progress.windows.plans[: progress.schedule.window_at(self._start_step)]))
             run.store.adopt(path.parent.parent / WINDOWS_FOLDER, finished, needed=True)
 
 
+def _write_plan(path: Path, plan: WindowedPlan) -> None:
+    """Writes a run's plan for its user to read; one that the user has edited stays."""
+    if path.is_file() and path.read_text(encoding="utf-8", errors="replace") != plan.to_json():
+        raise InputError(
+            f"{path} is not the plan of this run and was edited, it seems: give it with --pipeline.model.plan-file in "
+            "another --timestamp, or remove it."
+        )
+    write_atomically(path, lambda unfinished: unfinished.write_text(plan.to_json(), encoding="utf-8"))
+
+
+def _detached(value: Any) -> Any:
+    return value.detach() if isinstance(value, torch.Tensor) else value
+
+
 def _check_device(device_type: str) -> None:
     there = {"cuda": torch.cuda.is_available, "mps": torch.backends.mps.is_available}
     if device_type in there and not there[device_type]():
-        raise ValueError(
+        raise InputError(
             f"--machine.device-type {device_type} asks for a GPU and torch sees none: check the driver and torch's "
             "build, or train with --machine.device-type cpu."
         )

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import UInt8
 from torch import Tensor
 
-from mmpi_ns.utils.messages import brief
+from mmpi_ns.utils.errors import WriteError, brief
 
 
 def write_atomically(path: Path, write: Callable[[Path], object], folder: Path | None = None) -> None:
@@ -23,22 +23,29 @@ def write_atomically(path: Path, write: Callable[[Path], object], folder: Path |
         folder: where the unfinished file lies; beside the finished one unless given.
 
     Raises:
-        OSError: it could not be written (says why and what is left).
+        WriteError: it could not be written (says why and what is left).
     """
     temporary = (folder or path.parent) / f".{path.name}.{os.getpid()}.tmp"
     try:
         write(temporary)
+        _to_disk(temporary)
         os.replace(temporary, path)
     except (OSError, RuntimeError) as error:  # torch.save has a RuntimeError, without a reason, for a full disk
         free = shutil.disk_usage(temporary.parent).free / 2**20
         temporary.unlink(missing_ok=True)
-        raise OSError(
+        raise WriteError(
             f"{path} could not be written ({brief(error)}; {free:.0f} MB free): earlier files are "
             "untouched, so make room and start again (--load-dir goes on from the last checkpoint)."
         ) from error
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
+
+
+def _to_disk(path: Path) -> None:
+    """Waits until a file is on the disk: a rename may get there first, and a power cut would leave an empty file."""
+    with open(path, "rb+") as file:
+        os.fsync(file.fileno())
 
 
 def to_bytes(text: str) -> UInt8[Tensor, "B"]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import resource
 import shutil
 import subprocess
@@ -67,41 +68,6 @@ def set_pose(value):
 # The capture ---------------------------------------------------------------------------------------------------------
 
 
-def test_a_folder_without_transforms_is_named_with_what_to_do(tmp_path):
-    refusal(lambda: datamanager(tmp_path), tmp_path / "transforms.json", "--data", "mmpi-prepare", "colmap")
-
-
-@pytest.mark.parametrize("text", ["", "{ frames: ", "[1, 2]", "{}", '{"frames": []}', '{"frames": [3]}'])
-def test_transforms_that_hold_no_frames_are_refused(data, text):
-    (data / "transforms.json").write_text(text)
-    refusal(lambda: datamanager(data), data / "transforms.json")
-
-
-@pytest.mark.parametrize("missing", ["transform_matrix", "file_path"])
-def test_a_frame_without_pose_or_image_is_named(data, missing):
-    edit(data, lambda meta: meta["frames"][3].pop(missing))
-    refusal(lambda: datamanager(data), "4" if missing == "file_path" else name_of(3), missing, "remove the frame")
-
-
-@pytest.mark.parametrize(
-    "pose", [[[1.0, 0, 0, float("nan")], *np.eye(4)[1:].tolist()], [[1, 2], [3, 4]], "none", [["a"] * 4] * 4, None]
-)
-def test_a_pose_that_is_no_finite_matrix_is_named(data, pose):
-    edit(data, set_pose(pose))
-    refusal(lambda: datamanager(data), name_of(3), data / "transforms.json", "4 x 4")
-
-
-def test_a_focal_length_that_is_not_positive_is_refused(data):
-    edit(data, lambda meta: meta.update(fl_x=0.0))
-    refusal(lambda: datamanager(data), name_of(TRAIN[0]), "focal length")
-
-
-@pytest.mark.parametrize("change", [stand_still, keep_one])
-def test_cameras_in_one_place_are_refused_with_what_can_be_done(data, change):
-    edit(data, change)
-    refusal(lambda: datamanager(data), data / "transforms.json", "one place", "--auto-scale-poses False")
-
-
 @pytest.mark.parametrize("change", [stand_still, keep_one])
 def test_one_place_can_be_trained_on_request_and_says_what_it_cannot_learn(data, tmp_path, capsys, change):
     edit(data, change)
@@ -122,23 +88,6 @@ def test_a_capture_that_leaves_no_image_for_evaluation_says_so(data):
 
 
 # Images and masks ----------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("i", [0, TRAIN[2], TEST[1]])
-@pytest.mark.parametrize("damage", ["missing", "truncated", "no image"])
-def test_an_image_that_is_missing_or_cannot_be_read_is_named(data, i, damage):
-    path = data / "images" / name_of(i)
-    if damage == "missing":
-        path.unlink()
-    else:
-        path.write_bytes(path.read_bytes()[:300] if damage == "truncated" else b"hello")
-    refusal(lambda: datamanager(data), path, "cannot be read", "repair it or remove its frame")
-
-
-def test_an_image_of_another_size_than_its_camera_is_named(data):
-    path = data / "images" / name_of(3)
-    Image.fromarray(np.zeros((HEIGHT + 2, WIDTH, 3), np.uint8)).save(path)
-    refusal(lambda: datamanager(data), path, f"{WIDTH} x {HEIGHT + 2}", f"{WIDTH} x {HEIGHT}")
 
 
 def test_an_image_that_was_rounded_up_by_a_pixel_is_cut_to_its_camera(data):
@@ -277,7 +226,7 @@ def test_a_run_resumed_with_another_number_of_mpis_is_refused_and_changes_nothin
     after = contents(first.base_dir)
     # TensorBoard writes what it still holds of the first run whenever it likes.
     assert all(after[name] == data for name, data in before.items() if "tfevents" not in name.name)
-    config(2).save_config()  # ns-train overwrites config.yml before anything of ours runs
+    refusal(config(2).save_config, "holds checkpoints of an earlier run", "--load-dir", "--timestamp")
     _, pipeline, _, step = eval_setup(first.base_dir / "config.yml")
     assert step == 3 and len(pipeline.model.field.plan.mpis) == 1
 
@@ -293,14 +242,13 @@ def test_a_gpu_asked_for_where_there_is_none(scene, plan_file, tmp_path):
     assert not list(tmp_path.rglob("*.ckpt"))
 
 
-def test_the_command_ends_with_the_sentence_and_a_status_that_is_not_0(data, tmp_path):
+def test_the_command_ends_with_the_sentence_alone_and_status_1(data, tmp_path):
     edit(data, lambda meta: meta["frames"][3].pop("transform_matrix"))
-    env = {"COLUMNS": "200", "PATH": "/usr/bin:/bin", "OMP_NUM_THREADS": "1"}
     done = subprocess.run(
         [str(Path(sys.executable).with_name("ns-train")), "mmpi-small", "--data", str(data), "--output-dir",
          str(tmp_path / "out"), "--machine.device-type", "cpu", "--vis", "tensorboard"],
-        capture_output=True, text=True, timeout=100, env=env,
+        capture_output=True, text=True, timeout=200, env=os.environ | {"COLUMNS": "200"},
     )  # fmt: skip
-    assert done.returncode != 0
+    assert done.returncode == 1 and "Traceback" not in done.stdout + done.stderr
     last = done.stderr.strip().splitlines()[-1]
-    assert last.startswith("ValueError: Frame") and name_of(3) in last and last.endswith("remove the frame.")
+    assert last.startswith("ns-train: Frame") and name_of(3) in last and last.endswith("remove the frame.")

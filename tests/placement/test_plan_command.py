@@ -19,6 +19,7 @@ from mmpi_ns.scene.windows import WindowedPlan
 from mmpi_ns.scripts.plan import _defaults, entrypoint
 from mmpi_ns.synthetic.catalogue import make_scene
 from mmpi_ns.synthetic.dataset import write_dataset
+from mmpi_ns.utils.errors import InputError
 
 
 def run(monkeypatch, *words):
@@ -58,7 +59,7 @@ def test_the_defaults_are_those_of_the_method():
 
 
 def test_a_missing_scene_is_one_sentence(tmp_path, monkeypatch):
-    with pytest.raises(SystemExit, match="There is no scene at"):
+    with pytest.raises(InputError, match="There is no scene at"):
         run(monkeypatch, tmp_path / "nowhere", "--output", tmp_path / "plan")
     assert not (tmp_path / "plan").exists()
 

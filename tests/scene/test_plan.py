@@ -121,11 +121,11 @@ def test_scene_plans_without_mpis_or_with_impossible_distances_are_refused(plan)
 @pytest.mark.parametrize(
     ("edit", "words"),
     [
-        (lambda d: d.pop("ray_near"), ["ScenePlan", "ray_near"]),
-        (lambda d: d["mpis"][0].pop("extent"), ["MPIPlan", "extent"]),
-        (lambda d: d["mpis"][1].update(tilt=3), ["MPIPlan", "tilt"]),
-        (lambda d: d["cube"].pop("shape"), ["CubePlan", "shape"]),
-        (lambda d: d.update(colour="red"), ["ScenePlan", "colour"]),
+        (lambda d: d.pop("ray_near"), ["The scene plan", "ray_near"]),
+        (lambda d: d["mpis"][0].pop("extent"), ["MPI 'front'", "extent"]),
+        (lambda d: d["mpis"][1].update(tilt=3), ["MPI 'left'", "tilt"]),
+        (lambda d: d["cube"].pop("shape"), ["cube", "shape"]),
+        (lambda d: d.update(colour="red"), ["The scene plan", "colour"]),
         (lambda d: d.update(mpis=[]), ["mpis"]),
     ],
 )

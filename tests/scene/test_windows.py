@@ -112,9 +112,9 @@ def test_a_windowed_plan_survives_json():
 @pytest.mark.parametrize(
     "change, sentence",
     [
-        (lambda d: d["windows"][1].pop("margin"), "Every window of a scene plan needs"),
+        (lambda d: d["windows"][1].pop("margin"), "Window 1 of the plan lacks \\['margin'\\]"),
         (lambda d: d["windows"][1].update(radius=None), "radius"),
-        (lambda d: d["windows"][0].update(margin=0.0), "margin > 0"),
+        (lambda d: d["windows"][0].update(margin=0.0), "'margin' of window 0"),
         (lambda d: d.update(windows=[]), "at least one window"),
     ],
 )

@@ -1,0 +1,107 @@
+"""Checks of the cameras' intrinsics in a transforms.json: sizes, focal lengths, principal points and lenses."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from nerfstudio.cameras.cameras import CAMERA_MODEL_TO_TYPE, CameraType
+
+from mmpi_ns.utils.errors import InputError
+from mmpi_ns.utils.values import Number, check_number, check_row, shown
+
+POSITIVE = Number(0, above=True)
+SIDE = Number(1, 65536)
+"""Pixels along a side of an image."""
+FOCAL_SHARES = (1e-3, 1e4)
+"""Focal lengths that a lens can have, in widths of the image."""
+CAMERA = ("fl_x", "fl_y", "cx", "cy", "w", "h")
+RADIAL, TANGENTIAL = ("k1", "k2", "k3", "k4"), ("p1", "p2")
+STRETCH = 10.0
+"""A lens that moves what lies half way to a corner nearer or farther by more than this factor is a mistake."""
+
+
+def check_lenses(meta: Mapping[str, Any], frames: Sequence[Mapping[str, Any]], path: Path) -> None:
+    """Checks what nerfstudio's parser reads of every camera; a value for all frames goes before a frame's own.
+
+    Raises:
+        InputError: a value is missing, is no number, or cannot be a lens; names the file, the frame and the field.
+    """
+    model = meta.get("camera_model", "OPENCV")
+    if not isinstance(model, str) or model not in CAMERA_MODEL_TO_TYPE:
+        known = ", ".join(CAMERA_MODEL_TO_TYPE)
+        raise InputError(f"The camera_model of {path} is {shown(model)}: give one of {known}.")
+    for key in CAMERA:
+        lacking = next((f for f in frames if key not in f), None) if key not in meta else None
+        if lacking is not None:
+            raise InputError(f"{path} has no {key}, neither for all frames nor in {lacking['file_path']}: add it.")
+    # One coefficient for all frames, and nerfstudio reads none of the frames' own.
+    own_lens = not set(meta) & {"k1", "k2", "k3", *TANGENTIAL, "distortion_params"}
+    seen: set[tuple] = set()
+    for frame in frames:
+        own = {k: v for k, v in frame.items() if k not in meta}
+        lens = {k: v for k, v in (own if own_lens else meta).items() if k in (*RADIAL, *TANGENTIAL)}
+        params = (own if own_lens else meta).get("distortion_params")
+        camera = {k: meta.get(k, own.get(k)) for k in CAMERA}
+        key = (repr(camera), repr(lens), repr(params))
+        if key not in seen:
+            seen.add(key)
+            where = path if set(meta) >= set(CAMERA) and not own_lens else f"{frame['file_path']} in {path}"
+            _check_camera(camera, CAMERA_MODEL_TO_TYPE[model], str(where))
+            _check_distortion(camera, lens, params, CAMERA_MODEL_TO_TYPE[model], str(where))
+
+
+def _check_camera(camera: Mapping[str, Any], kind: CameraType, where: str) -> None:
+    for key in ("w", "h"):
+        check_number(f"The {key} of {where}", camera[key], SIDE)
+        if camera[key] != int(camera[key]):
+            raise InputError(f"The {key} of {where} must be whole pixels, not {shown(camera[key])}.")
+    least, most = FOCAL_SHARES
+    for key, side in (("fl_x", "w"), ("fl_y", "h")):
+        check_number(f"The focal length {key} of {where}", camera[key], POSITIVE)
+        share = camera[key] / camera[side]
+        if kind != CameraType.ORTHOPHOTO and not least <= share <= most:
+            raise InputError(
+                f"The focal length {key} of {where} is {camera[key]:g} pixels in an image of {camera[side]:g}: give "
+                f"it in pixels, between {least:g} and {most:g} times the image's side."
+            )
+    for key, side in (("cx", "w"), ("cy", "h")):
+        check_number(f"The {key} of {where}", camera[key], Number())
+        if not 0 <= camera[key] <= camera[side]:
+            raise InputError(
+                f"The principal point {key} of {where} is {camera[key]:g}, outside the image of {camera[side]:g} "
+                "pixels: give cx, cy, w and h for images of one size."
+            )
+
+
+def _check_distortion(
+    camera: Mapping[str, Any], lens: Mapping[str, Any], params: Any, kind: CameraType, where: str
+) -> None:
+    for key, value in lens.items():
+        check_number(f"The distortion {key} of {where}", value, Number(-1, 1) if key in TANGENTIAL else Number())
+    if params is not None:
+        check_row(f"The distortion_params of {where}", params, 16 if kind == CameraType.FISHEYE624 else 6, Number())
+        lens = {} if kind == CameraType.FISHEYE624 else dict(zip(RADIAL, params, strict=False))
+    if kind not in (CameraType.PERSPECTIVE, CameraType.FISHEYE):
+        return
+    corner = math.hypot(0.5 * camera["w"] / camera["fl_x"], 0.5 * camera["h"] / camera["fl_y"])
+    if not _can_be_undone([float(lens.get(k, 0)) for k in RADIAL], 0.5 * corner):
+        said = ", ".join(f"{k} {lens[k]:g}" for k in RADIAL if k in lens)
+        raise InputError(
+            f"The distortion of {where} ({said}) cannot be undone half way to the image's corners: give OpenCV's "
+            "coefficients for this camera_model, or undistorted images without any."
+        )
+
+
+def _can_be_undone(k: Sequence[float], radius: float) -> bool:
+    """Whether a radial polynomial rises until it reaches ``radius`` (tangent, or angle of a fisheye), about there."""
+    r = radius * np.linspace(0, STRETCH, 2001)[1:]
+    with np.errstate(over="ignore", invalid="ignore"):
+        distorted = r + sum(c * r ** (2 * n + 3) for n, c in enumerate(k))
+        reached = np.nonzero(~(distorted < radius))[0]
+        first = int(reached[0]) if len(reached) else len(r) - 1
+        rises = bool((np.diff(np.append(0.0, distorted[: first + 1])) > 0).all())
+    return len(reached) > 0 and rises and float(r[first]) >= radius / STRETCH

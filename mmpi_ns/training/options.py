@@ -1,0 +1,88 @@
+"""Options of a run that cannot be used, or that have no effect here, are refused before anything is written."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from typing import Any
+
+from nerfstudio.engine.trainer import TrainerConfig
+
+from mmpi_ns.placement.options import check_placement
+from mmpi_ns.utils.errors import InputError
+from mmpi_ns.utils.values import Number, check_number, check_options
+
+POSITIVE, NOT_NEGATIVE, COUNT = Number(0, above=True), Number(0), Number(0, whole=True)
+SHARE = Number(0, 1)
+RUN = {"max_num_iterations": Number(1, 10**9, whole=True), "steps_per_save": COUNT}
+PIXELS = {
+    "train_num_rays_per_batch": Number(1, 10**8, whole=True),
+    "eval_num_rays_per_batch": Number(1, 10**8, whole=True),
+    "keypoint_rays": Number(0, 10**8, whole=True),
+    "resident_pixels": NOT_NEGATIVE,
+    "camera_res_scale_factor": POSITIVE,
+}
+MODEL = {
+    "eval_num_rays_per_chunk": COUNT,
+    "resident_gib": NOT_NEGATIVE,
+    "blend_share": SHARE,
+    "finetune_share": SHARE,
+    "finetune_rate": NOT_NEGATIVE,
+    "decay_decades": NOT_NEGATIVE,
+    "growth_shares": SHARE,
+    "release_shares": SHARE,
+    "release_weight": NOT_NEGATIVE,
+    "feature_channels": Number(3, 256, whole=True),
+    "hidden_width": Number(1, 4096, whole=True),
+    "position_frequencies": Number(0, 32, whole=True),
+    "direction_frequencies": Number(0, 32, whole=True),
+    "samples_per_voxel": POSITIVE,
+    "cube_alpha": Number(0, 1, above=True),
+    "train_threshold": SHARE,
+    "render_threshold": SHARE,
+}
+NO_EFFECT = {
+    "pipeline.datamanager": (
+        "train_num_images_to_sample_from",
+        "train_num_times_to_repeat_images",
+        "eval_num_images_to_sample_from",
+        "eval_num_times_to_repeat_images",
+        "eval_image_indices",
+        "patch_size",
+        "pixel_sampler",
+        "images_on_gpu",
+        "masks_on_gpu",
+    ),
+    "pipeline.model": ("enable_collider", "collider_params", "loss_coefficients", "prompt"),
+}
+"""nerfstudio's options that this method has no use for."""
+
+
+def check_run(config: TrainerConfig) -> None:
+    """Raises InputError naming the option that cannot be used, or that would be ignored."""
+    manager: Any = config.pipeline.datamanager
+    model: Any = config.pipeline.model
+    check_options(config, RUN, "--")
+    check_options(manager, PIXELS, "--pipeline.datamanager.")
+    check_options(model, MODEL, "--pipeline.model.")
+    check_options(model.loss, {f.name: NOT_NEGATIVE for f in fields(model.loss)}, "--pipeline.model.loss.")
+    if model.training == "two-phase" and model.blend_share + model.finetune_share >= 1:
+        raise InputError(
+            "--pipeline.model.blend-share and finetune-share leave no steps for the first phase: give less than 1."
+        )
+    check_placement(model.placement, "--pipeline.model.placement.")
+    for name, entry in config.optimizers.items():
+        check_number(f"--optimizers.{name}.optimizer.lr", entry["optimizer"].lr, NOT_NEGATIVE)
+        if entry["optimizer"].max_norm is not None:
+            raise InputError(
+                f"--optimizers.{name}.optimizer.max-norm clips gradients, which are sparse here and cannot be clipped "
+                "as a whole: leave it out or lower the rate."
+            )
+    for path, names in NO_EFFECT.items():
+        settings = manager if path.endswith("datamanager") else model
+        usual = type(settings)()
+        for name in names:
+            if getattr(settings, name) != getattr(usual, name):
+                option = f"--{path}.{name}".replace("_", "-")
+                raise InputError(f"{option} has no effect on this method: leave it out.")
+    if config.machine.device_type == "mps":
+        raise InputError("--machine.device-type mps has no sparse gradients, which training needs: use cpu.")

@@ -1,0 +1,434 @@
+"""Captures that cannot be used: ns-train ends with one sentence that names file, frame and remedy (docs/errors.md)."""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+
+import numpy as np
+import pytest
+from forked import run, train
+from PIL import Image
+from tiny_scene import HEIGHT, WIDTH, name_of
+
+NAN, INF = math.nan, math.inf
+NAME = name_of(3)
+
+
+def frame(**changes):
+    """Sets fields of the fourth frame; ... removes one."""
+
+    def change(meta):
+        for key, value in changes.items():
+            if value is ...:
+                del meta["frames"][3][key]
+            else:
+                meta["frames"][3][key] = value
+
+    return change
+
+
+def file(**changes):
+    """Sets fields of the whole file; ... removes one."""
+
+    def change(meta):
+        for key, value in changes.items():
+            if value is ...:
+                del meta[key]
+            else:
+                meta[key] = value
+
+    return change
+
+
+def pose(how):
+    """Changes the fourth pose."""
+
+    def change(meta):
+        matrix = np.array(meta["frames"][3]["transform_matrix"])
+        meta["frames"][3]["transform_matrix"] = np.array(how(matrix)).tolist()
+
+    return change
+
+
+def places(how):
+    """Changes the places of all cameras."""
+
+    def change(meta):
+        for f in meta["frames"]:
+            matrix = np.array(f["transform_matrix"])
+            matrix[:3, 3] = how(matrix[:3, 3])
+            f["transform_matrix"] = matrix.tolist()
+
+    return change
+
+
+def moved(*offset):
+    return lambda place: place + np.array(offset)
+
+
+def rounded(meta):
+    for f in meta["frames"]:
+        f["transform_matrix"] = np.round(f["transform_matrix"], 3).tolist()
+
+
+def set_last_row(matrix):
+    matrix[3] = [0, 0, 1, 1]
+    return matrix
+
+
+def set_place(*place):
+    def how(matrix):
+        matrix[:3, 3] = place
+        return matrix
+
+    return how
+
+
+REFUSED = {
+    # Frames
+    "no pose": (frame(transform_matrix=...), [NAME, "has no transform_matrix", "remove the frame"]),
+    "no file": (frame(file_path=...), ["number 4", "has no file_path"]),
+    "file is a number": (frame(file_path=7), ["file_path", "number 4", "is 7"]),
+    "file is null": (frame(file_path=None), ["file_path", "number 4", "None"]),
+    "file is empty": (frame(file_path=" "), ["file_path", "number 4"]),
+    "file is a list": (frame(file_path=["a.png"]), ["file_path", "number 4"]),
+    "mask is null": (frame(mask_path=None), ["mask_path", "number 4"]),
+    "one mask alone": (frame(mask_path="masks/a.png"), ["has no mask_path and others have one"]),
+    "one depth alone": (frame(depth_file_path="a.png"), ["has no depth_file_path and others have one"]),
+    # Poses
+    "pose with NaN": (pose(lambda m: m * [1, NAN, 1, 1]), [NAME, "4 x 4 matrix of finite numbers"]),
+    "pose with infinity": (pose(set_place(INF, 0, 0)), [NAME, "4 x 4 matrix of finite numbers"]),
+    "pose 2 x 2": (frame(transform_matrix=[[1, 2], [3, 4]]), [NAME, "4 x 4"]),
+    "pose 3 x 4": (pose(lambda m: m[:3]), [NAME, "4 x 4"]),
+    "pose is text": (frame(transform_matrix="none"), [NAME, "4 x 4"]),
+    "pose of texts": (frame(transform_matrix=[["1"] * 4] * 4), [NAME, "4 x 4"]),
+    "pose is null": (frame(transform_matrix=None), [NAME, "4 x 4"]),
+    "pose with a long number": (frame(transform_matrix=[[10**400, 0, 0, 0]] * 4), [NAME, "4 x 4"]),
+    "pose is singular": (pose(lambda m: m * [0, 1, 1, 1]), [NAME, "no rotation and translation"]),
+    "pose is zero": (pose(lambda m: m * 0), [NAME, "no rotation and translation"]),
+    "pose is scaled": (pose(lambda m: m * [2, 2, 2, 1]), [NAME, "no rotation and translation", "2, 2, 2"]),
+    "pose is sheared": (pose(lambda m: m + [[0, 0.3, 0, 0]] * 4), [NAME, "no rotation and translation"]),
+    "pose is mirrored": (pose(lambda m: m * [-1, 1, 1, 1]), [NAME, "mirrored"]),
+    "pose is transposed": (pose(lambda m: m.T), [NAME, "transposed"]),
+    "pose with another last row": (pose(set_last_row), [NAME, "last row"]),
+    # Places
+    "one camera at 1e9": (pose(set_place(1e9, 0, 0)), [NAME, "stands 1e+09 from the others"]),
+    "one camera at 1e5": (pose(set_place(0, 1e5, 0)), [NAME, "from the others"]),
+    "map coordinates": (places(moved(448262, 5411932, 60)), ["float32", "448262", "subtract a common offset"]),
+    "all in one place": (places(lambda p: p * 0 + 3), ["stand in one place", "--auto-scale-poses False"]),
+    # Intrinsics
+    **{f"{k} missing": (file(**{k: ...}), [f"has no {k}"]) for k in ("fl_x", "fl_y", "cx", "cy", "w", "h")},
+    **{f"{k} is null": (file(**{k: None}), [f"{k} of", "None"]) for k in ("fl_x", "fl_y", "cx", "cy", "w", "h")},
+    **{f"{k} is text": (file(**{k: "28"}), [f"{k} of", "'28'"]) for k in ("fl_x", "cy", "w", "h")},
+    **{f"{k} is NaN": (file(**{k: NAN}), [f"{k} of", "nan"]) for k in ("fl_y", "cx", "w", "h")},
+    **{f"{k} is negative": (file(**{k: -28}), [f"{k} of", "-28"]) for k in ("fl_x", "cx", "w", "h")},
+    **{f"{k} is 0": (file(**{k: 0}), [f"{k} of"]) for k in ("fl_x", "fl_y", "w", "h")},
+    "w is not whole": (file(w=32.5), ["w of", "whole pixels"]),
+    "w is huge": (file(w=10**9), ["w of", "65536"]),
+    "focal length 1e12": (file(fl_x=1e12), ["focal length fl_x", "1e+12"]),
+    "focal length 1e-9": (file(fl_y=1e-9), ["focal length fl_y", "1e-09"]),
+    "cx outside the image": (file(cx=960), ["principal point cx", "960", "outside the image of 32"]),
+    "cy outside the image": (file(cy=25), ["principal point cy", "outside the image of 24"]),
+    # Lenses
+    "unknown camera model": (file(camera_model="PINHOLE2"), ["camera_model", "'PINHOLE2'", "OPENCV_FISHEYE"]),
+    "camera model is null": (file(camera_model=None), ["camera_model", "None"]),
+    "k1 is NaN": (file(k1=NAN), ["distortion k1", "nan"]),
+    "k2 is null": (file(k2=None), ["distortion k2", "None"]),
+    "k1 is text": (file(k1="0.1"), ["distortion k1", "'0.1'"]),
+    "p1 is infinite": (file(p1=INF), ["distortion p1", "inf"]),
+    "p2 is huge": (file(p2=1e6), ["distortion p2"]),
+    "k1 is huge": (file(k1=1e6), ["distortion", "cannot be undone"]),
+    "k1 is far below 0": (file(k1=-50), ["distortion", "cannot be undone"]),
+    "k3 is far below 0": (file(k3=-1e5), ["distortion", "cannot be undone"]),
+    "fisheye folds": (file(camera_model="OPENCV_FISHEYE", k1=-9), ["distortion", "cannot be undone"]),
+    "distortion_params of three": (file(distortion_params=[0, 0, 0]), ["distortion_params", "6 numbers"]),
+    "a frame's k1 is NaN": (frame(k1=NAN), ["distortion k1", NAME]),
+    # Fields of the whole file
+    "applied_transform is text": (file(applied_transform="none"), ["applied_transform", "3 rows of 4"]),
+    "applied_transform 2 x 2": (file(applied_transform=[[1, 0], [0, 1]]), ["applied_transform", "3 rows of 4"]),
+    "applied_transform with NaN": (file(applied_transform=[[NAN] * 4] * 3), ["applied_transform", "Row 1"]),
+    "applied_transform 4 x 4": (file(applied_transform=np.eye(4).tolist()), ["applied_transform", "3 rows of 4"]),
+    "applied_transform is zero": (file(applied_transform=[[0] * 4] * 3), ["applied_transform", "singular"]),
+    "applied_scale is text": (file(applied_scale="2"), ["applied_scale", "'2'"]),
+    "applied_scale is 0": (file(applied_scale=0), ["applied_scale", "above 0"]),
+    "orientation is unknown": (file(orientation_override="left"), ["orientation_override", "'left'"]),
+    # Splits
+    "train list with a stranger": (lambda m: m["train_filenames"].append("images/no.png"), ["no.png", "no frame"]),
+    "val list is no list": (file(val_filenames="images/a.png"), ["val_filenames", "unusable"]),
+    "train list of numbers": (file(train_filenames=[1, 2]), ["train_filenames", "unusable"]),
+    "train list is empty": (file(train_filenames=[]), ["train_filenames"]),
+    "val list is missing": (file(val_filenames=...), ["no list val_filenames"]),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_a_capture_that_cannot_be_used_is_refused(data, edit, tmp_path, case):
+    change, words = REFUSED[case]
+    edit(change)
+    said = train(data, tmp_path).sentence
+    assert str(data / "transforms.json") in said
+    assert all(word in said for word in words), said
+
+
+TEXTS = {
+    "empty": "", "cut short": '{"frames": [', "a list": "[1, 2]", "no frames": "{}", "frames empty": '{"frames": []}',
+    "frames of numbers": '{"frames": [3]}', "frames null": '{"frames": null}', "deep": "[" * 100_000,
+    "a long number": '{"frames": ' + "1" * 5000 + "}",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", TEXTS)
+def test_transforms_that_hold_no_frames_are_refused(data, tmp_path, case):
+    (data / "transforms.json").write_text(TEXTS[case])
+    assert str(data / "transforms.json") in train(data, tmp_path).sentence
+
+
+def test_transforms_in_latin_1_are_refused(data, tmp_path):
+    (data / "transforms.json").write_bytes('{"frames": "Straße"}'.encode("latin-1"))
+    assert "cannot be read as JSON" in train(data, tmp_path).sentence
+
+
+def test_a_folder_without_transforms_is_named_with_what_to_do(tmp_path):
+    said = train(tmp_path / "nowhere", tmp_path).sentence
+    assert "There is no" in said and "mmpi-prepare" in said and "colmap" in said
+
+
+RUNS = {
+    "tiny coordinates": places(lambda p: p * 1e-9),
+    "large coordinates": places(lambda p: p * 1e6),
+    "some way off": places(moved(100, -50, 3)),
+    "no camera model": file(camera_model=...),
+    "pixels as 32.0": file(w=32.0, h=24.0),
+    "poses rounded to three digits": rounded,
+    "a mild lens": file(k1=-0.1, k2=0.02, p1=1e-3),
+    "a fisheye": file(camera_model="OPENCV_FISHEYE", k1=0.01),
+    "an unknown field": file(aabb_scale=16),
+    "no applied_transform": file(applied_transform=...),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", RUNS)
+def test_a_capture_that_is_odd_and_usable_trains(data, edit, tmp_path, case):
+    edit(RUNS[case])
+    assert "Training Finished" in train(data, tmp_path).shown
+
+
+def test_images_outside_the_folder_are_allowed_and_said_once(data, edit, tmp_path):
+    (data / "images").rename(tmp_path / "elsewhere")
+
+    def move(meta):
+        text = json.dumps(meta).replace("images/", "../elsewhere/")
+        meta.update(json.loads(text))
+
+    edit(move)
+    assert train(data, tmp_path).shown.count("lie outside its folder") == 1
+
+
+# Images --------------------------------------------------------------------------------------------------------------
+
+
+def save(data, i, pixels, **how):
+    Image.fromarray(pixels, **how).save(data / "images" / name_of(i))
+
+
+def smooth(channels):
+    return np.broadcast_to(np.linspace(0, 255, WIDTH)[None, :, None], (HEIGHT, WIDTH, channels)).astype(np.uint8)
+
+
+def one_rgba(data):
+    save(data, 3, smooth(4))
+
+
+def one_gray(data):
+    save(data, 3, smooth(1)[..., 0])
+
+
+def one_palette(data):
+    Image.fromarray(smooth(3)).convert("P").save(data / "images" / name_of(3))
+
+
+def one_cmyk(data):
+    path = data / "images" / name_of(3)
+    Image.fromarray(smooth(4), mode="CMYK").save(path.with_suffix(".jpg"))
+    path.with_suffix(".jpg").rename(path)
+
+
+def sixteen_bits(data):
+    save(data, 3, np.full((HEIGHT, WIDTH), 40_000, np.uint16))
+
+
+@pytest.mark.parametrize("odd", [one_rgba, one_gray, one_palette, one_cmyk, sixteen_bits])
+def test_images_of_other_kinds_among_rgb_train(data, tmp_path, odd):
+    odd(data)
+    assert "Training Finished" in train(data, tmp_path).shown
+
+
+def test_16_bit_pixels_become_the_nearest_of_8_bits(data):
+    from training_runs import datamanager
+
+    sixteen_bits(data)
+    image = datamanager(data, test_mode="inference").train_dataset.get_data(2, image_type="uint8")["image"]
+    assert image.shape == (HEIGHT, WIDTH, 3) and (image == 40_000 // 257).all()
+
+
+def float_image(path):
+    Image.fromarray(np.zeros((HEIGHT, WIDTH), np.float32)).save(path, format="TIFF")
+
+
+DAMAGED = {
+    "missing": lambda p: p.unlink(),
+    "cut short": lambda p: p.write_bytes(p.read_bytes()[:300]),
+    "empty": lambda p: p.write_bytes(b""),
+    "no image": lambda p: p.write_bytes(b"hello"),
+    "a folder": lambda p: (p.unlink(), p.mkdir()),
+    "of floats": float_image,
+}
+
+
+@pytest.mark.parametrize("case", DAMAGED)
+@pytest.mark.parametrize("i", [3, 5])
+def test_an_image_that_cannot_be_read_is_named(data, tmp_path, case, i):
+    DAMAGED[case](data / "images" / name_of(i))
+    said = train(data, tmp_path).sentence
+    assert name_of(i) in said and "cannot be read" in said and "remove its frame" in said
+
+
+def test_an_image_of_another_size_is_named(data, tmp_path):
+    save(data, 3, np.zeros((HEIGHT, WIDTH + 2, 3), np.uint8))
+    assert f"{WIDTH + 2} x {HEIGHT} pixels and its camera {WIDTH} x {HEIGHT}" in train(data, tmp_path).sentence
+
+
+@pytest.mark.parametrize("kind", ["missing", "colours"])
+def test_a_depth_image_that_cannot_be_used_is_named(data, edit, tmp_path, kind):
+    (data / "depths").mkdir()
+    for i in range(8):
+        Image.fromarray(np.full((HEIGHT, WIDTH), 4000, np.uint16)).save(data / "depths" / name_of(i))
+    edit(lambda meta: [f.update(depth_file_path=f["file_path"].replace("images", "depths")) for f in meta["frames"]])
+    path = data / "depths" / name_of(3)
+    path.unlink()
+    if kind == "colours":
+        Image.fromarray(smooth(3)).save(path)
+    assert f"Depth image {path}" in train(data, tmp_path).sentence
+
+
+@pytest.mark.parametrize("factor", [8, 0, -2])
+def test_downscaling_without_copies_says_which_there_are(data, tmp_path, factor):
+    (data / "images_2").mkdir()
+    said = train(data, tmp_path, pipeline__datamanager__dataparser__downscale_factor=factor).sentence
+    assert "--downscale-factor" in said and (factor < 1 or "images_2" in said)
+
+
+# COLMAP models -------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def model(data):
+    """The scene's COLMAP model in the binary format."""
+    from mmpi_ns.capture.sfm import load_pycolmap
+
+    folder = data / "colmap/sparse/0"
+    load_pycolmap().Reconstruction(str(folder)).write_binary(str(folder))
+    for path in folder.glob("*.txt"):
+        path.unlink()
+    return folder
+
+
+def cut(name, share):
+    def change(folder):
+        whole = (folder / name).read_bytes()
+        (folder / name).write_bytes(whole[: int(len(whole) * share)])
+
+    return change
+
+
+def first_number(name, number):
+    def change(folder):
+        whole = (folder / name).read_bytes()
+        (folder / name).write_bytes(struct.pack("<Q", number) + whole[8:])
+
+    return change
+
+
+def overwrite(name, at, form, value):
+    def change(folder):
+        whole = bytearray((folder / name).read_bytes())
+        struct.pack_into(form, whole, at, value)
+        (folder / name).write_bytes(whole)
+
+    return change
+
+
+MODELS = {
+    "points cut short": cut("points3D.bin", 0.6),
+    "points of 20 bytes": cut("points3D.bin", 0.006),
+    "points empty": cut("points3D.bin", 0),
+    "images cut short": cut("images.bin", 0.6),
+    "images cut within a name": cut("images.bin", 0.012),
+    "images empty": cut("images.bin", 0),
+    "cameras cut short": cut("cameras.bin", 0.6),
+    "cameras empty": cut("cameras.bin", 0),
+    "too many points": first_number("points3D.bin", 10**12),
+    "too many images": first_number("images.bin", 2**63),
+    "fewer points than there are": first_number("points3D.bin", 3),
+    "a camera of no model": overwrite("cameras.bin", 12, "<i", 77),
+    "an image of no camera": overwrite("images.bin", 8 + 4 + 56, "<I", 9),
+}
+
+
+def test_a_whole_binary_model_trains(data, model, tmp_path):
+    said = train(data, tmp_path).shown
+    assert "Training Finished" in said and "No SfM tracks" not in said
+
+
+@pytest.mark.parametrize("case", MODELS)
+def test_a_damaged_colmap_model_is_named(data, model, tmp_path, case):
+    MODELS[case](model)
+    said = train(data, tmp_path, memory=2 << 30).sentence
+    assert f"The COLMAP model in {model} cannot be read" in said and "repair or remove it" in said
+
+
+@pytest.mark.parametrize("name", ["images.txt", "points3D.txt", "cameras.txt"])
+def test_a_colmap_model_of_text_that_was_cut_short_is_named(data, tmp_path, name):
+    cut(name, 0.4)(data / "colmap/sparse/0")
+    assert "The COLMAP model in" in train(data, tmp_path, memory=2 << 30).sentence
+
+
+# mmpi-plan -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_folder_that_is_no_scene_is_one_sentence(tmp_path):
+    (tmp_path / "data").mkdir()
+    said = run("mmpi-plan", tmp_path / "data", "--output", tmp_path / "plan").sentence
+    assert "neither a transforms.json nor a COLMAP model" in said
+
+
+def test_cameras_of_other_parsers_are_named(whole_scene):
+    from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+
+    from mmpi_ns.capture.observe import read_observations
+    from mmpi_ns.utils.errors import InputError
+
+    parser = NerfstudioDataParserConfig(data=whole_scene, downscale_factor=1).setup()
+    outputs = parser.get_dataparser_outputs("train")
+    outputs.cameras.fx[2] = -1.0
+    with pytest.raises(InputError, match=rf"The camera of .*{NAME}.* focal length"):
+        read_observations(outputs, outputs.cameras, None)
+
+
+JUDGED = ("pose is singular", "k1 is huge", "map coordinates", "val list is missing", "w is text")
+
+
+@pytest.mark.parametrize("case", JUDGED)
+def test_mmpi_plan_refuses_what_ns_train_refuses(data, edit, tmp_path, case):
+    change, words = REFUSED[case]
+    edit(change)
+    said = run("mmpi-plan", data, "--output", tmp_path / "plan").sentence
+    assert all(word in said for word in words), said
+
+
+@pytest.mark.parametrize("i", [3, 5])
+def test_mmpi_plan_reads_the_images_as_ns_train_does(data, tmp_path, i):
+    DAMAGED["cut short"](data / "images" / name_of(i))
+    assert name_of(i) in run("mmpi-plan", data, "--output", tmp_path / "plan").sentence

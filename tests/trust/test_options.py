@@ -1,0 +1,116 @@
+"""Options that cannot be used, or would be ignored, are named before anything is written (docs/errors.md)."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from forked import run, train
+
+NAN, INF = math.nan, math.inf
+P, M, D = "pipeline__model__placement__", "pipeline__model__", "pipeline__datamanager__"
+
+REFUSED = {
+    "max_num_iterations": [0, -1],
+    "steps_per_save": [-1],
+    D + "train_num_rays_per_batch": [0, -4],
+    D + "eval_num_rays_per_batch": [0],
+    D + "keypoint_rays": [-1],
+    D + "resident_pixels": [NAN, -1],
+    D + "camera_res_scale_factor": [0.0, NAN],
+    P + "texel_pixels": [NAN, 0.0, -1.0, INF],
+    P + "plane_pixels": [NAN, -1.0],
+    P + "max_mpis": [0, -1],
+    P + "max_planes": [0, 1, 10**6],
+    P + "max_texels": [NAN, -1],
+    P + "min_gain": [NAN],
+    P + "planes": [1],
+    P + "height": [0],
+    P + "width": [-5],
+    P + "max_voxels": [-1],
+    P + "window_length": [-1.0, NAN],
+    P + "faces": [(), ("up",)],
+    M + "feature_channels": [0],
+    M + "hidden_width": [0, -1],
+    M + "cube_alpha": [0.0, 2.0],
+    M + "train_threshold": [-1.0, NAN],
+    M + "render_threshold": [NAN],
+    M + "resident_gib": [-1.0],
+    M + "growth_shares": [(0.5, 2.0)],
+    M + "decay_decades": [NAN],
+    M + "loss__distortion": [NAN, -1.0],
+    "machine__device_type": ["mps"],
+}
+IGNORED = {
+    D + "patch_size": 4,
+    D + "train_num_images_to_sample_from": 5,
+    D + "train_num_times_to_repeat_images": 5,
+    D + "eval_num_images_to_sample_from": 5,
+    D + "eval_image_indices": (1,),
+    D + "images_on_gpu": True,
+    M + "enable_collider": True,
+    M + "prompt": "a street",
+}
+
+
+def option_of(name):
+    return "--" + name.replace("__", ".").replace("_", "-")
+
+
+@pytest.mark.parametrize(("name", "value"), [(n, v) for n, values in REFUSED.items() for v in values])
+def test_an_option_out_of_range_is_named(whole_scene, tmp_path, name, value):
+    assert option_of(name) in train(whole_scene, tmp_path / "out", **{name: value}).sentence
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("name", IGNORED)
+def test_an_option_that_would_be_ignored_is_refused(whole_scene, tmp_path, name):
+    said = train(whole_scene, tmp_path / "out", **{name: IGNORED[name]}).sentence
+    assert option_of(name) in said and "no effect" in said
+
+
+def test_shares_that_leave_nothing_for_the_first_phase_are_refused(whole_scene, tmp_path):
+    shares = {M + "blend_share": 0.6, M + "finetune_share": 0.4}
+    said = train(whole_scene, tmp_path, **shares, pipeline__model__training="two-phase").sentence
+    assert "blend-share" in said and "first phase" in said
+
+
+def test_clipping_is_refused_on_the_command_line(whole_scene, tmp_path):
+    words = ("--optimizers.density.optimizer.max-norm", "1.0", "--machine.device-type", "cpu")
+    ended = run("ns-train", "mmpi-small", "--data", whole_scene, "--output-dir", tmp_path, *words)
+    assert "--optimizers.density.optimizer.max-norm" in ended.sentence
+
+
+@pytest.mark.parametrize(("name", "value"), [("texel-pixels", "nan"), ("max-mpis", "0"), ("max-planes", "1")])
+def test_mmpi_plan_refuses_the_same_options(whole_scene, tmp_path, name, value):
+    ended = run("mmpi-plan", whole_scene, "--output", tmp_path / "o", f"--placement.{name}", value)
+    assert f"--placement.{name}" in ended.sentence
+
+
+def test_seeds_of_the_machine_are_those_of_our_draws(whole_scene, tmp_path):
+    import torch
+
+    for name, seed in (("a", 1), ("b", 2), ("c", 1)):
+        assert train(whole_scene, tmp_path, timestamp=name, machine__seed=seed).status == 0
+    a, b, c = (
+        torch.load(tmp_path / "tiny/mmpi-small" / n / "nerfstudio_models/step-000000002.ckpt", weights_only=True)
+        for n in "abc"
+    )
+    key = "_model.field.features"
+    assert torch.equal(a["pipeline"][key], c["pipeline"][key])
+    assert not torch.equal(a["pipeline"][key], b["pipeline"][key])
+
+
+def test_the_viewer_listens_on_this_machine_alone():
+    from mmpi_ns import config
+
+    for name in ("mmpi", "mmpi_small", "mmpi_kitti", "mmpi_scannet", "mmpi_scannet_short"):
+        assert getattr(config, name).config.viewer.websocket_host == "127.0.0.1"
+
+
+def test_the_papers_settings_have_one_window_and_keep_their_bricks():
+    from mmpi_ns import config
+
+    for name in ("mmpi_kitti", "mmpi_scannet", "mmpi_scannet_short"):
+        model = getattr(config, name).config.pipeline.model
+        assert model.placement.window_length == 0 and model.release_weight == 0

@@ -1,0 +1,260 @@
+"""Runs that are stopped, resumed and shared: nothing is lost or mixed up, and one sentence says so (docs/errors.md)."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+
+import pytest
+import torch
+import yaml
+from forked import run, start_train, train
+from tiny_scene import write_scene
+
+LONG = {"max_num_iterations": 100_000, "steps_per_save": 100_000}
+
+
+def folder_of(output, timestamp="run"):
+    return output / "tiny/mmpi-small" / timestamp
+
+
+@pytest.fixture(scope="module")
+def trained(whole_scene, tmp_path_factory):
+    """The folder of a finished run, never changed."""
+    output = tmp_path_factory.mktemp("trained")
+    assert train(whole_scene, output, max_num_iterations=6).status == 0
+    return folder_of(output)
+
+
+@pytest.fixture
+def finished(trained, tmp_path):
+    """A copy of a finished run that may be damaged; its config.yml names the copy."""
+    copy = shutil.copytree(trained, tmp_path / "tiny/mmpi-small/run")
+    config = yaml.load((copy / "config.yml").read_text(), Loader=yaml.Loader)
+    config.output_dir, config.pipeline.model.windows_folder = tmp_path, copy / "windows"
+    (copy / "config.yml").write_text(yaml.dump(config))
+    return copy
+
+
+def evaluate(folder, tmp_path):
+    return run("ns-eval", "--load-config", folder / "config.yml", "--output-path", tmp_path / "eval.json")
+
+
+# Stopping ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_run_that_is_stopped_saves_and_says_how_to_go_on(whole_scene, tmp_path, number, status):
+    running = start_train(whole_scene, tmp_path, **LONG)
+    running.wait_for("(0.0")
+    running.send(number)
+    ended = running.end()
+    assert ended.status == status and "Traceback" not in ended.out + ended.error
+    (last,) = ended.error.strip().splitlines()
+    (checkpoint,) = (folder_of(tmp_path) / "nerfstudio_models").iterdir()
+    assert str(checkpoint) in last and f"--load-dir {checkpoint.parent}" in last and last.endswith(".")
+    step = torch.load(checkpoint, weights_only=True)["step"]
+    assert checkpoint.name == f"step-{step:09d}.ckpt" and f"step {step + 1} of" in last
+
+
+def test_a_run_that_is_stopped_before_it_trains_says_so(whole_scene, tmp_path):
+    running = start_train(whole_scene, tmp_path, **LONG)
+    running.wait_for("Setting up training dataset")
+    running.send(signal.SIGINT)
+    ended = running.end()
+    assert ended.status == 130 and "Traceback" not in ended.out + ended.error
+    assert ended.error.strip().splitlines()[-1].startswith("Stopped")
+
+
+def test_a_stopped_run_goes_on_in_its_folder(whole_scene, tmp_path):
+    running = start_train(whole_scene, tmp_path, **LONG)
+    running.wait_for("(0.0")
+    running.send(signal.SIGINT)
+    assert running.end().status == 130
+    models = folder_of(tmp_path) / "nerfstudio_models"
+    (checkpoint,) = models.iterdir()
+    step = torch.load(checkpoint, weights_only=True)["step"]
+    again = start_train(whole_scene, tmp_path, **LONG, load_dir=models)
+    again.wait_for("Done loading")
+    again.wait_for("(0.0")
+    again.send(signal.SIGINT)
+    assert again.end().status == 130
+    (checkpoint,) = models.iterdir()
+    assert torch.load(checkpoint, weights_only=True)["step"] > step
+
+
+# Folders -------------------------------------------------------------------------------------------------------------
+
+
+def test_a_second_run_into_the_same_folder_is_refused(whole_scene, tmp_path):
+    first = start_train(whole_scene, tmp_path, **LONG)
+    first.wait_for("Saving config to")
+    said = train(whole_scene, tmp_path, **LONG).sentence
+    first.send(signal.SIGKILL)
+    first.process.join()
+    assert "Another run is writing into" in said and "--timestamp" in said
+    assert train(whole_scene, tmp_path).status == 0  # the killed one keeps nobody out
+
+
+def test_a_new_run_into_the_folder_of_an_old_one_is_refused(whole_scene, finished, tmp_path):
+    before = {p: p.read_bytes() for p in finished.rglob("*") if p.is_file()}
+    said = train(whole_scene, tmp_path).sentence
+    assert "holds checkpoints of an earlier run" in said and "--load-dir" in said
+    assert before == {p: p.read_bytes() for p in finished.rglob("*") if p.is_file() and p.name != ".lock"} | {
+        p: data for p, data in before.items() if p.name == ".lock"
+    }
+
+
+def test_what_a_killed_run_left_half_written_is_cleared_away(whole_scene, tmp_path):
+    folder = folder_of(tmp_path)
+    (folder / "windows").mkdir(parents=True)
+    left = [folder / ".step-000000001.ckpt.77.tmp", folder / "windows" / ".window-00000.pt.77.tmp"]
+    for path in left:
+        path.write_bytes(b"half")
+    assert train(whole_scene, tmp_path).status == 0
+    assert not any(path.exists() for path in left)
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
+def test_a_read_only_folder_is_named(whole_scene, tmp_path):
+    tmp_path.chmod(0o555)
+    assert "cannot be written" in train(whole_scene, tmp_path).sentence
+
+
+def test_an_output_folder_that_is_a_file_is_named(whole_scene, tmp_path):
+    (tmp_path / "out").write_text("")
+    said = train(whole_scene, tmp_path / "out").sentence
+    assert "cannot be written" in said and "--output-dir" in said
+
+
+# Resuming ------------------------------------------------------------------------------------------------------------
+
+
+def test_another_capture_with_the_old_plan_is_refused(whole_scene, trained, tmp_path):
+    other = write_scene(tmp_path / "other")
+    meta = json.loads((other / "transforms.json").read_text())
+    meta["frames"][0]["transform_matrix"][0][3] -= 0.2
+    (other / "transforms.json").write_text(json.dumps(meta))
+    said = train(
+        other, tmp_path, load_dir=trained / "nerfstudio_models", pipeline__model__plan_file=trained / "plan.json"
+    ).sentence
+    assert str(whole_scene) in said and str(other) in said and "another capture" in said
+
+
+def test_the_same_capture_in_another_folder_goes_on(whole_scene, trained, tmp_path):
+    moved = shutil.copytree(whole_scene, tmp_path / "moved")
+    said = train(moved, tmp_path, load_dir=trained / "nerfstudio_models", max_num_iterations=6).shown
+    assert "nothing to do" in said
+
+
+def test_another_plan_is_refused_and_what_differs_is_named(whole_scene, trained, tmp_path):
+    plan = json.loads((trained / "plan.json").read_text())
+    plan["mpis"][0]["planes"] += 3
+    (tmp_path / "plan.json").write_text(json.dumps(plan))
+    said = train(
+        whole_scene, tmp_path, load_dir=trained / "nerfstudio_models", pipeline__model__plan_file=tmp_path / "plan.json"
+    ).sentence
+    assert "another scene plan" in said and "'planes'" in said and plan["mpis"][0]["name"] in said
+
+
+DAMAGED = {
+    "cut short": lambda p: p.write_bytes(p.read_bytes()[:-500]),
+    "halved": lambda p: p.write_bytes(p.read_bytes()[: p.stat().st_size // 2]),
+    "empty": lambda p: p.write_bytes(b""),
+    "text": lambda p: p.write_text("hello"),
+    "another method's": lambda p: torch.save({"step": 5, "pipeline": {}, "optimizers": {}}, p),
+    "a list": lambda p: torch.save([1, 2], p),
+}
+
+
+@pytest.mark.parametrize("case", DAMAGED)
+def test_a_damaged_checkpoint_is_named_when_resuming(whole_scene, finished, tmp_path, case):
+    path = finished / "nerfstudio_models" / "step-000000005.ckpt"
+    DAMAGED[case](path)
+    assert str(path) in train(whole_scene, tmp_path / "new", load_dir=path.parent).sentence
+
+
+@pytest.mark.parametrize("case", DAMAGED)
+def test_a_damaged_checkpoint_is_named_when_evaluating(finished, tmp_path, case):
+    path = finished / "nerfstudio_models" / "step-000000005.ckpt"
+    DAMAGED[case](path)
+    assert str(path) in evaluate(finished, tmp_path).sentence
+
+
+def test_no_checkpoint_is_said(whole_scene, finished, tmp_path):
+    (finished / "nerfstudio_models" / "step-000000005.ckpt").unlink()
+    assert "There is no checkpoint in" in evaluate(finished, tmp_path).sentence
+    assert "There is no checkpoint in" in train(whole_scene, tmp_path / "n", load_dir=finished).sentence
+
+
+def test_a_step_that_is_not_there_is_said(whole_scene, trained, tmp_path):
+    said = train(whole_scene, tmp_path, load_dir=trained / "nerfstudio_models", load_step=3).sentence
+    assert "There is no step 3" in said and "[5]" in said
+
+
+STRAY = ("notes.txt", "step-9.ckpt.bak", ".DS_Store", "step-x.ckpt", "a folder")
+
+
+@pytest.fixture
+def littered(finished):
+    for name in STRAY:
+        path = finished / "nerfstudio_models" / name
+        path.mkdir() if name == "a folder" else path.write_text("hello")
+    return finished
+
+
+def test_stray_files_among_checkpoints_are_passed_over(whole_scene, littered, tmp_path):
+    evaluated = evaluate(littered, tmp_path)
+    assert json.loads((tmp_path / "eval.json").read_text())["checkpoint"].endswith("step-000000005.ckpt"), evaluated
+    said = train(whole_scene, tmp_path / "new", load_dir=littered / "nerfstudio_models", max_num_iterations=6).shown
+    assert "nothing to do" in said
+
+
+def test_a_run_that_was_resumed_from_a_step_can_be_evaluated(whole_scene, trained, tmp_path):
+    models = trained / "nerfstudio_models"
+    assert train(whole_scene, tmp_path, max_num_iterations=8, load_dir=models, load_step=5).status == 0
+    assert evaluate(folder_of(tmp_path), tmp_path).status == 0
+    assert json.loads((tmp_path / "eval.json").read_text())["checkpoint"].endswith("step-000000007.ckpt")
+
+
+def test_a_plan_that_was_edited_in_the_folder_of_a_run_is_not_replaced(whole_scene, finished, tmp_path):
+    path = finished / "plan.json"
+    plan = json.loads(path.read_text())
+    plan["mpis"][0]["name"] = "moved by hand"
+    path.write_text(json.dumps(plan))
+    said = train(whole_scene, tmp_path, load_dir=finished / "nerfstudio_models", max_num_iterations=9).sentence
+    assert str(path) in said and "--pipeline.model.plan-file" in said
+    assert json.loads(path.read_text()) == plan
+
+
+# Evaluating ----------------------------------------------------------------------------------------------------------
+
+
+def test_evaluation_takes_the_plan_from_the_checkpoint_and_places_nothing(finished, tmp_path):
+    ended = evaluate(finished, tmp_path)
+    assert ended.status == 0 and "Triangulated" not in ended.out and "SfM" not in ended.out
+    assert json.loads((tmp_path / "eval.json").read_text())["results"]["psnr"] > 5
+
+
+def test_evaluation_of_a_capture_that_has_gone_is_one_sentence(whole_scene, tmp_path):
+    data = shutil.copytree(whole_scene, tmp_path / "gone")
+    assert train(data, tmp_path).status == 0
+    shutil.rmtree(data)
+    assert "There is no" in evaluate(folder_of(tmp_path), tmp_path).sentence
+
+
+def test_a_run_shows_no_warning_that_users_can_do_nothing_about(whole_scene, tmp_path):
+    ended = train(whole_scene, tmp_path)
+    assert ended.status == 0 and not ended.error.strip(), ended.error
+
+
+def test_a_traceback_is_shown_on_request(tmp_path):
+    ended = start_train(tmp_path / "no", tmp_path, environment={"MMPI_TRACEBACK": "1"}).end()
+    assert ended.status == 1 and "Traceback" in ended.error and "InputError: There is no" in ended.error
+
+
+def test_a_checkpoint_file_that_is_not_there_is_said(whole_scene, tmp_path):
+    said = train(whole_scene, tmp_path, load_checkpoint=tmp_path / "no.ckpt").sentence
+    assert "There is no checkpoint at" in said and "--load-checkpoint" in said
