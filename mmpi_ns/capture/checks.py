@@ -18,7 +18,7 @@ from PIL import Image
 
 from mmpi_ns.capture.lenses import check_lenses
 from mmpi_ns.utils.errors import InputError, brief
-from mmpi_ns.utils.values import Number, check_number, check_row, shown
+from mmpi_ns.utils.values import Number, check_number, check_row, cut, shown
 
 SAME_PLACE = 1e-6
 """Cameras nearer to each other than this share of their distance from the origin stand in one place, in float32."""
@@ -65,7 +65,7 @@ def check_transforms(parser: NerfstudioDataParserConfig, data: Path, splits: Seq
     _check_places(poses[:, :3, 3], names, path, auto_scale=parser.auto_scale_poses)
     outside = [n for n in names if not (path.parent / n).resolve().is_relative_to(path.parent.resolve())]
     if outside:
-        CONSOLE.print(f"{len(outside)} image(s) of {path} lie outside its folder, for example {outside[0]}.")
+        CONSOLE.print(f"{len(outside)} image(s) of {path} lie outside its folder, for example {cut(outside[0])}.")
 
 
 def in_one_place(centers: NDArray[np.float64], share: float = SAME_PLACE) -> bool:
@@ -92,7 +92,7 @@ def _read(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
 def _check_paths(frame: Mapping[str, Any], index: int, path: Path) -> None:
     for key in ("file_path", "transform_matrix"):
         if key not in frame:
-            name = frame.get("file_path", f"number {index + 1}")
+            name = cut(str(frame.get("file_path", f"number {index + 1}")))
             raise InputError(f"Frame {name} of {path} has no {key}: add it or remove the frame.")
     for key in ("file_path", "mask_path", "depth_file_path"):
         value = frame.get(key, "given")
@@ -104,7 +104,7 @@ def _check_paths(frame: Mapping[str, Any], index: int, path: Path) -> None:
 
 def _pose(frame: Mapping[str, Any], path: Path) -> NDArray[np.float64]:
     """The 4 x 4 matrix of a frame: a rotation and a translation."""
-    name, rows = frame["file_path"], frame["transform_matrix"]
+    name, rows = cut(frame["file_path"]), frame["transform_matrix"]
     number = Number(-1e18, 1e18)
     is_matrix = isinstance(rows, list) and len(rows) == 4 and all(isinstance(r, list) and len(r) == 4 for r in rows)
     if not is_matrix or not all(number.holds(x) for row in rows for x in row):
@@ -152,7 +152,7 @@ def _check_same_for_all(frames: Frames, path: Path) -> None:
     for key in ("mask_path", "depth_file_path"):
         having = [key in frame for frame in frames]
         if any(having) and not all(having):
-            name = frames[having.index(False)]["file_path"]
+            name = cut(frames[having.index(False)]["file_path"])
             raise InputError(f"Frame {name} of {path} has no {key} and others have one: give all frames one, or none.")
 
 
@@ -219,7 +219,7 @@ def _check_places(centers: NDArray[np.float64], names: Sequence[str], path: Path
     usual = off[order[max(min(most, len(off) - 2), 0)]]
     if usual > 0 and off[order[-1]] > FAR_OFF * usual:
         raise InputError(
-            f"The camera of frame {names[order[-1]]} of {path} stands {off[order[-1]]:.3g} from the others, which lie "
+            f"The camera of frame {cut(names[order[-1]])} of {path} stands {off[order[-1]]:.3g} from the others, which lie "
             f"within {usual:.3g}: correct its transform_matrix or remove the frame."
         )
     extent = float(np.ptp(centers, axis=0).max())

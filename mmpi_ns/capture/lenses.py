@@ -11,7 +11,7 @@ import numpy as np
 from nerfstudio.cameras.cameras import CAMERA_MODEL_TO_TYPE, CameraType
 
 from mmpi_ns.utils.errors import InputError
-from mmpi_ns.utils.values import Number, check_number, check_row, shown
+from mmpi_ns.utils.values import Number, check_number, check_row, cut, shown
 
 POSITIVE = Number(0, above=True)
 SIDE = Number(1, 65536)
@@ -37,7 +37,7 @@ def check_lenses(meta: Mapping[str, Any], frames: Sequence[Mapping[str, Any]], p
     for key in CAMERA:
         lacking = next((f for f in frames if key not in f), None) if key not in meta else None
         if lacking is not None:
-            raise InputError(f"{path} has no {key}, neither for all frames nor in {lacking['file_path']}: add it.")
+            raise InputError(f"{path} has no {key}, neither for all frames nor in {cut(lacking['file_path'])}: add it.")
     # One coefficient for all frames, and nerfstudio reads none of the frames' own.
     own_lens = not set(meta) & {"k1", "k2", "k3", *TANGENTIAL, "distortion_params"}
     seen: set[tuple] = set()
@@ -49,7 +49,7 @@ def check_lenses(meta: Mapping[str, Any], frames: Sequence[Mapping[str, Any]], p
         key = (repr(camera), repr(lens), repr(params))
         if key not in seen:
             seen.add(key)
-            where = path if set(meta) >= set(CAMERA) and not own_lens else f"{frame['file_path']} in {path}"
+            where = path if set(meta) >= set(CAMERA) and not own_lens else f"{cut(frame['file_path'])} in {path}"
             _check_camera(camera, CAMERA_MODEL_TO_TYPE[model], str(where))
             _check_distortion(camera, lens, params, CAMERA_MODEL_TO_TYPE[model], str(where))
 

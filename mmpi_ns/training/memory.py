@@ -14,8 +14,6 @@ from mmpi_ns.utils.errors import InputError
 from mmpi_ns.utils.machine import free_memory
 
 GIB = 2**30
-TILE_BYTES = 8
-"""Of every tile, stored or not, while it is found out which ones training rays can reach."""
 
 
 def check_memory(
@@ -38,8 +36,7 @@ def check_memory(
     """
     free = free_memory(device)
     for plan, seen in zip(windows.plans, views, strict=True):
-        # Which tiles can be reached takes memory to find out as well.
-        needed = TILE_BYTES * count_tiles(plan)
+        needed = _bytes_to_look(plan, seen)
         if needed <= free:
             needed = training_bytes(plan, seen, feature_channels, two_phase)
         if needed > free:
@@ -48,6 +45,14 @@ def check_memory(
                 f"training and {free / GIB:.1f} GiB are free: give fewer texels, in the plan or with "
                 "--pipeline.model.placement.max-texels."
             )
+
+
+def _bytes_to_look(plan: ScenePlan, views: TrainingViews | None) -> int:
+    """Bytes that it takes to find out which tiles training rays can reach: marks, and 4 planes of every image's sides
+    at the tiles of one plane (``visible_tiles``)."""
+    cameras = 0 if views is None else len(views.origins)
+    largest = max(-(-height // SIDE) * -(-width // SIDE) for _, height, width in head_shapes(plan))
+    return 8 * count_tiles(plan) + 4 * 8 * 3 * cameras * largest
 
 
 def count_tiles(plan: ScenePlan) -> int:

@@ -64,7 +64,8 @@ def check_run(config: TrainerConfig) -> None:
     check_options(config, RUN, "--")
     check_options(manager, PIXELS, "--pipeline.datamanager.")
     check_options(model, MODEL, "--pipeline.model.")
-    check_options(model.loss, {f.name: NOT_NEGATIVE for f in fields(model.loss)}, "--pipeline.model.loss.")
+    weights = {f.name: NOT_NEGATIVE for f in fields(model.loss)} | {"tv_every": Number(1, whole=True)}
+    check_options(model.loss, weights, "--pipeline.model.loss.")
     if model.training == "two-phase" and model.blend_share + model.finetune_share >= 1:
         raise InputError(
             "--pipeline.model.blend-share and finetune-share leave no steps for the first phase: give less than 1."

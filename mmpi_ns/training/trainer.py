@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -296,12 +297,16 @@ class MMPITrainer(Trainer):
 
 def _write_plan(path: Path, plan: WindowedPlan) -> None:
     """Writes a run's plan for its user to read; one that the user has edited stays."""
-    if path.is_file() and path.read_text(encoding="utf-8", errors="replace") != plan.to_json():
+    text, told = plan.to_json(), path.with_name(f".{path.name}.sha256")
+    there = path.read_bytes() if path.is_file() else text.encode()
+    written = told.read_text(encoding="ascii") if told.is_file() else ""
+    if there != text.encode() and hashlib.sha256(there).hexdigest() != written:
         raise InputError(
             f"{path} is not the plan of this run and was edited, it seems: give it with --pipeline.model.plan-file in "
             "another --timestamp, or remove it."
         )
-    write_atomically(path, lambda unfinished: unfinished.write_text(plan.to_json(), encoding="utf-8"))
+    write_atomically(path, lambda unfinished: unfinished.write_text(text, encoding="utf-8"))
+    told.write_text(hashlib.sha256(text.encode()).hexdigest(), encoding="ascii")
 
 
 def _detached(value: Any) -> Any:

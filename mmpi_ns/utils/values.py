@@ -71,6 +71,12 @@ def check_text(what: str, value: Any) -> None:
         raise InputError(f"{what} must be text, not {shown(value)}.")
 
 
+def cut(text: str, most: int = 120) -> str:
+    """A name as it stands in a sentence: in one line, and no longer than a line."""
+    text = " ".join(text.split())
+    return text if len(text) <= most else text[: most - 3] + "..."
+
+
 def shown(value: Any, most: int = 60) -> str:
     """A value as it is quoted in a sentence."""
     text = " ".join(repr(value).split()) if not isinstance(value, int) or abs(value) < 10**most else "a longer number"

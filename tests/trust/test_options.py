@@ -39,6 +39,7 @@ REFUSED = {
     M + "growth_shares": [(0.5, 2.0)],
     M + "decay_decades": [NAN],
     M + "loss__distortion": [NAN, -1.0],
+    M + "loss__tv_every": [0],
     "machine__device_type": ["mps"],
 }
 IGNORED = {
