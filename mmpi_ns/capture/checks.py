@@ -219,8 +219,8 @@ def _check_places(centers: NDArray[np.float64], names: Sequence[str], path: Path
     usual = off[order[max(min(most, len(off) - 2), 0)]]
     if usual > 0 and off[order[-1]] > FAR_OFF * usual:
         raise InputError(
-            f"The camera of frame {cut(names[order[-1]])} of {path} stands {off[order[-1]]:.3g} from the others, which lie "
-            f"within {usual:.3g}: correct its transform_matrix or remove the frame."
+            f"The camera of frame {cut(names[order[-1]])} of {path} stands {off[order[-1]]:.3g} from the others, which "
+            f"lie within {usual:.3g}: correct its transform_matrix or remove the frame."
         )
     extent = float(np.ptp(centers, axis=0).max())
     if np.abs(centers).max() * FLOAT32_STEP > LEAST_DIGITS * extent / len(centers):

@@ -68,9 +68,8 @@ class Running:
     def __init__(self, name, options, arguments, memory, environment=None):
         self.folder = Path(tempfile.mkdtemp(prefix="trust"))
         self.began = time.monotonic()
-        self.process = _context.Process(
-            target=_child, args=(self.folder, name, options, arguments, memory, environment or {})
-        )
+        given = (self.folder, name, options, arguments, memory, environment or {})
+        self.process = _context.Process(target=_child, args=given, daemon=True)
         self.process.start()
 
     @property

@@ -214,7 +214,11 @@ def test_stray_files_among_checkpoints_are_passed_over(whole_scene, littered, tm
 
 def test_a_run_that_was_resumed_from_a_step_can_be_evaluated(whole_scene, trained, tmp_path):
     models = trained / "nerfstudio_models"
-    assert train(whole_scene, tmp_path, max_num_iterations=8, load_dir=models, load_step=5).status == 0
+    plan = trained / "plan.json"
+    resumed = train(
+        whole_scene, tmp_path, max_num_iterations=8, load_dir=models, load_step=5, pipeline__model__plan_file=plan
+    )
+    assert resumed.status == 0, resumed.error
     assert evaluate(folder_of(tmp_path), tmp_path).status == 0
     assert json.loads((tmp_path / "eval.json").read_text())["checkpoint"].endswith("step-000000007.ckpt")
 
@@ -224,7 +228,7 @@ def test_a_plan_that_was_edited_in_the_folder_of_a_run_is_not_replaced(whole_sce
     plan = json.loads(path.read_text())
     plan["mpis"][0]["name"] = "moved by hand"
     path.write_text(json.dumps(plan))
-    said = train(whole_scene, tmp_path, load_dir=finished / "nerfstudio_models", max_num_iterations=9).sentence
+    said = train(whole_scene, tmp_path, load_dir=finished / "nerfstudio_models", max_num_iterations=6).sentence
     assert str(path) in said and "--pipeline.model.plan-file" in said
     assert json.loads(path.read_text()) == plan
 
