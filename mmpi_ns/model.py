@@ -39,6 +39,7 @@ from mmpi_ns.rendering.windows import render_windows
 from mmpi_ns.scene.plan import MPIPlan, ScenePlan
 from mmpi_ns.scene.visible_tiles import TrainingViews
 from mmpi_ns.scene.windows import WindowedPlan
+from mmpi_ns.training.checkpoints import check_there_are_checkpoints
 from mmpi_ns.training.individual import individual_rays
 from mmpi_ns.training.losses import LossWeights, batch_losses, is_pixel_ray, over_background, photometric
 from mmpi_ns.training.memory import check_memory
@@ -213,6 +214,7 @@ class MMPIModel(Model):
         if path is not None and (observations is not None or path.is_file()):
             return WindowedPlan.load(path)
         if observations is None:
+            check_there_are_checkpoints(self.config.windows_folder)
             return WindowedPlan.single(UNTIL_LOADED)
         rays = self.config.total_steps * metadata[RAYS_PER_STEP]
         return place_windows(observations, self.config.placement, rays)

@@ -31,6 +31,16 @@ def checkpoints_in(folder: Path, steps: range | None = None) -> dict[int, Path]:
     return {step: path for step, path in found.items() if steps is None or step in steps}
 
 
+def check_there_are_checkpoints(windows_folder: Path | None) -> None:
+    """Raises InputError where a run has an empty folder of checkpoints beside that of its windows.
+
+    ns-eval and its like look for the last checkpoint after the model has been made, and end in a traceback.
+    """
+    folder = None if windows_folder is None else windows_folder.parent / "nerfstudio_models"
+    if folder is not None and folder.is_dir() and not checkpoints_in(folder):
+        raise InputError(f"There is no checkpoint in {folder} to load: train first, or put it back.")
+
+
 def checkpoint_to_load(config: TrainerConfig) -> Path | None:
     """The checkpoint that a run is to go on from; None for a new one.
 
