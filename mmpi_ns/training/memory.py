@@ -14,6 +14,8 @@ from mmpi_ns.utils.errors import InputError
 from mmpi_ns.utils.machine import free_memory
 
 GIB = 2**30
+LEAST_SHARE = 0.02
+"""Of a plan's texels at least so many are taken to be within reach of training rays: to find out takes its time."""
 
 
 def check_memory(
@@ -36,8 +38,9 @@ def check_memory(
     """
     free = free_memory(device)
     for plan, seen in zip(windows.plans, views, strict=True):
-        needed = _bytes_to_look(plan, seen)
-        if needed <= free:
+        everything = training_bytes(plan, None, feature_channels, two_phase)
+        needed = max(_bytes_to_look(plan, seen), int(LEAST_SHARE * everything))
+        if needed <= free < everything:
             needed = training_bytes(plan, seen, feature_channels, two_phase)
         if needed > free:
             raise InputError(
