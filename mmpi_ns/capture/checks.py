@@ -214,7 +214,7 @@ def _check_places(centers: NDArray[np.float64], names: Sequence[str], path: Path
         )
     middle = np.median(centers, axis=0)
     off = np.linalg.norm(centers - middle, axis=-1)
-    order = np.argsort(off)
+    order: list[int] = np.argsort(off).tolist()
     most = max(len(off) - 1 - int(FEW * len(off)), 0)
     usual = off[order[max(min(most, len(off) - 2), 0)]]
     if usual > 0 and off[order[-1]] > FAR_OFF * usual:
