@@ -22,8 +22,9 @@ def read_depth_image(file: Path, unit: float) -> NDArray[np.float32]:
         InputError: the file cannot be read or holds something else (names it).
     """
     try:
-        depth = np.load(file) if file.suffix == ".npy" else cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
-    except (OSError, ValueError) as error:
+        is_array = file.suffix == ".npy"
+        depth = np.load(file) if is_array else cv2.imdecode(np.fromfile(file, np.uint8), cv2.IMREAD_UNCHANGED)
+    except (OSError, ValueError, EOFError, cv2.error) as error:
         raise InputError(f"Depth image {file} cannot be read ({brief(error)}): repair or remove it.") from error
     if depth is None or np.squeeze(depth).ndim != 2:
         raise InputError(f"Depth image {file} is not one channel of depths: give a 16-bit PNG or a .npy file.")
