@@ -137,7 +137,7 @@ class MMPIModelConfig(ModelConfig):
     """Samples of less weight are not coloured when rendering; the dropped mass is reported."""
     render: Literal["exact", "baked"] = "exact"
     """Images from the field itself, or from bricks of 8-bit codes made of it when the first image is asked for
-    (shading ray, no cube): several times faster on a CPU, and nearly the same (docs/export.md)."""
+    (shading ray, no cube): faster on a CPU, and nearly the same (docs/export.md)."""
     render_shares: Literal["exact", "baked"] = "exact"
     """After two-phase training: a sample's share from the reliabilities of all MPIs that see it, or from its texels,
     which keep theirs from the first rendering on (faster by the number of MPIs that overlap, and nearly the same)."""
