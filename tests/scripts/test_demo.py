@@ -32,8 +32,8 @@ from mmpi_ns.synthetic import dataset
 def run(scene, plan_file, tmp_path_factory):
     """A run of a few steps, loaded from its folder."""
     config = trainer_config(scene, plan_file, tmp_path_factory.mktemp("run"), steps=30, training="joint")
-    trainer = ready(config)
     config.save_config()
+    trainer = ready(config)
     trainer.train()
     return load_run(config.get_base_dir() / "config.yml")
 
