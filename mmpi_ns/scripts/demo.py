@@ -120,6 +120,7 @@ class Demo:
             "--vis", "tensorboard", "--steps-per-save", str(max(1, self.steps // 3)), "--steps-per-eval-batch", every,
             "--pipeline.datamanager.eval-num-rays-per-batch", "8192", "--logging.steps-per-log", "20",
             "--pipeline.model.lpips-net", "none",  # half a gigabyte of weights would be fetched for it
+            "--pipeline.datamanager.depth-images", "False",  # the street has exact ones, an ordinary capture none
             *(["--load-dir", str(self.run / "nerfstudio_models")] if newest is not None else []),
         )  # fmt: skip
         if not self.checkpoint.is_file():

@@ -10,6 +10,7 @@ import tyro
 
 SHEET, README_PICTURE = "contact-sheet.png", "contact-sheet.jpg"
 """The demo's picture that the documentation shows, there and here."""
+FILM, README_FILM = "fly.mp4", "fly.webp"
 MOST_BYTES = 400_000
 
 
@@ -32,7 +33,8 @@ class Figures:
         if not (self.demo / SHEET).is_file():
             raise ValueError(f"{self.demo} lacks {SHEET}: run make demo first (the other figures are written).")
         _shrink(self.demo / SHEET, self.output / README_PICTURE)
-        print(f"Wrote merging.png, reliability.png, errors.png and {README_PICTURE} in {self.output}.")
+        _animate(self.demo / FILM, self.output / README_FILM)
+        print(f"Wrote merging.png, reliability.png, errors.png, {README_PICTURE} and {README_FILM} in {self.output}.")
 
 
 def _shrink(source: Path, target: Path) -> None:
@@ -46,6 +48,24 @@ def _shrink(source: Path, target: Path) -> None:
             return
     target.unlink()
     raise ValueError(f"{source} is larger than {MOST_BYTES // 1000} kB even as a poor JPEG: draw less in it.")
+
+
+def _animate(source: Path, target: Path, width: int = 480, rate: int = 12) -> None:
+    """Copies a film as an animated WebP that a web page plays, only as good as a file of moderate size allows."""
+    import av
+    from PIL import Image
+
+    with av.open(str(source)) as container:
+        frames = [frame.to_image() for frame in container.decode(video=0)]
+    height = round(frames[0].height * width / frames[0].width)
+    frames = [frame.resize((width, height), Image.Resampling.LANCZOS) for frame in frames]
+    for quality in (80, 70, 60, 50, 40, 30):
+        times = {"duration": 1000 // rate, "loop": 0}
+        frames[0].save(target, save_all=True, append_images=frames[1:], quality=quality, method=4, **times)
+        if target.stat().st_size <= 3 * MOST_BYTES:
+            return
+    target.unlink()
+    raise ValueError(f"{source} is larger than {3 * MOST_BYTES // 1000} kB even as a poor WebP: film fewer frames.")
 
 
 def main() -> int:

@@ -305,3 +305,18 @@ def test_large_pictures_shrink_or_are_refused(tmp_path, monkeypatch):
     with pytest.raises(ValueError, match="draw less"):
         figures._shrink(source, target)
     assert not target.exists()
+
+
+def test_a_film_becomes_an_animated_picture_or_is_refused(tmp_path, monkeypatch):
+    rng = np.random.default_rng(0)
+    stills = [Image.fromarray(rng.integers(0, 255, (60, 96, 3), dtype=np.uint8)) for _ in range(5)]
+    source, target = film.write_film(stills, tmp_path), tmp_path / "fly.webp"
+    if source.is_dir():
+        pytest.skip("PyAV has no encoder here")
+    figures._animate(source, target, width=48)
+    with Image.open(target) as picture:
+        assert (picture.n_frames, picture.size) == (5, (48, 30))
+    monkeypatch.setattr(figures, "MOST_BYTES", 10)
+    with pytest.raises(ValueError, match="film fewer frames"):
+        figures._animate(source, target)
+    assert not target.exists()
