@@ -59,7 +59,7 @@ def test_regions_pair_what_is_expected_with_what_is_measured_there():
     )
     axes = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0))
     # 3 behind the camera: a texel of 0.04 spans 25 * 0.04 * D / (D - 3) pixels at the depth D in the MPI.
-    mpi = MPIPlan("one", (0.0, 0.0, 3.0), axes, 4.0, (-1.0, 1.0, -1.0, 1.0), 10_000, 51, 51)
+    mpi = MPIPlan("one", (0.0, 0.0, 3.0), axes, 4.0, (-1.0, 1.0, -1.0, 1.0), 4096, 51, 51)
     squared = np.arange(1200.0).reshape(30, 40)
     found = Regions(Path(), rows=3, columns=4)._regions(
         regions._as_observations(camera), np.concatenate([points, behind]), ScenePlan((mpi,), None, 0.1, 1.0), squared

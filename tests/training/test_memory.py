@@ -35,7 +35,7 @@ def test_memory_is_that_of_tables_moments_and_pixels(scene, plan_file, tmp_path,
     most = max(bytes_of(load(trainer.checkpoint_dir, step)) for step in range(1, 16))
     assert most == tables[0] if training == "joint" else 0.5 * tables[0] < most <= tables[0]
     pool = trainer.pipeline.datamanager.pool
-    assert pixels == [pool.colors.nbytes + pool.indices.nbytes]
+    assert pixels == [pool.colors.nbytes + pool.indices.nbytes + pool.depths.nbytes]
     told = re.search(r"Memory in training: at most ([\d.]+) GiB", said)
     assert told and float(told[1]) == pytest.approx((tables[0] + pixels[0]) / 2**30, abs=0.006)
 
@@ -45,7 +45,8 @@ def test_pixels_read_window_by_window_count_for_that_window(scene):
     cameras = np.array([1, 2, 5])
     told = by_window.pixel_bytes(cameras), by_window.pixel_bytes()
     by_window.use_cameras(cameras)
-    assert told[0] == by_window.pool.colors.nbytes + by_window.pool.indices.nbytes < told[1]
+    pool = by_window.pool
+    assert told[0] == pool.colors.nbytes + pool.indices.nbytes + pool.depths.nbytes < told[1]
     at_once = datamanager(scene)
     assert at_once.pixel_bytes(cameras) == at_once.pixel_bytes() == told[1]
 
