@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from threading import current_thread, main_thread
 from typing import Any, Literal
@@ -27,13 +27,15 @@ from mmpi_ns.field.shading import Shading
 from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.blending import BlendForm, blended_optical_depth
 from mmpi_ns.ops.composite import composite_weights, winning_heads
+from mmpi_ns.ops.march.reference import most_kept
 from mmpi_ns.placement.rule import PlacementConfig
 from mmpi_ns.placement.split import place_windows
 from mmpi_ns.rendering.baked import BakedWindow, bake
-from mmpi_ns.rendering.chunks import rays_per_chunk, render_in_chunks
+from mmpi_ns.rendering.chunks import BYTES_PER_SLOT, rays_per_chunk, render_in_chunks
 from mmpi_ns.rendering.metrics import ImageMetrics, depth_metrics, pictures
 from mmpi_ns.rendering.rendered import RenderedRays, bounded, median_distance
-from mmpi_ns.rendering.sampler import MMPISampler
+from mmpi_ns.rendering.sampler import MergeReport, MMPISampler
+from mmpi_ns.rendering.shown import shown_outputs
 from mmpi_ns.rendering.window_store import WindowStore
 from mmpi_ns.rendering.windows import render_windows
 from mmpi_ns.scene.plan import MPIPlan, ScenePlan
@@ -251,12 +253,14 @@ class MMPIModel(Model):
     def training_outputs(self, bundle: RayBundle) -> dict[str, Any]:
         """rgb (without background), accumulation, depth, and ``RenderedRays`` for the losses, of the window at hand."""
         progress, field = self.progress, self.field
-        bundle, head_mask, choose = bounded(bundle, field.plan), None, None
+        asked, head_mask, choose = len(bundle), None, None
+        bundle = bounded(bundle, field.plan)
         if progress.phase.name == "individual":
             g = generator(self.config.seed, progress.step, "assignment", self.device)
             bundle, head_mask, choose = individual_rays(bundle, field.plan, self.config.rays_per_mpi, g)
         form = self.blend_form(field) if progress.schedule.blends_at(progress.step) else None
         rays = self._render(bundle, field, form=form, head_mask=head_mask, choose=choose, **self.training_bounds())
+        rays = replace(rays, times=len(bundle) // asked)
         if rays.lookup is not None and progress.schedule.watches(progress.step):
             field.note_use(rays.lookup, rays.composite.weights, rays.report.live)
         return self._outputs(rays, field) | {"training": rays}
@@ -305,20 +309,20 @@ class MMPIModel(Model):
             form = None
         if form is not None and self.config.render_shares == "baked" and not torch.is_grad_enabled():
             shares = baked_shares(field)
-        rays = self._render(
-            bounded(bundle, field.plan),
-            field,
-            form=form,
-            threshold=self.config.render_threshold,
-            head_mask=head_mask,
-            shares=shares,
-        )
-        outputs, heads = self._outputs(rays, field), metadata_of(rays.samples)["heads"][..., 0]
-        outputs["rgb"] = outputs["rgb"] + rays.composite.transmittance * self._background(outputs["rgb"])
-        winner = winning_heads(rays.composite.weights, heads, field.plan.num_heads)
-        return outputs | {
-            "rgb": outputs["rgb"].clamp(0, 1),
-            "winning_mpi": winner + self.progress.windows.first_head(window),
+        how = {"form": form, "threshold": self.config.render_threshold, "head_mask": head_mask, "shares": shares}
+        once = field.shading == "ray" and not torch.is_grad_enabled()
+        outputs = (shown_outputs if once else self._sampled_outputs)(bounded(bundle, field.plan), field, **how)
+        rgb = outputs["rgb"] + outputs.pop("transmittance") * self._background(outputs["rgb"])
+        winner = outputs["winning_mpi"] + self.progress.windows.first_head(window)
+        return outputs | {"rgb": rgb.clamp(0, 1), "winning_mpi": winner}
+
+    def _sampled_outputs(self, bundle: RayBundle, field: MMPIField, **how: Any) -> dict[str, Tensor]:
+        """``shown_outputs`` of any field, also with gradients."""
+        rays = self._render(bundle, field, **how)
+        heads, composite = metadata_of(rays.samples)["heads"][..., 0], rays.composite
+        return self._outputs(rays, field) | {
+            "transmittance": composite.transmittance,
+            "winning_mpi": winning_heads(composite.weights, heads, field.plan.num_heads),
             "dropped_mass": rays.report.dropped_mass,
         }
 
@@ -343,7 +347,7 @@ class MMPIModel(Model):
     def _render(self, bundle: RayBundle, field: MMPIField, *, form: BlendForm | None, **sampling: Any) -> RenderedRays:
         """Samples rays in a field, merges and blends, weighs the samples and colours them (see ``MMPISampler``)."""
         samples, report = self.sampler(bundle, field=field, blend_form=form, **sampling)
-        tau, lookup = self._optical_depth(field, samples, form)
+        tau, lookup = self._optical_depth(field, samples, report, form)
         meta = metadata_of(samples)
         valid, before = meta["valid"][..., 0], meta["skipped_before"][..., 0]
         composite = composite_weights(tau, valid, before, report.skipped_total)
@@ -353,12 +357,12 @@ class MMPIModel(Model):
 
     @staticmethod
     def _optical_depth(
-        field: MMPIField, samples: RaySamples, form: BlendForm | None
+        field: MMPIField, samples: RaySamples, report: MergeReport, form: BlendForm | None
     ) -> tuple[Float[Tensor, "R S"], Lookup | None]:
         """(Blended) optical depths, with gradients where they are wanted; else the sampler's own, without a lookup."""
         if not torch.is_grad_enabled():
             return metadata_of(samples)["tau"][..., 0], None
-        density, lookup = field.get_density(samples)
+        density, lookup = field.get_density(samples, report.head_counts)
         tau = density[..., 0]
         if form is not None and lookup.index.numel():
             shares = field.sample_shares(samples, lookup)
@@ -398,8 +402,13 @@ class MMPIModel(Model):
     @property
     def chunk_size(self) -> int:
         """Rays of an image that are rendered at once."""
-        most = max(plan.samples_per_ray for plan in self.progress.windows.plans)
-        return self.config.eval_num_rays_per_chunk or rays_per_chunk(most, self.device)
+        most, asked = max(plan.samples_per_ray for plan in self.progress.windows.plans), self.config
+        if asked.eval_num_rays_per_chunk:
+            return asked.eval_num_rays_per_chunk
+        compiled = asked.shading == "ray" and self.blend_form(self.field) != "opacity"
+        if compiled and dispatch.form_of("show_rays", self.field.features) == "gpu":
+            return rays_per_chunk(most_kept(most, asked.render_threshold), self.device, BYTES_PER_SLOT)
+        return rays_per_chunk(most, self.device)
 
     def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
         """Colours without their background, and how opaque each pixel is (ns-render's output "rgba")."""

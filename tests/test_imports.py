@@ -24,7 +24,7 @@ COMMANDS = {
 MAY_IMPORT = {wing: set(METHOD[: i + 1]) for i, wing in enumerate(METHOD)}
 MAY_IMPORT |= {wing: others | {wing} for wing, others in COMMANDS.items()}
 
-NOT_YET = {("mmpi_ns.ops.colors", "field"), ("mmpi_ns.ops.shade", "field"), ("mmpi_ns.ops.triton_shade", "field")}
+NOT_YET = {("mmpi_ns.ops.colors", "field"), ("mmpi_ns.ops.shade", "field")}
 """Operations that name the colour networks of the field, which are their reference: to be moved below ``ops``."""
 
 MODULES = {

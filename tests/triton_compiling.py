@@ -1,23 +1,32 @@
-"""Compiles the Triton kernels for a GPU that is not there: every launch becomes a compilation for its arguments."""
+"""Compiles the Triton kernels for GPUs that are not there: every launch becomes a compilation for its arguments.
+
+With another release of Triton, on the path before the installed one (two minutes an architecture; ``--largest`` halves
+that by compiling each kernel once, with the most in it):
+
+    pip install --no-deps --target triton-3.1 triton==3.1.0
+    PYTHONPATH=triton-3.1:.:tests python tests/triton_compiling.py 75 80 86 89 90
+"""
 
 from __future__ import annotations
 
 import importlib
 import subprocess
+import sys
 import tempfile
+import time
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 import triton
-from random_fields import random_field
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 
-from mmpi_ns.field.color_network import ColorNetworks
-from mmpi_ns.ops import dispatch, trial, triton_shade
+from mmpi_ns.ops import dispatch, trial
 
-TARGET = GPUTarget("cuda", 90, 32)
+ARCHITECTURES = (75, 80, 86, 89, 90)
+"""Turing, Ampere (A100), Ampere (RTX 30), Ada, Hopper."""
 NAMES = {
     torch.float32: "*fp32",
     torch.int64: "*i64",
@@ -25,6 +34,32 @@ NAMES = {
     torch.uint8: "*u8",
     torch.bool: "*i1",
 }
+TAKES_CONSTEXPRS = tuple(int(n) for n in triton.__version__.split(".")[:2]) >= (3, 3)
+"""Whether a signature lists the constants too."""
+
+
+@dataclass(frozen=True)
+class Launch:
+    """A kernel with the types of its arguments and its constants."""
+
+    kernel: triton.runtime.JITFunction
+    signature: tuple[tuple[str, str], ...]
+    constants: tuple[tuple[str, object], ...]
+    num_warps: int
+
+    @property
+    def name(self):
+        return self.kernel.fn.__name__
+
+    def compiled(self, architecture):
+        signature, constants = dict(self.signature), dict(self.constants)
+        if TAKES_CONSTEXPRS:
+            signature |= dict.fromkeys(constants, "constexpr")
+            source = ASTSource(self.kernel, signature=signature, constexprs=constants)
+        else:
+            source = ASTSource(self.kernel, signature=signature, constants=constants)
+        target = GPUTarget("cuda", architecture, 32)
+        return triton.compile(source, target=target, options={"num_warps": self.num_warps})
 
 
 def _type(value):
@@ -34,33 +69,58 @@ def _type(value):
 
 
 @contextmanager
-def compiling(made):
-    """Within, a launch compiles its kernel into ``made`` [(kernel's name, constants) -> compiled] and runs nothing.
+def launches_noted(noted):
+    """Within, a launch is added to ``noted`` (a dict, for its order) and runs nothing.
 
-    What a launch would have read or written is zeroed, so that callers who size arrays by it go on.
+    What it would have read or written is zeroed, so that callers who size arrays by it go on.
     """
     run = triton.runtime.JITFunction.run
 
-    def compile_instead(self, *args, grid, warmup, num_warps=4, **constants):
+    def note(self, *args, grid, warmup, num_warps=4, **constants):
         del grid, warmup
         given = dict(zip(self.arg_names, args, strict=False))
         # As a launch does: an integer of 1 becomes a constant.
-        constants |= {name: 1 for name, value in given.items() if type(value) is int and value == 1}
-        signature = {name: _type(value) for name, value in given.items()}
-        signature |= {name: "constexpr" for name in constants}
-        key = (self.fn.__name__, tuple(sorted(constants.items())), tuple(signature.values()))
-        if key not in made:
-            source = ASTSource(self, signature=signature, constexprs=constants)
-            made[key] = triton.compile(source, target=TARGET, options={"num_warps": num_warps})
+        ones = {n: 1 for n, v in given.items() if type(v) is int and v == 1 and n not in self.do_not_specialize}
+        given = {name: _type(value) for name, value in given.items() if name not in ones}
+        constants |= ones
+        noted[Launch(self, tuple(given.items()), tuple(constants.items()), num_warps)] = None
         for value in args:
             if isinstance(value, torch.Tensor):
                 value.zero_()
 
-    triton.runtime.JITFunction.run = compile_instead
+    triton.runtime.JITFunction.run = note
     try:
-        yield made
+        yield noted
     finally:
         triton.runtime.JITFunction.run = run
+
+
+def all_launches(setattr):
+    """Every kernel launched as on a GPU, with the arguments of the trials.
+
+    Args:
+        setattr: sets an attribute of an object, for as long as the launches are used.
+    """
+    setattr(dispatch, "_interpreting", True)
+    setattr(dispatch, "_faults", dict.fromkeys(["Triton", *dispatch.TABLE]))
+    with launches_noted({}) as noted:
+        for name, cases in trial.CASES.items():
+            module = importlib.import_module(f"mmpi_ns.ops.{dispatch.TABLE[name][0]}.gpu")
+            if hasattr(module, "block_size"):  # arrays on a CPU, but blocks of a GPU's size
+                setattr(module, "block_size", lambda wanted, device: wanted)
+            for given in cases("cpu"):
+                trial._outcome(name, "gpu", given)
+    return list(noted)
+
+
+def largest_launches(launches):
+    """Of each kernel the launch with the most in it."""
+    found = {}
+    for launch in launches:
+        size = sum(int(value) for _, value in launch.constants)
+        if launch.name not in found or size > found[launch.name][0]:
+            found[launch.name] = size, launch
+    return [launch for _, launch in found.values()]
 
 
 def resources(kernel):
@@ -72,16 +132,25 @@ def resources(kernel):
         return subprocess.run([tool, "-res-usage", file.name], capture_output=True, text=True, check=True).stdout
 
 
-def launches(monkeypatch):
-    """Launches every kernel as on a GPU: with the arguments of the trials."""
-    for name, cases in trial.CASES.items():
-        folder = dispatch.TABLE[name][0]
-        module = triton_shade if name == "shade" else importlib.import_module(f"mmpi_ns.ops.{folder}.gpu")
-        if hasattr(module, "block_size"):  # arrays on a CPU, but blocks of a GPU's size
-            monkeypatch.setattr(module, "block_size", lambda wanted, device: wanted)
-        for given in cases("cpu"):
-            trial._outcome(name, "gpu", given)
-    networks, grid = ColorNetworks(3, 9, 64, 2, 2), torch.arange(60).view(20, 3)
-    layout, rays, places = random_field(2, True, seed=1).layout, torch.zeros(3, 20, 3), torch.zeros(20, 3, 3)
-    monkeypatch.setattr(torch.Tensor, "tolist", lambda self: [0, 20, 40, 60])
-    triton_shade.shade(layout, torch.zeros(7, 9), networks, rays, grid, grid, places, grid >= 0)
+def main(architectures, largest):
+    """Compiles all, or the largest of each kernel, and says what does not compile."""
+    launches, failed = all_launches(setattr), 0
+    launches = largest_launches(launches) if largest else launches
+    print(f"Triton {triton.__version__}: {len(launches)} kernels", flush=True)
+    for architecture in architectures:
+        start, spilling = time.monotonic(), []
+        for launch in launches:
+            try:
+                if "STACK:0" not in resources(launch.compiled(architecture)):
+                    spilling.append(launch.name)
+            except Exception as error:
+                failed += 1
+                print(f"sm_{architecture} {launch.name} {dict(launch.constants)}: {type(error).__name__}: {error}")
+        seconds = time.monotonic() - start
+        said = f"registers spill in {', '.join(spilling)}" if spilling else "no register spills"
+        print(f"sm_{architecture}: {failed} failed so far, {said}, {seconds:.0f} s", flush=True)
+    return failed > 0
+
+
+if __name__ == "__main__":
+    sys.exit(main([int(word) for word in sys.argv[1:] if word.isdigit()] or ARCHITECTURES, "--largest" in sys.argv))

@@ -6,6 +6,7 @@ Its tables are in ``tables.py``.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -148,17 +149,23 @@ class MMPIField(TexelTables):
 
     # nerfstudio's Field ------------------------------------------------------------------------------------------
 
-    def get_density(self, ray_samples: RaySamples) -> tuple[Float[Tensor, "R S 1"], Lookup]:  # type: ignore[override]
+    def get_density(  # type: ignore[override]
+        self, ray_samples: RaySamples, head_counts: Sequence[int] | None = None
+    ) -> tuple[Float[Tensor, "R S 1"], Lookup]:
         """Optical depth of each valid sample (0 in empty slots), and where the lookups went.
 
         nerfstudio's "density" times interval: on a plane there is no interval, so the product itself is learned.
+
+        Args:
+            ray_samples: merged samples.
+            head_counts: how many are of each head, where it is known (``MergeReport``).
         """
-        lookup = self._lookup(ray_samples)
+        lookup = self._lookup(ray_samples, head_counts)
         raw = []
         for taps in lookup.groups:
             if self.training and self.learns_cover:
                 self.touched.index_fill_(0, lookup.gathered.rows if lookup.gathered else taps.rows.reshape(-1), 1)
-                self.touched[:BRICK] = 0
+                self.touched[:BRICK].zero_()
             raw.append(_read(self.density, lookup.gathered and lookup.gathered.density, taps)[:, 0])
         out = lookup.ndc.new_zeros(lookup.shape.numel())
         if raw:
@@ -169,13 +176,12 @@ class MMPIField(TexelTables):
             out = out.index_copy(0, lookup.index, tau)
         return out.view(*lookup.shape, 1), lookup
 
-    def _lookup(self, ray_samples: RaySamples) -> Lookup:
+    def _lookup(self, ray_samples: RaySamples, head_counts: Sequence[int] | None = None) -> Lookup:
         meta = metadata_of(ray_samples)
-        index = meta["valid"].reshape(-1).nonzero()[:, 0]
-        index = index[by_head(meta["heads"].reshape(-1)[index])]
+        index, counts = by_head(meta["heads"][..., 0], meta["valid"][..., 0], len(self.grids), head_counts)
         heads, planes = (meta[name].reshape(-1).index_select(0, index) for name in ("heads", "planes"))
         ndc = meta["ndc"].reshape(-1, 3).index_select(0, index)
-        spans, num_mpis, groups = head_spans(heads, len(self.grids)), len(self.plan.mpis), []
+        spans, num_mpis, groups = head_spans(counts), len(self.plan.mpis), []
         if in_mpis := [own for k, own in spans if k < num_mpis]:
             own = slice(0, in_mpis[-1].stop)
             groups.append(Taps(own, *texel_rows(self.layout, heads[own], planes[own], ndc[own])))
@@ -201,9 +207,8 @@ class MMPIField(TexelTables):
         """Colours of the valid samples (diffuse ones where a ray is shaded once); empty slots are black."""
         sampled = self.shading == "sample"
         if sampled and not torch.is_grad_enabled() and density_embedding is None:
-            form = dispatch.form_of("shade", self.features, ray_samples.frustums.directions)
-            if form != "reference":
-                return {FieldHeadNames.RGB: self._shade(form, ray_samples)}
+            if dispatch.form_of("shade", self.features, ray_samples.frustums.directions) == "cpu":
+                return {FieldHeadNames.RGB: self._shade(ray_samples)}
         lookup = density_embedding or self._lookup(ray_samples)
         features = self._features(lookup)
         found = self._sample_colors(features, lookup, ray_samples) if sampled else features[:, :3].sigmoid()
@@ -258,18 +263,13 @@ class MMPIField(TexelTables):
             sums = gather_taps(values, groups, lookup.index, composite.weights, wanted.to(values.device))
         return self.networks(sums, composite, ray_samples.frustums.directions[:, 0])
 
-    def _shade(self, form: dispatch.Form, ray_samples: RaySamples) -> Float[Tensor, "R S 3"]:
+    def _shade(self, ray_samples: RaySamples) -> Float[Tensor, "R S 3"]:
         assert isinstance(self.networks, ColorNetworks)
         meta, rays = metadata_of(ray_samples), ray_samples.frustums.directions[:, 0]
         axes = torch.stack([self._axes(k) for k in range(len(self.grids))])
         heads, planes, valid = (meta[name][..., 0] for name in ("heads", "planes", "valid"))
         samples = (heads, planes, meta["ndc"], valid)
-        if form == "cpu":
-            return shade(self.layout, self.tables(), self.features.data, self.networks, axes, rays, *samples)
-        from mmpi_ns.ops import triton_shade
-
-        directions = geometry.rotate(axes[:, None], rays)
-        return triton_shade.shade(self.layout, self.features.data, self.networks, directions, *samples)
+        return shade(self.layout, self.tables(), self.features.data, self.networks, axes, rays, *samples)
 
     def total_variation(self, lookup: Lookup, density_weight: float, feature_weight: float) -> Tensor:
         """Weighted total variation of the texels that the batch touched, in DVGO's normalisation (not yet per ray)."""

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import accumulate
 
 import torch
 from jaxtyping import Bool, Float, Int
 from nerfstudio.cameras.rays import RaySamples
 from torch import Tensor
+
+from mmpi_ns.ops import dispatch
 
 
 @dataclass(frozen=True)
@@ -54,8 +57,9 @@ class Lookup:
         return self.index // self.shape[1]
 
     def of_rays(self, chosen: Bool[Tensor, "R"]) -> Lookup:
-        """The samples of the chosen rays. Gathered rows stay those of all rays."""
-        if bool(chosen.all()):
+        """The samples of the chosen rays, or all where picking them would wait for a GPU. Gathered rows stay those of
+        all rays."""
+        if dispatch.on_device(chosen) or bool(chosen.all()):
             return self
         wanted = chosen[self.rays].nonzero()[:, 0]
         heads = self.heads[wanted]
@@ -68,14 +72,14 @@ class Lookup:
             groups.append(Taps(slice(start, stop), rows, weights, position))
             start = stop
         samples = (self.index[wanted], heads, self.planes[wanted], self.ndc.index_select(0, wanted))
-        last = self.spans[-1][0] if self.spans else 0
-        return Lookup(self.shape, *samples, head_spans(heads, last + 1), groups, self.gathered)
+        spans = head_spans(torch.bincount(heads).tolist())
+        return Lookup(self.shape, *samples, spans, groups, self.gathered)
 
 
-def head_spans(heads: Int[Tensor, "N"], num_heads: int) -> list[tuple[int, slice]]:
+def head_spans(counts: Sequence[int]) -> list[tuple[int, slice]]:
     """(head, range of its samples) for every head that occurs among samples ordered by head."""
-    edges = torch.searchsorted(heads, torch.arange(num_heads + 1, device=heads.device)).tolist()
-    return [(k, slice(a, b)) for k, (a, b) in enumerate(pairwise(edges)) if a < b]
+    ends = list(accumulate(counts))
+    return [(k, slice(end - n, end)) for k, (n, end) in enumerate(zip(counts, ends, strict=True)) if n]
 
 
 def metadata_of(ray_samples: RaySamples) -> dict[str, Tensor]:
@@ -84,10 +88,21 @@ def metadata_of(ray_samples: RaySamples) -> dict[str, Tensor]:
     return ray_samples.metadata
 
 
-def by_head(heads: Int[Tensor, "N"]) -> Int[Tensor, "N"]:
-    """The order that puts samples of a head together, heads rising, and otherwise keeps their order."""
-    if not heads.numel():
-        return heads
-    if heads.device.type != "cpu":  # one launch; a sort takes longer on a CPU
-        return torch.sort(heads.to(torch.int16), stable=True).indices
-    return torch.cat([(heads == k).nonzero()[:, 0] for k in range(int(heads.max()) + 1)])
+def by_head(
+    heads: Int[Tensor, "R S"], valid: Bool[Tensor, "R S"], num_heads: int, counts: Sequence[int] | None
+) -> tuple[Int[Tensor, "N"], Sequence[int]]:
+    """Flat slots of the valid samples, heads rising and otherwise in order, and how many each head has.
+
+    Args:
+        heads: of every slot.
+        valid: which slots hold a sample.
+        num_heads: of the scene.
+        counts: how many samples each head has, where it is known; else a GPU is waited for.
+    """
+    if counts is not None:
+        keys = torch.where(valid, heads, num_heads).reshape(-1)
+        return torch.sort(keys.to(torch.int16), stable=True).indices[: sum(counts)], counts
+    index = valid.reshape(-1).nonzero()[:, 0]
+    own = heads.reshape(-1)[index]
+    parts = [(own == k).nonzero()[:, 0] for k in range(num_heads)]  # on a CPU a sort takes longer
+    return index[torch.cat(parts)], [len(p) for p in parts]

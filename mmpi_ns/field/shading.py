@@ -74,10 +74,28 @@ class RayShader(Networks):
             composite: the weights that it was gathered by.
             directions: unit, world axes.
         """
-        mean = sums.gathered / composite.weights.sum(-1, keepdim=True).clamp(min=LEAST_MASS)
+        mass = composite.weights.sum(-1, keepdim=True)
+        rgb = self.shade(sums.gathered, mass, composite.accumulation, directions)
+        return RayColors(rgb, sums.mass, sums.first, sums.second)
+
+    def shade(
+        self,
+        gathered: Float[Tensor, "R C"],
+        mass: Float[Tensor, "R 1"],
+        accumulation: Float[Tensor, "R 1"],
+        directions: Float[Tensor, "R 3"],
+    ) -> Float[Tensor, "R 3"]:
+        """Colours of rays, without a background.
+
+        Args:
+            gathered: colours and features of the samples, times their weights.
+            mass: the sum of those weights.
+            accumulation: what the rays hold back, with the samples that were dropped.
+            directions: unit, world axes.
+        """
+        mean = gathered / mass.clamp(min=LEAST_MASS)
         encoded = positional_encoding(directions, self.direction_frequencies)
-        shaded = change_odds(mean[:, :COLORS], self.run(0, torch.cat([mean, encoded], -1)))
-        return RayColors(composite.accumulation * shaded, sums.mass, sums.first, sums.second)
+        return accumulation * change_odds(mean[:, :COLORS], self.run(0, torch.cat([mean, encoded], -1)))
 
 
 def change_odds(color: Float[Tensor, "R 3"], said: Float[Tensor, "R 3"]) -> Float[Tensor, "R 3"]:

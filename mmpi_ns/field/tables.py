@@ -14,6 +14,7 @@ from nerfstudio.fields.base_field import Field
 from torch import Tensor, nn
 
 from mmpi_ns.field.samples import Lookup
+from mmpi_ns.ops import dispatch
 from mmpi_ns.scene.bricks import grown_tiles, keep_bricks, new_table, resample, take_bricks
 from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.scene.texels import BRICK, TexelGrid, head_grids, number_tiles
@@ -208,7 +209,7 @@ def _keep_empty_brick(grad: Tensor) -> Tensor:
         return torch.cat([torch.zeros_like(grad[:BRICK]), grad[BRICK:]])
     rows, values = grad._indices(), grad._values()
     rises = grad.is_coalesced()
-    if rises and rows.device.type == "cpu":  # the empty brick's rows come first; a device would wait for their number
+    if rises and not dispatch.on_device(rows):  # the empty brick's rows come first
         first = int(torch.searchsorted(rows[0], BRICK))
         rows, values = rows[:, first:], values[first:]
     else:

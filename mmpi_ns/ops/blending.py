@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.interpolate import interpolate
 from mmpi_ns.ops.layout import SceneLayout
 from mmpi_ns.scene.geometry import LocalRays, local_to_ndc
@@ -103,17 +104,23 @@ def log_shares(
         inverse_t: inverse distance of each sample.
         heads: head that each sample was taken from.
     """
-    columns, cover = [], []
+    chosen, texels, cover = [], [], []
     for j, grid in enumerate(layout.grids):
         ndc, inside = _ndc_in_head(layout, j, rays, local, inverse_t)
         is_own = heads == j
-        index = (inside | is_own).nonzero()[:, 0]
-        position = ndc[index]
-        value = interpolate(reliability, *grid.trilinear(position))[:, 0]
-        columns.append(value.new_zeros(heads.shape[0]).index_put((index,), value))
-        voting = torch.zeros_like(is_own)
-        voting[index] = touched[grid.nearest(position)] > 0
-        cover.append(voting | is_own)
+        asked = inside | is_own
+        # A GPU would be waited for to say how many are asked: there all are, and the others read the empty brick.
+        index = torch.arange(len(heads), device=heads.device) if dispatch.on_device(heads) else asked.nonzero()[:, 0]
+        position, reads = ndc[index], asked[index]
+        rows, weights = grid.trilinear(position)
+        votes = reads & (touched[grid.nearest(position)] > 0)
+        chosen.append(index)
+        texels.append((rows * reads[:, None], weights))
+        cover.append(torch.zeros_like(is_own).index_copy(0, index, votes) | is_own)
+    # Read at once: gradients of the table are then one list of rows.
+    values = interpolate(reliability, *(torch.cat(parts) for parts in zip(*texels, strict=True)))[:, 0]
+    each = zip(values.split([len(i) for i in chosen]), chosen, strict=True)
+    columns = [value.new_zeros(len(heads)).index_copy(0, index, value) for value, index in each]
     return blend_shares(torch.stack(columns, -1), torch.stack(cover, -1), heads)
 
 

@@ -40,13 +40,17 @@ TABLE: dict[str, tuple[str, tuple[Form, ...]]] = {
     "total_variation": ("variation", ("cpu", "gpu")),
     "adam_rows": ("adam", ("cpu", "gpu")),
     "gather_taps": ("gather", ("cpu", "gpu")),
-    "gather_places": ("gather", ("cpu", "gpu")),
+    "gather_places": ("gather", ("cpu",)),
+    "show_rays": ("show", ("gpu",)),
     "colors": ("colors", ("cpu",)),
-    "shade": ("shade", ("cpu", "gpu")),
+    "shade": ("shade", ("cpu",)),
     "march_baked": ("baked", ("cpu",)),
     "shade_baked": ("baked", ("cpu",)),
 }
 """Every operation. Its function has the same name and signature in ``reference.py``, ``cpu.py`` and ``gpu.py``."""
+
+OLDEST_TRITON = (3, 1)
+"""The kernels compile with this and newer ones; torch brings it since 2.5."""
 
 _chosen: Route = "auto"
 _interpreting = False
@@ -62,7 +66,10 @@ def run(name: str, *given: Any) -> Any:
         return function(name, form)(*given)
     try:
         return function(name, "gpu")(*given)
-    except _triton_errors() as error:  # a shape that the trial did not have: it failed to compile, so nothing has run
+    except Exception as error:
+        if not _did_not_compile(error):
+            raise
+        # A shape that the trial did not have; nothing has run.
         _faults[name] = _say(f"{name} does not compile for this GPU ({_words(error)})", f"Plain torch for {name}")
         return function(name, "reference")(*given)
 
@@ -82,10 +89,15 @@ def form_of(name: str, *tensors: Tensor) -> Form:
     if _chosen == "torch" or any(t.is_floating_point() and t.dtype != torch.float32 for t in tensors):
         return "reference"
     if devices == {"cpu"} and not _interpreting:
-        return "cpu" if "cpu" in compiled and _fault("C++") is None else "reference"
-    if devices == ({"cpu"} if _interpreting else {"cuda"}) and "gpu" in compiled and _fault(name) is None:
+        return "cpu" if "cpu" in compiled and fault("C++") is None else "reference"
+    if devices == ({"cpu"} if _interpreting else {"cuda"}) and "gpu" in compiled and fault(name) is None:
         return "gpu"
     return "reference"
+
+
+def on_device(tensor: Tensor) -> bool:
+    """Whether numbers of a tensor have to be waited for: it is on a GPU, or taken as if it were (``interpret``)."""
+    return tensor.device.type != "cpu" or _interpreting
 
 
 @functools.cache
@@ -106,7 +118,7 @@ def choose(path: Route) -> None:
         return
     on_gpu = torch.cuda.is_available() or _interpreting
     names = ["Triton", *(n for n in TABLE if "gpu" in TABLE[n][1])] if on_gpu else ["C++"]
-    if reason := next((r for n in names if (r := _fault(n)) is not None), None):
+    if reason := next((r for n in names if (r := fault(n)) is not None), None):
         raise InputError(f"The compiled operations cannot be had ({reason}): use --pipeline.model.ops auto or torch.")
 
 
@@ -131,12 +143,12 @@ def interpret(on: bool) -> None:
     global _interpreting
     if on and os.environ.get("TRITON_INTERPRET") != "1":
         raise ValueError("Triton's interpreter must be asked for before Python starts: set TRITON_INTERPRET=1.")
-    if on and (reason := _fault("Triton")) is not None:
+    if on and (reason := fault("Triton")) is not None:
         raise ValueError(f"Triton cannot be had: {reason}.")
     _interpreting = on
 
 
-def _fault(name: str) -> str | None:
+def fault(name: str) -> str | None:
     """Why the compiler, Triton or an operation's GPU form cannot be used; found out once, and said in the log then."""
     if name not in _faults:
         with _trying:
@@ -154,11 +166,13 @@ def _try(name: str) -> str | None:
         return None
     if name == "Triton":
         try:
-            importlib.import_module("triton")
+            version = importlib.import_module("triton").__version__
         except ImportError as error:
             return _say(f"Triton cannot be imported ({error})")
+        if tuple(int(n) for n in version.split(".")[:2]) < OLDEST_TRITON:
+            return _say(f"Triton {version} is too old for the GPU's kernels, which need torch 2.5 or newer")
         return None
-    if (reason := _fault("Triton")) is not None:
+    if (reason := fault("Triton")) is not None:
         return reason
     try:  # the module tries operations, so it comes after this one
         importlib.import_module("mmpi_ns.ops.trial").run(name, "cpu" if _interpreting else "cuda")
@@ -167,8 +181,11 @@ def _try(name: str) -> str | None:
     return None
 
 
-def _triton_errors() -> type[Exception]:
-    return importlib.import_module("triton.errors").TritonError
+def _did_not_compile(error: Exception) -> bool:
+    """Whether this is Triton's, its compiler's or the assembler's complaint about a kernel."""
+    if isinstance(error, importlib.import_module("triton.errors").TritonError):
+        return True
+    return isinstance(error, RuntimeError) and ("PassManager" in str(error) or "ptxas" in str(error))
 
 
 def _words(error: Exception) -> str:

@@ -170,6 +170,16 @@ def bilinear(table, grids, head, plane, u, v, mask):
 
 
 @triton.jit
+def is_held(grids, head, plane, u, v, mask):
+    """Whether the tables hold any of the four texels around NDC (u, v) on a plane; False where masked."""
+    x, _ = cell(u, tl.load(grids + head * INTS + WIDTH))
+    y, _ = cell(v, tl.load(grids + head * INTS + HEIGHT))
+    near = is_stored(row_of(grids, head, plane, y, x, mask)) | is_stored(row_of(grids, head, plane, y, x + 1, mask))
+    far = is_stored(row_of(grids, head, plane, y + 1, x, mask))
+    return mask & (near | far | is_stored(row_of(grids, head, plane, y + 1, x + 1, mask)))
+
+
+@triton.jit
 def trilinear(table, grids, head, u, v, s, mask):
     """A one-channel table at NDC (u, v, s), s running over planes or layers; 0 where masked."""
     z, fz = cell(s, tl.load(grids + head * INTS + DEPTH))
@@ -238,19 +248,3 @@ def one_minus_exp(tau):
 def minus_log_of_rest(alpha):
     """-log(1 - alpha) for alpha in [0, 1/2)."""
     return twice_atanh(alpha / (2 - alpha))
-
-
-@triton.jit
-def sin_turn(t):
-    """sin(pi t), to 1e-7. The library's sine keeps a table for huge angles in memory; there are none here."""
-    t -= 2 * tl.floor(0.5 * t + 0.5)
-    size = tl.abs(t)
-    z = tl.minimum(size, 1 - size) * 3.14159265
-    q = z * z
-    p = -1.0 / 39916800
-    p = p * q + 1.0 / 362880
-    p = p * q - 1.0 / 5040
-    p = p * q + 1.0 / 120
-    p = p * q - 1.0 / 6
-    sine = z + z * q * p
-    return tl.where(t < 0, -sine, sine)

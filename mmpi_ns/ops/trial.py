@@ -172,14 +172,12 @@ def _gathers(device: str) -> list[tuple]:
     return cases
 
 
-def _places(device: str) -> list[tuple]:
+def _pictures(device: str) -> list[tuple]:
     cases = []
-    for with_cube in (False, True):
-        layout, shape = _scene(device, with_cube)[0], (RAYS, 6)
-        table = 2 * _random(device, len(layout.grids[0].places) * BRICK, CHANNELS) - 1
-        heads = (_random(device, *shape) * layout.num_heads).long()
-        places = (heads, (_random(device, *shape) * 4).long(), 2 * _random(device, *shape, 3) - 1)
-        cases.append((layout, table, *places, _random(device, *shape) > 0.3, 0.1 * _random(device, *shape)))
+    for layout, tables, origins, directions, hits, first, counts, threshold, _, form, baked in _marches(device):
+        features = 2 * _random(device, len(tables.density), CHANNELS) - 1
+        rays = (origins, directions, hits, first, counts)
+        cases.append((layout, tables, features, *rays, threshold, form, baked))
     return cases
 
 
@@ -190,13 +188,12 @@ CASES: dict[str, Callable[[str], list[tuple]]] = {
     "weighted_rows": lambda device: [
         (_random(device, ROWS, CHANNELS), _entries(device, RAYS, taps), _random(device, RAYS, taps)) for taps in (4, 8)
     ],
-    "index_rows": lambda device: [(_entries(device, RAYS, 4), ROWS)],
+    "index_rows": lambda device: [(_entries(device, RAYS, 4), ROWS, False)],
     "sum_rows": _sums,
     "composite_weights": _composites,
     "total_variation": _variations,
     "adam_rows": _adams,
     "gather_taps": _gathers,
-    "gather_places": _places,
-    "shade": lambda device: [],
+    "show_rays": _pictures,
 }
 """Arguments for every operation that has a GPU form."""

@@ -11,20 +11,24 @@ from torch import Tensor
 
 CPU_RAYS = 4096
 """Their samples stay in the caches' reach and below what the C library gives back to the system after each use."""
-GPU_RAYS = 1 << 17
-"""Of more, launches are no smaller part of the time."""
+GPU_RAYS = 1 << 20
+"""A frame of 1242 x 375, or half of one of 1920 x 1080, in one go."""
 BYTES_PER_SAMPLE = 128
 """What rendering holds at its peak for every plane that a ray may cross: where it is hit, what is kept, its colour."""
+BYTES_PER_SLOT = 40
+"""What compiled rendering with one shading a ray holds for every sample that a ray may keep (``ops.show``)."""
 FREE_SHARE = 0.5
 """Of the device's free memory; the rest is for what else runs there."""
 
 
-def rays_per_chunk(samples_per_ray: int, device: torch.device) -> int:
+def rays_per_chunk(samples_per_ray: int, device: torch.device, bytes_per_sample: int = BYTES_PER_SAMPLE) -> int:
     """Rays of a chunk where no number is asked for.
 
     Args:
-        samples_per_ray: samples that a ray has at most: the planes of all MPIs and the steps through the cube.
+        samples_per_ray: samples that a ray has at most: the planes of all MPIs and the steps through the cube; or those
+            that it can keep.
         device: where they are rendered.
+        bytes_per_sample: that each of them takes.
 
     Returns:
         A power of two from ``CPU_RAYS`` to ``GPU_RAYS``.
@@ -32,7 +36,7 @@ def rays_per_chunk(samples_per_ray: int, device: torch.device) -> int:
     if device.type != "cuda":
         return CPU_RAYS
     free = torch.cuda.mem_get_info(device)[0] + torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
-    fit = int(FREE_SHARE * free / (BYTES_PER_SAMPLE * max(samples_per_ray, 1)))
+    fit = int(FREE_SHARE * free / (bytes_per_sample * max(samples_per_ray, 1)))
     return min(max(1 << max(fit, 1).bit_length() - 1, CPU_RAYS), GPU_RAYS)
 
 

@@ -28,6 +28,8 @@ class RenderedRays:
     report: MergeReport
     lookup: Lookup | None
     """Where the field was read; None without gradients."""
+    times: int = 1
+    """How often each ray of a batch is among them: all rays, one time after the other."""
 
 
 def bounded(bundle: RayBundle, plan: ScenePlan) -> RayBundle:
@@ -40,7 +42,12 @@ def bounded(bundle: RayBundle, plan: ScenePlan) -> RayBundle:
 
 @torch.no_grad()
 def median_distance(composite: Composite, samples: RaySamples, plan: ScenePlan) -> Float[Tensor, "R 1"]:
-    """Euclidean distance at half the gathered mass; infinity is shown as ten times the farthest finite plane."""
+    """Euclidean distance at half the gathered mass."""
     inverse_t, valid = metadata_of(samples)["inverse_t"][..., 0], metadata_of(samples)["valid"][..., 0]
+    return distances_of(median_inverse_distance(composite.weights, inverse_t, valid), plan)
+
+
+def distances_of(inverse_t: Float[Tensor, "R 1"], plan: ScenePlan) -> Float[Tensor, "R 1"]:
+    """Distances from inverse ones; infinity is shown as ten times the farthest finite plane."""
     farthest = 10 * max(m.farthest for m in plan.mpis)
-    return 1 / median_inverse_distance(composite.weights, inverse_t, valid).clamp(min=1 / farthest)
+    return 1 / inverse_t.clamp(min=1 / farthest)

@@ -37,6 +37,18 @@ class MergeReport:
     explained: Bool[Tensor, "R 1"]
     """What the ray shows is the asked heads' to account for: they see it from before the first content out to infinity,
     or there are no other heads to see it."""
+    head_counts: tuple[int, ...] | None
+    """Samples of each head, where the march has told."""
+
+
+@dataclass(frozen=True)
+class Crossings:
+    """The live samples of R rays, head by head."""
+
+    hits: PlaneHits
+    first: Int[Tensor, "R H"]
+    """m of the nearest live plane; the number of the first sample in the cube."""
+    counts: Int[Tensor, "R H"]
 
 
 class MMPISampler(Sampler):
@@ -72,37 +84,36 @@ class MMPISampler(Sampler):
             RaySamples [R, S] whose metadata holds ``heads``, ``planes``, ``ndc``, ``inverse_t``, ``valid``,
             ``skipped_before`` and ``tau``, the (blended) optical depth (each [R, S, .]), and what was left out.
         """
-        assert ray_bundle is not None and ray_bundle.nears is not None and ray_bundle.fars is not None
-        origins, directions = ray_bundle.origins, ray_bundle.directions
-        hits = plane_hits(origins, directions, ray_bundle.nears, ray_bundle.fars, field.layout)
-        counts, cube_first = self._counts(ray_bundle, field, hits, head_mask, choose)
-        explained = (counts > 0).any(-1, keepdim=True)
+        assert ray_bundle is not None
+        at = crossings(ray_bundle, field, head_mask, choose)
+        explained = (at.counts > 0).any(-1, keepdim=True)
         if head_mask is not None or choose is not None:
-            explained &= _sees_all(hits, counts[:, : len(field.plan.mpis)], field)
-        first = hits.m_first if cube_first is None else torch.cat([hits.m_first, cube_first[:, None]], -1)
-        rays = (origins, directions, hits, first, counts)
+            explained &= _sees_all(at.hits, at.counts[:, : len(field.plan.mpis)], field)
+        rays = (ray_bundle.origins, ray_bundle.directions, at.hits, at.first, at.counts)
         scene = (field.layout, field.tables(shares))
         merged = march(*scene, *rays, threshold, fair_share, blend_form, baked=shares is not None)
-        report = MergeReport(counts.sum(-1), merged.skipped_total, merged.dropped_mass, explained)
+        left = merged.skipped_total, merged.dropped_mass
+        report = MergeReport(at.counts.sum(-1), *left, explained, merged.head_counts)
         return _ray_samples(ray_bundle, merged), report
 
-    @staticmethod
-    def _counts(
-        ray_bundle: RayBundle, field: MMPIField, hits: PlaneHits, head_mask: Tensor | None, choose: Tensor | None
-    ) -> tuple[Int[Tensor, "R H"], Int[Tensor, "R"] | None]:
-        counts, first = hits.count, None
-        if choose is not None:
-            best = torch.where(counts > 0, choose, torch.full_like(choose, -1.0)).argmax(-1, keepdim=True)
-            counts = torch.zeros_like(counts).scatter(1, best, counts.gather(1, best))
-        if field.cube is not None:
-            assert ray_bundle.nears is not None and ray_bundle.fars is not None
-            first, count = cube_hits(
-                ray_bundle.origins, ray_bundle.directions, ray_bundle.nears, ray_bundle.fars, field.cube
-            )
-            counts = torch.cat([counts, count[:, None]], -1)
-        if head_mask is not None:
-            counts = torch.where(head_mask, counts, torch.zeros_like(counts))
-        return counts, first
+
+def crossings(
+    ray_bundle: RayBundle, field: MMPIField, head_mask: Tensor | None = None, choose: Tensor | None = None
+) -> Crossings:
+    """The live samples of rays in the heads that may answer them (see ``MMPISampler``)."""
+    origins, directions, nears, fars = ray_bundle.origins, ray_bundle.directions, ray_bundle.nears, ray_bundle.fars
+    assert nears is not None and fars is not None
+    hits = plane_hits(origins, directions, nears, fars, field.layout)
+    first, counts = hits.m_first, hits.count
+    if choose is not None:
+        best = torch.where(counts > 0, choose, torch.full_like(choose, -1.0)).argmax(-1, keepdim=True)
+        counts = torch.zeros_like(counts).scatter(1, best, counts.gather(1, best))
+    if field.cube is not None:
+        start, count = cube_hits(origins, directions, nears, fars, field.cube)
+        first, counts = torch.cat([first, start[:, None]], -1), torch.cat([counts, count[:, None]], -1)
+    if head_mask is not None:
+        counts = torch.where(head_mask, counts, torch.zeros_like(counts))
+    return Crossings(hits, first, counts)
 
 
 def _sees_all(hits: PlaneHits, counts: Int[Tensor, "R K"], field: MMPIField) -> Bool[Tensor, "R 1"]:

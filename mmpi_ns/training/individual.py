@@ -27,7 +27,7 @@ def individual_rays(
         return bundle, None, torch.rand(len(bundle), num_mpis, generator=g, device=device)
     own = torch.arange(num_mpis, device=device).repeat_interleave(len(bundle))
     mask = torch.arange(plan.num_heads, device=device) == own[:, None]
-    mask[:, num_mpis:] = True
+    mask[:, num_mpis:].fill_(True)
     return repeat_rays(bundle, num_mpis), mask, None
 
 

@@ -164,9 +164,12 @@ def batch_losses(
         step: of the training.
     """
     known = rays.bundle.metadata.get(KEYPOINT_DEPTH)
-    is_pixel = is_pixel_ray(rays.bundle)
-    pixels = is_pixel.nonzero()[:, 0]  # once: every use of a mask would wait for the device
-    image = image.repeat(len(pixels) // len(image), 1)
+    # By counting: a GPU would be waited for to say which rays are pixels'.
+    asked, size, device = len(image), len(rays.bundle) // rays.times, image.device
+    starts = size * torch.arange(rays.times, device=device)[:, None]
+    pixels = (starts + torch.arange(asked, device=device)).reshape(-1)
+    keypoints = (starts + torch.arange(asked, size, device=device)).reshape(-1)
+    image = image.repeat(rays.times, 1)
     random = torch.rand(image.shape[0], 3, generator=g, device=image.device)
     observed = over_background(image, random)
     # Where MPIs that train apart see a ray only in part, what they let through is not theirs to explain.
@@ -181,8 +184,8 @@ def batch_losses(
         "entropy": weight.background_entropy * background_entropy(composite.transmittance),
         "distortion": weight.distortion * _distortion(rays, pixels, composite, field.plan.content_near),
     }
-    if known is not None and len(pixels) < len(is_pixel):
-        total["keypoint_depth"] = weight.keypoint_depth * _keypoint_depth(rays, (~is_pixel).nonzero()[:, 0], known)
+    if known is not None and len(keypoints):
+        total["keypoint_depth"] = weight.keypoint_depth * _keypoint_depth(rays, keypoints, known)
     if PIXEL_DEPTH in rays.bundle.metadata and weight.known_depth > 0:
         total["known_depth"] = weight.known_depth * _known_depth(rays, pixels, composite, field, weight.depth_outliers)
     if rays.lookup is not None and step % weight.tv_every == 0 and field.density.requires_grad:

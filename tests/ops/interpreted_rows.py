@@ -7,15 +7,12 @@ import torch
 from bricked import SHAPES, bricked_field, layout_of, thinned
 from gather_batches import batch, in_float32, with_gradients
 from interpreting import by_torch, interpreted, normal  # noqa: F401
-from random_fields import bundle, random_field, random_rays
 
-from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.ops import composite, gather, interpolate
 from mmpi_ns.ops.composite import reference as plain_composite
 from mmpi_ns.ops.interpolate import reference as plain_interpolate
 from mmpi_ns.ops.variation import reference as plain_variation
 from mmpi_ns.ops.variation import total_variation
-from mmpi_ns.rendering.sampler import MMPISampler
 from mmpi_ns.training.touched_adam import TouchedAdam
 
 # Rows ----------------------------------------------------------------------------------------------------------------
@@ -64,8 +61,20 @@ def test_distinct_rows_are_those_of_the_reference(count, spread):
     assert found.position.shape == rows.shape and torch.equal(found.unique[found.position.long()], rows)
 
 
-def test_no_rows_are_no_distinct_rows():
-    found = interpolate.index_rows(torch.zeros(0, 4, dtype=torch.int64), 9)
+def test_padded_rows_end_in_row_0_which_nothing_is_added_to():
+    rows = torch.tensor([[7, 3], [3, 90], [7, 7]])
+    found = interpolate.index_rows(rows, 100, pads=True)
+    assert found.unique.tolist() == [3, 7, 90, 0, 0, 0] and torch.equal(found.unique[found.position.long()], rows)
+    table = normal(100, 1).requires_grad_()
+    interpolate.interpolate(table, rows, torch.ones(3, 2)).sum().backward()
+    assert table.grad.is_sparse and torch.equal(
+        table.grad.to_dense()[:, 0], torch.bincount(rows.reshape(-1), minlength=100).float()
+    )
+
+
+@pytest.mark.parametrize("pads", [False, True])
+def test_no_rows_are_no_distinct_rows(pads):
+    found = interpolate.index_rows(torch.zeros(0, 4, dtype=torch.int64), 9, pads)
     assert found.unique.shape == (0,) and found.position.shape == (0, 4)
     assert interpolate.sum_rows(found.position, torch.zeros(0, 3), torch.zeros(0, 4), 0).shape == (0, 3)
 
@@ -134,47 +143,6 @@ def test_adam_on_rows_equals_the_plain_one():
 # Colours -------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("shared", [False, True])
-@pytest.mark.parametrize(("channels", "width", "octaves"), [(3, 5, (0, 0)), (9, 32, (2, 2)), (4, 64, (4, 1))])
-def test_shading_equals_the_colour_networks(channels, width, octaves, shared):
-    plan = random_field(3, True, seed=7).plan
-    field = MMPIField(
-        plan,
-        feature_channels=channels,
-        hidden_width=width,
-        position_frequencies=octaves[0],
-        direction_frequencies=octaves[1],
-        shared_colour=shared,
-    ).eval()
-    field.features.data = normal(*field.features.shape, seed=1) * 2
-    field.networks.weights.data = normal(*field.networks.weights.shape, seed=2) * 0.3
-    samples, _ = MMPISampler()(bundle(*random_rays(plan, 30, seed=8)), field=field, threshold=0.0)
-    assert samples.metadata["heads"].unique().numel() == 4
-    with torch.no_grad():
-        fast = next(iter(field.get_outputs(samples).values()))
-        plain = by_torch(lambda: next(iter(field.get_outputs(samples).values())))
-    assert plain.std() > 0.05 and (fast - plain).abs().max() < 5e-6
-    assert (fast[~samples.metadata["valid"][..., 0]] == 0).all()
-
-
-def gathered_at_places(channels, with_cube):
-    """What rays gather without gradients, and what the reference in float64 says."""
-    field = MMPIField(random_field(3, with_cube, seed=7).plan, feature_channels=channels).eval()
-    field.features.data = normal(*field.features.shape, seed=1) * 2
-    samples, _ = MMPISampler()(bundle(*random_rays(field.plan, 40, seed=8)), field=field, threshold=0.0)
-    meta = samples.metadata
-    places = [meta[n][..., 0] for n in ("heads", "planes")] + [meta["ndc"], meta["valid"][..., 0]]
-    weights = torch.rand(places[-1].shape, generator=torch.Generator().manual_seed(3))
-    found = gather.gather_places(field.layout, field.features.data, *places, weights)
-    return found, gather.reference.gather_places(field.layout, field.features.data, *places, weights)
-
-
-@pytest.mark.parametrize(("channels", "with_cube"), [(3, False), (9, True), (20, True)])
-def test_rays_gather_what_the_reference_says(channels, with_cube):
-    for a, b in zip(*(vars(s).values() for s in gathered_at_places(channels, with_cube)), strict=True):
-        assert b.abs().max() > 1 and (a - b).abs().max() < 2e-5
-
-
 @pytest.mark.parametrize("trains", [True, False])
 @pytest.mark.parametrize(("channels", "in_cube"), [(3, False), (9, True), (20, True)])
 def test_gathered_sums_and_their_gradients_are_those_of_float64(channels, in_cube, trains):
@@ -200,13 +168,6 @@ def test_without_samples_rays_gather_nothing():
     assert all(s.shape[0] == 3 and not s.any() for s in vars(sums).values())
     sums.gathered.sum().backward()
     assert not weights.grad.any()
-
-
-def test_without_samples_there_are_no_colours():
-    field = random_field(2, seed=1)
-    samples, _ = MMPISampler()(bundle([[0, 0, 0]], [[0, 0, 1]], far=1e-3), field=field, threshold=0.0)
-    with torch.no_grad():
-        assert (next(iter(field.get_outputs(samples).values())) == 0).all()
 
 
 # Compositing ---------------------------------------------------------------------------------------------------------

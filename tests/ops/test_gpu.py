@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import re
 import sys
+from types import SimpleNamespace
 
 import pytest
 import torch
 from random_fields import bundle, random_field, random_rays, render
 from triton_processes import HERE, needs_triton, python
+from waits import TRAININGS, counted_on_a_gpu, waits_of_phases
 
 from mmpi_ns.ops import dispatch
 
@@ -16,7 +18,7 @@ from mmpi_ns.ops import dispatch
 @needs_triton
 def test_kernels_by_the_interpreter():
     """The variable must be set before Triton is imported, so these tests have a process of their own."""
-    files = [str(HERE / "ops" / f"interpreted_{part}.py") for part in ("march", "rows")]
+    files = [str(HERE / "ops" / f"interpreted_{part}.py") for part in ("march", "rows", "show", "steps")]
     found = python("-m", "pytest", "-p", "no:cacheprovider", *files, TRITON_INTERPRET="1")
     assert found.returncode == 0, found.stdout[-6000:] + found.stderr[-2000:]
     passed = re.search(r"(\d+) passed", found.stdout)
@@ -26,23 +28,22 @@ def test_kernels_by_the_interpreter():
 @needs_triton
 def test_kernels_compile_for_a_gpu_without_spilling_registers(monkeypatch):
     """The interpreter takes what the compiler does not: types, shapes, control flow."""
-    from triton_compiling import compiling, launches, resources
+    from triton_compiling import all_launches, resources
 
-    monkeypatch.setattr(dispatch, "_interpreting", True)
-    monkeypatch.setattr(dispatch, "_faults", dict.fromkeys(["Triton", *dispatch.TABLE]))
-    with compiling({}) as made:
-        launches(monkeypatch)
-    names = {name for name, *_ in made}
-    assert {
-        "march_kernel",
-        "pack_kernel",
-        "weighted_rows_kernel",
-        "sum_rows_kernel",
-        "mark_kernel",
-        "adam_kernel",
-    } < names
-    for (name, constants, _), kernel in made.items():
-        assert "STACK:0" in resources(kernel), (name, constants)
+    launches = all_launches(monkeypatch.setattr)
+    assert {"hits_kernel", "march_kernel", "pack_kernel", "gather_kernel", "adam_kernel"} < {x.name for x in launches}
+    for launch in launches:
+        assert "STACK:0" in resources(launch.compiled(90)), (launch.name, launch.constants)
+
+
+@needs_triton
+@pytest.mark.commands
+@pytest.mark.parametrize("architecture", [75, 80, 86, 89])
+def test_kernels_compile_for_older_gpus(monkeypatch, architecture):
+    from triton_compiling import all_launches, largest_launches
+
+    for launch in largest_launches(all_launches(monkeypatch.setattr)):
+        assert launch.compiled(architecture).asm["cubin"], launch.name
 
 
 @pytest.mark.gpu
@@ -52,6 +53,14 @@ def test_kernels_on_a_gpu():
 
     found = run_checks("cuda", rehearse=False)
     assert found["failed"] == 0 and len(found["checks"]) > 30, [c for c in found["checks"] if not c["ok"]]
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+@TRAININGS
+def test_a_step_on_a_gpu_waits_for_it_twice_at_most(scene, plan_file, tmp_path, training, phases):
+    found = waits_of_phases(scene, plan_file, tmp_path, training, "cuda", counted_on_a_gpu)
+    assert list(found) == phases and all(1 <= sum(waits.values()) <= 2 for waits in found.values()), found
 
 
 def test_importing_the_package_imports_no_kernel():
@@ -94,6 +103,29 @@ def test_without_triton_plain_torch_runs_and_the_log_says_so(monkeypatch, no_tri
     dispatch.choose("auto")
     field = random_field(2, seed=1)
     assert torch.isfinite(render(field, bundle(*random_rays(field.plan, 5, seed=1))).rgb).all()
+
+
+@pytest.mark.parametrize(("version", "accepted"), [("3.0.0", False), ("3.1.0", True), ("3.10.0+git", True)])
+def test_a_triton_too_old_for_the_kernels_is_refused_in_one_sentence(monkeypatch, capsys, version, accepted):
+    monkeypatch.setattr(dispatch, "_faults", {})
+    monkeypatch.setitem(sys.modules, "triton", SimpleNamespace(__version__=version))
+    assert (dispatch.fault("Triton") is None) == accepted
+    said = " ".join(capsys.readouterr().out.split())
+    assert accepted == (not said) and (accepted or (f"Triton {version} is too old" in said and "torch 2.5" in said))
+
+
+def test_a_kernel_that_does_not_compile_for_a_shape_leaves_its_operation_to_plain_torch(monkeypatch, capsys):
+    def fails(*given):
+        raise RuntimeError("`ptxas` failed with error code 255")
+
+    right, table = dispatch.function, torch.arange(6.0).view(3, 2)
+    monkeypatch.setattr(dispatch, "_faults", {"weighted_rows": None})
+    monkeypatch.setattr(dispatch, "form_of", lambda name, *tensors: "reference" if dispatch._faults[name] else "gpu")
+    monkeypatch.setattr(dispatch, "function", lambda name, form: fails if form == "gpu" else right(name, form))
+    for _ in range(2):
+        found = dispatch.run("weighted_rows", table, torch.tensor([[2, 0]]), torch.tensor([[1.0, 0.5]]))
+        assert found.tolist() == [[4.0, 5.5]]
+    assert " ".join(capsys.readouterr().out.split()).count("Plain torch for weighted_rows") == 1
 
 
 def test_on_a_cpu_nothing_takes_the_gpus_kernels():

@@ -12,7 +12,7 @@ BLOCK = 1024
 """Entries of a program."""
 
 
-@triton.jit
+@triton.jit(do_not_specialize=("size",))
 def adam_kernel(
     rows, grads, params, means, squares, size, channels, beta1, beta2, correction, eps, rate, BLOCK: tl.constexpr
 ):

@@ -18,7 +18,7 @@ SLOTS = 2048
 """Samples of a program: as many rays as make that many."""
 
 
-@triton.jit
+@triton.jit(do_not_specialize=("num_rays", "slots"))
 def composite_kernel(
     taus, valid, befores, totals, weights, depths, num_rays, slots, RAYS: tl.constexpr, SLOTS: tl.constexpr
 ):
@@ -37,7 +37,7 @@ def composite_kernel(
     tl.store(depths + ray, depth, ray < num_rays)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=("num_rays", "slots"))
 def composite_backward_kernel(
     taus, valid, befores, weights, weight_grads, depth_grads, tau_grads, num_rays, slots,
     RAYS: tl.constexpr, SLOTS: tl.constexpr,

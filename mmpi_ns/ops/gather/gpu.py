@@ -14,8 +14,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mmpi_ns.ops.gather.reference import COLORS, KnownTaps, RaySums
-from mmpi_ns.ops.gpu_scene import DEPTH, HEIGHT, INTS, WIDTH, GpuScene, block_size, cell, row_of
-from mmpi_ns.ops.layout import SceneLayout
+from mmpi_ns.ops.gpu_scene import block_size
 
 NUMBERS = 512
 """Rays, or samples, of a program, times their channels: what its registers hold."""
@@ -38,43 +37,6 @@ def store_sums(sums, ray, inside, channels, total, mass, squares, column):
 
 
 @triton.jit
-def gather_places_kernel(
-    table, heads, planes, places, valid, weights, grids, sums, num_rays, slots, channels, num_mpis,
-    HAS_CUBE: tl.constexpr, CHANNELS: tl.constexpr, BLOCK: tl.constexpr,
-):  # fmt: skip
-    """Sums over samples at places in the heads; a lane a ray."""
-    ray, column = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK), tl.arange(0, CHANNELS)[None, :]
-    inside = ray < num_rays
-    mass = ray * 0.0
-    total = mass[:, None] * column
-    squares = total
-    for s in range(slots):
-        slot = ray.to(tl.int64) * slots + s
-        known = tl.load(valid + slot, inside, 0) != 0
-        head, z = tl.load(heads + slot, known, 0), tl.load(planes + slot, known, 0).to(tl.int64)
-        weight, grid = tl.load(weights + slot, known, 0.0), grids + head * INTS
-        x, fx = cell(tl.load(places + 3 * slot, known, 0.0), tl.load(grid + WIDTH))
-        y, fy = cell(tl.load(places + 3 * slot + 1, known, 0.0), tl.load(grid + HEIGHT))
-        in_cube, fz = head >= num_mpis, fx * 0
-        if HAS_CUBE:
-            lower, fraction = cell(tl.load(places + 3 * slot + 2, known, 0.0), tl.load(grid + DEPTH))
-            z, fz = tl.where(in_cube, lower, z), tl.where(in_cube, fraction, 0.0)
-        raw = total * 0
-        for tap in tl.static_range(8 if HAS_CUBE else 4):
-            dx, dy, dz = tap % 2, tap // 2 % 2, tap // 4
-            share = (fx if dx else 1 - fx) * (fy if dy else 1 - fy) * (fz if dz else 1 - fz)
-            reads = known & (in_cube | (dz == 0))
-            row = row_of(grids, head, z + dz, y + dy, x + dx, reads)
-            read = tl.load(table + row[:, None] * channels + column, reads[:, None] & (column < channels), 0.0)
-            raw += tl.where(reads, share, 0.0)[:, None] * read
-        value = weight[:, None] * activate(raw, column)
-        total += value
-        squares += value * activate(raw, column)
-        mass += weight
-    store_sums(sums, ray, inside, channels, total, mass, squares, column)
-
-
-@triton.jit
 def read_taps(values, positions, shares, number, known, channels, column, TAPS: tl.constexpr):
     """Interpolated texels of samples."""
     raw = number[:, None] * column * 0.0
@@ -86,7 +48,7 @@ def read_taps(values, positions, shares, number, known, channels, column, TAPS: 
     return raw
 
 
-@triton.jit
+@triton.jit(do_not_specialize=("num_rays", "slots", "planar"))
 def gather_kernel(
     values, numbers, weights, positions, shares, cube_positions, cube_shares, sums, num_rays, slots, channels, planar,
     HAS_CUBE: tl.constexpr, CHANNELS: tl.constexpr, BLOCK: tl.constexpr,
@@ -112,7 +74,7 @@ def gather_kernel(
     store_sums(sums, ray, inside, channels, total, mass, squares, column)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=("count", "slots_per_ray"))
 def gather_back_kernel(
     values, slots, wanted, weights, positions, shares, to_sums, to_first, to_second, to_values, to_weights,
     count, slots_per_ray, channels, NEEDED: tl.constexpr, TAPS: tl.constexpr, CHANNELS: tl.constexpr,
@@ -144,7 +106,7 @@ def _split(sums: Float[Tensor, "R N"], channels: int) -> tuple[Tensor, Tensor, T
     return gathered, mass, gathered[:, :COLORS].clone(), second
 
 
-def _sizes(channels: int, device: torch.device) -> tuple[int, int]:
+def sizes(channels: int, device: torch.device) -> tuple[int, int]:
     """Columns, and rays or samples, of a program."""
     columns = max(4, int(triton.next_power_of_2(channels)))  # colours take three, however few there are
     return columns, block_size(max(8, NUMBERS // columns), device)
@@ -161,7 +123,7 @@ class _GatherTaps(torch.autograd.Function):
         numbers = torch.full((num_rays, width), -1, dtype=torch.int32, device=device)
         numbers.view(-1)[slots] = torch.arange(len(slots), dtype=torch.int32, device=device)
         numbers.masked_fill_(~wanted[:, None], -1)
-        sums, (columns, block) = torch.zeros(num_rays, channels + 1 + COLORS, device=device), _sizes(channels, device)
+        sums, (columns, block) = torch.zeros(num_rays, channels + 1 + COLORS, device=device), sizes(channels, device)
         if len(slots):
             gather_kernel[(triton.cdiv(num_rays, block),)](
                 values, numbers, weights, positions, shares, cube_positions, cube_shares, sums,
@@ -179,7 +141,7 @@ class _GatherTaps(torch.autograd.Function):
         to_sums, _, to_first, to_second = (g.contiguous() for g in grad_outputs)
         needed, channels = ctx.needs_input_grad[0], values.shape[1]
         to_values, to_weights = torch.zeros_like(values) if needed else values, torch.zeros_like(weights)
-        columns, block = _sizes(channels, values.device)
+        columns, block = sizes(channels, values.device)
         for own, positions, shares in zip(
             slots.split([len(taps[0]), len(taps[2])]), taps[::2], taps[1::2], strict=True
         ):
@@ -204,24 +166,3 @@ def gather_taps(
     none = {n: (slots.new_zeros(0, n), weights.new_zeros(0, n)) for n in (4, 8)}
     taps = [x for pair in (none | found).values() for x in pair]
     return RaySums(*_GatherTaps.apply(values, weights, slots, wanted, *taps))  # type: ignore[misc]
-
-
-def gather_places(
-    layout: SceneLayout,
-    table: Float[Tensor, "T C"],
-    heads: Int[Tensor, "R S"],
-    planes: Int[Tensor, "R S"],
-    ndc: Float[Tensor, "R S 3"],
-    valid: Bool[Tensor, "R S"],
-    weights: Float[Tensor, "R S"],
-) -> RaySums:
-    """See ``reference.gather_places``."""
-    (num_rays, slots), channels, device = weights.shape, table.shape[1], table.device
-    held = [x.detach().contiguous() for x in (table, heads, planes, ndc, valid, weights)]
-    sums, (columns, block) = torch.empty(num_rays, channels + 1 + COLORS, device=device), _sizes(channels, device)
-    if num_rays:
-        gather_places_kernel[(triton.cdiv(num_rays, block),)](
-            *held, GpuScene.of(layout).grids, sums, num_rays, slots, channels, len(layout.mpis),
-            HAS_CUBE=layout.num_heads > len(layout.mpis), CHANNELS=columns, BLOCK=block,
-        )  # fmt: skip
-    return RaySums(*_split(sums, channels))

@@ -46,16 +46,23 @@ def _narrow(low, high, never, p, q, step, end):
 
 
 @triton.jit
-def _is_live(m, p, q, oz, step, end, last):
+def _is_live(m, near, far, q_far, bend_u, left, right, bend_v, up, down, oz, step, end, last):
     """Whether plane m meets all conditions: they decide where the division may be off by one."""
     w = m * step + end
-    live = (w * oz < 1) & (m >= 0) & (m <= last)
-    for i in tl.static_range(6):
-        live = live & (p[i] * w <= q[i])
-    return live
+    live = (w * oz < 1) & (m >= 0) & (m <= last) & (near * w <= 1) & (far * w <= q_far)
+    live = live & (bend_u * w <= right) & (-bend_u * w <= left)
+    return live & (bend_v * w <= down) & (-bend_v * w <= up)
 
 
 @triton.jit
+def _settle(m, out, near, far, q_far, bend_u, left, right, bend_v, up, down, oz, step, end, last):
+    """The last plane of a range: m, or the next one out, or the next one in."""
+    more = _is_live(m + out, near, far, q_far, bend_u, left, right, bend_v, up, down, oz, step, end, last)
+    less = _is_live(m, near, far, q_far, bend_u, left, right, bend_v, up, down, oz, step, end, last)
+    return tl.where(more, m + out, tl.where(less, m, m - out))
+
+
+@triton.jit(do_not_specialize=("size",))
 def hits_kernel(
     origins, directions, nears, fars, frames, firsts, counts, us, vs, local_origins, local_directions, size,
     K: tl.constexpr, BLOCK: tl.constexpr,
@@ -68,49 +75,44 @@ def hits_kernel(
     x, y, z = tl.load(origins + 3 * ray), tl.load(origins + 3 * ray + 1), tl.load(origins + 3 * ray + 2)
     x, y, z = x - tl.load(frame), y - tl.load(frame + 1), z - tl.load(frame + 2)
     ox, oy, oz = _rotate(frame + AXES, x, y, z)
-    dx, dy, dz = _rotate(
-        frame + AXES,
-        tl.load(directions + 3 * ray),
-        tl.load(directions + 3 * ray + 1),
-        tl.load(directions + 3 * ray + 2),
-    )
+    x, y, z = tl.load(directions + 3 * ray), tl.load(directions + 3 * ray + 1), tl.load(directions + 3 * ray + 2)
+    dx, dy, dz = _rotate(frame + AXES, x, y, z)
     facing = dz > EPS
     depth = tl.where(facing, dz, 1.0)
     u, v = dx / depth, dy / depth
     bend_u, bend_v = ox - oz * u, oy - oz * v
+    # Half-spaces p w <= q of the disparity w: from near to far, and within the extent.
     far, extent = 1 / tl.load(fars + ray), frame + EXTENT
-    p = (dz * tl.load(nears + ray) + oz, -(dz + oz * far), bend_u, -bend_u, bend_v, -bend_v)
-    q = (
-        far * 0 + 1,
-        -far,
-        tl.load(extent + 1) - u,
-        u - tl.load(extent),
-        tl.load(extent + 3) - v,
-        v - tl.load(extent + 2),
-    )
+    p_near, p_far = dz * tl.load(nears + ray) + oz, -(dz + oz * far)
+    left, right = u - tl.load(extent), tl.load(extent + 1) - u
+    up, down = v - tl.load(extent + 2), tl.load(extent + 3) - v
     step, end, last = tl.load(frame + STEP), tl.load(frame + END), tl.load(frame + LAST)
     low, high, never = tl.zeros([BLOCK], tl.float32), last + 0 * oz, oz != oz
-    for c in tl.static_range(6):
-        low, high, never = _narrow(low, high, never, p[c], q[c], step, end)
+    low, high, never = _narrow(low, high, never, p_near, far * 0 + 1, step, end)
+    low, high, never = _narrow(low, high, never, p_far, -far, step, end)
+    low, high, never = _narrow(low, high, never, bend_u, right, step, end)
+    low, high, never = _narrow(low, high, never, -bend_u, left, step, end)
+    low, high, never = _narrow(low, high, never, bend_v, down, step, end)
+    low, high, never = _narrow(low, high, never, -bend_v, up, step, end)
     high = tl.where(never, -1.0, tl.maximum(tl.floor(high), -1.0))
     low = tl.where(never, last + 1, tl.minimum(tl.ceil(low), last + 1))
-    more, less = _is_live(high + 1, p, q, oz, step, end, last), _is_live(high, p, q, oz, step, end, last)
-    high = tl.where(more, high + 1, tl.where(less, high, high - 1))
-    more, less = _is_live(low - 1, p, q, oz, step, end, last), _is_live(low, p, q, oz, step, end, last)
-    low = tl.where(more, low - 1, tl.where(less, low, low + 1))
+    high = _settle(high, 1, p_near, p_far, -far, bend_u, left, right, bend_v, up, down, oz, step, end, last)
+    low = _settle(low, -1, p_near, p_far, -far, bend_u, left, right, bend_v, up, down, oz, step, end, last)
     tl.store(firsts + i, high.to(tl.int64), exists)
     tl.store(counts + i, tl.where(facing, tl.maximum(high - low + 1, 0.0), 0.0).to(tl.int64), exists)
-    _store(us, vs, local_origins, local_directions, i, exists, (u, bend_u), (v, bend_v), (ox, oy, oz), (dx, dy, dz))
+    tl.store(us + 2 * i, u, exists)
+    tl.store(us + 2 * i + 1, bend_u, exists)
+    tl.store(vs + 2 * i, v, exists)
+    tl.store(vs + 2 * i + 1, bend_v, exists)
+    _store(local_origins + 3 * i, ox, oy, oz, exists)
+    _store(local_directions + 3 * i, dx, dy, dz, exists)
 
 
 @triton.jit
-def _store(us, vs, local_origins, local_directions, i, exists, u, v, origin, direction):
-    for a in tl.static_range(2):
-        tl.store(us + 2 * i + a, u[a], exists)
-        tl.store(vs + 2 * i + a, v[a], exists)
-    for a in tl.static_range(3):
-        tl.store(local_origins + 3 * i + a, origin[a], exists)
-        tl.store(local_directions + 3 * i + a, direction[a], exists)
+def _store(to, x, y, z, exists):
+    tl.store(to, x, exists)
+    tl.store(to + 1, y, exists)
+    tl.store(to + 2, z, exists)
 
 
 def plane_hits(origins: Tensor, directions: Tensor, nears: Tensor, fars: Tensor, layout: SceneLayout) -> PlaneHits:

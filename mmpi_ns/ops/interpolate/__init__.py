@@ -24,9 +24,16 @@ def texel_rows(
     return dispatch.run("texel_rows", layout, heads, planes, ndc)
 
 
-def index_rows(rows: Int[Tensor, "..."], table_rows: int) -> RowIndex:
-    """The distinct rows, rising, that a list names of a table of so many. On a GPU waits once, for their number."""
-    return dispatch.run("index_rows", rows, table_rows)
+def index_rows(rows: Int[Tensor, "..."], table_rows: int, pads: bool = False) -> RowIndex:
+    """The distinct rows, rising, that a list names of a table of so many.
+
+    Args:
+        rows: the list.
+        table_rows: of the table.
+        pads: the distinct rows may be followed by row 0 over and over, which no entry is: a GPU then need not be waited
+            for to tell their number.
+    """
+    return dispatch.run("index_rows", rows, table_rows, pads)
 
 
 def sum_rows(
@@ -75,7 +82,7 @@ class _Interpolate(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, None, None]:
         rows, weights = ctx.saved_tensors
-        index = index_rows(rows, ctx.table_shape[0])
+        index = index_rows(rows, ctx.table_shape[0], pads=True)
         values = sum_rows(index.position, grad_outputs[0], weights, len(index.unique))
         return _row_gradient(index.unique, values, ctx.table_shape), None, None
 

@@ -25,11 +25,11 @@ def texel_rows(layout: SceneLayout, heads: Tensor, planes: Tensor, ndc: Tensor) 
     return rows, weights
 
 
-def index_rows(rows: Tensor, table_rows: int) -> RowIndex:
+def index_rows(rows: Tensor, table_rows: int, pads: bool) -> RowIndex:
     """See ``ops.interpolate``."""
     count = rows.numel()
     if table_rows > MOST_ROWS or not 0 < count < 2**31:
-        return reference.index_rows(rows, table_rows)
+        return reference.index_rows(rows, table_rows, pads)
     bricks = torch.zeros(-(-table_rows // BRICK), 2, dtype=torch.int64)
     unique, position = torch.empty(count, dtype=torch.int64), torch.empty(rows.shape, dtype=torch.int32)
     given = (address(rows.contiguous(), torch.int64), *sizes(count), address(bricks, torch.int64), *sizes(len(bricks)))

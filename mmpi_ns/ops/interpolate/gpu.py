@@ -20,7 +20,7 @@ ROWS = 128
 # Which rows ---------------------------------------------------------------------------------------------------------
 
 
-@triton.jit
+@triton.jit(do_not_specialize=("count",))
 def texel_rows_kernel(heads, planes, ndc, grids, rows, weights, count, BLOCK: tl.constexpr):
     """Rows and weights of the four texels around samples."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -52,7 +52,7 @@ def texel_rows(layout: SceneLayout, heads: Tensor, planes: Tensor, ndc: Tensor) 
 # Interpolation ------------------------------------------------------------------------------------------------------
 
 
-@triton.jit
+@triton.jit(do_not_specialize=("count",))
 def weighted_rows_kernel(
     table, rows, weights, out, count, channels, TAPS: tl.constexpr, CHANNELS: tl.constexpr, BLOCK: tl.constexpr
 ):
@@ -81,7 +81,7 @@ def weighted_rows(table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
     return out
 
 
-@triton.jit
+@triton.jit(do_not_specialize=("count",))
 def sum_rows_kernel(
     positions, weights, values, out, count, channels,
     TAPS: tl.constexpr, WEIGHTED: tl.constexpr, CHANNELS: tl.constexpr, BLOCK: tl.constexpr,
@@ -116,7 +116,7 @@ def sum_rows(position: Tensor, values: Tensor, weights: Tensor | None, count: in
 # Distinct rows ------------------------------------------------------------------------------------------------------
 
 
-@triton.jit
+@triton.jit(do_not_specialize=("count",))
 def mark_kernel(rows, words, count, BLOCK: tl.constexpr):
     """Sets the bit of every row in words of 32."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -132,14 +132,14 @@ def _bits(word):
     return ((((word + (word >> 4)) & 0x0F0F0F0F) * 0x01010101) >> 24) & 0xFF
 
 
-@triton.jit
+@triton.jit(do_not_specialize=("size",))
 def count_kernel(words, counts, size, BLOCK: tl.constexpr):
     """counts[i] = set bits of words[i]."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     tl.store(counts + i, _bits(tl.load(words + i, i < size, 0)), i < size)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=("size",))
 def list_kernel(words, ends, unique, size, BLOCK: tl.constexpr):
     """Writes the rows whose bits are set, rising; ``ends`` counts them up to the end of each word."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -151,7 +151,7 @@ def list_kernel(words, ends, unique, size, BLOCK: tl.constexpr):
         at += is_set.to(tl.int32)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=("count",))
 def position_kernel(rows, words, ends, position, count, BLOCK: tl.constexpr):
     """Which of the distinct rows every entry is."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -161,22 +161,20 @@ def position_kernel(rows, words, ends, position, count, BLOCK: tl.constexpr):
     tl.store(position + i, tl.load(ends + (row >> 5), i < count, 0) - _bits(not_before), i < count)
 
 
-def index_rows(rows: Tensor, table_rows: int) -> RowIndex:
+def index_rows(rows: Tensor, table_rows: int, pads: bool) -> RowIndex:
     """See ``ops.interpolate``. A bit for every row of the table, and a running count of those that are set."""
     flat, device, block = rows.reshape(-1).contiguous(), rows.device, block_size(ROWS, rows.device)
     count, size = len(flat), -(-table_rows // 32)
     position = torch.empty(rows.shape, dtype=torch.int32, device=device)
     if not count:
         return RowIndex(flat, position)
-    words, counts = (
-        torch.zeros(size, dtype=torch.int32, device=device),
-        torch.empty(size, dtype=torch.int32, device=device),
-    )
+    words, counts = (torch.zeros(size, dtype=torch.int32, device=device) for _ in range(2))
     entries, of_words = (triton.cdiv(count, block),), (triton.cdiv(size, block),)
     mark_kernel[entries](flat, words, count, BLOCK=block)
     count_kernel[of_words](words, counts, size, BLOCK=block)
     ends = counts.cumsum(0, dtype=torch.int32)
-    unique = torch.empty(int(ends[-1]), dtype=torch.int64, device=device)
+    found = min(count, table_rows) if pads else int(ends[-1])
+    unique = torch.zeros(found, dtype=torch.int64, device=device)
     list_kernel[of_words](words, ends, unique, size, BLOCK=block)
     position_kernel[entries](flat, words, ends, position, count, BLOCK=block)
     return RowIndex(unique, position)

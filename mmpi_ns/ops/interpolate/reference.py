@@ -16,7 +16,7 @@ class RowIndex:
     """Which rows a list of lookups reads, each once, and which of those every entry is."""
 
     unique: Int[Tensor, "U"]
-    """Rising."""
+    """Rising, but for what it is padded with."""
     position: Int[Tensor, "..."]
     """Of every entry in ``unique``; int32 or int64."""
 
@@ -30,7 +30,7 @@ def texel_rows(layout: SceneLayout, heads: Tensor, planes: Tensor, ndc: Tensor) 
     return rows, weights
 
 
-def index_rows(rows: Tensor, table_rows: int) -> RowIndex:
+def index_rows(rows: Tensor, table_rows: int, pads: bool) -> RowIndex:
     """See ``ops.interpolate``."""
     return RowIndex(*torch.unique(rows, return_inverse=True))
 

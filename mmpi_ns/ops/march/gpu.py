@@ -10,9 +10,12 @@ each other. A ray ends where less than 1e-5 of its light is left, and less than 
 # pyright: reportGeneralTypeIssues=false, reportCallIssue=false, reportArgumentType=false
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 import triton
 import triton.language as tl
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from mmpi_ns.ops.blending import BlendForm
@@ -33,6 +36,7 @@ from mmpi_ns.ops.gpu_scene import (
     GpuScene,
     bilinear,
     block_size,
+    is_held,
     minus_log_of_rest,
     nearest_row,
     one_minus_exp,
@@ -40,7 +44,7 @@ from mmpi_ns.ops.gpu_scene import (
     trilinear,
 )
 from mmpi_ns.ops.layout import SceneLayout, Tables
-from mmpi_ns.ops.march.reference import MergedSamples
+from mmpi_ns.ops.march.reference import MergedSamples, most_kept
 from mmpi_ns.scene.geometry import PlaneHits
 
 OPAQUE = tl.constexpr(1e-5)
@@ -51,26 +55,27 @@ FAR_AWAY = tl.constexpr(1e-10)
 """Inverse distances are no less where a distance is needed."""
 ULPS = tl.constexpr(16 * 2.0**-23)
 """Slack of the border test, as in ``geometry.local_to_ndc``."""
-RAYS, STEPS = 16, 8
-"""Rays of a program (one warp), and samples that a ray looks up at once."""
+STEPS = 8
+"""Samples that a ray looks up at once."""
+RAYS, FEW_RAYS, MANY = 16, 4, 16_384
+"""Rays of a program (one warp), and of one where there are fewer rays than so many: a device has room for thousands of
+programs."""
 
 
 @triton.jit
-def _numbers(state, K: tl.constexpr, HEADS: tl.constexpr):
+def _numbers(first, done, K: tl.constexpr, HEADS: tl.constexpr):
     """m of each head's next plane, or number of the cube's next sample."""
-    first, _, done = state
     is_mpi = (tl.arange(0, HEADS) < K)[None, :]
     return tl.where(is_mpi, first - done, first + done)
 
 
 @triton.jit
-def _next_distances(state, constants, cube, path, K: tl.constexpr, HEADS: tl.constexpr, HAS_CUBE: tl.constexpr):
+def _next_distances(first, count, done, oz, dz, constants, cube, K: tl.constexpr, HEADS: tl.constexpr,
+                    HAS_CUBE: tl.constexpr):  # fmt: skip
     """1/t of each head's next sample; -1 where it has none left."""
-    _, count, done = state
-    oz, dz = path
     head = tl.arange(0, HEADS)
     is_mpi = head < K
-    number = _numbers(state, K, HEADS).to(tl.float32)
+    number = _numbers(first, done, K, HEADS).to(tl.float32)
     step = tl.load(constants + head * FLOATS + STEP, is_mpi, 0.0)[None, :]
     w = number * step + tl.load(constants + head * FLOATS + END, is_mpi, 0.0)[None, :]
     inverse_t = w * dz / (1 - w * oz)
@@ -81,18 +86,17 @@ def _next_distances(state, constants, cube, path, K: tl.constexpr, HEADS: tl.con
 
 
 @triton.jit
-def _choose(state, constants, cube, path, K: tl.constexpr, HEADS: tl.constexpr, HAS_CUBE: tl.constexpr,
+def _choose(first, count, done, oz, dz, constants, cube, K: tl.constexpr, HEADS: tl.constexpr, HAS_CUBE: tl.constexpr,
             RAYS: tl.constexpr, STEPS: tl.constexpr):  # fmt: skip
     """The next samples of each ray in the order of distance: head, number, 1/t (-1: none). Equal ones by head."""
-    first, count, done = state
     column, head = tl.arange(0, STEPS)[None, :], tl.arange(0, HEADS)[None, :]
     heads, numbers = tl.zeros([RAYS, STEPS], tl.int32), tl.zeros([RAYS, STEPS], tl.int32)
     inverse_ts = tl.full([RAYS, STEPS], -1.0, tl.float32)
     for i in tl.static_range(STEPS):
-        at = (first, count, done)
-        top, best = tl.max(_next_distances(at, constants, cube, path, K, HEADS, HAS_CUBE), 1, return_indices=True)
+        distances = _next_distances(first, count, done, oz, dz, constants, cube, K, HEADS, HAS_CUBE)
+        top, best = tl.max(distances, 1, return_indices=True)
         is_best = (head == best[:, None]) & (done < count)
-        number = tl.sum(tl.where(is_best, _numbers(at, K, HEADS), 0), 1)
+        number = tl.sum(tl.where(is_best, _numbers(first, done, K, HEADS), 0), 1)
         here = column == i
         heads = tl.where(here, best[:, None].to(tl.int32), heads)
         numbers = tl.where(here, number[:, None], numbers)
@@ -102,24 +106,45 @@ def _choose(state, constants, cube, path, K: tl.constexpr, HEADS: tl.constexpr, 
 
 
 @triton.jit
-def _look_up(rays, scene, ray, head, number, wanted, K: tl.constexpr, HAS_CUBE: tl.constexpr):
+def _on_plane(us, vs, constants, ray, mpi, number, wanted, K: tl.constexpr):
+    """Disparity, u and v of planes of MPIs where rays cross them."""
+    row, at = constants + mpi * FLOATS, 2 * (ray[:, None] * K + mpi)
+    w = number.to(tl.float32) * tl.load(row + STEP, wanted, 0.0) + tl.load(row + END, wanted, 0.0)
+    u = tl.load(us + at, wanted, 0.0) + w * tl.load(us + at + 1, wanted, 0.0)
+    v = tl.load(vs + at, wanted, 0.0) + w * tl.load(vs + at + 1, wanted, 0.0)
+    u = (u - tl.load(row + U0, wanted, 0.0)) * tl.load(row + U_SCALE, wanted, 0.0) - 1
+    return w, u, (v - tl.load(row + V0, wanted, 0.0)) * tl.load(row + V_SCALE, wanted, 0.0) - 1
+
+
+@triton.jit
+def _pass_empty(us, vs, constants, grids, ray, first, count, K: tl.constexpr, HEADS: tl.constexpr):
+    """How many of each MPI's nearest planes hold nothing where the ray crosses them."""
+    head = tl.arange(0, HEADS)[None, :]
+    passed, passes = count * 0, (head < K) & (count > 0)
+    mpi = tl.where(head < K, head, 0) + count * 0
+    while tl.max(tl.max(passes.to(tl.int32), 1), 0) > 0:
+        number = first - passed
+        _, u, v = _on_plane(us, vs, constants, ray, mpi, number, passes, K)
+        plane = tl.load(grids + mpi * INTS + DEPTH, passes, 0).to(tl.int32) - 1 - number
+        passes = passes & ~is_held(grids, mpi, plane, u, v, passes)
+        passed += passes.to(tl.int32)
+        passes = passes & (passed < count)
+    return passed
+
+
+@triton.jit
+def _look_up(origins, directions, us, vs, constants, grids, biases, cube, density, ray, head, number, wanted,
+             K: tl.constexpr, HAS_CUBE: tl.constexpr):  # fmt: skip
     """Plane, NDC and optical depth of samples."""
-    origins, directions, _, _, us, vs = rays
-    constants, grids, biases, cube, density, _, _ = scene
     is_mpi = head < K
-    own = tl.where(is_mpi, head, 0)
-    mpi, at, in_mpi = constants + own * FLOATS, 2 * (ray[:, None] * K + own), wanted & is_mpi
-    end = tl.load(mpi + END)
-    w = number.to(tl.float32) * tl.load(mpi + STEP) + end
-    u = tl.load(us + at, in_mpi, 0.0) + w * tl.load(us + at + 1, in_mpi, 0.0)
-    v = tl.load(vs + at, in_mpi, 0.0) + w * tl.load(vs + at + 1, in_mpi, 0.0)
-    u = (u - tl.load(mpi + U0)) * tl.load(mpi + U_SCALE) - 1
-    v = (v - tl.load(mpi + V0)) * tl.load(mpi + V_SCALE) - 1
-    s = 1 - tl.load(mpi + S_SCALE) * (w - end)
+    own, in_mpi = tl.where(is_mpi, head, 0), wanted & is_mpi
+    row = constants + own * FLOATS
+    w, u, v = _on_plane(us, vs, constants, ray, own, number, in_mpi, K)
+    s = 1 - tl.load(row + S_SCALE) * (w - tl.load(row + END))
     plane = tl.load(grids + own * INTS + DEPTH).to(tl.int32) - 1 - number
     raw = bilinear(density, grids, own, plane, u, v, in_mpi)
     raw += tl.load(biases + tl.load(grids + own * INTS + BIAS) + plane, in_mpi, 0.0)
-    tau = softplus(raw) * tl.load(mpi + INTERVAL)
+    tau = softplus(raw) * tl.load(row + INTERVAL)
     if HAS_CUBE:
         in_cube = wanted & (head == K)
         t = (tl.where(in_cube, number, 0).to(tl.float32) + 0.5) * tl.load(cube + 6)
@@ -144,10 +169,10 @@ def _in_cube(origins, directions, cube, ray, t):
 
 
 @triton.jit
-def _in_mpi(rays, constants, ray, k, inverse_t, K: tl.constexpr):
+def _in_mpi(local_origins, local_directions, constants, ray, k, inverse_t, K: tl.constexpr):
     """Where samples lie in MPI k, and whether inside its frustum."""
     at, mpi = 3 * (ray[:, None] * K + k), constants + k * FLOATS
-    origin, direction = rays[2] + at, rays[3] + at
+    origin, direction = local_origins + at, local_directions + at
     z = tl.load(origin + 2) * inverse_t + tl.load(direction + 2)
     ahead = z > 0
     depth = tl.where(ahead, z, 1.0)
@@ -160,11 +185,8 @@ def _in_mpi(rays, constants, ray, k, inverse_t, K: tl.constexpr):
 
 
 @triton.jit
-def _count_vote(votes, scene, k, head, ndc, thick):
+def _count_vote(own_vote, highest, others, grids, reliability, touched, k, head, u, v, s, inside, thick):
     """Adds head k's vote on samples: (own vote, highest of the others, sum of e^(other - highest))."""
-    own_vote, highest, others = votes
-    u, v, s, inside = ndc
-    _, grids, _, _, _, reliability, touched = scene
     is_own = head == k
     asked = thick & (inside | is_own)
     vote = trilinear(reliability, grids, k, u, v, s, asked)
@@ -177,17 +199,22 @@ def _count_vote(votes, scene, k, head, ndc, thick):
 
 
 @triton.jit
-def _blend(rays, scene, ray, head, inverse_t, tau, wanted, K: tl.constexpr, HAS_CUBE: tl.constexpr):
+def _blend(origins, directions, local_origins, local_directions, constants, grids, cube, reliability, touched,
+           ray, head, inverse_t, tau, wanted, K: tl.constexpr, HAS_CUBE: tl.constexpr):  # fmt: skip
     """Optical depths after blending (``blending.blend_shares`` and ``blended_optical_depth``)."""
     thick = wanted & (tau > NEGLIGIBLE)
-    votes = (tau * 0, tau * 0 - 1e30, tau * 0)
+    own_vote, highest, others = tau * 0, tau * 0 - 1e30, tau * 0
     for k in range(K):
-        votes = _count_vote(votes, scene, k, head, _in_mpi(rays, scene[0], ray, k, inverse_t, K), thick)
+        u, v, s, inside = _in_mpi(local_origins, local_directions, constants, ray, k, inverse_t, K)
+        own_vote, highest, others = _count_vote(
+            own_vote, highest, others, grids, reliability, touched, k, head, u, v, s, inside, thick
+        )
     if HAS_CUBE:
-        x, y, z = _in_cube(rays[0], rays[1], scene[3], ray, 1 / tl.maximum(inverse_t, FAR_AWAY))
+        x, y, z = _in_cube(origins, directions, cube, ray, 1 / tl.maximum(inverse_t, FAR_AWAY))
         inside = (inverse_t > 0) & (tl.abs(x) <= 1) & (tl.abs(y) <= 1) & (tl.abs(z) <= 1)
-        votes = _count_vote(votes, scene, K, head, (x, y, z, inside), thick)
-    own_vote, highest, others = votes
+        own_vote, highest, others = _count_vote(
+            own_vote, highest, others, grids, reliability, touched, K, head, x, y, z, inside, thick
+        )
     sole = others == 0
     odds = tl.where(sole, 0.0, highest - own_vote + tl.log(tl.where(sole, 1.0, others)))
     log_share, log_rest = -softplus(odds), -softplus(-odds)
@@ -199,10 +226,8 @@ def _blend(rays, scene, ray, head, inverse_t, tau, wanted, K: tl.constexpr, HAS_
 
 
 @triton.jit
-def _blend_baked(scene, head, ndc, tau, wanted, K: tl.constexpr, HAS_CUBE: tl.constexpr):
+def _blend_baked(grids, shares, head, u, v, s, tau, wanted, K: tl.constexpr, HAS_CUBE: tl.constexpr):
     """Optical depths after blending with the shares that stand where reliability does."""
-    _, grids, _, _, _, shares, _ = scene
-    u, v, s = ndc
     thick = wanted & (tau > NEGLIGIBLE)
     share = tl.minimum(tl.maximum(trilinear(shares, grids, head, u, v, s, thick), 0.0), 1.0)
     alpha = one_minus_exp(tau) * share
@@ -220,18 +245,17 @@ def _before(values, STEPS: tl.constexpr):
     return tl.sum(tl.where(earlier, values[:, None, :], 0), 2)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=("num_rays", "room"))
 def march_kernel(
     origins, directions, local_origins, local_directions, us, vs, firsts, counts,
     constants, grids, biases, cube, density, reliability, touched,
-    kept, skipped_total, dropped_mass, heads, planes, ndc, inverse_ts, taus, skipped_before,
+    kept, skipped_total, dropped_mass, heads, planes, ndc, inverse_ts, taus, skipped_before, numbers,
     num_rays, room, threshold, fair_share,
     K: tl.constexpr, HEADS: tl.constexpr, HAS_CUBE: tl.constexpr, BLENDS: tl.constexpr, BAKED: tl.constexpr,
     KEEP_ALL: tl.constexpr, RAYS: tl.constexpr, STEPS: tl.constexpr,
 ):  # fmt: skip
-    """Marches RAYS rays. What ray r keeps is written from r * room on; how much, to kept[r]."""
-    rays = (origins, directions, local_origins, local_directions, us, vs)
-    scene = (constants, grids, biases, cube, density, reliability, touched)
+    """Marches RAYS rays. What ray r keeps is written from r * room on; how much, to kept[r]. ``numbers``: the most that
+    a ray keeps, then what is kept of each head."""
     row = tl.program_id(0) * RAYS + tl.arange(0, RAYS)
     exists = row < num_rays
     ray, head_of = tl.where(exists, row, 0), tl.arange(0, HEADS)
@@ -239,24 +263,33 @@ def march_kernel(
     has = exists[:, None] & (head_of < K + HAS_CUBE)[None, :]
     first, count = tl.load(firsts + at, has, 0).to(tl.int32), tl.load(counts + at, has, 0).to(tl.int32)
     local_z, in_mpi = 3 * (ray[:, None] * K + head_of[None, :]) + 2, (head_of < K)[None, :]
-    path = (tl.load(local_origins + local_z, in_mpi, 0.0), tl.load(local_directions + local_z, in_mpi, 0.0))
+    oz, dz = tl.load(local_origins + local_z, in_mpi, 0.0), tl.load(local_directions + local_z, in_mpi, 0.0)
     left = tl.sum(count, 1)
     bound = tl.minimum(fair_share / tl.maximum(left, 1).to(tl.float32), threshold)
     end_of_light = tl.minimum(bound, OPAQUE)
+    done = count * 0
     if KEEP_ALL:
         bound, end_of_light = bound * 0 - 1, bound * 0 - 1
-    done, number_kept = count * 0, left * 0
+    else:
+        done = _pass_empty(us, vs, constants, grids, ray, first, count, K, HEADS)
+        left -= tl.sum(done, 1)
+    number_kept, of_heads = left * 0, head_of * 0
     depth, skipped, dropped = bound * 0, bound * 0, bound * 0
     while tl.max(left, 0) > 0:
         head, number, inverse_t, done = _choose(
-            (first, count, done), constants, cube, path, K, HEADS, HAS_CUBE, RAYS, STEPS
+            first, count, done, oz, dz, constants, cube, K, HEADS, HAS_CUBE, RAYS, STEPS
         )
         met = (inverse_t >= 0) & (left > 0)[:, None]
-        plane, u, v, s, tau = _look_up(rays, scene, ray, head, number, met, K, HAS_CUBE)
+        plane, u, v, s, tau = _look_up(
+            origins, directions, us, vs, constants, grids, biases, cube, density, ray, head, number, met, K, HAS_CUBE
+        )
         if BAKED:
-            tau = _blend_baked(scene, head, (u, v, s), tau, met, K, HAS_CUBE)
+            tau = _blend_baked(grids, reliability, head, u, v, s, tau, met, K, HAS_CUBE)
         elif BLENDS:
-            tau = _blend(rays, scene, ray, head, inverse_t, tau, met, K, HAS_CUBE)
+            tau = _blend(
+                origins, directions, local_origins, local_directions, constants, grids, cube, reliability, touched,
+                ray, head, inverse_t, tau, met, K, HAS_CUBE,
+            )  # fmt: skip
         tau = tl.where(met, tau, 0.0)
         light = tl.exp(-(depth[:, None] + _before(tau, STEPS)))
         seen = met & (light > end_of_light[:, None])
@@ -275,6 +308,8 @@ def march_kernel(
         tl.store(taus + to, tau, keep)
         tl.store(skipped_before + to, skipped[:, None] + _before(skip, STEPS), keep)
         number_kept += tl.sum(keep.to(tl.int32), 1)
+        own = keep[:, :, None] & (head[:, :, None] == head_of[None, None, :])
+        of_heads += tl.sum(tl.sum(own.to(tl.int32), 1), 0)
         skipped += tl.sum(skip, 1)
         dropped += tl.sum(tl.where(skip > 0, weight, 0.0), 1)
         depth += tl.sum(tl.where(seen, tau, 0.0), 1)
@@ -287,9 +322,11 @@ def march_kernel(
     tl.store(kept + row, number_kept, exists)
     tl.store(skipped_total + row, skipped, exists)
     tl.store(dropped_mass + row, dropped, exists)
+    tl.atomic_max(numbers, tl.max(number_kept, 0), sem="relaxed")
+    tl.atomic_add(numbers + 1 + head_of, of_heads, head_of < K + HAS_CUBE, sem="relaxed")
 
 
-@triton.jit
+@triton.jit(do_not_specialize=("size", "width", "room"))
 def pack_kernel(
     kept, heads, planes, ndc, inverse_ts, taus, skipped_before,
     to_heads, to_planes, to_ndc, to_inverse_ts, to_taus, to_skipped_before, valid,
@@ -311,6 +348,54 @@ def pack_kernel(
     tl.store(to_skipped_before + i, tl.load(skipped_before + at, has, 0.0), inside)
 
 
+@dataclass(frozen=True)
+class Slots:
+    """What rays kept, each in ``room`` slots of its own."""
+
+    kept: Int[Tensor, "R"]
+    """So many; what the other slots hold means nothing."""
+    slots: list[Tensor]
+    """Heads, planes, NDC, inverse distances, optical depths, and optical depths skipped before: each [R, room, .]."""
+    room: int
+    skipped_total: Float[Tensor, "R 1"]
+    dropped_mass: Float[Tensor, "R 1"]
+    numbers: Int[Tensor, "1+H"]
+    """The most that a ray kept, then what was kept of each head."""
+
+
+def march_into_slots(
+    layout: SceneLayout,
+    tables: Tables,
+    origins: Tensor,
+    directions: Tensor,
+    hits: PlaneHits,
+    first: Tensor,
+    counts: Tensor,
+    threshold: float,
+    fair_share: float,
+    form: BlendForm | None,
+    baked: bool,
+) -> Slots:
+    """``march`` before anything is waited for."""
+    scene, device, num_rays = GpuScene.of(layout), origins.device, len(origins)
+    parts = (origins, directions, hits.local_origins, hits.local_directions, hits.u, hits.v, first, counts)
+    rays, room = [x.contiguous() for x in parts], most_kept(scene.most_samples, threshold, fair_share)
+    kept = torch.empty(num_rays, dtype=torch.int32, device=device)
+    left = torch.empty(2, num_rays, 1, device=device)
+    slots = [torch.empty(num_rays, room, dtype=torch.int32, device=device) for _ in range(2)]
+    slots += [torch.empty(num_rays, room, width, device=device) for width in (3, 1, 1, 1)]
+    numbers = torch.zeros(1 + layout.num_heads, dtype=torch.int32, device=device)
+    if num_rays:
+        rays_at_once = block_size(RAYS if num_rays >= MANY else FEW_RAYS, device)
+        march_kernel[(triton.cdiv(num_rays, rays_at_once),)](
+            *rays, *scene.constants(), *tables, kept, left[0], left[1], *slots, numbers,
+            num_rays, room, float(threshold), float(fair_share),
+            K=len(layout.mpis), HEADS=triton.next_power_of_2(layout.num_heads), HAS_CUBE=layout.cube is not None,
+            BLENDS=form is not None, BAKED=baked, KEEP_ALL=threshold <= 0, RAYS=rays_at_once, STEPS=STEPS, num_warps=1,
+        )  # fmt: skip
+    return Slots(kept, slots, room, left[0], left[1], numbers)
+
+
 def march(
     layout: SceneLayout,
     tables: Tables,
@@ -325,26 +410,12 @@ def march(
     baked: bool,
 ) -> MergedSamples:
     """See ``ops.march``. Waits for the device once, to size the result."""
-    scene, device, num_rays = GpuScene.of(layout), origins.device, len(origins)
-    parts = (origins, directions, hits.local_origins, hits.local_directions, hits.u, hits.v, first, counts)
-    rays = [x.contiguous() for x in parts]
-    # Weights sum to at most 1, which bounds how many exceed the least that a sample must weigh.
-    most = scene.most_samples
-    room = most if threshold <= 0 else min(most, int(1.01 / min(threshold, fair_share / most)) + 2)
-    kept = torch.empty(num_rays, dtype=torch.int32, device=device)
-    left = torch.empty(2, num_rays, 1, device=device)
-    slots = [torch.empty(num_rays, room, dtype=torch.int32, device=device) for _ in range(2)]
-    slots += [torch.empty(num_rays, room, width, device=device) for width in (3, 1, 1, 1)]
-    if num_rays:
-        rays_at_once = block_size(RAYS, device)
-        march_kernel[(triton.cdiv(num_rays, rays_at_once),)](
-            *rays, *scene.constants(), *tables, kept, left[0], left[1], *slots,
-            num_rays, room, float(threshold), float(fair_share),
-            K=len(layout.mpis), HEADS=triton.next_power_of_2(layout.num_heads), HAS_CUBE=layout.cube is not None,
-            BLENDS=form is not None, BAKED=baked, KEEP_ALL=threshold <= 0, RAYS=rays_at_once, STEPS=STEPS, num_warps=1,
-        )  # fmt: skip
-    width = max(1, int(kept.max())) if num_rays else 1
-    return MergedSamples(*_pack(kept, slots, room, width), skipped_total=left[0], dropped_mass=left[1])
+    m = march_into_slots(layout, tables, origins, directions, hits, first, counts, threshold, fair_share, form, baked)
+    widest, *of_heads = m.numbers.tolist()
+    packed = _pack(m.kept, m.slots, m.room, max(1, widest))
+    return MergedSamples(
+        *packed, skipped_total=m.skipped_total, dropped_mass=m.dropped_mass, head_counts=tuple(of_heads)
+    )
 
 
 def _pack(kept: Tensor, slots: list[Tensor], room: int, width: int) -> list[Tensor]:

@@ -42,6 +42,8 @@ class MergedSamples:
     skipped_total: Float[Tensor, "R 1"]
     dropped_mass: Float[Tensor, "R 1"]
     """Sum of the weights of the dropped samples."""
+    head_counts: tuple[int, ...] | None = None
+    """How many are of each head, where it is known without asking for it."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +56,11 @@ class LiveSamples:
     ndc: Float[Tensor, "N 3"]
     inverse_t: Float[Tensor, "N"]
     tau: Float[Tensor, "N"]
+
+
+def most_kept(samples: int, threshold: float, fair_share: float = float("inf")) -> int:
+    """How many of a ray's samples are kept at most: weights sum to at most 1, and each exceeds ``prune``'s bound."""
+    return samples if threshold <= 0 else min(samples, int(1.01 / min(threshold, fair_share / samples)) + 2)
 
 
 def march(

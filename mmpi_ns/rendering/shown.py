@@ -1,0 +1,48 @@
+"""Images of a field that is shaded once a ray, from rays to colours without gradients."""
+
+from __future__ import annotations
+
+import torch
+from nerfstudio.cameras.rays import RayBundle
+from torch import Tensor
+
+from mmpi_ns.field.mmpi_field import MMPIField
+from mmpi_ns.field.shading import RayShader
+from mmpi_ns.ops.blending import BlendForm
+from mmpi_ns.ops.show import show_rays
+from mmpi_ns.rendering.rendered import distances_of
+from mmpi_ns.rendering.sampler import crossings
+
+
+@torch.no_grad()
+def shown_outputs(
+    bundle: RayBundle,
+    field: MMPIField,
+    *,
+    form: BlendForm | None,
+    threshold: float,
+    head_mask: Tensor | None,
+    shares: Tensor | None,
+) -> dict[str, Tensor]:
+    """rgb (without background), accumulation, transmittance, depth, winning head and dropped mass of rays [R, .].
+
+    Args:
+        bundle: the rays.
+        field: with ``shading ray``.
+        form: how reliability enters; None for not at all.
+        threshold: weight below which a sample is dropped.
+        head_mask: heads that may answer each ray; None for all.
+        shares: baked ones to blend by instead of reliability.
+    """
+    assert isinstance(field.networks, RayShader)
+    at = crossings(bundle, field, head_mask)
+    scene, rays = (field.layout, field.tables(shares), field.features.data), (bundle.origins, bundle.directions)
+    shown = show_rays(*scene, *rays, at.hits, at.first, at.counts, threshold, form, shares is not None)
+    return {
+        "rgb": field.networks.shade(shown.gathered, shown.mass, shown.accumulation, bundle.directions),
+        "accumulation": shown.accumulation,
+        "transmittance": shown.transmittance,
+        "depth": distances_of(shown.inverse_t, field.plan),
+        "winning_mpi": shown.winner,
+        "dropped_mass": shown.dropped_mass,
+    }

@@ -1,0 +1,149 @@
+"""How often a training step waits for the device: numbers that the host reads, arrays whose size depends on them."""
+
+from __future__ import annotations
+
+import traceback
+import warnings
+from collections import Counter
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+import torch
+from nerfstudio.engine.callbacks import TrainingCallbackLocation as At
+from torch.utils._python_dispatch import TorchDispatchMode
+from training_runs import ready, trainer_config
+
+import mmpi_ns
+from mmpi_ns.capture.rays import PinholeRays
+
+WAITING = {
+    "_local_scalar_dense",
+    "nonzero",
+    "_unique2",
+    "unique_dim",
+    "unique_consecutive",
+    "masked_select",
+    "_coalesce",
+    "equal",
+    "bincount",
+    "lift_fresh",  # torch.tensor of Python's numbers: a copy to the device that is waited for
+}
+"""Operations of torch that wait whatever they are given."""
+PACKAGE = Path(mmpi_ns.__file__).parent
+STEPS = 8
+TRAININGS = pytest.mark.parametrize(
+    ("training", "phases"), [("joint", ["joint"]), ("two-phase", ["individual", "blend", "finetune"])]
+)
+
+
+class Waits(TorchDispatchMode):
+    """Within, what would wait for a GPU is counted on a CPU, by the line that it comes from."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: Counter[str] = Counter()
+        self._paused = False
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        name = func.overloadpacket.__name__
+        by_mask = name in ("index", "index_put", "index_put_") and any(
+            i is not None and i.dtype in (torch.bool, torch.uint8) for i in args[1]
+        )
+        by_counts = name == "repeat_interleave" and not (kwargs or {}).get("output_size")
+        if name in WAITING or by_mask or by_counts:
+            self.note(name)
+        return func(*args, **(kwargs or {}))
+
+    def note(self, name: str) -> None:
+        if self._paused:
+            return
+        stack = [f for f in traceback.extract_stack() if "nerfstudio" in f.filename or str(PACKAGE) in f.filename]
+        place = f"{Path(stack[-1].filename).name}:{stack[-1].lineno} {stack[-1].name}" if stack else "elsewhere"
+        self.found[f"{name} at {place}"] += 1
+
+    @contextmanager
+    def paused(self):
+        """Within, nothing is counted: Triton's interpreter reads what a GPU's kernels would."""
+        before, self._paused = self._paused, True
+        try:
+            yield
+        finally:
+            self._paused = before
+
+
+@contextmanager
+def counted_on_a_cpu(monkeypatch):
+    """What runs within, by Triton's interpreter, would wait for a GPU as often as this counts."""
+    from triton.runtime.interpreter import GridExecutor
+
+    waits, launch = Waits(), GridExecutor.__call__
+
+    def quietly(self, *args, **kwargs):
+        with waits.paused():
+            return launch(self, *args, **kwargs)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(GridExecutor, "__call__", quietly)
+        for name in ("tolist", "numpy", "cpu"):  # on a CPU they pass torch's operations by
+            patch.setattr(torch.Tensor, name, _noted(waits, name))
+        with waits:
+            yield waits.found
+
+
+def _noted(waits, name):
+    work = getattr(torch.Tensor, name)
+
+    def noted(self, *args, **kwargs):
+        waits.note(name)
+        with waits.paused():
+            return work(self, *args, **kwargs)
+
+    return noted
+
+
+@contextmanager
+def counted_on_a_gpu():
+    """How often what runs within waits for the GPU, as torch says."""
+    found: Counter[str] = Counter()
+    torch.cuda.set_sync_debug_mode("warn")
+    try:
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always")
+            yield found
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    for w in said:
+        if "synchronizing" in str(w.message):
+            found[f"{Path(w.filename).name}:{w.lineno}"] += 1
+
+
+def waits_of_phases(scene, plan_file, folder, training, device, counted):
+    """What the last step of each phase waits for: {phase: {place: times}}."""
+    config = trainer_config(scene, plan_file, folder, steps=STEPS, training=training, growth_shares=(), shading="ray")
+    config.pipeline.datamanager.train_num_rays_per_batch, config.pipeline.datamanager.keypoint_rays = 16, 8
+    config.machine.device_type = device
+    trainer = ready(config)
+    trainer.pipeline.train()
+    manager, found = trainer.pipeline.datamanager, {}
+    del manager.train_ray_generator
+    manager.train_ray_generator = PinholeRays.of(manager.train_dataset.cameras, device)  # on a CPU as on a GPU
+    schedule = trainer.pipeline.model.progress.schedule
+    phases = [schedule.phase_at(step).name for step in range(STEPS)]
+    for step, phase in enumerate(phases):
+        if phase not in phases[step + 1 :]:
+            with counted() as waits:
+                _run(trainer, step)
+            found[phase] = dict(waits)
+        else:
+            _run(trainer, step)  # packs the scene's constants
+    return found
+
+
+def _run(trainer, step):
+    """One step as nerfstudio's loop makes it."""
+    for callback in trainer.callbacks:
+        callback.run_callback_at_location(step, location=At.BEFORE_TRAIN_ITERATION)
+    trainer.train_iteration(step)
+    for callback in trainer.callbacks:
+        callback.run_callback_at_location(step, location=At.AFTER_TRAIN_ITERATION)
