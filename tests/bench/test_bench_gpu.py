@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import json
 import re
+import sys
 from types import SimpleNamespace
 
+import gpu_session
 import pytest
 import torch
 from triton_processes import HERE, needs_triton, python
 
 from mmpi_ns.bench.apart import run_apart
 from mmpi_ns.bench.gpu import command as gpu
+from mmpi_ns.bench.gpu import quick
 from mmpi_ns.bench.gpu.command import Gpu, told_curve
 from mmpi_ns.bench.gpu.report import headline, markdown
+from mmpi_ns.bench.methods import METHODS
+from mmpi_ns.ops import dispatch
 
 
 @needs_triton
@@ -28,6 +34,35 @@ def test_without_a_gpu_one_sentence_and_a_status(tmp_path):
     found = python("-m", "mmpi_ns.bench", "gpu", "--output", str(tmp_path))
     assert found.returncode == 1 and "torch sees none" in found.stderr and not list(tmp_path.iterdir())
     assert "Traceback" not in found.stderr and "--rehearse" in found.stderr
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU, of which more would be said")
+@pytest.mark.commands
+def test_a_quick_look_without_a_gpu_ends_in_an_honest_sentence(tmp_path):
+    where = ["--output", str(tmp_path), "--work", str(tmp_path / "work")]
+    found = python("-m", "mmpi_ns.bench", "gpu", "--quick", *where)
+    said = found.stdout.strip().splitlines()
+    assert found.returncode == 0 and "only a machine with one can say" in said[-1], found.stdout + found.stderr
+    assert any("torch sees no GPU" in line for line in said) and any(line.startswith("a step of") for line in said)
+    rows = json.loads((tmp_path / "gpu-quick.json").read_text())["rows"]
+    assert rows["device"] == "cpu" and not rows["well"] and rows["timed"]["step_ms"] > 0
+
+
+def test_a_quick_look_names_what_falls_back(monkeypatch, capsys, tmp_path):
+    reason = "its Triton kernel fails on this device (CompilationError: at 3:4)"
+    names = [name for name, (_, forms) in dispatch.TABLE.items() if "gpu" in forms]
+    for faults, wanted in (
+        ({}, "All is well"),
+        ({"march": reason}, "1 operation(s) run in plain torch, several times slower: march."),
+    ):
+        monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+        monkeypatch.setattr(quick, "environment", dict)
+        monkeypatch.setattr(quick, "time_training", lambda *_: {"step_ms": 1.0, "frame_ms": 2.0, "pixels": 3})
+        monkeypatch.setattr(dispatch, "_faults", dict.fromkeys(names) | faults)
+        found = quick.run_quick(tmp_path, tmp_path, 16)
+        said = capsys.readouterr().out
+        assert found["well"] == (not faults) and wanted in said.splitlines()[-1]
+        assert not faults or f"march: plain torch, since {reason}" in said
 
 
 def test_mistakes_are_named(tmp_path):
@@ -67,6 +102,38 @@ def test_a_process_that_outlasts_its_time_is_ended(tmp_path, monkeypatch):
     assert "failed with status" in found["not_run"]
     assert told_curve(tmp_path / "run") == [{"step": 3, "seconds": 7.0, "psnr": 12.5}]
     assert told_curve(tmp_path / "nothing") == []
+
+
+def test_a_session_writes_what_each_part_said_also_where_one_is_cut_off(tmp_path, monkeypatch, capsys):
+    words = [[sys.executable, "-c", "print('well')"], ["no-such-command"]]
+    words += [[sys.executable, "-c", "import time; print('begun', flush=True); time.sleep(90)"], words[0]]
+    made = [
+        gpu_session.Part(name, w, 60 if name != "slow" else 5)
+        for name, w in zip("a missing slow b".split(), words, strict=True)
+    ]
+    monkeypatch.setattr(gpu_session, "parts", lambda *_: made)
+    monkeypatch.setattr(sys, "argv", ["gpu_session.py", "--data", str(tmp_path), "--out", str(tmp_path / "out")])
+    assert gpu_session.main() == 1
+    found = json.loads((tmp_path / "out" / "session.json").read_text())["parts"]
+    assert [(p["status"], p.get("ran_out_of_time", False)) for p in found.values()] == [
+        (0, False), (None, False), (-9, True), (0, False),
+    ]  # fmt: skip
+    assert found["slow"]["output"] == "begun\n" and "FileNotFoundError" in found["missing"]["output"]
+    assert capsys.readouterr().out.count("status") == 4
+
+
+def test_a_session_trains_at_full_size_and_ends_within_ten_minutes(tmp_path):
+    made = gpu_session.parts(tmp_path, tmp_path, tmp_path, rehearse=False)
+    assert {p.name for p in made} > {
+        "device",
+        "quick",
+        "tests",
+        "bench gpu",
+        *(f"train {name}" for name in METHODS if name in gpu_session.TRAININGS),
+    }
+    assert set(gpu_session.TRAININGS) < set(METHODS)
+    for part in made:
+        assert not part.name.startswith("train") or {"cuda", "1"} < set(part.words)
 
 
 def test_headline_holds_what_was_measured_and_nothing_else():

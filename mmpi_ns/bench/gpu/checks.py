@@ -152,7 +152,7 @@ def interpolation(device: str, samples: int) -> list[Check]:
     """Values and row gradients of 9 channels; many samples share rows."""
     g = torch.Generator().manual_seed(1)
     texels = max(10, samples // 3)
-    rows = torch.randint(0, texels, (samples, 4), generator=g).to(device)
+    rows = torch.randint(1, texels, (samples, 4), generator=g).to(device)  # row 0 is where gradients are padded
     weights, upstream = torch.rand(samples, 4, generator=g).to(device), _draw(device, samples, 9, seed=2)
     table, exact = _draw(device, texels, 9).requires_grad_(), _draw(device, texels, 9).double().requires_grad_()
     read = interpolate.interpolate(table, rows, weights)

@@ -12,6 +12,7 @@ import torch
 
 from mmpi_ns.bench.apart import run_apart
 from mmpi_ns.bench.gpu.parts import run_part
+from mmpi_ns.bench.gpu.quick import run_quick
 from mmpi_ns.bench.gpu.report import draw, headline, markdown
 from mmpi_ns.bench.methods import METHODS, Method, Scene
 from mmpi_ns.bench.report import Bench, Report, Row
@@ -29,6 +30,8 @@ SHARES = {
 """The parts in the order in which they run, and their shares of the time; what one leaves, the next ones have."""
 PEERS = {"mmpi": 3000, "nerfacto": 3000, "splatfacto": 5000}
 """Whose error is followed over time, and for how many steps at most."""
+QUICK_RAYS = 1024
+"""Of a step that ``--quick`` times."""
 GRACE = 60.0
 """Seconds that a part may run beyond its time before it is ended from outside: starting Python takes ten."""
 
@@ -51,10 +54,19 @@ class Gpu(Bench):
     """Which parts to run."""
     rehearse: bool = False
     """Run everything in miniature on a CPU, the kernels by Triton's interpreter: to see that it runs, not how fast."""
+    quick: bool = False
+    """In a minute: what there is, whether every kernel does what it should, and the time of a step and a frame. Without
+    a GPU, the same of this processor."""
 
     name = "gpu"
 
     def run(self) -> None:
+        if self.quick:
+            data = self._street(self.folder / "quick-street", 10, 155, 47, 400)
+            report = Report(self, key=None, file="gpu-quick")
+            report.rows.update(run_quick(data, (self.folder / "quick").resolve(), QUICK_RAYS))
+            report.save()
+            return
         self._check()
         start, report = time.monotonic(), Report(self, key=None)
         made, rows = report.content["made"], report.rows
@@ -94,15 +106,20 @@ class Gpu(Bench):
         """The data set, or a street that is made now."""
         if self.data is not None:
             return self.data.resolve()
+        sizes = (10, 40, 12, 150) if self.rehearse else (40, 621, 188, 4000)
+        return self._street(self.folder / "street", *sizes)
+
+    @staticmethod
+    def _street(folder: Path, count: int, width: int, height: int, points: int) -> Path:
+        """A procedural scene, made where it is not there yet."""
         from mmpi_ns.synthetic.catalogue import make_scene
         from mmpi_ns.synthetic.dataset import write_dataset
 
-        folder, (width, height) = (self.folder / "street").resolve(), (40, 12) if self.rehearse else (621, 188)
         if not (folder / "transforms.json").is_file():
-            print(f"No --data: making a street of {width} x {height} pixels ...", flush=True)
-            scene = make_scene("street", count=10 if self.rehearse else 40, width=width, height=height)
-            write_dataset(scene, folder, points=150 if self.rehearse else 4000, overwrite=True)
-        return folder
+            print(f"Making a street of {width} x {height} pixels ...", flush=True)
+            scene = make_scene("street", count=count, width=width, height=height)
+            write_dataset(scene, folder, points=points, overwrite=True)
+        return folder.resolve()
 
     def _part(self, name: str, data: Path, options: list[str], seconds: float) -> Row:
         if name == "quality":

@@ -1,0 +1,141 @@
+"""All that a machine with a GPU can tell of this project, in one call of ten minutes, without a network.
+
+    python tests/gpu_session.py --data CAPTURE --out FOLDER [--wheels FOLDER] [--seconds 590] [--rehearse]
+
+What it found is written to FOLDER/session.json after every part, so that a call that is cut off loses only the part at
+hand. Wheels (of what the machine lacks) are installed into a folder of their own. ``--rehearse`` runs the same parts on
+a CPU in miniature, to see that each starts and ends.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+TRAININGS = {"mmpi": (20_000, 110), "splatfacto": (5000, 75), "nerfacto": (5000, 75), "mmpi-small": (4000, 50),
+             "instant-ngp": (5000, 60)}  # fmt: skip
+"""Steps, and seconds at most, of each method on the capture at full size."""
+BENCH_PARTS = ("checks", "operations", "training triton")
+"""Of ``mmpi-bench gpu``; trainings to the end come after it."""
+TAIL = 6000
+"""Characters of what a part prints that are kept."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """A command, and the seconds that it may take."""
+
+    name: str
+    words: list[str]
+    seconds: float
+
+
+def parts(data: Path, out: Path, work: Path, rehearse: bool) -> list[Part]:
+    """Everything, in the order of what is wanted most."""
+    python, bench = [sys.executable], [sys.executable, "-m", "mmpi_ns.bench"]
+    where = ["--output", str(out), "--work", str(work)]
+    looks = [
+        "import torch, platform; print(platform.python_version(), torch.__version__, torch.version.cuda)",
+        "import triton; print('Triton', triton.__version__)",
+        "import nerfstudio.configs.method_configs, mmpi_ns.config; print('nerfstudio and mmpi_ns import')",
+    ]
+    small = ["--rehearse", "--parts", "checks"] if rehearse else ["--data", str(data), "--parts", *BENCH_PARTS]
+    return [
+        Part("device", ["nvidia-smi"], 20),
+        *(Part(f"environment {i}", [*python, "-c", line], 90) for i, line in enumerate(looks, 1)),
+        Part("quick", [*bench, "gpu", "--quick", *where], 120),
+        Part("tests", [*python, "-m", "pytest", "-m", "gpu", "-rs", "-p", "no:cacheprovider", "tests/ops"], 120),
+        Part("bench gpu", [*bench, "gpu", *small, *where, "--seconds", "120"], 150),
+        *(
+            Part(f"train {name}", [*bench, "train", *_training(name, steps, data, rehearse), *where], seconds)
+            for name, (steps, seconds) in TRAININGS.items()
+        ),
+    ]
+
+
+def _training(name: str, steps: int, data: Path, rehearse: bool) -> list[str]:
+    """Options of ``mmpi-bench train``; splats have no rays."""
+    words = ["--data", str(data), "--methods", name, "--downscale-factor", "1", "--seeds", "0", "--check-images", "1"]
+    words += ["--steps", f"{name}={2 if rehearse else steps}", "--final-images", "1" if rehearse else "8"]
+    if rehearse:
+        return [*words, "--device", "cpu", "--rays-per-batch", f"{name}=16"]
+    return [*words, "--device", "cuda", "--rays-per-batch", "nerfacto=4096"]
+
+
+def run_part(part: Part, seconds: float, log: Path) -> dict[str, object]:
+    """Runs a command, its output into a file; ended with all that it started when its time is up."""
+    start, late = time.monotonic(), threading.Event()
+    with log.open("wb") as stream:
+        try:
+            process = subprocess.Popen(
+                part.words, stdin=subprocess.DEVNULL, stdout=stream, stderr=subprocess.STDOUT, cwd=ROOT,
+                start_new_session=True,
+            )  # fmt: skip
+        except OSError as error:
+            return {"status": None, "wall_s": 0.0, "output": f"{type(error).__name__}: {error}"}
+
+        def end() -> None:
+            late.set()
+            os.killpg(process.pid, 9)
+
+        alarm = threading.Timer(seconds, end)
+        alarm.start()
+        status = process.wait()
+        alarm.cancel()
+    text = log.read_text(encoding="utf-8", errors="replace")[-TAIL:]
+    return {"status": status, "ran_out_of_time": late.is_set(), "wall_s": time.monotonic() - start, "output": text}
+
+
+def install(wheels: Path, site: Path) -> Part:
+    """Of the wheels, into a folder that Python looks in from now on."""
+    os.environ["PYTHONPATH"] = os.pathsep.join([str(ROOT), str(site), os.environ.get("PYTHONPATH", "")])
+    files = [str(path) for path in sorted(wheels.glob("*.whl"))]
+    words = [sys.executable, "-m", "pip", "install", "-q", "--no-index", "--no-deps", "--target", str(site), *files]
+    return Part("wheels", words, 90)
+
+
+def main() -> int:
+    """Runs all parts; 0 where each of them did its work, or said why it cannot here."""
+    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options.add_argument("--data", type=Path, required=True, help="a capture (a folder with transforms.json)")
+    options.add_argument("--out", type=Path, default=Path(os.environ.get("OUT", "outputs/gpu-session")))
+    options.add_argument("--wheels", type=Path, help="wheels of what this machine lacks")
+    options.add_argument("--seconds", type=float, default=590.0, help="for everything")
+    options.add_argument("--rehearse", action="store_true", help="in miniature, on a CPU")
+    given = options.parse_args()
+    data, out, start = given.data.resolve(), given.out.resolve(), time.monotonic()
+    (out / "logs").mkdir(parents=True, exist_ok=True)
+    work = Path(tempfile.mkdtemp(prefix="gpu-session-"))  # checkpoints are too large to bring back
+    os.environ["PYTHONPATH"] = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
+    todo = parts(data, out, work, given.rehearse)
+    if given.wheels is not None:
+        todo.insert(1, install(given.wheels.resolve(), work / "site"))
+    found: dict[str, dict[str, object]] = {}
+    for part in todo:
+        left = given.seconds - (time.monotonic() - start)
+        said: dict[str, object] = {"status": None, "wall_s": 0.0, "output": "no time was left"}
+        if left > 5:
+            seconds = left if given.rehearse else min(part.seconds, left)
+            said = run_part(part, seconds, out / "logs" / f"{part.name}.txt")
+        found[part.name] = {"command": part.words, **said}
+        for log in work.rglob("output.log"):
+            shutil.copy(log, out / "logs" / f"{'-'.join(log.relative_to(work).parts[:-1])[-120:]}.log")
+        report = {"command": sys.argv, "rehearsal": given.rehearse, "wall_s": time.monotonic() - start, "parts": found}
+        (out / "session.json").write_text(json.dumps(report, indent=1), encoding="utf-8")
+        print(f"{part.name}: status {said['status']}, {said['wall_s']:.0f} s", flush=True)
+    needed = [name for name in found if name != "device" or not given.rehearse]
+    return int(any(found[name]["status"] != 0 for name in needed))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
