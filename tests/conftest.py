@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import shutil
 import tempfile
+from pathlib import Path
 
 import hypothesis
 import pytest
@@ -16,10 +18,32 @@ from mmpi_ns.scene.plan import CubePlan, ScenePlan
 # Of the processes that tests start too: test files run side by side, and threads that wait for each other spin.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 # Depths that tests find are no business of the user's cache.
-os.environ["XDG_CACHE_HOME"] = tempfile.mkdtemp(prefix="mmpi-cache-")
+USERS = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache", "mmpi_ns")
+CACHE = tempfile.mkdtemp(prefix="mmpi-cache-")
+os.environ["XDG_CACHE_HOME"] = CACHE
 torch.set_num_threads(1)
 hypothesis.settings.register_profile("mmpi", deadline=None, derandomize=True, print_blob=True)
 hypothesis.settings.load_profile("mmpi")
+
+
+def pytest_configure(config):
+    """Kernels are compiled once, not once for each run: their names say of what and for which processor."""
+    for source in (config.cache.mkdir("kernels"), USERS):
+        _copy_kernels(source, Path(CACHE, "mmpi_ns"))
+
+
+def pytest_unconfigure(config):
+    _copy_kernels(Path(CACHE, "mmpi_ns"), config.cache.mkdir("kernels"))
+    shutil.rmtree(CACHE, ignore_errors=True)
+
+
+def _copy_kernels(source: Path, target: Path) -> None:
+    target.mkdir(parents=True, exist_ok=True)
+    for path in source.glob("kernels-*.so"):
+        if not (target / path.name).exists():
+            unfinished = target / f"{path.name}.{os.getpid()}"
+            shutil.copyfile(path, unfinished)
+            unfinished.rename(target / path.name)
 
 
 @pytest.fixture

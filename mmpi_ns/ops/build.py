@@ -53,7 +53,7 @@ def library() -> ctypes.CDLL:
             with tempfile.TemporaryDirectory(dir=folder) as scratch:
                 made = Path(scratch) / target.name
                 command = [*compiler, *FLAGS, "-o", str(made), *map(str, sources)]
-                subprocess.run(command, check=True, capture_output=True, text=True, timeout=120)
+                subprocess.run(command, check=True, capture_output=True, text=True, timeout=600)
                 os.replace(made, target)
         built = ctypes.CDLL(str(target))
     except subprocess.CalledProcessError as error:

@@ -65,6 +65,16 @@ def test_a_compiler_that_fails_is_named(monkeypatch, unbuilt, capsys):
     assert not list(unbuilt.glob("mmpi_ns/*.so"))
 
 
+def test_a_compiler_may_come_with_arguments(monkeypatch, unbuilt):
+    given = unbuilt / "given"
+    script = unbuilt / "my-compiler"
+    script.write_text(f'#!/bin/sh\necho "$@" > {given}\nexit 1\n')
+    script.chmod(0o755)
+    monkeypatch.setenv("CXX", f"{script} -pipe")
+    assert dispatch.form_of("march", torch.zeros(1)) == "reference"
+    assert given.read_text().split()[:2] == ["-pipe", "-std=c++17"]
+
+
 def test_what_was_compiled_is_used_again(monkeypatch, unbuilt):
     assert dispatch.form_of("march", torch.zeros(1)) == "cpu"
     assert [p.suffix for p in (unbuilt / "mmpi_ns").iterdir()] == [".so"]

@@ -66,7 +66,7 @@ class Running:
     """A command that has been started."""
 
     def __init__(self, name, options, arguments, memory, environment=None):
-        self.folder = Path(tempfile.mkdtemp(prefix="trust"))
+        self.folder = Path(tempfile.mkdtemp(prefix="trust", dir=os.environ["XDG_CACHE_HOME"]))  # conftest removes it
         self.began = time.monotonic()
         given = (self.folder, name, options, arguments, memory, environment or {})
         self.process = _context.Process(target=_child, args=given, daemon=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import json
 import math
+import os
 import tempfile
 from pathlib import Path
 
@@ -109,7 +110,7 @@ def use_plan(folder):
 
 
 def fuzz(kind, text):
-    folder = Path(tempfile.mkdtemp())
+    folder = Path(tempfile.mkdtemp(dir=os.environ["XDG_CACHE_HOME"]))
     refused = tried(json.loads(text), use_capture(folder) if kind == "capture" else use_plan(folder))
     print(f"refused {refused}")
 
