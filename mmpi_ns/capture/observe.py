@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from mmpi_ns.capture.cache import Arrays, digest, remembered
 from mmpi_ns.capture.checks import in_one_place
 from mmpi_ns.capture.dataset import MMPIDataset
+from mmpi_ns.capture.lens_directions import lens_directions
 from mmpi_ns.capture.loose_points import with_visible_points
 from mmpi_ns.capture.originals import at_full_size
 from mmpi_ns.capture.sfm import SfmModel, find_sfm_model
@@ -137,7 +138,12 @@ def read_observations(outputs: DataparserOutputs, cameras: Cameras, sfm: SfmMode
     elif "points3D_xyz" in outputs.metadata:
         result = {**result, "points": outputs.metadata["points3D_xyz"].double().numpy()}
     observations = Observations(
-        camera_to_worlds=poses, intrinsics=np.stack(flat, -1), sizes=sizes.astype(np.float64), seen_at=seen_at, **result
+        camera_to_worlds=poses,
+        intrinsics=np.stack(flat, -1),
+        sizes=sizes.astype(np.float64),
+        seen_at=seen_at,
+        lens=lens_directions(cameras),
+        **result,
     )
     if len(observations.points) and not len(observations.seen_by):
         return with_visible_points(observations)

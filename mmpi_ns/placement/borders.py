@@ -49,11 +49,8 @@ def border_points(observations: Observations, visible: VisiblePoints) -> Array:
     rim = np.array([(a, b) for a in steps for b in steps if a in (0.0, 1.0) or b in (0.0, 1.0)])
     shares = -BEYOND + (1 + 2 * BEYOND) * rim
     clouds = []
-    for pose, (fx, fy, cx, cy), (w, h), depths in zip(
-        observations.camera_to_worlds, observations.intrinsics, observations.sizes, visible.typical, strict=True
-    ):
-        x, y = (shares[:, 0] * w - cx) / fx, (shares[:, 1] * h - cy) / fy
-        directions = np.stack([x, -y, -np.ones_like(x)], -1) @ pose[:, :3].T
+    for i, (pose, depths) in enumerate(zip(observations.camera_to_worlds, visible.typical, strict=True)):
+        directions = observations.directions(i, shares) @ pose[:, :3].T
         clouds += [pose[:, 3] + depth * directions for depth in depths]
     return np.concatenate(clouds)
 

@@ -14,13 +14,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mmpi_ns.placement.errors import cube_errors, pixel_slopes
-from mmpi_ns.placement.hand_made import vector
+from mmpi_ns.placement.hand_made import facing_axes, vector
 from mmpi_ns.placement.observations import Array, Observations
 from mmpi_ns.placement.visibility import VisiblePoints
 from mmpi_ns.scene.plan import CubePlan, MPIPlan
 
-MAX_VIEWS = 96
-"""Training cameras that candidates start from, spread over all of them."""
+MAX_VIEWS, MAX_WIDE_VIEWS = 96, 32
+"""Training cameras that candidates start from, spread over all of them; fewer where wide lenses have several each."""
+FACES = ("front", "left", "right", "above", "below", "back")
+"""Ways that MPIs face where a wide camera stands; each holds what is seen most along it, and a little more."""
+BESIDE = 0.9
+"""Part of its largest component that a direction has along a face that holds it."""
 MARGINS = (1.12, 1.4, 1.75)
 """Frusta of views, relative to the camera's own."""
 PULL_BACKS = (0.0, 1.0, 2.0)
@@ -60,12 +64,13 @@ class Candidate:
 
 def find_candidates(observations: Observations, visible: VisiblePoints, with_cubes: bool) -> list[Candidate]:
     """Views of training cameras that are spread over the capture, and cubes."""
-    spread = spread_cameras(observations, visible, MAX_VIEWS)
+    spread = spread_cameras(observations, visible, MAX_WIDE_VIEWS if observations.wide.any() else MAX_VIEWS)
     views = [
         view
         for i in spread
+        for face in _faces(observations, i)
         for pull_back in PULL_BACKS
-        for view in _views(observations, visible, i, pull_back * visible.near)
+        for view in _views(observations, visible, i, face, pull_back * visible.near)
     ]
     return [*views, *(_cubes(observations, visible) if with_cubes else [])]
 
@@ -86,17 +91,50 @@ def spread_cameras(observations: Observations, visible: VisiblePoints, wanted: i
     return chosen
 
 
-def _views(observations: Observations, visible: VisiblePoints, i: int, pull_back: float) -> Iterator[Candidate]:
-    """One MPI for each margin. They differ in extent alone, so the errors are worked out once, in the widest."""
+@dataclass(frozen=True)
+class _Face:
+    """A way that MPIs may face where a camera stands."""
+
+    name: str
+    axes: Array
+    """Rows right, down, facing, in world axes."""
+    u: Array
+    """Least and largest tangent of what the camera sees there, to the right."""
+    v: Array
+    """The same downwards."""
+
+
+def _faces(observations: Observations, i: int) -> Iterator[_Face]:
+    """As the camera does, over what its lens sees; of a wide lens also to the sides of it, each over its part."""
     right, up, back = observations.camera_to_worlds[i, :, :3].T
-    fx, fy, cx, cy = observations.intrinsics[i]
-    width, height = observations.sizes[i]
-    origin, axes = observations.centers[i] + pull_back * back, np.stack([right, -up, -back])
-    u, v = np.array([-cx, width - cx]) / fx, np.array([-cy, height - cy]) / fy
+    axes, name = np.stack([right, -up, -back]), f"view {i + 1}"
+    if observations.lens is None:
+        fx, fy, cx, cy = observations.intrinsics[i]
+        width, height = observations.sizes[i]
+        yield _Face(name, axes, np.array([-cx, width - cx]) / fx, np.array([-cy, height - cy]) / fy)
+        return
+    seen = observations.lens[i].reshape(-1, 3) * [1, -1, -1]
+    for face in FACES if observations.wide[i] else FACES[:1]:
+        turn = np.array(facing_axes(np.eye(3), face))
+        x, y, ahead = local = turn @ seen.T
+        own = ahead >= BESIDE * np.abs(local).max(0) if observations.wide[i] else ahead > 1e-3
+        if own.sum() > 2:
+            u, v = (np.array([t.min(), t.max()]) for t in (x[own] / ahead[own], y[own] / ahead[own]))
+            if min(np.ptp(u), np.ptp(v)) > 1e-3:
+                yield _Face(name if face == "front" else f"{name} {face}", turn @ axes, u, v)
+
+
+def _views(
+    observations: Observations, visible: VisiblePoints, i: int, face: _Face, pull_back: float
+) -> Iterator[Candidate]:
+    """One MPI for each margin. They differ in extent alone, so the errors are worked out once, in the widest."""
+    fx, fy = observations.intrinsics[i, :2]
+    axes, u, v = face.axes, face.u, face.v
+    origin = observations.centers[i] - pull_back * axes[2]
     frame = MPIPlan(
-        name=f"view {i + 1}",
+        name=face.name,
         origin=vector(origin),
-        axes=(vector(right), vector(-up), vector(-back)),
+        axes=(vector(axes[0]), vector(axes[1]), vector(axes[2])),
         near=float(NEAR_SHARE * min(visible.nearest[i], visible.near) + pull_back),
         extent=_widened(u, v, max(MARGINS)),
         planes=2,

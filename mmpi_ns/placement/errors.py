@@ -106,10 +106,17 @@ def pixel_slopes(
     seen = inside & (depth > 1e-9 * np.abs(q).max(-1))
     depth = np.where(seen, depth, 1.0)
 
+    wide = observations.wide[cameras]
+
     def slope(direction: Array) -> Array:
         """Length in pixels of a unit step along one of (u, v, w)."""
         moved = direction[:, :2] / depth[:, None] + q[:, :2] * (direction[:, 2] / depth**2)[:, None]
-        return np.where(seen, np.linalg.norm(moved * focal, axis=-1), np.inf)
+        found = np.where(seen, np.linalg.norm(moved * focal, axis=-1), np.inf)
+        if wide.any():  # such lenses have as many pixels a degree at the borders as in the middle, about
+            some, size = direction[wide], np.linalg.norm(q[wide], axis=-1)
+            turned = np.linalg.norm(np.cross(some, q[wide]), axis=-1) / np.maximum(size, 1e-12) ** 2
+            found[wide] = np.where(inside[wide], turned * focal[wide].mean(-1), np.inf)
+        return found
 
     return slope(shift), slope(columns[..., 0]), slope(columns[..., 1])
 

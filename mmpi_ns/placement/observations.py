@@ -3,11 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+
+WIDE = 1.5
+"""Tangents beyond which a lens that squeezes its borders is wide: planes that face as the camera does hold too little
+of what it sees."""
+SQUEEZED = 1.3
+"""Such a lens sees farther than a pinhole of its focal length would, by this factor in tangents."""
+BEYOND_LENS = 0.05
+"""Cosines by which a keypoint may lie beyond the borders of its lens."""
 
 
 @dataclass(frozen=True)
@@ -28,6 +37,9 @@ class Observations:
     """[Q] point of each keypoint."""
     seen_at: Array
     """[S, 2] pixel (x, y) of the first S <= Q keypoints, those of SfM; the others come from a plane sweep."""
+    lens: Array | None = None
+    """[M, G, G, 3] unit directions, in camera axes, through a grid over each image from border to border, row after
+    row; None where all cameras are pinholes."""
 
     @property
     def centers(self) -> Array:
@@ -49,10 +61,52 @@ class Observations:
         right = _unit(right - right.dot(up) * up)
         return np.stack([right, -up, np.cross(right, -up)])
 
+    @cached_property
+    def wide(self) -> NDArray[np.bool_]:
+        """[M] which cameras see farther to the sides than planes in front of them can hold."""
+        if self.lens is None:
+            return np.zeros(len(self.centers), dtype=bool)
+        ahead = -self.lens[..., 2]
+        aside = np.abs(self.lens[..., :2]).max(-1)
+        tangent = np.where(ahead > 1e-3, aside / np.maximum(ahead, 1e-3), np.inf).max((1, 2))
+        middle, focal = self.intrinsics[:, 2:], self.intrinsics[:, :2]
+        pinhole = (np.maximum(middle, self.sizes - middle) / focal).max(-1)
+        return (tangent > WIDE) & (tangent > SQUEEZED * pinhole)
+
     def depths(self, cameras: NDArray[np.int64], points: Array) -> Array:
-        """Depths [Q] of points [Q, 3] along the axes of cameras [Q]; negative behind."""
+        """Depths [Q] of points [Q, 3] along the axes of cameras [Q]; negative behind.
+
+        Those of wide cameras are along the nearest of the camera's axes, sideways too; negative beyond the lens.
+        """
         poses = self.camera_to_worlds[cameras]
-        return -np.einsum("qi,qi->q", points - poses[:, :, 3], poses[:, :, 2])
+        depths = -np.einsum("qi,qi->q", points - poses[:, :, 3], poses[:, :, 2])
+        wide = self.wide[cameras]
+        if self.lens is not None and wide.any():
+            local = np.einsum("qji,qj->qi", poses[wide, :, :3], points[wide] - poses[wide, :, 3])
+            least = -self.lens[..., 2].max((1, 2))[cameras[wide]] - BEYOND_LENS
+            length = np.linalg.norm(local, axis=-1)
+            depths[wide] = np.where(-local[:, 2] >= least * length, np.abs(local).max(-1), -length)
+        return depths
+
+    def directions(self, camera: int, shares: Array) -> Array:
+        """Directions [N, 3], in camera axes and of depth 1, through places [N, 2] of an image.
+
+        Args:
+            camera: number of the camera.
+            shares: x and y as shares of the image's sides; a little beyond the borders will do.
+        """
+        if self.lens is None:
+            (fx, fy, cx, cy), (w, h) = self.intrinsics[camera], self.sizes[camera]
+            x, y = (shares[:, 0] * w - cx) / fx, (shares[:, 1] * h - cy) / fy
+            return np.stack([x, -y, -np.ones_like(x)], -1)
+        grid = self.lens[camera]
+        at = shares * (len(grid) - 1)
+        first = np.clip(np.floor(at).astype(int), 0, len(grid) - 2)
+        (x, y), (u, v) = first.T, (at - first).T[..., None]
+        found = (1 - v) * ((1 - u) * grid[y, x] + u * grid[y, x + 1])
+        found += v * ((1 - u) * grid[y + 1, x] + u * grid[y + 1, x + 1])
+        depth = np.abs(found).max(-1) if self.wide[camera] else -found[:, 2]
+        return found / depth[:, None]
 
     def project(self, cameras: NDArray[np.int64], points: Array) -> tuple[Array, NDArray[np.bool_]]:
         """Pixels [Q, 2] at which cameras [Q] would see points [Q, 3], lens distortion left out, and which lie ahead."""
@@ -80,12 +134,9 @@ def frustum_points(observations: Observations, near: Array, per_camera: int = 24
     index = np.arange(per_camera)
     uvw = np.stack([(index * g) % 1.0 for g in (0.7548776662, 0.5698402910, 0.8191725134)], -1)
     clouds = []
-    for pose, (fx, fy, cx, cy), (w, h), start in zip(
-        observations.camera_to_worlds, observations.intrinsics, observations.sizes, near, strict=True
-    ):
+    for i, (pose, start) in enumerate(zip(observations.camera_to_worlds, near, strict=True)):
         depth = start / np.maximum(uvw[:, 2], 1e-3)
-        x, y = (uvw[:, 0] * w - cx) / fx, (uvw[:, 1] * h - cy) / fy
-        local = np.stack([x, -y, -np.ones_like(x)], -1) * depth[:, None]
+        local = observations.directions(i, uvw[:, :2]) * depth[:, None]
         clouds.append(local @ pose[:, :3].T + pose[:, 3])
     return np.concatenate(clouds)
 

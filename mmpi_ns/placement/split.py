@@ -92,6 +92,7 @@ def of_cameras(observations: Observations, cameras: NDArray[np.int64]) -> Observ
         seen_by=number[observations.seen_by[keep]],
         seen_point=observations.seen_point[keep],
         seen_at=observations.seen_at[keep[: len(observations.seen_at)]],
+        lens=None if observations.lens is None else observations.lens[cameras],
     )
 
 

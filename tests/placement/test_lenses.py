@@ -1,0 +1,96 @@
+"""Placement knows the lens: what a fisheye sees is held by MPIs, to its borders."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from nerfstudio.cameras.cameras import Cameras, CameraType
+
+from mmpi_ns.capture.lens_directions import lens_directions
+from mmpi_ns.placement.observations import Observations
+from mmpi_ns.placement.rule import PlacementConfig, place
+
+SIDE, COUNT = 160, 10
+
+
+def equidistant(points):
+    """Directions [N, 3] of a fisheye at ((x - cx) / f, (cy - y) / f): the angle grows with the distance."""
+    angle = np.maximum(np.linalg.norm(points, axis=-1, keepdims=True), 1e-12)
+    return np.append(points / angle * np.sin(angle), -np.cos(angle), 1)
+
+
+def walk(degrees, width=SIDE, height=SIDE * 3 // 4):
+    """Fisheyes of so many degrees across on a walk through a hall, and points on its walls that each sees."""
+    focal = (width / 2) / np.radians(degrees / 2)
+    centers = np.stack([np.linspace(0, 1.5, COUNT), 0.1 * np.sin(np.arange(COUNT)), np.zeros(COUNT)], -1)
+    poses = np.concatenate([np.tile(np.eye(3), (COUNT, 1, 1)), centers[:, :, None]], -1)
+    kind = torch.full((COUNT, 1), CameraType.FISHEYE.value)
+    cameras = Cameras(
+        torch.from_numpy(poses).float(), focal, focal, width / 2, height / 2, width, height, torch.zeros(6), kind
+    )
+    rng = np.random.default_rng(0)
+    at = rng.uniform([0, 0], [width, height], (COUNT, 300, 2))
+    directions = equidistant(((at - [width / 2, height / 2]) / focal * [1, -1]).reshape(-1, 2)).reshape(COUNT, -1, 3)
+    reach = np.minimum(3 / np.abs(directions).max(-1, keepdims=True), 9)  # a room of 6 x 6 x 6 about each camera
+    points = (centers[:, None] + directions * reach * rng.uniform(0.7, 1, (COUNT, 300, 1))).reshape(-1, 3)
+    seen = np.repeat(np.arange(COUNT), 300)
+    intrinsics = np.tile([focal, focal, width / 2, height / 2], (COUNT, 1))
+    sizes = np.tile([float(width), height], (COUNT, 1))
+    found = Observations(
+        poses, intrinsics, sizes, points, seen, np.arange(len(points)), at.reshape(-1, 2), lens_directions(cameras)
+    )
+    return found, cameras
+
+
+def share_in_no_mpi(plan, cameras, distance):
+    """Of all pixels of all images, at some distance."""
+    lost = []
+    for i in range(len(cameras)):
+        rays = cameras.generate_rays(camera_indices=i)
+        points = (rays.origins + distance * rays.directions).double().reshape(-1, 3).numpy()
+        held = np.zeros(len(points), dtype=bool)
+        for mpi in plan.mpis:
+            x, y, z = ((points - mpi.origin) @ np.array(mpi.axes).T).T
+            u0, u1, v0, v1 = mpi.extent
+            held |= (z >= mpi.near) & (x >= u0 * z) & (x <= u1 * z) & (y >= v0 * z) & (y <= v1 * z)
+        lost.append(1 - held.mean())
+    return np.mean(lost)
+
+
+def test_directions_are_those_of_the_lens():
+    found, _ = walk(150)
+    focal = found.intrinsics[0, 0]
+    shares = np.random.default_rng(1).uniform(0, 1, (200, 2))
+    at = (shares - 0.5) * found.sizes[0] / focal * [1, -1]
+    wanted, got = equidistant(at), found.directions(3, shares)
+    assert np.abs(got).max(-1) == pytest.approx(1)
+    assert np.abs(got / np.linalg.norm(got, axis=-1, keepdims=True) - wanted).max() < 5e-3
+    assert np.abs(found.depths(np.full(200, 3), found.centers[3] + 4 * got) - 4).max() < 1e-9
+    behind = found.centers[3] + [[0, 0, 5.0], [1.0, 0, 5.0]]
+    assert (found.depths(np.array([3, 3]), behind) < 0).all()
+
+
+def test_lenses_without_distortion_are_pinholes():
+    focal = torch.full((2, 1), 100.0)
+    poses = torch.eye(4)[None, :3].repeat(2, 1, 1)
+    assert lens_directions(Cameras(poses, focal, focal, 50.0, 40.0, 100, 80)) is None
+    bent = Cameras(poses, focal, focal, 50.0, 40.0, 100, 80, torch.tensor([[-0.1, 0, 0, 0, 0, 0.0]]).repeat(2, 1))
+    found = lens_directions(bent)
+    assert found is not None and np.abs(found[0, 8, 8] - [0, 0, -1]).max() < 1e-6
+    assert found[0, 8, -1, 0] / -found[0, 8, -1, 2] > 0.51  # a barrel sees farther than 50 / 100
+
+
+@pytest.mark.parametrize("degrees", [100, 150, 178])
+def test_a_fisheyes_pixels_lie_in_mpis(degrees):
+    """At the depths of the room's walls; farther away fewer are lost than if the lens were a pinhole."""
+    found, cameras = walk(degrees)
+    assert found.wide.all() and not walk(80)[0].wide.any()
+    plan, pinholes = (place(o, PlacementConfig(max_texels=4e6)) for o in (found, replace(found, lens=None)))
+    for distance in (3.0, 4.5):
+        assert share_in_no_mpi(plan, cameras, distance) < 0.01, (distance, plan.names)
+    for distance in (9.0, 1e4):
+        lost = share_in_no_mpi(plan, cameras, distance)
+        assert lost < 0.5 * share_in_no_mpi(pinholes, cameras, distance), (distance, plan.names)
