@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import os
 import zipfile
@@ -10,6 +9,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import numpy as np
+from filelock import FileLock
 from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
 
@@ -47,12 +47,11 @@ def remembered(key: str, find: Callable[[], Arrays], folder: Path | None = None)
     path = folder / f"{key}.npz"
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        lock = (folder / f"{key}.lock").open("w")
+        lock = FileLock(folder / f"{key}.lock").acquire()
     except OSError as error:
         CONSOLE.print(f"[yellow]{folder} cannot be written to ({error.strerror}): depths are found anew at each start.")
         return find()
     with lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
         known = _read(path)
         if known is None:
             known = find()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager, VanillaDataManagerConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
@@ -25,6 +25,7 @@ from mmpi_ns.capture.checks import check_transforms
 from mmpi_ns.capture.dataset import MMPIDataset
 from mmpi_ns.capture.known_depth import KnownDepth, know_depths
 from mmpi_ns.capture.observe import observe, sfm_folder
+from mmpi_ns.capture.pixels import PixelPool, pixel_bytes
 from mmpi_ns.capture.rays import PinholeRays
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.scene.visible_tiles import TrainingViews
@@ -41,10 +42,6 @@ KEYPOINT_DEPTH = "keypoint_inverse_distance"
 """Ray-bundle metadata: inverse distance of the SfM point on a keypoint ray, 0 on ordinary rays."""
 PIXEL_DEPTH = "pixel_inverse_distance"
 """Ray-bundle metadata [R, 2]: inverse distance of what a pixel shows and its expected error, 0 where not known."""
-
-
-PIXEL_BYTES = 3 + 3 * 4 + 2 * 4
-"""Of a resident pixel: its colour, its image, row and column, and its depth with its error."""
 
 
 @dataclass
@@ -68,69 +65,11 @@ class MMPIDataManagerConfig(VanillaDataManagerConfig):
     depth_images: bool = True
     """Use the depths of sensors that a data parser names (depth_file_path)."""
     resident_pixels: float = 60e6
-    """Training pixels held in memory at once (23 bytes each); those of a longer capture are read window by window."""
+    """Training pixels held in memory at once (at most 15 bytes each). Those of a longer capture are read window by
+    window, and of a window that has more, so many at random. 0: window by window, all of them."""
     seed: int = field(default=0, init=False)
     """Not an option: the trainer sets it from --machine.seed. Batches depend on it and the step alone, so a resumed run
     draws what an uninterrupted one would."""
-
-
-@dataclass(frozen=True)
-class PixelPool:
-    """All training pixels that may be drawn, resident on the device."""
-
-    colors: Tensor
-    """[P, C] uint8 or float, C = 3 or 4."""
-    indices: Int[Tensor, "P 3"]
-    """(image, row, column) of each pixel."""
-    depths: Float[Tensor, "P 2"]
-    """Inverse distance of each pixel and its expected error; 0 where not known."""
-
-    @staticmethod
-    def from_dataset(
-        dataset: MMPIDataset,
-        device: str | torch.device,
-        images: Iterable[int] | None = None,
-        known: KnownDepth | None = None,
-    ) -> PixelPool:
-        """Reads every image, or some, once; masked pixels are left out.
-
-        Raises:
-            InputError: an image or mask cannot be used (names the file), or the masks leave nothing.
-        """
-        colors, indices, depths = [], [], []
-        alpha = dataset.has_alpha
-        for i in range(len(dataset)) if images is None else images:
-            data = dataset.get_data(i, image_type="uint8")
-            image = data["image"]
-            keep = torch.ones(image.shape[:2], dtype=torch.bool)
-            if "mask" in data:
-                keep = data["mask"][..., 0].bool()
-            rows, columns = keep.nonzero(as_tuple=True)
-            colors.append(_with_alpha(image[rows, columns]) if alpha else image[rows, columns])
-            indices.append(torch.stack([torch.full_like(rows, i), rows, columns], -1).to(torch.int32))
-            depth = torch.zeros(*keep.shape, 2) if known is None else torch.from_numpy(known.images[i])
-            depths.append(depth[rows, columns])
-        if not sum(len(c) for c in colors):
-            raise InputError("The masks leave no training pixel: white (non-zero) mask pixels are the ones used.")
-        return PixelPool(*(torch.cat(parts).to(device) for parts in (colors, indices, depths)))
-
-    def draw(
-        self, count: int, g: torch.Generator, allowed: Int[Tensor, "A"] | None = None
-    ) -> tuple[Float[Tensor, "R C"], Int[Tensor, "R 3"], Float[Tensor, "R 2"]]:
-        """Colours, indices and depths of random pixels, of all or of those at the ``allowed`` places."""
-        size = self.colors.shape[0] if allowed is None else len(allowed)
-        chosen = torch.randint(size, (count,), generator=g, device=g.device).to(self.colors.device)
-        chosen = chosen if allowed is None else allowed[chosen].long()
-        return self.colors[chosen].float() / 255, self.indices[chosen].long(), self.depths[chosen]
-
-    def places_of(self, images: Int[Tensor, "I"]) -> Int[Tensor, "A"]:
-        """Where the pixels of some images lie in the pool."""
-        return torch.isin(self.indices[:, 0], images.to(self.indices)).nonzero()[:, 0].to(torch.int32)
-
-
-def _with_alpha(colors: UInt8[Tensor, "P C"]) -> UInt8[Tensor, "P 4"]:
-    """Opaque where the image has no alpha and another one has."""
-    return torch.cat([colors, torch.full_like(colors[:, :1], 255)], -1) if colors.shape[1] == 3 else colors
 
 
 class MMPIDataManager(VanillaDataManager[MMPIDataset]):
@@ -191,7 +130,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         sizes = self.train_dataset.cameras.width * self.train_dataset.cameras.height
         self._reads_by_window = bool(sizes.sum() > self.config.resident_pixels)
         if not self._reads_by_window and self.test_mode == "val":
-            self.pool = PixelPool.from_dataset(self.train_dataset, self.device, known=self.known_depth)
+            self.pool = self._read_pixels()
         # Samples nothing: ns-export sets its batches' size here.
         self.train_pixel_sampler = self._get_pixel_sampler(self.train_dataset, self.config.train_num_rays_per_batch)
         cameras = self.train_dataset.cameras
@@ -208,19 +147,43 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         self._keypoints = _keypoint_targets(self.observations, self.device, cameras)
         self._allowed = None
         if cameras is not None and self._reads_by_window:
-            self.pool = PixelPool.from_dataset(self.train_dataset, self.device, cameras.tolist(), self.known_depth)
+            self.pool = None  # before the next one is read
+            self.pool = self._read_pixels(cameras.tolist())
         elif cameras is not None:
             assert self.pool is not None
             self._allowed = self.pool.places_of(torch.from_numpy(cameras))
             if not len(self._allowed):
                 raise InputError("The masks leave no training pixel in one stretch of the capture: use longer windows.")
 
+    def _read_pixels(self, images: Sequence[int] | None = None) -> PixelPool:
+        """The pixels of the training images, or of some; says so where a share of them must do."""
+        sizes, most = self._sizes(images), int(self.config.resident_pixels)
+        if 0 < most < sizes.sum():
+            CONSOLE.print(
+                f"{most / 1e6:.3g} of {sizes.sum() / 1e6:.3g} M training pixels are used, drawn at random: more are "
+                "held with --pipeline.datamanager.resident-pixels."
+            )
+        return PixelPool.from_dataset(
+            self.train_dataset, self.device, images, self.known_depth, most, self.config.seed
+        )  # fmt: skip
+
+    def _sizes(self, images: Sequence[int] | NDArray[np.int64] | None) -> NDArray[np.int64]:
+        """Pixels of each training image, or of some."""
+        sizes = (self.train_dataset.cameras.width * self.train_dataset.cameras.height).reshape(-1).cpu().numpy()
+        return sizes if images is None else sizes[images]
+
     def pixel_bytes(self, cameras: NDArray[np.int64] | None = None) -> int:
         """Bytes of the training pixels in memory while these cameras are drawn from; where masks hide some, at most."""
         if self.pool is not None and not self._reads_by_window:
-            return self.pool.colors.nbytes + self.pool.indices.nbytes + self.pool.depths.nbytes
-        sizes = (self.train_dataset.cameras.width * self.train_dataset.cameras.height).reshape(-1).cpu().numpy()
-        return PIXEL_BYTES * int((sizes if cameras is None else sizes[cameras]).sum())
+            return self.pool.nbytes
+        dataset, sizes, most = self.train_dataset, self._sizes(cameras), int(self.config.resident_pixels)
+        share = min(1.0, most / sizes.sum()) if most else 1.0
+        each = pixel_bytes(
+            whole=share == 1 and not dataset.has_masks,
+            depths=self.known_depth is not None,
+            channels=4 if dataset.has_alpha else 3,
+        )
+        return each * sum(int(share * size) for size in sizes.tolist())
 
     def setup_eval(self) -> None:
         """nerfstudio's loaders, but for the one that holds every evaluation image in memory."""
@@ -253,7 +216,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         """
         self.train_count += 1
         if self.pool is None:  # nobody said which window
-            self.pool = PixelPool.from_dataset(self.train_dataset, self.device, known=self.known_depth)
+            self.pool = self._read_pixels()
         g = generator(self.config.seed, step if self.training else self.train_count, "pixels", self.device)
         colors, indices, pixel_depths = self.pool.draw(self.get_train_rays_per_batch(), g, self._allowed)
         bundle = self.train_ray_generator(indices)

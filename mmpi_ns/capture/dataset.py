@@ -36,6 +36,10 @@ class MMPIDataset(InputDataset):
         """Whether any image has an alpha channel; files that cannot be read are named when they are needed."""
         return any(_header(name)[1] for name in self.image_filenames)
 
+    @property
+    def has_masks(self) -> bool:
+        return self._dataparser_outputs.mask_filenames is not None
+
     def get_numpy_image(self, image_idx: int) -> NDArray[np.uint8]:
         """Image [H, W, 3 or 4]: red, green, blue, and alpha where the file has it, in 8 bits."""
         name = self.image_filenames[image_idx]

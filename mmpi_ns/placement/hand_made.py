@@ -70,7 +70,8 @@ def drive_plan(
 def room_plan(
     observations: Observations,
     planes: int,
-    resolution: int,
+    height: int,
+    width: int,
     cube_voxels: int,
     near: float,
     cube_half_size: float,
@@ -82,7 +83,8 @@ def room_plan(
     Args:
         observations: training cameras.
         planes: planes of every MPI.
-        resolution: texels along each side of a plane.
+        height: texel rows of every MPI.
+        width: texel columns of every MPI.
         cube_voxels: voxels along each side of the cube; 0 for none.
         near: depth of the first plane, scene units.
         cube_half_size: half the cube's side, scene units.
@@ -99,8 +101,8 @@ def room_plan(
             near,
             (-tangent, tangent, -tangent, tangent),
             planes,
-            resolution,
-            resolution,
+            height,
+            width,
         )
         for name in names
     )

@@ -83,14 +83,14 @@ def place(observations: Observations, config: PlacementConfig, training_rays: in
         ValueError: the cameras leave nothing to place, e.g. all observations are behind their cameras.
     """
     visible = find_visible_points(observations)
+    size = (config.planes, config.height, config.width)
     if config.arrangement == "drive":
         # The hand-made rule is in metres; it was made where the nearest point lies 5 m away.
-        size = (config.planes, config.height, config.width)
         return drive_plan(observations, visible.near / 5, *size, config.faces, config.drive_pull_back)
     if config.arrangement == "room":
         half_size = float(np.abs(observations.centers - observations.centers.mean(0)).max()) + visible.near
         near = max(0.5 * visible.near, 1e-6)
-        return room_plan(observations, config.planes, config.width, config.cube_voxels, near, half_size)
+        return room_plan(observations, *size, config.cube_voxels, near, half_size)
     texel_pixels = max(config.texel_pixels, trainable_texel(observations, config, training_rays))
     config = replace(config, max_texels=affordable_texels(config, training_rays))
     chosen = _choose(observations, visible, config, texel_pixels)

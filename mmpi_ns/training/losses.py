@@ -174,7 +174,7 @@ def batch_losses(
     observed = over_background(image, random)
     # Where MPIs that train apart see a ray only in part, what they let through is not theirs to explain.
     explained = rays.report.explained[pixels]
-    background = random if image.shape[-1] == 4 else torch.where(explained, random, observed)
+    background = torch.where(explained, random, observed)
     c, colors = rays.composite, rays.colors.of_rays(pixels)
     composite = Composite(*(x.index_select(0, pixels) for x in (c.weights, c.accumulation, c.transmittance)))
     rgb = colors.rgb + composite.transmittance * background

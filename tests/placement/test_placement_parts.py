@@ -358,3 +358,11 @@ def test_the_table_says_what_a_slow_count_finds():
     assert f"Expected error {np.median(ordered):.2f} px in the median" in said
     between = ordered[int(0.9 * last)] + (0.9 * last % 1) * (ordered[int(0.9 * last) + 1] - ordered[int(0.9 * last)])
     assert f"{between:.2f} px at nine tenths" in said
+
+
+@pytest.mark.parametrize("arrangement", ["room", "drive"])
+def test_hand_made_mpis_have_the_rows_and_columns_that_are_asked_for(arrangement):
+    points = np.random.default_rng(0).uniform(-1, 1, (50, 3)) - [0, 0, 8.0]
+    cameras = observed([[0.0, 0, 0], [1, 0, 0]], points, np.repeat([0, 1], 25))
+    plan = place(cameras, PlacementConfig(arrangement=arrangement, planes=5, height=8, width=12))
+    assert {(m.planes, m.height, m.width) for m in plan.mpis} == {(5, 8, 12)}

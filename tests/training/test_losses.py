@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from training_runs import datamanager, plan_of, ready, trainer_config
 
 from mmpi_ns.field.shading import RayColors
 from mmpi_ns.ops.composite import Composite
@@ -266,3 +268,19 @@ def test_known_depth_has_the_gradient_of_finite_differences_and_a_finite_one_wit
         empty, torch.tensor([[1e30, 0.0, 1e-20], [5.0, 5.0, 0.0]]), bare, torch.ones(2, 3, dtype=torch.bool), 0.0
     ).backward()
     assert empty.grad is not None and torch.isfinite(empty.grad).all()
+
+
+def test_opaque_pixels_with_alpha_train_as_pixels_without(scene, tmp_path):
+    """Also rays that their MPI sees in part: what it lets through is not its to explain, in any format."""
+    plan = plan_of(datamanager(scene, test_mode="inference").observations)
+    narrow = replace(plan, mpis=tuple(replace(m, extent=(-0.6, 0.2, -0.3, 0.3)) for m in plan.mpis))
+    (tmp_path / "plan.json").write_text(narrow.to_json())
+    trainer = ready(trainer_config(scene, tmp_path / "plan.json", tmp_path))
+    model, manager = trainer.pipeline.model, trainer.pipeline.datamanager
+    model.train()
+    rays, batch = manager.next_train(0)
+    outputs = model.get_outputs(rays)
+    assert 0 < outputs["training"].report.explained.float().mean() < 1
+    alpha = {**batch, "image": torch.cat([batch["image"], torch.ones(len(batch["image"]), 1)], -1)}
+    plain, opaque = (model.get_loss_dict(outputs, b) for b in (batch, alpha))
+    assert plain["rgb_loss"].item() == opaque["rgb_loss"].item() > 0

@@ -1,0 +1,145 @@
+"""Training pixels in memory, from which batches are drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int, UInt8
+from torch import Tensor
+
+from mmpi_ns.capture.dataset import MMPIDataset
+from mmpi_ns.capture.known_depth import KnownDepth
+from mmpi_ns.utils.errors import InputError
+from mmpi_ns.utils.random_draws import generator
+
+
+@dataclass(frozen=True)
+class PixelPool:
+    """The pixels P of some images I that may be drawn, image after image, on the device.
+
+    Which row and column a pixel has follows from its place where all pixels of the images are here.
+    """
+
+    colors: UInt8[Tensor, "P C"]
+    """C = 3 or 4."""
+    images: Int[Tensor, "I"]
+    """Numbers of the images in the data set."""
+    widths: Int[Tensor, "I"]
+    starts: Int[Tensor, "I+1"]
+    """Where each image's pixels begin, and where the last one's end."""
+    places: Int[Tensor, "P"] | None
+    """row * width + column of each pixel; None where all are here."""
+    depths: Float[Tensor, "P 2"] | None
+    """Inverse distance of each pixel and its expected error, 0 where not known; None where none is."""
+
+    @staticmethod
+    def from_dataset(
+        dataset: MMPIDataset,
+        device: str | torch.device,
+        images: Sequence[int] | None = None,
+        known: KnownDepth | None = None,
+        most: int = 0,
+        seed: int = 0,
+    ) -> PixelPool:
+        """Reads images once; masked pixels are left out.
+
+        Args:
+            dataset: the training images.
+            device: where the pixels will lie.
+            images: which of them; None for all.
+            known: what is known of their depths.
+            most: pixels in all; of more, so many are taken at random, as large a share of each image. 0: no limit.
+            seed: of that choice.
+
+        Raises:
+            InputError: an image or mask cannot be used (names the file), or the masks leave nothing.
+        """
+        images = range(len(dataset)) if images is None else images
+        widths, heights = (x.reshape(-1).tolist() for x in (dataset.cameras.width, dataset.cameras.height))
+        sizes = [widths[i] * heights[i] for i in images]
+        share = min(1.0, most / sum(sizes)) if most else 1.0
+        whole = share == 1.0 and not dataset.has_masks
+        room = sum(int(share * size) for size in sizes)
+        colors = torch.empty(room, 4 if dataset.has_alpha else 3, dtype=torch.uint8)
+        places = None if whole else torch.empty(room, dtype=torch.int32)
+        depths = None if known is None else torch.empty(room, 2)
+        starts = [0]
+        for i in images:
+            image, kept = _pixels_of(dataset, i, share, seed)
+            end = starts[-1] + len(kept)
+            rows = slice(starts[-1], end)
+            colors[rows] = _with_alpha(image, colors.shape[1])[kept]
+            if places is not None:
+                places[rows] = kept.int()
+            if depths is not None and known is not None:
+                depths[rows] = torch.from_numpy(known.images[i]).reshape(-1, 2)[kept]
+            starts.append(end)
+        if not starts[-1]:
+            raise InputError("The masks leave no training pixel: white (non-zero) mask pixels are the ones used.")
+        colors, places, depths = (
+            None if x is None else x[: starts[-1]].to(device) for x in (colors, places, depths)
+        )  # fmt: skip
+        assert colors is not None
+        numbers = (torch.tensor(list(x), device=device) for x in (images, [widths[i] for i in images], starts))
+        return PixelPool(colors, *numbers, places, depths)
+
+    def draw(
+        self, count: int, g: torch.Generator, allowed: Int[Tensor, "A"] | None = None
+    ) -> tuple[Float[Tensor, "R C"], Int[Tensor, "R 3"], Float[Tensor, "R 2"]]:
+        """Colours, (image, row, column) and depths of random pixels: of all images, or of those ``allowed``.
+
+        Args:
+            count: R.
+            g: draws them.
+            allowed: places of images in ``images``, in their order.
+        """
+        begins, ends = self.starts[:-1], self.starts[1:]
+        if allowed is not None:
+            begins, ends = begins[allowed], ends[allowed]
+        after = (ends - begins).cumsum(0)
+        total = len(self.colors) if allowed is None else int(after[-1])
+        drawn = torch.randint(total, (count,), generator=g, device=g.device).to(self.colors.device)
+        which = torch.searchsorted(after, drawn, right=True)
+        chosen = drawn - after[which] + ends[which]
+        image = which if allowed is None else allowed[which]
+        place = chosen - begins[which] if self.places is None else self.places[chosen].long()
+        width = self.widths[image]
+        indices = torch.stack([self.images[image], place // width, place % width], -1)
+        depths = torch.zeros(count, 2, device=self.colors.device) if self.depths is None else self.depths[chosen]
+        return self.colors[chosen].float() / 255, indices, depths
+
+    def places_of(self, images: Int[Tensor, "A"]) -> Int[Tensor, "B"]:
+        """Where images, by their numbers, stand among those of which there are pixels."""
+        there = torch.isin(self.images, images.to(self.images)) & (self.starts[1:] > self.starts[:-1])
+        return there.nonzero()[:, 0]
+
+    @property
+    def nbytes(self) -> int:
+        return sum(x.nbytes for x in (self.colors, self.places, self.depths) if x is not None)
+
+
+def pixel_bytes(*, whole: bool, depths: bool, channels: int) -> int:
+    """Bytes of a pixel in a pool: its colour, its place in the image where it must be kept, and its depth."""
+    return channels + (0 if whole else 4) + (8 if depths else 0)
+
+
+def _pixels_of(dataset: MMPIDataset, i: int, share: float, seed: int) -> tuple[UInt8[Tensor, "N C"], Int[Tensor, "n"]]:
+    """The pixels of an image, and which of them are kept: a share, and none that a mask hides."""
+    data = dataset.get_data(i, image_type="uint8")
+    image = data["image"].reshape(-1, data["image"].shape[-1])
+    kept = torch.arange(len(image))
+    if share < 1:
+        kept = torch.randperm(len(image), generator=generator(seed, i, "resident"))[: int(share * len(image))]
+        kept = kept.sort().values
+    if "mask" in data:
+        kept = kept[data["mask"].reshape(-1).bool()[kept]]
+    return image, kept
+
+
+def _with_alpha(colors: UInt8[Tensor, "N C"], channels: int) -> UInt8[Tensor, "N D"]:
+    """Opaque where the image has no alpha and another one has."""
+    if colors.shape[1] == channels:
+        return colors
+    return torch.cat([colors, torch.full_like(colors[:, :1], 255)], -1)
