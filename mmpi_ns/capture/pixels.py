@@ -82,8 +82,10 @@ class PixelPool:
             None if x is None else x[: starts[-1]].to(device) for x in (colors, places, depths)
         )  # fmt: skip
         assert colors is not None
-        numbers = (torch.tensor(list(x), device=device) for x in (images, [widths[i] for i in images], starts))
-        return PixelPool(colors, *numbers, places, depths)
+        numbers, own_widths, begins = (
+            torch.tensor(list(x), device=device) for x in (images, [widths[i] for i in images], starts)
+        )
+        return PixelPool(colors, numbers, own_widths, begins, places, depths)
 
     def draw(
         self, count: int, g: torch.Generator, allowed: Int[Tensor, "A"] | None = None

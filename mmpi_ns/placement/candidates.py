@@ -115,13 +115,13 @@ def _faces(observations: Observations, i: int) -> Iterator[_Face]:
         return
     seen = observations.lens[i].reshape(-1, 3) * [1, -1, -1]
     for face in FACES if observations.wide[i] else FACES[:1]:
-        turn = np.array(facing_axes(np.eye(3), face))
+        turn: Array = np.array(facing_axes(np.eye(3), face))
         x, y, ahead = local = turn @ seen.T
         own = ahead >= BESIDE * np.abs(local).max(0) if observations.wide[i] else ahead > 1e-3
         if own.sum() > 2:
             u, v = (np.array([t.min(), t.max()]) for t in (x[own] / ahead[own], y[own] / ahead[own]))
             if min(np.ptp(u), np.ptp(v)) > 1e-3:
-                yield _Face(name if face == "front" else f"{name} {face}", turn @ axes, u, v)
+                yield _Face(name if face == "front" else f"{name} {face}", np.matmul(turn, axes), u, v)
 
 
 def _views(
