@@ -44,6 +44,7 @@ def _method(
                 keypoint_rays=keypoint_rays,
                 dense_depth=keypoint_rays > 0,
                 depth_images=keypoint_rays > 0,
+                new_view_share=0.75 if keypoint_rays > 0 else 0.0,
             ),
             model=model,
         ),

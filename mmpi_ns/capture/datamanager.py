@@ -23,8 +23,9 @@ from torch import Tensor
 
 from mmpi_ns.capture.checks import check_transforms
 from mmpi_ns.capture.dataset import MMPIDataset
-from mmpi_ns.capture.known_depth import KnownDepth, know_depths
-from mmpi_ns.capture.observe import observe, sfm_folder
+from mmpi_ns.capture.known_depth import KnownDepth, know_depths, with_known_depths
+from mmpi_ns.capture.new_views import SharedPoints, find_shared_points
+from mmpi_ns.capture.observe import observe, posed_images, sfm_folder
 from mmpi_ns.capture.pixels import PixelPool, pixel_bytes
 from mmpi_ns.capture.rays import PinholeRays
 from mmpi_ns.placement.observations import Observations
@@ -64,6 +65,9 @@ class MMPIDataManagerConfig(VanillaDataManagerConfig):
     than a second an image; kept in ~/.cache/mmpi_ns for the next start)."""
     depth_images: bool = True
     """Use the depths of sensors that a data parser names (depth_file_path)."""
+    new_view_share: float = 0.75
+    """Rays a step from between two training cameras, at points that both show at the same known depth, for each pixel
+    ray: what a new view would see there (0: none)."""
     resident_pixels: float = 60e6
     """Training pixels held in memory at once (at most 15 bytes each). Those of a longer capture are read window by
     window, and of a window that has more, so many at random. 0: window by window, all of them."""
@@ -81,6 +85,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         self.pool: PixelPool | None = None
         self.known_depth: KnownDepth | None = None
         self._allowed: Tensor | None = None
+        self._all_shared: SharedPoints | None = None
         parser = config.dataparser
         if isinstance(parser, NerfstudioDataParserConfig):
             mode = kwargs.get("test_mode", "val")
@@ -93,8 +98,9 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         dataset.metadata[RAYS_PER_STEP] = self.config.train_num_rays_per_batch
         dataset.metadata[TRAINING_VIEWS] = TrainingViews.of(dataset.cameras)
         if self.test_mode == "val":  # elsewhere the plan comes from a checkpoint
-            dataset.metadata[OBSERVATIONS] = self.observations
-            self.known_depth = self._known_depth(dataset)
+            self.known_depth = known = self._known_depth(dataset)
+            seen = self.observations if known is None else with_known_depths(self.observations, known, dataset)
+            dataset.metadata[OBSERVATIONS] = seen
         return dataset
 
     def _known_depth(self, dataset: MMPIDataset) -> KnownDepth | None:
@@ -137,6 +143,19 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         pinhole = PinholeRays.of(cameras, self.device) if torch.device(self.device).type == "cuda" else None
         self.train_ray_generator: Any = pinhole or RayGenerator(cameras.to(self.device))
         self._keypoints = _keypoint_targets(self.observations, self.device) if self.test_mode == "val" else None
+        if not self._reads_by_window:
+            self._all_shared = self._find_shared(range(len(self.train_dataset)))
+        self._shared = self._all_shared
+
+    def _find_shared(self, images: Sequence[int]) -> SharedPoints | None:
+        """The points that two of these training images show at the same depth, where new views are asked for."""
+        if self.known_depth is None or self.config.new_view_share <= 0:
+            return None
+        posed = posed_images(self.observations, self.train_dataset)
+        if posed is None:
+            return None
+        rays, seed = self.train_ray_generator, self.config.seed
+        return find_shared_points(self.train_dataset, posed, self.known_depth, rays, images, seed, self.device)
 
     def use_cameras(self, cameras: NDArray[np.int64] | None) -> None:
         """Draws pixels and keypoints of these training cameras alone from now on; None for all.
@@ -145,13 +164,15 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
             InputError: the masks leave them no pixel.
         """
         self._keypoints = _keypoint_targets(self.observations, self.device, cameras)
-        self._allowed = None
+        self._allowed, self._shared = None, self._all_shared
         if cameras is not None and self._reads_by_window:
             self.pool = None  # before the next one is read
             self.pool = self._read_pixels(cameras.tolist())
+            self._shared = self._find_shared(cameras.tolist())
         elif cameras is not None:
             assert self.pool is not None
             self._allowed = self.pool.places_of(torch.from_numpy(cameras))
+            self._shared = self._all_shared and self._all_shared.of_images(torch.from_numpy(cameras))
             if not len(self._allowed):
                 raise InputError("The masks leave no training pixel in one stretch of the capture: use longer windows.")
 
@@ -220,6 +241,11 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         g = generator(self.config.seed, step if self.training else self.train_count, "pixels", self.device)
         colors, indices, pixel_depths = self.pool.draw(self.get_train_rays_per_batch(), g, self._allowed)
         bundle = self.train_ray_generator(indices)
+        if self.training and self._shared is not None:
+            count = round(self.config.new_view_share * len(indices))
+            views, seen, distances = self._shared.draw(count, self.train_ray_generator, g)
+            bundle, colors = _join(bundle, views), torch.cat([colors, seen])
+            pixel_depths = torch.cat([pixel_depths, distances])
         depths = torch.zeros(len(bundle), 1, device=self.device)
         if self.training and self._keypoints is not None and self.config.keypoint_rays > 0:
             keypoint_bundle, keypoint_depths = self._keypoint_rays(g)

@@ -2,8 +2,8 @@
 
 Every image is compared with its nearest neighbours. A rough depth, interpolated from SfM points, warps the neighbour
 into the image, so that what is left to find is small whatever the motion was; DIS optical flow finds it. A match on its
-epipolar line gives an inverse depth; matches of several neighbours that agree are averaged. A second round starts from
-the depths of the first. All of it is OpenCV and NumPy at about twice the training size.
+epipolar line gives an inverse depth; matches of several neighbours that agree are averaged. Further rounds start from
+the depths of the one before. All of it is OpenCV and NumPy at about twice the training size.
 
 A point at inverse depth q lies at a + q b in the neighbour's axes, up to a factor. A match at a pixel there gives two
 linear equations r + q s = 0, in pixels once divided by the point's depth: their least squares is q, what remains is the
@@ -27,11 +27,11 @@ from mmpi_ns.utils.errors import InputError
 Map = NDArray[np.float32]
 Progress = Callable[[Iterable[int]], Iterable[int]]
 
-NEIGHBOURS = 6
+NEIGHBOURS = 4
 """Images that each one is compared with."""
 MAX_ANGLE = 40.0
 """Degrees between the facing directions of images that are compared."""
-ROUNDS = 2
+ROUNDS = 3
 """Rounds of matching; each starts from the depths of the one before."""
 NOISE = 0.3
 """Standard deviation of a match, working pixels, where images look alike."""
@@ -39,8 +39,8 @@ MAX_EPIPOLAR = 1.0
 """Working pixels that a match may lie off its epipolar line."""
 WINDOW = 7
 """Side of the window in which images are compared, working pixels."""
-MIN_CORRELATION = 0.6
-MIN_CONTRAST = 2.0
+MIN_CORRELATION = 0.5
+MIN_CONTRAST = 1.0
 """Standard deviation of gray levels in a window below which there is nothing to match."""
 AGREE = 2.5
 """Matches agree within so many of their standard deviations."""
@@ -226,21 +226,25 @@ def _mean(x: Map, side: int = WINDOW) -> Map:
 
 
 def fuse(inverse: NDArray[np.float32], weight: NDArray[np.float32]) -> Depth:
-    """Where at least two of n measurements [n, h, w] agree: the mean of most that do, and its expected error.
+    """The mean of the most of n measurements [n, h, w] that agree, and its expected error.
 
-    Weights are one over squared errors, 0 where there is no measurement. An error is never less than what the agreeing
-    measurements scatter by.
+    A single measurement counts where there is no other: ``confirmed`` asks another image. Weights are one over squared
+    errors, 0 where there is no measurement. An error is never less than what the agreeing measurements scatter by.
     """
     best = np.zeros(inverse.shape[1:], np.float32)
     mean, error = np.zeros_like(best), np.zeros_like(best)
-    variance = 1 / np.maximum(weight, 1e-30)
+    variance, measured = 1 / np.maximum(weight, 1e-30), (weight > 0).sum(0)
     for k in range(len(inverse)):
         agrees = (weight > 0) & (weight[k] > 0) & ((inverse - inverse[k]) ** 2 < AGREE**2 * (variance + variance[k]))
         w = np.where(agrees, weight, 0)
         total, count = w.sum(0), agrees.sum(0)
         average = (w * inverse).sum(0) / np.maximum(total, 1e-30)
         scatter = (w * (inverse - average) ** 2).sum(0) / np.maximum(count - 1, 1)
-        better = (count >= 2) & (average > 0) & (count + total / np.maximum(weight.sum(0), 1e-30) > best)
+        better = (
+            (count >= np.minimum(measured, 2))
+            & (average > 0)
+            & (count + total / np.maximum(weight.sum(0), 1e-30) > best)
+        )
         best = np.where(better, count + total / np.maximum(weight.sum(0), 1e-30), best)
         mean = np.where(better, average, mean)
         error = np.where(better, np.sqrt(np.maximum(scatter, 1) / np.maximum(total, 1e-30)), error)

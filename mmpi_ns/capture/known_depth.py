@@ -5,11 +5,12 @@ Sources, the later over the earlier: dense matches (``dense.py``), SfM points, d
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
+import torch
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
@@ -27,7 +28,7 @@ from mmpi_ns.placement.observations import Observations
 
 Map = NDArray[np.float32]
 
-VERSION = 1
+VERSION = 3
 """Of the way depths are found: kept ones of another version are found anew."""
 FINER, WIDEST = 2, 1600
 """Images are matched at so many times the training size, and no wider than this, where their originals are."""
@@ -35,6 +36,8 @@ COVERED = 0.3
 """Share of a training pixel's area in which working pixels must have a depth."""
 POINT_ERROR = 0.01
 """Relative error of an SfM point's distance, at least."""
+CELLS = 32
+"""Cells along the longer side of an image, each of which tells placement one depth."""
 SENSOR_ERROR = 0.01
 """Relative error of a sensor's depth."""
 
@@ -189,6 +192,42 @@ def _straightened(
     straighten = cv2.fisheye.undistortPoints if original.fisheye else cv2.undistortPoints
     found = straighten(at, camera_matrix(original.intrinsics[i]), original.distortion[i])[:, 0]
     return np.asarray(found[:, 0], np.float64), np.asarray(found[:, 1], np.float64)
+
+
+def with_known_depths(observations: Observations, known: KnownDepth, dataset: MMPIDataset) -> Observations:
+    """Adds what placement may know of the depths: of each image cell the pixel whose distance is known best.
+
+    Cells count alike, however many SfM points or matches lie in one. As they have no track, they come after the
+    keypoints that have.
+    """
+    seen_by, points = [], []
+    for i, depth in enumerate(known.images):
+        rows, columns = best_of_cells(depth)
+        coords = torch.from_numpy(np.stack([rows, columns], -1) + 0.5).float()
+        rays = dataset.cameras.generate_rays(torch.full((len(rows), 1), i), coords=coords)
+        seen_by.append(np.full(len(rows), i))
+        points.append(observations.centers[i] + rays.directions.double().numpy() / depth[rows, columns, :1])
+    count = len(observations.points)
+    added = np.concatenate(points)
+    return replace(
+        observations,
+        points=np.concatenate([observations.points, added]),
+        seen_by=np.concatenate([observations.seen_by, *seen_by]),
+        seen_point=np.concatenate([observations.seen_point, count + np.arange(len(added))]),
+    )
+
+
+def best_of_cells(depth: Map) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Row and column of the best known pixel of every cell of an image [H, W, 2] that has one."""
+    height, width = depth.shape[:2]
+    side = max(1, -(-max(height, width) // CELLS))
+    padded = np.full((-(-height // side) * side, -(-width // side) * side), np.inf, np.float32)
+    padded[:height, :width] = np.where(depth[..., 0] > 0, depth[..., 1] / np.maximum(depth[..., 0], 1e-12), np.inf)
+    cells = padded.reshape(padded.shape[0] // side, side, -1, side).swapaxes(1, 2).reshape(-1, side * side)
+    best = cells.argmin(1)
+    kept = np.nonzero(np.isfinite(cells.min(1)))[0]
+    down, across = np.divmod(kept, padded.shape[1] // side)
+    return down * side + best[kept] // side, across * side + best[kept] % side
 
 
 def with_points(known: KnownDepth, observations: Observations) -> KnownDepth:

@@ -18,6 +18,7 @@ PIXELS = {
     "train_num_rays_per_batch": Number(1, 10**8, whole=True),
     "eval_num_rays_per_batch": Number(1, 10**8, whole=True),
     "keypoint_rays": Number(0, 10**8, whole=True),
+    "new_view_share": NOT_NEGATIVE,
     "resident_pixels": NOT_NEGATIVE,
     "camera_res_scale_factor": POSITIVE,
 }

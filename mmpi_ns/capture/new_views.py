@@ -1,0 +1,197 @@
+"""Rays of views that nobody took: from between two training cameras that see the same point.
+
+A point that two images show alike and at the same depth is seen from everywhere between their cameras, but for what
+shows up only on the way. Its colour there lies between those of the two images. Such rays say what a new view must look
+like and, as they end on the point, that nothing lies before it: what explains the training images alone is unlearned.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float, Int, UInt8
+from nerfstudio.cameras.rays import RayBundle
+from numpy.typing import NDArray
+from torch import Tensor
+
+from mmpi_ns.capture.dataset import MMPIDataset
+from mmpi_ns.capture.dense import camera_matrix, look_up
+from mmpi_ns.capture.known_depth import KnownDepth
+from mmpi_ns.capture.tracks import PosedImages
+
+NEIGHBOURS = 4
+"""Cameras that a point of an image is looked for in: the nearest that look its way."""
+MAX_ANGLE = 60.0
+"""Degrees between the facing directions of two cameras with views between them."""
+CERTAIN = 0.03
+"""Relative error up to which a depth is good enough to say where a new view sees its point."""
+SAME_DEPTH = 0.03
+"""Two images' distances of a point agree within this share."""
+SAME_COLOR = 24
+"""Levels by which a colour may lie beyond those within a pixel of its place in the other image."""
+MOST = 2_000_000
+"""Pairs of pixels that are kept (30 bytes each), spread over the images."""
+
+Rays = Callable[[Int[Tensor, "R 3"]], RayBundle]
+
+
+@dataclass(frozen=True)
+class SharedPoints:
+    """Points that two training images show at the same depth, each as a pixel of the first."""
+
+    pixels: Int[Tensor, "P 3"]
+    """Image, row and column in the first."""
+    other: Int[Tensor, "P"]
+    """The second image."""
+    colors: UInt8[Tensor, "P 2 C"]
+    """Colour in the first and the second image."""
+    depths: Float[Tensor, "P 2"]
+    """Inverse distance from the first camera, and its expected error."""
+    centers: Float[Tensor, "M 3"]
+    """Where all training cameras stand."""
+
+    def of_images(self, images: Int[Tensor, "I"]) -> SharedPoints | None:
+        """The points that both images show of some images alone; None where there is none."""
+        images = images.to(self.pixels)
+        own = (torch.isin(self.pixels[:, 0], images) & torch.isin(self.other, images)).nonzero()[:, 0]
+        parts = (self.pixels, self.other, self.colors, self.depths)
+        return SharedPoints(*(x[own] for x in parts), self.centers) if len(own) else None
+
+    def draw(
+        self, count: int, rays: Rays, g: torch.Generator
+    ) -> tuple[RayBundle, Float[Tensor, "R C"], Float[Tensor, "R 2"]]:
+        """Random rays between cameras, what they show, and the inverse distances of their points with errors.
+
+        Args:
+            count: rays.
+            rays: makes rays through pixel centres (image, row, column).
+            g: draws the points and the places between the cameras.
+        """
+        device = self.pixels.device
+        chosen = torch.randint(len(self.pixels), (count,), generator=g, device=g.device).to(device)
+        share = torch.rand(count, 1, generator=g, device=g.device).to(device)
+        first = rays(self.pixels[chosen].long())
+        depths, colors = self.depths[chosen], self.colors[chosen].float() / 255
+        origins = torch.lerp(first.origins, self.centers[self.other[chosen].long()], share)
+        # From the first camera: what lies far keeps its direction to the last bit.
+        offsets = (first.origins - origins) * depths[:, :1] + first.directions
+        length = offsets.norm(dim=-1, keepdim=True).clamp(min=1e-6)
+        bundle = RayBundle(origins, offsets / length, torch.ones_like(share), camera_indices=first.camera_indices)
+        # Along the ray a distance's error stays about what it is from the first camera.
+        return bundle, torch.lerp(colors[:, 0], colors[:, 1], share), depths / torch.cat([length, length**2], -1)
+
+
+def find_shared_points(
+    dataset: MMPIDataset,
+    posed: PosedImages,
+    known: KnownDepth,
+    rays: Rays,
+    images: Sequence[int],
+    seed: int,
+    device: str | torch.device = "cpu",
+) -> SharedPoints | None:
+    """The points that two of the images show at the same depth; None where there are none.
+
+    Args:
+        dataset: the training images.
+        posed: their cameras.
+        known: depths of their pixels.
+        rays: makes rays through pixel centres (image, row, column).
+        images: those to look at.
+        seed: of the draw of pixels where there are more than are kept.
+        device: where rays are made and drawn.
+
+    Raises:
+        InputError: an image or mask cannot be used (names the file).
+    """
+    shown = {i: _image(dataset, i) for i in images}
+    rng, parts = np.random.default_rng(seed), []
+    budget = max(1, MOST // (NEIGHBOURS * max(1, len(images))))
+    for i in images:
+        rows, columns = _certain(known.images[i], shown[i][1])
+        if len(rows) > budget:
+            chosen = np.sort(rng.choice(len(rows), budget, replace=False))
+            rows, columns = rows[chosen], columns[chosen]
+        if not len(rows):
+            continue
+        pixels = torch.from_numpy(np.stack([np.full(len(rows), i), rows, columns], -1))
+        directions = rays(pixels.to(device)).directions.double().cpu().numpy()
+        depths = known.images[i][rows, columns]
+        points, own = posed.camera_to_worlds[i, :, 3] + directions / depths[:, :1], shown[i][0][rows, columns]
+        for j in _neighbours(posed, i, images):
+            seen, colors = _seen_by(posed, j, points, own, known.images[j], *shown[j])
+            both = np.stack([own[seen], colors], 1)
+            parts.append((pixels[seen].int(), torch.full((len(colors),), j, dtype=torch.int32), both, depths[seen]))
+    if not sum(len(p[1]) for p in parts):
+        return None
+    pixels, other, colors, depths = zip(*parts, strict=True)
+    tensors = torch.cat(pixels), torch.cat(other), *(torch.from_numpy(np.concatenate(x)) for x in (colors, depths))
+    centers = torch.from_numpy(posed.camera_to_worlds[:, :, 3]).float()
+    return SharedPoints(*(x.to(device) for x in (*tensors, centers)))
+
+
+def _image(dataset: MMPIDataset, i: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Colours of an image [H, W, C] and where it may be used [H, W]."""
+    data = dataset.get_data(i, image_type="uint8")
+    image = data["image"].numpy()
+    usable = np.ones(image.shape[:2], np.uint8) if "mask" not in data else data["mask"][..., 0].numpy().astype(np.uint8)
+    if image.shape[-1] == 4:
+        usable &= image[..., 3] == 255
+    elif dataset.has_alpha:
+        image = np.concatenate([image, np.full_like(image[..., :1], 255)], -1)
+    return image, usable
+
+
+def _certain(depth: NDArray[np.float32], usable: NDArray[np.uint8]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Rows and columns of the pixels whose depth is known well."""
+    return np.nonzero((depth[..., 0] > 0) & (depth[..., 1] < CERTAIN * depth[..., 0]) & (usable > 0))
+
+
+def _neighbours(posed: PosedImages, i: int, images: Sequence[int]) -> list[int]:
+    """The nearest of some images that look the same way and do not stand in the same place."""
+    others = np.array([j for j in images if j != i], np.int64)
+    centers, facing = posed.camera_to_worlds[:, :, 3], posed.camera_to_worlds[:, :, 2]
+    distance = np.linalg.norm(centers[others] - centers[i], axis=-1)
+    usable = (facing[others] @ facing[i] > np.cos(np.radians(MAX_ANGLE))) & (distance > 0)
+    order = np.argsort(np.where(usable, distance, np.inf), kind="stable")
+    return [int(j) for j in others[order[: min(NEIGHBOURS, int(usable.sum()))]]]
+
+
+def _seen_by(
+    posed: PosedImages,
+    j: int,
+    points: NDArray[np.float64],
+    own: NDArray[np.uint8],
+    depth: NDArray[np.float32],
+    image: NDArray[np.uint8],
+    usable: NDArray[np.uint8],
+) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
+    """Which points an image shows at their own distance and in about their own colour, and in which colours."""
+    at = project(posed, j, points)
+    about = np.ones((3, 3), np.uint8)
+    inverse, may, darkest, brightest = (
+        look_up(m, *at.T[:, :, None], nearest=True)[:, 0]
+        for m in (depth[..., 0], usable, cv2.erode(image, about), cv2.dilate(image, about))
+    )
+    expected = 1 / np.maximum(np.linalg.norm(points - posed.camera_to_worlds[j, :, 3], axis=-1), 1e-12)
+    same_depth = (inverse > 0) & (np.abs(inverse - expected) < SAME_DEPTH * expected)
+    same_color = (own >= darkest.astype(int) - SAME_COLOR).all(-1) & (own <= brightest.astype(int) + SAME_COLOR).all(-1)
+    seen = np.nonzero(same_depth & same_color & (may > 0))[0]
+    colors = look_up(image, *at[seen].T[:, :, None]) if len(seen) else np.zeros((0, 1, image.shape[-1]), np.uint8)
+    return seen, colors.reshape(len(seen), image.shape[-1])
+
+
+def project(posed: PosedImages, j: int, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Pixels [P, 2] at which a camera shows points [P, 3], lens included; far outside where they are behind it."""
+    pose = posed.camera_to_worlds[j]
+    local = (points - pose[:, 3]) @ pose[:, :3] * [1, -1, -1]  # OpenCV's axes: right, down, ahead
+    ahead = local[:, 2] > 0
+    local = np.where(ahead[:, None], local, [0.0, 0.0, 1.0])[:, None]
+    matrix, still = camera_matrix(posed.intrinsics[j]), np.zeros(3)
+    bend = cv2.fisheye.projectPoints if posed.fisheye else cv2.projectPoints
+    at = bend(local, still, still, matrix, posed.distortion[j])[0].reshape(-1, 2)
+    return np.where(ahead[:, None], at, -1e4)
