@@ -21,6 +21,7 @@ def datamanager(data: Path, test_mode="val", **settings):
     config.data = data
     config.train_num_rays_per_batch = 64
     config.keypoint_rays = 16
+    config.new_view_share = 0.0
     for name, value in settings.items():
         setattr(config, name, value)
     return config.setup(device="cpu", test_mode=test_mode)

@@ -55,7 +55,8 @@ class MMPIDataManagerConfig(VanillaDataManagerConfig):
     eval_num_rays_per_batch: int = 1024
     """Rays of an evaluation batch during training."""
     keypoint_rays: int = 384
-    """Extra rays a step through SfM keypoints of training images, for depth supervision (scenes with tracks only)."""
+    """Extra rays a step through SfM keypoints of training images, where few pixels have a depth that two images share
+    (scenes with tracks only)."""
     sfm_path: Path = Path("colmap/sparse/0")
     """COLMAP model with the tracks, relative to the data, in the frame of transforms.json (colmap parser: its own)."""
     triangulate: bool = True
@@ -247,19 +248,22 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
             bundle, colors = _join(bundle, views), torch.cat([colors, seen])
             pixel_depths = torch.cat([pixel_depths, distances])
         depths = torch.zeros(len(bundle), 1, device=self.device)
-        if self.training and self._keypoints is not None and self.config.keypoint_rays > 0:
-            keypoint_bundle, keypoint_depths = self._keypoint_rays(g)
+        # Points that two images share say more than keypoints, which make up for those that are missing.
+        missing = 1.0 if self._shared is None else max(0.0, 1 - self._shared.cover)
+        count = round(missing * self.config.keypoint_rays)
+        if self.training and self._keypoints is not None and count > 0:
+            keypoint_bundle, keypoint_depths = self._keypoint_rays(count, g)
             bundle, depths = _join(bundle, keypoint_bundle), torch.cat([depths, keypoint_depths])
             pixel_depths = torch.cat([pixel_depths, pixel_depths.new_zeros(len(keypoint_depths), 2)])
         bundle.metadata[KEYPOINT_DEPTH] = depths
         bundle.metadata[PIXEL_DEPTH] = pixel_depths
         return bundle, {"image": colors, "indices": indices}
 
-    def _keypoint_rays(self, g: torch.Generator) -> tuple[RayBundle, Float[Tensor, "Q 1"]]:
+    def _keypoint_rays(self, count: int, g: torch.Generator) -> tuple[RayBundle, Float[Tensor, "Q 1"]]:
         """Rays from training cameras straight at SfM points that they saw, and the inverse distances of those."""
         assert self._keypoints is not None
         cameras, origins, directions, inverse = self._keypoints
-        chosen = torch.randint(cameras.shape[0], (self.config.keypoint_rays,), generator=g, device=g.device)
+        chosen = torch.randint(cameras.shape[0], (count,), generator=g, device=g.device)
         chosen = chosen.to(cameras.device)
         bundle = RayBundle(
             origins=origins[chosen],

@@ -53,13 +53,15 @@ class SharedPoints:
     """Inverse distance from the first camera, and its expected error."""
     centers: Float[Tensor, "M 3"]
     """Where all training cameras stand."""
+    cover: float
+    """Such points for each pixel of the images: few are not drawn over and over."""
 
     def of_images(self, images: Int[Tensor, "I"]) -> SharedPoints | None:
         """The points that both images show of some images alone; None where there is none."""
         images = images.to(self.pixels)
         own = (torch.isin(self.pixels[:, 0], images) & torch.isin(self.other, images)).nonzero()[:, 0]
         parts = (self.pixels, self.other, self.colors, self.depths)
-        return SharedPoints(*(x[own] for x in parts), self.centers) if len(own) else None
+        return SharedPoints(*(x[own] for x in parts), self.centers, self.cover) if len(own) else None
 
     def draw(
         self, count: int, rays: Rays, g: torch.Generator
@@ -67,11 +69,12 @@ class SharedPoints:
         """Random rays between cameras, what they show, and the inverse distances of their points with errors.
 
         Args:
-            count: rays.
+            count: rays, as many where there is a point for every pixel.
             rays: makes rays through pixel centres (image, row, column).
             g: draws the points and the places between the cameras.
         """
         device = self.pixels.device
+        count = round(count * min(1.0, self.cover))
         chosen = torch.randint(len(self.pixels), (count,), generator=g, device=g.device).to(device)
         share = torch.rand(count, 1, generator=g, device=g.device).to(device)
         first = rays(self.pixels[chosen].long())
@@ -109,12 +112,13 @@ def find_shared_points(
         InputError: an image or mask cannot be used (names the file).
     """
     shown = {i: _image(dataset, i) for i in images}
-    rng, parts = np.random.default_rng(seed), []
+    rng, parts, found = np.random.default_rng(seed), [], 0.0
     budget = max(1, MOST // (NEIGHBOURS * max(1, len(images))))
     for i in images:
         rows, columns = _certain(known.images[i], shown[i][1])
-        if len(rows) > budget:
-            chosen = np.sort(rng.choice(len(rows), budget, replace=False))
+        count = len(rows)
+        if count > budget:
+            chosen = np.sort(rng.choice(count, budget, replace=False))
             rows, columns = rows[chosen], columns[chosen]
         if not len(rows):
             continue
@@ -124,6 +128,7 @@ def find_shared_points(
         points, own = posed.camera_to_worlds[i, :, 3] + directions / depths[:, :1], shown[i][0][rows, columns]
         for j in _neighbours(posed, i, images):
             seen, colors = _seen_by(posed, j, points, own, known.images[j], *shown[j])
+            found += len(seen) * count / len(rows)
             both = np.stack([own[seen], colors], 1)
             parts.append((pixels[seen].int(), torch.full((len(colors),), j, dtype=torch.int32), both, depths[seen]))
     if not sum(len(p[1]) for p in parts):
@@ -131,7 +136,8 @@ def find_shared_points(
     pixels, other, colors, depths = zip(*parts, strict=True)
     tensors = torch.cat(pixels), torch.cat(other), *(torch.from_numpy(np.concatenate(x)) for x in (colors, depths))
     centers = torch.from_numpy(posed.camera_to_worlds[:, :, 3]).float()
-    return SharedPoints(*(x.to(device) for x in (*tensors, centers)))
+    cover = found / sum(known.images[i][..., 0].size for i in images)
+    return SharedPoints(*(x.to(device) for x in (*tensors, centers)), cover)
 
 
 def _image(dataset: MMPIDataset, i: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:

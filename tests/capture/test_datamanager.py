@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import json
 
 import numpy as np
@@ -11,10 +12,10 @@ import torch
 from nerfstudio.cameras.cameras import CameraType
 from nerfstudio.model_components.ray_generators import RayGenerator
 from PIL import Image
-from tiny_scene import HEIGHT, TRAIN, WIDTH, image_of, name_of, project, wall_points, write_scene
-from training_runs import datamanager, plan_of
+from tiny_scene import HEIGHT, TRAIN, WIDTH, color_of, image_of, name_of, project, wall_points, write_scene
+from training_runs import datamanager, in_capture_frame, plan_of
 
-from mmpi_ns.capture.datamanager import KEYPOINT_DEPTH, OBSERVATIONS
+from mmpi_ns.capture.datamanager import KEYPOINT_DEPTH, OBSERVATIONS, PIXEL_DEPTH
 from mmpi_ns.capture.rays import PinholeRays
 from mmpi_ns.capture.sfm import MIN_TRACK
 from mmpi_ns.placement.rule import PlacementConfig, place
@@ -100,7 +101,8 @@ def test_transparency_reaches_the_batch(tmp_path):
 
 def test_keypoints_are_those_of_training_images_and_lie_on_the_wall(manager):
     observations = manager.observations
-    assert manager.train_dataset.metadata[OBSERVATIONS] is observations
+    placed = manager.train_dataset.metadata[OBSERVATIONS]
+    assert np.array_equal(placed.seen_at, observations.seen_at), "what is matched densely comes after the keypoints"
     wall = wall_in_scene_units(manager)
     assert len(observations.points) == TRACKED.sum() > 20
     gaps = np.linalg.norm(observations.points[:, None] - wall[TRACKED][None], axis=-1)
@@ -125,6 +127,32 @@ def test_without_a_colmap_model_or_on_request_there_are_no_keypoint_rays(scene, 
     rays, _ = bare.next_train(0)
     assert len(rays) == 64 and (rays.metadata[KEYPOINT_DEPTH] == 0).all()
     assert len(datamanager(scene, keypoint_rays=0).next_train(0)[0]) == 64
+
+
+def test_rays_of_new_views_come_after_the_pixels_and_leave_fewer_keypoint_rays(scene):
+    manager = datamanager(scene, new_view_share=1.0)
+    assert manager._shared.cover > 1 and len(manager.next_train(2)[0]) == 128, "no keypoint is missed"
+    manager._shared = shared = dataclasses.replace(manager._shared, cover=0.25)
+    rays, batch = manager.next_train(2)
+    count = round(64 * shared.cover)
+    assert batch["image"].shape == (64 + count, 3) and len(rays) == 64 + count + round(16 * (1 - shared.cover))
+    views = slice(64, 64 + count)
+    assert (rays.metadata[PIXEL_DEPTH][views] > 0).all() and (rays.metadata[KEYPOINT_DEPTH][views] == 0).all()
+    origins, directions = in_capture_frame(manager, rays.origins.double().numpy(), rays.directions.double().numpy())
+    error = np.abs(batch["image"].numpy()[views] - color_of(origins[views], directions[views]))
+    assert np.median(error) < 0.02, "their colours are those of the scene, seen from there"
+    manager.use_cameras(np.array([0, 1, 2]))
+    own = manager._shared
+    assert set(own.pixels[:, 0].tolist()) | set(own.other.tolist()) <= {0, 1, 2}
+    manager.use_cameras(None)
+    assert len(manager._shared.pixels) == len(shared.pixels)
+
+
+def test_new_views_are_drawn_by_window_where_pixels_are_read_by_window(scene):
+    manager = datamanager(scene, new_view_share=1.0, resident_pixels=10.0)
+    assert manager._shared is None
+    manager.use_cameras(np.array([0, 1, 2]))
+    assert set(manager._shared.pixels[:, 0].tolist()) <= {0, 1, 2}
 
 
 def test_a_colmap_model_that_cannot_be_read_is_named(tmp_path):
