@@ -28,13 +28,19 @@ hypothesis.settings.load_profile("mmpi")
 
 def pytest_configure(config):
     """Kernels are compiled once, not once for each run: their names say of what and for which processor."""
-    for source in (config.cache.mkdir("kernels"), USERS):
+    for source in (*_kept(config), USERS):
         _copy_kernels(source, Path(CACHE, "mmpi_ns"))
 
 
 def pytest_unconfigure(config):
-    _copy_kernels(Path(CACHE, "mmpi_ns"), config.cache.mkdir("kernels"))
+    for folder in _kept(config):
+        _copy_kernels(Path(CACHE, "mmpi_ns"), folder)
     shutil.rmtree(CACHE, ignore_errors=True)
+
+
+def _kept(config) -> list[Path]:
+    """Where kernels stay from one run to the next; nowhere where pytest is told to keep nothing."""
+    return [config.cache.mkdir("kernels")] if hasattr(config, "cache") else []
 
 
 def _copy_kernels(source: Path, target: Path) -> None:
