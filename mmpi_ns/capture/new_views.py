@@ -8,7 +8,7 @@ like and, as they end on the point, that nothing lies before it: what explains t
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -36,6 +36,9 @@ SAME_COLOR = 24
 MOST = 2_000_000
 """Pairs of pixels that are kept (30 bytes each), spread over the images."""
 
+PARTS = ("pixels", "other", "colors", "depths")
+"""What is known of every point."""
+
 Rays = Callable[[Int[Tensor, "R 3"]], RayBundle]
 
 
@@ -60,8 +63,7 @@ class SharedPoints:
         """The points that both images show of some images alone; None where there is none."""
         images = images.to(self.pixels)
         own = (torch.isin(self.pixels[:, 0], images) & torch.isin(self.other, images)).nonzero()[:, 0]
-        parts = (self.pixels, self.other, self.colors, self.depths)
-        return SharedPoints(*(x[own] for x in parts), self.centers, self.cover) if len(own) else None
+        return replace(self, **{name: getattr(self, name)[own] for name in PARTS}) if len(own) else None
 
     def draw(
         self, count: int, rays: Rays, g: torch.Generator
@@ -131,13 +133,14 @@ def find_shared_points(
             found += len(seen) * count / len(rows)
             both = np.stack([own[seen], colors], 1)
             parts.append((pixels[seen].int(), torch.full((len(colors),), j, dtype=torch.int32), both, depths[seen]))
-    if not sum(len(p[1]) for p in parts):
+    if found == 0:
         return None
-    pixels, other, colors, depths = zip(*parts, strict=True)
-    tensors = torch.cat(pixels), torch.cat(other), *(torch.from_numpy(np.concatenate(x)) for x in (colors, depths))
+    pixels, other = (torch.cat([part[n] for part in parts]) for n in (0, 1))
+    colors, depths = (torch.from_numpy(np.concatenate([part[n] for part in parts])) for n in (2, 3))
     centers = torch.from_numpy(posed.camera_to_worlds[:, :, 3]).float()
     cover = found / sum(known.images[i][..., 0].size for i in images)
-    return SharedPoints(*(x.to(device) for x in (*tensors, centers)), cover)
+    on_device = (x.to(device) for x in (pixels, other, colors, depths, centers))
+    return SharedPoints(*on_device, cover=cover)
 
 
 def _image(dataset: MMPIDataset, i: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
@@ -154,7 +157,8 @@ def _image(dataset: MMPIDataset, i: int) -> tuple[NDArray[np.uint8], NDArray[np.
 
 def _certain(depth: NDArray[np.float32], usable: NDArray[np.uint8]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Rows and columns of the pixels whose depth is known well."""
-    return np.nonzero((depth[..., 0] > 0) & (depth[..., 1] < CERTAIN * depth[..., 0]) & (usable > 0))
+    rows, columns = np.nonzero((depth[..., 0] > 0) & (depth[..., 1] < CERTAIN * depth[..., 0]) & (usable > 0))
+    return rows, columns
 
 
 def _neighbours(posed: PosedImages, i: int, images: Sequence[int]) -> list[int]:
