@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -28,7 +29,9 @@ from mmpi_ns.utils.errors import InputError
 
 MAX_REPROJECTION = 0.02
 """Median angle between keypoints and points, as a share of the image, beyond which a model is in another frame."""
-TRACKS_VERSION = 1
+POSES_OFF = 0.5
+"""Training pixels by which poses may be off before it is said."""
+TRACKS_VERSION = 2
 """Of the way tracks are found: kept ones of another version are found anew."""
 ENOUGH_KEYPOINTS = 20
 """Keypoints an image, on average, that need no plane sweep beside them."""
@@ -62,6 +65,10 @@ def observe(
     if find_points:
         if not len(observations.seen_by):
             observations = _find_points(observations, dataset, triangulates)
+        elif len(observations.seen_at):
+            angles = keypoint_angles(observations, dataset.cameras)
+            off = np.median(angles * observations.intrinsics[observations.seen_by, 0])
+            tell_poses(float(off), Path(outputs.image_filenames[0]))
         observations = drop_masked(observations, dataset)
     return observations
 
@@ -69,11 +76,29 @@ def observe(
 def _find_points(observations: Observations, dataset: MMPIDataset, triangulates: bool) -> Observations:
     """Points for a scene without tracks: triangulated, and swept where triangulation finds too few."""
     if triangulates and (images := posed_images(observations, dataset)) is not None:
-        observations = with_tracks(observations, _remembered_tracks(at_full_size(images)))
+        model = _remembered_tracks(at_full_size(images))
+        observations = with_tracks(observations, model)
+        tell_poses((model.off or 0.0) * float(images.sizes[:, 0].mean()), images.files[0])
     if len(observations.seen_by) < ENOUGH_KEYPOINTS * len(dataset):
         CONSOLE.print("Few or no tracks: a quick plane sweep finds out where the content lies.")
         observations = add_swept_points(observations, [_thumbnail(dataset, i) for i in range(len(dataset))])
     return observations
+
+
+def tell_poses(off: float, image: Path) -> None:
+    """Says when poses are worse than the images, with the command that mends them.
+
+    Args:
+        off: how far matches or keypoints lie from where the poses put them, median, in training pixels.
+        image: one of the training images.
+    """
+    if off <= POSES_OFF:
+        return
+    folder = image.parent
+    full = folder.with_name(re.sub(r"_\d+$", "", folder.name))  # images for images_2
+    command = f"mmpi-prepare {full} {full.parent}-refined --poses {full.parent / 'transforms.json'} --refine-poses"
+    says = f"The poses are off by {off:.1f} training pixels (median over the matches of the images)"
+    CONSOLE.print(f"{says}: {command} mends them.", style="bold yellow", markup=False, soft_wrap=True)
 
 
 def _remembered_tracks(images: PosedImages) -> SfmModel:
@@ -86,13 +111,17 @@ def _remembered_tracks(images: PosedImages) -> SfmModel:
         keypoints = [np.concatenate([points[:, None], at], -1) for points, at in model.keypoints]
         sizes = np.array([len(k) for k in keypoints], np.int64)
         table = np.concatenate(keypoints) if keypoints else np.zeros((0, 3))
-        return {"points": model.points, "names": np.array(model.names, "U16"), "keypoints": table, "sizes": sizes}
+        off = np.array([np.nan if model.off is None else model.off])
+        names = np.array(model.names, "U16")
+        return {"points": model.points, "names": names, "keypoints": table, "sizes": sizes, "off": off}
 
     cameras = images.camera_to_worlds, images.intrinsics, images.distortion, images.fisheye
     stored = remembered(digest(images.files, "tracks", TRACKS_VERSION, *cameras), find)
     tables = np.split(stored["keypoints"], np.cumsum(stored["sizes"].astype(np.int64))[:-1])
     keypoints = tuple((t[:, 0].astype(np.int64), t[:, 1:]) for t in tables) if len(stored["sizes"]) else ()
-    model = SfmModel(stored["points"], tuple(str(name) for name in stored["names"]), keypoints)  # type: ignore[arg-type]
+    off = float(stored["off"][0])
+    names = tuple(str(name) for name in stored["names"])
+    model = SfmModel(stored["points"], names, keypoints, off if np.isfinite(off) else None)  # type: ignore[arg-type]
     CONSOLE.print(f"{len(model.points)} triangulated points, seen {len(stored['keypoints'])} times.")
     return model
 

@@ -35,6 +35,9 @@ class SfmModel:
     """Image file names."""
     keypoints: tuple[tuple[NDArray[np.int64], NDArray[np.float64]], ...]
     """For each image: point of each keypoint [Q], and where it lies as a share of width and height [Q, 2]."""
+    off: float | None = None
+    """Median distance of the matches from the epipolar lines of given poses, as a share of the image's width; None of
+    a model that was read from files."""
 
     def keypoints_of(
         self, image_names: Sequence[str]

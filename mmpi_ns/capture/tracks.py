@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mmpi_ns.capture.epipolar import sampson
 from mmpi_ns.capture.sfm import SfmModel, load_pycolmap, read_reconstruction
 from mmpi_ns.utils.errors import InputError
 
@@ -122,7 +123,7 @@ def triangulate(images: PosedImages) -> SfmModel:
 
 
 def _attempt(pycolmap: Any, images: PosedImages, effort: Effort) -> SfmModel:
-    pairs = images.pairs()
+    pairs, off = images.pairs(), None
     with tempfile.TemporaryDirectory(prefix="mmpi-tracks-") as folder:
         work = Path(folder)
         names = _link(images.files, work / "images")
@@ -130,12 +131,13 @@ def _attempt(pycolmap: Any, images: PosedImages, effort: Effort) -> SfmModel:
         model = _posed_model(pycolmap, work, names, images)
         if pairs:
             _match(pycolmap, work, [(names[i], names[j]) for i, j in pairs], effort)
+            off = _off_epipolar_lines(pycolmap, work / "database.db", model)
             (work / "model").mkdir()
             model = pycolmap.triangulate_points(
                 model, work / "database.db", work / "images", work / "model", options=_triangulation(pycolmap)
             )
         tracks = read_reconstruction(model, MIN_TRACK)
-        return replace(tracks, names=tuple(str(names.index(name)) for name in tracks.names))
+        return replace(tracks, names=tuple(str(names.index(name)) for name in tracks.names), off=off)
 
 
 def _link(files: Sequence[Path], folder: Path) -> list[str]:
@@ -178,6 +180,29 @@ def _match(pycolmap: Any, work: Path, pairs: list[tuple[str, str]], effort: Effo
         pairing_options=pairing,
         verification_options=verification,
     )
+
+
+def _off_epipolar_lines(pycolmap: Any, database: Path, model: Any) -> float | None:
+    """Median distance of the verified matches from the epipolar lines of a model's poses, as a share of the width.
+
+    Unlike the errors of points it is not cut off: matches that fit the poses badly never become points.
+    """
+    with pycolmap.Database.open(database) as opened:
+        numbers, geometries = opened.read_two_view_geometries()
+        keypoints = {i: np.asarray(opened.read_keypoints(i), np.float64).reshape(-1, 6)[:, :2] for i in model.images}
+    found = []
+    for number, geometry in zip(numbers, geometries, strict=True):
+        matches = np.asarray(geometry.inlier_matches).astype(int).reshape(-1, 2)
+        images = [model.images[i] for i in pycolmap.pair_id_to_image_pair(number)]
+        cameras = [model.cameras[image.camera_id] for image in images]
+        rays = [
+            np.c_[camera.cam_from_img(keypoints[image.image_id][matches[:, k]]), np.ones(len(matches))]
+            for k, (image, camera) in enumerate(zip(images, cameras, strict=True))
+        ]
+        relative = images[1].cam_from_world() * images[0].cam_from_world().inverse()
+        off = sampson(rays[0], rays[1], pycolmap.essential_matrix_from_pose(relative))
+        found.append(off * cameras[0].mean_focal_length() / cameras[0].width)
+    return float(np.median(np.concatenate(found))) if found and sum(map(len, found)) else None
 
 
 def _triangulation(pycolmap: Any) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,7 +13,14 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 from tiny_scene import write_colmap
 
 from mmpi_ns.capture import observe as mmpi_observations
-from mmpi_ns.capture.observe import ENOUGH_KEYPOINTS, drop_masked, posed_images, read_observations, with_tracks
+from mmpi_ns.capture.observe import (
+    ENOUGH_KEYPOINTS,
+    drop_masked,
+    posed_images,
+    read_observations,
+    tell_poses,
+    with_tracks,
+)
 from mmpi_ns.capture.sfm import SfmModel, find_sfm_model
 from mmpi_ns.placement.observations import Observations
 
@@ -103,6 +111,16 @@ def test_images_are_swept_only_where_triangulation_finds_too_few_keypoints(monke
     assert len(found.seen_by) == 2 * each and len(calls) == swept
     mmpi_observations._find_points(bare(), data, triangulates=False)
     assert len(calls) == swept + 1 and [i.shape for i in calls[-1]] == [(20, 40)] * 2
+
+
+def test_poses_that_are_off_are_told_with_the_command_that_mends_them(capsys):
+    tell_poses(0.49, Path("room/images_2/a.png"))
+    assert not capsys.readouterr().out
+    tell_poses(1.34, Path("room/images_2/a.png"))
+    said = capsys.readouterr().out
+    assert "The poses are off by 1.3 training pixels" in said
+    command = "mmpi-prepare room/images room-refined --poses room/transforms.json --refine-poses"
+    assert command in said.replace("\n", " ")
 
 
 def test_a_mask_leaves_out_the_keypoints_on_its_black_pixels():

@@ -164,6 +164,17 @@ def test_keypoints_are_where_the_points_project(images, model):
     assert np.median(error) < 0.5 and error.max() < 6
 
 
+def test_disturbed_poses_show_in_the_matches_and_exact_ones_do_not(images, model):
+    """Turned by half a degree, a camera sees its matches 1.6 pixels off."""
+    assert model.off is not None and model.off * WIDTH < 0.25
+    turned = images.camera_to_worlds.copy()
+    for i in (1, 3):
+        c, s = np.cos(np.radians(0.5)), np.sin(np.radians(0.5))
+        turned[i, :, :3] = turned[i, :, :3] @ np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
+    off = triangulate(replace(images, camera_to_worlds=turned)).off
+    assert off is not None and 0.6 < off * WIDTH < 2
+
+
 def test_equal_images_give_equal_tracks(images, model):
     again = triangulate(images)
     assert np.array_equal(model.points, again.points) and model.names == again.names
