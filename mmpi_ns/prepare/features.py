@@ -18,8 +18,10 @@ BATCH = 8
 PAIR_BATCH = 64
 PIXELS_A_FEATURE = 100
 """More features than one for so many pixels repeat each other, and matching costs their square."""
-LEAST_FEATURES = 1024
-"""Small images may have so many all the same."""
+LEAST_FEATURES = 2048
+"""Small images may have so many all the same..."""
+FAINT = 0.003
+"""... and have faint ones counted (SIFT's peak threshold), as they are short of them."""
 MIN_INLIERS = 15
 """Matches from which a pair counts: COLMAP's own limit."""
 
@@ -87,6 +89,8 @@ def extract(
     options.num_threads = threads
     most = max(p.width * p.height for p in photos) // PIXELS_A_FEATURE
     options.sift.max_num_features = min(max_features, max(most, LEAST_FEATURES))
+    if most < LEAST_FEATURES:
+        options.sift.peak_threshold = FAINT
     reader = pycolmap.ImageReaderOptions()
     if masks is not None:
         reader.mask_path = masks

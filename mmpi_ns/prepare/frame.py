@@ -8,11 +8,10 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from mmpi_ns.prepare.alignment import similarity_matrix
 from mmpi_ns.prepare.stages import PrepareError
 
 Array = NDArray[np.float64]
-ROTATION_WEIGHT = 1.0
-"""Weight of rotations beside centres, whose main direction weighs 1, when two tracks are fitted to each other."""
 LEVEL_TURN = 0.15
 """Least share of the cameras' right vectors across their main direction from which gravity can be read."""
 LEAST_GROUND, GROUND_SHARE = 50, 0.15
@@ -144,19 +143,6 @@ def choose_frame(model: pycolmap.Reconstruction, camera_height: float | None) ->
 
 
 def similarity_between(source: Array, target: Array) -> pycolmap.Sim3d:
-    """The similarity that takes camera poses to other poses of the same cameras.
-
-    Centres and rotations count alike: a straight track turns about itself, and a short one is tilted by its noise.
-
-    Args:
-        source, target: camera to world. [N, 4, 4]
-    """
-    a = source[:, :3, 3] - source[:, :3, 3].mean(0)
-    b = target[:, :3, 3] - target[:, :3, 3].mean(0)
-    by_centers = b.T @ a / max(float(np.linalg.norm(a) * np.linalg.norm(b)), 1e-24)
-    by_rotations = np.einsum("nij,nkj->ik", target[:, :3, :3], source[:, :3, :3]) / len(source)
-    u, _, vt = np.linalg.svd(by_centers + ROTATION_WEIGHT * by_rotations)
-    rotation = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
-    scale = float((a @ rotation.T * b).sum() / max((a * a).sum(), 1e-24))
-    translation = target[:, :3, 3].mean(0) - scale * rotation @ source[:, :3, 3].mean(0)
+    """``similarity_matrix`` as pycolmap has it."""
+    scale, rotation, translation = similarity_matrix(source, target)
     return pycolmap.Sim3d(scale, pycolmap.Rotation3d(rotation), translation)

@@ -18,8 +18,6 @@ CARRIES = 0.5
 """Share of the images from which a model is gone on from with looser settings instead of beginning anew."""
 BENT_PX = 0.8
 """Mean reprojection error from which another attempt is made even though the images are registered."""
-WORTH = 0.97
-"""Share of the reprojection error to which a richer lens must bring it."""
 SNAPSHOT = 40
 """Images registered between two snapshots, from which an interrupted mapping goes on."""
 MANY = 100
@@ -65,7 +63,13 @@ class Mapping:
 
 
 def reconstruct(
-    database: Path, images: Path, work: Path, refine: bool, threads: int, is_sequence: bool = False
+    database: Path,
+    images: Path,
+    work: Path,
+    refine: bool,
+    threads: int,
+    is_sequence: bool = False,
+    attempts: int = len(ATTEMPTS),
 ) -> Mapping:
     """Runs the attempts in order until one registers nearly all images; the best one counts.
 
@@ -80,6 +84,7 @@ def reconstruct(
         threads: CPU threads; below 1 for all.
         is_sequence: begin with the settings for forward motion. They carry any motion of a sequence, while COLMAP's
             defaults look through all pairs before they give up (a minute for 64 images).
+        attempts: most attempts to make.
 
     Raises:
         PrepareError: no attempt found an initial pair.
@@ -94,7 +99,7 @@ def reconstruct(
         )
     best: Mapping | None = None
     tried: list[tuple[str, int]] = []
-    for attempt in ATTEMPTS[1 if is_sequence else 0 :]:
+    for attempt in ATTEMPTS[1 if is_sequence else 0 :][:attempts]:
         start = best.folder if best is not None and _carries(best.models[0], total) else None
         models = _run(attempt, database, images, work / attempt.name, total, refine, threads, start)
         size = models[0][0].num_reg_images() if models else 0
@@ -237,43 +242,6 @@ def bundle_options(
     if robust:
         options.ceres.loss_function_type, options.ceres.loss_function_scale = pycolmap.LossFunctionType.CAUCHY, 1.0
     return options
-
-
-def polish(
-    model: pycolmap.Reconstruction, folder: Path, full_lens: bool, principal_point: bool, threads: int
-) -> pycolmap.Reconstruction:
-    """A last bundle adjustment with what the mapper left fixed, kept where the images bear it out.
-
-    Args:
-        model: left as it is.
-        folder: where the model can be read from again.
-        full_lens: see whether OpenCV's four lens terms fit clearly better than one radial term. Where they do not,
-            they take up something else: driving forward, the principal point.
-        principal_point: refine the principal point.
-        threads: CPU threads; below 1 for all.
-
-    Returns:
-        The model to use.
-    """
-    full_lens = full_lens and any(c.model.name == "SIMPLE_RADIAL" for c in model.cameras.values())
-    with progress("Fitting the lens", principal_point + full_lens) as advance:
-        if principal_point:
-            adjust(model, bundle_options(True, True, True, threads))
-            advance()
-        if not full_lens:
-            return model
-        full = pycolmap.Reconstruction(folder)
-        for camera in full.cameras.values():
-            if camera.model.name == "SIMPLE_RADIAL":
-                f, cx, cy, k = camera.params
-                camera.model = pycolmap.CameraModelId.OPENCV
-                camera.params = [f, f, cx, cy, k, 0.0, 0.0, 0.0]
-        adjust(full, bundle_options(True, True, principal_point, threads))
-        advance()
-    before, after = model.compute_mean_reprojection_error(), full.compute_mean_reprojection_error()
-    chosen = "OpenCV's four terms" if after < WORTH * before else "one radial term"
-    say(f"Lens: {before:.3f} px with one radial term, {after:.3f} px with OpenCV's four: {chosen}.")
-    return full if after < WORTH * before else model
 
 
 def adjust(model: pycolmap.Reconstruction, options: pycolmap.BundleAdjustmentOptions) -> None:

@@ -15,15 +15,19 @@ import numpy as np
 import pycolmap
 
 from mmpi_ns.capture.tracks import near_pairs
-from mmpi_ns.prepare import checks, export, features, images, mapping, pairs, report
+from mmpi_ns.prepare import checks, export, features, images, pairs, report
 from mmpi_ns.prepare.cameras import Intrinsics, make_cameras, parse_camera, share
+from mmpi_ns.prepare.focal import WIDE, focal_in_words, focal_interval
 from mmpi_ns.prepare.frame import SceneFrame, camera_poses, choose_frame
 from mmpi_ns.prepare.images import Photo
 from mmpi_ns.prepare.known import solve_known
+from mmpi_ns.prepare.mappers import map_and_judge
+from mmpi_ns.prepare.polish import Free, polish
 from mmpi_ns.prepare.poses import read_poses, rigid3d
 from mmpi_ns.prepare.settings import Settings, check_options, read_lists
 from mmpi_ns.prepare.stages import PrepareError, Stages, only_one, progress, say, whole
 from mmpi_ns.prepare.undistort import undistort
+from mmpi_ns.prepare.verdict import REMEDY, Verdict
 from mmpi_ns.prepare.video import select_frames
 
 WORK = ".prepare"
@@ -38,6 +42,9 @@ class Solved:
     model: pycolmap.Reconstruction
     mapping: str
     groups: list[list[str]] = field(default_factory=list)
+    verdict: Verdict = field(default_factory=lambda: Verdict("right"))
+    focal: tuple[float, float] | None = None
+    """The interval of the focal length in pixels, where it was refined."""
 
 
 class Preparation:
@@ -50,8 +57,8 @@ class Preparation:
         self.notes: list[str] = []
         self.stages = Stages(self.work)
 
-    def run(self) -> None:
-        """Input to scene."""
+    def run(self) -> Verdict:
+        """Input to scene; how far it can be believed."""
         s = self.settings
         with self._timed("reading"):
             self.photos = self._read_input()
@@ -67,8 +74,10 @@ class Preparation:
             solved = self._solve(database)
         scene_frame = self._move(solved.model)
         self._check_share(solved)
+        self._check_verdict(solved.verdict)
         with self._timed("writing"):
             self._write(solved, scene_frame, database)
+        return solved.verdict
 
     @contextmanager
     def _timed(self, name: str) -> Iterator[None]:
@@ -179,29 +188,48 @@ class Preparation:
             solved = self._known(database) if self.known else self._map(database, folder)
             (folder / "model").mkdir(exist_ok=True)
             solved.model.write(folder / "model")
-            says = {"mapping": solved.mapping, "groups": solved.groups, "notes": self.notes}
+            if not self.is_fixed:
+                with progress("Judging the focal length", None):
+                    solved.focal = focal_interval(folder / "model", s.threads)
+            says = {"mapping": solved.mapping, "groups": solved.groups, "notes": self.notes, "focal": solved.focal}
+            says |= {"grade": solved.verdict.grade, "reasons": solved.verdict.reasons}
             (folder / "says.json").write_text(json.dumps(says), encoding="utf-8")
             return solved
 
         def load(folder: Path) -> Solved:
             says = json.loads((folder / "says.json").read_text(encoding="utf-8"))
             self.notes = says["notes"]
-            return Solved(pycolmap.Reconstruction(folder / "model"), says["mapping"], says["groups"])
+            verdict = Verdict(says["grade"], tuple(says["reasons"]))
+            model = pycolmap.Reconstruction(folder / "model")
+            return Solved(model, says["mapping"], says["groups"], verdict, says["focal"])
 
         made_from = [s.refine_poses, s.refine_intrinsics, s.refine_principal_point, s.lens, self.is_fixed]
         return self.stages.run("model", made_from, stage, load)
 
     def _map(self, database: Path, folder: Path) -> Solved:
         s = self.settings
-        is_sequence = self.matching.startswith("sequential")
-        found = mapping.reconstruct(database, self.image_folder, folder, not self.is_fixed, s.threads, is_sequence)
-        model = found.models[0]
-        if not self.is_fixed:
-            model = mapping.polish(model, found.folder, s.lens == "auto", s.refine_principal_point, s.threads)
+        names = [p.name for p in self.photos]
+        believed = map_and_judge(
+            database,
+            self.image_folder,
+            folder,
+            names,
+            fixed=self.is_fixed,
+            threads=s.threads,
+            is_sequence=self.matching.startswith("sequential"),
+            is_ordered=self.is_video or pairs.are_numbered(names),
+        )
+        found, model = believed.candidate, believed.candidate.model
+        free = Free(
+            lens=not self.is_fixed,
+            full_lens=not self.is_fixed and s.lens == "auto",
+            principal_point=s.camera is None or s.refine_intrinsics,
+            always=s.refine_principal_point,
+        )
+        model = polish(model, free, s.threads)
         here = set(camera_poses(model)[0])
         groups = [sorted(set(camera_poses(m)[0]) - here) for m in found.models[1:]]
-        tried = ", ".join(f"{name} {size}" for name, size in found.tried)
-        return Solved(model, f"'{found.attempt}' settings (images: {tried})", [g for g in groups if len(g) > 2])
+        return Solved(model, believed.says, [g for g in groups if len(g) > 2], believed.verdict)
 
     def _known(self, database: Path) -> Solved:
         s = self.settings
@@ -230,12 +258,19 @@ class Preparation:
             "What was found so far is kept, and a new run goes on from it."
         )
 
+    def _check_verdict(self, verdict: Verdict) -> None:
+        if verdict.grade == "broken" and not self.settings.allow_doubtful:
+            raise PrepareError(
+                f"The track that was found is wrong, so no scene was made. {verdict.words()} {REMEDY} "
+                "To look at it all the same: --allow-doubtful."
+            )
+
     def _write(self, solved: Solved, frame: SceneFrame, database: Path) -> None:
         s, model = self.settings, solved.model
         names = set(camera_poses(model)[0])
         photos = [p for p in self.photos if p.name in names]
         split = self._split([p.name for p in photos])
-        findings = self._findings(model, photos, database)
+        findings = [*_focal_findings(solved), *self._findings(model, photos, database)]
         folder, masks = self.image_folder, self.masks
         if s.undistort:
             flat = self.work / "undistorted"
@@ -253,9 +288,10 @@ class Preparation:
         facts = report.Facts(
             s.input.name, len(self.photos), missing, solved.groups, self.matching, solved.mapping,
             frame.up, frame.unit, split, findings, self._lens_notes(), self.times,
+            solved.verdict, solved.focal,
         )  # fmt: skip
         report.write_report(model, facts, built)
-        publish(built, s, findings, model, split)
+        publish(built, s, findings, solved, split)
 
     def _lens_notes(self) -> list[str]:
         s = self.settings
@@ -290,6 +326,14 @@ class Preparation:
         return found + checks.moving(model, database, names)
 
 
+def _focal_findings(solved: Solved) -> list[checks.Finding]:
+    """A focal length that the images hardly determine."""
+    if solved.focal is None or solved.focal[1] - solved.focal[0] < WIDE * solved.focal[1]:
+        return []
+    says = f"the images hardly determine the focal length ({focal_in_words(*solved.focal)})"
+    return [checks.Finding("intrinsics?", "", f"{says}: give --focal if you know it")]
+
+
 def check_folders(settings: Settings) -> None:
     """Refuses what would lose something.
 
@@ -315,10 +359,10 @@ def publish(
     built: Path,
     settings: Settings,
     findings: Sequence[checks.Finding],
-    model: pycolmap.Reconstruction,
+    solved: Solved,
     split: export.Split,
 ) -> None:
-    """Moves the scene into place and says what came out."""
+    """Moves the scene into place and says what came out; what cannot be believed in red."""
     scene = settings.scene
     aside = scene / next(f"previous-{i}" for i in range(1, 10_000) if not (scene / f"previous-{i}").exists())
     export.publish(built, scene, aside)
@@ -328,16 +372,20 @@ def publish(
         shutil.rmtree(scene / WORK)
     for line in checks.by_kind(findings):
         say(line, "yellow")
+    model, verdict = solved.model, solved.verdict
+    is_right = verdict.grade == "right"
+    if not is_right:
+        say(f"This scene is {verdict.grade}: {verdict.words()} {REMEDY}", "bold red")
     say(
         f"{scene}: {model.num_reg_images()} images, {model.compute_mean_reprojection_error():.2f} px, "
         f"{len(split.train)} train, {len(split.test)} test; report.md says more. Train with:",
-        "" if findings else "green",
+        "bold red" if not is_right else "" if findings else "green",
     )
     say(f"ns-train mmpi-small --data {shlex.quote(str(scene))}")
 
 
-def prepare(settings: Settings) -> None:
-    """Makes the scene.
+def prepare(settings: Settings) -> Verdict:
+    """Makes the scene; returns how far it can be believed.
 
     Raises:
         PrepareError: the input cannot be made into a scene.
@@ -345,4 +393,4 @@ def prepare(settings: Settings) -> None:
     check_options(settings)
     check_folders(settings)
     with only_one(settings.scene / WORK):
-        Preparation(settings).run()
+        return Preparation(settings).run()

@@ -13,9 +13,11 @@ from numpy.typing import NDArray
 
 from mmpi_ns.prepare.checks import Finding, coverage
 from mmpi_ns.prepare.export import Split
+from mmpi_ns.prepare.focal import focal_in_words
 from mmpi_ns.prepare.frame import camera_poses
 from mmpi_ns.prepare.images import in_short
 from mmpi_ns.prepare.stages import write_text
+from mmpi_ns.prepare.verdict import Verdict
 
 WORST = 5
 """Images of the least coverage that are listed."""
@@ -41,6 +43,9 @@ class Facts:
     notes: Sequence[str]
     times: dict[str, float]
     """Seconds of each stage that ran this time."""
+    verdict: Verdict
+    focal: tuple[float, float] | None
+    """The interval of a refined focal length, in pixels."""
 
 
 def write_report(model: pycolmap.Reconstruction, facts: Facts, scene: Path) -> str:
@@ -77,6 +82,8 @@ def _table(model: pycolmap.Reconstruction, facts: Facts, covered: dict[str, floa
         "coverage": f"{np.mean(list(covered.values())):.0%} on average, {min(covered.values()):.0%} at least",
         "matching": facts.matching,
         "mapping": facts.mapping,
+        "verdict": f"{facts.verdict.grade} {facts.verdict.words()}".strip(),
+        "focal length": "given" if facts.focal is None else focal_in_words(*facts.focal),
         "up": facts.up,
         "unit": facts.unit,
         "split": f"{len(facts.split.train)} train, {len(facts.split.test)} test: {facts.split.says}",

@@ -55,7 +55,7 @@ class Settings:
     overlap: int = 10
     """Frames of a sequence that each is matched with, before and after."""
     max_features: int = 4096
-    """Most SIFT features of an image; a small one gets one for every hundred pixels, or 1,024."""
+    """Most SIFT features of an image; a small one gets one for every hundred pixels, or 2,048."""
     camera_height: float | None = None
     """Metres of the camera above the ground: gives the scale, and up from the ground's normal."""
     test_every: int | None = None
@@ -72,6 +72,8 @@ class Settings:
     """Median motion between frames taken from a video, as a share of the image width."""
     allow_partial: bool = False
     """Make a scene even when less than half of the images are registered."""
+    allow_doubtful: bool = False
+    """Make a scene even when the evidence says that its track is wrong."""
     overwrite: bool = False
     """Replace what the scene folder holds; the old files are moved to a folder beside the new ones."""
     keep_work: bool = False

@@ -11,7 +11,7 @@ INTERRUPTED = "mmpi-prepare: interrupted; the same command goes on from here."
 
 
 def main() -> int:
-    """Runs mmpi-prepare; returns the exit status."""
+    """Runs mmpi-prepare; returns the exit status: 1 without a scene, 3 with one that cannot be believed."""
     # Before pycolmap is loaded: it has threads of its own, and each of them would start as many again for its matrices.
     for library in ("OMP", "OPENBLAS"):
         os.environ.setdefault(f"{library}_NUM_THREADS", "1")
@@ -24,11 +24,11 @@ def main() -> int:
     from mmpi_ns.prepare.pipeline import prepare
 
     try:
-        prepare(settings)
+        verdict = prepare(settings)
     except PrepareError as error:
         say(f"mmpi-prepare: {error}", "bold red")
         return 1
-    return 0
+    return 0 if verdict.grade == "right" else 3
 
 
 def end_at_once_on_signals() -> None:

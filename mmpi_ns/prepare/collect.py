@@ -1,0 +1,91 @@
+"""What evidence is judged by, read out of a model and the database of its matches."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from mmpi_ns.capture.epipolar import sampson
+from mmpi_ns.prepare.evidence import Array, Pairs, Places, Witness
+from mmpi_ns.prepare.features import MIN_INLIERS
+from mmpi_ns.prepare.frame import camera_poses
+
+FIT_PX = 2.0
+"""Pixels off its epipolar line (Sampson's distance), at an image side of 1,000, up to which a match lies on it."""
+
+
+def witness_of(name: str, model: pycolmap.Reconstruction, database: Path, offered: Sequence[str]) -> Witness:
+    """Everything that is judged of a mapper's model.
+
+    Args:
+        name: of the mapper.
+        model: poses and points, with the keypoints of the database.
+        database: verified matches.
+        offered: names of all images given, in order.
+    """
+    names, poses = camera_poses(model)
+    camera = model.cameras[next(iter(model.images[i] for i in model.reg_image_ids())).camera_id]
+    place = {name: i for i, name in enumerate(offered)}
+    return Witness(
+        name,
+        names,
+        np.array([place[n] for n in names], dtype=np.int64),
+        poses,
+        _pairs(model, database),
+        camera.mean_focal_length() / max(camera.width, camera.height),
+        model.compute_mean_reprojection_error(),
+        _median_angle(model),
+    )
+
+
+def _pairs(model: pycolmap.Reconstruction, database: Path) -> Pairs:
+    """Of every verified pair of registered images, how many matches became points and how many fit the poses."""
+    order = sorted(model.reg_image_ids())
+    place = {image_id: i for i, image_id in enumerate(order)}
+    points = {i: _points(model.images[i]) for i in order}
+    rays = {i: _rays(model, model.images[i]) for i in order}
+    rows: list[tuple[int, int, int, int, int]] = []
+    with pycolmap.Database.open(database) as opened:
+        numbers, geometries = opened.read_two_view_geometries()
+    for number, geometry in zip(numbers, geometries, strict=True):
+        a, b = pycolmap.pair_id_to_image_pair(number)
+        if a not in place or b not in place or len(geometry.inlier_matches) < MIN_INLIERS:
+            continue
+        matches = np.asarray(geometry.inlier_matches).astype(int)
+        seen = points[a][matches[:, 0]]
+        tracked = (seen == points[b][matches[:, 1]]) & (seen >= 0)
+        relative = model.images[b].cam_from_world() * model.images[a].cam_from_world().inverse()
+        off = sampson(rays[a][matches[:, 0]], rays[b][matches[:, 1]], pycolmap.essential_matrix_from_pose(relative))
+        camera = model.cameras[model.images[a].camera_id]
+        limit = FIT_PX * max(camera.width, camera.height) / 1000 / camera.mean_focal_length()
+        rows.append((place[a], place[b], len(matches), int(tracked.sum()), int((off < limit).sum())))
+    table = np.array(rows, dtype=np.int64).reshape(-1, 5)
+    low, high = table[:, :2].min(1, initial=len(order)), table[:, :2].max(1, initial=0)
+    return Pairs(low, high, *table[:, 2:].T.astype(np.float64))
+
+
+def _points(image: pycolmap.Image) -> Places:
+    """Number of the point that each keypoint sees; -1 for none. [K]"""
+    return np.array([p.point3D_id if p.has_point3D() else -1 for p in image.points2D], dtype=np.int64)
+
+
+def _rays(model: pycolmap.Reconstruction, image: pycolmap.Image) -> Array:
+    """Directions of the keypoints in the camera, with z = 1. [K, 3]"""
+    pixels = np.array([p.xy for p in image.points2D], dtype=np.float64).reshape(-1, 2)
+    return np.c_[model.cameras[image.camera_id].cam_from_img(pixels), np.ones(len(pixels))]
+
+
+def _median_angle(model: pycolmap.Reconstruction, most: int = 2000) -> float:
+    """Degrees between the two rays farthest apart of a point, median over (some of) the points."""
+    centers = {i: model.images[i].projection_center() for i in model.reg_image_ids()}
+    ids = sorted(model.point3D_ids())
+    angles = []
+    for number in ids[:: max(1, len(ids) // most)]:
+        point = model.points3D[number]
+        rays = np.array([centers[e.image_id] for e in point.track.elements]) - point.xyz
+        rays /= np.maximum(np.linalg.norm(rays, axis=-1, keepdims=True), 1e-12)
+        angles.append(np.degrees(np.arccos(np.clip((rays @ rays.T).min(), -1, 1))))
+    return float(np.median(angles)) if angles else 0.0

@@ -1,0 +1,88 @@
+"""Poses and points from matches, all images at once: COLMAP's global mapper (GLOMAP).
+
+It averages the rotations of all pairs first, then solves for all places and points together. So it has no first pair to
+choose wrongly and no place where the track can break off and go on at another scale, as the incremental mapper has;
+instead it needs a focal length that is about right from the start.
+
+Source: Pan et al., Global Structure-from-Motion Revisited (2024), as in COLMAP 4.
+"""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pycolmap
+
+from mmpi_ns.prepare.features import SEED, quiet
+
+MIN_MATCHES = 15
+"""Matches that agree, from which a pair counts."""
+MIN_ANGLE = 0.5
+"""Degrees between the rays of a point, at least: driving forward gives little more."""
+
+
+def map_globally(
+    database: Path, images: Path, folder: Path, refine: bool, threads: int
+) -> list[tuple[pycolmap.Reconstruction, Path]]:
+    """Models and their folders, most images first; read back where they were made before.
+
+    Args:
+        database: features, verified matches and the cameras to start from.
+        images: folder of the images, for the points' colours.
+        folder: for the models.
+        refine: refine intrinsics.
+        threads: CPU threads; below 1 for all.
+
+    Returns:
+        Empty where no model comes about.
+    """
+    done, models = folder / "done", folder / "models"
+    if not done.exists():
+        shutil.rmtree(folder, ignore_errors=True)
+        models.mkdir(parents=True)
+        with quiet():
+            found = pycolmap.global_mapping(database, images, models, global_options(refine, threads))
+        for number, model in found.items():
+            (models / str(number)).mkdir(exist_ok=True)
+            model.update_point_3d_errors()
+            model.write(models / str(number))
+        done.touch()
+    made = [(pycolmap.Reconstruction(p), p) for p in sorted(models.iterdir()) if p.is_dir()]
+    return sorted(made, key=lambda m: -m[0].num_reg_images())
+
+
+def global_options(refine: bool, threads: int) -> pycolmap.GlobalPipelineOptions:
+    """The mapper's settings: every random draw seeded, small angles kept, given intrinsics left alone."""
+    options = pycolmap.GlobalPipelineOptions()
+    options.min_num_matches = MIN_MATCHES
+    options.random_seed = SEED
+    options.num_threads = threads
+    mapper = options.mapper
+    mapper.random_seed = SEED
+    mapper.num_threads = threads
+    for part in (mapper.rotation_averaging, mapper.global_positioning, mapper.retriangulation):
+        part.random_seed = SEED
+    mapper.min_tri_angle_deg = mapper.retriangulation.min_angle = MIN_ANGLE
+    mapper.bundle_adjustment.refine_focal_length = refine
+    mapper.bundle_adjustment.refine_extra_params = refine
+    return options
+
+
+def start_from(database: Path, copy: Path, focals: dict[int, float]) -> None:
+    """A copy of a database whose cameras start with other focal lengths.
+
+    Args:
+        database: features and matches.
+        copy: where to; replaced.
+        focals: focal length by camera number, in pixels.
+    """
+    copy.parent.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(database, copy)
+    with pycolmap.Database.open(copy) as opened:
+        for camera in opened.read_all_cameras():
+            if camera.camera_id in focals:
+                params = camera.params.copy()
+                params[camera.focal_length_idxs()] = focals[camera.camera_id]
+                camera.params = params
+                opened.update_camera(camera)

@@ -1,0 +1,185 @@
+"""Both mappers on one database, and which of them to believe."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import pycolmap
+
+from mmpi_ns.prepare.collect import witness_of
+from mmpi_ns.prepare.evidence import Witness, agreement
+from mmpi_ns.prepare.features import SEED, quiet
+from mmpi_ns.prepare.focal import STARTS
+from mmpi_ns.prepare.global_mapping import map_globally, start_from
+from mmpi_ns.prepare.mapping import ATTEMPTS, reconstruct
+from mmpi_ns.prepare.stages import PrepareError, progress, say
+from mmpi_ns.prepare.verdict import Verdict, agrees, judge_alone, judge_together, rank
+
+NEAR = 0.1
+"""Relative difference up to which two focal lengths to start from are taken for one."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A mapper's models and what they say of themselves."""
+
+    models: tuple[pycolmap.Reconstruction, ...]
+    """Most images first."""
+    folder: Path
+    """Where the first can be read from again."""
+    witness: Witness
+    says: str
+
+    @property
+    def model(self) -> pycolmap.Reconstruction:
+        return self.models[0]
+
+
+@dataclass(frozen=True)
+class Believed:
+    """The model to use."""
+
+    candidate: Candidate
+    verdict: Verdict
+    says: str
+    """Both mappers in words."""
+
+
+def map_and_judge(
+    database: Path,
+    images: Path,
+    work: Path,
+    offered: Sequence[str],
+    *,
+    fixed: bool,
+    threads: int,
+    is_sequence: bool,
+    is_ordered: bool,
+) -> Believed:
+    """Runs the global mapper, then the incremental one from the focal length that it found, and chooses by evidence.
+
+    Args:
+        database: features and verified matches.
+        images: folder of the images.
+        work: folder for databases, models and snapshots; holds those of an interrupted run.
+        offered: names of all images, in order.
+        fixed: keep the intrinsics.
+        threads: CPU threads; below 1 for all.
+        is_sequence: matched as a sequence: the incremental mapper begins with settings for forward motion.
+        is_ordered: the images come in the order of the motion, so that breaks between neighbours can be looked for.
+
+    Raises:
+        PrepareError: neither mapper makes a model.
+    """
+    starts = _starts(database, work, fixed)
+    found = _globally(starts[:2], images, work, offered, fixed, threads)
+    if len(starts) > 2 and not _settled(found, is_ordered):
+        found += _globally(starts[2:], images, work, offered, fixed, threads)
+    settled = _settled(found, is_ordered)
+    found = sorted(found, key=lambda c: rank(c.witness, is_ordered), reverse=True)[:1]
+    start = database
+    if found and not fixed:
+        start = work / "from-global.db"
+        start_from(database, start, {c.camera_id: c.mean_focal_length() for c in found[0].model.cameras.values()})
+    try:
+        attempts = 1 if settled else len(ATTEMPTS)
+        one = reconstruct(start, images, work / "incremental", not fixed, threads, is_sequence, attempts)
+        witness = witness_of("incremental", one.models[0], database, offered)
+        tried = ", ".join(f"{name} {size}" for name, size in one.tried)
+        found.append(Candidate(one.models, one.folder, witness, f"incremental, '{one.attempt}' settings ({tried})"))
+    except PrepareError:
+        if not found:
+            raise
+    return _choose(found, is_ordered)
+
+
+def _settled(found: Sequence[Candidate], is_ordered: bool) -> bool:
+    """Whether the global mapper is of one mind, from all starts, and by its own evidence right."""
+    witnesses = [c.witness for c in found]
+    if not witnesses or any(judge_alone(w, is_ordered).grade != "right" for w in witnesses):
+        return False
+    differences = [agreement(witnesses[0], w) for w in witnesses[1:]]
+    return all(d is not None and agrees(d) for d in differences)
+
+
+def _starts(database: Path, work: Path, fixed: bool) -> list[tuple[str, Path]]:
+    """Databases for the global mapper, by name: as it is with a known focal length, else one for each guess.
+
+    The first guess is what the fundamental matrices of the pairs say, where they say anything (in a straight drive they
+    do not), the others are fixed shares of the image's side.
+    """
+    with pycolmap.Database.open(database) as opened:
+        unknown = [c for c in opened.read_all_cameras() if not c.has_prior_focal_length]
+    if fixed or not unknown:
+        return [("global", database)]
+    guesses = {f"global-{ratio}": {c.camera_id: ratio * max(c.width, c.height) for c in unknown} for ratio in STARTS}
+    calibrated = _calibrated(database, work / "calibrated.db")
+    if all(abs(calibrated[n] / focal - 1) > NEAR for guess in guesses.values() for n, focal in guess.items()):
+        guesses = {"global-calibrated": {c.camera_id: calibrated[c.camera_id] for c in unknown}} | guesses
+    for name, focals in guesses.items():
+        if not (work / name / "done").exists():
+            start_from(database, work / f"{name}.db", focals)
+    return [(name, work / f"{name}.db") for name in guesses]
+
+
+def _calibrated(database: Path, copy: Path) -> dict[int, float]:
+    """Focal lengths, by camera, with which the fundamental matrices of the pairs become essential ones."""
+    shutil.copyfile(database, copy)
+    options = pycolmap.ViewGraphCalibrationOptions()
+    options.random_seed = SEED
+    options.reestimate_relative_pose = False  # only the focal lengths are taken
+    with quiet():
+        pycolmap.calibrate_view_graph(copy, options)
+    with pycolmap.Database.open(copy) as opened:
+        focals = {c.camera_id: c.mean_focal_length() for c in opened.read_all_cameras()}
+    copy.unlink()
+    return focals
+
+
+def _globally(
+    starts: Sequence[tuple[str, Path]], images: Path, work: Path, offered: Sequence[str], fixed: bool, threads: int
+) -> list[Candidate]:
+    """The global mapper from all starts, at once on as many cores as there are; starts that failed are left out."""
+    cores = threads if threads > 0 else os.cpu_count() or 1
+    workers = min(cores, len(starts))
+
+    def run(start: tuple[str, Path]) -> list[tuple[pycolmap.Reconstruction, Path]]:
+        name, path = start
+        made = map_globally(path, images, work / name, not fixed, max(1, cores // workers))
+        advance()
+        return made
+
+    with (
+        progress("Mapping, all at once", len(starts)) as advance,
+        quiet(),  # outermost: each mapper's own would end before the other is done
+        ThreadPoolExecutor(workers) as pool,
+    ):
+        results = list(pool.map(run, starts))
+    found = []
+    for (name, path), made in zip(starts, results, strict=True):
+        if not made:
+            say(f"Mapping, {name}: no model.")
+            continue
+        model, folder = made[0]
+        witness = witness_of("global", model, path, offered)
+        focal = ", ".join(f"{c.mean_focal_length():.1f}" for _, c in sorted(model.cameras.items())[:3])
+        says = f"{model.num_reg_images()} of {len(offered)} images, {witness.error:.2f} px, focal length {focal} px"
+        say(f"Mapping, {name}: {says}.")
+        found.append(Candidate(tuple(m for m, _ in made), folder, witness, f"{name} ({says})"))
+    return found
+
+
+def _choose(found: Sequence[Candidate], is_ordered: bool) -> Believed:
+    """The candidate that the evidence prefers, judged beside the other."""
+    ordered = sorted(found, key=lambda c: rank(c.witness, is_ordered), reverse=True)
+    chosen, other = ordered[0], ordered[1] if len(ordered) > 1 else None
+    verdict = judge_together(chosen.witness, other.witness if other else None, is_ordered)
+    says = chosen.says
+    if other is not None:
+        says += f"; beside it {other.says}, {judge_alone(other.witness, is_ordered).grade} by itself"
+    return Believed(chosen, verdict, says)

@@ -1,0 +1,183 @@
+"""Right, doubtful or broken: what is made of the evidence, in sentences that name frames and remedy."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from mmpi_ns.prepare.evidence import (
+    Agreement,
+    Witness,
+    agreement,
+    bridges,
+    held_by_image,
+    jumps,
+    share,
+    speed_changes,
+)
+from mmpi_ns.prepare.images import in_short
+
+Grade = Literal["right", "doubtful", "broken"]
+ORDER: tuple[Grade, ...] = ("right", "doubtful", "broken")
+
+TRACKED = (0.55, 0.3)
+"""Share of all verified matches that must have become points: below the first doubtful, below the second broken."""
+FITTING = (0.93, 0.5)
+"""Share of them that must lie on their epipolar lines..."""
+FITTING_ACROSS = (0.88, 0.5)
+"""... and of those across each gap between frames. (What moves does not, so few are no proof of a broken track.)"""
+BRIDGED = (0.5, 0.25)
+"""Share of the matches across each gap between frames that must have become points..."""
+BRIDGED_OF_USUAL = (0.6, 0.35)
+"""... and the same as a share of what the other gaps have."""
+LOOSE = 0.25
+"""Share of an image's matches that must have become points, or its pose is doubted."""
+JUMP = 5.0
+"""Usual steps from which a step is a jump: doubtful where the matches across it hold badly as well."""
+CHANGE = 2.5
+"""Sudden change of speed from which the same is asked."""
+WEAK = 0.8
+"""Share of the usual below which matches hold badly beside a jump."""
+APART = (0.005, 0.02)
+"""Mean and largest distance between the centres of two mappers, as shares of the track, up to which they agree."""
+TURNED = (0.5, 1.5)
+"""The same of their rotations, in degrees."""
+REMEDY = (
+    "Give --focal (and --lens) if you know them, mask what moves (--masks), or prepare the frames before and after "
+    "apart from each other."
+)
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """How far a model can be believed."""
+
+    grade: Grade
+    reasons: tuple[str, ...] = ()
+    """Sentences, the gravest first; none where it is right."""
+
+    def words(self) -> str:
+        return " ".join(self.reasons)
+
+
+def worse(value: float, limits: tuple[float, float]) -> Grade:
+    """The grade of a share that must not be below two limits."""
+    return "right" if not value < limits[0] else "doubtful" if not value < limits[1] else "broken"
+
+
+def judge_alone(witness: Witness, is_sequence: bool) -> Verdict:
+    """What a mapper's model says of itself.
+
+    Args:
+        witness: of the mapper.
+        is_sequence: the images are in the order of the drive or walk.
+    """
+    pairs, count = witness.pairs, len(witness.images)
+    found: list[tuple[Grade, str]] = []
+    tracked, fitting = share(pairs.tracked, pairs.matches), share(pairs.fitting, pairs.matches)
+    found.append((worse(tracked, TRACKED), f"Only {tracked:.0%} of the verified matches became points."))
+    found.append((worse(fitting, FITTING), f"Only {fitting:.0%} of the verified matches fit the poses."))
+    if is_sequence:
+        found += _breaks(witness)
+    else:
+        held = held_by_image(pairs, count)
+        loose = [witness.images[int(i)] for i in np.flatnonzero(held < LOOSE)]
+        grade: Grade = "broken" if len(loose) > 0.1 * count else "doubtful" if loose else "right"
+        found.append((grade, f"Most matches of {in_short(loose, 4)} contradict their poses."))
+    return _worst(found)
+
+
+def _breaks(witness: Witness) -> list[tuple[Grade, str]]:
+    """Gaps of a sequence across which the track does not hold: the worst of each kind."""
+    across = bridges(witness.pairs, len(witness.images), witness.pairs.tracked)
+    if np.isnan(across).all():
+        return []
+    usual = float(np.nanmedian(across))
+    worst = int(np.nanargmin(across))
+    held = float(across[worst])
+    grades = worse(held, BRIDGED), worse(held / max(usual, 1e-9), BRIDGED_OF_USUAL)
+    grade: Grade = grades[0] if ORDER.index(grades[0]) > ORDER.index(grades[1]) else grades[1]
+    where = _between(witness, worst)
+    says = f"The track breaks {where}: {held:.0%} of the matches across became points, {usual:.0%} elsewhere."
+    found: list[tuple[Grade, str]] = [(grade, says)]
+    fitting = bridges(witness.pairs, len(witness.images), witness.pairs.fitting)
+    at = int(np.nanargmin(fitting))
+    where = _between(witness, at)
+    says = f"The track is bent or broken {where}: {fitting[at]:.0%} of the matches across fit its poses."
+    found.append((worse(float(fitting[at]), FITTING_ACROSS), says))
+    weak = across < WEAK * usual
+    leaps = np.where(weak, jumps(witness), 0.0)
+    if leaps.max(initial=0.0) > JUMP:
+        at = int(leaps.argmax())
+        where = _between(witness, at)
+        found.append(("broken", f"The track jumps {where}, {leaps[at]:.0f} usual steps, and few matches across hold."))
+    near_weak = np.zeros(len(witness.images), dtype=bool)
+    near_weak[:-1] |= weak
+    near_weak[1:] |= weak
+    changes = np.where(near_weak, speed_changes(witness), 1.0)
+    if changes.max(initial=1.0) > CHANGE:
+        at = int(changes.argmax())
+        where = f"{changes[at]:.1f} times at {witness.images[at]}"
+        found.append(("doubtful", f"The speed changes {where}, where few matches hold: the scale may break there."))
+    return found
+
+
+def _between(witness: Witness, gap: int) -> str:
+    return f"between {witness.images[gap]} and {witness.images[gap + 1]}"
+
+
+def _worst(found: Sequence[tuple[Grade, str]]) -> Verdict:
+    """All that is wrong, the gravest first."""
+    wrong = sorted((f for f in found if f[0] != "right"), key=lambda f: -ORDER.index(f[0]))
+    return Verdict(wrong[0][0], tuple(says for _, says in wrong)) if wrong else Verdict("right")
+
+
+def agrees(difference: Agreement) -> bool:
+    """Whether two mappers found one track."""
+    centers, turns = difference.centers, difference.turns
+    return all(
+        values.mean() <= limits[0] and values.max() <= limits[1]
+        for values, limits in ((centers, APART), (turns, TURNED))
+    )
+
+
+def judge_together(chosen: Witness, other: Witness | None, is_sequence: bool) -> Verdict:
+    """What is made of the mapper that is believed, beside the other one.
+
+    The other's track speaks against it where it differs and cannot be dismissed by evidence of its own. Where both
+    found one track, each in its own way, what was doubtful in it is believed.
+    """
+    own = judge_alone(chosen, is_sequence)
+    difference = None if other is None else agreement(chosen, other)
+    if other is None or difference is None:
+        return own
+    if agrees(difference):
+        return own if own.grade == "broken" else Verdict("right")
+    if own.grade == "right" and judge_alone(other, is_sequence).grade != "right":
+        return own
+    grade = "broken" if own.grade == "broken" else "doubtful"
+    return Verdict(grade, (*own.reasons, _differ(chosen, other, difference)))
+
+
+def _differ(chosen: Witness, other: Witness, difference: Agreement) -> str:
+    names = [difference.images[int(i)] for i in np.argsort(-difference.centers)[:3]]
+    return (
+        f"The {chosen.name} and the {other.name} mapper differ by {difference.centers.mean():.1%} of the track "
+        f"({difference.centers.max():.1%} at most; most at {', '.join(names)}), with focal lengths of "
+        f"{chosen.focal:.2f} and {other.focal:.2f} image sides."
+    )
+
+
+def rank(witness: Witness, is_sequence: bool) -> tuple[int, int, float, float]:
+    """Sorts witnesses, the most believable highest.
+
+    By verdict, by images, by the share of the matches that fit the poses, to a hundredth, and by matches that became
+    points. (A bent track may have more points than a right one: its points fit its bends.)
+    """
+    pairs = witness.pairs
+    fitting = round(share(pairs.fitting, pairs.matches), 2)
+    grade = judge_alone(witness, is_sequence).grade
+    return -ORDER.index(grade), len(witness.images), fitting, float(pairs.tracked.sum())

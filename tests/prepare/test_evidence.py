@@ -1,0 +1,160 @@
+"""Verdicts on tracks that are right, and on ones that were broken on purpose."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from sound_track import FOCAL, drive, project, scattered, witness_with
+
+from mmpi_ns.capture.epipolar import sampson
+from mmpi_ns.prepare.evidence import Pairs, agreement, bridges, held_by_image, jumps, speed_changes
+from mmpi_ns.prepare.verdict import judge_alone, judge_together
+
+POSES = drive()
+POINTS = scattered(POSES)
+
+
+@pytest.fixture(scope="module")
+def keypoints():
+    pixels, seen = project(POSES, POINTS)
+    return pixels + np.random.default_rng(1).normal(0, 0.3, pixels.shape), seen
+
+
+@pytest.fixture(scope="module")
+def sound(keypoints):
+    return witness_with(POSES, *keypoints)
+
+
+def moved(frames, shift=(0.0, 0.0, 0.0), scale=1.0, about=0):
+    """The drive with some frames moved, and scaled about one of them."""
+    poses = POSES.copy()
+    origin = poses[about, :3, 3]
+    poses[frames, :3, 3] = origin + scale * (poses[frames, :3, 3] - origin) + shift
+    return poses
+
+
+def test_sound_track_is_right(sound):
+    verdict = judge_alone(sound, is_sequence=True)
+    assert verdict.grade == "right" and not verdict.reasons
+    assert judge_alone(sound, is_sequence=False).grade == "right"
+
+
+def test_jump_along_the_way_is_broken_though_epipolar_lines_do_not_see_it(keypoints):
+    """Driving straight ahead, a leap forward leaves all epipolar lines where they were."""
+    straight = drive(turn=0.0)
+    pixels, seen = project(straight, scattered(straight))
+    broken = straight.copy()
+    broken[12:, 2, 3] += 6 * 0.9
+    witness = witness_with(broken, pixels, seen)
+    assert bridges(witness.pairs, len(straight), witness.pairs.fitting).min() > 0.99
+    verdict = judge_alone(witness, is_sequence=True)
+    assert verdict.grade == "broken"
+    assert "between frame_011 and frame_012" in verdict.words() and "usual steps" in verdict.words()
+
+
+def test_scale_that_breaks_half_way_is_not_right(keypoints):
+    verdict = judge_alone(witness_with(moved(np.s_[12:], scale=0.3, about=11), *keypoints), is_sequence=True)
+    assert verdict.grade != "right" and "frame_01" in verdict.words()
+
+
+def test_mirrored_piece_is_broken(keypoints):
+    """A piece that folds back: driven on in the mirror of the plane across the way."""
+    poses = POSES.copy()
+    normal, place = poses[11, :3, 2], poses[11, :3, 3]
+    poses[12:, :3, 3] -= 2 * ((poses[12:, :3, 3] - place) @ normal)[:, None] * normal
+    verdict = judge_alone(witness_with(poses, *keypoints), is_sequence=True)
+    assert verdict.grade == "broken" and "The track breaks between frame_" in verdict.words()
+
+
+def test_collapsed_track_is_broken(keypoints):
+    """All cameras on one spot, but for noise: their rays meet nowhere."""
+    poses = POSES.copy()
+    poses[:, :3, 3] = np.random.default_rng(3).normal(0, 1e-3, (len(poses), 3))
+    verdict = judge_alone(witness_with(poses, *keypoints), is_sequence=True)
+    assert verdict.grade == "broken"
+
+
+def test_wrong_focal_length_in_a_bend_is_not_right(keypoints):
+    assert judge_alone(witness_with(POSES, *keypoints, focal=1.5 * FOCAL), is_sequence=True).grade != "right"
+
+
+def test_one_misplaced_image_of_an_unordered_set_is_named(keypoints):
+    poses = moved([7], shift=(3.0, -1.0, 2.0))
+    verdict = judge_alone(witness_with(poses, *keypoints), is_sequence=False)
+    assert verdict.grade != "right" and "frame_007" in verdict.words()
+
+
+def test_gap_in_the_capture_is_no_break(keypoints):
+    """Frames that are missing make a long step, over which the matches hold."""
+    pixels, seen = keypoints
+    kept = np.r_[0:10, 13:24]
+    witness = witness_with(POSES[kept], pixels[kept], seen[kept])
+    assert jumps(witness).max() > 2
+    assert judge_alone(witness, is_sequence=True).grade == "right"
+    assert jumps(replace(witness, places=kept)).max() < 1.5
+
+
+def test_two_mappers_of_one_mind_are_right_and_of_two_minds_doubtful(sound, keypoints):
+    turned = np.diag([2.0, 2, 2, 1]) @ np.array([[0, -1, 0, 5], [1, 0, 0, 0], [0, 0, 1, 2], [0, 0, 0, 1.0]])
+    other = POSES.copy()
+    other[:, :3, :3] = turned[:3, :3] @ POSES[:, :3, :3] / 2
+    other[:, :3, 3] = POSES[:, :3, 3] @ turned[:3, :3].T + turned[:3, 3]
+    difference = agreement(sound, replace(sound, poses=other))
+    assert difference is not None and difference.centers.max() < 1e-9 and difference.turns.max() < 1e-4
+    assert judge_together(sound, replace(sound, poses=other), True).grade == "right"
+    bent = replace(sound, poses=drive(turn=0.03), name="global", focal=0.7)
+    verdict = judge_together(sound, bent, True)
+    assert verdict.grade == "doubtful" and "0.58 and 0.70 image sides" in verdict.words()
+
+
+def test_a_broken_second_mapper_does_not_speak_against_a_right_one(sound, keypoints):
+    broken = witness_with(moved(np.s_[12:], shift=(0, 0, 8.0)), *keypoints)
+    assert judge_alone(broken, True).grade == "broken"
+    assert judge_together(sound, broken, True).grade == "right"
+    assert judge_together(broken, sound, True).grade == "broken"
+
+
+def test_bridges_count_every_pair_across_a_gap_once():
+    random = np.random.default_rng(0)
+    pairs = [(i, j) for i in range(9) for j in range(i + 1, 9) if random.random() < 0.7]
+    matches = random.integers(100, 200, len(pairs)).astype(float)
+    tracked = matches * random.random(len(pairs))
+    first, second = np.array(pairs).T
+    found = bridges(Pairs(first, second, matches, tracked, tracked), 9, tracked)
+    for gap in range(8):
+        across = [k for k, (i, j) in enumerate(pairs) if i <= gap < j]
+        assert found[gap] == pytest.approx(sum(tracked[across]) / sum(matches[across]))
+    held = held_by_image(Pairs(first, second, matches, tracked, tracked), 9)
+    own = [k for k, pair in enumerate(pairs) if 4 in pair]
+    assert held[4] == pytest.approx(sum(tracked[own]) / sum(matches[own]))
+
+
+def test_speed_that_halves_is_seen_where_it_halves():
+    poses = np.tile(np.eye(4), (20, 1, 1))
+    poses[:, 0, 3] = np.r_[np.arange(10), 9 + 0.5 * np.arange(1, 11)]
+    pairs = Pairs(*(np.zeros(0, np.int64) for _ in range(2)), *(np.zeros(0) for _ in range(3)))
+    from mmpi_ns.prepare.evidence import Witness
+
+    changes = speed_changes(Witness("x", [str(i) for i in range(20)], np.arange(20), poses, pairs, 1.0, 0.3, 2.0))
+    assert changes[9] == changes.max() and 1.6 < changes.max() <= 2
+    assert changes[:5] == pytest.approx(1) and changes[-4:] == pytest.approx(1)
+
+
+def test_sampson_is_the_distance_to_the_nearest_exact_match():
+    """To first order: small offsets of exact matches across their epipolar lines come back."""
+    random = np.random.default_rng(2)
+    points = random.uniform([-2, -2, 4], [2, 2, 9], (50, 3))
+    turn, shift = drive(3, turn=0.1)[2, :3, :3], np.array([0.4, 0.1, -0.3])
+    first, second = points / points[:, 2:], points @ turn.T + shift
+    second /= second[:, 2:]
+    x, y, z = shift
+    essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ turn
+    assert sampson(first, second, essential).max() < 1e-12
+    line = first @ essential.T
+    across = line[:, :2] / np.linalg.norm(line[:, :2], axis=-1, keepdims=True)
+    back = second @ essential
+    share = np.hypot(*line[:, :2].T) / np.sqrt((line[:, :2] ** 2).sum(-1) + (back[:, :2] ** 2).sum(-1))
+    second[:, :2] += 1e-5 * across
+    assert sampson(first, second, essential) == pytest.approx(1e-5 * share, rel=1e-3)
