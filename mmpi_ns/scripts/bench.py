@@ -23,6 +23,7 @@ COMMANDS = {
     "results": "quality.results",
     "dense": "speed.dense",
     "regions": "quality.regions",
+    "prepare": "quality.prepare",
 }
 """Module below mmpi_ns.bench that holds the command, as a class of its name. Only what is asked for is imported."""
 

@@ -1,0 +1,121 @@
+"""Captures whose poses are known, as bare images: real ones, and procedural ones with exact poses."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from mmpi_ns.synthetic.catalogue import make_scene
+from mmpi_ns.synthetic.scene import render
+
+Array = NDArray[np.float64]
+ROAD_PIECE = 64
+"""Frames of each of the pieces that long-road is cut into."""
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What is known of a capture."""
+
+    names: tuple[str, ...]
+    """Of the N images."""
+    centers: Array
+    """Camera centres. [N, 3]"""
+    rotations: Array
+    """Camera to world, OpenCV axes. [N, 3, 3]"""
+    focal: float
+    """Pixels."""
+
+
+@dataclass(frozen=True)
+class Capture:
+    """One row of the table."""
+
+    name: str
+    source: str
+    """Of ``--data``, or of the catalogue of procedural scenes."""
+    is_real: bool
+    start: int = 0
+    stop: int | None = None
+    step: int = 1
+    half: bool = False
+    """Images at half size."""
+    count: int | None = None
+    """Images of a procedural scene."""
+    length: float | None = None
+
+    def write(self, data: Path, folder: Path) -> Truth:
+        """Writes the bare images and returns what is known of them.
+
+        Raises:
+            ValueError: the scene is not there.
+        """
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+        return self._real(data / self.source, folder) if self.is_real else self._made(folder)
+
+    def _real(self, scene: Path, folder: Path) -> Truth:
+        path = scene / "transforms.json"
+        if not path.is_file():
+            raise ValueError(f"{path} is not there")
+        meta = json.loads(path.read_text(encoding="utf-8"))
+        frames = sorted(meta["frames"], key=lambda f: f["file_path"])[self.start : self.stop : self.step]
+        names = tuple(Path(f["file_path"]).name for f in frames)
+        for name, frame in zip(names, frames, strict=True):
+            if self.half:
+                self._halve(Image.open(scene / frame["file_path"]), folder / name)
+            else:
+                shutil.copyfile(scene / frame["file_path"], folder / name)
+        poses = np.array([f["transform_matrix"] for f in frames], dtype=np.float64)
+        return _truth(names, poses, meta["fl_x"] / (2 if self.half else 1))
+
+    def _made(self, folder: Path) -> Truth:
+        scene = make_scene(self.source, 0, self.count, 640, 360 if self.length is None else 192, self.length)
+        chosen = range(len(scene.cameras))[self.start : self.stop : self.step]
+        names = tuple(f"frame_{i + 1:05d}.png" for i in chosen)
+        for name, i in zip(names, chosen, strict=True):
+            image = Image.fromarray((render(scene, i)[0] * 255).round().astype(np.uint8))
+            if self.half:
+                self._halve(image, folder / name)
+            else:
+                image.save(folder / name)
+        focal = scene.cameras.focal / (2 if self.half else 1)
+        return _truth(names, np.asarray(scene.cameras.camera_to_worlds)[list(chosen)], focal)
+
+    @staticmethod
+    def _halve(image: Image.Image, path: Path) -> None:
+        """An even cut of the image, box-filtered."""
+        width, height = image.width // 2, image.height // 2
+        small = image.convert("RGB").crop((0, 0, 2 * width, 2 * height)).resize((width, height), Image.Resampling.BOX)
+        small.save(path, quality=95)
+
+
+def _truth(names: tuple[str, ...], poses: Array, focal: float) -> Truth:
+    return Truth(names, poses[:, :3, 3], poses[:, :3, :3] * [1, -1, -1], focal)
+
+
+def catalogue() -> dict[str, Capture]:
+    """All captures by name: each as it is, at half size, and every second frame."""
+    base = [Capture("kitti-street", "kitti-street", True)]
+    for piece in range(5):
+        first = ROAD_PIECE * piece
+        base.append(Capture(f"long-road-{piece + 1}", "long-road", True, first, first + ROAD_PIECE))
+    base += [Capture(name, name, True) for name in ("fern", "fox", "room-walk")]
+    base += [
+        Capture("street", "street", False, count=48, length=40.0),
+        Capture("bends", "long-road", False, count=64, length=64.0),
+        Capture("loop", "room", False, count=64),
+        Capture("orbit", "object", False, count=48),
+    ]
+    found: dict[str, Capture] = {}
+    for capture in base:
+        found[capture.name] = capture
+        found[f"{capture.name}-half"] = replace(capture, name=f"{capture.name}-half", half=True)
+        found[f"{capture.name}-second"] = replace(capture, name=f"{capture.name}-second", step=2)
+    return found
