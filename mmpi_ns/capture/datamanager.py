@@ -102,6 +102,11 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
             self.known_depth = known = self._known_depth(dataset)
             seen = self.observations if known is None else with_known_depths(self.observations, known, dataset)
             dataset.metadata[OBSERVATIONS] = seen
+            has_keypoints = self.config.keypoint_rays > 0 and len(self.observations.seen_at) > 0
+            if not has_keypoints and (known is None or known.share == 0):
+                CONSOLE.print(
+                    "No distance is known, from tracks, matches or a sensor: it is learned from colours alone."
+                )
         return dataset
 
     def _known_depth(self, dataset: MMPIDataset) -> KnownDepth | None:

@@ -148,6 +148,13 @@ def test_rays_of_new_views_come_after_the_pixels_and_leave_fewer_keypoint_rays(s
     assert len(manager._shared.pixels) == len(shared.pixels)
 
 
+@pytest.mark.parametrize(("settings", "says"), [({}, False), ({"keypoint_rays": 0, "dense_depth": False}, True)])
+def test_a_run_without_any_depth_says_so_and_draws_pixels(scene, capsys, settings, says):
+    manager = datamanager(scene, depth_images=False, new_view_share=1.0, **settings)
+    assert ("No distance is known" in capsys.readouterr().out) == says
+    assert (len(manager.next_train(0)[0]) == 64) == says
+
+
 def test_new_views_are_drawn_by_window_where_pixels_are_read_by_window(scene):
     manager = datamanager(scene, new_view_share=1.0, resident_pixels=10.0)
     assert manager._shared is None

@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_tracks import FOCAL, HEIGHT, LENS, POSES, WIDTH, is_near_wall, scene_of
+from PIL import Image
+from test_tracks import FOCAL, HEIGHT, LENS, POSES, WIDTH, is_near_wall, pose_at, scene_of
 
 from mmpi_ns.capture import dense
 from mmpi_ns.capture.dense import Depth, confirmed, find_depths, fuse, load_view, without_fringes
@@ -176,3 +177,19 @@ def test_a_depth_counts_where_another_image_confirms_it_and_no_more_see_through_
     assert share(4.0) == share(4.0, 4.0, 8.0) == 1  # confirmed; confirmed twice, seen through once
     assert share(8.0) == share(4.0, 8.0) == share() == 0  # seen through; as often as confirmed; by nobody
     assert share(4.0, 2.0, 2.0) == 1  # hidden in the others, which says nothing
+
+
+def test_what_moves_with_the_camera_has_no_depth(tmp_path):
+    """A car ahead that keeps its distance on a straight road matches well, at infinity, which is no known depth."""
+    poses = [pose_at(0.12 * i) for i in range(5)]
+    images = scene_of(tmp_path, poses)
+    car = np.random.default_rng(0).integers(0, 255, (50, 60), np.uint8)
+    car = np.repeat(np.repeat(car[::5, ::5], 5, 0), 5, 1)
+    for file in images.files:
+        picture = np.array(Image.open(file))
+        picture[50:100, 70:130] = car if picture.ndim == 2 else car[..., None]
+        Image.fromarray(picture).save(file)
+    found = list(find_depths(images, lambda i: points_on_walls(poses[i]), WIDTH))
+    inside = np.mean([(d.inverse[58:92, 78:122] > 0).mean() for _, d in found])
+    outside = np.mean([(d.inverse[:, :60] > 0).mean() for _, d in found])
+    assert inside < 0.05 and outside > 0.8
