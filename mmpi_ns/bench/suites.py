@@ -148,13 +148,15 @@ def _ours() -> list[Variant]:
 def _depth() -> list[Variant]:
     """What the depths are worth that are found in the training images, from poses alone and beside SfM tracks."""
     alone = ("--pipeline.datamanager.sfm-path", "none")
-    dense, keypoints = ("--pipeline.datamanager.dense-depth", "False"), ("--pipeline.datamanager.keypoint-rays", "0")
+    views = ("--pipeline.datamanager.new-view-share", "0")
+    dense = ("--pipeline.datamanager.dense-depth", "False")
     return [
         Variant("poses alone, all depths", alone, group="poses alone"),
+        Variant("no new views", (*alone, *views), group="poses alone"),
         Variant("no dense depths", (*alone, *dense), group="poses alone"),
-        Variant("no keypoint rays", (*alone, *keypoints), group="poses alone"),
         Variant("no depth", (*alone, *NO_DEPTH), group="poses alone"),
         Variant("with SfM tracks, all depths", (), group="with SfM tracks"),
+        Variant("with SfM tracks, no new views", views, group="with SfM tracks"),
         Variant("with SfM tracks, no dense depths", dense, group="with SfM tracks"),
     ]
 
