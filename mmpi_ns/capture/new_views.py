@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -33,6 +34,8 @@ SAME_DEPTH = 0.03
 """Two images' distances of a point agree within this share."""
 SAME_COLOR = 24
 """Levels by which a colour may lie beyond those within a pixel of its place in the other image."""
+HELD = 32
+"""Images in memory at once."""
 MOST = 2_000_000
 """Pairs of pixels that are kept (30 bytes each), spread over the images."""
 
@@ -113,11 +116,11 @@ def find_shared_points(
     Raises:
         InputError: an image or mask cannot be used (names the file).
     """
-    shown = {i: _image(dataset, i) for i in images}
+    show = lru_cache(HELD)(lambda i: _image(dataset, i))  # neighbours mostly stand side by side
     rng, parts, found = np.random.default_rng(seed), [], 0.0
     budget = max(1, MOST // (NEIGHBOURS * max(1, len(images))))
     for i in images:
-        rows, columns = _certain(known.images[i], shown[i][1])
+        rows, columns = _certain(known.images[i], show(i)[1])
         count = len(rows)
         if count > budget:
             chosen = np.sort(rng.choice(count, budget, replace=False))
@@ -127,9 +130,9 @@ def find_shared_points(
         pixels = torch.from_numpy(np.stack([np.full(len(rows), i), rows, columns], -1))
         directions = rays(pixels.to(device)).directions.double().cpu().numpy()
         depths = known.images[i][rows, columns]
-        points, own = posed.camera_to_worlds[i, :, 3] + directions / depths[:, :1], shown[i][0][rows, columns]
+        points, own = posed.camera_to_worlds[i, :, 3] + directions / depths[:, :1], show(i)[0][rows, columns]
         for j in _neighbours(posed, i, images):
-            seen, colors = _seen_by(posed, j, points, own, known.images[j], *shown[j])
+            seen, colors = _seen_by(posed, j, points, own, known.images[j], *show(j))
             found += len(seen) * count / len(rows)
             both = np.stack([own[seen], colors], 1)
             parts.append((pixels[seen].int(), torch.full((len(colors),), j, dtype=torch.int32), both, depths[seen]))
