@@ -44,15 +44,13 @@ def parts(data: Path, out: Path, work: Path, rehearse: bool) -> list[Part]:
     """Everything, in the order of what is wanted most."""
     python, bench = [sys.executable], [sys.executable, "-m", "mmpi_ns.bench"]
     where = ["--output", str(out), "--work", str(work)]
-    looks = [
-        "import torch, platform; print(platform.python_version(), torch.__version__, torch.version.cuda)",
-        "import triton; print('Triton', triton.__version__)",
-        "import nerfstudio.configs.method_configs, mmpi_ns.config; print('nerfstudio and mmpi_ns import')",
-    ]
+    look = "import platform, torch; print(platform.python_version(), torch.__version__, torch.version.cuda, flush=True)"
+    look += "; import triton; print('Triton', triton.__version__, flush=True)"
+    look += "; import nerfstudio.configs.method_configs, mmpi_ns.config; print('nerfstudio and mmpi_ns import')"
     small = ["--rehearse", "--parts", "checks"] if rehearse else ["--data", str(data), "--parts", *BENCH_PARTS]
     return [
         Part("device", ["nvidia-smi"], 20),
-        *(Part(f"environment {i}", [*python, "-c", line], 90) for i, line in enumerate(looks, 1)),
+        Part("environment", [*python, "-c", look], 90),
         Part("quick", [*bench, "gpu", "--quick", *where], 120),
         Part("tests", [*python, "-m", "pytest", "-m", "gpu", "-rs", "-p", "no:cacheprovider", "tests/ops"], 120),
         Part("bench gpu", [*bench, "gpu", *small, *where, "--seconds", "120"], 150),

@@ -101,6 +101,7 @@ def all_launches(setattr):
     Args:
         setattr: sets an attribute of an object, for as long as the launches are used.
     """
+    march = importlib.import_module("mmpi_ns.ops.march.gpu")
     setattr(dispatch, "_interpreting", True)
     setattr(dispatch, "_faults", dict.fromkeys(["Triton", *dispatch.TABLE]))
     with launches_noted({}) as noted:
@@ -108,8 +109,10 @@ def all_launches(setattr):
             module = importlib.import_module(f"mmpi_ns.ops.{dispatch.TABLE[name][0]}.gpu")
             if hasattr(module, "block_size"):  # arrays on a CPU, but blocks of a GPU's size
                 setattr(module, "block_size", lambda wanted, device: wanted)
-            for given in cases("cpu"):
-                trial._outcome(name, "gpu", given)
+            for many in (1 << 30, 1) if name in ("march", "show_rays") else (1,):  # blocks for few rays, and for many
+                setattr(march, "MANY", many)
+                for given in cases("cpu"):
+                    trial._outcome(name, "gpu", given)
     return list(noted)
 
 

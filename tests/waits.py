@@ -30,6 +30,8 @@ WAITING = {
     "lift_fresh",  # torch.tensor of Python's numbers: a copy to the device that is waited for
 }
 """Operations of torch that wait whatever they are given."""
+NO_LAUNCH = ("empty", "new_empty", "_sparse_coo_tensor", "_indices", "_values", "_coalesced_", "lift_fresh")
+"""What the names of operations begin with that work on the host alone."""
 PACKAGE = Path(mmpi_ns.__file__).parent
 STEPS = 8
 TRAININGS = pytest.mark.parametrize(
@@ -43,6 +45,8 @@ class Waits(TorchDispatchMode):
     def __init__(self) -> None:
         super().__init__()
         self.found: Counter[str] = Counter()
+        self.launches = 0
+        """Kernels, torch's and ours: operations that are no views and allocate nothing alone."""
         self._paused = False
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
@@ -53,6 +57,7 @@ class Waits(TorchDispatchMode):
         by_counts = name == "repeat_interleave" and not (kwargs or {}).get("output_size")
         if name in WAITING or by_mask or by_counts:
             self.note(name)
+        self.launches += not (self._paused or func.is_view or name.startswith(NO_LAUNCH))
         return func(*args, **(kwargs or {}))
 
     def note(self, name: str) -> None:
@@ -80,6 +85,7 @@ def counted_on_a_cpu(monkeypatch):
     waits, launch = Waits(), GridExecutor.__call__
 
     def quietly(self, *args, **kwargs):
+        waits.launches += 1
         with waits.paused():
             return launch(self, *args, **kwargs)
 
@@ -88,7 +94,7 @@ def counted_on_a_cpu(monkeypatch):
         for name in ("tolist", "numpy", "cpu"):  # on a CPU they pass torch's operations by
             patch.setattr(torch.Tensor, name, _noted(waits, name))
         with waits:
-            yield waits.found
+            yield waits
 
 
 def _noted(waits, name):
@@ -104,22 +110,22 @@ def _noted(waits, name):
 
 @contextmanager
 def counted_on_a_gpu():
-    """How often what runs within waits for the GPU, as torch says."""
-    found: Counter[str] = Counter()
+    """How often what runs within waits for the GPU, as torch says; launches are not counted."""
+    waits = Waits()
     torch.cuda.set_sync_debug_mode("warn")
     try:
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always")
-            yield found
+            yield waits
     finally:
         torch.cuda.set_sync_debug_mode("default")
     for w in said:
         if "synchronizing" in str(w.message):
-            found[f"{Path(w.filename).name}:{w.lineno}"] += 1
+            waits.found[f"{Path(w.filename).name}:{w.lineno}"] += 1
 
 
 def waits_of_phases(scene, plan_file, folder, training, device, counted):
-    """What the last step of each phase waits for: {phase: {place: times}}."""
+    """What the last step of each phase waits for: {phase: Waits}."""
     config = trainer_config(scene, plan_file, folder, steps=STEPS, training=training, growth_shares=(), shading="ray")
     config.pipeline.datamanager.train_num_rays_per_batch, config.pipeline.datamanager.keypoint_rays = 16, 8
     config.machine.device_type = device
@@ -134,7 +140,7 @@ def waits_of_phases(scene, plan_file, folder, training, device, counted):
         if phase not in phases[step + 1 :]:
             with counted() as waits:
                 _run(trainer, step)
-            found[phase] = dict(waits)
+            found[phase] = waits
         else:
             _run(trainer, step)  # packs the scene's constants
     return found

@@ -106,10 +106,10 @@ def _split(sums: Float[Tensor, "R N"], channels: int) -> tuple[Tensor, Tensor, T
     return gathered, mass, gathered[:, :COLORS].clone(), second
 
 
-def sizes(channels: int, device: torch.device) -> tuple[int, int]:
-    """Columns, and rays or samples, of a program."""
+def sizes(channels: int, device: torch.device, numbers: int = NUMBERS) -> tuple[int, int]:
+    """Columns, and rays or samples, of a program that holds so many numbers."""
     columns = max(4, int(triton.next_power_of_2(channels)))  # colours take three, however few there are
-    return columns, block_size(max(8, NUMBERS // columns), device)
+    return columns, block_size(max(8, numbers // columns), device)
 
 
 class _GatherTaps(torch.autograd.Function):

@@ -308,8 +308,9 @@ def march_kernel(
         tl.store(taus + to, tau, keep)
         tl.store(skipped_before + to, skipped[:, None] + _before(skip, STEPS), keep)
         number_kept += tl.sum(keep.to(tl.int32), 1)
-        own = keep[:, :, None] & (head[:, :, None] == head_of[None, None, :])
-        of_heads += tl.sum(tl.sum(own.to(tl.int32), 1), 0)
+        for k in range(K + HAS_CUBE):
+            own = tl.sum(tl.sum((keep & (head == k)).to(tl.int32), 1), 0)
+            of_heads += tl.where(head_of == k, own, 0)
         skipped += tl.sum(skip, 1)
         dropped += tl.sum(tl.where(skip > 0, weight, 0.0), 1)
         depth += tl.sum(tl.where(seen, tau, 0.0), 1)

@@ -20,6 +20,9 @@ from mmpi_ns.ops.march.gpu import march_into_slots
 from mmpi_ns.ops.show.reference import Shown
 from mmpi_ns.scene.geometry import PlaneHits
 
+NUMBERS = 256
+"""Rays of a program times their channels: what its registers hold."""
+
 
 @triton.jit
 def _read(table, grids, head, plane, place, known, channels, column, num_mpis, HAS_CUBE: tl.constexpr):
@@ -106,7 +109,7 @@ def show_rays(
     gathered = torch.empty(num_rays, channels, device=device)
     mass, depth, median, winner = (torch.empty(num_rays, 1, device=device) for _ in range(4))
     if num_rays:
-        columns, block = sizes(channels, device)
+        columns, block = sizes(channels, device, NUMBERS)
         show_kernel[(triton.cdiv(num_rays, block),)](
             m.kept, *m.slots, m.skipped_total, features.contiguous(), GpuScene.of(layout).grids,
             gathered, mass, depth, median, winner, num_rays, m.room, channels, len(layout.mpis),
