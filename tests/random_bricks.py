@@ -30,7 +30,7 @@ def random_window(num_mpis=2, seed=0, planes=40, channels=5, stored=0.5, density
     codes = torch.randint(density[0], density[1] + 1, (count, 8, 8), generator=g, dtype=torch.uint8)
     texels = torch.randint(0, 256, (count, 8, 8, channels), generator=g, dtype=torch.uint8)
     intervals = tuple(rng.uniform(*shares) for _ in mpis)
-    ranges = (*[Codes.spanning(0, 1)] * 3, *[Codes.spanning(-0.7, 0.9)] * (channels - 3))
+    ranges = (*[Codes.spanning(-4, 4)] * 3, *[Codes.spanning(-1.5, 1.1)] * (channels - 3))
     baked = BakedMpis(mpis, intervals, torch.cat(columns), codes, texels, Codes.spanning(-12, 4), ranges)
     sizes = (channels + 15, 6, 6, 3)
     layers = tuple((torch.randn(o, i, generator=g) / i**0.5, torch.randn(o, generator=g)) for i, o in pairwise(sizes))

@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Callable, Iterable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import torch
 from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 
 from mmpi_ns.export.files import BakedScene, Pose
 from mmpi_ns.model import MMPIModel
 from mmpi_ns.ops.baked import march_baked
 from mmpi_ns.rendering.baked import BakedWindow
+from mmpi_ns.rendering.chunks import CPU_RAYS, render_in_chunks
+from mmpi_ns.rendering.metrics import ImageMetrics
 from mmpi_ns.rendering.windows import mix_windows
 from mmpi_ns.scene.windows import window_shares
 
@@ -100,24 +106,58 @@ def poses_of(pipeline: Any) -> list[Pose]:
     return [poses[name] for name in sorted(poses)]
 
 
+@dataclass(frozen=True)
+class Compared:
+    """Means over test images."""
+
+    to_exact: float
+    """PSNR of baked images against the exact renderer's, dB."""
+    exact: dict[str, float]
+    """psnr and ssim of the exact renderer's against the truth, and seconds of processor time a frame."""
+    baked: dict[str, float]
+    """The same of baked images."""
+
+    def __str__(self) -> str:
+        words = [f"{m['psnr']:.2f} dB, SSIM {m['ssim']:.4f}, {m['seconds']:.3f} s" for m in (self.exact, self.baked)]
+        return (
+            f"Baked images have {self.to_exact:.1f} dB to the exact renderer's;\n"
+            f"  against the truth {words[1]} a frame (processor time),\n  exact {words[0]}."
+        )
+
+
 @torch.no_grad()
-def compare(pipeline: Any, scene: BakedScene, count: int) -> tuple[list[float], list[float], list[float]]:
-    """PSNR of test images: baked against exact, exact against the truth, and baked against the truth.
+def compare(pipeline: Any, scene: BakedScene, count: int) -> Compared:
+    """Baked test images against exact ones and the truth.
 
     Args:
         pipeline: of the run.
         scene: its baked scene.
         count: how many test images, evenly spaced; all where there are fewer.
     """
-    dataset = pipeline.datamanager.eval_dataset
-    found: tuple[list[float], list[float], list[float]] = ([], [], [])
+    dataset, metrics = pipeline.datamanager.eval_dataset, ImageMetrics("none")
+    to_exact: list[float] = []
+    rows: dict[str, list[dict[str, float]]] = {"exact": [], "baked": []}
     for i in torch.linspace(0, len(dataset) - 1, min(count, len(dataset))).long().tolist():
         bundle, truth = dataset.cameras.generate_rays(i), dataset[i]["image"][..., :3]
-        exact = pipeline.model.get_outputs_for_camera_ray_bundle(bundle)["rgb"]
-        baked = render_scene(scene, *camera_rays(dataset.cameras, i))["rgb"].view(exact.shape)
-        for values, (a, b) in zip(found, ((baked, exact), (exact, truth), (baked, truth)), strict=True):
-            values.append(float(-10 * torch.log10((a - b).square().mean().clamp(min=1e-12))))
-    return found
+        renderers = {
+            "exact": lambda bundle=bundle: pipeline.model.get_outputs_for_camera_ray_bundle(bundle)["rgb"],
+            "baked": lambda bundle=bundle: _render_bundle(scene, bundle),
+        }
+        images = {}
+        for name, render in renderers.items():
+            start = time.process_time()
+            images[name] = render().cpu()
+            seconds = time.process_time() - start
+            rows[name].append({"ssim": math.nan, "seconds": seconds} | metrics(images[name], truth))
+        to_exact.append(metrics(images["baked"], images["exact"])["psnr"])
+    means = {name: {key: fmean(r[key] for r in found) for key in found[0]} for name, found in rows.items()}
+    return Compared(fmean(to_exact), **means)
+
+
+def _render_bundle(scene: BakedScene, bundle: RayBundle) -> Tensor:
+    """The image of a camera's rays."""
+    render = lambda rays: render_scene(scene, rays.origins, rays.directions)  # noqa: E731
+    return render_in_chunks(bundle, CPU_RAYS, torch.device("cpu"), render)["rgb"]
 
 
 def render_scene(

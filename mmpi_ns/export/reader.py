@@ -52,9 +52,9 @@ def brick_of(window: dict[str, Any], mpi: dict[str, Any], plane: int, row: int, 
 
 
 def crossings(window: dict[str, Any], origin: np.ndarray, direction: np.ndarray) -> list[tuple]:
-    """(1 / distance, MPI, optical depth, codes of the channels) where a ray crosses stored bricks, nearest first."""
+    """(1 / distance, optical depth, colour and features) where a ray crosses stored bricks, nearest first."""
     found = []
-    for k, mpi in enumerate(window["mpis"]):
+    for mpi in window["mpis"]:
         o, d = np.array(mpi["axes"]) @ (origin - mpi["origin"]), np.array(mpi["axes"]) @ direction
         u0, u1, v0, v1 = mpi["extent"]
         last = 0.0 if mpi["far"] is None else 1 / mpi["far"]
@@ -80,8 +80,15 @@ def crossings(window: dict[str, Any], origin: np.ndarray, direction: np.ndarray)
                 window["density_array"][brick, corners] @ weights
             )
             tau = np.logaddexp(0, raw) * mpi["interval"]
-            found.append((inverse_t, k, tau, window["texels_array"][:, brick, corners] @ weights))
+            found.append((inverse_t, tau, activated(window, window["texels_array"][:, brick, corners] @ weights)))
     return sorted(found, key=lambda sample: -sample[0])
+
+
+def activated(window: dict[str, Any], codes: np.ndarray) -> np.ndarray:
+    """Colour (three sigmoids) and features (hyperbolic tangents) of a sample."""
+    low, step = (np.array([c[name] for c in window["channels"]]) for name in ("low", "step"))
+    raw = low + step * codes
+    return np.concatenate([1 / (1 + np.exp(-raw[:3])), np.tanh(raw[3:])])
 
 
 def shade(window: dict[str, Any], mean: np.ndarray, direction: np.ndarray) -> np.ndarray:
@@ -99,18 +106,17 @@ def shade(window: dict[str, Any], mean: np.ndarray, direction: np.ndarray) -> np
 def render_ray(window: dict[str, Any], origin: np.ndarray, direction: np.ndarray) -> np.ndarray:
     """What one window shows of a ray."""
     light, mass, sums = 1.0, 0.0, np.zeros(len(window["channels"]))
-    for _, _, tau, codes in crossings(window, origin, direction):
+    for _, tau, colors in crossings(window, origin, direction):
         weight = light * -np.expm1(-tau)
         if weight > window["threshold"]:
-            sums, mass = sums + weight * codes, mass + weight
+            sums, mass = sums + weight * colors, mass + weight
         light *= np.exp(-tau)
-        if light < 2e-3:
+        if light < 1e-2:
             light = 0.0
             break
     if mass == 0:
         return np.full(3, light * window["background"])
-    low, step = (np.array([c[name] for c in window["channels"]]) for name in ("low", "step"))
-    color = shade(window, low + step * sums / mass, direction)
+    color = shade(window, sums / mass, direction)
     return np.clip(color * (1 - light) + light * window["background"], 0, 1)
 
 

@@ -38,8 +38,9 @@ class Codes:
     step: float
 
     @staticmethod
-    def spanning(low: float, high: float) -> Codes:
-        return Codes(float(low), max(high - low, 1e-6) / 255)
+    def spanning(low: float, high: float, highest: int = 255) -> Codes:
+        """Codes 0 to ``highest`` for values from low to high."""
+        return Codes(float(low), max(high - low, 1e-6) / highest)
 
     def encode(self, values: Tensor) -> UInt8[Tensor, "..."]:
         return ((values - self.low) / self.step).round().clamp(0, 255).to(torch.uint8)
@@ -66,7 +67,8 @@ class BakedMpis:
         intervals: factor on softplus of each MPI.
         columns: of all MPIs one after the other, each [words, down, across]: bits of the planes, and the first brick.
         density: codes of raw densities with the plane's bias.
-        texels: codes of the channels that are gathered along a ray: diffuse colour, then features.
+        texels: codes of the channels of a ray: logits of the diffuse colour, then arguments of the features. They
+            are interpolated before the sigmoid and the hyperbolic tangent, as in the exact renderer.
         density_codes: what the codes of ``density`` stand for.
         channel_codes: what those of ``texels`` stand for.
     """

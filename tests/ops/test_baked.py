@@ -13,7 +13,7 @@ from mmpi_ns.export import reader
 from mmpi_ns.export.files import write_baked
 from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.baked import cpu, reference
-from mmpi_ns.scene.baked import SIDE, Codes, Shader, brick_numbers, columns_from, columns_of
+from mmpi_ns.scene.baked import SIDE, Shader, brick_numbers, columns_from, columns_of
 
 FORMS = {"reference": reference, "cpu": cpu}
 
@@ -51,7 +51,7 @@ def test_agrees_with_the_reader(form, settings, tmp_path):
 
 
 def shaded(form, window, found, directions):
-    rgb = FORMS[form].shade_baked(window.shader, window.mpis.channel_codes, found.sums, found.mass, directions)
+    rgb = FORMS[form].shade_baked(window.shader, found.sums, found.mass, directions)
     rgb = torch.where(found.mass > 0, rgb, 0.0)
     return (rgb * (1 - found.passing) + 0.5 * found.passing).clamp(0, 1)
 
@@ -65,13 +65,13 @@ def test_shading_agrees_with_the_reference(octaves, sizes):
     g = torch.Generator().manual_seed(octaves)
     whole = (5 + 3 * (1 + 2 * octaves), *sizes)
     layers = tuple((torch.randn(o, i, generator=g), torch.randn(o, generator=g)) for i, o in pairwise(whole))
-    shader, codes = Shader(layers, octaves, 8.0), (*[Codes.spanning(0, 1)] * 3, *[Codes.spanning(-1, 1)] * 2)
+    shader = Shader(layers, octaves, 8.0)
     mass = torch.rand(101, 1, generator=g)
-    sums = mass * torch.rand(101, 5, generator=g) * 255
-    mass[3], sums[3], sums[4, :3], sums[5, :3] = 0, 0, 0, 255 * mass[5]
+    sums = mass * (torch.rand(101, 5, generator=g) * torch.tensor([1, 1, 1, 2, 2]) - torch.tensor([0, 0, 0, 1, 1]))
+    mass[3], sums[3], sums[4, :3], sums[5, :3] = 0, 0, 0, mass[5]
     directions = torch.nn.functional.normalize(torch.randn(101, 3, generator=g), dim=-1)
-    found = cpu.shade_baked(shader, codes, sums, mass, directions)
-    expected = reference.shade_baked(shader, codes, sums.double(), mass.double(), directions.double())
+    found = cpu.shade_baked(shader, sums, mass, directions)
+    expected = reference.shade_baked(shader, sums.double(), mass.double(), directions.double())
     # White to the last bit is not white, and odds may change by e^8.
     torch.testing.assert_close(found.double(), expected, atol=1e-3, rtol=0)
 

@@ -5,7 +5,7 @@ precision highp int;
 precision highp sampler2D;
 precision highp usampler2D;
 
-const float OPAQUE = 2e-3;
+const float OPAQUE = 1e-2;
 const int MOST = 4096; // samples of a ray
 
 uniform vec3 eye;
@@ -18,7 +18,7 @@ uniform float share;   // of the window
 uniform float rayNear, threshold, background;
 uniform vec2 depthRange; // logarithms of the distances at the ends of the ramp
 uniform vec2 densityCodes; // low, step
-uniform float low[4 * GROUPS], step_[4 * GROUPS]; // of the channels
+uniform vec4 low[GROUPS], step_[GROUPS]; // of the channels; features' doubled, for tanh x = 2 sigmoid(2 x) - 1
 uniform usampler2D columns;
 uniform sampler2D density;
 uniform sampler2D texels[GROUPS];

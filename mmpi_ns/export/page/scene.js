@@ -73,7 +73,7 @@ function networkSource(shader, channels) {
   });
   const mean = [];
   for (let c = 0; c < channels; c++)
-    mean.push(`x0[${c}] = low[${c}] + step_[${c}] * sums[${c >> 2}].${"xyzw"[c & 3]} / mass;`);
+    mean.push(`x0[${c}] = ${c < 3 ? "" : "2.0 * "}sums[${c >> 2}].${"xyzw"[c & 3]} / mass${c < 3 ? "" : " - 1.0"};`);
   const encoded = [];
   for (let a = 0; a < 3; a++) {
     encoded.push(`x0[${channels + a}] = direction[${a}];`);
@@ -146,7 +146,8 @@ class WindowOnCard {
 
   compile(network) {
     const { gl } = this;
-    const gather = Array.from({ length: this.groups }, (_, g) => `sums[${g}] += (255.0 * weight) * textureLod(texels[${g}], uv, 0.0);`);
+    const gather = Array.from({ length: this.groups }, (_, g) =>
+      `sums[${g}] += weight / (1.0 + exp(-(low[${g}] + step_[${g}] * textureLod(texels[${g}], uv, 0.0))));`);
     const fragment = "#version 300 es\n" + MARCH
       .replace("NETWORK", network)
       .replace("GATHER", gather.join("\n"))
@@ -213,9 +214,10 @@ class WindowOnCard {
     gl.uniform1f(this.uniform("threshold"), row.threshold);
     gl.uniform1f(this.uniform("background"), row.background);
     gl.uniform2f(this.uniform("densityCodes"), row.density.low, row.density.step);
-    const padded = (name) => Array.from({ length: 4 * this.groups }, (_, c) => row.channels[c]?.[name] ?? 0);
-    gl.uniform1fv(this.uniform("low"), padded("low"));
-    gl.uniform1fv(this.uniform("step_"), padded("step"));
+    const padded = (name, by) =>
+      Array.from({ length: 4 * this.groups }, (_, c) => (c < 3 ? by : 2 * by) * (row.channels[c]?.[name] ?? 0));
+    gl.uniform4fv(this.uniform("low"), padded("low", 1));
+    gl.uniform4fv(this.uniform("step_"), padded("step", 255));
     const near = Math.log(row.content_near || row.ray_near || 1e-3);
     gl.uniform2f(this.uniform("depthRange"), near, Math.max(near + 1, Math.log(row.farthest / 10)));
     gl.uniform1i(this.uniform("columns"), 0);

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.baked.reference import Gathered
-from mmpi_ns.scene.baked import BakedMpis, Codes, Shader
+from mmpi_ns.scene.baked import BakedMpis, Shader
 
 
 def march_baked(
@@ -35,7 +35,6 @@ def march_baked(
 
 def shade_baked(
     shader: Shader,
-    codes: tuple[Codes, ...],
     sums: Float[Tensor, "R C"],
     mass: Float[Tensor, "R 1"],
     directions: Float[Tensor, "R 3"],
@@ -44,9 +43,8 @@ def shade_baked(
 
     Args:
         shader: the network.
-        codes: what the channels' codes stand for.
         sums: see ``Gathered``.
         mass: likewise.
         directions: unit, world axes.
     """
-    return dispatch.run("shade_baked", shader, codes, sums, mass, directions)
+    return dispatch.run("shade_baked", shader, sums, mass, directions)

@@ -1,5 +1,5 @@
 // Rays through baked multi-plane images (scene/baked.py): all MPIs at once by distance, from brick to brick, until a ray
-// is opaque. What is gathered are codes, whose meaning is one number a channel. The reference is reference.py.
+// is opaque. What it gathers is read afterwards, all channels of a texel at once. The reference is reference.py.
 #include "lanes.h"
 
 #include <algorithm>
@@ -10,8 +10,8 @@
 
 namespace {
 
-constexpr float OPAQUE = 2e-3f; // a ray that lets less through is over
-constexpr int CELLS = 7, WORD = 32, FINENESS = 8;
+constexpr float OPAQUE = 1e-2f; // a ray that lets less through is over
+constexpr int CELLS = 7, WORD = 32, FINENESS = 8, COLORS = 3;
 typedef uint8_t ByteLanes __attribute__((vector_size(16)));
 
 struct Column {
@@ -33,6 +33,7 @@ struct Scene {
     const Head* heads;
     const Column* columns;
     const uint8_t *density, *texels;
+    const float *low, *step; // of sixteen channels; features' doubled, for tanh x = 2 sigmoid(2 x) - 1
 };
 
 // A ray on its way through one MPI. Planes are counted from the nearest one.
@@ -83,7 +84,7 @@ struct Walk {
     }
 
     // On to the next plane that holds something; false where there is none.
-    bool next(const Head& head, const Column* columns) {
+    bool next(const Scene& scene, const Head& head) {
         while (!ahead) {
             const int32_t l = exit + 1;
             if (l > last) return false;
@@ -92,7 +93,7 @@ struct Walk {
             const int32_t down = std::min(std::max(int32_t(y * (1.0f / CELLS)), 0), head.down - 1);
             word = l / WORD;
             left = across * CELLS, top = down * CELLS;
-            const Column column = columns[head.first_column + (word * head.down + down) * head.across + across];
+            const Column column = scene.columns[head.first_column + (word * head.down + down) * head.across + across];
             const float leaving = std::min(leaves(x0, x_step, x_turns, left), leaves(y0, y_step, y_turns, top));
             exit = std::min(last, word * WORD + WORD - 1);
             if (leaving < float(exit)) exit = std::max(l, int32_t(leaving));
@@ -104,6 +105,7 @@ struct Walk {
         ahead &= ahead - 1;
         brick++;
         const float w = float(head.planes - 1 - plane) * head.step + head.end;
+        __builtin_prefetch(scene.density + int64_t(brick) * 64);
         inverse_t = w * dz / (1 - w * oz);
         return true;
     }
@@ -124,76 +126,90 @@ Lanes widened(const uint8_t* from) {
     return __builtin_convertvector(codes, Lanes);
 }
 
+// A sample that weighs enough.
 struct Seen {
-    float weight, inverse_t;
-    int32_t head;
+    float weight, inverse_t, fx, fy;
+    int32_t head, texel;
 };
+
+// Colours and features of a sample, the features as sigmoids.
+inline __attribute__((always_inline)) Lanes colors(const Scene& scene, const Seen& sample, Lanes low, Lanes step) {
+    const int64_t C = scene.channels;
+    const uint8_t* texel = scene.texels + sample.texel * C;
+    const float fx = sample.fx, fy = sample.fy, gx = 1 - fx, gy = 1 - fy;
+    const Lanes codes = widened(texel) * (gx * gy) + widened(texel + C) * (fx * gy) + widened(texel + 8 * C) * (gx * fy) +
+                        widened(texel + 9 * C) * (fx * fy);
+    return 1.0f / (1.0f + exp_lanes(-(low + step * codes)));
+}
 
 } // namespace
 
 extern "C" {
 
-// Rays [begin, end). Sums of weight times code of each channel, the weights' sum, the light that passes, the inverse
+// Rays [begin, end). Sums of weight times colours and features, the weights' sum, the light that passes, the inverse
 // distance at half of the weight, the head of most weight; and, where asked for, the largest weight in each brick.
 void mmpi_march_baked(const Scene* scene, const float* origins, const float* directions, const float* nears,
                       const float* fars, float threshold, int64_t begin, int64_t end, float* sums, float* mass,
                       float* passing, float* inverse_t, int64_t* winner, float* peaks) {
     const int64_t H = scene->num_heads, C = scene->channels;
+    int64_t most_samples = 1;
+    for (int64_t h = 0; h < H; h++) most_samples += scene->heads[h].planes;
     std::vector<Walk> walks(H);
-    std::vector<int32_t> live(H);
-    std::vector<float> nearest(H), votes(H);
-    std::vector<Seen> seen;
+    std::vector<float> nearest(H), votes(H); // nearest: 1 / distance of each head's next sample; -1: none
+    std::vector<Seen> seen(most_samples);
+    const Lanes low = load(scene->low), step = load(scene->step);
     for (int64_t ray = begin; ray < end; ray++) {
-        int64_t alive = 0;
         for (int64_t h = 0; h < H; h++) {
             const Head& head = scene->heads[h];
             Walk& walk = walks[h];
-            if (!walk.begin(head, origins + 3 * ray, directions + 3 * ray, nears[ray], 1 / fars[ray])) continue;
-            if (walk.next(head, scene->columns)) nearest[alive] = walk.inverse_t, live[alive++] = int32_t(h);
+            const bool meets =
+                walk.begin(head, origins + 3 * ray, directions + 3 * ray, nears[ray], 1 / fars[ray]) &&
+                walk.next(*scene, head);
+            nearest[h] = meets ? walk.inverse_t : -1;
         }
-        float light = 1, total = 0;
-        Lanes gathered{};
-        seen.clear();
-        while (alive && light > OPAQUE) {
+        float light = 1;
+        int64_t count = 0;
+        while (light > OPAQUE) {
             int64_t best = 0;
-            for (int64_t i = 1; i < alive; i++) best = nearest[i] > nearest[best] ? i : best; // ties: the first head
-            const int32_t h = live[best];
-            Walk& walk = walks[h];
+            float top = nearest[0];
+            for (int64_t h = 1; h < H; h++) { // ties: the first head
+                best = nearest[h] > top ? h : best;
+                top = nearest[h] > top ? nearest[h] : top;
+            }
+            if (top < 0) break;
+            Walk& walk = walks[best];
             float fx, fy;
-            const int32_t cell = walk.cell(fx, fy);
-            const uint8_t* code = scene->density + int64_t(walk.brick) * 64 + cell;
+            const int32_t texel = walk.brick * 64 + walk.cell(fx, fy);
+            const uint8_t* code = scene->density + texel;
             const float above = float(code[0]) + fx * float(code[1] - code[0]);
             const float below = float(code[8]) + fx * float(code[9] - code[8]);
-            const float pass = scene->heads[h].pass[int32_t((above + fy * (below - above)) * FINENESS + 0.5f)];
+            const float pass = scene->heads[best].pass[int32_t((above + fy * (below - above)) * FINENESS + 0.5f)];
             const float weight = light * (1 - pass);
+            seen[count] = {weight, top, fx, fy, int32_t(best), texel};
+            count += weight > threshold;
             if (peaks) peaks[walk.brick] = std::max(peaks[walk.brick], weight);
-            if (weight > threshold) {
-                const uint8_t* texel = scene->texels + (int64_t(walk.brick) * 64 + cell) * C;
-                const float w = weight, gx = 1 - fx, gy = 1 - fy;
-                gathered += widened(texel) * (w * gx * gy) + widened(texel + C) * (w * fx * gy) +
-                            widened(texel + 8 * C) * (w * gx * fy) + widened(texel + 9 * C) * (w * fx * fy);
-                total += weight;
-                seen.push_back({weight, walk.inverse_t, h});
-            }
             light *= pass;
-            if (walk.next(scene->heads[h], scene->columns)) {
-                nearest[best] = walk.inverse_t;
-                continue;
-            }
-            alive--;
-            for (int64_t i = best; i < alive; i++) live[i] = live[i + 1], nearest[i] = nearest[i + 1];
+            nearest[best] = walk.next(*scene, scene->heads[best]) ? walk.inverse_t : -1;
         }
-        for (int64_t c = 0; c < C; c++) sums[ray * C + c] = gathered[c];
+        for (int64_t s = 0; s < count; s++) {
+            const uint8_t* texel = scene->texels + seen[s].texel * C;
+            __builtin_prefetch(texel), __builtin_prefetch(texel + 10 * C - 1);
+        }
+        float total = 0;
+        Lanes gathered{};
+        std::fill(votes.begin(), votes.end(), 0.0f);
+        for (int64_t s = 0; s < count; s++) {
+            gathered += seen[s].weight * colors(*scene, seen[s], low, step);
+            total += seen[s].weight;
+            votes[seen[s].head] += seen[s].weight;
+        }
+        for (int64_t c = 0; c < C; c++) sums[ray * C + c] = c < COLORS ? gathered[c] : 2 * gathered[c] - total;
         mass[ray] = total;
         passing[ray] = light > OPAQUE ? light : 0;
-        inverse_t[ray] = 0;
-        std::fill(votes.begin(), votes.end(), 0.0f);
         float half = 0;
-        for (const Seen& sample : seen) {
-            if (half < 0.5f * total && half + sample.weight >= 0.5f * total) inverse_t[ray] = sample.inverse_t;
-            half += sample.weight;
-            votes[sample.head] += sample.weight;
-        }
+        int64_t s = 0;
+        while (s < count && (half += seen[s].weight) < 0.5f * total) s++;
+        inverse_t[ray] = count ? seen[std::min(s, count - 1)].inverse_t : 0;
         winner[ray] = std::max_element(votes.begin(), votes.end()) - votes.begin();
     }
 }

@@ -11,7 +11,8 @@ from torch.nn.functional import pad
 
 from mmpi_ns.ops import build
 from mmpi_ns.ops.baked.reference import Gathered
-from mmpi_ns.scene.baked import MOST_CHANNELS, BakedMpis, Codes, Shader, tiles_of
+from mmpi_ns.ops.gather import COLORS
+from mmpi_ns.scene.baked import MOST_CHANNELS, BakedMpis, Shader, tiles_of
 
 
 class _Head(ctypes.Structure):
@@ -27,7 +28,7 @@ class _Head(ctypes.Structure):
 class _Scene(ctypes.Structure):
     _fields_ = [
         *((n, ctypes.c_int64) for n in ("num_heads", "channels")),
-        *((n, ctypes.c_void_p) for n in ("heads", "columns", "density", "texels")),
+        *((n, ctypes.c_void_p) for n in ("heads", "columns", "density", "texels", "low", "step")),
     ]
 
 
@@ -42,7 +43,8 @@ class _Packed:
     """A scene as the kernel reads it, with all that it points to."""
 
     def __init__(self, scene: BakedMpis) -> None:
-        assert scene.texels.shape[-1] <= MOST_CHANNELS
+        channels = scene.texels.shape[-1]
+        assert channels <= MOST_CHANNELS
         self.passes = [scene.steps_of_depth(k) for k in range(len(scene.mpis))]
         heads = []
         for k, mpi in enumerate(scene.mpis):
@@ -56,12 +58,11 @@ class _Packed:
         self.heads = (_Head * len(heads))(*heads)
         # Sixteen channels are read at once, also those of the last texel.
         self.texels = pad(scene.texels.reshape(-1), (0, MOST_CHANNELS))
-        tables = (
-            build.address(scene.columns, torch.int32),
-            build.address(scene.density, torch.uint8),
-            build.address(self.texels, torch.uint8),
-        )
-        self.scene = _Scene(len(heads), scene.texels.shape[-1], ctypes.addressof(self.heads), *tables)
+        low, step = (torch.tensor([getattr(c, name) for c in scene.channel_codes]) for name in ("low", "step"))
+        doubled = torch.tensor([1.0] * COLORS + [2.0] * (channels - COLORS))  # tanh x = 2 sigmoid(2 x) - 1
+        self.codes = [pad(doubled * x, (0, MOST_CHANNELS - channels)) for x in (low, step)]
+        tables = build.addresses([scene.columns, scene.density, self.texels, *self.codes])
+        self.scene = _Scene(len(heads), channels, ctypes.addressof(self.heads), *tables)
 
 
 def march_baked(
@@ -104,7 +105,6 @@ def march_baked(
 
 def shade_baked(
     shader: Shader,
-    codes: tuple[Codes, ...],
     sums: Float[Tensor, "R C"],
     mass: Float[Tensor, "R 1"],
     directions: Float[Tensor, "R 3"],
@@ -112,13 +112,12 @@ def shade_baked(
     """See ``baked.shade_baked``."""
     numbers = [[x.contiguous() for x in layer] for layer in shader.layers]  # alive until the kernel has run
     layers = (_Layer * len(numbers))(*(_Layer(*w.shape, build.address(w), build.address(b)) for w, b in numbers))
-    low, step = (torch.tensor([getattr(c, name) for c in codes], dtype=torch.float32) for name in ("low", "step"))
-    held = [x.contiguous() for x in (low, step, sums, mass, directions)]
+    held = [x.contiguous() for x in (sums, mass, directions)]
     rgb = torch.empty(len(sums), 3)
     given = [build.address(x) for x in held]
 
     def part(begin: int, end: int) -> None:
-        sizes = map(ctypes.c_int64, (len(numbers), len(codes), shader.direction_octaves))
+        sizes = map(ctypes.c_int64, (len(numbers), sums.shape[-1], shader.direction_octaves))
         bound, rays = ctypes.c_float(shader.bound), map(ctypes.c_int64, (begin, end))
         build.library().mmpi_shade_baked(layers, *sizes, bound, *given, *rays, build.address(rgb))
 

@@ -10,18 +10,19 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import linear, relu
 
-from mmpi_ns.scene.baked import CELLS, BakedMpis, Codes, Shader, brick_numbers, columns_of
+from mmpi_ns.ops.gather.reference import COLORS, activate
+from mmpi_ns.scene.baked import CELLS, BakedMpis, Shader, brick_numbers, columns_of
 from mmpi_ns.scene.geometry import PlaneHits, inverse_distance, plane_hits, sample_disparity
 
-OPAQUE = 2e-3
+OPAQUE = 1e-2
 """A ray that lets less light through is over."""
 
 
 class Gathered(NamedTuple):
-    """What rays gathered, in codes, and what passes them."""
+    """What rays gathered, and what passes them."""
 
     sums: Float[Tensor, "R C"]
-    """Sum of weight times code, of samples that weigh more than the threshold."""
+    """Sum of weight times colour and features, of samples that weigh more than the threshold."""
     mass: Float[Tensor, "R 1"]
     """Sum of the weights of those samples."""
     passing: Float[Tensor, "R 1"]
@@ -61,8 +62,10 @@ def march_baked(
     half = ((gathered >= 0.5 * mass) & (weights > 0)).to(torch.int8).argmax(-1, keepdim=True)
     passing = after[:, -1:]
     votes = weights.new_zeros(len(weights), len(scene.mpis)).scatter_add(1, heads, weights)
+    low, step = (texels.new_tensor([getattr(c, name) for c in scene.channel_codes]) for name in ("low", "step"))
+    colors = activate((low + step * texels).flatten(0, 1)).view(texels.shape)
     return Gathered(
-        (weights[..., None] * texels).sum(1),
+        (weights[..., None] * colors).sum(1),
         mass,
         torch.where(passing > OPAQUE, passing, 0.0),
         torch.where(mass > 0, inverse_t.gather(1, half), 0.0),
@@ -72,20 +75,18 @@ def march_baked(
 
 def shade_baked(
     shader: Shader,
-    codes: tuple[Codes, ...],
     sums: Float[Tensor, "R C"],
     mass: Float[Tensor, "R 1"],
     directions: Float[Tensor, "R 3"],
 ) -> Float[Tensor, "R 3"]:
     """See ``baked.shade_baked``."""
-    low, step = (sums.new_tensor([getattr(c, name) for c in codes]) for name in ("low", "step"))
-    mean = low + step * sums / mass.clamp(min=1e-6)
+    mean = sums / mass.clamp(min=1e-6)
     octaves = math.pi * 2.0 ** torch.arange(shader.direction_octaves, dtype=sums.dtype)
     angles = (directions[:, None] * octaves[:, None]).flatten(1)
     x = torch.cat([mean, directions, angles.sin(), angles.cos()], -1)
     for i, (weights, biases) in enumerate(shader.layers):
         x = linear(relu(x) if i else x, weights.to(x), biases.to(x))
-    color = mean[:, :3]
+    color = mean[:, :COLORS]
     return color / (color + (1 - color) * torch.exp(-shader.bound * torch.tanh(x / shader.bound)))
 
 

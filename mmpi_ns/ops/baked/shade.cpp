@@ -39,10 +39,10 @@ Lanes modulo_two(Lanes x) {
 
 extern "C" {
 
-// Colours of rays [begin, end): codes of what each gathered become means, which the network sees with the direction.
+// Colours of rays [begin, end): the network sees the means of what each gathered, and the direction.
 void mmpi_shade_baked(const Layer* layers, int64_t num_layers, int64_t channels, int64_t octaves, float bound,
-                      const float* low, const float* step, const float* sums, const float* mass,
-                      const float* directions, int64_t begin, int64_t end, float* rgb) {
+                      const float* sums, const float* mass, const float* directions, int64_t begin, int64_t end,
+                      float* rgb) {
     int64_t widest = channels + 3 * (1 + 2 * octaves);
     for (int64_t l = 0; l < num_layers; l++) widest = std::max(widest, layers[l].outputs);
     std::vector<Lanes> now(widest), next(widest);
@@ -54,7 +54,7 @@ void mmpi_shade_baked(const Layer* layers, int64_t num_layers, int64_t channels,
             return x;
         };
         const Lanes total = most(column(mass, 1, 0), splat(1e-6f));
-        for (int64_t c = 0; c < channels; c++) now[c] = low[c] + step[c] * column(sums, channels, c) / total;
+        for (int64_t c = 0; c < channels; c++) now[c] = column(sums, channels, c) / total;
         const Lanes mean[3] = {now[0], now[1], now[2]};
         for (int64_t a = 0; a < 3; a++) {
             const Lanes d = column(directions, 3, a);
