@@ -88,7 +88,7 @@ def activated(window: dict[str, Any], codes: np.ndarray) -> np.ndarray:
     """Colour (three sigmoids) and features (hyperbolic tangents) of a sample."""
     low, step = (np.array([c[name] for c in window["channels"]]) for name in ("low", "step"))
     raw = low + step * codes
-    return np.concatenate([1 / (1 + np.exp(-raw[:3])), np.tanh(raw[3:])])
+    return np.concatenate([0.5 + 0.5 * np.tanh(0.5 * raw[:3]), np.tanh(raw[3:])])
 
 
 def shade(window: dict[str, Any], mean: np.ndarray, direction: np.ndarray) -> np.ndarray:
