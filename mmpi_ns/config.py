@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import torch
-from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
+from nerfstudio.configs.base_config import LoggingConfig, MachineConfig, ViewerConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 from nerfstudio.plugins.types import MethodSpecification
@@ -12,6 +12,7 @@ from mmpi_ns.capture.datamanager import MMPIDataManagerConfig
 from mmpi_ns.model import MMPIModelConfig
 from mmpi_ns.placement.defaults import DEFAULTS
 from mmpi_ns.placement.rule import PlacementConfig
+from mmpi_ns.rendering.pipeline import MMPIPipeline
 from mmpi_ns.training.learning_rates import PhaseSchedulerConfig
 from mmpi_ns.training.losses import LossWeights
 from mmpi_ns.training.touched_adam import TouchedAdamConfig
@@ -37,7 +38,9 @@ def _method(
         steps_per_eval_batch=0,
         steps_per_eval_image=0,
         steps_per_eval_all_images=0,
+        logging=LoggingConfig(profiler="none"),
         pipeline=VanillaPipelineConfig(
+            _target=MMPIPipeline,
             datamanager=MMPIDataManagerConfig(
                 dataparser=NerfstudioDataParserConfig(),
                 train_num_rays_per_batch=rays,

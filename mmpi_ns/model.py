@@ -33,7 +33,7 @@ from mmpi_ns.placement.split import place_windows
 from mmpi_ns.rendering.baked import BakedWindow, bake
 from mmpi_ns.rendering.chunks import BYTES_PER_SLOT, rays_per_chunk, render_in_chunks
 from mmpi_ns.rendering.metrics import ImageMetrics, depth_metrics, pictures
-from mmpi_ns.rendering.rendered import RenderedRays, bounded, median_distance
+from mmpi_ns.rendering.rendered import BACKGROUNDS, RenderedRays, bounded, median_distance
 from mmpi_ns.rendering.sampler import MergeReport, MMPISampler
 from mmpi_ns.rendering.shown import shown_outputs
 from mmpi_ns.rendering.window_store import WindowStore
@@ -71,7 +71,6 @@ UNTIL_LOADED = ScenePlan(
     1.0,
 )
 """The plan of a model that only loads a checkpoint, which brings its own."""
-BACKGROUNDS = {"black": 0.0, "gray": 0.5, "white": 1.0}
 
 
 @dataclass
@@ -282,12 +281,23 @@ class MMPIModel(Model):
         if len(windows) == 1:
             return self.window_outputs(0, self.field, bundle, chosen)
 
-        def render(window: int, rays: RayBundle) -> dict[str, Tensor]:
+        there = self._windows_there()
+
+        def render(place: int, rays: RayBundle) -> dict[str, Tensor]:
+            window = there[place]
             field = self.field if window == trained else self.store.load(window, self.device)
             return self.window_outputs(window, field, rays, chosen)
 
-        # Windows are trained in order: those after the present one are not there yet.
-        return render_windows(bundle, windows.windows[: trained + 1], render, chosen and chosen[0])
+        shown = there.index(chosen[0]) if chosen is not None and chosen[0] in there else None
+        return render_windows(bundle, tuple(windows.windows[w] for w in there), render, shown)
+
+    def _windows_there(self) -> list[int]:
+        """Windows that can be rendered: trained in order, those after the present one are not there yet; where other
+        processes train some, those that they have finished."""
+        count, trained = len(self.progress.windows), self.progress.window
+        if self.run.shared:
+            return [w for w in range(count) if w == trained or self.store.path(w).is_file()]
+        return [*range(trained + 1)]
 
     def window_outputs(
         self, window: int, field: MMPIField, bundle: RayBundle, chosen: tuple[int, int] | None = None

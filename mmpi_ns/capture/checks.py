@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +34,7 @@ FEW = 0.1
 FLOAT32_STEP = 2.0**-23
 LEAST_DIGITS = 0.01
 """Share of the usual distance between two cameras that float32 must be able to tell apart."""
+PATHS = ("file_path", "mask_path", "depth_file_path")
 ORIENTATIONS = ("pca", "up", "vertical", "none")
 
 Frames = Sequence[Mapping[str, Any]]
@@ -63,9 +65,15 @@ def check_transforms(parser: NerfstudioDataParserConfig, data: Path, splits: Seq
         _check_first_image(parser.downscale_factor, path.parent, frames[0]["file_path"])
     names = [str(frame["file_path"]) for frame in frames]
     _check_places(poses[:, :3, 3], names, path, auto_scale=parser.auto_scale_poses)
-    outside = [n for n in names if not (path.parent / n).resolve().is_relative_to(path.parent.resolve())]
+    files = [str(frame[key]) for frame in frames for key in PATHS if key in frame]
+    outside = [n for n in files if not (path.parent / n).resolve().is_relative_to(path.parent.resolve())]
     if outside:
-        CONSOLE.print(f"{len(outside)} image(s) of {path} lie outside its folder, for example {cut(outside[0])}.")
+        _say_once(f"{len(outside)} file(s) of {path} lie outside its folder, for example {cut(outside[0])}.")
+
+
+@cache
+def _say_once(text: str) -> None:
+    CONSOLE.print(text)
 
 
 def in_one_place(centers: NDArray[np.float64], share: float = SAME_PLACE) -> bool:
@@ -94,7 +102,7 @@ def _check_paths(frame: Mapping[str, Any], index: int, path: Path) -> None:
         if key not in frame:
             name = cut(str(frame.get("file_path", f"number {index + 1}")))
             raise InputError(f"Frame {name} of {path} has no {key}: add it or remove the frame.")
-    for key in ("file_path", "mask_path", "depth_file_path"):
+    for key in PATHS:
         value = frame.get(key, "given")
         if not isinstance(value, str) or not value.strip() or "\0" in value:
             raise InputError(

@@ -138,10 +138,10 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
 
     def setup_train(self) -> None:
         """Loads the pixel pool instead of nerfstudio's image cache."""
-        CONSOLE.print("Setting up training dataset...")
         sizes = self.train_dataset.cameras.width * self.train_dataset.cameras.height
         self._reads_by_window = bool(sizes.sum() > self.config.resident_pixels)
         if not self._reads_by_window and self.test_mode == "val":
+            CONSOLE.print(f"Reading {len(self.train_dataset)} training images.")
             self.pool = self._read_pixels()
         # Samples nothing: ns-export sets its batches' size here.
         self.train_pixel_sampler = self._get_pixel_sampler(self.train_dataset, self.config.train_num_rays_per_batch)
@@ -182,6 +182,19 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
             if not len(self._allowed):
                 raise InputError("The masks leave no training pixel in one stretch of the capture: use longer windows.")
 
+    def found(self) -> str:
+        """What was found in the capture, in one line."""
+        cameras, seen = self.train_dataset.cameras, self.observations
+        sizes = sorted({(int(w), int(h)) for w, h in zip(cameras.width.view(-1), cameras.height.view(-1), strict=True)})
+        shapes = f"{sizes[0][0]} x {sizes[0][1]}" + (f" to {sizes[-1][0]} x {sizes[-1][1]}" if len(sizes) > 1 else "")
+        tests = 0 if self.eval_dataset is None else len(self.eval_dataset)
+        parts = [f"{len(cameras)} training and {tests} test images of {shapes}"]
+        if len(seen.points):
+            parts.append(f"{len(seen.points):,} points seen {len(seen.seen_by):,} times")
+        if self.known_depth is not None:
+            parts.append(f"the distance of {100 * self.known_depth.share:.0f} % of the training pixels is known")
+        return f"Capture: {'; '.join(parts)}."
+
     def _read_pixels(self, images: Sequence[int] | None = None) -> PixelPool:
         """The pixels of the training images, or of some; says so where a share of them must do."""
         sizes, most = self._sizes(images), int(self.config.resident_pixels)
@@ -215,7 +228,6 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
     def setup_eval(self) -> None:
         """nerfstudio's loaders, but for the one that holds every evaluation image in memory."""
         assert self.eval_dataset is not None
-        CONSOLE.print("Setting up evaluation dataset...")
         sizes = self.eval_dataset.cameras.width * self.eval_dataset.cameras.height
         # An image that cannot be used is named before training, not after it.
         reads = self.test_mode == "val" and sizes.sum() <= self.config.resident_pixels

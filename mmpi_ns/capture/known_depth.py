@@ -86,7 +86,6 @@ def know_depths(
     if files:
         unit = outputs.metadata.get("depth_unit_scale_factor", 1.0) * outputs.dataparser_scale
         known = with_sensor(known, [Path(f) for f in files], float(unit), original, posed)
-    CONSOLE.print(f"The distance of {100 * known.share:.0f} % of the training pixels is known.")
     return known
 
 

@@ -29,6 +29,35 @@ class CannotCompile(Exception):
     """Why there is no library."""
 
 
+def compiler() -> list[str]:
+    """The program that compiles, and its arguments.
+
+    Raises:
+        CannotCompile: there is none.
+    """
+    asked = shlex.split(os.environ.get("CXX", ""))  # a program and its arguments, ccache g++ for example
+    found = asked or [path for name in ("g++", "clang++") if (path := shutil.which(name))][:1]
+    if not found:
+        raise CannotCompile("no C++ compiler (g++ or clang++) is installed")
+    return found
+
+
+def library_file() -> Path:
+    """Where the library lies once it is compiled: a name for each source, compiler and processor.
+
+    Raises:
+        CannotCompile: there is no compiler, or there are no sources.
+    """
+    sources = sorted(OPS.glob("*/*.cpp"))
+    if not sources:
+        raise CannotCompile(f"{OPS} holds no C++ sources: install the package again")
+    texts = [p.read_bytes() for p in [*sources, *sorted(HEADERS.glob("*.h"))]]
+    parts = [*texts, " ".join([*compiler(), *FLAGS]).encode(), _processor()]
+    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mmpi_ns"
+    key = hashlib.sha256(b"\0".join(parts)).hexdigest()[:16]
+    return folder / f"kernels-{key}.so"
+
+
 @functools.cache
 def library() -> ctypes.CDLL:
     """All compiled functions, from the cache where they have been compiled before.
@@ -36,28 +65,18 @@ def library() -> ctypes.CDLL:
     Raises:
         CannotCompile: there is no compiler, or it fails.
     """
-    asked = shlex.split(os.environ.get("CXX", ""))  # a program and its arguments, ccache g++ for example
-    compiler = asked or [found for name in ("g++", "clang++") if (found := shutil.which(name))][:1]
-    if not compiler:
-        raise CannotCompile("no C++ compiler (g++ or clang++) is installed")
-    sources = sorted(OPS.glob("*/*.cpp"))
-    if not sources:
-        raise CannotCompile(f"{OPS} holds no C++ sources: install the package again")
-    texts = [p.read_bytes() for p in [*sources, *sorted(HEADERS.glob("*.h"))]]
-    key = hashlib.sha256(b"\0".join([*texts, " ".join([*compiler, *FLAGS]).encode(), _processor()])).hexdigest()[:16]
-    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mmpi_ns"
-    target = folder / f"kernels-{key}.so"
+    target, program = library_file(), compiler()
     try:
         if not target.is_file():
-            folder.mkdir(parents=True, exist_ok=True)
-            with tempfile.TemporaryDirectory(dir=folder) as scratch:
+            target.parent.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryDirectory(dir=target.parent) as scratch:
                 made = Path(scratch) / target.name
-                command = [*compiler, *FLAGS, "-o", str(made), *map(str, sources)]
+                command = [*program, *FLAGS, "-o", str(made), *map(str, sorted(OPS.glob("*/*.cpp")))]
                 subprocess.run(command, check=True, capture_output=True, text=True, timeout=600)
                 os.replace(made, target)
         built = ctypes.CDLL(str(target))
     except subprocess.CalledProcessError as error:
-        raise CannotCompile(f"{compiler[0]} failed: {(error.stderr or '').strip().splitlines()[:1]}") from error
+        raise CannotCompile(f"{program[0]} failed: {(error.stderr or '').strip().splitlines()[:1]}") from error
     except (OSError, subprocess.TimeoutExpired) as error:
         raise CannotCompile(str(error)) from error
     built.mmpi_index_rows.restype = ctypes.c_int64

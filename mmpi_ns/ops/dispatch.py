@@ -160,6 +160,8 @@ def fault(name: str) -> str | None:
 def _try(name: str) -> str | None:
     if name == "C++":
         try:
+            if not build.library_file().is_file():
+                CONSOLE.print("Compiling the inner loops for this processor: half a minute, once.")
             build.library()
         except build.CannotCompile as error:
             return _say(str(error))

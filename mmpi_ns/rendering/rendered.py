@@ -15,6 +15,9 @@ from mmpi_ns.ops.composite import Composite, median_inverse_distance
 from mmpi_ns.rendering.sampler import MergeReport
 from mmpi_ns.scene.plan import ScenePlan
 
+BACKGROUNDS = {"black": 0.0, "gray": 0.5, "white": 1.0}
+"""What can be shown behind everything."""
+
 
 @dataclass(frozen=True)
 class RenderedRays:

@@ -23,11 +23,11 @@ def render_windows(
     Args:
         bundle: rays.
         windows: those that are trained.
-        render: what one window, by its number, shows of some rays.
-        shown: the window that answers all rays; None: those that they start in.
+        render: what one window, by its place among them, shows of some rays.
+        shown: the window, by its place among them, that answers all rays; None: those that they start in.
     """
     shares = window_shares(bundle.origins, windows)
-    if shown is not None and shown < len(windows):
+    if shown is not None:
         shares = torch.zeros_like(shares).index_fill_(1, torch.tensor([shown], device=shares.device), 1.0)
     parts = {}
     for w in (shares > 0).any(0).nonzero()[:, 0].tolist():

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import shutil
+from collections.abc import Sequence
 from dataclasses import fields
+from pathlib import Path
 from typing import Any
 
 from nerfstudio.engine.trainer import TrainerConfig
@@ -56,6 +59,19 @@ NO_EFFECT = {
     "pipeline.model": ("enable_collider", "collider_params", "loss_coefficients", "prompt"),
 }
 """nerfstudio's options that this method has no use for."""
+
+
+def check_ffmpeg(command: Sequence[str]) -> None:
+    """Raises InputError where ns-render will ask for ffmpeg, which is not there; it would ask after loading.
+
+    Args:
+        command: the command that runs, and its arguments.
+    """
+    makes_films = Path(command[0]).stem == "ns-render" and "dataset" not in command
+    if makes_films and shutil.which("ffmpeg") is None:
+        raise InputError(
+            "ns-render needs ffmpeg, for images too, and it is not installed: install it (apt or conda install ffmpeg)."
+        )
 
 
 def check_run(config: TrainerConfig) -> None:

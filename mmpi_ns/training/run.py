@@ -61,6 +61,8 @@ class TrainingRun:
     ) -> None:
         self.progress, self.field, self.store = progress, field, store
         self.views, self.release_weight = views, release_weight
+        self.shared = False
+        """Whether other processes train some of the windows."""
         self._drawn_from: int | None = None
 
     def cameras_of(self, centers: NDArray[np.float64], window: int) -> NDArray[np.int64]:

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import hashlib
+import sys
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
+from time import monotonic
 from typing import Any, Literal
 
 import torch
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
-from nerfstudio.utils import comms
+from nerfstudio.utils import comms, writer
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from mmpi_ns.capture.datamanager import MMPIDataManager
+from mmpi_ns.rendering.rendered import BACKGROUNDS
 from mmpi_ns.scene.windows import WindowedPlan
 from mmpi_ns.training.checkpoints import (
     cameras_in_short,
@@ -26,10 +29,13 @@ from mmpi_ns.training.checkpoints import (
 )
 from mmpi_ns.training.learning_rates import following
 from mmpi_ns.training.memory import describe, training_bytes
-from mmpi_ns.training.options import check_run
+from mmpi_ns.training.options import check_ffmpeg, check_run
+from mmpi_ns.training.ranks import patient_group, wait_for_all
+from mmpi_ns.training.report import TrainingLog, duration, forecast, next_commands, quick_test
 from mmpi_ns.training.run import TrainingRun
 from mmpi_ns.training.run_folder import claim
 from mmpi_ns.training.stopping import end, end_before_training, signals_go_to
+from mmpi_ns.utils.console import keep_quiet, say
 from mmpi_ns.utils.errors import InputError, speak_plainly
 from mmpi_ns.utils.files import write_atomically
 
@@ -49,6 +55,7 @@ class MMPITrainerConfig(TrainerConfig):
     def set_timestamp(self) -> None:
         """The first of ours that ns-train runs."""
         speak_plainly()
+        keep_quiet()
         super().set_timestamp()
 
     def get_checkpoint_dir(self) -> Path:
@@ -57,6 +64,8 @@ class MMPITrainerConfig(TrainerConfig):
         They take every file in this folder for a checkpoint, and so they are told which is the last.
         """
         speak_plainly()
+        keep_quiet()
+        check_ffmpeg(sys.argv)
         folder = super().get_checkpoint_dir()
         steps = checkpoints_in(folder)
         if steps and self.load_dir in (None, folder) and self.load_step is None and self.load_checkpoint is None:
@@ -64,9 +73,20 @@ class MMPITrainerConfig(TrainerConfig):
             read_checkpoint(steps[self.load_step])
         return folder
 
+    def get_base_dir(self) -> Path:
+        """The folder of the run. The last of ours before ns-viewer opens its server.
+
+        ns-viewer takes addresses from its own options, whose default is every address of the machine.
+        """
+        options = [word.replace("_", "-") for word in sys.argv]
+        asked = any(word.startswith("--viewer.websocket-host") for word in options)
+        if Path(options[0]).stem == "ns-viewer" and not asked:
+            self.viewer.websocket_host = "127.0.0.1"
+        return super().get_base_dir()
+
     def print_to_terminal(self) -> None:
         """Says where all settings are; there are more of them than a terminal has lines."""
-        CONSOLE.print(f"All settings of this run: {self.get_base_dir() / 'config.yml'}", soft_wrap=True)
+        say(f"All settings of this run: {self.get_base_dir() / 'config.yml'}")
 
     def save_config(self) -> None:
         """Judges the options, takes the run's folder, and writes config.yml.
@@ -105,6 +125,8 @@ class MMPITrainer(Trainer):
     def _prepare(self, test_mode: Literal["test", "val", "inference"]) -> None:
         _check_device(self.config.machine.device_type)
         self._stopped_by: int | None = None
+        self._log: TrainingLog | None = None
+        self._began = monotonic()
         model_config: Any = self.config.pipeline.model
         model_config.seed = self.config.pipeline.datamanager.seed = self.config.machine.seed  # type: ignore[attr-defined]
         self._window_steps = model_config.total_steps = self.config.max_num_iterations
@@ -112,19 +134,30 @@ class MMPITrainer(Trainer):
         # Processes share the windows out among them; nerfstudio would have all of them average their gradients.
         self._processes, self._process, self.world_size = self.world_size, comms.get_rank(), 1
         self._resumes_from = self.config.load_dir
+        self._everyone = patient_group() if self._processes > 1 else None
         if self._processes > 1:
             self.config.load_dir = None
+        self._says_lines, self.config.logging.local_writer.enable = self.config.logging.local_writer.enable, False
         super().setup(test_mode)
         self.config.max_num_iterations = self._window_steps
         plan = self._run.progress.windows
         self.base_dir.mkdir(parents=True, exist_ok=True)
         _write_plan(self.base_dir / PLAN_FILE, plan)
-        CONSOLE.print(describe(plan, self._window_steps, *self._expected_memory()))
+        self._run.shared = self._processes > 1
+        self._say_what_comes(plan)
         if 1 < self._processes and len(plan) < self._processes:
             raise InputError(
                 f"The capture has {len(plan)} window(s), too few to share out among {self._processes} processes: start "
                 "fewer, or make windows shorter with --pipeline.model.placement.window-length."
             )
+
+    def _say_what_comes(self, plan: WindowedPlan) -> None:
+        """What was found in the capture, what is trained, and what it takes: together, before the first step."""
+        manager, steps = self._manager, self._total_steps
+        say(manager.found())
+        say(describe(plan, self._window_steps, *self._expected_memory()))
+        if not str(self.device).startswith("cuda"):
+            say(forecast(self.config.method_name or "", steps, manager.get_train_rays_per_batch()))
 
     @property
     def _manager(self) -> MMPIDataManager:
@@ -162,6 +195,7 @@ class MMPITrainer(Trainer):
             own = range(self._process, len(self._run.progress.windows), self._processes)
             for window in [w for w in own if not self._is_finished(w)]:
                 self._train_window(window)
+            wait_for_all(self._everyone)
             return
         self._last_step = self._start_step - 1
         self.config.max_num_iterations = max(0, self._total_steps - self._start_step)
@@ -170,6 +204,8 @@ class MMPITrainer(Trainer):
                 f"The checkpoint already holds {self._start_step} of {self._total_steps} steps: nothing to do."
             )
             return
+        self._began = monotonic()
+        self._log = self._new_log(self._total_steps)
         try:
             with signals_go_to(self._stop):
                 super().train()
@@ -185,6 +221,11 @@ class MMPITrainer(Trainer):
                 f"Stopped after step {self._last_step + 1} of {self._total_steps}, which is in {path}: the same "
                 f"command with --load-dir {self.checkpoint_dir} goes on from there.",
             )
+
+    def _new_log(self, end: int) -> TrainingLog | None:
+        """Of the steps up to ``end``; None where none is wanted."""
+        rays = self._manager.get_train_rays_per_batch()
+        return TrainingLog(self._run.progress.schedule, rays, self._start_step, end) if self._says_lines else None
 
     def _stop(self, number: int) -> None:
         """Has nerfstudio's loop end after the step at hand, also where training is paused."""
@@ -220,6 +261,7 @@ class MMPITrainer(Trainer):
             self.config.load_checkpoint = None
         self._last_step = self._start_step - 1
         self.config.max_num_iterations = first + self._window_steps - self._start_step
+        self._log = self._new_log(first + self._window_steps)
         try:
             super().train()
         finally:
@@ -232,6 +274,8 @@ class MMPITrainer(Trainer):
         """One step; remembers that it ran, and puts a window of several away when it was its last."""
         loss, *others = super().train_iteration(step)
         self._last_step = step
+        if self._log is not None:
+            self._log.note(step, others[0]["rgb_loss"])
         if self._stopped_by is not None:  # nerfstudio forgets what was said before its loop
             self.stop_training = True
         run, progress = self._run, self._run.progress
@@ -242,10 +286,20 @@ class MMPITrainer(Trainer):
     def _after_train(self) -> None:
         """Saves the last step that ran; 1.1.5 would save the next one's number when training is stopped."""
         self.step = self._last_step
-        if self._stopped_by is None:
-            return super()._after_train()
         self.training_state = "completed"
         self.save_checkpoint(self.step)
+        writer.write_out_storage()
+        if self._stopped_by is not None or self._processes > 1:
+            return
+        seconds = monotonic() - self._began
+        say(f"Training finished: {self._last_step + 1 - self._start_step:,} steps in {duration(seconds)}.")
+        model: Any = self.pipeline.model
+        images = self._manager.eval_dataset
+        if self._says_lines and images is not None:
+            say(quick_test(model, images, BACKGROUNDS[model.config.background]))
+        say(next_commands(self.base_dir))
+        if not self.config.viewer.quit_on_train_completion:
+            self._train_complete_viewer()
 
     def save_checkpoint(self, step: int) -> None:
         """Writes beside the checkpoint folder, then moves the finished file in: a kill or a full disk loses nothing.

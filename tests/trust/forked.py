@@ -100,9 +100,9 @@ class Running:
         )  # fmt: skip
 
 
-def start(name, *arguments, options=None, memory=None):
+def start(name, *arguments, options=None, memory=None, environment=None):
     """Starts a command with arguments, or ns-train with options {dotted name: value} of mmpi-small, unparsed."""
-    return Running(name, options, [str(a) for a in arguments], memory)
+    return Running(name, options, [str(a) for a in arguments], memory, environment)
 
 
 def run(name, *arguments, options=None, memory=None):

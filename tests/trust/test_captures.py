@@ -212,7 +212,7 @@ RUNS = {
 @pytest.mark.parametrize("case", RUNS)
 def test_a_capture_that_is_odd_and_usable_trains(data, edit, tmp_path, case):
     edit(RUNS[case])
-    assert "Training Finished" in train(data, tmp_path).shown
+    assert "Training finished" in train(data, tmp_path).shown
 
 
 def test_images_outside_the_folder_are_allowed_and_said_once(data, edit, tmp_path):
@@ -262,7 +262,7 @@ def sixteen_bits(data):
 @pytest.mark.parametrize("odd", [one_rgba, one_gray, one_palette, one_cmyk, sixteen_bits])
 def test_images_of_other_kinds_among_rgb_train(data, tmp_path, odd):
     odd(data)
-    assert "Training Finished" in train(data, tmp_path).shown
+    assert "Training finished" in train(data, tmp_path).shown
 
 
 def test_16_bit_pixels_become_the_nearest_of_8_bits(data):
@@ -379,7 +379,7 @@ MODELS = {
 
 def test_a_whole_binary_model_trains(data, model, tmp_path):
     said = train(data, tmp_path).shown
-    assert "Training Finished" in said and "No SfM tracks" not in said
+    assert "Training finished" in said and "No SfM tracks" not in said
 
 
 @pytest.mark.parametrize("case", MODELS)

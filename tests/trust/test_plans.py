@@ -105,7 +105,7 @@ def test_a_plan_that_is_not_there_is_named(whole_scene, tmp_path):
 def test_a_plan_that_is_usable_trains(whole_scene, plan_text, tmp_path):
     path = tmp_path / "plan.json"
     path.write_text(plan_text)
-    assert "Training Finished" in train(whole_scene, tmp_path, pipeline__model__plan_file=path).shown
+    assert "Training finished" in train(whole_scene, tmp_path, pipeline__model__plan_file=path).shown
 
 
 @pytest.mark.parametrize("side", [2000, 16384])

@@ -6,12 +6,13 @@ import json
 import os
 import shutil
 import signal
+from pathlib import Path
 
 import pytest
 import torch
 import yaml
-from forked import run, start_train, train
-from tiny_scene import write_scene
+from forked import run, start, start_train, train
+from tiny_scene import TEST, name_of, write_scene
 
 LONG = {"max_num_iterations": 100_000, "steps_per_save": 100_000}
 
@@ -48,7 +49,7 @@ def evaluate(folder, tmp_path):
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_run_that_is_stopped_saves_and_says_how_to_go_on(whole_scene, tmp_path, number, status):
     running = start_train(whole_scene, tmp_path, **LONG)
-    running.wait_for("(0.0")
+    running.wait_for("batch PSNR")
     running.send(number)
     ended = running.end()
     assert ended.status == status and "Traceback" not in ended.out + ended.error
@@ -61,7 +62,7 @@ def test_a_run_that_is_stopped_saves_and_says_how_to_go_on(whole_scene, tmp_path
 
 def test_a_run_that_is_stopped_before_it_trains_says_so(whole_scene, tmp_path):
     running = start_train(whole_scene, tmp_path, **LONG)
-    running.wait_for("Setting up training dataset")
+    running.wait_for("Reading")
     running.send(signal.SIGINT)
     ended = running.end()
     assert ended.status == 130 and "Traceback" not in ended.out + ended.error
@@ -70,7 +71,7 @@ def test_a_run_that_is_stopped_before_it_trains_says_so(whole_scene, tmp_path):
 
 def test_a_stopped_run_goes_on_in_its_folder(whole_scene, tmp_path):
     running = start_train(whole_scene, tmp_path, **LONG)
-    running.wait_for("(0.0")
+    running.wait_for("batch PSNR")
     running.send(signal.SIGINT)
     assert running.end().status == 130
     models = folder_of(tmp_path) / "nerfstudio_models"
@@ -78,7 +79,7 @@ def test_a_stopped_run_goes_on_in_its_folder(whole_scene, tmp_path):
     step = torch.load(checkpoint, weights_only=True)["step"]
     again = start_train(whole_scene, tmp_path, **LONG, load_dir=models)
     again.wait_for("Done loading")
-    again.wait_for("(0.0")
+    again.wait_for("batch PSNR")
     again.send(signal.SIGINT)
     assert again.end().status == 130
     (checkpoint,) = models.iterdir()
@@ -90,7 +91,7 @@ def test_a_stopped_run_goes_on_in_its_folder(whole_scene, tmp_path):
 
 def test_a_second_run_into_the_same_folder_is_refused(whole_scene, tmp_path):
     first = start_train(whole_scene, tmp_path, **LONG)
-    first.wait_for("Saving config to")
+    first.wait_for("Capture:")
     said = train(whole_scene, tmp_path, **LONG).sentence
     first.send(signal.SIGKILL)
     first.process.join()
@@ -183,6 +184,24 @@ def test_a_damaged_checkpoint_is_named_when_evaluating(finished, tmp_path, case)
     assert str(path) in evaluate(finished, tmp_path).sentence
 
 
+class Runs:
+    """Pickled, it makes a file when it is read."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return Path.touch, (self.path,)
+
+
+def test_a_checkpoint_cannot_run_code(whole_scene, finished, tmp_path):
+    path = finished / "nerfstudio_models" / "step-000000005.ckpt"
+    torch.save(torch.load(path, weights_only=True) | {"scalers": Runs(tmp_path / "ran")}, path)
+    assert str(path) in evaluate(finished, tmp_path).sentence
+    assert str(path) in train(whole_scene, tmp_path / "new", load_dir=path.parent).sentence
+    assert not (tmp_path / "ran").exists()
+
+
 def test_no_checkpoint_is_said(whole_scene, finished, tmp_path):
     (finished / "nerfstudio_models" / "step-000000005.ckpt").unlink()
     assert "There is no checkpoint in" in evaluate(finished, tmp_path).sentence
@@ -240,6 +259,34 @@ def test_evaluation_takes_the_plan_from_the_checkpoint_and_places_nothing(finish
     ended = evaluate(finished, tmp_path)
     assert ended.status == 0 and "Triangulated" not in ended.out and "SfM" not in ended.out
     assert json.loads((tmp_path / "eval.json").read_text())["results"]["psnr"] > 5
+
+
+def test_evaluation_says_psnr_and_ssim_with_the_worst_and_the_best_image(finished, tmp_path):
+    said = evaluate(finished, tmp_path).shown
+    results = json.loads((tmp_path / "eval.json").read_text())["results"]
+    assert f"2 images: PSNR {results['psnr']:.2f} dB (worst" in said and f"SSIM {results['ssim']:.3f} (" in said
+    assert all(name_of(i) in said for i in TEST)
+
+
+def test_ns_render_without_ffmpeg_says_so_before_loading(finished, tmp_path):
+    config = ("--load-config", finished / "config.yml", "--output-path", tmp_path / "film.mp4")
+    ended = start("ns-render", "interpolate", *config, environment={"PATH": str(tmp_path)}).end()
+    assert "needs ffmpeg" in ended.sentence and "loading" not in ended.out
+
+
+def test_a_run_ends_with_a_quick_test_and_commands_that_can_be_copied(whole_scene, tmp_path):
+    ended = train(whole_scene, tmp_path, max_num_iterations=12)
+    lines = ended.out.splitlines()
+    config = folder_of(tmp_path) / "config.yml"
+    first = next(i for i, line in enumerate(lines) if line.startswith("Capture: 6 training and 2 test images of 32 x"))
+    assert lines[first + 1].startswith("Scene plan") and any(x.startswith("Memory") for x in lines[first:])
+    assert any(x.startswith("step 12 of 12 | joint | ") and "rays/s | batch PSNR" in x for x in lines), lines
+    end = next(i for i, line in enumerate(lines) if line.startswith("Training finished: 12 steps in"))
+    assert lines[end + 1].startswith("Quick test on 2 of 2 test images: PSNR ") and "SSIM" in lines[end + 1]
+    assert lines[end + 2] == f"The run lies in {config.parent}. Next:"
+    names = [line.split()[0] for line in lines[end + 3 :]]
+    assert names == ["ns-eval", "ns-render", "ns-viewer"] and all(f" {config}" in x for x in lines[end + 3 :])
+    assert not any("Saving" in x or "overriding" in x or "Mixed precision" in x for x in lines)
 
 
 def test_evaluation_of_a_capture_that_has_gone_is_one_sentence(whole_scene, tmp_path):

@@ -17,9 +17,10 @@ from mmpi_ns.bench.report import Bench, Report, Row, figure, fingerprint, page, 
 from mmpi_ns.bench.stability.exact import Array
 from mmpi_ns.bench.stability.exact_ray import ExactField, ExactRay
 from mmpi_ns.bench.trainings import evenly
-from mmpi_ns.model import BACKGROUNDS, MMPIModel
+from mmpi_ns.model import MMPIModel
 from mmpi_ns.ops import dispatch
 from mmpi_ns.rendering.metrics import ImageMetrics
+from mmpi_ns.rendering.rendered import BACKGROUNDS
 
 NOISE = 1.05
 """A setting must be so much faster than another to count as faster."""

@@ -1,0 +1,122 @@
+"""What a training run says: a line now and then, and at its end how good it is and what to do next."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from time import monotonic
+
+import numpy as np
+import torch
+from nerfstudio.data.datasets.base_dataset import InputDataset
+from nerfstudio.models.base_model import Model
+from torch import Tensor
+
+from mmpi_ns.rendering.metrics import ImageMetrics
+from mmpi_ns.training.losses import over_background
+from mmpi_ns.training.phases import Schedule
+from mmpi_ns.utils.console import say
+
+FIRST_LINE, SHARE = 10, 0.025
+"""A line after so many steps, then after such a share of all of them."""
+LEAST_SECONDS, MOST_SECONDS = 2.0, 30.0
+"""Between two lines."""
+VIEWS, LOOK_SECONDS = 4, 20.0
+"""The quick test: test images at most, and seconds after which no other is begun."""
+CPU_RAYS = 6000.0
+"""Rays a second that one core trains with the settings of mmpi-small (docs/results/train.md)."""
+LONG = 1800.0
+"""Seconds from which on a smaller method is named."""
+
+
+class TrainingLog:
+    """Says how far a run is, from one step to the next.
+
+    Args:
+        schedule: of the run.
+        rays: of a step.
+        first: step that runs first.
+        end: step after the last one.
+    """
+
+    def __init__(self, schedule: Schedule, rays: int, first: int, end: int) -> None:
+        self.schedule, self.rays, self.first, self.end = schedule, rays, first, end
+        self._said_at, self._said = monotonic(), first
+        self._phase = ""
+
+    def note(self, step: int, rgb_loss: Tensor) -> None:
+        """After each step, with its squared colour error; prints where a line is due."""
+        done, now = step + 1, monotonic()
+        if done - self.first == 1:  # the first step compiles, and tells nothing of the others
+            self._said_at, self._said = now, done
+        window, phase = self.schedule.window_at(step), self.schedule.phase_at(step).name
+        where = phase if self.schedule.windows == 1 else f"window {window + 1} of {self.schedule.windows}, {phase}"
+        since, seconds = done - self._said, now - self._said_at
+        due = (since >= SHARE * (self.end - self.first) and seconds >= LEAST_SECONDS) or seconds > MOST_SECONDS
+        begins = done - self.first == FIRST_LINE or (where != self._phase and self._phase != "")
+        if since == 0 or done - self.first < FIRST_LINE or not (due or begins or done == self.end):
+            return
+        each = seconds / since
+        psnr = -10 * math.log10(max(float(rgb_loss.detach()), 1e-12))
+        say(
+            f"step {done:,} of {self.end:,} | {where} | {self.rays / max(each, 1e-9):,.0f} rays/s | batch PSNR "
+            f"{psnr:.1f} dB | {duration(each * (self.end - done))} left"
+        )
+        self._said_at, self._said, self._phase = now, done, where
+
+
+def duration(seconds: float) -> str:
+    """Seconds in words: 45 s, 12 min, 3.5 h."""
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
+
+
+def forecast(method: str, steps: int, rays: int) -> str:
+    """How long training takes on this machine's CPU, and the smaller method where that is long."""
+    seconds = steps * rays / (CPU_RAYS * torch.get_num_threads())
+    smaller = "; mmpi-small is made for a CPU" if seconds > LONG and method != "mmpi-small" else ""
+    return (
+        f"Without a GPU {steps:,} steps of {rays:,} rays take about {duration(seconds)}, or more with large plans"
+        f"{smaller}."
+    )
+
+
+@torch.no_grad()
+def quick_test(model: Model, images: InputDataset, background: float) -> str:
+    """PSNR and SSIM of a few test images, in a sentence.
+
+    Args:
+        model: as it is trained; it is left in training mode.
+        images: the test images.
+        background: behind those with transparency.
+    """
+    model.eval()
+    metrics, found, began = ImageMetrics("none"), [], monotonic()
+    count = min(VIEWS, len(images))
+    for i in np.linspace(0, len(images) - 1, count).round().astype(int).tolist():
+        predicted = model.get_outputs_for_camera(images.cameras[i : i + 1].to(model.device))["rgb"]
+        image = images.get_data(i, image_type="float32")["image"].to(predicted)
+        found.append(metrics(predicted, over_background(image, torch.full_like(image[..., :3], background))))
+        if monotonic() - began > LOOK_SECONDS:
+            break
+    model.train()
+    psnr = [values["psnr"] for values in found]
+    ssim = [values["ssim"] for values in found if "ssim" in values]
+    parts = [f"PSNR {np.mean(psnr):.2f} dB ({min(psnr):.1f} to {max(psnr):.1f})"]
+    if ssim:
+        parts.append(f"SSIM {np.mean(ssim):.3f}")
+    return f"Quick test on {len(found)} of {len(images)} test images: {', '.join(parts)}."
+
+
+def next_commands(folder: Path) -> str:
+    """Where a run lies, and what one does with it."""
+    config = folder / "config.yml"
+    return "\n".join(
+        [
+            f"The run lies in {folder}. Next:",
+            f"  ns-eval --load-config {config} --output-path {folder / 'eval.json'}",
+            f"  ns-render interpolate --load-config {config} --output-path {folder / 'fly.mp4'}",
+            f"  ns-viewer --load-config {config}",
+        ]
+    )

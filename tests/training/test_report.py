@@ -1,0 +1,61 @@
+"""What a training run says of itself (training/report.py)."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from mmpi_ns.rendering.pipeline import summary
+from mmpi_ns.training import report
+from mmpi_ns.training.phases import make_schedule
+
+
+def lines_of(monkeypatch, capsys, steps, seconds_a_step, **how):
+    """What is said of a run whose steps take so long, the first of them a minute longer."""
+    now = [0.0]
+    monkeypatch.setattr(report, "monotonic", lambda: now[0])
+    settings = {"blend_share": 0.25, "finetune_share": 0.25, "growth_shares": (), "decay_decades": 1.0}
+    schedule = make_schedule("two-phase", steps, **settings, finetune_rate=1.0, windows=1, release_shares=())
+    log = report.TrainingLog(schedule, 1000, 0, steps)
+    for step in range(steps):
+        now[0] += seconds_a_step + (60 if step == 0 else 0)
+        log.note(step, torch.tensor(0.01, requires_grad=True))
+    return capsys.readouterr().out.splitlines()
+
+
+def test_a_line_says_phase_speed_psnr_and_time_left(monkeypatch, capsys):
+    lines = lines_of(monkeypatch, capsys, 400, 0.5)
+    assert lines[0] == "step 10 of 400 | individual | 2,000 rays/s | batch PSNR 20.0 dB | 3 min left"
+    assert lines[-1] == "step 400 of 400 | finetune | 2,000 rays/s | batch PSNR 20.0 dB | 0 s left"
+    assert 40 <= len(lines) <= 44
+    assert any(line.startswith("step 201 of 400 | blend") for line in lines), "a phase begins"
+
+
+def test_lines_are_neither_dense_nor_half_a_minute_apart(monkeypatch, capsys):
+    assert len(lines_of(monkeypatch, capsys, 400, 0.01)) <= 5
+    slow = lines_of(monkeypatch, capsys, 40, 40.0)
+    assert len(slow) == 31  # every step from the tenth on
+
+
+def test_durations_are_in_words():
+    assert [report.duration(s) for s in (3.2, 89, 641, 12600)] == ["3 s", "89 s", "11 min", "3.5 h"]
+
+
+def test_a_long_run_without_a_gpu_names_the_smaller_method():
+    threads = torch.get_num_threads()
+    assert f"{20000 * 4096 / 6000 / threads / 3600:.1f} h" in report.forecast("mmpi", 20000, 4096)
+    assert "mmpi-small" in report.forecast("mmpi", 20000, 4096)
+    assert "mmpi-small" not in report.forecast("mmpi-small", 20000, 4096)
+
+
+def test_evaluation_is_summed_up_in_a_line():
+    found = [("a.png", {"psnr": 20.0, "ssim": 0.5}), ("b.png", {"psnr": 24.0, "ssim": 0.7}), ("c.png", {"psnr": 25.0})]
+    assert summary(found) == (
+        "3 images: PSNR 23.00 dB (worst 20.00, a.png; best 25.00, c.png), SSIM 0.600 (0.500 to 0.700)"
+    )
+    assert summary([("a.png", {"psnr": 20.0})]) == "1 images: PSNR 20.00 dB (worst 20.00, a.png; best 20.00, a.png)"
+
+
+@pytest.mark.parametrize("steps", [12, 400])
+def test_the_last_step_has_a_line(monkeypatch, capsys, steps):
+    assert lines_of(monkeypatch, capsys, steps, 0.001)[-1].startswith(f"step {steps} of {steps} |")
