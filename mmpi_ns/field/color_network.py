@@ -8,14 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-
-def positional_encoding(x: Float[Tensor, "N 3"], frequencies: int) -> Float[Tensor, "N E"]:
-    """(x, sin 2^i pi x, cos 2^i pi x) for i < frequencies (NeRF eq. 4)."""
-    if frequencies == 0:
-        return x
-    octaves = math.pi * 2.0 ** torch.arange(frequencies, device=x.device, dtype=x.dtype)
-    angles = (x[:, None, :] * octaves[:, None]).reshape(x.shape[0], -1)
-    return torch.cat([x, angles.sin(), angles.cos()], -1)
+from mmpi_ns.ops.shade.reference import SampleNetworks, positional_encoding, run_layers, sample_colors
 
 
 class Networks(nn.Module):
@@ -57,10 +50,7 @@ class Networks(nn.Module):
 
     def run(self, head: int, inputs: Float[Tensor, "N I"]) -> Float[Tensor, "N 3"]:
         """What one head's network makes of its inputs."""
-        w1, b1, w2, b2, w3, b3 = self.layers(head)
-        hidden = nn.functional.relu(nn.functional.linear(inputs, w1, b1))
-        hidden = nn.functional.relu(nn.functional.linear(hidden, w2, b2))
-        return nn.functional.linear(hidden, w3, b3)
+        return run_layers(self.layers(head), inputs)
 
 
 class ColorNetworks(Networks):
@@ -91,10 +81,12 @@ class ColorNetworks(Networks):
             directions: of each ray, in the head's axes; encoded once a ray.
             rays: ray of each sample; None where samples and rays are one.
         """
-        encoded = positional_encoding(directions, self.direction_frequencies)
-        inputs = [
-            features,
-            positional_encoding(ndc, self.position_frequencies),
-            encoded if rays is None else encoded.index_select(0, rays),
-        ]
-        return torch.sigmoid(features[:, :3] + self.run(head, torch.cat(inputs, -1)))
+        position = positional_encoding(ndc, self.position_frequencies)
+        direction = positional_encoding(directions, self.direction_frequencies)
+        direction = direction if rays is None else direction.index_select(0, rays)
+        return sample_colors(self.layers(head), features, position, direction)
+
+    def of_heads(self, count: int) -> SampleNetworks:
+        """The networks of so many heads, for ``ops.shade``."""
+        layers = tuple(tuple(x.detach() for x in self.layers(k)) for k in range(count))
+        return SampleNetworks(layers, self.position_frequencies, self.direction_frequencies)

@@ -20,9 +20,7 @@ from mmpi_ns.field.color_network import ColorNetworks
 from mmpi_ns.field.samples import Gathered, Lookup, Taps, by_head, head_spans, metadata_of
 from mmpi_ns.field.shading import RayColors, RayShader, Shading
 from mmpi_ns.field.tables import TexelTables, replace_data
-from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.blending import log_shares
-from mmpi_ns.ops.colors import colors
 from mmpi_ns.ops.composite import Composite, render_colors
 from mmpi_ns.ops.gather import KnownTaps, gather_places, gather_taps
 from mmpi_ns.ops.interpolate import gather_rows, index_rows, interpolate, interpolate_gathered, texel_rows
@@ -87,7 +85,8 @@ class MMPIField(TexelTables):
         self.samples_per_voxel = samples_per_voxel
         self.cube_alpha = cube_alpha
         self.learns_cover = True
-        """Whether training rays mark the texels they train; off once blending has begun, so that P cannot jump."""
+        """Whether training rays mark the texels they train. Only blending asks for it; once it has begun no more are
+        marked, so that P cannot jump."""
         self.shading = shading
         self.shared_colour = shared_colour
         if shading == "ray":
@@ -161,12 +160,11 @@ class MMPIField(TexelTables):
             head_counts: how many are of each head, where it is known (``MergeReport``).
         """
         lookup = self._lookup(ray_samples, head_counts)
-        raw = []
-        for taps in lookup.groups:
-            if self.training and self.learns_cover:
-                self.touched.index_fill_(0, lookup.gathered.rows if lookup.gathered else taps.rows.reshape(-1), 1)
-                self.touched[:BRICK].zero_()
-            raw.append(_read(self.density, lookup.gathered and lookup.gathered.density, taps)[:, 0])
+        if self.training and self.learns_cover and lookup.gathered is not None:
+            self.touched.index_fill_(0, lookup.gathered.rows, 1)
+            self.touched[:BRICK].zero_()
+        known = lookup.gathered and lookup.gathered.density
+        raw = [_read(self.density, known, taps)[:, 0] for taps in lookup.groups]
         out = lookup.ndc.new_zeros(lookup.shape.numel())
         if raw:
             flat = torch.cat(raw)
@@ -205,13 +203,14 @@ class MMPIField(TexelTables):
         self, ray_samples: RaySamples, density_embedding: Lookup | None = None
     ) -> dict[FieldHeadNames, Tensor]:
         """Colours of the valid samples (diffuse ones where a ray is shaded once); empty slots are black."""
-        sampled = self.shading == "sample"
-        if sampled and not torch.is_grad_enabled() and density_embedding is None:
-            if dispatch.form_of("shade", self.features, ray_samples.frustums.directions) == "cpu":
-                return {FieldHeadNames.RGB: self._shade(ray_samples)}
+        if isinstance(self.networks, ColorNetworks) and density_embedding is None and not torch.is_grad_enabled():
+            return {FieldHeadNames.RGB: self._shade(self.networks, ray_samples)}
         lookup = density_embedding or self._lookup(ray_samples)
         features = self._features(lookup)
-        found = self._sample_colors(features, lookup, ray_samples) if sampled else features[:, :3].sigmoid()
+        if isinstance(self.networks, ColorNetworks):
+            found = self._sample_colors(self.networks, features, lookup, ray_samples)
+        else:
+            found = features[:, :3].sigmoid()
         out = lookup.ndc.new_zeros(lookup.shape.numel(), 3).index_copy(0, lookup.index, found)
         return {FieldHeadNames.RGB: out.view(*lookup.shape, 3)}
 
@@ -220,14 +219,15 @@ class MMPIField(TexelTables):
         parts = [_read(self.features, known, taps) for taps in lookup.groups]
         return torch.cat(parts) if parts else lookup.ndc.new_zeros(0, self.feature_channels)
 
-    def _sample_colors(self, features: Tensor, lookup: Lookup, ray_samples: RaySamples) -> Float[Tensor, "N 3"]:
+    def _sample_colors(
+        self, networks: ColorNetworks, features: Tensor, lookup: Lookup, ray_samples: RaySamples
+    ) -> Float[Tensor, "N 3"]:
         """What the networks make of every sample."""
-        assert isinstance(self.networks, ColorNetworks)
         directions, rays = ray_samples.frustums.directions[:, 0], lookup.rays
         # Split, not sliced: the gradient of a slice is as large as the whole.
         each = features.split([own.stop - own.start for _, own in lookup.spans])
         found = [
-            colors(self.networks, k, part, lookup.ndc[own], geometry.rotate(self._axes(k), directions), rays[own])
+            networks(k, part, lookup.ndc[own], geometry.rotate(self._axes(k), directions), rays[own])
             for part, (k, own) in zip(each, lookup.spans, strict=True)
         ]
         return torch.cat(found) if found else lookup.ndc.new_zeros(0, 3)
@@ -263,13 +263,13 @@ class MMPIField(TexelTables):
             sums = gather_taps(values, groups, lookup.index, composite.weights, wanted.to(values.device))
         return self.networks(sums, composite, ray_samples.frustums.directions[:, 0])
 
-    def _shade(self, ray_samples: RaySamples) -> Float[Tensor, "R S 3"]:
-        assert isinstance(self.networks, ColorNetworks)
-        meta, rays = metadata_of(ray_samples), ray_samples.frustums.directions[:, 0]
-        axes = torch.stack([self._axes(k) for k in range(len(self.grids))])
+    def _shade(self, networks: ColorNetworks, ray_samples: RaySamples) -> Float[Tensor, "R S 3"]:
+        """What the networks make of every sample, without gradients."""
+        meta, count = metadata_of(ray_samples), len(self.grids)
+        axes, directions = torch.stack([self._axes(k) for k in range(count)]), ray_samples.frustums.directions[:, 0]
         heads, planes, valid = (meta[name][..., 0] for name in ("heads", "planes", "valid"))
         samples = (heads, planes, meta["ndc"], valid)
-        return shade(self.layout, self.tables(), self.features.data, self.networks, axes, rays, *samples)
+        return shade(self.layout, self.features.data, networks.of_heads(count), axes, directions, *samples)
 
     def total_variation(self, lookup: Lookup, density_weight: float, feature_weight: float) -> Tensor:
         """Weighted total variation of the texels that the batch touched, in DVGO's normalisation (not yet per ray)."""

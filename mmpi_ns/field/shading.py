@@ -13,9 +13,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from mmpi_ns.field.color_network import Networks, positional_encoding
+from mmpi_ns.field.color_network import Networks
 from mmpi_ns.ops.composite import Composite
 from mmpi_ns.ops.gather import COLORS, RaySums
+from mmpi_ns.ops.shade.reference import positional_encoding
 
 Shading = Literal["ray", "sample"]
 """Whether a network is asked once a ray or for every sample."""

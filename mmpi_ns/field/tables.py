@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from mmpi_ns.field.samples import Lookup
 from mmpi_ns.ops import dispatch
+from mmpi_ns.ops.interpolate import raise_peaks
 from mmpi_ns.scene.bricks import grown_tiles, keep_bricks, new_table, resample, take_bricks
 from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.scene.texels import BRICK, TexelGrid, head_grids, number_tiles
@@ -135,8 +136,7 @@ class TexelTables(Field):
         """Notes which bricks the samples of a training batch read and what those weighed, and how many there were."""
         weight = weights.reshape(-1)[lookup.index]
         for taps in lookup.groups:
-            bricks = (taps.rows >> 6).reshape(-1)
-            self.peak.scatter_reduce_(0, bricks, weight[taps.samples].repeat_interleave(taps.rows.shape[1]), "amax")
+            raise_peaks(self.peak, taps.rows, weight[taps.samples])
         self.crossings += live.sum()
 
     @torch.no_grad()

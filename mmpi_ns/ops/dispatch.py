@@ -26,12 +26,13 @@ Form = Literal["reference", "cpu", "gpu"]
 
 TABLE: dict[str, tuple[str, tuple[Form, ...]]] = {
     # operation: its folder, and which compiled forms there are beside the reference
-    "plane_hits": ("hits", ("gpu",)),
+    "plane_hits": ("hits", ("cpu", "gpu")),
     "march": ("march", ("cpu", "gpu")),
     "texel_rows": ("interpolate", ("cpu", "gpu")),
     "weighted_rows": ("interpolate", ("gpu",)),
     "take_rows": ("interpolate", ("cpu",)),
     "index_rows": ("interpolate", ("cpu", "gpu")),
+    "raise_peaks": ("interpolate", ("cpu",)),
     "sum_rows": ("interpolate", ("cpu", "gpu")),
     "composite_weights": ("composite", ("cpu", "gpu")),
     "gather_colors": ("composite", ("cpu",)),
@@ -42,7 +43,6 @@ TABLE: dict[str, tuple[str, tuple[Form, ...]]] = {
     "gather_taps": ("gather", ("cpu", "gpu")),
     "gather_places": ("gather", ("cpu",)),
     "show_rays": ("show", ("gpu",)),
-    "colors": ("colors", ("cpu",)),
     "shade": ("shade", ("cpu",)),
     "march_baked": ("baked", ("cpu",)),
     "shade_baked": ("baked", ("cpu",)),
@@ -52,6 +52,7 @@ TABLE: dict[str, tuple[str, tuple[Form, ...]]] = {
 OLDEST_TRITON = (3, 1)
 """The kernels compile with this and newer ones; torch brings it since 2.5."""
 
+_PRECISIONS = (torch.float32, torch.bfloat16)
 _chosen: Route = "auto"
 _interpreting = False
 _faults: dict[str, str | None] = {}
@@ -83,10 +84,10 @@ def _tensors(given: Iterable[Any]) -> Iterator[Tensor]:
 
 
 def form_of(name: str, *tensors: Tensor) -> Form:
-    """The form that these tensors get: a compiled one takes float32 (and integers) of one device."""
+    """The form that these tensors get: a compiled one takes float32, integers and Adam's bfloat16 of one device."""
     compiled = TABLE[name][1]
     devices = {t.device.type for t in tensors}
-    if _chosen == "torch" or any(t.is_floating_point() and t.dtype != torch.float32 for t in tensors):
+    if _chosen == "torch" or any(t.is_floating_point() and t.dtype not in _PRECISIONS for t in tensors):
         return "reference"
     if devices == {"cpu"} and not _interpreting:
         return "cpu" if "cpu" in compiled and fault("C++") is None else "reference"

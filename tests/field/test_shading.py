@@ -7,8 +7,10 @@ import math
 import numpy as np
 import pytest
 import torch
+from hand_made import make_mpi
 from random_fields import CLEAR, ERROR, OracleRay, bundle, fill, random_plan, random_rays
 
+from mmpi_ns.field.baking import baked_shares
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.samples import metadata_of
 from mmpi_ns.field.shading import RayShader, change_odds
@@ -16,6 +18,8 @@ from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.composite import Composite, composite_weights
 from mmpi_ns.ops.gather import RaySums
 from mmpi_ns.rendering.sampler import MMPISampler
+from mmpi_ns.rendering.shown import shown_outputs
+from mmpi_ns.scene.plan import ScenePlan
 
 F64 = torch.float64
 
@@ -203,3 +207,39 @@ def test_changed_odds_and_their_gradients_are_those_of_the_formula():
     wanted = torch.sigmoid(torch.logit(color) + 8 * torch.tanh(change / 2))
     assert torch.allclose(change_odds(color, change), wanted, atol=1e-12)
     assert torch.autograd.gradcheck(change_odds, (color, change))
+
+
+# Growth, baked shares ------------------------------------------------------------------------------------------------
+
+
+def test_growing_keeps_what_rays_show():
+    """Where texels are affine functions of the place on their plane, no resolution changes what lies between them."""
+    plan, draws = random_plan(3, False, seed=4), np.random.default_rng(0)
+    field = MMPIField(plan, shading="ray", feature_channels=6, hidden_width=8).eval()
+    field.build(plan, 1 / 4)
+    field.networks.weights.data = 0.5 * torch.from_numpy(draws.normal(size=field.networks.weights.shape)).float()
+    for grid in field.grids:
+        y, x = (np.linspace(-1, 1, n) for n in (grid.height, grid.width))
+        for table in (field.density, field.features):
+            level, across, down = draws.normal(size=(3, grid.depth, 1, 1, table.shape[1]))
+            values = level + across * x[None, None, :, None] + down * y[None, :, None, None]
+            table.data[grid.rows] = torch.from_numpy(values.reshape(-1, table.shape[1])).float()
+    rays = bundle(*random_rays(plan, 60, seed=1))
+    before, texels = shown(field, rays)[0].rgb, field.grids[0].texels
+    field.grow(1.0)
+    after = shown(field, rays)[0].rgb
+    assert field.grids[0].texels > 2 * texels and before.std() > 0.05
+    assert torch.allclose(before, after, atol=2e-5)
+
+
+def test_baked_shares_that_are_the_same_everywhere_show_what_blending_does():
+    """Two equal frusta that believe in nothing more than in each other: P is 1/2 at every place."""
+    plan = ScenePlan((make_mpi(), make_mpi("twin")), None, 0.05, 1.0)
+    field = fill(MMPIField(plan, shading="ray", feature_channels=6, hidden_width=8), 1).eval()
+    field.reliability.data.fill_(0.7)
+    rays, how = bundle(*random_rays(plan, 60, seed=3)), {"threshold": 0.0, "head_mask": None}
+    exact, baked = (shown_outputs(rays, field, form="paper", shares=s, **how) for s in (None, baked_shares(field)))
+    alone = shown_outputs(rays, field, form=None, shares=None, **how)
+    for name in ("rgb", "accumulation", "dropped_mass"):
+        assert torch.allclose(exact[name], baked[name], atol=2e-5), name
+    assert exact["rgb"].std() > 0.05 and (exact["rgb"] - alone["rgb"]).abs().max() > 0.01, "blending changes something"

@@ -6,7 +6,15 @@ import pytest
 import torch
 from compiled import both, compiled, normal  # noqa: F401
 
-from mmpi_ns.ops.interpolate import gather_rows, index_rows, interpolate, interpolate_gathered, reference, sum_rows
+from mmpi_ns.ops.interpolate import (
+    gather_rows,
+    index_rows,
+    interpolate,
+    interpolate_gathered,
+    raise_peaks,
+    reference,
+    sum_rows,
+)
 
 F64 = torch.float64
 
@@ -161,3 +169,20 @@ def test_gathered_rows_are_read_like_the_table_and_have_one_gradient_each(channe
     ((wanted * upstream).sum() + 2 * wanted[some].sum()).backward()
     assert torch.equal(table.grad._indices()[0], index.unique)
     assert torch.allclose(table.grad.to_dense(), plain.grad, atol=1e-5)
+
+
+@pytest.mark.parametrize("taps", [4, 8])
+def test_a_bricks_peak_is_the_largest_weight_of_what_reads_it(taps):
+    rows = torch.randint(0, 64 * 30, (500, taps), generator=torch.Generator().manual_seed(taps))
+    weights, peaks = normal(500).abs(), 0.5 * normal(40, seed=1).abs()
+    wanted = peaks.clone()
+    for row, weight in zip(rows.tolist(), weights, strict=True):
+        for brick in {r // 64 for r in row}:
+            wanted[brick] = max(wanted[brick], weight)
+
+    def raised():
+        found = peaks.clone()
+        raise_peaks(found, rows, weights)
+        return found
+
+    assert all(torch.equal(found, wanted) for found in both(raised)) and not torch.equal(peaks, wanted)

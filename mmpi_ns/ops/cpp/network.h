@@ -106,7 +106,7 @@ struct Block {
           second{hidden.row(ROWS), layers.units} {}
 };
 
-// (x, sin 2^i pi x, cos 2^i pi x) in the order of color_network.positional_encoding, a row an input.
+// (x, sin 2^i pi x, cos 2^i pi x) in the order of reference.positional_encoding, a row an input.
 inline void encode(int64_t frequencies, Block& block) {
     for (int a = 0; a < 3; a++)
         for (int first = 0; first < ROWS; first += WIDTH) {

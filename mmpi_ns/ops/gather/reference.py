@@ -6,6 +6,7 @@ sample has the sigmoids of the first and the hyperbolic tangents of the others.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -89,14 +90,19 @@ def gather_places(
         valid: which slots hold a sample.
         weights: rendering weights.
     """
-    raw, slots = [table.new_zeros(0, table.shape[1])], [heads.new_zeros(0)]
+    slots, raw = zip(*interpolated(layout, table, heads, planes, ndc, valid), strict=True)
+    return _sums(torch.cat(raw), torch.cat(slots), weights)
+
+
+def interpolated(
+    layout: SceneLayout, table: Tensor, heads: Tensor, planes: Tensor, ndc: Tensor, valid: Tensor
+) -> Iterator[tuple[Int[Tensor, "N"], Float[Tensor, "N C"]]]:
+    """Of each head the flat slots of its samples, and what the table holds at their places; see ``gather_places``."""
     for k, grid in enumerate(layout.grids):
         own = (valid & (heads == k)).reshape(-1).nonzero()[:, 0]
         place = ndc.reshape(-1, 3)[own]
         rows, shares = grid.bilinear(planes.reshape(-1)[own], place) if k < len(layout.mpis) else grid.trilinear(place)
-        raw.append((table[rows] * shares[..., None]).sum(1))
-        slots.append(own)
-    return _sums(torch.cat(raw), torch.cat(slots), weights)
+        yield own, (table[rows] * shares[..., None]).sum(1)
 
 
 def _sums(raw: Tensor, slots: Tensor, weights: Tensor) -> RaySums:

@@ -46,6 +46,11 @@ def sum_rows(
     return dispatch.run("sum_rows", position, values, weights, count)
 
 
+def raise_peaks(peaks: Float[Tensor, "B"], rows: Int[Tensor, "N T"], weights: Float[Tensor, "N"]) -> None:
+    """Raises each brick's peak to the largest weight of the samples that read rows of it, in place."""
+    dispatch.run("raise_peaks", peaks, rows, weights)
+
+
 def interpolate(
     table: Float[Tensor, "T C"], rows: Int[Tensor, "N B"], weights: Float[Tensor, "N B"]
 ) -> Float[Tensor, "N C"]:

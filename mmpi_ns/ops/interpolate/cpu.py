@@ -49,6 +49,13 @@ def sum_rows(position: Tensor, values: Tensor, weights: Tensor | None, count: in
     return out
 
 
+def raise_peaks(peaks: Tensor, rows: Tensor, weights: Tensor) -> None:
+    """See ``ops.interpolate``."""
+    rows, weights = rows.contiguous(), weights.contiguous()
+    given = (address(rows, torch.int64), *addresses((weights,)), *sizes(*rows.shape))
+    library().mmpi_raise_peaks(*given, address(peaks))
+
+
 def take_rows(table: Tensor, rows: Tensor) -> Tensor:
     """See ``ops.interpolate.reference``."""
     if table.ndim != 2 or not table.is_contiguous():

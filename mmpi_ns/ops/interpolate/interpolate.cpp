@@ -44,6 +44,14 @@ void mmpi_take_rows(const int64_t* rows, int64_t begin, int64_t end, int64_t cha
     }
 }
 
+// peaks[brick] is raised to the largest weight of the samples that read one of its rows.
+void mmpi_raise_peaks(const int64_t* rows, const float* weights, int64_t samples, int64_t taps, float* peaks) {
+    for (int64_t i = 0; i < samples * taps; i++) {
+        float& peak = peaks[rows[i] / BRICK];
+        peak = std::max(peak, weights[i / taps]);
+    }
+}
+
 // values[position[n, b]] += weights[n, b] * grad[n], with weights of 1 where none are given.
 void mmpi_sum_rows(const int32_t* position, const float* weights, const float* grad, int64_t samples, int64_t taps,
                        int64_t channels, float* values) {

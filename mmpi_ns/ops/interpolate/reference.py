@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from mmpi_ns.ops.layout import SceneLayout
+from mmpi_ns.scene.texels import BRICK
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,11 @@ def sum_rows(position: Tensor, values: Tensor, weights: Tensor | None, count: in
     out = torch.zeros(count, values.shape[1], dtype=values.dtype, device=values.device)
     each = values if weights is None else (values[:, None, :] * weights[..., None]).reshape(-1, values.shape[1])
     return out.index_add_(0, position.reshape(-1), each)
+
+
+def raise_peaks(peaks: Tensor, rows: Tensor, weights: Tensor) -> None:
+    """See ``ops.interpolate``."""
+    peaks.scatter_reduce_(0, (rows // BRICK).reshape(-1), weights.repeat_interleave(rows.shape[1]), "amax")
 
 
 def weighted_rows(table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:

@@ -1,5 +1,5 @@
 // Colours of samples, without gradients: features, position encoding and the colour network of a block of samples. The
-// reference is ColorNetworks.forward.
+// reference is reference.py.
 #include "network.h"
 #include "cells.h"
 #include "table.h"
@@ -150,13 +150,11 @@ void shade(const Grid& grid, bool in_cube, const Shading& shading, Head& head, f
 extern "C" {
 
 // Colours [R, S, 3] of the valid samples of rays [begin, end); empty slots become black. One network and start a head.
-void mmpi_shade(const Scene* scene, const Shading* shading, const Network* networks, const Start* starts, int64_t begin,
-                int64_t end, float* colors) {
+void mmpi_shade(const Grid* grids, int64_t num_mpis, int64_t num_heads, const Shading* shading, const Network* networks,
+                const Start* starts, int64_t begin, int64_t end, float* colors) {
     std::vector<std::unique_ptr<Head>> heads;
-    for (int64_t h = 0; h < scene->num_heads; h++) heads.push_back(std::make_unique<Head>(networks[h], starts[h]));
-    const auto shade_head = [&](int64_t h) {
-        shade(scene->grids[h], h >= scene->num_mpis, *shading, *heads[h], colors);
-    };
+    for (int64_t h = 0; h < num_heads; h++) heads.push_back(std::make_unique<Head>(networks[h], starts[h]));
+    const auto shade_head = [&](int64_t h) { shade(grids[h], h >= num_mpis, *shading, *heads[h], colors); };
     std::fill(colors + 3 * begin * shading->slots, colors + 3 * end * shading->slots, 0.0f);
     for (int64_t ray = begin; ray < end; ray++)
         for (int64_t slot = ray * shading->slots; slot < (ray + 1) * shading->slots; slot++) {
@@ -166,7 +164,7 @@ void mmpi_shade(const Scene* scene, const Shading* shading, const Network* netwo
             heads[h]->take(slot, shading->ndc + 3 * slot);
             if (heads[h]->size == ROWS) shade_head(h);
         }
-    for (int64_t h = 0; h < scene->num_heads; h++)
+    for (int64_t h = 0; h < num_heads; h++)
         if (heads[h]->size) shade_head(h);
 }
 }

@@ -1,0 +1,37 @@
+"""Colours of samples by a network of each head, without gradients: what rendering asks for with ``shading sample``."""
+
+from __future__ import annotations
+
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from mmpi_ns.ops import dispatch
+from mmpi_ns.ops.layout import SceneLayout
+from mmpi_ns.ops.shade.reference import SampleNetworks
+
+
+def shade(
+    layout: SceneLayout,
+    table: Float[Tensor, "T C"],
+    networks: SampleNetworks,
+    axes: Float[Tensor, "H 3 3"],
+    directions: Float[Tensor, "R 3"],
+    heads: Int[Tensor, "R S"],
+    planes: Int[Tensor, "R S"],
+    ndc: Float[Tensor, "R S 3"],
+    valid: Bool[Tensor, "R S"],
+) -> Float[Tensor, "R S 3"]:
+    """Colours of the valid samples; empty slots are black.
+
+    Args:
+        layout: of the scene.
+        table: colour features of all texels.
+        networks: of all heads.
+        axes: of each head, as rows.
+        directions: of each ray, world axes.
+        heads: head of each sample.
+        planes: its plane; of no meaning in the cube.
+        ndc: its position in the head.
+        valid: which slots hold a sample.
+    """
+    return dispatch.run("shade", layout, table, networks, axes, directions, heads, planes, ndc, valid)

@@ -1,0 +1,73 @@
+"""Colours of samples in plain torch (paper, MLP^(rgb)): also what training differentiates."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mmpi_ns.ops.gather.reference import interpolated
+from mmpi_ns.ops.layout import SceneLayout
+from mmpi_ns.scene.geometry import rotate
+
+Layers = Sequence[Tensor]
+"""Weights [outputs, inputs] and biases of a network's three layers."""
+
+
+class SampleNetworks(NamedTuple):
+    """The networks of all heads."""
+
+    layers: tuple[tuple[Tensor, ...], ...]
+    position_frequencies: int
+    """Octaves of the positional encoding of NDC positions."""
+    direction_frequencies: int
+    """Octaves of that of directions, in the head's axes."""
+
+
+def positional_encoding(x: Float[Tensor, "N 3"], frequencies: int) -> Float[Tensor, "N E"]:
+    """(x, sin 2^i pi x, cos 2^i pi x) for i < frequencies (NeRF eq. 4)."""
+    if frequencies == 0:
+        return x
+    octaves = math.pi * 2.0 ** torch.arange(frequencies, device=x.device, dtype=x.dtype)
+    angles = (x[:, None, :] * octaves[:, None]).flatten(1)
+    return torch.cat([x, angles.sin(), angles.cos()], -1)
+
+
+def run_layers(layers: Layers, inputs: Float[Tensor, "N I"]) -> Float[Tensor, "N 3"]:
+    """What a network makes of its inputs."""
+    w1, b1, w2, b2, w3, b3 = layers
+    hidden = torch.nn.functional.linear(inputs, w1, b1).relu_()
+    hidden = torch.nn.functional.linear(hidden, w2, b2).relu_()
+    return torch.nn.functional.linear(hidden, w3, b3)
+
+
+def sample_colors(
+    layers: Layers, features: Float[Tensor, "N C"], position: Float[Tensor, "N P"], direction: Float[Tensor, "N D"]
+) -> Float[Tensor, "N 3"]:
+    """Colours in [0, 1] of samples whose positions and directions are encoded: the first three features are their
+    logits, to which the network adds what the view changes."""
+    return torch.sigmoid(features[:, :3] + run_layers(layers, torch.cat([features, position, direction], -1)))
+
+
+def shade(
+    layout: SceneLayout,
+    table: Tensor,
+    networks: SampleNetworks,
+    axes: Tensor,
+    directions: Tensor,
+    heads: Tensor,
+    planes: Tensor,
+    ndc: Tensor,
+    valid: Tensor,
+) -> Tensor:
+    """See ``ops.shade``."""
+    colors = table.new_zeros(valid.numel(), 3)
+    for k, (slots, features) in enumerate(interpolated(layout, table, heads, planes, ndc, valid)):
+        position = positional_encoding(ndc.reshape(-1, 3)[slots], networks.position_frequencies)
+        direction = positional_encoding(rotate(axes[k], directions), networks.direction_frequencies)
+        colors[slots] = sample_colors(networks.layers[k], features, position, direction[slots // valid.shape[1]])
+    return colors.view(*valid.shape, 3)

@@ -1,0 +1,78 @@
+"""The compiled colours of samples against the colour networks in float64."""
+
+from __future__ import annotations
+
+import copy
+import math
+from typing import Any
+
+import pytest
+import torch
+from compiled import compiled, normal  # noqa: F401
+from nerfstudio.field_components.field_heads import FieldHeadNames
+from random_fields import bundle, random_field, random_rays
+
+from mmpi_ns.field.mmpi_field import MMPIField
+from mmpi_ns.ops import dispatch
+from mmpi_ns.rendering.sampler import MMPISampler
+
+
+def shaded(channels=9, width=32, octaves=(2, 2), shared=False):
+    """A field of four MPIs and a cube, samples in all of them, and their colours by the networks in float64."""
+    plan = random_field(4, True, seed=7).plan
+    sizes: dict[str, Any] = {"feature_channels": channels, "hidden_width": width, "shared_colour": shared}
+    sizes |= {"position_frequencies": octaves[0], "direction_frequencies": octaves[1]}
+    field = MMPIField(plan, **sizes).eval()
+    field.features.data = normal(*field.features.shape, seed=1) * 2
+    field.networks.weights.data = normal(*field.networks.weights.shape, seed=2) * 0.3
+    samples, _ = MMPISampler()(bundle(*random_rays(plan, 60, seed=8)), field=field, threshold=0.0)
+    assert samples.metadata["heads"].unique().numel() == 5
+    return field, samples
+
+
+def colors(field, samples):
+    with torch.no_grad():
+        return field.get_outputs(samples)[FieldHeadNames.RGB]
+
+
+def in_float64(field, samples):
+    """By the lookup and the networks of training."""
+    field._packed = {}  # made anew in float64
+    exact, given = copy.deepcopy(field).double(), copy.deepcopy(samples)
+    frustums, meta = given.frustums, given.metadata
+    frustums.directions, meta["ndc"] = frustums.directions.double(), meta["ndc"].double()
+    return exact.get_outputs(given)[FieldHeadNames.RGB].detach()
+
+
+@pytest.mark.parametrize("shared", [False, True])
+@pytest.mark.parametrize(("channels", "width", "octaves"), [(3, 5, (0, 0)), (9, 32, (2, 2)), (17, 64, (4, 1))])
+def test_colours_are_those_of_the_networks(channels, width, octaves, shared):
+    field, samples = shaded(channels, width, octaves, shared)
+    wanted, valid = in_float64(field, samples), samples.metadata["valid"][..., 0]
+    assert dispatch.form_of("shade", field.features.data, samples.metadata["ndc"]) == "cpu"
+    assert wanted[valid].std() > 0.05
+    for route in ("native", "torch"):
+        with dispatch.chosen(route):
+            found = colors(field, samples)
+        assert (found.double() - wanted).abs().max() < 2e-5 and (found[~valid] == 0).all()
+
+
+def test_colours_do_not_depend_on_the_number_of_threads():
+    field, samples = shaded()
+    threads, found = torch.get_num_threads(), []
+    for count in (1, 3):
+        try:
+            torch.set_num_threads(count)
+            found.append(colors(field, samples))
+        finally:
+            torch.set_num_threads(threads)
+    assert torch.equal(*found)
+
+
+def test_colours_say_where_a_feature_is_not_a_number():
+    field, samples = shaded()
+    before = colors(field, samples).isnan().any(-1)
+    read = field._lookup(samples)
+    field.features.data[read.groups[0].rows[3, 0], 5] = math.nan
+    found = colors(field, samples).isnan().any(-1)
+    assert not before.any() and found.reshape(-1)[read.index[3]] and not found.all()
