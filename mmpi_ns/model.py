@@ -8,9 +8,8 @@ from threading import current_thread, main_thread
 from typing import Any, Literal
 
 import torch
-from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras
-from nerfstudio.cameras.rays import RayBundle, RaySamples
+from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.model_components import renderers
@@ -22,28 +21,28 @@ from torch.nn import Parameter
 from mmpi_ns.capture.datamanager import OBSERVATIONS, RAYS_PER_STEP, TRAINING_VIEWS
 from mmpi_ns.field.baking import baked_shares
 from mmpi_ns.field.mmpi_field import MMPIField
-from mmpi_ns.field.samples import Lookup, metadata_of
+from mmpi_ns.field.samples import metadata_of
 from mmpi_ns.field.shading import Shading
 from mmpi_ns.ops import dispatch
-from mmpi_ns.ops.blending import BlendForm, blended_optical_depth
-from mmpi_ns.ops.composite import composite_weights, winning_heads
+from mmpi_ns.ops.blending import BlendForm
 from mmpi_ns.ops.march.reference import most_kept
 from mmpi_ns.placement.rule import PlacementConfig
 from mmpi_ns.placement.split import place_windows
 from mmpi_ns.rendering.baked import BakedWindow, bake
 from mmpi_ns.rendering.chunks import BYTES_PER_SLOT, rays_per_chunk, render_in_chunks
 from mmpi_ns.rendering.metrics import ImageMetrics, depth_metrics, pictures
-from mmpi_ns.rendering.rendered import BACKGROUNDS, RenderedRays, bounded, median_distance
-from mmpi_ns.rendering.sampler import MergeReport, MMPISampler
+from mmpi_ns.rendering.render import images_of, render_rays, sampled_outputs
+from mmpi_ns.rendering.rendered import BACKGROUNDS, RenderedRays, bounded
+from mmpi_ns.rendering.sampler import MMPISampler
 from mmpi_ns.rendering.shown import shown_outputs
 from mmpi_ns.rendering.window_store import WindowStore
 from mmpi_ns.rendering.windows import render_windows
-from mmpi_ns.scene.plan import MPIPlan, ScenePlan
+from mmpi_ns.scene.plan import NO_PLAN
 from mmpi_ns.scene.visible_tiles import TrainingViews
 from mmpi_ns.scene.windows import WindowedPlan
 from mmpi_ns.training.checkpoints import check_there_are_checkpoints
 from mmpi_ns.training.individual import individual_rays
-from mmpi_ns.training.losses import LossWeights, batch_losses, is_pixel_ray, over_background, photometric
+from mmpi_ns.training.losses import LossWeights, batch_losses, over_background, photometric
 from mmpi_ns.training.memory import check_memory
 from mmpi_ns.training.phases import Schedule, Training, make_schedule
 from mmpi_ns.training.progress import Progress
@@ -53,24 +52,6 @@ from mmpi_ns.utils.random_draws import generator
 
 FAIR_SHARE = 0.1
 """Until the field has sharpened, samples of more than this part of an equal weight are kept."""
-UNTIL_LOADED = ScenePlan(
-    (
-        MPIPlan(
-            "none",
-            (0.0, 0.0, 0.0),
-            ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
-            1.0,
-            (-1.0, 1.0, -1.0, 1.0),
-            2,
-            2,
-            2,
-        ),
-    ),
-    None,
-    0.0,
-    1.0,
-)
-"""The plan of a model that only loads a checkpoint, which brings its own."""
 
 
 @dataclass
@@ -216,7 +197,7 @@ class MMPIModel(Model):
             return WindowedPlan.load(path)
         if observations is None:
             check_there_are_checkpoints(self.config.windows_folder)
-            return WindowedPlan.single(UNTIL_LOADED)
+            return WindowedPlan.single(NO_PLAN)
         rays = self.config.total_steps * metadata[RAYS_PER_STEP]
         return place_windows(observations, self.config.placement, rays)
 
@@ -258,11 +239,12 @@ class MMPIModel(Model):
             g = generator(self.config.seed, progress.step, "assignment", self.device)
             bundle, head_mask, choose = individual_rays(bundle, field.plan, self.config.rays_per_mpi, g)
         form = self.blend_form(field) if progress.schedule.blends_at(progress.step) else None
-        rays = self._render(bundle, field, form=form, head_mask=head_mask, choose=choose, **self.training_bounds())
+        sampling = {"head_mask": head_mask, "choose": choose, **self.training_bounds()}
+        rays = render_rays(self.sampler, bundle, field, form=form, **sampling)
         rays = replace(rays, times=len(bundle) // asked)
         if rays.lookup is not None and progress.schedule.watches(progress.step):
             field.note_use(rays.lookup, rays.composite.weights, rays.report.live)
-        return self._outputs(rays, field) | {"training": rays}
+        return images_of(rays, field) | {"training": rays}
 
     def training_bounds(self) -> dict[str, float]:
         """What a sample must weigh to be kept in training (``march.reference.prune``).
@@ -321,20 +303,10 @@ class MMPIModel(Model):
             shares = baked_shares(field)
         how = {"form": form, "threshold": self.config.render_threshold, "head_mask": head_mask, "shares": shares}
         once = field.shading == "ray" and not torch.is_grad_enabled()
-        outputs = (shown_outputs if once else self._sampled_outputs)(bounded(bundle, field.plan), field, **how)
+        outputs = (shown_outputs if once else sampled_outputs)(bounded(bundle, field.plan), field, **how)
         rgb = outputs["rgb"] + outputs.pop("transmittance") * self._background(outputs["rgb"])
         winner = outputs["winning_mpi"] + self.progress.windows.first_head(window)
         return outputs | {"rgb": rgb.clamp(0, 1), "winning_mpi": winner}
-
-    def _sampled_outputs(self, bundle: RayBundle, field: MMPIField, **how: Any) -> dict[str, Tensor]:
-        """``shown_outputs`` of any field, also with gradients."""
-        rays = self._render(bundle, field, **how)
-        heads, composite = metadata_of(rays.samples)["heads"][..., 0], rays.composite
-        return self._outputs(rays, field) | {
-            "transmittance": composite.transmittance,
-            "winning_mpi": winning_heads(composite.weights, heads, field.plan.num_heads),
-            "dropped_mass": rays.report.dropped_mass,
-        }
 
     def _baked_outputs(self, window: int, field: MMPIField, bundle: RayBundle) -> dict[str, Tensor]:
         """``window_outputs`` of a field's baked bricks, which are read on the CPU."""
@@ -353,40 +325,6 @@ class MMPIModel(Model):
     def blend_form(self, field: MMPIField) -> BlendForm | None:
         """How reliability enters a field's pictures; None where it takes no part."""
         return None if self.config.training == "joint" or field.plan.num_heads == 1 else self.config.blend_form
-
-    def _render(self, bundle: RayBundle, field: MMPIField, *, form: BlendForm | None, **sampling: Any) -> RenderedRays:
-        """Samples rays in a field, merges and blends, weighs the samples and colours them (see ``MMPISampler``)."""
-        samples, report = self.sampler(bundle, field=field, blend_form=form, **sampling)
-        tau, lookup = self._optical_depth(field, samples, report, form)
-        meta = metadata_of(samples)
-        valid, before = meta["valid"][..., 0], meta["skipped_before"][..., 0]
-        composite = composite_weights(tau, valid, before, report.skipped_total)
-        # Keypoint rays are supervised in depth alone: no colours for them.
-        colors = field.render_colors(samples, lookup, composite, lookup and is_pixel_ray(bundle))
-        return RenderedRays(bundle, samples, composite, colors, report, lookup)
-
-    @staticmethod
-    def _optical_depth(
-        field: MMPIField, samples: RaySamples, report: MergeReport, form: BlendForm | None
-    ) -> tuple[Float[Tensor, "R S"], Lookup | None]:
-        """(Blended) optical depths, with gradients where they are wanted; else the sampler's own, without a lookup."""
-        if not torch.is_grad_enabled():
-            return metadata_of(samples)["tau"][..., 0], None
-        density, lookup = field.get_density(samples, report.head_counts)
-        tau = density[..., 0]
-        if form is not None and lookup.index.numel():
-            shares = field.sample_shares(samples, lookup)
-            blended = blended_optical_depth(tau.reshape(-1)[lookup.index], *shares, form)
-            tau = tau.new_zeros(tau.numel()).index_put((lookup.index,), blended).view(tau.shape)
-        return tau, lookup
-
-    @staticmethod
-    def _outputs(rays: RenderedRays, field: MMPIField) -> dict[str, Tensor]:
-        return {
-            "rgb": rays.colors.rgb,
-            "accumulation": rays.composite.accumulation,
-            "depth": median_distance(rays.composite, rays.samples, field.plan),
-        }
 
     # Images ------------------------------------------------------------------------------------------------------
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager, VanillaDataManagerConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
@@ -146,7 +146,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         # Samples nothing: ns-export sets its batches' size here.
         self.train_pixel_sampler = self._get_pixel_sampler(self.train_dataset, self.config.train_num_rays_per_batch)
         cameras = self.train_dataset.cameras
-        pinhole = PinholeRays.of(cameras, self.device) if torch.device(self.device).type == "cuda" else None
+        pinhole = PinholeRays.of(cameras, self.device)
         self.train_ray_generator: Any = pinhole or RayGenerator(cameras.to(self.device))
         self._keypoints = _keypoint_targets(self.observations, self.device) if self.test_mode == "val" else None
         if not self._reads_by_window:
@@ -321,3 +321,11 @@ def _keypoint_targets(
     parts = (origins, offsets / distance, 1 / distance[:, 0])
     seen_by = torch.from_numpy(observations.seen_by[tracked]).to(device)
     return seen_by, *(torch.from_numpy(x).float().to(device) for x in parts)
+
+
+def is_pixel_ray(bundle: RayBundle) -> Bool[Tensor, "R"]:
+    """Rays through pixels, as opposed to rays through SfM keypoints, which have a known depth but no pixel."""
+    known = bundle.metadata.get(KEYPOINT_DEPTH)
+    if known is None:
+        return torch.ones(len(bundle), dtype=torch.bool, device=bundle.origins.device)
+    return known[:, 0] == 0

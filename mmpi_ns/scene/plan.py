@@ -276,3 +276,23 @@ def _with_far(mpi: Any) -> Any:
 
 def _tuples(value: Any) -> Any:
     return tuple(_tuples(v) for v in value) if isinstance(value, list) else value
+
+
+NO_PLAN = ScenePlan(
+    (
+        MPIPlan(
+            "none",
+            (0.0, 0.0, 0.0),
+            ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+            1.0,
+            (-1.0, 1.0, -1.0, 1.0),
+            2,
+            2,
+            2,
+        ),
+    ),
+    None,
+    0.0,
+    1.0,
+)
+"""The plan of a model that only loads a checkpoint, which brings its own."""

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
-from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 
 from mmpi_ns.capture.datamanager import KEYPOINT_DEPTH, PIXEL_DEPTH
@@ -112,12 +111,17 @@ def keypoint_depth(
         relative_width: standard deviation of the window relative to the known inverse distance.
     """
     scaled = (inverse_t - known_inverse_t) / (relative_width * known_inverse_t.clamp(min=1e-12))
-    window = torch.where(valid, torch.exp(-0.5 * scaled**2), torch.zeros_like(scaled))
+    window = _window(scaled, valid)
     reachable = (valid & (scaled.abs() < 3)).any(-1) & (known_inverse_t[:, 0] > 0)
     mass = (weights * window).sum(-1)
     nll = -torch.log(mass + 1e-4)
     count = reachable.sum().clamp(min=1)
     return torch.where(reachable, nll, torch.zeros_like(nll)).sum() / count
+
+
+def _window(scaled: Float[Tensor, "R S"], valid: Bool[Tensor, "R S"]) -> Float[Tensor, "R S"]:
+    """exp(-1/2 scaled^2), 0 in empty slots; never below 1e-26, since exponentials that underflow take far longer."""
+    return torch.where(valid, torch.exp(-0.5 * scaled.square().clamp(max=120)), torch.zeros_like(scaled))
 
 
 def known_depth(
@@ -144,7 +148,7 @@ def known_depth(
     """
     error = torch.hypot(known[:, 1:], torch.full_like(known[:, 1:], least_error)).clamp(min=1e-12)
     scaled = (inverse_t - known[:, :1]) / error
-    window = torch.where(valid, torch.exp(-0.5 * scaled**2), torch.zeros_like(scaled))
+    window = _window(scaled, valid)
     reachable = (valid & (scaled.abs() < 3)).any(-1) & (known[:, 0] > 0)
     nll = -torch.log((weights * window).sum(-1) + outliers)
     return torch.where(reachable, nll, torch.zeros_like(nll)).mean() if len(nll) else weights.sum()
@@ -220,14 +224,6 @@ def _keypoint_depth(rays: RenderedRays, chosen: Tensor, known: Tensor) -> Tensor
         known[chosen],
         meta["valid"][..., 0].index_select(0, chosen),
     )
-
-
-def is_pixel_ray(bundle: RayBundle) -> Bool[Tensor, "R"]:
-    """Rays through pixels, as opposed to rays through SfM keypoints, which have a known depth but no pixel."""
-    known = bundle.metadata.get(KEYPOINT_DEPTH)
-    if known is None:
-        return torch.ones(len(bundle), dtype=torch.bool, device=bundle.origins.device)
-    return known[:, 0] == 0
 
 
 def over_background(image: Tensor, background: Tensor) -> Tensor:

@@ -1,0 +1,77 @@
+"""Rays through one field: sampled, merged, blended, weighed and coloured (docs/how_it_works.md has the steps)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from nerfstudio.cameras.rays import RayBundle, RaySamples
+from torch import Tensor
+
+from mmpi_ns.capture.datamanager import is_pixel_ray
+from mmpi_ns.field.mmpi_field import MMPIField
+from mmpi_ns.field.samples import Lookup, metadata_of
+from mmpi_ns.ops.blending import BlendForm, blended_optical_depth
+from mmpi_ns.ops.composite import composite_weights, winning_heads
+from mmpi_ns.rendering.rendered import RenderedRays, median_distance
+from mmpi_ns.rendering.sampler import MergeReport, MMPISampler
+
+
+def render_rays(
+    sampler: MMPISampler, bundle: RayBundle, field: MMPIField, *, form: BlendForm | None, **sampling: Any
+) -> RenderedRays:
+    """Renders rays that have nears and fars; with gradients where they are wanted.
+
+    Args:
+        sampler: samples and merges.
+        bundle: the rays.
+        field: that they are rendered from.
+        form: how reliability enters; None where it takes no part.
+        sampling: what else the sampler takes.
+    """
+    samples, report = sampler(bundle, field=field, blend_form=form, **sampling)
+    tau, lookup = _optical_depth(field, samples, report, form)
+    meta = metadata_of(samples)
+    valid, before = meta["valid"][..., 0], meta["skipped_before"][..., 0]
+    composite = composite_weights(tau, valid, before, report.skipped_total)
+    # Keypoint rays are supervised in depth alone: no colours for them.
+    colors = field.render_colors(samples, lookup, composite, lookup and is_pixel_ray(bundle))
+    return RenderedRays(bundle, samples, composite, colors, report, lookup)
+
+
+def _optical_depth(
+    field: MMPIField, samples: RaySamples, report: MergeReport, form: BlendForm | None
+) -> tuple[Float[Tensor, "R S"], Lookup | None]:
+    """(Blended) optical depths, with gradients where they are wanted; else the sampler's own, without a lookup."""
+    if not torch.is_grad_enabled():
+        return metadata_of(samples)["tau"][..., 0], None
+    density, lookup = field.get_density(samples, report.head_counts)
+    tau = density[..., 0]
+    if form is not None and lookup.index.numel():
+        shares = field.sample_shares(samples, lookup)
+        blended = blended_optical_depth(tau.reshape(-1)[lookup.index], *shares, form)
+        tau = tau.new_zeros(tau.numel()).index_put((lookup.index,), blended).view(tau.shape)
+    return tau, lookup
+
+
+def images_of(rays: RenderedRays, field: MMPIField) -> dict[str, Tensor]:
+    """What nerfstudio shows of rays: colour without a background, accumulation, depth."""
+    return {
+        "rgb": rays.colors.rgb,
+        "accumulation": rays.composite.accumulation,
+        "depth": median_distance(rays.composite, rays.samples, field.plan),
+    }
+
+
+def sampled_outputs(
+    bundle: RayBundle, field: MMPIField, *, form: BlendForm | None, **sampling: Any
+) -> dict[str, Tensor]:
+    """``shown.shown_outputs`` of any field, also with gradients."""
+    rays = render_rays(MMPISampler(), bundle, field, form=form, **sampling)
+    heads, composite = metadata_of(rays.samples)["heads"][..., 0], rays.composite
+    return images_of(rays, field) | {
+        "transmittance": composite.transmittance,
+        "winning_mpi": winning_heads(composite.weights, heads, field.plan.num_heads),
+        "dropped_mass": rays.report.dropped_mass,
+    }
