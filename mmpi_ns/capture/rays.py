@@ -1,7 +1,7 @@
-"""Rays of undistorted perspective cameras in one go, for training on a GPU.
+"""Rays of undistorted perspective cameras in one go.
 
-nerfstudio's ray generator handles every kind of camera, and asks the device some twenty times a batch which kinds and
-distortions there are; each answer is waited for.
+nerfstudio's ray generator handles every kind of camera, and asks some twenty times a batch which kinds and distortions
+there are: 4 of 75 ms of a step on a CPU, and on a GPU each answer is waited for.
 """
 
 from __future__ import annotations

@@ -158,10 +158,12 @@ def _variations(device: str) -> list[tuple]:
 
 
 def _adams(device: str) -> list[tuple]:
-    tables = [_random(device, ROWS, CHANNELS) for _ in range(3)]
+    moments = _random(device, ROWS, 2, CHANNELS)
     grad = _random(device, ROWS // 3, CHANNELS) - 0.5
     rows = 3 * torch.arange(ROWS // 3, device=device)
-    return [(*tables, rows, grad * (grad.abs() > 0.1), AdamConstants(0.9, 0.99, 0.2, 1e-8, 0.1))]
+    given = (rows, grad * (grad.abs() > 0.1), AdamConstants(0.9, 0.99, 0.2, 1e-8, 0.1))
+    tables = [(_random(device, ROWS, CHANNELS), m) for m in (moments, moments.bfloat16())]
+    return [(*each, *given) for each in tables]
 
 
 def _gathers(device: str) -> list[tuple]:

@@ -75,8 +75,9 @@ def training_bytes(plan: ScenePlan, views: TrainingViews | None, feature_channel
     tiles = count_tiles(plan)
     stored = tiles if views is None else int(reachable_tiles(views, plan).sum())
     learned = 1 + feature_channels + two_phase
-    numbers = 1 + feature_channels + 1 + 2 * learned  # density, features, reliability, two moments
-    return (stored + 1) * (BRICK * (4 * numbers + 1) + 4) + 4 * tiles  # and what is touched, peaks, where tiles lie
+    numbers, moments = 1 + feature_channels + 1, 2 * learned  # density, features, reliability; in float32, bfloat16
+    # And what is touched, peaks, where tiles lie.
+    return (stored + 1) * (BRICK * (4 * numbers + 2 * moments + 1) + 4) + 4 * tiles
 
 
 def describe(windows: WindowedPlan, steps: int, tables: Sequence[int], pixels: Sequence[int]) -> str:

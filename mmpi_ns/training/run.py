@@ -94,7 +94,7 @@ class TrainingRun:
         if len(progress.windows) > 1 and attributes is not None and self._drawn_from != progress.window:
             self._draw_from_window(attributes.pipeline.datamanager if attributes.pipeline else None)
         phase = progress.phase.name
-        field.learns_cover = phase in ("individual", "joint")
+        field.learns_cover = phase == "individual"
         for kind, params in groups.items():
             params[0].requires_grad_(kind in TRAINS[phase])
 

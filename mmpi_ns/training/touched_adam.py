@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from nerfstudio.engine.optimizers import OptimizerConfig
 from torch import Tensor
 from torch.nn import Parameter
@@ -42,8 +43,7 @@ class TouchedAdam(torch.optim.Optimizer):
                     continue
                 state = self.state[param]
                 if not state:
-                    state["step"] = 0
-                    state["exp_avg"], state["exp_avg_sq"] = _zeros_like(param), _zeros_like(param)
+                    state["step"], state["moments"] = 0, _no_moments(param, param.grad.is_sparse)
                 state["step"] += 1
                 update = _sparse_update if param.grad.is_sparse else _dense_update
                 update(param, param.grad, state, group)
@@ -55,16 +55,27 @@ class TouchedAdam(torch.optim.Optimizer):
     def keep_blocks(self, param: Parameter, kept: Tensor, size: int) -> None:
         """Moments of a table of which only the blocks ``kept`` [K], of ``size`` rows each, are left, in that order."""
         state = self.state.get(param, {})
-        for name in ("exp_avg", "exp_avg_sq"):
-            if name in state:
-                state[name] = state[name].view(-1, size, *param.shape[1:])[kept].flatten(0, 1)
+        if "moments" in state:
+            moments = state["moments"]
+            state["moments"] = moments.view(-1, size, *moments.shape[1:])[kept].flatten(0, 1)
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """As torch's own, which would give moments the precision of their parameters."""
+        super().load_state_dict(state_dict)
+        params = [param for group in self.param_groups for param in group["params"]]
+        for number, known in state_dict["state"].items():
+            self.state[params[number]]["moments"] = known["moments"].to(params[number].device)
 
 
-def _zeros_like(param: Tensor) -> Tensor:
-    """Zeros that take no memory on a CPU until they are written to: most rows of a table may never be."""
-    if param.device.type != "cpu" or param.dtype not in (torch.float32, torch.float64):
-        return torch.zeros_like(param)
-    return torch.from_numpy(np.zeros(param.shape, dtype=str(param.dtype).removeprefix("torch.")))
+def _no_moments(param: Tensor, of_rows: bool) -> Float[Tensor, "N 2 *C"]:
+    """Zeros, mean and uncentred variance. Those of a table's rows are in bfloat16 (docs/performance.md has what that
+    costs), and take no memory on a CPU until they are written to: most rows may never be."""
+    shape = (len(param), 2, *param.shape[1:])
+    if not of_rows or param.dtype != torch.float32:
+        return param.new_zeros(shape)
+    if param.device.type != "cpu":
+        return param.new_zeros(shape, dtype=torch.bfloat16)
+    return torch.from_numpy(np.zeros(shape, dtype=np.int16)).view(torch.bfloat16)
 
 
 def _constants(state: dict[str, Any], group: dict[str, Any]) -> AdamConstants:
@@ -75,14 +86,15 @@ def _constants(state: dict[str, Any], group: dict[str, Any]) -> AdamConstants:
 
 def _sparse_update(param: Parameter, grad: Tensor, state: dict[str, Any], group: dict[str, Any]) -> None:
     rows, values = grad._indices()[0], grad._values().to(param.dtype)
-    if not grad.is_coalesced():
+    # On a CPU torch forgets, where it accumulates a gradient, that it is coalesced.
+    if not (grad.is_coalesced() or bool((rows[1:] > rows[:-1]).all())):
         index = index_rows(rows, len(param))
         rows, values = index.unique, sum_rows(index.position, values, None, len(index.unique))
-    adam_rows(param.data, state["exp_avg"], state["exp_avg_sq"], rows, values, _constants(state, group))
+    adam_rows(param.data, state["moments"], rows, values, _constants(state, group))
 
 
 def _dense_update(param: Parameter, grad: Tensor, state: dict[str, Any], group: dict[str, Any]) -> None:
-    old = (param.data, state["exp_avg"], state["exp_avg_sq"])
+    old = (param.data, state["moments"])
     for tensor, new in zip(old, adam(*old, grad, _constants(state, group)), strict=True):
         tensor.copy_(new)
 

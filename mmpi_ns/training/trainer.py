@@ -38,6 +38,7 @@ from mmpi_ns.training.stopping import end, end_before_training, signals_go_to
 from mmpi_ns.utils.console import keep_quiet, say
 from mmpi_ns.utils.errors import InputError, speak_plainly
 from mmpi_ns.utils.files import write_atomically
+from mmpi_ns.utils.machine import keep_freed_memory
 
 PLAN_FILE = "plan.json"
 WINDOWS_FOLDER = "windows"
@@ -124,6 +125,7 @@ class MMPITrainer(Trainer):
 
     def _prepare(self, test_mode: Literal["test", "val", "inference"]) -> None:
         _check_device(self.config.machine.device_type)
+        keep_freed_memory()
         self._stopped_by: int | None = None
         self._log: TrainingLog | None = None
         self._began = monotonic()

@@ -1,7 +1,8 @@
-"""What the machine has left to give."""
+"""What the machine has left to give, and what a process keeps of it."""
 
 from __future__ import annotations
 
+import ctypes
 import os
 import sys
 from pathlib import Path
@@ -9,6 +10,28 @@ from pathlib import Path
 import torch
 
 CGROUP = Path("/sys/fs/cgroup")
+
+
+KEPT = 256 << 20
+"""Bytes that are freed and kept for the next use: more than a step takes beside the tables."""
+OWN_MAPPING = 32 << 20
+"""Arrays of so many bytes, which tables are, go back to the system at once: glibc's upper limit."""
+
+
+def keep_freed_memory() -> bool:
+    """Has glibc keep what a training step frees for the next one, which takes the same again.
+
+    Else it gives much of it back to the system, which then hands out zeroed pages: thousands of page faults a step.
+
+    Returns:
+        Whether it does so: other C libraries are left as they are.
+    """
+    trim_threshold, mmap_threshold = -1, -3  # malloc.h
+    try:
+        mallopt = ctypes.CDLL(None).mallopt
+    except (AttributeError, OSError, TypeError):
+        return False
+    return bool(mallopt(trim_threshold, KEPT)) and bool(mallopt(mmap_threshold, OWN_MAPPING))
 
 
 def free_memory(device: str | torch.device) -> int:

@@ -132,12 +132,13 @@ def test_adam_on_rows_equals_the_plain_one():
             values[:, step] = 0  # entries without a gradient within a touched row
             param.grad = torch.sparse_coo_tensor(rows[None], values, param.shape)
             optimizer.step()
-        return param.data, optimizer.state[param]["exp_avg"], optimizer.state[param]["exp_avg_sq"]
+        return param.data, optimizer.state[param]["moments"].float()
 
     fast, plain = work(), by_torch(work)
     assert (plain[0] - normal(500, 9)).abs().max() > 0.2
-    for a, b in zip(fast, plain, strict=True):
-        assert ((a - b).abs() <= 3e-6 * (1 + b.abs())).all()
+    for a, b in zip(fast, plain, strict=True):  # here and there a moment falls on the other side of a half
+        off = (a - b).abs()
+        assert (off <= 4e-6 * (1 + b.abs())).float().mean() > 0.995 and (off <= 2**-7 * b.abs() + 1e-3).all()
 
 
 # Colours -------------------------------------------------------------------------------------------------------------

@@ -44,8 +44,14 @@ def run(param, grads, optimizer):
     return param
 
 
-@pytest.mark.parametrize("layout", ["dense", "sparse", "duplicates"])
-@pytest.mark.parametrize(("dtype", "error"), [(torch.float32, 2e-6), (torch.float64, 1e-14)])
+@pytest.mark.parametrize(
+    ("layout", "dtype", "error"),
+    [
+        ("dense", torch.float32, 2e-6),
+        *((layout, torch.float64, 1e-14) for layout in ("dense", "sparse", "duplicates")),
+        *((layout, torch.float32, 5e-3) for layout in ("sparse", "duplicates")),  # moments in bfloat16: 2^-9 a step
+    ],
+)
 def test_everything_touched_equals_torchs_adam(layout, dtype, error):
     grads = gradients((8, 3), dtype=dtype)
     wanted = Parameter(table(dtype=dtype))
@@ -84,9 +90,8 @@ def test_untouched_rows_keep_every_bit_and_their_moments(layout):
         optimizer.step()
     state = optimizer.state[param]
     assert torch.equal(param[rest], before[0][rest]) and (param[touched] != before[0][touched]).all()
-    for name in ("exp_avg", "exp_avg_sq"):
-        assert torch.equal(state[name][rest], before[1][name][rest])
-        assert (state[name][touched] != before[1][name][touched]).all()
+    assert torch.equal(state["moments"][rest], before[1]["moments"][rest])
+    assert (state["moments"][touched] != before[1]["moments"][touched]).all()
 
 
 @pytest.mark.parametrize("layout", ["dense", "sparse"])
@@ -101,8 +106,8 @@ def test_entries_with_zero_gradient_are_skipped_within_a_touched_row(layout):
     optimizer.step()
     changed = (param != before).nonzero().tolist()
     assert changed == [[4, 1]]
-    assert (optimizer.state[param]["exp_avg"] != moments["exp_avg"]).nonzero().tolist() == [[4, 1]]
-    assert (optimizer.state[param]["exp_avg_sq"] != moments["exp_avg_sq"]).nonzero().tolist() == [[4, 1]]
+    changed = (optimizer.state[param]["moments"] != moments["moments"]).nonzero().tolist()
+    assert changed == [[4, 0, 1], [4, 1, 1]], "mean and variance"
 
 
 def test_duplicates_that_cancel_touch_nothing():
@@ -150,14 +155,17 @@ def test_parameters_without_gradient_stay_bit_identical():
     assert not torch.equal(moving, table())
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("layout", ["dense", "sparse"])
-def test_resumed_run_equals_an_uninterrupted_one(layout, tmp_path):
-    grads = [g if layout == "dense" else sparse([0, 3, 4], g[:3], g.shape) for g in gradients((8, 3), 6)]
-    whole = Parameter(table())
+def test_resumed_run_equals_an_uninterrupted_one(layout, dtype, tmp_path):
+    grads = [g if layout == "dense" else sparse([0, 3, 4], g[:3], g.shape) for g in gradients((8, 3), 6, dtype)]
+    whole = Parameter(table(dtype=dtype))
     run(whole, [g.clone() for g in grads], TouchedAdam([whole], **SETTINGS))
-    first = Parameter(table())
+    first = Parameter(table(dtype=dtype))
     optimizer = TouchedAdam([first], **SETTINGS)
     run(first, [g.clone() for g in grads[:3]], optimizer)
+    in_short = layout == "sparse" and dtype == torch.float32
+    assert optimizer.state[first]["moments"].dtype == (torch.bfloat16 if in_short else dtype)
     torch.save({"optimizer": optimizer.state_dict(), "param": first.data}, tmp_path / "c.pt")
     saved = torch.load(tmp_path / "c.pt", weights_only=True)
     second = Parameter(saved["param"])
@@ -175,7 +183,7 @@ def test_moments_follow_the_blocks_that_are_kept():
     optimizer.keep_blocks(param, kept, 2)
     rows = torch.tensor([0, 1, 4, 5, 6, 7])
     state = optimizer.state[param]
-    assert all(torch.equal(state[m], before[m][rows]) for m in ("exp_avg", "exp_avg_sq"))
+    assert torch.equal(state["moments"], before["moments"][rows])
     assert state["step"] == before["step"]
     optimizer.keep_blocks(Parameter(torch.zeros(4, 1)), kept, 2)  # one that was never seen
 
@@ -219,9 +227,10 @@ def test_adam_on_rows_equals_the_plain_one_to_the_last_bits():
             if step % 2:
                 param.grad = param.grad.coalesce()
             optimizer.step()
-        return param.data, optimizer.state[param]["exp_avg"], optimizer.state[param]["exp_avg_sq"]
+        return param.data, optimizer.state[param]["moments"].float()
 
     fast, plain = both(work)
     assert (plain[0] - normal(500, 9)).abs().max() > 0.3
-    for a, b in zip(fast, plain, strict=True):
-        assert ((a - b).abs() <= 2e-6 * (1 + b.abs())).all()
+    for a, b in zip(fast, plain, strict=True):  # here and there a moment falls on the other side of a half
+        off = (a - b).abs()
+        assert (off <= 4e-6 * (1 + b.abs())).float().mean() > 0.995 and (off <= 2**-7 * b.abs() + 1e-3).all()

@@ -188,7 +188,7 @@ def test_the_empty_brick_never_changes(monkeypatch, route):
         table = getattr(field, name)
         assert (table[:BRICK] == empty).all() and not torch.equal(table, before[name])
         assert not table.grad.to_dense()[:BRICK].any()
-        assert not optimizer.state[table]["exp_avg"][:BRICK].any()
+        assert not optimizer.state[table]["moments"][:BRICK].any()
     assert not field.touched[:BRICK].any() and field.touched.any()
 
 
@@ -292,7 +292,7 @@ def test_moments_and_marks_follow_their_texels():
     def by_texel(grids, table):
         return torch.cat([table.detach()[grid.rows] for grid in grids])
 
-    states = [optimizer.state[t][m] for t in tables.values() for m in ("exp_avg", "exp_avg_sq")]
+    states = [optimizer.state[t]["moments"] for t in tables.values()]
     before = [by_texel(grids, t) for t in (*tables.values(), *states, field.touched)]
     field.peak = torch.rand(count + 1, generator=torch.Generator().manual_seed(0))
     field.crossings.fill_(1e9)
@@ -301,7 +301,7 @@ def test_moments_and_marks_follow_their_texels():
     kept = field.release_unused(0.5)
     for table in tables.values():
         optimizer.keep_blocks(table, kept, BRICK)
-    states = [optimizer.state[t][m] for t in tables.values() for m in ("exp_avg", "exp_avg_sq")]
+    states = [optimizer.state[t]["moments"] for t in tables.values()]
     after = [by_texel(field.grids, t) for t in (*tables.values(), *states, field.touched)]
     assert 0 < field.num_bricks < count and all(tables[n] is getattr(field, n) for n in TABLES)
     for a, b in zip(before, after, strict=True):

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import platform
 import re
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -76,3 +79,25 @@ def test_the_largest_window_decides_what_memory_is_told():
     windows = WindowedPlan(tuple(Window((x, 0.0, 0.0), 1.0, 0.1, plan) for x in (0.0, 2.0)))
     said = describe(windows, 40, [2 * 2**30, 3 * 2**30], [2**30, 2**29])
     assert "2 windows of 40 steps" in said and "at most 3.50 GiB (tables and moments 3.00, pixels 0.50)" in said
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another C library")
+def test_what_a_step_frees_is_there_for_the_next_one():
+    """Page faults of arrays that are taken and freed again and again, in a process of its own."""
+    work = """if True:
+        import resource, torch
+        from mmpi_ns.utils.machine import keep_freed_memory
+        def faults():
+            before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+            for _ in range(5):
+                parts = [torch.ones(1 << 20) for _ in range(8)]
+                del parts
+            return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+        first = faults()
+        assert keep_freed_memory()
+        faults()
+        print(first, faults())
+    """
+    said = subprocess.run([sys.executable, "-c", work], capture_output=True, text=True, check=True).stdout
+    before, after = map(int, said.split())
+    assert after < 100 < before

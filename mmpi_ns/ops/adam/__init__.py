@@ -24,8 +24,7 @@ class AdamConstants(NamedTuple):
 
 def adam_rows(
     param: Float[Tensor, "T C"],
-    mean: Float[Tensor, "T C"],
-    square: Float[Tensor, "T C"],
+    moments: Float[Tensor, "T 2 C"],
     rows: Int[Tensor, "U"],
     grad: Float[Tensor, "U C"],
     constants: AdamConstants,
@@ -34,10 +33,9 @@ def adam_rows(
 
     Args:
         param: the table.
-        mean: its first moment.
-        square: its second moment.
+        moments: mean and uncentred variance of the gradients, in bfloat16 or in the table's precision.
         rows: which rows, each once.
         grad: their gradients.
         constants: of the step.
     """
-    dispatch.run("adam_rows", param, mean, square, rows, grad, constants)
+    dispatch.run("adam_rows", param, moments, rows, grad, constants)

@@ -3,28 +3,46 @@
 
 #include <cmath>
 
+namespace {
+
+// Numbers in bfloat16 are the upper halves of floats; the nearest, and of two the even one.
+float widen(uint16_t half) {
+    const uint32_t bits = uint32_t(half) << 16;
+    float x;
+    __builtin_memcpy(&x, &bits, sizeof x);
+    return x;
+}
+
+uint16_t narrow(float x) {
+    uint32_t bits;
+    __builtin_memcpy(&bits, &x, sizeof bits);
+    return uint16_t((bits + 0x7fff + ((bits >> 16) & 1)) >> 16);
+}
+
+} // namespace
+
 extern "C" {
 
-// Adam on distinct rows; entries whose gradient is exactly 0 are left alone.
+// Adam on distinct rows; entries whose gradient is exactly 0 are left alone. `moments` [T, 2, channels], means and
+// uncentred variances, are in bfloat16.
 void mmpi_adam_rows(const int64_t* rows, int64_t begin, int64_t end, int64_t channels, const float* grad, float* param,
-                    float* mean, float* square, float beta1, float beta2, float correction, float eps, float rate) {
+                    uint16_t* moments, float beta1, float beta2, float correction, float eps, float rate) {
     for (int64_t i = begin; i < end; i++) {
         if (i + AHEAD < end) {
-            const int64_t next = rows[i + AHEAD] * channels;
-            prefetch_row(param + next, channels);
-            prefetch_row(mean + next, channels);
-            prefetch_row(square + next, channels);
+            prefetch_row(param + rows[i + AHEAD] * channels, channels);
+            prefetch_row(moments + rows[i + AHEAD] * 2 * channels, 2 * channels);
         }
-        const float* g = grad + i * channels;
-        float *p = param + rows[i] * channels, *m = mean + rows[i] * channels, *s = square + rows[i] * channels;
+        const float* __restrict g = grad + i * channels;
+        float* __restrict value = param + rows[i] * channels;
+        uint16_t* __restrict mean = moments + rows[i] * 2 * channels;
         for (int64_t c = 0; c < channels; c++) {
             const bool touched = g[c] != 0;
-            const float new_mean = m[c] + (1 - beta1) * (g[c] - m[c]);
-            const float new_square = s[c] * beta2 + (1 - beta2) * g[c] * g[c];
+            const float m = widen(mean[c]), s = widen(mean[channels + c]);
+            const float new_mean = m + (1 - beta1) * (g[c] - m), new_square = s * beta2 + (1 - beta2) * g[c] * g[c];
             const float step = rate * (new_mean / (std::sqrt(new_square) / correction + eps));
-            m[c] = touched ? new_mean : m[c];
-            s[c] = touched ? new_square : s[c];
-            p[c] = touched ? p[c] - step : p[c];
+            mean[c] = touched ? narrow(new_mean) : mean[c];
+            mean[channels + c] = touched ? narrow(new_square) : mean[channels + c];
+            value[c] = touched ? value[c] - step : value[c];
         }
     }
 }

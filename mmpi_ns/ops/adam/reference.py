@@ -3,22 +3,25 @@
 from __future__ import annotations
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 
-def adam_rows(param: Tensor, mean: Tensor, square: Tensor, rows: Tensor, grad: Tensor, constants: tuple) -> None:
+def adam_rows(param: Tensor, moments: Tensor, rows: Tensor, grad: Tensor, constants: tuple) -> None:
     """See ``ops.adam``."""
-    new = adam(param.index_select(0, rows), mean.index_select(0, rows), square.index_select(0, rows), grad, constants)
-    for table, fresh in zip((param, mean, square), new, strict=True):
-        table.index_copy_(0, rows, fresh)
+    fresh, known = adam(param.index_select(0, rows), moments.index_select(0, rows), grad, constants)
+    param.index_copy_(0, rows, fresh)
+    moments.index_copy_(0, rows, known)
 
 
-def adam(param: Tensor, mean: Tensor, square: Tensor, grad: Tensor, constants: tuple) -> tuple[Tensor, Tensor, Tensor]:
-    """New values and moments of entries of any shape; ``constants`` as ``ops.adam.AdamConstants``."""
+def adam(
+    param: Float[Tensor, "N *C"], moments: Float[Tensor, "N 2 *C"], grad: Float[Tensor, "N *C"], constants: tuple
+) -> tuple[Tensor, Tensor]:
+    """New values and moments; ``constants`` as ``ops.adam.AdamConstants``."""
     beta1, beta2, correction, eps, rate = constants
-    touched = grad != 0
+    touched, (mean, square) = grad != 0, moments.to(param.dtype).unbind(1)
     mean = torch.where(touched, mean.lerp(grad, 1 - beta1), mean)
     square = torch.where(touched, (square * beta2).addcmul_(grad, grad, value=1 - beta2), square)
     delta = mean / square.sqrt().div_(correction).add_(eps)
     delta = torch.where(touched, delta, torch.zeros_like(delta))
-    return param - delta.mul_(rate), mean, square
+    return param - delta.mul_(rate), torch.stack([mean, square], 1).to(moments.dtype)
