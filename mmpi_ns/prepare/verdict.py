@@ -10,6 +10,7 @@ import numpy as np
 
 from mmpi_ns.prepare.evidence import (
     Agreement,
+    Array,
     Witness,
     agreement,
     bridges,
@@ -33,6 +34,8 @@ BRIDGED = (0.5, 0.25)
 """Share of the matches across each gap between frames that must have become points..."""
 BRIDGED_OF_USUAL = (0.6, 0.35)
 """... and the same as a share of what the other gaps have."""
+EDGE = 3
+"""Images at an end of which a break says little of the track."""
 LOOSE = 0.25
 """Share of an image's matches that must have become points, or its pose is doubted."""
 JUMP = 5.0
@@ -96,10 +99,9 @@ def _breaks(witness: Witness) -> list[tuple[Grade, str]]:
     if np.isnan(across).all():
         return []
     usual = float(np.nanmedian(across))
-    worst = int(np.nanargmin(across))
-    held = float(across[worst])
-    grades = worse(held, BRIDGED), worse(held / max(usual, 1e-9), BRIDGED_OF_USUAL)
-    grade: Grade = grades[0] if ORDER.index(grades[0]) > ORDER.index(grades[1]) else grades[1]
+    grades: list[Grade] = [_grade_of_gap(across, gap, usual) for gap in range(len(across))]
+    worst = max(range(len(across)), key=lambda gap: (ORDER.index(grades[gap]), -np.nan_to_num(across[gap], nan=1.0)))
+    held, grade = across[worst], grades[worst]
     where = _between(witness, worst)
     says = f"The track breaks {where}: {held:.0%} of the matches across became points, {usual:.0%} elsewhere."
     found: list[tuple[Grade, str]] = [(grade, says)]
@@ -123,6 +125,15 @@ def _breaks(witness: Witness) -> list[tuple[Grade, str]]:
         where = f"{changes[at]:.1f} times at {witness.images[at]}"
         found.append(("doubtful", f"The speed changes {where}, where few matches hold: the scale may break there."))
     return found
+
+
+def _grade_of_gap(across: Array, gap: int, usual: float) -> Grade:
+    """Of one gap, by the share of the matches across it that became points; few matches say nothing."""
+    held = float(across[gap])
+    absolute, relative = worse(held, BRIDGED), worse(held / max(usual, 1e-9), BRIDGED_OF_USUAL)
+    grade = absolute if ORDER.index(absolute) > ORDER.index(relative) else relative
+    at_an_end = min(gap + 1, len(across) - gap) < EDGE  # a few images may have few points, and their place all the same
+    return "doubtful" if at_an_end and grade == "broken" else grade
 
 
 def _between(witness: Witness, gap: int) -> str:

@@ -54,6 +54,18 @@ def test_jump_along_the_way_is_broken_though_epipolar_lines_do_not_see_it(keypoi
     assert "between frame_011 and frame_012" in verdict.words() and "usual steps" in verdict.words()
 
 
+def test_a_break_before_the_last_image_is_doubtful_and_believed_where_two_mappers_agree(sound):
+    pairs = sound.pairs
+    tracked = np.where(pairs.second == 23, 0.1 * pairs.matches, pairs.tracked)
+    witness = replace(sound, pairs=replace(pairs, tracked=tracked))
+    verdict = judge_alone(witness, is_sequence=True)
+    assert verdict.grade == "doubtful" and "between frame_022 and frame_023" in verdict.words()
+    assert judge_together(witness, sound, True).grade == "right"
+    inside = np.where((pairs.first < 12) & (pairs.second >= 12), 0.15 * pairs.matches, tracked)
+    verdict = judge_alone(replace(sound, pairs=replace(pairs, tracked=inside)), is_sequence=True)
+    assert verdict.grade == "broken" and "between frame_011 and frame_012" in verdict.words()
+
+
 def test_scale_that_breaks_half_way_is_not_right(keypoints):
     verdict = judge_alone(witness_with(moved(np.s_[12:], scale=0.3, about=11), *keypoints), is_sequence=True)
     assert verdict.grade != "right" and "frame_01" in verdict.words()

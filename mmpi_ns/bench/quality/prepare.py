@@ -136,7 +136,7 @@ def headline(rows: list[Row]) -> Row:
     green = [r for r in rows if r["grade"] == "right"]
     return {
         "captures": len(rows),
-        "right": sum(not r["is_wrong"] for r in green),
+        "right": sum(not r.get("is_wrong", True) for r in green),
         "false_green": sum(r.get("is_wrong", True) for r in green),
         "false_red": sum(r["grade"] != "right" and not r.get("is_wrong", True) for r in rows),
     }
