@@ -34,7 +34,7 @@ from mmpi_ns.scene.texels import TexelGrid
 THINNEST = -12.0
 """Raw density that the code 0 stands for at least: softplus of it is 6e-6."""
 HIGHEST = 127
-"""Largest code of a channel: seven bits give 53 dB to the exact renderer and a fifth less to load than eight."""
+"""Largest code of a channel: seven bits give 52 dB to the exact renderer and a fifth less to load than eight."""
 
 
 @dataclass(frozen=True, eq=False)
