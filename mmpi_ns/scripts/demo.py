@@ -17,11 +17,11 @@ from typing import Any
 
 import tyro
 
-PARTS = 5
+PARTS = 6
 FREE_BYTES = 2 << 30
 """What a demo may need on the disk: checkpoints are the most of it."""
 OURS = ("street", "runs", "fly", "unfinished.mp4", "fly.mp4", "times.json", "eval.json", "contact-sheet.png",
-        "overview.png", "psnr.png")  # fmt: skip
+        "overview.png", "psnr.png", "street.html")  # fmt: skip
 """What the demo writes, and removes when it starts afresh."""
 
 
@@ -58,6 +58,8 @@ class Demo:
         film = self._take_pictures()
         self._part(5, "PSNR against seconds")
         self._draw_curve()
+        self._part(6, "a page to fly through")
+        self._write_page()
         self._say_where(results, film, time.perf_counter() - start)
 
     @property
@@ -67,6 +69,10 @@ class Demo:
     @property
     def run(self) -> Path:
         return self.folder / "runs" / "street" / "mmpi-small" / "demo"
+
+    @property
+    def page(self) -> Path:
+        return self.folder / "street.html"
 
     @property
     def checkpoint(self) -> Path:
@@ -164,12 +170,20 @@ class Demo:
         started = json.loads(times.read_text(encoding="utf-8"))["started"]
         draw_curve(self.run, self.folder / "psnr.png", started, f"mmpi-small, {self.steps} steps on the demo's street")
 
+    def _write_page(self) -> None:
+        if not self._is_newer(self.page):
+            self._command(
+                "mmpi-export", "web", "--load-config", str(self.run / "config.yml"), "--output", str(self.page),
+                "--single-file", "--overwrite", "--compare", "0",
+            )  # fmt: skip
+
     def _say_where(self, results: dict[str, Any], film: Path, seconds: float) -> None:
         film_note = "the fly-through" if film.suffix else "the fly-through as frames (no encoder was found)"
         print(
             f"\nDone in {seconds // 60:.0f} min {seconds % 60:.0f} s. PSNR {results['psnr']:.2f} dB, "
             f"SSIM {results['ssim']:.3f} over {self.images // 2} images held out.\n\nOpen first:\n"
             f"  {self.folder / 'contact-sheet.png'}   what each MPI does\n"
+            f"  {self.page}   the street in a browser: open it by a double click, drag and press W\n"
             f"  {film}   {film_note}\n"
             f"  {self.folder / 'psnr.png'}   PSNR against seconds\n"
             f"  {self.folder / 'overview.png'}   one view, and where the MPIs stand\n\n"
