@@ -89,7 +89,7 @@ def trainer_config(data: Path, plan: Path, output: Path, steps=24, **model):
     config.vis = "tensorboard"
     config.data = config.pipeline.datamanager.data = data
     config.pipeline.datamanager.train_num_rays_per_batch = 64
-    config.pipeline.datamanager.keypoint_rays = 16
+    config.pipeline.datamanager.keypoint_rays, config.pipeline.datamanager.new_view_share = 16, 0.0
     settings = {
         "plan_file": plan,
         "training": "two-phase",

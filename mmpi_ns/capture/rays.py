@@ -33,7 +33,7 @@ class PinholeRays:
         if not plain or (distortion is not None and bool((distortion != 0).any())):
             return None
         focal, principal = torch.cat([cameras.fx, cameras.fy], -1), torch.cat([cameras.cx, cameras.cy], -1)
-        return PinholeRays(*(x.to(device) for x in (cameras.camera_to_worlds, focal, principal)))
+        return PinholeRays(*(x.to(device, torch.float32) for x in (cameras.camera_to_worlds, focal, principal)))
 
     def __call__(self, ray_indices: Int[Tensor, "R 3"]) -> RayBundle:
         """Rays through pixel centres. Their pixels' areas, which nobody here reads, are left at 1.

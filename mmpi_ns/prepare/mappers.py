@@ -48,6 +48,8 @@ class Believed:
     verdict: Verdict
     says: str
     """Both mappers in words."""
+    rest: tuple[pycolmap.Reconstruction, ...]
+    """The other models of both mappers: what is not connected to the first is in one of them."""
 
 
 def map_and_judge(
@@ -182,4 +184,5 @@ def _choose(found: Sequence[Candidate], is_ordered: bool) -> Believed:
     says = chosen.says
     if other is not None:
         says += f"; beside it {other.says}, {judge_alone(other.witness, is_ordered).grade} by itself"
-    return Believed(chosen, verdict, says)
+    rest = (*chosen.models[1:], *(other.models if other else ()))
+    return Believed(chosen, verdict, says, rest)

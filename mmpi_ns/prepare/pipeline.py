@@ -219,7 +219,7 @@ class Preparation:
             is_sequence=self.matching.startswith("sequential"),
             is_ordered=self.is_video or pairs.are_numbered(names),
         )
-        found, model = believed.candidate, believed.candidate.model
+        model = believed.candidate.model
         free = Free(
             lens=not self.is_fixed,
             full_lens=not self.is_fixed and s.lens == "auto",
@@ -228,8 +228,11 @@ class Preparation:
         )
         model = polish(model, free, s.threads)
         here = set(camera_poses(model)[0])
-        groups = [sorted(set(camera_poses(m)[0]) - here) for m in found.models[1:]]
-        return Solved(model, believed.says, [g for g in groups if len(g) > 2], believed.verdict)
+        groups = []
+        for other in believed.rest:
+            group = set(camera_poses(other)[0]) - here.union(*groups)
+            groups += [sorted(group)] if len(group) > 2 else []
+        return Solved(model, believed.says, groups, believed.verdict)
 
     def _known(self, database: Path) -> Solved:
         s = self.settings

@@ -103,7 +103,7 @@ def test_ops_end_to_end_and_again(scene, tmp_path, monkeypatch):
     assert all(isinstance(v, int | float) and math.isfinite(v) and v > 0 for v in found["headline"].values())
     for stage in ("early", "late"):
         counts, rows = found["rows"][stage]["counts"], found["rows"][stage]["ops"]
-        assert counts["pixels"] == 64 and 0 < counts["kept"] <= counts["live"] and len(rows) == 12
+        assert counts["pixels"] == 64 * 1.75 and 0 < counts["kept"] <= counts["live"] and len(rows) == 12
         assert counts["rows"] <= 4 * counts["kept"]
         assert f"{stage}_interpolation_backward_ms" in found["headline"]
         assert f"{stage}_adam_of_limit" in found["headline"]

@@ -131,7 +131,7 @@ def test_a_rendering_that_is_interrupted_anywhere_changes_nothing_and_holds_no_l
             break
         lines.add(line)
         assert not model.store._lock.locked(), line
-        number += 1 if number < 100 else 1 + number // 12  # the store is asked early
+        number += 1 if number < 400 else 1 + number // 12  # the store is asked early
     assert len(lines) > 20 and any("window_store" in line for line in lines)
     assert differences(dict(model.state_dict()), trained) == []
     outputs = model.get_outputs_for_camera(camera)

@@ -61,7 +61,7 @@ def test_a_window_draws_from_its_own_cameras_alone(whole):
     manager.train()
     bundle, _ = manager.next_train(2 * STEPS)
     beyond = (bundle.origins - torch.tensor(window.center)).norm(dim=-1)
-    assert len(bundle) > 64 and beyond.max() < window.radius + window.margin
+    assert len(bundle) == 80 and beyond.max() < window.radius + window.margin
     centers = torch.from_numpy(manager.observations.centers)
     assert ((centers - torch.tensor(window.center)).norm(dim=-1) > window.radius + window.margin).any()
 
@@ -291,6 +291,7 @@ def torchrun(scene, windows_file, output, processes, *options):
     command += ["--experiment-name", "tiny", "--timestamp", "run", "--max-num-iterations", str(STEPS)]
     command += ["--machine.device-type", "cpu", "--vis", "tensorboard", "--pipeline.model.plan-file", str(windows_file)]
     command += ["--pipeline.datamanager.train-num-rays-per-batch", "64", "--pipeline.datamanager.keypoint-rays", "16"]
+    command += ["--pipeline.datamanager.new-view-share", "0"]
     command += ["--pipeline.model.hidden-width", "8", "--pipeline.model.feature-channels", "4"]
     command += ["--pipeline.model.growth-shares", "0.25", "0.5", "--pipeline.model.release-weight", "0.0"]
     command += ["--steps-per-save", "2", *options]
