@@ -31,9 +31,6 @@ FAR_OFF = 1000.0
 """A camera that is so many times as far off as all but a few others is a mistake."""
 FEW = 0.1
 """Share of the cameras that are a few."""
-FLOAT32_STEP = 2.0**-23
-LEAST_DIGITS = 0.01
-"""Share of the usual distance between two cameras that float32 must be able to tell apart."""
 PATHS = ("file_path", "mask_path", "depth_file_path")
 ORIENTATIONS = ("pca", "up", "vertical", "none")
 
@@ -68,11 +65,12 @@ def check_transforms(parser: NerfstudioDataParserConfig, data: Path, splits: Seq
     files = [str(frame[key]) for frame in frames for key in PATHS if key in frame]
     outside = [n for n in files if not (path.parent / n).resolve().is_relative_to(path.parent.resolve())]
     if outside:
-        _say_once(f"{len(outside)} file(s) of {path} lie outside its folder, for example {cut(outside[0])}.")
+        say_once(f"{len(outside)} file(s) of {path} lie outside its folder, for example {cut(outside[0])}.")
 
 
 @cache
-def _say_once(text: str) -> None:
+def say_once(text: str) -> None:
+    """Prints a note, unless it has been printed."""
     CONSOLE.print(text)
 
 
@@ -212,7 +210,7 @@ def _check_first_image(factor: int | None, folder: Path, first: str) -> None:
 
 
 def _check_places(centers: NDArray[np.float64], names: Sequence[str], path: Path, *, auto_scale: bool) -> None:
-    """Places that float32, in which nerfstudio holds them, can tell apart."""
+    """Places that differ, and none far from all others."""
     if in_one_place(centers, FLOAT64_SAME):
         if not auto_scale:
             return
@@ -229,12 +227,4 @@ def _check_places(centers: NDArray[np.float64], names: Sequence[str], path: Path
         raise InputError(
             f"The camera of frame {cut(names[order[-1]])} of {path} stands {off[order[-1]]:.3g} from the others, which "
             f"lie within {usual:.3g}: correct its transform_matrix or remove the frame."
-        )
-    extent = float(np.ptp(centers, axis=0).max())
-    if np.abs(centers).max() * FLOAT32_STEP > LEAST_DIGITS * extent / len(centers):
-        offset = ", ".join(f"{x:.6g}" for x in middle)
-        raise InputError(
-            f"The cameras of {path} stand {np.abs(centers).max():.3g} from the origin and within {extent:.3g} of each "
-            f"other, more digits than float32 has: subtract a common offset, for example ({offset}), from the last "
-            "column of every transform_matrix and from the points of a COLMAP model beside it."
         )

@@ -24,6 +24,7 @@ from torch import Tensor
 from mmpi_ns.capture.checks import check_transforms
 from mmpi_ns.capture.dataset import MMPIDataset
 from mmpi_ns.capture.known_depth import KnownDepth, know_depths, with_known_depths
+from mmpi_ns.capture.local_origin import take_local_origins
 from mmpi_ns.capture.new_views import SharedPoints, find_shared_points
 from mmpi_ns.capture.observe import observe, posed_images, sfm_folder
 from mmpi_ns.capture.pixels import PixelPool, pixel_bytes
@@ -92,6 +93,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
             mode = kwargs.get("test_mode", "val")
             splits = ("train", "val" if mode == "val" else "test")
             check_transforms(parser, Path(config.data or parser.data), splits, opens=mode != "inference")
+        take_local_origins(parser)
         super().__init__(config, **kwargs)
 
     def create_train_dataset(self) -> MMPIDataset:

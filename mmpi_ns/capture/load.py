@@ -12,6 +12,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from mmpi_ns.capture.checks import check_transforms
 from mmpi_ns.capture.datamanager import MMPIDataManagerConfig
 from mmpi_ns.capture.dataset import MMPIDataset
+from mmpi_ns.capture.local_origin import take_local_origins
 from mmpi_ns.capture.observe import observe, sfm_folder
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.utils.errors import InputError
@@ -45,6 +46,7 @@ def load_observations(data: Path, downscale_factor: int | None = None, parser: P
     parser_config.downscale_factor = downscale_factor  # type: ignore[attr-defined]
     if isinstance(parser_config, NerfstudioDataParserConfig):
         check_transforms(parser_config, data, ("train",), opens=True)
+    take_local_origins(parser_config)
     outputs = parser_config.setup().get_dataparser_outputs(split="train")
     if any(Path(name).is_file() for name in outputs.image_filenames):
         # As ns-train does, so that it refuses what ns-train would refuse; placement asks for no depths of pixels.

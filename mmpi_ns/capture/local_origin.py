@@ -1,0 +1,119 @@
+"""Captures in map coordinates: a local origin, taken in float64 before nerfstudio's parsers round places to float32."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from nerfstudio.data.dataparsers import nerfstudio_dataparser
+from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig, DataparserOutputs
+from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParser
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio
+from plyfile import PlyData
+from torch import Tensor
+
+from mmpi_ns.capture.checks import say_once
+
+FAR = 10.0
+"""Cameras so many times as far from the origin as from each other get an origin among them."""
+
+
+class MapOutputs(DataparserOutputs):
+    """What a parser says of a capture in map coordinates; its transform is in float64."""
+
+    def transform_poses_to_original_space(
+        self, poses: Tensor, camera_convention: Literal["opengl", "opencv"] = "opencv"
+    ) -> Tensor:
+        return super().transform_poses_to_original_space(poses.double(), camera_convention)
+
+
+class LocalOrigin:
+    """The origin of one capture, in the axes in which its poses are saved."""
+
+    def __init__(self, meta: dict[str, Any], source: Path) -> None:
+        """Moves the poses of a transforms.json, or of what was read from a COLMAP model, where they are far off."""
+        poses = np.array([frame["transform_matrix"] for frame in meta["frames"]], dtype=np.float64)
+        applied = np.array(meta.get("applied_transform", np.eye(4)[:3]), dtype=np.float64)
+        centers = poses[:, :3, 3]
+        self.place, self.applied = centers.mean(0), applied[:, 3]
+        extent = float(np.ptp(centers, axis=0).max())
+        self.taken = bool(max(np.abs(self.place).max(), np.abs(self.applied).max()) > FAR * extent)
+        self._meta: Mapping[str, Any] = meta
+        if not self.taken:
+            return
+        poses[:, :3, 3] -= self.place
+        for frame, pose in zip(meta["frames"], poses, strict=True):
+            frame["transform_matrix"] = pose.tolist()
+        if "applied_transform" in meta:
+            meta["applied_transform"] = np.c_[applied[:, :3], np.zeros(3)].tolist()
+        say_once(f"{source} has map coordinates: they are taken from ({', '.join(f'{x:.10g}' for x in self.place)}).")
+
+    def tell(self, outputs: DataparserOutputs) -> DataparserOutputs:
+        """Gives the transform from the capture's own coordinates, in float64, for the points of a model."""
+        if self.taken:
+            own = np.array(self._meta.get("applied_transform", np.eye(4)[:3]), dtype=np.float64)  # the parser adds one
+            found = outputs.dataparser_transform.double().numpy().copy()
+            found[:, 3] += found[:, :3] @ np.linalg.solve(own[:, :3], self.applied - self.place)
+            return MapOutputs(**{**vars(outputs), "dataparser_transform": torch.from_numpy(found)})
+        return outputs
+
+
+class LocalNerfstudio(Nerfstudio):
+    """nerfstudio's parser of a transforms.json."""
+
+    _origin: LocalOrigin
+
+    def _generate_dataparser_outputs(self, split: str = "train") -> DataparserOutputs:
+        read = nerfstudio_dataparser.load_from_json
+
+        def read_near(path: Path) -> dict[str, Any]:
+            meta = read(path)
+            self._origin = LocalOrigin(meta, path)
+            return meta
+
+        # The parser reads and rounds in one function: this is the one place between.
+        nerfstudio_dataparser.load_from_json = read_near
+        try:
+            outputs = super()._generate_dataparser_outputs(split)
+        finally:
+            nerfstudio_dataparser.load_from_json = read
+        return self._origin.tell(outputs)
+
+    def _load_3D_points(self, ply_file_path: Path, transform_matrix: Tensor, scale_factor: float) -> Any:
+        if not self._origin.taken:
+            return super()._load_3D_points(ply_file_path, transform_matrix, scale_factor)
+        cloud = PlyData.read(ply_file_path)["vertex"]
+        far, colors = (np.stack([cloud[n] for n in names], -1) for names in (("x", "y", "z"), ("red", "green", "blue")))
+        local = torch.from_numpy(far.astype(np.float64) - self._origin.place).float()
+        points = (local @ transform_matrix[:, :3].T + transform_matrix[:, 3]) * scale_factor
+        return {"points3D_xyz": points, "points3D_rgb": torch.from_numpy(colors)} if len(points) else None
+
+
+class LocalColmap(ColmapDataParser):
+    """nerfstudio's parser of a COLMAP model."""
+
+    _origin: LocalOrigin
+
+    def _get_all_images_and_cameras(self, recon_dir: Path) -> dict[str, Any]:
+        meta = super()._get_all_images_and_cameras(recon_dir)
+        self._origin = LocalOrigin(meta, recon_dir)
+        return meta
+
+    def _generate_dataparser_outputs(self, split: str = "train", **kwargs: Any) -> DataparserOutputs:
+        outputs = super()._generate_dataparser_outputs(split, **kwargs)
+        return self._origin.tell(outputs)
+
+    def _load_3D_points(self, colmap_path: Path, transform_matrix: Tensor, scale_factor: float) -> Any:
+        # In float32. The model's points and tracks are read by ``find_sfm_model``, in float64.
+        return {} if self._origin.taken else super()._load_3D_points(colmap_path, transform_matrix, scale_factor)
+
+
+TARGETS: dict[type, type] = {Nerfstudio: LocalNerfstudio, ColmapDataParser: LocalColmap}
+
+
+def take_local_origins(config: DataParserConfig) -> None:
+    """Makes a parser's settings build the one that reads map coordinates, where there is one."""
+    config._target = TARGETS.get(config._target, config._target)
