@@ -12,7 +12,6 @@ from nerfstudio.data.dataparsers import nerfstudio_dataparser
 from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig, DataparserOutputs
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParser
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio
-from plyfile import PlyData
 from torch import Tensor
 
 from mmpi_ns.capture.checks import say_once
@@ -85,6 +84,8 @@ class LocalNerfstudio(Nerfstudio):
     def _load_3D_points(self, ply_file_path: Path, transform_matrix: Tensor, scale_factor: float) -> Any:
         if not self._origin.taken:
             return super()._load_3D_points(ply_file_path, transform_matrix, scale_factor)
+        from plyfile import PlyData  # comes with nerfstudio's viewer
+
         cloud = PlyData.read(ply_file_path)["vertex"]
         far, colors = (np.stack([cloud[n] for n in names], -1) for names in (("x", "y", "z"), ("red", "green", "blue")))
         local = torch.from_numpy(far.astype(np.float64) - self._origin.place).float()

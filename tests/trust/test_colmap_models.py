@@ -1,4 +1,4 @@
-"""COLMAP models that were cut short or do not fit: ns-train ends with one sentence, in little memory (docs/errors.md)."""
+"""COLMAP models that were cut short or do not fit: one sentence from ns-train, in little memory (docs/errors.md)."""
 
 from __future__ import annotations
 
