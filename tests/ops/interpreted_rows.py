@@ -122,7 +122,6 @@ def test_variation_equals_the_reference_with_its_gradient(channels):
     assert torch.allclose(found[0][1], found[1][1], atol=1e-5)
 
 
-@pytest.mark.xfail(reason="moments in bfloat16 differ by more than one rounding by Triton's interpreter; cause unknown")
 def test_adam_on_rows_equals_the_plain_one():
     def work():
         param = torch.nn.Parameter(normal(500, 9))
@@ -137,8 +136,9 @@ def test_adam_on_rows_equals_the_plain_one():
 
     fast, plain = work(), by_torch(work)
     assert (plain[0] - normal(500, 9)).abs().max() > 0.2
-    for a, b in zip(fast, plain, strict=True):  # Triton's interpreter cuts bfloat16 off, where a GPU rounds
-        assert ((a - b).abs() <= 2**-6 * b.abs() + 2e-3).all()
+    for a, b in zip(fast, plain, strict=True):  # here and there a moment falls on the other side of a half
+        off = (a - b).abs()
+        assert (off <= 4e-6 * (1 + b.abs())).float().mean() > 0.995 and (off <= 2**-7 * b.abs() + 1e-3).all()
 
 
 # Colours -------------------------------------------------------------------------------------------------------------

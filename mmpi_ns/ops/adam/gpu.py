@@ -4,12 +4,28 @@
 # pyright: reportGeneralTypeIssues=false, reportCallIssue=false, reportArgumentType=false
 from __future__ import annotations
 
+import torch
 import triton
 import triton.language as tl
 from torch import Tensor
 
+from mmpi_ns.ops.adam import reference
+
 BLOCK = 1024
 """Entries of a program."""
+
+
+@triton.jit
+def _widen(half):
+    """Numbers in bfloat16 are the upper halves of floats."""
+    return (half.to(tl.int32) << 16).to(tl.float32, bitcast=True)
+
+
+@triton.jit
+def _narrow(x):
+    """The nearest number in bfloat16, of two the even one. By hand: Triton's interpreter cuts the lower half off."""
+    bits = x.to(tl.int32, bitcast=True)
+    return ((bits + 0x7FFF + ((bits >> 16) & 1)) >> 16).to(tl.int16)
 
 
 @triton.jit(do_not_specialize=("size",))
@@ -21,20 +37,21 @@ def adam_kernel(rows, grads, params, moments, size, channels, beta1, beta2, corr
     touched = g != 0
     row, channel = tl.load(rows + i // channels, inside, 0), i % channels
     at, first = row * channels + channel, moments + 2 * row * channels + channel
-    mean = tl.load(first, touched, 0.0).to(tl.float32)
-    square = tl.load(first + channels, touched, 0.0).to(tl.float32)
+    mean, square = _widen(tl.load(first, touched, 0)), _widen(tl.load(first + channels, touched, 0))
     mean += (1 - beta1) * (g - mean)
     square = square * beta2 + (1 - beta2) * g * g
     step = rate * (mean / (tl.sqrt(square) / correction + eps))
-    tl.store(first, mean.to(moments.dtype.element_ty), touched)
-    tl.store(first + channels, square.to(moments.dtype.element_ty), touched)
+    tl.store(first, _narrow(mean), touched)
+    tl.store(first + channels, _narrow(square), touched)
     tl.store(params + at, tl.load(params + at, touched, 0.0) - step, touched)
 
 
 def adam_rows(param: Tensor, moments: Tensor, rows: Tensor, grad: Tensor, constants: tuple) -> None:
     """See ``ops.adam``."""
+    if moments.dtype != torch.bfloat16:
+        return reference.adam_rows(param, moments, rows, grad, constants)
     if grad.numel():
         adam_kernel[(triton.cdiv(grad.numel(), BLOCK),)](
-            rows.contiguous(), grad.contiguous(), param, moments, grad.numel(), param.shape[1], *constants,
-            BLOCK=BLOCK,
+            rows.contiguous(), grad.contiguous(), param, moments.view(torch.int16), grad.numel(), param.shape[1],
+            *constants, BLOCK=BLOCK,
         )  # fmt: skip
