@@ -46,7 +46,7 @@ def test_wrong_kernels_are_found(monkeypatch):
     assert all(c.ok for c in gpu_checks.interpolation("cpu", 50))
     wrong = {
         "sum_rows": lambda _, values, w, count: torch.zeros(count, values.shape[1]),
-        "march": lambda *given: march(*given[:-2], None, False),  # without blending
+        "march": lambda *given: march(*given[:-1], given[-1]._replace(form=None)),  # without blending
     }
     right, march = dispatch.function, dispatch.function("march", "gpu")
     monkeypatch.setattr(dispatch, "function", lambda name, form: wrong.get(name) or right(name, form))

@@ -17,7 +17,7 @@ from nerfstudio.field_components.field_heads import FieldHeadNames
 from torch import Tensor
 
 from mmpi_ns.field.color_network import ColorNetworks
-from mmpi_ns.field.samples import Gathered, Lookup, Taps, by_head, head_spans, metadata_of
+from mmpi_ns.field.samples import Gathered, Lookup, Taps, by_head, head_spans, metadata_of, places_of
 from mmpi_ns.field.shading import RayColors, RayShader, Shading
 from mmpi_ns.field.tables import TexelTables, replace_data
 from mmpi_ns.ops.blending import log_shares
@@ -252,9 +252,7 @@ class MMPIField(TexelTables):
             found = self.get_outputs(ray_samples, lookup)[FieldHeadNames.RGB]
             return RayColors.of_samples(composite, render_colors(composite, found), found)
         if lookup is None:
-            meta = metadata_of(ray_samples)
-            heads, planes, valid = (meta[name][..., 0] for name in ("heads", "planes", "valid"))
-            sums = gather_places(self.layout, self.features.data, heads, planes, meta["ndc"], valid, composite.weights)
+            sums = gather_places(self.layout, self.features.data, places_of(ray_samples), composite.weights)
         else:
             known = lookup.gathered and lookup.gathered.features
             groups = [KnownTaps(t.rows if t.position is None else t.position, t.weights) for t in lookup.groups]
@@ -265,11 +263,9 @@ class MMPIField(TexelTables):
 
     def _shade(self, networks: ColorNetworks, ray_samples: RaySamples) -> Float[Tensor, "R S 3"]:
         """What the networks make of every sample, without gradients."""
-        meta, count = metadata_of(ray_samples), len(self.grids)
-        axes, directions = torch.stack([self._axes(k) for k in range(count)]), ray_samples.frustums.directions[:, 0]
-        heads, planes, valid = (meta[name][..., 0] for name in ("heads", "planes", "valid"))
-        samples = (heads, planes, meta["ndc"], valid)
-        return shade(self.layout, self.features.data, networks.of_heads(count), axes, directions, *samples)
+        count, directions = len(self.grids), ray_samples.frustums.directions[:, 0]
+        axes, given = torch.stack([self._axes(k) for k in range(count)]), (self.layout, self.features.data)
+        return shade(*given, networks.of_heads(count), axes, directions, places_of(ray_samples))
 
     def total_variation(self, lookup: Lookup, density_weight: float, feature_weight: float) -> Tensor:
         """Weighted total variation of the texels that the batch touched, in DVGO's normalisation (not yet per ray)."""

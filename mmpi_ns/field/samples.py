@@ -12,6 +12,7 @@ from nerfstudio.cameras.rays import RaySamples
 from torch import Tensor
 
 from mmpi_ns.ops import dispatch
+from mmpi_ns.ops.layout import Places
 
 
 @dataclass(frozen=True)
@@ -86,6 +87,12 @@ def metadata_of(ray_samples: RaySamples) -> dict[str, Tensor]:
     """What the sampler knows about each merged sample (see ``MMPISampler``)."""
     assert ray_samples.metadata is not None, "these samples do not come from MMPISampler"
     return ray_samples.metadata
+
+
+def places_of(ray_samples: RaySamples) -> Places:
+    """Where merged samples lie."""
+    meta = metadata_of(ray_samples)
+    return Places(meta["heads"][..., 0], meta["planes"][..., 0], meta["ndc"], meta["valid"][..., 0])
 
 
 def by_head(

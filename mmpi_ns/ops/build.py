@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor, wait
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -98,14 +99,27 @@ def address(tensor: Tensor, dtype: torch.dtype = torch.float32) -> ctypes.c_void
     return ctypes.c_void_p(tensor.data_ptr())
 
 
-def addresses(tensors: Iterable[Tensor]) -> list[ctypes.c_void_p]:
-    """Where the numbers of several tensors lie, which have the types that they must have."""
-    return [address(t, t.dtype) for t in tensors]
+def arguments(given: Iterable[Any]) -> list[Any]:
+    """As the compiled functions take them: where tensors lie, integers of 64 bits, floats of 32; others as they are."""
+    return [_argument(x) for x in given]
 
 
-def sizes(*numbers: int) -> list[ctypes.c_int64]:
-    """Integers as the compiled functions take them."""
-    return [ctypes.c_int64(n) for n in numbers]
+def _argument(x: Any) -> Any:
+    if isinstance(x, Tensor):  # of the type that it must have
+        return address(x, x.dtype)
+    return ctypes.c_int64(x) if isinstance(x, int) else ctypes.c_float(x) if isinstance(x, float) else x
+
+
+def call(name: str, *given: Any) -> int:
+    """Calls a compiled function."""
+    return getattr(library(), name)(*arguments(given))
+
+
+def call_in_parts(name: str, count: int, before: Iterable[Any], after: Iterable[Any], least: int = 256) -> None:
+    """Calls a compiled function of ``(*before, begin, end, *after)`` for parts of 0..count (see ``in_parts``)."""
+    function, held = getattr(library(), name), (list(before), list(after))  # tensors live until all parts are done
+    first, last = (arguments(x) for x in held)
+    in_parts(lambda begin, end: function(*first, *arguments((begin, end)), *last), count, least)
 
 
 def in_parts(work: Callable[[int, int], None], count: int, least: int = 256) -> None:

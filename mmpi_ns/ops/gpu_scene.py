@@ -17,12 +17,11 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from mmpi_ns.ops.layout import SceneLayout
-from mmpi_ns.scene.plan import MPIPlan
 
-# Columns of the constants of a head; the cube's row holds its interval alone.
+# Columns of the constants of an MPI (``SceneLayout.head_rows``).
 STEP = tl.constexpr(0)
 END = tl.constexpr(1)
-SLACK = tl.constexpr(2)
+SHARE = tl.constexpr(2)
 S_SCALE = tl.constexpr(3)
 U0 = tl.constexpr(4)
 U_SCALE = tl.constexpr(5)
@@ -48,12 +47,11 @@ INTS = tl.constexpr(9)
 class GpuScene:
     """A layout on the device (``CpuScene`` for the GPU), made once by ``GpuScene.of``."""
 
-    heads: Float[Tensor, "H 9"]
+    heads: Float[Tensor, "K 9"]
     grids: Int[Tensor, "N"]
     """See ``_pack_grids``."""
     biases: Float[Tensor, "P"]
-    cube: Float[Tensor, "8"]
-    """Lower corner, extent, step between samples, bias; zeros without a cube."""
+    cube: Float[Tensor, "9"]
     most_samples: int
     """No ray has more: planes of all MPIs, and the cube's diagonal in steps."""
 
@@ -66,21 +64,12 @@ class GpuScene:
 
 
 def _pack(layout: SceneLayout) -> GpuScene:
-    device, cube, mpis = layout.frames.origins.device, layout.cube, layout.mpis
-    rows, most = [_head_row(m, layout.interval(k)) for k, m in enumerate(mpis)], sum(m.planes for m in mpis)
-    numbers = [0.0] * 8
+    device, cube = layout.frames.origins.device, layout.cube
+    most = sum(m.planes for m in layout.mpis)
     if cube is not None:
-        extent = (cube.upper - cube.lower).tolist()
-        numbers = [*cube.lower.tolist(), *extent, cube.step, layout.cube_bias]
-        rows.append([0.0] * 8 + [layout.cube_interval])
-        most += int(2 * math.hypot(*extent) / cube.step) + 2
-    return GpuScene(
-        torch.tensor(rows, dtype=torch.float32, device=device),
-        _pack_grids(layout, device),
-        torch.cat(layout.biases).to(device, torch.float32).contiguous(),
-        torch.tensor(numbers, dtype=torch.float32, device=device),
-        most,
-    )
+        most += int(2 * math.hypot(*(cube.upper - cube.lower).tolist()) / cube.step) + 2
+    biases = torch.cat(layout.biases).to(device, torch.float32).contiguous()
+    return GpuScene(layout.head_rows(), _pack_grids(layout, device), biases, layout.cube_row(), most)
 
 
 def _pack_grids(layout: SceneLayout, device: torch.device) -> Int[Tensor, "N"]:
@@ -88,20 +77,12 @@ def _pack_grids(layout: SceneLayout, device: torch.device) -> Int[Tensor, "N"]:
     brick of every tile and the tile of every brick."""
     grids, start = layout.grids, layout.num_heads * INTS.value
     tiles, places = grids[0].tiles, grids[0].places
-    starts = [sum(len(b) for b in layout.biases[:k]) for k in range(len(grids))]
     rows = [
         (g.first_tile, g.depth, g.height, g.width, b, g.down, g.across, start + g.first_tile, start + len(tiles))
-        for g, b in zip(grids, starts, strict=True)
+        for g, b in zip(grids, layout.bias_starts(), strict=True)
     ]
     head = torch.tensor(rows, dtype=torch.int32, device=device).reshape(-1)
     return torch.cat([head, tiles.to(device), places.to(device, torch.int32)])
-
-
-def _head_row(mpi: MPIPlan, interval: float) -> list[float]:
-    u0, u1, v0, v1 = mpi.extent
-    slack = 16 * torch.finfo(torch.float32).eps / mpi.depth_share  # as in geometry.local_to_ndc
-    depth = [mpi.disparity_step, mpi.last_disparity, slack, 2 * mpi.near / mpi.depth_share]
-    return [*depth, u0, 2 / (u1 - u0), v0, 2 / (v1 - v0), interval]
 
 
 def block_size(wanted: int, device: torch.device) -> int:

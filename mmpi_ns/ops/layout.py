@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from mmpi_ns.scene.geometry import Cube, Frames
@@ -24,6 +24,18 @@ class Tables(NamedTuple):
     """R, or the shares P that were baked from it."""
     touched: UInt8[Tensor, "T"]
     """1 where a training ray read the row."""
+
+
+class Places(NamedTuple):
+    """Where samples lie, in S slots of every ray."""
+
+    heads: Int[Tensor, "R S"]
+    planes: Int[Tensor, "R S"]
+    """Of no meaning in the cube."""
+    ndc: Float[Tensor, "R S 3"]
+    """Position in the head."""
+    valid: Bool[Tensor, "R S"]
+    """Which slots hold a sample."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +66,23 @@ class SceneLayout:
         # Where threads make it at once the first one's stays: compiled operations hold addresses in it.
         return self.packed.setdefault(name, make(self)) if found is None else found
 
+    def frame_rows(self) -> Float[Tensor, "K 19"]:
+        """Of each MPI: origin, axes, extent, disparity between planes and of the last one, number of the first one."""
+        return self.once("frame rows", _frame_rows)
+
+    def head_rows(self) -> Float[Tensor, "K 9"]:
+        """Of each MPI: disparity between planes and of the last one, 1 - near / far, scale of the NDC s, lower end and
+        scale of u and of v, interval."""
+        return self.once("head rows", _head_rows)
+
+    def cube_row(self) -> Float[Tensor, "9"]:
+        """Lower corner, extent, step between samples, bias, interval; zeros without a cube."""
+        return self.once("cube row", _cube_row)
+
+    def bias_starts(self) -> list[int]:
+        """Where each head's planes begin in the list of all biases."""
+        return [sum(len(b) for b in self.biases[:k]) for k in range(self.num_heads)]
+
     def interval(self, k: int) -> float:
         """Factor of head k's softplus: what a sample of it stands for."""
         return self.cube_interval if k >= len(self.mpis) else 256.0 / self.mpis[k].planes * self.depth_scale
@@ -63,3 +92,27 @@ class SceneLayout:
         raw = raw.float() if raw.dtype in (torch.float16, torch.bfloat16) else raw
         bias = self.cube_bias if k >= len(self.mpis) else self.biases[k][planes]
         return torch.nn.functional.softplus(raw + bias) * self.interval(k)
+
+
+def _frame_rows(layout: SceneLayout) -> Tensor:
+    frames = layout.frames
+    columns = (frames.disparity_steps, frames.last_disparities, frames.num_planes - 1)
+    parts = (frames.origins, frames.axes.flatten(1), frames.extents, *(x[:, None] for x in columns))
+    return torch.cat([x.float() for x in parts], -1).contiguous()
+
+
+def _head_rows(layout: SceneLayout) -> Tensor:
+    rows = []
+    for k, (mpi, step) in enumerate(zip(layout.mpis, layout.frames.disparity_steps.tolist(), strict=True)):
+        u0, u1, v0, v1 = mpi.extent
+        depth = (step, mpi.last_disparity, mpi.depth_share, 2 * mpi.near / mpi.depth_share)
+        rows.append((*depth, u0, 2 / (u1 - u0), v0, 2 / (v1 - v0), layout.interval(k)))
+    return torch.tensor(rows, dtype=torch.float32, device=layout.frames.origins.device)
+
+
+def _cube_row(layout: SceneLayout) -> Tensor:
+    cube, numbers = layout.cube, [0.0] * 9
+    if cube is not None:
+        corner, extent = cube.lower.tolist(), (cube.upper - cube.lower).tolist()
+        numbers = [*corner, *extent, cube.step, layout.cube_bias, layout.cube_interval]
+    return torch.tensor(numbers, dtype=torch.float32, device=layout.frames.origins.device)

@@ -17,13 +17,17 @@ from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.adam import AdamConstants
 from mmpi_ns.ops.gather.reference import KnownTaps
 from mmpi_ns.ops.layout import SceneLayout, Tables
+from mmpi_ns.ops.march import Crossings, MarchOptions
 from mmpi_ns.scene.geometry import Cube, Frames, cube_hits, plane_hits
 from mmpi_ns.scene.plan import CubePlan, MPIPlan
 from mmpi_ns.scene.texels import BRICK, make_grids
 
 CLOSE = 1e-3
 """Largest difference relative to the largest number: a wrong kernel is off by more, another order of sums by less."""
-RAYS, CHANNELS, ROWS = 40, 5, 300
+FEW = 1e-3
+"""Share of numbers that may differ: two samples at nearly one distance, or half of a ray's mass at nearly one sample,
+come out either way. Of forty rays none may."""
+RAYS, CHANNELS, ROWS = 40, 9, 300
 MANY_RAYS = 1 << 14
 """Of so many the march takes more at once."""
 AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -47,10 +51,9 @@ def run(name: str, device: str) -> None:
         for a, b in zip(found, wanted, strict=True):
             if a.shape != b.shape:
                 raise Disagreement(f"it makes {list(a.shape)} numbers where plain torch makes {list(b.shape)}")
-            exact, close = b.double(), max(CLOSE, _rounding(b))
-            error = float((a.double() - exact).abs().max() / exact.abs().max().clamp(min=1e-6)) if b.numel() else 0.0
-            if not error <= close:
-                raise Disagreement(f"it is off by {error:.2g} of the largest number that plain torch makes")
+            share = _share_off(a.double(), b.double(), max(CLOSE, _rounding(b)))
+            if share > FEW:
+                raise Disagreement(f"{share:.2g} of its numbers are not those of plain torch")
 
 
 def _outcome(name: str, form: dispatch.Form, given: tuple) -> list[Tensor]:
@@ -66,6 +69,14 @@ def _outcome(name: str, form: dispatch.Form, given: tuple) -> list[Tensor]:
         loss = sum((x * torch.linspace(-1, 1, x.numel(), device=x.device).view(x.shape)).sum() for x in found)
         found += list(torch.autograd.grad(loss, leaves))  # type: ignore[arg-type]
     return [x.detach() for x in found]
+
+
+def _share_off(found: Tensor, wanted: Tensor, close: float) -> float:
+    """Which share of the numbers differs by more than a share of the largest one, or is none."""
+    if not wanted.numel():
+        return 0.0
+    off = ~((found - wanted).abs() <= close * wanted.abs().max().clamp(min=1e-6))
+    return float(off.double().mean())
 
 
 def _rounding(x: Tensor) -> float:
@@ -113,14 +124,15 @@ def _rays(device: str, count: int = RAYS) -> tuple[Tensor, Tensor, Tensor, Tenso
     return origins, torch.nn.functional.normalize(directions, dim=-1), near, torch.full_like(near, torch.inf)
 
 
-def _marches(device: str) -> list[tuple]:
-    cases = []
-    for with_cube, threshold, form, baked, count in (
-        (True, 0.0, None, False, RAYS),
-        (True, 0.01, "paper", False, RAYS),
-        (False, 0.01, "paper", True, RAYS),
-        # So many would take the interpreter minutes. All are kept: some sample would weigh what the threshold says.
-        *([(True, 0.0, "paper", False, MANY_RAYS)] if device == "cuda" else []),
+def _marches(device: str, many: bool | None = None) -> list[tuple]:
+    """Also of many rays where the kernels do not take minutes for them, by Triton's interpreter."""
+    many, cases = device == "cuda" if many is None else many, []
+    for with_cube, options, count in (
+        (True, MarchOptions(0.0), RAYS),
+        (True, MarchOptions(0.01, form="paper"), RAYS),
+        (False, MarchOptions(0.01, form="paper", baked=True), RAYS),
+        # All are kept: some sample would weigh what the threshold says.
+        *([(True, MarchOptions(0.0, form="paper"), MANY_RAYS)] if many else []),
     ):
         layout, tables = _scene(device, with_cube)
         rays = _rays(device, count)
@@ -129,7 +141,7 @@ def _marches(device: str) -> list[tuple]:
         if layout.cube is not None:
             start, number = cube_hits(*rays, layout.cube)
             first, counts = torch.cat([first, start[:, None]], -1), torch.cat([counts, number[:, None]], -1)
-        cases.append((layout, tables, *rays[:2], hits, first, counts, threshold, float("inf"), form, baked))
+        cases.append((layout, tables, Crossings(*rays[:2], hits, first, counts), options))
     return cases
 
 
@@ -184,13 +196,11 @@ def _gathers(device: str) -> list[tuple]:
     return cases
 
 
-def _pictures(device: str) -> list[tuple]:
-    cases = []
-    for layout, tables, origins, directions, hits, first, counts, threshold, _, form, baked in _marches(device):
-        features = 2 * _random(device, len(tables.density), CHANNELS) - 1
-        rays = (origins, directions, hits, first, counts)
-        cases.append((layout, tables, features, *rays, threshold, form, baked))
-    return cases
+def _pictures(device: str, many: bool | None = None) -> list[tuple]:
+    return [
+        (layout, tables, 2 * _random(device, len(tables.density), CHANNELS) - 1, *how)
+        for layout, tables, *how in _marches(device, many)
+    ]
 
 
 CASES: dict[str, Callable[[str], list[tuple]]] = {

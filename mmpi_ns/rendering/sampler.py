@@ -17,7 +17,7 @@ from torch import Tensor
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.ops.blending import BlendForm
 from mmpi_ns.ops.hits import plane_hits
-from mmpi_ns.ops.march import MergedSamples, march
+from mmpi_ns.ops.march import Crossings, MarchOptions, MergedSamples, march
 from mmpi_ns.scene.geometry import PlaneHits, cube_hits, sample_disparity
 
 DIRECTION_AT_INFINITY = 1e-10
@@ -39,16 +39,6 @@ class MergeReport:
     or there are no other heads to see it."""
     head_counts: tuple[int, ...] | None
     """Samples of each head, where the march has told."""
-
-
-@dataclass(frozen=True)
-class Crossings:
-    """The live samples of R rays, head by head."""
-
-    hits: PlaneHits
-    first: Int[Tensor, "R H"]
-    """m of the nearest live plane; the number of the first sample in the cube."""
-    counts: Int[Tensor, "R H"]
 
 
 class MMPISampler(Sampler):
@@ -73,7 +63,7 @@ class MMPISampler(Sampler):
         Args:
             ray_bundle: R rays; nears and fars bound the samples.
             field: heads to sample, with their optical depths.
-            threshold: see ``ops.march``.
+            threshold: see ``ops.march.MarchOptions``.
             fair_share: likewise.
             head_mask: heads that may answer each ray; None for all.
             choose: priorities; each ray is answered by the MPI of highest priority among those it meets (and the cube).
@@ -89,9 +79,8 @@ class MMPISampler(Sampler):
         explained = (at.counts > 0).any(-1, keepdim=True)
         if head_mask is not None or choose is not None:
             explained &= _sees_all(at.hits, at.counts[:, : len(field.plan.mpis)], field)
-        rays = (ray_bundle.origins, ray_bundle.directions, at.hits, at.first, at.counts)
-        scene = (field.layout, field.tables(shares))
-        merged = march(*scene, *rays, threshold, fair_share, blend_form, baked=shares is not None)
+        options = MarchOptions(threshold, fair_share, blend_form, baked=shares is not None)
+        merged = march(field.layout, field.tables(shares), at, options)
         left = merged.skipped_total, merged.dropped_mass
         report = MergeReport(at.counts.sum(-1), *left, explained, merged.head_counts)
         return _ray_samples(ray_bundle, merged), report
@@ -113,7 +102,7 @@ def crossings(
         first, counts = torch.cat([first, start[:, None]], -1), torch.cat([counts, count[:, None]], -1)
     if head_mask is not None:
         counts = torch.where(head_mask, counts, torch.zeros_like(counts))
-    return Crossings(hits, first, counts)
+    return Crossings(origins, directions, hits, first, counts)
 
 
 class _Frustums(Frustums):

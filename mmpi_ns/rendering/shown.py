@@ -9,6 +9,7 @@ from torch import Tensor
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.shading import RayShader
 from mmpi_ns.ops.blending import BlendForm
+from mmpi_ns.ops.march import MarchOptions
 from mmpi_ns.ops.show import show_rays
 from mmpi_ns.rendering.rendered import distances_of
 from mmpi_ns.rendering.sampler import crossings
@@ -35,9 +36,9 @@ def shown_outputs(
         shares: baked ones to blend by instead of reliability.
     """
     assert isinstance(field.networks, RayShader)
-    at = crossings(bundle, field, head_mask)
-    scene, rays = (field.layout, field.tables(shares), field.features.data), (bundle.origins, bundle.directions)
-    shown = show_rays(*scene, *rays, at.hits, at.first, at.counts, threshold, form, shares is not None)
+    options = MarchOptions(threshold, form=form, baked=shares is not None)
+    scene = (field.layout, field.tables(shares), field.features.data)
+    shown = show_rays(*scene, crossings(bundle, field, head_mask), options)
     return {
         "rgb": field.networks.shade(shown.gathered, shown.mass, shown.accumulation, bundle.directions),
         "accumulation": shown.accumulation,

@@ -12,17 +12,14 @@ from bricked import bricked_field
 from interpreting import by_torch, interpreted  # noqa: F401
 from random_fields import OracleRay, _places, _table, bundle, random_field, random_rays
 
-from mmpi_ns.ops.march import gpu, reference
+from mmpi_ns.ops.march import MarchOptions, gpu, reference
 from mmpi_ns.ops.show import show_rays
 from mmpi_ns.rendering.sampler import crossings
 
 
 def shown(field, rays, threshold=0.0, form=None, shares=None):
-    at = crossings(rays, field)
-    scene = (field.layout, field.tables(shares), field.features.data)
-    return show_rays(
-        *scene, rays.origins, rays.directions, at.hits, at.first, at.counts, threshold, form, shares is not None
-    )
+    options = MarchOptions(threshold, form=form, baked=shares is not None)
+    return show_rays(field.layout, field.tables(shares), field.features.data, crossings(rays, field), options)
 
 
 def compare(field, rays, *how):

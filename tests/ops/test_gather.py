@@ -10,7 +10,7 @@ import torch
 from gather_batches import batch, in_float32, parts_of, with_gradients
 from random_fields import bundle, random_field, random_rays
 
-from mmpi_ns.field.samples import metadata_of
+from mmpi_ns.field.samples import metadata_of, places_of
 from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.gather import KnownTaps, gather_places, gather_taps, reference
 from mmpi_ns.rendering.sampler import MMPISampler
@@ -119,14 +119,14 @@ def test_at_places_sums_are_those_at_their_taps(with_cube):
     field = random_field(3, with_cube, seed=7)
     samples, _ = MMPISampler()(bundle(*random_rays(field.plan, 60, seed=8)), field=field, threshold=0.0)
     meta, lookup = metadata_of(samples), field.get_density(samples)[1]
-    valid, weights = meta["valid"][..., 0], torch.rand(lookup.shape, generator=torch.Generator().manual_seed(0))
-    places = (meta["heads"][..., 0], meta["planes"][..., 0], meta["ndc"], valid)
+    weights = torch.rand(lookup.shape, generator=torch.Generator().manual_seed(0))
+    places = places_of(samples)
     table, everything = field.features.data, torch.ones(60, dtype=torch.bool)
     taps = [KnownTaps(t.rows, t.weights.double()) for t in lookup.groups]
     exact = reference.gather_taps(table.double(), taps, lookup.index, weights.double(), everything)
     for found in (
-        gather_places(field.layout, table, *places, weights),
-        reference.gather_places(field.layout, table, *places, weights),
+        gather_places(field.layout, table, places, weights),
+        reference.gather_places(field.layout, table, places, weights),
     ):
         for a, b in zip(parts_of(found), parts_of(exact), strict=True):
             assert b.abs().max() > 1 and (a - b).abs().max() < 2e-5
@@ -136,10 +136,9 @@ def test_at_places_sums_are_those_at_their_taps(with_cube):
 def test_at_places_and_at_taps_give_the_same_bits():
     field = random_field(3, True, seed=7)
     samples, _ = MMPISampler()(bundle(*random_rays(field.plan, 60, seed=8)), field=field, threshold=0.0)
-    meta, lookup = metadata_of(samples), field.get_density(samples)[1]
-    places = [meta[n][..., 0] for n in ("heads", "planes")] + [meta["ndc"], meta["valid"][..., 0]]
+    lookup = field.get_density(samples)[1]
     weights = torch.rand(lookup.shape, generator=torch.Generator().manual_seed(0))
-    a = gather_places(field.layout, field.features.data, *places, weights)
+    a = gather_places(field.layout, field.features.data, places_of(samples), weights)
     taps = [KnownTaps(t.rows, t.weights) for t in lookup.groups]
     b = gather_taps(field.features.data, taps, lookup.index, weights, torch.ones(60, dtype=torch.bool))
     assert dispatch.form_of("gather_taps", torch.zeros(1)) == "cpu" and torch.equal(a.gathered, b.gathered)

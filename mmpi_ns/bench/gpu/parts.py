@@ -27,6 +27,8 @@ from mmpi_ns.bench.trainers import Steps
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.model import MMPIModel
 from mmpi_ns.ops import dispatch, interpolate
+from mmpi_ns.ops.march import Crossings, MarchOptions, march
+from mmpi_ns.scene.geometry import plane_hits
 
 SECTOR = 32
 """Bytes that a GPU fetches at least: a bilinear lookup of one channel touches two sectors, one in each row."""
@@ -86,13 +88,10 @@ def measure_operations(request: dict[str, Any], tell: Tell) -> dict[str, Any]:
 @torch.no_grad()
 def _measure_march(field: MMPIField, rays: dict[str, Tensor], repeats: int) -> dict[str, float]:
     """The kernel alone on rays that nothing stops and that keep nothing: it looks up every live sample."""
-    from mmpi_ns.ops.march import march
-    from mmpi_ns.scene.geometry import plane_hits
-
     hits = plane_hits(rays["origins"], rays["directions"], rays["nears"], rays["fars"], field.frames)
     live = int(hits.count.sum())
-    given = (rays["origins"], rays["directions"], hits, hits.m_first, hits.count, 0.9, float("inf"), None)
-    seconds = median_s(lambda: march(field.layout, field.tables(), *given), repeats)
+    at = Crossings(rays["origins"], rays["directions"], hits, hits.m_first, hits.count)
+    seconds = median_s(lambda: march(field.layout, field.tables(), at, MarchOptions(0.9)), repeats)
     gb = 2 * SECTOR * live / 1e9
     return {
         "ms": 1e3 * seconds,

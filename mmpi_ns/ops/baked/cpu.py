@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import ctypes
+from typing import Any
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import pad
 
-from mmpi_ns.ops import build
 from mmpi_ns.ops.baked.reference import Gathered
+from mmpi_ns.ops.build import arguments, call_in_parts
 from mmpi_ns.ops.gather import COLORS
 from mmpi_ns.scene.baked import MOST_CHANNELS, BakedMpis, Shader, tiles_of
 
@@ -61,65 +61,38 @@ class _Packed:
         low, step = (torch.tensor([getattr(c, name) for c in scene.channel_codes]) for name in ("low", "step"))
         doubled = torch.tensor([1.0] * COLORS + [2.0] * (channels - COLORS))  # tanh x = 2 sigmoid(2 x) - 1
         self.codes = [pad(doubled * x, (0, MOST_CHANNELS - channels)) for x in (low, step)]
-        tables = build.addresses([scene.columns, scene.density, self.texels, *self.codes])
+        tables = arguments([scene.columns, scene.density, self.texels, *self.codes])
         self.scene = _Scene(len(heads), channels, ctypes.addressof(self.heads), *tables)
 
 
 def march_baked(
     scene: BakedMpis,
-    origins: Float[Tensor, "R 3"],
-    directions: Float[Tensor, "R 3"],
-    nears: Float[Tensor, "R 1"],
-    fars: Float[Tensor, "R 1"],
+    origins: Tensor,
+    directions: Tensor,
+    nears: Tensor,
+    fars: Tensor,
     threshold: float,
-    peaks: Float[Tensor, "B"] | None = None,
+    peaks: Any = None,
 ) -> Gathered:
-    """See ``baked.march_baked``."""
+    """See ``ops.baked``."""
     if "cpu" not in scene.packed:
         scene.packed["cpu"] = _Packed(scene)
-    packed: _Packed = scene.packed["cpu"]
-    held = [x.contiguous() for x in (origins, directions, nears, fars)]  # alive until the kernel has run
-    num_rays = len(origins)
-    sums = torch.empty(num_rays, scene.texels.shape[-1])
+    num_rays, given = len(origins), [x.contiguous() for x in (origins, directions, nears, fars)]
+    sums, winner = torch.empty(num_rays, scene.texels.shape[-1]), torch.empty(num_rays, 1, dtype=torch.int64)
     mass, passing, inverse_t = (torch.empty(num_rays, 1) for _ in range(3))
-    winner = torch.empty(num_rays, 1, dtype=torch.int64)
-    given = [build.address(x) for x in held]
-    made = [*(build.address(x) for x in (sums, mass, passing, inverse_t)), build.address(winner, torch.int64)]
-
-    def part(begin: int, end: int) -> None:
-        build.library().mmpi_march_baked(
-            ctypes.byref(packed.scene),
-            *given,
-            ctypes.c_float(threshold),
-            *map(ctypes.c_int64, (begin, end)),
-            *made,
-            None if peaks is None else build.address(peaks),
-        )
-
-    if peaks is None:
-        build.in_parts(part, num_rays)
-    else:  # one thread alone, for all write to the same peaks
-        part(0, num_rays)
+    before = (ctypes.byref(scene.packed["cpu"].scene), *given, float(threshold))
+    # Where peaks are wanted, one thread alone: all would write to the same ones.
+    least = 256 if peaks is None else max(num_rays, 1)
+    after = (sums, mass, passing, inverse_t, winner, peaks)
+    call_in_parts("mmpi_march_baked", num_rays, before, after, least)
     return Gathered(sums, mass, passing, inverse_t, winner)
 
 
-def shade_baked(
-    shader: Shader,
-    sums: Float[Tensor, "R C"],
-    mass: Float[Tensor, "R 1"],
-    directions: Float[Tensor, "R 3"],
-) -> Float[Tensor, "R 3"]:
-    """See ``baked.shade_baked``."""
+def shade_baked(shader: Shader, sums: Tensor, mass: Tensor, directions: Tensor) -> Tensor:
+    """See ``ops.baked``."""
     numbers = [[x.contiguous() for x in layer] for layer in shader.layers]  # alive until the kernel has run
-    layers = (_Layer * len(numbers))(*(_Layer(*w.shape, build.address(w), build.address(b)) for w, b in numbers))
-    held = [x.contiguous() for x in (sums, mass, directions)]
-    rgb = torch.empty(len(sums), 3)
-    given = [build.address(x) for x in held]
-
-    def part(begin: int, end: int) -> None:
-        sizes = map(ctypes.c_int64, (len(numbers), sums.shape[-1], shader.direction_octaves))
-        bound, rays = ctypes.c_float(shader.bound), map(ctypes.c_int64, (begin, end))
-        build.library().mmpi_shade_baked(layers, *sizes, bound, *given, *rays, build.address(rgb))
-
-    build.in_parts(part, len(sums))
+    layers = (_Layer * len(numbers))(*(_Layer(*w.shape, *arguments((w, b))) for w, b in numbers))
+    given, rgb = [x.contiguous() for x in (sums, mass, directions)], torch.empty(len(sums), 3)
+    sizes = (len(numbers), sums.shape[-1], shader.direction_octaves, float(shader.bound))
+    call_in_parts("mmpi_shade_baked", len(sums), (layers, *sizes, *given), (rgb,))
     return rgb

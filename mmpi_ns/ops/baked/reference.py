@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -35,14 +35,14 @@ class Gathered(NamedTuple):
 
 def march_baked(
     scene: BakedMpis,
-    origins: Float[Tensor, "R 3"],
-    directions: Float[Tensor, "R 3"],
-    nears: Float[Tensor, "R 1"],
-    fars: Float[Tensor, "R 1"],
+    origins: Tensor,
+    directions: Tensor,
+    nears: Tensor,
+    fars: Tensor,
     threshold: float,
-    peaks: Float[Tensor, "B"] | None = None,
+    peaks: Any = None,
 ) -> Gathered:
-    """See ``baked.march_baked``."""
+    """See ``ops.baked``."""
     hits = plane_hits(origins, directions, nears, fars, scene.frames)
     parts = [_head(scene, k, hits) for k in range(len(scene.mpis))]
     tau, inverse_t, texels, bricks = (torch.cat(x, 1) for x in zip(*parts, strict=True))
@@ -73,13 +73,8 @@ def march_baked(
     )
 
 
-def shade_baked(
-    shader: Shader,
-    sums: Float[Tensor, "R C"],
-    mass: Float[Tensor, "R 1"],
-    directions: Float[Tensor, "R 3"],
-) -> Float[Tensor, "R 3"]:
-    """See ``baked.shade_baked``."""
+def shade_baked(shader: Shader, sums: Tensor, mass: Tensor, directions: Tensor) -> Tensor:
+    """See ``ops.baked``."""
     mean = sums / mass.clamp(min=1e-6)
     octaves = math.pi * 2.0 ** torch.arange(shader.direction_octaves, dtype=sums.dtype)
     angles = (directions[:, None] * octaves[:, None]).flatten(1)

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mmpi_ns.ops.build import address, addresses, in_parts, library, sizes
+from mmpi_ns.ops.build import call_in_parts
 from mmpi_ns.ops.composite.reference import Composite
 
 
@@ -15,40 +15,32 @@ class _Weights(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, tau: Tensor, valid: Tensor, before: Tensor, total: Tensor) -> tuple[Tensor, Tensor]:
         weights, depth = torch.empty_like(tau), torch.empty_like(total)
-        given, made, lib = addresses((tau, valid, before, total)), addresses((weights, depth)), library()
-        in_parts(lambda a, b: lib.mmpi_composite(*given, *sizes(a, b, tau.shape[1]), *made), len(tau))
+        call_in_parts("mmpi_composite", len(tau), (tau, valid, before, total), (tau.shape[1], weights, depth))
         ctx.save_for_backward(tau, valid, before, weights)
         return weights, depth
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
-        tau, valid, before, weights = ctx.saved_tensors
-        grads, grad, lib = [g.contiguous() for g in grad_outputs], torch.empty_like(tau), library()
-        given, made = addresses((tau, valid, before, weights, *grads)), address(grad)
-        in_parts(lambda a, b: lib.mmpi_composite_back(*given, *sizes(a, b, tau.shape[1]), made), len(tau))
+        tau, *_ = saved = ctx.saved_tensors
+        grad, grads = torch.empty_like(tau), [g.contiguous() for g in grad_outputs]
+        call_in_parts("mmpi_composite_back", len(tau), (*saved, *grads), (tau.shape[1], grad))
         return grad, None, None, None
 
 
 class _GatheredColors(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, weights: Tensor, colors: Tensor) -> Tensor:
-        sums, lib = torch.empty(len(weights), 3), library()
-        given, made = addresses((weights, colors)), address(sums)
-        in_parts(lambda a, b: lib.mmpi_gather_colors(*given, *sizes(a, b, weights.shape[1]), made), len(weights))
+        sums = torch.empty(len(weights), 3)
+        call_in_parts("mmpi_gather_colors", len(weights), (weights, colors), (weights.shape[1], sums))
         ctx.save_for_backward(weights, colors)
         return sums
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor, Tensor]:
         weights, colors = ctx.saved_tensors
-        grad, grads, lib = (
-            grad_outputs[0].contiguous(),
-            (torch.empty_like(weights), torch.empty_like(colors)),
-            library(),
-        )
-        given, made, slots = addresses((weights, colors, grad)), addresses(grads), weights.shape[1]
-        in_parts(lambda a, b: lib.mmpi_gather_colors_back(*given, *sizes(a, b, slots), *made), len(weights))
-        return grads
+        given, grads = (weights, colors, grad_outputs[0].contiguous()), [torch.empty_like(x) for x in (weights, colors)]
+        call_in_parts("mmpi_gather_colors_back", len(weights), given, (weights.shape[1], *grads))
+        return tuple(grads)  # type: ignore[return-value]
 
 
 def composite_weights(tau: Tensor, valid: Tensor, skipped_before: Tensor, skipped_total: Tensor) -> Composite:
@@ -64,15 +56,13 @@ def gather_colors(weights: Tensor, colors: Tensor) -> Tensor:
 
 def median_inverse_distance(weights: Tensor, inverse_t: Tensor, valid: Tensor) -> Tensor:
     """See ``ops.composite``."""
-    held, median, lib = [x.contiguous() for x in (weights, inverse_t, valid)], torch.empty(len(weights), 1), library()
-    given, made = addresses(held), address(median)
-    in_parts(lambda a, b: lib.mmpi_median(*given, *sizes(a, b, weights.shape[1]), made), len(weights))
+    given, median = [x.contiguous() for x in (weights, inverse_t, valid)], torch.empty(len(weights), 1)
+    call_in_parts("mmpi_median", len(weights), given, (weights.shape[1], median))
     return median
 
 
 def winning_heads(weights: Tensor, heads: Tensor, num_heads: int) -> Tensor:
     """See ``ops.composite``."""
-    held, winners, lib = (weights.contiguous(), heads.long().contiguous()), torch.empty(len(weights), 1), library()
-    given, made = addresses(held), address(winners)
-    in_parts(lambda a, b: lib.mmpi_winners(*given, *sizes(a, b, weights.shape[1], num_heads), made), len(weights))
+    given, winners = (weights.contiguous(), heads.long().contiguous()), torch.empty(len(weights), 1)
+    call_in_parts("mmpi_winners", len(weights), given, (weights.shape[1], num_heads, winners))
     return winners

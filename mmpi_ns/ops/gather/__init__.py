@@ -2,22 +2,37 @@
 
 from __future__ import annotations
 
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.gather.reference import COLORS, KnownTaps, RaySums
-from mmpi_ns.ops.layout import SceneLayout
+from mmpi_ns.ops.layout import Places, SceneLayout
 
 __all__ = ["COLORS", "KnownTaps", "RaySums", "gather_places", "gather_taps"]
 
 
-def gather_taps(values: Tensor, groups: list[KnownTaps], slots: Tensor, weights: Tensor, wanted: Tensor) -> RaySums:
-    """See ``reference.gather_taps``."""
+def gather_taps(
+    values: Float[Tensor, "U C"],
+    groups: list[KnownTaps],
+    slots: Int[Tensor, "N"],
+    weights: Float[Tensor, "R S"],
+    wanted: Bool[Tensor, "R"],
+) -> RaySums:
+    """Sums over samples whose taps are known, with gradients to ``values`` and ``weights``.
+
+    Args:
+        values: texels that the batch reads.
+        groups: taps of the samples, those of planes first.
+        slots: flat slot of each sample in ``weights``.
+        weights: rendering weights.
+        wanted: the rays to sum for; the others get 0.
+    """
     return dispatch.run("gather_taps", values, groups, slots, weights, wanted)
 
 
 def gather_places(
-    layout: SceneLayout, table: Tensor, heads: Tensor, planes: Tensor, ndc: Tensor, valid: Tensor, weights: Tensor
+    layout: SceneLayout, table: Float[Tensor, "T C"], places: Places, weights: Float[Tensor, "R S"]
 ) -> RaySums:
-    """See ``reference.gather_places``."""
-    return dispatch.run("gather_places", layout, table, heads, planes, ndc, valid, weights)
+    """Sums over samples at places in the heads, without gradients; ``table`` holds all texels."""
+    return dispatch.run("gather_places", layout, table, places, weights)

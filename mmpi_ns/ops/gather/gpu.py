@@ -10,10 +10,9 @@ from typing import Any
 import torch
 import triton
 import triton.language as tl
-from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from mmpi_ns.ops.gather.reference import COLORS, KnownTaps, RaySums
+from mmpi_ns.ops.gather.reference import COLORS, KnownTaps, RaySums, split_sums
 from mmpi_ns.ops.gpu_scene import block_size
 
 NUMBERS = 512
@@ -101,11 +100,6 @@ def gather_back_kernel(
             tl.atomic_add(to_values + row[:, None] * channels + column, share[:, None] * down, filled, sem="relaxed")
 
 
-def _split(sums: Float[Tensor, "R N"], channels: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    gathered, mass, second = sums.split([channels, 1, COLORS], -1)
-    return gathered, mass, gathered[:, :COLORS].clone(), second
-
-
 def sizes(channels: int, device: torch.device, numbers: int = NUMBERS) -> tuple[int, int]:
     """Columns, and rays or samples, of a program that holds so many numbers."""
     columns = max(4, int(triton.next_power_of_2(channels)))  # colours take three, however few there are
@@ -131,7 +125,7 @@ class _GatherTaps(torch.autograd.Function):
                 HAS_CUBE=len(cube_positions) > 0, CHANNELS=columns, BLOCK=block,
             )  # fmt: skip
         ctx.save_for_backward(*held)
-        found = _split(sums, channels)
+        found = split_sums(sums, channels)
         ctx.mark_non_differentiable(found[1])
         return found
 
@@ -154,14 +148,8 @@ class _GatherTaps(torch.autograd.Function):
         return to_values if needed else None, to_weights, None, None, None, None, None, None
 
 
-def gather_taps(
-    values: Float[Tensor, "U C"],
-    groups: list[KnownTaps],
-    slots: Int[Tensor, "N"],
-    weights: Float[Tensor, "R S"],
-    wanted: Bool[Tensor, "R"],
-) -> RaySums:
-    """See ``reference.gather_taps``."""
+def gather_taps(values: Tensor, groups: list[KnownTaps], slots: Tensor, weights: Tensor, wanted: Tensor) -> RaySums:
+    """See ``ops.gather``."""
     found = {g.shares.shape[1]: (g.positions, g.shares) for g in groups}
     none = {n: (slots.new_zeros(0, n), weights.new_zeros(0, n)) for n in (4, 8)}
     taps = [x for pair in (none | found).values() for x in pair]

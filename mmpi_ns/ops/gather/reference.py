@@ -10,10 +10,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from mmpi_ns.ops.layout import SceneLayout
+from mmpi_ns.ops.layout import Places, SceneLayout
 
 COLORS = 3
 """Channels of a texel that are colours."""
@@ -47,22 +47,8 @@ def activate(raw: Float[Tensor, "N C"]) -> Float[Tensor, "N C"]:
     return torch.cat([raw[:, :COLORS].sigmoid(), raw[:, COLORS:].tanh()], -1)
 
 
-def gather_taps(
-    values: Float[Tensor, "U C"],
-    groups: list[KnownTaps],
-    slots: Int[Tensor, "N"],
-    weights: Float[Tensor, "R S"],
-    wanted: Bool[Tensor, "R"],
-) -> RaySums:
-    """Sums over samples whose taps are known, with gradients to ``values`` and ``weights``.
-
-    Args:
-        values: texels that the batch reads.
-        groups: taps of the samples, those of planes first.
-        slots: flat slot of each sample in ``weights``.
-        weights: rendering weights.
-        wanted: the rays to sum for; the others get 0.
-    """
+def gather_taps(values: Tensor, groups: list[KnownTaps], slots: Tensor, weights: Tensor, wanted: Tensor) -> RaySums:
+    """See ``ops.gather``."""
     if not groups:
         return _sums(values.new_zeros(0, values.shape[1]), slots, weights)
     raw = torch.cat([(values[g.positions] * g.shares[..., None]).sum(1) for g in groups])
@@ -70,39 +56,27 @@ def gather_taps(
     return _sums(raw[own], slots[own], weights)
 
 
-def gather_places(
-    layout: SceneLayout,
-    table: Float[Tensor, "T C"],
-    heads: Int[Tensor, "R S"],
-    planes: Int[Tensor, "R S"],
-    ndc: Float[Tensor, "R S 3"],
-    valid: Bool[Tensor, "R S"],
-    weights: Float[Tensor, "R S"],
-) -> RaySums:
-    """Sums over samples at places in the heads, without gradients.
-
-    Args:
-        layout: of the scene.
-        table: the pooled texels.
-        heads: head of each sample.
-        planes: its plane; of no meaning in the cube.
-        ndc: its position in the head.
-        valid: which slots hold a sample.
-        weights: rendering weights.
-    """
-    slots, raw = zip(*interpolated(layout, table, heads, planes, ndc, valid), strict=True)
+def gather_places(layout: SceneLayout, table: Tensor, places: Places, weights: Tensor) -> RaySums:
+    """See ``ops.gather``."""
+    slots, raw = zip(*interpolated(layout, table, places), strict=True)
     return _sums(torch.cat(raw), torch.cat(slots), weights)
 
 
 def interpolated(
-    layout: SceneLayout, table: Tensor, heads: Tensor, planes: Tensor, ndc: Tensor, valid: Tensor
+    layout: SceneLayout, table: Float[Tensor, "T C"], places: Places
 ) -> Iterator[tuple[Int[Tensor, "N"], Float[Tensor, "N C"]]]:
-    """Of each head the flat slots of its samples, and what the table holds at their places; see ``gather_places``."""
+    """Of each head the flat slots of its samples, and what the table holds at their places."""
     for k, grid in enumerate(layout.grids):
-        own = (valid & (heads == k)).reshape(-1).nonzero()[:, 0]
-        place = ndc.reshape(-1, 3)[own]
-        rows, shares = grid.bilinear(planes.reshape(-1)[own], place) if k < len(layout.mpis) else grid.trilinear(place)
+        own = (places.valid & (places.heads == k)).reshape(-1).nonzero()[:, 0]
+        ndc, planes = places.ndc.reshape(-1, 3)[own], places.planes.reshape(-1)[own]
+        rows, shares = grid.bilinear(planes, ndc) if k < len(layout.mpis) else grid.trilinear(ndc)
         yield own, (table[rows] * shares[..., None]).sum(1)
+
+
+def split_sums(sums: Float[Tensor, "R N"], channels: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The parts of ``RaySums`` from what the compiled forms write: weighted texels, mass, squared colours."""
+    gathered, mass, second = sums.split([channels, 1, COLORS], -1)
+    return gathered, mass, gathered[:, :COLORS].clone(), second
 
 
 def _sums(raw: Tensor, slots: Tensor, weights: Tensor) -> RaySums:

@@ -7,7 +7,6 @@ from __future__ import annotations
 import torch
 import triton
 import triton.language as tl
-from jaxtyping import Float
 from torch import Tensor
 
 from mmpi_ns.ops.gpu_scene import block_size
@@ -15,7 +14,7 @@ from mmpi_ns.ops.layout import SceneLayout
 from mmpi_ns.scene.geometry import FACING_EPS, PlaneHits
 
 EPS = tl.constexpr(FACING_EPS)
-# Columns of an MPI's frame (``_pack``).
+# Columns of ``SceneLayout.frame_rows``.
 ORIGIN = tl.constexpr(0)
 AXES = tl.constexpr(3)
 EXTENT = tl.constexpr(12)
@@ -117,7 +116,7 @@ def _store(to, x, y, z, exists):
 
 def plane_hits(origins: Tensor, directions: Tensor, nears: Tensor, fars: Tensor, layout: SceneLayout) -> PlaneHits:
     """See ``geometry.plane_hits``; in float32."""
-    frames, count, device = layout.once("frames", _pack), len(layout.mpis), origins.device
+    frames, count, device = layout.frame_rows(), len(layout.mpis), origins.device
     shape, size = (len(origins), count), len(origins) * count
     ranges = [torch.empty(shape, dtype=torch.int64, device=device) for _ in range(2)]
     parts = [torch.empty(*shape, width, device=device) for width in (2, 2, 3, 3)]
@@ -126,12 +125,3 @@ def plane_hits(origins: Tensor, directions: Tensor, nears: Tensor, fars: Tensor,
         rays = (x.contiguous() for x in (origins, directions, nears, fars))
         hits_kernel[(triton.cdiv(size, block),)](*rays, frames, *ranges, *parts, size, K=count, BLOCK=block)
     return PlaneHits(*ranges, *parts)
-
-
-def _pack(layout: SceneLayout) -> Float[Tensor, "K 19"]:
-    """Origin, axes, extent, disparity step, last disparity and last plane of each MPI."""
-    frames = layout.frames
-    last = (frames.num_planes - 1).to(frames.nears.dtype)
-    columns = (frames.disparity_steps, frames.last_disparities, last)
-    parts = (frames.origins, frames.axes.flatten(1), frames.extents, torch.stack(columns, -1))
-    return torch.cat(parts, -1).float().contiguous()

@@ -6,10 +6,9 @@ from torch import Tensor
 
 from mmpi_ns.ops.layout import SceneLayout
 from mmpi_ns.scene import geometry
+from mmpi_ns.scene.geometry import PlaneHits
 
 
-def plane_hits(
-    origins: Tensor, directions: Tensor, nears: Tensor, fars: Tensor, layout: SceneLayout
-) -> geometry.PlaneHits:
-    """See ``geometry.plane_hits``."""
+def plane_hits(origins: Tensor, directions: Tensor, nears: Tensor, fars: Tensor, layout: SceneLayout) -> PlaneHits:
+    """See ``ops.hits``."""
     return geometry.plane_hits(origins, directions, nears, fars, layout.frames)

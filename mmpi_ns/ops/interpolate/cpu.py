@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from mmpi_ns.ops.build import address, addresses, in_parts, library, sizes
+from mmpi_ns.ops.build import call, call_in_parts
 from mmpi_ns.ops.cpu_scene import CpuScene
 from mmpi_ns.ops.interpolate import reference
 from mmpi_ns.ops.interpolate.reference import RowIndex
@@ -18,10 +18,9 @@ MOST_ROWS = 2**31
 
 def texel_rows(layout: SceneLayout, heads: Tensor, planes: Tensor, ndc: Tensor) -> tuple[Tensor, Tensor]:
     """See ``ops.interpolate``."""
-    held = [x.contiguous() for x in (heads, planes, ndc)]
     rows, weights = torch.empty(len(heads), 4, dtype=torch.int64), torch.empty(len(heads), 4)
-    grids = CpuScene.of(layout).grids
-    library().mmpi_texel_rows(grids, *addresses(held), *sizes(len(heads)), *addresses((rows, weights)))
+    given = (x.contiguous() for x in (heads, planes, ndc))
+    call("mmpi_texel_rows", CpuScene.of(layout).grids, *given, len(heads), rows, weights)
     return rows, weights
 
 
@@ -32,8 +31,7 @@ def index_rows(rows: Tensor, table_rows: int, pads: bool) -> RowIndex:
         return reference.index_rows(rows, table_rows, pads)
     bricks = torch.zeros(-(-table_rows // BRICK), 2, dtype=torch.int64)
     unique, position = torch.empty(count, dtype=torch.int64), torch.empty(rows.shape, dtype=torch.int32)
-    given = (address(rows.contiguous(), torch.int64), *sizes(count), address(bricks, torch.int64), *sizes(len(bricks)))
-    found = library().mmpi_index_rows(*given, *addresses((unique, position)))
+    found = call("mmpi_index_rows", rows.long().contiguous(), count, bricks, len(bricks), unique, position)
     return RowIndex(unique[:found].clone(), position)
 
 
@@ -42,25 +40,20 @@ def sum_rows(position: Tensor, values: Tensor, weights: Tensor | None, count: in
     if position.dtype != torch.int32:
         return reference.sum_rows(position, values, weights, count)
     out, taps = torch.zeros(count, values.shape[1]), 1 if weights is None else weights.shape[1]
-    position, values = position.contiguous(), values.contiguous()
-    weights = None if weights is None else weights.contiguous()
-    given = (address(position, torch.int32), None if weights is None else address(weights), address(values))
-    library().mmpi_sum_rows(*given, *sizes(values.shape[0], taps, values.shape[1]), address(out))
+    given = (None if x is None else x.contiguous() for x in (position, weights, values))
+    call("mmpi_sum_rows", *given, len(values), taps, values.shape[1], out)
     return out
 
 
 def raise_peaks(peaks: Tensor, rows: Tensor, weights: Tensor) -> None:
     """See ``ops.interpolate``."""
-    rows, weights = rows.contiguous(), weights.contiguous()
-    given = (address(rows, torch.int64), *addresses((weights,)), *sizes(*rows.shape))
-    library().mmpi_raise_peaks(*given, address(peaks))
+    call("mmpi_raise_peaks", rows.contiguous(), weights.contiguous(), *rows.shape, peaks)
 
 
 def take_rows(table: Tensor, rows: Tensor) -> Tensor:
     """See ``ops.interpolate.reference``."""
     if table.ndim != 2 or not table.is_contiguous():
         return reference.take_rows(table, rows)
-    values, rows, lib = torch.empty(len(rows), table.shape[1]), rows.contiguous(), library()
-    given, made = address(rows, torch.int64), addresses((table, values))
-    in_parts(lambda a, b: lib.mmpi_take_rows(given, *sizes(a, b, table.shape[1]), *made), len(rows), least=4096)
+    values = torch.empty(len(rows), table.shape[1])
+    call_in_parts("mmpi_take_rows", len(rows), (rows.contiguous(),), (table.shape[1], table, values), least=4096)
     return values

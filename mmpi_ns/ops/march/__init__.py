@@ -7,46 +7,23 @@ live samples a few at a time, take the nearest at each step, and end a ray where
 
 from __future__ import annotations
 
-from jaxtyping import Float, Int
-from torch import Tensor
-
 from mmpi_ns.ops import dispatch
-from mmpi_ns.ops.blending import BlendForm
 from mmpi_ns.ops.layout import SceneLayout, Tables
 from mmpi_ns.ops.march import reference
-from mmpi_ns.ops.march.reference import MergedSamples
-from mmpi_ns.scene.geometry import PlaneHits
+from mmpi_ns.ops.march.reference import Crossings, MarchOptions, MergedSamples
+
+__all__ = ["Crossings", "MarchOptions", "MergedSamples", "march"]
 
 
-def march(
-    layout: SceneLayout,
-    tables: Tables,
-    origins: Float[Tensor, "R 3"],
-    directions: Float[Tensor, "R 3"],
-    hits: PlaneHits,
-    first: Int[Tensor, "R H"],
-    counts: Int[Tensor, "R H"],
-    threshold: float,
-    fair_share: float,
-    form: BlendForm | None,
-    baked: bool = False,
-) -> MergedSamples:
+def march(layout: SceneLayout, tables: Tables, rays: Crossings, options: MarchOptions) -> MergedSamples:
     """The samples of each ray that matter.
 
     Args:
         layout: the scene.
         tables: densities, reliabilities and which texels were trained.
-        origins: ray origins, world axes.
-        directions: unit ray directions.
-        hits: where the rays cross the planes.
-        first: m of each head's nearest live plane; the cube's first sample in the last column, where there is a cube.
-        counts: live samples of each head.
-        threshold: weight below which a sample is dropped; 0 keeps all and ends no ray early.
-        fair_share: bound on the threshold relative to equal weights (``reference.prune``).
-        form: how reliability enters; None for not at all. The opacity-keeping form is for ablations: plain torch.
-        baked: ``tables.reliability`` holds shares (``baking.bake_shares``).
+        rays: where R rays cross it.
+        options: which samples are kept, and how they are blended.
     """
-    given = (layout, tables, origins, directions, hits, first, counts, threshold, fair_share, form, baked)
-    if form == "opacity":
-        return reference.march(*given)
-    return dispatch.run("march", *given)
+    if options.form == "opacity":
+        return reference.march(layout, tables, rays, options)
+    return dispatch.run("march", layout, tables, rays, options)

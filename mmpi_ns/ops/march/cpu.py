@@ -7,12 +7,10 @@ import ctypes
 import torch
 from torch import Tensor
 
-from mmpi_ns.ops.blending import BlendForm
-from mmpi_ns.ops.build import address, addresses, in_parts, library, sizes
+from mmpi_ns.ops.build import arguments, call_in_parts
 from mmpi_ns.ops.cpu_scene import CpuScene
 from mmpi_ns.ops.layout import SceneLayout, Tables
-from mmpi_ns.ops.march.reference import MergedSamples
-from mmpi_ns.scene.geometry import PlaneHits
+from mmpi_ns.ops.march.reference import Crossings, MarchOptions, MergedSamples
 
 NO_BLENDING, PAPERS_FORM, BAKED_SHARES = range(3)
 """How the compiled marches are told in which form reliability enters."""
@@ -27,44 +25,27 @@ class _Rays(ctypes.Structure):
     ]
 
 
-def march(
-    layout: SceneLayout,
-    tables: Tables,
-    origins: Tensor,
-    directions: Tensor,
-    hits: PlaneHits,
-    first: Tensor,
-    counts: Tensor,
-    threshold: float,
-    fair_share: float,
-    form: BlendForm | None,
-    baked: bool,
-) -> MergedSamples:
+def march(layout: SceneLayout, tables: Tables, rays: Crossings, options: MarchOptions) -> MergedSamples:
     """See ``ops.march``."""
+    origins, directions, hits, first, counts = rays
     parts = (origins, directions, hits.local_origins, hits.local_directions, hits.u, hits.v, first, counts)
     held = [x.contiguous() for x in parts]  # alive until the rays are marched
-    scene, rays, lib = CpuScene.of(layout).with_tables(tables), _Rays(*addresses(held)), library()
+    scene, packed = CpuScene.of(layout).with_tables(tables), _Rays(*arguments(held))
     total = counts.sum(-1)
     starts = total.cumsum(0) - total
     num_rays, size = len(total), int(total.sum())
     flat = [torch.empty((size, 3) if i == 2 else size, dtype=t) for i, t in enumerate(_FLAT)]
-    kept, left = torch.empty(num_rays, dtype=torch.int64), torch.empty(2, num_rays, 1)
-    bounds = (ctypes.c_float(threshold), ctypes.c_float(fair_share))
-    blends = NO_BLENDING if form is None else BAKED_SHARES if baked else PAPERS_FORM
-    made = addresses((kept, left[0], left[1], *flat))
-
-    def part(begin: int, end: int) -> None:
-        given = (ctypes.byref(scene), ctypes.byref(rays), address(starts, torch.int64), *sizes(begin, end))
-        lib.mmpi_march(*given, *bounds, blends, *made)
-
-    in_parts(part, num_rays)
-    return MergedSamples(*_pack(starts, kept, flat), skipped_total=left[0], dropped_mass=left[1])
+    kept, skipped, dropped = torch.empty(num_rays, dtype=torch.int64), *torch.empty(2, num_rays, 1)
+    form = ctypes.c_int(NO_BLENDING if options.form is None else BAKED_SHARES if options.baked else PAPERS_FORM)
+    how = (float(options.threshold), float(options.fair_share), form)
+    given = (ctypes.byref(scene), ctypes.byref(packed), starts)
+    call_in_parts("mmpi_march", num_rays, given, (*how, kept, skipped, dropped, *flat))
+    return MergedSamples(*_pack(starts, kept, flat), skipped_total=skipped, dropped_mass=dropped)
 
 
 def _pack(starts: Tensor, kept: Tensor, flat: list[Tensor]) -> list[Tensor]:
     """Flat samples in slots, packed to the left."""
-    num_rays, width, lib = len(kept), max(1, int(kept.max())) if kept.numel() else 1, library()
-    slots = [torch.empty((num_rays, width, 3) if i == 2 else (num_rays, width), dtype=t) for i, t in enumerate(_SLOTS)]
-    given, made = addresses((starts, kept)), addresses((*flat, *slots))
-    in_parts(lambda a, b: lib.mmpi_pack(*given, *sizes(a, b, width), *made), num_rays)
+    shape = (len(kept), max(1, int(kept.max())) if kept.numel() else 1)
+    slots = [torch.empty((*shape, 3) if i == 2 else shape, dtype=t) for i, t in enumerate(_SLOTS)]
+    call_in_parts("mmpi_pack", len(kept), (starts, kept), (shape[1], *flat, *slots))
     return slots

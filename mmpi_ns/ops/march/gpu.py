@@ -18,7 +18,6 @@ import triton.language as tl
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from mmpi_ns.ops.blending import BlendForm
 from mmpi_ns.ops.gpu_scene import (
     BIAS,
     DEPTH,
@@ -27,7 +26,7 @@ from mmpi_ns.ops.gpu_scene import (
     INTERVAL,
     INTS,
     S_SCALE,
-    SLACK,
+    SHARE,
     STEP,
     U0,
     U_SCALE,
@@ -44,8 +43,7 @@ from mmpi_ns.ops.gpu_scene import (
     trilinear,
 )
 from mmpi_ns.ops.layout import SceneLayout, Tables
-from mmpi_ns.ops.march.reference import MergedSamples, most_kept
-from mmpi_ns.scene.geometry import PlaneHits
+from mmpi_ns.ops.march.reference import Crossings, MarchOptions, MergedSamples, most_kept
 
 OPAQUE = tl.constexpr(1e-5)
 """Light that may be lost behind the end of a ray."""
@@ -150,7 +148,7 @@ def _look_up(origins, directions, us, vs, constants, grids, biases, cube, densit
         t = (tl.where(in_cube, number, 0).to(tl.float32) + 0.5) * tl.load(cube + 6)
         x, y, z = _in_cube(origins, directions, cube, ray, t)
         thick = softplus(trilinear(density, grids, K, x, y, z, in_cube) + tl.load(cube + 7))
-        tau = tl.where(is_mpi, tau, thick * tl.load(constants + K * FLOATS + INTERVAL))
+        tau = tl.where(is_mpi, tau, thick * tl.load(cube + 8))
         u, v, s = tl.where(is_mpi, u, x), tl.where(is_mpi, v, y), tl.where(is_mpi, s, z)
         plane = tl.where(is_mpi, plane, number)
     return plane, u, v, s, tau
@@ -180,7 +178,7 @@ def _in_mpi(local_origins, local_directions, constants, ray, k, inverse_t, K: tl
     v = (tl.load(origin + 1) * inverse_t + tl.load(direction + 1)) / depth - tl.load(mpi + V0)
     v = v * tl.load(mpi + V_SCALE) - 1
     s = 1 - tl.load(mpi + S_SCALE) * (inverse_t / depth - tl.load(mpi + END))
-    inside = ahead & (tl.abs(u) <= 1 + ULPS) & (tl.abs(v) <= 1 + ULPS) & (tl.abs(s) <= 1 + tl.load(mpi + SLACK))
+    inside = ahead & (tl.abs(u) <= 1 + ULPS) & (tl.abs(v) <= 1 + ULPS) & (tl.abs(s) <= 1 + ULPS / tl.load(mpi + SHARE))
     return tl.where(ahead, u, 0.0), tl.where(ahead, v, 0.0), tl.where(ahead, s, 0.0), inside
 
 
@@ -364,54 +362,32 @@ class Slots:
     """The most that a ray kept, then what was kept of each head."""
 
 
-def march_into_slots(
-    layout: SceneLayout,
-    tables: Tables,
-    origins: Tensor,
-    directions: Tensor,
-    hits: PlaneHits,
-    first: Tensor,
-    counts: Tensor,
-    threshold: float,
-    fair_share: float,
-    form: BlendForm | None,
-    baked: bool,
-) -> Slots:
+def march_into_slots(layout: SceneLayout, tables: Tables, rays: Crossings, options: MarchOptions) -> Slots:
     """``march`` before anything is waited for."""
-    scene, device, num_rays = GpuScene.of(layout), origins.device, len(origins)
+    origins, directions, hits, first, counts = rays
+    scene, device, num_rays, threshold = GpuScene.of(layout), origins.device, len(origins), float(options.threshold)
     parts = (origins, directions, hits.local_origins, hits.local_directions, hits.u, hits.v, first, counts)
-    rays, room = [x.contiguous() for x in parts], most_kept(scene.most_samples, threshold, fair_share)
+    room = most_kept(scene.most_samples, threshold, options.fair_share)
     kept = torch.empty(num_rays, dtype=torch.int32, device=device)
-    left = torch.empty(2, num_rays, 1, device=device)
+    skipped, dropped = (torch.empty(num_rays, 1, device=device) for _ in range(2))
     slots = [torch.empty(num_rays, room, dtype=torch.int32, device=device) for _ in range(2)]
     slots += [torch.empty(num_rays, room, width, device=device) for width in (3, 1, 1, 1)]
     numbers = torch.zeros(1 + layout.num_heads, dtype=torch.int32, device=device)
     if num_rays:
-        rays_at_once = block_size(RAYS if num_rays >= MANY else FEW_RAYS, device)
-        march_kernel[(triton.cdiv(num_rays, rays_at_once),)](
-            *rays, *scene.constants(), *tables, kept, left[0], left[1], *slots, numbers,
-            num_rays, room, float(threshold), float(fair_share),
+        at_once = block_size(RAYS if num_rays >= MANY else FEW_RAYS, device)
+        march_kernel[(triton.cdiv(num_rays, at_once),)](
+            *(x.contiguous() for x in parts), *scene.constants(), *tables, kept, skipped, dropped, *slots, numbers,
+            num_rays, room, threshold, float(options.fair_share),
             K=len(layout.mpis), HEADS=triton.next_power_of_2(layout.num_heads), HAS_CUBE=layout.cube is not None,
-            BLENDS=form is not None, BAKED=baked, KEEP_ALL=threshold <= 0, RAYS=rays_at_once, STEPS=STEPS, num_warps=1,
+            BLENDS=options.form is not None, BAKED=options.baked, KEEP_ALL=threshold <= 0, RAYS=at_once, STEPS=STEPS,
+            num_warps=1,
         )  # fmt: skip
-    return Slots(kept, slots, room, left[0], left[1], numbers)
+    return Slots(kept, slots, room, skipped, dropped, numbers)
 
 
-def march(
-    layout: SceneLayout,
-    tables: Tables,
-    origins: Tensor,
-    directions: Tensor,
-    hits: PlaneHits,
-    first: Tensor,
-    counts: Tensor,
-    threshold: float,
-    fair_share: float,
-    form: BlendForm | None,
-    baked: bool,
-) -> MergedSamples:
+def march(layout: SceneLayout, tables: Tables, rays: Crossings, options: MarchOptions) -> MergedSamples:
     """See ``ops.march``. Waits for the device once, to size the result."""
-    m = march_into_slots(layout, tables, origins, directions, hits, first, counts, threshold, fair_share, form, baked)
+    m = march_into_slots(layout, tables, rays, options)
     widest, *of_heads = m.numbers.tolist()
     packed = _pack(m.kept, m.slots, m.room, max(1, widest))
     return MergedSamples(

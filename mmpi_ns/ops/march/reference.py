@@ -6,6 +6,7 @@ What the compiled marches are compared with, and what runs where there are none.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -14,7 +15,7 @@ from torch import Tensor
 from mmpi_ns.ops.blending import BlendForm, blended_optical_depth, interpolate_shares, log_shares
 from mmpi_ns.ops.composite.reference import exclusive_cumsum
 from mmpi_ns.ops.interpolate import interpolate
-from mmpi_ns.ops.layout import SceneLayout, Tables
+from mmpi_ns.ops.layout import Places, SceneLayout, Tables
 from mmpi_ns.scene.geometry import LocalRays, PlaneHits, inverse_distance, sample_disparity
 
 BLEND_BLOCK = 16
@@ -23,6 +24,33 @@ OPAQUE_DEPTH = 9.2
 """exp(-9.2) = 1e-4 of the light: far below what a sample must weigh to be kept."""
 NEGLIGIBLE_DEPTH = 1e-4
 """Samples thinner than this get an equal share without a lookup of reliabilities."""
+
+
+class Crossings(NamedTuple):
+    """R rays, and their live samples in H heads."""
+
+    origins: Float[Tensor, "R 3"]
+    """World axes, as the unit directions are."""
+    directions: Float[Tensor, "R 3"]
+    hits: PlaneHits
+    """Where the rays cross the planes."""
+    first: Int[Tensor, "R H"]
+    """m of each head's nearest live plane; the cube's first sample in the last column, where there is a cube."""
+    counts: Int[Tensor, "R H"]
+    """Live samples of each head."""
+
+
+class MarchOptions(NamedTuple):
+    """Which samples are kept, and how they are blended."""
+
+    threshold: float
+    """Weight below which a sample is dropped; 0 keeps all and ends no ray early."""
+    fair_share: float = float("inf")
+    """Bound on the threshold relative to equal weights (``prune``)."""
+    form: BlendForm | None = None
+    """How reliability enters; None for not at all. The opacity-keeping form is for ablations: plain torch."""
+    baked: bool = False
+    """The tables hold shares in place of reliability (``baking.bake_shares``)."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +73,10 @@ class MergedSamples:
     head_counts: tuple[int, ...] | None = None
     """How many are of each head, where it is known without asking for it."""
 
+    @property
+    def places(self) -> Places:
+        return Places(self.heads, self.planes, self.ndc, self.valid)
+
 
 @dataclass(frozen=True)
 class LiveSamples:
@@ -63,31 +95,17 @@ def most_kept(samples: int, threshold: float, fair_share: float = float("inf")) 
     return samples if threshold <= 0 else min(samples, int(1.01 / min(threshold, fair_share / samples)) + 2)
 
 
-def march(
-    layout: SceneLayout,
-    tables: Tables,
-    origins: Tensor,
-    directions: Tensor,
-    hits: PlaneHits,
-    first: Tensor,
-    counts: Tensor,
-    threshold: float,
-    fair_share: float,
-    form: BlendForm | None,
-    baked: bool,
-) -> MergedSamples:
+def march(layout: SceneLayout, tables: Tables, rays: Crossings, options: MarchOptions) -> MergedSamples:
     """See ``ops.march``."""
-    num_mpis = len(layout.mpis)
-    samples = [_sample_mpi(k, counts[:, k], hits, layout, tables) for k in range(num_mpis)]
+    samples = [_sample_mpi(k, rays.counts[:, k], rays.hits, layout, tables) for k in range(len(layout.mpis))]
     if layout.cube is not None:
-        samples.append(_sample_cube(first[:, -1], counts[:, -1], origins, directions, layout, tables))
+        samples.append(_sample_cube(rays, layout, tables))
     flat = LiveSamples(*(torch.cat([getattr(s, f) for s in samples]) for f in LiveSamples.__dataclass_fields__))
-    order, valid = _sort(flat, counts)
+    order, valid = _sort(flat, rays.counts)
     tau = flat.tau
-    if form is not None and tau.numel():
-        local = LocalRays(origins, directions, hits.local_origins, hits.local_directions)
-        tau = _blend_visible(order, valid, flat, local, layout, tables, form, baked)
-    pruned = prune(order, valid, tau, threshold, fair_share)
+    if options.form is not None and tau.numel():
+        tau = _blend_visible(order, valid, flat, rays, layout, tables, options)
+    pruned = prune(order, valid, tau, options.threshold, options.fair_share)
     order, valid = pruned.order, pruned.valid
 
     def pick(values: Tensor) -> Tensor:
@@ -130,15 +148,13 @@ def _sample_mpi(k: int, counts: Int[Tensor, "R"], hits: PlaneHits, layout: Scene
     return LiveSamples(rays, torch.full_like(rays, k), planes, ndc, inverse_distance(w, ray[:, 4], ray[:, 5]), tau)
 
 
-def _sample_cube(
-    first: Tensor, counts: Tensor, origins: Tensor, directions: Tensor, layout: SceneLayout, tables: Tables
-) -> LiveSamples:
+def _sample_cube(at: Crossings, layout: SceneLayout, tables: Tables) -> LiveSamples:
     """All samples inside the cube, at fixed distances from each camera."""
     assert layout.cube is not None
-    rays, index = _enumerate(counts)
-    index, k = first[rays] + index, len(layout.mpis)
-    t = (index + 0.5).to(origins.dtype) * layout.cube.step
-    ndc = layout.cube.normalised(origins[rays] + directions[rays] * t[:, None])
+    rays, index = _enumerate(at.counts[:, -1])
+    index, k = at.first[:, -1][rays] + index, len(layout.mpis)
+    t = (index + 0.5).to(at.origins.dtype) * layout.cube.step
+    ndc = layout.cube.normalised(at.origins[rays] + at.directions[rays] * t[:, None])
     raw = interpolate(tables.density, *layout.grids[k].trilinear(ndc))[:, 0]
     return LiveSamples(rays, torch.full_like(rays, k), index, ndc, 1 / t, layout.optical_depth(k, raw, index))
 
@@ -204,11 +220,10 @@ def _blend_visible(
     order: Int[Tensor, "R S"],
     valid: Bool[Tensor, "R S"],
     flat: LiveSamples,
-    local: LocalRays,
+    rays: Crossings,
     layout: SceneLayout,
     tables: Tables,
-    form: BlendForm,
-    baked: bool,
+    options: MarchOptions,
 ) -> Float[Tensor, "N"]:
     """Blended optical depths, front to back, until a ray lets less than exp(-OPAQUE_DEPTH) through.
 
@@ -223,7 +238,7 @@ def _blend_visible(
         index = block[wanted]
         if not index.numel():
             break
-        tau[index] = _blend(index, flat, local, layout, tables, form, baked)
+        tau[index] = _blend(index, flat, rays, layout, tables, options)
         passed += torch.where(wanted, tau[block], 0.0).sum(-1)
     return tau
 
@@ -231,24 +246,25 @@ def _blend_visible(
 def _blend(
     index: Int[Tensor, "M"],
     flat: LiveSamples,
-    local: LocalRays,
+    rays: Crossings,
     layout: SceneLayout,
     tables: Tables,
-    form: BlendForm,
-    baked: bool,
+    options: MarchOptions,
 ) -> Float[Tensor, "M"]:
     """Blended optical depth of some samples; those too thin to matter get an equal share without a lookup."""
     tau = flat.tau[index]
     thick = (tau > NEGLIGIBLE_DEPTH).nonzero()[:, 0]
     own = index[thick]
-    if baked:
+    if options.baked:
         found = interpolate_shares(layout, tables.reliability, flat.ndc[own], flat.heads[own])
         share = found.log(), torch.log1p(-found)
     else:
+        local = LocalRays(rays.origins, rays.directions, rays.hits.local_origins, rays.hits.local_directions)
         asked = (flat.rays[own], local, flat.inverse_t[own], flat.heads[own])
         share = log_shares(layout, tables.reliability, tables.touched, *asked)
+    assert options.form is not None
     blended = tau / layout.num_heads
-    return blended.index_copy(0, thick, blended_optical_depth(tau[thick], *share, form))
+    return blended.index_copy(0, thick, blended_optical_depth(tau[thick], *share, options.form))
 
 
 # Prune ---------------------------------------------------------------------------------------------------------------

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from mmpi_ns.ops import dispatch
-from mmpi_ns.ops.layout import SceneLayout
+from mmpi_ns.ops.layout import Places, SceneLayout
 from mmpi_ns.ops.shade.reference import SampleNetworks
 
 
@@ -16,10 +16,7 @@ def shade(
     networks: SampleNetworks,
     axes: Float[Tensor, "H 3 3"],
     directions: Float[Tensor, "R 3"],
-    heads: Int[Tensor, "R S"],
-    planes: Int[Tensor, "R S"],
-    ndc: Float[Tensor, "R S 3"],
-    valid: Bool[Tensor, "R S"],
+    places: Places,
 ) -> Float[Tensor, "R S 3"]:
     """Colours of the valid samples; empty slots are black.
 
@@ -29,9 +26,6 @@ def shade(
         networks: of all heads.
         axes: of each head, as rows.
         directions: of each ray, world axes.
-        heads: head of each sample.
-        planes: its plane; of no meaning in the cube.
-        ndc: its position in the head.
-        valid: which slots hold a sample.
+        places: of the samples.
     """
-    return dispatch.run("shade", layout, table, networks, axes, directions, heads, planes, ndc, valid)
+    return dispatch.run("shade", layout, table, networks, axes, directions, places)

@@ -7,9 +7,9 @@ import ctypes
 import torch
 from torch import Tensor
 
-from mmpi_ns.ops.build import address, addresses, in_parts, library, sizes
+from mmpi_ns.ops.build import arguments, call_in_parts
 from mmpi_ns.ops.cpu_scene import CpuScene
-from mmpi_ns.ops.layout import SceneLayout
+from mmpi_ns.ops.layout import Places, SceneLayout
 from mmpi_ns.ops.shade.reference import SampleNetworks
 
 
@@ -34,30 +34,21 @@ class _Shading(ctypes.Structure):
 
 
 def shade(
-    layout: SceneLayout,
-    table: Tensor,
-    networks: SampleNetworks,
-    axes: Tensor,
-    directions: Tensor,
-    heads: Tensor,
-    planes: Tensor,
-    ndc: Tensor,
-    valid: Tensor,
+    layout: SceneLayout, table: Tensor, networks: SampleNetworks, axes: Tensor, directions: Tensor, places: Places
 ) -> Tensor:
     """See ``ops.shade``."""
-    lib, channels, axes = library(), table.shape[1], axes.contiguous()
+    channels, axes, shape = table.shape[1], axes.contiguous(), places.valid.shape
     split = channels + 3 * (1 + 2 * networks.position_frequencies)
     held, nets, starts = [], [], []
     for own_axes, (w1, b1, w2, b2, w3, b3) in zip(axes, networks.layers, strict=True):
         own = [x.contiguous() for x in (w1[:, :split], w2, b2, w3, b3)]
         first = [x.contiguous() for x in (own_axes, w1[:, split:], b1)]
-        nets.append(_Network(channels, networks.position_frequencies, len(w1), *addresses(own)))
-        starts.append(_Start(*addresses(first), networks.direction_frequencies))
+        nets.append(_Network(channels, networks.position_frequencies, len(w1), *arguments(own)))
+        starts.append(_Start(*arguments(first), networks.direction_frequencies))
         held.append((own, first))
-    parts = [x.contiguous() for x in (table, directions, heads, planes, ndc, valid)]
-    shading = _Shading(*addresses(parts), len(table), valid.shape[1])
-    given = (CpuScene.of(layout).grids, *sizes(len(layout.mpis), len(nets)), ctypes.byref(shading))
-    given = (*given, (_Network * len(nets))(*nets), (_Start * len(starts))(*starts))
-    colors = torch.empty(*valid.shape, 3)
-    in_parts(lambda a, b: lib.mmpi_shade(*given, *sizes(a, b), address(colors)), len(valid))
+    parts = [x.contiguous() for x in (table, directions, *places)]
+    shading = _Shading(*arguments(parts), len(table), shape[1])
+    given = (CpuScene.of(layout).grids, len(layout.mpis), len(nets), ctypes.byref(shading))
+    given, colors = (*given, (_Network * len(nets))(*nets), (_Start * len(starts))(*starts)), torch.empty(*shape, 3)
+    call_in_parts("mmpi_shade", len(colors), given, (colors,))
     return colors

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mmpi_ns.ops.gather.reference import interpolated
-from mmpi_ns.ops.layout import SceneLayout
+from mmpi_ns.ops.layout import Places, SceneLayout
 from mmpi_ns.scene.geometry import rotate
 
 Layers = Sequence[Tensor]
@@ -54,19 +54,12 @@ def sample_colors(
 
 
 def shade(
-    layout: SceneLayout,
-    table: Tensor,
-    networks: SampleNetworks,
-    axes: Tensor,
-    directions: Tensor,
-    heads: Tensor,
-    planes: Tensor,
-    ndc: Tensor,
-    valid: Tensor,
+    layout: SceneLayout, table: Tensor, networks: SampleNetworks, axes: Tensor, directions: Tensor, places: Places
 ) -> Tensor:
     """See ``ops.shade``."""
+    _, _, ndc, valid = places
     colors = table.new_zeros(valid.numel(), 3)
-    for k, (slots, features) in enumerate(interpolated(layout, table, heads, planes, ndc, valid)):
+    for k, (slots, features) in enumerate(interpolated(layout, table, places)):
         position = positional_encoding(ndc.reshape(-1, 3)[slots], networks.position_frequencies)
         direction = positional_encoding(rotate(axes[k], directions), networks.direction_frequencies)
         colors[slots] = sample_colors(networks.layers[k], features, position, direction[slots // valid.shape[1]])

@@ -12,13 +12,12 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from mmpi_ns.ops.blending import BlendForm
 from mmpi_ns.ops.gather.gpu import activate, sizes
 from mmpi_ns.ops.gpu_scene import DEPTH, HEIGHT, INTS, WIDTH, GpuScene, cell, one_minus_exp, row_of
 from mmpi_ns.ops.layout import SceneLayout, Tables
 from mmpi_ns.ops.march.gpu import march_into_slots
+from mmpi_ns.ops.march.reference import Crossings, MarchOptions
 from mmpi_ns.ops.show.reference import Shown
-from mmpi_ns.scene.geometry import PlaneHits
 
 NUMBERS = 256
 """Rays of a program times their channels: what its registers hold."""
@@ -90,22 +89,10 @@ def show_kernel(
     tl.store(medians + ray, median, inside)
 
 
-def show_rays(
-    layout: SceneLayout,
-    tables: Tables,
-    features: Tensor,
-    origins: Tensor,
-    directions: Tensor,
-    hits: PlaneHits,
-    first: Tensor,
-    counts: Tensor,
-    threshold: float,
-    form: BlendForm | None,
-    baked: bool,
-) -> Shown:
+def show_rays(layout: SceneLayout, tables: Tables, features: Tensor, rays: Crossings, options: MarchOptions) -> Shown:
     """See ``ops.show``."""
-    m = march_into_slots(layout, tables, origins, directions, hits, first, counts, threshold, float("inf"), form, baked)
-    num_rays, channels, device = len(origins), features.shape[1], origins.device
+    m = march_into_slots(layout, tables, rays, options)
+    num_rays, channels, device = len(rays.origins), features.shape[1], features.device
     gathered = torch.empty(num_rays, channels, device=device)
     mass, depth, median, winner = (torch.empty(num_rays, 1, device=device) for _ in range(4))
     if num_rays:

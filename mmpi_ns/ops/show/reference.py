@@ -7,12 +7,10 @@ from dataclasses import dataclass
 from jaxtyping import Float
 from torch import Tensor
 
-from mmpi_ns.ops.blending import BlendForm
 from mmpi_ns.ops.composite import composite_weights, median_inverse_distance, winning_heads
 from mmpi_ns.ops.gather import gather_places
 from mmpi_ns.ops.layout import SceneLayout, Tables
-from mmpi_ns.ops.march import march
-from mmpi_ns.scene.geometry import PlaneHits
+from mmpi_ns.ops.march import Crossings, MarchOptions, march
 
 
 @dataclass(frozen=True)
@@ -32,23 +30,11 @@ class Shown:
     dropped_mass: Float[Tensor, "R 1"]
 
 
-def show_rays(
-    layout: SceneLayout,
-    tables: Tables,
-    features: Tensor,
-    origins: Tensor,
-    directions: Tensor,
-    hits: PlaneHits,
-    first: Tensor,
-    counts: Tensor,
-    threshold: float,
-    form: BlendForm | None,
-    baked: bool,
-) -> Shown:
+def show_rays(layout: SceneLayout, tables: Tables, features: Tensor, rays: Crossings, options: MarchOptions) -> Shown:
     """See ``ops.show``."""
-    m = march(layout, tables, origins, directions, hits, first, counts, threshold, float("inf"), form, baked)
+    m = march(layout, tables, rays, options)
     composite = composite_weights(m.tau, m.valid, m.skipped_before, m.skipped_total)
-    sums = gather_places(layout, features, m.heads, m.planes, m.ndc, m.valid, composite.weights)
+    sums = gather_places(layout, features, m.places, composite.weights)
     return Shown(
         gathered=sums.gathered,
         mass=composite.weights.sum(-1, keepdim=True),

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import ctypes
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from mmpi_ns.ops.build import address, in_parts, library, sizes
+from mmpi_ns.ops.build import call_in_parts
 from mmpi_ns.ops.cpu_scene import CpuScene
 from mmpi_ns.ops.layout import SceneLayout
 from mmpi_ns.ops.variation.reference import Scales
@@ -20,17 +19,11 @@ PART = 4096
 class _Variation(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, values: Tensor, table: Tensor, rows: Tensor, layout: SceneLayout, scales: Scales) -> Tensor:
-        gradient, grids, lib = torch.empty_like(values), CpuScene.of(layout).grids, library()
-        flat = [s for each in scales for s in each]
+        gradient, grids = torch.empty_like(values), CpuScene.of(layout).grids
+        weights = torch.tensor(scales, dtype=torch.float32)
         totals = torch.zeros(-(-len(rows) // PART), dtype=torch.float64)
-        given = (address(table), *sizes(len(table)), grids, *sizes(len(grids)))
-        given = (*given, address(layout.grids[0].places, torch.int64), (ctypes.c_float * len(flat))(*flat))
-        made, where = (address(gradient), address(totals, torch.float64)), address(rows, torch.int64)
-
-        def part(begin: int, end: int) -> None:
-            lib.mmpi_total_variation(where, *sizes(len(rows), begin, end, table.shape[1]), *given, *made)
-
-        in_parts(part, len(totals), least=1)
+        given = (table.shape[1], table, len(table), grids, len(grids), layout.grids[0].places, weights)
+        call_in_parts("mmpi_total_variation", len(totals), (rows, len(rows)), (*given, gradient, totals), least=1)
         ctx.save_for_backward(gradient)
         return totals.sum().to(values.dtype)
 
