@@ -71,7 +71,7 @@ class MMPIDataManagerConfig(VanillaDataManagerConfig):
     """Rays a step from between two training cameras, at points that both show at the same known depth, for each pixel
     ray: what a new view would see there (0: none)."""
     resident_pixels: float = 60e6
-    """Training pixels held in memory at once (at most 15 bytes each). Those of a longer capture are read window by
+    """Training pixels held in memory at once (at most 12 bytes each). Those of a longer capture are read window by
     window, and of a window that has more, so many at random. 0: window by window, all of them."""
     seed: int = field(default=0, init=False)
     """Not an option: the trainer sets it from --machine.seed. Batches depend on it and the step alone, so a resumed run

@@ -90,7 +90,7 @@ def load_view(images: PosedImages, i: int, width: int) -> View:
         gray = cv2.resize(gray, (width, height), interpolation=cv2.INTER_AREA)
     scale = np.array([gray.shape[1] / full_width, gray.shape[0] / full_height])
     pinhole = images.intrinsics[i] * np.tile(scale, 2)
-    inside = np.ones(gray.shape, bool)
+    inside = np.broadcast_to(True, gray.shape)  # of no size
     if images.distortion[i].any():
         matrix, size = camera_matrix(pinhole), gray.shape[::-1]
         straighten = cv2.fisheye.initUndistortRectifyMap if images.fisheye else cv2.initUndistortRectifyMap

@@ -5,17 +5,20 @@ Sources, the later over the earlier: dense matches (``dense.py``), SfM points, d
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import torch
+from jaxtyping import Float, Int16
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.utils.rich_utils import CONSOLE
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 from rich.progress import track
+from torch import Tensor
 
 from mmpi_ns.capture.cache import Arrays, digest, remembered
 from mmpi_ns.capture.dataset import MMPIDataset
@@ -27,11 +30,14 @@ from mmpi_ns.capture.tracks import PosedImages
 from mmpi_ns.placement.observations import Observations
 
 Map = NDArray[np.float32]
+Codes = NDArray[np.int16]
 
-VERSION = 3
+VERSION = 4
 """Of the way depths are found: kept ones of another version are found anew."""
-FINER, WIDEST = 2, 1600
+FINER, WIDEST = 2.0, 1600
 """Images are matched at so many times the training size, and no wider than this, where their originals are."""
+MOST_WORKING = 6e8
+"""Pixels in all at which images are matched (13 bytes each meanwhile); of more, at a smaller size."""
 COVERED = 0.3
 """Share of a training pixel's area in which working pixels must have a depth."""
 POINT_ERROR = 0.01
@@ -40,23 +46,54 @@ CELLS = 32
 """Cells along the longer side of an image, each of which tells placement one depth."""
 SENSOR_ERROR = 0.01
 """Relative error of a sensor's depth."""
+UNKNOWN, OCTAVE = -(2**15), 1024
+"""Code of a number that is 0, and codes in an octave."""
 
 
 @dataclass(frozen=True)
 class KnownDepth:
-    """For every training image [H, W, 2]: inverse distance from the camera, 0 where unknown, and its expected error."""
+    """For every training image: inverse distance from the camera, 0 where unknown, and its expected error.
 
-    images: tuple[Map, ...]
+    Half as large as floating-point numbers would be: a distance is off by at most 0.034 %.
+    """
+
+    codes: tuple[Codes, ...]
+    """[H, W, 2] each, by ``packed``."""
+
+    @staticmethod
+    def of(maps: Iterable[Map]) -> KnownDepth:
+        """From the numbers themselves [H, W, 2]."""
+        return KnownDepth(tuple(packed(m) for m in maps))
 
     @staticmethod
     def nothing(sizes: NDArray[np.float64]) -> KnownDepth:
         """For images of these sizes (width, height)."""
-        return KnownDepth(tuple(np.zeros((int(h), int(w), 2), np.float32) for w, h in sizes))
+        return KnownDepth(tuple(np.full((int(h), int(w), 2), UNKNOWN, np.int16) for w, h in sizes))
+
+    def image(self, i: int) -> Map:
+        """The numbers of one image. [H, W, 2]"""
+        return unpacked(torch.from_numpy(self.codes[i])).numpy()
 
     @property
     def share(self) -> float:
         """Share of all pixels whose distance is known."""
-        return sum(int((m[..., 0] > 0).sum()) for m in self.images) / max(1, sum(m[..., 0].size for m in self.images))
+        known = sum(int((m[..., 0] != UNKNOWN).sum()) for m in self.codes)
+        return known / max(1, sum(m[..., 0].size for m in self.codes))
+
+
+def packed(values: ArrayLike) -> Codes:
+    """Logarithms of positive numbers in steps of 1/1024 of an octave, for 1/t and errors from 2^-31 to 2^31; 0 is kept.
+
+    Relative steps, as a distance's error is relative too, whatever the unit of the scene.
+    """
+    values = np.asarray(values, np.float32)
+    logarithms = np.log2(np.where(values > 0, values, 1))
+    return np.where(values > 0, np.rint(OCTAVE * logarithms.clip(-31, 31)), UNKNOWN).astype(np.int16)
+
+
+def unpacked(codes: Int16[Tensor, "*N"]) -> Float[Tensor, "*N"]:
+    """The numbers that ``packed`` made codes of."""
+    return torch.where(codes == UNKNOWN, 0.0, torch.exp2(codes.float() / OCTAVE))
 
 
 def know_depths(
@@ -95,16 +132,16 @@ def _remembered_depths(original: PosedImages, posed: PosedImages, observations: 
     seen_by, points = observations.seen_by[:tracked], observations.points[observations.seen_point[:tracked]]
     shapes = [(int(h), int(w)) for w, h in observations.sizes]
     file_shapes = [_file_shape(original, posed, i) for i in range(len(shapes))]
-    width = int(min(WIDEST, FINER * max(w for _, w in shapes)))
+    widest, pixels = max(w for _, w in shapes), sum(w * h for h, w in shapes)
+    width = int(min(WIDEST, widest * min(FINER, (MOST_WORKING / pixels) ** 0.5)))
 
     def find() -> Arrays:
         progress: Progress = lambda n: track(n, description=f"Depths of {len(shapes)} images", console=CONSOLE)  # noqa: E731
         found = find_depths(original, lambda i: points[seen_by == i], width, progress)
-        maps = [
-            at_training_pixels(view, depth, original, i, shapes[i], file_shapes[i])
+        return {
+            f"{i}": packed(at_training_pixels(view, depth, original, i, shapes[i], file_shapes[i]))
             for i, (view, depth) in enumerate(found)
-        ]
-        return {f"{i}": m for i, m in enumerate(maps)}
+        }
 
     cameras = original.camera_to_worlds, original.intrinsics, original.distortion, original.fisheye
     key = digest(original.files, "depths", VERSION, ROUNDS, width, shapes, *cameras, seen_by, points)
@@ -124,12 +161,12 @@ def with_sensor(
     known: KnownDepth, files: list[Path], unit: float, original: PosedImages, posed: PosedImages
 ) -> KnownDepth:
     """Takes the depths of sensors where they know any."""
-    maps = []
-    for i, (file, image) in enumerate(zip(files, known.images, strict=True)):
-        shape = image.shape[0], image.shape[1]
-        measured = read_sensor(file, unit, original, i, shape, _file_shape(original, posed, i))
-        maps.append(np.where(measured[..., :1] > 0, measured, image))
-    return KnownDepth(tuple(maps))
+    codes = []
+    for i, (file, own) in enumerate(zip(files, known.codes, strict=True)):
+        shape = own.shape[0], own.shape[1]
+        measured = packed(read_sensor(file, unit, original, i, shape, _file_shape(original, posed, i)))
+        codes.append(np.where(measured[..., :1] != UNKNOWN, measured, own))
+    return KnownDepth(tuple(codes))
 
 
 def at_training_pixels(
@@ -200,7 +237,8 @@ def with_known_depths(observations: Observations, known: KnownDepth, dataset: MM
     keypoints that have.
     """
     seen_by, points = [], []
-    for i, depth in enumerate(known.images):
+    for i in range(len(known.codes)):
+        depth = known.image(i)
         rows, columns = best_of_cells(depth)
         coords = torch.from_numpy(np.stack([rows, columns], -1) + 0.5).float()
         rays = dataset.cameras.generate_rays(torch.full((len(rows), 1), i), coords=coords)
@@ -231,15 +269,16 @@ def best_of_cells(depth: Map) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 
 def with_points(known: KnownDepth, observations: Observations) -> KnownDepth:
     """Adds the distances of SfM points at the pixels that saw them; the nearest where several fall on one."""
-    maps = [m.copy() for m in known.images]
+    codes = [m.copy() for m in known.codes]
     count = len(observations.seen_at)
     cameras, points = observations.seen_by[:count], observations.points[observations.seen_point[:count]]
     distance = np.linalg.norm(points - observations.centers[cameras], axis=-1)
+    inverse = packed(np.outer(1 / np.maximum(distance, 1e-30), [1, POINT_ERROR]))
     for k in np.argsort(-distance, kind="stable"):
-        image, (x, y) = maps[cameras[k]], observations.seen_at[k].astype(int)
+        image, (x, y) = codes[cameras[k]], observations.seen_at[k].astype(int)
         if distance[k] > 0 and 0 <= y < image.shape[0] and 0 <= x < image.shape[1]:
-            image[y, x] = 1 / distance[k], POINT_ERROR / distance[k]
-    return KnownDepth(tuple(maps))
+            image[y, x] = inverse[k]
+    return KnownDepth(tuple(codes))
 
 
 def read_sensor(

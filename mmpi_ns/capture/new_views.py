@@ -116,11 +116,12 @@ def find_shared_points(
     Raises:
         InputError: an image or mask cannot be used (names the file).
     """
-    show = lru_cache(HELD)(lambda i: _image(dataset, i))  # neighbours mostly stand side by side
+    show = lru_cache(HELD)(lambda i: (*_image(dataset, i), known.image(i)))  # neighbours mostly stand side by side
     rng, parts, found = np.random.default_rng(seed), [], 0.0
     budget = max(1, MOST // (NEIGHBOURS * max(1, len(images))))
     for i in images:
-        rows, columns = _certain(known.images[i], show(i)[1])
+        own_image, usable, own_depths = show(i)
+        rows, columns = _certain(own_depths, usable)
         count = len(rows)
         if count > budget:
             chosen = np.sort(rng.choice(count, budget, replace=False))
@@ -129,10 +130,10 @@ def find_shared_points(
             continue
         pixels = torch.from_numpy(np.stack([np.full(len(rows), i), rows, columns], -1))
         directions = rays(pixels.to(device)).directions.double().cpu().numpy()
-        depths = known.images[i][rows, columns]
-        points, own = posed.camera_to_worlds[i, :, 3] + directions / depths[:, :1], show(i)[0][rows, columns]
+        depths = own_depths[rows, columns]
+        points, own = posed.camera_to_worlds[i, :, 3] + directions / depths[:, :1], own_image[rows, columns]
         for j in _neighbours(posed, i, images):
-            seen, colors = _seen_by(posed, j, points, own, known.images[j], *show(j))
+            seen, colors = _seen_by(posed, j, points, own, *show(j))
             found += len(seen) * count / len(rows)
             both = np.stack([own[seen], colors], 1)
             parts.append((pixels[seen].int(), torch.full((len(colors),), j, dtype=torch.int32), both, depths[seen]))
@@ -141,7 +142,7 @@ def find_shared_points(
     pixels, other = (torch.cat([part[n] for part in parts]) for n in (0, 1))
     colors, depths = (torch.from_numpy(np.concatenate([part[n] for part in parts])) for n in (2, 3))
     centers = torch.from_numpy(posed.camera_to_worlds[:, :, 3]).float()
-    cover = found / sum(known.images[i][..., 0].size for i in images)
+    cover = found / sum(known.codes[i][..., 0].size for i in images)
     on_device = (x.to(device) for x in (pixels, other, colors, depths, centers))
     return SharedPoints(*on_device, cover=cover)
 
@@ -179,9 +180,9 @@ def _seen_by(
     j: int,
     points: NDArray[np.float64],
     own: NDArray[np.uint8],
-    depth: NDArray[np.float32],
     image: NDArray[np.uint8],
     usable: NDArray[np.uint8],
+    depth: NDArray[np.float32],
 ) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
     """Which points an image shows at their own distance and in about their own colour, and in which colours."""
     at = project(posed, j, points)

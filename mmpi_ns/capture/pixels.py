@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Int, Int16, UInt8
 from torch import Tensor
 
 from mmpi_ns.capture.dataset import MMPIDataset
-from mmpi_ns.capture.known_depth import KnownDepth
+from mmpi_ns.capture.known_depth import KnownDepth, unpacked
 from mmpi_ns.utils.errors import InputError
 from mmpi_ns.utils.random_draws import generator
 
@@ -31,8 +31,8 @@ class PixelPool:
     """Where each image's pixels begin, and where the last one's end."""
     places: Int[Tensor, "P"] | None
     """row * width + column of each pixel; None where all are here."""
-    depths: Float[Tensor, "P 2"] | None
-    """Inverse distance of each pixel and its expected error, 0 where not known; None where none is."""
+    depths: Int16[Tensor, "P 2"] | None
+    """Inverse distance of each pixel and its expected error, as ``known_depth.packed``; None where none is known."""
 
     @staticmethod
     def from_dataset(
@@ -64,7 +64,7 @@ class PixelPool:
         room = sum(int(share * size) for size in sizes)
         colors = torch.empty(room, 4 if dataset.has_alpha else 3, dtype=torch.uint8)
         places = None if whole else torch.empty(room, dtype=torch.int32)
-        depths = None if known is None else torch.empty(room, 2)
+        depths = None if known is None else torch.empty(room, 2, dtype=torch.int16)
         starts = [0]
         for i in images:
             image, kept = _pixels_of(dataset, i, share, seed)
@@ -74,7 +74,7 @@ class PixelPool:
             if places is not None:
                 places[rows] = kept.int()
             if depths is not None and known is not None:
-                depths[rows] = torch.from_numpy(known.images[i]).reshape(-1, 2)[kept]
+                depths[rows] = torch.from_numpy(known.codes[i]).reshape(-1, 2)[kept]
             starts.append(end)
         if not starts[-1]:
             raise InputError("The masks leave no training pixel: white (non-zero) mask pixels are the ones used.")
@@ -109,7 +109,8 @@ class PixelPool:
         place = chosen - begins[which] if self.places is None else self.places[chosen].long()
         width = self.widths[image]
         indices = torch.stack([self.images[image], place // width, place % width], -1)
-        depths = torch.zeros(count, 2, device=self.colors.device) if self.depths is None else self.depths[chosen]
+        nothing = torch.zeros(count, 2, device=self.colors.device)
+        depths = nothing if self.depths is None else unpacked(self.depths[chosen])
         return self.colors[chosen].float() / 255, indices, depths
 
     def places_of(self, images: Int[Tensor, "A"]) -> Int[Tensor, "B"]:
@@ -124,7 +125,7 @@ class PixelPool:
 
 def pixel_bytes(*, whole: bool, depths: bool, channels: int) -> int:
     """Bytes of a pixel in a pool: its colour, its place in the image where it must be kept, and its depth."""
-    return channels + (0 if whole else 4) + (8 if depths else 0)
+    return channels + (0 if whole else 4) + (4 if depths else 0)
 
 
 def _pixels_of(dataset: MMPIDataset, i: int, share: float, seed: int) -> tuple[UInt8[Tensor, "N C"], Int[Tensor, "n"]]:

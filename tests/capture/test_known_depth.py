@@ -23,6 +23,8 @@ from mmpi_ns.capture.tracks import PosedImages
 from mmpi_ns.placement.observations import Observations
 
 F32 = np.float32
+STEP = 3.5e-4
+"""Relative error of a stored distance."""
 WIDTH, HEIGHT = 80, 60
 
 
@@ -83,6 +85,15 @@ def test_areas_take_the_mean_by_certainty_and_edges_have_large_errors():
     assert mean[1, 0] == 0 and mean[1, 1] == pytest.approx(0.5)  # nothing known; half of the area known
 
 
+def test_stored_distances_are_off_by_a_tenth_of_their_least_error_and_0_stays_unknown():
+    numbers = (
+        np.concatenate([[0.0], 10 ** np.random.default_rng(0).uniform(-9, 9, 9999)]).astype(F32).reshape(50, 100, 2)
+    )
+    found = KnownDepth.of([numbers]).image(0)
+    assert np.allclose(found, numbers, rtol=STEP, atol=0) and STEP < 0.1 * min(POINT_ERROR, SENSOR_ERROR)
+    assert found[0, 0, 0] == 0 and (found.reshape(-1)[1:] > 0).all()
+
+
 def seen(points, cameras, at):
     """Observations of a camera at the origin and one a unit behind it."""
     poses = np.tile(np.eye(4)[:3], (2, 1, 1))
@@ -102,8 +113,9 @@ def test_points_set_the_distance_of_the_pixels_that_saw_them_the_nearest_where_s
     observations = seen([[0, 0, -4], [0, 0, -2], [0, 0, -3]], [0, 0, 1], [[40.9, 30.2], [40.1, 30.7], [3, 5]])
     nothing = KnownDepth.nothing(observations.sizes)
     found = with_points(nothing, observations)
-    assert found.images[0][30, 40] == pytest.approx([0.5, POINT_ERROR / 2]) and (found.images[0][..., 0] > 0).sum() == 1
-    assert found.images[1][5, 3] == pytest.approx([0.25, POINT_ERROR / 4]) and nothing.share == 0
+    first, second = found.image(0), found.image(1)
+    assert first[30, 40] == pytest.approx([0.5, POINT_ERROR / 2], rel=STEP) and (first[..., 0] > 0).sum() == 1
+    assert second[5, 3] == pytest.approx([0.25, POINT_ERROR / 4], rel=STEP) and nothing.share == 0
     assert found.share == pytest.approx(2 / (2 * 80 * 60))
 
 
@@ -123,8 +135,8 @@ def test_a_sensor_goes_before_other_sources_where_it_knows_something(tmp_path):
     depth = np.zeros((HEIGHT, WIDTH), np.uint16)
     depth[:30] = 2000
     cv2.imwrite(str(tmp_path / "d.png"), depth)
-    before = KnownDepth((np.full((HEIGHT, WIDTH, 2), 0.25, F32),))
-    found = with_sensor(before, [tmp_path / "d.png"], 1e-3, camera(), camera()).images[0]
+    before = KnownDepth.of([np.full((HEIGHT, WIDTH, 2), 0.25, F32)])
+    found = with_sensor(before, [tmp_path / "d.png"], 1e-3, camera(), camera()).image(0)
     assert (found[30:] == 0.25).all() and found[29, 40, 0] == pytest.approx(0.5, rel=1e-3)
 
 
