@@ -6,12 +6,14 @@ The sentences are listed in docs/errors.md.
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
@@ -19,7 +21,7 @@ from PIL import Image
 
 from mmpi_ns.capture.lenses import check_lenses
 from mmpi_ns.utils.errors import InputError, brief
-from mmpi_ns.utils.values import Number, check_number, check_row, cut, shown
+from mmpi_ns.utils.values import Number, check_number, check_options, check_row, cut, shown
 
 SAME_PLACE = 1e-6
 """Cameras nearer to each other than this share of their distance from the origin stand in one place, in float32."""
@@ -32,9 +34,22 @@ FAR_OFF = 1000.0
 FEW = 0.1
 """Share of the cameras that are a few."""
 PATHS = ("file_path", "mask_path", "depth_file_path")
+PARSER = {
+    "scale_factor": Number(0, 1e9, above=True),
+    "scene_scale": Number(0, above=True),
+    "train_split_fraction": Number(0, 1, above=True),
+    "eval_interval": Number(1, whole=True),
+    "depth_unit_scale_factor": Number(0, above=True),
+}
+"""Options that nerfstudio's data parsers have."""
 ORIENTATIONS = ("pca", "up", "vertical", "none")
 
 Frames = Sequence[Mapping[str, Any]]
+
+
+def check_parser(parser: DataParserConfig) -> None:
+    """Raises InputError naming the option of a data parser that cannot be used."""
+    check_options(parser, {name: number for name, number in PARSER.items() if hasattr(parser, name)}, "--")
 
 
 def check_transforms(parser: NerfstudioDataParserConfig, data: Path, splits: Sequence[str], *, opens: bool) -> None:
@@ -55,9 +70,11 @@ def check_transforms(parser: NerfstudioDataParserConfig, data: Path, splits: Seq
         _check_paths(frame, i, path)
     poses = np.stack([_pose(frame, path) for frame in frames])
     _check_whole_file(meta, path)
+    _check_points(parser, meta, path)
     check_lenses(meta, frames, path)
     _check_same_for_all(frames, path)
     _check_splits(meta, frames, splits, path, by_name=(parser.downscale_factor or 1) > 1)
+    _check_names(parser, meta, frames, path)
     if opens:
         _check_first_image(parser.downscale_factor, path.parent, frames[0]["file_path"])
     names = [str(frame["file_path"]) for frame in frames]
@@ -147,11 +164,37 @@ def _check_whole_file(meta: Mapping[str, Any], path: Path) -> None:
             raise InputError(f"applied_transform of {path} is singular: give a rotation and a translation.")
     if "applied_scale" in meta:
         check_number(f"applied_scale of {path}", meta["applied_scale"], Number(0, 1e18, above=True))
+    if "fisheye_crop_radius" in meta:
+        check_number(f"fisheye_crop_radius of {path}", meta["fisheye_crop_radius"], Number(0, 1e6, above=True))
     turned = meta.get("orientation_override", "none")
     if turned not in ORIENTATIONS:
         raise InputError(
             f"orientation_override of {path} is {shown(turned)}: leave it out or give one of {', '.join(ORIENTATIONS)}."
         )
+
+
+def _check_points(parser: NerfstudioDataParserConfig, meta: Mapping[str, Any], path: Path) -> None:
+    """A point cloud, where it is asked for: nerfstudio would ask back, or go on without."""
+    if not parser.load_3D_points:
+        return
+    cloud = meta.get("ply_file_path")
+    if not isinstance(cloud, str) or not (path.parent / cloud).is_file():
+        raise InputError(
+            f"--load-3D-points asks for the point cloud that ply_file_path of {path} names, and it is {shown(cloud)}: "
+            "give the path of a PLY file, or leave the option out."
+        )
+
+
+def _check_names(parser: NerfstudioDataParserConfig, meta: Mapping[str, Any], frames: Frames, path: Path) -> None:
+    """Names that say to which split an image belongs, where they are to."""
+    if parser.eval_mode != "filename" or any(f"{split}_filenames" in meta for split in ("train", "val", "test")):
+        return
+    for frame in frames:
+        if not re.search("train|eval", Path(frame["file_path"]).name):
+            raise InputError(
+                f"The file name of frame {cut(frame['file_path'])} of {path} has neither train nor eval in it: rename "
+                "it, or give another --eval-mode."
+            )
 
 
 def _check_same_for_all(frames: Frames, path: Path) -> None:

@@ -21,7 +21,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mmpi_ns.capture.checks import check_transforms
+from mmpi_ns.capture.checks import check_parser, check_transforms
 from mmpi_ns.capture.dataset import MMPIDataset
 from mmpi_ns.capture.known_depth import KnownDepth, know_depths, with_known_depths
 from mmpi_ns.capture.local_origin import take_local_origins
@@ -89,6 +89,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         self._allowed: Tensor | None = None
         self._all_shared: SharedPoints | None = None
         parser = config.dataparser
+        check_parser(parser)
         if isinstance(parser, NerfstudioDataParserConfig):
             mode = kwargs.get("test_mode", "val")
             splits = ("train", "val" if mode == "val" else "test")
@@ -98,6 +99,11 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
 
     def create_train_dataset(self) -> MMPIDataset:
         self.train_dataset = dataset = super().create_train_dataset()
+        if min(int(dataset.cameras.width.min()), int(dataset.cameras.height.min())) < 1:
+            raise InputError(
+                f"--pipeline.datamanager.camera-res-scale-factor {self.config.camera_res_scale_factor:g} leaves no "
+                "pixel of an image: give a larger one."
+            )
         dataset.metadata[RAYS_PER_STEP] = self.config.train_num_rays_per_batch
         dataset.metadata[TRAINING_VIEWS] = TrainingViews.of(dataset.cameras)
         if self.test_mode == "val":  # elsewhere the plan comes from a checkpoint

@@ -236,10 +236,12 @@ def with_known_depths(observations: Observations, known: KnownDepth, dataset: MM
     Cells count alike, however many SfM points or matches lie in one. As they have no track, they come after the
     keypoints that have.
     """
-    seen_by, points = [], []
+    seen_by, points = [observations.seen_by[:0]], [observations.points[:0]]
     for i in range(len(known.codes)):
         depth = known.image(i)
         rows, columns = best_of_cells(depth)
+        if not len(rows):
+            continue
         coords = torch.from_numpy(np.stack([rows, columns], -1) + 0.5).float()
         rays = dataset.cameras.generate_rays(torch.full((len(rows), 1), i), coords=coords)
         seen_by.append(np.full(len(rows), i))

@@ -18,6 +18,12 @@ SIDE = Number(1, 65536)
 """Pixels along a side of an image."""
 FOCAL_SHARES = (1e-3, 1e4)
 """Focal lengths that a lens can have, in widths of the image."""
+MODELS = {
+    name: kind for name, kind in CAMERA_MODEL_TO_TYPE.items() if not name.startswith(("OMNIDIRECTIONALSTEREO", "VR180"))
+}
+"""Names of camera models; those of image pairs have no pose for each image."""
+LONG_LENS = 12
+"""Coefficients that nerfstudio needs of a FISHEYE624."""
 CAMERA = ("fl_x", "fl_y", "cx", "cy", "w", "h")
 RADIAL, TANGENTIAL = ("k1", "k2", "k3", "k4"), ("p1", "p2")
 STRETCH = 10.0
@@ -31,9 +37,8 @@ def check_lenses(meta: Mapping[str, Any], frames: Sequence[Mapping[str, Any]], p
         InputError: a value is missing, is no number, or cannot be a lens; names the file, the frame and the field.
     """
     model = meta.get("camera_model", "OPENCV")
-    if not isinstance(model, str) or model not in CAMERA_MODEL_TO_TYPE:
-        known = ", ".join(CAMERA_MODEL_TO_TYPE)
-        raise InputError(f"The camera_model of {path} is {shown(model)}: give one of {known}.")
+    if not isinstance(model, str) or model not in MODELS:
+        raise InputError(f"The camera_model of {path} is {shown(model)}: give one of {', '.join(MODELS)}.")
     for key in CAMERA:
         lacking = next((f for f in frames if key not in f), None) if key not in meta else None
         if lacking is not None:
@@ -50,8 +55,8 @@ def check_lenses(meta: Mapping[str, Any], frames: Sequence[Mapping[str, Any]], p
         if key not in seen:
             seen.add(key)
             where = path if set(meta) >= set(CAMERA) and not own_lens else f"{cut(frame['file_path'])} in {path}"
-            _check_camera(camera, CAMERA_MODEL_TO_TYPE[model], str(where))
-            _check_distortion(camera, lens, params, CAMERA_MODEL_TO_TYPE[model], str(where))
+            _check_camera(camera, MODELS[model], str(where))
+            _check_distortion(camera, lens, params, MODELS[model], str(where))
 
 
 def _check_camera(camera: Mapping[str, Any], kind: CameraType, where: str) -> None:
@@ -82,9 +87,10 @@ def _check_distortion(
 ) -> None:
     for key, value in lens.items():
         check_number(f"The distortion {key} of {where}", value, Number(-1, 1) if key in TANGENTIAL else Number())
-    if params is not None:
-        check_row(f"The distortion_params of {where}", params, 16 if kind == CameraType.FISHEYE624 else 6, Number())
-        lens = {} if kind == CameraType.FISHEYE624 else dict(zip(RADIAL, params, strict=False))
+    if params is not None or kind == CameraType.FISHEYE624:
+        count = LONG_LENS if kind == CameraType.FISHEYE624 else 6
+        check_row(f"The distortion_params of {where}", params, count, Number())
+        lens = dict(zip(RADIAL, params or (), strict=False))
     if kind not in (CameraType.PERSPECTIVE, CameraType.FISHEYE):
         return
     corner = math.hypot(0.5 * camera["w"] / camera["fl_x"], 0.5 * camera["h"] / camera["fl_y"])

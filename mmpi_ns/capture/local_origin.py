@@ -15,6 +15,9 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio
 from torch import Tensor
 
 from mmpi_ns.capture.checks import say_once
+from mmpi_ns.capture.sfm import model_errors
+from mmpi_ns.capture.sfm_files import check_model_files
+from mmpi_ns.utils.errors import InputError
 
 FAR = 10.0
 """Cameras so many times as far from the origin as from each other get an origin among them."""
@@ -99,17 +102,21 @@ class LocalColmap(ColmapDataParser):
     _origin: LocalOrigin
 
     def _get_all_images_and_cameras(self, recon_dir: Path) -> dict[str, Any]:
-        meta = super()._get_all_images_and_cameras(recon_dir)
+        with model_errors(recon_dir):
+            check_model_files(recon_dir)
+            meta = super()._get_all_images_and_cameras(recon_dir)
         self._origin = LocalOrigin(meta, recon_dir)
         return meta
 
     def _generate_dataparser_outputs(self, split: str = "train", **kwargs: Any) -> DataparserOutputs:
+        model = self.config.data / self.config.colmap_path
+        if not model.is_dir():
+            raise InputError(f"There is no COLMAP model at {model}: check --data, and --colmap-path after colmap.")
         outputs = super()._generate_dataparser_outputs(split, **kwargs)
         return self._origin.tell(outputs)
 
     def _load_3D_points(self, colmap_path: Path, transform_matrix: Tensor, scale_factor: float) -> Any:
-        # In float32. The model's points and tracks are read by ``find_sfm_model``, in float64.
-        return {} if self._origin.taken else super()._load_3D_points(colmap_path, transform_matrix, scale_factor)
+        return {}  # in float32; ``find_sfm_model`` reads the model's points and tracks in float64
 
 
 TARGETS: dict[type, type] = {Nerfstudio: LocalNerfstudio, ColmapDataParser: LocalColmap}

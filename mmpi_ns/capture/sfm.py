@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Sequence
+import struct
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from threading import current_thread, main_thread
@@ -59,10 +61,17 @@ def find_sfm_model(path: Path) -> SfmModel | None:
     """
     if not (path / "images.bin").is_file() and not (path / "images.txt").is_file():
         return None
-    try:
+    with model_errors(path):
         check_model_files(path)
         return read_reconstruction(load_pycolmap().Reconstruction(str(path)))
-    except (ValueError, RuntimeError, OSError, LookupError, MemoryError) as error:
+
+
+@contextmanager
+def model_errors(path: Path) -> Iterator[None]:
+    """Whatever goes wrong while a model is read becomes one InputError."""
+    try:
+        yield
+    except (ValueError, RuntimeError, OSError, LookupError, MemoryError, AssertionError, struct.error) as error:
         raise InputError(f"The COLMAP model in {path} cannot be read ({brief(error)}): repair or remove it.") from error
 
 

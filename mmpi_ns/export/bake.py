@@ -15,6 +15,7 @@ from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
+from yaml import YAMLError
 
 from mmpi_ns.export.files import BakedScene, Pose
 from mmpi_ns.model import MMPIModel
@@ -36,7 +37,12 @@ def load_model(load_config: Path) -> Any:
     """
     from nerfstudio.utils.eval_utils import eval_setup
 
-    _, pipeline, _, _ = eval_setup(load_config, test_mode="test")
+    try:
+        _, pipeline, _, _ = eval_setup(load_config, test_mode="test")
+    except (YAMLError, AssertionError) as error:
+        raise ValueError(
+            f"{load_config} is no config.yml that ns-train wrote: give the one beside the run's nerfstudio_models."
+        ) from error
     if not isinstance(pipeline.model, MMPIModel):
         raise ValueError(f"The run of {load_config} was trained by another method: only those of mmpi can be exported.")
     return pipeline

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from mmpi_ns.utils.values import Number, check_options
+
 if TYPE_CHECKING:
     from mmpi_ns.export.files import BakedScene
 
@@ -27,6 +29,7 @@ class _Run:
 
     def bake(self) -> BakedScene:
         """The run's scene, with what baking cost in quality printed."""
+        check_options(self, {"least": Number(0, 1), "compare": Number(0, whole=True)}, "--")
         # Slow imports, which --help and mistakes do not need.
         from mmpi_ns.export.bake import bake_run, compare, load_model
 

@@ -14,6 +14,7 @@ from mmpi_ns.placement.defaults import DEFAULTS
 from mmpi_ns.placement.options import check_placement
 from mmpi_ns.placement.rule import PlacementConfig
 from mmpi_ns.utils.errors import InputError, speak_plainly
+from mmpi_ns.utils.values import Number, check_options
 
 if TYPE_CHECKING:
     from mmpi_ns.placement.observations import Observations
@@ -49,8 +50,12 @@ class PlanCommand:
         from mmpi_ns.capture.load import load_observations
         from mmpi_ns.placement.split import place_windows
         from mmpi_ns.scene.windows import WindowedPlan
+        from mmpi_ns.utils.files import write_errors
 
         check_placement(self.placement, "--placement.")
+        check_options(self, {"training_rays": Number(0, whole=True)}, "--")
+        with write_errors(self.output, "--output"):
+            self.output.mkdir(parents=True, exist_ok=True)
         if self.plan_file is not None:  # a mistake in it is said before the images are read
             WindowedPlan.load(self.plan_file)
         _check_not_edited(self.output / "plan.json")
@@ -77,7 +82,6 @@ class PlanCommand:
         from mmpi_ns.placement.split import cameras_of
         from mmpi_ns.placement.visibility import find_visible_points
 
-        self.output.mkdir(parents=True, exist_ok=True)
         parts = []
         for i, window in enumerate(windows.windows):
             own = cameras_of(window, observations)

@@ -46,7 +46,13 @@ class SceneCommand:
     def main(self) -> None:
         from mmpi_ns.synthetic.catalogue import make_scene
         from mmpi_ns.synthetic.dataset import check_folder, write_dataset
+        from mmpi_ns.utils.values import Number, check_options
 
+        ranges = {"seed": Number(0, whole=True), "noise": Number(0), "outliers": Number(0, 1)}
+        given = {"points": Number(1, whole=True), "count": Number(1, whole=True), "length": Number(0, above=True)}
+        given |= {"width": Number(1, 65536, whole=True), "height": Number(1, 65536, whole=True)}
+        ranges |= {name: number for name, number in given.items() if getattr(self, name) is not None}
+        check_options(self, ranges, "--")
         check_folder(self.folder, self.overwrite)
         scene = make_scene(self.name, self.seed, self.count, self.width, self.height, self.length)
         cameras, points = scene.cameras, self.points

@@ -57,7 +57,7 @@ def make_scene(
     if name not in SCENES:
         raise ValueError(f"There is no scene {name!r}: choose one of {', '.join(SCENES)}.")
     entry = SCENES[name]
-    sizes = {"width": width or entry.width, "height": height or entry.height}
+    sizes = {"width": entry.width if width is None else width, "height": entry.height if height is None else height}
     if length is not None and entry.length is None:
         raise ValueError(f"The scene {name} has no length: leave it out, or choose street or long-road.")
     drive: dict[str, float] = {}

@@ -8,6 +8,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
+import torch
 from nerfstudio.engine.trainer import TrainerConfig
 
 from mmpi_ns.placement.options import check_placement
@@ -16,7 +17,16 @@ from mmpi_ns.utils.values import Number, check_number, check_options
 
 POSITIVE, NOT_NEGATIVE, COUNT = Number(0, above=True), Number(0), Number(0, whole=True)
 SHARE = Number(0, 1)
-RUN = {"max_num_iterations": Number(1, 10**9, whole=True), "steps_per_save": COUNT}
+LONGEST_NAME = 255
+"""Bytes of a folder's name."""
+RUN = {
+    "max_num_iterations": Number(1, 10**9, whole=True),
+    "steps_per_save": COUNT,
+    "steps_per_eval_batch": COUNT,
+    "steps_per_eval_image": COUNT,
+    "steps_per_eval_all_images": COUNT,
+}
+MACHINE = {"seed": Number(0, 2**32 - 1, whole=True), "num_devices": Number(1, 10**4, whole=True)}
 PIXELS = {
     "train_num_rays_per_batch": Number(1, 10**8, whole=True),
     "eval_num_rays_per_batch": Number(1, 10**8, whole=True),
@@ -79,6 +89,8 @@ def check_run(config: TrainerConfig) -> None:
     manager: Any = config.pipeline.datamanager
     model: Any = config.pipeline.model
     check_options(config, RUN, "--")
+    check_options(config.machine, MACHINE, "--machine.")
+    check_options(config.logging, {"steps_per_log": Number(1, whole=True)}, "--logging.")
     check_options(manager, PIXELS, "--pipeline.datamanager.")
     check_options(model, MODEL, "--pipeline.model.")
     weights = {f.name: NOT_NEGATIVE for f in fields(model.loss)} | {"tv_every": Number(1, whole=True)}
@@ -102,5 +114,21 @@ def check_run(config: TrainerConfig) -> None:
             if getattr(settings, name) != getattr(usual, name):
                 option = f"--{path}.{name}".replace("_", "-")
                 raise InputError(f"{option} has no effect on this method: leave it out.")
+    for name in ("experiment_name", "timestamp"):
+        value = str(getattr(config, name))
+        if any(len(part.encode()) > LONGEST_NAME for part in Path(value).parts):
+            raise InputError(
+                f"--{name.replace('_', '-')} is too long for a folder's name: give one of at most {LONGEST_NAME} bytes."
+            )
+    if config.load_step is not None and config.load_dir is None:
+        raise InputError("--load-step says nothing without --load-dir: give the folder of the checkpoint too.")
+    if config.machine.device_type == "cpu" and (config.mixed_precision or config.use_grad_scaler):
+        raise InputError("--mixed-precision and --use-grad-scaler have no effect on a CPU: leave them out.")
+    processes = config.machine.num_devices
+    if processes > max(1, torch.cuda.device_count()):
+        raise InputError(
+            f"--machine.num-devices {processes} asks for as many GPUs and torch sees {torch.cuda.device_count()}: give "
+            f"fewer, or train on CPUs with torchrun --nproc-per-node {processes} -m mmpi_ns.scripts.train."
+        )
     if config.machine.device_type == "mps":
         raise InputError("--machine.device-type mps has no sparse gradients, which training needs: use cpu.")

@@ -7,7 +7,8 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from mmpi_ns.training.checkpoints import checkpoints_in
-from mmpi_ns.utils.errors import InputError, WriteError, brief
+from mmpi_ns.utils.errors import InputError
+from mmpi_ns.utils.files import write_errors
 
 LOCK = ".lock"
 _held: dict[Path, FileLock] = {}
@@ -25,15 +26,14 @@ def claim(folder: Path, checkpoints: Path, resumes_from: Path | None) -> None:
         InputError: another run is writing there, or has written checkpoints that this one does not go on from.
         WriteError: the folder cannot be written.
     """
-    try:
+    with write_errors(folder, "--output-dir"):
         folder.mkdir(parents=True, exist_ok=True)
+    try:
         _lock(folder.resolve())
     except Timeout as error:
         raise InputError(
             f"Another run is writing into {folder}: wait for its end, or give another --timestamp."
         ) from error
-    except OSError as error:
-        raise WriteError(f"{folder} cannot be written ({brief(error)}): choose another --output-dir.") from error
     own = {checkpoints.resolve()}
     goes_on = resumes_from is not None and bool(own & {resumes_from.resolve(), resumes_from.resolve().parent})
     if checkpoints_in(checkpoints) and not goes_on:
@@ -49,5 +49,6 @@ def _lock(folder: Path) -> None:
     """The system lets go of it when the process ends, however that happens."""
     if folder not in _held:
         lock = FileLock(folder / LOCK)
-        lock.acquire(timeout=0)
+        with write_errors(folder, "--output-dir"):
+            lock.acquire(timeout=0)
         _held[folder] = lock

@@ -18,6 +18,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from mmpi_ns.capture.datamanager import MMPIDataManager
 from mmpi_ns.rendering.rendered import BACKGROUNDS
+from mmpi_ns.scene.texels import BRICK
 from mmpi_ns.scene.windows import WindowedPlan
 from mmpi_ns.training.checkpoints import (
     cameras_in_short,
@@ -146,6 +147,11 @@ class MMPITrainer(Trainer):
         self.base_dir.mkdir(parents=True, exist_ok=True)
         _write_plan(self.base_dir / PLAN_FILE, plan)
         self._run.shared = self._processes > 1
+        if len(self._run.field.density) <= BRICK:  # the one that nothing lies in
+            raise InputError(
+                "No training image sees anything of the scene plan: its MPIs must stand among the cameras and face as "
+                "they do (mmpi-plan shows where)."
+            )
         self._say_what_comes(plan)
         if 1 < self._processes and len(plan) < self._processes:
             raise InputError(

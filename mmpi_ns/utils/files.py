@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import torch
@@ -40,6 +41,17 @@ def write_atomically(path: Path, write: Callable[[Path], object], folder: Path |
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
+
+
+@contextmanager
+def write_errors(folder: Path, option: str) -> Iterator[None]:
+    """Where a folder cannot be written this is said with the option that would name another."""
+    try:
+        yield
+    except TimeoutError:  # of a lock that another process holds
+        raise
+    except OSError as error:
+        raise WriteError(f"{folder} cannot be written ({brief(error)}): choose another {option}.") from error
 
 
 def _to_disk(path: Path) -> None:

@@ -131,6 +131,8 @@ REFUSED = {
     "cy outside the image": (file(cy=25), ["principal point cy", "outside the image of 24"]),
     # Lenses
     "unknown camera model": (file(camera_model="PINHOLE2"), ["camera_model", "'PINHOLE2'", "OPENCV_FISHEYE"]),
+    "stereo camera model": (file(camera_model="VR180_L"), ["camera_model", "'VR180_L'", "OPENCV_FISHEYE"]),
+    "FISHEYE624 without a lens": (file(camera_model="FISHEYE624"), ["distortion_params", "12 numbers"]),
     "camera model is null": (file(camera_model=None), ["camera_model", "None"]),
     "k1 is NaN": (file(k1=NAN), ["distortion k1", "nan"]),
     "k2 is null": (file(k2=None), ["distortion k2", "None"]),
@@ -149,6 +151,8 @@ REFUSED = {
     "applied_transform with NaN": (file(applied_transform=[[NAN] * 4] * 3), ["applied_transform", "Row 1"]),
     "applied_transform 4 x 4": (file(applied_transform=np.eye(4).tolist()), ["applied_transform", "3 rows of 4"]),
     "applied_transform is zero": (file(applied_transform=[[0] * 4] * 3), ["applied_transform", "singular"]),
+    "fisheye radius is text": (file(fisheye_crop_radius="a"), ["fisheye_crop_radius", "'a'"]),
+    "fisheye radius is 0": (file(fisheye_crop_radius=0), ["fisheye_crop_radius"]),
     "applied_scale is text": (file(applied_scale="2"), ["applied_scale", "'2'"]),
     "applied_scale is 0": (file(applied_scale=0), ["applied_scale", "above 0"]),
     "orientation is unknown": (file(orientation_override="left"), ["orientation_override", "'left'"]),
@@ -168,6 +172,21 @@ def test_a_capture_that_cannot_be_used_is_refused(data, edit, tmp_path, case):
     said = train(data, tmp_path).sentence
     assert str(data / "transforms.json") in said
     assert all(word in said for word in words), said
+
+
+@pytest.mark.parametrize("cloud", [..., "no.ply", 3])
+def test_a_point_cloud_that_is_asked_for_and_not_there_is_named(data, edit, tmp_path, cloud):
+    """Where a COLMAP model lies beside it nerfstudio would ask on the terminal whether to make one."""
+    if cloud is not ...:
+        edit(file(ply_file_path=cloud))
+    said = train(data, tmp_path, pipeline__datamanager__dataparser__load_3D_points=True).sentence
+    assert said.startswith("--load-3D-points") and "ply_file_path" in said
+
+
+def test_names_that_say_no_split_are_refused_where_they_must(data, edit, tmp_path):
+    edit(lambda meta: [meta.pop(f"{split}_filenames") for split in ("train", "val", "test")])
+    said = train(data, tmp_path, pipeline__datamanager__dataparser__eval_mode="filename").sentence
+    assert name_of(0) in said and "neither train nor eval" in said
 
 
 TEXTS = {
@@ -202,6 +221,9 @@ RUNS = {
     "poses rounded to three digits": rounded,
     "a mild lens": file(k1=-0.1, k2=0.02, p1=1e-3),
     "a fisheye": file(camera_model="OPENCV_FISHEYE", k1=0.01),
+    "a whole sphere": file(camera_model="EQUIRECTANGULAR"),
+    "FISHEYE624": file(camera_model="FISHEYE624", distortion_params=[0.01, *[0.0] * 11]),
+    "parallel rays": file(camera_model="ORTHOPHOTO"),
     "an unknown field": file(aabb_scale=16),
     "no applied_transform": file(applied_transform=...),
 }  # fmt: skip
@@ -298,7 +320,14 @@ def test_an_image_of_another_size_is_named(data, tmp_path):
     assert f"{WIDTH + 2} x {HEIGHT} pixels and its camera {WIDTH} x {HEIGHT}" in train(data, tmp_path).sentence
 
 
-@pytest.mark.parametrize("kind", ["missing", "colours"])
+ARRAYS = {
+    "a row": np.zeros(7), "empty": np.zeros((0, 0)), "of three channels": np.zeros((HEIGHT, WIDTH, 3)),
+    "of objects": np.array([{"a": 1}], dtype=object), "of texts": np.full((HEIGHT, WIDTH), "a"),
+    "of complex numbers": np.full((HEIGHT, WIDTH), 1j),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", ["missing", "colours", *ARRAYS])
 def test_a_depth_image_that_cannot_be_used_is_named(data, edit, tmp_path, kind):
     (data / "depths").mkdir()
     for i in range(8):
@@ -308,6 +337,10 @@ def test_a_depth_image_that_cannot_be_used_is_named(data, edit, tmp_path, kind):
     path.unlink()
     if kind == "colours":
         Image.fromarray(smooth(3)).save(path)
+    if kind in ARRAYS:
+        path = path.with_suffix(".npy")
+        np.save(path, ARRAYS[kind])
+        edit(lambda meta: meta["frames"][3].update(depth_file_path=f"depths/{path.name}"))
     assert f"Depth image {path}" in train(data, tmp_path).sentence
 
 

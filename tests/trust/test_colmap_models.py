@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 
 import pytest
-from forked import train
+from forked import run, train
 
 
 @pytest.fixture
@@ -78,3 +78,15 @@ def test_a_damaged_colmap_model_is_named(data, model, tmp_path, case):
 def test_a_colmap_model_of_text_that_was_cut_short_is_named(data, tmp_path, name):
     cut(name, 0.4)(data / "colmap/sparse/0")
     assert "The COLMAP model in" in train(data, tmp_path, memory=2 << 30).sentence
+
+
+@pytest.mark.parametrize("cut_to", [0.4, None])
+def test_the_colmap_parser_names_a_model_that_is_missing_or_cut_short(data, tmp_path, cut_to):
+    folder = data / "colmap/sparse/0"
+    if cut_to is None:
+        folder.rename(tmp_path / "elsewhere")
+    else:
+        cut("images.txt", cut_to)(folder)
+    options = ("--output-dir", tmp_path, "--machine.device-type", "cpu", "--vis", "tensorboard")
+    said = run("ns-train", "mmpi-small", "--data", data, *options, "colmap").sentence
+    assert f"COLMAP model {'in' if cut_to else 'at'} {folder}" in said

@@ -14,6 +14,12 @@ P, M, D = "pipeline__model__placement__", "pipeline__model__", "pipeline__datama
 REFUSED = {
     "max_num_iterations": [0, -1],
     "steps_per_save": [-1],
+    "steps_per_eval_batch": [-3],
+    "steps_per_eval_image": [-3],
+    "steps_per_eval_all_images": [-3],
+    "logging__steps_per_log": [0],
+    "machine__seed": [-1, 10**30],
+    "machine__num_devices": [0, 2],
     D + "train_num_rays_per_batch": [0, -4],
     D + "eval_num_rays_per_batch": [0],
     D + "keypoint_rays": [-1],
@@ -43,6 +49,13 @@ REFUSED = {
     M + "loss__tv_every": [0],
     "machine__device_type": ["mps"],
 }
+PARSER = {
+    "scale_factor": [0.0, NAN, -1.0],
+    "scene_scale": [NAN],
+    "train_split_fraction": [0.0, 2.0, NAN],
+    "eval_interval": [0, -8],
+    "depth_unit_scale_factor": [0.0, -1.0],
+}
 IGNORED = {
     D + "patch_size": 4,
     D + "train_num_images_to_sample_from": 5,
@@ -65,6 +78,17 @@ def test_an_option_out_of_range_is_named(whole_scene, tmp_path, name, value):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize(("name", "value"), [(n, v) for n, values in PARSER.items() for v in values])
+def test_an_option_of_a_data_parser_out_of_range_is_named(whole_scene, tmp_path, name, value):
+    said = train(whole_scene, tmp_path, **{D + "dataparser__" + name: value}).sentence
+    assert said.startswith(option_of(name) + " must be")
+
+
+def test_images_scaled_down_to_nothing_are_refused(whole_scene, tmp_path):
+    said = train(whole_scene, tmp_path, **{D + "camera_res_scale_factor": 0.01}).sentence
+    assert option_of(D + "camera_res_scale_factor") in said and "no pixel" in said
+
+
 @pytest.mark.parametrize("name", IGNORED)
 def test_an_option_that_would_be_ignored_is_refused(whole_scene, tmp_path, name):
     said = train(whole_scene, tmp_path / "out", **{name: IGNORED[name]}).sentence
@@ -77,16 +101,33 @@ def test_shares_that_leave_nothing_for_the_first_phase_are_refused(whole_scene, 
     assert "blend-share" in said and "first phase" in said
 
 
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"experiment_name": "a" * 400}, ["--experiment-name", "too long"]),
+        ({"timestamp": "b" * 400}, ["--timestamp", "too long"]),
+        ({"load_step": 3}, ["--load-step", "--load-dir"]),
+        ({"mixed_precision": True}, ["--mixed-precision", "CPU"]),
+        ({"use_grad_scaler": True}, ["--use-grad-scaler", "CPU"]),
+    ],
+)
+def test_options_that_say_nothing_together_are_refused(whole_scene, tmp_path, changes, words):
+    said = train(whole_scene, tmp_path, **changes).sentence
+    assert all(word in said for word in words), said
+
+
 def test_clipping_is_refused_on_the_command_line(whole_scene, tmp_path):
     words = ("--optimizers.density.optimizer.max-norm", "1.0", "--machine.device-type", "cpu")
     ended = run("ns-train", "mmpi-small", "--data", whole_scene, "--output-dir", tmp_path, *words)
     assert "--optimizers.density.optimizer.max-norm" in ended.sentence
 
 
-@pytest.mark.parametrize(("name", "value"), [("texel-pixels", "nan"), ("max-mpis", "0"), ("max-planes", "1")])
+@pytest.mark.parametrize(
+    ("name", "value"), [("--placement.texel-pixels", "nan"), ("--placement.max-mpis", "0"), ("--training-rays", "-1")]
+)
 def test_mmpi_plan_refuses_the_same_options(whole_scene, tmp_path, name, value):
-    ended = run("mmpi-plan", whole_scene, "--output", tmp_path / "o", f"--placement.{name}", value)
-    assert f"--placement.{name}" in ended.sentence
+    ended = run("mmpi-plan", whole_scene, "--output", tmp_path / "o", name, value)
+    assert name in ended.sentence
 
 
 def test_seeds_of_the_machine_are_those_of_our_draws(whole_scene, tmp_path):

@@ -108,6 +108,15 @@ def test_a_plan_that_is_usable_trains(whole_scene, plan_text, tmp_path):
     assert "Training finished" in train(whole_scene, tmp_path, pipeline__model__plan_file=path).shown
 
 
+def test_a_plan_that_no_camera_sees_is_refused(whole_scene, plan_text, tmp_path):
+    plan = json.loads(plan_text) | {"cube": None}
+    for mpi in plan["mpis"]:
+        mpi.update(origin=[0, 0, 1e6], far=1e3)
+    path = tmp_path / "plan.json"
+    path.write_text(json.dumps(plan))
+    assert "No training image sees" in train(whole_scene, tmp_path, pipeline__model__plan_file=path).sentence
+
+
 @pytest.mark.parametrize("side", [2000, 16384])
 def test_a_plan_that_needs_more_memory_than_there_is_is_refused_before_anything_is_allocated(
     whole_scene, plan_text, tmp_path, side
@@ -128,6 +137,12 @@ def test_mmpi_plan_refuses_the_same_plans(whole_scene, plan_text, tmp_path, case
     (tmp_path / "plan.json").write_text(json.dumps(plan))
     said = run("mmpi-plan", whole_scene, "--output", tmp_path / "o", "--plan-file", tmp_path / "plan.json").sentence
     assert all(word in said for word in words), said
+
+
+def test_mmpi_plan_names_a_folder_that_it_cannot_write(whole_scene, tmp_path):
+    (tmp_path / "o").write_text("")
+    said = run("mmpi-plan", whole_scene, "--output", tmp_path / "o" / "p").sentence
+    assert "cannot be written" in said and "--output" in said
 
 
 def test_mmpi_plan_does_not_replace_a_plan_that_was_edited(whole_scene, tmp_path):
