@@ -8,7 +8,7 @@ from pathlib import Path
 
 import torch
 
-from mmpi_ns.bench.suites import TWO_PHASE, P
+from mmpi_ns.bench.suites import NO_DEPTH, POSES_ALONE, TWO_PHASE, P
 
 
 @dataclass(frozen=True)
@@ -45,6 +45,10 @@ class Method:
     """What turns the optimisation of cameras off."""
     hashes: bool = False
     """Looks up hash tables in plain torch on a CPU, which ``peers.look_up_quickly`` can do instead."""
+    given: str = "SfM points with tracks; depths found in the training images"
+    """What it has beside training images and poses."""
+    wants_depths: bool = False
+    """Reads depth images: ``peers.give_depths`` gives it those that our methods find."""
 
     @property
     def ours(self) -> bool:
@@ -91,15 +95,28 @@ METHODS = {
     m.name: m
     for m in (
         Method("mmpi-small", "mmpi-small", steps=4000),
+        Method("poses alone", "mmpi-small", POSES_ALONE, steps=4000, given="depths found in the training images"),
+        Method("no depth", "mmpi-small", (*POSES_ALONE, *NO_DEPTH), steps=4000, given="nothing"),
         Method("mmpi", "mmpi", steps=20_000),
         Method("single", "mmpi-small", (P + "max-mpis", "1"), steps=4000),
         Method("two-phase", "mmpi-small", TWO_PHASE, steps=4000),
         Method("mmpi-kitti", "mmpi-kitti", steps=40_000),
         Method("mmpi-scannet", "mmpi-scannet", steps=30_000),
         Method("mmpi-scannet-short", "mmpi-scannet-short", steps=10_000),
-        Method("nerfacto", "nerfacto", _nerfacto_options(), camera_option=CAMERAS_OFF, hashes=True),
+        Method("nerfacto", "nerfacto", _nerfacto_options(), camera_option=CAMERAS_OFF, hashes=True, given="nothing"),
+        Method(
+            "depth-nerfacto",
+            "depth-nerfacto",
+            (*_nerfacto_options(), "--pipeline.model.is-euclidean-depth", "True"),
+            camera_option=CAMERAS_OFF,
+            hashes=True,
+            given="the depths that mmpi-small has",
+            wants_depths=True,
+        ),
         # It has no camera optimiser. Its batches adapt themselves to the samples of a ray.
-        Method("instant-ngp", "instant-ngp", steps=10_000, needs=("cuda", "nerfacc"), batch_option=None),
+        Method(
+            "instant-ngp", "instant-ngp", steps=10_000, needs=("cuda", "nerfacc"), batch_option=None, given="nothing"
+        ),
         Method(
             "splatfacto",
             "splatfacto",
@@ -108,6 +125,7 @@ METHODS = {
             whole_images=True,
             batch_option=None,
             camera_option=CAMERAS_OFF,
+            given="SfM points",
         ),
     )
 }

@@ -1,5 +1,5 @@
-"""What nerfstudio's methods lack on a bare machine: a reader of point clouds that does not need open3d, and lookups in
-hash tables that are quick without a GPU."""
+"""What nerfstudio's methods lack on a bare machine or beside ours: a reader of point clouds that does not need open3d,
+lookups in hash tables that are quick without a GPU, and the depths that our methods find."""
 
 from __future__ import annotations
 
@@ -47,6 +47,31 @@ def read_points_ourselves() -> None:
         return {"points3D_xyz": points, "points3D_rgb": torch.from_numpy(rgb)}
 
     Nerfstudio._load_3D_points = load  # type: ignore[method-assign]
+
+
+def give_depths(data: Path, downscale_factor: int) -> None:
+    """Makes nerfstudio's ``DepthDataset`` of this process hold the distances that our methods find of training images.
+
+    They are distances along the ray (``--pipeline.model.is-euclidean-depth True``), 0 where nothing is known.
+    """
+    from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+    from nerfstudio.data.datasets.depth_dataset import DepthDataset, InputDataset
+
+    from mmpi_ns.capture.datamanager import MMPIDataManagerConfig
+
+    parser = NerfstudioDataParserConfig(data=data, downscale_factor=downscale_factor)
+    manager = MMPIDataManagerConfig(data=data, dataparser=parser).setup(device="cpu", test_mode="val")
+    names, known = manager.train_dataset.image_filenames, manager.known_depth
+    if known is None or known.share == 0:
+        raise ValueError(f"{data}: no depth is known of any training pixel.")
+    inverse = {name: torch.from_numpy(image[..., :1]) for name, image in zip(names, known.images, strict=True)}
+
+    def depth_of(self: Any, batch: dict[str, Any]) -> dict[str, Tensor]:
+        found = inverse.get(self.image_filenames[batch["image_idx"]], torch.zeros_like(batch["image"][..., :1]))
+        return {"depth_image": torch.where(found > 0, 1 / found, 0.0)}
+
+    DepthDataset.__init__ = InputDataset.__init__  # type: ignore[method-assign]
+    DepthDataset.get_metadata = depth_of  # type: ignore[method-assign]
 
 
 HASH_FACTORS = (1, 2654435761, 805459861)

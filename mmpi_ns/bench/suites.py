@@ -17,6 +17,8 @@ NO_DEPTH = (
     *("--pipeline.datamanager.dense-depth", "False"),
     *("--pipeline.datamanager.depth-images", "False"),
 )
+POSES_ALONE = ("--pipeline.datamanager.sfm-path", "none")
+"""A COLMAP model that the scene has is not read."""
 OPACITY = ("--pipeline.model.blend-form", "opacity")
 EQUAL_SHARES = ("--optimizers.reliability.optimizer.lr", "1e-9")
 LITTLE_VARIATION = ("--pipeline.model.loss.tv-density", "1e-5", "--pipeline.model.loss.tv-features", "1e-6")
@@ -147,7 +149,7 @@ def _ours() -> list[Variant]:
 
 def _depth() -> list[Variant]:
     """What the depths are worth that are found in the training images, from poses alone and beside SfM tracks."""
-    alone = ("--pipeline.datamanager.sfm-path", "none")
+    alone = POSES_ALONE
     views = ("--pipeline.datamanager.new-view-share", "0")
     dense = ("--pipeline.datamanager.dense-depth", "False")
     return [

@@ -55,6 +55,8 @@ class Request:
     For methods whose schedule does not depend on how long they train."""
     quick_hashes: bool = False
     """Give nerfstudio's hash tables the compiled lookups of ``peers.look_up_quickly``."""
+    wants_depths: bool = False
+    """Give nerfstudio's reader of depth images those of ``peers.give_depths``."""
 
     @staticmethod
     def of(
@@ -63,7 +65,8 @@ class Request:
     ) -> Request:  # fmt: skip
         """A training of a method; looked at when it ends unless ``looks`` says otherwise."""
         words = method.words(scene, work, steps, rays, seed, device)
-        own = {"checks": (steps,), "whole_images": method.whole_images} | looks
+        own = {"checks": (steps,), "whole_images": method.whole_images, "wants_depths": method.wants_depths}
+        own |= looks
         return Request(tuple(words), str(scene.data), scene.downscale_factor, str(work), **own)
 
     @property
@@ -208,13 +211,15 @@ def train(asked: dict[str, Any], tell: Tell = print) -> dict[str, Any]:
         evaluation not) and PSNR; psnr, ssim, rays_per_s, frame_s over whole test images; setup_seconds, seconds,
         rays, parameters, peak_gib, split.
     """
-    from mmpi_ns.bench.peers import look_up_quickly, read_points_ourselves
+    from mmpi_ns.bench.peers import give_depths, look_up_quickly, read_points_ourselves
 
     plain: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in asked.items()}
     request = Request(**plain)
     read_points_ourselves()
     if request.quick_hashes:
         look_up_quickly()
+    if request.wants_depths:
+        give_depths(Path(request.data), request.downscale_factor)
     config = config_of(request.words)
     progress = Progress.before(request.words, Path(request.work), request.checks[-1] if request.go_on else 0)
     if progress.step:

@@ -8,8 +8,11 @@ from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 
+from mmpi_ns.scripts.version import say_version
+
 COMMANDS = {
     "train": "quality.train",
+    "score": "quality.score",
     "render": "speed.render",
     "speed": "speed.against_peers",
     "ops": "speed.ops",
@@ -37,6 +40,7 @@ def _purpose(module: str) -> str:
 
 def entrypoint() -> None:
     """The command ``mmpi-bench``; a mistake is one sentence and exit status 1."""
+    say_version("mmpi-bench")
     name = sys.argv[1] if len(sys.argv) > 1 else "--help"
     if name not in COMMANDS:
         print("usage: mmpi-bench COMMAND [OPTIONS] (mmpi-bench COMMAND --help)\n")

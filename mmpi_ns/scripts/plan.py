@@ -13,6 +13,7 @@ import tyro
 from mmpi_ns.placement.defaults import DEFAULTS
 from mmpi_ns.placement.options import check_placement
 from mmpi_ns.placement.rule import PlacementConfig
+from mmpi_ns.scripts.version import say_version
 from mmpi_ns.utils.errors import InputError, speak_plainly
 from mmpi_ns.utils.values import Number, check_options
 
@@ -124,6 +125,7 @@ def _defaults(arguments: list[str]) -> PlanCommand:
 
 def entrypoint() -> None:
     """The command ``mmpi-plan``; a problem with the scene or the plan ends it with one sentence and status 1."""
+    say_version("mmpi-plan")
     command = tyro.cli(PlanCommand, default=_defaults(sys.argv[1:]), description=PlanCommand.__doc__)
     speak_plainly()
     command.main()

@@ -7,6 +7,8 @@ import signal
 import sys
 import threading
 
+from mmpi_ns.scripts.version import say_version
+
 INTERRUPTED = "mmpi-prepare: interrupted; the same command goes on from here."
 
 
@@ -49,6 +51,7 @@ def end_at_once_on_signals() -> None:
 
 def entrypoint() -> None:
     """The command ``mmpi-prepare``."""
+    say_version("mmpi-prepare")
     end_at_once_on_signals()
     sys.exit(main())
 

@@ -10,6 +10,8 @@ from typing import Literal
 
 import tyro
 
+from mmpi_ns.scripts.version import say_version
+
 Name = Literal["street", "long-road", "room", "look-round", "object", "still-life"]
 
 
@@ -84,6 +86,7 @@ def _progress(images: Iterable[int]) -> Iterator[int]:
 
 def entrypoint() -> None:
     """The ``mmpi-scene`` command; a mistake is one sentence and exit status 1."""
+    say_version("mmpi-scene")
     try:
         tyro.cli(SceneCommand).main()
     except (ValueError, OSError) as error:

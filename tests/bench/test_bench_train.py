@@ -12,6 +12,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from nerfstudio.data.datasets.depth_dataset import DepthDataset
 from torchmetrics.image import lpip
 
 from mmpi_ns.bench import methods, trainings
@@ -23,6 +25,8 @@ from mmpi_ns.bench.quality.train import Train
 from mmpi_ns.bench.quality.train_report import headline, markdown
 from mmpi_ns.bench.speed import scaling
 from mmpi_ns.bench.trainers import Steps
+from mmpi_ns.capture.datamanager import MMPIDataManager
+from mmpi_ns.capture.known_depth import KnownDepth
 
 
 def in_this_process(request, threads):
@@ -120,6 +124,28 @@ def test_nerfacto_trains_through_nerfstudios_own_trainer(scene, tmp_path, monkey
     assert "--pipeline.model.camera-optimizer.mode off" in row["options"]
     assert not any("lpips" in k for k in row) and row["options"].startswith("nerfacto ")
     assert not list((tmp_path / "work").rglob("*.ckpt"))
+
+
+@pytest.mark.commands
+def test_depth_nerfacto_is_given_the_depths_that_ours_finds(scene, tmp_path, monkeypatch):
+    known = KnownDepth(tuple(np.full((24, 32, 2), 0.25 + 0.01 * i, np.float32) for i in range(6)))
+    known.images[0][:12] = 0  # half of an image is not known
+    monkeypatch.setattr(MMPIDataManager, "_known_depth", lambda self, dataset: known)
+    for name in ("__init__", "get_metadata"):  # put back afterwards
+        monkeypatch.setattr(DepthDataset, name, getattr(DepthDataset, name))
+    monkeypatch.setattr(train, "train_apart", in_this_process)
+    command(scene, tmp_path, methods=("depth-nerfacto",), steps=("depth-nerfacto=2",), seeds=(0,)).run()
+    (row,) = read(tmp_path)["rows"].values()
+    assert row["curve"][-1]["step"] == 2 and 3 < row["psnr"] < 40
+    text = (tmp_path / "results" / "train.md").read_text()
+    assert "| depth-nerfacto | the depths that mmpi-small has | 2 |" in text
+    config = NerfstudioDataParserConfig(data=scene, downscale_factor=1)
+    for split, wanted in (("train", [k[..., :1] for k in known.images]), ("test", np.zeros((2, 24, 32, 1)))):
+        held = DepthDataset(config.setup().get_dataparser_outputs(split=split))
+        for i, inverse in enumerate(wanted):
+            distance = held[i]["depth_image"].numpy()
+            assert np.array_equal(distance > 0, inverse > 0)
+            assert np.allclose((distance * inverse)[inverse > 0], 1)
 
 
 @pytest.mark.commands

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from mmpi_ns.bench.methods import METHODS
 from mmpi_ns.bench.quality.curves import Curve, compare
 from mmpi_ns.bench.report import Row, figure, not_run, page, slug, table
 
@@ -15,7 +16,7 @@ TIMES = (10, 30, 60, 120, 300, 600, 1200, 1800, 3600)
 """Seconds at which the second table compares."""
 QUICK = " (quick hashes)"
 """What follows the name of a peer whose hash tables are looked up by ``peers.look_up_quickly``."""
-PEERS = ("nerfacto", "nerfacto" + QUICK, "instant-ngp", "splatfacto")
+PEERS = ("nerfacto", "nerfacto" + QUICK, "depth-nerfacto" + QUICK, "instant-ngp", "splatfacto")
 
 
 @dataclass(frozen=True)
@@ -130,8 +131,15 @@ def _memory(row: Row) -> str:
     return f"{g.mean('peak_gib'):.2f}{on_gpu}"
 
 
+def _given(row: Row) -> str:
+    """What the method had beside training images and poses."""
+    name = row["g"].method.removesuffix(QUICK)
+    return METHODS[name].given if name in METHODS else ""
+
+
 _COLUMNS = {
     "method": "{g.method}",
+    "had, beside images and poses": _given,
     "steps": "{g.steps}",
     "M rays": lambda r: f"{r['g'].mean('rays') / 1e6:.2f}",
     "seconds (set up)": lambda r: f"{r['g'].mean('seconds'):.0f} ({r['g'].mean('setup_seconds'):.0f})",
