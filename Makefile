@@ -23,7 +23,7 @@ WORKERS ?= 2
 # Extra arguments for pytest or the demo: make test ARGS="-k geometry -x", make demo ARGS=--fresh
 ARGS ?=
 
-.PHONY: help venv demo test lint docs build wheel figures clean
+.PHONY: help venv demo test lint docs build wheel figures gallery clean
 
 help: ## List these commands
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -69,6 +69,9 @@ wheel: build ## Build, and run the wheel's commands in an otherwise empty enviro
 
 figures: venv ## Draw the figures of the documentation anew, from the demo
 	$(BIN)/python -m mmpi_ns.scripts.figures
+
+gallery: venv ## Train four procedural scenes and write docs/gallery.md with their pictures
+	$(BIN)/python -m mmpi_ns.scripts.gallery $(ARGS)
 
 clean: ## Remove build products and caches (not .venv)
 	rm -rf build dist *.egg-info .pytest_cache .hypothesis .ruff_cache

@@ -45,8 +45,8 @@ class Method:
     """What turns the optimisation of cameras off."""
     hashes: bool = False
     """Looks up hash tables in plain torch on a CPU, which ``peers.look_up_quickly`` can do instead."""
-    given: str = "SfM points with tracks; depths found in the training images"
-    """What it has beside training images and poses."""
+    given: str = "SfM tracks"
+    """Beside training images and poses."""
     wants_depths: bool = False
     """Reads depth images: ``peers.give_depths`` gives it those that our methods find."""
 
@@ -95,8 +95,8 @@ METHODS = {
     m.name: m
     for m in (
         Method("mmpi-small", "mmpi-small", steps=4000),
-        Method("poses alone", "mmpi-small", POSES_ALONE, steps=4000, given="depths found in the training images"),
-        Method("no depth", "mmpi-small", (*POSES_ALONE, *NO_DEPTH), steps=4000, given="nothing"),
+        Method("poses alone", "mmpi-small", POSES_ALONE, steps=4000, given="nothing (finds depths itself)"),
+        Method("no depth", "mmpi-small", (*POSES_ALONE, *NO_DEPTH), steps=4000, given="nothing (no depths)"),
         Method("mmpi", "mmpi", steps=20_000),
         Method("single", "mmpi-small", (P + "max-mpis", "1"), steps=4000),
         Method("two-phase", "mmpi-small", TWO_PHASE, steps=4000),
@@ -110,7 +110,7 @@ METHODS = {
             (*_nerfacto_options(), "--pipeline.model.is-euclidean-depth", "True"),
             camera_option=CAMERAS_OFF,
             hashes=True,
-            given="the depths that mmpi-small has",
+            given="the depths of mmpi-small",
             wants_depths=True,
         ),
         # It has no camera optimiser. Its batches adapt themselves to the samples of a ray.

@@ -24,7 +24,7 @@ from mmpi_ns.demo.painting import (
 from mmpi_ns.demo.views import Picture, Run, View, render_alone, render_view, truth_of
 from mmpi_ns.placement.observations import Array
 from mmpi_ns.placement.show.explain import describe_facing
-from mmpi_ns.scene.plan import CubePlan, MPIPlan
+from mmpi_ns.scene.plan import CubePlan
 
 LABELS, VIEW, GAP = 400, 360, 6
 """Widths of the column of labels and of a view, and the space between pictures; pixels."""
@@ -57,7 +57,7 @@ def show_views(
     run: Run, indices: list[int], progress: Callable[[Iterable[tuple[int, str]]], Iterable[tuple[int, str]]] = iter
 ) -> list[Shown]:
     """Renders test views, by all MPIs and by each one alone; ``progress`` wraps the renderings."""
-    names = ["all", *run.plan.names]
+    names = ["all", *run.windows.names]
     shown: list[Shown] = []
     for index, name in progress([(i, name) for i in indices for name in names]):
         camera = run.tests.cameras[index : index + 1]
@@ -96,7 +96,7 @@ def overview(run: Run, shown: Shown) -> Image.Image:
     ]
     height = parts[0][1].height + line
     top_view = Map.of(run.observations, 2 * width + GAP, 220)
-    from_above = top_view.draw(list(zip(_heads(run), run.colors, strict=True)), _places(run, [shown]))
+    from_above = top_view.draw(list(zip(run.heads, run.colors, strict=True)), _places(run, [shown]))
     picture = Image.new("RGB", (2 * width + 3 * GAP, 2 * (height + GAP) + line + from_above.height + GAP), "white")
     draw = ImageDraw.Draw(picture)
     for k, (text, image) in enumerate(parts):
@@ -104,7 +104,7 @@ def overview(run: Run, shown: Shown) -> Image.Image:
         write(draw, (x, y + 3), text)
         picture.paste(image, (x, y + line))
     y = 2 * (height + GAP)
-    count = len(run.plan.names)
+    count = len(run.windows.names)
     text = f"from above: training cameras (black), points of the scene (gray), this view (A), {count} MPIs (colours)"
     write(draw, (GAP, y + 3), text)
     picture.paste(from_above, (GAP, y + line))
@@ -112,7 +112,8 @@ def overview(run: Run, shown: Shown) -> Image.Image:
 
 
 def _header(run: Run, views: int) -> Image.Image:
-    count = f"{len(run.plan.mpis)} multi-plane images (MPIs){' and a cube' if run.plan.cube else ''}"
+    cubes = sum(isinstance(head, CubePlan) for head in run.heads)
+    count = f"{len(run.heads) - cubes} multi-plane images (MPIs){' and a cube' if cubes else ''}"
     text = (
         f"This scene is {count}. Each is a stack of see-through planes that face one way, dense near its origin (cross "
         "on the maps) and sparse far away.\nAn MPI is sharp for views that stand just past its origin: go down a "
@@ -177,7 +178,7 @@ def _alone_rows(run: Run, shown: list[Shown]) -> list[tuple[Image.Image, list[Im
     drawn = Map.of(run.observations, LABELS - 22, max(60, size - 46))
     marks = _places(run, shown)
     rows = []
-    for k, (head, color) in enumerate(zip(_heads(run), run.colors, strict=True)):
+    for k, (head, color) in enumerate(zip(run.heads, run.colors, strict=True)):
         won = 100 * float(np.mean([(s.view.winner == k).mean() for s in shown]))
         facing = "all round"
         if not isinstance(head, CubePlan):
@@ -185,19 +186,14 @@ def _alone_rows(run: Run, shown: list[Shown]) -> list[tuple[Image.Image, list[Im
         label = Image.new("RGB", (LABELS, size), "white")
         draw = ImageDraw.Draw(label)
         draw.rectangle([10, 4, 24, 18], fill=rgb8(color))
-        write(
-            draw, (32, 2), f'MPI "{run.plan.names[k]}" alone' if k < len(run.plan.mpis) else "cube alone", 15, bold=True
-        )
+        name = "cube" if isinstance(head, CubePlan) else f'MPI "{run.windows.names[k]}"'
+        write(draw, (32, 2), f"{name} alone", 15, bold=True)
         empty = max(float((v.alone[k][..., 3] < 0.5).mean()) for v in shown) > 0.01
         text = f"facing {facing}; wins {won:.0f} % of the pixels{'; checks: it holds nothing' if empty else ''}"
         write(draw, (10, 23), text, 12, fill=FAINT)
         label.paste(drawn.draw([(head, color)], marks), (10, size - drawn.size[1]))
         rows.append((label, [image_of(over_checks(s.alone[k]), VIEW) for s in shown]))
     return rows
-
-
-def _heads(run: Run) -> list[MPIPlan | CubePlan]:
-    return [*run.plan.mpis, *([run.plan.cube] if run.plan.cube else [])]
 
 
 def _places(run: Run, shown: list[Shown]) -> Array:

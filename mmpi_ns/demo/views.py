@@ -16,7 +16,8 @@ from mmpi_ns.capture.datamanager import MMPIDataManager
 from mmpi_ns.model import MMPIModel
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.rendering.metrics import head_palette
-from mmpi_ns.scene.plan import ScenePlan
+from mmpi_ns.scene.plan import CubePlan, MPIPlan
+from mmpi_ns.scene.windows import WindowedPlan
 
 Picture = NDArray[np.float32]
 
@@ -34,13 +35,18 @@ class Run:
     """Scene units in a unit of the capture (a metre, for the procedural scenes)."""
 
     @property
-    def plan(self) -> ScenePlan:
-        return self.model.field.full_plan
+    def windows(self) -> WindowedPlan:
+        return self.model.progress.windows
+
+    @property
+    def heads(self) -> list[MPIPlan | CubePlan]:
+        """The MPIs and the cube of every window, in the order in which the winner of a pixel counts them."""
+        return [h for plan in self.windows.plans for h in (*plan.mpis, *([plan.cube] if plan.cube else []))]
 
     @property
     def colors(self) -> list[tuple[float, float, float]]:
         """A colour for each MPI, the same in every picture."""
-        return [(r, g, b) for r, g, b in head_palette(self.plan.num_heads, "cpu").tolist()]
+        return [(r, g, b) for r, g, b in head_palette(len(self.heads), "cpu").tolist()]
 
 
 @dataclass(frozen=True)

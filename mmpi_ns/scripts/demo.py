@@ -1,4 +1,4 @@
-"""``make demo``: a street is made, learned, evaluated and shown; what is done is kept when it is started again."""
+"""``make demo``: a scene is made, learned, evaluated and shown; what is done is kept when it is started again."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ import warnings
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import tyro
 
 PARTS = 6
 FREE_BYTES = 2 << 30
 """What a demo may need on the disk: checkpoints are the most of it."""
-OURS = ("street", "runs", "fly", "unfinished.mp4", "fly.mp4", "times.json", "eval.json", "contact-sheet.png",
-        "overview.png", "psnr.png", "street.html")  # fmt: skip
-"""What the demo writes, and removes when it starts afresh."""
+OURS = ("runs", "fly", "unfinished.mp4", "fly.mp4", "times.json", "eval.json", "contact-sheet.png", "overview.png",
+        "psnr.png")  # fmt: skip
+"""What the demo writes beside the scene and its page, and removes when it starts afresh."""
 
 
 class DemoError(Exception):
@@ -31,7 +31,7 @@ class DemoError(Exception):
 
 @dataclass
 class Demo:
-    """Makes a procedural street, trains mmpi-small on it, evaluates it, and takes pictures. A rerun goes on where the
+    """Makes a procedural scene, trains mmpi-small on it, evaluates it, and takes pictures. A rerun goes on where the
     last one stopped."""
 
     folder: Path = Path("demo")
@@ -39,51 +39,62 @@ class Demo:
     steps: int = 1000
     """Training steps."""
     images: int = 64
-    """Images of the street; half of them are held out for testing."""
+    """Images of the scene; half of them are held out for testing."""
     frames: int = 40
     """Frames of the fly-through."""
+    kind: Literal["street", "long-road", "room", "object"] = "street"
+    """Which of mmpi-scene's scenes."""
+    length: float | None = None
+    """Metres driven (street: 40, long-road: 1000)."""
     fresh: bool = False
     """Start afresh instead of keeping what an earlier demo has done."""
 
     def main(self) -> None:
         start = time.perf_counter()
-        self._prepare_folder()
-        self._part(1, f"the street: {self.images} images of 320 x 96 pixels")
-        self._make_street()
-        self._part(2, f"training mmpi-small for {self.steps} steps")
-        self._train()
-        self._part(3, "evaluating on the images held out")
-        results = self._evaluate()
-        self._part(4, "fly-through and contact sheet")
-        film = self._take_pictures()
+        results, film = self.learn()
         self._part(5, "PSNR against seconds")
         self._draw_curve()
         self._part(6, "a page to fly through")
         self._write_page()
         self._say_where(results, film, time.perf_counter() - start)
 
+    def learn(self) -> tuple[dict[str, Any], Path]:
+        """Makes, trains and evaluates the scene and takes its pictures; returns ``ns-eval``'s figures and the film."""
+        self._prepare_folder()
+        self._part(1, f"the {self.kind}: {self.images} images")
+        self._make_scene()
+        self._part(2, f"training mmpi-small for {self.steps} steps")
+        self._train()
+        self._part(3, "evaluating on the images held out")
+        results = self._evaluate()
+        self._part(4, "fly-through and contact sheet")
+        return results, self._take_pictures()
+
     @property
     def scene(self) -> Path:
-        return self.folder / "street"
+        return self.folder / self.kind
 
     @property
     def run(self) -> Path:
-        return self.folder / "runs" / "street" / "mmpi-small" / "demo"
+        return self.folder / "runs" / self.kind / "mmpi-small" / "demo"
 
     @property
     def page(self) -> Path:
-        return self.folder / "street.html"
+        return self.folder / f"{self.kind}.html"
 
     @property
     def checkpoint(self) -> Path:
-        """The last one, when training is done."""
-        return self.run / "nerfstudio_models" / f"step-{self.steps - 1:09d}.ckpt"
+        """The last one, when training is done; every window of a long road takes so many steps."""
+        from mmpi_ns.scene.windows import WindowedPlan
+
+        plan = self.run / "plan.json"
+        windows = len(WindowedPlan.load(plan)) if plan.is_file() else 1
+        return self.run / "nerfstudio_models" / f"step-{windows * self.steps - 1:09d}.ckpt"
 
     def _prepare_folder(self) -> None:
         self.folder.mkdir(parents=True, exist_ok=True)
         if self.fresh:
-            for name in OURS:
-                path = self.folder / name
+            for path in (self.scene, self.page, *(self.folder / name for name in OURS)):
                 shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
         free = shutil.disk_usage(self.folder).free
         if free < FREE_BYTES and not self.checkpoint.is_file():
@@ -95,7 +106,7 @@ class Demo:
     def _part(self, number: int, what: str) -> None:
         print(f"\n=== {number}/{PARTS} {what} ===", flush=True)
 
-    def _make_street(self) -> None:
+    def _make_scene(self) -> None:
         from mmpi_ns.synthetic.catalogue import make_scene
         from mmpi_ns.synthetic.dataset import write_dataset
 
@@ -103,10 +114,10 @@ class Demo:
         if transforms.is_file() and len(json.loads(transforms.read_text(encoding="utf-8"))["frames"]) == self.images:
             _kept(self.scene)
             return
-        shutil.rmtree(self.run, ignore_errors=True)  # it belongs to the street of before
+        shutil.rmtree(self.run, ignore_errors=True)  # it belongs to the scene of before
         print("Looking for points that several cameras see ...", flush=True)
-        scene = make_scene("street", count=self.images)
-        write_dataset(scene, self.scene, overwrite=True, progress=lambda items: _track(items, "Rendering the street"))
+        scene = make_scene(self.kind, count=self.images, length=self.length)
+        write_dataset(scene, self.scene, overwrite=True, progress=lambda items: _track(items, "Rendering the scene"))
 
     def _train(self) -> None:
         if self.checkpoint.is_file():
@@ -122,11 +133,11 @@ class Demo:
         every = str(max(1, self.steps // 12))
         self._command(
             "ns-train", "mmpi-small", "--data", str(self.scene), "--output-dir", str(self.folder / "runs"),
-            "--experiment-name", "street", "--timestamp", "demo", "--max-num-iterations", str(self.steps),
+            "--experiment-name", self.kind, "--timestamp", "demo", "--max-num-iterations", str(self.steps),
             "--vis", "tensorboard", "--steps-per-save", str(max(1, self.steps // 3)), "--steps-per-eval-batch", every,
             "--pipeline.datamanager.eval-num-rays-per-batch", "8192", "--logging.steps-per-log", "20",
             "--pipeline.model.lpips-net", "none",  # half a gigabyte of weights would be fetched for it
-            "--pipeline.datamanager.depth-images", "False",  # the street has exact ones, an ordinary capture none
+            "--pipeline.datamanager.depth-images", "False",  # the scene has exact ones, an ordinary capture none
             *(["--load-dir", str(self.run / "nerfstudio_models")] if newest is not None else []),
         )  # fmt: skip
         if not self.checkpoint.is_file():
@@ -168,7 +179,9 @@ class Demo:
         if not times.is_file():
             raise DemoError(f"{times} is gone, so nobody knows when training began: start afresh with --fresh.")
         started = json.loads(times.read_text(encoding="utf-8"))["started"]
-        draw_curve(self.run, self.folder / "psnr.png", started, f"mmpi-small, {self.steps} steps on the demo's street")
+        draw_curve(
+            self.run, self.folder / "psnr.png", started, f"mmpi-small, {self.steps} steps on the demo's {self.kind}"
+        )
 
     def _write_page(self) -> None:
         if not self._is_newer(self.page):
@@ -183,7 +196,7 @@ class Demo:
             f"\nDone in {seconds // 60:.0f} min {seconds % 60:.0f} s. PSNR {results['psnr']:.2f} dB, "
             f"SSIM {results['ssim']:.3f} over {self.images // 2} images held out.\n\nOpen first:\n"
             f"  {self.folder / 'contact-sheet.png'}   what each MPI does\n"
-            f"  {self.page}   the street in a browser: open it by a double click, drag and press W\n"
+            f"  {self.page}   the {self.kind} in a browser: open it by a double click, drag and press W\n"
             f"  {film}   {film_note}\n"
             f"  {self.folder / 'psnr.png'}   PSNR against seconds\n"
             f"  {self.folder / 'overview.png'}   one view, and where the MPIs stand\n\n"

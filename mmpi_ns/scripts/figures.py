@@ -11,7 +11,6 @@ import tyro
 SHEET, README_PICTURE = "contact-sheet.png", "contact-sheet.jpg"
 """The demo's picture that the documentation shows, there and here."""
 FILM, README_FILM = "fly.mp4", "fly.webp"
-MOST_BYTES = 400_000
 
 
 @dataclass
@@ -32,26 +31,26 @@ class Figures:
         drawings.draw_errors(self.output / "errors.png")
         if not (self.demo / SHEET).is_file():
             raise ValueError(f"{self.demo} lacks {SHEET}: run make demo first (the other figures are written).")
-        _shrink(self.demo / SHEET, self.output / README_PICTURE)
-        _animate(self.demo / FILM, self.output / README_FILM)
+        shrink(self.demo / SHEET, self.output / README_PICTURE)
+        animate(self.demo / FILM, self.output / README_FILM)
         print(f"Wrote merging.png, reliability.png, errors.png, {README_PICTURE} and {README_FILM} in {self.output}.")
 
 
-def _shrink(source: Path, target: Path) -> None:
-    """Copies a picture as JPEG, only as good as a file of moderate size allows."""
+def shrink(source: Path, target: Path, most: int = 400_000) -> None:
+    """Copies a picture as JPEG, as good as fits into so many bytes."""
     from PIL import Image
 
     image = Image.open(source).convert("RGB")
     for quality in (92, 88, 84, 80, 75, 70, 65, 60):
         image.save(target, quality=quality, subsampling=0)
-        if target.stat().st_size <= MOST_BYTES:
+        if target.stat().st_size <= most:
             return
     target.unlink()
-    raise ValueError(f"{source} is larger than {MOST_BYTES // 1000} kB even as a poor JPEG: draw less in it.")
+    raise ValueError(f"{source} is larger than {most // 1000} kB even as a poor JPEG: draw less in it.")
 
 
-def _animate(source: Path, target: Path, width: int = 480, rate: int = 12) -> None:
-    """Copies a film as an animated WebP that a web page plays, only as good as a file of moderate size allows."""
+def animate(source: Path, target: Path, width: int = 480, rate: int = 12, most: int = 1_200_000) -> None:
+    """Copies a film as an animated WebP that a web page plays, as good as fits into so many bytes."""
     import av
     from PIL import Image
 
@@ -62,10 +61,10 @@ def _animate(source: Path, target: Path, width: int = 480, rate: int = 12) -> No
     for quality in (80, 70, 60, 50, 40, 30):
         times = {"duration": 1000 // rate, "loop": 0}
         frames[0].save(target, save_all=True, append_images=frames[1:], quality=quality, method=4, **times)
-        if target.stat().st_size <= 3 * MOST_BYTES:
+        if target.stat().st_size <= most:
             return
     target.unlink()
-    raise ValueError(f"{source} is larger than {3 * MOST_BYTES // 1000} kB even as a poor WebP: film fewer frames.")
+    raise ValueError(f"{source} is larger than {most // 1000} kB even as a poor WebP: film fewer frames.")
 
 
 def main() -> int:

@@ -93,7 +93,7 @@ def test_what_cannot_run_is_named_with_the_reason(trained):
     text = (trained / "results" / "train.md").read_text()
     assert "- splatfacto on tiny: it needs a CUDA device" in text
     assert text.count("splatfacto on tiny") == 1, "once, not for every seed"
-    assert text.count("| mmpi-small | 6 |") == 1 and "±" in text
+    assert text.count("| mmpi-small | SfM tracks | 6 |") == 1 and "±" in text
 
 
 def test_finished_rows_are_kept_and_others_are_run_again(scene, trained, monkeypatch):
@@ -138,7 +138,7 @@ def test_depth_nerfacto_is_given_the_depths_that_ours_finds(scene, tmp_path, mon
     (row,) = read(tmp_path)["rows"].values()
     assert row["curve"][-1]["step"] == 2 and 3 < row["psnr"] < 40
     text = (tmp_path / "results" / "train.md").read_text()
-    assert "| depth-nerfacto | the depths that mmpi-small has | 2 |" in text
+    assert "| depth-nerfacto | the depths of mmpi-small | 2 |" in text
     config = NerfstudioDataParserConfig(data=scene, downscale_factor=1)
     for split, wanted in (("train", [k[..., :1] for k in known.images]), ("test", np.zeros((2, 24, 32, 1)))):
         held = DepthDataset(config.setup().get_dataparser_outputs(split=split))

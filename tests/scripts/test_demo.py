@@ -45,7 +45,7 @@ def shown(run):
 
 def test_light_that_passes_all_mpis_passes_each_alone(run):
     camera = run.tests.cameras[0:1]
-    alone = [render_alone(run, camera, name)[..., 3] for name in run.plan.names]
+    alone = [render_alone(run, camera, name)[..., 3] for name in run.windows.names]
     everything = run.model.get_outputs_for_camera(camera)["accumulation"][..., 0].numpy()
     assert len(alone) == 3 and min(a.max() for a in alone) > 0.2
     np.testing.assert_allclose(np.prod([1 - a for a in alone], 0), 1 - everything, atol=1e-4)
@@ -70,7 +70,7 @@ def strip_of(sheet, row, column, header, height):
 def test_the_sheet_shows_truth_rendering_winner_and_each_mpi_of_every_view(run, shown):
     sheet = contact_sheet(run, shown)
     height = round(VIEW * HEIGHT / WIDTH)
-    rows = 5 + len(run.plan.names)
+    rows = 5 + len(run.windows.names)
     header = sheet.height - rows * (height + GAP) - GAP
     assert sheet.width == LABELS + 2 * (VIEW + GAP) + GAP and 80 < header < 160
     for column, view in enumerate(shown):
@@ -125,7 +125,7 @@ def test_the_map_has_cameras_where_they_are_and_the_mpi_between_its_borders(run)
     assert np.linalg.norm(cameras[-1] - cameras[0]) == pytest.approx(np.linalg.norm(level) * drawn.scale)
     for x, y in cameras * FINER:
         assert drawn.backdrop.getpixel((round(x), round(y))) == (20, 20, 20)
-    mpi, color = run.plan.mpis[0], (1.0, 0.0, 0.0)
+    mpi, color = run.windows.plans[0].mpis[0], (1.0, 0.0, 0.0)
     picture = np.asarray(drawn.draw([(mpi, color)]), np.float64)
     assert picture.shape == (100, 400, 3)
     forward, right = (np.asarray(row) for row in run.observations.mean_axes[[2, 0]])
@@ -208,10 +208,10 @@ def few_points(monkeypatch):
 @pytest.mark.usefixtures("few_points")
 def test_the_street_is_made_once(tmp_path, capsys):
     demo = Demo(tmp_path, images=2)
-    demo._make_street()
+    demo._make_scene()
     first = (tmp_path / "street" / "transforms.json").stat().st_mtime_ns
     assert len(list((tmp_path / "street" / "images").iterdir())) == 2
-    demo._make_street()
+    demo._make_scene()
     assert (tmp_path / "street" / "transforms.json").stat().st_mtime_ns == first
     assert "kept" in capsys.readouterr().out
 
@@ -223,7 +223,7 @@ def test_another_number_of_images_is_another_street_and_another_training(tmp_pat
     (tmp_path / "street" / "transforms.json").write_text('{"frames": [1, 2]}')
     demo.checkpoint.parent.mkdir(parents=True)
     demo.checkpoint.touch()
-    demo._make_street()
+    demo._make_scene()
     assert len(list((tmp_path / "street" / "images").iterdir())) == 3 and not demo.checkpoint.exists()
 
 
@@ -270,7 +270,7 @@ def test_a_command_that_fails_or_is_missing_is_named(tmp_path, monkeypatch):
 
 def test_a_full_disk_is_one_sentence_and_status_1(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(demo_script.shutil, "disk_usage", lambda _: SimpleNamespace(free=1 << 20))
-    monkeypatch.setattr(Demo, "_make_street", lambda _: pytest.fail("it went on"))
+    monkeypatch.setattr(Demo, "_make_scene", lambda _: pytest.fail("it went on"))
     monkeypatch.setattr(sys, "argv", ["demo", "--folder", str(tmp_path)])
     assert demo_script.main() == 1
     said = capsys.readouterr().err
@@ -292,31 +292,28 @@ def test_figures_are_drawn_and_the_demo_is_asked_for(tmp_path, monkeypatch, caps
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["errors.png", "merging.png", "reliability.png"]
 
 
-def test_large_pictures_shrink_or_are_refused(tmp_path, monkeypatch):
+def test_large_pictures_shrink_or_are_refused(tmp_path):
     noise = np.random.default_rng(0).integers(0, 255, (200, 200, 3), np.uint8)
     source, target = tmp_path / "large.png", tmp_path / "small.jpg"
     Image.fromarray(noise).save(source)
-    figures._shrink(source, target)
+    figures.shrink(source, target)
     best = target.stat().st_size
-    monkeypatch.setattr(figures, "MOST_BYTES", best // 2)
-    figures._shrink(source, target)
+    figures.shrink(source, target, best // 2)
     assert target.stat().st_size <= best // 2 and Image.open(target).size == (200, 200)
-    monkeypatch.setattr(figures, "MOST_BYTES", 1000)
     with pytest.raises(ValueError, match="draw less"):
-        figures._shrink(source, target)
+        figures.shrink(source, target, 1000)
     assert not target.exists()
 
 
-def test_a_film_becomes_an_animated_picture_or_is_refused(tmp_path, monkeypatch):
+def test_a_film_becomes_an_animated_picture_or_is_refused(tmp_path):
     rng = np.random.default_rng(0)
     stills = [Image.fromarray(rng.integers(0, 255, (60, 96, 3), dtype=np.uint8)) for _ in range(5)]
     source, target = film.write_film(stills, tmp_path), tmp_path / "fly.webp"
     if source.is_dir():
         pytest.skip("PyAV has no encoder here")
-    figures._animate(source, target, width=48)
+    figures.animate(source, target, width=48)
     with Image.open(target) as picture:
         assert (picture.n_frames, picture.size) == (5, (48, 30))
-    monkeypatch.setattr(figures, "MOST_BYTES", 10)
     with pytest.raises(ValueError, match="film fewer frames"):
-        figures._animate(source, target)
+        figures.animate(source, target, most=30)
     assert not target.exists()

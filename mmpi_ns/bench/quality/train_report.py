@@ -132,14 +132,14 @@ def _memory(row: Row) -> str:
 
 
 def _given(row: Row) -> str:
-    """What the method had beside training images and poses."""
+    """What the method was given beside training images and poses."""
     name = row["g"].method.removesuffix(QUICK)
     return METHODS[name].given if name in METHODS else ""
 
 
 _COLUMNS = {
     "method": "{g.method}",
-    "had, beside images and poses": _given,
+    "was given, beside images and poses": _given,
     "steps": "{g.steps}",
     "M rays": lambda r: f"{r['g'].mean('rays') / 1e6:.2f}",
     "seconds (set up)": lambda r: f"{r['g'].mean('seconds'):.0f} ({r['g'].mean('setup_seconds'):.0f})",
