@@ -18,7 +18,7 @@ class Progress:
     words: list[str]
     """What ``ns-train`` was asked for, but for the number of steps."""
     curve: list[dict[str, float]] = field(default_factory=list)
-    """One point for each look: step, rays, seconds, psnr."""
+    """One point for each look: step, rays, seconds by the clock and of processors, psnr."""
     rays: int = 0
     setup_seconds: float = 0.0
     checkpoints: str = ""
@@ -32,6 +32,10 @@ class Progress:
     @property
     def seconds(self) -> float:
         return self.curve[-1]["seconds"] if self.curve else 0.0
+
+    @property
+    def processor(self) -> float:
+        return self.curve[-1]["processor"] if self.curve else 0.0
 
     def save(self, trainer: Any, folder: Path) -> None:
         """Saves a checkpoint of nerfstudio's trainer, and then what belongs to it."""

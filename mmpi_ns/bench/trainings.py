@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from mmpi_ns.bench.apart import Tell, run_apart
 from mmpi_ns.bench.methods import Method, Scene
@@ -89,27 +90,31 @@ def train_apart(
 
 
 class Stopwatch:
-    """Seconds that training took, without what it was stopped for."""
+    """Seconds that training took, without what it was stopped for: by the clock, and of this process's processors."""
 
     def __init__(self) -> None:
-        self._start, self._stopped = clock(), 0.0
+        self._start = _now()
 
-    def set(self, seconds: float) -> None:
+    def set(self, seconds: float, processor: float) -> None:
         """Makes it show so many seconds."""
-        self._stopped += self.seconds - seconds
+        self._start = _now() - np.array([seconds, processor])
 
-    @property
-    def seconds(self) -> float:
-        return clock() - self._start - self._stopped
+    def read(self) -> dict[str, float]:
+        """seconds, processor."""
+        return dict(zip(("seconds", "processor"), (_now() - self._start).tolist(), strict=True))
 
     @contextlib.contextmanager
     def stopped(self) -> Iterator[None]:
         """Does not count what runs inside, nor lets it change random draws outside."""
-        begin, numpy_state = clock(), np.random.get_state()  # noqa: NPY002
+        begin, numpy_state = _now(), np.random.get_state()  # noqa: NPY002
         with torch.random.fork_rng():  # of all devices
             yield
         np.random.set_state(numpy_state)  # noqa: NPY002
-        self._stopped += clock() - begin
+        self._start += _now() - begin
+
+
+def _now() -> NDArray[np.float64]:
+    return np.array([clock(), time.process_time()])
 
 
 def evenly(count: int, wanted: int) -> list[int]:
@@ -208,8 +213,8 @@ def train(asked: dict[str, Any], tell: Tell = print) -> dict[str, Any]:
 
     Returns:
         curve: for each check step, rays, seconds since the trainer was set up (placement and loading included,
-        evaluation not) and PSNR; psnr, ssim, rays_per_s, frame_s over whole test images; setup_seconds, seconds,
-        rays, parameters, peak_gib, split.
+        evaluation not; by the clock, and of processors) and PSNR; psnr, ssim, rays_per_s, frame_s over whole test
+        images; setup_seconds, seconds, processor_seconds, rays, parameters, peak_gib, split.
     """
     from mmpi_ns.bench.peers import give_depths, look_up_quickly, read_points_ourselves
 
@@ -231,9 +236,9 @@ def train(asked: dict[str, Any], tell: Tell = print) -> dict[str, Any]:
     # Random draws are not saved with a checkpoint: the second part must not repeat those of the first.
     trainer = trainer_of(config, progress.step)
     if progress.step:
-        watch.set(progress.seconds)
+        watch.set(progress.seconds, progress.processor)
     else:
-        progress.setup_seconds = watch.seconds
+        progress.setup_seconds = watch.read()["seconds"]
     row = _follow(trainer, request, watch, tell, progress)
     end_helpers(trainer)
     if not request.keep:
@@ -255,12 +260,12 @@ def _follow(trainer: Any, request: Request, watch: Stopwatch, tell: Tell, progre
         progress.rays += pixels_of_step(pipeline)
         if step + 1 not in request.checks:
             return
-        seconds = watch.seconds
+        taken = watch.read()
         with watch.stopped():
             found = score(pipeline, evenly(count, request.check_images), request.check_pixels, request.whole_images)
-            point = {"step": step + 1, "rays": progress.rays, "seconds": seconds, "psnr": found["psnr"]}
+            point = {"step": step + 1, "rays": progress.rays, **taken, "psnr": found["psnr"]}
             progress.curve.append(point)
-            tell(f"step {step + 1}: {seconds:.0f} s of training, {found['psnr']:.2f} dB")
+            tell(f"step {step + 1}: {taken['seconds']:.0f} s of training, {found['psnr']:.2f} dB")
             if request.go_on:
                 progress.save(trainer, Path(request.work))
             if step + 1 == request.checks[-1]:
@@ -276,6 +281,7 @@ def _follow(trainer: Any, request: Request, watch: Stopwatch, tell: Tell, progre
         **final,
         "setup_seconds": progress.setup_seconds,
         "seconds": progress.seconds,
+        "processor_seconds": progress.processor,
         "rays": progress.rays,
         "parameters": sum(p.numel() for p in pipeline.model.parameters()),
         **peak,

@@ -8,7 +8,7 @@ from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 
-from mmpi_ns.scripts.version import say_version
+from mmpi_ns.scripts.command import say_version
 
 COMMANDS = {
     "train": "quality.train",

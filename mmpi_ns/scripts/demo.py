@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-import tyro
+from mmpi_ns.scripts.command import run
 
 PARTS = 6
 FREE_BYTES = 2 << 30
@@ -25,7 +25,7 @@ OURS = ("runs", "fly", "unfinished.mp4", "fly.mp4", "times.json", "eval.json", "
 """What the demo writes beside the scene and its page, and removes when it starts afresh."""
 
 
-class DemoError(Exception):
+class DemoError(ValueError):
     """Why the demo cannot go on, in one sentence that says what to do."""
 
 
@@ -238,17 +238,12 @@ def _track(items: Iterable[Any], what: str) -> Iterator[Any]:
 
 def main() -> int:
     """Runs the demo; a mistake is one sentence and status 1."""
-    demo = tyro.cli(Demo)
     warnings.simplefilter("ignore")
     try:
-        demo.main()
-    except (DemoError, ValueError, OSError) as error:
-        print(f"demo: {error}", file=sys.stderr)
-        return 1
+        return run("demo", Demo)
     except KeyboardInterrupt:
         print("\nInterrupted: the same command goes on from here.", file=sys.stderr)
         return 130
-    return 0
 
 
 if __name__ == "__main__":

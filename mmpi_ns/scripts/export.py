@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from mmpi_ns.scripts.version import say_version
+from mmpi_ns.scripts.command import run
 from mmpi_ns.utils.values import Number, check_options
 
 if TYPE_CHECKING:
@@ -118,11 +118,7 @@ Command = Annotated[Bake, tyro.conf.subcommand("bake")] | Annotated[Web, tyro.co
 
 def entrypoint() -> None:
     """The command ``mmpi-export``; a mistake is one sentence and exit status 1."""
-    say_version("mmpi-export")
-    try:
-        tyro.cli(Command, description=__doc__).main()  # type: ignore[arg-type]
-    except (ValueError, OSError) as error:
-        sys.exit(f"mmpi-export: {error}")
+    sys.exit(run("mmpi-export", Command, description=__doc__))
 
 
 if __name__ == "__main__":

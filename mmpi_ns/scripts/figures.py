@@ -6,7 +6,7 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-import tyro
+from mmpi_ns.scripts.command import run
 
 SHEET, README_PICTURE = "contact-sheet.png", "contact-sheet.jpg"
 """The demo's picture that the documentation shows, there and here."""
@@ -67,16 +67,5 @@ def animate(source: Path, target: Path, width: int = 480, rate: int = 12, most: 
     raise ValueError(f"{source} is larger than {most // 1000} kB even as a poor WebP: film fewer frames.")
 
 
-def main() -> int:
-    """Draws the figures; a mistake is one sentence and status 1."""
-    figures = tyro.cli(Figures)
-    try:
-        figures.main()
-    except (ValueError, OSError) as error:
-        print(f"figures: {error}", file=sys.stderr)
-        return 1
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run("figures", Figures))

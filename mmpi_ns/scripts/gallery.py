@@ -7,11 +7,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import tyro
-
 from mmpi_ns.bench.report import commit, processor, read_json, table
 from mmpi_ns.scene.windows import WindowedPlan
-from mmpi_ns.scripts.demo import Demo, DemoError
+from mmpi_ns.scripts.command import run
+from mmpi_ns.scripts.demo import Demo
 from mmpi_ns.scripts.figures import animate, shrink
 
 SHOWN = {
@@ -92,8 +91,8 @@ def markdown(rows: list[dict[str, Any]]) -> str:
     """The page."""
     parts = [
         "# Gallery",
-        "Four made-up scenes, each trained with `mmpi-small` for a minute or two. Figures are means over test images, "
-        "which are half of each scene; depths of the training images come from the images alone.",
+        "Four procedural scenes, each trained with `mmpi-small` for a minute or two. PSNR and SSIM are means over the "
+        "test images, half of each scene; depths are found in the training images, the exact ones are not read.",
         table(COLUMNS, rows),
         f"Made by `make gallery` on {processor()}, commit {commit()}; seconds are from the start of `ns-train` to its "
         "last checkpoint, on a machine that did other things too.",
@@ -110,16 +109,5 @@ def markdown(rows: list[dict[str, Any]]) -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def main() -> int:
-    """Makes the gallery; a mistake is one sentence and status 1."""
-    gallery = tyro.cli(Gallery)
-    try:
-        gallery.main()
-    except (DemoError, ValueError, OSError) as error:
-        print(f"gallery: {error}", file=sys.stderr)
-        return 1
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run("gallery", Gallery))

@@ -13,7 +13,7 @@ import tyro
 from mmpi_ns.placement.defaults import DEFAULTS
 from mmpi_ns.placement.options import check_placement
 from mmpi_ns.placement.rule import PlacementConfig
-from mmpi_ns.scripts.version import say_version
+from mmpi_ns.scripts.command import say_version
 from mmpi_ns.utils.errors import InputError, speak_plainly
 from mmpi_ns.utils.values import Number, check_options
 

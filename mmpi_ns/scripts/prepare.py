@@ -7,7 +7,7 @@ import signal
 import sys
 import threading
 
-from mmpi_ns.scripts.version import say_version
+from mmpi_ns.scripts.command import say_version
 
 INTERRUPTED = "mmpi-prepare: interrupted; the same command goes on from here."
 

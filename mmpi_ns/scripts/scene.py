@@ -10,7 +10,7 @@ from typing import Literal
 
 import tyro
 
-from mmpi_ns.scripts.version import say_version
+from mmpi_ns.scripts.command import run
 
 Name = Literal["street", "long-road", "room", "look-round", "object", "still-life"]
 
@@ -86,11 +86,7 @@ def _progress(images: Iterable[int]) -> Iterator[int]:
 
 def entrypoint() -> None:
     """The ``mmpi-scene`` command; a mistake is one sentence and exit status 1."""
-    say_version("mmpi-scene")
-    try:
-        tyro.cli(SceneCommand).main()
-    except (ValueError, OSError) as error:
-        sys.exit(f"mmpi-scene: {error}")
+    sys.exit(run("mmpi-scene", SceneCommand))
 
 
 if __name__ == "__main__":

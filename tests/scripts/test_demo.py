@@ -24,6 +24,7 @@ from mmpi_ns.demo.views import load_run, render_alone, render_view, truth_of
 from mmpi_ns.rendering.metrics import ImageMetrics
 from mmpi_ns.scripts import demo as demo_script
 from mmpi_ns.scripts import figures
+from mmpi_ns.scripts.command import run as run_command
 from mmpi_ns.scripts.demo import Demo, DemoError
 from mmpi_ns.synthetic import dataset
 
@@ -287,7 +288,7 @@ def test_the_ray_of_the_figure_crosses_planes_where_geometry_says():
 
 def test_figures_are_drawn_and_the_demo_is_asked_for(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["figures", "--demo", str(tmp_path / "none"), "--output", str(tmp_path / "out")])
-    assert figures.main() == 1
+    assert run_command("figures", figures.Figures) == 1
     assert "run make demo first" in capsys.readouterr().err
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["errors.png", "merging.png", "reliability.png"]
 

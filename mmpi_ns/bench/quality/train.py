@@ -34,7 +34,7 @@ class Train(Bench):
     """What to train; also mmpi, mmpi-kitti, mmpi-scannet, mmpi-scannet-short."""
     steps: tuple[str, ...] = ()
     """Steps by method, as nerfacto=1500; a method may be named more than once, for runs of several lengths."""
-    rays_per_batch: tuple[str, ...] = ("nerfacto=1024",)
+    rays_per_batch: tuple[str, ...] = ("nerfacto=1024", "depth-nerfacto=1024")
     """Rays of a step by method."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """Seeds of every method."""

@@ -114,7 +114,8 @@ _PROTOCOL = """\
 All methods train with the same images, sizes and poses and are scored on the scene's test images; cameras are
 not optimised. Seconds count from the setting up of the trainer (images read, MPIs placed, kernels compiled) and
 not while test images are rendered. PSNR and SSIM are means over whole test images at the end, ± the standard
-deviation over seeds; on the way, PSNR is the mean over a fixed draw of pixels of each test image. nerfstudio's
+deviation over seeds; on the way, PSNR is the mean over a fixed draw of pixels of each test image. Processor seconds
+are those of the training process: with one thread, what the clock would have shown on an idle machine. nerfstudio's
 methods run through its own trainer with their own settings but for the size of a batch; their LPIPS is replaced
 (its weights are fetched by their constructors) and not reported. Quick hashes: the lookups in hash tables, which
 take most of nerfacto's time on a CPU, by our compiled gathering instead of plain torch, to rounding the same."""
@@ -143,6 +144,7 @@ _COLUMNS = {
     "steps": "{g.steps}",
     "M rays": lambda r: f"{r['g'].mean('rays') / 1e6:.2f}",
     "seconds (set up)": lambda r: f"{r['g'].mean('seconds'):.0f} ({r['g'].mean('setup_seconds'):.0f})",
+    "processor s": lambda r: f"{r['g'].mean('processor_seconds'):.0f}" if "processor_seconds" in r["g"].rows[0] else "",
     "rays/s": lambda r: f"{np.mean([_rate(x['curve']) for x in r['g'].rows]):.0f}",
     "PSNR": _psnr,
     "SSIM": lambda r: f"{r['g'].mean('ssim'):.3f}",

@@ -1,0 +1,33 @@
+"""What commands share: ``--version``, and mistakes that are one sentence."""
+
+from __future__ import annotations
+
+import sys
+from importlib.metadata import version
+from typing import Any
+
+import tyro
+
+
+def say_version(name: str) -> None:
+    """Ends the command with its name and the version of pyproject.toml where ``--version`` is the first word given."""
+    if sys.argv[1:2] == ["--version"]:
+        print(f"{name} {version('mmpi-ns')}")
+        sys.exit()
+
+
+def run(name: str, command: Any, **how: Any) -> int:
+    """Reads a command's options, runs its ``main`` and returns the exit status.
+
+    Args:
+        name: of the command, for its messages.
+        command: what tyro makes from the words given.
+        how: for tyro.
+    """
+    say_version(name)
+    try:
+        tyro.cli(command, prog=name, **how).main()
+    except (ValueError, OSError) as error:
+        print(f"{name}: {error}", file=sys.stderr)
+        return 1
+    return 0
