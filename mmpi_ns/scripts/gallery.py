@@ -19,15 +19,15 @@ SHOWN = {
         "A drive of 40 m past houses and parked cars, which is what MPIs are for.",
     ),
     "long-road": (
-        Demo(kind="long-road", images=100, length=150.0, steps=500),
+        Demo(kind="long-road", images=100, length=150.0, steps=400),
         "A road with bends. It is split into windows, each with MPIs of its own, trained one after the other.",
     ),
     "room": (
-        Demo(kind="room", images=64),
+        Demo(kind="room", images=64, steps=600),
         "A walk round a table, looking to all sides. MPIs face wherever the cameras looked.",
     ),
     "object": (
-        Demo(kind="object", images=48),
+        Demo(kind="object", images=48, steps=600),
         "An object walked all round, which is what MPIs are not for: from behind, one shows the edges of its planes.",
     ),
 }
