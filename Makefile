@@ -64,7 +64,7 @@ build: venv ## Build the sdist and the wheel in dist/
 	rm -rf dist
 	$(BIN)/python -m build
 
-wheel: build ## Build, and run the wheel's commands in an otherwise empty environment
+wheel: build ## Build, and run the wheel's commands and the demo in an otherwise empty environment
 	.ci/wheel
 
 figures: venv ## Draw the figures of the documentation anew, from the demo

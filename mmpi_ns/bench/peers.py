@@ -64,7 +64,7 @@ def give_depths(data: Path, downscale_factor: int) -> None:
     names, known = manager.train_dataset.image_filenames, manager.known_depth
     if known is None or known.share == 0:
         raise ValueError(f"{data}: no depth is known of any training pixel.")
-    inverse = {name: torch.from_numpy(image[..., :1]) for name, image in zip(names, known.images, strict=True)}
+    inverse = {name: torch.from_numpy(known.image(i)[..., :1]) for i, name in enumerate(names)}
 
     def depth_of(self: Any, batch: dict[str, Any]) -> dict[str, Tensor]:
         found = inverse.get(self.image_filenames[batch["image_idx"]], torch.zeros_like(batch["image"][..., :1]))
