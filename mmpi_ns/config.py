@@ -19,8 +19,12 @@ from mmpi_ns.training.touched_adam import TouchedAdamConfig
 from mmpi_ns.training.trainer import MMPITrainerConfig
 
 
-def _optimizers() -> dict:
-    rates = {"density": 0.1, "features": 0.1, "colour": 1e-3, "reliability": 0.1}
+PAPER_DATA = {"keypoint_rays": 0, "dense_depth": False, "depth_images": False, "new_view_share": 0.0}
+"""The paper trains on the colours of pixels alone."""
+
+
+def _optimizers(colour: float) -> dict:
+    rates = {"density": 0.1, "features": 0.1, "colour": colour, "reliability": 0.1}
     return {
         kind: {"optimizer": TouchedAdamConfig(lr=lr), "scheduler": PhaseSchedulerConfig(kind=kind)}
         for kind, lr in rates.items()
@@ -28,7 +32,7 @@ def _optimizers() -> dict:
 
 
 def _method(
-    name: str, description: str, *, steps: int, rays: int, model: MMPIModelConfig, keypoint_rays: int = 384
+    name: str, description: str, *, steps: int, rays: int, model: MMPIModelConfig, paper: bool = False
 ) -> MethodSpecification:
     config = MMPITrainerConfig(
         method_name=name,
@@ -44,23 +48,21 @@ def _method(
             datamanager=MMPIDataManagerConfig(
                 dataparser=NerfstudioDataParserConfig(),
                 train_num_rays_per_batch=rays,
-                keypoint_rays=keypoint_rays,
-                dense_depth=keypoint_rays > 0,
-                depth_images=keypoint_rays > 0,
-                new_view_share=0.75 if keypoint_rays > 0 else 0.0,
+                **(PAPER_DATA if paper else {}),
             ),
             model=model,
         ),
-        optimizers=_optimizers(),
+        optimizers=_optimizers(colour=1e-3 if paper else 3e-3),
         viewer=ViewerConfig(websocket_host="127.0.0.1", num_rays_per_chunk=1 << 14, quit_on_train_completion=True),
         vis="viewer+tensorboard",
     )
     return MethodSpecification(config=config, description=description)
 
 
-def _paper_loss() -> LossWeights:
-    """DVGO's total variation, which the paper takes."""
-    return LossWeights(tv_density=1e-5, tv_features=1e-6)
+def _paper() -> dict:
+    """What the paper takes from DVGO: total variation, and rates that fall from the start; no release of bricks."""
+    loss = LossWeights(tv_density=1e-5, tv_features=1e-6)
+    return {"loss": loss, "decay_from": 0.0, "decay_decades": 1.5, "release_weight": 0.0, "shading": "sample"}
 
 
 mmpi = _method(
@@ -82,16 +84,14 @@ mmpi_kitti = _method(
     "MMPI with the paper's KITTI settings: front, left, right, below; each alone, then reliability.",
     steps=40000,
     rays=4096,
-    keypoint_rays=0,
+    paper=True,
     model=MMPIModelConfig(
         placement=PlacementConfig(arrangement="drive", window_length=0.0, planes=256, height=270, width=270),
-        shading="sample",
         training="two-phase",
         rays_per_mpi="split",
         blend_share=0.25,
         finetune_share=0.0,
-        loss=_paper_loss(),
-        release_weight=0.0,
+        **_paper(),
     ),
 )
 
@@ -101,10 +101,8 @@ def _scannet() -> MMPIModelConfig:
         placement=PlacementConfig(
             arrangement="room", window_length=0.0, planes=128, height=192, width=192, cube_voxels=160
         ),
-        shading="sample",
         training="joint",
-        loss=_paper_loss(),
-        release_weight=0.0,
+        **_paper(),
     )
 
 
@@ -113,7 +111,7 @@ mmpi_scannet = _method(
     "MMPI with the paper's ScanNet settings: five MPIs and a cube, all together.",
     steps=30000,
     rays=4096,
-    keypoint_rays=0,
+    paper=True,
     model=_scannet(),
 )
 mmpi_scannet_short = _method(
@@ -121,6 +119,6 @@ mmpi_scannet_short = _method(
     "MMPI with the paper's ScanNet settings and a third of the steps.",
     steps=10000,
     rays=4096,
-    keypoint_rays=0,
+    paper=True,
     model=_scannet(),
 )

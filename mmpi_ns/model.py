@@ -81,8 +81,10 @@ class MMPIModelConfig(ModelConfig):
     """Share of the steps in which everything trains together at the end."""
     finetune_rate: float = 1.0
     """Learning rates at the start of the fine-tune relative to those of the first phase."""
-    decay_decades: float = 1.5
-    """Decades that learning rates fall over a phase."""
+    decay_decades: float = 1.0
+    """Decades that learning rates fall over a phase,"""
+    decay_from: float = 0.5
+    """after they have stayed for this share of it."""
     growth_shares: tuple[float, ...] = (1 / 15, 2 / 15, 3 / 15, 4 / 15)
     """When the texels of a plane double, as shares of the first phase."""
     release_shares: tuple[float, ...] = (0.5, 0.75, 0.95)
@@ -145,6 +147,7 @@ class MMPIModelConfig(ModelConfig):
             finetune_share=self.finetune_share,
             growth_shares=self.growth_shares,
             decay_decades=self.decay_decades,
+            decay_from=self.decay_from,
             finetune_rate=self.finetune_rate,
             windows=windows,
             release_shares=self.release_shares if self.release_weight > 0 else (),

@@ -42,6 +42,7 @@ MODEL = {
     "finetune_share": SHARE,
     "finetune_rate": NOT_NEGATIVE,
     "decay_decades": NOT_NEGATIVE,
+    "decay_from": SHARE,
     "growth_shares": SHARE,
     "release_shares": SHARE,
     "release_weight": NOT_NEGATIVE,

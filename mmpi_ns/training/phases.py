@@ -40,7 +40,9 @@ class Schedule:
     growth: tuple[int, ...]
     """Steps at which the texels of a plane double; before the first they are 2^-len(growth) of the plan's."""
     decay_decades: float
-    """Learning rates fall by 10^-decay_decades over a phase."""
+    """Learning rates fall by 10^-decay_decades over the rest of a phase,"""
+    decay_from: float
+    """after they have stayed for this share of it."""
     finetune_rate: float
     """Learning rates at the start of the fine-tune, relative to those of the first phase."""
     windows: int = 1
@@ -105,8 +107,9 @@ class Schedule:
         if kind not in TRAINS[phase.name]:
             return 0.0
         progress = (step - phase.start) / max(1, phase.end - phase.start)
+        falls = (min(progress, 1.0) - self.decay_from) / (1 - self.decay_from)
         base = self.finetune_rate if phase.name == "finetune" else 1.0
-        return float(base * 10.0 ** (-self.decay_decades * min(progress, 1.0)))
+        return float(base * 10.0 ** (-self.decay_decades * max(falls, 0.0)))
 
     def to_json(self) -> str:
         return json.dumps(asdict(self))
@@ -127,6 +130,7 @@ def make_schedule(
     finetune_share: float = 0.0,
     growth_shares: tuple[float, ...] = (1 / 15, 2 / 15, 3 / 15, 4 / 15),
     decay_decades: float = 1.5,
+    decay_from: float = 0.0,
     finetune_rate: float = 0.1,
     windows: int = 1,
     release_shares: tuple[float, ...] = (),
@@ -140,6 +144,7 @@ def make_schedule(
         finetune_share: share of the steps in which everything trains together at the end (two-phase).
         growth_shares: when texels double, as shares of the first phase.
         decay_decades: decades that learning rates fall over a phase (paper: x0.1 per 20k of 30k steps = 1.5).
+        decay_from: share of a phase for which they stay before that.
         finetune_rate: learning rates at the start of the fine-tune relative to the first phase's.
         windows: windows of a long capture, trained one after the other.
         release_shares: when bricks in which nothing is seen are given up, as shares of the first phase; not before
@@ -168,6 +173,8 @@ def make_schedule(
     growth = tuple(max(1, round(s * phases[0].end)) for s in growth_shares)
     if any(a > b for a, b in pairwise(growth)):
         raise ValueError("growth-shares must not decrease.")
-    schedule = Schedule(phases, growth, float(decay_decades), float(finetune_rate), windows)
+    if not 0 <= decay_from < 1:
+        raise ValueError(f"decay-from must lie between 0 and 1, 1 excluded, got {decay_from}.")
+    schedule = Schedule(phases, growth, float(decay_decades), float(decay_from), float(finetune_rate), windows)
     release = sorted({round(s * phases[0].end) for s in release_shares})
     return replace(schedule, release=tuple(s for s in release if s > schedule._sharp_from))

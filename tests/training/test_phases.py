@@ -80,6 +80,15 @@ def test_rates_fall_by_the_given_decades_over_each_phase():
     assert schedule.rate_factor("density", 50_000) == pytest.approx(0.003)  # no further decay after the run
 
 
+def test_rates_stay_for_a_share_of_each_phase_and_then_fall():
+    schedule = two_phase(decay_decades=2.0, decay_from=0.5, finetune_share=0.25)
+    first = schedule.phases[0].end
+    rates = [schedule.rate_factor("density", round(share * first)) for share in (0, 0.25, 0.5, 0.75)]
+    assert rates == pytest.approx([1, 1, 1, 0.1], rel=1e-3)
+    assert schedule.rate_factor("density", first - 1) == pytest.approx(0.01, rel=1e-3)
+    assert schedule.rate_factor("reliability", first) == 1.0
+
+
 def test_paper_rates_fall_tenfold_in_20k_of_30k_steps():
     assert make_schedule("joint", 30_000).rate_factor("density", 20_000) == pytest.approx(0.1)
 
@@ -144,7 +153,7 @@ def test_phases_without_steps_are_left_out():
 
 @pytest.mark.parametrize("training", ["two-phase", "joint"])
 def test_schedule_survives_json(training):
-    schedule = make_schedule(training, 1234, decay_decades=0.7, finetune_rate=0.2, release_shares=(0.5, 0.9))
+    schedule = make_schedule(training, 1234, decay_decades=0.7, decay_from=0.25, finetune_rate=0.2, release_shares=(0.5, 0.9))
     assert Schedule.from_json(schedule.to_json()) == schedule
     assert hash(Schedule.from_json(schedule.to_json())) == hash(schedule)
 
@@ -154,7 +163,7 @@ def test_numpy_settings_do_not_leak_into_rates():
     schedule = make_schedule("two-phase", 100, decay_decades=np.float64(1.5), finetune_rate=np.float64(0.1))
     assert type(schedule.decay_decades) is float and type(schedule.finetune_rate) is float
     schedule.to_json()
-    by_hand = Schedule((Phase("joint", 0, 10),), (), np.float64(1.5), np.float64(0.1))
+    by_hand = Schedule((Phase("joint", 0, 10),), (), np.float64(1.5), np.float64(0.5), np.float64(0.1))
     assert type(schedule.rate_factor("density", 10)) is type(by_hand.rate_factor("density", 10)) is float
 
 
@@ -165,6 +174,7 @@ def test_numpy_settings_do_not_leak_into_rates():
         ({"total_steps": 100, "blend_share": 0.7, "finetune_share": 0.3}, "blend-share"),
         ({"total_steps": 100, "blend_share": -0.25}, "blend-share"),
         ({"total_steps": 100, "growth_shares": (0.5, 0.25)}, "growth-shares"),
+        ({"total_steps": 100, "decay_from": 1.0}, "decay-from"),
     ],
 )
 def test_impossible_schedules_name_the_setting(settings, word):

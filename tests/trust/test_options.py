@@ -45,6 +45,7 @@ REFUSED = {
     M + "resident_gib": [-1.0],
     M + "growth_shares": [(0.5, 2.0)],
     M + "decay_decades": [NAN],
+    M + "decay_from": [1.5],
     M + "loss__distortion": [NAN, -1.0],
     M + "loss__tv_every": [0],
     "machine__device_type": ["mps"],
