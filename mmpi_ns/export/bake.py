@@ -81,11 +81,11 @@ def prune(window: BakedWindow, rays: Iterable[tuple[Tensor, Tensor]], least: flo
     """A window without the bricks in which no sample of these rays weighs ``least``."""
     if least <= 0:
         return window
-    peaks = torch.zeros(window.mpis.num_bricks)
+    peaks = torch.zeros(window.mpis.density.shape)
     for origins, directions in rays:
         nears = torch.full_like(origins[:, :1], window.ray_near)
         march_baked(window.mpis, origins, directions, nears, torch.full_like(nears, torch.inf), window.threshold, peaks)
-    return window.keep(peaks >= least)
+    return window.keep(peaks.amax((1, 2)) >= least)
 
 
 def camera_rays(cameras: Cameras, index: int) -> tuple[Float[Tensor, "R 3"], Float[Tensor, "R 3"]]:

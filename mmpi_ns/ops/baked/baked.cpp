@@ -12,6 +12,7 @@ namespace {
 
 constexpr float OPAQUE = 1e-2f; // a ray that lets less through is over
 constexpr int CELLS = 7, WORD = 32, FINENESS = 8, COLORS = 3;
+constexpr int32_t CORNERS[4] = {0, 1, 8, 9}; // of a cell, texels within a brick
 typedef uint8_t ByteLanes __attribute__((vector_size(16)));
 
 struct Column {
@@ -142,33 +143,36 @@ inline __attribute__((always_inline)) Lanes colors(const Scene& scene, const See
     return 1.0f / (1.0f + exp_lanes(-(low + step * codes)));
 }
 
-} // namespace
+struct Rays {
+    const float *origins, *directions, *nears, *fars;
+};
 
-extern "C" {
+// Marches one ray after the other.
+class Marcher {
+  public:
+    std::vector<Seen> seen; // the first `count`: samples of the last ray that weigh enough, front to back
+    int64_t count = 0;
 
-// Rays [begin, end). Sums of weight times colours and features, the weights' sum, the light that passes, the inverse
-// distance at half of the weight, the head of most weight; and, where asked for, the largest weight in each brick.
-void mmpi_march_baked(const Scene* scene, const float* origins, const float* directions, const float* nears,
-                      const float* fars, float threshold, int64_t begin, int64_t end, float* sums, float* mass,
-                      float* passing, float* inverse_t, int64_t* winner, float* peaks) {
-    const int64_t H = scene->num_heads, C = scene->channels;
-    int64_t most_samples = 1;
-    for (int64_t h = 0; h < H; h++) most_samples += scene->heads[h].planes;
-    std::vector<Walk> walks(H);
-    std::vector<float> nearest(H), votes(H); // nearest: 1 / distance of each head's next sample; -1: none
-    std::vector<Seen> seen(most_samples);
-    const Lanes low = load(scene->low), step = load(scene->step);
-    for (int64_t ray = begin; ray < end; ray++) {
+    Marcher(const Scene& scene, float threshold, float* peaks)
+        : scene(scene), threshold(threshold), peaks(peaks), walks(scene.num_heads), nearest(scene.num_heads) {
+        int64_t most = 1;
+        for (int64_t h = 0; h < scene.num_heads; h++) most += scene.heads[h].planes;
+        seen.resize(most);
+    }
+
+    // The light that passes a ray.
+    float march(const Rays& rays, int64_t ray) {
+        const int64_t H = scene.num_heads;
+        const float near = rays.nears[ray], inverse_far = 1 / rays.fars[ray];
         for (int64_t h = 0; h < H; h++) {
-            const Head& head = scene->heads[h];
-            Walk& walk = walks[h];
+            const Head& head = scene.heads[h];
             const bool meets =
-                walk.begin(head, origins + 3 * ray, directions + 3 * ray, nears[ray], 1 / fars[ray]) &&
-                walk.next(*scene, head);
-            nearest[h] = meets ? walk.inverse_t : -1;
+                walks[h].begin(head, rays.origins + 3 * ray, rays.directions + 3 * ray, near, inverse_far) &&
+                walks[h].next(scene, head);
+            nearest[h] = meets ? walks[h].inverse_t : -1;
         }
         float light = 1;
-        int64_t count = 0;
+        count = 0;
         while (light > OPAQUE) {
             int64_t best = 0;
             float top = nearest[0];
@@ -180,17 +184,47 @@ void mmpi_march_baked(const Scene* scene, const float* origins, const float* dir
             Walk& walk = walks[best];
             float fx, fy;
             const int32_t texel = walk.brick * 64 + walk.cell(fx, fy);
-            const uint8_t* code = scene->density + texel;
+            const uint8_t* code = scene.density + texel;
             const float above = float(code[0]) + fx * float(code[1] - code[0]);
             const float below = float(code[8]) + fx * float(code[9] - code[8]);
-            const float pass = scene->heads[best].pass[int32_t((above + fy * (below - above)) * FINENESS + 0.5f)];
+            const float pass = scene.heads[best].pass[int32_t((above + fy * (below - above)) * FINENESS + 0.5f)];
             const float weight = light * (1 - pass);
             seen[count] = {weight, top, fx, fy, int32_t(best), texel};
             count += weight > threshold;
-            if (peaks) peaks[walk.brick] = std::max(peaks[walk.brick], weight);
+            if (peaks)
+                for (const int32_t corner : CORNERS) peaks[texel + corner] = std::max(peaks[texel + corner], weight);
             light *= pass;
-            nearest[best] = walk.next(*scene, scene->heads[best]) ? walk.inverse_t : -1;
+            nearest[best] = walk.next(scene, scene.heads[best]) ? walk.inverse_t : -1;
         }
+        return light;
+    }
+
+  private:
+    const Scene& scene;
+    const float threshold;
+    float* const peaks; // of every texel, or null
+    std::vector<Walk> walks;
+    std::vector<float> nearest; // 1 / distance of each head's next sample; -1: none
+};
+
+} // namespace
+
+extern "C" {
+
+// Rays [begin, end). Sums of weight times colours and features, the weights' sum, the light that passes, the inverse
+// distance at half of the weight, the head of most weight; and, where asked for, the largest weight that reads a texel.
+void mmpi_march_baked(const Scene* scene, const float* origins, const float* directions, const float* nears,
+                      const float* fars, float threshold, int64_t begin, int64_t end, float* sums, float* mass,
+                      float* passing, float* inverse_t, int64_t* winner, float* peaks) {
+    const int64_t C = scene->channels;
+    const Rays rays{origins, directions, nears, fars};
+    Marcher marcher(*scene, threshold, peaks);
+    const std::vector<Seen>& seen = marcher.seen;
+    std::vector<float> votes(scene->num_heads);
+    const Lanes low = load(scene->low), step = load(scene->step);
+    for (int64_t ray = begin; ray < end; ray++) {
+        const float light = marcher.march(rays, ray);
+        const int64_t count = marcher.count;
         for (int64_t s = 0; s < count; s++) {
             const uint8_t* texel = scene->texels + seen[s].texel * C;
             __builtin_prefetch(texel), __builtin_prefetch(texel + 10 * C - 1);
@@ -211,6 +245,41 @@ void mmpi_march_baked(const Scene* scene, const float* origins, const float* dir
         while (s < count && (half += seen[s].weight) < 0.5f * total) s++;
         inverse_t[ray] = count ? seen[std::min(s, count - 1)].inverse_t : 0;
         winner[ray] = std::max_element(votes.begin(), votes.end()) - votes.begin();
+    }
+}
+
+// Adds what rays [begin, end) show at their samples to the groups of the texels that these read. With b = (1, direction)
+// and t the sample's colour with its odds changed as its ray's are, a group has 22 sums over weights: the ten products of
+// b with itself (the diagonal's and those above it, row by row), then b times t_red, t_green, t_blue for each b.
+void mmpi_spread_baked(const Scene* scene, const float* origins, const float* directions, const float* nears,
+                       const float* fars, float threshold, int64_t begin, int64_t end, const float* changes,
+                       const int32_t* groups, float* moments) {
+    const Rays rays{origins, directions, nears, fars};
+    Marcher marcher(*scene, threshold, nullptr);
+    const Lanes low = load(scene->low), step = load(scene->step);
+    for (int64_t ray = begin; ray < end; ray++) {
+        marcher.march(rays, ray);
+        const float* d = directions + 3 * ray;
+        const float b[4] = {1, d[0], d[1], d[2]};
+        float factor[COLORS];
+        for (int c = 0; c < COLORS; c++) factor[c] = std::exp(-changes[COLORS * ray + c]);
+        for (int64_t s = 0; s < marcher.count; s++) {
+            const Seen& sample = marcher.seen[s];
+            const Lanes color = colors(*scene, sample, low, step);
+            const float fx = sample.fx, fy = sample.fy;
+            const float shares[4] = {(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy};
+            for (int corner = 0; corner < 4; corner++) {
+                const int32_t group = groups[sample.texel + CORNERS[corner]];
+                if (group < 0) continue;
+                const float weight = sample.weight * shares[corner];
+                float* sum = moments + int64_t(group) * 22;
+                for (int i = 0; i < 4; i++)
+                    for (int j = i; j < 4; j++) *sum++ += weight * b[i] * b[j];
+                for (int i = 0; i < 4; i++)
+                    for (int c = 0; c < COLORS; c++)
+                        *sum++ += weight * b[i] * color[c] / (color[c] + (1 - color[c]) * factor[c]);
+            }
+        }
     }
 }
 }

@@ -75,17 +75,39 @@ def march_baked(
     peaks: Any = None,
 ) -> Gathered:
     """See ``ops.baked``."""
-    if "cpu" not in scene.packed:
-        scene.packed["cpu"] = _Packed(scene)
-    num_rays, given = len(origins), [x.contiguous() for x in (origins, directions, nears, fars)]
+    num_rays = len(origins)
     sums, winner = torch.empty(num_rays, scene.texels.shape[-1]), torch.empty(num_rays, 1, dtype=torch.int64)
     mass, passing, inverse_t = (torch.empty(num_rays, 1) for _ in range(3))
-    before = (ctypes.byref(scene.packed["cpu"].scene), *given, float(threshold))
+    before = (_packed(scene), *(x.contiguous() for x in (origins, directions, nears, fars)), float(threshold))
     # Where peaks are wanted, one thread alone: all would write to the same ones.
     least = 256 if peaks is None else max(num_rays, 1)
     after = (sums, mass, passing, inverse_t, winner, peaks)
     call_in_parts("mmpi_march_baked", num_rays, before, after, least)
     return Gathered(sums, mass, passing, inverse_t, winner)
+
+
+def spread_baked(
+    scene: BakedMpis,
+    origins: Tensor,
+    directions: Tensor,
+    nears: Tensor,
+    fars: Tensor,
+    threshold: float,
+    changes: Tensor,
+    groups: Tensor,
+    moments: Tensor,
+) -> None:
+    """See ``ops.baked``."""
+    given = [x.contiguous() for x in (origins, directions, nears, fars)]
+    before, after = (_packed(scene), *given, float(threshold)), (changes.contiguous(), groups.contiguous(), moments)
+    call_in_parts("mmpi_spread_baked", len(origins), before, after, max(len(origins), 1))  # all add to the same sums
+
+
+def _packed(scene: BakedMpis) -> Any:
+    """A scene as the kernels take it, made once."""
+    if "cpu" not in scene.packed:
+        scene.packed["cpu"] = _Packed(scene)
+    return ctypes.byref(scene.packed["cpu"].scene)
 
 
 def shade_baked(shader: Shader, sums: Tensor, mass: Tensor, directions: Tensor) -> Tensor:

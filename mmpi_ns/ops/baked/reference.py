@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import linear, relu
 
 from mmpi_ns.ops.gather.reference import COLORS, activate
-from mmpi_ns.scene.baked import CELLS, BakedMpis, Shader, brick_numbers, columns_of
+from mmpi_ns.scene.baked import CELLS, SIDE, BakedMpis, Shader, brick_numbers, columns_of
 from mmpi_ns.scene.geometry import PlaneHits, inverse_distance, plane_hits, sample_disparity
 
 OPAQUE = 1e-2
@@ -33,6 +33,19 @@ class Gathered(NamedTuple):
     """The head that gave most weight."""
 
 
+class _Samples(NamedTuple):
+    """All crossings of rays with bricks, nearest first; weight 0 where a ray is over or nothing is stored."""
+
+    weights: Float[Tensor, "R S"]
+    inverse_t: Float[Tensor, "R S"]
+    colors: Float[Tensor, "R S C"]
+    heads: Int[Tensor, "R S"]
+    taps: Int[Tensor, "R S 4"]
+    """Texels that a sample reads, counted through all bricks."""
+    shares: Float[Tensor, "R S 4"]
+    passing: Float[Tensor, "R 1"]
+
+
 def march_baked(
     scene: BakedMpis,
     origins: Tensor,
@@ -43,34 +56,70 @@ def march_baked(
     peaks: Any = None,
 ) -> Gathered:
     """See ``ops.baked``."""
+    samples = _samples(scene, origins, directions, nears, fars)
+    weights = samples.weights
+    if peaks is not None:
+        each = weights[..., None].expand(samples.taps.shape)
+        peaks.view(-1).scatter_reduce_(0, samples.taps.flatten(), each.flatten().to(peaks), "amax")
+    weights = torch.where(weights > threshold, weights, 0.0)
+    mass = weights.sum(-1, keepdim=True)
+    half = ((weights.cumsum(-1) >= 0.5 * mass) & (weights > 0)).to(torch.int8).argmax(-1, keepdim=True)
+    votes = weights.new_zeros(len(weights), len(scene.mpis)).scatter_add(1, samples.heads, weights)
+    return Gathered(
+        (weights[..., None] * samples.colors).sum(1),
+        mass,
+        torch.where(samples.passing > OPAQUE, samples.passing, 0.0),
+        torch.where(mass > 0, samples.inverse_t.gather(1, half), 0.0),
+        votes.argmax(-1, keepdim=True),
+    )
+
+
+def spread_baked(
+    scene: BakedMpis,
+    origins: Tensor,
+    directions: Tensor,
+    nears: Tensor,
+    fars: Tensor,
+    threshold: float,
+    changes: Tensor,
+    groups: Tensor,
+    moments: Tensor,
+) -> None:
+    """See ``ops.baked``."""
+    samples = _samples(scene, origins, directions, nears, fars)
+    color = samples.colors[..., :COLORS]
+    shown = color / (color + (1 - color) * torch.exp(-changes)[:, None])
+    basis = torch.cat([torch.ones_like(directions[:, :1]), directions], -1)
+    row, column = torch.triu_indices(4, 4)
+    squares = (basis[:, row] * basis[:, column])[:, None].expand(*shown.shape[:2], -1)
+    each = torch.cat([squares, (basis[:, None, :, None] * shown[:, :, None]).flatten(2)], -1)
+    weights = torch.where(samples.weights > threshold, samples.weights, 0.0)[..., None] * samples.shares
+    group = groups.view(-1)[samples.taps].to(torch.int64)
+    used = (group >= 0) & (weights > 0)
+    ray, sample, _ = used.nonzero().unbind(-1)
+    moments.index_add_(0, group[used], (weights[used][:, None] * each[ray, sample]).to(moments))
+
+
+def _samples(scene: BakedMpis, origins: Tensor, directions: Tensor, nears: Tensor, fars: Tensor) -> _Samples:
+    if scene.num_bricks == 0:
+        none = origins.new_zeros(len(origins), 1)
+        taps = torch.zeros(len(origins), 1, 4, dtype=torch.int64)
+        colors = none[..., None].expand(-1, 1, scene.texels.shape[-1])
+        return _Samples(none, none, colors, none.to(torch.int64), taps, taps.to(none), torch.ones_like(none))
     hits = plane_hits(origins, directions, nears, fars, scene.frames)
     parts = [_head(scene, k, hits) for k in range(len(scene.mpis))]
-    tau, inverse_t, texels, bricks = (torch.cat(x, 1) for x in zip(*parts, strict=True))
-    heads = torch.cat([torch.full_like(p[3], k) for k, p in enumerate(parts)], 1)
+    tau, inverse_t, taps, shares = (torch.cat(x, 1) for x in zip(*parts, strict=True))
+    heads = torch.cat([torch.full(p[0].shape, k) for k, p in enumerate(parts)], 1)
     order = torch.sort(inverse_t, stable=True, dim=-1, descending=True).indices
-    tau, inverse_t, bricks, heads = (x.gather(1, order) for x in (tau, inverse_t, bricks, heads))
-    texels = texels.gather(1, order[..., None].expand(*order.shape, texels.shape[-1]))
+    tau, inverse_t, heads = (x.gather(1, order) for x in (tau, inverse_t, heads))
+    taps, shares = (x.gather(1, order[..., None].expand(x.shape)) for x in (taps, shares))
     after = torch.exp(-tau.cumsum(-1))
     before = torch.cat([torch.ones_like(after[:, :1]), after[:, :-1]], -1)
     weights = torch.where(before > OPAQUE, before * -torch.expm1(-tau), 0.0)
-    if peaks is not None:
-        stored = bricks >= 0
-        peaks.scatter_reduce_(0, bricks[stored], weights[stored], "amax")
-    weights = torch.where(weights > threshold, weights, 0.0)
-    mass = weights.sum(-1, keepdim=True)
-    gathered = weights.cumsum(-1)
-    half = ((gathered >= 0.5 * mass) & (weights > 0)).to(torch.int8).argmax(-1, keepdim=True)
-    passing = after[:, -1:]
-    votes = weights.new_zeros(len(weights), len(scene.mpis)).scatter_add(1, heads, weights)
-    low, step = (texels.new_tensor([getattr(c, name) for c in scene.channel_codes]) for name in ("low", "step"))
-    colors = activate((low + step * texels).flatten(0, 1)).view(texels.shape)
-    return Gathered(
-        (weights[..., None] * colors).sum(1),
-        mass,
-        torch.where(passing > OPAQUE, passing, 0.0),
-        torch.where(mass > 0, inverse_t.gather(1, half), 0.0),
-        votes.argmax(-1, keepdim=True),
-    )
+    low, step = (shares.new_tensor([getattr(c, name) for c in scene.channel_codes]) for name in ("low", "step"))
+    codes = (scene.texels.view(-1, len(low))[taps] * shares[..., None]).sum(-2)
+    colors = activate((low + step * codes).flatten(0, 1)).view(codes.shape)
+    return _Samples(weights, inverse_t, colors, heads, taps, shares, after[:, -1:])
 
 
 def shade_baked(shader: Shader, sums: Tensor, mass: Tensor, directions: Tensor) -> Tensor:
@@ -86,7 +135,8 @@ def shade_baked(shader: Shader, sums: Tensor, mass: Tensor, directions: Tensor) 
 
 
 def _head(scene: BakedMpis, k: int, hits: PlaneHits) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Optical depth, inverse distance, codes and brick on every plane of one MPI [R, P, ...]; 0 and -1 where none."""
+    """Optical depth and inverse distance [R, P], texels and their shares [R, P, 4] on every plane of one MPI; zeros
+    where nothing is stored."""
     mpi, frames = scene.mpis[k], scene.frames
     first = scene.first_column(k)
     numbers = brick_numbers(scene.columns[first : first + columns_of(mpi)], mpi)
@@ -101,19 +151,13 @@ def _head(scene: BakedMpis, k: int, hits: PlaneHits) -> tuple[Tensor, Tensor, Te
     tile_y, fy = _split(y, mpi.height)
     brick = torch.where(live, numbers[plane, tile_y[0], tile_x[0]], -1)
     live = brick >= 0
-    index = torch.where(live, brick, scene.num_bricks)
-    density, texels_of = (
-        torch.cat([table, table.new_zeros(1, *table.shape[1:])]) for table in (scene.density, scene.texels)
-    )
-    codes, texels = 0.0, 0.0
-    for dy, wy in ((0, 1 - fy), (1, fy)):
-        for dx, wx in ((0, 1 - fx), (1, fx)):
-            at = index, tile_y[1] + dy, tile_x[1] + dx
-            codes = codes + density[at].float() * (wx * wy)
-            texels = texels + texels_of[at].float() * (wx * wy)[..., None]
+    corner = (brick.clamp(min=0) * SIDE + tile_y[1]) * SIDE + tile_x[1]
+    taps = corner[..., None] + torch.tensor([0, 1, SIDE, SIDE + 1])
+    shares = torch.stack([(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy], -1)
+    codes = (scene.density.view(-1)[taps] * shares).sum(-1)
     local = hits.local_origins[:, k, 2:], hits.local_directions[:, k, 2:]
     tau = torch.where(live, scene.optical_depth(k, codes), 0.0)
-    return tau, torch.where(live, inverse_distance(w, *local), 0.0), texels, brick
+    return tau, torch.where(live, inverse_distance(w, *local), 0.0), taps, shares
 
 
 def _split(position: Float[Tensor, "R P"], size: int) -> tuple[tuple[Tensor, Tensor], Tensor]:
