@@ -7,33 +7,43 @@ fitted to what rays show at it, as a linear function of the direction: spherical
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from statistics import fmean
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
+from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 
-from mmpi_ns.ops.baked import march_baked, shade_baked, spread_baked
+from mmpi_ns.export.files import BakedScene, Pose
+from mmpi_ns.export.reader import camera_rays
+from mmpi_ns.ops.baked import march_baked
 from mmpi_ns.ops.gather.reference import COLORS, activate
+from mmpi_ns.ops.splat import splat_image, splat_sums
+from mmpi_ns.ops.splat.reference import BLUR, Gaussians, View
 from mmpi_ns.rendering.baked import BakedWindow
 from mmpi_ns.scene.baked import CELLS, SIDE, brick_numbers, columns_of
+from mmpi_ns.scene.windows import Window, window_shares
 from mmpi_ns.utils.files import write_atomically
 
-Rays = tuple[Float[Tensor, "R 3"], Float[Tensor, "R 3"]]
-
-WIDTH = 0.5
+WIDTH = 0.35
 """Standard deviation of a splat, in texels."""
-BLUR = 0.3
-"""Variance, in square pixels, that rasterisers add to every splat."""
 THICKNESS = 0.01
 """Of a splat, in its width."""
 LARGEST = 3
 """Most often that four neighbours become one."""
 AGREEING_COLOR, AGREEING_FEATURE, AGREEING_ALPHA = 0.04, 0.2, 0.1
 """Neighbours whose colours, features and alphas differ by less are one splat."""
+DENSER = 1.25
+"""Factor on optical depths."""
+FRACTIONS = (0.0, 0.5, 0.25, 0.75)
+"""Of the way from one camera to the next: where colours are fitted, round by round."""
+ROUNDS = 8
+STEP = 1.7
+"""Of a round: more than 1 arrives sooner."""
 STEADY = 0.02
 """Weight, as a share of a splat's, by which its colour is held to be the same from everywhere."""
 SH0, SH1 = 0.28209479177387814, 0.4886025119029199
@@ -55,6 +65,21 @@ class Splats:
     colors: Float[Tensor, "N 4 3"]
     """Red, green and blue seen in direction d are these times (1, d)."""
 
+    @property
+    def gaussians(self) -> Gaussians:
+        turns = torch.tensor(Rotation.from_quat(self.rotations[:, [1, 2, 3, 0]].numpy()).as_matrix()).float()
+        half = turns * self.scales[:, None]
+        return Gaussians(self.means, half @ half.mT, self.alphas)
+
+    def basis(self, eye: Float[Tensor, "3"]) -> Float[Tensor, "N 4"]:
+        """(1, d) of each, seen from a point."""
+        directions = torch.nn.functional.normalize(self.means - eye, dim=-1)
+        return torch.cat([torch.ones_like(directions[:, :1]), directions], -1)
+
+    def seen_from(self, eye: Float[Tensor, "3"]) -> Float[Tensor, "N 3"]:
+        """Their colours, seen from a point."""
+        return (self.basis(eye)[:, :, None] * self.colors).sum(1).clamp(0, 1)
+
 
 @dataclass(frozen=True)
 class _Texels:
@@ -72,45 +97,84 @@ class _Texels:
     """Which of these each texel of the bricks is; -1 for those outside the plane."""
 
 
-def splats_of(window: BakedWindow, views: Sequence[Callable[[], Rays]], focal: float, least: float, most: int) -> Splats:
+def splats_of(window: BakedWindow, poses: list[Pose], least: float, most: int, rounds: int = ROUNDS) -> Splats:
     """A window as splats.
 
     Args:
         window: baked.
-        views: the rays of each training camera.
-        focal: of those cameras, pixels: opacities are right where a pixel is as large as theirs.
-        least: texels whose samples weigh less in all views are left out.
+        poses: training cameras.
+        least: texels whose samples weigh less in all these views are left out.
         most: number of splats; those of least weight are left out.
+        rounds: of fitting colours to what the window shows.
     """
     peaks = torch.zeros(window.mpis.density.shape)
-    changes = [_march(window, view(), peaks) for view in views]
+    for pose in poses:
+        march_baked(window.mpis, *_reach(window, pose), window.threshold, peaks)
     texels = _texels(window, peaks)
     group, level = _merged(texels, texels.peaks >= least)
-    weight = texels.peaks.new_zeros(int(group.max()) + 1).scatter_reduce(0, group[group >= 0], texels.peaks[group >= 0], "amax")
-    kept = torch.full((len(weight),), -1)
+    wanted = group >= 0
+    weight = torch.zeros(int(group.max()) + 1).scatter_reduce(0, group[wanted], texels.peaks[wanted], "amax")
     chosen = weight.argsort(descending=True)[:most].sort().values
-    kept[chosen] = torch.arange(len(chosen))
-    group = torch.where(group >= 0, kept[group.clamp(min=0)], -1)
-    of_bricks = torch.where(texels.own >= 0, group[texels.own.clamp(min=0)], -1).to(torch.int32)
-    moments = torch.zeros(len(chosen), 22)
-    for view, change in zip(views, changes, strict=True):
-        origins, directions = view()
-        nears = torch.full_like(origins[:, :1], window.ray_near)
-        fars = torch.full_like(nears, torch.inf)
-        spread_baked(window.mpis, origins, directions, nears, fars, window.threshold, change, of_bricks, moments)
-    inside = group >= 0
-    return _placed(window, texels, group[inside], level[inside], inside, focal, _colors(moments))
+    kept = torch.full((len(weight),), -1).index_copy(0, chosen, torch.arange(len(chosen)))
+    group = torch.where(wanted, kept[group.clamp(min=0)], -1)
+    splats = _placed(window, texels, group, level, fmean(pose.focal[0] for pose in poses))
+    for number in range(rounds):  # other cameras each time, so that splats do not suit those of the capture alone
+        splats = fitted(splats, window, between(poses, FRACTIONS[number % len(FRACTIONS)]))
+    return splats
 
 
-def _march(window: BakedWindow, rays: Rays, peaks: Tensor) -> Float[Tensor, "R 3"]:
-    """Raises the texels' peaks; returns how the network changes the logarithm of the odds of each ray's colour."""
-    origins, directions = rays
+def poses_in(place: Window, scene: BakedScene) -> list[Pose]:
+    """Training cameras that a window answers."""
+    poses = [pose for pose in scene.path if not pose.test]
+    shares = window_shares(torch.tensor([p.to_world for p in poses])[:, :, 3], tuple(w for w, _ in scene.windows))
+    number = [w for w, _ in scene.windows].index(place)
+    return [pose for pose, share in zip(poses, shares[:, number].tolist(), strict=True) if share > 0]
+
+
+def rays_of(pose: Pose) -> tuple[Float[Tensor, "R 3"], Float[Tensor, "R 3"]]:
+    """Origins and unit directions of a camera's pixels."""
+    origins, directions = (torch.tensor(np.array(x), dtype=torch.float32) for x in camera_rays(pose.__dict__))
+    return origins, directions
+
+
+def _reach(window: BakedWindow, pose: Pose) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Origins, directions, nears and fars of a camera's pixels."""
+    origins, directions = rays_of(pose)
     nears = torch.full_like(origins[:, :1], window.ray_near)
-    fars = torch.full_like(nears, torch.inf)
-    found = march_baked(window.mpis, origins, directions, nears, fars, window.threshold, peaks)
-    shown = shade_baked(window.shader, found.sums, found.mass, directions)
-    gathered = found.sums[:, :COLORS] / found.mass.clamp(min=1e-6)
-    return torch.where(found.mass > 0, torch.logit(shown, 1e-5) - torch.logit(gathered, 1e-5), 0.0)
+    return origins, directions, nears, torch.full_like(nears, torch.inf)
+
+
+def between(poses: list[Pose], fraction: float) -> list[Pose]:
+    """Cameras this far on the way from each to the next one."""
+    made = []
+    for a, b in zip(poses, [*poses[1:], poses[-1]], strict=True):
+        (a_turn, a_eye), (b_turn, b_eye) = ((x[:, :3], x[:, 3:]) for x in (np.array(a.to_world), np.array(b.to_world)))
+        turn = Slerp([0, 1], Rotation.from_matrix([a_turn, b_turn]))(fraction).as_matrix()
+        made.append(replace(a, to_world=np.hstack([turn, a_eye + fraction * (b_eye - a_eye)]).tolist()))
+    return made
+
+
+def fitted(splats: Splats, window: BakedWindow, poses: list[Pose]) -> Splats:
+    """Splats with colours, linear in direction, that come closer to what a window shows.
+
+    The errors of all images are taken back to the splats, and each is corrected by least squares over (1, direction),
+    as if it were alone. Weights of a pixel sum up to 1 at most, so steps of less than twice that converge.
+    """
+    gaussians, count = splats.gaussians, len(splats.means)
+    squares, errors = torch.zeros(count, 4, 4), torch.zeros(count, 4, COLORS)
+    for pose in poses:
+        view = View(torch.tensor(pose.to_world).float(), pose.size, pose.focal, pose.center)
+        target = window.render(*_reach(window, pose), torch.full((COLORS,), window.background))["rgb"]
+        image = splat_image(gaussians, view, splats.seen_from(view.to_world[:, 3]))
+        shown = image[..., :3] + window.background * image[..., 3:]
+        sums = splat_sums(gaussians, view, target.view(shown.shape) - shown)
+        seen = sums[:, 3].nonzero()[:, 0]
+        basis, sums = splats.basis(view.to_world[:, 3])[seen], sums[seen]
+        squares.index_add_(0, seen, basis[:, :, None] * basis[:, None] * sums[:, 3, None, None])
+        errors.index_add_(0, seen, basis[:, :, None] * sums[:, None, :3])
+    weight = squares[:, :1, 0].clamp(min=1e-6)
+    held = STEADY * weight * squares.new_tensor([1e-4, 1.0, 1.0, 1.0])
+    return replace(splats, colors=splats.colors + STEP * torch.linalg.solve(squares + torch.diag_embed(held), errors))
 
 
 def _texels(window: BakedWindow, peaks: Float[Tensor, "B 8 8"]) -> _Texels:
@@ -154,9 +218,9 @@ def _merged(texels: _Texels, wanted: Tensor) -> tuple[Int[Tensor, "T"], Int[Tens
     for depth in range(1, LARGEST + 1):
         _, parent, count = name(depth).unique(return_inverse=True, return_counts=True)
         index = parent[:, None].expand(values.shape)
-        spread = [values.new_zeros(len(count), values.shape[1]).scatter_reduce(0, index, values, how, include_self=False)
-                  for how in ("amax", "amin")]  # fmt: skip
-        agrees = (count == 4**depth) & ((spread[0] - spread[1]).amax(-1) < 1)
+        none = values.new_zeros(len(count), values.shape[1])
+        high, low = (none.scatter_reduce(0, index, values, how, include_self=False) for how in ("amax", "amin"))
+        agrees = (count == 4**depth) & ((high - low).amax(-1) < 1)
         level = torch.where(agrees[parent], depth, level)
     _, group = (name(level) * (LARGEST + 1) + level).unique(return_inverse=True)
     groups, levels = torch.full(wanted.shape, -1), torch.zeros(wanted.shape, dtype=torch.int64)
@@ -164,52 +228,39 @@ def _merged(texels: _Texels, wanted: Tensor) -> tuple[Int[Tensor, "T"], Int[Tens
     return groups, levels
 
 
-def _colors(moments: Float[Tensor, "N 22"]) -> Float[Tensor, "N 4 3"]:
-    """Least squares of colour over (1, direction), by weight; steady where few directions tell."""
-    row, column = torch.triu_indices(4, 4)
-    squares = moments.new_zeros(len(moments), 4, 4)
-    squares[:, row, column] = squares[:, column, row] = moments[:, :10]
-    weight = squares[:, 0, 0].clamp(min=1e-6)
-    held = STEADY * weight[:, None] * moments.new_tensor([1e-4, 1.0, 1.0, 1.0])
-    return torch.linalg.solve(squares + torch.diag_embed(held), moments[:, 10:].view(-1, 4, 3))
-
-
-def _placed(
-    window: BakedWindow, texels: _Texels, group: Tensor, level: Tensor, inside: Tensor, focal: float, colors: Tensor
-) -> Splats:
-    """Where splats lie, how large they are and how much light they take."""
-    count = torch.bincount(group, minlength=len(colors)).float()
-    mean = lambda values: torch.zeros(len(colors)).index_add(0, group, values[inside].float()) / count  # noqa: E731
-    first = torch.empty(len(colors), dtype=torch.int64)
-    first[group] = inside.nonzero()[:, 0]
+def _placed(window: BakedWindow, texels: _Texels, group: Tensor, level: Tensor, focal: float) -> Splats:
+    """Where splats lie, how large they are, how much light they take, and their diffuse colours."""
+    inside = (group >= 0).nonzero()[:, 0]
+    group, level, total = group[inside], level[inside], int(group.max()) + 1
+    count = torch.bincount(group, minlength=total).float()
+    mean = lambda x: torch.zeros(total, x.shape[1]).index_add(0, group, x[inside].float()) / count[:, None]  # noqa: E731
+    first = torch.empty_like(count, dtype=torch.int64).index_copy(0, group, inside)
     head, plane = texels.places[first, :2].unbind(-1)
-    size = 2.0 ** torch.zeros(len(colors), dtype=torch.int64).index_copy(0, group, level)
-    y, x, depth = mean(texels.places[:, 2]), mean(texels.places[:, 3]), mean(texels.depths)
-    means, scales = torch.empty(len(colors), 3), torch.empty(len(colors), 3)
-    rotations, alphas = torch.empty(len(colors), 4), torch.empty(len(colors))
+    size = 2.0 ** torch.empty_like(first).index_copy(0, group, level)
+    (y, x), depth = mean(texels.places[:, 2:]).unbind(-1), mean(texels.depths[:, None])[:, 0]
+    means, scales = torch.empty(total, 3), torch.empty(total, 3)
+    rotations, alphas = torch.empty(total, 4), torch.empty(total)
     for k, mpi in enumerate(window.mpis.mpis):
         own = head == k
         u0, u1, v0, v1 = mpi.extent
         du, dv = (u1 - u0) / (mpi.width - 1), (v1 - v0) / (mpi.height - 1)
         disparity = (mpi.planes - 1 - plane[own]) * mpi.disparity_step + mpi.last_disparity
         z = 1 / disparity.clamp(min=1 / window.farthest)
-        axes = torch.tensor(mpi.axes)
         local = torch.stack([(u0 + x[own] * du) * z, (v0 + y[own] * dv) * z, z], -1)
-        means[own] = torch.tensor(mpi.origin) + local @ axes
+        means[own] = torch.tensor(mpi.origin) + local @ torch.tensor(mpi.axes)
         sides = torch.stack([size[own] * du, size[own] * dv], -1)
         scales[own] = torch.cat([WIDTH * sides, THICKNESS * sides[:, :1]], -1) * z[:, None]
-        rotations[own] = quaternion(axes.T)
+        rotations[own] = quaternion(mpi.axes)
         # Splats of this spacing sum up to so many times their middle, as a rasteriser blurs them.
         overlap = 2 * math.pi * (WIDTH**2 + BLUR / (focal * sides) ** 2).prod(-1).sqrt()
-        alphas[own] = -torch.expm1(-depth[own] / overlap)
+        alphas[own] = -torch.expm1(-DENSER * depth[own] / overlap)
+    colors = torch.cat([mean(texels.channels[:, :COLORS])[:, None], torch.zeros(total, 3, COLORS)], 1)
     return Splats(means, scales, rotations, alphas.clamp(max=0.999), colors)
 
 
-def quaternion(rotation: Float[Tensor, "3 3"]) -> Float[Tensor, "4"]:
-    """Unit quaternion (w, x, y, z) of a rotation."""
-    from scipy.spatial.transform import Rotation
-
-    x, y, z, w = Rotation.from_matrix(rotation.numpy()).as_quat()
+def quaternion(axes: Any) -> Float[Tensor, "4"]:
+    """Unit quaternion (w, x, y, z) that turns x, y, z into the three axes given."""
+    x, y, z, w = Rotation.from_matrix(np.transpose(axes)).as_quat()
     return torch.tensor([w, x, y, z], dtype=torch.float32)
 
 

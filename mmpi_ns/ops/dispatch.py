@@ -45,7 +45,8 @@ TABLE: dict[str, tuple[str, tuple[Form, ...]]] = {
     "show_rays": ("show", ("gpu",)),
     "shade": ("shade", ("cpu",)),
     "march_baked": ("baked", ("cpu",)),
-    "spread_baked": ("baked", ("cpu",)),
+    "splat_image": ("splat", ("cpu",)),
+    "splat_sums": ("splat", ("cpu",)),
     "shade_baked": ("baked", ("cpu",)),
 }
 """Every operation. Its function has the same name and signature in ``reference.py``, ``cpu.py`` and ``gpu.py``."""

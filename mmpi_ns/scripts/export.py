@@ -1,4 +1,4 @@
-"""``mmpi-export``: a trained model for others to look at, as a baked scene or as a page for a browser."""
+"""``mmpi-export``: a trained model for others to look at, as a baked scene, as a page for a browser, or as splats."""
 
 from __future__ import annotations
 
@@ -92,6 +92,39 @@ class Web(_Run):
         print(f"  python -m http.server --directory {self.output}    # and open http://localhost:8000")
 
 
+@dataclass
+class Splats(_Run):
+    """Writes Gaussians in the layout (.ply) that viewers of 3D Gaussian splatting read; one file a window."""
+
+    output: Path = Path("scene.ply")
+    """File to write; scene-00000.ply and so on where there are several windows."""
+    weight: float = 0.01
+    """Texels that no training view gives this rendering weight are left out."""
+    most: int = 1_000_000
+    """Splats of a window at most."""
+
+    def main(self) -> None:
+        _check_run(self.load_config)
+        if self.output.exists() and not self.overwrite:
+            raise ValueError(f"{self.output} is there already: name another file, or give --overwrite.")
+        import torch
+
+        from mmpi_ns.ops import dispatch
+
+        if dispatch.form_of("splat_image", torch.zeros(1)) != "cpu":
+            raise ValueError("Colours of splats are fitted by compiled code: install a C++ compiler (g++ or clang++).")
+        scene = self.bake()
+        from mmpi_ns.export.splats import poses_in, splats_of, write_ply
+
+        for number, (place, window) in enumerate(scene.windows):
+            path = self.output
+            if len(scene.windows) > 1:
+                path = path.with_stem(f"{path.stem}-{number:05d}")
+            splats = splats_of(window, poses_in(place, scene), self.weight, self.most)
+            size = write_ply(splats, path)
+            print(f"Wrote {path}: {len(splats.means)} splats, {size / 1e6:.1f} MB.")
+
+
 def _check_run(load_config: Path) -> None:
     """Raises ValueError where there is no run, or none with a checkpoint."""
     if not load_config.is_file():
@@ -113,7 +146,11 @@ def _check_output(folder: Path, overwrite: bool) -> None:
         raise ValueError(f"{folder} holds an export already: name another folder, or give --overwrite.")
 
 
-Command = Annotated[Bake, tyro.conf.subcommand("bake")] | Annotated[Web, tyro.conf.subcommand("web")]
+Command = (
+    Annotated[Bake, tyro.conf.subcommand("bake")]
+    | Annotated[Web, tyro.conf.subcommand("web")]
+    | Annotated[Splats, tyro.conf.subcommand("splats")]
+)
 
 
 def entrypoint() -> None:

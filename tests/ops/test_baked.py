@@ -100,37 +100,6 @@ def test_peaks_are_the_largest_weights(form):
     torch.testing.assert_close(again.sums, found.sums, rtol=1e-4, atol=1e-3)
 
 
-def spread(form, window, rays, changes, groups):
-    moments = torch.zeros(int(groups.max()) + 1, 22)
-    FORMS[form].spread_baked(window.mpis, *rays, window.threshold, changes, groups, moments)
-    return moments
-
-
-@pytest.mark.parametrize("form", FORMS)
-def test_moments_are_the_sums_that_rays_gather(form):
-    """All texels in one group: the weights and colours of all rays times (1, direction), and its products."""
-    window = random_window(num_mpis=3)
-    rays, found = (given := rays_into(window, 40)), marched(form, window, given)
-    groups = torch.zeros(window.mpis.density.shape, dtype=torch.int32)
-    moments = spread(form, window, rays, torch.zeros(40, 3), groups)[0]
-    basis = torch.cat([torch.ones(40, 1), rays[1]], -1)
-    expected = [(found.mass[:, 0] * basis[:, i] * basis[:, j]).sum() for i in range(4) for j in range(i, 4)]
-    expected += [(found.sums[:, c] * basis[:, i]).sum() for i in range(4) for c in range(3)]
-    torch.testing.assert_close(moments, torch.stack(expected), atol=2e-3, rtol=1e-3)
-
-
-def test_the_forms_spread_alike():
-    """Texels in groups and in none, colours with odds changed."""
-    window, g = random_window(num_mpis=2, seed=4), torch.Generator().manual_seed(0)
-    rays, groups = rays_into(window, 100), torch.randint(-1, 30, window.mpis.density.shape, generator=g).int()
-    if dispatch.form_of("spread_baked", torch.zeros(1)) != "cpu":
-        pytest.skip("no C++ compiler")
-    changes = torch.randn(100, 3, generator=g)
-    compiled, plain = (spread(form, window, rays, changes, groups) for form in ("cpu", "reference"))
-    assert (plain[:, 0] > 0).all()
-    torch.testing.assert_close(compiled, plain, atol=5e-3, rtol=0.02)
-
-
 def test_columns_find_every_brick():
     """Numbers and places of bricks survive the way through columns, beyond 32 planes and with the sign bit set."""
     window = random_window(num_mpis=1, planes=65, stored=0.7)

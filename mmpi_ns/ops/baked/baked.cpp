@@ -247,39 +247,4 @@ void mmpi_march_baked(const Scene* scene, const float* origins, const float* dir
         winner[ray] = std::max_element(votes.begin(), votes.end()) - votes.begin();
     }
 }
-
-// Adds what rays [begin, end) show at their samples to the groups of the texels that these read. With b = (1, direction)
-// and t the sample's colour with its odds changed as its ray's are, a group has 22 sums over weights: the ten products of
-// b with itself (the diagonal's and those above it, row by row), then b times t_red, t_green, t_blue for each b.
-void mmpi_spread_baked(const Scene* scene, const float* origins, const float* directions, const float* nears,
-                       const float* fars, float threshold, int64_t begin, int64_t end, const float* changes,
-                       const int32_t* groups, float* moments) {
-    const Rays rays{origins, directions, nears, fars};
-    Marcher marcher(*scene, threshold, nullptr);
-    const Lanes low = load(scene->low), step = load(scene->step);
-    for (int64_t ray = begin; ray < end; ray++) {
-        marcher.march(rays, ray);
-        const float* d = directions + 3 * ray;
-        const float b[4] = {1, d[0], d[1], d[2]};
-        float factor[COLORS];
-        for (int c = 0; c < COLORS; c++) factor[c] = std::exp(-changes[COLORS * ray + c]);
-        for (int64_t s = 0; s < marcher.count; s++) {
-            const Seen& sample = marcher.seen[s];
-            const Lanes color = colors(*scene, sample, low, step);
-            const float fx = sample.fx, fy = sample.fy;
-            const float shares[4] = {(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy};
-            for (int corner = 0; corner < 4; corner++) {
-                const int32_t group = groups[sample.texel + CORNERS[corner]];
-                if (group < 0) continue;
-                const float weight = sample.weight * shares[corner];
-                float* sum = moments + int64_t(group) * 22;
-                for (int i = 0; i < 4; i++)
-                    for (int j = i; j < 4; j++) *sum++ += weight * b[i] * b[j];
-                for (int i = 0; i < 4; i++)
-                    for (int c = 0; c < COLORS; c++)
-                        *sum++ += weight * b[i] * color[c] / (color[c] + (1 - color[c]) * factor[c]);
-            }
-        }
-    }
-}
 }

@@ -86,23 +86,6 @@ def march_baked(
     return Gathered(sums, mass, passing, inverse_t, winner)
 
 
-def spread_baked(
-    scene: BakedMpis,
-    origins: Tensor,
-    directions: Tensor,
-    nears: Tensor,
-    fars: Tensor,
-    threshold: float,
-    changes: Tensor,
-    groups: Tensor,
-    moments: Tensor,
-) -> None:
-    """See ``ops.baked``."""
-    given = [x.contiguous() for x in (origins, directions, nears, fars)]
-    before, after = (_packed(scene), *given, float(threshold)), (changes.contiguous(), groups.contiguous(), moments)
-    call_in_parts("mmpi_spread_baked", len(origins), before, after, max(len(origins), 1))  # all add to the same sums
-
-
 def _packed(scene: BakedMpis) -> Any:
     """A scene as the kernels take it, made once."""
     if "cpu" not in scene.packed:

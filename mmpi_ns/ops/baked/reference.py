@@ -74,32 +74,6 @@ def march_baked(
     )
 
 
-def spread_baked(
-    scene: BakedMpis,
-    origins: Tensor,
-    directions: Tensor,
-    nears: Tensor,
-    fars: Tensor,
-    threshold: float,
-    changes: Tensor,
-    groups: Tensor,
-    moments: Tensor,
-) -> None:
-    """See ``ops.baked``."""
-    samples = _samples(scene, origins, directions, nears, fars)
-    color = samples.colors[..., :COLORS]
-    shown = color / (color + (1 - color) * torch.exp(-changes)[:, None])
-    basis = torch.cat([torch.ones_like(directions[:, :1]), directions], -1)
-    row, column = torch.triu_indices(4, 4)
-    squares = (basis[:, row] * basis[:, column])[:, None].expand(*shown.shape[:2], -1)
-    each = torch.cat([squares, (basis[:, None, :, None] * shown[:, :, None]).flatten(2)], -1)
-    weights = torch.where(samples.weights > threshold, samples.weights, 0.0)[..., None] * samples.shares
-    group = groups.view(-1)[samples.taps].to(torch.int64)
-    used = (group >= 0) & (weights > 0)
-    ray, sample, _ = used.nonzero().unbind(-1)
-    moments.index_add_(0, group[used], (weights[used][:, None] * each[ray, sample]).to(moments))
-
-
 def _samples(scene: BakedMpis, origins: Tensor, directions: Tensor, nears: Tensor, fars: Tensor) -> _Samples:
     if scene.num_bricks == 0:
         none = origins.new_zeros(len(origins), 1)

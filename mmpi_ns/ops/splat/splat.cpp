@@ -1,0 +1,106 @@
+// Gaussians seen by a camera (reference.py): projected, sorted by depth, and laid over each other front to back.
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <numeric>
+#include <vector>
+
+namespace {
+
+constexpr float BLUR = 0.3f, FAINTEST = 1.0f / 255, STRONGEST = 0.99f, OPAQUE = 1e-4f, NEAREST = 0.01f, ASIDE = 1.3f;
+
+struct View {
+    float to_world[3][4]; // from camera axes: x right, y up, looking along -z
+    float fx, fy, cx, cy;
+    int32_t width, height;
+};
+
+// A Gaussian in the image: its middle, the inverse of its covariance, and the pixels that it reaches.
+struct Seen {
+    float z, u, v, a, b, c, alpha;
+    int32_t left, right, top, bottom, index;
+};
+
+float within(float x, float limit) { return std::min(std::max(x, -limit), limit); }
+
+// False where it is not seen.
+bool project(const View& view, const float* mean, const float* covariance, float alpha, Seen& seen) {
+    float at[3] = {0, 0, 0}, axes[3][3]; // rows: right, down, ahead
+    for (int i = 0; i < 3; i++)
+        for (int j = 0; j < 3; j++) {
+            axes[i][j] = (i ? -1 : 1) * view.to_world[j][i];
+            at[i] += axes[i][j] * (mean[j] - view.to_world[j][3]);
+        }
+    const float z = at[2];
+    if (!(z > NEAREST) || alpha < FAINTEST) return false;
+    const float tx = within(at[0] / z, ASIDE * float(view.width) / (2 * view.fx));
+    const float ty = within(at[1] / z, ASIDE * float(view.height) / (2 * view.fy));
+    float bend[2][3], half[2][3];
+    for (int j = 0; j < 3; j++) {
+        bend[0][j] = view.fx / z * (axes[0][j] - tx * axes[2][j]);
+        bend[1][j] = view.fy / z * (axes[1][j] - ty * axes[2][j]);
+    }
+    for (int i = 0; i < 2; i++)
+        for (int j = 0; j < 3; j++)
+            half[i][j] = bend[i][0] * covariance[j] + bend[i][1] * covariance[3 + j] + bend[i][2] * covariance[6 + j];
+    const auto spread = [&](int i, int j) {
+        return half[i][0] * bend[j][0] + half[i][1] * bend[j][1] + half[i][2] * bend[j][2];
+    };
+    const float xx = spread(0, 0) + BLUR, xy = spread(0, 1), yy = spread(1, 1) + BLUR, area = xx * yy - xy * xy;
+    const float u = view.fx * at[0] / z + view.cx, v = view.fy * at[1] / z + view.cy;
+    const float reach = std::sqrt(2 * std::log(alpha / FAINTEST)), wide = reach * std::sqrt(xx), high = reach * std::sqrt(yy);
+    if (!(u + wide > 0 && u - wide < float(view.width) && v + high > 0 && v - high < float(view.height))) return false;
+    seen = {z, u, v, yy / area, -xy / area, xx / area, alpha, 0, 0, 0, 0, 0};
+    seen.left = std::max(0, int32_t(std::ceil(u - wide - 0.5f)));
+    seen.right = std::min(view.width - 1, int32_t(std::floor(u + wide - 0.5f)));
+    seen.top = std::max(0, int32_t(std::ceil(v - high - 0.5f)));
+    seen.bottom = std::min(view.height - 1, int32_t(std::floor(v + high - 0.5f)));
+    return true;
+}
+
+} // namespace
+
+extern "C" {
+
+// Either an image [height, width, 4] of colours and passing light from `colors`, or, where `errors` [height, width, 3] is
+// given, the sums [count, 4] over pixels of each Gaussian's weight times (error, 1).
+void mmpi_splat(const View* view, int64_t count, const float* means, const float* covariances, const float* alphas,
+                const float* colors, float* image, const float* errors, float* sums) {
+    std::vector<Seen> seen;
+    for (int64_t i = 0; i < count; i++) {
+        Seen one;
+        if (!project(*view, means + 3 * i, covariances + 9 * i, alphas[i], one)) continue;
+        one.index = int32_t(i);
+        seen.push_back(one);
+    }
+    std::stable_sort(seen.begin(), seen.end(), [](const Seen& a, const Seen& b) { return a.z < b.z; });
+    const int64_t pixels = int64_t(view->width) * view->height;
+    std::vector<float> light(pixels, 1.0f); // negative once a pixel is done
+    for (const Seen& one : seen) {
+        float sum[4] = {0, 0, 0, 0};
+        for (int32_t row = one.top; row <= one.bottom; row++) {
+            const float dy = float(row) + 0.5f - one.v;
+            for (int32_t column = one.left; column <= one.right; column++) {
+                const int64_t pixel = int64_t(row) * view->width + column;
+                if (light[pixel] < 0) continue;
+                const float dx = float(column) + 0.5f - one.u;
+                const float power = 0.5f * (one.a * dx * dx + one.c * dy * dy) + one.b * dx * dy;
+                const float alpha = std::min(STRONGEST, one.alpha * std::exp(-power));
+                if (alpha < FAINTEST) continue;
+                const float after = light[pixel] * (1 - alpha), weight = light[pixel] * alpha;
+                light[pixel] = after > OPAQUE ? after : -light[pixel];
+                if (after <= OPAQUE) continue;
+                if (errors)
+                    for (int c = 0; c < 3; c++) sum[c] += weight * errors[3 * pixel + c];
+                else
+                    for (int c = 0; c < 3; c++) image[4 * pixel + c] += weight * colors[3 * int64_t(one.index) + c];
+                sum[3] += weight;
+            }
+        }
+        if (errors)
+            for (int c = 0; c < 4; c++) sums[4 * int64_t(one.index) + c] += sum[c];
+    }
+    if (!errors)
+        for (int64_t p = 0; p < pixels; p++) image[4 * p + 3] = std::fabs(light[p]);
+}
+}

@@ -1,0 +1,117 @@
+"""Splats: the file's layout, where a plane's splats lie, merging, and the fit of their colours."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from random_bricks import random_window, scene_of
+
+from mmpi_ns.export import splats
+from mmpi_ns.export.files import Pose
+from mmpi_ns.ops.splat.reference import View, splat_image
+
+
+@pytest.fixture(scope="module")
+def window():
+    """Everything is stored, one colour in each brick; the nearest planes are opaque."""
+    found = random_window(num_mpis=1, planes=8, stored=1.0, density=(200, 255), seed=3)
+    for table in (found.mpis.density, found.mpis.texels):
+        table[:] = table[:, :1, :1]
+    return found
+
+
+def cameras(window):
+    return scene_of(window).path
+
+
+def read(path):
+    """The columns of a file as a viewer finds them, by name."""
+    data = path.read_bytes()
+    end = data.index(b"end_header\n") + len(b"end_header\n")
+    lines = data[:end].decode().splitlines()
+    assert lines[:2] == ["ply", "format binary_little_endian 1.0"]
+    names = [line.split()[2] for line in lines if line.startswith("property float ")]
+    table = np.frombuffer(data[end:], "<f4").reshape(-1, len(names))
+    assert f"element vertex {len(table)}" in lines
+    return dict(zip(names, table.T, strict=True))
+
+
+def test_the_file_is_what_viewers_read(tmp_path):
+    """Positions, logarithms of scales, w x y z, logits of opacity, and harmonics channel by channel."""
+    g = torch.Generator().manual_seed(0)
+    given = splats.Splats(
+        torch.randn(5, 3, generator=g), torch.rand(5, 3, generator=g) + 0.1,
+        torch.nn.functional.normalize(torch.randn(5, 4, generator=g), dim=-1),
+        torch.rand(5, generator=g) * 0.9 + 0.05, torch.rand(5, 4, 3, generator=g),
+    )  # fmt: skip
+    size = splats.write_ply(given, tmp_path / "scene.ply")
+    assert size == (tmp_path / "scene.ply").stat().st_size
+    found = read(tmp_path / "scene.ply")
+    column = lambda *names: np.stack([found[n] for n in names], -1)  # noqa: E731
+    np.testing.assert_array_equal(column("x", "y", "z"), given.means)
+    np.testing.assert_allclose(np.exp(column("scale_0", "scale_1", "scale_2")), given.scales, rtol=1e-5)
+    np.testing.assert_array_equal(column("rot_0", "rot_1", "rot_2", "rot_3"), given.rotations)
+    np.testing.assert_allclose(1 / (1 + np.exp(-found["opacity"])), given.alphas, rtol=1e-4)
+    x, y, z = d = np.array([0.6, 0.0, 0.8])
+    basis = 0.4886025119029199 * np.array([-y, z, -x])
+    for c in range(3):
+        rest = column(*(f"f_rest_{3 * c + i}" for i in range(3)))
+        shown = 0.5 + 0.28209479177387814 * found[f"f_dc_{c}"] + rest @ basis
+        np.testing.assert_allclose(shown, given.colors[:, 0, c] + given.colors[:, 1:, c].numpy() @ d, atol=1e-5)
+
+
+def test_a_splat_lies_in_its_plane_where_its_texel_is(window):
+    """At every texel's place, flat along the MPI's axis, and as wide as the texels are apart."""
+    made = splats.splats_of(window, cameras(window), 0.0, 10**6, rounds=0)
+    (mpi,) = window.mpis.mpis
+    local = (made.means - torch.tensor(mpi.origin)) @ torch.tensor(mpi.axes).T
+    plane = ((1 / local[:, 2] - mpi.last_disparity) / mpi.disparity_step).numpy()
+    finite = plane > 0.5
+    np.testing.assert_allclose(plane[finite], plane[finite].round(), atol=1e-3)
+    u0, u1, v0, v1 = mpi.extent
+    x, y = (local[:, 0] / local[:, 2] - u0) / (u1 - u0), (local[:, 1] / local[:, 2] - v0) / (v1 - v0)
+    half_texels = 2 * torch.stack([x * (mpi.width - 1), y * (mpi.height - 1)], -1)
+    np.testing.assert_allclose(half_texels, half_texels.round(), atol=5e-3)  # merged ones lie between texels
+    thin = made.gaussians.covariances @ torch.tensor(mpi.axes)[2]
+    assert (thin.norm(dim=-1) < 1e-3 * made.gaussians.covariances.flatten(1).norm(dim=-1)).all()
+
+
+def test_neighbours_that_agree_become_one(window):
+    many = splats.splats_of(replace(window), cameras(window), 0.0, 10**6, rounds=0)
+    texels = splats._texels(window, torch.ones(window.mpis.density.shape))
+    assert len(texels.places.unique(dim=0)) == len(texels.places) > 1.5 * len(many.means)
+    group, level = splats._merged(texels, torch.ones(len(texels.places), dtype=torch.bool))
+    assert level.max() > 0 and torch.bincount(group).max() == 4 ** int(level.max())
+    few = splats.splats_of(window, cameras(window), 0.0, 50, rounds=0)
+    assert len(few.means) == 50
+
+
+def test_fitted_colours_come_closer_to_the_window(window):
+    """Each round brings images of the splats closer to those of the bricks, also from between the cameras."""
+    poses = cameras(window)
+    start = splats.splats_of(window, poses, 0.0, 10**6, rounds=0)
+    end = splats.splats_of(window, poses, 0.0, 10**6, rounds=4)
+
+    def error(made, pose):
+        view = View(torch.tensor(pose.to_world).float(), pose.size, pose.focal, pose.center)
+        rays = splats._reach(window, pose)
+        shown = splat_image(made.gaussians, view, made.seen_from(view.to_world[:, 3]))
+        target = window.render(*rays, torch.full((3,), 0.5))["rgb"].view(*shown.shape[:2], 3)
+        return float((shown[..., :3] + 0.5 * shown[..., 3:] - target).square().mean())
+
+    (middle,) = splats.between(poses[:1] + poses[1:], 0.4)[:1]
+    small: Pose = replace(middle, size=(24, 16), focal=(20.0, 20.0), center=(12.0, 8.0))
+    assert error(end, small) < 0.5 * error(start, small)
+    assert error(end, small) < 0.01
+
+
+def test_cameras_between_two_lie_between_them():
+    a = Pose([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]], (4, 4), (4, 4), (2, 2))
+    b = replace(a, to_world=[[0, 0, 1, 2], [0, 1, 0, 0], [-1, 0, 0, 0]])  # a quarter turn to the left
+    made, last = splats.between([a, b], 0.5)
+    half = 0.5**0.5
+    np.testing.assert_allclose(made.to_world, [[half, 0, half, 1], [0, 1, 0, 0], [-half, 0, half, 0]], atol=1e-9)
+    np.testing.assert_allclose(last.to_world, b.to_world, atol=1e-9)

@@ -1,0 +1,88 @@
+"""Gaussians seen by a camera: compiled and plain against a renderer in float64 that goes pixel by pixel."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from mmpi_ns.ops import dispatch
+from mmpi_ns.ops.splat import cpu, reference
+from mmpi_ns.ops.splat.reference import Gaussians, View
+
+FORMS = {"reference": reference, "cpu": cpu}
+VIEW = View(
+    torch.eye(4)[:3] + torch.tensor([[0, 0, 0, 0.3], [0, 0, 0, -0.2], [0, 0, 0, 1.0]]),
+    (19, 13),
+    (15.0, 14.0),
+    (8.2, 7.1),
+)
+
+
+def some(count=60, seed=0):
+    """Gaussians before, beside and behind the camera, flat and round, faint and opaque."""
+    g = torch.Generator().manual_seed(seed)
+    means = torch.rand(count, 3, generator=g) * torch.tensor([6.0, 5.0, 8.0]) - torch.tensor([3.0, 2.5, 6.5])
+    half = torch.randn(count, 3, 3, generator=g) * torch.tensor([0.3, 0.2, 0.002])
+    alphas = torch.rand(count, generator=g)
+    alphas[:3] = torch.tensor([0.0, 1 / 300, 1.0])
+    return Gaussians(means, half @ half.mT, alphas), torch.rand(count, 3, generator=g)
+
+
+def by_hand(gaussians, view, colors):
+    """The image and each Gaussian's weights, one pixel and one Gaussian after the other. [H, W, 4], [H, W, N]"""
+    to_world = view.to_world.double().numpy()
+    width, height = view.size
+    image, weights = np.zeros((height, width, 4)), np.zeros((height, width, len(colors)))
+    seen = []
+    for i, (mean, covariance) in enumerate(zip(*(x.double().numpy() for x in gaussians[:2]), strict=True)):
+        right, up, back = (to_world[:, :3].T @ (mean - to_world[:, 3])).tolist()
+        x, y, z = right, -up, -back
+        if z <= 0.01:
+            continue
+        axes = np.stack([to_world[:, 0], -to_world[:, 1], -to_world[:, 2]])
+        tx = min(max(x / z, -1.3 * width / 2 / view.focal[0]), 1.3 * width / 2 / view.focal[0])
+        ty = min(max(y / z, -1.3 * height / 2 / view.focal[1]), 1.3 * height / 2 / view.focal[1])
+        bend = np.array([[view.focal[0], 0, -view.focal[0] * tx], [0, view.focal[1], -view.focal[1] * ty]]) / z @ axes
+        middle = view.focal[0] * x / z + view.center[0], view.focal[1] * y / z + view.center[1]
+        seen.append((z, i, middle, np.linalg.inv(bend @ covariance @ bend.T + 0.3 * np.eye(2))))
+    for row in range(height):
+        for column in range(width):
+            light = 1.0
+            for _, i, (u, v), inverse in sorted(seen, key=lambda s: s[0]):
+                away = np.array([column + 0.5 - u, row + 0.5 - v])
+                alpha = min(0.99, float(gaussians.alphas[i]) * math.exp(-0.5 * away @ inverse @ away))
+                if alpha < 1 / 255:
+                    continue
+                if light * (1 - alpha) <= 1e-4:
+                    break
+                weights[row, column, i] = light * alpha
+                light *= 1 - alpha
+            image[row, column, :3] = weights[row, column] @ colors.double().numpy()
+            image[row, column, 3] = light
+    return image, weights
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("seed", range(3))
+def test_agrees_with_the_hand_made_renderer(form, seed):
+    if form == "cpu" and dispatch.form_of("splat_image", torch.zeros(1)) != "cpu":
+        pytest.skip("no C++ compiler")
+    gaussians, colors = some(seed=seed)
+    expected, weights = by_hand(gaussians, VIEW, colors)
+    assert (weights.sum(-1) > 0.5).any() and (expected[..., 3] > 0.5).any()
+    image = FORMS[form].splat_image(gaussians, VIEW, colors).numpy()
+    np.testing.assert_allclose(image, expected, atol=5e-3)  # an alpha at its least to the last bit may count or not
+    errors = torch.randn(*expected.shape[:2], 3, generator=torch.Generator().manual_seed(seed))
+    sums = FORMS[form].splat_sums(gaussians, VIEW, errors).numpy()
+    np.testing.assert_allclose(sums[:, :3], np.einsum("hwn,hwc->nc", weights, errors.numpy()), atol=0.03)
+    np.testing.assert_allclose(sums[:, 3], weights.sum((0, 1)), atol=0.03)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_no_gaussians_show_nothing(form):
+    gaussians = Gaussians(torch.zeros(0, 3), torch.zeros(0, 3, 3), torch.zeros(0))
+    image = FORMS[form].splat_image(gaussians, VIEW, torch.zeros(0, 3))
+    assert (image[..., :3] == 0).all() and (image[..., 3] == 1).all()
