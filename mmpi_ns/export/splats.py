@@ -41,8 +41,8 @@ DENSER = 1.25
 """Factor on optical depths."""
 FRACTIONS = (0.0, 0.5, 0.25, 0.75)
 """Of the way from one camera to the next: where colours are fitted, round by round."""
-ROUNDS = 8
-STEP = 1.7
+ROUNDS = 4
+STEP = 1.5
 """Of a round: more than 1 arrives sooner."""
 STEADY = 0.02
 """Weight, as a share of a splat's, by which its colour is held to be the same from everywhere."""
