@@ -18,7 +18,6 @@ from mmpi_ns.training.losses import LossWeights
 from mmpi_ns.training.touched_adam import TouchedAdamConfig
 from mmpi_ns.training.trainer import MMPITrainerConfig
 
-
 PAPER_DATA = {"keypoint_rays": 0, "dense_depth": False, "depth_images": False, "new_view_share": 0.0}
 """The paper trains on the colours of pixels alone."""
 

@@ -153,7 +153,9 @@ def test_phases_without_steps_are_left_out():
 
 @pytest.mark.parametrize("training", ["two-phase", "joint"])
 def test_schedule_survives_json(training):
-    schedule = make_schedule(training, 1234, decay_decades=0.7, decay_from=0.25, finetune_rate=0.2, release_shares=(0.5, 0.9))
+    schedule = make_schedule(
+        training, 1234, decay_decades=0.7, decay_from=0.25, finetune_rate=0.2, release_shares=(0.5, 0.9)
+    )
     assert Schedule.from_json(schedule.to_json()) == schedule
     assert hash(Schedule.from_json(schedule.to_json())) == hash(schedule)
 
