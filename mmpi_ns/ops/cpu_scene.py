@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Sequence
 
 import torch
+from torch import Tensor
 
 from mmpi_ns.ops.build import address, arguments
 from mmpi_ns.ops.layout import SceneLayout, Tables
@@ -24,6 +26,19 @@ class Grid(ctypes.Structure):
     def of(grid: TexelGrid, bias: int = 0) -> Grid:
         numbers = (grid.depth, grid.height, grid.width, grid.down, grid.across, grid.first_tile)
         return Grid(*numbers, address(grid.tiles, torch.int32), bias)
+
+
+class Layer(ctypes.Structure):
+    """Of a small network (``cpp/layers.h``)."""
+
+    _fields_ = [(n, ctypes.c_int64) for n in ("outputs", "inputs")] + [
+        (n, ctypes.c_void_p) for n in ("weights", "biases")
+    ]
+
+    @staticmethod
+    def array(pairs: Sequence[tuple[Tensor, Tensor]]) -> ctypes.Array:
+        """Weights and biases, which must outlive it."""
+        return (Layer * len(pairs))(*(Layer(*w.shape, *arguments((w, b))) for w, b in pairs))
 
 
 class SceneTables(ctypes.Structure):

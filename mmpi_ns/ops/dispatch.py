@@ -35,7 +35,6 @@ TABLE: dict[str, tuple[str, tuple[Form, ...]]] = {
     "raise_peaks": ("interpolate", ("cpu",)),
     "sum_rows": ("interpolate", ("cpu", "gpu")),
     "composite_weights": ("composite", ("cpu", "gpu")),
-    "gather_colors": ("composite", ("cpu",)),
     "median_inverse_distance": ("composite", ("cpu",)),
     "winning_heads": ("composite", ("cpu",)),
     "total_variation": ("variation", ("cpu", "gpu")),

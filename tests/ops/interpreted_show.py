@@ -46,9 +46,9 @@ def test_rays_show_what_the_reference_says(monkeypatch, form, threshold):
 
 
 def test_thin_scenes_with_gaps_and_shares_at_texels_show_what_the_reference_says(monkeypatch):
-    monkeypatch.setattr(gpu, "block_size", lambda wanted, device: wanted)  # several programs, of different lengths
+    monkeypatch.setattr(gpu, "block_size", lambda wanted, device: 16)  # two programs, of different lengths
     field = bricked_field(0.4)
-    rays = bundle(*random_rays(field.plan, 40, seed=1))
+    rays = bundle(*random_rays(field.plan, 27, seed=1))
     wanted = compare(field, rays, 1e-3)
     assert (wanted.transmittance > 0.1).any()
     compare(field, rays, 1e-3, "paper", torch.rand(len(field.density), 1, generator=torch.Generator().manual_seed(1)))

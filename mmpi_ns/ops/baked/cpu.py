@@ -11,6 +11,7 @@ from torch.nn.functional import pad
 
 from mmpi_ns.ops.baked.reference import Gathered
 from mmpi_ns.ops.build import arguments, call_in_parts
+from mmpi_ns.ops.cpu_scene import Layer
 from mmpi_ns.ops.gather import COLORS
 from mmpi_ns.scene.baked import MOST_CHANNELS, BakedMpis, Shader, tiles_of
 
@@ -29,13 +30,6 @@ class _Scene(ctypes.Structure):
     _fields_ = [
         *((n, ctypes.c_int64) for n in ("num_heads", "channels")),
         *((n, ctypes.c_void_p) for n in ("heads", "columns", "density", "texels", "low", "step")),
-    ]
-
-
-class _Layer(ctypes.Structure):
-    _fields_ = [
-        *((n, ctypes.c_int64) for n in ("outputs", "inputs")),
-        *((n, ctypes.c_void_p) for n in ("weights", "biases")),
     ]
 
 
@@ -95,9 +89,8 @@ def _packed(scene: BakedMpis) -> Any:
 
 def shade_baked(shader: Shader, sums: Tensor, mass: Tensor, directions: Tensor) -> Tensor:
     """See ``ops.baked``."""
-    numbers = [[x.contiguous() for x in layer] for layer in shader.layers]  # alive until the kernel has run
-    layers = (_Layer * len(numbers))(*(_Layer(*w.shape, *arguments((w, b))) for w, b in numbers))
+    numbers = [(w.contiguous(), b.contiguous()) for w, b in shader.layers]  # alive until the kernel has run
     given, rgb = [x.contiguous() for x in (sums, mass, directions)], torch.empty(len(sums), 3)
     sizes = (len(numbers), sums.shape[-1], shader.direction_octaves, float(shader.bound))
-    call_in_parts("mmpi_shade_baked", len(sums), (layers, *sizes, *given), (rgb,))
+    call_in_parts("mmpi_shade_baked", len(sums), (Layer.array(numbers), *sizes, *given), (rgb,))
     return rgb

@@ -7,7 +7,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mmpi_ns.ops import dispatch
-from mmpi_ns.ops.composite.reference import Composite, fill_up
+from mmpi_ns.ops.composite.reference import Composite, render_colors
+
+__all__ = ["Composite", "composite_weights", "median_inverse_distance", "render_colors", "winning_heads"]
 
 
 def composite_weights(
@@ -30,11 +32,6 @@ def composite_weights(
     Source: paper eq. (rendering) and its blended form in sec. III-C.
     """
     return dispatch.run("composite_weights", tau, valid, skipped_before, skipped_total)
-
-
-def render_colors(composite: Composite, colors: Float[Tensor, "R S 3"]) -> Float[Tensor, "R 3"]:
-    """Colour gathered along each ray, without background, with gradients to weights and colours."""
-    return fill_up(composite, dispatch.run("gather_colors", composite.weights, colors))
 
 
 @torch.no_grad()

@@ -1,4 +1,4 @@
-// Rendering weights of rays and the colours that they gather, with their gradients. References in compositing.py.
+// Rendering weights of rays with their gradients; median distances and winners. The reference is reference.py.
 #include "lanes.h"
 
 #include <algorithm>
@@ -79,31 +79,6 @@ void mmpi_composite_back(const float* tau, const bool* valid, const float* skipp
             if (valid[i]) behind += grad_weights[i] * weights[i];
         }
     }
-}
-
-// Sums of weights [R, S] times colours [R, S, 3] of rays [begin, end).
-void mmpi_gather_colors(const float* weights, const float* colors, int64_t begin, int64_t end, int64_t slots,
-                        float* sums) {
-    for (int64_t r = begin; r < end; r++) {
-        float sum[3] = {};
-        for (int64_t i = r * slots; i < (r + 1) * slots; i++)
-            for (int a = 0; a < 3; a++) sum[a] += weights[i] * colors[3 * i + a];
-        for (int a = 0; a < 3; a++) sums[3 * r + a] = sum[a];
-    }
-}
-
-// The gradients of both from that of the sums.
-void mmpi_gather_colors_back(const float* weights, const float* colors, const float* grad, int64_t begin, int64_t end,
-                             int64_t slots, float* grad_weights, float* grad_colors) {
-    for (int64_t r = begin; r < end; r++)
-        for (int64_t i = r * slots; i < (r + 1) * slots; i++) {
-            float sum = 0;
-            for (int a = 0; a < 3; a++) {
-                sum += grad[3 * r + a] * colors[3 * i + a];
-                grad_colors[3 * i + a] = grad[3 * r + a] * weights[i];
-            }
-            grad_weights[i] = sum;
-        }
 }
 
 // Inverse distance of the sample at which each of rays [begin, end) has gathered half of what it gathers, or 0.

@@ -27,31 +27,10 @@ class _Weights(torch.autograd.Function):
         return grad, None, None, None
 
 
-class _GatheredColors(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, weights: Tensor, colors: Tensor) -> Tensor:
-        sums = torch.empty(len(weights), 3)
-        call_in_parts("mmpi_gather_colors", len(weights), (weights, colors), (weights.shape[1], sums))
-        ctx.save_for_backward(weights, colors)
-        return sums
-
-    @staticmethod
-    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor, Tensor]:
-        weights, colors = ctx.saved_tensors
-        given, grads = (weights, colors, grad_outputs[0].contiguous()), [torch.empty_like(x) for x in (weights, colors)]
-        call_in_parts("mmpi_gather_colors_back", len(weights), given, (weights.shape[1], *grads))
-        return tuple(grads)  # type: ignore[return-value]
-
-
 def composite_weights(tau: Tensor, valid: Tensor, skipped_before: Tensor, skipped_total: Tensor) -> Composite:
     """See ``ops.composite``."""
     weights, depth = _Weights.apply(*(x.contiguous() for x in (tau, valid, skipped_before, skipped_total)))  # type: ignore[misc]
     return Composite(weights, -torch.expm1(-depth), torch.exp(-depth))
-
-
-def gather_colors(weights: Tensor, colors: Tensor) -> Tensor:
-    """See ``ops.composite.reference``."""
-    return _GatheredColors.apply(weights.contiguous(), colors.contiguous())  # type: ignore[no-any-return]
 
 
 def median_inverse_distance(weights: Tensor, inverse_t: Tensor, valid: Tensor) -> Tensor:

@@ -46,22 +46,15 @@ def composite_weights(
     return Composite(weights, -torch.expm1(-depth), torch.exp(-depth))
 
 
-def gather_colors(weights: Float[Tensor, "R S"], colors: Float[Tensor, "R S 3"]) -> Float[Tensor, "R 3"]:
-    """Sum of weights times colours along each ray."""
-    return (weights[..., None] * colors).sum(-2)
-
-
 def render_colors(composite: Composite, colors: Float[Tensor, "R S 3"]) -> Float[Tensor, "R 3"]:
-    """See ``ops.composite``."""
-    return fill_up(composite, gather_colors(composite.weights, colors))
+    """Colour gathered along each ray, without background, with gradients to weights and colours.
 
-
-def fill_up(composite: Composite, gathered: Float[Tensor, "R 3"]) -> Float[Tensor, "R 3"]:
-    """Colour of rays whose kept samples have gathered this: the mass of the dropped ones is given the mean colour of
-    those (a constant factor per ray), so that dropping does not darken the image."""
+    The mass of the dropped samples is given the mean colour of those kept (a constant factor per ray), so that dropping
+    does not darken the image.
+    """
     kept = composite.weights.sum(-1, keepdim=True)
     factor = torch.where(kept > 1e-6, composite.accumulation / kept.clamp(min=1e-6), torch.ones_like(kept))
-    return factor.detach() * gathered
+    return factor.detach() * (composite.weights[..., None] * colors).sum(-2)
 
 
 def median_inverse_distance(

@@ -1,20 +1,11 @@
 // What rays gather of the texels along them, and its gradients. References in ops/gather/reference.py.
-#include "scene.h"
-#include "table.h"
+#include "taps.h"
 
 #include <vector>
 
 namespace {
 
 constexpr int COLORS = 3; // channels that are colours; the others are features
-
-// What a sample reads, and what it weighs.
-struct Sample {
-    int64_t rows[8];
-    float shares[8];
-    int taps;
-    float weight;
-};
 
 // Taps of samples that are known: those of planes first, then those of the cube.
 struct Taps {
@@ -33,13 +24,6 @@ inline Texel activate(Lanes raw, int64_t first) {
     const Lanes share = 1.0f / (1.0f + exp_lanes(is_color ? -raw : -2.0f * raw));
     const Lanes rest = share * (1.0f - share), value = is_color ? share : 2.0f * share - 1.0f;
     return {raw == raw ? value : raw, is_color ? rest : 4.0f * rest};
-}
-
-inline Lanes interpolate(const Table& table, const Sample& sample, int64_t first) {
-    Lanes sum{};
-    for (int tap = 0; tap < sample.taps; tap++)
-        sum += sample.shares[tap] * table.read(sample.rows[tap] * table.channels + first);
-    return sum;
 }
 
 // Sums over a ray's samples: weight times what their texels hold, weight, weight times squared colour.
@@ -67,22 +51,12 @@ void gather_rays(const Table& table, int64_t begin, int64_t end, const Find& fin
         std::vector<Sample>& found = samples[ray & 1];
         found.clear();
         find(ray, found);
-        for (const Sample& sample : found)
-            for (int tap = 0; tap < sample.taps; tap++) table.prefetch(sample.rows[tap]);
+        for (const Sample& sample : found) prefetch(table, sample);
     };
     if (begin < end) prepare(begin);
     for (int64_t ray = begin; ray < end; ray++) {
         if (ray + 1 < end) prepare(ray + 1);
         gather(table, samples[ray & 1], sums + ray * (table.channels + 1 + COLORS));
-    }
-}
-
-void put_plane(Sample& sample, const Grid& grid, int64_t layer, const Cell& x, const Cell& y, float share) {
-    const Corners corners(grid, layer, y.lower, x.lower);
-    for (int i = 0; i < 4; i++) {
-        sample.rows[sample.taps] = corners.row[i];
-        sample.shares[sample.taps++] =
-            (i & 1 ? x.fraction : 1 - x.fraction) * (i >> 1 ? y.fraction : 1 - y.fraction) * share;
     }
 }
 
@@ -106,18 +80,9 @@ void mmpi_gather_places(const Grid* grids, int64_t num_mpis, const float* featur
     const auto find = [&](int64_t ray, std::vector<Sample>& samples) {
         for (int64_t slot = ray * slots; slot < (ray + 1) * slots; slot++) {
             if (!valid[slot]) continue;
-            const Grid& grid = grids[heads[slot]];
-            const float* place = ndc + 3 * slot;
-            const Cell x(place[0], grid.width), y(place[1], grid.height);
             Sample sample;
-            sample.taps = 0, sample.weight = weights[slot];
-            if (heads[slot] < num_mpis) {
-                put_plane(sample, grid, planes[slot], x, y, 1);
-            } else {
-                const Cell z(place[2], grid.depth);
-                put_plane(sample, grid, z.lower, x, y, 1 - z.fraction);
-                put_plane(sample, grid, z.lower + 1, x, y, z.fraction);
-            }
+            sample.weight = weights[slot];
+            sample.put(grids[heads[slot]], heads[slot] >= num_mpis, planes[slot], ndc + 3 * slot);
             samples.push_back(sample);
         }
     };

@@ -1,0 +1,38 @@
+// The texels that a sample reads, and what they hold.
+#pragma once
+#include "scene.h"
+#include "table.h"
+
+struct Sample {
+    int64_t rows[8];
+    float shares[8];
+    int taps = 0;
+    float weight = 0;
+
+    // At a place in a head: on one of its planes, or anywhere in the cube.
+    void put(const Grid& grid, bool in_cube, int64_t plane, const float* ndc) {
+        const Cell x(ndc[0], grid.width), y(ndc[1], grid.height), z(ndc[2], grid.depth);
+        put_plane(grid, in_cube ? z.lower : plane, x, y, in_cube ? 1 - z.fraction : 1);
+        if (in_cube) put_plane(grid, z.lower + 1, x, y, z.fraction);
+    }
+
+    void put_plane(const Grid& grid, int64_t layer, const Cell& x, const Cell& y, float share) {
+        const Corners corners(grid, layer, y.lower, x.lower);
+        for (int i = 0; i < 4; i++) {
+            rows[taps] = corners.row[i];
+            shares[taps++] = (i & 1 ? x.fraction : 1 - x.fraction) * (i >> 1 ? y.fraction : 1 - y.fraction) * share;
+        }
+    }
+};
+
+inline void prefetch(const Table& table, const Sample& sample) {
+    for (int tap = 0; tap < sample.taps; tap++) table.prefetch(sample.rows[tap]);
+}
+
+// Channels from `first` on.
+inline Lanes interpolate(const Table& table, const Sample& sample, int64_t first) {
+    Lanes sum{};
+    for (int tap = 0; tap < sample.taps; tap++)
+        sum += sample.shares[tap] * table.read(sample.rows[tap] * table.channels + first);
+    return sum;
+}
