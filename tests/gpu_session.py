@@ -1,10 +1,12 @@
 """All that a machine with a GPU can tell of this project, in one call of ten minutes, without a network.
 
-    python tests/gpu_session.py --data CAPTURE --out FOLDER [--wheels FOLDER] [--seconds 590] [--rehearse]
+    python tests/gpu_session.py --data CAPTURE --out FOLDER [--wheels FOLDER] [--seconds 590]
+    python tests/gpu_session.py --rehearse --out FOLDER [--only environment quick "train mmpi" ...]
 
 What it found is written to FOLDER/session.json after every part, so that a call that is cut off loses only the part at
-hand. Wheels (of what the machine lacks) are installed into a folder of their own. ``--rehearse`` runs the same parts on
-a CPU in miniature, to see that each starts and ends.
+hand. Wheels (of what the machine lacks) are installed into a folder of their own; without pycolmap among them the
+capture's tracks are not read. ``--rehearse`` runs the same commands on a CPU in miniature, on a procedural street and
+without the packages that a bare machine lacks, to see that each starts and ends.
 """
 
 from __future__ import annotations
@@ -27,6 +29,8 @@ TRAININGS = {"mmpi": (20_000, 110), "splatfacto": (5000, 75), "nerfacto": (5000,
 """Steps, and seconds at most, of each method on the capture at full size."""
 BENCH_PARTS = ("checks", "operations", "training triton")
 """Of ``mmpi-bench gpu``; trainings to the end come after it."""
+BARE = ("pycolmap", "open3d", "pymeshlab", "wandb", "comet_ml")
+"""Packages that the machine is not expected to have."""
 TAIL = 6000
 """Characters of what a part prints that are kept."""
 
@@ -59,6 +63,19 @@ def parts(data: Path, out: Path, work: Path, rehearse: bool) -> list[Part]:
             for name, (steps, seconds) in TRAININGS.items()
         ),
     ]
+
+
+def strip(folder: Path) -> None:
+    """From now on Python finds none of the packages that a bare machine lacks."""
+    folder.mkdir()
+    lines = ("import sys", f"sys.modules.update(dict.fromkeys({BARE!r}))")
+    (folder / "sitecustomize.py").write_text("\n".join(lines), encoding="utf-8")
+    os.environ["PYTHONPATH"] = os.pathsep.join([str(folder), os.environ["PYTHONPATH"]])
+
+
+def mib(path: Path | None) -> float:
+    """What a folder takes that is carried along."""
+    return 0.0 if path is None else sum(p.stat().st_size for p in path.rglob("*") if p.is_file()) / 2**20
 
 
 def _training(name: str, steps: int, data: Path, rehearse: bool) -> list[str]:
@@ -105,19 +122,27 @@ def install(wheels: Path, site: Path) -> Part:
 def main() -> int:
     """Runs all parts; 0 where each of them did its work, or said why it cannot here."""
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    options.add_argument("--data", type=Path, required=True, help="a capture (a folder with transforms.json)")
+    options.add_argument("--data", type=Path, help="a capture (a folder with transforms.json)")
     options.add_argument("--out", type=Path, default=Path(os.environ.get("OUT", "outputs/gpu-session")))
     options.add_argument("--wheels", type=Path, help="wheels of what this machine lacks")
     options.add_argument("--seconds", type=float, default=590.0, help="for everything")
     options.add_argument("--rehearse", action="store_true", help="in miniature, on a CPU")
+    options.add_argument("--only", nargs="+", help="names of parts; all unless given")
     given = options.parse_args()
-    data, out, start = given.data.resolve(), given.out.resolve(), time.monotonic()
+    if given.data is None and not given.rehearse:
+        options.error("--data is needed: a capture to train on")
+    out, start = given.out.resolve(), time.monotonic()
     (out / "logs").mkdir(parents=True, exist_ok=True)
     work = Path(tempfile.mkdtemp(prefix="gpu-session-"))  # checkpoints are too large to bring back
+    data = (given.data or work / "gpu" / "quick-street").resolve()  # which the quick look makes
     os.environ["PYTHONPATH"] = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
-    todo = parts(data, out, work, given.rehearse)
+    if given.rehearse:
+        strip(work / "bare")
+    todo = [p for p in parts(data, out, work, given.rehearse) if given.only is None or p.name in given.only]
     if given.wheels is not None:
         todo.insert(1, install(given.wheels.resolve(), work / "site"))
+    carried = {"data": mib(given.data), "wheels": mib(given.wheels)}
+    print({name: round(size, 1) for name, size in carried.items()}, "MiB carried", flush=True)
     found: dict[str, dict[str, object]] = {}
     for part in todo:
         left = given.seconds - (time.monotonic() - start)
@@ -128,10 +153,12 @@ def main() -> int:
         found[part.name] = {"command": part.words, **said}
         for log in work.rglob("output.log"):
             shutil.copy(log, out / "logs" / f"{'-'.join(log.relative_to(work).parts[:-1])[-120:]}.log")
-        report = {"command": sys.argv, "rehearsal": given.rehearse, "wall_s": time.monotonic() - start, "parts": found}
+        report = {"command": sys.argv, "rehearsal": given.rehearse, "carried_mib": carried, "parts": found}
+        report["wall_s"] = time.monotonic() - start
         (out / "session.json").write_text(json.dumps(report, indent=1), encoding="utf-8")
         print(f"{part.name}: status {said['status']}, {said['wall_s']:.0f} s", flush=True)
     needed = [name for name in found if name != "device" or not given.rehearse]
+    shutil.rmtree(work, ignore_errors=True)
     return int(any(found[name]["status"] != 0 for name in needed))
 
 

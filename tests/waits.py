@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import traceback
 import warnings
-from collections import Counter
+from collections import Counter, defaultdict
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -95,6 +95,35 @@ def counted_on_a_cpu(monkeypatch):
             patch.setattr(torch.Tensor, name, _noted(waits, name))
         with waits:
             yield waits
+
+
+@contextmanager
+def variants_noted(monkeypatch):
+    """What a GPU would compile for the launches within, by Triton's interpreter: {kernel: different sets of types,
+    constants, and sizes and addresses that are specialised}."""
+    from triton.runtime.interpreter import InterpretedFunction
+
+    found, run = defaultdict(set), InterpretedFunction.run
+
+    def noted(self, *args, grid, warmup, **kwargs):
+        plain = self.kwargs.get("do_not_specialize") or ()
+        given = dict(zip(self.arg_names, args, strict=False))
+        key = tuple((name, _specialised(x, name in plain)) for name, x in given.items())
+        found[self.fn.__name__].add((key, tuple(kwargs.items())))
+        return run(self, *args, grid=grid, warmup=warmup, **kwargs)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(InterpretedFunction, "run", noted)
+        yield found
+
+
+def _specialised(x, plain):
+    """What of an argument a compiled kernel depends on."""
+    if isinstance(x, torch.Tensor):
+        return x.dtype, not plain and x.data_ptr() % 16 == 0
+    if type(x) is not int:
+        return type(x)
+    return abs(x) >= 2**31, not plain and (1 if x == 1 else x % 16 == 0)
 
 
 def _noted(waits, name):

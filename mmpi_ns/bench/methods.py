@@ -74,7 +74,8 @@ class Method:
             seed: of every random draw.
             device: cpu or cuda.
         """
-        words = [self.registered, *self.options, *self.camera_option, "--machine.seed", str(seed)]
+        own = (*self.options, *(no_tracks() if self.ours and not has_pycolmap() else ()))
+        words = [self.registered, *own, *self.camera_option, "--machine.seed", str(seed)]
         if rays is not None and self.batch_option is not None:
             words += [self.batch_option, str(rays)]
         words += ["--output-dir", str(folder), "--experiment-name", "run", "--timestamp", "1", "--vis", "tensorboard"]
@@ -83,6 +84,16 @@ class Method:
         words += ["--logging.profiler", "none", "--logging.local-writer.enable", "False", "--data", str(scene.data)]
         words += ["nerfstudio-data", "--downscale-factor", str(scene.downscale_factor)]
         return words + (["--load-3D-points", "True"] if self.whole_images else [])
+
+
+def has_pycolmap() -> bool:
+    """Whether a COLMAP model can be read, and features be triangulated."""
+    return importlib.util.find_spec("pycolmap") is not None
+
+
+def no_tracks() -> tuple[str, ...]:
+    """Options of our methods that leave pycolmap out: points are looked for by a plane sweep."""
+    return ("--pipeline.datamanager.sfm-path", "none", "--pipeline.datamanager.triangulate", "False")
 
 
 def _nerfacto_options() -> tuple[str, ...]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 import triton
@@ -88,6 +89,12 @@ def _pack_grids(layout: SceneLayout, device: torch.device) -> Int[Tensor, "N"]:
 def block_size(wanted: int, device: torch.device) -> int:
     """Rays or rows of a program. The interpreter runs one program after the other, so there the fewer the better."""
     return wanted if device.type == "cuda" else 16 * wanted
+
+
+def launch(kernel: Any, size: int, block: int, *given: Any, **constants: Any) -> None:
+    """Runs a kernel on so many things, ``block`` a program; not at all where there is nothing."""
+    if size:
+        kernel[(triton.cdiv(size, block),)](*given, **constants)
 
 
 # Texels -------------------------------------------------------------------------------------------------------------

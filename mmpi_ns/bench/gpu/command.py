@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import re
 import time
 from dataclasses import dataclass
@@ -14,7 +13,7 @@ from mmpi_ns.bench.apart import run_apart
 from mmpi_ns.bench.gpu.parts import run_part
 from mmpi_ns.bench.gpu.quick import run_quick
 from mmpi_ns.bench.gpu.report import draw, headline, markdown
-from mmpi_ns.bench.methods import METHODS, Method, Scene
+from mmpi_ns.bench.methods import METHODS, Method, Scene, has_pycolmap
 from mmpi_ns.bench.report import Bench, Report, Row
 from mmpi_ns.bench.suites import JOINT
 from mmpi_ns.bench.trainings import Request, train_apart
@@ -71,15 +70,14 @@ class Gpu(Bench):
         start, report = time.monotonic(), Report(self, key=None)
         made, rows = report.content["made"], report.rows
         data, report.content["rehearsal"] = self._scene(), self.rehearse
-        options = [] if importlib.util.find_spec("pycolmap") else ["--pipeline.datamanager.sfm-path", "none"]
         made["scene_seconds"] = time.monotonic() - start
-        made["tracks"] = "of the data set" if not options else "triangulated from images: pycolmap is not installed"
+        made["tracks"] = "of the data set" if has_pycolmap() else "none: pycolmap is not installed"
         for number, name in enumerate(self.parts):
             left = self.seconds - (time.monotonic() - start)
             share = SHARES[name] / sum(SHARES[n] for n in self.parts[number:])
             print(f"{name}: {max(0.0, left * share):.0f} s ...", flush=True)
             begin = time.monotonic()
-            found = self._part(name, data, options, left * share) if left > 0 else {"not_run": "no time was left"}
+            found = self._part(name, data, left * share) if left > 0 else {"not_run": "no time was left"}
             rows[name] = {**found, "wall_s": time.monotonic() - begin}
             head = headline(rows)
             report.finish(head, markdown(report.content, head), lambda path: draw(path, rows.get("quality", {})))
@@ -121,11 +119,11 @@ class Gpu(Bench):
             write_dataset(scene, folder, points=points, overwrite=True)
         return folder.resolve()
 
-    def _part(self, name: str, data: Path, options: list[str], seconds: float) -> Row:
+    def _part(self, name: str, data: Path, seconds: float) -> Row:
         if name == "quality":
-            return self._quality(data, options, seconds)
+            return self._quality(data, seconds)
         part, _, ops = name.partition(" ")
-        request = {"part": part, "ops": ops, "device": self._device, "rehearse": self.rehearse, "options": options}
+        request = {"part": part, "ops": ops, "device": self._device, "rehearse": self.rehearse}
         request |= {"data": str(data), "downscale_factor": self.downscale_factor, "work": str(self.folder.resolve())}
         request["seconds"] = max(5.0, seconds - 15)  # less what it takes to start
         folder = self.folder / name.replace(" ", "-")
@@ -144,14 +142,14 @@ class Gpu(Bench):
     def _cores(self) -> int:
         return 1 if self.rehearse else self.cores
 
-    def _quality(self, data: Path, options: list[str], seconds: float) -> Row:
+    def _quality(self, data: Path, seconds: float) -> Row:
         """PSNR of test views against seconds of training: ours, nerfacto and splatfacto."""
         rows: dict[str, Row] = {}
         names = ("mmpi",) if self.rehearse else tuple(PEERS)
         for number, name in enumerate(names):
             begin, method = time.monotonic(), METHODS[name]
             if method.ours:
-                method = Method(name, name, (*JOINT, *options, *(TINY if self.rehearse else ())))
+                method = Method(name, name, (*JOINT, *(TINY if self.rehearse else ())))
             reason = method.why_not()
             if reason is not None:
                 rows[name] = {"not_run": reason}

@@ -141,8 +141,6 @@ def steps_of(request: dict[str, Any], name: str, method: Method, steps: int) -> 
         torch.cuda.reset_peak_memory_stats()
     scene = Scene(Path(request["data"]), request["downscale_factor"])
     folder = Path(request["work"]) / name.replace(" ", "-")
-    more = tuple(request["options"])
-    method = Method(method.name, method.registered, (*method.options, *more))
     return Steps(method.words(scene, folder, steps, None, 0, request["device"]))
 
 

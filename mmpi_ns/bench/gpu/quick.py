@@ -12,7 +12,7 @@ from pathlib import Path
 import torch
 
 from mmpi_ns.bench.gpu.parts import drive
-from mmpi_ns.bench.methods import Method, Scene
+from mmpi_ns.bench.methods import Method, Scene, no_tracks
 from mmpi_ns.bench.report import Row, processor
 from mmpi_ns.bench.trainers import Steps
 from mmpi_ns.ops import dispatch
@@ -44,13 +44,7 @@ def try_operations(device: str) -> dict[str, str | None]:
 
 def time_training(device: str, data: Path, work: Path, rays: int) -> Row:
     """Milliseconds of a step and of a frame of a small street."""
-    options = (
-        *drive(64, rays),
-        "--pipeline.datamanager.dense-depth",
-        "False",
-        "--pipeline.datamanager.sfm-path",
-        "none",
-    )
+    options = (*drive(64, rays), "--pipeline.datamanager.dense-depth", "False", *no_tracks())
     method = Method("mmpi-small", "mmpi-small", options)
     with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of others' deprecations

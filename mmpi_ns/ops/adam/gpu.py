@@ -10,6 +10,7 @@ import triton.language as tl
 from torch import Tensor
 
 from mmpi_ns.ops.adam import reference
+from mmpi_ns.ops.gpu_scene import launch
 
 BLOCK = 1024
 """Entries of a program."""
@@ -50,8 +51,5 @@ def adam_rows(param: Tensor, moments: Tensor, rows: Tensor, grad: Tensor, consta
     """See ``ops.adam``."""
     if moments.dtype != torch.bfloat16:
         return reference.adam_rows(param, moments, rows, grad, constants)
-    if grad.numel():
-        adam_kernel[(triton.cdiv(grad.numel(), BLOCK),)](
-            rows.contiguous(), grad.contiguous(), param, moments.view(torch.int16), grad.numel(), param.shape[1],
-            *constants, BLOCK=BLOCK,
-        )  # fmt: skip
+    given, size = (rows.contiguous(), grad.contiguous(), param, moments.view(torch.int16)), grad.numel()
+    launch(adam_kernel, size, BLOCK, *given, size, param.shape[1], *constants, BLOCK=BLOCK)

@@ -12,7 +12,7 @@ import triton.language as tl
 from torch import Tensor
 
 from mmpi_ns.ops.composite.reference import Composite
-from mmpi_ns.ops.gpu_scene import block_size, one_minus_exp
+from mmpi_ns.ops.gpu_scene import block_size, launch, one_minus_exp
 
 SLOTS = 2048
 """Samples of a program: as many rays as make that many."""
@@ -61,8 +61,8 @@ def composite_backward_kernel(
 
 
 def _shape(slots: int, device: torch.device) -> tuple[int, int]:
-    """Rays and slots of a program."""
-    width = triton.next_power_of_2(max(1, slots))
+    """Rays and slots of a program; few widths, each of which is compiled."""
+    width = triton.next_power_of_2(max(16, slots))
     return max(1, block_size(SLOTS, device) // width), width  # type: ignore[return-value]
 
 
@@ -72,23 +72,18 @@ class _Weights(torch.autograd.Function):
         num_rays, slots = tau.shape
         weights, depth = torch.empty_like(tau), torch.empty_like(total)
         rays, width = _shape(slots, tau.device)
-        if num_rays:
-            composite_kernel[(triton.cdiv(num_rays, rays),)](
-                tau, valid, before, total, weights, depth, num_rays, slots, RAYS=rays, SLOTS=width
-            )
+        given = (tau, valid, before, total, weights, depth, num_rays, slots)
+        launch(composite_kernel, num_rays, rays, *given, RAYS=rays, SLOTS=width)
         ctx.save_for_backward(tau, valid, before, weights)
         return weights, depth
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor, None, None, None]:
-        tau, valid, before, weights = ctx.saved_tensors
+        tau, *_ = saved = ctx.saved_tensors
         num_rays, slots = tau.shape
         grad, (rays, width) = torch.empty_like(tau), _shape(slots, tau.device)
-        if num_rays:
-            composite_backward_kernel[(triton.cdiv(num_rays, rays),)](
-                tau, valid, before, weights, *(g.contiguous() for g in grad_outputs), grad, num_rays, slots,
-                RAYS=rays, SLOTS=width,
-            )  # fmt: skip
+        given = (*saved, *(g.contiguous() for g in grad_outputs), grad, num_rays, slots)
+        launch(composite_backward_kernel, num_rays, rays, *given, RAYS=rays, SLOTS=width)
         return grad, None, None, None
 
 

@@ -13,7 +13,7 @@ import triton.language as tl
 from torch import Tensor
 
 from mmpi_ns.ops.gather.reference import COLORS, KnownTaps, RaySums, split_sums
-from mmpi_ns.ops.gpu_scene import block_size
+from mmpi_ns.ops.gpu_scene import block_size, launch
 
 NUMBERS = 512
 """Rays, or samples, of a program, times their channels: what its registers hold."""
@@ -47,7 +47,8 @@ def read_taps(values, positions, shares, number, known, channels, column, TAPS: 
     return raw
 
 
-@triton.jit(do_not_specialize=("num_rays", "slots", "planar"))
+# Arrays that are parts of others begin anywhere, and no variant is compiled for those that happen to be aligned.
+@triton.jit(do_not_specialize=("num_rays", "slots", "planar", "cube_positions"))
 def gather_kernel(
     values, numbers, weights, positions, shares, cube_positions, cube_shares, sums, num_rays, slots, channels, planar,
     HAS_CUBE: tl.constexpr, CHANNELS: tl.constexpr, BLOCK: tl.constexpr,
@@ -73,16 +74,16 @@ def gather_kernel(
     store_sums(sums, ray, inside, channels, total, mass, squares, column)
 
 
-@triton.jit(do_not_specialize=("count", "slots_per_ray"))
+@triton.jit(do_not_specialize=("first", "count", "slots_per_ray", "positions"))
 def gather_back_kernel(
     values, slots, wanted, weights, positions, shares, to_sums, to_first, to_second, to_values, to_weights,
-    count, slots_per_ray, channels, NEEDED: tl.constexpr, TAPS: tl.constexpr, CHANNELS: tl.constexpr,
+    first, count, slots_per_ray, channels, NEEDED: tl.constexpr, TAPS: tl.constexpr, CHANNELS: tl.constexpr,
     BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Gradients of texels (added to what is there) and weights; a lane a sample."""
+    """Gradients of texels (added to what is there) and weights; a lane a sample, the ``first`` one and those after."""
     number, column = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK), tl.arange(0, CHANNELS)[None, :]
     inside = number < count
-    slot = tl.load(slots + number, inside, 0)
+    slot = tl.load(slots + first + number, inside, 0)
     ray = slot // slots_per_ray
     inside = inside & (tl.load(wanted + ray, inside, 0) != 0)
     value = activate(read_taps(values, positions, shares, number, inside, channels, column, TAPS), column)
@@ -118,12 +119,11 @@ class _GatherTaps(torch.autograd.Function):
         numbers.view(-1)[slots] = torch.arange(len(slots), dtype=torch.int32, device=device)
         numbers.masked_fill_(~wanted[:, None], -1)
         sums, (columns, block) = torch.zeros(num_rays, channels + 1 + COLORS, device=device), sizes(channels, device)
-        if len(slots):
-            gather_kernel[(triton.cdiv(num_rays, block),)](
-                values, numbers, weights, positions, shares, cube_positions, cube_shares, sums,
-                num_rays, width, channels, len(positions),
-                HAS_CUBE=len(cube_positions) > 0, CHANNELS=columns, BLOCK=block,
-            )  # fmt: skip
+        given = (values, numbers, weights, positions, shares, cube_positions, cube_shares, sums)
+        launch(
+            gather_kernel, num_rays if len(slots) else 0, block, *given, num_rays, width, channels, len(positions),
+            HAS_CUBE=len(cube_positions) > 0, CHANNELS=columns, BLOCK=block,
+        )  # fmt: skip
         ctx.save_for_backward(*held)
         found = split_sums(sums, channels)
         ctx.mark_non_differentiable(found[1])
@@ -136,15 +136,14 @@ class _GatherTaps(torch.autograd.Function):
         needed, channels = ctx.needs_input_grad[0], values.shape[1]
         to_values, to_weights = torch.zeros_like(values) if needed else values, torch.zeros_like(weights)
         columns, block = sizes(channels, values.device)
-        for own, positions, shares in zip(
-            slots.split([len(taps[0]), len(taps[2])]), taps[::2], taps[1::2], strict=True
-        ):
-            if len(own):
-                gather_back_kernel[(triton.cdiv(len(own), block),)](
-                    values, own, wanted, weights, positions, shares, to_sums, to_first, to_second, to_values,
-                    to_weights, len(own), weights.shape[1], channels,
-                    NEEDED=needed, TAPS=shares.shape[1], CHANNELS=columns, BLOCK=block,
-                )  # fmt: skip
+        first = 0
+        for positions, shares in zip(taps[::2], taps[1::2], strict=True):
+            launch(
+                gather_back_kernel, len(positions), block, values, slots, wanted, weights, positions, shares,
+                to_sums, to_first, to_second, to_values, to_weights, first, len(positions), weights.shape[1], channels,
+                NEEDED=needed, TAPS=shares.shape[1], CHANNELS=columns, BLOCK=block,
+            )  # fmt: skip
+            first += len(positions)
         return to_values if needed else None, to_weights, None, None, None, None, None, None
 
 

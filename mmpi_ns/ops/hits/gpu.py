@@ -9,7 +9,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from mmpi_ns.ops.gpu_scene import block_size
+from mmpi_ns.ops.gpu_scene import block_size, launch
 from mmpi_ns.ops.layout import SceneLayout
 from mmpi_ns.scene.geometry import FACING_EPS, PlaneHits
 
@@ -120,8 +120,6 @@ def plane_hits(origins: Tensor, directions: Tensor, nears: Tensor, fars: Tensor,
     shape, size = (len(origins), count), len(origins) * count
     ranges = [torch.empty(shape, dtype=torch.int64, device=device) for _ in range(2)]
     parts = [torch.empty(*shape, width, device=device) for width in (2, 2, 3, 3)]
-    if size:
-        block = block_size(PAIRS, device)
-        rays = (x.contiguous() for x in (origins, directions, nears, fars))
-        hits_kernel[(triton.cdiv(size, block),)](*rays, frames, *ranges, *parts, size, K=count, BLOCK=block)
+    rays, block = (x.contiguous() for x in (origins, directions, nears, fars)), block_size(PAIRS, device)
+    launch(hits_kernel, size, block, *rays, frames, *ranges, *parts, size, K=count, BLOCK=block)
     return PlaneHits(*ranges, *parts)

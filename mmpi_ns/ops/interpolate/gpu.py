@@ -9,7 +9,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from mmpi_ns.ops.gpu_scene import HEIGHT, INTS, WIDTH, GpuScene, block_size, cell, row_of
+from mmpi_ns.ops.gpu_scene import HEIGHT, INTS, WIDTH, GpuScene, block_size, cell, launch, row_of
 from mmpi_ns.ops.interpolate.reference import RowIndex
 from mmpi_ns.ops.layout import SceneLayout
 
@@ -41,11 +41,8 @@ def texel_rows(layout: SceneLayout, heads: Tensor, planes: Tensor, ndc: Tensor) 
     count, scene = len(heads), GpuScene.of(layout)
     rows = torch.empty(count, 4, dtype=torch.int64, device=ndc.device)
     weights = torch.empty(count, 4, device=ndc.device)
-    if count:
-        block = block_size(ROWS, ndc.device)
-        texel_rows_kernel[(triton.cdiv(count, block),)](
-            heads.contiguous(), planes.contiguous(), ndc.contiguous(), scene.grids, rows, weights, count, BLOCK=block
-        )
+    given, block = (x.contiguous() for x in (heads, planes, ndc)), block_size(ROWS, ndc.device)
+    launch(texel_rows_kernel, count, block, *given, scene.grids, rows, weights, count, BLOCK=block)
     return rows, weights
 
 
@@ -72,12 +69,9 @@ def weighted_rows(table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
     """See ``ops.interpolate.reference``."""
     count, channels = len(rows), table.shape[1]
     out = torch.empty(count, channels, device=table.device)
-    if count:
-        block = block_size(ROWS, table.device)
-        weighted_rows_kernel[(triton.cdiv(count, block),)](
-            table, rows.contiguous(), weights.contiguous(), out, count, channels,
-            TAPS=rows.shape[1], CHANNELS=triton.next_power_of_2(channels), BLOCK=block,
-        )  # fmt: skip
+    block, columns = block_size(ROWS, table.device), triton.next_power_of_2(channels)
+    given = (table, rows.contiguous(), weights.contiguous(), out, count, channels)
+    launch(weighted_rows_kernel, count, block, *given, TAPS=rows.shape[1], CHANNELS=columns, BLOCK=block)
     return out
 
 
@@ -103,13 +97,12 @@ def sum_rows(position: Tensor, values: Tensor, weights: Tensor | None, count: in
     """See ``ops.interpolate``."""
     entries, channels = values.shape
     out = torch.zeros(count, channels, device=values.device)
-    if entries:
-        block = block_size(ROWS, values.device)
-        sum_rows_kernel[(triton.cdiv(entries, block),)](
-            position.contiguous(), values if weights is None else weights.contiguous(), values.contiguous(), out,
-            entries, channels, TAPS=1 if weights is None else weights.shape[1], WEIGHTED=weights is not None,
-            CHANNELS=triton.next_power_of_2(channels), BLOCK=block,
-        )  # fmt: skip
+    taps, block = 1 if weights is None else weights.shape[1], block_size(ROWS, values.device)
+    given = (x.contiguous() for x in (position, values if weights is None else weights, values))
+    launch(
+        sum_rows_kernel, entries, block, *given, out, entries, channels,
+        TAPS=taps, WEIGHTED=weights is not None, CHANNELS=triton.next_power_of_2(channels), BLOCK=block,
+    )  # fmt: skip
     return out
 
 
@@ -169,12 +162,11 @@ def index_rows(rows: Tensor, table_rows: int, pads: bool) -> RowIndex:
     if not count:
         return RowIndex(flat, position)
     words, counts = (torch.zeros(size, dtype=torch.int32, device=device) for _ in range(2))
-    entries, of_words = (triton.cdiv(count, block),), (triton.cdiv(size, block),)
-    mark_kernel[entries](flat, words, count, BLOCK=block)
-    count_kernel[of_words](words, counts, size, BLOCK=block)
+    launch(mark_kernel, count, block, flat, words, count, BLOCK=block)
+    launch(count_kernel, size, block, words, counts, size, BLOCK=block)
     ends = counts.cumsum(0, dtype=torch.int32)
     found = min(count, table_rows) if pads else int(ends[-1])
     unique = torch.zeros(found, dtype=torch.int64, device=device)
-    list_kernel[of_words](words, ends, unique, size, BLOCK=block)
-    position_kernel[entries](flat, words, ends, position, count, BLOCK=block)
+    launch(list_kernel, size, block, words, ends, unique, size, BLOCK=block)
+    launch(position_kernel, count, block, flat, words, ends, position, count, BLOCK=block)
     return RowIndex(unique, position)

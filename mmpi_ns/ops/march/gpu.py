@@ -36,6 +36,7 @@ from mmpi_ns.ops.gpu_scene import (
     bilinear,
     block_size,
     is_held,
+    launch,
     minus_log_of_rest,
     nearest_row,
     one_minus_exp,
@@ -373,15 +374,14 @@ def march_into_slots(layout: SceneLayout, tables: Tables, rays: Crossings, optio
     slots = [torch.empty(num_rays, room, dtype=torch.int32, device=device) for _ in range(2)]
     slots += [torch.empty(num_rays, room, width, device=device) for width in (3, 1, 1, 1)]
     numbers = torch.zeros(1 + layout.num_heads, dtype=torch.int32, device=device)
-    if num_rays:
-        at_once = block_size(RAYS if num_rays >= MANY else FEW_RAYS, device)
-        march_kernel[(triton.cdiv(num_rays, at_once),)](
-            *(x.contiguous() for x in parts), *scene.constants(), *tables, kept, skipped, dropped, *slots, numbers,
-            num_rays, room, threshold, float(options.fair_share),
-            K=len(layout.mpis), HEADS=triton.next_power_of_2(layout.num_heads), HAS_CUBE=layout.cube is not None,
-            BLENDS=options.form is not None, BAKED=options.baked, KEEP_ALL=threshold <= 0, RAYS=at_once, STEPS=STEPS,
-            num_warps=1,
-        )  # fmt: skip
+    at_once = block_size(RAYS if num_rays >= MANY else FEW_RAYS, device)
+    launch(
+        march_kernel, num_rays, at_once, *(x.contiguous() for x in parts), *scene.constants(), *tables,
+        kept, skipped, dropped, *slots, numbers, num_rays, room, threshold, float(options.fair_share),
+        K=len(layout.mpis), HEADS=triton.next_power_of_2(layout.num_heads), HAS_CUBE=layout.cube is not None,
+        BLENDS=options.form is not None, BAKED=options.baked, KEEP_ALL=threshold <= 0, RAYS=at_once, STEPS=STEPS,
+        num_warps=1,
+    )  # fmt: skip
     return Slots(kept, slots, room, skipped, dropped, numbers)
 
 
@@ -400,6 +400,5 @@ def _pack(kept: Tensor, slots: list[Tensor], room: int, width: int) -> list[Tens
     shape, size = (len(kept), width), len(kept) * width
     types = (torch.int64, torch.int64, *[torch.float32] * 4, torch.bool)
     out = [torch.empty((*shape, 3) if i == 2 else shape, dtype=t, device=kept.device) for i, t in enumerate(types)]
-    if size:
-        pack_kernel[(triton.cdiv(size, 1024),)](kept, *slots, *out, size, width, room, BLOCK=1024)
+    launch(pack_kernel, size, 1024, kept, *slots, *out, size, width, room, BLOCK=1024)
     return out

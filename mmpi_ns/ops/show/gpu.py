@@ -13,7 +13,7 @@ import triton.language as tl
 from torch import Tensor
 
 from mmpi_ns.ops.gather.gpu import activate, sizes
-from mmpi_ns.ops.gpu_scene import DEPTH, HEIGHT, INTS, WIDTH, GpuScene, cell, one_minus_exp, row_of
+from mmpi_ns.ops.gpu_scene import DEPTH, HEIGHT, INTS, WIDTH, GpuScene, cell, launch, one_minus_exp, row_of
 from mmpi_ns.ops.layout import SceneLayout, Tables
 from mmpi_ns.ops.march.gpu import march_into_slots
 from mmpi_ns.ops.march.reference import Crossings, MarchOptions
@@ -95,12 +95,10 @@ def show_rays(layout: SceneLayout, tables: Tables, features: Tensor, rays: Cross
     num_rays, channels, device = len(rays.origins), features.shape[1], features.device
     gathered = torch.empty(num_rays, channels, device=device)
     mass, depth, median, winner = (torch.empty(num_rays, 1, device=device) for _ in range(4))
-    if num_rays:
-        columns, block = sizes(channels, device, NUMBERS)
-        show_kernel[(triton.cdiv(num_rays, block),)](
-            m.kept, *m.slots, m.skipped_total, features.contiguous(), GpuScene.of(layout).grids,
-            gathered, mass, depth, median, winner, num_rays, m.room, channels, len(layout.mpis),
-            HAS_CUBE=layout.cube is not None, HEADS=triton.next_power_of_2(layout.num_heads),
-            CHANNELS=columns, BLOCK=block,
-        )  # fmt: skip
+    columns, block = sizes(channels, device, NUMBERS)
+    launch(
+        show_kernel, num_rays, block, m.kept, *m.slots, m.skipped_total, features.contiguous(),
+        GpuScene.of(layout).grids, gathered, mass, depth, median, winner, num_rays, m.room, channels, len(layout.mpis),
+        HAS_CUBE=layout.cube is not None, HEADS=triton.next_power_of_2(layout.num_heads), CHANNELS=columns, BLOCK=block,
+    )  # fmt: skip
     return Shown(gathered, mass, torch.exp(-depth), -torch.expm1(-depth), median, winner, m.dropped_mass)

@@ -11,7 +11,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from mmpi_ns.ops.gpu_scene import DEPTH, HEIGHT, INTS, WIDTH, GpuScene, block_size, is_stored, row_of, texel_of
+from mmpi_ns.ops.gpu_scene import DEPTH, HEIGHT, INTS, WIDTH, GpuScene, block_size, is_stored, launch, row_of, texel_of
 from mmpi_ns.ops.layout import SceneLayout
 from mmpi_ns.ops.variation.reference import Scales
 
@@ -53,11 +53,9 @@ class _Variation(torch.autograd.Function):
         block = block_size(ROWS, values.device)
         gradient, programs = torch.empty_like(values), triton.cdiv(count, block)
         totals = torch.zeros(max(1, programs), device=values.device)
-        if count:
-            variation_kernel[(programs,)](
-                rows.contiguous(), values.contiguous(), table, grids, scales, gradient, totals, count, channels,
-                NUM_HEADS=len(scales), CHANNELS=triton.next_power_of_2(channels), BLOCK=block,
-            )  # fmt: skip
+        given = (rows.contiguous(), values.contiguous(), table, grids, scales, gradient, totals, count, channels)
+        sizes = {"CHANNELS": triton.next_power_of_2(channels), "BLOCK": block}
+        launch(variation_kernel, count, block, *given, NUM_HEADS=len(scales), **sizes)
         ctx.save_for_backward(gradient)
         return totals.sum()
 
