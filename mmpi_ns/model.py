@@ -19,6 +19,7 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from mmpi_ns.capture.datamanager import OBSERVATIONS, RAYS_PER_STEP, TRAINING_VIEWS
+from mmpi_ns.capture.rays import PinholeRays
 from mmpi_ns.field.baking import baked_shares
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.samples import metadata_of
@@ -343,7 +344,10 @@ class MMPIModel(Model):
                 f"The crop box has no size (its sides are {[round(float(s), 6) for s in obb_box.S]}): give crop_scale "
                 "three positive lengths, or leave the crop out."
             )
-        return super().get_outputs_for_camera(camera, obb_box)
+        rays = PinholeRays.of(camera, self.device) if obb_box is None else None
+        if rays is None:
+            return super().get_outputs_for_camera(camera, obb_box)
+        return self.get_outputs_for_camera_ray_bundle(rays.image(int(camera.height), int(camera.width)))
 
     @torch.no_grad()
     def get_outputs_for_camera_ray_bundle(self, camera_ray_bundle: RayBundle) -> dict[str, Tensor]:

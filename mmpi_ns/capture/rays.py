@@ -49,3 +49,9 @@ class PinholeRays:
         )
         one = torch.ones_like(u)[:, None]
         return RayBundle(poses[:, :, 3], directions, pixel_area=one, camera_indices=camera[:, None], metadata={})
+
+    def image(self, height: int, width: int) -> RayBundle:
+        """Rays [height, width] through all pixels of the first camera."""
+        rows, columns = (torch.arange(n, device=self.focal.device) for n in (height, width))
+        y, x = torch.meshgrid(rows, columns, indexing="ij")
+        return self(torch.stack([torch.zeros_like(x), y, x], -1).view(-1, 3)).reshape((height, width))

@@ -214,6 +214,10 @@ def test_rays_of_pinhole_cameras_are_nerfstudios(scene):
     for name in ("origins", "directions", "camera_indices"):
         assert torch.allclose(getattr(ours, name), getattr(theirs, name), atol=1e-6), name
     assert ours.pixel_area.shape == theirs.pixel_area.shape
+    image, whole = made.image(HEIGHT, WIDTH), cameras[0:1].generate_rays(camera_indices=0, keep_shape=True)
+    for name in ("origins", "directions", "camera_indices"):
+        assert getattr(image, name).shape == getattr(whole, name).shape
+        assert torch.allclose(getattr(image, name), getattr(whole, name), atol=1e-6), name
 
 
 def test_other_cameras_are_left_to_nerfstudio(scene):

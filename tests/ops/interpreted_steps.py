@@ -18,4 +18,5 @@ def test_a_step_waits_twice_at_most_and_kernels_are_not_compiled_for_sizes(
         print(phase, sum(waits.found.values()), "waits,", waits.launches, "launches")
         assert 1 <= sum(waits.found.values()) <= 2, (phase, waits.found)
     print(training, {name: len(kinds) for name, kinds in sorted(variants.items())})
-    assert max(map(len, variants.values())) <= 4, {name: kinds for name, kinds in variants.items() if len(kinds) > 4}
+    many = {name: kinds for name, kinds in variants.items() if len(kinds) > 4}
+    assert not many, many  # one or nine channels, four or eight texels

@@ -48,7 +48,9 @@ def read_taps(values, positions, shares, number, known, channels, column, TAPS: 
 
 
 # Arrays that are parts of others begin anywhere, and no variant is compiled for those that happen to be aligned.
-@triton.jit(do_not_specialize=("num_rays", "slots", "planar", "cube_positions"))
+@triton.jit(
+    do_not_specialize=("num_rays", "slots", "planar", "positions", "shares", "cube_positions", "cube_shares"),
+)
 def gather_kernel(
     values, numbers, weights, positions, shares, cube_positions, cube_shares, sums, num_rays, slots, channels, planar,
     HAS_CUBE: tl.constexpr, CHANNELS: tl.constexpr, BLOCK: tl.constexpr,
@@ -74,7 +76,9 @@ def gather_kernel(
     store_sums(sums, ray, inside, channels, total, mass, squares, column)
 
 
-@triton.jit(do_not_specialize=("first", "count", "slots_per_ray", "positions"))
+@triton.jit(
+    do_not_specialize=("first", "count", "slots_per_ray", "positions", "shares", "to_sums", "to_first", "to_second"),
+)
 def gather_back_kernel(
     values, slots, wanted, weights, positions, shares, to_sums, to_first, to_second, to_values, to_weights,
     first, count, slots_per_ray, channels, NEEDED: tl.constexpr, TAPS: tl.constexpr, CHANNELS: tl.constexpr,

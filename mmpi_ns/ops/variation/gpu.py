@@ -19,7 +19,7 @@ ROWS = 128
 """Texels of a program."""
 
 
-@triton.jit(do_not_specialize=("count",))
+@triton.jit(do_not_specialize=("count", "rows", "values"))
 def variation_kernel(
     rows, values, table, grids, scales, gradient, totals, count, channels,
     NUM_HEADS: tl.constexpr, CHANNELS: tl.constexpr, BLOCK: tl.constexpr,
