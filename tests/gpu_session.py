@@ -140,7 +140,7 @@ def main() -> int:
         strip(work / "bare")
     todo = [p for p in parts(data, out, work, given.rehearse) if given.only is None or p.name in given.only]
     if given.wheels is not None:
-        todo.insert(1, install(given.wheels.resolve(), work / "site"))
+        todo.insert(int(todo[0].name == "device"), install(given.wheels.resolve(), work / "site"))
     carried = {"data": mib(given.data), "wheels": mib(given.wheels)}
     print({name: round(size, 1) for name, size in carried.items()}, "MiB carried", flush=True)
     found: dict[str, dict[str, object]] = {}

@@ -6,9 +6,9 @@ import json
 import shutil
 from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import pycolmap
 from PIL import Image
 
 from mmpi_ns.synthetic.scene import Colors, Scene, render
@@ -31,6 +31,7 @@ def write_dataset(
     noise_pixels: float = 0.3,
     outliers: float = 0.02,
     images: bool = True,
+    tracks: bool = True,
     overwrite: bool = False,
     progress: Callable[[Iterable[int]], Iterable[int]] = iter,
 ) -> SfmPoints:
@@ -41,6 +42,7 @@ def write_dataset(
     Args:
         points, noise_pixels, outliers: see ``sfm_points``.
         images: False writes cameras and points alone.
+        tracks: False writes no points and no COLMAP model, for which it takes pycolmap.
         overwrite: replaces a data set that is in the folder.
         progress: wraps the image numbers as they are rendered.
 
@@ -51,10 +53,11 @@ def write_dataset(
     check_folder(folder, overwrite)
     found = sfm_points(scene, points, noise_pixels, outliers)
     clear(folder)
-    model = colmap_model(scene, found)
-    (folder / "colmap" / "sparse" / "0").mkdir(parents=True)
-    model.write(folder / "colmap" / "sparse" / "0")
-    model.export_PLY(folder / "sparse_pc.ply")
+    if tracks:
+        model = colmap_model(scene, found)
+        (folder / "colmap" / "sparse" / "0").mkdir(parents=True)
+        model.write(folder / "colmap" / "sparse" / "0")
+        model.export_PLY(folder / "sparse_pc.ply")
     for part in ("images", "depths") if images else ():
         (folder / part).mkdir()
     for i in progress(range(len(scene.cameras))) if images else ():
@@ -119,8 +122,10 @@ def _transforms(scene: Scene, images: bool) -> dict:
     }  # fmt: skip
 
 
-def colmap_model(scene: Scene, found: SfmPoints) -> pycolmap.Reconstruction:
-    """The cameras, points and tracks as a COLMAP model; image and point ids count from 1."""
+def colmap_model(scene: Scene, found: SfmPoints) -> Any:
+    """The cameras, points and tracks as a ``pycolmap.Reconstruction``; image and point ids count from 1."""
+    import pycolmap  # a machine with a GPU may lack it
+
     cameras, points = scene.cameras, found.points
     model = pycolmap.Reconstruction()
     intrinsics = [cameras.focal, cameras.focal, *cameras.center]

@@ -116,7 +116,7 @@ class Gpu(Bench):
         if not (folder / "transforms.json").is_file():
             print(f"Making a street of {width} x {height} pixels ...", flush=True)
             scene = make_scene("street", count=count, width=width, height=height)
-            write_dataset(scene, folder, points=points, overwrite=True)
+            write_dataset(scene, folder, points=points, tracks=has_pycolmap(), overwrite=True)
         return folder.resolve()
 
     def _part(self, name: str, data: Path, seconds: float) -> Row:
