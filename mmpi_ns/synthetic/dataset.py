@@ -31,9 +31,9 @@ def write_dataset(
     noise_pixels: float = 0.3,
     outliers: float = 0.02,
     images: bool = True,
-    tracks: bool = True,
     overwrite: bool = False,
     progress: Callable[[Iterable[int]], Iterable[int]] = iter,
+    tracks: bool = True,
 ) -> SfmPoints:
     """Writes images, depths (along the optical axis), transforms.json, sparse_pc.ply and colmap/sparse/0.
 
@@ -42,9 +42,9 @@ def write_dataset(
     Args:
         points, noise_pixels, outliers: see ``sfm_points``.
         images: False writes cameras and points alone.
-        tracks: False writes no points and no COLMAP model, for which it takes pycolmap.
         overwrite: replaces a data set that is in the folder.
         progress: wraps the image numbers as they are rendered.
+        tracks: False writes no points and no COLMAP model, for which it takes pycolmap.
 
     Raises:
         FileExistsError: the folder is in use and may not, or cannot safely, be overwritten. Nothing was touched.
