@@ -47,7 +47,7 @@ def run_apart(
     source, target, log = folder / "request.json", folder / "answer.json", folder / "output.log"
     target.unlink(missing_ok=True)
     source.write_text(json.dumps(request, indent=1), encoding="utf-8")
-    environment = {**os.environ, "OMP_NUM_THREADS": str(threads), "OPENBLAS_NUM_THREADS": str(threads), **(extra or {})}
+    environment = {**environment_of(threads), **(extra or {})}
     words = [sys.executable, "-m", "mmpi_ns.bench.apart", work.__module__, work.__qualname__, str(source), str(target)]
     pipes: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
     last = ""
@@ -69,6 +69,24 @@ def run_apart(
     if process.returncode or not target.is_file():
         return {"not_run": f"it failed with status {process.returncode} ({last[:300]}); see {log}"}
     return read_json(target)
+
+
+def environment_of(threads: int) -> dict[str, str]:
+    """This process' variables for one of so many threads."""
+    return {**os.environ, "OMP_NUM_THREADS": str(threads), "OPENBLAS_NUM_THREADS": str(threads)}
+
+
+def run_command(words: list[str], log: Path, threads: int, **how: Any) -> None:
+    """Runs a command to its end; what it prints goes to a log.
+
+    Raises:
+        ValueError: it failed; names the log.
+    """
+    log.parent.mkdir(parents=True, exist_ok=True)
+    with log.open("w", encoding="utf-8") as stream:
+        ended = subprocess.run(words, stdout=stream, stderr=subprocess.STDOUT, env=environment_of(threads), **how)
+    if ended.returncode:
+        raise ValueError(f"{Path(words[0]).name} failed with status {ended.returncode}: see {log}.")
 
 
 def main(module: str, function: str, source: str, target: str) -> None:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,11 +13,22 @@ from nerfstudio.cameras.rays import RayBundle, RaySamples
 from torch import Tensor
 
 from mmpi_ns.bench.stability.exact import Array
+from mmpi_ns.bench.trainings import evenly
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.samples import metadata_of
 from mmpi_ns.ops.blending import BlendForm, blended_optical_depth
 from mmpi_ns.ops.composite.reference import Composite, composite_weights, median_inverse_distance
 from mmpi_ns.rendering.sampler import MergeReport, MMPISampler
+
+Image = tuple[Any, Tensor]
+"""A test camera and its image [H, W, 3]."""
+
+
+def images_of(pipeline: Any, count: int = 0) -> Iterator[Image]:
+    """Test images of a finished run, evenly spaced; 0 for all."""
+    data, device = pipeline.datamanager.eval_dataset, pipeline.model.device
+    for i in evenly(len(data), count):
+        yield data.cameras[i : i + 1].to(device), data.get_image_float32(i)[..., :3]
 
 
 @dataclass(frozen=True)

@@ -58,6 +58,16 @@ class Bench:
         return f"{fingerprint()} {', '.join(words)}"
 
 
+@dataclass(kw_only=True)
+class SceneBench(Bench):
+    """Options of benchmarks on one scene."""
+
+    data: Path
+    """The scene (a folder with transforms.json)."""
+    downscale_factor: int = 4
+    """Image size to use."""
+
+
 class Report:
     """The rows of one table, written after each. Rows that an earlier run finished are kept where its key is this one.
 

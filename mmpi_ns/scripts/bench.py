@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import ast
 import sys
+from dataclasses import fields
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 
 from mmpi_ns.scripts.command import say_version
+from mmpi_ns.utils.values import Number, check_options
 
+COUNT = Number(0, whole=True)
 COMMANDS = {
     "train": "quality.train",
     "score": "quality.score",
@@ -51,6 +54,8 @@ def entrypoint() -> None:
     measure = getattr(import_module(f"mmpi_ns.bench.{COMMANDS[name]}"), name.capitalize())
     command = tyro.cli(measure, prog=f"mmpi-bench {name}", args=sys.argv[2:])
     try:
+        counts = {f.name: COUNT for f in fields(command) if type(getattr(command, f.name)) is int}
+        check_options(command, counts, "--")
         command.run()
     except (ValueError, OSError) as error:
         sys.exit(f"mmpi-bench: {error}")

@@ -76,7 +76,8 @@ def test_what_was_measured_is_kept(run, tmp_path, monkeypatch):
 
 def test_exact_rays_without_votes_equal_those_with_them(run):
     """Where reliability takes no part, leaving it out of the exact ray changes nothing."""
-    model, images = render._load(run, 1)
+    pipeline = render.load_model(run)
+    model, images = pipeline.model, list(render.images_of(pipeline, 1))
     bundle = images[0][0].generate_rays(camera_indices=0, keep_shape=True)
     origin, direction = (x[5, 7].double().numpy() for x in (bundle.origins, bundle.directions))
     field = render.ExactField.of(model.field)
@@ -85,7 +86,8 @@ def test_exact_rays_without_votes_equal_those_with_them(run):
 
 
 def test_what_passes_a_ray_shows_the_background(run):
-    model, images = render._load(run, 2)
+    pipeline = render.load_model(run)
+    model, images = pipeline.model, list(render.images_of(pipeline, 2))
     model.field.density.data.fill_(-100.0)  # as good as empty
     colors = render.exact_colors(model, images, render._some_rays(images, 5))
     assert np.allclose(colors, 0.5) and colors.shape == (5, 3)

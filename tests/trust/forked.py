@@ -20,6 +20,9 @@ COMMANDS = {
     "ns-render": "nerfstudio.scripts.render",
     "ns-viewer": "nerfstudio.scripts.viewer.run_viewer",
     "mmpi-plan": "mmpi_ns.scripts.plan",
+    "mmpi-scene": "mmpi_ns.scripts.scene",
+    "mmpi-export": "mmpi_ns.scripts.export",
+    "mmpi-bench": "mmpi_ns.scripts.bench",
 }
 CALM = {
     "machine.device_type": "cpu", "vis": "tensorboard", "max_num_iterations": 3, "experiment_name": "tiny",

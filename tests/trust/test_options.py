@@ -131,6 +131,23 @@ def test_mmpi_plan_refuses_the_same_options(whole_scene, tmp_path, name, value):
     assert name in ended.sentence
 
 
+OTHER_COMMANDS = [
+    *(("mmpi-scene street {out}", option, value) for option, value in (
+        ("--width", "0"), ("--height", "-3"), ("--count", "0"), ("--length", "nan"), ("--points", "0"),
+        ("--seed", "-1"), ("--noise", "nan"), ("--outliers", "2"),
+    )),
+    ("mmpi-bench dense --output {out}", "--steps", "-1"),
+    ("mmpi-bench dense --output {out}", "--threads", "-1"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("command", "option", "value"), OTHER_COMMANDS)
+def test_other_commands_name_the_option_that_cannot_be_used(tmp_path, command, option, value):
+    words = command.format(out=tmp_path / "out").split()
+    assert run(*words, option, value).sentence.startswith(f"{option} must be")
+    assert not (tmp_path / "out").exists()
+
+
 def test_seeds_of_the_machine_are_those_of_our_draws(whole_scene, tmp_path):
     import torch
 

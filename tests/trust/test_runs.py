@@ -274,6 +274,22 @@ def test_ns_render_without_ffmpeg_says_so_before_loading(finished, tmp_path):
     assert "needs ffmpeg" in ended.sentence and "loading" not in ended.out
 
 
+@pytest.mark.parametrize(("option", "value"), [("--least", "nan"), ("--least", "-1"), ("--compare", "-3")])
+def test_mmpi_export_names_the_option_that_cannot_be_used(trained, tmp_path, option, value):
+    place = ("--load-config", trained / "config.yml", "--output", tmp_path / "out")
+    assert run("mmpi-export", "bake", *place, option, value).sentence.startswith(f"{option} must be")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("text", ["", "hello", "a: [1,"])
+def test_mmpi_export_names_a_config_that_is_none(finished, text):
+    (finished / "config.yml").write_text(text)
+    assert (
+        "no config.yml that ns-train wrote"
+        in run("mmpi-export", "bake", "--load-config", finished / "config.yml").sentence
+    )
+
+
 def test_a_run_ends_with_a_quick_test_and_commands_that_can_be_copied(whole_scene, tmp_path):
     ended = train(whole_scene, tmp_path, max_num_iterations=12)
     lines = ended.out.splitlines()

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from mmpi_ns.bench.methods import Method, Scene
-from mmpi_ns.bench.report import Bench, Report, Row, commit, figure, not_run, page, slug, table, title
+from mmpi_ns.bench.report import Report, Row, SceneBench, commit, figure, not_run, page, slug, table, title
 from mmpi_ns.bench.suites import ABLATIONS, Variant
 from mmpi_ns.bench.trainings import Request, train_apart
 
@@ -18,18 +18,14 @@ NEAR = 0.1
 
 
 @dataclass
-class Ablate(Bench):
+class Ablate(SceneBench):
     """Every variant of an ablation, first with the reference's steps, then for the seconds that the reference took.
 
     How many steps fit is computed from the variant's own first run. Finished runs are kept in ablate-SUITE.json.
     """
 
-    data: Path
-    """The scene (a folder with transforms.json)."""
     suite: Literal["drive", "room", "depth"] = "drive"
     """drive: the paper's KITTI ablation and ours; room: its ScanNet one, with and without the cube."""
-    downscale_factor: int = 4
-    """Image size to use."""
     steps: int = 1500
     """Steps at equal rays."""
     rays: int = 1024

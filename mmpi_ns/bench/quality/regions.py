@@ -7,11 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from nerfstudio.utils.eval_utils import eval_setup
 
+from mmpi_ns.bench.rendering import images_of
 from mmpi_ns.bench.report import Bench, Report, page
-from mmpi_ns.capture.datamanager import MMPIDataManager
-from mmpi_ns.model import MMPIModel
+from mmpi_ns.export.bake import load_model
 from mmpi_ns.placement.errors import WORST, pixel_errors
 from mmpi_ns.placement.observations import Array, Observations
 from mmpi_ns.scene.plan import ScenePlan
@@ -34,25 +33,21 @@ class Regions(Bench):
     name = "regions"
 
     def run(self) -> None:
-        _, pipeline, _, _ = eval_setup(self.load_config, test_mode="test")
+        pipeline = load_model(self.load_config)
         manager, model = pipeline.datamanager, pipeline.model
-        assert isinstance(manager, MMPIDataManager) and isinstance(model, MMPIModel)
         points = manager.observations.points
         if not len(points):
             raise ValueError("The scene has no SfM points in colmap/sparse/0: nothing to expect errors of.")
         expected, errors, slopes = [], [], []
-        for i in range(len(manager.eval_dataset)):
-            camera = manager.eval_dataset.cameras[i : i + 1].to(model.device)
+        for camera, truth in images_of(pipeline):
             with torch.no_grad():
                 rgb = model.get_outputs_for_camera(camera)["rgb"].cpu()
-            truth = manager.eval_dataset.get_image_float32(i)[..., :3]
             squared = ((rgb - truth) ** 2).mean(-1).numpy()
             found = self._regions(
                 _as_observations(camera), points, model.field.plan, squared, squared_slope(truth.numpy())
             )
             for values, more in zip((expected, errors, slopes), found, strict=True):
                 values += more
-            print(f"{i + 1} of {len(manager.eval_dataset)} images", flush=True)
         # A pixel of displacement costs what the image changes over a pixel: nothing on a plain wall.
         pixels = np.array(errors) / np.maximum(slopes, 1e-6)
         found = {"regions": len(expected), "rank_correlation": spearman(np.array(expected), np.array(errors))}

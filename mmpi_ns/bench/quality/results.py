@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import functools
 import json
-import os
-import subprocess
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -13,7 +11,8 @@ from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
 
-from mmpi_ns.bench.report import Bench, Report, Row, commit, figure, page, processor, slug, table
+from mmpi_ns.bench.apart import run_command
+from mmpi_ns.bench.report import Report, Row, SceneBench, commit, figure, page, processor, slug, table
 from mmpi_ns.bench.suites import DEFAULT, SUITES, Variant
 from mmpi_ns.capture.load import load_observations
 from mmpi_ns.placement.errors import pixel_errors
@@ -24,19 +23,15 @@ RAYS_PER_STEP = 1024
 
 
 @dataclass
-class Results(Bench):
+class Results(SceneBench):
     """Trains and evaluates every variant of a suite on a scene, as a user would.
 
     Rows that are finished are kept in SUITE.json.
     """
 
-    data: Path
-    """The scene (a folder with transforms.json)."""
     suite: str
     """Which variants: kitti-street, room-walk, fern, fox; kitti-street-budgets and room-walk-budgets draw quality over
     texels."""
-    downscale_factor: int = 4
-    """Image size to use."""
     parallel: int = 1
     """Runs at the same time, each with its share of the cores."""
     only: str = ""
@@ -63,11 +58,12 @@ class Results(Bench):
         scene = ["--data", str(self.data), "nerfstudio-data", "--downscale-factor", str(self.downscale_factor)]
         place = ["--output-dir", str(folder), "--experiment-name", "run", "--timestamp", "1", "--vis", "tensorboard"]
         start = time.perf_counter()
-        _command(["ns-train", variant.method, *place, *steps, *variant.options, *scene], folder, threads)
+        train, evaluate = (str(Path(sys.executable).with_name(name)) for name in ("ns-train", "ns-eval"))
+        run_command([train, variant.method, *place, *steps, *variant.options, *scene], folder / "train.log", threads)
         seconds = time.perf_counter() - start
         run, found = folder / "run" / variant.method / "1", folder / "eval.json"
         render = ["--output-path", str(found), "--render-output-path", str(folder / "renders")]
-        _command(["ns-eval", "--load-config", str(run / "config.yml"), *render], folder, threads)
+        run_command([evaluate, "--load-config", str(run / "config.yml"), *render], folder / "eval.log", threads)
         results = json.loads(found.read_text(encoding="utf-8"))["results"]
         row = {k: results[k] for k in ("psnr", "ssim", "num_rays_per_sec", "dropped_mass") if k in results}
         row |= {k: v for k, v in results.items() if k.startswith("lpips") and not k.endswith("std")}
@@ -143,14 +139,3 @@ def _observations(data: Path, downscale_factor: int):
 def steps_of(run: Path) -> int:
     """Steps of a finished run, by its last checkpoint."""
     return 1 + max(int(p.stem.split("-")[1]) for p in (run / "nerfstudio_models").glob("step-*.ckpt"))
-
-
-def _command(words: list[str], folder: Path, threads: int) -> None:
-    """Runs a command of this Python's environment; its output goes to a log beside the run."""
-    folder.mkdir(parents=True, exist_ok=True)
-    program, log = str(Path(sys.executable).with_name(words[0])), folder / f"{words[0]}.log"
-    environment = {**os.environ, "OMP_NUM_THREADS": str(threads)}
-    with log.open("w", encoding="utf-8") as stream:
-        code = subprocess.run([program, *words[1:]], stdout=stream, stderr=subprocess.STDOUT, env=environment)
-    if code.returncode:
-        raise RuntimeError(f"{words[0]} failed with status {code.returncode}: see {log}.")

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from mmpi_ns.bench.apart import Tell, run_apart
 from mmpi_ns.bench.methods import METHODS, Method, Scene
-from mmpi_ns.bench.report import Bench, Report, Row, figure, page, table
+from mmpi_ns.bench.report import Report, Row, SceneBench, figure, page, table
 from mmpi_ns.bench.speed.all_planes import DenseSteps
 from mmpi_ns.bench.suites import P
 from mmpi_ns.bench.trainers import Steps, end_helpers
@@ -22,7 +22,7 @@ NERFACTO_RAYS = 2048
 
 
 @dataclass
-class Speed(Bench):
+class Speed(SceneBench):
     """Training rays/s, frames and memory on a CPU, alternating in one process; what leaving samples out costs in dB.
 
     The dense reference evaluates every plane of every MPI for every ray, sorts all samples and colours those whose
@@ -30,10 +30,6 @@ class Speed(Bench):
     PSNR is that of our training when it keeps every sample, with the same losses and steps.
     """
 
-    data: Path
-    """The scene (a folder with transforms.json)."""
-    downscale_factor: int = 4
-    """Image size to use."""
     arrangement: Literal["drive", "automatic"] = "drive"
     """Four hand-made MPIs for a drive, or what placement finds."""
     planes: int = 64

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from mmpi_ns.bench.methods import METHODS, Scene
-from mmpi_ns.bench.report import Bench, Report, Row, figure, page, slug, table, title
+from mmpi_ns.bench.report import Report, Row, SceneBench, figure, page, slug, table, title
 from mmpi_ns.bench.trainers import Steps, clock
 from mmpi_ns.field.samples import Gathered, Lookup, Taps, metadata_of
 from mmpi_ns.model import MMPIModel
@@ -39,17 +39,13 @@ class Op:
 
 
 @dataclass
-class Ops(Bench):
+class Ops(SceneBench):
     """Milliseconds of each operation of a training step, beside what bandwidth and arithmetic would allow.
 
     The limit of an operation is its bytes (each number that it reads or writes counts once, however often it is looked
     up) over the bandwidth of a copy, or its sums over the rate of a matrix product, whichever takes longer.
     """
 
-    data: Path
-    """The scene (a folder with transforms.json)."""
-    downscale_factor: int = 4
-    """Image size to use."""
     early: int = 40
     """Steps before the first measurement, while resolution grows."""
     steps: int = 600

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import subprocess
 import sys
 import time
 from dataclasses import dataclass, field
@@ -13,6 +12,7 @@ from typing import Any
 
 import torch
 
+from mmpi_ns.bench.apart import run_command
 from mmpi_ns.bench.report import Bench, Report, Row, page, table
 
 
@@ -88,16 +88,8 @@ class Processes(Bench):
         words += ["nerfstudio-data", "--downscale-factor", str(self.downscale_factor)]
         core = min(os.sched_getaffinity(0))
         start = time.perf_counter()
-        with (folder / "log.txt").open("w", encoding="utf-8") as log:
-            status = subprocess.run(
-                words,
-                stdout=log,
-                stderr=subprocess.STDOUT,
-                env={**os.environ, "OMP_NUM_THREADS": str(self.threads), "OPENBLAS_NUM_THREADS": str(self.threads)},
-                preexec_fn=(lambda: os.sched_setaffinity(0, {core})) if count == 1 else None,
-            ).returncode
-        if status:
-            raise ValueError(f"Training with {count} processes failed with status {status}; see {folder / 'log.txt'}.")
+        held = {"preexec_fn": lambda: os.sched_setaffinity(0, {core})} if count == 1 else {}
+        run_command(words, folder / "log.txt", self.threads, **held)
         return time.perf_counter() - start
 
     def _difference(self, windows: int) -> float:

@@ -8,15 +8,15 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 
+from mmpi_ns.bench.rendering import Image, images_of
 from mmpi_ns.bench.report import Bench, Report, Row, figure, fingerprint, page, table
 from mmpi_ns.bench.stability.exact import Array
 from mmpi_ns.bench.stability.exact_ray import ExactField, ExactRay
-from mmpi_ns.bench.trainings import evenly
+from mmpi_ns.export.bake import load_model
 from mmpi_ns.model import MMPIModel
 from mmpi_ns.ops import dispatch
 from mmpi_ns.rendering.metrics import ImageMetrics
@@ -89,7 +89,8 @@ class Render(Bench):
     name = "render"
 
     def run(self) -> None:
-        model, images = _load(self.load_config, self.images)
+        pipeline = load_model(self.load_config)
+        model, images = pipeline.model, list(images_of(pipeline, self.images))
         report = Report(self, self._key(model))
         default = Setting(model.config.render_threshold, model.chunk_size, _ops_in_use(model))
         rays = _some_rays(images, self.exact_rays)
@@ -124,23 +125,6 @@ class Render(Bench):
             found += [Setting(t, default.chunk, ops) for ops in self.ops for t in (default.threshold, 0.0)]
         found += [Setting(default.threshold, default.chunk, default.ops, a) for a in self.also]
         return list(dict.fromkeys(found))
-
-
-Image = tuple[Any, torch.Tensor]
-"""A test camera and its image [H, W, 3]."""
-
-
-def _load(config: Path, count: int) -> tuple[MMPIModel, list[Image]]:
-    from nerfstudio.utils.eval_utils import eval_setup
-
-    _, pipeline, _, _ = eval_setup(config, test_mode="test")
-    model, data = pipeline.model.eval(), pipeline.datamanager.eval_dataset
-    if not isinstance(model, MMPIModel):
-        raise ValueError(f"{config} is a run of another method: give one of mmpi's.")
-    assert data is not None
-    chosen = evenly(len(data), count)
-    cameras = [data.cameras[i : i + 1].to(model.device) for i in chosen]
-    return model, [(c, data.get_image_float32(i)[..., :3]) for c, i in zip(cameras, chosen, strict=True)]
 
 
 def _ops_in_use(model: MMPIModel) -> str:
