@@ -19,15 +19,40 @@ import numpy as np
 def read(folder: Path) -> dict[str, Any]:
     """The header, with each window's arrays decoded in place of where they are in its file."""
     scene = json.loads((folder / "scene.json").read_text(encoding="utf-8"))
-    assert scene["format"] == "mmpi-baked" and scene["version"] == 1
+    assert scene["format"] == "mmpi-baked" and scene["version"] == 2
     for window in scene["windows"]:
         blob = (folder / window["file"]).read_bytes()
         for name, a in window["arrays"].items():
             data = gzip.decompress(blob[a["offset"] : a["offset"] + a["bytes"]])
             window[name + "_array"] = np.frombuffer(data, a["type"]).reshape(a["shape"])
-        for name in ("density_array", "texels_array"):  # within a brick each texel is the difference to the one before
-            window[name] = np.cumsum(window[name], axis=-1, dtype=np.uint8)
+        for name in ("density_array", "texels_array"):  # differences along rows and columns, and from brick to brick
+            codes = window[name].reshape(-1, len(window["density_array"]), 8, 8).copy()
+            codes[:, :, 0, 0] = np.cumsum(codes[:, :, 0, 0], axis=1, dtype=np.uint8)
+            codes = codes.cumsum(-1, dtype=np.uint8).cumsum(-2, dtype=np.uint8)
+            take_borders(window, codes)
+            window[name] = codes.reshape(window[name].shape)
     return scene
+
+
+def take_borders(window: dict[str, Any], codes: np.ndarray) -> None:
+    """The last column and row of a brick are the first ones of its neighbours, where there are any."""
+    bricks = []
+    for mpi in window["mpis"]:
+        rows, columns = -(-(mpi["height"] - 1) // 7), -(-(mpi["width"] - 1) // 7)
+        for plane, row, column in np.ndindex(mpi["planes"], rows, columns):
+            if (own := brick_of(window, mpi, plane, row, column)) >= 0:
+                right = brick_of(window, mpi, plane, row, column + 1) if column + 1 < columns else -1
+                below = brick_of(window, mpi, plane, row + 1, column) if row + 1 < rows else -1
+                bricks.append((own, right, below))
+    for own, right, _ in bricks:
+        if right >= 0:
+            codes[:, own, :7, 7] = codes[:, right, :7, 0]
+    for own, _, below in bricks:
+        if below >= 0:
+            codes[:, own, 7] = codes[:, below, 0]
+    for own, right, below in bricks:
+        if right >= 0 > below:
+            codes[:, own, 7, 7] = codes[:, right, 7, 0]
 
 
 def camera_rays(pose: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:

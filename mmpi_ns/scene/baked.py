@@ -129,6 +129,26 @@ def brick_numbers(columns: Int[Tensor, "N 2"], mpi: MPIPlan) -> Int[Tensor, "P Y
     return numbers.view(words, down, across, WORD).permute(0, 3, 1, 2).reshape(-1, down, across)[: mpi.planes]
 
 
+def neighbours(columns: Int[Tensor, "N 2"], mpis: tuple[MPIPlan, ...], count: int) -> Int[Tensor, "2 B"]:
+    """The bricks to the right of each brick and below it, in its plane; -1 where there is none."""
+    found, start = torch.full((2, count), -1), 0
+    for mpi in mpis:
+        numbers = brick_numbers(columns[start : start + columns_of(mpi)], mpi).to(torch.int64)
+        beside = torch.nn.functional.pad(numbers, (0, 1, 0, 1), value=-1)
+        found[:, numbers[numbers >= 0]] = torch.stack([beside[:, :-1, 1:], beside[:, 1:, :-1]])[:, numbers >= 0]
+        start += columns_of(mpi)
+    return found
+
+
+def take_borders(codes: UInt8[Tensor, "B 8 8 ..."], beside: Int[Tensor, "2 B"]) -> None:
+    """Gives the last column and row of each brick the texels of the bricks right and below, which are the same ones."""
+    (right, has_right), (below, has_below) = ((x.clamp(min=0), x >= 0) for x in beside)
+    codes[has_right, :CELLS, CELLS] = codes[right[has_right], :CELLS, 0]
+    codes[has_below, CELLS] = codes[below[has_below], 0]
+    alone = has_right & ~has_below
+    codes[alone, CELLS, CELLS] = codes[right[alone], CELLS, 0]
+
+
 def columns_from(stored: Tensor, first: int) -> tuple[Int[Tensor, "N 2"], Int[Tensor, "B 3"]]:
     """Columns of one MPI, and (plane, row, column) of its bricks in their order.
 

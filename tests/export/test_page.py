@@ -15,6 +15,7 @@ from mmpi_ns.export.bake import render_scene
 from mmpi_ns.export.files import HEADER, read_baked, write_baked
 from mmpi_ns.export.reader import camera_rays
 from mmpi_ns.export.web import write_page, write_single_file
+from mmpi_ns.scene.baked import neighbours, take_borders
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium to open the page with (apt-get install chromium)")
 CLOSE = 48.0
@@ -22,10 +23,11 @@ CLOSE = 48.0
 
 
 def smooth_window(seed, **settings):
-    """A window whose codes change from brick to brick alone, for a card interpolates with 8 bits."""
+    """A window whose codes change at the borders of bricks alone, for a card interpolates with 8 bits."""
     window = random_window(seed=seed, density=(120, 200), **settings)
     for table in (window.mpis.density, window.mpis.texels):
         table[:] = table[:, :1, :1]
+        take_borders(table, neighbours(window.mpis.columns, window.mpis.mpis, window.mpis.num_bricks))
     return window
 
 

@@ -18,9 +18,42 @@ async function unpack(bytes, spec) {
   }
 }
 
-function sumDifferences(codes) {
-  for (let brick = 0; brick < codes.length; brick += 64)
-    for (let i = brick + 1; i < brick + 64; i++) codes[i] += codes[i - 1];
+// For each brick the ones right of it and below it in its plane, as they are in `columns`; -1 for none.
+function neighbours(mpis, columns, bricks) {
+  const right = new Int32Array(bricks).fill(-1), below = new Int32Array(bricks).fill(-1);
+  const ones = (v) => { let n = 0; for (; v; v &= v - 1) n++; return n; };
+  const number = (column, bit) =>
+    columns[2 * column] >>> bit & 1 ? columns[2 * column + 1] + ones(columns[2 * column] & ~(-1 << bit)) : -1;
+  for (const m of mpis) {
+    const across = Math.ceil((m.width - 1) / 7), down = Math.ceil((m.height - 1) / 7), words = Math.ceil(m.planes / 32);
+    for (let c = 0; c < words * down * across; c++)
+      for (let bit = 0; bit < 32; bit++) {
+        const column = m.first_column + c, own = number(column, bit);
+        if (own < 0) continue;
+        if (c % across + 1 < across) right[own] = number(column + 1, bit);
+        if (Math.floor(c / across) % down + 1 < down) below[own] = number(column + across, bit);
+      }
+  }
+  return { right, below };
+}
+
+// Codes of one channel from the differences that are kept, and border texels from the neighbours.
+function sumDifferences(codes, { right, below }) {
+  const bricks = codes.length / 64;
+  for (let at = 0; at < codes.length; at += 64) {
+    if (at) codes[at] += codes[at - 64];
+    for (let i = 1; i < 8; i++) codes[at + i] += codes[at + i - 1];
+    for (let row = at + 8; row < at + 64; row += 8) {
+      let sum = 0;
+      for (let x = 0; x < 8; x++) codes[row + x] = codes[row + x - 8] + (sum += codes[row + x]);
+    }
+  }
+  for (let b = 0; b < bricks; b++)
+    if (right[b] >= 0) for (let y = 0; y < 7; y++) codes[64 * b + 8 * y + 7] = codes[64 * right[b] + 8 * y];
+  for (let b = 0; b < bricks; b++)
+    if (below[b] >= 0) for (let x = 0; x < 8; x++) codes[64 * b + 56 + x] = codes[64 * below[b] + x];
+  for (let b = 0; b < bricks; b++)
+    if (right[b] >= 0 && below[b] < 0) codes[64 * b + 63] = codes[64 * right[b] + 56];
   return codes;
 }
 
@@ -34,8 +67,8 @@ function halves(data) {
 
 function checkHeader(header) {
   if (!header || header.format !== "mmpi-baked") throw new Refusal("scene.json is not the header of a baked scene.");
-  if (header.version !== 1)
-    throw new Refusal(`This scene is of version ${header.version}, and this page reads version 1: export it again.`);
+  if (header.version !== 2)
+    throw new Refusal(`This scene is of version ${header.version}, and this page reads version 2: export it again.`);
   return header;
 }
 
@@ -130,14 +163,16 @@ class WindowOnCard {
       throw new Refusal("The network of this scene is too wide for this graphics card.");
     own.groups = Math.ceil(channels / 4);
     own.program = own.compile(network.source);
-    own.addColumns(new Uint32Array(await unpack(bytes, arrays.columns)));
-    const density = sumDifferences(new Uint8Array(await unpack(bytes, arrays.density)));
+    const columns = new Uint32Array(await unpack(bytes, arrays.columns));
+    const beside = neighbours(row.mpis, columns, bricks);
+    own.addColumns(columns);
+    const density = sumDifferences(new Uint8Array(await unpack(bytes, arrays.density)), beside);
     own.addAtlas([density], bricks, per, 1);
-    const texels = sumDifferences(new Uint8Array(await unpack(bytes, arrays.texels)));
+    const texels = new Uint8Array(await unpack(bytes, arrays.texels));
     for (let g = 0; g < own.groups; g++) {
       const some = [];
       for (let c = 4 * g; c < Math.min(channels, 4 * g + 4); c++)
-        some.push(texels.subarray(c * bricks * 64, (c + 1) * bricks * 64));
+        some.push(sumDifferences(texels.subarray(c * bricks * 64, (c + 1) * bricks * 64), beside));
       own.addAtlas(some, bricks, per, 4);
     }
     own.setConstants(networkBlock(row.shader, halves(await unpack(bytes, arrays.network)), network.size));
