@@ -143,6 +143,7 @@ def test_what_cannot_be_baked_is_refused(trainer, monkeypatch):
             ["web", "--load-config", "run2/config.yml", "--output", "one.html", "--single-file"],
             "one.html is there already",
         ),
+        (["splats", "--load-config", "run2/config.yml", "--output", "file"], "file is there already"),
     ],
 )
 def test_mistakes_are_one_sentence(arguments, words, tmp_path, monkeypatch):
