@@ -7,7 +7,10 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
 import pycolmap
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from mmpi_ns.prepare.images import Photo
 from mmpi_ns.prepare.stages import PrepareError, progress, whole
@@ -143,6 +146,19 @@ def count_matching_pairs(database: Path) -> int:
     with pycolmap.Database.open(database) as opened:
         _, inliers = opened.read_two_view_geometry_num_inliers()
     return sum(n >= MIN_INLIERS for n in inliers)
+
+
+def connected(database: Path, places: Sequence[int]) -> list[list[int]]:
+    """Groups of at least three of some images (by their places) that verified matches connect, the largest first."""
+    place = {p + 1: n for n, p in enumerate(places)}
+    with pycolmap.Database.open(database) as opened:
+        numbers, inliers = opened.read_two_view_geometry_num_inliers()
+    pairs = [pycolmap.pair_id_to_image_pair(n) for n, c in zip(numbers, inliers, strict=True) if c >= MIN_INLIERS]
+    edges = np.array([(place[a], place[b]) for a, b in pairs if a in place and b in place], int).reshape(-1, 2)
+    graph = coo_array((np.ones(len(edges)), tuple(edges.T)), shape=(len(places), len(places)))
+    _, labels = connected_components(graph, directed=False)
+    groups = [[places[i] for i in np.flatnonzero(labels == label)] for label in np.unique(labels)]
+    return sorted((g for g in groups if len(g) > 2), key=len, reverse=True)
 
 
 def matched_keypoints(database: Path, image_ids: Sequence[int]) -> int:

@@ -15,6 +15,7 @@ from pathlib import Path
 import pycolmap
 
 from mmpi_ns.prepare.features import SEED, quiet
+from mmpi_ns.prepare.mapping import largest_model
 
 MIN_MATCHES = 15
 """Matches that agree, from which a pair counts."""
@@ -24,8 +25,8 @@ MIN_ANGLE = 0.5
 
 def map_globally(
     database: Path, images: Path, folder: Path, refine: bool, threads: int
-) -> list[tuple[pycolmap.Reconstruction, Path]]:
-    """Models and their folders, most images first; read back where they were made before.
+) -> tuple[pycolmap.Reconstruction, Path] | None:
+    """The largest model and its folder; read back where it was made before.
 
     Args:
         database: features, verified matches and the cameras to start from.
@@ -35,7 +36,7 @@ def map_globally(
         threads: CPU threads; below 1 for all.
 
     Returns:
-        Empty where no model comes about.
+        None where no model comes about.
     """
     done, models = folder / "done", folder / "models"
     if not done.exists():
@@ -48,8 +49,7 @@ def map_globally(
             model.update_point_3d_errors()
             model.write(models / str(number))
         done.touch()
-    made = [(pycolmap.Reconstruction(p), p) for p in sorted(models.iterdir()) if p.is_dir()]
-    return sorted(made, key=lambda m: -m[0].num_reg_images())
+    return largest_model(models)
 
 
 def global_options(refine: bool, threads: int) -> pycolmap.GlobalPipelineOptions:

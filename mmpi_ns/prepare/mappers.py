@@ -26,18 +26,11 @@ NEAR = 0.1
 
 @dataclass(frozen=True)
 class Candidate:
-    """A mapper's models and what they say of themselves."""
+    """A mapper's model and what it says of itself."""
 
-    models: tuple[pycolmap.Reconstruction, ...]
-    """Most images first."""
-    folder: Path
-    """Where the first can be read from again."""
+    model: pycolmap.Reconstruction
     witness: Witness
     says: str
-
-    @property
-    def model(self) -> pycolmap.Reconstruction:
-        return self.models[0]
 
 
 @dataclass(frozen=True)
@@ -48,8 +41,6 @@ class Believed:
     verdict: Verdict
     says: str
     """Both mappers in words."""
-    rest: tuple[pycolmap.Reconstruction, ...]
-    """The other models of both mappers: what is not connected to the first is in one of them."""
 
 
 def map_and_judge(
@@ -91,9 +82,9 @@ def map_and_judge(
     try:
         attempts = 1 if settled else len(ATTEMPTS)
         one = reconstruct(start, images, work / "incremental", not fixed, threads, is_sequence, attempts)
-        witness = witness_of("incremental", one.models[0], database, offered)
+        witness = witness_of("incremental", one.model, database, offered)
         tried = ", ".join(f"{name} {size}" for name, size in one.tried)
-        found.append(Candidate(one.models, one.folder, witness, f"incremental, '{one.attempt}' settings ({tried})"))
+        found.append(Candidate(one.model, witness, f"incremental, '{one.attempt}' settings ({tried})"))
     except PrepareError:
         if not found:
             raise
@@ -150,7 +141,7 @@ def _globally(
     cores = threads if threads > 0 else os.cpu_count() or 1
     workers = min(cores, len(starts))
 
-    def run(start: tuple[str, Path]) -> list[tuple[pycolmap.Reconstruction, Path]]:
+    def run(start: tuple[str, Path]) -> tuple[pycolmap.Reconstruction, Path] | None:
         name, path = start
         made = map_globally(path, images, work / name, not fixed, max(1, cores // workers))
         advance()
@@ -167,12 +158,12 @@ def _globally(
         if not made:
             say(f"Mapping, {name}: no model.")
             continue
-        model, folder = made[0]
+        model, _ = made
         witness = witness_of("global", model, path, offered)
         focal = ", ".join(f"{c.mean_focal_length():.1f}" for _, c in sorted(model.cameras.items())[:3])
         says = f"{model.num_reg_images()} of {len(offered)} images, {witness.error:.2f} px, focal length {focal} px"
         say(f"Mapping, {name}: {says}.")
-        found.append(Candidate(tuple(m for m, _ in made), folder, witness, f"{name} ({says})"))
+        found.append(Candidate(model, witness, f"{name} ({says})"))
     return found
 
 
@@ -184,5 +175,4 @@ def _choose(found: Sequence[Candidate], is_ordered: bool) -> Believed:
     says = chosen.says
     if other is not None:
         says += f"; beside it {other.says}, {judge_alone(other.witness, is_ordered).grade} by itself"
-    rest = (*chosen.models[1:], *(other.models if other else ()))
-    return Believed(chosen, verdict, says, rest)
+    return Believed(chosen, verdict, says)

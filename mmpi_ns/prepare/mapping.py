@@ -53,10 +53,9 @@ ATTEMPTS = (
 class Mapping:
     """What the mapper found."""
 
-    models: tuple[pycolmap.Reconstruction, ...]
-    """Separate models, most images first."""
+    model: pycolmap.Reconstruction
     folder: Path
-    """Where the first can be read from again."""
+    """Where it can be read from again."""
     attempt: str
     tried: tuple[tuple[str, int], ...]
     """(attempt, images in its largest model) in order."""
@@ -100,15 +99,15 @@ def reconstruct(
     best: Mapping | None = None
     tried: list[tuple[str, int]] = []
     for attempt in ATTEMPTS[1 if is_sequence else 0 :][:attempts]:
-        start = best.folder if best is not None and _carries(best.models[0], total) else None
-        models = _run(attempt, database, images, work / attempt.name, total, refine, threads, start)
-        size = models[0][0].num_reg_images() if models else 0
+        start = best.folder if best is not None and _carries(best.model, total) else None
+        made = _run(attempt, database, images, work / attempt.name, total, refine, threads, start)
+        size = made[0].num_reg_images() if made else 0
         tried.append((attempt.name, size))
-        says = f", {models[0][0].compute_mean_reprojection_error():.2f} px" if models else ""
+        says = f", {made[0].compute_mean_reprojection_error():.2f} px" if made else ""
         say(f"Mapping, {attempt.name} ({attempt.says}): {size} of {total} images{says}.")
-        if models and (best is None or _quality(models[0][0]) > _quality(best.models[0])):
-            best = Mapping(tuple(m for m, _ in models), models[0][1], attempt.name, ())
-        if size >= ENOUGH * total and not is_bent(models[0][0]):
+        if made and (best is None or _quality(made[0]) > _quality(best.model)):
+            best = Mapping(*made, attempt.name, ())
+        if made and size >= ENOUGH * total and not is_bent(made[0]):
             break
     if best is None:
         raise PrepareError(
@@ -148,8 +147,8 @@ def _run(
     refine: bool,
     threads: int,
     start: Path | None = None,
-) -> list[tuple[pycolmap.Reconstruction, Path]]:
-    """Models of one attempt and their folders, most images first; read back where it was finished before.
+) -> tuple[pycolmap.Reconstruction, Path] | None:
+    """The largest model of one attempt and its folder; read back where it was finished before.
 
     It begins with the newest snapshot of an interrupted run, or else with the model in ``start``.
     """
@@ -180,8 +179,13 @@ def _run(
             model.write(folder / "models" / str(number))
         done.touch()
         shutil.rmtree(folder / "snapshots")
-    models = [(pycolmap.Reconstruction(p), p) for p in sorted((folder / "models").iterdir()) if p.is_dir()]
-    return sorted(models, key=lambda m: -m[0].num_reg_images())
+    return largest_model(folder / "models")
+
+
+def largest_model(folder: Path) -> tuple[pycolmap.Reconstruction, Path] | None:
+    """The model with the most images of those in a folder's folders, and its own; None where there is none."""
+    models = [(pycolmap.Reconstruction(p), p) for p in sorted(folder.iterdir()) if p.is_dir()]
+    return max(models, key=lambda m: m[0].num_reg_images(), default=None)
 
 
 def _step(advance: Callable[..., None], count: int, start: int | None = None) -> Callable[[], None]:

@@ -227,11 +227,8 @@ class Preparation:
             always=s.refine_principal_point,
         )
         model = polish(model, free, s.threads)
-        here = set(camera_poses(model)[0])
-        groups = []
-        for other in believed.rest:
-            group = set(camera_poses(other)[0]) - here.union(*groups)
-            groups += [sorted(group)] if len(group) > 2 else []
+        places = sorted(set(range(len(names))) - {i - 1 for i in model.reg_image_ids()})
+        groups = [[names[i] for i in group] for group in features.connected(database, places)]
         return Solved(model, believed.says, groups, believed.verdict)
 
     def _known(self, database: Path) -> Solved:

@@ -244,7 +244,6 @@ def test_images_without_overlap_are_refused(tmp_path):
         prepare(Settings(tmp_path / "in", tmp_path / "scene", threads=1))
 
 
-@pytest.mark.xfail(reason="the global mapper keeps the largest group alone, and the report does not name the others")
 def test_two_disconnected_groups_are_named_and_the_larger_can_be_had(tmp_path):
     corridor.write_images(tmp_path / "in", 7, seed=1)
     corridor.write_images(tmp_path / "in", 6, seed=2, start=20)

@@ -236,7 +236,7 @@ def test_looser_settings_go_on_from_a_sound_model_of_most_images(first, starts, 
 
     def run(attempt, database, images, folder, total, refine, threads, start):
         seen.append(start)
-        return [(first if len(seen) == 1 else found_model(99, 0.6), Path(attempt.name))]
+        return first if len(seen) == 1 else found_model(99, 0.6), Path(attempt.name)
 
     database = SimpleNamespace(num_images=lambda: 100)
     monkeypatch.setattr(mapping.pycolmap.Database, "open", lambda path: nullcontext(database))
@@ -244,7 +244,7 @@ def test_looser_settings_go_on_from_a_sound_model_of_most_images(first, starts, 
     monkeypatch.setattr(mapping, "_run", run)
     found = mapping.reconstruct(tmp_path / "database", tmp_path, tmp_path, True, 1, is_sequence=True)
     assert seen == starts
-    assert found.models[0].num_reg_images() == (96 if len(starts) == 1 else 99)
+    assert found.model.num_reg_images() == (96 if len(starts) == 1 else 99)
 
 
 def test_given_intrinsics_are_left_alone_and_others_refined():
