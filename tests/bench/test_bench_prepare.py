@@ -67,10 +67,11 @@ def test_false_greens_and_false_reds_are_counted():
 
 def test_page_shows_what_was_said_of_a_refused_capture_and_what_did_not_run():
     row = {"grade": "refused", "says": "mmpi-prepare: broken.", "seconds": 9.6, "cpu_seconds": 8.2, "images": 64}
+    row |= {"commit": "abc1234"}
     rows = {"fern": row | {"registered": 0, "focal_true": 815.0}, "fox": {"not_run": "it is not there"}}
     made = {"command": "c", "processor": "p", "threads": 1, "torch": "t", "commit": "h", "date": "d"}
     text = markdown(rows, headline([rows["fern"]]), made)
-    assert "| fern | 0 of 64 | - | - | nan, 815.0 | refused | 10 s | 8 s |" in text
+    assert "| fern | 0 of 64 | - | - | nan, 815.0 | refused | 10 s | 8 s | abc1234 |" in text
     assert "- fern: mmpi-prepare: broken." in text and "fox: it is not there" in text
 
 

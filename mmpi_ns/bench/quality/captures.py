@@ -51,13 +51,12 @@ class Capture:
     length: float | None = None
 
     def write(self, data: Path, folder: Path) -> Truth:
-        """Writes the bare images and returns what is known of them.
+        """Writes the bare images, but for those that are there, and returns what is known of them.
 
         Raises:
             ValueError: the scene is not there.
         """
-        shutil.rmtree(folder, ignore_errors=True)
-        folder.mkdir(parents=True)
+        folder.mkdir(parents=True, exist_ok=True)
         return self._real(data / self.source, folder) if self.is_real else self._made(folder)
 
     def _real(self, scene: Path, folder: Path) -> Truth:
@@ -68,6 +67,8 @@ class Capture:
         frames = sorted(meta["frames"], key=lambda f: f["file_path"])[self.start : self.stop : self.step]
         names = tuple(Path(f["file_path"]).name for f in frames)
         for name, frame in zip(names, frames, strict=True):
+            if (folder / name).exists():
+                continue
             if self.half:
                 self._halve(Image.open(scene / frame["file_path"]), folder / name)
             else:
@@ -80,6 +81,8 @@ class Capture:
         chosen = range(len(scene.cameras))[self.start : self.stop : self.step]
         names = tuple(f"frame_{i + 1:05d}.png" for i in chosen)
         for name, i in zip(names, chosen, strict=True):
+            if (folder / name).exists():
+                continue
             image = Image.fromarray((render(scene, i)[0] * 255).round().astype(np.uint8))
             if self.half:
                 self._halve(image, folder / name)

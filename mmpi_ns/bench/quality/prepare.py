@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import resource
+import shutil
 import subprocess
 import sys
 import time
@@ -16,8 +16,9 @@ from typing import Any
 import numpy as np
 
 from mmpi_ns.bench.quality.captures import Array, Truth, catalogue
-from mmpi_ns.bench.report import Bench, Report, Row, not_run, page, table
+from mmpi_ns.bench.report import Bench, Report, Row, commit, not_run, page, table
 from mmpi_ns.prepare.alignment import similarity_of_centers
+from mmpi_ns.prepare.pipeline import WORK
 
 WRONG = (0.01, 0.03)
 """Mean and largest error of the camera centres, as shares of the length of the track, from which a track is wrong."""
@@ -30,38 +31,35 @@ class Prepare(Bench):
     """Runs mmpi-prepare on bare images and compares what comes out with the known poses.
 
     A green end with a wrong track is a false green, a red one or a refusal of a right track a false red: what was
-    refused is made all the same, to be measured. Finished rows are kept as long as mmpi-prepare's sources stay as they
-    are; --only chooses rows, and several runs add up.
+    refused is made all the same, to be measured. --only chooses rows, and several runs add up: finished rows are kept,
+    each with the commit that made it.
     """
 
     data: Path
     """Folder of the real captures: kitti-street, long-road, fern, fox, room-walk."""
     only: tuple[str, ...] = ()
     """Rows to make; all unless given. A name ending in * stands for all that begin so."""
+    anew: bool = False
+    """Make chosen rows again that are there."""
     focal_given: bool = False
     """Give --focal with the known focal length."""
 
     name = "prepare"
 
     def run(self) -> None:
-        report = Report(self, key=self._key(), file="prepare-focal" if self.focal_given else "")
+        report = Report(self, key=f"{self.cores}", file="prepare-focal" if self.focal_given else "")
         captures = catalogue()
         for name in captures:
             if not self.only or any(name == o or (o.endswith("*") and name.startswith(o[:-1])) for o in self.only):
+                if self.anew:
+                    report.rows.pop(name, None)
+                    shutil.rmtree(self.folder / name / "scene", ignore_errors=True)
                 row = report.row(name, lambda name=name: self._measure(name), needed=False)
                 print(f"{name}: {row}", flush=True)
         rows = {name: report.rows[name] for name in captures if name in report.rows}
         head = headline([r for r in rows.values() if "grade" in r])
         report.finish(head, markdown(rows, head, report.content["made"]))
         print(head)
-
-    def _key(self) -> str:
-        """Of mmpi-prepare's sources, and how it is started."""
-        folder = Path(__file__).resolve().parents[2] / "prepare"
-        digest = hashlib.sha256()
-        for path in sorted(folder.glob("*.py")):
-            digest.update(path.read_bytes())
-        return f"{digest.hexdigest()[:16]} {self.focal_given} {self.cores}"
 
     def _measure(self, name: str) -> Row:
         folder = self.folder / name
@@ -70,11 +68,14 @@ class Prepare(Bench):
         except (ValueError, OSError) as error:
             return {"not_run": str(error)}
         options = ["--threads", str(self.cores), "--keep-work", "--overwrite"]
+        goes_on = (folder / "scene" / WORK).exists()  # its time would be that of the rest
         options += ["--focal", f"{truth.focal}"] if self.focal_given else []
         row = run_prepare(folder / "images", folder / "scene", options)
+        if goes_on:
+            del row["seconds"], row["cpu_seconds"]
         if row["grade"] == "refused":  # go on from there: was that right?
             run_prepare(folder / "images", folder / "scene", [*options, "--allow-doubtful", "--allow-partial"])
-        row |= {"images": len(truth.names), "focal_true": truth.focal}
+        row |= {"images": len(truth.names), "focal_true": truth.focal, "commit": commit()}
         return row | compare(folder / "scene", truth)
 
 
@@ -158,11 +159,15 @@ def markdown(rows: dict[str, Row], head: Row, made: Row) -> str:
         "turned by": lambda r: f"{r['turn_mean']:.2f}°" if "turn_mean" in r else "-",
         "focal length, known": lambda r: f"{r.get('focal', float('nan')):.1f}, {r['focal_true']:.1f}",
         "verdict": "{grade}",
-        "clock": "{seconds:.0f} s",
-        "CPU": "{cpu_seconds:.0f} s",
+        "clock": lambda r: f"{r['seconds']:.0f} s" if "seconds" in r else "-",
+        "CPU": lambda r: f"{r['cpu_seconds']:.0f} s" if "seconds" in r else "-",
+        "commit": "{commit}",
     }
     wrong = f"{head['false_green']} wrong and said to be right, {head['false_red']} right and said not to be"
     counts = f"{head['captures']} captures; {head['right']} right and said to be so, {wrong}."
     says = "\n".join(f"- {r['name']}: {r['says']}" for r in done if r["says"])
-    note = "Centres in the units of the known poses, after the best similarity; refused ones as they would have been."
+    note = (
+        "Centres in the units of the known poses, after the best similarity; refused ones as they would have been. "
+        "No time: the run went on from one that was interrupted."
+    )
     return page("mmpi-prepare on bare images", made, counts, table(columns, done), note, says, not_run(rows))
