@@ -9,8 +9,8 @@ import pycolmap
 
 from mmpi_ns.prepare.mapping import adjust, bundle_options
 
-STARTS = (1.2, 0.6)
-"""Focal lengths over the longer side that are tried where none is known: COLMAP's guess, and a wide one."""
+STARTS = (0.7, 1.2)
+"""Focal lengths over the longer side that are tried where none is known: telephones and cars, then COLMAP's guess."""
 PARTS = 20
 """Images from which the two halves of a capture are asked on their own."""
 WIDE = 0.08

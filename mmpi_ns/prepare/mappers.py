@@ -71,9 +71,10 @@ def map_and_judge(
     """
     starts = _starts(database, work, fixed)
     found = _globally(starts[:2], images, work, offered, fixed, threads)
-    if len(starts) > 2 and not _settled(found, is_ordered):
-        found += _globally(starts[2:], images, work, offered, fixed, threads)
     settled = _settled(found, is_ordered)
+    if len(starts) > 2 and not settled:
+        found += _globally(starts[2:], images, work, offered, fixed, threads)
+        settled = _settled(found, is_ordered)
     found = sorted(found, key=lambda c: rank(c.witness, is_ordered), reverse=True)[:1]
     start = database
     if found and not fixed:
@@ -92,12 +93,10 @@ def map_and_judge(
 
 
 def _settled(found: Sequence[Candidate], is_ordered: bool) -> bool:
-    """Whether the global mapper is of one mind, from all starts, and by its own evidence right."""
-    witnesses = [c.witness for c in found]
-    if not witnesses or any(judge_alone(w, is_ordered).grade != "right" for w in witnesses):
-        return False
-    differences = [agreement(witnesses[0], w) for w in witnesses[1:]]
-    return all(d is not None and agrees(d) for d in differences)
+    """Whether the global mapper is right by its own evidence, and of one mind from all starts from which it is."""
+    right = [c.witness for c in found if judge_alone(c.witness, is_ordered).grade == "right"]
+    differences = [agreement(right[0], w) for w in right[1:]]
+    return bool(right) and all(d is not None and agrees(d) for d in differences)
 
 
 def _starts(database: Path, work: Path, fixed: bool) -> list[tuple[str, Path]]:
