@@ -29,8 +29,12 @@ CELLS = (6, 8)
 """Rows and columns of the grid in which coverage and motion are judged."""
 MOVED_PX = 4.0
 """Pixels off its epipolar line, at 640 pixels' width, from which a match counts as moving."""
-FOCAL_OFF = 0.03
-"""Relative change of a given focal length, when set free, from which it is doubted."""
+LEAST_CELLS = 3
+"""Moving cells of an image from which it is said: one or two are as often wrong matches."""
+FOCAL_OFF = (0.03, 0.05)
+"""Relative change of a given focal length, when set free, from which it is doubted, and the scene with it..."""
+FOCAL_HELPS = (0.95, 0.85)
+"""... where that brings the reprojection error below these shares of what it was."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +48,8 @@ class Finding:
     says: str
     badness: float = 1.0
     """Sorts findings of a kind."""
+    is_grave: bool = False
+    """Whether the scene cannot be believed because of it."""
 
 
 def by_kind(findings: Sequence[Finding]) -> list[str]:
@@ -163,7 +169,7 @@ def moving(model: pycolmap.Reconstruction, database: Path, names: Sequence[str])
             if len(matches) < 30:
                 continue
             share = _moving_share(model, pair, matches)
-            if share > 0:
+            if share >= LEAST_CELLS / (CELLS[0] * CELLS[1]):
                 says = f"{share:.0%} of the image's cells do not follow the camera's motion: mask it (--masks)"
                 found.append(Finding("moving?", name, says, share))
     return found
@@ -212,9 +218,13 @@ def doubtful_intrinsics(model: pycolmap.Reconstruction, fixed: bool, copy: Path,
         after = free.compute_mean_reprojection_error()
         for number, camera in model.cameras.items():
             given, fits = camera.mean_focal_length(), free.cameras[number].mean_focal_length()
-            if abs(fits / given - 1) > FOCAL_OFF and after < 0.9 * before:
+            doubted, grave = (
+                abs(fits / given - 1) > off and after < helps * before
+                for off, helps in zip(FOCAL_OFF, FOCAL_HELPS, strict=True)
+            )
+            if doubted:
                 says = f"the given focal length {given:.1f} px does not fit: {fits:.1f} px would bring the error"
-                found.append(Finding("intrinsics?", "", f"{says} from {before:.2f} to {after:.2f} px"))
+                found.append(Finding("intrinsics?", "", f"{says} from {before:.2f} to {after:.2f} px", is_grave=grave))
     for camera in model.cameras.values():
         ratio = camera.mean_focal_length() / max(camera.width, camera.height)
         if not 0.3 < ratio < 4:

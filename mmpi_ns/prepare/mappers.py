@@ -17,8 +17,9 @@ from mmpi_ns.prepare.features import SEED, quiet
 from mmpi_ns.prepare.focal import STARTS
 from mmpi_ns.prepare.global_mapping import map_globally, start_from
 from mmpi_ns.prepare.mapping import ATTEMPTS, reconstruct
+from mmpi_ns.prepare.polish import Free, polish
 from mmpi_ns.prepare.stages import PrepareError, progress, say
-from mmpi_ns.prepare.verdict import Verdict, agrees, judge_alone, judge_together, rank
+from mmpi_ns.prepare.verdict import ORDER, Verdict, agrees, judge_alone, judge_together, rank
 
 NEAR = 0.1
 """Relative difference up to which two focal lengths to start from are taken for one."""
@@ -37,7 +38,7 @@ class Candidate:
 class Believed:
     """The model to use."""
 
-    candidate: Candidate
+    model: pycolmap.Reconstruction
     verdict: Verdict
     says: str
     """Both mappers in words."""
@@ -49,19 +50,21 @@ def map_and_judge(
     work: Path,
     offered: Sequence[str],
     *,
-    fixed: bool,
+    free: Free,
     threads: int,
     is_sequence: bool,
     is_ordered: bool,
 ) -> Believed:
     """Runs the global mapper, then the incremental one from the focal length that it found, and chooses by evidence.
 
+    What is chosen is adjusted once more (``polish``), where that leaves the evidence as good.
+
     Args:
         database: features and verified matches.
         images: folder of the images.
         work: folder for databases, models and snapshots; holds those of an interrupted run.
         offered: names of all images, in order.
-        fixed: keep the intrinsics.
+        free: what may be refined of the intrinsics.
         threads: CPU threads; below 1 for all.
         is_sequence: matched as a sequence: the incremental mapper begins with settings for forward motion.
         is_ordered: the images come in the order of the motion, so that breaks between neighbours can be looked for.
@@ -69,13 +72,14 @@ def map_and_judge(
     Raises:
         PrepareError: neither mapper makes a model.
     """
+    fixed = not free.lens
     starts = _starts(database, work, fixed)
     found = _globally(starts[:2], images, work, offered, fixed, threads)
     settled = _settled(found, is_ordered)
     if len(starts) > 2 and not settled:
         found += _globally(starts[2:], images, work, offered, fixed, threads)
         settled = _settled(found, is_ordered)
-    found = sorted(found, key=lambda c: rank(c.witness, is_ordered), reverse=True)[:1]
+    found = sorted(found, key=lambda c: rank(c.witness, is_ordered), reverse=True)
     start = database
     if found and not fixed:
         start = work / "from-global.db"
@@ -89,7 +93,13 @@ def map_and_judge(
     except PrepareError:
         if not found:
             raise
-    return _choose(found, is_ordered)
+    chosen, verdict, says = _choose(found, is_ordered)
+    polished = polish(chosen.model, free, threads)
+    grade = judge_alone(witness_of("polished", polished, database, offered), is_ordered).grade
+    if ORDER.index(grade) > ORDER.index(judge_alone(chosen.witness, is_ordered).grade):
+        say("The last adjustment makes the evidence worse: left out.", "yellow")
+        polished = chosen.model
+    return Believed(polished, verdict, says)
 
 
 def _settled(found: Sequence[Candidate], is_ordered: bool) -> bool:
@@ -166,12 +176,9 @@ def _globally(
     return found
 
 
-def _choose(found: Sequence[Candidate], is_ordered: bool) -> Believed:
-    """The candidate that the evidence prefers, judged beside the other."""
-    ordered = sorted(found, key=lambda c: rank(c.witness, is_ordered), reverse=True)
-    chosen, other = ordered[0], ordered[1] if len(ordered) > 1 else None
-    verdict = judge_together(chosen.witness, other.witness if other else None, is_ordered)
-    says = chosen.says
-    if other is not None:
-        says += f"; beside it {other.says}, {judge_alone(other.witness, is_ordered).grade} by itself"
-    return Believed(chosen, verdict, says)
+def _choose(found: Sequence[Candidate], is_ordered: bool) -> tuple[Candidate, Verdict, str]:
+    """The candidate that the evidence prefers, judged beside the others, and all in words."""
+    chosen, *others = sorted(found, key=lambda c: rank(c.witness, is_ordered), reverse=True)
+    verdict = judge_together(chosen.witness, [c.witness for c in others], is_ordered)
+    beside = [f"{c.says}, {judge_alone(c.witness, is_ordered).grade} by itself" for c in others]
+    return chosen, verdict, "; beside it ".join([chosen.says, *beside])

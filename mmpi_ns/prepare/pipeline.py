@@ -22,7 +22,7 @@ from mmpi_ns.prepare.frame import SceneFrame, camera_poses, choose_frame
 from mmpi_ns.prepare.images import Photo
 from mmpi_ns.prepare.known import solve_known
 from mmpi_ns.prepare.mappers import map_and_judge
-from mmpi_ns.prepare.polish import Free, polish
+from mmpi_ns.prepare.polish import Free
 from mmpi_ns.prepare.poses import read_poses, rigid3d
 from mmpi_ns.prepare.settings import Settings, check_options, read_lists
 from mmpi_ns.prepare.stages import PrepareError, Stages, only_one, progress, say, whole
@@ -143,6 +143,11 @@ class Preparation:
         return self.stages.run("features", made_from, stage, lambda folder: folder / "database.db")
 
     @property
+    def is_ordered(self) -> bool:
+        """Whether the images come in the order of the motion."""
+        return self.is_video or pairs.are_numbered([p.name for p in self.photos])
+
+    @property
     def image_folder(self) -> Path:
         return self.work / "input" / "images"
 
@@ -209,24 +214,19 @@ class Preparation:
     def _map(self, database: Path, folder: Path) -> Solved:
         s = self.settings
         names = [p.name for p in self.photos]
+        lens, place = not self.is_fixed, s.camera is None or s.refine_intrinsics
+        free = Free(lens, lens and s.lens == "auto", principal_point=place, always=s.refine_principal_point)
         believed = map_and_judge(
             database,
             self.image_folder,
             folder,
             names,
-            fixed=self.is_fixed,
+            free=free,
             threads=s.threads,
             is_sequence=self.matching.startswith("sequential"),
-            is_ordered=self.is_video or pairs.are_numbered(names),
+            is_ordered=self.is_ordered,
         )
-        model = believed.candidate.model
-        free = Free(
-            lens=not self.is_fixed,
-            full_lens=not self.is_fixed and s.lens == "auto",
-            principal_point=s.camera is None or s.refine_intrinsics,
-            always=s.refine_principal_point,
-        )
-        model = polish(model, free, s.threads)
+        model = believed.model
         places = sorted(set(range(len(names))) - {i - 1 for i in model.reg_image_ids()})
         groups = [[names[i] for i in group] for group in features.connected(database, places)]
         return Solved(model, believed.says, groups, believed.verdict)
@@ -271,6 +271,9 @@ class Preparation:
         photos = [p for p in self.photos if p.name in names]
         split = self._split([p.name for p in photos])
         findings = [*_focal_findings(solved), *self._findings(model, photos, database)]
+        grave = [f"{f.says[:1].upper()}{f.says[1:]}." for f in findings if f.is_grave]
+        if grave and self.known is None and solved.verdict.grade == "right":
+            solved.verdict = Verdict("doubtful", tuple(grave))
         folder, masks = self.image_folder, self.masks
         if s.undistort:
             flat = self.work / "undistorted"
@@ -311,15 +314,14 @@ class Preparation:
         self, model: pycolmap.Reconstruction, photos: Sequence[Photo], database: Path
     ) -> list[checks.Finding]:
         names = [p.name for p in photos]
-        is_ordered = self.is_video or pairs.are_numbered(names)
         found = checks.doubtful_intrinsics(model, self.is_fixed, self.work / "model" / "model", self.settings.threads)
         sharp = np.zeros(len(names))
         with progress("Checking images", len(names)) as advance:
             for i, name in enumerate(names):
                 sharp[i] = checks.sharpness(checks.read_gray(self.image_folder / name))
                 advance(1)
-        found += checks.blurred(names, sharp, is_ordered)
-        if is_ordered:
+        found += checks.blurred(names, sharp, self.is_ordered)
+        if self.is_ordered:
             order, poses = camera_poses(model)
             offered = [p.name for p in self.photos]
             found += checks.misplaced(order, [offered.index(n) for n in order], poses)

@@ -155,22 +155,31 @@ def agrees(difference: Agreement) -> bool:
     )
 
 
-def judge_together(chosen: Witness, other: Witness | None, is_sequence: bool) -> Verdict:
-    """What is made of the mapper that is believed, beside the other one.
+def judge_together(chosen: Witness, others: Sequence[Witness], is_sequence: bool) -> Verdict:
+    """What is made of the model that is believed, beside those of the other mapper and from other focal lengths.
 
-    The other's track speaks against it where it differs and cannot be dismissed by evidence of its own. Where both
-    found one track, each in its own way, what was doubtful in it is believed.
+    A track that differs speaks against it unless it can be dismissed: by evidence of its own, or because a third one
+    agrees with the chosen track, which more matches fit. Where two mappers found one track, each in its own way, what
+    was doubtful in it is believed.
     """
     own = judge_alone(chosen, is_sequence)
-    difference = None if other is None else agreement(chosen, other)
-    if other is None or difference is None:
-        return own
-    if agrees(difference):
-        return own if own.grade == "broken" else Verdict("right")
-    if own.grade == "right" and judge_alone(other, is_sequence).grade != "right":
-        return own
-    grade = "broken" if own.grade == "broken" else "doubtful"
-    return Verdict(grade, (*own.reasons, _differ(chosen, other, difference)))
+    compared = [(other, d) for other in others if (d := agreement(chosen, other)) is not None]
+    different = [(other, d) for other, d in compared if not agrees(d)]
+    is_confirmed = any(agrees(d) and other.name != chosen.name for other, d in compared)
+    against = [
+        (other, d)
+        for other, d in different
+        if (judge_alone(other, is_sequence).grade == "right" and not (is_confirmed and _fit(other) < _fit(chosen)))
+        or (own.grade != "right" and not is_confirmed)
+    ]
+    if own.grade == "broken" or not against:
+        return own if own.grade == "broken" or not is_confirmed else Verdict("right")
+    return Verdict("doubtful", (*own.reasons, _differ(chosen, *against[0])))
+
+
+def _fit(witness: Witness) -> float:
+    """Share of the matches that fit the poses, to a hundredth."""
+    return round(share(witness.pairs.fitting, witness.pairs.matches), 2)
 
 
 def _differ(chosen: Witness, other: Witness, difference: Agreement) -> str:
@@ -188,7 +197,5 @@ def rank(witness: Witness, is_sequence: bool) -> tuple[int, int, float, float]:
     By verdict, by images, by the share of the matches that fit the poses, to a hundredth, and by matches that became
     points. (A bent track may have more points than a right one: its points fit its bends.)
     """
-    pairs = witness.pairs
-    fitting = round(share(pairs.fitting, pairs.matches), 2)
     grade = judge_alone(witness, is_sequence).grade
-    return -ORDER.index(grade), len(witness.images), fitting, float(pairs.tracked.sum())
+    return -ORDER.index(grade), len(witness.images), _fit(witness), float(witness.pairs.tracked.sum())

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import signal
 import sys
-import threading
 
 from mmpi_ns.scripts.command import say_version
 
 INTERRUPTED = "mmpi-prepare: interrupted; the same command goes on from here."
+PR_SET_PDEATHSIG = 1
+"""Of prctl: the signal that a process gets when its parent ends."""
 
 
 def main() -> int:
@@ -36,17 +38,26 @@ def main() -> int:
 def end_at_once_on_signals() -> None:
     """SIGINT and SIGTERM end the command with one sentence, also in the middle of COLMAP's work.
 
-    A thread waits for them: a handler would wait until COLMAP returns, and COLMAP's own prints a stack trace.
+    A child process goes on with the work, and is killed. A handler or a thread would wait until COLMAP returns: its
+    adjustments keep the interpreter's lock for up to a minute. COLMAP's own handler prints a stack trace.
     """
     ends = {signal.SIGINT, signal.SIGTERM}
-    signal.pthread_sigmask(signal.SIG_BLOCK, ends)  # inherited by every thread that starts from now on
-
-    def wait() -> None:
-        number = signal.sigwait(ends)
-        os.write(2, f"\x1b[?25h\n{INTERRUPTED}\n".encode())  # the cursor that the bar hid; no lock is taken
-        os._exit(128 + number)
-
-    threading.Thread(target=wait, daemon=True).start()
+    signal.pthread_sigmask(signal.SIG_BLOCK, ends | {signal.SIGCHLD})
+    child = os.fork()
+    if not child:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGCHLD})
+        if sys.platform == "linux":
+            ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)  # it does not outlive its parent
+        return
+    while (number := signal.sigwait(ends | {signal.SIGCHLD})) == signal.SIGCHLD:
+        ended, status = os.waitpid(child, os.WNOHANG)
+        if ended:
+            code = os.waitstatus_to_exitcode(status)
+            os._exit(code if code >= 0 else 128 - code)
+    os.kill(child, signal.SIGKILL)
+    os.waitpid(child, 0)
+    os.write(2, f"\x1b[?25h\n{INTERRUPTED}\n".encode())  # the cursor that the bar hid
+    os._exit(128 + number)
 
 
 def entrypoint() -> None:

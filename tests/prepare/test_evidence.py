@@ -60,7 +60,7 @@ def test_a_break_before_the_last_image_is_doubtful_and_believed_where_two_mapper
     witness = replace(sound, pairs=replace(pairs, tracked=tracked))
     verdict = judge_alone(witness, is_sequence=True)
     assert verdict.grade == "doubtful" and "between frame_022 and frame_023" in verdict.words()
-    assert judge_together(witness, sound, True).grade == "right"
+    assert judge_together(replace(witness, name="global"), [sound], True).grade == "right"
     inside = np.where((pairs.first < 12) & (pairs.second >= 12), 0.15 * pairs.matches, tracked)
     verdict = judge_alone(replace(sound, pairs=replace(pairs, tracked=inside)), is_sequence=True)
     assert verdict.grade == "broken" and "between frame_011 and frame_012" in verdict.words()
@@ -115,17 +115,35 @@ def test_two_mappers_of_one_mind_are_right_and_of_two_minds_doubtful(sound, keyp
     other[:, :3, 3] = POSES[:, :3, 3] @ turned[:3, :3].T + turned[:3, 3]
     difference = agreement(sound, replace(sound, poses=other))
     assert difference is not None and difference.centers.max() < 1e-9 and difference.turns.max() < 1e-4
-    assert judge_together(sound, replace(sound, poses=other), True).grade == "right"
+    assert judge_together(sound, [replace(sound, poses=other)], True).grade == "right"
     bent = replace(sound, poses=drive(turn=0.03), name="global", focal=0.7)
-    verdict = judge_together(sound, bent, True)
+    verdict = judge_together(sound, [bent], True)
     assert verdict.grade == "doubtful" and "0.58 and 0.70 image sides" in verdict.words()
 
 
 def test_a_broken_second_mapper_does_not_speak_against_a_right_one(sound, keypoints):
     broken = witness_with(moved(np.s_[12:], shift=(0, 0, 8.0)), *keypoints)
     assert judge_alone(broken, True).grade == "broken"
-    assert judge_together(sound, broken, True).grade == "right"
-    assert judge_together(broken, sound, True).grade == "broken"
+    assert judge_together(sound, [broken], True).grade == "right"
+    assert judge_together(broken, [sound], True).grade == "broken"
+
+
+def test_a_track_from_another_focal_length_that_is_as_good_speaks_against_the_chosen_one(sound):
+    rival = replace(sound, poses=drive(turn=0.03))
+    assert judge_together(sound, [rival], True).grade == "doubtful"
+    ally = replace(sound, name="global")
+    assert judge_together(sound, [ally, rival], True).grade == "doubtful"
+    worse = replace(rival, pairs=replace(rival.pairs, fitting=0.97 * rival.pairs.fitting))
+    assert judge_alone(worse, True).grade == "right"
+    assert judge_together(sound, [worse], True).grade == "doubtful"
+    assert judge_together(sound, [ally, worse], True).grade == "right"  # fewer matches fit it, and two are against it
+
+
+def test_what_is_doubtful_is_not_believed_because_the_same_mapper_says_it_twice(sound):
+    weak = replace(sound, pairs=replace(sound.pairs, tracked=0.5 * sound.pairs.tracked))
+    assert judge_alone(weak, True).grade == "doubtful"
+    assert judge_together(weak, [weak], True).grade == "doubtful"
+    assert judge_together(weak, [replace(weak, name="global")], True).grade == "right"
 
 
 def test_bridges_count_every_pair_across_a_gap_once():

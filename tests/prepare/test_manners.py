@@ -146,3 +146,24 @@ def test_a_signal_ends_it_with_one_sentence(number, tmp_path):
     assert said.replace("\x1b[?25h", "").strip() == "mmpi-prepare: interrupted; the same command goes on from here."
     prepare(Settings(tmp_path / "frames", tmp_path / "scene", threads=1))
     assert (tmp_path / "scene" / "transforms.json").is_file()
+
+
+def test_a_signal_ends_the_command_while_the_interpreters_lock_is_held(tmp_path):
+    """As COLMAP's bundle adjustment holds it."""
+    program = (
+        "from mmpi_ns.scripts.prepare import end_at_once_on_signals; import ctypes; end_at_once_on_signals();"
+        "print('at work', flush=True); ctypes.PyDLL(None).sleep(60)"
+    )
+    run = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert run.stdout is not None and run.stdout.readline() == "at work\n"
+    run.send_signal(signal.SIGTERM)
+    _, said = run.communicate(timeout=30)
+    assert run.returncode == 128 + signal.SIGTERM and "interrupted" in said
+
+
+@pytest.mark.parametrize(("ends", "status"), [("sys.exit(3)", 3), ("os.kill(os.getpid(), 9)", 137)])
+def test_the_exit_status_is_that_of_the_work(ends, status):
+    program = (
+        f"from mmpi_ns.scripts.prepare import end_at_once_on_signals; import os, sys; end_at_once_on_signals(); {ends}"
+    )
+    assert subprocess.run([sys.executable, "-c", program], check=False).returncode == status
