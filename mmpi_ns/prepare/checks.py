@@ -12,6 +12,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from mmpi_ns.prepare.evidence import local_median
 from mmpi_ns.prepare.images import in_short
 from mmpi_ns.prepare.mapping import adjust, bundle_options, is_bent
 from mmpi_ns.prepare.stages import PrepareError
@@ -84,12 +85,6 @@ def read_gray(path: Path) -> NDArray[np.uint8]:
     if gray is None:
         raise PrepareError(f"{path.name} cannot be read: repair or remove it.")
     return gray  # type: ignore[return-value]
-
-
-def local_median(values: Array, reach: int) -> Array:
-    """Median of the neighbours of each value, itself left out. [N] -> [N]"""
-    rows = [np.delete(values[max(0, i - reach) : i + reach + 1], min(i, reach)) for i in range(len(values))]
-    return np.array([np.median(row) if len(row) else values[i] for i, row in enumerate(rows)])
 
 
 def blurred(names: Sequence[str], sharp: Array, ordered: bool) -> list[Finding]:

@@ -37,7 +37,6 @@ def witness_of(name: str, model: pycolmap.Reconstruction, database: Path, offere
         _pairs(model, database),
         camera.mean_focal_length() / max(camera.width, camera.height),
         model.compute_mean_reprojection_error(),
-        _median_angle(model),
     )
 
 
@@ -76,16 +75,3 @@ def _rays(model: pycolmap.Reconstruction, image: pycolmap.Image) -> Array:
     """Directions of the keypoints in the camera, with z = 1. [K, 3]"""
     pixels = np.array([p.xy for p in image.points2D], dtype=np.float64).reshape(-1, 2)
     return np.c_[model.cameras[image.camera_id].cam_from_img(pixels), np.ones(len(pixels))]
-
-
-def _median_angle(model: pycolmap.Reconstruction, most: int = 2000) -> float:
-    """Degrees between the two rays farthest apart of a point, median over (some of) the points."""
-    centers = {i: model.images[i].projection_center() for i in model.reg_image_ids()}
-    ids = sorted(model.point3D_ids())
-    angles = []
-    for number in ids[:: max(1, len(ids) // most)]:
-        point = model.points3D[number]
-        rays = np.array([centers[e.image_id] for e in point.track.elements]) - point.xyz
-        rays /= np.maximum(np.linalg.norm(rays, axis=-1, keepdims=True), 1e-12)
-        angles.append(np.degrees(np.arccos(np.clip((rays @ rays.T).min(), -1, 1))))
-    return float(np.median(angles)) if angles else 0.0

@@ -63,8 +63,6 @@ class Witness:
     """Mean focal length over the longer side."""
     error: float
     """Mean reprojection error, pixels."""
-    angle: float
-    """Degrees between the two most different rays of a point, median over points."""
 
 
 @dataclass(frozen=True)
@@ -122,9 +120,13 @@ def jumps(witness: Witness) -> Array:
     """How many usual steps each step is long: of the median of the steps around it. [N - 1]"""
     lengths = steps(witness)
     floor = 0.05 * float(np.median(lengths)) if len(lengths) else 0.0
-    around = [np.delete(lengths[max(0, i - WINDOW) : i + WINDOW + 1], min(i, WINDOW)) for i in range(len(lengths))]
-    usual = np.array([np.median(a) if len(a) else lengths[i] for i, a in enumerate(around)])
-    return lengths / np.maximum(usual + floor, 1e-12)
+    return lengths / np.maximum(local_median(lengths, WINDOW) + floor, 1e-12)
+
+
+def local_median(values: Array, reach: int) -> Array:
+    """Median of the neighbours of each value, itself left out. [N] -> [N]"""
+    rows = [np.delete(values[max(0, i - reach) : i + reach + 1], min(i, reach)) for i in range(len(values))]
+    return np.array([np.median(row) if len(row) else values[i] for i, row in enumerate(rows)])
 
 
 def speed_changes(witness: Witness) -> Array:

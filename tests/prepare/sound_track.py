@@ -90,4 +90,4 @@ def witness_with(poses, pixels, seen, focal=FOCAL, name="incremental"):
     table = np.array(rows)
     pairs = Pairs(table[:, 0], table[:, 1], *table[:, 2:].T.astype(float))
     names = [f"frame_{i:03d}" for i in range(count)]
-    return Witness(name, names, np.arange(count), poses, pairs, focal / WIDTH, 0.4, 3.0)
+    return Witness(name, names, np.arange(count), poses, pairs, focal / WIDTH, 0.4)

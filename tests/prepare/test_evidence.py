@@ -167,7 +167,7 @@ def test_speed_that_halves_is_seen_where_it_halves():
     pairs = Pairs(*(np.zeros(0, np.int64) for _ in range(2)), *(np.zeros(0) for _ in range(3)))
     from mmpi_ns.prepare.evidence import Witness
 
-    changes = speed_changes(Witness("x", [str(i) for i in range(20)], np.arange(20), poses, pairs, 1.0, 0.3, 2.0))
+    changes = speed_changes(Witness("x", [str(i) for i in range(20)], np.arange(20), poses, pairs, 1.0, 0.3))
     assert changes[9] == changes.max() and 1.6 < changes.max() <= 2
     assert changes[:5] == pytest.approx(1) and changes[-4:] == pytest.approx(1)
 
