@@ -9,7 +9,7 @@ import numpy as np
 import pycolmap
 
 from mmpi_ns.capture.epipolar import sampson
-from mmpi_ns.prepare.evidence import Array, Pairs, Places, Witness
+from mmpi_ns.prepare.evidence import Array, Pairs, Places, Witness, scale_changes
 from mmpi_ns.prepare.features import MIN_INLIERS
 from mmpi_ns.prepare.frame import camera_poses
 
@@ -37,6 +37,7 @@ def witness_of(name: str, model: pycolmap.Reconstruction, database: Path, offere
         _pairs(model, database),
         camera.mean_focal_length() / max(camera.width, camera.height),
         model.compute_mean_reprojection_error(),
+        scale_changes(*_observations(model), len(names)),
     )
 
 
@@ -64,6 +65,20 @@ def _pairs(model: pycolmap.Reconstruction, database: Path) -> Pairs:
     table = np.array(rows, dtype=np.int64).reshape(-1, 5)
     low, high = table[:, :2].min(1, initial=len(order)), table[:, :2].max(1, initial=0)
     return Pairs(low, high, *table[:, 2:].T.astype(np.float64))
+
+
+def _observations(model: pycolmap.Reconstruction) -> tuple[Places, Places, Array, Array]:
+    """Point, place of the image, centre and ray of everything that is seen. [O], [O], [O, 3], [O, 3]"""
+    parts = []
+    for place, image_id in enumerate(sorted(model.reg_image_ids())):
+        image = model.images[image_id]
+        points = _points(image)
+        rays = _rays(model, image)[points >= 0] @ image.cam_from_world().rotation.matrix()
+        rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+        center = np.tile(image.projection_center(), (len(rays), 1))
+        parts.append((points[points >= 0], np.full(len(rays), place), center, rays))
+    points, places, centers, rays = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return points, places, centers, rays
 
 
 def _points(image: pycolmap.Image) -> Places:

@@ -3,8 +3,9 @@
 A track that broke off and went on at another scale, or folded over, has a small reprojection error: each part fits its
 own points. What it cannot do is to join them. So this looks at the verified matches of pairs of images, found without
 any track: how many became points that both images see, how many lie on the epipolar lines of the two poses, and whether
-that holds for the pairs across each gap between two frames. Two mappers that work in different ways are compared with
-each other as well.
+that holds for the pairs across each gap between two frames. And points that are seen on both sides of a gap are found
+twice, from either side alone: where the scale changes, the two differ. Two mappers that work in different ways are
+compared with each other as well.
 
 Pure functions of numpy arrays; ``collect.py`` reads them out of a model.
 """
@@ -26,6 +27,10 @@ REACH = 12
 """Frames across a gap, at most, of the pairs that speak for it: farther ones have few matches and mostly wrong ones."""
 FEW = 60
 """Matches across a gap below which it says nothing."""
+LEAST_ANGLE = 1.0
+"""Degrees between the first and the last ray on either side of a gap, from which a point is found from that side."""
+LEAST_POINTS = 20
+"""Such points from which a gap's scale is known."""
 WINDOW = 5
 """Steps before and after a gap that are compared with each other."""
 
@@ -63,6 +68,8 @@ class Witness:
     """Mean focal length over the longer side."""
     error: float
     """Mean reprojection error, pixels."""
+    scales: Array
+    """Logarithm of the change of scale across each gap, as far as it is certain; NaN where it is not known. [N - 1]"""
 
 
 @dataclass(frozen=True)
@@ -109,6 +116,55 @@ def held_by_image(pairs: Pairs, count: int) -> Array:
         np.add.at(held, ends, pairs.tracked)
         np.add.at(matches, ends, pairs.matches)
     return np.where(matches >= FEW, held / np.maximum(matches, 1), np.nan)
+
+
+def scale_changes(points: Places, frames: Places, centers: Array, rays: Array, count: int) -> Array:
+    """How the scale changes across each gap: the distance of points found from the frames after it alone, over that of
+    the same points found from those before it.
+
+    Bundle adjustment that got stuck, and a track that broke off and went on, leave such changes where reprojection
+    errors and epipolar lines show little: a camera that sees a point twice as far off moves twice as fast.
+
+    Args:
+        points: number of the point that each observation sees. [O]
+        frames: place of its image. [O]
+        centers: of its camera. [O, 3]
+        rays: unit, world axes. [O, 3]
+        count: registered images, N.
+
+    Returns:
+        Medians over points of the logarithm, three standard errors nearer to 0; NaN where there are few. [N - 1]
+    """
+    order = np.lexsort((frames, points))
+    points, frames, centers, rays = points[order], frames[order], centers[order], rays[order]
+    first = np.searchsorted(points, points)
+    stop = np.searchsorted(points, points, side="right")
+    # Sums of what the least squares point of rays is made of, up to each observation: any range is a difference of two.
+    across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
+    terms = np.concatenate([across, np.einsum("nij,nj->ni", across, centers)[..., None]], -1)
+    sums = np.concatenate([np.zeros((1, 3, 4)), np.cumsum(terms, axis=0)])
+    last = np.arange(len(points))  # before the gap
+    last = last[(last > first) & (stop - last > 2)]
+    wide = np.cos(np.radians(LEAST_ANGLE))
+    before, after = (rays[first[last]], rays[last]), (rays[last + 1], rays[stop[last] - 1])
+    last = last[((before[0] * before[1]).sum(-1) < wide) & ((after[0] * after[1]).sum(-1) < wide)]
+
+    def distance(start: Places, end: Places) -> Array:
+        found = sums[end] - sums[start]
+        at = np.linalg.solve(found[:, :, :3], found[:, :, 3:])[..., 0]
+        return ((at - centers[last]) * rays[last]).sum(-1)
+
+    pair = distance(first[last], last + 1), distance(last + 1, stop[last])
+    seen = (pair[0] > 0) & (pair[1] > 0)
+    change, left, right = np.log(pair[1][seen] / pair[0][seen]), frames[last[seen]], frames[last[seen] + 1]
+    result = np.full(max(count - 1, 0), np.nan)
+    for gap in range(len(result)):
+        own = change[(left <= gap) & (right > gap)]
+        if len(own) >= LEAST_POINTS:
+            middle = float(np.median(own))
+            error = 1.48 * float(np.median(np.abs(own - middle))) / np.sqrt(len(own))
+            result[gap] = np.sign(middle) * max(abs(middle) - 3 * error, 0.0)
+    return result
 
 
 def steps(witness: Witness) -> Array:

@@ -36,6 +36,8 @@ BRIDGED_OF_USUAL = (0.6, 0.35)
 """... and the same as a share of what the other gaps have."""
 EDGE = 3
 """Images at an end of which a break says little of the track."""
+SCALE = (0.03, 0.2)
+"""Logarithm of a change of scale across a gap from which it is doubtful, and broken. (Sound tracks have 0.01.)"""
 LOOSE = 0.25
 """Share of an image's matches that must have become points, or its pose is doubted."""
 JUMP = 5.0
@@ -110,6 +112,11 @@ def _breaks(witness: Witness) -> list[tuple[Grade, str]]:
     where = _between(witness, at)
     says = f"The track is bent or broken {where}: {fitting[at]:.0%} of the matches across fit its poses."
     found.append((worse(float(fitting[at]), FITTING_ACROSS), says))
+    if np.isfinite(witness.scales).any():
+        at = int(np.nanargmax(np.abs(witness.scales)))
+        change = float(abs(witness.scales[at]))
+        grade = "right" if change < SCALE[0] else "doubtful" if change < SCALE[1] else "broken"
+        found.append((grade, f"The scale changes by {np.expm1(change):.0%} {_between(witness, at)}."))
     weak = across < WEAK * usual
     leaps = np.where(weak, jumps(witness), 0.0)
     if leaps.max(initial=0.0) > JUMP:

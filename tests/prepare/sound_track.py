@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from mmpi_ns.capture.epipolar import sampson
-from mmpi_ns.prepare.evidence import Pairs, Witness
+from mmpi_ns.prepare.evidence import Pairs, Witness, scale_changes
 
 FOCAL, WIDTH, HEIGHT = 360.0, 620, 188
 LIMIT = 3.0
@@ -90,4 +90,13 @@ def witness_with(poses, pixels, seen, focal=FOCAL, name="incremental"):
     table = np.array(rows)
     pairs = Pairs(table[:, 0], table[:, 1], *table[:, 2:].T.astype(float))
     names = [f"frame_{i:03d}" for i in range(count)]
-    return Witness(name, names, np.arange(count), poses, pairs, focal / WIDTH, 0.4)
+    scales = scale_changes(*observed(poses, pixels, kept, focal), count)
+    return Witness(name, names, np.arange(count), poses, pairs, focal / WIDTH, 0.4, scales)
+
+
+def observed(poses, pixels, seen, focal=FOCAL):
+    """Point, frame, centre and ray of every keypoint that is seen."""
+    frames, points = np.nonzero(seen)
+    local = np.concatenate([(pixels - [WIDTH / 2, HEIGHT / 2]) / focal, np.ones((*pixels.shape[:2], 1))], -1)
+    rays = np.einsum("oij,oj->oi", poses[frames, :3, :3], local[frames, points])
+    return points, frames, poses[frames, :3, 3], rays / np.linalg.norm(rays, axis=-1, keepdims=True)

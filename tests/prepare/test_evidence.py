@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from sound_track import FOCAL, drive, project, scattered, witness_with
+from sound_track import FOCAL, drive, observed, project, scattered, triangulated, witness_with
 
 from mmpi_ns.capture.epipolar import sampson
-from mmpi_ns.prepare.evidence import Pairs, agreement, bridges, held_by_image, jumps, speed_changes
+from mmpi_ns.prepare.evidence import Pairs, agreement, bridges, held_by_image, jumps, scale_changes, speed_changes
 from mmpi_ns.prepare.verdict import judge_alone, judge_together
 
 POSES = drive()
@@ -167,9 +167,44 @@ def test_speed_that_halves_is_seen_where_it_halves():
     pairs = Pairs(*(np.zeros(0, np.int64) for _ in range(2)), *(np.zeros(0) for _ in range(3)))
     from mmpi_ns.prepare.evidence import Witness
 
-    changes = speed_changes(Witness("x", [str(i) for i in range(20)], np.arange(20), poses, pairs, 1.0, 0.3))
+    changes = speed_changes(
+        Witness("x", [str(i) for i in range(20)], np.arange(20), poses, pairs, 1.0, 0.3, np.zeros(19))
+    )
     assert changes[9] == changes.max() and 1.6 < changes.max() <= 2
     assert changes[:5] == pytest.approx(1) and changes[-4:] == pytest.approx(1)
+
+
+def test_scale_that_changes_is_measured_where_it_changes(keypoints):
+    """Against points found one by one from the frames before and after each gap, of noisy keypoints."""
+    poses = moved(np.s_[12:], scale=1.5, about=11)
+    points, frames, centers, rays = observed(poses, *keypoints)
+    shuffled = np.random.default_rng(5).permutation(len(points))
+    found = scale_changes(points[shuffled], frames[shuffled], centers[shuffled], rays[shuffled], len(poses))
+    for gap in (4, 11, 13):
+        ratios = []
+        for p in np.unique(points):
+            own = points == p
+            sides = [np.flatnonzero(own & side) for side in (frames <= gap, frames > gap)]
+            if min(map(len, sides)) < 2:
+                continue
+            if max(rays[s[0]] @ rays[s[-1]] for s in sides) > np.cos(np.radians(1)):
+                continue
+            near = sides[0][-1]
+            at = [(triangulated(rays[s], centers[s]) - centers[near]) @ rays[near] for s in sides]
+            ratios += [np.log(at[1] / at[0])] if min(at) > 0 else []
+        middle = np.median(ratios)
+        error = 1.48 * np.median(np.abs(ratios - middle)) / np.sqrt(len(ratios))
+        assert len(ratios) > 20 and found[gap] == pytest.approx(np.sign(middle) * max(abs(middle) - 3 * error, 0))
+    assert np.nanargmax(np.abs(found)) == 11 and np.exp(found[11]) == pytest.approx(1.5, abs=0.05)
+    still = scale_changes(*observed(POSES, *keypoints), len(POSES))
+    assert np.nanmax(np.abs(still)) < 0.01
+
+
+def test_scale_that_changes_by_a_third_is_broken_though_most_matches_hold(keypoints, sound):
+    changed = witness_with(moved(np.s_[12:], scale=1.33, about=11), *keypoints)
+    verdict = judge_alone(replace(sound, scales=changed.scales), is_sequence=True)
+    assert verdict.grade == "broken" and "changes by 3" in verdict.words()
+    assert "between frame_011 and frame_012" in verdict.words()
 
 
 def test_sampson_is_the_distance_to_the_nearest_exact_match():
