@@ -57,7 +57,7 @@ def parts(data: Path, out: Path, work: Path, rehearse: bool) -> list[Part]:
         Part("environment", [*python, "-c", look], 90),
         Part("quick", [*bench, "gpu", "--quick", *where], 120),
         Part("tests", [*python, "-m", "pytest", "-m", "gpu", "-rs", "-p", "no:cacheprovider", "tests/ops"], 120),
-        Part("bench gpu", [*bench, "gpu", *small, *where, "--seconds", "120"], 150),
+        Part("bench gpu", [*bench, "gpu", *small, *where, "--seconds", "1800" if rehearse else "120"], 150),
         *(
             Part(f"train {name}", [*bench, "train", *_training(name, steps, data, rehearse), *where], seconds)
             for name, (steps, seconds) in TRAININGS.items()

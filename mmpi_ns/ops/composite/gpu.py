@@ -18,6 +18,17 @@ SLOTS = 2048
 """Samples of a program: as many rays as make that many."""
 
 
+@triton.jit
+def _samples(taus, valid, befores, at, inside, slot):
+    """Which slots hold a sample, their optical depths, and what lies in front of them."""
+    has = tl.load(valid + at, inside, 0) != 0
+    # The samples before each one, loaded one slot off: a running sum minus the sample itself would lose small ones.
+    earlier = inside & (slot > 0)[None, :]
+    earlier = earlier & (tl.load(valid + at - 1, earlier, 0) != 0)
+    before = tl.cumsum(tl.load(taus + at - 1, earlier, 0.0), 1) + tl.load(befores + at, inside, 0.0)
+    return has, tl.load(taus + at, has, 0.0), before
+
+
 @triton.jit(do_not_specialize=("num_rays", "slots"))
 def composite_kernel(
     taus, valid, befores, totals, weights, depths, num_rays, slots, RAYS: tl.constexpr, SLOTS: tl.constexpr
@@ -26,12 +37,7 @@ def composite_kernel(
     ray, slot = tl.program_id(0) * RAYS + tl.arange(0, RAYS), tl.arange(0, SLOTS)
     at = ray[:, None].to(tl.int64) * slots + slot[None, :]
     inside = (ray < num_rays)[:, None] & (slot < slots)[None, :]
-    has = tl.load(valid + at, inside, 0) != 0
-    tau = tl.load(taus + at, has, 0.0)
-    # The samples before each one, loaded one slot off: a running sum minus the sample itself would lose small ones.
-    earlier = inside & (slot > 0)[None, :]
-    earlier = earlier & (tl.load(valid + at - 1, earlier, 0) != 0)
-    before = tl.cumsum(tl.load(taus + at - 1, earlier, 0.0), 1) + tl.load(befores + at, inside, 0.0)
+    has, tau, before = _samples(taus, valid, befores, at, inside, slot)
     tl.store(weights + at, tl.where(has, tl.exp(-before) * one_minus_exp(tau), 0.0), inside)
     depth = tl.sum(tau, 1) + tl.load(totals + ray, ray < num_rays, 0.0)
     tl.store(depths + ray, depth, ray < num_rays)
@@ -46,11 +52,7 @@ def composite_backward_kernel(
     ray, slot = tl.program_id(0) * RAYS + tl.arange(0, RAYS), tl.arange(0, SLOTS)
     at = ray[:, None].to(tl.int64) * slots + slot[None, :]
     inside = (ray < num_rays)[:, None] & (slot < slots)[None, :]
-    has = tl.load(valid + at, inside, 0) != 0
-    tau = tl.load(taus + at, has, 0.0)
-    earlier = inside & (slot > 0)[None, :]
-    earlier = earlier & (tl.load(valid + at - 1, earlier, 0) != 0)
-    before = tl.cumsum(tl.load(taus + at - 1, earlier, 0.0), 1) + tl.load(befores + at, inside, 0.0)
+    has, tau, before = _samples(taus, valid, befores, at, inside, slot)
     own = tl.exp(-(before + tau)) * tl.load(weight_grads + at, has, 0.0)
     later = inside & (slot + 1 < slots)[None, :]
     later = later & (tl.load(valid + at + 1, later, 0) != 0)
