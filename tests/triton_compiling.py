@@ -136,6 +136,13 @@ def resources(kernel):
         return subprocess.run([tool, "-res-usage", file.name], capture_output=True, text=True, check=True).stdout
 
 
+def spills(kernel):
+    """Whether registers of a compiled kernel go to memory. A stack alone, of a few bytes, says nothing where the kernel
+    does not take all registers that there are."""
+    found = resources(kernel)
+    return "STACK:0" not in found and "REG:255" in found
+
+
 def main(architectures, largest):
     """Compiles all, or the largest of each kernel, and says what does not compile."""
     launches, failed = all_launches(setattr), 0
@@ -145,7 +152,7 @@ def main(architectures, largest):
         start, spilling = time.monotonic(), []
         for launch in launches:
             try:
-                if "STACK:0" not in resources(launch.compiled(architecture)):
+                if spills(launch.compiled(architecture)):
                     spilling.append(launch.name)
             except Exception as error:
                 failed += 1
