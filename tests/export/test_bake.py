@@ -146,7 +146,7 @@ def test_what_cannot_be_baked_is_refused(trainer, monkeypatch):
         (["splats", "--load-config", "run2/config.yml", "--output", "file"], "file is there already"),
     ],
 )
-def test_mistakes_are_one_sentence(arguments, words, tmp_path, monkeypatch):
+def test_mistakes_are_one_sentence(arguments, words, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     for folder in ("run", "run2/nerfstudio_models", "used", "export"):
         Path(folder).mkdir(parents=True)
@@ -156,6 +156,6 @@ def test_mistakes_are_one_sentence(arguments, words, tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["mmpi-export", *arguments])
     with pytest.raises(SystemExit) as caught:
         export.entrypoint()
-    said = str(caught.value.code)
-    assert said.startswith("mmpi-export: ") and words in said and "\n" not in said
+    said = capsys.readouterr().err.strip()
+    assert caught.value.code == 1 and said.startswith("mmpi-export: ") and words in said and "\n" not in said
     assert all(Path(name).read_text() == "{}" for name in files)
