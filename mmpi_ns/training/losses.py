@@ -33,7 +33,7 @@ class LossWeights:
     """Spread of a ray's mass over distance."""
     keypoint_depth: float = 0.02
     """-log of the mass near an SfM keypoint (scenes with tracks)."""
-    known_depth: float = 0.04
+    known_depth: float = 0.01
     """-log of the likelihood of a pixel's known depth, which is dense matches', an SfM point's or a sensor's."""
     depth_outliers: float = 0.02
     """Likelihood of a known depth where nothing of a ray's mass is: the larger, the less false depths are followed."""
