@@ -16,8 +16,8 @@ COMMANDS = {
     "prepare": {"utils", "scene", "placement", "capture"},
     "synthetic": {"utils"},
     "demo": set(METHOD) | {"synthetic"},
-    "bench": set(METHOD) | {"synthetic", "prepare", "demo"},
     "export": set(METHOD),
+    "bench": set(METHOD) | {"synthetic", "prepare", "demo", "export"},
     "scripts": set(METHOD) | {"export", "prepare", "synthetic", "demo", "bench", "placement"},
 }
 """The method never imports these."""

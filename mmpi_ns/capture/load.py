@@ -20,6 +20,12 @@ from mmpi_ns.utils.errors import InputError
 Parser = Literal["auto", "nerfstudio", "colmap"]
 
 
+def check_there(data: Path) -> None:
+    """Raises InputError where there is neither a folder nor a file."""
+    if not data.exists():
+        raise InputError(f"There is no scene at {data}: check the path.")
+
+
 def load_observations(data: Path, downscale_factor: int | None = None, parser: Parser = "auto") -> Observations:
     """The observations that training on a scene would use.
 
@@ -31,8 +37,7 @@ def load_observations(data: Path, downscale_factor: int | None = None, parser: P
     Raises:
         InputError: the folder holds no scene, or one that cannot be trained.
     """
-    if not data.exists():
-        raise InputError(f"There is no scene at {data}: check the path.")
+    check_there(data)
     config = MMPIDataManagerConfig(dataparser=NerfstudioDataParserConfig())
     is_nerfstudio = data.suffix == ".json" or (data / "transforms.json").is_file()
     if parser == "colmap" or (parser == "auto" and not is_nerfstudio):

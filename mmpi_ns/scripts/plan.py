@@ -48,13 +48,14 @@ class PlanCommand:
 
     def main(self) -> None:
         # Slow imports, which --help does not need.
-        from mmpi_ns.capture.load import load_observations
+        from mmpi_ns.capture.load import check_there, load_observations
         from mmpi_ns.placement.split import place_windows
         from mmpi_ns.scene.windows import WindowedPlan
         from mmpi_ns.utils.files import write_errors
 
         check_placement(self.placement, "--placement.")
         check_options(self, {"training_rays": Number(0, whole=True)}, "--")
+        check_there(self.scene)
         with write_errors(self.output, "--output"):
             self.output.mkdir(parents=True, exist_ok=True)
         if self.plan_file is not None:  # a mistake in it is said before the images are read

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from numbers import Integral, Real
 from typing import Any
 
 from mmpi_ns.utils.errors import InputError
+
+LARGEST = sys.float_info.max
+"""What floating-point numbers reach; whole numbers in a file may be larger."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +30,7 @@ class Number:
         if not isinstance(value, Integral if self.whole else Real) or isinstance(value, bool):
             return False
         number: Any = value
-        return self.low <= number <= self.high and not (self.above and number == self.low) and abs(number) < math.inf
+        return self.low <= number <= self.high and not (self.above and number == self.low) and abs(number) <= LARGEST
 
     def __str__(self) -> str:
         kind = "a whole number" if self.whole else "a finite number"

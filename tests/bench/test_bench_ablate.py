@@ -36,7 +36,9 @@ def three(monkeypatch):
 
 def command(scene, folder, **changes):
     settings = {"steps": 100, "rays": 64, "threads": 1} | changes
-    return Ablate(scene, "drive", 1, output=folder / "results", work=folder / "work", **settings)
+    return Ablate(
+        data=scene, downscale_factor=1, suite="drive", output=folder / "results", work=folder / "work", **settings
+    )
 
 
 def read(folder):

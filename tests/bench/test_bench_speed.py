@@ -31,7 +31,7 @@ def rounds_here(work, request, folder, threads):
 def command(scene, folder, **changes):
     settings = {"arrangement": "automatic", "planes": 16, "steps": 10, "rounds": 2, "dense_steps": 1}
     settings |= {"nerfacto_steps": 1, "rays": 64, "test_images": 0, "threads": 1, "full_size": 2} | changes
-    return Speed(scene, 1, output=folder / "results", work=folder / "work", **settings)
+    return Speed(data=scene, downscale_factor=1, output=folder / "results", work=folder / "work", **settings)
 
 
 @pytest.mark.commands
@@ -96,7 +96,9 @@ def test_steps_are_those_of_nerfstudios_loop(steps, scene, tmp_path):
 
 
 def test_ops_end_to_end_and_again(scene, tmp_path, monkeypatch):
-    made = Ops(scene, 1, early=2, steps=6, rays=64, repeats=1, output=tmp_path, work=tmp_path / "work")
+    made = Ops(
+        data=scene, downscale_factor=1, early=2, steps=6, rays=64, repeats=1, output=tmp_path, work=tmp_path / "work"
+    )
     monkeypatch.setattr(ops, "COPIED", 1 << 16)
     made.run()
     found = json.loads((tmp_path / "ops.json").read_text())
@@ -110,7 +112,7 @@ def test_ops_end_to_end_and_again(scene, tmp_path, monkeypatch):
     monkeypatch.setattr(Ops, "_measure", lambda _: pytest.fail("measured again"))
     made.run()
     with pytest.raises(ValueError, match="between 0 and --steps"):
-        Ops(scene, early=9, steps=9).run()
+        Ops(data=scene, early=9, steps=9).run()
 
 
 def test_operations_do_what_their_names_say(steps):

@@ -353,8 +353,13 @@ def test_a_folder_in_use_is_left_as_it_is(tmp_path, monkeypatch, capsys):
         monkeypatch.setattr("sys.argv", ["mmpi-scene", "room", str(folder), *extra])
         with pytest.raises(SystemExit) as stop:
             script.entrypoint()
-        message = str(stop.value.code)  # a string exits with status 1 and goes to stderr
-        assert message.startswith("mmpi-scene: ") and str(folder) in message and "\n" not in message
+        message = capsys.readouterr().err.strip()
+        assert (
+            stop.value.code == 1
+            and message.startswith("mmpi-scene: ")
+            and str(folder) in message
+            and "\n" not in message
+        )
         assert [p.name for p in folder.iterdir()] == ["notes.txt"]
 
 
