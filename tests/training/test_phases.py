@@ -8,6 +8,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from mmpi_ns.config import mmpi_kitti, mmpi_scannet, mmpi_scannet_short
+from mmpi_ns.model import MMPIModelConfig
 from mmpi_ns.training.phases import TRAINS, Phase, Schedule, make_schedule
 
 KINDS = ("density", "features", "colour", "reliability")
@@ -182,3 +184,16 @@ def test_numpy_settings_do_not_leak_into_rates():
 def test_impossible_schedules_name_the_setting(settings, word):
     with pytest.raises(ValueError, match=word):
         make_schedule("two-phase", **settings)
+
+
+def test_a_models_schedule_is_made_of_its_options():
+    schedule = MMPIModelConfig(decay_decades=2.0, decay_from=0.25, finetune_rate=0.3).schedule("two-phase", 3)
+    assert (schedule.decay_decades, schedule.decay_from, schedule.finetune_rate) == (2.0, 0.25, 0.3)
+    assert schedule.windows == 3
+
+
+@pytest.mark.parametrize("method", [mmpi_kitti, mmpi_scannet, mmpi_scannet_short])
+def test_the_papers_methods_keep_its_rates(method):
+    model, optimizers = method.config.pipeline.model, method.config.optimizers
+    assert (model.decay_decades, model.decay_from) == (1.5, 0.0)
+    assert optimizers["colour"]["optimizer"].lr == 1e-3
