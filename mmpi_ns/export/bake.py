@@ -170,14 +170,18 @@ def render_scene(
     scene: BakedScene, origins: Float[Tensor, "R 3"], directions: Float[Tensor, "R 3"]
 ) -> dict[str, Tensor]:
     """What a scene shows of rays: the windows that they start in, mixed as the model mixes them."""
+    if len(scene.windows) == 1:
+        return _render_window(scene.windows[0][1], origins, directions)
     shares = window_shares(origins, tuple(place for place, _ in scene.windows))
     parts = {}
     for w in (shares > 0).any(0).nonzero()[:, 0].tolist():
-        rays, window = (shares[:, w] > 0).nonzero()[:, 0], scene.windows[w][1]
-        nears = torch.full_like(origins[rays, :1], window.ray_near)
-        background = torch.full((3,), window.background)
-        parts[w] = (
-            rays,
-            window.render(origins[rays], directions[rays], nears, torch.full_like(nears, torch.inf), background),
-        )
+        rays = (shares[:, w] > 0).nonzero()[:, 0]
+        parts[w] = (rays, _render_window(scene.windows[w][1], origins[rays], directions[rays]))
     return mix_windows(shares, parts)
+
+
+def _render_window(window: BakedWindow, origins: Tensor, directions: Tensor) -> dict[str, Tensor]:
+    """What one window shows of rays without an end."""
+    nears = torch.full_like(origins[:, :1], window.ray_near)
+    background = torch.full((3,), window.background)
+    return window.render(origins, directions, nears, torch.full_like(nears, torch.inf), background)

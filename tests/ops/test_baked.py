@@ -87,6 +87,18 @@ def test_the_forms_agree(seed):
 
 
 @pytest.mark.parametrize("form", FORMS)
+def test_rays_do_not_see_their_neighbours(form):
+    """Rays are marched side by side: whatever their number and order, each finds what it finds alone, to the bit."""
+    window = random_window(num_mpis=3, planes=70)
+    rays = rays_into(window, 50)
+    whole = marched(form, window, rays)
+    parts = [marched(form, window, [x[a:b] for x in rays]) for a, b in ((0, 1), (1, 18), (18, 50))]
+    turned = marched(form, window, [x.flip(0) for x in rays])
+    for name, all_, back, *some in zip(whole._fields, whole, turned, *parts, strict=True):
+        assert torch.equal(all_, torch.cat(some)) and torch.equal(all_, back.flip(0)), name
+
+
+@pytest.mark.parametrize("form", FORMS)
 def test_peaks_are_the_largest_weights(form):
     """A brick's peak is reached, a brick that no ray reads keeps 0, and one ray alone weighs no more than 1."""
     window = random_window(num_mpis=2, density=(150, 255))

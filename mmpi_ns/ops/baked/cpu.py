@@ -50,12 +50,12 @@ class _Packed:
             place = (ctypes.c_float * 3)(*mpi.origin), axes, u0, v0, u1, v1, *scales
             heads.append(_Head(*place, mpi.disparity_step, mpi.last_disparity, *sizes, self.passes[k].data_ptr()))
         self.heads = (_Head * len(heads))(*heads)
-        # Sixteen channels are read at once, also those of the last texel.
-        self.texels = pad(scene.texels.reshape(-1), (0, MOST_CHANNELS))
+        # Sixteen channels are read at once, also those of the last texel, and four densities.
+        self.density, self.texels = (pad(x.reshape(-1), (0, MOST_CHANNELS)) for x in (scene.density, scene.texels))
         low, step = (torch.tensor([getattr(c, name) for c in scene.channel_codes]) for name in ("low", "step"))
         doubled = torch.tensor([1.0] * COLORS + [2.0] * (channels - COLORS))  # tanh x = 2 sigmoid(2 x) - 1
         self.codes = [pad(doubled * x, (0, MOST_CHANNELS - channels)) for x in (low, step)]
-        tables = arguments([scene.columns, scene.density, self.texels, *self.codes])
+        tables = arguments([scene.columns, self.density, self.texels, *self.codes])
         self.scene = _Scene(len(heads), channels, ctypes.addressof(self.heads), *tables)
 
 

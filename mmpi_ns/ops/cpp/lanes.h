@@ -12,6 +12,53 @@ inline Lanes least(Lanes a, Lanes b) { return a < b ? a : b; }
 inline Lanes most(Lanes a, Lanes b) { return a > b ? a : b; }
 inline Lanes magnitude(Lanes x) { return most(x, -x); }
 
+// Conditions of lanes are masks: ~0 where they hold, else 0.
+typedef IntLanes Mask;
+
+inline IntLanes whole(int32_t x) { return x - IntLanes{}; }
+inline IntLanes least(IntLanes a, IntLanes b) { return a < b ? a : b; }
+inline IntLanes most(IntLanes a, IntLanes b) { return a > b ? a : b; }
+inline Lanes pick(Mask where, Lanes a, Lanes b) { return where ? a : b; }
+inline IntLanes pick(Mask where, IntLanes a, IntLanes b) { return where ? a : b; }
+inline Lanes real(IntLanes x) { return __builtin_convertvector(x, Lanes); }
+inline IntLanes truncated(Lanes x) { return __builtin_convertvector(x, IntLanes); } // towards zero
+
+// The bits that any lane has.
+inline uint32_t merged(IntLanes x) {
+    int32_t each[WIDTH], all = 0;
+    __builtin_memcpy(each, &x, sizeof each);
+    for (int i = 0; i < WIDTH; i++) all |= each[i];
+    return uint32_t(all);
+}
+
+inline bool any(Mask where) { return merged(where); }
+
+// A bit for each lane.
+inline uint32_t bits(Mask where) {
+    return merged(where & IntLanes{1,      1 << 1, 1 << 2,  1 << 3,  1 << 4,  1 << 5,  1 << 6,  1 << 7,
+                                   1 << 8, 1 << 9, 1 << 10, 1 << 11, 1 << 12, 1 << 13, 1 << 14, 1 << 15});
+}
+
+inline float largest(Lanes x) {
+    float each[WIDTH];
+    __builtin_memcpy(each, &x, sizeof each);
+    float found = each[0];
+    for (int i = 1; i < WIDTH; i++) found = each[i] > found ? each[i] : found;
+    return found;
+}
+
+// What a function of each lane's number gives.
+template <typename To, typename F> inline To each_lane(IntLanes x, F f) {
+    int32_t from[WIDTH];
+    decltype(f(from[0])) to[WIDTH];
+    static_assert(sizeof to == sizeof(To), "sixteen numbers of four bytes");
+    __builtin_memcpy(from, &x, sizeof from);
+    for (int i = 0; i < WIDTH; i++) to[i] = f(from[i]);
+    To made;
+    __builtin_memcpy(&made, to, sizeof made);
+    return made;
+}
+
 inline Lanes load(const float* from) {
     Lanes x;
     __builtin_memcpy(&x, from, sizeof x);
