@@ -49,7 +49,7 @@ demo: venv ## Make a street, learn it, evaluate it and show what came of it, in 
 	@$(BIN)/python -m mmpi_ns.scripts.demo $(ARGS)
 
 test: venv ## Run the tests (ARGS="..." goes to pytest)
-	$(BIN)/python -m pytest --numprocesses $(WORKERS) --dist loadfile $(ARGS)
+	$(BIN)/python -m pytest --numprocesses $(WORKERS) --dist loadfile --no-loadscope-reorder $(ARGS)
 
 lint: venv ## Check style, formatting and types
 	$(BIN)/python -m ruff check .

@@ -32,6 +32,17 @@ def pytest_configure(config):
         _copy_kernels(source, Path(CACHE, "mmpi_ns"))
 
 
+LONGEST = (
+    "test_gpu", "test_bench_gpu", "test_bench_roads", "test_commands", "test_bench_train", "test_window_training",
+)  # fmt: skip
+"""Files whose few tests take minutes."""
+
+
+def pytest_collection_modifyitems(items):
+    """They start first, so that at the end no worker waits for another (xdist would start them last)."""
+    items.sort(key=lambda item: LONGEST.index(item.path.stem) if item.path.stem in LONGEST else len(LONGEST))
+
+
 def pytest_unconfigure(config):
     for folder in _kept(config):
         _copy_kernels(Path(CACHE, "mmpi_ns"), folder)

@@ -7,42 +7,22 @@ import itertools
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from mmpi_ns.capture.point_cloud import read_ply
 from mmpi_ns.ops.interpolate import interpolate_gathered
 
 
-def read_ply(path: Path) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Positions [P, 3] and colours [P, 3] of a PLY file of points.
-
-    Raises:
-        ValueError: it is no such file.
-    """
-    from plyfile import PlyData, PlyParseError  # comes with nerfstudio's viewer
-
-    try:
-        points = PlyData.read(path)["vertex"]
-        columns = [np.asarray(points[name]) for name in ("x", "y", "z", "red", "green", "blue")]
-    except (PlyParseError, KeyError, ValueError) as error:
-        raise ValueError(f"{path} is not a PLY file of coloured points ({error}): write it again.") from error
-    return np.stack(columns[:3], -1).astype(np.float32), np.stack(columns[3:], -1).astype(np.uint8)
-
-
 def read_points_ourselves() -> None:
-    """Makes nerfstudio's data parser read point clouds by ``read_ply`` in this process.
-
-    open3d, by which it would, is often absent from a machine, or there without the system's libraries that it needs.
-    """
+    """Makes nerfstudio's data parser read point clouds by ``read_ply`` in this process."""
     from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio
 
     def load(self, ply_file_path: Path, transform_matrix: torch.Tensor, scale_factor: float):
         xyz, rgb = read_ply(ply_file_path)
         if not len(xyz):
             return None
-        points = torch.from_numpy(xyz)
+        points = torch.from_numpy(xyz).float()
         points = torch.cat([points, torch.ones_like(points[:, :1])], -1) @ transform_matrix.T * scale_factor
         return {"points3D_xyz": points, "points3D_rgb": torch.from_numpy(rgb)}
 

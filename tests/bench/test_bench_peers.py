@@ -11,6 +11,7 @@ import torch
 from nerfstudio.field_components.encodings import HashEncoding
 
 from mmpi_ns.bench import peers
+from mmpi_ns.capture.point_cloud import read_ply
 from mmpi_ns.bench.progress import Progress, without_length
 from mmpi_ns.ops import dispatch
 
@@ -65,11 +66,11 @@ def test_point_clouds_are_read_without_open3d(tmp_path):
     binary = tmp_path / "binary.ply"
     binary.write_bytes("\n".join(head).format("binary_little_endian 1.0").encode() + np.array(rows, kind).tobytes())
     for path in (text, binary):
-        xyz, rgb = peers.read_ply(path)
+        xyz, rgb = read_ply(path)
         assert xyz.tolist() == [list(r[:3]) for r in rows] and rgb.tolist() == [list(r[3:]) for r in rows]
     text.write_text("solid cube")
     with pytest.raises(ValueError, match="not a PLY file"):
-        peers.read_ply(text)
+        read_ply(text)
 
 
 def test_points_are_where_nerfstudio_puts_them(tmp_path, monkeypatch):

@@ -183,6 +183,21 @@ def test_a_point_cloud_that_is_asked_for_and_not_there_is_named(data, edit, tmp_
     assert said.startswith("--load-3D-points") and "ply_file_path" in said
 
 
+CLOUDS = {
+    "no PLY": b"solid cube", "empty": b"", "cut short": b"ply\nformat binary_little_endian 1.0\nelement vertex 9\n"
+    b"property float x\nproperty float y\nproperty float z\nend_header\n123",
+    "without z": b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nend_header\n1 2\n",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", CLOUDS)
+def test_a_point_cloud_that_cannot_be_read_is_named(data, edit, tmp_path, case):
+    (data / "cloud.ply").write_bytes(CLOUDS[case])
+    edit(file(ply_file_path="cloud.ply"))
+    said = train(data, tmp_path, pipeline__datamanager__dataparser__load_3D_points=True).sentence
+    assert str(data / "cloud.ply") in said and "is not a PLY file of points" in said
+
+
 def test_names_that_say_no_split_are_refused_where_they_must(data, edit, tmp_path):
     edit(lambda meta: [meta.pop(f"{split}_filenames") for split in ("train", "val", "test")])
     said = train(data, tmp_path, pipeline__datamanager__dataparser__eval_mode="filename").sentence
