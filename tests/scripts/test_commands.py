@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from forked import start
 from PIL import Image
 from tiny_scene import FOCAL, HEIGHT, TEST, TRAIN, WIDTH, image_of
 from training_runs import datamanager
@@ -37,7 +38,10 @@ def command(tmp_path_factory):
         "HTTPS_PROXY": nowhere, "HTTP_PROXY": nowhere, "https_proxy": nowhere, "http_proxy": nowhere,
     }  # fmt: skip
 
-    def run(name, *arguments):
+    def run(name, *arguments, fork=True):
+        """In a fork of a process that has imported nerfstudio, or as it is installed."""
+        if fork:
+            return start(name, *arguments, environment=env).end(200).shown
         path = Path(sys.executable).with_name(name)
         done = subprocess.run(
             [str(path), *map(str, arguments)], env=env, cwd=folder, capture_output=True, text=True, timeout=200
@@ -52,7 +56,7 @@ def command(tmp_path_factory):
 def train(command, scene, plan_file, tmp_path_factory):
     output = tmp_path_factory.mktemp("output")
 
-    def run(timestamp, *arguments):
+    def run(timestamp, *arguments, fork=True):
         command(
             "ns-train", "mmpi-small", "--data", scene, "--output-dir", output, "--experiment-name", "tiny",
             "--timestamp", timestamp, "--vis", "tensorboard", "--machine.device-type", "cpu",
@@ -60,7 +64,7 @@ def train(command, scene, plan_file, tmp_path_factory):
             "--pipeline.model.plan-file", plan_file, "--pipeline.model.hidden-width", "8",
             "--pipeline.model.training", "two-phase", "--pipeline.model.rays-per-mpi", "split",
             "--pipeline.model.blend-share", "0.25", "--pipeline.model.finetune-share", "0.25",
-            "--pipeline.datamanager.train-num-rays-per-batch", "256", *arguments,
+            "--pipeline.datamanager.train-num-rays-per-batch", "256", *arguments, fork=fork,
         )  # fmt: skip
         return output / "tiny" / "mmpi-small" / timestamp
 
@@ -70,7 +74,7 @@ def train(command, scene, plan_file, tmp_path_factory):
 @pytest.fixture(scope="module")
 def run_folder(train):
     """Folder of a whole training run."""
-    return train("whole")
+    return train("whole", fork=False)
 
 
 @pytest.fixture(scope="module")
