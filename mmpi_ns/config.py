@@ -5,14 +5,14 @@ from __future__ import annotations
 import torch
 from nerfstudio.configs.base_config import LoggingConfig, MachineConfig, ViewerConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
-from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
+from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
 from mmpi_ns.capture.datamanager import MMPIDataManagerConfig
 from mmpi_ns.model import MMPIModelConfig
 from mmpi_ns.placement.defaults import DEFAULTS
 from mmpi_ns.placement.rule import PlacementConfig
-from mmpi_ns.rendering.pipeline import MMPIPipeline
+from mmpi_ns.rendering.pipeline import MMPIPipelineConfig
 from mmpi_ns.training.learning_rates import PhaseSchedulerConfig
 from mmpi_ns.training.losses import LossWeights
 from mmpi_ns.training.touched_adam import TouchedAdamConfig
@@ -20,14 +20,15 @@ from mmpi_ns.training.trainer import MMPITrainerConfig
 
 PAPER_DATA = {"keypoint_rays": 0, "dense_depth": False, "depth_images": False, "new_view_share": 0.0}
 """The paper trains on the colours of pixels alone."""
+POSE_RATE = 1e-4
+"""Learning rate of refined poses, radians and scene units: a tenth of nerfacto's (docs/experiments.md)."""
 
 
 def _optimizers(colour: float) -> dict:
     rates = {"density": 0.1, "features": 0.1, "colour": colour, "reliability": 0.1}
-    return {
-        kind: {"optimizer": TouchedAdamConfig(lr=lr), "scheduler": PhaseSchedulerConfig(kind=kind)}
-        for kind, lr in rates.items()
-    }
+    optimizers: dict = {kind: TouchedAdamConfig(lr=lr) for kind, lr in rates.items()}
+    optimizers["camera_opt"] = AdamOptimizerConfig(lr=POSE_RATE, eps=1e-15)
+    return {kind: {"optimizer": x, "scheduler": PhaseSchedulerConfig(kind=kind)} for kind, x in optimizers.items()}
 
 
 def _method(
@@ -42,8 +43,7 @@ def _method(
         steps_per_eval_image=0,
         steps_per_eval_all_images=0,
         logging=LoggingConfig(profiler="none"),
-        pipeline=VanillaPipelineConfig(
-            _target=MMPIPipeline,
+        pipeline=MMPIPipelineConfig(
             datamanager=MMPIDataManagerConfig(
                 dataparser=NerfstudioDataParserConfig(),
                 train_num_rays_per_batch=rays,

@@ -8,6 +8,7 @@ from threading import current_thread, main_thread
 from typing import Any, Literal
 
 import torch
+from nerfstudio.cameras.camera_optimizers import CameraOptimizer, CameraOptimizerConfig
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.scene_box import OrientedBox
@@ -47,7 +48,8 @@ from mmpi_ns.training.losses import LossWeights, batch_losses, over_background, 
 from mmpi_ns.training.memory import check_memory
 from mmpi_ns.training.phases import Schedule, Training, make_schedule
 from mmpi_ns.training.progress import Progress
-from mmpi_ns.training.run import TrainingRun, parameters_by_kind, views_of
+from mmpi_ns.training.refined_poses import check_refined_poses, move_rays
+from mmpi_ns.training.run import TrainingRun, views_of
 from mmpi_ns.utils.errors import InputError
 from mmpi_ns.utils.random_draws import generator
 
@@ -74,6 +76,8 @@ class MMPIModelConfig(ModelConfig):
     half_windows: bool = False
     """Write the finished windows of a long capture in half precision: half of the disk, and the same pictures to a
     fraction of a grey level."""
+    camera_optimizer: CameraOptimizerConfig = field(default_factory=CameraOptimizerConfig)
+    """Refines the poses of the training images while it trains (docs/captures.md, "Poses that are not exact")."""
     training: Training = "joint"
     """Each MPI alone, then reliability (two-phase), or all together without reliability (joint)."""
     blend_share: float = 0.05
@@ -190,7 +194,12 @@ class MMPIModel(Model):
         self.sampler = MMPISampler()
         self.metrics = ImageMetrics(config.lpips_net)
         self.show = ViewerDropdown("Show MPI", "all", ["all", *windows.names], hint="One MPI alone, or all")
-        self.run = TrainingRun(self.progress, self.field, self.store, views, config.release_weight)
+        self.camera_optimizer: CameraOptimizer = config.camera_optimizer.setup(
+            num_cameras=self.num_train_data, device=self.kwargs.get("device", "cpu")
+        )
+        check_refined_poses(config.camera_optimizer.mode, len(windows))
+        poses = self.camera_optimizer.parameters()
+        self.run = TrainingRun(self.progress, self.field, self.store, views, config.release_weight, [*poses])
         self.register_load_state_dict_post_hook(lambda *_: self._after_loading())
 
     def _plan(self) -> WindowedPlan:
@@ -222,7 +231,7 @@ class MMPIModel(Model):
         self.show.set_options(["all", *self.progress.windows.names])
 
     def get_param_groups(self) -> dict[str, list[Parameter]]:
-        return parameters_by_kind(self.field)
+        return self.run.parameters()
 
     def get_training_callbacks(self, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:  # type: ignore[override]
         before = [TrainingCallbackLocation.BEFORE_TRAIN_ITERATION]
@@ -238,6 +247,7 @@ class MMPIModel(Model):
         """rgb (without background), accumulation, depth, and ``RenderedRays`` for the losses, of the window at hand."""
         progress, field = self.progress, self.field
         asked, head_mask, choose = len(bundle), None, None
+        move_rays(bundle, self.camera_optimizer)
         bundle = bounded(bundle, field.plan)
         if progress.phase.name == "individual":
             g = generator(self.config.seed, progress.step, "assignment", self.device)
@@ -382,35 +392,38 @@ class MMPIModel(Model):
         self, outputs: dict[str, Any], batch: dict[str, Tensor], metrics_dict: dict[str, Any] | None = None
     ) -> dict[str, Tensor]:
         if "training" not in outputs:  # an evaluation batch during training
-            return {"rgb_loss": photometric(outputs["rgb"], self._observed(batch))}
+            return {"rgb_loss": photometric(outputs["rgb"], self.observed(batch))}
         image, step = batch["image"].to(self.device), self.progress.step
         g = generator(self.config.seed, step, "background", self.device)
         total = batch_losses(outputs["training"], self.field, image, self.config.loss, g, step)
+        self.camera_optimizer.get_loss_dict(total)
         # A batch that meets nothing that trains would have no gradient at all; this adds 0 with one.
         total["rgb_loss"] = total["rgb_loss"] + self.device_indicator_param.sum()
         return total
 
     def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Tensor]) -> dict[str, Any]:
         if "training" not in outputs:
-            return {"psnr": -10 * torch.log10(photometric(outputs["rgb"], self._observed(batch)))}
+            return {"psnr": -10 * torch.log10(photometric(outputs["rgb"], self.observed(batch)))}
         rays: RenderedRays = outputs["training"]
-        return {
+        found = {
             "live_samples": rays.report.live.float().mean(),
             "kept_samples": metadata_of(rays.samples)["valid"].float().sum() / len(rays.report.live),
             "dropped_mass": rays.report.dropped_mass.mean(),
         }
+        self.camera_optimizer.get_metrics_dict(found)
+        return found
 
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
-        observed = self._observed(batch).to(outputs["rgb"].device)
+        observed = self.observed(batch).to(outputs["rgb"].device)
         values = self.metrics(outputs["rgb"], observed)
         values["dropped_mass"] = float(outputs["dropped_mass"].mean())
         if "distance" in batch:
             values |= depth_metrics(outputs["depth"], batch["distance"].to(outputs["depth"]))
         return values, pictures(observed, outputs, len(self.progress.windows.names))
 
-    def _observed(self, batch: dict[str, Tensor]) -> Tensor:
+    def observed(self, batch: dict[str, Tensor]) -> Tensor:
         """The pixels of a batch, over the background where they are transparent."""
         image = batch["image"].to(self.device)
         return over_background(image, torch.full_like(image[..., :3], BACKGROUNDS[self.config.background]))

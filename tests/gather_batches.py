@@ -34,10 +34,13 @@ def in_float32(given):
     return values.float(), [KnownTaps(g.positions, g.shares.float()) for g in groups], slots, weights.float(), wanted
 
 
-def with_gradients(function, given, upstream):
+def with_gradients(function, given, upstream, moved=False):
+    """Sums and gradients of values and weights, and of shares where samples are moved."""
     values, weights = (x.clone().requires_grad_() for x in (given[0], given[3]))
-    sums = function(values, given[1], given[2], weights, given[4])
+    groups = [KnownTaps(g.positions, g.shares.clone().requires_grad_(moved)) for g in given[1]]
+    sums = function(values, groups, given[2], weights, given[4])
     chosen = [s for s in parts_of(sums) if s.requires_grad]
     grads = [u for u, s in zip(upstream, parts_of(sums), strict=True) if s.requires_grad]
     torch.autograd.backward(chosen, [g.to(s.dtype) for g, s in zip(grads, chosen, strict=True)])
-    return [x.double() for x in (*(s.detach() for s in parts_of(sums)), values.grad, weights.grad)]
+    to_shares = [g.shares.grad for g in groups] if moved else []
+    return [x.double() for x in (*(s.detach() for s in parts_of(sums)), values.grad, weights.grad, *to_shares)]

@@ -44,6 +44,8 @@ KEYPOINT_DEPTH = "keypoint_inverse_distance"
 """Ray-bundle metadata: inverse distance of the SfM point on a keypoint ray, 0 on ordinary rays."""
 PIXEL_DEPTH = "pixel_inverse_distance"
 """Ray-bundle metadata [R, 2]: inverse distance of what a pixel shows and its expected error, 0 where not known."""
+OWN_PIXEL = "is_own_pixel"
+"""Ray-bundle metadata [R, 1]: whether a ray goes through a pixel of a training image."""
 
 
 @dataclass
@@ -280,6 +282,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
             keypoint_bundle, keypoint_depths = self._keypoint_rays(count, g)
             bundle, depths = _join(bundle, keypoint_bundle), torch.cat([depths, keypoint_depths])
             pixel_depths = torch.cat([pixel_depths, pixel_depths.new_zeros(len(keypoint_depths), 2)])
+        bundle.metadata[OWN_PIXEL] = (torch.arange(len(bundle), device=self.device) < len(indices))[:, None]
         bundle.metadata[KEYPOINT_DEPTH] = depths
         bundle.metadata[PIXEL_DEPTH] = pixel_depths
         return bundle, {"image": colors, "indices": indices}

@@ -17,6 +17,7 @@ from nerfstudio.field_components.field_heads import FieldHeadNames
 from torch import Tensor
 
 from mmpi_ns.field.color_network import ColorNetworks
+from mmpi_ns.field.moving import moving
 from mmpi_ns.field.samples import Gathered, Lookup, Taps, by_head, head_spans, metadata_of, places_of
 from mmpi_ns.field.shading import RayColors, RayShader, Shading
 from mmpi_ns.field.tables import TexelTables, replace_data
@@ -179,6 +180,10 @@ class MMPIField(TexelTables):
         index, counts = by_head(meta["heads"][..., 0], meta["valid"][..., 0], len(self.grids), head_counts)
         heads, planes = (meta[name].reshape(-1).index_select(0, index) for name in ("heads", "planes"))
         ndc = meta["ndc"].reshape(-1, 3).index_select(0, index)
+        starts, ways = ray_samples.frustums.origins[:, 0], ray_samples.frustums.directions[:, 0]
+        if starts.requires_grad or ways.requires_grad:
+            rays, inverse_t = index // meta["valid"].shape[1], meta["inverse_t"].reshape(-1)[index]
+            ndc = moving(self.layout, starts, ways, rays, heads, planes, inverse_t, ndc)
         spans, num_mpis, groups = head_spans(counts), len(self.plan.mpis), []
         if in_mpis := [own for k, own in spans if k < num_mpis]:
             own = slice(0, in_mpis[-1].stop)
@@ -294,7 +299,9 @@ class MMPIField(TexelTables):
     def sample_shares(self, ray_samples: RaySamples, lookup: Lookup) -> tuple[Tensor, Tensor]:
         """log P and log(1 - P) of the valid samples of a merged batch, with gradients to the reliability."""
         frustums = ray_samples.frustums
-        local = geometry.LocalRays.of(frustums.origins[:, 0], frustums.directions[:, 0], self.frames)
+        # Shares do not move with poses.
+        origins, directions = frustums.origins[:, 0].detach(), frustums.directions[:, 0].detach()
+        local = geometry.LocalRays.of(origins, directions, self.frames)
         inverse_t = metadata_of(ray_samples)["inverse_t"].reshape(-1)[lookup.index]
         return self.log_shares(lookup.rays, local, inverse_t, lookup.heads)
 

@@ -62,6 +62,8 @@ def _outcome(name: str, form: dispatch.Form, given: tuple) -> list[Tensor]:
     leaves = [
         c.requires_grad_() for c, x in zip(copies, given, strict=True) if isinstance(x, Tensor) and x.requires_grad
     ]
+    groups = [g for x in copies if isinstance(x, list) for g in x if isinstance(g, KnownTaps)]
+    leaves += [g.shares for g in groups if g.shares.requires_grad]
     with torch.set_grad_enabled(bool(leaves)):
         made = dispatch.function(name, form)(*copies)
     found = _numbers(copies if made is None else made)
@@ -185,11 +187,14 @@ def _adams(device: str) -> list[tuple]:
 
 
 def _gathers(device: str) -> list[tuple]:
-    """Samples with known texels, of planes and of both planes and the cube; texels with gradients and without."""
+    """Samples with known texels, of planes and of both planes and the cube, that move and that do not; texels with
+    gradients and without."""
     weights, wanted = 0.1 * _random(device, RAYS, 4), torch.arange(RAYS, device=device) % 5 > 0
     cases = []
-    for sizes, learns in (((4,), True), ((4, 8), False), ((4, 8), True)):
-        groups = [KnownTaps(_entries(device, RAYS, n).int(), _random(device, RAYS, n) / n) for n in sizes]
+    both = (4, 8)
+    for sizes, learns, moves in (((4,), True, False), (both, False, False), (both, True, False), (both, True, True)):
+        shares = [(_random(device, RAYS, n) / n).requires_grad_(moves) for n in sizes]
+        groups = [KnownTaps(_entries(device, RAYS, x.shape[1]).int(), x) for x in shares]
         slots = torch.cat([4 * torch.arange(RAYS, device=device) + i for i in range(len(sizes))])
         values = (2 * _random(device, ROWS, CHANNELS) - 1).requires_grad_(learns)
         cases.append((values, groups, slots, weights.clone().requires_grad_(), wanted))

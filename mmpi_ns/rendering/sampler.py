@@ -1,6 +1,6 @@
 """Sample and merge: each ray is sampled in every MPI, the samples are merged by distance (paper sec. III-B).
 
-Everything here is free of gradients. The field later differentiates through the samples that the sampler kept.
+The march is free of gradients. The field later differentiates through the samples that the sampler kept.
 """
 
 from __future__ import annotations
@@ -44,7 +44,6 @@ class MergeReport:
 class MMPISampler(Sampler):
     """Samples rays in all MPIs and the cube, and merges by distance."""
 
-    @torch.no_grad()
     def generate_ray_samples(  # type: ignore[override]
         self,
         ray_bundle: RayBundle | None = None,
@@ -75,12 +74,13 @@ class MMPISampler(Sampler):
             ``skipped_before`` and ``tau``, the (blended) optical depth (each [R, S, .]), and what was left out.
         """
         assert ray_bundle is not None
-        at = crossings(ray_bundle, field, head_mask, choose)
-        explained = (at.counts > 0).any(-1, keepdim=True)
-        if head_mask is not None or choose is not None:
-            explained &= _sees_all(at.hits, at.counts[:, : len(field.plan.mpis)], field)
-        options = MarchOptions(threshold, fair_share, blend_form, baked=shares is not None)
-        merged = march(field.layout, field.tables(shares), at, options)
+        with torch.no_grad():
+            at = crossings(ray_bundle, field, head_mask, choose)
+            explained = (at.counts > 0).any(-1, keepdim=True)
+            if head_mask is not None or choose is not None:
+                explained &= _sees_all(at.hits, at.counts[:, : len(field.plan.mpis)], field)
+            options = MarchOptions(threshold, fair_share, blend_form, baked=shares is not None)
+            merged = march(field.layout, field.tables(shares), at, options)
         left = merged.skipped_total, merged.dropped_mass
         report = MergeReport(at.counts.sum(-1), *left, explained, merged.head_counts)
         return _ray_samples(ray_bundle, merged), report

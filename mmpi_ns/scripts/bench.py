@@ -30,6 +30,7 @@ COMMANDS = {
     "dense": "speed.dense",
     "regions": "quality.regions",
     "prepare": "quality.prepare",
+    "poses": "quality.poses",
 }
 """Module below mmpi_ns.bench that holds the command, as a class of its name. Only what is asked for is imported."""
 

@@ -12,14 +12,14 @@ from itertools import pairwise
 from typing import Literal
 
 PhaseName = Literal["individual", "blend", "finetune", "joint"]
-ParameterKind = Literal["density", "features", "colour", "reliability"]
+ParameterKind = Literal["density", "features", "colour", "reliability", "camera_opt"]
 Training = Literal["two-phase", "joint"]
 
 TRAINS: dict[str, frozenset[str]] = {
-    "individual": frozenset({"density", "features", "colour"}),
-    "joint": frozenset({"density", "features", "colour"}),
+    "individual": frozenset({"density", "features", "colour", "camera_opt"}),
+    "joint": frozenset({"density", "features", "colour", "camera_opt"}),
     "blend": frozenset({"reliability"}),
-    "finetune": frozenset({"density", "features", "colour", "reliability"}),
+    "finetune": frozenset({"density", "features", "colour", "reliability", "camera_opt"}),
 }
 """What trains in each phase; everything else is frozen, bit for bit."""
 

@@ -49,6 +49,7 @@ class TrainingRun:
         store: where finished windows go.
         views: the training images; None: every texel is stored.
         release_weight: bricks in which no sample weighs this much are given up.
+        poses: corrections of the cameras' poses, where they are refined.
     """
 
     def __init__(
@@ -58,12 +59,17 @@ class TrainingRun:
         store: WindowStore,
         views: TrainingViews | None,
         release_weight: float,
+        poses: list[Parameter] | None = None,
     ) -> None:
         self.progress, self.field, self.store = progress, field, store
-        self.views, self.release_weight = views, release_weight
+        self.views, self.release_weight, self._poses = views, release_weight, poses or []
         self.shared = False
         """Whether other processes train some of the windows."""
         self._drawn_from: int | None = None
+
+    def parameters(self) -> dict[str, list[Parameter]]:
+        """What trains, by what has a learning rate of its own."""
+        return parameters_by_kind(self.field) | ({"camera_opt": self._poses} if self._poses else {})
 
     def cameras_of(self, centers: NDArray[np.float64], window: int) -> NDArray[np.int64]:
         """Those of the cameras that ask a window."""
@@ -84,7 +90,7 @@ class TrainingRun:
         progress.step = step
         field.forget_shares()
         optimizers = attributes.optimizers.optimizers if attributes and attributes.optimizers else {}
-        groups = parameters_by_kind(field)
+        groups = self.parameters()
         if progress.schedule.window_at(step) != progress.window:
             self._begin_window(progress.schedule.window_at(step), progress.schedule.texel_factor(step))
             for kind, params in groups.items():

@@ -145,13 +145,13 @@ def test_adam_on_rows_equals_the_plain_one():
 # Colours -------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("trains", [True, False])
+@pytest.mark.parametrize(("trains", "moved"), [(True, True), (True, False), (False, False)])
 @pytest.mark.parametrize(("channels", "in_cube"), [(3, False), (9, True), (20, True)])
-def test_gathered_sums_and_their_gradients_are_those_of_float64(channels, in_cube, trains):
+def test_gathered_sums_and_their_gradients_are_those_of_float64(channels, in_cube, trains, moved):
     given, upstream = batch(channels, rays=40, in_cube=in_cube), [normal(40, n) for n in (channels, 1, 3, 3)]
     if trains:
-        found = with_gradients(gather.gather_taps, in_float32(given), upstream)
-        wanted = with_gradients(gather.reference.gather_taps, given, upstream)
+        found = with_gradients(gather.gather_taps, in_float32(given), upstream, moved)
+        wanted = with_gradients(gather.reference.gather_taps, given, upstream, moved)
     else:
         values, groups, slots, weights, wanted_rays = in_float32(given)
         sums = gather.gather_taps(values, groups, slots, weights.requires_grad_(), wanted_rays)

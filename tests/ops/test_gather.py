@@ -56,13 +56,16 @@ def test_sums_are_those_of_loops(function, channels, in_cube):
 
 @pytest.mark.parametrize("channels", CHANNELS)
 @pytest.mark.parametrize("seed", [0, 1])
-def test_gradients_are_those_of_float64(channels, seed):
+@pytest.mark.parametrize("moved", [False, True])
+def test_gradients_are_those_of_float64(channels, seed, moved):
     given = batch(channels, seed)
     g = torch.Generator().manual_seed(seed)
     upstream = [torch.randn(7, n, generator=g, dtype=torch.float64) for n in (channels, 1, 3, 3)]
     fast, exact = (
-        with_gradients(f, x, upstream) for f, x in ((gather_taps, in_float32(given)), (reference.gather_taps, given))
+        with_gradients(f, x, upstream, moved)
+        for f, x in ((gather_taps, in_float32(given)), (reference.gather_taps, given))
     )
+    assert len(fast) == (8 if moved else 6)
     for a, b in zip(fast, exact, strict=True):
         assert b.abs().max() > 0.05 and (a - b).abs().max() < 3e-6 * (1 + b.abs().max())
 
@@ -70,14 +73,16 @@ def test_gradients_are_those_of_float64(channels, seed):
 def test_reference_gradients_are_finite_differences():
     values, groups, slots, weights, wanted = batch(5)
 
-    def sums(values, weights):
-        return reference.gather_taps(values, groups, slots, weights, wanted).gathered
+    def sums(values, weights, *shares):
+        taps = [KnownTaps(g.positions, s) for g, s in zip(groups, shares or [g.shares for g in groups], strict=True)]
+        return reference.gather_taps(values, taps, slots, weights, wanted).gathered
 
     def moments(values):
         found = reference.gather_taps(values, groups, slots, weights, wanted)
         return found.first, found.second
 
-    assert torch.autograd.gradcheck(sums, (values.requires_grad_(), weights.clone().requires_grad_()))
+    shares = [g.shares.clone().requires_grad_() for g in groups]
+    assert torch.autograd.gradcheck(sums, (values.requires_grad_(), weights.clone().requires_grad_(), *shares))
     assert torch.autograd.gradcheck(moments, (values,))
 
 

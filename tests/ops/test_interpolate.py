@@ -109,11 +109,16 @@ def test_weights_of_another_precision_are_taken():
     assert torch.equal(interpolate(table, rows, weights.double()), interpolate(table, rows, weights))
 
 
-def test_weights_get_no_gradient():
+@pytest.mark.parametrize("gathered", [False, True])
+@pytest.mark.parametrize("trains", [False, True])
+def test_gradients_of_weights_are_finite_differences(gathered, trains):
+    """Also where the table is frozen, which then gets none."""
     table, rows, weights = lookup()
-    weights.requires_grad_()
-    interpolate(table.requires_grad_(), rows, weights).sum().backward()
-    assert weights.grad is None and table.grad is not None
+    table.requires_grad_(trains)
+    look = interpolate_gathered if gathered else interpolate
+    assert torch.autograd.gradcheck(lambda w: look(table.detach(), rows, w).sin(), (weights.requires_grad_(),))
+    look(table, rows, weights).sum().backward()
+    assert torch.equal(weights.grad, table.detach()[rows].sum(-1)) and (table.grad is not None) == trains
 
 
 # Rows ----------------------------------------------------------------------------------------------------------------

@@ -19,7 +19,7 @@ def gather_taps(
     weights: Float[Tensor, "R S"],
     wanted: Bool[Tensor, "R"],
 ) -> RaySums:
-    """Sums over samples whose taps are known, with gradients to ``values`` and ``weights``.
+    """Sums over samples whose taps are known, with gradients to ``values``, ``weights`` and the taps' shares.
 
     Args:
         values: texels that the batch reads.

@@ -19,14 +19,20 @@ LANES = 16
 
 
 class _Taps(ctypes.Structure):
-    _fields_ = [("positions", ctypes.c_void_p), ("shares", ctypes.c_void_p), ("count", ctypes.c_int64)]
+    _fields_ = [
+        ("positions", ctypes.c_void_p),
+        ("shares", ctypes.c_void_p),
+        ("count", ctypes.c_int64),
+        ("grad_shares", ctypes.c_void_p),
+    ]
 
 
-def _groups(positions: list[Tensor], shares: list[Tensor]) -> Any:
-    """Taps of planes, then those of the cube, as the kernels take them."""
+def _groups(taps: list[Tensor], to_shares: list[Tensor | None] | None = None) -> Any:
+    """Taps of planes, then those of the cube, as the kernels take them, and where the gradients of their shares go."""
     found = (_Taps * 2)()
-    for position, share in zip(positions, shares, strict=True):
-        found[position.shape[1] // 8] = _Taps(*arguments((position, share, len(position))))
+    positions, shares = taps[::2], taps[1::2]
+    for position, share, to in zip(positions, shares, to_shares or [None] * len(shares), strict=True):
+        found[position.shape[1] // 8] = _Taps(*arguments((position, share, len(position), to)))
     return found
 
 
@@ -47,7 +53,7 @@ class _GatherTaps(torch.autograd.Function):
         numbers.view(-1)[slots] = torch.arange(len(slots), dtype=torch.int32)
         numbers[~wanted] = -1
         sums = torch.empty(num_rays, channels + 1 + COLORS)
-        given = (values, *values.shape, _groups(held[4::2], held[5::2]), numbers, weights)
+        given = (values, *values.shape, _groups(held[4:]), numbers, weights)
         call_in_parts("mmpi_gather_taps", num_rays, given, (width, sums))
         ctx.save_for_backward(*held)
         found = split_sums(sums, channels)
@@ -60,10 +66,12 @@ class _GatherTaps(torch.autograd.Function):
         to_sums, _, to_first, to_second = grad_outputs
         to_values = torch.zeros_like(values) if ctx.needs_input_grad[0] else None
         to_weights = torch.zeros_like(weights)
-        given = (values, *values.shape, _groups(taps[::2], taps[1::2]), slots, wanted, weights)
+        needed = zip(taps[1::2], ctx.needs_input_grad[5::2], strict=True)
+        to_shares = [torch.zeros_like(x) if moves else None for x, moves in needed]
+        given = (values, *values.shape, _groups(taps, to_shares), slots, wanted, weights)
         padded = [_pad(g) for g in (to_sums, to_first, 2 * to_second)]
         call("mmpi_gather_back", *given, *padded, weights.shape[1], to_values, to_weights)
-        return to_values, to_weights, None, None, *[None] * len(taps)
+        return to_values, to_weights, None, None, *(x for to in to_shares for x in (None, to))
 
 
 def gather_taps(values: Tensor, groups: list[KnownTaps], slots: Tensor, weights: Tensor, wanted: Tensor) -> RaySums:

@@ -12,6 +12,7 @@ struct Taps {
     const int32_t* positions;
     const float* shares;
     int64_t count;
+    float* grad_shares; // null where not wanted
 };
 
 struct Texel {
@@ -69,6 +70,13 @@ void put_known(Sample& sample, const Taps* groups, int64_t number) {
         sample.rows[tap] = group.positions[at + tap], sample.shares[tap] = group.shares[at + tap];
 }
 
+// Where the gradients of a sample's shares go.
+float* grad_of_shares(const Taps* groups, int64_t number) {
+    const bool in_cube = number >= groups[0].count;
+    const Taps& group = groups[in_cube];
+    return group.grad_shares ? group.grad_shares + (in_cube ? 8 * (number - groups[0].count) : 4 * number) : nullptr;
+}
+
 } // namespace
 
 extern "C" {
@@ -104,8 +112,9 @@ void mmpi_gather_taps(const float* values, int64_t rows, int64_t channels, const
     gather_rays({values, rows, channels}, begin, end, find, sums);
 }
 
-// Gradients of values [rows, channels] (added to what is there; null where not wanted) and weights [R, S] from those of the sums [R, padded]
-// and, for the values alone, of the sums of colours and twice those of squared colours [R, 16], padded with zeros.
+// Gradients of values [rows, channels] (added to what is there; null where not wanted), of shares (likewise, in the taps)
+// and of weights [R, S] from those of the sums [R, padded] and, but for the weights, of the sums of colours and twice
+// those of squared colours [R, 16], padded with zeros.
 // Samples are taken in the order of `slots`, so sums do not depend on threads.
 void mmpi_gather_back(const float* values, int64_t rows, int64_t channels, const Taps* groups, const int64_t* slots,
                       const bool* wanted, const float* weights, const float* grad_sums, const float* grad_colors,
@@ -141,6 +150,11 @@ void mmpi_gather_back(const float* values, int64_t rows, int64_t channels, const
             for (int tap = 0; grad_values && tap < sample.taps; tap++) {
                 float* to = grad_values + sample.rows[tap] * channels + first;
                 for (int64_t c = 0; c < size; c++) to[c] += sample.shares[tap] * down[c];
+            }
+            float* to_shares = grad_of_shares(groups, n);
+            for (int tap = 0; to_shares && tap < sample.taps; tap++) {
+                const float* read = values + sample.rows[tap] * channels + first;
+                for (int64_t c = 0; c < size; c++) to_shares[tap] += read[c] * down[c];
             }
         }
         float sum = 0;

@@ -80,11 +80,12 @@ def gather_kernel(
     do_not_specialize=("first", "count", "slots_per_ray", "positions", "shares", "to_sums", "to_first", "to_second"),
 )
 def gather_back_kernel(
-    values, slots, wanted, weights, positions, shares, to_sums, to_first, to_second, to_values, to_weights,
-    first, count, slots_per_ray, channels, NEEDED: tl.constexpr, TAPS: tl.constexpr, CHANNELS: tl.constexpr,
-    BLOCK: tl.constexpr,
+    values, slots, wanted, weights, positions, shares, to_sums, to_first, to_second, to_values, to_weights, to_shares,
+    first, count, slots_per_ray, channels, NEEDED: tl.constexpr, MOVED: tl.constexpr, TAPS: tl.constexpr,
+    CHANNELS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Gradients of texels (added to what is there) and weights; a lane a sample, the ``first`` one and those after."""
+    """Gradients of texels (added to what is there), weights and shares, the first and the last where NEEDED and where
+    samples may be MOVED; a lane a sample, the ``first`` one and those after."""
     number, column = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK), tl.arange(0, CHANNELS)[None, :]
     inside = number < count
     slot = tl.load(slots + first + number, inside, 0)
@@ -94,15 +95,20 @@ def gather_back_kernel(
     filled, is_color = inside[:, None] & (column < channels), inside[:, None] & (column < 3)
     slope = tl.load(to_sums + ray[:, None] * channels + column, filled, 0.0)
     tl.store(to_weights + slot, tl.sum(slope * value, 1), inside)
-    if NEEDED:
+    if NEEDED or MOVED:
         slope += tl.load(to_first + ray[:, None] * 3 + column, is_color, 0.0)
         slope += 2 * value * tl.load(to_second + ray[:, None] * 3 + column, is_color, 0.0)
         inner = tl.where(column < 3, value * (1 - value), 1 - value * value)
         down = tl.load(weights + slot, inside, 0.0)[:, None] * slope * inner
         for tap in tl.static_range(TAPS):
             row = tl.load(positions + number * TAPS + tap, inside, 0).to(tl.int64)
-            share = tl.load(shares + number * TAPS + tap, inside, 0.0)
-            tl.atomic_add(to_values + row[:, None] * channels + column, share[:, None] * down, filled, sem="relaxed")
+            at = row[:, None] * channels + column
+            if NEEDED:
+                share = tl.load(shares + number * TAPS + tap, inside, 0.0)
+                tl.atomic_add(to_values + at, share[:, None] * down, filled, sem="relaxed")
+            if MOVED:
+                read = tl.load(values + at, filled, 0.0)
+                tl.store(to_shares + number * TAPS + tap, tl.sum(read * down, 1), inside)
 
 
 def sizes(channels: int, device: torch.device, numbers: int = NUMBERS) -> tuple[int, int]:
@@ -140,15 +146,16 @@ class _GatherTaps(torch.autograd.Function):
         needed, channels = ctx.needs_input_grad[0], values.shape[1]
         to_values, to_weights = torch.zeros_like(values) if needed else values, torch.zeros_like(weights)
         columns, block = sizes(channels, values.device)
-        first = 0
-        for positions, shares in zip(taps[::2], taps[1::2], strict=True):
+        moved, to_shares, first = any(ctx.needs_input_grad[5::2]), [torch.zeros_like(x) for x in taps[1::2]], 0
+        for positions, shares, to in zip(taps[::2], taps[1::2], to_shares, strict=True):
             launch(
                 gather_back_kernel, len(positions), block, values, slots, wanted, weights, positions, shares,
-                to_sums, to_first, to_second, to_values, to_weights, first, len(positions), weights.shape[1], channels,
-                NEEDED=needed, TAPS=shares.shape[1], CHANNELS=columns, BLOCK=block,
+                to_sums, to_first, to_second, to_values, to_weights, to, first, len(positions), weights.shape[1],
+                channels, NEEDED=needed, MOVED=moved, TAPS=shares.shape[1], CHANNELS=columns, BLOCK=block,
             )  # fmt: skip
             first += len(positions)
-        return to_values if needed else None, to_weights, None, None, None, None, None, None
+        given = (x if moved else None for to in to_shares for x in (None, to))
+        return to_values if needed else None, to_weights, None, None, *given
 
 
 def gather_taps(values: Tensor, groups: list[KnownTaps], slots: Tensor, weights: Tensor, wanted: Tensor) -> RaySums:

@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from mmpi_ns.ops import dispatch
+from mmpi_ns.ops.interpolate import reference
 from mmpi_ns.ops.interpolate.reference import RowIndex
 from mmpi_ns.ops.layout import SceneLayout
 
@@ -20,7 +21,10 @@ from mmpi_ns.ops.layout import SceneLayout
 def texel_rows(
     layout: SceneLayout, heads: Int[Tensor, "N"], planes: Int[Tensor, "N"], ndc: Float[Tensor, "N 3"]
 ) -> tuple[Int[Tensor, "N 4"], Float[Tensor, "N 4"]]:
-    """``TexelGrid.bilinear`` of samples in several MPIs: the rows that each reads, and their weights."""
+    """``TexelGrid.bilinear`` of samples in several MPIs: the rows that each reads, and their weights, with gradients to
+    ``ndc`` where it wants them."""
+    if ndc.requires_grad:
+        return reference.texel_rows(layout, heads, planes, ndc)
     return dispatch.run("texel_rows", layout, heads, planes, ndc)
 
 
@@ -54,12 +58,12 @@ def raise_peaks(peaks: Float[Tensor, "B"], rows: Int[Tensor, "N T"], weights: Fl
 def interpolate(
     table: Float[Tensor, "T C"], rows: Int[Tensor, "N B"], weights: Float[Tensor, "N B"]
 ) -> Float[Tensor, "N C"]:
-    """sum_b weights[n, b] table[rows[n, b]]. The table's gradient is sparse over rows; weights get none.
+    """sum_b weights[n, b] table[rows[n, b]]. The table's gradient is sparse over rows.
 
     Args:
         table: texels, channels last.
         rows: rows to combine for each output.
-        weights: their weights (constants).
+        weights: their weights.
     """
     return _Interpolate.apply(table, rows, weights.to(table.dtype))  # type: ignore[no-any-return]
 
@@ -80,16 +84,19 @@ def interpolate_gathered(
 class _Interpolate(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
-        ctx.save_for_backward(rows, weights)
+        ctx.save_for_backward(rows, weights, _if_moved(ctx, table))
         ctx.table_shape = table.shape
         return dispatch.run("weighted_rows", table, rows, weights)
 
     @staticmethod
-    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, None, None]:
-        rows, weights = ctx.saved_tensors
-        index = index_rows(rows, ctx.table_shape[0], pads=True)
-        values = sum_rows(index.position, grad_outputs[0], weights, len(index.unique))
-        return _row_gradient(index.unique, values, ctx.table_shape), None, None
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, None, Tensor | None]:
+        rows, weights, table = ctx.saved_tensors
+        to_table = None
+        if ctx.needs_input_grad[0]:
+            index = index_rows(rows, ctx.table_shape[0], pads=True)
+            values = sum_rows(index.position, grad_outputs[0], weights, len(index.unique))
+            to_table = _row_gradient(index.unique, values, ctx.table_shape)
+        return to_table, None, _weight_gradient(table, rows, grad_outputs[0])
 
 
 class _Gather(torch.autograd.Function):
@@ -107,14 +114,25 @@ class _Gather(torch.autograd.Function):
 class _InterpolateGathered(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, gathered: Tensor, position: Tensor, weights: Tensor) -> Tensor:
-        ctx.save_for_backward(position, weights)
+        ctx.save_for_backward(position, weights, _if_moved(ctx, gathered))
         ctx.count = gathered.shape[0]
         return dispatch.run("weighted_rows", gathered, position, weights)
 
     @staticmethod
-    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor, None, None]:
-        position, weights = ctx.saved_tensors
-        return sum_rows(position, grad_outputs[0], weights, ctx.count), None, None
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor, None, Tensor | None]:
+        position, weights, gathered = ctx.saved_tensors
+        to_weights = _weight_gradient(gathered, position, grad_outputs[0])
+        return sum_rows(position, grad_outputs[0], weights, ctx.count), None, to_weights
+
+
+def _if_moved(ctx: Any, table: Tensor) -> Tensor | None:
+    """The table, where the gradient of the weights is wanted: samples may be moved."""
+    return table if ctx.needs_input_grad[2] else None
+
+
+def _weight_gradient(table: Tensor | None, rows: Tensor, grad: Tensor) -> Float[Tensor, "N B"] | None:
+    """What each row holds, along the gradient of the sum that it is weighed into."""
+    return None if table is None else (table[rows] * grad[:, None]).sum(-1)
 
 
 def _row_gradient(rows: Int[Tensor, "U"], values: Float[Tensor, "U C"], shape: torch.Size) -> Tensor:

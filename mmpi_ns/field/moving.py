@@ -1,0 +1,65 @@
+"""How samples move with their rays: what poses are refined by (docs/how_it_works.md, "Refined poses").
+
+The march is free of gradients. A sample stays on the plane it was found on, so with its ray it moves within that plane:
+
+    u(w) = dx/dz + w (ox - oz dx/dz)
+
+at the plane's disparity w, and likewise v. Depths of planes, which planes a ray meets and which samples are kept are
+held fixed; a sample of the cube moves with the point at its distance.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from mmpi_ns.ops.layout import SceneLayout
+from mmpi_ns.scene.geometry import FACING_EPS, rays_in_frames, sample_disparity
+
+
+def moving(
+    layout: SceneLayout,
+    origins: Float[Tensor, "R 3"],
+    directions: Float[Tensor, "R 3"],
+    rays: Int[Tensor, "N"],
+    heads: Int[Tensor, "N"],
+    planes: Int[Tensor, "N"],
+    inverse_t: Float[Tensor, "N"],
+    ndc: Float[Tensor, "N 3"],
+) -> Float[Tensor, "N 3"]:
+    """The positions of samples as they are, to the bit, with gradients to the rays.
+
+    Args:
+        layout: of the scene.
+        origins: of the rays, world axes.
+        directions: likewise, unit.
+        rays: ray of each sample.
+        heads: of each sample, rising: those of the cube come last.
+        planes: of each sample.
+        inverse_t: inverse distances of the samples.
+        ndc: where they are.
+    """
+    count = len(heads) if layout.cube is None else int(torch.searchsorted(heads, len(layout.mpis)))
+    parts = [_on_planes(layout, origins, directions, rays[:count], heads[:count], planes[:count])]
+    if layout.cube is not None:
+        own = rays[count:]
+        parts.append(layout.cube.normalised(origins[own] + directions[own] / inverse_t[count:, None]))
+    moved = torch.cat(parts)
+    return ndc + (moved - moved.detach())
+
+
+def _on_planes(
+    layout: SceneLayout, origins: Tensor, directions: Tensor, rays: Tensor, heads: Tensor, planes: Tensor
+) -> Float[Tensor, "N 3"]:
+    """NDC (u, v, .) at which rays cross planes, but for a constant."""
+    frames = layout.frames
+    o, d = rays_in_frames(origins, directions, frames)
+    facing = d[..., 2:] > FACING_EPS  # where it is not there are no samples
+    slope = d[..., :2] / torch.where(facing, d[..., 2:], 1)
+    bend = o[..., :2] - o[..., 2:] * slope
+    line = torch.cat([slope, bend], -1).flatten(0, 1).index_select(0, rays * len(layout.mpis) + heads)
+    m = frames.num_planes[heads] - 1 - planes
+    w = sample_disparity(m, frames.disparity_steps[heads], frames.last_disparities[heads])[:, None]
+    size = (frames.extents[:, 1::2] - frames.extents[:, ::2])[heads]
+    return torch.nn.functional.pad((line[:, :2] + w * line[:, 2:]) * (2 / size), (0, 1))

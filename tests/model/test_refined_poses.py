@@ -1,0 +1,144 @@
+"""Poses refined during training and before scoring: what moves, what is kept, what is exported, what is refused."""
+
+from __future__ import annotations
+
+import json
+import sys
+from unittest.mock import MagicMock
+
+import numpy as np
+import pytest
+import torch
+from nerfstudio.cameras.lie_groups import exp_map_SO3xR3
+from tiny_scene import write_scene
+from training_runs import compared, differences, load, ready, trainer_config, write_plan, write_windows
+
+from mmpi_ns.utils.errors import InputError
+
+STEPS = 24
+OFF = 0.06
+"""Radians that a pose is turned by: 1.7 pixels of the tiny scene."""
+
+
+def refining(scene, plan_file, folder, steps=STEPS, **settings):
+    config = trainer_config(scene, plan_file, folder, steps, **settings)
+    config.pipeline.model.camera_optimizer.mode = "SO3xR3"
+    return config
+
+
+@pytest.fixture(scope="module")
+def whole(scene, plan_file, tmp_path_factory):
+    """A run of all phases with refined poses, and config.yml beside it."""
+    config = refining(scene, plan_file, tmp_path_factory.mktemp("whole"))
+    config.save_config()
+    trainer = ready(config)
+    trainer.train()
+    return trainer
+
+
+def corrections(folder, step):
+    return load(folder, step)["pipeline"]["_model.camera_optimizer.pose_adjustment"]
+
+
+def test_poses_move_in_every_phase_but_that_of_reliability(whole):
+    moved = {step: corrections(whole.checkpoint_dir, step) for step in range(1, STEPS)}
+    assert moved[1].shape == (6, 6) and torch.isfinite(moved[STEPS - 1]).all()
+    phases = whole.pipeline.model.progress.schedule.phases
+    assert [p.name for p in phases] == ["individual", "blend", "finetune"]
+    for step in range(2, STEPS):
+        still = phases[1].start <= step < phases[1].end
+        assert torch.equal(moved[step], moved[step - 1]) == still
+
+
+@pytest.mark.parametrize("step", [5, 14, 20])
+def test_a_resumed_run_refines_as_the_uninterrupted_one(whole, scene, plan_file, tmp_path, step):
+    trainer = ready(refining(scene, plan_file, tmp_path), load_dir=whole.checkpoint_dir, load_step=step)
+    trainer.train()
+    wanted, found = (load(t.checkpoint_dir, STEPS - 1) for t in (whole, trainer))
+    assert differences(compared(wanted), compared(found)) == []
+
+
+def test_poses_stay_without_being_asked_for(scene, plan_file, tmp_path):
+    model = ready(trainer_config(scene, plan_file, tmp_path)).pipeline.model
+    assert not list(model.camera_optimizer.parameters()) and "camera_opt" not in model.get_param_groups()
+
+
+def test_exported_cameras_are_the_given_ones_with_their_corrections(whole, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "open3d", MagicMock())  # cannot be imported everywhere, and has no part in this
+    from nerfstudio.scripts.exporter import ExportCameraPoses
+
+    ExportCameraPoses(load_config=whole.base_dir / "config.yml", output_dir=tmp_path).main()
+    frames = json.loads((tmp_path / "transforms_train.json").read_text())
+    found = torch.tensor([frame["transform"] for frame in frames])
+    given = whole.pipeline.datamanager.train_dataset.cameras.camera_to_worlds
+    moves = exp_map_SO3xR3(corrections(whole.checkpoint_dir, STEPS - 1))
+    assert torch.allclose(found[:, :, :3], moves[:, :, :3] @ given[:, :, :3], atol=1e-6)
+    assert torch.allclose(found[:, :, 3], moves[:, :, 3] + given[:, :, 3], atol=1e-6)
+    assert (found - given).abs().max() > 1e-4
+    names = [str(name) for name in whole.pipeline.datamanager.train_dataset.image_filenames]
+    assert [frame["file_path"] for frame in frames] == names
+
+
+def test_a_capture_in_several_windows_is_refused(scene, tmp_path):
+    windows = write_windows(scene, tmp_path / "windows.json")
+    with pytest.raises(InputError, match=r"trained in 2 windows.*--refine-poses.*window-length 0"):
+        ready(refining(scene, windows, tmp_path))
+
+
+# Poses that are off ---------------------------------------------------------------------------------------------------
+
+
+def turn(pose, by):
+    """A pose [4, 4] turned about the world's axes."""
+    turned = np.array(pose)
+    move = torch.tensor([[0.0, 0, 0, *by]])
+    turned[:3, :3] = exp_map_SO3xR3(move)[0, :, :3].numpy() @ turned[:3, :3]
+    return turned.tolist()
+
+
+@pytest.fixture(scope="module")
+def turned(tmp_path_factory):
+    """The tiny scene with one training and one test image turned, trained with refined poses."""
+    data = write_scene(tmp_path_factory.mktemp("turned") / "data")
+    plan = write_plan(data, data.parent / "plan.json")
+    path = data / "transforms.json"
+    scene = json.loads(path.read_text())
+    for name in (scene["train_filenames"][2], scene["test_filenames"][0]):
+        frame = next(f for f in scene["frames"] if f["file_path"] == name)
+        frame["transform_matrix"] = turn(frame["transform_matrix"], (0.0, OFF, 0.0))
+    path.write_text(json.dumps(scene))
+    config = refining(data, plan, data.parent / "out", 300, training="joint")
+    config.pipeline.datamanager.train_num_rays_per_batch = 256
+    config.pipeline.refine_eval_poses, config.steps_per_save = True, 300
+    trainer = ready(config)
+    trainer.train()
+    return trainer
+
+
+def test_training_turns_a_pose_back(turned):
+    moved = turned.pipeline.model.camera_optimizer.pose_adjustment.detach()[:, 3:]
+    others = moved[[0, 1, 3, 4, 5]]
+    up = turned.pipeline.datamanager.train_dataparser_outputs.dataparser_transform[:, 1]  # the capture's y
+    against = (moved[2] - others.mean(0)) @ up
+    assert -1.4 * OFF < against < -0.6 * OFF and (others - others.mean(0)).abs().max() < 0.4 * OFF
+
+
+def test_a_test_image_is_scored_twice_and_the_plain_score_stays(turned, capsys):
+    pipeline, model = turned.pipeline, turned.pipeline.model
+    found = pipeline.get_average_eval_image_metrics()
+    pipeline.config.refine_eval_poses = False
+    plain = pipeline.get_average_eval_image_metrics()
+    pipeline.config.refine_eval_poses = True
+    for name in ("psnr", "ssim", "dropped_mass"):
+        assert found[name] == plain[name] and f"refined_{name}" in found
+    assert "refined_psnr" not in plain and found["refined_psnr"] > found["psnr"] + 0.5
+    assert found["refined_rotation_degrees"] == pytest.approx(np.degrees(OFF) / 2, rel=0.5)  # one of two is turned
+    assert "own pose refined against the model" in capsys.readouterr().out
+    assert model.field.density.requires_grad, "the field can be trained on"
+
+
+def test_poses_are_not_refined_against_what_has_no_gradients(turned):
+    turned.pipeline.model.config.render = "baked"
+    with pytest.raises(InputError, match="render exact"):
+        turned.pipeline.get_average_eval_image_metrics()
+    turned.pipeline.model.config.render = "exact"
