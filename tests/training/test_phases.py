@@ -12,7 +12,7 @@ from mmpi_ns.config import mmpi_kitti, mmpi_scannet, mmpi_scannet_short
 from mmpi_ns.model import MMPIModelConfig
 from mmpi_ns.training.phases import TRAINS, Phase, Schedule, make_schedule
 
-KINDS = ("density", "features", "colour", "reliability")
+KINDS = ("density", "features", "colour", "reliability", "camera_opt")
 
 
 def two_phase(**settings):
@@ -67,7 +67,7 @@ def test_rates_are_zero_exactly_where_a_kind_is_frozen(kind):
 
 def test_only_reliability_trains_in_blend_and_everything_else_before():
     assert TRAINS["blend"] == {"reliability"}
-    assert TRAINS["individual"] == TRAINS["joint"] == {"density", "features", "colour"}
+    assert TRAINS["individual"] == TRAINS["joint"] == {"density", "features", "colour", "camera_opt"}
     assert TRAINS["finetune"] == set(KINDS)
 
 
