@@ -11,8 +11,8 @@ import torch
 from nerfstudio.field_components.encodings import HashEncoding
 
 from mmpi_ns.bench import peers
-from mmpi_ns.capture.point_cloud import read_ply
 from mmpi_ns.bench.progress import Progress, without_length
+from mmpi_ns.capture.point_cloud import read_ply
 from mmpi_ns.ops import dispatch
 
 
