@@ -50,6 +50,7 @@ from mmpi_ns.training.phases import Schedule, Training, make_schedule
 from mmpi_ns.training.progress import Progress
 from mmpi_ns.training.refined_poses import check_refined_poses, move_rays
 from mmpi_ns.training.run import TrainingRun, views_of
+from mmpi_ns.utils.console import say
 from mmpi_ns.utils.errors import InputError
 from mmpi_ns.utils.random_draws import generator
 
@@ -332,8 +333,12 @@ class MMPIModel(Model):
 
     def baked(self, field: MMPIField) -> BakedWindow:
         """A field baked, made once, until it is trained on. Raises ValueError where it cannot be."""
-        background = BACKGROUNDS[self.config.background]
-        make = lambda: bake(field, self.config.render_threshold, background, self.blend_form(field))  # noqa: E731
+
+        def make() -> BakedWindow:
+            say("Baking, once: a few seconds.")
+            background = BACKGROUNDS[self.config.background]
+            return bake(field, self.config.render_threshold, background, self.blend_form(field))
+
         return field.cached("baked", make)
 
     def blend_form(self, field: MMPIField) -> BlendForm | None:

@@ -123,7 +123,8 @@ def _pack(window: BakedWindow) -> tuple[bytes, dict[str, Any]]:
     }
     blob, rows = b"", {}
     for name, array in arrays.items():
-        packer = zlib.compressobj(9, zlib.DEFLATED, 31, 9, zlib.Z_FILTERED)  # gzip, for numbers that are mostly small
+        # Gzip, for numbers that are mostly small. Level 9 takes seven times as long and saves a thirtieth.
+        packer = zlib.compressobj(6, zlib.DEFLATED, 31, 9, zlib.Z_FILTERED)
         data = packer.compress(np.ascontiguousarray(array).tobytes()) + packer.flush()
         rows[name] = {"type": str(array.dtype), "shape": array.shape, "offset": len(blob), "bytes": len(data)}
         blob += data

@@ -15,6 +15,7 @@ from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.shading import CHANGE, MOST_CHANGE, RayShader
 from mmpi_ns.ops.baked import march_baked, shade_baked
 from mmpi_ns.ops.blending import BlendForm, blended_optical_depth
+from mmpi_ns.ops.gather import COLORS
 from mmpi_ns.ops.march.reference import NEGLIGIBLE_DEPTH
 from mmpi_ns.scene.baked import (
     CELLS,
@@ -33,8 +34,9 @@ from mmpi_ns.scene.texels import TexelGrid
 
 THINNEST = -12.0
 """Raw density that the code 0 stands for at least: softplus of it is 6e-6."""
-HIGHEST = 127
-"""Largest code of a channel: seven bits give 52 dB to the exact renderer and a fifth less to load than eight."""
+HIGHEST_COLOR, HIGHEST_FEATURE = 191, 96
+"""Largest codes of a channel of diffuse colour and of one of a feature. With 255 for both 0.0003 of SSIM are lost and a
+fifth more is to be loaded, with these 0.0007, with 127 for both 0.0011 at this size (docs/export.md)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,8 +181,9 @@ def _raw(
 def _channel_codes(model_field: MMPIField) -> tuple[Codes, ...]:
     """Ranges of the channels: all that there is."""
     values = model_field.features.data
-    bounds = zip(values.amin(0).tolist(), values.amax(0).tolist(), strict=True)
-    return tuple(Codes.spanning(low, high, HIGHEST) for low, high in bounds)
+    highest = [HIGHEST_COLOR] * COLORS + [HIGHEST_FEATURE] * (values.shape[1] - COLORS)
+    bounds = zip(values.amin(0).tolist(), values.amax(0).tolist(), highest, strict=True)
+    return tuple(Codes.spanning(*bound) for bound in bounds)
 
 
 def _texel_codes(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from training_runs import ready, trainer_config
 
 from mmpi_ns.bench.speed import render
 from mmpi_ns.bench.speed.render import Render, Setting
+from mmpi_ns.model import MMPIModelConfig
 from mmpi_ns.ops import dispatch
 
 
@@ -51,11 +53,23 @@ def test_every_setting_is_timed_and_compared_with_exact_rays(run, tmp_path):
     assert len(kept) == 2 and all(r["max_error"] < 1e-4 and r["error_999"] <= r["max_error"] for r in kept)
     dropped = [r for r in rows.values() if r["threshold"] == 3e-2]
     assert dropped[0]["error_999"] > 2 * kept[0]["error_999"]
+    assert not any(r["also"] for r in rows.values()), "a model with a cube cannot be baked"
     chunks = [r for r in rows.values() if r["threshold"] == 3e-3 and r["ops"] == "native"]
     assert len(chunks) == 2 and chunks[0]["psnr"] == pytest.approx(chunks[1]["psnr"], abs=1e-4)
     text = (tmp_path / "render.md").read_text()
     assert text.count("(default)") == 1 and f"**{found['default']}**" in text
     assert (tmp_path / "render.png").stat().st_size > 10_000
+
+
+def test_a_model_that_can_be_baked_is_measured_so(tmp_path):
+    default = Setting(3e-3, 4096, "native")
+    bench = Render(tmp_path / "config.yml", **settings(tmp_path))
+    more = set(bench._settings(default, bakes=True)) - set(bench._settings(default, bakes=False))
+    assert [s.also for s in more] == ["render=baked"]
+    model = SimpleNamespace(config=MMPIModelConfig())
+    with more.pop().applied(model):  # type: ignore[arg-type]
+        assert model.config.render == "baked"
+    assert model.config.render == "exact"
 
 
 def test_what_was_measured_is_kept(run, tmp_path, monkeypatch):

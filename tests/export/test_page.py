@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from mmpi_ns.export.files import HEADER, read_baked, write_baked
 from mmpi_ns.export.reader import camera_rays
 from mmpi_ns.export.web import write_page, write_single_file
 from mmpi_ns.scene.baked import neighbours, take_borders
+from mmpi_ns.scene.windows import window_shares
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium to open the page with (apt-get install chromium)")
 CLOSE = 48.0
@@ -160,6 +162,38 @@ def test_resolution_follows_the_time_of_a_frame(opened):
 
 def test_the_console_stays_empty(opened):
     assert opened.messages == []
+
+
+def at_its_place(window, x):
+    """The window with its MPIs so far along, and a camera that looks into the first of them."""
+    mpis = tuple(replace(m, origin=(x, 0.1 * k, 0.0)) for k, m in enumerate(window.mpis.mpis))
+    moved = replace(window, mpis=replace(window.mpis, mpis=mpis, packed={}))
+    return moved, scene_of(moved).path[0]
+
+
+def test_a_long_capture_keeps_few_windows(tab, tmp_path):
+    """Windows are fetched as the camera comes, let go behind it, and fetched again; all the way they are shown as by
+    us, and mixed where two meet."""
+    places = [4.0 * i + 1.9 * (i % 2) for i in range(8)]  # the middle of each ball of radius 1.9, or its border
+    windows, path = zip(*(at_its_place(smooth_window(10 + i, planes=24), x) for i, x in enumerate(places)), strict=True)
+    scene = replace(scene_of(*windows, radius=1.9), path=list(path))
+    write_baked(scene, tmp_path)
+    write_page(tmp_path)
+    difference = lambda number: np.square(shown(tab, number) - ours(tmp_path, path[number])).mean()  # noqa: E731
+    with served(tmp_path) as address:
+        assert tab.open(f"{address}/index.html") == "ready"
+        assert tab.evaluate("mmpi.windows.size") < 3
+        tab.evaluate("window.first = mmpi.windows.get(0).textures")
+        for number in [*range(len(windows)), 0]:
+            tab.evaluate(f"mmpi.camera = structuredClone(mmpi.path[{number}]); mmpi.feed()")
+            shares = window_shares(torch.tensor(path[number].to_world)[None, :, 3], tuple(w for w, _ in scene.windows))
+            for w in shares[0].nonzero()[:, 0].tolist():
+                tab.until(f"mmpi.windows.get({w})")
+            assert tab.evaluate("mmpi.windows.size") <= 4
+            assert ours(tmp_path, path[number]).std() > 0.01 and -10 * np.log10(difference(number)) > CLOSE - 4
+            if number == len(windows) - 1:
+                assert not tab.evaluate("window.first.some((t) => mmpi.gl.isTexture(t)) || mmpi.windows.has(0)")
+    assert tab.messages == []
 
 
 def test_one_file_opens_from_the_disk(tab, site, tmp_path):

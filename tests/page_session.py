@@ -1,0 +1,65 @@
+"""The page of a run in a real browser against the exact renderer and the truth, at test cameras.
+
+    python tests/page_session.py --load-config RUN/config.yml
+
+Prints a line for each camera and what is lost on average. Fails where the canvas has less than 38 dB to the exact
+renderer's image, or on average more than 0.1 dB less against the truth.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from pathlib import Path
+from statistics import fmean
+
+import numpy as np
+import torch
+import tyro
+from browser import browser, served
+
+from mmpi_ns.export.bake import bake_run, load_model
+from mmpi_ns.export.files import write_baked
+from mmpi_ns.export.web import write_page
+from mmpi_ns.rendering.metrics import ImageMetrics
+
+LEAST_DB, MOST_LOST = 38.0, 0.1
+
+
+def main(load_config: Path, cameras: int = 5, least: float = 0.003) -> None:
+    """Compares.
+
+    Args:
+        load_config: the run's config.yml.
+        cameras: test cameras, evenly spaced.
+        least: bricks in which no training view sees this weight are left out.
+    """
+    pipeline = load_model(load_config)
+    train, test = pipeline.datamanager.train_dataset, pipeline.datamanager.eval_dataset
+    places = sorted(str(name) for dataset in (train, test) for name in dataset.image_filenames)
+    metrics, close, lost = ImageMetrics("none"), [], []
+    with tempfile.TemporaryDirectory() as name, torch.no_grad():
+        site = Path(name) / "site"
+        print(f"{write_baked(bake_run(pipeline, least), site) / 1e6:.1f} MB")
+        write_page(site)
+        with served(site) as address, browser(Path(name) / "profile", size=(640, 360)) as tab:
+            start = time.perf_counter()
+            assert tab.open(f"{address}/index.html") == "ready", tab.messages
+            print(f"ready after {time.perf_counter() - start:.1f} s")
+            for i in np.linspace(0, len(test) - 1, cameras).astype(int).tolist():
+                camera = f"mmpi.path[{places.index(str(test.image_filenames[i]))}]"
+                tab.evaluate(f"mmpi.camera = structuredClone({camera}); mmpi.feed()")
+                shown = tab.picture(f"(mmpi.draw({camera}, ...{camera}.size), mmpi.gl.canvas.toDataURL())")
+                exact = pipeline.model.get_outputs_for_camera(test.cameras[i : i + 1])["rgb"].cpu()
+                canvas, truth = torch.from_numpy(shown).float(), test[i]["image"][..., :3]
+                close.append(metrics(canvas, exact)["psnr"])
+                ours, theirs = (metrics(image, truth)["psnr"] for image in (exact, canvas))
+                lost.append(ours - theirs)
+                print(f"{test.image_filenames[i].name}: {close[-1]:.1f} dB to exact; {ours:.2f} -> {theirs:.2f} dB")
+            assert not tab.messages, tab.messages
+    print(f"at least {min(close):.1f} dB to exact, {fmean(lost):.3f} dB lost on average, {max(lost):.3f} at most")
+    assert min(close) >= LEAST_DB and fmean(lost) <= MOST_LOST
+
+
+if __name__ == "__main__":
+    tyro.cli(main)
