@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mmpi_ns.capture.epipolar import sampson
+from mmpi_ns.capture.matching import match_pairs, quiet, triangulate_points
 from mmpi_ns.capture.sfm import SfmModel, load_pycolmap, read_reconstruction
 from mmpi_ns.utils.errors import InputError
 
@@ -26,13 +27,10 @@ SMALL, LARGE = 800, 1600
 """Images no wider or higher than the first are doubled to find fine features, larger ones than the second shrunk."""
 MAX_ANGLE = 60.0
 """Degrees between the facing directions of two images worth matching."""
-MIN_ANGLE = 0.5
-"""Degrees between the rays of a point, at least: driving forward gives little more."""
 MIN_TRACK = 2
 """Images that see a point, at least: with poses given, two that agree are enough."""
 ENOUGH = 100
 """Keypoints an image, on average, that make the thorough search unnecessary."""
-SEED = 0
 
 
 @dataclass(frozen=True)
@@ -107,19 +105,14 @@ def triangulate(images: PosedImages) -> SfmModel:
     Raises:
         InputError: an image file cannot be read.
     """
-    pycolmap = load_pycolmap()
-    level = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = int(pycolmap.logging.Level.ERROR)
-    try:
-        tracks = None
+    pycolmap, tracks = load_pycolmap(), None
+    with quiet():
         for effort in EFFORTS:
             tracks = _attempt(pycolmap, images, effort)
             if sum(len(points) for points, _ in tracks.keypoints) >= ENOUGH * len(images.files):
                 break
-        assert tracks is not None
-        return tracks
-    finally:
-        pycolmap.logging.minloglevel = level
+    assert tracks is not None
+    return tracks
 
 
 def _attempt(pycolmap: Any, images: PosedImages, effort: Effort) -> SfmModel:
@@ -130,12 +123,10 @@ def _attempt(pycolmap: Any, images: PosedImages, effort: Effort) -> SfmModel:
         _extract(pycolmap, work, names, effort, doubled=images.sizes.max() <= SMALL)
         model = _posed_model(pycolmap, work, names, images)
         if pairs:
-            _match(pycolmap, work, [(names[i], names[j]) for i, j in pairs], effort)
-            off = _off_epipolar_lines(pycolmap, work / "database.db", model)
-            (work / "model").mkdir()
-            model = pycolmap.triangulate_points(
-                model, work / "database.db", work / "images", work / "model", options=_triangulation(pycolmap)
-            )
+            named, database = [(names[i], names[j]) for i, j in pairs], work / "database.db"
+            match_pairs(database, named, guided=effort.guided, least=effort.min_matches)
+            off = _off_epipolar_lines(pycolmap, database, model)
+            model = triangulate_points(model, database, work / "images", pairs_alone=True)
         tracks = read_reconstruction(model, MIN_TRACK)
         return replace(tracks, names=tuple(str(names.index(name)) for name in tracks.names), off=off)
 
@@ -164,24 +155,6 @@ def _extract(pycolmap: Any, work: Path, names: list[str], effort: Effort, double
     )
 
 
-def _match(pycolmap: Any, work: Path, pairs: list[tuple[str, str]], effort: Effort) -> None:
-    listing = work / "pairs.txt"
-    listing.write_text("".join(f"{a} {b}\n" for a, b in pairs), encoding="utf-8")
-    matching = pycolmap.FeatureMatchingOptions()
-    matching.guided_matching = effort.guided
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = SEED
-    verification.min_num_inliers = effort.min_matches
-    pairing = pycolmap.ImportedPairingOptions()
-    pairing.match_list_path = listing
-    pycolmap.match_image_pairs(
-        work / "database.db",
-        matching_options=matching,
-        pairing_options=pairing,
-        verification_options=verification,
-    )
-
-
 def _off_epipolar_lines(pycolmap: Any, database: Path, model: Any) -> float | None:
     """Median distance of the verified matches from the epipolar lines of a model's poses, as a share of the width.
 
@@ -203,15 +176,6 @@ def _off_epipolar_lines(pycolmap: Any, database: Path, model: Any) -> float | No
         off = sampson(rays[0], rays[1], pycolmap.essential_matrix_from_pose(relative))
         found.append(off * cameras[0].mean_focal_length() / cameras[0].width)
     return float(np.median(np.concatenate(found))) if found and sum(map(len, found)) else None
-
-
-def _triangulation(pycolmap: Any) -> Any:
-    options = pycolmap.IncrementalPipelineOptions()
-    options.triangulation.min_angle = options.mapper.filter_min_tri_angle = MIN_ANGLE
-    options.triangulation.ignore_two_view_tracks = False
-    options.triangulation.random_seed = SEED
-    options.ba_refine_focal_length = options.ba_refine_principal_point = options.ba_refine_extra_params = False
-    return options
 
 
 def _posed_model(pycolmap: Any, work: Path, names: list[str], images: PosedImages) -> Any:

@@ -9,8 +9,8 @@ import numpy as np
 import pycolmap
 
 from mmpi_ns.capture.epipolar import sampson
+from mmpi_ns.capture.matching import MIN_INLIERS
 from mmpi_ns.prepare.evidence import Array, Pairs, Places, Witness, scale_changes
-from mmpi_ns.prepare.features import MIN_INLIERS
 from mmpi_ns.prepare.frame import camera_poses
 
 FIT_PX = 2.0

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import tempfile
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,10 +10,10 @@ import pycolmap
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from mmpi_ns.capture.matching import MIN_INLIERS, match_pairs, quiet
 from mmpi_ns.prepare.images import Photo
 from mmpi_ns.prepare.stages import PrepareError, progress, whole
 
-SEED = 0
 BATCH = 8
 """Images extracted at a time: what an interruption loses."""
 PAIR_BATCH = 64
@@ -25,19 +23,6 @@ LEAST_FEATURES = 2048
 """Small images may have so many all the same..."""
 FAINT = 0.003
 """... and have faint ones counted (SIFT's peak threshold), as they are short of them."""
-MIN_INLIERS = 15
-"""Matches from which a pair counts: COLMAP's own limit."""
-
-
-@contextmanager
-def quiet() -> Iterator[None]:
-    """Keeps COLMAP's log to errors."""
-    level = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = int(pycolmap.logging.Level.ERROR)
-    try:
-        yield
-    finally:
-        pycolmap.logging.minloglevel = level
 
 
 def create_database(
@@ -123,20 +108,10 @@ def match(database: Path, photos: Sequence[Photo], pairs: Sequence[tuple[int, in
     Returns:
         Pairs with verified matches.
     """
-    options = pycolmap.FeatureMatchingOptions()
-    options.num_threads = threads
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = SEED
-    with progress("Matching pairs", len(pairs)) as advance, quiet(), tempfile.TemporaryDirectory() as folder:
-        listing = Path(folder) / "pairs.txt"
-        pairing = pycolmap.ImportedPairingOptions()
-        pairing.match_list_path = listing
+    with progress("Matching pairs", len(pairs)) as advance, quiet():
         for start in range(0, len(pairs), PAIR_BATCH):
             batch = pairs[start : start + PAIR_BATCH]
-            listing.write_text("".join(f"{photos[i].name} {photos[j].name}\n" for i, j in batch), encoding="utf-8")
-            pycolmap.match_image_pairs(
-                database, matching_options=options, pairing_options=pairing, verification_options=verification
-            )
+            match_pairs(database, [(photos[i].name, photos[j].name) for i, j in batch], threads=threads)
             advance(len(batch))
     return count_matching_pairs(database)
 

@@ -14,13 +14,8 @@ from pathlib import Path
 
 import pycolmap
 
-from mmpi_ns.prepare.features import SEED, quiet
+from mmpi_ns.capture.matching import MIN_ANGLE, MIN_INLIERS, SEED, quiet
 from mmpi_ns.prepare.mapping import largest_model
-
-MIN_MATCHES = 15
-"""Matches that agree, from which a pair counts."""
-MIN_ANGLE = 0.5
-"""Degrees between the rays of a point, at least: driving forward gives little more."""
 
 
 def map_globally(
@@ -55,7 +50,7 @@ def map_globally(
 def global_options(refine: bool, threads: int) -> pycolmap.GlobalPipelineOptions:
     """The mapper's settings: every random draw seeded, small angles kept, given intrinsics left alone."""
     options = pycolmap.GlobalPipelineOptions()
-    options.min_num_matches = MIN_MATCHES
+    options.min_num_matches = MIN_INLIERS
     options.random_seed = SEED
     options.num_threads = threads
     mapper = options.mapper

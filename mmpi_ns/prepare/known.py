@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from mmpi_ns.capture.tracks import MIN_ANGLE
-from mmpi_ns.prepare.features import SEED, matched_keypoints, quiet
+from mmpi_ns.capture.matching import quiet, triangulate_points
+from mmpi_ns.prepare.features import matched_keypoints
 from mmpi_ns.prepare.frame import camera_poses, similarity_between
 from mmpi_ns.prepare.mapping import adjust, bundle_options
 from mmpi_ns.prepare.stages import PrepareError, say
@@ -53,7 +53,9 @@ def solve_known(
     """
     _, given = camera_poses(model)
     refine = refine_poses or refine_intrinsics
-    model = _triangulate(model, database, images, COARSE_PX if refine else FINE_PX, threads)
+    worst = COARSE_PX if refine else FINE_PX
+    with quiet():
+        model = triangulate_points(model, database, images, max_error=worst, threads=threads)
     share = model.compute_num_observations() / max(matched_keypoints(database, list(model.reg_image_ids())), 1)
     if share < LEAST_SHARE:
         raise PrepareError(
@@ -65,7 +67,8 @@ def solve_known(
     says = f"points from known poses: {share:.0%} of the matched keypoints, {error:.2f} px"
     for _ in range(ROUNDS if refine else 0):
         adjust(model, bundle_options(refine_poses, refine_intrinsics, False, threads, robust=True))
-        model = _triangulate(model, database, images, FINE_PX, threads)
+        with quiet():
+            model = triangulate_points(model, database, images, max_error=FINE_PX, threads=threads)
     if refine:
         _, refined = camera_poses(model)
         model.transform(similarity_between(refined, given))
@@ -83,17 +86,3 @@ def _changes(given: np.ndarray, model: pycolmap.Reconstruction) -> str:
         f"poses moved by {moved.mean():.3g} units (at most {moved.max():.3g}) "
         f"and turned by {turned.mean():.2f} degrees (at most {turned.max():.2f})"
     )
-
-
-def _triangulate(
-    model: pycolmap.Reconstruction, database: Path, images: Path, max_error: float, threads: int
-) -> pycolmap.Reconstruction:
-    options = pycolmap.IncrementalPipelineOptions()
-    options.random_seed = options.triangulation.random_seed = SEED
-    options.num_threads = options.mapper.num_threads = threads
-    options.triangulation.min_angle = options.mapper.filter_min_tri_angle = MIN_ANGLE
-    options.triangulation.merge_max_reproj_error = max_error
-    options.triangulation.complete_max_reproj_error = options.mapper.filter_max_reproj_error = max_error
-    options.ba_refine_focal_length = options.ba_refine_extra_params = False
-    with quiet():
-        return pycolmap.triangulate_points(model, database, images, images.parent, clear_points=True, options=options)

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pycolmap
 
+from mmpi_ns.capture.matching import SEED, quiet
 from mmpi_ns.prepare.collect import witness_of
 from mmpi_ns.prepare.evidence import Witness, agreement
-from mmpi_ns.prepare.features import SEED, quiet
 from mmpi_ns.prepare.focal import STARTS
 from mmpi_ns.prepare.global_mapping import map_globally, start_from
 from mmpi_ns.prepare.mapping import ATTEMPTS, reconstruct

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pycolmap
 
-from mmpi_ns.prepare.features import SEED, count_matching_pairs, quiet
+from mmpi_ns.capture.matching import SEED, quiet
+from mmpi_ns.prepare.features import count_matching_pairs
 from mmpi_ns.prepare.stages import PrepareError, progress, say
 
 ENOUGH = 0.95
