@@ -122,6 +122,21 @@ def check_same_plan(state: dict[str, Any], path: Path, ours: WindowedPlan, plan_
         )
 
 
+def check_same_refinement(state: dict[str, Any], path: Path, mode: str) -> None:
+    """Raises InputError where a checkpoint refines poses and this run does not, or the other way round.
+
+    Args:
+        state: of the pipeline, in the checkpoint.
+        path: the checkpoint.
+        mode: of this run's camera optimiser.
+    """
+    if ("_model.camera_optimizer.pose_adjustment" in state) == (mode == "off"):
+        there, as_there = ("unrefined", "off") if mode != "off" else ("refined", "SO3xR3")
+        raise InputError(
+            f"{path} was trained with {there} poses: resume with --pipeline.model.camera-optimizer.mode {as_there}."
+        )
+
+
 def _difference(theirs: WindowedPlan, ours: WindowedPlan) -> str:
     """What differs first between two plans."""
     shapes = [(len(p), sum(len(plan.mpis) for plan in p.plans)) for p in (theirs, ours)]

@@ -24,6 +24,7 @@ from mmpi_ns.training.checkpoints import (
     cameras_in_short,
     check_same_capture,
     check_same_plan,
+    check_same_refinement,
     checkpoint_to_load,
     checkpoints_in,
     read_checkpoint,
@@ -344,6 +345,8 @@ class MMPITrainer(Trainer):
             state = read_checkpoint(path)
             check_same_capture(state, path, self._manager.get_datapath(), self._manager.observations)
             check_same_plan(state["pipeline"], path, run.progress.windows, PLAN_FILE)
+            model: Any = self.pipeline.model
+            check_same_refinement(state["pipeline"], path, model.camera_optimizer.config.mode)
             torch.set_rng_state(state["rng"]["torch"])
             del state
         # nerfstudio takes every file in load_dir for a checkpoint.

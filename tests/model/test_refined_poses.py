@@ -59,6 +59,21 @@ def test_a_resumed_run_refines_as_the_uninterrupted_one(whole, scene, plan_file,
     assert differences(compared(wanted), compared(found)) == []
 
 
+@pytest.mark.parametrize("refines", [False, True])
+def test_a_checkpoint_with_other_refinement_is_refused(whole, scene, plan_file, tmp_path, refines):
+    folder = whole.checkpoint_dir
+    if refines:
+        state = load(folder, 1)
+        del state["pipeline"]["_model.camera_optimizer.pose_adjustment"]
+        folder = tmp_path / "models"
+        folder.mkdir()
+        torch.save(state, folder / "step-000000001.ckpt")
+    config = (refining if refines else trainer_config)(scene, plan_file, tmp_path)
+    said = "unrefined poses: .* off" if refines else "with refined poses: .* SO3xR3"
+    with pytest.raises(InputError, match=said):
+        ready(config, load_dir=folder, load_step=1)
+
+
 def test_poses_stay_without_being_asked_for(scene, plan_file, tmp_path):
     model = ready(trainer_config(scene, plan_file, tmp_path)).pipeline.model
     assert not list(model.camera_optimizer.parameters()) and "camera_opt" not in model.get_param_groups()
