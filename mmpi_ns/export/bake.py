@@ -18,12 +18,12 @@ from torch import Tensor
 from yaml import YAMLError
 
 from mmpi_ns.export.files import BakedScene, Pose
+from mmpi_ns.export.frames import render_scene
 from mmpi_ns.model import MMPIModel
 from mmpi_ns.ops.baked import march_baked
 from mmpi_ns.rendering.baked import BakedWindow
 from mmpi_ns.rendering.chunks import CPU_RAYS, render_in_chunks
 from mmpi_ns.rendering.metrics import ImageMetrics
-from mmpi_ns.rendering.windows import mix_windows
 from mmpi_ns.scene.windows import window_shares
 
 Say = Callable[[str], None]
@@ -164,24 +164,3 @@ def _render_bundle(scene: BakedScene, bundle: RayBundle) -> Tensor:
     """The image of a camera's rays."""
     render = lambda rays: render_scene(scene, rays.origins, rays.directions)  # noqa: E731
     return render_in_chunks(bundle, CPU_RAYS, torch.device("cpu"), render)["rgb"]
-
-
-def render_scene(
-    scene: BakedScene, origins: Float[Tensor, "R 3"], directions: Float[Tensor, "R 3"]
-) -> dict[str, Tensor]:
-    """What a scene shows of rays: the windows that they start in, mixed as the model mixes them."""
-    if len(scene.windows) == 1:
-        return _render_window(scene.windows[0][1], origins, directions)
-    shares = window_shares(origins, tuple(place for place, _ in scene.windows))
-    parts = {}
-    for w in (shares > 0).any(0).nonzero()[:, 0].tolist():
-        rays = (shares[:, w] > 0).nonzero()[:, 0]
-        parts[w] = (rays, _render_window(scene.windows[w][1], origins[rays], directions[rays]))
-    return mix_windows(shares, parts)
-
-
-def _render_window(window: BakedWindow, origins: Tensor, directions: Tensor) -> dict[str, Tensor]:
-    """What one window shows of rays without an end."""
-    nears = torch.full_like(origins[:, :1], window.ray_near)
-    background = torch.full((3,), window.background)
-    return window.render(origins, directions, nears, torch.full_like(nears, torch.inf), background)

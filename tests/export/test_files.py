@@ -11,8 +11,8 @@ import torch
 from random_bricks import random_window, rays_into, scene_of
 
 from mmpi_ns.export import reader
-from mmpi_ns.export.bake import render_scene
 from mmpi_ns.export.files import HEADER, read_baked, write_baked
+from mmpi_ns.export.frames import render_scene
 from mmpi_ns.ops.baked.reference import march_baked
 
 

@@ -12,8 +12,8 @@ import torch
 from browser import CHROMIUM, browser, served
 from random_bricks import random_window, scene_of
 
-from mmpi_ns.export.bake import render_scene
 from mmpi_ns.export.files import HEADER, read_baked, write_baked
+from mmpi_ns.export.frames import render_scene
 from mmpi_ns.export.reader import camera_rays
 from mmpi_ns.export.web import write_page, write_single_file
 from mmpi_ns.scene.baked import neighbours, take_borders
