@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import torch
 from nerfstudio.cameras.camera_optimizers import CameraOptimizer
 from nerfstudio.cameras.rays import RayBundle
+from torch.nn import Parameter
 
 from mmpi_ns.capture.datamanager import OWN_PIXEL
 from mmpi_ns.utils.errors import InputError
@@ -17,6 +20,16 @@ def check_refined_poses(mode: str, windows: int) -> None:
             f"The capture is trained in {windows} windows, one after the other, and poses are refined in one alone: "
             "refine them before (mmpi-prepare --refine-poses), or give --pipeline.model.placement.window-length 0."
         )
+
+
+@torch.no_grad()
+def keep_frame(poses: Iterable[Parameter]) -> None:
+    """Takes what all cameras have in common out of their corrections [N, 6].
+
+    The scene would follow them and every training image look the same, but test images would not: their poses stay.
+    """
+    for moves in poses:
+        moves -= moves.mean(0)
 
 
 def move_rays(bundle: RayBundle, poses: CameraOptimizer) -> None:

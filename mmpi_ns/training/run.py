@@ -17,6 +17,7 @@ from mmpi_ns.scene.visible_tiles import TrainingViews
 from mmpi_ns.scene.windows import Window
 from mmpi_ns.training.phases import TRAINS
 from mmpi_ns.training.progress import Progress
+from mmpi_ns.training.refined_poses import keep_frame
 from mmpi_ns.training.storage import prepare_storage
 
 
@@ -103,6 +104,8 @@ class TrainingRun:
         field.learns_cover = phase == "individual"
         for kind, params in groups.items():
             params[0].requires_grad_(kind in TRAINS[phase])
+        if "camera_opt" in TRAINS[phase]:
+            keep_frame(self._poses)
 
     def _begin_window(self, window: int, factor: float) -> None:
         """Another window with fresh tables and networks; the trainer has put the one before away."""
