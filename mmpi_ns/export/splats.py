@@ -22,7 +22,7 @@ from mmpi_ns.export.files import BakedScene, Pose
 from mmpi_ns.export.reader import camera_rays
 from mmpi_ns.ops.baked import march_baked
 from mmpi_ns.ops.gather.reference import COLORS, activate
-from mmpi_ns.ops.splat import splat_image, splat_sums
+from mmpi_ns.ops.splat import splat_image, splat_opacities, splat_sums
 from mmpi_ns.ops.splat.reference import BLUR, Gaussians, View
 from mmpi_ns.rendering.baked import BakedWindow
 from mmpi_ns.scene.baked import CELLS, SIDE, brick_numbers, columns_of
@@ -44,6 +44,9 @@ FRACTIONS = (0.0, 0.5, 0.25, 0.75)
 ROUNDS = 4
 STEP = 1.5
 """Of a round: more than 1 arrives sooner."""
+OPACITY_STEP, MOST_CHANGE = 0.3, 1.0
+"""Of a round for logits of opacities, which move together with the colours (at 1 both overshoot), and the most that one
+moves."""
 STEADY = 0.02
 """Weight, as a share of a splat's, by which its colour is held to be the same from everywhere."""
 SH0, SH1 = 0.28209479177387814, 0.4886025119029199
@@ -155,26 +158,33 @@ def between(poses: list[Pose], fraction: float) -> list[Pose]:
 
 
 def fitted(splats: Splats, window: BakedWindow, poses: list[Pose]) -> Splats:
-    """Splats with colours, linear in direction, that come closer to what a window shows.
+    """Splats with colours, linear in direction, and opacities that come closer to what a window shows.
 
     The errors of all images are taken back to the splats, and each is corrected by least squares over (1, direction),
-    as if it were alone. Weights of a pixel sum up to 1 at most, so steps of less than twice that converge.
+    as if it were alone. Weights of a pixel sum up to 1 at most, so steps of less than twice that converge. An error is
+    shared out among opacities by how much the pixel changes with each.
     """
     gaussians, count = splats.gaussians, len(splats.means)
-    squares, errors = torch.zeros(count, 4, 4), torch.zeros(count, 4, COLORS)
+    squares, errors, opacities = torch.zeros(count, 4, 4), torch.zeros(count, 4, COLORS), torch.zeros(count, 2)
     for pose in poses:
         view = View(torch.tensor(pose.to_world).float(), pose.size, pose.focal, pose.center)
         target = window.render(*_reach(window, pose), torch.full((COLORS,), window.background))["rgb"]
-        image = splat_image(gaussians, view, splats.seen_from(view.to_world[:, 3]))
+        colors = splats.seen_from(view.to_world[:, 3])
+        image = splat_image(gaussians, view, colors)
         shown = image[..., :3] + window.background * image[..., 3:]
-        sums = splat_sums(gaussians, view, target.view(shown.shape) - shown)
+        missing = target.view(shown.shape) - shown
+        sums = splat_sums(gaussians, view, missing)
+        opacities += splat_opacities(gaussians, view, colors, shown, missing)
         seen = sums[:, 3].nonzero()[:, 0]
         basis, sums = splats.basis(view.to_world[:, 3])[seen], sums[seen]
         squares.index_add_(0, seen, basis[:, :, None] * basis[:, None] * sums[:, 3, None, None])
         errors.index_add_(0, seen, basis[:, :, None] * sums[:, None, :3])
     weight = squares[:, :1, 0].clamp(min=1e-6)
     held = STEADY * weight * squares.new_tensor([1e-4, 1.0, 1.0, 1.0])
-    return replace(splats, colors=splats.colors + STEP * torch.linalg.solve(squares + torch.diag_embed(held), errors))
+    colors = splats.colors + STEP * torch.linalg.solve(squares + torch.diag_embed(held), errors)
+    change = OPACITY_STEP * opacities[:, 0] / opacities[:, 1].clamp(min=1e-6)
+    alphas = torch.sigmoid(torch.logit(splats.alphas, 1e-4) + change.clamp(-MOST_CHANGE, MOST_CHANGE))
+    return replace(splats, colors=colors, alphas=alphas.clamp(max=0.999))
 
 
 def _texels(window: BakedWindow, peaks: Float[Tensor, "B 8 8"]) -> _Texels:

@@ -46,6 +46,7 @@ TABLE: dict[str, tuple[str, tuple[Form, ...]]] = {
     "march_baked": ("baked", ("cpu",)),
     "splat_image": ("splat", ("cpu",)),
     "splat_sums": ("splat", ("cpu",)),
+    "splat_opacities": ("splat", ("cpu",)),
     "shade_baked": ("baked", ("cpu",)),
 }
 """Every operation. Its function has the same name and signature in ``reference.py``, ``cpu.py`` and ``gpu.py``."""

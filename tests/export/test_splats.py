@@ -108,6 +108,33 @@ def test_fitted_colours_come_closer_to_the_window(window):
     assert error(end, small) < 0.01
 
 
+def test_fitted_opacities_help(window, monkeypatch):
+    """Splats that are too faint come closer to the window with their opacities than with their colours alone."""
+    poses = cameras(window)
+    faint = splats.splats_of(window, poses, 0.01, 10_000, rounds=0)
+    faint = replace(faint, alphas=0.4 * faint.alphas)
+
+    def error(step):
+        monkeypatch.setattr(splats, "OPACITY_STEP", step)
+        found = faint
+        for _ in range(4):
+            found = splats.fitted(found, window, poses)
+        shown = [splat_image(found.gaussians, view_of(p), found.seen_from(eye_of(p))) for p in poses]
+        images = [x[..., :3] + window.background * x[..., 3:] for x in shown]
+        targets = [window.render(*splats._reach(window, p), torch.full((3,), window.background))["rgb"] for p in poses]
+        return sum(float((a.reshape(-1, 3) - b).square().mean()) for a, b in zip(images, targets, strict=True))
+
+    assert error(splats.OPACITY_STEP) < 0.95 * error(0.0)
+
+
+def view_of(pose):
+    return View(torch.tensor(pose.to_world).float(), pose.size, pose.focal, pose.center)
+
+
+def eye_of(pose):
+    return torch.tensor(pose.to_world).float()[:, 3]
+
+
 def test_cameras_between_two_lie_between_them():
     a = Pose([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]], (4, 4), (4, 4), (2, 2))
     b = replace(a, to_world=[[0, 0, 1, 2], [0, 1, 0, 0], [-1, 0, 0, 0]])  # a quarter turn to the left

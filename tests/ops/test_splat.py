@@ -86,3 +86,29 @@ def test_no_gaussians_show_nothing(form):
     gaussians = Gaussians(torch.zeros(0, 3), torch.zeros(0, 3, 3), torch.zeros(0))
     image = FORMS[form].splat_image(gaussians, VIEW, torch.zeros(0, 3))
     assert (image[..., :3] == 0).all() and (image[..., 3] == 1).all()
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_opacities_agree_with_finite_differences(form):
+    """What the image changes with each opacity, as the hand-made renderer changes, shares out an error."""
+    if form == "cpu" and dispatch.form_of("splat_image", torch.zeros(1)) != "cpu":
+        pytest.skip("no C++ compiler")
+    gaussians, colors = some(12, seed=5)
+    gaussians = gaussians._replace(alphas=gaussians.alphas.clamp(0.05, 0.9))
+    background, step = np.array([0.5, 0.2, 0.9]), 1e-5
+
+    def by_logits(logits):
+        image, _ = by_hand(gaussians._replace(alphas=torch.sigmoid(logits)), VIEW, colors)
+        return image[..., :3] + image[..., 3:] * background
+
+    logits = torch.logit(gaussians.alphas.double())
+    moves = step * torch.eye(len(logits), dtype=torch.float64)
+    slopes = np.stack([(by_logits(logits + m) - by_logits(logits - m)) / (2 * step) for m in moves], -1)
+    slopes[np.abs(slopes) > 1] = 0  # an alpha that became too faint in between
+    errors = np.random.default_rng(0).normal(size=slopes.shape[:3])
+    parts = slopes * errors[..., None] / np.maximum(np.abs(slopes).sum(-1, keepdims=True), 1e-6)
+    expected = np.stack([parts.sum((0, 1, 2)), np.abs(slopes).sum((0, 1, 2))], -1)
+    given = (torch.tensor(x, dtype=torch.float32) for x in (by_logits(logits), errors))
+    found = FORMS[form].splat_opacities(gaussians, VIEW, colors, *given).numpy()
+    assert (expected[:, 1] > 0.1).sum() > 4
+    np.testing.assert_allclose(found, expected, rtol=0.02, atol=0.02)

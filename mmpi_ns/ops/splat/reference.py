@@ -50,6 +50,22 @@ def splat_sums(gaussians: Gaussians, view: View, image: Tensor) -> Tensor:
     return (weights.T @ pixels.to(weights)).to(image)
 
 
+def splat_opacities(gaussians: Gaussians, view: View, colors: Tensor, shown: Tensor, errors: Tensor) -> Tensor:
+    """See ``ops.splat``."""
+    weights, passing = _weights(gaussians, view)
+    behind = (shown.reshape(-1, 3).double() - weights @ colors.double()) / passing
+
+    def image(logits: Tensor) -> Tensor:
+        weights, passing = _weights(gaussians._replace(alphas=torch.sigmoid(logits)), view)
+        return weights @ colors.double() + passing * behind
+
+    slopes = torch.autograd.functional.jacobian(image, torch.logit(gaussians.alphas.double()))  # [P, 3, N]
+    assert isinstance(slopes, Tensor)
+    total = slopes.abs().sum(-1, keepdim=True).clamp(min=1e-6)
+    parts = slopes * errors.reshape(-1, 3, 1).double() / total
+    return torch.stack([parts.sum((0, 1)), slopes.abs().sum((0, 1))], -1).to(errors)
+
+
 def _weights(gaussians: Gaussians, view: View) -> tuple[Float[Tensor, "P N"], Float[Tensor, "P 1"]]:
     """Weight of each Gaussian in each pixel, and the light that passes all, in double precision."""
     means, covariances, alphas, to_world = (x.double() for x in (*gaussians, view.to_world))

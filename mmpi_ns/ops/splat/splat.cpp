@@ -58,49 +58,89 @@ bool project(const View& view, const float* mean, const float* covariance, float
     return true;
 }
 
-} // namespace
+struct Gaussians {
+    int64_t count;
+    const float *means, *covariances, *alphas;
+};
 
-extern "C" {
-
-// Either an image [height, width, 4] of colours and passing light from `colors`, or, where `errors` [height, width, 3] is
-// given, the sums [count, 4] over pixels of each Gaussian's weight times (error, 1).
-void mmpi_splat(const View* view, int64_t count, const float* means, const float* covariances, const float* alphas,
-                const float* colors, float* image, const float* errors, float* sums) {
+// Those that a camera sees, front to back.
+std::vector<Seen> sorted(const View& view, const Gaussians& all) {
     std::vector<Seen> seen;
-    for (int64_t i = 0; i < count; i++) {
+    for (int64_t i = 0; i < all.count; i++) {
         Seen one;
-        if (!project(*view, means + 3 * i, covariances + 9 * i, alphas[i], one)) continue;
+        if (!project(view, all.means + 3 * i, all.covariances + 9 * i, all.alphas[i], one)) continue;
         one.index = int32_t(i);
         seen.push_back(one);
     }
     std::stable_sort(seen.begin(), seen.end(), [](const Seen& a, const Seen& b) { return a.z < b.z; });
-    const int64_t pixels = int64_t(view->width) * view->height;
-    std::vector<float> light(pixels, 1.0f); // negative once a pixel is done
-    for (const Seen& one : seen) {
-        float sum[4] = {0, 0, 0, 0};
+    return seen;
+}
+
+// Tells of every Gaussian at every pixel that it changes: its number, the pixel, its alpha there, the light before it.
+// Returns the light that passes each pixel.
+template <typename Tell> std::vector<float> lay(const View& view, const std::vector<Seen>& seen, Tell tell) {
+    std::vector<float> light(int64_t(view.width) * view.height, 1.0f); // negative once a pixel is done
+    for (const Seen& one : seen)
         for (int32_t row = one.top; row <= one.bottom; row++) {
             const float dy = float(row) + 0.5f - one.v;
             for (int32_t column = one.left; column <= one.right; column++) {
-                const int64_t pixel = int64_t(row) * view->width + column;
+                const int64_t pixel = int64_t(row) * view.width + column;
                 if (light[pixel] < 0) continue;
                 const float dx = float(column) + 0.5f - one.u;
                 const float power = 0.5f * (one.a * dx * dx + one.c * dy * dy) + one.b * dx * dy;
                 const float alpha = std::min(STRONGEST, one.alpha * std::exp(-power));
                 if (alpha < FAINTEST) continue;
-                const float after = light[pixel] * (1 - alpha), weight = light[pixel] * alpha;
-                light[pixel] = after > OPAQUE ? after : -light[pixel];
-                if (after <= OPAQUE) continue;
-                if (errors)
-                    for (int c = 0; c < 3; c++) sum[c] += weight * errors[3 * pixel + c];
-                else
-                    for (int c = 0; c < 3; c++) image[4 * pixel + c] += weight * colors[3 * int64_t(one.index) + c];
-                sum[3] += weight;
+                const float before = light[pixel], after = before * (1 - alpha);
+                light[pixel] = after > OPAQUE ? after : -before;
+                if (after > OPAQUE) tell(one.index, pixel, alpha, before);
             }
         }
-        if (errors)
-            for (int c = 0; c < 4; c++) sums[4 * int64_t(one.index) + c] += sum[c];
-    }
-    if (!errors)
-        for (int64_t p = 0; p < pixels; p++) image[4 * p + 3] = std::fabs(light[p]);
+    for (float& x : light) x = std::fabs(x);
+    return light;
+}
+
+} // namespace
+
+extern "C" {
+
+// An image [height, width, 4] of colours and passing light.
+void mmpi_splat_image(const View* view, Gaussians all, const float* colors, float* image) {
+    const auto light = lay(*view, sorted(*view, all), [&](int64_t i, int64_t pixel, float alpha, float before) {
+        for (int c = 0; c < 3; c++) image[4 * pixel + c] += before * alpha * colors[3 * i + c];
+    });
+    for (size_t p = 0; p < light.size(); p++) image[4 * p + 3] = light[p];
+}
+
+// The sums [count, 4] over pixels of each Gaussian's weight times (error, 1).
+void mmpi_splat_sums(const View* view, Gaussians all, const float* errors, float* sums) {
+    lay(*view, sorted(*view, all), [&](int64_t i, int64_t pixel, float alpha, float before) {
+        for (int c = 0; c < 3; c++) sums[4 * i + c] += before * alpha * errors[3 * pixel + c];
+        sums[4 * i + 3] += before * alpha;
+    });
+}
+
+// With J what a number of the image changes with the logit of a Gaussian's opacity, the sums [count, 2] over an image's
+// numbers of (J error / (sum of all Gaussians' |J|), |J|). `shown` is the image with its background, [height, width, 3].
+void mmpi_splat_opacities(const View* view, Gaussians all, const float* colors, const float* shown, const float* errors,
+                          float* sums) {
+    const std::vector<Seen> seen = sorted(*view, all);
+    std::vector<float> front, total(int64_t(view->width) * view->height * 3, 0.0f);
+    const auto walk = [&](auto use) {
+        front.assign(total.size(), 0.0f);
+        lay(*view, seen, [&](int64_t i, int64_t pixel, float alpha, float before) {
+            for (int c = 0; c < 3; c++) {
+                const int64_t at = 3 * pixel + c;
+                front[at] += before * alpha * colors[3 * i + c];
+                const float behind = (shown[at] - front[at]) / (1 - alpha);
+                const float change = alpha < STRONGEST ? alpha * (1 - all.alphas[i]) : 0.0f;
+                use(i, at, change * (before * colors[3 * i + c] - behind));
+            }
+        });
+    };
+    walk([&](int64_t, int64_t at, float slope) { total[at] += std::fabs(slope); });
+    walk([&](int64_t i, int64_t at, float slope) {
+        sums[2 * i] += slope * errors[at] / std::max(total[at], 1e-6f);
+        sums[2 * i + 1] += std::fabs(slope);
+    });
 }
 }
