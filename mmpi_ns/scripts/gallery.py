@@ -1,4 +1,4 @@
-"""``make gallery``: four procedural scenes, each trained for a minute or two, and their page in the documentation."""
+"""``make gallery``: four procedural scenes, each trained for some minutes, and their page in the documentation."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ SHOWN = {
     ),
 }
 """Each scene with how it is made and trained, and a sentence about it."""
-MOST_PICTURE, MOST_CLIP = 90_000, 140_000
+MOST_PICTURE, MOST_CLIP = 200_000, 500_000
 """Bytes of a scene's picture and clip."""
 COLUMNS = {
     "scene": "[{name}](#{name})",
@@ -91,8 +91,8 @@ def markdown(rows: list[dict[str, Any]]) -> str:
     """The page."""
     parts = [
         "# Gallery",
-        "Four procedural scenes, each trained with `mmpi-small` for a minute or two. PSNR and SSIM are means over the "
-        "test images, half of each scene; depths are found in the training images, the exact ones are not read.",
+        "Four procedural scenes, each trained with `mmpi-small` for some minutes on one core. PSNR and SSIM are means "
+        "over the test images; depths are found in the training images, the exact ones are not read.",
         table(COLUMNS, rows),
         f"Made by `make gallery` on {processor()}, commit {commit()}; seconds are from the start of `ns-train` to its "
         "last checkpoint, on a machine that did other things too.",
