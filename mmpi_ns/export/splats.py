@@ -7,6 +7,7 @@ fitted to what rays show at it, as a linear function of the direction: spherical
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean
@@ -15,6 +16,7 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float, Int
+from rich.progress import track
 from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 
@@ -122,7 +124,8 @@ def splats_of(window: BakedWindow, poses: list[Pose], least: float, most: int, r
     group = torch.where(wanted, kept[group.clamp(min=0)], -1)
     splats = _placed(window, texels, group, level, fmean(pose.focal[0] for pose in poses))
     for number in range(rounds):  # other cameras each time, so that splats do not suit those of the capture alone
-        splats = fitted(splats, window, between(poses, FRACTIONS[number % len(FRACTIONS)]))
+        asked = between(poses, FRACTIONS[number % len(FRACTIONS)])
+        splats = fitted(splats, window, track(asked, description=f"Fitting splats, round {number + 1} of {rounds}"))
     return splats
 
 
@@ -157,7 +160,7 @@ def between(poses: list[Pose], fraction: float) -> list[Pose]:
     return made
 
 
-def fitted(splats: Splats, window: BakedWindow, poses: list[Pose]) -> Splats:
+def fitted(splats: Splats, window: BakedWindow, poses: Iterable[Pose]) -> Splats:
     """Splats with colours, linear in direction, and opacities that come closer to what a window shows.
 
     The errors of all images are taken back to the splats, and each is corrected by least squares over (1, direction),
