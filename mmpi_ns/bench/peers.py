@@ -10,23 +10,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mmpi_ns.capture.point_cloud import read_ply
+from mmpi_ns.capture.point_cloud import parser_points
 from mmpi_ns.ops.interpolate import interpolate_gathered
 
 
 def read_points_ourselves() -> None:
-    """Makes nerfstudio's data parser read point clouds by ``read_ply`` in this process."""
+    """Makes nerfstudio's data parser read point clouds by ``parser_points`` in this process."""
     from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio
 
-    def load(self, ply_file_path: Path, transform_matrix: torch.Tensor, scale_factor: float):
-        xyz, rgb = read_ply(ply_file_path)
-        if not len(xyz):
-            return None
-        points = torch.from_numpy(xyz).float()
-        points = torch.cat([points, torch.ones_like(points[:, :1])], -1) @ transform_matrix.T * scale_factor
-        return {"points3D_xyz": points, "points3D_rgb": torch.from_numpy(rgb)}
-
-    Nerfstudio._load_3D_points = load  # type: ignore[method-assign]
+    Nerfstudio._load_3D_points = lambda self, *given: parser_points(*given)  # type: ignore[method-assign]
 
 
 def give_depths(data: Path, downscale_factor: int) -> None:

@@ -15,7 +15,7 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio
 from torch import Tensor
 
 from mmpi_ns.capture.checks import say_once
-from mmpi_ns.capture.point_cloud import read_ply
+from mmpi_ns.capture.point_cloud import parser_points
 from mmpi_ns.capture.sfm import model_errors
 from mmpi_ns.capture.sfm_files import check_model_files
 from mmpi_ns.utils.errors import InputError
@@ -86,10 +86,8 @@ class LocalNerfstudio(Nerfstudio):
         return self._origin.tell(outputs)
 
     def _load_3D_points(self, ply_file_path: Path, transform_matrix: Tensor, scale_factor: float) -> Any:
-        xyz, colors = read_ply(ply_file_path)
-        local = torch.from_numpy(xyz - self._origin.place if self._origin.taken else xyz).float()
-        points = (local @ transform_matrix[:, :3].T + transform_matrix[:, 3]) * scale_factor
-        return {"points3D_xyz": points, "points3D_rgb": torch.from_numpy(colors)} if len(points) else None
+        origin = self._origin.place if self._origin.taken else 0.0
+        return parser_points(ply_file_path, transform_matrix, scale_factor, origin)
 
 
 class LocalColmap(ColmapDataParser):

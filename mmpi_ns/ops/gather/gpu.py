@@ -146,7 +146,8 @@ class _GatherTaps(torch.autograd.Function):
         needed, channels = ctx.needs_input_grad[0], values.shape[1]
         to_values, to_weights = torch.zeros_like(values) if needed else values, torch.zeros_like(weights)
         columns, block = sizes(channels, values.device)
-        moved, to_shares, first = any(ctx.needs_input_grad[5::2]), [torch.zeros_like(x) for x in taps[1::2]], 0
+        moved, first = any(ctx.needs_input_grad[5::2]), 0
+        to_shares = [torch.zeros_like(x) if moved else to_weights for x in taps[1::2]]  # not written where unmoved
         for positions, shares, to in zip(taps[::2], taps[1::2], to_shares, strict=True):
             launch(
                 gather_back_kernel, len(positions), block, values, slots, wanted, weights, positions, shares,
