@@ -9,11 +9,15 @@ from unittest.mock import MagicMock
 import numpy as np
 import pytest
 import torch
+from nerfstudio.cameras.camera_optimizers import CameraOptimizer, CameraOptimizerConfig
 from nerfstudio.cameras.lie_groups import exp_map_SO3xR3
+from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.utils.eval_utils import eval_setup
 from tiny_scene import write_scene
 from training_runs import compared, differences, load, ready, trainer_config, write_plan, write_windows
 
+from mmpi_ns.capture.datamanager import OWN_PIXEL
+from mmpi_ns.training.refined_poses import move_rays
 from mmpi_ns.utils.errors import InputError
 
 STEPS = 24
@@ -161,3 +165,24 @@ def test_poses_are_not_refined_against_what_has_no_gradients(turned):
     with pytest.raises(InputError, match="render exact"):
         turned.pipeline.get_average_eval_image_metrics()
     turned.pipeline.model.config.render = "exact"
+
+
+@pytest.mark.parametrize("part", ["origins", "directions"])
+def test_every_ray_follows_its_camera_and_pixels_of_images_alone_move_it(part):
+    poses: CameraOptimizer = CameraOptimizerConfig(mode="SO3xR3").setup(num_cameras=2, device="cpu")
+    with torch.no_grad():
+        poses.pose_adjustment.copy_(torch.tensor([[0.1, 0.2, 0.3, 0.0, 0.0, 0.2], [0.0, 0.0, -0.5, 0.3, 0.0, 0.0]]))
+    numbers, own = torch.tensor([[0], [1], [0], [1]]), torch.tensor([[True], [False], [False], [False]])
+    ways = torch.nn.functional.normalize(torch.tensor([[1.0, 2, 3], [3, 1, 2], [1, 0, 0], [0, 1, 1]]), dim=-1)
+    given = {"origins": torch.ones(4, 3), "directions": ways}
+    bundle = RayBundle(**given, pixel_area=torch.ones(4, 1), camera_indices=numbers, metadata={OWN_PIXEL: own})
+    move_rays(bundle, poses)
+    moves = poses(numbers[:, 0])
+    wanted = {
+        "origins": given["origins"] + moves[:, :, 3],
+        "directions": (moves[:, :, :3] @ given["directions"][..., None])[..., 0],
+    }
+    assert torch.allclose(getattr(bundle, part), wanted[part]) and not torch.allclose(wanted[part], given[part])
+    (getattr(bundle, part) * torch.arange(12.0).view(4, 3)).sum().backward()
+    grad = poses.pose_adjustment.grad
+    assert grad is not None and grad[0].abs().sum() > 0 and not grad[1].any()
