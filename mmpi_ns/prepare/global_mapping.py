@@ -17,6 +17,10 @@ import pycolmap
 from mmpi_ns.capture.matching import MIN_ANGLE, MIN_INLIERS, SEED, quiet
 from mmpi_ns.prepare.mapping import largest_model
 
+TRACKS_PER_VIEW = 500
+"""Tracks that an image needs in order to be placed; the longest are taken. All others come in at the end, by
+triangulation: with all of them from the start kitti-street takes twice as long and is no better (docs/prepare.md)."""
+
 
 def map_globally(
     database: Path, images: Path, folder: Path, refine: bool, threads: int
@@ -54,6 +58,7 @@ def global_options(refine: bool, threads: int) -> pycolmap.GlobalPipelineOptions
     options.random_seed = SEED
     options.num_threads = threads
     mapper = options.mapper
+    mapper.track_required_tracks_per_view = TRACKS_PER_VIEW
     mapper.random_seed = SEED
     mapper.num_threads = threads
     for part in (mapper.rotation_averaging, mapper.global_positioning, mapper.retriangulation):
