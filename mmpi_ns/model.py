@@ -30,7 +30,7 @@ from mmpi_ns.ops.blending import BlendForm
 from mmpi_ns.ops.march.reference import most_kept
 from mmpi_ns.placement.rule import PlacementConfig
 from mmpi_ns.placement.split import place_windows
-from mmpi_ns.rendering.baked import BakedWindow, bake
+from mmpi_ns.rendering.baked import BakedWindow, bake, suits_bricks
 from mmpi_ns.rendering.chunks import BYTES_PER_SLOT, rays_per_chunk, render_in_chunks
 from mmpi_ns.rendering.metrics import ImageMetrics, depth_metrics, pictures
 from mmpi_ns.rendering.render import images_of, render_rays, sampled_outputs
@@ -125,9 +125,10 @@ class MMPIModelConfig(ModelConfig):
     compiled where that can be done (auto)."""
     render_threshold: float = 3e-3
     """Samples of less weight are not coloured when rendering; the dropped mass is reported."""
-    render: Literal["exact", "baked"] = "exact"
-    """Images from the field itself, or from bricks of 8-bit codes made of it when the first image is asked for
-    (shading ray, no cube): faster on a CPU, and nearly the same (docs/export.md)."""
+    render: Literal["auto", "exact", "baked"] = "auto"
+    """Images from the field itself (exact), or from bricks of 8-bit codes made of it when the first image is asked for
+    (baked: a third of the time on a CPU, 0.01 dB less; docs/export.md). auto: bricks for ns-render and ns-viewer on a
+    CPU, where a model can be baked; while it trains, where it is measured (ns-eval) and on a GPU the field itself."""
     render_shares: Literal["exact", "baked"] = "exact"
     """After two-phase training: a sample's share from the reliabilities of all MPIs that see it, or from its texels,
     which keep theirs from the first rendering on (faster by the number of MPIs that overlap, and nearly the same)."""
@@ -186,7 +187,8 @@ class MMPIModel(Model):
         joint = config.training == "joint" or all(plan.num_heads == 1 for plan in windows.plans)
         self.progress = Progress(windows, config.schedule("joint" if joint else "two-phase", len(windows)))
         views = self.kwargs.get("metadata", {}).get(TRAINING_VIEWS)
-        if OBSERVATIONS in self.kwargs.get("metadata", {}):  # it is going to be trained
+        self.trains = OBSERVATIONS in self.kwargs.get("metadata", {})
+        if self.trains:
             seen, device = [views_of(window, views) for window in windows.windows], self.kwargs.get("device", "cpu")
             check_memory(windows, seen, config.feature_channels, not joint, device)
         self.field = self._new_field(views_of(windows.windows[0], views))
@@ -307,8 +309,9 @@ class MMPIModel(Model):
             bundle: the rays.
             chosen: the one (window, head) to show; None for all.
         """
-        if self.config.render == "baked" and chosen is None:
-            return self._baked_outputs(window, field, bounded(bundle, field.plan))
+        if chosen is None and self._shows_bricks(field):
+            outputs = self.baked(field).outputs(bounded(bundle, field.plan), self._background(bundle.origins))
+            return outputs | {"winning_mpi": outputs["winning_mpi"] + self.progress.windows.first_head(window)}
         form, head_mask, shares = self.blend_form(field), None, None
         if chosen is not None:
             head = chosen[1] if chosen[0] == window else -1
@@ -323,13 +326,11 @@ class MMPIModel(Model):
         winner = outputs["winning_mpi"] + self.progress.windows.first_head(window)
         return outputs | {"rgb": rgb.clamp(0, 1), "winning_mpi": winner}
 
-    def _baked_outputs(self, window: int, field: MMPIField, bundle: RayBundle) -> dict[str, Tensor]:
-        """``window_outputs`` of a field's baked bricks, which are read on the CPU."""
-        assert bundle.nears is not None and bundle.fars is not None
-        rays = bundle.origins.cpu(), bundle.directions.cpu(), bundle.nears.cpu(), bundle.fars.cpu()
-        outputs = self.baked(field).render(*rays, self._background(bundle.origins).cpu())
-        outputs["winning_mpi"] = outputs["winning_mpi"] + self.progress.windows.first_head(window)
-        return {name: values.to(self.device) for name, values in outputs.items()}
+    def _shows_bricks(self, field: MMPIField) -> bool:
+        """Whether images of a field come from its bricks."""
+        if self.config.render == "auto":
+            return not self.trains and suits_bricks(field)
+        return self.config.render == "baked"
 
     def baked(self, field: MMPIField) -> BakedWindow:
         """A field baked, made once, until it is trained on. Raises ValueError where it cannot be."""

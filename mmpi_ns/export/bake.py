@@ -30,7 +30,7 @@ Say = Callable[[str], None]
 
 
 def load_model(load_config: Path) -> Any:
-    """The pipeline of a finished run, ready to render.
+    """The pipeline of a finished run, ready to render exactly.
 
     Raises:
         ValueError: it was not trained by this method.
@@ -45,6 +45,7 @@ def load_model(load_config: Path) -> Any:
         ) from error
     if not isinstance(pipeline.model, MMPIModel):
         raise ValueError(f"The run of {load_config} was trained by another method: only those of mmpi can be exported.")
+    pipeline.model.config.render = "exact"  # what others are compared with
     return pipeline
 
 

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, UInt8
+from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 from torch.nn.functional import pad
 
 from mmpi_ns.field.baking import baked_shares
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.shading import CHANGE, MOST_CHANGE, RayShader
+from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.baked import march_baked, shade_baked
 from mmpi_ns.ops.blending import BlendForm, blended_optical_depth
 from mmpi_ns.ops.gather import COLORS
@@ -37,6 +41,25 @@ THINNEST = -12.0
 HIGHEST_COLOR, HIGHEST_FEATURE = 191, 96
 """Largest codes of a channel of diffuse colour and of one of a feature. With 255 for both 0.0003 of SSIM are lost and a
 fifth more is to be loaded, with these 0.0007, with 127 for both 0.0011 at this size (docs/export.md)."""
+
+_measuring: ContextVar[bool] = ContextVar("measuring", default=False)
+
+
+@contextmanager
+def exact_images() -> Iterator[None]:
+    """Inside, images of this thread are the field's own and not its bricks', where ``render auto`` has the choice."""
+    token = _measuring.set(True)
+    try:
+        yield
+    finally:
+        _measuring.reset(token)
+
+
+def suits_bricks(model_field: MMPIField) -> bool:
+    """Whether ``render auto`` shows a field that does not train by its bricks: compiled, on a CPU, not measured."""
+    wanted = not _measuring.get() and not torch.is_grad_enabled()
+    compiled = dispatch.form_of("march_baked", model_field.features.data) == "cpu"
+    return wanted and compiled and not why_not_baked(model_field)
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +96,13 @@ class BakedWindow:
             "dropped_mass": (1 - found.passing - found.mass).clamp(min=0),
         }
 
+    def outputs(self, bundle: RayBundle, background: Float[Tensor, "3"]) -> dict[str, Tensor]:
+        """The same of a bundle with nears and fars on any device: bricks are read on the CPU."""
+        assert bundle.nears is not None and bundle.fars is not None
+        rays = (bundle.origins, bundle.directions, bundle.nears, bundle.fars, background)
+        outputs = self.render(*(x.cpu() for x in rays))
+        return {name: values.to(bundle.origins.device) for name, values in outputs.items()}
+
     def keep(self, kept: Bool[Tensor, "B"]) -> BakedWindow:
         """The same with some of the bricks alone."""
         mpis, columns, first = self.mpis, [], 0
@@ -86,17 +116,20 @@ class BakedWindow:
         return replace(self, mpis=replace(mpis, **tables, packed={}))
 
 
-def shader_of(model_field: MMPIField) -> Shader:
-    """The network that shades a field's rays.
+def why_not_baked(model_field: MMPIField) -> str:
+    """Why a field cannot be baked, and how to train one that can; empty where it can."""
+    if not isinstance(model_field.networks, RayShader):
+        return "A model whose samples are coloured one by one cannot be baked: train with --pipeline.model.shading ray."
+    if model_field.cube is not None:
+        return "A model with a cube cannot be baked: train one of MPIs alone (placement.cube-voxels 0)."
+    channels = model_field.feature_channels
+    if channels > MOST_CHANNELS:
+        return f"A model of {channels} channels a texel cannot be baked: {MOST_CHANNELS} is the most."
+    return ""
 
-    Raises:
-        ValueError: its samples are coloured one by one.
-    """
-    network = model_field.networks
-    if not isinstance(network, RayShader):
-        raise ValueError(
-            "A model whose samples are coloured one by one cannot be baked: train with --pipeline.model.shading ray."
-        )
+
+def shader_of(network: RayShader) -> Shader:
+    """The network that shades a field's rays."""
     numbers = [x.detach().cpu() for x in network.layers(0)]
     numbers[-2:] = [CHANGE * x for x in numbers[-2:]]
     return Shader(tuple(zip(numbers[::2], numbers[1::2], strict=True)), network.direction_frequencies, MOST_CHANGE)
@@ -115,13 +148,10 @@ def bake(model_field: MMPIField, threshold: float, background: float, form: Blen
     Raises:
         ValueError: the field has a cube, too many channels, or colours its samples one by one.
     """
-    shader = shader_of(model_field)
-    if model_field.cube is not None:
-        raise ValueError("A model with a cube cannot be baked: train one of MPIs alone (placement.cube-voxels 0).")
-    if model_field.feature_channels > MOST_CHANNELS:
-        raise ValueError(
-            f"A model of {model_field.feature_channels} channels a texel cannot be baked: {MOST_CHANNELS} is the most."
-        )
+    if refusal := why_not_baked(model_field):
+        raise ValueError(refusal)
+    assert isinstance(model_field.networks, RayShader)
+    shader = shader_of(model_field.networks)
     plan = model_field.plan
     shares = baked_shares(model_field) if form is not None else None
     highest = max(float((_raw(model_field, k, p, form, shares)).max()) for k, p in _all_planes(model_field))

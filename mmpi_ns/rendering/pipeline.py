@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 
+from mmpi_ns.rendering.baked import exact_images
 from mmpi_ns.rendering.eval_poses import refined_camera
 from mmpi_ns.utils.console import say
 
@@ -46,7 +47,8 @@ class MMPIPipeline(VanillaPipeline):
 
         model.get_image_metrics_and_images = noted
         try:
-            means = super().get_average_image_metrics(data_loader, image_prefix, *args, **kwargs)
+            with exact_images():
+                means = super().get_average_image_metrics(data_loader, image_prefix, *args, **kwargs)
         finally:
             del model.get_image_metrics_and_images
         names = [Path(name).name for name in data_loader.input_dataset.image_filenames]

@@ -69,7 +69,7 @@ def test_a_model_that_can_be_baked_is_measured_so(tmp_path):
     model = SimpleNamespace(config=MMPIModelConfig())
     with more.pop().applied(model):  # type: ignore[arg-type]
         assert model.config.render == "baked"
-    assert model.config.render == "exact"
+    assert model.config.render == "auto"
 
 
 def test_what_was_measured_is_kept(run, tmp_path, monkeypatch):

@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import copy
 import sys
+import threading
 from pathlib import Path
 
 import pytest
 import torch
 from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.utils.eval_utils import eval_setup
 from random_fields import random_rays
 from training_runs import ready, trainer_config, write_plan
 
 from mmpi_ns.export.bake import bake_run, compare, prune
 from mmpi_ns.export.files import read_baked, write_baked
 from mmpi_ns.field.shading import RayShader
+from mmpi_ns.ops import dispatch
+from mmpi_ns.rendering import baked as baking
+from mmpi_ns.rendering.baked import exact_images
 from mmpi_ns.scripts import export
 
 
@@ -49,7 +54,7 @@ def outputs(model, how, rays):
     model.config.render = how
     with torch.no_grad():
         found = model.get_outputs(copy.deepcopy(rays))
-    model.config.render = "exact"
+    model.config.render = "auto"
     return found
 
 
@@ -83,6 +88,66 @@ def test_blending_is_baked_into_the_bricks(trainer, form, monkeypatch):
     monkeypatch.setattr(model.config, "training", "joint")
     unblended = outputs(model, "baked", rays)
     assert error < 1e-3 and error < 0.2 * (exact["rgb"] - unblended["rgb"]).square().mean()
+
+
+def test_what_is_looked_at_is_baked_and_what_is_measured_is_not(trainer, monkeypatch):
+    """Render auto: bricks, but the field of a model that trains, that is measured, or whose gradients are asked for."""
+    model = filled(trainer)
+    rays = bundle_of(model.field.plan)
+    exact, baked = (outputs(model, how, rays)["rgb"] for how in ("exact", "baked"))
+    assert not torch.equal(exact, baked)
+    auto = lambda: outputs(model, "auto", rays)["rgb"]  # noqa: E731
+    assert model.trains and torch.equal(auto(), exact)
+    monkeypatch.setattr(model, "trains", False)
+    assert torch.equal(auto(), baked)
+    with exact_images():
+        assert torch.equal(auto(), exact)
+        beside: list[torch.Tensor] = []
+        thread = threading.Thread(target=lambda: beside.append(auto()))
+        thread.start()
+        thread.join()
+        assert torch.equal(beside[0], baked), "a viewer's thread beside an evaluation"
+    assert torch.equal(auto(), baked)
+    monkeypatch.setattr(model.config, "render", "auto")
+    with torch.enable_grad():
+        model.get_outputs(copy.deepcopy(rays))["rgb"].sum().backward()
+    assert model.field.features.grad is not None and model.field.features.grad.abs().sum() > 0
+    model.field.zero_grad()
+
+
+def test_a_model_that_cannot_be_baked_is_shown_as_it_is(trainer, monkeypatch):
+    """Render auto: no sentence, no failure; nor without a compiler, where plain torch would take longer than before."""
+    model = filled(trainer)
+    rays = bundle_of(model.field.plan)
+    exact = outputs(model, "exact", rays)["rgb"]
+    monkeypatch.setattr(model, "trains", False)
+    assert not torch.equal(outputs(model, "auto", rays)["rgb"], exact)
+    monkeypatch.setattr(baking, "MOST_CHANNELS", 2)
+    assert torch.equal(outputs(model, "auto", rays)["rgb"], exact)
+    monkeypatch.undo()
+    monkeypatch.setattr(model, "trains", False)
+    dispatch.choose("torch")
+    try:
+        torch.testing.assert_close(outputs(model, "auto", rays)["rgb"], exact, atol=1e-4, rtol=0)
+    finally:
+        dispatch.choose("auto")
+
+
+def test_ns_eval_scores_the_field_and_a_render_shows_the_bricks(trainer):
+    """A run loaded as nerfstudio's commands load it."""
+    trainer.save_checkpoint(0)
+    trainer.config.save_config()
+    _, pipeline, _, _ = eval_setup(trainer.base_dir / "config.yml")
+    model = pipeline.model
+    assert model.config.render == "auto" and not model.trains
+    camera = pipeline.datamanager.eval_dataset.cameras[:1]
+    shown = model.get_outputs_for_camera(camera)["rgb"]
+    scores = {}
+    for how in ("auto", "exact", "baked"):
+        model.config.render = how
+        scores[how] = pipeline.get_average_eval_image_metrics()["psnr"]
+    assert scores["auto"] == scores["exact"] != scores["baked"]
+    assert torch.equal(shown, model.get_outputs_for_camera(camera)["rgb"])
 
 
 def test_training_on_forgets_what_was_baked(trainer):
