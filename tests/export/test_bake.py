@@ -27,7 +27,9 @@ from mmpi_ns.scripts import export
 def trainer(scene, tmp_path_factory):
     folder = tmp_path_factory.mktemp("run")
     plan = write_plan(scene, folder / "plan.json", planes=40)
-    return ready(trainer_config(scene, plan, folder, shading="ray"))
+    config = trainer_config(scene, plan, folder, shading="ray")
+    config.save_config()
+    return ready(config)
 
 
 def filled(trainer, seed=0):
@@ -135,8 +137,8 @@ def test_a_model_that_cannot_be_baked_is_shown_as_it_is(trainer, monkeypatch):
 
 def test_ns_eval_scores_the_field_and_a_render_shows_the_bricks(trainer):
     """A run loaded as nerfstudio's commands load it."""
+    filled(trainer)
     trainer.save_checkpoint(0)
-    trainer.config.save_config()
     _, pipeline, _, _ = eval_setup(trainer.base_dir / "config.yml")
     model = pipeline.model
     assert model.config.render == "auto" and not model.trains
