@@ -11,7 +11,6 @@ from mmpi_ns.bench import trainings
 from mmpi_ns.bench.gpu import checks as gpu_checks
 from mmpi_ns.bench.gpu import command as gpu
 from mmpi_ns.bench.gpu.command import SHARES, Gpu
-from mmpi_ns.bench.stability.exact_ray import ExactField, ExactRay
 from mmpi_ns.bench.stability.rays import scene
 from mmpi_ns.ops import dispatch
 
@@ -49,8 +48,9 @@ def test_wrong_kernels_are_found(monkeypatch):
         "march": lambda *given: march(*given[:-1], given[-1]._replace(form=None)),  # without blending
     }
     right, march = dispatch.function, dispatch.function("march", "gpu")
-    monkeypatch.setattr(dispatch, "function", lambda name, form: wrong.get(name) or right(name, form))
+    monkeypatch.setattr(
+        dispatch, "function", lambda name, form: wrong[name] if form == "gpu" and name in wrong else right(name, form)
+    )
     assert [c.ok for c in gpu_checks.interpolation("cpu", 50)] == [True, False]
-    s = scene(2, 2, "paper")
-    exact = [ExactRay(ExactField.of(s.field), o, d) for o, d in zip(s.origins, s.directions, strict=True)]
-    assert not all(c.ok for c in gpu_checks.marched(s, "wrong", s.field, "cpu", exact, [0, 1]))
+    s, exact = scene(2, 2, "paper").clear()
+    assert len(exact) == 2 and not all(c.ok for c in gpu_checks.marched(s, "wrong", exact))

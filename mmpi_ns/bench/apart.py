@@ -8,11 +8,13 @@ import os
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Mapping
+import time
+from collections.abc import Callable, Mapping, Sequence
+from datetime import date
 from pathlib import Path
 from typing import Any
 
-from mmpi_ns.bench.report import read_json
+from mmpi_ns.bench.report import Scene, commit, processor, read_json
 
 Tell = Callable[[str], None]
 """Says how far it is."""
@@ -87,6 +89,35 @@ def run_command(words: list[str], log: Path, threads: int, **how: Any) -> None:
         ended = subprocess.run(words, stdout=stream, stderr=subprocess.STDOUT, env=environment_of(threads), **how)
     if ended.returncode:
         raise ValueError(f"{Path(words[0]).name} failed with status {ended.returncode}: see {log}.")
+
+
+def train_and_evaluate(
+    scene: Scene, folder: Path, method: str, options: Sequence[str], asked: Sequence[str], threads: int
+) -> tuple[Path, dict[str, Any], dict[str, Any]]:
+    """``ns-train`` and ``ns-eval``, as a user types them, each with its log in a folder.
+
+    Args:
+        scene: to train.
+        folder: of the run and its logs.
+        method: nerfstudio's name of it.
+        options: of ns-train.
+        asked: further options of ns-eval.
+        threads: of both.
+
+    Returns:
+        The run's folder, the results of ns-eval, and for the row: seconds of training, threads, machine and commit.
+    """
+    train, evaluate = (str(Path(sys.executable).with_name(name)) for name in ("ns-train", "ns-eval"))
+    place = ["--output-dir", str(folder), "--experiment-name", "run", "--timestamp", "1", "--vis", "tensorboard"]
+    size = ["--data", str(scene.data), "nerfstudio-data", "--downscale-factor", str(scene.downscale_factor)]
+    start = time.perf_counter()
+    run_command([train, method, *place, *options, *size], folder / "train.log", threads)
+    seconds = time.perf_counter() - start
+    run, found = folder / "run" / method / "1", folder / "eval.json"
+    words = [evaluate, "--load-config", str(run / "config.yml"), "--output-path", str(found), *asked]
+    run_command(words, folder / "eval.log", threads)
+    made = {"train_seconds": seconds, "threads": threads, "processor": processor(), "commit": commit()}
+    return run, read_json(found)["results"], made | {"date": date.today().isoformat()}
 
 
 def main(module: str, function: str, source: str, target: str) -> None:

@@ -8,19 +8,20 @@ from pathlib import Path
 
 import torch
 
-from mmpi_ns.bench.suites import NO_DEPTH, POSES_ALONE, TWO_PHASE, P
+from mmpi_ns.bench.report import Scene
 
-
-@dataclass(frozen=True)
-class Scene:
-    """A data set and the size of its images that is used."""
-
-    data: Path
-    downscale_factor: int
-
-    @property
-    def name(self) -> str:
-        return self.data.resolve().name
+P = "--pipeline.model.placement."
+JOINT = ("--pipeline.model.training", "joint")
+TWO_PHASE = ("--pipeline.model.training", "two-phase")
+"""As it is unless told otherwise: all rays for each MPI, a little blending, and a long fine-tune at full rates."""
+SPLIT = ("--pipeline.model.rays-per-mpi", "split")
+NO_DEPTH = (
+    *("--pipeline.datamanager.keypoint-rays", "0"),
+    *("--pipeline.datamanager.dense-depth", "False"),
+    *("--pipeline.datamanager.depth-images", "False"),
+)
+POSES_ALONE = ("--pipeline.datamanager.sfm-path", "none")
+"""A COLMAP model that the scene has is not read."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,7 @@ class Method:
     options: tuple[str, ...] = ()
     """As for ns-train."""
     steps: int = 1500
-    """Steps unless told otherwise."""
+    """Steps unless told otherwise; 0 for its own."""
     needs: tuple[str, ...] = ()
     """Modules that must be installed, and "cuda"."""
     whole_images: bool = False
@@ -49,6 +50,13 @@ class Method:
     """Beside training images and poses."""
     wants_depths: bool = False
     """Reads depth images: ``peers.give_depths`` gives it those that our methods find."""
+    group: str = ""
+    """Of variants of a method: those of one group share a table."""
+
+    @property
+    def key(self) -> str:
+        """Of a variant's row."""
+        return f"{self.group}: {self.name}" if self.group else self.name
 
     @property
     def ours(self) -> bool:

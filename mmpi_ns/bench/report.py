@@ -58,6 +58,18 @@ class Bench:
         return f"{fingerprint()} {', '.join(words)}"
 
 
+@dataclass(frozen=True)
+class Scene:
+    """A data set and the size of its images that is used."""
+
+    data: Path
+    downscale_factor: int
+
+    @property
+    def name(self) -> str:
+        return self.data.resolve().name
+
+
 @dataclass(kw_only=True)
 class SceneBench(Bench):
     """Options of benchmarks on one scene."""
@@ -66,6 +78,10 @@ class SceneBench(Bench):
     """The scene (a folder with transforms.json)."""
     downscale_factor: int = 4
     """Image size to use."""
+
+    @property
+    def scene(self) -> Scene:
+        return Scene(self.data, self.downscale_factor)
 
 
 class Report:

@@ -9,12 +9,11 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
-import resource
 import shlex
 import shutil
 import time
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -23,10 +22,13 @@ import torch
 from numpy.typing import NDArray
 
 from mmpi_ns.bench.apart import Tell, run_apart
-from mmpi_ns.bench.methods import Method, Scene
-from mmpi_ns.bench.progress import Progress
-from mmpi_ns.bench.trainers import clock, config_of, end_helpers, trainer_of
+from mmpi_ns.bench.methods import Method
+from mmpi_ns.bench.peers import give_depths, look_up_quickly, read_points_ourselves
+from mmpi_ns.bench.report import Scene, read_json, write_json
+from mmpi_ns.bench.trainers import clock, config_of, end_helpers, peak_gib, trainer_of
 from mmpi_ns.rendering.metrics import ImageMetrics
+
+PROGRESS = "progress.json"
 
 
 @dataclass(frozen=True)
@@ -89,6 +91,43 @@ def train_apart(
     return run_apart(train, asdict(request), Path(request.work), threads, seconds, variables)
 
 
+@dataclass
+class Progress:
+    """How far a training has come, and where its checkpoints lie: what a run that goes on must know."""
+
+    words: list[str]
+    """What ``ns-train`` was asked for, but for the number of steps."""
+    curve: list[dict[str, float]] = field(default_factory=list)
+    """One point for each look: step, rays, seconds by the clock and of processors, psnr."""
+    rays: int = 0
+    setup_seconds: float = 0.0
+    checkpoints: str = ""
+    """Folder."""
+
+    @property
+    def last(self) -> dict[str, Any]:
+        """The last look."""
+        return self.curve[-1] if self.curve else {"step": 0, "seconds": 0.0, "processor": 0.0}
+
+    def save(self, trainer: Any, folder: Path) -> None:
+        """Saves a checkpoint of nerfstudio's trainer, and then what belongs to it."""
+        trainer.save_checkpoint(self.last["step"] - 1)
+        self.checkpoints = str(trainer.checkpoint_dir)
+        write_json(folder / PROGRESS, asdict(self))
+
+    @staticmethod
+    def before(words: tuple[str, ...], folder: Path, last: int) -> Progress:
+        """That of a run in this folder from which one of ``last`` steps can go on; else none yet."""
+        own = [w for i, w in enumerate(words) if i == 0 or words[i - 1] != "--max-num-iterations"]
+        if known := read_json(folder / PROGRESS):
+            found = Progress(**known)
+            step = found.last["step"]
+            saved = Path(found.checkpoints) / f"step-{step - 1:09d}.ckpt"
+            if found.words == own and 0 < step < last and saved.is_file():
+                return found
+        return Progress(own)
+
+
 class Stopwatch:
     """Seconds that training took, without what it was stopped for: by the clock, and of this process's processors."""
 
@@ -149,8 +188,7 @@ def score(pipeline: Any, images: list[int], pixels: int, whole_images: bool) -> 
         truth = truth.float() / 255 if truth.dtype == torch.uint8 else truth
         if truth.shape[-1] != 3:
             raise ValueError("A test image is see-through: methods put it over different backgrounds.")
-        height, width = truth.shape[:2]
-        chosen = chosen_pixels(index, height, width, pixels)
+        chosen = chosen_pixels(index, *truth.shape[:2], pixels)
         start = time.perf_counter()
         if pixels and not whole_images:
             bundle = camera.generate_rays(camera_indices=0, keep_shape=True).flatten()
@@ -170,11 +208,11 @@ def score(pipeline: Any, images: list[int], pixels: int, whole_images: bool) -> 
 
 
 def split_of(datamanager: Any) -> dict[str, Any]:
-    """Which images a method trains with and is tested on: counts, image size, and a hash of names, sizes, focal lengths
+    """Which images a method trains with and is tested on: names, image size, and a hash of names, sizes, focal lengths
     and how far apart the cameras are."""
-    parts = {"train": datamanager.train_dataparser_outputs, "test": datamanager.eval_dataset._dataparser_outputs}
     found: dict[str, Any] = {}
     digest = hashlib.sha256()
+    parts = {"train": datamanager.train_dataparser_outputs, "test": datamanager.eval_dataset._dataparser_outputs}
     for name, outputs in parts.items():
         found[name] = [str(p) for p in outputs.image_filenames]
         cameras = outputs.cameras
@@ -200,8 +238,8 @@ def check_split(split: dict[str, Any], data: Path, downscale_factor: int) -> Non
         wanted = [str(p) for p in parser.get_dataparser_outputs(split=name).image_filenames]
         if split[name] != wanted:
             raise ValueError(f"{data}: the {name} images are not those of its {name} list; val and test must be equal.")
-    if set(split["train"]) & set(split["test"]):
-        raise ValueError(f"{data}: {sorted(set(split['train']) & set(split['test']))[0]} is in both lists.")
+    if both := sorted(set(split["train"]) & set(split["test"])):
+        raise ValueError(f"{data}: {both[0]} is in both lists.")
 
 
 def train(asked: dict[str, Any], tell: Tell = print) -> dict[str, Any]:
@@ -216,8 +254,6 @@ def train(asked: dict[str, Any], tell: Tell = print) -> dict[str, Any]:
         evaluation not; by the clock, and of processors) and PSNR; psnr, ssim, rays_per_s, frame_s over whole test
         images; setup_seconds, seconds, processor_seconds, rays, parameters, peak_gib, split.
     """
-    from mmpi_ns.bench.peers import give_depths, look_up_quickly, read_points_ourselves
-
     plain: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in asked.items()}
     request = Request(**plain)
     read_points_ourselves()
@@ -227,16 +263,17 @@ def train(asked: dict[str, Any], tell: Tell = print) -> dict[str, Any]:
         give_depths(Path(request.data), request.downscale_factor)
     config = config_of(request.words)
     progress = Progress.before(request.words, Path(request.work), request.checks[-1] if request.go_on else 0)
-    if progress.step:
-        config.load_dir, config.load_step = Path(progress.checkpoints), progress.step - 1
-        config.max_num_iterations -= progress.step  # nerfstudio's trainer makes so many more
-        tell(f"goes on from step {progress.step}")
+    done = int(progress.last["step"])
+    if done:
+        config.load_dir, config.load_step = Path(progress.checkpoints), done - 1
+        config.max_num_iterations -= done  # nerfstudio's trainer makes so many more
+        tell(f"goes on from step {done}")
     config.save_config()
     watch = Stopwatch()
     # Random draws are not saved with a checkpoint: the second part must not repeat those of the first.
-    trainer = trainer_of(config, progress.step)
-    if progress.step:
-        watch.set(progress.seconds, progress.processor)
+    trainer = trainer_of(config, done)
+    if done:
+        watch.set(progress.last["seconds"], progress.last["processor"])
     else:
         progress.setup_seconds = watch.read()["seconds"]
     row = _follow(trainer, request, watch, tell, progress)
@@ -263,8 +300,7 @@ def _follow(trainer: Any, request: Request, watch: Stopwatch, tell: Tell, progre
         taken = watch.read()
         with watch.stopped():
             found = score(pipeline, evenly(count, request.check_images), request.check_pixels, request.whole_images)
-            point = {"step": step + 1, "rays": progress.rays, **taken, "psnr": found["psnr"]}
-            progress.curve.append(point)
+            progress.curve.append({"step": step + 1, "rays": progress.rays, **taken, "psnr": found["psnr"]})
             tell(f"step {step + 1}: {taken['seconds']:.0f} s of training, {found['psnr']:.2f} dB")
             if request.go_on:
                 progress.save(trainer, Path(request.work))
@@ -273,19 +309,18 @@ def _follow(trainer: Any, request: Request, watch: Stopwatch, tell: Tell, progre
 
     trainer.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], look))
     trainer.train()
-    peak = {"peak_gib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20}
-    if torch.cuda.is_available():
-        peak["peak_gpu_gib"] = torch.cuda.max_memory_allocated() / 2**30
+    on_gpu = {"peak_gpu_gib": torch.cuda.max_memory_allocated() / 2**30} if torch.cuda.is_available() else {}
     return {
         "curve": progress.curve,
         **final,
         "setup_seconds": progress.setup_seconds,
-        "seconds": progress.seconds,
-        "processor_seconds": progress.processor,
+        "seconds": progress.last["seconds"],
+        "processor_seconds": progress.last["processor"],
         "rays": progress.rays,
         "parameters": sum(p.numel() for p in pipeline.model.parameters()),
-        **peak,
-        "split": {**{k: len(split[k]) for k in ("train", "test")}, "size": split["size"], "digest": split["digest"]},
+        "peak_gib": peak_gib(),
+        **on_gpu,
+        "split": {**split, "train": len(split["train"]), "test": count},
     }
 
 

@@ -9,9 +9,10 @@ from dataclasses import asdict
 import pytest
 
 from mmpi_ns.bench import trainings
+from mmpi_ns.bench.methods import JOINT, Method, P, Scene
 from mmpi_ns.bench.quality import ablate
 from mmpi_ns.bench.quality.ablate import Ablate, equal_time_steps
-from mmpi_ns.bench.suites import ABLATIONS, JOINT, P, Variant
+from mmpi_ns.bench.suites import ABLATIONS
 
 NAMES = ("reference", "twice as slow", "about as fast")
 
@@ -19,7 +20,7 @@ NAMES = ("reference", "twice as slow", "about as fast")
 @pytest.fixture
 def three(monkeypatch):
     """A suite whose trainings are pretended."""
-    variants = [Variant(name, (P + "planes", str(i)), group="g") for i, name in enumerate(NAMES)]
+    variants = [Method(name, "mmpi-small", (P + "planes", str(i)), group="g") for i, name in enumerate(NAMES)]
     monkeypatch.setitem(ABLATIONS, "drive", variants)
     asked = []
 
@@ -89,7 +90,10 @@ def test_ablate_end_to_end(scene, tmp_path, monkeypatch):
         return trainings.train(asdict(request), lambda text: None)
 
     small = (*JOINT, P + "max-planes", "16")
-    variants = [Variant("placed", small, group="g"), Variant("one", (*small, P + "max-mpis", "1"), group="g")]
+    variants = [
+        Method("placed", "mmpi-small", small, group="g"),
+        Method("one", "mmpi-small", (*small, P + "max-mpis", "1"), group="g"),
+    ]
     monkeypatch.setitem(ABLATIONS, "drive", variants)
     monkeypatch.setattr(ablate, "train_apart", here)
     command(scene, tmp_path, steps=4, equal_time=False, seeds=(0, 1)).run()
@@ -104,13 +108,11 @@ def test_every_ablation_is_made_of_lines_that_ns_train_takes(scene, tmp_path):
     import tyro
     from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
 
-    from mmpi_ns.bench.methods import Method, Scene
-
     for suite, variants in ABLATIONS.items():
         assert len({v.name for v in variants}) == len(variants), suite
         seen = []
         for v in variants:
-            words = Method(v.name, v.method, v.options).words(Scene(scene, 1), tmp_path, 5, 64, 0, "cpu")
+            words = v.words(Scene(scene, 1), tmp_path, 5, 64, 0, "cpu")
             config = tyro.cli(AnnotatedBaseConfigUnion, args=words)
             seen.append((config.pipeline.model, config.pipeline.datamanager, config.optimizers))
         assert all(a != b for i, a in enumerate(seen) for b in seen[:i]), f"{suite}: two variants are the same"

@@ -14,9 +14,9 @@ from triton_processes import HERE, needs_triton, python
 
 from mmpi_ns.bench.apart import run_apart
 from mmpi_ns.bench.gpu import command as gpu
-from mmpi_ns.bench.gpu import quick
+from mmpi_ns.bench.gpu import parts, quick
 from mmpi_ns.bench.gpu.command import Gpu, told_curve
-from mmpi_ns.bench.gpu.report import headline, markdown
+from mmpi_ns.bench.gpu.report import markdown
 from mmpi_ns.bench.methods import METHODS
 from mmpi_ns.ops import dispatch
 
@@ -76,18 +76,19 @@ def test_a_part_that_fails_takes_no_other_with_it(tmp_path, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     answers = {
         "checks": {"not_run": "it failed with status 1"},
-        "operations": {"copy_gb_per_s": 5.0, "march": {}, "ops": {}},
+        "operations": {"headline": {"copy_gb_per_s": 5.0}, "tables": {"A copy moves 5 GB/s": {}}},
     }
     monkeypatch.setattr(gpu, "run_apart", lambda work, request, *_: answers[request["part"]])
     Gpu(data=tmp_path, output=tmp_path, work=tmp_path, parts=("checks", "operations")).run()
     text = (tmp_path / "gpu.md").read_text()
-    assert "Not run: it failed with status 1" in text and "5 GB/s" in text
+    assert "Not run: it failed with status 1" in text and "5 GB/s" in text and "| copy_gb_per_s | 5 |" in text
 
 
 def test_a_kernel_that_is_wrong_ends_with_a_status(tmp_path, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     bad = {"name": "march", "error": 1.0, "bound": 0.0, "ok": False}
-    monkeypatch.setattr(gpu, "run_apart", lambda *_: {"checks": [bad], "failed": 1})
+    monkeypatch.setattr(parts, "run_checks", lambda *_: {"checks": [bad], "failed": 1})
+    monkeypatch.setattr(gpu, "run_apart", lambda work, request, *_: parts.check(request, print))
     with pytest.raises(SystemExit, match="a kernel is wrong"):
         Gpu(data=tmp_path, output=tmp_path, work=tmp_path, parts=("checks",)).run()
     assert "| march | 1 | 0 | FAIL |" in (tmp_path / "gpu.md").read_text()
@@ -136,14 +137,32 @@ def test_a_session_trains_at_full_size_and_ends_within_ten_minutes(tmp_path):
         assert not part.name.startswith("train") or {"cuda", "1"} < set(part.words)
 
 
-def test_headline_holds_what_was_measured_and_nothing_else():
-    assert headline({"checks": {"not_run": "no time"}}) == {}
-    row = {"rays_per_s": 2.0, "frame_ms": 5.0, "peak_gib": 1.0}
-    parts = {"training triton": {"4096 rays": row, "16384 rays": {**row, "rays_per_s": 3.0}, "device": "GPU"}}
-    assert headline(parts) == {"rays_per_s": 3.0, "peak_gib": 1.0, "frame_ms": 5.0}
-    curve = [{"step": 1, "seconds": 2.0, "psnr": 20.0}]
-    quality = {"methods": {"mmpi": {"curve": curve}, "nerfacto": {"not_run": "no"}}}
-    assert headline({"quality": quality}) == {"mmpi_psnr_db": 20.0, "mmpi_seconds": 2.0}
+def test_headline_holds_what_was_measured_and_nothing_else(tmp_path, monkeypatch):
+    paces = iter([2.0, 3.0])
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr(parts, "steps_of", lambda *_: None)
+    monkeypatch.setattr(parts, "train_for", lambda *_: {"late_steps_per_s": next(paces)})
+    monkeypatch.setattr(parts, "render_both", lambda *_: {"frame_ms": 5.0, "psnr": 9.0})
+    monkeypatch.setattr(parts.ops, "matmul_rate", lambda _: 1e9)
+    monkeypatch.setattr(parts.ops, "copy_rate", lambda *_: 1e9)
+    monkeypatch.setattr(parts.ops, "measure", lambda *_: {"ops": {"gather": {"ms": 1.0}}})
+    request = {"rehearse": False, "ops": "torch", "device": "cpu", "seconds": 1.0}
+    found = parts.measure_training(request, lambda _: None)
+    assert found["headline"] == {"torch_rays_per_s": 3.0 * 16_384, "torch_frame_ms": 5.0}
+    assert [list(rows) for rows in found["tables"].values()] == [["4096 rays", "16384 rays"], ["gather"]]
+
+
+def test_a_method_that_was_cut_off_has_the_curve_that_it_told(tmp_path, monkeypatch):
+    monkeypatch.setattr(
+        METHODS["splatfacto"].__class__, "why_not", lambda self: "no" if "gsplat" in self.needs else None
+    )
+    curve = [{"step": 1, "seconds": 2.0, "psnr": 20.0}, {"step": 2, "seconds": 3.0, "psnr": 19.0}]
+    answers = {"mmpi": {"curve": curve}, "nerfacto": {"not_run": "it failed"}}
+    monkeypatch.setattr(gpu, "train_apart", lambda request, *_: answers[request.words[0]])
+    found = Gpu(data=tmp_path, output=tmp_path, work=tmp_path)._quality(tmp_path, 10.0)
+    assert found["headline"] == {"mmpi_psnr_db": 20.0, "mmpi_seconds": 2.0} and found["curves"] == {"mmpi": curve}
     made = {"command": "mmpi-bench gpu", "processor": "x", "threads": 1, "torch": "2", "commit": "c", "date": "d"}
-    content = {"rows": {"quality": {**quality, "wall_s": 1.0}}, "made": made, "rehearsal": False}
-    assert "| nerfacto | - | - | not run: no |" in markdown(content, {}) and "rehearsal" not in markdown(content, {})
+    content = {"rows": {"quality": {**found, "wall_s": 1.0}}, "made": made, "rehearsal": False}
+    text = markdown(content, found["headline"])
+    assert "| nerfacto | not run: it failed |" in text and "| splatfacto | not run: no |" in text
+    assert "| mmpi | 2: 20.00, 3: 19.00 |" in text and "rehearsal" not in text

@@ -11,7 +11,7 @@ import torch
 from nerfstudio.field_components.encodings import HashEncoding
 
 from mmpi_ns.bench import peers
-from mmpi_ns.bench.progress import Progress, without_length
+from mmpi_ns.bench.trainings import Progress
 from mmpi_ns.capture.point_cloud import read_ply
 from mmpi_ns.ops import dispatch
 
@@ -41,19 +41,22 @@ def test_quick_hash_lookups_are_nerfstudios_own(levels, size, native_or_torch, m
 
 def test_what_a_run_goes_on_from_was_asked_for_in_the_same_words(tmp_path):
     words = ("nerfacto", "--max-num-iterations", "5", "--machine.seed", "0")
-    kept = Progress(without_length(words), [{"step": 1, "seconds": 2.0}, {"step": 2, "seconds": 3.5}], 128, 1.5)
+    own = [words[0], *words[3:]]
+    kept = Progress(own, [{"step": 1, "seconds": 2.0}, {"step": 2, "seconds": 3.5}], 128, 1.5)
     saved = tmp_path / "step-000000001.ckpt"
     steps = []
     kept.save(SimpleNamespace(save_checkpoint=steps.append, checkpoint_dir=tmp_path), tmp_path)
-    assert steps == [1] and Progress.before(words, tmp_path, 5).step == 0, "the trainer names checkpoints by this"
+    assert steps == [1] and Progress.before(words, tmp_path, 5).last["step"] == 0, (
+        "the trainer names checkpoints by this"
+    )
     saved.touch()
-    assert Progress.before(words, tmp_path, 5) == kept and (kept.step, kept.seconds) == (2, 3.5)
+    assert Progress.before(words, tmp_path, 5) == kept and (kept.last["step"], kept.last["seconds"]) == (2, 3.5)
     assert Progress.before((*words[:2], "9", *words[3:]), tmp_path, 9) == kept
-    assert Progress.before((*words[:4], "1"), tmp_path, 5).step == 0, "another seed"
-    assert Progress.before(words, tmp_path, 2).step == 0, "a run as long has nothing to add"
-    assert Progress.before(words, tmp_path / "elsewhere", 5) == Progress(without_length(words))
+    assert Progress.before((*words[:4], "1"), tmp_path, 5).last["step"] == 0, "another seed"
+    assert Progress.before(words, tmp_path, 2).last["step"] == 0, "a run as long has nothing to add"
+    assert Progress.before(words, tmp_path / "elsewhere", 5) == Progress(own)
     saved.unlink()
-    assert Progress.before(words, tmp_path, 5).step == 0, "its checkpoint is gone"
+    assert Progress.before(words, tmp_path, 5).last["step"] == 0, "its checkpoint is gone"
 
 
 def test_point_clouds_are_read_without_open3d(tmp_path):

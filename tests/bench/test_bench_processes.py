@@ -27,7 +27,7 @@ def command(road, tmp_path, monkeypatch):
     def train(count: int, steps: int) -> float:
         plan = WindowedPlan.load(made.folder / "plan.json")
         for window in range(len(plan)):
-            path = made._folder(count, steps) / f"road/mmpi-small/run/windows/window-{window:05d}.pt"
+            path = made._folder(count, steps) / f"run/mmpi-small/1/windows/window-{window:05d}.pt"
             path.parent.mkdir(parents=True, exist_ok=True)
             density = torch.ones(3) + (0.25 if count > 1 and window == 1 else 0.0)
             torch.save({"window": window, "field": {"density": density, "empty": torch.zeros(0)}}, path)

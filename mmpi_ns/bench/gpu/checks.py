@@ -10,24 +10,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mmpi_ns.bench.rendering import bundle_of, render
-from mmpi_ns.bench.stability.exact_ray import ExactField, ExactRay, Gradients
-from mmpi_ns.bench.stability.rays import CLEAR, CUBE, Scene, scene
+from mmpi_ns.bench.rendering import of_slots
+from mmpi_ns.bench.stability.exact_ray import ExactRay
+from mmpi_ns.bench.stability.rays import CUBE, Scene, gradients_of, scene, slopes_of, wrong_samples
 from mmpi_ns.field.baking import baked_shares
-from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.samples import metadata_of
 from mmpi_ns.ops import dispatch, interpolate, variation
 from mmpi_ns.ops.blending import BlendForm, blended_optical_depth, interpolate_shares
 from mmpi_ns.ops.composite import composite_weights
-from mmpi_ns.ops.composite import reference as plain_composite
-from mmpi_ns.ops.interpolate import reference as plain_interpolate
+from mmpi_ns.ops.interpolate import reference as plain
 from mmpi_ns.ops.march.reference import NEGLIGIBLE_DEPTH
-from mmpi_ns.ops.variation import reference as plain_variation
 from mmpi_ns.rendering.sampler import MMPISampler
 from mmpi_ns.scene.plan import CubePlan
 from mmpi_ns.training.touched_adam import TouchedAdam
-
-FORMS: tuple[BlendForm, ...] = ("paper", "opacity")
 
 
 @dataclass(frozen=True)
@@ -44,9 +39,9 @@ class Check:
         return self.error <= self.bound
 
 
-def _relative(found: Tensor, wanted: Tensor) -> float:
+def _relative(found: Any, wanted: Any) -> float:
     """Largest difference relative to the largest wanted number; infinite where something is not finite."""
-    found, wanted = found.double().cpu(), wanted.double().cpu()
+    found, wanted = (torch.as_tensor(x).detach().double().cpu() for x in (found, wanted))
     if found.shape != wanted.shape or not bool(torch.isfinite(found).all()):
         return float("inf")
     return float((found - wanted).abs().max() / wanted.abs().max().clamp(min=1e-12)) if wanted.numel() else 0.0
@@ -61,58 +56,43 @@ def _draw(device: str, *shape: int, seed: int = 0) -> Tensor:
 
 def whole_rays(s: Scene, name: str, device: str) -> list[Check]:
     """March, interpolation and compositing together, values and gradients, against exact arithmetic."""
-    known, field = ExactField.of(s.field), s.field.to(device)
-    exact = [ExactRay(known, o, d) for o, d in zip(s.origins, s.directions, strict=True)]
-    clear = [i for i, ray in enumerate(exact) if ray.margin > CLEAR]
-    upstream = np.random.default_rng(0).normal(size=(len(exact), 3))
-    wanted, slopes, sizes = [], known.zeros(), known.zeros()
-    for i in clear:
-        wanted.append(torch.tensor(exact[i].render(s.form)[0]))
-        exact[i].add_gradient(upstream[i], s.form, slopes, sizes)
-    rays = bundle_of(s.origins, s.directions).to(device)
-    found = render(field, rays, form=s.form)
-    rgb, kept = found.rgb, metadata_of(found.samples)["valid"].sum((1, 2))
-    by = torch.tensor(upstream, dtype=torch.float32, device=device)
-    (rgb[clear] * by[clear]).sum().backward()
-    wrong = sum(int(kept[i]) != len(exact[i].samples) for i in clear)
+    s, exact = s.clear()
+    by = np.random.default_rng(0).normal(size=(len(exact), 3))
+    wanted, (slopes, _) = np.array([ray.render(s.form)[0] for ray in exact]), slopes_of(exact, by, s.form)
+    s.field.to(device)
+    found = s.render()
+    made = gradients_of(s.field, found, by)
     with torch.no_grad():
-        shaded = render(field, rays, form=s.form, known_lookup=False).rgb
-    checks = [
-        *marched(s, name, field, device, exact, clear),
-        Check(f"{name}: rays with a wrong number of samples, of {len(clear)}", wrong, 0),
-        Check(f"{name}: colours", _relative(rgb[clear].detach(), torch.stack(wanted)), 2e-4),
-        Check(f"{name}: colours without gradients", _relative(shaded[clear], torch.stack(wanted)), 2e-4),
+        shaded = s.render().colors.rgb
+    return [
+        *marched(s, name, exact),
+        Check(f"{name}: rays with wrong samples, of {len(exact)}", wrong_samples(found, exact), 0),
+        Check(f"{name}: colours", _relative(found.colors.rgb, wanted), 2e-4),
+        Check(f"{name}: colours without gradients", _relative(shaded, wanted), 2e-4),
+        *(
+            Check(f"{name}: gradient of {kind}", _relative(made[kind], slopes.flat(kind)), 1e-3)
+            for kind in ("density", "features", *(["reliability"] if s.form else []))
+        ),
     ]
-    for kind in ("density", "features", *(["reliability"] if s.form else [])):
-        checks.append(Check(f"{name}: gradient of {kind}", _slope_error(field, kind, slopes), 1e-3))
-    return checks
 
 
 @torch.no_grad()
-def marched(s: Scene, name: str, field: MMPIField, device: str, exact: list[ExactRay], clear: list[int]) -> list[Check]:
+def marched(s: Scene, name: str, exact: list[ExactRay]) -> list[Check]:
     """What the march itself says: optical depths, and which samples it keeps at a threshold."""
-    rays, threshold = bundle_of(s.origins, s.directions).to(device), 0.02
-    samples, _ = MMPISampler()(rays, field=field, threshold=0.0, blend_form=s.form)
-    depth = metadata_of(samples)["tau"][..., 0].sum(-1)[clear]
-    wanted = torch.tensor([sum(b.depth for b in exact[i].blended(s.form)) for i in clear])
-    samples, report = MMPISampler()(rays, field=field, threshold=threshold, blend_form=s.form)
-    kept, wrong, lost = metadata_of(samples)["valid"][..., 0].sum(-1), 0, []
-    for i in clear:
-        weights = exact[i].render(s.form)[1].weights
+    threshold, wrong, lost = 0.02, 0, []
+    depth = of_slots(s.render(), "tau").sum(-1)
+    wanted = [sum(b.depth for b in ray.blended(s.form)) for ray in exact]
+    found = s.render(threshold)
+    for kept, ray in zip(of_slots(found, "valid").sum(-1).tolist(), exact, strict=True):
+        weights = ray.render(s.form)[1].weights
         lost.append(float(weights[weights <= threshold].sum()))
         sure = [int((weights > threshold * (1 + sign * 1e-3)).sum()) for sign in (1, -1)]
-        wrong += not sure[0] <= int(kept[i]) <= sure[1]
+        wrong += not sure[0] <= kept <= sure[1]
     return [
         Check(f"{name}: optical depths by the march", _relative(depth, wanted), 1e-4),
         Check(f"{name}: rays that keep other samples than they should", wrong, 0),
-        Check(f"{name}: mass of what is dropped", _relative(report.dropped_mass[clear, 0], torch.tensor(lost)), 1e-2),
+        Check(f"{name}: mass of what is dropped", _relative(found.report.dropped_mass[:, 0], lost), 1e-2),
     ]
-
-
-def _slope_error(field: MMPIField, kind: str, slopes: Gradients) -> float:
-    found, texels = getattr(field, kind).grad, torch.cat([grid.rows for grid in field.grids])
-    found = found.to_dense() if found.is_sparse else found
-    return _relative(found[texels], torch.tensor(slopes.flat(kind)))
 
 
 def marches(device: str, rehearse: bool) -> list[Check]:
@@ -129,23 +109,30 @@ def marches(device: str, rehearse: bool) -> list[Check]:
 @torch.no_grad()
 def baked_march(device: str, rehearse: bool) -> list[Check]:
     """Optical depths blended by shares at texels, against the same blending of plain samples in float64."""
-    s, found = scene(3, 4 if rehearse else 200, "paper", seed=5, cube=CUBE), []
-    field, rays = s.field.to(device), bundle_of(s.origins, s.directions).to(device)
-    shares = baked_shares(field)
-    plain = metadata_of(MMPISampler()(rays, field=field, threshold=0.0)[0])
-    valid = plain["valid"][..., 0]
-    tau, ndc, heads = (plain[name][valid].double().cpu() for name in ("tau", "ndc", "heads"))
-    share = interpolate_shares(field.cpu().layout, shares.double().cpu(), ndc, heads[:, 0].long())
+    s, found = scene(3, 4 if rehearse else 200, None, seed=5, cube=CUBE), []
+    field = s.field.to(device)
+    unblended = s.render()
+    shares, valid = baked_shares(field), of_slots(unblended, "valid")
+    tau, heads = of_slots(unblended, "tau")[valid].double().cpu(), of_slots(unblended, "heads")[valid].cpu().long()
+    ndc = metadata_of(unblended.samples)["ndc"][valid].double().cpu()
+    share = interpolate_shares(field.cpu().layout, shares.double().cpu(), ndc, heads)
     field.to(device)
-    for form in FORMS[: 1 if rehearse else None]:
-        made = metadata_of(MMPISampler()(rays, field=field, threshold=0.0, blend_form=form, shares=shares)[0])
-        wanted = blended_optical_depth(tau[:, 0], share.log(), torch.log1p(-share), form)
-        wanted = torch.where(tau[:, 0] > NEGLIGIBLE_DEPTH, wanted, tau[:, 0] / len(field.grids))
-        found.append(Check(f"shares at texels, {form} blending", _relative(made["tau"][valid][:, 0], wanted), 1e-4))
+    for form in ("paper", "opacity")[: 1 if rehearse else None]:
+        samples, _ = MMPISampler()(s.bundle(), field=field, threshold=0.0, blend_form=form, shares=shares)
+        made = metadata_of(samples)["tau"][..., 0][valid]
+        wanted = blended_optical_depth(tau, share.log(), torch.log1p(-share), form)
+        wanted = torch.where(tau > NEGLIGIBLE_DEPTH, wanted, tau / len(field.grids))
+        found.append(Check(f"shares at texels, {form} blending", _relative(made, wanted), 1e-4))
     return found
 
 
 # Kernels by themselves -----------------------------------------------------------------------------------------------
+
+
+def _twice(bounds: dict[str, float], work: Callable[[torch.dtype], tuple[Tensor, ...]]) -> list[Check]:
+    """What ``work`` makes in float32 against the same in float64, for which there is plain torch alone."""
+    made = zip(bounds.items(), work(torch.float32), work(torch.float64), strict=True)
+    return [Check(name, _relative(a, b), bound) for (name, bound), a, b in made]
 
 
 def interpolation(device: str, samples: int) -> list[Check]:
@@ -154,16 +141,15 @@ def interpolation(device: str, samples: int) -> list[Check]:
     texels = max(10, samples // 3)
     rows = torch.randint(1, texels, (samples, 4), generator=g).to(device)  # row 0 is where gradients are padded
     weights, upstream = torch.rand(samples, 4, generator=g).to(device), _draw(device, samples, 9, seed=2)
-    table, exact = _draw(device, texels, 9).requires_grad_(), _draw(device, texels, 9).double().requires_grad_()
-    read = interpolate.interpolate(table, rows, weights)
-    wanted = plain_interpolate.interpolate(exact, rows, weights.double())
-    (read * upstream).sum().backward()
-    (wanted * upstream).sum().backward()
-    assert table.grad is not None and exact.grad is not None
-    return [
-        Check("interpolation", _relative(read.detach(), wanted.detach()), 1e-6),
-        Check("interpolation: row gradients", _relative(table.grad.to_dense(), exact.grad), 5e-6),
-    ]
+
+    def work(dtype: torch.dtype) -> tuple[Tensor, ...]:
+        table = _draw(device, texels, 9).to(dtype).requires_grad_()
+        read = (interpolate if dtype == torch.float32 else plain).interpolate(table, rows, weights.to(dtype))
+        (read * upstream).sum().backward()
+        assert table.grad is not None
+        return read, table.grad.to_dense()
+
+    return _twice({"interpolation": 1e-6, "interpolation: row gradients": 5e-6}, work)
 
 
 def distinct_rows(device: str, samples: int) -> list[Check]:
@@ -176,11 +162,11 @@ def distinct_rows(device: str, samples: int) -> list[Check]:
     wrong = int(len(index.unique) != len(wanted)) or int((index.unique != wanted).sum())
     wrong += int((index.unique[index.position.long()] != rows).sum())
     values, weights = _draw(device, samples, 9), torch.rand(samples, 4, generator=g).to(device)
-    total = interpolate.sum_rows(index.position, values, weights, len(wanted))
-    each = (values[:, None].double() * weights[..., None]).reshape(-1, 9)
-    exact = torch.zeros(len(index.unique), 9, dtype=torch.float64, device=device)
-    exact.index_add_(0, index.position.reshape(-1).long(), each)
-    return [Check("distinct rows: wrong", wrong, 0), Check("distinct rows: sums", _relative(total, exact), 5e-6)]
+
+    def work(dtype: torch.dtype) -> tuple[Tensor, ...]:
+        return (interpolate.sum_rows(index.position, values.to(dtype), weights.to(dtype), len(wanted)),)
+
+    return [Check("distinct rows: wrong", wrong, 0), *_twice({"distinct rows: sums": 5e-6}, work)]
 
 
 def variations(device: str, texels: int) -> list[Check]:
@@ -188,17 +174,16 @@ def variations(device: str, texels: int) -> list[Check]:
     field = scene(3, 1, None, cube=CUBE).field.to(device)
     table = _draw(device, len(field.density), 9) * 2
     rows = torch.randperm(len(table), generator=torch.Generator().manual_seed(1))[:texels].to(device)
-    scales, found = [(0.5, 2.0, 1.0)] * len(field.grids), []
-    for form, dtype in ((variation, torch.float32), (plain_variation, torch.float64)):
+
+    def work(dtype: torch.dtype) -> tuple[Tensor, ...]:
         values = table[rows].to(dtype).requires_grad_()
-        value = form.total_variation(values, table.to(dtype), rows, field.layout, scales)
+        scales = [(0.5, 2.0, 1.0)] * len(field.grids)
+        value = variation.total_variation(values, table.to(dtype), rows, field.layout, scales)
         value.backward()
-        found.append((value.detach()[None], values.grad))
-    (value, slope), (exact, exact_slope) = found
-    return [
-        Check("total variation", _relative(value, exact), 1e-5),
-        Check("total variation: gradient", _relative(slope, exact_slope), 1e-5),
-    ]
+        assert values.grad is not None
+        return value[None], values.grad
+
+    return _twice({"total variation": 1e-5, "total variation: gradient": 1e-5}, work)
 
 
 def compositing_kernels(device: str, rays: int, slots: int) -> list[Check]:
@@ -207,22 +192,22 @@ def compositing_kernels(device: str, rays: int, slots: int) -> list[Check]:
     tau = (10 ** (torch.rand(rays, slots, generator=g) * 6 - 5)).to(device)
     valid = (torch.arange(slots) < torch.randint(0, slots + 1, (rays, 1), generator=g)).to(device)
     before = (torch.rand(rays, slots, generator=g).cumsum(1) * 0.02).to(device)
-    upstream, found = _draw(device, rays, slots), []
-    for function, dtype in ((composite_weights, torch.float32), (plain_composite.composite_weights, torch.float64)):
+    upstream = _draw(device, rays, slots)
+
+    def work(dtype: torch.dtype) -> tuple[Tensor, ...]:
         leaf = tau.to(dtype, copy=True).requires_grad_()
-        made = function(leaf, valid, before.to(dtype), before[:, -1:].to(dtype))
+        made = composite_weights(leaf, valid, before.to(dtype), before[:, -1:].to(dtype))
         ((made.weights * upstream).sum() + made.accumulation.sum()).backward()
-        found.append((made.weights.detach(), made.transmittance.detach(), leaf.grad))
-    names = ("weights", "transmittance", "gradient")
-    return [
-        Check(f"compositing: {name}", _relative(a, b), 5e-6) for name, a, b in zip(names, *found, strict=True)
-    ]  # fmt: skip
+        assert leaf.grad is not None
+        return made.weights, made.transmittance, leaf.grad
+
+    return _twice({f"compositing: {name}": 5e-6 for name in ("weights", "transmittance", "gradient")}, work)
 
 
 def adam(device: str, rows: int) -> list[Check]:
-    """Four steps on touched rows."""
-    found = []
-    for dtype in (torch.float32, torch.float64):  # and moments in bfloat16, whose roundings these four steps keep small
+    """Four steps on touched rows, with moments in bfloat16 too, whose roundings these four steps keep small."""
+
+    def work(dtype: torch.dtype) -> tuple[Tensor, ...]:
         param = torch.nn.Parameter(_draw(device, rows, 9).to(dtype))
         optimizer = TouchedAdam([param], lr=0.1)
         for step in range(4):
@@ -230,8 +215,9 @@ def adam(device: str, rows: int) -> list[Check]:
             values = _draw(device, rows // 2, 9, seed=step).to(dtype)
             param.grad = torch.sparse_coo_tensor(chosen[None], values, param.shape)
             optimizer.step()
-        found.append(param.data)
-    return [Check("Adam on rows", _relative(*found), 1e-2)]
+        return (param.data,)
+
+    return _twice({"Adam on rows": 1e-2}, work)
 
 
 def everything(device: str, rehearse: bool) -> list[Callable[[], list[Check]]]:
@@ -255,15 +241,14 @@ def run_checks(device: str, rehearse: bool) -> dict[str, Any]:
         RuntimeError: the kernels are not there to be checked.
     """
     one = torch.zeros(1, device=device)
-    plain = [n for n, (_, forms) in dispatch.TABLE.items() if "gpu" in forms and dispatch.form_of(n, one) != "gpu"]
-    if plain:
-        raise RuntimeError(f"there are no kernels to be checked for {', '.join(plain)} (the log says why)")
+    missing = [n for n, (_, forms) in dispatch.TABLE.items() if "gpu" in forms and dispatch.form_of(n, one) != "gpu"]
+    if missing:
+        raise RuntimeError(f"there are no kernels to be checked for {', '.join(missing)} (the log says why)")
     rows: list[dict[str, Any]] = []
     for number, work in enumerate(everything(device, rehearse)):
         try:
             rows += [{**asdict(c), "ok": c.ok} for c in work()]
         except Exception as error:  # the others are still worth knowing
-            rows.append(
-                {"name": f"group {number}", "error": None, "bound": 0.0, "ok": False, "raised": repr(error)[:400]}
-            )
+            failed: dict[str, Any] = {"name": f"group {number}", "error": None, "bound": 0.0, "ok": False}
+            rows.append(failed | {"raised": repr(error)[:400]})
     return {"checks": rows, "failed": sum(not r["ok"] for r in rows)}

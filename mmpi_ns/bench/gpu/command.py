@@ -12,10 +12,9 @@ import torch
 from mmpi_ns.bench.apart import run_apart
 from mmpi_ns.bench.gpu.parts import run_part
 from mmpi_ns.bench.gpu.quick import run_quick
-from mmpi_ns.bench.gpu.report import draw, headline, markdown
-from mmpi_ns.bench.methods import METHODS, Method, Scene, has_pycolmap
-from mmpi_ns.bench.report import Bench, Report, Row
-from mmpi_ns.bench.suites import JOINT
+from mmpi_ns.bench.gpu.report import draw, markdown
+from mmpi_ns.bench.methods import JOINT, METHODS, Method, has_pycolmap
+from mmpi_ns.bench.report import Bench, Report, Row, Scene, slug
 from mmpi_ns.bench.trainings import Request, train_apart
 
 SHARES = {
@@ -79,8 +78,9 @@ class Gpu(Bench):
             begin = time.monotonic()
             found = self._part(name, data, left * share) if left > 0 else {"not_run": "no time was left"}
             rows[name] = {**found, "wall_s": time.monotonic() - begin}
-            head = headline(rows)
-            report.finish(head, markdown(report.content, head), lambda path: draw(path, rows.get("quality", {})))
+            head = {k: v for part in rows.values() for k, v in part.get("headline", {}).items()}
+            curves = rows.get("quality", {}).get("curves", {})
+            report.finish(head, markdown(report.content, head), lambda path, curves=curves: draw(path, curves))
         head = report.content["headline"]
         print(head)
         wrong = [name for name, part in rows.items() if "not_run" in part] if self.rehearse else []
@@ -126,48 +126,43 @@ class Gpu(Bench):
         request = {"part": part, "ops": ops, "device": self._device, "rehearse": self.rehearse}
         request |= {"data": str(data), "downscale_factor": self.downscale_factor, "work": str(self.folder.resolve())}
         request["seconds"] = max(5.0, seconds - 15)  # less what it takes to start
-        folder = self.folder / name.replace(" ", "-")
-        return run_apart(run_part, request, folder, self._cores, seconds + GRACE, self._extra)
+        return run_apart(run_part, request, self.folder / slug(name, "-"), *self._how(seconds + GRACE))
 
     @property
     def _device(self) -> str:
         return "cpu" if self.rehearse else "cuda"
 
-    @property
-    def _extra(self) -> dict[str, str]:
-        """For the parts' processes: this one runs no kernel."""
-        return {"TRITON_INTERPRET": "1", "CUDA_VISIBLE_DEVICES": ""} if self.rehearse else {}
-
-    @property
-    def _cores(self) -> int:
-        return 1 if self.rehearse else self.cores
+    def _how(self, seconds: float) -> tuple[int, float, dict[str, str]]:
+        """Threads, seconds and variables of a part's process; this one runs no kernel."""
+        hidden = {"TRITON_INTERPRET": "1", "CUDA_VISIBLE_DEVICES": ""} if self.rehearse else {}
+        return 1 if self.rehearse else self.cores, seconds, hidden
 
     def _quality(self, data: Path, seconds: float) -> Row:
         """PSNR of test views against seconds of training: ours, nerfacto and splatfacto."""
-        rows: dict[str, Row] = {}
-        names = ("mmpi",) if self.rehearse else tuple(PEERS)
+        said, curves, head = {}, {}, {}
+        names, few = (("mmpi",), 1) if self.rehearse else (tuple(PEERS), 4)
         for number, name in enumerate(names):
             begin, method = time.monotonic(), METHODS[name]
             if method.ours:
                 method = Method(name, name, (*JOINT, *(TINY if self.rehearse else ())))
-            reason = method.why_not()
-            if reason is not None:
-                rows[name] = {"not_run": reason}
+            if reason := method.why_not():
+                said[name] = {"curve (s: dB)": f"not run: {reason}"}
                 continue
             limit = seconds / (len(names) - number) + (GRACE if self.rehearse else 0)
-            request = self._training(method, data, self.folder / f"quality-{name}")
-            row = train_apart(request, self._cores, limit, self._extra)
-            rows[name] = row if "not_run" not in row else {**row, "curve": told_curve(Path(request.work))}
+            steps = 4 if self.rehearse else PEERS[name]
+            checks = sorted({max(1, round(steps * 2.0**-i)) for i in range(9)} | {round(steps * 3 / 4)})
+            looks: Row = {"checks": tuple(checks), "check_images": few, "check_pixels": 1024 * few, "final_images": few}
+            scene, folder = Scene(data, self.downscale_factor), self.folder / f"quality-{name}"
+            row = train_apart(Request.of(method, scene, folder, steps, device=self._device, **looks), *self._how(limit))
+            curve = row["curve"] if "curve" in row else told_curve(folder)
+            told = ", ".join(f"{p['seconds']:.0f}: {p['psnr']:.2f}" for p in curve)
+            said[name] = {"curve (s: dB)": told or f"not run: {row['not_run']}"}
+            if curve:
+                best, curves[name] = max(curve, key=lambda point: point["psnr"]), curve
+                head |= {f"{name}_psnr_db": best["psnr"], f"{name}_seconds": best["seconds"]}
             seconds -= time.monotonic() - begin
-        ran = any("curve" in row for row in rows.values())
-        return {"methods": rows} if ran else {"not_run": str(rows), "methods": rows}
-
-    def _training(self, method: Method, data: Path, folder: Path) -> Request:
-        steps = 4 if self.rehearse else PEERS[method.name]
-        few = 1 if self.rehearse else 4
-        checks = sorted({max(1, round(steps * 2.0**-i)) for i in range(9)} | {round(steps * 3 / 4)})
-        looks = {"checks": tuple(checks), "check_images": few, "check_pixels": 1024 * few, "final_images": few}
-        return Request.of(method, Scene(data, self.downscale_factor), folder, steps, device=self._device, **looks)
+        found: Row = {"headline": head, "curves": curves, "tables": {"PSNR of test views on the way.": said}}
+        return found if curves else {"not_run": str(said), **found}
 
 
 TINY = (

@@ -1,7 +1,8 @@
 """What ``mmpi-bench gpu`` times, each part in a process of its own.
 
 A part that fails, or breaks the device's context, takes no other with it. Parts look at the clock between measurements
-and return what they have when their time is up.
+and return what they have when their time is up: the named numbers that they add to the headline, and tables, by what is
+said over each.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import gc
 import statistics
 import time
 from collections.abc import Callable
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -19,16 +21,17 @@ from torch import Tensor
 
 from mmpi_ns.bench.apart import Tell
 from mmpi_ns.bench.gpu.checks import run_checks
-from mmpi_ns.bench.methods import Method, Scene
-from mmpi_ns.bench.speed.ops import copy_rate, median_s
-from mmpi_ns.bench.speed.scaling import Point
-from mmpi_ns.bench.suites import JOINT, TWO_PHASE, P
-from mmpi_ns.bench.trainers import Steps
+from mmpi_ns.bench.methods import JOINT, TWO_PHASE, Method, P
+from mmpi_ns.bench.report import Row, Scene, slug
+from mmpi_ns.bench.speed import ops
+from mmpi_ns.bench.speed.scaling import Point, made_up_batch
+from mmpi_ns.bench.trainers import Steps, median_s
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.model import MMPIModel
-from mmpi_ns.ops import dispatch, interpolate
-from mmpi_ns.ops.march import Crossings, MarchOptions, march
-from mmpi_ns.scene.geometry import plane_hits
+from mmpi_ns.ops import dispatch
+from mmpi_ns.ops.march import MarchOptions, march
+from mmpi_ns.rendering.metrics import ImageMetrics
+from mmpi_ns.rendering.sampler import crossings
 
 SECTOR = 32
 """Bytes that a GPU fetches at least: a bilinear lookup of one channel touches two sectors, one in each row."""
@@ -40,88 +43,53 @@ FULL_WIDTH = 1242
 """Pixels across a frame of KITTI (375 down)."""
 
 
+def check(request: Row, tell: Tell) -> Row:
+    """Correctness first."""
+    found = run_checks(request["device"], request["rehearse"])
+    rows, failed = found["checks"], found["failed"]
+    for row in rows:
+        if not row["ok"]:
+            tell(f"FAIL {row}")
+    shown = {r["name"]: {"error": r["error"], "bound": r["bound"], "": "ok" if r["ok"] else "FAIL"} for r in rows}
+    said = f"{len(rows)} comparisons with float64, {failed} failed."
+    return {"headline": {"checks": len(rows), "failed_checks": failed}, "tables": {said: shown}, **found}
+
+
 # Operations ----------------------------------------------------------------------------------------------------------
 
 
-def rays_of(count: int, coherent: bool, device: str) -> dict[str, Tensor]:
-    """Rays along the row of MPIs: of one image, or anywhere, as a training batch has them."""
-    g = torch.Generator().manual_seed(0)
-    if coherent:
-        side = max(1, round(count**0.5))
-        grid = torch.stack(torch.meshgrid(*[torch.linspace(0, 1, side)] * 2, indexing="xy"), -1).reshape(-1, 2)
-        origins = torch.tensor([0.1, 0.1, 12.0]).expand(len(grid), 3)
-    else:
-        grid = torch.rand(count, 2, generator=g)
-        origins = torch.rand(count, 3, generator=g) * torch.tensor([0.2, 0.2, 35.0])
-    tangents = grid * torch.tensor([1.6, 0.5]) - torch.tensor([0.8, 0.25])
-    directions = torch.nn.functional.normalize(torch.cat([tangents, torch.ones(len(grid), 1)], -1), dim=-1)
-    one = torch.ones(len(grid), 1)
-    parts = {"origins": origins, "directions": directions, "pixel_area": one, "nears": one, "fars": one * torch.inf}
-    return {k: v.contiguous().to(device) for k, v in parts.items()}
-
-
-def measure_operations(request: dict[str, Any], tell: Tell) -> dict[str, Any]:
-    """The march against the bandwidth of a copy, and each operation of a step by Triton and by plain torch."""
+def measure_operations(request: Row, tell: Tell) -> Row:
+    """The march against the bandwidth of a copy."""
     device, small = request["device"], request["rehearse"]
-    found: dict[str, Any] = {"copy_gb_per_s": copy_rate(device, 1 << (12 if small else 28)) / 1e9, "march": {}}
-    tell(f"copy: {found['copy_gb_per_s']:.0f} GB/s")
+    copied = ops.copy_rate(device, 1 << (12 if small else 28)) / 1e9
+    tell(f"copy: {copied:.0f} GB/s")
     mpis, planes, side = (2, 8, 12) if small else KITTI
     plan = Point(mpis=mpis, planes=planes, height=side, width=side).plan()
-    field = MMPIField(plan, feature_channels=1, hidden_width=2).eval()
-    field = field.to(device)
+    field = MMPIField(plan, feature_channels=1, hidden_width=2).eval().to(device)
     field.density.data.fill_(TRANSPARENT)
-    repeats = 1 if small else 20
-    for name, count, coherent in (("batch", 4096, False), ("large batch", 65_536, False), ("image", 466_000, True)):
-        rays = rays_of(32 if small else count, coherent, device)
-        found["march"][name] = _measure_march(field, rays, repeats)
-        tell(f"march, {name}: {found['march'][name]}")
-    found["ops"] = {}
-    for name, work in _table_operations(device, 300 if small else 200_000).items():
-        row = found["ops"][name] = {}
-        for route in ("torch", "auto"):
-            dispatch.choose(route)
-            row["torch_ms" if route == "torch" else "triton_ms"] = 1e3 * median_s(work, repeats)
-        tell(f"{name}: {row}")
-    return found
+    rows, head = {}, {"copy_gb_per_s": copied}
+    for name, count in (("batch", 4096), ("large batch", 65_536), ("image", 466_000)):
+        torch.manual_seed(0)
+        rays, _ = made_up_batch(32 if small else count, image=name == "image")
+        row = rows[name] = _measure_march(field, rays.to(device), 1 if small else 20)
+        head[f"march_{slug(name)}_gb_per_s"] = row["gb_per_s"]
+        head[f"march_{slug(name)}_share_of_copy"] = row["gb_per_s"] / copied
+        tell(f"march, {name}: {row}")
+    said = f"""\
+A copy within the device moves {copied:.0f} GB/s, read and written. The march looks up every live sample
+of 4 MPIs of 256 planes, one sector (32 bytes) in each of two rows of texels; 16 of the 64 bytes are used."""
+    return {"headline": head, "tables": {said: rows}}
 
 
 @torch.no_grad()
-def _measure_march(field: MMPIField, rays: dict[str, Tensor], repeats: int) -> dict[str, float]:
+def _measure_march(field: MMPIField, rays: Any, repeats: int) -> Row:
     """The kernel alone on rays that nothing stops and that keep nothing: it looks up every live sample."""
-    hits = plane_hits(rays["origins"], rays["directions"], rays["nears"], rays["fars"], field.frames)
-    live = int(hits.count.sum())
-    at = Crossings(rays["origins"], rays["directions"], hits, hits.m_first, hits.count)
+    at = crossings(rays, field)
+    live, count = int(at.counts.sum()), len(rays)
     seconds = median_s(lambda: march(field.layout, field.tables(), at, MarchOptions(0.9)), repeats)
-    gb = 2 * SECTOR * live / 1e9
-    return {
-        "ms": 1e3 * seconds,
-        "rays": len(rays["origins"]),
-        "live_samples_a_ray": live / len(rays["origins"]),
-        "gb_per_s": gb / seconds,
-        "useful_gb_per_s": gb / 4 / seconds,
-    }
-
-
-def _table_operations(device: str, samples: int) -> dict[str, Callable[[], Any]]:
-    """Those that read and write rows of 9 channels, at the sizes of an early training step."""
-    g = torch.Generator().manual_seed(0)
-    texels = 10 * samples
-    table = torch.randn(texels, 9, generator=g).to(device)
-    rows = torch.randint(0, texels, (samples // 3, 4), generator=g).repeat(3, 1).to(device)
-    weights, values = (
-        torch.rand(len(rows), 4, generator=g).to(device),
-        torch.randn(len(rows), 9, generator=g).to(device),
-    )
-
-    def gradients() -> Tensor:
-        index = interpolate.index_rows(rows, texels)
-        return interpolate.sum_rows(index.position, values, weights, len(index.unique))
-
-    return {
-        "interpolate": lambda: interpolate.interpolate(table, rows, weights),
-        "distinct rows": lambda: interpolate.index_rows(rows, texels),
-        "distinct rows and their gradients": gradients,
-    }
+    gb = 2 * SECTOR * live / 1e9 / seconds
+    row = {"ms": 1e3 * seconds, "rays": count, "live_samples_a_ray": live / count}
+    return row | {"gb_per_s": gb, "useful_gb_per_s": gb / 4}
 
 
 # Training ------------------------------------------------------------------------------------------------------------
@@ -133,54 +101,61 @@ def drive(planes: int, rays: int, *more: str) -> tuple[str, ...]:
     return (*place, *JOINT, "--pipeline.datamanager.train-num-rays-per-batch", str(rays), *more)
 
 
-def steps_of(request: dict[str, Any], name: str, method: Method, steps: int) -> Steps:
+def steps_of(request: Row, name: str, method: Method, steps: int) -> Steps:
     """A trainer on the benchmark's scene, on a device that holds nothing of an earlier one."""
     gc.collect()
     if torch.cuda.is_available():
         torch.cuda.empty_cache()
         torch.cuda.reset_peak_memory_stats()
     scene = Scene(Path(request["data"]), request["downscale_factor"])
-    folder = Path(request["work"]) / name.replace(" ", "-")
-    return Steps(method.words(scene, folder, steps, None, 0, request["device"]))
+    return Steps(method.words(scene, Path(request["work"]) / slug(name, "-"), steps, None, 0, request["device"]))
 
 
-def measure_training(request: dict[str, Any], tell: Tell) -> dict[str, Any]:
+def measure_training(request: Row, tell: Tell) -> Row:
     """Training rays/s, frames, memory and launches of a joint training of four MPIs, by one of the two paths."""
-    small, found = request["rehearse"], {}
-    total = 4 if small else 2000
-    route = ("--pipeline.model.ops", "torch" if request["ops"] == "torch" else "auto")
-    size = ("--pipeline.model.eval-num-rays-per-chunk", "2048" if small else str(1 << 17))
-    sizes = (16,) if small else (4096, 16_384)
+    small, path, device = request["rehearse"], request["ops"], request["device"]
+    total, sizes, repeats = (4, (16,), 1) if small else (2000, (4096, 16_384), 10)
+    options = ["--pipeline.model.ops", "torch" if path == "torch" else "auto"]
+    options += ["--pipeline.model.eval-num-rays-per-chunk", "2048" if small else str(1 << 17)]
+    options += ["--pipeline.datamanager.keypoint-rays", "4"] if small else []
+    rows, tables = {}, {}
     for rays in sizes:
         ends = time.monotonic() + request["seconds"] / len(sizes)
-        few = ("--pipeline.datamanager.keypoint-rays", "4") if small else ()
-        options = drive(8 if small else 256, rays, *route, *size, *few)
-        steps = steps_of(request, f"{request['ops']} {rays}", Method("mmpi", "mmpi", options), total)
-        row = found[f"{rays} rays"] = train_for(steps, total, ends, tell)
-        row |= {"rays_per_s": rays * row["late_steps_per_s"]}
+        method = Method("mmpi", "mmpi", drive(8 if small else 256, rays, *options))
+        steps = steps_of(request, f"{path} {rays}", method, total)
+        row = rows[f"{rays} rays"] = train_for(steps, total, ends)
+        row["rays_per_s"] = rays * row["late_steps_per_s"]
         if rays == sizes[0]:
             row |= count_launches(steps) if torch.cuda.is_available() else {}
-            row |= render_both(steps, request["ops"], 1 if small else 10)
+            row |= render_both(steps, path, repeats)
+            limits = {"copy_gb_per_s": ops.copy_rate(device, 1 << (12 if small else 26)) / 1e9}
+            limits["matmul_gflop_per_s"] = ops.matmul_rate(device) / 1e9
+            said = f"Each operation of a step of {rays} rays, beside what bandwidth and arithmetic would allow."
+            tables[said] = ops.measure(steps, repeats, limits)["ops"]
         tell(f"{rays} rays: {row}")
         del steps
-    return found
+    first = rows[f"{sizes[0]} rays"]
+    names = ("peak_gib", "frame_ms", "full_frame_ms", "psnr_delta_db", "launches_a_step", "waits_a_step")
+    head = {"rays_per_s": max(r["rays_per_s"] for r in rows.values()), **{n: first[n] for n in names if n in first}}
+    prefix = "torch_" if path == "torch" else ""
+    tables = {"`mmpi`, four MPIs by hand, 256 planes, trained together.": rows, **tables}
+    return {"headline": {prefix + name: value for name, value in head.items()}, "tables": tables}
 
 
-def train_for(steps: Steps, total: int, ends: float, tell: Tell) -> dict[str, Any]:
+def train_for(steps: Steps, total: int, ends: float) -> Row:
     """Trains until the run or the time is over; steps a second while resolution grows and after it."""
     model = steps.pipeline.model
     assert isinstance(model, MMPIModel)
     steps.run(2)  # compiles
-    block, rows = max(1, total // 40), []
+    block, rates = max(1, total // 40), {True: [], False: []}
     while steps.step + block <= total and time.monotonic() < ends:
         young = not model.progress.schedule.sharpened(steps.step)
-        rows.append((young, block / steps.run(block)))
-    late = [rate for young, rate in rows if not young]
-    early = [rate for young, rate in rows if young]
+        rates[young].append(block / steps.run(block))
+    early, late = rates[True], rates[False]
     return {
         "steps": steps.step,
         "early_steps_per_s": statistics.median(early) if early else None,
-        "late_steps_per_s": statistics.median(late or early) if rows else 0.0,
+        "late_steps_per_s": statistics.median(late or early or [0.0]),
         "texels": model.field.full_plan.texels,
         **memory(),
     }
@@ -203,9 +178,9 @@ def count_launches(steps: Steps) -> dict[str, int]:
 
 
 @torch.no_grad()
-def render_both(steps: Steps, ops: str, repeats: int) -> dict[str, Any]:
+def render_both(steps: Steps, path: str, repeats: int) -> Row:
     """Milliseconds of a frame by the path that was trained; for Triton, its error against plain torch too."""
-    pipeline = steps.pipeline
+    pipeline, psnr = steps.pipeline, ImageMetrics("none")
     pipeline.eval()
     camera, batch = next(iter(pipeline.datamanager.fixed_indices_eval_dataloader))
     truth = batch["image"][..., :3].to(pipeline.device)
@@ -215,31 +190,31 @@ def render_both(steps: Steps, ops: str, repeats: int) -> dict[str, Any]:
         return pipeline.model.get_outputs_for_camera(view)["rgb"]
 
     frame_s, rgb = median_s(render, repeats), render()
-    found = {"frame_ms": 1e3 * frame_s, "frame_pixels": rgb.shape[0] * rgb.shape[1], "psnr": _psnr(rgb, truth)}
     larger = copy.deepcopy(camera)
     larger.rescale_output_resolution(FULL_WIDTH / rgb.shape[1] if repeats > 1 else 0.5)
-    found["full_frame_ms"] = 1e3 * median_s(lambda: render(larger), repeats)
-    found["full_frame_pixels"] = int(larger.width) * int(larger.height)
-    if ops != "torch":
+    found = {
+        "frame_ms": 1e3 * frame_s,
+        "frame_pixels": rgb.shape[0] * rgb.shape[1],
+        "psnr": psnr(rgb, truth)["psnr"],
+        "full_frame_ms": 1e3 * median_s(lambda: render(larger), repeats),
+        "full_frame_pixels": int(larger.width) * int(larger.height),
+    }
+    if path != "torch":
         dispatch.choose("torch")
         plain = render()
         dispatch.choose("auto")
         found["largest_difference"] = float((rgb - plain).abs().max())
-        found["psnr_delta_db"] = found["psnr"] - _psnr(plain, truth)
+        found["psnr_delta_db"] = found["psnr"] - psnr(plain, truth)["psnr"]
     pipeline.train()
     return found
 
 
-def _psnr(rgb: Tensor, truth: Tensor) -> float:
-    return float(-10 * torch.log10(((rgb - truth) ** 2).mean()))
-
-
-def measure_kitti(request: dict[str, Any], tell: Tell) -> dict[str, Any]:
+def measure_kitti(request: Row, tell: Tell) -> Row:
     """``mmpi-kitti`` at the paper's size, its schedule run through in fewer steps; what 40,000 would take.
 
     Both readings of the paper's 30,000 individual steps: the MPIs share each batch, or each renders all of it.
     """
-    found, small = {}, request["rehearse"]
+    small, head, tables, facts = request["rehearse"], {}, {}, {}
     total = 3 if small else 1000
     for reading in ("split", "all"):
         ends = time.monotonic() + request["seconds"] / 2
@@ -248,14 +223,18 @@ def measure_kitti(request: dict[str, Any], tell: Tell) -> dict[str, Any]:
             options += (P + "planes", "6", P + "height", "12", P + "width", "12", *TWO_PHASE)
             options += ("--pipeline.datamanager.train-num-rays-per-batch", "16")
         steps = steps_of(request, f"kitti {reading}", Method("mmpi-kitti", "mmpi-kitti", options), total)
-        found[reading] = time_phases(steps, total, ends)
-        tell(f"{reading}: {found[reading]}")
+        row, stages = time_phases(steps, total, ends)
+        facts[f"`rays-per-mpi {reading}`"], tables[f"Stages of `rays-per-mpi {reading}`:"] = row, stages
+        head |= {f"kitti_{reading}_{n}": row[n] for n in ("steps_per_s", "minutes_of_40000_steps")}
+        head |= {f"kitti_{reading}_{n}": value for n, value in memory().items()}
+        tell(f"{reading}: {row}")
         del steps
-    return found
+    said = "The paper's KITTI size, its schedule in fewer steps, and what 40,000 would take."
+    return {"headline": head, "tables": {said: facts, **tables}}
 
 
-def time_phases(steps: Steps, total: int, ends: float) -> dict[str, Any]:
-    """Mean seconds of a step at each resolution and phase, and the minutes of 40,000 steps with those shares.
+def time_phases(steps: Steps, total: int, ends: float) -> tuple[Row, Row]:
+    """The minutes of 40,000 steps, and milliseconds of a step at each resolution and phase.
 
     A step whose stage was not reached within the time is given the mean of the last stage that was.
     """
@@ -265,18 +244,15 @@ def time_phases(steps: Steps, total: int, ends: float) -> dict[str, Any]:
     steps.run(1)
     block = max(1, total // 100)
     while steps.step < total and time.monotonic() < ends:
-        stage = stages[steps.step]
-        count = 1
-        while count < block and steps.step + count < total and stages[steps.step + count] == stage:
-            count += 1
+        stage, ahead = next(groupby(stages[steps.step : steps.step + block]))
+        count = len(list(ahead))
         times.setdefault(stage, []).append(steps.run(count) / count)
     means, last = {}, 0.0
     for stage in dict.fromkeys(stages):
         # The median: the first steps of a stage compile kernels and resample tables.
         means[stage] = last = statistics.median(times[stage]) if stage in times else last
     mean_s = sum(means[s] for s in stages) / total
-    return {
-        "step_ms": {f"{name}, {factor:.3g} of the texels": 1e3 * s for (name, factor), s in means.items()},
+    row = {
         "steps_run": steps.step,
         "reached_the_end": steps.step >= total,
         "steps_per_s": 1 / mean_s if mean_s else 0.0,
@@ -284,18 +260,10 @@ def time_phases(steps: Steps, total: int, ends: float) -> dict[str, Any]:
         "parameters": sum(p.numel() for p in model.parameters()),
         **memory(),
     }
+    return row, {f"{name}, {factor:.3g} of the texels": {"ms a step": 1e3 * s} for (name, factor), s in means.items()}
 
 
-def check(request: dict[str, Any], tell: Tell) -> dict[str, Any]:
-    """Correctness first."""
-    found = run_checks(request["device"], request["rehearse"])
-    for row in found["checks"]:
-        if not row["ok"]:
-            tell(f"FAIL {row}")
-    return found
-
-
-PARTS: dict[str, Callable[[dict[str, Any], Tell], dict[str, Any]]] = {
+PARTS: dict[str, Callable[[Row, Tell], Row]] = {
     "checks": check,
     "operations": measure_operations,
     "training": measure_training,
@@ -303,14 +271,10 @@ PARTS: dict[str, Callable[[dict[str, Any], Tell], dict[str, Any]]] = {
 }
 
 
-def run_part(request: dict[str, Any], tell: Tell) -> dict[str, Any]:
+def run_part(request: Row, tell: Tell) -> Row:
     """One part, as asked."""
     if request["rehearse"]:
         torch.set_num_threads(1)
         dispatch.interpret(True)
-    found = PARTS[request["part"]](request, tell)
-    return {**found, "device": _device_name()}
-
-
-def _device_name() -> str:
-    return torch.cuda.get_device_name() if torch.cuda.is_available() else "CPU (rehearsal by Triton's interpreter)"
+    name = torch.cuda.get_device_name() if torch.cuda.is_available() else "CPU (rehearsal by Triton's interpreter)"
+    return {**PARTS[request["part"]](request, tell), "device": name}

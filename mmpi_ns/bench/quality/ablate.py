@@ -8,9 +8,9 @@ from typing import Literal
 
 import numpy as np
 
-from mmpi_ns.bench.methods import Method, Scene
-from mmpi_ns.bench.report import Report, Row, SceneBench, commit, figure, not_run, page, slug, table, title
-from mmpi_ns.bench.suites import ABLATIONS, Variant
+from mmpi_ns.bench.methods import Method
+from mmpi_ns.bench.report import Cell, Report, Row, SceneBench, commit, figure, not_run, page, slug, table, title
+from mmpi_ns.bench.suites import ABLATIONS
 from mmpi_ns.bench.trainings import Request, train_apart
 
 NEAR = 0.1
@@ -42,7 +42,7 @@ class Ablate(SceneBench):
     name = "ablate"
 
     def run(self) -> None:
-        key = f"{self.data.resolve().name} /{self.downscale_factor}, {self.steps} steps of {self.rays} rays"
+        key = f"{self.scene.name} /{self.downscale_factor}, {self.steps} steps of {self.rays} rays"
         key += f", {self.cores} threads, {self.test_images or 'all'} test images"
         report = Report(self, key, f"ablate-{self.suite}")
         first, *others = ABLATIONS[self.suite]
@@ -53,7 +53,7 @@ class Ablate(SceneBench):
                     self._ensure_equal_time(report, variant, seed, row)
         print(report.content["headline"])
 
-    def _ensure_equal_time(self, report: Report, variant: Variant, seed: int, row: Row) -> None:
+    def _ensure_equal_time(self, report: Report, variant: Method, seed: int, row: Row) -> None:
         reference = report.rows[_key(ABLATIONS[self.suite][0].name, seed, self.steps)]
         if "not_run" in reference:
             raise ValueError(f"The reference failed: {reference['not_run']}")
@@ -64,7 +64,7 @@ class Ablate(SceneBench):
             known = [r["steps"] for r in own if "not_run" not in r and r["steps"] != self.steps]
             self._ensure(report, variant, seed, known[0] if known else steps)
 
-    def _ensure(self, report: Report, variant: Variant, seed: int, steps: int) -> Row:
+    def _ensure(self, report: Report, variant: Method, seed: int, steps: int) -> Row:
         """Makes a row unless it is there, and writes everything."""
         key = _key(variant.name, seed, steps)
         row = report.row(key, lambda: self._train(variant, seed, steps), needed=False)
@@ -73,13 +73,12 @@ class Ablate(SceneBench):
         report.finish(headline(found), markdown(self.suite, report.content, found), lambda path: draw(path, found))
         return row
 
-    def _train(self, variant: Variant, seed: int, steps: int) -> Row:
+    def _train(self, variant: Method, seed: int, steps: int) -> Row:
         key = _key(variant.name, seed, steps)
         print(f"{key} ...", flush=True)
-        method, scene = Method(variant.name, variant.method, variant.options), Scene(self.data, self.downscale_factor)
-        looks: Row = {"check_images": self.test_images, "final_images": self.test_images}
         folder = self.folder / self.suite / slug(key)
-        request = Request.of(method, scene, folder, steps, self.rays, seed, **looks)
+        looks: Row = {"check_images": self.test_images, "final_images": self.test_images}
+        request = Request.of(variant, self.scene, folder, steps, self.rays, seed, **looks)
         row = {"name": variant.name, "seed": seed, "steps": steps, "commit": commit(), "options": request.shown}
         return {**row, "what": f"{variant.name}, seed {seed}", **train_apart(request, self.cores)}
 
@@ -132,34 +131,30 @@ def headline(found: dict[str, Row]) -> dict[str, float]:
     return made
 
 
-def _psnr(means: Row | None) -> str:
-    if means is None:
-        return ""
-    return f"{means['psnr']:.2f}" + ("" if means["spread"] is None else f" ± {means['spread']:.2f}")
-
-
-def _at_equal_time(form: str):
-    return lambda row: "" if row["time"] is None else form.format(**row["time"])
-
-
-_COLUMNS = {
-    "variant": "{name}",
-    "PSNR, equal rays": lambda row: _psnr(row["rays"]),
-    "gain": "{rays[gain]:+.2f}",
-    "SSIM": "{rays[ssim]:.3f}",
-    "seconds": "{rays[seconds]:.0f}",
-    "steps at equal time": _at_equal_time("{steps:.0f}"),
-    "PSNR, equal time": lambda row: _psnr(row["time"]),
-    "gain ": _at_equal_time("{gain:+.2f}"),
-    "seconds ": _at_equal_time("{seconds:.0f}"),
-}
-
-
 def markdown(suite: str, content: Row, found: dict[str, Row]) -> str:
     """The page."""
+
+    def psnr(means: Row | None) -> str:
+        spread = f" ± {means['spread']:.2f}" if means and means["spread"] is not None else ""
+        return "" if means is None else f"{means['psnr']:.2f}{spread}"
+
+    def at_equal_time(form: str) -> Cell:
+        return lambda row: "" if row["time"] is None else form.format(**row["time"])
+
+    columns = {
+        "variant": "{name}",
+        "PSNR, equal rays": lambda row: psnr(row["rays"]),
+        "gain": "{rays[gain]:+.2f}",
+        "SSIM": "{rays[ssim]:.3f}",
+        "seconds": "{rays[seconds]:.0f}",
+        "steps at equal time": at_equal_time("{steps:.0f}"),
+        "PSNR, equal time": lambda row: psnr(row["time"]),
+        "gain ": at_equal_time("{gain:+.2f}"),
+        "seconds ": at_equal_time("{seconds:.0f}"),
+    }
     blocks = []
     for group in dict.fromkeys(entry["group"] for entry in found.values()):
-        blocks += [f"## {title(group)}", table(_COLUMNS, (e for e in found.values() if e["group"] == group))]
+        blocks += [f"## {title(group)}", table(columns, (e for e in found.values() if e["group"] == group))]
     commits = ", ".join(sorted({r["commit"] for r in content["rows"].values()}))
     said = f"""\
 {content["key"]}. PSNR and SSIM are means over whole test images (and seeds; ± their standard deviation).

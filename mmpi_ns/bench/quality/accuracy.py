@@ -10,10 +10,11 @@ import numpy as np
 import torch
 
 from mmpi_ns.bench.quality.solids import Solids, bake
-from mmpi_ns.bench.rendering import bundle_of, render
+from mmpi_ns.bench.rendering import AHEAD, bundle_of, of_slots, render
 from mmpi_ns.bench.report import Bench, Report, Row, figure, page, table
 from mmpi_ns.bench.stability.exact import Array
 from mmpi_ns.ops.blending import BlendForm
+from mmpi_ns.ops.composite.reference import median_inverse_distance
 from mmpi_ns.scene.plan import MPIPlan
 
 SLANTED = Solids((-0.3, 0.2, 1.0), 6.0, ball=(-0.4, 0.3, 4.2, 0.9))
@@ -59,15 +60,15 @@ def measure(solids: Solids, mpis: list[MPIPlan], form: BlendForm | None = None) 
         found = render(field, bundle_of(origins, directions), THRESHOLD, form)
     t = solids.hit(origins, directions)
     exact = solids.color(origins + t[:, None] * directions)
-    depth = np.abs(found.median_inverse_distance().double().numpy() - 1 / t)
-    color = np.abs(found.rgb.double().numpy() - exact).mean(-1)
+    slots = (of_slots(found, name) for name in ("inverse_t", "valid"))
+    depth = np.abs(median_inverse_distance(found.composite.weights, *slots)[:, 0].double().numpy() - 1 / t)
+    color = np.abs(found.colors.rgb.double().numpy() - exact).mean(-1)
     return {"depth_error": float(depth.mean()), "color_error": float(color.mean())}
 
 
 def front(planes: int, height: int, width: int) -> MPIPlan:
     """An MPI at the world's origin that faces the wall."""
-    axes = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-    return MPIPlan("front", (0.0, 0.0, 0.0), axes, 2.5, EXTENT, planes, height, width)
+    return MPIPlan("front", (0.0, 0.0, 0.0), AHEAD, 2.5, EXTENT, planes, height, width)
 
 
 def expected_depth_error(solids: Solids, mpi: MPIPlan) -> float:

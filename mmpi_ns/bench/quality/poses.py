@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import sys
 from dataclasses import dataclass
-from datetime import date
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +11,8 @@ import torch
 from nerfstudio.cameras.lie_groups import exp_map_SO3xR3
 from numpy.typing import NDArray
 
-from mmpi_ns.bench.apart import run_command
-from mmpi_ns.bench.report import Report, Row, SceneBench, commit, page, processor, table
+from mmpi_ns.bench.apart import train_and_evaluate
+from mmpi_ns.bench.report import Report, Row, Scene, SceneBench, page, table
 
 Array = NDArray[np.float64]
 MODES = {"as they are": "off", "refined in training": "SO3xR3"}
@@ -40,7 +38,7 @@ class Poses(SceneBench):
     name = "poses"
 
     def run(self) -> None:
-        report = Report(self, key=self.key(), file=f"poses-{self.data.resolve().name}")
+        report = Report(self, key=self.key(), file=f"poses-{self.scene.name}")
         for given in ("given", "disturbed") if self.degrees or self.distance else ("given",):
             for poses, mode in MODES.items():
                 name = f"{given} poses, {poses}"
@@ -49,25 +47,17 @@ class Poses(SceneBench):
         report.finish({}, markdown(report.content))
 
     def _row(self, given: str, mode: str) -> Row:
-        folder = self.folder / self.data.resolve().name / f"{given}-{mode}"
-        exact = write_scene(self.data.resolve(), folder / "exact", self.test_images)
-        scene = folder / "scene"
+        folder = self.folder / self.scene.name / f"{given}-{mode}"
+        exact, scene = folder / "exact", folder / "scene"
         off = (self.degrees, self.distance) if given == "disturbed" else (0.0, 0.0)
+        write_scene(self.data.resolve(), exact, self.test_images)
         write_scene(self.data.resolve(), scene, self.test_images, *off)
-        place = ["--output-dir", str(folder), "--experiment-name", "run", "--timestamp", "1", "--vis", "tensorboard"]
-        asked = ["--pipeline.model.camera-optimizer.mode", mode, "--pipeline.refine-eval-poses", "True"]
-        asked += ["--max-num-iterations", str(self.steps), "--pipeline.model.lpips-net", "none"]
-        size = ["--data", str(scene), "nerfstudio-data", "--downscale-factor", str(self.downscale_factor)]
-        train, evaluate = (str(Path(sys.executable).with_name(name)) for name in ("ns-train", "ns-eval"))
-        run_command([train, "mmpi-small", *place, *asked, *size], folder / "train.log", self.cores)
-        run, found = folder / "run" / "mmpi-small" / "1", folder / "eval.json"
-        command = [evaluate, "--load-config", str(run / "config.yml"), "--output-path", str(found)]
-        run_command(command, folder / "eval.log", self.cores)
-        results = json.loads(found.read_text(encoding="utf-8"))["results"]
+        options = ["--pipeline.model.camera-optimizer.mode", mode, "--pipeline.refine-eval-poses", "True"]
+        options += ["--max-num-iterations", str(self.steps), "--pipeline.model.lpips-net", "none"]
+        copied = Scene(scene, self.downscale_factor)
+        run, results, made = train_and_evaluate(copied, folder, "mmpi-small", options, (), self.cores)
         names = ("psnr", "ssim", "refined_psnr", "refined_ssim", "refined_rotation_degrees")
-        row = {name: results[name] for name in names}
-        row |= {"processor": processor(), "commit": commit(), "date": date.today().isoformat()}
-        return row | pose_errors(exact, scene, run)
+        return {name: results[name] for name in names} | made | pose_errors(exact, scene, run)
 
 
 def write_scene(data: Path, folder: Path, test_images: int, degrees: float = 0.0, distance: float = 0.0) -> Path:
@@ -139,6 +129,16 @@ def pose_errors(exact: Path, scene: Path, run: Path) -> Row:
 
 def markdown(content: Row) -> str:
     """The page."""
+    columns = {
+        "training poses": "{name}",
+        "off by, degrees": "{degrees_off:.3f}",
+        "units": "{distance_off:.3f}",
+        "PSNR": "{psnr:.2f}",
+        "SSIM": "{ssim:.3f}",
+        "PSNR, own pose refined": "{refined_psnr:.2f}",
+        "SSIM, own pose refined": "{refined_ssim:.3f}",
+        "by, degrees": "{refined_rotation_degrees:.2f}",
+    }
     rows = [{"name": name, **row} for name, row in content["rows"].items()]
     said = (
         "Errors of training poses are means, against the scene's own poses. PSNR and SSIM are `ns-eval`'s means over "
@@ -146,16 +146,4 @@ def markdown(content: Row) -> str:
         "where the frozen model shows it best (`--pipeline.refine-eval-poses True`): what the model knows of the scene "
         "whatever frame its poses drifted to, and no score of new views at given poses."
     )
-    return page("Refined poses", content["made"], said, table(_COLUMNS, rows))
-
-
-_COLUMNS = {
-    "training poses": "{name}",
-    "off by, degrees": "{degrees_off:.3f}",
-    "units": "{distance_off:.3f}",
-    "PSNR": "{psnr:.2f}",
-    "SSIM": "{ssim:.3f}",
-    "PSNR, own pose refined": "{refined_psnr:.2f}",
-    "SSIM, own pose refined": "{refined_ssim:.3f}",
-    "by, degrees": "{refined_rotation_degrees:.2f}",
-}
+    return page("Refined poses", content["made"], said, table(columns, rows))

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import functools
 import json
-import sys
-import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from datetime import date
 from pathlib import Path
 
-from mmpi_ns.bench.apart import run_command
-from mmpi_ns.bench.report import Report, Row, SceneBench, commit, figure, page, processor, slug, table
-from mmpi_ns.bench.suites import DEFAULT, SUITES, Variant
+from mmpi_ns.bench.apart import train_and_evaluate
+from mmpi_ns.bench.methods import Method
+from mmpi_ns.bench.report import Report, Row, SceneBench, figure, page, slug, table
+from mmpi_ns.bench.suites import DEFAULT, SUITES
 from mmpi_ns.capture.load import load_observations
 from mmpi_ns.placement.errors import pixel_errors
 from mmpi_ns.placement.visibility import find_visible_points
@@ -51,40 +49,42 @@ class Results(SceneBench):
         head = {f"{slug(name)}_{what}": r[what] for name, r in report.rows.items() for what in ("psnr", "ssim")}
         report.finish(head, markdown(self.suite, report.content), draw)
 
-    def _row(self, variant: Variant) -> Row:
-        folder = self.work / self.name / self.suite / slug(variant.key, "-")
+    def _row(self, variant: Method) -> Row:
+        folder = self.folder / self.suite / slug(variant.key, "-")
         threads = self.threads or max(1, self.cores // self.parallel)
-        steps = [] if variant.steps is None else ["--max-num-iterations", str(variant.steps)]
-        scene = ["--data", str(self.data), "nerfstudio-data", "--downscale-factor", str(self.downscale_factor)]
-        place = ["--output-dir", str(folder), "--experiment-name", "run", "--timestamp", "1", "--vis", "tensorboard"]
-        start = time.perf_counter()
-        train, evaluate = (str(Path(sys.executable).with_name(name)) for name in ("ns-train", "ns-eval"))
-        run_command([train, variant.method, *place, *steps, *variant.options, *scene], folder / "train.log", threads)
-        seconds = time.perf_counter() - start
-        run, found = folder / "run" / variant.method / "1", folder / "eval.json"
-        render = ["--output-path", str(found), "--render-output-path", str(folder / "renders")]
-        run_command([evaluate, "--load-config", str(run / "config.yml"), *render], folder / "eval.log", threads)
-        results = json.loads(found.read_text(encoding="utf-8"))["results"]
+        steps = [] if not variant.steps else ["--max-num-iterations", str(variant.steps)]
+        options, renders = [*steps, *variant.options], ["--render-output-path", str(folder / "renders")]
+        run, results, made = train_and_evaluate(self.scene, folder, variant.registered, options, renders, threads)
         row = {k: results[k] for k in ("psnr", "ssim", "num_rays_per_sec", "dropped_mass") if k in results}
         row |= {k: v for k, v in results.items() if k.startswith("lpips") and not k.endswith("std")}
-        row |= self._plan_figures(run) | {"train_seconds": seconds, "steps": steps_of(run), "threads": threads}
-        row |= {"processor": processor(), "commit": commit(), "date": date.today().isoformat()}
-        return row | {"command": " ".join(["ns-train", variant.method, *steps, *variant.options])}
-
-    def _plan_figures(self, run: Path) -> Row:
-        """MPIs, texels and expected pixel errors of the plan that a run used."""
+        # MPIs, texels and expected pixel errors of the plan that the run used.
         plan, observations = ScenePlan.load(run / "plan.json"), _observations(self.data, self.downscale_factor)
         visible = find_visible_points(observations)
-        errors = pixel_errors(plan, observations, visible.cameras, visible.points).summary()
-        return {"mpis": len(plan.mpis), "texels": plan.texels, **errors}
+        row |= {"mpis": len(plan.mpis), "texels": plan.texels}
+        row |= pixel_errors(plan, observations, visible.cameras, visible.points).summary()
+        return row | made | {"steps": steps_of(run), "command": " ".join(["ns-train", variant.registered, *options])}
 
 
 def markdown(suite: str, content: Row) -> str:
     """The page."""
+    columns = {
+        "variant": "{name}",
+        "PSNR": "{psnr:.2f}",
+        "SSIM": "{ssim:.3f}",
+        "LPIPS": lambda r: next((f"{v:.3f}" for k, v in r.items() if k.startswith("lpips")), "no weights"),
+        "rays": lambda r: f"{r['steps'] * RAYS_PER_STEP / 1e6:.2f} M",
+        "training, s": "{train_seconds:.0f}",
+        "threads": "{threads}",
+        "render rays/s": "{num_rays_per_sec:.0f}",
+        "MPIs": "{mpis}",
+        "M texels": lambda r: f"{r['texels'] / 1e6:.1f}",
+        "e_p": "{e_p_50:.2f} / {e_p_90:.2f}",
+        "e_t": "{e_t_50:.2f} / {e_t_90:.2f}",
+    }
     rows, blocks = content["rows"], []
     for group in dict.fromkeys(v.group for v in SUITES[suite]):
         own = ({"name": v.name, **rows[v.key]} for v in SUITES[suite] if v.group == group and v.key in rows)
-        blocks += [f"## {group}" if group else "", table(_COLUMNS, own)]
+        blocks += [f"## {group}" if group else "", table(columns, own)]
     commits = sorted({f"{r['commit']} ({r['date']})" for r in rows.values()})
     said = f"""\
 Rows ran on {" and ".join(sorted({r["processor"] for r in rows.values()}))}. Every figure is `ns-eval`'s mean over all
@@ -92,22 +92,6 @@ test images. Rays are pixel rays of training; e_p and e_t are the expected pixel
 texels (median / 90th percentile over the training observations, each in the MPI that serves it best)."""
     last = f"Commits: {', '.join(commits)}. Options of each row: `{suite}.json`."
     return page(suite, content["made"], said, blocks, last)
-
-
-_COLUMNS = {
-    "variant": "{name}",
-    "PSNR": "{psnr:.2f}",
-    "SSIM": "{ssim:.3f}",
-    "LPIPS": lambda r: next((f"{v:.3f}" for k, v in r.items() if k.startswith("lpips")), "no weights"),
-    "rays": lambda r: f"{r['steps'] * RAYS_PER_STEP / 1e6:.2f} M",
-    "training, s": "{train_seconds:.0f}",
-    "threads": "{threads}",
-    "render rays/s": "{num_rays_per_sec:.0f}",
-    "MPIs": "{mpis}",
-    "M texels": lambda r: f"{r['texels'] / 1e6:.1f}",
-    "e_p": "{e_p_50:.2f} / {e_p_90:.2f}",
-    "e_t": "{e_t_50:.2f} / {e_t_90:.2f}",
-}
 
 
 def draw_budgets(path: Path, rows: dict[str, Row]) -> None:

@@ -8,10 +8,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 from mmpi_ns.bench.apart import Tell, run_apart
-from mmpi_ns.bench.methods import METHODS, Method, Scene
+from mmpi_ns.bench.methods import METHODS, Method, P
 from mmpi_ns.bench.report import Report, Row, SceneBench, figure, page, table
 from mmpi_ns.bench.speed.all_planes import DenseSteps
-from mmpi_ns.bench.suites import P
 from mmpi_ns.bench.trainers import Steps, end_helpers
 from mmpi_ns.bench.trainings import Request, train_apart
 
@@ -67,17 +66,16 @@ class Speed(SceneBench):
     def _train(self, method: Method, folder: str) -> Row:
         print(f"{folder} ...", flush=True)
         looks: Row = {"check_images": self.test_images, "final_images": self.test_images}
-        scene = Scene(self.data, self.downscale_factor)
-        request = Request.of(method, scene, self.folder / folder, self.steps, self.rays, 0, **looks)
+        request = Request.of(method, self.scene, self.folder / folder, self.steps, self.rays, 0, **looks)
         return train_apart(request, self.cores)
 
     def _rounds(self, ours: Method) -> Row:
         print("rounds ...", flush=True)
-        folder, scene = self.folder / "rounds", Scene(self.data, self.downscale_factor)
+        folder = self.folder / "rounds"
         names = ("steps", "dense_steps", "nerfacto_steps", "rounds", "full_size")
         request: dict[str, Any] = {name: getattr(self, name) for name in names}
         for name, method in (("ours", ours), ("nerfacto", METHODS["nerfacto"])):
-            request[name] = method.words(scene, folder, self.steps, self.rays, 0, "cpu")
+            request[name] = method.words(self.scene, folder, self.steps, self.rays, 0, "cpu")
         return run_apart(take_turns, request, folder, self.cores)
 
 
@@ -97,8 +95,9 @@ def take_turns(request: dict[str, Any], tell: Tell) -> Row:
     assert nerfacto.rays == ours.rays
     nerfacto.run(2)  # its process that prepares batches takes seconds to start
     dense.run(1)
-    rounds, found = range(request["rounds"]), {}
-    steps, seconds = request["steps"] // len(rounds), 0.0
+    rounds, found, pixels = range(request["rounds"]), {}, {}
+    steps = request["steps"] // len(rounds)
+    peers = (("dense", dense, request["dense_steps"]), ("nerfacto", nerfacto, request["nerfacto_steps"]))
 
     def add(**more: float) -> None:
         for name, value in more.items():
@@ -106,21 +105,15 @@ def take_turns(request: dict[str, Any], tell: Tell) -> Row:
         tell(", ".join(f"{n} {v:.3g}" for n, v in more.items()))
 
     for _ in rounds:
-        spent = ours.run(steps)
-        seconds += spent
-        add(
-            rays_per_s=steps * ours.rays / spent,
-            dense_rays_per_s=request["dense_steps"] * ours.rays / dense.run(request["dense_steps"]),
-            nerfacto_rays_per_s=request["nerfacto_steps"] * ours.rays / nerfacto.run(request["nerfacto_steps"]),
-        )
-    pixels = {}
+        add(rays_per_s=steps * ours.rays / ours.run(steps))
+        add(**{f"{name}_rays_per_s": count * ours.rays / peer.run(count) for name, peer, count in peers})
     for _ in rounds:  # frames of the trained model
         frame_s, pixels["frame_pixels"] = ours.render()
         full_s, pixels["frame_full_pixels"] = ours.render(request["full_size"])
         render_s, rays = nerfacto.render(rays=NERFACTO_RAYS)
         add(frame_s=frame_s, frame_full_s=full_s, nerfacto_render_rays_per_s=rays / render_s)
     end_helpers(nerfacto.trainer)
-    whole_run = steps * len(rounds) * ours.rays / seconds
+    whole_run = statistics.harmonic_mean(found["rays_per_s"])
     return {**found, **pixels, "whole_run_rays_per_s": whole_run, "dense_samples": dense.samples}
 
 

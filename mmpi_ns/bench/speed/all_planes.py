@@ -6,12 +6,13 @@ import torch
 from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 
+from mmpi_ns.bench.rendering import crossings
 from mmpi_ns.bench.trainers import Steps, clock
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.ops.composite.reference import composite_weights, render_colors
 from mmpi_ns.ops.interpolate.reference import interpolate as interpolate_reference
 from mmpi_ns.rendering.rendered import bounded
-from mmpi_ns.scene.geometry import inverse_distance, plane_hits, sample_disparity
+from mmpi_ns.scene.geometry import plane_hits
 
 
 def render_densely(field: MMPIField, bundle: RayBundle) -> tuple[Tensor, float]:
@@ -25,14 +26,10 @@ def render_densely(field: MMPIField, bundle: RayBundle) -> tuple[Tensor, float]:
     taus, keys, colors = [], [], []
     count = len(bundle)
     for k, mpi in enumerate(field.plan.mpis):
-        m = torch.arange(mpi.planes - 1, -1, -1).expand(count, -1)
-        w = sample_disparity(m, field.frames.disparity_steps[k], field.frames.last_disparities[k])
-        live = (m <= hits.m_first[:, k : k + 1]) & (m > (hits.m_first - hits.count)[:, k : k + 1])
-        u0, u1, v0, v1 = mpi.extent
-        u = (hits.u[:, k, :1] + w * hits.u[:, k, 1:] - u0) * (2 / (u1 - u0)) - 1
-        v = (hits.v[:, k, :1] + w * hits.v[:, k, 1:] - v0) * (2 / (v1 - v0)) - 1
-        ndc = torch.stack([u, v, 1 - 2 * mpi.near / mpi.depth_share * (w - mpi.last_disparity)], -1).reshape(-1, 3)
-        planes = (mpi.planes - 1 - m).reshape(-1)
+        live, u, v, inverse_t = crossings(hits, field.frames, k, mpi.planes)
+        planes, (u0, u1, v0, v1) = torch.arange(mpi.planes).expand(count, -1), mpi.extent
+        ndc = (2 * (u - u0) / (u1 - u0) - 1, 2 * (v - v0) / (v1 - v0) - 1, 2 * planes / (mpi.planes - 1) - 1)
+        ndc, planes = torch.stack(ndc, -1).reshape(-1, 3), planes.reshape(-1)
         rows, weights = field.grids[k].bilinear(planes, ndc)
         raw = interpolate_reference(field.density, rows, weights)[:, 0]
         tau = torch.where(live.reshape(-1), field.layout.optical_depth(k, raw, planes), 0.0)
@@ -42,8 +39,7 @@ def render_densely(field: MMPIField, bundle: RayBundle) -> tuple[Tensor, float]:
         color = field.networks(k, features, ndc[chosen], local)
         colors.append(torch.zeros(tau.shape[0], 3).index_put((chosen,), color).view(count, -1, 3))
         taus.append(tau.view(count, -1))
-        oz, dz = hits.local_origins[:, k, 2:], hits.local_directions[:, k, 2:]
-        keys.append(torch.where(live, inverse_distance(w, oz, dz), -1.0))
+        keys.append(torch.where(live, inverse_t, -1.0))
     order = torch.sort(torch.cat(keys, -1), dim=-1, descending=True, stable=True)[1]
     tau = torch.cat(taus, -1).gather(-1, order)
     color = torch.cat(colors, 1).gather(1, order[..., None].expand(-1, -1, 3))
@@ -66,20 +62,11 @@ class DenseSteps:
     """
 
     def __init__(self, like: Steps) -> None:
-        model = like.pipeline.model
-        config = model.config
-        self.like, self.model, self.step = like, model, 0
-        self.field = MMPIField(
-            model.field.full_plan,
-            feature_channels=config.feature_channels,
-            hidden_width=config.hidden_width,
-            position_frequencies=config.position_frequencies,
-            direction_frequencies=config.direction_frequencies,
-            shared_colour=config.shared_colour,
-            shares_depth=True,
-        ).to(model.device)
+        self.like, self.model, self.step, self.samples = like, like.pipeline.model, 0, 0.0
+        names = ("feature_channels", "hidden_width", "position_frequencies", "direction_frequencies", "shared_colour")
+        settings = {name: getattr(self.model.config, name) for name in names}
+        self.field = MMPIField(self.model.field.full_plan, **settings, shares_depth=True).to(self.model.device)
         self.optimizer = torch.optim.Adam(rates_of(self.field), betas=(0.9, 0.99))
-        self.samples = 0.0
 
     def run(self, count: int) -> float:
         """Trains; returns seconds."""

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import math
-import statistics
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from mmpi_ns.bench.methods import METHODS, Scene
+from mmpi_ns.bench.methods import METHODS
 from mmpi_ns.bench.report import Report, Row, SceneBench, figure, page, slug, table, title
-from mmpi_ns.bench.trainers import Steps, clock
+from mmpi_ns.bench.trainers import Steps, median_s
 from mmpi_ns.field.samples import Gathered, Lookup, Taps, metadata_of
 from mmpi_ns.model import MMPIModel
 from mmpi_ns.ops.composite.reference import composite_weights
@@ -72,8 +72,7 @@ class Ops(SceneBench):
         if self.threads:
             torch.set_num_threads(self.threads)
         device = "cuda" if torch.cuda.is_available() else "cpu"
-        scene = Scene(self.data, self.downscale_factor)
-        steps = Steps(METHODS["mmpi-small"].words(scene, self.folder, self.steps, self.rays, 0, device))
+        steps = Steps(METHODS["mmpi-small"].words(self.scene, self.folder, self.steps, self.rays, 0, device))
         limits = {"copy_gb_per_s": copy_rate(device, COPIED) / 1e9, "matmul_gflop_per_s": matmul_rate(device) / 1e9}
         print(limits, flush=True)
         rows: dict[str, Row] = {"limits": limits}
@@ -81,18 +80,6 @@ class Ops(SceneBench):
             step_ms = 1e3 * steps.run(count) / count
             rows[name] = {**measure(steps, self.repeats, limits), "step_ms": step_ms}
         return rows
-
-
-def median_s(work: Callable[[], Any], repeats: int, untimed: int = 1) -> float:
-    """Median seconds, the device waited for, after some untimed calls (which may compile)."""
-    for _ in range(untimed):
-        work()
-    times = []
-    for _ in range(repeats):
-        start = clock()
-        work()
-        times.append(clock() - start)
-    return statistics.median(times)
 
 
 def copy_rate(device: str, size: int) -> float:
@@ -151,7 +138,7 @@ def operations(model: MMPIModel, steps: Steps) -> tuple[list[Op], dict[str, floa
     ops += _interpolation(field, taps, lookup.gathered, channels)
     ops += _shading(field, samples, lookup, report)
     ops.append(_variation(field, lookup, rows * (1 + channels) * 2 * 4))
-    ops.append(_adam(model, steps, rows * (1 + channels) * 7 * 4))
+    ops.append(_adam(steps, rows * (1 + channels) * 7 * 4))
     return ops, counts
 
 
@@ -169,18 +156,13 @@ def _interpolation(field: Any, taps: Taps, gathered: Gathered, channels: int) ->
     """Features of the kept samples from the distinct rows, and back."""
     position, weights, rows = taps.position, taps.weights, gathered.rows
     assert position is not None
-    read, values = position.numel() * (position.element_size() + 4), len(position) * channels * 4
-    table = len(rows) * channels * 4
-    known = gathered.features.detach()
+    table, known = len(rows) * channels * 4, gathered.features.detach()
+    moved = position.numel() * (position.element_size() + 4) + table + len(position) * channels * 4
     grad = torch.rand(len(position), channels, device=weights.device)
     return [
         Op("gather rows", lambda: gather_rows(field.features.data, rows), len(rows) * 8 + 2 * table),
-        Op("interpolation", lambda: interpolate_gathered(known, position, weights), read + table + values),
-        Op(
-            "interpolation, backward",
-            lambda: sum_rows(position, grad, weights, len(rows)),
-            read + table + values,
-        ),
+        Op("interpolation", lambda: interpolate_gathered(known, position, weights), moved),
+        Op("interpolation, backward", lambda: sum_rows(position, grad, weights, len(rows)), moved),
     ]
 
 
@@ -200,59 +182,49 @@ def _shading(field: Any, samples: Any, lookup: Lookup, report: Any) -> list[Op]:
     def show() -> Tensor:
         return field.render_colors(samples, lookup, fixed).rgb
 
-    def back(work: Callable[[], Tensor]) -> Callable[[], None]:
-        def both() -> None:
-            work().sum().backward()
-            tau.grad = features.grad = field.networks.weights.grad = None
+    def back(work: Callable[[], Tensor]) -> None:
+        work().sum().backward()
+        tau.grad = features.grad = field.networks.weights.grad = None
 
-        return both
-
-    weights = sum(math.prod(s) for s in field.networks.shapes[::2])
     asked = len(valid) if field.shading == "ray" else len(lookup.index)
+    sums = 2.0 * sum(math.prod(s) for s in field.networks.shapes[::2]) * asked
     depths, read = valid.numel() * (4 + 4 + 1 + 4), features.numel() * 4 + len(lookup.index) * 4 * (4 + 4)
-    sums = 2.0 * weights * asked
     return [
         Op("compositing", weigh, depths),
-        Op("compositing, and backward", back(weigh), 2 * depths),
+        Op("compositing, and backward", partial(back, weigh), 2 * depths),
         Op("colours of rays", show, read, sums),
-        Op("colours of rays, and backward", back(show), 2 * read, 3 * sums),
+        Op("colours of rays, and backward", partial(back, show), 2 * read, 3 * sums),
     ]
 
 
 def _variation(field: Any, lookup: Lookup, moved: float) -> Op:
     def work() -> None:
-        field.total_variation(lookup, 1e-5, 1e-6).backward()
-        field.density.grad = field.features.grad = None
-
-    # The rows are gathered again each time: what a backward pass went through is gone.
-    def fresh() -> None:
-        nonlocal lookup
+        # The rows are gathered again each time: what a backward pass went through is gone.
         assert lookup.gathered is not None
         rows = lookup.gathered.rows
         density, features = (gather_rows(t, rows) for t in (field.density, field.features))
-        lookup = replace(lookup, gathered=Gathered(rows, density, features))
-        work()
+        fresh = replace(lookup, gathered=Gathered(rows, density, features))
+        field.total_variation(fresh, 1e-5, 1e-6).backward()
+        field.density.grad = field.features.grad = None
 
-    return Op("total variation, forward and backward", fresh, moved)
+    return Op("total variation, forward and backward", work, moved)
 
 
-def _adam(model: MMPIModel, steps: Steps, moved: float) -> Op:
+def _adam(steps: Steps, moved: float) -> Op:
     """The optimisers' step with the gradients of one batch; restores nothing: some more steps do no harm."""
-    trainer = steps.trainer
+    optimizers = list(steps.trainer.optimizers.optimizers.values())
     _, losses, _ = steps.pipeline.get_train_loss_dict(step=steps.step)
-    for optimizer in trainer.optimizers.optimizers.values():
+    for optimizer in optimizers:
         optimizer.zero_grad()
     torch.stack([loss.reshape(()) for loss in losses.values()]).sum().backward()
-
-    params = [p for o in trainer.optimizers.optimizers.values() for g in o.param_groups for p in g["params"]]
-    grads = [p.grad for p in params]
+    grads = {p: p.grad for o in optimizers for group in o.param_groups for p in group["params"]}
 
     def work() -> None:
-        for p, grad in zip(params, grads, strict=True):
+        for p, grad in grads.items():
             p.grad = grad
-        for optimizer in trainer.optimizers.optimizers.values():
+        for optimizer in optimizers:
             optimizer.step()
-        for p in params:
+        for p in grads:
             p.grad = None  # other operations have gradients of their own
 
     return Op("Adam", work, moved)

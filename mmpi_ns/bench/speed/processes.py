@@ -13,7 +13,11 @@ from typing import Any
 import torch
 
 from mmpi_ns.bench.apart import run_command
+from mmpi_ns.bench.methods import Method, Scene
 from mmpi_ns.bench.report import Bench, Report, Row, page, table
+from mmpi_ns.capture.load import load_observations
+from mmpi_ns.config import mmpi_small
+from mmpi_ns.placement.split import place_windows
 
 
 @dataclass
@@ -43,7 +47,7 @@ class Processes(Bench):
         report = Report(self, self.key())
         windows = self._plan()
         for count in (1, self.processes):
-            row = report.row(str(count), lambda count=count: self._times(count))
+            row = report.row(str(count), lambda c=count: {str(n): self._train(c, n) for n in (self.few, self.steps)})
             print(f"{count} processes: {row} s", flush=True)
         rows = {int(count): {int(n): s for n, s in row.items()} for count, row in report.rows.items()}
         head = headline(rows, self.processes, windows, self.few, self.steps)
@@ -51,19 +55,12 @@ class Processes(Bench):
         report.finish(head, self._markdown(rows, head, windows, report.content["made"]))
         print(head)
 
-    def _times(self, count: int) -> Row:
-        return {str(n): self._train(count, n) for n in (self.few, self.steps)}
-
     def _plan(self) -> int:
         """Places MPIs for the steps of the longer run; returns how many windows there are."""
-        from mmpi_ns.capture.load import load_observations
-        from mmpi_ns.config import mmpi_small
-        from mmpi_ns.placement.split import place_windows
-
-        manager: Any = mmpi_small.config.pipeline.datamanager
+        settings: Any = mmpi_small.config.pipeline
         observations = load_observations(self.data, downscale_factor=self.downscale_factor)
-        settings: Any = mmpi_small.config.pipeline.model
-        plan = place_windows(observations, settings.placement, self.steps * manager.train_num_rays_per_batch)
+        rays = self.steps * settings.datamanager.train_num_rays_per_batch
+        plan = place_windows(observations, settings.model.placement, rays)
         if len(plan) < self.processes:
             raise ValueError(
                 f"{self.data} has {len(plan)} window(s), too few for {self.processes} processes: give a longer capture."
@@ -80,12 +77,10 @@ class Processes(Bench):
         folder = self._folder(count, steps)
         shutil.rmtree(folder, ignore_errors=True)  # windows that are finished there would not be trained again
         folder.mkdir(parents=True)
+        method = Method("road", "mmpi-small", ("--pipeline.model.plan-file", str(self.folder / "plan.json")))
         words = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(count)]
-        words += ["-m", "mmpi_ns.scripts.train", "mmpi-small", "--max-num-iterations", str(steps)]
-        words += ["--steps-per-save", str(100 * steps), "--vis", "tensorboard", "--machine.device-type", "cpu"]
-        words += ["--pipeline.model.plan-file", str(self.folder / "plan.json"), "--output-dir", str(folder)]
-        words += ["--experiment-name", "road", "--timestamp", "run", "--data", str(self.data)]
-        words += ["nerfstudio-data", "--downscale-factor", str(self.downscale_factor)]
+        words += ["-m", "mmpi_ns.scripts.train"]
+        words += method.words(Scene(self.data, self.downscale_factor), folder, steps, None, 0, "cpu")
         core = min(os.sched_getaffinity(0))
         start = time.perf_counter()
         held = {"preexec_fn": lambda: os.sched_setaffinity(0, {core})} if count == 1 else {}
@@ -94,29 +89,25 @@ class Processes(Bench):
 
     def _difference(self, windows: int) -> float:
         """Largest difference between the tables that one process and several made of the same windows."""
-        largest = 0.0
+        largest = [0.0]
         for window in range(windows):
-            name = f"road/mmpi-small/run/windows/window-{window:05d}.pt"
-            one, several = (
-                torch.load(self._folder(c, self.steps) / name, weights_only=True)["field"] for c in (1, self.processes)
-            )
-            for kind, values in one.items():
-                if values.is_floating_point():
-                    largest = max(largest, float((values - several[kind]).abs().max()) if values.numel() else 0.0)
-        return largest
+            name = f"run/mmpi-small/1/windows/window-{window:05d}.pt"
+            folders = [self._folder(count, self.steps) for count in (1, self.processes)]
+            one, several = (torch.load(folder / name, weights_only=True)["field"] for folder in folders)
+            kinds = [kind for kind, values in one.items() if values.is_floating_point() and values.numel()]
+            largest += [float((one[kind] - several[kind]).abs().max()) for kind in kinds]
+        return max(largest)
 
     def _markdown(self, rows: dict[int, dict[int, float]], h: Row, windows: int, made: Row) -> str:
         columns = {
             "processes": "{count}",
-            f"{self.few} steps a window, s": "{few:.1f}",
-            f"{self.steps} steps, s": "{steps:.1f}",
+            f"{self.few} steps a window, s": lambda r: f"{rows[r['count']][self.few]:.1f}",
+            f"{self.steps} steps, s": lambda r: f"{rows[r['count']][self.steps]:.1f}",
             "steps/s in between": "{rate:.1f}",
             "times": "{times:.2f}",
         }
         shown = [{"count": 1, "rate": h["one_steps_per_s"], "times": 1.0}]
         shown += [{"count": self.processes, "rate": h["several_steps_per_s"], "times": h["throughput_ratio"]}]
-        for row in shown:
-            row |= {"few": rows[row["count"]][self.few], "steps": rows[row["count"]][self.steps]}
         said = f"{self.data.resolve().name} /{self.downscale_factor}, {windows} windows, {self.threads} thread(s) for "
         said += "each process; one process alone is held to one core."
         last = f"The windows' tables differ by at most {h['largest_difference']:g}."

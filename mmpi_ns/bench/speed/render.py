@@ -91,7 +91,10 @@ class Render(Bench):
     def run(self) -> None:
         pipeline = load_model(self.load_config)
         model, images = pipeline.model, list(images_of(pipeline, self.images))
-        report = Report(self, self._key(model))
+        checkpoint = sorted((self.load_config.parent / "nerfstudio_models").glob("*.ckpt"))[-1]
+        stat = checkpoint.stat()
+        made = f"{checkpoint.name} {stat.st_size} {stat.st_mtime_ns} {self.images} {self.exact_rays}"
+        report = Report(self, f"{fingerprint()} {made}")
         default = Setting(model.config.render_threshold, model.chunk_size, _ops_in_use(model))
         rays = _some_rays(images, self.exact_rays)
         exact = report.kept.get("exact") or exact_colors(model, images, rays).tolist()
@@ -110,12 +113,6 @@ class Render(Bench):
         head = headline(report.content)
         report.finish(head, markdown(report.content, head), lambda path: draw(path, report.content))
         print(head)
-
-    def _key(self, model: MMPIModel) -> str:
-        """Of what a measurement depends on beside the setting."""
-        checkpoint = sorted((self.load_config.parent / "nerfstudio_models").glob("*.ckpt"))[-1]
-        stat = checkpoint.stat()
-        return f"{fingerprint()} {checkpoint.name} {stat.st_size} {stat.st_mtime_ns} {self.images} {self.exact_rays}"
 
     def _settings(self, default: Setting, bakes: bool) -> list[Setting]:
         """The default, then one thing at a time, every threshold under every ops, and baked where that can be done."""
@@ -139,13 +136,10 @@ def _ops_in_use(model: MMPIModel) -> str:
 
 def _some_rays(images: list[Image], count: int) -> list[Array]:
     """Pixels (row, column) of each image [N, 2], drawn without repetition."""
-    rng = np.random.default_rng(0)
-    found = []
+    rng, found = np.random.default_rng(0), []
     for i, (_, truth) in enumerate(images):
-        share = count // len(images) + (i < count % len(images))
-        height, width = truth.shape[:2]
-        flat = rng.permutation(height * width)[:share]
-        found.append(np.stack([flat // width, flat % width], -1))
+        share, (height, width) = count // len(images) + (i < count % len(images)), truth.shape[:2]
+        found.append(np.stack(divmod(rng.permutation(height * width)[:share], width), -1))
     return found
 
 
@@ -194,13 +188,11 @@ def measure(model: MMPIModel, images: list[Image], rays: list[Array], exact: Arr
 
 
 def _rows(content: Row) -> list[Row]:
-    """Settings with rays/s and what they lose against the best that keeps every sample."""
-    settings = content["rows"]
-    best = next((r["psnr"] for r in settings.values() if r["threshold"] == 0 and not r["also"]), None)
-    best = best if best is not None else max(r["psnr"] for r in settings.values())
-    rows = [{**r, "name": n, "fps": 1 / statistics.median(r["frame_s"])} for n, r in settings.items()]
+    """Settings with rays/s, what they lose against the best that keeps every sample, and whether none beats them."""
+    rows = [{**r, "name": n, "fps": 1 / statistics.median(r["frame_s"])} for n, r in content["rows"].items()]
+    best = [r["psnr"] for r in rows if r["threshold"] == 0 and not r["also"]] or [max(r["psnr"] for r in rows)]
     for row in rows:
-        row |= {"rays_per_s": row["fps"] * content["pixels"], "loss": best - row["psnr"]}
+        row |= {"rays_per_s": row["fps"] * content["pixels"], "loss": best[0] - row["psnr"]}
     for row in rows:
         row["on_front"] = not any(_beats(other, row) for other in rows)
     return rows
@@ -218,11 +210,8 @@ def headline(content: Row) -> dict[str, float]:
     default = next(r for r in rows if r["name"] == content["default"])
     rivals = [r["rays_per_s"] for r in rows if r["loss"] <= default["loss"] + SAME_DB]
     return {
-        "rays_per_s": default["rays_per_s"],
-        "fps": default["fps"],
+        **{name: default[name] for name in ("rays_per_s", "fps", "max_error", "error_999")},
         "psnr_loss_db": default["loss"],
-        "max_error": default["max_error"],
-        "error_999": default["error_999"],
         "default_on_front": int(default["on_front"]),
         "fastest_at_no_more_loss_over_default": max(rivals) / default["rays_per_s"],
         "exact_rays": len(content["exact"]),

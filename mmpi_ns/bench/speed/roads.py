@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import resource
 import statistics
 import time
 from dataclasses import dataclass, field
@@ -11,13 +10,20 @@ from typing import Any
 
 import numpy as np
 import torch
+from PIL import Image
 
 from mmpi_ns.bench.apart import Tell, run_apart
 from mmpi_ns.bench.methods import Method, Scene
 from mmpi_ns.bench.report import Bench, Report, Row, figure, page, table
-from mmpi_ns.bench.trainers import config_of, trainer_of
+from mmpi_ns.bench.trainers import config_of, median_s, peak_gib, trainer_of
+from mmpi_ns.capture.load import load_observations
+from mmpi_ns.placement.split import place_windows
+from mmpi_ns.rendering.metrics import ImageMetrics
 from mmpi_ns.rendering.rendered import bounded
 from mmpi_ns.scene.windows import Window
+from mmpi_ns.synthetic import catalogue
+from mmpi_ns.synthetic.dataset import image_name, write_dataset
+from mmpi_ns.synthetic.scene import render
 
 BYTES_A_TEXEL = 4 * (1 + 9 + 1) + 1
 """Density, features, reliability and the mark of having been trained."""
@@ -43,11 +49,8 @@ class Roads(Bench):
         report = Report(self, self.key("lengths"))
         for length in self.lengths:
             r = report.row(f"{length:g} m", lambda length=length: self._measure(length))
-            print(
-                f"{length:g} m: {r['windows']} windows, plan {r['plan_s']:.0f} s, step {r['step_ms']:.0f} ms, "
-                f"frame {r['frame_ms']:.0f} ms, {r['peak_gib']:.2f} GiB",
-                flush=True,
-            )
+            said = "{windows} windows, plan {plan_s:.0f} s, step {step_ms:.0f} ms, frame {frame_ms:.0f} ms"
+            print(f"{length:g} m: {said.format(**r)}, {r['peak_gib']:.2f} GiB", flush=True)
         rows = list(report.rows.values())
         head = headline(rows)
         report.finish(head, markdown(report.content), lambda path: draw(path, rows))
@@ -79,54 +82,35 @@ def plan_road(request: dict[str, Any], tell: Tell) -> Row:
     Returns:
         Seconds of planning, windows, MPIs of all and of the largest, texels of all and of the largest, cameras.
     """
-    from mmpi_ns.capture.load import load_observations
-    from mmpi_ns.placement.split import place_windows
-    from mmpi_ns.synthetic.catalogue import make_scene
-    from mmpi_ns.synthetic.dataset import write_dataset
-
-    folder, steps, windows = Path(request["folder"]), request["steps"], request["windows"]
-    length, data = request["length"], folder / "data"
-    scene = make_scene("long-road", length=length)
+    folder, length = Path(request["folder"]), request["length"]
+    data, scene = folder / "data", catalogue.make_scene("long-road", length=length)
     write_dataset(scene, data, max(4000, 4 * round(length)), images=False, overwrite=True)
     observations = load_observations(data, downscale_factor=1)
-    config = _config(folder, steps).pipeline.model.placement
+    config = _config(folder, request["steps"]).pipeline.model.placement
     start = time.perf_counter()
-    plan = place_windows(observations, config, steps * RAYS)
+    plan = place_windows(observations, config, request["steps"] * RAYS)
     seconds = time.perf_counter() - start
     (folder / "plan.json").write_text(plan.to_json(), encoding="utf-8")
-    _write_images(scene, data, [plan.windows[w] for w in some_windows(len(plan), windows)])
-    return {
-        "cameras": len(scene.cameras),
-        "plan_s": seconds,
-        "windows": len(plan),
-        "mpis": sum(len(p.mpis) for p in plan.plans),
-        "most_mpis": max(len(p.mpis) for p in plan.plans),
-        "texels": sum(p.texels for p in plan.plans),
-        "most_texels": max(p.texels for p in plan.plans),
-    }
+    _write_images(scene, data, [plan.windows[w] for w in some_windows(len(plan), request["windows"])])
+    mpis, texels = [len(p.mpis) for p in plan.plans], [p.texels for p in plan.plans]
+    row = {"cameras": len(scene.cameras), "plan_s": seconds, "windows": len(plan), "mpis": sum(mpis)}
+    return row | {"most_mpis": max(mpis), "texels": sum(texels), "most_texels": max(texels)}
 
 
 def _write_images(scene: Any, data: Path, windows: list[Window]) -> None:
     """Renders what the cameras about some windows see: those that they train with and are looked at from."""
-    from PIL import Image
-
-    from mmpi_ns.synthetic.dataset import image_name
-    from mmpi_ns.synthetic.scene import render
-
     # Reads no images, but knows the scene's frame.
     manager = _config(data.parent, 10).pipeline.datamanager.setup(device="cpu", test_mode="inference")
     outputs = manager.train_dataparser_outputs
     transform = outputs.dataparser_transform.double().numpy()
-    centers = (
-        scene.cameras.camera_to_worlds[:, :, 3] @ transform[:, :3].T + transform[:, 3]
-    ) * outputs.dataparser_scale
-    near = np.zeros(len(centers), bool)
-    for w in windows:
-        near |= np.linalg.norm(centers - np.asarray(w.center), axis=-1) < 1.01 * (w.radius + w.margin)
+    centers = scene.cameras.camera_to_worlds[:, :, 3] @ transform[:, :3].T + transform[:, 3]
+    middles = np.array([w.center for w in windows])
+    gaps = np.linalg.norm(centers[:, None] * outputs.dataparser_scale - middles, axis=-1)
+    near = (gaps < [1.01 * (w.radius + w.margin) for w in windows]).any(-1)
     (data / "images").mkdir(exist_ok=True)
-    for i in np.nonzero(near)[0]:
-        colors, _ = render(scene, int(i))
-        Image.fromarray((colors * 255).round().astype(np.uint8)).save(data / "images" / image_name(int(i)))
+    for i in np.nonzero(near)[0].tolist():
+        colors, _ = render(scene, i)
+        Image.fromarray((colors * 255).round().astype(np.uint8)).save(data / "images" / image_name(i))
 
 
 def train_windows(request: dict[str, Any], tell: Tell) -> Row:
@@ -140,9 +124,9 @@ def train_windows(request: dict[str, Any], tell: Tell) -> Row:
         Medians over the windows (and lists of them): milliseconds of a step after growth and of a frame (medians in
         themselves), MPIs and texels, PSNR of the frame; and how much memory the process held at most (GiB).
     """
-    folder, steps, windows = Path(request["folder"]), request["steps"], request["windows"]
+    folder, steps = Path(request["folder"]), request["steps"]
     trainer = trainer_of(_config(folder, steps, "--pipeline.model.plan-file", str(folder / "plan.json")))
-    plans, times = trainer._run.progress.windows.plans, []
+    plans, times, rows = trainer._run.progress.windows.plans, [], []
     step_once = trainer.train_iteration
 
     def timed(step: int) -> Any:
@@ -152,43 +136,31 @@ def train_windows(request: dict[str, Any], tell: Tell) -> Row:
         return result
 
     trainer.train_iteration = timed
-    rows = []
-    for window in some_windows(len(plans), windows):
+    for window in some_windows(len(plans), request["windows"]):
         times.clear()
         trainer._train_window(window) if len(plans) > 1 else trainer.train()
-        plan = plans[window]
         row = {"step_ms": 1e3 * statistics.median(times[steps // 2 :]), **_look(trainer, window)}
-        rows.append(row | {"window_mpis": len(plan.mpis), "window_texels": plan.texels})
-    found: dict[str, Any] = {name: statistics.median(r[name] for r in rows) for name in rows[0]}
-    return found | {"by_window": rows, "peak_gib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20}
-
-
-def _look(trainer: Any, window: int) -> dict[str, float]:
-    """The test view nearest to a window's middle: milliseconds of the frame (median of three), PSNR, samples."""
-    model, data_set = trainer.pipeline.model, trainer.pipeline.datamanager.eval_dataset
-    centers = data_set.cameras.camera_to_worlds[:, :, 3].double()
-    middle = torch.tensor(model.progress.windows.windows[window].center, dtype=torch.float64)
-    nearest = int((centers - middle).norm(dim=-1).argmin())
-    model.eval()
-    camera, frames = data_set.cameras[nearest : nearest + 1], []
-    outputs = model.get_outputs_for_camera(camera)
-    for _ in range(3):
-        start = time.perf_counter()
-        model.get_outputs_for_camera(camera)
-        frames.append(time.perf_counter() - start)
-    truth = data_set.get_data(nearest)["image"][..., :3]
-    psnr = float(-10 * torch.log10(((outputs["rgb"] - truth) ** 2).mean()))
-    return {"frame_ms": 1e3 * statistics.median(frames), "psnr_db": psnr, **_samples(model, camera)}
+        rows.append(row | {"window_mpis": len(plans[window].mpis), "window_texels": plans[window].texels})
+    found: Row = {name: statistics.median(r[name] for r in rows) for name in rows[0]}
+    return found | {"by_window": rows, "peak_gib": peak_gib()}
 
 
 @torch.no_grad()
-def _samples(model: Any, camera: Any) -> dict[str, float]:
-    """What a frame's cost follows: samples that a ray of it meets, and those of them that are coloured."""
+def _look(trainer: Any, window: int) -> dict[str, float]:
+    """The test view nearest to a window's middle: milliseconds of the frame (median of three), PSNR, and what its cost
+    follows: samples that a ray meets, and those of them that are coloured."""
+    model, data_set = trainer.pipeline.model.eval(), trainer.pipeline.datamanager.eval_dataset
+    middle = torch.tensor(model.progress.windows.windows[window].center, dtype=torch.float64)
+    nearest = int((data_set.cameras.camera_to_worlds[:, :, 3].double() - middle).norm(dim=-1).argmin())
+    camera = data_set.cameras[nearest : nearest + 1]
+    frame_ms = 1e3 * median_s(lambda: model.get_outputs_for_camera(camera), 3)
+    rgb, truth = model.get_outputs_for_camera(camera)["rgb"], data_set.get_data(nearest)["image"][..., :3]
     rays = camera.generate_rays(0, keep_shape=False)
     some = bounded(rays[:: max(1, len(rays) // 4096)], model.field.plan)
     samples, report = model.sampler(some, field=model.field, threshold=model.config.render_threshold)
-    kept = samples.metadata["valid"].sum() / len(some)
-    return {"live_samples": float(report.live.float().mean()), "kept_samples": float(kept)}
+    kept, live = float(samples.metadata["valid"].sum() / len(some)), float(report.live.float().mean())
+    psnr = ImageMetrics("none")(rgb, truth)["psnr"]
+    return {"frame_ms": frame_ms, "psnr_db": psnr, "live_samples": live, "kept_samples": kept}
 
 
 def _config(folder: Path, steps: int, *options: str) -> Any:
@@ -200,36 +172,32 @@ def _config(folder: Path, steps: int, *options: str) -> Any:
 def headline(rows: list[Row]) -> dict[str, float]:
     """Longest over shortest: what should stay is near 1, what should grow is near the ratio of lengths."""
     first, last = min(rows, key=lambda r: r["length"]), max(rows, key=lambda r: r["length"])
-    found = {"length_ratio": last["length"] / first["length"]}
-    for name in ("step_ms", "frame_ms", "peak_gib", "plan_s", "texels", "windows"):
-        found[f"{name}_ratio"] = last[name] / first[name]
-    return found
-
-
-_COLUMNS = {
-    "road": "{name}",
-    "cameras": "{cameras}",
-    "windows": "{windows}",
-    "MPIs in all": "{mpis}",
-    "plan, s": "{plan_s:.0f}",
-    "disk, GB": lambda r: f"{r['texels'] * BYTES_A_TEXEL / 1e9:.2f}",
-    "MPIs of a window": "{window_mpis:g}",
-    "step, ms": "{step_ms:.0f}",
-    "frame, ms": "{frame_ms:.0f}",
-    "samples a ray, coloured": "{live_samples:.0f}, {kept_samples:.0f}",
-    "PSNR": "{psnr_db:.1f}",
-    "memory, GiB": "{peak_gib:.2f}",
-}
+    names = ("length", "step_ms", "frame_ms", "peak_gib", "plan_s", "texels", "windows")
+    return {f"{name}_ratio": last[name] / first[name] for name in names}
 
 
 def markdown(content: Row) -> str:
     """The page."""
+    columns = {
+        "road": "{name}",
+        "cameras": "{cameras}",
+        "windows": "{windows}",
+        "MPIs in all": "{mpis}",
+        "plan, s": "{plan_s:.0f}",
+        "disk, GB": lambda r: f"{r['texels'] * BYTES_A_TEXEL / 1e9:.2f}",
+        "MPIs of a window": "{window_mpis:g}",
+        "step, ms": "{step_ms:.0f}",
+        "frame, ms": "{frame_ms:.0f}",
+        "samples a ray, coloured": "{live_samples:.0f}, {kept_samples:.0f}",
+        "PSNR": "{psnr_db:.1f}",
+        "memory, GiB": "{peak_gib:.2f}",
+    }
     said = """\
 Procedural bending roads (`mmpi-scene long-road`), an image of 320 x 96 pixels every 1.5 m. The whole road is
 planned; some windows, spread evenly over it, are trained as a run through all would train them, and a frame
 is rendered in the middle of each: medians. Disk is what all windows take when they are finished."""
     rows = ({"name": name, **r} for name, r in content["rows"].items())
-    return page("Roads", content["made"], said, "![By length](roads.png)", table(_COLUMNS, rows))
+    return page("Roads", content["made"], said, "![By length](roads.png)", table(columns, rows))
 
 
 def draw(path: Path, rows: list[Row]) -> None:

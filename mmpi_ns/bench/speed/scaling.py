@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import resource
 import statistics
 import time
 from dataclasses import asdict, dataclass, replace
@@ -16,10 +15,12 @@ from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 
 from mmpi_ns.bench.apart import Tell, run_apart
-from mmpi_ns.bench.rendering import render
+from mmpi_ns.bench.rendering import AHEAD, render
 from mmpi_ns.bench.report import Bench, Report, Row, figure, page, table
 from mmpi_ns.bench.speed.all_planes import rates_of, render_densely
+from mmpi_ns.bench.trainers import peak_gib
 from mmpi_ns.field.mmpi_field import MMPIField
+from mmpi_ns.field.samples import metadata_of
 from mmpi_ns.rendering.sampler import MMPISampler
 from mmpi_ns.scene.plan import MPIPlan, ScenePlan
 from mmpi_ns.training.touched_adam import TouchedAdam
@@ -48,15 +49,11 @@ class Point:
         return f"{self.series}: {self.mpis} + {self.elsewhere} MPIs, {size}, {self.rays} rays"
 
     def plan(self) -> ScenePlan:
-        ahead = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
         back = ((-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, -1.0))
-        mpis = []
-        for k in range(self.mpis + self.elsewhere):
-            here = k < self.mpis
-            z = TRAVEL * (k + 0.5) / self.mpis - 10 if here else 0.0
-            frame = ((0.0, 0.0, z), ahead if here else back, 3.0, (-1.0, 1.0, -0.35, 0.35))
-            mpis.append(MPIPlan(str(k), *frame, self.planes, self.height, self.width))
-        return ScenePlan(tuple(mpis), None, 1.0, 5.0, "benchmark")
+        frames = [((0.0, 0.0, TRAVEL * (k + 0.5) / self.mpis - 10), AHEAD) for k in range(self.mpis)]
+        frames += [((0.0, 0.0, 0.0), back)] * self.elsewhere
+        size = (3.0, (-1.0, 1.0, -0.35, 0.35), self.planes, self.height, self.width)
+        return ScenePlan(tuple(MPIPlan(str(k), *f, *size) for k, f in enumerate(frames)), None, 1.0, 5.0, "benchmark")
 
 
 BASE = Point()
@@ -73,20 +70,24 @@ def points() -> list[Point]:
     ]
 
 
-def made_up_batch(count: int) -> tuple[RayBundle, Tensor]:
-    """Rays of cameras along the drive, and a smooth target with a surface at some depth."""
-    origins = torch.rand(count, 3) * torch.tensor([0.2, 0.2, 35.0])
-    tangents = torch.rand(count, 2) * torch.tensor([1.6, 0.5]) - torch.tensor([0.8, 0.25])
-    directions = torch.nn.functional.normalize(torch.cat([tangents, torch.ones(count, 1)], -1), dim=-1)
+def made_up_batch(count: int, image: bool = False) -> tuple[RayBundle, Tensor]:
+    """Rays of cameras along the drive, or of one ``image``, and a smooth target with a surface at some depth."""
+    if image:
+        side = torch.linspace(0, 1, max(1, round(count**0.5)))
+        places = torch.stack(torch.meshgrid(side, side, indexing="xy"), -1).reshape(-1, 2)
+        origins = torch.tensor([0.1, 0.1, 12.0]).expand(len(places), 3)
+    else:
+        origins, places = torch.rand(count, 3) * torch.tensor([0.2, 0.2, 35.0]), torch.rand(count, 2)
+    tangents, one = places * torch.tensor([1.6, 0.5]) - torch.tensor([0.8, 0.25]), torch.ones(len(places), 1)
+    directions = torch.nn.functional.normalize(torch.cat([tangents, one], -1), dim=-1)
     target = 0.5 + 0.5 * torch.sin(20 * directions + origins[:, 2:] / 10)
-    one = torch.ones(count, 1)
     return RayBundle(origins, directions, one, nears=one, fars=one * torch.inf), target
 
 
 def render_ours(field: MMPIField, bundle: RayBundle, young: bool, threshold: float = 3e-3) -> tuple[Tensor, float]:
     """Colours over grey [R, 3] as a training step renders them, and live samples a ray."""
     found = render(field, bundle, threshold, fair_share=0.1 if young else math.inf)
-    return found.rgb + 0.5 * found.composite.transmittance, float(found.report.live.float().mean())
+    return found.colors.rgb + 0.5 * found.composite.transmittance, float(found.report.live.float().mean())
 
 
 def measure(request: dict[str, Any], tell: Tell) -> dict[str, float]:
@@ -104,11 +105,11 @@ def measure(request: dict[str, Any], tell: Tell) -> dict[str, float]:
     point = Point(**{k: v for k, v in request.items() if k not in ("steps", "dense")})
     steps, dense = request["steps"], request.get("dense", False)
     torch.manual_seed(0)
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    before = peak_gib()
     field, sampler = MMPIField(point.plan(), hidden_width=32, shares_depth=True), MMPISampler()
     groups = rates_of(field)
     optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99)) if dense else TouchedAdam(groups, lr=0.1)
-    found: dict[str, list[float]] = {"step": [], "march": [], "live": [], "kept": []}
+    rows = []
     for step in range(2 * steps):
         bundle, target = made_up_batch(point.rays)
         start = time.perf_counter()
@@ -116,26 +117,21 @@ def measure(request: dict[str, Any], tell: Tell) -> dict[str, float]:
         optimizer.zero_grad()
         ((rgb - target) ** 2).mean().backward()
         optimizer.step()
-        found["step"].append(time.perf_counter() - start)
+        row = {"live": live, "kept": live, "step_ms": 1e3 * (time.perf_counter() - start)}
         start = time.perf_counter()
-        samples = None if dense else sampler(bundle, field=field, threshold=3e-3)[0]
-        found["march"].append(time.perf_counter() - start)
-        found["live"].append(live)
-        found["kept"].append(live if samples is None else float(samples.metadata["valid"].sum()) / point.rays)
+        if not dense:
+            samples = sampler(bundle, field=field, threshold=3e-3)[0]
+            row["kept"] = float(metadata_of(samples)["valid"].sum()) / point.rays
+        rows.append(row | {"march_ms": 1e3 * (time.perf_counter() - start)})
     tensors = [p.data for p in field.parameters()] + list(field.buffers())
     tensors += [t for state in optimizer.state.values() for t in state.values() if isinstance(t, Tensor)]
-    middle = {k: statistics.median(v[steps:]) for k, v in found.items()}
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return {
-        "live": middle["live"],
-        "kept": middle["kept"],
-        "step_ms": 1e3 * middle["step"],
-        "march_ms": 1e3 * middle["march"],
+        **{name: statistics.median(r[name] for r in rows[steps:]) for name in rows[0]},
         "texels": float(len(field.density)),
         "table_bytes": float(sum(t.numel() * t.element_size() for t in tensors)),
         "threads": float(torch.get_num_threads()),
-        "gained_gib": (peak - before) / 2**20,
-        "peak_gib": peak / 2**20,
+        "gained_gib": peak_gib() - before,
+        "peak_gib": peak_gib(),
     }
 
 
@@ -191,24 +187,22 @@ def headline(rows: list[Row]) -> dict[str, float]:
     return found | {"time_over_rays_exponent": growth / math.log(many[-1]["rays"] / many[0]["rays"])}
 
 
-_COLUMNS = {
-    "series": "{series}",
-    "MPIs met + not met": "{mpis} + {elsewhere}",
-    "planes": "{planes}",
-    "texels of a plane": "{height} x {width}",
-    "rays": "{rays}",
-    "live a ray": "{live:.0f}",
-    "kept a ray": "{kept:.0f}",
-    "sampler, us a ray": lambda r: f"{1e3 * r['march_ms'] / r['rays']:.1f}",
-    "step, us a ray": lambda r: f"{1e3 * r['step_ms'] / r['rays']:.0f}",
-    "M texels": lambda r: f"{r['texels'] / 1e6:.2f}",
-    "tables and moments, MB": lambda r: f"{r['table_bytes'] / 1e6:.0f}",
-    "gained by the process, MB": lambda r: f"{1024 * r['gained_gib']:.0f}",
-}
-
-
 def markdown(rows: list[Row], h: dict[str, float], made: Row) -> str:
     """The page."""
+    columns = {
+        "series": "{series}",
+        "MPIs met + not met": "{mpis} + {elsewhere}",
+        "planes": "{planes}",
+        "texels of a plane": "{height} x {width}",
+        "rays": "{rays}",
+        "live a ray": "{live:.0f}",
+        "kept a ray": "{kept:.0f}",
+        "sampler, us a ray": lambda r: f"{1e3 * r['march_ms'] / r['rays']:.1f}",
+        "step, us a ray": lambda r: f"{1e3 * r['step_ms'] / r['rays']:.0f}",
+        "M texels": lambda r: f"{r['texels'] / 1e6:.2f}",
+        "tables and moments, MB": lambda r: f"{r['table_bytes'] / 1e6:.0f}",
+        "gained by the process, MB": lambda r: f"{1024 * r['gained_gib']:.0f}",
+    }
     said = f"""\
 Joint training on made-up rays along a drive. A sample is live where its ray crosses a plane inside the MPI's
 frustum. The sampler's time a ray grows by {h["march_ns_per_live_sample"]:.0f} ns a live sample (a line explains
@@ -217,9 +211,8 @@ frustum. The sampler's time a ray grows by {h["march_ns_per_live_sample"]:.0f} n
 included (where they were never written they take none: the process gained {h["process_bytes_per_texel"]:.0f} bytes a
 texel, {100 * h["process_bytes_over_texels_r2"]:.0f} %). With {h["heads_with_unmet_over_without"]:.0f} times the MPIs,
 of which the added ones are met by no ray, the sampler takes {h["march_with_unmet_over_without"]:.2f} times as long."""
-    return page(
-        "Scaling", made, said, "![Time over live samples, memory over texels](scaling.png)", table(_COLUMNS, rows)
-    )
+    picture = "![Time over live samples, memory over texels](scaling.png)"
+    return page("Scaling", made, said, picture, table(columns, rows))
 
 
 def draw(path: Path, rows: list[Row]) -> None:

@@ -13,11 +13,11 @@ from typing import Any
 
 import torch
 
-from mmpi_ns.bench.methods import Method, Scene
-from mmpi_ns.bench.report import commit
-from mmpi_ns.bench.suites import TWO_PHASE
+from mmpi_ns.bench.methods import TWO_PHASE, Method
+from mmpi_ns.bench.report import Scene, commit
 from mmpi_ns.bench.trainers import config_of, trainer_of
-from mmpi_ns.scene.plan import MPIPlan, ScenePlan
+from mmpi_ns.rendering.metrics import ImageMetrics
+from mmpi_ns.scene.plan import MPIPlan
 from mmpi_ns.synthetic.catalogue import make_scene
 from mmpi_ns.synthetic.dataset import write_dataset
 from mmpi_ns.training.trainer import MMPITrainer
@@ -37,15 +37,6 @@ class Absurdity:
     """MPIs to train, from those that the scene would get."""
     start: Callable[[MMPITrainer], None] | None = None
     """Alters the model before the first step."""
-
-
-def write_scene(folder: Path) -> Path:
-    """A still life of 9 images of 32 x 24 pixels, once."""
-    if not (folder / "transforms.json").is_file():
-        write_dataset(
-            make_scene("still-life", count=IMAGES, width=WIDTH, height=HEIGHT), folder, points=150, overwrite=True
-        )
-    return folder
 
 
 def _rates(config: Any, _: Path) -> None:
@@ -87,57 +78,37 @@ OPTIONS = (
 """mmpi-small with both phases and a fine-tune, few rays and small networks."""
 
 
-def _config(scene: Path, output: Path, steps: int) -> Any:
-    words = Method("absurd", "mmpi-small", OPTIONS).words(Scene(scene, 1), output, steps, None, 0, "cpu")
-    return config_of(words)
-
-
-def prepare(work: Path) -> Path:
-    """The tiny scene, and the plan that the placement rule gives it (by which the altered plans are made)."""
-    scene = write_scene(work / "scene")
-    if not (scene / "plan.json").is_file():
-        with _quiet():
-            plan = trainer_of(_config(scene, work / "plan", 1))._run.field.full_plan
-        (scene / "plan.json").write_text(plan.to_json(), encoding="utf-8")
-    return scene
-
-
-def _quiet() -> contextlib.AbstractContextManager:
-    return contextlib.redirect_stdout(io.StringIO())
-
-
 def train(absurdity: Absurdity, work: Path, steps: int) -> dict[str, Any]:
     """Trains to the end or to an error; which numbers of the model are not finite."""
-    scene = prepare(work)
-    folder = work / absurdity.name.replace(" ", "-")
-    config = _config(scene, folder, steps)
+    scene, folder = work / "scene", work / absurdity.name.replace(" ", "-")
+    if not (scene / "transforms.json").is_file():
+        still = make_scene("still-life", count=IMAGES, width=WIDTH, height=HEIGHT)
+        write_dataset(still, scene, points=150, overwrite=True)
+    folder.mkdir(parents=True, exist_ok=True)
+    method = Method("absurd", "mmpi-small", OPTIONS)
+    config = config_of(method.words(Scene(scene, 1), folder, steps, None, 0, "cpu"))
     row: dict[str, Any] = {"expectation": "finite weights", "steps": steps, "commit": commit()}
     start = time.perf_counter()
     try:
-        with _quiet():
+        with contextlib.redirect_stdout(io.StringIO()):
             if absurdity.change is not None:
                 absurdity.change(config, scene)
             if absurdity.mpis is not None:
-                plan = ScenePlan.load(scene / "plan.json")
+                plan = trainer_of(config)._run.field.full_plan
                 config.pipeline.model.plan_file = folder / "plan.json"
-                folder.mkdir(parents=True, exist_ok=True)
                 config.pipeline.model.plan_file.write_text(replace(plan, mpis=absurdity.mpis(plan.mpis)).to_json())
             trainer = trainer_of(config)
             if absurdity.start is not None:
                 absurdity.start(trainer)
             trainer.train()
     except ValueError as error:
-        row.update(outcome=f"error: {error}", ok=_is_one_sentence(str(error)))
+        said = str(error).strip()
+        row.update(outcome=f"error: {error}", ok=20 < len(said) < 400 and "\n" not in said)
     except Exception as error:  # anything else is no message to a user, whatever it says: a failure to be reported
         row.update(outcome=f"{type(error).__name__}: {error}", ok=False)
     else:
         row.update(_weights(trainer, steps))
-    row["seconds"] = time.perf_counter() - start
-    return row
-
-
-def _is_one_sentence(text: str) -> bool:
-    return 20 < len(text) < 400 and "\n" not in text.strip()
+    return row | {"seconds": time.perf_counter() - start}
 
 
 def _weights(trainer: MMPITrainer, steps: int) -> dict[str, Any]:
@@ -150,10 +121,8 @@ def _weights(trainer: MMPITrainer, steps: int) -> dict[str, Any]:
     with torch.no_grad():
         image = model.get_outputs_for_camera(test_images.cameras[0:1])
     broken += sorted(f"output {k}" for k, v in image.items() if not bool(torch.isfinite(v).all()))
-    truth = test_images.get_image_float32(0)[..., :3]
-    psnr = float(-10 * torch.log10(((image["rgb"] - truth) ** 2).mean()))
+    psnr = ImageMetrics("none")(image["rgb"], test_images.get_image_float32(0)[..., :3])["psnr"]
     ran = trainer._last_step + 1
-    done = ran == steps and not broken
     said = "finite weights" if not broken else f"not finite: {', '.join(broken)}"
     said += "" if ran == steps else f" after {ran} of {steps} steps"
-    return {"outcome": said, "ok": done, "largest": largest, "psnr": psnr}
+    return {"outcome": said, "ok": ran == steps and not broken, "largest": largest, "psnr": psnr}

@@ -3,54 +3,61 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
 
 from mmpi_ns.bench.stability import exact
-from mmpi_ns.bench.stability.cases import Case, Error, Outcome, Precision, compare, plan_of, random_mpi, single
+from mmpi_ns.bench.stability.cases import (
+    Case,
+    Outcome,
+    Precision,
+    compare,
+    float32,
+    plan_of,
+    random_mpi,
+    single,
+    tried,
+)
 from mmpi_ns.bench.stability.exact import Array
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.ops.blending import BlendForm, blend_shares, blended_optical_depth
 from mmpi_ns.ops.composite.reference import composite_weights, median_inverse_distance, render_colors
 
+TAUS = (0.0, 1e-30, 1e-12, 1e-6, 1e-3, 0.1, 1.0, 5.0, 30.0, 90.0, 1e4)
+LONG = 10_000
+"""Samples of a long ray."""
+
 # Densities -----------------------------------------------------------------------------------------------------------
 
-DENSITY = "tau and d tau to 16 roundings of the numbers added"
+
+def _layout(planes: int) -> Any:
+    """Of a field of one MPI."""
+    mpi = random_mpi(np.random.default_rng(0), planes)
+    return MMPIField(plan_of([mpi]), feature_channels=3, hidden_width=4).layout
 
 
 def _density(raw: Array, planes: int, precision: Precision) -> Outcome:
     """tau = softplus(raw + b_l) 256 / L on every plane, for every raw density."""
-    rng = np.random.default_rng(0)
-    field = MMPIField(plan_of([random_mpi(rng, planes)]), feature_channels=3, hidden_width=4)
-    values = np.tile(single(raw), planes)
-    index = np.repeat(np.arange(planes), len(raw))
-    given = torch.tensor(values, dtype=torch.float32, requires_grad=True)
-    with precision.context():
-        tau = field.layout.optical_depth(0, given, torch.tensor(index))
-        tau.sum().backward()
-    assert given.grad is not None
+    values, index = np.tile(single(raw), planes), np.repeat(np.arange(planes), len(raw))
+    layout, at = _layout(planes), torch.tensor(index)
+    (tau,), (gradient,) = tried(precision, lambda x: layout.optical_depth(0, x, at), values)
     bias, interval = exact.plane_bias(planes)
     x = values + bias[index]
-    slope, size = exact.sigmoid(x) * interval, np.abs(values) + np.abs(bias[index]) + 1
+    wanted, slope = exact.softplus(x) * interval, exact.sigmoid(x) * interval
+    size = np.abs(values) + np.abs(bias[index]) + 1
     # d sigmoid = sigmoid (1 - sigmoid) dx <= sigmoid dx.
-    return Outcome(
-        compare(tau, exact.softplus(x) * interval, exact.softplus(x) * interval + slope * size, 16),
-        compare(given.grad, slope, slope * size, 16),
-    )
+    return Outcome(compare(tau, wanted, wanted + slope * size, 16), compare(gradient, slope, slope * size, 16))
 
 
 def _equal_start(planes: int, precision: Precision) -> Outcome:
     """A new MPI gives every plane the weight 1/L (the last one 0.999 of what is left)."""
-    rng = np.random.default_rng(0)
-    field = MMPIField(plan_of([random_mpi(rng, planes)]), feature_channels=3, hidden_width=4)
-    index = torch.arange(planes)
+    layout = _layout(planes)
     with precision.context():
-        tau = field.layout.optical_depth(0, torch.zeros(planes), index)[None]
-        made = composite_weights(
-            tau, torch.ones_like(tau, dtype=torch.bool), torch.zeros_like(tau), torch.zeros_like(tau[:, :1])
-        )
+        tau = layout.optical_depth(0, torch.zeros(planes), torch.arange(planes))[None]
+        made = composite_weights(tau, tau > -1, torch.zeros_like(tau), torch.zeros(1, 1))
     wanted = np.full(planes, 1 / planes)
     wanted[-1] *= 0.999
     # log(e^b - 1) is rounded once, at magnitudes up to |b|; the depths in front add up to log L.
@@ -60,43 +67,23 @@ def _equal_start(planes: int, precision: Precision) -> Outcome:
 
 # Shares and blended depths -------------------------------------------------------------------------------------------
 
-SHARES = "tau', d tau' / d tau, d tau' / d R to 16 roundings of the differences of reliabilities"
-
-
-def _votes(
-    rng: np.random.Generator, samples: int, heads: int, scale: float, level: float
-) -> tuple[Array, Array, Array]:
-    own = rng.integers(0, heads, samples)
-    cover = rng.random((samples, heads)) < 0.7
-    cover[np.arange(samples), own] = True
-    return single(level + rng.normal(size=(samples, heads)) * scale), cover, own
-
 
 def _blending(
-    heads: int,
-    scale: float,
-    form: BlendForm,
-    precision: Precision,
-    level: float = 0.0,
-    taus: tuple[float, ...] = (0.0, 1e-30, 1e-12, 1e-6, 1e-3, 0.1, 1.0, 5.0, 30.0, 90.0, 1e4),
-    half: bool = False,
+    heads: int, scale: float, form: BlendForm, precision: Precision, level: float = 0.0, half: bool = False
 ) -> Outcome:
-    rng = np.random.default_rng(heads)
-    reliability, cover, own = _votes(rng, 40 * len(taus), heads, scale, level)
-    tau = single(np.resize(np.array(taus), len(own)))
-    given = torch.tensor(reliability, dtype=torch.float32).to(torch.bfloat16 if half else torch.float32)
-    reliability = given.double().numpy()
-    given.requires_grad_()
-    depth = torch.tensor(tau, dtype=torch.float32, requires_grad=True)
-    with precision.context():
-        shares = blend_shares(given, torch.tensor(cover), torch.tensor(own))
-        blended = blended_optical_depth(depth, *shares, form)
-        blended.sum().backward()
-    assert given.grad is not None and depth.grad is not None
+    """Votes of a level and scale, for samples of every optical depth; ``half``: held in bfloat16."""
+    rng, count = np.random.default_rng(heads), 40 * len(TAUS)
+    own, cover = rng.integers(0, heads, count), rng.random((count, heads)) < 0.7
+    cover[np.arange(count), own] = True
+    given = float32(level + rng.normal(size=(count, heads)) * scale).to(torch.bfloat16 if half else torch.float32)
+    reliability, tau = given.double().numpy(), single(np.resize(np.array(TAUS), count))
+
+    def blended(votes: torch.Tensor, depth: torch.Tensor) -> torch.Tensor:
+        return blended_optical_depth(depth, *blend_shares(votes, torch.tensor(cover), torch.tensor(own)), form)
+
+    (found,), (found_by_vote, found_by_tau) = tried(precision, blended, given, tau)
     wanted = [exact.blend(t, r, c, int(o), form) for t, r, c, o in zip(tau, reliability, cover, own, strict=True)]
-    value = np.array([w.depth for w in wanted])
-    by_tau = np.array([w.by_tau for w in wanted])
-    by_vote = np.array([w.by_reliability for w in wanted])
+    value, by_tau, by_vote = (np.array([getattr(w, n) for w in wanted]) for n in ("depth", "by_tau", "by_reliability"))
     highest = np.where(cover, reliability, -np.inf).max(-1)
     spread = 1 + highest - np.where(cover, reliability, np.inf).min(-1)
     share = np.array([float(exact.shares(r, c, int(o))[0][o]) for r, c, o in zip(reliability, cover, own, strict=True)])
@@ -104,108 +91,87 @@ def _blending(
     # thin sample, and moves -log(1 - alpha') of an opaque one by at most as much.
     size = value + np.minimum(value, 1) * spread + by_tau * tau
     size_votes = np.abs(by_vote).max(-1, keepdims=True) * (spread + tau * (tau < 88))[:, None]
-    unit = 2.0**-9 / 2.0**-24 if half else 1.0  # the gradient of a bfloat16 number is stored in bfloat16
-    return Outcome(
-        compare(blended, value, size, 16),
-        Error.worst(
-            [
-                compare(depth.grad, by_tau, by_tau * (spread + tau) + share, 16),
-                compare(given.grad.double(), by_vote, size_votes, 16 * max(1.0, unit / 8)),
-            ]
-        ),
-    )
+    rounded = 2.0**-9 / 2.0**-24 / 8 if half else 1.0  # the gradient of a bfloat16 number is stored in bfloat16
+    gradients = [
+        compare(found_by_tau, by_tau, by_tau * (spread + tau) + share, 16),
+        compare(found_by_vote, by_vote, size_votes, 16 * rounded),
+    ]
+    return Outcome.of([compare(found, value, size, 16)], gradients)
 
 
 def _ties(heads: int, precision: Precision) -> Outcome:
     """Equal reliabilities of any size share equally: P = 1/K."""
-    levels = single(np.array([-1e3, -40.0, 0.0, 17.0, 1e3]))
-    reliability = torch.tensor(np.repeat(levels, heads), dtype=torch.float32).view(-1, heads)
-    own = torch.arange(len(levels)) % heads
+    levels = np.array([-1e3, -40.0, 0.0, 17.0, 1e3])
+    reliability, own = float32(np.repeat(levels[:, None], heads, 1)), torch.arange(len(levels)) % heads
     with precision.context():
-        log_share, log_rest = blend_shares(reliability, torch.ones_like(reliability, dtype=torch.bool), own)
-    wanted = np.full(len(levels), -math.log(heads))
-    rest = np.full(len(levels), math.log1p(-1 / heads))
-    return Outcome(Error.worst([compare(log_share, wanted, 1.0, 4), compare(log_rest, rest, 1.0, 4)]))
+        found = blend_shares(reliability, torch.ones_like(reliability, dtype=torch.bool), own)
+    wanted = (-math.log(heads), math.log1p(-1 / heads))
+    return Outcome.of([compare(x, np.full(len(levels), w), 1.0, 4) for x, w in zip(found, wanted, strict=True)])
 
 
 def _sole(precision: Precision) -> Outcome:
     """A sole cover keeps exactly tau whatever the others hold, NaN and infinity included; its votes get no gradient."""
     junk = [1e30, -math.inf, math.inf, math.nan, 0.0, -1e3]
-    reliability = torch.tensor([[5.0, j] for j in junk], requires_grad=True)
-    tau = torch.tensor([0.0, 1e-30, 1e-7, 3.0, 88.0, 1e4], requires_grad=True)
-    cover = torch.tensor([[True, False]] * len(junk))
-    with precision.context():
-        blended = blended_optical_depth(
-            tau, *blend_shares(reliability, cover, torch.zeros(len(junk), dtype=torch.long))
-        )
-        blended.sum().backward()
-    assert reliability.grad is not None and tau.grad is not None
-    return Outcome(
-        compare(blended, tau.detach().double().numpy(), 1.0, 0),
-        Error.worst(
-            [compare(tau.grad, np.ones(len(junk)), 1.0, 0), compare(reliability.grad, np.zeros((len(junk), 2)), 1.0, 0)]
-        ),
+    cover, own = torch.tensor([[True, False]] * len(junk)), torch.zeros(len(junk), dtype=torch.long)
+    (found,), (by_tau, by_vote) = tried(
+        precision,
+        lambda tau, votes: blended_optical_depth(tau, *blend_shares(votes, cover, own)),
+        taus := [0.0, 1e-30, 1e-7, 3.0, 88.0, 1e4],
+        [[5.0, j] for j in junk],
     )
+    slopes = [compare(by_tau, np.ones(len(junk)), 1.0, 0), compare(by_vote, np.zeros((len(junk), 2)), 1.0, 0)]
+    return Outcome.of([compare(found, single(taus), 1.0, 0)], slopes)
 
 
 # Compositing ---------------------------------------------------------------------------------------------------------
-
-COMPOSITE = (
-    "weights, transmittance, accumulation and their gradient to 4 + log2(samples) roundings of the depth in front"
-)
 
 
 def _composite(taus: Array, precision: Precision, dropped: bool = False) -> Outcome:
     """Every ray [R, S]: weights, what passes, what is gathered, and the gradient of a random mixture of them."""
     rng = np.random.default_rng(5)
     taus = single(taus)
-    rays, samples = taus.shape
-    roundings = 4 + math.log2(samples)
+    roundings = 4 + math.log2(taus.shape[1])
     kept = rng.random(taus.shape) < 0.5 if dropped else np.ones(taus.shape, bool)
     skipped = np.where(kept, 0, taus)
-    before = single(np.cumsum(skipped, -1) - skipped)
-    by_weight, by_rest = single(rng.normal(size=taus.shape)), single(rng.normal(size=(rays, 1)))
-    given = torch.tensor(taus, dtype=torch.float32, requires_grad=True)
-    constants = [
-        torch.tensor(x, dtype=torch.float32) for x in (before, skipped.sum(-1, keepdims=True), by_weight, by_rest)
-    ]
-    with precision.context():
-        made = composite_weights(given, torch.tensor(kept), constants[0], constants[1])
-        ((made.weights * constants[2]).sum() + (made.transmittance * constants[3]).sum()).backward()
-    assert given.grad is not None
+    constants = float32(np.cumsum(skipped, -1) - skipped), float32(skipped.sum(-1, keepdims=True))
+    by_weight, by_rest = single(rng.normal(size=taus.shape)), single(rng.normal(size=(len(taus), 1)))
+
+    def composited(tau: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        made = composite_weights(tau, torch.tensor(kept), *constants)
+        return made.weights, made.transmittance, made.accumulation
+
+    (weights, transmittance, accumulation), (gradient,) = tried(precision, composited, taus, by=(by_weight, by_rest))
     errors, gradients = [], []
-    for r in range(rays):
-        wanted = exact.composite(taus[r])
+    for r, tau in enumerate(taus):
+        wanted = exact.composite(tau)
         front = 1 - np.log(np.maximum(wanted.in_front, 1e-300))
         rest = wanted.transmittance
         errors += [
-            compare(made.weights[r], np.where(kept[r], wanted.weights, 0), wanted.weights * front, roundings),
-            compare(made.transmittance[r], np.array([rest]), rest * (1 + taus[r].sum()), roundings),
-            compare(made.accumulation[r], np.array([wanted.accumulation]), wanted.accumulation, roundings),
+            compare(weights[r], np.where(kept[r], wanted.weights, 0), wanted.weights * front, roundings),
+            compare(transmittance[r], [rest], rest * (1 + tau.sum()), roundings),
+            compare(accumulation[r], [wanted.accumulation], wanted.accumulation, roundings),
         ]
         g = np.where(kept[r], by_weight[r], 0)
-        slope = np.where(kept[r], exact.composite_gradient(taus[r], g, float(by_rest[r, 0])), 0)
+        slope = np.where(kept[r], exact.composite_gradient(tau, g, float(by_rest[r, 0])), 0)
         behind = np.abs(g * wanted.weights) * front
         size = np.abs(g) * wanted.in_front * front + np.cumsum(behind[::-1])[::-1] - behind
-        size = size + np.abs(by_rest[r]) * rest * (1 + taus[r].sum())
-        gradients.append(compare(given.grad[r], slope, np.maximum(size, 1e-30), 2 * roundings))
-    return Outcome(Error.worst(errors), Error.worst(gradients))
+        size = size + np.abs(by_rest[r]) * rest * (1 + tau.sum())
+        gradients.append(compare(gradient[r], slope, np.maximum(size, 1e-30), 2 * roundings))
+    return Outcome.of(errors, gradients)
 
 
 def _empty_slots(precision: Precision) -> Outcome:
     """What is in an empty slot, NaN and infinity included, changes nothing and gets no gradient."""
-    tau = torch.tensor([[0.3, math.nan, 0.5, math.inf, 1e30]], requires_grad=True)
-    valid = torch.tensor([[True, False, True, False, False]])
-    with precision.context():
-        made = composite_weights(tau, valid, torch.zeros_like(tau), torch.zeros(1, 1))
-        made.weights.sum().backward()
-    assert tau.grad is not None
-    wanted = exact.composite(single(np.array([0.3, 0.5])))
-    weights = np.array([[wanted.weights[0], 0, wanted.weights[1], 0, 0]])
-    slope = exact.composite_gradient(single(np.array([0.3, 0.5])), np.ones(2), 0.0)
-    return Outcome(
-        compare(made.weights, weights, 1.0, 4), compare(tau.grad, np.array([[slope[0], 0, slope[1], 0, 0]]), 1.0, 8)
+    valid, none = torch.tensor([[True, False, True, False, False]]), torch.zeros(1, 5)
+    (weights,), (gradient,) = tried(
+        precision,
+        lambda tau: composite_weights(tau, valid, none, none[:, :1]).weights,
+        [[0.3, math.nan, 0.5, math.inf, 1e30]],
     )
+    taus, wanted, slope = single([0.3, 0.5]), np.zeros((1, 5)), np.zeros((1, 5))
+    wanted[0, [0, 2]] = exact.composite(taus).weights
+    slope[0, [0, 2]] = exact.composite_gradient(taus, np.ones(2), 0.0)
+    return Outcome(compare(weights, wanted, 1.0, 4), compare(gradient, slope, 1.0, 8))
 
 
 def _nothing(precision: Precision) -> Outcome:
@@ -222,22 +188,18 @@ def _nothing(precision: Precision) -> Outcome:
 def _median(precision: Precision) -> Outcome:
     """1/t at half of what is gathered, in 10,000 samples; wrong is a sample whose gathered share is not half."""
     rng = np.random.default_rng(6)
-    weights = single(rng.exponential(1e-4, (8, 10_000)))
-    inverse_t = single(-np.sort(-rng.random((8, 10_000)), axis=-1))
+    weights = single(rng.exponential(1e-4, (8, LONG)))
+    inverse_t = single(-np.sort(-rng.random((8, LONG)), axis=-1))
     with precision.context():
-        found = median_inverse_distance(
-            torch.tensor(weights, dtype=torch.float32), torch.tensor(inverse_t, dtype=torch.float32),
-            torch.ones(8, 10_000, dtype=torch.bool),
-        )  # fmt: skip
+        found = median_inverse_distance(float32(weights), float32(inverse_t), torch.ones(8, LONG, dtype=torch.bool))
+    at = (np.arange(8), np.abs(inverse_t - found.double().numpy()).argmin(-1))
     gathered = np.cumsum(weights, -1)
-    at = [int(np.argmin(np.abs(inverse_t[r] - float(found[r])))) for r in range(8)]
-    share = np.array([gathered[r, i] / gathered[r, -1] for r, i in enumerate(at)])
-    step = np.array([weights[r, i] / gathered[r, -1] for r, i in enumerate(at)])
-    return Outcome(compare(np.maximum(np.abs(share - 0.5) - step, 0), np.zeros(8), 1.0, 4 + math.log2(10_000)))
+    share, step = gathered[at] / gathered[:, -1], weights[at] / gathered[:, -1]
+    return Outcome(compare(np.maximum(np.abs(share - 0.5) - step, 0), np.zeros(8), 1.0, 4 + math.log2(LONG)))
 
 
-def _long(mean: float, opaque_at: int | None = None, rays: int = 4) -> Array:
-    taus = np.random.default_rng(1).exponential(mean, (rays, 10_000))
+def _long(mean: float, opaque_at: int | None = None) -> Array:
+    taus = np.random.default_rng(1).exponential(mean, (4, LONG))
     if opaque_at is not None:
         taus[:, opaque_at] = 1e4
     return taus
@@ -247,27 +209,8 @@ def _mixed(low: float, high: float) -> Array:
     return 10 ** np.random.default_rng(4).uniform(low, high, (40, 300))
 
 
-def _composite_cases() -> list[Case]:
-    inputs: list[tuple[str, Callable[[], Array]]] = [
-        ("alpha 0 everywhere", lambda: np.zeros((4, 300))),
-        ("alpha 1 everywhere (tau = 1e4)", lambda: np.full((4, 300), 1e4)),
-        ("optical depths 1e-12 to 1e-4", lambda: _mixed(-12, -4)),
-        ("optical depths 1e-6 to 10", lambda: _mixed(-6, 1)),
-        ("optical depths 1e-30 to 1e4", lambda: _mixed(-30, 4)),
-        ("10,000 samples of mean depth 1e-6", lambda: _long(1e-6)),
-        ("10,000 samples of mean depth 1e-3, the 9,000th opaque", lambda: _long(1e-3, 9000)),
-        ("10,000 samples of mean depth 1", lambda: _long(1.0)),
-        ("10,000 equal samples that let 1e-30 through", lambda: np.full((2, 10_000), math.log(1e30) / 10_000)),
-        ("transmittance 1e-30 before the last of 64 samples", lambda: _before_last(math.log(1e30))),
-        ("transmittance 1e-43 (no normal float32 number) before the last", lambda: _before_last(math.log(1e43))),
-    ]
-    rows = [Case("compositing", name, COMPOSITE, lambda p, t=taus: _composite(t(), p)) for name, taus in inputs]
-    name = "half of 300 samples dropped"
-    return [*rows, Case("compositing", name, COMPOSITE, lambda p: _composite(_mixed(-4, 0), p, dropped=True))]
-
-
-def _before_last(depth: float) -> Array:
-    taus = np.full((4, 64), depth / 63)
+def _before_last(transmittance: float) -> Array:
+    taus = np.full((4, 64), -math.log(transmittance) / 63)
     taus[:, -1] = [0.0, 1e-3, 1.0, 1e4]
     return taus
 
@@ -275,34 +218,52 @@ def _before_last(depth: float) -> Array:
 def cases() -> list[Case]:
     """All cases of densities, shares and compositing."""
     spread = np.random.default_rng(7).uniform(-20, 20, 200)
-    rows = [
-        Case("density", "raw densities -20 to 20, 64 planes", DENSITY,
-             lambda p: _density(spread, 64, p)),
-        Case("density", "raw densities +-1e4, +-200, +-88.7, +-20.001 (softplus' switch)", DENSITY,
-             lambda p: _density(np.outer([-1, 1], [1e4, 200, 88.7, 20.001]).ravel(), 64, p)),
-        Case("density", "1,024 planes, raw densities around each plane's bias", DENSITY,
-             lambda p: _density(np.linspace(-15, 15, 31), 1024, p)),
-        Case("density", "2 planes, released texels (-20)", DENSITY, lambda p: _density(np.array([-20.0, 0.0]), 2, p)),
-        *(Case("density", f"a new MPI of {n} planes", "weight 1/L on every plane", lambda p, n=n: _equal_start(n, p))
-          for n in (16, 256, 1024)),
-    ]  # fmt: skip
-    forms: tuple[BlendForm, ...] = ("paper", "opacity")
-    for form in forms:
+    switch = np.outer([-1, 1], [1e4, 200, 88.7, 20.001]).ravel()
+    tau = "tau and d tau to 16 roundings of the numbers added"
+    shares = "tau', d tau' / d tau, d tau' / d R to 16 roundings of the differences of reliabilities"
+    composited = "weights, transmittance, accumulation and their gradient to 4 + log2(samples) roundings of the depth "
+    composited += "in front"
+    around = np.linspace(-15, 15, 31)
+    density = [
+        ("raw densities -20 to 20, 64 planes", tau, partial(_density, spread, 64)),
+        ("raw densities +-1e4, +-200, +-88.7, +-20.001 (softplus' switch)", tau, partial(_density, switch, 64)),
+        ("1,024 planes, raw densities around each plane's bias", tau, partial(_density, around, 1024)),
+        ("2 planes, released texels (-20)", tau, partial(_density, np.array([-20.0, 0.0]), 2)),
+    ]
+    for n in (16, 256, 1024):
+        density.append((f"a new MPI of {n} planes", "weight 1/L on every plane", partial(_equal_start, n)))
+    blending = []
+    for form in ("paper", "opacity"):
         for heads, scale in ((2, 1.0), (2, 1e3), (12, 1.0), (12, 1e3)):
             name = f"{heads} MPIs, reliabilities +-{scale:g}, tau 0 to 1e4, {form} form"
-            rows.append(Case("blending", name, SHARES, lambda p, h=heads, s=scale, f=form: _blending(h, s, f, p)))
-    rows += [
-        Case("blending", "3 MPIs, reliabilities 1,000 +- 1", SHARES, lambda p: _blending(3, 1.0, "paper", p, 1e3)),
-        Case("blending", "1 MPI (K = 1)", "exactly tau", lambda p: _blending(1, 1e3, "paper", p)),
-        Case("blending", "reliabilities in bfloat16", SHARES + " (gradient of R: as bfloat16 holds it)",
-             lambda p: _blending(4, 3.0, "paper", p, half=True)),
-        Case("blending", "12 MPIs that tie at -1e3 to 1e3", "P = 1/12 to 4 roundings", lambda p: _ties(12, p)),
-        Case("blending", "sole cover, the others hold NaN, +-inf, 1e30", "exactly tau, gradients 1 and 0", _sole),
-    ]  # fmt: skip
-    rows += _composite_cases()
-    rows += [
-        Case("compositing", "empty slots that hold NaN, inf, 1e30", "as if they were not there", _empty_slots),
-        Case("compositing", "rays that meet nothing", "black, transparent, 1/t = 0", _nothing),
-        Case("compositing", "median distance in 10,000 samples", "half of the mass, to 17 roundings", _median),
+            blending.append((name, shares, partial(_blending, heads, scale, form)))
+    in_half = shares + " (gradient of R: as bfloat16 holds it)"
+    blending += [
+        ("3 MPIs, reliabilities 1,000 +- 1", shares, partial(_blending, 3, 1.0, "paper", level=1e3)),
+        ("1 MPI (K = 1)", "exactly tau", partial(_blending, 1, 1e3, "paper")),
+        ("reliabilities in bfloat16", in_half, partial(_blending, 4, 3.0, "paper", half=True)),
+        ("12 MPIs that tie at -1e3 to 1e3", "P = 1/12 to 4 roundings", partial(_ties, 12)),
+        ("sole cover, the others hold NaN, +-inf, 1e30", "exactly tau, gradients 1 and 0", _sole),
     ]
-    return rows
+    rays = {
+        "alpha 0 everywhere": np.zeros((4, 300)),
+        "alpha 1 everywhere (tau = 1e4)": np.full((4, 300), 1e4),
+        "optical depths 1e-12 to 1e-4": _mixed(-12, -4),
+        "optical depths 1e-6 to 10": _mixed(-6, 1),
+        "optical depths 1e-30 to 1e4": _mixed(-30, 4),
+        "10,000 samples of mean depth 1e-6": _long(1e-6),
+        "10,000 samples of mean depth 1e-3, the 9,000th opaque": _long(1e-3, 9000),
+        "10,000 samples of mean depth 1": _long(1.0),
+        "10,000 equal samples that let 1e-30 through": np.full((2, LONG), math.log(1e30) / LONG),
+        "transmittance 1e-30 before the last of 64 samples": _before_last(1e-30),
+        "transmittance 1e-43 (no normal float32 number) before the last": _before_last(1e-43),
+    }
+    compositing = [(name, composited, partial(_composite, taus)) for name, taus in rays.items()]
+    compositing += [
+        ("half of 300 samples dropped", composited, partial(_composite, _mixed(-4, 0), dropped=True)),
+        ("empty slots that hold NaN, inf, 1e30", "as if they were not there", _empty_slots),
+        ("rays that meet nothing", "black, transparent, 1/t = 0", _nothing),
+        ("median distance in 10,000 samples", "half of the mass, to 17 roundings", _median),
+    ]
+    groups = {"density": density, "blending": blending, "compositing": compositing}
+    return [Case(group, *row) for group, rows in groups.items() for row in rows]

@@ -67,6 +67,13 @@ class Outcome:
     def holds(self) -> bool:
         return self.value.holds and (self.gradient is None or self.gradient.holds)
 
+    @staticmethod
+    def of(values: list[Error], gradients: list[Error] | None = None, wrong: int = 0) -> Outcome:
+        """The worst of each; decisions must all be right, or they alone count."""
+        if wrong:
+            return Outcome(Error(float(wrong), 0.0))
+        return Outcome(Error.worst(values or [Error(0.0, 0.0)]), Error.worst(gradients) if gradients else None)
+
 
 @dataclass(frozen=True)
 class Case:
@@ -83,10 +90,39 @@ class Case:
 
 
 def as_array(values: Tensor | Array) -> Array:
-    return values.detach().double().cpu().numpy() if isinstance(values, Tensor) else np.asarray(values, np.float64)
+    if isinstance(values, Tensor):
+        return values.detach().to_dense().double().cpu().numpy()
+    return np.asarray(values, np.float64)
 
 
-def compare(found: Tensor | Array, wanted: Array, size: Array | float, roundings: float) -> Error:
+def float32(values: Any) -> Tensor:
+    return torch.tensor(np.asarray(values), dtype=torch.float32)
+
+
+def tried(
+    precision: Precision, function: Callable[..., Any], *inputs: Any, by: tuple[Any, ...] = (1.0,)
+) -> tuple[list[Tensor], list[Array]]:
+    """What a function makes of inputs, and how a sum of that depends on them.
+
+    Args:
+        precision: under which it runs.
+        function: of tensors, to one or a tuple of them.
+        inputs: arrays, which become float32, or tensors as they are.
+        by: weights of the first of the results in the sum that is differentiated.
+
+    Returns:
+        The results, and a gradient by each input.
+    """
+    given = [(x.clone() if isinstance(x, Tensor) else float32(x)).requires_grad_() for x in inputs]
+    with precision.context():
+        found = function(*given)
+        results = list(found) if isinstance(found, tuple) else [found]
+        weights = [float32(np.broadcast_to(b, r.shape)) for r, b in zip(results, by, strict=False)]
+        torch.autograd.backward(results[: len(by)], weights)
+    return results, [as_array(x.grad) for x in given if x.grad is not None]
+
+
+def compare(found: Tensor | Array, wanted: Any, size: Array | float, roundings: float) -> Error:
     """Largest error in units of ``size`` (the magnitudes that a number is made of), beside ``roundings`` of them."""
     found, wanted = as_array(found), np.asarray(wanted, np.float64)
     if found.shape != wanted.shape:
@@ -97,35 +133,22 @@ def compare(found: Tensor | Array, wanted: Array, size: Array | float, roundings
     return Error(float((gap / np.maximum(size, FLOOR)).max(initial=0.0)), roundings * UNIT)
 
 
-def count_wrong(wrong: int | float) -> Error:
-    """Decisions that must all be right."""
-    return Error(float(wrong), 0.0)
-
-
 # Scenes in numbers that float32 holds exactly, so that rounding the input is not counted as an error ----------------
 
 
-def single(x: Array | float) -> Array:
+def single(x: Any) -> Array:
     """Rounded to float32."""
     return np.asarray(x, np.float32).astype(np.float64)
 
 
-def _floats(x: Array) -> Any:
-    """Plain numbers, as plans hold them."""
-    return tuple(float(v) for v in single(x))
+def _plain(x: Any) -> Any:
+    """Rounded to float32, in plain numbers and tuples, as plans hold them."""
+    return float(np.float32(x)) if np.ndim(x) == 0 else tuple(_plain(v) for v in x)
 
 
 def snap(mpi: MPIPlan) -> MPIPlan:
     """The MPI with every number rounded to float32 (the axes stay orthonormal to 1e-7)."""
-    axes = tuple(_floats(np.array(row)) for row in mpi.axes)
-    return replace(
-        mpi,
-        origin=_floats(np.array(mpi.origin)),
-        axes=axes,
-        near=float(single(mpi.near)),
-        far=float(single(mpi.far)),
-        extent=_floats(np.array(mpi.extent)),
-    )
+    return replace(mpi, **{name: _plain(getattr(mpi, name)) for name in ("origin", "axes", "near", "far", "extent")})
 
 
 def rotation(rng: np.random.Generator) -> Array:
@@ -134,20 +157,12 @@ def rotation(rng: np.random.Generator) -> Array:
     return q if np.linalg.det(q) > 0 else -q
 
 
-def random_mpi(rng: np.random.Generator, planes: int = 12, axes: Array | None = None, **changes) -> MPIPlan:
+def random_mpi(rng: np.random.Generator, planes: int = 12, axes: Any = None, **changes: Any) -> MPIPlan:
     """An MPI within a few units of the world's origin, with an asymmetric frustum."""
-    low, wide = -rng.uniform(0.1, 2, 2), rng.uniform(0.5, 4, 2)
+    (u, v), (across, down) = -rng.uniform(0.1, 2, 2), rng.uniform(0.5, 4, 2)
     frame = rotation(rng) if axes is None else axes
-    mpi = MPIPlan(
-        name="random",
-        origin=_floats(rng.normal(size=3) * 2),
-        axes=tuple(_floats(row) for row in frame),  # type: ignore
-        near=float(rng.uniform(0.5, 4)),
-        extent=(low[0], low[0] + wide[0], low[1], low[1] + wide[1]),
-        planes=planes,
-        height=5,
-        width=7,
-    )
+    origin, near = _plain(rng.normal(size=3) * 2), float(rng.uniform(0.5, 4))
+    mpi = MPIPlan("random", origin, _plain(frame), near, (u, u + across, v, v + down), planes, 5, 7)
     return snap(replace(mpi, **changes))
 
 

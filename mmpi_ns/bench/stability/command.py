@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import time
 import traceback
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -36,8 +35,7 @@ class Stability(Bench):
 
     def run(self) -> None:
         report, sources = Report(self, None if self.only else ""), fingerprint()
-        same = report.kept.get("sources") == sources
-        known = report.rows if same else {}
+        known = report.rows if report.kept.get("sources") == sources else {}
         content = report.content | {"sources": sources, "rows": {}, "trainings": report.kept.get("trainings", {})}
         report.content, save = content, (lambda: None) if self.only else report.save
         chosen = {c.name: c for c in all_cases() if self.only in c.name}
@@ -99,13 +97,9 @@ def headline(rows: dict[str, Row], trainings: dict[str, Row]) -> Row:
     """How many cases there are and how many fail; trainings among them."""
     every = [*rows.values(), *trainings.values()]
     used = [use(row["paths"][name][what]) for row in rows.values() for name, what in CELLS]
-    return {
-        "cases": len(every),
-        "failed": sum(not row["ok"] for row in every),
-        "input_cases": len(rows),
-        "trainings": len(trainings),
-        "largest_share_of_a_bound": max((u for u in used if u is not None), default=0.0),
-    }
+    counts = {"cases": len(every), "failed": sum(not row["ok"] for row in every), "input_cases": len(rows)}
+    largest = max((u for u in used if u is not None), default=0.0)
+    return counts | {"trainings": len(trainings), "largest_share_of_a_bound": largest}
 
 
 def use(cell: Row | None) -> float | None:
@@ -123,33 +117,26 @@ def _text(cell: Row | None) -> str:
     return f"{cell['error']:.1e} / {cell['bound']:.1e}" if cell["bound"] else f"{cell['error']:.0f} wrong"
 
 
-def _passed(row: Row) -> str:
-    return "pass" if row["ok"] else "**FAIL**"
-
-
-_TRAINING_COLUMNS = {
-    "setting": "{name}",
-    "expectation": "{expectation}",
-    "steps": "{steps}",
-    "what came of it": "{outcome}",
-    "largest number": lambda r: f"{r['largest']:.1e}" if "largest" in r else "-",
-    "PSNR of a test image": lambda r: f"{r['psnr']:.1f}" if "psnr" in r else "-",
-    "": _passed,
-}
-
-
 def markdown(content: Row, head: Row) -> str:
     """The page."""
+    passed = {"": lambda r: "pass" if r["ok"] else "**FAIL**"}
     columns = {"input": "{inputs}", "expectation": "{expectation}"}
-    columns |= {f"{n}, {w}": lambda r, n=n, w=w: _text(r["paths"][n][w]) for n, w in CELLS} | {"": _passed}
+    columns |= {f"{n}, {w}": lambda r, n=n, w=w: _text(r["paths"][n][w]) for n, w in CELLS} | passed
     rows, blocks = list(content["rows"].values()), []
     for group in dict.fromkeys(r["group"] for r in rows):
         blocks += [f"## {title(group)}", table(columns, (r for r in rows if r["group"] == group))]
     if trainings := content["trainings"]:
-        said = (
-            "`mmpi-small`, two phases and a fine-tune, on a still life of 9 images of 32 x 24 pixels, 64 rays a step."
-        )
-        blocks += ["## Trainings", said, table(_TRAINING_COLUMNS, ({"name": n, **r} for n, r in trainings.items()))]
+        blocks += ["## Trainings", "`mmpi-small`, two phases and a fine-tune, on a still life of 9 images of 32 x 24 "
+                   "pixels, 64 rays a step."]  # fmt: skip
+        columns = {
+            "setting": "{name}",
+            "expectation": "{expectation}",
+            "steps": "{steps}",
+            "what came of it": "{outcome}",
+            "largest number": lambda r: f"{r['largest']:.1e}" if "largest" in r else "-",
+            "PSNR of a test image": lambda r: f"{r['psnr']:.1f}" if "psnr" in r else "-",
+        }
+        blocks += [table(columns | passed, ({"name": n, **r} for n, r in trainings.items()))]
         blocks += [f"Commits: {', '.join(sorted({r['commit'] for r in trainings.values()}))}."]
     counted = f"**{head['cases']} cases, {head['failed']} failed** ({head['input_cases']} inputs, {head['trainings']} "
     counted += f"trainings). The largest error uses {100 * head['largest_share_of_a_bound']:.0f} % of its bound."
@@ -161,17 +148,15 @@ condition: [docs/stability.md](../stability.md)."""
     return page("Stability on hard cases", content["made"], counted, said, picture, blocks)
 
 
-def draw(path: Path, rows: Iterable[Row]) -> None:
+def draw(path: Path, rows: list[Row]) -> None:
     """Every error as a share of its bound, by group, on a logarithmic axis."""
     groups = list(dict.fromkeys(r["group"] for r in rows))
     with figure(path, 1, 1, (8, 0.45 * len(groups) + 1.5)) as ((axis,),):
         for offset, (name, what) in enumerate(CELLS):
             points = [(use(r["paths"][name][what]), groups.index(r["group"])) for r in rows]
             shown = [(max(u, 1e-5), y + 0.15 * (offset - 1.5)) for u, y in points if u is not None]
-            color, mark = f"C{offset // 2}", "o^"[offset % 2]
-            if shown:
-                x, y = zip(*shown, strict=True)
-                axis.plot(x, y, mark, color=color, ms=4, alpha=0.6, mew=0, label=f"{name}, {what}")
+            style = {"color": f"C{offset // 2}", "ms": 4, "alpha": 0.6, "mew": 0, "label": f"{name}, {what}"}
+            axis.plot([x for x, _ in shown], [y for _, y in shown], "o^"[offset % 2], **style)
         axis.axvline(1, color="black", lw=1)
         axis.set(xscale="log", xlim=(6e-6, 3), xlabel="error / bound (bound at 1)")
         axis.set_yticks(range(len(groups)), groups)

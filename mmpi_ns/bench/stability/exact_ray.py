@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +19,8 @@ from mmpi_ns.bench.stability import exact
 from mmpi_ns.bench.stability.exact import STILL, Array, Jitter
 from mmpi_ns.scene.plan import MPIPlan, ScenePlan
 
+Corners = list[tuple[tuple[int, ...], float]]
+"""Indices of texels, and their weights."""
 TABLES = ("density", "features", "reliability", "networks")
 
 
@@ -104,8 +107,8 @@ class Sample:
     inputs: Array
     """Of the colour network."""
     color: Array
-    corners: list[tuple[tuple[int, ...], float]]
-    vote_corners: list[list[tuple[tuple[int, ...], float]]]
+    corners: Corners
+    vote_corners: list[Corners]
 
 
 @dataclass
@@ -148,11 +151,6 @@ class ExactRay:
             if a.head != b.head and a.inverse_t != b.inverse_t:
                 self.margin = min(self.margin, (a.inverse_t - b.inverse_t) / (a.size_q + b.size_q))
 
-    def _bias(self, k: int) -> Array:
-        mpi = self.field.plan.mpis[k]
-        step = (1 / mpi.near - 1 / mpi.far) / (mpi.planes - 1)
-        return exact.plane_bias(mpi.planes, 1 / mpi.far / step)[0]
-
     def _in_cube(self, inverse_t: float) -> Array:
         assert self.field.plan.cube is not None
         lower, upper = np.array(self.field.plan.cube.lower), np.array(self.field.plan.cube.upper)
@@ -162,15 +160,16 @@ class ExactRay:
     def _sample(self, k: int, plane: int, q: tuple[float, float], ndc: Array) -> Sample:
         f, plan, (inverse_t, size_q) = self.field, self.field.plan, q
         if k < len(plan.mpis):
-            corners = [((plane, *at), w) for at, w in _corners(ndc[1::-1], f.density[k].shape[1:3])]
-            axes = np.array(plan.mpis[k].axes)
-            bias, scale = self._bias(k)[plane], 256 / plan.mpis[k].planes * f.depth_scale
+            mpi = plan.mpis[k]
+            corners = [((plane, *at), w) for at, w in corners_of(ndc[1::-1], f.density[k].shape[1:3])]
+            axes, step = np.array(mpi.axes), (1 / mpi.near - 1 / mpi.far) / (mpi.planes - 1)
+            bias, scale = exact.plane_bias(mpi.planes, 1 / mpi.far / step)[0][plane], 256 / mpi.planes * f.depth_scale
         else:
-            corners, axes = _corners(ndc[::-1], f.density[k].shape[:3]), np.eye(3)
+            corners, axes = corners_of(ndc[::-1], f.density[k].shape[:3]), np.eye(3)
             scale = 1 / f.samples_per_voxel
             bias = math.log(math.expm1(-math.log1p(-f.cube_alpha) / scale))
-        raw = self.jitter(_look_up(f.density[k], corners), _size(f.density[k], corners) + abs(bias))[0] + bias
-        features = self.jitter(_look_up(f.features[k], corners), _size(f.features[k], corners))
+        raw = self._read(f.density[k], corners, abs(bias))[0] + bias
+        features = self._read(f.features[k], corners)
         votes, cover, vote_corners = self._votes(k, inverse_t, ndc)
         tau = float(self.jitter(exact.softplus(raw) * scale))
         inputs, color = features, exact.sigmoid(features[:3])
@@ -178,6 +177,11 @@ class ExactRay:
             inputs = self._encode((ndc, axes @ self.direction), features)
             color = exact.sigmoid(features[:3] + self._network(k, inputs)[0])
         return Sample(k, plane, inverse_t, size_q, raw, scale, tau, votes, cover, inputs, color, corners, vote_corners)
+
+    def _read(self, table: Array, corners: Corners, more: float = 0.0) -> Array:
+        """A lookup. Its position is known to a rounding of 1: times the texels across, that moves it by its texels."""
+        size = max(table.shape[:3]) * np.max([np.abs(table[index]) for index, _ in corners], axis=0)
+        return self.jitter(np.sum([weight * table[index] for index, weight in corners], axis=0), size + more)
 
     def _votes(self, own: int, inverse_t: float, own_ndc: Array):
         """Reliability of every head at a sample, which of them cover it, and the texels that were read."""
@@ -204,11 +208,11 @@ class ExactRay:
                 cover.append(False)
                 read.append([])
                 continue
-            corners = _corners(np.clip(ndc, -1, 1)[::-1], f.reliability[j].shape[:3])
+            corners = corners_of(np.clip(ndc, -1, 1)[::-1], f.reliability[j].shape[:3])
             nearest, gap = _nearest(ndc[::-1], f.touched[j].shape[:3])
             trained = bool(f.touched[j][nearest][0])
             self.margin = min(self.margin, gap) if not f.touched[j].all() else self.margin
-            votes.append(float(self.jitter(_look_up(f.reliability[j], corners), _size(f.reliability[j], corners))[0]))
+            votes.append(float(self._read(f.reliability[j], corners)[0]))
             cover.append(j == own or trained)
             read.append(corners)
         return np.array(votes), np.array(cover), read
@@ -314,7 +318,7 @@ def _same_frame(a: MPIPlan, b: MPIPlan) -> bool:
     return (a.origin, a.axes, a.near, a.far, a.extent) == (b.origin, b.axes, b.near, b.far, b.extent)
 
 
-def _corners(position: Array, shape: tuple[int, ...]) -> list[tuple[tuple[int, ...], float]]:
+def corners_of(position: Sequence[float] | Array, shape: tuple[int, ...]) -> Corners:
     """(index, weight) of the texels around a position in [-1, 1]^D; corners of the range are texel centres."""
     axes = []
     for x, n in zip(position, shape, strict=True):
@@ -331,19 +335,6 @@ def _nearest(position: Array, shape: tuple[int, ...]) -> tuple[tuple[int, ...], 
     at = [min(max((float(x) + 1) / 2 * (n - 1), 0.0), n - 1.0) for x, n in zip(position, shape, strict=True)]
     gap = min(abs(a % 1 - 0.5) / n for a, n in zip(at, shape, strict=True))
     return tuple(round(a) for a in at), gap
-
-
-def _look_up(table: Array, corners: list[tuple[tuple[int, ...], float]]) -> Array:
-    value = np.zeros(table.shape[-1])
-    for index, weight in corners:
-        value = value + weight * table[index]
-    return value
-
-
-def _size(table: Array, corners: list[tuple[tuple[int, ...], float]]) -> Array:
-    """Magnitudes of the texels around a lookup, times the texels across: a position is known to a rounding of 1."""
-    across = max(table.shape[:3])
-    return across * np.max([np.abs(table[index]) for index, _ in corners], axis=0)
 
 
 def _scatter(table: Array, sizes: Array, corners, value: Array | float, size: Array | float) -> None:
