@@ -41,7 +41,7 @@ def test_quick_hash_lookups_are_nerfstudios_own(levels, size, native_or_torch, m
 
 def test_what_a_run_goes_on_from_was_asked_for_in_the_same_words(tmp_path):
     words = ("nerfacto", "--max-num-iterations", "5", "--machine.seed", "0")
-    own = [words[0], *words[3:]]
+    own = [*words[:2], *words[3:]]
     kept = Progress(own, [{"step": 1, "seconds": 2.0}, {"step": 2, "seconds": 3.5}], 128, 1.5)
     saved = tmp_path / "step-000000001.ckpt"
     steps = []
