@@ -9,7 +9,8 @@ import oracle
 import pytest
 import torch
 from bricked import bricked_field
-from hand_made import make_mpi, random_mpi, unit
+from hand_made import make_mpi, random_mpi
+from hard_rays import HARD_RAYS, hard_plan, hard_rays
 from interpreting import by_torch, interpreted, normal  # noqa: F401
 from random_fields import OracleRay, bundle, fill, random_field, random_rays, render
 
@@ -19,7 +20,7 @@ from mmpi_ns.ops import blending, composite
 from mmpi_ns.ops.hits import plane_hits
 from mmpi_ns.ops.march import gpu, reference
 from mmpi_ns.rendering.sampler import MMPISampler
-from mmpi_ns.scene.plan import CubePlan, ScenePlan
+from mmpi_ns.scene.plan import ScenePlan
 
 # Hits ----------------------------------------------------------------------------------------------------------------
 
@@ -46,8 +47,7 @@ def test_rays_cross_the_planes_that_the_oracle_has(far):
 
 def test_hits_of_hard_rays_are_those_of_the_reference():
     plan = hard_plan()
-    field, (origins, directions) = MMPIField(plan), (np.array(x, float) for x in zip(*HARD_RAYS.values(), strict=True))
-    rays = bundle(origins, np.stack([unit(d) for d in directions]))
+    field, rays = MMPIField(plan), hard_rays()
     found = plane_hits(rays.origins, rays.directions, rays.nears, rays.fars, field.layout)
     wanted = by_torch(lambda: plane_hits(rays.origins, rays.directions, rays.nears, rays.fars, field.layout))
     assert torch.equal(found.count, wanted.count) and (wanted.count > 0).any()
@@ -147,26 +147,6 @@ def test_rays_render_as_the_oracle_has_them():
         assert checked > 15
 
 
-def hard_plan(**changes):
-    twin = make_mpi("twin", planes=12)
-    cube = CubePlan((-1.0, -1.0, 2.0), (1.0, 1.0, 4.0), (4, 4, 4))
-    return ScenePlan((make_mpi(planes=12), twin, make_mpi("ends", near=0.5, far=3.0, planes=5)), cube, 0.05, 1.0)
-
-
-HARD_RAYS = {
-    "along the planes": ([0, 0, 1.5], [1, 0, 0]),
-    "nearly along the planes": ([0, 0, 2], [1, 0, 2e-6]),
-    "from a plane": ([0.1, 0.1, 1.0], [0, 0, 1]),
-    "from behind all finite planes": ([0, 0, 500.0], [0.1, 0, 1]),
-    "backwards": ([0, 0, 5], [0, 0, -1]),
-    "on the border of the frustum": ([0, 0, 0], [1, 0.5, 1]),
-    "on the axis": ([0, 0, 0], [0, 0, 1]),
-    "into a corner of the cube": ([0, 0, 0], [0.5, 0.5, 2.0]),
-    "from inside the cube": ([0.2, 0.1, 3.0], [0.3, 0.2, 1.0]),
-    "from far away": ([0, 0, -1e5], [0, 0, 1]),
-}
-
-
 @pytest.mark.parametrize("raw", [0.0, 1e4, -1e4])
 def test_hard_rays_through_thin_and_opaque_planes_march_like_the_reference(monkeypatch, raw):
     """Two MPIs coincide, so that every distance is a tie; raw densities make alpha 1 or 0."""
@@ -175,8 +155,7 @@ def test_hard_rays_through_thin_and_opaque_planes_march_like_the_reference(monke
     field.reliability.data.normal_(generator=torch.Generator().manual_seed(1))
     field.density.data.fill_(raw)
     field.touched.fill_(1)
-    origins, directions = (np.array(x, float) for x in zip(*HARD_RAYS.values(), strict=True))
-    rays = bundle(origins, np.stack([unit(d) for d in directions]))
+    rays = hard_rays()
     for form, threshold in ((None, 0.0), (None, 1e-3), ("paper", 1e-3)):
         fast, _ = compare(field.eval(), rays, threshold, form)
         found = fast.samples.metadata

@@ -77,27 +77,6 @@ def test_colours_of_rays_and_their_gradients_equal_float64():
         assert b.abs().max() > 0.1 and ((a.double() - b).abs() <= 2e-5 * b.abs() + 2e-6).all()
 
 
-def test_the_median_distance_is_that_of_the_reference():
-    weights, valid, *_ = batch(rays=400)
-    weights = weights.clamp(max=1)
-    weights[7] = 0
-    inverse_t = torch.rand(weights.shape, generator=torch.Generator().manual_seed(3))
-    weights = torch.where(valid, weights, 0.0)
-    with torch.no_grad():
-        found = composite.median_inverse_distance(weights, inverse_t, valid)
-    wanted = reference.median_inverse_distance(weights, inverse_t, valid)
-    assert torch.equal(found, wanted) and (wanted == 0).any() and wanted.unique().numel() > 300
-
-
-def test_the_winning_head_is_the_one_of_most_weight():
-    weights, g = batch(rays=300)[0].clamp(max=1), torch.Generator().manual_seed(4)
-    heads = torch.randint(0, 5, weights.shape, generator=g)
-    weights[9] = 0
-    found, wanted = both(lambda: composite.winning_heads(weights, heads, 6))
-    assert torch.equal(found, wanted)
-    assert found[9] == 0 and sorted(found.unique().tolist()) == [0, 1, 2, 3, 4]
-
-
 def test_without_rays_or_slots_nothing_is_gathered():
     for rays, slots in ((0, 5), (3, 1)):
         given = torch.zeros(rays, slots), torch.zeros(rays, slots, dtype=torch.bool), torch.zeros(rays, slots)

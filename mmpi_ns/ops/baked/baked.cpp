@@ -9,10 +9,64 @@
 namespace {
 
 constexpr float OPAQUE = 1e-2f; // a ray that lets less through is over
-constexpr int FINENESS = 8, COLORS = 3;
+constexpr int FINENESS = 8, COLORS = 3, CELLS = 7;
 constexpr int32_t CORNERS[4] = {0, 1, 8, 9}; // of a cell, texels within a brick
 typedef uint8_t ByteLanes __attribute__((vector_size(16)));
 typedef uint16_t ShortLanes __attribute__((vector_size(32)));
+
+struct Head {
+    float origin[3], axes[3][3];
+    float u0, v0, u1, v1, u_scale, v_scale; // texel = (u - u0) * u_scale
+    Stack stack;
+    const float* pass; // e^-tau at codes 0, 1/8, ...
+};
+
+struct Scene {
+    int64_t num_heads, channels;
+    const Head* heads;
+    const Column* columns;
+    const uint8_t *density, *texels; // with some bytes behind each, which are read and not used
+    const float *low, *step;         // of sixteen channels; features' doubled, for tanh x = 2 sigmoid(2 x) - 1
+};
+
+struct Packet {
+    Lanes origin[3], direction[3], near, inverse_far;
+};
+
+// Rays on their way through one head, at the first plane that each can meet.
+Walks<CELLS> begin(const Scene& scene, const Head& head, const Packet& rays) {
+    const Stack& stack = head.stack;
+    Lanes o[3], d[3], relative[3];
+    for (int a = 0; a < 3; a++) relative[a] = rays.origin[a] - head.origin[a];
+    for (int a = 0; a < 3; a++) {
+        const float* axis = head.axes[a];
+        o[a] = axis[0] * relative[0] + axis[1] * relative[1] + axis[2] * relative[2];
+        d[a] = axis[0] * rays.direction[0] + axis[1] * rays.direction[1] + axis[2] * rays.direction[2];
+    }
+    const Lanes u = d[0] / d[2], v = d[1] / d[2], bend_u = o[0] - o[2] * u, bend_v = o[1] - o[2] * v;
+    // Half-spaces p w <= q in disparity, as in scene/geometry.py.
+    const Lanes p[6] = {d[2] * rays.near + o[2], -(d[2] + o[2] * rays.inverse_far), bend_u, -bend_u, bend_v, -bend_v};
+    const Lanes q[6] = {splat(1), -rays.inverse_far, head.u1 - u, u - head.u0, head.v1 - v, v - head.v0};
+    Mask meets = d[2] > 1e-6f;
+    Lanes low{}, high = splat(float(stack.planes - 1)); // planes counted from the last one
+    for (int i = 0; i < 6; i++) {
+        const Lanes slope = p[i] * stack.step, rest = q[i] - p[i] * stack.end, bound = rest / slope;
+        high = slope > 0 ? least(high, bound) : high;
+        low = slope < 0 ? most(low, bound) : low;
+        meets &= (slope != 0) | (rest >= 0);
+    }
+    meets &= low <= high;
+    low = pick(meets, low, Lanes{}), high = pick(meets, high, Lanes{});
+    const IntLanes below = truncated(low), first = stack.planes - 1 - truncated(high);
+    Walks<CELLS> walks;
+    walks.last = stack.planes - 1 - below + (real(below) < low); // a condition that holds is -1
+    walks.x_step = -bend_u * stack.step * head.u_scale, walks.y_step = -bend_v * stack.step * head.v_scale;
+    walks.x_last = (u + bend_u * stack.end - head.u0) * head.u_scale;
+    walks.y_last = (v + bend_v * stack.end - head.v0) * head.v_scale;
+    walks.oz = o[2], walks.dz = d[2];
+    walks.begin(scene.columns, stack, first, meets);
+    return walks;
+}
 
 // By way of 16 bits: GCC 12 takes bytes apart one by one to make floats of them, for a quarter of a frame's time.
 Lanes widened(const uint8_t* from) {
@@ -46,45 +100,36 @@ class Marcher {
     Marcher(const Scene& scene, float threshold, float* peaks)
         : scene(scene), threshold(threshold), peaks(peaks), walks(scene.num_heads) {
         int64_t most = 1;
-        for (int64_t h = 0; h < scene.num_heads; h++) most += scene.heads[h].planes;
+        for (int64_t h = 0; h < scene.num_heads; h++) most += scene.heads[h].stack.planes;
         for (auto& samples : seen) samples.resize(most);
     }
 
     // The light that passes each ray; those that are not `there` are left out.
     Lanes march(const Packet& rays, Mask there) {
-        const int32_t H = int32_t(scene.num_heads);
-        for (int32_t h = 0; h < H; h++) walks[h].begin(scene, scene.heads[h], rays);
+        for (int64_t h = 0; h < scene.num_heads; h++) walks[h] = begin(scene, scene.heads[h], rays);
         std::fill(count, count + WIDTH, 0);
         light = splat(1);
-        for (;;) {
-            Lanes top = walks[0].inverse_t;
-            IntLanes best{};
-            for (int32_t h = 1; h < H; h++) { // ties: the first head
-                best = walks[h].inverse_t > top ? whole(h) : best;
-                top = most(walks[h].inverse_t, top);
-            }
-            const Mask left = there & (top >= 0) & (light > OPAQUE);
-            if (!any(left)) return light;
-            // The ray that is least far on its way goes first, with all that wait for the same MPI: so they stay abreast.
-            const Lanes waiting = pick(left, top, splat(-1));
-            const int32_t h = best[__builtin_ctz(bits(waiting == largest(waiting)))];
-            step(h, left & (best == h));
-        }
+        walk_abreast(
+            int32_t(scene.num_heads), [&](int32_t h) { return walks[h].inverse_t; },
+            [&] { return ~there | (light <= OPAQUE); }, [&](int32_t h, Mask going) { step(h, going); });
+        return light;
     }
 
   private:
     const Scene& scene;
     const float threshold;
     float* const peaks; // of every texel, or null
-    std::vector<Walks> walks;
+    std::vector<Walks<CELLS>> walks;
     Lanes light;
 
     // Rays of `going` take their next sample of one MPI.
     void step(int32_t h, Mask going) {
         const Head& head = scene.heads[h];
-        Walks& walk = walks[h];
+        Walks<CELLS>& walk = walks[h];
+        IntLanes column, row;
         Lanes fx, fy;
-        const IntLanes texel = pick(going, walk.brick * 64 + walk.cell(fx, fy), IntLanes{});
+        walk.cell(head.stack, column, row, fx, fy);
+        const IntLanes texel = pick(going, walk.brick * 64 + row * 8 + column, IntLanes{});
         const auto pair = [this](int32_t at) { // a texel and the one right of it, in the lowest bytes
             int32_t codes;
             __builtin_memcpy(&codes, scene.density + at, sizeof codes);
@@ -102,7 +147,7 @@ class Marcher {
         keep(h, weight, walk.inverse_t, fx, fy, texel);
         if (peaks) raise(weight, texel);
         light *= pass;
-        walk.next(scene, head, going);
+        walk.next(scene.columns, head.stack, going);
     }
 
     // Notes the samples that weigh enough, and asks for their colours.

@@ -1,4 +1,4 @@
-// Rendering weights of rays with their gradients; median distances and winners. The reference is reference.py.
+// Rendering weights of rays with their gradients. The reference is reference.py.
 #include "lanes.h"
 
 #include <algorithm>
@@ -78,34 +78,6 @@ void mmpi_composite_back(const float* tau, const bool* valid, const float* skipp
             grad[i] = valid[i] ? grad_weights[i] * ray.before[s] - behind + grad_depth[r] : 0;
             if (valid[i]) behind += grad_weights[i] * weights[i];
         }
-    }
-}
-
-// Inverse distance of the sample at which each of rays [begin, end) has gathered half of what it gathers, or 0.
-void mmpi_median(const float* weights, const float* inverse_t, const bool* valid, int64_t begin, int64_t end,
-                 int64_t slots, float* median) {
-    for (int64_t r = begin; r < end; r++) {
-        const int64_t first = r * slots;
-        double total = 0, gathered = 0; // as torch sums
-        for (int64_t s = 0; s < slots; s++) total += weights[first + s];
-        median[r] = 0;
-        for (int64_t s = 0; s < slots && total > 0; s++) {
-            gathered += weights[first + s];
-            if (!(float(gathered) >= 0.5f * float(total) && valid[first + s])) continue;
-            median[r] = inverse_t[first + s];
-            break;
-        }
-    }
-}
-
-// Number of the head that gives each of rays [begin, end) most of its weight.
-void mmpi_winners(const float* weights, const int64_t* heads, int64_t begin, int64_t end, int64_t slots,
-                  int64_t num_heads, float* winners) {
-    std::vector<float> mass(num_heads);
-    for (int64_t r = begin; r < end; r++) {
-        std::fill(mass.begin(), mass.end(), 0.0f);
-        for (int64_t i = r * slots; i < (r + 1) * slots; i++) mass[heads[i]] += weights[i];
-        winners[r] = float(std::max_element(mass.begin(), mass.end()) - mass.begin());
     }
 }
 }

@@ -31,17 +31,3 @@ def composite_weights(tau: Tensor, valid: Tensor, skipped_before: Tensor, skippe
     """See ``ops.composite``."""
     weights, depth = _Weights.apply(*(x.contiguous() for x in (tau, valid, skipped_before, skipped_total)))  # type: ignore[misc]
     return Composite(weights, -torch.expm1(-depth), torch.exp(-depth))
-
-
-def median_inverse_distance(weights: Tensor, inverse_t: Tensor, valid: Tensor) -> Tensor:
-    """See ``ops.composite``."""
-    given, median = [x.contiguous() for x in (weights, inverse_t, valid)], torch.empty(len(weights), 1)
-    call_in_parts("mmpi_median", len(weights), given, (weights.shape[1], median))
-    return median
-
-
-def winning_heads(weights: Tensor, heads: Tensor, num_heads: int) -> Tensor:
-    """See ``ops.composite``."""
-    given, winners = (weights.contiguous(), heads.long().contiguous()), torch.empty(len(weights), 1)
-    call_in_parts("mmpi_winners", len(weights), given, (weights.shape[1], num_heads, winners))
-    return winners

@@ -57,10 +57,14 @@ def render_colors(composite: Composite, colors: Float[Tensor, "R S 3"]) -> Float
     return factor.detach() * (composite.weights[..., None] * colors).sum(-2)
 
 
+@torch.no_grad()
 def median_inverse_distance(
     weights: Float[Tensor, "R S"], inverse_t: Float[Tensor, "R S"], valid: Bool[Tensor, "R S"]
 ) -> Float[Tensor, "R 1"]:
-    """See ``ops.composite``."""
+    """1/t of the sample at which a ray has gathered half of what it gathers; 0 (infinity) for an empty ray.
+
+    Depends on one ray alone, so not on how an image is cut into chunks.
+    """
     gathered = weights.cumsum(-1)
     total = gathered[:, -1:]
     reached = (gathered >= 0.5 * total) & valid & (total > 0)
@@ -70,6 +74,6 @@ def median_inverse_distance(
 
 
 def winning_heads(weights: Float[Tensor, "R S"], heads: Int[Tensor, "R S"], num_heads: int) -> Float[Tensor, "R 1"]:
-    """See ``ops.composite``."""
+    """The head that gives each ray most of its weight, as nerfstudio's images take it; the first of equals."""
     mass = weights.new_zeros(len(weights), num_heads).scatter_add(1, heads, weights)
     return mass.argmax(-1, keepdim=True).to(weights.dtype)

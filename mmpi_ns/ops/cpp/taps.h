@@ -36,3 +36,17 @@ inline Lanes interpolate(const Table& table, const Sample& sample, int64_t first
         sum += sample.shares[tap] * table.read(sample.rows[tap] * table.channels + first);
     return sum;
 }
+
+constexpr int COLORS = 3; // channels that are colours; the others are features
+
+struct Texel {
+    Lanes value, slope;
+};
+
+// Colours are sigmoids and features hyperbolic tangents, of sixteen channels from `first` on. What is not a number stays so.
+inline Texel activate(Lanes raw, int64_t first) {
+    const auto is_color = IOTA + float(first) < float(COLORS);
+    const Lanes share = 1.0f / (1.0f + exp_lanes(is_color ? -raw : -2.0f * raw));
+    const Lanes rest = share * (1.0f - share), value = is_color ? share : 2.0f * share - 1.0f;
+    return {raw == raw ? value : raw, is_color ? rest : 4.0f * rest};
+}

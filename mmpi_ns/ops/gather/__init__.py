@@ -6,8 +6,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mmpi_ns.ops import dispatch
-from mmpi_ns.ops.gather.reference import COLORS, KnownTaps, RaySums
-from mmpi_ns.ops.layout import Places, SceneLayout
+from mmpi_ns.ops.gather.reference import COLORS, KnownTaps, RaySums, gather_places
 
 __all__ = ["COLORS", "KnownTaps", "RaySums", "gather_places", "gather_taps"]
 
@@ -29,10 +28,3 @@ def gather_taps(
         wanted: the rays to sum for; the others get 0.
     """
     return dispatch.run("gather_taps", values, groups, slots, weights, wanted)
-
-
-def gather_places(
-    layout: SceneLayout, table: Float[Tensor, "T C"], places: Places, weights: Float[Tensor, "R S"]
-) -> RaySums:
-    """Sums over samples at places in the heads, without gradients; ``table`` holds all texels."""
-    return dispatch.run("gather_places", layout, table, places, weights)

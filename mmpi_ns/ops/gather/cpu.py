@@ -10,9 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mmpi_ns.ops.build import arguments, call, call_in_parts
-from mmpi_ns.ops.cpu_scene import CpuScene
 from mmpi_ns.ops.gather.reference import COLORS, KnownTaps, RaySums, split_sums
-from mmpi_ns.ops.layout import Places, SceneLayout
 
 LANES = 16
 """Gradients of sums are padded to multiples of this many channels."""
@@ -78,13 +76,3 @@ def gather_taps(values: Tensor, groups: list[KnownTaps], slots: Tensor, weights:
     """See ``ops.gather``. The sum of a gradient does not depend on the number of threads."""
     taps = [x for g in groups for x in (g.positions.to(torch.int32), g.shares)]
     return RaySums(*_GatherTaps.apply(values, weights, slots, wanted, *taps))  # type: ignore[misc]
-
-
-def gather_places(layout: SceneLayout, table: Tensor, places: Places, weights: Tensor) -> RaySums:
-    """See ``ops.gather``."""
-    (num_rays, slots), channels = weights.shape, table.shape[1]
-    table, *rest = (x.detach().contiguous() for x in (table, *places, weights))
-    sums = torch.empty(num_rays, channels + 1 + COLORS)
-    given = (CpuScene.of(layout).grids, len(layout.mpis), table, *table.shape, *rest)
-    call_in_parts("mmpi_gather_places", num_rays, given, (slots, sums))
-    return RaySums(*split_sums(sums, channels))

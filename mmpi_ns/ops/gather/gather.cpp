@@ -5,8 +5,6 @@
 
 namespace {
 
-constexpr int COLORS = 3; // channels that are colours; the others are features
-
 // Taps of samples that are known: those of planes first, then those of the cube.
 struct Taps {
     const int32_t* positions;
@@ -14,18 +12,6 @@ struct Taps {
     int64_t count;
     float* grad_shares; // null where not wanted
 };
-
-struct Texel {
-    Lanes value, slope;
-};
-
-// Colours are sigmoids and features hyperbolic tangents, of sixteen channels from `first` on. What is not a number stays so.
-inline Texel activate(Lanes raw, int64_t first) {
-    const auto is_color = IOTA + float(first) < float(COLORS);
-    const Lanes share = 1.0f / (1.0f + exp_lanes(is_color ? -raw : -2.0f * raw));
-    const Lanes rest = share * (1.0f - share), value = is_color ? share : 2.0f * share - 1.0f;
-    return {raw == raw ? value : raw, is_color ? rest : 4.0f * rest};
-}
 
 // Sums over a ray's samples: weight times what their texels hold, weight, weight times squared colour.
 void gather(const Table& table, const std::vector<Sample>& samples, float* sums) {
@@ -42,23 +28,6 @@ void gather(const Table& table, const std::vector<Sample>& samples, float* sums)
     }
     sums[table.channels] = mass;
     for (int c = 0; c < COLORS; c++) sums[table.channels + 1 + c] = squares[c];
-}
-
-// Rays [begin, end), whose samples `find(ray, samples)` finds. The next ray's memory is asked for before one is summed.
-template <typename Find>
-void gather_rays(const Table& table, int64_t begin, int64_t end, const Find& find, float* sums) {
-    std::vector<Sample> samples[2];
-    const auto prepare = [&](int64_t ray) {
-        std::vector<Sample>& found = samples[ray & 1];
-        found.clear();
-        find(ray, found);
-        for (const Sample& sample : found) prefetch(table, sample);
-    };
-    if (begin < end) prepare(begin);
-    for (int64_t ray = begin; ray < end; ray++) {
-        if (ray + 1 < end) prepare(ray + 1);
-        gather(table, samples[ray & 1], sums + ray * (table.channels + 1 + COLORS));
-    }
 }
 
 void put_known(Sample& sample, const Taps* groups, int64_t number) {
@@ -81,35 +50,29 @@ float* grad_of_shares(const Taps* groups, int64_t number) {
 
 extern "C" {
 
-// Sums [R, channels + 4] of rays [begin, end) at samples whose places are given, without gradients.
-void mmpi_gather_places(const Grid* grids, int64_t num_mpis, const float* features, int64_t rows, int64_t channels,
-                        const int64_t* heads, const int64_t* planes, const float* ndc, const bool* valid,
-                        const float* weights, int64_t begin, int64_t end, int64_t slots, float* sums) {
-    const auto find = [&](int64_t ray, std::vector<Sample>& samples) {
-        for (int64_t slot = ray * slots; slot < (ray + 1) * slots; slot++) {
-            if (!valid[slot]) continue;
-            Sample sample;
-            sample.weight = weights[slot];
-            sample.put(grids[heads[slot]], heads[slot] >= num_mpis, planes[slot], ndc + 3 * slot);
-            samples.push_back(sample);
-        }
-    };
-    gather_rays({features, rows, channels}, begin, end, find, sums);
-}
-
-// The same at samples whose taps are known: `numbers` [R, S] says which are whose, -1 for none.
+// Sums [R, channels + 4] of rays [begin, end) at samples whose taps are known: `numbers` [R, S] says which are whose, -1
+// for none. The next ray's memory is asked for before one is summed.
 void mmpi_gather_taps(const float* values, int64_t rows, int64_t channels, const Taps* groups, const int32_t* numbers,
                       const float* weights, int64_t begin, int64_t end, int64_t slots, float* sums) {
-    const auto find = [&](int64_t ray, std::vector<Sample>& samples) {
+    const Table table{values, rows, channels};
+    std::vector<Sample> samples[2];
+    const auto prepare = [&](int64_t ray) {
+        std::vector<Sample>& found = samples[ray & 1];
+        found.clear();
         for (int64_t slot = ray * slots; slot < (ray + 1) * slots; slot++) {
             if (numbers[slot] < 0) continue;
             Sample sample;
             put_known(sample, groups, numbers[slot]);
             sample.weight = weights[slot];
-            samples.push_back(sample);
+            found.push_back(sample);
+            prefetch(table, sample);
         }
     };
-    gather_rays({values, rows, channels}, begin, end, find, sums);
+    if (begin < end) prepare(begin);
+    for (int64_t ray = begin; ray < end; ray++) {
+        if (ray + 1 < end) prepare(ray + 1);
+        gather(table, samples[ray & 1], sums + ray * (channels + 1 + COLORS));
+    }
 }
 
 // Gradients of values [rows, channels] (added to what is there; null where not wanted), of shares (likewise, in the taps)

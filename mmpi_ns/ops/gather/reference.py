@@ -56,8 +56,11 @@ def gather_taps(values: Tensor, groups: list[KnownTaps], slots: Tensor, weights:
     return _sums(raw[own], slots[own], weights)
 
 
-def gather_places(layout: SceneLayout, table: Tensor, places: Places, weights: Tensor) -> RaySums:
-    """See ``ops.gather``."""
+def gather_places(
+    layout: SceneLayout, table: Float[Tensor, "T C"], places: Places, weights: Float[Tensor, "R S"]
+) -> RaySums:
+    """Sums over samples at places in the heads, without gradients; ``table`` holds all texels. In plain torch alone:
+    pictures are made by ``ops.show``."""
     slots, raw = zip(*interpolated(layout, table, places), strict=True)
     return _sums(torch.cat(raw), torch.cat(slots), weights)
 

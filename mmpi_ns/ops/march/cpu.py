@@ -18,28 +18,41 @@ _FLAT = (torch.int32, torch.int32, *[torch.float32] * 4)
 _SLOTS = (torch.int64, torch.int64, *[torch.float32] * 4, torch.bool)
 
 
-class _Rays(ctypes.Structure):
+class Rays(ctypes.Structure):
+    """``Crossings`` (``cpp/rays.h``)."""
+
     _fields_ = [
         (n, ctypes.c_void_p)
         for n in ("origins", "directions", "local_origins", "local_directions", "u", "v", "first", "counts")
     ]
+    held: list[Tensor]
+    """What it points to."""
+
+    @staticmethod
+    def of(rays: Crossings) -> Rays:
+        origins, directions, hits, first, counts = rays
+        parts = (origins, directions, hits.local_origins, hits.local_directions, hits.u, hits.v, first, counts)
+        held = [x.contiguous() for x in parts]
+        made = Rays(*arguments(held))
+        made.held = held
+        return made
+
+
+def how(options: MarchOptions) -> tuple[float, float, ctypes.c_int]:
+    """Threshold, fair share, and in which form reliability enters, as the compiled marches take them."""
+    form = NO_BLENDING if options.form is None else BAKED_SHARES if options.baked else PAPERS_FORM
+    return float(options.threshold), float(options.fair_share), ctypes.c_int(form)
 
 
 def march(layout: SceneLayout, tables: Tables, rays: Crossings, options: MarchOptions) -> MergedSamples:
     """See ``ops.march``."""
-    origins, directions, hits, first, counts = rays
-    parts = (origins, directions, hits.local_origins, hits.local_directions, hits.u, hits.v, first, counts)
-    held = [x.contiguous() for x in parts]  # alive until the rays are marched
-    scene, packed = CpuScene.of(layout).with_tables(tables), _Rays(*arguments(held))
-    total = counts.sum(-1)
+    scene, packed, total = CpuScene.of(layout).with_tables(tables), Rays.of(rays), rays.counts.sum(-1)
     starts = total.cumsum(0) - total
     num_rays, size = len(total), int(total.sum())
     flat = [torch.empty((size, 3) if i == 2 else size, dtype=t) for i, t in enumerate(_FLAT)]
     kept, skipped, dropped = torch.empty(num_rays, dtype=torch.int64), *torch.empty(2, num_rays, 1)
-    form = ctypes.c_int(NO_BLENDING if options.form is None else BAKED_SHARES if options.baked else PAPERS_FORM)
-    how = (float(options.threshold), float(options.fair_share), form)
     given = (ctypes.byref(scene), ctypes.byref(packed), starts)
-    call_in_parts("mmpi_march", num_rays, given, (*how, kept, skipped, dropped, *flat))
+    call_in_parts("mmpi_march", num_rays, given, (*how(options), kept, skipped, dropped, *flat))
     return MergedSamples(*_pack(starts, kept, flat), skipped_total=skipped, dropped_mass=dropped)
 
 

@@ -1,23 +1,9 @@
 // Rays through all heads at once: every head's samples come near to far, so the merge takes the nearest head at each
 // step, and a ray ends where nothing behind it can matter. The reference is reference.py.
 #include "cells.h"
-
-#include <limits>
-#include <vector>
+#include "rays.h"
 
 namespace {
-
-constexpr float OPAQUE = 1e-5f;      // light that may be lost behind the end of a ray
-constexpr float NEGLIGIBLE = 1e-4f;  // optical depths below this get an equal share without a lookup
-constexpr float INFINITY_T = 1e-10f; // inverse distances are no less where a distance is needed
-
-struct Rays {
-    const float *origins, *directions;             // [R, 3] world
-    const float *local_origins, *local_directions; // [R, K, 3]
-    const float *u, *v;                            // [R, K, 2]
-    const int64_t* first;                          // [R, H]: m of the nearest plane; the cube's first sample
-    const int64_t* counts;                         // [R, H]
-};
 
 // One head's samples along one ray, looked up a block at a time.
 struct Run {
@@ -91,10 +77,7 @@ void fill_cube(Run& run, const Scene& scene, const Rays& rays, int64_t ray, bool
         const int32_t index = int32_t(run.first + run.begin++);
         const float t = (float(index) + 0.5f) * cube.step;
         const int j = run.size;
-        for (int a = 0; a < 3; a++) {
-            const float x = rays.origins[3 * ray + a] + rays.directions[3 * ray + a] * t;
-            run.ndc[j][a] = 2 * (x - cube.lower[a]) / cube.extent[a] - 1;
-        }
+        place_in_cube(cube, rays, ray, t, run.ndc[j]);
         const Cell x(run.ndc[j][0], grid.width), y(run.ndc[j][1], grid.height), z(run.ndc[j][2], grid.depth);
         const Corners front(grid, z.lower, y.lower, x.lower), back(grid, z.lower + 1, y.lower, x.lower);
         if (skips && !front.stored && !back.stored) continue;
@@ -117,78 +100,12 @@ void advance(Run& run, const Scene& scene, const Rays& rays, int64_t ray, int64_
         fill_cube(run, scene, rays, ray, skips);
 }
 
-// Where a sample lies in head j; false outside its frustum.
-bool place(const Scene& scene, const Rays& rays, int64_t ray, int64_t j, float inverse_t, float* ndc) {
-    if (j < scene.num_mpis) {
-        const Mpi& mpi = scene.mpis[j];
-        const float *o = rays.local_origins + 3 * (ray * scene.num_mpis + j),
-                    *d = rays.local_directions + 3 * (ray * scene.num_mpis + j);
-        const float z = o[2] * inverse_t + d[2];
-        if (!(z > 0)) {
-            ndc[0] = ndc[1] = ndc[2] = 0;
-            return false;
-        }
-        ndc[0] = ((o[0] * inverse_t + d[0]) / z - mpi.u0) * mpi.u_scale - 1;
-        ndc[1] = ((o[1] * inverse_t + d[1]) / z - mpi.v0) * mpi.v_scale - 1;
-        ndc[2] = 1 - (mpi.s_scale * inverse_t / z - mpi.s_scale * mpi.end);
-        const float slack = 16 * std::numeric_limits<float>::epsilon(), s_slack = slack / mpi.share;
-        return std::abs(ndc[0]) <= 1 + slack && std::abs(ndc[1]) <= 1 + slack && std::abs(ndc[2]) <= 1 + s_slack;
-    }
-    bool inside = inverse_t > 0;
-    for (int a = 0; a < 3; a++) {
-        const float x = rays.origins[3 * ray + a] + rays.directions[3 * ray + a] / std::max(inverse_t, INFINITY_T);
-        const float position = 2 * (x - scene.cube->lower[a]) / scene.cube->extent[a] - 1;
-        inside = inside && std::abs(position) <= 1;
-        ndc[a] = std::min(std::max(position, -1.0f), 1.0f);
-    }
-    return inside;
-}
-
-float softplus(float x) { return x > 20 ? x : std::log1p(std::exp(x)); }
-
-// Optical depth of a sample after blending with the share that its texels hold (where reliability stands are shares).
-float blended_baked(const Scene& scene, int64_t own, const float* ndc, float tau) {
-    if (tau <= NEGLIGIBLE) return tau / float(scene.num_heads);
-    const float share = std::min(std::max(trilinear(scene.reliability, scene.grids[own], ndc), 0.0f), 1.0f);
-    if (share == 1) return tau; // the sole cover
-    const float alpha = -std::expm1(-tau) * share;
-    return alpha < 0.5f ? -std::log1p(-alpha) : -std::log(1 - share + share * std::exp(-tau));
-}
-
-// Optical depth of a sample after blending (blending.blend_shares and blended_optical_depth).
-float blended(const Scene& scene, const Rays& rays, int64_t ray, int64_t own, float inverse_t, float tau,
-              std::vector<float>& votes) {
-    if (tau <= NEGLIGIBLE) return tau / float(scene.num_heads);
-    votes.clear();
-    float own_vote = 0, highest = -std::numeric_limits<float>::infinity(), others = 0;
-    for (int64_t j = 0; j < scene.num_heads; j++) {
-        float ndc[3];
-        if (!place(scene, rays, ray, j, inverse_t, ndc) && j != own) continue;
-        const Grid& grid = scene.grids[j];
-        if (j == own) {
-            own_vote = trilinear(scene.reliability, grid, ndc);
-        } else if (scene.touched[nearest_texel(grid, ndc)]) {
-            votes.push_back(trilinear(scene.reliability, grid, ndc));
-            highest = std::max(highest, votes.back());
-        }
-    }
-    if (votes.empty()) return tau; // the sole cover
-    for (float vote : votes) others += std::exp(vote - highest);
-    const float odds = highest - own_vote + std::log(others);
-    const float log_share = -softplus(odds), log_rest = -softplus(-odds);
-    const float alpha = -std::expm1(-tau) * std::exp(log_share);
-    if (alpha < 0.5f) return -std::log1p(-alpha);
-    const float a = log_rest, b = log_share - tau;
-    return std::max(-(std::max(a, b) + softplus(-std::abs(a - b))), 0.0f);
-}
-
 } // namespace
 
 extern "C" {
 
 // Marches rays [begin, end). What they keep is written one ray behind the other, from `starts[begin]` on; where a ray's
 // samples begin, to `starts[ray]`; how many, to `kept[ray]`.
-// form: 0 no blending, 1 the paper's, 2 with baked shares in place of reliability.
 void mmpi_march(const Scene* scene, const Rays* rays, int64_t* starts, int64_t begin, int64_t end,
                 float threshold, float fair_share, int form, int64_t* kept, float* skipped_total, float* dropped_mass,
                 int32_t* heads, int32_t* planes, float* ndc, float* inverse_t, float* taus, float* skipped_before) {
@@ -213,8 +130,7 @@ void mmpi_march(const Scene* scene, const Rays* rays, int64_t* starts, int64_t b
             advance(run, *scene, *rays, ray, h, threshold > 0);
             if (!run.done()) nearest[alive] = run.next(), live[alive++] = h;
         }
-        const float bound = threshold > 0 ? std::min(fair_share / float(std::max<int64_t>(total, 1)), threshold) : -1;
-        const float end_of_light = threshold > 0 ? std::min(bound, OPAQUE) : -1;
+        const Bounds bounds(threshold, fair_share, total);
         starts[ray] = out;
         float light = 1, skipped = 0, dropped = 0;
         while (alive) {
@@ -224,18 +140,17 @@ void mmpi_march(const Scene* scene, const Rays* rays, int64_t* starts, int64_t b
             const int64_t h = live[best];
             Run& run = runs[h];
             const int at = run.at;
-            if (light <= end_of_light) {
+            if (light <= bounds.light) {
                 dropped += light; // no less than what all the rest weighs
                 break;
             }
             float tau = run.tau[at], pass = run.pass[at];
             if (form) {
-                tau = form == 2 ? blended_baked(*scene, h, run.ndc[at], tau)
-                                : blended(*scene, *rays, ray, h, run.inverse_t[at], tau, votes);
+                tau = blended(*scene, *rays, ray, h, run.inverse_t[at], tau, form, votes);
                 pass = std::exp(-tau);
             }
             const float weight = light * (1 - pass);
-            if (weight > bound) {
+            if (weight > bounds.weight) {
                 heads[out] = int32_t(h);
                 planes[out] = run.plane[at];
                 for (int a = 0; a < 3; a++) ndc[3 * out + a] = run.ndc[at][a];

@@ -19,6 +19,9 @@ def show_rays(
 ) -> Shown:
     """What rays gather, how much light they let through, and where. On a GPU nothing is waited for.
 
+    The compiled form on a CPU takes sixteen rays side by side and passes over tiles that are not stored, also where the
+    threshold is 0.
+
     Args:
         layout: the scene.
         tables: densities, reliabilities and which texels were trained.
