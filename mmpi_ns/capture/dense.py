@@ -107,6 +107,18 @@ def camera_matrix(pinhole: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
 
 
+def project(posed: PosedImages, j: int, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Pixels [P, 2] at which a camera shows points [P, 3], lens included; far outside where they are behind it."""
+    pose = posed.camera_to_worlds[j]
+    local = (points - pose[:, 3]) @ pose[:, :3] * [1, -1, -1]  # OpenCV's axes: right, down, ahead
+    ahead = local[:, 2] > 0
+    local = np.where(ahead[:, None], local, [0.0, 0.0, 1.0])[:, None]
+    matrix, still = camera_matrix(posed.intrinsics[j]), np.zeros(3)
+    bend = cv2.fisheye.projectPoints if posed.fisheye else cv2.projectPoints
+    at = bend(local, still, still, matrix, posed.distortion[j])[0].reshape(-1, 2)
+    return np.where(ahead[:, None], at, -1e4)
+
+
 def pixel_grid(shape: tuple[int, ...]) -> tuple[Map, Map]:
     """x and y of pixel centres. [h, w] each"""
     x, y = np.meshgrid(np.arange(shape[1], dtype=np.float32) + 0.5, np.arange(shape[0], dtype=np.float32) + 0.5)

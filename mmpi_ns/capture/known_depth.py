@@ -24,6 +24,7 @@ from mmpi_ns.capture.cache import Arrays, digest, remembered
 from mmpi_ns.capture.dataset import MMPIDataset
 from mmpi_ns.capture.dense import ROUNDS, Depth, Progress, View, camera_matrix, find_depths, look_up
 from mmpi_ns.capture.depth_images import read_depth_image
+from mmpi_ns.capture.lone_depth import alone, continued
 from mmpi_ns.capture.observe import posed_images
 from mmpi_ns.capture.originals import at_full_size
 from mmpi_ns.capture.tracks import PosedImages
@@ -123,7 +124,7 @@ def know_depths(
     if files:
         unit = outputs.metadata.get("depth_unit_scale_factor", 1.0) * outputs.dataparser_scale
         known = with_sensor(known, [Path(f) for f in files], float(unit), original, posed)
-    return known
+    return with_continued(known, posed, dataset)
 
 
 def _remembered_depths(original: PosedImages, posed: PosedImages, observations: Observations) -> KnownDepth:
@@ -228,6 +229,24 @@ def _straightened(
     straighten = cv2.fisheye.undistortPoints if original.fisheye else cv2.undistortPoints
     found = straighten(at, camera_matrix(original.intrinsics[i]), original.distortion[i])[:, 0]
     return np.asarray(found[:, 0], np.float64), np.asarray(found[:, 1], np.float64)
+
+
+def with_continued(known: KnownDepth, posed: PosedImages, dataset: MMPIDataset) -> KnownDepth:
+    """Adds the distances of pixels that show what no other image shows, where surfaces go on (``lone_depth.py``)."""
+    codes = []
+    for i, own in enumerate(known.codes):
+        height, width = own.shape[:2]
+        coords = torch.from_numpy(np.stack(np.indices((height, width)), -1).reshape(-1, 2) + 0.5).float()
+        rays = dataset.cameras.generate_rays(torch.full((len(coords), 1), i), coords=coords)
+        directions = rays.directions.numpy().reshape(height, width, 3)
+        found = continued(known.image(i), directions)
+        rows, columns = np.nonzero(found[..., 0])
+        points = posed.camera_to_worlds[i, :, 3] + directions[rows, columns] / found[rows, columns, :1]
+        lone = alone(posed, i, points)
+        added = own.copy()
+        added[rows[lone], columns[lone]] = packed(found[rows[lone], columns[lone]])
+        codes.append(added)
+    return KnownDepth(tuple(codes))
 
 
 def with_known_depths(observations: Observations, known: KnownDepth, dataset: MMPIDataset) -> Observations:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mmpi_ns.capture.dataset import MMPIDataset
-from mmpi_ns.capture.dense import camera_matrix, look_up
+from mmpi_ns.capture.dense import look_up, project
 from mmpi_ns.capture.known_depth import KnownDepth
 from mmpi_ns.capture.tracks import PosedImages
 
@@ -197,15 +197,3 @@ def _seen_by(
     seen = np.nonzero(same_depth & same_color & (may > 0))[0]
     colors = look_up(image, *at[seen].T[:, :, None]) if len(seen) else np.zeros((0, 1, image.shape[-1]), np.uint8)
     return seen, colors.reshape(len(seen), image.shape[-1])
-
-
-def project(posed: PosedImages, j: int, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Pixels [P, 2] at which a camera shows points [P, 3], lens included; far outside where they are behind it."""
-    pose = posed.camera_to_worlds[j]
-    local = (points - pose[:, 3]) @ pose[:, :3] * [1, -1, -1]  # OpenCV's axes: right, down, ahead
-    ahead = local[:, 2] > 0
-    local = np.where(ahead[:, None], local, [0.0, 0.0, 1.0])[:, None]
-    matrix, still = camera_matrix(posed.intrinsics[j]), np.zeros(3)
-    bend = cv2.fisheye.projectPoints if posed.fisheye else cv2.projectPoints
-    at = bend(local, still, still, matrix, posed.distortion[j])[0].reshape(-1, 2)
-    return np.where(ahead[:, None], at, -1e4)

@@ -1,0 +1,104 @@
+"""Depth of what one training image alone shows: continued from the surfaces about it.
+
+Where no other training image looks, as at the borders of the first image of a drive, nothing can be matched, and
+colours are explained from any distance. Where the surfaces that are known nearby go on, such pixels lie on them: the
+road, a wall. A plane n.x = d is seen along the unit direction v at the inverse distance n.v / d, which is linear in v
+for any lens. So inverse distances are fitted by w.v over the known pixels about a pixel, closely weighted where many
+are near, widely where they are far.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mmpi_ns.capture.dense import project
+from mmpi_ns.capture.tracks import PosedImages
+
+Map = NDArray[np.float32]
+
+WIDTHS = (1 / 80, 1 / 40, 1 / 20, 1 / 10, 1 / 5)
+"""Standard deviations of the weights by distance in the image, as shares of its longer side; the first that knows
+enough is taken."""
+ENOUGH = 0.05
+"""Weighted share of known pixels about a pixel from which a plane is fitted."""
+LEAST_ERROR = 0.05
+"""Relative error of a continued distance at least."""
+MOST_ERROR = 0.3
+"""Relative error from which on it is worth nothing."""
+NEAREST = 16
+"""Cameras nearby that are asked whether they see a point."""
+
+
+def continued(known: Map, directions: Map) -> Map:
+    """Inverse distances of the unknown pixels of an image where planes through the known ones about them say any.
+
+    Args:
+        known: [H, W, 2] inverse distance, 0 where unknown, and its expected error.
+        directions: [H, W, 3] unit directions of the pixels.
+
+    Returns:
+        [H, W, 2] the same of the unknown pixels alone: 0 where known, and where no plane fits.
+    """
+    inverse, error = known[..., 0].astype(np.float64), known[..., 1].astype(np.float64)
+    there = inverse > 0
+    found, missing = np.zeros(known.shape, np.float32), ~there
+    if not there.any():
+        return found
+    scale = float(np.median(inverse[there]))
+    q, v = inverse / scale, directions.astype(np.float64)
+    trust = np.where(there, 1 / (1 + (error / np.maximum(LEAST_ERROR * inverse, 1e-30)) ** 2), 0)
+    parts = [trust, trust * q * q, *(trust * q * v[..., i] for i in range(3))]
+    parts += [trust * v[..., i] * v[..., j] for i, j in _PAIRS]
+    for share in WIDTHS:
+        sums = [cv2.GaussianBlur(p, (0, 0), share * max(inverse.shape), borderType=cv2.BORDER_CONSTANT) for p in parts]
+        rows, columns = np.nonzero(missing & (sums[0] > ENOUGH))
+        at = np.stack([s[rows, columns] for s in sums], -1)
+        value, deviation = _planes(at, v[rows, columns])
+        good = (value > 0) & (deviation < MOST_ERROR * value)
+        rows, columns = rows[good], columns[good]
+        found[rows, columns] = np.stack([value[good], np.maximum(deviation[good], LEAST_ERROR * value[good])], -1)
+        found[rows, columns] *= scale
+        missing[rows, columns] = False
+    return found
+
+
+_PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+
+
+def _planes(
+    sums: NDArray[np.float64], directions: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Fits w.v to weighted pixels, and what that says along directions.
+
+    Args:
+        sums: [P, 11] of weights, weights times q^2, q v (3) and v v^T (6, ``_PAIRS``).
+        directions: [P, 3]
+
+    Returns:
+        q along the directions [P] and its expected error: the scatter about the plane, times what lies outside of the
+        pixels that it was fitted to is worth less.
+    """
+    mean = sums / sums[:, :1]
+    matrix = np.empty((len(sums), 3, 3))
+    for n, (i, j) in enumerate(_PAIRS):
+        matrix[:, i, j] = matrix[:, j, i] = mean[:, 5 + n]
+    matrix += 1e-7 * np.eye(3)
+    solved = np.linalg.solve(matrix, np.stack([mean[:, 2:5], directions], -1))
+    plane, spread = solved[..., 0], solved[..., 1]
+    scatter = np.maximum(mean[:, 1] - (plane * mean[:, 2:5]).sum(-1), 0)
+    leverage = np.maximum((spread * directions).sum(-1), 1)
+    value = (plane * directions).sum(-1)
+    return value, np.sqrt((scatter + (0.2 * LEAST_ERROR * value) ** 2) * leverage)
+
+
+def alone(posed: PosedImages, i: int, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Which points [P, 3] that image i shows lie in no other image near it."""
+    centers = posed.camera_to_worlds[:, :, 3]
+    order = np.argsort(np.linalg.norm(centers - centers[i], axis=-1), kind="stable")
+    lone = np.ones(len(points), bool)
+    for j in [j for j in order if j != i][:NEAREST]:
+        at = project(posed, int(j), points)
+        lone &= ~((at >= 0) & (at <= posed.sizes[j])).all(-1)
+    return lone
