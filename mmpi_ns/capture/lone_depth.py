@@ -19,8 +19,9 @@ from mmpi_ns.capture.tracks import PosedImages
 Map = NDArray[np.float32]
 
 WIDTHS = (1 / 80, 1 / 40, 1 / 20, 1 / 10, 1 / 5)
-"""Standard deviations of the weights by distance in the image, as shares of its longer side; the first that knows
-enough is taken."""
+"""Standard deviations of the weights by distance in the image, as shares of its longer side; the surest fit counts."""
+PIXELS = 4.0
+"""Standard deviation of a blur, at most, at the size at which it is made."""
 ENOUGH = 0.05
 """Weighted share of known pixels about a pixel from which a plane is fitted."""
 LEAST_ERROR = 0.05
@@ -43,7 +44,7 @@ def continued(known: Map, directions: Map) -> Map:
     """
     inverse, error = known[..., 0].astype(np.float64), known[..., 1].astype(np.float64)
     there = inverse > 0
-    found, missing = np.zeros(known.shape, np.float32), ~there
+    found, best = np.zeros(known.shape, np.float32), np.where(there, 0, MOST_ERROR)
     if not there.any():
         return found
     scale = float(np.median(inverse[there]))
@@ -52,16 +53,27 @@ def continued(known: Map, directions: Map) -> Map:
     parts = [trust, trust * q * q, *(trust * q * v[..., i] for i in range(3))]
     parts += [trust * v[..., i] * v[..., j] for i, j in _PAIRS]
     for share in WIDTHS:
-        sums = [cv2.GaussianBlur(p, (0, 0), share * max(inverse.shape), borderType=cv2.BORDER_CONSTANT) for p in parts]
-        rows, columns = np.nonzero(missing & (sums[0] > ENOUGH))
+        sums = [_blurred(p, share * max(inverse.shape)) for p in parts]
+        rows, columns = np.nonzero(~there & (sums[0] > ENOUGH))
         at = np.stack([s[rows, columns] for s in sums], -1)
         value, deviation = _planes(at, v[rows, columns])
-        good = (value > 0) & (deviation < MOST_ERROR * value)
-        rows, columns = rows[good], columns[good]
-        found[rows, columns] = np.stack([value[good], np.maximum(deviation[good], LEAST_ERROR * value[good])], -1)
-        found[rows, columns] *= scale
-        missing[rows, columns] = False
+        relative = np.where(value > 0, np.maximum(deviation / np.maximum(value, 1e-12), LEAST_ERROR), np.inf)
+        good = relative < best[rows, columns]
+        rows, columns, value, relative = rows[good], columns[good], value[good], relative[good]
+        best[rows, columns] = relative
+        found[rows, columns] = scale * np.stack([value, relative * value], -1)
     return found
+
+
+def _blurred(image: NDArray[np.float64], deviation: float) -> NDArray[np.float64]:
+    """An image blurred widely, nothing beyond its borders; at a size at which that takes a few pixels."""
+    height, width = image.shape
+    shrink = max(1.0, deviation / PIXELS)
+    small = cv2.resize(
+        image, (max(1, round(width / shrink)), max(1, round(height / shrink))), interpolation=cv2.INTER_AREA
+    )
+    small = cv2.GaussianBlur(small, (0, 0), deviation / shrink, borderType=cv2.BORDER_CONSTANT)
+    return np.asarray(cv2.resize(small, (width, height), interpolation=cv2.INTER_LINEAR))
 
 
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))

@@ -1,0 +1,131 @@
+"""Depths continued into what one image alone shows: planes go on, what is no plane does not, errors say how far."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from nerfstudio.cameras.cameras import Cameras
+
+from mmpi_ns.capture.known_depth import KnownDepth, with_continued
+from mmpi_ns.capture.lone_depth import LEAST_ERROR, MOST_ERROR, alone, continued
+from mmpi_ns.capture.tracks import PosedImages
+
+F32 = np.float32
+WIDTH, HEIGHT, FOCAL = 96, 64, 60.0
+
+
+def directions(shape=(HEIGHT, WIDTH), focal=FOCAL):
+    """Unit directions of a pinhole's pixels, its own axes (OpenGL). [H, W, 3]"""
+    rows, columns = np.indices(shape) + 0.5
+    d = np.stack([(columns - shape[1] / 2) / focal, (shape[0] / 2 - rows) / focal, -np.ones(shape)], -1)
+    return (d / np.linalg.norm(d, axis=-1, keepdims=True)).astype(F32)
+
+
+def plane(normal, distance, d):
+    """Inverse distances of the plane normal . x = distance, by meeting each ray with it."""
+    t = distance / (d.astype(np.float64) @ np.asarray(normal, float))
+    return np.where(t > 0, 1 / np.where(t > 0, t, 1), 0)
+
+
+def seen(inverse, kept, error=0.01):
+    inverse = np.where(kept, inverse, 0)
+    return np.stack([inverse, error * inverse], -1).astype(F32)
+
+
+def middle(margin=24):
+    kept = np.zeros((HEIGHT, WIDTH), bool)
+    kept[margin // 2 : -margin // 2, margin:-margin] = True
+    return kept
+
+
+@pytest.mark.parametrize("normal", [(0, 0, -1), (0.5, 0.1, -0.8), (0.3, -0.9, -0.3), (-0.7, 0.0, -0.7)])
+@pytest.mark.parametrize("unit", [1e-3, 1.0, 1e4])
+def test_a_plane_goes_on(normal, unit):
+    """Where a slanted plane is known in the middle, its distances follow outside, in any unit of length."""
+    d, kept = directions(), middle()
+    exact = plane(normal, 5 * unit, d)
+    found = continued(seen(exact, kept & (exact > 0)), d)
+    added = found[..., 0] > 0
+    assert not added[kept].any()
+    assert added[~kept & (exact > 0)].mean() > 0.6
+    relative = np.abs(found[added][:, 0] / exact[added] - 1)
+    assert (
+        np.median(relative) < 0.01 and (relative < np.maximum(3 * found[added][:, 1] / found[added][:, 0], 1e-3)).all()
+    )
+
+
+def test_errors_grow_with_the_way_that_is_continued():
+    d = directions()
+    noise = 1 + 0.02 * np.random.default_rng(0).standard_normal((HEIGHT, WIDTH))
+    found = continued(seen(plane((0.2, 0, -1), 5, d) * noise, middle(30)), d)
+    relative = (found[..., 1] / np.maximum(found[..., 0], 1e-9))[HEIGHT // 2]
+    assert relative[29] >= LEAST_ERROR * 0.999 and relative[8] > 1.2 * relative[28]
+    assert relative.max() < MOST_ERROR
+
+
+def test_what_is_no_plane_is_not_continued():
+    """Distances without any order, a factor of ten apart."""
+    kept = middle()
+    inverse = 10 ** np.random.default_rng(1).uniform(-1, 0, (HEIGHT, WIDTH))
+    found = continued(seen(inverse, kept), directions())
+    assert (found[..., 0] > 0).mean() < 0.02
+
+
+def test_nothing_known_or_everything_known_adds_nothing():
+    d = directions()
+    assert not continued(np.zeros((HEIGHT, WIDTH, 2), F32), d).any()
+    assert not continued(seen(plane((0, 0, -1), 5, d), np.ones((HEIGHT, WIDTH), bool)), d).any()
+
+
+def test_the_trusted_of_two_surfaces_is_continued():
+    """A near wall known badly over a far one known well: the far one goes on."""
+    d, rng = directions(), np.random.default_rng(2)
+    far, near = plane((0, 0, -1), 10, d), plane((0, 0, -1), 9, d)
+    bad = rng.random((HEIGHT, WIDTH)) < 0.5
+    known = seen(far, middle())
+    known[bad] = seen(near, middle(), error=0.5)[bad]
+    found = continued(known, d)
+    added = found[..., 0] > 0
+    assert added.any()
+    assert np.abs(found[added][:, 0] / far[added] - 1).max() < 0.01
+
+
+def posed(*places, lens=(0.0, 0.0, 0.0, 0.0)):
+    """Cameras that look along -z from these places."""
+    poses = np.tile(np.eye(4)[:3], (len(places), 1, 1))
+    poses[:, :, 3] = places
+    count = len(places)
+    intrinsics = np.tile([FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2], (count, 1))
+    sizes = np.tile([float(WIDTH), HEIGHT], (count, 1))
+    return PosedImages(("x.png",) * count, poses, intrinsics, sizes, np.tile(lens, (count, 1)).astype(float))  # type: ignore[arg-type]
+
+
+def test_what_no_other_image_shows_is_alone():
+    """The second camera stands further on: it sees the middle of what the first one sees, nothing behind itself."""
+    images = posed((0, 0, 0), (0, 0, -3))
+    points = np.array([[0.0, 0, -10], [7.0, 0, -10], [0.0, 0, -2], [5.0, 0.0, -10]])
+    assert alone(images, 0, points).tolist() == [False, True, True, False]  # 48 / 60 * 7 = 5.6 is its border
+    assert not alone(images, 1, points[:1]).any()
+    assert alone(posed((0, 0, 0)), 0, points).all()
+
+
+def test_the_border_of_the_first_image_of_a_drive_gets_a_depth():
+    """Two images along the way to a wall: the first one's border is its own; of the second nothing is."""
+    images, d = posed((0, 0, 0), (0, 0, -4)), directions()
+    distances = 10.0, 6.0
+    known = [seen(plane((0, 0, -1), t, d), middle()) for t in distances]
+    cameras = Cameras(
+        torch.tensor(images.camera_to_worlds).float(), FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, width=WIDTH, height=HEIGHT
+    )
+    dataset = type("Images", (), {"cameras": cameras})()
+    found = with_continued(KnownDepth.of(known), images, dataset)
+    first, second = (found.image(i) for i in range(2))
+    exact = plane((0, 0, -1), 10, d)
+    points = d / np.maximum(exact, 1e-9)[..., None]
+    beyond = (np.abs(points[..., 0]) > 0.8 * 6) | (np.abs(points[..., 1]) > HEIGHT / 2 / FOCAL * 6)
+    added = (first[..., 0] > 0) & ~middle()
+    assert added[beyond & ~middle()].mean() > 0.8 and not added[~beyond].any()
+    assert first[added][:, 0] == pytest.approx(exact[added], rel=0.02)
+    assert np.array_equal(second, KnownDepth.of(known).image(1)), "the first image shows all that the second shows"
+    assert np.array_equal(first[middle()], KnownDepth.of(known).image(0)[middle()])
