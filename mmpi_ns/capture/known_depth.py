@@ -24,7 +24,7 @@ from mmpi_ns.capture.cache import Arrays, digest, remembered
 from mmpi_ns.capture.dataset import MMPIDataset
 from mmpi_ns.capture.dense import ROUNDS, Depth, Progress, View, camera_matrix, find_depths, look_up
 from mmpi_ns.capture.depth_images import read_depth_image
-from mmpi_ns.capture.lone_depth import alone, continued
+from mmpi_ns.capture.lone_depth import MOST_OTHERS, continued, others_that_see
 from mmpi_ns.capture.observe import posed_images
 from mmpi_ns.capture.originals import at_full_size
 from mmpi_ns.capture.tracks import PosedImages
@@ -232,7 +232,7 @@ def _straightened(
 
 
 def with_continued(known: KnownDepth, posed: PosedImages, dataset: MMPIDataset) -> KnownDepth:
-    """Adds the distances of pixels that show what no other image shows, where surfaces go on (``lone_depth.py``)."""
+    """Adds distances of pixels that show what hardly any other image shows, where surfaces go on (``lone_depth.py``)."""
     codes = []
     for i, own in enumerate(known.codes):
         height, width = own.shape[:2]
@@ -242,7 +242,7 @@ def with_continued(known: KnownDepth, posed: PosedImages, dataset: MMPIDataset) 
         found = continued(known.image(i), directions)
         rows, columns = np.nonzero(found[..., 0])
         points = posed.camera_to_worlds[i, :, 3] + directions[rows, columns] / found[rows, columns, :1]
-        lone = alone(posed, i, points)
+        lone = others_that_see(posed, i, points) <= MOST_OTHERS
         added = own.copy()
         added[rows[lone], columns[lone]] = packed(found[rows[lone], columns[lone]])
         codes.append(added)

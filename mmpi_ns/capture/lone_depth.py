@@ -1,8 +1,8 @@
-"""Depth of what one training image alone shows: continued from the surfaces about it.
+"""Depth of what hardly any other training image shows: continued from the surfaces about it.
 
-Where no other training image looks, as at the borders of the first image of a drive, nothing can be matched, and
-colours are explained from any distance. Where the surfaces that are known nearby go on, such pixels lie on them: the
-road, a wall. A plane n.x = d is seen along the unit direction v at the inverse distance n.v / d, which is linear in v
+Where at most one other training image looks, as at the borders of the first image of a drive, little can be matched,
+and colours are explained from many a distance. Where the surfaces that are known nearby go on, such pixels lie on them:
+the road, a wall. A plane n.x = d is seen along the unit direction v at the inverse distance n.v / d, which is linear in v
 for any lens. So inverse distances are fitted by w.v over the known pixels about a pixel, closely weighted where many
 are near, widely where they are far.
 """
@@ -29,7 +29,9 @@ LEAST_ERROR = 0.05
 MOST_ERROR = 0.3
 """Relative error from which on it is worth nothing."""
 NEAREST = 16
-"""Cameras nearby that are asked whether they see a point."""
+"""Images nearby that are asked whether they show a point."""
+MOST_OTHERS = 1
+"""Images beside its own in which a continued point may lie: where there are more, matches and colours know better."""
 
 
 def continued(known: Map, directions: Map) -> Map:
@@ -105,12 +107,12 @@ def _planes(
     return value, np.sqrt((scatter + (0.2 * LEAST_ERROR * value) ** 2) * leverage)
 
 
-def alone(posed: PosedImages, i: int, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which points [P, 3] that image i shows lie in no other image near it."""
+def others_that_see(posed: PosedImages, i: int, points: NDArray[np.float64]) -> NDArray[np.int64]:
+    """In how many of the images near image i the points [P, 3] lie, which it shows."""
     centers = posed.camera_to_worlds[:, :, 3]
     order = np.argsort(np.linalg.norm(centers - centers[i], axis=-1), kind="stable")
-    lone = np.ones(len(points), bool)
-    for j in [j for j in order if j != i][:NEAREST]:
+    count = np.zeros(len(points), np.int64)
+    for j in [j for j in order if j != i][:NEAREST] if len(points) else []:
         at = project(posed, int(j), points)
-        lone &= ~((at >= 0) & (at <= posed.sizes[j])).all(-1)
-    return lone
+        count += ((at >= 0) & (at <= posed.sizes[j])).all(-1)
+    return count
