@@ -232,7 +232,7 @@ def _straightened(
 
 
 def with_continued(known: KnownDepth, posed: PosedImages, dataset: MMPIDataset) -> KnownDepth:
-    """Adds distances of pixels that show what hardly any other image shows, where surfaces go on (``lone_depth.py``)."""
+    """Adds distances of what hardly any other image shows, where surfaces go on (``lone_depth.py``)."""
     codes = []
     for i, own in enumerate(known.codes):
         height, width = own.shape[:2]

@@ -2,9 +2,8 @@
 
 Where at most one other training image looks, as at the borders of the first image of a drive, little can be matched,
 and colours are explained from many a distance. Where the surfaces that are known nearby go on, such pixels lie on them:
-the road, a wall. A plane n.x = d is seen along the unit direction v at the inverse distance n.v / d, which is linear in v
-for any lens. So inverse distances are fitted by w.v over the known pixels about a pixel, closely weighted where many
-are near, widely where they are far.
+the road, a wall. A plane n.x = d is seen along the unit direction v at the inverse distance n.v / d, which is linear in
+v for any lens. So inverse distances are fitted by w.v over the known pixels about a pixel.
 """
 
 from __future__ import annotations

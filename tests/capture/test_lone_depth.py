@@ -1,4 +1,4 @@
-"""Depths continued into what hardly another image shows: planes go on, what is no plane does not, errors say how far."""
+"""Depths continued into what hardly another image shows: planes go on, nothing else does, and errors say how far."""
 
 from __future__ import annotations
 
