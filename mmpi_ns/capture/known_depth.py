@@ -236,7 +236,7 @@ def with_continued(known: KnownDepth, posed: PosedImages, dataset: MMPIDataset) 
     codes = []
     for i, own in enumerate(known.codes):
         height, width = own.shape[:2]
-        coords = torch.from_numpy(np.stack(np.indices((height, width)), -1).reshape(-1, 2) + 0.5).float()
+        coords = torch.from_numpy(np.moveaxis(np.indices((height, width)), 0, -1).reshape(-1, 2) + 0.5).float()
         rays = dataset.cameras.generate_rays(torch.full((len(coords), 1), i), coords=coords)
         directions = rays.directions.numpy().reshape(height, width, 3)
         found = continued(known.image(i), directions)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -120,7 +123,7 @@ def test_the_border_of_the_first_image_of_a_drive_gets_a_depth(between):
     cameras = Cameras(
         torch.tensor(images.camera_to_worlds).float(), FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, width=WIDTH, height=HEIGHT
     )
-    dataset = type("Images", (), {"cameras": cameras})()
+    dataset: Any = SimpleNamespace(cameras=cameras)
     found = with_continued(KnownDepth.of(known), images, dataset)
     first, exact = found.image(0), plane((0, 0, -1), 10, d)
     points = d / exact[..., None]
