@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 
@@ -40,6 +40,12 @@ class Observations:
     lens: Array | None = None
     """[M, G, G, 3] unit directions, in camera axes, through a grid over each image from border to border, row after
     row; None where all cameras are pinholes."""
+
+    @staticmethod
+    def of_cameras(camera_to_worlds: Array, intrinsics: ArrayLike, sizes: ArrayLike) -> Observations:
+        """Cameras of which no point is known."""
+        numbers, none = (np.array(x, np.float64) for x in (intrinsics, sizes)), np.zeros(0, np.int64)
+        return Observations(camera_to_worlds, *numbers, np.zeros((0, 3)), none, none, np.zeros((0, 2)))
 
     @property
     def centers(self) -> Array:

@@ -11,7 +11,7 @@ from hand_made import random_mpi, random_votes, unit
 from random_fields import OracleRay, random_field, random_rays
 
 from mmpi_ns.bench.stability import exact
-from mmpi_ns.bench.stability.exact_ray import ExactField, ExactRay
+from mmpi_ns.bench.stability.exact_ray import ExactField, ExactRay, Gradients
 
 FORMS = ["paper", "opacity", None]
 
@@ -122,13 +122,11 @@ def test_gradients_of_a_whole_ray_are_its_finite_differences(form):
     field = random_field(2, True, seed=4)
     known = ExactField.of(field)
     origin, direction = (x[0] for x in random_rays(field.plan, 1, seed=5))
-    by_color, total, size = np.array([1.0, -0.7, 0.4]), known.zeros(), known.zeros()
-    ExactRay(known, origin, direction).add_gradient(by_color, form, total, size)
+    by_color, total = np.array([1.0, -0.7, 0.4]), Gradients(known)
+    ExactRay(known, origin, direction).add_gradient(by_color, form, total)
     checked = 0
     for name in ("density", "features", "reliability", "networks"):
-        tables = getattr(known, name) if name != "networks" else [known.networks]
-        gradients = getattr(total, name) if name != "networks" else [total.networks]
-        for table, gradient in zip(tables, gradients, strict=True):
+        for table, gradient in zip(known.tables[name], total.sums[name], strict=True):
             strongest = np.argsort(-np.abs(gradient), axis=None)[:4]
             for index in (np.unravel_index(i, table.shape) for i in strongest):
                 values = []

@@ -38,45 +38,40 @@ class Regions(Bench):
         points = manager.observations.points
         if not len(points):
             raise ValueError("The scene has no SfM points in colmap/sparse/0: nothing to expect errors of.")
-        expected, errors, slopes = [], [], []
+        found: list[tuple[float, ...]] = []
         for camera, truth in images_of(pipeline):
             with torch.no_grad():
                 rgb = model.get_outputs_for_camera(camera)["rgb"].cpu()
-            squared = ((rgb - truth) ** 2).mean(-1).numpy()
-            found = self._regions(
-                _as_observations(camera), points, model.field.plan, squared, squared_slope(truth.numpy())
-            )
-            for values, more in zip((expected, errors, slopes), found, strict=True):
-                values += more
+            squared = ((rgb - truth) ** 2).mean(-1).numpy(), squared_slope(truth.numpy())
+            found += self._regions(_as_observations(camera), points, model.field.plan, *squared)
+        expected, errors, slopes = np.array(found).T
         # A pixel of displacement costs what the image changes over a pixel: nothing on a plain wall.
-        pixels = np.array(errors) / np.maximum(slopes, 1e-6)
-        found = {"regions": len(expected), "rank_correlation": spearman(np.array(expected), np.array(errors))}
-        found["rank_correlation_in_pixels"] = spearman(np.array(expected), pixels)
+        head = {"regions": len(found), "rank_correlation": spearman(expected, errors)}
+        head["rank_correlation_in_pixels"] = spearman(expected, errors / np.maximum(slopes, 1e-6))
         report = Report(self, key=None)
         said = "Rank correlation of the expected error with the error of colours in {regions} regions of test images:"
         said += " {rank_correlation:.2f}; with that error in pixels {rank_correlation_in_pixels:.2f}."
-        report.finish(found, page("Expected and measured errors", report.content["made"], said.format(**found)))
-        print(found)
+        report.finish(head, page("Expected and measured errors", report.content["made"], said.format(**head)))
+        print(head)
 
-    def _regions(self, camera: Observations, points: Array, plan: ScenePlan, *squared: Array) -> list[list[float]]:
+    def _regions(
+        self, camera: Observations, points: Array, plan: ScenePlan, *squared: Array
+    ) -> list[tuple[float, ...]]:
         """Median expected error, then the root means of maps of squares [H, W], of every region with enough points."""
-        only = np.zeros(len(points), np.int64)
+        only, found = np.zeros(len(points), np.int64), []
         pixels, ahead = camera.project(only, points)
         height, width = squared[0].shape
-        row = np.floor(pixels[:, 1] / height * self.rows).astype(int)
-        column = np.floor(pixels[:, 0] / width * self.columns).astype(int)
+        row = np.floor(pixels[:, 1] / height * self.rows)
+        column = np.floor(pixels[:, 0] / width * self.columns)
         errors = pixel_errors(plan, camera, only, points).combined.min(-1)
-        found: list[list[float]] = [[] for _ in range(1 + len(squared))]
-        for r in range(self.rows):
-            for c in range(self.columns):
-                inside = ahead & (row == r) & (column == c)
-                if inside.sum() < MIN_POINTS:
-                    continue
-                rows = slice(r * height // self.rows, (r + 1) * height // self.rows)
-                columns = slice(c * width // self.columns, (c + 1) * width // self.columns)
-                found[0].append(float(np.median(np.minimum(errors[inside], WORST))))
-                for values, area in zip(found[1:], squared, strict=True):
-                    values.append(float(np.sqrt(area[rows, columns].mean())))
+        for r, c in np.ndindex(self.rows, self.columns):
+            inside = ahead & (row == r) & (column == c)
+            if inside.sum() < MIN_POINTS:
+                continue
+            rows = slice(r * height // self.rows, (r + 1) * height // self.rows)
+            columns = slice(c * width // self.columns, (c + 1) * width // self.columns)
+            areas = (float(np.sqrt(area[rows, columns].mean())) for area in squared)
+            found.append((float(np.median(np.minimum(errors[inside], WORST))), *areas))
         return found
 
 
@@ -100,13 +95,5 @@ def _ranks(values: Array) -> Array:
 def _as_observations(camera) -> Observations:
     """One nerfstudio camera, without points."""
     flat = [float(x) for x in (camera.fx, camera.fy, camera.cx, camera.cy)]
-    empty = np.zeros(0, np.int64)
-    return Observations(
-        camera_to_worlds=camera.camera_to_worlds.double().cpu().numpy(),
-        intrinsics=np.array([flat]),
-        sizes=np.array([[float(camera.width), float(camera.height)]]),
-        points=np.zeros((0, 3)),
-        seen_by=empty,
-        seen_point=empty,
-        seen_at=np.zeros((0, 2)),
-    )
+    size = [float(camera.width), float(camera.height)]
+    return Observations.of_cameras(camera.camera_to_worlds.double().cpu().numpy(), [flat], [size])

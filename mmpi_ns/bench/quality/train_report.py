@@ -132,15 +132,16 @@ def _memory(row: Row) -> str:
     return f"{g.mean('peak_gib'):.2f}{on_gpu}"
 
 
-def _given(row: Row) -> str:
-    """What the method was given beside training images and poses."""
-    name = row["g"].method.removesuffix(QUICK)
-    return METHODS[name].given if name in METHODS else ""
+def _rate(curve: list[dict[str, float]]) -> float:
+    """Training rays/s from the first look to the last: without the start, in which nerfacto waits for its batches."""
+    first, last = curve[0] if len(curve) > 1 else {"rays": 0, "seconds": 0.0}, curve[-1]
+    return (last["rays"] - first["rays"]) / (last["seconds"] - first["seconds"])
 
 
+GIVEN = {name: method.given for name, method in METHODS.items()}
 _COLUMNS = {
     "method": "{g.method}",
-    "was given, beside images and poses": _given,
+    "was given, beside images and poses": lambda r: GIVEN.get(r["g"].method.removesuffix(QUICK), ""),
     "steps": "{g.steps}",
     "M rays": lambda r: f"{r['g'].mean('rays') / 1e6:.2f}",
     "seconds (set up)": lambda r: f"{r['g'].mean('seconds'):.0f} ({r['g'].mean('setup_seconds'):.0f})",
@@ -155,21 +156,15 @@ _COLUMNS = {
 }
 
 
-def _rate(curve: list[dict[str, float]]) -> float:
-    """Training rays/s from the first look to the last: without the start, in which nerfacto waits for its batches."""
-    first, last = curve[0] if len(curve) > 1 else {"rays": 0, "seconds": 0.0}, curve[-1]
-    return (last["rays"] - first["rays"]) / (last["seconds"] - first["seconds"])
-
-
 def _times(groups: list[Group]) -> str:
     """PSNR of every method at equal times."""
-    rows: list[Row] = [{"": f"{g.method}, {g.steps} steps", "curve": g.curve} for g in groups]
-    for row in rows:
-        at = {f"{t} s": row["curve"].at(t) for t in TIMES}
-        row |= {name: "" if psnr is None else f"{psnr:.2f}" for name, psnr in at.items()}
-        row["at the end"] = f"{row['curve'].psnr[-1]:.2f} ({row['curve'].seconds[-1]:.0f} s)"
-    shown = [f"{t} s" for t in TIMES if any(r[f"{t} s"] for r in rows)]
-    return table({name: lambda r, name=name: r[name] for name in ("", *shown, "at the end")}, rows)
+    rows: list[Row] = []
+    for g in groups:
+        at = {f"{t} s": g.curve.at(t) for t in TIMES}
+        row = {"": f"{g.method}, {g.steps} steps"} | {t: "" if p is None else f"{p:.2f}" for t, p in at.items()}
+        rows.append(row | {"at the end": f"{g.curve.psnr[-1]:.2f} ({g.curve.seconds[-1]:.0f} s)"})
+    shown = [name for name in rows[0] if any(r[name] for r in rows)]
+    return table({name: lambda r, name=name: r[name] for name in shown}, rows)
 
 
 def draw(path: Path, rows: dict[str, Row]) -> None:

@@ -26,17 +26,13 @@ TABLES = ("density", "features", "reliability", "networks")
 
 @dataclass(frozen=True)
 class ExactField:
-    """A field as arrays; per-head tables are [planes, height, width, channels]."""
+    """A field as arrays."""
 
     plan: ScenePlan
-    density: list[Array]
-    features: list[Array]
-    reliability: list[Array]
-    touched: list[Array]
-    networks: Array
-    """[N, weights], one row per head or one for all."""
+    tables: dict[str, list[Array]]
+    """By name, of each head: [planes, height, width, channels]; of the networks [N, weights], a row a head or one."""
     layers: list[tuple[int, ...]]
-    """Shapes of weights and biases in such a row."""
+    """Shapes of weights and biases in a network's row."""
     frequencies: tuple[int, int]
     shading: str
     """Whether a network is asked once a ray or for every sample."""
@@ -48,44 +44,34 @@ class ExactField:
     def of(source) -> ExactField:
         """The state of an ``MMPIField``, in float64."""
 
-        def split(table) -> list[Array]:
-            flat = table.detach().double().cpu()
+        def split(name: str) -> list[Array]:
+            flat = getattr(source, name).detach().double().cpu()
             return [flat[g.rows].view(g.depth, g.height, g.width, -1).numpy() for g in source.grids]
 
         networks = source.networks
-        return ExactField(
-            source.plan,
-            split(source.density),
-            split(source.features),
-            split(source.reliability),
-            split(source.touched),
-            networks.weights.detach().double().cpu().numpy(),
-            list(networks.shapes),
-            (getattr(networks, "position_frequencies", 0), networks.direction_frequencies),
-            source.shading,
-            source.depth_scale,
-            source.samples_per_voxel,
-            source.cube_alpha,
-        )
-
-    def zeros(self) -> Gradients:
-        d, f, r = ([np.zeros_like(t) for t in table] for table in (self.density, self.features, self.reliability))
-        return Gradients(d, f, r, np.zeros_like(self.networks))
+        tables = {name: split(name) for name in (*TABLES[:3], "touched")}
+        tables["networks"] = [networks.weights.detach().double().cpu().numpy()]
+        frequencies = getattr(networks, "position_frequencies", 0), networks.direction_frequencies
+        numbers = source.shading, source.depth_scale, source.samples_per_voxel, source.cube_alpha
+        return ExactField(source.plan, tables, list(networks.shapes), frequencies, *numbers)
 
 
-@dataclass
 class Gradients:
-    """Derivatives by every table, in the tables' shapes."""
+    """Derivatives by every table of a field, and the magnitudes that each is made of, in the tables' shapes."""
 
-    density: list[Array]
-    features: list[Array]
-    reliability: list[Array]
-    networks: Array
+    def __init__(self, field: ExactField) -> None:
+        self.sums, self.sizes = ({n: [np.zeros_like(t) for t in field.tables[n]] for n in TABLES} for _ in range(2))
 
-    def flat(self, name: str) -> Array:
-        """One table's derivatives, [texels, channels], head by head in reading order."""
-        value = getattr(self, name)
-        return value if name == "networks" else np.concatenate([t.reshape(-1, t.shape[-1]) for t in value])
+    def add(self, name: str, head: int, corners: Corners, value: Array | float, size: Array | float) -> None:
+        """Adds what a lookup's gradient is to the texels that were read."""
+        for index, weight in corners:
+            self.sums[name][head][index] += weight * value
+            self.sizes[name][head][index] += weight * np.abs(size)
+
+    @staticmethod
+    def flat(tables: dict[str, list[Array]], name: str) -> Array:
+        """One table's sums or sizes, [texels, channels], head by head in reading order."""
+        return np.concatenate([t.reshape(-1, t.shape[-1]) for t in tables[name]])
 
 
 @dataclass(frozen=True)
@@ -159,17 +145,18 @@ class ExactRay:
 
     def _sample(self, k: int, plane: int, q: tuple[float, float], ndc: Array) -> Sample:
         f, plan, (inverse_t, size_q) = self.field, self.field.plan, q
+        densities = f.tables["density"][k]
         if k < len(plan.mpis):
             mpi = plan.mpis[k]
-            corners = [((plane, *at), w) for at, w in corners_of(ndc[1::-1], f.density[k].shape[1:3])]
+            corners = [((plane, *at), w) for at, w in corners_of(ndc[1::-1], densities.shape[1:3])]
             axes, step = np.array(mpi.axes), (1 / mpi.near - 1 / mpi.far) / (mpi.planes - 1)
             bias, scale = exact.plane_bias(mpi.planes, 1 / mpi.far / step)[0][plane], 256 / mpi.planes * f.depth_scale
         else:
-            corners, axes = corners_of(ndc[::-1], f.density[k].shape[:3]), np.eye(3)
+            corners, axes = corners_of(ndc[::-1], densities.shape[:3]), np.eye(3)
             scale = 1 / f.samples_per_voxel
             bias = math.log(math.expm1(-math.log1p(-f.cube_alpha) / scale))
-        raw = self._read(f.density[k], corners, abs(bias))[0] + bias
-        features = self._read(f.features[k], corners)
+        raw = self._read(densities, corners, abs(bias))[0] + bias
+        features = self._read(f.tables["features"][k], corners)
         votes, cover, vote_corners = self._votes(k, inverse_t, ndc)
         tau = float(self.jitter(exact.softplus(raw) * scale))
         inputs, color = features, exact.sigmoid(features[:3])
@@ -185,7 +172,7 @@ class ExactRay:
 
     def _votes(self, own: int, inverse_t: float, own_ndc: Array):
         """Reliability of every head at a sample, which of them cover it, and the texels that were read."""
-        f, plan = self.field, self.field.plan
+        plan, tables = self.field.plan, self.field.tables
         votes, cover, read = [], [], []
         for j in range(plan.num_heads):
             if j == own:
@@ -208,11 +195,12 @@ class ExactRay:
                 cover.append(False)
                 read.append([])
                 continue
-            corners = corners_of(np.clip(ndc, -1, 1)[::-1], f.reliability[j].shape[:3])
-            nearest, gap = _nearest(ndc[::-1], f.touched[j].shape[:3])
-            trained = bool(f.touched[j][nearest][0])
-            self.margin = min(self.margin, gap) if not f.touched[j].all() else self.margin
-            votes.append(float(self._read(f.reliability[j], corners)[0]))
+            corners = corners_of(np.clip(ndc, -1, 1)[::-1], tables["reliability"][j].shape[:3])
+            touched = tables["touched"][j]
+            nearest, gap = _nearest(ndc[::-1], touched.shape[:3])
+            trained = bool(touched[nearest][0])
+            self.margin = min(self.margin, gap) if not touched.all() else self.margin
+            votes.append(float(self._read(tables["reliability"][j], corners)[0]))
             cover.append(j == own or trained)
             read.append(corners)
         return np.array(votes), np.array(cover), read
@@ -227,8 +215,11 @@ class ExactRay:
             parts += [x, np.sin(angles), np.cos(angles)]
         return np.concatenate(parts)
 
+    def _row(self, head: int) -> int:
+        return head if len(self.field.tables["networks"][0]) > 1 else 0
+
     def _weights(self, head: int) -> list[Array]:
-        row = self.field.networks[head if len(self.field.networks) > 1 else 0]
+        row = self.field.tables["networks"][0][self._row(head)]
         ends = np.cumsum([math.prod(s) for s in self.field.layers])
         return [part.reshape(s) for part, s in zip(np.split(row, ends[:-1]), self.field.layers, strict=True)]
 
@@ -267,48 +258,43 @@ class ExactRay:
         odds = np.exp(8 * np.tanh(change / 8)) * mean[:3]
         return made.accumulation * odds / (odds + 1 - mean[:3])
 
-    def add_gradient(self, by_color: Array, form: str | None, total: Gradients, size: Gradients) -> None:
-        """Adds the derivatives of ``by_color`` . colour, and to ``size`` the magnitudes of all that is added."""
+    def add_gradient(self, by_color: Array, form: str | None, total: Gradients) -> None:
+        """Adds the derivatives of ``by_color`` . colour, and the magnitudes of all that is added."""
         blended = self.blended(form)
         taus = np.array([b.depth for b in blended])
         made = exact.composite(taus)
         by_weight = np.array([float(by_color @ s.color) for s in self.samples])
         by_depth = exact.composite_gradient(taus, by_weight, 0.0)
-        by_depth_size = exact.composite_gradient(taus, np.abs(by_weight), 0.0)
+        sizes = exact.composite_gradient(taus, np.abs(by_weight), 0.0)
         # Both terms of that difference count: the light that a sample stops and what it takes from those behind.
-        by_depth_size = np.abs(by_depth_size) + 2 * float(np.abs(by_weight) @ made.weights)
+        sizes = np.abs(sizes) + 2 * float(np.abs(by_weight) @ made.weights)
         for i, (s, b) in enumerate(zip(self.samples, blended, strict=True)):
             raw = b.by_tau * s.scale * float(exact.sigmoid(s.raw))
-            _scatter(total.density[s.head], size.density[s.head], s.corners, by_depth[i] * raw, by_depth_size[i] * raw)
-            for j, corners in enumerate(s.vote_corners):
-                slope = b.by_reliability[j]
-                _scatter(
-                    total.reliability[j], size.reliability[j], corners, by_depth[i] * slope, by_depth_size[i] * slope
-                )
-            self._add_color(s, by_color * made.weights[i], total, size)
+            total.add("density", s.head, s.corners, by_depth[i] * raw, sizes[i] * raw)
+            for j, (slope, corners) in enumerate(zip(b.by_reliability, s.vote_corners, strict=True)):
+                total.add("reliability", j, corners, by_depth[i] * slope, sizes[i] * slope)
+            self._add_color(s, by_color * made.weights[i], total)
 
-    def _add_color(self, s: Sample, by_color: Array, total: Gradients, size: Gradients) -> None:
+    def _add_color(self, s: Sample, by_color: Array, total: Gradients) -> None:
         """Backwards through a colour network."""
-        features = s.inputs[: self.field.features[s.head].shape[-1]]
+        channels = self.field.tables["features"][s.head].shape[-1]
         logits, h1, h2, x = self._network(s.head, s.inputs)
-        color = exact.sigmoid(features[:3] + logits)
-        w1, _, w2, _, w3, _ = self._weights(s.head)
+        color = exact.sigmoid(s.inputs[:3] + logits)
         by_logit = by_color * color * (1 - color)
-        by_h2 = (w3.T @ by_logit) * (h2 > 0)
-        by_h1 = (w2.T @ by_h2) * (h1 > 0)
-        size_h2 = (np.abs(w3).T @ np.abs(by_logit)) * (h2 > 0)
-        size_h1 = (np.abs(w2).T @ size_h2) * (h1 > 0)
-        by_features, size_features = w1.T @ by_h1, np.abs(w1).T @ size_h1
-        by_features[:3] += by_logit
-        size_features[:3] += np.abs(by_logit)
-        _scatter(total.features[s.head], size.features[s.head], s.corners, by_features[: len(features)],
-                 size_features[: len(features)])  # fmt: skip
-        row = s.head if len(self.field.networks) > 1 else 0
-        parts = [np.outer(by_h1, x), by_h1, np.outer(by_h2, h1), by_h2, np.outer(by_logit, h2), by_logit]
-        sizes = [np.outer(size_h1, np.abs(x)), size_h1, np.outer(size_h2, h1), size_h2,
-                 np.outer(np.abs(by_logit), h2), np.abs(by_logit)]  # fmt: skip
-        total.networks[row] += np.concatenate([p.reshape(-1) for p in parts])
-        size.networks[row] += np.concatenate([p.reshape(-1) for p in sizes])
+        for sums, (w1, _, w2, _, w3, _), by in (
+            (total.sums, self._weights(s.head), by_logit),
+            (total.sizes, [np.abs(w) for w in self._weights(s.head)], np.abs(by_logit)),
+        ):
+            # The magnitudes go the same way as the derivatives; all inputs count with theirs.
+            a, b, c = (x, h1, h2) if sums is total.sums else (np.abs(x), h1, h2)
+            by_h2 = (w3.T @ by) * (h2 > 0)
+            by_h1 = (w2.T @ by_h2) * (h1 > 0)
+            by_features = (w1.T @ by_h1)[:channels]
+            by_features[:3] += by
+            for index, weight in s.corners:
+                sums["features"][s.head][index] += weight * by_features
+            parts = [np.outer(by_h1, a), by_h1, np.outer(by_h2, b), by_h2, np.outer(by, c), by]
+            sums["networks"][0][self._row(s.head)] += np.concatenate([p.reshape(-1) for p in parts])
 
 
 # Lookups -------------------------------------------------------------------------------------------------------------
@@ -335,9 +321,3 @@ def _nearest(position: Array, shape: tuple[int, ...]) -> tuple[tuple[int, ...], 
     at = [min(max((float(x) + 1) / 2 * (n - 1), 0.0), n - 1.0) for x, n in zip(position, shape, strict=True)]
     gap = min(abs(a % 1 - 0.5) / n for a, n in zip(at, shape, strict=True))
     return tuple(round(a) for a in at), gap
-
-
-def _scatter(table: Array, sizes: Array, corners, value: Array | float, size: Array | float) -> None:
-    for index, weight in corners:
-        table[index] += weight * value
-        sizes[index] += weight * np.abs(size)

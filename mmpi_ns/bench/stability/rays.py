@@ -158,12 +158,13 @@ def wrong_samples(found: RenderedRays, rays: list[ExactRay]) -> int:
     return wrong
 
 
-def slopes_of(rays: list[ExactRay], by: Array, form: str | None) -> tuple[Gradients, Gradients]:
-    """Derivatives of the sum of ``by`` times the rays' colours, and the magnitudes that they are made of."""
-    total, size = rays[0].field.zeros(), rays[0].field.zeros()
+def slopes_of(rays: list[ExactRay], by: Array, form: str | None) -> tuple[dict[str, Array], dict[str, float]]:
+    """Derivatives of the sum of ``by`` times the rays' colours by every table, and the largest sum of magnitudes."""
+    total = Gradients(rays[0].field)
     for ray, by_color in zip(rays, by, strict=True):
-        ray.add_gradient(by_color, form, total, size)
-    return total, size
+        ray.add_gradient(by_color, form, total)
+    slopes, sizes = ({n: total.flat(tables, n) for n in TABLES} for tables in (total.sums, total.sizes))
+    return slopes, {name: float(size.max()) for name, size in sizes.items()}
 
 
 def gradients_of(field: MMPIField, found: RenderedRays, by: Array) -> dict[str, Array]:
@@ -195,15 +196,15 @@ def measure(make: Callable[[], Scene], precision: Precision) -> Outcome:
         moved_color = np.maximum(moved_color, np.abs(colors - wanted).max(-1))
         moved, _ = slopes_of(rays, by, s.form)
         for name in gradients:
-            moved_slope[name] = max(moved_slope[name], float(np.abs(moved.flat(name) - slopes.flat(name)).max()))
+            moved_slope[name] = max(moved_slope[name], float(np.abs(moved[name] - slopes[name]).max()))
     off = np.abs(as_array(found.colors.rgb) - wanted).max(-1)
     errors = [Error(float(a), 2 * float(b) + 16 * UNIT) for a, b in zip(off, moved_color, strict=True)]
     by_table = []
     for name, gradient in gradients.items():
         # An error counts against the largest sum of magnitudes that an entry is made of. Colours reach every table
         # through a network, forwards in its arithmetic and, but for reliability, backwards.
-        if largest := float(sizes.flat(name).max()):
-            error = float(np.abs(gradient.reshape(slopes.flat(name).shape) - slopes.flat(name)).max()) / largest
+        if largest := sizes[name]:
+            error = float(np.abs(gradient.reshape(slopes[name].shape) - slopes[name]).max()) / largest
             by_table.append(Error(error, 2 * moved_slope[name] / largest + 16 * precision.network_unit))
     return Outcome.of(errors, by_table)
 

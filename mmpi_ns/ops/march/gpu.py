@@ -389,16 +389,12 @@ def march(layout: SceneLayout, tables: Tables, rays: Crossings, options: MarchOp
     """See ``ops.march``. Waits for the device once, to size the result."""
     m = march_into_slots(layout, tables, rays, options)
     widest, *of_heads = m.numbers.tolist()
-    packed = _pack(m.kept, m.slots, m.room, max(1, widest))
+    num_rays, width = len(m.kept), max(1, widest)
+    shapes = [(num_rays, width, 3) if i == 2 else (num_rays, width) for i in range(7)]
+    types = (torch.int64, torch.int64, *[torch.float32] * 4, torch.bool)
+    packed = [torch.empty(shape, dtype=t, device=m.kept.device) for shape, t in zip(shapes, types, strict=True)]
+    size = num_rays * width
+    launch(pack_kernel, size, 1024, m.kept, *m.slots, *packed, size, width, m.room, BLOCK=1024)
     return MergedSamples(
         *packed, skipped_total=m.skipped_total, dropped_mass=m.dropped_mass, head_counts=tuple(of_heads)
     )
-
-
-def _pack(kept: Tensor, slots: list[Tensor], room: int, width: int) -> list[Tensor]:
-    """What the rays kept in ``width`` slots each, packed to the left."""
-    shape, size = (len(kept), width), len(kept) * width
-    types = (torch.int64, torch.int64, *[torch.float32] * 4, torch.bool)
-    out = [torch.empty((*shape, 3) if i == 2 else shape, dtype=t, device=kept.device) for i, t in enumerate(types)]
-    launch(pack_kernel, size, 1024, kept, *slots, *out, size, width, room, BLOCK=1024)
-    return out
