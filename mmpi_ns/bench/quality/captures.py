@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -15,6 +16,8 @@ from mmpi_ns.synthetic.catalogue import make_scene
 from mmpi_ns.synthetic.scene import render
 
 Array = NDArray[np.float64]
+Known = tuple[tuple[str, ...], Array, float, Callable[[int], Path | NDArray[np.uint8]]]
+"""Names, camera to world, focal length at full size, and each image: its file, or its pixels."""
 ROAD_PIECE = 64
 """Frames of each of the pieces that long-road is cut into."""
 
@@ -57,50 +60,40 @@ class Capture:
             ValueError: the scene is not there.
         """
         folder.mkdir(parents=True, exist_ok=True)
-        return self._real(data / self.source, folder) if self.is_real else self._made(folder)
+        names, poses, focal, picture = self._real(data / self.source) if self.is_real else self._made()
+        for i, name in enumerate(names):
+            if not (folder / name).exists():
+                self._save(picture(i), folder / name)
+        focal /= 2 if self.half else 1
+        return Truth(names, poses[:, :3, 3], poses[:, :3, :3] * [1, -1, -1], focal)
 
-    def _real(self, scene: Path, folder: Path) -> Truth:
+    def _real(self, scene: Path) -> Known:
         path = scene / "transforms.json"
         if not path.is_file():
             raise ValueError(f"{path} is not there")
         meta = json.loads(path.read_text(encoding="utf-8"))
         frames = sorted(meta["frames"], key=lambda f: f["file_path"])[self.start : self.stop : self.step]
         names = tuple(Path(f["file_path"]).name for f in frames)
-        for name, frame in zip(names, frames, strict=True):
-            if (folder / name).exists():
-                continue
-            if self.half:
-                self._halve(Image.open(scene / frame["file_path"]), folder / name)
-            else:
-                shutil.copyfile(scene / frame["file_path"], folder / name)
         poses = np.array([f["transform_matrix"] for f in frames], dtype=np.float64)
-        return _truth(names, poses, meta["fl_x"] / (2 if self.half else 1))
+        return names, poses, meta["fl_x"], lambda i: scene / frames[i]["file_path"]
 
-    def _made(self, folder: Path) -> Truth:
+    def _made(self) -> Known:
         scene = make_scene(self.source, 0, self.count, 640, 360 if self.length is None else 192, self.length)
         chosen = range(len(scene.cameras))[self.start : self.stop : self.step]
         names = tuple(f"frame_{i + 1:05d}.png" for i in chosen)
-        for name, i in zip(names, chosen, strict=True):
-            if (folder / name).exists():
-                continue
-            image = Image.fromarray((render(scene, i)[0] * 255).round().astype(np.uint8))
-            if self.half:
-                self._halve(image, folder / name)
-            else:
-                image.save(folder / name)
-        focal = scene.cameras.focal / (2 if self.half else 1)
-        return _truth(names, np.asarray(scene.cameras.camera_to_worlds)[list(chosen)], focal)
+        poses = np.asarray(scene.cameras.camera_to_worlds)[list(chosen)]
+        return names, poses, scene.cameras.focal, lambda i: (render(scene, chosen[i])[0] * 255).round().astype(np.uint8)
 
-    @staticmethod
-    def _halve(image: Image.Image, path: Path) -> None:
-        """An even cut of the image, box-filtered."""
-        width, height = image.width // 2, image.height // 2
-        small = image.convert("RGB").crop((0, 0, 2 * width, 2 * height)).resize((width, height), Image.Resampling.BOX)
-        small.save(path, quality=95)
-
-
-def _truth(names: tuple[str, ...], poses: Array, focal: float) -> Truth:
-    return Truth(names, poses[:, :3, 3], poses[:, :3, :3] * [1, -1, -1], focal)
+    def _save(self, picture: Path | NDArray[np.uint8], path: Path) -> None:
+        """A file as it is; or an even cut of the image at half size, box-filtered."""
+        if isinstance(picture, Path) and not self.half:
+            shutil.copyfile(picture, path)
+            return
+        image = (Image.open(picture) if isinstance(picture, Path) else Image.fromarray(picture)).convert("RGB")
+        if self.half:
+            width, height = image.width // 2, image.height // 2
+            image = image.crop((0, 0, 2 * width, 2 * height)).resize((width, height), Image.Resampling.BOX)
+        image.save(path, quality=95)
 
 
 def catalogue() -> dict[str, Capture]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import json
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,8 +29,6 @@ class Results(SceneBench):
     suite: str
     """Which variants: kitti-street, room-walk, fern, fox; kitti-street-budgets and room-walk-budgets draw quality over
     texels."""
-    parallel: int = 1
-    """Runs at the same time, each with its share of the cores."""
     only: str = ""
     """Run only variants whose group and name contain this."""
 
@@ -41,20 +38,19 @@ class Results(SceneBench):
         if self.suite not in SUITES:
             raise ValueError(f"There is no suite {self.suite!r}: choose from {', '.join(SUITES)}.")
         report = Report(self, file=self.suite)
-        wanted = [v for v in SUITES[self.suite] if self.only in v.key and v.key not in report.rows]
-        with ThreadPoolExecutor(self.parallel) as pool:
-            for variant, row in zip(wanted, pool.map(self._row, wanted), strict=True):
-                print(json.dumps({variant.key: report.row(variant.key, lambda row=row: row)}), flush=True)
+        for variant in SUITES[self.suite]:
+            if self.only in variant.key:
+                row = report.row(variant.key, lambda variant=variant: self._row(variant))
+                print(json.dumps({variant.key: row}), flush=True)
         draw = (lambda path: draw_budgets(path, report.rows)) if self.suite.endswith("-budgets") else None
         head = {f"{slug(name)}_{what}": r[what] for name, r in report.rows.items() for what in ("psnr", "ssim")}
         report.finish(head, markdown(self.suite, report.content), draw)
 
     def _row(self, variant: Method) -> Row:
         folder = self.folder / self.suite / slug(variant.key, "-")
-        threads = self.threads or max(1, self.cores // self.parallel)
         steps = [] if not variant.steps else ["--max-num-iterations", str(variant.steps)]
         options, renders = [*steps, *variant.options], ["--render-output-path", str(folder / "renders")]
-        run, results, made = train_and_evaluate(self.scene, folder, variant.registered, options, renders, threads)
+        run, results, made = train_and_evaluate(self.scene, folder, variant.registered, options, renders, self.cores)
         row = {k: results[k] for k in ("psnr", "ssim", "num_rays_per_sec", "dropped_mass") if k in results}
         row |= {k: v for k, v in results.items() if k.startswith("lpips") and not k.endswith("std")}
         # MPIs, texels and expected pixel errors of the plan that the run used.
