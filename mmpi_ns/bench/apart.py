@@ -94,15 +94,7 @@ def run_command(words: list[str], log: Path, threads: int, **how: Any) -> None:
 def train_and_evaluate(
     scene: Scene, folder: Path, method: str, options: Sequence[str], asked: Sequence[str], threads: int
 ) -> tuple[Path, dict[str, Any], dict[str, Any]]:
-    """``ns-train`` and ``ns-eval``, as a user types them, each with its log in a folder.
-
-    Args:
-        scene: to train.
-        folder: of the run and its logs.
-        method: nerfstudio's name of it.
-        options: of ns-train.
-        asked: further options of ns-eval.
-        threads: of both.
+    """``ns-train`` with some options, and ``ns-eval`` with what is asked, as a user types them; logs are in the folder.
 
     Returns:
         The run's folder, the results of ns-eval, and for the row: seconds of training, threads, machine and commit.

@@ -54,15 +54,8 @@ AT_ONCE = 1024
 
 def hash_lookups(self: Any, in_tensor: Tensor) -> Tensor:
     """``HashEncoding.pytorch_fwd`` by our compiled gathering of weighted rows: the same values and gradients of the
-    table to rounding, several times faster. Positions get no gradient (nerfacto asks for one and drops it).
-
-    Args:
-        self: the encoding.
-        in_tensor: [..., 3] positions in the unit cube.
-
-    Returns:
-        [..., levels x features] features.
-    """
+    table to rounding, several times faster: features [..., levels x features] at positions [..., 3] in the unit cube.
+    Positions get no gradient (nerfacto asks for one and drops it)."""
     positions = in_tensor.detach().reshape(-1, 3)
     shape = (len(positions), len(self.scalings), 8)
     rows = torch.empty(shape, dtype=torch.int32, device=positions.device)

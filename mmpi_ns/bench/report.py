@@ -145,12 +145,7 @@ def page(title: str, made: Row, *blocks: str | list[str]) -> str:
 
 
 def table(columns: Mapping[str, Cell], rows: Iterable[Row]) -> str:
-    """A Markdown table.
-
-    Args:
-        columns: by heading.
-        rows: one line each.
-    """
+    """A Markdown table: columns by heading, a line for each row."""
     lines = [f"| {' | '.join(columns)} |", "|" + "---|" * len(columns)]
     for row in rows:
         cells = (cell.format(**row) if isinstance(cell, str) else str(cell(row)) for cell in columns.values())

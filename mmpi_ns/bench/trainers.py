@@ -76,11 +76,8 @@ def peak_gib() -> float:
 
 
 class Steps:
-    """A trainer a step at a time: what its own loop does in a step, without logging and saving.
-
-    Args:
-        words: an ``ns-train`` line.
-    """
+    """The trainer of an ``ns-train`` line a step at a time: what its own loop does in a step, without logging and
+    saving."""
 
     def __init__(self, words: Sequence[str]) -> None:
         self.trainer = trainer_of(config_of(words))

@@ -95,7 +95,7 @@ def test_exact_rays_without_votes_equal_those_with_them(run):
     bundle = images[0][0].generate_rays(camera_indices=0, keep_shape=True)
     origin, direction = (x[5, 7].double().numpy() for x in (bundle.origins, bundle.directions))
     field = render.ExactField.of(model.field)
-    found = [kind(field, origin, direction).render(None)[0] for kind in (render.ExactRay, render._Unblended)]
+    found = [render.ExactRay(field, origin, direction, votes=asked).render(None)[0] for asked in (True, False)]
     assert np.array_equal(*found) and found[0].std() > 0
 
 

@@ -142,23 +142,26 @@ def measure_training(request: Row, tell: Tell) -> Row:
     return {"headline": {prefix + name: value for name, value in head.items()}, "tables": tables}
 
 
+def time_stages(steps: Steps, stages: list[Any], ends: float, blocks: int) -> dict[Any, list[float]]:
+    """Trains until the run or the time is over: seconds of a step in each block, by the stage that it belongs to."""
+    times: dict[Any, list[float]] = {}
+    while steps.step < len(stages) and time.monotonic() < ends:
+        stage, ahead = next(groupby(stages[steps.step :][: max(1, len(stages) // blocks)]))
+        count = len(list(ahead))
+        times.setdefault(stage, []).append(steps.run(count) / count)
+    return times
+
+
 def train_for(steps: Steps, total: int, ends: float) -> Row:
-    """Trains until the run or the time is over; steps a second while resolution grows and after it."""
+    """Steps a second while resolution grows and after it."""
     model = steps.pipeline.model
     assert isinstance(model, MMPIModel)
     steps.run(2)  # compiles
-    block, rates = max(1, total // 40), {True: [], False: []}
-    while steps.step + block <= total and time.monotonic() < ends:
-        young = not model.progress.schedule.sharpened(steps.step)
-        rates[young].append(block / steps.run(block))
-    early, late = rates[True], rates[False]
-    return {
-        "steps": steps.step,
-        "early_steps_per_s": statistics.median(early) if early else None,
-        "late_steps_per_s": statistics.median(late or early or [0.0]),
-        "texels": model.field.full_plan.texels,
-        **memory(),
-    }
+    times = time_stages(steps, [model.progress.schedule.sharpened(s) for s in range(total)], ends, 40)
+    rates = {late: 1 / statistics.median(seconds) for late, seconds in times.items()}
+    early, late = rates.get(False), rates.get(True, rates.get(False, 0.0))
+    found = {"steps": steps.step, "early_steps_per_s": early, "late_steps_per_s": late}
+    return found | {"texels": model.field.full_plan.texels, **memory()}
 
 
 def memory() -> dict[str, float]:
@@ -238,16 +241,11 @@ def time_phases(steps: Steps, total: int, ends: float) -> tuple[Row, Row]:
 
     A step whose stage was not reached within the time is given the mean of the last stage that was.
     """
-    model, times = steps.pipeline.model, {}
+    model = steps.pipeline.model
     schedule = model.progress.schedule
     stages = [(schedule.phase_at(s).name, schedule.texel_factor(s)) for s in range(total)]
     steps.run(1)
-    block = max(1, total // 100)
-    while steps.step < total and time.monotonic() < ends:
-        stage, ahead = next(groupby(stages[steps.step : steps.step + block]))
-        count = len(list(ahead))
-        times.setdefault(stage, []).append(steps.run(count) / count)
-    means, last = {}, 0.0
+    times, means, last = time_stages(steps, stages, ends, 100), {}, 0.0
     for stage in dict.fromkeys(stages):
         # The median: the first steps of a stage compile kernels and resample tables.
         means[stage] = last = statistics.median(times[stage]) if stage in times else last

@@ -56,16 +56,8 @@ def time_training(device: str, data: Path, work: Path, rays: int) -> Row:
 
 
 def run_quick(data: Path, work: Path, rays: int) -> Row:
-    """Looks, tries, times, and says so line by line.
-
-    Args:
-        data: a small scene.
-        work: folder of the run.
-        rays: of a step.
-
-    Returns:
-        environment, operations (why each falls back, or None), timed, and ``well``, the verdict.
-    """
+    """Looks, tries, times, and says so line by line: environment, operations (why each falls back, or None), times of
+    a small scene, and ``well``, the verdict."""
     found: Row = {"environment": environment()}
     for name, value in found["environment"].items():
         print(f"{name}: {value}", flush=True)

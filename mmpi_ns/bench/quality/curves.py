@@ -61,13 +61,8 @@ class Curve:
 
 
 def compare(ours: list[Curve], peer: Curve, name: str) -> dict[str, float]:
-    """How we stand to a peer: at equal time, and how long we take to the PSNR that the peer ends with.
-
-    Args:
-        ours: curves of runs of several lengths (a schedule follows the length), of which the best counts.
-        peer: the other method's.
-        name: of the peer, for the names of the figures.
-    """
+    """How we stand to a peer: at equal time, and how long we take to the PSNR that the peer ends with. Of ours, runs of
+    several lengths (a schedule follows the length), the best counts."""
     found: dict[str, float] = {}
     equal = min(peer.seconds[-1], max(c.seconds[-1] for c in ours))
     theirs, here = peer.at(equal), [c.at(min(equal, c.seconds[-1])) for c in ours]

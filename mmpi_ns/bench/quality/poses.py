@@ -61,15 +61,8 @@ class Poses(SceneBench):
 
 
 def write_scene(data: Path, folder: Path, test_images: int, degrees: float = 0.0, distance: float = 0.0) -> Path:
-    """A copy of a scene without tracks, whose images are links, with errors in its training poses.
-
-    Args:
-        data: the scene.
-        folder: of the copy.
-        test_images: how many are left, evenly spaced; 0 for all.
-        degrees: of rotation.
-        distance: of position.
-    """
+    """A copy of a scene without tracks, whose images are links, with so many test images (0: all), evenly spaced, and
+    errors of so many degrees and units in its training poses."""
     folder.mkdir(parents=True, exist_ok=True)
     for path in data.iterdir():
         if path.is_dir() and path.name.startswith(("images", "masks")) and not (folder / path.name).exists():
@@ -105,13 +98,8 @@ def training_poses(scene: Path) -> Array:
 
 
 def pose_errors(exact: Path, scene: Path, run: Path) -> Row:
-    """Mean error of the training poses of a run: degrees, and units of the capture.
-
-    Args:
-        exact: the scene with exact poses.
-        scene: that was trained on.
-        run: its folder.
-    """
+    """Mean error of the training poses of a run on a scene, against the scene with exact poses: degrees, and units of
+    the capture."""
     told = json.loads((run / "dataparser_transforms.json").read_text(encoding="utf-8"))
     to_run, scale = np.vstack([told["transform"], [0, 0, 0, 1]]), told["scale"]
     wanted, found = (to_run @ training_poses(folder) for folder in (exact, scene))

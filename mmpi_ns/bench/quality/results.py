@@ -91,12 +91,7 @@ texels (median / 90th percentile over the training observations, each in the MPI
 
 
 def draw_budgets(path: Path, rows: dict[str, Row]) -> None:
-    """PSNR and SSIM over millions of texels, the default apart.
-
-    Args:
-        path: of the picture.
-        rows: by name, with texels, psnr and ssim.
-    """
+    """PSNR and SSIM over millions of texels, the default apart."""
     held = sorted((r for name, r in rows.items() if name != DEFAULT), key=lambda r: r["texels"])
     texels = [r["texels"] / 1e6 for r in held]
     ticks = [m for m in (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50) if 0.7 * min(texels) <= m <= 1.4 * max(texels)]

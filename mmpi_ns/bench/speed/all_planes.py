@@ -55,11 +55,8 @@ def rates_of(field: MMPIField) -> list[dict]:
 
 
 class DenseSteps:
-    """Training by it on the same plan as ours, at all its texels, with the same batches: photometric loss, plain Adam.
-
-    Args:
-        like: ours.
-    """
+    """Training by it like ours, on the same plan at all its texels, with the same batches: photometric loss, plain
+    Adam."""
 
     def __init__(self, like: Steps) -> None:
         self.like, self.model, self.step, self.samples = like, like.pipeline.model, 0, 0.0

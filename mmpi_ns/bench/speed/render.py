@@ -148,24 +148,16 @@ def exact_colors(model: MMPIModel, images: list[Image], rays: list[Array]) -> Ar
     field = ExactField.of(model.field)
     form = model.blend_form(model.field)
     near, background = float(np.float32(model.field.plan.ray_near)), BACKGROUNDS[model.config.background]
-    colors, kind = [], ExactRay if form is not None else _Unblended
+    colors = []
     for number, ((camera, _), pixels) in enumerate(zip(images, rays, strict=True), 1):
         bundle = camera.generate_rays(camera_indices=0, keep_shape=True)
         at = torch.from_numpy(pixels[:, 0]), torch.from_numpy(pixels[:, 1])
         origins, directions = (x.cpu()[at].double().numpy() for x in (bundle.origins, bundle.directions))
         for origin, direction in zip(origins, directions, strict=True):
-            color, made = kind(field, origin, direction, near).render(form)
+            color, made = ExactRay(field, origin, direction, near, votes=form is not None).render(form)
             colors.append((color + float(made.transmittance) * background).clip(0, 1))
         print(f"exact: {number} of {len(images)} images", flush=True)
     return np.array(colors)
-
-
-class _Unblended(ExactRay):
-    """Where reliability takes no part nobody is asked for it."""
-
-    def _votes(self, own: int, inverse_t: float, own_ndc: Array):
-        heads = self.field.plan.num_heads
-        return np.zeros(heads), np.arange(heads) == own, [[] for _ in range(heads)]
 
 
 @torch.no_grad()

@@ -106,7 +106,9 @@ class ExactRay:
     direction: Array
     near: float = 0.05
     far: float = math.inf
-    jitter: Jitter = dataclasses.field(default_factory=lambda: STILL)
+    jitter: Jitter = STILL
+    votes: bool = True
+    """Whether reliability is asked for; where it takes no part that changes nothing."""
     margin: float = math.inf
     samples: list[Sample] = dataclasses.field(default_factory=list)
 
@@ -173,6 +175,8 @@ class ExactRay:
     def _votes(self, own: int, inverse_t: float, own_ndc: Array):
         """Reliability of every head at a sample, which of them cover it, and the texels that were read."""
         plan, tables = self.field.plan, self.field.tables
+        if not self.votes:
+            return np.zeros(plan.num_heads), np.arange(plan.num_heads) == own, [[]] * plan.num_heads
         votes, cover, read = [], [], []
         for j in range(plan.num_heads):
             if j == own:

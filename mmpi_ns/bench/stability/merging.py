@@ -59,13 +59,8 @@ def _spread(count: int) -> Array:
 
 
 def _merge_order(keys: Array, precision: Precision, empty: bool = False) -> Outcome:
-    """Nearest first; equal distances in the order (MPI, plane). Counts samples in a wrong place.
-
-    Args:
-        keys: 1/t of the samples [R, H, S], of which each head has the first few.
-        precision: under which they are merged.
-        empty: some rays have none.
-    """
+    """Nearest first; equal distances in the order (MPI, plane). Counts samples in a wrong place. Of the keys 1/t
+    [R, H, S] each head has the first few; where ``empty``, some rays have none."""
     rays, heads, samples = keys.shape
     keys = single(-np.sort(-keys, axis=-1))
     counts = np.random.default_rng(2).integers(0, samples + 1, (rays, heads))
