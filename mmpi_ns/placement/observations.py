@@ -44,8 +44,9 @@ class Observations:
     @staticmethod
     def of_cameras(camera_to_worlds: Array, intrinsics: ArrayLike, sizes: ArrayLike) -> Observations:
         """Cameras of which no point is known."""
-        numbers, none = (np.array(x, np.float64) for x in (intrinsics, sizes)), np.zeros(0, np.int64)
-        return Observations(camera_to_worlds, *numbers, np.zeros((0, 3)), none, none, np.zeros((0, 2)))
+        pinholes, none = np.array(intrinsics, np.float64), np.zeros(0, np.int64)
+        seen = np.zeros((0, 3)), none, none, np.zeros((0, 2))
+        return Observations(camera_to_worlds, pinholes, np.array(sizes, np.float64), *seen)
 
     @property
     def centers(self) -> Array:
