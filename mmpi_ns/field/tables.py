@@ -93,6 +93,10 @@ class TexelTables(Field):
         # Where threads make it at once the first one's stays: kernels hold addresses in it, not references.
         return self._packed.setdefault(key, make()) if found is None else found
 
+    def known(self, name: str) -> Any:
+        """What ``cached`` has made; None where it has not."""
+        return self._packed.get((name, self.density.device))
+
     def build(self, plan: ScenePlan, factor: float, tiles: Int[Tensor, "T"] | None = None) -> None:
         """Allocates all tables afresh for ``plan`` at ``factor`` times its texels. Parameters stay the same objects.
 

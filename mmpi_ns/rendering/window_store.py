@@ -145,7 +145,9 @@ def _widened(values: Tensor) -> Tensor:
 
 
 def _bytes_of(field: MMPIField) -> int:
-    return sum(values.nbytes for values in field.state_dict().values())
+    """Of its tables, and of its bricks where it has been baked."""
+    bricks = field.known("baked")
+    return sum(values.nbytes for values in field.state_dict().values()) + (0 if bricks is None else bricks.mpis.nbytes)
 
 
 def _check_plan(source: Path, plan: ScenePlan) -> None:

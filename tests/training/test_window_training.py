@@ -261,6 +261,21 @@ def test_as_many_windows_are_held_as_fit_the_budget(whole, tmp_path, room, held)
         assert len(store._held) == 1 or taken <= room * size
 
 
+def test_the_bricks_of_a_held_window_take_room_too(whole, tmp_path):
+    """Room for two windows and a little; one that was baked is let go for the other."""
+    model = whole.pipeline.model
+    size = model.store.path(1).stat().st_size
+    for baked, expected in ((False, [0, 1]), (True, [1])):
+        store = WindowStore(tmp_path, model._new_field, budget=2.05 * size)
+        store.save(0, model.field)
+        store.save(1, model.field)
+        field = store.load(0, model.device)
+        if baked:
+            assert model.baked(field).mpis.nbytes > 0.1 * size
+        store.load(1, model.device)
+        assert list(store._held) == expected
+
+
 def test_windows_in_half_precision_take_half_of_the_disk_and_are_read_as_they_were_rounded(
     whole, scene, windows_file, tmp_path
 ):
