@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -10,8 +11,11 @@ import pytest
 import torch
 from PIL import Image
 
+from mmpi_ns.bench import apart
+from mmpi_ns.bench.apart import train_and_evaluate
 from mmpi_ns.bench.quality import regions, results
 from mmpi_ns.bench.quality.regions import Regions, spearman
+from mmpi_ns.bench.report import Scene
 from mmpi_ns.bench.speed.all_planes import render_densely
 from mmpi_ns.bench.speed.scaling import BASE, made_up_batch, render_ours
 from mmpi_ns.bench.suites import DEFAULT, SUITES
@@ -96,6 +100,26 @@ def test_a_row_of_results_says_what_was_run(tmp_path):
     header = next(x for x in lines if x.startswith("| variant |"))
     assert header.count("|") == line.count("|") == lines[lines.index(header) + 1].count("|")
     assert "2 cores of X" in lines[4] and "Commits: abc (2026-01-02)" in lines[-1]
+
+
+def test_a_suite_is_trained_and_evaluated_as_a_user_would(tmp_path, monkeypatch):
+    asked = []
+
+    def pretend(words, log, threads):
+        asked.append((Path(words[0]).name, *words[1:], threads))
+        if "--output-path" in words:
+            Path(words[words.index("--output-path") + 1]).write_text(json.dumps({"results": {"psnr": 20.0}}))
+
+    monkeypatch.setattr(apart, "run_command", pretend)
+    scene = Scene(tmp_path / "scene", 2)
+    run, results, made = train_and_evaluate(scene, tmp_path, "mmpi-small", ["--x", "1"], ["--y", "2"], 3)
+    assert run == tmp_path / "run" / "mmpi-small" / "1" and results == {"psnr": 20.0}
+    place = ("--output-dir", str(tmp_path), "--experiment-name", "run", "--timestamp", "1", "--vis", "tensorboard")
+    size = ("--data", str(scene.data), "nerfstudio-data", "--downscale-factor", "2")
+    assert asked[0] == ("ns-train", "mmpi-small", *place, "--x", "1", *size, 3)
+    found = ("--output-path", str(tmp_path / "eval.json"))
+    assert asked[1] == ("ns-eval", "--load-config", str(run / "config.yml"), *found, "--y", "2", 3)
+    assert made["threads"] == 3 and made["train_seconds"] >= 0 and {"processor", "commit", "date"} < set(made)
 
 
 def test_budgets_are_drawn_with_the_default_apart(tmp_path):
