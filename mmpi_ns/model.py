@@ -377,7 +377,7 @@ class MMPIModel(Model):
         if asked.eval_num_rays_per_chunk:
             return asked.eval_num_rays_per_chunk
         compiled = asked.shading == "ray" and self.blend_form(self.field) != "opacity"
-        if compiled and dispatch.form_of("show_rays", self.field.features) == "gpu":
+        if compiled and dispatch.form_of("show_rays", self.field.features) != "reference":
             return rays_per_chunk(most_kept(most, asked.render_threshold), self.device, BYTES_PER_SLOT)
         return rays_per_chunk(most, self.device)
 

@@ -11,6 +11,8 @@ from torch import Tensor
 
 CPU_RAYS = 4096
 """Their samples stay in the caches' reach and below what the C library gives back to the system after each use."""
+SHOWN_RAYS = 4 * CPU_RAYS
+"""On a CPU where pictures are made in one pass that keeps nothing of the samples (``ops.show``)."""
 GPU_RAYS = 1 << 20
 """A frame of 1242 x 375, or half of one of 1920 x 1080, in one go."""
 BYTES_PER_SAMPLE = 128
@@ -31,10 +33,10 @@ def rays_per_chunk(samples_per_ray: int, device: torch.device, bytes_per_sample:
         bytes_per_sample: that each of them takes.
 
     Returns:
-        A power of two from ``CPU_RAYS`` to ``GPU_RAYS``.
+        A power of two; on a GPU from ``CPU_RAYS`` to ``GPU_RAYS``.
     """
     if device.type != "cuda":
-        return CPU_RAYS
+        return SHOWN_RAYS if bytes_per_sample == BYTES_PER_SLOT else CPU_RAYS
     free = torch.cuda.mem_get_info(device)[0] + torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
     fit = int(FREE_SHARE * free / (bytes_per_sample * max(samples_per_ray, 1)))
     return min(max(1 << max(fit, 1).bit_length() - 1, CPU_RAYS), GPU_RAYS)

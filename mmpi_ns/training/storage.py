@@ -8,6 +8,7 @@ from typing import Any
 from mmpi_ns.field.tables import TABLES, TexelTables
 from mmpi_ns.scene.texels import BRICK
 from mmpi_ns.training.phases import Schedule
+from mmpi_ns.utils.machine import give_back_freed_memory
 
 
 def prepare_storage(
@@ -27,9 +28,11 @@ def prepare_storage(
     if factor != field.factor:
         for optimizer, table in own:
             optimizer.reset_moments(table)
+        give_back_freed_memory()
         field.grow(factor)
     phase, left = schedule.phase_at(step), []
     if schedule.releases_at(step):
+        give_back_freed_memory()
         left.append(field.release_unused(least))
     elif schedule.sharpened(step) and not schedule.sharpened(step - 1):
         field.look_afresh()

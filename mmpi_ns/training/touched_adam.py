@@ -9,7 +9,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from nerfstudio.engine.optimizers import OptimizerConfig
@@ -19,6 +18,7 @@ from torch.nn import Parameter
 from mmpi_ns.ops.adam import AdamConstants, adam_rows
 from mmpi_ns.ops.adam.reference import adam
 from mmpi_ns.ops.interpolate import index_rows, sum_rows
+from mmpi_ns.utils.machine import lazy_zeros
 
 
 class TouchedAdam(torch.optim.Optimizer):
@@ -70,12 +70,9 @@ class TouchedAdam(torch.optim.Optimizer):
 def _no_moments(param: Tensor, of_rows: bool) -> Float[Tensor, "N 2 *C"]:
     """Zeros, mean and uncentred variance. Those of a table's rows are in bfloat16 (docs/performance.md has what that
     costs), and take no memory on a CPU until they are written to: most rows may never be."""
-    shape = (len(param), 2, *param.shape[1:])
-    if not of_rows or param.dtype != torch.float32:
-        return param.new_zeros(shape)
-    if param.device.type != "cpu":
-        return param.new_zeros(shape, dtype=torch.bfloat16)
-    return torch.from_numpy(np.zeros(shape, dtype=np.int16)).view(torch.bfloat16)
+    rounds = of_rows and param.dtype == torch.float32
+    dtype = torch.bfloat16 if rounds else param.dtype
+    return lazy_zeros((len(param), 2, *param.shape[1:]), dtype, param.device)
 
 
 def _constants(state: dict[str, Any], group: dict[str, Any]) -> AdamConstants:

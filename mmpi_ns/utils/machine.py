@@ -7,10 +7,11 @@ import os
 import sys
 from pathlib import Path
 
+import numpy as np
 import torch
+from torch import Tensor
 
 CGROUP = Path("/sys/fs/cgroup")
-
 
 KEPT = 256 << 20
 """Bytes that are freed and kept for the next use: more than a step takes beside the tables."""
@@ -32,6 +33,21 @@ def keep_freed_memory() -> bool:
     except (AttributeError, OSError, TypeError):
         return False
     return bool(mallopt(trim_threshold, KEPT)) and bool(mallopt(mmap_threshold, OWN_MAPPING))
+
+
+def give_back_freed_memory() -> None:
+    """Has glibc give back what it keeps and nobody uses: before tables grow, which do not fit into what steps leave."""
+    try:
+        ctypes.CDLL(None).malloc_trim(0)
+    except (AttributeError, OSError, TypeError):  # another C library
+        return
+
+
+def lazy_zeros(shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Zeros that take no memory on a CPU until they are written to (torch's are written at once)."""
+    if device.type != "cpu":
+        return torch.zeros(shape, dtype=dtype, device=device)
+    return torch.from_numpy(np.zeros((*shape, dtype.itemsize), dtype=np.uint8)).view(dtype).squeeze(-1)
 
 
 def free_memory(device: str | torch.device) -> int:

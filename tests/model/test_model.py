@@ -213,7 +213,7 @@ def test_pictures_do_not_depend_on_the_chunk_size(model, camera, monkeypatch, th
 
 def test_chunks_have_the_size_that_suits_the_device_unless_another_is_asked_for(model, camera, monkeypatch):
     sizes = []
-    monkeypatch.setattr(mmpi_model, "rays_per_chunk", lambda samples, device: 100)
+    monkeypatch.setattr(mmpi_model, "rays_per_chunk", lambda *_: 100)
     monkeypatch.setattr(
         model, "image_outputs", lambda bundle, get=model.image_outputs: sizes.append(len(bundle)) or get(bundle)
     )

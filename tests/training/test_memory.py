@@ -101,3 +101,32 @@ def test_what_a_step_frees_is_there_for_the_next_one():
     said = subprocess.run([sys.executable, "-c", work], capture_output=True, text=True, check=True).stdout
     before, after = map(int, said.split())
     assert after < 100 < before
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another C library")
+def test_what_steps_leave_is_given_back_before_tables_grow_and_zeros_take_nothing():
+    """Resident memory, in a process of its own: between the parts that go lie parts that stay."""
+    work = """if True:
+        import os, torch
+        from pathlib import Path
+        from mmpi_ns.scene.bricks import resample
+        from mmpi_ns.scene.texels import BRICK, make_grids
+        from mmpi_ns.utils.machine import give_back_freed_memory, keep_freed_memory, lazy_zeros
+        def resident():
+            return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") >> 20
+        assert keep_freed_memory()
+        parts = [torch.ones(n) for _ in range(40) for n in (1 << 20, 1 << 10)]
+        del parts[::2]
+        before = resident()
+        give_back_freed_memory()
+        given = before - resident()
+        old, new = make_grids([(8, 256, 256)]), make_grids([(16, 1024, 1024)])
+        before = resident()
+        nothing = lazy_zeros((len(old[0].places) * BRICK, 1), torch.float32, torch.device("cpu"))
+        table = resample(nothing, old, new, [False])
+        assert table.shape == (len(new[0].places) * BRICK, 1) and not table[::1000].any()
+        print(given, resident() - before)
+    """
+    said = subprocess.run([sys.executable, "-c", work], capture_output=True, text=True, check=True).stdout
+    given, taken = map(int, said.split())
+    assert given > 120 and taken < 20, said
