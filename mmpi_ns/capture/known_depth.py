@@ -43,6 +43,8 @@ COVERED = 0.3
 """Share of a training pixel's area in which working pixels must have a depth."""
 POINT_ERROR = 0.01
 """Relative error of an SfM point's distance, at least."""
+CONTINUED = 320
+"""Pixels along the longer side of an image, at most, at which surfaces are continued: they are smooth."""
 CELLS = 32
 """Cells along the longer side of an image, each of which tells placement one depth."""
 SENSOR_ERROR = 0.01
@@ -232,21 +234,34 @@ def _straightened(
 
 
 def with_continued(known: KnownDepth, posed: PosedImages, dataset: MMPIDataset) -> KnownDepth:
-    """Adds distances of what hardly any other image shows, where surfaces go on (``lone_depth.py``)."""
-    codes = []
-    for i, own in enumerate(known.codes):
-        height, width = own.shape[:2]
-        coords = torch.from_numpy(np.moveaxis(np.indices((height, width)), 0, -1).reshape(-1, 2) + 0.5).float()
-        rays = dataset.cameras.generate_rays(torch.full((len(coords), 1), i), coords=coords)
-        directions = rays.directions.numpy().reshape(height, width, 3)
-        found = continued(known.image(i), directions)
-        rows, columns = np.nonzero(found[..., 0])
-        points = posed.camera_to_worlds[i, :, 3] + directions[rows, columns] / found[rows, columns, :1]
-        lone = others_that_see(posed, i, points) <= MOST_OTHERS
-        added = own.copy()
-        added[rows[lone], columns[lone]] = packed(found[rows[lone], columns[lone]])
-        codes.append(added)
-    return KnownDepth(tuple(codes))
+    """Adds distances of what hardly any other image shows, where surfaces go on (``lone_depth.py``); found once."""
+
+    def find() -> Arrays:
+        numbers = track(range(len(known.codes)), description="Surfaces that go on", console=CONSOLE)
+        return {f"{i}": _continued_codes(known, i, posed, dataset) for i in numbers}
+
+    cameras = posed.camera_to_worlds, posed.intrinsics, posed.distortion, posed.fisheye
+    stored = remembered(digest(posed.files, "continued", VERSION, *cameras, *known.codes), find)
+    return KnownDepth(tuple(stored[f"{i}"] for i in range(len(known.codes))))  # type: ignore[arg-type]
+
+
+def _continued_codes(known: KnownDepth, i: int, posed: PosedImages, dataset: MMPIDataset) -> Codes:
+    """Codes of one image, those of continued surfaces too; found for every n-th pixel of a large image."""
+    own = known.codes[i].copy()
+    step = -(-max(own.shape[:2]) // CONTINUED)
+    rows, columns = (np.minimum(np.arange(0, n, step) + step // 2, n - 1) for n in own.shape[:2])
+    coords = np.stack(np.meshgrid(rows, columns, indexing="ij"), -1).reshape(-1, 2) + 0.5
+    at = torch.full((len(coords), 1), i)
+    directions = dataset.cameras.generate_rays(at, coords=torch.from_numpy(coords).float()).directions.numpy()
+    directions = directions.reshape(len(rows), len(columns), 3)
+    found = continued(known.image(i)[np.ix_(rows, columns)], directions)
+    down, across = np.nonzero(found[..., 0])
+    points = posed.camera_to_worlds[i, :, 3] + directions[down, across] / found[down, across, :1]
+    many = others_that_see(posed, i, points) > MOST_OTHERS
+    found[down[many], across[many]] = 0
+    down, across = np.nonzero(own[..., 0] == UNKNOWN)
+    own[down, across] = packed(found)[down // step, across // step]
+    return own
 
 
 def with_known_depths(observations: Observations, known: KnownDepth, dataset: MMPIDataset) -> Observations:
