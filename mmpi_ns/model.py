@@ -127,7 +127,7 @@ class MMPIModelConfig(ModelConfig):
     """Samples of less weight are not coloured when rendering; the dropped mass is reported."""
     render: Literal["auto", "exact", "baked"] = "auto"
     """Images from the field itself (exact), or from bricks of 8-bit codes made of it when the first image is asked for
-    (baked: a third of the time on a CPU, 0.01 dB less; docs/export.md). auto: bricks for ns-render and ns-viewer on a
+    (baked: half of the time on a CPU, 0.01 dB less; docs/export.md). auto: bricks for ns-render and ns-viewer on a
     CPU, where a model can be baked; while it trains, where it is measured (ns-eval) and on a GPU the field itself."""
     render_shares: Literal["exact", "baked"] = "exact"
     """After two-phase training: a sample's share from the reliabilities of all MPIs that see it, or from its texels,
