@@ -44,7 +44,7 @@ def test_every_setting_is_timed_and_compared_with_exact_rays(run, tmp_path):
     assert found["headline"]["exact_rays"] == len(found["exact"]) == 60
     rows = found["rows"]
     assert {r["threshold"] for r in rows.values()} == {0.0, 1e-4, 1e-3, 3e-3, 1e-2, 3e-2}
-    assert {r["chunk"] for r in rows.values()} == {100, 4096} and {r["ops"] for r in rows.values()} == {
+    assert {r["chunk"] for r in rows.values()} == {100, 16384} and {r["ops"] for r in rows.values()} == {
         "native",
         "torch",
     }
