@@ -10,6 +10,12 @@ ROTATION_WEIGHT = 1.0
 """Weight of rotations beside centres, whose main direction weighs 1, when two tracks are fitted to each other."""
 
 
+def degrees_between(one: Array, other: Array) -> Array:
+    """Angles [N] of the rotations that take rotations [N, 3, 3] to others."""
+    traces = np.einsum("nij,nij->n", one, other)
+    return np.degrees(np.arccos(np.clip((traces - 1) / 2, -1, 1)))
+
+
 def similarity_matrix(source: Array, target: Array) -> tuple[float, Array, Array]:
     """Scale, rotation [3, 3] and translation [3] that take camera poses to other poses of the same cameras.
 

@@ -12,6 +12,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from mmpi_ns.prepare.alignment import degrees_between
 from mmpi_ns.prepare.evidence import local_median
 from mmpi_ns.prepare.images import in_short
 from mmpi_ns.prepare.mapping import adjust, bundle_options, is_bent
@@ -111,8 +112,7 @@ def misplaced(names: Sequence[str], places: Sequence[int], poses: Array) -> list
         return []
     gaps = np.diff(places)
     steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=-1) / gaps
-    cosines = np.einsum("nij,nij->n", poses[1:, :3, :3], poses[:-1, :3, :3])
-    turns = np.degrees(np.arccos(np.clip((cosines - 1) / 2, -1, 1))) / gaps
+    turns = degrees_between(poses[1:, :3, :3], poses[:-1, :3, :3]) / gaps
     usual_step, usual_turn = local_median(steps, 5), local_median(turns, 5)
     floor = 0.05 * float(np.median(steps))
     found = []

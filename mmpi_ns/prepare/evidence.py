@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mmpi_ns.prepare.alignment import similarity_matrix
+from mmpi_ns.prepare.alignment import degrees_between, similarity_matrix
 
 Array = NDArray[np.float64]
 Places = NDArray[np.int64]
@@ -205,6 +205,5 @@ def agreement(one: Witness, other: Witness) -> Agreement | None:
     scale, rotation, translation = similarity_matrix(a, b)
     moved = scale * a[:, :3, 3] @ rotation.T + translation
     extent = max(float(np.linalg.norm(np.ptp(b[:, :3, 3], axis=0))), 1e-12)
-    cosines = np.einsum("nij,nij->n", rotation @ a[:, :3, :3], b[:, :3, :3])
-    turns = np.degrees(np.arccos(np.clip((cosines - 1) / 2, -1, 1)))
+    turns = degrees_between(rotation @ a[:, :3, :3], b[:, :3, :3])
     return Agreement(common, np.linalg.norm(moved - b[:, :3, 3], axis=-1) / extent, turns)

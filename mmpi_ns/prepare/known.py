@@ -9,6 +9,7 @@ import numpy as np
 import pycolmap
 
 from mmpi_ns.capture.matching import quiet, triangulate_points
+from mmpi_ns.prepare.alignment import degrees_between
 from mmpi_ns.prepare.features import matched_keypoints
 from mmpi_ns.prepare.frame import camera_poses, similarity_between
 from mmpi_ns.prepare.mapping import adjust, bundle_options
@@ -80,8 +81,7 @@ def solve_known(
 def _changes(given: np.ndarray, model: pycolmap.Reconstruction) -> str:
     _, now = camera_poses(model)
     moved = np.linalg.norm(now[:, :3, 3] - given[:, :3, 3], axis=-1)
-    cosines = np.einsum("nij,nij->n", now[:, :3, :3], given[:, :3, :3])
-    turned = np.degrees(np.arccos(np.clip((cosines - 1) / 2, -1, 1)))
+    turned = degrees_between(now[:, :3, :3], given[:, :3, :3])
     return (
         f"poses moved by {moved.mean():.3g} units (at most {moved.max():.3g}) "
         f"and turned by {turned.mean():.2f} degrees (at most {turned.max():.2f})"

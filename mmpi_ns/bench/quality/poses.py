@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from mmpi_ns.bench.apart import train_and_evaluate
 from mmpi_ns.bench.report import Report, Row, Scene, SceneBench, page, table
+from mmpi_ns.prepare.alignment import degrees_between
 
 Array = NDArray[np.float64]
 MODES = {"as they are": "off", "refined in training": "SO3xR3"}
@@ -109,8 +110,7 @@ def pose_errors(exact: Path, scene: Path, run: Path) -> Row:
     if moves is not None:
         numbers = moves.double().numpy()
         found = moved(found, np.concatenate([numbers[:, :3] / scale, numbers[:, 3:]], -1))
-    traces = np.einsum("nij,nij->n", wanted[:, :3, :3], found[:, :3, :3])
-    turned = np.degrees(np.arccos(np.clip((traces - 1) / 2, -1, 1)))
+    turned = degrees_between(wanted[:, :3, :3], found[:, :3, :3])
     off = np.linalg.norm(wanted[:, :3, 3] - found[:, :3, 3], axis=-1)
     return {"degrees_off": float(turned.mean()), "distance_off": float(off.mean())}
 
