@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from threading import current_thread, main_thread
 from typing import Any, Literal
 
 import torch
@@ -13,7 +12,6 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
-from nerfstudio.model_components import renderers
 from nerfstudio.models.base_model import Model, ModelConfig
 from nerfstudio.viewer.viewer_elements import ViewerDropdown
 from torch import Tensor
@@ -23,7 +21,6 @@ from mmpi_ns.capture.datamanager import OBSERVATIONS, RAYS_PER_STEP, TRAINING_VI
 from mmpi_ns.capture.rays import PinholeRays
 from mmpi_ns.field.baking import baked_shares
 from mmpi_ns.field.mmpi_field import MMPIField
-from mmpi_ns.field.samples import metadata_of
 from mmpi_ns.field.shading import Shading
 from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.blending import BlendForm
@@ -31,12 +28,12 @@ from mmpi_ns.ops.march.reference import most_kept
 from mmpi_ns.placement.rule import PlacementConfig
 from mmpi_ns.placement.split import place_windows
 from mmpi_ns.rendering.baked import BakedWindow, bake, suits_bricks
-from mmpi_ns.rendering.chunks import BYTES_PER_SLOT, rays_per_chunk, render_in_chunks
+from mmpi_ns.rendering.chunks import check_crop, rays_per_chunk, render_in_chunks
 from mmpi_ns.rendering.metrics import ImageMetrics, depth_metrics, pictures
 from mmpi_ns.rendering.render import images_of, render_rays, sampled_outputs
-from mmpi_ns.rendering.rendered import BACKGROUNDS, RenderedRays, bounded
+from mmpi_ns.rendering.rendered import BACKGROUNDS, RenderedRays, background_of, bounded
 from mmpi_ns.rendering.sampler import MMPISampler
-from mmpi_ns.rendering.shown import shown_outputs
+from mmpi_ns.rendering.shown import shown_outputs, shows_in_one_pass
 from mmpi_ns.rendering.window_store import WindowStore
 from mmpi_ns.rendering.windows import render_windows
 from mmpi_ns.scene.plan import NO_PLAN
@@ -51,7 +48,6 @@ from mmpi_ns.training.progress import Progress
 from mmpi_ns.training.refined_poses import check_refined_poses, move_rays
 from mmpi_ns.training.run import TrainingRun, views_of
 from mmpi_ns.utils.console import say
-from mmpi_ns.utils.errors import InputError
 from mmpi_ns.utils.random_draws import generator
 
 FAIR_SHARE = 0.1
@@ -162,15 +158,8 @@ class MMPIModelConfig(ModelConfig):
 
     def field_settings(self) -> dict[str, Any]:
         """What a field takes from here, by its arguments' names."""
-        names = (
-            "shading",
-            "feature_channels",
-            "hidden_width",
-            "position_frequencies",
-            "direction_frequencies",
-            "shared_colour",
-        )
-        return {name: getattr(self, name) for name in (*names, "samples_per_voxel", "cube_alpha")}
+        names = ("shading", "feature_channels", "hidden_width", "position_frequencies", "direction_frequencies")
+        return {n: getattr(self, n) for n in (*names, "shared_colour", "samples_per_voxel", "cube_alpha")}
 
 
 class MMPIModel(Model):
@@ -280,7 +269,7 @@ class MMPIModel(Model):
         if len(windows) == 1:
             return self.window_outputs(0, self.field, bundle, chosen)
 
-        there = self._windows_there()
+        there = self.run.windows_there()
 
         def render(place: int, rays: RayBundle) -> dict[str, Tensor]:
             window = there[place]
@@ -289,14 +278,6 @@ class MMPIModel(Model):
 
         shown = there.index(chosen[0]) if chosen is not None and chosen[0] in there else None
         return render_windows(bundle, tuple(windows.windows[w] for w in there), render, shown)
-
-    def _windows_there(self) -> list[int]:
-        """Windows that can be rendered: trained in order, those after the present one are not there yet; where other
-        processes train some, those that they have finished."""
-        count, trained = len(self.progress.windows), self.progress.window
-        if self.run.shared:
-            return [w for w in range(count) if w == trained or self.store.path(w).is_file()]
-        return [*range(trained + 1)]
 
     def window_outputs(
         self, window: int, field: MMPIField, bundle: RayBundle, chosen: tuple[int, int] | None = None
@@ -310,7 +291,8 @@ class MMPIModel(Model):
             chosen: the one (window, head) to show; None for all.
         """
         if chosen is None and self._shows_bricks(field):
-            outputs = self.baked(field).outputs(bounded(bundle, field.plan), self._background(bundle.origins))
+            behind = background_of(self.config.background, bundle.origins)
+            outputs = self.baked(field).outputs(bounded(bundle, field.plan), behind)
             return outputs | {"winning_mpi": outputs["winning_mpi"] + self.progress.windows.first_head(window)}
         form, head_mask, shares = self.blend_form(field), None, None
         if chosen is not None:
@@ -322,7 +304,7 @@ class MMPIModel(Model):
         how = {"form": form, "threshold": self.config.render_threshold, "head_mask": head_mask, "shares": shares}
         once = field.shading == "ray" and not torch.is_grad_enabled()
         outputs = (shown_outputs if once else sampled_outputs)(bounded(bundle, field.plan), field, **how)
-        rgb = outputs["rgb"] + outputs.pop("transmittance") * self._background(outputs["rgb"])
+        rgb = outputs["rgb"] + outputs.pop("transmittance") * background_of(self.config.background, outputs["rgb"])
         winner = outputs["winning_mpi"] + self.progress.windows.first_head(window)
         return outputs | {"rgb": rgb.clamp(0, 1), "winning_mpi": winner}
 
@@ -349,17 +331,8 @@ class MMPIModel(Model):
     # Images ------------------------------------------------------------------------------------------------------
 
     def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
-        """Renders a camera's image, or what of it lies in a box.
-
-        Raises:
-            InputError: the box has no size. Not so in the viewer, whose render thread an error would end while
-                somebody types a size: there it shows the background.
-        """
-        if obb_box is not None and not bool((obb_box.S > 0).all()) and current_thread() is main_thread():
-            raise InputError(
-                f"The crop box has no size (its sides are {[round(float(s), 6) for s in obb_box.S]}): give crop_scale "
-                "three positive lengths, or leave the crop out."
-            )
+        """Renders a camera's image, or what of it lies in a box. Raises InputError where the box has no size."""
+        check_crop(obb_box)
         rays = PinholeRays.of(camera, self.device) if obb_box is None else None
         if rays is None:
             return super().get_outputs_for_camera(camera, obb_box)
@@ -373,24 +346,17 @@ class MMPIModel(Model):
     @property
     def chunk_size(self) -> int:
         """Rays of an image that are rendered at once."""
-        most, asked = max(plan.samples_per_ray for plan in self.progress.windows.plans), self.config
-        if asked.eval_num_rays_per_chunk:
-            return asked.eval_num_rays_per_chunk
-        compiled = asked.shading == "ray" and self.blend_form(self.field) != "opacity"
-        if compiled and dispatch.form_of("show_rays", self.field.features) != "reference":
-            return rays_per_chunk(most_kept(most, asked.render_threshold), self.device, BYTES_PER_SLOT)
-        return rays_per_chunk(most, self.device)
+        if self.config.eval_num_rays_per_chunk:
+            return self.config.eval_num_rays_per_chunk
+        most = max(plan.samples_per_ray for plan in self.progress.windows.plans)
+        one_pass = shows_in_one_pass(self.field, self.blend_form(self.field))
+        return rays_per_chunk(most, self.device, most_kept(most, self.config.render_threshold) if one_pass else None)
 
     def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
         """Colours without their background, and how opaque each pixel is (ns-render's output "rgba")."""
         accumulation = outputs["accumulation"]
-        colors = outputs[output_name] - (1 - accumulation) * self._background(accumulation)
+        colors = outputs[output_name] - (1 - accumulation) * background_of(self.config.background, accumulation)
         return torch.cat([(colors / accumulation.clamp(min=1e-6)).clamp(0, 1), accumulation], -1)
-
-    def _background(self, like: Tensor) -> Tensor:
-        """Colour behind everything: what the viewer or a crop asks for, else the config's."""
-        asked = renderers.BACKGROUND_COLOR_OVERRIDE
-        return like.new_full((3,), BACKGROUNDS[self.config.background]) if asked is None else asked.to(like)
 
     # Losses and metrics ------------------------------------------------------------------------------------------
 
@@ -411,11 +377,7 @@ class MMPIModel(Model):
         if "training" not in outputs:
             return {"psnr": -10 * torch.log10(photometric(outputs["rgb"], self.observed(batch)))}
         rays: RenderedRays = outputs["training"]
-        found = {
-            "live_samples": rays.report.live.float().mean(),
-            "kept_samples": metadata_of(rays.samples)["valid"].float().sum() / len(rays.report.live),
-            "dropped_mass": rays.report.dropped_mass.mean(),
-        }
+        found = rays.counts()
         self.camera_optimizer.get_metrics_dict(found)
         return found
 

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable
+from threading import current_thread, main_thread
 
 import torch
 from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.data.scene_box import OrientedBox
 from torch import Tensor
+
+from mmpi_ns.utils.errors import InputError
 
 CPU_RAYS = 4096
 """Their samples stay in the caches' reach and below what the C library gives back to the system after each use."""
@@ -18,28 +22,39 @@ GPU_RAYS = 1 << 20
 BYTES_PER_SAMPLE = 128
 """What rendering holds at its peak for every plane that a ray may cross: where it is hit, what is kept, its colour."""
 BYTES_PER_SLOT = 40
-"""What compiled rendering with one shading a ray holds for every sample that a ray may keep (``ops.show``)."""
+"""What one compiled pass holds for every sample that a ray may keep."""
 FREE_SHARE = 0.5
 """Of the device's free memory; the rest is for what else runs there."""
 
 
-def rays_per_chunk(samples_per_ray: int, device: torch.device, bytes_per_sample: int = BYTES_PER_SAMPLE) -> int:
+def rays_per_chunk(samples_per_ray: int, device: torch.device, kept_in_one_pass: int | None = None) -> int:
     """Rays of a chunk where no number is asked for.
 
     Args:
-        samples_per_ray: samples that a ray has at most: the planes of all MPIs and the steps through the cube; or those
-            that it can keep.
+        samples_per_ray: samples that a ray has at most: the planes of all MPIs and the steps through the cube.
         device: where they are rendered.
-        bytes_per_sample: that each of them takes.
+        kept_in_one_pass: how many of them a ray can keep, where pictures are made in one compiled pass (``ops.show``),
+            which holds nothing of the others; None where they are made step by step.
 
     Returns:
         A power of two; on a GPU from ``CPU_RAYS`` to ``GPU_RAYS``.
     """
     if device.type != "cuda":
-        return SHOWN_RAYS if bytes_per_sample == BYTES_PER_SLOT else CPU_RAYS
+        return CPU_RAYS if kept_in_one_pass is None else SHOWN_RAYS
     free = torch.cuda.mem_get_info(device)[0] + torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
-    fit = int(FREE_SHARE * free / (bytes_per_sample * max(samples_per_ray, 1)))
+    held = BYTES_PER_SAMPLE * samples_per_ray if kept_in_one_pass is None else BYTES_PER_SLOT * kept_in_one_pass
+    fit = int(FREE_SHARE * free / max(held, 1))
     return min(max(1 << max(fit, 1).bit_length() - 1, CPU_RAYS), GPU_RAYS)
+
+
+def check_crop(box: OrientedBox | None) -> None:
+    """Raises InputError where a crop has no size. Not so in the viewer, whose render thread an error would end while
+    somebody types a size: there it shows the background."""
+    if box is not None and not bool((box.S > 0).all()) and current_thread() is main_thread():
+        raise InputError(
+            f"The crop box has no size (its sides are {[round(float(s), 6) for s in box.S]}): give crop_scale "
+            "three positive lengths, or leave the crop out."
+        )
 
 
 def render_in_chunks(

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Float
 from nerfstudio.cameras.rays import RayBundle, RaySamples
+from nerfstudio.model_components import renderers
 from torch import Tensor
 
 from mmpi_ns.field.samples import Lookup, metadata_of
@@ -17,6 +18,12 @@ from mmpi_ns.scene.plan import ScenePlan
 
 BACKGROUNDS = {"black": 0.0, "gray": 0.5, "white": 1.0}
 """What can be shown behind everything."""
+
+
+def background_of(name: str, like: Tensor) -> Tensor:
+    """Colour [3] behind everything: what the viewer or a crop asks for, else the one of this name."""
+    asked = renderers.BACKGROUND_COLOR_OVERRIDE
+    return like.new_full((3,), BACKGROUNDS[name]) if asked is None else asked.to(like)
 
 
 @dataclass(frozen=True)
@@ -33,6 +40,12 @@ class RenderedRays:
     """Where the field was read; None without gradients."""
     times: int = 1
     """How often each ray of a batch is among them: all rays, one time after the other."""
+
+    def counts(self) -> dict[str, Tensor]:
+        """Samples a ray, met and kept, and the weight of those that were not."""
+        kept = metadata_of(self.samples)["valid"].float().sum() / len(self.report.live)
+        dropped = self.report.dropped_mass.mean()
+        return {"live_samples": self.report.live.float().mean(), "kept_samples": kept, "dropped_mass": dropped}
 
 
 def bounded(bundle: RayBundle, plan: ScenePlan) -> RayBundle:

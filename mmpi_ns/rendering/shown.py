@@ -8,11 +8,18 @@ from torch import Tensor
 
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.shading import RayShader
+from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.blending import BlendForm
 from mmpi_ns.ops.march import MarchOptions
 from mmpi_ns.ops.show import show_rays
 from mmpi_ns.rendering.rendered import distances_of
 from mmpi_ns.rendering.sampler import crossings
+
+
+def shows_in_one_pass(field: MMPIField, form: BlendForm | None) -> bool:
+    """Whether a compiled form makes pictures of a field: one pass, which holds nothing of the samples."""
+    compiled = dispatch.form_of("show_rays", field.features) != "reference"
+    return field.shading == "ray" and form != "opacity" and compiled
 
 
 @torch.no_grad()

@@ -80,6 +80,14 @@ class TrainingRun:
         """The training images that ask a window."""
         return views_of(self.progress.windows.windows[window], self.views)
 
+    def windows_there(self) -> list[int]:
+        """Windows that can be rendered: trained in order, those after the present one are not there yet; where other
+        processes train some, those that they have finished."""
+        count, trained = len(self.progress.windows), self.progress.window
+        if self.shared:
+            return [w for w in range(count) if w == trained or self.store.path(w).is_file()]
+        return [*range(trained + 1)]
+
     def prepare_step(self, attributes: TrainingCallbackAttributes | None, step: int) -> None:
         """Brings window, resolution, storage and freezing to what the schedule says of a step.
 

@@ -7,7 +7,6 @@ import torch
 
 from mmpi_ns.rendering.chunks import (
     BYTES_PER_SAMPLE,
-    BYTES_PER_SLOT,
     CPU_RAYS,
     FREE_SHARE,
     GPU_RAYS,
@@ -29,7 +28,7 @@ def gpu_with(monkeypatch, free: float, cached: float = 0.0) -> torch.device:
 @pytest.mark.parametrize("samples", [0, 1, 1024])
 def test_a_cpu_has_larger_chunks_where_nothing_is_kept(samples):
     assert rays_per_chunk(samples, torch.device("cpu")) == CPU_RAYS
-    assert rays_per_chunk(samples, torch.device("cpu"), BYTES_PER_SLOT) == SHOWN_RAYS > CPU_RAYS
+    assert rays_per_chunk(samples, torch.device("cpu"), samples) == SHOWN_RAYS > CPU_RAYS
 
 
 @pytest.mark.parametrize("free", [0.5, 2.0, 7.0, 24.0])
