@@ -27,7 +27,7 @@ ROOT = Path(__file__).resolve().parents[1]
 TRAININGS = {"mmpi": (20_000, 110), "splatfacto": (5000, 75), "nerfacto": (5000, 75), "mmpi-small": (4000, 50),
              "instant-ngp": (5000, 60)}  # fmt: skip
 """Steps, and seconds at most, of each method on the capture at full size."""
-BENCH_PARTS = ("checks", "operations", "training triton")
+BENCH_PARTS = ("checks", "training triton")
 """Of ``mmpi-bench gpu``; trainings to the end come after it."""
 BARE = ("pycolmap", "open3d", "pymeshlab", "wandb", "comet_ml")
 """Packages that the machine is not expected to have."""

@@ -19,7 +19,6 @@ COMMANDS = {
     "render": "speed.render",
     "speed": "speed.against_peers",
     "ops": "speed.ops",
-    "scaling": "speed.scaling",
     "roads": "speed.roads",
     "processes": "speed.processes",
     "ablate": "quality.ablate",
@@ -27,8 +26,6 @@ COMMANDS = {
     "stability": "stability.command",
     "accuracy": "quality.accuracy",
     "results": "quality.results",
-    "dense": "speed.dense",
-    "regions": "quality.regions",
     "prepare": "quality.prepare",
     "poses": "quality.poses",
 }

@@ -4,78 +4,37 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
-import pytest
-import torch
 from PIL import Image
+from random_fields import bundle, random_field, random_rays
 
 from mmpi_ns.bench import apart
 from mmpi_ns.bench.apart import train_and_evaluate
-from mmpi_ns.bench.quality import regions, results
-from mmpi_ns.bench.quality.regions import Regions, spearman
+from mmpi_ns.bench.quality import results
 from mmpi_ns.bench.report import Scene
 from mmpi_ns.bench.speed.all_planes import render_densely
-from mmpi_ns.bench.speed.scaling import BASE, made_up_batch, render_ours
 from mmpi_ns.bench.suites import DEFAULT, SUITES
-from mmpi_ns.field.mmpi_field import MMPIField
-from mmpi_ns.scene.plan import MPIPlan, ScenePlan
+from mmpi_ns.rendering.render import render_rays
+from mmpi_ns.rendering.sampler import MMPISampler
 
 
 def test_the_dense_reference_renders_what_the_sampler_renders():
-    torch.manual_seed(0)
-    field = MMPIField(BASE.plan().scaled(1 / 64), hidden_width=8, shares_depth=True)
-    with torch.no_grad():
-        field.density.normal_(std=3)
-        field.features.normal_()
-    bundle, _ = made_up_batch(64)
-    ours, _ = render_ours(field, bundle, young=False, threshold=0.0)
-    reference, _ = render_densely(field, bundle)
+    field = random_field(3)
+    field.features.data.mul_(0.3)
+    rays = bundle(*random_rays(field.plan, 64, seed=1))
+    ours = render_rays(MMPISampler(), rays, field, form=None, threshold=0.0)
+    reference, samples = render_densely(field, rays)
     # The reference leaves out colours below alpha = 1e-4, so they may differ by that much a sample.
-    assert float((ours - reference).abs().max()) < 5e-3
-    assert float(ours.std()) > 0.05
+    found = ours.colors.rgb + 0.5 * ours.composite.transmittance
+    assert samples == 36 and float((found - reference).abs().max()) < 5e-3
+    assert float(found.std()) > 0.05
 
 
 def test_rows_of_a_suite_have_different_names():
     for variants in SUITES.values():
         keys = [(v.group, v.name) for v in variants]
         assert len(set(keys)) == len(keys)
-
-
-def test_rank_correlation_asks_for_order_alone():
-    a = np.array([3.0, 1.0, 2.0, 10.0])
-    assert spearman(a, np.exp(a)) == pytest.approx(1)
-    assert spearman(a, -a) == pytest.approx(-1)
-    # Ties share their mean rank: ranks (1.5, 1.5, 3, 4) against (1, 2, 3, 4).
-    assert spearman(np.array([5.0, 5.0, 6.0, 7.0]), np.arange(4.0)) == pytest.approx(0.9486832981)
-
-
-def test_regions_pair_what_is_expected_with_what_is_measured_there():
-    """A camera at the origin looks along -z at three groups of points; its image is 40 x 30, regions 10 x 10."""
-    groups = {(2.0, 7.0): 6, (33.0, 22.0): 5, (22.0, 12.0): 4}  # the last is too small
-    pixels = np.repeat(list(groups), list(groups.values()), axis=0)
-    depth = np.concatenate([np.full(6, 10.0), np.full(5, 20.0), np.full(4, 5.0)])
-    points = np.column_stack([(pixels[:, 0] - 20) / 25, -(pixels[:, 1] - 15) / 25, -np.ones(15)]) * depth[:, None]
-    behind = -points[:6]
-    camera = SimpleNamespace(
-        fx=25.0, fy=25.0, cx=20.0, cy=15.0, width=40, height=30, camera_to_worlds=torch.eye(4)[None, :3]
-    )
-    axes = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0))
-    # 3 behind the camera: a texel of 0.04 spans 25 * 0.04 * D / (D - 3) pixels at the depth D in the MPI.
-    mpi = MPIPlan("one", (0.0, 0.0, 3.0), axes, 4.0, (-1.0, 1.0, -1.0, 1.0), 4096, 51, 51)
-    squared = np.arange(1200.0).reshape(30, 40)
-    found = Regions(Path(), rows=3, columns=4)._regions(
-        regions._as_observations(camera), np.concatenate([points, behind]), ScenePlan((mpi,), None, 0.1, 1.0), squared
-    )
-    assert [f[0] for f in found] == pytest.approx([0.5 * 13 / 10, 0.5 * 23 / 20], rel=1e-3)
-    cells = squared[:10, :10], squared[20:, 30:]
-    assert [f[1] for f in found] == pytest.approx([np.sqrt(c.mean()) for c in cells])
-
-
-def test_the_slope_of_an_image_is_its_change_over_a_pixel():
-    ramp = np.arange(12.0)[None, :, None] * [0.3, 0.6, 0.0] + np.arange(9.0)[:, None, None] * [0.0, 0.0, 0.9]
-    assert regions.squared_slope(ramp) == pytest.approx(np.full((9, 12), (0.09 + 0.36 + 0.81) / 3))
 
 
 def test_a_row_of_results_says_what_was_run(tmp_path):

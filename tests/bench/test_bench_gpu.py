@@ -15,8 +15,7 @@ from triton_processes import HERE, needs_triton, python
 from mmpi_ns.bench.apart import run_apart
 from mmpi_ns.bench.gpu import command as gpu
 from mmpi_ns.bench.gpu import parts, quick
-from mmpi_ns.bench.gpu.command import Gpu, told_curve
-from mmpi_ns.bench.gpu.report import markdown
+from mmpi_ns.bench.gpu.command import Gpu
 from mmpi_ns.bench.methods import METHODS
 from mmpi_ns.ops import dispatch
 
@@ -76,12 +75,12 @@ def test_a_part_that_fails_takes_no_other_with_it(tmp_path, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     answers = {
         "checks": {"not_run": "it failed with status 1"},
-        "operations": {"headline": {"copy_gb_per_s": 5.0}, "tables": {"A copy moves 5 GB/s": {}}},
+        "kitti": {"headline": {"steps_per_s": 5.0}, "tables": {"The paper's KITTI size": {}}},
     }
     monkeypatch.setattr(gpu, "run_apart", lambda work, request, *_: answers[request["part"]])
-    Gpu(data=tmp_path, output=tmp_path, work=tmp_path, parts=("checks", "operations")).run()
+    Gpu(data=tmp_path, output=tmp_path, work=tmp_path, parts=("checks", "kitti")).run()
     text = (tmp_path / "gpu.md").read_text()
-    assert "Not run: it failed with status 1" in text and "5 GB/s" in text and "| copy_gb_per_s | 5 |" in text
+    assert "Not run: it failed with status 1" in text and "KITTI size" in text and "| steps_per_s | 5 |" in text
 
 
 def test_a_kernel_that_is_wrong_ends_with_a_status(tmp_path, monkeypatch):
@@ -101,8 +100,7 @@ def test_a_process_that_outlasts_its_time_is_ended(tmp_path, monkeypatch):
     sleep = SimpleNamespace(__module__="sleeper", __qualname__="sleep")
     found = run_apart(sleep, {}, tmp_path / "run", 1, seconds=20.0)
     assert "failed with status" in found["not_run"]
-    assert told_curve(tmp_path / "run") == [{"step": 3, "seconds": 7.0, "psnr": 12.5}]
-    assert told_curve(tmp_path / "nothing") == []
+    assert "@ step 3: 7 s of training" in (tmp_path / "run" / "output.log").read_text()
 
 
 def test_a_session_writes_what_each_part_said_also_where_one_is_cut_off(tmp_path, monkeypatch, capsys):
@@ -150,19 +148,3 @@ def test_headline_holds_what_was_measured_and_nothing_else(tmp_path, monkeypatch
     found = parts.measure_training(request, lambda _: None)
     assert found["headline"] == {"torch_rays_per_s": 3.0 * 16_384, "torch_frame_ms": 5.0}
     assert [list(rows) for rows in found["tables"].values()] == [["4096 rays", "16384 rays"], ["gather"]]
-
-
-def test_a_method_that_was_cut_off_has_the_curve_that_it_told(tmp_path, monkeypatch):
-    monkeypatch.setattr(
-        METHODS["splatfacto"].__class__, "why_not", lambda self: "no" if "gsplat" in self.needs else None
-    )
-    curve = [{"step": 1, "seconds": 2.0, "psnr": 20.0}, {"step": 2, "seconds": 3.0, "psnr": 19.0}]
-    answers = {"mmpi": {"curve": curve}, "nerfacto": {"not_run": "it failed"}}
-    monkeypatch.setattr(gpu, "train_apart", lambda request, *_: answers[request.words[0]])
-    found = Gpu(data=tmp_path, output=tmp_path, work=tmp_path)._quality(tmp_path, 10.0)
-    assert found["headline"] == {"mmpi_psnr_db": 20.0, "mmpi_seconds": 2.0} and found["curves"] == {"mmpi": curve}
-    made = {"command": "mmpi-bench gpu", "processor": "x", "threads": 1, "torch": "2", "commit": "c", "date": "d"}
-    content = {"rows": {"quality": {**found, "wall_s": 1.0}}, "made": made, "rehearsal": False}
-    text = markdown(content, found["headline"])
-    assert "| nerfacto | not run: it failed |" in text and "| splatfacto | not run: no |" in text
-    assert "| mmpi | 2: 20.00, 3: 19.00 |" in text and "rehearsal" not in text

@@ -1,8 +1,7 @@
-"""``mmpi-bench gpu``: all that matters on a GPU in under ten minutes, correctness first, without a network."""
+"""``mmpi-bench gpu``: on a GPU, in minutes and without a network: correctness first, then training and frames."""
 
 from __future__ import annotations
 
-import re
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,22 +11,12 @@ import torch
 from mmpi_ns.bench.apart import run_apart
 from mmpi_ns.bench.gpu.parts import run_part
 from mmpi_ns.bench.gpu.quick import run_quick
-from mmpi_ns.bench.gpu.report import draw, markdown
-from mmpi_ns.bench.methods import JOINT, METHODS, Method, has_pycolmap
-from mmpi_ns.bench.report import Bench, Report, Row, Scene, slug
-from mmpi_ns.bench.trainings import Request, train_apart
+from mmpi_ns.bench.gpu.report import markdown
+from mmpi_ns.bench.methods import has_pycolmap
+from mmpi_ns.bench.report import Bench, Report, Row, slug
 
-SHARES = {
-    "checks": 0.15,
-    "operations": 0.1,
-    "training triton": 0.15,
-    "training torch": 0.12,
-    "kitti": 0.2,
-    "quality": 0.28,
-}
+SHARES = {"checks": 0.25, "training triton": 0.25, "training torch": 0.2, "kitti": 0.3}
 """The parts in the order in which they run, and their shares of the time; what one leaves, the next ones have."""
-PEERS = {"mmpi": 3000, "nerfacto": 3000, "splatfacto": 5000}
-"""Whose error is followed over time, and for how many steps at most."""
 QUICK_RAYS = 1024
 """Of a step that ``--quick`` times."""
 GRACE = 60.0
@@ -36,17 +25,17 @@ GRACE = 60.0
 
 @dataclass
 class Gpu(Bench):
-    """Kernels against float64, then training, frames, the paper's KITTI size, and error over time, on one GPU.
+    """Kernels against float64, then training, frames, and the paper's KITTI size, on one GPU.
 
     Every part runs in a process of its own within its share of the time: one that fails is recorded, and the others go
-    on. Ends with status 1 where a kernel is wrong.
+    on. Ends with status 1 where a kernel is wrong. For error over time there, see train.
     """
 
     data: Path | None = None
     """A drive (a folder with transforms.json); a procedural street is made where none is given."""
     downscale_factor: int = 1
     """Image size to use."""
-    seconds: float = 560.0
+    seconds: float = 400.0
     """For everything."""
     parts: tuple[str, ...] = tuple(SHARES)
     """Which parts to run."""
@@ -79,8 +68,7 @@ class Gpu(Bench):
             found = self._part(name, data, left * share) if left > 0 else {"not_run": "no time was left"}
             rows[name] = {**found, "wall_s": time.monotonic() - begin}
             head = {k: v for part in rows.values() for k, v in part.get("headline", {}).items()}
-            curves = rows.get("quality", {}).get("curves", {})
-            report.finish(head, markdown(report.content, head), lambda path, curves=curves: draw(path, curves))
+            report.finish(head, markdown(report.content, head))
         head = report.content["headline"]
         print(head)
         wrong = [name for name, part in rows.items() if "not_run" in part] if self.rehearse else []
@@ -120,62 +108,11 @@ class Gpu(Bench):
         return folder.resolve()
 
     def _part(self, name: str, data: Path, seconds: float) -> Row:
-        if name == "quality":
-            return self._quality(data, seconds)
         part, _, ops = name.partition(" ")
-        request = {"part": part, "ops": ops, "device": self._device, "rehearse": self.rehearse}
+        device = "cpu" if self.rehearse else "cuda"
+        request = {"part": part, "ops": ops, "device": device, "rehearse": self.rehearse}
         request |= {"data": str(data), "downscale_factor": self.downscale_factor, "work": str(self.folder.resolve())}
         request["seconds"] = max(5.0, seconds - 15)  # less what it takes to start
-        return run_apart(run_part, request, self.folder / slug(name, "-"), *self._how(seconds + GRACE))
-
-    @property
-    def _device(self) -> str:
-        return "cpu" if self.rehearse else "cuda"
-
-    def _how(self, seconds: float) -> tuple[int, float, dict[str, str]]:
-        """Threads, seconds and variables of a part's process; this one runs no kernel."""
         hidden = {"TRITON_INTERPRET": "1", "CUDA_VISIBLE_DEVICES": ""} if self.rehearse else {}
-        return 1 if self.rehearse else self.cores, seconds, hidden
-
-    def _quality(self, data: Path, seconds: float) -> Row:
-        """PSNR of test views against seconds of training: ours, nerfacto and splatfacto."""
-        said, curves, head = {}, {}, {}
-        names, few = (("mmpi",), 1) if self.rehearse else (tuple(PEERS), 4)
-        for number, name in enumerate(names):
-            begin, method = time.monotonic(), METHODS[name]
-            if method.ours:
-                method = Method(name, name, (*JOINT, *(TINY if self.rehearse else ())))
-            if reason := method.why_not():
-                said[name] = {"curve (s: dB)": f"not run: {reason}"}
-                continue
-            limit = seconds / (len(names) - number) + (GRACE if self.rehearse else 0)
-            steps = 4 if self.rehearse else PEERS[name]
-            checks = sorted({max(1, round(steps * 2.0**-i)) for i in range(9)} | {round(steps * 3 / 4)})
-            looks: Row = {"checks": tuple(checks), "check_images": few, "check_pixels": 1024 * few, "final_images": few}
-            scene, folder = Scene(data, self.downscale_factor), self.folder / f"quality-{name}"
-            row = train_apart(Request.of(method, scene, folder, steps, device=self._device, **looks), *self._how(limit))
-            curve = row["curve"] if "curve" in row else told_curve(folder)
-            told = ", ".join(f"{p['seconds']:.0f}: {p['psnr']:.2f}" for p in curve)
-            said[name] = {"curve (s: dB)": told or f"not run: {row['not_run']}"}
-            if curve:
-                best, curves[name] = max(curve, key=lambda point: point["psnr"]), curve
-                head |= {f"{name}_psnr_db": best["psnr"], f"{name}_seconds": best["seconds"]}
-            seconds -= time.monotonic() - begin
-        found: Row = {"headline": head, "curves": curves, "tables": {"PSNR of test views on the way.": said}}
-        return found if curves else {"not_run": str(said), **found}
-
-
-TINY = (
-    *("--pipeline.datamanager.train-num-rays-per-batch", "16", "--pipeline.datamanager.keypoint-rays", "4"),
-    *("--pipeline.model.placement.max-planes", "12", "--pipeline.model.placement.max-texels", "20000"),
-    *("--pipeline.model.hidden-width", "8"),
-)
-"""For a rehearsal."""
-
-
-def told_curve(folder: Path) -> list[dict[str, float]]:
-    """What a training that was ended early had said of itself."""
-    log = folder / "output.log"
-    text = log.read_text(encoding="utf-8", errors="replace") if log.is_file() else ""
-    found = re.findall(r"step (\d+): (\d+) s of training, ([\d.]+) dB", text)
-    return [{"step": int(a), "seconds": float(b), "psnr": float(c)} for a, b, c in found]
+        threads = 1 if self.rehearse else self.cores
+        return run_apart(run_part, request, self.folder / slug(name, "-"), threads, seconds + GRACE, hidden)

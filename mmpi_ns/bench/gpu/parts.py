@@ -24,21 +24,11 @@ from mmpi_ns.bench.gpu.checks import run_checks
 from mmpi_ns.bench.methods import JOINT, TWO_PHASE, Method, P
 from mmpi_ns.bench.report import Row, Scene, slug
 from mmpi_ns.bench.speed import ops
-from mmpi_ns.bench.speed.scaling import Point, made_up_batch
 from mmpi_ns.bench.trainers import Steps, median_s
-from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.model import MMPIModel
 from mmpi_ns.ops import dispatch
-from mmpi_ns.ops.march import MarchOptions, march
 from mmpi_ns.rendering.metrics import ImageMetrics
-from mmpi_ns.rendering.sampler import crossings
 
-SECTOR = 32
-"""Bytes that a GPU fetches at least: a bilinear lookup of one channel touches two sectors, one in each row."""
-TRANSPARENT = -30.0
-"""A raw density through which no light is lost."""
-KITTI = (4, 256, 270)
-"""MPIs, planes, and texels a side of the paper's KITTI setting."""
 FULL_WIDTH = 1242
 """Pixels across a frame of KITTI (375 down)."""
 
@@ -53,43 +43,6 @@ def check(request: Row, tell: Tell) -> Row:
     shown = {r["name"]: {"error": r["error"], "bound": r["bound"], "": "ok" if r["ok"] else "FAIL"} for r in rows}
     said = f"{len(rows)} comparisons with float64, {failed} failed."
     return {"headline": {"checks": len(rows), "failed_checks": failed}, "tables": {said: shown}, **found}
-
-
-# Operations ----------------------------------------------------------------------------------------------------------
-
-
-def measure_operations(request: Row, tell: Tell) -> Row:
-    """The march against the bandwidth of a copy."""
-    device, small = request["device"], request["rehearse"]
-    copied = ops.copy_rate(device, 1 << (12 if small else 28)) / 1e9
-    tell(f"copy: {copied:.0f} GB/s")
-    mpis, planes, side = (2, 8, 12) if small else KITTI
-    plan = Point(mpis=mpis, planes=planes, height=side, width=side).plan()
-    field = MMPIField(plan, feature_channels=1, hidden_width=2).eval().to(device)
-    field.density.data.fill_(TRANSPARENT)
-    rows, head = {}, {"copy_gb_per_s": copied}
-    for name, count in (("batch", 4096), ("large batch", 65_536), ("image", 466_000)):
-        torch.manual_seed(0)
-        rays, _ = made_up_batch(32 if small else count, image=name == "image")
-        row = rows[name] = _measure_march(field, rays.to(device), 1 if small else 20)
-        head[f"march_{slug(name)}_gb_per_s"] = row["gb_per_s"]
-        head[f"march_{slug(name)}_share_of_copy"] = row["gb_per_s"] / copied
-        tell(f"march, {name}: {row}")
-    said = f"""\
-A copy within the device moves {copied:.0f} GB/s, read and written. The march looks up every live sample
-of 4 MPIs of 256 planes, one sector (32 bytes) in each of two rows of texels; 16 of the 64 bytes are used."""
-    return {"headline": head, "tables": {said: rows}}
-
-
-@torch.no_grad()
-def _measure_march(field: MMPIField, rays: Any, repeats: int) -> Row:
-    """The kernel alone on rays that nothing stops and that keep nothing: it looks up every live sample."""
-    at = crossings(rays, field)
-    live, count = int(at.counts.sum()), len(rays)
-    seconds = median_s(lambda: march(field.layout, field.tables(), at, MarchOptions(0.9)), repeats)
-    gb = 2 * SECTOR * live / 1e9 / seconds
-    row = {"ms": 1e3 * seconds, "rays": count, "live_samples_a_ray": live / count}
-    return row | {"gb_per_s": gb, "useful_gb_per_s": gb / 4}
 
 
 # Training ------------------------------------------------------------------------------------------------------------
@@ -118,7 +71,7 @@ def measure_training(request: Row, tell: Tell) -> Row:
     options = ["--pipeline.model.ops", "torch" if path == "torch" else "auto"]
     options += ["--pipeline.model.eval-num-rays-per-chunk", "2048" if small else str(1 << 17)]
     options += ["--pipeline.datamanager.keypoint-rays", "4"] if small else []
-    rows, tables = {}, {}
+    rows, tables, limits = {}, {}, {}
     for rays in sizes:
         ends = time.monotonic() + request["seconds"] / len(sizes)
         method = Method("mmpi", "mmpi", drive(8 if small else 256, rays, *options))
@@ -128,7 +81,7 @@ def measure_training(request: Row, tell: Tell) -> Row:
         if rays == sizes[0]:
             row |= count_launches(steps) if torch.cuda.is_available() else {}
             row |= render_both(steps, path, repeats)
-            limits = {"copy_gb_per_s": ops.copy_rate(device, 1 << (12 if small else 26)) / 1e9}
+            limits["copy_gb_per_s"] = ops.copy_rate(device, 1 << (12 if small else 26)) / 1e9
             limits["matmul_gflop_per_s"] = ops.matmul_rate(device) / 1e9
             said = f"Each operation of a step of {rays} rays, beside what bandwidth and arithmetic would allow."
             tables[said] = ops.measure(steps, repeats, limits)["ops"]
@@ -137,7 +90,7 @@ def measure_training(request: Row, tell: Tell) -> Row:
     first = rows[f"{sizes[0]} rays"]
     names = ("peak_gib", "frame_ms", "full_frame_ms", "psnr_delta_db", "launches_a_step", "waits_a_step")
     head = {"rays_per_s": max(r["rays_per_s"] for r in rows.values()), **{n: first[n] for n in names if n in first}}
-    prefix = "torch_" if path == "torch" else ""
+    prefix, head = ("torch_", head) if path == "torch" else ("", head | limits)
     tables = {"`mmpi`, four MPIs by hand, 256 planes, trained together.": rows, **tables}
     return {"headline": {prefix + name: value for name, value in head.items()}, "tables": tables}
 
@@ -263,7 +216,6 @@ def time_phases(steps: Steps, total: int, ends: float) -> tuple[Row, Row]:
 
 PARTS: dict[str, Callable[[Row, Tell], Row]] = {
     "checks": check,
-    "operations": measure_operations,
     "training": measure_training,
     "kitti": measure_kitti,
 }

@@ -1,11 +1,10 @@
-"""Markdown and figure of ``mmpi-bench gpu``."""
+"""Page of ``mmpi-bench gpu``."""
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
-from mmpi_ns.bench.report import Row, figure, page, table, title
+from mmpi_ns.bench.report import Row, page, table, title
 
 
 def markdown(content: Row, head: Row) -> str:
@@ -31,14 +30,3 @@ def _number(value: Any) -> str:
     if not isinstance(value, int | float):
         return "-" if value is None else str(value)
     return f"{value:,}" if isinstance(value, int) else f"{value:.4g}"
-
-
-def draw(path: Path, curves: dict[str, list[dict[str, float]]]) -> None:
-    """PSNR against seconds, one line a method; nothing where none was trained."""
-    if not curves:
-        return
-    with figure(path, 1, 1, (6, 4)) as ((axis,),):
-        for name, curve in curves.items():
-            axis.plot([max(p["seconds"], 0.1) for p in curve], [p["psnr"] for p in curve], marker="o", label=name)
-        along = "seconds of training, placement and loading included"
-        axis.set(xscale="log", xlabel=along, ylabel="PSNR of test views, dB")
