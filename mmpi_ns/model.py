@@ -51,7 +51,7 @@ from mmpi_ns.utils.console import say
 from mmpi_ns.utils.random_draws import generator
 
 FAIR_SHARE = 0.1
-"""Until the field has sharpened, samples of more than this part of an equal weight are kept."""
+"""While the resolution grows, samples with more than this fraction of an equal weight are kept."""
 
 
 @dataclass
@@ -62,21 +62,21 @@ class MMPIModelConfig(ModelConfig):
     enable_collider: bool = False
     """Must stay off: a finite far would drop the plane at infinity."""
     eval_num_rays_per_chunk: int = 0
-    """Rays rendered at once; 0 for what suits the device (on a GPU: what half of its free memory holds)."""
+    """Rays in a rendering chunk; 0 chooses for the device (on a GPU: as many as fit in half of its free memory)."""
     placement: PlacementConfig = field(default_factory=PlacementConfig)
-    """Where the MPIs stand and how fine they are."""
+    """Placement and resolution of the MPIs."""
     plan_file: Path | None = None
     """A scene plan (JSON) to use instead of the placement rule."""
     resident_gib: float = 2.0
-    """Device memory that rendering may take for the windows of a long capture, GiB, beside the one trained last: as
-    many are held as fit, at least one; the one not used for longest goes first."""
+    """Device memory for rendering the windows of a long capture, GiB, in addition to the one trained last. As many as
+    fit are kept, at least one; the least recently used is evicted first."""
     half_windows: bool = False
-    """Write the finished windows of a long capture in half precision: half of the disk, and the same pictures to a
+    """Write the finished windows of a long capture in half precision: half of the disk space; images change by a
     fraction of a grey level."""
     camera_optimizer: CameraOptimizerConfig = field(default_factory=CameraOptimizerConfig)
-    """Refines the poses of the training images while it trains (docs/captures.md, "Poses that are not exact")."""
+    """Refines the poses of the training images during training (docs/captures.md, "Poses that are not exact")."""
     training: Training = "joint"
-    """Each MPI alone, then reliability (two-phase), or all together without reliability (joint)."""
+    """Train each MPI alone, then reliability (two-phase), or all MPIs together without reliability (joint)."""
     blend_share: float = 0.05
     """Share of the steps in which only reliability trains."""
     finetune_share: float = 0.4
@@ -86,26 +86,26 @@ class MMPIModelConfig(ModelConfig):
     decay_decades: float = 1.0
     """Decades that learning rates fall over a phase,"""
     decay_from: float = 0.5
-    """after they have stayed for this share of it."""
+    """after being constant for this fraction of it."""
     growth_shares: tuple[float, ...] = (1 / 15, 2 / 15, 3 / 15, 4 / 15)
     """When the texels of a plane double, as shares of the first phase."""
     release_shares: tuple[float, ...] = (0.5, 0.75, 0.95)
-    """When bricks (8 x 8 texels of a plane) in which nothing is seen are given up, as shares of the first phase."""
+    """When empty bricks (8 x 8 texels of a plane) are released, as fractions of the first phase."""
     release_weight: float = 5e-3
-    """Bricks in which no sample of a training ray weighs this much are given up; 0 keeps all that rays can reach."""
+    """Bricks in which no sample of a training ray has this weight are released; 0 keeps all that rays can reach."""
     rays_per_mpi: Literal["split", "all"] = "all"
-    """Individual phase: each MPI renders all rays of a batch (K times the work of a step, about what joint training
-    takes), or the MPIs share them."""
+    """Individual phase: each MPI renders all rays of a batch (all; K times the work, about that of joint training), or
+    the MPIs share them (split)."""
     blend_form: BlendForm = "paper"
-    """How reliability enters: P alpha (paper) or 1 - (1 - alpha)^P (opacity)."""
+    """Form of blending by reliability: P alpha (paper) or 1 - (1 - alpha)^P (opacity)."""
     shading: Shading = "ray"
-    """Whether a network looks at what a ray has gathered, once, or colours every sample as in the paper."""
+    """Evaluate the colour network once a ray, after compositing (ray), or for every sample as in the paper (sample)."""
     shared_colour: bool = False
     """Shading of samples: one colour network for all MPIs instead of one each."""
     feature_channels: int = 9
-    """Numbers of a texel beside its density: three of a colour, the others of what depends on the view."""
+    """Channels of a texel besides its density: three of a colour, the others features for view-dependent appearance."""
     hidden_width: int = 64
-    """Width of the networks."""
+    """Width of the colour networks."""
     position_frequencies: int = 2
     """Shading of samples: octaves of the positional encoding of NDC positions."""
     direction_frequencies: int = 2
@@ -115,25 +115,25 @@ class MMPIModelConfig(ModelConfig):
     cube_alpha: float = 1e-3
     """Initial alpha of a cube sample: 1e-2 for a small room to 1e-4."""
     train_threshold: float = 3e-3
-    """Samples of less weight get no gradient (while resolution grows: nor more than a tenth of an equal share)."""
+    """Samples of less weight get no gradient (at most a tenth of an equal share while the resolution grows)."""
     ops: dispatch.Route = "auto"
-    """Inner loops: compiled at first use (native; by a C++ compiler on a CPU, by Triton on a GPU), plain torch, or
-    compiled where that can be done (auto)."""
+    """Inner loops: compiled at first use (native; by a C++ compiler on a CPU, by Triton on a GPU), plain torch (torch),
+    or compiled if possible (auto)."""
     render_threshold: float = 3e-3
-    """Samples of less weight are not coloured when rendering; the dropped mass is reported."""
+    """Samples of less weight are not shaded when rendering; their total weight is reported (dropped_mass)."""
     render: Literal["auto", "exact", "baked"] = "auto"
-    """Images from the field itself (exact), or from bricks of 8-bit codes made of it when the first image is asked for
-    (baked: half of the time on a CPU, 0.01 dB less; docs/export.md). auto: bricks for ns-render and ns-viewer on a
-    CPU, where a model can be baked; while it trains, where it is measured (ns-eval) and on a GPU the field itself."""
+    """Render the field itself (exact), or 8-bit texels baked from it before the first image (baked: half of the time on
+    a CPU, 0.01 dB less; docs/export.md). auto: baked for ns-render and ns-viewer on a CPU if the model can be baked;
+    exact during training, in ns-eval and on a GPU."""
     render_shares: Literal["exact", "baked"] = "exact"
-    """After two-phase training: a sample's share from the reliabilities of all MPIs that see it, or from its texels,
-    which keep theirs from the first rendering on (faster by the number of MPIs that overlap, and nearly the same)."""
+    """After two-phase training: compute a sample's share from the reliabilities of all MPIs that cover it (exact), or
+    interpolate shares baked into its texels (baked: faster by the number of overlapping MPIs, nearly the same)."""
     background: Literal["black", "gray", "white"] = "gray"
-    """Behind everything, when rendering. Training uses random colours where the MPIs explain the whole ray."""
+    """Background when rendering. Training uses random colours where the MPIs cover the whole ray."""
     loss: LossWeights = field(default_factory=LossWeights)
     """Weights of the losses."""
     lpips_net: Literal["vgg", "alex", "none"] = "vgg"
-    """Network of the LPIPS metric (the paper: VGG); left out where its weights (0.5 GB for VGG) cannot be had."""
+    """Network of the LPIPS metric (the paper: VGG); left out if its weights (0.5 GB for VGG) are not available."""
     seed: int = field(default=0, init=False)
     """Not an option: the trainer sets it from --machine.seed."""
     total_steps: int = field(default=1, init=False)

@@ -1,1 +1,1 @@
-"""What comes from a capture: images, rays, SfM tracks and depths, and checks of the input."""
+"""Everything read from a capture: images, rays, SfM tracks and depths, and checks of the input."""

@@ -1,4 +1,4 @@
-"""Results that take long to find and depend on files: kept in the user's cache folder, found once by all processes."""
+"""Slow results that depend on files: kept in the user's cache folder, computed once by all processes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from mmpi_ns.utils.files import write_atomically
 
 KEPT = 24
-"""Results that are kept; the one not used for longest goes first."""
+"""Results that are kept; the least recently used is removed first."""
 
 Arrays = dict[str, NDArray[np.generic]]
 
@@ -27,7 +27,7 @@ def cache_folder() -> Path:
 
 
 def digest(files: Iterable[Path], *parts: object) -> str:
-    """A key of files, by path, size and time of change, and of arrays and settings."""
+    """A key made of files (path, size, modification time), arrays and settings."""
     found = hashlib.sha256()
     for file in files:
         stat = file.stat()
@@ -38,10 +38,10 @@ def digest(files: Iterable[Path], *parts: object) -> str:
 
 
 def remembered(key: str, find: Callable[[], Arrays], folder: Path | None = None) -> Arrays:
-    """What ``find`` gives, or gave when the key was last asked for.
+    """The result of ``find``, from the cache if the key is there.
 
-    Where several processes ask at once one finds and the others wait. Where the folder cannot be written to, every
-    process finds for itself, and says so.
+    If several processes ask at once, one computes and the others wait. If the folder is not writable, every process
+    computes the result itself, and says so.
     """
     folder = folder or cache_folder()
     path = folder / f"{key}.npz"
@@ -49,7 +49,7 @@ def remembered(key: str, find: Callable[[], Arrays], folder: Path | None = None)
         folder.mkdir(parents=True, exist_ok=True)
         lock = FileLock(folder / f"{key}.lock").acquire()
     except OSError as error:
-        CONSOLE.print(f"[yellow]{folder} cannot be written to ({error.strerror}): depths are found anew at each start.")
+        CONSOLE.print(f"[yellow]{folder} cannot be written to ({error.strerror}): depths are recomputed at each start.")
         return find()
     with lock:
         known = _read(path)

@@ -1,4 +1,4 @@
-"""Checks of what a user gives, before nerfstudio reads it, whose own errors name neither frame nor remedy.
+"""Checks of the input before nerfstudio reads it, whose own errors name neither frame nor remedy.
 
 The sentences are listed in docs/errors.md.
 """
@@ -24,15 +24,15 @@ from mmpi_ns.utils.errors import InputError, brief
 from mmpi_ns.utils.values import Number, check_number, check_options, check_row, cut, shown
 
 SAME_PLACE = 1e-6
-"""Cameras nearer to each other than this share of their distance from the origin stand in one place, in float32."""
+"""Cameras closer together than this fraction of their distance from the origin count as one place, in float32."""
 FLOAT64_SAME = 1e-12
-"""The same of numbers as they are in a file."""
+"""The same for numbers as they are in a file."""
 ROTATION_SLACK = 0.01
-"""How much longer or shorter than 1 the axes of a pose may be."""
+"""Tolerance on the length of the axes of a pose, which should be 1."""
 FAR_OFF = 1000.0
-"""A camera that is so many times as far off as all but a few others is a mistake."""
+"""A camera this many times as far away as all but a few others is a mistake."""
 FEW = 0.1
-"""Share of the cameras that are a few."""
+"""Fraction of the cameras that counts as a few."""
 PATHS = ("file_path", "mask_path", "depth_file_path")
 PARSER = {
     "scale_factor": Number(0, 1e9, above=True),
@@ -53,12 +53,12 @@ def check_parser(parser: DataParserConfig) -> None:
 
 
 def check_transforms(parser: NerfstudioDataParserConfig, data: Path, splits: Sequence[str], *, opens: bool) -> None:
-    """Reads a transforms.json and judges all that nerfstudio's parser takes from it.
+    """Reads a transforms.json and checks everything that nerfstudio's parser takes from it.
 
     Args:
         parser: its settings.
         data: folder with a transforms.json, or a file of that kind.
-        splits: which of train, val and test the parser will be asked for.
+        splits: those of train, val and test that will be requested.
         opens: the parser takes its downscale factor from the first image, unless one is given, or from its copies.
 
     Raises:
@@ -87,12 +87,12 @@ def check_transforms(parser: NerfstudioDataParserConfig, data: Path, splits: Seq
 
 @cache
 def say_once(text: str) -> None:
-    """Prints a note, unless it has been printed."""
+    """Prints a note once."""
     CONSOLE.print(text)
 
 
 def in_one_place(centers: NDArray[np.float64], share: float = SAME_PLACE) -> bool:
-    """Whether camera centres [M, 3] are the same but for rounding: a share of their distance from the origin."""
+    """Whether camera centres [M, 3] are equal up to rounding, which is relative to their distance from the origin."""
     return float(np.ptp(centers, axis=0).max()) <= share * max(1.0, float(np.abs(centers).max()))
 
 
@@ -174,7 +174,7 @@ def _check_whole_file(meta: Mapping[str, Any], path: Path) -> None:
 
 
 def _check_points(parser: NerfstudioDataParserConfig, meta: Mapping[str, Any], path: Path) -> None:
-    """A point cloud, where it is asked for: nerfstudio would ask back, or go on without."""
+    """A point cloud, if one is requested: nerfstudio would prompt, or continue without it."""
     if not parser.load_3D_points:
         return
     cloud = meta.get("ply_file_path")
@@ -186,7 +186,7 @@ def _check_points(parser: NerfstudioDataParserConfig, meta: Mapping[str, Any], p
 
 
 def _check_names(parser: NerfstudioDataParserConfig, meta: Mapping[str, Any], frames: Frames, path: Path) -> None:
-    """Names that say to which split an image belongs, where they are to."""
+    """File names that determine the split, if --eval-mode filename is used."""
     if parser.eval_mode != "filename" or any(f"{split}_filenames" in meta for split in ("train", "val", "test")):
         return
     for frame in frames:
@@ -206,7 +206,7 @@ def _check_same_for_all(frames: Frames, path: Path) -> None:
 
 
 def _check_splits(meta: Mapping[str, Any], frames: Frames, splits: Sequence[str], path: Path, *, by_name: bool) -> None:
-    """Lists of training and evaluation frames: where one is there, those of all splits asked for must be."""
+    """Lists of training and evaluation frames: if there is one, all requested splits need theirs."""
     keys = [f"{split}_filenames" for split in ("train", "val", "test")]
     if not any(key in meta for key in keys):
         return
@@ -253,7 +253,7 @@ def _check_first_image(factor: int | None, folder: Path, first: str) -> None:
 
 
 def _check_places(centers: NDArray[np.float64], names: Sequence[str], path: Path, *, auto_scale: bool) -> None:
-    """Places that differ, and none far from all others."""
+    """Camera positions must differ, and none may be far from all others."""
     if in_one_place(centers, FLOAT64_SAME):
         if not auto_scale:
             return

@@ -35,15 +35,15 @@ from mmpi_ns.utils.errors import InputError
 from mmpi_ns.utils.random_draws import generator
 
 OBSERVATIONS = "mmpi_observations"
-"""Key under which the model finds the scene's Observations in the data set's metadata."""
+"""Key of the scene's Observations in the data set's metadata, for the model."""
 RAYS_PER_STEP = "mmpi_rays_per_step"
-"""Key under which it finds the pixel rays of a training step."""
+"""Key of the pixel rays of a training step."""
 TRAINING_VIEWS = "mmpi_training_views"
-"""Key under which it finds where the training cameras stand and what they can see (``TrainingViews``)."""
+"""Key of the positions and fields of view of the training cameras (``TrainingViews``)."""
 KEYPOINT_DEPTH = "keypoint_inverse_distance"
 """Ray-bundle metadata: inverse distance of the SfM point on a keypoint ray, 0 on ordinary rays."""
 PIXEL_DEPTH = "pixel_inverse_distance"
-"""Ray-bundle metadata [R, 2]: inverse distance of what a pixel shows and its expected error, 0 where not known."""
+"""Ray-bundle metadata [R, 2]: inverse distance of the content of a pixel and its expected error, 0 where unknown."""
 OWN_PIXEL = "is_own_pixel"
 """Ray-bundle metadata [R, 1]: whether a ray goes through a pixel of a training image."""
 
@@ -58,7 +58,7 @@ class MMPIDataManagerConfig(VanillaDataManagerConfig):
     eval_num_rays_per_batch: int = 1024
     """Rays of an evaluation batch during training."""
     keypoint_rays: int = 384
-    """Extra rays a step through SfM keypoints of training images, where few pixels have a depth that two images share
+    """Extra rays a step through SfM keypoints of training images, if few pixels have a depth shared by two images
     (scenes with tracks only)."""
     sfm_path: Path = Path("colmap/sparse/0")
     """COLMAP model with the tracks, relative to the data, in the frame of transforms.json (colmap parser: its own)."""
@@ -68,13 +68,13 @@ class MMPIDataManagerConfig(VanillaDataManagerConfig):
     """Match the originals of neighbouring training images densely at the start, for the depth of most pixels (less
     than a second an image; kept in ~/.cache/mmpi_ns for the next start)."""
     depth_images: bool = True
-    """Use the depths of sensors that a data parser names (depth_file_path)."""
+    """Use the depth images that a data parser lists (depth_file_path)."""
     new_view_share: float = 0.75
-    """Rays a step from between two training cameras, at points that both show at the same known depth, for each pixel
-    ray: what a new view would see there (0: none)."""
+    """Rays of new views for each pixel ray: from between two training cameras to points that both show at the same
+    known depth (0: none)."""
     resident_pixels: float = 60e6
-    """Training pixels held in memory at once (at most 12 bytes each). Those of a longer capture are read window by
-    window, and of a window that has more, so many at random. 0: window by window, all of them."""
+    """Training pixels held in memory at once (at most 12 bytes each). Longer captures are read window by window; if a
+    window has more pixels, a random subset of this size is used. 0: window by window, all of them."""
     seed: int = field(default=0, init=False)
     """Not an option: the trainer sets it from --machine.seed. Batches depend on it and the step alone, so a resumed run
     draws what an uninterrupted one would."""
@@ -115,12 +115,12 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
             has_keypoints = self.config.keypoint_rays > 0 and len(self.observations.seen_at) > 0
             if not has_keypoints and (known is None or known.share == 0):
                 CONSOLE.print(
-                    "No distance is known, from tracks, matches or a sensor: it is learned from colours alone."
+                    "No depths are known, from tracks, matches or a sensor: geometry is learned from colours alone."
                 )
         return dataset
 
     def _known_depth(self, dataset: MMPIDataset) -> KnownDepth | None:
-        """Depths of pixels, matched or measured, where they are asked for."""
+        """Depths of pixels, matched or measured, if enabled."""
         parts = {"dense": self.config.dense_depth, "sensor": self.config.depth_images}
         if not any(parts.values()):
             return None
@@ -128,7 +128,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
 
     @cached_property
     def observations(self) -> Observations:
-        """What the training cameras saw; only training looks for points in the images, which may be absent."""
+        """What the training cameras saw. Only training searches the images, which may be absent later, for points."""
         return observe(
             self.train_dataparser_outputs,
             self.train_dataset,
@@ -164,7 +164,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         self._shared = self._all_shared
 
     def _find_shared(self, images: Sequence[int]) -> SharedPoints | None:
-        """The points that two of these training images show at the same depth, where new views are asked for."""
+        """The points that two of these training images show at the same depth, if rays of new views are enabled."""
         if self.known_depth is None or self.config.new_view_share <= 0:
             return None
         posed = posed_images(self.observations, self.train_dataset)
@@ -174,7 +174,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         return find_shared_points(self.train_dataset, posed, self.known_depth, rays, images, seed, self.device)
 
     def use_cameras(self, cameras: NDArray[np.int64] | None) -> None:
-        """Draws pixels and keypoints of these training cameras alone from now on; None for all.
+        """Restricts pixels and keypoints to these training cameras from now on; None for all.
 
         Raises:
             InputError: the masks leave them no pixel.
@@ -206,7 +206,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         return f"Capture: {'; '.join(parts)}."
 
     def _read_pixels(self, images: Sequence[int] | None = None) -> PixelPool:
-        """The pixels of the training images, or of some; says so where a share of them must do."""
+        """The pixels of the training images, or of some; prints a note if only a subset is used."""
         sizes, most = self._sizes(images), int(self.config.resident_pixels)
         if 0 < most < sizes.sum():
             CONSOLE.print(
@@ -236,7 +236,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         return each * sum(int(share * size) for size in sizes.tolist())
 
     def setup_eval(self) -> None:
-        """nerfstudio's loaders, but for the one that holds every evaluation image in memory."""
+        """nerfstudio's loaders, except the one that holds every evaluation image in memory."""
         assert self.eval_dataset is not None
         sizes = self.eval_dataset.cameras.width * self.eval_dataset.cameras.height
         # An image that cannot be used is named before training, not after it.
@@ -261,7 +261,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
     def next_train(self, step: int) -> tuple[RayBundle, dict]:
         """Pixel rays first, then keypoint rays (marked in the bundle's metadata), keyed on (seed, step).
 
-        Outside training (ns-export asks for step 0 again and again) pixel rays alone, others with each call.
+        Outside training (ns-export always requests step 0) there are only pixel rays, different ones in each call.
         """
         self.train_count += 1
         if self.pool is None:  # nobody said which window
@@ -275,7 +275,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
             bundle, colors = _join(bundle, views), torch.cat([colors, seen])
             pixel_depths = torch.cat([pixel_depths, distances])
         depths = torch.zeros(len(bundle), 1, device=self.device)
-        # Points that two images share say more than keypoints, which make up for those that are missing.
+        # Points shared by two images are more informative than keypoints, which replace the missing ones.
         missing = 1.0 if self._shared is None else max(0.0, 1 - self._shared.cover)
         count = round(missing * self.config.keypoint_rays)
         if self.training and self._keypoints is not None and count > 0:
@@ -288,7 +288,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         return bundle, {"image": colors, "indices": indices}
 
     def _keypoint_rays(self, count: int, g: torch.Generator) -> tuple[RayBundle, Float[Tensor, "Q 1"]]:
-        """Rays from training cameras straight at SfM points that they saw, and the inverse distances of those."""
+        """Rays from training cameras to SfM points that they saw, and the inverse distances of the points."""
         assert self._keypoints is not None
         cameras, origins, directions, inverse = self._keypoints
         chosen = torch.randint(cameras.shape[0], (count,), generator=g, device=g.device)
@@ -318,7 +318,7 @@ def _keypoint_targets(
 ) -> tuple[Tensor, ...] | None:
     """Camera, origin, unit direction and inverse distance of every keypoint of the training images, or of some.
 
-    The ray goes to the point itself, a fraction of a pixel from the keypoint: no lens model enters.
+    The ray goes to the point itself, a fraction of a pixel from the keypoint, so no lens model is needed.
     """
     # Points of a plane sweep come after those of the tracks: too rough to supervise depth.
     tracked = np.arange(len(observations.seen_at))
@@ -335,7 +335,7 @@ def _keypoint_targets(
 
 
 def is_pixel_ray(bundle: RayBundle) -> Bool[Tensor, "R"]:
-    """Rays through pixels, as opposed to rays through SfM keypoints, which have a known depth but no pixel."""
+    """Marks rays through pixels; rays to SfM keypoints have a known depth but no pixel."""
     known = bundle.metadata.get(KEYPOINT_DEPTH)
     if known is None:
         return torch.ones(len(bundle), dtype=torch.bool, device=bundle.origins.device)

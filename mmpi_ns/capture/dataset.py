@@ -25,7 +25,7 @@ SIXTEEN_BIT = ("I", "I;16", "I;16B", "I;16L", "I;16N")
 
 
 class UnusableFile(InputError):
-    """One sentence with the image or mask file that cannot be used, and what to do."""
+    """An image or mask file that cannot be used; the message names it and the remedy."""
 
 
 class MMPIDataset(InputDataset):
@@ -80,7 +80,7 @@ class MMPIDataset(InputDataset):
         return data | {k: data[k][:height, :width] for k in ("image", "mask", "distance") if k in data}
 
     def _distance(self, file: Path, image_idx: int, shape: tuple[int, int]) -> Float[Tensor, "H W 1"]:
-        """Distance of what each pixel of an evaluated image shows, from its depth image; 0 where unknown."""
+        """Distance of the content of each pixel of an evaluated image, from its depth image; 0 where unknown."""
         unit = self.metadata.get("depth_unit_scale_factor", 1.0) * self._dataparser_outputs.dataparser_scale
         depth = cv2.resize(read_depth_image(file, unit), shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
         camera = self.cameras[image_idx : image_idx + 1]

@@ -1,13 +1,13 @@
 """Depth of most pixels of the training images: dense matches between neighbouring views, each with its error.
 
 Every image is compared with its nearest neighbours. A rough depth, interpolated from SfM points, warps the neighbour
-into the image, so that what is left to find is small whatever the motion was; DIS optical flow finds it. A match on its
-epipolar line gives an inverse depth; matches of several neighbours that agree are averaged. Further rounds start from
-the depths of the one before. All of it is OpenCV and NumPy at about twice the training size.
+into the image, so that the remaining displacement, found by DIS optical flow, is small whatever the motion was. A match
+on its epipolar line gives an inverse depth; consistent matches of several neighbours are averaged. Further rounds start
+from the depths of the previous one. All of it runs in OpenCV and NumPy at about twice the training size.
 
 A point at inverse depth q lies at a + q b in the neighbour's axes, up to a factor. A match at a pixel there gives two
-linear equations r + q s = 0, in pixels once divided by the point's depth: their least squares is q, what remains is the
-distance from the epipolar line, and |s| / depth is the parallax, pixels for each unit of q.
+linear equations r + q s = 0, in pixels once divided by the point's depth: q is their least-squares solution, the
+residual is the distance from the epipolar line, and |s| / depth is the parallax in pixels for each unit of q.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ Map = NDArray[np.float32]
 Progress = Callable[[Iterable[int]], Iterable[int]]
 
 NEIGHBOURS = 4
-"""Images that each one is compared with."""
+"""Neighbours that each image is compared with."""
 MAX_ANGLE = 40.0
 """Degrees between the facing directions of images that are compared."""
 ROUNDS = 3
-"""Rounds of matching; each starts from the depths of the one before."""
+"""Rounds of matching; each starts from the depths of the previous one."""
 NOISE = 0.3
 """Standard deviation of a match, working pixels, where images look alike."""
 MAX_EPIPOLAR = 1.0
@@ -43,18 +43,18 @@ MIN_CORRELATION = 0.5
 MIN_CONTRAST = 1.0
 """Standard deviation of gray levels in a window below which there is nothing to match."""
 AGREE = 2.5
-"""Matches agree within so many of their standard deviations."""
+"""Matches agree if they differ by at most this many standard deviations."""
 EDGE, STEP = 9, 1.1
-"""An edge: inverse depths that differ by this factor within a window of so many pixels. What lies behind takes the
-motion of what is in front there, as windows reach across."""
+"""An edge: inverse depths that differ by this factor within a window of this many pixels. Background there takes on the
+motion of the foreground, because windows reach across."""
 OWN_CONTRAST = 4.0
 """Standard deviation of gray levels in 3 x 3 pixels that a match near an edge needs."""
 SAME_DEPTH = 0.03
-"""Two images' depths of a point agree within this share and three of their errors."""
+"""The depths of a point in two images agree within this fraction plus three of their errors."""
 MAX_RELATIVE = 0.15
-"""Depths with a larger relative error are not kept."""
+"""Depths with a larger relative error are discarded."""
 PRIOR_ERROR = 0.5
-"""Relative error of the rough depths that the first round starts from, against which measured ones are weighed."""
+"""Relative error of the initial rough depths, against which measured ones are weighted."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class View:
 
 @dataclass(frozen=True)
 class Depth:
-    """Inverse depth along the optical axis, and its expected error; both 0 where nothing is known. [h, w]"""
+    """Inverse depth along the optical axis, and its expected error; both 0 where unknown. [h, w]"""
 
     inverse: Map
     error: Map
@@ -238,10 +238,10 @@ def _mean(x: Map, side: int = WINDOW) -> Map:
 
 
 def fuse(inverse: NDArray[np.float32], weight: NDArray[np.float32]) -> Depth:
-    """The mean of the most of n measurements [n, h, w] that agree, and its expected error.
+    """The mean of the largest consistent subset of n measurements [n, h, w], and its expected error.
 
-    A single measurement counts where there is no other: ``confirmed`` asks another image. Weights are one over squared
-    errors, 0 where there is no measurement. An error is never less than what the agreeing measurements scatter by.
+    A single measurement counts if there is no other; ``confirmed`` checks it in another image. Weights are one over
+    squared errors, 0 where there is no measurement. The error is at least the scatter of the measurements averaged.
     """
     best = np.zeros(inverse.shape[1:], np.float32)
     mean, error = np.zeros_like(best), np.zeros_like(best)
@@ -265,7 +265,7 @@ def fuse(inverse: NDArray[np.float32], weight: NDArray[np.float32]) -> Depth:
 
 
 def filled(depth: Depth, rough: Map) -> Map:
-    """Inverse depths of all pixels: rough ones pulled to the measured ones about them, widely first, then closely."""
+    """Inverse depths of all pixels: rough ones pulled towards measured ones nearby, from coarse to fine."""
     relative = depth.error / np.maximum(depth.inverse, 1e-12)
     weight = np.where(depth.inverse > 0, 1 / np.maximum(relative, 0.01), 0).astype(np.float32)
     for side in (65, 33, 17, 9):
@@ -276,7 +276,7 @@ def filled(depth: Depth, rough: Map) -> Map:
 
 
 def neighbours_of(images: PosedImages, i: int) -> list[int]:
-    """The nearest images that look roughly the same way and do not stand in the same place."""
+    """The nearest images with a similar viewing direction and another position."""
     poses = images.camera_to_worlds
     distance = np.linalg.norm(poses[:, :, 3] - poses[i, :, 3], axis=-1)
     alike = poses[:, :, 2] @ poses[i, :, 2] > np.cos(np.radians(MAX_ANGLE))
@@ -315,7 +315,7 @@ def find_depths(
 
 
 def compared(views: list[View], near: list[list[int]], i: int, start: Map, flow: cv2.DISOpticalFlow) -> Depth:
-    """The depths of a view by comparison with those near it."""
+    """The depths of a view by comparison with its neighbours."""
     parts = [measure(views[i], views[j], start, flow) for j in near[i]]
     if not parts:
         return Depth(np.zeros_like(start), np.zeros_like(start))
@@ -323,7 +323,7 @@ def compared(views: list[View], near: list[list[int]], i: int, start: Map, flow:
 
 
 def without_fringes(view: View, depth: Depth) -> Depth:
-    """Leaves out the fringe about a foreground where the background has no texture of its own."""
+    """Removes the fringe around a foreground object where the background has no texture of its own."""
     known = depth.inverse > 0
     least = cv2.erode(np.where(known, depth.inverse, 1e30).astype(np.float32), np.ones((EDGE, EDGE), np.uint8))
     gray = view.gray.astype(np.float32)
@@ -332,7 +332,7 @@ def without_fringes(view: View, depth: Depth) -> Depth:
 
 
 def confirmed(view: View, depth: Depth, others: list[tuple[View, Depth]]) -> Depth:
-    """Keeps the depths that another image's depth confirms and that no more of them see through."""
+    """Keeps the depths confirmed by the depth of at least one other image and by at least as many as contradict it."""
     confirm, contradict = np.zeros(depth.inverse.shape, np.int8), np.zeros(depth.inverse.shape, np.int8)
     for other, theirs in others:
         parallax = _Parallax.between(view, other)

@@ -1,4 +1,4 @@
-"""Depth images of sensors, as nerfstudio's data parsers name them (depth_file_path, depth_unit_scale_factor)."""
+"""Depth images of sensors, as nerfstudio's data parsers list them (depth_file_path, depth_unit_scale_factor)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How far matches lie from their epipolar lines: what poses alone say about them, without any point."""
+"""Distance of matches from their epipolar lines: a test of poses that needs no triangulated points."""
 
 from __future__ import annotations
 

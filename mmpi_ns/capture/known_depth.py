@@ -1,6 +1,6 @@
-"""What is known of the distance at each training pixel: inverse distance and expected error, from whatever gave it.
+"""Known distances of training pixels: inverse distance and expected error, from all sources.
 
-Sources, the later over the earlier: dense matches (``dense.py``), SfM points, depth images of a sensor.
+Sources, later ones replacing earlier ones: dense matches (``dense.py``), SfM points, depth images of a sensor.
 """
 
 from __future__ import annotations
@@ -34,19 +34,19 @@ Map = NDArray[np.float32]
 Codes = NDArray[np.int16]
 
 VERSION = 4
-"""Of the way depths are found: kept ones of another version are found anew."""
+"""Version of the algorithm: cached depths of another version are recomputed."""
 FINER, WIDEST = 2.0, 1600
-"""Images are matched at so many times the training size, and no wider than this, where their originals are."""
+"""Images are matched at this multiple of the training size, and at most this wide, if the originals are available."""
 MOST_WORKING = 6e8
-"""Pixels in all at which images are matched (13 bytes each meanwhile); of more, at a smaller size."""
+"""Total number of pixels at which images are matched (13 bytes each); larger captures are matched at a smaller size."""
 COVERED = 0.3
-"""Share of a training pixel's area in which working pixels must have a depth."""
+"""Fraction of a training pixel's area in which working pixels must have a depth."""
 POINT_ERROR = 0.01
-"""Relative error of an SfM point's distance, at least."""
+"""Minimum relative error of the distance of an SfM point."""
 CONTINUED = 320
-"""Pixels along the longer side of an image, at most, at which surfaces are continued: they are smooth."""
+"""Maximum pixels along the longer side of an image at which surfaces are extrapolated; they are smooth."""
 CELLS = 32
-"""Cells along the longer side of an image, each of which tells placement one depth."""
+"""Cells along the longer side of an image; placement gets one depth from each."""
 SENSOR_ERROR = 0.01
 """Relative error of a sensor's depth."""
 UNKNOWN, OCTAVE = -(2**15), 1024
@@ -57,7 +57,7 @@ UNKNOWN, OCTAVE = -(2**15), 1024
 class KnownDepth:
     """For every training image: inverse distance from the camera, 0 where unknown, and its expected error.
 
-    Half as large as floating-point numbers would be: a distance is off by at most 0.034 %.
+    Stored in 16 bits each; the relative rounding error of a distance is at most 0.034 %.
     """
 
     codes: tuple[Codes, ...]
@@ -102,10 +102,10 @@ def unpacked(codes: Int16[Tensor, "*N"]) -> Float[Tensor, "*N"]:
 def know_depths(
     outputs: DataparserOutputs, observations: Observations, dataset: MMPIDataset, *, dense: bool, sensor: bool
 ) -> KnownDepth:
-    """What can be known of the training images' depths.
+    """All available depths of the training images.
 
     Args:
-        outputs: what the data parser said of them.
+        outputs: of the data parser.
         observations: their cameras and tracks.
         dataset: the images.
         dense: whether to match neighbouring images.
@@ -130,7 +130,7 @@ def know_depths(
 
 
 def _remembered_depths(original: PosedImages, posed: PosedImages, observations: Observations) -> KnownDepth:
-    """Depths by dense matching, found once."""
+    """Depths by dense matching, from the cache if possible."""
     tracked = len(observations.seen_at)
     seen_by, points = observations.seen_by[:tracked], observations.points[observations.seen_point[:tracked]]
     shapes = [(int(h), int(w)) for w, h in observations.sizes]
@@ -163,7 +163,7 @@ def _file_shape(original: PosedImages, posed: PosedImages, i: int) -> tuple[int,
 def with_sensor(
     known: KnownDepth, files: list[Path], unit: float, original: PosedImages, posed: PosedImages
 ) -> KnownDepth:
-    """Takes the depths of sensors where they know any."""
+    """Replaces depths by those of sensors where there are any."""
     codes = []
     for i, (file, own) in enumerate(zip(files, known.codes, strict=True)):
         shape = own.shape[0], own.shape[1]
@@ -177,8 +177,8 @@ def at_training_pixels(
 ) -> Map:
     """Distances of a training image's pixels from the depths of its view at working size.
 
-    A training pixel takes the mean of what its area holds, weighted by certainty; where that differs within the area,
-    as on an edge, its error grows by it.
+    A training pixel takes the mean over its area, weighted by certainty; the spread within the area, large at an
+    edge, is added to its error.
 
     Args:
         view: the image at working size.
@@ -234,7 +234,7 @@ def _straightened(
 
 
 def with_continued(known: KnownDepth, posed: PosedImages, dataset: MMPIDataset) -> KnownDepth:
-    """Adds distances of what hardly any other image shows, where surfaces go on (``lone_depth.py``); found once."""
+    """Extrapolates surfaces into regions that hardly any other image shows (``lone_depth.py``); cached."""
 
     def find() -> Arrays:
         numbers = track(range(len(known.codes)), description="Surfaces that go on", console=CONSOLE)
@@ -246,7 +246,7 @@ def with_continued(known: KnownDepth, posed: PosedImages, dataset: MMPIDataset) 
 
 
 def _continued_codes(known: KnownDepth, i: int, posed: PosedImages, dataset: MMPIDataset) -> Codes:
-    """Codes of one image, those of continued surfaces too; found for every n-th pixel of a large image."""
+    """Codes of one image with extrapolated surfaces; computed for every n-th pixel of a large image."""
     own = known.codes[i].copy()
     step = -(-max(own.shape[:2]) // CONTINUED)
     rows, columns = (np.minimum(np.arange(0, n, step) + step // 2, n - 1) for n in own.shape[:2])
@@ -265,10 +265,10 @@ def _continued_codes(known: KnownDepth, i: int, posed: PosedImages, dataset: MMP
 
 
 def with_known_depths(observations: Observations, known: KnownDepth, dataset: MMPIDataset) -> Observations:
-    """Adds what placement may know of the depths: of each image cell the pixel whose distance is known best.
+    """Adds depths to the observations for placement: the most certain pixel of each image cell.
 
-    Cells count alike, however many SfM points or matches lie in one. As they have no track, they come after the
-    keypoints that have.
+    Each cell counts once, however many SfM points or matches lie in it. These observations have no track and come
+    after the keypoints.
     """
     seen_by, points = [observations.seen_by[:0]], [observations.points[:0]]
     for i in range(len(known.codes)):
@@ -291,7 +291,7 @@ def with_known_depths(observations: Observations, known: KnownDepth, dataset: MM
 
 
 def best_of_cells(depth: Map) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Row and column of the best known pixel of every cell of an image [H, W, 2] that has one."""
+    """Row and column of the most certain pixel of every cell of an image [H, W, 2] that has one."""
     height, width = depth.shape[:2]
     side = max(1, -(-max(height, width) // CELLS))
     padded = np.full((-(-height // side) * side, -(-width // side) * side), np.inf, np.float32)

@@ -1,4 +1,4 @@
-"""Where the rays of a lens go, as placement wants to know it: directions through a grid over each image."""
+"""Ray directions of a lens on a grid over each image, for placement."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 from numpy.typing import NDArray
 
 GRID = 17
-"""Directions along each side of an image; between them it is interpolated."""
+"""Grid points along each side of an image."""
 BENT = (CameraType.FISHEYE, CameraType.FISHEYE624, CameraType.EQUIRECTANGULAR)
-"""Kinds of cameras that are no pinholes, whatever their distortion."""
+"""Camera types that are not pinholes, whatever their distortion."""
 
 
 def lens_directions(cameras: Cameras) -> NDArray[np.float64] | None:
     """Unit directions [M, G, G, 3] in camera axes (x right, y up, z backwards), row after row, borders included.
 
-    None where all cameras are pinholes, or of kinds whose rays do not start in one point.
+    None if all cameras are pinholes, or of types without a single centre of projection.
     """
     kinds = cameras.camera_type.reshape(-1)
     bent = torch.isin(kinds, torch.tensor([kind.value for kind in BENT]).to(kinds))

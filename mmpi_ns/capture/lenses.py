@@ -17,7 +17,7 @@ POSITIVE = Number(0, above=True)
 SIDE = Number(1, 65536)
 """Pixels along a side of an image."""
 FOCAL_SHARES = (1e-3, 1e4)
-"""Focal lengths that a lens can have, in widths of the image."""
+"""Plausible focal lengths, in widths of the image."""
 MODELS = {
     name: kind for name, kind in CAMERA_MODEL_TO_TYPE.items() if not name.startswith(("OMNIDIRECTIONALSTEREO", "VR180"))
 }
@@ -27,11 +27,11 @@ LONG_LENS = 12
 CAMERA = ("fl_x", "fl_y", "cx", "cy", "w", "h")
 RADIAL, TANGENTIAL = ("k1", "k2", "k3", "k4"), ("p1", "p2")
 STRETCH = 10.0
-"""A lens that moves what lies half way to a corner nearer or farther by more than this factor is a mistake."""
+"""Distortion that displaces a point half way to a corner by more than this factor is a mistake."""
 
 
 def check_lenses(meta: Mapping[str, Any], frames: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Checks what nerfstudio's parser reads of every camera; a value for all frames goes before a frame's own.
+    """Checks the intrinsics of every camera; as in nerfstudio, a value for all frames overrides that of a frame.
 
     Raises:
         InputError: a value is missing, is no number, or cannot be a lens; names the file, the frame and the field.
@@ -103,7 +103,7 @@ def _check_distortion(
 
 
 def _can_be_undone(k: Sequence[float], radius: float) -> bool:
-    """Whether a radial polynomial rises until it reaches ``radius`` (tangent, or angle of a fisheye), about there."""
+    """Whether a radial polynomial increases up to about ``radius`` (tangent, or angle of a fisheye)."""
     r = radius * np.linspace(0, STRETCH, 2001)[1:]
     with np.errstate(over="ignore", invalid="ignore"):
         distorted = r + sum(c * r ** (2 * n + 3) for n, c in enumerate(k))

@@ -1,4 +1,4 @@
-"""A scene's observations outside training: what ``ns-train`` would hand to placement."""
+"""The observations of a scene outside training, as ``ns-train`` would pass them to placement."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def load_observations(data: Path, downscale_factor: int | None = None, parser: P
     Args:
         data: the scene's folder.
         downscale_factor: size of the images, as for the data parser; None leaves it to the parser.
-        parser: how the scene is stored; auto takes nerfstudio's format where there is a transforms.json.
+        parser: format of the scene; auto means nerfstudio's format if there is a transforms.json.
 
     Raises:
         InputError: the folder holds no scene, or one that cannot be trained.

@@ -1,4 +1,4 @@
-"""Captures in map coordinates: a local origin, taken in float64 before nerfstudio's parsers round places to float32."""
+"""Captures in map coordinates: a local origin is subtracted in float64 before nerfstudio's parsers round to float32."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from mmpi_ns.capture.sfm_files import check_model_files
 from mmpi_ns.utils.errors import InputError
 
 FAR = 10.0
-"""Cameras so many times as far from the origin as from each other get an origin among them."""
+"""Cameras this many times as far from the origin as from each other get a local origin."""
 
 
 class MapOutputs(DataparserOutputs):
-    """What a parser says of a capture in map coordinates; its transform is in float64."""
+    """Parser outputs of a capture in map coordinates, with the transform in float64."""
 
     def transform_poses_to_original_space(
         self, poses: Tensor, camera_convention: Literal["opengl", "opencv"] = "opencv"
@@ -37,7 +37,7 @@ class LocalOrigin:
     """The origin of one capture, in the axes in which its poses are saved."""
 
     def __init__(self, meta: dict[str, Any], source: Path) -> None:
-        """Moves the poses of a transforms.json, or of what was read from a COLMAP model, where they are far off."""
+        """Subtracts the local origin from poses of a transforms.json or a COLMAP model that are far from the origin."""
         poses = np.array([frame["transform_matrix"] for frame in meta["frames"]], dtype=np.float64)
         applied = np.array(meta.get("applied_transform", np.eye(4)[:3]), dtype=np.float64)
         centers = poses[:, :3, 3]

@@ -1,9 +1,9 @@
-"""Depth of what hardly any other training image shows: continued from the surfaces about it.
+"""Depth where hardly any other training image looks: extrapolated from surrounding surfaces.
 
-Where at most one other training image looks, as at the borders of the first image of a drive, little can be matched,
-and colours are explained from many a distance. Where the surfaces that are known nearby go on, such pixels lie on them:
-the road, a wall. A plane n.x = d is seen along the unit direction v at the inverse distance n.v / d, which is linear in
-v for any lens. So inverse distances are fitted by w.v over the known pixels about a pixel.
+In regions that at most one other training image shows, such as the borders of the first image of a drive, little can be
+matched, and content at many distances explains the colours. There, nearby known surfaces (the road, a wall) are
+extrapolated. A plane n.x = d appears along the unit direction v at the inverse distance n.v / d, which is linear in v
+for any lens. So w.v is fitted to the inverse distances of the known pixels around a pixel.
 """
 
 from __future__ import annotations
@@ -18,30 +18,30 @@ from mmpi_ns.capture.tracks import PosedImages
 Map = NDArray[np.float32]
 
 WIDTHS = (1 / 80, 1 / 40, 1 / 20, 1 / 10, 1 / 5)
-"""Standard deviations of the weights by distance in the image, as shares of its longer side; the surest fit counts."""
+"""Widths of the Gaussian weights, as fractions of the longer side of the image; the most certain fit is used."""
 PIXELS = 4.0
-"""Standard deviation of a blur, at most, at the size at which it is made."""
+"""Largest standard deviation of a blur in pixels; wider ones are computed on smaller images."""
 ENOUGH = 0.05
-"""Weighted share of known pixels about a pixel from which a plane is fitted."""
+"""Smallest weighted fraction of known pixels around a pixel for which a plane is fitted."""
 LEAST_ERROR = 0.05
-"""Relative error of a continued distance at least."""
+"""Minimum relative error of an extrapolated distance."""
 MOST_ERROR = 0.3
-"""Relative error from which on it is worth nothing."""
+"""Extrapolated distances with a larger relative error are discarded."""
 NEAREST = 16
-"""Images nearby that are asked whether they show a point."""
+"""Nearby images that are checked for a point."""
 MOST_OTHERS = 1
-"""Images beside its own in which a continued point may lie: where there are more, matches and colours know better."""
+"""Other images in which an extrapolated point may lie; with more, matches and colours are more reliable."""
 
 
 def continued(known: Map, directions: Map) -> Map:
-    """Inverse distances of the unknown pixels of an image where planes through the known ones about them say any.
+    """Inverse distances of unknown pixels of an image, from planes fitted to the known pixels around them.
 
     Args:
         known: [H, W, 2] inverse distance, 0 where unknown, and its expected error.
         directions: [H, W, 3] unit directions of the pixels.
 
     Returns:
-        [H, W, 2] the same of the unknown pixels alone: 0 where known, and where no plane fits.
+        [H, W, 2] the same for the unknown pixels only: 0 where known, and where no plane fits.
     """
     inverse, error = known[..., 0].astype(np.float64), known[..., 1].astype(np.float64)
     there = inverse > 0
@@ -67,7 +67,7 @@ def continued(known: Map, directions: Map) -> Map:
 
 
 def _blurred(image: NDArray[np.float64], deviation: float) -> NDArray[np.float64]:
-    """An image blurred widely, nothing beyond its borders; at a size at which that takes a few pixels."""
+    """An image after a wide blur with zero padding, computed on a smaller image."""
     height, width = image.shape
     shrink = max(1.0, deviation / PIXELS)
     small = cv2.resize(
@@ -83,15 +83,15 @@ _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 def _planes(
     sums: NDArray[np.float64], directions: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Fits w.v to weighted pixels, and what that says along directions.
+    """Fits w.v to weighted pixels and evaluates it along directions.
 
     Args:
         sums: [P, 11] of weights, weights times q^2, q v (3) and v v^T (6, ``_PAIRS``).
         directions: [P, 3]
 
     Returns:
-        q along the directions [P] and its expected error: the scatter about the plane, times what lies outside of the
-        pixels that it was fitted to is worth less.
+        q along the directions [P] and its expected error: the scatter about the plane, increased by the distance of the
+        extrapolation.
     """
     mean = sums / sums[:, :1]
     matrix = np.empty((len(sums), 3, 3))

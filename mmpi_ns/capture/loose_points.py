@@ -1,7 +1,7 @@
-"""Points that come without tracks (``points3D`` of a data parser): which training image sees which of them.
+"""Visibility of points without tracks (``points3D`` of a data parser) in the training images.
 
-A cloud does not say who saw a point, and an image would see points through walls. Coarse depth images of the cloud
-itself tell: a point is seen where nothing of the cloud lies clearly before it, in its cell of the image or beside it.
+A point cloud does not record which image saw a point, and projection alone would see through walls. Coarse depth images
+of the cloud decide: a point is visible if no other one lies clearly in front of it, in its cell or a neighbouring one.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from mmpi_ns.placement.observations import Observations
 CELLS = 48
 """Cells of a coarse depth image along the longer side."""
 BEHIND = 1.15
-"""A point further than the nearest about it by this factor is hidden."""
+"""A point farther away than the nearest one around it by this factor is hidden."""
 
 
 def with_visible_points(observations: Observations) -> Observations:
-    """Keypoints for the observations' points wherever a camera sees one; the lens is left out."""
+    """Keypoints of the observations' points in every camera that sees them; lens distortion is ignored."""
     seen_by, seen_point, seen_at = [observations.seen_by[:0]], [observations.seen_point[:0]], [np.zeros((0, 2))]
     for camera, (width, height) in enumerate(observations.sizes):
         cameras = np.full(len(observations.points), camera)

@@ -1,4 +1,4 @@
-"""Matches of pairs of images and points from known poses, by pycolmap: for training and ``mmpi-prepare`` alike."""
+"""Matching of image pairs and triangulation from known poses, by pycolmap, for training and ``mmpi-prepare``."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from typing import Any
 from mmpi_ns.capture.sfm import load_pycolmap
 
 MIN_ANGLE = 0.5
-"""Degrees between the rays of a point, at least: driving forward gives little more."""
+"""Minimum angle in degrees between the rays of a point; driving forward gives little more."""
 MIN_INLIERS = 15
-"""Matches from which a pair counts: COLMAP's own limit."""
+"""Minimum number of matches of a pair: COLMAP's own limit."""
 SEED = 0
 
 
@@ -33,7 +33,7 @@ def match_pairs(
 ) -> None:
     """Matches and verifies pairs of images, by name, in a database of their features; those that it has are skipped.
 
-    ``guided`` matches a pair again along the epipolar lines of its first matches; ``least`` must agree for it to count.
+    ``guided`` matches a pair again along the epipolar lines of its first matches; ``least`` is the minimum of inliers.
     """
     pycolmap = load_pycolmap()
     matching, verification = pycolmap.FeatureMatchingOptions(), pycolmap.TwoViewGeometryOptions()

@@ -1,8 +1,8 @@
-"""Rays of views that nobody took: from between two training cameras that see the same point.
+"""Rays of new views: from positions between two training cameras that see the same point.
 
-A point that two images show alike and at the same depth is seen from everywhere between their cameras, but for what
-shows up only on the way. Its colour there lies between those of the two images. Such rays say what a new view must look
-like and, as they end on the point, that nothing lies before it: what explains the training images alone is unlearned.
+A point that two images show with the same colour and depth is visible from everywhere between their cameras, unless an
+object between them hides it. Its colour there lies between those of the two images. Such rays supervise the colour of a
+new view and, since they end at the point, the empty space in front of it, which removes floaters.
 """
 
 from __future__ import annotations
@@ -25,19 +25,19 @@ from mmpi_ns.capture.known_depth import KnownDepth
 from mmpi_ns.capture.tracks import PosedImages
 
 NEIGHBOURS = 4
-"""Cameras that a point of an image is looked for in: the nearest that look its way."""
+"""Number of cameras, the nearest facing the same way, in which a point of an image is searched."""
 MAX_ANGLE = 60.0
-"""Degrees between the facing directions of two cameras with views between them."""
+"""Maximum angle in degrees between the viewing directions of two cameras with new views between them."""
 CERTAIN = 0.03
-"""Relative error up to which a depth is good enough to say where a new view sees its point."""
+"""Maximum relative error of a depth used for new views."""
 SAME_DEPTH = 0.03
-"""Two images' distances of a point agree within this share."""
+"""Maximum relative difference between the distances of a point in two images."""
 SAME_COLOR = 24
-"""Levels by which a colour may lie beyond those within a pixel of its place in the other image."""
+"""Tolerance, in levels, beyond the range of colours within a pixel of the projection in the other image."""
 HELD = 32
 """Images in memory at once."""
 MOST = 2_000_000
-"""Pairs of pixels that are kept (30 bytes each), spread over the images."""
+"""Maximum number of pixel pairs (30 bytes each), spread over the images."""
 
 PARTS = ("pixels", "other", "colors", "depths")
 """What is known of every point."""
@@ -58,12 +58,12 @@ class SharedPoints:
     depths: Float[Tensor, "P 2"]
     """Inverse distance from the first camera, and its expected error."""
     centers: Float[Tensor, "M 3"]
-    """Where all training cameras stand."""
+    """Positions of all training cameras."""
     cover: float
-    """Such points for each pixel of the images: few are not drawn over and over."""
+    """Number of points divided by the number of pixels; limits how often each point is drawn."""
 
     def of_images(self, images: Int[Tensor, "I"]) -> SharedPoints | None:
-        """The points that both images show of some images alone; None where there is none."""
+        """The points shared by two of the given images; None if there is none."""
         images = images.to(self.pixels)
         own = (torch.isin(self.pixels[:, 0], images) & torch.isin(self.other, images)).nonzero()[:, 0]
         return replace(self, **{name: getattr(self, name)[own] for name in PARTS}) if len(own) else None
@@ -71,12 +71,12 @@ class SharedPoints:
     def draw(
         self, count: int, rays: Rays, g: torch.Generator
     ) -> tuple[RayBundle, Float[Tensor, "R C"], Float[Tensor, "R 2"]]:
-        """Random rays between cameras, what they show, and the inverse distances of their points with errors.
+        """Random rays from between cameras, with their colours and the inverse distances of their points with errors.
 
         Args:
-            count: rays, as many where there is a point for every pixel.
+            count: number of rays if there is a point for every pixel; fewer otherwise.
             rays: makes rays through pixel centres (image, row, column).
-            g: draws the points and the places between the cameras.
+            g: generator for the points and the positions between the cameras.
         """
         device = self.pixels.device
         count = round(count * min(1.0, self.cover))
@@ -85,11 +85,11 @@ class SharedPoints:
         first = rays(self.pixels[chosen].long())
         depths, colors = self.depths[chosen], self.colors[chosen].float() / 255
         origins = torch.lerp(first.origins, self.centers[self.other[chosen].long()], share)
-        # From the first camera: what lies far keeps its direction to the last bit.
+        # Relative to the first camera, so that the direction of distant points stays exact.
         offsets = (first.origins - origins) * depths[:, :1] + first.directions
         length = offsets.norm(dim=-1, keepdim=True).clamp(min=1e-6)
         bundle = RayBundle(origins, offsets / length, torch.ones_like(share), camera_indices=first.camera_indices)
-        # Along the ray a distance's error stays about what it is from the first camera.
+        # The error of a distance along the ray is about that from the first camera.
         return bundle, torch.lerp(colors[:, 0], colors[:, 1], share), depths / torch.cat([length, length**2], -1)
 
 
@@ -102,14 +102,14 @@ def find_shared_points(
     seed: int,
     device: str | torch.device = "cpu",
 ) -> SharedPoints | None:
-    """The points that two of the images show at the same depth; None where there are none.
+    """The points that two of the images show at the same depth; None if there are none.
 
     Args:
         dataset: the training images.
         posed: their cameras.
         known: depths of their pixels.
         rays: makes rays through pixel centres (image, row, column).
-        images: those to look at.
+        images: the images to compare.
         seed: of the draw of pixels where there are more than are kept.
         device: where rays are made and drawn.
 
@@ -160,13 +160,13 @@ def _image(dataset: MMPIDataset, i: int) -> tuple[NDArray[np.uint8], NDArray[np.
 
 
 def _certain(depth: NDArray[np.float32], usable: NDArray[np.uint8]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows and columns of the pixels whose depth is known well."""
+    """Rows and columns of the pixels with an accurate depth."""
     rows, columns = np.nonzero((depth[..., 0] > 0) & (depth[..., 1] < CERTAIN * depth[..., 0]) & (usable > 0))
     return rows, columns
 
 
 def _neighbours(posed: PosedImages, i: int, images: Sequence[int]) -> list[int]:
-    """The nearest of some images that look the same way and do not stand in the same place."""
+    """The nearest of some images with a similar viewing direction and another position."""
     others = np.array([j for j in images if j != i], np.int64)
     centers, facing = posed.camera_to_worlds[:, :, 3], posed.camera_to_worlds[:, :, 2]
     distance = np.linalg.norm(centers[others] - centers[i], axis=-1)
@@ -184,7 +184,7 @@ def _seen_by(
     usable: NDArray[np.uint8],
     depth: NDArray[np.float32],
 ) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
-    """Which points an image shows at their own distance and in about their own colour, and in which colours."""
+    """Which points an image shows at their own distance and with about the same colour, and the colours there."""
     at = project(posed, j, points)
     about = np.ones((3, 3), np.uint8)
     inverse, may, darkest, brightest = (

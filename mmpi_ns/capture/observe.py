@@ -1,4 +1,4 @@
-"""What the data set knows of a scene, as placement's Observations: cameras, points, and who saw what."""
+"""Observations of a data set for placement: cameras, points, and which camera saw which point."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ from mmpi_ns.placement.sweep import add_swept_points
 from mmpi_ns.utils.errors import InputError
 
 MAX_REPROJECTION = 0.02
-"""Median angle between keypoints and points, as a share of the image, beyond which a model is in another frame."""
+"""Median angle between keypoints and points, as a fraction of the image, above which a model is in another frame."""
 POSES_OFF = 0.5
-"""Training pixels by which poses may be off before it is said."""
+"""Error of the poses, in training pixels, above which it is reported."""
 TRACKS_VERSION = 2
-"""Of the way tracks are found: kept ones of another version are found anew."""
+"""Version of the algorithm: cached tracks of another version are recomputed."""
 ENOUGH_KEYPOINTS = 20
-"""Keypoints an image, on average, that need no plane sweep beside them."""
+"""Average number of keypoints in an image above which no plane sweep is needed."""
 
 
 def sfm_folder(parser: DataParserConfig, default: Path) -> Path:
-    """Where a scene's COLMAP model would be: where its data parser looks, else ``default`` beside its frames."""
+    """Folder of a scene's COLMAP model: the data parser's, otherwise ``default`` beside the frames."""
     data = Path(parser.data)
     folder = data.parent if data.suffix == ".json" else data
     return folder / getattr(parser, "colmap_path", default)
@@ -50,11 +50,11 @@ def observe(
     """The observations of a training data set.
 
     Args:
-        outputs: what the data parser said of the training images.
+        outputs: data parser outputs of the training images.
         dataset: the training images.
-        sfm: folder of a COLMAP model; there need not be one.
-        find_points: whether to look for points in the images where there are no tracks. Reads the images.
-        triangulates: whether to look for them by matching features, before a plane sweep.
+        sfm: folder of a COLMAP model, which need not exist.
+        find_points: whether to find points in the images if there are no tracks. Reads the images.
+        triangulates: whether to match features for this before a plane sweep.
 
     Raises:
         InputError: poses or intrinsics that cannot be used.
@@ -74,22 +74,22 @@ def observe(
 
 
 def _find_points(observations: Observations, dataset: MMPIDataset, triangulates: bool) -> Observations:
-    """Points for a scene without tracks: triangulated, and swept where triangulation finds too few."""
+    """Points of a scene without tracks: triangulated, and from a plane sweep if triangulation finds too few."""
     if triangulates and (images := posed_images(observations, dataset)) is not None:
         model = _remembered_tracks(at_full_size(images))
         observations = with_tracks(observations, model)
         tell_poses((model.off or 0.0) * float(images.sizes[:, 0].mean()), images.files[0])
     if len(observations.seen_by) < ENOUGH_KEYPOINTS * len(dataset):
-        CONSOLE.print("Few or no tracks: a quick plane sweep finds out where the content lies.")
+        CONSOLE.print("Few or no tracks: a quick plane sweep locates the content.")
         observations = add_swept_points(observations, [_thumbnail(dataset, i) for i in range(len(dataset))])
     return observations
 
 
 def tell_poses(off: float, image: Path) -> None:
-    """Says when poses are worse than the images, with the command that mends them.
+    """Reports inaccurate poses, with the command that refines them.
 
     Args:
-        off: how far matches or keypoints lie from where the poses put them, median, in training pixels.
+        off: median distance of matches or keypoints from their positions predicted by the poses, training pixels.
         image: one of the training images.
     """
     if off <= POSES_OFF:
@@ -102,7 +102,7 @@ def tell_poses(off: float, image: Path) -> None:
 
 
 def _remembered_tracks(images: PosedImages) -> SfmModel:
-    """The tracks of posed images, found once."""
+    """The tracks of posed images, from the cache if possible."""
 
     def find() -> Arrays:
         width, height = images.sizes.max(0).astype(int)
@@ -150,7 +150,7 @@ def read_observations(outputs: DataparserOutputs, cameras: Cameras, sfm: SfmMode
             f"The camera of {outputs.image_filenames[usable.argmin()]} has a pose or focal length that is no finite "
             "number or not positive: correct it or remove the frame."
         )
-    # An MPI that faces as a camera does needs axes that are orthonormal to more digits than captures have.
+    # The axes of an MPI come from a camera and must be orthonormal to more digits than poses in captures are.
     left, _, right = np.linalg.svd(poses[:, :, :3])
     poses[:, :, :3] = left @ right
     sizes = np.stack([cameras.width.cpu().numpy().reshape(-1), cameras.height.cpu().numpy().reshape(-1)], -1)
@@ -180,7 +180,7 @@ def read_observations(outputs: DataparserOutputs, cameras: Cameras, sfm: SfmMode
 
 
 def _fitting_tracks(observations: Observations, cameras: Cameras) -> Observations:
-    """Leaves out points behind the camera that saw them, and all tracks where the model is in another frame."""
+    """Drops points behind the camera that saw them, and all tracks if the model is in another frame."""
     angles = keypoint_angles(observations, cameras)
     width = np.arctan(0.5 * observations.sizes[:, 0] / observations.intrinsics[:, 0]) * 2
     if np.median(angles / width[observations.seen_by]) > MAX_REPROJECTION:
@@ -240,7 +240,7 @@ def posed_images(observations: Observations, dataset: MMPIDataset) -> PosedImage
 
 
 def with_tracks(observations: Observations, model: SfmModel) -> Observations:
-    """The observations with the points of a model whose image names are the places of the training images."""
+    """The observations with the points of a model whose image names are indices of the training images."""
     seen_by, seen_point, relative = model.keypoints_of([str(i) for i in range(len(observations.centers))])
     return replace(
         observations,
@@ -252,7 +252,7 @@ def with_tracks(observations: Observations, model: SfmModel) -> Observations:
 
 
 def drop_masked(observations: Observations, dataset: MMPIDataset) -> Observations:
-    """Leaves out keypoints on masked pixels: what moves there has no depth to learn from."""
+    """Drops keypoints on masked pixels: moving objects have no depth to learn from."""
     if not len(observations.seen_at) or dataset._dataparser_outputs.mask_filenames is None:
         return observations
     keep = np.ones(len(observations.seen_by), dtype=bool)

@@ -1,7 +1,7 @@
-"""Training images at the size they were taken in, where a data parser names downscaled copies of them.
+"""Training images at their original size, if the data parser lists downscaled copies.
 
 A data parser with a downscale factor N reads ``images_N/x.jpg``; the original lies beside it as ``images/x.jpg``.
-Features are found and depths are measured in the originals: four times as many pixels see four times as sharply.
+Features are detected and depths measured in the originals, which are sharper.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ def original_of(file: Path) -> tuple[Path, int]:
 
 
 def at_full_size(images: PosedImages) -> PosedImages:
-    """The same views in their originals, with exact cameras; a view whose original is of another shape stays as it is.
+    """The same views in their originals, with exact cameras; a view whose original has another shape is kept.
 
-    A copy shows the whole original, whatever the rounding of its size: a pixel's place as a share of width and height
-    is the same in both. Focal lengths are those of the copy times the factor, as nerfstudio divided them by it.
+    A copy shows the whole original, however its size was rounded: a position relative to width and height is the same
+    in both. Focal lengths are those of the copy times the factor, as nerfstudio divided them by it.
 
     Raises:
         InputError: an image file cannot be read (names it).

@@ -17,9 +17,9 @@ from mmpi_ns.utils.random_draws import generator
 
 @dataclass(frozen=True)
 class PixelPool:
-    """The pixels P of some images I that may be drawn, image after image, on the device.
+    """The pixels P of some images I that may be drawn, image by image, on the device.
 
-    Which row and column a pixel has follows from its place where all pixels of the images are here.
+    If all pixels of the images are here, row and column of a pixel follow from its index.
     """
 
     colors: UInt8[Tensor, "P C"]
@@ -28,11 +28,11 @@ class PixelPool:
     """Numbers of the images in the data set."""
     widths: Int[Tensor, "I"]
     starts: Int[Tensor, "I+1"]
-    """Where each image's pixels begin, and where the last one's end."""
+    """Index of each image's first pixel, and the total number of pixels."""
     places: Int[Tensor, "P"] | None
-    """row * width + column of each pixel; None where all are here."""
+    """row * width + column of each pixel; None if all pixels are here."""
     depths: Int16[Tensor, "P 2"] | None
-    """Inverse distance of each pixel and its expected error, as ``known_depth.packed``; None where none is known."""
+    """Inverse distance of each pixel and its expected error, as ``known_depth.packed``; None if none is known."""
 
     @staticmethod
     def from_dataset(
@@ -47,11 +47,11 @@ class PixelPool:
 
         Args:
             dataset: the training images.
-            device: where the pixels will lie.
+            device: of the pixels.
             images: which of them; None for all.
-            known: what is known of their depths.
-            most: pixels in all; of more, so many are taken at random, as large a share of each image. 0: no limit.
-            seed: of that choice.
+            known: their known depths.
+            most: maximum number of pixels; beyond it, a random subset, the same fraction of each image. 0: no limit.
+            seed: of the subset.
 
         Raises:
             InputError: an image or mask cannot be used (names the file), or the masks leave nothing.
@@ -95,7 +95,7 @@ class PixelPool:
         Args:
             count: R.
             g: draws them.
-            allowed: places of images in ``images``, in their order.
+            allowed: indices into ``images``, in ascending order.
         """
         begins, ends = self.starts[:-1], self.starts[1:]
         if allowed is not None:
@@ -114,7 +114,7 @@ class PixelPool:
         return self.colors[chosen].float() / 255, indices, depths
 
     def places_of(self, images: Int[Tensor, "A"]) -> Int[Tensor, "B"]:
-        """Where images, by their numbers, stand among those of which there are pixels."""
+        """Indices of images, given by number, among those with pixels in the pool."""
         there = torch.isin(self.images, images.to(self.images)) & (self.starts[1:] > self.starts[:-1])
         return there.nonzero()[:, 0]
 
@@ -129,7 +129,7 @@ def pixel_bytes(*, whole: bool, depths: bool, channels: int) -> int:
 
 
 def _pixels_of(dataset: MMPIDataset, i: int, share: float, seed: int) -> tuple[UInt8[Tensor, "N C"], Int[Tensor, "n"]]:
-    """The pixels of an image, and which of them are kept: a share, and none that a mask hides."""
+    """The pixels of an image, and which of them are kept: a fraction of those that no mask hides."""
     data = dataset.get_data(i, image_type="uint8")
     image = data["image"].reshape(-1, data["image"].shape[-1])
     kept = torch.arange(len(image))

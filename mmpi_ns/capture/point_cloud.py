@@ -1,7 +1,7 @@
 """Point clouds in PLY files, read in float64 and without open3d.
 
-nerfstudio reads them with open3d, which is often absent from a machine, or there without the system's libraries that it
-needs, and rounds map coordinates to float32.
+nerfstudio reads them with open3d, which is often missing or lacks system libraries, and rounds map coordinates to
+float32.
 """
 
 from __future__ import annotations

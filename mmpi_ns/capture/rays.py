@@ -1,7 +1,7 @@
-"""Rays of undistorted perspective cameras in one go.
+"""Rays of undistorted perspective cameras in one batch.
 
-nerfstudio's ray generator handles every kind of camera, and asks some twenty times a batch which kinds and distortions
-there are: 4 of 75 ms of a step on a CPU, and on a GPU each answer is waited for.
+nerfstudio's ray generator handles every camera type and checks types and distortions some twenty times for each batch,
+which takes 4 of 75 ms of a step on a CPU; on a GPU, each check is a synchronisation.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class PinholeRays:
 
     @staticmethod
     def of(cameras: Cameras, device: torch.device | str) -> PinholeRays | None:
-        """None where a camera is of another kind, distorted, or has a time."""
+        """None if a camera has another type, distortion or a time."""
         distortion = cameras.distortion_params
         plain = bool((cameras.camera_type == CameraType.PERSPECTIVE.value).all()) and cameras.times is None
         if not plain or (distortion is not None and bool((distortion != 0).any())):
@@ -36,7 +36,7 @@ class PinholeRays:
         return PinholeRays(*(x.to(device, torch.float32) for x in (cameras.camera_to_worlds, focal, principal)))
 
     def __call__(self, ray_indices: Int[Tensor, "R 3"]) -> RayBundle:
-        """Rays through pixel centres. Their pixels' areas, which nobody here reads, are left at 1.
+        """Rays through pixel centres. Pixel areas, which this package does not use, are 1.
 
         Args:
             ray_indices: camera, row and column of each.

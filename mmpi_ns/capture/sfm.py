@@ -36,10 +36,10 @@ class SfmModel:
     names: tuple[str, ...]
     """Image file names."""
     keypoints: tuple[tuple[NDArray[np.int64], NDArray[np.float64]], ...]
-    """For each image: point of each keypoint [Q], and where it lies as a share of width and height [Q, 2]."""
+    """For each image: point of each keypoint [Q], and its position relative to width and height [Q, 2]."""
     off: float | None = None
-    """Median distance of the matches from the epipolar lines of given poses, as a share of the image's width; None of
-    a model that was read from files."""
+    """Median distance of the matches from the epipolar lines of given poses, relative to the width of the image; None
+    for a model read from files."""
 
     def keypoints_of(
         self, image_names: Sequence[str]
@@ -68,7 +68,7 @@ def find_sfm_model(path: Path) -> SfmModel | None:
 
 @contextmanager
 def model_errors(path: Path) -> Iterator[None]:
-    """Whatever goes wrong while a model is read becomes one InputError."""
+    """Turns any error while reading a model into one InputError."""
     try:
         yield
     except (ValueError, RuntimeError, OSError, LookupError, MemoryError, AssertionError, struct.error) as error:

@@ -1,6 +1,6 @@
-"""Whether the files of a binary COLMAP model are whole and agree, before pycolmap reads them.
+"""Checks that the files of a binary COLMAP model are complete and consistent, before pycolmap reads them.
 
-pycolmap trusts the counts in the files: a file that was cut short makes it allocate gigabytes or end the process.
+pycolmap trusts the counts in the files: a truncated file makes it allocate gigabytes or end the process.
 The format: https://colmap.github.io/format.html.
 """
 
@@ -38,7 +38,7 @@ class _Reader:
             raise Damaged(f"{self.name} ends too early, after {len(self.data)} bytes")
 
     def count(self, least: int) -> int:
-        """A number of records of at least so many bytes, which must fit what is left of the file."""
+        """A number of records of at least this many bytes each, which must fit into the rest of the file."""
         (number,) = self.take("<Q")
         if number * least > len(self.data) - self.at:
             raise Damaged(f"{self.name} says it has {number} records and has room for fewer")
@@ -50,7 +50,7 @@ class _Reader:
 
 
 def check_model_files(folder: Path) -> None:
-    """Raises Damaged where the binary files of a model are cut short, or name what is not there."""
+    """Raises Damaged if the binary files of a model are truncated or refer to missing records."""
     if not all((folder / f"{name}.bin").is_file() for name in ("cameras", "images", "points3D")):
         return
     cameras = _cameras(_Reader(folder / "cameras.bin"))

@@ -1,7 +1,7 @@
 """Tracks for scenes that come with poses alone: features of the training images, matched and triangulated by pycolmap.
 
-Poses and intrinsics are taken as given and stay as they are. What comes out is what a COLMAP model would have held:
-points, and which training image saw which point where. They tell placement where content lies, and supervise depth.
+Poses and intrinsics are kept fixed. The result is what a COLMAP model would contain: points, and their keypoints in the
+training images. Placement uses them to locate content, and training to supervise depth.
 """
 
 from __future__ import annotations
@@ -22,31 +22,31 @@ from mmpi_ns.capture.sfm import SfmModel, load_pycolmap, read_reconstruction
 from mmpi_ns.utils.errors import InputError
 
 NEIGHBOURS = 8
-"""Images that each image is matched with at most: the nearest that look roughly the same way."""
+"""Maximum number of images that each image is matched with: the nearest with a similar viewing direction."""
 SMALL, LARGE = 800, 1600
-"""Images no wider or higher than the first are doubled to find fine features, larger ones than the second shrunk."""
+"""Images up to the first size are doubled to find fine features; images above the second are reduced to it."""
 MAX_ANGLE = 60.0
-"""Degrees between the facing directions of two images worth matching."""
+"""Maximum angle in degrees between the viewing directions of matched images."""
 MIN_TRACK = 2
-"""Images that see a point, at least: with poses given, two that agree are enough."""
+"""Minimum number of images of a point; with given poses, two are enough."""
 ENOUGH = 100
-"""Keypoints an image, on average, that make the thorough search unnecessary."""
+"""Average number of keypoints in an image above which the thorough search is skipped."""
 
 
 @dataclass(frozen=True)
 class Effort:
-    """How hard to look for matches."""
+    """Effort of the search for matches."""
 
     peak_threshold: float
     """Contrast of the faintest features (SIFT)."""
     guided: bool
     """Whether a pair is matched again along the epipolar lines of its first matches."""
     min_matches: int
-    """Matches that agree, at least, for a pair to count."""
+    """Minimum number of inlier matches of a pair."""
 
 
 EFFORTS = (Effort(0.0067, False, 15), Effort(0.002, True, 8))
-"""What textured images need, and what rooms at low resolution do (two to four times the time)."""
+"""Settings for textured images, and for rooms at low resolution (two to four times slower)."""
 
 
 @dataclass(frozen=True)
@@ -70,12 +70,12 @@ class PosedImages:
 
 
 def near_pairs(centers: NDArray[np.float64], facing: NDArray[np.float64], neighbours: int) -> list[tuple[int, int]]:
-    """Each camera with the nearest that look roughly its way.
+    """Pairs of each camera with the nearest ones that have a similar viewing direction.
 
     Args:
         centers: camera centres. [M, 3]
         facing: unit viewing directions. [M, 3]
-        neighbours: most cameras that one chooses.
+        neighbours: maximum number of cameras chosen by each.
 
     Returns:
         Pairs (i, j) with i < j, in order.
@@ -91,16 +91,16 @@ def near_pairs(centers: NDArray[np.float64], facing: NDArray[np.float64], neighb
 
 
 def triangulate(images: PosedImages) -> SfmModel:
-    """Points seen from several of the images, and where each saw them.
+    """Points seen in several images, and their keypoints.
 
-    Deterministic for equal images and poses. A quick search comes first, a thorough one where that finds little.
-    Takes about a third of a second an image and core, the thorough search a second.
+    Deterministic for equal images and poses. A quick search is followed by a thorough one if it finds too little.
+    The quick search takes about a third of a second for each image on one core, the thorough one a second.
 
     Args:
         images: image files with their cameras, whose poses are in any one frame.
 
     Returns:
-        Points in the frame of the poses; none where nothing matches. Image names are their places in ``images``.
+        Points in the frame of the poses; none if nothing matches. Image names are their indices in ``images``.
 
     Raises:
         InputError: an image file cannot be read.
@@ -132,7 +132,7 @@ def _attempt(pycolmap: Any, images: PosedImages, effort: Effort) -> SfmModel:
 
 
 def _link(files: Sequence[Path], folder: Path) -> list[str]:
-    """Links the images under names that are their places, since two folders may hold files of one name."""
+    """Links the images under their indices as names, since two folders may contain files of the same name."""
     folder.mkdir()
     names = []
     for i, file in enumerate(files):
@@ -156,9 +156,9 @@ def _extract(pycolmap: Any, work: Path, names: list[str], effort: Effort, double
 
 
 def _off_epipolar_lines(pycolmap: Any, database: Path, model: Any) -> float | None:
-    """Median distance of the verified matches from the epipolar lines of a model's poses, as a share of the width.
+    """Median distance of the verified matches from the epipolar lines of a model's poses, relative to the width.
 
-    Unlike the errors of points it is not cut off: matches that fit the poses badly never become points.
+    Unlike reprojection errors of points it is not truncated: matches that fit the poses badly never become points.
     """
     with pycolmap.Database.open(database) as opened:
         numbers, geometries = opened.read_two_view_geometries()
@@ -181,7 +181,8 @@ def _off_epipolar_lines(pycolmap: Any, database: Path, model: Any) -> float | No
 def _posed_model(pycolmap: Any, work: Path, names: list[str], images: PosedImages) -> Any:
     """A model of the given cameras without points, and a database of the features in the order of the images.
 
-    Extraction numbers the images as its threads finish; the second database makes equal images give equal tracks.
+    Extraction numbers the images in the order in which its threads finish; the second database makes the tracks
+    deterministic.
     """
     model = pycolmap.Reconstruction()
     with (

@@ -1,4 +1,4 @@
-"""Checkpoint files: which there are, and whether a run can go on from one."""
+"""Checkpoint files: finding them, and checking that a run can resume from one."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from mmpi_ns.utils.files import to_text
 from mmpi_ns.utils.values import shown
 
 HOLDS = {"step", "pipeline", "optimizers", "schedulers", "scalers", "rng", "capture"}
-"""What every checkpoint of ours has."""
+"""Keys of every checkpoint of this method."""
 
 
 def checkpoints_in(folder: Path, steps: range | None = None) -> dict[int, Path]:
@@ -32,9 +32,9 @@ def checkpoints_in(folder: Path, steps: range | None = None) -> dict[int, Path]:
 
 
 def check_there_are_checkpoints(windows_folder: Path | None) -> None:
-    """Raises InputError where a run has an empty folder of checkpoints beside that of its windows.
+    """Raises InputError if a run has finished windows but no checkpoint.
 
-    ns-eval and its like look for the last checkpoint after the model has been made, and end in a traceback.
+    ns-eval, ns-render and ns-viewer look for the last checkpoint only after making the model, and end in a traceback.
     """
     folder = None if windows_folder is None else windows_folder.parent / "nerfstudio_models"
     if folder is not None and folder.is_dir() and not checkpoints_in(folder):
@@ -42,7 +42,7 @@ def check_there_are_checkpoints(windows_folder: Path | None) -> None:
 
 
 def checkpoint_to_load(config: TrainerConfig) -> Path | None:
-    """The checkpoint that a run is to go on from; None for a new one.
+    """The checkpoint that a run resumes from; None for a new run.
 
     Raises:
         InputError: it is not there.
@@ -64,13 +64,13 @@ def checkpoint_to_load(config: TrainerConfig) -> Path | None:
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
-    """What a checkpoint holds.
+    """The content of a checkpoint.
 
     Raises:
         InputError: it is damaged.
     """
     try:
-        # Mapped: what is looked at is read, and a file that was cut short is found all the same.
+        # Memory-mapped: only what is used is read, but a truncated file is still detected.
         state = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
     except (OSError, RuntimeError, ValueError, EOFError, pickle.UnpicklingError) as error:
         raise InputError(
@@ -83,13 +83,13 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
 
 
 def cameras_in_short(observations: Observations) -> Float[Tensor, "M 18"]:
-    """Poses, intrinsics and sizes of the training cameras, by which a capture is known wherever its files lie."""
+    """Poses, intrinsics and sizes of the training cameras, which identify a capture wherever its files are."""
     poses = observations.camera_to_worlds.reshape(-1, 12)
     return torch.from_numpy(np.concatenate([poses, observations.intrinsics, observations.sizes], -1)).float()
 
 
 def check_same_capture(state: dict[str, Any], path: Path, data: Path, observations: Observations) -> None:
-    """Raises InputError where a checkpoint was trained on another capture than this run's.
+    """Raises InputError if a checkpoint was trained on another capture.
 
     Args:
         state: the checkpoint.
@@ -106,13 +106,13 @@ def check_same_capture(state: dict[str, Any], path: Path, data: Path, observatio
 
 
 def check_same_plan(state: dict[str, Any], path: Path, ours: WindowedPlan, plan_file: str) -> None:
-    """Raises InputError where a checkpoint was trained with another plan than this run has.
+    """Raises InputError if a checkpoint was trained with another plan.
 
     Args:
         state: of the pipeline, in the checkpoint.
         path: the checkpoint.
         ours: the plan of this run.
-        plan_file: what a run calls the file of its plan.
+        plan_file: file name of a run's plan.
     """
     theirs = WindowedPlan.from_json(to_text(state["_model.progress.windows_bytes"]))
     if theirs != ours:
@@ -123,7 +123,7 @@ def check_same_plan(state: dict[str, Any], path: Path, ours: WindowedPlan, plan_
 
 
 def check_same_refinement(state: dict[str, Any], path: Path, mode: str) -> None:
-    """Raises InputError where a checkpoint refines poses and this run does not, or the other way round.
+    """Raises InputError if a checkpoint refines poses and this run does not, or vice versa.
 
     Args:
         state: of the pipeline, in the checkpoint.
@@ -138,7 +138,7 @@ def check_same_refinement(state: dict[str, Any], path: Path, mode: str) -> None:
 
 
 def _difference(theirs: WindowedPlan, ours: WindowedPlan) -> str:
-    """What differs first between two plans."""
+    """The first difference between two plans."""
     shapes = [(len(p), sum(len(plan.mpis) for plan in p.plans)) for p in (theirs, ours)]
     if shapes[0] != shapes[1]:
         there, here = (f"{mpis} MPIs" if w == 1 else f"{w} windows with {mpis} MPIs" for w, mpis in shapes)

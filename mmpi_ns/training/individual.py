@@ -1,4 +1,4 @@
-"""The individual phase: which MPI answers a training ray (paper sec. III-C, first stage)."""
+"""The individual phase: which MPI renders a training ray (paper sec. III-C, first stage)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mmpi_ns.scene.plan import ScenePlan
 def individual_rays(
     bundle: RayBundle, plan: ScenePlan, rays_per_mpi: Literal["split", "all"], g: torch.Generator
 ) -> tuple[RayBundle, Bool[Tensor, "R H"] | None, Float[Tensor, "R K"] | None]:
-    """Gives each ray to one MPI of those it meets, or to every MPI in turn; the cube joins each.
+    """Assigns each ray to one of the MPIs it meets, or to every MPI in turn; the cube is added to each.
 
     Returns:
         The rays, (all) the heads that each may meet, and (split) priorities of the MPIs.

@@ -18,11 +18,11 @@ class PhaseSchedulerConfig(SchedulerConfig):
 
     _target: type = field(default_factory=lambda: PhaseScheduler)
     kind: str = "density"
-    """Which parameter kind the group holds."""
+    """Parameter kind of the group."""
 
 
 class PhaseScheduler(Scheduler):
-    """Follows a ``Schedule``; without one (a config used outside our trainer) the rate stays constant."""
+    """Follows a ``Schedule``; without one (a config used outside this trainer) the rate is constant."""
 
     config: PhaseSchedulerConfig
     schedule: Schedule | None = None
@@ -33,8 +33,8 @@ class PhaseScheduler(Scheduler):
 
 
 def following(config: SchedulerConfig, progress: Progress) -> SchedulerConfig:
-    """The config of a scheduler that follows a run's schedule, also where a checkpoint that is loaded later brings its
-    own; other schedulers stay as they are."""
+    """The config of a scheduler that follows a run's schedule, even if a checkpoint loaded later has its own; other
+    schedulers are unchanged."""
     if not isinstance(config, PhaseSchedulerConfig):
         return config
 

@@ -18,31 +18,31 @@ from mmpi_ns.ops.composite.reference import Composite, exclusive_cumsum
 from mmpi_ns.rendering.rendered import RenderedRays
 
 PLANE_ERROR = 0.6
-"""Least error of a known depth, in spacings of planes."""
+"""Minimum error of a known depth, in plane spacings."""
 
 
 @dataclass
 class LossWeights:
-    """Weights of the losses beside the photometric one."""
+    """Weights of the losses added to the photometric one."""
 
     point_color: float = 0.01
     """Colour of each sample against its ray's."""
     background_entropy: float = 0.001
-    """Entropy of what passes a ray."""
+    """Entropy of the transmittance of a ray."""
     distortion: float = 0.01
-    """Spread of a ray's mass over distance."""
+    """Spread of a ray's weights over distance (distortion)."""
     keypoint_depth: float = 0.02
-    """-log of the mass near an SfM keypoint (scenes with tracks)."""
+    """-log of the weights near an SfM keypoint (scenes with tracks)."""
     known_depth: float = 0.01
-    """-log of the likelihood of a pixel's known depth, which is dense matches', an SfM point's or a sensor's."""
+    """-log of the likelihood of a pixel's known depth, from dense matches, an SfM point or a sensor."""
     depth_outliers: float = 0.02
-    """Likelihood of a known depth where nothing of a ray's mass is: the larger, the less false depths are followed."""
+    """Likelihood of a known depth where a ray has no weight: the larger, the less influence false depths have."""
     tv_density: float = 1e-4
     """Total variation of the densities, in DVGO's normalisation (there: 1e-5)."""
     tv_features: float = 1e-5
-    """Total variation of the features, likewise (there: 1e-6)."""
+    """Total variation of the features, in the same normalisation (there: 1e-6)."""
     tv_every: int = 4
-    """Total variation is added every so many steps, at so many times its weight."""
+    """Total variation is added every this many steps, with its weight multiplied by the same number."""
 
 
 def photometric(predicted: Float[Tensor, "R 3"], observed: Float[Tensor, "R 3"]) -> Float[Tensor, ""]:
@@ -56,7 +56,7 @@ def point_color(
     second: Float[Tensor, "R 3"],
     observed: Float[Tensor, "R 3"],
 ) -> Float[Tensor, ""]:
-    """Each sample's own colour against its ray's, weighted by what it contributes (L_pt_rgb; weights held fixed).
+    """Each sample's own colour against its ray's, weighted by its rendering weight (L_pt_rgb; weights held fixed).
 
     sum_s w_s |c_s - o|^2, mean over rays, from the sums over each ray's samples of w, w c and w c^2.
     """
@@ -65,7 +65,7 @@ def point_color(
 
 
 def background_entropy(transmittance: Float[Tensor, "R 1"]) -> Float[Tensor, ""]:
-    """Entropy of the mass behind the last sample: a ray ends on something or on nothing (L_bg)."""
+    """Entropy of the transmittance behind the last sample: a ray should be either opaque or empty (L_bg)."""
     p = transmittance.clamp(1e-6, 1 - 1e-6)
     return -(p * p.log() + (1 - p) * (1 - p).log()).mean()
 
@@ -73,14 +73,14 @@ def background_entropy(transmittance: Float[Tensor, "R 1"]) -> Float[Tensor, ""]
 def distortion(
     weights: Float[Tensor, "R S"], positions: Float[Tensor, "R S"], intervals: Float[Tensor, "R S"]
 ) -> Float[Tensor, ""]:
-    """Spread of a ray's mass (L_dist): sum_ij w_i w_j |s_i - s_j| + 1/3 sum_i w_i^2 delta_i, mean over rays.
+    """Spread of a ray's weights (L_dist): sum_ij w_i w_j |s_i - s_j| + 1/3 sum_i w_i^2 delta_i, mean over rays.
 
     O(S) a ray by prefix sums, which needs ``positions`` sorted along the ray.
 
     Args:
         weights: rendering weights, 0 in empty slots.
         positions: s, a monotone map of the merged distance into [0, 1].
-        intervals: delta, the length each sample stands for on that map.
+        intervals: delta, the length of each sample on that map.
 
     Source: mip-NeRF 360 eq. (15); O(N) form as in DVGO v2.
     """
@@ -101,7 +101,7 @@ def keypoint_depth(
     """-log of the weight mass near an SfM keypoint's known inverse distance, mean over the rays that can reach it.
 
     A soft window exp(-1/2 ((q - q0) / (width q0))^2) in inverse distance q. Rays without a sample within three widths
-    say nothing about the point and are left out.
+    carry no information about the point and are left out.
 
     Args:
         weights: rendering weights of the keypoint rays.
@@ -132,19 +132,19 @@ def known_depth(
     least_error: float,
     outliers: float = 0.02,
 ) -> Float[Tensor, ""]:
-    """-log of the likelihood of measured inverse distances under the mass along their rays, mean over all rays.
+    """-log of the likelihood of measured inverse distances given the weights along their rays, mean over all rays.
 
-    A measurement is right, and then the mass lies within its error, exp(-1/2 ((q - q0) / error)^2) of it; or it is one
-    of the outliers, and then the mass may lie anywhere: -log(mass + outliers). So what many views contradict is given
-    up instead of followed, as the gradient is at most 1 / outliers.
+    A measurement is either right, so that the weights lie within its error, exp(-1/2 ((q - q0) / error)^2), or an
+    outlier, so that they may lie anywhere: -log(mass + outliers). The gradient is at most 1 / outliers, so a
+    measurement that many views contradict is ignored.
 
     Args:
         weights: rendering weights.
         inverse_t: inverse distances of the samples.
-        known: measured inverse distance, 0 where there is none, and its expected error.
+        known: measured inverse distance, 0 if there is none, and its expected error.
         valid: which slots hold a sample.
-        least_error: error that all have at least: that of planes, which lie so far apart.
-        outliers: likelihood of any measurement beside the mass.
+        least_error: lower bound on all errors, from the spacing of planes.
+        outliers: likelihood of an outlier.
     """
     error = torch.hypot(known[:, 1:], torch.full_like(known[:, 1:], least_error)).clamp(min=1e-12)
     scaled = (inverse_t - known[:, :1]) / error
@@ -161,14 +161,14 @@ def batch_losses(
 
     Args:
         rays: pixel rays, then keypoint rays.
-        field: that they were rendered from.
+        field: rendered for these rays.
         image: [P, 3 or 4] colours of the pixels.
         weight: of each loss.
         g: draws the colours behind the pixels.
         step: of the training.
     """
     known = rays.bundle.metadata.get(KEYPOINT_DEPTH)
-    # By counting: a GPU would be waited for to say which rays are pixels'.
+    # Counted on the host: asking the GPU which rays are pixel rays would be a synchronisation.
     asked, size, device = len(image), len(rays.bundle) // rays.times, image.device
     starts = size * torch.arange(rays.times, device=device)[:, None]
     pixels = (starts + torch.arange(asked, device=device)).reshape(-1)
@@ -176,7 +176,7 @@ def batch_losses(
     image = image.repeat(rays.times, 1)
     random = torch.rand(image.shape[0], 3, generator=g, device=image.device)
     observed = over_background(image, random)
-    # Where MPIs that train apart see a ray only in part, what they let through is not theirs to explain.
+    # If MPIs train separately and cover a ray only in part, they need not explain the remaining transmittance.
     explained = rays.report.explained[pixels]
     background = torch.where(explained, random, observed)
     c, colors = rays.composite, rays.colors.of_rays(pixels)
@@ -210,7 +210,7 @@ def _known_depth(rays: RenderedRays, pixels: Tensor, composite: Composite, field
     meta = metadata_of(rays.samples)
     inverse_t, valid = (meta[name][..., 0].index_select(0, pixels) for name in ("inverse_t", "valid"))
     known = rays.bundle.metadata[PIXEL_DEPTH].index_select(0, pixels)
-    # Planes lie so far apart in inverse distance, and a surface between two of them is shown by both.
+    # The plane spacing in inverse distance; a surface between two planes is represented by both.
     spacings = [1 / (m.near * max(1, m.planes - 1)) for m in field.plan.mpis]
     least = PLANE_ERROR * sum(spacings) / max(1, len(spacings))
     return known_depth(composite.weights, inverse_t, known, valid, least, outliers)
@@ -227,7 +227,7 @@ def _keypoint_depth(rays: RenderedRays, chosen: Tensor, known: Tensor) -> Tensor
 
 
 def over_background(image: Tensor, background: Tensor) -> Tensor:
-    """RGBA over a background; RGB as it is."""
+    """RGBA over a background; RGB unchanged."""
     if image.shape[-1] == 4:
         return image[..., :3] * image[..., 3:] + background * (1 - image[..., 3:])
     return image

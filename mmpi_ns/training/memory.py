@@ -1,4 +1,4 @@
-"""How much memory a run takes, and what it trains: told before it starts."""
+"""Plan and memory of a run, reported before it starts."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mmpi_ns.utils.machine import free_memory
 
 GIB = 2**30
 LEAST_SHARE = 0.02
-"""Of a plan's texels at least so many are taken to be within reach of training rays: to find out takes its time."""
+"""Fraction of a plan's texels assumed to be in reach of training rays; computing it takes time."""
 
 
 def check_memory(
@@ -25,7 +25,7 @@ def check_memory(
     two_phase: bool,
     device: str | torch.device,
 ) -> None:
-    """Compares what the largest window takes in training with what the machine has, before anything is allocated.
+    """Compares the memory that the largest window needs in training with what is free, before anything is allocated.
 
     Args:
         windows: of the capture.
@@ -34,7 +34,7 @@ def check_memory(
         device: on which it will be trained.
 
     Raises:
-        InputError: it has less.
+        InputError: not enough memory is free.
     """
     free = free_memory(device)
     for plan, seen in zip(windows.plans, views, strict=True):
@@ -51,8 +51,8 @@ def check_memory(
 
 
 def _bytes_to_look(plan: ScenePlan, views: TrainingViews | None) -> int:
-    """Bytes that it takes to find out which tiles training rays can reach: marks, and 4 planes of every image's sides
-    at the tiles of one plane (``visible_tiles``)."""
+    """Bytes needed to find the tiles that training rays can reach: marks, and the 4 side planes of every image at the
+    tiles of one plane (``visible_tiles``)."""
     cameras = 0 if views is None else len(views.origins)
     largest = max(-(-height // SIDE) * -(-width // SIDE) for _, height, width in head_shapes(plan))
     return 8 * count_tiles(plan) + 4 * 8 * 3 * cameras * largest
@@ -64,11 +64,11 @@ def count_tiles(plan: ScenePlan) -> int:
 
 
 def training_bytes(plan: ScenePlan, views: TrainingViews | None, feature_channels: int, two_phase: bool) -> int:
-    """Bytes of the tables of one window at full resolution, and of their moments; at most, as bricks may be given up.
+    """Bytes of the tables of one window at full resolution, and of their moments, before bricks are released.
 
     Args:
         plan: MPIs and cube.
-        views: training images; what none can reach is not stored. None: everything is.
+        views: training images; texels that none can reach are not stored. None: all are stored.
         feature_channels: colour features of a texel.
         two_phase: whether reliability is trained, so that it has moments.
     """
@@ -76,18 +76,18 @@ def training_bytes(plan: ScenePlan, views: TrainingViews | None, feature_channel
     stored = tiles if views is None else int(reachable_tiles(views, plan).sum())
     learned = 1 + feature_channels + two_phase
     numbers, moments = 1 + feature_channels + 1, 2 * learned  # density, features, reliability; in float32, bfloat16
-    # And what is touched, peaks, where tiles lie.
+    # Also marks of touched texels, peaks of bricks, and the tile map.
     return (stored + 1) * (BRICK * (4 * numbers + 2 * moments + 1) + 4) + 4 * tiles
 
 
 def describe(windows: WindowedPlan, steps: int, tables: Sequence[int], pixels: Sequence[int]) -> str:
-    """What will be trained, and what it takes.
+    """The plan and the memory it needs, as text.
 
     Args:
         windows: of the capture.
         steps: of each window.
         tables: ``training_bytes`` of each window.
-        pixels: bytes of training pixels that are held while each window trains.
+        pixels: bytes of training pixels in memory while each window trains.
     """
     most = max(range(len(windows)), key=lambda w: tables[w] + pixels[w])
     memory = (

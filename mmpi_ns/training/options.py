@@ -69,11 +69,11 @@ NO_EFFECT = {
     ),
     "pipeline.model": ("enable_collider", "collider_params", "loss_coefficients", "prompt"),
 }
-"""nerfstudio's options that this method has no use for."""
+"""nerfstudio's options that have no effect on this method."""
 
 
 def check_ffmpeg(command: Sequence[str]) -> None:
-    """Raises InputError where ns-render will ask for ffmpeg, which is not there; it would ask after loading.
+    """Raises InputError if ns-render will need ffmpeg and it is missing; nerfstudio checks only after loading.
 
     Args:
         command: the command that runs, and its arguments.

@@ -1,6 +1,6 @@
-"""Which phase a step is in, what trains in it, at which resolution and learning rate. Pure functions of the step.
+"""Phase, trainable parameters, resolution and learning rates, as pure functions of the step.
 
-The schedule is fixed before step 0 and travels in the checkpoint, so that a resumed run walks the same path.
+The schedule is fixed before step 0 and stored in the checkpoint, so that a resumed run follows the same schedule.
 Source: paper sec. III-C ("two-stage reliability learning scheme") and sec. IV (30k + 10k steps).
 """
 
@@ -21,7 +21,7 @@ TRAINS: dict[str, frozenset[str]] = {
     "blend": frozenset({"reliability"}),
     "finetune": frozenset({"density", "features", "colour", "reliability", "camera_opt"}),
 }
-"""What trains in each phase; everything else is frozen, bit for bit."""
+"""Trainable parameters of each phase; everything else is frozen bit for bit."""
 
 
 @dataclass(frozen=True)
@@ -42,18 +42,18 @@ class Schedule:
     decay_decades: float
     """Learning rates fall by 10^-decay_decades over the rest of a phase,"""
     decay_from: float
-    """after they have stayed for this share of it."""
+    """after being constant for this fraction of it."""
     finetune_rate: float
     """Learning rates at the start of the fine-tune, relative to those of the first phase."""
     windows: int = 1
-    """Windows of a long capture, which walk through all of this one after the other."""
+    """Windows of a long capture, which follow this schedule one after the other."""
     release: tuple[int, ...] = ()
-    """Steps before which bricks are given up in which nothing was seen since the last such step, or since surfaces
-    formed."""
+    """Steps before which empty bricks are released, judging by the samples since the previous such step, or since
+    surfaces formed."""
 
     @property
     def is_joint(self) -> bool:
-        """Whether all MPIs train together from the start, so that each has a share of the optical depth."""
+        """Whether all MPIs train together from the start, each with 1/K of the optical depth."""
         return self.phases[0].name == "joint"
 
     @property
@@ -65,14 +65,14 @@ class Schedule:
         return self.window_steps * self.windows
 
     def window_at(self, step: int) -> int:
-        """The window that an absolute step trains; the last one from the end on."""
+        """The window that an absolute step trains; the last one after the end."""
         return min(step // self.window_steps, self.windows - 1)
 
     def _local(self, step: int) -> int:
         return step - self.window_at(step) * self.window_steps
 
     def phase_at(self, step: int) -> Phase:
-        """The phase of an absolute step; the last phase from its end on (evaluation after training)."""
+        """The phase of an absolute step; the last phase after its end (evaluation after training)."""
         first = self.window_at(step) * self.window_steps
         chosen = next((phase for phase in self.phases if step - first < phase.end), self.phases[-1])
         return Phase(chosen.name, chosen.start + first, chosen.end + first)
@@ -94,11 +94,11 @@ class Schedule:
         return self.growth[-1] if self.growth else self.phases[0].end // 10
 
     def releases_at(self, step: int) -> bool:
-        """Whether bricks are given up before this step."""
+        """Whether bricks are released before this step."""
         return self._local(step) in self.release
 
     def watches(self, step: int) -> bool:
-        """Whether what a step sees counts for the next release of bricks."""
+        """Whether the samples of a step count for the next release of bricks."""
         return bool(self.release) and self._sharp_from <= self._local(step) < self.release[-1]
 
     def rate_factor(self, kind: str, step: int) -> float:
@@ -144,11 +144,11 @@ def make_schedule(
         finetune_share: share of the steps in which everything trains together at the end (two-phase).
         growth_shares: when texels double, as shares of the first phase.
         decay_decades: decades that learning rates fall over a phase (paper: x0.1 per 20k of 30k steps = 1.5).
-        decay_from: share of a phase for which they stay before that.
+        decay_from: fraction of a phase for which they are constant before that.
         finetune_rate: learning rates at the start of the fine-tune relative to the first phase's.
         windows: windows of a long capture, trained one after the other.
-        release_shares: when bricks in which nothing is seen are given up, as shares of the first phase; not before
-            surfaces have formed.
+        release_shares: when empty bricks are released, as fractions of the first phase; not before surfaces have
+            formed.
 
     Raises:
         ValueError: the shares leave no step for the first phase.
@@ -163,7 +163,7 @@ def make_schedule(
             raise ValueError("blend-share and finetune-share must not be negative.")
         if blend_share + finetune_share >= 1:
             raise ValueError("blend-share + finetune-share leave no step for the individual phase: lower them.")
-        # The first phase has a step even where so few are asked for that the others' are rounded up to all of them.
+        # The first phase has at least one step, even if rounding up the others would take all of them.
         blend = min(round(total_steps * blend_share), total_steps - 1)
         finetune = min(round(total_steps * finetune_share), total_steps - 1 - blend)
         lengths = [("individual", total_steps - blend - finetune), ("blend", blend), ("finetune", finetune)]

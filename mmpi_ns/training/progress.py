@@ -1,6 +1,6 @@
-"""How far a run is: its windows and its schedule, the step, and the window that is being trained.
+"""Progress of a run: its windows and schedule, the step, and the window being trained.
 
-Windows, schedule and the window's number travel in checkpoints.
+Windows, schedule and the number of the window are stored in checkpoints.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from mmpi_ns.utils.files import to_bytes, to_text
 
 
 class Progress(nn.Module):
-    """The state of a run beside its field.
+    """The state of a run apart from its field.
 
     Args:
         windows: of the capture.
@@ -28,7 +28,7 @@ class Progress(nn.Module):
         self.windows, self.schedule = windows, schedule
         self.step = 0
         self.window = 0
-        """The window that is being trained; those before it are finished, those after it are not there yet."""
+        """The window being trained; earlier ones are finished, later ones do not exist yet."""
         self.windows_bytes: Tensor
         self.schedule_bytes: Tensor
         self.window_number: Tensor
@@ -41,12 +41,12 @@ class Progress(nn.Module):
         return self.schedule.phase_at(self.step)
 
     def begin(self, window: int) -> None:
-        """Another window is trained from now on."""
+        """Starts training another window."""
         self.window_number.fill_(window)
         self.window = window
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
-        """The plan and the schedule of a run are its checkpoint's, whatever config and capture say now."""
+        """Plan and schedule of a run come from its checkpoint, whatever config and capture say now."""
         for name in ("windows_bytes", "schedule_bytes"):
             stored = state_dict.get(prefix + name)
             if stored is not None:  # nerfstudio loads the pipeline's own, empty state in a second pass

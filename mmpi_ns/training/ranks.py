@@ -7,13 +7,13 @@ from datetime import timedelta
 import torch.distributed as dist
 
 PATIENCE = timedelta(days=7)
-"""nerfstudio's processes give up half an hour after the first of them is through."""
+"""nerfstudio's processes time out half an hour after the first of them has finished."""
 
 
 def patient_group() -> dist.ProcessGroup | None:
-    """All processes, waiting as long as it takes; called by all of them.
+    """A process group of all processes without time limit; called by all of them.
 
-    None where there is one process, and under torchrun, where ``scripts.train`` waits.
+    None if there is one process, and under torchrun, where ``scripts.train`` waits.
     """
     if not dist.is_initialized() or dist.get_backend() == "gloo":
         return None
@@ -23,6 +23,6 @@ def patient_group() -> dist.ProcessGroup | None:
 
 
 def wait_for_all(group: dist.ProcessGroup | None) -> None:
-    """Until all processes have called this."""
+    """Waits until all processes have called this."""
     if group is not None:
         dist.barrier(group=group)

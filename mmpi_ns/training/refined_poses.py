@@ -1,4 +1,4 @@
-"""Poses refined while the scene is learned: nerfstudio's camera optimiser, and which rays it learns from."""
+"""Pose refinement during training: nerfstudio's camera optimiser, and the rays it learns from."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mmpi_ns.utils.errors import InputError
 
 
 def check_refined_poses(mode: str, windows: int) -> None:
-    """Raises InputError where poses are to be refined of a capture in several windows, which would not share them."""
+    """Raises InputError if poses of a capture in several windows are to be refined, since windows do not share them."""
     if mode != "off" and windows > 1:
         raise InputError(
             f"The capture is trained in {windows} windows, one after the other, and poses are refined in one alone: "
@@ -24,9 +24,9 @@ def check_refined_poses(mode: str, windows: int) -> None:
 
 @torch.no_grad()
 def keep_frame(poses: Iterable[Parameter]) -> None:
-    """Takes what all cameras have in common out of their corrections [N, 6].
+    """Subtracts the mean of the cameras' corrections [N, 6].
 
-    The scene would follow them and every training image look the same, but test images would not: their poses stay.
+    The scene would follow a common correction without changing the training images, but test images keep their poses.
     """
     for moves in poses:
         moves -= moves.mean(0)
@@ -35,8 +35,8 @@ def keep_frame(poses: Iterable[Parameter]) -> None:
 def move_rays(bundle: RayBundle, poses: CameraOptimizer) -> None:
     """Moves a training batch's rays with their cameras, in place.
 
-    Rays of new views and through keypoints follow the camera that they were made from and do not move it: where they
-    start and what they show come from depths that were found under the given poses, and would hold it there.
+    Rays of new views and keypoint rays follow their camera but do not move it: they were made from depths found with
+    the given poses, and would pull the camera back to them.
     """
     if poses.config.mode == "off":
         return

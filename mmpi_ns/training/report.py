@@ -1,4 +1,4 @@
-"""What a training run says: a line now and then, and at its end how good it is and what to do next."""
+"""Console output of a training run: progress lines, and at the end its quality and the next commands."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ from mmpi_ns.training.phases import Schedule
 from mmpi_ns.utils.console import say
 
 FIRST_LINE, SHARE = 10, 0.025
-"""A line after so many steps, then after such a share of all of them."""
+"""A line after this many steps, then after each such fraction of all steps."""
 LEAST_SECONDS, MOST_SECONDS = 2.0, 30.0
 """Between two lines."""
 VIEWS, LOOK_SECONDS = 4, 20.0
-"""The quick test: test images at most, and seconds after which no other is begun."""
+"""The quick test: maximum number of test images, and seconds after which no further one is started."""
 CPU_RAYS = 6000.0
-"""Rays a second that one core trains with the settings of mmpi-small (docs/results/train.md)."""
+"""Rays/s that one core trains with the settings of mmpi-small (docs/results/train.md)."""
 LONG = 1800.0
-"""Seconds from which on a smaller method is named."""
+"""Seconds from which a smaller method is suggested."""
 
 
 class TrainingLog:
-    """Says how far a run is, from one step to the next.
+    """Prints the progress of a run.
 
     Args:
         schedule: of the run.
         rays: of a step.
-        first: step that runs first.
+        first: first step.
         end: step after the last one.
     """
 
@@ -45,9 +45,9 @@ class TrainingLog:
         self._phase = ""
 
     def note(self, step: int, rgb_loss: Tensor) -> None:
-        """After each step, with its squared colour error; prints where a line is due."""
+        """Called after each step with its squared colour error; prints if a line is due."""
         done, now = step + 1, monotonic()
-        if done - self.first == 1:  # the first step compiles, and tells nothing of the others
+        if done - self.first == 1:  # the first step includes compilation
             self._said_at, self._said = now, done
         window, phase = self.schedule.window_at(step), self.schedule.phase_at(step).name
         where = phase if self.schedule.windows == 1 else f"window {window + 1} of {self.schedule.windows}, {phase}"
@@ -73,7 +73,7 @@ def duration(seconds: float) -> str:
 
 
 def forecast(method: str, steps: int, rays: int) -> str:
-    """How long training takes on this machine's CPU, and the smaller method where that is long."""
+    """Training time on this machine's CPU, and the smaller method if that is long."""
     seconds = steps * rays / (CPU_RAYS * torch.get_num_threads())
     smaller = "; mmpi-small is made for a CPU" if seconds > LONG and method != "mmpi-small" else ""
     return (
@@ -84,10 +84,10 @@ def forecast(method: str, steps: int, rays: int) -> str:
 
 @torch.no_grad()
 def quick_test(model: Model, images: InputDataset, background: float) -> str:
-    """PSNR and SSIM of a few test images, in a sentence.
+    """PSNR and SSIM of a few test images, as a sentence.
 
     Args:
-        model: as it is trained; it is left in training mode.
+        model: in training mode, also afterwards.
         images: the test images.
         background: behind those with transparency.
     """
@@ -110,11 +110,11 @@ def quick_test(model: Model, images: InputDataset, background: float) -> str:
 
 
 def next_commands(folder: Path) -> str:
-    """Where a run lies, and what one does with it."""
+    """The folder of a run, and the next commands."""
     config = folder / "config.yml"
     return "\n".join(
         [
-            f"The run lies in {folder}. Next:",
+            f"The run is in {folder}. Next:",
             f"  ns-eval --load-config {config} --output-path {folder / 'eval.json'}",
             f"  ns-render interpolate --load-config {config} --output-path {folder / 'fly.mp4'}",
             f"  ns-viewer --load-config {config}",

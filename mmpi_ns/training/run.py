@@ -1,4 +1,4 @@
-"""A training run between two steps: which window, at which resolution, from which pixels, and what trains."""
+"""State changes of a training run between two steps: window, resolution, pixels, and trainable parameters."""
 
 from __future__ import annotations
 
@@ -42,15 +42,15 @@ def views_of(window: Window, views: TrainingViews | None) -> TrainingViews | Non
 
 
 class TrainingRun:
-    """What is trained, and how it is brought from one step to the next.
+    """What is trained, and its changes from one step to the next.
 
     Args:
         progress: windows, schedule and step.
         field: of the window that is trained, one after the other.
         store: where finished windows go.
         views: the training images; None: every texel is stored.
-        release_weight: bricks in which no sample weighs this much are given up.
-        poses: corrections of the cameras' poses, where they are refined.
+        release_weight: bricks in which no sample has this weight are released.
+        poses: corrections of the cameras' poses, if they are refined.
     """
 
     def __init__(
@@ -89,11 +89,11 @@ class TrainingRun:
         return [*range(trained + 1)]
 
     def prepare_step(self, attributes: TrainingCallbackAttributes | None, step: int) -> None:
-        """Brings window, resolution, storage and freezing to what the schedule says of a step.
+        """Applies the schedule of a step: window, resolution, storage and frozen parameters.
 
         Args:
-            attributes: the trainer's optimisers and data manager; None where there is no trainer.
-            step: that is about to run.
+            attributes: the trainer's optimisers and data manager; None without a trainer.
+            step: about to run.
         """
         progress, field = self.progress, self.field
         progress.step = step
@@ -116,7 +116,7 @@ class TrainingRun:
             keep_frame(self._poses)
 
     def _begin_window(self, window: int, factor: float) -> None:
-        """Another window with fresh tables and networks; the trainer has put the one before away."""
+        """Starts another window with new tables and networks; the trainer has saved the previous one."""
         field = self.field
         self.store.forget(window)
         field.views = self.views_of(window)
@@ -125,7 +125,7 @@ class TrainingRun:
         self.progress.begin(window)
 
     def _draw_from_window(self, manager: Any) -> None:
-        """Has the data manager draw from the cameras that ask the window at hand."""
+        """Makes the data manager draw from the cameras of the current window."""
         assert isinstance(manager, MMPIDataManager), "windows need MMPIDataManager"
         manager.use_cameras(self.cameras_of(manager.observations.centers, self.progress.window))
         self._drawn_from = self.progress.window

@@ -15,15 +15,15 @@ _held: dict[Path, FileLock] = {}
 
 
 def claim(folder: Path, checkpoints: Path, resumes_from: Path | None) -> None:
-    """Makes a run's folder this process's own until it ends, and clears away what killed runs left half written.
+    """Locks a run's folder for this process until it ends, and removes files left half-written by killed runs.
 
     Args:
         folder: of the run.
         checkpoints: its folder of checkpoints.
-        resumes_from: the folder, or the file, of the checkpoint that the run goes on from.
+        resumes_from: folder or file of the checkpoint that the run resumes from.
 
     Raises:
-        InputError: another run is writing there, or has written checkpoints that this one does not go on from.
+        InputError: another run is writing there, or its checkpoints are there and this run does not resume from them.
         WriteError: the folder cannot be written.
     """
     with write_errors(folder, "--output-dir"):
@@ -46,7 +46,7 @@ def claim(folder: Path, checkpoints: Path, resumes_from: Path | None) -> None:
 
 
 def _lock(folder: Path) -> None:
-    """The system lets go of it when the process ends, however that happens."""
+    """The operating system releases the lock when the process ends, however that happens."""
     if folder not in _held:
         lock = FileLock(folder / LOCK)
         with write_errors(folder, "--output-dir"):

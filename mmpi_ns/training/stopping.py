@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM: the step at hand is finished, the run is saved, and one sentence says how to go on."""
+"""Ctrl-C and SIGTERM: the current step is finished, the run is saved, and one sentence says how to resume."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 @contextmanager
 def signals_go_to(handle: Callable[[int], object]) -> Iterator[None]:
-    """Within the block the first Ctrl-C or SIGTERM calls ``handle`` with its number, and the next does what it did.
+    """Within the block the first Ctrl-C or SIGTERM calls ``handle`` with its number; the next one has its usual effect.
 
-    In other threads than the main one nothing is changed.
+    Has no effect outside the main thread.
     """
     if current_thread() is not main_thread():
         yield
@@ -40,12 +40,12 @@ def signals_go_to(handle: Callable[[int], object]) -> Iterator[None]:
 
 
 def end(number: int, sentence: str) -> NoReturn:
-    """Ends the process as one that a signal ended, 130 after Ctrl-C, with a sentence."""
+    """Ends the process with the exit status of the signal (130 after Ctrl-C) and a sentence."""
     sys.stdout.flush()
     print(sentence, file=sys.stderr, flush=True)
     raise SystemExit(128 + number)
 
 
 def end_before_training(number: int) -> NoReturn:
-    """For signals that come while a run is prepared."""
+    """Handles signals that arrive while a run is prepared."""
     end(number, "Stopped before the first step: there is nothing to go on from.")

@@ -1,4 +1,4 @@
-"""When a field's tables grow and which bricks they give up, by the schedule; the optimisers' moments follow."""
+"""Growth of a field's tables and release of bricks, by the schedule; the optimisers' moments follow."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from mmpi_ns.utils.machine import give_back_freed_memory
 def prepare_storage(
     field: TexelTables, schedule: Schedule, step: int, least: float, optimizers: Mapping[str, Any]
 ) -> None:
-    """Grows and gives up what the schedule says of a step.
+    """Grows tables and releases bricks as scheduled for a step.
 
     Args:
         field: the field that is trained.
         schedule: of the whole run.
         step: that is about to run.
         least: see ``TexelTables.release_unused``.
-        optimizers: of the tables, by their names, where there are any; their moments follow.
+        optimizers: of the tables, by name, if there are any; their moments follow.
     """
     own = [(optimizers[name], getattr(field, name)) for name in TABLES if name in optimizers]
     factor = schedule.texel_factor(step)

@@ -1,6 +1,6 @@
-"""Adam that visits only what a batch touched (DVGO's masked Adam, for sparse row gradients).
+"""Adam that updates only the rows a batch touched (DVGO's masked Adam, for sparse row gradients).
 
-Equal to dense Adam in which entries with no gradient are skipped: their values and moments stay as they are.
+Equal to dense Adam in which entries without a gradient are skipped, with values and moments unchanged.
 """
 
 from __future__ import annotations
@@ -53,14 +53,14 @@ class TouchedAdam(torch.optim.Optimizer):
         self.state.pop(param, None)
 
     def keep_blocks(self, param: Parameter, kept: Tensor, size: int) -> None:
-        """Moments of a table of which only the blocks ``kept`` [K], of ``size`` rows each, are left, in that order."""
+        """Keeps the moments of the blocks ``kept`` [K] of a table, of ``size`` rows each, in that order."""
         state = self.state.get(param, {})
         if "moments" in state:
             moments = state["moments"]
             state["moments"] = moments.view(-1, size, *moments.shape[1:])[kept].flatten(0, 1)
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """As torch's own, which would give moments the precision of their parameters."""
+        """Like torch's own, which would convert moments to the precision of their parameters."""
         super().load_state_dict(state_dict)
         params = [param for group in self.param_groups for param in group["params"]]
         for number, known in state_dict["state"].items():
@@ -83,7 +83,7 @@ def _constants(state: dict[str, Any], group: dict[str, Any]) -> AdamConstants:
 
 def _sparse_update(param: Parameter, grad: Tensor, state: dict[str, Any], group: dict[str, Any]) -> None:
     rows, values = grad._indices()[0], grad._values().to(param.dtype)
-    # On a CPU torch forgets, where it accumulates a gradient, that it is coalesced.
+    # On a CPU, torch loses the information that an accumulated gradient is coalesced.
     if not (grad.is_coalesced() or bool((rows[1:] > rows[:-1]).all())):
         index = index_rows(rows, len(param))
         rows, values = index.unique, sum_rows(index.position, values, None, len(index.unique))

@@ -50,21 +50,21 @@ WINDOWS_FOLDER = "windows"
 class MMPITrainerConfig(TrainerConfig):
     """nerfstudio's trainer settings; max-num-iterations is the length of the whole run, resumed or not.
 
-    A capture so long that it is split into windows gets as many steps for each of them.
+    If a long capture is split into windows, each window gets this many steps.
     """
 
     _target: type = field(default_factory=lambda: MMPITrainer)
 
     def set_timestamp(self) -> None:
-        """The first of ours that ns-train runs."""
+        """The first code of this package that ns-train runs."""
         speak_plainly()
         keep_quiet()
         super().set_timestamp()
 
     def get_checkpoint_dir(self) -> Path:
-        """The first of ours that ns-eval, ns-render and ns-viewer run.
+        """The first code of this package that ns-eval, ns-render and ns-viewer run.
 
-        They take every file in this folder for a checkpoint, and so they are told which is the last.
+        They take every file in this folder for a checkpoint, so the last one is given explicitly.
         """
         speak_plainly()
         keep_quiet()
@@ -77,9 +77,9 @@ class MMPITrainerConfig(TrainerConfig):
         return folder
 
     def get_base_dir(self) -> Path:
-        """The folder of the run. The last of ours before ns-viewer opens its server.
+        """The folder of the run. The last code of this package before ns-viewer opens its server.
 
-        ns-viewer takes addresses from its own options, whose default is every address of the machine.
+        ns-viewer takes the address from its own options, whose default is every address of the machine.
         """
         options = [word.replace("_", "-") for word in sys.argv]
         asked = any(word.startswith("--viewer.websocket-host") for word in options)
@@ -88,14 +88,14 @@ class MMPITrainerConfig(TrainerConfig):
         return super().get_base_dir()
 
     def print_to_terminal(self) -> None:
-        """Says where all settings are; there are more of them than a terminal has lines."""
+        """Prints where all settings are, which are more than a terminal has lines."""
         say(f"All settings of this run: {self.get_base_dir() / 'config.yml'}")
 
     def save_config(self) -> None:
-        """Judges the options, takes the run's folder, and writes config.yml.
+        """Checks the options, locks the run's folder, and writes config.yml.
 
-        From that ns-eval and ns-render learn where the windows of a long capture lie. What the run goes on from is not
-        theirs to load.
+        It tells ns-eval and ns-render where the windows of a long capture are, but not which checkpoint this run resumes
+        from, which they must not load.
         """
         check_run(self)
         folder = self.get_base_dir()
@@ -121,7 +121,7 @@ class MMPITrainer(Trainer):
         return run
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
-        """Prepares the run; a signal in the meantime ends it with a sentence (of several processes: torchrun's)."""
+        """Prepares the run; a signal during this time ends it with a sentence (of several processes: torchrun's)."""
         with signals_go_to(end_before_training) if self.world_size == 1 else nullcontext():
             self._prepare(test_mode)
 
@@ -135,7 +135,7 @@ class MMPITrainer(Trainer):
         model_config.seed = self.config.pipeline.datamanager.seed = self.config.machine.seed  # type: ignore[attr-defined]
         self._window_steps = model_config.total_steps = self.config.max_num_iterations
         model_config.windows_folder = self.base_dir / WINDOWS_FOLDER
-        # Processes share the windows out among them; nerfstudio would have all of them average their gradients.
+        # Processes share the windows; nerfstudio would make them average their gradients.
         self._processes, self._process, self.world_size = self.world_size, comms.get_rank(), 1
         self._resumes_from = self.config.load_dir
         self._everyone = patient_group() if self._processes > 1 else None
@@ -161,7 +161,7 @@ class MMPITrainer(Trainer):
             )
 
     def _say_what_comes(self, plan: WindowedPlan) -> None:
-        """What was found in the capture, what is trained, and what it takes: together, before the first step."""
+        """Prints capture, plan and memory together, before the first step."""
         manager, steps = self._manager, self._total_steps
         say(manager.found())
         say(describe(plan, self._window_steps, *self._expected_memory()))
@@ -175,7 +175,7 @@ class MMPITrainer(Trainer):
         return manager
 
     def _expected_memory(self) -> tuple[list[int], list[int]]:
-        """Bytes that the training of each window holds: of tables with their moments, and of pixels."""
+        """Bytes needed for training each window: tables with their moments, and pixels."""
         run, manager = self._run, self._manager
         blends = any(phase.name == "blend" for phase in run.progress.schedule.phases)
         tables = [
@@ -188,7 +188,7 @@ class MMPITrainer(Trainer):
         return tables, [manager.pixel_bytes(run.cameras_of(centers, w)) for w in range(len(tables))]
 
     def setup_optimizers(self) -> Optimizers:
-        """nerfstudio's optimisers, with schedulers that know the phases."""
+        """nerfstudio's optimisers, with schedulers that follow the phases."""
         progress = self._run.progress
         # nerfstudio shows what is left
         self._total_steps = self.config.max_num_iterations = progress.schedule.total_steps
@@ -199,7 +199,7 @@ class MMPITrainer(Trainer):
         return Optimizers(config, self.pipeline.get_param_groups())
 
     def train(self) -> None:
-        """Runs up to max-num-iterations in all (a window); 1.1.5 would run as many again after a resume."""
+        """Runs max-num-iterations in total (a window); nerfstudio 1.1.5 would run as many again after a resume."""
         if self._processes > 1:
             own = range(self._process, len(self._run.progress.windows), self._processes)
             for window in [w for w in own if not self._is_finished(w)]:
@@ -237,21 +237,21 @@ class MMPITrainer(Trainer):
         return TrainingLog(self._run.progress.schedule, rays, self._start_step, end) if self._says_lines else None
 
     def _stop(self, number: int) -> None:
-        """Has nerfstudio's loop end after the step at hand, also where training is paused."""
+        """Makes nerfstudio's loop end after the current step, even if training is paused."""
         self._stopped_by, self.stop_training = number, True
 
     def _checkpoints_of(self, window: int) -> dict[int, Path]:
-        """Checkpoints of one window of several, here and in the run that this one goes on from."""
+        """Folders with the checkpoints of one window of several, here and in the run that this one resumes."""
         steps = range(window * self._window_steps, (window + 1) * self._window_steps)
         folders = [self.checkpoint_dir, *([self._resumes_from] if self._resumes_from else [])]
         return {step: path for folder in folders for step, path in checkpoints_in(folder, steps).items()}
 
     def _is_finished(self, window: int) -> bool:
-        """Whether a window of several need not be trained; takes over its file where another run finished it."""
+        """Whether a window of several is finished; takes over its file if the resumed run finished it."""
         store, windows = self._run.store, self._run.progress.windows
         if self._resumes_from:
             store.adopt(self._resumes_from.parent / WINDOWS_FOLDER, {window: windows.plans[window]})
-        # Of the last window the checkpoint is needed too: evaluation begins there.
+        # The last window needs its checkpoint too, because evaluation loads it.
         is_last = window == len(windows) - 1
         finished = store.path(window).is_file() and (
             not is_last or (window + 1) * self._window_steps - 1 in self._checkpoints_of(window)
@@ -261,7 +261,7 @@ class MMPITrainer(Trainer):
         return finished
 
     def _train_window(self, window: int) -> None:
-        """Trains one window of several, from where another run left it."""
+        """Trains one window of several, from where the resumed run left it."""
         first, known = window * self._window_steps, self._checkpoints_of(window)
         self._start_step = first
         if known:
@@ -280,7 +280,7 @@ class MMPITrainer(Trainer):
                 path.unlink()
 
     def train_iteration(self, step: int) -> Any:
-        """One step; remembers that it ran, and puts a window of several away when it was its last."""
+        """One step; records that it ran, and saves a window of several after its last step."""
         loss, *others = super().train_iteration(step)
         self._last_step = step
         if self._log is not None:
@@ -293,7 +293,7 @@ class MMPITrainer(Trainer):
         return loss.detach(), *({k: _detached(v) for k, v in values.items()} for values in others)
 
     def _after_train(self) -> None:
-        """Saves the last step that ran; 1.1.5 would save the next one's number when training is stopped."""
+        """Saves with the number of the last step that ran; nerfstudio 1.1.5 would use the next one after a stop."""
         self.step = self._last_step
         self.training_state = "completed"
         self.save_checkpoint(self.step)
@@ -311,7 +311,7 @@ class MMPITrainer(Trainer):
             self._train_complete_viewer()
 
     def save_checkpoint(self, step: int) -> None:
-        """Writes beside the checkpoint folder, then moves the finished file in: a kill or a full disk loses nothing.
+        """Writes beside the checkpoint folder, then moves the file in, so a kill or a full disk loses nothing.
 
         Names inside the folder are parsed as steps by nerfstudio, so the unfinished file must not lie there.
         """
@@ -361,7 +361,7 @@ class MMPITrainer(Trainer):
 
 
 def _write_plan(path: Path, plan: WindowedPlan) -> None:
-    """Writes a run's plan for its user to read; one that the user has edited stays."""
+    """Writes a run's plan for the user to read; one that was edited is kept."""
     text, told = plan.to_json(), path.with_name(f".{path.name}.sha256")
     there = path.read_bytes() if path.is_file() else text.encode()
     written = told.read_text(encoding="ascii") if told.is_file() else ""

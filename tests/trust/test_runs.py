@@ -299,7 +299,7 @@ def test_a_run_ends_with_a_quick_test_and_commands_that_can_be_copied(whole_scen
     assert any(x.startswith("step 12 of 12 | joint | ") and "rays/s | batch PSNR" in x for x in lines), lines
     end = next(i for i, line in enumerate(lines) if line.startswith("Training finished: 12 steps in"))
     assert lines[end + 1].startswith("Quick test on 2 of 2 test images: PSNR ") and "SSIM" in lines[end + 1]
-    assert lines[end + 2] == f"The run lies in {config.parent}. Next:"
+    assert lines[end + 2] == f"The run is in {config.parent}. Next:"
     names = [line.split()[0] for line in lines[end + 3 :]]
     assert names == ["ns-eval", "ns-render", "ns-viewer"] and all(f" {config}" in x for x in lines[end + 3 :])
     assert not any("Saving" in x or "overriding" in x or "Mixed precision" in x for x in lines)
