@@ -1,4 +1,4 @@
-"""The similarity that takes one track of cameras to another of the same cameras."""
+"""Similarity alignment of two tracks of the same cameras."""
 
 from __future__ import annotations
 
@@ -7,19 +7,19 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 ROTATION_WEIGHT = 1.0
-"""Weight of rotations beside centres, whose main direction weighs 1, when two tracks are fitted to each other."""
+"""Weight of rotations in the alignment of two tracks; the main direction of the centres has weight 1."""
 
 
 def degrees_between(one: Array, other: Array) -> Array:
-    """Angles [N] of the rotations that take rotations [N, 3, 3] to others."""
+    """Angles [N] between rotations [N, 3, 3] and others."""
     traces = np.einsum("nij,nij->n", one, other)
     return np.degrees(np.arccos(np.clip((traces - 1) / 2, -1, 1)))
 
 
 def similarity_matrix(source: Array, target: Array) -> tuple[float, Array, Array]:
-    """Scale, rotation [3, 3] and translation [3] that take camera poses to other poses of the same cameras.
+    """Scale, rotation [3, 3] and translation [3] that align camera poses with other poses of the same cameras.
 
-    Centres and rotations count alike: a straight track turns about itself, and a short one is tilted by its noise.
+    Uses centres and rotations: the centres of a straight track do not fix its roll, and noise tilts a short one.
 
     Args:
         source, target: camera to world. [N, 4, 4]
@@ -36,7 +36,7 @@ def similarity_matrix(source: Array, target: Array) -> tuple[float, Array, Array
 
 
 def similarity_of_centers(source: Array, target: Array) -> tuple[float, Array, Array]:
-    """Scale, rotation [3, 3] and translation [3] that bring points nearest to others.
+    """Scale, rotation [3, 3] and translation [3] that align points with others in the least-squares sense.
 
     Args:
         source, target: [N, 3]

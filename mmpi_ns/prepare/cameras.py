@@ -15,7 +15,7 @@ Lens = Literal["auto", "pinhole", "radial", "opencv", "fisheye"]
 Sharing = Literal["auto", "shared", "per-image"]
 MODELS = {"pinhole": "PINHOLE", "radial": "SIMPLE_RADIAL", "opencv": "OPENCV", "fisheye": "OPENCV_FISHEYE"}
 GUESSED_FOCAL = 1.2
-"""Focal length over the longer side where nothing is known: COLMAP's guess."""
+"""Focal length over the longer side if nothing is known: COLMAP's guess."""
 GIVEN_COUNTS = {3: "f cx cy", 4: "fx fy cx cy", 8: "fx fy cx cy k1 k2 p1 p2"}
 
 
@@ -33,7 +33,7 @@ class Intrinsics:
 
 
 def parse_camera(values: Sequence[float], fisheye: bool) -> Intrinsics:
-    """The numbers of ``--camera``.
+    """The camera of ``--camera``.
 
     Raises:
         PrepareError: their count fits no camera, or a focal length is not positive.
@@ -69,14 +69,14 @@ def share(photos: Sequence[Photo], sharing: Sharing, given: dict[str, Intrinsics
 def make_cameras(
     photos: Sequence[Photo], numbers: Sequence[int], given: dict[str, Intrinsics], focal: float | None, lens: Lens
 ) -> list[pycolmap.Camera]:
-    """One pycolmap camera a number, from what is given, else from EXIF, else guessed.
+    """One pycolmap camera for each number, from given intrinsics, else from EXIF, else guessed.
 
     Args:
         photos: the images.
         numbers: camera of each image.
         given: known intrinsics by image name.
         focal: focal length in pixels, from the command line.
-        lens: distortion model where none is given.
+        lens: distortion model if none is given.
     """
     cameras: dict[int, pycolmap.Camera] = {}
     for photo, number in zip(photos, numbers, strict=True):
@@ -107,7 +107,7 @@ def read_intrinsics(camera: pycolmap.Camera) -> Intrinsics:
     """A pycolmap camera as OpenCV's.
 
     Raises:
-        PrepareError: a lens model that nerfstudio-data has no place for.
+        PrepareError: nerfstudio-data does not support the lens model.
     """
     name, p = camera.model.name, [float(v) for v in camera.params]
     f = (camera.focal_length_x, camera.focal_length_y, camera.principal_point_x, camera.principal_point_y)
@@ -119,4 +119,4 @@ def read_intrinsics(camera: pycolmap.Camera) -> Intrinsics:
         return Intrinsics(*f, distortion=(p[3], p[4], 0.0, 0.0))
     if name in ("OPENCV", "OPENCV_FISHEYE"):
         return Intrinsics(*f, distortion=(p[4], p[5], p[6], p[7]), fisheye=name == "OPENCV_FISHEYE")
-    raise PrepareError(f"Lens model {name} has no place in transforms.json.")
+    raise PrepareError(f"Lens model {name} is not supported in transforms.json.")

@@ -1,4 +1,4 @@
-"""What may be wrong with a prepared scene: misplaced, blurred or moving frames, and intrinsics that do not fit."""
+"""Checks of a prepared scene: misplaced, blurred or moving frames, and intrinsics that do not fit."""
 
 from __future__ import annotations
 
@@ -20,38 +20,38 @@ from mmpi_ns.prepare.stages import PrepareError
 
 Array = NDArray[np.float64]
 SIDE = 640
-"""Pixels of the longer side at which sharpness is judged."""
+"""Longer side, in pixels, at which sharpness is measured."""
 BLURRED = 0.4
-"""Share of its neighbours' sharpness below which an image counts as blurred."""
+"""Fraction of its neighbours' sharpness below which an image counts as blurred."""
 JUMP = 5.0
 """Times its neighbours' step (or turn) from which a step counts as a jump."""
 TURN = 8.0
-"""Degrees a turn must have beyond that."""
+"""Minimum angle of such a turn, degrees."""
 CELLS = (6, 8)
-"""Rows and columns of the grid in which coverage and motion are judged."""
+"""Rows and columns of the grid for coverage and motion."""
 MOVED_PX = 4.0
-"""Pixels off its epipolar line, at 640 pixels' width, from which a match counts as moving."""
+"""Distance from its epipolar line, in pixels of an image 640 wide, from which a match counts as moving."""
 LEAST_CELLS = 3
-"""Moving cells of an image from which it is said: one or two are as often wrong matches."""
+"""Moving cells of an image from which they are reported; one or two are as often wrong matches."""
 FOCAL_OFF = (0.03, 0.05)
-"""Relative change of a given focal length, when set free, from which it is doubted, and the scene with it..."""
+"""Relative change of a given focal length, when refined, from which it is doubted, and the scene with it..."""
 FOCAL_HELPS = (0.95, 0.85)
-"""... where that brings the reprojection error below these shares of what it was."""
+"""... if refining it lowers the reprojection error below these fractions."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """Something to look at."""
+    """A warning."""
 
     kind: str
-    """One word and a question mark: what may be the matter."""
+    """One word and a question mark: the suspected problem."""
     image: str
     """Empty for the scene as a whole."""
     says: str
     badness: float = 1.0
     """Sorts findings of a kind."""
     is_grave: bool = False
-    """Whether the scene cannot be believed because of it."""
+    """Whether it makes the scene doubtful."""
 
 
 def by_kind(findings: Sequence[Finding]) -> list[str]:
@@ -68,7 +68,7 @@ def by_kind(findings: Sequence[Finding]) -> list[str]:
 
 
 def sharpness(gray: NDArray[np.uint8]) -> float:
-    """Variance of the Laplacian over that of the image, at a fixed size: contrast cancels, blur lowers it."""
+    """Variance of the Laplacian over that of the image, at a fixed size: independent of contrast, lowered by blur."""
     scale = SIDE / max(gray.shape)
     if scale < 1:
         gray = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)  # type: ignore[assignment]
@@ -89,7 +89,7 @@ def read_gray(path: Path) -> NDArray[np.uint8]:
 
 
 def blurred(names: Sequence[str], sharp: Array, ordered: bool) -> list[Finding]:
-    """Images much less sharp than their neighbours (or than the others, where order means nothing)."""
+    """Images much less sharp than their neighbours (or than all others, if the images are not in order)."""
     usual = local_median(sharp, 7) if ordered else np.full(len(sharp), np.median(sharp))
     share = sharp / np.maximum(usual, 1e-12)
     what = "its neighbours" if ordered else "the others"
@@ -105,7 +105,7 @@ def misplaced(names: Sequence[str], places: Sequence[int], poses: Array) -> list
 
     Args:
         names: images in order.
-        places: their places in the input, so that a gap of two frames may be twice as long.
+        places: their indices in the input, so that a gap of two frames may be twice as long.
         poses: camera to world, OpenCV axes. [N, 4, 4]
     """
     if len(names) < 5:
@@ -127,7 +127,7 @@ def misplaced(names: Sequence[str], places: Sequence[int], poses: Array) -> list
 
 
 def coverage(model: pycolmap.Reconstruction) -> dict[str, float]:
-    """Share of an image's cells that hold a keypoint with a point, for each image."""
+    """Fraction of an image's cells that contain a keypoint with a point, for each image."""
     shares = {}
     for i in model.reg_image_ids():
         image = model.images[i]
@@ -149,9 +149,9 @@ def _cell_counts(points: Array, width: int, height: int) -> NDArray[np.int64]:
 
 
 def moving(model: pycolmap.Reconstruction, database: Path, names: Sequence[str]) -> list[Finding]:
-    """Images where many matches with the next image, close together, leave their epipolar lines: something moves there.
+    """Images in which clustered matches with the next image leave their epipolar lines: something moves there.
 
-    What moves along its epipolar line (a car driving ahead) passes unseen.
+    Motion along the epipolar line (a car driving ahead) is not detected.
     """
     by_name = {model.images[i].name: i for i in model.reg_image_ids()}
     found = []
@@ -188,7 +188,7 @@ def _moving_share(model: pycolmap.Reconstruction, pair: tuple[int, int], matches
         own = cell == number
         if own.sum() >= 6 and bad[own].mean() > 0.6:
             spread = np.median(np.abs(flow[own & bad] - np.median(flow[own & bad], axis=0)), axis=0)
-            # wrong matches point everywhere; what moves, moves as one
+            # wrong matches point everywhere; a moving object moves as one
             count += int(spread.max() < 0.01 * cameras[0].width)
     return count / (CELLS[0] * CELLS[1])
 
@@ -198,7 +198,7 @@ def doubtful_intrinsics(model: pycolmap.Reconstruction, fixed: bool, copy: Path,
 
     Args:
         model: the final model.
-        fixed: intrinsics were given and kept: they are set free in a copy, and compared.
+        fixed: intrinsics were given and kept; they are refined in a copy and compared.
         copy: folder the model can be read from.
         threads: CPU threads; below 1 for all.
     """

@@ -1,4 +1,4 @@
-"""What evidence is judged by, read out of a model and the database of its matches."""
+"""Collects the evidence from a model and the database of its matches."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from mmpi_ns.prepare.evidence import Array, Pairs, Places, Witness, scale_change
 from mmpi_ns.prepare.frame import camera_poses
 
 FIT_PX = 2.0
-"""Pixels off its epipolar line (Sampson's distance), at an image side of 1,000, up to which a match lies on it."""
+"""Sampson distance, in pixels of an image side of 1,000, up to which a match lies on its epipolar line."""
 
 
 def witness_of(name: str, model: pycolmap.Reconstruction, database: Path, offered: Sequence[str]) -> Witness:
-    """Everything that is judged of a mapper's model.
+    """The evidence on a mapper's model.
 
     Args:
         name: of the mapper.
@@ -42,7 +42,7 @@ def witness_of(name: str, model: pycolmap.Reconstruction, database: Path, offere
 
 
 def _pairs(model: pycolmap.Reconstruction, database: Path) -> Pairs:
-    """Of every verified pair of registered images, how many matches became points and how many fit the poses."""
+    """For every verified pair of registered images, how many matches became points and how many fit the poses."""
     order = sorted(model.reg_image_ids())
     place = {image_id: i for i, image_id in enumerate(order)}
     points = {i: _points(model.images[i]) for i in order}
@@ -68,7 +68,7 @@ def _pairs(model: pycolmap.Reconstruction, database: Path) -> Pairs:
 
 
 def _observations(model: pycolmap.Reconstruction) -> tuple[Places, Places, Array, Array]:
-    """Point, place of the image, centre and ray of everything that is seen. [O], [O], [O, 3], [O, 3]"""
+    """Point, index of the image, camera centre and ray of every observation. [O], [O], [O, 3], [O, 3]"""
     parts = []
     for place, image_id in enumerate(sorted(model.reg_image_ids())):
         image = model.images[image_id]

@@ -1,13 +1,13 @@
-"""How far a reconstruction can be believed, by evidence that a wrong track cannot fake.
+"""Evidence on the correctness of a reconstruction, which a wrong track cannot fake.
 
-A track that broke off and went on at another scale, or folded over, has a small reprojection error: each part fits its
-own points. What it cannot do is to join them. So this looks at the verified matches of pairs of images, found without
-any track: how many became points that both images see, how many lie on the epipolar lines of the two poses, and whether
-that holds for the pairs across each gap between two frames. And points that are seen on both sides of a gap are found
-twice, from either side alone: where the scale changes, the two differ. Two mappers that work in different ways are
-compared with each other as well.
+A track that breaks and continues at another scale, or folds over, has a small reprojection error: each part fits its
+own points. But matches between the parts do not fit. So the evidence is taken from the verified matches of image
+pairs, which do not depend on any track: how many became points that both images see, and how many lie on the epipolar
+lines of the two poses, also separately for the pairs across each gap between two frames. In addition, points seen on
+both sides of a gap are triangulated twice, from either side alone: if the scale changes, the two differ. The results of
+two different mappers are compared as well.
 
-Pure functions of numpy arrays; ``collect.py`` reads them out of a model.
+Pure functions of numpy arrays; ``collect.py`` reads these from a model.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ Array = NDArray[np.float64]
 Places = NDArray[np.int64]
 
 REACH = 12
-"""Frames across a gap, at most, of the pairs that speak for it: farther ones have few matches and mostly wrong ones."""
+"""Maximum frame distance of pairs used for a gap; pairs farther apart have few matches, most of them wrong."""
 FEW = 60
-"""Matches across a gap below which it says nothing."""
+"""Minimum number of matches across a gap for a statement about it."""
 LEAST_ANGLE = 1.0
-"""Degrees between the first and the last ray on either side of a gap, from which a point is found from that side."""
+"""Minimum angle in degrees between the first and last ray on one side of a gap for triangulation from that side."""
 LEAST_POINTS = 20
-"""Such points from which a gap's scale is known."""
+"""Minimum number of such points for the scale of a gap."""
 WINDOW = 5
 """Steps before and after a gap that are compared with each other."""
 
@@ -40,7 +40,7 @@ class Pairs:
     """Verified matches of P pairs of registered images."""
 
     first: Places
-    """Place of the first image in the order of the registered ones. [P]"""
+    """Index of the first image among the registered ones. [P]"""
     second: Places
     """Of the second, later one. [P]"""
     matches: Array
@@ -53,14 +53,14 @@ class Pairs:
 
 @dataclass(frozen=True)
 class Witness:
-    """What one mapper says."""
+    """The model of one mapper, reduced to its evidence."""
 
     name: str
     """Of the mapper."""
     images: Sequence[str]
-    """Names of the N registered images in their order."""
+    """Names of the N registered images in order."""
     places: Places
-    """Their places among all images given. [N]"""
+    """Their indices among all images given. [N]"""
     poses: Array
     """Camera to world, OpenCV axes. [N, 4, 4]"""
     pairs: Pairs
@@ -69,17 +69,17 @@ class Witness:
     error: float
     """Mean reprojection error, pixels."""
     scales: Array
-    """Logarithm of the change of scale across each gap, as far as it is certain; NaN where it is not known. [N - 1]"""
+    """Logarithm of the change of scale across each gap, reduced to its certain part; NaN if unknown. [N - 1]"""
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """How far two tracks of the same cameras differ, after the best similarity."""
+    """Difference between two tracks of the same cameras after similarity alignment."""
 
     images: Sequence[str]
     """Of both. [N]"""
     centers: Array
-    """Distances of the centres, as shares of the extent of the track. [N]"""
+    """Distances of the centres, relative to the extent of the track. [N]"""
     turns: Array
     """Degrees between the rotations. [N]"""
 
@@ -90,7 +90,7 @@ def share(part: Array, whole: Array) -> float:
 
 
 def bridges(pairs: Pairs, count: int, part: Array) -> Array:
-    """For each gap between two registered images, the share of the matches across it that hold.
+    """For each gap between two registered images, the fraction of the matches across it that hold.
 
     Args:
         pairs: of the model.
@@ -98,7 +98,7 @@ def bridges(pairs: Pairs, count: int, part: Array) -> Array:
         part: ``pairs.tracked`` or ``pairs.fitting``. [P]
 
     Returns:
-        Shares; NaN where too few matches lead across. [N - 1]
+        Fractions; NaN if there are too few matches across. [N - 1]
     """
     near = pairs.second - pairs.first <= REACH
     totals = np.zeros((2, count + 1))
@@ -119,11 +119,11 @@ def held_by_image(pairs: Pairs, count: int) -> Array:
 
 
 def scale_changes(points: Places, frames: Places, centers: Array, rays: Array, count: int) -> Array:
-    """How the scale changes across each gap: the distance of points found from the frames after it alone, over that of
-    the same points found from those before it.
+    """Change of scale across each gap: the distance of points triangulated from the frames after it alone, over that
+    of the same points triangulated from those before it.
 
-    Bundle adjustment that got stuck, and a track that broke off and went on, leave such changes where reprojection
-    errors and epipolar lines show little: a camera that sees a point twice as far off moves twice as fast.
+    A bundle adjustment that got stuck, or a track that broke, leaves such changes even if reprojection errors and
+    epipolar lines show little.
 
     Args:
         points: number of the point that each observation sees. [O]
@@ -133,13 +133,13 @@ def scale_changes(points: Places, frames: Places, centers: Array, rays: Array, c
         count: registered images, N.
 
     Returns:
-        Medians over points of the logarithm, three standard errors nearer to 0; NaN where there are few. [N - 1]
+        Medians over points of the logarithm, moved three standard errors towards 0; NaN if there are few. [N - 1]
     """
     order = np.lexsort((frames, points))
     points, frames, centers, rays = points[order], frames[order], centers[order], rays[order]
     first = np.searchsorted(points, points)
     stop = np.searchsorted(points, points, side="right")
-    # Sums of what the least squares point of rays is made of, up to each observation: any range is a difference of two.
+    # Prefix sums of the normal equations of the point nearest to rays: any range is a difference of two.
     across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
     terms = np.concatenate([across, np.einsum("nij,nj->ni", across, centers)[..., None]], -1)
     sums = np.concatenate([np.zeros((1, 3, 4)), np.cumsum(terms, axis=0)])
@@ -168,19 +168,19 @@ def scale_changes(points: Places, frames: Places, centers: Array, rays: Array, c
 
 
 def steps(witness: Witness) -> Array:
-    """Distances from frame to frame, a missing frame's share taken off. [N - 1]"""
+    """Distances from frame to frame, divided over missing frames. [N - 1]"""
     return np.linalg.norm(np.diff(witness.poses[:, :3, 3], axis=0), axis=-1) / np.maximum(np.diff(witness.places), 1)
 
 
 def jumps(witness: Witness) -> Array:
-    """How many usual steps each step is long: of the median of the steps around it. [N - 1]"""
+    """Length of each step relative to the median of the steps around it. [N - 1]"""
     lengths = steps(witness)
     floor = 0.05 * float(np.median(lengths)) if len(lengths) else 0.0
     return lengths / np.maximum(local_median(lengths, WINDOW) + floor, 1e-12)
 
 
 def local_median(values: Array, reach: int) -> Array:
-    """Median of the neighbours of each value, itself left out. [N] -> [N]"""
+    """Median of the neighbours of each value, excluding itself. [N] -> [N]"""
     rows = [np.delete(values[max(0, i - reach) : i + reach + 1], min(i, reach)) for i in range(len(values))]
     return np.array([np.median(row) if len(row) else values[i] for i, row in enumerate(rows)])
 
@@ -197,7 +197,7 @@ def speed_changes(witness: Witness) -> Array:
 
 
 def agreement(one: Witness, other: Witness) -> Agreement | None:
-    """How far two witnesses differ in the images that both have; None where these are fewer than three."""
+    """Difference of two witnesses in the images that both have; None if there are fewer than three."""
     common = [n for n in one.images if n in set(other.images)]
     if len(common) < 3:
         return None

@@ -19,9 +19,9 @@ from mmpi_ns.prepare.images import Photo
 from mmpi_ns.prepare.stages import PrepareError, progress, whole, write_text
 
 IDENTITY = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]]
-"""Stated outright: nerfstudio-data invents an axis swap where colmap/sparse/0 exists without it."""
+"""Written explicitly: without it, nerfstudio-data assumes an axis swap if colmap/sparse/0 exists."""
 SCENE_PARTS = ("images", "masks", "colmap", "sparse_pc.ply", "report.md", "report", "transforms.json")
-"""What a scene consists of besides downscaled copies; transforms.json last, as the mark of a whole scene."""
+"""The parts of a scene besides downscaled copies; transforms.json last, as the mark of a complete scene."""
 
 
 @dataclass(frozen=True)
@@ -34,13 +34,17 @@ class Split:
 
 
 def split_by_count(names: Sequence[str], test_every: int | None, train_every: int | None) -> Split:
-    """Every so-manieth image tests, or trains, counted from the middle of the first so many.
+    """Every n-th image tests, or trains, starting from the middle of the first n.
 
     Raises:
         PrepareError: a side would be empty.
     """
     if test_every == 0:
-        return Split(tuple(names), tuple(names), "every image trains and tests (--test-every 0): scores mean nothing")
+        return Split(
+            tuple(names),
+            tuple(names),
+            "every image is used for training and testing (--test-every 0): scores are meaningless",
+        )
     every = train_every or test_every or min(8, len(names))
     picked = {n for i, n in enumerate(names) if i % every == every // 2}
     rest = {n for n in names if n not in picked}
@@ -69,11 +73,11 @@ def split_from(lists: dict[str, Any], names: Sequence[str], source: str) -> Spli
 
 def check_fisheye(lenses: Sequence[Intrinsics]) -> None:
     if len({lens.fisheye for lens in lenses}) > 1:
-        raise PrepareError("Fisheye and perspective lenses in one scene: prepare them apart, or with --undistort.")
+        raise PrepareError("Fisheye and perspective lenses in one scene: prepare them separately, or with --undistort.")
 
 
 def transforms(model: pycolmap.Reconstruction, split: Split, masks: bool, notes: dict[str, Any]) -> dict[str, Any]:
-    """transforms.json for the registered images. Intrinsics stand at the top where all images share them."""
+    """transforms.json for the registered images. Intrinsics are at the top level if all images share them."""
     lenses = {n: read_intrinsics(c) for n, c in model.cameras.items()}
     check_fisheye(list(lenses.values()))
     entries = {n: _camera_entry(lenses[n], model.cameras[n]) for n in lenses}
@@ -114,7 +118,7 @@ def _camera_entry(lens: Intrinsics, camera: pycolmap.Camera) -> dict[str, Any]:
 
 
 def write_images(source: Path, photos: Sequence[Photo], scene: Path, factors: Sequence[int]) -> None:
-    """Images and their downscaled copies. Copies that are whole are kept."""
+    """Images and their downscaled copies. Complete copies are kept."""
     with progress("Writing images", len(photos)) as advance:
         for photo in photos:
             copy_once(source / photo.name, scene / "images" / photo.name)
@@ -124,7 +128,7 @@ def write_images(source: Path, photos: Sequence[Photo], scene: Path, factors: Se
 
 
 def write_masks(source: Path, photos: Sequence[Photo], scene: Path, factors: Sequence[int]) -> None:
-    """Masks under their images' stems, and downscaled: a pixel that holds a masked one is masked."""
+    """Masks under the stems of their images, and downscaled: a pixel that contains a masked one is masked."""
     for photo in photos:
         mask = scene / "masks" / mask_name(photo.name)
         copy_once(source / f"{photo.name}.png", mask)
@@ -155,7 +159,7 @@ def downscale(source: Path, target: Path, factor: int, mask: bool = False) -> No
 
 
 def save_like(image: Image.Image, target: Path) -> None:
-    """Writes an image whole or not at all, JPEG at high quality."""
+    """Writes an image atomically, JPEG at high quality."""
     with whole(target) as partial:
         if target.suffix.lower() == ".png":
             image.save(partial, format="PNG")

@@ -1,4 +1,4 @@
-"""Features of the images and their matches, in a COLMAP database that an interrupted run goes on filling."""
+"""Features of the images and their matches, in a COLMAP database that a resumed run continues to fill."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from mmpi_ns.prepare.images import Photo
 from mmpi_ns.prepare.stages import PrepareError, progress, whole
 
 BATCH = 8
-"""Images extracted at a time: what an interruption loses."""
+"""Images extracted at a time: the most that an interruption loses."""
 PAIR_BATCH = 64
 PIXELS_A_FEATURE = 100
-"""More features than one for so many pixels repeat each other, and matching costs their square."""
+"""At most one feature for this many pixels: more are redundant, and the cost of matching is quadratic."""
 LEAST_FEATURES = 2048
-"""Small images may have so many all the same..."""
+"""Small images may have this many..."""
 FAINT = 0.003
-"""... and have faint ones counted (SIFT's peak threshold), as they are short of them."""
+"""... including weak ones (SIFT's peak threshold), because they have few."""
 
 
 def create_database(
     path: Path, photos: Sequence[Photo], numbers: Sequence[int], cameras: Sequence[pycolmap.Camera]
 ) -> None:
-    """A database of the images and cameras; image ids follow the images' order, whatever the threads do later."""
+    """A database of the images and cameras; image ids follow the order of the images, independent of threads."""
     if path.exists():
         return
     path.with_name(path.name + ".partial").unlink(missing_ok=True)
@@ -103,7 +103,7 @@ def extract(
 
 
 def match(database: Path, photos: Sequence[Photo], pairs: Sequence[tuple[int, int]], threads: int) -> int:
-    """Matches and verifies pairs of images (places in ``photos``); pairs matched before are skipped.
+    """Matches and verifies pairs of images (indices into ``photos``); pairs matched before are skipped.
 
     Returns:
         Pairs with verified matches.

@@ -1,4 +1,4 @@
-"""How well the images determine the focal length: how far it moves when something else that is assumed is let go."""
+"""How well the images determine the focal length: how much it changes under other assumptions."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from mmpi_ns.prepare.mapping import adjust, bundle_options
 STARTS = (0.7, 1.2)
 """Focal lengths over the longer side that are tried where none is known: telephones and cars, then COLMAP's guess."""
 PARTS = 20
-"""Images from which the two halves of a capture are asked on their own."""
+"""Number of images from which the two halves of a capture are also used separately."""
 WIDE = 0.08
-"""Width of the interval, as a share of the focal length, from which to ask for --focal."""
+"""Width of the interval, relative to the focal length, from which --focal is asked for."""
 
 
 def focal_interval(folder: Path, threads: int) -> tuple[float, float]:
     """Focal lengths, in pixels, that bundle adjustments of one model end at under different assumptions.
 
-    They are: the principal point in the middle; free; and each half of the images on its own. The statistical error of
-    one adjustment is far smaller and says little: what is wrong is what was assumed. Of several cameras the first.
+    Principal point in the middle; principal point free; each half of the images alone. The statistical error of one
+    adjustment is far smaller and means little, because the assumptions dominate. Of several cameras, the first.
 
     Args:
         folder: of the model; read anew for each adjustment.

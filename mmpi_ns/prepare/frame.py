@@ -1,4 +1,4 @@
-"""The scene's frame: gravity up and metres where they can be known."""
+"""The frame of the scene: gravity, and metres if they can be known."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from mmpi_ns.prepare.stages import PrepareError
 
 Array = NDArray[np.float64]
 LEVEL_TURN = 0.15
-"""Least share of the cameras' right vectors across their main direction from which gravity can be read."""
+"""Minimum spread of the cameras' right vectors across their main direction for estimating gravity."""
 LEAST_GROUND, GROUND_SHARE = 50, 0.15
-"""Points below the cameras that are needed to look for the ground, and the share of them that must lie on it."""
+"""Minimum number of points below the cameras for finding the ground, and the fraction that must lie on it."""
 GROUND_TILT = 25.0
-"""Degrees between gravity as the cameras have it and the normal of the ground, at most."""
+"""Maximum angle in degrees between gravity estimated from the cameras and the normal of the ground."""
 
 
 @dataclass(frozen=True)
 class SceneFrame:
-    """How the model was moved into the scene."""
+    """How the model was transformed into the scene."""
 
     similarity: pycolmap.Sim3d
     """Scene from model."""
     up: str
-    """Where up comes from, in words."""
+    """Source of the up direction, in words."""
     unit: str
-    """What one unit is, in words."""
+    """The unit, in words."""
 
 
 def camera_poses(model: pycolmap.Reconstruction) -> tuple[list[str], Array]:
@@ -45,7 +45,7 @@ def camera_poses(model: pycolmap.Reconstruction) -> tuple[list[str], Array]:
 
 
 def up_from_cameras(poses: Array) -> Array:
-    """Gravity's opposite, if cameras are held level: across all right vectors where they turn, else the mean up. [3]"""
+    """Up, assuming level cameras: perpendicular to all right vectors if they turn, else the mean up vector. [3]"""
     mean = -poses[:, :3, 1].mean(0)
     mean /= max(float(np.linalg.norm(mean)), 1e-12)
     values, vectors = np.linalg.eigh(poses[:, :3, 0].T @ poses[:, :3, 0] / len(poses))
@@ -108,7 +108,7 @@ def _largest_plane(points: Array, up: Array, tolerance: float, rng: np.random.Ge
 
 
 def rotation_to_z(up: Array, forward: Array) -> Array:
-    """Rotation that takes up to +z and forward, as far as it is level, to +y. [3, 3]"""
+    """Rotation that maps up to +z and the level part of forward to +y. [3, 3]"""
     y = forward - (forward @ up) * up
     if np.linalg.norm(y) < 1e-6:
         y = np.cross(up, [1.0, 0.0, 0.0]) if abs(up[0]) < 0.9 else np.cross(up, [0.0, 1.0, 0.0])
@@ -126,7 +126,7 @@ def choose_frame(model: pycolmap.Reconstruction, camera_height: float | None) ->
     _, poses = camera_poses(model)
     centers = poses[:, :3, 3]
     up = up_from_cameras(poses)
-    words = "mean of the cameras, taken to be held level"
+    words = "mean of the cameras, assumed level"
     if camera_height is not None:
         points = np.array([p.xyz for p in model.points3D.values()])
         up, height = fit_ground(points, centers, up)

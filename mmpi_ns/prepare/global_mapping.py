@@ -1,8 +1,8 @@
 """Poses and points from matches, all images at once: COLMAP's global mapper (GLOMAP).
 
-It averages the rotations of all pairs first, then solves for all places and points together. So it has no first pair to
-choose wrongly and no place where the track can break off and go on at another scale, as the incremental mapper has;
-instead it needs a focal length that is about right from the start.
+It averages the rotations of all pairs first, then solves for all positions and points together. Unlike the incremental
+mapper it cannot start from a wrong pair, and the track cannot break and continue at another scale; but it needs an
+initial focal length that is about right.
 
 Source: Pan et al., Global Structure-from-Motion Revisited (2024), as in COLMAP 4.
 """
@@ -18,8 +18,8 @@ from mmpi_ns.capture.matching import MIN_ANGLE, MIN_INLIERS, SEED, quiet
 from mmpi_ns.prepare.mapping import largest_model
 
 TRACKS_PER_VIEW = 500
-"""Tracks that an image needs in order to be placed; the longest are taken. All others come in at the end, by
-triangulation: with all of them from the start kitti-street takes twice as long and is no better (docs/prepare.md)."""
+"""Tracks used for placing each image, the longest ones. All others are triangulated at the end: using all of them from
+the start takes twice as long on kitti-street and is no better (docs/prepare.md)."""
 
 
 def map_globally(
@@ -35,7 +35,7 @@ def map_globally(
         threads: CPU threads; below 1 for all.
 
     Returns:
-        None where no model comes about.
+        None if there is no model.
     """
     done, models = folder / "done", folder / "models"
     if not done.exists():

@@ -1,4 +1,4 @@
-"""The images of a capture: which there are, upright copies of them, their masks, and what their EXIF says."""
+"""The images of a capture: finding them, upright copies, masks, and EXIF."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from mmpi_ns.prepare.stages import PrepareError, progress, say, whole, write_tex
 
 IMAGES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
 HEIF = (".heic", ".heif")
-"""What telephones write; read where pillow-heif is installed."""
+"""Written by phones; read if pillow-heif is installed."""
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg")
 KEPT = {"JPEG": (".jpg", ".jpeg"), "PNG": (".png",)}
-"""Formats that are copied as they are; others become PNG."""
+"""Formats that are copied unchanged; others become PNG."""
 FILM_WIDTH = 36.0
 """Millimetres: EXIF's 35-mm equivalent refers to film this wide."""
 
@@ -29,11 +29,11 @@ class Photo:
     """An image of the scene."""
 
     name: str
-    """File name in the scene; no two are alike."""
+    """Unique file name in the scene."""
     width: int
     height: int
     lens: str = ""
-    """What EXIF says about body and lens: images that differ here do not share intrinsics."""
+    """Body and lens from EXIF: images that differ in them do not share intrinsics."""
     exif_focal: float | None = None
     """Pixels."""
     source: str = ""
@@ -41,7 +41,7 @@ class Photo:
 
 
 def find_images(folder: Path) -> list[Path]:
-    """The images in a folder in natural order; those of its subfolders where it has none itself.
+    """The images in a folder in natural order; those of its subfolders if it has none itself.
 
     Raises:
         PrepareError: fewer than two images.
@@ -56,7 +56,7 @@ def find_images(folder: Path) -> list[Path]:
     if len(found) < 2:
         count = "no image" if not found else f"one image only ({found[0].name})"
         raise PrepareError(
-            f"{folder} holds {count} ({', '.join(readable)}): a scene needs at least two views, and rather twenty."
+            f"{folder} holds {count} ({', '.join(readable)}): a scene needs at least two views, better twenty."
         )
     return sorted(found, key=lambda p: natural_key(str(p.relative_to(folder))))
 
@@ -72,7 +72,7 @@ def reads_heif() -> bool:
 
 
 def _tell_unread(files: Sequence[Path], folder: Path) -> None:
-    """Counts and names what is left out, by kind."""
+    """Reports the files that are left out, by kind."""
     kinds: dict[str, list[str]] = {}
     for file in files:
         kinds.setdefault(file.suffix.lower() or "no suffix", []).append(str(file.relative_to(folder)))
@@ -81,7 +81,7 @@ def _tell_unread(files: Sequence[Path], folder: Path) -> None:
         if kind in HEIF:
             why = "are not read: pip install pillow-heif, and start again"
         elif kind in IMAGES:
-            why = "are in subfolders and left out, as the folder has images of its own"
+            why = "are in subfolders and left out, because the folder has images of its own"
         say(f"{len(names)} {kind} files {why} ({in_short(names)}).", "yellow")
 
 
@@ -96,7 +96,7 @@ def natural_key(text: str) -> list[tuple[int, int | str]]:
 
 
 def scene_names(files: Sequence[Path], folder: Path) -> list[str]:
-    """Names in the scene: the files' own, with their subfolders in front where there are any; no two alike."""
+    """Unique names in the scene: those of the files, prefixed with their subfolders if there are any."""
     names, used = [], set()
     for file in files:
         # COLMAP's list of pairs is split at blanks
@@ -167,7 +167,7 @@ def open_image(path: Path) -> Image.Image:
 
 
 def _convert(image: Image.Image, path: Path, suffix: str) -> None:
-    """Upright 8-bit copy of an image that nerfstudio would show turned or not read."""
+    """Upright 8-bit copy of an image that nerfstudio would show rotated or not read."""
     upright = ImageOps.exif_transpose(image)
     if upright.mode.startswith(("I", "F")):
         values = np.asarray(upright, dtype=np.float64)
@@ -220,12 +220,12 @@ def gather_masks(folder: Path, photos: Sequence[Photo], target: Path) -> int:
     if not found:
         raise PrepareError(f"No mask in {folder} is named like an image (a.png or a.jpg.png for a.jpg).")
     if found < len(photos):
-        say(f"{len(photos) - found} of {len(photos)} images have no mask: all of them is used.", "yellow")
+        say(f"{len(photos) - found} of {len(photos)} images have no mask: all their pixels are used.", "yellow")
     return found
 
 
 def _masks_by_name(folder: Path) -> dict[str, Path]:
-    """Masks by their path below the folder without suffix, and by their stem where no other has it."""
+    """Masks by their path below the folder without suffix, and by their stem if it is unique."""
     files = [p for p in sorted(folder.rglob("*")) if p.suffix.lower() in IMAGES]
     by_name: dict[str, Path] = {}
     for with_folder in (True, False):

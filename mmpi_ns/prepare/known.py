@@ -1,4 +1,4 @@
-"""Points from known poses, and the poses themselves refined if asked."""
+"""Points from known poses, and refinement of the poses on request."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from mmpi_ns.prepare.mapping import adjust, bundle_options
 from mmpi_ns.prepare.stages import PrepareError, say
 
 ROUNDS = 3
-"""Times that poses are refined and the points triangulated anew."""
+"""Rounds of refining poses and triangulating points again."""
 COARSE_PX, FINE_PX = 8.0, 4.0
 """Largest reprojection error of a point: while poses are to be refined, and in the end."""
 LEAST_SHARE = 0.2
-"""Share of the matched keypoints that must become points; where poses and images do not belong together, few do."""
+"""Fraction of the matched keypoints that must become points; few do if poses and images do not belong together."""
 
 
 @dataclass(frozen=True)
@@ -45,12 +45,12 @@ def solve_known(
         model: cameras and posed images without points; changed in place.
         database: features and matches.
         images: folder of the images.
-        refine_poses: bundle-adjust poses; scale and frame are fitted back to those given.
+        refine_poses: bundle-adjust poses; the result is aligned with the given scale and frame.
         refine_intrinsics: bundle-adjust intrinsics as well.
         threads: CPU threads; below 1 for all.
 
     Raises:
-        PrepareError: the poses fit the matches nowhere.
+        PrepareError: the poses do not fit the matches.
     """
     _, given = camera_poses(model)
     refine = refine_poses or refine_intrinsics

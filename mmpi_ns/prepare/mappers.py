@@ -1,4 +1,4 @@
-"""Both mappers on one database, and which of them to believe."""
+"""Runs both mappers on one database and chooses between them."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from mmpi_ns.prepare.stages import PrepareError, progress, say
 from mmpi_ns.prepare.verdict import ORDER, Verdict, agrees, judge_alone, judge_together, rank
 
 NEAR = 0.1
-"""Relative difference up to which two focal lengths to start from are taken for one."""
+"""Relative difference below which two initial focal lengths count as the same."""
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A mapper's model and what it says of itself."""
+    """A mapper's model and the evidence on it."""
 
     model: pycolmap.Reconstruction
     witness: Witness
@@ -55,9 +55,9 @@ def map_and_judge(
     is_sequence: bool,
     is_ordered: bool,
 ) -> Believed:
-    """Runs the global mapper, then the incremental one from the focal length that it found, and chooses by evidence.
+    """Runs the global mapper, then the incremental one from the focal length found, and chooses by the evidence.
 
-    What is chosen is adjusted once more (``polish``), where that leaves the evidence as good.
+    The chosen model is adjusted once more (``polish``), unless that makes the evidence worse.
 
     Args:
         database: features and verified matches.
@@ -97,23 +97,23 @@ def map_and_judge(
     polished = polish(chosen.model, free, threads)
     grade = judge_alone(witness_of("polished", polished, database, offered), is_ordered).grade
     if ORDER.index(grade) > ORDER.index(judge_alone(chosen.witness, is_ordered).grade):
-        say("The last adjustment makes the evidence worse: left out.", "yellow")
+        say("The final bundle adjustment makes the evidence worse: left out.", "yellow")
         polished = chosen.model
     return Believed(polished, verdict, says)
 
 
 def _settled(found: Sequence[Candidate], is_ordered: bool) -> bool:
-    """Whether the global mapper is right by its own evidence, and of one mind from all starts from which it is."""
+    """Whether the global mapper is right by its own evidence, with the same result from all starts for which it is."""
     right = [c.witness for c in found if judge_alone(c.witness, is_ordered).grade == "right"]
     differences = [agreement(right[0], w) for w in right[1:]]
     return bool(right) and all(d is not None and agrees(d) for d in differences)
 
 
 def _starts(database: Path, work: Path, fixed: bool) -> list[tuple[str, Path]]:
-    """Databases for the global mapper, by name: as it is with a known focal length, else one for each guess.
+    """Databases for the global mapper, by name: unchanged if the focal length is known, else one for each guess.
 
-    The first guess is what the fundamental matrices of the pairs say, where they say anything (in a straight drive they
-    do not), the others are fixed shares of the image's side.
+    The first guess comes from the fundamental matrices of the pairs, if they determine it (in a straight drive they
+    do not); the others are fixed multiples of the image side.
     """
     with pycolmap.Database.open(database) as opened:
         unknown = [c for c in opened.read_all_cameras() if not c.has_prior_focal_length]
@@ -130,7 +130,7 @@ def _starts(database: Path, work: Path, fixed: bool) -> list[tuple[str, Path]]:
 
 
 def _calibrated(database: Path, copy: Path) -> dict[int, float]:
-    """Focal lengths, by camera, with which the fundamental matrices of the pairs become essential ones."""
+    """Focal lengths, by camera, for which the fundamental matrices of the pairs become essential matrices."""
     shutil.copyfile(database, copy)
     options = pycolmap.ViewGraphCalibrationOptions()
     options.random_seed = SEED
@@ -146,7 +146,7 @@ def _calibrated(database: Path, copy: Path) -> dict[int, float]:
 def _globally(
     starts: Sequence[tuple[str, Path]], images: Path, work: Path, offered: Sequence[str], fixed: bool, threads: int
 ) -> list[Candidate]:
-    """The global mapper from all starts, at once on as many cores as there are; starts that failed are left out."""
+    """Runs the global mapper from all starts in parallel on all cores; failed starts are left out."""
     cores = threads if threads > 0 else os.cpu_count() or 1
     workers = min(cores, len(starts))
 
@@ -157,7 +157,7 @@ def _globally(
         return made
 
     with (
-        progress("Mapping, all at once", len(starts)) as advance,
+        progress("Global mapping", len(starts)) as advance,
         quiet(),  # outermost: each mapper's own would end before the other is done
         ThreadPoolExecutor(workers) as pool,
     ):
@@ -177,7 +177,7 @@ def _globally(
 
 
 def _choose(found: Sequence[Candidate], is_ordered: bool) -> tuple[Candidate, Verdict, str]:
-    """The candidate that the evidence prefers, judged beside the others, and all in words."""
+    """The candidate preferred by the evidence, compared with the others, and all of them in words."""
     chosen, *others = sorted(found, key=lambda c: rank(c.witness, is_ordered), reverse=True)
     verdict = judge_together(chosen.witness, [c.witness for c in others], is_ordered)
     beside = [f"{c.says}, {judge_alone(c.witness, is_ordered).grade} by itself" for c in others]

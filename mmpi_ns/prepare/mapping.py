@@ -1,4 +1,4 @@
-"""Poses and points from matches: COLMAP's incremental mapper, with settings that are relaxed until they carry."""
+"""Poses and points from matches: COLMAP's incremental mapper, with settings relaxed until it succeeds."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from mmpi_ns.prepare.features import count_matching_pairs
 from mmpi_ns.prepare.stages import PrepareError, progress, say
 
 ENOUGH = 0.95
-"""Share of the images that, once registered, ends the trying."""
+"""Fraction of registered images at which no further attempt is made."""
 CARRIES = 0.5
-"""Share of the images from which a model is gone on from with looser settings instead of beginning anew."""
+"""Fraction of images from which a model is continued with looser settings instead of starting over."""
 BENT_PX = 0.8
-"""Mean reprojection error from which another attempt is made even though the images are registered."""
+"""Mean reprojection error above which another attempt is made even though the images are registered."""
 SNAPSHOT = 40
-"""Images registered between two snapshots, from which an interrupted mapping goes on."""
+"""Images registered between two snapshots, from which an interrupted run resumes."""
 STILL = 1e-6
 """Relative change of the cost at which an adjustment ends. COLMAP goes on to 100 iterations: of 64 images of a drive
 that took four times as long, and moved the focal length by 0.002 px."""
 MANY = 100
-"""Images from which adjusting all of them again and again would take most of the time."""
+"""Number of images from which repeated global bundle adjustment would dominate the time."""
 
 
 @dataclass(frozen=True)
@@ -55,11 +55,11 @@ ATTEMPTS = (
 
 @dataclass(frozen=True)
 class Mapping:
-    """What the mapper found."""
+    """Result of the mapper."""
 
     model: pycolmap.Reconstruction
     folder: Path
-    """Where it can be read from again."""
+    """Folder of the model."""
     attempt: str
     tried: tuple[tuple[str, int], ...]
     """(attempt, images in its largest model) in order."""
@@ -74,10 +74,10 @@ def reconstruct(
     is_sequence: bool = False,
     attempts: int = len(ATTEMPTS),
 ) -> Mapping:
-    """Runs the attempts in order until one registers nearly all images; the best one counts.
+    """Runs the attempts in order until one registers nearly all images; returns the best.
 
-    An attempt goes on from the best model so far where that is sound and holds ``CARRIES`` of the images: what stopped
-    it is often one stretch with few matches, and the rest need not be found again.
+    An attempt continues the best model so far if that is sound and contains the fraction ``CARRIES`` of the images:
+    often it stopped at one stretch with few matches, and the rest need not be computed again.
 
     Args:
         database: features and matches.
@@ -87,7 +87,7 @@ def reconstruct(
         threads: CPU threads; below 1 for all.
         is_sequence: begin with the settings for forward motion. They carry any motion of a sequence, while COLMAP's
             defaults look through all pairs before they give up (a minute for 64 images).
-        attempts: most attempts to make.
+        attempts: maximum number of attempts.
 
     Raises:
         PrepareError: no attempt found an initial pair.
@@ -133,7 +133,7 @@ def is_bent(model: pycolmap.Reconstruction) -> bool:
 
 
 def _carries(model: pycolmap.Reconstruction, total: int) -> bool:
-    """Whether another attempt had better go on from a model than begin anew."""
+    """Whether another attempt should continue a model instead of starting over."""
     return not is_bent(model) and model.num_reg_images() >= CARRIES * total
 
 
@@ -178,7 +178,7 @@ def _run(
                 initial_image_pair_callback=_step(advance, 2, 0),
                 next_image_callback=_step(advance, 1),
             )
-        for number, model in found.items():  # COLMAP itself leaves out a model that it went on from
+        for number, model in found.items():  # COLMAP itself does not write a model that it continued
             (folder / "models" / str(number)).mkdir(exist_ok=True)
             model.write(folder / "models" / str(number))
         done.touch()
@@ -187,7 +187,7 @@ def _run(
 
 
 def largest_model(folder: Path) -> tuple[pycolmap.Reconstruction, Path] | None:
-    """The model with the most images of those in a folder's folders, and its own; None where there is none."""
+    """The model with the most images in the subfolders of a folder, and its subfolder; None if there is none."""
     models = [(pycolmap.Reconstruction(p), p) for p in sorted(folder.iterdir()) if p.is_dir()]
     return max(models, key=lambda m: m[0].num_reg_images(), default=None)
 
@@ -197,7 +197,7 @@ def _step(advance: Callable[..., None], count: int, start: int | None = None) ->
 
 
 def _latest_snapshot(folder: Path) -> Path | None:
-    """The newest snapshot that can be read: the last may be cut off."""
+    """The newest readable snapshot; the last one may be truncated."""
     for path in sorted(folder.glob("*"), reverse=True) if folder.is_dir() else ():
         try:
             pycolmap.Reconstruction(path)
@@ -212,8 +212,8 @@ def mapper_options(
 ) -> pycolmap.IncrementalPipelineOptions:
     """The mapper's settings for an attempt, with given intrinsics left alone unless they are to be refined.
 
-    Of a large capture all images are adjusted together less often, and with fewer points: those that add little to
-    what holds an image are left out until the end.
+    For a large capture, global bundle adjustment runs less often and with fewer points; points that add little to the
+    constraints of an image are left out until the end.
     """
     options = pycolmap.IncrementalPipelineOptions()
     options.min_num_matches = attempt.min_matches
@@ -241,7 +241,7 @@ def mapper_options(
 def bundle_options(
     refine_poses: bool, refine: bool, principal_point: bool, threads: int, robust: bool = False
 ) -> pycolmap.BundleAdjustmentOptions:
-    """Bundle adjustment of points, and of poses and intrinsics if asked."""
+    """Bundle adjustment of points, and of poses and intrinsics on request."""
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_rig_from_world = refine_poses
     options.refine_focal_length = options.refine_extra_params = refine

@@ -1,6 +1,6 @@
-"""Which images are worth matching: neighbours in time, neighbours in pose, look-alikes, or all.
+"""Choice of image pairs for matching: neighbours in time, neighbours in pose, similar images, or all.
 
-Look-alikes are found by VLAD (residuals of SIFT descriptors to the words of a small vocabulary, summed per word). The
+Similar images are found by VLAD (residuals of SIFT descriptors to the words of a small vocabulary, summed by word). The
 vocabulary is made from the capture itself, so nothing is downloaded.
 """
 
@@ -17,23 +17,23 @@ from numpy.typing import NDArray
 
 Matching = Literal["auto", "sequential", "exhaustive", "retrieval"]
 FEW = 40
-"""So many images are matched exhaustively whatever their order."""
+"""Up to this many images are matched exhaustively, whatever their order."""
 MANY = 120
-"""Above so many, unordered images are matched with their look-alikes only."""
+"""More unordered images than this are matched with similar ones only."""
 WORDS, SAMPLE, FEATURES = 64, 20_000, 800
 """Vocabulary size, descriptors it is learnt from, and descriptors of an image that are summed."""
 REVISITS = 3
-"""Look-alikes that each image of a sequence is matched with beyond its neighbours in time."""
+"""Similar images that each image of a sequence is matched with besides its neighbours in time."""
 LOOK_ALIKES = 30
-"""Look-alikes that each image of a large unordered set is matched with."""
+"""Similar images that each image of a large unordered set is matched with."""
 FAR_STEPS = (15, 20, 30, 45)
-"""Frames further apart than the overlap, as far as they go: slow stretches want a longer baseline."""
+"""Frame distances beyond the overlap that are matched too, because slow stretches need a longer baseline."""
 
 Pairs = list[tuple[int, int]]
 
 
 def describe_images(database: Path, count: int, seed: int = 0) -> NDArray[np.float32]:
-    """One unit vector per image; the dot product of two says how alike they look. [count, WORDS * 128]"""
+    """One unit vector for each image; the dot product of two is their similarity. [count, WORDS * 128]"""
     rng = np.random.default_rng(seed)
     with pycolmap.Database.open(database) as opened:
 
@@ -72,14 +72,14 @@ def _vlad(descriptors: NDArray[np.float32], words: NDArray[np.float32]) -> NDArr
 
 
 def similarity(vectors: NDArray[np.float32]) -> NDArray[np.float32]:
-    """How alike any two images look; -1 on the diagonal. [N, N]"""
+    """Similarity of any two images; -1 on the diagonal. [N, N]"""
     alike = vectors @ vectors.T
     np.fill_diagonal(alike, -1)
     return alike
 
 
 def are_numbered(names: Sequence[str]) -> bool:
-    """Whether names differ in one number alone, as frames of a video do."""
+    """Whether names differ only in one number, like frames of a video."""
     stems = [Path(n).stem for n in names]
     patterns = {re.sub(r"\d+", "#", s) for s in stems}
     last = [re.findall(r"\d+", s) for s in stems]
@@ -88,7 +88,7 @@ def are_numbered(names: Sequence[str]) -> bool:
 
 
 def look_like_sequence(alike: NDArray[np.float32]) -> bool:
-    """Whether most images look most like one of the three before or after them."""
+    """Whether most images are most similar to one of the three before or after them."""
     best = alike.argmax(-1)
     return float(np.mean(np.abs(best - np.arange(len(alike))) <= 3)) > 0.7
 
@@ -122,7 +122,7 @@ def list_pairs(matching: str, alike: NDArray[np.float32], overlap: int) -> Pairs
 
 
 def revisits(alike: NDArray[np.float32], overlap: int) -> Pairs:
-    """Images of a sequence that may show a place again: as alike as images a few frames apart."""
+    """Pairs of a sequence that may show a place again: as similar as images a few frames apart."""
     apart = np.abs(np.subtract.outer(np.arange(len(alike)), np.arange(len(alike))))
     near = apart <= max(FAR_STEPS[-1], overlap)
     edge = alike[apart == min(overlap, len(alike) - 1)]
@@ -130,7 +130,7 @@ def revisits(alike: NDArray[np.float32], overlap: int) -> Pairs:
 
 
 def _look_alikes(alike: NDArray[np.float32], number: int, barred: NDArray[np.bool_]) -> Pairs:
-    """Each image with the images most like it. Nothing is paired with itself."""
+    """Each image with the most similar other images."""
     allowed = np.where(barred | np.eye(len(alike), dtype=bool), -np.inf, alike)
     order = np.argsort(-allowed, axis=-1, kind="stable")[:, :number]
     found = {(min(i, int(j)), max(i, int(j))) for i, row in enumerate(order) for j in row if np.isfinite(allowed[i, j])}

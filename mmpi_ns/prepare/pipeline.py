@@ -64,7 +64,7 @@ class Preparation:
             self.photos = self._read_input()
             self.masks = self._read_masks()
             self.known = read_poses(s.poses, s.poses_format, s.poses_axes, self.photos) if s.poses else None
-            self._split([p.name for p in self.photos])  # what cannot be split is better refused now
+            self._split([p.name for p in self.photos])  # refuse a split that is impossible before the work
         self.is_fixed = self._set_cameras()
         with self._timed("features"):
             database = self._features()
@@ -194,7 +194,7 @@ class Preparation:
             (folder / "model").mkdir(exist_ok=True)
             solved.model.write(folder / "model")
             if not self.is_fixed:
-                with progress("Judging the focal length", None):
+                with progress("Checking the focal length", None):
                     solved.focal = focal_interval(folder / "model", s.threads)
             says = {"mapping": solved.mapping, "groups": solved.groups, "notes": self.notes, "focal": solved.focal}
             says |= {"grade": solved.verdict.grade, "reasons": solved.verdict.reasons}
@@ -337,7 +337,7 @@ def _focal_findings(solved: Solved) -> list[checks.Finding]:
 
 
 def check_folders(settings: Settings) -> None:
-    """Refuses what would lose something.
+    """Refuses output folders whose use would lose something.
 
     Raises:
         PrepareError: the input is missing or in the scene's way, or the scene folder is in use.
@@ -364,7 +364,7 @@ def publish(
     solved: Solved,
     split: export.Split,
 ) -> None:
-    """Moves the scene into place and says what came out; what cannot be believed in red."""
+    """Moves the scene into place and reports the result; doubtful ones in red."""
     scene = settings.scene
     aside = scene / next(f"previous-{i}" for i in range(1, 10_000) if not (scene / f"previous-{i}").exists())
     export.publish(built, scene, aside)

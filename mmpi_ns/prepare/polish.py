@@ -1,4 +1,4 @@
-"""A last bundle adjustment that outliers do not pull, with what the mappers left fixed where the images bear it out."""
+"""Final bundle adjustment with a robust loss, with more parameters free if the images support it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mmpi_ns.prepare.mapping import adjust, bundle_options
 from mmpi_ns.prepare.stages import progress, say
 
 WORTH = 0.97
-"""Share of the reprojection error to which something set free must bring it."""
+"""Fraction of the reprojection error to which a freed parameter must lower it."""
 
 
 @dataclass(frozen=True)
@@ -23,20 +23,20 @@ class Free:
     lens: bool
     """Focal length and distortion."""
     full_lens: bool
-    """OpenCV's four lens terms in place of one radial term, where they fit clearly better."""
+    """OpenCV's four lens terms in place of one radial term, if they fit clearly better."""
     principal_point: bool
-    """The principal point, where that fits clearly better. Driving straight ahead it hardly shows, in bends it does."""
+    """The principal point, if that fits clearly better. It is hardly observable on straight stretches, but in bends."""
     always: bool = False
-    """The principal point, whether it fits better or not."""
+    """The principal point, in any case."""
 
 
 def polish(model: pycolmap.Reconstruction, free: Free, threads: int) -> pycolmap.Reconstruction:
-    """The model adjusted with a robust loss, and again with more set free where that brings the error down.
+    """The model adjusted with a robust loss, and again with more parameters free if that lowers the error.
 
-    What does not bring it down takes up something else: driving forward, lens terms take up the principal point.
+    Parameters that do not lower it absorb other errors: driving forward, lens terms absorb the principal point.
 
     Args:
-        model: left as it is.
+        model: not changed.
         free: what may be refined.
         threads: CPU threads; below 1 for all.
     """

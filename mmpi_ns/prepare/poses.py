@@ -19,7 +19,7 @@ from mmpi_ns.prepare.stages import PrepareError, say
 
 Array = NDArray[np.float64]
 MAX_LAG = 0.05
-"""Seconds between an image's time stamp and its pose's, at most."""
+"""Maximum time in seconds between an image and its pose."""
 FISHEYE = ("OPENCV_FISHEYE", "FISHEYE")
 
 
@@ -121,10 +121,10 @@ def _frame_numbers(photos: Sequence[Photo]) -> list[int] | None:
 
 
 def _read_kitti(rows: Array, path: Path, photos: Sequence[Photo]) -> KnownPoses:
-    """A line an image; with more lines than images, the numbers in the file names choose (counted from 0)."""
+    """One line for each image; if there are more lines, the numbers in the file names choose them (counted from 0)."""
     matrices = np.concatenate([rows.reshape(-1, 3, 4), np.tile([[[0.0, 0.0, 0.0, 1.0]]], (len(rows), 1, 1))], 1)
     places: Sequence[int] = range(len(photos))
-    says = "KITTI poses, a line an image"
+    says = "KITTI poses, one line for each image"
     if len(rows) != len(photos):
         numbers = _frame_numbers(photos)
         if len(rows) < len(photos) or numbers is None or max(numbers) >= len(rows):
@@ -134,7 +134,7 @@ def _read_kitti(rows: Array, path: Path, photos: Sequence[Photo]) -> KnownPoses:
 
 
 def _read_tum(rows: Array, path: Path, photos: Sequence[Photo]) -> KnownPoses:
-    """By time stamp where the file names are time stamps, else a line an image."""
+    """By time stamp if the file names are time stamps, else one line for each image."""
     if not len(rows):
         raise PrepareError(f"{path} holds no pose.")
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
@@ -153,7 +153,9 @@ def _read_tum(rows: Array, path: Path, photos: Sequence[Photo]) -> KnownPoses:
         raise PrepareError(
             f"{path} has {len(rows)} poses for {len(photos)} images, and the images' names are not their time stamps."
         )
-    return KnownPoses({p.name: pose for p, pose in zip(photos, poses, strict=True)}, "TUM poses, a line an image")
+    return KnownPoses(
+        {p.name: pose for p, pose in zip(photos, poses, strict=True)}, "TUM poses, one line for each image"
+    )
 
 
 def _time_stamp(source: str) -> float | None:
@@ -162,9 +164,9 @@ def _time_stamp(source: str) -> float | None:
 
 
 def _read_matrices(path: Path, photos: Sequence[Photo]) -> KnownPoses:
-    """A text file an image, of its name, or else in order."""
+    """One text file for each image, by name, else in order."""
     if not path.is_dir():
-        raise PrepareError(f"--poses {path}: 4x4 matrices are read from a folder, one text file an image.")
+        raise PrepareError(f"--poses {path}: 4x4 matrices are read from a folder with one text file for each image.")
     files = sorted(
         (p for p in path.iterdir() if p.suffix.lower() in (".txt", ".mat", "")), key=lambda p: natural_key(p.name)
     )
@@ -189,12 +191,12 @@ def _read_matrices(path: Path, photos: Sequence[Photo]) -> KnownPoses:
 
 
 def _pose_stem(path: Path) -> str:
-    """Name without what tells images and poses apart: frame-000001.color.png and frame-000001.pose.txt."""
+    """Name without the part that differs between images and poses: frame-000001.color.png, frame-000001.pose.txt."""
     return re.sub(r"[._-]?(pose|color|rgb|image)s?$", "", path.stem, flags=re.IGNORECASE)
 
 
 def _read_transforms(path: Path, photos: Sequence[Photo]) -> KnownPoses:
-    """By file name, with intrinsics and lists of train and test files where the file has them."""
+    """By file name, with intrinsics and lists of train and test files if the file has them."""
     path = path / "transforms.json" if path.is_dir() else path
     try:
         meta = json.loads(path.read_text(encoding="utf-8"))
@@ -214,7 +216,7 @@ def _read_transforms(path: Path, photos: Sequence[Photo]) -> KnownPoses:
 
 
 def _frame_of(photo: Photo, files: Sequence[Path]) -> int | None:
-    """The frame of an image's name, and of its folder too where several have that name; None where there is none."""
+    """The frame with an image's name, and its folder if several have that name; None if there is none."""
     for wanted in (Path(photo.name), Path(photo.source)):
         named = [n for n, f in enumerate(files) if f.stem == wanted.stem]
         folders = wanted.parent.parts
@@ -225,7 +227,7 @@ def _frame_of(photo: Photo, files: Sequence[Path]) -> int | None:
 
 
 def _check_apart(found: dict[str, Any], path: Path) -> None:
-    """Raises PrepareError where two images were given one pose: those of two folders may have one name."""
+    """Raises PrepareError if two images were given the same pose, as images of two folders may have the same name."""
     first: dict[Any, str] = {}
     for name, pose in found.items():
         if pose in first:
@@ -236,7 +238,7 @@ def _check_apart(found: dict[str, Any], path: Path) -> None:
 
 
 def _frame_intrinsics(frame: dict[str, Any], photo: Photo) -> Intrinsics:
-    """Of a frame, for images that may be smaller or larger than those the file tells of."""
+    """Intrinsics of a frame, for images that may be smaller or larger than those of the file."""
     fisheye = frame.get("camera_model") in FISHEYE
     keys = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2")
     sx, sy = photo.width / frame.get("w", photo.width), photo.height / frame.get("h", photo.height)

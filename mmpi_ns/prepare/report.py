@@ -1,4 +1,4 @@
-"""report.md: what came out, in figures and words, with a top view of the track."""
+"""report.md: the result in figures and words, with a top view of the track."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from mmpi_ns.prepare.stages import write_text
 from mmpi_ns.prepare.verdict import Verdict
 
 WORST = 5
-"""Images of the least coverage that are listed."""
+"""Number of images with the least coverage that are listed."""
 
 
 @dataclass(frozen=True)
 class Facts:
-    """What the report tells beyond the model."""
+    """Content of the report beyond the model."""
 
     source: str
     offered: int

@@ -17,9 +17,9 @@ from mmpi_ns.prepare.stages import PrepareError
 
 @dataclass(frozen=True)
 class Settings:
-    """Makes a scene for ns-train of a folder of images or a video, by structure from motion or from known poses.
+    """Makes a scene for ns-train from a folder of images or a video, by structure from motion or from known poses.
 
-    An interrupted run goes on where it stopped when it is started again with the same options.
+    An interrupted run continues when it is started again with the same options.
     """
 
     input: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="INPUT")]
@@ -35,47 +35,47 @@ class Settings:
     poses_axes: Literal["auto", "opencv", "opengl"] = "auto"
     """Camera axes of --poses (camera to world): auto is opengl for transforms.json and opencv for the others."""
     refine_poses: bool = False
-    """Refine known poses by bundle adjustment; frame and scale stay those given."""
+    """Refine known poses by bundle adjustment; frame and scale are kept."""
     focal: float | None = None
-    """Focal length in pixels of the input images; kept as it is unless --refine-intrinsics."""
+    """Focal length in pixels of the input images; kept fixed unless --refine-intrinsics."""
     camera: tuple[float, ...] | None = None
-    """f cx cy | fx fy cx cy | fx fy cx cy k1 k2 p1 p2 in pixels of the input; kept unless --refine-intrinsics."""
+    """f cx cy | fx fy cx cy | fx fy cx cy k1 k2 p1 p2 in pixels of the input; kept fixed unless --refine-intrinsics."""
     lens: Lens = "auto"
-    """Distortion where --camera gives none. auto: none with --focal; else one radial term, at last OpenCV's four."""
+    """Distortion if --camera gives none. auto: none with --focal; else one radial term, or OpenCV's four if better."""
     intrinsics: Sharing = "auto"
-    """auto: images of one size and one EXIF body and lens share a camera."""
+    """auto: images with the same size, EXIF body and lens share a camera."""
     refine_intrinsics: bool = False
     """Refine given intrinsics."""
     refine_principal_point: bool = False
-    """Refine the principal point as well, at the end; otherwise it stays at the image's middle."""
+    """Refine the principal point as well, at the end; otherwise it stays at the centre of the image."""
     undistort: bool = False
-    """Undo lens distortion instead of keeping it in transforms.json."""
+    """Undistort the images instead of writing the distortion to transforms.json."""
     matching: Matching = "auto"
-    """auto: all pairs of few images, neighbours and revisits of a sequence, look-alikes of many."""
+    """auto: all pairs of few images; neighbours and revisits of a sequence; similar images of many."""
     overlap: int = 10
-    """Frames of a sequence that each is matched with, before and after."""
+    """Frames before and after that each frame of a sequence is matched with."""
     max_features: int = 4096
-    """Most SIFT features of an image; a small one gets one for every hundred pixels, or 2,048."""
+    """Maximum SIFT features of an image; small images get one for every hundred pixels, or 2,048."""
     camera_height: float | None = None
-    """Metres of the camera above the ground: gives the scale, and up from the ground's normal."""
+    """Camera height above the ground in metres: sets the scale, and the up direction by the normal of the ground."""
     test_every: int | None = None
-    """One image in so many tests (8 unless said otherwise); 0: all train and test."""
+    """Every n-th image is a test image (default 8); 0: all are used for training and testing."""
     train_every: int | None = None
-    """One image in so many trains, the others test."""
+    """Every n-th image is a training image, the others are test images."""
     split_from: Path | None = None
-    """A JSON file whose train_filenames and test_filenames to use, such as another scene's transforms.json."""
+    """JSON file with the train_filenames and test_filenames to use, such as another scene's transforms.json."""
     downscales: tuple[int, ...] = (2, 4)
-    """Factors of downscaled copies."""
+    """Downscale factors of the copies."""
     max_frames: int = 300
-    """Most frames to take from a video."""
+    """Maximum number of frames from a video."""
     frame_motion: float = 0.01
-    """Median motion between frames taken from a video, as a share of the image width."""
+    """Median motion between frames taken from a video, relative to the image width."""
     allow_partial: bool = False
-    """Make a scene even when less than half of the images are registered."""
+    """Make a scene even if less than half of the images are registered."""
     allow_doubtful: bool = False
-    """Make a scene even when the evidence says that its track is wrong."""
+    """Make a scene even if the evidence shows that its track is wrong."""
     overwrite: bool = False
-    """Replace what the scene folder holds; the old files are moved to a folder beside the new ones."""
+    """Replace the contents of the scene folder; the old files are moved to a folder beside the new ones."""
     keep_work: bool = False
     """Keep the features, matches and models in SCENE/.prepare."""
     threads: Annotated[int, tyro.conf.arg(metavar="N")] = -1
@@ -83,7 +83,7 @@ class Settings:
 
 
 def check_options(s: Settings) -> None:
-    """Judges options by themselves, before any work.
+    """Checks the options before any work.
 
     Raises:
         PrepareError: a number is out of range, two options contradict each other, or a file is missing.
@@ -105,7 +105,7 @@ def check_options(s: Settings) -> None:
         if value is not None and value < 2:
             raise PrepareError(f"{option} takes 2 or more, not {value} (--test-every 0: all images train and test).")
     if s.max_frames < 2:
-        raise PrepareError(f"--max-frames {s.max_frames}: a scene needs two views at least.")
+        raise PrepareError(f"--max-frames {s.max_frames}: a scene needs at least two views.")
     if any(f < 2 for f in s.downscales) or len(set(s.downscales)) < len(s.downscales):
         raise PrepareError(f"--downscales takes different whole numbers from 2 on, not {s.downscales}.")
     if s.threads < 1 and s.threads != -1:

@@ -1,4 +1,4 @@
-"""What makes an interrupted preparation go on where it stopped: each stage knows what it was made from."""
+"""Resuming an interrupted preparation: each stage records what it was made from."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ T = TypeVar("T")
 CONSOLE = Console(width=120)
 FULL = (errno.ENOSPC, errno.EDQUOT)
 LEFT = 1 << 20
-"""Bytes free below which a failure to write is put down to a full disk: COLMAP's errors do not say why."""
+"""Free bytes below which a failure to write is attributed to a full disk; COLMAP's errors give no reason."""
 
 
 class PrepareError(Exception):
@@ -29,11 +29,11 @@ class PrepareError(Exception):
 
 
 class Stages:
-    """Stages of a preparation, run in order, each skipped when it was finished before from the same settings.
+    """Stages of a preparation, run in order; a stage that was finished with the same settings is skipped.
 
-    A stage's outputs stay valid while its own settings and those of all stages before it stay as they were. The first
-    stage whose settings changed is emptied, and so are all after it. A stage that was interrupted finds its own
-    partial output again.
+    The outputs of a stage are valid while its own settings and those of all earlier stages are unchanged. The first
+    stage whose settings changed is emptied, and so are all after it. An interrupted stage finds its own partial
+    output again.
     """
 
     def __init__(self, work: Path) -> None:
@@ -42,11 +42,11 @@ class Stages:
         work.mkdir(parents=True, exist_ok=True)
 
     def run(self, name: str, settings: Any, stage: Callable[[Path], T], load: Callable[[Path], T]) -> T:
-        """Runs a stage in its own folder, or loads what it left there.
+        """Runs a stage in its own folder, or loads its result from there.
 
         Args:
             name: the folder's name.
-            settings: everything the result depends on beyond the stages before; JSON or text.
+            settings: everything the result depends on besides the earlier stages; JSON or text.
             stage: makes the result; may find its own partial output in the folder.
             load: reads the result of a finished stage.
         """
@@ -70,7 +70,7 @@ def _read_json(path: Path) -> dict[str, Any]:
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
-        return {}  # never written, or cut off while being written: the stage starts over
+        return {}  # missing or truncated: the stage starts over
 
 
 def say(text: str, style: str = "") -> None:
@@ -80,7 +80,7 @@ def say(text: str, style: str = "") -> None:
 
 @contextmanager
 def whole(path: Path) -> Iterator[Path]:
-    """A path to write to; what was written takes the file's place at the end, so that it is whole or not there."""
+    """A temporary path to write to, which replaces the file at the end, so that the file is complete or absent."""
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(path.name + ".partial")
     yield partial
@@ -88,14 +88,14 @@ def whole(path: Path) -> Iterator[Path]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Writes a file whole or not at all."""
+    """Writes a file atomically."""
     with whole(path) as partial:
         partial.write_text(text, encoding="utf-8")
 
 
 @contextmanager
 def only_one(work: Path) -> Iterator[None]:
-    """Keeps a second run out of a work folder, and calls a full disk a full disk.
+    """Locks a work folder against a second run, and reports a full disk.
 
     Raises:
         PrepareError: another run is at work there, or the disk is full.
@@ -109,9 +109,7 @@ def only_one(work: Path) -> Iterator[None]:
     except (OSError, RuntimeError, ValueError) as error:
         free = shutil.disk_usage(work.parent).free
         if getattr(error, "errno", None) in FULL or free < LEFT:
-            says = (
-                f"The disk of {work.parent} is full ({free / 2**20:.0f} MB free): make room; the same command goes on."
-            )
+            says = f"The disk of {work.parent} is full ({free / 2**20:.0f} MB free): make room and repeat the command."
             raise PrepareError(says) from error
         raise
 

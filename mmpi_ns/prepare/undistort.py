@@ -1,4 +1,4 @@
-"""Lens distortion undone: images, masks and keypoints as a pinhole would have seen them."""
+"""Undistortion of images, masks and keypoints to a pinhole camera."""
 
 from __future__ import annotations
 

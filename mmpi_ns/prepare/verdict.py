@@ -1,4 +1,4 @@
-"""Right, doubtful or broken: what is made of the evidence, in sentences that name frames and remedy."""
+"""The verdict, right, doubtful or broken, with sentences that name frames and remedy."""
 
 from __future__ import annotations
 
@@ -35,15 +35,15 @@ BRIDGED = (0.5, 0.25)
 BRIDGED_OF_USUAL = (0.6, 0.35)
 """... and the same as a share of what the other gaps have."""
 EDGE = 3
-"""Images at an end of which a break says little of the track."""
+"""Number of images at either end of the track where a break means little."""
 SCALE = (0.03, 0.2)
 """Logarithm of a change of scale across a gap from which it is doubtful, and broken. (Sound tracks have 0.01.)"""
 LOOSE = 0.25
 """Share of an image's matches that must have become points, or its pose is doubted."""
 JUMP = 5.0
-"""Usual steps from which a step is a jump: doubtful where the matches across it hold badly as well."""
+"""Step length, in usual steps, that counts as a jump: doubtful if few of the matches across it hold."""
 CHANGE = 2.5
-"""Sudden change of speed from which the same is asked."""
+"""Ratio of speeds that counts as a sudden change, treated alike."""
 WEAK = 0.8
 """Share of the usual below which matches hold badly beside a jump."""
 APART = (0.005, 0.02)
@@ -58,11 +58,11 @@ REMEDY = (
 
 @dataclass(frozen=True)
 class Verdict:
-    """How far a model can be believed."""
+    """The verdict on a model."""
 
     grade: Grade
     reasons: tuple[str, ...] = ()
-    """Sentences, the gravest first; none where it is right."""
+    """Sentences, the most severe first; none if it is right."""
 
     def words(self) -> str:
         return " ".join(self.reasons)
@@ -74,7 +74,7 @@ def worse(value: float, limits: tuple[float, float]) -> Grade:
 
 
 def judge_alone(witness: Witness, is_sequence: bool) -> Verdict:
-    """What a mapper's model says of itself.
+    """The verdict on a mapper's model by its own evidence.
 
     Args:
         witness: of the mapper.
@@ -122,7 +122,9 @@ def _breaks(witness: Witness) -> list[tuple[Grade, str]]:
     if leaps.max(initial=0.0) > JUMP:
         at = int(leaps.argmax())
         where = _between(witness, at)
-        found.append(("broken", f"The track jumps {where}, {leaps[at]:.0f} usual steps, and few matches across hold."))
+        found.append(
+            ("broken", f"The track jumps {where}, {leaps[at]:.0f} usual steps, and few matches across it hold.")
+        )
     near_weak = np.zeros(len(witness.images), dtype=bool)
     near_weak[:-1] |= weak
     near_weak[1:] |= weak
@@ -139,7 +141,7 @@ def _grade_of_gap(across: Array, gap: int, usual: float) -> Grade:
     held = float(across[gap])
     absolute, relative = worse(held, BRIDGED), worse(held / max(usual, 1e-9), BRIDGED_OF_USUAL)
     grade = absolute if ORDER.index(absolute) > ORDER.index(relative) else relative
-    at_an_end = min(gap + 1, len(across) - gap) < EDGE  # a few images may have few points, and their place all the same
+    at_an_end = min(gap + 1, len(across) - gap) < EDGE  # a few images may have few points and still be placed correctly
     return "doubtful" if at_an_end and grade == "broken" else grade
 
 
@@ -148,13 +150,13 @@ def _between(witness: Witness, gap: int) -> str:
 
 
 def _worst(found: Sequence[tuple[Grade, str]]) -> Verdict:
-    """All that is wrong, the gravest first."""
+    """All problems, the most severe first."""
     wrong = sorted((f for f in found if f[0] != "right"), key=lambda f: -ORDER.index(f[0]))
     return Verdict(wrong[0][0], tuple(says for _, says in wrong)) if wrong else Verdict("right")
 
 
 def agrees(difference: Agreement) -> bool:
-    """Whether two mappers found one track."""
+    """Whether two mappers found the same track."""
     centers, turns = difference.centers, difference.turns
     return all(
         values.mean() <= limits[0] and values.max() <= limits[1]
@@ -163,11 +165,11 @@ def agrees(difference: Agreement) -> bool:
 
 
 def judge_together(chosen: Witness, others: Sequence[Witness], is_sequence: bool) -> Verdict:
-    """What is made of the model that is believed, beside those of the other mapper and from other focal lengths.
+    """The verdict on the chosen model, given those of the other mapper and from other focal lengths.
 
-    A track that differs speaks against it unless it can be dismissed: by evidence of its own, or because a third one
-    agrees with the chosen track, which more matches fit. Where two mappers found one track, each in its own way, what
-    was doubtful in it is believed.
+    A different track makes it doubtful unless that one can be dismissed: by its own evidence, or because a third track
+    agrees with the chosen one, which fits more matches. If two mappers found the same track independently, doubtful
+    parts of it are accepted.
     """
     own = judge_alone(chosen, is_sequence)
     compared = [(other, d) for other in others if (d := agreement(chosen, other)) is not None]
@@ -199,7 +201,7 @@ def _differ(chosen: Witness, other: Witness, difference: Agreement) -> str:
 
 
 def rank(witness: Witness, is_sequence: bool) -> tuple[int, int, float, float]:
-    """Sorts witnesses, the most believable highest.
+    """Sort key of witnesses, the most credible highest.
 
     By verdict, by images, by the share of the matches that fit the poses, to a hundredth, and by matches that became
     points. (A bent track may have more points than a right one: its points fit its bends.)

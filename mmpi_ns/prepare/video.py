@@ -1,4 +1,4 @@
-"""Frames of a video, chosen by how far the image has moved and how sharp they are."""
+"""Frames of a video, chosen by image motion and sharpness."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from mmpi_ns.prepare.stages import PrepareError, progress, say, whole, write_tex
 TRACK_WIDTH = 320
 """Width at which motion is measured."""
 LOST = 0.15
-"""Motion, as a share of the width, put down for frames that cannot be tracked from the last (a cut, a blank)."""
+"""Motion, relative to the width, assumed for frames that cannot be tracked from the last (a cut, a blank frame)."""
 MOST_MOTION = 0.15
 """Motion between chosen frames beyond which SfM gets difficult."""
 
 
 @dataclass(frozen=True)
 class Measured:
-    """What the first pass over a video finds for each frame."""
+    """Results of the first pass over a video, for each frame."""
 
     motion: NDArray[np.float64]
     """Median motion since the frame before, as a share of the width. [N]"""
@@ -67,7 +67,7 @@ def measure(video: Path) -> Measured:
     capture, total = _open(video)
     motion, sharp = [], []
     last = None
-    with progress("Looking through the video", total or None) as advance:
+    with progress("Reading the video", total or None) as advance:
         while True:
             ok, frame = capture.read()
             if not ok:
@@ -110,11 +110,11 @@ def median_motion(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> float:
 def choose_frames(measured: Measured, max_frames: int, step: float) -> tuple[list[int], float]:
     """The sharpest frame of every stretch of equal motion.
 
-    A camera that stands still adds no frame. The first and last stretch give theirs too.
+    A camera that stands still adds no frame. The first and last stretch count like the others.
 
     Args:
         measured: motion and sharpness of every frame.
-        max_frames: no more frames than this; the step grows to keep to it.
+        max_frames: maximum number of frames; the step is increased if necessary.
         step: motion of a stretch, as a share of the width.
 
     Returns:
@@ -126,7 +126,7 @@ def choose_frames(measured: Measured, max_frames: int, step: float) -> tuple[lis
     chosen = []
     for number in np.unique(stretch):
         own = np.nonzero(stretch == number)[0]
-        # near the middle of its stretch, unless another is clearly sharper: keeps the spacing even
+        # near the middle of its stretch unless another is clearly sharper, to keep the spacing even
         off = np.abs(path[own] / used - number)
         chosen.append(int(own[np.argmax(measured.sharp[own] * (1 - 0.5 * off))]))
     return chosen, used

@@ -94,8 +94,8 @@ class MMPITrainerConfig(TrainerConfig):
     def save_config(self) -> None:
         """Checks the options, locks the run's folder, and writes config.yml.
 
-        It tells ns-eval and ns-render where the windows of a long capture are, but not which checkpoint this run resumes
-        from, which they must not load.
+        It tells ns-eval and ns-render where the windows of a long capture are, but not which checkpoint this run
+        resumes from, which they must not load.
         """
         check_run(self)
         folder = self.get_base_dir()

@@ -48,7 +48,7 @@ def test_where_nothing_can_be_written_it_is_found_and_said(tmp_path, capsys):
     calls = []
     (tmp_path / "file").write_text("")
     assert remembered("key", counting(calls), tmp_path / "file/cache")["x"].tolist() == [0, 1, 2, 3, 4]
-    assert calls == [1] and "found anew" in capsys.readouterr().out
+    assert calls == [1] and "recomputed" in capsys.readouterr().out
 
 
 def test_the_oldest_are_forgotten(tmp_path, monkeypatch):

@@ -151,7 +151,7 @@ def test_rays_of_new_views_come_after_the_pixels_and_leave_fewer_keypoint_rays(s
 @pytest.mark.parametrize(("settings", "says"), [({}, False), ({"keypoint_rays": 0, "dense_depth": False}, True)])
 def test_a_run_without_any_depth_says_so_and_draws_pixels(scene, capsys, settings, says):
     manager = datamanager(scene, depth_images=False, new_view_share=1.0, **settings)
-    assert ("No distance is known" in capsys.readouterr().out) == says
+    assert ("No depths are known" in capsys.readouterr().out) == says
     assert (len(manager.next_train(0)[0]) == 64) == says
 
 
