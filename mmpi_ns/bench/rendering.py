@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import torch
 from nerfstudio.cameras.rays import RayBundle
+from numpy.typing import NDArray
 from torch import Tensor
 
-from mmpi_ns.bench.stability.exact import Array
 from mmpi_ns.bench.trainings import evenly
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.samples import metadata_of
@@ -21,6 +21,8 @@ from mmpi_ns.rendering.rendered import RenderedRays
 from mmpi_ns.rendering.sampler import MMPISampler
 from mmpi_ns.scene.geometry import Frames, PlaneHits, inverse_distance, sample_disparity
 
+Array = NDArray[Any]
+"""Of float64; numpy's stubs lose that in too many operations to say so."""
 Image = tuple[Any, Tensor]
 """A test camera and its image [H, W, 3]."""
 AHEAD = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -39,6 +41,12 @@ def bundle_of(origins: Array, directions: Array, near: float = 0.05, far: float 
     o, d = (torch.tensor(np.atleast_2d(x), dtype=torch.float32) for x in (origins, directions))
     column = torch.ones(len(o), 1)
     return RayBundle(origins=o, directions=d, pixel_area=column * 1e-4, nears=near * column, fars=far * column)
+
+
+def in_float64(bundle: RayBundle) -> RayBundle:
+    """The rays on the CPU in float64, for which every operation has its reference in plain torch alone."""
+    names = ("origins", "directions", "pixel_area", "nears", "fars")
+    return RayBundle(**{name: getattr(bundle, name).cpu().double() for name in names})
 
 
 def render(

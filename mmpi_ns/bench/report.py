@@ -1,6 +1,6 @@
 """What all benchmarks share: options, provenance, rows that are kept, and one way to write a table and a figure.
 
-A new benchmark is a dataclass that extends ``Bench`` in the folder of its question (quality, speed, stability, gpu),
+A new benchmark is a dataclass that extends ``Bench`` in the folder of its question (quality, speed, gpu),
 keeps its rows in a ``Report``, and is named in ``mmpi_ns/scripts/bench.py``.
 """
 

@@ -23,7 +23,6 @@ COMMANDS = {
     "processes": "speed.processes",
     "ablate": "quality.ablate",
     "gpu": "gpu.command",
-    "stability": "stability.command",
     "accuracy": "quality.accuracy",
     "results": "quality.results",
     "prepare": "quality.prepare",

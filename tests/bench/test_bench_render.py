@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from stability.exact_ray import ExactField, ExactRay
 from training_runs import ready, trainer_config
 
 from mmpi_ns.bench.speed import render
@@ -88,15 +89,15 @@ def test_what_was_measured_is_kept(run, tmp_path, monkeypatch):
     assert measured == [0.5] and {k: after["rows"][k] for k in before["rows"]} == before["rows"]
 
 
-def test_exact_rays_without_votes_equal_those_with_them(run):
-    """Where reliability takes no part, leaving it out of the exact ray changes nothing."""
+def test_exact_rays_equal_the_oracle(run):
     pipeline = render.load_model(run)
     model, images = pipeline.model, list(render.images_of(pipeline, 1))
     bundle = images[0][0].generate_rays(camera_indices=0, keep_shape=True)
     origin, direction = (x[5, 7].double().numpy() for x in (bundle.origins, bundle.directions))
-    field = render.ExactField.of(model.field)
-    found = [render.ExactRay(field, origin, direction, votes=asked).render(None)[0] for asked in (True, False)]
-    assert np.array_equal(*found) and found[0].std() > 0
+    near, form = float(np.float32(model.field.plan.ray_near)), model.blend_form(model.field)
+    color, made = ExactRay(ExactField.of(model.field), origin, direction, near).render(form)
+    found = render.exact_colors(model, images, [np.array([[5, 7], [6, 7]])])
+    assert np.abs(found[0] - color - 0.5 * made.transmittance).max() < 1e-6 < found.std()
 
 
 def test_what_passes_a_ray_shows_the_background(run):

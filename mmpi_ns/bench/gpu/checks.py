@@ -10,9 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mmpi_ns.bench.gpu.scenes import CUBE, Scene, gradients_of, random_scene, samples_of
 from mmpi_ns.bench.rendering import of_slots
-from mmpi_ns.bench.stability.exact_ray import ExactRay
-from mmpi_ns.bench.stability.rays import CUBE, Scene, gradients_of, scene, slopes_of, wrong_samples
 from mmpi_ns.field.baking import baked_shares
 from mmpi_ns.field.samples import metadata_of
 from mmpi_ns.ops import dispatch, interpolate, variation
@@ -55,42 +54,38 @@ def _draw(device: str, *shape: int, seed: int = 0) -> Tensor:
 
 
 def whole_rays(s: Scene, name: str, device: str) -> list[Check]:
-    """March, interpolation and compositing together, values and gradients, against exact arithmetic."""
-    s, exact = s.clear()
-    by = np.random.default_rng(0).normal(size=(len(exact), 3))
-    wanted, (slopes, _) = np.array([ray.render(s.form)[0] for ray in exact]), slopes_of(exact, by, s.form)
+    """March, interpolation and compositing together, values and gradients, against plain torch in float64."""
+    s = s.clear()
+    exact, by = s.exact(), np.random.default_rng(0).normal(size=(len(s.bundle), 3))
+    wanted = exact.render()
+    slopes = gradients_of(exact.field, wanted, by)
     s.field.to(device)
     found = s.render()
     made = gradients_of(s.field, found, by)
     with torch.no_grad():
         shaded = s.render().colors.rgb
+    wrong = sum(a != b for a, b in zip(samples_of(found)[0], samples_of(wanted)[0], strict=True))
     return [
         *marched(s, name, exact),
-        Check(f"{name}: rays with wrong samples, of {len(exact)}", wrong_samples(found, exact), 0),
-        Check(f"{name}: colours", _relative(found.colors.rgb, wanted), 2e-4),
-        Check(f"{name}: colours without gradients", _relative(shaded, wanted), 2e-4),
-        *(
-            Check(f"{name}: gradient of {kind}", _relative(made[kind], slopes[kind]), 1e-3)
-            for kind in ("density", "features", *(["reliability"] if s.form else []))
-        ),
+        Check(f"{name}: rays with wrong samples, of {len(by)}", wrong, 0),
+        Check(f"{name}: colours", _relative(found.colors.rgb, wanted.colors.rgb), 2e-4),
+        Check(f"{name}: colours without gradients", _relative(shaded, wanted.colors.rgb), 2e-4),
+        *(Check(f"{name}: gradient of {kind}", _relative(made[kind], slopes[kind]), 1e-3) for kind in slopes),
     ]
 
 
 @torch.no_grad()
-def marched(s: Scene, name: str, exact: list[ExactRay]) -> list[Check]:
+def marched(s: Scene, name: str, exact: Scene) -> list[Check]:
     """What the march itself says: optical depths, and which samples it keeps at a threshold."""
-    threshold, wrong, lost = 0.02, 0, []
-    depth = of_slots(s.render(), "tau").sum(-1)
-    wanted = [sum(b.depth for b in ray.blended(s.form)) for ray in exact]
+    threshold, wanted = 0.02, exact.render()
+    depth, weights = of_slots(s.render(), "tau").sum(-1), wanted.composite.weights
     found = s.render(threshold)
-    for kept, ray in zip(of_slots(found, "valid").sum(-1).tolist(), exact, strict=True):
-        weights = ray.render(s.form)[1].weights
-        lost.append(float(weights[weights <= threshold].sum()))
-        sure = [int((weights > threshold * (1 + sign * 1e-3)).sum()) for sign in (1, -1)]
-        wrong += not sure[0] <= kept <= sure[1]
+    kept = of_slots(found, "valid").sum(-1).cpu()
+    least, most = ((weights > threshold * (1 + sign * 1e-3)).sum(-1) for sign in (1, -1))
+    lost = torch.where(weights <= threshold, weights, 0).sum(-1)
     return [
-        Check(f"{name}: optical depths by the march", _relative(depth, wanted), 1e-4),
-        Check(f"{name}: rays that keep other samples than they should", wrong, 0),
+        Check(f"{name}: optical depths by the march", _relative(depth, of_slots(wanted, "tau").sum(-1)), 1e-4),
+        Check(f"{name}: rays that keep other samples than they should", int(((kept < least) | (kept > most)).sum()), 0),
         Check(f"{name}: mass of what is dropped", _relative(found.report.dropped_mass[:, 0], lost), 1e-2),
     ]
 
@@ -102,14 +97,14 @@ def marches(device: str, rehearse: bool) -> list[Check]:
     found = []
     for count, form, cube in cases[: 1 if rehearse else None]:
         name = f"{count} MPIs{' and the cube' if cube else ''}, {form or 'no'} blending"
-        found += whole_rays(scene(count, 4 if rehearse else 24, form, seed=count, cube=cube), name, device)
+        found += whole_rays(random_scene(count, 4 if rehearse else 200, form, count, cube), name, device)
     return found
 
 
 @torch.no_grad()
 def baked_march(device: str, rehearse: bool) -> list[Check]:
     """Optical depths blended by shares at texels, against the same blending of plain samples in float64."""
-    s, found = scene(3, 4 if rehearse else 200, None, seed=5, cube=CUBE), []
+    s, found = random_scene(3, 4 if rehearse else 200, None, 5, CUBE), []
     field = s.field.to(device)
     unblended = s.render()
     shares, valid = baked_shares(field), of_slots(unblended, "valid")
@@ -118,7 +113,7 @@ def baked_march(device: str, rehearse: bool) -> list[Check]:
     share = interpolate_shares(field.cpu().layout, shares.double().cpu(), ndc, heads)
     field.to(device)
     for form in ("paper", "opacity")[: 1 if rehearse else None]:
-        samples, _ = MMPISampler()(s.bundle(), field=field, threshold=0.0, blend_form=form, shares=shares)
+        samples, _ = MMPISampler()(s.bundle.to(device), field=field, threshold=0.0, blend_form=form, shares=shares)
         made = metadata_of(samples)["tau"][..., 0][valid]
         wanted = blended_optical_depth(tau, share.log(), torch.log1p(-share), form)
         wanted = torch.where(tau > NEGLIGIBLE_DEPTH, wanted, tau / len(field.grids))
@@ -171,7 +166,7 @@ def distinct_rows(device: str, samples: int) -> list[Check]:
 
 def variations(device: str, texels: int) -> list[Check]:
     """Total variation of MPIs and a cube with its gradient."""
-    field = scene(3, 1, None, cube=CUBE).field.to(device)
+    field = random_scene(3, 1, None, cube=CUBE).field.to(device)
     table = _draw(device, len(field.density), 9) * 2
     rows = torch.randperm(len(table), generator=torch.Generator().manual_seed(1))[:texels].to(device)
 

@@ -10,9 +10,8 @@ import numpy as np
 import torch
 
 from mmpi_ns.bench.quality.solids import Solids, bake
-from mmpi_ns.bench.rendering import AHEAD, bundle_of, of_slots, render
+from mmpi_ns.bench.rendering import AHEAD, Array, bundle_of, of_slots, render
 from mmpi_ns.bench.report import Bench, Report, Row, figure, page, table
-from mmpi_ns.bench.stability.exact import Array
 from mmpi_ns.ops.blending import BlendForm
 from mmpi_ns.ops.composite.reference import median_inverse_distance
 from mmpi_ns.scene.plan import MPIPlan

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from mmpi_ns.bench.stability.exact import Array, disparities
+from mmpi_ns.bench.rendering import Array
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.scene.plan import MPIPlan, ScenePlan
 
@@ -60,7 +60,7 @@ def bake(solids: Solids, mpis: list[MPIPlan]) -> MMPIField:
     for mpi, grid in zip(mpis, field.grids, strict=True):
         u, v = np.linspace(*mpi.extent[:2], mpi.width), np.linspace(*mpi.extent[2:], mpi.height)
         rays = np.stack([*np.meshgrid(u, v), np.ones((mpi.height, mpi.width))], -1) @ np.array(mpi.axes)
-        w = disparities(mpi)[:, None, None]
+        w = np.linspace(1 / mpi.near, 1 / mpi.far, mpi.planes)[:, None, None]
         # A plane at infinity lies inside a wall that goes on for ever; its texture means nothing there.
         depth = 1 / np.maximum(w, 1e-6)
         points = np.array(mpi.origin) + rays * depth[..., None]

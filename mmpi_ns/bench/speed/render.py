@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import statistics
 import time
 from collections.abc import Iterator
@@ -12,16 +13,17 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from mmpi_ns.bench.rendering import Image, images_of
+from mmpi_ns.bench.rendering import Array, Image, images_of, in_float64
+from mmpi_ns.bench.rendering import render as render_plainly
 from mmpi_ns.bench.report import Bench, Report, Row, figure, fingerprint, page, table
-from mmpi_ns.bench.stability.exact import Array
-from mmpi_ns.bench.stability.exact_ray import ExactField, ExactRay
 from mmpi_ns.export.bake import load_model
 from mmpi_ns.model import MMPIModel
 from mmpi_ns.ops import dispatch
 from mmpi_ns.rendering.metrics import ImageMetrics
-from mmpi_ns.rendering.rendered import BACKGROUNDS
+from mmpi_ns.rendering.rendered import BACKGROUNDS, bounded
 
+EXACT_RAYS = 256
+"""Rays that are rendered exactly at once."""
 NOISE = 1.05
 """A setting must be so much faster than another to count as faster."""
 SAME_DB = 5e-4
@@ -65,8 +67,8 @@ class Setting:
 class Render(Bench):
     """Rays/s and frames/s against loss of PSNR and against error with respect to exact arithmetic.
 
-    The exact image is made in float64, one ray and one sample after the other, with every sample kept, for some rays
-    of the test images. Settings take turns, so that a busy moment of the machine does not fall on one of them.
+    The exact image is made in float64 by plain torch, with every sample kept, for some rays of the test images.
+    Settings take turns, so that a busy moment of the machine does not fall on one of them.
     """
 
     load_config: Path
@@ -84,7 +86,7 @@ class Render(Bench):
     rounds: int = 3
     """Times that every setting renders them; the median counts."""
     exact_rays: int = 1000
-    """Random rays of those images that are rendered exactly (0.05 to 0.5 s each)."""
+    """Random rays of those images that are rendered exactly."""
 
     name = "render"
 
@@ -143,21 +145,19 @@ def _some_rays(images: list[Image], count: int) -> list[Array]:
     return found
 
 
+@torch.no_grad()
 def exact_colors(model: MMPIModel, images: list[Image], rays: list[Array]) -> Array:
     """Colours [N, 3] of some pixels, in float64, without dropping anything, over the model's background."""
-    field = ExactField.of(model.field)
-    form = model.blend_form(model.field)
-    near, background = float(np.float32(model.field.plan.ray_near)), BACKGROUNDS[model.config.background]
+    field = copy.deepcopy(model.field).cpu().double()
     colors = []
-    for number, ((camera, _), pixels) in enumerate(zip(images, rays, strict=True), 1):
-        bundle = camera.generate_rays(camera_indices=0, keep_shape=True)
-        at = torch.from_numpy(pixels[:, 0]), torch.from_numpy(pixels[:, 1])
-        origins, directions = (x.cpu()[at].double().numpy() for x in (bundle.origins, bundle.directions))
-        for origin, direction in zip(origins, directions, strict=True):
-            color, made = ExactRay(field, origin, direction, near, votes=form is not None).render(form)
-            colors.append((color + float(made.transmittance) * background).clip(0, 1))
-        print(f"exact: {number} of {len(images)} images", flush=True)
-    return np.array(colors)
+    for (camera, _), pixels in zip(images, rays, strict=True):
+        bundle = camera.generate_rays(camera_indices=0, keep_shape=True)[tuple(torch.from_numpy(pixels).T)]
+        rays64 = in_float64(bounded(bundle, field.plan))
+        for part in (rays64[i : i + EXACT_RAYS] for i in range(0, len(rays64), EXACT_RAYS)):
+            found = render_plainly(field, part, form=model.blend_form(field))
+            behind = found.composite.transmittance * BACKGROUNDS[model.config.background]
+            colors.append((found.colors.rgb + behind).clamp(0, 1).numpy())
+    return np.concatenate(colors)
 
 
 @torch.no_grad()

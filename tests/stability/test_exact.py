@@ -9,9 +9,8 @@ import oracle
 import pytest
 from hand_made import random_mpi, random_votes, unit
 from random_fields import OracleRay, random_field, random_rays
-
-from mmpi_ns.bench.stability import exact
-from mmpi_ns.bench.stability.exact_ray import ExactField, ExactRay, Gradients
+from stability import exact
+from stability.exact_ray import ExactField, ExactRay, Gradients
 
 FORMS = ["paper", "opacity", None]
 

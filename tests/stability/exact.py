@@ -1,7 +1,7 @@
 """Exact geometry, blending and compositing to measure the fast paths against, with exact gradients.
 
 Float64 and 60-digit decimals, one ray at a time, every plane by itself. Shares no code with ``scene/geometry.py``,
-``ops``, the sampler or the field: plans come in as plain data. ``tests/bench/test_bench_exact.py`` compares it with
+``ops``, the sampler or the field: plans come in as plain data. ``test_exact.py`` compares it with
 ``tests/oracle.py``, and its gradients with finite differences.
 """
 

@@ -9,10 +9,8 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-
-from mmpi_ns.bench.rendering import AHEAD, bundle_of, crossings
-from mmpi_ns.bench.stability import exact
-from mmpi_ns.bench.stability.cases import (
+from stability import exact
+from stability.cases import (
     UNIT,
     Case,
     Error,
@@ -26,7 +24,9 @@ from mmpi_ns.bench.stability.cases import (
     single,
     snap,
 )
-from mmpi_ns.bench.stability.exact import Array
+from stability.exact import Array
+
+from mmpi_ns.bench.rendering import AHEAD, bundle_of, crossings
 from mmpi_ns.scene.geometry import Cube, Frames, cube_hits, plane_hits, samples_to_ndc
 from mmpi_ns.scene.plan import CubePlan, MPIPlan
 

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 import torch
+from stability.exact import Array
 from torch import Tensor
 
-from mmpi_ns.bench.stability.exact import Array
 from mmpi_ns.scene.plan import CubePlan, MPIPlan, ScenePlan
 
 UNIT = 2.0**-24

@@ -11,9 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 from nerfstudio.cameras.rays import RayBundle
-
-from mmpi_ns.bench.rendering import bundle_of, of_slots, render
-from mmpi_ns.bench.stability.cases import (
+from stability.cases import (
     UNIT,
     Case,
     Error,
@@ -29,8 +27,10 @@ from mmpi_ns.bench.stability.cases import (
     single,
     snap,
 )
-from mmpi_ns.bench.stability.exact import Array, Jitter
-from mmpi_ns.bench.stability.exact_ray import TABLES, ExactField, ExactRay, Gradients
+from stability.exact import Array, Jitter
+from stability.exact_ray import TABLES, ExactField, ExactRay, Gradients
+
+from mmpi_ns.bench.rendering import bundle_of, of_slots, render
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.ops.blending import BlendForm
 from mmpi_ns.rendering.rendered import RenderedRays

@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 import torch
-
-from mmpi_ns.bench.stability import exact
-from mmpi_ns.bench.stability.cases import (
+from stability import exact
+from stability.cases import (
     Case,
     Outcome,
     Precision,
@@ -21,7 +20,8 @@ from mmpi_ns.bench.stability.cases import (
     single,
     tried,
 )
-from mmpi_ns.bench.stability.exact import Array
+from stability.exact import Array
+
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.ops.blending import BlendForm, blend_shares, blended_optical_depth
 from mmpi_ns.ops.composite.reference import composite_weights, median_inverse_distance, render_colors

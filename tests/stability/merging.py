@@ -8,11 +8,11 @@ from functools import partial
 
 import numpy as np
 import torch
+from stability import exact
+from stability.cases import UNIT, Case, Outcome, Precision, compare, float32, single, tried
+from stability.exact import Array
+from stability.exact_ray import corners_of
 
-from mmpi_ns.bench.stability import exact
-from mmpi_ns.bench.stability.cases import UNIT, Case, Outcome, Precision, compare, float32, single, tried
-from mmpi_ns.bench.stability.exact import Array
-from mmpi_ns.bench.stability.exact_ray import corners_of
 from mmpi_ns.ops.interpolate import interpolate
 from mmpi_ns.ops.march.reference import merge, prune
 from mmpi_ns.ops.variation.reference import clamped_differences

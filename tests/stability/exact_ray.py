@@ -14,9 +14,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from stability import exact
+from stability.exact import STILL, Array, Jitter
 
-from mmpi_ns.bench.stability import exact
-from mmpi_ns.bench.stability.exact import STILL, Array, Jitter
 from mmpi_ns.scene.plan import MPIPlan, ScenePlan
 
 Corners = list[tuple[tuple[int, ...], float]]

@@ -1,0 +1,110 @@
+"""Random scenes for the checks of kernels, and the same rays by plain torch in float64."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from nerfstudio.cameras.rays import RayBundle
+from torch import Tensor
+
+from mmpi_ns.bench.rendering import Array, bundle_of, in_float64, of_slots, render
+from mmpi_ns.field.mmpi_field import MMPIField
+from mmpi_ns.ops.blending import BlendForm
+from mmpi_ns.rendering.rendered import RenderedRays
+from mmpi_ns.scene.plan import CubePlan, MPIPlan, ScenePlan
+
+CUBE = CubePlan((-1.5, -1.25, -1.0), (1.5, 1.5, 2.0), (6, 5, 4))
+CLEAR = 2.0**-18
+"""Rays are left out on which moving the inputs by this share changes which samples there are, their order, or (by more
+than ``SAME_DEPTH``) their blended depths: there roundings may decide otherwise."""
+SAME_DEPTH = 1e-2
+TABLES = ("density", "features", "reliability")
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A field with random tables, rays into it, and how they are blended."""
+
+    field: MMPIField
+    bundle: RayBundle
+    form: BlendForm | None = None
+
+    def render(self, threshold: float = 0.0) -> RenderedRays:
+        return render(self.field, self.bundle.to(self.field.density.device), threshold, self.form)
+
+    def exact(self) -> Scene:
+        """The same in float64 on the CPU, for which there is plain torch alone."""
+        return replace(self, field=copy.deepcopy(self.field).cpu().double(), bundle=in_float64(self.bundle))
+
+    def clear(self) -> Scene:
+        """With the rays alone on which no decision is close.
+
+        Raises:
+            ValueError: fewer than a quarter are left.
+        """
+        exact, kept = self.exact(), torch.ones(len(self.bundle), dtype=torch.bool)
+        with torch.no_grad():
+            samples, depths = samples_of(exact.render())
+            for draw in range(4):
+                moved = samples_of(replace(exact, bundle=_moved(exact.bundle, draw)).render())
+                for i, (own, others, a, b) in enumerate(zip(samples, moved[0], depths, moved[1], strict=True)):
+                    kept[i] &= len(own) > 0 and own == others and bool(((a - b).abs() <= SAME_DEPTH * a).all())
+        if kept.sum() < len(kept) / 4:
+            raise ValueError(f"Only {int(kept.sum())} of {len(kept)} rays are clear: choose another seed.")
+        return replace(self, bundle=self.bundle[kept])
+
+
+def _moved(bundle: RayBundle, seed: int) -> RayBundle:
+    """float64 rays with every number moved by up to ``CLEAR`` of it."""
+    g, found = torch.Generator().manual_seed(seed), in_float64(bundle)
+    shape = found.origins.shape
+    by_origin, by_direction = (1 + CLEAR * (2 * torch.rand(shape, generator=g, dtype=torch.float64) - 1) for _ in "od")
+    found.origins, found.directions = found.origins * by_origin, found.directions * by_direction
+    return found
+
+
+def samples_of(found: RenderedRays) -> tuple[list[list[tuple[int, int]]], list[Tensor]]:
+    """Of each ray the (head, plane) of its samples, nearest first, and their optical depths."""
+    valid, heads, planes, tau = (of_slots(found, name).cpu() for name in ("valid", "heads", "planes", "tau"))
+    pairs = [list(zip(h[v].tolist(), p[v].tolist(), strict=True)) for h, p, v in zip(heads, planes, valid, strict=True)]
+    return pairs, [t[v] for t, v in zip(tau, valid, strict=True)]
+
+
+def gradients_of(field: MMPIField, found: RenderedRays, by: Array) -> dict[str, Tensor]:
+    """Derivatives of the sum of ``by`` [R, 3] times the rays' colours, by every table."""
+    field.zero_grad()
+    found.colors.rgb.backward(torch.tensor(by).to(found.colors.rgb))
+    grads = {name: getattr(field, name).grad for name in TABLES}
+    return {n: (g.to_dense() if g.is_sparse else g).cpu() for n, g in grads.items() if g is not None}
+
+
+def random_scene(count: int, rays: int, form: BlendForm | None, seed: int = 0, cube: CubePlan | None = None) -> Scene:
+    """MPIs side by side that face about the same way, so that most points are covered by several; all texels trained,
+    optical depths of a sample from 1e-3 to 1."""
+    rng, g = np.random.default_rng(seed), torch.Generator().manual_seed(seed)
+    mpis = tuple(_mpi(rng, f"mpi{k}") for k in range(count))
+    settings: dict[str, Any] = {"feature_channels": 5, "hidden_width": 6, "samples_per_voxel": 1.5}
+    field = MMPIField(ScenePlan(mpis, cube, 0.05, 1.0), **settings).eval().requires_grad_()
+    field.density.data.uniform_(-4, 2, generator=g)
+    for table, size in ((field.features, 1.0), (field.reliability, 3.0), (field.networks.weights, 0.3)):
+        table.data.normal_(generator=g).mul_(size)
+    field.touched.fill_(1)
+    aimed = [mpis[i % count] for i in range(rays)]
+    origins = np.array([m.origin for m in aimed]) + rng.normal(size=(rays, 3)) * 0.6
+    tangents = np.concatenate([rng.uniform(-0.6, 0.6, (rays, 2)), np.ones((rays, 1))], -1)
+    targets = np.array([m.near / rng.uniform(0.1, 0.9) * (t @ np.array(m.axes)) + m.origin
+                        for m, t in zip(aimed, tangents, strict=True)])  # fmt: skip
+    away = targets - origins
+    return Scene(field, bundle_of(origins, away / np.linalg.norm(away, axis=-1, keepdims=True)), form)
+
+
+def _mpi(rng: np.random.Generator, name: str) -> MPIPlan:
+    turn, r = np.linalg.qr(np.eye(3) + 0.1 * rng.normal(size=(3, 3)))
+    axes = tuple(tuple(row) for row in (turn * np.sign(np.diag(r))).T.tolist())
+    extent = tuple((rng.uniform(0.7, 1.3, 4) * [-1, 1, -1, 1]).tolist())
+    origin, near = tuple((rng.normal(size=3) * 0.4).tolist()), float(rng.uniform(0.8, 1.6))
+    return MPIPlan(name, origin, axes, near, extent, 12, 5, 7)  # type: ignore[arg-type]
