@@ -9,6 +9,7 @@ import torch
 from hypothesis import assume
 from hypothesis import strategies as st
 
+from mmpi_ns.scene.geometry import local_to_ndc, rays_in_frames, rotate
 from mmpi_ns.scene.plan import MPIPlan
 
 IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -18,6 +19,18 @@ def make_mpi(name="front", origin=(0.0, 0.0, 0.0), axes=IDENTITY, near=1.0, exte
     """An MPI at the world's origin facing +z with 9 planes; every field can be replaced."""
     size = {"planes": 9, "height": 5, "width": 7, **size}
     return MPIPlan(name=name, origin=origin, axes=axes, near=near, extent=extent, **size)
+
+
+def world_to_ndc(points, inverse_t, frames):
+    """``local_to_ndc`` of homogeneous world points."""
+    return local_to_ndc(rotate(frames.axes, points[:, None] - frames.origins * inverse_t[:, None, None]),
+                        inverse_t[:, None], frames)  # fmt: skip
+
+
+def samples_to_ndc(origins, directions, inverse_t, frames):
+    """``local_to_ndc`` of the points origins + t directions, from differences to each MPI's origin (exact far away)."""
+    local_origins, local_directions = rays_in_frames(origins, directions, frames)
+    return local_to_ndc(local_origins * inverse_t[:, None, None] + local_directions, inverse_t[:, None], frames)
 
 
 def rotation(quaternion):

@@ -201,13 +201,13 @@ def inverse_distance(w: Tensor, oz: Tensor, dz: Tensor) -> Tensor:
     return w * dz / (1 - w * oz)
 
 
-def world_to_ndc(
-    points: Float[Tensor, "N 3"], inverse_t: Float[Tensor, "N"], frames: Frames
+def local_to_ndc(
+    local: Float[Tensor, "N K 3"], inverse_t: Float[Tensor, "N 1"], frames: Frames
 ) -> tuple[Float[Tensor, "N K 3"], Bool[Tensor, "N K"]]:
-    """NDC of homogeneous world points (x/t, 1/t) in each MPI, and whether they lie inside its frustum.
+    """NDC of homogeneous points (x/t, 1/t) in each MPI, and whether they lie inside its frustum.
 
     Args:
-        points: x / t for a finite point x, or a direction for a point at infinity.
+        local: x / t in the MPI's axes, relative to its origin; a direction for a point at infinity.
         inverse_t: 1 / t, 0 at infinity.
         frames: the K MPI frames.
 
@@ -215,15 +215,6 @@ def world_to_ndc(
         NDC (u, v, s), each normalised to [-1, 1] over the frustum (s: near plane -1, last plane +1), and the inside
         mask. Where a point lies behind an MPI its NDC is meaningless (finite) and the mask is False.
     """
-    relative = points[:, None, :] - frames.origins * inverse_t[:, None, None]
-    local = rotate(frames.axes, relative)
-    return local_to_ndc(local, inverse_t[:, None], frames)
-
-
-def local_to_ndc(
-    local: Float[Tensor, "N K 3"], inverse_t: Float[Tensor, "N 1"], frames: Frames
-) -> tuple[Float[Tensor, "N K 3"], Bool[Tensor, "N K"]]:
-    """``world_to_ndc`` for points already in each MPI's axes, relative to its origin."""
     z = local[..., 2]
     ahead = z > 0
     safe_z = torch.where(ahead, z, torch.ones_like(z))
@@ -238,27 +229,6 @@ def local_to_ndc(
     slack = torch.stack([torch.ones_like(scale), torch.ones_like(scale), 1 / frames.depth_shares], -1)
     inside = ahead & (ndc.abs() <= 1 + 16 * torch.finfo(ndc.dtype).eps * slack).all(-1)
     return torch.where(ahead[..., None], ndc, torch.zeros_like(ndc)), inside
-
-
-def samples_to_ndc(
-    origins: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"], inverse_t: Float[Tensor, "N"], frames: Frames
-) -> tuple[Float[Tensor, "N K 3"], Bool[Tensor, "N K"]]:
-    """``world_to_ndc`` of the points origins + t directions, from differences to each MPI's origin (exact far away)."""
-    local_origins, local_directions = rays_in_frames(origins, directions, frames)
-    return local_to_ndc(local_origins * inverse_t[:, None, None] + local_directions, inverse_t[:, None], frames)
-
-
-def ndc_to_world(
-    ndc: Float[Tensor, "N 3"], heads: Int[Tensor, "N"], frames: Frames
-) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N"]]:
-    """Homogeneous world points (X, W): the finite point is X / W, and W = 0 is the direction X at infinity."""
-    u0, u1, v0, v1 = frames.extents[heads].unbind(-1)
-    u = u0 + (ndc[:, 0] + 1) / 2 * (u1 - u0)
-    v = v0 + (ndc[:, 1] + 1) / 2 * (v1 - v0)
-    w = (1 - ndc[:, 2]) / 2 / frames.nears[heads] * frames.depth_shares[heads] + frames.last_disparities[heads]
-    rays = torch.stack([u, v, torch.ones_like(u)], -1)
-    directions = rotate(frames.axes[heads].mT, rays)
-    return directions + frames.origins[heads] * w[:, None], w
 
 
 @dataclass(frozen=True)
