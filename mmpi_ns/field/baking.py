@@ -1,8 +1,8 @@
-"""Reliability baked at texels: the share of every texel, computed once, so that a sample asks one head instead of all.
+"""Reliability baked into texels: shares are computed once, so that a sample reads one head instead of all.
 
-Blending asks, for every sample, how reliable each head that covers the place is (paper sec. III-C). What comes of it is
-nearly a function of the place alone, so a texel can keep it: between texels shares are interpolated instead of the
-reliabilities that they are made of. For rendering only; docs/performance.md has time and error.
+Blending looks up, for every sample, the reliability of each head that covers its position (paper sec. III-C). The
+resulting share depends on the position alone, so a texel can store it: shares are interpolated between texels instead
+of reliabilities. For rendering only; docs/performance.md has time and error.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ AT_ONCE = 1 << 18
 
 
 def baked_shares(field: MMPIField) -> Float[Tensor, "N 1"]:
-    """``bake_shares`` of a field, made once, until it is trained on (``MMPIField.forget_shares``)."""
+    """``bake_shares`` of a field, computed once, until it is trained further (``MMPIField.forget_shares``)."""
     return field.cached("shares", lambda: bake_shares(field))
 
 
 @torch.no_grad()
 def bake_shares(field: MMPIField) -> Float[Tensor, "N 1"]:
-    """Shares P of all rows of a field's tables, among the heads that cover the places of their texels; 1 elsewhere."""
+    """Shares P of all rows of a field's tables, among the heads that cover the position of the texel; 1 elsewhere."""
     shares = torch.ones_like(field.density)
     rows = torch.arange(BRICK, len(shares), device=shares.device)
     for k, grid in enumerate(field.grids):
         own = rows[grid.holds(rows)]
         z, y, x = grid.texel(own)
-        exists = (y < grid.height) & (x < grid.width)  # tiles reach over the borders of a plane
+        exists = (y < grid.height) & (x < grid.width)  # tiles extend beyond the borders of a plane
         sizes = torch.tensor([grid.width, grid.height, grid.depth], device=own.device)
         ndc = (2 * torch.stack([x, y, z], -1)[exists] / (sizes - 1) - 1).to(shares.dtype)
         for part, places in zip(own[exists].split(AT_ONCE), ndc.split(AT_ONCE), strict=True):
@@ -47,12 +47,12 @@ def bake_shares(field: MMPIField) -> Float[Tensor, "N 1"]:
 def rays_to(
     field: MMPIField, k: int, ndc: Float[Tensor, "N 3"]
 ) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 3"], Float[Tensor, "N"]]:
-    """Rays from a head's own origin to places in it, so that nothing is lost far from the world's.
+    """Rays from a head's own origin to positions in it, to keep precision far from the world origin.
 
     Args:
-        field: whose head.
+        field: of the head.
         k: its number.
-        ndc: places in it.
+        ndc: positions in it.
 
     Returns:
         Origins, directions (not of unit length), and inverse distances in units of those.

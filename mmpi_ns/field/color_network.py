@@ -1,4 +1,4 @@
-"""Shallow networks, and the paper's use of them: a colour for every sample (eq. for MLP^(rgb))."""
+"""Shallow networks, and the paper's colour network for every sample (eq. for MLP^(rgb))."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mmpi_ns.ops.shade.reference import SampleNetworks, positional_encoding, run
 class Networks(nn.Module):
     """``count`` networks of two hidden layers, inputs -> three numbers, in one pooled parameter.
 
-    Their last layer starts at zero, so what they correct learns at the tables' rate from the first step.
+    Their last layer starts at zero, so the tables learn at their own rate from the first step.
     """
 
     def __init__(self, count: int, inputs: int, width: int) -> None:
@@ -30,7 +30,7 @@ class Networks(nn.Module):
 
     @torch.no_grad()
     def resize(self, count: int) -> None:
-        """Allocates ``count`` fresh networks."""
+        """Allocates ``count`` new networks."""
         self.weights.data = self.fresh(count).to(self.weights.device)
 
     def fresh(self, count: int) -> Float[Tensor, "count P"]:
@@ -49,14 +49,14 @@ class Networks(nn.Module):
         return [p.view(s) for p, s in zip(self.weights[index].split(sizes), self.shapes, strict=True)]
 
     def run(self, head: int, inputs: Float[Tensor, "N I"]) -> Float[Tensor, "N 3"]:
-        """What one head's network makes of its inputs."""
+        """Output of one head's network."""
         return run_layers(self.layers(head), inputs)
 
 
 class ColorNetworks(Networks):
-    """Networks (features, PE(position), PE(direction)) -> rgb, one per head or one for all, that every sample asks.
+    """Networks (features, PE(position), PE(direction)) -> rgb for every sample, one per head or one for all.
 
-    The first three features are colour logits, to which the network adds what the view changes.
+    The first three features are colour logits, to which the network adds the view-dependent part.
     """
 
     def __init__(self, count: int, channels: int, width: int, position_frequencies: int, direction_frequencies: int):
@@ -75,11 +75,11 @@ class ColorNetworks(Networks):
         """Colours in [0, 1] of one head's samples.
 
         Args:
-            head: whose network.
+            head: of the network.
             features: of each sample.
             ndc: position of each sample.
             directions: of each ray, in the head's axes; encoded once a ray.
-            rays: ray of each sample; None where samples and rays are one.
+            rays: ray of each sample; None if there is one sample for each ray.
         """
         position = positional_encoding(ndc, self.position_frequencies)
         direction = positional_encoding(directions, self.direction_frequencies)
@@ -87,6 +87,6 @@ class ColorNetworks(Networks):
         return sample_colors(self.layers(head), features, position, direction)
 
     def of_heads(self, count: int) -> SampleNetworks:
-        """The networks of so many heads, for ``ops.shade``."""
+        """The networks of this many heads, for ``ops.shade``."""
         layers = tuple(tuple(x.detach() for x in self.layers(k)) for k in range(count))
         return SampleNetworks(layers, self.position_frequencies, self.direction_frequencies)

@@ -38,8 +38,8 @@ def plane_biases(planes: int, missing: float = 0.0) -> tuple[Float[Tensor, "L"],
     """Density biases b_l with which all planes start at equal rendering weight 1/L, and the interval 256/L.
 
     alpha_l = 1 / (L - l), the last one clamped; alpha = 1 - exp(-softplus(b) interval) solved for b.
-    An MPI that ends begins as one to infinity from which the last ``missing`` planes were taken away, alpha_l =
-    1 / (L + missing - l): their share of the weight is left to what lies behind.
+    An MPI with a finite far starts like one to infinity without its last ``missing`` planes, alpha_l =
+    1 / (L + missing - l): their share of the weight is left to content behind it.
     Source: DVGO v2's MPI; docs/how_it_works.md, "Density".
     """
     interval = 256.0 / planes
@@ -52,7 +52,7 @@ class MMPIField(TexelTables):
 
     Args:
         plan: frames and resolutions.
-        shading: whether a network is asked once a ray or for every sample (``shading.py``).
+        shading: whether the network is evaluated once a ray or for every sample (``shading.py``).
         feature_channels: channels of the colour features; the first three are colour logits.
         hidden_width: width of the colour networks' hidden layers.
         position_frequencies: octaves of the positional encoding of NDC positions.
@@ -62,7 +62,7 @@ class MMPIField(TexelTables):
         samples_per_voxel: samples along a ray per voxel side of the cube.
         cube_alpha: initial alpha of a cube sample.
         factor: texels in use, as a share of the plan's.
-        views: training images; what none of them can reach is not stored. None stores everything.
+        views: training images; texels that none of them can reach are not stored. None stores all.
     """
 
     def __init__(
@@ -86,8 +86,8 @@ class MMPIField(TexelTables):
         self.samples_per_voxel = samples_per_voxel
         self.cube_alpha = cube_alpha
         self.learns_cover = True
-        """Whether training rays mark the texels they train. Only blending asks for it; once it has begun no more are
-        marked, so that P cannot jump."""
+        """Whether training rays mark the texels they train. Only blending needs the marks; once it has begun none are
+        added, so that P cannot jump."""
         self.shading = shading
         self.shared_colour = shared_colour
         if shading == "ray":
@@ -97,7 +97,7 @@ class MMPIField(TexelTables):
             self.networks = ColorNetworks(1 if shared_colour else plan.num_heads, *sizes)
 
     def renew_networks(self) -> None:
-        """Fresh networks for the plan at hand in the same Parameter."""
+        """Creates new networks for the current plan in the same Parameter."""
         one = self.shading == "ray" or self.shared_colour
         weights = self.networks.weights
         replace_data(weights, self.networks.fresh(1 if one else self.full_plan.num_heads).to(weights.device))
@@ -109,7 +109,7 @@ class MMPIField(TexelTables):
             self.networks.resize(stored.shape[0])
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
-    # What the operations take ----------------------------------------------------------------------------------
+    # Inputs of the operations ----------------------------------------------------------------------------------
 
     @property
     def layout(self) -> SceneLayout:
@@ -126,7 +126,7 @@ class MMPIField(TexelTables):
         return SceneLayout(mpis, frames, self.grids, biases, self.depth_scale, packed, bias, interval)
 
     def tables(self, shares: Tensor | None = None) -> Tables:
-        """What rays are marched through, with baked shares in place of reliability where they are given."""
+        """Input of the march, with baked shares in place of reliability if given."""
         return Tables(self.density.data, self.reliability.data if shares is None else shares, self.touched)
 
     @property
@@ -139,11 +139,11 @@ class MMPIField(TexelTables):
 
     @property
     def depth_scale(self) -> float:
-        """Factor on every optical depth of an MPI, by the plan at hand: a checkpoint's has a K of its own."""
+        """Factor on every optical depth of an MPI, from the current plan: that of a checkpoint has its own K."""
         return 1.0 / len(self.full_plan.mpis) if self.shares_depth else 1.0
 
     def forget_shares(self) -> None:
-        """What was baked no longer holds: the field is about to be trained."""
+        """Drops baked data, because the field is about to be trained."""
         for name in ("shares", "baked"):
             self._packed.pop((name, self.density.device), None)
 
@@ -158,7 +158,7 @@ class MMPIField(TexelTables):
 
         Args:
             ray_samples: merged samples.
-            head_counts: how many are of each head, where it is known (``MergeReport``).
+            head_counts: samples of each head, if known (``MergeReport``).
         """
         lookup = self._lookup(ray_samples, head_counts)
         if self.training and self.learns_cover and lookup.gathered is not None:
@@ -244,13 +244,13 @@ class MMPIField(TexelTables):
         composite: Composite,
         wanted: Bool[Tensor, "R"] | None = None,
     ) -> RayColors:
-        """What rays show.
+        """Colours of rays.
 
         Args:
             ray_samples: merged samples.
-            lookup: where they read the tables; None where no gradients are wanted.
+            lookup: where they read the tables; None without gradients.
             composite: weights of the samples.
-            wanted: the rays that colours are wanted of, as far as leaving others out saves time; None for all.
+            wanted: rays whose colours are needed; others may be left out to save time. None for all.
         """
         if not isinstance(self.networks, RayShader):
             lookup = lookup if lookup is None or wanted is None else lookup.of_rays(wanted)

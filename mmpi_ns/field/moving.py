@@ -1,6 +1,6 @@
-"""How samples move with their rays: what poses are refined by (docs/how_it_works.md, "Refined poses").
+"""Gradients of sample positions with respect to rays, for pose refinement (docs/how_it_works.md, "Refined poses").
 
-The march is free of gradients. A sample stays on the plane it was found on, so with its ray it moves within that plane:
+The march has no gradients. A sample stays on its plane, so it moves within that plane when its ray moves:
 
     u(w) = dx/dz + w (ox - oz dx/dz)
 
@@ -28,7 +28,7 @@ def moving(
     inverse_t: Float[Tensor, "N"],
     ndc: Float[Tensor, "N 3"],
 ) -> Float[Tensor, "N 3"]:
-    """The positions of samples as they are, to the bit, with gradients to the rays.
+    """The positions of samples, bit for bit unchanged, with gradients to the rays.
 
     Args:
         layout: of the scene.
@@ -38,7 +38,7 @@ def moving(
         heads: of each sample, rising: those of the cube come last.
         planes: of each sample.
         inverse_t: inverse distances of the samples.
-        ndc: where they are.
+        ndc: their positions.
     """
     count = len(heads) if layout.cube is None else int(torch.searchsorted(heads, len(layout.mpis)))
     parts = [_on_planes(layout, origins, directions, rays[:count], heads[:count], planes[:count])]
@@ -52,7 +52,7 @@ def moving(
 def _on_planes(
     layout: SceneLayout, origins: Tensor, directions: Tensor, rays: Tensor, heads: Tensor, planes: Tensor
 ) -> Float[Tensor, "N 3"]:
-    """NDC (u, v, .) at which rays cross planes, but for a constant."""
+    """NDC (u, v, .) at which rays cross planes, up to a constant."""
     frames = layout.frames
     o, d = rays_in_frames(origins, directions, frames)
     facing = d[..., 2:] > FACING_EPS  # where it is not there are no samples

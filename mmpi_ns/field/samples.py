@@ -1,4 +1,4 @@
-"""Merged samples: what the sampler knows about them and where the field looks them up."""
+"""Merged samples: their data from the sampler and their lookups in the field."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ class Taps:
     rows: Int[Tensor, "N B"]
     weights: Float[Tensor, "N B"]
     position: Int[Tensor, "N B"] | None = None
-    """Of each row among the batch's distinct rows, where gradients are wanted."""
+    """Index of each row among the batch's distinct rows, if gradients are needed."""
 
 
 @dataclass(frozen=True)
 class Gathered:
-    """The distinct rows that a batch reads. Gradients meet here, so that each row has one."""
+    """The distinct rows that a batch reads. Gradients are summed here, so that each row has one."""
 
     rows: Int[Tensor, "U"]
     density: Float[Tensor, "U 1"]
@@ -37,7 +37,7 @@ class Gathered:
 
 @dataclass(frozen=True)
 class Lookup:
-    """Where the valid samples of a merged batch read the tables. Samples are ordered by head, then by slot."""
+    """Lookups of the valid samples of a merged batch in the tables. Samples are ordered by head, then by slot."""
 
     shape: torch.Size
     """(R, S) of the batch."""
@@ -51,15 +51,15 @@ class Lookup:
     groups: list[Taps]
     """All MPIs together, then the cube."""
     gathered: Gathered | None
-    """What the groups read, where gradients are wanted."""
+    """Rows read by the groups, if gradients are needed."""
 
     @property
     def rays(self) -> Int[Tensor, "N"]:
         return self.index // self.shape[1]
 
     def of_rays(self, chosen: Bool[Tensor, "R"]) -> Lookup:
-        """The samples of the chosen rays, or all where picking them would wait for a GPU. Gathered rows stay those of
-        all rays."""
+        """The samples of the chosen rays, or of all rays if choosing would synchronise with a GPU. Gathered rows are
+        still those of all rays."""
         if dispatch.on_device(chosen) or bool(chosen.all()):
             return self
         wanted = chosen[self.rays].nonzero()[:, 0]
@@ -84,13 +84,13 @@ def head_spans(counts: Sequence[int]) -> list[tuple[int, slice]]:
 
 
 def metadata_of(ray_samples: RaySamples) -> dict[str, Tensor]:
-    """What the sampler knows about each merged sample (see ``MMPISampler``)."""
+    """Data of each merged sample from the sampler (see ``MMPISampler``)."""
     assert ray_samples.metadata is not None, "these samples do not come from MMPISampler"
     return ray_samples.metadata
 
 
 def places_of(ray_samples: RaySamples) -> Places:
-    """Where merged samples lie."""
+    """Positions of merged samples."""
     meta = metadata_of(ray_samples)
     return Places(meta["heads"][..., 0], meta["planes"][..., 0], meta["ndc"], meta["valid"][..., 0])
 
@@ -104,7 +104,7 @@ def by_head(
         heads: of every slot.
         valid: which slots hold a sample.
         num_heads: of the scene.
-        counts: how many samples each head has, where it is known; else a GPU is waited for.
+        counts: samples of each head, if known; otherwise this synchronises with a GPU.
     """
     if counts is not None:
         keys = torch.where(valid, heads, num_heads).reshape(-1)

@@ -1,7 +1,7 @@
-"""Shading: what a ray shows, from the texels along it.
+"""Shading: the colour of a ray from the texels along it.
 
-``ray``: a texel holds a diffuse colour and features of what it shows from elsewhere; both are gathered along the ray by
-rendering weights, and one network shades the ray once. ``sample``: a network colours every sample (the paper).
+``ray``: a texel stores a diffuse colour and features for view dependence; both are composited along the ray, and one
+network shades the ray once. ``sample``: a network gives every sample its colour (the paper).
 """
 
 from __future__ import annotations
@@ -19,20 +19,20 @@ from mmpi_ns.ops.gather import COLORS, RaySums
 from mmpi_ns.ops.shade.reference import positional_encoding
 
 Shading = Literal["ray", "sample"]
-"""Whether a network is asked once a ray or for every sample."""
+"""Whether the network is evaluated once a ray or for every sample."""
 
 
 CHANGE = 4.0
-"""Change of the logarithm of a colour's odds for each unit that the network says: a middle grey then changes by one."""
+"""Change of the log odds of a colour for each unit of network output: a middle grey then changes by one unit."""
 MOST_CHANGE = 8.0
 """Bound of that change."""
 LEAST_MASS = 1e-6
-"""Rays whose samples weigh less show next to nothing, whatever colour that is."""
+"""Rays with less accumulated weight are almost invisible, whatever their colour."""
 
 
 @dataclass(frozen=True)
 class RayColors:
-    """What rays show without a background, and the colours of the samples along them."""
+    """Colours of rays without a background, and of the samples along them."""
 
     rgb: Float[Tensor, "R 3"]
     mass: Float[Tensor, "R 1"]
@@ -44,18 +44,18 @@ class RayColors:
 
     @staticmethod
     def of_samples(composite: Composite, rgb: Float[Tensor, "R 3"], colors: Float[Tensor, "R S 3"]) -> RayColors:
-        """Those of samples with a colour each."""
+        """The sums for samples with a colour each."""
         weights = composite.weights.detach()[..., None]
         first, second = (weights * colors).sum(1), (weights * colors**2).sum(1)
         return RayColors(rgb, weights.sum(1), first, second)
 
     def of_rays(self, rays: Int[Tensor, "P"]) -> RayColors:
-        """Those of the chosen rays."""
+        """The sums of the chosen rays."""
         return RayColors(*(x.index_select(0, rays) for x in (self.rgb, self.mass, self.first, self.second)))
 
 
 class RayShader(Networks):
-    """One network (colour, features, PE(direction)) -> what the view changes in the colour that a ray has gathered.
+    """One network (colour, features, PE(direction)) -> view-dependent change of the composited colour of a ray.
 
     Args:
         channels: of a texel: three of the diffuse colour, the others features.
@@ -68,11 +68,11 @@ class RayShader(Networks):
         self.direction_frequencies = direction_frequencies
 
     def forward(self, sums: RaySums, composite: Composite, directions: Float[Tensor, "R 3"]) -> RayColors:
-        """What rays show.
+        """Colours of rays.
 
         Args:
-            sums: what they gathered.
-            composite: the weights that it was gathered by.
+            sums: composited colours and features.
+            composite: the weights used.
             directions: unit, world axes.
         """
         mass = composite.weights.sum(-1, keepdim=True)
@@ -91,7 +91,7 @@ class RayShader(Networks):
         Args:
             gathered: colours and features of the samples, times their weights.
             mass: the sum of those weights.
-            accumulation: what the rays hold back, with the samples that were dropped.
+            accumulation: of the rays, including the dropped samples.
             directions: unit, world axes.
         """
         mean = gathered / mass.clamp(min=LEAST_MASS)
@@ -100,10 +100,10 @@ class RayShader(Networks):
 
 
 def change_odds(color: Float[Tensor, "R 3"], said: Float[Tensor, "R 3"]) -> Float[Tensor, "R 3"]:
-    """Colours whose odds c / (1 - c) are e^change times those given: sigmoid(logit(c) + change), without the logit.
+    """Colours whose odds c / (1 - c) are multiplied by e^change: sigmoid(logit(c) + change), without the logit.
 
-    So black and white are colours like others, and gradients pass where a clipped sum would end them. The change is
-    ``CHANGE`` times what the network says, and bounded: larger factors would magnify the rounding of the colour.
+    Black and white need no special case, and gradients do not vanish as with a clipped sum. The change is ``CHANGE``
+    times the network output, and bounded, because larger factors would amplify the rounding of the colour.
     """
     factor = torch.exp(-MOST_CHANGE * torch.tanh(said * (CHANGE / MOST_CHANGE)))
     return color / (color + (1 - color) * factor)

@@ -27,17 +27,17 @@ RELEASED_DENSITY = -20.0
 TABLES = ("density", "features", "reliability")
 """The parameters that have a row for every texel."""
 ENOUGH_CROSSINGS = 32
-"""Samples of training rays for each brick that there must have been, on average, before any is given up."""
+"""Average number of training samples for each brick before any brick may be released."""
 
 
 class TexelTables(Field):
-    """Density, features and reliability of every texel that is stored.
+    """Density, features and reliability of all stored texels.
 
     Args:
         plan: frames and resolutions.
         feature_channels: channels of the colour features.
         factor: texels in use, as a share of the plan's.
-        views: training images; what none of them can reach is not stored. None stores everything.
+        views: training images; texels that none of them can reach are not stored. None stores all.
     """
 
     def __init__(
@@ -47,7 +47,7 @@ class TexelTables(Field):
         self.feature_channels = feature_channels
         self.full_plan = self.plan = plan
         self.factor = 1.0
-        """Share of the plan's texels in use: ``texel_factor``, where reading it does not wait for a device."""
+        """Fraction of the plan's texels in use: ``texel_factor`` on the host, readable without synchronising."""
         self.views = views
         self._packed: dict[Any, Any] = {}
         self.density = nn.Parameter(torch.empty(0, 1))
@@ -67,11 +67,11 @@ class TexelTables(Field):
         self.tiles: Tensor
         """Brick of every tile of all heads (``texels.py``)."""
         self.touched: Tensor
-        """Of every row: 1 where a training ray read it."""
+        """For every row: 1 if a training ray read it."""
         self.peak: Tensor
-        """Of every brick: the largest weight that a training sample had in it since the last look."""
+        """For every brick: the largest weight of a training sample in it since the last release."""
         self.crossings: Tensor
-        """Samples of training rays since the last look."""
+        """Training samples since the last release."""
         self.plan_bytes: Tensor
         self.texel_factor: Tensor
         self.build(plan, factor)
@@ -83,7 +83,7 @@ class TexelTables(Field):
 
     @property
     def num_bricks(self) -> int:
-        """Bricks that are stored, without the empty one."""
+        """Number of stored bricks, without the empty one."""
         return len(self.density) // BRICK - 1
 
     def cached(self, name: str, make: Any) -> Any:
@@ -94,16 +94,16 @@ class TexelTables(Field):
         return self._packed.setdefault(key, make()) if found is None else found
 
     def known(self, name: str) -> Any:
-        """What ``cached`` has made; None where it has not."""
+        """The result of ``cached``; None if there is none."""
         return self._packed.get((name, self.density.device))
 
     def build(self, plan: ScenePlan, factor: float, tiles: Int[Tensor, "T"] | None = None) -> None:
-        """Allocates all tables afresh for ``plan`` at ``factor`` times its texels. Parameters stay the same objects.
+        """Allocates new tables for ``plan`` at ``factor`` times its texels. Parameters stay the same objects.
 
         Args:
             plan: frames and resolutions.
             factor: texels in use, as a share of the plan's.
-            tiles: which are stored; None for those that training rays can reach.
+            tiles: tiles to store; None for those that training rays can reach.
         """
         self.full_plan, self.plan, self.factor = plan, plan.scaled(factor), factor
         device = self.density.device
@@ -137,7 +137,7 @@ class TexelTables(Field):
 
     @torch.no_grad()
     def note_use(self, lookup: Lookup, weights: Float[Tensor, "R S"], live: Int[Tensor, "R"]) -> None:
-        """Notes which bricks the samples of a training batch read and what those weighed, and how many there were."""
+        """Records the bricks, weights and number of the samples of a training batch."""
         weight = weights.reshape(-1)[lookup.index]
         for taps in lookup.groups:
             raise_peaks(self.peak, taps.rows, weight[taps.samples])
@@ -145,11 +145,11 @@ class TexelTables(Field):
 
     @torch.no_grad()
     def release_unused(self, least: float) -> Int[Tensor, "K"] | None:
-        """Gives up the bricks in which no training sample weighed ``least`` since the last look, and looks afresh.
+        """Releases the bricks in which no training sample had the weight ``least``, and resets the records.
 
         Returns:
-            Numbers that the bricks left had before (for ``TouchedAdam.keep_blocks``); None where nothing changed,
-            as when too few rays were seen to tell.
+            Previous numbers of the remaining bricks (for ``TouchedAdam.keep_blocks``); None if nothing changed, for
+            example because too few rays were seen.
         """
         enough = float(self.crossings) >= ENOUGH_CROSSINGS * self.num_bricks
         kept = self._keep(self.peak >= least) if enough else None
@@ -157,7 +157,7 @@ class TexelTables(Field):
         return kept
 
     def look_afresh(self) -> None:
-        """Forgets what was noted about the use of bricks."""
+        """Resets the records on the use of bricks."""
         self.peak = torch.zeros(self.num_bricks + 1, device=self.density.device)
         self.crossings = torch.zeros_like(self.crossings)
 
@@ -179,7 +179,7 @@ class TexelTables(Field):
         return kept
 
     def _forget(self) -> None:
-        """After a change of resolution."""
+        """Updates state after a change of resolution."""
         self._packed = {}
         self.look_afresh()
 
@@ -203,12 +203,12 @@ class TexelTables(Field):
 
 
 def _empty_value(name: str) -> float:
-    """What the empty brick holds."""
+    """Content of the empty brick."""
     return RELEASED_DENSITY if name == "density" else 0.0
 
 
 def _keep_empty_brick(grad: Tensor) -> Tensor:
-    """A table's gradient without the rows of the empty brick: samples beside a released tile read them as well."""
+    """A table's gradient without the rows of the empty brick, which samples next to a released tile read as well."""
     if not grad.is_sparse:
         return torch.cat([torch.zeros_like(grad[:BRICK]), grad[BRICK:]])
     rows, values = grad._indices(), grad._values()

@@ -1,1 +1,1 @@
-"""Where MPIs stand: observations, candidates, expected pixel errors, choice, plan."""
+"""Placement of MPIs: observations, candidates, expected pixel errors, choice, plan."""

@@ -1,4 +1,4 @@
-"""Image borders: MPIs are widened until some MPI holds the borders of every image, and a little beyond."""
+"""Image borders: MPIs are widened until the borders of every image, and a margin around them, lie in some MPI."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from mmpi_ns.placement.visibility import VisiblePoints
 from mmpi_ns.scene.plan import MPIPlan
 
 BEYOND = 0.05
-"""How far beyond an image's borders there should be texels, as a share of its sides: other views look there."""
+"""Margin around an image that should have texels, as a fraction of its sides, because other views look there."""
 WIDEST, FARTHEST = 3.0, 0.5
-"""No tangent is widened beyond the one, nor by more than the other: a border far from all MPIs would cost too much."""
+"""Limits on widened tangents, absolute and relative: a border far from all MPIs would cost too much."""
 
 
 def widened(mpis: list[MPIPlan], observations: Observations, visible: VisiblePoints) -> list[MPIPlan]:
-    """The MPIs, widened where the borders of an image are in none of them; texels keep their size.
+    """The MPIs, widened if the borders of an image lie in none of them; texels keep their size.
 
-    A border counts at the depths between which its points lie. Each border point that nothing holds goes to the MPI
-    that must grow least for it.
+    A border is tested at the depths between which the image's points lie. Each border point outside all MPIs is
+    assigned to the MPI that must grow least for it.
 
     Args:
         mpis: the chosen MPIs.
         observations: the training cameras.
-        visible: what they see.
+        visible: points that they see.
     """
     points = border_points(observations, visible)
     tangents, depths = _in_frames(mpis, points)

@@ -1,8 +1,8 @@
-"""Where MPIs and the cube might stand: a generous list, from which ``rule.py`` chooses.
+"""Candidates for MPIs and the cube: a generous list, from which ``rule.py`` chooses.
 
 Two kinds. *Views* are frusta of training cameras, some pulled back, some widened: seen from its own origin an MPI has
 no plane error and texels as fine as pixels. *Cubes* surround what the cameras look at from all round. (MPIs that face
-left, right, up or down from a camera's place were candidates too, and measured worse: docs/experiments.md.)
+left, right, up or down at a camera were candidates too, and measured worse: docs/experiments.md.)
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from mmpi_ns.placement.visibility import VisiblePoints
 from mmpi_ns.scene.plan import CubePlan, MPIPlan
 
 MAX_VIEWS, MAX_WIDE_VIEWS = 96, 32
-"""Training cameras that candidates start from, spread over all of them; fewer where wide lenses have several each."""
+"""Number of training cameras used for candidates, spread over all; fewer for wide lenses, which have several each."""
 FACES = ("front", "left", "right", "above", "below", "back")
-"""Ways that MPIs face where a wide camera stands; each holds what is seen most along it, and a little more."""
+"""Facing directions of MPIs at a wide camera; each covers the directions nearest to it, with a margin."""
 BESIDE = 0.9
 """Part of its largest component that a direction has along a face that holds it."""
 MARGINS = (1.12, 1.4, 1.75)
@@ -37,24 +37,24 @@ CUBE_SIZES = (0.4, 0.7, 1.0)
 
 @dataclass(frozen=True)
 class Candidate:
-    """A place for an MPI or a cube, of any fineness, and the expected errors there."""
+    """A candidate MPI or cube of any resolution, and its expected errors."""
 
     frame: MPIPlan | CubePlan
-    """Pose and extent; its planes and texels mean nothing yet."""
+    """Pose and extent; its planes and texels are not set yet."""
     rows: float
     """Rows (of a cube: voxels a side) if a texel spans one pixel, seen from where the MPI stands."""
     columns: float
     plane: NDArray[np.float32]
     """[Q] e_p of each observation with two planes, in pixels: with L planes it is plane / (L - 1)."""
     texel: NDArray[np.float32]
-    """[Q] e_t of each observation, relative to the pixels of a texel; inf where the candidate does not hold it."""
+    """[Q] e_t of each observation, relative to the pixels of a texel; inf if the candidate does not contain it."""
 
     def coarsest(self, max_voxels: int) -> float:
-        """Pixels that a texel spans at least: a cube may not have enough voxels for finer ones."""
+        """Minimum pixels that a texel spans: a cube may not have enough voxels for finer ones."""
         return self.rows / max_voxels if isinstance(self.frame, CubePlan) else 0.0
 
     def at(self, texel_pixels: float, planes: int, max_voxels: int) -> MPIPlan | CubePlan:
-        """The MPI or cube with texels of so many pixels."""
+        """The MPI or cube with texels of this many pixels."""
         if isinstance(self.frame, CubePlan):
             side = int(np.clip(round(self.rows / texel_pixels), 8, max_voxels))
             return replace(self.frame, shape=(side, side, side))
@@ -76,7 +76,7 @@ def find_candidates(observations: Observations, visible: VisiblePoints, with_cub
 
 
 def spread_cameras(observations: Observations, visible: VisiblePoints, wanted: int) -> list[int]:
-    """Cameras far apart in place or direction, each the farthest from those before it.
+    """Cameras far apart in position or direction, each the farthest from the previous ones.
 
     Starts at the camera farthest from the middle, so the numbering of the cameras does not matter.
     """
@@ -93,19 +93,19 @@ def spread_cameras(observations: Observations, visible: VisiblePoints, wanted: i
 
 @dataclass(frozen=True)
 class _Face:
-    """A way that MPIs may face where a camera stands."""
+    """A facing direction for MPIs at a camera."""
 
     name: str
     axes: Array
     """Rows right, down, facing, in world axes."""
     u: Array
-    """Least and largest tangent of what the camera sees there, to the right."""
+    """Smallest and largest tangent to the right that the camera sees there."""
     v: Array
     """The same downwards."""
 
 
 def _faces(observations: Observations, i: int) -> Iterator[_Face]:
-    """As the camera does, over what its lens sees; of a wide lens also to the sides of it, each over its part."""
+    """The direction of the camera, with the extent of its lens; for a wide lens also its sides, each with its part."""
     right, up, back = observations.camera_to_worlds[i, :, :3].T
     axes, name = np.stack([right, -up, -back]), f"view {i + 1}"
     if observations.lens is None:
@@ -127,7 +127,7 @@ def _faces(observations: Observations, i: int) -> Iterator[_Face]:
 def _views(
     observations: Observations, visible: VisiblePoints, i: int, face: _Face, pull_back: float
 ) -> Iterator[Candidate]:
-    """One MPI for each margin. They differ in extent alone, so the errors are worked out once, in the widest."""
+    """One MPI for each margin. They differ only in extent, so the errors are computed once, in the widest."""
     fx, fy = observations.intrinsics[i, :2]
     axes, u, v = face.axes, face.u, face.v
     origin = observations.centers[i] - pull_back * axes[2]
@@ -159,7 +159,7 @@ def _widened(u: Array, v: Array, margin: float) -> tuple[float, float, float, fl
 
 
 def _cubes(observations: Observations, visible: VisiblePoints) -> Iterator[Candidate]:
-    """Cubes around the point that the cameras look at; none where they look elsewhere.
+    """Cubes around the point that the cameras look at; none if there is no such point.
 
     Their voxels span the wanted number of pixels in the median over the observations inside.
     """
@@ -178,7 +178,7 @@ def _cubes(observations: Observations, visible: VisiblePoints) -> Iterator[Candi
 
 
 def _looked_at(observations: Observations) -> tuple[Array | None, float]:
-    """The point nearest to all viewing axes and its median distance; no point where most cameras do not face it."""
+    """The point nearest to all viewing axes and its median distance; no point if most cameras do not face it."""
     forward = -observations.camera_to_worlds[:, :, 2]
     across = np.eye(3) - forward[:, :, None] * forward[:, None, :]
     total = across.sum(0)

@@ -1,4 +1,4 @@
-"""What mmpi and mmpi-small place with: the rule's settings, and the rays of a whole training. Quick to import."""
+"""Placement defaults of mmpi and mmpi-small: settings and training rays. Quick to import."""
 
 from __future__ import annotations
 

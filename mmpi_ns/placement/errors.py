@@ -1,9 +1,9 @@
-"""Expected pixel errors of a plan: how far off a point can be drawn for lack of planes (e_p) or texels (e_t).
+"""Expected pixel errors of a plan: displacement of a point due to the spacing of planes (e_p) and texels (e_t).
 
-A point between two planes is drawn on one of them, up to half a spacing off in disparity; seen by a camera away from
-the MPI's origin that is a shift in the image. A texel seen from closer than the MPI's origin spans several pixels.
-Formulas for a camera parallel to the MPI are in docs/how_it_works.md; here the projection is differentiated instead,
-which holds for any pose.
+A point between two planes is represented on one of them, with an error of up to half a spacing in disparity; for a
+camera away from the MPI's origin that is a shift in the image. A texel seen from closer than the MPI's origin spans
+several pixels. Formulas for a camera parallel to the MPI are in docs/how_it_works.md; here the projection is
+differentiated instead, which holds for any pose.
 """
 
 from __future__ import annotations
@@ -17,21 +17,21 @@ from mmpi_ns.placement.observations import Array, Observations
 from mmpi_ns.scene.plan import CubePlan, MPIPlan, ScenePlan
 
 WORST = 64.0
-"""Pixels: what an observation costs that nothing holds; worse errors count no more than this."""
+"""Error in pixels of an observation that no head contains, and upper bound on all errors."""
 
 
 @dataclass(frozen=True)
 class PixelErrors:
-    """Errors of Q observations in K heads (MPIs, then the cube); inf where the head does not hold the point."""
+    """Errors of Q observations in K heads (MPIs, then the cube); inf if the head does not contain the point."""
 
     plane: Array
     """[Q, K] e_p: half a plane spacing, in pixels."""
     texel: Array
-    """[Q, K] e_t: the pixels that a texel spans, along the worse of its sides."""
+    """[Q, K] e_t: the pixels that a texel spans along its longer side."""
 
     @property
     def combined(self) -> Array:
-        """[Q, K] one figure for both: a sample lies at most e_p, and half a texel, away from where it belongs."""
+        """[Q, K] both combined: a sample is displaced by at most e_p and half a texel."""
         return np.hypot(self.plane, 0.5 * self.texel)
 
     @property
@@ -40,7 +40,7 @@ class PixelErrors:
         return self.combined.argmin(-1)
 
     def summary(self) -> dict[str, float]:
-        """Medians and 90th percentiles over the observations, each in the head that serves it best; share unserved."""
+        """Medians and 90th percentiles over the observations, each in its best head; fraction outside all heads."""
         rows = np.arange(len(self.plane))
         served = np.isfinite(self.combined.min(-1))
         result = {"unserved": float(1 - served.mean()) if len(rows) else 0.0}
@@ -52,7 +52,7 @@ class PixelErrors:
 
 
 def pixel_errors(plan: ScenePlan, observations: Observations, cameras: NDArray[np.int64], points: Array) -> PixelErrors:
-    """e_p and e_t of observed points in every head of a plan: its MPIs, then the cube where there is one.
+    """e_p and e_t of observed points in every head of a plan: its MPIs, then the cube if there is one.
 
     Args:
         plan: the MPIs and the cube.
@@ -70,7 +70,7 @@ def pixel_errors(plan: ScenePlan, observations: Observations, cameras: NDArray[n
 def mpi_errors(
     mpi: MPIPlan, observations: Observations, cameras: NDArray[np.int64], points: Array
 ) -> tuple[Array, Array]:
-    """(e_p, e_t) of observed points in one MPI, in pixels; inf where it does not hold the point."""
+    """(e_p, e_t) of observed points in one MPI, in pixels; inf if it does not contain the point."""
     plane, across, down = pixel_slopes(mpi, observations, cameras, points)
     u0, u1, v0, v1 = mpi.extent
     texel = np.maximum(across * (u1 - u0) / (mpi.width - 1), down * (v1 - v0) / (mpi.height - 1))
@@ -82,10 +82,10 @@ def pixel_slopes(
 ) -> tuple[Array, Array, Array]:
     """Pixels that an observed point moves per unit of its disparity, tangent u and tangent v in an MPI's frame.
 
-    Neither planes nor texels of the MPI enter, so that they can be chosen by the slopes.
+    Independent of the planes and texels of the MPI, which can be chosen by these slopes.
 
     Returns:
-        Three arrays [Q]; inf where the MPI does not hold the point.
+        Three arrays [Q]; inf if the MPI does not contain the point.
     """
     axes, origin = np.asarray(mpi.axes), np.asarray(mpi.origin)
     local = (points - origin) @ axes.T
@@ -112,7 +112,7 @@ def pixel_slopes(
         """Length in pixels of a unit step along one of (u, v, w)."""
         moved = direction[:, :2] / depth[:, None] + q[:, :2] * (direction[:, 2] / depth**2)[:, None]
         found = np.where(seen, np.linalg.norm(moved * focal, axis=-1), np.inf)
-        if wide.any():  # such lenses have as many pixels a degree at the borders as in the middle, about
+        if wide.any():  # such lenses have about as many pixels for each degree at the borders as in the middle
             some, size = direction[wide], np.linalg.norm(q[wide], axis=-1)
             turned = np.linalg.norm(np.cross(some, q[wide]), axis=-1) / np.maximum(size, 1e-12) ** 2
             found[wide] = np.where(inside[wide], turned * focal[wide].mean(-1), np.inf)

@@ -1,4 +1,4 @@
-"""Hand-made plans: the frozen rule for drives that automatic placement has to beat, and the paper's room."""
+"""Hand-made plans: a fixed arrangement for drives, as a baseline for automatic placement, and the paper's room."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def drive_plan(
     names: tuple[str, ...] = ("front", "left", "right", "below"),
     pull_back: float = 0.45,
 ) -> ScenePlan:
-    """Four MPIs along a straight drive, placed by hand in metres (frozen: the rule to beat).
+    """Four MPIs along a straight drive, placed by hand in metres (fixed, as a baseline).
 
     Args:
         observations: training cameras; the drive runs along their mean direction.
@@ -45,7 +45,7 @@ def drive_plan(
         height: texel rows of every MPI.
         width: texel columns of every MPI.
         names: which of the four to use.
-        pull_back: how far behind the first camera the front MPI stands, as a share of the travel.
+        pull_back: distance of the front MPI behind the first camera, as a fraction of the travel.
     """
     base = observations.mean_axes
     centers = observations.centers @ base.T

@@ -1,4 +1,4 @@
-"""What placement knows about a scene: training cameras, SfM points and who saw what. Plain float64 NumPy."""
+"""Input of placement: training cameras, SfM points and their keypoints. Plain float64 NumPy."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[np.float64]
 
 WIDE = 1.5
-"""Tangents beyond which a lens that squeezes its borders is wide: planes that face as the camera does hold too little
-of what it sees."""
+"""Tangent beyond which a lens that compresses its borders counts as wide: planes facing like the camera cover too
+little of its field of view."""
 SQUEEZED = 1.3
 """Such a lens sees farther than a pinhole of its focal length would, by this factor in tangents."""
 BEYOND_LENS = 0.05
@@ -21,7 +21,7 @@ BEYOND_LENS = 0.05
 
 @dataclass(frozen=True)
 class Observations:
-    """Training cameras and, where there is structure from motion, points and the pixels they were seen at."""
+    """Training cameras and, if there is structure from motion, points and their keypoints."""
 
     camera_to_worlds: Array
     """[M, 3, 4], OpenGL axes (x right, y up, z backwards), scene units."""
@@ -39,7 +39,7 @@ class Observations:
     """[S, 2] pixel (x, y) of the first S <= Q keypoints, those of SfM; the others come from a plane sweep."""
     lens: Array | None = None
     """[M, G, G, 3] unit directions, in camera axes, through a grid over each image from border to border, row after
-    row; None where all cameras are pinholes."""
+    row; None if all cameras are pinholes."""
 
     @staticmethod
     def of_cameras(camera_to_worlds: Array, intrinsics: ArrayLike, sizes: ArrayLike) -> Observations:
@@ -56,8 +56,8 @@ class Observations:
     def mean_axes(self) -> Array:
         """Rows x (right), y (down), z (facing) of the mean camera; gravity is the cameras' mean up vector.
 
-        Only sums of camera axes enter, so a rotated scene gives the rotated frame. Where the cameras look every way
-        the mean facing direction is ill-defined: the first camera's, made horizontal, stands in for it.
+        Only sums of camera axes are used, so a rotated scene gives the rotated frame. If the cameras look in all
+        directions, the mean is ill-defined, and the horizontal direction of the first camera is used instead.
         """
         up = _unit(self.camera_to_worlds[:, :, 1].mean(0))
         mean_facing = -self.camera_to_worlds[:, :, 2].mean(0)
@@ -70,7 +70,7 @@ class Observations:
 
     @cached_property
     def wide(self) -> NDArray[np.bool_]:
-        """[M] which cameras see farther to the sides than planes in front of them can hold."""
+        """[M] which cameras see farther to the sides than planes in front of them can cover."""
         if self.lens is None:
             return np.zeros(len(self.centers), dtype=bool)
         ahead = -self.lens[..., 2]

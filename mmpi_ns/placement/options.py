@@ -1,4 +1,4 @@
-"""Which values the options of placement can have."""
+"""Valid values of the options of placement."""
 
 from __future__ import annotations
 

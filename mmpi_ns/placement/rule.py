@@ -1,9 +1,9 @@
 """The placement rule: as many MPIs as lower the expected pixel error enough, each where it lowers it most.
 
 Greedy facility location (Nemhauser et al. 1978) over ``candidates.py``: every observation is served by the chosen head
-that shows it with the least expected error (``errors.py``), and the candidate that lowers the mean of log2(error) most
-for its texels is taken, until the next would add too little. Heads that later ones have made superfluous are put back.
-Then each MPI gets the planes that what it serves asks for, and is widened where there would be holes (``borders.py``).
+with the smallest expected error for it (``errors.py``), and the candidate that lowers the mean of log2(error) most for
+its texels is added, until the next would add too little. Heads that have become superfluous are removed. Then each MPI
+gets the planes that its observations need, and is widened where there would be holes (``borders.py``).
 """
 
 from __future__ import annotations
@@ -29,28 +29,28 @@ BUDGET_ROUNDS = 8
 
 @dataclass
 class PlacementConfig:
-    """Where the MPIs stand and how fine they are."""
+    """Placement and resolution of the MPIs."""
 
     arrangement: Literal["automatic", "drive", "room"] = "automatic"
-    """automatic: what the scene needs; drive: front, left, right, below; room: five around the centre."""
+    """automatic: by the expected pixel error; drive: front, left, right, below; room: five around the centre."""
     max_mpis: int = 64
-    """No more MPIs than this (automatic)."""
+    """Maximum number of MPIs (automatic)."""
     max_texels: float = 16e6
-    """Texels and voxels in all, about: beyond, all of them are made larger; 0 for no limit (automatic)."""
+    """Approximate maximum of texels and voxels in total; texels are made larger to meet it; 0: no limit (automatic)."""
     min_gain: float = 1.5
-    """Bits: a further MPI must halve the expected error of one training image's points this often (automatic)."""
+    """Minimum gain of an MPI in bits: how often it must halve the expected error of one training image (automatic)."""
     planes: int = 64
     """Planes of every MPI (drive, room)."""
     max_planes: int = 128
-    """Planes of an MPI at most; each gets those that the points it serves need (automatic)."""
+    """Maximum planes of an MPI; each gets as many as the points it serves need (automatic)."""
     plane_pixels: float = 0.5
-    """Error for lack of planes to allow four fifths of what an MPI serves, relative to a texel's pixels (automatic)."""
+    """Plane error allowed for four fifths of the points of an MPI, relative to a texel's pixels (automatic)."""
     texel_pixels: float = 1.5
-    """Image pixels that a texel spans, seen from where the MPI stands (automatic)."""
+    """Image pixels that a texel spans, seen from the origin of the MPI (automatic)."""
     rays_per_texel: float = 2.5
-    """Training rays that a texel's footprint should get: a short run on large images gets larger texels (automatic)."""
+    """Training rays for the footprint of a texel: a short run on large images gets larger texels (automatic)."""
     texels_per_ray: float = 8.0
-    """Texels in all for each training ray at most: more than it can train fit the noise; 0: no limit (automatic)."""
+    """Maximum texels for each training ray, in total: more would overfit; 0: no limit (automatic)."""
     height: int = 96
     """Texel rows of every MPI (drive, room)."""
     width: int = 256
@@ -58,15 +58,15 @@ class PlacementConfig:
     enough: float = 0.85
     """Expected error that needs no further MPI, relative to a texel's pixels (automatic)."""
     texel_cost: float = 0.5
-    """How much texels count against a candidate: its gain is divided by texels to this power (automatic)."""
+    """Cost of texels: the gain of a candidate is divided by its texels to this power (automatic)."""
     max_voxels: int = 0
-    """Voxels along a side of a cube at most, where one is worth it; 0 for none (automatic)."""
+    """Maximum voxels along a side of a cube, if it lowers the expected error; 0: no cube (automatic)."""
     window_length: float = 5.0
-    """A longer capture is split into windows of this length, in median distances of what was seen; 0: never."""
+    """Longer captures are split into windows of this length, in median distances of the content; 0: never."""
     faces: tuple[str, ...] = ("front", "left", "right", "below")
     """Which MPIs of the drive to use (drive)."""
     drive_pull_back: float = 0.45
-    """How far behind the first camera the front MPI stands, as a share of the travel (drive)."""
+    """Distance of the front MPI behind the first camera, as a fraction of the travel (drive)."""
     cube_voxels: int = 0
     """Voxels along each side of the centred cube; 0 for none (room)."""
 
@@ -77,7 +77,7 @@ def place(observations: Observations, config: PlacementConfig, training_rays: in
     Args:
         observations: training cameras and what they saw.
         config: the rule's settings.
-        training_rays: pixel rays of the whole training, where known: texels are no finer than those can train.
+        training_rays: pixel rays of the whole training, if known: texels are no finer than these can train.
 
     Raises:
         ValueError: the cameras leave nothing to place, e.g. all observations are behind their cameras.
@@ -100,7 +100,7 @@ def place(observations: Observations, config: PlacementConfig, training_rays: in
 
 
 def trainable_texel(observations: Observations, config: PlacementConfig, training_rays: int | None) -> float:
-    """Pixels that a texel must span to get ``rays_per_texel`` of the training's rays; 0 where those are not known."""
+    """Pixels that a texel must span to get ``rays_per_texel`` of the training's rays; 0 if these are not known."""
     if training_rays is None:
         return 0.0
     rays_per_pixel = training_rays / float(observations.sizes.prod(-1).sum())
@@ -116,7 +116,7 @@ def affordable_texels(config: PlacementConfig, training_rays: int | None) -> flo
 def _choose(
     observations: Observations, visible: VisiblePoints, config: PlacementConfig, texel_pixels: float
 ) -> list[MPIPlan | CubePlan]:
-    """The heads that a scene needs, with texels no finer than the budget allows."""
+    """The heads for a scene, with texels no finer than the budget allows."""
     candidates = find_candidates(observations, visible, with_cubes=config.max_voxels > 0)
     best: list[MPIPlan | CubePlan] | None = None
     chosen: list[MPIPlan | CubePlan] = []
@@ -133,13 +133,13 @@ def _choose(
             texel_pixels = (too_fine * texel_pixels) ** 0.5
         else:
             too_fine = texel_pixels
-            # Coarser texels have fewer rows and columns and ask for fewer planes: a third power, nearly.
+            # Coarser texels mean fewer rows, columns and planes: nearly a third power.
             texel_pixels *= max(1.04, excess ** (1 / 3)) if best is None else 1.1
     return chosen if best is None else best
 
 
 class _Choice:
-    """Greedy choice among candidates, by what each costs every observation."""
+    """Greedy choice among candidates, by the cost of every observation in each."""
 
     def __init__(
         self, candidates: list[Candidate], weights: NDArray[np.float64], config: PlacementConfig, texel_pixels: float
@@ -166,12 +166,12 @@ class _Choice:
         return [self._head(self.candidates[j], self._planes(j, owner == n)) for n, j in enumerate(chosen)]
 
     def _total(self, chosen: list[int]) -> float:
-        """Expected error that is left, in bits, summed over images."""
+        """Remaining expected error, in bits, summed over images."""
         served = np.minimum(self.nothing, self.cost[chosen].min(0)) if chosen else self.nothing
         return float(served @ self.weights)
 
     def _next(self, chosen: list[int]) -> int | None:
-        """The candidate that gains most for its texels; None where none gains enough. The first must be an MPI."""
+        """The candidate with the largest gain for its texels; None if none gains enough. The first must be an MPI."""
         served = np.minimum(self.nothing, self.cost[chosen].min(0)) if chosen else self.nothing
         gain = np.maximum(served - self.cost, 0) @ self.weights
         if not chosen:  # a scene needs an MPI, however little it gains
@@ -182,7 +182,7 @@ class _Choice:
         return int(np.where(allowed, gain / self.price, -1.0).argmax()) if allowed.any() else None
 
     def _without_superfluous(self, chosen: list[int]) -> list[int]:
-        """Leaves out, one by one, heads whose absence costs less than the least gain that counts."""
+        """Removes, one by one, heads whose absence costs less than the minimum gain."""
         while True:
             total = self._total(chosen)
             losses = [self._total([c for c in chosen if c != j]) - total for j in chosen]
@@ -194,7 +194,7 @@ class _Choice:
             chosen = [j for n, j in enumerate(chosen) if n != least]
 
     def _planes(self, j: int, own: NDArray[np.bool_]) -> int:
-        """Planes at which four fifths of what candidate j serves best err little enough."""
+        """Planes at which the error of four fifths of the observations served by candidate j is small enough."""
         error = self.candidates[j].plane[own]
         error = error[np.isfinite(error)]
         wanted = float(np.quantile(error, 0.8)) / (self.config.plane_pixels * self.texel_pixels) if len(error) else 0.0
@@ -204,7 +204,7 @@ class _Choice:
         return candidate.at(self.texel_pixels, planes, self.config.max_voxels)
 
     def _bits(self, candidate: Candidate) -> NDArray[np.float32]:
-        """log2 of the expected pixel errors over what is small enough: what each observation costs if served here."""
+        """Cost of each observation if served here: log2 of the expected pixel error over ``enough``."""
         enough = self.config.enough * self.texel_pixels
         size = max(self.texel_pixels, candidate.coarsest(self.config.max_voxels))
         plane, texel = candidate.plane / (self.config.max_planes - 1), 0.5 * size * candidate.texel
@@ -213,5 +213,5 @@ class _Choice:
 
 
 def _named(mpis: tuple[MPIPlan, ...]) -> tuple[MPIPlan, ...]:
-    """Names that differ where two MPIs stand at one camera."""
+    """Unique names, also if two MPIs are placed at one camera."""
     return tuple(replace(m, name=f"{m.name} ({i})") for i, m in enumerate(mpis))

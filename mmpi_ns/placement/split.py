@@ -1,4 +1,4 @@
-"""Splits a long capture into windows: balls of neighbouring cameras, placed each by itself."""
+"""Splits a long capture into windows: balls of neighbouring cameras, each placed separately."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from mmpi_ns.placement.visibility import find_visible_points
 from mmpi_ns.scene.windows import Window, WindowedPlan
 
 MARGIN = 0.08
-"""Distance over which a window's part falls off, as a share of the windows' length."""
+"""Distance over which the share of a window falls off, as a fraction of the windows' length."""
 FEWEST = 4
-"""Training cameras that a window needs; fewer join the window beside them."""
+"""Minimum training cameras of a window; smaller ones are merged with their neighbours."""
 SLACK = 1.1
-"""Windows may be longer than asked by this factor."""
+"""Windows may be longer than configured by this factor."""
 ROUNDS = 50
 """Rounds of moving windows to the middle of their cameras."""
 
@@ -25,12 +25,12 @@ ROUNDS = 50
 def place_windows(
     observations: Observations, config: PlacementConfig, training_rays: int | None = None
 ) -> WindowedPlan:
-    """A plan for each stretch of a capture; one for the whole of a short one.
+    """A plan for each window of a capture; a single one for a short capture.
 
     Args:
         observations: training cameras and what they saw.
         config: the rule's settings; budgets are those of one window.
-        training_rays: pixel rays of one window's training, where known.
+        training_rays: pixel rays of one window's training, if known.
 
     Raises:
         ValueError: the cameras leave nothing to place.
@@ -50,7 +50,7 @@ def find_balls(observations: Observations, length: float) -> list[tuple[Array, f
 
     Args:
         observations: the cameras.
-        length: how long a window may be, in median distances of what the cameras saw.
+        length: maximum length of a window, in median distances of the content.
     """
     visible = find_visible_points(observations)
     longest = length * float(np.median(np.linalg.norm(visible.points - observations.centers[visible.cameras], axis=-1)))
@@ -67,7 +67,7 @@ def find_balls(observations: Observations, length: float) -> list[tuple[Array, f
 
 
 def cameras_of(window: Window, observations: Observations) -> Observations:
-    """What the cameras saw that ask a window, fully or in part; its placement and its training rest on these."""
+    """Observations of the cameras with a share in a window, which its placement and training use."""
     if window.radius == np.inf:
         return observations
     middle = np.asarray(window.center)
@@ -75,12 +75,12 @@ def cameras_of(window: Window, observations: Observations) -> Observations:
 
 
 def cameras_in(centers: Array, middle: Array, radius: float) -> NDArray[np.int64]:
-    """Cameras in a ball; all where it has no end."""
+    """Cameras in a ball; all if its radius is infinite."""
     return np.nonzero(np.linalg.norm(centers - middle, axis=-1) < radius)[0]
 
 
 def of_cameras(observations: Observations, cameras: NDArray[np.int64]) -> Observations:
-    """What some of the cameras saw. Points keep their numbers."""
+    """Observations of some of the cameras. Points keep their numbers."""
     number = np.full(len(observations.centers), -1)
     number[cameras] = np.arange(len(cameras))
     keep = number[observations.seen_by] >= 0
@@ -97,7 +97,7 @@ def of_cameras(observations: Observations, cameras: NDArray[np.int64]) -> Observ
 
 
 def _spread_out(centers: Array, spread: Array, radius: float) -> Array:
-    """Cameras so far apart that balls of ``radius`` about them hold all (farthest-point traversal, Gonzalez 1985)."""
+    """Cameras such that balls of ``radius`` around them contain all (farthest-point traversal, Gonzalez 1985)."""
     chosen = [int(spread.argmax())]
     distance = np.linalg.norm(centers - centers[chosen[0]], axis=-1)
     while distance.max() > radius:
@@ -107,7 +107,7 @@ def _spread_out(centers: Array, spread: Array, radius: float) -> Array:
 
 
 def _fewest(centers: Array, start: Array, radius: float) -> Array:
-    """The fewest of ``start``, moved to the middle of their cameras, whose balls are hardly larger than ``radius``."""
+    """As few of ``start`` as possible, moved to the middle of their cameras; balls hardly larger than ``radius``."""
     low, high = 1, len(start)  # farthest points are at most twice as many as are needed
     best = _settled(centers, start)
     while low < high:
@@ -121,7 +121,7 @@ def _fewest(centers: Array, start: Array, radius: float) -> Array:
 
 
 def _settled(centers: Array, middles: Array) -> Array:
-    """Every ball in the middle of the cameras nearest to it (Lloyd)."""
+    """Moves every ball to the middle of the cameras nearest to it (Lloyd)."""
     for _ in range(ROUNDS):
         owner = _nearest(centers, middles)
         moved = np.stack([_middle(centers[owner == i]) for i in range(len(middles)) if (owner == i).any()])
@@ -136,12 +136,12 @@ def _nearest(centers: Array, middles: Array) -> NDArray[np.int64]:
 
 
 def _middle(points: Array) -> Array:
-    """Centre of the box about points: balls about it are smaller than about their mean."""
+    """Centre of the bounding box of points: balls around it are smaller than around their mean."""
     return (points.min(0) + points.max(0)) / 2
 
 
 def _without_small(centers: Array, middles: Array) -> Array:
-    """Leaves out, smallest first, windows of too few cameras; neighbours take those over."""
+    """Removes, smallest first, windows with too few cameras; neighbours take these over."""
     while len(middles) > 1:
         counts = np.bincount(_nearest(centers, middles), minlength=len(middles))
         if counts.min() >= FEWEST:
@@ -151,7 +151,7 @@ def _without_small(centers: Array, middles: Array) -> Array:
 
 
 def _along(middles: Array) -> list[int]:
-    """An order in which neighbours follow each other: from the one farthest from all, always on to the nearest."""
+    """An order in which neighbours follow each other: from the one farthest from all others, always to the nearest."""
     left = list(range(len(middles)))
     order = [int(np.linalg.norm(middles - middles.mean(0), axis=-1).argmax())]
     left.remove(order[0])

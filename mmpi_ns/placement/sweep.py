@@ -1,7 +1,7 @@
 """A quick plane sweep: rough points for scenes that come with poses but without structure from motion.
 
-Placement needs to know the depths roughly, no more. Some views are compared with their neighbours over a range
-of disparities at low resolution; pixels with one clear match become points. A few seconds.
+Placement needs only rough depths. Some views are compared with their neighbours over a range of disparities at low
+resolution; pixels with one clear match become points. Takes a few seconds.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from mmpi_ns.placement.observations import Array, Observations
 HYPOTHESES = 64
 WINDOW = 7
 MIN_SCORE = 0.85
-"""Correlation that a match must reach."""
+"""Minimum correlation of a match."""
 MIN_MARGIN = 0.08
-"""By how much it must beat every match at another depth."""
+"""Minimum lead over every match at another depth."""
 
 
 @dataclass(frozen=True)

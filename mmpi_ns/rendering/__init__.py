@@ -1,1 +1,1 @@
-"""From rays to pictures: sampling and merging, windows on disk, image metrics."""
+"""From rays to images: sampling and merging, windows on disk, image metrics."""

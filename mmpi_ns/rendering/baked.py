@@ -1,4 +1,4 @@
-"""A baked window: a field in bricks of 8-bit codes with the network that shades its rays, and the images it gives."""
+"""A baked window: a field as bricks of 8-bit codes with the network that shades its rays, and its rendering."""
 
 from __future__ import annotations
 
@@ -37,17 +37,17 @@ from mmpi_ns.scene.texels import SIDE as STORED_SIDE
 from mmpi_ns.scene.texels import TexelGrid
 
 THINNEST = -12.0
-"""Raw density that the code 0 stands for at least: softplus of it is 6e-6."""
+"""Lower bound on the raw density of code 0; its softplus is 6e-6."""
 HIGHEST_COLOR, HIGHEST_FEATURE = 191, 96
-"""Largest codes of a channel of diffuse colour and of one of a feature. With 255 for both 0.0003 of SSIM are lost and a
-fifth more is to be loaded, with these 0.0007, with 127 for both 0.0011 at this size (docs/export.md)."""
+"""Largest codes of a colour channel and of a feature. These lose 0.0007 of SSIM; 255 for both loses 0.0003 and is a
+fifth larger, 127 for both loses 0.0011 (docs/export.md)."""
 
 _measuring: ContextVar[bool] = ContextVar("measuring", default=False)
 
 
 @contextmanager
 def exact_images() -> Iterator[None]:
-    """Inside, images of this thread are the field's own and not its bricks', where ``render auto`` has the choice."""
+    """Inside, ``render auto`` uses the exact renderer for images of this thread."""
     token = _measuring.set(True)
     try:
         yield
@@ -56,7 +56,7 @@ def exact_images() -> Iterator[None]:
 
 
 def suits_bricks(model_field: MMPIField) -> bool:
-    """Whether ``render auto`` shows a field that does not train by its bricks: compiled, on a CPU, not measured."""
+    """Whether ``render auto`` uses bricks for a field that is not training: compiled, on a CPU, not for metrics."""
     wanted = not _measuring.get() and not torch.is_grad_enabled()
     compiled = dispatch.form_of("march_baked", model_field.features.data) == "cpu"
     return wanted and compiled and not why_not_baked(model_field)
@@ -64,13 +64,13 @@ def suits_bricks(model_field: MMPIField) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class BakedWindow:
-    """What one window shows, ready to render."""
+    """One baked window, ready to render."""
 
     mpis: BakedMpis
     shader: Shader
     ray_near: float
     threshold: float
-    """Samples of less weight are not gathered."""
+    """Samples of less weight are not shaded."""
     background: float = 0.5
     """Grey level behind everything."""
     farthest: float = 1e3
@@ -84,7 +84,7 @@ class BakedWindow:
         fars: Float[Tensor, "R 1"],
         background: Float[Tensor, "3"],
     ) -> dict[str, Tensor]:
-        """rgb, accumulation, depth, winning MPI and dropped mass of rays, as the model gives them."""
+        """rgb, accumulation, depth, winning MPI and dropped mass of rays, like those of the model."""
         found = march_baked(self.mpis, origins, directions, nears, fars, self.threshold)
         rgb = shade_baked(self.shader, found.sums, found.mass, directions)
         rgb = torch.where(found.mass > 0, rgb, 0.0)
@@ -97,14 +97,14 @@ class BakedWindow:
         }
 
     def outputs(self, bundle: RayBundle, background: Float[Tensor, "3"]) -> dict[str, Tensor]:
-        """The same of a bundle with nears and fars on any device: bricks are read on the CPU."""
+        """The same for a bundle with nears and fars on any device; bricks are read on the CPU."""
         assert bundle.nears is not None and bundle.fars is not None
         rays = (bundle.origins, bundle.directions, bundle.nears, bundle.fars, background)
         outputs = self.render(*(x.cpu() for x in rays))
         return {name: values.to(bundle.origins.device) for name, values in outputs.items()}
 
     def keep(self, kept: Bool[Tensor, "B"]) -> BakedWindow:
-        """The same with some of the bricks alone."""
+        """The same window with only some of the bricks."""
         mpis, columns, first = self.mpis, [], 0
         for k, mpi in enumerate(mpis.mpis):
             start = mpis.first_column(k)
@@ -117,7 +117,7 @@ class BakedWindow:
 
 
 def why_not_baked(model_field: MMPIField) -> str:
-    """Why a field cannot be baked, and how to train one that can; empty where it can."""
+    """Why a field cannot be baked, and how to train one that can; empty if it can."""
     if not isinstance(model_field.networks, RayShader):
         return "A model whose samples are coloured one by one cannot be baked: train with --pipeline.model.shading ray."
     if model_field.cube is not None:
@@ -137,16 +137,16 @@ def shader_of(network: RayShader) -> Shader:
 
 @torch.no_grad()
 def bake(model_field: MMPIField, threshold: float, background: float, form: BlendForm | None = None) -> BakedWindow:
-    """A field as bricks of 8-bit codes: all that hold something.
+    """A field as bricks of 8-bit codes: all that are not empty.
 
     Args:
         model_field: what to bake.
-        threshold: samples of less weight will not be gathered.
+        threshold: samples of less weight will not be shaded.
         background: grey level behind everything.
-        form: how reliability enters, for which texels keep their blended optical depth; None where it takes no part.
+        form: form of blending by reliability, of which texels keep the optical depths; None without reliability.
 
     Raises:
-        ValueError: the field has a cube, too many channels, or colours its samples one by one.
+        ValueError: the field has a cube, too many channels, or a network for every sample.
     """
     if refusal := why_not_baked(model_field):
         raise ValueError(refusal)
@@ -195,7 +195,7 @@ def _all_planes(model_field: MMPIField) -> Iterator[tuple[int, slice]]:
 def _raw(
     model_field: MMPIField, k: int, planes: slice, form: BlendForm | None, shares: Tensor | None
 ) -> Float[Tensor, "P H W"]:
-    """Raw densities with the planes' biases, such that softplus gives what a sample at a texel weighs when blended."""
+    """Raw densities including the biases of the planes, whose softplus gives the blended optical depth."""
     grid = model_field.grids[k]
     raw = read_planes(model_field.density.data, grid, planes)[..., 0] + model_field.layout.biases[k][planes, None, None]
     if form is None or shares is None:
@@ -209,7 +209,7 @@ def _raw(
 
 
 def _channel_codes(model_field: MMPIField) -> tuple[Codes, ...]:
-    """Ranges of the channels: all that there is."""
+    """Ranges of the channels, over all texels."""
     values = model_field.features.data
     highest = [HIGHEST_COLOR] * COLORS + [HIGHEST_FEATURE] * (values.shape[1] - COLORS)
     bounds = zip(values.amin(0).tolist(), values.amax(0).tolist(), highest, strict=True)

@@ -1,4 +1,4 @@
-"""Images in chunks of rays: as many at once as suit the caches of a CPU, or as fit into the memory of a GPU."""
+"""Images in chunks of rays, sized for the caches of a CPU or the memory of a GPU."""
 
 from __future__ import annotations
 
@@ -14,27 +14,27 @@ from torch import Tensor
 from mmpi_ns.utils.errors import InputError
 
 CPU_RAYS = 4096
-"""Their samples stay in the caches' reach and below what the C library gives back to the system after each use."""
+"""Their samples fit the caches and stay below the size that the C library returns to the system after each use."""
 SHOWN_RAYS = 4 * CPU_RAYS
-"""On a CPU where pictures are made in one pass that keeps nothing of the samples (``ops.show``)."""
+"""On a CPU if images are made in one pass without arrays of samples (``ops.show``)."""
 GPU_RAYS = 1 << 20
-"""A frame of 1242 x 375, or half of one of 1920 x 1080, in one go."""
+"""A frame of 1242 x 375, or half of one of 1920 x 1080, in one chunk."""
 BYTES_PER_SAMPLE = 128
-"""What rendering holds at its peak for every plane that a ray may cross: where it is hit, what is kept, its colour."""
+"""Peak bytes for every plane that a ray may cross: hits, kept samples, colours."""
 BYTES_PER_SLOT = 40
-"""What one compiled pass holds for every sample that a ray may keep."""
+"""Bytes of one compiled pass for every sample that a ray may keep."""
 FREE_SHARE = 0.5
-"""Of the device's free memory; the rest is for what else runs there."""
+"""Fraction of the device's free memory; the rest is left to other programs."""
 
 
 def rays_per_chunk(samples_per_ray: int, device: torch.device, kept_in_one_pass: int | None = None) -> int:
-    """Rays of a chunk where no number is asked for.
+    """Rays of a chunk if none is configured.
 
     Args:
-        samples_per_ray: samples that a ray has at most: the planes of all MPIs and the steps through the cube.
+        samples_per_ray: maximum samples of a ray: the planes of all MPIs and the steps through the cube.
         device: where they are rendered.
-        kept_in_one_pass: how many of them a ray can keep, where pictures are made in one compiled pass (``ops.show``),
-            which holds nothing of the others; None where they are made step by step.
+        kept_in_one_pass: how many of them a ray can keep, if images are made in one compiled pass (``ops.show``), which
+            stores nothing of the others; None if they are made step by step.
 
     Returns:
         A power of two; on a GPU from ``CPU_RAYS`` to ``GPU_RAYS``.
@@ -48,8 +48,8 @@ def rays_per_chunk(samples_per_ray: int, device: torch.device, kept_in_one_pass:
 
 
 def check_crop(box: OrientedBox | None) -> None:
-    """Raises InputError where a crop has no size. Not so in the viewer, whose render thread an error would end while
-    somebody types a size: there it shows the background."""
+    """Raises InputError if a crop has no size. In the viewer an error would end the render thread while the user types
+    a size, so the background is shown there instead."""
     if box is not None and not bool((box.S > 0).all()) and current_thread() is main_thread():
         raise InputError(
             f"The crop box has no size (its sides are {[round(float(s), 6) for s in box.S]}): give crop_scale "
@@ -60,7 +60,7 @@ def check_crop(box: OrientedBox | None) -> None:
 def render_in_chunks(
     bundle: RayBundle, size: int, device: torch.device, render: Callable[[RayBundle], dict[str, Tensor]]
 ) -> dict[str, Tensor]:
-    """Outputs [H, W, C] of an image's rays [H, W], rendered ``size`` at a time, on the device where the rays are.
+    """Outputs [H, W, C] of an image's rays [H, W], rendered ``size`` at a time, on the device of the rays.
 
     nerfstudio's own loop reads the size from the config, which threads share.
 

@@ -1,8 +1,8 @@
-"""Poses of test images refined against a trained model: how it scores where poses are not exact.
+"""Poses of test images refined against a trained model, to score it if poses are not exact.
 
-A model whose training poses were wrong, or were refined, agrees with test poses only as far as those are right. So each
-test image's own pose is moved to where the frozen model shows the image best: six numbers of an image, by the colours
-of the very pixels that are then scored. It is no view synthesis score, and is said beside the plain one, never instead.
+If the training poses were wrong, or were refined, the model does not match the given test poses exactly. So the pose of
+each test image is optimised with the frozen model: six numbers for an image, by the colours of the same pixels that are
+then scored. This is not a score of view synthesis, and is reported in addition to the plain one, never instead.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from mmpi_ns.utils.errors import InputError
 from mmpi_ns.utils.random_draws import generator
 
 STEPS = 80
-"""Of the descent, for each image."""
+"""Optimisation steps for each image."""
 RAYS = 1024
 """Pixels of each step."""
 RATES = (2e-3, 5e-5)
@@ -27,7 +27,7 @@ RATES = (2e-3, 5e-5)
 
 
 def refined_camera(model: Any, camera: Cameras, image: Tensor, seed: int) -> tuple[Cameras, float, float]:
-    """A camera moved to where a frozen model shows its image best.
+    """A camera moved to the pose from which a frozen model renders its image best.
 
     Args:
         model: ``MMPIModel``, in evaluation.
@@ -36,7 +36,7 @@ def refined_camera(model: Any, camera: Cameras, image: Tensor, seed: int) -> tup
         seed: of the draw of pixels.
 
     Returns:
-        The moved camera, by how many degrees it turned, and how far it moved in scene units.
+        The moved camera, its rotation in degrees, and its translation in scene units.
 
     Raises:
         InputError: the model renders what has no gradients.

@@ -1,4 +1,4 @@
-"""Image metrics: PSNR, SSIM, and LPIPS where its weights can be had."""
+"""Image metrics: PSNR, SSIM, and LPIPS if its weights are available."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from torch import Tensor, nn
 from torchmetrics.functional.image import structural_similarity_index_measure
 
 MOST_SORTED = 1 << 20
-"""Pixels from which the brightness of a depth picture follows; torch finds quantiles of no more than 16.7 M."""
+"""Pixels used for the brightness range of a depth image; torch computes quantiles of at most 16.7 M."""
 
 
 class ImageMetrics:
-    """Metrics of a rendered image. LPIPS fetches its weights on first use; without them it is left out, and says so."""
+    """Metrics of a rendered image. LPIPS downloads its weights on first use and is left out without them."""
 
     def __init__(self, lpips_net: Literal["vgg", "alex", "none"]) -> None:
         self.lpips_net: Literal["vgg", "alex", "none"] = lpips_net
@@ -53,8 +53,7 @@ class ImageMetrics:
 
 
 def depth_metrics(predicted: Float[Tensor, "H W 1"], true: Float[Tensor, "H W 1"]) -> dict[str, float]:
-    """Error of rendered distances relative to the true ones, where those are known: its median, and the share over
-    a tenth."""
+    """Relative error of rendered distances where the true ones are known: median, and fraction above a tenth."""
     known = true > 0
     if not bool(known.any()):
         return {}
@@ -63,7 +62,7 @@ def depth_metrics(predicted: Float[Tensor, "H W 1"], true: Float[Tensor, "H W 1"
 
 
 def pictures(observed: Float[Tensor, "H W 3"], outputs: dict[str, Tensor], num_heads: int) -> dict[str, Tensor]:
-    """What is worth looking at of a rendered image, in colours."""
+    """Images for display of a rendered image."""
     near = 1 / outputs["depth"].clamp(min=1e-9)
     some = near.flatten()[:: 1 + near.numel() // MOST_SORTED]
     return {
@@ -75,6 +74,6 @@ def pictures(observed: Float[Tensor, "H W 3"], outputs: dict[str, Tensor], num_h
 
 
 def head_palette(count: int, device: torch.device | str) -> Float[Tensor, "H 3"]:
-    """Distinct colours, one a head."""
+    """Distinct colours, one for each head."""
     hue = torch.arange(count, dtype=torch.float32, device=device) * 0.61803 % 1
     return 0.5 + 0.45 * torch.cos(2 * torch.pi * (hue[:, None] - torch.tensor([0.0, 1 / 3, 2 / 3], device=device)))

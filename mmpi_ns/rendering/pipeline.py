@@ -1,4 +1,4 @@
-"""nerfstudio's pipeline, whose evaluation says its figures and not only writes them."""
+"""nerfstudio's pipeline, whose evaluation also prints its figures."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mmpi_ns.rendering.eval_poses import refined_camera
 from mmpi_ns.utils.console import say
 
 REFINED = "refined_"
-"""Begins the names of metrics of images whose own poses were refined against the model."""
+"""Prefix of metrics of images whose own poses were refined against the model."""
 
 
 @dataclass
@@ -23,8 +23,8 @@ class MMPIPipelineConfig(VanillaPipelineConfig):
 
     _target: type = field(default_factory=lambda: MMPIPipeline)
     refine_eval_poses: bool = False
-    """Score each evaluated image a second time, from where the trained model shows it best: metrics "refined_...",
-    beside the plain ones (docs/captures.md, "Poses that are not exact")."""
+    """Score each evaluated image a second time, with its pose refined against the trained model: metrics "refined_...",
+    in addition to the plain ones (docs/captures.md, "Poses that are not exact")."""
 
 
 class MMPIPipeline(VanillaPipeline):
@@ -33,7 +33,7 @@ class MMPIPipeline(VanillaPipeline):
     config: MMPIPipelineConfig
 
     def get_average_image_metrics(self, data_loader: Any, image_prefix: str, *args: Any, **kwargs: Any) -> Any:
-        """Means over the images of a loader, as nerfstudio's, and a line about them."""
+        """Means over the images of a loader, like nerfstudio's, and a summary line."""
         found: list[tuple[int, dict[str, float]]] = []
         model: Any = self.model
         measure = model.get_image_metrics_and_images
@@ -56,7 +56,7 @@ class MMPIPipeline(VanillaPipeline):
         return means
 
     def _refined_metrics(self, cameras: Any, batch: Any, measure: Any) -> dict[str, float]:
-        """Metrics of an image with its pose refined against the model, and by how much."""
+        """Metrics of an image with its pose refined against the model, and the size of the refinement."""
         model: Any = self.model
         i = int(batch["image_idx"])
         camera, observed = cameras[i : i + 1].to(model.device), model.observed(batch)

@@ -1,4 +1,4 @@
-"""Rays through one field: sampled, merged, blended, weighed and coloured (docs/how_it_works.md has the steps)."""
+"""Renders rays through one field: sampling, merging, blending, compositing and shading (docs/how_it_works.md)."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from mmpi_ns.rendering.sampler import MergeReport, MMPISampler
 def render_rays(
     sampler: MMPISampler, bundle: RayBundle, field: MMPIField, *, form: BlendForm | None, **sampling: Any
 ) -> RenderedRays:
-    """Renders rays that have nears and fars; with gradients where they are wanted.
+    """Renders rays that have nears and fars, with gradients if enabled.
 
     Args:
         sampler: samples and merges.
         bundle: the rays.
-        field: that they are rendered from.
-        form: how reliability enters; None where it takes no part.
-        sampling: what else the sampler takes.
+        field: to render.
+        form: form of blending by reliability; None without reliability.
+        sampling: further arguments of the sampler.
     """
     samples, report = sampler(bundle, field=field, blend_form=form, **sampling)
     tau, lookup = _optical_depth(field, samples, report, form)
@@ -43,7 +43,7 @@ def render_rays(
 def _optical_depth(
     field: MMPIField, samples: RaySamples, report: MergeReport, form: BlendForm | None
 ) -> tuple[Float[Tensor, "R S"], Lookup | None]:
-    """(Blended) optical depths, with gradients where they are wanted; else the sampler's own, without a lookup."""
+    """(Blended) optical depths, with gradients if enabled; otherwise the sampler's own, without a lookup."""
     if not torch.is_grad_enabled():
         return metadata_of(samples)["tau"][..., 0], None
     density, lookup = field.get_density(samples, report.head_counts)
@@ -56,7 +56,7 @@ def _optical_depth(
 
 
 def images_of(rays: RenderedRays, field: MMPIField) -> dict[str, Tensor]:
-    """What nerfstudio shows of rays: colour without a background, accumulation, depth."""
+    """Outputs of rays for nerfstudio: colour without a background, accumulation, depth."""
     return {
         "rgb": rays.colors.rgb,
         "accumulation": rays.composite.accumulation,
@@ -67,7 +67,7 @@ def images_of(rays: RenderedRays, field: MMPIField) -> dict[str, Tensor]:
 def sampled_outputs(
     bundle: RayBundle, field: MMPIField, *, form: BlendForm | None, **sampling: Any
 ) -> dict[str, Tensor]:
-    """``shown.shown_outputs`` of any field, also with gradients."""
+    """``shown.shown_outputs`` for any field, also with gradients."""
     rays = render_rays(MMPISampler(), bundle, field, form=form, **sampling)
     heads, composite = metadata_of(rays.samples)["heads"][..., 0], rays.composite
     return images_of(rays, field) | {

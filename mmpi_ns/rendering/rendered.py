@@ -1,4 +1,4 @@
-"""Rays after rendering: their samples, and what each of those has given."""
+"""Rays after rendering: their samples, with weights and colours."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from mmpi_ns.rendering.sampler import MergeReport
 from mmpi_ns.scene.plan import ScenePlan
 
 BACKGROUNDS = {"black": 0.0, "gray": 0.5, "white": 1.0}
-"""What can be shown behind everything."""
+"""Names of backgrounds."""
 
 
 def background_of(name: str, like: Tensor) -> Tensor:
-    """Colour [3] behind everything: what the viewer or a crop asks for, else the one of this name."""
+    """Background colour [3]: that of the viewer or a crop if set, else the one of this name."""
     asked = renderers.BACKGROUND_COLOR_OVERRIDE
     return like.new_full((3,), BACKGROUNDS[name]) if asked is None else asked.to(like)
 
 
 @dataclass(frozen=True)
 class RenderedRays:
-    """R rays with S merged samples each. In training pixel rays, then keypoint rays (both once for every MPI that they
-    went to)."""
+    """R rays with S merged samples each. In training, pixel rays, then keypoint rays (both repeated for every MPI that
+    renders them)."""
 
     bundle: RayBundle
     samples: RaySamples
@@ -37,19 +37,19 @@ class RenderedRays:
     colors: RayColors
     report: MergeReport
     lookup: Lookup | None
-    """Where the field was read; None without gradients."""
+    """Texels read from the field; None without gradients."""
     times: int = 1
-    """How often each ray of a batch is among them: all rays, one time after the other."""
+    """Repetitions of the batch: all rays, then all rays again."""
 
     def counts(self) -> dict[str, Tensor]:
-        """Samples a ray, met and kept, and the weight of those that were not."""
+        """Live and kept samples of each ray, and the weight of the dropped ones."""
         kept = metadata_of(self.samples)["valid"].float().sum() / len(self.report.live)
         dropped = self.report.dropped_mass.mean()
         return {"live_samples": self.report.live.float().mean(), "kept_samples": kept, "dropped_mass": dropped}
 
 
 def bounded(bundle: RayBundle, plan: ScenePlan) -> RayBundle:
-    """The rays with nears and fars: the plan's start of rays, and no end, unless a crop has set tighter ones."""
+    """The rays with nears and fars: ``ray_near`` of the plan and infinity, unless a crop has set tighter ones."""
     near = torch.full_like(bundle.origins[:, :1], plan.ray_near)
     bundle.nears = near if bundle.nears is None else torch.maximum(bundle.nears, near)
     bundle.fars = torch.full_like(near, torch.inf) if bundle.fars is None else bundle.fars
@@ -58,12 +58,12 @@ def bounded(bundle: RayBundle, plan: ScenePlan) -> RayBundle:
 
 @torch.no_grad()
 def median_distance(composite: Composite, samples: RaySamples, plan: ScenePlan) -> Float[Tensor, "R 1"]:
-    """Euclidean distance at half the gathered mass."""
+    """Euclidean distance at which half of the weight is accumulated."""
     inverse_t, valid = metadata_of(samples)["inverse_t"][..., 0], metadata_of(samples)["valid"][..., 0]
     return distances_of(median_inverse_distance(composite.weights, inverse_t, valid), plan)
 
 
 def distances_of(inverse_t: Float[Tensor, "R 1"], plan: ScenePlan) -> Float[Tensor, "R 1"]:
-    """Distances from inverse ones; infinity is shown as ten times the farthest finite plane."""
+    """Distances from inverse ones; infinity becomes ten times the farthest finite plane."""
     farthest = 10 * max(m.farthest for m in plan.mpis)
     return 1 / inverse_t.clamp(min=1 / farthest)

@@ -1,6 +1,6 @@
 """Sample and merge: each ray is sampled in every MPI, the samples are merged by distance (paper sec. III-B).
 
-The march is free of gradients. The field later differentiates through the samples that the sampler kept.
+The march has no gradients. The field later differentiates through the samples that were kept.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from mmpi_ns.ops.march import Crossings, MarchOptions, MergedSamples, march
 from mmpi_ns.scene.geometry import PlaneHits, cube_hits, sample_disparity
 
 DIRECTION_AT_INFINITY = 1e-10
-"""Inverse distances below this are written as a distance of 1e10 into nerfstudio's starts and ends."""
+"""Inverse distances below this become a distance of 1e10 in nerfstudio's starts and ends."""
 
 
 @dataclass(frozen=True)
 class MergeReport:
-    """What the sampler can say about each ray beyond its samples."""
+    """Output of the sampler for each ray besides its samples."""
 
     live: Int[Tensor, "R"]
     """Samples before dropping."""
@@ -35,10 +35,10 @@ class MergeReport:
     dropped_mass: Float[Tensor, "R 1"]
     """Rendering weight of the dropped samples: the error bound of dropping."""
     explained: Bool[Tensor, "R 1"]
-    """What the ray shows is the asked heads' to account for: they see it from before the first content out to infinity,
-    or there are no other heads to see it."""
+    """Whether the given heads must explain the whole ray: they cover it from before the first content out to infinity,
+    or there are no other heads."""
     head_counts: tuple[int, ...] | None
-    """Samples of each head, where the march has told."""
+    """Samples of each head, if the march counted them."""
 
 
 class MMPISampler(Sampler):
@@ -57,16 +57,16 @@ class MMPISampler(Sampler):
         shares: Float[Tensor, "N 1"] | None = None,
         **_: Any,
     ) -> tuple[RaySamples, MergeReport]:
-        """Live samples of each ray that matter, nearest first.
+        """Kept samples of each ray, nearest first.
 
         Args:
             ray_bundle: R rays; nears and fars bound the samples.
             field: heads to sample, with their optical depths.
             threshold: see ``ops.march.MarchOptions``.
             fair_share: likewise.
-            head_mask: heads that may answer each ray; None for all.
-            choose: priorities; each ray is answered by the MPI of highest priority among those it meets (and the cube).
-            blend_form: blend by reliability; None where reliability takes no part.
+            head_mask: heads that may render each ray; None for all.
+            choose: priorities; each ray is rendered by the MPI of highest priority among those it meets (and the cube).
+            blend_form: form of blending by reliability; None without reliability.
             shares: baked ones (``baking.bake_shares``) to blend by instead.
 
         Returns:
@@ -89,7 +89,7 @@ class MMPISampler(Sampler):
 def crossings(
     ray_bundle: RayBundle, field: MMPIField, head_mask: Tensor | None = None, choose: Tensor | None = None
 ) -> Crossings:
-    """The live samples of rays in the heads that may answer them (see ``MMPISampler``)."""
+    """The live samples of rays in the heads that may render them (see ``MMPISampler``)."""
     origins, directions, nears, fars = ray_bundle.origins, ray_bundle.directions, ray_bundle.nears, ray_bundle.fars
     assert nears is not None and fars is not None
     hits = plane_hits(origins, directions, nears, fars, field.layout)
@@ -106,7 +106,7 @@ def crossings(
 
 
 class _Frustums(Frustums):
-    """Of which all parts have one shape: nerfstudio's way of making them so takes 2 of 75 ms of a training step."""
+    """All parts have the same shape already: nerfstudio's broadcasting takes 2 of 75 ms of a training step."""
 
     def __post_init__(self) -> None:
         self._shape = self.starts.shape[:-1]
@@ -120,7 +120,7 @@ class _Samples(RaySamples):
 
 
 def _sees_all(hits: PlaneHits, counts: Int[Tensor, "R K"], field: MMPIField) -> Bool[Tensor, "R 1"]:
-    """Some head sees the ray out to infinity, and the first head is entered before the first content."""
+    """Whether some head covers the ray out to infinity, and the first head is entered before the first content."""
     live = counts > 0
     # One plane before the first live one bounds the entry: behind the camera means that the ray starts inside.
     m_before = torch.minimum(hits.m_first + 1, field.frames.num_planes - 1)

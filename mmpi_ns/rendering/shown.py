@@ -17,7 +17,7 @@ from mmpi_ns.rendering.sampler import crossings
 
 
 def shows_in_one_pass(field: MMPIField, form: BlendForm | None) -> bool:
-    """Whether a compiled form makes pictures of a field: one pass, which holds nothing of the samples."""
+    """Whether a compiled form renders images of a field in one pass, without arrays of samples."""
     compiled = dispatch.form_of("show_rays", field.features) != "reference"
     return field.shading == "ray" and form != "opacity" and compiled
 
@@ -37,10 +37,10 @@ def shown_outputs(
     Args:
         bundle: the rays.
         field: with ``shading ray``.
-        form: how reliability enters; None for not at all.
+        form: form of blending by reliability; None without reliability.
         threshold: weight below which a sample is dropped.
-        head_mask: heads that may answer each ray; None for all.
-        shares: baked ones to blend by instead of reliability.
+        head_mask: heads that may render each ray; None for all.
+        shares: baked shares to blend by instead of reliability.
     """
     assert isinstance(field.networks, RayShader)
     options = MarchOptions(threshold, form=form, baked=shares is not None)

@@ -1,4 +1,4 @@
-"""The finished windows of a long capture: on disk, and a few of them in memory to render."""
+"""The finished windows of a long capture: on disk, with a few in memory for rendering."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from mmpi_ns.utils.files import to_text, write_atomically
 from mmpi_ns.utils.threads import Uninterrupted
 
 _DAMAGED = (OSError, RuntimeError, EOFError, KeyError, TypeError, pickle.UnpicklingError)
-"""What reading a damaged file raises."""
+"""Exceptions of reading a damaged file."""
 
 
 class WindowStore:
     """Finished windows, one file each. Several threads may render from one store.
 
     Args:
-        folder: where the files lie; None where there is one window alone.
+        folder: of the files; None if there is only one window.
         empty: makes a field of the run's settings to load into.
-        budget: bytes that windows held to render may take. The one that is rendered is held whatever it takes.
+        budget: bytes of the windows kept for rendering. The window being rendered is kept in any case.
         half: write tables in half precision.
     """
 
@@ -39,22 +39,22 @@ class WindowStore:
         self.folder, self.budget, self.half = folder, budget, half
         self._empty, self._lock = empty, Lock()
         self._held: dict[int, MMPIField] = {}
-        """Those that are held, the one used last at the end."""
+        """Windows in memory, the most recently used last."""
         self._alive: WeakValueDictionary[int, MMPIField] = WeakValueDictionary()
-        """Those and what a rendering still works on: letting a window go takes it from nobody who has it."""
+        """These and windows still in use: evicting a window does not take it from a thread that is rendering it."""
 
     def path(self, window: int) -> Path:
         assert self.folder is not None, "several windows need a folder"
         return self.folder / f"window-{window:05d}.pt"
 
     def forget(self, window: int) -> None:
-        """Leaves the file alone: the window is about to be trained, and will be written anew."""
+        """Ignores the file from now on: the window is about to be trained and will be written again."""
         with Uninterrupted(), self._lock:
             self._held.pop(window, None)
             self._alive.pop(window, None)
 
     def save(self, window: int, field: MMPIField) -> None:
-        """Writes a finished window: whole, or not at all.
+        """Writes a finished window atomically.
 
         Raises:
             OSError: the disk is full or cannot be written.
@@ -68,11 +68,11 @@ class WindowStore:
         write_atomically(path, lambda unfinished: torch.save(state, unfinished))
 
     def load(self, window: int, device: torch.device) -> MMPIField:
-        """A finished window, ready to render. It stays whole for whoever holds it, whatever the store lets go.
+        """A finished window, ready to render. It stays valid for the caller even if the store evicts it.
 
         Args:
             window: its number.
-            device: where to.
+            device: to load it to.
 
         Raises:
             InputError: the file is missing or damaged (says which, and what to do).
@@ -105,20 +105,20 @@ class WindowStore:
         return field
 
     def _make_room(self, needed: int) -> None:
-        """Lets windows go, the one that was not used for longest first, until ``needed`` bytes fit the budget too."""
+        """Evicts windows, least recently used first, until ``needed`` bytes fit into the budget."""
         while self._held and needed + sum(map(_bytes_of, self._held.values())) > self.budget:
             del self._held[next(iter(self._held))]
 
     def adopt(self, other: Path, plans: dict[int, ScenePlan], needed: bool = False) -> None:
-        """Takes over finished windows of the run that this one goes on from.
+        """Takes over finished windows of the run that this one resumes.
 
         Args:
             other: that run's folder of windows.
-            plans: of the windows to take over, by their numbers.
-            needed: whether all must be there.
+            plans: of the windows to take over, by number.
+            needed: whether all of them must exist.
 
         Raises:
-            InputError: one is missing there that is needed, is damaged, or was trained with another plan.
+            InputError: a needed one is missing, one is damaged, or was trained with another plan.
         """
         if not plans or other.resolve() == self.path(0).parent.resolve():
             return
@@ -145,7 +145,7 @@ def _widened(values: Tensor) -> Tensor:
 
 
 def _bytes_of(field: MMPIField) -> int:
-    """Of its tables, and of its bricks where it has been baked."""
+    """Bytes of its tables, and of its bricks if it is baked."""
     bricks = field.known("baked")
     return sum(values.nbytes for values in field.state_dict().values()) + (0 if bricks is None else bricks.mpis.nbytes)
 

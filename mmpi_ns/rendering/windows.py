@@ -1,4 +1,4 @@
-"""Rays of a long capture: each asks the windows that it starts in, and their renderings are mixed."""
+"""Rays of a long capture: each is rendered by the windows that it starts in, and the renderings are mixed."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ def render_windows(
     Args:
         bundle: rays.
         windows: those that are trained.
-        render: what one window, by its place among them, shows of some rays.
-        shown: the window, by its place among them, that answers all rays; None: those that they start in.
+        render: renders some rays by one window, given its index.
+        shown: index of the window that renders all rays; None: those that they start in.
     """
     shares = window_shares(bundle.origins, windows)
     if shown is not None:
@@ -39,11 +39,11 @@ def render_windows(
 def mix_windows(
     shares: Float[Tensor, "R W"], parts: dict[int, tuple[Int[Tensor, "P"], dict[str, Tensor]]]
 ) -> dict[str, Tensor]:
-    """One rendering of several windows': colours by their shares, depth and winner of the window of most share.
+    """Mixes the renderings of several windows: colours by shares; depth and winner from the one with the largest share.
 
     Args:
         shares: of each ray and window.
-        parts: for each window that was asked, which rays, and what it shows of them.
+        parts: for each window used, its rays and their outputs.
     """
     mixed: dict[str, Tensor] = {}
     most = shares.argmax(-1)
