@@ -333,8 +333,10 @@ def test_ndc_of_world_points_undoes_the_oracle(mpi, ndc, at_infinity):
     assert is_direction == (ndc[2] == 1 and math.isinf(mpi.far))
     inverse_t = torch.tensor([0.0 if is_direction else 1.0], dtype=F64)
     back, inside = world_to_ndc(torch.tensor(point, dtype=F64)[None], inverse_t, frames)
-    assert inside.item()
-    assert torch.allclose(back[0, 0], given_ndc[0], atol=1e-11 * (1 + np.abs(mpi.origin).max() / mpi.near))
+    # The world point is a rounded sum with the origin, and what lies between near and far may be a sliver of the world.
+    slack = 1e-12 * (1 + np.abs(mpi.origin).max() / mpi.near) / mpi.depth_share
+    assert inside.item() or np.abs(ndc).max() > 1 - slack
+    assert torch.allclose(back[0, 0], given_ndc[0], rtol=0, atol=slack)
 
 
 def test_ndc_of_samples_equals_the_oracle_in_every_mpi():
