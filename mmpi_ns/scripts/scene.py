@@ -11,6 +11,7 @@ from typing import Literal
 import tyro
 
 from mmpi_ns.scripts.command import run
+from mmpi_ns.synthetic.wrong_depths import Wrong
 
 Name = Literal["street", "long-road", "room", "look-round", "object", "still-life"]
 
@@ -40,6 +41,9 @@ class SceneCommand:
     """Standard deviation of the keypoints' noise, pixels; the points are triangulated from them."""
     outliers: float = 0.02
     """Share of the points that are wrong."""
+    wrong_depths: Wrong = "none"
+    """Wrong depths in training images, to see whether a training follows them. scattered: a tenth of the pixels at
+    random. mirror: surfaces beside the way too far, alike in all images. car: one drives ahead."""
     images: tyro.conf.FlagConversionOff[bool] = True
     """False writes cameras, points and tracks alone."""
     overwrite: bool = False
@@ -61,9 +65,9 @@ class SceneCommand:
         if points is None:
             points = max(4000, 4 * round(self.length or 0))
         print(f"{self.name}: {len(scene.primitives)} solids, {len(cameras)} cameras; looking for points ...")
-        found = write_dataset(
-            scene, self.folder, points, self.noise, self.outliers, self.images, self.overwrite, _progress
-        )
+        sfm = (points, self.noise, self.outliers)
+        others = {"progress": _progress, "wrong_depths": self.wrong_depths}
+        found = write_dataset(scene, self.folder, *sfm, self.images, self.overwrite, **others)
         test = int(cameras.is_test.sum())
         kind = "images with depths" if self.images else "cameras (no images)"
         print(f"Wrote {self.folder}: {len(cameras)} {kind} of {cameras.width}x{cameras.height} pixels,")

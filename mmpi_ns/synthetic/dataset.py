@@ -13,6 +13,7 @@ from PIL import Image
 
 from mmpi_ns.synthetic.scene import Colors, Scene, render
 from mmpi_ns.synthetic.sfm_like import SfmPoints, sfm_points
+from mmpi_ns.synthetic.wrong_depths import Wrong, wrong_distances
 
 PARTS = ("transforms.json", "images", "images_2", "images_4", "images_8", "depths", "colmap", "sparse_pc.ply")
 """What belongs to a data set, and is removed before another one is written in its place."""
@@ -34,6 +35,7 @@ def write_dataset(
     overwrite: bool = False,
     progress: Callable[[Iterable[int]], Iterable[int]] = iter,
     tracks: bool = True,
+    wrong_depths: Wrong = "none",
 ) -> SfmPoints:
     """Writes images, depths (along the optical axis), transforms.json, sparse_pc.ply and colmap/sparse/0.
 
@@ -45,6 +47,7 @@ def write_dataset(
         overwrite: replaces a data set that is in the folder.
         progress: wraps the image numbers as they are rendered.
         tracks: False writes no points and no COLMAP model, for which it takes pycolmap.
+        wrong_depths: how the depths of the training images are wrong; those of the test images are exact.
 
     Raises:
         FileExistsError: the folder is in use and may not, or cannot safely, be overwritten. Nothing was touched.
@@ -62,6 +65,8 @@ def write_dataset(
         (folder / part).mkdir()
     for i in progress(range(len(scene.cameras))) if images else ():
         colors, distances = render(scene, i)
+        if not scene.cameras.is_test[i]:
+            distances = wrong_distances(wrong_depths, scene.cameras, i, distances, scene.seed)
         Image.fromarray((colors * 255).round().astype(np.uint8)).save(folder / "images" / image_name(i))
         Image.fromarray(_millimetres(scene, i, distances)).save(folder / "depths" / image_name(i))
     # Last, so that a folder with a transforms.json is complete.
