@@ -23,7 +23,6 @@ from mmpi_ns.bench.quality import train
 from mmpi_ns.bench.quality.curves import Curve, compare
 from mmpi_ns.bench.quality.train import Train
 from mmpi_ns.bench.quality.train_report import headline, markdown
-from mmpi_ns.bench.speed import scaling
 from mmpi_ns.bench.trainers import Steps
 from mmpi_ns.capture.datamanager import MMPIDataManager
 from mmpi_ns.capture.known_depth import KnownDepth
@@ -207,10 +206,12 @@ def test_a_process_that_fails_says_why_and_where(tmp_path):
 
 
 @pytest.mark.commands
-def test_a_process_answers_with_the_threads_that_it_was_given(tmp_path, capsys):
-    point = {"planes": 8, "height": 8, "width": 8, "rays": 16, "mpis": 1, "steps": 1}
-    row = run_apart(scaling.measure, point, tmp_path, 1)
-    assert row["texels"] == (8 + 1) * 64 and row["threads"] == 1
+def test_a_process_answers_with_the_threads_that_it_was_given(tmp_path, monkeypatch):
+    lines = ("import torch", "def count(asked, tell): return {**asked, 'threads': torch.get_num_threads()}")
+    (tmp_path / "counter.py").write_text("\n".join(lines))
+    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}:{Path(methods.__file__).parents[2]}")
+    count = SimpleNamespace(__module__="counter", __qualname__="count")
+    assert run_apart(count, {"asked": 5}, tmp_path / "run", 1) == {"asked": 5, "threads": 1}
 
 
 def test_a_scene_whose_test_images_are_not_the_ones_evaluated_is_refused(scene):
