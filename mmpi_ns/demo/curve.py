@@ -1,4 +1,4 @@
-"""PSNR against seconds, from what the trainer logged."""
+"""PSNR against seconds, from the log of the trainer."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from tensorboard.backend.event_processing.event_accumulator import SCALARS, EventAccumulator
 
 TEST, TRAIN = "Eval Metrics Dict/psnr", "Train Loss Dict/rgb_loss"
-"""nerfstudio's names of what is drawn."""
+"""nerfstudio's names of the quantities drawn."""
 
 
 def read_curve(run: Path, tag: str) -> NDArray[np.float64]:

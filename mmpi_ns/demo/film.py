@@ -1,4 +1,4 @@
-"""A fly-through along the capture's path: rendering, depth and winning MPI below each other."""
+"""A flight along the capture's path: rendering, depth and winning MPI below each other."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def film_frames(
 
 
 def write_film(images: Iterable[Image.Image], folder: Path, rate: int = 12) -> Path:
-    """Writes fly.mp4 or, where nothing here encodes it, a folder fly/ of png frames; returns which."""
+    """Writes fly.mp4 or, without an encoder, a folder fly/ of PNG frames; returns its path."""
     target, frames = folder / "fly.mp4", folder / "fly"
     shutil.rmtree(frames, ignore_errors=True)
     encoder = find_encoder()

@@ -1,4 +1,4 @@
-"""A map: cameras, points and where MPIs stand, seen from above."""
+"""A map of cameras, points and MPIs, seen from above."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Colours of what is not a colour, and text on pictures."""
+"""Colour maps, and text on pictures."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The contact sheet: what MMPI is, in one picture of a trained run."""
+"""The contact sheet: a trained run in one picture."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ LABELS, VIEW, GAP = 400, 360, 6
 
 @dataclass(frozen=True)
 class Shown:
-    """A test view with everything that the sheet shows of it."""
+    """A test view with all its pictures on the sheet."""
 
     index: int
     """Of the test image."""

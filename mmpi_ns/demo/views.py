@@ -1,4 +1,4 @@
-"""A trained run, loaded for taking pictures: its cameras, renderings by all MPIs and by each one alone."""
+"""A trained run, loaded for rendering pictures: its cameras, all MPIs merged, and each one alone."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""A trained model for others: baked scenes, a page that flies through them, splats."""
+"""Export of trained models: baked scenes, a web page for them, splats."""

@@ -1,4 +1,4 @@
-"""A finished run baked: all its windows, with the bricks that its training views see, and the path of its cameras."""
+"""Baking of a finished run: all its windows, with the bricks that its training views see, and the camera path."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def load_model(load_config: Path) -> Any:
         ) from error
     if not isinstance(pipeline.model, MMPIModel):
         raise ValueError(f"The run of {load_config} was trained by another method: only those of mmpi can be exported.")
-    pipeline.model.config.render = "exact"  # what others are compared with
+    pipeline.model.config.render = "exact"  # the exact renderer is the reference
     return pipeline
 
 
@@ -55,7 +55,7 @@ def bake_run(pipeline: Any, least: float, say: Say = print) -> BakedScene:
     Args:
         pipeline: of a finished run.
         least: bricks in which no training view sees this weight are left out; 0 keeps all.
-        say: told what is being done.
+        say: called with progress messages.
 
     Raises:
         ValueError: the model cannot be baked (says why).
@@ -102,7 +102,7 @@ def bake_window(model: MMPIModel, number: int) -> BakedWindow:
 
 
 def poses_of(pipeline: Any) -> list[Pose]:
-    """All cameras of a capture in the order of their images' names, those held out too, as pinholes."""
+    """All cameras of a capture, training and test, in the order of their image names, as pinholes."""
     poses = {}
     for dataset, test in ((pipeline.datamanager.train_dataset, False), (pipeline.datamanager.eval_dataset, True)):
         for i, name in enumerate(dataset.image_filenames):
@@ -120,9 +120,9 @@ class Compared:
     to_exact: float
     """PSNR of baked images against the exact renderer's, dB."""
     exact: dict[str, float]
-    """psnr and ssim of the exact renderer's against the truth, and seconds of processor time a frame."""
+    """psnr and ssim of the exact renderer against the ground truth, and seconds of processor time for a frame."""
     baked: dict[str, float]
-    """The same of baked images."""
+    """The same for baked images."""
 
     def __str__(self) -> str:
         words = [f"{m['psnr']:.2f} dB, SSIM {m['ssim']:.4f}, {m['seconds']:.3f} s" for m in (self.exact, self.baked)]
@@ -134,12 +134,12 @@ class Compared:
 
 @torch.no_grad()
 def compare(pipeline: Any, scene: BakedScene, count: int) -> Compared:
-    """Baked test images against exact ones and the truth.
+    """Compares baked test images with exact ones and the ground truth.
 
     Args:
         pipeline: of the run.
         scene: its baked scene.
-        count: how many test images, evenly spaced; all where there are fewer.
+        count: number of test images, evenly spaced; all if there are fewer.
     """
     dataset, metrics = pipeline.datamanager.eval_dataset, ImageMetrics("none")
     to_exact: list[float] = []

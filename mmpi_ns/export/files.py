@@ -1,4 +1,4 @@
-"""Baked scenes on disk: a header ``scene.json`` and one file of arrays a window (docs/export.md has the format)."""
+"""Baked scenes on disk: a header ``scene.json`` and one file of arrays for each window (format: docs/export.md)."""
 
 from __future__ import annotations
 
@@ -44,17 +44,17 @@ class Pose:
 
 @dataclass(frozen=True)
 class BakedScene:
-    """All windows of a run, the cameras' path, and where up is."""
+    """All windows of a run, the camera path, and the up direction."""
 
     name: str
     up: tuple[float, float, float]
     path: list[Pose]
     windows: list[tuple[Window, BakedWindow]]
-    """Where a window is asked (its plan holds the MPIs as they were baked), and what it shows."""
+    """The region of a window (its plan contains the MPIs as baked), and its content."""
 
 
 def write_baked(scene: BakedScene, folder: Path) -> int:
-    """Writes a scene into a folder, the header last, so that a scene with a header is whole.
+    """Writes a scene into a folder, the header last, so that a scene with a header is complete.
 
     Returns:
         Bytes that were written.
@@ -85,7 +85,7 @@ def write_baked(scene: BakedScene, folder: Path) -> int:
 
 
 def _describe(place: Window, window: BakedWindow) -> dict[str, Any]:
-    """What a header says of a window beside its arrays."""
+    """Header of a window, without its arrays."""
     mpis, shader = window.mpis, window.shader
     plan = json.loads(place.plan.to_json())
     extra = [{"interval": interval, "first_column": mpis.first_column(k)} for k, interval in enumerate(mpis.intervals)]
@@ -111,7 +111,7 @@ def _describe(place: Window, window: BakedWindow) -> dict[str, Any]:
 
 
 def _pack(window: BakedWindow) -> tuple[bytes, dict[str, Any]]:
-    """A window's arrays one after the other, each compressed, and where each is."""
+    """A window's arrays one after the other, each compressed, and the position of each."""
     mpis = window.mpis
     beside = neighbours(mpis.columns, mpis.mpis, mpis.num_bricks)
     network = [x.detach().half().reshape(-1) for layer in window.shader.layers for x in layer]
@@ -132,8 +132,8 @@ def _pack(window: BakedWindow) -> tuple[bytes, dict[str, Any]]:
 
 
 def _differences(codes: UInt8[Tensor, "B 8 8"], beside: Int[Tensor, "2 B"]) -> NDArray[np.uint8]:
-    """What is kept of one channel: differences along rows and columns, and those of first texels along bricks; 0 for
-    border texels that a neighbour holds too. [B, 64]"""
+    """Stored form of one channel: differences along rows and columns, and of first texels along bricks; 0 for border
+    texels that a neighbour also contains. [B, 64]"""
     made, (right, below) = codes.numpy(), (beside >= 0).numpy()
     for axis in (2, 1):
         made = np.diff(made, axis=axis, prepend=np.uint8(0))

@@ -1,4 +1,4 @@
-"""What a baked scene shows of rays. Neither nerfstudio's models nor a checkpoint are loaded for it."""
+"""Rendering of rays of a baked scene, without nerfstudio's models or a checkpoint."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mmpi_ns.scene.windows import window_shares
 def render_scene(
     scene: BakedScene, origins: Float[Tensor, "R 3"], directions: Float[Tensor, "R 3"]
 ) -> dict[str, Tensor]:
-    """What a scene shows of rays: the windows that they start in, mixed as the model mixes them."""
+    """Renders rays by the windows that they start in, mixed as in the model."""
     if len(scene.windows) == 1:
         return _render_window(scene.windows[0][1], origins, directions)
     shares = window_shares(origins, tuple(place for place, _ in scene.windows))
@@ -27,7 +27,7 @@ def render_scene(
 
 
 def _render_window(window: BakedWindow, origins: Tensor, directions: Tensor) -> dict[str, Tensor]:
-    """What one window shows of rays without an end."""
+    """Renders rays by one window, to infinity."""
     nears = torch.full_like(origins[:, :1], window.ray_near)
     background = torch.full((3,), window.background)
     return window.render(origins, directions, nears, torch.full_like(nears, torch.inf), background)

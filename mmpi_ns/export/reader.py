@@ -1,8 +1,8 @@
-"""A reader of baked scenes in NumPy alone: the format in a hundred lines, for those who write a viewer of their own.
+"""A reader of baked scenes in plain NumPy: the format in a hundred lines, as a reference for other viewers.
 
     python -m mmpi_ns.export.reader FOLDER NUMBER image.npy      # renders camera NUMBER of the path, slowly
 
-It is written to be read, in float64 throughout, and shares no code with the rest: tests compare the renderer with it.
+Written for readability, in float64, sharing no code with the rest: tests compare the renderer with it.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def read(folder: Path) -> dict[str, Any]:
 
 
 def take_borders(window: dict[str, Any], codes: np.ndarray) -> None:
-    """The last column and row of a brick are the first ones of its neighbours, where there are any."""
+    """The last column and row of a brick are the first ones of its neighbours, if there are any."""
     bricks = []
     for mpi in window["mpis"]:
         rows, columns = -(-(mpi["height"] - 1) // 7), -(-(mpi["width"] - 1) // 7)
@@ -117,7 +117,7 @@ def activated(window: dict[str, Any], codes: np.ndarray) -> np.ndarray:
 
 
 def shade(window: dict[str, Any], mean: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """The colour that the network makes of a ray's mean colour and features."""
+    """The colour of a ray from its mean colour and features, by the network."""
     octaves = np.pi * 2.0 ** np.arange(window["shader"]["direction_octaves"])
     angles = (octaves[:, None] * direction).reshape(-1)
     x, at, numbers = np.concatenate([mean, direction, np.sin(angles), np.cos(angles)]), 0, window["network_array"]
@@ -129,7 +129,7 @@ def shade(window: dict[str, Any], mean: np.ndarray, direction: np.ndarray) -> np
 
 
 def render_ray(window: dict[str, Any], origin: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """What one window shows of a ray."""
+    """Renders a ray by one window."""
     light, mass, sums = 1.0, 0.0, np.zeros(len(window["channels"]))
     for _, tau, colors in crossings(window, origin, direction):
         weight = light * -np.expm1(-tau)

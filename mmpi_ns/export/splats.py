@@ -1,7 +1,7 @@
-"""A baked window as flat Gaussians ("splats"), in the file that every viewer of 3D Gaussian splatting reads.
+"""A baked window as flat Gaussians ("splats"), in the file format of 3D Gaussian splatting viewers.
 
-A texel that training rays see becomes a Gaussian in its plane. Neighbours that agree become one. A splat's colour is
-fitted to what rays show at it, as a linear function of the direction: spherical harmonics of degree 1.
+A texel seen by training rays becomes a Gaussian in its plane. Similar neighbours are merged. A splat's colour is fitted
+to the colours of rays through it, as a linear function of the direction: spherical harmonics of degree 1.
 """
 
 from __future__ import annotations
@@ -36,21 +36,20 @@ WIDTH = 0.35
 THICKNESS = 0.01
 """Of a splat, in its width."""
 LARGEST = 3
-"""Most often that four neighbours become one."""
+"""Maximum number of times that four neighbours are merged into one."""
 AGREEING_COLOR, AGREEING_FEATURE, AGREEING_ALPHA = 0.04, 0.2, 0.1
-"""Neighbours whose colours, features and alphas differ by less are one splat."""
+"""Neighbours whose colours, features and alphas differ by less are merged."""
 DENSER = 1.25
 """Factor on optical depths."""
 FRACTIONS = (0.0, 0.5, 0.25, 0.75)
-"""Of the way from one camera to the next: where colours are fitted, round by round."""
+"""Camera positions of each round of fitting, as fractions of the way from one camera to the next."""
 ROUNDS = 4
 STEP = 1.5
-"""Of a round: more than 1 arrives sooner."""
+"""Step size of a round; above 1 is over-relaxation."""
 OPACITY_STEP, MOST_CHANGE = 0.3, 1.0
-"""Of a round for logits of opacities, which move together with the colours (at 1 both overshoot), and the most that one
-moves."""
+"""Step size for logits of opacities, which move together with the colours (at 1 both overshoot), and maximum step."""
 STEADY = 0.02
-"""Weight, as a share of a splat's, by which its colour is held to be the same from everywhere."""
+"""Regularisation towards a view-independent colour, relative to the weight of a splat."""
 SH0, SH1 = 0.28209479177387814, 0.4886025119029199
 """Spherical harmonics: the constant one, and the factor of those of degree 1, -y, z and -x."""
 
@@ -88,7 +87,7 @@ class Splats:
 
 @dataclass(frozen=True)
 class _Texels:
-    """Texels of a window, each once though two bricks may share it."""
+    """Texels of a window, each once, even if two bricks share it."""
 
     places: Int[Tensor, "T 4"]
     """MPI, plane, row, column."""
@@ -108,9 +107,9 @@ def splats_of(window: BakedWindow, poses: list[Pose], least: float, most: int, r
     Args:
         window: baked.
         poses: training cameras.
-        least: texels whose samples weigh less in all these views are left out.
-        most: number of splats; those of least weight are left out.
-        rounds: of fitting colours to what the window shows.
+        least: texels whose samples have less weight in all these views are left out.
+        most: maximum number of splats; those with the least weight are left out.
+        rounds: of fitting colours to renderings of the window.
     """
     peaks = torch.zeros(window.mpis.density.shape)
     for pose in poses:
@@ -123,14 +122,14 @@ def splats_of(window: BakedWindow, poses: list[Pose], least: float, most: int, r
     kept = torch.full((len(weight),), -1).index_copy(0, chosen, torch.arange(len(chosen)))
     group = torch.where(wanted, kept[group.clamp(min=0)], -1)
     splats = _placed(window, texels, group, level, fmean(pose.focal[0] for pose in poses))
-    for number in range(rounds):  # other cameras each time, so that splats do not suit those of the capture alone
+    for number in range(rounds):  # other cameras each time, so that splats do not overfit to those of the capture
         asked = between(poses, FRACTIONS[number % len(FRACTIONS)])
         splats = fitted(splats, window, track(asked, description=f"Fitting splats, round {number + 1} of {rounds}"))
     return splats
 
 
 def poses_in(place: Window, scene: BakedScene) -> list[Pose]:
-    """Training cameras that a window answers."""
+    """Training cameras that a window renders."""
     poses = [pose for pose in scene.path if not pose.test]
     shares = window_shares(torch.tensor([p.to_world for p in poses])[:, :, 3], tuple(w for w, _ in scene.windows))
     number = [w for w, _ in scene.windows].index(place)
@@ -161,11 +160,11 @@ def between(poses: list[Pose], fraction: float) -> list[Pose]:
 
 
 def fitted(splats: Splats, window: BakedWindow, poses: Iterable[Pose]) -> Splats:
-    """Splats with colours, linear in direction, and opacities that come closer to what a window shows.
+    """One round of fitting colours, linear in direction, and opacities to renderings of a window.
 
-    The errors of all images are taken back to the splats, and each is corrected by least squares over (1, direction),
-    as if it were alone. Weights of a pixel sum up to 1 at most, so steps of less than twice that converge. An error is
-    shared out among opacities by how much the pixel changes with each.
+    The errors of all images are propagated to the splats, and each splat is corrected by least squares over
+    (1, direction), independently of the others. Weights of a pixel sum to at most 1, so steps below 2 converge. An
+    error is distributed among opacities in proportion to their effect on the pixel.
     """
     gaussians, count = splats.gaussians, len(splats.means)
     squares, errors, opacities = torch.zeros(count, 4, 4), torch.zeros(count, 4, COLORS), torch.zeros(count, 2)
@@ -242,7 +241,7 @@ def _merged(texels: _Texels, wanted: Tensor) -> tuple[Int[Tensor, "T"], Int[Tens
 
 
 def _placed(window: BakedWindow, texels: _Texels, group: Tensor, level: Tensor, focal: float) -> Splats:
-    """Where splats lie, how large they are, how much light they take, and their diffuse colours."""
+    """Positions, sizes, opacities and diffuse colours of splats."""
     inside = (group >= 0).nonzero()[:, 0]
     group, level, total = group[inside], level[inside], int(group.max()) + 1
     count = torch.bincount(group, minlength=total).float()
@@ -264,7 +263,7 @@ def _placed(window: BakedWindow, texels: _Texels, group: Tensor, level: Tensor, 
         sides = torch.stack([size[own] * du, size[own] * dv], -1)
         scales[own] = torch.cat([WIDTH * sides, THICKNESS * sides[:, :1]], -1) * z[:, None]
         rotations[own] = quaternion(mpi.axes)
-        # Splats of this spacing sum up to so many times their middle, as a rasteriser blurs them.
+        # Overlapping splats of this spacing sum to this multiple of their centre value, after a rasteriser's blur.
         overlap = 2 * math.pi * (WIDTH**2 + BLUR / (focal * sides) ** 2).prod(-1).sqrt()
         alphas[own] = -torch.expm1(-DENSER * depth[own] / overlap)
     colors = torch.cat([mean(texels.channels[:, :COLORS])[:, None], torch.zeros(total, 3, COLORS)], 1)

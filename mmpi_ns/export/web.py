@@ -1,4 +1,4 @@
-"""The page that flies through a baked scene: a folder for any static host, or one HTML file."""
+"""The web page of a baked scene: a folder for any static host, or one HTML file."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def write_page(folder: Path) -> Path:
 
 
 def write_single_file(folder: Path, path: Path) -> None:
-    """Writes one HTML file that holds a baked scene and opens by a double click.
+    """Writes one HTML file that contains a baked scene and opens by a double click.
 
     Args:
         folder: of the baked scene.

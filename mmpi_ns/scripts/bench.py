@@ -1,4 +1,4 @@
-"""``mmpi-bench``: the figures in docs/results, each made again by one command."""
+"""``mmpi-bench``: the tables in docs/results, each reproduced by one command."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ COMMANDS = {
     "prepare": "quality.prepare",
     "poses": "quality.poses",
 }
-"""Module below mmpi_ns.bench that holds the command, as a class of its name. Only what is asked for is imported."""
+"""Module below mmpi_ns.bench with the command, as a class of its name. Only the requested one is imported."""
 
 
 def _purpose(module: str) -> str:
@@ -39,7 +39,7 @@ def _purpose(module: str) -> str:
 
 
 def entrypoint() -> None:
-    """The command ``mmpi-bench``; a mistake is one sentence and exit status 1."""
+    """The command ``mmpi-bench``; an error is one sentence and exit status 1."""
     say_version("mmpi-bench")
     name = sys.argv[1] if len(sys.argv) > 1 else "--help"
     if name not in COMMANDS:

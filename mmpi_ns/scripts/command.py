@@ -1,4 +1,4 @@
-"""What commands share: ``--version``, and mistakes that are one sentence."""
+"""Shared by all commands: ``--version``, and errors as one sentence."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import tyro
 
 
 def say_version(name: str) -> None:
-    """Ends the command with its name and the version of pyproject.toml where ``--version`` is the first word given."""
+    """Prints the name and the version of pyproject.toml and ends the command if ``--version`` is its first argument."""
     if sys.argv[1:2] == ["--version"]:
         print(f"{name} {version('mmpi-ns')}")
         sys.exit()
@@ -21,7 +21,7 @@ def run(name: str, command: Any, **how: Any) -> int:
 
     Args:
         name: of the command, for its messages.
-        command: what tyro makes from the words given.
+        command: type that tyro builds from the arguments.
         how: for tyro.
     """
     say_version(name)

@@ -1,4 +1,4 @@
-"""``make demo``: a scene is made, learned, evaluated and shown; what is done is kept when it is started again."""
+"""``make demo``: makes a scene, trains on it, evaluates and shows it; a rerun keeps what is finished."""
 
 from __future__ import annotations
 
@@ -19,23 +19,23 @@ from mmpi_ns.scripts.command import run
 
 PARTS = 6
 FREE_BYTES = 2 << 30
-"""What a demo may need on the disk: checkpoints are the most of it."""
+"""Disk space that a demo may need, mostly for checkpoints."""
 OURS = ("runs", "fly", "unfinished.mp4", "fly.mp4", "times.json", "eval.json", "contact-sheet.png", "overview.png",
         "psnr.png")  # fmt: skip
-"""What the demo writes beside the scene and its page, and removes when it starts afresh."""
+"""Outputs of the demo besides the scene and its page, which are removed on a fresh start."""
 
 
 class DemoError(ValueError):
-    """Why the demo cannot go on, in one sentence that says what to do."""
+    """The demo cannot continue; one sentence that says why and what to do."""
 
 
 @dataclass
 class Demo:
-    """Makes a procedural scene, trains mmpi-small on it, evaluates it, and takes pictures. A rerun goes on where the
+    """Makes a procedural scene, trains mmpi-small on it, evaluates it, and takes pictures. A rerun continues where the
     last one stopped."""
 
     folder: Path = Path("demo")
-    """Everything is written here."""
+    """Folder for everything that is written."""
     steps: int = 1000
     """Training steps."""
     images: int = 64
@@ -43,11 +43,11 @@ class Demo:
     frames: int = 40
     """Frames of the fly-through."""
     kind: Literal["street", "long-road", "room", "object"] = "street"
-    """Which of mmpi-scene's scenes."""
+    """One of the scenes of mmpi-scene."""
     length: float | None = None
     """Metres driven (street: 40, long-road: 1000)."""
     fresh: bool = False
-    """Start afresh instead of keeping what an earlier demo has done."""
+    """Start over instead of keeping the results of an earlier demo."""
 
     def main(self) -> None:
         start = time.perf_counter()
@@ -84,7 +84,7 @@ class Demo:
 
     @property
     def checkpoint(self) -> Path:
-        """The last one, when training is done; every window of a long road takes so many steps."""
+        """The last step of training; each window of a long road has this many steps."""
         from mmpi_ns.scene.windows import WindowedPlan
 
         plan = self.run / "plan.json"
@@ -136,15 +136,15 @@ class Demo:
             "--experiment-name", self.kind, "--timestamp", "demo", "--max-num-iterations", str(self.steps),
             "--vis", "tensorboard", "--steps-per-save", str(max(1, self.steps // 3)), "--steps-per-eval-batch", every,
             "--pipeline.datamanager.eval-num-rays-per-batch", "8192", "--logging.steps-per-log", "20",
-            "--pipeline.model.lpips-net", "none",  # half a gigabyte of weights would be fetched for it
-            "--pipeline.datamanager.depth-images", "False",  # the scene has exact ones, an ordinary capture none
+            "--pipeline.model.lpips-net", "none",  # would download half a gigabyte of weights
+            "--pipeline.datamanager.depth-images", "False",  # the scene has exact depths, an ordinary capture has none
             *(["--load-dir", str(self.run / "nerfstudio_models")] if newest is not None else []),
         )  # fmt: skip
         if not self.checkpoint.is_file():
             raise DemoError(f"ns-train ended before its last step: start again, it goes on from {self.run}.")
 
     def _resumable(self) -> int | None:
-        """The last step that an interrupted training of as many steps has saved."""
+        """The last saved step of an interrupted training of the same length."""
         times = self.folder / "times.json"
         if not times.is_file() or json.loads(times.read_text(encoding="utf-8")).get("steps") != self.steps:
             return None
@@ -204,19 +204,19 @@ class Demo:
         )
 
     def _is_newer(self, path: Path) -> bool:
-        """Whether an output was made from the checkpoint that is there."""
+        """Whether an output was made from the current checkpoint."""
         newer = path.exists() and path.stat().st_mtime >= self.checkpoint.stat().st_mtime
         if newer:
             _kept(path)
         return newer
 
     def _command(self, name: str, *arguments: str) -> None:
-        """Runs a command of this environment; shows it, as that is what one would type."""
+        """Prints and runs a command of this environment."""
         program = _program(name)
         if not program.is_file():
             raise DemoError(f"{program} does not exist: install the package into this environment (make venv).")
         print(f"$ {shlex.join([name, *arguments])}", flush=True)
-        quiet = {**os.environ, "PYTHONWARNINGS": "ignore"}  # those of the libraries, which would bury the progress
+        quiet = {**os.environ, "PYTHONWARNINGS": "ignore"}  # warnings of libraries, which would bury the progress
         code = subprocess.run([str(program), *arguments], env=quiet, check=False).returncode
         if code:
             raise DemoError(f"{name} ended with status {code}: what it said is above.")
@@ -237,7 +237,7 @@ def _track(items: Iterable[Any], what: str) -> Iterator[Any]:
 
 
 def main() -> int:
-    """Runs the demo; a mistake is one sentence and status 1."""
+    """Runs the demo; an error is one sentence and status 1."""
     warnings.simplefilter("ignore")
     try:
         return run("demo", Demo)

@@ -1,4 +1,4 @@
-"""``mmpi-export``: a trained model for others to look at, as a baked scene, as a page for a browser, or as splats."""
+"""``mmpi-export``: exports a trained model as a baked scene, a web page, or splats."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ class _Run:
     compare: int = 5
     """Test images to compare with the exact renderer; 0 for none."""
     overwrite: bool = False
-    """Replace an export that is at the output."""
+    """Replace an existing export."""
 
     def bake(self) -> BakedScene:
-        """The run's scene, with what baking cost in quality printed."""
+        """Bakes the run's scene and prints the loss of quality."""
         check_options(self, {"least": Number(0, 1), "compare": Number(0, whole=True)}, "--")
-        # Slow imports, which --help and mistakes do not need.
+        # Slow imports, not needed for --help and errors.
         from mmpi_ns.export.bake import bake_run, compare, load_model
 
         pipeline = load_model(self.load_config)
@@ -46,7 +46,7 @@ class Bake(_Run):
     """Writes a baked scene: a folder with scene.json and the bricks of every window (docs/export.md)."""
 
     output: Path | None = None
-    """Folder to write; unless given, 'baked' beside config.yml."""
+    """Folder to write (default: 'baked' beside config.yml)."""
 
     def main(self) -> None:
         _check_run(self.load_config)
@@ -61,10 +61,10 @@ class Bake(_Run):
 
 @dataclass
 class Web(_Run):
-    """Writes a page that flies through the scene in a browser with WebGL2: a folder for any web server, or one file."""
+    """Writes an interactive web page of the scene (WebGL2): a folder for any web server, or one file."""
 
     output: Path = Path("site")
-    """Folder to write; with --single-file the file."""
+    """Folder to write; with --single-file, the file."""
     single_file: bool = False
     """One HTML file that opens by a double click."""
 
@@ -94,14 +94,14 @@ class Web(_Run):
 
 @dataclass
 class Splats(_Run):
-    """Writes Gaussians in the layout (.ply) that viewers of 3D Gaussian splatting read; one file a window."""
+    """Writes Gaussians in the .ply format of 3D Gaussian splatting viewers; one file for each window."""
 
     output: Path = Path("scene.ply")
-    """File to write; scene-00000.ply and so on where there are several windows."""
+    """File to write; scene-00000.ply and so on if there are several windows."""
     weight: float = 0.01
-    """Texels that no training view gives this rendering weight are left out."""
+    """Texels without this rendering weight in any training view are left out."""
     most: int = 1_000_000
-    """Splats of a window at most."""
+    """Maximum number of splats of a window."""
 
     def main(self) -> None:
         _check_run(self.load_config)
@@ -126,16 +126,16 @@ class Splats(_Run):
 
 
 def _check_run(load_config: Path) -> None:
-    """Raises ValueError where there is no run, or none with a checkpoint."""
+    """Raises ValueError if there is no run, or it has no checkpoint."""
     if not load_config.is_file():
         raise ValueError(f"There is no run at {load_config}: give the config.yml that ns-train wrote.")
     checkpoints = load_config.parent / "nerfstudio_models"
     if not any(checkpoints.glob("step-*.ckpt")):
-        raise ValueError(f"The run has no checkpoint in {checkpoints}: train it to its first save at least.")
+        raise ValueError(f"The run has no checkpoint in {checkpoints}: train it at least until its first checkpoint.")
 
 
 def _check_output(folder: Path, overwrite: bool) -> None:
-    """Raises ValueError where a folder holds something that an export would not replace."""
+    """Raises ValueError if a folder contains something that an export would not replace."""
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"{folder} is a file: name a folder to write.")
     if not folder.is_dir() or not any(folder.iterdir()):
@@ -154,7 +154,7 @@ Command = (
 
 
 def entrypoint() -> None:
-    """The command ``mmpi-export``; a mistake is one sentence and exit status 1."""
+    """The command ``mmpi-export``; an error is one sentence and exit status 1."""
     sys.exit(run("mmpi-export", Command, description=__doc__))
 
 

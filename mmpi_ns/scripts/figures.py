@@ -9,7 +9,7 @@ from pathlib import Path
 from mmpi_ns.scripts.command import run
 
 SHEET, README_PICTURE = "contact-sheet.png", "contact-sheet.jpg"
-"""The demo's picture that the documentation shows, there and here."""
+"""The demo's picture that the documentation shows: source and target."""
 FILM, README_FILM = "fly.mp4", "fly.webp"
 
 
@@ -18,7 +18,7 @@ class Figures:
     """Draws the figures of README.md and docs/."""
 
     demo: Path = Path("demo")
-    """Folder of ``make demo``; its contact sheet is copied. Without it only the explanations are drawn."""
+    """Folder of ``make demo``; its contact sheet is copied. Without it only the explanatory figures are drawn."""
     output: Path = Path("docs/images")
     """Folder to write."""
 
@@ -37,7 +37,7 @@ class Figures:
 
 
 def shrink(source: Path, target: Path, most: int = 400_000) -> None:
-    """Copies a picture as JPEG, as good as fits into so many bytes."""
+    """Copies a picture as JPEG, at the best quality that fits into this many bytes."""
     from PIL import Image
 
     image = Image.open(source).convert("RGB")
@@ -50,7 +50,7 @@ def shrink(source: Path, target: Path, most: int = 400_000) -> None:
 
 
 def animate(source: Path, target: Path, width: int = 480, rate: int = 12, most: int = 1_200_000) -> None:
-    """Copies a film as an animated WebP that a web page plays, as good as fits into so many bytes."""
+    """Copies a film as an animated WebP, at the best quality that fits into this many bytes."""
     import av
     from PIL import Image
 

@@ -1,4 +1,4 @@
-"""``make gallery``: four procedural scenes, each trained for some minutes, and their page in the documentation."""
+"""``make gallery``: trains four procedural scenes for some minutes each and writes their page in the documentation."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ SHOWN = {
     ),
     "long-road": (
         Demo(kind="long-road", images=100, length=150.0, steps=400),
-        "A road with bends. It is split into windows, each with MPIs of its own, trained one after the other.",
+        "A winding road. It is split into windows, each with its own MPIs, trained one after the other.",
     ),
     "room": (
         Demo(kind="room", images=64, steps=600),
-        "A walk round a table, looking to all sides. MPIs face wherever the cameras looked.",
+        "A walk around a table, looking in all directions. MPIs face wherever the cameras looked.",
     ),
     "object": (
         Demo(kind="object", images=48, steps=600),
-        "An object walked all round, which is what MPIs are not for: from behind, one shows the edges of its planes.",
+        "An object filmed from all sides, which MPIs are not suited for: from behind, one shows the edges of its planes.",
     ),
 }
-"""Each scene with how it is made and trained, and a sentence about it."""
+"""Each scene with the options of making and training it, and a sentence about it."""
 MOST_PICTURE, MOST_CLIP = 200_000, 500_000
 """Bytes of a scene's picture and clip."""
 COLUMNS = {
@@ -49,8 +49,8 @@ COLUMNS = {
 
 @dataclass
 class Gallery:
-    """Trains each procedural scene with mmpi-small and writes gallery.md with a picture and a clip of it. What an
-    earlier run has done is kept."""
+    """Trains each procedural scene with mmpi-small and writes gallery.md with a picture and a clip of it. Results of an
+    earlier run are kept."""
 
     folder: Path = Path("gallery")
     """Scenes and runs go here."""
@@ -92,7 +92,7 @@ def markdown(rows: list[dict[str, Any]]) -> str:
     parts = [
         "# Gallery",
         "Four procedural scenes, each trained with `mmpi-small` for some minutes on one core. PSNR and SSIM are means "
-        "over the test images; depths are found in the training images, the exact ones are not read.",
+        "over the test images; depths are found in the training images; the exact ones are not used.",
         table(COLUMNS, rows),
         f"Made by `make gallery` on {processor()}, commit {commit()}; seconds are from the start of `ns-train` to its "
         "last checkpoint, on a machine that did other things too.",

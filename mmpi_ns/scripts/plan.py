@@ -1,4 +1,4 @@
-"""``mmpi-plan``: shows where MPIs would stand in a scene, why, and what each of them is good for."""
+"""``mmpi-plan``: shows where MPIs would be placed in a scene, and why."""
 
 from __future__ import annotations
 
@@ -26,23 +26,23 @@ if TYPE_CHECKING:
 class PlanCommand:
     """Places MPIs in a scene without training: a table, plan.json, and pictures.
 
-    plan.json can be edited and given back with ``ns-train mmpi --pipeline.model.plan-file plan.json``.
+    plan.json can be edited and used with ``ns-train mmpi --pipeline.model.plan-file plan.json``.
     """
 
     scene: tyro.conf.Positional[Path]
     """Folder with transforms.json, or with images and a COLMAP model."""
     output: Path
-    """Folder for plan.json, plan.md, plan.png and errors.png (of a long capture: of each window too)."""
+    """Folder for plan.json, plan.md, plan.png and errors.png (for a long capture, also of each window)."""
     method: Literal["mmpi", "mmpi-small"] = "mmpi-small"
-    """Whose defaults to place with."""
+    """Method whose defaults are used."""
     downscale_factor: int | None = None
     """Size of the images, as for the data parser."""
     parser: Literal["auto", "nerfstudio", "colmap"] = "auto"
-    """How the scene is stored."""
+    """Format of the scene."""
     plan_file: Path | None = None
-    """Explain this plan instead of placing a new one."""
+    """Evaluate this plan instead of making a new one."""
     training_rays: int = 0
-    """Pixel rays of the training that the texels should suit; 0 for any number."""
+    """Pixel rays of the training for which texels are sized; 0: no limit."""
     placement: PlacementConfig = field(default_factory=PlacementConfig)
     """The rule's settings."""
 
@@ -58,7 +58,7 @@ class PlanCommand:
         check_there(self.scene)
         with write_errors(self.output, "--output"):
             self.output.mkdir(parents=True, exist_ok=True)
-        if self.plan_file is not None:  # a mistake in it is said before the images are read
+        if self.plan_file is not None:  # report an error in it before the images are read
             WindowedPlan.load(self.plan_file)
         _check_not_edited(self.output / "plan.json")
         observations = load_observations(self.scene, self.downscale_factor, self.parser)
@@ -78,7 +78,7 @@ class PlanCommand:
         )
 
     def _explain(self, windows: WindowedPlan, observations: Observations) -> str:
-        """Draws the pictures and returns the tables: of each window, over what its own cameras saw."""
+        """Draws the pictures and returns the tables: for each window, over the observations of its own cameras."""
         from mmpi_ns.placement.show.explain import explain, table
         from mmpi_ns.placement.show.pictures import draw_errors, draw_plan, draw_windows
         from mmpi_ns.placement.split import cameras_of
@@ -107,7 +107,7 @@ def _mark(plan: Path) -> str:
 
 
 def _check_not_edited(plan: Path) -> None:
-    """Raises InputError where a plan lies that this command did not write as it is."""
+    """Raises InputError if there is a plan that this command did not write, or that was edited."""
     told = plan.with_suffix(".md")
     if plan.is_file() and not (told.is_file() and _mark(plan) in told.read_text(encoding="utf-8", errors="replace")):
         raise InputError(

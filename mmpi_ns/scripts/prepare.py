@@ -1,4 +1,4 @@
-"""``mmpi-prepare INPUT SCENE``: a folder of images or a video becomes a scene that ns-train reads as it is."""
+"""``mmpi-prepare INPUT SCENE``: turns a folder of images or a video into a scene for ns-train."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ import sys
 
 from mmpi_ns.scripts.command import say_version
 
-INTERRUPTED = "mmpi-prepare: interrupted; the same command goes on from here."
+INTERRUPTED = "mmpi-prepare: interrupted; the same command continues from here."
 PR_SET_PDEATHSIG = 1
 """Of prctl: the signal that a process gets when its parent ends."""
 
 
 def main() -> int:
-    """Runs mmpi-prepare; returns the exit status: 1 without a scene, 3 with one that cannot be believed."""
+    """Runs mmpi-prepare; returns the exit status: 1 without a scene, 3 with a doubtful one."""
     # Before pycolmap is loaded: it has threads of its own, and each of them would start as many again for its matrices.
     for library in ("OMP", "OPENBLAS"):
         os.environ.setdefault(f"{library}_NUM_THREADS", "1")

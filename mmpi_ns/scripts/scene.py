@@ -18,11 +18,12 @@ Name = Literal["street", "long-road", "room", "look-round", "object", "still-lif
 
 @dataclass
 class SceneCommand:
-    """Writes images, exact depths, cameras and SfM-like points of a made-up scene; equal options give equal files."""
+    """Writes images, exact depths, cameras and SfM-like points of a procedural scene, deterministically."""
 
     name: tyro.conf.Positional[Name]
-    """street: driven along. long-road: the same with bends, of any length. room: a walk round a table, looking all
-    round. look-round: nearly one spot of that room. object: walked round. still-life: a grid of cameras facing it."""
+    """street: a straight drive. long-road: a winding drive of any length. room: a walk around a table, looking in all
+    directions. look-round: nearly one spot of that room. object: filmed from all sides. still-life: a grid of cameras
+    facing it."""
     folder: tyro.conf.Positional[Path]
     """Folder to write."""
     width: int | None = None
@@ -34,20 +35,20 @@ class SceneCommand:
     length: float | None = None
     """Metres driven (street: 40, long-road: 1000)."""
     seed: int = 0
-    """Another seed is another scene of the same kind."""
+    """Each seed gives another scene of the same kind."""
     points: int | None = None
     """SfM points; by default 4,000, and four a metre on drives of more than a kilometre."""
     noise: float = 0.3
     """Standard deviation of the keypoints' noise, pixels; the points are triangulated from them."""
     outliers: float = 0.02
-    """Share of the points that are wrong."""
+    """Fraction of wrong points."""
     wrong_depths: Wrong = "none"
-    """Wrong depths in training images, to see whether a training follows them. scattered: a tenth of the pixels at
-    random. mirror: surfaces beside the way too far, alike in all images. car: one drives ahead."""
+    """Wrong depths in training images, to test whether a training follows them. scattered: a tenth of the pixels, at
+    random. mirror: surfaces beside the path too far away, consistently in all images. car: a car that drives ahead."""
     images: tyro.conf.FlagConversionOff[bool] = True
-    """False writes cameras, points and tracks alone."""
+    """False: write cameras, points and tracks only."""
     overwrite: bool = False
-    """Replace a data set that is in the folder."""
+    """Replace a data set in the folder."""
 
     def main(self) -> None:
         from mmpi_ns.synthetic.catalogue import make_scene
@@ -89,7 +90,7 @@ def _progress(images: Iterable[int]) -> Iterator[int]:
 
 
 def entrypoint() -> None:
-    """The ``mmpi-scene`` command; a mistake is one sentence and exit status 1."""
+    """The ``mmpi-scene`` command; an error is one sentence and exit status 1."""
     sys.exit(run("mmpi-scene", SceneCommand))
 
 

@@ -1,10 +1,10 @@
-"""``ns-train`` in several processes that share the windows of a long capture out among them; no GPU is needed.
+"""``ns-train`` in several processes that share the windows of a long capture; no GPU is needed.
 
     torchrun --nproc-per-node 2 -m mmpi_ns.scripts.train mmpi-small --data road/
 
-nerfstudio starts several processes on GPUs alone (``--machine.num-devices``). Windows have nothing in common, so
-nothing is exchanged but a barrier at the beginning and at the end. Every finished window is a file; the same command
-with ``--load-dir``, and with any number of processes, goes on from those.
+nerfstudio itself starts several processes only on GPUs (``--machine.num-devices``). Windows are independent, so the
+processes exchange nothing but a barrier at the beginning and at the end. Every finished window is a file; the same
+command with ``--load-dir``, and with any number of processes, continues from those.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from nerfstudio.scripts.train import train_loop
 from nerfstudio.utils import profiler
 
 TIMEOUT = timedelta(days=7)
-"""Processes with less to do wait so long for the others; one that dies ends the run at once, by torchrun."""
+"""Time that processes with less work wait for the others; if one dies, torchrun ends the run at once."""
 
 
 def main() -> None:
