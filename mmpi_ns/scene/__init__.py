@@ -1,1 +1,1 @@
-"""What a scene is made of: the plan with its windows, MPI geometry, texels and bricks. No nerfstudio."""
+"""Data structures of a scene: the plan with its windows, MPI geometry, texels and bricks. No nerfstudio."""

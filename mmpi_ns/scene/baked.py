@@ -1,9 +1,9 @@
 """Baked multi-plane images: bricks of 8-bit codes, and the columns that find them (docs/export.md has the format).
 
-A baked brick holds 8 x 8 texels of one plane and shares its border texels with its neighbours, so that it covers 7 x 7
-cells and a lookup reads one brick alone. A column is the bricks that lie behind each other in ``WORD`` planes of one
-tile: a bit for each plane that holds something, and the number of the first brick; the others follow it. So a ray knows
-from one word which of the next planes it can leave out.
+A baked brick contains 8 x 8 texels of one plane and shares its border texels with its neighbours, so that it covers
+7 x 7 cells and a lookup reads only one brick. A column consists of the bricks of one tile in ``WORD`` consecutive
+planes: a bit for each occupied plane, and the number of the first brick; the others follow it. One word thus tells a
+ray which of the next planes it can skip.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ CELLS = SIDE - 1
 WORD = 32
 """Planes of a column."""
 FINENESS = 8
-"""Steps between two codes in which the optical depth of interpolated codes is told apart."""
+"""Subdivisions between two codes in the table of optical depths of interpolated codes."""
 MOST_CHANNELS = 16
-"""Channels that a texel can have."""
+"""Maximum channels of a texel."""
 
 
 @dataclass(frozen=True)
 class Codes:
-    """What 8-bit codes stand for: low + step code."""
+    """Values of 8-bit codes: low + step code."""
 
     low: float
     step: float
@@ -48,7 +48,7 @@ class Codes:
 
 @dataclass(frozen=True, eq=False)
 class Shader:
-    """The network that is asked once a ray: mean colour, mean features, encoded direction -> change of the colour."""
+    """The network evaluated once a ray: mean colour, mean features, encoded direction -> change of the colour."""
 
     layers: tuple[tuple[Float[Tensor, "O I"], Float[Tensor, "O"]], ...]
     """Weights and biases, with max(0, .) between them."""
@@ -69,8 +69,8 @@ class BakedMpis:
         density: codes of raw densities with the plane's bias.
         texels: codes of the channels of a ray: logits of the diffuse colour, then arguments of the features. They
             are interpolated before the sigmoid and the hyperbolic tangent, as in the exact renderer.
-        density_codes: what the codes of ``density`` stand for.
-        channel_codes: what those of ``texels`` stand for.
+        density_codes: values of the codes of ``density``.
+        channel_codes: values of the codes of ``texels``.
     """
 
     mpis: tuple[MPIPlan, ...]
@@ -81,7 +81,7 @@ class BakedMpis:
     density_codes: Codes
     channel_codes: tuple[Codes, ...]
     packed: dict[str, Any] = field(default_factory=dict)
-    """The same as a compiled operation reads it, made by it once."""
+    """The same in the layout of a compiled operation, made by it once."""
 
     @property
     def frames(self) -> Frames:
@@ -122,7 +122,7 @@ def columns_of(mpi: MPIPlan) -> int:
 
 
 def brick_numbers(columns: Int[Tensor, "N 2"], mpi: MPIPlan) -> Int[Tensor, "P Y X"]:
-    """Brick of every tile of one MPI from its columns; -1 where nothing is stored."""
+    """Brick of every tile of one MPI from its columns; -1 if it is empty."""
     words, down, across = tiles_of(mpi)
     bits = (columns[:, :1] >> torch.arange(WORD)) & 1
     numbers = torch.where(bits > 0, columns[:, 1:] + bits.cumsum(1) - bits, -1)
@@ -130,7 +130,7 @@ def brick_numbers(columns: Int[Tensor, "N 2"], mpi: MPIPlan) -> Int[Tensor, "P Y
 
 
 def neighbours(columns: Int[Tensor, "N 2"], mpis: tuple[MPIPlan, ...], count: int) -> Int[Tensor, "2 B"]:
-    """The bricks to the right of each brick and below it, in its plane; -1 where there is none."""
+    """The bricks to the right of each brick and below it, in its plane; -1 if there is none."""
     found, start = torch.full((2, count), -1), 0
     for mpi in mpis:
         numbers = brick_numbers(columns[start : start + columns_of(mpi)], mpi).to(torch.int64)
@@ -141,7 +141,7 @@ def neighbours(columns: Int[Tensor, "N 2"], mpis: tuple[MPIPlan, ...], count: in
 
 
 def take_borders(codes: UInt8[Tensor, "B 8 8 ..."], beside: Int[Tensor, "2 B"]) -> None:
-    """Gives the last column and row of each brick the texels of the bricks right and below, which are the same ones."""
+    """Copies the shared texels of the bricks to the right and below into the last column and row of each brick."""
     (right, has_right), (below, has_below) = ((x.clamp(min=0), x >= 0) for x in beside)
     codes[has_right, :CELLS, CELLS] = codes[right[has_right], :CELLS, 0]
     codes[has_below, CELLS] = codes[below[has_below], 0]
@@ -153,7 +153,7 @@ def columns_from(stored: Tensor, first: int) -> tuple[Int[Tensor, "N 2"], Int[Te
     """Columns of one MPI, and (plane, row, column) of its bricks in their order.
 
     Args:
-        stored: bool [planes, down, across], which tiles hold something.
+        stored: bool [planes, down, across], which tiles are occupied.
         first: bricks of the MPIs before.
     """
     planes, down, across = stored.shape

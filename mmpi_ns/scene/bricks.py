@@ -13,11 +13,11 @@ from mmpi_ns.scene.texels import BRICK, SIDE, TexelGrid, number_tiles
 from mmpi_ns.utils.machine import lazy_zeros
 
 CHUNK = 1 << 17
-"""Texels of an MPI that are resampled at once: of nine channels that takes some 40 MB beside both tables."""
+"""Texels of an MPI that are resampled at once: for nine channels this takes some 40 MB besides both tables."""
 
 
 def new_table(tiles: Int[Tensor, "T"], channels: int, empty: float = 0.0, dtype=torch.float32) -> Float[Tensor, "N C"]:
-    """A table of zeros with a brick for every stored tile; the empty brick holds ``empty``."""
+    """A table of zeros with a brick for every stored tile; the empty brick contains ``empty``."""
     bricks = int((tiles > 0).sum()) + 1
     table = torch.zeros(bricks * BRICK, channels, dtype=dtype, device=tiles.device)
     table[:BRICK] = empty
@@ -33,7 +33,7 @@ def read_planes(table: Float[Tensor, "N C"], grid: TexelGrid, planes: slice) -> 
 
 
 def write_planes(table: Float[Tensor, "N C"], grid: TexelGrid, planes: slice, images: Float[Tensor, "P H W C"]) -> None:
-    """Stores images in the bricks that there are; texels of other tiles are left out."""
+    """Stores images in the existing bricks; texels of other tiles are left out."""
     tiles = grid.own_tiles[planes]
     stored = tiles > 0
     below, right = grid.down * SIDE - grid.height, grid.across * SIDE - grid.width
@@ -43,7 +43,7 @@ def write_planes(table: Float[Tensor, "N C"], grid: TexelGrid, planes: slice, im
 
 
 def keep_bricks(tiles: Int[Tensor, "T"], keep: Bool[Tensor, "B"]) -> tuple[Int[Tensor, "T"], Int[Tensor, "K"]]:
-    """``tiles`` without the bricks that are given up, and the numbers that the others had before (0 among them)."""
+    """``tiles`` without the released bricks, and the previous numbers of the others (including 0)."""
     keep = keep.clone()
     keep[0] = True
     numbers = (keep.cumsum(0) - 1) * keep
@@ -61,8 +61,8 @@ def grown_tiles(
     """``tiles`` at another resolution: those that a stored texel of the old one reaches, and a training ray too.
 
     Args:
-        old: heads as they are.
-        new: heads as they will be; their tiles are not read.
+        old: current heads.
+        new: heads at the new resolution; their tiles are not read.
         is_cube: which of them is the cube.
         reachable: tiles that training rays cross; None for all.
     """
@@ -82,10 +82,10 @@ def resample(
 ) -> Float[Tensor, "M C"]:
     """The table at another resolution: bilinear on every plane of an MPI, trilinear in the cube (paper growth).
 
-    Texels beside a tile that holds nothing go on as the stored ones are. Planes are worked on a few at a time, so the
-    old table and the new one are all that is held.
+    Texels next to an empty tile extend the stored ones. Planes are processed a few at a time, so only the old and the
+    new table need memory.
     """
-    if not empty and not bool(table.any()):  # reliability that does not train takes no memory
+    if not empty and not bool(table.any()):  # untrained reliability takes no memory
         return lazy_zeros((int((new[0].tiles > 0).sum() + 1) * BRICK, table.shape[-1]), table.dtype, table.device)
     out = new_table(new[0].tiles, table.shape[-1], empty, table.dtype)
     for source, target, cube in zip(old, new, is_cube, strict=True):

@@ -1,7 +1,7 @@
 """The MPI frame: world <-> NDC, plane hits and the live interval of a ray (docs/how_it_works.md, "Geometry").
 
 Everything here is affine in disparity w = 1/depth, so a plane at infinity (w = 0) is an ordinary plane.
-Points travel as homogeneous pairs ``(o/t + d, 1/t)``, which are finite and exact at infinity.
+Points are represented as homogeneous pairs ``(o/t + d, 1/t)``, which are finite and exact at infinity.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from torch import Tensor
 from mmpi_ns.scene.plan import CubePlan, MPIPlan
 
 FACING_EPS = 1e-6
-"""A ray with a smaller facing component (cosine) runs along the planes and hits none of them."""
+"""A ray with a smaller facing component (cosine) is parallel to the planes and hits none of them."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Frames:
     extents: Float[Tensor, "K 4"]
     num_planes: Int[Tensor, "K"]
     last_disparities: Float[Tensor, "K"]
-    """Disparity of the last plane, 1 / far; 0 where an MPI reaches to infinity."""
+    """Disparity of the last plane, 1 / far; 0 if an MPI reaches to infinity."""
 
     @staticmethod
     def pack(mpis: Sequence[MPIPlan], dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Frames:
@@ -52,7 +52,7 @@ class Frames:
 
     @property
     def depth_shares(self) -> Float[Tensor, "K"]:
-        """1 - near / far: the share of all disparities beyond the near plane that an MPI spans; 1 to infinity."""
+        """1 - near / far: the fraction of all disparities beyond the near plane that an MPI spans; 1 to infinity."""
         return 1.0 - self.nears * self.last_disparities
 
     def one(self, k: int) -> Frames:
@@ -71,7 +71,7 @@ class PlaneHits:
     m_first: Int[Tensor, "R K"]
     """m of the nearest live plane."""
     count: Int[Tensor, "R K"]
-    """Number of live planes; 0 where the ray meets none."""
+    """Number of live planes; 0 if the ray meets none."""
     u: Float[Tensor, "R K 2"]
     """u(w) = u[0] + w u[1], tangent along the frame's x."""
     v: Float[Tensor, "R K 2"]
@@ -81,15 +81,15 @@ class PlaneHits:
 
 
 def rotate(axes: Float[Tensor, "*#N 3 3"], vectors: Float[Tensor, "*#N 3"]) -> Float[Tensor, "*N 3"]:
-    """axes @ vector by single products: a matrix product would run in bfloat16 under autocast."""
+    """axes @ vector by elementwise products: a matrix product would run in bfloat16 under autocast."""
     return (axes * vectors[..., None, :]).sum(-1)
 
 
 def rays_in_frames(
     origins: Float[Tensor, "R 3"], directions: Float[Tensor, "R 3"], frames: Frames
 ) -> tuple[Float[Tensor, "R K 3"], Float[Tensor, "R K 3"]]:
-    """Ray origins and directions in each MPI's axes, relative to the MPI's origin (differences first: far from the
-    world's origin nothing is lost)."""
+    """Ray origins and directions in each MPI's axes, relative to the MPI's origin (differences first, to keep precision
+    far from the world origin)."""
     offsets = origins[:, None, :] - frames.origins
     local_origins = rotate(frames.axes, offsets)
     return local_origins, rotate(frames.axes, directions[:, None, :])
@@ -124,7 +124,7 @@ def plane_hits(
 ) -> PlaneHits:
     """The live planes of each ray in each MPI, in closed form.
 
-    A plane is live when it faces the ray, lies ahead of the camera, between near and far, and is crossed inside
+    A plane is live if it faces the ray, lies ahead of the camera, between near and far, and is crossed inside
     the MPI's extent. Each condition is a half-space p w <= q in disparity, so the live planes are one range.
 
     Args:
@@ -264,7 +264,7 @@ def cube_hits(
 ) -> tuple[Int[Tensor, "R"], Int[Tensor, "R"]]:
     """First sample index and number of samples inside the cube; sample i lies at distance (i + 1/2) step.
 
-    Slab test; a direction component of 0 inside its slab puts no bound, outside it there is no hit.
+    Slab test; a direction component of 0 gives no bound inside its slab and no hit outside it.
     """
     flat = directions == 0
     safe = torch.where(flat, torch.ones_like(directions), directions)

@@ -1,7 +1,7 @@
-"""ScenePlan: where the MPIs stand and what they spend texels on, as plain data.
+"""ScenePlan: placement and resolution of the MPIs, as plain data.
 
-A plan is all that a field needs to be built, so it travels inside the checkpoint (as JSON bytes) and beside
-``config.yml`` (as a file that a person can read and edit).
+A field is built from its plan alone, so the plan is stored in the checkpoint (as JSON bytes) and beside ``config.yml``
+(as a file to read and edit).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ Vector = tuple[float, float, float]
 Plan = TypeVar("Plan")
 
 SHALLOWEST = 1.001
-"""An MPI's last plane lies at least so many times as deep as its first: closer, float32 could not tell them apart."""
+"""Minimum ratio of the depths of an MPI's last and first plane: float32 could not distinguish closer ones."""
 
 HUGE = 1e18
 """Longest length of a plan, scene units: float32 still holds its square."""
@@ -61,7 +61,7 @@ class MPIPlan:
 
     @property
     def depth_share(self) -> float:
-        """1 - near / far: the share of all disparities beyond the near plane that the planes span; 1 to infinity."""
+        """1 - near / far: the fraction of all disparities beyond the near plane that the planes span; 1 to infinity."""
         return 1.0 - self.near * self.last_disparity
 
     @property
@@ -110,11 +110,11 @@ class ScenePlan:
     mpis: tuple[MPIPlan, ...]
     cube: CubePlan | None
     ray_near: float
-    """Rays start here: nothing is sampled closer to a camera than this."""
+    """Rays start at this distance: nothing is sampled closer to a camera."""
     content_near: float
-    """Distance from the cameras to the first content: an MPI entered later than this explains a ray only in part."""
+    """Distance from the cameras to the first content: an MPI entered later covers a ray only in part."""
     origin_of_plan: str = "by hand"
-    """Which rule made the plan, for the reader."""
+    """The rule that made the plan, for information."""
 
     def __post_init__(self) -> None:
         self.validate()
@@ -133,7 +133,7 @@ class ScenePlan:
 
     @property
     def samples_per_ray(self) -> int:
-        """Samples of a ray that crosses every plane, and about as many of the cube as it can have."""
+        """Maximum samples of a ray: every plane, and about as many as possible in the cube."""
         return sum(m.planes for m in self.mpis) + (sum(self.cube.shape) if self.cube else 0)
 
     def scaled(self, factor: float) -> ScenePlan:
@@ -184,7 +184,7 @@ class ScenePlan:
 
 
 def load_plan(path: Path, read: Callable[[str], Plan]) -> Plan:
-    """Reads the text of a plan file, and names the file in whatever is said about it."""
+    """Reads the text of a plan file; errors name the file."""
     if not path.is_file():
         raise InputError(f"There is no scene plan at {path}: check the path given to --pipeline.model.plan-file.")
     try:
@@ -240,7 +240,7 @@ def _validate_cube(cube: CubePlan) -> None:
 
 
 def read_object(text: str) -> dict:
-    """The JSON object of a plan. Raises InputError with one sentence where there is none."""
+    """The JSON object of a plan. Raises InputError with one sentence if there is none."""
     try:
         data = json.loads(text)
     except (ValueError, RecursionError) as error:
@@ -253,7 +253,7 @@ def read_object(text: str) -> dict:
 
 
 def check_fields(cls: type, data: Any, where: str) -> None:
-    """Raises InputError where ``data`` is no JSON object with the fields of a class."""
+    """Raises InputError if ``data`` is not a JSON object with the fields of a class."""
     if not isinstance(data, dict):
         raise InputError(f"{where} is not a JSON object: compare it with docs/how_it_works.md.")
     names = {f.name for f in fields(cls)}
@@ -270,7 +270,7 @@ def _build(cls: type, data: Any, where: str) -> Any:
 
 
 def _with_far(mpi: Any) -> Any:
-    """Null, or nothing, stands for infinity."""
+    """Null, or a missing value, stands for infinity."""
     return {**mpi, "far": math.inf if mpi.get("far") is None else mpi["far"]} if isinstance(mpi, dict) else mpi
 
 
@@ -295,4 +295,4 @@ NO_PLAN = ScenePlan(
     0.0,
     1.0,
 )
-"""The plan of a model that only loads a checkpoint, which brings its own."""
+"""The plan of a model that will load a checkpoint, which has its own plan."""

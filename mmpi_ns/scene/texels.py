@@ -1,9 +1,9 @@
 """Which texels a lookup reads, and with which weights. Pure index arithmetic over one pooled table.
 
-All heads share one table a kind (density, features, reliability). A table is a list of bricks of ``BRICK`` rows, each
-the ``SIDE`` x ``SIDE`` texels of one tile of a plane (row by row), and ``tiles`` says which brick a tile is: head by
-head, plane by plane from near to far (in the cube: layer by layer), tile row by tile row. Brick 0 is shared by all
-tiles that hold nothing.
+Density, features and reliability each have one table, shared by all heads. A table is a list of bricks of ``BRICK``
+rows, the ``SIDE`` x ``SIDE`` texels of one tile of a plane (row by row). ``tiles`` maps tiles to bricks: head by head,
+plane by plane from near to far (in the cube: layer by layer), tile row by tile row. Brick 0 is shared by all empty
+tiles.
 
     row of texel (plane, y, x) = tiles[first_tile + (plane * down + y // 8) * across + x // 8] * 64 + y % 8 * 8 + x % 8
 """
@@ -21,7 +21,7 @@ from mmpi_ns.scene.plan import ScenePlan
 SIDE = 8
 """Texels along each side of a brick."""
 BRICK = SIDE * SIDE
-"""Rows of a brick. The first so many rows of every table are the empty brick, which nothing may change."""
+"""Rows of a brick. The first brick of every table is the empty one, which must not change."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,9 +32,9 @@ class TexelGrid:
     height: int
     width: int
     first_tile: int
-    """Where the head's tiles begin among those of all heads."""
+    """Index of the head's first tile among those of all heads."""
     tiles: Int[Tensor, "T"]
-    """Brick of every tile of all heads (int32); 0 where nothing is stored."""
+    """Brick of every tile of all heads (int32); 0 for empty tiles."""
     places: Int[Tensor, "B"]
     """Tile of every brick (int64); -1 for the empty one."""
 
@@ -98,12 +98,12 @@ class TexelGrid:
         return self.row(z, y, x)
 
     def holds(self, rows: Int[Tensor, "N"]) -> Bool[Tensor, "N"]:
-        """Which rows are this head's; those of the empty brick are nobody's."""
+        """Which rows belong to this head; those of the empty brick belong to none."""
         place = self.places[rows >> 6]
         return (place >= self.first_tile) & (place < self.first_tile + self.num_tiles)
 
     def texel(self, rows: Int[Tensor, "N"]) -> tuple[Int[Tensor, "N"], Int[Tensor, "N"], Int[Tensor, "N"]]:
-        """(plane, y, x) of rows that this head ``holds``: the way back from ``row``."""
+        """(plane, y, x) of rows that this head ``holds``: the inverse of ``row``."""
         tile = self.places[rows >> 6] - self.first_tile
         x = (tile % self.across) * SIDE + (rows & 7)
         y = (tile // self.across % self.down) * SIDE + (rows >> 3 & 7)
@@ -151,7 +151,7 @@ def head_shapes(plan: ScenePlan) -> list[tuple[int, int, int]]:
 
 
 def make_grids(shapes: list[tuple[int, int, int]], tiles: Int[Tensor, "T"] | None = None) -> list[TexelGrid]:
-    """Grids of the given sizes, one behind the other."""
+    """Grids of the given sizes, stored one after the other."""
     counts = [depth * -(-height // SIDE) * -(-width // SIDE) for depth, height, width in shapes]
     if tiles is None:
         tiles = torch.arange(1, sum(counts) + 1, dtype=torch.int32)

@@ -1,4 +1,4 @@
-"""Which tiles of texels training rays can read, from the cameras alone (no image is looked at)."""
+"""Tiles of texels that training rays can read, from the cameras alone, without reading images."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from mmpi_ns.scene.plan import MPIPlan, ScenePlan
 from mmpi_ns.scene.texels import SIDE
 
 BORDER_RAYS = 33
-"""Rays along each border of an image: enough to follow what a lens bends."""
+"""Rays along each border of an image, enough to follow lens distortion."""
 MARGIN = 0.25
 """Texels added on each side of a tile: rays are drawn in float32."""
 
 
 @dataclass(frozen=True)
 class TrainingViews:
-    """Where each training camera stands and the four planes through it that its image lies between."""
+    """Position of each training camera and the four side planes of its frustum."""
 
     origins: Float[Tensor, "M 3"]
     inward: Float[Tensor, "M 4 3"]
-    """Normals of the planes: a direction d is in the image only where all inward . d >= 0."""
+    """Normals of the planes: a direction d is in the image only if all inward . d >= 0."""
 
     @staticmethod
     def of(cameras: Cameras) -> TrainingViews:
-        """The views of a data set. A camera that sees half the world or more is bounded by nothing (normals of 0)."""
+        """The views of a data set. A camera that sees half the sphere or more has no bounds (normals of 0)."""
         cameras, count, shares = cameras.to("cpu"), len(cameras), torch.linspace(0, 1, BORDER_RAYS)
         ends = torch.zeros(BORDER_RAYS)
         sides = [(ends, shares), (ends + 1, shares), (shares, ends), (shares, ends + 1)]
@@ -58,10 +58,11 @@ class TrainingViews:
 
 
 def reachable_tiles(views: TrainingViews, plan: ScenePlan) -> Bool[Tensor, "T"]:
-    """Tiles (in the order of ``texels``) that hold a texel which a ray through a training image can read.
+    """Tiles (in the order of ``texels``) with a texel that a ray through a training image can read.
 
-    A tile is left out when it lies beyond one of the four planes of every image, or on a plane that no camera is in
-    front of; so are a few too many marked at the corners of images, never too few. All tiles of the cube are marked.
+    A tile is left out if it lies outside one of the four planes of every image, or on a plane that no camera is in
+    front of. This is conservative: a few too many are marked at the corners of images. All tiles of the cube are
+    marked.
 
     Args:
         views: the training images.
@@ -78,7 +79,7 @@ def _tiles_of(mpi: MPIPlan, views: TrainingViews) -> Bool[Tensor, "L Y X"]:
     """Tiles of one MPI that some image can read.
 
     From a camera at o (in the MPI's axes) the point with tangents (u, v) on the plane of disparity w lies in direction
-    (u, v, 1) - w o, which is affine in u and v: over a tile, the most of normal . direction is a sum of two maxima.
+    (u, v, 1) - w o, which is affine in u and v: over a tile, the maximum of normal . direction is a sum of two maxima.
     """
     axes = torch.tensor(mpi.axes, dtype=torch.float64)
     origins = (views.origins - torch.tensor(mpi.origin, dtype=torch.float64)) @ axes.T

@@ -1,8 +1,9 @@
-"""Windows: stretches of a long capture, each with MPIs of its own, asked only by rays that start there.
+"""Windows: parts of a long capture, each with its own MPIs, which render only rays that start there.
 
-A ray's camera decides which windows it asks. Where balls of cameras overlap the renderings are mixed, with shares that
-change continuously along the way, so no seam is seen (Block-NeRF, Tancik et al. 2022, mixes by camera distance too).
-Cost a ray, a step and memory are those of one window, however long the capture is; docs/how_it_works.md, "Windows".
+The camera position of a ray determines its windows. Where balls of cameras overlap, the renderings are mixed, with
+shares that change continuously along the path, so no seam is visible (Block-NeRF, Tancik et al. 2022, also mixes by
+camera distance). The work for a ray or a step and the memory are those of one window, however long the capture is;
+docs/how_it_works.md, "Windows".
 """
 
 from __future__ import annotations
@@ -24,14 +25,14 @@ from mmpi_ns.utils.values import Number, check_number, check_row
 
 @dataclass(frozen=True)
 class Window:
-    """The cameras in a ball, and the plan that shows what they see."""
+    """A ball of cameras, and the plan for what they see."""
 
     center: Vector
     """Middle of the ball, world axes, scene units."""
     radius: float
-    """Cameras within ask this window fully; inf (in JSON: null) where there is one window alone."""
+    """Rays of cameras within are rendered by this window; inf (in JSON: null) if there is only one window."""
     margin: float
-    """Beyond the radius the window's share falls to nothing over this distance."""
+    """Beyond the radius, the share of the window falls to zero over this distance."""
     plan: ScenePlan
 
 
@@ -70,7 +71,7 @@ class WindowedPlan:
         return sum(plan.num_heads for plan in self.plans[:window])
 
     def find(self, name: str) -> tuple[int, int] | None:
-        """Window and head that one of ``names`` stands for; None for any other name."""
+        """Window and head of one of ``names``; None for any other name."""
         names = self.names
         if name not in names:
             return None
@@ -120,14 +121,14 @@ def _read_window(row: Any, index: int) -> Window:
 
 
 def window_shares(origins: Float[Tensor, "R 3"], windows: tuple[Window, ...]) -> Float[Tensor, "R W"]:
-    """How much each window says of rays that start at ``origins``; every row sums to 1.
+    """Share of each window in rays that start at ``origins``; every row sums to 1.
 
-    Inside its ball a window counts fully, and beyond it falls off linearly over its margin; shares are normalised. A
-    ray that starts in no ball asks the nearest.
+    Inside its ball a window has full weight, which falls off linearly over its margin beyond it; weights are
+    normalised. A ray that starts in no ball uses the nearest.
 
     Args:
-        origins: where rays start.
-        windows: those that can be asked.
+        origins: of the rays.
+        windows: available windows.
     """
     centers = torch.tensor([w.center for w in windows], dtype=torch.float64, device=origins.device)
     radii, margins = (

@@ -28,7 +28,7 @@ SHOWN = {
     ),
     "object": (
         Demo(kind="object", images=48, steps=600),
-        "An object filmed from all sides, which MPIs are not suited for: from behind, one shows the edges of its planes.",
+        "An object filmed from all sides, for which MPIs are not made: from behind, one shows the edges of its planes.",
     ),
 }
 """Each scene with the options of making and training it, and a sentence about it."""
