@@ -89,10 +89,10 @@ def overview(run: Run, shown: Shown) -> Image.Image:
     """Half a sheet for the impatient: one view, and where all MPIs stand."""
     width, line = 440, 22
     parts = [
-        ("truth (held out of training)", image_of(shown.truth, width)),
+        ("ground truth (test image)", image_of(shown.truth, width)),
         (f"rendering, {shown.psnr:.1f} dB", image_of(shown.view.color, width)),
         ("depth: near is bright", image_of(depth_colors(shown.view.inverse_depth, nearest_of([shown])), width)),
-        ("winning MPI: whose colour a pixel has", image_of(_winner_colors(run, shown.view), width)),
+        ("winning MPI: largest weight in a pixel", image_of(_winner_colors(run, shown.view), width)),
     ]
     height = parts[0][1].height + line
     top_view = Map.of(run.observations, 2 * width + GAP, 220)
@@ -115,17 +115,17 @@ def _header(run: Run, views: int) -> Image.Image:
     cubes = sum(isinstance(head, CubePlan) for head in run.heads)
     count = f"{len(run.heads) - cubes} multi-plane images (MPIs){' and a cube' if cubes else ''}"
     text = (
-        f"This scene is {count}. Each is a stack of see-through planes that face one way, dense near its origin (cross "
-        "on the maps) and sparse far away.\nAn MPI is sharp for views that stand just past its origin: go down a "
-        "column and see which one is, and that it wins there. A ray reads\nall of them, sorts what it meets by "
-        "distance and adds it up: that is the rendering. Black dots are training cameras, A, B, ... the test views."
+        f"This scene consists of {count}. Each is a stack of semi-transparent planes that face one way,\ndense near "
+        "its origin (cross on the maps) and sparse far away. An MPI is sharp for views just past its origin: follow a "
+        "column down\nto see which one that is; it wins there. The rendering samples all MPIs along each ray and "
+        "composites the samples by distance.\nBlack dots are training cameras, A, B, ... the test views."
     )
-    header = Image.new("RGB", (LABELS + views * (VIEW + GAP) + GAP, 122), "white")
+    header = Image.new("RGB", (LABELS + views * (VIEW + GAP) + GAP, 138), "white")
     draw = ImageDraw.Draw(header)
     write(draw, (10, 8), "One radiance field made of several multi-plane images", 18, bold=True)
     write(draw, (10, 36), text, 13)
     for k in range(views):
-        write(draw, (LABELS + k * (VIEW + GAP), 102), f"test view {chr(ord('A') + k)}", 14, bold=True)
+        write(draw, (LABELS + k * (VIEW + GAP), 118), f"test view {chr(ord('A') + k)}", 14, bold=True)
     return header
 
 
@@ -153,7 +153,7 @@ def _whole_rows(run: Run, shown: list[Shown]) -> list[tuple[Image.Image, list[Im
     error_ticks = [(0.0, "0"), (0.5, f"{WORST_ERROR / 2:.2f}"), (1.0, f"{WORST_ERROR:.1f} or more")]
     error_bar = scale_bar(_ramp("inferno"), 300, 12, error_ticks)
     return [
-        (_label("Truth", "images held out of the training", size), [image_of(s.truth, VIEW) for s in shown]),
+        (_label("Ground truth", "test images, not used for training", size), [image_of(s.truth, VIEW) for s in shown]),
         (
             _label("Rendering", f"all MPIs merged by distance\nPSNR {scores} dB", size),
             [image_of(v.color, VIEW) for v in views],
@@ -163,11 +163,11 @@ def _whole_rows(run: Run, shown: list[Shown]) -> list[tuple[Image.Image, list[Im
             [image_of(error_colors(e), VIEW) for e in errors],
         ),
         (
-            _label("Depth", "distance at which a ray has half its colour", size, depth_bar),
+            _label("Depth", "distance at which half of a ray's weight is reached", size, depth_bar),
             [image_of(depth_colors(v.inverse_depth, nearest), VIEW) for v in views],
         ),
         (
-            _label("Winning MPI", "the MPI that gives a pixel most of its colour;\nthe colours are named below", size),
+            _label("Winning MPI", "the MPI with the largest weight in a pixel;\nfor the colours see below", size),
             [image_of(_winner_colors(run, v), VIEW) for v in views],
         ),
     ]
@@ -189,7 +189,7 @@ def _alone_rows(run: Run, shown: list[Shown]) -> list[tuple[Image.Image, list[Im
         name = "cube" if isinstance(head, CubePlan) else f'MPI "{run.windows.names[k]}"'
         write(draw, (32, 2), f"{name} alone", 15, bold=True)
         empty = max(float((v.alone[k][..., 3] < 0.5).mean()) for v in shown) > 0.01
-        text = f"facing {facing}; wins {won:.0f} % of the pixels{'; checks: it holds nothing' if empty else ''}"
+        text = f"facing {facing}; wins {won:.0f} % of the pixels{'; checkerboard: empty' if empty else ''}"
         write(draw, (10, 23), text, 12, fill=FAINT)
         label.paste(drawn.draw([(head, color)], marks), (10, size - drawn.size[1]))
         rows.append((label, [image_of(over_checks(s.alone[k]), VIEW) for s in shown]))
