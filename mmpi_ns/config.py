@@ -59,9 +59,11 @@ def _method(
 
 
 def _paper() -> dict:
-    """What the paper takes from DVGO: total variation, and rates that fall from the start; no release of bricks."""
+    """What the paper takes from DVGO: total variation, nine features, and rates that fall from the start; no release of
+    bricks, and all rays at every step."""
     loss = LossWeights(tv_density=1e-5, tv_features=1e-6)
-    return {"loss": loss, "decay_from": 0.0, "decay_decades": 1.5, "release_weight": 0.0, "shading": "sample"}
+    rates = {"decay_from": 0.0, "decay_decades": 1.5, "growing_rays": 1.0}
+    return rates | {"loss": loss, "release_weight": 0.0, "shading": "sample", "feature_channels": 9}
 
 
 mmpi = _method(

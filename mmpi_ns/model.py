@@ -89,6 +89,8 @@ class MMPIModelConfig(ModelConfig):
     """after being constant for this fraction of it."""
     growth_shares: tuple[float, ...] = (1 / 15, 2 / 15, 3 / 15, 4 / 15)
     """When the texels of a plane double, as shares of the first phase."""
+    growing_rays: float = 0.5
+    """Fraction of a step's rays that are drawn until then: coarse texels need fewer, and nearly all samples learn."""
     release_shares: tuple[float, ...] = (0.5, 0.75, 0.95)
     """When empty bricks (8 x 8 texels of a plane) are released, as fractions of the first phase."""
     release_weight: float = 5e-3
@@ -102,8 +104,9 @@ class MMPIModelConfig(ModelConfig):
     """Evaluate the colour network once a ray, after compositing (ray), or for every sample as in the paper (sample)."""
     shared_colour: bool = False
     """Shading of samples: one colour network for all MPIs instead of one each."""
-    feature_channels: int = 9
-    """Channels of a texel besides its density: three of a colour, the others features for view-dependent appearance."""
+    feature_channels: int = 8
+    """Channels of a texel besides its density: three of a colour, the others features for view-dependent appearance.
+    Eight are half a cache line, so a CPU trains faster with them than with nine (docs/performance.md)."""
     hidden_width: int = 64
     """Width of the colour networks."""
     position_frequencies: int = 2
@@ -154,6 +157,7 @@ class MMPIModelConfig(ModelConfig):
             finetune_rate=self.finetune_rate,
             windows=windows,
             release_shares=self.release_shares if self.release_weight > 0 else (),
+            growing_rays=self.growing_rays,
         )
 
     def field_settings(self) -> dict[str, Any]:

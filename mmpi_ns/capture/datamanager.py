@@ -88,6 +88,8 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
     def __init__(self, config: MMPIDataManagerConfig, **kwargs: Any) -> None:
         self.pool: PixelPool | None = None
         self.known_depth: KnownDepth | None = None
+        self.rays_share = 1.0
+        """Share of a step's rays that are drawn; the schedule sets it."""
         self._allowed: Tensor | None = None
         self._all_shared: SharedPoints | None = None
         parser = config.dataparser
@@ -162,6 +164,10 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         if not self._reads_by_window:
             self._all_shared = self._find_shared(range(len(self.train_dataset)))
         self._shared = self._all_shared
+
+    def get_train_rays_per_batch(self) -> int:
+        """Pixel rays of the step at hand."""
+        return max(1, round(self.rays_share * self.config.train_num_rays_per_batch))
 
     def _find_shared(self, images: Sequence[int]) -> SharedPoints | None:
         """The points that two of these training images show at the same depth, if rays of new views are enabled."""
@@ -277,7 +283,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         depths = torch.zeros(len(bundle), 1, device=self.device)
         # Points shared by two images are more informative than keypoints, which replace the missing ones.
         missing = 1.0 if self._shared is None else max(0.0, 1 - self._shared.cover)
-        count = round(missing * self.config.keypoint_rays)
+        count = round(missing * self.rays_share * self.config.keypoint_rays)
         if self.training and self._keypoints is not None and count > 0:
             keypoint_bundle, keypoint_depths = self._keypoint_rays(count, g)
             bundle, depths = _join(bundle, keypoint_bundle), torch.cat([depths, keypoint_depths])

@@ -44,6 +44,7 @@ MODEL = {
     "decay_decades": NOT_NEGATIVE,
     "decay_from": SHARE,
     "growth_shares": SHARE,
+    "growing_rays": Number(0, 1, above=True),
     "release_shares": SHARE,
     "release_weight": NOT_NEGATIVE,
     "feature_channels": Number(3, 256, whole=True),

@@ -50,6 +50,8 @@ class Schedule:
     release: tuple[int, ...] = ()
     """Steps before which empty bricks are released, judging by the samples since the previous such step, or since
     surfaces formed."""
+    growing_rays: float = 1.0
+    """Fraction of a step's rays that are drawn until surfaces have formed."""
 
     @property
     def is_joint(self) -> bool:
@@ -93,6 +95,10 @@ class Schedule:
     def _sharp_from(self) -> int:
         return self.growth[-1] if self.growth else self.phases[0].end // 10
 
+    def rays_share(self, step: int) -> float:
+        """Share of the rays of a step that are drawn."""
+        return 1.0 if self.sharpened(step) else self.growing_rays
+
     def releases_at(self, step: int) -> bool:
         """Whether bricks are released before this step."""
         return self._local(step) in self.release
@@ -134,6 +140,7 @@ def make_schedule(
     finetune_rate: float = 0.1,
     windows: int = 1,
     release_shares: tuple[float, ...] = (),
+    growing_rays: float = 1.0,
 ) -> Schedule:
     """The schedule of a run of ``total_steps`` steps a window.
 
@@ -149,6 +156,7 @@ def make_schedule(
         windows: windows of a long capture, trained one after the other.
         release_shares: when empty bricks are released, as fractions of the first phase; not before surfaces have
             formed.
+        growing_rays: fraction of a step's rays that are drawn until then.
 
     Raises:
         ValueError: the shares leave no step for the first phase.
@@ -175,6 +183,7 @@ def make_schedule(
         raise ValueError("growth-shares must not decrease.")
     if not 0 <= decay_from < 1:
         raise ValueError(f"decay-from must lie between 0 and 1, 1 excluded, got {decay_from}.")
-    schedule = Schedule(phases, growth, float(decay_decades), float(decay_from), float(finetune_rate), windows)
+    rates = float(decay_decades), float(decay_from), float(finetune_rate)
+    schedule = Schedule(phases, growth, *rates, windows, growing_rays=float(growing_rays))
     release = sorted({round(s * phases[0].end) for s in release_shares})
     return replace(schedule, release=tuple(s for s in release if s > schedule._sharp_from))

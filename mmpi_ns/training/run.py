@@ -106,8 +106,8 @@ class TrainingRun:
                 if kind in optimizers:
                     optimizers[kind].reset_moments(params[0])
         prepare_storage(field, progress.schedule, step, self.release_weight, optimizers)
-        if len(progress.windows) > 1 and attributes is not None and self._drawn_from != progress.window:
-            self._draw_from_window(attributes.pipeline.datamanager if attributes.pipeline else None)
+        if attributes is not None and attributes.pipeline is not None:
+            self._prepare_draws(attributes.pipeline.datamanager)
         phase = progress.phase.name
         field.learns_cover = phase == "individual"
         for kind, params in groups.items():
@@ -124,8 +124,11 @@ class TrainingRun:
         field.renew_networks()
         self.progress.begin(window)
 
-    def _draw_from_window(self, manager: Any) -> None:
-        """Makes the data manager draw from the cameras of the current window."""
-        assert isinstance(manager, MMPIDataManager), "windows need MMPIDataManager"
-        manager.use_cameras(self.cameras_of(manager.observations.centers, self.progress.window))
-        self._drawn_from = self.progress.window
+    def _prepare_draws(self, manager: Any) -> None:
+        """Makes the data manager draw the rays of the current step, from the cameras of the current window."""
+        assert isinstance(manager, MMPIDataManager), "training needs MMPIDataManager"
+        progress = self.progress
+        manager.rays_share = progress.schedule.rays_share(progress.step)
+        if len(progress.windows) > 1 and self._drawn_from != progress.window:
+            manager.use_cameras(self.cameras_of(manager.observations.centers, progress.window))
+            self._drawn_from = progress.window

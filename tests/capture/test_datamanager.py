@@ -129,6 +129,16 @@ def test_without_a_colmap_model_or_on_request_there_are_no_keypoint_rays(scene, 
     assert len(datamanager(scene, keypoint_rays=0).next_train(0)[0]) == 64
 
 
+def test_a_share_of_a_steps_rays_is_drawn_of_each_kind(scene):
+    manager = datamanager(scene, new_view_share=1.0)
+    manager._shared = dataclasses.replace(manager._shared, cover=0.5)
+    assert len(manager.next_train(2)[0]) == 64 + 32 + 8 and manager.get_train_rays_per_batch() == 64
+    manager.rays_share = 0.25
+    rays, batch = manager.next_train(2)
+    assert len(rays) == 16 + 8 + 2 and batch["image"].shape == (16 + 8, 3)
+    assert manager.get_train_rays_per_batch() == 16, "what nerfstudio counts"
+
+
 def test_rays_of_new_views_come_after_the_pixels_and_leave_fewer_keypoint_rays(scene):
     manager = datamanager(scene, new_view_share=1.0)
     assert manager._shared.cover > 1 and len(manager.next_train(2)[0]) == 128, "no keypoint is missed"

@@ -14,7 +14,7 @@ from mmpi_ns.field.samples import metadata_of, places_of
 from mmpi_ns.ops.gather import KnownTaps, gather_places, gather_taps, reference
 from mmpi_ns.rendering.sampler import MMPISampler
 
-CHANNELS = (3, 9, 16, 20)
+CHANNELS = (3, 8, 9, 16, 20)
 
 
 def values_by_hand(raw):

@@ -17,7 +17,7 @@ from mmpi_ns.scene.plan import CubePlan, ScenePlan
 from mmpi_ns.scene.texels import BRICK
 
 
-@pytest.mark.parametrize("channels", [1, 9])
+@pytest.mark.parametrize("channels", [1, 8, 9])
 def test_variation_equals_the_reference_with_its_gradient(channels):
     cube = CubePlan((-1.0, -1.0, 2.0), (1.0, 1.0, 5.0), (3, 2, 4))
     plan = ScenePlan((make_mpi("a", height=5, width=4, planes=3), make_mpi("b", height=2, width=3)), cube, 0.05, 1.0)
@@ -36,7 +36,7 @@ def test_variation_equals_the_reference_with_its_gradient(channels):
     assert torch.allclose(found[0][1], found[1][1], atol=1e-5)
 
 
-@pytest.mark.parametrize("channels", [1, 9])
+@pytest.mark.parametrize("channels", [1, 8, 9])
 def test_variation_of_many_texels_does_not_depend_on_the_number_of_threads(channels):
     layout = layout_of([(3, 70, 60), (2, 50, 41)])
     grids = layout.grids

@@ -128,6 +128,14 @@ def test_shares_that_leave_nothing_for_the_first_phase_are_refused(blend, finetu
         make_schedule("two-phase", 1000, blend_share=blend, finetune_share=finetune)
 
 
+def test_fewer_rays_are_drawn_until_surfaces_have_formed():
+    schedule = make_schedule("joint", 1500, growing_rays=0.25, windows=2)
+    assert [schedule.rays_share(step) for step in (0, 399, 400, 1499, 1500, 1899, 1900)] == [
+        0.25, 0.25, 1, 1, 0.25, 0.25, 1,
+    ]  # fmt: skip
+    assert make_schedule("joint", 1500).rays_share(0) == 1, "as it was, unless fewer are asked for"
+
+
 def test_without_growth_all_texels_are_there_from_the_start():
     assert make_schedule("joint", 10, growth_shares=()).texel_factor(0) == 1
 
@@ -187,7 +195,9 @@ def test_impossible_schedules_name_the_setting(settings, word):
 
 
 def test_a_models_schedule_is_made_of_its_options():
-    schedule = MMPIModelConfig(decay_decades=2.0, decay_from=0.25, finetune_rate=0.3).schedule("two-phase", 3)
+    config = MMPIModelConfig(decay_decades=2.0, decay_from=0.25, finetune_rate=0.3, growing_rays=0.7)
+    schedule = config.schedule("two-phase", 3)
+    assert schedule.growing_rays == 0.7
     assert (schedule.decay_decades, schedule.decay_from, schedule.finetune_rate) == (2.0, 0.25, 0.3)
     assert schedule.windows == 3
 
@@ -196,4 +206,5 @@ def test_a_models_schedule_is_made_of_its_options():
 def test_the_papers_methods_keep_its_rates(method):
     model, optimizers = method.config.pipeline.model, method.config.optimizers
     assert (model.decay_decades, model.decay_from) == (1.5, 0.0)
+    assert (model.growing_rays, model.feature_channels) == (1.0, 9)
     assert optimizers["colour"]["optimizer"].lr == 1e-3

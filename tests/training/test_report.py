@@ -14,7 +14,7 @@ def lines_of(monkeypatch, capsys, steps, seconds_a_step, **how):
     """What is said of a run whose steps take so long, the first of them a minute longer."""
     now = [0.0]
     monkeypatch.setattr(report, "monotonic", lambda: now[0])
-    settings = {"blend_share": 0.25, "finetune_share": 0.25, "growth_shares": (), "decay_decades": 1.0}
+    settings = {"blend_share": 0.25, "finetune_share": 0.25, "growth_shares": (), "decay_decades": 1.0} | how
     schedule = make_schedule("two-phase", steps, **settings, finetune_rate=1.0, windows=1, release_shares=())
     log = report.TrainingLog(schedule, 1000, 0, steps)
     for step in range(steps):
@@ -29,6 +29,13 @@ def test_a_line_says_phase_speed_psnr_and_time_left(monkeypatch, capsys):
     assert lines[-1] == "step 400 of 400 | finetune | 2,000 rays/s | batch PSNR 20.0 dB | 0 s left"
     assert 40 <= len(lines) <= 44
     assert any(line.startswith("step 201 of 400 | blend") for line in lines), "a phase begins"
+
+
+def test_the_speed_counts_the_rays_that_are_drawn(monkeypatch, capsys):
+    lines = lines_of(monkeypatch, capsys, 400, 0.5, growth_shares=(0.5,), growing_rays=0.25)
+    speeds = [line.split(" | ")[2] for line in lines]
+    assert speeds[0] == "500 rays/s" and speeds[-1] == "2,000 rays/s" and len(set(speeds)) <= 3
+    assert sum(speed == "500 rays/s" for speed in speeds) > 8, "half of the first phase"
 
 
 def test_lines_are_neither_dense_nor_half_a_minute_apart(monkeypatch, capsys):

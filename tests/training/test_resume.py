@@ -250,3 +250,14 @@ def test_a_longer_run_keeps_the_schedule_of_the_checkpoint_in_model_and_learning
     assert sorted(int(p.stem[5:]) for p in trainer.checkpoint_dir.iterdir())[-1] == STEPS + 5
     state = load(trainer.checkpoint_dir, STEPS - 1)
     assert differences(compared(load(whole[1], STEPS - 1)), compared(state)) == []
+
+
+def test_fewer_rays_are_drawn_until_the_texels_have_grown(scene, plan_file, tmp_path):
+    trainer = ready(trainer_config(scene, plan_file, tmp_path, STEPS, growing_rays=0.25))
+    drawn = []
+    for step in (0, 5, 6):
+        for callback in trainer.callbacks:
+            callback.run_callback_at_location(step, location=TrainingCallbackLocation.BEFORE_TRAIN_ITERATION)
+        rays, _ = trainer.pipeline.datamanager.next_train(step)
+        drawn.append(len(rays))
+    assert drawn == [20, 20, 80]

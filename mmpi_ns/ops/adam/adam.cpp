@@ -2,6 +2,7 @@
 #include "table.h"
 
 #include <cmath>
+#include <type_traits>
 
 namespace {
 
@@ -35,15 +36,21 @@ void mmpi_adam_rows(const int64_t* rows, int64_t begin, int64_t end, int64_t cha
         const float* __restrict g = grad + i * channels;
         float* __restrict value = param + rows[i] * channels;
         uint16_t* __restrict mean = moments + rows[i] * 2 * channels;
-        for (int64_t c = 0; c < channels; c++) {
-            const bool touched = g[c] != 0;
-            const float m = widen(mean[c]), s = widen(mean[channels + c]);
-            const float new_mean = m + (1 - beta1) * (g[c] - m), new_square = s * beta2 + (1 - beta2) * g[c] * g[c];
-            const float step = rate * (new_mean / (std::sqrt(new_square) / correction + eps));
-            mean[c] = touched ? narrow(new_mean) : mean[c];
-            mean[channels + c] = touched ? narrow(new_square) : mean[channels + c];
-            value[c] = touched ? value[c] - step : value[c];
-        }
+        const auto step_row = [&](auto size) {
+            for (int64_t c = 0; c < size; c++) {
+                const bool touched = g[c] != 0;
+                const float m = widen(mean[c]), s = widen(mean[size + c]);
+                const float new_mean = m + (1 - beta1) * (g[c] - m), new_square = s * beta2 + (1 - beta2) * g[c] * g[c];
+                const float step = rate * (new_mean / (std::sqrt(new_square) / correction + eps));
+                mean[c] = touched ? narrow(new_mean) : mean[c];
+                mean[size + c] = touched ? narrow(new_square) : mean[size + c];
+                value[c] = touched ? value[c] - step : value[c];
+            }
+        };
+        if (channels == OCTET)
+            step_row(std::integral_constant<int64_t, OCTET>{});
+        else
+            step_row(channels);
     }
 }
 }

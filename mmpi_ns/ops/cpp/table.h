@@ -1,4 +1,7 @@
 // A table of rows of numbers, of which sixteen are read at once.
+//
+// Rows of eight numbers, which the tables of features have by default, are half a cache line: they are read, written and
+// added to whole, without a loop over channels.
 #pragma once
 #include "lanes.h"
 
@@ -9,6 +12,25 @@ template <typename T> inline void prefetch_row(const T* row, int64_t channels) {
     for (const char* line = reinterpret_cast<const char*>(row); line < end; line += 64) __builtin_prefetch(line);
 }
 
+constexpr int64_t OCTET = 8;
+typedef float Octet __attribute__((vector_size(32)));
+
+inline Lanes join(Octet a, Octet b) {
+    return __builtin_shufflevector(a, b, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+}
+
+// to += share * from.
+inline void add_row(float* to, const float* from, float share, int64_t channels) {
+    if (channels == OCTET) {
+        Octet sum, given;
+        __builtin_memcpy(&sum, to, sizeof sum);
+        __builtin_memcpy(&given, from, sizeof given);
+        sum += share * given;
+        __builtin_memcpy(to, &sum, sizeof sum);
+    } else
+        for (int64_t c = 0; c < channels; c++) to[c] += share * from[c];
+}
+
 struct Table {
     const float* numbers;
     int64_t rows, channels;
@@ -16,6 +38,13 @@ struct Table {
     void prefetch(int64_t row) const {
         __builtin_prefetch(numbers + row * channels);
         __builtin_prefetch(numbers + (row + 1) * channels - 1);
+    }
+
+    // A row of eight numbers.
+    Octet octet(int64_t row) const {
+        Octet x;
+        __builtin_memcpy(&x, numbers + row * OCTET, sizeof x);
+        return x;
     }
 
     // Sixteen numbers from `at` on; those beyond the table are 0.

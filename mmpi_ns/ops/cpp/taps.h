@@ -31,6 +31,11 @@ inline void prefetch(const Table& table, const Sample& sample) {
 
 // Channels from `first` on.
 inline Lanes interpolate(const Table& table, const Sample& sample, int64_t first) {
+    if (table.channels == OCTET) {
+        Octet sum{};
+        for (int tap = 0; tap < sample.taps; tap++) sum += sample.shares[tap] * table.octet(sample.rows[tap]);
+        return join(sum, Octet{});
+    }
     Lanes sum{};
     for (int tap = 0; tap < sample.taps; tap++)
         sum += sample.shares[tap] * table.read(sample.rows[tap] * table.channels + first);

@@ -110,10 +110,8 @@ void mmpi_gather_back(const float* values, int64_t rows, int64_t channels, const
             float down[WIDTH];
             store(down, weight * slope * texel.slope);
             const int64_t size = std::min<int64_t>(WIDTH, channels - first);
-            for (int tap = 0; grad_values && tap < sample.taps; tap++) {
-                float* to = grad_values + sample.rows[tap] * channels + first;
-                for (int64_t c = 0; c < size; c++) to[c] += sample.shares[tap] * down[c];
-            }
+            for (int tap = 0; grad_values && tap < sample.taps; tap++)
+                add_row(grad_values + sample.rows[tap] * channels + first, down, sample.shares[tap], size);
             float* to_shares = grad_of_shares(groups, n);
             for (int tap = 0; to_shares && tap < sample.taps; tap++) {
                 const float* read = values + sample.rows[tap] * channels + first;

@@ -56,11 +56,10 @@ void mmpi_raise_peaks(const int64_t* rows, const float* weights, int64_t samples
 void mmpi_sum_rows(const int32_t* position, const float* weights, const float* grad, int64_t samples, int64_t taps,
                        int64_t channels, float* values) {
     for (int64_t n = 0; n < samples; n++) {
-        const float* __restrict from = grad + n * channels;
+        const float* from = grad + n * channels;
         for (int64_t b = 0; b < taps; b++) {
-            float* __restrict to = values + int64_t(position[n * taps + b]) * channels;
-            const float weight = weights ? weights[n * taps + b] : 1.0f;
-            for (int64_t c = 0; c < channels; c++) to[c] += weight * from[c];
+            float* to = values + int64_t(position[n * taps + b]) * channels;
+            add_row(to, from, weights ? weights[n * taps + b] : 1.0f, channels);
         }
     }
 }
