@@ -208,7 +208,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         if len(seen.points):
             parts.append(f"{len(seen.points):,} points seen {len(seen.seen_by):,} times")
         if self.known_depth is not None:
-            parts.append(f"the distance of {100 * self.known_depth.share:.0f} % of the training pixels is known")
+            parts.append(f"{100 * self.known_depth.share:.0f} % of the training pixels have a known depth")
         return f"Capture: {'; '.join(parts)}."
 
     def _read_pixels(self, images: Sequence[int] | None = None) -> PixelPool:

@@ -237,7 +237,7 @@ def with_continued(known: KnownDepth, posed: PosedImages, dataset: MMPIDataset) 
     """Extrapolates surfaces into regions that hardly any other image shows (``lone_depth.py``); cached."""
 
     def find() -> Arrays:
-        numbers = track(range(len(known.codes)), description="Surfaces that go on", console=CONSOLE)
+        numbers = track(range(len(known.codes)), description="Extrapolating surfaces", console=CONSOLE)
         return {f"{i}": _continued_codes(known, i, posed, dataset) for i in numbers}
 
     cameras = posed.camera_to_worlds, posed.intrinsics, posed.distortion, posed.fisheye

@@ -129,7 +129,7 @@ class Demo:
             begun = {"started": time.time(), "steps": self.steps}
             (self.folder / "times.json").write_text(json.dumps(begun), encoding="utf-8")
         else:
-            print(f"Going on from step {newest}.")
+            print(f"Continuing from step {newest}.")
         every = str(max(1, self.steps // 12))
         self._command(
             "ns-train", "mmpi-small", "--data", str(self.scene), "--output-dir", str(self.folder / "runs"),

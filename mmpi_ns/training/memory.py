@@ -92,7 +92,7 @@ def describe(windows: WindowedPlan, steps: int, tables: Sequence[int], pixels: S
     most = max(range(len(windows)), key=lambda w: tables[w] + pixels[w])
     memory = (
         f"Memory in training: at most {(tables[most] + pixels[most]) / GIB:.2f} GiB (tables and moments "
-        f"{tables[most] / GIB:.2f}, pixels {pixels[most] / GIB:.2f}), beside the program and the work of a step."
+        f"{tables[most] / GIB:.2f}, pixels {pixels[most] / GIB:.2f}), plus the program and the work of a step."
     )
     if len(windows) == 1:
         return "\n".join([*_describe_plan(windows.plans[0]), memory])
@@ -108,7 +108,8 @@ def describe(windows: WindowedPlan, steps: int, tables: Sequence[int], pixels: S
 
 
 def _describe_plan(plan: ScenePlan) -> list[str]:
-    lines = [f"Scene plan ({plan.origin_of_plan}): {len(plan.mpis)} MPIs, {plan.texels / 1e6:.1f} M texels"]
+    count = f"{len(plan.mpis)} {'MPI' if len(plan.mpis) == 1 else 'MPIs'}"
+    lines = [f"Scene plan ({plan.origin_of_plan}): {count}, {plan.texels / 1e6:.1f} M texels"]
     for m in plan.mpis:
         tangents = " ".join(f"{t:.2f}" for t in m.extent)
         lines.append(

@@ -79,7 +79,7 @@ def forecast(method: str, steps: int, rays: int) -> str:
     seconds = steps * rays / (CPU_RAYS * torch.get_num_threads())
     smaller = "; mmpi-small is made for a CPU" if seconds > LONG and method != "mmpi-small" else ""
     return (
-        f"Without a GPU {steps:,} steps of {rays:,} rays take about {duration(seconds)}, or more with large plans"
+        f"Without a GPU, {steps:,} steps of {rays:,} rays take about {duration(seconds)}, or more with large plans"
         f"{smaller}."
     )
 

@@ -228,7 +228,7 @@ class MMPITrainer(Trainer):
             end(
                 self._stopped_by,
                 f"Stopped after step {self._last_step + 1} of {self._total_steps}, which is in {path}: the same "
-                f"command with --load-dir {self.checkpoint_dir} goes on from there.",
+                f"command with --load-dir {self.checkpoint_dir} continues from there.",
             )
 
     def _new_log(self, end: int) -> TrainingLog | None:
