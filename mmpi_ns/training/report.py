@@ -118,7 +118,7 @@ def next_commands(folder: Path) -> str:
         [
             f"The run is in {folder}. Next:",
             f"  ns-eval --load-config {config} --output-path {folder / 'eval.json'}",
-            f"  ns-render interpolate --load-config {config} --output-path {folder / 'fly.mp4'}",
+            f"  ns-render interpolate --load-config {config} --pose-source train --output-path {folder / 'fly.mp4'}",
             f"  ns-viewer --load-config {config}",
         ]
     )
