@@ -1,6 +1,6 @@
-"""Blending by reliability: how much a sample is believed among the heads that cover its place (paper sec. III-C).
+"""Blending by reliability: the share of a sample among the heads that cover its position (paper sec. III-C).
 
-Plain torch, with gradients. The compiled marches hold their own form of it, without.
+Plain torch, with gradients. The compiled marches contain their own form without gradients.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def blend_shares(
     """log P and log(1 - P) of each sample's own head among the heads that cover it.
 
     Args:
-        reliability: R of every head at the sample's position; what uncovered heads hold is ignored.
+        reliability: R of every head at the sample's position; values of heads that do not cover it are ignored.
         cover: which heads cover the position; a sample's own head must be among them.
         own: the head a sample was taken from.
 
@@ -38,7 +38,7 @@ def blend_shares(
     """
     reliability = reliability.float() if reliability.dtype in (torch.float16, torch.bfloat16) else reliability
     lowest = torch.finfo(reliability.dtype).min
-    # Only differences matter, and they are exact only where the numbers are small: the highest becomes 0.
+    # Only differences matter, and they are exact only for small numbers: the highest becomes 0.
     highest = torch.where(cover, reliability, torch.full_like(reliability, lowest)).amax(-1, keepdim=True).detach()
     reliability = reliability - highest
     is_own = torch.arange(cover.shape[-1], device=cover.device) == own[:, None]
@@ -49,7 +49,7 @@ def blend_shares(
     other_values = torch.where(others, reliability, torch.full_like(reliability, lowest))
     other_values = torch.where(has_others[:, None], other_values, torch.zeros_like(other_values))
     odds = torch.logsumexp(other_values, -1) - own_value
-    # As softplus both logs and both slopes are exact at P near 0 and 1; differences with the sum of all cancel there.
+    # With softplus, both logs and both slopes are exact at P near 0 and 1; differences from the sum would cancel there.
     log_share = torch.where(has_others, -_softplus(odds), torch.zeros_like(odds))
     log_rest = torch.where(has_others, -_softplus(-odds), torch.full_like(odds, -torch.inf))
     return log_share, log_rest
@@ -66,7 +66,7 @@ def blended_optical_depth(
     log_rest: Float[Tensor, "N"],
     form: BlendForm = "paper",
 ) -> Float[Tensor, "N"]:
-    """-log(1 - alpha') of a sample after blending; exactly tau where it is the sole cover.
+    """-log(1 - alpha') of a sample after blending; exactly tau if no other head covers it.
 
     Source: paper sec. III-C, alpha' = P alpha, so 1 - alpha' = (1 - P) + P (1 - alpha).
     """
@@ -93,12 +93,12 @@ def log_shares(
 ) -> tuple[Float[Tensor, "N"], Float[Tensor, "N"]]:
     """log P and log(1 - P) of samples among the heads that cover them, with gradients to the reliability.
 
-    A head covers a point inside its frustum whose nearest texel was trained; a sample's own head always does.
+    A head covers a point in its frustum if the nearest texel was trained; a sample's own head always covers it.
 
     Args:
         layout: of the scene.
         reliability: R of all texels.
-        touched: of every row [T]: 1 where a training ray read it.
+        touched: for every row [T]: 1 if a training ray read it.
         rays: ray of each sample.
         local: the rays in every head's axes.
         inverse_t: inverse distance of each sample.
@@ -109,7 +109,7 @@ def log_shares(
         ndc, inside = _ndc_in_head(layout, j, rays, local, inverse_t)
         is_own = heads == j
         asked = inside | is_own
-        # A GPU would be waited for to say how many are asked: there all are, and the others read the empty brick.
+        # Counting them would synchronise with a GPU: there all samples are looked up, the others in the empty brick.
         index = torch.arange(len(heads), device=heads.device) if dispatch.on_device(heads) else asked.nonzero()[:, 0]
         position, reads = ndc[index], asked[index]
         rows, weights = grid.trilinear(position)
@@ -127,7 +127,7 @@ def log_shares(
 def _ndc_in_head(
     layout: SceneLayout, k: int, rays: Tensor, local: LocalRays, inverse_t: Tensor
 ) -> tuple[Float[Tensor, "N 3"], Bool[Tensor, "N"]]:
-    """Where samples lie in one head, and whether inside it."""
+    """Positions of samples in one head, and whether they are inside it."""
     moved = local.table(k).index_select(0, rays)
     if k < len(layout.mpis):
         point = moved[:, :3] * inverse_t[:, None] + moved[:, 3:]

@@ -23,15 +23,15 @@ from torch import Tensor
 OPS = Path(__file__).parent
 HEADERS = OPS / "cpp"
 FLAGS = ["-std=c++17", "-O3", "-march=native", "-fno-math-errno", "-shared", "-fPIC", f"-I{HEADERS}"]
-"""Nothing that reorders sums: a result never depends on how the compiler groups them."""
+"""No option that reorders sums, so that results do not depend on the compiler."""
 
 
 class CannotCompile(Exception):
-    """Why there is no library."""
+    """The reason why there is no library."""
 
 
 def compiler() -> list[str]:
-    """The program that compiles, and its arguments.
+    """The compiler and its arguments.
 
     Raises:
         CannotCompile: there is none.
@@ -44,7 +44,7 @@ def compiler() -> list[str]:
 
 
 def library_file() -> Path:
-    """Where the library lies once it is compiled: a name for each source, compiler and processor.
+    """Path of the compiled library, with a name for each combination of sources, compiler and processor.
 
     Raises:
         CannotCompile: there is no compiler, or there are no sources.
@@ -61,7 +61,7 @@ def library_file() -> Path:
 
 @functools.cache
 def library() -> ctypes.CDLL:
-    """All compiled functions, from the cache where they have been compiled before.
+    """All compiled functions, from the cache if they have been compiled before.
 
     Raises:
         CannotCompile: there is no compiler, or it fails.
@@ -85,7 +85,7 @@ def library() -> ctypes.CDLL:
 
 
 def _processor() -> bytes:
-    """What -march=native depends on: a home folder may be shared by machines that differ."""
+    """What -march=native depends on: different machines may share a home folder."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
         return "".join(sorted({x for x in lines if x.startswith(("model name", "flags", "Features"))})).encode()
@@ -94,13 +94,13 @@ def _processor() -> bytes:
 
 
 def address(tensor: Tensor, dtype: torch.dtype = torch.float32) -> ctypes.c_void_p:
-    """Where a tensor's numbers lie, for a function that expects them close together and of this type."""
+    """Address of a tensor's data, for a function that expects it contiguous and of this type."""
     assert tensor.dtype == dtype and tensor.is_contiguous(), (tensor.dtype, tensor.stride())
     return ctypes.c_void_p(tensor.data_ptr())
 
 
 def arguments(given: Iterable[Any]) -> list[Any]:
-    """As the compiled functions take them: where tensors lie, integers of 64 bits, floats of 32; others as they are."""
+    """Arguments of the compiled functions: addresses of tensors, 64-bit integers, 32-bit floats; others unchanged."""
     return [_argument(x) for x in given]
 
 

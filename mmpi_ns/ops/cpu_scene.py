@@ -1,4 +1,4 @@
-"""A scene as the compiled functions read it: the structures of ``cpp/scene.h``."""
+"""A scene in the layout of the compiled functions: the structures of ``cpp/scene.h``."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class CpuScene:
         return layout.once("cpu", CpuScene)
 
     def with_tables(self, tables: Tables) -> SceneTables:
-        """What a compiled function takes; the tables must outlive it."""
+        """Argument of a compiled function; the tables must outlive it."""
         plan = (*arguments([self.mpis]), ctypes.addressof(self.grids), *arguments([self.biases, self.cube]))
         assert tables.density.dtype == tables.reliability.dtype == torch.float32 and tables.touched.dtype == torch.uint8
         return SceneTables(len(self.mpis), len(self.grids), *plan, *arguments(tables))

@@ -1,4 +1,4 @@
-"""Which form of an operation runs: its reference in plain torch, C++ on a CPU, or Triton kernels on a GPU.
+"""Choice of the form of an operation: its reference in plain torch, C++ on a CPU, or Triton kernels on a GPU.
 
 ``--pipeline.model.ops`` chooses for the whole process. Where a compiled form cannot be had, or does not do on this
 device what the reference does (``trial.py``), that operation alone falls back to its reference, and the log says why.
@@ -60,7 +60,7 @@ _trying = threading.RLock()
 
 
 def run(name: str, *given: Any) -> Any:
-    """What the operation makes of its arguments, by the form that suits the tensors among them."""
+    """Runs the operation in the form that suits the tensors among its arguments."""
     form = form_of(name, *_tensors(given))
     if form != "gpu" or _chosen == "native":
         return function(name, form)(*given)
@@ -83,7 +83,7 @@ def _tensors(given: Iterable[Any]) -> Iterator[Tensor]:
 
 
 def form_of(name: str, *tensors: Tensor) -> Form:
-    """The form that these tensors get: a compiled one takes float32, integers and Adam's bfloat16 of one device."""
+    """The form for these tensors: a compiled one takes float32, integers and Adam's bfloat16 on one device."""
     compiled = TABLE[name][1]
     devices = {t.device.type for t in tensors}
     if _chosen == "torch" or any(t.is_floating_point() and t.dtype not in _PRECISIONS for t in tensors):
@@ -96,7 +96,7 @@ def form_of(name: str, *tensors: Tensor) -> Form:
 
 
 def on_device(tensor: Tensor) -> bool:
-    """Whether numbers of a tensor have to be waited for: it is on a GPU, or taken as if it were (``interpret``)."""
+    """Whether reading a tensor synchronises: it is on a GPU, or treated as if it were (``interpret``)."""
     return tensor.device.type != "cpu" or _interpreting
 
 
@@ -107,7 +107,7 @@ def function(name: str, form: Form) -> Any:
 
 
 def choose(path: Route) -> None:
-    """Sets which forms the operations of this process take.
+    """Sets the forms of the operations in this process.
 
     Raises:
         ValueError: ``native`` is asked for, and an operation has no compiled form here (says why).
@@ -124,7 +124,7 @@ def choose(path: Route) -> None:
 
 @contextmanager
 def chosen(path: Route) -> Iterator[None]:
-    """Within, operations take these forms."""
+    """Within the block, operations use these forms."""
     global _chosen
     with _trying:
         before, _chosen = _chosen, path
@@ -135,7 +135,7 @@ def chosen(path: Route) -> Iterator[None]:
 
 
 def interpret(on: bool) -> None:
-    """Lets Triton's interpreter run the GPU's kernels on CPU tensors: for tests and rehearsals, and very slow.
+    """Makes Triton's interpreter run the GPU kernels on CPU tensors, for tests and rehearsals; very slow.
 
     Raises:
         ValueError: TRITON_INTERPRET=1 was not in the environment when the process started, or there is no Triton.
@@ -149,7 +149,7 @@ def interpret(on: bool) -> None:
 
 
 def fault(name: str) -> str | None:
-    """Why the compiler, Triton or an operation's GPU form cannot be used; found out once, and said in the log then."""
+    """Why the compiler, Triton or an operation's GPU form cannot be used; determined and logged once."""
     if name not in _faults:
         with _trying:
             if name not in _faults:
@@ -191,7 +191,7 @@ def _did_not_compile(error: Exception) -> bool:
 
 
 def _words(error: Exception) -> str:
-    """An error's first line that says something."""
+    """First informative line of an error."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return f"{type(error).__name__}: {lines[0][:200]}" if lines else type(error).__name__
 

@@ -1,4 +1,4 @@
-"""What the Triton kernels know of a plan, and the functions they share. The counterpart of ``cpp/scene.h``.
+"""Plan data of the Triton kernels, and the functions they share. The counterpart of ``cpp/scene.h``.
 
 Imported only where Triton is wanted (``dispatch.py``): the package runs without it.
 """
@@ -87,7 +87,7 @@ def _pack_grids(layout: SceneLayout, device: torch.device) -> Int[Tensor, "N"]:
 
 
 def block_size(wanted: int, device: torch.device) -> int:
-    """Rays or rows of a program. The interpreter runs one program after the other, so there the fewer the better."""
+    """Rays or rows of a program. The interpreter runs programs one after the other, so it should have few."""
     return wanted if device.type == "cuda" else 16 * wanted
 
 
@@ -132,7 +132,7 @@ def texel_of(grids, row, mask, NUM_HEADS: tl.constexpr):
 
 @triton.jit
 def is_stored(row):
-    """Whether the tables hold anything at a row that ``row_of`` found."""
+    """Whether a row found by ``row_of`` is stored."""
     return row >= 64
 
 
@@ -194,7 +194,7 @@ def nearest_row(grids, head, u, v, s, mask):
     return row_of(grids, head, nearest(s, tl.load(grid + DEPTH)), y, x, mask)
 
 
-# Arithmetic that stays exact where its plain form cancels ---------------------------------------------------------
+# Arithmetic that avoids cancellation ---------------------------------------------------------
 
 
 @triton.jit

@@ -1,4 +1,4 @@
-"""What the operations know of a scene: MPIs and cube, where their texels are, and from raw density to optical depth."""
+"""Scene data of the operations: MPIs and cube, layout of texels, and raw density to optical depth."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ class Tables(NamedTuple):
 
 
 class Places(NamedTuple):
-    """Where samples lie, in S slots of every ray."""
+    """Positions of samples, in S slots of every ray."""
 
     heads: Int[Tensor, "R S"]
     planes: Int[Tensor, "R S"]
-    """Of no meaning in the cube."""
+    """Meaningless in the cube."""
     ndc: Float[Tensor, "R S 3"]
     """Position in the head."""
     valid: Bool[Tensor, "R S"]
@@ -40,7 +40,7 @@ class Places(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class SceneLayout:
-    """Constants of K MPIs, and of the cube where there is one (H heads, the cube last), at the resolution in use."""
+    """Constants of K MPIs, and of the cube if there is one (H heads, the cube last), at the resolution in use."""
 
     mpis: tuple[MPIPlan, ...]
     frames: Frames
@@ -54,7 +54,7 @@ class SceneLayout:
     cube_bias: float = 0.0
     cube_interval: float = 1.0
     packed: dict[str, Any] = field(default_factory=dict)
-    """The same as the compiled operations read it, made by them once."""
+    """The same in the layout of the compiled operations, made by them once."""
 
     @property
     def num_heads(self) -> int:

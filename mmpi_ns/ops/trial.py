@@ -1,7 +1,7 @@
-"""Tries an operation's GPU form on a toy scene: on the device at hand it must make what the reference makes there.
+"""Tries an operation's GPU form on a toy scene: on the current device it must agree with the reference.
 
-Also compiles what is tried: where a Triton release, a driver or an architecture cannot, that shows here and not in the
-first step of a training.
+This also compiles the kernels, so that an incompatible Triton release, driver or architecture is noticed here and not
+in the first step of a training.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 class Disagreement(Exception):
-    """A kernel ran and made something else than its reference."""
+    """A kernel ran and disagrees with its reference."""
 
 
 def run(name: str, device: str) -> None:

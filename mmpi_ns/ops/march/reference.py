@@ -1,6 +1,6 @@
-"""Sample and merge in plain torch: looks up and sorts all live samples of a ray, then drops those of little weight.
+"""Sample and merge in plain torch: looks up and sorts all live samples of a ray, then drops those with little weight.
 
-What the compiled marches are compared with, and what runs where there are none.
+The reference for the compiled marches, used where these are not available.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from mmpi_ns.ops.layout import Places, SceneLayout, Tables
 from mmpi_ns.scene.geometry import LocalRays, PlaneHits, inverse_distance, sample_disparity
 
 BLEND_BLOCK = 16
-"""Samples a ray between two checks whether it is opaque already."""
+"""Samples of a ray between two checks whether it is already opaque."""
 OPAQUE_DEPTH = 9.2
-"""exp(-9.2) = 1e-4 of the light: far below what a sample must weigh to be kept."""
+"""exp(-9.2) = 1e-4 of the light: far below the weight of a kept sample."""
 NEGLIGIBLE_DEPTH = 1e-4
 """Samples thinner than this get an equal share without a lookup of reliabilities."""
 
@@ -33,7 +33,7 @@ class Crossings(NamedTuple):
     """World axes, as the unit directions are."""
     directions: Float[Tensor, "R 3"]
     hits: PlaneHits
-    """Where the rays cross the planes."""
+    """Crossings of the rays with the planes."""
     first: Int[Tensor, "R H"]
     """m of each head's nearest live plane; the cube's first sample in the last column, where there is a cube."""
     counts: Int[Tensor, "R H"]
@@ -48,22 +48,22 @@ class MarchOptions(NamedTuple):
     fair_share: float = float("inf")
     """Bound on the threshold relative to equal weights (``prune``)."""
     form: BlendForm | None = None
-    """How reliability enters; None for not at all. The opacity-keeping form is for ablations: plain torch."""
+    """Form of blending by reliability; None without. The opacity-keeping form is for ablations: plain torch."""
     baked: bool = False
-    """The tables hold shares in place of reliability (``baking.bake_shares``)."""
+    """The tables contain shares in place of reliability (``baking.bake_shares``)."""
 
 
 @dataclass(frozen=True)
 class MergedSamples:
-    """The samples of R rays that matter, nearest first in S slots a ray, and what the dropped ones leave behind."""
+    """The kept samples of R rays, nearest first in S slots of each ray, and the attenuation by the dropped ones."""
 
     heads: Int[Tensor, "R S"]
-    """0 in empty slots, as all of these."""
+    """0 in empty slots, like all fields."""
     planes: Int[Tensor, "R S"]
     ndc: Float[Tensor, "R S 3"]
     inverse_t: Float[Tensor, "R S"]
     tau: Float[Tensor, "R S"]
-    """Optical depth, blended where reliability takes part."""
+    """Optical depth, blended if reliability is used."""
     skipped_before: Float[Tensor, "R S"]
     """Optical depth of the dropped samples in front of each sample."""
     valid: Bool[Tensor, "R S"]
@@ -71,7 +71,7 @@ class MergedSamples:
     dropped_mass: Float[Tensor, "R 1"]
     """Sum of the weights of the dropped samples."""
     head_counts: tuple[int, ...] | None = None
-    """How many are of each head, where it is known without asking for it."""
+    """Samples of each head, if known without synchronising."""
 
     @property
     def places(self) -> Places:
@@ -272,7 +272,7 @@ def _blend(
 
 @dataclass(frozen=True)
 class Pruned:
-    """The samples that matter, packed to the left, and what the dropped ones leave behind."""
+    """The kept samples, packed to the left, and the attenuation by the dropped ones."""
 
     order: Int[Tensor, "R S"]
     """Index into the flat list (0 in empty slots)."""
@@ -289,8 +289,8 @@ def prune(
 ) -> Pruned:
     """Keep the samples whose weight exceeds min(threshold, fair_share / samples on the ray).
 
-    The second bound matters at the start, when all weights are 1/L: a fixed threshold would keep nothing, and what is
-    not kept never learns.
+    The second bound matters at the start, when all weights are 1/L: a fixed threshold would keep nothing, and samples
+    that are not kept cannot learn.
 
     Args:
         order: all samples, nearest first (see ``merge``).
