@@ -105,7 +105,13 @@ class Schedule:
 
     def watches(self, step: int) -> bool:
         """Whether the samples of a step count for the next release of bricks."""
-        return bool(self.release) and self._sharp_from <= self._local(step) < self.release[-1]
+        return bool(self.release) and self._watched_from <= self._local(step) < self.release[-1]
+
+    @property
+    def _watched_from(self) -> int:
+        """Surfaces have formed, or, for a release before the last growth, the texels have the size before it."""
+        before_growth = self.release[0] == self._sharp_from
+        return ([0] + [s for s in self.growth if s < self._sharp_from])[-1] if before_growth else self._sharp_from
 
     def rate_factor(self, kind: str, step: int) -> float:
         """Learning rate of a parameter kind relative to its start value; 0 where it is frozen."""
@@ -186,4 +192,5 @@ def make_schedule(
     rates = float(decay_decades), float(decay_from), float(finetune_rate)
     schedule = Schedule(phases, growth, *rates, windows, growing_rays=float(growing_rays))
     release = sorted({round(s * phases[0].end) for s in release_shares})
-    return replace(schedule, release=tuple(s for s in release if s > schedule._sharp_from))
+    first = schedule._sharp_from + (not growth)  # there is nothing to be spared by a release without growth
+    return replace(schedule, release=tuple(s for s in release if s >= first))

@@ -23,7 +23,7 @@ LEAST_SECONDS, MOST_SECONDS = 2.0, 30.0
 """Between two lines."""
 VIEWS, LOOK_SECONDS = 4, 20.0
 """The quick test: maximum number of test images, and seconds after which no further one is started."""
-CPU_RAYS = 6000.0
+CPU_RAYS = 10000.0
 """Rays/s that one core trains with the settings of mmpi-small (docs/results/train.md)."""
 LONG = 1800.0
 """Seconds from which a smaller method is suggested."""

@@ -10,6 +10,9 @@ from mmpi_ns.scene.texels import BRICK
 from mmpi_ns.training.phases import Schedule
 from mmpi_ns.utils.machine import give_back_freed_memory
 
+FORMING = 0.4
+"""Factor of the weight below which bricks are released while surfaces still form."""
+
 
 def prepare_storage(
     field: TexelTables, schedule: Schedule, step: int, least: float, optimizers: Mapping[str, Any]
@@ -24,16 +27,17 @@ def prepare_storage(
         optimizers: of the tables, by name, if there are any; their moments follow.
     """
     own = [(optimizers[name], getattr(field, name)) for name in TABLES if name in optimizers]
-    factor = schedule.texel_factor(step)
-    if factor != field.factor:
+    phase, factor, left = schedule.phase_at(step), schedule.texel_factor(step), []
+    grows = factor != field.factor
+    if grows:
         for optimizer, table in own:
             optimizer.reset_moments(table)
+    if grows or schedule.releases_at(step):
         give_back_freed_memory()
-        field.grow(factor)
-    phase, left = schedule.phase_at(step), []
     if schedule.releases_at(step):
-        give_back_freed_memory()
-        left.append(field.release_unused(least))
+        left.append(field.release_unused(FORMING * least if grows else least))
+    if grows:  # what has just been released does not grow
+        field.grow(factor)
     elif schedule.sharpened(step) and not schedule.sharpened(step - 1):
         field.look_afresh()
     if phase.name == "blend" and step == phase.start:

@@ -140,6 +140,14 @@ def test_without_growth_all_texels_are_there_from_the_start():
     assert make_schedule("joint", 10, growth_shares=()).texel_factor(0) == 1
 
 
+def test_bricks_may_be_released_just_before_the_texels_double_for_the_last_time():
+    schedule = make_schedule("joint", 1_000, release_shares=(0.2, 4 / 15, 0.5))
+    assert schedule.growth == (67, 133, 200, 267) and schedule.release == (267, 500)
+    assert [s for s in range(1_000) if schedule.watches(s)] == [*range(200, 500)]
+    once = make_schedule("joint", 1_000, growth_shares=(0.3,), release_shares=(0.3,))
+    assert [s for s in range(1_000) if once.watches(s)] == [*range(300)]
+
+
 def test_bricks_are_given_up_after_growth_and_what_is_seen_before_does_not_count():
     schedule = make_schedule("joint", 1_000, release_shares=(0.1, 0.5, 0.75, 0.5), windows=2)
     assert schedule.growth[-1] == 267 and schedule.release == (500, 750), "not before surfaces have formed, and once"
@@ -147,6 +155,7 @@ def test_bricks_are_given_up_after_growth_and_what_is_seen_before_does_not_count
     watched = [s for s in range(2_000) if schedule.watches(s)]
     assert watched == [*range(267, 750), *range(1_267, 1_750)]
     assert not any(make_schedule("joint", 100).watches(s) for s in range(100))
+    assert make_schedule("joint", 100, growth_shares=(), release_shares=(0.1, 0.2)).release == (20,)
     assert make_schedule("two-phase", 1_000, release_shares=(1.0,)).release == (750,), "shares of the first phase"
 
 

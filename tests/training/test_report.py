@@ -50,7 +50,7 @@ def test_durations_are_in_words():
 
 def test_a_long_run_without_a_gpu_names_the_smaller_method():
     threads = torch.get_num_threads()
-    assert f"{20000 * 4096 / 6000 / threads / 3600:.1f} h" in report.forecast("mmpi", 20000, 4096)
+    assert f"{20000 * 4096 / 10000 / threads / 3600:.1f} h" in report.forecast("mmpi", 20000, 4096)
     assert "mmpi-small" in report.forecast("mmpi", 20000, 4096)
     assert "mmpi-small" not in report.forecast("mmpi-small", 20000, 4096)
 

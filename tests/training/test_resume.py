@@ -10,8 +10,8 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocati
 from training_runs import compared, differences, load, ready, trainer_config, write_plan
 
 STEPS = 24
-"""individual 0-11 with doublings at 3 and 6 and a release of bricks before 11, blend 12-17, finetune 18-23; joint 0-23
-with doublings at 6 and 12 and a release before 22."""
+"""individual 0-11 with doublings at 3 and 6 and releases of bricks before 6 and 11, blend 12-17, finetune 18-23; joint
+0-23 with doublings at 6 and 12 and releases before 12 and 22."""
 BOUNDARIES = (3, 6, 12, 18)
 
 
@@ -20,7 +20,7 @@ def whole(request, scene, plan_file, tmp_path_factory):
     """Settings, and the checkpoints of every step of an uninterrupted run."""
     settings = {"training": "joint"} if request.param == "joint" else {"rays_per_mpi": request.param}
     settings |= {"shading": "sample" if request.param == "all" else "ray"}
-    settings |= {"release_shares": (0.9,), "release_weight": 0.06}
+    settings |= {"release_shares": (0.5, 0.9), "release_weight": 0.06}
     config = trainer_config(scene, plan_file, tmp_path_factory.mktemp("whole"), STEPS, **settings)
     trainer = ready(config)
     trainer.train()
