@@ -91,9 +91,9 @@ class MMPIModelConfig(ModelConfig):
     """When the texels of a plane double, as shares of the first phase."""
     growing_rays: float = 0.5
     """Fraction of a step's rays that are drawn until then: coarse texels need fewer, and nearly all samples learn."""
-    release_shares: tuple[float, ...] = (4 / 15, 0.5, 0.75, 0.95)
-    """When empty bricks (8 x 8 texels of a plane) are released, as fractions of the first phase; not before the texels
-    are about to double for the last time."""
+    release_shares: tuple[float, ...] = (3 / 15, 4 / 15, 0.5, 0.75, 0.95)
+    """When empty bricks (8 x 8 texels of a plane) are released, as fractions of the first phase: after growth, or just
+    before the texels double."""
     release_weight: float = 5e-3
     """Bricks in which no sample of a training ray has this weight are released; 0 keeps all that rays can reach."""
     rays_per_mpi: Literal["split", "all"] = "all"

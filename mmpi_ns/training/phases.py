@@ -109,9 +109,8 @@ class Schedule:
 
     @property
     def _watched_from(self) -> int:
-        """Surfaces have formed, or, for a release before the last growth, the texels have the size before it."""
-        before_growth = self.release[0] == self._sharp_from
-        return ([0] + [s for s in self.growth if s < self._sharp_from])[-1] if before_growth else self._sharp_from
+        """The texels have the size that they have before the first release."""
+        return max([s for s in self.growth if s < self.release[0]], default=0) if self.growth else self._sharp_from
 
     def rate_factor(self, kind: str, step: int) -> float:
         """Learning rate of a parameter kind relative to its start value; 0 where it is frozen."""
@@ -192,5 +191,5 @@ def make_schedule(
     rates = float(decay_decades), float(decay_from), float(finetune_rate)
     schedule = Schedule(phases, growth, *rates, windows, growing_rays=float(growing_rays))
     release = sorted({round(s * phases[0].end) for s in release_shares})
-    first = schedule._sharp_from + (not growth)  # there is nothing to be spared by a release without growth
-    return replace(schedule, release=tuple(s for s in release if s >= first))
+    # A release at a growth step comes before it, so that less grows.
+    return replace(schedule, release=tuple(s for s in release if s > schedule._sharp_from or s in growth))
