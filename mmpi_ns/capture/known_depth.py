@@ -49,6 +49,8 @@ CELLS = 32
 """Cells along the longer side of an image; placement gets one depth from each."""
 SENSOR_ERROR = 0.01
 """Relative error of a sensor's depth."""
+CONTRADICTS = 6.0
+"""Difference of two sources, in expected errors of both, from which one of them is wrong."""
 UNKNOWN, OCTAVE = -(2**15), 1024
 """Code of a number that is 0, and codes in an octave."""
 
@@ -163,13 +165,21 @@ def _file_shape(original: PosedImages, posed: PosedImages, i: int) -> tuple[int,
 def with_sensor(
     known: KnownDepth, files: list[Path], unit: float, original: PosedImages, posed: PosedImages
 ) -> KnownDepth:
-    """Replaces depths by those of sensors where there are any."""
+    """Replaces depths by those of sensors where there are any; where both are known and contradict, neither is kept."""
     codes = []
     for i, (file, own) in enumerate(zip(files, known.codes, strict=True)):
         shape = own.shape[0], own.shape[1]
         measured = packed(read_sensor(file, unit, original, i, shape, _file_shape(original, posed, i)))
-        codes.append(np.where(measured[..., :1] != UNKNOWN, measured, own))
+        own = np.where(measured[..., :1] != UNKNOWN, measured, own)
+        own[contradict(unpacked(torch.from_numpy(measured)).numpy(), known.image(i))] = UNKNOWN
+        codes.append(own)
     return KnownDepth(tuple(codes))
+
+
+def contradict(one: Map, other: Map) -> NDArray[np.bool_]:
+    """Where two sources [H, W, 2] know a distance and differ by more than their errors can explain. [H, W]"""
+    apart = np.abs(one[..., 0] - other[..., 0]) > CONTRADICTS * np.hypot(one[..., 1], other[..., 1])
+    return apart & (one[..., 0] > 0) & (other[..., 0] > 0)
 
 
 def at_training_pixels(

@@ -140,6 +140,23 @@ def test_a_sensor_goes_before_other_sources_where_it_knows_something(tmp_path):
     assert (found[30:] == 0.25).all() and found[29, 40, 0] == pytest.approx(0.5, rel=1e-3)
 
 
+def test_a_sensor_and_matches_that_contradict_each_other_are_both_left_out(tmp_path):
+    depth = np.full((HEIGHT, WIDTH), 2000, np.uint16)
+    depth[:, 40:] = 0
+    cv2.imwrite(str(tmp_path / "d.png"), depth)
+    sensor = with_sensor(
+        KnownDepth.of([np.zeros((HEIGHT, WIDTH, 2), F32)]), [tmp_path / "d.png"], 1e-3, camera(), camera()
+    ).image(0)
+    matched = np.stack([1.8 * sensor[..., 0], np.full((HEIGHT, WIDTH), 0.01, F32)], -1)  # as a mirror shows
+    matched[:20, :, 0] = 1.02 * sensor[:20, :, 0]  # within the errors
+    matched[:, 40:] = 0.25  # the sensor says nothing
+    matched[50:] = 0  # the matches say nothing
+    found = with_sensor(KnownDepth.of([matched]), [tmp_path / "d.png"], 1e-3, camera(), camera()).image(0)
+    assert (found[20:50, :40] == 0).all()
+    assert (found[:20, :40] == sensor[:20, :40]).all() and (found[50:, :40] == sensor[50:, :40]).all()
+    assert (found[:50, 40:] == 0.25).all() and sensor[0, 0, 0] > 0.3
+
+
 @pytest.mark.parametrize("content", [None, b"no image"])
 def test_a_depth_image_that_cannot_be_read_is_named(tmp_path, content):
     file = tmp_path / "lost.png"
