@@ -91,7 +91,7 @@ class MMPIModelConfig(ModelConfig):
     """When the texels of a plane double, as shares of the first phase."""
     growing_rays: float = 0.5
     """Fraction of a step's rays that are drawn until then: coarse texels need fewer, and nearly all samples learn."""
-    release_shares: tuple[float, ...] = (3 / 15, 4 / 15, 0.5, 0.75, 0.95)
+    release_shares: tuple[float, ...] = (3 / 15, 4 / 15, 0.3, 0.5, 0.75, 0.95)
     """When empty bricks (8 x 8 texels of a plane) are released, as fractions of the first phase: after growth, or just
     before the texels double."""
     release_weight: float = 5e-3

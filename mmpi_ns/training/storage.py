@@ -38,6 +38,7 @@ def prepare_storage(
         left.append(field.release_unused(FORMING * least if grows else least))
     if grows:  # what has just been released does not grow
         field.grow(factor)
+        give_back_freed_memory()
     elif schedule.sharpened(step) and not schedule.sharpened(step - 1):
         field.look_afresh()
     if phase.name == "blend" and step == phase.start:
