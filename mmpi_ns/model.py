@@ -90,7 +90,8 @@ class MMPIModelConfig(ModelConfig):
     growth_shares: tuple[float, ...] = (1 / 15, 2 / 15, 3 / 15, 4 / 15)
     """When the texels of a plane double, as shares of the first phase."""
     growing_rays: float = 0.5
-    """Fraction of a step's rays that are drawn until then: coarse texels need fewer, and nearly all samples learn."""
+    """Fraction of a step's rays that are drawn until then: coarse texels need fewer, and nearly all samples learn. Of
+    fewer than 4,000 steps proportionally more."""
     release_shares: tuple[float, ...] = (3 / 15, 4 / 15, 0.3, 0.5, 0.75, 0.95)
     """When empty bricks (8 x 8 texels of a plane) are released, as fractions of the first phase: after growth, or just
     before the texels double."""

@@ -15,6 +15,8 @@ PhaseName = Literal["individual", "blend", "finetune", "joint"]
 ParameterKind = Literal["density", "features", "colour", "reliability", "camera_opt"]
 Training = Literal["two-phase", "joint"]
 
+LONG_RUN = 4000
+"""Steps from which on the rays while the texels grow are more than enough."""
 TRAINS: dict[str, frozenset[str]] = {
     "individual": frozenset({"density", "features", "colour", "camera_opt"}),
     "joint": frozenset({"density", "features", "colour", "camera_opt"}),
@@ -161,7 +163,8 @@ def make_schedule(
         windows: windows of a long capture, trained one after the other.
         release_shares: when empty bricks are released, as fractions of the first phase; not before surfaces have
             formed.
-        growing_rays: fraction of a step's rays that are drawn until then.
+        growing_rays: fraction of a step's rays that are drawn until then; proportionally more in runs of fewer than
+            ``LONG_RUN`` steps, which would see too few.
 
     Raises:
         ValueError: the shares leave no step for the first phase.
@@ -189,7 +192,8 @@ def make_schedule(
     if not 0 <= decay_from < 1:
         raise ValueError(f"decay-from must lie between 0 and 1, 1 excluded, got {decay_from}.")
     rates = float(decay_decades), float(decay_from), float(finetune_rate)
-    schedule = Schedule(phases, growth, *rates, windows, growing_rays=float(growing_rays))
+    few = min(1.0, float(growing_rays) * max(1.0, LONG_RUN / total_steps))
+    schedule = Schedule(phases, growth, *rates, windows, growing_rays=few)
     release = sorted({round(s * phases[0].end) for s in release_shares})
     # A release at a growth step comes before it, so that less grows.
     return replace(schedule, release=tuple(s for s in release if s > schedule._sharp_from or s in growth))

@@ -129,11 +129,16 @@ def test_shares_that_leave_nothing_for_the_first_phase_are_refused(blend, finetu
 
 
 def test_fewer_rays_are_drawn_until_surfaces_have_formed():
-    schedule = make_schedule("joint", 1500, growing_rays=0.25, windows=2)
-    assert [schedule.rays_share(step) for step in (0, 399, 400, 1499, 1500, 1899, 1900)] == [
+    schedule = make_schedule("joint", 6000, growing_rays=0.25, windows=2)
+    assert [schedule.rays_share(step) for step in (0, 1599, 1600, 5999, 6000, 7599, 7600)] == [
         0.25, 0.25, 1, 1, 0.25, 0.25, 1,
     ]  # fmt: skip
-    assert make_schedule("joint", 1500).rays_share(0) == 1, "as it was, unless fewer are asked for"
+    assert make_schedule("joint", 6000).rays_share(0) == 1, "as it was, unless fewer are asked for"
+
+
+def test_a_short_run_draws_no_fewer_rays_than_it_needs():
+    shares = [make_schedule("joint", steps, growing_rays=0.5).rays_share(0) for steps in (20_000, 4000, 3000, 750)]
+    assert shares == [0.5, 0.5, pytest.approx(2 / 3), 1]
 
 
 def test_without_growth_all_texels_are_there_from_the_start():
@@ -205,6 +210,7 @@ def test_impossible_schedules_name_the_setting(settings, word):
 
 def test_a_models_schedule_is_made_of_its_options():
     config = MMPIModelConfig(decay_decades=2.0, decay_from=0.25, finetune_rate=0.3, growing_rays=0.7)
+    config.total_steps = 5000
     schedule = config.schedule("two-phase", 3)
     assert schedule.growing_rays == 0.7
     assert (schedule.decay_decades, schedule.decay_from, schedule.finetune_rate) == (2.0, 0.25, 0.3)

@@ -7,7 +7,7 @@ import torch
 
 from mmpi_ns.rendering.pipeline import summary
 from mmpi_ns.training import report
-from mmpi_ns.training.phases import make_schedule
+from mmpi_ns.training.phases import LONG_RUN, make_schedule
 
 
 def lines_of(monkeypatch, capsys, steps, seconds_a_step, **how):
@@ -32,7 +32,7 @@ def test_a_line_says_phase_speed_psnr_and_time_left(monkeypatch, capsys):
 
 
 def test_the_speed_counts_the_rays_that_are_drawn(monkeypatch, capsys):
-    lines = lines_of(monkeypatch, capsys, 400, 0.5, growth_shares=(0.5,), growing_rays=0.25)
+    lines = lines_of(monkeypatch, capsys, 400, 0.5, growth_shares=(0.5,), growing_rays=0.25 * 400 / LONG_RUN)
     speeds = [line.split(" | ")[2] for line in lines]
     assert speeds[0] == "500 rays/s" and speeds[-1] == "2,000 rays/s" and len(set(speeds)) <= 3
     assert sum(speed == "500 rays/s" for speed in speeds) > 8, "half of the first phase"

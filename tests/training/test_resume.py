@@ -9,6 +9,8 @@ import torch
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from training_runs import compared, differences, load, ready, trainer_config, write_plan
 
+from mmpi_ns.training.phases import LONG_RUN
+
 STEPS = 24
 """individual 0-11 with doublings at 3 and 6 and releases of bricks before 6 and 11, blend 12-17, finetune 18-23; joint
 0-23 with doublings at 6 and 12 and releases before 12 and 22."""
@@ -253,7 +255,8 @@ def test_a_longer_run_keeps_the_schedule_of_the_checkpoint_in_model_and_learning
 
 
 def test_fewer_rays_are_drawn_until_the_texels_have_grown(scene, plan_file, tmp_path):
-    trainer = ready(trainer_config(scene, plan_file, tmp_path, STEPS, growing_rays=0.25))
+    few = 0.25 * STEPS / LONG_RUN
+    trainer = ready(trainer_config(scene, plan_file, tmp_path, STEPS, growing_rays=few))
     drawn = []
     for step in (0, 5, 6):
         for callback in trainer.callbacks:
