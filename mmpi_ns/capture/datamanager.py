@@ -167,7 +167,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
 
     def get_train_rays_per_batch(self) -> int:
         """Pixel rays of the step at hand."""
-        return max(1, round(self.rays_share * self.config.train_num_rays_per_batch))
+        return max(1, round(self.rays_share * super().get_train_rays_per_batch()))
 
     def _find_shared(self, images: Sequence[int]) -> SharedPoints | None:
         """The points that two of these training images show at the same depth, if rays of new views are enabled."""

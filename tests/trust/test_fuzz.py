@@ -46,7 +46,7 @@ def mistaken(draw, document):
                 elif how == "double" and isinstance(node, list):
                     node.insert(key, copy.deepcopy(node[key]))
                 else:
-                    node[key] = draw(JUNK)
+                    node[key] = copy.deepcopy(draw(JUNK))
                 break
             node = node[key]
     return document
