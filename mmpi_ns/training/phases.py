@@ -50,8 +50,8 @@ class Schedule:
     windows: int = 1
     """Windows of a long capture, which follow this schedule one after the other."""
     release: tuple[int, ...] = ()
-    """Steps before which empty bricks are released, judging by the samples since the previous such step, or since
-    surfaces formed."""
+    """Steps before which empty bricks are released, judging by the samples since the previous such step or the last
+    growth."""
     growing_rays: float = 1.0
     """Fraction of a step's rays that are drawn until surfaces have formed."""
 
