@@ -55,6 +55,20 @@ def test_what_a_run_has_mended_is_no_error_any_more(scenes, tmp_path, share):
     assert found["distance_off"] == pytest.approx(0.3 * left, abs=1e-5)
 
 
+def test_the_copy_has_the_depth_files_that_its_frames_name(tmp_path):
+    data = write_scene(tmp_path / "data")
+    meta = json.loads((data / "transforms.json").read_text())
+    (data / "depths").mkdir()
+    for number, frame in enumerate(meta["frames"]):
+        frame["depth_file_path"] = f"depths/{number}.png"
+        (data / frame["depth_file_path"]).write_bytes(b"depth")
+    (data / "transforms.json").write_text(json.dumps(meta))
+    off = disturb(data, tmp_path / "copy", 2, 0.3, 0.05)
+    for frame in json.loads((off / "transforms.json").read_text())["frames"]:
+        assert (off / frame["depth_file_path"]).read_bytes() == b"depth" and (off / frame["file_path"]).is_file()
+    assert not (off / "colmap").exists()
+
+
 def test_the_page_says_which_figures_have_refined_test_poses():
     numbers = (
         "degrees_off",

@@ -65,10 +65,11 @@ def write_scene(data: Path, folder: Path, test_images: int, degrees: float = 0.0
     """A copy of a scene without tracks, whose images are links, with so many test images (0: all), evenly spaced, and
     errors of so many degrees and units in its training poses."""
     folder.mkdir(parents=True, exist_ok=True)
-    for path in data.iterdir():
-        if path.is_dir() and path.name.startswith(("images", "masks")) and not (folder / path.name).exists():
-            (folder / path.name).symlink_to(path)
     meta, rng = json.loads((data / "transforms.json").read_text(encoding="utf-8")), np.random.default_rng(0)
+    named = {Path(told).parts[0] for f in meta["frames"] for told in f.values() if isinstance(told, str)}
+    for path in data.iterdir():  # images, masks, depths, and their smaller copies
+        if path.is_dir() and path.name.startswith(tuple(named)) and not (folder / path.name).exists():
+            (folder / path.name).symlink_to(path)
     meta.pop("ply_file_path", None)
     tests = meta["test_filenames"]
     chosen = np.linspace(0, len(tests) - 1, min(test_images or len(tests), len(tests))).round().astype(int)
