@@ -16,6 +16,12 @@ def degrees_between(one: Array, other: Array) -> Array:
     return np.degrees(np.arccos(np.clip((traces - 1) / 2, -1, 1)))
 
 
+def rotation_between(source: Array, target: Array) -> Array:
+    """The rotation [3, 3] that takes rotations [N, 3, 3] nearest to others: it turns all cameras of a track alike."""
+    u, _, vt = np.linalg.svd(np.einsum("nij,nkj->ik", target, source))
+    return u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
+
+
 def similarity_matrix(source: Array, target: Array) -> tuple[float, Array, Array]:
     """Scale, rotation [3, 3] and translation [3] that align camera poses with other poses of the same cameras.
 

@@ -16,6 +16,7 @@ from mmpi_ns.prepare.alignment import degrees_between
 from mmpi_ns.prepare.evidence import local_median
 from mmpi_ns.prepare.images import in_short
 from mmpi_ns.prepare.mapping import adjust, bundle_options, is_bent
+from mmpi_ns.prepare.polish import with_fewer_points
 from mmpi_ns.prepare.stages import PrepareError
 
 Array = NDArray[np.float64]
@@ -193,13 +194,12 @@ def _moving_share(model: pycolmap.Reconstruction, pair: tuple[int, int], matches
     return count / (CELLS[0] * CELLS[1])
 
 
-def doubtful_intrinsics(model: pycolmap.Reconstruction, fixed: bool, copy: Path, threads: int) -> list[Finding]:
+def doubtful_intrinsics(model: pycolmap.Reconstruction, fixed: bool, threads: int) -> list[Finding]:
     """Models, focal lengths and lenses that do not fit.
 
     Args:
         model: the final model.
         fixed: intrinsics were given and kept; they are refined in a copy and compared.
-        copy: folder the model can be read from.
         threads: CPU threads; below 1 for all.
     """
     found = []
@@ -207,7 +207,7 @@ def doubtful_intrinsics(model: pycolmap.Reconstruction, fixed: bool, copy: Path,
         error = model.compute_mean_reprojection_error()
         found.append(Finding("bent?", "", f"a reprojection error of {error:.2f} px is high: the track may be wrong"))
     if fixed:
-        free = pycolmap.Reconstruction(copy)
+        free = with_fewer_points(model)
         before = free.compute_mean_reprojection_error()
         adjust(free, bundle_options(True, True, False, threads, robust=True))
         after = free.compute_mean_reprojection_error()

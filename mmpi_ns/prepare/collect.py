@@ -15,6 +15,8 @@ from mmpi_ns.prepare.frame import camera_poses
 
 FIT_PX = 2.0
 """Sampson distance, in pixels of an image side of 1,000, up to which a match lies on its epipolar line."""
+BESIDE = 4.0
+"""Multiple of that distance up to which a match lies beside its line."""
 
 
 def witness_of(name: str, model: pycolmap.Reconstruction, database: Path, offered: Sequence[str]) -> Witness:
@@ -42,12 +44,12 @@ def witness_of(name: str, model: pycolmap.Reconstruction, database: Path, offere
 
 
 def _pairs(model: pycolmap.Reconstruction, database: Path) -> Pairs:
-    """For every verified pair of registered images, how many matches became points and how many fit the poses."""
+    """For every verified pair of registered images, how many matches became points and how well they fit the poses."""
     order = sorted(model.reg_image_ids())
     place = {image_id: i for i, image_id in enumerate(order)}
     points = {i: _points(model.images[i]) for i in order}
     rays = {i: _rays(model, model.images[i]) for i in order}
-    rows: list[tuple[int, int, int, int, int]] = []
+    rows: list[tuple[int, ...]] = []
     with pycolmap.Database.open(database) as opened:
         numbers, geometries = opened.read_two_view_geometries()
     for number, geometry in zip(numbers, geometries, strict=True):
@@ -60,9 +62,10 @@ def _pairs(model: pycolmap.Reconstruction, database: Path) -> Pairs:
         relative = model.images[b].cam_from_world() * model.images[a].cam_from_world().inverse()
         off = sampson(rays[a][matches[:, 0]], rays[b][matches[:, 1]], pycolmap.essential_matrix_from_pose(relative))
         camera = model.cameras[model.images[a].camera_id]
-        limit = FIT_PX * max(camera.width, camera.height) / 1000 / camera.mean_focal_length()
-        rows.append((place[a], place[b], len(matches), int(tracked.sum()), int((off < limit).sum())))
-    table = np.array(rows, dtype=np.int64).reshape(-1, 5)
+        off *= camera.mean_focal_length() / (FIT_PX * max(camera.width, camera.height) / 1000)
+        fitting, beside = int((off < 1).sum()), int(((off >= 1) & (off < BESIDE)).sum())
+        rows.append((place[a], place[b], len(matches), int(tracked.sum()), fitting, beside))
+    table = np.array(rows, dtype=np.int64).reshape(-1, 6)
     low, high = table[:, :2].min(1, initial=len(order)), table[:, :2].max(1, initial=0)
     return Pairs(low, high, *table[:, 2:].T.astype(np.float64))
 

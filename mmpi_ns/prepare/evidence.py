@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mmpi_ns.prepare.alignment import degrees_between, similarity_matrix
+from mmpi_ns.prepare.alignment import degrees_between, rotation_between, similarity_matrix
 
 Array = NDArray[np.float64]
 Places = NDArray[np.int64]
@@ -27,6 +27,8 @@ REACH = 12
 """Maximum frame distance of pairs used for a gap; pairs farther apart have few matches, most of them wrong."""
 FEW = 60
 """Minimum number of matches across a gap for a statement about it."""
+FEW_OF_ONE = 40
+"""Minimum number of an image's matches with earlier or with later ones for a statement about it."""
 LEAST_ANGLE = 1.0
 """Minimum angle in degrees between the first and last ray on one side of a gap for triangulation from that side."""
 LEAST_POINTS = 20
@@ -49,6 +51,9 @@ class Pairs:
     """Of these, matches whose two keypoints see one point of the model. [P]"""
     fitting: Array
     """Of these, matches that lie on the epipolar lines of the two poses. [P]"""
+    beside: Array
+    """Of these, matches that lie close beside them: a bent track has many. Those far off are false, or the poses are
+    broken. [P]"""
 
 
 @dataclass(frozen=True)
@@ -89,20 +94,21 @@ def share(part: Array, whole: Array) -> float:
     return float(part.sum() / max(float(whole.sum()), 1.0))
 
 
-def bridges(pairs: Pairs, count: int, part: Array) -> Array:
+def bridges(pairs: Pairs, count: int, part: Array, whole: Array | None = None) -> Array:
     """For each gap between two registered images, the fraction of the matches across it that hold.
 
     Args:
         pairs: of the model.
         count: registered images, N.
         part: ``pairs.tracked`` or ``pairs.fitting``. [P]
+        whole: what it is a part of; all matches unless given. [P]
 
     Returns:
         Fractions; NaN if there are too few matches across. [N - 1]
     """
     near = pairs.second - pairs.first <= REACH
     totals = np.zeros((2, count + 1))
-    for row, values in enumerate((part, pairs.matches)):
+    for row, values in enumerate((part, pairs.matches if whole is None else whole)):
         np.add.at(totals[row], pairs.first[near], values[near])
         np.add.at(totals[row], pairs.second[near], -values[near])
     held, crossing = np.cumsum(totals, axis=1)[:, : max(count - 1, 0)]
@@ -116,6 +122,19 @@ def held_by_image(pairs: Pairs, count: int) -> Array:
         np.add.at(held, ends, pairs.tracked)
         np.add.at(matches, ends, pairs.matches)
     return np.where(matches >= FEW, held / np.maximum(matches, 1), np.nan)
+
+
+def held_by_side(pairs: Pairs, count: int) -> Array:
+    """Share of each image's matches with earlier images, and with later ones, that fit the poses; NaN for few. [2, N]
+
+    An image that is misplaced, alone or at a break, contradicts all images of one side, while most matches across the
+    gaps beside it, which join other images, may hold.
+    """
+    held, matches = np.zeros((2, count)), np.zeros((2, count))
+    for side, ends in enumerate((pairs.second, pairs.first)):
+        np.add.at(held[side], ends, pairs.fitting)
+        np.add.at(matches[side], ends, pairs.matches)
+    return np.where(matches >= FEW_OF_ONE, held / np.maximum(matches, 1), np.nan)
 
 
 def scale_changes(points: Places, frames: Places, centers: Array, rays: Array, count: int) -> Array:
@@ -197,7 +216,10 @@ def speed_changes(witness: Witness) -> Array:
 
 
 def agreement(one: Witness, other: Witness) -> Agreement | None:
-    """Difference of two witnesses in the images that both have; None if there are fewer than three."""
+    """Difference of two witnesses in the images that both have; None if there are fewer than three.
+
+    Centres and rotations are aligned each for itself: another principal point turns all cameras alike.
+    """
     common = [n for n in one.images if n in set(other.images)]
     if len(common) < 3:
         return None
@@ -205,5 +227,5 @@ def agreement(one: Witness, other: Witness) -> Agreement | None:
     scale, rotation, translation = similarity_matrix(a, b)
     moved = scale * a[:, :3, 3] @ rotation.T + translation
     extent = max(float(np.linalg.norm(np.ptp(b[:, :3, 3], axis=0))), 1e-12)
-    turns = degrees_between(rotation @ a[:, :3, :3], b[:, :3, :3])
+    turns = degrees_between(rotation_between(a[:, :3, :3], b[:, :3, :3]) @ a[:, :3, :3], b[:, :3, :3])
     return Agreement(common, np.linalg.norm(moved - b[:, :3, 3], axis=-1) / extent, turns)

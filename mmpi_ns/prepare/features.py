@@ -20,9 +20,11 @@ PAIR_BATCH = 64
 PIXELS_A_FEATURE = 100
 """At most one feature for this many pixels: more are redundant, and the cost of matching is quadratic."""
 LEAST_FEATURES = 2048
-"""Small images may have this many..."""
+"""Small images may have this many."""
 FAINT = 0.003
-"""... including weak ones (SIFT's peak threshold), because they have few."""
+"""SIFT's peak threshold for images with few features: weak ones count too."""
+SAMPLE = 4
+"""Images that are looked at to find whether they have few."""
 
 
 def create_database(
@@ -77,7 +79,7 @@ def extract(
     options.num_threads = threads
     most = max(p.width * p.height for p in photos) // PIXELS_A_FEATURE
     options.sift.max_num_features = min(max_features, max(most, LEAST_FEATURES))
-    if most < LEAST_FEATURES:
+    if most < LEAST_FEATURES or _are_poor(database, images, photos, options):
         options.sift.peak_threshold = FAINT
     reader = pycolmap.ImageReaderOptions()
     if masks is not None:
@@ -100,6 +102,22 @@ def extract(
             f"Hardly any features: {max(counts)} in the best image. The images are blank, blurred or masked over."
         )
     return counts
+
+
+def _are_poor(
+    database: Path, images: Path, photos: Sequence[Photo], options: pycolmap.FeatureExtractionOptions
+) -> bool:
+    """Whether most of a few images, evenly spaced, have less than half of the features that they may have."""
+    places = sorted({round(i) for i in np.linspace(0, len(photos) - 1, SAMPLE)})
+    sample = database.with_name("sample.db")
+    sample.unlink(missing_ok=True)
+    with quiet():
+        names = [photos[i].name for i in places]
+        pycolmap.extract_features(sample, images, image_names=names, extraction_options=options)
+    with pycolmap.Database.open(sample) as opened:
+        counts = [opened.num_keypoints_for_image(i.image_id) for i in opened.read_all_images()]
+    sample.unlink()
+    return float(np.median(counts or [0])) < 0.5 * options.sift.max_num_features
 
 
 def match(database: Path, photos: Sequence[Photo], pairs: Sequence[tuple[int, int]], threads: int) -> int:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
-from pathlib import Path
 
 import pycolmap
 
 from mmpi_ns.prepare.mapping import adjust, bundle_options
+from mmpi_ns.prepare.polish import with_fewer_points
 
 STARTS = (0.7, 1.2)
 """Focal lengths over the longer side that are tried where none is known: telephones and cars, then COLMAP's guess."""
@@ -17,30 +18,33 @@ WIDE = 0.08
 """Width of the interval, relative to the focal length, from which --focal is asked for."""
 
 
-def focal_interval(folder: Path, threads: int) -> tuple[float, float]:
+def focal_interval(model: pycolmap.Reconstruction, threads: int) -> tuple[float, float]:
     """Focal lengths, in pixels, that bundle adjustments of one model end at under different assumptions.
 
     Principal point in the middle; principal point free; each half of the images alone. The statistical error of one
     adjustment is far smaller and means little, because the assumptions dominate. Of several cameras, the first.
 
     Args:
-        folder: of the model; read anew for each adjustment.
+        model: not changed.
         threads: CPU threads; below 1 for all.
     """
-    model = pycolmap.Reconstruction(folder)
+    light = with_fewer_points(model)
     ids = sorted(model.reg_image_ids())
     found = [_first_focal(model)]
-    found.append(_after(folder, lambda m: None, True, threads))
+    found.append(_after(light, lambda m: None, True, threads))
     if len(ids) >= PARTS:
         for part in (ids[: len(ids) // 2], ids[len(ids) // 2 :]):
-            found.append(_after(folder, lambda m, part=part: _keep(m, part), False, threads))
+            found.append(_after(light, lambda m, part=part: _keep(m, part), False, threads))
     return min(found), max(found)
 
 
 def _after(
-    folder: Path, change: Callable[[pycolmap.Reconstruction], None], principal_point: bool, threads: int
+    light: pycolmap.Reconstruction,
+    change: Callable[[pycolmap.Reconstruction], None],
+    principal_point: bool,
+    threads: int,
 ) -> float:
-    model = pycolmap.Reconstruction(folder)
+    model = copy.deepcopy(light)
     change(model)
     adjust(model, bundle_options(True, True, principal_point, threads, robust=True))
     return _first_focal(model)

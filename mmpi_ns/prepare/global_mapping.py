@@ -10,20 +10,24 @@ Source: Pan et al., Global Structure-from-Motion Revisited (2024), as in COLMAP 
 from __future__ import annotations
 
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 
 import pycolmap
 
 from mmpi_ns.capture.matching import MIN_ANGLE, MIN_INLIERS, SEED, quiet
 from mmpi_ns.prepare.mapping import largest_model
+from mmpi_ns.prepare.polish import with_all_points
 
+ROUNDS = 2
+"""Times that a placed model is given all points and adjusted: after one, the focal length may still be far off."""
 TRACKS_PER_VIEW = 500
-"""Tracks used for placing each image, the longest ones. All others are triangulated at the end: using all of them from
-the start takes twice as long on kitti-street and is no better (docs/prepare.md)."""
+"""Tracks used for placing each image, the longest ones: using all of them takes twice as long on kitti-street and is no
+better (docs/prepare.md)."""
 
 
 def map_globally(
-    database: Path, images: Path, folder: Path, refine: bool, threads: int
+    database: Path, images: Path, folder: Path, names: Sequence[str], refine: bool, threads: int
 ) -> tuple[pycolmap.Reconstruction, Path] | None:
     """The largest model and its folder; read back where it was made before.
 
@@ -31,6 +35,7 @@ def map_globally(
         database: features, verified matches and the cameras to start from.
         images: folder of the images, for the points' colours.
         folder: for the models.
+        names: the images to place.
         refine: refine intrinsics.
         threads: CPU threads; below 1 for all.
 
@@ -41,12 +46,13 @@ def map_globally(
     if not done.exists():
         shutil.rmtree(folder, ignore_errors=True)
         models.mkdir(parents=True)
+        options = global_options(refine, threads)
+        options.image_names = list(names)
         with quiet():
-            found = pycolmap.global_mapping(database, images, models, global_options(refine, threads))
-        for number, model in found.items():
-            (models / str(number)).mkdir(exist_ok=True)
-            model.update_point_3d_errors()
-            model.write(models / str(number))
+            found = pycolmap.global_mapping(database, images, models, options)
+            for number, model in found.items():
+                (models / str(number)).mkdir(exist_ok=True)
+                with_all_points(model, database, images, refine, threads, ROUNDS).write(models / str(number))
         done.touch()
     return largest_model(models)
 
@@ -61,9 +67,9 @@ def global_options(refine: bool, threads: int) -> pycolmap.GlobalPipelineOptions
     mapper.track_required_tracks_per_view = TRACKS_PER_VIEW
     mapper.random_seed = SEED
     mapper.num_threads = threads
-    for part in (mapper.rotation_averaging, mapper.global_positioning, mapper.retriangulation):
+    for part in (mapper.rotation_averaging, mapper.global_positioning):
         part.random_seed = SEED
-    mapper.min_tri_angle_deg = mapper.retriangulation.min_angle = MIN_ANGLE
+    mapper.min_tri_angle_deg, mapper.skip_retriangulation = MIN_ANGLE, True
     mapper.bundle_adjustment.refine_focal_length = refine
     mapper.bundle_adjustment.refine_extra_params = refine
     return options

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import os
 import shutil
 from collections.abc import Sequence
@@ -17,10 +18,12 @@ from mmpi_ns.prepare.evidence import Witness, agreement
 from mmpi_ns.prepare.focal import STARTS
 from mmpi_ns.prepare.global_mapping import map_globally, start_from
 from mmpi_ns.prepare.mapping import ATTEMPTS, reconstruct
-from mmpi_ns.prepare.polish import Free, polish
+from mmpi_ns.prepare.polish import Free, polish, with_all_points
 from mmpi_ns.prepare.stages import PrepareError, progress, say
-from mmpi_ns.prepare.verdict import ORDER, Verdict, agrees, judge_alone, judge_together, rank
+from mmpi_ns.prepare.verdict import NEARLY_ALL, ORDER, Grade, Verdict, agrees, best_first, judge_alone, judge_together
 
+PLACED = 100
+"""Images of a sequence that the global mapper places at least, if there are so many."""
 NEAR = 0.1
 """Relative difference below which two initial focal lengths count as the same."""
 
@@ -44,80 +47,127 @@ class Believed:
     """Both mappers in words."""
 
 
-def map_and_judge(
-    database: Path,
-    images: Path,
-    work: Path,
-    offered: Sequence[str],
-    *,
-    free: Free,
-    threads: int,
-    is_sequence: bool,
-    is_ordered: bool,
-) -> Believed:
+@dataclass(frozen=True)
+class Task:
+    """What is to be mapped, and where."""
+
+    database: Path
+    """Features and verified matches."""
+    images: Path
+    """Folder of the images."""
+    work: Path
+    """Folder for databases, models and snapshots; holds those of an interrupted run."""
+    offered: Sequence[str]
+    """Names of all images, in order."""
+    free: Free
+    """What may be refined of the intrinsics."""
+    threads: int
+    """CPU threads; below 1 for all."""
+    is_sequence: bool
+    """Matched as a sequence: the incremental mapper begins with settings for forward motion."""
+    is_ordered: bool
+    """The images come in the order of the motion, so that breaks between neighbours can be looked for."""
+
+    @property
+    def placed(self) -> Sequence[str]:
+        """Names of the images that the global mapper places first: of a long sequence every second, third and so on.
+
+        That is enough to find the focal length and to confirm the incremental mapper's track, in a part of the time.
+        """
+        return self.offered[:: max(1, len(self.offered) // PLACED)] if self.is_ordered else self.offered
+
+
+def map_and_judge(task: Task) -> Believed:
     """Runs the global mapper, then the incremental one from the focal length found, and chooses by the evidence.
 
-    The chosen model is adjusted once more (``polish``), unless that makes the evidence worse.
-
-    Args:
-        database: features and verified matches.
-        images: folder of the images.
-        work: folder for databases, models and snapshots; holds those of an interrupted run.
-        offered: names of all images, in order.
-        free: what may be refined of the intrinsics.
-        threads: CPU threads; below 1 for all.
-        is_sequence: matched as a sequence: the incremental mapper begins with settings for forward motion.
-        is_ordered: the images come in the order of the motion, so that breaks between neighbours can be looked for.
+    The chosen model is given all points and adjusted (``polish``), unless that makes the evidence worse.
 
     Raises:
         PrepareError: neither mapper makes a model.
     """
-    fixed = not free.lens
-    starts = _starts(database, work, fixed)
-    found = _globally(starts[:2], images, work, offered, fixed, threads)
-    settled = _settled(found, is_ordered)
-    if len(starts) > 2 and not settled:
-        found += _globally(starts[2:], images, work, offered, fixed, threads)
-        settled = _settled(found, is_ordered)
-    found = sorted(found, key=lambda c: rank(c.witness, is_ordered), reverse=True)
-    start = database
-    if found and not fixed:
-        start = work / "from-global.db"
-        start_from(database, start, {c.camera_id: c.mean_focal_length() for c in found[0].model.cameras.values()})
-    try:
-        attempts = 1 if settled else len(ATTEMPTS)
-        one = reconstruct(start, images, work / "incremental", not fixed, threads, is_sequence, attempts)
-        witness = witness_of("incremental", one.model, database, offered)
-        tried = ", ".join(f"{name} {size}" for name, size in one.tried)
-        found.append(Candidate(one.model, witness, f"incremental, '{one.attempt}' settings ({tried})"))
-    except PrepareError:
-        if not found:
-            raise
-    chosen, verdict, says = _choose(found, is_ordered)
-    polished = polish(chosen.model, free, threads)
-    grade = judge_alone(witness_of("polished", polished, database, offered), is_ordered).grade
-    if ORDER.index(grade) > ORDER.index(judge_alone(chosen.witness, is_ordered).grade):
+    found = _candidates(task)
+    chosen, *others = _best_first(found, task)
+    with progress("Adding points", None):
+        model = copy.deepcopy(chosen.model)
+        model = with_all_points(model, task.database, task.images, task.free.lens, task.threads)
+    model = polish(model, task.free, task.threads)
+    polished = Candidate(model, witness_of(chosen.witness.name, model, task.database, task.offered), chosen.says)
+    if ORDER.index(_grade(polished, task)) > ORDER.index(_grade(chosen, task)):
         say("The final bundle adjustment makes the evidence worse: left out.", "yellow")
-        polished = chosen.model
-    return Believed(polished, verdict, says)
+    else:
+        chosen = polished
+    verdict = judge_together(chosen.witness, [c.witness for c in others], task.is_ordered)
+    beside = [f"{c.says}, {_grade(c, task)} by itself" for c in others]
+    return Believed(chosen.model, verdict, "; beside it ".join([chosen.says, *beside]))
 
 
-def _settled(found: Sequence[Candidate], is_ordered: bool) -> bool:
+def _candidates(task: Task) -> list[Candidate]:
+    """The models of both mappers, of the global one from several focal lengths.
+
+    Where the global mapper has placed a part of a long sequence, it places all images if the incremental one fails.
+    """
+    starts = _starts(task)
+    found = _globally(starts[:2], task.placed, task)
+    settled = _settled(found, task)
+    if len(starts) > 2 and not settled:
+        found += _globally(starts[2:], task.placed, task)
+        settled = _settled(found, task)
+    found = _best_first(found, task)
+    start, is_part = task.database, len(task.placed) < len(task.offered)
+    if found and task.free.lens:
+        start = task.work / "from-global.db"
+        start_from(task.database, start, {n: c.mean_focal_length() for n, c in found[0].model.cameras.items()})
+    failed: PrepareError | None = None
+    try:
+        found.append(_incrementally(start, 1 if settled and not is_part else len(ATTEMPTS), task))
+    except PrepareError as error:
+        failed = error
+    if is_part and not any(_is_whole(c, task) for c in found):
+        found += _globally([("global-all", start)], task.offered, task)
+    if failed and not found:
+        raise failed
+    return found
+
+
+def _is_whole(candidate: Candidate, task: Task) -> bool:
+    """Whether a model is right by its own evidence and has nearly all images."""
+    return len(candidate.witness.images) >= NEARLY_ALL * len(task.offered) and _grade(candidate, task) == "right"
+
+
+def _incrementally(start: Path, attempts: int, task: Task) -> Candidate:
+    """The incremental mapper's model, from the cameras of a database."""
+    work, refine = task.work / "incremental", task.free.lens
+    made = reconstruct(start, task.images, work, refine, task.threads, task.is_sequence, attempts)
+    witness = witness_of("incremental", made.model, task.database, task.offered)
+    tried = ", ".join(f"{name} {size}" for name, size in made.tried)
+    return Candidate(made.model, witness, f"incremental, '{made.attempt}' settings ({tried})")
+
+
+def _grade(candidate: Candidate, task: Task) -> Grade:
+    return judge_alone(candidate.witness, task.is_ordered).grade
+
+
+def _best_first(found: Sequence[Candidate], task: Task) -> list[Candidate]:
+    return [found[i] for i in best_first([c.witness for c in found], task.is_ordered)]
+
+
+def _settled(found: Sequence[Candidate], task: Task) -> bool:
     """Whether the global mapper is right by its own evidence, with the same result from all starts for which it is."""
-    right = [c.witness for c in found if judge_alone(c.witness, is_ordered).grade == "right"]
+    right = [c.witness for c in found if _grade(c, task) == "right"]
     differences = [agreement(right[0], w) for w in right[1:]]
     return bool(right) and all(d is not None and agrees(d) for d in differences)
 
 
-def _starts(database: Path, work: Path, fixed: bool) -> list[tuple[str, Path]]:
+def _starts(task: Task) -> list[tuple[str, Path]]:
     """Databases for the global mapper, by name: unchanged if the focal length is known, else one for each guess.
 
     The first guess comes from the fundamental matrices of the pairs, if they determine it (in a straight drive they
     do not); the others are fixed multiples of the image side.
     """
+    database, work = task.database, task.work
     with pycolmap.Database.open(database) as opened:
         unknown = [c for c in opened.read_all_cameras() if not c.has_prior_focal_length]
-    if fixed or not unknown:
+    if not task.free.lens or not unknown:
         return [("global", database)]
     guesses = {f"global-{ratio}": {c.camera_id: ratio * max(c.width, c.height) for c in unknown} for ratio in STARTS}
     calibrated = _calibrated(database, work / "calibrated.db")
@@ -143,16 +193,15 @@ def _calibrated(database: Path, copy: Path) -> dict[int, float]:
     return focals
 
 
-def _globally(
-    starts: Sequence[tuple[str, Path]], images: Path, work: Path, offered: Sequence[str], fixed: bool, threads: int
-) -> list[Candidate]:
-    """Runs the global mapper from all starts in parallel on all cores; failed starts are left out."""
-    cores = threads if threads > 0 else os.cpu_count() or 1
+def _globally(starts: Sequence[tuple[str, Path]], names: Sequence[str], task: Task) -> list[Candidate]:
+    """Runs the global mapper on some images from all starts in parallel on all cores; failed starts are left out."""
+    cores = task.threads if task.threads > 0 else os.cpu_count() or 1
     workers = min(cores, len(starts))
 
     def run(start: tuple[str, Path]) -> tuple[pycolmap.Reconstruction, Path] | None:
         name, path = start
-        made = map_globally(path, images, work / name, not fixed, max(1, cores // workers))
+        refine, threads = task.free.lens, max(1, cores // workers)
+        made = map_globally(path, task.images, task.work / name, names, refine, threads)
         advance()
         return made
 
@@ -168,17 +217,9 @@ def _globally(
             say(f"Mapping, {name}: no model.")
             continue
         model, _ = made
-        witness = witness_of("global", model, path, offered)
+        witness = witness_of("global", model, path, task.offered)
         focal = ", ".join(f"{c.mean_focal_length():.1f}" for _, c in sorted(model.cameras.items())[:3])
-        says = f"{model.num_reg_images()} of {len(offered)} images, {witness.error:.2f} px, focal length {focal} px"
+        says = f"{model.num_reg_images()} of {len(names)} images, {witness.error:.2f} px, focal length {focal} px"
         say(f"Mapping, {name}: {says}.")
         found.append(Candidate(model, witness, f"{name} ({says})"))
     return found
-
-
-def _choose(found: Sequence[Candidate], is_ordered: bool) -> tuple[Candidate, Verdict, str]:
-    """The candidate preferred by the evidence, compared with the others, and all of them in words."""
-    chosen, *others = sorted(found, key=lambda c: rank(c.witness, is_ordered), reverse=True)
-    verdict = judge_together(chosen.witness, [c.witness for c in others], is_ordered)
-    beside = [f"{c.says}, {judge_alone(c.witness, is_ordered).grade} by itself" for c in others]
-    return chosen, verdict, "; beside it ".join([chosen.says, *beside])

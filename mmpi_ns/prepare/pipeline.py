@@ -21,7 +21,7 @@ from mmpi_ns.prepare.focal import WIDE, focal_in_words, focal_interval
 from mmpi_ns.prepare.frame import SceneFrame, camera_poses, choose_frame
 from mmpi_ns.prepare.images import Photo
 from mmpi_ns.prepare.known import solve_known
-from mmpi_ns.prepare.mappers import map_and_judge
+from mmpi_ns.prepare.mappers import Task, map_and_judge
 from mmpi_ns.prepare.polish import Free
 from mmpi_ns.prepare.poses import read_poses, rigid3d
 from mmpi_ns.prepare.settings import Settings, check_options, read_lists
@@ -195,7 +195,7 @@ class Preparation:
             solved.model.write(folder / "model")
             if not self.is_fixed:
                 with progress("Checking the focal length", None):
-                    solved.focal = focal_interval(folder / "model", s.threads)
+                    solved.focal = focal_interval(solved.model, s.threads)
             says = {"mapping": solved.mapping, "groups": solved.groups, "notes": self.notes, "focal": solved.focal}
             says |= {"grade": solved.verdict.grade, "reasons": solved.verdict.reasons}
             (folder / "says.json").write_text(json.dumps(says), encoding="utf-8")
@@ -216,16 +216,11 @@ class Preparation:
         names = [p.name for p in self.photos]
         lens, place = not self.is_fixed, s.camera is None or s.refine_intrinsics
         free = Free(lens, lens and s.lens == "auto", principal_point=place, always=s.refine_principal_point)
-        believed = map_and_judge(
-            database,
-            self.image_folder,
-            folder,
-            names,
-            free=free,
-            threads=s.threads,
-            is_sequence=self.matching.startswith("sequential"),
-            is_ordered=self.is_ordered,
-        )
+        task = Task(
+            database, self.image_folder, folder, names, free, s.threads,
+            is_sequence=self.matching.startswith("sequential"), is_ordered=self.is_ordered,
+        )  # fmt: skip
+        believed = map_and_judge(task)
         model = believed.model
         places = sorted(set(range(len(names))) - {i - 1 for i in model.reg_image_ids()})
         groups = [[names[i] for i in group] for group in features.connected(database, places)]
@@ -314,7 +309,7 @@ class Preparation:
         self, model: pycolmap.Reconstruction, photos: Sequence[Photo], database: Path
     ) -> list[checks.Finding]:
         names = [p.name for p in photos]
-        found = checks.doubtful_intrinsics(model, self.is_fixed, self.work / "model" / "model", self.settings.threads)
+        found = checks.doubtful_intrinsics(model, self.is_fixed, self.settings.threads)
         sharp = np.zeros(len(names))
         with progress("Checking images", len(names)) as advance:
             for i, name in enumerate(names):

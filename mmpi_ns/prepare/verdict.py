@@ -15,6 +15,7 @@ from mmpi_ns.prepare.evidence import (
     agreement,
     bridges,
     held_by_image,
+    held_by_side,
     jumps,
     share,
     speed_changes,
@@ -26,10 +27,15 @@ ORDER: tuple[Grade, ...] = ("right", "doubtful", "broken")
 
 TRACKED = (0.55, 0.3)
 """Share of all verified matches that must have become points: below the first doubtful, below the second broken."""
-FITTING = (0.93, 0.5)
-"""Share of them that must lie on their epipolar lines..."""
-FITTING_ACROSS = (0.88, 0.5)
-"""... and of those across each gap between frames. (What moves does not, so few are no proof of a broken track.)"""
+FITTING = (0.9, 0.5)
+"""Share of the matches on or close beside their epipolar lines that must lie on them: where many are beside, the track
+is bent. (Matches far off are false, or belong to what moves.)"""
+FITTING_ACROSS = (0.83, 0.5)
+"""The same across each gap between frames."""
+HELD_ACROSS = (0.5, 0.25)
+"""Share of all matches across each gap that must lie on their epipolar lines: false matches are fewer."""
+HELD_BY_SIDE = (0.4, 0.15)
+"""Share of an image's matches with earlier, or with later, images that must lie on their epipolar lines."""
 BRIDGED = (0.5, 0.25)
 """Share of the matches across each gap between frames that must have become points..."""
 BRIDGED_OF_USUAL = (0.6, 0.35)
@@ -46,10 +52,12 @@ CHANGE = 2.5
 """Ratio of speeds that counts as a sudden change, treated alike."""
 WEAK = 0.8
 """Share of the usual below which matches hold badly beside a jump."""
-APART = (0.005, 0.02)
+APART = (0.01, 0.03)
 """Mean and largest distance between the centres of two mappers, as shares of the track, up to which they agree."""
-TURNED = (0.5, 1.5)
+TURNED = (1.0, 2.0)
 """The same of their rotations, in degrees."""
+NEARLY_ALL = 0.9
+"""Share of the images of the largest track below which another has clearly fewer."""
 REMEDY = (
     "Give --focal (and --lens) if you know them, mask what moves (--masks), or prepare the frames before and after "
     "apart from each other."
@@ -82,9 +90,9 @@ def judge_alone(witness: Witness, is_sequence: bool) -> Verdict:
     """
     pairs, count = witness.pairs, len(witness.images)
     found: list[tuple[Grade, str]] = []
-    tracked, fitting = share(pairs.tracked, pairs.matches), share(pairs.fitting, pairs.matches)
+    tracked, fitting = share(pairs.tracked, pairs.matches), share(pairs.fitting, pairs.fitting + pairs.beside)
     found.append((worse(tracked, TRACKED), f"Only {tracked:.0%} of the verified matches became points."))
-    found.append((worse(fitting, FITTING), f"Only {fitting:.0%} of the verified matches fit the poses."))
+    found.append((worse(fitting, FITTING), f"{1 - fitting:.0%} of the verified matches miss the poses by a little."))
     if is_sequence:
         found += _breaks(witness)
     else:
@@ -107,11 +115,7 @@ def _breaks(witness: Witness) -> list[tuple[Grade, str]]:
     where = _between(witness, worst)
     says = f"The track breaks {where}: {held:.0%} of the matches across became points, {usual:.0%} elsewhere."
     found: list[tuple[Grade, str]] = [(grade, says)]
-    fitting = bridges(witness.pairs, len(witness.images), witness.pairs.fitting)
-    at = int(np.nanargmin(fitting))
-    where = _between(witness, at)
-    says = f"The track is bent or broken {where}: {fitting[at]:.0%} of the matches across fit its poses."
-    found.append((worse(float(fitting[at]), FITTING_ACROSS), says))
+    found += _contradictions(witness)
     if np.isfinite(witness.scales).any():
         at = int(np.nanargmax(np.abs(witness.scales)))
         change = float(abs(witness.scales[at]))
@@ -133,6 +137,30 @@ def _breaks(witness: Witness) -> list[tuple[Grade, str]]:
         at = int(changes.argmax())
         where = f"{changes[at]:.1f} times at {witness.images[at]}"
         found.append(("doubtful", f"The speed changes {where}, where few matches hold: the scale may break there."))
+    return found
+
+
+def _contradictions(witness: Witness) -> list[tuple[Grade, str]]:
+    """Where matches lie beside or far from the epipolar lines of the poses: the worst gaps, and the worst image."""
+    pairs, count = witness.pairs, len(witness.images)
+    found: list[tuple[Grade, str]] = []
+    for word, limits, whole in (
+        ("bent", FITTING_ACROSS, pairs.fitting + pairs.beside),
+        ("broken", HELD_ACROSS, pairs.matches),
+    ):
+        fitting = bridges(pairs, count, pairs.fitting, whole)
+        if np.isfinite(fitting).any():
+            at = int(np.nanargmin(fitting))
+            says = (
+                f"The track is {word} {_between(witness, at)}: {fitting[at]:.0%} of the matches across fit its poses."
+            )
+            found.append((worse(float(fitting[at]), limits), says))
+    held = held_by_side(pairs, count)
+    if np.isfinite(held).any():
+        side, at = divmod(int(np.nanargmin(held)), count)
+        others, fitting = ("later" if side else "earlier"), float(held[side, at])
+        says = f"{witness.images[at]} is misplaced: {fitting:.0%} of its matches with {others} images fit its pose."
+        found.append((worse(fitting, HELD_BY_SIDE), says))
     return found
 
 
@@ -200,11 +228,20 @@ def _differ(chosen: Witness, other: Witness, difference: Agreement) -> str:
     )
 
 
-def rank(witness: Witness, is_sequence: bool) -> tuple[int, int, float, float]:
-    """Sort key of witnesses, the most credible highest.
+def best_first(witnesses: Sequence[Witness], is_sequence: bool) -> list[int]:
+    """Numbers of the witnesses, the most credible first.
 
-    By verdict, by images, by the share of the matches that fit the poses, to a hundredth, and by matches that became
-    points. (A bent track may have more points than a right one: its points fit its bends.)
+    Broken ones are last, and those with clearly fewer images than another come after it: a small part of the capture
+    is seldom wrong. Then by verdict, by images, by the share of the matches that fit the poses, to a hundredth, and by
+    matches that became points. (A bent track may have more points than a right one: its points fit its bends.)
     """
-    grade = judge_alone(witness, is_sequence).grade
-    return -ORDER.index(grade), len(witness.images), _fit(witness), float(witness.pairs.tracked.sum())
+    grades = [judge_alone(w, is_sequence).grade for w in witnesses]
+    most = max((len(w.images) for w, grade in zip(witnesses, grades, strict=True) if grade != "broken"), default=0)
+
+    def key(number: int) -> tuple[bool, bool, int, int, float, float]:
+        witness, grade = witnesses[number], grades[number]
+        size = len(witness.images)
+        tracked = float(witness.pairs.tracked.sum())
+        return grade != "broken", size >= NEARLY_ALL * most, -ORDER.index(grade), size, _fit(witness), tracked
+
+    return sorted(range(len(witnesses)), key=key, reverse=True)

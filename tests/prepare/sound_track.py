@@ -86,7 +86,8 @@ def witness_with(poses, pixels, seen, focal=FOCAL, name="incremental"):
             x, y, z = poses[j, :3, :3].T @ (poses[i, :3, 3] - poses[j, :3, 3])
             essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ turn
             off = sampson(local[i, both], local[j, both], essential) * focal
-            rows.append((i, j, len(both), (kept[i, both] & kept[j, both]).sum(), (off < 1.24).sum()))
+            fitting, beside = (off < 1.24).sum(), ((off >= 1.24) & (off < 4 * 1.24)).sum()
+            rows.append((i, j, len(both), (kept[i, both] & kept[j, both]).sum(), fitting, beside))
     table = np.array(rows)
     pairs = Pairs(table[:, 0], table[:, 1], *table[:, 2:].T.astype(float))
     names = [f"frame_{i:03d}" for i in range(count)]

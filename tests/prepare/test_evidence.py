@@ -9,8 +9,18 @@ import pytest
 from sound_track import FOCAL, drive, observed, project, scattered, triangulated, witness_with
 
 from mmpi_ns.capture.epipolar import sampson
-from mmpi_ns.prepare.evidence import Pairs, agreement, bridges, held_by_image, jumps, scale_changes, speed_changes
-from mmpi_ns.prepare.verdict import judge_alone, judge_together
+from mmpi_ns.prepare.alignment import rotation_between
+from mmpi_ns.prepare.evidence import (
+    Pairs,
+    agreement,
+    bridges,
+    held_by_image,
+    held_by_side,
+    jumps,
+    scale_changes,
+    speed_changes,
+)
+from mmpi_ns.prepare.verdict import best_first, judge_alone, judge_together
 
 POSES = drive()
 POINTS = scattered(POSES)
@@ -152,11 +162,11 @@ def test_bridges_count_every_pair_across_a_gap_once():
     matches = random.integers(100, 200, len(pairs)).astype(float)
     tracked = matches * random.random(len(pairs))
     first, second = np.array(pairs).T
-    found = bridges(Pairs(first, second, matches, tracked, tracked), 9, tracked)
+    found = bridges(Pairs(first, second, matches, tracked, tracked, matches - tracked), 9, tracked)
     for gap in range(8):
         across = [k for k, (i, j) in enumerate(pairs) if i <= gap < j]
         assert found[gap] == pytest.approx(sum(tracked[across]) / sum(matches[across]))
-    held = held_by_image(Pairs(first, second, matches, tracked, tracked), 9)
+    held = held_by_image(Pairs(first, second, matches, tracked, tracked, matches - tracked), 9)
     own = [k for k, pair in enumerate(pairs) if 4 in pair]
     assert held[4] == pytest.approx(sum(tracked[own]) / sum(matches[own]))
 
@@ -164,7 +174,7 @@ def test_bridges_count_every_pair_across_a_gap_once():
 def test_speed_that_halves_is_seen_where_it_halves():
     poses = np.tile(np.eye(4), (20, 1, 1))
     poses[:, 0, 3] = np.r_[np.arange(10), 9 + 0.5 * np.arange(1, 11)]
-    pairs = Pairs(*(np.zeros(0, np.int64) for _ in range(2)), *(np.zeros(0) for _ in range(3)))
+    pairs = Pairs(*(np.zeros(0, np.int64) for _ in range(2)), *(np.zeros(0) for _ in range(4)))
     from mmpi_ns.prepare.evidence import Witness
 
     changes = speed_changes(
@@ -223,3 +233,60 @@ def test_sampson_is_the_distance_to_the_nearest_exact_match():
     share = np.hypot(*line[:, :2].T) / np.sqrt((line[:, :2] ** 2).sum(-1) + (back[:, :2] ** 2).sum(-1))
     second[:, :2] += 1e-5 * across
     assert sampson(first, second, essential) == pytest.approx(1e-5 * share, rel=1e-3)
+
+
+def test_one_misplaced_image_of_a_sequence_is_named_though_most_matches_across_its_gaps_hold(keypoints):
+    """The images before and after it see each other."""
+    sideways = drive()
+    sideways[12, :3, 3] += 3.0 * sideways[12, :3, 0]
+    witness = witness_with(sideways, *keypoints)
+    held = held_by_side(witness.pairs, len(sideways))
+    assert np.nanmin(held) == min(held[0, 12], held[1, 12]) < 0.4
+    verdict = judge_alone(witness, is_sequence=True)
+    assert verdict.grade != "right" and "frame_012 is misplaced" in verdict.words()
+
+
+def test_sides_of_an_image_are_its_earlier_and_its_later_partners():
+    random = np.random.default_rng(4)
+    pairs = [(i, j) for i in range(9) for j in range(i + 1, 9) if random.random() < 0.8]
+    matches = random.integers(100, 200, len(pairs)).astype(float)
+    fitting = matches * random.random(len(pairs))
+    first, second = np.array(pairs).T
+    held = held_by_side(Pairs(first, second, matches, fitting, fitting, matches - fitting), 9)
+    for side in (0, 1):
+        own = [k for k, pair in enumerate(pairs) if pair[1 - side] == 4]
+        assert held[side, 4] == pytest.approx(sum(fitting[own]) / sum(matches[own]))
+    assert np.isnan(held[0, 0]) and np.isnan(held[1, 8])
+
+
+def test_false_matches_far_from_their_lines_bend_nothing_and_those_beside_them_do(sound):
+    pairs = sound.pairs
+    across = (pairs.first < 12) & (pairs.second >= 12)
+    fitting = np.where(across, 0.6 * pairs.matches, pairs.fitting)
+    false = replace(sound, pairs=replace(pairs, fitting=fitting, beside=np.where(across, 0.0, pairs.beside)))
+    assert judge_alone(false, is_sequence=True).grade == "right"
+    bent = replace(sound, pairs=replace(pairs, fitting=fitting, beside=np.where(across, 0.4 * pairs.matches, 0.0)))
+    verdict = judge_alone(bent, is_sequence=True)
+    assert verdict.grade == "doubtful" and "bent between frame_011 and frame_012: 60%" in verdict.words()
+
+
+def test_a_sound_piece_comes_after_a_doubtful_whole_and_a_broken_whole_after_both(sound, keypoints):
+    half = witness_with(POSES[:12], keypoints[0][:12], keypoints[1][:12])
+    weak = replace(sound, pairs=replace(sound.pairs, tracked=0.5 * sound.pairs.tracked))
+    broken = witness_with(moved(np.s_[12:], shift=(0, 0, 8.0)), *keypoints)
+    assert [judge_alone(w, True).grade for w in (half, weak, broken)] == ["right", "doubtful", "broken"]
+    assert best_first([broken, half, weak], True) == [2, 1, 0]
+    nearly = witness_with(POSES[:22], keypoints[0][:22], keypoints[1][:22])
+    assert best_first([weak, nearly], True) == [1, 0]
+
+
+def test_cameras_that_are_all_turned_alike_agree(sound):
+    """As by a principal point that was taken to be elsewhere."""
+    c, s = np.cos(0.1), np.sin(0.1)
+    turned = POSES.copy()
+    turned[:, :3, :3] = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ POSES[:, :3, :3]
+    difference = agreement(sound, replace(sound, poses=turned))
+    assert difference is not None and difference.turns.max() < 1e-4
+    assert rotation_between(POSES[:, :3, :3], turned[:, :3, :3]) == pytest.approx(
+        np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    )

@@ -17,7 +17,7 @@ import numpy as np
 
 from mmpi_ns.bench.quality.captures import Array, Truth, catalogue
 from mmpi_ns.bench.report import Bench, Report, Row, commit, not_run, page, table
-from mmpi_ns.prepare.alignment import degrees_between, similarity_of_centers
+from mmpi_ns.prepare.alignment import degrees_between, rotation_between, similarity_of_centers
 from mmpi_ns.prepare.pipeline import WORK
 
 WRONG = (0.01, 0.03)
@@ -126,8 +126,7 @@ def pose_errors(centers: Array, rotations: Array, truth: Truth, kept: list[int])
     """
     scale, rotation, shift = similarity_of_centers(centers, truth.centers[kept])
     off = np.linalg.norm(scale * centers @ rotation.T + shift - truth.centers[kept], axis=-1)
-    u, _, vt = np.linalg.svd(np.einsum("nij,nkj->ik", truth.rotations[kept], rotations))
-    best = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
+    best = rotation_between(rotations, truth.rotations[kept])
     return off, degrees_between(best @ rotations, truth.rotations[kept])
 
 
