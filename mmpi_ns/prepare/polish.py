@@ -37,12 +37,12 @@ class Free:
 
 
 def polish(model: pycolmap.Reconstruction, free: Free, threads: int) -> pycolmap.Reconstruction:
-    """The model adjusted with a robust loss, and again with more parameters free if that lowers the error.
+    """The model adjusted with more parameters free, if that lowers the error.
 
     Parameters that do not lower it absorb other errors: driving forward, lens terms absorb the principal point.
 
     Args:
-        model: not changed.
+        model: adjusted; not changed.
         free: what may be refined.
         threads: CPU threads; below 1 for all.
     """
@@ -54,7 +54,8 @@ def polish(model: pycolmap.Reconstruction, free: Free, threads: int) -> pycolmap
     place = free.always
     with progress("Fitting the lens", 1 + len(trials)) as advance:
         best = copy.deepcopy(model)
-        adjust(best, bundle_options(True, free.lens, place, threads, robust=True))
+        if place:
+            adjust(best, bundle_options(True, free.lens, place, threads, robust=True))
         advance()
         light = with_fewer_points(best)
         if trials:

@@ -1,0 +1,136 @@
+"""Which images the mappers place, what they fall back on, and on which points their models rest."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import replace
+from pathlib import Path
+
+import corridor
+import numpy as np
+import pycolmap
+import pytest
+from PIL import Image
+
+from mmpi_ns.prepare import features, mappers, polish
+from mmpi_ns.prepare.frame import camera_poses, similarity_between
+from mmpi_ns.prepare.images import Photo, read_photos
+from mmpi_ns.prepare.mappers import Task, map_and_judge
+from mmpi_ns.prepare.pipeline import WORK, prepare
+from mmpi_ns.prepare.polish import Free, with_all_points, with_fewer_points
+from mmpi_ns.prepare.settings import Settings
+from mmpi_ns.prepare.stages import PrepareError
+
+COUNT = 12
+
+
+@pytest.fixture(scope="module")
+def matched(tmp_path_factory):
+    """The work folder of a finished run on frames of a corridor."""
+    folder = tmp_path_factory.mktemp("matched")
+    corridor.write_images(folder / "frames", COUNT)
+    prepare(Settings(folder / "frames", folder / "scene", threads=1, keep_work=True))
+    return folder / "scene" / WORK
+
+
+@pytest.fixture
+def task(matched, tmp_path):
+    names = [p.name for p in read_photos(matched / "input")]
+    free = Free(lens=True, full_lens=False, principal_point=False)
+    return Task(matched / "matches/database.db", matched / "input/images", tmp_path, names, free, 1, True, True)
+
+
+def error_of(model):
+    """Largest distance of the centres from the true ones, as a share of the track."""
+    names, poses = camera_poses(model)
+    given = corridor.poses(COUNT)[[int(Path(n).stem[-3:]) - 1 for n in names]]
+    moved = similarity_between(poses, given)
+    off = [np.linalg.norm(moved * p - q) for p, q in zip(poses[:, :3, 3], given[:, :3, 3], strict=True)]
+    return max(off) / np.linalg.norm(np.diff(given[:, :3, 3], axis=0), axis=-1).sum()
+
+
+@pytest.mark.parametrize(("count", "step"), [(64, 1), (199, 1), (200, 2), (300, 3), (1000, 10)])
+def test_of_a_long_sequence_a_hundred_images_are_placed_first(task, count, step):
+    names = [f"{i:04d}.jpg" for i in range(count)]
+    assert replace(task, offered=names).placed == names[::step]
+    assert replace(task, offered=names, is_ordered=False).placed == names
+
+
+def test_a_long_sequence_is_confirmed_by_a_part_of_it(task, monkeypatch):
+    monkeypatch.setattr(mappers, "PLACED", COUNT // 2)
+    believed = map_and_judge(task)
+    assert believed.verdict.grade == "right" and believed.model.num_reg_images() == COUNT
+    assert f"{COUNT // 2} of {COUNT // 2} images" in believed.says and "global-all" not in believed.says
+    assert error_of(believed.model) < 0.01
+
+
+def test_all_images_are_placed_at_once_where_the_incremental_mapper_fails(task, monkeypatch):
+    def fail(*args):
+        raise PrepareError("no pair can start")
+
+    monkeypatch.setattr(mappers, "PLACED", COUNT // 2)
+    monkeypatch.setattr(mappers, "reconstruct", fail)
+    believed = map_and_judge(task)
+    assert believed.model.num_reg_images() == COUNT and believed.says.startswith("global-all")
+    assert error_of(believed.model) < 0.01
+    monkeypatch.setattr(mappers, "map_globally", lambda *args: None)
+    (task.work / "none").mkdir()
+    with pytest.raises(PrepareError, match="no pair can start"):
+        map_and_judge(replace(task, work=task.work / "none"))
+
+
+def test_a_placed_model_is_given_the_points_of_all_matches_and_adjusted(task):
+    exact = pycolmap.Reconstruction(task.database.parents[1] / "model/model")
+    before = exact.num_points3D()
+    moved = copy.deepcopy(exact)
+    for number in list(moved.points3D)[::2]:
+        moved.delete_point3D(number)
+    for camera in moved.cameras.values():
+        camera.params = camera.params * [1.02, 1, 1, 1]
+    found = with_all_points(moved, task.database, task.images, True, 1, rounds=2)
+    assert found.num_points3D() > 0.9 * before and found.num_reg_images() == COUNT
+    (camera,), (given,) = found.cameras.values(), exact.cameras.values()
+    assert camera.mean_focal_length() == pytest.approx(given.mean_focal_length(), rel=0.01)
+    assert max(p.error for p in found.points3D.values()) <= polish.LARGEST_ERROR
+    assert error_of(found) < 0.01
+
+
+def test_fewer_points_are_those_that_most_images_see_and_every_image_keeps_enough(task, monkeypatch):
+    monkeypatch.setattr(polish, "ENOUGH_POINTS", 40)
+    model = pycolmap.Reconstruction(task.database.parents[1] / "model/model")
+    before = model.num_points3D()
+    light = with_fewer_points(model)
+    assert model.num_points3D() == before > 2 * light.num_points3D()
+    for number, image in light.images.items():
+        assert image.num_points3D >= min(40, model.images[number].num_points3D)
+    lengths = {i: p.track.length() for i, p in model.points3D.items()}
+    for number in set(model.points3D) - set(light.points3D):  # each image that sees it has enough as long ones
+        for seen in model.points3D[number].track.elements:
+            kept = [p.point3D_id for p in light.images[seen.image_id].points2D if p.has_point3D()]
+            assert sum(lengths[i] >= lengths[number] for i in kept) >= 40
+
+
+@pytest.mark.parametrize("is_poor", [True, False])
+def test_weak_features_count_where_images_have_few(tmp_path, monkeypatch, is_poor):
+    """Large images of noise have enough; ones of faint blobs do not."""
+    random, size = np.random.default_rng(0), (480, 640)
+    (tmp_path / "images").mkdir()
+    for i in range(3):
+        coarse = random.normal(128, 4 if is_poor else 60, (24, 32) if is_poor else (160, 213))
+        image = Image.fromarray(coarse.clip(0, 255).astype(np.uint8)).resize(size[::-1], Image.Resampling.BICUBIC)
+        image.convert("RGB").save(tmp_path / f"images/{i}.png")
+    asked: list[tuple[int, float]] = []
+    real = pycolmap.extract_features
+
+    def watch(*args, image_names, extraction_options, **rest):
+        asked.append((len(image_names), extraction_options.sift.peak_threshold))
+        return real(*args, image_names=image_names, extraction_options=extraction_options, **rest)
+
+    monkeypatch.setattr(pycolmap, "extract_features", watch)
+    photos = [Photo(f"{i}.png", 640, 480) for i in range(3)]
+    camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=640, height=480, params=[600, 320, 240, 0], camera_id=1)
+    features.create_database(tmp_path / "database.db", photos, [1] * 3, [camera])
+    found = features.extract(tmp_path / "database.db", tmp_path / "images", photos, None, 8192, 1)
+    usual = pycolmap.FeatureExtractionOptions().sift.peak_threshold
+    assert asked[-1] == (3, pytest.approx(features.FAINT if is_poor else usual))
+    assert min(found) > 50 and not (tmp_path / "sample.db").exists()
