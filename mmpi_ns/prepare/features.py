@@ -79,12 +79,13 @@ def extract(
     options.num_threads = threads
     most = max(p.width * p.height for p in photos) // PIXELS_A_FEATURE
     options.sift.max_num_features = min(max_features, max(most, LEAST_FEATURES))
-    if most < LEAST_FEATURES or _are_poor(database, images, photos, options):
-        options.sift.peak_threshold = FAINT
     reader = pycolmap.ImageReaderOptions()
     if masks is not None:
         reader.mask_path = masks
     names = [p.name for p in photos]
+    sample = [names[i] for i in sorted({round(i) for i in np.linspace(0, len(names) - 1, SAMPLE)})]
+    if most < LEAST_FEATURES or _are_poor(sample, images, database.with_name("sample.db"), reader, options):
+        options.sift.peak_threshold = FAINT
     with progress("Finding features", len(names)) as advance, quiet():
         for start in range(0, len(names), BATCH):
             batch = names[start : start + BATCH]
@@ -105,18 +106,19 @@ def extract(
 
 
 def _are_poor(
-    database: Path, images: Path, photos: Sequence[Photo], options: pycolmap.FeatureExtractionOptions
+    names: Sequence[str],
+    images: Path,
+    unused: Path,
+    reader: pycolmap.ImageReaderOptions,
+    options: pycolmap.FeatureExtractionOptions,
 ) -> bool:
-    """Whether most of a few images, evenly spaced, have less than half of the features that they may have."""
-    places = sorted({round(i) for i in np.linspace(0, len(photos) - 1, SAMPLE)})
-    sample = database.with_name("sample.db")
-    sample.unlink(missing_ok=True)
+    """Whether most of some images have less than half of the features that they may have; ``unused`` is a database."""
+    unused.unlink(missing_ok=True)
     with quiet():
-        names = [photos[i].name for i in places]
-        pycolmap.extract_features(sample, images, image_names=names, extraction_options=options)
-    with pycolmap.Database.open(sample) as opened:
+        pycolmap.extract_features(unused, images, image_names=names, reader_options=reader, extraction_options=options)
+    with pycolmap.Database.open(unused) as opened:
         counts = [opened.num_keypoints_for_image(i.image_id) for i in opened.read_all_images()]
-    sample.unlink()
+    unused.unlink()
     return float(np.median(counts or [0])) < 0.5 * options.sift.max_num_features
 
 

@@ -87,9 +87,10 @@ def map_and_judge(task: Task) -> Believed:
     """
     found = _candidates(task)
     chosen, *others = _best_first(found, task)
-    with progress("Adding points", None):
+    with progress("Adding points", 1) as advance:
         model = copy.deepcopy(chosen.model)
         model = with_all_points(model, task.database, task.images, task.free.lens, task.threads)
+        advance()
     model = polish(model, task.free, task.threads)
     polished = Candidate(model, witness_of(chosen.witness.name, model, task.database, task.offered), chosen.says)
     if ORDER.index(_grade(polished, task)) > ORDER.index(_grade(chosen, task)):

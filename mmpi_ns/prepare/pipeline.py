@@ -194,8 +194,9 @@ class Preparation:
             (folder / "model").mkdir(exist_ok=True)
             solved.model.write(folder / "model")
             if not self.is_fixed:
-                with progress("Checking the focal length", None):
+                with progress("Checking the focal length", 1) as advance:
                     solved.focal = focal_interval(solved.model, s.threads)
+                    advance()
             says = {"mapping": solved.mapping, "groups": solved.groups, "notes": self.notes, "focal": solved.focal}
             says |= {"grade": solved.verdict.grade, "reasons": solved.verdict.reasons}
             (folder / "says.json").write_text(json.dumps(says), encoding="utf-8")
