@@ -134,3 +134,24 @@ def test_weak_features_count_where_images_have_few(tmp_path, monkeypatch, is_poo
     usual = pycolmap.FeatureExtractionOptions().sift.peak_threshold
     assert asked[-1] == (3, pytest.approx(features.FAINT if is_poor else usual))
     assert min(found) > 50 and not (tmp_path / "sample.db").exists()
+
+
+def test_the_adjusted_model_is_kept_and_judged_unless_its_evidence_is_worse(task, monkeypatch):
+    made: list[pycolmap.Reconstruction] = []
+
+    def watch(*args):
+        made.append(polish.polish(*args))
+        return made[-1]
+
+    monkeypatch.setattr(mappers, "polish", watch)
+    assert map_and_judge(task).model is made[-1]
+
+    def spoil(model, *rest):
+        spoilt = watch(model, *rest)
+        for number in list(spoilt.points3D):
+            spoilt.delete_point3D(number)
+        return spoilt
+
+    monkeypatch.setattr(mappers, "polish", spoil)
+    believed = map_and_judge(task)
+    assert believed.model is not made[-1] and believed.verdict.grade == "right"
