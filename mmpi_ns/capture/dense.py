@@ -53,6 +53,8 @@ SAME_DEPTH = 0.03
 """The depths of a point in two images agree within this fraction plus three of their errors."""
 MAX_RELATIVE = 0.15
 """Depths with a larger relative error are discarded."""
+REMAP_SIDE, REMAP_PART = 32766, 8192
+"""Largest side of what OpenCV's remap reads and writes, and side of the parts of anything larger."""
 PRIOR_ERROR = 0.5
 """Relative error of the initial rough depths, against which measured ones are weighted."""
 
@@ -126,11 +128,40 @@ def pixel_grid(shape: tuple[int, ...]) -> tuple[Map, Map]:
 
 
 def look_up(image: NDArray[Any], x: NDArray[Any], y: NDArray[Any], *, nearest: bool = False) -> NDArray[Any]:
-    """Values of an image at pixel places, centres at halves: interpolated, or the nearest pixel's and 0 outside."""
-    at = x.astype(np.float32) - 0.5, y.astype(np.float32) - 0.5
-    if nearest:
-        return np.asarray(cv2.remap(image, *at, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=(0.0,)))
-    return np.asarray(cv2.remap(image, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
+    """Values of an image at pixel places, centres at halves: interpolated, or the nearest pixel's and 0 outside.
+
+    Args:
+        image: [H, W] or [H, W, C], of any size.
+        x, y: places, of any one shape and number.
+        nearest: take the nearest pixel.
+
+    Returns:
+        The shape of ``x``, and channels where there are several.
+    """
+    at_x, at_y = x.astype(np.float32) - 0.5, y.astype(np.float32) - 0.5
+    mode = cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR
+    border = cv2.BORDER_CONSTANT if nearest else cv2.BORDER_REPLICATE
+    if at_x.ndim == 2 and max(*image.shape[:2], *at_x.shape) <= REMAP_SIDE:
+        return np.asarray(cv2.remap(image, at_x, at_y, mode, borderMode=border, borderValue=(0.0,)))
+    # OpenCV counts rows and columns in 16 bits: places are folded into rows, and large images are read in parts.
+    flat_x, flat_y = at_x.reshape(-1), at_y.reshape(-1)
+    values = np.zeros((len(flat_x), *image.shape[2:]), image.dtype)
+    part = [
+        np.clip(c // REMAP_PART, 0, (n - 1) // REMAP_PART).astype(int)
+        for c, n in ((flat_y, image.shape[0]), (flat_x, image.shape[1]))
+    ]
+    parts = part[0] * (image.shape[1] // REMAP_PART + 1) + part[1]
+    for number in np.unique(parts):
+        inside = np.nonzero(parts == number)[0]
+        top, left = REMAP_PART * part[0][inside[0]], REMAP_PART * part[1][inside[0]]
+        view = image[top : top + REMAP_PART + 1, left : left + REMAP_PART + 1]  # one more, to interpolate with
+        for begin in range(0, len(inside), REMAP_PART**2):
+            chosen = inside[begin : begin + REMAP_PART**2]
+            rows = np.zeros((2, -(-len(chosen) // REMAP_PART), REMAP_PART), np.float32)
+            rows.reshape(2, -1)[:, : len(chosen)] = flat_x[chosen] - left, flat_y[chosen] - top
+            found = cv2.remap(view, rows[0], rows[1], mode, borderMode=border, borderValue=(0.0,))
+            values[chosen] = found.reshape(-1, *image.shape[2:])[: len(chosen)]
+    return values.reshape(*x.shape, *image.shape[2:])
 
 
 def rough_inverse_depth(view: View, points: NDArray[np.float64], step: int = 8) -> Map:

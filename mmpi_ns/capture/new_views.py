@@ -188,12 +188,11 @@ def _seen_by(
     at = project(posed, j, points)
     about = np.ones((3, 3), np.uint8)
     inverse, may, darkest, brightest = (
-        look_up(m, *at.T[:, :, None], nearest=True)[:, 0]
+        look_up(m, *at.T, nearest=True)
         for m in (depth[..., 0], usable, cv2.erode(image, about), cv2.dilate(image, about))
     )
     expected = 1 / np.maximum(np.linalg.norm(points - posed.camera_to_worlds[j, :, 3], axis=-1), 1e-12)
     same_depth = (inverse > 0) & (np.abs(inverse - expected) < SAME_DEPTH * expected)
     same_color = (own >= darkest.astype(int) - SAME_COLOR).all(-1) & (own <= brightest.astype(int) + SAME_COLOR).all(-1)
     seen = np.nonzero(same_depth & same_color & (may > 0))[0]
-    colors = look_up(image, *at[seen].T[:, :, None]) if len(seen) else np.zeros((0, 1, image.shape[-1]), np.uint8)
-    return seen, colors.reshape(len(seen), image.shape[-1])
+    return seen, look_up(image, *at[seen].T)

@@ -10,9 +10,47 @@ from PIL import Image
 from test_tracks import FOCAL, HEIGHT, LENS, POSES, WIDTH, is_near_wall, pose_at, scene_of
 
 from mmpi_ns.capture import dense
-from mmpi_ns.capture.dense import Depth, confirmed, find_depths, fuse, load_view, without_fringes
+from mmpi_ns.capture.dense import Depth, confirmed, find_depths, fuse, load_view, look_up, project, without_fringes
 
 F32 = np.float32
+
+
+def values_at(image, x, y, nearest):
+    """Oracle of ``look_up`` for a list of places, float64: what is nearest, or interpolated within the borders."""
+    x, y, image = np.float32(x) - 0.5, np.float32(y) - 0.5, image.astype(np.float64)
+    height, width = image.shape[:2]
+    if nearest:
+        c, r = np.rint(x).astype(int), np.rint(y).astype(int)
+        inside = (c >= 0) & (c < width) & (r >= 0) & (r < height)
+        return np.where(inside, image[r.clip(0, height - 1), c.clip(0, width - 1)].T, 0).T
+    x, y = x.clip(0, width - 1), y.clip(0, height - 1)
+    c, r = np.minimum(x.astype(int), width - 2), np.minimum(y.astype(int), height - 2)
+    u, v = (x - c, y - r) if image.ndim == 2 else ((x - c)[:, None], (y - r)[:, None])
+    upper, lower = ((1 - u) * image[k, c] + u * image[k, c + 1] for k in (r, r + 1))
+    return (1 - v) * upper + v * lower
+
+
+@pytest.mark.parametrize("shape", [(40, 60), (40, 60, 3), (3, 70_000), (50_000, 2, 3), (2, 32_767), (8193, 3)])
+@pytest.mark.parametrize("nearest", [True, False])
+def test_images_and_lists_of_any_size_are_looked_up(shape, nearest):
+    rng = np.random.default_rng(0)
+    image = rng.random(shape).astype(F32)
+    x, y = rng.uniform(-3, shape[1] + 3, 100_000), rng.uniform(-3, shape[0] + 3, 100_000)
+    x[:9], y[:9] = [-1e4, 1e6, -1e6, 0, 0.5, shape[1], shape[1] - 0.5, 8192.5, 8192.2], 1.5
+    expected = values_at(image, x, y, nearest)
+    step = 0 if nearest else 1 / 32  # OpenCV rounds places to this much of a pixel
+    assert np.abs(look_up(image, x, y, nearest=nearest) - expected).max() <= step + 1e-6
+    folded = look_up(image, x.reshape(250, 400), y.reshape(250, 400), nearest=nearest)
+    assert np.abs(folded.reshape(expected.shape) - expected).max() <= step + 1e-6
+    assert look_up(image, x[:0], y[:0], nearest=nearest).shape == (0, *shape[2:])
+
+
+def test_a_hundred_thousand_points_are_projected(tmp_path):
+    images = scene_of(tmp_path, POSES[:1], LENS)
+    local = np.random.default_rng(0).uniform(-1, 1, (100_000, 3)) - [0, 0, 3]
+    at = project(images, 0, local @ POSES[0][:, :3].T + POSES[0][:, 3])
+    again = np.concatenate([project(images, 0, p @ POSES[0][:, :3].T + POSES[0][:, 3]) for p in np.split(local, 100)])
+    assert at.shape == (100_000, 2) and np.allclose(at, again, atol=1e-9)
 
 
 def true_depth(pose):

@@ -40,6 +40,16 @@ def slanted(pinhole, shape):
     return 0.5 + 0.2 * (x - pinhole[2]) / pinhole[0] + 0.1 * (y - pinhole[3]) / pinhole[1]
 
 
+def test_a_panorama_wider_than_sixteen_bits_count_gets_its_distances():
+    posed, shape = camera(), (HEIGHT, 50_000)
+    pinhole = posed.intrinsics[0]
+    inverse = slanted(pinhole, (HEIGHT, WIDTH)).astype(F32)
+    view = View(np.zeros((HEIGHT, WIDTH), np.uint8), pinhole, posed.camera_to_worlds[0], np.ones((HEIGHT, WIDTH), bool))
+    found = at_training_pixels(view, Depth(inverse, 0.01 * inverse), posed, 0, shape, shape)
+    same_size = at_training_pixels(view, Depth(inverse, 0.01 * inverse), posed, 0, (HEIGHT, WIDTH), (HEIGHT, WIDTH))
+    assert found[:, 312::625, 0] == pytest.approx(same_size[..., 0], rel=0.02)
+
+
 @pytest.mark.parametrize(("lens", "fisheye"), [((0, 0, 0, 0), False), ((0.1, -0.05, 0.002, -0.001), False),
                                                ((0.08, -0.03, 0.02, 0.01), True)])  # fmt: skip
 def test_a_training_pixel_gets_the_distance_of_what_it_shows(lens, fisheye):

@@ -192,3 +192,21 @@ def test_a_point_of_another_colour_in_the_other_image_is_no_point():
     points = find(dataset=Changed())
     with_first = (points.pixels[:, 0] == 0) | (points.other == 0)
     assert with_first.sum() < 0.04 * len(with_first) and len(with_first) > 1000
+
+
+def test_an_image_of_more_points_than_sixteen_bits_count():
+    """Photos of ordinary size: 11 of 1416 x 1064 came to more than 32,767 points an image."""
+    count = 100_000
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(1, WIDTH - 1, count), rng.uniform(1, HEIGHT - 1, count)
+    pose = POSES[1]
+    local = np.stack([(x - WIDTH / 2) / FOCAL, (HEIGHT / 2 - y) / FOCAL, -np.ones(count)], -1)
+    points = 2.5 * local @ pose[:, :3].T + pose[:, 3]
+    image = rng.integers(0, 255, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+    depth = np.zeros((HEIGHT, WIDTH, 2), np.float32)
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    depth[..., 0] = 0.4 / np.sqrt(((columns - WIDTH / 2) / FOCAL) ** 2 + ((HEIGHT / 2 - rows) / FOCAL) ** 2 + 1)
+    own = image[y.astype(int), x.astype(int)]
+    usable = np.ones((HEIGHT, WIDTH), np.uint8)
+    seen, colors = new_views._seen_by(posed(), 1, points, own, image, usable, depth)
+    assert np.array_equal(seen, np.arange(count)) and colors.shape == (count, 3)
