@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ast
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -17,6 +19,8 @@ COMMANDS = {
     "synthetic": {"utils"},
     "demo": set(METHOD) | {"synthetic"},
     "export": set(METHOD),
+    "functional": set(METHOD) | {"export"},
+    "": {"functional"},
     "bench": set(METHOD) | {"synthetic", "prepare", "demo", "export"},
     "scripts": set(METHOD) | {"export", "prepare", "synthetic", "demo", "bench", "placement"},
 }
@@ -74,9 +78,10 @@ def test_no_import_goes_in_a_circle():
         visit(name, ())
 
 
-@pytest.mark.parametrize("name", sorted(n for n in MODULES if wing(n) != "scripts"))
+@pytest.mark.parametrize("name", sorted(n for n in MODULES if wing(n) not in ("scripts", "")))
 def test_nothing_of_ours_is_imported_for_types_alone(name):
-    """Commands may: they answer --help before anything large is read."""
+    """Commands may: they answer --help before anything large is read. So may the root, which names the functional entry
+    to type checkers and imports it when it is first asked for."""
     tree = ast.parse(MODULES[name].read_text(encoding="utf-8"))
     for_types = [node for node in ast.walk(tree) if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test)]
     assert [each for block in for_types for node in ast.walk(block) for each in imported(node, name)] == []
@@ -90,5 +95,11 @@ def test_only_triton_is_imported_within_a_function(name):
     assert [each for each in inner if "triton" not in each] == []
 
 
-def test_the_root_holds_the_model_and_the_registered_methods_alone():
-    assert {path.name for path in ROOT.glob("*.py")} == {"__init__.py", "config.py", "model.py"}
+def test_the_root_holds_the_model_the_registered_methods_and_the_functional_entry_alone():
+    assert {path.name for path in ROOT.glob("*.py")} == {"__init__.py", "config.py", "functional.py", "model.py"}
+
+
+def test_importing_the_package_imports_nothing_large():
+    """Torch takes seconds: it is imported when a function is first asked for."""
+    code = "import sys, mmpi_ns; assert not {'torch', 'nerfstudio', 'numpy'} & set(sys.modules); mmpi_ns.render"
+    subprocess.run([sys.executable, "-c", code], check=True)

@@ -11,40 +11,49 @@ from statistics import fmean
 from typing import Any
 
 import torch
+import yaml
 from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.engine.trainer import TrainerConfig
+from nerfstudio.utils.eval_utils import eval_setup
 from torch import Tensor
-from yaml import YAMLError
 
 from mmpi_ns.export.files import BakedScene, Pose
 from mmpi_ns.export.frames import render_scene
-from mmpi_ns.model import MMPIModel
+from mmpi_ns.model import MMPIModel, MMPIModelConfig
 from mmpi_ns.ops.baked import march_baked
 from mmpi_ns.rendering.baked import BakedWindow
 from mmpi_ns.rendering.chunks import CPU_RAYS, render_in_chunks
 from mmpi_ns.rendering.metrics import ImageMetrics
 from mmpi_ns.scene.windows import window_shares
+from mmpi_ns.utils.errors import InputError, brief
 
 Say = Callable[[str], None]
 
 
-def load_model(load_config: Path) -> Any:
-    """The pipeline of a finished run, ready to render exactly.
+def read_run_config(path: Path) -> MMPIModelConfig:
+    """The model's settings in a run's config.yml.
 
     Raises:
-        ValueError: it was not trained by this method.
+        InputError: ns-train did not write it, or trained another method.
     """
-    from nerfstudio.utils.eval_utils import eval_setup
-
     try:
-        _, pipeline, _, _ = eval_setup(load_config, test_mode="test")
-    except (YAMLError, AssertionError) as error:
-        raise ValueError(
-            f"{load_config} is no config.yml that ns-train wrote: give the one beside the run's nerfstudio_models."
-        ) from error
-    if not isinstance(pipeline.model, MMPIModel):
-        raise ValueError(f"The run of {load_config} was trained by another method: only those of mmpi can be exported.")
+        config = yaml.load(path.read_text(encoding="utf-8"), Loader=yaml.Loader)
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise InputError(f"{path} is not a config.yml that ns-train wrote ({brief(error)}).") from error
+    if not isinstance(config, TrainerConfig):
+        raise InputError(f"{path} is not a config.yml that ns-train wrote: give the one beside nerfstudio_models.")
+    if not isinstance(config.pipeline.model, MMPIModelConfig):
+        raise InputError(f"The run of {path} was trained by another method: only those of mmpi can be read.")
+    return config.pipeline.model
+
+
+def load_model(load_config: Path) -> Any:
+    """The pipeline of a finished run, ready to render exactly. Raises InputError as ``read_run_config``."""
+    read_run_config(load_config)
+    _, pipeline, _, _ = eval_setup(load_config, test_mode="test")
+    assert isinstance(pipeline.model, MMPIModel)
     pipeline.model.config.render = "exact"  # the exact renderer is the reference
     return pipeline
 

@@ -1,0 +1,182 @@
+"""Trained scenes as functions: ``load`` a run or a baked scene, ``render`` images from any pinhole cameras.
+
+Neither needs the images of the capture, nor nerfstudio's classes at hand. README.md has an example.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from jaxtyping import Float, Int
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.scene_box import SceneBox
+from torch import Tensor
+
+from mmpi_ns.capture.rays import PinholeRays
+from mmpi_ns.export.bake import read_run_config
+from mmpi_ns.export.files import HEADER, BakedScene, read_baked
+from mmpi_ns.export.frames import render_scene
+from mmpi_ns.rendering.chunks import SHOWN_RAYS, render_in_chunks
+from mmpi_ns.scene.windows import WindowedPlan
+from mmpi_ns.training.checkpoints import checkpoints_in, read_checkpoint
+from mmpi_ns.utils.errors import InputError
+from mmpi_ns.utils.values import Number, check_number
+
+
+@dataclass(frozen=True, eq=False)
+class CameraPath:
+    """Cameras of the capture that a scene was trained on."""
+
+    camera_to_worlds: Float[Tensor, "N 3 4"]
+    """Camera axes are x right, y up, looking along -z; world axes and units are those of the scene."""
+    intrinsics: Float[Tensor, "N 3 3"]
+    """Pixels; pixel centres lie at halves."""
+    sizes: Int[Tensor, "N 2"]
+    """Width and height, pixels."""
+
+    def __len__(self) -> int:
+        return len(self.sizes)
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A trained scene, ready to render."""
+
+    mpis: tuple[str, ...]
+    """Names of the MPIs and cubes that ``Images.winning_mpi`` numbers."""
+    path: CameraPath
+    """Training cameras of a run; training and test cameras of a baked scene, in the order of the capture."""
+    device: torch.device
+    """Where images are rendered. Baked scenes are rendered on the CPU and their images moved here."""
+    _render: Callable[[Cameras], dict[str, Tensor]]
+    """Outputs [H, W, C] of one camera."""
+
+
+@dataclass(frozen=True, eq=False)
+class Images:
+    """Rendered images; the leading axes are those of the cameras."""
+
+    rgb: Float[Tensor, "*N H W 3"]
+    """Colours in [0, 1] over the scene's background."""
+    depth: Float[Tensor, "*N H W 1"]
+    """Median distance from the camera along the ray, scene units."""
+    accumulation: Float[Tensor, "*N H W 1"]
+    """Opacity of the scene along the ray, in [0, 1]."""
+    winning_mpi: Int[Tensor, "*N H W 1"]
+    """Number in ``Scene.mpis`` of the MPI with the largest weight on the ray."""
+
+
+def load(path: str | Path, device: str | torch.device | None = None) -> Scene:
+    """A trained scene, from a run of ns-train or from an export.
+
+    A run is rendered exactly, as ns-eval renders it, from its last checkpoint. It needs no images of the capture. A
+    baked scene takes about half of the time on a CPU and differs by 0.01 dB (docs/export.md).
+
+    Args:
+        path: a run's folder or its config.yml, or a folder written by ``mmpi-export bake`` or ``mmpi-export web``.
+        device: where images are rendered; by default a GPU if there is one.
+
+    Raises:
+        InputError: there is no scene, or its files are damaged (says which, and what to do).
+    """
+    path = Path(path)
+    device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+    folder = path.parent if path.is_file() else path
+    if (folder / HEADER).is_file():
+        return _load_baked(read_baked(folder), device)
+    if (folder / "config.yml").is_file():
+        return _load_run(folder / "config.yml", device)
+    raise InputError(
+        f"There is no scene at {path}: give the folder of a run (with config.yml), or one that mmpi-export bake or "
+        f"mmpi-export web wrote (with {HEADER})."
+    )
+
+
+def _load_run(config_path: Path, device: torch.device) -> Scene:
+    """The model of a run with its last checkpoint, without a data manager."""
+    config, folder = read_run_config(config_path), config_path.parent / "nerfstudio_models"
+    checkpoints = checkpoints_in(folder)
+    if not checkpoints:
+        raise InputError(f"There is no checkpoint in {folder} to load: train first, or put it back.")
+    state = read_checkpoint(checkpoints[max(checkpoints)])
+    cameras = state["capture"]["cameras"]
+    config.windows_folder, config.render = config_path.parent / "windows", "exact"
+    unbounded = SceneBox(torch.tensor([[-1.0] * 3, [1.0] * 3]))
+    model = config.setup(scene_box=unbounded, num_train_data=len(cameras), metadata={}, device=device).to(device)
+    tensors = {k.removeprefix("_model."): v for k, v in state["pipeline"].items() if k.startswith("_model.")}
+    model.load_state_dict(tensors)
+    model.eval()
+    fx, fy, cx, cy = cameras[:, 12:16].unbind(-1)
+    path = CameraPath(cameras[:, :12].view(-1, 3, 4), _intrinsics(fx, fy, cx, cy), cameras[:, 16:].long())
+    return Scene(model.progress.windows.names, path, device, model.get_outputs_for_camera)
+
+
+def _load_baked(baked: BakedScene, device: torch.device) -> Scene:
+    def render_image(camera: Cameras) -> dict[str, Tensor]:
+        rays = PinholeRays.of(camera, "cpu")
+        assert rays is not None
+        bundle = rays.image(int(camera.height), int(camera.width))
+        return render_in_chunks(
+            bundle, SHOWN_RAYS, bundle.origins.device, lambda part: render_scene(baked, part.origins, part.directions)
+        )
+
+    numbers = torch.tensor([(*pose.focal, *pose.center) for pose in baked.path])
+    poses, sizes = torch.tensor([pose.to_world for pose in baked.path]), torch.tensor([p.size for p in baked.path])
+    names = WindowedPlan(tuple(place for place, _ in baked.windows)).names
+    return Scene(names, CameraPath(poses, _intrinsics(*numbers.unbind(-1)), sizes), device, render_image)
+
+
+def _intrinsics(fx: Tensor, fy: Tensor, cx: Tensor, cy: Tensor) -> Float[Tensor, "N 3 3"]:
+    zero, one = torch.zeros_like(fx), torch.ones_like(fx)
+    return torch.stack([fx, zero, cx, zero, fy, cy, zero, zero, one], -1).view(-1, 3, 3)
+
+
+@torch.no_grad()
+def render(
+    scene: Scene,
+    camera_to_worlds: Float[Tensor, "*N 3 4"] | Float[Tensor, "*N 4 4"],
+    intrinsics: Float[Tensor, "*N 3 3"] | Float[Tensor, "3 3"],
+    width: int,
+    height: int,
+) -> Images:
+    """Images of a scene from pinhole cameras, without gradients.
+
+    Args:
+        scene: from ``load``.
+        camera_to_worlds: poses of the cameras: x right, y up, looking along -z; world axes and units of the scene,
+            which ``dataparser_transforms.json`` beside config.yml relates to those of the capture. [*N, 3 or 4, 4]
+        intrinsics: focal lengths and principal point in pixels, without skew; pixel centres lie at halves.
+            [*N, 3, 3], or [3, 3] for all cameras
+        width: of the images, pixels.
+        height: of the images, pixels.
+
+    Returns:
+        Images [*N, H, W, .] on the scene's device; [H, W, .] for one pose [3, 4].
+
+    Raises:
+        InputError: a shape or a number is wrong (says which).
+    """
+    for name, size in (("width", width), ("height", height)):
+        check_number(f"The {name} of images", size, Number(1, whole=True))
+    poses, lenses = (torch.as_tensor(x, dtype=torch.float32).cpu() for x in (camera_to_worlds, intrinsics))
+    if poses.shape[-2:] not in ((3, 4), (4, 4)) or not poses.numel():
+        raise InputError(f"camera_to_worlds must be [*N, 3, 4] or [*N, 4, 4], not {list(poses.shape)}.")
+    batch = poses.shape[:-2]
+    if lenses.shape not in ((3, 3), (*batch, 3, 3)):
+        raise InputError(f"intrinsics must be [3, 3] or {[*batch, 3, 3]}, not {list(lenses.shape)}.")
+    poses, lenses = poses.reshape(-1, *poses.shape[-2:])[:, :3], lenses.expand(*batch, 3, 3).reshape(-1, 3, 3)
+    if not bool(poses.isfinite().all() and lenses.isfinite().all()):
+        raise InputError("camera_to_worlds and intrinsics must be finite numbers.")
+    if bool((lenses[:, [0, 1], [0, 1]] <= 0).any()) or bool(lenses[:, [0, 1], [1, 0]].any()):
+        raise InputError("Focal lengths in intrinsics must be positive, and cameras are rendered without skew.")
+    fx, fy, cx, cy = (lenses[:, i, j, None] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    cameras = Cameras(poses, fx, fy, cx, cy, width, height)
+    outputs = [scene._render(cameras[i : i + 1].to(scene.device)) for i in range(len(poses))]
+    stacked = {
+        name: torch.stack([image[name] for image in outputs]).to(scene.device).view(*batch, height, width, -1)
+        for name in ("rgb", "depth", "accumulation", "winning_mpi")
+    }
+    return Images(stacked["rgb"], stacked["depth"], stacked["accumulation"], stacked["winning_mpi"].long())
