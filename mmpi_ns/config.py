@@ -21,7 +21,7 @@ from mmpi_ns.training.trainer import MMPITrainerConfig
 PAPER_DATA = {"keypoint_rays": 0, "dense_depth": False, "depth_images": False, "new_view_share": 0.0}
 """The paper trains on the colours of pixels alone."""
 POSE_RATE = 1e-4
-"""Learning rate of refined poses, radians and scene units: a tenth of nerfacto's (docs/experiments.md)."""
+"""Learning rate of refined poses, radians and scene units: a tenth of nerfacto's (docs/log/experiments.md)."""
 
 
 def _optimizers(colour: float) -> dict:

@@ -108,7 +108,7 @@ class MMPIModelConfig(ModelConfig):
     """Shading of samples: one colour network for all MPIs instead of one each."""
     feature_channels: int = 8
     """Channels of a texel besides its density: three of a colour, the others features for view-dependent appearance.
-    Eight are half a cache line, so a CPU trains faster with them than with nine (docs/performance.md)."""
+    Eight are half a cache line, so a CPU trains faster with them than with nine (docs/log/performance.md)."""
     hidden_width: int = 64
     """Width of the colour networks."""
     position_frequencies: int = 2

@@ -2,7 +2,7 @@
 
 Two kinds. *Views* are frusta of training cameras, some pulled back, some widened: seen from its own origin an MPI has
 no plane error and texels as fine as pixels. *Cubes* surround what the cameras look at from all round. (MPIs that face
-left, right, up or down at a camera were candidates too, and measured worse: docs/experiments.md.)
+left, right, up or down at a camera were candidates too, and measured worse: docs/log/experiments.md.)
 """
 
 from __future__ import annotations

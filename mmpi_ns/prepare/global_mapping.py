@@ -23,7 +23,7 @@ ROUNDS = 2
 """Times that a placed model is given all points and adjusted: after one, the focal length may still be far off."""
 TRACKS_PER_VIEW = 500
 """Tracks used for placing each image, the longest ones: using all of them takes twice as long on kitti-street and is no
-better (docs/prepare.md)."""
+better (docs/log/prepare.md)."""
 
 
 def map_globally(

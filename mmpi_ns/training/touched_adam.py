@@ -68,8 +68,8 @@ class TouchedAdam(torch.optim.Optimizer):
 
 
 def _no_moments(param: Tensor, of_rows: bool) -> Float[Tensor, "N 2 *C"]:
-    """Zeros, mean and uncentred variance. Those of a table's rows are in bfloat16 (docs/performance.md has what that
-    costs), and take no memory on a CPU until they are written to: most rows may never be."""
+    """Zeros, mean and uncentred variance. Those of a table's rows are in bfloat16 (docs/log/performance.md has
+    what that costs), and take no memory on a CPU until they are written to: most rows may never be."""
     rounds = of_rows and param.dtype == torch.float32
     dtype = torch.bfloat16 if rounds else param.dtype
     return lazy_zeros((len(param), 2, *param.shape[1:]), dtype, param.device)
