@@ -268,22 +268,28 @@ class MMPIModel(Model):
         cube = 0.1 * self.config.cube_alpha if self.field.cube is not None else float("inf")
         return {"threshold": min(self.config.train_threshold, cube), "fair_share": FAIR_SHARE}
 
-    def image_outputs(self, bundle: RayBundle) -> dict[str, Tensor]:
-        """rgb, accumulation, depth, winning MPI and dropped mass, of the windows that the rays start in."""
+    def image_outputs(self, bundle: RayBundle, chunk: int | None = None) -> dict[str, Tensor]:
+        """rgb, accumulation, depth, winning MPI and dropped mass [R, .] of rays, from the windows that they start in.
+
+        Args:
+            bundle: the rays [R].
+            chunk: rays that one window renders at once; None: all.
+        """
         windows, trained = self.progress.windows, self.progress.window
         chosen = windows.find(self.show.value)  # by the viewer
-        if len(windows) == 1:
-            return self.window_outputs(0, self.field, bundle, chosen)
-
-        there = self.run.windows_there()
+        there = self.run.windows_there() if len(windows) > 1 else [0]
 
         def render(place: int, rays: RayBundle) -> dict[str, Tensor]:
             window = there[place]
             field = self.field if window == trained else self.store.load(window, self.device)
-            return self.window_outputs(window, field, rays, chosen)
+            outputs = lambda part: self.window_outputs(window, field, part, chosen)  # noqa: E731
+            return outputs(rays) if chunk is None else render_in_chunks(rays, chunk, self.device, outputs)
 
+        if len(windows) == 1:
+            return render(0, bundle)
         shown = there.index(chosen[0]) if chosen is not None and chosen[0] in there else None
-        return render_windows(bundle, tuple(windows.windows[w] for w in there), render, shown)
+        in_memory = [i for i, window in enumerate(there) if window in (trained, *self.store.in_memory)]
+        return render_windows(bundle, tuple(windows.windows[w] for w in there), render, shown, in_memory)
 
     def window_outputs(
         self, window: int, field: MMPIField, bundle: RayBundle, chosen: tuple[int, int] | None = None
@@ -346,8 +352,9 @@ class MMPIModel(Model):
 
     @torch.no_grad()
     def get_outputs_for_camera_ray_bundle(self, camera_ray_bundle: RayBundle) -> dict[str, Tensor]:
-        """Renders an image, as many rays at once as asked for or as suit the device."""
-        return render_in_chunks(camera_ray_bundle, self.chunk_size, self.device, self.image_outputs)
+        """Renders an image: window by window, each as many rays at once as asked for or as suit the device."""
+        outputs = self.image_outputs(camera_ray_bundle.flatten(), self.chunk_size)
+        return {name: values.view(*camera_ray_bundle.shape, -1) for name, values in outputs.items()}
 
     @property
     def chunk_size(self) -> int:

@@ -60,7 +60,7 @@ def check_crop(box: OrientedBox | None) -> None:
 def render_in_chunks(
     bundle: RayBundle, size: int, device: torch.device, render: Callable[[RayBundle], dict[str, Tensor]]
 ) -> dict[str, Tensor]:
-    """Outputs [H, W, C] of an image's rays [H, W], rendered ``size`` at a time, on the device of the rays.
+    """Outputs [*N, C] of rays [*N], rendered ``size`` at a time, on the device of the rays.
 
     nerfstudio's own loop reads the size from the config, which threads share.
 
@@ -71,8 +71,8 @@ def render_in_chunks(
         render: outputs [R, C] of some of the rays.
     """
     parts: dict[str, list[Tensor]] = defaultdict(list)
-    for start in range(0, len(bundle), size):
-        chunk = bundle.get_row_major_sliced_ray_bundle(start, start + size).to(device)
-        for name, values in render(chunk).items():
+    rays = bundle.flatten()
+    for start in range(0, len(rays), size):
+        for name, values in render(rays[start : start + size].to(device)).items():
             parts[name].append(values.to(bundle.origins.device))
-    return {name: torch.cat(values).view(*bundle.origins.shape[:2], -1) for name, values in parts.items()}
+    return {name: torch.cat(values).view(*bundle.shape, -1) for name, values in parts.items()}

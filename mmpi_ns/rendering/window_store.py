@@ -47,6 +47,12 @@ class WindowStore:
         assert self.folder is not None, "several windows need a folder"
         return self.folder / f"window-{window:05d}.pt"
 
+    @property
+    def in_memory(self) -> tuple[int, ...]:
+        """Windows that can be rendered without reading a file, the most recently used last."""
+        with Uninterrupted(), self._lock:
+            return tuple(self._held)
+
     def forget(self, window: int) -> None:
         """Ignores the file from now on: the window is about to be trained and will be written again."""
         with Uninterrupted(), self._lock:

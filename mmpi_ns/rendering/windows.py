@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 
 import torch
 from jaxtyping import Float, Int
@@ -17,20 +17,23 @@ def render_windows(
     windows: tuple[Window, ...],
     render: Callable[[int, RayBundle], dict[str, Tensor]],
     shown: int | None = None,
+    in_memory: Collection[int] = (),
 ) -> dict[str, Tensor]:
-    """Renders rays by all windows that they start in.
+    """Outputs of rays from all windows that they start in, one window after the other.
 
     Args:
-        bundle: rays.
+        bundle: rays [R].
         windows: those that are trained.
-        render: renders some rays by one window, given its index.
+        render: outputs of some rays from one window, given its index. Called once for each window, so that a window is
+            read from disk once at most, however many rays there are.
         shown: index of the window that renders all rays; None: those that they start in.
+        in_memory: windows to render first, before the reading of another one evicts them.
     """
     shares = window_shares(bundle.origins, windows)
     if shown is not None:
         shares = torch.zeros_like(shares).index_fill_(1, torch.tensor([shown], device=shares.device), 1.0)
     parts = {}
-    for w in (shares > 0).any(0).nonzero()[:, 0].tolist():
+    for w in sorted((shares > 0).any(0).nonzero()[:, 0].tolist(), key=lambda w: w not in in_memory):
         rays = (shares[:, w] > 0).nonzero()[:, 0]
         parts[w] = rays, render(w, bundle[rays])
     return mix_windows(shares, parts)
@@ -47,7 +50,7 @@ def mix_windows(
     """
     mixed: dict[str, Tensor] = {}
     most = shares.argmax(-1)
-    for w, (rays, outputs) in parts.items():
+    for w, (rays, outputs) in sorted(parts.items()):  # sums do not depend on the order of rendering
         own = (most[rays] == w)[:, None]
         for name, values in outputs.items():
             whole = mixed.setdefault(name, values.new_zeros(len(shares), *values.shape[1:]))

@@ -214,8 +214,9 @@ def test_pictures_do_not_depend_on_the_chunk_size(model, camera, monkeypatch, th
 def test_chunks_have_the_size_that_suits_the_device_unless_another_is_asked_for(model, camera, monkeypatch):
     sizes = []
     monkeypatch.setattr(mmpi_model, "rays_per_chunk", lambda *_: 100)
+    render = model.window_outputs
     monkeypatch.setattr(
-        model, "image_outputs", lambda bundle, get=model.image_outputs: sizes.append(len(bundle)) or get(bundle)
+        model, "window_outputs", lambda w, field, rays, *more: sizes.append(len(rays)) or render(w, field, rays, *more)
     )
     for asked, expected in ((0, 100), (17, 17)):
         sizes.clear()

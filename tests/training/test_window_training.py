@@ -6,6 +6,7 @@ import os
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -274,6 +275,40 @@ def test_the_bricks_of_a_held_window_take_room_too(whole, tmp_path):
             assert model.baked(field).mpis.nbytes > 0.1 * size
         store.load(1, model.device)
         assert list(store._held) == expected
+
+
+def test_an_image_between_two_windows_reads_each_from_disk_once(scene, windows_file, tmp_path, monkeypatch):
+    """With room for one window alone, chunk after chunk; the next image begins with the one that is in memory."""
+    plan = WindowedPlan.load(windows_file)
+    first, second = plan.windows
+    last = replace(second, center=tuple((1.5 * np.array(second.center) - 0.5 * np.array(first.center)).tolist()))
+    (tmp_path / "plan.json").write_text(WindowedPlan((first, second, last)).to_json())
+    trainer = ready(trainer_config(scene, tmp_path / "plan.json", tmp_path, 2, training="joint"))
+    trainer.train()
+    model = trainer.pipeline.model.eval()
+    assert model.progress.window == 2
+    camera = trainer.pipeline.datamanager.eval_dataset.cameras[:1]
+    middle = torch.tensor([first.center, second.center]).mean(0)
+    camera.camera_to_worlds[0, :, 3] = middle
+    assert (window_shares(middle[None], plan.windows) > 0.1).all()
+
+    def read_windows(budget, chunk, monkeypatch, images=1):
+        reads, read = [], WindowStore._read
+        model.store = WindowStore(trainer.base_dir / "windows", model._new_field, budget)
+        monkeypatch.setattr(WindowStore, "_read", lambda store, window: reads.append(window) or read(store, window))
+        monkeypatch.setattr(model.config, "eval_num_rays_per_chunk", chunk)
+        outputs = [model.get_outputs_for_camera(camera) for _ in range(images)]
+        monkeypatch.setattr(WindowStore, "_read", read)
+        return reads, outputs[-1]
+
+    reads, whole = read_windows(0.0, 10_000, monkeypatch)
+    assert sorted(reads) == [0, 1]
+    reads, chunks = read_windows(0.0, 100, monkeypatch)
+    assert sorted(reads) == [0, 1]
+    assert all(torch.allclose(whole[name], chunks[name], atol=1e-5) for name in ("rgb", "accumulation"))
+    reads, again = read_windows(0.0, 100, monkeypatch, images=3)
+    assert len(reads) == 4 and torch.equal(again["rgb"], chunks["rgb"])
+    assert len(read_windows(float("inf"), 100, monkeypatch, images=3)[0]) == 2
 
 
 def test_windows_in_half_precision_take_half_of_the_disk_and_are_read_as_they_were_rounded(
