@@ -149,7 +149,7 @@ def test_keys_choose_what_is_shown(opened):
     pictures.append(max(alone, key=lambda p: np.abs(p - colors).mean()))  # one may be all that is seen
     assert all(np.abs(p - colors).mean() > 0.01 for p in pictures)
     opened.evaluate("mmpi.press('m')")
-    assert opened.evaluate("mmpi.alone") == -1
+    assert opened.evaluate("mmpi.alone") is None
     assert np.array_equal(shown(opened, 1), colors)
 
 
@@ -164,16 +164,27 @@ def test_the_console_stays_empty(opened):
     assert opened.messages == []
 
 
+NEEDED_LAST = """(() => {
+    const at = (eye) => windowShares(mmpi.header.windows, eye), { eye, axes } = mmpi.camera;
+    const ahead = at(add(eye, axes[2], -mmpi.speed)), needed = at(eye).map((s, w) => s > 0 || ahead[w] > 0);
+    const kept = [...mmpi.windows.keys()], count = needed.filter(Boolean).length;
+    return kept.slice(kept.length - count).every((w) => needed[w]);
+})()"""
+"""Whether the windows that the camera needs would be freed last."""
+
+
 def at_its_place(window, x):
     """The window with its MPIs so far along, and a camera that looks into the first of them."""
-    mpis = tuple(replace(m, origin=(x, 0.1 * k, 0.0)) for k, m in enumerate(window.mpis.mpis))
+    mpis = tuple(
+        replace(m, origin=(x, 0.1 * k, 0.0), name=f"{m.name} at {x:g}") for k, m in enumerate(window.mpis.mpis)
+    )
     moved = replace(window, mpis=replace(window.mpis, mpis=mpis, packed={}))
     return moved, scene_of(moved).path[0]
 
 
 def test_a_long_capture_keeps_few_windows(tab, tmp_path):
     """Windows are fetched as the camera comes, let go behind it, and fetched again; all the way they are shown as by
-    us, and mixed where two meet."""
+    us, and mixed where two meet. Those that were needed last stay; key M names MPIs of the window one is in."""
     places = [4.0 * i + 1.9 * (i % 2) for i in range(8)]  # the middle of each ball of radius 1.9, or its border
     windows, path = zip(*(at_its_place(smooth_window(10 + i, planes=24), x) for i, x in enumerate(places)), strict=True)
     scene = replace(scene_of(*windows, radius=1.9), path=list(path))
@@ -184,13 +195,18 @@ def test_a_long_capture_keeps_few_windows(tab, tmp_path):
         assert tab.open(f"{address}/index.html") == "ready"
         assert tab.evaluate("mmpi.windows.size") < 3
         tab.evaluate("window.first = mmpi.windows.get(0).textures")
-        for number in [*range(len(windows)), 0]:
-            tab.evaluate(f"mmpi.camera = structuredClone(mmpi.path[{number}]); mmpi.feed()")
+        for number in [0, 1, 2, 1, *range(2, len(windows)), 0]:
+            tab.evaluate(f"mmpi.camera = structuredClone(mmpi.path[{number}]); mmpi.touched(); mmpi.feed()")
+            assert tab.evaluate("mmpi.alone") is None, "another window's MPI was shown alone"
+            assert tab.evaluate(NEEDED_LAST)
             shares = window_shares(torch.tensor(path[number].to_world)[None, :, 3], tuple(w for w, _ in scene.windows))
             for w in shares[0].nonzero()[:, 0].tolist():
                 tab.until(f"mmpi.windows.get({w})")
             assert tab.evaluate("mmpi.windows.size") <= 4
             assert ours(tmp_path, path[number]).std() > 0.01 and -10 * np.log10(difference(number)) > CLOSE - 4
+            tab.evaluate("mmpi.press('m')")
+            named = windows[int(shares[0].argmax())].mpis.mpis[0].name
+            assert tab.evaluate("document.getElementById('status').textContent") == f"MPI '{named}' alone"
             if number == len(windows) - 1:
                 assert not tab.evaluate("window.first.some((t) => mmpi.gl.isTexture(t)) || mmpi.windows.has(0)")
     assert tab.messages == []

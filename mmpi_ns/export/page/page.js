@@ -8,6 +8,7 @@ const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a
 const unit = (a) => a.map((x) => x / Math.hypot(...a));
 const WHILE_MOVING = 1 / 40, AT_REST = 1; // seconds that a frame may take
 const LEAST_SCALE = 0.1;
+const MOST_WINDOWS = 4; // on the card at once, unless the camera needs more
 
 function rotated(v, axis, angle) {
   const c = Math.cos(angle), s = Math.sin(angle), k = cross(axis, v);
@@ -28,10 +29,11 @@ function between(a, b, t) {
 
 class Page {
   constructor(gl, header, source) {
-    Object.assign(this, { gl, header, source, mode: 0, alone: -1, playing: null, moved: 0, dirty: true });
+    Object.assign(this, { gl, header, source, mode: 0, alone: null, playing: null, moved: 0, dirty: true });
+    // `alone` is {window, head} of the one MPI to show, or null for all of them.
     this.cost = 1e-5; // seconds a pixel, as the last frame took
     this.keys = new Set();
-    this.windows = new Map(); // on the card, by number; null while it is on its way
+    this.windows = new Map(); // on the card, by number, least recently needed first; null while it is on its way
     this.path = header.path.map(cameraOf);
     const training = header.path.findIndex((pose) => !pose.test);
     this.start = structuredClone(this.path[Math.max(training, 0)]);
@@ -41,12 +43,17 @@ class Page {
     this.speed = Math.max(4 * (steps.sort((a, b) => a - b)[steps.length >> 1] || 0), near / 4); // a second
   }
 
-  // Fetches the windows that the camera asks, and lets the others go but the two that were asked last.
+  // Fetches the windows that the camera needs, and frees the least recently needed others beyond MOST_WINDOWS.
   async feed() {
     const shares = windowShares(this.header.windows, this.camera.eye);
     const ahead = windowShares(this.header.windows, add(this.camera.eye, this.camera.axes[2], -this.speed));
     for (let w = 0; w < shares.length; w++) {
-      if ((shares[w] > 0 || ahead[w] > 0) && !this.windows.has(w)) {
+      if (shares[w] <= 0 && ahead[w] <= 0) continue;
+      if (this.windows.has(w)) {
+        const window = this.windows.get(w);
+        this.windows.delete(w);
+        this.windows.set(w, window);
+      } else {
         this.windows.set(w, null);
         try {
           const row = this.header.windows[w];
@@ -61,7 +68,7 @@ class Page {
       }
     }
     for (const [w, window] of this.windows)
-      if (window && this.windows.size > 4 && shares[w] === 0 && ahead[w] === 0) {
+      if (window && this.windows.size > MOST_WINDOWS && shares[w] === 0 && ahead[w] === 0) {
         window.free();
         this.windows.delete(w);
       }
@@ -74,7 +81,6 @@ class Page {
     const cover = Math.max(width / camera.size[0], height / camera.size[1]);
     const lens = [camera.focal[0] * cover, camera.focal[1] * cover,
       width / 2 + (camera.center[0] - camera.size[0] / 2) * cover, height / 2 + (camera.center[1] - camera.size[1] / 2) * cover];
-    const view = { eye: camera.eye, turn: camera.axes.flat(), lens, height, mode: this.mode, alone: this.alone };
     gl.viewport(0, 0, width, height);
     gl.clearColor(0, 0, 0, 1);
     gl.clear(gl.COLOR_BUFFER_BIT);
@@ -83,8 +89,10 @@ class Page {
     let shares = windowShares(this.header.windows, camera.eye).map((s, w) => (this.windows.get(w) ? s : 0));
     const total = shares.reduce((a, b) => a + b, 0);
     const most = shares.indexOf(Math.max(...shares));
+    const alone = this.alone && this.alone.window === most ? this.alone.head : -1;
+    const view = { eye: camera.eye, turn: camera.axes.flat(), lens, height, mode: this.mode, alone };
     shares.forEach((share, w) => {
-      const part = this.mode ? Number(w === most) : share / total;
+      const part = this.mode || alone >= 0 ? Number(w === most) : share / total;
       if (share > 0 && part > 0) this.windows.get(w).draw(view, part);
     });
   }
@@ -152,18 +160,40 @@ class Page {
   touched() {
     this.moved = performance.now();
     this.dirty = true;
+    this.checkAlone();
+  }
+
+  // One MPI is shown alone for as long as the camera stays in its window.
+  checkAlone() {
+    if (!this.alone || this.alone.window === this.nearest()) return;
+    this.alone = null;
+    this.describe();
+  }
+
+  // The window with the largest share where the camera stands.
+  nearest() {
+    const shares = windowShares(this.header.windows, this.camera.eye);
+    return shares.indexOf(Math.max(...shares));
+  }
+
+  describe() {
+    const shows = ["", "depth", "winning MPI"][this.mode];
+    const name = this.alone && this.header.windows[this.alone.window].mpis[this.alone.head].name;
+    report([shows, name ? `MPI '${name}' alone` : ""].filter(Boolean).join(", "));
   }
 
   press(key) {
-    const heads = this.header.windows[0].mpis;
     if (key === "p" || key === " ") this.playing = this.playing === null ? 0 : null;
     else if (key === "r") { this.playing = null; this.camera = structuredClone(this.start); }
     else if (key === "1" || key === "2" || key === "3") this.mode = Number(key) - 1;
-    else if (key === "m") this.alone = this.alone + 1 >= heads.length ? -1 : this.alone + 1;
+    else if (key === "m") {
+      const window = this.nearest(), head = this.alone ? this.alone.head + 1 : 0;
+      this.alone = head < this.header.windows[window].mpis.length ? { window, head } : null;
+    }
     else if (key === "h") $("help").hidden = !$("help").hidden;
     else return;
-    const shows = ["", "depth", "winning MPI"][this.mode];
-    report([shows, this.alone >= 0 ? `MPI '${heads[this.alone].name}' alone` : ""].filter(Boolean).join(", "));
+    this.checkAlone();
+    this.describe();
     this.dirty = true;
   }
 }
