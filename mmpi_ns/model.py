@@ -19,11 +19,9 @@ from torch.nn import Parameter
 
 from mmpi_ns.capture.datamanager import OBSERVATIONS, RAYS_PER_STEP, TRAINING_VIEWS
 from mmpi_ns.capture.rays import PinholeRays
-from mmpi_ns.field.baking import baked_shares
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.shading import Shading
 from mmpi_ns.ops import dispatch
-from mmpi_ns.ops.blending import BlendForm
 from mmpi_ns.ops.march.reference import most_kept
 from mmpi_ns.placement.rule import PlacementConfig
 from mmpi_ns.placement.split import place_windows
@@ -100,8 +98,6 @@ class MMPIModelConfig(ModelConfig):
     rays_per_mpi: Literal["split", "all"] = "all"
     """Individual phase: each MPI renders all rays of a batch (all; K times the work, about that of joint training), or
     the MPIs share them (split)."""
-    blend_form: BlendForm = "paper"
-    """Form of blending by reliability: P alpha (paper) or 1 - (1 - alpha)^P (opacity)."""
     shading: Shading = "ray"
     """Evaluate the colour network once a ray, after compositing (ray), or for every sample as in the paper (sample)."""
     shared_colour: bool = False
@@ -130,9 +126,6 @@ class MMPIModelConfig(ModelConfig):
     """Render the field itself (exact), or 8-bit texels baked from it before the first image (baked: half of the time on
     a CPU, 0.01 dB less; docs/export.md). auto: baked for ns-render and ns-viewer on a CPU if the model can be baked;
     exact during training, in ns-eval and on a GPU."""
-    render_shares: Literal["exact", "baked"] = "exact"
-    """After two-phase training: compute a sample's share from the reliabilities of all MPIs that cover it (exact), or
-    interpolate shares baked into its texels (baked: faster by the number of overlapping MPIs, nearly the same)."""
     background: Literal["black", "gray", "white"] = "gray"
     """Background when rendering. Training uses random colours where the MPIs cover the whole ray."""
     loss: LossWeights = field(default_factory=LossWeights)
@@ -250,9 +243,9 @@ class MMPIModel(Model):
         if progress.phase.name == "individual":
             g = generator(self.config.seed, progress.step, "assignment", self.device)
             bundle, head_mask, choose = individual_rays(bundle, field.plan, self.config.rays_per_mpi, g)
-        form = self.blend_form(field) if progress.schedule.blends_at(progress.step) else None
+        blends = progress.schedule.blends_at(progress.step) and self.blends(field)
         sampling = {"head_mask": head_mask, "choose": choose, **self.training_bounds()}
-        rays = render_rays(self.sampler, bundle, field, form=form, **sampling)
+        rays = render_rays(self.sampler, bundle, field, blends=blends, **sampling)
         rays = replace(rays, times=len(bundle) // asked)
         if rays.lookup is not None and progress.schedule.watches(progress.step):
             field.note_use(rays.lookup, rays.composite.weights, rays.report.live)
@@ -306,14 +299,12 @@ class MMPIModel(Model):
             behind = background_of(self.config.background, bundle.origins)
             outputs = self.baked(field).outputs(bounded(bundle, field.plan), behind)
             return outputs | {"winning_mpi": outputs["winning_mpi"] + self.progress.windows.first_head(window)}
-        form, head_mask, shares = self.blend_form(field), None, None
+        blends, head_mask = self.blends(field), None
         if chosen is not None:
             head = chosen[1] if chosen[0] == window else -1
             head_mask = (torch.arange(field.plan.num_heads, device=self.device) == head).expand(len(bundle), -1)
-            form = None
-        if form is not None and self.config.render_shares == "baked" and not torch.is_grad_enabled():
-            shares = baked_shares(field)
-        how = {"form": form, "threshold": self.config.render_threshold, "head_mask": head_mask, "shares": shares}
+            blends = False
+        how = {"blends": blends, "threshold": self.config.render_threshold, "head_mask": head_mask}
         once = field.shading == "ray" and not torch.is_grad_enabled()
         outputs = (shown_outputs if once else sampled_outputs)(bounded(bundle, field.plan), field, **how)
         rgb = outputs["rgb"] + outputs.pop("transmittance") * background_of(self.config.background, outputs["rgb"])
@@ -332,13 +323,13 @@ class MMPIModel(Model):
         def make() -> BakedWindow:
             say("Baking, once: a few seconds.")
             background = BACKGROUNDS[self.config.background]
-            return bake(field, self.config.render_threshold, background, self.blend_form(field))
+            return bake(field, self.config.render_threshold, background, self.blends(field))
 
         return field.cached("baked", make)
 
-    def blend_form(self, field: MMPIField) -> BlendForm | None:
-        """How reliability enters a field's pictures; None where it takes no part."""
-        return None if self.config.training == "joint" or field.plan.num_heads == 1 else self.config.blend_form
+    def blends(self, field: MMPIField) -> bool:
+        """Whether reliability enters a field's pictures."""
+        return self.config.training != "joint" and field.plan.num_heads > 1
 
     # Images ------------------------------------------------------------------------------------------------------
 
@@ -362,7 +353,7 @@ class MMPIModel(Model):
         if self.config.eval_num_rays_per_chunk:
             return self.config.eval_num_rays_per_chunk
         most = max(plan.samples_per_ray for plan in self.progress.windows.plans)
-        one_pass = shows_in_one_pass(self.field, self.blend_form(self.field))
+        one_pass = shows_in_one_pass(self.field)
         return rays_per_chunk(most, self.device, most_kept(most, self.config.render_threshold) if one_pass else None)
 
     def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:

@@ -42,12 +42,12 @@ def test_wrong_kernels_are_found(monkeypatch):
     assert all(c.ok for c in gpu_checks.interpolation("cpu", 50))
     wrong = {
         "sum_rows": lambda _, values, w, count: torch.zeros(count, values.shape[1]),
-        "march": lambda *given: march(*given[:-1], given[-1]._replace(form=None)),  # without blending
+        "march": lambda *given: march(*given[:-1], given[-1]._replace(blends=False)),  # without blending
     }
     right, march = dispatch.function, dispatch.function("march", "gpu")
     monkeypatch.setattr(
         dispatch, "function", lambda name, form: wrong[name] if form == "gpu" and name in wrong else right(name, form)
     )
     assert [c.ok for c in gpu_checks.interpolation("cpu", 50)] == [True, False]
-    s = random_scene(2, 4, "paper").clear()
+    s = random_scene(2, 4, True).clear()
     assert len(s.bundle) >= 2 and not all(c.ok for c in gpu_checks.marched(s, "wrong", s.exact()))

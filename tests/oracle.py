@@ -183,11 +183,9 @@ def log_shares(reliability, cover, own):
     return float(_DIGITS.ln(share)), -math.inf if rest == 0 else float(_DIGITS.ln(rest))
 
 
-def blended_depth(tau, reliability, cover, own, form="paper"):
-    """-log(1 - alpha') with alpha' = P alpha (paper) or 1 - (1 - alpha)^P (opacity)."""
+def blended_depth(tau, reliability, cover, own):
+    """-log(1 - alpha') with alpha' = P alpha."""
     share, rest = _share(reliability, cover, own)
-    if form == "opacity":
-        return float(_DIGITS.multiply(share, Decimal(float(tau))))
     passes = _DIGITS.add(rest, _DIGITS.multiply(share, _DIGITS.exp(Decimal(-float(tau)))))
     return float(_DIGITS.minus(_DIGITS.ln(passes)))
 
@@ -251,16 +249,13 @@ class RenderedRay:
     median_inverse_distance: float
 
 
-def render_ray(samples_by_head, form="paper"):
-    """Merges the samples of all heads by distance, blends each by reliability, and composites front to back.
+def render_ray(samples_by_head, blends=True):
+    """Merges the samples of all heads by distance, blends each by reliability if asked, and composites front to back.
 
-    ``form`` is "paper", "opacity" or None (no blending). Equal distances are met in the order (head, plane).
+    Equal distances are met in the order (head, plane).
     """
     samples = sorted((s for head in samples_by_head for s in head), key=lambda s: (-s.inverse_t, s.head, s.plane))
-    if form is None:
-        taus = [s.tau for s in samples]
-    else:
-        taus = [blended_depth(s.tau, s.reliability, s.cover, s.head, form) for s in samples]
+    taus = [blended_depth(s.tau, s.reliability, s.cover, s.head) if blends else s.tau for s in samples]
     gathered = composite(taus)
     color = np.zeros(3)
     for weight, sample in zip(gathered.weights, samples, strict=True):

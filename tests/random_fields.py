@@ -73,13 +73,13 @@ class Rendered:
 
 
 @torch.no_grad()
-def render(field, rays, threshold=0.0, blend_form=None, **chosen):
+def render(field, rays, threshold=0.0, blends=False, **chosen):
     """Sampler, field and compositing, put together as the model does."""
-    samples, report = MMPISampler()(rays, field=field, threshold=threshold, blend_form=blend_form, **chosen)
+    samples, report = MMPISampler()(rays, field=field, threshold=threshold, blends=blends, **chosen)
     tau, lookup = field.get_density(samples)
     tau = tau[..., 0]
-    if blend_form is not None and lookup.index.numel():
-        flat = blended_optical_depth(tau.reshape(-1)[lookup.index], *field.sample_shares(samples, lookup), blend_form)
+    if blends and lookup.index.numel():
+        flat = blended_optical_depth(tau.reshape(-1)[lookup.index], *field.sample_shares(samples, lookup))
         tau = tau.new_zeros(tau.numel()).index_put((lookup.index,), flat).view(tau.shape)
     meta = samples.metadata
     composite = composite_weights(
@@ -191,9 +191,9 @@ class OracleRay:
         value = oracle.trilinear(_table(self.field, self.field.reliability, j), np.clip(ndc, -1, 1))[0]
         return value, own or bool(touched[tuple(position)])
 
-    def render(self, form=None, heads=None):
+    def render(self, blends=False, heads=None):
         chosen = self.heads if heads is None else [s if k in heads else [] for k, s in enumerate(self.heads)]
-        return oracle.render_ray(chosen, form)
+        return oracle.render_ray(chosen, blends)
 
 
 ERROR = 3e-5
@@ -202,15 +202,15 @@ CLEAR = 2e-5
 """Rays on which any decision is closer than this may differ in float32 and are left out."""
 
 
-def compare(field, origins, directions, form=None, heads_of=None, near=0.05, far=math.inf, error=ERROR, **chosen):
+def compare(field, origins, directions, blends=False, heads_of=None, near=0.05, far=math.inf, error=ERROR, **chosen):
     """Renders all rays at once and each by the oracle; returns the number of clear rays that met something."""
-    found = render(field, bundle(origins, directions, near, far), blend_form=form, **chosen)
+    found = render(field, bundle(origins, directions, near, far), blends=blends, **chosen)
     met = 0
     for i in range(len(origins)):
         ray = OracleRay(field, origins[i], directions[i], near, far)
         if ray.margin < CLEAR:
             continue
-        wanted = ray.render(form, heads_of(i, ray) if heads_of else None)
+        wanted = ray.render(blends, heads_of(i, ray) if heads_of else None)
         count = len(wanted.samples)
         assert found.report.live[i] == count
         valid = found.samples.metadata["valid"][i, :, 0]

@@ -14,12 +14,10 @@ from mmpi_ns.ops.show import show_rays
 from mmpi_ns.rendering.sampler import crossings
 
 
-def shown(field, rays, threshold=0.0, form=None, shares=None, **chosen):
+def shown(field, rays, threshold=0.0, blends=False, **chosen):
     """What rays show, whatever heads may answer them."""
-    options = MarchOptions(threshold, form=form, baked=shares is not None)
-    return show_rays(
-        field.layout, field.tables(shares), field.features.data, crossings(rays, field, **chosen), options
-    )  # fmt: skip
+    options = MarchOptions(threshold, blends=blends)
+    return show_rays(field.layout, field.tables, field.features.data, crossings(rays, field, **chosen), options)
 
 
 def compare(field, rays, *how, error=3e-5, **chosen):
@@ -36,15 +34,15 @@ def compare(field, rays, *how, error=3e-5, **chosen):
     return wanted
 
 
-def as_float64_says(field, count, form="paper"):
+def as_float64_says(field, count, blends=True):
     """Checks rays that no decision is close on; returns how many those are."""
     origins, directions = random_rays(field.plan, count, seed=6)
-    found, checked = shown(field, bundle(origins, directions), 0.0, form), 0
+    found, checked = shown(field, bundle(origins, directions), 0.0, blends), 0
     for i in range(count):
         ray = OracleRay(field, origins[i], directions[i])
         if ray.margin < 1e-5:
             continue
-        wanted, gathered, masses, checked = ray.render(form), np.zeros(5), np.zeros(len(field.grids)), checked + 1
+        wanted, gathered, masses, checked = ray.render(blends), np.zeros(5), np.zeros(len(field.grids)), checked + 1
         for weight, sample in zip(wanted.weights, wanted.samples, strict=True):
             ndc = _places(field.plan, origins[i], directions[i], sample.inverse_t)[sample.head]
             table = _table(field, field.features, sample.head)

@@ -15,7 +15,6 @@ from torch import Tensor
 from mmpi_ns.bench.trainings import evenly
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.samples import metadata_of
-from mmpi_ns.ops.blending import BlendForm
 from mmpi_ns.rendering.render import render_rays
 from mmpi_ns.rendering.rendered import RenderedRays
 from mmpi_ns.rendering.sampler import MMPISampler
@@ -50,10 +49,10 @@ def in_float64(bundle: RayBundle) -> RayBundle:
 
 
 def render(
-    field: MMPIField, rays: RayBundle, threshold: float = 0.0, form: BlendForm | None = None, **sampling: Any
+    field: MMPIField, rays: RayBundle, threshold: float = 0.0, blends: bool = False, **sampling: Any
 ) -> RenderedRays:
     """Rays without background; with gradients, or as images are rendered where none are wanted."""
-    return render_rays(MMPISampler(), rays, field, form=form, threshold=threshold, **sampling)
+    return render_rays(MMPISampler(), rays, field, blends=blends, threshold=threshold, **sampling)
 
 
 def of_slots(found: RenderedRays, name: str) -> Tensor:

@@ -8,7 +8,6 @@ DRIVE = (P + "arrangement", "drive")
 BY_HAND = (*DRIVE, *JOINT)
 FRONT = (*BY_HAND, P + "faces", "front")
 NOT_PULLED = (P + "drive-pull-back", "0")
-OPACITY = ("--pipeline.model.blend-form", "opacity")
 EQUAL_SHARES = ("--optimizers.reliability.optimizer.lr", "1e-9")
 LITTLE_VARIATION = ("--pipeline.model.loss.tv-density", "1e-5", "--pipeline.model.loss.tv-features", "1e-6")
 """DVGO's."""
@@ -118,7 +117,6 @@ ABLATIONS: dict[str, list[Method]] = {
                 "one front MPI, pulled back": FRONT,
                 "each alone, then reliability": (*ALONE, *SPLIT),
                 "... every MPI sees all rays (30k each)": ALONE,
-                "... opacity-keeping form": (*ALONE, *SPLIT, *OPACITY),
                 "... then a joint fine-tune": (*DRIVE, *TWO_PHASE, *SPLIT, *_shares(0.1, 0.4, 0.3)),
                 "... a longer one, at full rates": (*DRIVE, *TWO_PHASE, *SPLIT),
                 "... and every MPI sees all rays (the default)": (*DRIVE, *TWO_PHASE),

@@ -1,8 +1,7 @@
-"""Reliability baked into texels: shares are computed once, so that a sample reads one head instead of all.
+"""Shares of blending at texels: what reliability leaves of each texel's optical depth, for baked scenes.
 
 Blending looks up, for every sample, the reliability of each head that covers its position (paper sec. III-C). The
-resulting share depends on the position alone, so a texel can store it: shares are interpolated between texels instead
-of reliabilities. For rendering only; docs/performance.md has time and error.
+resulting share depends on the position alone, so a baked texel stores the optical depth that is left.
 """
 
 from __future__ import annotations
@@ -17,11 +16,6 @@ from mmpi_ns.scene.texels import BRICK
 
 AT_ONCE = 1 << 18
 """Texels whose shares are computed together."""
-
-
-def baked_shares(field: MMPIField) -> Float[Tensor, "N 1"]:
-    """``bake_shares`` of a field, computed once, until it is trained further (``MMPIField.forget_shares``)."""
-    return field.cached("shares", lambda: bake_shares(field))
 
 
 @torch.no_grad()

@@ -125,9 +125,10 @@ class MMPIField(TexelTables):
         bias = math.log(math.expm1(-math.log1p(-self.cube_alpha) / interval))
         return SceneLayout(mpis, frames, self.grids, biases, self.depth_scale, packed, bias, interval)
 
-    def tables(self, shares: Tensor | None = None) -> Tables:
-        """Input of the march, with baked shares in place of reliability if given."""
-        return Tables(self.density.data, self.reliability.data if shares is None else shares, self.touched)
+    @property
+    def tables(self) -> Tables:
+        """What the march reads."""
+        return Tables(self.density.data, self.reliability.data, self.touched)
 
     @property
     def frames(self) -> geometry.Frames:
@@ -142,10 +143,9 @@ class MMPIField(TexelTables):
         """Factor on every optical depth of an MPI, from the current plan: that of a checkpoint has its own K."""
         return 1.0 / len(self.full_plan.mpis) if self.shares_depth else 1.0
 
-    def forget_shares(self) -> None:
-        """Drops baked data, because the field is about to be trained."""
-        for name in ("shares", "baked"):
-            self._packed.pop((name, self.density.device), None)
+    def forget_baked(self) -> None:
+        """Drops the baked window, because the field is about to be trained."""
+        self._packed.pop(("baked", self.density.device), None)
 
     # nerfstudio's Field ------------------------------------------------------------------------------------------
 

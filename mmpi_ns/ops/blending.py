@@ -5,8 +5,6 @@ Plain torch, with gradients. The compiled marches contain their own form without
 
 from __future__ import annotations
 
-from typing import Literal
-
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -15,9 +13,6 @@ from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.interpolate import interpolate
 from mmpi_ns.ops.layout import SceneLayout
 from mmpi_ns.scene.geometry import LocalRays, local_to_ndc
-
-BlendForm = Literal["paper", "opacity"]
-"""paper: alpha' = P alpha. opacity: 1 - alpha' = (1 - alpha)^P, which keeps opaque copies opaque."""
 
 
 def blend_shares(
@@ -61,17 +56,12 @@ def _softplus(x: Tensor) -> Tensor:
 
 
 def blended_optical_depth(
-    tau: Float[Tensor, "N"],
-    log_share: Float[Tensor, "N"],
-    log_rest: Float[Tensor, "N"],
-    form: BlendForm = "paper",
+    tau: Float[Tensor, "N"], log_share: Float[Tensor, "N"], log_rest: Float[Tensor, "N"]
 ) -> Float[Tensor, "N"]:
     """-log(1 - alpha') of a sample after blending; exactly tau if no other head covers it.
 
     Source: paper sec. III-C, alpha' = P alpha, so 1 - alpha' = (1 - P) + P (1 - alpha).
     """
-    if form == "opacity":
-        return tau * log_share.exp()
     sole = torch.isneginf(log_rest)
     # Two forms of one number: the first is exact for thin samples (and 0 for empty ones), the second for opaque ones.
     alpha = -torch.expm1(-tau) * log_share.exp()
@@ -136,14 +126,3 @@ def _ndc_in_head(
     assert layout.cube is not None
     ndc = layout.cube.normalised(moved[:, :3] + moved[:, 3:] / inverse_t.clamp(min=1e-10)[:, None])
     return ndc.clamp(-1, 1), (ndc.abs() <= 1).all(-1) & (inverse_t > 0)
-
-
-def interpolate_shares(
-    layout: SceneLayout, shares: Float[Tensor, "T 1"], ndc: Float[Tensor, "N 3"], heads: Int[Tensor, "N"]
-) -> Float[Tensor, "N"]:
-    """Shares of samples from those of texels (``baking.bake_shares``), in the head that each was taken from."""
-    found = ndc.new_zeros(len(heads))
-    for k, grid in enumerate(layout.grids):
-        index = (heads == k).nonzero()[:, 0]
-        found = found.index_copy(0, index, interpolate(shares, *grid.trilinear(ndc[index]))[:, 0])
-    return found.clamp(0, 1)

@@ -21,7 +21,6 @@ class Tables(NamedTuple):
     density: Float[Tensor, "T 1"]
     """Raw densities."""
     reliability: Float[Tensor, "T 1"]
-    """R, or the shares P that were baked from it."""
     touched: UInt8[Tensor, "T"]
     """1 where a training ray read the row."""
 

@@ -131,10 +131,10 @@ def _marches(device: str, many: bool | None = None) -> list[tuple]:
     many, cases = device == "cuda" if many is None else many, []
     for with_cube, options, count in (
         (True, MarchOptions(0.0), RAYS),
-        (True, MarchOptions(0.01, form="paper"), RAYS),
-        (False, MarchOptions(0.01, form="paper", baked=True), RAYS),
+        (True, MarchOptions(0.01, blends=True), RAYS),
+        (False, MarchOptions(0.01), RAYS),
         # All are kept: some sample would weigh what the threshold says.
-        *([(True, MarchOptions(0.0, form="paper"), MANY_RAYS)] if many else []),
+        *([(True, MarchOptions(0.0, blends=True), MANY_RAYS)] if many else []),
     ):
         layout, tables = _scene(device, with_cube)
         rays = _rays(device, count)

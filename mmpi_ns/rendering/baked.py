@@ -13,12 +13,12 @@ from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 from torch.nn.functional import pad
 
-from mmpi_ns.field.baking import baked_shares
+from mmpi_ns.field.baking import bake_shares
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.shading import CHANGE, MOST_CHANGE, RayShader
 from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.baked import march_baked, shade_baked
-from mmpi_ns.ops.blending import BlendForm, blended_optical_depth
+from mmpi_ns.ops.blending import blended_optical_depth
 from mmpi_ns.ops.gather import COLORS
 from mmpi_ns.ops.march.reference import NEGLIGIBLE_DEPTH
 from mmpi_ns.scene.baked import (
@@ -136,14 +136,14 @@ def shader_of(network: RayShader) -> Shader:
 
 
 @torch.no_grad()
-def bake(model_field: MMPIField, threshold: float, background: float, form: BlendForm | None = None) -> BakedWindow:
+def bake(model_field: MMPIField, threshold: float, background: float, blends: bool = False) -> BakedWindow:
     """A field as bricks of 8-bit codes: all that are not empty.
 
     Args:
         model_field: what to bake.
         threshold: samples of less weight will not be shaded.
         background: grey level behind everything.
-        form: form of blending by reliability, of which texels keep the optical depths; None without reliability.
+        blends: texels keep the optical depths that blending by reliability leaves at them.
 
     Raises:
         ValueError: the field has a cube, too many channels, or a network for every sample.
@@ -153,13 +153,13 @@ def bake(model_field: MMPIField, threshold: float, background: float, form: Blen
     assert isinstance(model_field.networks, RayShader)
     shader = shader_of(model_field.networks)
     plan = model_field.plan
-    shares = baked_shares(model_field) if form is not None else None
-    highest = max(float((_raw(model_field, k, p, form, shares)).max()) for k, p in _all_planes(model_field))
+    shares = bake_shares(model_field) if blends else None
+    highest = max(float((_raw(model_field, k, p, shares)).max()) for k, p in _all_planes(model_field))
     density_codes = Codes.spanning(THINNEST, max(highest, THINNEST + 1))
     channels = _channel_codes(model_field)
     columns, density, texels, count = [], [], [], 0
     for k, _ in enumerate(plan.mpis):
-        raw = torch.cat([_raw(model_field, k, p, form, shares) for p in _planes(model_field, k)])
+        raw = torch.cat([_raw(model_field, k, p, shares) for p in _planes(model_field, k)])
         codes = density_codes.encode(raw)
         blocks = _tiled(codes[..., None])[..., 0]
         found, places = columns_from(_stored(model_field.grids[k]).cpu() & (blocks.amax((-1, -2)) > 0), count)
@@ -192,18 +192,16 @@ def _all_planes(model_field: MMPIField) -> Iterator[tuple[int, slice]]:
             yield k, planes
 
 
-def _raw(
-    model_field: MMPIField, k: int, planes: slice, form: BlendForm | None, shares: Tensor | None
-) -> Float[Tensor, "P H W"]:
+def _raw(model_field: MMPIField, k: int, planes: slice, shares: Tensor | None) -> Float[Tensor, "P H W"]:
     """Raw densities including the biases of the planes, whose softplus gives the blended optical depth."""
     grid = model_field.grids[k]
     raw = read_planes(model_field.density.data, grid, planes)[..., 0] + model_field.layout.biases[k][planes, None, None]
-    if form is None or shares is None:
+    if shares is None:
         return raw.cpu()
     interval = model_field.layout.interval(k)
     share = read_planes(shares, grid, planes)[..., 0].clamp(0, 1)
     tau = torch.nn.functional.softplus(raw) * interval
-    blended = blended_optical_depth(tau, share.log(), torch.log1p(-share), form)
+    blended = blended_optical_depth(tau, share.log(), torch.log1p(-share))
     tau = torch.where(tau > NEGLIGIBLE_DEPTH, blended, tau / len(model_field.grids)) / interval
     return (tau + torch.log(-torch.expm1(-tau.clamp(min=1e-12)))).cpu()
 

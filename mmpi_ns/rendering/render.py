@@ -12,14 +12,14 @@ from torch import Tensor
 from mmpi_ns.capture.datamanager import is_pixel_ray
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.samples import Lookup, metadata_of
-from mmpi_ns.ops.blending import BlendForm, blended_optical_depth
+from mmpi_ns.ops.blending import blended_optical_depth
 from mmpi_ns.ops.composite import composite_weights, winning_heads
 from mmpi_ns.rendering.rendered import RenderedRays, median_distance
 from mmpi_ns.rendering.sampler import MergeReport, MMPISampler
 
 
 def render_rays(
-    sampler: MMPISampler, bundle: RayBundle, field: MMPIField, *, form: BlendForm | None, **sampling: Any
+    sampler: MMPISampler, bundle: RayBundle, field: MMPIField, *, blends: bool, **sampling: Any
 ) -> RenderedRays:
     """Renders rays that have nears and fars, with gradients if enabled.
 
@@ -27,11 +27,11 @@ def render_rays(
         sampler: samples and merges.
         bundle: the rays.
         field: to render.
-        form: form of blending by reliability; None without reliability.
+        blends: samples are blended by reliability.
         sampling: further arguments of the sampler.
     """
-    samples, report = sampler(bundle, field=field, blend_form=form, **sampling)
-    tau, lookup = _optical_depth(field, samples, report, form)
+    samples, report = sampler(bundle, field=field, blends=blends, **sampling)
+    tau, lookup = _optical_depth(field, samples, report, blends)
     meta = metadata_of(samples)
     valid, before = meta["valid"][..., 0], meta["skipped_before"][..., 0]
     composite = composite_weights(tau, valid, before, report.skipped_total)
@@ -41,16 +41,16 @@ def render_rays(
 
 
 def _optical_depth(
-    field: MMPIField, samples: RaySamples, report: MergeReport, form: BlendForm | None
+    field: MMPIField, samples: RaySamples, report: MergeReport, blends: bool
 ) -> tuple[Float[Tensor, "R S"], Lookup | None]:
     """(Blended) optical depths, with gradients if enabled; otherwise the sampler's own, without a lookup."""
     if not torch.is_grad_enabled():
         return metadata_of(samples)["tau"][..., 0], None
     density, lookup = field.get_density(samples, report.head_counts)
     tau = density[..., 0]
-    if form is not None and lookup.index.numel():
+    if blends and lookup.index.numel():
         shares = field.sample_shares(samples, lookup)
-        blended = blended_optical_depth(tau.reshape(-1)[lookup.index], *shares, form)
+        blended = blended_optical_depth(tau.reshape(-1)[lookup.index], *shares)
         tau = tau.new_zeros(tau.numel()).index_put((lookup.index,), blended).view(tau.shape)
     return tau, lookup
 
@@ -64,11 +64,9 @@ def images_of(rays: RenderedRays, field: MMPIField) -> dict[str, Tensor]:
     }
 
 
-def sampled_outputs(
-    bundle: RayBundle, field: MMPIField, *, form: BlendForm | None, **sampling: Any
-) -> dict[str, Tensor]:
+def sampled_outputs(bundle: RayBundle, field: MMPIField, *, blends: bool, **sampling: Any) -> dict[str, Tensor]:
     """``shown.shown_outputs`` for any field, also with gradients."""
-    rays = render_rays(MMPISampler(), bundle, field, form=form, **sampling)
+    rays = render_rays(MMPISampler(), bundle, field, blends=blends, **sampling)
     heads, composite = metadata_of(rays.samples)["heads"][..., 0], rays.composite
     return images_of(rays, field) | {
         "transmittance": composite.transmittance,

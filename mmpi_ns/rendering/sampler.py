@@ -15,7 +15,6 @@ from nerfstudio.model_components.ray_samplers import Sampler
 from torch import Tensor
 
 from mmpi_ns.field.mmpi_field import MMPIField
-from mmpi_ns.ops.blending import BlendForm
 from mmpi_ns.ops.hits import plane_hits
 from mmpi_ns.ops.march import Crossings, MarchOptions, MergedSamples, march
 from mmpi_ns.scene.geometry import PlaneHits, cube_hits, sample_disparity
@@ -53,8 +52,7 @@ class MMPISampler(Sampler):
         fair_share: float = float("inf"),
         head_mask: Bool[Tensor, "R H"] | None = None,
         choose: Float[Tensor, "R K"] | None = None,
-        blend_form: BlendForm | None = None,
-        shares: Float[Tensor, "N 1"] | None = None,
+        blends: bool = False,
         **_: Any,
     ) -> tuple[RaySamples, MergeReport]:
         """Kept samples of each ray, nearest first.
@@ -66,8 +64,7 @@ class MMPISampler(Sampler):
             fair_share: likewise.
             head_mask: heads that may render each ray; None for all.
             choose: priorities; each ray is rendered by the MPI of highest priority among those it meets (and the cube).
-            blend_form: form of blending by reliability; None without reliability.
-            shares: baked ones (``baking.bake_shares``) to blend by instead.
+            blends: samples are blended by reliability.
 
         Returns:
             RaySamples [R, S] whose metadata holds ``heads``, ``planes``, ``ndc``, ``inverse_t``, ``valid``,
@@ -79,8 +76,8 @@ class MMPISampler(Sampler):
             explained = (at.counts > 0).any(-1, keepdim=True)
             if head_mask is not None or choose is not None:
                 explained &= _sees_all(at.hits, at.counts[:, : len(field.plan.mpis)], field)
-            options = MarchOptions(threshold, fair_share, blend_form, baked=shares is not None)
-            merged = march(field.layout, field.tables(shares), at, options)
+            options = MarchOptions(threshold, fair_share, blends)
+            merged = march(field.layout, field.tables, at, options)
         left = merged.skipped_total, merged.dropped_mass
         report = MergeReport(at.counts.sum(-1), *left, explained, merged.head_counts)
         return _ray_samples(ray_bundle, merged), report

@@ -9,17 +9,15 @@ from torch import Tensor
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.shading import RayShader
 from mmpi_ns.ops import dispatch
-from mmpi_ns.ops.blending import BlendForm
 from mmpi_ns.ops.march import MarchOptions
 from mmpi_ns.ops.show import show_rays
 from mmpi_ns.rendering.rendered import distances_of
 from mmpi_ns.rendering.sampler import crossings
 
 
-def shows_in_one_pass(field: MMPIField, form: BlendForm | None) -> bool:
+def shows_in_one_pass(field: MMPIField) -> bool:
     """Whether a compiled form renders images of a field in one pass, without arrays of samples."""
-    compiled = dispatch.form_of("show_rays", field.features) != "reference"
-    return field.shading == "ray" and form != "opacity" and compiled
+    return field.shading == "ray" and dispatch.form_of("show_rays", field.features) != "reference"
 
 
 @torch.no_grad()
@@ -27,24 +25,22 @@ def shown_outputs(
     bundle: RayBundle,
     field: MMPIField,
     *,
-    form: BlendForm | None,
+    blends: bool,
     threshold: float,
     head_mask: Tensor | None,
-    shares: Tensor | None,
 ) -> dict[str, Tensor]:
     """rgb (without background), accumulation, transmittance, depth, winning head and dropped mass of rays [R, .].
 
     Args:
         bundle: the rays.
         field: with ``shading ray``.
-        form: form of blending by reliability; None without reliability.
+        blends: samples are blended by reliability.
         threshold: weight below which a sample is dropped.
         head_mask: heads that may render each ray; None for all.
-        shares: baked shares to blend by instead of reliability.
     """
     assert isinstance(field.networks, RayShader)
-    options = MarchOptions(threshold, form=form, baked=shares is not None)
-    scene = (field.layout, field.tables(shares), field.features.data)
+    options = MarchOptions(threshold, blends=blends)
+    scene = (field.layout, field.tables, field.features.data)
     shown = show_rays(*scene, crossings(bundle, field, head_mask), options)
     return {
         "rgb": field.networks.shade(shown.gathered, shown.mass, shown.accumulation, bundle.directions),

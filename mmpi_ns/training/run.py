@@ -97,7 +97,7 @@ class TrainingRun:
         """
         progress, field = self.progress, self.field
         progress.step = step
-        field.forget_shares()
+        field.forget_baked()
         optimizers = attributes.optimizers.optimizers if attributes and attributes.optimizers else {}
         groups = self.parameters()
         if progress.schedule.window_at(step) != progress.window:

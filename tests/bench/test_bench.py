@@ -23,7 +23,7 @@ def test_the_dense_reference_renders_what_the_sampler_renders():
     field = random_field(3)
     field.features.data.mul_(0.3)
     rays = bundle(*random_rays(field.plan, 64, seed=1))
-    ours = render_rays(MMPISampler(), rays, field, form=None, threshold=0.0)
+    ours = render_rays(MMPISampler(), rays, field, blends=False, threshold=0.0)
     reference, samples = render_densely(field, rays)
     # The reference leaves out colours below alpha = 1e-4, so they may differ by that much a sample.
     found = ours.colors.rgb + 0.5 * ours.composite.transmittance

@@ -94,8 +94,8 @@ def test_exact_rays_equal_the_oracle(run):
     model, images = pipeline.model, list(render.images_of(pipeline, 1))
     bundle = images[0][0].generate_rays(camera_indices=0, keep_shape=True)
     origin, direction = (x[5, 7].double().numpy() for x in (bundle.origins, bundle.directions))
-    near, form = float(np.float32(model.field.plan.ray_near)), model.blend_form(model.field)
-    color, made = ExactRay(ExactField.of(model.field), origin, direction, near).render(form)
+    near, blends = float(np.float32(model.field.plan.ray_near)), model.blends(model.field)
+    color, made = ExactRay(ExactField.of(model.field), origin, direction, near).render(blends)
     found = render.exact_colors(model, images, [np.array([[5, 7], [6, 7]])])
     assert np.abs(found[0] - color - 0.5 * made.transmittance).max() < 1e-6 < found.std()
 

@@ -36,7 +36,7 @@ def filled(trainer, seed=0):
     """A model whose densities, colours and features are random."""
     model = trainer.pipeline.model.eval()
     field, g = model.field, torch.Generator().manual_seed(seed)
-    field.forget_shares()
+    field.forget_baked()
     field.density.data[64:] = torch.randn(len(field.density) - 64, 1, generator=g) * 2 + 1.5
     field.features.data[64:] = torch.randn(len(field.features) - 64, field.feature_channels, generator=g)
     field.reliability.data = torch.randn(field.reliability.shape, generator=g)
@@ -74,11 +74,9 @@ def test_baked_images_are_the_exact_ones(trainer, monkeypatch):
     assert (exact["winning_mpi"] == baked["winning_mpi"]).float().mean() > 0.95
 
 
-@pytest.mark.parametrize("form", ["paper", "opacity"])
-def test_blending_is_baked_into_the_bricks(trainer, form, monkeypatch):
+def test_blending_is_baked_into_the_bricks(trainer, monkeypatch):
     """Two phases: bricks hold blended densities, and differ from those that are not; shares are interpolated."""
     model = filled(trainer, 1)
-    monkeypatch.setattr(model.config, "blend_form", form)
     model.field.reliability.data[:] = 0.0
     for k, grid in enumerate(model.field.grids):  # one vote a head: shares change where covers end alone
         rows = torch.arange(64, len(model.field.density))
@@ -86,7 +84,7 @@ def test_blending_is_baked_into_the_bricks(trainer, form, monkeypatch):
     rays = bundle_of(model.field.plan)
     exact, baked = outputs(model, "exact", rays), outputs(model, "baked", rays)
     error = (exact["rgb"] - baked["rgb"]).square().mean()
-    model.field.forget_shares()
+    model.field.forget_baked()
     monkeypatch.setattr(model.config, "training", "joint")
     unblended = outputs(model, "baked", rays)
     assert error < 1e-3 and error < 0.2 * (exact["rgb"] - unblended["rgb"]).square().mean()
@@ -156,7 +154,7 @@ def test_training_on_forgets_what_was_baked(trainer):
     model = filled(trainer)
     first = model.baked(model.field)
     assert model.baked(model.field) is first
-    model.field.forget_shares()
+    model.field.forget_baked()
     assert model.baked(model.field) is not first
 
 
@@ -180,7 +178,7 @@ def test_a_run_is_baked_and_read_again(trainer, tmp_path):
 
 def test_what_cannot_be_baked_is_refused(trainer, monkeypatch):
     model = filled(trainer)
-    model.field.forget_shares()
+    model.field.forget_baked()
     monkeypatch.setattr(model.field, "feature_channels", 17)
     with pytest.raises(ValueError, match="16 is the most"):
         model.baked(model.field)

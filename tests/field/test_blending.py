@@ -14,7 +14,6 @@ from mmpi_ns.ops.blending import blend_shares, blended_optical_depth
 from mmpi_ns.ops.composite.reference import composite_weights
 
 F64 = torch.float64
-FORMS = ["paper", "opacity"]
 
 
 def shares_of(votes, dtype=F64):
@@ -73,16 +72,15 @@ def test_what_uncovered_heads_hold_is_ignored():
         assert torch.isfinite(reliability.grad).all()
 
 
-@pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("dtype", [torch.float32, F64])
-def test_sole_cover_keeps_its_optical_depth_exactly(form, dtype):
+def test_sole_cover_keeps_its_optical_depth_exactly(dtype):
     tau = torch.tensor([0.0, 1e-30, 1e-7, 0.1, 3.0, 88.0, 1e4], dtype=dtype)
     own = torch.arange(7) % 3
     cover = torch.nn.functional.one_hot(own, 3).bool()
     reliability = torch.linspace(-1e3, 1e3, 21, dtype=dtype).view(7, 3)
     log_share, log_rest = blend_shares(reliability, cover, own)
     assert log_share.tolist() == [0.0] * 7 and log_rest.tolist() == [-math.inf] * 7
-    assert torch.equal(blended_optical_depth(tau, log_share, log_rest, form), tau)
+    assert torch.equal(blended_optical_depth(tau, log_share, log_rest), tau)
 
 
 def test_sole_cover_sends_all_gradient_to_its_depth_and_none_to_its_reliability():
@@ -106,86 +104,78 @@ def test_half_precision_reliabilities_are_blended_in_float32():
 # Blended optical depth -----------------------------------------------------------------------------------------------
 
 
-def test_paper_form_scales_alpha_and_opacity_form_scales_depth():
+def test_blending_scales_alpha():
     tau, share = tensor([0.7]), tensor([0.25])
     alpha = 1 - math.exp(-0.7)
-    paper = blended_optical_depth(tau, share.log(), (1 - share).log(), "paper")
-    opacity = blended_optical_depth(tau, share.log(), (1 - share).log(), "opacity")
-    assert 1 - math.exp(-paper.item()) == pytest.approx(0.25 * alpha)
-    assert opacity.item() == pytest.approx(0.25 * 0.7)
+    blended = blended_optical_depth(tau, share.log(), (1 - share).log())
+    assert 1 - math.exp(-blended.item()) == pytest.approx(0.25 * alpha)
 
 
 @pytest.mark.parametrize("heads", [2, 4])
-def test_opaque_copies_leak_in_the_paper_form_and_not_in_the_opacity_form(heads):
+def test_opaque_copies_that_share_equally_leak(heads):
     votes = (np.zeros((heads, heads)), np.ones((heads, heads), bool), np.arange(heads))
-    for form, leak in (("paper", (1 - 1 / heads) ** heads), ("opacity", 0.0)):
-        tau = blended_optical_depth(torch.full((heads,), 1e4, dtype=F64), *shares_of(votes), form)
-        assert composite_all(tau[None]).transmittance.item() == pytest.approx(leak, abs=1e-12)
+    tau = blended_optical_depth(torch.full((heads,), 1e4, dtype=F64), *shares_of(votes))
+    leak = (1 - 1 / heads) ** heads
+    assert composite_all(tau[None]).transmittance.item() == pytest.approx(leak, abs=1e-12)
 
 
 # As for shares: a few ulps of the largest |R|, absolute where the depth is small and relative where it is large.
-@pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("scale", [0.0, 1.0, 30.0, 1e3])
 @pytest.mark.parametrize("dtype", [torch.float32, F64])
-def test_blended_depth_equals_the_oracle(form, scale, dtype):
+def test_blended_depth_equals_the_oracle(scale, dtype):
     rng = np.random.default_rng(7)
     reliability, cover, own = random_votes(rng, 300, 4, scale)
     reliability = tensor(reliability, dtype).double().numpy()
     tau = tensor(np.concatenate([[0.0, 1e4, 1e-12], 10 ** rng.uniform(-8, 4, size=297)]), dtype)
     votes = (reliability, cover, own)
-    wanted = [oracle.blended_depth(*args, form=form) for args in zip(tau.tolist(), *votes, strict=True)]
-    found = blended_optical_depth(tau, *shares_of(votes, dtype), form).double().numpy()
+    wanted = [oracle.blended_depth(*args) for args in zip(tau.tolist(), *votes, strict=True)]
+    found = blended_optical_depth(tau, *shares_of(votes, dtype)).double().numpy()
     ulp = torch.finfo(dtype).eps * max(4.0, np.abs(reliability).max())
     assert np.all(np.abs(found - wanted) <= 2 * ulp * (1 + np.array(wanted)))
 
 
-@pytest.mark.parametrize("form", FORMS)
-def test_blended_depth_never_exceeds_depth_and_is_never_negative(form):
+def test_blended_depth_never_exceeds_depth_and_is_never_negative():
     rng = np.random.default_rng(9)
     votes = random_votes(rng, 4000, 5, 20.0)
     tau = tensor(10 ** rng.uniform(-8, 4, size=4000), torch.float32)
-    blended = blended_optical_depth(tau, *shares_of(votes, torch.float32), form)
+    blended = blended_optical_depth(tau, *shares_of(votes, torch.float32))
     assert (blended >= 0).all() and (blended <= tau * (1 + 1e-6) + 2e-5).all()
 
 
-@pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("level", [-1e3, 0.0, 30.0, 1e3])
-def test_empty_samples_stay_empty_at_any_level_of_reliability_in_float32(form, level):
+def test_empty_samples_stay_empty_at_any_level_of_reliability_in_float32(level):
     """Only differences of reliabilities matter. A thousand empty samples a ray must not add up to a veil."""
     reliability, cover, own = random_votes(np.random.default_rng(1), 2000, 3, 1.0)
     shares = shares_of((reliability + level, cover, own), torch.float32)
-    assert blended_optical_depth(torch.zeros(2000), *shares, form).max() < 5e-7
+    assert blended_optical_depth(torch.zeros(2000), *shares).max() < 5e-7
 
 
-@pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("depth", [1e-8, 1e-5, 1e-3, 0.1, 1.0, 30.0])
 @pytest.mark.parametrize("level", [0.0, 1e3])
-def test_thin_samples_keep_their_relative_precision_in_float32(form, depth, level):
+def test_thin_samples_keep_their_relative_precision_in_float32(depth, level):
     votes = random_votes(np.random.default_rng(2), 200, 3, 1.0)
     votes = (tensor(votes[0] + level, torch.float32).double().numpy(), *votes[1:])
     tau = torch.full((200,), depth)
-    wanted = [oracle.blended_depth(*args, form=form) for args in zip(tau.tolist(), *votes, strict=True)]
-    found = blended_optical_depth(tau, *shares_of(votes, torch.float32), form)
+    wanted = [oracle.blended_depth(*args) for args in zip(tau.tolist(), *votes, strict=True)]
+    found = blended_optical_depth(tau, *shares_of(votes, torch.float32))
     assert np.allclose(found, wanted, rtol=3e-6, atol=0)
 
 
 # Gradients -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("form", FORMS)
-def test_blending_has_the_gradient_of_finite_differences(form):
+def test_blending_has_the_gradient_of_finite_differences():
     rng = np.random.default_rng(11)
     reliability, cover, own = random_votes(rng, 12, 4, 2.0)
     reliability, tau = tensor(reliability).requires_grad_(), tensor(rng.exponential(1.0, 12)).requires_grad_()
 
     def blend(r, t):
-        return blended_optical_depth(t, *blend_shares(r, torch.tensor(cover), torch.tensor(own)), form)
+        return blended_optical_depth(t, *blend_shares(r, torch.tensor(cover), torch.tensor(own)))
 
     assert torch.autograd.gradcheck(blend, (reliability, tau))
 
 
-@pytest.mark.parametrize("form", FORMS)
-def test_float32_gradients_are_finite_on_every_hard_input(form):
+def test_float32_gradients_are_finite_on_every_hard_input():
     reliabilities = torch.tensor([-1e3, -40.0, 0.0, 40.0, 1e3])
     depths = torch.tensor([0.0, 1e-30, 1e-3, 1.0, 90.0, 1e4])
     a, b, t = (x.reshape(-1) for x in torch.meshgrid(reliabilities, reliabilities, depths, indexing="ij"))
@@ -194,7 +184,7 @@ def test_float32_gradients_are_finite_on_every_hard_input(form):
     cover = torch.ones(reliability.shape[0], 2, dtype=torch.bool)
     cover[::3, 1] = False
     log_share, log_rest = blend_shares(reliability, cover, torch.zeros(cover.shape[0], dtype=torch.int64))
-    blended = blended_optical_depth(tau, log_share, log_rest, form)
+    blended = blended_optical_depth(tau, log_share, log_rest)
     composite = composite_all(blended.view(-1, 6))
     for output in (blended.sum(), composite.weights.sum(), composite.transmittance.sum()):
         reliability.grad = tau.grad = None
@@ -202,16 +192,15 @@ def test_float32_gradients_are_finite_on_every_hard_input(form):
         assert torch.isfinite(output) and torch.isfinite(reliability.grad).all() and torch.isfinite(tau.grad).all()
 
 
-@pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("gap", [-80.0, -30.0, -10.0, 10.0, 30.0, 80.0])
-def test_small_gradients_of_reliability_are_right_in_float32(form, gap):
+def test_small_gradients_of_reliability_are_right_in_float32(gap):
     """Where P is near 0 or 1 the slopes P (1 - P) are tiny; Adam makes full steps of them, so signs must be true."""
     for tau in (1e-3, 1.0, 30.0):
         reliability = torch.tensor([[gap, 0.0]], requires_grad=True)
         shares = blend_shares(reliability, torch.ones(1, 2, dtype=torch.bool), torch.tensor([0]))
-        blended_optical_depth(torch.tensor([tau]), *shares, form).sum().backward()
+        blended_optical_depth(torch.tensor([tau]), *shares).sum().backward()
         h, either = 1e-3, np.ones(2, bool)
-        above, below = (oracle.blended_depth(tau, [gap + s, 0.0], either, 0, form) for s in (h, -h))
+        above, below = (oracle.blended_depth(tau, [gap + s, 0.0], either, 0) for s in (h, -h))
         assert reliability.grad[0].tolist() == pytest.approx(
             [(above - below) / 2 / h, -(above - below) / 2 / h], rel=1e-4
         )

@@ -280,8 +280,7 @@ def test_a_state_dict_brings_its_own_plan_and_resolution(ours, theirs, shared, f
     for name, value in written.state_dict().items():
         assert torch.equal(read.state_dict()[name], value), name
     rays = bundle(*random_rays(written.plan, 12, seed=3))
-    form = "paper" if theirs > 1 else None
-    a, b = (render(f.eval(), rays, blend_form=form) for f in (written, read))
+    a, b = (render(f.eval(), rays, blends=theirs > 1) for f in (written, read))
     assert torch.equal(a.rgb, b.rgb) and torch.equal(a.report.live, b.report.live) and a.report.live.any()
 
 

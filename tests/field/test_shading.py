@@ -7,10 +7,8 @@ import math
 import numpy as np
 import pytest
 import torch
-from hand_made import make_mpi
 from random_fields import CLEAR, ERROR, OracleRay, bundle, fill, random_plan, random_rays
 
-from mmpi_ns.field.baking import baked_shares
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.samples import metadata_of
 from mmpi_ns.field.shading import RayShader, change_odds
@@ -18,8 +16,6 @@ from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.composite import Composite, composite_weights
 from mmpi_ns.ops.gather import RaySums
 from mmpi_ns.rendering.sampler import MMPISampler
-from mmpi_ns.rendering.shown import shown_outputs
-from mmpi_ns.scene.plan import ScenePlan
 
 F64 = torch.float64
 
@@ -209,7 +205,7 @@ def test_changed_odds_and_their_gradients_are_those_of_the_formula():
     assert torch.autograd.gradcheck(change_odds, (color, change))
 
 
-# Growth, baked shares ------------------------------------------------------------------------------------------------
+# Growth ----------------------------------------------------------------------------------------------------------
 
 
 def test_growing_keeps_what_rays_show():
@@ -230,16 +226,3 @@ def test_growing_keeps_what_rays_show():
     after = shown(field, rays)[0].rgb
     assert field.grids[0].texels > 2 * texels and before.std() > 0.05
     assert torch.allclose(before, after, atol=2e-5)
-
-
-def test_baked_shares_that_are_the_same_everywhere_show_what_blending_does():
-    """Two equal frusta that believe in nothing more than in each other: P is 1/2 at every place."""
-    plan = ScenePlan((make_mpi(), make_mpi("twin")), None, 0.05, 1.0)
-    field = fill(MMPIField(plan, shading="ray", feature_channels=6, hidden_width=8), 1).eval()
-    field.reliability.data.fill_(0.7)
-    rays, how = bundle(*random_rays(plan, 60, seed=3)), {"threshold": 0.0, "head_mask": None}
-    exact, baked = (shown_outputs(rays, field, form="paper", shares=s, **how) for s in (None, baked_shares(field)))
-    alone = shown_outputs(rays, field, form=None, shares=None, **how)
-    for name in ("rgb", "accumulation", "dropped_mass"):
-        assert torch.allclose(exact[name], baked[name], atol=2e-5), name
-    assert exact["rgb"].std() > 0.05 and (exact["rgb"] - alone["rgb"]).abs().max() > 0.01, "blending changes something"

@@ -16,7 +16,6 @@ from training_runs import plan_of, ready, trainer_config, write_plan
 
 from mmpi_ns import model as mmpi_model
 from mmpi_ns.config import mmpi_small
-from mmpi_ns.field.baking import baked_shares
 from mmpi_ns.training.phases import TRAINS
 
 KINDS = ("density", "features", "colour", "reliability")
@@ -58,7 +57,7 @@ def camera(trained):
 
 
 @pytest.mark.parametrize("settings", [{"rays_per_mpi": "split"}, {"rays_per_mpi": "all"}, {"training": "joint"},
-                                      {"shared_colour": True}, {"blend_form": "opacity"}])  # fmt: skip
+                                      {"shared_colour": True}])  # fmt: skip
 def test_every_phase_has_finite_losses_and_trains_what_it_says(scene, plan_file, tmp_path, settings):
     trainer = trainer_of(scene, plan_file, tmp_path, steps=24, **settings)
     schedule = trainer.pipeline.model.progress.schedule
@@ -226,21 +225,6 @@ def test_chunks_have_the_size_that_suits_the_device_unless_another_is_asked_for(
         assert model.config.eval_num_rays_per_chunk == asked
 
 
-def test_baked_shares_render_nearly_the_same_and_are_made_anew_after_a_step(model, camera, monkeypatch):
-    exact = model.get_outputs_for_camera(camera)["rgb"]
-    monkeypatch.setattr(model.config, "render_shares", "baked")
-    baked = model.get_outputs_for_camera(camera)["rgb"]
-    shares = baked_shares(model.field)
-    difference = (exact - baked).abs()
-    assert 0 < difference.max() and difference.mean() < 0.01
-    changed = model.field.reliability.data + torch.linspace(-4, 4, len(shares))[:, None]
-    monkeypatch.setattr(model.field.reliability, "data", changed)
-    model.get_outputs_for_camera(camera)
-    assert baked_shares(model.field) is shares
-    model.run.prepare_step(None, model.progress.step)
-    assert not torch.equal(baked_shares(model.field), shares)
-
-
 def test_depth_is_the_distance_along_the_ray_and_finite_at_infinity(model, camera):
     outputs = model.get_outputs_for_camera(camera)
     plan = model.field.plan
@@ -372,4 +356,4 @@ def test_a_checkpoint_renders_the_same_in_a_model_that_was_placed_otherwise(
         expected, found = (m.get_outputs_for_camera(camera)[name] for m in (trained, read))
         assert torch.equal(expected, found), name
     assert read.show.options == ["all", *trained.field.full_plan.names]
-    assert read.blend_form(read.field) == trained.blend_form(trained.field)
+    assert read.blends(read.field) == trained.blends(trained.field)

@@ -60,10 +60,10 @@ def test_hits_of_hard_rays_are_those_of_the_reference():
 # March ---------------------------------------------------------------------------------------------------------------
 
 
-def compare(field, rays, threshold, form=None, **chosen):
+def compare(field, rays, threshold, blends=False, **chosen):
     """The kernel's samples are the reference's; returns the kernel's rendering and the reference's."""
-    fast = render(field, rays, threshold, form, **chosen)
-    plain = by_torch(lambda: render(field, rays, threshold, form, **chosen))
+    fast = render(field, rays, threshold, blends, **chosen)
+    plain = by_torch(lambda: render(field, rays, threshold, blends, **chosen))
     kept, wanted = fast.samples.metadata, plain.samples.metadata
     assert kept["valid"].shape == wanted["valid"].shape
     # A sample whose weight is the threshold's to the last bits may fall on either side of it.
@@ -86,34 +86,20 @@ def compare(field, rays, threshold, form=None, **chosen):
     return fast, plain
 
 
-@pytest.mark.parametrize("form", ["paper", None])
+@pytest.mark.parametrize("blends", [True, False])
 @pytest.mark.parametrize("threshold", [0.0, 1e-2])
-def test_the_march_keeps_what_the_reference_keeps(monkeypatch, form, threshold):
+def test_the_march_keeps_what_the_reference_keeps(monkeypatch, blends, threshold):
     monkeypatch.setattr(reference, "OPAQUE_DEPTH", math.inf)  # the reference stops blending at 1e-4 of the light
     field = random_field(3, True, seed=3, planes=14)
-    _, plain = compare(field, bundle(*random_rays(field.plan, 40, seed=1)), threshold, form)
+    _, plain = compare(field, bundle(*random_rays(field.plan, 40, seed=1)), threshold, blends)
     valid = plain.samples.metadata["valid"]
     assert plain.samples.metadata["heads"][valid].unique().numel() == 4
     assert (plain.report.dropped_mass > 1e-3).any() == (threshold > 0)
 
 
-def test_baked_shares_blend_like_the_reference(monkeypatch):
-    monkeypatch.setattr(reference, "OPAQUE_DEPTH", math.inf)
-    field = random_field(3, True, seed=4, planes=14, log_depths=(-5, 1.5))
-    rays = bundle(*random_rays(field.plan, 40, seed=1))
-    shares = torch.rand(len(field.density), 1, generator=torch.Generator().manual_seed(1)) * 1.4 - 0.2  # clamped
-    given = {"field": field, "threshold": 0.0, "blend_form": "paper", "shares": shares}
-    fast = MMPISampler()(rays, **given)[0].metadata
-    plain = by_torch(lambda: MMPISampler()(rays, **given)[0].metadata)
-    same = (fast["valid"].sum(1) == plain["valid"].sum(1))[:, 0]
-    a, b = (m["tau"][same][m["valid"][same]] for m in (fast, plain))
-    assert same.float().mean() > 0.9 and (a > 2).any()
-    assert ((a - b).abs() <= 2e-4 * b + 1e-6).float().mean() > 0.999
-
-
 def test_rays_pass_what_holds_nothing_like_the_reference():
     field = bricked_field(0.4)
-    compare(field, bundle(*random_rays(field.plan, 40, seed=1)), 1e-3, "paper")
+    compare(field, bundle(*random_rays(field.plan, 40, seed=1)), 1e-3, True)
 
 
 def test_nine_heads_and_several_programs_march_like_the_reference(monkeypatch):
@@ -132,13 +118,13 @@ def test_a_fair_share_keeps_what_a_threshold_alone_would_drop():
 def test_rays_render_as_the_oracle_has_them():
     field = random_field(3, True, seed=5, planes=10)
     origins, directions = random_rays(field.plan, 30, seed=6)
-    for form in ("paper", None):
-        fast, checked = render(field, bundle(origins, directions), blend_form=form), 0
+    for blends in (True, False):
+        fast, checked = render(field, bundle(origins, directions), blends=blends), 0
         for i in range(30):
             exact = OracleRay(field, origins[i], directions[i])
             if exact.margin < 1e-5:
                 continue
-            wanted, checked = exact.render(form), checked + 1
+            wanted, checked = exact.render(blends), checked + 1
             assert int(fast.samples.metadata["valid"][i].sum()) == len(wanted.samples)
             assert np.abs(fast.rgb[i].double().numpy() - wanted.color).max() < 5e-5
             weights = fast.composite.weights[i, : len(wanted.samples)].double().numpy()
@@ -156,8 +142,8 @@ def test_hard_rays_through_thin_and_opaque_planes_march_like_the_reference(monke
     field.density.data.fill_(raw)
     field.touched.fill_(1)
     rays = hard_rays()
-    for form, threshold in ((None, 0.0), (None, 1e-3), ("paper", 1e-3)):
-        fast, _ = compare(field.eval(), rays, threshold, form)
+    for blends, threshold in ((False, 0.0), (False, 1e-3), (True, 1e-3)):
+        fast, _ = compare(field.eval(), rays, threshold, blends)
         found = fast.samples.metadata
         tensors = [fast.rgb, fast.composite.weights, fast.report.dropped_mass, *found.values()]
         assert all(torch.isfinite(t.float()).all() for t in tensors)
@@ -177,7 +163,7 @@ def test_behind_an_opaque_plane_the_march_visits_nothing_and_loses_a_hundred_tho
 
 def test_without_rays_or_samples_there_is_nothing_to_march():
     field = MMPIField(ScenePlan((make_mpi(),), None, 0.05, 1.0)).eval()
-    away = render(field, bundle([[0, 0, 0]], [[0, 0, -1]]), blend_form="paper")
+    away = render(field, bundle([[0, 0, 0]], [[0, 0, -1]]), blends=True)
     assert away.samples.metadata["valid"].sum() == 0 and away.composite.accumulation.item() == 0
     samples, report = MMPISampler()(bundle(torch.zeros(0, 3), torch.zeros(0, 3)), field=field, threshold=1e-3)
     assert samples.shape[0] == 0 and report.live.shape == (0,)
@@ -197,10 +183,10 @@ def test_gradients_of_a_rendered_batch_are_those_of_plain_torch():
 
     def gradients():
         field.zero_grad(set_to_none=True)
-        samples, report = MMPISampler()(rays, field=field, threshold=1e-3, blend_form="paper")
+        samples, report = MMPISampler()(rays, field=field, threshold=1e-3, blends=True)
         tau, lookup = field.get_density(samples)
         share = field.sample_shares(samples, lookup)
-        flat = blending.blended_optical_depth(tau.reshape(-1)[lookup.index], *share, "paper")
+        flat = blending.blended_optical_depth(tau.reshape(-1)[lookup.index], *share)
         tau = tau.new_zeros(tau[..., 0].numel()).index_put((lookup.index,), flat).view(tau.shape[:2])
         meta = metadata_of(samples)
         made = composite.composite_weights(
@@ -224,4 +210,4 @@ def test_a_field_of_trained_and_untrained_texels_blends_like_the_reference(monke
     monkeypatch.setattr(reference, "OPAQUE_DEPTH", math.inf)
     field = fill(MMPIField(random_field(3, True, seed=11).plan, feature_channels=5, hidden_width=6), 11)
     field.touched.copy_(torch.rand(len(field.touched), generator=torch.Generator().manual_seed(1)) < 0.5)
-    compare(field, bundle(*random_rays(field.plan, 40, seed=2)), 1e-3, "paper")
+    compare(field, bundle(*random_rays(field.plan, 40, seed=2)), 1e-3, True)

@@ -16,7 +16,6 @@ from mmpi_ns.ops.blending import blend_shares, blended_optical_depth
 from mmpi_ns.ops.composite.reference import composite_weights, exclusive_cumsum, median_inverse_distance, render_colors
 
 F64 = torch.float64
-FORMS = ["paper", "opacity"]
 
 
 def composite_all(tau, valid=None):
@@ -169,12 +168,11 @@ def random_votes_of(rng, own, heads, scale):
     return rng.normal(size=heads) * scale, cover
 
 
-@pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize(("heads", "scale"), [(1, 1.0), (2, 3.0), (5, 1.0), (12, 1e3)])
 @pytest.mark.parametrize(("dtype", "error"), [(torch.float32, 3e-4), (F64, 1e-10)])
-def test_merged_ray_equals_the_sequential_oracle(heads, scale, form, dtype, error):
+def test_merged_ray_equals_the_sequential_oracle(heads, scale, dtype, error):
     by_head = random_samples(np.random.default_rng(heads), heads, scale)
-    ray = oracle.render_ray(by_head, form)
+    ray = oracle.render_ray(by_head)
     samples = [s for head in by_head for s in head]
     samples = [samples[i] for i in np.argsort([-s.inverse_t for s in samples], kind="stable")]
     stack = {
@@ -183,7 +181,7 @@ def test_merged_ray_equals_the_sequential_oracle(heads, scale, form, dtype, erro
     }
     cover = torch.tensor(np.array([s.cover for s in samples]))
     shares = blend_shares(stack["reliability"], cover, torch.tensor([s.head for s in samples]))
-    tau = blended_optical_depth(stack["tau"], *shares, form)[None]
+    tau = blended_optical_depth(stack["tau"], *shares)[None]
     composite = composite_all(tau)
     color = render_colors(composite, stack["color"][None])
     median = median_inverse_distance(composite.weights, stack["inverse_t"][None], torch.ones_like(tau).bool())

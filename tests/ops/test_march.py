@@ -16,14 +16,14 @@ from mmpi_ns.rendering.sampler import MMPISampler
 from mmpi_ns.scene.plan import ScenePlan
 
 
-@pytest.mark.parametrize("form", ["paper", None])
+@pytest.mark.parametrize("blends", [True, False])
 @pytest.mark.parametrize(("num_mpis", "with_cube"), [(1, False), (4, True), (9, False)])
 @pytest.mark.parametrize("threshold", [0.0, 1e-3, 3e-2])
-def test_the_march_keeps_what_the_reference_keeps(monkeypatch, num_mpis, with_cube, form, threshold):
+def test_the_march_keeps_what_the_reference_keeps(monkeypatch, num_mpis, with_cube, blends, threshold):
     monkeypatch.setattr(reference, "OPAQUE_DEPTH", math.inf)  # the reference stops blending at 1e-4 of the light
     field = random_field(num_mpis, with_cube, seed=num_mpis, planes=40)
     rays = bundle(*random_rays(field.plan, 200, seed=1))
-    fast, plain = both(lambda: render(field, rays, threshold, form))
+    fast, plain = both(lambda: render(field, rays, threshold, blends))
     kept, wanted = fast.samples.metadata, plain.samples.metadata
     # A sample whose weight is the threshold's to the last bits may fall on either side of it.
     same = (kept["valid"].sum(1) == wanted["valid"].sum(1))[:, 0]
@@ -56,7 +56,7 @@ def test_behind_an_opaque_plane_the_march_visits_nothing_and_loses_a_hundred_tho
 
 def test_without_rays_or_samples_there_is_nothing_to_march():
     field = MMPIField(ScenePlan((make_mpi(),), None, 0.05, 1.0)).eval()
-    away = render(field, bundle([[0, 0, 0]], [[0, 0, -1]]), blend_form="paper")
+    away = render(field, bundle([[0, 0, 0]], [[0, 0, -1]]), blends=True)
     assert away.samples.metadata["valid"].sum() == 0 and away.composite.accumulation.item() == 0
     samples, report = MMPISampler()(bundle(torch.zeros(0, 3), torch.zeros(0, 3)), field=field, threshold=1e-3)
     assert samples.shape[0] == 0 and report.live.shape == (0,)
@@ -69,7 +69,7 @@ def test_results_do_not_depend_on_the_number_of_threads():
     for count in (1, 3):
         try:
             torch.set_num_threads(count)
-            found.append(render(field, rays, 1e-3, "paper"))
+            found.append(render(field, rays, 1e-3, True))
         finally:
             torch.set_num_threads(threads)
     one, three = found

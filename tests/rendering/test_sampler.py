@@ -17,22 +17,21 @@ from mmpi_ns.rendering.sampler import MMPISampler
 from mmpi_ns.scene.plan import CubePlan, ScenePlan
 
 
-@pytest.mark.parametrize("form", ["paper", "opacity", None])
+@pytest.mark.parametrize("blends", [True, False])
 @pytest.mark.parametrize("with_cube", [False, True])
 @pytest.mark.parametrize(("num_mpis", "rays"), [(1, 24), (4, 12), (12, 5)])
-def test_with_threshold_0_rays_look_as_the_oracle_says(num_mpis, rays, with_cube, form):
+def test_with_threshold_0_rays_look_as_the_oracle_says(num_mpis, rays, with_cube, blends):
     field = random_field(num_mpis, with_cube, seed=num_mpis)
-    assert compare(field, *random_rays(field.plan, rays, seed=5), form) >= 0.6 * rays
+    assert compare(field, *random_rays(field.plan, rays, seed=5), blends) >= 0.6 * rays
 
 
-@pytest.mark.parametrize("form", ["paper", "opacity"])
-def test_texels_that_no_ray_trained_do_not_vote(form):
+def test_texels_that_no_ray_trained_do_not_vote():
     field = random_field(4, True, seed=4)
     rays = random_rays(field.plan, 10, seed=6)
-    everyone = render(field, bundle(*rays), blend_form=form).composite.weights
+    everyone = render(field, bundle(*rays), blends=True).composite.weights
     field.touched[torch.rand(len(field.touched), generator=torch.Generator().manual_seed(0)) < 0.6] = 0
-    assert compare(field, *rays, form) >= 5
-    assert (render(field, bundle(*rays), blend_form=form).composite.weights - everyone).abs().max() > 0.01
+    assert compare(field, *rays, True) >= 5
+    assert (render(field, bundle(*rays), blends=True).composite.weights - everyone).abs().max() > 0.01
 
 
 @pytest.mark.parametrize("with_cube", [False, True])
@@ -60,22 +59,22 @@ def test_each_ray_goes_to_its_first_choice_among_the_mpis_that_it_meets_and_to_t
     assert any(second_choices), "no ray misses its first choice"
 
 
-@pytest.mark.parametrize("form", ["paper", "opacity", None])
-def test_samples_of_two_identical_mpis_tie_and_the_first_mpi_comes_first(form):
+@pytest.mark.parametrize("blends", [True, False])
+def test_samples_of_two_identical_mpis_tie_and_the_first_mpi_comes_first(blends):
     twin = make_mpi("a", (0.3, 0.1, -0.2), IDENTITY), make_mpi("b", (0.3, 0.1, -0.2), IDENTITY)
     field = fill(MMPIField(ScenePlan(twin, None, 0.05, 1.0), feature_channels=5, hidden_width=6), seed=1)
-    assert compare(field, *random_rays(field.plan, 10, seed=3), form) >= 8
-    samples = render(field, bundle([[0, 0, 0]], [[0, 0, 1]]), blend_form=form).samples
+    assert compare(field, *random_rays(field.plan, 10, seed=3), blends) >= 8
+    samples = render(field, bundle([[0, 0, 0]], [[0, 0, 1]]), blends=blends).samples
     assert samples.metadata["heads"][0, :, 0].tolist() == [0, 1] * 9
     assert (samples.metadata["inverse_t"][0, ::2] == samples.metadata["inverse_t"][0, 1::2]).all()
 
 
-@pytest.mark.parametrize("form", ["paper", None])
+@pytest.mark.parametrize("blends", [True, False])
 @pytest.mark.parametrize("threshold", [1e-3, 1e-2, 0.3])
-def test_dropping_samples_changes_a_ray_by_no_more_than_the_dropped_mass(threshold, form):
+def test_dropping_samples_changes_a_ray_by_no_more_than_the_dropped_mass(threshold, blends):
     field = random_field(4, True, seed=10, planes=40)
     rays = bundle(*random_rays(field.plan, 64, seed=11))
-    whole, part = render(field, rays, 0.0, form), render(field, rays, threshold, form)
+    whole, part = render(field, rays, 0.0, blends), render(field, rays, threshold, blends)
     dropped = part.report.dropped_mass
     assert ((part.rgb - whole.rgb).abs() <= dropped + 1e-5).all()
     assert ((part.composite.accumulation - whole.composite.accumulation).abs() <= 1e-5).all()
@@ -94,13 +93,13 @@ def test_with_a_fair_share_nothing_is_dropped_at_the_start_where_all_weights_are
     assert torch.allclose(found.composite.weights, torch.tensor(1 / 64), rtol=0.01)
 
 
-@pytest.mark.parametrize("form", ["paper", None])
-def test_rays_that_meet_nothing_are_empty(plan, form):
+@pytest.mark.parametrize("blends", [True, False])
+def test_rays_that_meet_nothing_are_empty(plan, blends):
     """Away from every head, alone in a batch, beside a ray that meets planes, and in a batch of no rays."""
     field = fill(MMPIField(plan), seed=0)
     backwards, forwards = [0.0, 0, -1], [0.0, 0, 1]
     for directions in ([backwards], [backwards, forwards], np.zeros((0, 3))):
-        found = render(field, bundle(np.zeros((len(directions), 3)), directions), blend_form=form)
+        found = render(field, bundle(np.zeros((len(directions), 3)), directions), blends=blends)
         count = len(directions)
         assert found.rgb.shape == (count, 3) and found.samples.shape[0] == count
         assert torch.isfinite(found.rgb).all()
@@ -116,7 +115,7 @@ def test_rays_that_meet_nothing_are_empty(plan, form):
 def test_samples_lie_between_near_and_far(near, far):
     field = random_field(4, True, seed=12)
     origins, directions = random_rays(field.plan, 12, seed=13)
-    assert compare(field, origins, directions, "paper", near=near, far=far) >= 4
+    assert compare(field, origins, directions, True, near=near, far=far) >= 4
     meta = render(field, bundle(origins, directions, near, far)).samples.metadata
     t = 1 / meta["inverse_t"][meta["valid"]]
     assert t.min() >= near * (1 - 1e-5) and t.max() <= far * (1 + 1e-5)
@@ -138,18 +137,18 @@ def test_the_plane_at_infinity_is_sampled_where_the_ray_points_and_not_where_it_
     assert render(field, bundle(origins, [direction, direction], far=1e6)).report.live.tolist() == [8, 0]
 
 
-@pytest.mark.parametrize("form", ["paper", None])
+@pytest.mark.parametrize("blends", [True, False])
 @pytest.mark.parametrize("threshold", [0.0, 1e-3])
-def test_a_ray_does_not_depend_on_its_batch(form, threshold):
+def test_a_ray_does_not_depend_on_its_batch(blends, threshold):
     field = random_field(4, True, seed=14, planes=30)
     origins, directions = random_rays(field.plan, 60, seed=15)
     order = np.random.default_rng(0).permutation(60)
-    whole = render(field, bundle(origins, directions), threshold, form)
-    shuffled = render(field, bundle(origins[order], directions[order]), threshold, form)
+    whole = render(field, bundle(origins, directions), threshold, blends)
+    shuffled = render(field, bundle(origins[order], directions[order]), threshold, blends)
     assert torch.equal(whole.report.live[order], shuffled.report.live)
     assert torch.allclose(whole.rgb[order], shuffled.rgb, atol=1e-6)
     for size in (1, 7, 59):
-        parts = [render(field, bundle(origins[i : i + size], directions[i : i + size]), threshold, form)
+        parts = [render(field, bundle(origins[i : i + size], directions[i : i + size]), threshold, blends)
                  for i in range(0, 60, size)]  # fmt: skip
         assert torch.allclose(whole.rgb, torch.cat([p.rgb for p in parts]), atol=1e-6)
         dropped = torch.cat([p.report.dropped_mass for p in parts])
@@ -204,10 +203,10 @@ def test_stopping_where_a_ray_is_opaque_changes_nothing_visible(monkeypatch):
     looked_up = []
     blend = reference._blend
     monkeypatch.setattr(reference, "_blend", lambda index, *rest: looked_up.append(len(index)) or blend(index, *rest))
-    stopped = render(field, rays, 1e-3, "paper")
+    stopped = render(field, rays, 1e-3, True)
     count = sum(looked_up)
     monkeypatch.setattr(reference, "OPAQUE_DEPTH", math.inf)
-    whole = render(field, rays, 1e-3, "paper")
+    whole = render(field, rays, 1e-3, True)
     assert count < 0.8 * (sum(looked_up) - count), "nothing was stopped"
     assert (stopped.rgb - whole.rgb).abs().max() < 1e-4
     assert (stopped.composite.accumulation - whole.composite.accumulation).abs().max() < 1e-4
@@ -215,7 +214,7 @@ def test_stopping_where_a_ray_is_opaque_changes_nothing_visible(monkeypatch):
 
 def test_ray_samples_hold_what_the_field_needs():
     field = random_field(4, True, seed=18)
-    found = render(field, bundle(*random_rays(field.plan, 9, seed=19)), blend_form="paper").samples
+    found = render(field, bundle(*random_rays(field.plan, 9, seed=19)), blends=True).samples
     width, valid = found.shape[1], found.metadata["valid"]
     assert found.shape == (9, width) and width == valid.sum(1).max()
     shapes = {name: tuple(value.shape) for name, value in found.metadata.items()}
@@ -237,7 +236,7 @@ def test_ray_samples_hold_what_the_field_needs():
 def test_the_sampler_builds_no_graph():
     field = random_field(2, True, seed=20).train()
     samples, report = MMPISampler()(
-        bundle(*random_rays(field.plan, 4, seed=21)), field=field, threshold=0.0, blend_form="paper"
+        bundle(*random_rays(field.plan, 4, seed=21)), field=field, threshold=0.0, blends=True
     )
     tensors = [*samples.metadata.values(), report.skipped_total, report.dropped_mass]
     assert not any(t.requires_grad for t in tensors)

@@ -40,8 +40,7 @@ def test_oracle_renders_two_planes_by_hand():
     assert ray.weights.tolist() == pytest.approx([9 / 16, 7 / 16 / 4])
     assert ray.color.tolist() == pytest.approx([7 / 64, 9 / 16, 0])
     assert ray.transmittance == pytest.approx(21 / 64) and ray.median_inverse_distance == 1.0
-    assert oracle.render_ray(samples, None).transmittance == pytest.approx(1 / 8)
-    assert oracle.render_ray(samples, "opacity").transmittance == pytest.approx(2**-0.5 * 4**-0.75)
+    assert oracle.render_ray(samples, False).transmittance == pytest.approx(1 / 8)
 
 
 def make_scene(num_mpis, seed):
@@ -53,7 +52,7 @@ def make_scene(num_mpis, seed):
     return plan, depth, torch.tensor(rng.random((rows, 3))), torch.tensor(rng.normal(size=(rows, 1)) * 3)
 
 
-def render_by_oracle(scene, origin, direction, form):
+def render_by_oracle(scene, origin, direction):
     plan, *tables = scene
     blocks = [
         [t[g.rows].view(g.depth, g.height, g.width, -1).numpy() for g in head_grids(plan)] for t in tables
@@ -67,10 +66,10 @@ def render_by_oracle(scene, origin, direction, form):
         )
         for head in range(len(plan.mpis))
     ]  # fmt: skip
-    return oracle.render_ray(samples, form)
+    return oracle.render_ray(samples)
 
 
-def render_by_modules(scene, origin, direction, form, dtype):
+def render_by_modules(scene, origin, direction, dtype):
     """One ray through geometry, texels, interpolate and compositing, as the sampler and the field do for batches."""
     plan, *tables = scene
     depths, colors, votes = (t.to(dtype) for t in tables)
@@ -87,7 +86,7 @@ def render_by_modules(scene, origin, direction, form, dtype):
         lookup = grid.bilinear(plan.mpis[k].planes - 1 - m, ndc[:, k, :2])
         reliability = [interpolate(votes, *g.trilinear(ndc[:, j]))[:, 0] for j, g in enumerate(grids)]
         log_p, log_q = blend_shares(torch.stack(reliability, -1), cover, torch.full_like(m, k))
-        tau = blended_optical_depth(interpolate(depths, *lookup)[:, 0], log_p, log_q, form)
+        tau = blended_optical_depth(interpolate(depths, *lookup)[:, 0], log_p, log_q)
         parts.append((inverse_t, tau, interpolate(colors, *lookup)))
     inverse_t, tau, color = (torch.cat(p)[None] for p in zip(*parts, strict=True))
     order = torch.sort(inverse_t, descending=True, stable=True).indices[0]
@@ -98,18 +97,17 @@ def render_by_modules(scene, origin, direction, form, dtype):
     return composite, rendered, median_inverse_distance(composite.weights, inverse_t, valid) if tau.numel() else None
 
 
-@pytest.mark.parametrize("form", ["paper", "opacity"])
 @pytest.mark.parametrize("num_mpis", [1, 4, 12])
 @pytest.mark.parametrize(("dtype", "error"), [(torch.float32, 2e-5), (torch.float64, 1e-10)])
-def test_modules_together_render_rays_as_the_oracle_does(num_mpis, form, dtype, error):
+def test_modules_together_render_rays_as_the_oracle_does(num_mpis, dtype, error):
     scene = make_scene(num_mpis, seed=num_mpis)
     rng, met = np.random.default_rng(99), 0
     for _ in range(8):
         target, _ = oracle.ndc_to_world(scene[0].mpis[0], rng.uniform(-1.2, 0.8, size=3))
         origin = rng.normal(size=3)
         direction = unit(target - origin)
-        wanted = render_by_oracle(scene, origin, direction, form)
-        composite, color, median = render_by_modules(scene, origin, direction, form, dtype)
+        wanted = render_by_oracle(scene, origin, direction)
+        composite, color, median = render_by_modules(scene, origin, direction, dtype)
         met += len(wanted.samples) > 0
         assert composite.weights.shape[1] == len(wanted.samples)
         assert np.abs(color[0].double().numpy() - wanted.color).max() < error

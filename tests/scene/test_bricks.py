@@ -101,22 +101,22 @@ def test_planes_are_read_and_written_as_images():
 # Rays ----------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("form", ["paper", "opacity", None])
+@pytest.mark.parametrize("blends", [True, False])
 @pytest.mark.parametrize("route", ["torch", "native"])
-def test_rays_through_released_bricks_look_as_the_oracle_says(monkeypatch, route, form):
+def test_rays_through_released_bricks_look_as_the_oracle_says(monkeypatch, route, blends):
     monkeypatch.setattr(dispatch, "_chosen", route)
     field = bricked_field()
-    assert compare(field, *random_rays(field.plan, 12, seed=5), form) >= 8
+    assert compare(field, *random_rays(field.plan, 12, seed=5), blends) >= 8
 
 
-@pytest.mark.parametrize("form", ["paper", None])
-def test_the_march_leaves_out_what_holds_nothing_and_keeps_the_rest(monkeypatch, form):
+@pytest.mark.parametrize("blends", [True, False])
+def test_the_march_leaves_out_what_holds_nothing_and_keeps_the_rest(monkeypatch, blends):
     field, rays = bricked_field(0.4), None
     rays = bundle(*random_rays(field.plan, 200, seed=1))
     found = []
     for route in ("native", "torch"):
         monkeypatch.setattr(dispatch, "_chosen", route)
-        found.append(render(field, rays, 1e-3, form))
+        found.append(render(field, rays, 1e-3, blends))
     fast, plain = found
     same = (fast.samples.metadata["valid"].sum(1) == plain.samples.metadata["valid"].sum(1))[:, 0]
     assert same.float().mean() > 0.97
@@ -317,9 +317,9 @@ def test_bricks_without_a_trained_texel_go_before_blending_and_change_nothing():
     field.reliability.data[field.touched == 0] = 0  # never trained: as it started
     rays = bundle(*random_rays(field.plan, 40, seed=2))
     field.density.data[field.touched == 0] = RELEASED_DENSITY
-    before, count = render(field, rays, blend_form="paper"), field.num_bricks
+    before, count = render(field, rays, blends=True), field.num_bricks
     assert field.release_untouched() is not None and field.num_bricks < count
-    after = render(field, rays, blend_form="paper")
+    after = render(field, rays, blends=True)
     assert (field.grids[1].rows < BRICK).all()
     assert (after.composite.weights - before.composite.weights).abs().max() < 1e-6
     assert (after.rgb - before.rgb).abs().max() < 1e-6

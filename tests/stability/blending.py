@@ -23,7 +23,7 @@ from stability.cases import (
 from stability.exact import Array
 
 from mmpi_ns.field.mmpi_field import MMPIField
-from mmpi_ns.ops.blending import BlendForm, blend_shares, blended_optical_depth
+from mmpi_ns.ops.blending import blend_shares, blended_optical_depth
 from mmpi_ns.ops.composite.reference import composite_weights, median_inverse_distance, render_colors
 
 TAUS = (0.0, 1e-30, 1e-12, 1e-6, 1e-3, 0.1, 1.0, 5.0, 30.0, 90.0, 1e4)
@@ -68,9 +68,7 @@ def _equal_start(planes: int, precision: Precision) -> Outcome:
 # Shares and blended depths -------------------------------------------------------------------------------------------
 
 
-def _blending(
-    heads: int, scale: float, form: BlendForm, precision: Precision, level: float = 0.0, half: bool = False
-) -> Outcome:
+def _blending(heads: int, scale: float, precision: Precision, level: float = 0.0, half: bool = False) -> Outcome:
     """Votes of a level and scale, for samples of every optical depth; ``half``: held in bfloat16."""
     rng, count = np.random.default_rng(heads), 40 * len(TAUS)
     own, cover = rng.integers(0, heads, count), rng.random((count, heads)) < 0.7
@@ -79,10 +77,10 @@ def _blending(
     reliability, tau = given.double().numpy(), single(np.resize(np.array(TAUS), count))
 
     def blended(votes: torch.Tensor, depth: torch.Tensor) -> torch.Tensor:
-        return blended_optical_depth(depth, *blend_shares(votes, torch.tensor(cover), torch.tensor(own)), form)
+        return blended_optical_depth(depth, *blend_shares(votes, torch.tensor(cover), torch.tensor(own)))
 
     (found,), (found_by_vote, found_by_tau) = tried(precision, blended, given, tau)
-    wanted = [exact.blend(t, r, c, int(o), form) for t, r, c, o in zip(tau, reliability, cover, own, strict=True)]
+    wanted = [exact.blend(t, r, c, int(o), True) for t, r, c, o in zip(tau, reliability, cover, own, strict=True)]
     value, by_tau, by_vote = (np.array([getattr(w, n) for w in wanted]) for n in ("depth", "by_tau", "by_reliability"))
     highest = np.where(cover, reliability, -np.inf).max(-1)
     spread = 1 + highest - np.where(cover, reliability, np.inf).min(-1)
@@ -233,15 +231,14 @@ def cases() -> list[Case]:
     for n in (16, 256, 1024):
         density.append((f"a new MPI of {n} planes", "weight 1/L on every plane", partial(_equal_start, n)))
     blending = []
-    for form in ("paper", "opacity"):
-        for heads, scale in ((2, 1.0), (2, 1e3), (12, 1.0), (12, 1e3)):
-            name = f"{heads} MPIs, reliabilities +-{scale:g}, tau 0 to 1e4, {form} form"
-            blending.append((name, shares, partial(_blending, heads, scale, form)))
+    for heads, scale in ((2, 1.0), (2, 1e3), (12, 1.0), (12, 1e3)):
+        name = f"{heads} MPIs, reliabilities +-{scale:g}, tau 0 to 1e4"
+        blending.append((name, shares, partial(_blending, heads, scale)))
     in_half = shares + " (gradient of R: as bfloat16 holds it)"
     blending += [
-        ("3 MPIs, reliabilities 1,000 +- 1", shares, partial(_blending, 3, 1.0, "paper", level=1e3)),
-        ("1 MPI (K = 1)", "exactly tau", partial(_blending, 1, 1e3, "paper")),
-        ("reliabilities in bfloat16", in_half, partial(_blending, 4, 3.0, "paper", half=True)),
+        ("3 MPIs, reliabilities 1,000 +- 1", shares, partial(_blending, 3, 1.0, level=1e3)),
+        ("1 MPI (K = 1)", "exactly tau", partial(_blending, 1, 1e3)),
+        ("reliabilities in bfloat16", in_half, partial(_blending, 4, 3.0, half=True)),
         ("12 MPIs that tie at -1e3 to 1e3", "P = 1/12 to 4 roundings", partial(_ties, 12)),
         ("sole cover, the others hold NaN, +-inf, 1e30", "exactly tau, gradients 1 and 0", _sole),
     ]

@@ -207,19 +207,16 @@ def shares(reliability: Array, cover: NDArray[np.bool_], own: int) -> tuple[list
     return [_DIGITS.divide(w, total) for w in weights], _DIGITS.divide(rest, total)
 
 
-def blend(tau: float, reliability: Array, cover: NDArray[np.bool_], own: int, form: str | None) -> Blended:
-    """-log(1 - alpha') with alpha' = P alpha (paper), 1 - (1 - alpha)^P (opacity), or tau itself (None)."""
+def blend(tau: float, reliability: Array, cover: NDArray[np.bool_], own: int, blends: bool) -> Blended:
+    """-log(1 - alpha') with alpha' = P alpha, or tau itself."""
     heads = len(cover)
-    if form is None:
+    if not blends:
         return Blended(tau, 1.0, np.zeros(heads))
     every, rest = shares(reliability, cover, own)
     share = every[own]
     # d share / d R_j = share (1 if j is own - P_j)
     slopes = [_DIGITS.multiply(share, (rest if j == own else -p)) for j, p in enumerate(every)]
     depth = Decimal(float(tau))
-    if form == "opacity":
-        by = np.array([float(_DIGITS.multiply(s, depth)) for s in slopes])
-        return Blended(float(_DIGITS.multiply(share, depth)), float(share), by)
     clear = _DIGITS.exp(-depth)
     passes = _DIGITS.add(rest, _DIGITS.multiply(share, clear))
     opaque = _DIGITS.divide(1 - clear, passes)

@@ -239,12 +239,12 @@ class ExactRay:
 
     # Rendering -----------------------------------------------------------------------------------------------
 
-    def blended(self, form: str | None) -> list[exact.Blended]:
-        return [exact.blend(s.tau, s.votes, s.cover, s.head, form) for s in self.samples]
+    def blended(self, blends: bool) -> list[exact.Blended]:
+        return [exact.blend(s.tau, s.votes, s.cover, s.head, blends) for s in self.samples]
 
-    def render(self, form: str | None = None) -> tuple[Array, exact.Composited]:
+    def render(self, blends: bool = False) -> tuple[Array, exact.Composited]:
         """Colour [3] without background, and weights and transmittance."""
-        made = exact.composite(np.array([b.depth for b in self.blended(form)]))
+        made = exact.composite(np.array([b.depth for b in self.blended(blends)]))
         if self.field.shading == "ray":
             return self._shaded_once(made), made
         color = np.zeros(3)
@@ -262,9 +262,9 @@ class ExactRay:
         odds = np.exp(8 * np.tanh(change / 8)) * mean[:3]
         return made.accumulation * odds / (odds + 1 - mean[:3])
 
-    def add_gradient(self, by_color: Array, form: str | None, total: Gradients) -> None:
+    def add_gradient(self, by_color: Array, blends: bool, total: Gradients) -> None:
         """Adds the derivatives of ``by_color`` . colour, and the magnitudes of all that is added."""
-        blended = self.blended(form)
+        blended = self.blended(blends)
         taus = np.array([b.depth for b in blended])
         made = exact.composite(taus)
         by_weight = np.array([float(by_color @ s.color) for s in self.samples])

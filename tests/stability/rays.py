@@ -32,7 +32,6 @@ from stability.exact_ray import TABLES, ExactField, ExactRay, Gradients
 
 from mmpi_ns.bench.rendering import bundle_of, of_slots, render
 from mmpi_ns.field.mmpi_field import MMPIField
-from mmpi_ns.ops.blending import BlendForm
 from mmpi_ns.rendering.rendered import RenderedRays
 from mmpi_ns.scene.plan import CubePlan, MPIPlan, ScenePlan
 
@@ -54,7 +53,7 @@ class Scene:
     field: MMPIField
     origins: Array
     directions: Array
-    form: BlendForm | None = None
+    blends: bool = False
     far: float = math.inf
 
     @property
@@ -67,7 +66,7 @@ class Scene:
         return rays.to(self.field.density.device)
 
     def render(self, threshold: float = 0.0, rows: Any = slice(None)) -> RenderedRays:
-        return render(self.field, self.bundle(rows), threshold, self.form)
+        return render(self.field, self.bundle(rows), threshold, self.blends)
 
     def clear(self) -> tuple[Scene, list[ExactRay]]:
         """Those of its rays whose every decision is clear, and the same rays exactly."""
@@ -78,7 +77,7 @@ class Scene:
             raise ValueError(f"Only {len(kept)} of {len(every)} rays are clear: choose other rays for this case.")
         exact = [every[i] for i in kept]
         covered = [sample.cover.sum() for ray in exact for sample in ray.samples]
-        if self.form is not None and known.plan.num_heads > 1 and max(covered) < 2:
+        if self.blends and known.plan.num_heads > 1 and max(covered) < 2:
             raise ValueError("No sample of this case is covered twice: nothing is blended.")
         return replace(self, origins=self.origins[kept], directions=self.directions[kept]), exact
 
@@ -121,7 +120,7 @@ def _mpis(count: int, seed: int, scale: float = 1.0, shift: float = 0.0) -> list
 def scene(
     count: int,
     rays: int,
-    form: BlendForm | None,
+    blends: bool,
     seed: int = 0,
     *,
     scale: float = 1.0,
@@ -135,14 +134,14 @@ def scene(
     mpis = _mpis(count, seed, scale, shift)
     field = filled(plan_of(mpis, cube, 0.05 * scale), seed, **tables)
     field.touched[torch.rand(len(field.touched), generator=torch.Generator().manual_seed(0)) < untrained] = 0
-    return Scene(field, *rays_at(np.random.default_rng(seed + 100), mpis, rays), form, far)
+    return Scene(field, *rays_at(np.random.default_rng(seed + 100), mpis, rays), blends, far)
 
 
 def _twins() -> Scene:
     """Two identical MPIs: every distance ties."""
     mpi = _mpis(1, 3)[0]
     field = filled(plan_of([mpi, mpi]), 3)
-    return Scene(field, *rays_at(np.random.default_rng(4), [mpi], 8), "paper")
+    return Scene(field, *rays_at(np.random.default_rng(4), [mpi], 8), True)
 
 
 # Measures ------------------------------------------------------------------------------------------------------------
@@ -158,11 +157,11 @@ def wrong_samples(found: RenderedRays, rays: list[ExactRay]) -> int:
     return wrong
 
 
-def slopes_of(rays: list[ExactRay], by: Array, form: str | None) -> tuple[dict[str, Array], dict[str, float]]:
+def slopes_of(rays: list[ExactRay], by: Array, blends: bool) -> tuple[dict[str, Array], dict[str, float]]:
     """Derivatives of the sum of ``by`` times the rays' colours by every table, and the largest sum of magnitudes."""
     total = Gradients(rays[0].field)
     for ray, by_color in zip(rays, by, strict=True):
-        ray.add_gradient(by_color, form, total)
+        ray.add_gradient(by_color, blends, total)
     slopes, sizes = ({n: total.flat(tables, n) for n in TABLES} for tables in (total.sums, total.sizes))
     return slopes, {name: float(size.max()) for name, size in sizes.items()}
 
@@ -186,15 +185,15 @@ def measure(make: Callable[[], Scene], precision: Precision) -> Outcome:
         gradients = gradients_of(s.field, found, by)
     if wrong := wrong_samples(found, exact):
         return Outcome.of([], wrong=wrong)
-    wanted = np.array([ray.render(s.form)[0] for ray in exact])
-    slopes, sizes = slopes_of(exact, by, s.form)
+    wanted = np.array([ray.render(s.blends)[0] for ray in exact])
+    slopes, sizes = slopes_of(exact, by, s.blends)
     moved_color, moved_slope = np.zeros(len(exact)), {name: 0.0 for name in gradients}
     for draw in range(DRAWS):
         jitters = [Jitter(MOVE, 8 * precision.network_unit, 31 * draw + i) for i in range(len(exact))]
         rays = [replace(ray, jitter=j, samples=[]) for ray, j in zip(exact, jitters, strict=True)]
-        colors = np.array([ray.render(s.form)[0] for ray in rays])
+        colors = np.array([ray.render(s.blends)[0] for ray in rays])
         moved_color = np.maximum(moved_color, np.abs(colors - wanted).max(-1))
-        moved, _ = slopes_of(rays, by, s.form)
+        moved, _ = slopes_of(rays, by, s.blends)
         for name in gradients:
             moved_slope[name] = max(moved_slope[name], float(np.abs(moved[name] - slopes[name]).max()))
     off = np.abs(as_array(found.colors.rgb) - wanted).max(-1)
@@ -211,7 +210,7 @@ def measure(make: Callable[[], Scene], precision: Precision) -> Outcome:
 
 def _chunks(threshold: float, precision: Precision) -> Outcome:
     """The same rays all at once and in pieces of 1, 7 and 19; and in another order."""
-    s = scene(4, 32, "paper", 16, cube=CUBE)
+    s = scene(4, 32, True, 16, cube=CUBE)
     count, errors = len(s.origins), []
     order = np.random.default_rng(0).permutation(count)
     with torch.no_grad(), precision.context():
@@ -233,7 +232,7 @@ def _chunks(threshold: float, precision: Precision) -> Outcome:
 
 def _threshold(threshold: float, precision: Precision) -> Outcome:
     """Dropping samples changes a colour by no more than the mass that was dropped."""
-    s = scene(4, 100, "paper", 17, log_depths=(-3, 1.0))
+    s = scene(4, 100, True, 17, log_depths=(-3, 1.0))
     with torch.no_grad(), precision.context():
         whole, part = (s.render(t) for t in (0.0, threshold))
     dropped = as_array(part.report.dropped_mass)
@@ -245,7 +244,7 @@ def _threshold(threshold: float, precision: Precision) -> Outcome:
 
 def _nothing(precision: Precision) -> Outcome:
     """Rays that meet nothing, alone and beside one that meets planes, and no rays at all."""
-    s = scene(2, 2, "paper", 5)
+    s = scene(2, 2, True, 5)
     away = -np.sum([m.axes[2] for m in s.field.plan.mpis], 0, keepdims=True)
     away = away / np.linalg.norm(away)
     origins = np.concatenate([np.array(s.field.plan.mpis[0].origin)[None] + 1e4 * away, s.origins[:1]])
@@ -263,21 +262,20 @@ def _nothing(precision: Precision) -> Outcome:
 def cases() -> list[Case]:
     """All cases of whole rays."""
     rays: list[tuple[str, Callable[[], Scene]]] = [
-        ("1 MPI (K = 1)", partial(scene, 1, 16, None, 1)),
-        ("4 MPIs, no reliability (joint)", partial(scene, 4, 10, None, 2)),
-        ("4 MPIs, paper form", partial(scene, 4, 10, "paper", 2)),
-        ("4 MPIs, opacity form", partial(scene, 4, 10, "opacity", 2)),
-        ("4 MPIs and a cube, paper form", partial(scene, 4, 8, "paper", 6, cube=CUBE)),
-        ("12 MPIs (K = 12), paper form", partial(scene, 12, 4, "paper", 7)),
-        ("4 MPIs, 60 % of the texels untrained", partial(scene, 4, 10, "paper", 8, untrained=0.6)),
+        ("1 MPI (K = 1)", partial(scene, 1, 16, False, 1)),
+        ("4 MPIs, no reliability (joint)", partial(scene, 4, 10, False, 2)),
+        ("4 MPIs, blended", partial(scene, 4, 10, True, 2)),
+        ("4 MPIs and a cube, blended", partial(scene, 4, 8, True, 6, cube=CUBE)),
+        ("12 MPIs (K = 12), blended", partial(scene, 12, 4, True, 7)),
+        ("4 MPIs, 60 % of the texels untrained", partial(scene, 4, 10, True, 8, untrained=0.6)),
         ("two identical MPIs: all distances tie", _twins),
-        ("raw densities +-1e4", partial(scene, 3, 10, "paper", 9, density=1e4)),
-        ("reliabilities +-1e3", partial(scene, 3, 10, "paper", 10, votes=1e3)),
-        ("optical depths 1e-12 to 1e-4", partial(scene, 3, 10, "paper", 11, log_depths=(-12, -4))),
-        ("scene scale 1e-4", partial(scene, 3, 10, "paper", 12, scale=2.0**-13)),
-        ("scene scale 1e5", partial(scene, 3, 10, "paper", 13, scale=2.0**17)),
-        ("everything 1e6 units from the world's origin", partial(scene, 3, 12, "paper", 14, scale=8.0, shift=1e6)),
-        ("finite far (8 units)", partial(scene, 3, 12, "paper", 15, far=8.0)),
+        ("raw densities +-1e4", partial(scene, 3, 10, True, 9, density=1e4)),
+        ("reliabilities +-1e3", partial(scene, 3, 10, True, 10, votes=1e3)),
+        ("optical depths 1e-12 to 1e-4", partial(scene, 3, 10, True, 11, log_depths=(-12, -4))),
+        ("scene scale 1e-4", partial(scene, 3, 10, True, 12, scale=2.0**-13)),
+        ("scene scale 1e5", partial(scene, 3, 10, True, 13, scale=2.0**17)),
+        ("everything 1e6 units from the world's origin", partial(scene, 3, 12, True, 14, scale=8.0, shift=1e6)),
+        ("finite far (8 units)", partial(scene, 3, 12, True, 15, far=8.0)),
     ]
     exactly = (
         "the exact samples in the exact order; colours and gradients within what moving every input by 8 roundings "

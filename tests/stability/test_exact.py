@@ -12,8 +12,6 @@ from random_fields import OracleRay, random_field, random_rays
 from stability import exact
 from stability.exact_ray import ExactField, ExactRay, Gradients
 
-FORMS = ["paper", "opacity", None]
-
 
 def test_crossings_equal_the_oracle():
     rng = np.random.default_rng(0)
@@ -46,14 +44,13 @@ def test_points_far_and_at_infinity_lie_where_the_oracle_says():
         assert found is None or np.allclose(found[0], wanted, rtol=1e-9)
 
 
-@pytest.mark.parametrize("form", ["paper", "opacity"])
 @pytest.mark.parametrize("scale", [1.0, 1e3])
-def test_blending_equals_the_oracle_and_has_its_differences(form, scale):
+def test_blending_equals_the_oracle_and_has_its_differences(scale):
     rng = np.random.default_rng(2)
     reliability, cover, own = random_votes(rng, 60, 4, scale)
     for r, c, o, tau in zip(reliability, cover, own, 10 ** rng.uniform(-6, 2, 60), strict=True):
-        made = exact.blend(tau, r, c, o, form)
-        assert made.depth == pytest.approx(oracle.blended_depth(tau, r, c, o, form), rel=1e-14, abs=1e-300)
+        made = exact.blend(tau, r, c, o, True)
+        assert made.depth == pytest.approx(oracle.blended_depth(tau, r, c, o), rel=1e-14, abs=1e-300)
         every, rest = exact.shares(r, c, int(o))
         log_share, log_rest = oracle.log_shares(r, c, o)
         assert float(every[o].ln()) == pytest.approx(log_share, rel=1e-14)
@@ -62,14 +59,12 @@ def test_blending_equals_the_oracle_and_has_its_differences(form, scale):
             continue
         h = 1e-6
         differences = [
-            (oracle.blended_depth(tau, r + h * e, c, o, form) - oracle.blended_depth(tau, r - h * e, c, o, form))
-            / 2
-            / h
+            (oracle.blended_depth(tau, r + h * e, c, o) - oracle.blended_depth(tau, r - h * e, c, o)) / 2 / h
             for e in np.eye(4)
         ]
         assert np.allclose(made.by_reliability, differences, rtol=1e-6, atol=1e-8)
         h = 1e-4 * tau
-        slope = (oracle.blended_depth(tau + h, r, c, o, form) - oracle.blended_depth(tau - h, r, c, o, form)) / 2 / h
+        slope = (oracle.blended_depth(tau + h, r, c, o) - oracle.blended_depth(tau - h, r, c, o)) / 2 / h
         assert made.by_tau == pytest.approx(slope, rel=1e-5)
 
 
@@ -97,9 +92,9 @@ def test_biases_give_every_plane_an_equal_weight():
     assert np.allclose(weights, 1 / 48, rtol=2e-3) and np.allclose(weights[:-1], 1 / 48, rtol=1e-12)
 
 
-@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("blends", [True, False])
 @pytest.mark.parametrize("with_cube", [False, True])
-def test_whole_rays_equal_the_oracle(with_cube, form):
+def test_whole_rays_equal_the_oracle(with_cube, blends):
     field = random_field(3, with_cube, seed=1)
     field.touched[::3] = 0
     known, met = ExactField.of(field), 0
@@ -107,8 +102,8 @@ def test_whole_rays_equal_the_oracle(with_cube, form):
         found, wanted = ExactRay(known, origin, direction), OracleRay(field, origin, direction)
         if wanted.margin < 1e-9:
             continue
-        expected = wanted.render(form)
-        color, made = found.render(form)
+        expected = wanted.render(blends)
+        color, made = found.render(blends)
         assert [(s.head, s.plane) for s in found.samples] == [(s.head, s.plane) for s in expected.samples]
         assert np.allclose(made.weights, expected.weights, atol=1e-10)
         assert np.allclose(color, expected.color, atol=1e-10)
@@ -116,13 +111,13 @@ def test_whole_rays_equal_the_oracle(with_cube, form):
     assert met >= 4
 
 
-@pytest.mark.parametrize("form", FORMS)
-def test_gradients_of_a_whole_ray_are_its_finite_differences(form):
+@pytest.mark.parametrize("blends", [True, False])
+def test_gradients_of_a_whole_ray_are_its_finite_differences(blends):
     field = random_field(2, True, seed=4)
     known = ExactField.of(field)
     origin, direction = (x[0] for x in random_rays(field.plan, 1, seed=5))
     by_color, total = np.array([1.0, -0.7, 0.4]), Gradients(known)
-    ExactRay(known, origin, direction).add_gradient(by_color, form, total)
+    ExactRay(known, origin, direction).add_gradient(by_color, blends, total)
     checked = 0
     for name in ("density", "features", "reliability", "networks"):
         for table, gradient in zip(known.tables[name], total.sums[name], strict=True):
@@ -131,8 +126,8 @@ def test_gradients_of_a_whole_ray_are_its_finite_differences(form):
                 values = []
                 for move in (1e-5, -2e-5):
                     table[index] += move
-                    values.append(by_color @ ExactRay(known, origin, direction).render(form)[0])
+                    values.append(by_color @ ExactRay(known, origin, direction).render(blends)[0])
                 table[index] += 1e-5
                 assert gradient[index] == pytest.approx((values[0] - values[1]) / 2e-5, rel=1e-4, abs=1e-7)
                 checked += abs(gradient[index]) > 1e-4
-    assert checked >= (20 if form else 14)
+    assert checked >= (20 if blends else 14)

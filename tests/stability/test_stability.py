@@ -67,7 +67,7 @@ def test_shares_from_log_softmax_alone_fail_where_reliability_is_saturated(monke
         share = torch.where(cover, reliability, -math.inf).log_softmax(-1).gather(1, own[:, None])[:, 0]
         return share, torch.log1p(-share.exp())
 
-    case = named("12 MPIs, reliabilities +-1000, tau 0 to 1e4, paper form", cases_blending)
+    case = named("12 MPIs, reliabilities +-1000, tau 0 to 1e4", cases_blending)
     assert case.measure(FLOAT32).holds
     monkeypatch.setattr(cases_blending, "blend_shares", plain)
     assert not case.measure(FLOAT32).holds
@@ -109,7 +109,7 @@ def test_an_unstable_sort_fails_the_ties(monkeypatch):
 
 def test_a_whole_ray_with_a_wrong_gradient_fails(monkeypatch):
     """Colours are right, but the reliability's gradient is 0.1 % too large."""
-    case = named("4 MPIs, paper form", cases_rays)
+    case = named("4 MPIs, blended", cases_rays)
     assert case.measure(FLOAT32).holds
 
     class Scaled(torch.autograd.Function):

@@ -12,14 +12,9 @@ from torch import Tensor
 
 from mmpi_ns.bench.gpu.scenes import CUBE, Scene, gradients_of, random_scene, samples_of
 from mmpi_ns.bench.rendering import of_slots
-from mmpi_ns.field.baking import baked_shares
-from mmpi_ns.field.samples import metadata_of
 from mmpi_ns.ops import dispatch, interpolate, variation
-from mmpi_ns.ops.blending import BlendForm, blended_optical_depth, interpolate_shares
 from mmpi_ns.ops.composite import composite_weights
 from mmpi_ns.ops.interpolate import reference as plain
-from mmpi_ns.ops.march.reference import NEGLIGIBLE_DEPTH
-from mmpi_ns.rendering.sampler import MMPISampler
 from mmpi_ns.scene.plan import CubePlan
 from mmpi_ns.training.touched_adam import TouchedAdam
 
@@ -91,33 +86,13 @@ def marched(s: Scene, name: str, exact: Scene) -> list[Check]:
 
 
 def marches(device: str, rehearse: bool) -> list[Check]:
-    """One, four and nine heads, with and without the cube, in every form of blending."""
-    cases: list[tuple[int, BlendForm | None, CubePlan | None]]
-    cases = [(4, "paper", CUBE), (1, None, None), (4, None, None), (4, "opacity", None), (9, None, CUBE)]
+    """One, four and nine heads, with and without the cube, blended and not."""
+    cases: list[tuple[int, bool, CubePlan | None]]
+    cases = [(4, True, CUBE), (1, False, None), (4, False, None), (4, True, None), (9, False, CUBE)]
     found = []
-    for count, form, cube in cases[: 1 if rehearse else None]:
-        name = f"{count} MPIs{' and the cube' if cube else ''}, {form or 'no'} blending"
-        found += whole_rays(random_scene(count, 4 if rehearse else 200, form, count, cube), name, device)
-    return found
-
-
-@torch.no_grad()
-def baked_march(device: str, rehearse: bool) -> list[Check]:
-    """Optical depths blended by shares at texels, against the same blending of plain samples in float64."""
-    s, found = random_scene(3, 4 if rehearse else 200, None, 5, CUBE), []
-    field = s.field.to(device)
-    unblended = s.render()
-    shares, valid = baked_shares(field), of_slots(unblended, "valid")
-    tau, heads = of_slots(unblended, "tau")[valid].double().cpu(), of_slots(unblended, "heads")[valid].cpu().long()
-    ndc = metadata_of(unblended.samples)["ndc"][valid].double().cpu()
-    share = interpolate_shares(field.cpu().layout, shares.double().cpu(), ndc, heads)
-    field.to(device)
-    for form in ("paper", "opacity")[: 1 if rehearse else None]:
-        samples, _ = MMPISampler()(s.bundle.to(device), field=field, threshold=0.0, blend_form=form, shares=shares)
-        made = metadata_of(samples)["tau"][..., 0][valid]
-        wanted = blended_optical_depth(tau, share.log(), torch.log1p(-share), form)
-        wanted = torch.where(tau > NEGLIGIBLE_DEPTH, wanted, tau / len(field.grids))
-        found.append(Check(f"shares at texels, {form} blending", _relative(made, wanted), 1e-4))
+    for count, blends, cube in cases[: 1 if rehearse else None]:
+        name = f"{count} MPIs{' and the cube' if cube else ''}, {'' if blends else 'no '}blending"
+        found += whole_rays(random_scene(count, 4 if rehearse else 200, blends, count, cube), name, device)
     return found
 
 
@@ -166,7 +141,7 @@ def distinct_rows(device: str, samples: int) -> list[Check]:
 
 def variations(device: str, texels: int) -> list[Check]:
     """Total variation of MPIs and a cube with its gradient."""
-    field = random_scene(3, 1, None, cube=CUBE).field.to(device)
+    field = random_scene(3, 1, False, cube=CUBE).field.to(device)
     table = _draw(device, len(field.density), 9) * 2
     rows = torch.randperm(len(table), generator=torch.Generator().manual_seed(1))[:texels].to(device)
 
@@ -225,7 +200,6 @@ def everything(device: str, rehearse: bool) -> list[Callable[[], list[Check]]]:
         lambda: variations(device, 200 if rehearse else 100_000),
         lambda: adam(device, size),
         lambda: marches(device, rehearse),
-        lambda: baked_march(device, rehearse),
     ]
 
 

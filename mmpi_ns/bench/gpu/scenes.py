@@ -13,7 +13,6 @@ from torch import Tensor
 
 from mmpi_ns.bench.rendering import Array, bundle_of, in_float64, of_slots, render
 from mmpi_ns.field.mmpi_field import MMPIField
-from mmpi_ns.ops.blending import BlendForm
 from mmpi_ns.rendering.rendered import RenderedRays
 from mmpi_ns.scene.plan import CubePlan, MPIPlan, ScenePlan
 
@@ -31,10 +30,10 @@ class Scene:
 
     field: MMPIField
     bundle: RayBundle
-    form: BlendForm | None = None
+    blends: bool = False
 
     def render(self, threshold: float = 0.0) -> RenderedRays:
-        return render(self.field, self.bundle.to(self.field.density.device), threshold, self.form)
+        return render(self.field, self.bundle.to(self.field.density.device), threshold, self.blends)
 
     def exact(self) -> Scene:
         """The same in float64 on the CPU, for which there is plain torch alone."""
@@ -82,7 +81,7 @@ def gradients_of(field: MMPIField, found: RenderedRays, by: Array) -> dict[str, 
     return {n: (g.to_dense() if g.is_sparse else g).cpu() for n, g in grads.items() if g is not None}
 
 
-def random_scene(count: int, rays: int, form: BlendForm | None, seed: int = 0, cube: CubePlan | None = None) -> Scene:
+def random_scene(count: int, rays: int, blends: bool, seed: int = 0, cube: CubePlan | None = None) -> Scene:
     """MPIs side by side that face about the same way, so that most points are covered by several; all texels trained,
     optical depths of a sample from 1e-3 to 1."""
     rng, g = np.random.default_rng(seed), torch.Generator().manual_seed(seed)
@@ -99,7 +98,7 @@ def random_scene(count: int, rays: int, form: BlendForm | None, seed: int = 0, c
     targets = np.array([m.near / rng.uniform(0.1, 0.9) * (t @ np.array(m.axes)) + m.origin
                         for m, t in zip(aimed, tangents, strict=True)])  # fmt: skip
     away = targets - origins
-    return Scene(field, bundle_of(origins, away / np.linalg.norm(away, axis=-1, keepdims=True)), form)
+    return Scene(field, bundle_of(origins, away / np.linalg.norm(away, axis=-1, keepdims=True)), blends)
 
 
 def _mpi(rng: np.random.Generator, name: str) -> MPIPlan:

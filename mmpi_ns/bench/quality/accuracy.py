@@ -12,7 +12,6 @@ import torch
 from mmpi_ns.bench.quality.solids import Solids, bake
 from mmpi_ns.bench.rendering import AHEAD, Array, bundle_of, of_slots, render
 from mmpi_ns.bench.report import Bench, Report, Row, figure, page, table
-from mmpi_ns.ops.blending import BlendForm
 from mmpi_ns.ops.composite.reference import median_inverse_distance
 from mmpi_ns.scene.plan import MPIPlan
 
@@ -24,7 +23,7 @@ TEXELS = (9, 17, 33, 65, 129)
 COUNTS = (1, 2, 3, 4, 6)
 THRESHOLD = 1e-4
 """Samples of less weight are not coloured: hundreds lie behind the first that is opaque."""
-FORMS: tuple[BlendForm | None, ...] = (None, "paper", "opacity")
+FORMS = ("joint", "blended")
 
 
 @dataclass
@@ -51,12 +50,12 @@ def cameras() -> tuple[Array, Array]:
     return origins, np.tile(directions, (len(places), 1))
 
 
-def measure(solids: Solids, mpis: list[MPIPlan], form: BlendForm | None = None) -> dict[str, float]:
+def measure(solids: Solids, mpis: list[MPIPlan], blends: bool = False) -> dict[str, float]:
     """Mean errors over all rays. Depth is compared in inverse distance, in which planes are evenly spaced."""
     origins, directions = cameras()
     field = bake(solids, mpis)
     with torch.no_grad():
-        found = render(field, bundle_of(origins, directions), THRESHOLD, form)
+        found = render(field, bundle_of(origins, directions), THRESHOLD, blends)
     t = solids.hit(origins, directions)
     exact = solids.color(origins + t[:, None] * directions)
     slots = (of_slots(found, name) for name in ("inverse_t", "valid"))
@@ -115,10 +114,10 @@ def several(count: int, planes: int = 17) -> list[MPIPlan]:
 
 
 def by_count() -> list[Row]:
-    """Ever more MPIs of 17 planes each, merged without reliability and with equal reliability in both forms."""
+    """Ever more MPIs of 17 planes each, merged without reliability and blended with equal reliability."""
     rows = []
     for count in COUNTS:
-        row: Row = {"mpis": count} | {form or "joint": measure(SLANTED, several(count), form) for form in FORMS}
+        row: Row = {"mpis": count} | {form: measure(SLANTED, several(count), form == "blended") for form in FORMS}
         print("{mpis} MPIs: depth {joint[depth_error]:.2e}, colour {joint[color_error]:.2e}".format(**row), flush=True)
         rows.append(row)
     return rows
@@ -187,12 +186,12 @@ finest is {head["depth_error_over_expected"]:.2f} times that. Of all added MPIs 
     )
     texels = {"texels": "{texels} x {texels}", "colour error": "{color_error:.2e}", "order": "{color_error_order}"}
     by_form = {"K": "{mpis}"}
-    for form in (f or "joint" for f in FORMS):
+    for form in FORMS:
         by_form |= {f"{form}: depth": f"{{{form}[depth_error]:.2e}}", f"{form}: colour": f"{{{form}[color_error]:.2e}}"}
     merged = """\
-K MPIs of 17 planes around the cameras. *Joint*: merged without reliability, as trained together. *Paper* and
-*opacity*: blended with equal reliability everywhere, before it has learned anything. The paper's form then
-lets (1 - 1/K)^K of the light through K opaque samples and mixes in what lies deeper."""
+K MPIs of 17 planes around the cameras. *Joint*: merged without reliability, as trained together. *Blended*:
+with equal reliability everywhere, before it has learned anything. It then lets (1 - 1/K)^K of the light
+through K opaque samples and mixes in what lies deeper."""
     blocks = [said, table(columns, orders), half, "![Errors over planes, texels and MPIs](accuracy.png)"]
     blocks += ["## Planes", "One MPI, 121 x 97 texels.", planes, "## Texels"]
     blocks += ["A flat wall that lies in a plane of the MPI: only the texture is interpolated."]
@@ -213,7 +212,7 @@ def draw(path: Path, rows: dict[str, list[Row]]) -> None:
         middle.loglog(x, errors, "s-", color="C1", label="colour")
         middle.loglog(x, errors[0] * (x[0] / x) ** 2, "k--", lw=1, label="order 2")
         middle.set(xlabel="texels - 1", title="one MPI, wall in a plane")
-        for form, style in zip((f or "joint" for f in FORMS), ("o-", "^:", "v:"), strict=False):
+        for form, style in zip(FORMS, ("o-", "^:"), strict=True):
             for what, color in (("depth", "C0"), ("color", "C1")):
                 errors = [r[form][f"{what}_error"] for r in mpis]
                 right.plot([r["mpis"] for r in mpis], errors, style, color=color, label=f"{what}, {form}")

@@ -11,8 +11,6 @@ constexpr float OPAQUE = 1e-5f;      // light that may be lost behind the end of
 constexpr float NEGLIGIBLE = 1e-4f;  // optical depths below this get an equal share without a lookup
 constexpr float INFINITY_T = 1e-10f; // inverse distances are no less where a distance is needed
 
-enum Form { NO_BLENDING, PAPERS_FORM, BAKED_SHARES };
-
 struct Rays {
     const float *origins, *directions;             // [R, 3] world
     const float *local_origins, *local_directions; // [R, K, 3]
@@ -66,23 +64,11 @@ inline bool place(const Scene& scene, const Rays& rays, int64_t ray, int64_t j, 
 
 inline float softplus(float x) { return x > 20 ? x : std::log1p(std::exp(x)); }
 
-// Optical depth of a sample after blending with the share that its texels hold (where reliability stand shares).
-inline float blended_baked(const Scene& scene, int64_t own, const float* ndc, float tau) {
-    const float share = std::min(std::max(trilinear(scene.reliability, scene.grids[own], ndc), 0.0f), 1.0f);
-    if (share == 1) return tau; // the sole cover
-    const float alpha = -std::expm1(-tau) * share;
-    return alpha < 0.5f ? -std::log1p(-alpha) : -std::log(1 - share + share * std::exp(-tau));
-}
-
 // Optical depth of a sample after blending (blending.blend_shares and blended_optical_depth).
 inline float blended(const Scene& scene, const Rays& rays, int64_t ray, int64_t own, float inverse_t, float tau,
-                     int form, std::vector<float>& votes) {
+                     std::vector<float>& votes) {
     if (tau <= NEGLIGIBLE) return tau / float(scene.num_heads);
     float ndc[3], own_vote = 0, highest = -std::numeric_limits<float>::infinity(), others = 0;
-    if (form == BAKED_SHARES) {
-        place(scene, rays, ray, own, inverse_t, ndc);
-        return blended_baked(scene, own, ndc, tau);
-    }
     votes.clear();
     for (int64_t j = 0; j < scene.num_heads; j++) {
         if (!place(scene, rays, ray, j, inverse_t, ndc) && j != own) continue;

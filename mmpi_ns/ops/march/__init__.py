@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.layout import SceneLayout, Tables
-from mmpi_ns.ops.march import reference
 from mmpi_ns.ops.march.reference import Crossings, MarchOptions, MergedSamples
 
 __all__ = ["Crossings", "MarchOptions", "MergedSamples", "march"]
@@ -24,6 +23,4 @@ def march(layout: SceneLayout, tables: Tables, rays: Crossings, options: MarchOp
         rays: where R rays cross it.
         options: which samples are kept, and how they are blended.
     """
-    if options.form == "opacity":
-        return reference.march(layout, tables, rays, options)
     return dispatch.run("march", layout, tables, rays, options)

@@ -12,8 +12,6 @@ from mmpi_ns.ops.cpu_scene import CpuScene
 from mmpi_ns.ops.layout import SceneLayout, Tables
 from mmpi_ns.ops.march.reference import Crossings, MarchOptions, MergedSamples
 
-NO_BLENDING, PAPERS_FORM, BAKED_SHARES = range(3)
-"""How the compiled marches are told in which form reliability enters."""
 _FLAT = (torch.int32, torch.int32, *[torch.float32] * 4)
 _SLOTS = (torch.int64, torch.int64, *[torch.float32] * 4, torch.bool)
 
@@ -38,10 +36,9 @@ class Rays(ctypes.Structure):
         return made
 
 
-def how(options: MarchOptions) -> tuple[float, float, ctypes.c_int]:
-    """Threshold, fair share, and in which form reliability enters, as the compiled marches take them."""
-    form = NO_BLENDING if options.form is None else BAKED_SHARES if options.baked else PAPERS_FORM
-    return float(options.threshold), float(options.fair_share), ctypes.c_int(form)
+def how(options: MarchOptions) -> tuple[float, float, ctypes.c_bool]:
+    """Threshold, fair share, and whether reliability enters, as the compiled marches take them."""
+    return float(options.threshold), float(options.fair_share), ctypes.c_bool(options.blends)
 
 
 def march(layout: SceneLayout, tables: Tables, rays: Crossings, options: MarchOptions) -> MergedSamples:

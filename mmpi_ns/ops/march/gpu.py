@@ -225,18 +225,6 @@ def _blend(origins, directions, local_origins, local_directions, constants, grid
 
 
 @triton.jit
-def _blend_baked(grids, shares, head, u, v, s, tau, wanted, K: tl.constexpr, HAS_CUBE: tl.constexpr):
-    """Optical depths after blending with the shares that stand where reliability does."""
-    thick = wanted & (tau > NEGLIGIBLE)
-    share = tl.minimum(tl.maximum(trilinear(shares, grids, head, u, v, s, thick), 0.0), 1.0)
-    alpha = one_minus_exp(tau) * share
-    left = tl.where(share < 1, 1 - share + share * tl.exp(-tau), 1.0)
-    blended = tl.where(alpha < 0.5, minus_log_of_rest(tl.minimum(alpha, 0.5)), -tl.log(left))
-    blended = tl.where(share < 1, blended, tau)
-    return tl.where(thick, blended, tau / (K + HAS_CUBE))
-
-
-@triton.jit
 def _before(values, STEPS: tl.constexpr):
     """Sum of the earlier columns. Summed, not subtracted: x - x loses what came before a large x."""
     i = tl.arange(0, STEPS)
@@ -250,7 +238,7 @@ def march_kernel(
     constants, grids, biases, cube, density, reliability, touched,
     kept, skipped_total, dropped_mass, heads, planes, ndc, inverse_ts, taus, skipped_before, numbers,
     num_rays, room, threshold, fair_share,
-    K: tl.constexpr, HEADS: tl.constexpr, HAS_CUBE: tl.constexpr, BLENDS: tl.constexpr, BAKED: tl.constexpr,
+    K: tl.constexpr, HEADS: tl.constexpr, HAS_CUBE: tl.constexpr, BLENDS: tl.constexpr,
     KEEP_ALL: tl.constexpr, RAYS: tl.constexpr, STEPS: tl.constexpr,
 ):  # fmt: skip
     """Marches RAYS rays. What ray r keeps is written from r * room on; how much, to kept[r]. ``numbers``: the most that
@@ -282,9 +270,7 @@ def march_kernel(
         plane, u, v, s, tau = _look_up(
             origins, directions, us, vs, constants, grids, biases, cube, density, ray, head, number, met, K, HAS_CUBE
         )
-        if BAKED:
-            tau = _blend_baked(grids, reliability, head, u, v, s, tau, met, K, HAS_CUBE)
-        elif BLENDS:
+        if BLENDS:
             tau = _blend(
                 origins, directions, local_origins, local_directions, constants, grids, cube, reliability, touched,
                 ray, head, inverse_t, tau, met, K, HAS_CUBE,
@@ -379,7 +365,7 @@ def march_into_slots(layout: SceneLayout, tables: Tables, rays: Crossings, optio
         march_kernel, num_rays, at_once, *(x.contiguous() for x in parts), *scene.constants(), *tables,
         kept, skipped, dropped, *slots, numbers, num_rays, room, threshold, float(options.fair_share),
         K=len(layout.mpis), HEADS=triton.next_power_of_2(layout.num_heads), HAS_CUBE=layout.cube is not None,
-        BLENDS=options.form is not None, BAKED=options.baked, KEEP_ALL=threshold <= 0, RAYS=at_once, STEPS=STEPS,
+        BLENDS=options.blends, KEEP_ALL=threshold <= 0, RAYS=at_once, STEPS=STEPS,
         num_warps=1,
     )  # fmt: skip
     return Slots(kept, slots, room, skipped, dropped, numbers)

@@ -107,7 +107,7 @@ extern "C" {
 // Marches rays [begin, end). What they keep is written one ray behind the other, from `starts[begin]` on; where a ray's
 // samples begin, to `starts[ray]`; how many, to `kept[ray]`.
 void mmpi_march(const Scene* scene, const Rays* rays, int64_t* starts, int64_t begin, int64_t end,
-                float threshold, float fair_share, int form, int64_t* kept, float* skipped_total, float* dropped_mass,
+                float threshold, float fair_share, bool blends, int64_t* kept, float* skipped_total, float* dropped_mass,
                 int32_t* heads, int32_t* planes, float* ndc, float* inverse_t, float* taus, float* skipped_before) {
     const int64_t H = scene->num_heads;
     std::vector<Run> runs(H);
@@ -145,8 +145,8 @@ void mmpi_march(const Scene* scene, const Rays* rays, int64_t* starts, int64_t b
                 break;
             }
             float tau = run.tau[at], pass = run.pass[at];
-            if (form) {
-                tau = blended(*scene, *rays, ray, h, run.inverse_t[at], tau, form, votes);
+            if (blends) {
+                tau = blended(*scene, *rays, ray, h, run.inverse_t[at], tau, votes);
                 pass = std::exp(-tau);
             }
             const float weight = light * (1 - pass);

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from mmpi_ns.ops.blending import BlendForm, blended_optical_depth, interpolate_shares, log_shares
+from mmpi_ns.ops.blending import blended_optical_depth, log_shares
 from mmpi_ns.ops.composite.reference import exclusive_cumsum
 from mmpi_ns.ops.interpolate import interpolate
 from mmpi_ns.ops.layout import Places, SceneLayout, Tables
@@ -47,10 +47,8 @@ class MarchOptions(NamedTuple):
     """Weight below which a sample is dropped; 0 keeps all and ends no ray early."""
     fair_share: float = float("inf")
     """Bound on the threshold relative to equal weights (``prune``)."""
-    form: BlendForm | None = None
-    """Form of blending by reliability; None without. The opacity-keeping form is for ablations: plain torch."""
-    baked: bool = False
-    """The tables contain shares in place of reliability (``baking.bake_shares``)."""
+    blends: bool = False
+    """Samples are blended by reliability."""
 
 
 @dataclass(frozen=True)
@@ -103,8 +101,8 @@ def march(layout: SceneLayout, tables: Tables, rays: Crossings, options: MarchOp
     flat = LiveSamples(*(torch.cat([getattr(s, f) for s in samples]) for f in LiveSamples.__dataclass_fields__))
     order, valid = _sort(flat, rays.counts)
     tau = flat.tau
-    if options.form is not None and tau.numel():
-        tau = _blend_visible(order, valid, flat, rays, layout, tables, options)
+    if options.blends and tau.numel():
+        tau = _blend_visible(order, valid, flat, rays, layout, tables)
     pruned = prune(order, valid, tau, options.threshold, options.fair_share)
     order, valid = pruned.order, pruned.valid
 
@@ -223,7 +221,6 @@ def _blend_visible(
     rays: Crossings,
     layout: SceneLayout,
     tables: Tables,
-    options: MarchOptions,
 ) -> Float[Tensor, "N"]:
     """Blended optical depths, front to back, until a ray lets less than exp(-OPAQUE_DEPTH) through.
 
@@ -238,7 +235,7 @@ def _blend_visible(
         index = block[wanted]
         if not index.numel():
             break
-        tau[index] = _blend(index, flat, rays, layout, tables, options)
+        tau[index] = _blend(index, flat, rays, layout, tables)
         passed += torch.where(wanted, tau[block], 0.0).sum(-1)
     return tau
 
@@ -249,22 +246,16 @@ def _blend(
     rays: Crossings,
     layout: SceneLayout,
     tables: Tables,
-    options: MarchOptions,
 ) -> Float[Tensor, "M"]:
     """Blended optical depth of some samples; those too thin to matter get an equal share without a lookup."""
     tau = flat.tau[index]
     thick = (tau > NEGLIGIBLE_DEPTH).nonzero()[:, 0]
     own = index[thick]
-    if options.baked:
-        found = interpolate_shares(layout, tables.reliability, flat.ndc[own], flat.heads[own])
-        share = found.log(), torch.log1p(-found)
-    else:
-        local = LocalRays(rays.origins, rays.directions, rays.hits.local_origins, rays.hits.local_directions)
-        asked = (flat.rays[own], local, flat.inverse_t[own], flat.heads[own])
-        share = log_shares(layout, tables.reliability, tables.touched, *asked)
-    assert options.form is not None
+    local = LocalRays(rays.origins, rays.directions, rays.hits.local_origins, rays.hits.local_directions)
+    asked = (flat.rays[own], local, flat.inverse_t[own], flat.heads[own])
+    shares = log_shares(layout, tables.reliability, tables.touched, *asked)
     blended = tau / layout.num_heads
-    return blended.index_copy(0, thick, blended_optical_depth(tau[thick], *share, options.form))
+    return blended.index_copy(0, thick, blended_optical_depth(tau[thick], *shares))
 
 
 # Prune ---------------------------------------------------------------------------------------------------------------

@@ -8,7 +8,6 @@ from torch import Tensor
 from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.layout import SceneLayout, Tables
 from mmpi_ns.ops.march import Crossings, MarchOptions
-from mmpi_ns.ops.show import reference
 from mmpi_ns.ops.show.reference import Shown
 
 __all__ = ["Shown", "show_rays"]
@@ -29,6 +28,4 @@ def show_rays(
         rays: where R rays cross the scene.
         options: see ``ops.march``.
     """
-    if options.form == "opacity":
-        return reference.show_rays(layout, tables, features, rays, options)
     return dispatch.run("show_rays", layout, tables, features, rays, options)

@@ -46,9 +46,9 @@ struct CubeWalks {
 class Marcher {
   public:
     Marcher(const Scene& scene, const Rays& rays, const Tiles& tiles, const Table& features, float threshold,
-            float fair_share, int form)
+            float fair_share, bool blends)
         : scene(scene), rays(rays), tiles(tiles), features(features), threshold(threshold), fair_share(fair_share),
-          form(form), walks(scene.num_mpis), masses(scene.num_heads) {
+          blends(blends), walks(scene.num_mpis), masses(scene.num_heads) {
         int32_t column = 0;
         for (int64_t k = 0; k < scene.num_mpis; k++) {
             const Mpi& mpi = scene.mpis[k];
@@ -82,7 +82,7 @@ class Marcher {
     const Tiles& tiles;
     const Table& features;
     const float threshold, fair_share;
-    const int form;
+    const bool blends;
     std::vector<Stack> stacks;
     std::vector<Walks<CELLS>> walks;
     CubeWalks cube;
@@ -147,9 +147,9 @@ class Marcher {
         raw += in_cube ? splat(scene.cube->bias)
                        : each_lane<Lanes>(pick(going, walks[h].plane, IntLanes{}), [&](int32_t l) { return biases[l]; });
         Lanes tau = softplus_lanes(raw) * (in_cube ? scene.cube->interval : scene.mpis[h].interval);
-        for (uint32_t lanes = form ? bits(going) : 0; lanes; lanes &= lanes - 1) {
+        for (uint32_t lanes = blends ? bits(going) : 0; lanes; lanes &= lanes - 1) {
             const int i = __builtin_ctz(lanes);
-            tau[i] = blended(scene, rays, numbers[i], h, inverse_t[i], tau[i], form, votes);
+            tau[i] = blended(scene, rays, numbers[i], h, inverse_t[i], tau[i], votes);
         }
         const Lanes pass = pick(going, exp_lanes(-tau), splat(1)), weight = light * (1 - pass);
         const Mask kept = going & (weight > least_weight);
@@ -233,10 +233,10 @@ class Marcher {
 extern "C" {
 
 void mmpi_show(const Scene* scene, const Rays* rays, const Tiles* tiles, const float* features, int64_t rows,
-               int64_t channels, float threshold, float fair_share, int form, int64_t begin, int64_t end,
+               int64_t channels, float threshold, float fair_share, bool blends, int64_t begin, int64_t end,
                const Outputs* to) {
     const Table table{features, rows, channels};
-    Marcher marcher(*scene, *rays, *tiles, table, threshold, fair_share, form);
+    Marcher marcher(*scene, *rays, *tiles, table, threshold, fair_share, blends);
     for (int64_t ray = begin; ray < end; ray += WIDTH) marcher.show(ray, std::min<int64_t>(WIDTH, end - ray), *to);
 }
 }
