@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ import tyro
 from mmpi_ns.scripts.command import run
 from mmpi_ns.synthetic.wrong_depths import Wrong
 
-Name = Literal["street", "long-road", "room", "look-round", "object", "still-life"]
+Name = Literal["street", "long-road", "walk", "room", "look-round", "object", "still-life"]
 
 
 @dataclass
@@ -21,9 +22,9 @@ class SceneCommand:
     """Writes images, exact depths, cameras and SfM-like points of a procedural scene, deterministically."""
 
     name: tyro.conf.Positional[Name]
-    """street: a straight drive. long-road: a winding drive of any length. room: a walk around a table, looking in all
-    directions. look-round: nearly one spot of that room. object: filmed from all sides. still-life: a grid of cameras
-    facing it."""
+    """street: a straight drive. long-road: a winding drive of any length. walk: a hand-held walk down a street, with
+    lens distortion. room: a walk around a table, looking in all directions. look-round: nearly one spot of that room.
+    object: filmed from all sides. still-life: a grid of cameras facing it."""
     folder: tyro.conf.Positional[Path]
     """Folder to write."""
     width: int | None = None
@@ -33,7 +34,7 @@ class SceneCommand:
     count: int | None = None
     """Images; the default depends on the scene."""
     length: float | None = None
-    """Metres driven (street: 40, long-road: 1000)."""
+    """Metres driven or walked (street: 40, long-road: 1000, walk: 60)."""
     seed: int = 0
     """Each seed gives another scene of the same kind."""
     points: int | None = None
@@ -68,6 +69,7 @@ class SceneCommand:
         print(f"{self.name}: {len(scene.primitives)} solids, {len(cameras)} cameras; looking for points ...")
         sfm = (points, self.noise, self.outliers)
         others = {"progress": _progress, "wrong_depths": self.wrong_depths}
+        others["processes"] = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
         found = write_dataset(scene, self.folder, *sfm, self.images, self.overwrite, **others)
         test = int(cameras.is_test.sum())
         kind = "images with depths" if self.images else "cameras (no images)"

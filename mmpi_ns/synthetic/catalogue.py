@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from mmpi_ns.synthetic import indoor, street
+from mmpi_ns.synthetic import indoor, street, walk
 from mmpi_ns.synthetic.scene import Scene
 
 
@@ -19,12 +19,13 @@ class Entry:
     height: int = 160
     count: int = 64
     length: float | None = None
-    """Metres driven; None: not a drive."""
+    """Metres driven or walked; None: it has no length."""
 
 
 SCENES: dict[str, Entry] = {
     "street": Entry(street.street, 320, 96, 64, 40.0),
     "long-road": Entry(street.long_road, 320, 96, 0, 1000.0),
+    "walk": Entry(walk.walk, 960, 540, 300, 60.0),
     "room": Entry(indoor.room),
     "look-round": Entry(indoor.look_round, count=36),
     "object": Entry(indoor.orbited, count=48),
@@ -59,7 +60,7 @@ def make_scene(
     entry = SCENES[name]
     sizes = {"width": entry.width if width is None else width, "height": entry.height if height is None else height}
     if length is not None and entry.length is None:
-        raise ValueError(f"The scene {name} has no length: leave it out, or choose street or long-road.")
+        raise ValueError(f"The scene {name} has no length: leave it out, or choose street, long-road or walk.")
     drive: dict[str, float] = {}
     if entry.length is not None:
         drive["length"] = entry.length if length is None else length

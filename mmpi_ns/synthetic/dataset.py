@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from functools import partial
+from multiprocessing import get_all_start_methods, get_context
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from PIL import Image
 
-from mmpi_ns.synthetic.scene import Colors, Scene, render
+from mmpi_ns.synthetic.scene import Scene, render
 from mmpi_ns.synthetic.sfm_like import SfmPoints, sfm_points
 from mmpi_ns.synthetic.wrong_depths import Wrong, wrong_distances
 
@@ -36,6 +40,7 @@ def write_dataset(
     progress: Callable[[Iterable[int]], Iterable[int]] = iter,
     tracks: bool = True,
     wrong_depths: Wrong = "none",
+    processes: int = 1,
 ) -> SfmPoints:
     """Writes images, depths (along the optical axis), transforms.json, sparse_pc.ply and colmap/sparse/0.
 
@@ -48,6 +53,7 @@ def write_dataset(
         progress: wraps the image numbers as they are rendered.
         tracks: False writes no points and no COLMAP model, for which it takes pycolmap.
         wrong_depths: how the depths of the training images are wrong; those of the test images are exact.
+        processes: render side by side; the files do not depend on their number.
 
     Raises:
         FileExistsError: the folder is in use and may not, or cannot safely, be overwritten. Nothing was touched.
@@ -63,15 +69,51 @@ def write_dataset(
         model.export_PLY(folder / "sparse_pc.ply")
     for part in ("images", "depths") if images else ():
         (folder / part).mkdir()
-    for i in progress(range(len(scene.cameras))) if images else ():
-        colors, distances = render(scene, i)
-        if not scene.cameras.is_test[i]:
-            distances = wrong_distances(wrong_depths, scene.cameras, i, distances, scene.seed)
-        Image.fromarray((colors * 255).round().astype(np.uint8)).save(folder / "images" / image_name(i))
-        Image.fromarray(_millimetres(scene, i, distances)).save(folder / "depths" / image_name(i))
+    if images:
+        write = partial(_write_image, scene, folder, wrong_depths)
+        with _side_by_side(write, len(scene.cameras), processes) as written:
+            for _ in progress(range(len(scene.cameras))):
+                next(written)
     # Last, so that a folder with a transforms.json is complete.
     (folder / "transforms.json").write_text(json.dumps(_transforms(scene, images), indent=1))
     return found
+
+
+def _write_image(scene: Scene, folder: Path, wrong_depths: Wrong, camera: int) -> None:
+    """Renders one image and writes its files."""
+    colors, distances = render(scene, camera)
+    if not scene.cameras.is_test[camera]:
+        distances = wrong_distances(wrong_depths, scene.cameras, camera, distances, scene.seed)
+    depths = scene.cameras.depths(1000 * distances)
+    millimetres = np.where(depths <= MILLIMETRES, depths, 0).round().astype(np.uint16)
+    Image.fromarray((colors * 255).round().astype(np.uint8)).save(folder / "images" / image_name(camera))
+    Image.fromarray(millimetres).save(folder / "depths" / image_name(camera))
+
+
+_job: Callable[[int], None]
+"""What each process of a pool does with a number: inherited, as closures cannot be sent."""
+
+
+def _do(number: int) -> None:
+    _job(number)
+
+
+@contextmanager
+def _side_by_side(job: Callable[[int], None], count: int, processes: int) -> Iterator[Iterator[None]]:
+    """``job`` of 0 to count - 1, in order, by forked processes if there are several and the system can fork."""
+    if min(processes, count) < 2 or "fork" not in get_all_start_methods():
+        yield map(job, range(count))
+        return
+
+    def adopt() -> None:
+        global _job
+        _job = job
+
+    pool = ProcessPoolExecutor(min(processes, count), get_context("fork"), adopt)
+    try:
+        yield pool.map(_do, range(count))
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
 def check_folder(folder: Path, overwrite: bool) -> None:
@@ -97,15 +139,6 @@ def clear(folder: Path) -> None:
             path.unlink(missing_ok=True)
 
 
-def _millimetres(scene: Scene, camera: int, distances: Colors) -> np.ndarray:
-    """Depth along the optical axis [H, W] as uint16, 0 where it is too far."""
-    height, width = distances.shape
-    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    (cx, cy), focal = scene.cameras.center, scene.cameras.focal
-    depth = 1000 * distances / np.sqrt(((x - cx) / focal) ** 2 + ((y - cy) / focal) ** 2 + 1)
-    return np.where(depth <= MILLIMETRES, depth, 0).round().astype(np.uint16)
-
-
 def _transforms(scene: Scene, images: bool) -> dict:
     cameras = scene.cameras
     frames = []
@@ -118,7 +151,8 @@ def _transforms(scene: Scene, images: bool) -> dict:
     return {
         "camera_model": "OPENCV",
         "fl_x": cameras.focal, "fl_y": cameras.focal, "cx": cameras.center[0], "cy": cameras.center[1],
-        "w": cameras.width, "h": cameras.height, "k1": 0, "k2": 0, "p1": 0, "p2": 0,
+        "w": cameras.width, "h": cameras.height,
+        **dict(zip(("k1", "k2", "p1", "p2"), cameras.distortion, strict=True)),
         "applied_transform": np.eye(4)[:3].tolist(),
         "ply_file_path": "sparse_pc.ply",
         "scene": {"name": scene.name, "seed": scene.seed},
@@ -135,7 +169,13 @@ def colmap_model(scene: Scene, found: SfmPoints) -> Any:
     model = pycolmap.Reconstruction()
     intrinsics = [cameras.focal, cameras.focal, *cameras.center]
     model.add_camera_with_trivial_rig(
-        pycolmap.Camera(model="PINHOLE", width=cameras.width, height=cameras.height, params=intrinsics, camera_id=1)
+        pycolmap.Camera(
+            model="OPENCV" if any(cameras.distortion) else "PINHOLE",
+            width=cameras.width,
+            height=cameras.height,
+            params=[*intrinsics, *(cameras.distortion if any(cameras.distortion) else ())],
+            camera_id=1,
+        )
     )
     by_camera = np.argsort(found.camera, kind="stable")
     bounds = np.searchsorted(found.camera[by_camera], np.arange(len(cameras) + 1))

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from mmpi_ns.synthetic.cameras import Cameras
 from mmpi_ns.synthetic.kit import BEIGE, BROWN, GRAY, GREEN, PAINTS, PALE_GREEN, WALLS, WHITE, Kit, look, look_at
-from mmpi_ns.synthetic.scene import Cameras, Light, Scene
+from mmpi_ns.synthetic.scene import Light, Scene
 from mmpi_ns.synthetic.surroundings import floor_inside, meadow, open_sky
 
 ROOM = (6.4, 5.2, 2.7)

@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from mmpi_ns.synthetic.cameras import Cameras
 from mmpi_ns.synthetic.materials import MATERIALS, Surface
 from mmpi_ns.synthetic.primitives import CYLINDER, PACKET, SPHERE, Array, Primitives, Tracer, dot, to_local
 from mmpi_ns.synthetic.textures import Noise
@@ -20,50 +21,6 @@ Sky = Callable[[Array, float, Noise], Colors]
 """Colours [N, 3] of unit directions [N, 3], for pixels so many radians wide."""
 TILE = 64
 """Side of the image tiles whose rays are traced together, pixels."""
-
-
-@dataclass(frozen=True)
-class Cameras:
-    """M pinhole cameras that share their intrinsics."""
-
-    camera_to_worlds: Array
-    """[M, 3, 4], OpenGL axes (x right, y up, z backwards), metres."""
-    focal: float
-    """Pixels."""
-    width: int
-    height: int
-    test_every: int
-    """One image in so many is held out."""
-
-    def __len__(self) -> int:
-        return len(self.camera_to_worlds)
-
-    @property
-    def center(self) -> tuple[float, float]:
-        """(cx, cy), pixels."""
-        return self.width / 2, self.height / 2
-
-    @property
-    def is_test(self) -> NDArray[np.bool_]:
-        """[M] held out for testing."""
-        return np.arange(len(self)) % self.test_every == self.test_every // 2
-
-    def rays(self, camera: int, pixels: Array) -> tuple[Array, Array]:
-        """Origins and unit directions [N, 3] of the rays through pixels [N, 2] (x, y; centres at half integers)."""
-        pose, (cx, cy) = self.camera_to_worlds[camera], self.center
-        x, y = (pixels[:, 0] - cx) / self.focal, -(pixels[:, 1] - cy) / self.focal
-        local = np.stack([x, y, -np.ones_like(x)], -1)
-        directions = local @ pose[:, :3].T / np.sqrt((local**2).sum(-1, keepdims=True))
-        return np.broadcast_to(pose[:, 3], directions.shape), directions
-
-    def project(self, camera: int | NDArray[np.int64], points: Array) -> tuple[Array, Array]:
-        """Pixels [N, 2] of world points [N, 3] in a camera, or each in its own [N], and their depths [N] along the
-        optical axis (negative: behind)."""
-        poses = self.camera_to_worlds[camera]
-        local = np.einsum("...ji,...j->...i", poses[..., :3], points - poses[..., 3])
-        depth = -local[:, 2]
-        safe = np.where(np.abs(depth) < 1e-9, 1e-9, depth)
-        return np.stack([local[:, 0], -local[:, 1]], -1) / safe[:, None] * self.focal + self.center, depth
 
 
 @dataclass(frozen=True)
@@ -236,12 +193,10 @@ def render(scene: Scene, camera: int, supersample: int = 2, contrast: float = 0.
     cameras = scene.cameras
     h, w = cameras.height, cameras.width
     colors, depths, patch = np.empty((h * w, 3), np.float32), np.empty(h * w), np.empty(h * w, np.int64)
-    x, y = np.meshgrid(np.arange(w) + 0.5, np.arange(h) + 0.5)
-    pixels = np.stack([x, y], -1).reshape(-1, 2)
     order = _by_tile(h, w)
     for start in range(0, h * w, PACKET):
         these = order[start : start + PACKET]
-        rays = cameras.rays(camera, pixels[these])
+        rays = cameras.rays_at(camera, cameras.central_tangents[these])
         depths[these], row = scene.hit(*rays)
         colors[these], patch[these] = scene.shade(*rays, depths[these], row, 1 / cameras.focal)
     edges = order[_differs(colors.reshape(h, w, 3), patch.reshape(h, w), contrast).reshape(-1)[order]]
@@ -250,7 +205,7 @@ def render(scene: Scene, camera: int, supersample: int = 2, contrast: float = 0.
     per_packet = max(PACKET // len(shifts), 1)
     for start in range(0, len(edges), per_packet):
         these = edges[start : start + per_packet]
-        rays = cameras.rays(camera, (pixels[these][:, None] + shifts).reshape(-1, 2))
+        rays = cameras.rays(camera, (cameras.pixel_centers[these][:, None] + shifts).reshape(-1, 2))
         found = scene.trace(*rays, pixel=1 / (cameras.focal * supersample))[1]
         colors[these] = found.reshape(len(these), -1, 3).mean(1)
     return colors.reshape(h, w, 3), depths.reshape(h, w).astype(np.float32)

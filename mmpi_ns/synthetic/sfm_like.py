@@ -6,7 +6,7 @@ noise, and its point is triangulated from them: uncertain along the road, as in 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -181,21 +181,25 @@ def _triangulated(scene: Scene, points: Array, camera: NDArray, point: NDArray, 
     """Points [P, 3] of least squared reprojection error, by Gauss-Newton from the true ones."""
     if not len(points):
         return points
-    axes = scene.cameras.camera_to_worlds[camera, :, :3]
+    # As pinholes see it: the noise is far below what a lens changes over it.
+    pinholes = replace(scene.cameras, distortion=(0.0, 0.0, 0.0, 0.0))
+    if any(scene.cameras.distortion):
+        pixel = scene.cameras.tangents(pixel) * pinholes.focal + pinholes.center
+    axes = pinholes.camera_to_worlds[camera, :, :3]
     starts = np.searchsorted(point, np.arange(len(points)))
     points = points.copy()
     for _ in range(4):
-        where, depth = scene.cameras.project(camera, points[point])
-        slope = (where - scene.cameras.center) / scene.cameras.focal
+        where, depth = pinholes.project(camera, points[point])
+        slope = (where - pinholes.center) / pinholes.focal
         # d(x, y)/d(point): the image axes less what moving along the optical axis does.
         right, down, ahead = axes[:, :, 0], -axes[:, :, 1], -axes[:, :, 2]
         jacobian = np.stack([right - slope[:, :1] * ahead, down - slope[:, 1:] * ahead], 1)
-        jacobian *= scene.cameras.focal / depth[:, None, None]
+        jacobian *= pinholes.focal / depth[:, None, None]
         normal = np.add.reduceat(np.einsum("qki,qkj->qij", jacobian, jacobian), starts)
         gradient = np.add.reduceat(np.einsum("qki,qk->qi", jacobian, pixel - where), starts)
         step = np.linalg.solve(normal, gradient[..., None])[..., 0]
         # A step of more than a tenth of the distance leaves where the linearisation holds.
-        far = np.linalg.norm(points - scene.cameras.camera_to_worlds[camera[starts], :, 3], axis=-1)
+        far = np.linalg.norm(points - pinholes.camera_to_worlds[camera[starts], :, 3], axis=-1)
         size = np.linalg.norm(step, axis=-1)
         points += step * np.minimum(1, 0.1 * far / np.maximum(size, 1e-12))[:, None]
     return points

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from mmpi_ns.synthetic.cameras import Cameras
 from mmpi_ns.synthetic.kit import BROWN, GRAY, GREEN, PAINTS, PALE_GREEN, WALLS, WHITE, Kit, look
 from mmpi_ns.synthetic.road import Road
-from mmpi_ns.synthetic.scene import Cameras, Light, Scene
+from mmpi_ns.synthetic.scene import Light, Scene
 from mmpi_ns.synthetic.surroundings import open_sky, street_ground
 
 CAMERA_HEIGHT = 1.65
@@ -132,7 +133,7 @@ def drive_cameras(road: Road, seed: int, count: int, width: int, height: int) ->
     return Cameras(poses, FOCAL_SHARE * width, width, height, test_every=2)
 
 
-def make_street(name: str, road: Road, seed: int, count: int, width: int, height: int) -> Scene:
+def make_street(name: str, road: Road, seed: int, cameras: Cameras) -> Scene:
     """Builds a street along a road; the work grows linearly with its length."""
     kit = Street(seed, road)
     first, last = -road.before, road.length + road.beyond
@@ -140,13 +141,13 @@ def make_street(name: str, road: Road, seed: int, count: int, width: int, height
         kit.houses(side, first + kit.random.uniform(0, 4), last)
         kit.parked(side, first + kit.random.uniform(0, 4), last)
         kit.kerbside(side, first + kit.random.uniform(0, 8), last)
-    cameras = drive_cameras(road, seed, count, width, height)
     return Scene(name, seed, kit.done(), street_ground(road), open_sky, Light(SUN), cameras)
 
 
 def street(seed: int, count: int, width: int, height: int, length: float) -> Scene:
     """A straight street."""
-    return make_street("street", Road(length, beyond=150.0), seed, count, width, height)
+    road = Road(length, beyond=150.0)
+    return make_street("street", road, seed, drive_cameras(road, seed, count, width, height))
 
 
 def long_road(seed: int, count: int, width: int, height: int, length: float) -> Scene:
@@ -154,4 +155,5 @@ def long_road(seed: int, count: int, width: int, height: int, length: float) -> 
     phases = np.random.default_rng([seed, 3]).uniform(0, 2 * np.pi, 2)
     # A whole number of half turns apart would start straight for every seed: phases are free.
     waves = ((9.0, 250.0, float(phases[0])), (38.0, 900.0, float(phases[1])))
-    return make_street("long-road", Road(length, waves), seed, count, width, height)
+    road = Road(length, waves)
+    return make_street("long-road", road, seed, drive_cameras(road, seed, count, width, height))

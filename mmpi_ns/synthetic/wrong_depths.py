@@ -11,8 +11,8 @@ from typing import Literal
 
 import numpy as np
 
-from mmpi_ns.synthetic.primitives import Array
-from mmpi_ns.synthetic.scene import Cameras, Colors
+from mmpi_ns.synthetic.cameras import Array, Cameras
+from mmpi_ns.synthetic.scene import Colors
 
 Wrong = Literal["none", "scattered", "mirror", "car"]
 """How the depths of training images are wrong."""
