@@ -1,4 +1,4 @@
-"""Pixels on the device, and the training cameras, SfM points and keypoints for the model."""
+"""nerfstudio's data manager: training batches, and the training cameras, SfM points and depths for the model."""
 
 from __future__ import annotations
 
@@ -10,24 +10,22 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager, VanillaDataManagerConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader, RandIndicesEvalDataloader
-from nerfstudio.data.utils.nerfstudio_collate import nerfstudio_collate
 from nerfstudio.model_components.ray_generators import RayGenerator
 from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
-from torch import Tensor
 
-from mmpi_ns.capture.checks import check_parser, check_transforms
+from mmpi_ns.capture.checks import check_parser, check_transforms, say_once
 from mmpi_ns.capture.dataset import MMPIDataset
 from mmpi_ns.capture.known_depth import KnownDepth, know_depths, with_known_depths
 from mmpi_ns.capture.local_origin import take_local_origins
 from mmpi_ns.capture.new_views import SharedPoints, find_shared_points
 from mmpi_ns.capture.observe import observe, posed_images, sfm_folder
 from mmpi_ns.capture.pixels import PixelPool, pixel_bytes
+from mmpi_ns.capture.ray_sources import Keypoints, RaySources
 from mmpi_ns.capture.rays import PinholeRays
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.scene.visible_tiles import TrainingViews
@@ -40,12 +38,6 @@ RAYS_PER_STEP = "mmpi_rays_per_step"
 """Key of the pixel rays of a training step."""
 TRAINING_VIEWS = "mmpi_training_views"
 """Key of the positions and fields of view of the training cameras (``TrainingViews``)."""
-KEYPOINT_DEPTH = "keypoint_inverse_distance"
-"""Ray-bundle metadata: inverse distance of the SfM point on a keypoint ray, 0 on ordinary rays."""
-PIXEL_DEPTH = "pixel_inverse_distance"
-"""Ray-bundle metadata [R, 2]: inverse distance of the content of a pixel and its expected error, 0 where unknown."""
-OWN_PIXEL = "is_own_pixel"
-"""Ray-bundle metadata [R, 1]: whether a ray goes through a pixel of a training image."""
 
 
 @dataclass
@@ -81,17 +73,18 @@ class MMPIDataManagerConfig(VanillaDataManagerConfig):
 
 
 class MMPIDataManager(VanillaDataManager[MMPIDataset]):
-    """Draws training batches from a resident pixel pool and hands the scene's observations to the model."""
+    """Draws training batches from ``RaySources`` and hands the scene's observations to the model."""
 
     config: MMPIDataManagerConfig
 
     def __init__(self, config: MMPIDataManagerConfig, **kwargs: Any) -> None:
-        self.pool: PixelPool | None = None
         self.known_depth: KnownDepth | None = None
         self.rays_share = 1.0
         """Share of a step's rays that are drawn; the schedule sets it."""
-        self._allowed: Tensor | None = None
-        self._all_shared: SharedPoints | None = None
+        self.sources: RaySources | None = None
+        """What a step draws from now."""
+        self._resident: RaySources | None = None
+        """The sources of all cameras, if they are in memory all the time."""
         parser = config.dataparser
         check_parser(parser)
         if isinstance(parser, NerfstudioDataParserConfig):
@@ -149,57 +142,69 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         return dataset
 
     def setup_train(self) -> None:
-        """Loads the pixel pool instead of nerfstudio's image cache."""
-        sizes = self.train_dataset.cameras.width * self.train_dataset.cameras.height
-        self._reads_by_window = bool(sizes.sum() > self.config.resident_pixels)
-        if not self._reads_by_window and self.test_mode == "val":
-            CONSOLE.print(f"Reading {len(self.train_dataset)} training images.")
-            self.pool = self._read_pixels()
+        """Reads the pixels into memory, unless there are too many, instead of nerfstudio's image cache."""
         # Samples nothing: ns-export sets its batches' size here.
         self.train_pixel_sampler = self._get_pixel_sampler(self.train_dataset, self.config.train_num_rays_per_batch)
         cameras = self.train_dataset.cameras
         pinhole = PinholeRays.of(cameras, self.device)
         self.train_ray_generator: Any = pinhole or RayGenerator(cameras.to(self.device))
-        self._keypoints = _keypoint_targets(self.observations, self.device) if self.test_mode == "val" else None
-        if not self._reads_by_window:
-            self._all_shared = self._find_shared(range(len(self.train_dataset)))
-        self._shared = self._all_shared
+        self._reads_by_window = bool(self._sizes(None).sum() > self.config.resident_pixels)
+        if not self._reads_by_window and self.test_mode == "val":
+            CONSOLE.print(f"Reading {len(self.train_dataset)} training images.")
+            self.sources = self._resident = self._read_sources(None)
 
     def get_train_rays_per_batch(self) -> int:
         """Pixel rays of the step at hand."""
         return max(1, round(self.rays_share * super().get_train_rays_per_batch()))
 
-    def _find_shared(self, images: Sequence[int]) -> SharedPoints | None:
-        """The points that two of these training images show at the same depth, if rays of new views are enabled."""
-        if self.known_depth is None or self.config.new_view_share <= 0:
-            return None
-        posed = posed_images(self.observations, self.train_dataset)
-        if posed is None:
-            return None
-        rays, seed = self.train_ray_generator, self.config.seed
-        return find_shared_points(self.train_dataset, posed, self.known_depth, rays, images, seed, self.device)
-
     def use_cameras(self, cameras: NDArray[np.int64] | None) -> None:
-        """Restricts pixels and keypoints to these training cameras from now on; None for all.
+        """Draws from these training cameras from now on, None for all, and prints the share of each source.
 
         Raises:
-            InputError: the masks leave them no pixel.
+            InputError: an image cannot be used, or the masks leave no pixel.
         """
-        self._keypoints = _keypoint_targets(self.observations, self.device, cameras)
-        self._allowed, self._shared = None, self._all_shared
-        if cameras is not None and self._reads_by_window:
-            self.pool = None  # before the next one is read
-            self.pool = self._read_pixels(cameras.tolist())
-            self._shared = self._find_shared(cameras.tolist())
-        elif cameras is not None:
-            assert self.pool is not None
-            self._allowed = self.pool.places_of(torch.from_numpy(cameras))
-            self._shared = self._all_shared and self._all_shared.of_images(torch.from_numpy(cameras))
-            if not len(self._allowed):
-                raise InputError("The masks leave no training pixel in one stretch of the capture: use longer windows.")
+        if self._resident is None:
+            self.sources = None  # before the next pixels are read
+            self.sources = self._read_sources(cameras)
+        else:
+            self.sources = self._resident if cameras is None else self._resident.of_images(cameras)
+        say_once(self.sources.describe(super().get_train_rays_per_batch()))
 
-    def found(self) -> str:
-        """What was found in the capture, in one line."""
+    def _read_sources(self, cameras: NDArray[np.int64] | None) -> RaySources:
+        """The pixels, new views and keypoints of all training cameras, or of some; notes if pixels are left out."""
+        config, images = self.config, range(len(self.train_dataset)) if cameras is None else cameras.tolist()
+        total, most = self._sizes(cameras).sum(), int(config.resident_pixels)
+        if 0 < most < total:
+            CONSOLE.print(
+                f"{most / 1e6:.3g} of {total / 1e6:.3g} M training pixels are used, drawn at random: more are "
+                "held with --pipeline.datamanager.resident-pixels."
+            )
+        pixels = PixelPool.from_dataset(
+            self.train_dataset, self.device, images, self.known_depth, most, config.seed
+        )  # fmt: skip
+        new_views, no_new_views = self._find_shared(images)
+        keypoints = Keypoints.of(self.observations, self.device) if self.test_mode == "val" else None
+        keypoints = keypoints if cameras is None else keypoints and keypoints.of_images(torch.from_numpy(cameras))
+        return RaySources(
+            pixels, new_views, keypoints, self.train_ray_generator, config.new_view_share, config.keypoint_rays,
+            no_new_views,
+        )  # fmt: skip
+
+    def _find_shared(self, images: Sequence[int]) -> tuple[SharedPoints | None, str]:
+        """The points that two of these training images show at the same depth, or why there are none."""
+        if self.config.new_view_share <= 0:
+            return None, "--pipeline.datamanager.new-view-share 0"
+        if self.known_depth is None or self.known_depth.share == 0:
+            return None, "no pixel has a known depth"
+        posed = posed_images(self.observations, self.train_dataset)
+        if posed is None:
+            return None, "the cameras are neither all perspective nor all fisheye"
+        rays, seed = self.train_ray_generator, self.config.seed
+        points = find_shared_points(self.train_dataset, posed, self.known_depth, rays, images, seed, self.device)
+        return points, "no two images show a point at the same depth"
+
+    def describe(self) -> str:
+        """What the capture holds, in one line."""
         cameras, seen = self.train_dataset.cameras, self.observations
         sizes = sorted({(int(w), int(h)) for w, h in zip(cameras.width.view(-1), cameras.height.view(-1), strict=True)})
         shapes = f"{sizes[0][0]} x {sizes[0][1]}" + (f" to {sizes[-1][0]} x {sizes[-1][1]}" if len(sizes) > 1 else "")
@@ -211,18 +216,6 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
             parts.append(f"{100 * self.known_depth.share:.0f} % of the training pixels have a known depth")
         return f"Capture: {'; '.join(parts)}."
 
-    def _read_pixels(self, images: Sequence[int] | None = None) -> PixelPool:
-        """The pixels of the training images, or of some; prints a note if only a subset is used."""
-        sizes, most = self._sizes(images), int(self.config.resident_pixels)
-        if 0 < most < sizes.sum():
-            CONSOLE.print(
-                f"{most / 1e6:.3g} of {sizes.sum() / 1e6:.3g} M training pixels are used, drawn at random: more are "
-                "held with --pipeline.datamanager.resident-pixels."
-            )
-        return PixelPool.from_dataset(
-            self.train_dataset, self.device, images, self.known_depth, most, self.config.seed
-        )  # fmt: skip
-
     def _sizes(self, images: Sequence[int] | NDArray[np.int64] | None) -> NDArray[np.int64]:
         """Pixels of each training image, or of some."""
         sizes = (self.train_dataset.cameras.width * self.train_dataset.cameras.height).reshape(-1).cpu().numpy()
@@ -230,8 +223,8 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
 
     def pixel_bytes(self, cameras: NDArray[np.int64] | None = None) -> int:
         """Bytes of the training pixels in memory while these cameras are drawn from; where masks hide some, at most."""
-        if self.pool is not None and not self._reads_by_window:
-            return self.pool.nbytes
+        if self._resident is not None:
+            return self._resident.pixels.nbytes
         dataset, sizes, most = self.train_dataset, self._sizes(cameras), int(self.config.resident_pixels)
         share = min(1.0, most / sizes.sum()) if most else 1.0
         each = pixel_bytes(
@@ -249,7 +242,6 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         reads = self.test_mode == "val" and sizes.sum() <= self.config.resident_pixels
         for i in range(len(self.eval_dataset)) if reads else ():
             self.eval_dataset.get_data(i, image_type="uint8")
-        self.eval_pixel_sampler = self._get_pixel_sampler(self.eval_dataset, self.config.eval_num_rays_per_batch)
         self.eval_ray_generator = RayGenerator(self.eval_dataset.cameras.to(self.device))
         loaders = {"input_dataset": self.eval_dataset, "device": self.device, "num_workers": 4}
         self.fixed_indices_eval_dataloader = FixedIndicesEvalDataloader(**loaders)
@@ -258,91 +250,27 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
     def next_eval(self, step: int) -> tuple[RayBundle, dict]:
         """Pixels of one evaluation image, keyed on (seed, step)."""
         self.eval_count += 1
-        assert self.eval_dataset is not None and self.eval_pixel_sampler is not None
+        assert self.eval_dataset is not None
         g = generator(self.config.seed, step, "evaluation", "cpu")
-        data = self.eval_dataset[int(torch.randint(len(self.eval_dataset), (1,), generator=g))]
-        batch = self.eval_pixel_sampler.sample(nerfstudio_collate([data]))
+        number = int(torch.randint(len(self.eval_dataset), (1,), generator=g))
+        data = self.eval_dataset[number]
+        shown = data["mask"][..., 0] if "mask" in data else torch.ones(data["image"].shape[:2], dtype=torch.bool)
+        pixels = shown.nonzero()
+        if not len(pixels):
+            raise InputError(f"The mask of {self.eval_dataset.image_filenames[number]} leaves no pixel: correct it.")
+        chosen = pixels[torch.randint(len(pixels), (self.config.eval_num_rays_per_batch,), generator=g)]
+        batch = {name: data[name][chosen[:, 0], chosen[:, 1]] for name in ("image", "distance") if name in data}
+        batch["indices"] = torch.cat([torch.full_like(chosen[:, :1], number), chosen], -1)
         return self.eval_ray_generator(batch["indices"]), batch
 
     def next_train(self, step: int) -> tuple[RayBundle, dict]:
-        """Pixel rays first, then keypoint rays (marked in the bundle's metadata), keyed on (seed, step).
+        """The rays of a step, keyed on (seed, step), as ``RaySources.draw`` gives them.
 
         Outside training (ns-export always requests step 0) there are only pixel rays, different ones in each call.
         """
         self.train_count += 1
-        if self.pool is None:  # nobody said which window
-            self.pool = self._read_pixels()
+        if self.sources is None:  # nobody said which window
+            self.use_cameras(None)
+        assert self.sources is not None
         g = generator(self.config.seed, step if self.training else self.train_count, "pixels", self.device)
-        colors, indices, pixel_depths = self.pool.draw(self.get_train_rays_per_batch(), g, self._allowed)
-        bundle = self.train_ray_generator(indices)
-        if self.training and self._shared is not None:
-            count = round(self.config.new_view_share * len(indices))
-            views, seen, distances = self._shared.draw(count, self.train_ray_generator, g)
-            bundle, colors = _join(bundle, views), torch.cat([colors, seen])
-            pixel_depths = torch.cat([pixel_depths, distances])
-        depths = torch.zeros(len(bundle), 1, device=self.device)
-        # Points shared by two images are more informative than keypoints, which replace the missing ones.
-        missing = 1.0 if self._shared is None else max(0.0, 1 - self._shared.cover)
-        count = round(missing * self.rays_share * self.config.keypoint_rays)
-        if self.training and self._keypoints is not None and count > 0:
-            keypoint_bundle, keypoint_depths = self._keypoint_rays(count, g)
-            bundle, depths = _join(bundle, keypoint_bundle), torch.cat([depths, keypoint_depths])
-            pixel_depths = torch.cat([pixel_depths, pixel_depths.new_zeros(len(keypoint_depths), 2)])
-        bundle.metadata[OWN_PIXEL] = (torch.arange(len(bundle), device=self.device) < len(indices))[:, None]
-        bundle.metadata[KEYPOINT_DEPTH] = depths
-        bundle.metadata[PIXEL_DEPTH] = pixel_depths
-        return bundle, {"image": colors, "indices": indices}
-
-    def _keypoint_rays(self, count: int, g: torch.Generator) -> tuple[RayBundle, Float[Tensor, "Q 1"]]:
-        """Rays from training cameras to SfM points that they saw, and the inverse distances of the points."""
-        assert self._keypoints is not None
-        cameras, origins, directions, inverse = self._keypoints
-        chosen = torch.randint(cameras.shape[0], (count,), generator=g, device=g.device)
-        chosen = chosen.to(cameras.device)
-        bundle = RayBundle(
-            origins=origins[chosen],
-            directions=directions[chosen],
-            pixel_area=torch.ones_like(inverse[chosen][:, None]),
-            camera_indices=cameras[chosen][:, None],
-        )
-        return bundle, inverse[chosen][:, None]
-
-
-def _join(a: RayBundle, b: RayBundle) -> RayBundle:
-    assert a.camera_indices is not None and b.camera_indices is not None
-    return RayBundle(
-        origins=torch.cat([a.origins, b.origins]),
-        directions=torch.cat([a.directions, b.directions]),
-        pixel_area=torch.cat([a.pixel_area, b.pixel_area]),
-        camera_indices=torch.cat([a.camera_indices, b.camera_indices]),
-        metadata={},
-    )
-
-
-def _keypoint_targets(
-    observations: Observations, device: str | torch.device, cameras: NDArray[np.int64] | None = None
-) -> tuple[Tensor, ...] | None:
-    """Camera, origin, unit direction and inverse distance of every keypoint of the training images, or of some.
-
-    The ray goes to the point itself, a fraction of a pixel from the keypoint, so no lens model is needed.
-    """
-    # Points of a plane sweep come after those of the tracks: too rough to supervise depth.
-    tracked = np.arange(len(observations.seen_at))
-    if cameras is not None:
-        tracked = tracked[np.isin(observations.seen_by[tracked], cameras)]
-    if not len(tracked):
-        return None
-    origins = observations.centers[observations.seen_by[tracked]]
-    offsets = observations.points[observations.seen_point[tracked]] - origins
-    distance = np.maximum(np.linalg.norm(offsets, axis=-1, keepdims=True), 1e-12)
-    parts = (origins, offsets / distance, 1 / distance[:, 0])
-    seen_by = torch.from_numpy(observations.seen_by[tracked]).to(device)
-    return seen_by, *(torch.from_numpy(x).float().to(device) for x in parts)
-
-
-def is_pixel_ray(bundle: RayBundle) -> Bool[Tensor, "R"]:
-    """Marks rays through pixels; rays to SfM keypoints have a known depth but no pixel."""
-    known = bundle.metadata.get(KEYPOINT_DEPTH)
-    if known is None:
-        return torch.ones(len(bundle), dtype=torch.bool, device=bundle.origins.device)
-    return known[:, 0] == 0
+        return self.sources.draw(self.get_train_rays_per_batch(), self.rays_share, g, pixels_alone=not self.training)

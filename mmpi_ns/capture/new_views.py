@@ -74,12 +74,11 @@ class SharedPoints:
         """Random rays from between cameras, with their colours and the inverse distances of their points with errors.
 
         Args:
-            count: number of rays if there is a point for every pixel; fewer otherwise.
+            count: number of rays.
             rays: makes rays through pixel centres (image, row, column).
             g: generator for the points and the positions between the cameras.
         """
         device = self.pixels.device
-        count = round(count * min(1.0, self.cover))
         chosen = torch.randint(len(self.pixels), (count,), generator=g, device=g.device).to(device)
         share = torch.rand(count, 1, generator=g, device=g.device).to(device)
         first = rays(self.pixels[chosen].long())

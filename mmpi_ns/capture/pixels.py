@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Int, Int16, UInt8
@@ -17,9 +17,9 @@ from mmpi_ns.utils.random_draws import generator
 
 @dataclass(frozen=True)
 class PixelPool:
-    """The pixels P of some images I that may be drawn, image by image, on the device.
+    """The pixels P of some images, image by image, on the device; those of images I are drawn.
 
-    If all pixels of the images are here, row and column of a pixel follow from its index.
+    If all pixels of an image are here, row and column of a pixel follow from its index.
     """
 
     colors: UInt8[Tensor, "P C"]
@@ -27,8 +27,9 @@ class PixelPool:
     images: Int[Tensor, "I"]
     """Numbers of the images in the data set."""
     widths: Int[Tensor, "I"]
-    starts: Int[Tensor, "I+1"]
-    """Index of each image's first pixel, and the total number of pixels."""
+    begins: Int[Tensor, "I"]
+    """Index of each image's first pixel."""
+    ends: Int[Tensor, "I"]
     places: Int[Tensor, "P"] | None
     """row * width + column of each pixel; None if all pixels are here."""
     depths: Int16[Tensor, "P 2"] | None
@@ -82,41 +83,42 @@ class PixelPool:
             None if x is None else x[: starts[-1]].to(device) for x in (colors, places, depths)
         )  # fmt: skip
         assert colors is not None
-        numbers, own_widths, begins = (
-            torch.tensor(list(x), device=device) for x in (images, [widths[i] for i in images], starts)
+        numbers, image_widths, begins, ends = (
+            torch.tensor(list(x), device=device) for x in (images, [widths[i] for i in images], starts[:-1], starts[1:])
         )
-        return PixelPool(colors, numbers, own_widths, begins, places, depths)
+        return PixelPool(colors, numbers, image_widths, begins, ends, places, depths)
 
     def draw(
-        self, count: int, g: torch.Generator, allowed: Int[Tensor, "A"] | None = None
+        self, count: int, g: torch.Generator
     ) -> tuple[Float[Tensor, "R C"], Int[Tensor, "R 3"], Float[Tensor, "R 2"]]:
-        """Colours, (image, row, column) and depths of random pixels: of all images, or of those ``allowed``.
+        """Colours, (image, row, column) and depths of random pixels.
 
         Args:
             count: R.
             g: draws them.
-            allowed: indices into ``images``, in ascending order.
         """
-        begins, ends = self.starts[:-1], self.starts[1:]
-        if allowed is not None:
-            begins, ends = begins[allowed], ends[allowed]
-        after = (ends - begins).cumsum(0)
-        total = len(self.colors) if allowed is None else int(after[-1])
+        after = (self.ends - self.begins).cumsum(0)
+        total = int(after[-1])
         drawn = torch.randint(total, (count,), generator=g, device=g.device).to(self.colors.device)
         which = torch.searchsorted(after, drawn, right=True)
-        chosen = drawn - after[which] + ends[which]
-        image = which if allowed is None else allowed[which]
-        place = chosen - begins[which] if self.places is None else self.places[chosen].long()
-        width = self.widths[image]
-        indices = torch.stack([self.images[image], place // width, place % width], -1)
+        chosen = drawn - after[which] + self.ends[which]
+        place = chosen - self.begins[which] if self.places is None else self.places[chosen].long()
+        width = self.widths[which]
+        indices = torch.stack([self.images[which], place // width, place % width], -1)
         nothing = torch.zeros(count, 2, device=self.colors.device)
         depths = nothing if self.depths is None else unpacked(self.depths[chosen])
         return self.colors[chosen].float() / 255, indices, depths
 
-    def places_of(self, images: Int[Tensor, "A"]) -> Int[Tensor, "B"]:
-        """Indices of images, given by number, among those with pixels in the pool."""
-        there = torch.isin(self.images, images.to(self.images)) & (self.starts[1:] > self.starts[:-1])
-        return there.nonzero()[:, 0]
+    def of_images(self, images: Int[Tensor, "A"]) -> PixelPool:
+        """Draws from some of the images, given by their numbers; shares the pixels.
+
+        Raises:
+            InputError: they have no pixel here.
+        """
+        kept = (torch.isin(self.images, images.to(self.images)) & (self.ends > self.begins)).nonzero()[:, 0]
+        if not len(kept):
+            raise InputError("The masks leave no training pixel in one stretch of the capture: use longer windows.")
+        return replace(self, **{name: getattr(self, name)[kept] for name in ("images", "widths", "begins", "ends")})
 
     @property
     def nbytes(self) -> int:

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from nerfstudio.cameras.rays import RayBundle, RaySamples
 from torch import Tensor
 
-from mmpi_ns.capture.datamanager import is_pixel_ray
+from mmpi_ns.capture.ray_sources import is_pixel_ray
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.samples import Lookup, metadata_of
 from mmpi_ns.ops.blending import blended_optical_depth

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mmpi_ns.capture.datamanager import KEYPOINT_DEPTH, PIXEL_DEPTH
+from mmpi_ns.capture.ray_sources import KEYPOINT_DEPTH, PIXEL_DEPTH
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.samples import metadata_of
 from mmpi_ns.ops.composite.reference import Composite, exclusive_cumsum

@@ -9,7 +9,7 @@ from nerfstudio.cameras.camera_optimizers import CameraOptimizer
 from nerfstudio.cameras.rays import RayBundle
 from torch.nn import Parameter
 
-from mmpi_ns.capture.datamanager import OWN_PIXEL
+from mmpi_ns.capture.ray_sources import OWN_PIXEL
 from mmpi_ns.utils.errors import InputError
 
 

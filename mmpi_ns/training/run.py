@@ -129,6 +129,7 @@ class TrainingRun:
         assert isinstance(manager, MMPIDataManager), "training needs MMPIDataManager"
         progress = self.progress
         manager.rays_share = progress.schedule.rays_share(progress.step)
-        if len(progress.windows) > 1 and self._drawn_from != progress.window:
-            manager.use_cameras(self.cameras_of(manager.observations.centers, progress.window))
+        if self._drawn_from != progress.window:
+            several = len(progress.windows) > 1
+            manager.use_cameras(self.cameras_of(manager.observations.centers, progress.window) if several else None)
             self._drawn_from = progress.window

@@ -163,7 +163,7 @@ class MMPITrainer(Trainer):
     def _say_what_comes(self, plan: WindowedPlan) -> None:
         """Prints capture, plan and memory together, before the first step."""
         manager, steps = self._manager, self._total_steps
-        say(manager.found())
+        say(manager.describe())
         say(describe(plan, self._window_steps, *self._expected_memory()))
         if not str(self.device).startswith("cuda"):
             say(forecast(self.config.method_name or "", steps, manager.get_train_rays_per_batch()))

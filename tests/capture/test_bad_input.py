@@ -94,7 +94,7 @@ def test_an_image_that_was_rounded_up_by_a_pixel_is_cut_to_its_camera(data):
     for i in range(8):
         Image.fromarray(np.zeros((HEIGHT + 1, WIDTH + 1, 3), np.uint8)).save(data / "images" / name_of(i))
     manager = datamanager(data)
-    assert len(manager.pool.colors) == len(TRAIN) * WIDTH * HEIGHT
+    assert len(manager.sources.pixels.colors) == len(TRAIN) * WIDTH * HEIGHT
     assert manager.eval_dataset[0]["image"].shape == (HEIGHT, WIDTH, 3)
 
 

@@ -15,7 +15,9 @@ from PIL import Image
 from tiny_scene import HEIGHT, TRAIN, WIDTH, color_of, image_of, name_of, project, wall_points, write_scene
 from training_runs import datamanager, in_capture_frame, plan_of
 
-from mmpi_ns.capture.datamanager import KEYPOINT_DEPTH, OBSERVATIONS, PIXEL_DEPTH
+from mmpi_ns.capture.checks import say_once
+from mmpi_ns.capture.datamanager import OBSERVATIONS
+from mmpi_ns.capture.ray_sources import KEYPOINT_DEPTH, OWN_PIXEL, PIXEL_DEPTH
 from mmpi_ns.capture.rays import PinholeRays
 from mmpi_ns.capture.sfm import MIN_TRACK
 from mmpi_ns.placement.rule import PlacementConfig, place
@@ -64,14 +66,14 @@ def test_a_batch_holds_the_colours_of_the_pixels_that_its_rays_pass(manager):
 
 
 def test_every_training_pixel_can_be_drawn(manager):
-    assert len(manager.pool.colors) == len(TRAIN) * WIDTH * HEIGHT
+    assert len(manager.sources.pixels.colors) == len(TRAIN) * WIDTH * HEIGHT
     drawn = torch.cat([manager.next_train(step)[1]["indices"] for step in range(30)])
     assert set(drawn[:, 0].tolist()) == set(range(6)) and drawn[:, 1].max() > 20 and drawn[:, 2].max() > 28
 
 
 def test_masked_pixels_are_never_drawn(tmp_path):
     manager = datamanager(write_scene(tmp_path / "masked", masks=True))
-    assert len(manager.pool.colors) == len(TRAIN) * WIDTH * HEIGHT / 2
+    assert len(manager.sources.pixels.colors) == len(TRAIN) * WIDTH * HEIGHT / 2
     columns = torch.cat([manager.next_train(step)[1]["indices"][:, 2] for step in range(20)])
     assert columns.max() == WIDTH / 2 - 1 and columns.min() == 0
 
@@ -129,9 +131,15 @@ def test_without_a_colmap_model_or_on_request_there_are_no_keypoint_rays(scene, 
     assert len(datamanager(scene, keypoint_rays=0).next_train(0)[0]) == 64
 
 
+def with_cover(manager, cover):
+    """The manager's sources as if this share of the pixels had points shared by two images."""
+    new_views = dataclasses.replace(manager.sources.new_views, cover=cover)
+    return dataclasses.replace(manager.sources, new_views=new_views)
+
+
 def test_a_share_of_a_steps_rays_is_drawn_of_each_kind(scene):
     manager = datamanager(scene, new_view_share=1.0)
-    manager._shared = dataclasses.replace(manager._shared, cover=0.5)
+    manager.sources = with_cover(manager, 0.5)
     assert len(manager.next_train(2)[0]) == 64 + 32 + 8 and manager.get_train_rays_per_batch() == 64
     manager.rays_share = 0.25
     rays, batch = manager.next_train(2)
@@ -141,21 +149,23 @@ def test_a_share_of_a_steps_rays_is_drawn_of_each_kind(scene):
 
 def test_rays_of_new_views_come_after_the_pixels_and_leave_fewer_keypoint_rays(scene):
     manager = datamanager(scene, new_view_share=1.0)
-    assert manager._shared.cover > 1 and len(manager.next_train(2)[0]) == 128, "no keypoint is missed"
-    manager._shared = shared = dataclasses.replace(manager._shared, cover=0.25)
+    count = len(manager.sources.new_views.pixels)
+    assert manager.sources.new_views.cover > 1 and len(manager.next_train(2)[0]) == 128, "no keypoint is missed"
+    manager.sources = with_cover(manager, 0.25)
     rays, batch = manager.next_train(2)
-    count = round(64 * shared.cover)
-    assert batch["image"].shape == (64 + count, 3) and len(rays) == 64 + count + round(16 * (1 - shared.cover))
-    views = slice(64, 64 + count)
+    assert batch["image"].shape == (64 + 16, 3) and len(rays) == 64 + 16 + 12
+    views = slice(64, 64 + 16)
     assert (rays.metadata[PIXEL_DEPTH][views] > 0).all() and (rays.metadata[KEYPOINT_DEPTH][views] == 0).all()
+    assert rays.metadata[OWN_PIXEL][:, 0].tolist() == [True] * 64 + [False] * (16 + 12)
     origins, directions = in_capture_frame(manager, rays.origins.double().numpy(), rays.directions.double().numpy())
     error = np.abs(batch["image"].numpy()[views] - color_of(origins[views], directions[views]))
     assert np.median(error) < 0.02, "their colours are those of the scene, seen from there"
     manager.use_cameras(np.array([0, 1, 2]))
-    own = manager._shared
+    own = manager.sources.new_views
     assert set(own.pixels[:, 0].tolist()) | set(own.other.tolist()) <= {0, 1, 2}
+    assert set(manager.sources.keypoints.cameras.tolist()) == {0, 1, 2}
     manager.use_cameras(None)
-    assert len(manager._shared.pixels) == len(shared.pixels)
+    assert len(manager.sources.new_views.pixels) == count
 
 
 @pytest.mark.parametrize(("settings", "says"), [({}, False), ({"keypoint_rays": 0, "dense_depth": False}, True)])
@@ -167,9 +177,35 @@ def test_a_run_without_any_depth_says_so_and_draws_pixels(scene, capsys, setting
 
 def test_new_views_are_drawn_by_window_where_pixels_are_read_by_window(scene):
     manager = datamanager(scene, new_view_share=1.0, resident_pixels=10.0)
-    assert manager._shared is None
+    assert manager.sources is None, "nothing is read before a window asks"
     manager.use_cameras(np.array([0, 1, 2]))
-    assert set(manager._shared.pixels[:, 0].tolist()) <= {0, 1, 2}
+    assert set(manager.sources.new_views.pixels[:, 0].tolist()) <= {0, 1, 2}
+
+
+def test_one_window_of_more_pixels_than_are_held_has_its_new_views_and_keypoints(scene):
+    """In a run; they were missing in all of it."""
+    all_held, some = (datamanager(scene, new_view_share=1.0, resident_pixels=n) for n in (60e6, 1000.0))
+    some.use_cameras(None)
+    assert len(some.sources.pixels.colors) <= 1000 < len(all_held.sources.pixels.colors)
+    assert torch.equal(some.sources.new_views.pixels, all_held.sources.new_views.pixels)
+    assert torch.equal(some.sources.keypoints.cameras, all_held.sources.keypoints.cameras)
+    assert len(some.next_train(0)[0]) == 128
+
+
+@pytest.mark.parametrize(("settings", "shares"), [
+    ({}, "80 % pixels, 0 % new views (--pipeline.datamanager.new-view-share 0), 20 % keypoints"),
+    ({"new_view_share": 1.0}, "50 % pixels, 50 % new views, 0 % keypoints (new views take their place)"),
+    ({"new_view_share": 1.0, "dense_depth": False, "sfm_path": "none", "triangulate": False},
+     "100 % pixels, 0 % new views (no pixel has a known depth), 0 % keypoints (no SfM tracks)"),
+    ({"keypoint_rays": 0, "new_view_share": 1.0, "resident_pixels": 10.0},
+     "50 % pixels, 50 % new views, 0 % keypoints (--pipeline.datamanager.keypoint-rays 0)"),
+])  # fmt: skip
+def test_the_share_of_each_source_is_told_with_the_reason_where_it_is_none(scene, capsys, settings, shares):
+    say_once.cache_clear()
+    manager = datamanager(scene, depth_images=False, **settings)
+    capsys.readouterr()
+    manager.use_cameras(None)
+    assert f"Rays of a step: {shares}." in " ".join(capsys.readouterr().out.split())
 
 
 def test_a_colmap_model_that_cannot_be_read_is_named(tmp_path):

@@ -16,7 +16,7 @@ from nerfstudio.utils.eval_utils import eval_setup
 from tiny_scene import write_scene
 from training_runs import compared, differences, load, ready, trainer_config, write_plan, write_windows
 
-from mmpi_ns.capture.datamanager import OWN_PIXEL
+from mmpi_ns.capture.ray_sources import OWN_PIXEL
 from mmpi_ns.training.refined_poses import move_rays
 from mmpi_ns.utils.errors import InputError
 

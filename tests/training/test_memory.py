@@ -39,7 +39,7 @@ def test_memory_is_that_of_tables_moments_and_pixels(scene, plan_file, tmp_path,
     trainer.train()
     most = max(bytes_of(load(trainer.checkpoint_dir, step)) for step in range(1, 16))
     assert most == tables[0] if training == "joint" else 0.5 * tables[0] < most <= tables[0]
-    pool = trainer.pipeline.datamanager.pool
+    pool = trainer.pipeline.datamanager.sources.pixels
     assert pixels == [pool.nbytes] and pool.places is None  # which pixel it is follows from where it lies
     told = re.search(r"Memory in training: at most ([\d.]+) GiB", said)
     assert told and float(told[1]) == pytest.approx((tables[0] + pixels[0]) / 2**30, abs=0.006)
@@ -50,7 +50,7 @@ def test_pixels_read_window_by_window_count_for_that_window(scene):
     cameras = np.array([1, 2, 5])
     told = by_window.pixel_bytes(cameras), by_window.pixel_bytes()
     by_window.use_cameras(cameras)
-    assert told[0] == by_window.pool.nbytes < told[1]
+    assert told[0] == by_window.sources.pixels.nbytes < told[1]
     at_once = datamanager(scene)
     assert at_once.pixel_bytes(cameras) == at_once.pixel_bytes() == told[1]
 
@@ -62,16 +62,18 @@ def test_of_a_window_with_too_many_pixels_so_many_are_held_as_is_told(scene, tmp
     told = manager.pixel_bytes()
     for step in range(3):
         _, batch = manager.next_train(step)
-    pool = manager.pool
+    pool = manager.sources.pixels
     assert pool.nbytes == told if not masks else 0.4 * told < pool.nbytes < told
     assert "random" in capsys.readouterr().out and len(pool.colors) <= 1000
-    assert set(pool.images.tolist()) == set(range(len(TRAIN))) and (pool.starts.diff() > 60).all()
+    assert set(pool.images.tolist()) == set(range(len(TRAIN))) and (pool.ends - pool.begins > 60).all()
     for color, (camera, row, column) in zip(batch["image"], batch["indices"].tolist(), strict=True):
         assert np.abs(color.numpy() - image_of(TRAIN[camera])[row, column]).max() < 0.5 / 255 + 1e-6
         assert not masks or column < WIDTH / 2
     again, other = (datamanager(data, resident_pixels=1000, seed=seed) for seed in (0, 1))
     again.next_train(0), other.next_train(0)
-    assert torch.equal(again.pool.places, pool.places) and not torch.equal(other.pool.places, pool.places)
+    assert torch.equal(again.sources.pixels.places, pool.places) and not torch.equal(
+        other.sources.pixels.places, pool.places
+    )
 
 
 def test_the_largest_window_decides_what_memory_is_told():

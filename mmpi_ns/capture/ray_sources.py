@@ -1,0 +1,174 @@
+"""What a training step draws from: pixels, points that two images share, and SfM keypoints, of some of the cameras."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import reduce
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from nerfstudio.cameras.rays import RayBundle
+from numpy.typing import NDArray
+from torch import Tensor
+
+from mmpi_ns.capture.new_views import Rays, SharedPoints
+from mmpi_ns.capture.pixels import PixelPool
+from mmpi_ns.placement.observations import Observations
+
+KEYPOINT_DEPTH = "keypoint_inverse_distance"
+"""Ray-bundle metadata: inverse distance of the SfM point on a keypoint ray, 0 on ordinary rays."""
+PIXEL_DEPTH = "pixel_inverse_distance"
+"""Ray-bundle metadata [R, 2]: inverse distance of the content of a pixel and its expected error, 0 where unknown."""
+OWN_PIXEL = "is_own_pixel"
+"""Ray-bundle metadata [R, 1]: whether a ray goes through a pixel of a training image."""
+
+
+@dataclass(frozen=True)
+class Keypoints:
+    """Rays from training cameras to the SfM points that they saw.
+
+    A ray goes to the point itself, a fraction of a pixel from the keypoint, so no lens model is needed.
+    """
+
+    cameras: Int[Tensor, "Q"]
+    origins: Float[Tensor, "Q 3"]
+    directions: Float[Tensor, "Q 3"]
+    inverse_distances: Float[Tensor, "Q"]
+
+    @staticmethod
+    def of(observations: Observations, device: str | torch.device) -> Keypoints | None:
+        """Those of all training images; None if there are none."""
+        # Points of a plane sweep come after those of the tracks: too rough to supervise depth.
+        tracked = slice(len(observations.seen_at))
+        cameras, points = observations.seen_by[tracked], observations.points[observations.seen_point[tracked]]
+        if not len(cameras):
+            return None
+        origins = observations.centers[cameras]
+        distance = np.maximum(np.linalg.norm(points - origins, axis=-1, keepdims=True), 1e-12)
+        parts = origins, (points - origins) / distance, 1 / distance[:, 0]
+        return Keypoints(torch.from_numpy(cameras).to(device), *(torch.from_numpy(x).float().to(device) for x in parts))
+
+    def of_images(self, images: Int[Tensor, "I"]) -> Keypoints | None:
+        """Those of the given images; None if there are none."""
+        kept = torch.isin(self.cameras, images.to(self.cameras)).nonzero()[:, 0]
+        return Keypoints(*(x[kept] for x in vars(self).values())) if len(kept) else None
+
+    def draw(self, count: int, g: torch.Generator) -> tuple[RayBundle, Float[Tensor, "R 1"]]:
+        """Random rays and the inverse distances of their points."""
+        chosen = torch.randint(len(self.cameras), (count,), generator=g, device=g.device).to(self.cameras.device)
+        inverse = self.inverse_distances[chosen][:, None]
+        camera = self.cameras[chosen][:, None]
+        bundle = RayBundle(
+            self.origins[chosen], self.directions[chosen], torch.ones_like(inverse), camera_indices=camera
+        )
+        return bundle, inverse
+
+
+@dataclass(frozen=True)
+class RaySources:
+    """What a step draws from, for all training cameras or for those of one window."""
+
+    pixels: PixelPool
+    new_views: SharedPoints | None
+    keypoints: Keypoints | None
+    rays: Rays
+    """Makes rays through pixel centres (image, row, column)."""
+    new_view_share: float
+    """Rays of new views for each pixel ray."""
+    keypoint_rays: int
+    """Keypoint rays of a step without new views."""
+    no_new_views: str
+    """Why there are no new views, where there are none."""
+
+    def of_images(self, images: NDArray[np.int64]) -> RaySources:
+        """The sources of some images.
+
+        Raises:
+            InputError: the masks leave them no pixel.
+        """
+        numbers = torch.from_numpy(images)
+        return replace(
+            self,
+            pixels=self.pixels.of_images(numbers),
+            new_views=self.new_views and self.new_views.of_images(numbers),
+            keypoints=self.keypoints and self.keypoints.of_images(numbers),
+            no_new_views=self.no_new_views if self.new_views is None else "no two of these images show a point alike",
+        )
+
+    def counts(self, pixel_rays: int, share: float) -> tuple[int, int, int]:
+        """Rays of pixels, new views and keypoints in a step that draws a share of its rays, this many of pixels."""
+        cover = 0.0 if self.new_views is None else min(1.0, self.new_views.cover)
+        new_view_rays = round(cover * round(self.new_view_share * pixel_rays))
+        # Points shared by two images are more informative than keypoints, which replace the missing ones.
+        keypoint_rays = 0 if self.keypoints is None else round((1 - cover) * share * self.keypoint_rays)
+        return pixel_rays, new_view_rays, keypoint_rays
+
+    def describe(self, pixel_rays: int) -> str:
+        """The share of each source in a step, with the reason where it is none, in one line."""
+        counts = self.counts(pixel_rays, 1.0)
+        if self.keypoint_rays == 0:
+            no_keypoints = "--pipeline.datamanager.keypoint-rays 0"
+        elif self.keypoints is None:
+            no_keypoints = "no SfM tracks"
+        else:
+            no_keypoints = "new views take their place"
+        reasons = ("", self.no_new_views, no_keypoints)
+        shares = [
+            f"{round(100 * count / sum(counts))} % {name}" + ("" if count else f" ({reason})")
+            for count, name, reason in zip(counts, ("pixels", "new views", "keypoints"), reasons, strict=True)
+        ]
+        return f"Rays of a step: {', '.join(shares)}."
+
+    def draw(
+        self, pixel_rays: int, share: float, g: torch.Generator, pixels_alone: bool = False
+    ) -> tuple[RayBundle, dict[str, Tensor]]:
+        """Rays of pixels, of new views and of keypoints, in this order, and what the images say of them.
+
+        Args:
+            pixel_rays: rays through pixels.
+            share: of the step's rays that are drawn.
+            g: draws them.
+            pixels_alone: without new views and keypoints.
+
+        Returns:
+            The rays, with KEYPOINT_DEPTH, PIXEL_DEPTH and OWN_PIXEL in their metadata. The batch: ``image``, colours
+            of the rays of pixels and new views [R, C], and ``indices``, image, row and column of the pixels [N, 3].
+        """
+        colors, indices, depths = self.pixels.draw(pixel_rays, g)
+        bundles, device = [self.rays(indices)], colors.device
+        _, new_view_rays, keypoint_rays = (0, 0, 0) if pixels_alone else self.counts(pixel_rays, share)
+        if self.new_views is not None and new_view_rays:
+            views, seen, distances = self.new_views.draw(new_view_rays, self.rays, g)
+            bundles.append(views)
+            colors, depths = torch.cat([colors, seen]), torch.cat([depths, distances])
+        keypoint_depths = torch.zeros(len(colors), 1, device=device)
+        if self.keypoints is not None and keypoint_rays:
+            targets, inverse = self.keypoints.draw(keypoint_rays, g)
+            bundles.append(targets)
+            keypoint_depths = torch.cat([keypoint_depths, inverse])
+            depths = torch.cat([depths, depths.new_zeros(len(inverse), 2)])
+        bundle = reduce(_join, bundles)
+        bundle.metadata[OWN_PIXEL] = (torch.arange(len(bundle), device=device) < len(indices))[:, None]
+        bundle.metadata[KEYPOINT_DEPTH] = keypoint_depths
+        bundle.metadata[PIXEL_DEPTH] = depths
+        return bundle, {"image": colors, "indices": indices}
+
+
+def _join(a: RayBundle, b: RayBundle) -> RayBundle:
+    assert a.camera_indices is not None and b.camera_indices is not None
+    return RayBundle(
+        origins=torch.cat([a.origins, b.origins]),
+        directions=torch.cat([a.directions, b.directions]),
+        pixel_area=torch.cat([a.pixel_area, b.pixel_area]),
+        camera_indices=torch.cat([a.camera_indices, b.camera_indices]),
+        metadata={},
+    )
+
+
+def is_pixel_ray(bundle: RayBundle) -> Bool[Tensor, "R"]:
+    """Marks rays through pixels; rays to SfM keypoints have a known depth but no pixel."""
+    keypoint_depths = bundle.metadata.get(KEYPOINT_DEPTH)
+    if keypoint_depths is None:
+        return torch.ones(len(bundle), dtype=torch.bool, device=bundle.origins.device)
+    return keypoint_depths[:, 0] == 0
