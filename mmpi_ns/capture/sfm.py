@@ -21,6 +21,8 @@ from mmpi_ns.utils.errors import InputError, brief
 if TYPE_CHECKING:
     import pycolmap
 
+OLDEST_PYCOLMAP = 4
+"""First major version with the functions that this package calls."""
 MIN_TRACK = 3
 """Points seen by fewer images are too uncertain to supervise depth."""
 MAX_ERROR_PX = 2.0
@@ -79,12 +81,20 @@ def load_pycolmap() -> ModuleType:
     """pycolmap, which is slow to import, with SIGTERM left as it was.
 
     It installs glog's handler, which prints a stack trace and may wait for ever, instead of whatever was there.
+
+    Raises:
+        InputError: pycolmap is too old.
     """
     handler = signal.getsignal(signal.SIGTERM)
     import pycolmap
 
     if handler is not None and current_thread() is main_thread():
         signal.signal(signal.SIGTERM, handler)
+    if int(pycolmap.__version__.split(".")[0]) < OLDEST_PYCOLMAP:
+        raise InputError(
+            f"pycolmap {pycolmap.__version__} is installed, which lacks rigs and the global mapper: "
+            f"pip install 'pycolmap>={OLDEST_PYCOLMAP}'."
+        )
     return pycolmap
 
 

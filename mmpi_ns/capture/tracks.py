@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mmpi_ns.capture.epipolar import sampson
 from mmpi_ns.capture.matching import match_pairs, quiet, triangulate_points
 from mmpi_ns.capture.sfm import SfmModel, load_pycolmap, read_reconstruction
 from mmpi_ns.utils.errors import InputError
@@ -169,11 +168,11 @@ def _off_epipolar_lines(pycolmap: Any, database: Path, model: Any) -> float | No
         images = [model.images[i] for i in pycolmap.pair_id_to_image_pair(number)]
         cameras = [model.cameras[image.camera_id] for image in images]
         rays = [
-            np.c_[camera.cam_from_img(keypoints[image.image_id][matches[:, k]]), np.ones(len(matches))]
+            camera.cam_from_img(keypoints[image.image_id][matches[:, k]])
             for k, (image, camera) in enumerate(zip(images, cameras, strict=True))
         ]
         relative = images[1].cam_from_world() * images[0].cam_from_world().inverse()
-        off = sampson(rays[0], rays[1], pycolmap.essential_matrix_from_pose(relative))
+        off = np.sqrt(pycolmap.compute_squared_sampson_error(*rays, pycolmap.essential_matrix_from_pose(relative)))
         found.append(off * cameras[0].mean_focal_length() / cameras[0].width)
     return float(np.median(np.concatenate(found))) if found and sum(map(len, found)) else None
 

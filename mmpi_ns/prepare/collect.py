@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from mmpi_ns.capture.epipolar import sampson
 from mmpi_ns.capture.matching import MIN_INLIERS
 from mmpi_ns.prepare.evidence import Array, Pairs, Places, Witness, scale_changes
 from mmpi_ns.prepare.frame import camera_poses
@@ -60,7 +59,9 @@ def _pairs(model: pycolmap.Reconstruction, database: Path) -> Pairs:
         seen = points[a][matches[:, 0]]
         tracked = (seen == points[b][matches[:, 1]]) & (seen >= 0)
         relative = model.images[b].cam_from_world() * model.images[a].cam_from_world().inverse()
-        off = sampson(rays[a][matches[:, 0]], rays[b][matches[:, 1]], pycolmap.essential_matrix_from_pose(relative))
+        essential = pycolmap.essential_matrix_from_pose(relative)
+        pixels = rays[a][matches[:, 0], :2], rays[b][matches[:, 1], :2]
+        off = np.sqrt(pycolmap.compute_squared_sampson_error(*pixels, essential))
         camera = model.cameras[model.images[a].camera_id]
         off *= camera.mean_focal_length() / (FIT_PX * max(camera.width, camera.height) / 1000)
         fitting, beside = int((off < 1).sum()), int(((off >= 1) & (off < BESIDE)).sum())

@@ -13,6 +13,7 @@ import numpy as np
 import pycolmap
 from PIL import Image
 
+from mmpi_ns.capture.exif import kept_tags
 from mmpi_ns.prepare.cameras import Intrinsics, read_intrinsics
 from mmpi_ns.prepare.frame import camera_poses
 from mmpi_ns.prepare.images import Photo
@@ -148,6 +149,7 @@ def downscale(source: Path, target: Path, factor: int, mask: bool = False) -> No
     if target.exists():
         return
     with Image.open(source) as image:
+        tags = kept_tags(image)
         width, height = (n // factor * factor for n in image.size)
         image = image.crop((0, 0, width, height))
         if mask:
@@ -155,16 +157,17 @@ def downscale(source: Path, target: Path, factor: int, mask: bool = False) -> No
             small = Image.fromarray(blocks.min((1, 3)))
         else:
             small = image.reduce(factor)
-    save_like(small, target)
+    save_like(small, target, tags)
 
 
-def save_like(image: Image.Image, target: Path) -> None:
-    """Writes an image atomically, JPEG at high quality."""
+def save_like(image: Image.Image, target: Path, tags: Image.Exif) -> None:
+    """Writes an image with its EXIF atomically, JPEG at high quality."""
     with whole(target) as partial:
         if target.suffix.lower() == ".png":
-            image.save(partial, format="PNG")
+            image.save(partial, format="PNG", exif=tags)
         else:
-            image.convert("L" if image.mode == "L" else "RGB").save(partial, format="JPEG", quality=97, subsampling=0)
+            image = image.convert("L" if image.mode == "L" else "RGB")
+            image.save(partial, format="JPEG", quality=97, subsampling=0, exif=tags)
 
 
 def write_scene(model: pycolmap.Reconstruction, scene: Path, content: dict[str, Any]) -> None:

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 
+from mmpi_ns.capture.exif import kept_tags
 from mmpi_ns.prepare.stages import PrepareError, progress, say, whole, write_text
 
 IMAGES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
@@ -176,7 +177,8 @@ def _convert(image: Image.Image, path: Path, suffix: str) -> None:
     mode = "L" if upright.mode in ("1", "L") else "RGBA" if upright.mode in ("RGBA", "LA", "PA") else "RGB"
     form = "PNG" if suffix == ".png" else "JPEG"
     upright = upright.convert("RGB" if form == "JPEG" and mode == "RGBA" else mode)
-    upright.save(path, format=form, **({"quality": 97, "subsampling": 0} if form == "JPEG" else {}))
+    options = {"quality": 97, "subsampling": 0} if form == "JPEG" else {}
+    upright.save(path, format=form, exif=kept_tags(image), **options)
 
 
 def _read_exif(exif: Image.Exif, longest: int) -> tuple[str, float | None]:

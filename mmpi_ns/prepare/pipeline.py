@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
+from mmpi_ns.capture.sfm import load_pycolmap
 from mmpi_ns.capture.tracks import near_pairs
 from mmpi_ns.prepare import checks, export, features, images, pairs, report
 from mmpi_ns.prepare.cameras import Intrinsics, make_cameras, parse_camera, share
@@ -274,7 +275,7 @@ class Preparation:
         if s.undistort:
             flat = self.work / "undistorted"
             shutil.rmtree(flat, ignore_errors=True)
-            photos = undistort(model, photos, folder, masks, flat)
+            model, photos = undistort(model, photos, folder, masks, flat, s.threads)
             folder, masks = flat / "images", flat / "masks" if masks else None
         built = self.work / "scene"
         shutil.rmtree(built, ignore_errors=True)
@@ -284,8 +285,9 @@ class Preparation:
         notes = {"unit": frame.unit, "up": frame.up, "mapping": solved.mapping, "matching": self.matching}
         export.write_scene(model, built, export.transforms(model, split, masks is not None, notes))
         missing = [p.name for p in self.photos if p.name not in names and not any(p.name in g for g in solved.groups)]
+        exposure = report.exposure_in_words([built / "images" / p.name for p in photos])
         facts = report.Facts(
-            s.input.name, len(self.photos), missing, solved.groups, self.matching, solved.mapping,
+            s.input.name, len(self.photos), missing, solved.groups, self.matching, solved.mapping, exposure,
             frame.up, frame.unit, split, findings, self._lens_notes(), self.times,
             solved.verdict, solved.focal,
         )  # fmt: skip
@@ -388,6 +390,7 @@ def prepare(settings: Settings) -> Verdict:
     Raises:
         PrepareError: the input cannot be made into a scene.
     """
+    load_pycolmap()  # in a version that is new enough
     check_options(settings)
     check_folders(settings)
     with only_one(settings.scene / WORK):

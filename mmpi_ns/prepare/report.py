@@ -11,6 +11,7 @@ import pycolmap
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from mmpi_ns.capture.exif import exposure_of
 from mmpi_ns.prepare.checks import Finding, coverage
 from mmpi_ns.prepare.export import Split
 from mmpi_ns.prepare.focal import focal_in_words
@@ -36,6 +37,7 @@ class Facts:
     """Images of models that are not connected to this one."""
     matching: str
     mapping: str
+    exposure: str
     up: str
     unit: str
     split: Split
@@ -46,6 +48,15 @@ class Facts:
     verdict: Verdict
     focal: tuple[float, float] | None
     """The interval of a refined focal length, in pixels."""
+
+
+def exposure_in_words(images: Sequence[Path]) -> str:
+    """How much the exposure of some images varies by their EXIF, for the report."""
+    exposures = [e for e in map(exposure_of, images) if e is not None]
+    light = [e.time * (e.sensitivity or 1.0) / (e.aperture or 1.0) ** 2 for e in exposures]
+    if not light:
+        return "not known: no EXIF"
+    return f"varies {max(light) / min(light):.1f}-fold by the EXIF of {len(light)} images"
 
 
 def write_report(model: pycolmap.Reconstruction, facts: Facts, scene: Path) -> str:
@@ -84,6 +95,7 @@ def _table(model: pycolmap.Reconstruction, facts: Facts, covered: dict[str, floa
         "mapping": facts.mapping,
         "verdict": f"{facts.verdict.grade} {facts.verdict.words()}".strip(),
         "focal length": "given" if facts.focal is None else focal_in_words(*facts.focal),
+        "exposure": facts.exposure,
         "up": facts.up,
         "unit": facts.unit,
         "split": f"{len(facts.split.train)} train, {len(facts.split.test)} test: {facts.split.says}",

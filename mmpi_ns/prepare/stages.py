@@ -16,6 +16,8 @@ from filelock import FileLock, Timeout
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
+from mmpi_ns.utils.errors import InputError
+
 T = TypeVar("T")
 
 CONSOLE = Console(width=120)
@@ -24,7 +26,7 @@ LEFT = 1 << 20
 """Free bytes below which a failure to write is attributed to a full disk; COLMAP's errors give no reason."""
 
 
-class PrepareError(Exception):
+class PrepareError(InputError):
     """The input cannot be made into a scene; the message says why and what to do."""
 
 
@@ -106,6 +108,8 @@ def only_one(work: Path) -> Iterator[None]:
             yield
     except Timeout as error:
         raise PrepareError(f"Another mmpi-prepare is making {work.parent}: wait for it, or name another.") from error
+    except InputError:
+        raise
     except (OSError, RuntimeError, ValueError) as error:
         free = shutil.disk_usage(work.parent).free
         if getattr(error, "errno", None) in FULL or free < LEFT:

@@ -1,83 +1,75 @@
-"""Undistortion of images, masks and keypoints to a pinhole camera."""
+"""Undistortion of images, masks and keypoints to a pinhole camera, by COLMAP."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pycolmap
 from PIL import Image
 
-from mmpi_ns.prepare.export import save_like
+from mmpi_ns.capture.matching import quiet
 from mmpi_ns.prepare.images import Photo
 from mmpi_ns.prepare.stages import progress
 
+QUALITY = 97
+"""Of JPEG."""
+
 
 def undistort(
-    model: pycolmap.Reconstruction, photos: Sequence[Photo], images: Path, masks: Path | None, target: Path
-) -> list[Photo]:
-    """Writes undistorted images and masks to ``target`` and changes the model's cameras and keypoints to match.
+    model: pycolmap.Reconstruction,
+    photos: Sequence[Photo],
+    images: Path,
+    masks: Path | None,
+    target: Path,
+    threads: int,
+) -> tuple[pycolmap.Reconstruction, list[Photo]]:
+    """Writes undistorted images, with their EXIF, and masks.
 
     Args:
-        model: changed in place: pinhole cameras, keypoints moved.
+        model: not changed.
         photos: registered images.
         images: folder of the images.
         masks: folder of the masks (``NAME.png``), or None.
         target: gets ``images`` and ``masks``.
+        threads: CPU threads; below 1 for all.
 
     Returns:
-        The images with their new sizes.
+        The model with pinhole cameras and moved keypoints, and the images with their new sizes.
     """
-    pinholes = {n: pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), c) for n, c in model.cameras.items()}
-    maps = {n: _map(pinholes[n], camera) for n, camera in model.cameras.items()}
-    by_name = {model.images[i].name: model.images[i] for i in model.reg_image_ids()}
-    (target / "images").mkdir(parents=True, exist_ok=True)
-    done = []
-    with progress("Undistorting", len(photos)) as advance:
-        for photo in photos:
-            image = by_name[photo.name]
-            old, new, grid = model.cameras[image.camera_id], pinholes[image.camera_id], maps[image.camera_id]
-            _warp(images / photo.name, target / "images" / photo.name, grid, cv2.INTER_LINEAR)
-            if masks is not None:
-                (target / "masks").mkdir(exist_ok=True)
-                name = f"{photo.name}.png"
-                _warp(masks / name, target / "masks" / name, grid, cv2.INTER_NEAREST)
-            _move_keypoints(image, old, new)
-            done.append(Photo(photo.name, new.width, new.height, photo.lens, None, photo.source))
-            advance(1)
-    for number, pinhole in pinholes.items():
-        camera = model.cameras[number]
-        camera.model, camera.params = pinhole.model, pinhole.params
-        camera.width, camera.height = pinhole.width, pinhole.height
-    model.update_point_3d_errors()
-    return done
+    (target / "bent").mkdir(parents=True)
+    model.write(target / "bent")
+    names = [photo.name for photo in photos]
+    with progress("Undistorting", 1) as advance, quiet():
+        pycolmap.undistort_images(
+            target, target / "bent", images, image_names=names, jpeg_quality=QUALITY, num_threads=threads
+        )
+        advance()
+    flat = pycolmap.Reconstruction(target / "sparse")
+    flat.update_point_3d_errors()
+    flat_photos = []
+    for photo in photos:
+        number = next(i.camera_id for i in model.images.values() if i.name == photo.name)
+        with Image.open(images / photo.name) as image:
+            alpha = image.getchannel("A") if image.mode == "RGBA" else None
+        if alpha is not None:  # COLMAP reads colours alone
+            with Image.open(target / "images" / photo.name) as image:
+                tags = image.getexif()
+                image.putalpha(_undistort_mask(alpha, model.cameras[number]))
+            image.save(target / "images" / photo.name, exif=tags)
+        if masks is not None:
+            (target / "masks").mkdir(exist_ok=True)
+            with Image.open(masks / f"{photo.name}.png") as mask:
+                flat_mask = _undistort_mask(mask, model.cameras[number]).point(lambda v: 255 if v == 255 else 0)
+            flat_mask.save(target / "masks" / f"{photo.name}.png")
+        size = flat.cameras[number]
+        flat_photos.append(replace(photo, width=size.width, height=size.height, exif_focal=None))
+    return flat, flat_photos
 
 
-def _map(pinhole: pycolmap.Camera, camera: pycolmap.Camera) -> np.ndarray:
-    """Where each pixel of the pinhole lies in the distorted image, in OpenCV's pixel centres. [height, width, 2]"""
-    columns, rows = np.meshgrid(np.arange(pinhole.width) + 0.5, np.arange(pinhole.height) + 0.5)
-    rays = np.asarray(pinhole.cam_from_img(np.stack([columns.ravel(), rows.ravel()], -1)))
-    pixels = camera.img_from_cam(np.c_[rays, np.ones(len(rays))])
-    return (np.asarray(pixels).reshape(pinhole.height, pinhole.width, 2) - 0.5).astype(np.float32)
-
-
-def _warp(source: Path, target: Path, grid: np.ndarray, interpolation: int) -> None:
-    if target.exists():
-        return
-    with Image.open(source) as image:
-        pixels = np.asarray(image)
-    # Masks: outside the lens nothing is known. Images: undistort_camera leaves no such pixel.
-    border = cv2.BORDER_CONSTANT if interpolation == cv2.INTER_NEAREST else cv2.BORDER_REPLICATE
-    save_like(Image.fromarray(cv2.remap(pixels, grid[..., 0], grid[..., 1], interpolation, borderMode=border)), target)
-
-
-def _move_keypoints(image: pycolmap.Image, old: pycolmap.Camera, new: pycolmap.Camera) -> None:
-    points = list(image.points2D)
-    if not points:
-        return
-    rays = np.asarray(old.cam_from_img(np.array([p.xy for p in points])))
-    pixels = np.asarray(new.img_from_cam(np.c_[rays, np.ones(len(rays))]))
-    for point, xy in zip(image.points2D, pixels, strict=True):
-        point.xy = xy
+def _undistort_mask(mask: Image.Image, camera: pycolmap.Camera) -> Image.Image:
+    bitmap = pycolmap.Bitmap.from_array(np.asarray(mask))
+    flat, _ = pycolmap.undistort_image(pycolmap.UndistortCameraOptions(), bitmap, camera)
+    return Image.fromarray(flat.to_array())

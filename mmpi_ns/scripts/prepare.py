@@ -22,14 +22,15 @@ def main() -> int:
     import tyro
 
     from mmpi_ns.prepare.settings import Settings
-    from mmpi_ns.prepare.stages import PrepareError, say
+    from mmpi_ns.prepare.stages import say
+    from mmpi_ns.utils.errors import InputError
 
     settings = tyro.cli(Settings, description=Settings.__doc__)
     from mmpi_ns.prepare.pipeline import prepare
 
     try:
         verdict = prepare(settings)
-    except PrepareError as error:
+    except InputError as error:
         say(f"mmpi-prepare: {error}", "bold red")
         return 1
     return 0 if verdict.grade == "right" else 3

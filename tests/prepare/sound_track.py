@@ -7,8 +7,8 @@ observation that fits worst until all fit or too few are left.
 from __future__ import annotations
 
 import numpy as np
+import pycolmap
 
-from mmpi_ns.capture.epipolar import sampson
 from mmpi_ns.prepare.evidence import Pairs, Witness, scale_changes
 
 FOCAL, WIDTH, HEIGHT = 360.0, 620, 188
@@ -85,7 +85,8 @@ def witness_with(poses, pixels, seen, focal=FOCAL, name="incremental"):
             turn = poses[j, :3, :3].T @ poses[i, :3, :3]
             x, y, z = poses[j, :3, :3].T @ (poses[i, :3, 3] - poses[j, :3, 3])
             essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ turn
-            off = sampson(local[i, both], local[j, both], essential) * focal
+            squared = pycolmap.compute_squared_sampson_error(local[i, both, :2], local[j, both, :2], essential)
+            off = np.sqrt(squared) * focal
             fitting, beside = (off < 1.24).sum(), ((off >= 1.24) & (off < 4 * 1.24)).sum()
             rows.append((i, j, len(both), (kept[i, both] & kept[j, both]).sum(), fitting, beside))
     table = np.array(rows)

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pycolmap
 import pytest
 from sound_track import FOCAL, drive, observed, project, scattered, triangulated, witness_with
 
-from mmpi_ns.capture.epipolar import sampson
 from mmpi_ns.prepare.alignment import rotation_between
 from mmpi_ns.prepare.evidence import (
     Pairs,
@@ -217,8 +217,12 @@ def test_scale_that_changes_by_a_third_is_broken_though_most_matches_hold(keypoi
     assert "between frame_011 and frame_012" in verdict.words()
 
 
-def test_sampson_is_the_distance_to_the_nearest_exact_match():
+def test_colmaps_sampson_error_is_the_squared_distance_to_the_nearest_exact_match():
     """To first order: small offsets of exact matches across their epipolar lines come back."""
+
+    def sampson(first, second, essential):
+        return np.sqrt(pycolmap.compute_squared_sampson_error(first[:, :2], second[:, :2], essential))
+
     random = np.random.default_rng(2)
     points = random.uniform([-2, -2, 4], [2, 2, 9], (50, 3))
     turn, shift = drive(3, turn=0.1)[2, :3, :3], np.array([0.4, 0.1, -0.3])

@@ -12,6 +12,7 @@ import time
 
 import corridor
 import numpy as np
+import pycolmap
 import pytest
 from PIL import Image
 
@@ -20,6 +21,7 @@ from mmpi_ns.prepare.checks import Finding, by_kind
 from mmpi_ns.prepare.pipeline import WORK, prepare
 from mmpi_ns.prepare.settings import Settings
 from mmpi_ns.prepare.stages import PrepareError, only_one, progress
+from mmpi_ns.utils.errors import InputError
 
 NAN = float("nan")
 
@@ -61,6 +63,13 @@ def test_files_that_options_name_are_read_before_any_work(frames, tmp_path):
     with pytest.raises(PrepareError, match="None of the 1 test_filenames"):
         prepare(Settings(frames, scene, split_from=lists))
     assert not (scene / WORK / "features").exists()
+
+
+def test_an_old_pycolmap_is_named_with_the_remedy(frames, tmp_path, monkeypatch):
+    monkeypatch.setattr(pycolmap, "__version__", "3.13.0")
+    with pytest.raises(InputError, match=r"pycolmap 3\.13\.0 is installed.*pip install 'pycolmap>=4'"):
+        prepare(Settings(frames, tmp_path / "scene"))
+    assert not (tmp_path / "scene").exists()
 
 
 def test_a_second_run_into_a_scene_says_so_and_ends(frames, tmp_path):

@@ -5,16 +5,21 @@ from __future__ import annotations
 import corridor
 import cv2
 import numpy as np
+import pycolmap
 import pytest
-from PIL import Image
+from PIL import ExifTags, Image
+from PIL.TiffImagePlugin import IFDRational
 
+from mmpi_ns.capture.exif import Exposure, exposure_of
 from mmpi_ns.prepare import checks, export, features, pairs
 from mmpi_ns.prepare.cameras import make_cameras, parse_camera, read_intrinsics, share
 from mmpi_ns.prepare.frame import up_from_cameras
-from mmpi_ns.prepare.images import Photo, find_images, gather, gather_masks, scene_names
+from mmpi_ns.prepare.images import Photo, find_images, gather, gather_masks, reads_heif, scene_names
 from mmpi_ns.prepare.pipeline import prepare
+from mmpi_ns.prepare.report import exposure_in_words
 from mmpi_ns.prepare.settings import Settings
 from mmpi_ns.prepare.stages import PrepareError
+from mmpi_ns.prepare.undistort import undistort
 from mmpi_ns.prepare.video import Measured, choose_frames, measure, select_frames
 
 
@@ -46,6 +51,86 @@ def test_turned_photo_is_set_upright_and_its_focal_length_read(tmp_path):
     assert (photos[0].width, photos[0].height) == (30, 40)
     assert Image.open(tmp_path / "out/images/0.jpg").size == (30, 40)
     assert photos[0].exif_focal == pytest.approx(40)
+
+
+@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif", ".heic"])
+def test_every_written_image_keeps_its_exposure(suffix, turned, tmp_path):
+    """Copied, set upright, converted, and downscaled."""
+    if suffix == ".heic" and not reads_heif():
+        pytest.skip("pillow-heif is not installed")
+    for n in range(2):
+        exif = Image.Exif()
+        exif[ExifTags.Base.Orientation] = 6 if turned else 1
+        exif[ExifTags.Base.Model] = "Phone"
+        shot = {ExifTags.Base.ExposureTime: IFDRational(1, 250 + n), ExifTags.Base.ISOSpeedRatings: 80}
+        shot |= {ExifTags.Base.FNumber: IFDRational(9, 5), ExifTags.Base.MakerNote: b"x" * 9000}
+        exif.get_ifd(ExifTags.IFD.Exif).update(shot)
+        (tmp_path / "in").mkdir(exist_ok=True)
+        with Image.open(save(tmp_path / "phone.jpg", (64, 48), exif=exif)) as image:
+            image.save(tmp_path / f"in/{n}{suffix}", exif=image.getexif())  # Pillow writes a new Exif to no TIFF
+    photos = gather(tmp_path / "in", find_images(tmp_path / "in"), tmp_path / "out")
+    export.write_images(tmp_path / "out/images", photos, tmp_path / "scene", (2,))
+    for folder in ("images", "images_2"):
+        files = [tmp_path / "scene" / folder / photo.name for photo in photos]
+        for n, file in enumerate(files):
+            exposure = exposure_of(file)
+            assert exposure is not None and exposure.time == pytest.approx(1 / (250 + n))
+            assert exposure.sensitivity == 80 and exposure.aperture == pytest.approx(1.8)
+            with Image.open(file) as image:
+                assert image.getexif().get(ExifTags.Base.Orientation, 1) == 1
+                assert image.getexif()[ExifTags.Base.Model] == "Phone"
+        assert exposure_in_words(files) == "varies 1.0-fold by the EXIF of 2 images"
+
+
+def test_exif_that_says_nothing_gives_no_exposure(tmp_path):
+    assert exposure_of(save(tmp_path / "bare.jpg")) is None
+    for n, time in enumerate((IFDRational(0, 1), IFDRational(0, 0))):
+        exif = Image.Exif()
+        exif[ExifTags.IFD.Exif] = {ExifTags.Base.ExposureTime: time, ExifTags.Base.FNumber: IFDRational(2, 1)}
+        assert exposure_of(save(tmp_path / f"{n}.jpg", exif=exif)) is None
+    exif = Image.Exif()
+    exif[ExifTags.IFD.Exif] = {ExifTags.Base.ExposureTime: IFDRational(1, 8)}
+    assert exposure_of(save(tmp_path / "time.jpg", exif=exif)) == Exposure(0.125, None, None)
+    assert exposure_in_words([tmp_path / "bare.jpg"]) == "not known: no EXIF"
+
+
+def test_undistorted_images_keep_exposure_and_alpha_and_masks_stay_black_and_white(tmp_path):
+    """A lens of a known term: what lies on a ray in the photo lies on the same ray of the pinhole's image."""
+    camera = pycolmap.Camera(
+        model="OPENCV", width=200, height=160, params=[150, 150, 100, 80, 0.2, 0, 0, 0], camera_id=1
+    )
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(camera)
+    edge = camera.img_from_cam(np.array([[0.3, 0.0, 1.0]]))[0, 0]  # everything right of this ray is white, opaque, used
+    right = np.tile(np.arange(200) + 0.5 > edge, (160, 1))
+    exif = Image.Exif()
+    exif[ExifTags.IFD.Exif] = {ExifTags.Base.ExposureTime: IFDRational(1, 60)}
+    for folder in ("images", "masks"):
+        (tmp_path / folder).mkdir()
+    photos = [Photo("a.jpg", 200, 160), Photo("b.png", 200, 160)]
+    for i, photo in enumerate(photos):
+        pixels = np.stack([right * 255] * (3 + i), -1).astype(np.uint8)
+        Image.fromarray(pixels).save(tmp_path / "images" / photo.name, exif=exif)
+        Image.fromarray((right * 255).astype(np.uint8)).save(tmp_path / "masks" / f"{photo.name}.png")
+        image = pycolmap.Image(name=photo.name, camera_id=1, image_id=i + 1, points2D=[pycolmap.Point2D([edge, 80.0])])
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
+    flat, flat_photos = undistort(model, photos, tmp_path / "images", tmp_path / "masks", tmp_path / "flat", 1)
+    pinhole = flat.cameras[1]
+    at = pinhole.params[2] + 0.3 * pinhole.params[0]
+    assert pinhole.model.name == "PINHOLE" and flat.images[1].points2D[0].xy[0] == pytest.approx(at, abs=1e-3)
+    for photo in flat_photos:
+        assert (photo.width, photo.height) == (pinhole.width, pinhole.height)
+        with Image.open(tmp_path / "flat/images" / photo.name) as image:
+            assert image.size == (photo.width, photo.height)
+            colors = np.asarray(image.convert("RGBA")).astype(int)
+        exposure = exposure_of(tmp_path / "flat/images" / photo.name)
+        assert exposure is not None and exposure.time == pytest.approx(1 / 60, abs=1e-6)
+        mask = np.asarray(Image.open(tmp_path / f"flat/masks/{photo.name}.png"))
+        row = photo.height // 2
+        for values in (mask[row], colors[row, :, 0], *([colors[row, :, 3]] if photo.name == "b.png" else [])):
+            assert abs(np.argmax(values > 127) - at) < 1.5 and values[0] < 9 and values[-1] > 246
+        assert set(np.unique(mask)) == {0, 255}
 
 
 def test_plain_photo_is_copied_byte_for_byte(tmp_path):
