@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from nerfstudio.configs.base_config import LoggingConfig, MachineConfig, ViewerConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
@@ -9,17 +11,21 @@ from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
 from mmpi_ns.capture.datamanager import MMPIDataManagerConfig
+from mmpi_ns.field.mmpi_field import ColourConfig
 from mmpi_ns.model import MMPIModelConfig
 from mmpi_ns.placement.defaults import DEFAULTS
 from mmpi_ns.placement.rule import PlacementConfig
 from mmpi_ns.rendering.pipeline import MMPIPipelineConfig
 from mmpi_ns.training.learning_rates import PhaseSchedulerConfig
 from mmpi_ns.training.losses import LossWeights
+from mmpi_ns.training.phases import ScheduleConfig
 from mmpi_ns.training.touched_adam import TouchedAdamConfig
 from mmpi_ns.training.trainer import MMPITrainerConfig
 
 PAPER_DATA = {"keypoint_rays": 0, "dense_depth": False, "depth_images": False, "new_view_share": 0.0}
 """The paper trains on the colours of pixels alone."""
+PAPER_SCHEDULE = ScheduleConfig(decay_from=0.0, decay_decades=1.5, growing_rays=1.0, release_weight=0.0)
+"""The paper's rates fall from the start, as DVGO's; all rays are drawn at every step, and no bricks are released."""
 POSE_RATE = 1e-4
 """Learning rate of refined poses, radians and scene units: a tenth of nerfacto's (docs/log/experiments.md)."""
 
@@ -59,11 +65,9 @@ def _method(
 
 
 def _paper() -> dict:
-    """What the paper takes from DVGO: total variation, nine features, and rates that fall from the start; no release of
-    bricks, and all rays at every step."""
+    """What the paper takes from DVGO: total variation and nine features; and a network evaluated for every sample."""
     loss = LossWeights(tv_density=1e-5, tv_features=1e-6)
-    rates = {"decay_from": 0.0, "decay_decades": 1.5, "growing_rays": 1.0}
-    return rates | {"loss": loss, "release_weight": 0.0, "shading": "sample", "feature_channels": 9}
+    return {"loss": loss, "colour": ColourConfig(shading="sample", feature_channels=9)}
 
 
 mmpi = _method(
@@ -88,10 +92,9 @@ mmpi_kitti = _method(
     paper=True,
     model=MMPIModelConfig(
         placement=PlacementConfig(arrangement="drive", window_length=0.0, planes=256, height=270, width=270),
-        training="two-phase",
-        rays_per_mpi="split",
-        blend_share=0.25,
-        finetune_share=0.0,
+        schedule=replace(
+            PAPER_SCHEDULE, training="two-phase", rays_per_mpi="split", blend_share=0.25, finetune_share=0.0
+        ),
         **_paper(),
     ),
 )
@@ -102,7 +105,7 @@ def _scannet() -> MMPIModelConfig:
         placement=PlacementConfig(
             arrangement="room", window_length=0.0, planes=128, height=192, width=192, cube_voxels=160
         ),
-        training="joint",
+        schedule=replace(PAPER_SCHEDULE, training="joint"),
         **_paper(),
     )
 

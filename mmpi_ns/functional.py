@@ -103,7 +103,7 @@ def _load_run(config_path: Path, device: torch.device) -> Scene:
         raise InputError(f"There is no checkpoint in {folder} to load: train first, or put it back.")
     state = read_checkpoint(checkpoints[max(checkpoints)])
     cameras = state["capture"]["cameras"]
-    config.windows_folder, config.render = config_path.parent / "windows", "exact"
+    config.windows_folder, config.rendering.mode = config_path.parent / "windows", "exact"
     unbounded = SceneBox(torch.tensor([[-1.0] * 3, [1.0] * 3]))
     model = config.setup(scene_box=unbounded, num_train_data=len(cameras), metadata={}, device=device).to(device)
     tensors = {k.removeprefix("_model."): v for k, v in state["pipeline"].items() if k.startswith("_model.")}

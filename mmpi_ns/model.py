@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -19,8 +19,7 @@ from torch.nn import Parameter
 
 from mmpi_ns.capture.datamanager import OBSERVATIONS, RAYS_PER_STEP, TRAINING_VIEWS
 from mmpi_ns.capture.rays import PinholeRays
-from mmpi_ns.field.mmpi_field import MMPIField
-from mmpi_ns.field.shading import Shading
+from mmpi_ns.field.mmpi_field import ColourConfig, MMPIField
 from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.march.reference import most_kept
 from mmpi_ns.placement.rule import PlacementConfig
@@ -29,8 +28,8 @@ from mmpi_ns.rendering.baked import BakedWindow, bake, suits_bricks
 from mmpi_ns.rendering.chunks import check_crop, rays_per_chunk, render_in_chunks
 from mmpi_ns.rendering.metrics import ImageMetrics, depth_metrics, pictures
 from mmpi_ns.rendering.render import images_of, render_rays, sampled_outputs
-from mmpi_ns.rendering.rendered import BACKGROUNDS, RenderedRays, background_of, bounded
-from mmpi_ns.rendering.sampler import MMPISampler
+from mmpi_ns.rendering.rendered import BACKGROUNDS, RenderedRays, RenderingConfig, background_of, bounded
+from mmpi_ns.rendering.sampler import MMPISampler, SamplingConfig
 from mmpi_ns.rendering.shown import shown_outputs, shows_in_one_pass
 from mmpi_ns.rendering.window_store import WindowStore
 from mmpi_ns.rendering.windows import render_windows
@@ -38,10 +37,11 @@ from mmpi_ns.scene.plan import NO_PLAN
 from mmpi_ns.scene.visible_tiles import TrainingViews
 from mmpi_ns.scene.windows import WindowedPlan
 from mmpi_ns.training.checkpoints import check_there_are_checkpoints
+from mmpi_ns.training.config_files import grouped
 from mmpi_ns.training.individual import individual_rays
 from mmpi_ns.training.losses import LossWeights, batch_losses, over_background, photometric
 from mmpi_ns.training.memory import check_memory
-from mmpi_ns.training.phases import Schedule, Training, make_schedule
+from mmpi_ns.training.phases import ScheduleConfig, make_schedule
 from mmpi_ns.training.progress import Progress
 from mmpi_ns.training.refined_poses import check_refined_poses, move_rays
 from mmpi_ns.training.run import TrainingRun, views_of
@@ -65,69 +65,19 @@ class MMPIModelConfig(ModelConfig):
     """Placement and resolution of the MPIs."""
     plan_file: Path | None = None
     """A scene plan (JSON) to use instead of the placement rule."""
-    resident_gib: float = 2.0
-    """Device memory for rendering the windows of a long capture, GiB, in addition to the one trained last. As many as
-    fit are kept, at least one; the least recently used is evicted first."""
-    half_windows: bool = False
-    """Write the finished windows of a long capture in half precision: half of the disk space; images change by a
-    fraction of a grey level."""
     camera_optimizer: CameraOptimizerConfig = field(default_factory=CameraOptimizerConfig)
     """Refines the poses of the training images during training (docs/captures.md, "Poses that are not exact")."""
-    training: Training = "joint"
-    """Train each MPI alone, then reliability (two-phase), or all MPIs together without reliability (joint)."""
-    blend_share: float = 0.05
-    """Share of the steps in which only reliability trains."""
-    finetune_share: float = 0.4
-    """Share of the steps in which everything trains together at the end."""
-    finetune_rate: float = 1.0
-    """Learning rates at the start of the fine-tune relative to those of the first phase."""
-    decay_decades: float = 1.0
-    """Decades that learning rates fall over a phase,"""
-    decay_from: float = 0.5
-    """after being constant for this fraction of it."""
-    growth_shares: tuple[float, ...] = (1 / 15, 2 / 15, 3 / 15, 4 / 15)
-    """When the texels of a plane double, as shares of the first phase."""
-    growing_rays: float = 0.5
-    """Fraction of a step's rays that are drawn until then: coarse texels need fewer, and nearly all samples learn. Of
-    fewer than 4,000 steps proportionally more."""
-    release_shares: tuple[float, ...] = (3 / 15, 4 / 15, 0.3, 0.5, 0.75, 0.95)
-    """When empty bricks (8 x 8 texels of a plane) are released, as fractions of the first phase: after growth, or just
-    before the texels double."""
-    release_weight: float = 5e-3
-    """Bricks in which no sample of a training ray has this weight are released; 0 keeps all that rays can reach."""
-    rays_per_mpi: Literal["split", "all"] = "all"
-    """Individual phase: each MPI renders all rays of a batch (all; K times the work, about that of joint training), or
-    the MPIs share them (split)."""
-    shading: Shading = "ray"
-    """Evaluate the colour network once a ray, after compositing (ray), or for every sample as in the paper (sample)."""
-    shared_colour: bool = False
-    """Shading of samples: one colour network for all MPIs instead of one each."""
-    feature_channels: int = 8
-    """Channels of a texel besides its density: three of a colour, the others features for view-dependent appearance.
-    Eight are half a cache line, so a CPU trains faster with them than with nine (docs/log/performance.md)."""
-    hidden_width: int = 64
-    """Width of the colour networks."""
-    position_frequencies: int = 2
-    """Shading of samples: octaves of the positional encoding of NDC positions."""
-    direction_frequencies: int = 2
-    """Octaves of the positional encoding of directions."""
-    samples_per_voxel: float = 1.0
-    """Samples per voxel side along a ray through the cube."""
-    cube_alpha: float = 1e-3
-    """Initial alpha of a cube sample: 1e-2 for a small room to 1e-4."""
-    train_threshold: float = 3e-3
-    """Samples of less weight get no gradient (at most a tenth of an equal share while the resolution grows)."""
+    schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
+    """Phases, growth, learning rates and release of bricks."""
+    sampling: SamplingConfig = field(default_factory=SamplingConfig)
+    """Samples of a ray, and which of them train."""
+    colour: ColourConfig = field(default_factory=ColourConfig)
+    """Features and networks."""
     ops: dispatch.Route = "auto"
     """Inner loops: compiled at first use (native; by a C++ compiler on a CPU, by Triton on a GPU), plain torch (torch),
     or compiled if possible (auto)."""
-    render_threshold: float = 3e-3
-    """Samples of less weight are not shaded when rendering; their total weight is reported (dropped_mass)."""
-    render: Literal["auto", "exact", "baked"] = "auto"
-    """Render the field itself (exact), or 8-bit texels baked from it before the first image (baked: half of the time on
-    a CPU, 0.01 dB less; docs/export.md). auto: baked for ns-render and ns-viewer on a CPU if the model can be baked;
-    exact during training, in ns-eval and on a GPU."""
-    background: Literal["black", "gray", "white"] = "gray"
-    """Background when rendering. Training uses random colours where the MPIs cover the whole ray."""
+    rendering: RenderingConfig = field(default_factory=RenderingConfig)
+    """Images: of which texels, over which background, and the memory for their windows."""
     loss: LossWeights = field(default_factory=LossWeights)
     """Weights of the losses."""
     lpips_net: Literal["vgg", "alex", "none"] = "vgg"
@@ -139,26 +89,9 @@ class MMPIModelConfig(ModelConfig):
     windows_folder: Path | None = field(default=None, init=False)
     """Not an option: the trainer sets it, and config.yml keeps it for evaluation; where the finished windows lie."""
 
-    def schedule(self, training: Training, windows: int) -> Schedule:
-        """The schedule of a run through so many windows."""
-        return make_schedule(
-            training,
-            max(1, self.total_steps),
-            blend_share=self.blend_share,
-            finetune_share=self.finetune_share,
-            growth_shares=self.growth_shares,
-            decay_decades=self.decay_decades,
-            decay_from=self.decay_from,
-            finetune_rate=self.finetune_rate,
-            windows=windows,
-            release_shares=self.release_shares if self.release_weight > 0 else (),
-            growing_rays=self.growing_rays,
-        )
-
-    def field_settings(self) -> dict[str, Any]:
-        """What a field takes from here, by its arguments' names."""
-        names = ("shading", "feature_channels", "hidden_width", "position_frequencies", "direction_frequencies")
-        return {n: getattr(self, n) for n in (*names, "shared_colour", "samples_per_voxel", "cube_alpha")}
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Reads a config.yml, also one from before the options were in groups."""
+        vars(self).update(grouped(state, type(self)()))
 
 
 class MMPIModel(Model):
@@ -172,16 +105,17 @@ class MMPIModel(Model):
         dispatch.choose(config.ops)
         windows = self._plan()
         # One head has nothing to blend with, so it trains in one go.
-        joint = config.training == "joint" or all(plan.num_heads == 1 for plan in windows.plans)
-        self.progress = Progress(windows, config.schedule("joint" if joint else "two-phase", len(windows)))
+        joint = config.schedule.training == "joint" or all(plan.num_heads == 1 for plan in windows.plans)
+        phases = replace(config.schedule, training="joint" if joint else "two-phase")
+        self.progress = Progress(windows, make_schedule(phases, max(1, config.total_steps), len(windows)))
         views = self.kwargs.get("metadata", {}).get(TRAINING_VIEWS)
         self.trains = OBSERVATIONS in self.kwargs.get("metadata", {})
         if self.trains:
             seen, device = [views_of(window, views) for window in windows.windows], self.kwargs.get("device", "cpu")
-            check_memory(windows, seen, config.feature_channels, not joint, device)
+            check_memory(windows, seen, config.colour.feature_channels, not joint, device)
         self.field = self._new_field(views_of(windows.windows[0], views))
-        budget = config.resident_gib * 2**30
-        self.store = WindowStore(config.windows_folder, self._new_field, budget, config.half_windows)
+        budget = config.rendering.resident_gib * 2**30
+        self.store = WindowStore(config.windows_folder, self._new_field, budget, config.rendering.half_windows)
         self.sampler = MMPISampler()
         self.metrics = ImageMetrics(config.lpips_net)
         self.show = ViewerDropdown("Show MPI", "all", ["all", *windows.names], hint="One MPI alone, or all")
@@ -190,7 +124,7 @@ class MMPIModel(Model):
         )
         check_refined_poses(config.camera_optimizer.mode, len(windows))
         poses = self.camera_optimizer.parameters()
-        self.run = TrainingRun(self.progress, self.field, self.store, views, config.release_weight, [*poses])
+        self.run = TrainingRun(self.progress, self.field, self.store, views, config.schedule.release_weight, [*poses])
         self.register_load_state_dict_post_hook(lambda *_: self._after_loading())
 
     def _plan(self) -> WindowedPlan:
@@ -213,7 +147,9 @@ class MMPIModel(Model):
             shares_depth=schedule.is_joint,
             factor=schedule.texel_factor(0),
             views=views,
-            **self.config.field_settings(),
+            **asdict(self.config.colour),
+            samples_per_voxel=self.config.sampling.samples_per_voxel,
+            cube_alpha=self.config.sampling.cube_alpha,
         )
 
     def _after_loading(self) -> None:
@@ -242,7 +178,7 @@ class MMPIModel(Model):
         bundle = bounded(bundle, field.plan)
         if progress.phase.name == "individual":
             g = generator(self.config.seed, progress.step, "assignment", self.device)
-            bundle, head_mask, choose = individual_rays(bundle, field.plan, self.config.rays_per_mpi, g)
+            bundle, head_mask, choose = individual_rays(bundle, field.plan, self.config.schedule.rays_per_mpi, g)
         blends = progress.schedule.blends_at(progress.step) and self.blends(field)
         sampling = {"head_mask": head_mask, "choose": choose, **self.training_bounds()}
         rays = render_rays(self.sampler, bundle, field, blends=blends, **sampling)
@@ -256,10 +192,9 @@ class MMPIModel(Model):
 
         While surfaces form, samples of little weight must learn too, and the cube starts nearly empty.
         """
-        if self.progress.schedule.sharpened(self.progress.step):
-            return {"threshold": self.config.train_threshold, "fair_share": float("inf")}
-        cube = 0.1 * self.config.cube_alpha if self.field.cube is not None else float("inf")
-        return {"threshold": min(self.config.train_threshold, cube), "fair_share": FAIR_SHARE}
+        sampling, forming = self.config.sampling, not self.progress.schedule.sharpened(self.progress.step)
+        cube = 0.1 * sampling.cube_alpha if forming and self.field.cube is not None else float("inf")
+        return {"threshold": min(sampling.threshold, cube), "fair_share": FAIR_SHARE if forming else float("inf")}
 
     def image_outputs(self, bundle: RayBundle, chunk: int | None = None) -> dict[str, Tensor]:
         """rgb, accumulation, depth, winning MPI and dropped mass [R, .] of rays, from the windows that they start in.
@@ -296,40 +231,42 @@ class MMPIModel(Model):
             chosen: the one (window, head) to show; None for all.
         """
         if chosen is None and self._shows_bricks(field):
-            behind = background_of(self.config.background, bundle.origins)
-            outputs = self.baked(field).outputs(bounded(bundle, field.plan), behind)
+            outputs = self.baked(field).outputs(bounded(bundle, field.plan), self._behind(bundle.origins))
             return outputs | {"winning_mpi": outputs["winning_mpi"] + self.progress.windows.first_head(window)}
         blends, head_mask = self.blends(field), None
         if chosen is not None:
             head = chosen[1] if chosen[0] == window else -1
             head_mask = (torch.arange(field.plan.num_heads, device=self.device) == head).expand(len(bundle), -1)
             blends = False
-        how = {"blends": blends, "threshold": self.config.render_threshold, "head_mask": head_mask}
+        how = {"blends": blends, "threshold": self.config.rendering.threshold, "head_mask": head_mask}
         once = field.shading == "ray" and not torch.is_grad_enabled()
         outputs = (shown_outputs if once else sampled_outputs)(bounded(bundle, field.plan), field, **how)
-        rgb = outputs["rgb"] + outputs.pop("transmittance") * background_of(self.config.background, outputs["rgb"])
+        rgb = outputs["rgb"] + outputs.pop("transmittance") * self._behind(outputs["rgb"])
         winner = outputs["winning_mpi"] + self.progress.windows.first_head(window)
         return outputs | {"rgb": rgb.clamp(0, 1), "winning_mpi": winner}
 
     def _shows_bricks(self, field: MMPIField) -> bool:
         """Whether images of a field come from its bricks."""
-        if self.config.render == "auto":
+        if self.config.rendering.mode == "auto":
             return not self.trains and suits_bricks(field)
-        return self.config.render == "baked"
+        return self.config.rendering.mode == "baked"
 
     def baked(self, field: MMPIField) -> BakedWindow:
         """A field baked, made once, until it is trained on. Raises ValueError where it cannot be."""
 
         def make() -> BakedWindow:
             say("Baking, once: a few seconds.")
-            background = BACKGROUNDS[self.config.background]
-            return bake(field, self.config.render_threshold, background, self.blends(field))
+            background = BACKGROUNDS[self.config.rendering.background]
+            return bake(field, self.config.rendering.threshold, background, self.blends(field))
 
         return field.cached("baked", make)
 
     def blends(self, field: MMPIField) -> bool:
         """Whether reliability enters a field's pictures."""
-        return self.config.training != "joint" and field.plan.num_heads > 1
+        return self.config.schedule.training != "joint" and field.plan.num_heads > 1
+
+    def _behind(self, like: Tensor) -> Tensor:
+        return background_of(self.config.rendering.background, like)
 
     # Images ------------------------------------------------------------------------------------------------------
 
@@ -354,12 +291,14 @@ class MMPIModel(Model):
             return self.config.eval_num_rays_per_chunk
         most = max(plan.samples_per_ray for plan in self.progress.windows.plans)
         one_pass = shows_in_one_pass(self.field)
-        return rays_per_chunk(most, self.device, most_kept(most, self.config.render_threshold) if one_pass else None)
+        return rays_per_chunk(most, self.device, most_kept(most, self.config.rendering.threshold) if one_pass else None)
 
     def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
         """Colours without their background, and how opaque each pixel is (ns-render's output "rgba")."""
         accumulation = outputs["accumulation"]
-        colors = outputs[output_name] - (1 - accumulation) * background_of(self.config.background, accumulation)
+        colors = outputs[output_name] - (1 - accumulation) * background_of(
+            self.config.rendering.background, accumulation
+        )
         return torch.cat([(colors / accumulation.clamp(min=1e-6)).clamp(0, 1), accumulation], -1)
 
     # Losses and metrics ------------------------------------------------------------------------------------------
@@ -398,4 +337,4 @@ class MMPIModel(Model):
     def observed(self, batch: dict[str, Tensor]) -> Tensor:
         """The pixels of a batch, over the background where they are transparent."""
         image = batch["image"].to(self.device)
-        return over_background(image, torch.full_like(image[..., :3], BACKGROUNDS[self.config.background]))
+        return over_background(image, torch.full_like(image[..., :3], BACKGROUNDS[self.config.rendering.background]))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from mmpi_ns.capture.datamanager import MMPIDataManagerConfig
 from mmpi_ns.config import mmpi_small
 from mmpi_ns.scene.plan import CubePlan, MPIPlan, ScenePlan
 from mmpi_ns.scene.windows import Window, WindowedPlan
+from mmpi_ns.training.phases import ScheduleConfig, make_schedule
 
 
 def datamanager(data: Path, test_mode="val", **settings):
@@ -100,10 +102,25 @@ def trainer_config(data: Path, plan: Path, output: Path, steps=24, **model):
         "release_weight": 0.0,
     }
     settings |= {"hidden_width": 8, "feature_channels": 4, "cube_alpha": 0.03}
-    for name, value in (settings | model).items():
-        assert hasattr(config.pipeline.model, name), name
-        setattr(config.pipeline.model, name, value)
+    set_options(config.pipeline.model, **(settings | model))
     return config
+
+
+def set_options(model, **settings):
+    """Sets options of a model's config by their names; those of one name in two groups as group__name."""
+    groups = {name: group for name, group in vars(model).items() if is_dataclass(group)}
+    for path, value in settings.items():
+        group, _, name = path.rpartition("__")
+        places = [groups[group]] if group else [model, *groups.values()]
+        (place,) = [p for p in places if name in {f.name for f in fields(p)}]
+        setattr(place, name, value)
+
+
+def schedule_of(training, steps, windows=1, **settings):
+    """A schedule with the paper's settings, unless they are named."""
+    paper = {"blend_share": 0.25, "finetune_share": 0.0, "finetune_rate": 0.1, "decay_decades": 1.5, "decay_from": 0.0}
+    paper |= {"release_shares": (), "growing_rays": 1.0}
+    return make_schedule(ScheduleConfig(training, **(paper | settings)), steps, windows)
 
 
 def ready(config, **changes):

@@ -11,10 +11,10 @@ import torch
 from mmpi_ns.bench.report import Scene
 
 P = "--pipeline.model.placement."
-JOINT = ("--pipeline.model.training", "joint")
-TWO_PHASE = ("--pipeline.model.training", "two-phase")
+JOINT = ("--pipeline.model.schedule.training", "joint")
+TWO_PHASE = ("--pipeline.model.schedule.training", "two-phase")
 """As it is unless told otherwise: all rays for each MPI, a little blending, and a long fine-tune at full rates."""
-SPLIT = ("--pipeline.model.rays-per-mpi", "split")
+SPLIT = ("--pipeline.model.schedule.rays-per-mpi", "split")
 NO_DEPTH = (
     *("--pipeline.datamanager.keypoint-rays", "0"),
     *("--pipeline.datamanager.dense-depth", "False"),

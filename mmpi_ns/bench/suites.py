@@ -11,7 +11,7 @@ NOT_PULLED = (P + "drive-pull-back", "0")
 EQUAL_SHARES = ("--optimizers.reliability.optimizer.lr", "1e-9")
 LITTLE_VARIATION = ("--pipeline.model.loss.tv-density", "1e-5", "--pipeline.model.loss.tv-features", "1e-6")
 """DVGO's."""
-SHARED = ("--pipeline.model.shared-colour", "True")
+SHARED = ("--pipeline.model.colour.shared-colour", "True")
 DEFAULT = "the default"
 """Of a suite of budgets: what is drawn apart."""
 ROOM = (P + "arrangement", "room", P + "width", "160", *JOINT)
@@ -19,8 +19,13 @@ ROOM_CUBE = (*ROOM, P + "cube-voxels", "96")
 
 
 def _shares(blend: float, finetune: float = 0.0, rate: float = 1.0) -> tuple[str, ...]:
-    shares = ("--pipeline.model.blend-share", str(blend), "--pipeline.model.finetune-share", str(finetune))
-    return (*shares, "--pipeline.model.finetune-rate", str(rate)) if finetune else shares
+    shares = (
+        "--pipeline.model.schedule.blend-share",
+        str(blend),
+        "--pipeline.model.schedule.finetune-share",
+        str(finetune),
+    )
+    return (*shares, "--pipeline.model.schedule.finetune-rate", str(rate)) if finetune else shares
 
 
 ALONE = (*DRIVE, *TWO_PHASE, *_shares(0.25))

@@ -54,7 +54,7 @@ def load_model(load_config: Path) -> Any:
     read_run_config(load_config)
     _, pipeline, _, _ = eval_setup(load_config, test_mode="test")
     assert isinstance(pipeline.model, MMPIModel)
-    pipeline.model.config.render = "exact"  # the exact renderer is the reference
+    pipeline.model.config.rendering.mode = "exact"  # the exact renderer is the reference
     return pipeline
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -45,6 +45,25 @@ def plane_biases(planes: int, missing: float = 0.0) -> tuple[Float[Tensor, "L"],
     interval = 256.0 / planes
     alpha = (1.0 / (planes + missing - torch.arange(planes, dtype=torch.float64))).clamp(max=0.999)
     return torch.log(torch.expm1(-torch.log1p(-alpha) / interval)).float(), interval
+
+
+@dataclass
+class ColourConfig:
+    """Features and networks of colours: ``--pipeline.model.colour.*``."""
+
+    shading: Shading = "ray"
+    """Evaluate the colour network once a ray, after compositing (ray), or for every sample as in the paper (sample)."""
+    feature_channels: int = 8
+    """Channels of a texel besides its density: three of a colour, the others features for view-dependent appearance.
+    Eight are half a cache line, so a CPU trains faster with them than with nine (docs/log/performance.md)."""
+    hidden_width: int = 64
+    """Width of the colour networks."""
+    position_frequencies: int = 2
+    """Shading of samples: octaves of the positional encoding of NDC positions."""
+    direction_frequencies: int = 2
+    """Octaves of the positional encoding of directions."""
+    shared_colour: bool = False
+    """Shading of samples: one colour network for all MPIs instead of one each."""
 
 
 class MMPIField(TexelTables):

@@ -119,7 +119,10 @@ class BakedWindow:
 def why_not_baked(model_field: MMPIField) -> str:
     """Why a field cannot be baked, and how to train one that can; empty if it can."""
     if not isinstance(model_field.networks, RayShader):
-        return "A model whose samples are coloured one by one cannot be baked: train with --pipeline.model.shading ray."
+        return (
+            "A model whose samples are coloured one by one cannot be baked: train with "
+            "--pipeline.model.colour.shading ray."
+        )
     if model_field.cube is not None:
         return "A model with a cube cannot be baked: train one of MPIs alone (placement.cube-voxels 0)."
     channels = model_field.feature_channels

@@ -41,8 +41,10 @@ def refined_camera(model: Any, camera: Cameras, image: Tensor, seed: int) -> tup
     Raises:
         InputError: the model renders what has no gradients.
     """
-    if model.config.render == "baked":
-        raise InputError("Poses are refined by gradients: use --pipeline.model.render exact, or no refine-eval-poses.")
+    if model.config.rendering.mode == "baked":
+        raise InputError(
+            "Poses are refined by gradients: use --pipeline.model.rendering.mode exact, or no refine-eval-poses."
+        )
     moves: CameraOptimizer = CameraOptimizerConfig(mode="SO3xR3").setup(num_cameras=1, device=model.device)
     optimizer = torch.optim.Adam(moves.parameters(), lr=RATES[0])
     decay = torch.optim.lr_scheduler.ExponentialLR(optimizer, (RATES[1] / RATES[0]) ** (1 / STEPS))

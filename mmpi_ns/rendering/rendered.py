@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -24,6 +25,26 @@ def background_of(name: str, like: Tensor) -> Tensor:
     """Background colour [3]: that of the viewer or a crop if set, else the one of this name."""
     asked = renderers.BACKGROUND_COLOR_OVERRIDE
     return like.new_full((3,), BACKGROUNDS[name]) if asked is None else asked.to(like)
+
+
+@dataclass
+class RenderingConfig:
+    """Images: ``--pipeline.model.rendering.*``."""
+
+    mode: Literal["auto", "exact", "baked"] = "auto"
+    """Render the field itself (exact), or 8-bit texels baked from it before the first image (baked: half of the time on
+    a CPU, 0.01 dB less; docs/export.md). auto: baked for ns-render and ns-viewer on a CPU if the model can be baked;
+    exact during training, in ns-eval and on a GPU."""
+    threshold: float = 3e-3
+    """Samples of less weight are not shaded when rendering; their total weight is reported (dropped_mass)."""
+    background: Literal["black", "gray", "white"] = "gray"
+    """Background when rendering. Training uses random colours where the MPIs cover the whole ray."""
+    resident_gib: float = 2.0
+    """Device memory for rendering the windows of a long capture, GiB, in addition to the one trained last. As many as
+    fit are kept, at least one; the least recently used is evicted first."""
+    half_windows: bool = False
+    """Write the finished windows of a long capture in half precision: half of the disk space; images change by a
+    fraction of a grey level."""
 
 
 @dataclass(frozen=True)

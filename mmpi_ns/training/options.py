@@ -12,6 +12,7 @@ import torch
 from nerfstudio.engine.trainer import TrainerConfig
 
 from mmpi_ns.placement.options import check_placement
+from mmpi_ns.training.phases import check_schedule
 from mmpi_ns.utils.errors import InputError
 from mmpi_ns.utils.values import Number, check_number, check_options
 
@@ -35,9 +36,7 @@ PIXELS = {
     "resident_pixels": NOT_NEGATIVE,
     "camera_res_scale_factor": POSITIVE,
 }
-MODEL = {
-    "eval_num_rays_per_chunk": COUNT,
-    "resident_gib": NOT_NEGATIVE,
+SCHEDULE = {
     "blend_share": SHARE,
     "finetune_share": SHARE,
     "finetune_rate": NOT_NEGATIVE,
@@ -47,15 +46,15 @@ MODEL = {
     "growing_rays": Number(0, 1, above=True),
     "release_shares": SHARE,
     "release_weight": NOT_NEGATIVE,
+}
+COLOUR = {
     "feature_channels": Number(3, 256, whole=True),
     "hidden_width": Number(1, 4096, whole=True),
     "position_frequencies": Number(0, 32, whole=True),
     "direction_frequencies": Number(0, 32, whole=True),
-    "samples_per_voxel": POSITIVE,
-    "cube_alpha": Number(0, 1, above=True),
-    "train_threshold": SHARE,
-    "render_threshold": SHARE,
 }
+SAMPLING = {"samples_per_voxel": POSITIVE, "cube_alpha": Number(0, 1, above=True), "threshold": SHARE}
+RENDERING = {"threshold": SHARE, "resident_gib": NOT_NEGATIVE}
 NO_EFFECT = {
     "pipeline.datamanager": (
         "train_num_images_to_sample_from",
@@ -94,13 +93,12 @@ def check_run(config: TrainerConfig) -> None:
     check_options(config.machine, MACHINE, "--machine.")
     check_options(config.logging, {"steps_per_log": Number(1, whole=True)}, "--logging.")
     check_options(manager, PIXELS, "--pipeline.datamanager.")
-    check_options(model, MODEL, "--pipeline.model.")
+    check_options(model, {"eval_num_rays_per_chunk": COUNT}, "--pipeline.model.")
     weights = {f.name: NOT_NEGATIVE for f in fields(model.loss)} | {"tv_every": Number(1, whole=True)}
-    check_options(model.loss, weights, "--pipeline.model.loss.")
-    if model.training == "two-phase" and model.blend_share + model.finetune_share >= 1:
-        raise InputError(
-            "--pipeline.model.blend-share and finetune-share leave no steps for the first phase: give less than 1."
-        )
+    groups = {"schedule": SCHEDULE, "sampling": SAMPLING, "colour": COLOUR, "rendering": RENDERING, "loss": weights}
+    for name, ranges in groups.items():
+        check_options(getattr(model, name), ranges, f"--pipeline.model.{name}.")
+    check_schedule(model.schedule)
     check_placement(model.placement, "--pipeline.model.placement.")
     for name, entry in config.optimizers.items():
         check_number(f"--optimizers.{name}.optimizer.lr", entry["optimizer"].lr, NOT_NEGATIVE)

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict, dataclass, replace
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from typing import Literal
+
+from mmpi_ns.utils.errors import InputError
 
 PhaseName = Literal["individual", "blend", "finetune", "joint"]
 ParameterKind = Literal["density", "features", "colour", "reliability", "camera_opt"]
@@ -24,6 +26,37 @@ TRAINS: dict[str, frozenset[str]] = {
     "finetune": frozenset({"density", "features", "colour", "reliability", "camera_opt"}),
 }
 """Trainable parameters of each phase; everything else is frozen bit for bit."""
+
+
+@dataclass
+class ScheduleConfig:
+    """What trains when: ``--pipeline.model.schedule.*``."""
+
+    training: Training = "joint"
+    """Train each MPI alone, then reliability (two-phase), or all MPIs together without reliability (joint)."""
+    rays_per_mpi: Literal["split", "all"] = "all"
+    """Individual phase: each MPI renders all rays of a batch (all; K times the work, about that of joint training), or
+    the MPIs share them (split)."""
+    blend_share: float = 0.05
+    """Share of the steps in which only reliability trains."""
+    finetune_share: float = 0.4
+    """Share of the steps in which everything trains together at the end."""
+    finetune_rate: float = 1.0
+    """Learning rates at the start of the fine-tune relative to those of the first phase."""
+    decay_decades: float = 1.0
+    """Decades that learning rates fall over a phase (paper: x0.1 per 20k of 30k steps = 1.5),"""
+    decay_from: float = 0.5
+    """after being constant for this fraction of it."""
+    growth_shares: tuple[float, ...] = (1 / 15, 2 / 15, 3 / 15, 4 / 15)
+    """When the texels of a plane double, as shares of the first phase."""
+    growing_rays: float = 0.5
+    """Share of the batch drawn while resolution grows, when rays cost most. Runs shorter than 4,000 steps draw
+    proportionally more."""
+    release_shares: tuple[float, ...] = (3 / 15, 4 / 15, 0.3, 0.5, 0.75, 0.95)
+    """When empty bricks (8 x 8 texels of a plane) are released, as fractions of the first phase: after growth, or just
+    before the texels double."""
+    release_weight: float = 5e-3
+    """Bricks in which no sample of a training ray has this weight are released; 0 keeps all that rays can reach."""
 
 
 @dataclass(frozen=True)
@@ -135,65 +168,55 @@ class Schedule:
         return Schedule(phases=phases, **lists, **data)
 
 
-def make_schedule(
-    training: Training,
-    total_steps: int,
-    *,
-    blend_share: float = 0.25,
-    finetune_share: float = 0.0,
-    growth_shares: tuple[float, ...] = (1 / 15, 2 / 15, 3 / 15, 4 / 15),
-    decay_decades: float = 1.5,
-    decay_from: float = 0.0,
-    finetune_rate: float = 0.1,
-    windows: int = 1,
-    release_shares: tuple[float, ...] = (),
-    growing_rays: float = 1.0,
-) -> Schedule:
+def make_schedule(config: ScheduleConfig, total_steps: int, windows: int = 1) -> Schedule:
     """The schedule of a run of ``total_steps`` steps a window.
 
     Args:
-        training: ``two-phase`` (individual, blend, optional fine-tune) or ``joint`` (all MPIs at once, no reliability).
+        config: phases, growth, rates and release of bricks; nothing is released before surfaces have formed.
         total_steps: all steps of a window.
-        blend_share: share of the steps in which only reliability trains (two-phase).
-        finetune_share: share of the steps in which everything trains together at the end (two-phase).
-        growth_shares: when texels double, as shares of the first phase.
-        decay_decades: decades that learning rates fall over a phase (paper: x0.1 per 20k of 30k steps = 1.5).
-        decay_from: fraction of a phase for which they are constant before that.
-        finetune_rate: learning rates at the start of the fine-tune relative to the first phase's.
         windows: windows of a long capture, trained one after the other.
-        release_shares: when empty bricks are released, as fractions of the first phase; not before surfaces have
-            formed.
-        growing_rays: fraction of a step's rays that are drawn until then; proportionally more in runs of fewer than
-            ``LONG_RUN`` steps, which would see too few.
 
     Raises:
-        ValueError: the shares leave no step for the first phase.
+        InputError: no step is left for the first phase, growth goes backwards, or rates never fall.
     """
     if total_steps < 1:
-        raise ValueError(f"Training needs at least 1 step, got {total_steps}: raise --max-num-iterations.")
-    lengths: list[tuple[str, int]]
-    if training == "joint":
-        lengths = [("joint", total_steps)]
-    else:
-        if min(blend_share, finetune_share) < 0:
-            raise ValueError("blend-share and finetune-share must not be negative.")
-        if blend_share + finetune_share >= 1:
-            raise ValueError("blend-share + finetune-share leave no step for the individual phase: lower them.")
-        # The first phase has at least one step, even if rounding up the others would take all of them.
-        blend = min(round(total_steps * blend_share), total_steps - 1)
-        finetune = min(round(total_steps * finetune_share), total_steps - 1 - blend)
-        lengths = [("individual", total_steps - blend - finetune), ("blend", blend), ("finetune", finetune)]
-    lengths = [(name, n) for name, n in lengths if n > 0]
-    ends = [sum(n for _, n in lengths[: i + 1]) for i in range(len(lengths))]
-    phases = tuple(Phase(name, end - n, end) for (name, n), end in zip(lengths, ends, strict=True))
-    growth = tuple(max(1, round(s * phases[0].end)) for s in growth_shares)
-    if any(a > b for a, b in pairwise(growth)):
-        raise ValueError("growth-shares must not decrease.")
-    if not 0 <= decay_from < 1:
-        raise ValueError(f"decay-from must lie between 0 and 1, 1 excluded, got {decay_from}.")
-    rates = float(decay_decades), float(decay_from), float(finetune_rate)
-    few = min(1.0, float(growing_rays) * max(1.0, LONG_RUN / total_steps))
-    schedule = Schedule(phases, growth, *rates, windows, growing_rays=few)
-    release = sorted({round(s * phases[0].end) for s in release_shares})
+        raise InputError(f"Training needs at least 1 step, got {total_steps}: raise --max-num-iterations.")
+    check_schedule(config)
+    phases = _phases(config, total_steps)
+    first = phases[0].end
+    growth = tuple(max(1, round(s * first)) for s in config.growth_shares)
+    # Shorter runs would see too few rays.
+    growing_rays = min(1.0, float(config.growing_rays) * max(1.0, LONG_RUN / total_steps))
+    rates = float(config.decay_decades), float(config.decay_from), float(config.finetune_rate)
+    schedule = Schedule(phases, growth, *rates, windows, growing_rays=growing_rays)
+    release = sorted({round(s * first) for s in config.release_shares}) if config.release_weight > 0 else []
     # A release at a growth step comes before it, so that less grows.
     return replace(schedule, release=tuple(s for s in release if s > schedule._sharp_from or s in growth))
+
+
+def check_schedule(config: ScheduleConfig) -> None:
+    """Raises InputError naming the options that leave no schedule."""
+    option = "--pipeline.model.schedule."
+    if config.training == "two-phase" and min(config.blend_share, config.finetune_share) < 0:
+        raise InputError(f"{option}blend-share and finetune-share must not be negative.")
+    if config.training == "two-phase" and config.blend_share + config.finetune_share >= 1:
+        raise InputError(
+            f"{option}blend-share and finetune-share leave no steps for the first phase: give less than 1."
+        )
+    if any(a > b for a, b in pairwise(config.growth_shares)):
+        raise InputError(f"{option}growth-shares must not decrease.")
+    if not 0 <= config.decay_from < 1:
+        raise InputError(
+            f"{option}decay-from must be a finite number from 0 to 1, 1 excluded, not {config.decay_from}."
+        )
+
+
+def _phases(config: ScheduleConfig, total_steps: int) -> tuple[Phase, ...]:
+    """Phases of at least one step; the first has one even if rounding up the others would take all of them."""
+    if config.training == "joint":
+        return (Phase("joint", 0, total_steps),)
+    blend = min(round(total_steps * config.blend_share), total_steps - 1)
+    finetune = min(round(total_steps * config.finetune_share), total_steps - 1 - blend)
+    lengths = {"individual": total_steps - blend - finetune, "blend": blend, "finetune": finetune}
+    ends = accumulate(lengths.values())
+    return tuple(Phase(name, end - n, end) for (name, n), end in zip(lengths.items(), ends, strict=True) if n > 0)

@@ -29,6 +29,7 @@ from mmpi_ns.training.checkpoints import (
     checkpoints_in,
     read_checkpoint,
 )
+from mmpi_ns.training.config_files import check_nothing_left
 from mmpi_ns.training.learning_rates import following
 from mmpi_ns.training.memory import describe, training_bytes
 from mmpi_ns.training.options import check_ffmpeg, check_run
@@ -69,6 +70,7 @@ class MMPITrainerConfig(TrainerConfig):
         speak_plainly()
         keep_quiet()
         check_ffmpeg(sys.argv)
+        check_nothing_left(self.pipeline.model)
         folder = super().get_checkpoint_dir()
         steps = checkpoints_in(folder)
         if steps and self.load_dir in (None, folder) and self.load_step is None and self.load_checkpoint is None:
@@ -305,7 +307,7 @@ class MMPITrainer(Trainer):
         model: Any = self.pipeline.model
         images = self._manager.eval_dataset
         if self._says_lines and images is not None:
-            say(quick_test(model, images, BACKGROUNDS[model.config.background]))
+            say(quick_test(model, images, BACKGROUNDS[model.config.rendering.background]))
         say(next_commands(self.base_dir))
         if not self.config.viewer.quit_on_train_completion:
             self._train_complete_viewer()

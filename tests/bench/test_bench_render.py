@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import math
 from types import SimpleNamespace
@@ -66,11 +67,11 @@ def test_a_model_that_can_be_baked_is_measured_so(tmp_path):
     default = Setting(3e-3, 4096, "native")
     bench = Render(tmp_path / "config.yml", **settings(tmp_path))
     more = set(bench._settings(default, bakes=True)) - set(bench._settings(default, bakes=False))
-    assert [s.also for s in more] == ["render=baked"]
+    assert [s.also for s in more] == ["rendering.mode=baked"]
     model = SimpleNamespace(config=MMPIModelConfig())
     with more.pop().applied(model):  # type: ignore[arg-type]
-        assert model.config.render == "baked"
-    assert model.config.render == "auto"
+        assert model.config.rendering.mode == "baked"
+    assert model.config.rendering.mode == "auto"
 
 
 def test_what_was_measured_is_kept(run, tmp_path, monkeypatch):
@@ -79,7 +80,7 @@ def test_what_was_measured_is_kept(run, tmp_path, monkeypatch):
     measured, measure = [], render.measure
 
     def count(model, *rest):
-        measured.append(model.config.render_threshold)
+        measured.append(model.config.rendering.threshold)
         return measure(model, *rest)
 
     monkeypatch.setattr(render, "measure", count)
@@ -133,17 +134,13 @@ def test_a_setting_is_off_the_front_where_another_is_faster_without_more_error()
 
 
 def test_a_further_setting_of_the_model_is_tried_with_its_own_type_and_taken_back():
-    class Model:
-        class config:
-            render_threshold, eval_num_rays_per_chunk, background, train_threshold = 0.0, 1, "gray", 1.0
-            ops = "auto"
-
-    config = Model.config
-    with Setting(0.25, 7, "torch", "train_threshold=0.5").applied(Model):  # type: ignore[arg-type]
-        assert (config.render_threshold, config.eval_num_rays_per_chunk) == (0.25, 7)
-        assert config.train_threshold == 0.5 and dispatch.form_of("march", torch.zeros(1)) == "reference"
-    assert (config.render_threshold, config.eval_num_rays_per_chunk, config.train_threshold) == (0.0, 1, 1.0)
+    model = SimpleNamespace(config=MMPIModelConfig(eval_num_rays_per_chunk=1))
+    usual = copy.deepcopy(model.config)
+    with Setting(0.25, 7, "torch", "sampling.threshold=0.5").applied(model):  # type: ignore[arg-type]
+        assert (model.config.rendering.threshold, model.config.eval_num_rays_per_chunk) == (0.25, 7)
+        assert model.config.sampling.threshold == 0.5 and dispatch.form_of("march", torch.zeros(1)) == "reference"
+    assert model.config == usual
     assert dispatch.form_of("march", torch.zeros(1)) == "cpu"
-    with Setting(0.25, 7, "auto", "background=white").applied(Model):  # type: ignore[arg-type]
-        assert config.background == "white"
-    assert config.background == "gray"
+    with Setting(0.25, 7, "auto", "rendering.background=white").applied(model):  # type: ignore[arg-type]
+        assert model.config.rendering.background == "white"
+    assert model.config == usual

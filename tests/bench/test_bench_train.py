@@ -370,4 +370,4 @@ def test_every_method_is_a_line_that_ns_train_takes(scene):
             assert config.pipeline.datamanager.dataparser.load_3D_points and request.whole_images
             assert config.pipeline.model.camera_optimizer.mode == "off"
         else:
-            assert config.pipeline.model.training == "two-phase"
+            assert config.pipeline.model.schedule.training == "two-phase"

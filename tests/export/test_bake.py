@@ -53,17 +53,17 @@ def bundle_of(plan, count=400):
 
 
 def outputs(model, how, rays):
-    model.config.render = how
+    model.config.rendering.mode = how
     with torch.no_grad():
         found = model.get_outputs(copy.deepcopy(rays))
-    model.config.render = "auto"
+    model.config.rendering.mode = "auto"
     return found
 
 
 def test_baked_images_are_the_exact_ones(trainer, monkeypatch):
     """The same colours to the error of 8 bits, the same depths and winners nearly everywhere; joint, so not blended."""
     model = filled(trainer)
-    monkeypatch.setattr(model.config, "training", "joint")
+    monkeypatch.setattr(model.config.schedule, "training", "joint")
     rays = bundle_of(model.field.plan)
     exact, baked = outputs(model, "exact", rays), outputs(model, "baked", rays)
     assert set(exact) == set(baked) and all(exact[n].shape == baked[n].shape for n in exact)
@@ -85,7 +85,7 @@ def test_blending_is_baked_into_the_bricks(trainer, monkeypatch):
     exact, baked = outputs(model, "exact", rays), outputs(model, "baked", rays)
     error = (exact["rgb"] - baked["rgb"]).square().mean()
     model.field.forget_baked()
-    monkeypatch.setattr(model.config, "training", "joint")
+    monkeypatch.setattr(model.config.schedule, "training", "joint")
     unblended = outputs(model, "baked", rays)
     assert error < 1e-3 and error < 0.2 * (exact["rgb"] - unblended["rgb"]).square().mean()
 
@@ -108,7 +108,7 @@ def test_what_is_looked_at_is_baked_and_what_is_measured_is_not(trainer, monkeyp
         thread.join()
         assert torch.equal(beside[0], baked), "a viewer's thread beside an evaluation"
     assert torch.equal(auto(), baked)
-    monkeypatch.setattr(model.config, "render", "auto")
+    monkeypatch.setattr(model.config.rendering, "mode", "auto")
     with torch.enable_grad():
         model.get_outputs(copy.deepcopy(rays))["rgb"].sum().backward()
     assert model.field.features.grad is not None and model.field.features.grad.abs().sum() > 0
@@ -139,12 +139,12 @@ def test_ns_eval_scores_the_field_and_a_render_shows_the_bricks(trainer):
     trainer.save_checkpoint(0)
     _, pipeline, _, _ = eval_setup(trainer.base_dir / "config.yml")
     model = pipeline.model
-    assert model.config.render == "auto" and not model.trains
+    assert model.config.rendering.mode == "auto" and not model.trains
     camera = pipeline.datamanager.eval_dataset.cameras[:1]
     shown = model.get_outputs_for_camera(camera)["rgb"]
     scores = {}
     for how in ("auto", "exact", "baked"):
-        model.config.render = how
+        model.config.rendering.mode = how
         scores[how] = pipeline.get_average_eval_image_metrics()["psnr"]
     assert scores["auto"] == scores["exact"] != scores["baked"]
     assert torch.equal(shown, model.get_outputs_for_camera(camera)["rgb"])

@@ -88,7 +88,7 @@ def test_total_variation_is_added_every_few_steps_while_densities_train(scene, p
 
 
 def test_in_the_individual_phase_a_ray_goes_to_one_mpi_and_the_cube(scene, plan_file, tmp_path):
-    trainer = trainer_of(scene, plan_file, tmp_path, train_threshold=0.0)
+    trainer = trainer_of(scene, plan_file, tmp_path, sampling__threshold=0.0)
 
     def heads_of_rays(step):
         meta = run_step(trainer, step)[0].samples.metadata
@@ -103,7 +103,7 @@ def test_in_the_individual_phase_a_ray_goes_to_one_mpi_and_the_cube(scene, plan_
 
 def test_with_rays_per_mpi_all_every_mpi_renders_every_ray_alone_with_the_cube(scene, tmp_path):
     plan = write_plan(scene, tmp_path / "plan.json", num_mpis=3, with_cube=True)
-    trainer = trainer_of(scene, plan, tmp_path, rays_per_mpi="all", train_threshold=0.0)
+    trainer = trainer_of(scene, plan, tmp_path, rays_per_mpi="all", sampling__threshold=0.0)
     rays, losses, _ = run_step(trainer, 0)
     heads, valid = rays.samples.metadata["heads"], rays.samples.metadata["valid"]
     assert len(rays.bundle) == 3 * 80
@@ -139,10 +139,10 @@ def test_one_mpi_has_nothing_to_blend_with_and_trains_in_one_go(scene, tmp_path)
 
 @pytest.mark.parametrize("training", ["two-phase", "joint"])
 def test_the_cube_learns_from_the_first_step_at_the_default_settings(scene, plan_file, tmp_path, training):
-    config = mmpi_small.config.pipeline.model
+    config = mmpi_small.config.pipeline.model.sampling
     trainer = trainer_of(
         scene, plan_file, tmp_path, training=training,
-        cube_alpha=config.cube_alpha, train_threshold=config.train_threshold,
+        cube_alpha=config.cube_alpha, sampling__threshold=config.threshold,
     )  # fmt: skip
     rays, losses, _ = run_step(trainer, 0)
     live = rays.report.live.sum() - (rays.samples.metadata["heads"][rays.samples.metadata["valid"]] < 2).sum()
@@ -197,7 +197,7 @@ def test_outputs_are_one_row_a_ray(model, camera):
 
 @pytest.mark.parametrize("threshold", [0.0, 1e-3])
 def test_pictures_do_not_depend_on_the_chunk_size(model, camera, monkeypatch, threshold):
-    monkeypatch.setattr(model.config, "render_threshold", threshold)
+    monkeypatch.setattr(model.config.rendering, "threshold", threshold)
     found = []
     for size in (WIDTH * HEIGHT, 100, 17):
         monkeypatch.setattr(model.config, "eval_num_rays_per_chunk", size)

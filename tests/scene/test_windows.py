@@ -11,13 +11,12 @@ import pytest
 import torch
 from hand_made import make_mpi
 from long_road import road
-from training_runs import datamanager
+from training_runs import datamanager, schedule_of
 
 from mmpi_ns.placement.rule import PlacementConfig
 from mmpi_ns.placement.split import FEWEST, find_balls, of_cameras, place_windows
 from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.scene.windows import Window, WindowedPlan, window_shares
-from mmpi_ns.training.phases import make_schedule
 
 # Splitting -----------------------------------------------------------------------------------------------------------
 
@@ -126,7 +125,7 @@ def test_a_windowed_plan_that_cannot_be_used_is_refused(change, sentence):
 
 
 def test_a_schedule_walks_through_each_window_anew():
-    one = make_schedule("two-phase", 20, blend_share=0.25, finetune_share=0.25)
+    one = schedule_of("two-phase", 20, blend_share=0.25, finetune_share=0.25)
     three = replace(one, windows=3)
     assert three.total_steps == 60
     for step in range(60):

@@ -61,9 +61,9 @@ def train(command, scene, plan_file, tmp_path_factory):
             "ns-train", "mmpi-small", "--data", scene, "--output-dir", output, "--experiment-name", "tiny",
             "--timestamp", timestamp, "--vis", "tensorboard", "--machine.device-type", "cpu",
             "--max-num-iterations", STEPS, "--steps-per-save", SAVED, "--save-only-latest-checkpoint", "False",
-            "--pipeline.model.plan-file", plan_file, "--pipeline.model.hidden-width", "8",
-            "--pipeline.model.training", "two-phase", "--pipeline.model.rays-per-mpi", "split",
-            "--pipeline.model.blend-share", "0.25", "--pipeline.model.finetune-share", "0.25",
+            "--pipeline.model.plan-file", plan_file, "--pipeline.model.colour.hidden-width", "8",
+            "--pipeline.model.schedule.training", "two-phase", "--pipeline.model.schedule.rays-per-mpi", "split",
+            "--pipeline.model.schedule.blend-share", "0.25", "--pipeline.model.schedule.finetune-share", "0.25",
             "--pipeline.datamanager.train-num-rays-per-batch", "256", *arguments, fork=fork,
         )  # fmt: skip
         return output / "tiny" / "mmpi-small" / timestamp
@@ -122,13 +122,9 @@ def test_the_papers_methods_keep_its_settings_and_ours_have_their_own():
     for name, model in models.items():
         ours = name in ("mmpi", "mmpi_small")
         assert (model.loss.tv_density, model.loss.tv_features) == ((1e-4, 1e-5) if ours else (1e-5, 1e-6)), name
-    kitti = models["mmpi_kitti"]
-    assert (kitti.training, kitti.rays_per_mpi, kitti.blend_share, kitti.finetune_share) == (
-        "two-phase",
-        "split",
-        0.25,
-        0.0,
-    )
+    kitti = models["mmpi_kitti"].schedule
+    assert (kitti.training, kitti.rays_per_mpi) == ("two-phase", "split")
+    assert (kitti.blend_share, kitti.finetune_share) == (0.25, 0.0)
     assert len({id(m.loss) for m in models.values()}) == len(models), "a change of one must not reach another"
 
 

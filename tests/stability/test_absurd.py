@@ -73,7 +73,7 @@ ABSURDITIES = (
 )
 OPTIONS = (
     *("--pipeline.datamanager.train-num-rays-per-batch", str(RAYS), "--pipeline.datamanager.keypoint-rays", "16"),
-    *(*TWO_PHASE, "--pipeline.model.hidden-width", "16", "--pipeline.model.placement.max-planes", "32"),
+    *(*TWO_PHASE, "--pipeline.model.colour.hidden-width", "16", "--pipeline.model.placement.max-planes", "32"),
 )
 """mmpi-small with both phases and a fine-tune, few rays and small networks."""
 

@@ -7,16 +7,16 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from training_runs import schedule_of
 
 from mmpi_ns.config import mmpi_kitti, mmpi_scannet, mmpi_scannet_short
-from mmpi_ns.model import MMPIModelConfig
-from mmpi_ns.training.phases import TRAINS, Phase, Schedule, make_schedule
+from mmpi_ns.training.phases import TRAINS, Phase, Schedule, ScheduleConfig, make_schedule
 
 KINDS = ("density", "features", "colour", "reliability", "camera_opt")
 
 
 def two_phase(**settings):
-    return make_schedule("two-phase", 40_000, **settings)
+    return schedule_of("two-phase", 40_000, **settings)
 
 
 def test_phases_follow_each_other_and_end_with_the_run():
@@ -31,7 +31,7 @@ def test_phases_follow_each_other_and_end_with_the_run():
 
 def test_paper_schedule_is_30k_individual_and_10k_blend():
     assert two_phase().phases == (Phase("individual", 0, 30_000), Phase("blend", 30_000, 40_000))
-    assert make_schedule("joint", 30_000).phases == (Phase("joint", 0, 30_000),)
+    assert schedule_of("joint", 30_000).phases == (Phase("joint", 0, 30_000),)
 
 
 @pytest.mark.parametrize(
@@ -52,12 +52,12 @@ def test_a_phase_ends_just_before_the_next_begins(step, name):
 def test_reliability_takes_part_from_the_first_blend_step_on():
     schedule = two_phase(finetune_share=0.25)
     assert [schedule.blends_at(s) for s in (0, 19_999, 20_000, 29_999, 30_000, 40_000)] == [False] * 2 + [True] * 4
-    assert not make_schedule("joint", 100).blends_at(100)
+    assert not schedule_of("joint", 100).blends_at(100)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_rates_are_zero_exactly_where_a_kind_is_frozen(kind):
-    for schedule in (two_phase(finetune_share=0.25), make_schedule("joint", 100)):
+    for schedule in (two_phase(finetune_share=0.25), schedule_of("joint", 100)):
         for phase in schedule.phases:
             for step in (phase.start, phase.end - 1):
                 rate = schedule.rate_factor(kind, step)
@@ -92,11 +92,11 @@ def test_rates_stay_for_a_share_of_each_phase_and_then_fall():
 
 
 def test_paper_rates_fall_tenfold_in_20k_of_30k_steps():
-    assert make_schedule("joint", 30_000).rate_factor("density", 20_000) == pytest.approx(0.1)
+    assert schedule_of("joint", 30_000).rate_factor("density", 20_000) == pytest.approx(0.1)
 
 
 def test_texels_double_at_each_growth_step():
-    schedule = make_schedule("joint", 30_000)
+    schedule = schedule_of("joint", 30_000)
     assert schedule.growth == (2_000, 4_000, 6_000, 8_000)
     steps = (0, 1_999, 2_000, 3_999, 4_000, 6_000, 7_999, 8_000, 30_000)
     assert [schedule.texel_factor(s) for s in steps] == [1 / 16, 1 / 16, 1 / 8, 1 / 8, 1 / 4, 1 / 2, 1 / 2, 1, 1]
@@ -108,7 +108,7 @@ def test_growth_follows_the_first_phase_and_not_the_whole_run():
 
 def test_growth_is_over_within_the_first_phase_of_any_length():
     for steps in (1, 2, 7, 100, 1600):
-        schedule = make_schedule("two-phase", steps)
+        schedule = schedule_of("two-phase", steps)
         assert schedule.texel_factor(schedule.phases[0].end) == 1
         assert schedule.texel_factor(0) == 1 / 16
         assert list(schedule.growth) == sorted(schedule.growth)
@@ -117,7 +117,7 @@ def test_growth_is_over_within_the_first_phase_of_any_length():
 @pytest.mark.parametrize(("blend", "finetune"), [(0.05, 0.8), (0.6, 0.3), (0.0, 0.99), (0.99, 0.0)])
 def test_large_shares_of_few_steps_leave_one_for_the_first_phase(blend, finetune):
     for steps in (1, 2, 3, 5, 1000):
-        phases = make_schedule("two-phase", steps, blend_share=blend, finetune_share=finetune).phases
+        phases = schedule_of("two-phase", steps, blend_share=blend, finetune_share=finetune).phases
         assert phases[0].name == "individual" and phases[0].end >= 1 and phases[-1].end == steps
         assert all(a.end == b.start and b.end > b.start for a, b in pairwise(phases))
 
@@ -125,59 +125,59 @@ def test_large_shares_of_few_steps_leave_one_for_the_first_phase(blend, finetune
 @pytest.mark.parametrize(("blend", "finetune"), [(0.5, 0.5), (0.9, 0.2), (-0.1, 0.3), (0.3, -0.1)])
 def test_shares_that_leave_nothing_for_the_first_phase_are_refused(blend, finetune):
     with pytest.raises(ValueError, match=r"leave no step|must not be negative"):
-        make_schedule("two-phase", 1000, blend_share=blend, finetune_share=finetune)
+        schedule_of("two-phase", 1000, blend_share=blend, finetune_share=finetune)
 
 
 def test_fewer_rays_are_drawn_until_surfaces_have_formed():
-    schedule = make_schedule("joint", 6000, growing_rays=0.25, windows=2)
+    schedule = schedule_of("joint", 6000, growing_rays=0.25, windows=2)
     assert [schedule.rays_share(step) for step in (0, 1599, 1600, 5999, 6000, 7599, 7600)] == [
         0.25, 0.25, 1, 1, 0.25, 0.25, 1,
     ]  # fmt: skip
-    assert make_schedule("joint", 6000).rays_share(0) == 1, "as it was, unless fewer are asked for"
+    assert schedule_of("joint", 6000).rays_share(0) == 1, "as it was, unless fewer are asked for"
 
 
 def test_a_short_run_draws_no_fewer_rays_than_it_needs():
-    shares = [make_schedule("joint", steps, growing_rays=0.5).rays_share(0) for steps in (20_000, 4000, 3000, 750)]
+    shares = [schedule_of("joint", steps, growing_rays=0.5).rays_share(0) for steps in (20_000, 4000, 3000, 750)]
     assert shares == [0.5, 0.5, pytest.approx(2 / 3), 1]
 
 
 def test_without_growth_all_texels_are_there_from_the_start():
-    assert make_schedule("joint", 10, growth_shares=()).texel_factor(0) == 1
+    assert schedule_of("joint", 10, growth_shares=()).texel_factor(0) == 1
 
 
 def test_bricks_may_be_released_just_before_the_texels_double():
-    schedule = make_schedule("joint", 1_000, release_shares=(0.1, 3 / 15, 4 / 15, 0.5))
+    schedule = schedule_of("joint", 1_000, release_shares=(0.1, 3 / 15, 4 / 15, 0.5))
     assert schedule.growth == (67, 133, 200, 267) and schedule.release == (200, 267, 500)
     assert [s for s in range(1_000) if schedule.watches(s)] == [*range(133, 500)]
-    once = make_schedule("joint", 1_000, growth_shares=(0.3,), release_shares=(0.3,))
+    once = schedule_of("joint", 1_000, growth_shares=(0.3,), release_shares=(0.3,))
     assert [s for s in range(1_000) if once.watches(s)] == [*range(300)]
 
 
 def test_bricks_are_given_up_after_growth_and_what_is_seen_before_does_not_count():
-    schedule = make_schedule("joint", 1_000, release_shares=(0.1, 0.5, 0.75, 0.5), windows=2)
+    schedule = schedule_of("joint", 1_000, release_shares=(0.1, 0.5, 0.75, 0.5), windows=2)
     assert schedule.growth[-1] == 267 and schedule.release == (500, 750), "not before surfaces have formed, and once"
     assert [s for s in range(2_000) if schedule.releases_at(s)] == [500, 750, 1_500, 1_750]
     watched = [s for s in range(2_000) if schedule.watches(s)]
     assert watched == [*range(267, 750), *range(1_267, 1_750)]
-    assert not any(make_schedule("joint", 100).watches(s) for s in range(100))
-    assert make_schedule("joint", 100, growth_shares=(), release_shares=(0.1, 0.2)).release == (20,)
-    assert make_schedule("two-phase", 1_000, release_shares=(1.0,)).release == (750,), "shares of the first phase"
+    assert not any(schedule_of("joint", 100).watches(s) for s in range(100))
+    assert schedule_of("joint", 100, growth_shares=(), release_shares=(0.1, 0.2)).release == (20,)
+    assert schedule_of("two-phase", 1_000, release_shares=(1.0,)).release == (750,), "shares of the first phase"
 
 
 def test_a_schedule_from_before_there_were_releases_has_none():
-    text = json.loads(make_schedule("joint", 100, release_shares=(0.5,)).to_json())
+    text = json.loads(schedule_of("joint", 100, release_shares=(0.5,)).to_json())
     del text["release"]
-    assert Schedule.from_json(json.dumps(text)) == make_schedule("joint", 100)
+    assert Schedule.from_json(json.dumps(text)) == schedule_of("joint", 100)
 
 
 def test_phases_without_steps_are_left_out():
-    assert [p.name for p in make_schedule("two-phase", 100, blend_share=0.0).phases] == ["individual"]
-    assert make_schedule("two-phase", 1).phases == (Phase("individual", 0, 1),)
+    assert [p.name for p in schedule_of("two-phase", 100, blend_share=0.0).phases] == ["individual"]
+    assert schedule_of("two-phase", 1).phases == (Phase("individual", 0, 1),)
 
 
 @pytest.mark.parametrize("training", ["two-phase", "joint"])
 def test_schedule_survives_json(training):
-    schedule = make_schedule(
+    schedule = schedule_of(
         training, 1234, decay_decades=0.7, decay_from=0.25, finetune_rate=0.2, release_shares=(0.5, 0.9)
     )
     assert Schedule.from_json(schedule.to_json()) == schedule
@@ -186,7 +186,7 @@ def test_schedule_survives_json(training):
 
 def test_numpy_settings_do_not_leak_into_rates():
     """A numpy scalar in an optimiser's rate makes checkpoints unreadable for torch's safe loader."""
-    schedule = make_schedule("two-phase", 100, decay_decades=np.float64(1.5), finetune_rate=np.float64(0.1))
+    schedule = schedule_of("two-phase", 100, decay_decades=np.float64(1.5), finetune_rate=np.float64(0.1))
     assert type(schedule.decay_decades) is float and type(schedule.finetune_rate) is float
     schedule.to_json()
     by_hand = Schedule((Phase("joint", 0, 10),), (), np.float64(1.5), np.float64(0.5), np.float64(0.1))
@@ -196,22 +196,21 @@ def test_numpy_settings_do_not_leak_into_rates():
 @pytest.mark.parametrize(
     ("settings", "word"),
     [
-        ({"total_steps": 0}, "max-num-iterations"),
-        ({"total_steps": 100, "blend_share": 0.7, "finetune_share": 0.3}, "blend-share"),
-        ({"total_steps": 100, "blend_share": -0.25}, "blend-share"),
-        ({"total_steps": 100, "growth_shares": (0.5, 0.25)}, "growth-shares"),
-        ({"total_steps": 100, "decay_from": 1.0}, "decay-from"),
+        ({"steps": 0}, "max-num-iterations"),
+        ({"steps": 100, "blend_share": 0.7, "finetune_share": 0.3}, "blend-share"),
+        ({"steps": 100, "blend_share": -0.25}, "blend-share"),
+        ({"steps": 100, "growth_shares": (0.5, 0.25)}, "growth-shares"),
+        ({"steps": 100, "decay_from": 1.0}, "decay-from"),
     ],
 )
 def test_impossible_schedules_name_the_setting(settings, word):
     with pytest.raises(ValueError, match=word):
-        make_schedule("two-phase", **settings)
+        schedule_of("two-phase", **settings)
 
 
 def test_a_models_schedule_is_made_of_its_options():
-    config = MMPIModelConfig(decay_decades=2.0, decay_from=0.25, finetune_rate=0.3, growing_rays=0.7)
-    config.total_steps = 5000
-    schedule = config.schedule("two-phase", 3)
+    options = ScheduleConfig("two-phase", decay_decades=2.0, decay_from=0.25, finetune_rate=0.3, growing_rays=0.7)
+    schedule = make_schedule(options, 5000, 3)
     assert schedule.growing_rays == 0.7
     assert (schedule.decay_decades, schedule.decay_from, schedule.finetune_rate) == (2.0, 0.25, 0.3)
     assert schedule.windows == 3
@@ -220,6 +219,6 @@ def test_a_models_schedule_is_made_of_its_options():
 @pytest.mark.parametrize("method", [mmpi_kitti, mmpi_scannet, mmpi_scannet_short])
 def test_the_papers_methods_keep_its_rates(method):
     model, optimizers = method.config.pipeline.model, method.config.optimizers
-    assert (model.decay_decades, model.decay_from) == (1.5, 0.0)
-    assert (model.growing_rays, model.feature_channels) == (1.0, 9)
+    assert (model.schedule.decay_decades, model.schedule.decay_from) == (1.5, 0.0)
+    assert (model.schedule.growing_rays, model.colour.feature_channels) == (1.0, 9)
     assert optimizers["colour"]["optimizer"].lr == 1e-3

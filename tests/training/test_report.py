@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import pytest
 import torch
+from training_runs import schedule_of
 
 from mmpi_ns.rendering.pipeline import summary
 from mmpi_ns.training import report
-from mmpi_ns.training.phases import LONG_RUN, make_schedule
+from mmpi_ns.training.phases import LONG_RUN
 
 
 def lines_of(monkeypatch, capsys, steps, seconds_a_step, **how):
@@ -15,7 +16,7 @@ def lines_of(monkeypatch, capsys, steps, seconds_a_step, **how):
     now = [0.0]
     monkeypatch.setattr(report, "monotonic", lambda: now[0])
     settings = {"blend_share": 0.25, "finetune_share": 0.25, "growth_shares": (), "decay_decades": 1.0} | how
-    schedule = make_schedule("two-phase", steps, **settings, finetune_rate=1.0, windows=1, release_shares=())
+    schedule = schedule_of("two-phase", steps, **settings, finetune_rate=1.0)
     log = report.TrainingLog(schedule, 1000, 0, steps)
     for step in range(steps):
         now[0] += seconds_a_step + (60 if step == 0 else 0)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
-from mmpi_ns.training.phases import make_schedule
+from training_runs import schedule_of
+
 from mmpi_ns.training.storage import FORMING, prepare_storage
 
 
@@ -16,7 +17,7 @@ def test_what_is_released_at_a_growth_is_released_before_it_and_by_a_lower_weigh
         release_unused=lambda least: calls.append(("release", least)),
         look_afresh=lambda: calls.append(("look afresh",)),
     )
-    schedule = make_schedule("joint", 100, growth_shares=(0.5,), release_shares=(0.5, 0.75))
+    schedule = schedule_of("joint", 100, growth_shares=(0.5,), release_shares=(0.5, 0.75))
     prepare_storage(field, schedule, 50, 0.01, {})
     assert calls == [("release", FORMING * 0.01), ("grow", 1.0)]
     field.factor = 1.0

@@ -344,8 +344,14 @@ def torchrun(scene, windows_file, output, processes, *options):
     command += ["--machine.device-type", "cpu", "--vis", "tensorboard", "--pipeline.model.plan-file", str(windows_file)]
     command += ["--pipeline.datamanager.train-num-rays-per-batch", "64", "--pipeline.datamanager.keypoint-rays", "16"]
     command += ["--pipeline.datamanager.new-view-share", "0"]
-    command += ["--pipeline.model.hidden-width", "8", "--pipeline.model.feature-channels", "4"]
-    command += ["--pipeline.model.growth-shares", "0.25", "0.5", "--pipeline.model.release-weight", "0.0"]
+    command += ["--pipeline.model.colour.hidden-width", "8", "--pipeline.model.colour.feature-channels", "4"]
+    command += [
+        "--pipeline.model.schedule.growth-shares",
+        "0.25",
+        "0.5",
+        "--pipeline.model.schedule.release-weight",
+        "0.0",
+    ]
     command += ["--steps-per-save", "2", *options]
     done = subprocess.run(
         command, capture_output=True, text=True, timeout=300, env={**os.environ, "OMP_NUM_THREADS": "1"}

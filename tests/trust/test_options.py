@@ -37,15 +37,15 @@ REFUSED = {
     P + "max_voxels": [-1],
     P + "window_length": [-1.0, NAN],
     P + "faces": [(), ("up",)],
-    M + "feature_channels": [0],
-    M + "hidden_width": [0, -1],
-    M + "cube_alpha": [0.0, 2.0],
-    M + "train_threshold": [-1.0, NAN],
-    M + "render_threshold": [NAN],
-    M + "resident_gib": [-1.0],
-    M + "growth_shares": [(0.5, 2.0)],
-    M + "decay_decades": [NAN],
-    M + "decay_from": [1.5],
+    M + "colour__feature_channels": [0],
+    M + "colour__hidden_width": [0, -1],
+    M + "sampling__cube_alpha": [0.0, 2.0],
+    M + "sampling__threshold": [-1.0, NAN],
+    M + "rendering__threshold": [NAN],
+    M + "rendering__resident_gib": [-1.0],
+    M + "schedule__growth_shares": [(0.5, 2.0)],
+    M + "schedule__decay_decades": [NAN],
+    M + "schedule__decay_from": [1.5],
     M + "loss__distortion": [NAN, -1.0],
     M + "loss__tv_every": [0],
     "machine__device_type": ["mps"],
@@ -97,8 +97,8 @@ def test_an_option_that_would_be_ignored_is_refused(whole_scene, tmp_path, name)
 
 
 def test_shares_that_leave_nothing_for_the_first_phase_are_refused(whole_scene, tmp_path):
-    shares = {M + "blend_share": 0.6, M + "finetune_share": 0.4}
-    said = train(whole_scene, tmp_path, **shares, pipeline__model__training="two-phase").sentence
+    shares = {M + "schedule__blend_share": 0.6, M + "schedule__finetune_share": 0.4}
+    said = train(whole_scene, tmp_path, **shares, pipeline__model__schedule__training="two-phase").sentence
     assert "blend-share" in said and "first phase" in said
 
 
@@ -185,4 +185,4 @@ def test_the_papers_settings_have_one_window_and_keep_their_bricks():
 
     for name in ("mmpi_kitti", "mmpi_scannet", "mmpi_scannet_short"):
         model = getattr(config, name).config.pipeline.model
-        assert model.placement.window_length == 0 and model.release_weight == 0
+        assert model.placement.window_length == 0 and model.schedule.release_weight == 0

@@ -174,7 +174,7 @@ def measure_kitti(request: Row, tell: Tell) -> Row:
     total = 3 if small else 1000
     for reading in ("split", "all"):
         ends = time.monotonic() + request["seconds"] / 2
-        options = ("--pipeline.model.rays-per-mpi", reading)
+        options = ("--pipeline.model.schedule.rays-per-mpi", reading)
         if small:
             options += (P + "planes", "6", P + "height", "12", P + "width", "12", *TWO_PHASE)
             options += ("--pipeline.datamanager.train-num-rays-per-batch", "16")

@@ -14,7 +14,7 @@ from mmpi_ns.bench.speed.all_planes import DenseSteps
 from mmpi_ns.bench.trainers import Steps, end_helpers
 from mmpi_ns.bench.trainings import Request, train_apart
 
-KEEP_ALL = ("--pipeline.model.train-threshold", "0", "--pipeline.model.render-threshold", "0")
+KEEP_ALL = ("--pipeline.model.sampling.threshold", "0", "--pipeline.model.rendering.threshold", "0")
 """Every live sample is coloured and learns, as in a dense evaluation, with the same losses."""
 NERFACTO_RAYS = 2048
 """Rays of a test image that nerfacto renders in each round."""

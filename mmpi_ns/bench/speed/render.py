@@ -8,6 +8,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
@@ -38,7 +39,7 @@ class Setting:
     chunk: int
     ops: str
     also: str = ""
-    """name=value of a further setting of the model."""
+    """group.name=value of a further setting of the model."""
 
     @property
     def name(self) -> str:
@@ -47,20 +48,19 @@ class Setting:
     @contextmanager
     def applied(self, model: MMPIModel) -> Iterator[None]:
         """Renders so within the block, and as before after it."""
-        changes: Row = {"render_threshold": self.threshold, "eval_num_rays_per_chunk": self.chunk}
-        if self.also:
-            name, _, text = self.also.partition("=")
-            changes[name] = type(getattr(model.config, name))(text)
-        before = {name: getattr(model.config, name) for name in changes}
+        usual, model.config = model.config, copy.deepcopy(model.config)
         try:
-            for name, value in changes.items():
-                setattr(model.config, name, value)
+            model.config.rendering.threshold, model.config.eval_num_rays_per_chunk = self.threshold, self.chunk
+            if self.also:
+                path, _, text = self.also.partition("=")
+                group, _, name = path.rpartition(".")
+                settings = attrgetter(group)(model.config) if group else model.config
+                setattr(settings, name, type(getattr(settings, name))(text))
             dispatch.choose(self.ops)  # type: ignore[arg-type]
             yield
         finally:
-            for name, value in before.items():
-                setattr(model.config, name, value)
-            dispatch.choose(model.config.ops)
+            model.config = usual
+            dispatch.choose(usual.ops)
 
 
 @dataclass
@@ -80,7 +80,7 @@ class Render(Bench):
     ops: tuple[str, ...] = ("native", "torch")
     """Inner loops (on a CPU)."""
     also: tuple[str, ...] = ()
-    """Further settings of the model to try one at a time, as name=value."""
+    """Further settings of the model to try one at a time, as group.name=value."""
     images: int = 4
     """Test images, evenly spaced."""
     rounds: int = 3
@@ -97,7 +97,7 @@ class Render(Bench):
         stat = checkpoint.stat()
         made = f"{checkpoint.name} {stat.st_size} {stat.st_mtime_ns} {self.images} {self.exact_rays}"
         report = Report(self, f"{fingerprint()} {made}")
-        default = Setting(model.config.render_threshold, model.chunk_size, _ops_in_use(model))
+        default = Setting(model.config.rendering.threshold, model.chunk_size, _ops_in_use(model))
         rays = _some_rays(images, self.exact_rays)
         exact = report.kept.get("exact") or exact_colors(model, images, rays).tolist()
         facts = {"exact": exact, "default": default.name, "device": str(model.device)}
@@ -125,7 +125,7 @@ class Render(Bench):
             found += [Setting(t, default.chunk, ops) for ops in self.ops for t in (default.threshold, 0.0)]
         found += [Setting(default.threshold, default.chunk, default.ops, a) for a in self.also]
         if bakes:
-            found.append(Setting(default.threshold, default.chunk, default.ops, "render=baked"))
+            found.append(Setting(default.threshold, default.chunk, default.ops, "rendering.mode=baked"))
         return list(dict.fromkeys(found))
 
 
@@ -155,7 +155,7 @@ def exact_colors(model: MMPIModel, images: list[Image], rays: list[Array]) -> Ar
         rays64 = in_float64(bounded(bundle, field.plan))
         for part in (rays64[i : i + EXACT_RAYS] for i in range(0, len(rays64), EXACT_RAYS)):
             found = render_plainly(field, part, blends=model.blends(field))
-            behind = found.composite.transmittance * BACKGROUNDS[model.config.background]
+            behind = found.composite.transmittance * BACKGROUNDS[model.config.rendering.background]
             colors.append((found.colors.rgb + behind).clamp(0, 1).numpy())
     return np.concatenate(colors)
 

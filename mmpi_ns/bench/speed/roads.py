@@ -157,7 +157,7 @@ def _look(trainer: Any, window: int) -> dict[str, float]:
     rgb, truth = model.get_outputs_for_camera(camera)["rgb"], data_set.get_data(nearest)["image"][..., :3]
     rays = camera.generate_rays(0, keep_shape=False)
     some = bounded(rays[:: max(1, len(rays) // 4096)], model.field.plan)
-    samples, report = model.sampler(some, field=model.field, threshold=model.config.render_threshold)
+    samples, report = model.sampler(some, field=model.field, threshold=model.config.rendering.threshold)
     kept, live = float(samples.metadata["valid"].sum() / len(some)), float(report.live.float().mean())
     psnr = ImageMetrics("none")(rgb, truth)["psnr"]
     return {"frame_ms": frame_ms, "psnr_db": psnr, "live_samples": live, "kept_samples": kept}
