@@ -18,7 +18,6 @@ from torch import Tensor
 from mmpi_ns.capture.rays import PinholeRays
 from mmpi_ns.export.bake import read_run_config
 from mmpi_ns.export.files import HEADER, BakedScene, read_baked
-from mmpi_ns.export.frames import render_scene
 from mmpi_ns.rendering.chunks import SHOWN_RAYS, render_in_chunks
 from mmpi_ns.scene.windows import WindowedPlan
 from mmpi_ns.training.checkpoints import checkpoints_in, read_checkpoint
@@ -120,7 +119,7 @@ def _load_baked(baked: BakedScene, device: torch.device) -> Scene:
         assert rays is not None
         bundle = rays.image(int(camera.height), int(camera.width))
         return render_in_chunks(
-            bundle, SHOWN_RAYS, bundle.origins.device, lambda part: render_scene(baked, part.origins, part.directions)
+            bundle, SHOWN_RAYS, bundle.origins.device, lambda part: baked.render(part.origins, part.directions)
         )
 
     numbers = torch.tensor([(*pose.focal, *pose.center) for pose in baked.path])

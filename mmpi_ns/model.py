@@ -207,17 +207,17 @@ class MMPIModel(Model):
         chosen = windows.find(self.show.value)  # by the viewer
         there = self.run.windows_there() if len(windows) > 1 else [0]
 
-        def render(place: int, rays: RayBundle) -> dict[str, Tensor]:
+        def render(place: int, rays: Tensor | slice) -> dict[str, Tensor]:
             window = there[place]
             field = self.field if window == trained else self.store.load(window, self.device)
             outputs = lambda part: self.window_outputs(window, field, part, chosen)  # noqa: E731
-            return outputs(rays) if chunk is None else render_in_chunks(rays, chunk, self.device, outputs)
+            return render_in_chunks(bundle[rays], chunk or len(bundle), self.device, outputs)
 
         if len(windows) == 1:
-            return render(0, bundle)
+            return render(0, slice(None))
         shown = there.index(chosen[0]) if chosen is not None and chosen[0] in there else None
         in_memory = [i for i, window in enumerate(there) if window in (trained, *self.store.in_memory)]
-        return render_windows(bundle, tuple(windows.windows[w] for w in there), render, shown, in_memory)
+        return render_windows(bundle.origins, tuple(windows.windows[w] for w in there), render, shown, in_memory)
 
     def window_outputs(
         self, window: int, field: MMPIField, bundle: RayBundle, chosen: tuple[int, int] | None = None

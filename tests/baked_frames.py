@@ -35,7 +35,6 @@ def main(folder: tyro.conf.Positional[Path], scale: int = 1, frames: int = 8, ro
     import numpy as np
 
     from mmpi_ns.export.files import read_baked
-    from mmpi_ns.export.frames import render_scene
     from mmpi_ns.export.reader import camera_rays
     from mmpi_ns.rendering.chunks import CPU_RAYS
 
@@ -51,7 +50,7 @@ def main(folder: tyro.conf.Positional[Path], scale: int = 1, frames: int = 8, ro
         origins, directions = (torch.tensor(np.array(x), dtype=torch.float32) for x in rays)
         start = time.process_time()
         parts = zip(origins.split(CPU_RAYS), directions.split(CPU_RAYS), strict=True)
-        image = torch.cat([render_scene(scene, *part)["rgb"] for part in parts])
+        image = torch.cat([scene.render(*part)["rgb"] for part in parts])
         spent.append(time.process_time() - start)
     say("and frames")
     print(

@@ -18,7 +18,6 @@ from training_runs import ready, trainer_config, write_plan, write_windows
 
 import mmpi_ns
 from mmpi_ns.export.files import HEADER, read_baked, write_baked
-from mmpi_ns.export.frames import render_scene
 from mmpi_ns.export.reader import camera_rays
 from mmpi_ns.rendering.baked import exact_images
 from mmpi_ns.utils.errors import InputError
@@ -105,7 +104,7 @@ def test_images_of_a_baked_scene_are_those_of_its_bricks(baked):
         width, height = pose.size
         images = mmpi_ns.render(scene, scene.path.camera_to_worlds[i], scene.path.intrinsics[i], width, height)
         rays = [torch.tensor(np.array(x), dtype=torch.float32) for x in camera_rays(pose.__dict__)]
-        expected = render_scene(bricks, *rays)
+        expected = bricks.render(*rays)
         assert expected["rgb"].std() > 0.02
         close = (images.rgb.view(-1, 3) - expected["rgb"]).abs().amax(-1) < 1e-3
         assert close.float().mean() > 0.99  # a ray through the border of a brick may round to either side

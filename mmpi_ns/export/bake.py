@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean
@@ -12,18 +12,13 @@ from typing import Any
 
 import torch
 import yaml
-from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras
-from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.utils.eval_utils import eval_setup
 from torch import Tensor
 
 from mmpi_ns.export.files import BakedScene, Pose
-from mmpi_ns.export.frames import render_scene
 from mmpi_ns.model import MMPIModel, MMPIModelConfig
-from mmpi_ns.ops.baked import march_baked
-from mmpi_ns.rendering.baked import BakedWindow
 from mmpi_ns.rendering.chunks import CPU_RAYS, render_in_chunks
 from mmpi_ns.rendering.metrics import ImageMetrics
 from mmpi_ns.scene.windows import window_shares
@@ -71,43 +66,28 @@ def bake_run(pipeline: Any, least: float, say: Say = print) -> BakedScene:
     """
     model: MMPIModel = pipeline.model
     cameras: Cameras = pipeline.datamanager.train_dataset.cameras
-    shares = window_shares(cameras.camera_to_worlds[:, :, 3], model.progress.windows.windows)
+    places = model.progress.windows.windows
+    shares = (
+        window_shares(cameras.camera_to_worlds[:, :, 3], places) if len(places) > 1 else torch.ones(len(cameras), 1)
+    )
+
+    def camera_rays(camera: int) -> tuple[Tensor, Tensor]:
+        rays = cameras.generate_rays(camera).flatten()
+        return rays.origins.contiguous(), rays.directions.contiguous()
+
     windows = []
-    for number, place in enumerate(model.progress.windows.windows):
-        own = (
-            (shares[:, number] > 0).nonzero()[:, 0].tolist() if len(model.progress.windows) > 1 else range(len(cameras))
-        )
-        whole = bake_window(model, number)
-        kept = prune(whole, (camera_rays(cameras, i) for i in own), least)
+    for number, place in enumerate(places):
+        field = model.field if number == model.progress.window else model.store.load(number, model.device)
+        whole = kept = model.baked(field)
+        if least > 0:
+            peaks = whole.peaks((shares[:, number] > 0).nonzero()[:, 0].tolist(), camera_rays)
+            kept = whole.keep(peaks.amax((1, 2)) >= least)
         say(f"Window {number}: {kept.mpis.num_bricks} of {whole.mpis.num_bricks} bricks are seen ({least:g} or more).")
         windows.append((replace(place, plan=replace(place.plan, mpis=kept.mpis.mpis, cube=None)), kept))
     path = poses_of(pipeline)
     ups = torch.tensor([pose.to_world for pose in path])[:, :, 1].mean(0)
     name = Path(pipeline.datamanager.get_datapath()).resolve().name
     return BakedScene(name, tuple((ups / ups.norm()).tolist()), path, windows)
-
-
-def prune(window: BakedWindow, rays: Iterable[tuple[Tensor, Tensor]], least: float) -> BakedWindow:
-    """A window without the bricks in which no sample of these rays weighs ``least``."""
-    if least <= 0:
-        return window
-    peaks = torch.zeros(window.mpis.density.shape)
-    for origins, directions in rays:
-        nears = torch.full_like(origins[:, :1], window.ray_near)
-        march_baked(window.mpis, origins, directions, nears, torch.full_like(nears, torch.inf), window.threshold, peaks)
-    return window.keep(peaks.amax((1, 2)) >= least)
-
-
-def camera_rays(cameras: Cameras, index: int) -> tuple[Float[Tensor, "R 3"], Float[Tensor, "R 3"]]:
-    """Origins and unit directions of a camera's pixels."""
-    rays = cameras.generate_rays(index).flatten()
-    return rays.origins.contiguous(), rays.directions.contiguous()
-
-
-def bake_window(model: MMPIModel, number: int) -> BakedWindow:
-    """One window of a model with all its bricks."""
-    field = model.field if number == model.progress.window else model.store.load(number, model.device)
-    return model.baked(field)
 
 
 def poses_of(pipeline: Any) -> list[Pose]:
@@ -157,7 +137,9 @@ def compare(pipeline: Any, scene: BakedScene, count: int) -> Compared:
         bundle, truth = dataset.cameras.generate_rays(i), dataset[i]["image"][..., :3]
         renderers = {
             "exact": lambda bundle=bundle: pipeline.model.get_outputs_for_camera_ray_bundle(bundle)["rgb"],
-            "baked": lambda bundle=bundle: _render_bundle(scene, bundle),
+            "baked": lambda bundle=bundle: render_in_chunks(
+                bundle, CPU_RAYS, torch.device("cpu"), lambda rays: scene.render(rays.origins, rays.directions)
+            )["rgb"],
         }
         images = {}
         for name, render in renderers.items():
@@ -166,11 +148,5 @@ def compare(pipeline: Any, scene: BakedScene, count: int) -> Compared:
             seconds = time.process_time() - start
             rows[name].append({"ssim": math.nan, "seconds": seconds} | metrics(images[name], truth))
         to_exact.append(metrics(images["baked"], images["exact"])["psnr"])
-    means = {name: {key: fmean(r[key] for r in found) for key in found[0]} for name, found in rows.items()}
+    means = {name: {key: fmean(r[key] for r in each) for key in each[0]} for name, each in rows.items()}
     return Compared(fmean(to_exact), **means)
-
-
-def _render_bundle(scene: BakedScene, bundle: RayBundle) -> Tensor:
-    """The image of a camera's rays."""
-    render = lambda rays: render_scene(scene, rays.origins, rays.directions)  # noqa: E731
-    return render_in_chunks(bundle, CPU_RAYS, torch.device("cpu"), render)["rgb"]

@@ -15,14 +15,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from rich.progress import track
 from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 
 from mmpi_ns.export.files import BakedScene, Pose
-from mmpi_ns.export.reader import camera_rays
-from mmpi_ns.ops.baked import march_baked
 from mmpi_ns.ops.gather.reference import COLORS, activate
 from mmpi_ns.ops.splat import splat_image, splat_opacities, splat_sums
 from mmpi_ns.ops.splat.reference import BLUR, Gaussians, View
@@ -30,6 +28,7 @@ from mmpi_ns.rendering.baked import BakedWindow
 from mmpi_ns.scene.baked import CELLS, SIDE, brick_numbers, columns_of
 from mmpi_ns.scene.windows import Window, window_shares
 from mmpi_ns.utils.files import write_atomically
+from mmpi_ns.utils.parallel import in_order
 
 WIDTH = 0.35
 """Standard deviation of a splat, in texels."""
@@ -97,8 +96,6 @@ class _Texels:
     channels: Float[Tensor, "T C"]
     """Colours and features."""
     peaks: Float[Tensor, "T"]
-    own: Int[Tensor, "B 8 8"]
-    """Which of these each texel of the bricks is; -1 for those outside the plane."""
 
 
 def splats_of(window: BakedWindow, poses: list[Pose], least: float, most: int, rounds: int = ROUNDS) -> Splats:
@@ -111,20 +108,17 @@ def splats_of(window: BakedWindow, poses: list[Pose], least: float, most: int, r
         most: maximum number of splats; those with the least weight are left out.
         rounds: of fitting colours to renderings of the window.
     """
-    peaks = torch.zeros(window.mpis.density.shape)
-    for pose in poses:
-        march_baked(window.mpis, *_reach(window, pose), window.threshold, peaks)
-    texels = _texels(window, peaks)
+    texels = _texels(window, window.peaks(poses, Pose.rays))
     group, level = _merged(texels, texels.peaks >= least)
-    wanted = group >= 0
-    weight = torch.zeros(int(group.max()) + 1).scatter_reduce(0, group[wanted], texels.peaks[wanted], "amax")
-    chosen = weight.argsort(descending=True)[:most].sort().values
-    kept = torch.full((len(weight),), -1).index_copy(0, chosen, torch.arange(len(chosen)))
-    group = torch.where(wanted, kept[group.clamp(min=0)], -1)
+    is_seen = group >= 0
+    weight = torch.zeros(int(group.max()) + 1).scatter_reduce(0, group[is_seen], texels.peaks[is_seen], "amax")
+    heaviest = weight.argsort(descending=True)[:most].sort().values
+    numbers = torch.full((len(weight),), -1).index_copy(0, heaviest, torch.arange(len(heaviest)))
+    group = torch.where(is_seen, numbers[group.clamp(min=0)], -1)
     splats = _placed(window, texels, group, level, fmean(pose.focal[0] for pose in poses))
     for number in range(rounds):  # other cameras each time, so that splats do not overfit to those of the capture
-        asked = between(poses, FRACTIONS[number % len(FRACTIONS)])
-        splats = fitted(splats, window, track(asked, description=f"Fitting splats, round {number + 1} of {rounds}"))
+        cameras = between(poses, FRACTIONS[number % len(FRACTIONS)])
+        splats = fitted(splats, window, track(cameras, description=f"Fitting splats, round {number + 1} of {rounds}"))
     return splats
 
 
@@ -136,27 +130,14 @@ def poses_in(place: Window, scene: BakedScene) -> list[Pose]:
     return [pose for pose, share in zip(poses, shares[:, number].tolist(), strict=True) if share > 0]
 
 
-def rays_of(pose: Pose) -> tuple[Float[Tensor, "R 3"], Float[Tensor, "R 3"]]:
-    """Origins and unit directions of a camera's pixels."""
-    origins, directions = (torch.tensor(np.array(x), dtype=torch.float32) for x in camera_rays(pose.__dict__))
-    return origins, directions
-
-
-def _reach(window: BakedWindow, pose: Pose) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Origins, directions, nears and fars of a camera's pixels."""
-    origins, directions = rays_of(pose)
-    nears = torch.full_like(origins[:, :1], window.ray_near)
-    return origins, directions, nears, torch.full_like(nears, torch.inf)
-
-
 def between(poses: list[Pose], fraction: float) -> list[Pose]:
     """Cameras this far on the way from each to the next one."""
-    made = []
+    cameras = []
     for a, b in zip(poses, [*poses[1:], poses[-1]], strict=True):
         (a_turn, a_eye), (b_turn, b_eye) = ((x[:, :3], x[:, 3:]) for x in (np.array(a.to_world), np.array(b.to_world)))
         turn = Slerp([0, 1], Rotation.from_matrix([a_turn, b_turn]))(fraction).as_matrix()
-        made.append(replace(a, to_world=np.hstack([turn, a_eye + fraction * (b_eye - a_eye)]).tolist()))
-    return made
+        cameras.append(replace(a, to_world=np.hstack([turn, a_eye + fraction * (b_eye - a_eye)]).tolist()))
+    return cameras
 
 
 def fitted(splats: Splats, window: BakedWindow, poses: Iterable[Pose]) -> Splats:
@@ -168,15 +149,17 @@ def fitted(splats: Splats, window: BakedWindow, poses: Iterable[Pose]) -> Splats
     """
     gaussians, count = splats.gaussians, len(splats.means)
     squares, errors, opacities = torch.zeros(count, 4, 4), torch.zeros(count, 4, COLORS), torch.zeros(count, 2)
-    for pose in poses:
+
+    def errors_in(pose: Pose) -> tuple[View, Tensor, Tensor]:
         view = View(torch.tensor(pose.to_world).float(), pose.size, pose.focal, pose.center)
-        target = window.render(*_reach(window, pose), torch.full((COLORS,), window.background))["rgb"]
         colors = splats.seen_from(view.to_world[:, 3])
         image = splat_image(gaussians, view, colors)
         shown = image[..., :3] + window.background * image[..., 3:]
-        missing = target.view(shown.shape) - shown
-        sums = splat_sums(gaussians, view, missing)
-        opacities += splat_opacities(gaussians, view, colors, shown, missing)
+        missing = window.render(*pose.rays())["rgb"].view(shown.shape) - shown
+        return view, splat_sums(gaussians, view, missing), splat_opacities(gaussians, view, colors, shown, missing)
+
+    for view, sums, change in in_order(errors_in, poses):
+        opacities += change
         seen = sums[:, 3].nonzero()[:, 0]
         basis, sums = splats.basis(view.to_world[:, 3])[seen], sums[seen]
         squares.index_add_(0, seen, basis[:, :, None] * basis[:, None] * sums[:, 3, None, None])
@@ -198,15 +181,13 @@ def _texels(window: BakedWindow, peaks: Float[Tensor, "B 8 8"]) -> _Texels:
         numbers = brick_numbers(mpis.columns[first : first + columns_of(mpi)], mpi)
         plane, row, column = ((numbers >= 0).nonzero()).unbind(-1)
         y, x = (row * CELLS)[:, None, None] + steps[:, None], (column * CELLS)[:, None, None] + steps
-        key = ((plane[:, None, None] + 0) * mpi.height + y) * mpi.width + x + starts[k]
+        key = (plane[:, None, None] * mpi.height + y) * mpi.width + x + starts[k]
         keys[numbers[plane, row, column].to(torch.int64)] = torch.where((y < mpi.height) & (x < mpi.width), key, -1)
-    found, own = keys.unique(return_inverse=True)
-    outside = int(found[0] < 0)
-    found, own = found[outside:], own - outside
-    flat, inside = own.flatten(), own.flatten() >= 0
-    gather = lambda values: values.new_zeros(len(found), *values.shape[1:]).index_copy(0, flat[inside], values[inside])  # noqa: E731
-    head = torch.searchsorted(starts, found, right=True) - 1
-    place, (_, height, width) = found - starts[head], sizes[head].unbind(-1)
+    inside = keys.flatten() >= 0
+    texels, flat = keys.flatten()[inside].unique(return_inverse=True)
+    gather = lambda values: values.new_zeros(len(texels), *values.shape[1:]).index_copy(0, flat, values[inside])  # noqa: E731
+    head = torch.searchsorted(starts, texels, right=True) - 1
+    place, (_, height, width) = texels - starts[head], sizes[head].unbind(-1)
     places = torch.stack([head, place // (height * width), place // width % height, place % width], -1)
     codes = gather(mpis.density.flatten()).float()
     depths = torch.empty_like(codes)
@@ -214,16 +195,16 @@ def _texels(window: BakedWindow, peaks: Float[Tensor, "B 8 8"]) -> _Texels:
         depths[head == k] = mpis.optical_depth(k, codes[head == k])
     low, step = (torch.tensor([getattr(c, name) for c in mpis.channel_codes]) for name in ("low", "step"))
     channels = activate(low + step * gather(mpis.texels.flatten(0, 2)).float())
-    highest = torch.zeros(len(found)).scatter_reduce(0, flat[inside], peaks.flatten()[inside], "amax")
-    return _Texels(places, -torch.expm1(-depths), depths, channels, highest, own)
+    highest = torch.zeros(len(texels)).scatter_reduce(0, flat, peaks.flatten()[inside], "amax")
+    return _Texels(places, -torch.expm1(-depths), depths, channels, highest)
 
 
-def _merged(texels: _Texels, wanted: Tensor) -> tuple[Int[Tensor, "T"], Int[Tensor, "T"]]:
-    """Group of each wanted texel (-1 for the others), and how often four became one in it."""
+def _merged(texels: _Texels, is_seen: Bool[Tensor, "T"]) -> tuple[Int[Tensor, "T"], Int[Tensor, "T"]]:
+    """Group of each texel that is seen (-1 for the others), and how often four became one in it."""
     tolerance = texels.channels.new_tensor([AGREEING_ALPHA] + [AGREEING_COLOR] * COLORS)
     tolerance = torch.cat([tolerance, tolerance.new_full((texels.channels.shape[1] - COLORS,), AGREEING_FEATURE)])
-    values = torch.cat([texels.alphas[:, None], texels.channels], -1)[wanted] / tolerance
-    head, plane, y, x = texels.places[wanted].unbind(-1)
+    values = torch.cat([texels.alphas[:, None], texels.channels], -1)[is_seen] / tolerance
+    head, plane, y, x = texels.places[is_seen].unbind(-1)
     wide = int(texels.places.max()) + 1
     level = torch.zeros_like(x)
     name = lambda depth: ((head * wide + plane) * wide + (y >> depth)) * wide + (x >> depth)  # noqa: E731
@@ -235,8 +216,8 @@ def _merged(texels: _Texels, wanted: Tensor) -> tuple[Int[Tensor, "T"], Int[Tens
         agrees = (count == 4**depth) & ((high - low).amax(-1) < 1)
         level = torch.where(agrees[parent], depth, level)
     _, group = (name(level) * (LARGEST + 1) + level).unique(return_inverse=True)
-    groups, levels = torch.full(wanted.shape, -1), torch.zeros(wanted.shape, dtype=torch.int64)
-    groups[wanted], levels[wanted] = group, level
+    groups, levels = torch.full(is_seen.shape, -1), torch.zeros(is_seen.shape, dtype=torch.int64)
+    groups[is_seen], levels[is_seen] = group, level
     return groups, levels
 
 
@@ -253,19 +234,19 @@ def _placed(window: BakedWindow, texels: _Texels, group: Tensor, level: Tensor, 
     means, scales = torch.empty(total, 3), torch.empty(total, 3)
     rotations, alphas = torch.empty(total, 4), torch.empty(total)
     for k, mpi in enumerate(window.mpis.mpis):
-        own = head == k
+        in_mpi = head == k
         u0, u1, v0, v1 = mpi.extent
         du, dv = (u1 - u0) / (mpi.width - 1), (v1 - v0) / (mpi.height - 1)
-        disparity = (mpi.planes - 1 - plane[own]) * mpi.disparity_step + mpi.last_disparity
+        disparity = (mpi.planes - 1 - plane[in_mpi]) * mpi.disparity_step + mpi.last_disparity
         z = 1 / disparity.clamp(min=1 / window.farthest)
-        local = torch.stack([(u0 + x[own] * du) * z, (v0 + y[own] * dv) * z, z], -1)
-        means[own] = torch.tensor(mpi.origin) + local @ torch.tensor(mpi.axes)
-        sides = torch.stack([size[own] * du, size[own] * dv], -1)
-        scales[own] = torch.cat([WIDTH * sides, THICKNESS * sides[:, :1]], -1) * z[:, None]
-        rotations[own] = quaternion(mpi.axes)
+        local = torch.stack([(u0 + x[in_mpi] * du) * z, (v0 + y[in_mpi] * dv) * z, z], -1)
+        means[in_mpi] = torch.tensor(mpi.origin) + local @ torch.tensor(mpi.axes)
+        sides = torch.stack([size[in_mpi] * du, size[in_mpi] * dv], -1)
+        scales[in_mpi] = torch.cat([WIDTH * sides, THICKNESS * sides[:, :1]], -1) * z[:, None]
+        rotations[in_mpi] = quaternion(mpi.axes)
         # Overlapping splats of this spacing sum to this multiple of their centre value, after a rasteriser's blur.
         overlap = 2 * math.pi * (WIDTH**2 + BLUR / (focal * sides) ** 2).prod(-1).sqrt()
-        alphas[own] = -torch.expm1(-DENSER * depth[own] / overlap)
+        alphas[in_mpi] = -torch.expm1(-DENSER * depth[in_mpi] / overlap)
     colors = torch.cat([mean(texels.channels[:, :COLORS])[:, None], torch.zeros(total, 3, COLORS)], 1)
     return Splats(means, scales, rotations, alphas.clamp(max=0.999), colors)
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
+from functools import reduce
+from typing import TypeVar
 
 import torch
 from jaxtyping import Bool, Float, UInt8
@@ -35,6 +37,9 @@ from mmpi_ns.scene.baked import (
 from mmpi_ns.scene.bricks import read_planes
 from mmpi_ns.scene.texels import SIDE as STORED_SIDE
 from mmpi_ns.scene.texels import TexelGrid
+from mmpi_ns.utils.parallel import in_order
+
+Item = TypeVar("Item")
 
 THINNEST = -12.0
 """Lower bound on the raw density of code 0; its softplus is 6e-6."""
@@ -80,27 +85,59 @@ class BakedWindow:
         self,
         origins: Float[Tensor, "R 3"],
         directions: Float[Tensor, "R 3"],
-        nears: Float[Tensor, "R 1"],
-        fars: Float[Tensor, "R 1"],
-        background: Float[Tensor, "3"],
+        bounds: tuple[Float[Tensor, "R 1"], Float[Tensor, "R 1"]] | None = None,
+        background: Float[Tensor, "3"] | None = None,
     ) -> dict[str, Tensor]:
-        """rgb, accumulation, depth, winning MPI and dropped mass of rays, like those of the model."""
-        found = march_baked(self.mpis, origins, directions, nears, fars, self.threshold)
-        rgb = shade_baked(self.shader, found.sums, found.mass, directions)
-        rgb = torch.where(found.mass > 0, rgb, 0.0)
+        """rgb, accumulation, depth, winning MPI and dropped mass of rays, like those of the model.
+
+        Args:
+            origins: of the rays.
+            directions: of the rays, unit vectors.
+            bounds: nears and fars of the rays; None: from ``ray_near`` to infinity.
+            background: colour behind everything; None: the window's own.
+        """
+        rays = march_baked(self.mpis, origins, directions, *(bounds or self.unbounded(origins)), self.threshold)
+        rgb = shade_baked(self.shader, rays.sums, rays.mass, directions)
+        rgb = torch.where(rays.mass > 0, rgb, 0.0)
+        behind = self.background if background is None else background
         return {
-            "rgb": (rgb * (1 - found.passing) + background * found.passing).clamp(0, 1),
-            "accumulation": 1 - found.passing,
-            "depth": 1 / found.inverse_t.clamp(min=1 / self.farthest),
-            "winning_mpi": found.winner,
-            "dropped_mass": (1 - found.passing - found.mass).clamp(min=0),
+            "rgb": (rgb * (1 - rays.passing) + behind * rays.passing).clamp(0, 1),
+            "accumulation": 1 - rays.passing,
+            "depth": 1 / rays.inverse_t.clamp(min=1 / self.farthest),
+            "winning_mpi": rays.winner,
+            "dropped_mass": (1 - rays.passing - rays.mass).clamp(min=0),
         }
+
+    def unbounded(self, origins: Float[Tensor, "R 3"]) -> tuple[Float[Tensor, "R 1"], Float[Tensor, "R 1"]]:
+        """Nears and fars of rays that see everything."""
+        nears = torch.full_like(origins[:, :1], self.ray_near)
+        return nears, torch.full_like(nears, torch.inf)
+
+    def peaks(
+        self, views: Sequence[Item], rays_of: Callable[[Item], tuple[Float[Tensor, "R 3"], Float[Tensor, "R 3"]]]
+    ) -> Float[Tensor, "B 8 8"]:
+        """Largest weight of any sample of some views in each texel.
+
+        Args:
+            views: shared out among threads, each with a table of its own.
+            rays_of: origins and unit directions of a view's rays.
+        """
+        threads = torch.get_num_threads()
+
+        def peaks_of(thread: int) -> Tensor:
+            peaks = torch.zeros(self.mpis.density.shape)
+            for view in views[thread::threads]:
+                origins, directions = rays_of(view)
+                march_baked(self.mpis, origins, directions, *self.unbounded(origins), self.threshold, peaks)
+            return peaks
+
+        return reduce(torch.maximum, in_order(peaks_of, range(threads)))
 
     def outputs(self, bundle: RayBundle, background: Float[Tensor, "3"]) -> dict[str, Tensor]:
         """The same for a bundle with nears and fars on any device; bricks are read on the CPU."""
         assert bundle.nears is not None and bundle.fars is not None
-        rays = (bundle.origins, bundle.directions, bundle.nears, bundle.fars, background)
-        outputs = self.render(*(x.cpu() for x in rays))
+        bounds = bundle.nears.cpu(), bundle.fars.cpu()
+        outputs = self.render(bundle.origins.cpu(), bundle.directions.cpu(), bounds, background.cpu())
         return {name: values.to(bundle.origins.device) for name, values in outputs.items()}
 
     def keep(self, kept: Bool[Tensor, "B"]) -> BakedWindow:

@@ -14,7 +14,7 @@ from nerfstudio.utils.eval_utils import eval_setup
 from random_fields import random_rays
 from training_runs import ready, trainer_config, write_plan
 
-from mmpi_ns.export.bake import bake_run, compare, prune
+from mmpi_ns.export.bake import bake_run, compare
 from mmpi_ns.export.files import read_baked, write_baked
 from mmpi_ns.field.shading import RayShader
 from mmpi_ns.ops import dispatch
@@ -173,7 +173,7 @@ def test_a_run_is_baked_and_read_again(trainer, tmp_path):
         assert found.to_exact > 35 and abs(found.exact["psnr"] - found.baked["psnr"]) < 0.3
         assert abs(found.exact["ssim"] - found.baked["ssim"]) < 0.01 and found.baked["seconds"] > 0
         assert "dB to the exact" in str(found)
-    assert prune(whole, [], 0).mpis.num_bricks == whole.mpis.num_bricks
+    assert bake_run(trainer.pipeline, 0, said.append).windows[0][1] is whole
 
 
 def test_what_cannot_be_baked_is_refused(trainer, monkeypatch):

@@ -10,9 +10,8 @@ import pytest
 import torch
 from random_bricks import random_window, rays_into, scene_of
 
-from mmpi_ns.export import reader
+from mmpi_ns.export import files, reader
 from mmpi_ns.export.files import HEADER, read_baked, write_baked
-from mmpi_ns.export.frames import render_scene
 from mmpi_ns.ops.baked.reference import march_baked
 
 
@@ -61,13 +60,27 @@ def test_windows_are_mixed_by_their_shares():
     """Midway between two windows a ray shows the mean of both, and inside a ball one alone."""
     a, b = random_window(seed=3, stored=1.0), random_window(seed=4, stored=1.0)
     scene = scene_of(a, b, radius=1.5)  # centres 4 apart, margins of 1: shares of a half in the middle
-    _, directions, nears, fars = rays_into(a, 12)
+    _, directions, _, _ = rays_into(a, 12)
     origins = torch.tensor([2.0, 0.0, 0.0]).expand(12, 3).contiguous()
-    shown = render_scene(scene, origins, directions)["rgb"]
-    parts = [w.render(origins, directions, nears, fars, torch.full((3,), 0.5))["rgb"] for w in (a, b)]
+    shown = scene.render(origins, directions)["rgb"]
+    parts = [w.render(origins, directions)["rgb"] for w in (a, b)]
     torch.testing.assert_close(shown, (parts[0] + parts[1]) / 2, atol=1e-5, rtol=0)
-    at_first = render_scene(scene, origins - 2, directions)["rgb"]
-    torch.testing.assert_close(at_first, a.render(origins - 2, directions, nears, fars, torch.full((3,), 0.5))["rgb"])
+    at_first = scene.render(origins - 2, directions)["rgb"]
+    torch.testing.assert_close(at_first, a.render(origins - 2, directions)["rgb"])
+
+
+@pytest.mark.parametrize("size", [0, 1, 999, 1000, 1001, 30_500])
+def test_blocks_are_one_gzip_stream(size, monkeypatch):
+    """Of any length, with what repeats from block to block, and the same bytes from any number of threads."""
+    monkeypatch.setattr(files, "BLOCK", 1000)
+    data = (np.arange(size) ** 2 // 7 % 50).astype(np.uint8).tobytes()
+    packed = files._gzip(data)
+    assert gzip.decompress(packed) == data and len(packed) < 100 + size / 2
+    torch.set_num_threads(3)
+    try:
+        assert files._gzip(data) == packed
+    finally:
+        torch.set_num_threads(1)
 
 
 def edit(folder, **changes):

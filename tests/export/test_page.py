@@ -12,8 +12,8 @@ import torch
 from browser import CHROMIUM, browser, served
 from random_bricks import random_window, scene_of
 
+from mmpi_ns.export import files
 from mmpi_ns.export.files import HEADER, read_baked, write_baked
-from mmpi_ns.export.frames import render_scene
 from mmpi_ns.export.reader import camera_rays
 from mmpi_ns.export.web import write_page, write_single_file
 from mmpi_ns.scene.baked import neighbours, take_borders
@@ -36,7 +36,9 @@ def smooth_window(seed, **settings):
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
     folder = tmp_path_factory.mktemp("site")
-    write_baked(scene_of(smooth_window(1, num_mpis=3, planes=40), smooth_window(2), radius=1.9), folder)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(files, "BLOCK", 1000)  # a browser unpacks streams of many blocks
+        write_baked(scene_of(smooth_window(1, num_mpis=3, planes=40), smooth_window(2), radius=1.9), folder)
     write_page(folder)
     return folder
 
@@ -57,7 +59,7 @@ def opened(tab, site):
 def ours(site, pose):
     scene = read_baked(site)
     origins, directions = camera_rays(pose.__dict__)
-    shown = render_scene(scene, *(torch.tensor(np.array(x), dtype=torch.float32) for x in (origins, directions)))
+    shown = scene.render(*(torch.tensor(np.array(x), dtype=torch.float32) for x in (origins, directions)))
     return shown["rgb"].view(pose.size[1], pose.size[0], 3).numpy()
 
 

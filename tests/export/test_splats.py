@@ -97,9 +97,8 @@ def test_fitted_colours_come_closer_to_the_window(window):
 
     def error(made, pose):
         view = View(torch.tensor(pose.to_world).float(), pose.size, pose.focal, pose.center)
-        rays = splats._reach(window, pose)
         shown = splat_image(made.gaussians, view, made.seen_from(view.to_world[:, 3]))
-        target = window.render(*rays, torch.full((3,), 0.5))["rgb"].view(*shown.shape[:2], 3)
+        target = window.render(*pose.rays())["rgb"].view(*shown.shape[:2], 3)
         return float((shown[..., :3] + 0.5 * shown[..., 3:] - target).square().mean())
 
     (middle,) = splats.between(poses[:1] + poses[1:], 0.4)[:1]
@@ -121,10 +120,23 @@ def test_fitted_opacities_help(window, monkeypatch):
             found = splats.fitted(found, window, poses)
         shown = [splat_image(found.gaussians, view_of(p), found.seen_from(eye_of(p))) for p in poses]
         images = [x[..., :3] + window.background * x[..., 3:] for x in shown]
-        targets = [window.render(*splats._reach(window, p), torch.full((3,), window.background))["rgb"] for p in poses]
+        targets = [window.render(*p.rays())["rgb"] for p in poses]
         return sum(float((a.reshape(-1, 3) - b).square().mean()) for a, b in zip(images, targets, strict=True))
 
     assert error(splats.OPACITY_STEP) < 0.95 * error(0.0)
+
+
+def test_splats_do_not_depend_on_the_number_of_threads(window):
+    """Cameras are shared out; what they add up to is added in their order."""
+    poses = cameras(window)
+    alone = splats.splats_of(window, poses, 0.01, 10**6, rounds=2)
+    torch.set_num_threads(2)
+    try:
+        shared = splats.splats_of(window, poses, 0.01, 10**6, rounds=2)
+    finally:
+        torch.set_num_threads(1)
+    for name in ("means", "scales", "alphas", "colors"):
+        assert torch.equal(getattr(alone, name), getattr(shared, name)), name
 
 
 def view_of(pose):
