@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from mmpi_ns.ops.gather import KnownTaps
+from mmpi_ns.ops.gather import Taps
 
 
 def batch(channels, seed=0, rays=7, width=6, in_cube=True):
@@ -16,7 +16,7 @@ def batch(channels, seed=0, rays=7, width=6, in_cube=True):
     parts = [np.sort(taken[:cut]), np.sort(taken[cut:])]
     values = torch.tensor(rng.normal(size=(30, channels)) * 2)
     groups = [
-        KnownTaps(torch.tensor(rng.integers(0, 30, (len(p), taps))), torch.tensor(rng.dirichlet(np.ones(taps), len(p))))
+        Taps(torch.tensor(rng.integers(0, 30, (len(p), taps))), torch.tensor(rng.dirichlet(np.ones(taps), len(p))))
         for p, taps in zip(parts, (4, 8), strict=True)
         if len(p)
     ]
@@ -31,16 +31,16 @@ def parts_of(sums):
 
 def in_float32(given):
     values, groups, slots, weights, wanted = given
-    return values.float(), [KnownTaps(g.positions, g.shares.float()) for g in groups], slots, weights.float(), wanted
+    return values.float(), [Taps(g.positions, g.weights.float()) for g in groups], slots, weights.float(), wanted
 
 
 def with_gradients(function, given, upstream, moved=False):
     """Sums and gradients of values and weights, and of shares where samples are moved."""
     values, weights = (x.clone().requires_grad_() for x in (given[0], given[3]))
-    groups = [KnownTaps(g.positions, g.shares.clone().requires_grad_(moved)) for g in given[1]]
+    groups = [Taps(g.positions, g.weights.clone().requires_grad_(moved)) for g in given[1]]
     sums = function(values, groups, given[2], weights, given[4])
     chosen = [s for s in parts_of(sums) if s.requires_grad]
     grads = [u for u, s in zip(upstream, parts_of(sums), strict=True) if s.requires_grad]
     torch.autograd.backward(chosen, [g.to(s.dtype) for g, s in zip(grads, chosen, strict=True)])
-    to_shares = [g.shares.grad for g in groups] if moved else []
+    to_shares = [g.weights.grad for g in groups] if moved else []
     return [x.double() for x in (*(s.detach() for s in parts_of(sums)), values.grad, weights.grad, *to_shares)]

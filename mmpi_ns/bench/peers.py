@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from mmpi_ns.capture.point_cloud import parser_points
-from mmpi_ns.ops.interpolate import interpolate_gathered
+from mmpi_ns.ops.interpolate import weigh_rows
 
 
 def read_points_ourselves() -> None:
@@ -63,7 +63,7 @@ def hash_lookups(self: Any, in_tensor: Tensor) -> Tensor:
     for begin in range(0, len(positions), AT_ONCE):
         part = slice(begin, begin + AT_ONCE)
         rows[part], weights[part] = hash_rows(self, positions[part])
-    found = interpolate_gathered(self.hash_table, rows.view(-1, 8), weights.view(-1, 8))
+    found = weigh_rows(self.hash_table, rows.view(-1, 8), weights.view(-1, 8))
     return found.view(*in_tensor.shape[:-1], -1)
 
 

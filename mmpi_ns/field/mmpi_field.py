@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -18,13 +18,13 @@ from torch import Tensor
 
 from mmpi_ns.field.color_network import ColorNetworks
 from mmpi_ns.field.moving import moving
-from mmpi_ns.field.samples import Gathered, Lookup, Taps, by_head, head_spans, metadata_of, places_of
+from mmpi_ns.field.samples import Lookup, by_head, head_spans, metadata_of, places_of
 from mmpi_ns.field.shading import RayColors, RayShader, Shading
 from mmpi_ns.field.tables import TexelTables, replace_data
 from mmpi_ns.ops.blending import log_shares
 from mmpi_ns.ops.composite import Composite, render_colors
-from mmpi_ns.ops.gather import KnownTaps, gather_places, gather_taps
-from mmpi_ns.ops.interpolate import gather_rows, index_rows, interpolate, interpolate_gathered, texel_rows
+from mmpi_ns.ops.gather import Taps, gather_places, gather_taps
+from mmpi_ns.ops.interpolate import index_rows, read_rows, texel_rows
 from mmpi_ns.ops.layout import SceneLayout, Tables
 from mmpi_ns.ops.shade import shade
 from mmpi_ns.ops.variation import total_variation
@@ -180,18 +180,14 @@ class MMPIField(TexelTables):
             head_counts: samples of each head, if known (``MergeReport``).
         """
         lookup = self._lookup(ray_samples, head_counts)
-        if self.training and self.learns_cover and lookup.gathered is not None:
-            self.touched.index_fill_(0, lookup.gathered.rows, 1)
+        if self.training and self.learns_cover:
+            self.touched.index_fill_(0, lookup.rows, 1)
             self.touched[:BRICK].zero_()
-        known = lookup.gathered and lookup.gathered.density
-        raw = [_read(self.density, known, taps)[:, 0] for taps in lookup.groups]
+        raw = lookup.by_head(lookup.read(lookup.density)[:, 0])
+        tau = [self.layout.optical_depth(k, part, lookup.planes[samples]) for k, samples, part in raw]
         out = lookup.ndc.new_zeros(lookup.shape.numel())
-        if raw:
-            flat = torch.cat(raw)
-            each = flat.split([own.stop - own.start for _, own in lookup.spans])
-            parts = zip(each, lookup.spans, strict=True)
-            tau = torch.cat([self.layout.optical_depth(k, part, lookup.planes[own]) for part, (k, own) in parts])
-            out = out.index_copy(0, lookup.index, tau)
+        if tau:
+            out = out.index_copy(0, lookup.index, torch.cat(tau))
         return out.view(*lookup.shape, 1), lookup
 
     def _lookup(self, ray_samples: RaySamples, head_counts: Sequence[int] | None = None) -> Lookup:
@@ -203,25 +199,18 @@ class MMPIField(TexelTables):
         if starts.requires_grad or ways.requires_grad:
             rays, inverse_t = index // meta["valid"].shape[1], meta["inverse_t"].reshape(-1)[index]
             ndc = moving(self.layout, starts, ways, rays, heads, planes, inverse_t, ndc)
-        spans, num_mpis, groups = head_spans(counts), len(self.plan.mpis), []
-        if in_mpis := [own for k, own in spans if k < num_mpis]:
-            own = slice(0, in_mpis[-1].stop)
-            groups.append(Taps(own, *texel_rows(self.layout, heads[own], planes[own], ndc[own])))
-        if spans and spans[-1][0] == num_mpis:
-            own = spans[-1][1]
-            groups.append(Taps(own, *self.grids[-1].trilinear(ndc[own])))
-        return Lookup(meta["valid"].shape[:2], index, heads, planes, ndc, spans, *self._gather(groups))
-
-    def _gather(self, groups: list[Taps]) -> tuple[list[Taps], Gathered | None]:
-        """The distinct rows of all groups, and the groups with their positions among them."""
-        learns = torch.is_grad_enabled() and (self.density.requires_grad or self.features.requires_grad)
-        if not learns or not groups:
-            return groups, None
-        index = index_rows(torch.cat([taps.rows.reshape(-1) for taps in groups]), len(self.density))
-        positions = index.position.split([taps.rows.numel() for taps in groups])
-        placed = [replace(t, position=p.view(t.rows.shape)) for t, p in zip(groups, positions, strict=True)]
-        density, features = (gather_rows(table, index.unique) for table in (self.density, self.features))
-        return placed, Gathered(index.unique, density, features)
+        spans, num_mpis = head_spans(counts), len(self.plan.mpis)
+        in_mpis, parts = sum(counts[:num_mpis]), []
+        if in_mpis:
+            parts.append(texel_rows(self.layout, heads[:in_mpis], planes[:in_mpis], ndc[:in_mpis]))
+        if in_mpis < len(index):
+            parts.append(self.grids[-1].trilinear(ndc[in_mpis:]))
+        rows = [rows.reshape(-1) for rows, _ in parts] or [heads]
+        distinct = index_rows(torch.cat(rows), len(self.density))
+        positions = distinct.positions.split([len(r) for r in rows])
+        taps = [Taps(p.view(w.shape), w) for p, (_, w) in zip(positions, parts)]  # noqa: B905
+        read = (distinct.unique, *(read_rows(table, distinct.unique) for table in (self.density, self.features)))
+        return Lookup(meta["valid"].shape[:2], index, heads, planes, ndc, spans, taps, *read)
 
     def get_outputs(  # type: ignore[override]
         self, ray_samples: RaySamples, density_embedding: Lookup | None = None
@@ -230,38 +219,25 @@ class MMPIField(TexelTables):
         if isinstance(self.networks, ColorNetworks) and density_embedding is None and not torch.is_grad_enabled():
             return {FieldHeadNames.RGB: self._shade(self.networks, ray_samples)}
         lookup = density_embedding or self._lookup(ray_samples)
-        features = self._features(lookup)
+        features = lookup.read(lookup.features)
         if isinstance(self.networks, ColorNetworks):
-            found = self._sample_colors(self.networks, features, lookup, ray_samples)
+            directions = ray_samples.frustums.directions[:, 0]
+            colors = [
+                self.networks(k, part, lookup.ndc[here], geometry.rotate(self._axes(k), directions), lookup.rays[here])
+                for k, here, part in lookup.by_head(features)
+            ]
+            colors = torch.cat(colors) if colors else features.new_zeros(0, 3)
         else:
-            found = features[:, :3].sigmoid()
-        out = lookup.ndc.new_zeros(lookup.shape.numel(), 3).index_copy(0, lookup.index, found)
+            colors = features[:, :3].sigmoid()
+        out = lookup.ndc.new_zeros(lookup.shape.numel(), 3).index_copy(0, lookup.index, colors)
         return {FieldHeadNames.RGB: out.view(*lookup.shape, 3)}
-
-    def _features(self, lookup: Lookup) -> Float[Tensor, "N C"]:
-        known = lookup.gathered and lookup.gathered.features
-        parts = [_read(self.features, known, taps) for taps in lookup.groups]
-        return torch.cat(parts) if parts else lookup.ndc.new_zeros(0, self.feature_channels)
-
-    def _sample_colors(
-        self, networks: ColorNetworks, features: Tensor, lookup: Lookup, ray_samples: RaySamples
-    ) -> Float[Tensor, "N 3"]:
-        """What the networks make of every sample."""
-        directions, rays = ray_samples.frustums.directions[:, 0], lookup.rays
-        # Split, not sliced: the gradient of a slice is as large as the whole.
-        each = features.split([own.stop - own.start for _, own in lookup.spans])
-        found = [
-            networks(k, part, lookup.ndc[own], geometry.rotate(self._axes(k), directions), rays[own])
-            for part, (k, own) in zip(each, lookup.spans, strict=True)
-        ]
-        return torch.cat(found) if found else lookup.ndc.new_zeros(0, 3)
 
     def render_colors(
         self,
         ray_samples: RaySamples,
         lookup: Lookup | None,
         composite: Composite,
-        wanted: Bool[Tensor, "R"] | None = None,
+        chosen: Bool[Tensor, "R"] | None = None,
     ) -> RayColors:
         """Colours of rays.
 
@@ -269,20 +245,18 @@ class MMPIField(TexelTables):
             ray_samples: merged samples.
             lookup: where they read the tables; None without gradients.
             composite: weights of the samples.
-            wanted: rays whose colours are needed; others may be left out to save time. None for all.
+            chosen: rays whose colours are needed; others may be left out to save time. None for all.
         """
         if not isinstance(self.networks, RayShader):
-            lookup = lookup if lookup is None or wanted is None else lookup.of_rays(wanted)
-            found = self.get_outputs(ray_samples, lookup)[FieldHeadNames.RGB]
-            return RayColors.of_samples(composite, render_colors(composite, found), found)
+            lookup = lookup if lookup is None or chosen is None else lookup.of_rays(chosen)
+            colors = self.get_outputs(ray_samples, lookup)[FieldHeadNames.RGB]
+            return RayColors.of_samples(composite, render_colors(composite, colors), colors)
         if lookup is None:
             sums = gather_places(self.layout, self.features.data, places_of(ray_samples), composite.weights)
         else:
-            known = lookup.gathered and lookup.gathered.features
-            groups = [KnownTaps(t.rows if t.position is None else t.position, t.weights) for t in lookup.groups]
-            wanted = torch.ones(lookup.shape[0], dtype=torch.bool) if wanted is None else wanted
-            values = self.features if known is None else known
-            sums = gather_taps(values, groups, lookup.index, composite.weights, wanted.to(values.device))
+            if chosen is None:
+                chosen = torch.ones(lookup.shape[0], dtype=torch.bool, device=lookup.rows.device)
+            sums = gather_taps(lookup.features, lookup.taps, lookup.index, composite.weights, chosen)
         return self.networks(sums, composite, ray_samples.frustums.directions[:, 0])
 
     def _shade(self, networks: ColorNetworks, ray_samples: RaySamples) -> Float[Tensor, "R S 3"]:
@@ -293,21 +267,17 @@ class MMPIField(TexelTables):
 
     def total_variation(self, lookup: Lookup, density_weight: float, feature_weight: float) -> Tensor:
         """Weighted total variation of the texels that the batch touched, in DVGO's normalisation (not yet per ray)."""
-        total = self.density.new_zeros(())
-        found = lookup.gathered
-        if found is None:
-            return total
-        scales = []
+        total, scales = self.density.new_zeros(()), []
         for k, grid in enumerate(self.grids):
             side = max(grid.width, grid.height)
             sides = (side, side, grid.depth) if k < len(self.plan.mpis) else (grid.width, grid.height, grid.depth)
             scales.append((sides[0] / 128, sides[1] / 128, sides[2] / 128))
         for table, values, weight in (
-            (self.density, found.density, density_weight),
-            (self.features, found.features, feature_weight),
+            (self.density, lookup.density, density_weight),
+            (self.features, lookup.features, feature_weight),
         ):
             if weight > 0:
-                total = total + weight * total_variation(values, table.data, found.rows, self.layout, scales)
+                total = total + weight * total_variation(values, table.data, lookup.rows, self.layout, scales)
         return total
 
     def _axes(self, k: int) -> Tensor:
@@ -329,10 +299,3 @@ class MMPIField(TexelTables):
     ) -> tuple[Float[Tensor, "N"], Float[Tensor, "N"]]:
         """``blending.log_shares`` in this field."""
         return log_shares(self.layout, self.reliability, self.touched, rays, local, inverse_t, heads)
-
-
-def _read(table: Tensor, gathered: Tensor | None, taps: Taps) -> Tensor:
-    """Interpolated rows of a table, or of what was gathered from it."""
-    if gathered is None or taps.position is None:
-        return interpolate(table, taps.rows, taps.weights)
-    return interpolate_gathered(gathered, taps.position, taps.weights)

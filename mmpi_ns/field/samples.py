@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from itertools import accumulate
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import accumulate, pairwise
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -12,32 +12,18 @@ from nerfstudio.cameras.rays import RaySamples
 from torch import Tensor
 
 from mmpi_ns.ops import dispatch
+from mmpi_ns.ops.gather import Taps
+from mmpi_ns.ops.interpolate import weigh_rows
 from mmpi_ns.ops.layout import Places
 
 
 @dataclass(frozen=True)
-class Taps:
-    """Texels that a range of samples reads: 4 each in the MPIs, 8 in the cube."""
-
-    samples: slice
-    rows: Int[Tensor, "N B"]
-    weights: Float[Tensor, "N B"]
-    position: Int[Tensor, "N B"] | None = None
-    """Index of each row among the batch's distinct rows, if gradients are needed."""
-
-
-@dataclass(frozen=True)
-class Gathered:
-    """The distinct rows that a batch reads. Gradients are summed here, so that each row has one."""
-
-    rows: Int[Tensor, "U"]
-    density: Float[Tensor, "U 1"]
-    features: Float[Tensor, "U C"]
-
-
-@dataclass(frozen=True)
 class Lookup:
-    """Lookups of the valid samples of a merged batch in the tables. Samples are ordered by head, then by slot."""
+    """Lookups of the valid samples of a merged batch in the tables. Samples are ordered by head, then by slot.
+
+    Every row that the batch reads is taken from its table once: ``density`` and ``features`` are what the samples read,
+    and their gradients are those of the tables (``ops.interpolate.Table``).
+    """
 
     shape: torch.Size
     """(R, S) of the batch."""
@@ -48,33 +34,49 @@ class Lookup:
     ndc: Float[Tensor, "N 3"]
     spans: list[tuple[int, slice]]
     """(head, its samples) for every head that occurs."""
-    groups: list[Taps]
-    """All MPIs together, then the cube."""
-    gathered: Gathered | None
-    """Rows read by the groups, if gradients are needed."""
+    taps: list[Taps]
+    """Of the samples of all MPIs together, then of those of the cube; positions are among ``rows``."""
+    rows: Int[Tensor, "U"]
+    """Distinct rows of the tables, rising."""
+    density: Float[Tensor, "U 1"]
+    features: Float[Tensor, "U C"]
 
     @property
     def rays(self) -> Int[Tensor, "N"]:
         return self.index // self.shape[1]
 
+    def read(self, values: Float[Tensor, "U C"]) -> Float[Tensor, "N C"]:
+        """Interpolated values of the samples, from those of the rows."""
+        parts = [weigh_rows(values, taps.positions, taps.weights) for taps in self.taps]
+        return torch.cat(parts) if parts else values.new_zeros(0, values.shape[1])
+
+    def by_head(self, values: Float[Tensor, "N *C"]) -> Iterator[tuple[int, slice, Tensor]]:
+        """(head, its samples, their values) for every head that occurs."""
+        # Split, not sliced: the gradient of a slice is as large as the whole.
+        parts = values.split([samples.stop - samples.start for _, samples in self.spans])
+        return ((k, samples, part) for (k, samples), part in zip(self.spans, parts, strict=True))
+
     def of_rays(self, chosen: Bool[Tensor, "R"]) -> Lookup:
-        """The samples of the chosen rays, or of all rays if choosing would synchronise with a GPU. Gathered rows are
-        still those of all rays."""
+        """The samples of the chosen rays, or of all rays if choosing would synchronise with a GPU. Rows are still those
+        of all rays."""
         if dispatch.on_device(chosen) or bool(chosen.all()):
             return self
-        wanted = chosen[self.rays].nonzero()[:, 0]
-        heads = self.heads[wanted]
-        bounds = torch.searchsorted(wanted, torch.tensor([g.samples.stop for g in self.groups], device=wanted.device))
-        groups, start = [], 0
-        for taps, stop in zip(self.groups, bounds.tolist(), strict=True):
-            own = wanted[start:stop] - taps.samples.start
-            position = None if taps.position is None else taps.position.index_select(0, own)
-            rows, weights = taps.rows.index_select(0, own), taps.weights.index_select(0, own)
-            groups.append(Taps(slice(start, stop), rows, weights, position))
-            start = stop
-        samples = (self.index[wanted], heads, self.planes[wanted], self.ndc.index_select(0, wanted))
-        spans = head_spans(torch.bincount(heads).tolist())
-        return Lookup(self.shape, *samples, spans, groups, self.gathered)
+        samples = chosen[self.rays].nonzero()[:, 0]
+        ends = torch.tensor([*accumulate(len(taps.positions) for taps in self.taps)])
+        bounds, taps = [0, *torch.searchsorted(samples, ends).tolist()], []
+        for each, end, (a, b) in zip(self.taps, ends.tolist(), pairwise(bounds), strict=True):
+            chosen_taps = samples[a:b] - (end - len(each.positions))
+            taps.append(Taps(*(x.index_select(0, chosen_taps) for x in (each.positions, each.weights))))
+        heads = self.heads[samples]
+        return replace(
+            self,
+            index=self.index[samples],
+            heads=heads,
+            planes=self.planes[samples],
+            ndc=self.ndc.index_select(0, samples),
+            spans=head_spans(torch.bincount(heads).tolist()),
+            taps=taps,
+        )
 
 
 def head_spans(counts: Sequence[int]) -> list[tuple[int, slice]]:
@@ -110,6 +112,6 @@ def by_head(
         keys = torch.where(valid, heads, num_heads).reshape(-1)
         return torch.sort(keys.to(torch.int16), stable=True).indices[: sum(counts)], counts
     index = valid.reshape(-1).nonzero()[:, 0]
-    own = heads.reshape(-1)[index]
-    parts = [(own == k).nonzero()[:, 0] for k in range(num_heads)]  # on a CPU a sort takes longer
+    heads = heads.reshape(-1)[index]
+    parts = [(heads == k).nonzero()[:, 0] for k in range(num_heads)]  # on a CPU a sort takes longer
     return index[torch.cat(parts)], [len(p) for p in parts]

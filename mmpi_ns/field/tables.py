@@ -14,8 +14,7 @@ from nerfstudio.fields.base_field import Field
 from torch import Tensor, nn
 
 from mmpi_ns.field.samples import Lookup
-from mmpi_ns.ops import dispatch
-from mmpi_ns.ops.interpolate import raise_peaks
+from mmpi_ns.ops.interpolate import Table, raise_peaks
 from mmpi_ns.scene.bricks import grown_tiles, keep_bricks, new_table, resample, take_bricks
 from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.scene.texels import BRICK, TexelGrid, head_grids, number_tiles
@@ -50,11 +49,9 @@ class TexelTables(Field):
         """Fraction of the plan's texels in use: ``texel_factor`` on the host, readable without synchronising."""
         self.views = views
         self._packed: dict[Any, Any] = {}
-        self.density = nn.Parameter(torch.empty(0, 1))
-        self.features = nn.Parameter(torch.empty(0, feature_channels))
-        self.reliability = nn.Parameter(torch.empty(0, 1))
-        for name in TABLES:
-            getattr(self, name).register_hook(_keep_empty_brick)
+        self.density = Table(torch.empty(0, 1))
+        self.features = Table(torch.empty(0, feature_channels))
+        self.reliability = Table(torch.empty(0, 1))
         for name, dtype in (
             ("tiles", torch.int32),
             ("touched", torch.uint8),
@@ -138,9 +135,9 @@ class TexelTables(Field):
     @torch.no_grad()
     def note_use(self, lookup: Lookup, weights: Float[Tensor, "R S"], live: Int[Tensor, "R"]) -> None:
         """Records the bricks, weights and number of the samples of a training batch."""
-        weight = weights.reshape(-1)[lookup.index]
-        for taps in lookup.groups:
-            raise_peaks(self.peak, taps.rows, weight[taps.samples])
+        parts = weights.reshape(-1)[lookup.index].split([len(taps.positions) for taps in lookup.taps])
+        for taps, part in zip(lookup.taps, parts, strict=True):
+            raise_peaks(self.peak, lookup.rows, taps.positions, part)
         self.crossings += live.sum()
 
     @torch.no_grad()
@@ -205,20 +202,6 @@ class TexelTables(Field):
 def _empty_value(name: str) -> float:
     """Content of the empty brick."""
     return RELEASED_DENSITY if name == "density" else 0.0
-
-
-def _keep_empty_brick(grad: Tensor) -> Tensor:
-    """A table's gradient without the rows of the empty brick, which samples next to a released tile read as well."""
-    if not grad.is_sparse:
-        return torch.cat([torch.zeros_like(grad[:BRICK]), grad[BRICK:]])
-    rows, values = grad._indices(), grad._values()
-    rises = grad.is_coalesced()
-    if rises and not dispatch.on_device(rows):  # the empty brick's rows come first
-        first = int(torch.searchsorted(rows[0], BRICK))
-        rows, values = rows[:, first:], values[first:]
-    else:
-        values = values.masked_fill((rows[0] < BRICK)[:, None], 0)
-    return torch.sparse_coo_tensor(rows, values, grad.shape, is_coalesced=rises, check_invariants=False)
 
 
 def replace_data(parameter: nn.Parameter, data: Tensor) -> None:

@@ -11,19 +11,22 @@ import shlex
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import torch
+from jaxtyping import Int
 from torch import Tensor
 
 OPS = Path(__file__).parent
 HEADERS = OPS / "cpp"
 FLAGS = ["-std=c++17", "-O3", "-march=native", "-fno-math-errno", "-shared", "-fPIC", f"-I{HEADERS}"]
 """No option that reorders sums, so that results do not depend on the compiler."""
+ENTRIES_PER_PART = 1024
+"""Entries that are looked at to divide sums evenly among threads."""
 
 
 class CannotCompile(Exception):
@@ -80,7 +83,7 @@ def library() -> ctypes.CDLL:
         raise CannotCompile(f"{program[0]} failed: {(error.stderr or '').strip().splitlines()[:1]}") from error
     except (OSError, subprocess.TimeoutExpired) as error:
         raise CannotCompile(str(error)) from error
-    built.mmpi_index_rows.restype = ctypes.c_int64
+    built.mmpi_count_rows.restype = ctypes.c_int64
     return built
 
 
@@ -116,22 +119,44 @@ def call(name: str, *given: Any) -> int:
 
 
 def call_in_parts(name: str, count: int, before: Iterable[Any], after: Iterable[Any], least: int = 256) -> None:
-    """Calls a compiled function of ``(*before, begin, end, *after)`` for parts of 0..count (see ``in_parts``)."""
+    """Calls a compiled function of ``(*before, begin, end, *after)`` for parts of 0..count (see ``run_in_parts``)."""
     function, held = getattr(library(), name), (list(before), list(after))  # tensors live until all parts are done
     first, last = (arguments(x) for x in held)
-    in_parts(lambda begin, end: function(*first, *arguments((begin, end)), *last), count, least)
+    run_in_parts(lambda a, b: function(*first, *arguments((a, b)), *last), even_bounds(count, least))
 
 
-def in_parts(work: Callable[[int, int], None], count: int, least: int = 256) -> None:
-    """Calls work(begin, end) for parts of 0..count, on as many threads as torch uses. Parts must not meet."""
-    threads = max(1, min(torch.get_num_threads(), count // least))
-    if threads == 1:
-        return work(0, count)
-    bounds = [count * i // threads for i in range(threads + 1)]
-    parts = [_pool(threads).submit(work, a, b) for a, b in pairwise(bounds)]
+def even_bounds(count: int, least: int = 256) -> list[int]:
+    """Bounds of parts of 0..count, one for each of torch's threads, as far as each gets ``least``."""
+    parts = max(1, min(torch.get_num_threads(), count // least))
+    return [count * i // parts for i in range(parts + 1)]
+
+
+def owned_bounds(positions: Sequence[Int[Tensor, "N B"]], count: int, least: int) -> list[int]:
+    """Bounds of parts of rows 0..count with about as many entries each, for sums by row.
+
+    A row has one owner, who adds all its entries in order: no sum depends on where the bounds lie.
+
+    Args:
+        positions: rows of all entries; some of them are looked at.
+        count: of the rows.
+        least: entries that each part gets (see ``even_bounds``).
+    """
+    entries = sum(p.numel() for p in positions)
+    parts = len(even_bounds(entries, least)) - 1
+    if parts == 1:
+        return [0, count]
+    some = torch.cat([p.reshape(-1)[:: 1 + entries // ENTRIES_PER_PART // parts] for p in positions]).sort().values
+    inner = some[[len(some) * i // parts for i in range(1, parts)]].tolist()
+    return [0, *sorted({n for n in inner if 0 < n < count}), count]
+
+
+def run_in_parts(work: Callable[[int, int], Any], bounds: Sequence[int]) -> list[Any]:
+    """Results of work(begin, end) for the parts between bounds, each by a thread. Parts must not write to one place."""
+    if len(bounds) == 2:
+        return [work(*bounds)]
+    parts = [_pool(torch.get_num_threads()).submit(work, a, b) for a, b in pairwise(bounds)]
     try:
-        for part in parts:
-            part.result()
+        return [part.result() for part in parts]
     finally:
         wait(parts)  # also when interrupted: the caller's tensors are freed then, and the kernels write to them
 

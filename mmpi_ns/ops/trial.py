@@ -15,7 +15,7 @@ from torch import Tensor
 
 from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.adam import AdamConstants
-from mmpi_ns.ops.gather.reference import KnownTaps
+from mmpi_ns.ops.gather.reference import Taps
 from mmpi_ns.ops.layout import SceneLayout, Tables
 from mmpi_ns.ops.march import Crossings, MarchOptions
 from mmpi_ns.scene.geometry import Cube, Frames, cube_hits, plane_hits
@@ -62,8 +62,8 @@ def _outcome(name: str, form: dispatch.Form, given: tuple) -> list[Tensor]:
     leaves = [
         c.requires_grad_() for c, x in zip(copies, given, strict=True) if isinstance(x, Tensor) and x.requires_grad
     ]
-    groups = [g for x in copies if isinstance(x, list) for g in x if isinstance(g, KnownTaps)]
-    leaves += [g.shares for g in groups if g.shares.requires_grad]
+    taps = [t for x in copies if isinstance(x, list) for t in x if isinstance(t, Taps)]
+    leaves += [t.weights for t in taps if t.weights.requires_grad]
     with torch.set_grad_enabled(bool(leaves)):
         made = dispatch.function(name, form)(*copies)
     found = _numbers(copies if made is None else made)
@@ -159,10 +159,7 @@ def _texels(device: str) -> list[tuple]:
 
 def _sums(device: str) -> list[tuple]:
     values, weights = _random(device, RAYS, CHANNELS), _random(device, RAYS, 4)
-    return [
-        (_entries(device, RAYS, 4).int(), values, weights, ROWS),
-        (_entries(device, RAYS, 1).int(), values, None, ROWS),
-    ]
+    return [(_entries(device, RAYS, 4).int(), values, weights, ROWS)]
 
 
 def _composites(device: str) -> list[tuple]:
@@ -194,10 +191,10 @@ def _gathers(device: str) -> list[tuple]:
     both = (4, 8)
     for sizes, learns, moves in (((4,), True, False), (both, False, False), (both, True, False), (both, True, True)):
         shares = [(_random(device, RAYS, n) / n).requires_grad_(moves) for n in sizes]
-        groups = [KnownTaps(_entries(device, RAYS, x.shape[1]).int(), x) for x in shares]
+        taps = [Taps(_entries(device, RAYS, x.shape[1]).int(), x) for x in shares]
         slots = torch.cat([4 * torch.arange(RAYS, device=device) + i for i in range(len(sizes))])
         values = (2 * _random(device, ROWS, CHANNELS) - 1).requires_grad_(learns)
-        cases.append((values, groups, slots, weights.clone().requires_grad_(), wanted))
+        cases.append((values, taps, slots, weights.clone().requires_grad_(), wanted))
     return cases
 
 

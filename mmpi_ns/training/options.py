@@ -102,11 +102,6 @@ def check_run(config: TrainerConfig) -> None:
     check_placement(model.placement, "--pipeline.model.placement.")
     for name, entry in config.optimizers.items():
         check_number(f"--optimizers.{name}.optimizer.lr", entry["optimizer"].lr, NOT_NEGATIVE)
-        if entry["optimizer"].max_norm is not None:
-            raise InputError(
-                f"--optimizers.{name}.optimizer.max-norm clips gradients, which are sparse here and cannot be clipped "
-                "as a whole: leave it out or lower the rate."
-            )
     for path, names in NO_EFFECT.items():
         settings = manager if path.endswith("datamanager") else model
         usual = type(settings)()
@@ -131,4 +126,4 @@ def check_run(config: TrainerConfig) -> None:
             f"fewer, or train on CPUs with torchrun --nproc-per-node {processes} -m mmpi_ns.scripts.train."
         )
     if config.machine.device_type == "mps":
-        raise InputError("--machine.device-type mps has no sparse gradients, which training needs: use cpu.")
+        raise InputError("--machine.device-type mps has no compiled operations: use cpu.")

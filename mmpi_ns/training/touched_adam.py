@@ -1,4 +1,4 @@
-"""Adam that updates only the rows a batch touched (DVGO's masked Adam, for sparse row gradients).
+"""Adam that updates only the rows of tables that a batch read (DVGO's masked Adam).
 
 Equal to dense Adam in which entries without a gradient are skipped, with values and moments unchanged.
 """
@@ -17,15 +17,16 @@ from torch.nn import Parameter
 
 from mmpi_ns.ops.adam import AdamConstants, adam_rows
 from mmpi_ns.ops.adam.reference import adam
-from mmpi_ns.ops.interpolate import index_rows, sum_rows
+from mmpi_ns.ops.interpolate import Table
 from mmpi_ns.utils.machine import lazy_zeros
 
 
 class TouchedAdam(torch.optim.Optimizer):
-    """Adam over touched rows (sparse gradients) or touched entries (dense gradients).
+    """Adam over the rows of a ``Table`` that were read, but for its empty brick, or over entries of other parameters
+    whose gradient is not 0.
 
     Args:
-        params: parameters; tables with sparse gradients are [rows, channels].
+        params: parameters.
         lr: learning rate.
         betas: decay of the two moments (paper settings: 0.9, 0.99).
         eps: added to the root of the second moment.
@@ -43,10 +44,15 @@ class TouchedAdam(torch.optim.Optimizer):
                     continue
                 state = self.state[param]
                 if not state:
-                    state["step"], state["moments"] = 0, _no_moments(param, param.grad.is_sparse)
+                    state["step"], state["moments"] = 0, _no_moments(param)
                 state["step"] += 1
-                update = _sparse_update if param.grad.is_sparse else _dense_update
-                update(param, param.grad, state, group)
+                old, constants = (param.data, state["moments"]), _constants(state["step"], group)
+                if isinstance(param, Table):
+                    assert param.grad_rows is not None
+                    adam_rows(*old, param.grad_rows, param.grad, constants)
+                else:
+                    for tensor, new in zip(old, adam(*old, param.grad, constants), strict=True):
+                        tensor.copy_(new)
 
     def reset_moments(self, param: Parameter) -> None:
         """Forgets the moments of a parameter whose data was resized or redefined."""
@@ -63,37 +69,21 @@ class TouchedAdam(torch.optim.Optimizer):
         """Like torch's own, which would convert moments to the precision of their parameters."""
         super().load_state_dict(state_dict)
         params = [param for group in self.param_groups for param in group["params"]]
-        for number, known in state_dict["state"].items():
-            self.state[params[number]]["moments"] = known["moments"].to(params[number].device)
+        for number, state in state_dict["state"].items():
+            self.state[params[number]]["moments"] = state["moments"].to(params[number].device)
 
 
-def _no_moments(param: Tensor, of_rows: bool) -> Float[Tensor, "N 2 *C"]:
-    """Zeros, mean and uncentred variance. Those of a table's rows are in bfloat16 (docs/log/performance.md has
-    what that costs), and take no memory on a CPU until they are written to: most rows may never be."""
-    rounds = of_rows and param.dtype == torch.float32
-    dtype = torch.bfloat16 if rounds else param.dtype
+def _no_moments(param: Parameter) -> Float[Tensor, "N 2 *C"]:
+    """Zeros, mean and uncentred variance. Those of a table are in bfloat16 (docs/log/performance.md has what that
+    costs), and take no memory on a CPU until they are written to: most rows may never be."""
+    dtype = torch.bfloat16 if isinstance(param, Table) and param.dtype == torch.float32 else param.dtype
     return lazy_zeros((len(param), 2, *param.shape[1:]), dtype, param.device)
 
 
-def _constants(state: dict[str, Any], group: dict[str, Any]) -> AdamConstants:
+def _constants(step: int, group: dict[str, Any]) -> AdamConstants:
     beta1, beta2 = group["betas"]
-    correction = (1 - beta2 ** state["step"]) ** 0.5
-    return AdamConstants(beta1, beta2, correction, group["eps"], group["lr"] / (1 - beta1 ** state["step"]))
-
-
-def _sparse_update(param: Parameter, grad: Tensor, state: dict[str, Any], group: dict[str, Any]) -> None:
-    rows, values = grad._indices()[0], grad._values().to(param.dtype)
-    # On a CPU, torch loses the information that an accumulated gradient is coalesced.
-    if not (grad.is_coalesced() or bool((rows[1:] > rows[:-1]).all())):
-        index = index_rows(rows, len(param))
-        rows, values = index.unique, sum_rows(index.position, values, None, len(index.unique))
-    adam_rows(param.data, state["moments"], rows, values, _constants(state, group))
-
-
-def _dense_update(param: Parameter, grad: Tensor, state: dict[str, Any], group: dict[str, Any]) -> None:
-    old = (param.data, state["moments"])
-    for tensor, new in zip(old, adam(*old, grad, _constants(state, group)), strict=True):
-        tensor.copy_(new)
+    correction = (1 - beta2**step) ** 0.5
+    return AdamConstants(beta1, beta2, correction, group["eps"], group["lr"] / (1 - beta1**step))
 
 
 @dataclass

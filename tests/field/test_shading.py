@@ -26,7 +26,7 @@ def ray_field(num_mpis=3, with_cube=True, seed=0, channels=7, **chosen):
     return fill(field, seed)
 
 
-def shown(field, rays, gradients=False, wanted=None):
+def shown(field, rays, gradients=False, chosen=None):
     """What the field's rays show, by the ways of training or of rendering."""
     with torch.set_grad_enabled(gradients):
         samples, report = MMPISampler()(rays, field=field, threshold=0.0)
@@ -35,7 +35,7 @@ def shown(field, rays, gradients=False, wanted=None):
         made = composite_weights(
             tau[..., 0], meta["valid"][..., 0], meta["skipped_before"][..., 0], report.skipped_total
         )
-        return field.render_colors(samples, lookup, made, wanted), made
+        return field.render_colors(samples, lookup, made, chosen), made
 
 
 # By hand -------------------------------------------------------------------------------------------------------------
@@ -116,19 +116,19 @@ def test_gradients_of_texels_densities_and_network_are_those_of_float64(path):
         finally:
             dispatch.choose("auto")
         tables = (field.density, field.features, field.networks.weights)
-        found.append([p.grad.to_dense().double() if p.grad.is_sparse else p.grad.double() for p in tables])
+        found.append([p.grad.double() for p in tables])
     for a, b in zip(*found, strict=True):
         assert b.abs().max() > 0.01 and (a - b).abs().max() < 1e-4 * b.abs().max()
 
 
-def test_rays_that_are_not_wanted_learn_no_colour():
+def test_rays_that_are_not_chosen_learn_no_colour():
     field = ray_field()
-    rays, wanted = bundle(*random_rays(field.plan, 20, seed=6)), torch.arange(20) % 2 == 0
-    colors, _ = shown(field, rays, gradients=True, wanted=wanted)
+    rays, chosen = bundle(*random_rays(field.plan, 20, seed=6)), torch.arange(20) % 2 == 0
+    colors, _ = shown(field, rays, gradients=True, chosen=chosen)
     everything, _ = shown(field, rays, gradients=True)
-    assert torch.equal(colors.rgb[wanted], everything.rgb[wanted]) and not colors.first[~wanted].any()
-    (colors.first[~wanted].sum() + colors.second[~wanted].sum()).backward()
-    assert not field.features.grad.to_dense().any()
+    assert torch.equal(colors.rgb[chosen], everything.rgb[chosen]) and not colors.first[~chosen].any()
+    (colors.first[~chosen].sum() + colors.second[~chosen].sum()).backward()
+    assert not field.features.grad.any()
 
 
 def test_a_fresh_network_shows_the_diffuse_colour():

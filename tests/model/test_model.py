@@ -75,8 +75,7 @@ def test_every_phase_has_finite_losses_and_trains_what_it_says(scene, plan_file,
         with_gradient = {k for k in KINDS if groups[k][0].grad is not None}
         assert with_gradient == TRAINS[phase.name] & set(KINDS)
         for k in with_gradient:
-            grad = groups[k][0].grad
-            assert torch.isfinite(grad.coalesce().values() if grad.is_sparse else grad).all()
+            assert torch.isfinite(groups[k][0].grad).all()
 
 
 def test_total_variation_is_added_every_few_steps_while_densities_train(scene, plan_file, tmp_path):
@@ -150,7 +149,7 @@ def test_the_cube_learns_from_the_first_step_at_the_default_settings(scene, plan
     assert live > 100 and kept > 0.5 * live
     sum(losses.values()).backward()
     field = trainer.pipeline.model.field
-    assert field.density.grad.to_dense()[field.grids[-1].rows].abs().sum() > 0
+    assert field.density.dense_grad()[field.grids[-1].rows].abs().sum() > 0
 
 
 def test_transparent_pixels_are_trained_and_measured_over_a_background(tmp_path):

@@ -18,6 +18,7 @@ from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.samples import metadata_of
 from mmpi_ns.ops import blending, composite
 from mmpi_ns.ops.hits import plane_hits
+from mmpi_ns.ops.interpolate import Table
 from mmpi_ns.ops.march import gpu, reference
 from mmpi_ns.rendering.sampler import MMPISampler
 from mmpi_ns.scene.plan import ScenePlan
@@ -195,7 +196,7 @@ def test_gradients_of_a_rendered_batch_are_those_of_plain_torch():
         colors = next(iter(field.get_outputs(samples, lookup).values()))
         loss = (composite.render_colors(made, colors) * upstream).sum() + made.accumulation.sum()
         (loss + 0.1 * field.total_variation(lookup, 1.0, 1.0)).backward()
-        return {n: p.grad.to_dense() if p.grad.is_sparse else p.grad for n, p in params.items()}
+        return {n: p.dense_grad() if isinstance(p, Table) else p.grad for n, p in params.items()}
 
     fast, plain = gradients(), by_torch(gradients)
     for name in ("density", "features", "reliability", "networks.weights"):

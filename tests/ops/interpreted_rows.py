@@ -10,6 +10,7 @@ from interpreting import by_torch, interpreted, normal  # noqa: F401
 
 from mmpi_ns.ops import composite, gather, interpolate
 from mmpi_ns.ops.composite import reference as plain_composite
+from mmpi_ns.ops.interpolate import Table
 from mmpi_ns.ops.interpolate import reference as plain_interpolate
 from mmpi_ns.ops.variation import reference as plain_variation
 from mmpi_ns.ops.variation import total_variation
@@ -22,29 +23,29 @@ from mmpi_ns.training.touched_adam import TouchedAdam
 def test_interpolation_and_its_gradient_are_those_of_float64(channels, taps):
     g = torch.Generator().manual_seed(taps)
     rows, weights = torch.randint(0, 40, (300, taps), generator=g), torch.rand(300, taps, generator=g)
-    table, exact = normal(50, channels).requires_grad_(), normal(50, channels).double().requires_grad_()
+    table, exact = Table(normal(50, channels)), normal(50, channels).double().requires_grad_()
     upstream = normal(300, channels, seed=2)
     read = interpolate.interpolate(table, rows, weights)
     wanted = plain_interpolate.interpolate(exact, rows, weights.double())
     assert (read.double() - wanted).abs().max() < 2e-6
     (read * upstream).sum().backward()
     (wanted * upstream.double()).sum().backward()
-    assert table.grad.is_sparse and (table.grad.to_dense().double() - exact.grad).abs().max() < 2e-5
+    assert (table.dense_grad().double() - exact.grad).abs().max() < 2e-5
     assert exact.grad[40:].abs().max() == 0 < exact.grad.abs().max()
 
 
 def test_gathered_rows_are_read_like_the_table_and_have_one_gradient_each():
     rows, weights = torch.randint(0, 50, (80, 4), generator=torch.Generator().manual_seed(1)), torch.rand(80, 4)
     index, some = interpolate.index_rows(rows, 50), torch.arange(0, 80, 3)
-    table, plain = (normal(50, 9).requires_grad_() for _ in range(2))
-    gathered = interpolate.gather_rows(table, index.unique)
-    read = interpolate.interpolate_gathered(gathered, index.position, weights)
-    part = interpolate.interpolate_gathered(gathered, index.position[some], weights[some])
+    table, plain = Table(normal(50, 9)), normal(50, 9).requires_grad_()
+    values = interpolate.read_rows(table, index.unique)
+    read = interpolate.weigh_rows(values, index.positions, weights)
+    part = interpolate.weigh_rows(values, index.positions[some], weights[some])
     wanted = plain_interpolate.interpolate(plain, rows, weights)
     assert torch.allclose(read, wanted, atol=1e-6) and torch.allclose(part, wanted[some], atol=1e-6)
     ((read**2).sum() + 2 * part.sum()).backward()
     ((wanted**2).sum() + 2 * wanted[some].sum()).backward()
-    assert torch.allclose(table.grad.to_dense(), plain.grad, atol=1e-4)
+    assert torch.allclose(table.dense_grad(), plain.grad, atol=1e-4)
 
 
 @pytest.mark.parametrize("spread", ["side by side", "a brick apart", "anywhere", "one"])
@@ -59,36 +60,33 @@ def test_distinct_rows_are_those_of_the_reference(count, spread):
     ]
     found = interpolate.index_rows(rows, most)
     assert torch.equal(found.unique, rows.unique())
-    assert found.position.shape == rows.shape and torch.equal(found.unique[found.position.long()], rows)
+    assert found.positions.shape == rows.shape and torch.equal(found.unique[found.positions.long()], rows)
 
 
 def test_padded_rows_end_in_row_0_which_nothing_is_added_to():
     rows = torch.tensor([[7, 3], [3, 90], [7, 7]])
     found = interpolate.index_rows(rows, 100, pads=True)
-    assert found.unique.tolist() == [3, 7, 90, 0, 0, 0] and torch.equal(found.unique[found.position.long()], rows)
-    table = normal(100, 1).requires_grad_()
+    assert found.unique.tolist() == [3, 7, 90, 0, 0, 0] and torch.equal(found.unique[found.positions.long()], rows)
+    table = Table(normal(100, 1))
     interpolate.interpolate(table, rows, torch.ones(3, 2)).sum().backward()
-    assert table.grad.is_sparse and torch.equal(
-        table.grad.to_dense()[:, 0], torch.bincount(rows.reshape(-1), minlength=100).float()
-    )
+    assert torch.equal(table.dense_grad()[:, 0], torch.bincount(rows.reshape(-1), minlength=100).float())
 
 
 @pytest.mark.parametrize("pads", [False, True])
 def test_no_rows_are_no_distinct_rows(pads):
     found = interpolate.index_rows(torch.zeros(0, 4, dtype=torch.int64), 9, pads)
-    assert found.unique.shape == (0,) and found.position.shape == (0, 4)
-    assert interpolate.sum_rows(found.position, torch.zeros(0, 3), torch.zeros(0, 4), 0).shape == (0, 3)
+    assert found.unique.shape == (0,) and found.positions.shape == (0, 4)
+    assert interpolate.sum_rows(found.positions, torch.zeros(0, 3), torch.zeros(0, 4), 0).shape == (0, 3)
 
 
-@pytest.mark.parametrize("weighted", [True, False])
-def test_rows_gather_what_their_entries_give(weighted):
-    rows = torch.randint(0, 40, (300, 4 if weighted else 1), generator=torch.Generator().manual_seed(1))
-    values, weights = normal(300, 9), torch.rand(300, 4) if weighted else None
+def test_rows_gather_what_their_entries_give():
+    rows = torch.randint(0, 40, (300, 4), generator=torch.Generator().manual_seed(1))
+    values, weights = normal(300, 9), torch.rand(300, 4)
     index = interpolate.index_rows(rows, 50)
     found = torch.zeros(40, 9).index_copy_(
-        0, index.unique, interpolate.sum_rows(index.position, values, weights, len(index.unique))
+        0, index.unique, interpolate.sum_rows(index.positions, values, weights, len(index.unique))
     )
-    each = values[:, None].double() * (torch.ones(300, 1) if weights is None else weights)[..., None].double()
+    each = values[:, None].double() * weights[..., None].double()
     wanted = torch.zeros(40, 9, dtype=torch.float64).index_add_(0, rows.reshape(-1), each.reshape(-1, 9))
     assert wanted.abs().max() > 1 and (found.double() - wanted).abs().max() < 1e-5
 
@@ -125,13 +123,14 @@ def test_variation_equals_the_reference_with_its_gradient(channels):
 
 def test_adam_on_rows_equals_the_plain_one():
     def work():
-        param = torch.nn.Parameter(normal(500, 9))
+        param = Table(normal(500, 9))
         optimizer = TouchedAdam([param], lr=0.1)
         for step in range(4):
-            rows = torch.randint(0, 500, (300,), generator=torch.Generator().manual_seed(step))
+            rows = torch.randperm(500, generator=torch.Generator().manual_seed(step))[:300].sort().values
             values = normal(300, 9, seed=step)
             values[:, step] = 0  # entries without a gradient within a touched row
-            param.grad = torch.sparse_coo_tensor(rows[None], values, param.shape)
+            param.grad = None
+            param.add_grad(rows, values)
             optimizer.step()
         return param.data, optimizer.state[param]["moments"].float()
 

@@ -9,6 +9,9 @@ import torch
 from compiled import both, compiled, normal  # noqa: F401
 from torch.nn import Parameter
 
+from mmpi_ns.ops.adam import AdamConstants, adam_rows
+from mmpi_ns.ops.interpolate import Table
+from mmpi_ns.scene.texels import BRICK
 from mmpi_ns.training.touched_adam import TouchedAdam, TouchedAdamConfig
 
 SETTINGS = {"lr": 0.1, "betas": (0.9, 0.99), "eps": 1e-8}
@@ -18,53 +21,51 @@ def table(rows=8, channels=3, dtype=torch.float64):
     return torch.randn(rows, channels, generator=torch.Generator().manual_seed(0), dtype=torch.float64).to(dtype)
 
 
+def parameter(layout, dtype=torch.float64):
+    """The same numbers as an ordinary parameter, or as a table whose rows come after the empty brick."""
+    values = table(dtype=dtype)
+    return Parameter(values) if layout == "dense" else Table(torch.cat([torch.zeros(BRICK, 3, dtype=dtype), values]))
+
+
 def gradients(shape, steps=6, dtype=torch.float64):
     g = torch.Generator().manual_seed(1)
     return [torch.randn(shape, generator=g, dtype=torch.float64).to(dtype) for _ in range(steps)]
 
 
-def sparse(rows, values, shape):
-    return torch.sparse_coo_tensor(torch.tensor(rows)[None], values, shape)
+def give(param, values, rows=range(8), parts=(1.0,)):
+    """Sets the gradient of some rows; a table's comes in parts, which are added."""
+    param.grad = None
+    if not isinstance(param, Table):
+        param.grad = torch.zeros_like(param)
+        param.grad[list(rows)] = values
+        return
+    for part in parts:
+        param.add_grad(BRICK + torch.tensor(list(rows)), part * values)
 
 
-def with_duplicates(dense):
-    """The same gradient as sparse rows in a shuffled order, each row split in two parts."""
-    rows = torch.randperm(dense.shape[0], generator=torch.Generator().manual_seed(2))
-    return sparse(
-        torch.cat([rows, rows.flip(0)]).tolist(),
-        torch.cat([0.25 * dense[rows], 0.75 * dense[rows.flip(0)]]),
-        dense.shape,
-    )
-
-
-def run(param, grads, optimizer):
+def run(param, grads, optimizer, parts=(1.0,)):
     for grad in grads:
-        param.grad = grad
+        give(param, grad, range(len(grad)), parts)
         optimizer.step()
     return param
 
 
 @pytest.mark.parametrize(
-    ("layout", "dtype", "error"),
+    ("layout", "parts", "dtype", "error"),
     [
-        ("dense", torch.float32, 2e-6),
-        *((layout, torch.float64, 1e-14) for layout in ("dense", "sparse", "duplicates")),
-        *((layout, torch.float32, 5e-3) for layout in ("sparse", "duplicates")),  # moments in bfloat16: 2^-9 a step
+        ("dense", (1.0,), torch.float32, 2e-6),
+        ("dense", (1.0,), torch.float64, 1e-14),
+        *(("rows", parts, torch.float64, 1e-14) for parts in ((1.0,), (0.25, 0.75))),
+        *(("rows", parts, torch.float32, 5e-3) for parts in ((1.0,), (0.25, 0.75))),  # bfloat16: 2^-9 a step
     ],
 )
-def test_everything_touched_equals_torchs_adam(layout, dtype, error):
-    grads = gradients((8, 3), dtype=dtype)
-    wanted = Parameter(table(dtype=dtype))
-    run(wanted, grads, torch.optim.Adam([wanted], **SETTINGS))
-    form = {
-        "dense": lambda g: g.clone(),
-        "sparse": lambda g: sparse(range(8), g, g.shape),
-        "duplicates": with_duplicates,
-    }[layout]
-    param = Parameter(table(dtype=dtype))
-    run(param, [form(g) for g in grads], TouchedAdam([param], **SETTINGS))
-    assert torch.allclose(param, wanted, rtol=error, atol=error)
-    assert not torch.equal(param, table(dtype=dtype))
+def test_everything_touched_equals_torchs_adam(layout, parts, dtype, error):
+    grads, plain = gradients((8, 3), dtype=dtype), Parameter(table(dtype=dtype))
+    run(plain, grads, torch.optim.Adam([plain], **SETTINGS))
+    param = parameter(layout, dtype)
+    run(param, grads, TouchedAdam([param], **SETTINGS), parts)
+    assert torch.allclose(param[-8:], plain, rtol=error, atol=error)
+    assert not torch.equal(param[-8:], table(dtype=dtype))
 
 
 def test_first_step_moves_every_touched_entry_by_the_learning_rate():
@@ -74,66 +75,64 @@ def test_first_step_moves_every_touched_entry_by_the_learning_rate():
     assert torch.allclose(param, torch.tensor([[-0.1, 0.1], [0.0, -0.1]], dtype=torch.float64), atol=2e-6)
 
 
-@pytest.mark.parametrize("layout", ["dense", "sparse"])
+@pytest.mark.parametrize("layout", ["dense", "rows"])
 def test_untouched_rows_keep_every_bit_and_their_moments(layout):
-    param = Parameter(table())
+    param = parameter(layout)
     optimizer = TouchedAdam([param], **SETTINGS)
     run(param, gradients((8, 3), 3), optimizer)  # give all rows moments
-    before = param.detach().clone(), copy.deepcopy(optimizer.state[param])
-    touched, rest = [1, 6], [0, 2, 3, 4, 5, 7]
+    before = param.detach().clone(), optimizer.state[param]["moments"].clone()
+    touched, first = [1, 6], len(param) - 8
     for grad in gradients((2, 3), 4):
-        if layout == "sparse":
-            param.grad = sparse(touched, grad, param.shape)
-        else:
-            param.grad = torch.zeros_like(param)
-            param.grad[touched] = grad
+        give(param, grad, touched)
         optimizer.step()
-    state = optimizer.state[param]
-    assert torch.equal(param[rest], before[0][rest]) and (param[touched] != before[0][touched]).all()
-    assert torch.equal(state["moments"][rest], before[1]["moments"][rest])
-    assert (state["moments"][touched] != before[1]["moments"][touched]).all()
+    rest = [i for i in range(len(param)) if i - first not in touched]
+    changed, moments = [first + i for i in touched], optimizer.state[param]["moments"]
+    assert torch.equal(param[rest], before[0][rest]) and (param[changed] != before[0][changed]).all()
+    assert torch.equal(moments[rest], before[1][rest]) and (moments[changed] != before[1][changed]).all()
 
 
-@pytest.mark.parametrize("layout", ["dense", "sparse"])
+@pytest.mark.parametrize("layout", ["dense", "rows"])
 def test_entries_with_zero_gradient_are_skipped_within_a_touched_row(layout):
-    param = Parameter(table())
+    param = parameter(layout)
     optimizer = TouchedAdam([param], **SETTINGS)
     run(param, gradients((8, 3), 2), optimizer)
-    before, moments = param.detach().clone(), copy.deepcopy(optimizer.state[param])
-    grad = torch.zeros(8, 3, dtype=torch.float64)
-    grad[4, 1] = 2.0
-    param.grad = grad if layout == "dense" else sparse([4], grad[4:5], grad.shape)
+    before, moments, row = param.detach().clone(), optimizer.state[param]["moments"].clone(), len(param) - 4
+    give(param, torch.tensor([[0.0, 2.0, 0.0]]).double(), [4])
     optimizer.step()
-    changed = (param != before).nonzero().tolist()
-    assert changed == [[4, 1]]
-    changed = (optimizer.state[param]["moments"] != moments["moments"]).nonzero().tolist()
-    assert changed == [[4, 0, 1], [4, 1, 1]], "mean and variance"
+    assert (param != before).nonzero().tolist() == [[row, 1]]
+    changed = (optimizer.state[param]["moments"] != moments).nonzero().tolist()
+    assert changed == [[row, 0, 1], [row, 1, 1]], "mean and variance"
 
 
-def test_duplicates_that_cancel_touch_nothing():
-    param = Parameter(table())
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_empty_brick_is_left_alone(dtype):
+    param = parameter("rows", dtype)
+    param.add_grad(torch.tensor([0, 63, 64]), torch.ones(3, 3, dtype=dtype))
+    optimizer = TouchedAdam([param], **SETTINGS)
+    optimizer.step()
+    moved = (param != parameter("rows", dtype)).any(1).nonzero()[:, 0]
+    assert moved.tolist() == [64] == optimizer.state[param]["moments"].any(-1).any(-1).nonzero()[:, 0].tolist()
+
+
+def test_parts_that_cancel_touch_nothing():
+    param = parameter("rows")
     optimizer = TouchedAdam([param], **SETTINGS)
     run(param, gradients((8, 3), 2), optimizer)
     before = param.detach().clone()
-    ones = torch.ones(1, 3, dtype=torch.float64)
-    param.grad = sparse([5, 5], torch.cat([ones, -ones]), param.shape)
+    give(param, torch.ones(1, 3).double(), [5], parts=(1.0, -1.0))
     optimizer.step()
     assert torch.equal(param, before)
 
 
-def test_sparse_and_dense_gradients_of_the_same_batch_give_the_same_step():
-    grads = gradients((8, 3), 5)
-    for grad in grads:
-        grad[torch.rand(8, generator=torch.Generator().manual_seed(3)) < 0.5] = 0
-    dense, rows = Parameter(table()), Parameter(table())
-    run(dense, [g.clone() for g in grads], TouchedAdam([dense], **SETTINGS))
-    kept = [g.abs().sum(-1).nonzero()[:, 0] for g in grads]
-    run(
-        rows,
-        [sparse(k.tolist(), g[k], g.shape) for k, g in zip(kept, grads, strict=True)],
-        TouchedAdam([rows], **SETTINGS),
-    )
-    assert torch.allclose(dense, rows, rtol=1e-14) and not torch.equal(dense, table())
+def test_rows_and_a_dense_gradient_of_the_same_batch_give_the_same_step():
+    dense, rows = parameter("dense"), parameter("rows")
+    optimizers = [TouchedAdam([p], **SETTINGS) for p in (dense, rows)]
+    for grad in gradients((8, 3), 5):
+        kept = (torch.rand(8, generator=torch.Generator().manual_seed(3)) < 0.5).nonzero()[:, 0].tolist()
+        for param, optimizer in zip((dense, rows), optimizers, strict=True):
+            give(param, grad[kept], kept)
+            optimizer.step()
+    assert torch.allclose(dense, rows[-8:], rtol=1e-14) and not torch.equal(dense, table())
 
 
 def test_bias_correction_follows_the_count_of_steps_not_of_touches():
@@ -156,22 +155,22 @@ def test_parameters_without_gradient_stay_bit_identical():
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("layout", ["dense", "sparse"])
+@pytest.mark.parametrize("layout", ["dense", "rows"])
 def test_resumed_run_equals_an_uninterrupted_one(layout, dtype, tmp_path):
-    grads = [g if layout == "dense" else sparse([0, 3, 4], g[:3], g.shape) for g in gradients((8, 3), 6, dtype)]
-    whole = Parameter(table(dtype=dtype))
-    run(whole, [g.clone() for g in grads], TouchedAdam([whole], **SETTINGS))
-    first = Parameter(table(dtype=dtype))
+    grads = gradients((3, 3), 6, dtype)
+    whole = parameter(layout, dtype)
+    run(whole, grads, TouchedAdam([whole], **SETTINGS))
+    first = parameter(layout, dtype)
     optimizer = TouchedAdam([first], **SETTINGS)
-    run(first, [g.clone() for g in grads[:3]], optimizer)
-    in_short = layout == "sparse" and dtype == torch.float32
+    run(first, grads[:3], optimizer)
+    in_short = layout == "rows" and dtype == torch.float32
     assert optimizer.state[first]["moments"].dtype == (torch.bfloat16 if in_short else dtype)
     torch.save({"optimizer": optimizer.state_dict(), "param": first.data}, tmp_path / "c.pt")
     saved = torch.load(tmp_path / "c.pt", weights_only=True)
-    second = Parameter(saved["param"])
+    second = type(first)(saved["param"])
     resumed = TouchedAdam([second], lr=123.0)
     resumed.load_state_dict(saved["optimizer"])
-    run(second, [g.clone() for g in grads[3:]], resumed)
+    run(second, grads[3:], resumed)
     assert torch.equal(second, whole)
 
 
@@ -218,15 +217,13 @@ def test_config_builds_the_optimizer_with_its_settings():
 @pytest.mark.parametrize("channels", [8, 9])
 def test_adam_on_rows_equals_the_plain_one_to_the_last_bits(channels):
     def work():
-        param = torch.nn.Parameter(normal(500, channels))
+        param = Table(normal(500, channels))
         optimizer = TouchedAdam([param], lr=0.1)
         for step in range(6):
-            rows = torch.randint(0, 500, (300,), generator=torch.Generator().manual_seed(step))
             values = normal(300, channels, seed=step)
             values[:, step] = 0  # entries without a gradient within a touched row
-            param.grad = torch.sparse_coo_tensor(rows[None], values, param.shape)
-            if step % 2:
-                param.grad = param.grad.coalesce()
+            param.grad = None
+            param.add_grad(chosen_rows(500, 300, step), values)
             optimizer.step()
         return param.data, optimizer.state[param]["moments"].float()
 
@@ -235,3 +232,15 @@ def test_adam_on_rows_equals_the_plain_one_to_the_last_bits(channels):
     for a, b in zip(fast, plain, strict=True):  # here and there a moment falls on the other side of a half
         off = (a - b).abs()
         assert (off <= 4e-6 * (1 + b.abs())).float().mean() > 0.995 and (off <= 2**-7 * b.abs() + 1e-3).all()
+
+
+def chosen_rows(count, chosen, seed):
+    return torch.randperm(count, generator=torch.Generator().manual_seed(seed))[:chosen].sort().values
+
+
+@pytest.mark.parametrize("shapes", [((9, 2), (9, 2), (4,), (4, 2)), ((9, 2), (9, 2, 2), (4,), (5, 2)),
+                                    ((9, 2), (8, 2, 2), (4,), (4, 2)), ((9,), (9, 2), (4,), (4,))])  # fmt: skip
+def test_arrays_of_a_wrong_shape_are_refused(shapes):
+    param, moments, rows, grad = (torch.zeros(shape) for shape in shapes)
+    with pytest.raises(ValueError, match="has the shape"):
+        adam_rows(param, moments, rows.long(), grad, AdamConstants(0.9, 0.99, 1.0, 1e-8, 0.1))

@@ -11,7 +11,7 @@ from gather_batches import batch, in_float32, parts_of, with_gradients
 from random_fields import bundle, random_field, random_rays
 
 from mmpi_ns.field.samples import metadata_of, places_of
-from mmpi_ns.ops.gather import KnownTaps, gather_places, gather_taps, reference
+from mmpi_ns.ops.gather import Taps, gather_places, gather_taps, reference
 from mmpi_ns.rendering.sampler import MMPISampler
 
 CHANNELS = (3, 8, 9, 16, 20)
@@ -44,7 +44,7 @@ def test_sums_are_those_of_loops(function, channels, in_cube):
     samples = [
         list(zip(p.tolist(), s.tolist(), strict=True))
         for g in groups
-        for p, s in zip(g.positions, g.shares, strict=True)
+        for p, s in zip(g.positions, g.weights, strict=True)
     ]
     wanted_sums = sums_by_hand(values.numpy(), samples, slots.tolist(), weights.numpy(), wanted.tolist())
     found = function(*in_float32(given))
@@ -73,14 +73,14 @@ def test_reference_gradients_are_finite_differences():
     values, groups, slots, weights, wanted = batch(5)
 
     def sums(values, weights, *shares):
-        taps = [KnownTaps(g.positions, s) for g, s in zip(groups, shares or [g.shares for g in groups], strict=True)]
+        taps = [Taps(g.positions, s) for g, s in zip(groups, shares or [g.weights for g in groups], strict=True)]
         return reference.gather_taps(values, taps, slots, weights, wanted).gathered
 
     def moments(values):
         found = reference.gather_taps(values, groups, slots, weights, wanted)
         return found.first, found.second
 
-    shares = [g.shares.clone().requires_grad_() for g in groups]
+    shares = [g.weights.clone().requires_grad_() for g in groups]
     assert torch.autograd.gradcheck(sums, (values.requires_grad_(), weights.clone().requires_grad_(), *shares))
     assert torch.autograd.gradcheck(moments, (values,))
 
@@ -126,7 +126,7 @@ def test_at_places_sums_are_those_at_their_taps(with_cube):
     weights = torch.rand(lookup.shape, generator=torch.Generator().manual_seed(0))
     places = places_of(samples)
     table, everything = field.features.data, torch.ones(60, dtype=torch.bool)
-    taps = [KnownTaps(t.rows, t.weights.double()) for t in lookup.groups]
+    taps = [Taps(lookup.rows[t.positions], t.weights.double()) for t in lookup.taps]
     exact = reference.gather_taps(table.double(), taps, lookup.index, weights.double(), everything)
     found = gather_places(field.layout, table, places, weights)
     for a, b in zip(parts_of(found), parts_of(exact), strict=True):
@@ -147,7 +147,7 @@ def test_no_samples_gather_nothing(form):
 @pytest.mark.parametrize("form", [gather_taps, reference.gather_taps])
 def test_saturated_texels_are_colours_and_features_of_0_and_1_with_finite_gradients(form):
     values = torch.tensor([[200.0, -200.0, 30.0, 200.0, -200.0]], requires_grad=True)
-    taps = [KnownTaps(torch.zeros(1, 4, dtype=torch.int64), torch.full((1, 4), 0.25))]
+    taps = [Taps(torch.zeros(1, 4, dtype=torch.int64), torch.full((1, 4), 0.25))]
     weights = torch.ones(1, 1, requires_grad=True)
     sums = form(values, taps, torch.zeros(1, dtype=torch.int64), weights, torch.ones(1, dtype=torch.bool))
     assert sums.gathered.tolist() == [pytest.approx([1, 0, 1, 1, -1], abs=1e-12)]

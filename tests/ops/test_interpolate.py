@@ -1,19 +1,23 @@
-"""Weighted sums of table rows: the fast path equals the plain one, and its gradient is sparse (ops/interpolate.py)."""
+"""Weighted sums of table rows: the fast path equals the plain one, and rows that were read have a gradient
+(ops/interpolate)."""
 
 from __future__ import annotations
 
 import pytest
 import torch
+from bricked import bricked_field
 from compiled import both, compiled, normal  # noqa: F401
 
 from mmpi_ns.ops.interpolate import (
-    gather_rows,
+    Table,
     index_rows,
     interpolate,
-    interpolate_gathered,
     raise_peaks,
+    read_rows,
     reference,
     sum_rows,
+    texel_rows,
+    weigh_rows,
 )
 
 F64 = torch.float64
@@ -28,18 +32,6 @@ def lookup(samples=50, corners=4, rows=30, channels=5, dtype=F64, seed=0):
     )
 
 
-class DenseGradient(torch.autograd.Function):
-    """The identity; gradcheck wants a dense gradient, so what comes back sparse is written out."""
-
-    @staticmethod
-    def forward(ctx, table):
-        return table.view_as(table)
-
-    @staticmethod
-    def backward(ctx, grad):
-        return grad.to_dense()
-
-
 def test_interpolation_by_hand():
     table = torch.tensor([[1.0, 10.0], [2.0, 20.0], [4.0, 40.0]])
     rows, weights = torch.tensor([[0, 2], [1, 1]]), torch.tensor([[0.25, 0.75], [0.5, 0.5]])
@@ -51,57 +43,67 @@ def test_interpolation_by_hand():
 @pytest.mark.parametrize("corners", [1, 4, 8])
 @pytest.mark.parametrize(("dtype", "error"), [(torch.float32, 2e-6), (F64, 1e-14)])
 def test_fast_path_equals_the_reference_with_its_gradient(channels, corners, dtype, error):
-    table, rows, weights = lookup(channels=channels, corners=corners, dtype=dtype)
-    fast, plain = table.clone().requires_grad_(), table.clone().requires_grad_()
-    out, wanted = interpolate(fast, rows, weights), reference.interpolate(plain, rows, weights)
-    assert out.shape == (50, channels) and torch.allclose(out, wanted, atol=error, rtol=error)
+    values, rows, weights = lookup(channels=channels, corners=corners, dtype=dtype)
+    table, plain = Table(values.clone()), values.clone().requires_grad_()
+    out, exact = interpolate(table, rows, weights), reference.interpolate(plain, rows, weights)
+    assert out.shape == (50, channels) and torch.allclose(out, exact, atol=error, rtol=error)
     upstream = torch.randn(50, channels, generator=torch.Generator().manual_seed(1), dtype=F64).to(dtype)
     out.backward(upstream)
-    wanted.backward(upstream)
-    assert fast.grad.is_sparse and not plain.grad.is_sparse
-    assert torch.allclose(fast.grad.to_dense(), plain.grad, atol=10 * error, rtol=10 * error)
+    exact.backward(upstream)
+    assert torch.equal(table.grad_rows, rows.unique()) and table.grad.shape == (len(rows.unique()), channels)
+    assert torch.allclose(table.dense_grad(), plain.grad, atol=10 * error, rtol=10 * error)
 
 
-def test_sparse_gradient_is_that_of_finite_differences():
-    table, rows, weights = lookup(samples=6, rows=7, channels=2)
-
-    def read(t):
-        return interpolate(DenseGradient.apply(t), rows, weights)
-
-    assert torch.autograd.gradcheck(read, (table.requires_grad_(),))
-
-
-def test_gradient_names_only_the_rows_that_were_read():
-    table, rows, weights = lookup(samples=3, rows=1000)
-    table.requires_grad_()
-    interpolate(table, rows, weights).sum().backward()
-    assert table.grad._nnz() <= rows.numel()
-    assert set(table.grad.coalesce().indices()[0].tolist()) == set(rows.reshape(-1).tolist())
+def test_gradients_of_rows_and_weights_are_finite_differences():
+    values, rows, weights = lookup(samples=6, rows=7, channels=2)
+    inputs = (values.requires_grad_(), weights.requires_grad_())
+    assert torch.autograd.gradcheck(lambda v, w: weigh_rows(v, rows, w).sin(), inputs)
 
 
 def test_two_lookups_in_one_table_add_their_gradients():
-    table, rows, weights = lookup()
-    fast, plain = table.clone().requires_grad_(), table.clone().requires_grad_()
-    for t, function in ((fast, interpolate), (plain, reference.interpolate)):
-        (function(t, rows, weights).sum() + 2 * (function(t, rows.flip(0), weights) ** 2).sum()).backward()
-    assert fast.grad.is_sparse and torch.allclose(fast.grad.to_dense(), plain.grad)
+    values, rows, weights = lookup()
+    table, plain = Table(values.clone()), values.clone().requires_grad_()
+    for t, function in ((table, interpolate), (plain, reference.interpolate)):
+        (function(t, rows[:9], weights[:9]).sum() + 2 * (function(t, rows[5:20], weights[5:20]) ** 2).sum()).backward()
+    assert torch.equal(table.grad_rows, rows[:20].unique()) and torch.allclose(table.dense_grad(), plain.grad)
+
+
+def test_a_dropped_gradient_is_gone_and_its_rows_with_it():
+    values, rows, weights = lookup()
+    table = Table(values)
+    for part in (slice(0, 9), slice(5, 7)):
+        table.grad = None
+        interpolate(table, rows[part], weights[part]).sum().backward()
+    assert torch.equal(table.grad_rows, rows[5:7].unique())
+    table.grad = None
+    assert table.grad is None and table.grad_rows is None and table.dense_grad() is None
+
+
+def test_hosts_scale_clip_and_drop_the_gradient_as_they_do_any():
+    values, rows, weights = lookup(dtype=torch.float32)
+    table = Table(values)
+    interpolate(table, rows, weights).sum().backward()
+    before = table.dense_grad()
+    torch.nn.utils.clip_grad_norm_([table], 0.5)
+    assert table.grad.norm() == pytest.approx(0.5, rel=1e-4)
+    assert torch.allclose(table.dense_grad(), before * 0.5 / before.norm(), rtol=1e-4)
+    torch.optim.SGD([table], lr=1.0).zero_grad()
+    assert table.grad is None
+
+
+def test_what_reads_a_table_in_another_way_is_told():
+    table = Table(torch.ones(3, 2))
+    table[1].sum().backward()
+    with pytest.raises(AssertionError, match="read_rows"):
+        table.grad  # noqa: B018
 
 
 def test_no_samples_give_no_values_and_no_gradient():
-    table = torch.randn(5, 3, requires_grad=True)
+    table = Table(torch.randn(5, 3))
     out = interpolate(table, torch.zeros(0, 4, dtype=torch.int64), torch.zeros(0, 4))
     assert out.shape == (0, 3) and out.dtype == table.dtype
     out.sum().backward()
-    assert table.grad is None or table.grad.to_dense().abs().sum() == 0
-
-
-def test_lookup_without_samples_leaves_the_gradient_of_others_sparse():
-    """A head that covers no sample of a batch must not make the optimiser visit the whole table."""
-    table, rows, weights = lookup()
-    table.requires_grad_()
-    empty = interpolate(table, rows[:0], weights[:0])
-    (interpolate(table, rows[:2], weights[:2]).sum() + empty.sum()).backward()
-    assert table.grad.is_sparse and set(table.grad.coalesce().indices()[0].tolist()) == set(rows[:2].view(-1).tolist())
+    assert table.grad is None or not table.grad.numel()
 
 
 def test_weights_of_another_precision_are_taken():
@@ -109,16 +111,30 @@ def test_weights_of_another_precision_are_taken():
     assert torch.equal(interpolate(table, rows, weights.double()), interpolate(table, rows, weights))
 
 
-@pytest.mark.parametrize("gathered", [False, True])
 @pytest.mark.parametrize("trains", [False, True])
-def test_gradients_of_weights_are_finite_differences(gathered, trains):
-    """Also where the table is frozen, which then gets none."""
-    table, rows, weights = lookup()
-    table.requires_grad_(trains)
-    look = interpolate_gathered if gathered else interpolate
-    assert torch.autograd.gradcheck(lambda w: look(table.detach(), rows, w).sin(), (weights.requires_grad_(),))
-    look(table, rows, weights).sum().backward()
-    assert torch.equal(weights.grad, table.detach()[rows].sum(-1)) and (table.grad is not None) == trains
+def test_weights_have_gradients_also_where_the_table_is_frozen(trains):
+    values, rows, weights = lookup()
+    table = Table(values, requires_grad=trains)
+    interpolate(table, rows, weights.requires_grad_()).sum().backward()
+    assert torch.equal(weights.grad, values[rows].sum(-1)) and (table.grad is not None) == trains
+
+
+@pytest.mark.parametrize(
+    "work",
+    [
+        lambda: weigh_rows(torch.zeros(9, 2), torch.zeros(5, 4).long(), torch.zeros(5, 3)),
+        lambda: weigh_rows(torch.zeros(9), torch.zeros(5, 4).long(), torch.zeros(5, 4)),
+        lambda: sum_rows(torch.zeros(5, 4).int(), torch.zeros(6, 2), torch.zeros(5, 4), 9),
+        lambda: sum_rows(torch.zeros(5).int(), torch.zeros(5, 2), torch.zeros(5), 9),
+        lambda: raise_peaks(torch.zeros(3), torch.zeros(9).long(), torch.zeros(5, 4).int(), torch.zeros(4)),
+        lambda: texel_rows(None, torch.zeros(5).long(), torch.zeros(4).long(), torch.zeros(5, 3)),
+        lambda: texel_rows(None, torch.zeros(5).long(), torch.zeros(5).long(), torch.zeros(5, 2)),
+        lambda: read_rows(Table(torch.zeros(9, 2)), torch.zeros(5, 1).long()),
+    ],
+)
+def test_arrays_of_a_wrong_shape_are_refused(work):
+    with pytest.raises(ValueError, match="has the shape"):
+        work()
 
 
 # Rows ----------------------------------------------------------------------------------------------------------------
@@ -133,26 +149,25 @@ def test_distinct_rows_are_those_of_the_reference(count, spread):
     rows = {"side by side": chosen, "4096 apart": chosen * 4096, "anywhere": anywhere[chosen]}[spread]
     fast, plain = both(lambda: index_rows(rows, 2**27))
     assert torch.equal(fast.unique, plain.unique)
-    assert fast.position.shape == rows.shape and torch.equal(fast.unique[fast.position.long()], rows)
+    assert fast.positions.shape == rows.shape and torch.equal(fast.unique[fast.positions.long()], rows)
 
 
 def test_rows_of_a_table_too_large_to_mark_are_sorted():
     rows = torch.tensor([2**40, 3, 2**40, 2**31])
     index = index_rows(rows, 2**40 + 1)
     assert torch.equal(index.unique, torch.tensor([3, 2**31, 2**40]))
-    assert torch.equal(index.unique[index.position.long()], rows)
+    assert torch.equal(index.unique[index.positions.long()], rows)
 
 
-@pytest.mark.parametrize("weighted", [True, False])
 @pytest.mark.parametrize("channels", [1, 9])
-def test_rows_gather_what_their_entries_give(channels, weighted):
-    rows = torch.randint(0, 40, (300, 4 if weighted else 1), generator=torch.Generator().manual_seed(1))
-    values, weights = normal(300, channels), torch.rand(300, 4) if weighted else None
+def test_rows_gather_what_their_entries_give(channels):
+    rows = torch.randint(0, 40, (300, 4), generator=torch.Generator().manual_seed(1))
+    values, weights = normal(300, channels), torch.rand(300, 4)
 
     def work():
         index = index_rows(rows, 2**27)
         return torch.zeros(40, channels).index_copy_(
-            0, index.unique, sum_rows(index.position, values, weights, len(index.unique))
+            0, index.unique, sum_rows(index.positions, values, weights, len(index.unique))
         )
 
     fast, plain = both(work)
@@ -164,16 +179,16 @@ def test_gathered_rows_are_read_like_the_table_and_have_one_gradient_each(channe
     rows, weights = torch.randint(0, 50, (80, 4), generator=torch.Generator().manual_seed(1)), torch.rand(80, 4)
     index = index_rows(rows, 2**27)
     some, upstream = torch.arange(0, 80, 3), normal(80, channels, seed=2)
-    table, plain = (normal(50, channels).requires_grad_() for _ in range(2))
-    gathered = gather_rows(table, index.unique)
-    read = interpolate_gathered(gathered, index.position, weights)
-    part = interpolate_gathered(gathered, index.position[some], weights[some])
+    table, plain = Table(normal(50, channels)), normal(50, channels).requires_grad_()
+    values = read_rows(table, index.unique)
+    read = weigh_rows(values, index.positions, weights)
+    part = weigh_rows(values, index.positions[some], weights[some])
     wanted = reference.interpolate(plain, rows, weights)
     assert torch.allclose(read, wanted, atol=1e-6) and torch.allclose(part, wanted[some], atol=1e-6)
     ((read * upstream).sum() + 2 * part.sum()).backward()
     ((wanted * upstream).sum() + 2 * wanted[some].sum()).backward()
-    assert torch.equal(table.grad._indices()[0], index.unique)
-    assert torch.allclose(table.grad.to_dense(), plain.grad, atol=1e-5)
+    assert torch.equal(table.grad_rows, index.unique)
+    assert torch.allclose(table.dense_grad(), plain.grad, atol=1e-5)
 
 
 @pytest.mark.parametrize("taps", [4, 8])
@@ -186,8 +201,30 @@ def test_a_bricks_peak_is_the_largest_weight_of_what_reads_it(taps):
             wanted[brick] = max(wanted[brick], weight)
 
     def raised():
-        found = peaks.clone()
-        raise_peaks(found, rows, weights)
-        return found
+        raised, index = peaks.clone(), index_rows(rows, 64 * 40)
+        raise_peaks(raised, index.unique, index.positions, weights)
+        return raised
 
     assert all(torch.equal(found, wanted) for found in both(raised)) and not torch.equal(peaks, wanted)
+
+
+@pytest.mark.parametrize("threads", [2, 3, 7])
+def test_bits_of_all_operations_on_rows_do_not_depend_on_threads(threads):
+    rows = torch.randint(0, 2**20, (20_000,), generator=torch.Generator().manual_seed(1))[:, None] * 8 + torch.arange(4)
+    values, weights, layout = normal(20_000, 9), normal(20_000, 4, seed=2).abs(), bricked_field().layout
+    heads = torch.arange(20_000) % len(layout.mpis)
+    ndc = normal(20_000, 3, seed=3).clamp(-1, 1)
+
+    def work():
+        index = index_rows(rows, 2**23 + 4)
+        sums = sum_rows(index.positions, values, weights, len(index.unique))
+        raise_peaks(peaks := torch.zeros(2**17 + 1), index.unique, index.positions, weights[:, 0])
+        return index.unique, index.positions, sums, peaks, *texel_rows(layout, heads, heads, ndc)
+
+    before, one = torch.get_num_threads(), work()
+    try:
+        torch.set_num_threads(threads)
+        assert all(torch.equal(a, b) for a, b in zip(work(), one, strict=True))
+    finally:
+        torch.set_num_threads(before)
+    assert one[2].abs().max() > 1 and one[3].any()

@@ -73,6 +73,6 @@ def test_colours_say_where_a_feature_is_not_a_number():
     field, samples = shaded()
     before = colors(field, samples).isnan().any(-1)
     read = field._lookup(samples)
-    field.features.data[read.groups[0].rows[3, 0], 5] = math.nan
+    field.features.data[read.rows[read.taps[0].positions[3, 0]], 5] = math.nan
     found = colors(field, samples).isnan().any(-1)
     assert not before.any() and found.reshape(-1)[read.index[3]] and not found.all()

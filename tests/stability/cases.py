@@ -91,7 +91,7 @@ class Case:
 
 def as_array(values: Tensor | Array) -> Array:
     if isinstance(values, Tensor):
-        return values.detach().to_dense().double().cpu().numpy()
+        return values.detach().double().cpu().numpy()
     return np.asarray(values, np.float64)
 
 

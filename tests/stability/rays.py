@@ -32,6 +32,7 @@ from stability.exact_ray import TABLES, ExactField, ExactRay, Gradients
 
 from mmpi_ns.bench.rendering import bundle_of, of_slots, render
 from mmpi_ns.field.mmpi_field import MMPIField
+from mmpi_ns.ops.interpolate import Table
 from mmpi_ns.rendering.rendered import RenderedRays
 from mmpi_ns.scene.plan import CubePlan, MPIPlan, ScenePlan
 
@@ -172,8 +173,8 @@ def gradients_of(field: MMPIField, found: RenderedRays, by: Array) -> dict[str, 
     tables = {name: field.networks.weights if name == "networks" else getattr(field, name) for name in TABLES}
     field.zero_grad()
     found.colors.rgb.backward(float32(by).to(field.density.device))
-    made = {name: as_array(table.grad) for name, table in tables.items() if table.grad is not None}
-    return {name: x if name == "networks" else x[texels.numpy()] for name, x in made.items()}
+    read = {name: table for name, table in tables.items() if table.grad is not None}
+    return {n: as_array(t.dense_grad()[texels] if isinstance(t, Table) else t.grad) for n, t in read.items()}
 
 
 def measure(make: Callable[[], Scene], precision: Precision) -> Outcome:

@@ -117,12 +117,6 @@ def test_options_that_say_nothing_together_are_refused(whole_scene, tmp_path, ch
     assert all(word in said for word in words), said
 
 
-def test_clipping_is_refused_on_the_command_line(whole_scene, tmp_path):
-    words = ("--optimizers.density.optimizer.max-norm", "1.0", "--machine.device-type", "cpu")
-    ended = run("ns-train", "mmpi-small", "--data", whole_scene, "--output-dir", tmp_path, *words)
-    assert "--optimizers.density.optimizer.max-norm" in ended.sentence
-
-
 @pytest.mark.parametrize(
     ("name", "value"), [("--placement.texel-pixels", "nan"), ("--placement.max-mpis", "0"), ("--training-rays", "-1")]
 )

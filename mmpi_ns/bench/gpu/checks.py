@@ -113,11 +113,16 @@ def interpolation(device: str, samples: int) -> list[Check]:
     weights, upstream = torch.rand(samples, 4, generator=g).to(device), _draw(device, samples, 9, seed=2)
 
     def work(dtype: torch.dtype) -> tuple[Tensor, ...]:
-        table = _draw(device, texels, 9).to(dtype).requires_grad_()
-        read = (interpolate if dtype == torch.float32 else plain).interpolate(table, rows, weights.to(dtype))
-        (read * upstream).sum().backward()
-        assert table.grad is not None
-        return read, table.grad.to_dense()
+        table = interpolate.Table(_draw(device, texels, 9).to(dtype))
+        if dtype == torch.float32:
+            read = interpolate.interpolate(table, rows, weights)
+            (read * upstream).sum().backward()
+            gradient = table.dense_grad()
+        else:
+            read = plain.interpolate(values := table.data.requires_grad_(), rows, weights.to(dtype))
+            (gradient,) = torch.autograd.grad((read * upstream).sum(), values)
+        assert gradient is not None
+        return read, gradient
 
     return _twice({"interpolation": 1e-6, "interpolation: row gradients": 5e-6}, work)
 
@@ -130,11 +135,11 @@ def distinct_rows(device: str, samples: int) -> list[Check]:
     rows = pool[torch.randint(0, len(pool), (samples, 4), generator=g)].to(device)
     index, wanted = interpolate.index_rows(rows, texels), rows.unique()
     wrong = int(len(index.unique) != len(wanted)) or int((index.unique != wanted).sum())
-    wrong += int((index.unique[index.position.long()] != rows).sum())
+    wrong += int((index.unique[index.positions.long()] != rows).sum())
     values, weights = _draw(device, samples, 9), torch.rand(samples, 4, generator=g).to(device)
 
     def work(dtype: torch.dtype) -> tuple[Tensor, ...]:
-        return (interpolate.sum_rows(index.position, values.to(dtype), weights.to(dtype), len(wanted)),)
+        return (interpolate.sum_rows(index.positions, values.to(dtype), weights.to(dtype), len(wanted)),)
 
     return [Check("distinct rows: wrong", wrong, 0), *_twice({"distinct rows: sums": 5e-6}, work)]
 
@@ -178,14 +183,14 @@ def adam(device: str, rows: int) -> list[Check]:
     """Four steps on touched rows, with moments in bfloat16 too, whose roundings these four steps keep small."""
 
     def work(dtype: torch.dtype) -> tuple[Tensor, ...]:
-        param = torch.nn.Parameter(_draw(device, rows, 9).to(dtype))
-        optimizer = TouchedAdam([param], lr=0.1)
+        table = interpolate.Table(_draw(device, rows, 9).to(dtype))
+        optimizer = TouchedAdam([table], lr=0.1)
         for step in range(4):
-            chosen = torch.randint(0, rows, (rows // 2,), generator=torch.Generator().manual_seed(step)).to(device)
-            values = _draw(device, rows // 2, 9, seed=step).to(dtype)
-            param.grad = torch.sparse_coo_tensor(chosen[None], values, param.shape)
+            chosen = torch.randperm(rows, generator=torch.Generator().manual_seed(step))[: rows // 2].sort().values
+            table.grad = None
+            table.add_grad(chosen.to(device), _draw(device, rows // 2, 9, seed=step).to(dtype))
             optimizer.step()
-        return (param.data,)
+        return (table.data,)
 
     return _twice({"Adam on rows": 1e-2}, work)
 

@@ -77,8 +77,8 @@ def gradients_of(field: MMPIField, found: RenderedRays, by: Array) -> dict[str, 
     """Derivatives of the sum of ``by`` [R, 3] times the rays' colours, by every table."""
     field.zero_grad()
     found.colors.rgb.backward(torch.tensor(by).to(found.colors.rgb))
-    grads = {name: getattr(field, name).grad for name in TABLES}
-    return {n: (g.to_dense() if g.is_sparse else g).cpu() for n, g in grads.items() if g is not None}
+    grads = {name: getattr(field, name).dense_grad() for name in TABLES}
+    return {n: g.cpu() for n, g in grads.items() if g is not None}
 
 
 def random_scene(count: int, rays: int, blends: bool, seed: int = 0, cube: CubePlan | None = None) -> Scene:

@@ -15,10 +15,10 @@ from torch import Tensor
 from mmpi_ns.bench.methods import METHODS
 from mmpi_ns.bench.report import Report, Row, SceneBench, figure, page, slug, table, title
 from mmpi_ns.bench.trainers import Steps, median_s
-from mmpi_ns.field.samples import Gathered, Lookup, Taps, metadata_of
+from mmpi_ns.field.samples import Lookup, metadata_of
 from mmpi_ns.model import MMPIModel
 from mmpi_ns.ops.composite.reference import composite_weights
-from mmpi_ns.ops.interpolate import gather_rows, index_rows, interpolate_gathered, sum_rows
+from mmpi_ns.ops.interpolate import index_rows, read_rows, sum_rows, weigh_rows
 from mmpi_ns.ops.march.reference import merge
 from mmpi_ns.rendering.rendered import bounded
 
@@ -125,17 +125,16 @@ def operations(model: MMPIModel, steps: Steps) -> tuple[list[Op], dict[str, floa
 
     samples, report = sample()
     lookup = field._lookup(samples)
-    assert lookup.gathered is not None
     (num_rays, slots), live, kept = lookup.shape, float(report.live.sum()), float(len(lookup.index))
-    channels, rows, taps = field.feature_channels, float(len(lookup.gathered.rows)), lookup.groups[0]
+    channels, rows, taps = field.feature_channels, float(len(lookup.rows)), lookup.taps[0]
     counts = {"rays": num_rays, "live": live, "kept": kept, "rows": rows, "pixels": len(batch["image"])}
     kept_bytes = 2 * 4 + 3 * 4 + 3 * 4 + 1  # head and plane, position, distance and depths, whether valid
     ops = [
         Op("march: look up, merge, keep", sample, live * 4 * 4 + kept * kept_bytes),
         _sort(report.live, slots),
-        Op("index of rows", lambda: index_rows(taps.rows, len(field.density)), taps.rows.numel() * (8 + 4) + rows * 8),
+        _index(lookup.rows[taps.positions], len(field.density), rows),
     ]
-    ops += _interpolation(field, taps, lookup.gathered, channels)
+    ops += _interpolation(field, lookup, channels)
     ops += _shading(field, samples, lookup, report)
     ops.append(_variation(field, lookup, rows * (1 + channels) * 2 * 4))
     ops.append(_adam(steps, rows * (1 + channels) * 7 * 4))
@@ -152,16 +151,19 @@ def _sort(live: Tensor, slots: int) -> Op:
     return Op("merge by a sort", lambda: merge(places, keys, live, False), count * (8 + 4) + len(live) * width * 9)
 
 
-def _interpolation(field: Any, taps: Taps, gathered: Gathered, channels: int) -> list[Op]:
+def _index(rows: Tensor, table_rows: int, distinct: float) -> Op:
+    return Op("index of rows", lambda: index_rows(rows, table_rows), rows.numel() * (8 + 4) + distinct * 8)
+
+
+def _interpolation(field: Any, lookup: Lookup, channels: int) -> list[Op]:
     """Features of the kept samples from the distinct rows, and back."""
-    position, weights, rows = taps.position, taps.weights, gathered.rows
-    assert position is not None
-    table, known = len(rows) * channels * 4, gathered.features.detach()
+    position, weights, rows = lookup.taps[0].positions, lookup.taps[0].weights, lookup.rows
+    table, features = len(rows) * channels * 4, lookup.features.detach()
     moved = position.numel() * (position.element_size() + 4) + table + len(position) * channels * 4
     grad = torch.rand(len(position), channels, device=weights.device)
     return [
-        Op("gather rows", lambda: gather_rows(field.features.data, rows), len(rows) * 8 + 2 * table),
-        Op("interpolation", lambda: interpolate_gathered(known, position, weights), moved),
+        Op("gather rows", lambda: read_rows(field.features, rows), len(rows) * 8 + 2 * table),
+        Op("interpolation", lambda: weigh_rows(features, position, weights), moved),
         Op("interpolation, backward", lambda: sum_rows(position, grad, weights, len(rows)), moved),
     ]
 
@@ -170,10 +172,8 @@ def _shading(field: Any, samples: Any, lookup: Lookup, report: Any) -> list[Op]:
     """Weights of the samples, and what rays show by them: forwards, and back to texels and depths."""
     meta = metadata_of(samples)
     valid, skipped = meta["valid"][..., 0], meta["skipped_before"][..., 0]
-    tau, known = meta["tau"][..., 0].clone().requires_grad_(), lookup.gathered
-    assert known is not None
-    features = known.features.detach().requires_grad_()
-    lookup = replace(lookup, gathered=Gathered(known.rows, known.density.detach(), features))
+    tau, features = meta["tau"][..., 0].clone().requires_grad_(), lookup.features.detach().requires_grad_()
+    lookup = replace(lookup, density=lookup.density.detach(), features=features)
     fixed = composite_weights(tau.detach(), valid, skipped, report.skipped_total)
 
     def weigh() -> Tensor:
@@ -200,10 +200,8 @@ def _shading(field: Any, samples: Any, lookup: Lookup, report: Any) -> list[Op]:
 def _variation(field: Any, lookup: Lookup, moved: float) -> Op:
     def work() -> None:
         # The rows are gathered again each time: what a backward pass went through is gone.
-        assert lookup.gathered is not None
-        rows = lookup.gathered.rows
-        density, features = (gather_rows(t, rows) for t in (field.density, field.features))
-        fresh = replace(lookup, gathered=Gathered(rows, density, features))
+        density, features = (read_rows(t, lookup.rows) for t in (field.density, field.features))
+        fresh = replace(lookup, density=density, features=features)
         field.total_variation(fresh, 1e-5, 1e-6).backward()
         field.density.grad = field.features.grad = None
 
@@ -217,15 +215,10 @@ def _adam(steps: Steps, moved: float) -> Op:
     for optimizer in optimizers:
         optimizer.zero_grad()
     torch.stack([loss.reshape(()) for loss in losses.values()]).sum().backward()
-    grads = {p: p.grad for o in optimizers for group in o.param_groups for p in group["params"]}
 
     def work() -> None:
-        for p, grad in grads.items():
-            p.grad = grad
         for optimizer in optimizers:
             optimizer.step()
-        for p in grads:
-            p.grad = None  # other operations have gradients of their own
 
     return Op("Adam", work, moved)
 

@@ -8,6 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from mmpi_ns.ops import dispatch
+from mmpi_ns.ops.shapes import check_shapes
 
 
 class AdamConstants(NamedTuple):
@@ -29,13 +30,14 @@ def adam_rows(
     grad: Float[Tensor, "U C"],
     constants: AdamConstants,
 ) -> None:
-    """One step of Adam on distinct rows; entries whose gradient is exactly 0 are left alone.
+    """One step of Adam on distinct rows. The empty brick, and entries whose gradient is exactly 0, are left alone.
 
     Args:
         param: the table.
         moments: mean and uncentred variance of the gradients, in bfloat16 or in the table's precision.
-        rows: which rows, each once.
-        grad: their gradients.
+        rows: of the gradient (``Table.grad_rows``).
+        grad: of those rows.
         constants: of the step.
     """
+    check_shapes("param T C, moments T 2 C, rows U, grad U C", param, moments, rows, grad)
     dispatch.run("adam_rows", param, moments, rows, grad, constants)

@@ -1,4 +1,5 @@
 // Adam on the rows of a table that a batch touched. The reference is reference.py.
+#include "scene.h"
 #include "table.h"
 
 #include <cmath>
@@ -24,8 +25,8 @@ uint16_t narrow(float x) {
 
 extern "C" {
 
-// Adam on distinct rows; entries whose gradient is exactly 0 are left alone. `moments` [T, 2, channels], means and
-// uncentred variances, are in bfloat16.
+// Adam on distinct rows; the empty brick, and entries whose gradient is exactly 0, are left alone. `moments`
+// [T, 2, channels], means and uncentred variances, are in bfloat16.
 void mmpi_adam_rows(const int64_t* rows, int64_t begin, int64_t end, int64_t channels, const float* grad, float* param,
                     uint16_t* moments, float beta1, float beta2, float correction, float eps, float rate) {
     for (int64_t i = begin; i < end; i++) {
@@ -33,6 +34,7 @@ void mmpi_adam_rows(const int64_t* rows, int64_t begin, int64_t end, int64_t cha
             prefetch_row(param + rows[i + AHEAD] * channels, channels);
             prefetch_row(moments + rows[i + AHEAD] * 2 * channels, 2 * channels);
         }
+        if (rows[i] < BRICK) continue;
         const float* __restrict g = grad + i * channels;
         float* __restrict value = param + rows[i] * channels;
         uint16_t* __restrict mean = moments + rows[i] * 2 * channels;

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from mmpi_ns.ops.adam import reference
 from mmpi_ns.ops.gpu_scene import launch
+from mmpi_ns.scene.texels import BRICK
 
 BLOCK = 1024
 """Entries of a program."""
@@ -30,13 +31,16 @@ def _narrow(x):
 
 
 @triton.jit(do_not_specialize=("size",))
-def adam_kernel(rows, grads, params, moments, size, channels, beta1, beta2, correction, eps, rate, BLOCK: tl.constexpr):
-    """Adam on distinct rows; entries whose gradient is exactly 0 are left alone."""
+def adam_kernel(
+    rows, grads, params, moments, size, channels, beta1, beta2, correction, eps, rate,
+    EMPTY: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Adam on distinct rows; those of the empty brick, and entries whose gradient is exactly 0, are left alone."""
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     inside = i < size
     g = tl.load(grads + i, inside, 0.0)
-    touched = g != 0
     row, channel = tl.load(rows + i // channels, inside, 0), i % channels
+    touched = (g != 0) & (row >= EMPTY)
     at, first = row * channels + channel, moments + 2 * row * channels + channel
     mean, square = _widen(tl.load(first, touched, 0)), _widen(tl.load(first + channels, touched, 0))
     mean += (1 - beta1) * (g - mean)
@@ -52,4 +56,4 @@ def adam_rows(param: Tensor, moments: Tensor, rows: Tensor, grad: Tensor, consta
     if moments.dtype != torch.bfloat16:
         return reference.adam_rows(param, moments, rows, grad, constants)
     given, size = (rows.contiguous(), grad.contiguous(), param, moments.view(torch.int16)), grad.numel()
-    launch(adam_kernel, size, BLOCK, *given, size, param.shape[1], *constants, BLOCK=BLOCK)
+    launch(adam_kernel, size, BLOCK, *given, size, param.shape[1], *constants, EMPTY=BRICK, BLOCK=BLOCK)

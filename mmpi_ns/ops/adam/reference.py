@@ -6,12 +6,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mmpi_ns.scene.texels import BRICK
+
 
 def adam_rows(param: Tensor, moments: Tensor, rows: Tensor, grad: Tensor, constants: tuple) -> None:
     """See ``ops.adam``."""
-    fresh, known = adam(param.index_select(0, rows), moments.index_select(0, rows), grad, constants)
-    param.index_copy_(0, rows, fresh)
-    moments.index_copy_(0, rows, known)
+    grad = grad.masked_fill((rows < BRICK)[:, None], 0)
+    new_param, new_moments = adam(param.index_select(0, rows), moments.index_select(0, rows), grad, constants)
+    param.index_copy_(0, rows, new_param)
+    moments.index_copy_(0, rows, new_moments)
 
 
 def adam(

@@ -5,12 +5,49 @@
 
 namespace {
 
-// Taps of samples that are known: those of planes first, then those of the cube.
+// Rows and weights of the taps of samples: those of planes first, then those of the cube.
 struct Taps {
     const int32_t* positions;
-    const float* shares;
+    const float* weights;
     int64_t count;
-    float* grad_shares; // null where not wanted
+    float* grad_weights; // null: not asked for
+};
+
+// A sample's part of them.
+struct SampleTaps {
+    int taps;
+    const int32_t* positions;
+    const float* weights;
+    float* grad_weights;
+
+    SampleTaps(const Taps* groups, int64_t number) {
+        const bool in_cube = number >= groups[0].count;
+        const Taps& group = groups[in_cube];
+        taps = in_cube ? 8 : 4;
+        const int64_t at = (number - (in_cube ? groups[0].count : 0)) * taps;
+        positions = group.positions + at, weights = group.weights + at;
+        grad_weights = group.grad_weights ? group.grad_weights + at : nullptr;
+    }
+
+    Sample sample(float weight) const {
+        Sample x;
+        x.taps = taps, x.weight = weight;
+        for (int tap = 0; tap < taps; tap++) x.rows[tap] = positions[tap], x.shares[tap] = weights[tap];
+        return x;
+    }
+};
+
+// Rows [begin, end) of the values, whose gradients one thread sums.
+struct Owned {
+    int64_t begin, end;
+
+    bool has(int32_t row) const { return begin <= row && row < end; }
+
+    bool any(const SampleTaps& x) const {
+        for (int tap = 0; tap < x.taps; tap++)
+            if (has(x.positions[tap])) return true;
+        return false;
+    }
 };
 
 // Sums over a ray's samples: weight times what their texels hold, weight, weight times squared colour.
@@ -30,42 +67,23 @@ void gather(const Table& table, const std::vector<Sample>& samples, float* sums)
     for (int c = 0; c < COLORS; c++) sums[table.channels + 1 + c] = squares[c];
 }
 
-void put_known(Sample& sample, const Taps* groups, int64_t number) {
-    const bool in_cube = number >= groups[0].count;
-    const Taps& group = groups[in_cube];
-    sample.taps = in_cube ? 8 : 4;
-    const int64_t at = (number - (in_cube ? groups[0].count : 0)) * sample.taps;
-    for (int tap = 0; tap < sample.taps; tap++)
-        sample.rows[tap] = group.positions[at + tap], sample.shares[tap] = group.shares[at + tap];
-}
-
-// Where the gradients of a sample's shares go.
-float* grad_of_shares(const Taps* groups, int64_t number) {
-    const bool in_cube = number >= groups[0].count;
-    const Taps& group = groups[in_cube];
-    return group.grad_shares ? group.grad_shares + (in_cube ? 8 * (number - groups[0].count) : 4 * number) : nullptr;
-}
-
 } // namespace
 
 extern "C" {
 
-// Sums [R, channels + 4] of rays [begin, end) at samples whose taps are known: `numbers` [R, S] says which are whose, -1
-// for none. The next ray's memory is asked for before one is summed.
+// Sums [R, channels + 4] of rays [begin, end): `numbers` [R, S] says which sample is in a slot, -1 if there is none. The
+// next ray's memory is asked for before one is summed.
 void mmpi_gather_taps(const float* values, int64_t rows, int64_t channels, const Taps* groups, const int32_t* numbers,
                       const float* weights, int64_t begin, int64_t end, int64_t slots, float* sums) {
     const Table table{values, rows, channels};
     std::vector<Sample> samples[2];
     const auto prepare = [&](int64_t ray) {
-        std::vector<Sample>& found = samples[ray & 1];
-        found.clear();
+        std::vector<Sample>& next = samples[ray & 1];
+        next.clear();
         for (int64_t slot = ray * slots; slot < (ray + 1) * slots; slot++) {
             if (numbers[slot] < 0) continue;
-            Sample sample;
-            put_known(sample, groups, numbers[slot]);
-            sample.weight = weights[slot];
-            found.push_back(sample);
-            prefetch(table, sample);
+            next.push_back(SampleTaps(groups, numbers[slot]).sample(weights[slot]));
+            prefetch(table, next.back());
         }
     };
     if (begin < end) prepare(begin);
@@ -75,32 +93,36 @@ void mmpi_gather_taps(const float* values, int64_t rows, int64_t channels, const
     }
 }
 
-// Gradients of values [rows, channels] (added to what is there; null where not wanted), of shares (likewise, in the taps)
-// and of weights [R, S] from those of the sums [R, padded] and, but for the weights, of the sums of colours and twice
-// those of squared colours [R, 16], padded with zeros.
-// Samples are taken in the order of `slots`, so sums do not depend on threads.
+// Gradients of values [rows, channels] (added to what is there; null if not asked for), of the taps' weights (likewise,
+// in the taps) and of weights [R, S] from those of the sums [R, padded] and, except for the weights, of the sums of
+// colours and twice those of squared colours [R, 16], padded with zeros. Samples of rays that are not `chosen` have none.
+// Rows [begin, end) have one owner, who adds the samples in the order of `slots`: sums do not depend on the threads. The
+// owner of a sample's first row writes the other gradients.
 void mmpi_gather_back(const float* values, int64_t rows, int64_t channels, const Taps* groups, const int64_t* slots,
-                      const bool* wanted, const float* weights, const float* grad_sums, const float* grad_colors,
-                      const float* grad_squares, int64_t slots_per_ray, float* grad_values, float* grad_weights) {
+                      const bool* chosen, const float* weights, const float* grad_sums, const float* grad_colors,
+                      const float* grad_squares, int64_t slots_per_ray, int64_t begin, int64_t end, float* grad_values,
+                      float* grad_weights) {
     const Table table{values, rows, channels};
+    const Owned owned{begin, end};
     const int64_t padded = (channels + WIDTH - 1) / WIDTH * WIDTH, count = groups[0].count + groups[1].count;
     constexpr int64_t AHEAD = 6;
     for (int64_t n = 0; n < count; n++) {
         if (n + AHEAD < count) {
-            Sample soon;
-            put_known(soon, groups, n + AHEAD);
+            const SampleTaps soon(groups, n + AHEAD);
             for (int tap = 0; tap < soon.taps; tap++) {
-                table.prefetch(soon.rows[tap]);
+                if (!owned.has(soon.positions[tap])) continue;
+                table.prefetch(soon.positions[tap]);
                 if (!grad_values) continue;
-                __builtin_prefetch(grad_values + soon.rows[tap] * channels, 1);
-                __builtin_prefetch(grad_values + (soon.rows[tap] + 1) * channels - 1, 1);
+                __builtin_prefetch(grad_values + soon.positions[tap] * channels, 1);
+                __builtin_prefetch(grad_values + (soon.positions[tap] + 1) * channels - 1, 1);
             }
         }
+        const SampleTaps at(groups, n);
+        if (!owned.any(at)) continue;
         const int64_t slot = slots[n], ray = slot / slots_per_ray;
-        if (!wanted[ray]) continue;
-        Sample sample;
-        put_known(sample, groups, n);
-        const float weight = weights[slot];
+        if (!chosen[ray]) continue;
+        const Sample sample = at.sample(weights[slot]);
+        const bool is_first = owned.has(at.positions[0]);
         Lanes total{};
         for (int64_t first = 0; first < channels; first += WIDTH) {
             const Texel texel = activate(interpolate(table, sample, first), first);
@@ -108,16 +130,17 @@ void mmpi_gather_back(const float* values, int64_t rows, int64_t channels, const
             total += IOTA < float(channels - first) ? slope * texel.value : Lanes{};
             if (first == 0) slope += load(grad_colors + ray * WIDTH) + load(grad_squares + ray * WIDTH) * texel.value;
             float down[WIDTH];
-            store(down, weight * slope * texel.slope);
+            store(down, sample.weight * slope * texel.slope);
             const int64_t size = std::min<int64_t>(WIDTH, channels - first);
-            for (int tap = 0; grad_values && tap < sample.taps; tap++)
-                add_row(grad_values + sample.rows[tap] * channels + first, down, sample.shares[tap], size);
-            float* to_shares = grad_of_shares(groups, n);
-            for (int tap = 0; to_shares && tap < sample.taps; tap++) {
-                const float* read = values + sample.rows[tap] * channels + first;
-                for (int64_t c = 0; c < size; c++) to_shares[tap] += read[c] * down[c];
+            for (int tap = 0; grad_values && tap < at.taps; tap++)
+                if (owned.has(at.positions[tap]))
+                    add_row(grad_values + at.positions[tap] * channels + first, down, at.weights[tap], size);
+            for (int tap = 0; is_first && at.grad_weights && tap < at.taps; tap++) {
+                const float* read = values + at.positions[tap] * channels + first;
+                for (int64_t c = 0; c < size; c++) at.grad_weights[tap] += read[c] * down[c];
             }
         }
+        if (!is_first) continue;
         float sum = 0;
         for (int i = 0; i < WIDTH; i++) sum += total[i];
         grad_weights[slot] = sum;

@@ -12,7 +12,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from mmpi_ns.ops.gather.reference import COLORS, KnownTaps, RaySums, split_sums
+from mmpi_ns.ops.gather.reference import COLORS, RaySums, Taps, split_sums
 from mmpi_ns.ops.gpu_scene import block_size, launch
 
 NUMBERS = 512
@@ -36,13 +36,13 @@ def store_sums(sums, ray, inside, channels, total, mass, squares, column):
 
 
 @triton.jit
-def read_taps(values, positions, shares, number, known, channels, column, TAPS: tl.constexpr):
+def read_taps(values, positions, shares, number, inside, channels, column, TAPS: tl.constexpr):
     """Interpolated texels of samples."""
     raw = number[:, None] * column * 0.0
     for tap in tl.static_range(TAPS):
-        row = tl.load(positions + number * TAPS + tap, known, 0).to(tl.int64)
-        share = tl.load(shares + number * TAPS + tap, known, 0.0)
-        read = tl.load(values + row[:, None] * channels + column, known[:, None] & (column < channels), 0.0)
+        row = tl.load(positions + number * TAPS + tap, inside, 0).to(tl.int64)
+        share = tl.load(shares + number * TAPS + tap, inside, 0.0)
+        read = tl.load(values + row[:, None] * channels + column, inside[:, None] & (column < channels), 0.0)
         raw += share[:, None] * read
     return raw
 
@@ -80,7 +80,7 @@ def gather_kernel(
     do_not_specialize=("first", "count", "slots_per_ray", "positions", "shares", "to_sums", "to_first", "to_second"),
 )
 def gather_back_kernel(
-    values, slots, wanted, weights, positions, shares, to_sums, to_first, to_second, to_values, to_weights, to_shares,
+    values, slots, chosen, weights, positions, shares, to_sums, to_first, to_second, to_values, to_weights, to_shares,
     first, count, slots_per_ray, channels, NEEDED: tl.constexpr, MOVED: tl.constexpr, TAPS: tl.constexpr,
     CHANNELS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
@@ -90,7 +90,7 @@ def gather_back_kernel(
     inside = number < count
     slot = tl.load(slots + first + number, inside, 0)
     ray = slot // slots_per_ray
-    inside = inside & (tl.load(wanted + ray, inside, 0) != 0)
+    inside = inside & (tl.load(chosen + ray, inside, 0) != 0)
     value = activate(read_taps(values, positions, shares, number, inside, channels, column, TAPS), column)
     filled, is_color = inside[:, None] & (column < channels), inside[:, None] & (column < 3)
     slope = tl.load(to_sums + ray[:, None] * channels + column, filled, 0.0)
@@ -120,28 +120,28 @@ def sizes(channels: int, device: torch.device, numbers: int = NUMBERS) -> tuple[
 class _GatherTaps(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, values: Tensor, weights: Tensor, slots: Tensor, wanted: Tensor, *taps: Tensor
+        ctx: Any, values: Tensor, weights: Tensor, slots: Tensor, chosen: Tensor, *taps: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        held = [x.contiguous() for x in (values, weights, slots, wanted, *taps)]
-        values, weights, slots, wanted, positions, shares, cube_positions, cube_shares = held
+        saved = [x.contiguous() for x in (values, weights, slots, chosen, *taps)]
+        values, weights, slots, chosen, positions, shares, cube_positions, cube_shares = saved
         (num_rays, width), channels, device = weights.shape, values.shape[1], values.device
         numbers = torch.full((num_rays, width), -1, dtype=torch.int32, device=device)
         numbers.view(-1)[slots] = torch.arange(len(slots), dtype=torch.int32, device=device)
-        numbers.masked_fill_(~wanted[:, None], -1)
+        numbers.masked_fill_(~chosen[:, None], -1)
         sums, (columns, block) = torch.zeros(num_rays, channels + 1 + COLORS, device=device), sizes(channels, device)
-        given = (values, numbers, weights, positions, shares, cube_positions, cube_shares, sums)
+        tensors = (values, numbers, weights, positions, shares, cube_positions, cube_shares, sums)
         launch(
-            gather_kernel, num_rays if len(slots) else 0, block, *given, num_rays, width, channels, len(positions),
+            gather_kernel, num_rays if len(slots) else 0, block, *tensors, num_rays, width, channels, len(positions),
             HAS_CUBE=len(cube_positions) > 0, CHANNELS=columns, BLOCK=block,
         )  # fmt: skip
-        ctx.save_for_backward(*held)
-        found = split_sums(sums, channels)
-        ctx.mark_non_differentiable(found[1])
-        return found
+        ctx.save_for_backward(*saved)
+        parts = split_sums(sums, channels)
+        ctx.mark_non_differentiable(parts[1])
+        return parts
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
-        values, weights, slots, wanted, *taps = ctx.saved_tensors
+        values, weights, slots, chosen, *taps = ctx.saved_tensors
         to_sums, _, to_first, to_second = (g.contiguous() for g in grad_outputs)
         needed, channels = ctx.needs_input_grad[0], values.shape[1]
         to_values, to_weights = torch.zeros_like(values) if needed else values, torch.zeros_like(weights)
@@ -150,18 +150,18 @@ class _GatherTaps(torch.autograd.Function):
         to_shares = [torch.zeros_like(x) if moved else to_weights for x in taps[1::2]]  # not written where unmoved
         for positions, shares, to in zip(taps[::2], taps[1::2], to_shares, strict=True):
             launch(
-                gather_back_kernel, len(positions), block, values, slots, wanted, weights, positions, shares,
+                gather_back_kernel, len(positions), block, values, slots, chosen, weights, positions, shares,
                 to_sums, to_first, to_second, to_values, to_weights, to, first, len(positions), weights.shape[1],
                 channels, NEEDED=needed, MOVED=moved, TAPS=shares.shape[1], CHANNELS=columns, BLOCK=block,
             )  # fmt: skip
             first += len(positions)
-        given = (x if moved else None for to in to_shares for x in (None, to))
-        return to_values if needed else None, to_weights, None, None, *given
+        tensors = (x if moved else None for to in to_shares for x in (None, to))
+        return to_values if needed else None, to_weights, None, None, *tensors
 
 
-def gather_taps(values: Tensor, groups: list[KnownTaps], slots: Tensor, weights: Tensor, wanted: Tensor) -> RaySums:
+def gather_taps(values: Tensor, taps: list[Taps], slots: Tensor, weights: Tensor, chosen: Tensor) -> RaySums:
     """See ``ops.gather``."""
-    found = {g.shares.shape[1]: (g.positions, g.shares) for g in groups}
+    parts = {t.weights.shape[1]: (t.positions, t.weights) for t in taps}
     none = {n: (slots.new_zeros(0, n), weights.new_zeros(0, n)) for n in (4, 8)}
-    taps = [x for pair in (none | found).values() for x in pair]
-    return RaySums(*_GatherTaps.apply(values, weights, slots, wanted, *taps))  # type: ignore[misc]
+    tensors = [x for pair in (none | parts).values() for x in pair]
+    return RaySums(*_GatherTaps.apply(values, weights, slots, chosen, *tensors))  # type: ignore[misc]

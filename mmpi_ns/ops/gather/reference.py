@@ -20,12 +20,13 @@ COLORS = 3
 
 
 @dataclass(frozen=True)
-class KnownTaps:
+class Taps:
     """Texels that samples read: 4 each of planes, or 8 each of the cube."""
 
     positions: Int[Tensor, "N B"]
-    """Among the values that are read."""
-    shares: Float[Tensor, "N B"]
+    """Of the texels in the list of values that is read."""
+    weights: Float[Tensor, "N B"]
+    """Of the texels in what is interpolated."""
 
 
 @dataclass(frozen=True)
@@ -47,13 +48,13 @@ def activate(raw: Float[Tensor, "N C"]) -> Float[Tensor, "N C"]:
     return torch.cat([raw[:, :COLORS].sigmoid(), raw[:, COLORS:].tanh()], -1)
 
 
-def gather_taps(values: Tensor, groups: list[KnownTaps], slots: Tensor, weights: Tensor, wanted: Tensor) -> RaySums:
+def gather_taps(values: Tensor, taps: list[Taps], slots: Tensor, weights: Tensor, chosen: Tensor) -> RaySums:
     """See ``ops.gather``."""
-    if not groups:
+    if not taps:
         return _sums(values.new_zeros(0, values.shape[1]), slots, weights)
-    raw = torch.cat([(values[g.positions] * g.shares[..., None]).sum(1) for g in groups])
-    own = wanted[slots // weights.shape[1]].nonzero()[:, 0]
-    return _sums(raw[own], slots[own], weights)
+    raw = torch.cat([(values[t.positions] * t.weights[..., None]).sum(1) for t in taps])
+    samples = chosen[slots // weights.shape[1]].nonzero()[:, 0]
+    return _sums(raw[samples], slots[samples], weights)
 
 
 def gather_places(
@@ -70,10 +71,10 @@ def interpolated(
 ) -> Iterator[tuple[Int[Tensor, "N"], Float[Tensor, "N C"]]]:
     """Of each head the flat slots of its samples, and what the table holds at their places."""
     for k, grid in enumerate(layout.grids):
-        own = (places.valid & (places.heads == k)).reshape(-1).nonzero()[:, 0]
-        ndc, planes = places.ndc.reshape(-1, 3)[own], places.planes.reshape(-1)[own]
-        rows, shares = grid.bilinear(planes, ndc) if k < len(layout.mpis) else grid.trilinear(ndc)
-        yield own, (table[rows] * shares[..., None]).sum(1)
+        slots = (places.valid & (places.heads == k)).reshape(-1).nonzero()[:, 0]
+        ndc, planes = places.ndc.reshape(-1, 3)[slots], places.planes.reshape(-1)[slots]
+        rows, weights = grid.bilinear(planes, ndc) if k < len(layout.mpis) else grid.trilinear(ndc)
+        yield slots, (table[rows] * weights[..., None]).sum(1)
 
 
 def split_sums(sums: Float[Tensor, "R N"], channels: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:

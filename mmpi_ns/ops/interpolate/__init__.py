@@ -1,7 +1,6 @@
-"""Weighted sums of table rows: the gather behind every bilinear and trilinear lookup.
+"""Rows of tables: which of them a batch reads, weighted sums of those, and the gradients of the rows that were read.
 
-The table's gradient is sparse over its rows, so that backward and optimiser cost follow the rows a batch touched, never
-the size of the table.
+A table has millions of rows of which a step reads a few: backward and optimiser follow those, never the table's size.
 """
 
 from __future__ import annotations
@@ -10,131 +9,158 @@ from typing import Any
 
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor
+from torch import Tensor, nn
 
 from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.interpolate import reference
 from mmpi_ns.ops.interpolate.reference import RowIndex
 from mmpi_ns.ops.layout import SceneLayout
+from mmpi_ns.ops.shapes import check_shapes
+
+__all__ = ["RowIndex", "Table", "index_rows", "interpolate", "raise_peaks", "read_rows", "sum_rows", "texel_rows",
+           "weigh_rows"]  # fmt: skip
+
+
+class Table(nn.Parameter):
+    """A parameter of T rows, whose gradient is that of the rows that were read: ``grad`` [U, C] of ``grad_rows`` [U].
+
+    ``read_rows`` brings the gradient and ``TouchedAdam`` takes it. Whatever treats gradients number by number works as
+    with any parameter: dropping, scaling, clipping and norms, in torch and in nerfstudio.
+    """
+
+    grad_rows: Int[Tensor, "U"] | None = None
+    """Rising and each once, but that row 0 with a gradient of 0 may follow any number of times."""
+    _row_grad: Float[Tensor, "U C"] | None = None
+
+    @property
+    def grad(self) -> Float[Tensor, "U C"] | None:  # type: ignore[override]
+        """Gradient of ``grad_rows``; None if no row was read since it was dropped."""
+        assert super().grad is None, "what reads a table must do so by read_rows, or it learns nothing"
+        return self._row_grad
+
+    @grad.setter
+    def grad(self, value: None) -> None:
+        assert value is None, "a table's gradient comes with its rows: add_grad"
+        self.grad_rows = self._row_grad = None
+
+    def add_grad(self, rows: Int[Tensor, "U"], values: Float[Tensor, "U C"]) -> None:
+        """Adds the gradient of rows in the order of ``grad_rows`` to what is there."""
+        if self.grad_rows is not None and self._row_grad is not None:
+            rows, values = torch.cat([self.grad_rows, rows]), torch.cat([self._row_grad, values])
+            index, ones = index_rows(rows[:, None], len(self), pads=True), torch.ones_like(values[:, :1])
+            rows, values = index.unique, sum_rows(index.positions, values, ones, len(index.unique))
+        self.grad_rows, self._row_grad = rows, values
+
+    def dense_grad(self) -> Float[Tensor, "T C"] | None:
+        """The gradient of all rows; to look at, not to train with."""
+        if self.grad_rows is None or self._row_grad is None:
+            return None
+        return torch.zeros_like(self.data).index_add_(0, self.grad_rows, self._row_grad)
 
 
 def texel_rows(
     layout: SceneLayout, heads: Int[Tensor, "N"], planes: Int[Tensor, "N"], ndc: Float[Tensor, "N 3"]
 ) -> tuple[Int[Tensor, "N 4"], Float[Tensor, "N 4"]]:
-    """``TexelGrid.bilinear`` of samples in several MPIs: the rows that each reads, and their weights, with gradients to
-    ``ndc`` where it wants them."""
+    """Rows and weights of the four texels around samples of several MPIs (``TexelGrid.bilinear``), with gradients to
+    ``ndc`` where it requires them.
+
+    Args:
+        layout: of the scene.
+        heads: MPI of each sample.
+        planes: plane of each sample.
+        ndc: position of each sample in its MPI.
+    """
+    check_shapes("heads N, planes N, ndc N 3", heads, planes, ndc)
     if ndc.requires_grad:
         return reference.texel_rows(layout, heads, planes, ndc)
     return dispatch.run("texel_rows", layout, heads, planes, ndc)
 
 
 def index_rows(rows: Int[Tensor, "..."], table_rows: int, pads: bool = False) -> RowIndex:
-    """The distinct rows, rising, that a list names of a table of so many.
+    """Distinct rows of a list, rising.
 
     Args:
         rows: the list.
-        table_rows: of the table.
-        pads: the distinct rows may be followed by row 0 over and over, which no entry is: a GPU then need not be waited
-            for to tell their number.
+        table_rows: rows of the table.
+        pads: row 0, which no entry refers to there, may follow the distinct rows any number of times. A GPU then
+            need not be waited for to tell their number.
     """
     return dispatch.run("index_rows", rows, table_rows, pads)
 
 
 def sum_rows(
-    position: Int[Tensor, "N B"], values: Float[Tensor, "N C"], weights: Float[Tensor, "N B"] | None, count: int
+    positions: Int[Tensor, "N B"], values: Float[Tensor, "N C"], weights: Float[Tensor, "N B"], count: int
 ) -> Float[Tensor, "U C"]:
-    """For each of ``count`` rows the sum of weights[n, b] values[n] over its entries (None: B = 1, weights of 1).
+    """For each of ``count`` rows the sum of weights[n, b] values[n] over the entries of ``positions`` that refer to it.
 
-    On a GPU sums are atomic, so their last bits may differ from run to run.
+    On a CPU a row's entries are added in order, for any number of threads. On a GPU sums are atomic, so their last bits
+    may differ from run to run.
     """
-    return dispatch.run("sum_rows", position, values, weights, count)
+    check_shapes("positions N B, values N C, weights N B", positions, values, weights)
+    return dispatch.run("sum_rows", positions, values, weights, count)
 
 
-def raise_peaks(peaks: Float[Tensor, "B"], rows: Int[Tensor, "N T"], weights: Float[Tensor, "N"]) -> None:
-    """Raises each brick's peak to the largest weight of the samples that read rows of it, in place."""
-    dispatch.run("raise_peaks", peaks, rows, weights)
+def raise_peaks(
+    peaks: Float[Tensor, "K"], rows: Int[Tensor, "U"], positions: Int[Tensor, "N B"], weights: Float[Tensor, "N"]
+) -> None:
+    """Raises each brick's peak to the largest weight of the samples that read its rows, in place.
+
+    Args:
+        peaks: of all bricks.
+        rows: distinct rows.
+        positions: of the rows that each sample reads, among those.
+        weights: of the samples.
+    """
+    check_shapes("peaks K, rows U, positions N B, weights N", peaks, rows, positions, weights)
+    dispatch.run("raise_peaks", peaks, rows, positions, weights)
+
+
+def read_rows(table: Table, rows: Int[Tensor, "U"]) -> Float[Tensor, "U C"]:
+    """table[rows] for the distinct rows of ``index_rows``; their gradient goes to the table's ``grad``."""
+    check_shapes("table T C, rows U", table, rows)
+    return _ReadRows.apply(table, rows)  # type: ignore[no-any-return]
+
+
+def weigh_rows(
+    values: Float[Tensor, "U C"], positions: Int[Tensor, "N B"], weights: Float[Tensor, "N B"]
+) -> Float[Tensor, "N C"]:
+    """sum_b weights[n, b] values[positions[n, b]], with dense gradients to values and weights."""
+    check_shapes("values U C, positions N B, weights N B", values, positions, weights)
+    return _WeighRows.apply(values, positions, weights.to(values.dtype))  # type: ignore[no-any-return]
 
 
 def interpolate(
     table: Float[Tensor, "T C"], rows: Int[Tensor, "N B"], weights: Float[Tensor, "N B"]
 ) -> Float[Tensor, "N C"]:
-    """sum_b weights[n, b] table[rows[n, b]]. The table's gradient is sparse over rows.
-
-    Args:
-        table: texels, channels last.
-        rows: rows to combine for each output.
-        weights: their weights.
-    """
-    return _Interpolate.apply(table, rows, weights.to(table.dtype))  # type: ignore[no-any-return]
+    """``weigh_rows`` of a table, whose gradient goes to its ``grad`` if it is a ``Table``."""
+    if not (isinstance(table, Table) and table.requires_grad and torch.is_grad_enabled()):
+        return weigh_rows(table, rows, weights)
+    index = index_rows(rows, len(table), pads=True)
+    return weigh_rows(read_rows(table, index.unique), index.positions, weights)
 
 
-def gather_rows(table: Float[Tensor, "T C"], rows: Int[Tensor, "U"]) -> Float[Tensor, "U C"]:
-    """table[rows] for the distinct rows of ``index_rows``, with a sparse gradient: whatever reads the rows adds its
-    gradient densely, over U rows only."""
-    return _Gather.apply(table, rows)  # type: ignore[no-any-return]
-
-
-def interpolate_gathered(
-    gathered: Float[Tensor, "U C"], position: Int[Tensor, "N B"], weights: Float[Tensor, "N B"]
-) -> Float[Tensor, "N C"]:
-    """``interpolate`` on gathered rows, of which ``position`` counts; with a dense gradient."""
-    return _InterpolateGathered.apply(gathered, position, weights.to(gathered.dtype))  # type: ignore[no-any-return]
-
-
-class _Interpolate(torch.autograd.Function):
+class _ReadRows(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
-        ctx.save_for_backward(rows, weights, _if_moved(ctx, table))
-        ctx.table_shape = table.shape
-        return dispatch.run("weighted_rows", table, rows, weights)
-
-    @staticmethod
-    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, None, Tensor | None]:
-        rows, weights, table = ctx.saved_tensors
-        to_table = None
-        if ctx.needs_input_grad[0]:
-            index = index_rows(rows, ctx.table_shape[0], pads=True)
-            values = sum_rows(index.position, grad_outputs[0], weights, len(index.unique))
-            to_table = _row_gradient(index.unique, values, ctx.table_shape)
-        return to_table, None, _weight_gradient(table, rows, grad_outputs[0])
-
-
-class _Gather(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, table: Tensor, rows: Tensor) -> Tensor:
-        ctx.save_for_backward(rows)
-        ctx.table_shape = table.shape
+    def forward(ctx: Any, table: Table, rows: Tensor) -> Tensor:
+        ctx.table, ctx.rows = table, rows
         return dispatch.run("take_rows", table, rows)
 
     @staticmethod
-    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor, None]:
-        return _row_gradient(ctx.saved_tensors[0], grad_outputs[0], ctx.table_shape), None
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[None, None]:
+        ctx.table.add_grad(ctx.rows, grad_outputs[0])
+        return None, None
 
 
-class _InterpolateGathered(torch.autograd.Function):
+class _WeighRows(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, gathered: Tensor, position: Tensor, weights: Tensor) -> Tensor:
-        ctx.save_for_backward(position, weights, _if_moved(ctx, gathered))
-        ctx.count = gathered.shape[0]
-        return dispatch.run("weighted_rows", gathered, position, weights)
+    def forward(ctx: Any, values: Tensor, positions: Tensor, weights: Tensor) -> Tensor:
+        ctx.save_for_backward(positions, weights, values if ctx.needs_input_grad[2] else None)
+        ctx.count = len(values)
+        return dispatch.run("weighted_rows", values, positions, weights)
 
     @staticmethod
-    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor, None, Tensor | None]:
-        position, weights, gathered = ctx.saved_tensors
-        to_weights = _weight_gradient(gathered, position, grad_outputs[0])
-        return sum_rows(position, grad_outputs[0], weights, ctx.count), None, to_weights
-
-
-def _if_moved(ctx: Any, table: Tensor) -> Tensor | None:
-    """The table, where the gradient of the weights is wanted: samples may be moved."""
-    return table if ctx.needs_input_grad[2] else None
-
-
-def _weight_gradient(table: Tensor | None, rows: Tensor, grad: Tensor) -> Float[Tensor, "N B"] | None:
-    """What each row holds, along the gradient of the sum that it is weighed into."""
-    return None if table is None else (table[rows] * grad[:, None]).sum(-1)
-
-
-def _row_gradient(rows: Int[Tensor, "U"], values: Float[Tensor, "U C"], shape: torch.Size) -> Tensor:
-    """A sparse gradient of the rows that ``index_rows`` found: rising, so what torch calls coalesced."""
-    return torch.sparse_coo_tensor(rows[None], values, shape, is_coalesced=True, check_invariants=False)
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, None, Tensor | None]:
+        (positions, weights, values), grad = ctx.saved_tensors, grad_outputs[0]
+        to_values = sum_rows(positions, grad, weights, ctx.count) if ctx.needs_input_grad[0] else None
+        to_weights = None if values is None else (values[positions] * grad[:, None]).sum(-1)
+        return to_values, None, to_weights

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from itertools import accumulate
+
 import torch
 from torch import Tensor
 
-from mmpi_ns.ops.build import call, call_in_parts
+from mmpi_ns.ops.build import call, call_in_parts, even_bounds, owned_bounds, run_in_parts
 from mmpi_ns.ops.cpu_scene import CpuScene
 from mmpi_ns.ops.interpolate import reference
 from mmpi_ns.ops.interpolate.reference import RowIndex
@@ -13,47 +15,58 @@ from mmpi_ns.ops.layout import SceneLayout
 from mmpi_ns.scene.texels import BRICK
 
 MOST_ROWS = 2**31
-"""A quarter byte is taken for every row of the table: beyond this, torch's sort."""
+"""A bit is taken for every row of the table: beyond this, torch's sort."""
+AT_LEAST = 4096
+"""Samples, rows or bricks that are worth another thread."""
 
 
 def texel_rows(layout: SceneLayout, heads: Tensor, planes: Tensor, ndc: Tensor) -> tuple[Tensor, Tensor]:
     """See ``ops.interpolate``."""
     rows, weights = torch.empty(len(heads), 4, dtype=torch.int64), torch.empty(len(heads), 4)
-    given = (x.contiguous() for x in (heads, planes, ndc))
-    call("mmpi_texel_rows", CpuScene.of(layout).grids, *given, len(heads), rows, weights)
+    samples = (x.contiguous() for x in (heads, planes, ndc))
+    call_in_parts("mmpi_texel_rows", len(heads), (CpuScene.of(layout).grids, *samples), (rows, weights), AT_LEAST)
     return rows, weights
 
 
 def index_rows(rows: Tensor, table_rows: int, pads: bool) -> RowIndex:
     """See ``ops.interpolate``."""
-    count = rows.numel()
+    count, listed = rows.numel(), rows.long().contiguous()
     if table_rows > MOST_ROWS or not 0 < count < 2**31:
         return reference.index_rows(rows, table_rows, pads)
-    bricks = torch.zeros(-(-table_rows // BRICK), 2, dtype=torch.int64)
-    unique, position = torch.empty(count, dtype=torch.int64), torch.empty(rows.shape, dtype=torch.int32)
-    found = call("mmpi_index_rows", rows.long().contiguous(), count, bricks, len(bricks), unique, position)
-    return RowIndex(unique[:found].clone(), position)
+    words = torch.zeros(-(-table_rows // BRICK), dtype=torch.int64)
+    before, positions = torch.empty(len(words), dtype=torch.int32), torch.empty(rows.shape, dtype=torch.int32)
+    call_in_parts("mmpi_mark_rows", count, (listed,), (words,), AT_LEAST)
+    bounds = even_bounds(len(words), AT_LEAST)
+    ends = [0, *accumulate(run_in_parts(lambda a, b: call("mmpi_count_rows", a, b, words), bounds))]
+    starts, unique = dict(zip(bounds, ends, strict=True)), torch.empty(ends[-1], dtype=torch.int64)
+    run_in_parts(lambda a, b: call("mmpi_list_rows", a, b, words, starts[a], before, unique), bounds)
+    call_in_parts("mmpi_place_rows", count, (listed,), (words, before, positions), AT_LEAST)
+    return RowIndex(unique, positions)
 
 
-def sum_rows(position: Tensor, values: Tensor, weights: Tensor | None, count: int) -> Tensor:
+def sum_rows(positions: Tensor, values: Tensor, weights: Tensor, count: int) -> Tensor:
     """See ``ops.interpolate``."""
-    if position.dtype != torch.int32:
-        return reference.sum_rows(position, values, weights, count)
-    out, taps = torch.zeros(count, values.shape[1]), 1 if weights is None else weights.shape[1]
-    given = (None if x is None else x.contiguous() for x in (position, weights, values))
-    call("mmpi_sum_rows", *given, len(values), taps, values.shape[1], out)
-    return out
+    if positions.dtype != torch.int32:
+        return reference.sum_rows(positions, values, weights, count)
+    sums, (samples, taps) = torch.zeros(count, values.shape[1]), positions.shape
+    entries = (*(x.contiguous() for x in (positions, weights, values)), samples, taps, values.shape[1])
+    bounds = owned_bounds([positions], count, AT_LEAST)
+    run_in_parts(lambda a, b: call("mmpi_sum_rows", *entries, a, b, sums), bounds)
+    return sums
 
 
-def raise_peaks(peaks: Tensor, rows: Tensor, weights: Tensor) -> None:
+def raise_peaks(peaks: Tensor, rows: Tensor, positions: Tensor, weights: Tensor) -> None:
     """See ``ops.interpolate``."""
-    call("mmpi_raise_peaks", rows.contiguous(), weights.contiguous(), *rows.shape, peaks)
+    if positions.dtype != torch.int32:
+        return reference.raise_peaks(peaks, rows, positions, weights)
+    samples, after = (positions.contiguous(), weights.contiguous()), (positions.shape[1], rows.contiguous(), peaks)
+    call_in_parts("mmpi_raise_peaks", len(positions), samples, after, AT_LEAST)
 
 
 def take_rows(table: Tensor, rows: Tensor) -> Tensor:
     """See ``ops.interpolate.reference``."""
-    if table.ndim != 2 or not table.is_contiguous():
+    if not table.is_contiguous():
         return reference.take_rows(table, rows)
     values = torch.empty(len(rows), table.shape[1])
-    call_in_parts("mmpi_take_rows", len(rows), (rows.contiguous(),), (table.shape[1], table, values), least=4096)
+    call_in_parts("mmpi_take_rows", len(rows), (rows.contiguous(),), (table.shape[1], table, values), AT_LEAST)
     return values

@@ -12,6 +12,7 @@ from torch import Tensor
 from mmpi_ns.ops.gpu_scene import HEIGHT, INTS, WIDTH, GpuScene, block_size, cell, launch, row_of
 from mmpi_ns.ops.interpolate.reference import RowIndex
 from mmpi_ns.ops.layout import SceneLayout
+from mmpi_ns.scene.texels import BRICK
 
 ROWS = 128
 """Samples, or rows, of a program."""
@@ -77,33 +78,27 @@ def weighted_rows(table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
 
 @triton.jit(do_not_specialize=("count",))
 def sum_rows_kernel(
-    positions, weights, values, out, count, channels,
-    TAPS: tl.constexpr, WEIGHTED: tl.constexpr, CHANNELS: tl.constexpr, BLOCK: tl.constexpr,
-):  # fmt: skip
-    """out[positions[n, b]] += weights[n, b] values[n]."""
+    positions, weights, values, sums, count, channels, TAPS: tl.constexpr, CHANNELS: tl.constexpr, BLOCK: tl.constexpr
+):
+    """sums[positions[n, b]] += weights[n, b] values[n]."""
     i, c = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK), tl.arange(0, CHANNELS)
     inside = i < count
     both = inside[:, None] & (c < channels)[None, :]
     value = tl.load(values + i[:, None] * channels + c[None, :], both, 0.0)
     for tap in tl.static_range(TAPS):
         row = tl.load(positions + i * TAPS + tap, inside, 0).to(tl.int64)
-        part = value
-        if WEIGHTED:
-            part = tl.load(weights + i * TAPS + tap, inside, 0.0)[:, None] * value
-        tl.atomic_add(out + row[:, None] * channels + c[None, :], part, both, sem="relaxed")
+        part = tl.load(weights + i * TAPS + tap, inside, 0.0)[:, None] * value
+        tl.atomic_add(sums + row[:, None] * channels + c[None, :], part, both, sem="relaxed")
 
 
-def sum_rows(position: Tensor, values: Tensor, weights: Tensor | None, count: int) -> Tensor:
+def sum_rows(positions: Tensor, values: Tensor, weights: Tensor, count: int) -> Tensor:
     """See ``ops.interpolate``."""
-    entries, channels = values.shape
-    out = torch.zeros(count, channels, device=values.device)
-    taps, block = 1 if weights is None else weights.shape[1], block_size(ROWS, values.device)
-    given = (x.contiguous() for x in (position, values if weights is None else weights, values))
-    launch(
-        sum_rows_kernel, entries, block, *given, out, entries, channels,
-        TAPS=taps, WEIGHTED=weights is not None, CHANNELS=triton.next_power_of_2(channels), BLOCK=block,
-    )  # fmt: skip
-    return out
+    (samples, channels), block = values.shape, block_size(ROWS, values.device)
+    sums = torch.zeros(count, channels, device=values.device)
+    tensors, columns = (x.contiguous() for x in (positions, weights, values)), triton.next_power_of_2(channels)
+    sizes = {"TAPS": weights.shape[1], "CHANNELS": columns, "BLOCK": block}
+    launch(sum_rows_kernel, samples, block, *tensors, sums, samples, channels, **sizes)
+    return sums
 
 
 # Distinct rows ------------------------------------------------------------------------------------------------------
@@ -127,46 +122,53 @@ def _bits(word):
 
 @triton.jit(do_not_specialize=("size",))
 def count_kernel(words, counts, size, BLOCK: tl.constexpr):
-    """counts[i] = set bits of words[i]."""
+    """counts[i] = set bits of the two words of brick i."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    tl.store(counts + i, _bits(tl.load(words + i, i < size, 0)), i < size)
+    first, second = tl.load(words + 2 * i, i < size, 0), tl.load(words + 2 * i + 1, i < size, 0)
+    tl.store(counts + i, _bits(first) + _bits(second), i < size)
 
 
 @triton.jit(do_not_specialize=("size",))
 def list_kernel(words, ends, unique, size, BLOCK: tl.constexpr):
-    """Writes the rows whose bits are set, rising; ``ends`` counts them up to the end of each word."""
+    """Writes the rows whose bits are set, rising; ``ends`` counts them up to the end of each brick."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    word = tl.load(words + i, i < size, 0)
-    at = tl.load(ends + i, i < size, 0) - _bits(word)
-    for bit in tl.static_range(32):
-        is_set = ((word >> bit) & 1) == 1
-        tl.store(unique + at, i.to(tl.int64) * 32 + bit, is_set)
+    first, second = tl.load(words + 2 * i, i < size, 0), tl.load(words + 2 * i + 1, i < size, 0)
+    is_read = (first | second) != 0
+    at = tl.load(ends + i, is_read, 0) - _bits(first) - _bits(second)
+    for bit in tl.static_range(64):
+        word = first if bit < 32 else second
+        is_set = ((word >> (bit % 32)) & 1) == 1
+        tl.store(unique + at, i.to(tl.int64) * 64 + bit, is_set)
         at += is_set.to(tl.int32)
 
 
 @triton.jit(do_not_specialize=("count",))
-def position_kernel(rows, words, ends, position, count, BLOCK: tl.constexpr):
-    """Which of the distinct rows every entry is."""
+def position_kernel(rows, words, ends, positions, count, BLOCK: tl.constexpr):
+    """Place of every entry among the distinct rows."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     row = tl.load(rows + i, i < count, 0)
+    brick, is_second = row >> 6, ((row >> 5) & 1) == 1
     word = tl.load(words + (row >> 5), i < count, 0)
     not_before = word & (-1 << (row & 31).to(tl.int32))  # the row's own bit and those above it
-    tl.store(position + i, tl.load(ends + (row >> 5), i < count, 0) - _bits(not_before), i < count)
+    later = tl.load(words + 2 * brick + 1, (i < count) & (is_second == 0), 0)
+    end = tl.load(ends + brick, i < count, 0)
+    tl.store(positions + i, end - _bits(not_before) - _bits(later), i < count)
 
 
 def index_rows(rows: Tensor, table_rows: int, pads: bool) -> RowIndex:
-    """See ``ops.interpolate``. A bit for every row of the table, and a running count of those that are set."""
+    """See ``ops.interpolate``. A bit for every row of the table, and a running count of them by bricks."""
     flat, device, block = rows.reshape(-1).contiguous(), rows.device, block_size(ROWS, rows.device)
-    count, size = len(flat), -(-table_rows // 32)
-    position = torch.empty(rows.shape, dtype=torch.int32, device=device)
+    count, bricks = len(flat), -(-table_rows // BRICK)
+    positions = torch.empty(rows.shape, dtype=torch.int32, device=device)
     if not count:
-        return RowIndex(flat, position)
-    words, counts = (torch.zeros(size, dtype=torch.int32, device=device) for _ in range(2))
+        return RowIndex(flat, positions)
+    words = torch.zeros(2 * bricks, dtype=torch.int32, device=device)
+    counts = torch.empty(bricks, dtype=torch.int32, device=device)
     launch(mark_kernel, count, block, flat, words, count, BLOCK=block)
-    launch(count_kernel, size, block, words, counts, size, BLOCK=block)
+    launch(count_kernel, bricks, block, words, counts, bricks, BLOCK=block)
     ends = counts.cumsum(0, dtype=torch.int32)
-    found = min(count, table_rows) if pads else int(ends[-1])
-    unique = torch.zeros(found, dtype=torch.int64, device=device)
-    launch(list_kernel, size, block, words, ends, unique, size, BLOCK=block)
-    launch(position_kernel, count, block, flat, words, ends, position, count, BLOCK=block)
-    return RowIndex(unique, position)
+    distinct = min(count, table_rows) if pads else int(ends[-1])
+    unique = torch.zeros(distinct, dtype=torch.int64, device=device)
+    launch(list_kernel, bricks, block, words, ends, unique, bricks, BLOCK=block)
+    launch(position_kernel, count, block, flat, words, ends, positions, count, BLOCK=block)
+    return RowIndex(unique, positions)

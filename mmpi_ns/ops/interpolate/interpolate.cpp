@@ -2,35 +2,42 @@
 #include "scene.h"
 #include "table.h"
 
-namespace {
-
-// Which rows of a brick occur, and how many others come before them.
-struct Seen {
-    uint64_t rows;
-    int64_t before;
-};
-
-} // namespace
-
 extern "C" {
 
-// Numbers the distinct values of `rows`, none negative, in rising order. `bricks` holds as many bricks as the largest
-// value needs, all zero. Returns how many there are; `unique` and `position` have room for `count`.
-int64_t mmpi_index_rows(const int64_t* rows, int64_t count, Seen* bricks, int64_t num_bricks, int64_t* unique,
-                        int32_t* position) {
-    for (int64_t i = 0; i < count; i++) bricks[rows[i] >> 6].rows |= uint64_t(1) << (rows[i] & 63);
-    int64_t found = 0;
-    for (int64_t b = 0; b < num_bricks; b++) {
-        bricks[b].before = found;
-        for (uint64_t left = bricks[b].rows; left; left &= left - 1)
-            unique[found++] = b * BRICK + __builtin_ctzll(left);
+// Distinct values of `rows`, none negative, in four steps of which each may be done in parts by several threads: every
+// brick has a word of 64 bits, all 0 before the first step, and only the words are read of bricks that no row lies in.
+
+// Sets the bits of rows [begin, end) of a list.
+void mmpi_mark_rows(const int64_t* rows, int64_t begin, int64_t end, uint64_t* words) {
+    for (int64_t i = begin; i < end; i++) {
+        uint64_t* word = words + (rows[i] >> 6);
+        const uint64_t bit = uint64_t(1) << (rows[i] & 63);
+        if (!(__atomic_load_n(word, __ATOMIC_RELAXED) & bit)) __atomic_fetch_or(word, bit, __ATOMIC_RELAXED);
     }
-    for (int64_t i = 0; i < count; i++) {
-        const Seen& brick = bricks[rows[i] >> 6];
-        const uint64_t earlier = brick.rows & ((uint64_t(1) << (rows[i] & 63)) - 1);
-        position[i] = int32_t(brick.before + __builtin_popcountll(earlier));
+}
+
+// How many rows are marked in bricks [begin, end).
+int64_t mmpi_count_rows(int64_t begin, int64_t end, const uint64_t* words) {
+    int64_t count = 0;
+    for (int64_t b = begin; b < end; b++) count += __builtin_popcountll(words[b]);
+    return count;
+}
+
+// Lists the marked rows of bricks [begin, end) from place `at` on; `before` [bricks] is how many come before a brick's.
+void mmpi_list_rows(int64_t begin, int64_t end, const uint64_t* words, int64_t at, int32_t* before, int64_t* unique) {
+    for (int64_t b = begin; b < end; b++) {
+        if (words[b]) before[b] = int32_t(at);
+        for (uint64_t left = words[b]; left; left &= left - 1) unique[at++] = b * BRICK + __builtin_ctzll(left);
     }
-    return found;
+}
+
+// Places of rows [begin, end) among the marked ones.
+void mmpi_place_rows(const int64_t* rows, int64_t begin, int64_t end, const uint64_t* words, const int32_t* before,
+                     int32_t* positions) {
+    for (int64_t i = begin; i < end; i++) {
+        const uint64_t earlier = words[rows[i] >> 6] & ((uint64_t(1) << (rows[i] & 63)) - 1);
+        positions[i] = before[rows[i] >> 6] + int32_t(__builtin_popcountll(earlier));
+    }
 }
 
 // Rows [begin, end) of a list, read from the table; those that follow each other as one stretch.
@@ -44,30 +51,32 @@ void mmpi_take_rows(const int64_t* rows, int64_t begin, int64_t end, int64_t cha
     }
 }
 
-// peaks[brick] is raised to the largest weight of the samples that read one of its rows.
-void mmpi_raise_peaks(const int64_t* rows, const float* weights, int64_t samples, int64_t taps, float* peaks) {
-    for (int64_t i = 0; i < samples * taps; i++) {
-        float& peak = peaks[rows[i] / BRICK];
-        peak = std::max(peak, weights[i / taps]);
+// peaks[brick] is raised to the largest weight of those of samples [begin, end) that read one of its rows.
+void mmpi_raise_peaks(const int32_t* positions, const float* weights, int64_t begin, int64_t end, int64_t taps,
+                      const int64_t* rows, float* peaks) {
+    for (int64_t i = begin * taps; i < end * taps; i++) {
+        float* peak = peaks + rows[positions[i]] / BRICK;
+        float weight = weights[i / taps], now;
+        __atomic_load(peak, &now, __ATOMIC_RELAXED);
+        while (now < weight && !__atomic_compare_exchange(peak, &now, &weight, true, __ATOMIC_RELAXED, __ATOMIC_RELAXED))
+            ;
     }
 }
 
-// values[position[n, b]] += weights[n, b] * grad[n], with weights of 1 where none are given.
-void mmpi_sum_rows(const int32_t* position, const float* weights, const float* grad, int64_t samples, int64_t taps,
-                       int64_t channels, float* values) {
-    for (int64_t n = 0; n < samples; n++) {
-        const float* from = grad + n * channels;
-        for (int64_t b = 0; b < taps; b++) {
-            float* to = values + int64_t(position[n * taps + b]) * channels;
-            add_row(to, from, weights ? weights[n * taps + b] : 1.0f, channels);
-        }
-    }
+// values[positions[n, b]] += weights[n, b] * grad[n], of the entries at positions [begin, end): each has one owner, who
+// adds in the order of samples.
+void mmpi_sum_rows(const int32_t* positions, const float* weights, const float* grad, int64_t samples, int64_t taps,
+                   int64_t channels, int64_t begin, int64_t end, float* values) {
+    for (int64_t i = 0; i < samples * taps; i++)
+        if (begin <= positions[i] && positions[i] < end)
+            add_row(values + positions[i] * channels, grad + i / taps * channels, weights[i], channels);
 }
 
-// Rows and weights of bilinear lookups at (u, v, .) of `ndc` on planes of MPIs (TexelGrid.bilinear).
-void mmpi_texel_rows(const Grid* grids, const int64_t* heads, const int64_t* planes, const float* ndc, int64_t count,
-                     int64_t* rows, float* weights) {
-    for (int64_t i = 0; i < count; i++) {
+// Rows and weights of bilinear lookups of samples [begin, end) at (u, v, .) of `ndc` on planes of MPIs
+// (TexelGrid.bilinear).
+void mmpi_texel_rows(const Grid* grids, const int64_t* heads, const int64_t* planes, const float* ndc, int64_t begin,
+                     int64_t end, int64_t* rows, float* weights) {
+    for (int64_t i = begin; i < end; i++) {
         const Grid& grid = grids[heads[i]];
         const Cell x(ndc[3 * i], grid.width), y(ndc[3 * i + 1], grid.height);
         const Corners corners(grid, planes[i], y.lower, x.lower);

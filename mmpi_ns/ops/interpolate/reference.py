@@ -14,11 +14,11 @@ from mmpi_ns.scene.texels import BRICK
 
 @dataclass(frozen=True)
 class RowIndex:
-    """Which rows a list of lookups reads, each once, and which of those every entry is."""
+    """Distinct rows of a list, and the place of every entry among them."""
 
     unique: Int[Tensor, "U"]
-    """Rising, but for what it is padded with."""
-    position: Int[Tensor, "..."]
+    """Rising, except for padding."""
+    positions: Int[Tensor, "..."]
     """Of every entry in ``unique``; int32 or int64."""
 
 
@@ -26,8 +26,8 @@ def texel_rows(layout: SceneLayout, heads: Tensor, planes: Tensor, ndc: Tensor) 
     """See ``ops.interpolate``."""
     rows, weights = planes.new_zeros(len(heads), 4), ndc.new_zeros(len(heads), 4)
     for k, grid in enumerate(layout.grids[: len(layout.mpis)]):
-        own = (heads == k).nonzero()[:, 0]
-        rows[own], weights[own] = grid.bilinear(planes[own], ndc[own])
+        here = (heads == k).nonzero()[:, 0]
+        rows[here], weights[here] = grid.bilinear(planes[here], ndc[here])
     return rows, weights
 
 
@@ -36,25 +36,26 @@ def index_rows(rows: Tensor, table_rows: int, pads: bool) -> RowIndex:
     return RowIndex(*torch.unique(rows, return_inverse=True))
 
 
-def sum_rows(position: Tensor, values: Tensor, weights: Tensor | None, count: int) -> Tensor:
+def sum_rows(positions: Tensor, values: Tensor, weights: Tensor, count: int) -> Tensor:
     """See ``ops.interpolate``."""
     out = torch.zeros(count, values.shape[1], dtype=values.dtype, device=values.device)
-    each = values if weights is None else (values[:, None, :] * weights[..., None]).reshape(-1, values.shape[1])
-    return out.index_add_(0, position.reshape(-1), each)
+    each = (values[:, None, :] * weights[..., None]).reshape(-1, values.shape[1])
+    return out.index_add_(0, positions.reshape(-1), each)
 
 
-def raise_peaks(peaks: Tensor, rows: Tensor, weights: Tensor) -> None:
+def raise_peaks(peaks: Tensor, rows: Tensor, positions: Tensor, weights: Tensor) -> None:
     """See ``ops.interpolate``."""
-    peaks.scatter_reduce_(0, (rows // BRICK).reshape(-1), weights.repeat_interleave(rows.shape[1]), "amax")
+    bricks = (rows // BRICK)[positions.reshape(-1)]
+    peaks.scatter_reduce_(0, bricks, weights.repeat_interleave(positions.shape[1]), "amax")
 
 
 def weighted_rows(table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
-    """Values of ``ops.interpolate.interpolate``: torch's embedding bag, on a CPU 3 to 6 times faster than indexing."""
+    """Values of ``ops.interpolate.weigh_rows``: torch's embedding bag, on a CPU 3 to 6 times faster than indexing."""
     return torch.nn.functional.embedding_bag(rows, table, per_sample_weights=weights, mode="sum")
 
 
 def take_rows(table: Tensor, rows: Tensor) -> Tensor:
-    """Values of ``ops.interpolate.gather_rows``."""
+    """Values of ``ops.interpolate.read_rows``."""
     return table.index_select(0, rows)
 
 
