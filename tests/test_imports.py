@@ -101,5 +101,5 @@ def test_the_root_holds_the_model_the_registered_methods_and_the_functional_entr
 
 def test_importing_the_package_imports_nothing_large():
     """Torch takes seconds: it is imported when a function is first asked for."""
-    code = "import sys, mmpi_ns; assert not {'torch', 'nerfstudio', 'numpy'} & set(sys.modules); mmpi_ns.render"
+    code = "import sys, mmpi_ns; assert not {'torch', 'nerfstudio', 'numpy'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
