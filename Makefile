@@ -46,7 +46,7 @@ $(STAMP): pyproject.toml constraints.txt
 	@touch $@
 
 demo: venv ## Make a street, learn it, evaluate it and show what came of it, in demo/ (ARGS="..." as in demo --help)
-	@$(BIN)/python -m mmpi_ns.scripts.demo $(ARGS)
+	@$(BIN)/python examples/demo.py $(ARGS)
 
 test: venv ## Run the tests (ARGS="..." goes to pytest)
 	$(BIN)/python -m pytest --numprocesses $(WORKERS) --dist loadfile --no-loadscope-reorder $(ARGS)
@@ -64,15 +64,15 @@ build: venv ## Build the sdist and the wheel in dist/
 	rm -rf dist
 	$(BIN)/python -m build
 
-wheel: build ## Build, and run the wheel's commands and the demo in an otherwise empty environment
+wheel: build ## Build, and run the wheel's commands in an otherwise empty environment
 	.ci/wheel
 
 figures: venv ## Draw the figures of the documentation anew, from the demo
-	$(BIN)/python -m mmpi_ns.scripts.figures
+	$(BIN)/python examples/figures.py
 
 gallery: venv ## Train four procedural scenes and write docs/gallery.md with their pictures
-	$(BIN)/python -m mmpi_ns.scripts.gallery $(ARGS)
+	$(BIN)/python examples/gallery.py $(ARGS)
 
 clean: ## Remove build products and caches (not .venv)
 	rm -rf build dist *.egg-info .pytest_cache .hypothesis .ruff_cache
-	find mmpi_ns tests -name __pycache__ -type d -prune -exec rm -rf {} +
+	find mmpi_ns benchmarks examples tests -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -46,7 +46,8 @@ class Part:
 
 def parts(data: Path, out: Path, work: Path, rehearse: bool) -> list[Part]:
     """Everything, in the order of what is wanted most."""
-    python, bench = [sys.executable], [sys.executable, "-m", "mmpi_ns.bench"]
+    python, bench = [sys.executable], [sys.executable, "-m", "mmpi_ns.scripts.bench"]
+    train = [sys.executable, str(ROOT / "benchmarks" / "train.py")]
     where = ["--output", str(out), "--work", str(work)]
     look = "import platform, torch; print(platform.python_version(), torch.__version__, torch.version.cuda, flush=True)"
     look += "; import triton; print('Triton', triton.__version__, flush=True)"
@@ -59,7 +60,7 @@ def parts(data: Path, out: Path, work: Path, rehearse: bool) -> list[Part]:
         Part("tests", [*python, "-m", "pytest", "-m", "gpu", "-rs", "-p", "no:cacheprovider", "tests/ops"], 120),
         Part("bench gpu", [*bench, "gpu", *small, *where, "--seconds", "1800" if rehearse else "120"], 150),
         *(
-            Part(f"train {name}", [*bench, "train", *_training(name, steps, data, rehearse), *where], seconds)
+            Part(f"train {name}", [*train, *_training(name, steps, data, rehearse), *where], seconds)
             for name, (steps, seconds) in TRAININGS.items()
         ),
     ]
@@ -79,7 +80,7 @@ def mib(path: Path | None) -> float:
 
 
 def _training(name: str, steps: int, data: Path, rehearse: bool) -> list[str]:
-    """Options of ``mmpi-bench train``; splats have no rays."""
+    """Options of ``benchmarks/train.py``; splats have no rays."""
     words = ["--data", str(data), "--methods", name, "--downscale-factor", "1", "--seeds", "0", "--check-images", "1"]
     words += ["--steps", f"{name}={2 if rehearse else steps}", "--final-images", "1" if rehearse else "8"]
     if rehearse:

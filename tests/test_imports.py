@@ -17,12 +17,11 @@ METHOD = ["utils", "scene", "ops", "placement", "capture", "field", "rendering",
 COMMANDS = {
     "prepare": {"utils", "scene", "placement", "capture"},
     "synthetic": {"utils"},
-    "demo": set(METHOD) | {"synthetic"},
     "export": set(METHOD),
     "functional": set(METHOD) | {"export"},
     "": {"functional"},
-    "bench": set(METHOD) | {"synthetic", "prepare", "demo", "export"},
-    "scripts": set(METHOD) | {"export", "prepare", "synthetic", "demo", "bench", "placement"},
+    "bench": set(METHOD) | {"synthetic"},
+    "scripts": set(METHOD) | {"export", "prepare", "synthetic", "bench"},
 }
 """The method never imports these."""
 MAY_IMPORT = {wing: set(METHOD[: i + 1]) for i, wing in enumerate(METHOD)}
@@ -103,3 +102,21 @@ def test_importing_the_package_imports_nothing_large():
     """Torch takes seconds: it is imported when a function is first asked for."""
     code = "import sys, mmpi_ns; assert not {'torch', 'nerfstudio', 'numpy'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+BESIDE = {path.stem: path for folder in ("benchmarks", "examples") for path in (ROOT.parent / folder).glob("*.py")}
+
+
+@pytest.mark.parametrize("name", sorted(MODULES))
+def test_the_package_imports_neither_benchmarks_nor_examples(name):
+    tree = ast.parse(MODULES[name].read_text(encoding="utf-8"))
+    plain = {alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names}
+    plain |= {str(node.module) for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
+    assert len(BESIDE) > 20 and not plain & (BESIDE.keys() | {"benchmarks", "examples"})
+
+
+def test_modules_beside_the_package_have_names_of_their_own():
+    """They are imported by their bare names, as scripts are."""
+    paths = [p for folder in ("benchmarks", "examples", "tests") for p in (ROOT.parent / folder).glob("*.py")]
+    names = [path.stem for path in paths]
+    assert len(set(names)) == len(names) and not set(names) & (sys.stdlib_module_names | {"mmpi_ns"})

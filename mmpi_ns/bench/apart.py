@@ -8,13 +8,11 @@ import os
 import subprocess
 import sys
 import threading
-import time
-from collections.abc import Callable, Mapping, Sequence
-from datetime import date
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from mmpi_ns.bench.report import Scene, commit, processor, read_json
+from mmpi_ns.bench.report import read_json
 
 Tell = Callable[[str], None]
 """Says how far it is."""
@@ -49,8 +47,11 @@ def run_apart(
     source, target, log = folder / "request.json", folder / "answer.json", folder / "output.log"
     target.unlink(missing_ok=True)
     source.write_text(json.dumps(request, indent=1), encoding="utf-8")
-    environment = {**environment_of(threads), **(extra or {})}
-    words = [sys.executable, "-m", "mmpi_ns.bench.apart", work.__module__, work.__qualname__, str(source), str(target)]
+    module = work.__module__
+    if module == "__main__":  # of a script, which the other process imports by its name
+        module = Path(sys.modules["__main__"].__file__ or "").stem
+    environment = {**environment_of(threads), "PYTHONPATH": os.pathsep.join(sys.path), **(extra or {})}
+    words = [sys.executable, "-m", "mmpi_ns.bench.apart", module, work.__qualname__, str(source), str(target)]
     pipes: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
     last = ""
     with (
@@ -76,40 +77,6 @@ def run_apart(
 def environment_of(threads: int) -> dict[str, str]:
     """This process' variables for one of so many threads."""
     return {**os.environ, "OMP_NUM_THREADS": str(threads), "OPENBLAS_NUM_THREADS": str(threads)}
-
-
-def run_command(words: list[str], log: Path, threads: int, **how: Any) -> None:
-    """Runs a command to its end; what it prints goes to a log.
-
-    Raises:
-        ValueError: it failed; names the log.
-    """
-    log.parent.mkdir(parents=True, exist_ok=True)
-    with log.open("w", encoding="utf-8") as stream:
-        ended = subprocess.run(words, stdout=stream, stderr=subprocess.STDOUT, env=environment_of(threads), **how)
-    if ended.returncode:
-        raise ValueError(f"{Path(words[0]).name} failed with status {ended.returncode}: see {log}.")
-
-
-def train_and_evaluate(
-    scene: Scene, folder: Path, method: str, options: Sequence[str], asked: Sequence[str], threads: int
-) -> tuple[Path, dict[str, Any], dict[str, Any]]:
-    """``ns-train`` with some options, and ``ns-eval`` with what is asked, as a user types them; logs are in the folder.
-
-    Returns:
-        The run's folder, the results of ns-eval, and for the row: seconds of training, threads, machine and commit.
-    """
-    train, evaluate = (str(Path(sys.executable).with_name(name)) for name in ("ns-train", "ns-eval"))
-    place = ["--output-dir", str(folder), "--experiment-name", "run", "--timestamp", "1", "--vis", "tensorboard"]
-    size = ["--data", str(scene.data), "nerfstudio-data", "--downscale-factor", str(scene.downscale_factor)]
-    start = time.perf_counter()
-    run_command([train, method, *place, *options, *size], folder / "train.log", threads)
-    seconds = time.perf_counter() - start
-    run, found = folder / "run" / method / "1", folder / "eval.json"
-    words = [evaluate, "--load-config", str(run / "config.yml"), "--output-path", str(found), *asked]
-    run_command(words, folder / "eval.log", threads)
-    made = {"train_seconds": seconds, "threads": threads, "processor": processor(), "commit": commit()}
-    return run, read_json(found)["results"], made | {"date": date.today().isoformat()}
 
 
 def main(module: str, function: str, source: str, target: str) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -12,27 +11,14 @@ from nerfstudio.cameras.rays import RayBundle
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mmpi_ns.bench.trainings import evenly
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.samples import metadata_of
 from mmpi_ns.rendering.render import render_rays
 from mmpi_ns.rendering.rendered import RenderedRays
 from mmpi_ns.rendering.sampler import MMPISampler
-from mmpi_ns.scene.geometry import Frames, PlaneHits, inverse_distance, sample_disparity
 
 Array = NDArray[Any]
 """Of float64; numpy's stubs lose that in too many operations to say so."""
-Image = tuple[Any, Tensor]
-"""A test camera and its image [H, W, 3]."""
-AHEAD = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-"""Axes of an MPI that faces +z."""
-
-
-def images_of(pipeline: Any, count: int = 0) -> Iterator[Image]:
-    """Test images of a finished run, evenly spaced; 0 for all."""
-    data, device = pipeline.datamanager.eval_dataset, pipeline.model.device
-    for i in evenly(len(data), count):
-        yield data.cameras[i : i + 1].to(device), data.get_image_float32(i)[..., :3]
 
 
 def bundle_of(origins: Array, directions: Array, near: float = 0.05, far: float = math.inf) -> RayBundle:
@@ -58,13 +44,3 @@ def render(
 def of_slots(found: RenderedRays, name: str) -> Tensor:
     """What is known of each sample, by its name in the metadata [R, S]."""
     return metadata_of(found.samples)[name][..., 0]
-
-
-def crossings(hits: PlaneHits, frames: Frames, k: int, planes: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Every plane of MPI k, nearest first: whether it is live, the tangents u and v, and 1/t. [R, L] each"""
-    m = torch.arange(planes - 1, -1, -1).expand(len(hits.count), -1)
-    w = sample_disparity(m, frames.disparity_steps[k], frames.last_disparities[k])
-    first, count = hits.m_first[:, k, None], hits.count[:, k, None]
-    u, v = (x[:, k, :1] + w * x[:, k, 1:] for x in (hits.u, hits.v))
-    q = inverse_distance(w, hits.local_origins[:, k, 2:], hits.local_directions[:, k, 2:])
-    return (m <= first) & (m > first - count), u, v, q

@@ -1,12 +1,12 @@
-"""What all benchmarks share: options, provenance, rows that are kept, and one way to write a table and a figure.
+"""What all benchmarks share: options, provenance, rows that are kept, and one way to write a table.
 
-A new benchmark is a dataclass that extends ``Bench`` in the folder of its question (quality, speed, gpu),
-keeps its rows in a ``Report``, and is named in ``mmpi_ns/scripts/bench.py``.
+A new benchmark is a file of ``benchmarks/`` with a dataclass that extends ``Bench`` and keeps its rows in a ``Report``.
 """
 
 from __future__ import annotations
 
 import hashlib
+import inspect
 import json
 import math
 import os
@@ -14,14 +14,15 @@ import platform
 import re
 import shlex
 import subprocess
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import MISSING, dataclass, fields
 from datetime import date
 from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
+
+from mmpi_ns.utils.values import Number, check_options
 
 Row = dict[str, Any]
 Cell = str | Callable[[Row], Any]
@@ -41,6 +42,15 @@ class Bench:
     name: ClassVar[str]
     """Of the command and of its files."""
 
+    def main(self) -> None:
+        """Measures, once the numbers among the options are known to be counts."""
+        counts = {f.name: Number(0, whole=True) for f in fields(self) if type(getattr(self, f.name)) is int}
+        check_options(self, counts, "--")
+        self.run()
+
+    def run(self) -> None:
+        raise NotImplementedError
+
     @property
     def cores(self) -> int:
         return self.threads or os.cpu_count() or 1
@@ -55,33 +65,7 @@ class Bench:
         own = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("output", "work", *without)}
         own["threads"] = self.cores
         words = (f"{k} {v.resolve().name if isinstance(v, Path) else v}" for k, v in own.items())
-        return f"{fingerprint()} {', '.join(words)}"
-
-
-@dataclass(frozen=True)
-class Scene:
-    """A data set and the size of its images that is used."""
-
-    data: Path
-    downscale_factor: int
-
-    @property
-    def name(self) -> str:
-        return self.data.resolve().name
-
-
-@dataclass(kw_only=True)
-class SceneBench(Bench):
-    """Options of benchmarks on one scene."""
-
-    data: Path
-    """The scene (a folder with transforms.json)."""
-    downscale_factor: int = 4
-    """Image size to use."""
-
-    @property
-    def scene(self) -> Scene:
-        return Scene(self.data, self.downscale_factor)
+        return f"{fingerprint(self)} {', '.join(words)}"
 
 
 class Report:
@@ -135,7 +119,7 @@ class Report:
             draw(self.path.with_suffix(".png"))
 
 
-# Pages and figures ---------------------------------------------------------------------------------------------------
+# Pages ---------------------------------------------------------------------------------------------------
 
 
 def page(title: str, made: Row, *blocks: str | list[str]) -> str:
@@ -151,30 +135,6 @@ def table(columns: Mapping[str, Cell], rows: Iterable[Row]) -> str:
         cells = (cell.format(**row) if isinstance(cell, str) else str(cell(row)) for cell in columns.values())
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
-
-
-def not_run(rows: Mapping[str, Row]) -> str:
-    """A list of what did not run, with the reasons; each once."""
-    lines = dict.fromkeys(f"- {r.get('what', name)}: {r['not_run']}." for name, r in rows.items() if "not_run" in r)
-    return "\n".join(["Not run:", "", *lines]) if lines else ""
-
-
-@contextmanager
-def figure(path: Path, rows: int, columns: int, size: tuple[float, float], **how: Any) -> Iterator[Any]:
-    """Axes [rows, columns] to draw on; written when the block ends, with grids, and legends where there are labels."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    drawing = Figure(figsize=size, layout="constrained")
-    FigureCanvasAgg(drawing)
-    axes = drawing.subplots(rows, columns, squeeze=False, **how)
-    yield axes
-    for axis in axes.flat:
-        axis.grid(alpha=0.3)
-        if axis.get_legend() is None and axis.get_legend_handles_labels()[1]:
-            axis.legend(fontsize=7)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    drawing.savefig(path, dpi=110)
 
 
 def slug(text: str, between: str = "_") -> str:
@@ -204,18 +164,19 @@ def commit() -> str:
     return subprocess.run(words, capture_output=True, text=True, check=False).stdout.strip() or "unknown"
 
 
-def fingerprint() -> str:
-    """Of this package's sources and torch: what was measured with equal ones need not be measured again."""
-    package = Path(__file__).resolve().parents[1]
+def fingerprint(bench: Bench) -> str:
+    """Hash of torch's version and of the sources of this package and the benchmark."""
+    folders = Path(__file__).resolve().parents[1], Path(inspect.getfile(type(bench))).resolve().parent
     digest = hashlib.sha256(torch.__version__.encode())
-    for path in sorted(p for p in package.rglob("*") if p.suffix in (".py", ".cpp", ".h")):
+    for path in sorted({p for folder in folders for p in folder.rglob("*") if p.suffix in (".py", ".cpp", ".h")}):
         digest.update(path.read_bytes())
     return digest.hexdigest()[:16]
 
 
 def command_of(bench: Bench) -> str:
-    """The ``mmpi-bench`` line that makes these settings: what differs from the defaults."""
-    words = ["mmpi-bench", bench.name]
+    """The command line that makes these settings: what differs from the defaults."""
+    ours = type(bench).__module__.startswith("mmpi_ns.")
+    words = ["mmpi-bench", bench.name] if ours else ["python", f"benchmarks/{bench.name}.py"]
     for f in fields(bench):
         value = getattr(bench, f.name)
         if value == (f.default_factory() if f.default_factory is not MISSING else f.default):

@@ -2,14 +2,66 @@
 
 from __future__ import annotations
 
-import resource
+import importlib.util
 import statistics
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import nn
+
+P = "--pipeline.model.placement."
+JOINT = ("--pipeline.model.schedule.training", "joint")
+TWO_PHASE = ("--pipeline.model.schedule.training", "two-phase")
+"""All rays for each MPI, a little blending, and a long fine-tune at full rates, unless more options follow."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A data set and the size of its images that is used."""
+
+    data: Path
+    downscale_factor: int
+
+    @property
+    def name(self) -> str:
+        return self.data.resolve().name
+
+
+def train_words(
+    method: str, options: Sequence[str], scene: Scene, folder: Path, steps: int, seed: int, device: str
+) -> list[str]:
+    """An ``ns-train`` line that leaves evaluating and saving to the caller: it saves once, at the end.
+
+    Args:
+        method: nerfstudio's name of it.
+        options: of the method; they come first, so that later words win.
+        scene: to train.
+        folder: of the run.
+        steps: of the run.
+        seed: of every random draw.
+        device: cpu or cuda.
+    """
+    tracks = no_tracks() if method.startswith("mmpi") and not has_pycolmap() else ()
+    words = [method, *options, *tracks, "--machine.seed", str(seed)]
+    words += ["--output-dir", str(folder), "--experiment-name", "run", "--timestamp", "1", "--vis", "tensorboard"]
+    words += ["--machine.device-type", device, "--max-num-iterations", str(steps), "--steps-per-save", str(10**9)]
+    words += [word for what in ("batch", "image", "all-images") for word in (f"--steps-per-eval-{what}", "0")]
+    words += ["--logging.profiler", "none", "--logging.local-writer.enable", "False", "--data", str(scene.data)]
+    return [*words, "nerfstudio-data", "--downscale-factor", str(scene.downscale_factor)]
+
+
+def has_pycolmap() -> bool:
+    """Whether a COLMAP model can be read, and features be triangulated."""
+    return importlib.util.find_spec("pycolmap") is not None
+
+
+def no_tracks() -> tuple[str, ...]:
+    """Options of our methods that leave pycolmap out: points are looked for by a plane sweep."""
+    return ("--pipeline.datamanager.sfm-path", "none", "--pipeline.datamanager.triangulate", "False")
 
 
 class NoLPIPS(nn.Module):
@@ -46,12 +98,6 @@ def trainer_of(config: Any, seed_offset: int = 0) -> Any:
     return trainer
 
 
-def end_helpers(trainer: Any) -> None:
-    """Ends the processes that prepare nerfacto's batches."""
-    for process in getattr(trainer.pipeline.datamanager, "data_procs", []):
-        process.terminate()
-
-
 def clock() -> float:
     """Seconds; on a GPU, once it has done all."""
     if torch.cuda.is_available():
@@ -68,11 +114,6 @@ def median_s(work: Callable[[], Any], repeats: int) -> float:
         work()
         times.append(clock() - start)
     return statistics.median(times)
-
-
-def peak_gib() -> float:
-    """Most memory that this process has held."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
 
 
 class Steps:

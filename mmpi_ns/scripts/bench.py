@@ -1,41 +1,17 @@
-"""``mmpi-bench``: the tables in docs/results, each reproduced by one command."""
+"""``mmpi-bench``: scores anybody's renderings, and checks and times the kernels on a GPU."""
 
 from __future__ import annotations
 
-import ast
 import sys
-from dataclasses import fields
 from importlib import import_module
-from importlib.util import find_spec
-from pathlib import Path
 
-from mmpi_ns.scripts.command import say_version
-from mmpi_ns.utils.values import Number, check_options
+from mmpi_ns.scripts.command import run, say_version
 
-COUNT = Number(0, whole=True)
 COMMANDS = {
-    "train": "quality.train",
-    "score": "quality.score",
-    "render": "speed.render",
-    "speed": "speed.against_peers",
-    "ops": "speed.ops",
-    "roads": "speed.roads",
-    "processes": "speed.processes",
-    "ablate": "quality.ablate",
-    "gpu": "gpu.command",
-    "accuracy": "quality.accuracy",
-    "results": "quality.results",
-    "prepare": "quality.prepare",
-    "poses": "quality.poses",
+    "score": ("mmpi_ns.bench.score", "PSNR, SSIM and LPIPS of test images that any program has rendered."),
+    "gpu": ("mmpi_ns.bench.gpu.command", "On a GPU, in minutes: kernels against float64, training and frames."),
 }
-"""Module below mmpi_ns.bench with the command, as a class of its name. Only the requested one is imported."""
-
-
-def _purpose(module: str) -> str:
-    """First line of a module's docstring, read without importing it."""
-    origin = getattr(find_spec(f"mmpi_ns.bench.{module}"), "origin", None)
-    source = Path(origin).read_text(encoding="utf-8") if origin else ""
-    return (ast.get_docstring(ast.parse(source)) or "").partition("\n")[0].rpartition("``: ")[2]
+"""Module that holds the command, as a class of its name, and what it does. Only the requested one is imported."""
 
 
 def entrypoint() -> None:
@@ -44,18 +20,10 @@ def entrypoint() -> None:
     name = sys.argv[1] if len(sys.argv) > 1 else "--help"
     if name not in COMMANDS:
         print("usage: mmpi-bench COMMAND [OPTIONS] (mmpi-bench COMMAND --help)\n")
-        print("\n".join(f"  {command:10} {_purpose(module)}" for command, module in COMMANDS.items()))
+        print("\n".join(f"  {command:10} {purpose}" for command, (_, purpose) in COMMANDS.items()))
         sys.exit(0 if name in ("-h", "--help") else f"mmpi-bench: there is no command {name!r}.")
-    import tyro
-
-    measure = getattr(import_module(f"mmpi_ns.bench.{COMMANDS[name]}"), name.capitalize())
-    command = tyro.cli(measure, prog=f"mmpi-bench {name}", args=sys.argv[2:])
-    try:
-        counts = {f.name: COUNT for f in fields(command) if type(getattr(command, f.name)) is int}
-        check_options(command, counts, "--")
-        command.run()
-    except (ValueError, OSError) as error:
-        sys.exit(f"mmpi-bench: {error}")
+    command = getattr(import_module(COMMANDS[name][0]), name.capitalize())
+    sys.exit(run("mmpi-bench", command, prog=f"mmpi-bench {name}", args=sys.argv[2:]))
 
 
 if __name__ == "__main__":

@@ -26,7 +26,7 @@ def run(name: str, command: Any, **how: Any) -> int:
     """
     say_version(name)
     try:
-        tyro.cli(command, prog=name, **how).main()
+        tyro.cli(command, **{"prog": name, **how}).main()
     except (ValueError, OSError) as error:
         print(f"{name}: {error}", file=sys.stderr)
         return 1

@@ -12,9 +12,8 @@ from typing import Literal
 import tyro
 
 from mmpi_ns.scripts.command import run
-from mmpi_ns.synthetic.wrong_depths import Wrong
 
-Name = Literal["street", "long-road", "walk", "room", "look-round", "object", "still-life"]
+Name = Literal["street", "long-road", "walk", "room", "look-round", "object"]
 
 
 @dataclass
@@ -24,7 +23,7 @@ class SceneCommand:
     name: tyro.conf.Positional[Name]
     """street: a straight drive. long-road: a winding drive of any length. walk: a hand-held walk down a street, with
     lens distortion. room: a walk around a table, looking in all directions. look-round: nearly one spot of that room.
-    object: filmed from all sides. still-life: a grid of cameras facing it."""
+    object: filmed from all sides."""
     folder: tyro.conf.Positional[Path]
     """Folder to write."""
     width: int | None = None
@@ -43,9 +42,6 @@ class SceneCommand:
     """Standard deviation of the keypoints' noise, pixels; the points are triangulated from them."""
     outliers: float = 0.02
     """Fraction of wrong points."""
-    wrong_depths: Wrong = "none"
-    """Wrong depths in training images, to test whether a training follows them. scattered: a tenth of the pixels, at
-    random. mirror: surfaces beside the path too far away, consistently in all images. car: a car that drives ahead."""
     images: tyro.conf.FlagConversionOff[bool] = True
     """False: write cameras, points and tracks only."""
     overwrite: bool = False
@@ -68,9 +64,10 @@ class SceneCommand:
             points = max(4000, 4 * round(self.length or 0))
         print(f"{self.name}: {len(scene.primitives)} solids, {len(cameras)} cameras; looking for points ...")
         sfm = (points, self.noise, self.outliers)
-        others = {"progress": _progress, "wrong_depths": self.wrong_depths}
-        others["processes"] = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-        found = write_dataset(scene, self.folder, *sfm, self.images, self.overwrite, **others)
+        processes = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        found = write_dataset(
+            scene, self.folder, *sfm, self.images, self.overwrite, progress=_progress, processes=processes
+        )
         test = int(cameras.is_test.sum())
         kind = "images with depths" if self.images else "cameras (no images)"
         print(f"Wrote {self.folder}: {len(cameras)} {kind} of {cameras.width}x{cameras.height} pixels,")

@@ -29,7 +29,6 @@ SCENES: dict[str, Entry] = {
     "room": Entry(indoor.room),
     "look-round": Entry(indoor.look_round, count=36),
     "object": Entry(indoor.orbited, count=48),
-    "still-life": Entry(indoor.still_life, count=25),
 }
 FRAME_SPACING = 1.5
 """Metres between the images of a long road."""

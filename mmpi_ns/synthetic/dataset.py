@@ -15,9 +15,8 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from mmpi_ns.synthetic.scene import Scene, render
+from mmpi_ns.synthetic.scene import Colors, Scene, render
 from mmpi_ns.synthetic.sfm_like import SfmPoints, sfm_points
-from mmpi_ns.synthetic.wrong_depths import Wrong, wrong_distances
 
 PARTS = ("transforms.json", "images", "images_2", "images_4", "images_8", "depths", "colmap", "sparse_pc.ply")
 """What belongs to a data set, and is removed before another one is written in its place."""
@@ -39,7 +38,6 @@ def write_dataset(
     overwrite: bool = False,
     progress: Callable[[Iterable[int]], Iterable[int]] = iter,
     tracks: bool = True,
-    wrong_depths: Wrong = "none",
     processes: int = 1,
 ) -> SfmPoints:
     """Writes images, depths (along the optical axis), transforms.json, sparse_pc.ply and colmap/sparse/0.
@@ -52,7 +50,6 @@ def write_dataset(
         overwrite: replaces a data set that is in the folder.
         progress: wraps the image numbers as they are rendered.
         tracks: False writes no points and no COLMAP model, for which it takes pycolmap.
-        wrong_depths: how the depths of the training images are wrong; those of the test images are exact.
         processes: render side by side; the files do not depend on their number.
 
     Raises:
@@ -70,7 +67,7 @@ def write_dataset(
     for part in ("images", "depths") if images else ():
         (folder / part).mkdir()
     if images:
-        write = partial(_write_image, scene, folder, wrong_depths)
+        write = partial(_write_image, scene, folder)
         with _side_by_side(write, len(scene.cameras), processes) as written:
             for _ in progress(range(len(scene.cameras))):
                 next(written)
@@ -79,14 +76,24 @@ def write_dataset(
     return found
 
 
-def _write_image(scene: Scene, folder: Path, wrong_depths: Wrong, camera: int) -> None:
+def _write_image(scene: Scene, folder: Path, camera: int) -> None:
     """Renders one image and writes its files."""
     colors, distances = render(scene, camera)
-    if not scene.cameras.is_test[camera]:
-        distances = wrong_distances(wrong_depths, scene.cameras, camera, distances, scene.seed)
+    Image.fromarray((colors * 255).round().astype(np.uint8)).save(folder / "images" / image_name(camera))
+    write_depths(scene, folder, camera, distances)
+
+
+def write_depths(scene: Scene, folder: Path, camera: int, distances: Colors) -> None:
+    """Writes the depth image of a camera: millimetres along the optical axis, 0 where that is too far.
+
+    Args:
+        scene: whose cameras these are.
+        folder: of the data set.
+        camera: number of the camera.
+        distances: along the rays [H, W], metres.
+    """
     depths = scene.cameras.depths(1000 * distances)
     millimetres = np.where(depths <= MILLIMETRES, depths, 0).round().astype(np.uint16)
-    Image.fromarray((colors * 255).round().astype(np.uint8)).save(folder / "images" / image_name(camera))
     Image.fromarray(millimetres).save(folder / "depths" / image_name(camera))
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mmpi_ns.bench.quality.score import Score
+from mmpi_ns.bench.score import Score
 from mmpi_ns.scripts.bench import entrypoint
 
 
@@ -86,13 +86,14 @@ def see_through(folder: Path, name: str) -> None:
         (lambda folder, name: [p.unlink() for p in folder.iterdir()], "no image is there"),
     ],
 )
-def test_a_mistake_is_one_sentence(harm, said, rendered, scene, tests_of, monkeypatch):
+def test_a_mistake_is_one_sentence(harm, said, rendered, scene, tests_of, monkeypatch, capsys):
     harm(rendered, next(iter(tests_of)))
     words = ["mmpi-bench", "score", "--images", str(rendered), "--data", str(scene), "--lpips", "none"]
     monkeypatch.setattr(sys, "argv", words)
-    with pytest.raises(SystemExit) as error:
+    with pytest.raises(SystemExit) as ended:
         entrypoint()
-    assert said in str(error.value) and str(error.value).startswith("mmpi-bench: ") and "\n" not in str(error.value)
+    error = capsys.readouterr().err.strip()
+    assert ended.value.code == 1 and said in error and error.startswith("mmpi-bench: ") and "\n" not in error
 
 
 def test_folders_that_are_not_there_are_named(rendered, scene, tmp_path):

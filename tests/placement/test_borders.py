@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from procedural import observations_of
+from still_life import still_life
 
 from mmpi_ns.placement.borders import WIDEST, border_points, widened
 from mmpi_ns.placement.rule import PlacementConfig, place
@@ -24,13 +25,13 @@ def holds(mpi: MPIPlan, points: np.ndarray) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def scene():
-    observations = observations_of(make_scene("still-life"), per_camera=30)
+    observations = observations_of(still_life(), per_camera=30)
     return observations, find_visible_points(observations)
 
 
-@pytest.mark.parametrize("name", ["street", "still-life", "look-round"])
-def test_a_plan_holds_the_borders_of_every_image(name):
-    observations = observations_of(make_scene(name), per_camera=30)
+@pytest.mark.parametrize("make", [lambda: make_scene("street"), still_life, lambda: make_scene("look-round")])
+def test_a_plan_holds_the_borders_of_every_image(make):
+    observations = observations_of(make(), per_camera=30)
     plan = place(observations, PlacementConfig())
     points = border_points(observations, find_visible_points(observations))
     assert np.any([holds(m, points) for m in plan.mpis], axis=0).mean() > 0.995

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from procedural import moved, observations_of
+from still_life import still_life
 
 from mmpi_ns.placement.candidates import find_candidates
 from mmpi_ns.placement.errors import WORST, cube_errors, mpi_errors
@@ -47,7 +48,7 @@ def bits(plan: ScenePlan, observations: Observations, config: PlacementConfig = 
 
 
 def test_a_forward_facing_grid_gets_one_mpi_and_no_cube():
-    plan = place(observations_of(make_scene("still-life")), CONFIG)
+    plan = place(observations_of(still_life()), CONFIG)
     assert len(plan.mpis) == 1 and plan.cube is None
 
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from hand_made import samples_to_ndc
+from rays import AHEAD, crossings
 from stability import exact
 from stability.cases import (
     UNIT,
@@ -27,7 +28,7 @@ from stability.cases import (
 )
 from stability.exact import Array
 
-from mmpi_ns.bench.rendering import AHEAD, bundle_of, crossings
+from mmpi_ns.bench.rendering import bundle_of
 from mmpi_ns.scene.geometry import Cube, Frames, cube_hits, plane_hits
 from mmpi_ns.scene.plan import CubePlan, MPIPlan
 

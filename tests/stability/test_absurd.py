@@ -11,12 +11,10 @@ from typing import Any
 
 import pytest
 import torch
+from still_life import still_life
 
-from mmpi_ns.bench.methods import TWO_PHASE, Method
-from mmpi_ns.bench.report import Scene
-from mmpi_ns.bench.trainers import config_of, trainer_of
+from mmpi_ns.bench.trainers import TWO_PHASE, Scene, config_of, train_words, trainer_of
 from mmpi_ns.scene.plan import MPIPlan
-from mmpi_ns.synthetic.catalogue import make_scene
 from mmpi_ns.synthetic.dataset import write_dataset
 from mmpi_ns.training.trainer import MMPITrainer
 
@@ -81,14 +79,14 @@ OPTIONS = (
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
     folder = tmp_path_factory.mktemp("still-life")
-    still = make_scene("still-life", count=IMAGES, width=WIDTH, height=HEIGHT)
+    still = still_life(count=IMAGES, width=WIDTH, height=HEIGHT)
     write_dataset(still, folder, points=150, overwrite=True)
     return folder
 
 
 def train(absurdity: Absurdity, scene: Path, folder: Path) -> MMPITrainer:
     """Trains to the end, or raises."""
-    config = config_of(Method("absurd", "mmpi-small", OPTIONS).words(Scene(scene, 1), folder, STEPS, None, 0, "cpu"))
+    config = config_of(train_words("mmpi-small", OPTIONS, Scene(scene, 1), folder, STEPS, 0, "cpu"))
     if absurdity.change is not None:
         absurdity.change(config, scene)
     if absurdity.mpis is not None:

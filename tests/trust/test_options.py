@@ -130,8 +130,8 @@ OTHER_COMMANDS = [
         ("--width", "0"), ("--height", "-3"), ("--count", "0"), ("--length", "nan"), ("--points", "0"),
         ("--seed", "-1"), ("--noise", "nan"), ("--outliers", "2"),
     )),
-    ("mmpi-bench roads --output {out}", "--steps", "-1"),
-    ("mmpi-bench roads --output {out}", "--threads", "-1"),
+    ("mmpi-bench score --images {out} --data {out} --output {out}", "--test-images", "-1"),
+    ("mmpi-bench gpu --output {out}", "--threads", "-1"),
 ]  # fmt: skip
 
 

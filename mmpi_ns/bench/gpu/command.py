@@ -12,8 +12,8 @@ from mmpi_ns.bench.apart import run_apart
 from mmpi_ns.bench.gpu.parts import run_part
 from mmpi_ns.bench.gpu.quick import run_quick
 from mmpi_ns.bench.gpu.report import markdown
-from mmpi_ns.bench.methods import has_pycolmap
 from mmpi_ns.bench.report import Bench, Report, Row, slug
+from mmpi_ns.bench.trainers import has_pycolmap
 
 SHARES = {"checks": 0.25, "training triton": 0.25, "training torch": 0.2, "kitti": 0.3}
 """The parts in the order in which they run, and their shares of the time; what one leaves, the next ones have."""

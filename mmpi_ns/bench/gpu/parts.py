@@ -21,10 +21,8 @@ from torch import Tensor
 
 from mmpi_ns.bench.apart import Tell
 from mmpi_ns.bench.gpu.checks import run_checks
-from mmpi_ns.bench.methods import JOINT, TWO_PHASE, Method, P
-from mmpi_ns.bench.report import Row, Scene, slug
-from mmpi_ns.bench.speed import ops
-from mmpi_ns.bench.trainers import Steps, median_s
+from mmpi_ns.bench.report import Row, slug
+from mmpi_ns.bench.trainers import JOINT, TWO_PHASE, P, Scene, Steps, median_s, train_words
 from mmpi_ns.model import MMPIModel
 from mmpi_ns.ops import dispatch
 from mmpi_ns.rendering.metrics import ImageMetrics
@@ -54,14 +52,15 @@ def drive(planes: int, rays: int, *more: str) -> tuple[str, ...]:
     return (*place, *JOINT, "--pipeline.datamanager.train-num-rays-per-batch", str(rays), *more)
 
 
-def steps_of(request: Row, name: str, method: Method, steps: int) -> Steps:
+def steps_of(request: Row, name: str, method: str, options: tuple[str, ...], steps: int) -> Steps:
     """A trainer on the benchmark's scene, on a device that holds nothing of an earlier one."""
     gc.collect()
     if torch.cuda.is_available():
         torch.cuda.empty_cache()
         torch.cuda.reset_peak_memory_stats()
     scene = Scene(Path(request["data"]), request["downscale_factor"])
-    return Steps(method.words(scene, Path(request["work"]) / slug(name, "-"), steps, None, 0, request["device"]))
+    folder = Path(request["work"]) / slug(name, "-")
+    return Steps(train_words(method, options, scene, folder, steps, 0, request["device"]))
 
 
 def measure_training(request: Row, tell: Tell) -> Row:
@@ -71,28 +70,31 @@ def measure_training(request: Row, tell: Tell) -> Row:
     options = ["--pipeline.model.ops", "torch" if path == "torch" else "auto"]
     options += ["--pipeline.model.eval-num-rays-per-chunk", "2048" if small else str(1 << 17)]
     options += ["--pipeline.datamanager.keypoint-rays", "4"] if small else []
-    rows, tables, limits = {}, {}, {}
+    rows, limits = {}, {}
     for rays in sizes:
         ends = time.monotonic() + request["seconds"] / len(sizes)
-        method = Method("mmpi", "mmpi", drive(8 if small else 256, rays, *options))
-        steps = steps_of(request, f"{path} {rays}", method, total)
+        steps = steps_of(request, f"{path} {rays}", "mmpi", drive(8 if small else 256, rays, *options), total)
         row = rows[f"{rays} rays"] = train_for(steps, total, ends)
         row["rays_per_s"] = rays * row["late_steps_per_s"]
         if rays == sizes[0]:
             row |= count_launches(steps) if torch.cuda.is_available() else {}
             row |= render_both(steps, path, repeats)
-            limits["copy_gb_per_s"] = ops.copy_rate(device, 1 << (12 if small else 26)) / 1e9
-            limits["matmul_gflop_per_s"] = ops.matmul_rate(device) / 1e9
-            said = f"Each operation of a step of {rays} rays, beside what bandwidth and arithmetic would allow."
-            tables[said] = ops.measure(steps, repeats, limits)["ops"]
+            limits["copy_gb_per_s"] = copy_rate(device, 1 << (12 if small else 26)) / 1e9
         tell(f"{rays} rays: {row}")
         del steps
     first = rows[f"{sizes[0]} rays"]
     names = ("peak_gib", "frame_ms", "full_frame_ms", "psnr_delta_db", "launches_a_step", "waits_a_step")
     head = {"rays_per_s": max(r["rays_per_s"] for r in rows.values()), **{n: first[n] for n in names if n in first}}
     prefix, head = ("torch_", head) if path == "torch" else ("", head | limits)
-    tables = {"`mmpi`, four MPIs by hand, 256 planes, trained together.": rows, **tables}
+    tables = {"`mmpi`, four MPIs by hand, 256 planes, trained together.": rows}
     return {"headline": {prefix + name: value for name, value in head.items()}, "tables": tables}
+
+
+def copy_rate(device: str, size: int) -> float:
+    """Bytes a second of a copy of so many numbers, read and written."""
+    a = torch.ones(size, device=device)
+    b = torch.empty_like(a)
+    return 8 * size / median_s(lambda: b.copy_(a), 5)
 
 
 def time_stages(steps: Steps, stages: list[Any], ends: float, blocks: int) -> dict[Any, list[float]]:
@@ -178,7 +180,7 @@ def measure_kitti(request: Row, tell: Tell) -> Row:
         if small:
             options += (P + "planes", "6", P + "height", "12", P + "width", "12", *TWO_PHASE)
             options += ("--pipeline.datamanager.train-num-rays-per-batch", "16")
-        steps = steps_of(request, f"kitti {reading}", Method("mmpi-kitti", "mmpi-kitti", options), total)
+        steps = steps_of(request, f"kitti {reading}", "mmpi-kitti", options, total)
         row, stages = time_phases(steps, total, ends)
         facts[f"`rays-per-mpi {reading}`"], tables[f"Stages of `rays-per-mpi {reading}`:"] = row, stages
         head |= {f"kitti_{reading}_{n}": row[n] for n in ("steps_per_s", "minutes_of_40000_steps")}

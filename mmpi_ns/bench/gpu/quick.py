@@ -12,9 +12,8 @@ from pathlib import Path
 import torch
 
 from mmpi_ns.bench.gpu.parts import drive
-from mmpi_ns.bench.methods import Method, Scene, no_tracks
 from mmpi_ns.bench.report import Row, processor
-from mmpi_ns.bench.trainers import Steps
+from mmpi_ns.bench.trainers import Scene, Steps, no_tracks, train_words
 from mmpi_ns.ops import dispatch
 
 STEPS = 20
@@ -45,10 +44,9 @@ def try_operations(device: str) -> dict[str, str | None]:
 def time_training(device: str, data: Path, work: Path, rays: int) -> Row:
     """Milliseconds of a step and of a frame of a small street."""
     options = (*drive(64, rays), "--pipeline.datamanager.dense-depth", "False", *no_tracks())
-    method = Method("mmpi-small", "mmpi-small", options)
     with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of others' deprecations
-        steps = Steps(method.words(Scene(data, 1), work, 10 * STEPS, None, 0, device))
+        steps = Steps(train_words("mmpi-small", options, Scene(data, 1), work, 10 * STEPS, 0, device))
         steps.run(2)  # compiles
         seconds = steps.run(STEPS) / STEPS
         frame, pixels = min(steps.render(larger=2) for _ in range(3))

@@ -1,0 +1,101 @@
+"""What all benchmarks share: options of a scene, nerfstudio's commands as a user types them, and figures."""
+
+from __future__ import annotations
+
+import resource
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+from mmpi_ns.bench.apart import environment_of
+from mmpi_ns.bench.report import Bench, Row, commit, processor, read_json
+from mmpi_ns.bench.trainers import Scene
+
+
+@dataclass(kw_only=True)
+class SceneBench(Bench):
+    """Options of benchmarks on one scene."""
+
+    data: Path
+    """The scene (a folder with transforms.json)."""
+    downscale_factor: int = 4
+    """Image size to use."""
+
+    @property
+    def scene(self) -> Scene:
+        return Scene(self.data, self.downscale_factor)
+
+
+def run_command(words: list[str], log: Path, threads: int, **how: Any) -> None:
+    """Runs a command to its end; what it prints goes to a log.
+
+    Raises:
+        ValueError: it failed; names the log.
+    """
+    log.parent.mkdir(parents=True, exist_ok=True)
+    with log.open("w", encoding="utf-8") as stream:
+        ended = subprocess.run(words, stdout=stream, stderr=subprocess.STDOUT, env=environment_of(threads), **how)
+    if ended.returncode:
+        raise ValueError(f"{Path(words[0]).name} failed with status {ended.returncode}: see {log}.")
+
+
+def train_and_evaluate(
+    scene: Scene, folder: Path, method: str, options: Sequence[str], asked: Sequence[str], threads: int
+) -> tuple[Path, dict[str, Any], dict[str, Any]]:
+    """``ns-train`` with some options, and ``ns-eval`` with what is asked, as a user types them; logs are in the folder.
+
+    Returns:
+        The run's folder, the results of ns-eval, and for the row: seconds of training, threads, machine and commit.
+    """
+    train, evaluate = (str(Path(sys.executable).with_name(name)) for name in ("ns-train", "ns-eval"))
+    place = ["--output-dir", str(folder), "--experiment-name", "run", "--timestamp", "1", "--vis", "tensorboard"]
+    size = ["--data", str(scene.data), "nerfstudio-data", "--downscale-factor", str(scene.downscale_factor)]
+    start = time.perf_counter()
+    run_command([train, method, *place, *options, *size], folder / "train.log", threads)
+    seconds = time.perf_counter() - start
+    run, found = folder / "run" / method / "1", folder / "eval.json"
+    words = [evaluate, "--load-config", str(run / "config.yml"), "--output-path", str(found), *asked]
+    run_command(words, folder / "eval.log", threads)
+    made = {"train_seconds": seconds, "threads": threads, "processor": processor(), "commit": commit()}
+    return run, read_json(found)["results"], made | {"date": date.today().isoformat()}
+
+
+def end_helpers(trainer: Any) -> None:
+    """Ends the processes that prepare nerfacto's batches."""
+    for process in getattr(trainer.pipeline.datamanager, "data_procs", []):
+        process.terminate()
+
+
+def peak_gib() -> float:
+    """Most memory that this process has held."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+
+
+def not_run(rows: Mapping[str, Row]) -> str:
+    """A list of what did not run, with the reasons; each once."""
+    lines = dict.fromkeys(f"- {r.get('what', name)}: {r['not_run']}." for name, r in rows.items() if "not_run" in r)
+    return "\n".join(["Not run:", "", *lines]) if lines else ""
+
+
+@contextmanager
+def figure(path: Path, rows: int, columns: int, size: tuple[float, float], **how: Any) -> Iterator[Any]:
+    """Axes [rows, columns] to draw on; written when the block ends, with grids, and legends where there are labels."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    drawing = Figure(figsize=size, layout="constrained")
+    FigureCanvasAgg(drawing)
+    axes = drawing.subplots(rows, columns, squeeze=False, **how)
+    yield axes
+    for axis in axes.flat:
+        axis.grid(alpha=0.3)
+        if axis.get_legend() is None and axis.get_legend_handles_labels()[1]:
+            axis.legend(fontsize=7)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    drawing.savefig(path, dpi=110)

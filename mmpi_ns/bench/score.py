@@ -1,0 +1,167 @@
+"""``mmpi-bench score``: PSNR, SSIM and LPIPS of test images that any program has rendered."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from torch import Tensor
+
+from mmpi_ns.bench.report import Bench, Report, Row, page, table
+from mmpi_ns.capture.checks import check_transforms
+from mmpi_ns.capture.dataset import MMPIDataset
+from mmpi_ns.rendering.metrics import ImageMetrics
+from mmpi_ns.rendering.pipeline import summary
+
+ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
+SAME_DB = 119.0
+"""Images whose PSNR is above this are equal but for rounding (``ImageMetrics`` ends at 120)."""
+PROTOCOL = """\
+PSNR of an image is -10 log10 of the mean squared error over its pixels and colours (0 to 1), SSIM torchmetrics' with
+its defaults, LPIPS torchmetrics' with the network that is named. All are means over the test images."""
+Scores = list[tuple[str, dict[str, float]]]
+"""Name and metrics of each image."""
+
+
+@dataclass
+class Score(Bench):
+    """Scores renderings of a scene's test images, whatever made them, as every other table scores its own.
+
+    A rendering bears the name of its test image, with any ending: frame_00002.png for images/frame_00002.jpg. Other
+    images in the folder are passed over. All pixels count, masked ones too.
+    """
+
+    images: Path
+    """Folder of the renderings."""
+    data: Path
+    """The scene (a folder with transforms.json; its test list is used)."""
+    downscale_factor: int = 1
+    """Size of the test images that were rendered."""
+    test_images: int = 0
+    """Test images, evenly spaced, that are scored; 0 for all."""
+    lpips: Literal["vgg", "alex", "none"] = "vgg"
+    """Network of LPIPS; it is left out where the weights cannot be had."""
+    method: str = ""
+    """Name of what made the images: writes a row into score.json and score.md. Without it the scores are only said."""
+    given: str = ""
+    """What that was given beside the training images, for the row."""
+    seconds: float = 0.0
+    """How long it was trained, for the row."""
+    remark: str = ""
+    """For the row."""
+
+    name = "score"
+
+    def run(self) -> None:
+        truths = test_images_of(self.data, self.downscale_factor)
+        chosen = evenly(len(truths), self.test_images)
+        files = find_renderings(self.images, [truths.image_filenames[i] for i in chosen])
+        metrics = ImageMetrics(self.lpips)
+        found: Scores = []
+        for i, file in zip(chosen, files, strict=True):
+            truth = truths.get_data(i)["image"]
+            if truth.shape[-1] != 3:
+                raise ValueError(f"{truths.image_filenames[i]} is see-through: there is no one truth to compare with.")
+            found.append((truths.image_filenames[i].name, metrics(read_rendering(truths, file, truth), truth)))
+        if min(values["psnr"] for _, values in found) > SAME_DB:
+            raise ValueError(f"{self.images} holds the test images themselves: give the folder of the renderings.")
+        means = {k: float(np.mean([values[k] for _, values in found])) for k in found[0][1]}
+        print(summary(found) + "".join(f", {k} {v:.3f}" for k, v in means.items() if k.startswith("lpips")))
+        print(PROTOCOL)
+        if self.method:
+            self._keep(found, means)
+
+    def _keep(self, found: Scores, means: dict[str, float]) -> None:
+        report = Report(self)
+        scene = f"{self.data.resolve().name} /{self.downscale_factor}"
+        row: Row = {"method": self.method, "scene": scene, "given": self.given, "seconds": self.seconds}
+        row |= {"remark": self.remark, "images": len(found), **means, "each": dict(found)}
+        row |= {"command": report.content["made"]["command"]}
+        report.rows[f"{self.method} on {scene}, {len(found)} images"] = row
+        head = {f"{key}: {k}": r[k] for key, r in report.rows.items() for k in means if k in r}
+        report.finish(head, markdown(report.content))
+
+
+def evenly(count: int, wanted: int) -> list[int]:
+    """``wanted`` of 0 ... count - 1, evenly spaced from half a spacing on; all where 0 or more are wanted."""
+    if wanted <= 0 or wanted >= count:
+        return list(range(count))
+    return [int((i + 0.5) * count / wanted) for i in range(wanted)]
+
+
+def test_images_of(data: Path, downscale_factor: int) -> MMPIDataset:
+    """The images of a scene's test list.
+
+    Raises:
+        ValueError: there is no scene, or one that cannot be used.
+    """
+    if not data.exists():
+        raise ValueError(f"There is no scene at {data}: check the path.")
+    config = NerfstudioDataParserConfig(data=data, downscale_factor=downscale_factor)
+    check_transforms(config, data, ("test",), opens=True)
+    return MMPIDataset(config.setup().get_dataparser_outputs(split="test"))
+
+
+def find_renderings(folder: Path, tests: list[Path]) -> list[Path]:
+    """The rendering of each test image, in their order.
+
+    Raises:
+        ValueError: one is missing, or there twice.
+    """
+    if not folder.is_dir():
+        raise ValueError(f"There is no folder {folder}: give the one that holds the renderings.")
+    by_name: dict[str, list[Path]] = {}
+    for path in sorted(p for p in folder.iterdir() if p.suffix.lower() in ENDINGS):
+        by_name.setdefault(path.stem, []).append(path)
+    missing = [test.stem for test in tests if test.stem not in by_name]
+    if missing:
+        there = f"the first image there is {next(iter(by_name.values()))[0].name}" if by_name else "no image is there"
+        raise ValueError(
+            f"{folder} lacks {len(missing)} of {len(tests)} test images, {missing[0]}.png to begin with ({there}): "
+            "name each rendering as its test image."
+        )
+    for first, *others in (by_name[test.stem] for test in tests):
+        if others:
+            raise ValueError(f"{folder} holds {first.name} and {others[0].name}: keep one of them.")
+    return [by_name[test.stem][0] for test in tests]
+
+
+def read_rendering(tests: MMPIDataset, file: Path, truth: Tensor) -> Tensor:
+    """The rendering of a test image [H, W, 3], from 0 to 1.
+
+    Raises:
+        ValueError: it cannot be read, is see-through, or is not of the size of the truth [H, W, 3].
+    """
+    outputs = replace(tests._dataparser_outputs, image_filenames=[file])
+    pixels = MMPIDataset(outputs).get_numpy_image(0)
+    if pixels.shape[-1] == 4 and pixels[..., 3].min() < 255:
+        raise ValueError(f"{file} is see-through: put it over the background that the test images have.")
+    (height, width), (high, wide) = pixels.shape[:2], truth.shape[:2]
+    if (height, width) != (high, wide):
+        raise ValueError(
+            f"{file} has {width} x {height} pixels and its test image {wide} x {high}: render at that size, or give "
+            "the --downscale-factor that was rendered at."
+        )
+    return torch.from_numpy(pixels[..., :3].astype(np.float32) / 255)
+
+
+def markdown(content: Row) -> str:
+    """The page."""
+    columns = {
+        "method": "{method}",
+        "scene": "{scene}",
+        "was given": "{given}",
+        "training, s": lambda r: f"{r['seconds']:.0f}" if r["seconds"] else "",
+        "test images": "{images}",
+        "PSNR": "{psnr:.2f}",
+        "SSIM": lambda r: f"{r['ssim']:.3f}" if "ssim" in r else "",
+        "LPIPS": lambda r: next((f"{v:.3f} ({k[6:]})" for k, v in r.items() if k.startswith("lpips")), "no weights"),
+        "remark": "{remark}",
+    }
+    rows = list(content["rows"].values())
+    commands = ["Rows were made by:", "\n".join(f"    {r['command']}" for r in rows)]
+    return page("Images rendered by other programs", content["made"], PROTOCOL, table(columns, rows), commands)

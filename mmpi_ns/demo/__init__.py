@@ -1,1 +1,0 @@
-"""Pictures of a trained run: contact sheet, fly-through, PSNR against seconds (``make demo``)."""
