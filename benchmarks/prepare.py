@@ -18,7 +18,7 @@ from captures import Array, Truth, catalogue
 from lab import not_run
 
 from mmpi_ns.bench.report import Bench, Report, Row, commit, page, table
-from mmpi_ns.prepare.alignment import degrees_between, rotation_between, similarity_of_centers
+from mmpi_ns.prepare.alignment import degrees_between, nearest_rotation, rotation_between
 from mmpi_ns.prepare.pipeline import WORK
 from mmpi_ns.scripts.command import run
 
@@ -130,6 +130,22 @@ def pose_errors(centers: Array, rotations: Array, truth: Truth, kept: list[int])
     off = np.linalg.norm(scale * centers @ rotation.T + shift - truth.centers[kept], axis=-1)
     best = rotation_between(rotations, truth.rotations[kept])
     return off, degrees_between(best @ rotations, truth.rotations[kept])
+
+
+def similarity_of_centers(source: Array, target: Array) -> tuple[float, Array, Array]:
+    """Scale, rotation [3, 3] and translation [3] that align points with others in the least-squares sense.
+
+    ``pycolmap.estimate_sim3d`` gives up where all points lie on a plane, as the track of a car does.
+
+    Args:
+        source, target: [N, 3]
+
+    Source: Umeyama, Least-squares estimation of transformation parameters between two point patterns (1991).
+    """
+    a, b = source - source.mean(0), target - target.mean(0)
+    rotation = nearest_rotation(b.T @ a)
+    scale = float((a @ rotation.T * b).sum() / max((a * a).sum(), 1e-24))
+    return scale, rotation, target.mean(0) - scale * rotation @ source.mean(0)
 
 
 def headline(rows: list[Row]) -> Row:

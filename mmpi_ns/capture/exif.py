@@ -40,11 +40,11 @@ def exposure_of(file: Path) -> Exposure | None:
     """
     with Image.open(file) as image:
         tags = image.getexif().get_ifd(ExifTags.IFD.Exif)
-    time, sensitivity, aperture = (_positive(tags.get(tag)) for tag in SHOT[:1] + SHOT[2:3] + SHOT[1:2])
+    time, sensitivity, aperture = (positive_number(tags.get(tag)) for tag in SHOT[:1] + SHOT[2:3] + SHOT[1:2])
     return None if time is None else Exposure(time, sensitivity, aperture)
 
 
-def _positive(value: Any) -> float | None:
+def positive_number(value: Any) -> float | None:
     """A tag's number; None where it is missing, no number, or not positive (0/0 stands for unknown)."""
     try:
         number = float(value[0] if isinstance(value, tuple) else value)

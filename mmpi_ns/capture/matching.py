@@ -1,12 +1,15 @@
-"""Matching of image pairs and triangulation from known poses, by pycolmap, for training and ``mmpi-prepare``."""
+"""Features, matches and triangulation from known poses in one COLMAP database, for training and ``mmpi-prepare``."""
 
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from mmpi_ns.capture.sfm import load_pycolmap
 
@@ -26,6 +29,67 @@ def quiet() -> Iterator[None]:
         yield
     finally:
         log.minloglevel = level
+
+
+def rigid3d(camera_to_world: NDArray[np.float64]) -> Any:
+    """World to camera, as COLMAP has it, of a pose with OpenCV axes. [3, 4] or [4, 4]"""
+    pycolmap, rotation = load_pycolmap(), camera_to_world[:3, :3]
+    return pycolmap.Rigid3d(pycolmap.Rotation3d(rotation.T), -rotation.T @ camera_to_world[:3, 3])
+
+
+def new_model(
+    cameras: Iterable[Any], names: Sequence[str], camera_ids: Sequence[int], poses: Mapping[str, Any] | None = None
+) -> Any:
+    """A reconstruction without points: image i has id i + 1. With poses (by name), only the images that have one."""
+    pycolmap = load_pycolmap()
+    model = pycolmap.Reconstruction()
+    for camera in cameras:
+        model.add_camera_with_trivial_rig(camera)
+    for i, (name, camera_id) in enumerate(zip(names, camera_ids, strict=True)):
+        image = pycolmap.Image(name=name, camera_id=camera_id, image_id=i + 1)
+        if poses is None:
+            model.add_image_with_trivial_frame(image)
+        elif name in poses:
+            model.add_image_with_trivial_frame(image, poses[name])
+    return model
+
+
+def write_images(model: Any, database: Path) -> None:
+    """Writes cameras and images of a model to a new database; features keep these ids, whatever the threads do."""
+    with load_pycolmap().Database.open(database) as opened:
+        for _, camera in sorted(model.cameras.items()):
+            opened.write_camera(camera, use_camera_id=True)
+        for _, rig in sorted(model.rigs.items()):
+            opened.write_rig(rig, use_rig_id=True)
+        for _, image in sorted(model.images.items()):
+            opened.write_frame(model.frames[image.frame_id], use_frame_id=True)
+            opened.write_image(image, use_image_id=True)
+
+
+def find_features(database: Path, images: Path, names: Sequence[str], options: Any, masks: Path | None = None) -> None:
+    """SIFT features of images that the database lists; images that have theirs are skipped.
+
+    Args:
+        database: gets keypoints and descriptors.
+        images: folder of the images.
+        names: of the images, below the folder.
+        options: pycolmap.FeatureExtractionOptions.
+        masks: folder of masks (``NAME.png``): no features where they are black.
+    """
+    pycolmap = load_pycolmap()
+    reader = pycolmap.ImageReaderOptions()
+    if masks is not None:
+        reader.mask_path = masks
+    pycolmap.extract_features(
+        database, images, image_names=list(names), reader_options=reader, extraction_options=options
+    )
+
+
+def count_features(database: Path) -> list[int | None]:
+    """Number of features of each image by id; None of an image that could not be read."""
+    with load_pycolmap().Database.open(database) as opened:
+        ids = sorted(image.image_id for image in opened.read_all_images())
+        return [opened.num_keypoints_for_image(i) if opened.exists_keypoints(i) else None for i in ids]
 
 
 def match_pairs(
@@ -65,3 +129,19 @@ def triangulate_points(
     options.ba_refine_focal_length = options.ba_refine_principal_point = options.ba_refine_extra_params = False
     with tempfile.TemporaryDirectory(prefix="mmpi-points-") as unread:
         return pycolmap.triangulate_points(model, database, images, unread, clear_points=True, options=options)
+
+
+def epipolar_distances(
+    model: Any, first: int, second: int, rays: tuple[NDArray[np.float64], NDArray[np.float64]]
+) -> NDArray[np.float64]:
+    """Sampson distances of matches from the epipolar lines of two images' poses, over the focal length. [M]
+
+    Args:
+        model: poses and cameras.
+        first, second: ids of the images.
+        rays: matched keypoints of each image in the plane z = 1. [M, 2]
+    """
+    pycolmap = load_pycolmap()
+    relative = model.images[second].cam_from_world() * model.images[first].cam_from_world().inverse()
+    essential = pycolmap.essential_matrix_from_pose(relative)
+    return np.sqrt(pycolmap.compute_squared_sampson_error(*rays, essential))

@@ -48,7 +48,7 @@ def parse_camera(values: Sequence[float], fisheye: bool) -> Intrinsics:
     return Intrinsics(*values[:4], distortion=lens, fisheye=fisheye)  # type: ignore[arg-type]
 
 
-def share(photos: Sequence[Photo], sharing: Sharing, given: dict[str, Intrinsics]) -> list[int]:
+def share(photos: Sequence[Photo], sharing: Sharing, lenses: dict[str, Intrinsics]) -> list[int]:
     """Camera of each image, numbered from 1: images of one size, lens and given intrinsics share one.
 
     Raises:
@@ -62,19 +62,19 @@ def share(photos: Sequence[Photo], sharing: Sharing, given: dict[str, Intrinsics
         raise PrepareError(f"--intrinsics shared, but the images are of different sizes ({listed}): use auto.")
     numbers: dict[Any, int] = {}
     lens = "" if sharing == "shared" else None
-    keys = [(p.width, p.height, p.lens if lens is None else lens, given.get(p.name)) for p in photos]
+    keys = [(p.width, p.height, p.lens if lens is None else lens, lenses.get(p.name)) for p in photos]
     return [numbers.setdefault(key, len(numbers) + 1) for key in keys]
 
 
 def make_cameras(
-    photos: Sequence[Photo], numbers: Sequence[int], given: dict[str, Intrinsics], focal: float | None, lens: Lens
+    photos: Sequence[Photo], numbers: Sequence[int], lenses: dict[str, Intrinsics], focal: float | None, lens: Lens
 ) -> list[pycolmap.Camera]:
     """One pycolmap camera for each number, from given intrinsics, else from EXIF, else guessed.
 
     Args:
         photos: the images.
         numbers: camera of each image.
-        given: known intrinsics by image name.
+        lenses: known intrinsics by image name.
         focal: focal length in pixels, from the command line.
         lens: distortion model if none is given.
     """
@@ -82,25 +82,20 @@ def make_cameras(
     for photo, number in zip(photos, numbers, strict=True):
         if number in cameras:
             continue
-        size = {"width": photo.width, "height": photo.height, "camera_id": number}
-        known = given.get(photo.name)
-        if known is not None:
-            cameras[number] = pycolmap.Camera(**size, **_known_model(known))
+        intrinsics = lenses.get(photo.name)
+        if intrinsics is not None:
+            params = [intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy]
+            is_bent = intrinsics.fisheye or any(intrinsics.distortion)
+            model = "OPENCV_FISHEYE" if intrinsics.fisheye else "OPENCV" if is_bent else "PINHOLE"
+            params += intrinsics.distortion if is_bent else ()
+            size = {"width": photo.width, "height": photo.height, "camera_id": number}
+            cameras[number] = pycolmap.Camera(model=model, params=params, **size)
         else:
             model = MODELS["radial" if lens == "auto" and focal is None else "pinhole" if lens == "auto" else lens]
             guess = focal or photo.exif_focal or GUESSED_FOCAL * max(photo.width, photo.height)
             cameras[number] = pycolmap.Camera.create_from_model_name(number, model, guess, photo.width, photo.height)
-        cameras[number].has_prior_focal_length = bool(known or focal or photo.exif_focal)
+        cameras[number].has_prior_focal_length = bool(intrinsics or focal or photo.exif_focal)
     return [cameras[n] for n in sorted(cameras)]
-
-
-def _known_model(known: Intrinsics) -> dict[str, Any]:
-    params = [known.fx, known.fy, known.cx, known.cy]
-    if known.fisheye:
-        return {"model": "OPENCV_FISHEYE", "params": [*params, *known.distortion]}
-    if any(known.distortion):
-        return {"model": "OPENCV", "params": [*params, *known.distortion]}
-    return {"model": "PINHOLE", "params": params}
 
 
 def read_intrinsics(camera: pycolmap.Camera) -> Intrinsics:

@@ -12,14 +12,12 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from mmpi_ns.prepare.alignment import degrees_between
+from mmpi_ns.prepare.adjustment import WIDE, adjust, focal_in_words, with_fewer_points
+from mmpi_ns.prepare.alignment import Array, degrees_between
 from mmpi_ns.prepare.evidence import local_median
 from mmpi_ns.prepare.images import in_short
-from mmpi_ns.prepare.mapping import adjust, bundle_options, is_bent
-from mmpi_ns.prepare.polish import with_fewer_points
-from mmpi_ns.prepare.stages import PrepareError
+from mmpi_ns.prepare.mapping import is_bent
 
-Array = NDArray[np.float64]
 SIDE = 640
 """Longer side, in pixels, at which sharpness is measured."""
 BLURRED = 0.4
@@ -77,18 +75,6 @@ def sharpness(gray: NDArray[np.uint8]) -> float:
     return float(cv2.Laplacian(values, cv2.CV_32F).var() / max(float(values.var()), 1.0))
 
 
-def read_gray(path: Path) -> NDArray[np.uint8]:
-    """Gray image.
-
-    Raises:
-        PrepareError: the file cannot be read.
-    """
-    gray = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-    if gray is None:
-        raise PrepareError(f"{path.name} cannot be read: repair or remove it.")
-    return gray  # type: ignore[return-value]
-
-
 def blurred(names: Sequence[str], sharp: Array, ordered: bool) -> list[Finding]:
     """Images much less sharp than their neighbours (or than all others, if the images are not in order)."""
     usual = local_median(sharp, 7) if ordered else np.full(len(sharp), np.median(sharp))
@@ -116,15 +102,21 @@ def misplaced(names: Sequence[str], places: Sequence[int], poses: Array) -> list
     turns = degrees_between(poses[1:, :3, :3], poses[:-1, :3, :3]) / gaps
     usual_step, usual_turn = local_median(steps, 5), local_median(turns, 5)
     floor = 0.05 * float(np.median(steps))
-    found = []
+    findings = []
     for i in range(len(steps)):
         where = f"between {names[i]} and {names[i + 1]}"
         if steps[i] > JUMP * usual_step[i] + floor:
             times = steps[i] / max(usual_step[i], 1e-12)
-            found.append(Finding("misplaced?", names[i + 1], f"a step of {times:.0f} usual ones {where}", times))
+            findings.append(Finding("misplaced?", names[i + 1], f"a step of {times:.0f} usual ones {where}", times))
         elif turns[i] > JUMP * usual_turn[i] + TURN:
-            found.append(Finding("misplaced?", names[i + 1], f"a turn of {turns[i]:.0f} degrees {where}", turns[i]))
-    return found
+            findings.append(Finding("misplaced?", names[i + 1], f"a turn of {turns[i]:.0f} degrees {where}", turns[i]))
+    return findings
+
+
+def cells(points: Array, camera: pycolmap.Camera) -> NDArray[np.int64]:
+    """Number of the cell of each pixel position in the grid of an image. [N]"""
+    place = np.clip(points / [camera.width, camera.height], 0, 1 - 1e-9) * CELLS[::-1]
+    return place[:, 1].astype(int) * CELLS[1] + place[:, 0].astype(int)
 
 
 def coverage(model: pycolmap.Reconstruction) -> dict[str, float]:
@@ -132,21 +124,9 @@ def coverage(model: pycolmap.Reconstruction) -> dict[str, float]:
     shares = {}
     for i in model.reg_image_ids():
         image = model.images[i]
-        camera = model.cameras[image.camera_id]
         seen = np.array([p.xy for p in image.points2D if p.has_point3D()]).reshape(-1, 2)
-        shares[image.name] = float(_cell_counts(seen, camera.width, camera.height).astype(bool).mean())
+        shares[image.name] = len(np.unique(cells(seen, model.cameras[image.camera_id]))) / (CELLS[0] * CELLS[1])
     return shares
-
-
-def _cells(points: Array, width: int, height: int) -> NDArray[np.int64]:
-    """Number of the cell of each pixel position. [N]"""
-    rows, columns = CELLS
-    row = np.clip(points[:, 1] / height * rows, 0, rows - 1).astype(int)
-    return row * columns + np.clip(points[:, 0] / width * columns, 0, columns - 1).astype(int)
-
-
-def _cell_counts(points: Array, width: int, height: int) -> NDArray[np.int64]:
-    return np.bincount(_cells(points, width, height), minlength=CELLS[0] * CELLS[1])
 
 
 def moving(model: pycolmap.Reconstruction, database: Path, names: Sequence[str]) -> list[Finding]:
@@ -154,74 +134,76 @@ def moving(model: pycolmap.Reconstruction, database: Path, names: Sequence[str])
 
     Motion along the epipolar line (a car driving ahead) is not detected.
     """
-    by_name = {model.images[i].name: i for i in model.reg_image_ids()}
-    found = []
+    by_name, findings = {model.images[i].name: i for i in model.reg_image_ids()}, []
     with pycolmap.Database.open(database) as opened:
         for name, after in pairwise(names):
             pair = by_name[name], by_name[after]
-            if not opened.exists_matches(*pair):
-                continue
-            matches = np.asarray(opened.read_matches(*pair)).astype(int)
+            matches = np.asarray(opened.read_matches(*pair)) if opened.exists_matches(*pair) else np.zeros((0, 2))
             if len(matches) < 30:
                 continue
-            share = _moving_share(model, pair, matches)
+            share = len(moving_cells(model, pair, matches.astype(int))) / (CELLS[0] * CELLS[1])
             if share >= LEAST_CELLS / (CELLS[0] * CELLS[1]):
                 says = f"{share:.0%} of the image's cells do not follow the camera's motion: mask it (--masks)"
-                found.append(Finding("moving?", name, says, share))
-    return found
+                findings.append(Finding("moving?", name, says, share))
+    return findings
 
 
-def _moving_share(model: pycolmap.Reconstruction, pair: tuple[int, int], matches: NDArray[np.int64]) -> float:
-    """Share of the first image's cells where most of at least six matches are off their epipolar lines, alike."""
+def moving_cells(model: pycolmap.Reconstruction, pair: tuple[int, int], matches: NDArray[np.int64]) -> list[int]:
+    """Cells of the first image where most of at least six matches are off their epipolar lines, alike."""
     images = [model.images[i] for i in pair]
     cameras = [model.cameras[image.camera_id] for image in images]
     pixels = [np.array([p.xy for p in image.points2D])[matches[:, k]] for k, image in enumerate(images)]
     rays = [np.c_[c.cam_from_img(p), np.ones(len(p))] for c, p in zip(cameras, pixels, strict=True)]
     relative = images[1].cam_from_world() * images[0].cam_from_world().inverse()
-    essential = pycolmap.essential_matrix_from_pose(relative)
-    lines = rays[0] @ essential.T
+    lines = rays[0] @ pycolmap.essential_matrix_from_pose(relative).T
     off = np.abs((lines * rays[1]).sum(-1)) / np.maximum(np.linalg.norm(lines[:, :2], axis=-1), 1e-12)
-    bad = off * cameras[1].mean_focal_length() * SIDE / cameras[1].width > MOVED_PX
-    cell = _cells(pixels[0], cameras[0].width, cameras[0].height)
-    flow = pixels[1] - pixels[0]
-    count = 0
-    for number in np.unique(cell[bad]):
-        own = cell == number
-        if own.sum() >= 6 and bad[own].mean() > 0.6:
-            spread = np.median(np.abs(flow[own & bad] - np.median(flow[own & bad], axis=0)), axis=0)
-            # wrong matches point everywhere; a moving object moves as one
-            count += int(spread.max() < 0.01 * cameras[0].width)
-    return count / (CELLS[0] * CELLS[1])
+    is_off = off * cameras[1].mean_focal_length() * SIDE / cameras[1].width > MOVED_PX
+    cell, flow, moved = cells(pixels[0], cameras[0]), pixels[1] - pixels[0], []
+    for number in np.unique(cell[is_off]):
+        inside = cell == number
+        if inside.sum() >= 6 and is_off[inside].mean() > 0.6:
+            some = flow[inside & is_off]
+            spread = np.median(np.abs(some - np.median(some, axis=0)), axis=0)
+            if spread.max() < 0.01 * cameras[0].width:  # wrong matches point everywhere; a moving object moves as one
+                moved.append(int(number))
+    return moved
 
 
-def doubtful_intrinsics(model: pycolmap.Reconstruction, fixed: bool, threads: int) -> list[Finding]:
+def doubtful_intrinsics(
+    model: pycolmap.Reconstruction, is_fixed: bool, focal: tuple[float, float] | None, threads: int
+) -> list[Finding]:
     """Models, focal lengths and lenses that do not fit.
 
     Args:
         model: the final model.
-        fixed: intrinsics were given and kept; they are refined in a copy and compared.
+        is_fixed: intrinsics were given and kept; they are refined in a copy and compared.
+        focal: the interval of the focal length in pixels, where it was refined.
         threads: CPU threads; below 1 for all.
     """
-    found = []
+    findings = []
+    if focal is not None and focal[1] - focal[0] >= WIDE * focal[1]:
+        says = f"the images hardly determine the focal length ({focal_in_words(*focal)})"
+        findings.append(Finding("intrinsics?", "", f"{says}: give --focal if you know it"))
     if is_bent(model):
         error = model.compute_mean_reprojection_error()
-        found.append(Finding("bent?", "", f"a reprojection error of {error:.2f} px is high: the track may be wrong"))
-    if fixed:
+        findings.append(Finding("bent?", "", f"a reprojection error of {error:.2f} px is high: the track may be wrong"))
+    if is_fixed:
         free = with_fewer_points(model)
         before = free.compute_mean_reprojection_error()
-        adjust(free, bundle_options(True, True, False, threads, robust=True))
+        adjust(free, threads, lens=True)
         after = free.compute_mean_reprojection_error()
         for number, camera in model.cameras.items():
-            given, fits = camera.mean_focal_length(), free.cameras[number].mean_focal_length()
-            doubted, grave = (
-                abs(fits / given - 1) > off and after < helps * before
+            fixed, fitted = camera.mean_focal_length(), free.cameras[number].mean_focal_length()
+            is_doubtful, is_grave = (
+                abs(fitted / fixed - 1) > off and after < helps * before
                 for off, helps in zip(FOCAL_OFF, FOCAL_HELPS, strict=True)
             )
-            if doubted:
-                says = f"the given focal length {given:.1f} px does not fit: {fits:.1f} px would bring the error"
-                found.append(Finding("intrinsics?", "", f"{says} from {before:.2f} to {after:.2f} px", is_grave=grave))
+            if is_doubtful:
+                says = f"the given focal length {fixed:.1f} px does not fit: {fitted:.1f} px would bring the error"
+                says = f"{says} from {before:.2f} to {after:.2f} px"
+                findings.append(Finding("intrinsics?", "", says, is_grave=is_grave))
     for camera in model.cameras.values():
         ratio = camera.mean_focal_length() / max(camera.width, camera.height)
         if not 0.3 < ratio < 4:
-            found.append(Finding("intrinsics?", "", f"a focal length of {ratio:.2f} image sides is unusual"))
-    return found
+            findings.append(Finding("intrinsics?", "", f"a focal length of {ratio:.2f} image sides is unusual"))
+    return findings

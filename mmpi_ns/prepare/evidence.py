@@ -7,21 +7,28 @@ lines of the two poses, also separately for the pairs across each gap between tw
 both sides of a gap are triangulated twice, from either side alone: if the scale changes, the two differ. The results of
 two different mappers are compared as well.
 
-Pure functions of numpy arrays; ``collect.py`` reads these from a model.
+All but ``witness_of``, which reads a model and its database, are pure functions of numpy arrays.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
+import pycolmap
 from numpy.typing import NDArray
 
-from mmpi_ns.prepare.alignment import degrees_between, rotation_between, similarity_matrix
+from mmpi_ns.capture.matching import MIN_INLIERS, epipolar_distances
+from mmpi_ns.prepare.alignment import Array, camera_poses, degrees_between, rotation_between, similarity_between
 
-Array = NDArray[np.float64]
 Places = NDArray[np.int64]
+
+FIT_PX = 2.0
+"""Sampson distance, in pixels of an image side of 1,000, up to which a match lies on its epipolar line."""
+BESIDE = 4.0
+"""Multiple of that distance up to which a match lies beside its line."""
 
 REACH = 12
 """Maximum frame distance of pairs used for a gap; pairs farther apart have few matches, most of them wrong."""
@@ -87,6 +94,68 @@ class Agreement:
     """Distances of the centres, relative to the extent of the track. [N]"""
     turns: Array
     """Degrees between the rotations. [N]"""
+
+
+def witness_of(name: str, model: pycolmap.Reconstruction, database: Path, offered: Sequence[str]) -> Witness:
+    """The evidence on a mapper's model.
+
+    Args:
+        name: of the mapper.
+        model: poses and points, with the keypoints of the database.
+        database: verified matches.
+        offered: names of all images given, in order.
+    """
+    names, poses = camera_poses(model)
+    images = [model.images[i] for i in sorted(model.reg_image_ids())]
+    points = {  # the point that each keypoint sees, -1 for none
+        image.image_id: np.array([p.point3D_id if p.has_point3D() else -1 for p in image.points2D], dtype=np.int64)
+        for image in images
+    }
+    rays, observations = {}, []  # rays in the camera, with z = 1
+    for place, (image, pose) in enumerate(zip(images, poses, strict=True)):
+        pixels = np.array([p.xy for p in image.points2D], dtype=np.float64).reshape(-1, 2)
+        rays[image.image_id] = np.asarray(model.cameras[image.camera_id].cam_from_img(pixels)).reshape(-1, 2)
+        seen = points[image.image_id]
+        directions = np.c_[rays[image.image_id], np.ones(len(seen))][seen >= 0] @ pose[:3, :3].T
+        directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+        center = np.tile(pose[:3, 3], (len(directions), 1))
+        observations.append((seen[seen >= 0], np.full(len(directions), place), center, directions))
+    points_seen, frames, centers, directions = (np.concatenate(column) for column in zip(*observations, strict=True))
+    camera, order = model.cameras[images[0].camera_id], {image: i for i, image in enumerate(offered)}
+    return Witness(
+        name,
+        names,
+        np.array([order[n] for n in names], dtype=np.int64),
+        poses,
+        _pair_evidence(model, database, points, rays),
+        camera.mean_focal_length() / max(camera.width, camera.height),
+        model.compute_mean_reprojection_error(),
+        scale_changes(points_seen, frames, centers, directions, len(names)),
+    )
+
+
+def _pair_evidence(
+    model: pycolmap.Reconstruction, database: Path, points: dict[int, Places], rays: dict[int, Array]
+) -> Pairs:
+    """For every verified pair of registered images, how many matches became points and how well they fit the poses."""
+    place = {image_id: i for i, image_id in enumerate(sorted(points))}
+    rows: list[tuple[int, ...]] = []
+    with pycolmap.Database.open(database) as opened:
+        numbers, geometries = opened.read_two_view_geometries()
+    for number, geometry in zip(numbers, geometries, strict=True):
+        a, b = pycolmap.pair_id_to_image_pair(number)
+        if a not in place or b not in place or len(geometry.inlier_matches) < MIN_INLIERS:
+            continue
+        left, right = np.asarray(geometry.inlier_matches).astype(int).T
+        tracked = (points[a][left] == points[b][right]) & (points[a][left] >= 0)
+        camera = model.cameras[model.images[a].camera_id]
+        fit = FIT_PX * max(camera.width, camera.height) / 1000 / camera.mean_focal_length()
+        distance = epipolar_distances(model, a, b, (rays[a][left], rays[b][right])) / fit
+        fitting, beside = int((distance < 1).sum()), int(((distance >= 1) & (distance < BESIDE)).sum())
+        rows.append((place[a], place[b], len(left), int(tracked.sum()), fitting, beside))
+    table = np.array(rows, dtype=np.int64).reshape(-1, 6)
+    low, high = table[:, :2].min(1, initial=len(place)), table[:, :2].max(1, initial=0)
+    return Pairs(low, high, *table[:, 2:].T.astype(np.float64))
 
 
 def share(part: Array, whole: Array) -> float:
@@ -169,8 +238,8 @@ def scale_changes(points: Places, frames: Places, centers: Array, rays: Array, c
     last = last[((before[0] * before[1]).sum(-1) < wide) & ((after[0] * after[1]).sum(-1) < wide)]
 
     def distance(start: Places, end: Places) -> Array:
-        found = sums[end] - sums[start]
-        at = np.linalg.solve(found[:, :, :3], found[:, :, 3:])[..., 0]
+        terms = sums[end] - sums[start]
+        at = np.linalg.solve(terms[:, :, :3], terms[:, :, 3:])[..., 0]
         return ((at - centers[last]) * rays[last]).sum(-1)
 
     pair = distance(first[last], last + 1), distance(last + 1, stop[last])
@@ -178,10 +247,10 @@ def scale_changes(points: Places, frames: Places, centers: Array, rays: Array, c
     change, left, right = np.log(pair[1][seen] / pair[0][seen]), frames[last[seen]], frames[last[seen] + 1]
     result = np.full(max(count - 1, 0), np.nan)
     for gap in range(len(result)):
-        own = change[(left <= gap) & (right > gap)]
-        if len(own) >= LEAST_POINTS:
-            middle = float(np.median(own))
-            error = 1.48 * float(np.median(np.abs(own - middle))) / np.sqrt(len(own))
+        across_gap = change[(left <= gap) & (right > gap)]
+        if len(across_gap) >= LEAST_POINTS:
+            middle = float(np.median(across_gap))
+            error = 1.48 * float(np.median(np.abs(across_gap - middle))) / np.sqrt(len(across_gap))
             result[gap] = np.sign(middle) * max(abs(middle) - 3 * error, 0.0)
     return result
 
@@ -224,8 +293,8 @@ def agreement(one: Witness, other: Witness) -> Agreement | None:
     if len(common) < 3:
         return None
     a, b = (w.poses[[list(w.images).index(n) for n in common]] for w in (one, other))
-    scale, rotation, translation = similarity_matrix(a, b)
-    moved = scale * a[:, :3, 3] @ rotation.T + translation
+    similarity = similarity_between(a, b).matrix()
+    moved = a[:, :3, 3] @ similarity[:, :3].T + similarity[:, 3]
     extent = max(float(np.linalg.norm(np.ptp(b[:, :3, 3], axis=0))), 1e-12)
     turns = degrees_between(rotation_between(a[:, :3, :3], b[:, :3, :3]) @ a[:, :3, :3], b[:, :3, :3])
     return Agreement(common, np.linalg.norm(moved - b[:, :3, 3], axis=-1) / extent, turns)

@@ -1,11 +1,12 @@
-"""The scene as nerfstudio-data and mmpi read it: transforms.json, points, COLMAP model, images, masks."""
+"""The scene as nerfstudio-data and mmpi read it: transforms.json, points, COLMAP model, images, masks; undistortion."""
 
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,15 +15,18 @@ import pycolmap
 from PIL import Image
 
 from mmpi_ns.capture.exif import kept_tags
-from mmpi_ns.prepare.cameras import Intrinsics, read_intrinsics
-from mmpi_ns.prepare.frame import camera_poses
+from mmpi_ns.capture.matching import quiet
+from mmpi_ns.prepare.alignment import camera_poses
+from mmpi_ns.prepare.cameras import read_intrinsics
 from mmpi_ns.prepare.images import Photo
 from mmpi_ns.prepare.stages import PrepareError, progress, whole, write_text
 
 IDENTITY = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]]
 """Written explicitly: without it, nerfstudio-data assumes an axis swap if colmap/sparse/0 exists."""
-SCENE_PARTS = ("images", "masks", "colmap", "sparse_pc.ply", "report.md", "report", "transforms.json")
-"""The parts of a scene besides downscaled copies; transforms.json last, as the mark of a complete scene."""
+PART = re.compile(r"(images|masks)(_\d+)?|colmap|sparse_pc\.ply|report\.md|report|transforms\.json")
+"""The parts of a scene."""
+QUALITY = 97
+"""Of JPEG."""
 
 
 @dataclass(frozen=True)
@@ -65,38 +69,42 @@ def split_from(lists: dict[str, Any], names: Sequence[str], source: str) -> Spli
     """
     sides = []
     for key in ("train_filenames", "test_filenames"):
-        wanted = {Path(str(n)).name for n in lists[key]}
-        sides.append(tuple(n for n in names if n in wanted))
+        listed = {Path(str(n)).name for n in lists[key]}
+        sides.append(tuple(n for n in names if n in listed))
         if not sides[-1]:
-            raise PrepareError(f"None of the {len(wanted)} {key} of {source} is among the registered images.")
+            raise PrepareError(f"None of the {len(listed)} {key} of {source} is among the registered images.")
     return Split(sides[0], sides[1], f"as listed in {source}")
 
 
-def check_fisheye(lenses: Sequence[Intrinsics]) -> None:
-    if len({lens.fisheye for lens in lenses}) > 1:
-        raise PrepareError("Fisheye and perspective lenses in one scene: prepare them separately, or with --undistort.")
-
-
 def transforms(model: pycolmap.Reconstruction, split: Split, masks: bool, notes: dict[str, Any]) -> dict[str, Any]:
-    """transforms.json for the registered images. Intrinsics are at the top level if all images share them."""
-    lenses = {n: read_intrinsics(c) for n, c in model.cameras.items()}
-    check_fisheye(list(lenses.values()))
-    entries = {n: _camera_entry(lenses[n], model.cameras[n]) for n in lenses}
-    names, poses = camera_poses(model)
-    shared = len(entries) == 1
+    """transforms.json for the registered images. Intrinsics are at the top level if all images share them.
+
+    Raises:
+        PrepareError: nerfstudio-data reads no scene with these lenses.
+    """
+    lenses = {number: read_intrinsics(camera) for number, camera in model.cameras.items()}
+    if len({lens.fisheye for lens in lenses.values()}) > 1:
+        raise PrepareError("Fisheye and perspective lenses in one scene: prepare them separately, or with --undistort.")
+    is_fisheye = any(lens.fisheye for lens in lenses.values())
+    keys = ("k1", "k2", "k3", "k4") if is_fisheye else ("k1", "k2", "p1", "p2")
+    entries: dict[int, dict[str, Any]] = {}
+    for number, lens in lenses.items():
+        size = {"w": model.cameras[number].width, "h": model.cameras[number].height}
+        entry = {"fl_x": lens.fx, "fl_y": lens.fy, "cx": lens.cx, "cy": lens.cy, **size}
+        entries[number] = entry | dict(zip(keys, lens.distortion, strict=True))
+    is_shared = len(entries) == 1
+    camera_of = {image.name: image.camera_id for image in model.images.values()}
     frames = []
-    by_name = {image.name: image for image in model.images.values()}
-    for name, pose in sorted(zip(names, poses, strict=True), key=lambda pair: pair[0]):
+    for name, pose in sorted(zip(*camera_poses(model), strict=True), key=lambda pair: pair[0]):
         frame: dict[str, Any] = {"file_path": f"images/{name}"}
         if masks:
-            frame["mask_path"] = f"masks/{mask_name(name)}"
-        frame |= {} if shared else entries[by_name[name].camera_id]
+            frame["mask_path"] = f"masks/{Path(name).stem}.png"
+        frame |= {} if is_shared else entries[camera_of[name]]
         frames.append({**frame, "transform_matrix": (pose @ np.diag([1.0, -1.0, -1.0, 1.0])).tolist()})
-    fisheye = any(lens.fisheye for lens in lenses.values())
     test = [f"images/{n}" for n in split.test]
     return {
-        "camera_model": "OPENCV_FISHEYE" if fisheye else "OPENCV",
-        **(next(iter(entries.values())) if shared else {}),
+        "camera_model": "OPENCV_FISHEYE" if is_fisheye else "OPENCV",
+        **(next(iter(entries.values())) if is_shared else {}),
         "frames": frames,
         "train_filenames": [f"images/{n}" for n in split.train],
         "val_filenames": test,
@@ -107,45 +115,29 @@ def transforms(model: pycolmap.Reconstruction, split: Split, masks: bool, notes:
     }
 
 
-def mask_name(image_name: str) -> str:
-    return Path(image_name).stem + ".png"
-
-
-def _camera_entry(lens: Intrinsics, camera: pycolmap.Camera) -> dict[str, Any]:
-    keys = ("k1", "k2", "k3", "k4") if lens.fisheye else ("k1", "k2", "p1", "p2")
-    entry: dict[str, Any] = {"fl_x": lens.fx, "fl_y": lens.fy, "cx": lens.cx, "cy": lens.cy}
-    entry |= {"w": camera.width, "h": camera.height}
-    return entry | dict(zip(keys, lens.distortion, strict=True))
-
-
-def write_images(source: Path, photos: Sequence[Photo], scene: Path, factors: Sequence[int]) -> None:
-    """Images and their downscaled copies. Complete copies are kept."""
+def write_images(
+    images: Path, masks: Path | None, photos: Sequence[Photo], scene: Path, factors: Sequence[int]
+) -> None:
+    """Images, masks under the stems of their images, and downscaled copies of both. Complete files are kept."""
     with progress("Writing images", len(photos)) as advance:
         for photo in photos:
-            copy_once(source / photo.name, scene / "images" / photo.name)
-            for factor in factors:
-                downscale(scene / "images" / photo.name, scene / f"images_{factor}" / photo.name, factor)
+            files = [(images / photo.name, "images", photo.name)]
+            files += [(masks / f"{photo.name}.png", "masks", f"{Path(photo.name).stem}.png")] if masks else []
+            for source, folder, name in files:
+                target = scene / folder / name
+                if not target.exists():
+                    with whole(target) as partial:
+                        shutil.copyfile(source, partial)
+                for factor in factors:
+                    downscale(target, scene / f"{folder}_{factor}" / name, factor, mask=folder == "masks")
             advance(1)
 
 
-def write_masks(source: Path, photos: Sequence[Photo], scene: Path, factors: Sequence[int]) -> None:
-    """Masks under the stems of their images, and downscaled: a pixel that contains a masked one is masked."""
-    for photo in photos:
-        mask = scene / "masks" / mask_name(photo.name)
-        copy_once(source / f"{photo.name}.png", mask)
-        for factor in factors:
-            downscale(mask, scene / f"masks_{factor}" / mask.name, factor, mask=True)
-
-
-def copy_once(source: Path, target: Path) -> None:
-    if target.exists():
-        return
-    with whole(target) as partial:
-        shutil.copyfile(source, partial)
-
-
 def downscale(source: Path, target: Path, factor: int, mask: bool = False) -> None:
-    """Box-filtered copy of floor(size / factor) pixels, cut at the far edges so that cameras scale by 1 / factor."""
+    """Box-filtered copy of floor(size / factor) pixels, cut at the far edges so that cameras scale by 1 / factor.
+
+    A pixel of a mask that contains a masked one is masked. JPEG is written at high quality.
+    """
     if target.exists():
         return
     with Image.open(source) as image:
@@ -157,17 +149,12 @@ def downscale(source: Path, target: Path, factor: int, mask: bool = False) -> No
             small = Image.fromarray(blocks.min((1, 3)))
         else:
             small = image.reduce(factor)
-    save_like(small, target, tags)
-
-
-def save_like(image: Image.Image, target: Path, tags: Image.Exif) -> None:
-    """Writes an image with its EXIF atomically, JPEG at high quality."""
     with whole(target) as partial:
         if target.suffix.lower() == ".png":
-            image.save(partial, format="PNG", exif=tags)
+            small.save(partial, format="PNG", exif=tags)
         else:
-            image = image.convert("L" if image.mode == "L" else "RGB")
-            image.save(partial, format="JPEG", quality=97, subsampling=0, exif=tags)
+            small = small.convert("L" if small.mode == "L" else "RGB")
+            small.save(partial, format="JPEG", quality=QUALITY, subsampling=0, exif=tags)
 
 
 def write_scene(model: pycolmap.Reconstruction, scene: Path, content: dict[str, Any]) -> None:
@@ -191,12 +178,63 @@ def publish(built: Path, scene: Path, replaced: Path) -> None:
 
 def existing_parts(scene: Path) -> list[str]:
     """Names in a folder that a scene would use, transforms.json first."""
-    if not scene.is_dir():
-        return []
-    found = [p.name for p in scene.iterdir() if p.name in SCENE_PARTS or is_downscaled(p.name)]
-    return sorted(found, key=lambda n: (n != "transforms.json", n))
+    parts = [p.name for p in scene.iterdir() if PART.fullmatch(p.name)] if scene.is_dir() else []
+    return sorted(parts, key=lambda n: (n != "transforms.json", n))
 
 
-def is_downscaled(name: str) -> bool:
-    stem, _, factor = name.rpartition("_")
-    return stem in ("images", "masks") and factor.isdigit()
+def undistort(
+    model: pycolmap.Reconstruction,
+    photos: Sequence[Photo],
+    images: Path,
+    masks: Path | None,
+    target: Path,
+    threads: int,
+) -> tuple[pycolmap.Reconstruction, list[Photo]]:
+    """Writes undistorted images, with their EXIF, and masks.
+
+    Args:
+        model: not changed.
+        photos: registered images.
+        images: folder of the images.
+        masks: folder of the masks (``NAME.png``), or None.
+        target: gets ``images`` and ``masks``.
+        threads: CPU threads; below 1 for all.
+
+    Returns:
+        The model with pinhole cameras and moved keypoints, and the images with their new sizes.
+    """
+    (target / "bent").mkdir(parents=True)
+    model.write(target / "bent")
+    names = [photo.name for photo in photos]
+    with progress("Undistorting", 1) as advance, quiet():
+        pycolmap.undistort_images(
+            target, target / "bent", images, image_names=names, jpeg_quality=QUALITY, num_threads=threads
+        )
+        advance()
+    flat = pycolmap.Reconstruction(target / "sparse")
+    flat.update_point_3d_errors()
+    camera_of = {image.name: image.camera_id for image in model.images.values()}
+    flat_photos = []
+    for photo in photos:
+        number = camera_of[photo.name]
+        with Image.open(images / photo.name) as image:
+            alpha = image.getchannel("A") if image.mode == "RGBA" else None
+        if alpha is not None:  # COLMAP reads colours alone
+            with Image.open(target / "images" / photo.name) as image:
+                tags = image.getexif()
+                image.putalpha(_undistort_mask(alpha, model.cameras[number]))
+            image.save(target / "images" / photo.name, exif=tags)
+        if masks is not None:
+            (target / "masks").mkdir(exist_ok=True)
+            with Image.open(masks / f"{photo.name}.png") as mask:
+                flat_mask = _undistort_mask(mask, model.cameras[number]).point(lambda v: 255 if v == 255 else 0)
+            flat_mask.save(target / "masks" / f"{photo.name}.png")
+        size = flat.cameras[number]
+        flat_photos.append(replace(photo, width=size.width, height=size.height, exif_focal=None))
+    return flat, flat_photos
+
+
+def _undistort_mask(mask: Image.Image, camera: pycolmap.Camera) -> Image.Image:
+    bitmap = pycolmap.Bitmap.from_array(np.asarray(mask))
+    flat, _ = pycolmap.undistort_image(pycolmap.UndistortCameraOptions(), bitmap, camera)
+    return Image.fromarray(flat.to_array())

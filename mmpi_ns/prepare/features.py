@@ -10,13 +10,23 @@ import pycolmap
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from mmpi_ns.capture.matching import MIN_INLIERS, match_pairs, quiet
+from mmpi_ns.capture.matching import (
+    MIN_INLIERS,
+    count_features,
+    find_features,
+    match_pairs,
+    new_model,
+    quiet,
+    write_images,
+)
 from mmpi_ns.prepare.images import Photo
 from mmpi_ns.prepare.stages import PrepareError, progress, whole
 
 BATCH = 8
 """Images extracted at a time: the most that an interruption loses."""
 PAIR_BATCH = 64
+LARGEST_SIDE = 2000
+"""Larger images are reduced to this side for SIFT (docs/prepare.md has time and error by size)."""
 PIXELS_A_FEATURE = 100
 """At most one feature for this many pixels: more are redundant, and the cost of matching is quadratic."""
 LEAST_FEATURES = 2048
@@ -25,49 +35,26 @@ FAINT = 0.003
 """SIFT's peak threshold for images with few features: weak ones count too."""
 SAMPLE = 4
 """Images that are looked at to find whether they have few."""
+FEATURES = 50
+"""An image with fewer is of no use."""
 
 
 def create_database(
     path: Path, photos: Sequence[Photo], numbers: Sequence[int], cameras: Sequence[pycolmap.Camera]
 ) -> None:
-    """A database of the images and cameras; image ids follow the order of the images, independent of threads."""
-    if path.exists():
-        return
-    path.with_name(path.name + ".partial").unlink(missing_ok=True)
-    model = empty_model(photos, numbers, cameras)
-    with whole(path) as partial, pycolmap.Database.open(partial) as database:
-        for camera in cameras:
-            database.write_camera(camera, use_camera_id=True)
-        for rig in model.rigs.values():
-            database.write_rig(rig, use_rig_id=True)
-        for image_id in range(1, len(photos) + 1):
-            database.write_frame(model.frames[model.images[image_id].frame_id], use_frame_id=True)
-            database.write_image(model.images[image_id], use_image_id=True)
-
-
-def empty_model(
-    photos: Sequence[Photo],
-    numbers: Sequence[int],
-    cameras: Sequence[pycolmap.Camera],
-    poses: dict[str, pycolmap.Rigid3d] | None = None,
-) -> pycolmap.Reconstruction:
-    """A reconstruction without points: image i has id i + 1. With poses, only the images that have one."""
-    model = pycolmap.Reconstruction()
-    for camera in cameras:
-        model.add_camera_with_trivial_rig(camera)
-    for i, (photo, number) in enumerate(zip(photos, numbers, strict=True)):
-        image = pycolmap.Image(name=photo.name, camera_id=number, image_id=i + 1)
-        if poses is None:
-            model.add_image_with_trivial_frame(image)
-        elif photo.name in poses:
-            model.add_image_with_trivial_frame(image, poses[photo.name])
-    return model
+    """A database of the images and cameras, without features, unless it is there."""
+    if not path.exists():
+        path.with_name(path.name + ".partial").unlink(missing_ok=True)
+        with whole(path) as partial:
+            write_images(new_model(cameras, [p.name for p in photos], numbers), partial)
 
 
 def extract(
     database: Path, images: Path, photos: Sequence[Photo], masks: Path | None, max_features: int, threads: int
 ) -> list[int]:
     """SIFT features of all images; images that have theirs are skipped.
+
+    Weak features count too if most of a sample of the images have less than half of the features that they may have.
 
     Returns:
         Features of each image.
@@ -76,50 +63,34 @@ def extract(
         PrepareError: an image cannot be read, or hardly any has features.
     """
     options = pycolmap.FeatureExtractionOptions()
-    options.num_threads = threads
+    options.num_threads, options.max_image_size = threads, LARGEST_SIDE
     most = max(p.width * p.height for p in photos) // PIXELS_A_FEATURE
     options.sift.max_num_features = min(max_features, max(most, LEAST_FEATURES))
-    reader = pycolmap.ImageReaderOptions()
-    if masks is not None:
-        reader.mask_path = masks
     names = [p.name for p in photos]
-    sample = [names[i] for i in sorted({round(i) for i in np.linspace(0, len(names) - 1, SAMPLE)})]
-    if most < LEAST_FEATURES or _are_poor(sample, images, database.with_name("sample.db"), reader, options):
-        options.sift.peak_threshold = FAINT
-    with progress("Finding features", len(names)) as advance, quiet():
-        for start in range(0, len(names), BATCH):
-            batch = names[start : start + BATCH]
-            pycolmap.extract_features(
-                database, images, image_names=batch, reader_options=reader, extraction_options=options
-            )
-            advance(len(batch))
-    with pycolmap.Database.open(database) as opened:
-        counts = [opened.num_keypoints_for_image(i + 1) for i in range(len(names))]
-        for i, name in enumerate(names):
-            if not opened.exists_keypoints(i + 1):
-                raise PrepareError(f"{name} cannot be read by COLMAP: repair or remove it.")
-    if sum(c >= 50 for c in counts) < 2:
-        raise PrepareError(
-            f"Hardly any features: {max(counts)} in the best image. The images are blank, blurred or masked over."
-        )
-    return counts
-
-
-def _are_poor(
-    names: Sequence[str],
-    images: Path,
-    unused: Path,
-    reader: pycolmap.ImageReaderOptions,
-    options: pycolmap.FeatureExtractionOptions,
-) -> bool:
-    """Whether most of some images have less than half of the features that they may have; ``unused`` is a database."""
-    unused.unlink(missing_ok=True)
     with quiet():
-        pycolmap.extract_features(unused, images, image_names=names, reader_options=reader, extraction_options=options)
-    with pycolmap.Database.open(unused) as opened:
-        counts = [opened.num_keypoints_for_image(i.image_id) for i in opened.read_all_images()]
-    unused.unlink()
-    return float(np.median(counts or [0])) < 0.5 * options.sift.max_num_features
+        is_poor = most < LEAST_FEATURES
+        if not is_poor:
+            sample = database.with_name("sample.db")
+            sample.unlink(missing_ok=True)
+            places = sorted({round(i) for i in np.linspace(0, len(names) - 1, SAMPLE)})
+            find_features(sample, images, [names[i] for i in places], options, masks)
+            is_poor = float(np.median([n or 0 for n in count_features(sample)])) < 0.5 * options.sift.max_num_features
+            sample.unlink()
+        if is_poor:
+            options.sift.peak_threshold = FAINT
+        with progress("Finding features", len(names)) as advance:
+            for start in range(0, len(names), BATCH):
+                find_features(database, images, names[start : start + BATCH], options, masks)
+                advance(len(names[start : start + BATCH]))
+    counts = count_features(database)
+    if None in counts:
+        raise PrepareError(f"{names[counts.index(None)]} cannot be read by COLMAP: repair or remove it.")
+    numbers = [n or 0 for n in counts]
+    if sum(n >= FEATURES for n in numbers) < 2:
+        raise PrepareError(
+            f"Hardly any features: {max(numbers)} in the best image. The images are blank, blurred or masked over."
+        )
+    return numbers
 
 
 def match(database: Path, photos: Sequence[Photo], pairs: Sequence[tuple[int, int]], threads: int) -> int:
@@ -133,24 +104,22 @@ def match(database: Path, photos: Sequence[Photo], pairs: Sequence[tuple[int, in
             batch = pairs[start : start + PAIR_BATCH]
             match_pairs(database, [(photos[i].name, photos[j].name) for i, j in batch], threads=threads)
             advance(len(batch))
-    return count_matching_pairs(database)
+    return len(matching_pairs(database))
 
 
-def count_matching_pairs(database: Path) -> int:
-    """Pairs with enough matches that one motion of the camera explains."""
+def matching_pairs(database: Path) -> list[tuple[int, int]]:
+    """Pairs of image ids with enough matches that one motion of the camera explains."""
     with pycolmap.Database.open(database) as opened:
-        _, inliers = opened.read_two_view_geometry_num_inliers()
-    return sum(n >= MIN_INLIERS for n in inliers)
+        pairs, inliers = opened.read_two_view_geometry_num_inliers()
+    return [pycolmap.pair_id_to_image_pair(p) for p, n in zip(pairs, inliers, strict=True) if n >= MIN_INLIERS]
 
 
 def connected(database: Path, places: Sequence[int]) -> list[list[int]]:
     """Groups of at least three of some images (by their places) that verified matches connect, the largest first."""
-    place = {p + 1: n for n, p in enumerate(places)}
-    with pycolmap.Database.open(database) as opened:
-        numbers, inliers = opened.read_two_view_geometry_num_inliers()
-    pairs = [pycolmap.pair_id_to_image_pair(n) for n, c in zip(numbers, inliers, strict=True) if c >= MIN_INLIERS]
-    edges = np.array([(place[a], place[b]) for a, b in pairs if a in place and b in place], int).reshape(-1, 2)
-    graph = coo_array((np.ones(len(edges)), tuple(edges.T)), shape=(len(places), len(places)))
+    row = {place + 1: n for n, place in enumerate(places)}
+    edges = [(row[a], row[b]) for a, b in matching_pairs(database) if a in row and b in row]
+    ends = np.array(edges, dtype=int).reshape(-1, 2).T
+    graph = coo_array((np.ones(len(edges)), tuple(ends)), shape=(len(places), len(places)))
     _, labels = connected_components(graph, directed=False)
     groups = [[places[i] for i in np.flatnonzero(labels == label)] for label in np.unique(labels)]
     return sorted((g for g in groups if len(g) > 2), key=len, reverse=True)
@@ -158,12 +127,12 @@ def connected(database: Path, places: Sequence[int]) -> list[list[int]]:
 
 def matched_keypoints(database: Path, image_ids: Sequence[int]) -> int:
     """Keypoints of these images with a verified match in another of them."""
-    wanted, found = set(image_ids), {i: set() for i in image_ids}
+    matched: dict[int, set[int]] = {i: set() for i in image_ids}
     with pycolmap.Database.open(database) as opened:
         pairs, geometries = opened.read_two_view_geometries()
     for pair, geometry in zip(pairs, geometries, strict=True):
-        a, b = pycolmap.pair_id_to_image_pair(pair)
-        if a in wanted and b in wanted:
-            found[a].update(geometry.inlier_matches[:, 0].tolist())
-            found[b].update(geometry.inlier_matches[:, 1].tolist())
-    return sum(len(keypoints) for keypoints in found.values())
+        ids = pycolmap.pair_id_to_image_pair(pair)
+        if all(i in matched for i in ids):
+            for side, i in enumerate(ids):
+                matched[i].update(geometry.inlier_matches[:, side].tolist())
+    return sum(map(len, matched.values()))

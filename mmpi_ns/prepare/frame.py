@@ -6,18 +6,18 @@ from dataclasses import dataclass
 
 import numpy as np
 import pycolmap
-from numpy.typing import NDArray
 
-from mmpi_ns.prepare.alignment import similarity_matrix
+from mmpi_ns.prepare.alignment import Array, camera_poses
 from mmpi_ns.prepare.stages import PrepareError
 
-Array = NDArray[np.float64]
 LEVEL_TURN = 0.15
 """Minimum spread of the cameras' right vectors across their main direction for estimating gravity."""
 LEAST_GROUND, GROUND_SHARE = 50, 0.15
 """Minimum number of points below the cameras for finding the ground, and the fraction that must lie on it."""
 GROUND_TILT = 25.0
 """Maximum angle in degrees between gravity estimated from the cameras and the normal of the ground."""
+TRIALS = 2000
+"""Planes tried for the ground (RANSAC)."""
 
 
 @dataclass(frozen=True)
@@ -32,18 +32,6 @@ class SceneFrame:
     """The unit, in words."""
 
 
-def camera_poses(model: pycolmap.Reconstruction) -> tuple[list[str], Array]:
-    """Names in order of the image ids, and camera to world with OpenCV axes. [N, 4, 4]"""
-    names, poses = [], []
-    for image_id in sorted(model.reg_image_ids()):
-        image = model.images[image_id]
-        names.append(image.name)
-        pose = np.eye(4)
-        pose[:3] = image.cam_from_world().inverse().matrix()
-        poses.append(pose)
-    return names, np.array(poses).reshape(-1, 4, 4)
-
-
 def up_from_cameras(poses: Array) -> Array:
     """Up, assuming level cameras: perpendicular to all right vectors if they turn, else the mean up vector. [3]"""
     mean = -poses[:, :3, 1].mean(0)
@@ -55,7 +43,7 @@ def up_from_cameras(poses: Array) -> Array:
 
 
 def fit_ground(points: Array, centers: Array, up: Array, seed: int = 0) -> tuple[Array, float]:
-    """The plane that the cameras stand over.
+    """The plane that the cameras stand over: the most populous among roughly level ones, by RANSAC.
 
     Args:
         points: SfM points. [P, 3]
@@ -68,52 +56,33 @@ def fit_ground(points: Array, centers: Array, up: Array, seed: int = 0) -> tuple
     Raises:
         PrepareError: too few points below the cameras, or no plane among them.
     """
-    below = _below_cameras(points, centers, up)
+    # Points below the nearest camera and near the track.
+    some = centers[:: max(1, len(centers) // 32)]
+    reach = 2 * np.linalg.norm(centers - np.median(centers, axis=0), axis=-1).max()
+    offset = points - some[np.linalg.norm(points[:, None] - some[None], axis=-1).argmin(1)]
+    height = offset @ up
+    across = np.linalg.norm(offset - height[:, None] * up, axis=-1)
+    below = points[(height < 0) & (-height > 0.05 * across) & (across < reach)]
     if len(below) < LEAST_GROUND:
         raise PrepareError(
             f"--camera-height: only {len(below)} points lie below the cameras: too few to find the ground."
         )
-    depth = float(np.median(-((below - np.median(centers, axis=0)) @ up)))
-    inside = _largest_plane(below, up, 0.04 * abs(depth), np.random.default_rng(seed))
+    tolerance = 0.04 * abs(float(np.median(-((below - np.median(centers, axis=0)) @ up))))
+    rng, inside = np.random.default_rng(seed), np.zeros(len(below), dtype=bool)
+    for _ in range(TRIALS):
+        a, b, c = below[rng.choice(len(below), 3, replace=False)]
+        normal = np.cross(b - a, c - a)
+        length = np.linalg.norm(normal)
+        if length < 1e-12 or abs(normal @ up) / length < np.cos(np.radians(GROUND_TILT)):
+            continue
+        near = np.abs((below - a) @ normal) < tolerance * length
+        inside = near if near.sum() > inside.sum() else inside
     if inside.sum() < GROUND_SHARE * len(below):
         raise PrepareError("--camera-height: the points below the cameras lie on no common plane.")
     center = below[inside].mean(0)
     normal = np.linalg.eigh((below[inside] - center).T @ (below[inside] - center))[1][:, 0]
     normal *= np.sign(normal @ up)
     return normal, float(np.median((centers - center) @ normal))
-
-
-def _below_cameras(points: Array, centers: Array, up: Array) -> Array:
-    """Points that lie below the nearest camera and near the track. [Q, 3]"""
-    some = centers[:: max(1, len(centers) // 32)]
-    reach = 2 * np.linalg.norm(centers - np.median(centers, axis=0), axis=-1).max()
-    offset = points - some[np.linalg.norm(points[:, None] - some[None], axis=-1).argmin(1)]
-    height = offset @ up
-    across = np.linalg.norm(offset - height[:, None] * up, axis=-1)
-    return points[(height < 0) & (-height > 0.05 * across) & (across < reach)]
-
-
-def _largest_plane(points: Array, up: Array, tolerance: float, rng: np.random.Generator) -> NDArray[np.bool_]:
-    """Points of the most populous plane among roughly level ones, by RANSAC. [Q]"""
-    best = np.zeros(len(points), dtype=bool)
-    for _ in range(2000):
-        a, b, c = points[rng.choice(len(points), 3, replace=False)]
-        normal = np.cross(b - a, c - a)
-        length = np.linalg.norm(normal)
-        if length < 1e-12 or abs(normal @ up) / length < np.cos(np.radians(GROUND_TILT)):
-            continue
-        inside = np.abs((points - a) @ normal) < tolerance * length
-        best = inside if inside.sum() > best.sum() else best
-    return best
-
-
-def rotation_to_z(up: Array, forward: Array) -> Array:
-    """Rotation that maps up to +z and the level part of forward to +y. [3, 3]"""
-    y = forward - (forward @ up) * up
-    if np.linalg.norm(y) < 1e-6:
-        y = np.cross(up, [1.0, 0.0, 0.0]) if abs(up[0]) < 0.9 else np.cross(up, [0.0, 1.0, 0.0])
-    y = y / np.linalg.norm(y)
-    return np.stack([np.cross(y, up), y, up])
 
 
 def choose_frame(model: pycolmap.Reconstruction, camera_height: float | None) -> SceneFrame:
@@ -137,12 +106,10 @@ def choose_frame(model: pycolmap.Reconstruction, camera_height: float | None) ->
     else:
         extent = float(np.ptp(centers @ np.linalg.svd(centers - centers.mean(0))[2][0]))
         scale, unit = 1 / max(extent, 1e-12), "the extent of the camera track (metres are not known)"
-    rotation = rotation_to_z(up, poses[0, :3, 2])
+    heading = poses[0, :3, 2] - (poses[0, :3, 2] @ up) * up
+    if np.linalg.norm(heading) < 1e-6:  # the first camera looks up or down
+        heading = np.cross(up, [1.0, 0.0, 0.0] if abs(up[0]) < 0.9 else [0.0, 1.0, 0.0])
+    heading = heading / np.linalg.norm(heading)
+    rotation = np.stack([np.cross(heading, up), heading, up])
     similarity = pycolmap.Sim3d(scale, pycolmap.Rotation3d(rotation), -scale * rotation @ centers.mean(0))
     return SceneFrame(similarity, words, unit)
-
-
-def similarity_between(source: Array, target: Array) -> pycolmap.Sim3d:
-    """``similarity_matrix`` as pycolmap has it."""
-    scale, rotation, translation = similarity_matrix(source, target)
-    return pycolmap.Sim3d(scale, pycolmap.Rotation3d(rotation), translation)

@@ -12,13 +12,16 @@ from pathlib import Path
 import numpy as np
 from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 
-from mmpi_ns.capture.exif import kept_tags
+from mmpi_ns.capture.exif import kept_tags, positive_number
 from mmpi_ns.prepare.stages import PrepareError, progress, say, whole, write_text
 
 IMAGES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
 HEIF = (".heic", ".heif")
 """Written by phones; read if pillow-heif is installed."""
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg")
+SUFFIXES = re.compile(rf"({'|'.join(map(re.escape, IMAGES))}){{1,2}}$", re.IGNORECASE)
+"""Of a mask: a.jpg.png is that of a.jpg."""
+FOCAL_TAGS = (ExifTags.Base.FocalLength, ExifTags.Base.FocalLengthIn35mmFilm)
 KEPT = {"JPEG": (".jpg", ".jpeg"), "PNG": (".png",)}
 """Formats that are copied unchanged; others become PNG."""
 FILM_WIDTH = 36.0
@@ -52,14 +55,23 @@ def find_images(folder: Path) -> list[Path]:
     readable = (*IMAGES, *(HEIF if reads_heif() else ()))
     files = [p for p in folder.rglob("*") if p.is_file() and not p.name.startswith(".")]
     images = [p for p in files if p.suffix.lower() in readable]
-    found = [p for p in images if p.parent == folder] or images
-    _tell_unread(sorted(set(files) - set(found)), folder)
-    if len(found) < 2:
-        count = "no image" if not found else f"one image only ({found[0].name})"
+    images = [p for p in images if p.parent == folder] or images
+    kinds: dict[str, list[str]] = {}
+    for file in sorted(set(files) - set(images)):
+        kinds.setdefault(file.suffix.lower() or "no suffix", []).append(str(file.relative_to(folder)))
+    for kind, names in sorted(kinds.items()):
+        why = "are not read"
+        if kind in HEIF:
+            why = "are not read: pip install pillow-heif, and start again"
+        elif kind in IMAGES:
+            why = "are in subfolders and left out, because the folder has images of its own"
+        say(f"{len(names)} {kind} files {why} ({in_short(names)}).", "yellow")
+    if len(images) < 2:
+        count = "no image" if not images else f"one image only ({images[0].name})"
         raise PrepareError(
             f"{folder} holds {count} ({', '.join(readable)}): a scene needs at least two views, better twenty."
         )
-    return sorted(found, key=lambda p: natural_key(str(p.relative_to(folder))))
+    return sorted(images, key=lambda p: natural_key(str(p.relative_to(folder))))
 
 
 def reads_heif() -> bool:
@@ -70,20 +82,6 @@ def reads_heif() -> bool:
         return False
     register_heif_opener()
     return True
-
-
-def _tell_unread(files: Sequence[Path], folder: Path) -> None:
-    """Reports the files that are left out, by kind."""
-    kinds: dict[str, list[str]] = {}
-    for file in files:
-        kinds.setdefault(file.suffix.lower() or "no suffix", []).append(str(file.relative_to(folder)))
-    for kind, names in sorted(kinds.items()):
-        why = "are not read"
-        if kind in HEIF:
-            why = "are not read: pip install pillow-heif, and start again"
-        elif kind in IMAGES:
-            why = "are in subfolders and left out, because the folder has images of its own"
-        say(f"{len(names)} {kind} files {why} ({in_short(names)}).", "yellow")
 
 
 def in_short(names: Sequence[str], most: int = 4) -> str:
@@ -118,11 +116,30 @@ def gather(folder: Path, files: Sequence[Path], target: Path) -> list[Photo]:
         PrepareError: an image cannot be read; names the file.
     """
     (target / "images").mkdir(parents=True, exist_ok=True)
-    names = scene_names(files, folder)
     photos = []
     with progress("Reading images", len(files)) as advance:
-        for file, name in zip(files, names, strict=True):
-            photos.append(_gather_one(file, target / "images" / name, str(file.relative_to(folder))))
+        for file, name in zip(files, scene_names(files, folder), strict=True):
+            image, copy = open_image(file), target / "images" / name
+            exif = image.getexif()
+            is_turned = exif.get(ExifTags.Base.Orientation, 1) not in (0, 1)
+            size = ImageOps.exif_transpose(image).size if is_turned else image.size
+            if not copy.exists():
+                is_read = file.suffix.lower() in KEPT.get(image.format or "", ()) and image.mode in ("L", "RGB", "RGBA")
+                with whole(copy) as partial:
+                    if is_read and not is_turned:
+                        shutil.copyfile(file, partial)
+                    else:
+                        _convert(image, partial, copy.suffix.lower())
+            shot = exif.get_ifd(ExifTags.IFD.Exif)
+            parts = [
+                exif.get(ExifTags.Base.Make),
+                exif.get(ExifTags.Base.Model),
+                *(shot.get(tag) for tag in FOCAL_TAGS),
+            ]
+            focal = positive_number(shot.get(FOCAL_TAGS[1]))
+            focal = focal and focal / FILM_WIDTH * max(size)
+            lens = " ".join(str(part).strip() for part in parts if part)
+            photos.append(Photo(name, *size, lens, focal, str(file.relative_to(folder))))
             advance(1)
     write_photos(photos, target)
     return photos
@@ -135,22 +152,6 @@ def write_photos(photos: Sequence[Photo], target: Path) -> None:
 def read_photos(target: Path) -> list[Photo]:
     """The images that ``gather`` or the frame selection left."""
     return [Photo(**entry) for entry in json.loads((target / "photos.json").read_text(encoding="utf-8"))]
-
-
-def _gather_one(source: Path, copy: Path, shown: str) -> Photo:
-    image = open_image(source)
-    exif = image.getexif()
-    turned = exif.get(ExifTags.Base.Orientation, 1) not in (0, 1)
-    keep = not turned and source.suffix.lower() in KEPT.get(image.format or "", ())
-    width, height = ImageOps.exif_transpose(image).size if turned else image.size
-    if not copy.exists():
-        with whole(copy) as partial:
-            if keep and image.mode in ("L", "RGB", "RGBA"):
-                shutil.copyfile(source, partial)
-            else:
-                _convert(image, partial, copy.suffix.lower())
-    lens, focal = _read_exif(exif, max(width, height))
-    return Photo(copy.name, width, height, lens, focal, shown)
 
 
 def open_image(path: Path) -> Image.Image:
@@ -181,19 +182,6 @@ def _convert(image: Image.Image, path: Path, suffix: str) -> None:
     upright.save(path, format=form, exif=kept_tags(image), **options)
 
 
-def _read_exif(exif: Image.Exif, longest: int) -> tuple[str, float | None]:
-    """(body and lens in words, focal length in pixels if EXIF gives the 35-mm equivalent)."""
-    details = exif.get_ifd(ExifTags.IFD.Exif)
-    base, tags = ExifTags.Base, (ExifTags.Base.FocalLength, ExifTags.Base.FocalLengthIn35mmFilm)
-    parts = [exif.get(base.Make), exif.get(base.Model), *(details.get(tag) for tag in tags)]
-    lens = " ".join(str(p).strip() for p in parts if p)
-    try:
-        equivalent = float(details.get(tags[1], 0))
-    except (TypeError, ValueError):
-        equivalent = 0.0
-    return lens, equivalent / FILM_WIDTH * longest if equivalent > 0 else None
-
-
 def gather_masks(folder: Path, photos: Sequence[Photo], target: Path) -> int:
     """Writes a mask for each image to ``target/NAME.png``: white is used, black (zero) is left out.
 
@@ -203,15 +191,19 @@ def gather_masks(folder: Path, photos: Sequence[Photo], target: Path) -> int:
     Raises:
         PrepareError: no mask fits an image, or one has another size.
     """
-    by_name = _masks_by_name(folder)
+    files = [p for p in sorted(folder.rglob("*")) if p.suffix.lower() in IMAGES]
+    bare = [SUFFIXES.sub("", p.relative_to(folder).as_posix()) for p in files]
+    stems = [Path(b).name for b in bare]
+    by_name = dict(zip(bare, files, strict=True))
+    by_name |= {stem: p for stem, p in zip(stems, files, strict=True) if stems.count(stem) == 1}
     target.mkdir(parents=True, exist_ok=True)
-    found = 0
+    count = 0
     for photo in photos:
         names = (photo.source.rpartition(".")[0], Path(photo.name).stem, Path(photo.source).stem)
         source = next((by_name[n] for n in names if n in by_name), None)
         mask = Image.new("L", (photo.width, photo.height), 255)
         if source is not None:
-            found += 1
+            count += 1
             mask = ImageOps.exif_transpose(open_image(source)).convert("L").point(lambda v: 255 if v else 0)
             if mask.size != (photo.width, photo.height):
                 raise PrepareError(
@@ -219,24 +211,8 @@ def gather_masks(folder: Path, photos: Sequence[Photo], target: Path) -> int:
                     f"{photo.width}x{photo.height}: they must be of one size."
                 )
         mask.save(target / f"{photo.name}.png")
-    if not found:
+    if not count:
         raise PrepareError(f"No mask in {folder} is named like an image (a.png or a.jpg.png for a.jpg).")
-    if found < len(photos):
-        say(f"{len(photos) - found} of {len(photos)} images have no mask: all their pixels are used.", "yellow")
-    return found
-
-
-def _masks_by_name(folder: Path) -> dict[str, Path]:
-    """Masks by their path below the folder without suffix, and by their stem if it is unique."""
-    files = [p for p in sorted(folder.rglob("*")) if p.suffix.lower() in IMAGES]
-    by_name: dict[str, Path] = {}
-    for with_folder in (True, False):
-        keys = [_bare(p.relative_to(folder)).as_posix() if with_folder else _bare(p).name for p in files]
-        by_name |= {k: p for k, p in zip(keys, files, strict=True) if with_folder or keys.count(k) == 1}
-    return by_name
-
-
-def _bare(path: Path) -> Path:
-    """Without its suffix, or both of them: a.jpg.png is the mask of a.jpg."""
-    path = path.with_suffix("")
-    return path.with_suffix("") if path.suffix.lower() in IMAGES else path
+    if count < len(photos):
+        say(f"{len(photos) - count} of {len(photos)} images have no mask: all their pixels are used.", "yellow")
+    return count

@@ -5,23 +5,22 @@ from __future__ import annotations
 import copy
 import os
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import pycolmap
 
 from mmpi_ns.capture.matching import SEED, quiet
-from mmpi_ns.prepare.collect import witness_of
-from mmpi_ns.prepare.evidence import Witness, agreement
-from mmpi_ns.prepare.focal import STARTS
-from mmpi_ns.prepare.global_mapping import map_globally, start_from
-from mmpi_ns.prepare.mapping import ATTEMPTS, reconstruct
-from mmpi_ns.prepare.polish import Free, polish, with_all_points
+from mmpi_ns.prepare.adjustment import Free, polish, with_all_points
+from mmpi_ns.prepare.evidence import Witness, agreement, witness_of
+from mmpi_ns.prepare.mapping import ATTEMPTS, map_globally, reconstruct
 from mmpi_ns.prepare.stages import PrepareError, progress, say
 from mmpi_ns.prepare.verdict import NEARLY_ALL, ORDER, Grade, Verdict, agrees, best_first, judge_alone, judge_together
 
+STARTS = (0.7, 1.2)
+"""Focal lengths over the longer side that are tried where none is known: telephones and cars, then COLMAP's guess."""
 PLACED = 100
 """Images of a sequence that the global mapper places at least, if there are so many."""
 NEAR = 0.1
@@ -29,22 +28,13 @@ NEAR = 0.1
 
 
 @dataclass(frozen=True)
-class Candidate:
-    """A mapper's model and the evidence on it."""
+class Solution:
+    """Poses and points, how they came about, and how far they can be believed."""
 
     model: pycolmap.Reconstruction
-    witness: Witness
     says: str
-
-
-@dataclass(frozen=True)
-class Believed:
-    """The model to use."""
-
-    model: pycolmap.Reconstruction
-    verdict: Verdict
-    says: str
-    """Both mappers in words."""
+    """The mappers in words."""
+    verdict: Verdict = field(default_factory=lambda: Verdict("right"))
 
 
 @dataclass(frozen=True)
@@ -77,29 +67,47 @@ class Task:
         return self.offered[:: max(1, len(self.offered) // PLACED)] if self.is_ordered else self.offered
 
 
-def map_and_judge(task: Task) -> Believed:
-    """Runs the global mapper, then the incremental one from the focal length found, and chooses by the evidence.
+@dataclass(frozen=True)
+class Candidate:
+    """A mapper's model, and the evidence on it."""
+
+    model: pycolmap.Reconstruction
+    witness: Witness
+    says: str
+    grade: Grade
+    """By its own evidence."""
+
+
+def _judged(mapper: str, model: pycolmap.Reconstruction, says: str, task: Task) -> Candidate:
+    witness = witness_of(mapper, model, task.database, task.offered)
+    return Candidate(model, witness, says, judge_alone(witness, task.is_ordered).grade)
+
+
+def map_and_judge(task: Task) -> Solution:
+    """Runs the global mapper, then the incremental one from the focal length that fits, and chooses by the evidence.
 
     The chosen model is given all points and adjusted (``polish``), unless that makes the evidence worse.
 
     Raises:
         PrepareError: neither mapper makes a model.
     """
-    found = _candidates(task)
-    chosen, *others = _best_first(found, task)
+    chosen, *others = _best_first(_candidates(task), task)
     with progress("Adding points", 1) as advance:
         model = copy.deepcopy(chosen.model)
         model = with_all_points(model, task.database, task.images, task.free.lens, task.threads)
         advance()
-    model = polish(model, task.free, task.threads)
-    polished = Candidate(model, witness_of(chosen.witness.name, model, task.database, task.offered), chosen.says)
-    if ORDER.index(_grade(polished, task)) > ORDER.index(_grade(chosen, task)):
+    polished = _judged(chosen.witness.name, polish(model, task.free, task.threads), chosen.says, task)
+    if ORDER.index(polished.grade) > ORDER.index(chosen.grade):
         say("The final bundle adjustment makes the evidence worse: left out.", "yellow")
     else:
         chosen = polished
     verdict = judge_together(chosen.witness, [c.witness for c in others], task.is_ordered)
-    beside = [f"{c.says}, {_grade(c, task)} by itself" for c in others]
-    return Believed(chosen.model, verdict, "; beside it ".join([chosen.says, *beside]))
+    beside = [f"{c.says}, {c.grade} by itself" for c in others]
+    return Solution(chosen.model, "; beside it ".join([chosen.says, *beside]), verdict)
+
+
+def _best_first(candidates: Sequence[Candidate], task: Task) -> list[Candidate]:
+    return [candidates[i] for i in best_first([c.witness for c in candidates], task.is_ordered)]
 
 
 def _candidates(task: Task) -> list[Candidate]:
@@ -107,63 +115,43 @@ def _candidates(task: Task) -> list[Candidate]:
 
     Where the global mapper has placed a part of a long sequence, it places all images if the incremental one fails.
     """
-    starts = _starts(task)
-    found = _globally(starts[:2], task.placed, task)
-    settled = _settled(found, task)
-    if len(starts) > 2 and not settled:
-        found += _globally(starts[2:], task.placed, task)
-        settled = _settled(found, task)
-    found = _best_first(found, task)
+    starts, candidates, is_settled = _starts(task), [], False
+    for some in (starts[:2], starts[2:]):
+        if some and not is_settled:
+            candidates += _globally(some, task.placed, task)
+            right = [c.witness for c in candidates if c.grade == "right"]
+            differences = [agreement(right[0], w) for w in right[1:]]
+            is_settled = bool(right) and all(d is not None and agrees(d) for d in differences)
+    candidates = _best_first(candidates, task)
     start, is_part = task.database, len(task.placed) < len(task.offered)
-    if found and task.free.lens:
+    if candidates and task.free.lens:
         start = task.work / "from-global.db"
-        start_from(task.database, start, {n: c.mean_focal_length() for n, c in found[0].model.cameras.items()})
+        start_from(task.database, start, {n: c.mean_focal_length() for n, c in candidates[0].model.cameras.items()})
     failed: PrepareError | None = None
     try:
-        found.append(_incrementally(start, 1 if settled and not is_part else len(ATTEMPTS), task))
+        attempts = 1 if is_settled and not is_part else len(ATTEMPTS)
+        mapping = reconstruct(
+            start, task.images, task.work / "incremental", task.free.lens, task.threads, task.is_sequence, attempts
+        )
+        tried = ", ".join(f"{name} {size}" for name, size in mapping.tried)
+        says = f"incremental, '{mapping.attempt}' settings ({tried})"
+        candidates.append(_judged("incremental", mapping.model, says, task))
     except PrepareError as error:
         failed = error
-    if is_part and not any(_is_whole(c, task) for c in found):
-        found += _globally([("global-all", start)], task.offered, task)
-    if failed and not found:
+    nearly_all = NEARLY_ALL * len(task.offered)
+    if is_part and not any(len(c.witness.images) >= nearly_all and c.grade == "right" for c in candidates):
+        candidates += _globally([("global-all", start)], task.offered, task)
+    if failed and not candidates:
         raise failed
-    return found
-
-
-def _is_whole(candidate: Candidate, task: Task) -> bool:
-    """Whether a model is right by its own evidence and has nearly all images."""
-    return len(candidate.witness.images) >= NEARLY_ALL * len(task.offered) and _grade(candidate, task) == "right"
-
-
-def _incrementally(start: Path, attempts: int, task: Task) -> Candidate:
-    """The incremental mapper's model, from the cameras of a database."""
-    work, refine = task.work / "incremental", task.free.lens
-    made = reconstruct(start, task.images, work, refine, task.threads, task.is_sequence, attempts)
-    witness = witness_of("incremental", made.model, task.database, task.offered)
-    tried = ", ".join(f"{name} {size}" for name, size in made.tried)
-    return Candidate(made.model, witness, f"incremental, '{made.attempt}' settings ({tried})")
-
-
-def _grade(candidate: Candidate, task: Task) -> Grade:
-    return judge_alone(candidate.witness, task.is_ordered).grade
-
-
-def _best_first(found: Sequence[Candidate], task: Task) -> list[Candidate]:
-    return [found[i] for i in best_first([c.witness for c in found], task.is_ordered)]
-
-
-def _settled(found: Sequence[Candidate], task: Task) -> bool:
-    """Whether the global mapper is right by its own evidence, with the same result from all starts for which it is."""
-    right = [c.witness for c in found if _grade(c, task) == "right"]
-    differences = [agreement(right[0], w) for w in right[1:]]
-    return bool(right) and all(d is not None and agrees(d) for d in differences)
+    return candidates
 
 
 def _starts(task: Task) -> list[tuple[str, Path]]:
     """Databases for the global mapper, by name: unchanged if the focal length is known, else one for each guess.
 
     The first guess comes from the fundamental matrices of the pairs, if they determine it (in a straight drive they
-    do not); the others are fixed multiples of the image side.
+    do not): the focal lengths for which they become essential matrices. The others are fixed multiples of the image
+    side.
     """
     database, work = task.database, task.work
     with pycolmap.Database.open(database) as opened:
@@ -171,7 +159,16 @@ def _starts(task: Task) -> list[tuple[str, Path]]:
     if not task.free.lens or not unknown:
         return [("global", database)]
     guesses = {f"global-{ratio}": {c.camera_id: ratio * max(c.width, c.height) for c in unknown} for ratio in STARTS}
-    calibrated = _calibrated(database, work / "calibrated.db")
+    calibrated_database = work / "calibrated.db"
+    shutil.copyfile(database, calibrated_database)
+    options = pycolmap.ViewGraphCalibrationOptions()
+    options.random_seed = SEED
+    options.reestimate_relative_pose = False  # only the focal lengths are taken
+    with quiet():
+        pycolmap.calibrate_view_graph(calibrated_database, options)
+    with pycolmap.Database.open(calibrated_database) as opened:
+        calibrated = {c.camera_id: c.mean_focal_length() for c in opened.read_all_cameras()}
+    calibrated_database.unlink()
     if all(abs(calibrated[n] / focal - 1) > NEAR for guess in guesses.values() for n, focal in guess.items()):
         guesses = {"global-calibrated": {c.camera_id: calibrated[c.camera_id] for c in unknown}} | guesses
     for name, focals in guesses.items():
@@ -180,18 +177,17 @@ def _starts(task: Task) -> list[tuple[str, Path]]:
     return [(name, work / f"{name}.db") for name in guesses]
 
 
-def _calibrated(database: Path, copy: Path) -> dict[int, float]:
-    """Focal lengths, by camera, for which the fundamental matrices of the pairs become essential matrices."""
+def start_from(database: Path, copy: Path, focals: Mapping[int, float]) -> None:
+    """A copy of a database whose cameras start with other focal lengths, in pixels by camera id; replaces ``copy``."""
+    copy.parent.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(database, copy)
-    options = pycolmap.ViewGraphCalibrationOptions()
-    options.random_seed = SEED
-    options.reestimate_relative_pose = False  # only the focal lengths are taken
-    with quiet():
-        pycolmap.calibrate_view_graph(copy, options)
     with pycolmap.Database.open(copy) as opened:
-        focals = {c.camera_id: c.mean_focal_length() for c in opened.read_all_cameras()}
-    copy.unlink()
-    return focals
+        for camera in opened.read_all_cameras():
+            if camera.camera_id in focals:
+                params = camera.params.copy()
+                params[camera.focal_length_idxs()] = focals[camera.camera_id]
+                camera.params = params
+                opened.update_camera(camera)
 
 
 def _globally(starts: Sequence[tuple[str, Path]], names: Sequence[str], task: Task) -> list[Candidate]:
@@ -202,9 +198,9 @@ def _globally(starts: Sequence[tuple[str, Path]], names: Sequence[str], task: Ta
     def run(start: tuple[str, Path]) -> tuple[pycolmap.Reconstruction, Path] | None:
         name, path = start
         refine, threads = task.free.lens, max(1, cores // workers)
-        made = map_globally(path, task.images, task.work / name, names, refine, threads)
+        result = map_globally(path, task.images, task.work / name, names, refine, threads)
         advance()
-        return made
+        return result
 
     with (
         progress("Global mapping", len(starts)) as advance,
@@ -212,15 +208,15 @@ def _globally(starts: Sequence[tuple[str, Path]], names: Sequence[str], task: Ta
         ThreadPoolExecutor(workers) as pool,
     ):
         results = list(pool.map(run, starts))
-    found = []
-    for (name, path), made in zip(starts, results, strict=True):
-        if not made:
+    candidates = []
+    for (name, _), result in zip(starts, results, strict=True):
+        if not result:
             say(f"Mapping, {name}: no model.")
             continue
-        model, _ = made
-        witness = witness_of("global", model, path, task.offered)
+        model, _ = result
         focal = ", ".join(f"{c.mean_focal_length():.1f}" for _, c in sorted(model.cameras.items())[:3])
-        says = f"{model.num_reg_images()} of {len(names)} images, {witness.error:.2f} px, focal length {focal} px"
+        error = model.compute_mean_reprojection_error()
+        says = f"{model.num_reg_images()} of {len(names)} images, {error:.2f} px, focal length {focal} px"
         say(f"Mapping, {name}: {says}.")
-        found.append(Candidate(model, witness, f"{name} ({says})"))
-    return found
+        candidates.append(_judged("global", model, f"{name} ({says})", task))
+    return candidates

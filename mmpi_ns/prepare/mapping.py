@@ -1,16 +1,27 @@
-"""Poses and points from matches: COLMAP's incremental mapper, with settings relaxed until it succeeds."""
+"""Poses and points from matches by COLMAP: image by image, all at once, or points alone where poses are known.
+
+The incremental mapper's settings are relaxed until it succeeds. The global mapper (GLOMAP) averages the rotations of
+all pairs first, then solves for all positions and points together. It cannot start from a wrong pair, and the track
+cannot break and continue at another scale; but it needs an initial focal length that is about right.
+
+Source: Pan et al., Global Structure-from-Motion Revisited (2024), as in COLMAP 4.
+"""
 
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
+import numpy as np
 import pycolmap
 
-from mmpi_ns.capture.matching import SEED, quiet
-from mmpi_ns.prepare.features import count_matching_pairs
+from mmpi_ns.capture.matching import MIN_ANGLE, MIN_INLIERS, SEED, quiet, triangulate_points
+from mmpi_ns.prepare.adjustment import STILL, adjust, with_all_points
+from mmpi_ns.prepare.alignment import camera_poses, degrees_between, similarity_between
+from mmpi_ns.prepare.features import matched_keypoints, matching_pairs
 from mmpi_ns.prepare.stages import PrepareError, progress, say
 
 ENOUGH = 0.95
@@ -21,16 +32,24 @@ BENT_PX = 0.8
 """Mean reprojection error above which another attempt is made even though the images are registered."""
 SNAPSHOT = 40
 """Images registered between two snapshots, from which an interrupted run resumes."""
-STILL = 1e-6
-"""Relative change of the cost at which an adjustment ends. COLMAP goes on to 100 iterations: of 64 images of a drive
-that took four times as long, and moved the focal length by 0.002 px."""
 MANY = 100
 """Number of images from which repeated global bundle adjustment would dominate the time."""
+PLACED_ROUNDS = 2
+"""Times that a globally placed model is given all points and adjusted: after one, the focal length may be far off."""
+TRACKS_PER_VIEW = 500
+"""Tracks used for placing each image globally, the longest ones: using all takes twice as long on kitti-street and is
+no better (docs/log/prepare.md)."""
+REFINE_ROUNDS = 3
+"""Rounds of refining known poses and triangulating points again."""
+COARSE_PX, FINE_PX = 8.0, 4.0
+"""Largest reprojection error of a point of known poses: while these are to be refined, and in the end."""
+LEAST_SHARE = 0.2
+"""Fraction of the matched keypoints that must become points; few do where known poses are those of other images."""
 
 
 @dataclass(frozen=True)
 class Attempt:
-    """One way to run the mapper."""
+    """One way to run the incremental mapper."""
 
     name: str
     says: str
@@ -55,7 +74,7 @@ ATTEMPTS = (
 
 @dataclass(frozen=True)
 class Mapping:
-    """Result of the mapper."""
+    """Result of the incremental mapper."""
 
     model: pycolmap.Reconstruction
     folder: Path
@@ -66,13 +85,7 @@ class Mapping:
 
 
 def reconstruct(
-    database: Path,
-    images: Path,
-    work: Path,
-    refine: bool,
-    threads: int,
-    is_sequence: bool = False,
-    attempts: int = len(ATTEMPTS),
+    database: Path, images: Path, work: Path, refine: bool, threads: int, is_sequence: bool = False, attempts: int = 3
 ) -> Mapping:
     """Runs the attempts in order until one registers nearly all images; returns the best.
 
@@ -94,7 +107,7 @@ def reconstruct(
     """
     with pycolmap.Database.open(database) as opened:
         total = opened.num_images()
-    pairs = count_matching_pairs(database)
+    pairs = len(matching_pairs(database))
     if not pairs:
         raise PrepareError(
             "No two images have enough matches in common: they do not overlap, or show too little texture. "
@@ -103,15 +116,16 @@ def reconstruct(
     best: Mapping | None = None
     tried: list[tuple[str, int]] = []
     for attempt in ATTEMPTS[1 if is_sequence else 0 :][:attempts]:
-        start = best.folder if best is not None and _carries(best.model, total) else None
-        made = _run(attempt, database, images, work / attempt.name, total, refine, threads, start)
-        size = made[0].num_reg_images() if made else 0
+        carries = best is not None and not is_bent(best.model) and best.model.num_reg_images() >= CARRIES * total
+        start = best.folder if best is not None and carries else None
+        result = _run(attempt, database, images, work / attempt.name, total, refine, threads, start)
+        size = result[0].num_reg_images() if result else 0
         tried.append((attempt.name, size))
-        says = f", {made[0].compute_mean_reprojection_error():.2f} px" if made else ""
+        says = f", {result[0].compute_mean_reprojection_error():.2f} px" if result else ""
         say(f"Mapping, {attempt.name} ({attempt.says}): {size} of {total} images{says}.")
-        if made and (best is None or _quality(made[0]) > _quality(best.model)):
-            best = Mapping(*made, attempt.name, ())
-        if made and size >= ENOUGH * total and not is_bent(made[0]):
+        if result and (best is None or _quality(result[0]) > _quality(best.model)):
+            best = Mapping(*result, attempt.name, ())
+        if result and size >= ENOUGH * total and not is_bent(result[0]):
             break
     if best is None:
         raise PrepareError(
@@ -121,25 +135,19 @@ def reconstruct(
     return replace(best, tried=tuple(tried))
 
 
-def _error(model: pycolmap.Reconstruction) -> float:
-    """Mean reprojection error at an image width of 1,000 pixels, or in pixels of smaller images."""
+def _quality(model: pycolmap.Reconstruction) -> tuple[bool, int, float]:
+    """Sorts models: sound ones first, then those with more images, then those that fit better.
+
+    Errors are those at an image width of 1,000 pixels, or in pixels of smaller images.
+    """
     widest = max(camera.width for camera in model.cameras.values())
-    return model.compute_mean_reprojection_error() / max(1.0, widest / 1000)
+    error = model.compute_mean_reprojection_error() / max(1.0, widest / 1000)
+    return error <= BENT_PX, model.num_reg_images(), -error
 
 
 def is_bent(model: pycolmap.Reconstruction) -> bool:
     """Whether a model fits its images so badly that it may have started from a wrong pair: squeezed or folded."""
-    return _error(model) > BENT_PX
-
-
-def _carries(model: pycolmap.Reconstruction, total: int) -> bool:
-    """Whether another attempt should continue a model instead of starting over."""
-    return not is_bent(model) and model.num_reg_images() >= CARRIES * total
-
-
-def _quality(model: pycolmap.Reconstruction) -> tuple[bool, int, float]:
-    """Sorts models: sound ones first, then those with more images, then those that fit better."""
-    return not is_bent(model), model.num_reg_images(), -_error(model)
+    return not _quality(model)[0]
 
 
 def _run(
@@ -150,7 +158,7 @@ def _run(
     total: int,
     refine: bool,
     threads: int,
-    start: Path | None = None,
+    start: Path | None,
 ) -> tuple[pycolmap.Reconstruction, Path] | None:
     """The largest model of one attempt and its folder; read back where it was finished before.
 
@@ -164,21 +172,21 @@ def _run(
         (folder / "snapshots").mkdir(exist_ok=True)
         options = mapper_options(attempt, refine, threads, total > MANY)
         options.snapshot_path, options.snapshot_frames_freq = folder / "snapshots", SNAPSHOT
-        known = pycolmap.Reconstruction(start).num_reg_images() if start is not None else 0
-        if known:
-            say(f"Mapping, {attempt.name}: goes on from {known} images.")
+        before = pycolmap.Reconstruction(start).num_reg_images() if start is not None else 0
+        if before:
+            say(f"Mapping, {attempt.name}: goes on from {before} images.")
         with progress(f"Mapping, {attempt.name}", total) as advance, quiet():
-            advance(known)
-            found = pycolmap.incremental_mapping(
+            advance(before)
+            models = pycolmap.incremental_mapping(
                 database,
                 images,
                 folder / "models",
                 options,
                 input_path=start or "",
-                initial_image_pair_callback=_step(advance, 2, 0),
-                next_image_callback=_step(advance, 1),
+                initial_image_pair_callback=partial(advance, 2, 0),
+                next_image_callback=partial(advance, 1),
             )
-        for number, model in found.items():  # COLMAP itself does not write a model that it continued
+        for number, model in models.items():  # COLMAP itself does not write a model that it continued
             (folder / "models" / str(number)).mkdir(exist_ok=True)
             model.write(folder / "models" / str(number))
         done.touch()
@@ -190,10 +198,6 @@ def largest_model(folder: Path) -> tuple[pycolmap.Reconstruction, Path] | None:
     """The model with the most images in the subfolders of a folder, and its subfolder; None if there is none."""
     models = [(pycolmap.Reconstruction(p), p) for p in sorted(folder.iterdir()) if p.is_dir()]
     return max(models, key=lambda m: m[0].num_reg_images(), default=None)
-
-
-def _step(advance: Callable[..., None], count: int, start: int | None = None) -> Callable[[], None]:
-    return lambda: advance(count, start)
 
 
 def _latest_snapshot(folder: Path) -> Path | None:
@@ -210,7 +214,7 @@ def _latest_snapshot(folder: Path) -> Path | None:
 def mapper_options(
     attempt: Attempt, refine: bool, threads: int, is_large: bool = False
 ) -> pycolmap.IncrementalPipelineOptions:
-    """The mapper's settings for an attempt, with given intrinsics left alone unless they are to be refined.
+    """The incremental mapper's settings for an attempt; given intrinsics are left alone.
 
     For a large capture, global bundle adjustment runs less often and with fewer points; points that add little to the
     constraints of an image are left out until the end.
@@ -238,29 +242,92 @@ def mapper_options(
     return options
 
 
-def bundle_options(
-    refine_poses: bool, refine: bool, principal_point: bool, threads: int, robust: bool = False
-) -> pycolmap.BundleAdjustmentOptions:
-    """Bundle adjustment of points, and of poses and intrinsics on request."""
-    options = pycolmap.BundleAdjustmentOptions()
-    options.refine_rig_from_world = refine_poses
-    options.refine_focal_length = options.refine_extra_params = refine
-    options.refine_principal_point = principal_point
-    options.print_summary = False
-    options.ceres.solver_options.num_threads = threads
-    options.ceres.solver_options.function_tolerance = STILL
-    if robust:
-        options.ceres.loss_function_type, options.ceres.loss_function_scale = pycolmap.LossFunctionType.CAUCHY, 1.0
-    return options
+def map_globally(
+    database: Path, images: Path, folder: Path, names: Sequence[str], refine: bool, threads: int
+) -> tuple[pycolmap.Reconstruction, Path] | None:
+    """The largest model of the global mapper and its folder; read back where it was made before.
+
+    Every random draw is seeded, small angles are kept, and given intrinsics left alone.
+
+    Args:
+        database: features, verified matches and the cameras to start from.
+        images: folder of the images, for the points' colours.
+        folder: for the models.
+        names: the images to place.
+        refine: refine intrinsics.
+        threads: CPU threads; below 1 for all.
+
+    Returns:
+        None if there is no model.
+    """
+    done, folders = folder / "done", folder / "models"
+    if not done.exists():
+        shutil.rmtree(folder, ignore_errors=True)
+        folders.mkdir(parents=True)
+        options = pycolmap.GlobalPipelineOptions()
+        options.image_names = list(names)
+        options.min_num_matches = MIN_INLIERS
+        mapper = options.mapper
+        options.num_threads = mapper.num_threads = threads
+        for part in (options, mapper, mapper.rotation_averaging, mapper.global_positioning):
+            part.random_seed = SEED
+        mapper.track_required_tracks_per_view = TRACKS_PER_VIEW
+        mapper.min_tri_angle_deg, mapper.skip_retriangulation = MIN_ANGLE, True
+        mapper.bundle_adjustment.refine_focal_length = mapper.bundle_adjustment.refine_extra_params = refine
+        with quiet():
+            models = pycolmap.global_mapping(database, images, folders, options)
+            for number, model in models.items():
+                (folders / str(number)).mkdir(exist_ok=True)
+                full = with_all_points(model, database, images, refine, threads, PLACED_ROUNDS)
+                full.write(folders / str(number))
+        done.touch()
+    return largest_model(folders)
 
 
-def adjust(model: pycolmap.Reconstruction, options: pycolmap.BundleAdjustmentOptions) -> None:
-    """Bundle adjustment over all images, in place. (``pycolmap.bundle_adjustment`` cannot be kept quiet.)"""
-    config = pycolmap.BundleAdjustmentConfig()
-    for image_id in model.reg_image_ids():
-        config.add_image(image_id)
-    if options.refine_rig_from_world:
-        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+def map_known_poses(
+    model: pycolmap.Reconstruction, database: Path, images: Path, refine_poses: bool, refine_lens: bool, threads: int
+) -> tuple[pycolmap.Reconstruction, str]:
+    """Triangulates points from the poses of a model, and refines these.
+
+    Args:
+        model: cameras and posed images without points; changed in place.
+        database: features and matches.
+        images: folder of the images.
+        refine_poses: bundle-adjust poses; the result is aligned with the given scale and frame.
+        refine_lens: bundle-adjust intrinsics as well.
+        threads: CPU threads; below 1 for all.
+
+    Returns:
+        The model with points, and what was done in words.
+
+    Raises:
+        PrepareError: the poses do not fit the matches.
+    """
+    _, before = camera_poses(model)
+    refines = refine_poses or refine_lens
     with quiet():
-        pycolmap.create_default_bundle_adjuster(options, config, model).solve()
-    model.update_point_3d_errors()
+        model = triangulate_points(model, database, images, threads, COARSE_PX if refines else FINE_PX)
+    share = model.compute_num_observations() / max(matched_keypoints(database, list(model.reg_image_ids())), 1)
+    if share < LEAST_SHARE:
+        raise PrepareError(
+            f"Only {share:.0%} of the matched keypoints become points from the given poses: the camera axes "
+            "(--poses-axes opencv or opengl), the order of the images, the direction (camera "
+            "to world is wanted) or the intrinsics (--focal, --camera) are not what the poses were made with."
+        )
+    error = model.compute_mean_reprojection_error()
+    says = f"points from known poses: {share:.0%} of the matched keypoints, {error:.2f} px"
+    if refines:
+        for _ in range(REFINE_ROUNDS):
+            adjust(model, threads, refine_lens, poses=refine_poses)
+            with quiet():
+                model = triangulate_points(model, database, images, threads, FINE_PX)
+        model.transform(similarity_between(camera_poses(model)[1], before))
+        _, after = camera_poses(model)
+        moved = np.linalg.norm(after[:, :3, 3] - before[:, :3, 3], axis=-1)
+        turned = degrees_between(after[:, :3, :3], before[:, :3, :3])
+        says += (
+            f"; refined, {model.compute_mean_reprojection_error():.2f} px; poses moved by {moved.mean():.3g} units (at "
+            f"most {moved.max():.3g}) and turned by {turned.mean():.2f} degrees (at most {turned.max():.2f})"
+        )
+    say(says)
+    return model, says

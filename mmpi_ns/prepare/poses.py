@@ -5,19 +5,18 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pycolmap
-from numpy.typing import NDArray
 
+from mmpi_ns.prepare.alignment import Array, nearest_rotation
 from mmpi_ns.prepare.cameras import Intrinsics
 from mmpi_ns.prepare.images import IMAGES, Photo, natural_key
 from mmpi_ns.prepare.stages import PrepareError, say
 
-Array = NDArray[np.float64]
 MAX_LAG = 0.05
 """Maximum time in seconds between an image and its pose."""
 FISHEYE = ("OPENCV_FISHEYE", "FISHEYE")
@@ -50,36 +49,23 @@ def read_poses(path: Path, form: str, axes: str, photos: Sequence[Photo]) -> Kno
         PrepareError: the file is not understood, or fits fewer than two images.
     """
     form = _guess_format(path) if form == "auto" else form
-    if form == "transforms":
-        known = _read_transforms(path, photos)
-    elif form == "matrices":
-        known = _read_matrices(path, photos)
-    else:
-        rows = _read_rows(path, 12 if form == "kitti" else 8)
-        known = _read_kitti(rows, path, photos) if form == "kitti" else _read_tum(rows, path, photos)
+    readers = {"kitti": _read_kitti, "tum": _read_tum, "transforms": _read_transforms, "matrices": _read_matrices}
+    read = readers[form](path, photos)
     opengl = axes == "opengl" or (axes == "auto" and form == "transforms")
     flip = np.diag([1.0, -1.0, -1.0, 1.0]) if opengl else np.eye(4)
-    poses = {n: _rigid(p @ flip, n) for n, p in known.poses.items() if np.isfinite(p).all()}
+    poses = {n: p @ flip for n, p in read.poses.items() if np.isfinite(p).all()}
+    for name, pose in poses.items():
+        stretch = np.linalg.svd(pose[:3, :3])[1]
+        if np.abs(stretch - 1).max() > 0.02 or np.linalg.det(pose[:3, :3]) < 0:
+            raise PrepareError(
+                f"The pose of {name} is no rotation and translation (singular values {stretch.round(3)})."
+            )
+        pose[:3, :3] = nearest_rotation(pose[:3, :3])
     if len(poses) < 2:
         raise PrepareError(f"--poses {path} has finite poses for {len(poses)} images: at least two are needed.")
     if len(poses) < len(photos):
         say(f"{len(photos) - len(poses)} of {len(photos)} images have no pose: left out.", "yellow")
-    return KnownPoses(poses, known.says, known.intrinsics, known.split)
-
-
-def rigid3d(pose: Array) -> pycolmap.Rigid3d:
-    """World to camera, as COLMAP wants it, of a camera-to-world matrix. [4, 4]"""
-    return pycolmap.Rigid3d(pycolmap.Rotation3d(pose[:3, :3].T), -pose[:3, :3].T @ pose[:3, 3])
-
-
-def _rigid(pose: Array, name: str) -> Array:
-    """The pose with an exact rotation."""
-    u, s, vt = np.linalg.svd(pose[:3, :3])
-    if np.abs(s - 1).max() > 0.02 or np.linalg.det(u @ vt) < 0:
-        raise PrepareError(f"The pose of {name} is no rotation and translation (singular values {s.round(3)}).")
-    fixed = pose.copy()
-    fixed[:3, :3] = u @ vt
-    return fixed
+    return replace(read, poses=poses)
 
 
 def _guess_format(path: Path) -> str:
@@ -113,40 +99,37 @@ def _read_rows(path: Path, width: int) -> Array:
     return np.array(rows, dtype=np.float64).reshape(-1, width)
 
 
-def _frame_numbers(photos: Sequence[Photo]) -> list[int] | None:
-    """The last number in each source name, where all have one and no two are alike."""
-    found = [re.findall(r"\d+", Path(p.source).stem) for p in photos]
-    numbers = [int(f[-1]) for f in found if f]
-    return numbers if len(set(numbers)) == len(photos) else None
-
-
-def _read_kitti(rows: Array, path: Path, photos: Sequence[Photo]) -> KnownPoses:
+def _read_kitti(path: Path, photos: Sequence[Photo]) -> KnownPoses:
     """One line for each image; if there are more lines, the numbers in the file names choose them (counted from 0)."""
+    rows = _read_rows(path, 12)
     matrices = np.concatenate([rows.reshape(-1, 3, 4), np.tile([[[0.0, 0.0, 0.0, 1.0]]], (len(rows), 1, 1))], 1)
     places: Sequence[int] = range(len(photos))
     says = "KITTI poses, one line for each image"
     if len(rows) != len(photos):
-        numbers = _frame_numbers(photos)
-        if len(rows) < len(photos) or numbers is None or max(numbers) >= len(rows):
+        digits = [re.findall(r"\d+", Path(p.source).stem) for p in photos]
+        places = [int(d[-1]) for d in digits if d]
+        if len(rows) < len(photos) or len(set(places)) < len(photos) or max(places) >= len(rows):
             raise PrepareError(f"{path} has {len(rows)} poses for {len(photos)} images: they cannot be matched.")
-        places, says = numbers, "KITTI poses, the lines that the images' numbers name (from 0)"
+        says = "KITTI poses, the lines that the images' numbers name (from 0)"
     return KnownPoses({p.name: matrices[i] for p, i in zip(photos, places, strict=True)}, says)
 
 
-def _read_tum(rows: Array, path: Path, photos: Sequence[Photo]) -> KnownPoses:
+def _read_tum(path: Path, photos: Sequence[Photo]) -> KnownPoses:
     """By time stamp if the file names are time stamps, else one line for each image."""
+    rows = _read_rows(path, 8)
     if not len(rows):
         raise PrepareError(f"{path} holds no pose.")
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     for pose, row in zip(poses, rows, strict=True):
         pose[:3, :3] = pycolmap.Rotation3d(row[4:8]).matrix() if np.linalg.norm(row[4:8]) > 0 else np.nan
         pose[:3, 3] = row[1:4]
-    stamps = [_time_stamp(p.source) for p in photos]
     matched: dict[str, Array] = {}
-    for photo, stamp in zip(photos, stamps, strict=True):
-        nearest = int(np.abs(rows[:, 0] - stamp).argmin()) if stamp is not None else 0
-        if stamp is not None and abs(rows[nearest, 0] - stamp) <= MAX_LAG:
-            matched[photo.name] = poses[nearest]
+    for photo in photos:
+        source = Path(photo.source)
+        stamps = re.findall(r"\d+\.\d+|\d+", source.stem if source.suffix.lower() in IMAGES else photo.source)
+        lags = np.abs(rows[:, 0] - float(stamps[-1])) if stamps else np.full(1, np.inf)
+        if lags.min() <= MAX_LAG:
+            matched[photo.name] = poses[lags.argmin()]
     if 2 * len(matched) >= len(photos):
         return KnownPoses(matched, f"TUM poses, matched by time stamp within {MAX_LAG} s")
     if len(rows) != len(photos):
@@ -156,11 +139,6 @@ def _read_tum(rows: Array, path: Path, photos: Sequence[Photo]) -> KnownPoses:
     return KnownPoses(
         {p.name: pose for p, pose in zip(photos, poses, strict=True)}, "TUM poses, one line for each image"
     )
-
-
-def _time_stamp(source: str) -> float | None:
-    found = re.findall(r"\d+\.\d+|\d+", Path(source).stem if Path(source).suffix.lower() in IMAGES else source)
-    return float(found[-1]) if found else None
 
 
 def _read_matrices(path: Path, photos: Sequence[Photo]) -> KnownPoses:
@@ -201,11 +179,12 @@ def _read_transforms(path: Path, photos: Sequence[Photo]) -> KnownPoses:
     try:
         meta = json.loads(path.read_text(encoding="utf-8"))
         frames: list[dict[str, Any]] = meta["frames"]
-        found = {p.name: n for p in photos if (n := _frame_of(p, [Path(f["file_path"]) for f in frames])) is not None}
-        _check_apart(found, path)
+        files = [Path(f["file_path"]) for f in frames]
+        places = {p.name: n for p in photos if (n := _frame_of(p, files)) is not None}
+        _check_apart(places, path)
         poses, intrinsics = {}, {}
-        for photo in (p for p in photos if p.name in found):
-            frame = frames[found[photo.name]]
+        for photo in (p for p in photos if p.name in places):
+            frame = frames[places[photo.name]]
             poses[photo.name] = np.array(frame["transform_matrix"], dtype=np.float64).reshape(4, 4)
             if "fl_x" in meta or "fl_x" in frame:
                 intrinsics[photo.name] = _frame_intrinsics({**meta, **frame}, photo)
@@ -217,19 +196,19 @@ def _read_transforms(path: Path, photos: Sequence[Photo]) -> KnownPoses:
 
 def _frame_of(photo: Photo, files: Sequence[Path]) -> int | None:
     """The frame with an image's name, and its folder if several have that name; None if there is none."""
-    for wanted in (Path(photo.name), Path(photo.source)):
-        named = [n for n, f in enumerate(files) if f.stem == wanted.stem]
-        folders = wanted.parent.parts
+    for path in (Path(photo.name), Path(photo.source)):
+        named = [n for n, f in enumerate(files) if f.stem == path.stem]
+        folders = path.parent.parts
         inside = [n for n in named if files[n].parent.parts[-len(folders) :] == folders] if folders else []
         if len(named) == 1 or len(inside) == 1:
             return (inside or named)[0]
     return None
 
 
-def _check_apart(found: dict[str, Any], path: Path) -> None:
+def _check_apart(poses: dict[str, Any], path: Path) -> None:
     """Raises PrepareError if two images were given the same pose, as images of two folders may have the same name."""
     first: dict[Any, str] = {}
-    for name, pose in found.items():
+    for name, pose in poses.items():
         if pose in first:
             raise PrepareError(
                 f"{path} has one pose for {first[pose]} and {name}: images of one name in two folders need two."

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,42 +11,12 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from mmpi_ns.capture.exif import exposure_of
+from mmpi_ns.prepare.alignment import camera_poses
 from mmpi_ns.prepare.checks import Finding, coverage
-from mmpi_ns.prepare.export import Split
-from mmpi_ns.prepare.focal import focal_in_words
-from mmpi_ns.prepare.frame import camera_poses
-from mmpi_ns.prepare.images import in_short
 from mmpi_ns.prepare.stages import write_text
-from mmpi_ns.prepare.verdict import Verdict
 
 WORST = 5
 """Number of images with the least coverage that are listed."""
-
-
-@dataclass(frozen=True)
-class Facts:
-    """Content of the report beyond the model."""
-
-    source: str
-    offered: int
-    """Images given (or chosen from the video)."""
-    missing: Sequence[str]
-    """Images without a pose."""
-    groups: Sequence[Sequence[str]]
-    """Images of models that are not connected to this one."""
-    matching: str
-    mapping: str
-    exposure: str
-    up: str
-    unit: str
-    split: Split
-    findings: Sequence[Finding]
-    notes: Sequence[str]
-    times: dict[str, float]
-    """Seconds of each stage that ran this time."""
-    verdict: Verdict
-    focal: tuple[float, float] | None
-    """The interval of a refined focal length, in pixels."""
 
 
 def exposure_in_words(images: Sequence[Path]) -> str:
@@ -59,73 +28,63 @@ def exposure_in_words(images: Sequence[Path]) -> str:
     return f"varies {max(light) / min(light):.1f}-fold by the EXIF of {len(light)} images"
 
 
-def write_report(model: pycolmap.Reconstruction, facts: Facts, scene: Path) -> str:
-    """Writes report.md and report/track.png; returns the text."""
+def write_report(
+    model: pycolmap.Reconstruction,
+    title: str,
+    rows: Mapping[str, str],
+    findings: Sequence[Finding],
+    warnings: Sequence[str],
+    notes: Sequence[str],
+    scene: Path,
+) -> None:
+    """Writes report.md and report/track.png.
+
+    Args:
+        model: in the frame of the scene.
+        title: of the report.
+        rows: what the table says beyond the model's figures, by their names.
+        findings: of the checks; listed as warnings and marked in the drawing.
+        warnings: further ones, listed first.
+        notes: listed last.
+        scene: folder to write to.
+    """
     (scene / "report").mkdir(parents=True, exist_ok=True)
-    _draw_track(model, facts.findings, scene / "report" / "track.png")
+    _draw_track(model, findings, scene / "report" / "track.png")
     covered = coverage(model)
-    parts = [
-        f"# {facts.source}\n",
-        "\n".join(_table(model, facts, covered)),
-        "\n## Warnings\n",
-        "\n".join(_warnings(facts)) or "None.",
-        "\n## Track from above\n\n![track](report/track.png)\n",
-        "## Cameras\n",
-        "\n".join(f"- {camera_in_words(c)}" for _, c in sorted(model.cameras.items())),
-        "\n## Coverage\n",
-        "Share of an image's cells (8 x 6) that hold a keypoint with a point; the least:\n",
-        "\n".join(f"- {n}: {v:.0%}" for n, v in sorted(covered.items(), key=lambda x: x[1])[:WORST]),
-        "\n## Notes\n",
-        "\n".join(f"- {n}" for n in facts.notes) or "None.",
-    ]
-    text = "\n".join(parts) + "\n"
-    write_text(scene / "report.md", text)
-    return text
-
-
-def _table(model: pycolmap.Reconstruction, facts: Facts, covered: dict[str, float]) -> list[str]:
     rows = {
-        "images registered": f"{model.num_reg_images()} of {facts.offered}",
+        **rows,
         "reprojection error": f"{model.compute_mean_reprojection_error():.3f} px",
         "points": f"{model.num_points3D()}",
         "track length": f"{model.compute_mean_track_length():.1f} images",
         "points seen by an image": f"{model.compute_mean_observations_per_reg_image():.0f}",
         "coverage": f"{np.mean(list(covered.values())):.0%} on average, {min(covered.values()):.0%} at least",
-        "matching": facts.matching,
-        "mapping": facts.mapping,
-        "verdict": f"{facts.verdict.grade} {facts.verdict.words()}".strip(),
-        "focal length": "given" if facts.focal is None else focal_in_words(*facts.focal),
-        "exposure": facts.exposure,
-        "up": facts.up,
-        "unit": facts.unit,
-        "split": f"{len(facts.split.train)} train, {len(facts.split.test)} test: {facts.split.says}",
-        "times": ", ".join(f"{name} {seconds:.0f} s" for name, seconds in facts.times.items()),
     }
-    return ["| | |", "|---|---|", *(f"| {k} | {v} |" for k, v in rows.items())]
-
-
-def _warnings(facts: Facts) -> list[str]:
-    lines = []
-    if facts.missing:
-        lines.append(f"- {len(facts.missing)} images have no pose and are left out: {in_short(facts.missing, 8)}")
-    for group in facts.groups:
-        lines.append(
-            f"- {len(group)} images form a group of their own, not connected to the scene: {in_short(group, 8)}"
-        )
-    for finding in sorted(facts.findings, key=lambda f: (f.kind, -f.badness)):
-        lines.append(f"- {finding.kind} {finding.image + ': ' if finding.image else ''}{finding.says}")
-    return lines
-
-
-def camera_in_words(camera: pycolmap.Camera) -> str:
-    params = ", ".join(f"{v:.5g}" for v in camera.params)
-    return f"{camera.model.name} {camera.width}x{camera.height}: {camera.params_info} = {params}"
+    worst_first = sorted(findings, key=lambda f: (f.kind, -f.badness))
+    warnings = [*warnings, *(f"{f.kind} {f.image + ': ' if f.image else ''}{f.says}" for f in worst_first)]
+    parts = [
+        f"# {title}\n",
+        "\n".join(["| | |", "|---|---|", *(f"| {k} | {v} |" for k, v in rows.items())]),
+        "\n## Warnings\n",
+        "\n".join(f"- {w}" for w in warnings) or "None.",
+        "\n## Track from above\n\n![track](report/track.png)\n",
+        "## Cameras\n",
+        *(
+            f"- {c.model.name} {c.width}x{c.height}: {c.params_info} = {', '.join(f'{v:.5g}' for v in c.params)}"
+            for _, c in sorted(model.cameras.items())
+        ),
+        "\n## Coverage\n",
+        "Share of an image's cells (8 x 6) that hold a keypoint with a point; the least:\n",
+        *(f"- {n}: {v:.0%}" for n, v in sorted(covered.items(), key=lambda x: x[1])[:WORST]),
+        "\n## Notes\n",
+        "\n".join(f"- {n}" for n in notes) or "None.",
+    ]
+    write_text(scene / "report.md", "\n".join(parts) + "\n")
 
 
 def _draw_track(model: pycolmap.Reconstruction, findings: Sequence[Finding], path: Path) -> None:
     """Cameras and points from above."""
     names, poses = camera_poses(model)
-    axes = _horizontal(poses)
+    axes = horizontal_axes(poses)
     centers, facing = poses[:, :3, 3] @ axes, poses[:, :3, 2] @ axes
     points = np.array([p.xyz for p in model.points3D.values()]).reshape(-1, 3) @ axes
     reach = 0.6 * max(float(np.ptp(centers, axis=0).max()), 1e-9)
@@ -142,7 +101,7 @@ def _draw_track(model: pycolmap.Reconstruction, findings: Sequence[Finding], pat
     figure.savefig(path, dpi=110)
 
 
-def _horizontal(poses: NDArray[np.float64]) -> NDArray[np.float64]:
+def horizontal_axes(poses: NDArray[np.float64]) -> NDArray[np.float64]:
     """Two axes across the cameras' mean up, whatever frame the scene is in. [3, 2]"""
     up = -poses[:, :3, 1].mean(0)
     up /= max(float(np.linalg.norm(up)), 1e-12)

@@ -55,7 +55,10 @@ class Stages:
         text = self._key + name + json.dumps(settings, sort_keys=True, default=str)
         self._key = hashlib.sha256(text.encode()).hexdigest()
         folder, stamp = self.work / name, self.work / f"{name}.json"
-        state = _read_json(stamp)
+        try:
+            state = json.loads(stamp.read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            state = {}  # missing or truncated: the stage starts over
         if state.get("key") != self._key:
             shutil.rmtree(folder, ignore_errors=True)
             write_text(stamp, json.dumps({"key": self._key, "finished": False}))
@@ -66,13 +69,6 @@ class Stages:
         result = stage(folder)
         write_text(stamp, json.dumps({"key": self._key, "finished": True}))
         return result
-
-
-def _read_json(path: Path) -> dict[str, Any]:
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}  # missing or truncated: the stage starts over
 
 
 def say(text: str, style: str = "") -> None:
@@ -120,7 +116,7 @@ def only_one(work: Path) -> Iterator[None]:
 
 @contextmanager
 def progress(what: str, total: int | None) -> Iterator[Callable[..., None]]:
-    """A progress bar; yields a function that advances it by so many, from ``start`` where it begins anew."""
+    """A progress bar; yields a function that advances it by a count, from ``start`` where it begins anew."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*columns, console=CONSOLE) as bar:
         task = bar.add_task(what, total=total)

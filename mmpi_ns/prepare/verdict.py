@@ -89,61 +89,40 @@ def judge_alone(witness: Witness, is_sequence: bool) -> Verdict:
         is_sequence: the images are in the order of the drive or walk.
     """
     pairs, count = witness.pairs, len(witness.images)
-    found: list[tuple[Grade, str]] = []
     tracked, fitting = share(pairs.tracked, pairs.matches), share(pairs.fitting, pairs.fitting + pairs.beside)
-    found.append((worse(tracked, TRACKED), f"Only {tracked:.0%} of the verified matches became points."))
-    found.append((worse(fitting, FITTING), f"{1 - fitting:.0%} of the verified matches miss the poses by a little."))
+    problems: list[tuple[Grade, str]] = [
+        (worse(tracked, TRACKED), f"Only {tracked:.0%} of the verified matches became points."),
+        (worse(fitting, FITTING), f"{1 - fitting:.0%} of the verified matches miss the poses by a little."),
+    ]
     if is_sequence:
-        found += _breaks(witness)
+        across = bridges(pairs, count, pairs.tracked)
+        if not np.isnan(across).all():
+            problems += [_break(witness, across), *_contradictions(witness), *_leaps(witness, across)]
     else:
         held = held_by_image(pairs, count)
         loose = [witness.images[int(i)] for i in np.flatnonzero(held < LOOSE)]
         grade: Grade = "broken" if len(loose) > 0.1 * count else "doubtful" if loose else "right"
-        found.append((grade, f"Most matches of {in_short(loose, 4)} contradict their poses."))
-    return _worst(found)
+        problems.append((grade, f"Most matches of {in_short(loose, 4)} contradict their poses."))
+    severe = sorted((p for p in problems if p[0] != "right"), key=lambda p: -ORDER.index(p[0]))
+    return Verdict(severe[0][0], tuple(says for _, says in severe)) if severe else Verdict("right")
 
 
-def _breaks(witness: Witness) -> list[tuple[Grade, str]]:
-    """Gaps of a sequence across which the track does not hold: the worst of each kind."""
-    across = bridges(witness.pairs, len(witness.images), witness.pairs.tracked)
-    if np.isnan(across).all():
-        return []
-    usual = float(np.nanmedian(across))
-    grades: list[Grade] = [_grade_of_gap(across, gap, usual) for gap in range(len(across))]
+def _break(witness: Witness, across: Array) -> tuple[Grade, str]:
+    """The worst gap of a sequence by the share of the matches across it that became points; few matches say nothing."""
+    usual, grades = float(np.nanmedian(across)), []
+    for gap, held in enumerate(across):
+        grade = max(worse(held, BRIDGED), worse(held / max(usual, 1e-9), BRIDGED_OF_USUAL), key=ORDER.index)
+        at_an_end = min(gap + 1, len(across) - gap) < EDGE  # a few images may have few points and still be right
+        grades.append("doubtful" if at_an_end and grade == "broken" else grade)
     worst = max(range(len(across)), key=lambda gap: (ORDER.index(grades[gap]), -np.nan_to_num(across[gap], nan=1.0)))
-    held, grade = across[worst], grades[worst]
-    where = _between(witness, worst)
-    says = f"The track breaks {where}: {held:.0%} of the matches across became points, {usual:.0%} elsewhere."
-    found: list[tuple[Grade, str]] = [(grade, says)]
-    found += _contradictions(witness)
-    if np.isfinite(witness.scales).any():
-        at = int(np.nanargmax(np.abs(witness.scales)))
-        change = float(abs(witness.scales[at]))
-        grade = "right" if change < SCALE[0] else "doubtful" if change < SCALE[1] else "broken"
-        found.append((grade, f"The scale changes by {np.expm1(change):.0%} {_between(witness, at)}."))
-    weak = across < WEAK * usual
-    leaps = np.where(weak, jumps(witness), 0.0)
-    if leaps.max(initial=0.0) > JUMP:
-        at = int(leaps.argmax())
-        where = _between(witness, at)
-        found.append(
-            ("broken", f"The track jumps {where}, {leaps[at]:.0f} usual steps, and few matches across it hold.")
-        )
-    near_weak = np.zeros(len(witness.images), dtype=bool)
-    near_weak[:-1] |= weak
-    near_weak[1:] |= weak
-    changes = np.where(near_weak, speed_changes(witness), 1.0)
-    if changes.max(initial=1.0) > CHANGE:
-        at = int(changes.argmax())
-        where = f"{changes[at]:.1f} times at {witness.images[at]}"
-        found.append(("doubtful", f"The speed changes {where}, where few matches hold: the scale may break there."))
-    return found
+    says = f"{across[worst]:.0%} of the matches across became points, {usual:.0%} elsewhere."
+    return grades[worst], f"The track breaks {_between(witness, worst)}: {says}"
 
 
 def _contradictions(witness: Witness) -> list[tuple[Grade, str]]:
     """Where matches lie beside or far from the epipolar lines of the poses: the worst gaps, and the worst image."""
     pairs, count = witness.pairs, len(witness.images)
-    found: list[tuple[Grade, str]] = []
+    problems: list[tuple[Grade, str]] = []
     for word, limits, whole in (
         ("bent", FITTING_ACROSS, pairs.fitting + pairs.beside),
         ("broken", HELD_ACROSS, pairs.matches),
@@ -151,36 +130,42 @@ def _contradictions(witness: Witness) -> list[tuple[Grade, str]]:
         fitting = bridges(pairs, count, pairs.fitting, whole)
         if np.isfinite(fitting).any():
             at = int(np.nanargmin(fitting))
-            says = (
-                f"The track is {word} {_between(witness, at)}: {fitting[at]:.0%} of the matches across fit its poses."
-            )
-            found.append((worse(float(fitting[at]), limits), says))
+            says = f"{fitting[at]:.0%} of the matches across fit its poses."
+            problems.append((worse(float(fitting[at]), limits), f"The track is {word} {_between(witness, at)}: {says}"))
     held = held_by_side(pairs, count)
     if np.isfinite(held).any():
         side, at = divmod(int(np.nanargmin(held)), count)
         others, fitting = ("later" if side else "earlier"), float(held[side, at])
         says = f"{witness.images[at]} is misplaced: {fitting:.0%} of its matches with {others} images fit its pose."
-        found.append((worse(fitting, HELD_BY_SIDE), says))
-    return found
+        problems.append((worse(fitting, HELD_BY_SIDE), says))
+    return problems
 
 
-def _grade_of_gap(across: Array, gap: int, usual: float) -> Grade:
-    """Of one gap, by the share of the matches across it that became points; few matches say nothing."""
-    held = float(across[gap])
-    absolute, relative = worse(held, BRIDGED), worse(held / max(usual, 1e-9), BRIDGED_OF_USUAL)
-    grade = absolute if ORDER.index(absolute) > ORDER.index(relative) else relative
-    at_an_end = min(gap + 1, len(across) - gap) < EDGE  # a few images may have few points and still be placed correctly
-    return "doubtful" if at_an_end and grade == "broken" else grade
+def _leaps(witness: Witness, across: Array) -> list[tuple[Grade, str]]:
+    """The largest change of scale, and jumps and changes of speed where few matches hold across a gap."""
+    problems: list[tuple[Grade, str]] = []
+    if np.isfinite(witness.scales).any():
+        at = int(np.nanargmax(np.abs(witness.scales)))
+        change = float(abs(witness.scales[at]))
+        grade: Grade = "right" if change < SCALE[0] else "doubtful" if change < SCALE[1] else "broken"
+        problems.append((grade, f"The scale changes by {np.expm1(change):.0%} {_between(witness, at)}."))
+    is_weak = across < WEAK * float(np.nanmedian(across))
+    leaps = np.where(is_weak, jumps(witness), 0.0)
+    if leaps.max(initial=0.0) > JUMP:
+        at = int(leaps.argmax())
+        says = f"{_between(witness, at)}, {leaps[at]:.0f} usual steps, and few matches across it hold."
+        problems.append(("broken", f"The track jumps {says}"))
+    beside_weak = np.append(is_weak, False) | np.append(False, is_weak)
+    changes = np.where(beside_weak, speed_changes(witness), 1.0)
+    if changes.max(initial=1.0) > CHANGE:
+        at = int(changes.argmax())
+        says = f"{changes[at]:.1f} times at {witness.images[at]}"
+        problems.append(("doubtful", f"The speed changes {says}, where few matches hold: the scale may break there."))
+    return problems
 
 
 def _between(witness: Witness, gap: int) -> str:
     return f"between {witness.images[gap]} and {witness.images[gap + 1]}"
-
-
-def _worst(found: Sequence[tuple[Grade, str]]) -> Verdict:
-    """All problems, the most severe first."""
-    wrong = sorted((f for f in found if f[0] != "right"), key=lambda f: -ORDER.index(f[0]))
-    return Verdict(wrong[0][0], tuple(says for _, says in wrong)) if wrong else Verdict("right")
 
 
 def agrees(difference: Agreement) -> bool:
@@ -199,33 +184,33 @@ def judge_together(chosen: Witness, others: Sequence[Witness], is_sequence: bool
     agrees with the chosen one, which fits more matches. If two mappers found the same track independently, doubtful
     parts of it are accepted.
     """
-    own = judge_alone(chosen, is_sequence)
+    alone = judge_alone(chosen, is_sequence)
     compared = [(other, d) for other in others if (d := agreement(chosen, other)) is not None]
-    different = [(other, d) for other, d in compared if not agrees(d)]
     is_confirmed = any(agrees(d) and other.name != chosen.name for other, d in compared)
     against = [
         (other, d)
-        for other, d in different
-        if (judge_alone(other, is_sequence).grade == "right" and not (is_confirmed and _fit(other) < _fit(chosen)))
-        or (own.grade != "right" and not is_confirmed)
+        for other, d in compared
+        if not agrees(d)
+        and (
+            (judge_alone(other, is_sequence).grade == "right" and not (is_confirmed and _fit(other) < _fit(chosen)))
+            or (alone.grade != "right" and not is_confirmed)
+        )
     ]
-    if own.grade == "broken" or not against:
-        return own if own.grade == "broken" or not is_confirmed else Verdict("right")
-    return Verdict("doubtful", (*own.reasons, _differ(chosen, *against[0])))
+    if alone.grade == "broken" or not against:
+        return alone if alone.grade == "broken" or not is_confirmed else Verdict("right")
+    other, difference = against[0]
+    worst = [difference.images[int(i)] for i in np.argsort(-difference.centers)[:3]]
+    says = (
+        f"The {chosen.name} and the {other.name} mapper differ by {difference.centers.mean():.1%} of the track "
+        f"({difference.centers.max():.1%} at most; most at {', '.join(worst)}), with focal lengths of "
+        f"{chosen.focal:.2f} and {other.focal:.2f} image sides."
+    )
+    return Verdict("doubtful", (*alone.reasons, says))
 
 
 def _fit(witness: Witness) -> float:
     """Share of the matches that fit the poses, to a hundredth."""
     return round(share(witness.pairs.fitting, witness.pairs.matches), 2)
-
-
-def _differ(chosen: Witness, other: Witness, difference: Agreement) -> str:
-    names = [difference.images[int(i)] for i in np.argsort(-difference.centers)[:3]]
-    return (
-        f"The {chosen.name} and the {other.name} mapper differ by {difference.centers.mean():.1%} of the track "
-        f"({difference.centers.max():.1%} at most; most at {', '.join(names)}), with focal lengths of "
-        f"{chosen.focal:.2f} and {other.focal:.2f} image sides."
-    )
 
 
 def best_first(witnesses: Sequence[Witness], is_sequence: bool) -> list[int]:

@@ -43,17 +43,35 @@ def select_frames(video: Path, target: Path, max_frames: int, step: float) -> li
     if not log.exists():
         measured = measure(video)
         write_text(log, json.dumps({"motion": measured.motion.tolist(), "sharp": measured.sharp.tolist()}))
-    read = json.loads(log.read_text(encoding="utf-8"))
-    measured = Measured(np.array(read["motion"]), np.array(read["sharp"]))
+    measured = Measured(**{name: np.array(row) for name, row in json.loads(log.read_text(encoding="utf-8")).items()})
     chosen, used = choose_frames(measured, max_frames, step)
-    if len(chosen) < 2:
-        raise PrepareError(f"{video} shows no motion in {len(measured.motion)} frames: there is no second view.")
     frames = len(measured.motion)
+    if len(chosen) < 2:
+        raise PrepareError(f"{video} shows no motion in {frames} frames: there is no second view.")
     say(f"{len(chosen)} of {frames} frames taken: the sharpest for every {used:.1%} of the width of motion.")
     if used > MOST_MOTION:
         remedy = f"raise --max-frames above {max_frames} or cut the video into shorter ones"
         say(f"{used:.0%} of the width between frames is much: {remedy}.", "yellow")
-    photos = _write_frames(video, target, chosen)
+    capture, _ = _open(video)
+    photos = []
+    with progress("Writing frames", len(chosen)) as advance:
+        for index in range(chosen[-1] + 1):
+            if not capture.grab():
+                raise PrepareError(f"{video} could be read to frame {index - 1} this time: it changed, or is damaged.")
+            if index != chosen[len(photos)]:
+                continue
+            _, frame = capture.retrieve()
+            name = f"frame_{index:06d}.jpg"
+            path = target / "images" / name
+            if not path.exists():
+                is_encoded, data = cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, 97])
+                if not is_encoded:
+                    raise PrepareError(f"Frame {index} of {video} cannot be written.")
+                with whole(path) as partial:
+                    partial.write_bytes(data.tobytes())
+            photos.append(Photo(name, frame.shape[1], frame.shape[0], source=name))
+            advance(1)
+    capture.release()
     write_photos(photos, target)
     return photos
 
@@ -99,9 +117,9 @@ def median_motion(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> float:
     corners = cv2.goodFeaturesToTrack(before, 200, 0.01, 7)
     if corners is None or len(corners) < 8:
         return LOST
-    moved, found, _ = cv2.calcOpticalFlowPyrLK(before, after, corners, None, winSize=(15, 15), maxLevel=3)  # type: ignore[call-overload]
-    back, found_back, _ = cv2.calcOpticalFlowPyrLK(after, before, moved, None, winSize=(15, 15), maxLevel=3)  # type: ignore[call-overload]
-    good = (found & found_back).ravel().astype(bool) & (np.linalg.norm(back - corners, axis=-1).ravel() < 1)
+    moved, is_tracked, _ = cv2.calcOpticalFlowPyrLK(before, after, corners, None, winSize=(15, 15), maxLevel=3)  # type: ignore[call-overload]
+    back, is_back, _ = cv2.calcOpticalFlowPyrLK(after, before, moved, None, winSize=(15, 15), maxLevel=3)  # type: ignore[call-overload]
+    good = (is_tracked & is_back).ravel().astype(bool) & (np.linalg.norm(back - corners, axis=-1).ravel() < 1)
     if good.sum() < 8:
         return LOST
     return float(np.median(np.linalg.norm(moved - corners, axis=-1).ravel()[good])) / before.shape[1]
@@ -125,33 +143,8 @@ def choose_frames(measured: Measured, max_frames: int, step: float) -> tuple[lis
     stretch = np.floor(path / used + 0.5).astype(int)
     chosen = []
     for number in np.unique(stretch):
-        own = np.nonzero(stretch == number)[0]
+        frames = np.nonzero(stretch == number)[0]
         # near the middle of its stretch unless another is clearly sharper, to keep the spacing even
-        off = np.abs(path[own] / used - number)
-        chosen.append(int(own[np.argmax(measured.sharp[own] * (1 - 0.5 * off))]))
+        off = np.abs(path[frames] / used - number)
+        chosen.append(int(frames[np.argmax(measured.sharp[frames] * (1 - 0.5 * off))]))
     return chosen, used
-
-
-def _write_frames(video: Path, target: Path, chosen: list[int]) -> list[Photo]:
-    """Second pass: writes the chosen frames, named by their place in the video."""
-    capture, _ = _open(video)
-    wanted, photos = set(chosen), []
-    with progress("Writing frames", len(chosen)) as advance:
-        for index in range(chosen[-1] + 1):
-            if not capture.grab():
-                raise PrepareError(f"{video} could be read to frame {index - 1} this time: it changed, or is damaged.")
-            if index not in wanted:
-                continue
-            _, frame = capture.retrieve()
-            name = f"frame_{index:06d}.jpg"
-            path = target / "images" / name
-            if not path.exists():
-                ok, data = cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, 97])
-                if not ok:
-                    raise PrepareError(f"Frame {index} of {video} cannot be written.")
-                with whole(path) as partial:
-                    partial.write_bytes(data.tobytes())
-            photos.append(Photo(name, frame.shape[1], frame.shape[0], source=name))
-            advance(1)
-    capture.release()
-    return photos

@@ -125,9 +125,9 @@ def test_a_fisheye_lens_is_taken_for_what_it_is(tmp_path):
 def test_faint_images_are_searched_more_thoroughly_and_others_are_not(tmp_path, images, monkeypatch):
     efforts, attempt = [], triangulation._attempt
 
-    def spy(pycolmap, images, effort):
+    def spy(images, effort):
         efforts.append(effort)
-        return attempt(pycolmap, images, effort)
+        return attempt(images, effort)
 
     match, guided = pycolmap.match_image_pairs, []
 

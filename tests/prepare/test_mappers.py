@@ -12,12 +12,12 @@ import pycolmap
 import pytest
 from PIL import Image
 
-from mmpi_ns.prepare import features, mappers, polish
-from mmpi_ns.prepare.frame import camera_poses, similarity_between
+from mmpi_ns.prepare import adjustment, features, mappers
+from mmpi_ns.prepare.adjustment import Free, with_all_points, with_fewer_points
+from mmpi_ns.prepare.alignment import camera_poses, similarity_between
 from mmpi_ns.prepare.images import Photo, read_photos
 from mmpi_ns.prepare.mappers import Task, map_and_judge
 from mmpi_ns.prepare.pipeline import WORK, prepare
-from mmpi_ns.prepare.polish import Free, with_all_points, with_fewer_points
 from mmpi_ns.prepare.settings import Settings
 from mmpi_ns.prepare.stages import PrepareError
 
@@ -91,12 +91,12 @@ def test_a_placed_model_is_given_the_points_of_all_matches_and_adjusted(task):
     assert found.num_points3D() > 0.9 * before and found.num_reg_images() == COUNT
     (camera,), (given,) = found.cameras.values(), exact.cameras.values()
     assert camera.mean_focal_length() == pytest.approx(given.mean_focal_length(), rel=0.01)
-    assert max(p.error for p in found.points3D.values()) <= polish.LARGEST_ERROR
+    assert max(p.error for p in found.points3D.values()) <= adjustment.LARGEST_ERROR
     assert error_of(found) < 0.01
 
 
 def test_fewer_points_are_those_that_most_images_see_and_every_image_keeps_enough(task, monkeypatch):
-    monkeypatch.setattr(polish, "ENOUGH_POINTS", 40)
+    monkeypatch.setattr(adjustment, "ENOUGH_POINTS", 40)
     model = pycolmap.Reconstruction(task.database.parents[1] / "model/model")
     before = model.num_points3D()
     light = with_fewer_points(model)
@@ -123,6 +123,7 @@ def test_weak_features_count_where_images_have_few(tmp_path, monkeypatch, is_poo
     real = pycolmap.extract_features
 
     def watch(*args, image_names, extraction_options, **rest):
+        assert extraction_options.max_image_size == features.LARGEST_SIDE
         asked.append((len(image_names), extraction_options.sift.peak_threshold))
         return real(*args, image_names=image_names, extraction_options=extraction_options, **rest)
 
@@ -140,7 +141,7 @@ def test_the_adjusted_model_is_kept_and_judged_unless_its_evidence_is_worse(task
     made: list[pycolmap.Reconstruction] = []
 
     def watch(*args):
-        made.append(polish.polish(*args))
+        made.append(adjustment.polish(*args))
         return made[-1]
 
     monkeypatch.setattr(mappers, "polish", watch)

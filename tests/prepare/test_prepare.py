@@ -16,7 +16,7 @@ from reprojection import median_reprojection_error
 from mmpi_ns.capture.observe import read_observations
 from mmpi_ns.capture.sfm import find_sfm_model
 from mmpi_ns.prepare import features, mappers, mapping
-from mmpi_ns.prepare.frame import camera_poses, similarity_between
+from mmpi_ns.prepare.alignment import camera_poses, similarity_between
 from mmpi_ns.prepare.pipeline import WORK, prepare
 from mmpi_ns.prepare.settings import Settings
 
@@ -195,23 +195,31 @@ def test_interrupted_mapping_goes_on_from_its_snapshot(capture, tmp_path, monkey
     settings = Settings(capture / "frames", tmp_path / "scene", threads=1)
     registered = []
 
+    run = pycolmap.incremental_mapping
+
     def count_to(most):
-        def make(advance, count, start=None):
-            def step():
-                registered.append(count)
+        def mapping_that_counts(*args, initial_image_pair_callback, next_image_callback, **options):
+            def count(images, callback):
+                callback()
+                registered.append(images)
                 if sum(registered) > most:
                     raise KeyboardInterrupt
 
-            return step
+            return run(
+                *args,
+                initial_image_pair_callback=lambda: count(2, initial_image_pair_callback),
+                next_image_callback=lambda: count(1, next_image_callback),
+                **options,
+            )
 
-        return make
+        return mapping_that_counts
 
     monkeypatch.setattr(mapping, "SNAPSHOT", 3)
-    monkeypatch.setattr(mapping, "_step", count_to(8))
+    monkeypatch.setattr(pycolmap, "incremental_mapping", count_to(8))
     with pytest.raises(KeyboardInterrupt):
         prepare(settings)
     registered.clear()
-    monkeypatch.setattr(mapping, "_step", count_to(1000))
+    monkeypatch.setattr(pycolmap, "incremental_mapping", count_to(1000))
     prepare(settings)
     assert 0 < sum(registered) < COUNT  # the others came with the snapshot
     assert len(read_json(tmp_path / "scene")["frames"]) == COUNT

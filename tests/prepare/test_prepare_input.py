@@ -19,7 +19,6 @@ from mmpi_ns.prepare.pipeline import prepare
 from mmpi_ns.prepare.report import exposure_in_words
 from mmpi_ns.prepare.settings import Settings
 from mmpi_ns.prepare.stages import PrepareError
-from mmpi_ns.prepare.undistort import undistort
 from mmpi_ns.prepare.video import Measured, choose_frames, measure, select_frames
 
 
@@ -70,7 +69,7 @@ def test_every_written_image_keeps_its_exposure(suffix, turned, tmp_path):
         with Image.open(save(tmp_path / "phone.jpg", (64, 48), exif=exif)) as image:
             image.save(tmp_path / f"in/{n}{suffix}", exif=image.getexif())  # Pillow writes a new Exif to no TIFF
     photos = gather(tmp_path / "in", find_images(tmp_path / "in"), tmp_path / "out")
-    export.write_images(tmp_path / "out/images", photos, tmp_path / "scene", (2,))
+    export.write_images(tmp_path / "out/images", None, photos, tmp_path / "scene", (2,))
     for folder in ("images", "images_2"):
         files = [tmp_path / "scene" / folder / photo.name for photo in photos]
         for n, file in enumerate(files):
@@ -115,7 +114,7 @@ def test_undistorted_images_keep_exposure_and_alpha_and_masks_stay_black_and_whi
         Image.fromarray((right * 255).astype(np.uint8)).save(tmp_path / "masks" / f"{photo.name}.png")
         image = pycolmap.Image(name=photo.name, camera_id=1, image_id=i + 1, points2D=[pycolmap.Point2D([edge, 80.0])])
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
-    flat, flat_photos = undistort(model, photos, tmp_path / "images", tmp_path / "masks", tmp_path / "flat", 1)
+    flat, flat_photos = export.undistort(model, photos, tmp_path / "images", tmp_path / "masks", tmp_path / "flat", 1)
     pinhole = flat.cameras[1]
     at = pinhole.params[2] + 0.3 * pinhole.params[0]
     assert pinhole.model.name == "PINHOLE" and flat.images[1].points2D[0].xy[0] == pytest.approx(at, abs=1e-3)
@@ -230,7 +229,7 @@ def test_look_alikes_are_found_by_their_features(tmp_path):
     database = tmp_path / "database.db"
     features.create_database(database, photos, [1] * 4, make_cameras(photos, [1] * 4, {}, None, "auto"))
     features.extract(database, tmp_path / "images", photos, None, 1000, 1)
-    alike = pairs.similarity(pairs.describe_images(database, 4))
+    alike = pairs.image_similarity(database, 4)
     assert alike.argmax(-1).tolist() == [1, 0, 3, 2]
 
 

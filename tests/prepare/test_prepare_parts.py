@@ -13,12 +13,13 @@ import pycolmap
 import pytest
 from PIL import Image
 
+from mmpi_ns.capture.matching import rigid3d
 from mmpi_ns.prepare import export, mapping, pairs
+from mmpi_ns.prepare.adjustment import Free, adjust, polish
+from mmpi_ns.prepare.alignment import similarity_between
 from mmpi_ns.prepare.cameras import Intrinsics, make_cameras, read_intrinsics, share
-from mmpi_ns.prepare.frame import choose_frame, similarity_between
+from mmpi_ns.prepare.frame import choose_frame
 from mmpi_ns.prepare.images import Photo
-from mmpi_ns.prepare.polish import Free, polish
-from mmpi_ns.prepare.poses import rigid3d
 from mmpi_ns.prepare.stages import PrepareError
 from mmpi_ns.prepare.video import Measured, choose_frames, median_motion
 
@@ -240,7 +241,7 @@ def test_looser_settings_go_on_from_a_sound_model_of_most_images(first, starts, 
 
     database = SimpleNamespace(num_images=lambda: 100)
     monkeypatch.setattr(mapping.pycolmap.Database, "open", lambda path: nullcontext(database))
-    monkeypatch.setattr(mapping, "count_matching_pairs", lambda path: 500)
+    monkeypatch.setattr(mapping, "matching_pairs", lambda path: [(1, 2)] * 500)
     monkeypatch.setattr(mapping, "_run", run)
     found = mapping.reconstruct(tmp_path / "database", tmp_path, tmp_path, True, 1, is_sequence=True)
     assert seen == starts
@@ -275,7 +276,7 @@ def test_four_lens_terms_are_kept_only_where_the_images_bear_them_out(tangential
     for point, track in zip(points, tracks, strict=True):
         if track.length() > 2:
             model.add_point3D(point, track, np.zeros(3, np.uint8))
-    mapping.adjust(model, mapping.bundle_options(True, True, False, 1))
+    adjust(model, 1, lens=True)
     found = polish(model, Free(lens=True, full_lens=True, principal_point=False), 1)
     (camera,) = found.cameras.values()
     assert camera.model.name == kept and model.num_points3D() > 150

@@ -1,0 +1,191 @@
+"""Bundle adjustment: points of all matches, the lens as far as the images determine it, and how well they do."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from mmpi_ns.capture.matching import MIN_ANGLE, quiet, triangulate_points
+from mmpi_ns.prepare.stages import progress, say
+
+STILL = 1e-6
+"""Relative change of the cost at which an adjustment ends. COLMAP goes on to 100 iterations: of 64 images of a drive
+that took four times as long, and moved the focal length by 0.002 px."""
+WORTH = 0.97
+"""Fraction of the reprojection error to which a freed parameter must lower it."""
+LARGEST_ERROR = 4.0
+"""Reprojection error in pixels above which an observation is dropped."""
+ENOUGH_POINTS = 300
+"""Points of each image, those that most images see, on which a choice between camera models rests."""
+PARTS = 20
+"""Number of images from which the two halves of a capture are also used separately to judge the focal length."""
+WIDE = 0.08
+"""Width of the interval of the focal length, relative to it, from which --focal is asked for."""
+
+
+@dataclass(frozen=True)
+class Free:
+    """What may be refined of the cameras."""
+
+    lens: bool
+    """Focal length and distortion."""
+    full_lens: bool
+    """OpenCV's four lens terms in place of one radial term, if they fit clearly better."""
+    principal_point: bool
+    """The principal point, if that fits clearly better. It is hardly observable on straight stretches, but in bends."""
+    always: bool = False
+    """The principal point, in any case."""
+
+
+def adjust(
+    model: pycolmap.Reconstruction, threads: int, lens: bool, principal_point: bool = False, poses: bool = True
+) -> None:
+    """Bundle adjustment over all images with a robust loss, in place.
+
+    Args:
+        model: adjusted; its points always are.
+        threads: CPU threads; below 1 for all.
+        lens: refine focal length and distortion.
+        principal_point: refine the principal point.
+        poses: refine poses.
+    """
+    options, config = pycolmap.BundleAdjustmentOptions(), pycolmap.BundleAdjustmentConfig()
+    options.refine_rig_from_world = poses
+    options.refine_focal_length = options.refine_extra_params = lens
+    options.refine_principal_point = principal_point
+    options.print_summary = False
+    options.ceres.solver_options.num_threads = threads
+    options.ceres.solver_options.function_tolerance = STILL
+    options.ceres.loss_function_type, options.ceres.loss_function_scale = pycolmap.LossFunctionType.CAUCHY, 1.0
+    for image_id in model.reg_image_ids():
+        config.add_image(image_id)
+    if poses:
+        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    with quiet():  # pycolmap.bundle_adjustment cannot be kept quiet
+        pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+    model.update_point_3d_errors()
+
+
+def polish(model: pycolmap.Reconstruction, free: Free, threads: int) -> pycolmap.Reconstruction:
+    """The model adjusted with more parameters free, if that lowers the error.
+
+    Parameters that do not lower it absorb other errors: driving forward, lens terms absorb the principal point.
+
+    Args:
+        model: adjusted; not changed.
+        free: what may be refined.
+        threads: CPU threads; below 1 for all.
+    """
+    trials: list[tuple[str, Callable[[pycolmap.Reconstruction], None], bool]] = []
+    if free.principal_point and not free.always:
+        trials.append(("the principal point free", lambda model: None, True))
+    if free.full_lens and any(c.model.name == "SIMPLE_RADIAL" for c in model.cameras.values()):
+        trials.append(("OpenCV's four lens terms", _give_four_terms, False))
+    place = free.always
+    with progress("Fitting the lens", 1 + len(trials)) as advance:
+        best = copy.deepcopy(model)
+        if place:
+            adjust(best, threads, free.lens, place)
+        advance()
+        light = with_fewer_points(best)
+        if trials:
+            adjust(light, threads, free.lens, place)
+        changes = []
+        for says, change, moves_center in trials:
+            trial = copy.deepcopy(light)
+            change(trial)
+            adjust(trial, threads, free.lens, place or moves_center)
+            advance()
+            before, after = rms_error(light), rms_error(trial)
+            is_better = after < WORTH * before
+            say(f"Lens: {before:.3f} px, {after:.3f} px with {says}: {'kept' if is_better else 'not kept'}.")
+            if is_better:
+                light, place = trial, place or moves_center
+                changes.append(change)
+        if changes:
+            for change in changes:
+                change(best)
+            adjust(best, threads, free.lens, place)
+    return best
+
+
+def _give_four_terms(model: pycolmap.Reconstruction) -> None:
+    """Cameras of one radial term become OpenCV's, with the others at zero."""
+    for camera in model.cameras.values():
+        if camera.model.name == "SIMPLE_RADIAL":
+            f, cx, cy, k = camera.params
+            camera.model = pycolmap.CameraModelId.OPENCV
+            camera.params = [f, f, cx, cy, k, 0.0, 0.0, 0.0]
+
+
+def rms_error(model: pycolmap.Reconstruction) -> float:
+    """Root mean square of the points' reprojection errors, each counted once for each image that sees it; pixels."""
+    errors = np.array([p.error for p in model.points3D.values()])
+    lengths = np.array([p.track.length() for p in model.points3D.values()])
+    return float(np.sqrt((errors**2 * lengths).sum() / max(int(lengths.sum()), 1)))
+
+
+def with_fewer_points(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+    """A copy with the points that most images see, ENOUGH_POINTS for each image: as telling, and quickly adjusted."""
+    light = copy.deepcopy(model)
+    counts = dict.fromkeys(light.reg_image_ids(), 0)
+    tracks = {i: [e.image_id for e in p.track.elements] for i, p in light.points3D.items()}
+    for number in sorted(tracks, key=lambda i: (-len(tracks[i]), i)):
+        if all(counts[image] >= ENOUGH_POINTS for image in tracks[number]):
+            light.delete_point3D(number)
+        else:
+            for image in tracks[number]:
+                counts[image] += 1
+    return light
+
+
+def with_all_points(
+    model: pycolmap.Reconstruction, database: Path, images: Path, lens: bool, threads: int, rounds: int = 1
+) -> pycolmap.Reconstruction:
+    """A placed model with the points of all verified matches, and everything adjusted to them, in several rounds.
+
+    In place of COLMAP's own last step, which takes longer, and leaves out many points of sequences with small angles:
+    of every second frame of a drive with bends half of the matches became points, with this three quarters.
+    """
+    for _ in range(rounds):
+        with quiet():
+            model = triangulate_points(model, database, images, threads, LARGEST_ERROR)
+        adjust(model, threads, lens)
+        pycolmap.ObservationManager(model).filter_all_points3D(LARGEST_ERROR, MIN_ANGLE)
+        model.update_point_3d_errors()
+    return model
+
+
+def focal_interval(model: pycolmap.Reconstruction, threads: int) -> tuple[float, float]:
+    """Focal lengths, in pixels, that bundle adjustments of one model end at under different assumptions.
+
+    Principal point in the middle; principal point free; each half of the images alone. The statistical error of one
+    adjustment is far smaller and means little, because the assumptions dominate. Of several cameras, the first.
+
+    Args:
+        model: not changed.
+        threads: CPU threads; below 1 for all.
+    """
+    light, ids = with_fewer_points(model), sorted(model.reg_image_ids())
+    middle = len(ids) // 2
+    trials: list[tuple[list[int], bool]] = [(ids, True)]
+    trials += [(ids[:middle], False), (ids[middle:], False)] if len(ids) >= PARTS else []
+    models = [model]
+    for part, principal_point in trials:
+        models.append(copy.deepcopy(light))
+        for image_id in set(ids) - set(part):
+            models[-1].deregister_frame(models[-1].images[image_id].frame_id)
+        adjust(models[-1], threads, True, principal_point)
+    firsts = [m.cameras[m.images[min(m.reg_image_ids())].camera_id] for m in models]
+    focals = [float(camera.mean_focal_length()) for camera in firsts]
+    return min(focals), max(focals)
+
+
+def focal_in_words(low: float, high: float) -> str:
+    """The interval of a focal length, for the report."""
+    return f"between {low:.1f} and {high:.1f} px, {(high - low) / high:.1%} wide"
