@@ -198,7 +198,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
             return None, "no pixel has a known depth"
         posed = posed_images(self.observations, self.train_dataset)
         if posed is None:
-            return None, "the cameras are neither all perspective nor all fisheye"
+            return None, "a camera is neither perspective nor fisheye"
         rays, seed = self.train_ray_generator, self.config.seed
         points = find_shared_points(self.train_dataset, posed, self.known_depth, rays, images, seed, self.device)
         return points, "no two images show a point at the same depth"

@@ -95,7 +95,7 @@ def load_view(images: PosedImages, i: int, width: int) -> View:
     inside = np.broadcast_to(True, gray.shape)  # of no size
     if images.distortion[i].any():
         matrix, size = camera_matrix(pinhole), gray.shape[::-1]
-        straighten = cv2.fisheye.initUndistortRectifyMap if images.fisheye else cv2.initUndistortRectifyMap
+        straighten = cv2.fisheye.initUndistortRectifyMap if images.is_fisheye(i) else cv2.initUndistortRectifyMap
         # OpenCV counts from pixel centres.
         matrix[:2, 2] -= 0.5
         x, y = straighten(matrix, images.distortion[i], np.eye(3), matrix, size, cv2.CV_32FC1)
@@ -116,7 +116,7 @@ def project(posed: PosedImages, j: int, points: NDArray[np.float64]) -> NDArray[
     ahead = local[:, 2] > 0
     local = np.where(ahead[:, None], local, [0.0, 0.0, 1.0])[:, None]
     matrix, still = camera_matrix(posed.intrinsics[j]), np.zeros(3)
-    bend = cv2.fisheye.projectPoints if posed.fisheye else cv2.projectPoints
+    bend = cv2.fisheye.projectPoints if posed.is_fisheye(j) else cv2.projectPoints
     at = bend(local, still, still, matrix, posed.distortion[j])[0].reshape(-1, 2)
     return np.where(ahead[:, None], at, -1e4)
 

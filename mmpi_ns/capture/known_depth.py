@@ -238,7 +238,7 @@ def _straightened(
     if not original.distortion[i].any():
         fx, fy, cx, cy = original.intrinsics[i]
         return (at[:, 0, 0] - cx) / fx, (at[:, 0, 1] - cy) / fy
-    straighten = cv2.fisheye.undistortPoints if original.fisheye else cv2.undistortPoints
+    straighten = cv2.fisheye.undistortPoints if original.is_fisheye(i) else cv2.undistortPoints
     found = straighten(at, camera_matrix(original.intrinsics[i]), original.distortion[i])[:, 0]
     return np.asarray(found[:, 0], np.float64), np.asarray(found[:, 1], np.float64)
 

@@ -75,7 +75,10 @@ def observe(
 
 def _find_points(observations: Observations, dataset: MMPIDataset, triangulates: bool) -> Observations:
     """Points of a scene without tracks: triangulated, and from a plane sweep if triangulation finds too few."""
-    if triangulates and (images := posed_images(observations, dataset)) is not None:
+    images = posed_images(observations, dataset)
+    if images is None:
+        CONSOLE.print("Cameras that are neither perspective nor fisheye: no features are matched.")
+    elif triangulates:
         model = _remembered_tracks(at_full_size(images))
         observations = with_tracks(observations, model)
         tell_poses((model.off or 0.0) * float(images.sizes[:, 0].mean()), images.files[0])
@@ -222,20 +225,20 @@ def _keep_keypoints(observations: Observations, keep: NDArray[np.bool_]) -> Obse
 def posed_images(observations: Observations, dataset: MMPIDataset) -> PosedImages | None:
     """The training images with their cameras and lenses; None where a camera is neither perspective nor fisheye."""
     cameras = dataset.cameras
-    types = set(cameras.camera_type.reshape(-1).tolist())
-    if types not in ({CameraType.PERSPECTIVE.value}, {CameraType.FISHEYE.value}):
+    kinds = cameras.camera_type.reshape(-1).cpu()
+    is_fisheye = kinds == CameraType.FISHEYE.value
+    if not (is_fisheye | (kinds == CameraType.PERSPECTIVE.value)).all():
         return None
-    fisheye = types == {CameraType.FISHEYE.value}
     lens = cameras.distortion_params  # k1, k2, k3, k4, p1, p2
     lens = torch.zeros(len(dataset), 6) if lens is None else lens.reshape(len(dataset), 6).cpu()
-    used = [0, 1, 2, 3] if fisheye else [0, 1, 4, 5]
+    lens = torch.where(is_fisheye[:, None], lens[:, :4], lens[:, [0, 1, 4, 5]])
     return PosedImages(
         files=tuple(Path(name) for name in dataset.image_filenames),
         camera_to_worlds=observations.camera_to_worlds,
         intrinsics=observations.intrinsics,
         sizes=observations.sizes,
-        distortion=lens[:, used].double().numpy(),
-        fisheye=fisheye,
+        distortion=lens.double().numpy(),
+        fisheye=is_fisheye.numpy(),
     )
 
 

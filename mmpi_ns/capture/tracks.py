@@ -71,7 +71,12 @@ class PosedImages:
     """[M, 2]: width, height in pixels."""
     distortion: NDArray[np.float64]
     """[M, 4]: k1, k2, p1, p2 (OpenCV), or k1 to k4 of a fisheye lens."""
-    fisheye: bool = False
+    fisheye: NDArray[np.bool_] | bool = False
+    """Whether the lens of each image is a fisheye: [M], or one for all."""
+
+    def is_fisheye(self, i: int) -> bool:
+        """Whether image i has a fisheye lens."""
+        return bool(np.broadcast_to(self.fisheye, len(self.sizes))[i])
 
     def pairs(self) -> list[tuple[int, int]]:
         """Images worth matching."""
@@ -158,7 +163,7 @@ def _posed_model(images: PosedImages, names: Sequence[str]) -> Any:
     for i, name in enumerate(names):
         width, height = (int(n) for n in images.sizes[i])
         params = [*images.intrinsics[i], *images.distortion[i]]
-        lens = "OPENCV_FISHEYE" if images.fisheye else "OPENCV"
+        lens = "OPENCV_FISHEYE" if images.is_fisheye(i) else "OPENCV"
         cameras.append(pycolmap.Camera(model=lens, width=width, height=height, params=params, camera_id=i + 1))
         cameras[-1].has_prior_focal_length = True
         opencv = images.camera_to_worlds[i] @ np.diag([1.0, -1.0, -1.0, 1.0])

@@ -57,12 +57,21 @@ def as_data(kind=CameraType.PERSPECTIVE, lens=None, **more):
 LENS = torch.tensor([[0.1, 0.2, 0.3, 0.4, 0.5, 0.6], [1.1, 1.2, 1.3, 1.4, 1.5, 1.6]])  # nerfstudio's k1 k2 k3 k4 p1 p2
 
 
+def test_each_camera_of_a_mixture_has_its_own_lens_and_others_are_none():
+    kinds = torch.tensor([[CameraType.PERSPECTIVE.value], [CameraType.FISHEYE.value]])
+    images = posed_images(bare(), as_data(kind=kinds, lens=LENS))
+    assert images is not None and [images.is_fisheye(i) for i in range(2)] == [False, True]
+    assert images.distortion == pytest.approx(np.array([(0.1, 0.2, 0.5, 0.6), (1.1, 1.2, 1.3, 1.4)]))
+    kinds[1] = CameraType.EQUIRECTANGULAR.value
+    assert posed_images(bare(), as_data(kind=kinds, lens=LENS)) is None
+
+
 @pytest.mark.parametrize(
     ("kind", "used"), [(CameraType.PERSPECTIVE, (0.1, 0.2, 0.5, 0.6)), (CameraType.FISHEYE, (0.1, 0.2, 0.3, 0.4))]
 )
 def test_a_lens_goes_to_colmap_in_its_order(kind, used):
     images = posed_images(bare(), as_data(kind=kind, lens=LENS))
-    assert images is not None and images.fisheye == (kind is CameraType.FISHEYE)
+    assert images is not None and images.is_fisheye(1) == (kind is CameraType.FISHEYE)
     assert images.distortion == pytest.approx(np.array([used, np.add(used, 1)]))
     assert [str(f) for f in images.files] == ["a/x.png", "b/x.png"] and np.array_equal(images.sizes, SIZES)
     assert not posed_images(bare(), as_data(kind=kind)).distortion.any()

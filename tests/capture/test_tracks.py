@@ -122,6 +122,20 @@ def test_a_fisheye_lens_is_taken_for_what_it_is(tmp_path):
     assert not len(others) or np.median(depth_error(others)) > 0.01
 
 
+def test_perspective_and_fisheye_images_are_matched_with_each_other(tmp_path):
+    straight, round_ = (scene_of(tmp_path / str(f), POSES[f::2], LENS, fisheye=bool(f)) for f in range(2))
+    both = {
+        name: np.concatenate([getattr(straight, name), getattr(round_, name)])
+        for name in ("camera_to_worlds", "intrinsics", "sizes", "distortion")
+    }
+    is_fisheye = np.array([False] * len(straight.files) + [True] * len(round_.files))
+    found = triangulate(PosedImages(files=straight.files + round_.files, **both, fisheye=is_fisheye))
+    assert len(found.points) > 100 and np.median(depth_error(found.points)) < 0.005
+    cameras, points, _ = found.keypoints_of([str(i) for i in range(len(POSES))])
+    mixed = [len(set(is_fisheye[cameras[points == p]])) == 2 for p in range(len(found.points))]
+    assert np.mean(mixed) > 0.5
+
+
 def test_faint_images_are_searched_more_thoroughly_and_others_are_not(tmp_path, images, monkeypatch):
     efforts, attempt = [], triangulation._attempt
 
