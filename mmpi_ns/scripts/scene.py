@@ -12,6 +12,7 @@ from typing import Literal
 import tyro
 
 from mmpi_ns.scripts.command import run
+from mmpi_ns.synthetic.exposure import ExposureName
 
 Name = Literal["street", "long-road", "walk", "room", "look-round", "object"]
 
@@ -42,6 +43,11 @@ class SceneCommand:
     """Standard deviation of the keypoints' noise, pixels; the points are triangulated from them."""
     outliers: float = 0.02
     """Fraction of wrong points."""
+    exposure: ExposureName = "none"
+    """auto: gains that follow the content (three-fold), white balance, vignetting and a tone curve, written to
+    exposure.json. vignetting: one exposure, half of the light lost in the corners."""
+    moving: int = 0
+    """Cars and people that move through a street; exact masks in moving/. Test images show none of them."""
     images: tyro.conf.FlagConversionOff[bool] = True
     """False: write cameras, points and tracks only."""
     overwrite: bool = False
@@ -50,24 +56,28 @@ class SceneCommand:
     def main(self) -> None:
         from mmpi_ns.synthetic.catalogue import make_scene
         from mmpi_ns.synthetic.dataset import check_folder, write_dataset
+        from mmpi_ns.synthetic.exposure import make_exposure
+        from mmpi_ns.synthetic.movers import with_movers
         from mmpi_ns.utils.values import Number, check_options
 
         ranges = {"seed": Number(0, whole=True), "noise": Number(0), "outliers": Number(0, 1)}
+        ranges["moving"] = Number(0, 1000, whole=True)
         given = {"points": Number(1, whole=True), "count": Number(1, whole=True), "length": Number(0, above=True)}
         given |= {"width": Number(1, 65536, whole=True), "height": Number(1, 65536, whole=True)}
         ranges |= {name: number for name, number in given.items() if getattr(self, name) is not None}
         check_options(self, ranges, "--")
         check_folder(self.folder, self.overwrite)
         scene = make_scene(self.name, self.seed, self.count, self.width, self.height, self.length)
+        if self.moving:
+            scene = with_movers(scene, self.moving)
         cameras, points = scene.cameras, self.points
         if points is None:
             points = max(4000, 4 * round(self.length or 0))
         print(f"{self.name}: {len(scene.primitives)} solids, {len(cameras)} cameras; looking for points ...")
         sfm = (points, self.noise, self.outliers)
         processes = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        found = write_dataset(
-            scene, self.folder, *sfm, self.images, self.overwrite, progress=_progress, processes=processes
-        )
+        others = {"exposure": make_exposure(self.exposure, scene), "progress": _progress, "processes": processes}
+        found = write_dataset(scene, self.folder, *sfm, self.images, self.overwrite, **others)
         test = int(cameras.is_test.sum())
         kind = "images with depths" if self.images else "cameras (no images)"
         print(f"Wrote {self.folder}: {len(cameras)} {kind} of {cameras.width}x{cameras.height} pixels,")

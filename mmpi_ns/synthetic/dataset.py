@@ -15,10 +15,15 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from mmpi_ns.synthetic.exposure import Exposure
+from mmpi_ns.synthetic.movers import moving_mask
 from mmpi_ns.synthetic.scene import Colors, Scene, render
 from mmpi_ns.synthetic.sfm_like import SfmPoints, sfm_points
 
-PARTS = ("transforms.json", "images", "images_2", "images_4", "images_8", "depths", "colmap", "sparse_pc.ply")
+PARTS = (
+    *("transforms.json", "images", "images_2", "images_4", "images_8", "depths", "moving", "exposure.json", "colmap"),
+    "sparse_pc.ply",
+)
 """What belongs to a data set, and is removed before another one is written in its place."""
 MILLIMETRES = 65535
 """The farthest depth that a 16-bit file holds; 0 stands for farther, and for the sky."""
@@ -38,9 +43,13 @@ def write_dataset(
     overwrite: bool = False,
     progress: Callable[[Iterable[int]], Iterable[int]] = iter,
     tracks: bool = True,
+    exposure: Exposure | None = None,
     processes: int = 1,
 ) -> SfmPoints:
     """Writes images, depths (along the optical axis), transforms.json, sparse_pc.ply and colmap/sparse/0.
+
+    With movers also their exact masks (moving/), which transforms.json does not name: finding them is what is tried.
+    With an exposure also exposure.json.
 
     Everything is in the scene's own frame, which applied_transform states, as Nerfstudio would guess another.
 
@@ -50,6 +59,7 @@ def write_dataset(
         overwrite: replaces a data set that is in the folder.
         progress: wraps the image numbers as they are rendered.
         tracks: False writes no points and no COLMAP model, for which it takes pycolmap.
+        exposure: of the images; None: pixel values are the scene's colours.
         processes: render side by side; the files do not depend on their number.
 
     Raises:
@@ -64,23 +74,32 @@ def write_dataset(
         (folder / "colmap" / "sparse" / "0").mkdir(parents=True)
         model.write(folder / "colmap" / "sparse" / "0")
         model.export_PLY(folder / "sparse_pc.ply")
-    for part in ("images", "depths") if images else ():
+    for part in ("images", "depths", *(["moving"] if scene.movers else [])) if images else ():
         (folder / part).mkdir()
     if images:
-        write = partial(_write_image, scene, folder)
+        write = partial(_write_image, scene, folder, exposure)
         with _side_by_side(write, len(scene.cameras), processes) as written:
             for _ in progress(range(len(scene.cameras))):
                 next(written)
+    if exposure is not None:
+        names = [f"images/{image_name(i)}" for i in range(len(scene.cameras))]
+        (folder / "exposure.json").write_text(json.dumps(exposure.to_object(names), indent=1))
     # Last, so that a folder with a transforms.json is complete.
     (folder / "transforms.json").write_text(json.dumps(_transforms(scene, images), indent=1))
     return found
 
 
-def _write_image(scene: Scene, folder: Path, camera: int) -> None:
+def _write_image(scene: Scene, folder: Path, exposure: Exposure | None, camera: int) -> None:
     """Renders one image and writes its files."""
-    colors, distances = render(scene, camera)
-    Image.fromarray((colors * 255).round().astype(np.uint8)).save(folder / "images" / image_name(camera))
+    name = image_name(camera)
+    colors, distances = render(scene.filmed_by(camera), camera)
+    if exposure is not None:
+        colors = exposure.expose(scene.cameras, camera, colors)
+    exif = Image.Exif() if exposure is None else exposure.exif(camera)
+    Image.fromarray((colors * 255).round().astype(np.uint8)).save(folder / "images" / name, exif=exif)
     write_depths(scene, folder, camera, distances)
+    if scene.movers is not None:
+        Image.fromarray(moving_mask(scene, camera)).save(folder / "moving" / name)
 
 
 def write_depths(scene: Scene, folder: Path, camera: int, distances: Colors) -> None:

@@ -50,6 +50,11 @@ class Primitives:
     def take(self, rows: NDArray[np.int64]) -> Primitives:
         return Primitives(*(getattr(self, f.name)[rows] for f in fields(self)))
 
+    def joined(self, other: Primitives) -> Primitives:
+        """These and others, sorted."""
+        both = (np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self))
+        return Primitives(*both).sorted()
+
     def sorted(self) -> Primitives:
         return self.take(np.argsort(self.center[:, 0], kind="stable"))
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from mmpi_ns.synthetic.cameras import Cameras
 from mmpi_ns.synthetic.materials import MATERIALS, Surface
 from mmpi_ns.synthetic.primitives import CYLINDER, PACKET, SPHERE, Array, Primitives, Tracer, dot, to_local
+from mmpi_ns.synthetic.road import Road
 from mmpi_ns.synthetic.textures import Noise
 
 Colors = NDArray[np.float32]
@@ -50,10 +51,24 @@ class Scene:
     """Solids farther from a ray's origin do not count, so the cost of an image does not grow with the scene."""
     track_range: float = 60.0
     """SfM points are matched no farther away than this."""
+    road: Road | None = None
+    """Along which a street lies."""
+    movers: Callable[[int], Primitives] | None = None
+    """What moves, when an image is taken."""
+    moving: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, bool))
+    """[P] which solids are movers; empty: none."""
     noise: Noise = field(init=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "noise", Noise(self.seed))
+
+    def filmed_by(self, camera: int) -> Scene:
+        """The scene when an image is taken: with its movers, unless the image is held out for testing."""
+        if self.movers is None or self.cameras.is_test[camera]:
+            return self if self.movers is None else replace(self, movers=None)
+        movers = self.movers(camera)
+        order = np.argsort(np.concatenate([self.primitives.center, movers.center])[:, 0], kind="stable")
+        return replace(self, primitives=self.primitives.joined(movers), moving=order >= len(self.primitives))
 
     @cached_property
     def tracer(self) -> Tracer:
@@ -193,7 +208,7 @@ def render(scene: Scene, camera: int, supersample: int = 2, contrast: float = 0.
     cameras = scene.cameras
     h, w = cameras.height, cameras.width
     colors, depths, patch = np.empty((h * w, 3), np.float32), np.empty(h * w), np.empty(h * w, np.int64)
-    order = _by_tile(h, w)
+    order = tile_order(h, w)
     for start in range(0, h * w, PACKET):
         these = order[start : start + PACKET]
         rays = cameras.rays_at(camera, cameras.central_tangents[these])
@@ -211,7 +226,7 @@ def render(scene: Scene, camera: int, supersample: int = 2, contrast: float = 0.
     return colors.reshape(h, w, 3), depths.reshape(h, w).astype(np.float32)
 
 
-def _by_tile(height: int, width: int) -> NDArray[np.int64]:
+def tile_order(height: int, width: int) -> NDArray[np.int64]:
     """Flat pixel indices tile by tile, so that packets of rays lie close together."""
     y, x = np.divmod(np.arange(height * width), width)
     return np.lexsort((x, y, x // TILE, y // TILE))

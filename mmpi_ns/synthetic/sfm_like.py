@@ -86,7 +86,9 @@ def visible(scene: Scene, camera: int, points: Array) -> tuple[NDArray[np.bool_]
     seen &= ((pixel > 0) & (pixel < [cameras.width, cameras.height])).all(-1)
     rows = np.flatnonzero(seen)
     directions = offset[rows] / distance[rows, None]
-    hit = scene.hit(np.broadcast_to(cameras.camera_to_worlds[camera, :, 3], directions.shape), directions)[0]
+    hit = scene.filmed_by(camera).hit(
+        np.broadcast_to(cameras.camera_to_worlds[camera, :, 3], directions.shape), directions
+    )[0]
     seen[rows] = hit >= distance[rows] - 1e-5 * (1 + distance[rows])
     return seen, pixel
 

@@ -19,8 +19,8 @@ FOCAL_SHARE = 0.58
 class Street(Kit):
     """Adds what stands along a road."""
 
-    def __init__(self, seed: int, road: Road) -> None:
-        super().__init__(seed, 1)
+    def __init__(self, seed: int, road: Road, topic: int = 1) -> None:
+        super().__init__(seed, topic)
         self.road = road
 
     def place(self, along: float, aside: float, z: float = 0.0) -> tuple[tuple[float, float, float], float]:
@@ -141,7 +141,7 @@ def make_street(name: str, road: Road, seed: int, cameras: Cameras) -> Scene:
         kit.houses(side, first + kit.random.uniform(0, 4), last)
         kit.parked(side, first + kit.random.uniform(0, 4), last)
         kit.kerbside(side, first + kit.random.uniform(0, 8), last)
-    return Scene(name, seed, kit.done(), street_ground(road), open_sky, Light(SUN), cameras)
+    return Scene(name, seed, kit.done(), street_ground(road), open_sky, Light(SUN), cameras, road=road)
 
 
 def street(seed: int, count: int, width: int, height: int, length: float) -> Scene:

@@ -1,0 +1,134 @@
+"""Cars and people that move through a street while it is filmed, and exact masks of what they change.
+
+Test images hold none of them: their truth is the street without movers.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mmpi_ns.synthetic.cameras import Array
+from mmpi_ns.synthetic.kit import PAINTS, WHITE
+from mmpi_ns.synthetic.primitives import Primitives, Tracer
+from mmpi_ns.synthetic.road import Road
+from mmpi_ns.synthetic.scene import Scene, tile_order
+from mmpi_ns.synthetic.street import Street
+
+WALKING, DRIVING = 1.3, 8.0
+"""Metres a second; whoever films the street walks or drives too."""
+LANE, PAVEMENT = 1.8, 7.6
+"""Metres from the middle line at which cars drive, and people walk."""
+STRIDES, SWING = 0.95, 0.28
+"""Double steps a second, and metres by which a foot is ahead of the body."""
+MOVER, SHADOW = 255, 128
+"""Values of masks: a mover is seen, or the light that it takes away."""
+CHANGED = 1 / 255
+"""Change of a colour from which on a shadow counts."""
+
+
+@dataclass(frozen=True)
+class Movers:
+    """N cars and people along a road, as functions of time."""
+
+    seed: int
+    road: Road
+    count: int
+    along: Array
+    """[M] metres along the road of each camera."""
+    walks: bool
+    """Whether the cameras walk; else they drive."""
+
+    @property
+    def seconds(self) -> Array:
+        """[M] at which each image is taken."""
+        return (self.along - self.along[0]) / (WALKING if self.walks else DRIVING)
+
+    def solids(self, camera: int) -> Primitives:
+        """The movers when an image is taken."""
+        now, kits = float(self.seconds[camera]), []
+        for number in range(self.count):
+            # The same draws for every image: a mover keeps its looks.
+            kit = Street(self.seed, self.road, topic=100 + number)
+            self._add(kit, number, now)
+            kits += kit.rows
+        everything = Street(self.seed, self.road)
+        everything.rows = kits
+        return everything.done()
+
+    def _add(self, kit: Street, number: int, now: float) -> None:
+        """One mover: in turns oncoming, ahead of the camera, crossing, on the pavement, overtaking."""
+        meets = float(kit.random.uniform(0.1, 0.9)) * float(self.seconds[-1])
+        since, speed = now - meets, WALKING if self.walks else DRIVING
+        camera = float(np.interp(now, self.seconds, self.along))
+        met = float(np.interp(meets, self.seconds, self.along))
+        paint, side = kit.pick(PAINTS), float(kit.random.choice([-1, 1]))
+        if number % 5 == 0:
+            kit.car(met + 8 - DRIVING * since, LANE, paint)
+        elif number % 5 == 1 and self.walks:
+            _add_person(kit, camera + float(kit.random.uniform(4, 8)), float(kit.random.uniform(-1.2, 0.6)), paint, now)
+        elif number % 5 == 1:
+            kit.car(camera + 9, -LANE, paint)
+        elif number % 5 == 2:
+            _add_person(kit, met + (7 if self.walks else 18), side * WALKING * since, paint, now)
+        elif number % 5 == 3:
+            _add_person(kit, met + 5 - WALKING * since, side * PAVEMENT, paint, now)
+        else:
+            kit.car(met + 8 + (speed + 4) * since, LANE, paint)
+
+
+def _add_person(kit: Street, along: float, aside: float, paint, now: float) -> None:
+    """Somebody who walks: two legs, a body and a head."""
+    swing = SWING * np.sin(2 * np.pi * STRIDES * now)
+    trousers = kit.pick(PAINTS)
+    for foot, half in ((swing, 0.09), (-swing, -0.09)):
+        kit.cylinder(kit.place(along + foot, aside + half)[0], 0.085, 0.85, "plaster", trousers, trousers)
+    kit.cylinder(kit.place(along, aside, 0.8)[0], 0.22, 0.62, "stripes", paint, kit.varied(paint, 0.3), WHITE)
+    kit.sphere(kit.place(along, aside, 1.56)[0], 0.13, "plaster", (0.8, 0.6, 0.48), (0.7, 0.5, 0.4))
+
+
+def with_movers(scene: Scene, count: int) -> Scene:
+    """The scene with so many movers in its training images.
+
+    Raises:
+        ValueError: the scene has no road.
+    """
+    if scene.road is None:
+        raise ValueError(f"Nothing moves in the scene {scene.name}: choose street, long-road or walk.")
+    along = scene.road.locate(scene.cameras.camera_to_worlds[:, :2, 3])[0]
+    return replace(scene, movers=Movers(scene.seed, scene.road, count, along, scene.name == "walk").solids)
+
+
+def moving_mask(scene: Scene, camera: int, supersample: int = 3) -> NDArray[np.uint8]:
+    """Where an image [H, W] shows a mover or its shadow; zeros elsewhere.
+
+    Args:
+        scene: with movers.
+        camera: number of the image.
+        supersample: rays along each side of a pixel, of which one that meets a mover is enough.
+    """
+    cameras, filmed = scene.cameras, scene.filmed_by(camera)
+    mask = np.zeros(cameras.height * cameras.width, np.uint8)
+    if filmed.movers is None or scene.movers is None:
+        return mask.reshape(cameras.height, cameras.width)
+    movers = Tracer(scene.movers(camera), scene.reach)
+    order = tile_order(cameras.height, cameras.width)
+    tangents = cameras.central_tangents[order]
+    origins, directions = cameras.rays_at(camera, tangents)
+    distance = filmed.hit(origins, directions)[0]
+    solid = np.flatnonzero(np.isfinite(distance))
+    points = origins[solid] + distance[solid, None] * directions[solid]
+    sun = np.broadcast_to(np.array(scene.light.toward) / np.linalg.norm(scene.light.toward), points.shape)
+    dark = solid[np.isfinite(movers(points, sun)[0])]
+    rays, pixel = (origins[dark], directions[dark]), 1 / cameras.focal
+    change = np.abs(scene.trace(*rays, pixel)[1] - filmed.trace(*rays, pixel)[1]).max(-1, initial=0)
+    mask[order[dark[change > CHANGED]]] = SHADOW
+    inner = (np.arange(supersample) + 0.5) / supersample - 0.5
+    for shift in np.stack(np.meshgrid(inner, inner), -1).reshape(-1, 2):
+        origins, directions = cameras.rays(camera, cameras.pixel_centers[order] + shift)
+        near = np.flatnonzero(np.isfinite(movers(origins, directions)[0]))
+        row = filmed.hit(origins[near], directions[near])[1]
+        mask[order[near[filmed.moving[row] & (row >= 0)]]] = MOVER
+    return mask.reshape(cameras.height, cameras.width)
