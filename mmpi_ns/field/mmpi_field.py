@@ -18,13 +18,13 @@ from torch import Tensor
 
 from mmpi_ns.field.color_network import ColorNetworks
 from mmpi_ns.field.moving import moving
-from mmpi_ns.field.samples import Lookup, by_head, head_spans, metadata_of, places_of
+from mmpi_ns.field.samples import Lookup, head_spans, metadata_of, places_of
 from mmpi_ns.field.shading import RayColors, RayShader, Shading
 from mmpi_ns.field.tables import TexelTables, replace_data
 from mmpi_ns.ops.blending import log_shares
 from mmpi_ns.ops.composite import Composite, render_colors
 from mmpi_ns.ops.gather import Taps, gather_places, gather_taps
-from mmpi_ns.ops.interpolate import index_rows, read_rows, texel_rows
+from mmpi_ns.ops.interpolate import index_rows, order_by_head, read_rows, texel_rows
 from mmpi_ns.ops.layout import SceneLayout, Tables
 from mmpi_ns.ops.shade import shade
 from mmpi_ns.ops.variation import total_variation
@@ -192,9 +192,7 @@ class MMPIField(TexelTables):
 
     def _lookup(self, ray_samples: RaySamples, head_counts: Sequence[int] | None = None) -> Lookup:
         meta = metadata_of(ray_samples)
-        index, counts = by_head(meta["heads"][..., 0], meta["valid"][..., 0], len(self.grids), head_counts)
-        heads, planes = (meta[name].reshape(-1).index_select(0, index) for name in ("heads", "planes"))
-        ndc = meta["ndc"].reshape(-1, 3).index_select(0, index)
+        index, heads, planes, ndc, counts = order_by_head(places_of(ray_samples), len(self.grids), head_counts)
         starts, ways = ray_samples.frustums.origins[:, 0], ray_samples.frustums.directions[:, 0]
         if starts.requires_grad or ways.requires_grad:
             rays, inverse_t = index // meta["valid"].shape[1], meta["inverse_t"].reshape(-1)[index]

@@ -95,23 +95,3 @@ def places_of(ray_samples: RaySamples) -> Places:
     """Positions of merged samples."""
     meta = metadata_of(ray_samples)
     return Places(meta["heads"][..., 0], meta["planes"][..., 0], meta["ndc"], meta["valid"][..., 0])
-
-
-def by_head(
-    heads: Int[Tensor, "R S"], valid: Bool[Tensor, "R S"], num_heads: int, counts: Sequence[int] | None
-) -> tuple[Int[Tensor, "N"], Sequence[int]]:
-    """Flat slots of the valid samples, heads rising and otherwise in order, and how many each head has.
-
-    Args:
-        heads: of every slot.
-        valid: which slots hold a sample.
-        num_heads: of the scene.
-        counts: samples of each head, if known; otherwise this synchronises with a GPU.
-    """
-    if counts is not None:
-        keys = torch.where(valid, heads, num_heads).reshape(-1)
-        return torch.sort(keys.to(torch.int16), stable=True).indices[: sum(counts)], counts
-    index = valid.reshape(-1).nonzero()[:, 0]
-    heads = heads.reshape(-1)[index]
-    parts = [(heads == k).nonzero()[:, 0] for k in range(num_heads)]  # on a CPU a sort takes longer
-    return index[torch.cat(parts)], [len(p) for p in parts]

@@ -152,11 +152,10 @@ def owned_bounds(positions: Sequence[Int[Tensor, "N B"]], count: int, least: int
 
 def run_in_parts(work: Callable[[int, int], Any], bounds: Sequence[int]) -> list[Any]:
     """Results of work(begin, end) for the parts between bounds, each by a thread. Parts must not write to one place."""
-    if len(bounds) == 2:
-        return [work(*bounds)]
-    parts = [_pool(torch.get_num_threads()).submit(work, a, b) for a, b in pairwise(bounds)]
+    (first, *others), threads = pairwise(bounds), torch.get_num_threads()
+    parts = [_pool(threads - 1).submit(work, *part) for part in others]
     try:
-        return [part.result() for part in parts]
+        return [work(*first), *(part.result() for part in parts)]
     finally:
         wait(parts)  # also when interrupted: the caller's tensors are freed then, and the kernels write to them
 

@@ -28,6 +28,7 @@ TABLE: dict[str, tuple[str, tuple[Form, ...]]] = {
     # operation: its folder, and which compiled forms there are beside the reference
     "plane_hits": ("hits", ("cpu", "gpu")),
     "march": ("march", ("cpu", "gpu")),
+    "order_by_head": ("interpolate", ("cpu",)),
     "texel_rows": ("interpolate", ("cpu", "gpu")),
     "weighted_rows": ("interpolate", ("gpu",)),
     "take_rows": ("interpolate", ("cpu",)),

@@ -12,6 +12,7 @@ from mmpi_ns.ops.interpolate import (
     Table,
     index_rows,
     interpolate,
+    order_by_head,
     raise_peaks,
     read_rows,
     reference,
@@ -19,6 +20,7 @@ from mmpi_ns.ops.interpolate import (
     texel_rows,
     weigh_rows,
 )
+from mmpi_ns.ops.layout import Places
 
 F64 = torch.float64
 
@@ -208,6 +210,24 @@ def test_a_bricks_peak_is_the_largest_weight_of_what_reads_it(taps):
     assert all(torch.equal(found, wanted) for found in both(raised)) and not torch.equal(peaks, wanted)
 
 
+def places(rays=700, slots=9, heads=4):
+    g = torch.Generator().manual_seed(1)
+    of_heads, planes = (torch.randint(0, n, (rays, slots), generator=g) for n in (heads, 50))
+    return Places(of_heads, planes, normal(rays, slots, 3), torch.rand(rays, slots, generator=g) < 0.6)
+
+
+@pytest.mark.parametrize("counted", [False, True])
+def test_samples_by_head_are_those_of_loops(counted):
+    at = places()
+    heads, valid = at.heads.reshape(-1).tolist(), at.valid.reshape(-1).tolist()
+    slots = [[i for i, h in enumerate(heads) if valid[i] and h == k] for k in range(5)]
+    for form in both(lambda: order_by_head(at, 5, [len(x) for x in slots] if counted else None)):
+        assert form.slots.tolist() == [i for x in slots for i in x] and list(form.counts) == [*map(len, slots)] and form.counts[4] == 0
+        assert torch.equal(form.heads, at.heads.reshape(-1)[form.slots])
+        assert torch.equal(form.planes, at.planes.reshape(-1)[form.slots])
+        assert torch.equal(form.ndc, at.ndc.reshape(-1, 3)[form.slots])
+
+
 @pytest.mark.parametrize("threads", [2, 3, 7])
 def test_bits_of_all_operations_on_rows_do_not_depend_on_threads(threads):
     rows = torch.randint(0, 2**20, (20_000,), generator=torch.Generator().manual_seed(1))[:, None] * 8 + torch.arange(4)
@@ -219,7 +239,8 @@ def test_bits_of_all_operations_on_rows_do_not_depend_on_threads(threads):
         index = index_rows(rows, 2**23 + 4)
         sums = sum_rows(index.positions, values, weights, len(index.unique))
         raise_peaks(peaks := torch.zeros(2**17 + 1), index.unique, index.positions, weights[:, 0])
-        return index.unique, index.positions, sums, peaks, *texel_rows(layout, heads, heads, ndc)
+        by_head = order_by_head(places(rays=4000), 4)[:4]
+        return index.unique, index.positions, sums, peaks, *texel_rows(layout, heads, heads, ndc), *by_head
 
     before, one = torch.get_num_threads(), work()
     try:

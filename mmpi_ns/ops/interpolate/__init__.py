@@ -5,6 +5,7 @@ A table has millions of rows of which a step reads a few: backward and optimiser
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -13,12 +14,12 @@ from torch import Tensor, nn
 
 from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.interpolate import reference
-from mmpi_ns.ops.interpolate.reference import RowIndex
-from mmpi_ns.ops.layout import SceneLayout
+from mmpi_ns.ops.interpolate.reference import HeadSamples, RowIndex
+from mmpi_ns.ops.layout import Places, SceneLayout
 from mmpi_ns.ops.shapes import check_shapes
 
-__all__ = ["RowIndex", "Table", "index_rows", "interpolate", "raise_peaks", "read_rows", "sum_rows", "texel_rows",
-           "weigh_rows"]  # fmt: skip
+__all__ = ["HeadSamples", "RowIndex", "Table", "index_rows", "interpolate", "order_by_head", "raise_peaks", "read_rows",
+           "sum_rows", "texel_rows", "weigh_rows"]  # fmt: skip
 
 
 class Table(nn.Parameter):
@@ -56,6 +57,18 @@ class Table(nn.Parameter):
         if self.grad_rows is None or self._row_grad is None:
             return None
         return torch.zeros_like(self.data).index_add_(0, self.grad_rows, self._row_grad)
+
+
+def order_by_head(places: Places, num_heads: int, counts: Sequence[int] | None = None) -> HeadSamples:
+    """Valid samples of a batch, ordered by head and otherwise by slot.
+
+    Args:
+        places: of the samples.
+        num_heads: of the scene.
+        counts: samples of each head, if known; otherwise this synchronises with a GPU.
+    """
+    check_shapes("heads R S, planes R S, ndc R S 3, valid R S", *places)
+    return dispatch.run("order_by_head", places, num_heads, counts)
 
 
 def texel_rows(

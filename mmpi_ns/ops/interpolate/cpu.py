@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import accumulate
 
 import torch
@@ -10,14 +11,32 @@ from torch import Tensor
 from mmpi_ns.ops.build import call, call_in_parts, even_bounds, owned_bounds, run_in_parts
 from mmpi_ns.ops.cpu_scene import CpuScene
 from mmpi_ns.ops.interpolate import reference
-from mmpi_ns.ops.interpolate.reference import RowIndex
-from mmpi_ns.ops.layout import SceneLayout
+from mmpi_ns.ops.interpolate.reference import HeadSamples, RowIndex
+from mmpi_ns.ops.layout import Places, SceneLayout
 from mmpi_ns.scene.texels import BRICK
 
 MOST_ROWS = 2**31
 """A bit is taken for every row of the table: beyond this, torch's sort."""
 AT_LEAST = 4096
 """Samples, rows or bricks that are worth another thread."""
+
+
+def order_by_head(places: Places, num_heads: int, counts: Sequence[int] | None) -> HeadSamples:
+    """See ``ops.interpolate``."""
+    heads, planes, ndc, valid = (x.contiguous() for x in places)
+    bounds = even_bounds(heads.numel(), AT_LEAST)
+    in_parts = torch.zeros(len(bounds) - 1, num_heads, dtype=torch.int64)
+    part_of = {begin: i for i, begin in enumerate(bounds)}
+    run_in_parts(lambda a, b: call("mmpi_count_heads", heads, valid, a, b, in_parts[part_of[a]]), bounds)
+    totals = in_parts.sum(0)
+    starts = totals.cumsum(0) - totals + in_parts.cumsum(0) - in_parts
+    count = int(totals.sum())
+    slots, of_heads, of_planes = (torch.empty(count, dtype=torch.int64) for _ in range(3))
+    columns = (slots, of_heads, of_planes, torch.empty(count, 3))
+    run_in_parts(
+        lambda a, b: call("mmpi_order_by_head", heads, planes, ndc, valid, a, b, starts[part_of[a]], *columns), bounds
+    )
+    return HeadSamples(*columns, totals.tolist())
 
 
 def texel_rows(layout: SceneLayout, heads: Tensor, planes: Tensor, ndc: Tensor) -> tuple[Tensor, Tensor]:

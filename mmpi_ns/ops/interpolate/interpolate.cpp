@@ -72,6 +72,24 @@ void mmpi_sum_rows(const int32_t* positions, const float* weights, const float* 
             add_row(values + positions[i] * channels, grad + i / taps * channels, weights[i], channels);
 }
 
+// Adds to `counts` [heads] how many of slots [begin, end) hold a sample of each head.
+void mmpi_count_heads(const int64_t* heads, const bool* valid, int64_t begin, int64_t end, int64_t* counts) {
+    for (int64_t i = begin; i < end; i++) counts[heads[i]] += valid[i];
+}
+
+// Writes slot, head, plane and position of each sample in slots [begin, end) to the next place of its head; `next` [heads]
+// is advanced.
+void mmpi_order_by_head(const int64_t* heads, const int64_t* planes, const float* ndc, const bool* valid, int64_t begin,
+                        int64_t end, int64_t* next, int64_t* slots, int64_t* of_heads, int64_t* of_planes,
+                        float* of_ndc) {
+    for (int64_t i = begin; i < end; i++) {
+        if (!valid[i]) continue;
+        const int64_t to = next[heads[i]]++;
+        slots[to] = i, of_heads[to] = heads[i], of_planes[to] = planes[i];
+        std::copy_n(ndc + 3 * i, 3, of_ndc + 3 * to);
+    }
+}
+
 // Rows and weights of bilinear lookups of samples [begin, end) at (u, v, .) of `ndc` on planes of MPIs
 // (TexelGrid.bilinear).
 void mmpi_texel_rows(const Grid* grids, const int64_t* heads, const int64_t* planes, const float* ndc, int64_t begin,

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from mmpi_ns.ops.layout import SceneLayout
+from mmpi_ns.ops.layout import Places, SceneLayout
 from mmpi_ns.scene.texels import BRICK
 
 
@@ -20,6 +22,31 @@ class RowIndex:
     """Rising, except for padding."""
     positions: Int[Tensor, "..."]
     """Of every entry in ``unique``; int32 or int64."""
+
+
+class HeadSamples(NamedTuple):
+    """The valid samples of a batch: heads rising, and the slots of each head."""
+
+    slots: Int[Tensor, "N"]
+    """Flat slots [R, S] of the samples."""
+    heads: Int[Tensor, "N"]
+    planes: Int[Tensor, "N"]
+    ndc: Float[Tensor, "N 3"]
+    counts: Sequence[int]
+    """Samples of each head."""
+
+
+def order_by_head(places: Places, num_heads: int, counts: Sequence[int] | None) -> HeadSamples:
+    """See ``ops.interpolate``."""
+    heads, valid = places.heads.reshape(-1), places.valid.reshape(-1)
+    if counts is None:
+        parts = [(valid & (heads == k)).nonzero()[:, 0] for k in range(num_heads)]
+        slots, counts = torch.cat(parts), [len(p) for p in parts]
+    else:
+        keys = torch.where(valid, heads, num_heads)
+        slots = torch.sort(keys.to(torch.int16), stable=True).indices[: sum(counts)]
+    columns = (heads, places.planes.reshape(-1), places.ndc.reshape(-1, 3))
+    return HeadSamples(slots, *(x.index_select(0, slots) for x in columns), counts)
 
 
 def texel_rows(layout: SceneLayout, heads: Tensor, planes: Tensor, ndc: Tensor) -> tuple[Tensor, Tensor]:

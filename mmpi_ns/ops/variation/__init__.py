@@ -26,4 +26,6 @@ def total_variation(
         layout: of the scene.
         scales: weight of a difference along x, y and z, of each head.
     """
+    check_shapes("values U C, table T C, rows U", values, table, rows, T=len(layout.grids[0].places) * BRICK)
+    check_shapes("scales H 3", torch.empty(len(scales), 3), H=layout.num_heads)
     return dispatch.run("total_variation", values, table, rows, layout, scales)
