@@ -13,7 +13,6 @@ NOT_PULLED = (P + "drive-pull-back", "0")
 EQUAL_SHARES = ("--optimizers.reliability.optimizer.lr", "1e-9")
 LITTLE_VARIATION = ("--pipeline.model.loss.tv-density", "1e-5", "--pipeline.model.loss.tv-features", "1e-6")
 """DVGO's."""
-SHARED = ("--pipeline.model.colour.shared-colour", "True")
 DEFAULT = "the default"
 """Of a suite of budgets: what is drawn apart."""
 ROOM = (P + "arrangement", "room", P + "width", "160", *JOINT)
@@ -135,7 +134,6 @@ ABLATIONS: dict[str, list[Method]] = {
             {
                 "one front MPI, at the first camera": (*FRONT, *NOT_PULLED),
                 "four MPIs, the front one not pulled back": (*BY_HAND, *NOT_PULLED),
-                "one colour network for all": (*BY_HAND, *SHARED),
                 "no SfM depth": (*BY_HAND, *NO_DEPTH),
             },
         ),
@@ -143,7 +141,6 @@ ABLATIONS: dict[str, list[Method]] = {
             "automatic placement",
             {
                 "placed among the cameras, joint": JOINT,
-                "placed, one colour network for all": (*JOINT, *SHARED),
                 "placed, no SfM depth": (*JOINT, *NO_DEPTH),
                 "placed, a tenth of the total variation": (*JOINT, *LITTLE_VARIATION),
                 "placed, each alone, reliability, fine-tune": (*TWO_PHASE, *SPLIT, *_shares(0.1, 0.4, 0.3)),

@@ -24,13 +24,12 @@ WAITING = {
     "unique_dim",
     "unique_consecutive",
     "masked_select",
-    "_coalesce",
     "equal",
     "bincount",
     "lift_fresh",  # torch.tensor of Python's numbers: a copy to the device that is waited for
 }
 """Operations of torch that wait whatever they are given."""
-NO_LAUNCH = ("empty", "new_empty", "_sparse_coo_tensor", "_indices", "_values", "_coalesced_", "lift_fresh")
+NO_LAUNCH = ("empty", "new_empty", "lift_fresh")
 """What the names of operations begin with that work on the host alone."""
 PACKAGE = Path(mmpi_ns.__file__).parent
 STEPS = 8

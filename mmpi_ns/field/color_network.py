@@ -44,9 +44,8 @@ class Networks(nn.Module):
 
     def layers(self, head: int) -> list[Tensor]:
         """Weights [out, in] and biases of one head's three layers."""
-        index = head if self.count > 1 else 0
         sizes = [math.prod(s) for s in self.shapes]
-        return [p.view(s) for p, s in zip(self.weights[index].split(sizes), self.shapes, strict=True)]
+        return [p.view(s) for p, s in zip(self.weights[head].split(sizes), self.shapes, strict=True)]
 
     def run(self, head: int, inputs: Float[Tensor, "N I"]) -> Float[Tensor, "N 3"]:
         """Output of one head's network."""
@@ -54,7 +53,7 @@ class Networks(nn.Module):
 
 
 class ColorNetworks(Networks):
-    """Networks (features, PE(position), PE(direction)) -> rgb for every sample, one per head or one for all.
+    """Networks (features, PE(position), PE(direction)) -> rgb for every sample, one for each head.
 
     The first three features are colour logits, to which the network adds the view-dependent part.
     """

@@ -62,8 +62,6 @@ class ColourConfig:
     """Shading of samples: octaves of the positional encoding of NDC positions."""
     direction_frequencies: int = 2
     """Octaves of the positional encoding of directions."""
-    shared_colour: bool = False
-    """Shading of samples: one colour network for all MPIs instead of one each."""
 
 
 class MMPIField(TexelTables):
@@ -76,7 +74,6 @@ class MMPIField(TexelTables):
         hidden_width: width of the colour networks' hidden layers.
         position_frequencies: octaves of the positional encoding of NDC positions.
         direction_frequencies: octaves of the positional encoding of directions in the MPI's frame.
-        shared_colour: one colour network for all heads (the paper's notation) instead of one each.
         shares_depth: K MPIs train jointly from the start, so each has 1/K of the optical depth.
         samples_per_voxel: samples along a ray per voxel side of the cube.
         cube_alpha: initial alpha of a cube sample.
@@ -93,7 +90,6 @@ class MMPIField(TexelTables):
         hidden_width: int = 64,
         position_frequencies: int = 2,
         direction_frequencies: int = 2,
-        shared_colour: bool = False,
         shares_depth: bool = False,
         samples_per_voxel: float = 1.0,
         cube_alpha: float = 1e-3,
@@ -108,18 +104,16 @@ class MMPIField(TexelTables):
         """Whether training rays mark the texels they train. Only blending needs the marks; once it has begun none are
         added, so that P cannot jump."""
         self.shading = shading
-        self.shared_colour = shared_colour
         if shading == "ray":
             self.networks = RayShader(feature_channels, hidden_width, direction_frequencies)
         else:
             sizes = (feature_channels, hidden_width, position_frequencies, direction_frequencies)
-            self.networks = ColorNetworks(1 if shared_colour else plan.num_heads, *sizes)
+            self.networks = ColorNetworks(plan.num_heads, *sizes)
 
     def renew_networks(self) -> None:
         """Creates new networks for the current plan in the same Parameter."""
-        one = self.shading == "ray" or self.shared_colour
-        weights = self.networks.weights
-        replace_data(weights, self.networks.fresh(1 if one else self.full_plan.num_heads).to(weights.device))
+        weights, count = self.networks.weights, 1 if self.shading == "ray" else self.full_plan.num_heads
+        replace_data(weights, self.networks.fresh(count).to(weights.device))
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
         """Takes the number of colour networks from the checkpoint first."""

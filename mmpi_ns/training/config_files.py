@@ -21,7 +21,6 @@ MOVED = {
         name: f"colour.{name}"
         for name in (
             "shading", "feature_channels", "hidden_width", "position_frequencies", "direction_frequencies",
-            "shared_colour",
         )
     },
     **{name: f"rendering.{name}" for name in ("background", "resident_gib", "half_windows")},

@@ -259,12 +259,11 @@ def test_a_batch_without_samples_has_no_variation_and_no_density(plan):
 # State ---------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("shared", [False, True])
 @pytest.mark.parametrize(("ours", "theirs"), [(1, 3), (3, 1), (2, 2), (4, 2)])
 @pytest.mark.parametrize("factor", [1.0, 0.25])
-def test_a_state_dict_brings_its_own_plan_and_resolution(ours, theirs, shared, factor):
+def test_a_state_dict_brings_its_own_plan_and_resolution(ours, theirs, factor):
     def field(num_mpis, with_cube, seed):
-        return MMPIField(random_plan(num_mpis, with_cube, seed), hidden_width=6, shared_colour=shared)
+        return MMPIField(random_plan(num_mpis, with_cube, seed), hidden_width=6)
 
     written, read = field(theirs, ours == 4, seed=11), field(ours, ours == 3, seed=22)
     written.build(written.full_plan, factor)

@@ -57,7 +57,7 @@ def camera(trained):
 
 
 @pytest.mark.parametrize("settings", [{"rays_per_mpi": "split"}, {"rays_per_mpi": "all"}, {"training": "joint"},
-                                      {"shared_colour": True}])  # fmt: skip
+                                      {"shading": "sample"}])  # fmt: skip
 def test_every_phase_has_finite_losses_and_trains_what_it_says(scene, plan_file, tmp_path, settings):
     trainer = trainer_of(scene, plan_file, tmp_path, steps=24, **settings)
     schedule = trainer.pipeline.model.progress.schedule

@@ -13,14 +13,16 @@ from nerfstudio.field_components.field_heads import FieldHeadNames
 from random_fields import bundle, random_field, random_rays
 
 from mmpi_ns.field.mmpi_field import MMPIField
+from mmpi_ns.field.samples import places_of
 from mmpi_ns.ops import dispatch
+from mmpi_ns.ops.shade import shade
 from mmpi_ns.rendering.sampler import MMPISampler
 
 
-def shaded(channels=9, width=32, octaves=(2, 2), shared=False):
+def shaded(channels=9, width=32, octaves=(2, 2)):
     """A field of four MPIs and a cube, samples in all of them, and their colours by the networks in float64."""
     plan = random_field(4, True, seed=7).plan
-    sizes: dict[str, Any] = {"feature_channels": channels, "hidden_width": width, "shared_colour": shared}
+    sizes: dict[str, Any] = {"feature_channels": channels, "hidden_width": width}
     sizes |= {"position_frequencies": octaves[0], "direction_frequencies": octaves[1]}
     field = MMPIField(plan, **sizes).eval()
     field.features.data = normal(*field.features.shape, seed=1) * 2
@@ -44,10 +46,9 @@ def in_float64(field, samples):
     return exact.get_outputs(given)[FieldHeadNames.RGB].detach()
 
 
-@pytest.mark.parametrize("shared", [False, True])
 @pytest.mark.parametrize(("channels", "width", "octaves"), [(3, 5, (0, 0)), (9, 32, (2, 2)), (17, 64, (4, 1))])
-def test_colours_are_those_of_the_networks(channels, width, octaves, shared):
-    field, samples = shaded(channels, width, octaves, shared)
+def test_colours_are_those_of_the_networks(channels, width, octaves):
+    field, samples = shaded(channels, width, octaves)
     wanted, valid = in_float64(field, samples), samples.metadata["valid"][..., 0]
     assert dispatch.form_of("shade", field.features.data, samples.metadata["ndc"]) == "cpu"
     assert wanted[valid].std() > 0.05
@@ -76,3 +77,29 @@ def test_colours_say_where_a_feature_is_not_a_number():
     field.features.data[read.rows[read.taps[0].positions[3, 0]], 5] = math.nan
     found = colors(field, samples).isnan().any(-1)
     assert not before.any() and found.reshape(-1)[read.index[3]] and not found.all()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda given: given | {"table": given["table"][:-1]},
+        lambda given: given | {"axes": given["axes"][:4]},
+        lambda given: given | {"directions": given["directions"][:-1]},
+        lambda given: given | {"places": given["places"]._replace(ndc=given["places"].ndc[..., :2])},
+        lambda given: given | {"networks": given["networks"]._replace(position_frequencies=3)},
+        lambda given: given | {"networks": given["networks"]._replace(layers=given["networks"].layers[1:])},
+    ],
+)
+def test_arrays_of_a_wrong_shape_are_refused(change):
+    field, samples = shaded()
+    given = {
+        "layout": field.layout,
+        "table": field.features.data,
+        "networks": field.networks.of_heads(5),
+        "axes": torch.eye(3).expand(5, 3, 3),
+        "directions": samples.frustums.directions[:, 0],
+        "places": places_of(samples),
+    }
+    shade(**given)
+    with pytest.raises(ValueError, match="where"):
+        shade(**change(given))

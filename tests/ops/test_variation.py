@@ -61,6 +61,14 @@ def test_variation_of_many_texels_does_not_depend_on_the_number_of_threads(chann
     assert torch.allclose(found[0][1].double(), values.grad, atol=2e-6)
 
 
+@pytest.mark.parametrize(("rows", "values", "heads", "more"), [(9, 8, 1, 0), (9, 9, 2, 0), (9, 9, 1, 64)])
+def test_arrays_of_a_wrong_shape_are_refused(rows, values, heads, more):
+    layout = layout_of([(2, 9, 9)])
+    table = normal(len(layout.grids[0].places) * BRICK + more, 3)
+    with pytest.raises(ValueError, match="where"):
+        total_variation(normal(values, 3), table, torch.arange(rows), layout, [(1.0, 1.0, 1.0)] * heads)
+
+
 def test_variation_says_where_a_texel_is_not_a_number():
     layout = layout_of([(2, 9, 9)])
     grids = layout.grids

@@ -45,8 +45,8 @@ def order_by_head(places: Places, num_heads: int, counts: Sequence[int] | None) 
     else:
         keys = torch.where(valid, heads, num_heads)
         slots = torch.sort(keys.to(torch.int16), stable=True).indices[: sum(counts)]
-    columns = (heads, places.planes.reshape(-1), places.ndc.reshape(-1, 3))
-    return HeadSamples(slots, *(x.index_select(0, slots) for x in columns), counts)
+    planes, ndc = places.planes.reshape(-1)[slots], places.ndc.reshape(-1, 3)[slots]
+    return HeadSamples(slots, heads[slots], planes, ndc, counts)
 
 
 def texel_rows(layout: SceneLayout, heads: Tensor, planes: Tensor, ndc: Tensor) -> tuple[Tensor, Tensor]:

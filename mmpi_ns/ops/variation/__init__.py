@@ -7,7 +7,9 @@ from torch import Tensor
 
 from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.layout import SceneLayout
+from mmpi_ns.ops.shapes import check_shapes
 from mmpi_ns.ops.variation.reference import Scales
+from mmpi_ns.scene.texels import BRICK
 
 
 def total_variation(
@@ -27,5 +29,6 @@ def total_variation(
         scales: weight of a difference along x, y and z, of each head.
     """
     check_shapes("values U C, table T C, rows U", values, table, rows, T=len(layout.grids[0].places) * BRICK)
-    check_shapes("scales H 3", torch.empty(len(scales), 3), H=layout.num_heads)
+    if len(scales) != layout.num_heads:
+        raise ValueError(f"scales of {len(scales)} heads where the scene has {layout.num_heads}")
     return dispatch.run("total_variation", values, table, rows, layout, scales)
