@@ -57,8 +57,8 @@ class MMPIDataManagerConfig(VanillaDataManagerConfig):
     triangulate: bool = True
     """Scenes without tracks: match and triangulate the training images' features at the start (a second or so each)."""
     dense_depth: bool = True
-    """Match the originals of neighbouring training images densely at the start, for the depth of most pixels (less
-    than a second an image; kept in ~/.cache/mmpi_ns for the next start)."""
+    """Match the originals of neighbouring training images densely at the start, for the depth of most pixels (about a
+    second for a million pixels on one core, on all cores; kept in ~/.cache/mmpi_ns for the next start)."""
     depth_images: bool = True
     """Use the depth images that a data parser lists (depth_file_path)."""
     new_view_share: float = 0.75

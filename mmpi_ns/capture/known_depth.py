@@ -6,6 +6,7 @@ Sources, later ones replacing earlier ones: dense matches (``dense.py``), SfM po
 from __future__ import annotations
 
 from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -22,23 +23,25 @@ from torch import Tensor
 
 from mmpi_ns.capture.cache import Arrays, digest, remembered
 from mmpi_ns.capture.dataset import MMPIDataset
-from mmpi_ns.capture.dense import ROUNDS, Depth, Progress, View, camera_matrix, find_depths, look_up
+from mmpi_ns.capture.dense import ROUNDS, SECONDS, Depth, find_depths
 from mmpi_ns.capture.depth_images import read_depth_image
 from mmpi_ns.capture.lone_depth import MOST_OTHERS, continued, others_that_see
 from mmpi_ns.capture.observe import posed_images
 from mmpi_ns.capture.originals import at_full_size
 from mmpi_ns.capture.tracks import PosedImages
+from mmpi_ns.capture.views import View, camera_matrix, look_up
 from mmpi_ns.placement.observations import Observations
+from mmpi_ns.utils.console import duration
 
 Map = NDArray[np.float32]
 Codes = NDArray[np.int16]
 
-VERSION = 4
+VERSION = 5
 """Version of the algorithm: cached depths of another version are recomputed."""
 FINER, WIDEST = 2.0, 1600
 """Images are matched at this multiple of the training size, and at most this wide, if the originals are available."""
-MOST_WORKING = 6e8
-"""Total number of pixels at which images are matched (13 bytes each); larger captures are matched at a smaller size."""
+MOST_WORKING = 2.5e8
+"""Total number of pixels at which images are matched (10 bytes each); larger captures are matched at a smaller size."""
 COVERED = 0.3
 """Fraction of a training pixel's area in which working pixels must have a depth."""
 POINT_ERROR = 0.01
@@ -140,17 +143,25 @@ def _remembered_depths(original: PosedImages, posed: PosedImages, observations: 
     widest, pixels = max(w for _, w in shapes), sum(w * h for h, w in shapes)
     width = int(min(WIDEST, widest * min(FINER, (MOST_WORKING / pixels) ** 0.5)))
 
-    def find() -> Arrays:
-        progress: Progress = lambda n: track(n, description=f"Depths of {len(shapes)} images", console=CONSOLE)  # noqa: E731
-        found = find_depths(original, lambda i: points[seen_by == i], width, progress)
-        return {
-            f"{i}": packed(at_training_pixels(view, depth, original, i, shapes[i], file_shapes[i]))
-            for i, (view, depth) in enumerate(found)
-        }
+    def finish(i: int, view: View, depth: Depth) -> Codes:
+        return packed(at_training_pixels(view, depth, original, i, shapes[i], file_shapes[i]))
+
+    def match() -> Arrays:
+        threads = torch.get_num_threads()
+        seconds = SECONDS * 1e-6 * sum(float(min(1, width / w) ** 2 * w * h) for w, h in original.sizes) / threads
+        CONSOLE.print(
+            f"Matching {len(shapes)} images densely, at most {width} pixels wide: about {duration(seconds)} with "
+            f"{threads} thread(s)."
+        )
+        codes = find_depths(
+            original, lambda i: points[seen_by == i], width, finish,
+            progress=lambda work, count: track(work, "Depths", count, console=CONSOLE),
+        )  # fmt: skip
+        return {f"{i}": image for i, image in enumerate(codes)}
 
     cameras = original.camera_to_worlds, original.intrinsics, original.distortion, original.fisheye
     key = digest(original.files, "depths", VERSION, ROUNDS, width, shapes, *cameras, seen_by, points)
-    stored = remembered(key, find)
+    stored = remembered(key, match)
     return KnownDepth(tuple(stored[f"{i}"] for i in range(len(shapes))))  # type: ignore[arg-type]
 
 
@@ -246,12 +257,15 @@ def _straightened(
 def with_continued(known: KnownDepth, posed: PosedImages, dataset: MMPIDataset) -> KnownDepth:
     """Extrapolates surfaces into regions that hardly any other image shows (``lone_depth.py``); cached."""
 
-    def find() -> Arrays:
-        numbers = track(range(len(known.codes)), description="Extrapolating surfaces", console=CONSOLE)
-        return {f"{i}": _continued_codes(known, i, posed, dataset) for i in numbers}
+    def continue_all() -> Arrays:
+        count = len(known.codes)
+        with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+            codes = pool.map(lambda i: _continued_codes(known, i, posed, dataset), range(count))
+            shown = track(codes, "Extrapolating surfaces", count, console=CONSOLE)
+            return {f"{i}": image for i, image in enumerate(shown)}
 
     cameras = posed.camera_to_worlds, posed.intrinsics, posed.distortion, posed.fisheye
-    stored = remembered(digest(posed.files, "continued", VERSION, *cameras, *known.codes), find)
+    stored = remembered(digest(posed.files, "continued", VERSION, *cameras, *known.codes), continue_all)
     return KnownDepth(tuple(stored[f"{i}"] for i in range(len(known.codes))))  # type: ignore[arg-type]
 
 
@@ -320,10 +334,12 @@ def with_points(known: KnownDepth, observations: Observations) -> KnownDepth:
     cameras, points = observations.seen_by[:count], observations.points[observations.seen_point[:count]]
     distance = np.linalg.norm(points - observations.centers[cameras], axis=-1)
     inverse = packed(np.outer(1 / np.maximum(distance, 1e-30), [1, POINT_ERROR]))
-    for k in np.argsort(-distance, kind="stable"):
-        image, (x, y) = codes[cameras[k]], observations.seen_at[k].astype(int)
-        if distance[k] > 0 and 0 <= y < image.shape[0] and 0 <= x < image.shape[1]:
-            image[y, x] = inverse[k]
+    columns, rows = observations.seen_at.astype(int).T
+    for i, image in enumerate(codes):
+        inside = (rows >= 0) & (rows < image.shape[0]) & (columns >= 0) & (columns < image.shape[1])
+        chosen = np.nonzero((cameras == i) & inside & (distance > 0))[0]
+        chosen = chosen[np.argsort(-distance[chosen], kind="stable")]  # the last one written stays
+        image[rows[chosen], columns[chosen]] = inverse[chosen]
     return KnownDepth(tuple(codes))
 
 

@@ -12,8 +12,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mmpi_ns.capture.dense import project
 from mmpi_ns.capture.tracks import PosedImages
+from mmpi_ns.capture.views import project
+from mmpi_ns.scene.near_views import nearest_views
 
 Map = NDArray[np.float32]
 
@@ -94,12 +95,14 @@ def _planes(
         extrapolation.
     """
     mean = sums / sums[:, :1]
-    matrix = np.empty((len(sums), 3, 3))
+    matrix = np.empty((3, len(sums), 3))
     for n, (i, j) in enumerate(_PAIRS):
-        matrix[:, i, j] = matrix[:, j, i] = mean[:, 5 + n]
-    matrix += 1e-7 * np.eye(3)
-    solved = np.linalg.solve(matrix, np.stack([mean[:, 2:5], directions], -1))
-    plane, spread = solved[..., 0], solved[..., 1]
+        matrix[i, :, j] = matrix[j, :, i] = mean[:, 5 + n]
+    matrix += 1e-7 * np.eye(3)[:, None]
+    # In closed form: LAPACK takes these one by one, and where OpenBLAS has several threads each waits for all of them.
+    cofactors = np.stack([np.cross(matrix[n - 2], matrix[n - 1]) for n in range(3)])
+    inverse = cofactors / (matrix[0] * cofactors[0]).sum(-1, keepdims=True)
+    plane, spread = (np.einsum("ipj,pj->pi", inverse, right) for right in (mean[:, 2:5], directions))
     scatter = np.maximum(mean[:, 1] - (plane * mean[:, 2:5]).sum(-1), 0)
     leverage = np.maximum((spread * directions).sum(-1), 1)
     value = (plane * directions).sum(-1)
@@ -108,10 +111,8 @@ def _planes(
 
 def others_that_see(posed: PosedImages, i: int, points: NDArray[np.float64]) -> NDArray[np.int64]:
     """In how many of the images near image i the points [P, 3] lie, which it shows."""
-    centers = posed.camera_to_worlds[:, :, 3]
-    order = np.argsort(np.linalg.norm(centers - centers[i], axis=-1), kind="stable")
     count = np.zeros(len(points), np.int64)
-    for j in [j for j in order if j != i][:NEAREST] if len(points) else []:
-        at = project(posed, int(j), points)
+    for j in nearest_views(posed.camera_to_worlds, i, NEAREST) if len(points) else []:
+        at = project(posed, j, points)
         count += ((at >= 0) & (at <= posed.sizes[j])).all(-1)
     return count

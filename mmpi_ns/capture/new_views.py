@@ -20,9 +20,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mmpi_ns.capture.dataset import MMPIDataset
-from mmpi_ns.capture.dense import look_up, project
 from mmpi_ns.capture.known_depth import KnownDepth
 from mmpi_ns.capture.tracks import PosedImages
+from mmpi_ns.capture.views import look_up, project
+from mmpi_ns.scene.near_views import nearest_views
 
 NEIGHBOURS = 4
 """Number of cameras, the nearest facing the same way, in which a point of an image is searched."""
@@ -131,7 +132,7 @@ def find_shared_points(
         directions = rays(pixels.to(device)).directions.double().cpu().numpy()
         depths = own_depths[rows, columns]
         points, own = posed.camera_to_worlds[i, :, 3] + directions / depths[:, :1], own_image[rows, columns]
-        for j in _neighbours(posed, i, images):
+        for j in nearest_views(posed.camera_to_worlds, i, NEIGHBOURS, MAX_ANGLE, images):
             seen, colors = _seen_by(posed, j, points, own, *show(j))
             found += len(seen) * count / len(rows)
             both = np.stack([own[seen], colors], 1)
@@ -162,16 +163,6 @@ def _certain(depth: NDArray[np.float32], usable: NDArray[np.uint8]) -> tuple[NDA
     """Rows and columns of the pixels with an accurate depth."""
     rows, columns = np.nonzero((depth[..., 0] > 0) & (depth[..., 1] < CERTAIN * depth[..., 0]) & (usable > 0))
     return rows, columns
-
-
-def _neighbours(posed: PosedImages, i: int, images: Sequence[int]) -> list[int]:
-    """The nearest of some images with a similar viewing direction and another position."""
-    others = np.array([j for j in images if j != i], np.int64)
-    centers, facing = posed.camera_to_worlds[:, :, 3], posed.camera_to_worlds[:, :, 2]
-    distance = np.linalg.norm(centers[others] - centers[i], axis=-1)
-    usable = (facing[others] @ facing[i] > np.cos(np.radians(MAX_ANGLE))) & (distance > 0)
-    order = np.argsort(np.where(usable, distance, np.inf), kind="stable")
-    return [int(j) for j in others[order[: min(NEIGHBOURS, int(usable.sum()))]]]
 
 
 def _seen_by(

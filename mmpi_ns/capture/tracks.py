@@ -28,6 +28,7 @@ from mmpi_ns.capture.matching import (
     write_images,
 )
 from mmpi_ns.capture.sfm import SfmModel, load_pycolmap, read_reconstruction
+from mmpi_ns.scene.near_views import nearest_views
 from mmpi_ns.utils.errors import InputError
 
 NEIGHBOURS = 8
@@ -80,28 +81,20 @@ class PosedImages:
 
     def pairs(self) -> list[tuple[int, int]]:
         """Images worth matching."""
-        return near_pairs(self.camera_to_worlds[:, :, 3], -self.camera_to_worlds[:, :, 2], NEIGHBOURS)
+        return near_pairs(self.camera_to_worlds, NEIGHBOURS)
 
 
-def near_pairs(centers: NDArray[np.float64], facing: NDArray[np.float64], neighbours: int) -> list[tuple[int, int]]:
-    """Pairs of each camera with the nearest ones that have a similar viewing direction.
+def near_pairs(camera_to_worlds: NDArray[np.float64], neighbours: int) -> list[tuple[int, int]]:
+    """Pairs (i, j) with i < j, in order, of each camera with its nearest ones that have a similar viewing direction.
 
     Args:
-        centers: camera centres. [M, 3]
-        facing: unit viewing directions. [M, 3]
+        camera_to_worlds: poses. [M, 3, 4]
         neighbours: maximum number of cameras chosen by each.
-
-    Returns:
-        Pairs (i, j) with i < j, in order.
     """
-    pairs = set()
-    for i, (center, axis) in enumerate(zip(centers, facing, strict=True)):
-        distance = np.linalg.norm(centers - center, axis=-1)
-        usable = facing @ axis > np.cos(np.radians(MAX_ANGLE))
-        usable[i] = False
-        order = np.argsort(np.where(usable, distance, np.inf), kind="stable")
-        pairs |= {(min(i, int(j)), max(i, int(j))) for j in order[: min(neighbours, int(usable.sum()))]}
-    return sorted(pairs)
+    near = [
+        nearest_views(camera_to_worlds, i, neighbours, MAX_ANGLE, apart=False) for i in range(len(camera_to_worlds))
+    ]
+    return sorted({(min(i, j), max(i, j)) for i, others in enumerate(near) for j in others})
 
 
 def triangulate(images: PosedImages) -> SfmModel:

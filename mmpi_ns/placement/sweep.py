@@ -13,9 +13,12 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates, uniform_filter
 
 from mmpi_ns.placement.observations import Array, Observations
+from mmpi_ns.scene.near_views import nearest_views
 
 HYPOTHESES = 64
 WINDOW = 7
+MAX_ANGLE = 30.0
+"""Degrees between the viewing directions of views that are compared."""
 MIN_SCORE = 0.85
 """Minimum correlation of a match."""
 MIN_MARGIN = 0.08
@@ -46,7 +49,7 @@ def add_swept_points(observations: Observations, images: list[Array], num_refere
     points, cameras, indices = [observations.points], [observations.seen_by], [observations.seen_point]
     total = len(observations.points)
     for i in references:
-        neighbours = _neighbours(observations, int(i), wanted=8)
+        neighbours = nearest_views(observations.camera_to_worlds, int(i), 8, MAX_ANGLE)
         if not neighbours:
             continue
         found = _sweep(views[i], [views[j] for j in neighbours[:4]])
@@ -72,16 +75,6 @@ def _in_image(observations: Observations, camera: int, points: Array) -> NDArray
 def _view(observations: Observations, index: int, image: Array) -> _View:
     scale = image.shape[1] / observations.sizes[index, 0]
     return _View(image, observations.camera_to_worlds[index], observations.intrinsics[index] * scale)
-
-
-def _neighbours(observations: Observations, index: int, wanted: int) -> list[int]:
-    """The nearest views that look the same way (within 30 degrees) from somewhere else."""
-    offset = observations.centers - observations.centers[index]
-    facing = observations.camera_to_worlds[:, :, 2]
-    distance = np.linalg.norm(offset, axis=-1)
-    usable = (facing @ facing[index] > np.cos(np.radians(30))) & (distance > 1e-9)
-    order = np.argsort(np.where(usable, distance, np.inf), kind="stable")
-    return [int(j) for j in order[: min(wanted, int(usable.sum()))]]
 
 
 def _sweep(reference: _View, neighbours: list[_View]) -> Array:

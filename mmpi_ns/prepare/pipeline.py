@@ -154,7 +154,7 @@ class Preparation:
         if self.known is not None and s.matching == "auto":
             places = [i for i, n in enumerate(names) if n in self.known.poses]
             poses = np.array([self.known.poses[names[i]] for i in places])  # OpenCV axes
-            near = near_pairs(poses[:, :3, 3], poses[:, :3, 2], 2 * s.overlap)
+            near = near_pairs(poses[:, :3], 2 * s.overlap)
             return [(places[i], places[j]) for i, j in near], f"the {2 * s.overlap} nearest by pose"
         alike = pairs.image_similarity(database, len(names))
         chosen, why = pairs.choose(s.matching, names, alike, self.is_video)

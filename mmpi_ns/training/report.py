@@ -15,7 +15,7 @@ from torch import Tensor
 from mmpi_ns.rendering.metrics import ImageMetrics
 from mmpi_ns.training.losses import over_background
 from mmpi_ns.training.phases import Schedule
-from mmpi_ns.utils.console import say
+from mmpi_ns.utils.console import duration, say
 
 FIRST_LINE, SHARE = 10, 0.025
 """A line after this many steps, then after each such fraction of all steps."""
@@ -65,13 +65,6 @@ class TrainingLog:
             f"{psnr:.1f} dB | {duration(each * (self.end - done))} left"
         )
         self._said_at, self._said, self._phase, self._drawn = now, done, where, 0.0
-
-
-def duration(seconds: float) -> str:
-    """Seconds in words: 45 s, 12 min, 3.5 h."""
-    if seconds < 90:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
 
 
 def forecast(method: str, steps: int, rays: int) -> str:

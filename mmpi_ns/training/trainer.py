@@ -34,11 +34,11 @@ from mmpi_ns.training.learning_rates import following
 from mmpi_ns.training.memory import describe, training_bytes
 from mmpi_ns.training.options import check_ffmpeg, check_run
 from mmpi_ns.training.ranks import patient_group, wait_for_all
-from mmpi_ns.training.report import TrainingLog, duration, forecast, next_commands, quick_test
+from mmpi_ns.training.report import TrainingLog, forecast, next_commands, quick_test
 from mmpi_ns.training.run import TrainingRun
 from mmpi_ns.training.run_folder import claim
 from mmpi_ns.training.stopping import end, end_before_training, signals_go_to
-from mmpi_ns.utils.console import keep_quiet, say
+from mmpi_ns.utils.console import duration, keep_quiet, say
 from mmpi_ns.utils.errors import InputError, speak_plainly
 from mmpi_ns.utils.files import write_atomically
 from mmpi_ns.utils.machine import keep_freed_memory

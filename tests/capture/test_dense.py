@@ -10,7 +10,8 @@ from PIL import Image
 from test_tracks import FOCAL, HEIGHT, LENS, POSES, WIDTH, is_near_wall, pose_at, scene_of
 
 from mmpi_ns.capture import dense
-from mmpi_ns.capture.dense import Depth, confirmed, find_depths, fuse, load_view, look_up, project, without_fringes
+from mmpi_ns.capture.dense import Depth, confirmed, find_depths, fuse, without_fringes
+from mmpi_ns.capture.views import View, load_view, look_up, project
 
 F32 = np.float32
 
@@ -143,6 +144,117 @@ def test_equal_images_give_equal_depths(tmp_path):
         np.array_equal(x.inverse, y.inverse) and np.array_equal(x.error, y.error)
         for (_, x), (_, y) in zip(a, b, strict=True)
     )
+
+
+def test_depths_do_not_depend_on_the_number_of_threads(tmp_path, monkeypatch):
+    images = scene_of(tmp_path, POSES)
+    results = []
+    for threads in (1, 4):
+        monkeypatch.setattr(dense.torch, "get_num_threads", lambda count=threads: count)
+        results.append(find_depths(images, lambda i: points_on_walls(POSES[i]), WIDTH))
+    for (_, one), (_, four) in zip(*results, strict=True):
+        assert np.array_equal(one.inverse, four.inverse) and np.array_equal(one.error, four.error)
+
+
+def test_each_image_is_shown_twice_and_finished_once(tmp_path):
+    images, shown = scene_of(tmp_path, POSES[:3]), []
+
+    def progress(work, count):
+        shown.append(count)
+        for result in work:
+            shown.append(result)
+            yield result
+
+    threads = dense.cv2.getNumThreads()
+    results = find_depths(
+        images, lambda i: points_on_walls(POSES[i]), WIDTH, lambda i, view, depth: (i, depth.inverse.shape), progress
+    )
+    assert results == [(i, (HEIGHT, WIDTH)) for i in range(3)] == shown[4:] and shown[0] == 6 and len(shown) == 7
+    assert dense.cv2.getNumThreads() == threads, "OpenCV's setting is left as it was"
+
+
+def test_rounds_from_coarse_to_fine_give_the_depths_of_full_size(tmp_path, monkeypatch):
+    images = scene_of(tmp_path, POSES)
+    monkeypatch.setattr(dense, "SMALLEST", 40)
+    results = find_depths(images, lambda i: points_on_walls(POSES[i]), WIDTH)
+    error, scaled = relative_errors(results, POSES)
+    assert np.mean([(d.inverse > 0).mean() for _, d in results]) > 0.88
+    assert np.median(error) < 0.003 and np.quantile(scaled, 0.9) < 2
+
+
+def test_a_reduced_view_shows_the_same(tmp_path):
+    images = scene_of(tmp_path, POSES[:1], LENS)
+    view = load_view(images, 0, WIDTH)
+    half = view.reduced(2)
+    assert half.gray.shape == half.inside.shape == (HEIGHT // 2, WIDTH // 2) and view.reduced(1) is view
+    assert half.pinhole == pytest.approx(view.pinhole / 2)
+    means = view.gray.reshape(HEIGHT // 2, 2, WIDTH // 2, 2).mean((1, 3))
+    assert np.abs(half.gray - means).max() <= 0.75
+    assert load_view(scene_of(tmp_path / "straight", POSES[:1]), 0, WIDTH).reduced(4).inside.all()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_parallax_is_that_of_points_in_both_cameras(seed, monkeypatch):
+    """Oracle: the points themselves, in float64; many strips. Solving returns the inverse depths."""
+    monkeypatch.setattr(dense, "STRIP", 100)
+    rng = np.random.default_rng(seed)
+    shape = (23, 31)
+    views = []
+    for _ in range(2):
+        turn = np.linalg.qr(np.eye(3) + 0.2 * rng.normal(size=(3, 3)))[0]
+        turn *= np.sign(np.diag(turn))
+        pose = np.concatenate([turn, rng.normal(size=(3, 1))], -1)
+        pinhole = np.array([30.0, 33.0, 15.0, 11.0]) + rng.normal(size=4)
+        views.append(View(np.zeros(shape, np.uint8), pinhole, pose, np.ones(shape, bool)))
+    inverse = rng.uniform(0.02, 0.2, shape).astype(F32)
+    parallax = dense._Parallax.between(*views)
+    x, y, depth = parallax.pixels(inverse)
+    columns, rows = np.meshgrid(np.arange(31) + 0.5, np.arange(23) + 0.5)
+    fx, fy, cx, cy = views[0].pinhole
+    local = np.stack([(columns - cx) / fx, (cy - rows) / fy, -np.ones(shape)], -1) / inverse.astype(float)[..., None]
+    there = (local @ views[0].pose[:, :3].T + views[0].pose[:, 3] - views[1].pose[:, 3]) @ views[1].pose[:, :3]
+    fx, fy, cx, cy = views[1].pinhole
+    ahead = there[..., 2] < -1e-3
+    assert 0.3 < ahead.mean()
+    assert x[ahead] == pytest.approx((cx - fx * there[..., 0] / there[..., 2])[ahead], rel=1e-3, abs=2e-3)
+    assert y[ahead] == pytest.approx((cy + fy * there[..., 1] / there[..., 2])[ahead], rel=1e-3, abs=2e-3)
+    assert depth[ahead] == pytest.approx((-there[..., 2] * inverse)[ahead], rel=1e-4, abs=1e-5)
+    assert (x[there[..., 2] > 1e-3] == -1e4).all() and (depth[there[..., 2] > 1e-3] == 0).all()
+    with np.errstate(all="ignore"):
+        solved, off_line, squared = parallax.solve(x, y, slice(0, 23))
+    sure = ahead & (squared > 1) & (np.abs(x) < 300) & (np.abs(y) < 300)
+    assert solved[sure] == pytest.approx(inverse[sure], abs=2e-3) and off_line[sure].max() < 1e-3
+    moved = np.hypot(*(p - q for p, q in zip(parallax.pixels(inverse + F32(1e-4))[:2], (x, y), strict=True))) / 1e-4
+    assert np.sqrt(squared[sure]) == pytest.approx(moved[sure], rel=0.1, abs=1.0)
+
+
+def fused_slowly(inverse, weight):
+    """Oracle of ``fuse`` for one pixel."""
+    best, mean, error = 0.0, 0.0, 0.0
+    there = [n for n in range(len(weight)) if weight[n] > 0]
+    for k in there:
+        own = [n for n in there if (inverse[n] - inverse[k]) ** 2 < dense.AGREE**2 * (1 / weight[n] + 1 / weight[k])]
+        total = sum(weight[n] for n in own)
+        average = sum(weight[n] * inverse[n] for n in own) / total
+        scatter = sum(weight[n] * (inverse[n] - average) ** 2 for n in own) / max(len(own) - 1, 1)
+        value = len(own) + total / sum(weight)
+        if len(own) >= min(len(there), 2) and average > 0 and value > best:
+            best, mean, error = value, average, np.sqrt(max(scatter, 1) / total)
+    return (mean, error) if best > 0 and error < dense.MAX_RELATIVE * mean else (0.0, 0.0)
+
+
+def test_fusing_is_that_of_single_pixels(monkeypatch):
+    monkeypatch.setattr(dense, "STRIP", 40)
+    rng = np.random.default_rng(0)
+    inverse = rng.choice([0.2, 0.201, 0.21, 0.3, -0.1], (4, 20, 30)) + rng.normal(0, 5e-4, (4, 20, 30))
+    weight = rng.choice([0, 1e4, 1e6, 1e7], (4, 20, 30))
+    inverse, weight = (np.float32(x) for x in (np.where(weight > 0, inverse, 0), weight))
+    depth = fuse(inverse, weight)
+    expected = np.array([fused_slowly(q, w) for q, w in zip(
+        inverse.reshape(4, -1).T.astype(float), weight.reshape(4, -1).T.astype(float), strict=True
+    )]).reshape(20, 30, 2)  # fmt: skip
+    same = np.isclose(depth.inverse, expected[..., 0], rtol=1e-5) & np.isclose(depth.error, expected[..., 1], rtol=1e-3)
+    assert same.mean() > 0.995 and (depth.inverse > 0).mean() > 0.5  # ties may fall either way
 
 
 def stack(*values):

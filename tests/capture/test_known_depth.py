@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from mmpi_ns.capture.dense import Depth, View
+from mmpi_ns.capture.dense import Depth
 from mmpi_ns.capture.known_depth import (
     POINT_ERROR,
     SENSOR_ERROR,
@@ -20,6 +20,7 @@ from mmpi_ns.capture.known_depth import (
     with_sensor,
 )
 from mmpi_ns.capture.tracks import PosedImages
+from mmpi_ns.capture.views import View
 from mmpi_ns.placement.observations import Observations
 
 F32 = np.float32

@@ -9,6 +9,7 @@ from training_runs import schedule_of
 from mmpi_ns.rendering.pipeline import summary
 from mmpi_ns.training import report
 from mmpi_ns.training.phases import LONG_RUN
+from mmpi_ns.utils.console import duration
 
 
 def lines_of(monkeypatch, capsys, steps, seconds_a_step, **how):
@@ -46,7 +47,7 @@ def test_lines_are_neither_dense_nor_half_a_minute_apart(monkeypatch, capsys):
 
 
 def test_durations_are_in_words():
-    assert [report.duration(s) for s in (3.2, 89, 641, 12600)] == ["3 s", "89 s", "11 min", "3.5 h"]
+    assert [duration(s) for s in (3.2, 89, 641, 12600)] == ["3 s", "89 s", "11 min", "3.5 h"]
 
 
 def test_a_long_run_without_a_gpu_names_the_smaller_method():

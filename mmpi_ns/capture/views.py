@@ -1,0 +1,128 @@
+"""Images as their cameras see them: undistorted views, projection of points, and pixels at any place."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mmpi_ns.capture.tracks import PosedImages
+from mmpi_ns.utils.errors import InputError
+
+Map = NDArray[np.float32]
+
+REMAP_SIDE, REMAP_PART = 32766, 8192
+"""Largest side of what OpenCV's remap reads and writes, and side of the parts of anything larger."""
+
+
+@dataclass(frozen=True)
+class View:
+    """An image as a pinhole camera sees it, at working size."""
+
+    gray: NDArray[np.uint8]
+    """[h, w]"""
+    pinhole: NDArray[np.float64]
+    """fx, fy, cx, cy, working pixels."""
+    pose: NDArray[np.float64]
+    """[3, 4] camera to world, OpenGL axes."""
+    inside: NDArray[np.bool_]
+    """[h, w] where the lens shows something."""
+
+    def reduced(self, factor: int) -> View:
+        """The view at one over ``factor`` of its size."""
+        if factor == 1:
+            return self
+        height, width = self.gray.shape
+        size = max(1, round(width / factor)), max(1, round(height / factor))
+        pinhole = self.pinhole * np.tile([size[0] / width, size[1] / height], 2)
+        gray = cv2.resize(self.gray, size, interpolation=cv2.INTER_AREA)
+        inside = np.broadcast_to(True, gray.shape)  # of no size
+        if self.inside.strides != (0, 0):
+            inside = cv2.resize(self.inside.view(np.uint8), size, interpolation=cv2.INTER_NEAREST).view(np.bool_)
+        return replace(self, gray=np.asarray(gray, np.uint8), pinhole=pinhole, inside=inside)
+
+
+def load_view(images: PosedImages, i: int, width: int) -> View:
+    """Image i in gray, at most ``width`` pixels wide, its lens distortion taken out."""
+    gray = cv2.imread(str(images.files[i]), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    if gray is None:
+        raise InputError(f"Training image {images.files[i]} cannot be read: repair it or remove its frame.")
+    full_height, full_width = gray.shape
+    if full_width > width:
+        height = max(1, round(full_height * width / full_width))
+        gray = cv2.resize(gray, (width, height), interpolation=cv2.INTER_AREA)
+    scale = np.array([gray.shape[1] / full_width, gray.shape[0] / full_height])
+    pinhole = images.intrinsics[i] * np.tile(scale, 2)
+    inside = np.broadcast_to(True, gray.shape)  # of no size
+    if images.distortion[i].any():
+        matrix, size = camera_matrix(pinhole), gray.shape[::-1]
+        straighten = cv2.fisheye.initUndistortRectifyMap if images.is_fisheye(i) else cv2.initUndistortRectifyMap
+        # OpenCV counts from pixel centres.
+        matrix[:2, 2] -= 0.5
+        x, y = straighten(matrix, images.distortion[i], np.eye(3), matrix, size, cv2.CV_32FC1)
+        gray = cv2.remap(gray, x, y, cv2.INTER_LINEAR)
+        inside = (x >= 0) & (x <= size[0] - 1) & (y >= 0) & (y <= size[1] - 1)
+    return View(np.ascontiguousarray(gray, np.uint8), pinhole, images.camera_to_worlds[i], inside)
+
+
+def camera_matrix(pinhole: NDArray[np.float64]) -> NDArray[np.float64]:
+    fx, fy, cx, cy = pinhole
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+
+
+def project(posed: PosedImages, j: int, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Pixels [P, 2] at which a camera shows points [P, 3], lens included; far outside where they are behind it."""
+    pose = posed.camera_to_worlds[j]
+    local = (points - pose[:, 3]) @ pose[:, :3] * [1, -1, -1]  # OpenCV's axes: right, down, ahead
+    ahead = local[:, 2] > 0
+    local = np.where(ahead[:, None], local, [0.0, 0.0, 1.0])[:, None]
+    matrix, still = camera_matrix(posed.intrinsics[j]), np.zeros(3)
+    bend = cv2.fisheye.projectPoints if posed.is_fisheye(j) else cv2.projectPoints
+    at = bend(local, still, still, matrix, posed.distortion[j])[0].reshape(-1, 2)
+    return np.where(ahead[:, None], at, -1e4)
+
+
+def pixel_grid(shape: tuple[int, ...]) -> tuple[Map, Map]:
+    """x and y of pixel centres. [h, w] each"""
+    x, y = np.meshgrid(np.arange(shape[1], dtype=np.float32) + 0.5, np.arange(shape[0], dtype=np.float32) + 0.5)
+    return x, y
+
+
+def look_up(image: NDArray[Any], x: NDArray[Any], y: NDArray[Any], *, nearest: bool = False) -> NDArray[Any]:
+    """Values of an image at pixel places, centres at halves: interpolated, or the nearest pixel's and 0 outside.
+
+    Args:
+        image: [H, W] or [H, W, C], of any size.
+        x, y: places, of any one shape and number.
+        nearest: take the nearest pixel.
+
+    Returns:
+        The shape of ``x``, and channels where there are several.
+    """
+    at_x, at_y = x.astype(np.float32) - 0.5, y.astype(np.float32) - 0.5
+    mode = cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR
+    border = cv2.BORDER_CONSTANT if nearest else cv2.BORDER_REPLICATE
+    if at_x.ndim == 2 and max(*image.shape[:2], *at_x.shape) <= REMAP_SIDE:
+        return np.asarray(cv2.remap(image, at_x, at_y, mode, borderMode=border, borderValue=(0.0,)))
+    # OpenCV counts rows and columns in 16 bits: places are folded into rows, and large images are read in parts.
+    flat_x, flat_y = at_x.reshape(-1), at_y.reshape(-1)
+    values = np.zeros((len(flat_x), *image.shape[2:]), image.dtype)
+    part = [
+        np.clip(c // REMAP_PART, 0, (n - 1) // REMAP_PART).astype(int)
+        for c, n in ((flat_y, image.shape[0]), (flat_x, image.shape[1]))
+    ]
+    parts = part[0] * (image.shape[1] // REMAP_PART + 1) + part[1]
+    for number in np.unique(parts):
+        inside = np.nonzero(parts == number)[0]
+        top, left = REMAP_PART * part[0][inside[0]], REMAP_PART * part[1][inside[0]]
+        view = image[top : top + REMAP_PART + 1, left : left + REMAP_PART + 1]  # one more, to interpolate with
+        for begin in range(0, len(inside), REMAP_PART**2):
+            chosen = inside[begin : begin + REMAP_PART**2]
+            rows = np.zeros((2, -(-len(chosen) // REMAP_PART), REMAP_PART), np.float32)
+            rows.reshape(2, -1)[:, : len(chosen)] = flat_x[chosen] - left, flat_y[chosen] - top
+            found = cv2.remap(view, rows[0], rows[1], mode, borderMode=border, borderValue=(0.0,))
+            values[chosen] = found.reshape(-1, *image.shape[2:])[: len(chosen)]
+    return values.reshape(*x.shape, *image.shape[2:])
