@@ -24,12 +24,12 @@ def bake_shares(field: MMPIField) -> Float[Tensor, "N 1"]:
     shares = torch.ones_like(field.density)
     rows = torch.arange(BRICK, len(shares), device=shares.device)
     for k, grid in enumerate(field.grids):
-        own = rows[grid.holds(rows)]
-        z, y, x = grid.texel(own)
+        stored = rows[grid.holds(rows)]
+        z, y, x = grid.texel(stored)
         exists = (y < grid.height) & (x < grid.width)  # tiles extend beyond the borders of a plane
-        sizes = torch.tensor([grid.width, grid.height, grid.depth], device=own.device)
+        sizes = torch.tensor([grid.width, grid.height, grid.depth], device=stored.device)
         ndc = (2 * torch.stack([x, y, z], -1)[exists] / (sizes - 1) - 1).to(shares.dtype)
-        for part, places in zip(own[exists].split(AT_ONCE), ndc.split(AT_ONCE), strict=True):
+        for part, places in zip(stored[exists].split(AT_ONCE), ndc.split(AT_ONCE), strict=True):
             origins, directions, inverse_t = rays_to(field, k, places)
             local = geometry.LocalRays.of(origins, directions, field.frames)
             numbers = torch.arange(len(part), device=part.device)

@@ -208,14 +208,17 @@ class MMPIField(TexelTables):
         self, ray_samples: RaySamples, density_embedding: Lookup | None = None
     ) -> dict[FieldHeadNames, Tensor]:
         """Colours of the valid samples (diffuse ones where a ray is shaded once); empty slots are black."""
-        if isinstance(self.networks, ColorNetworks) and density_embedding is None and not torch.is_grad_enabled():
-            return {FieldHeadNames.RGB: self._shade(self.networks, ray_samples)}
+        directions, axes, networks = ray_samples.frustums.directions[:, 0], self.frames.axes, self.networks
+        if self.cube is not None:
+            axes = torch.cat([axes, torch.eye(3, device=axes.device)[None]])
+        if isinstance(networks, ColorNetworks) and density_embedding is None and not torch.is_grad_enabled():
+            shading = (networks.of_heads(len(axes)), axes, directions, places_of(ray_samples))
+            return {FieldHeadNames.RGB: shade(self.layout, self.features.data, *shading)}
         lookup = density_embedding or self._lookup(ray_samples)
         features = lookup.read(lookup.features)
-        if isinstance(self.networks, ColorNetworks):
-            directions = ray_samples.frustums.directions[:, 0]
+        if isinstance(networks, ColorNetworks):
             colors = [
-                self.networks(k, part, lookup.ndc[here], geometry.rotate(self._axes(k), directions), lookup.rays[here])
+                networks(k, part, lookup.ndc[here], geometry.rotate(axes[k], directions), lookup.rays[here])
                 for k, here, part in lookup.by_head(features)
             ]
             colors = torch.cat(colors) if colors else features.new_zeros(0, 3)
@@ -251,12 +254,6 @@ class MMPIField(TexelTables):
             sums = gather_taps(lookup.features, lookup.taps, lookup.index, composite.weights, chosen)
         return self.networks(sums, composite, ray_samples.frustums.directions[:, 0])
 
-    def _shade(self, networks: ColorNetworks, ray_samples: RaySamples) -> Float[Tensor, "R S 3"]:
-        """What the networks make of every sample, without gradients."""
-        count, directions = len(self.grids), ray_samples.frustums.directions[:, 0]
-        axes, given = torch.stack([self._axes(k) for k in range(count)]), (self.layout, self.features.data)
-        return shade(*given, networks.of_heads(count), axes, directions, places_of(ray_samples))
-
     def total_variation(self, lookup: Lookup, density_weight: float, feature_weight: float) -> Tensor:
         """Weighted total variation of the texels that the batch touched, in DVGO's normalisation (not yet per ray)."""
         total, scales = self.density.new_zeros(()), []
@@ -271,11 +268,6 @@ class MMPIField(TexelTables):
             if weight > 0:
                 total = total + weight * total_variation(values, table.data, lookup.rows, self.layout, scales)
         return total
-
-    def _axes(self, k: int) -> Tensor:
-        if k < len(self.plan.mpis):
-            return self.frames.axes[k]
-        return torch.eye(3, device=self.density.device)
 
     def sample_shares(self, ray_samples: RaySamples, lookup: Lookup) -> tuple[Tensor, Tensor]:
         """log P and log(1 - P) of the valid samples of a merged batch, with gradients to the reliability."""

@@ -43,8 +43,8 @@ def moving(
     count = len(heads) if layout.cube is None else int(torch.searchsorted(heads, len(layout.mpis)))
     parts = [_on_planes(layout, origins, directions, rays[:count], heads[:count], planes[:count])]
     if layout.cube is not None:
-        own = rays[count:]
-        parts.append(layout.cube.normalised(origins[own] + directions[own] / inverse_t[count:, None]))
+        in_cube = rays[count:]
+        parts.append(layout.cube.normalised(origins[in_cube] + directions[in_cube] / inverse_t[count:, None]))
     moved = torch.cat(parts)
     return ndc + (moved - moved.detach())
 

@@ -6,6 +6,7 @@ which nerfstudio fixes before K is known. Row arithmetic is in ``texels.py``, wo
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -23,7 +24,9 @@ from mmpi_ns.utils.files import to_bytes, to_text
 
 RELEASED_DENSITY = -20.0
 """Raw density of texels that no ray trained: their alpha is below 1e-7."""
-TABLES = ("density", "features", "reliability")
+EMPTY = {"density": RELEASED_DENSITY, "features": 0.0, "reliability": 0.0}
+"""Content of the empty brick in each table."""
+TABLES = tuple(EMPTY)
 """The parameters that have a row for every texel."""
 ENOUGH_CROSSINGS = 32
 """Average number of training samples for each brick before any brick may be released."""
@@ -83,16 +86,12 @@ class TexelTables(Field):
         """Number of stored bricks, without the empty one."""
         return len(self.density) // BRICK - 1
 
-    def cached(self, name: str, make: Any) -> Any:
-        """A constant of the plan, made once for the device that the parameters are on."""
+    def cached(self, name: str, make: Callable[[], Any] | None = None) -> Any:
+        """A constant of the plan, made once for the device that the parameters are on; None if nobody makes it."""
         key = (name, self.density.device)
-        found = self._packed.get(key)
+        constant = self._packed.get(key)
         # Where threads make it at once the first one's stays: kernels hold addresses in it, not references.
-        return self._packed.setdefault(key, make()) if found is None else found
-
-    def known(self, name: str) -> Any:
-        """The result of ``cached``; None if there is none."""
-        return self._packed.get((name, self.density.device))
+        return self._packed.setdefault(key, make()) if constant is None and make is not None else constant
 
     def build(self, plan: ScenePlan, factor: float, tiles: Int[Tensor, "T"] | None = None) -> None:
         """Allocates new tables for ``plan`` at ``factor`` times its texels. Parameters stay the same objects.
@@ -110,11 +109,12 @@ class TexelTables(Field):
         self.tiles = tiles.to(device, copy=True)
         for name in TABLES:
             table = getattr(self, name)
-            replace_data(table, new_table(self.tiles, self._channels(name), _empty_value(name)))
+            replace_data(table, new_table(self.tiles, table.shape[1], EMPTY[name]))
         self.touched = torch.zeros(len(self.density), dtype=torch.uint8, device=device)
         self.plan_bytes = to_bytes(plan.to_json()).to(device)
         self.texel_factor = torch.tensor(factor, dtype=torch.float64, device=device)
-        self._forget()
+        self._packed = {}
+        self.look_afresh()
 
     @torch.no_grad()
     def grow(self, factor: float) -> None:
@@ -126,18 +126,19 @@ class TexelTables(Field):
         new = head_grids(self.plan, tiles)
         for name in TABLES:
             table = getattr(self, name)
-            replace_data(table, resample(table.data, old, new, is_cube, _empty_value(name)))
+            replace_data(table, resample(table.data, old, new, is_cube, EMPTY[name]))
         touched = resample(self.touched[:, None].float(), old, new, is_cube)
         self.tiles, self.touched = tiles, (touched[:, 0] > 0).to(torch.uint8)
         self.texel_factor.fill_(factor)
-        self._forget()
+        self._packed = {}
+        self.look_afresh()
 
     @torch.no_grad()
     def note_use(self, lookup: Lookup, weights: Float[Tensor, "R S"], live: Int[Tensor, "R"]) -> None:
         """Records the bricks, weights and number of the samples of a training batch."""
         parts = weights.reshape(-1)[lookup.index].split([len(taps.positions) for taps in lookup.taps])
-        for taps, part in zip(lookup.taps, parts, strict=True):
-            raise_peaks(self.peak, lookup.rows, taps.positions, part)
+        for taps, weight in zip(lookup.taps, parts, strict=True):
+            raise_peaks(self.peak, lookup.rows, taps.positions, weight)
         self.crossings += live.sum()
 
     @torch.no_grad()
@@ -175,16 +176,8 @@ class TexelTables(Field):
         self._packed = {}
         return kept
 
-    def _forget(self) -> None:
-        """Updates state after a change of resolution."""
-        self._packed = {}
-        self.look_afresh()
-
     def _reachable(self) -> Bool[Tensor, "T"] | None:
         return None if self.views is None else reachable_tiles(self.views, self.plan)
-
-    def _channels(self, name: str) -> int:
-        return self.feature_channels if name == "features" else 1
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
         """Takes plan, resolution and tiles from the checkpoint first, so that all shapes fit."""
@@ -197,11 +190,6 @@ class TexelTables(Field):
         self.build(plan, float(state_dict[prefix + "texel_factor"]), state_dict[prefix + "tiles"])
         self.plan_bytes = plan_bytes.clone().to(self.density.device)  # as it was written, whatever a plan has now
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
-
-
-def _empty_value(name: str) -> float:
-    """Content of the empty brick."""
-    return RELEASED_DENSITY if name == "density" else 0.0
 
 
 def replace_data(parameter: nn.Parameter, data: Tensor) -> None:

@@ -40,10 +40,10 @@ def compiler() -> list[str]:
         CannotCompile: there is none.
     """
     asked = shlex.split(os.environ.get("CXX", ""))  # a program and its arguments, ccache g++ for example
-    found = asked or [path for name in ("g++", "clang++") if (path := shutil.which(name))][:1]
-    if not found:
+    program = asked or [path for name in ("g++", "clang++") if (path := shutil.which(name))][:1]
+    if not program:
         raise CannotCompile("no C++ compiler (g++ or clang++) is installed")
-    return found
+    return program
 
 
 def library_file() -> Path:
@@ -74,10 +74,10 @@ def library() -> ctypes.CDLL:
         if not target.is_file():
             target.parent.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryDirectory(dir=target.parent) as scratch:
-                made = Path(scratch) / target.name
-                command = [*program, *FLAGS, "-o", str(made), *map(str, sorted(OPS.glob("*/*.cpp")))]
+                unfinished = Path(scratch) / target.name
+                command = [*program, *FLAGS, "-o", str(unfinished), *map(str, sorted(OPS.glob("*/*.cpp")))]
                 subprocess.run(command, check=True, capture_output=True, text=True, timeout=600)
-                os.replace(made, target)
+                os.replace(unfinished, target)
         built = ctypes.CDLL(str(target))
     except subprocess.CalledProcessError as error:
         raise CannotCompile(f"{program[0]} failed: {(error.stderr or '').strip().splitlines()[:1]}") from error
@@ -102,26 +102,23 @@ def address(tensor: Tensor, dtype: torch.dtype = torch.float32) -> ctypes.c_void
     return ctypes.c_void_p(tensor.data_ptr())
 
 
-def arguments(given: Iterable[Any]) -> list[Any]:
+def arguments(values: Iterable[Any]) -> list[Any]:
     """Arguments of the compiled functions: addresses of tensors, 64-bit integers, 32-bit floats; others unchanged."""
-    return [_argument(x) for x in given]
+    forms = {int: ctypes.c_int64, bool: ctypes.c_int64, float: ctypes.c_float}
+    return [
+        address(x, x.dtype) if isinstance(x, Tensor) else forms[type(x)](x) if type(x) in forms else x for x in values
+    ]
 
 
-def _argument(x: Any) -> Any:
-    if isinstance(x, Tensor):  # of the type that it must have
-        return address(x, x.dtype)
-    return ctypes.c_int64(x) if isinstance(x, int) else ctypes.c_float(x) if isinstance(x, float) else x
-
-
-def call(name: str, *given: Any) -> int:
+def call(name: str, *values: Any) -> int:
     """Calls a compiled function."""
-    return getattr(library(), name)(*arguments(given))
+    return getattr(library(), name)(*arguments(values))
 
 
 def call_in_parts(name: str, count: int, before: Iterable[Any], after: Iterable[Any], least: int = 256) -> None:
     """Calls a compiled function of ``(*before, begin, end, *after)`` for parts of 0..count (see ``run_in_parts``)."""
-    function, held = getattr(library(), name), (list(before), list(after))  # tensors live until all parts are done
-    first, last = (arguments(x) for x in held)
+    function, tensors = getattr(library(), name), (list(before), list(after))  # which live until all parts are done
+    first, last = (arguments(x) for x in tensors)
     run_in_parts(lambda a, b: function(*first, *arguments((a, b)), *last), even_bounds(count, least))
 
 

@@ -152,7 +152,7 @@ def _widened(values: Tensor) -> Tensor:
 
 def _bytes_of(field: MMPIField) -> int:
     """Bytes of its tables, and of its bricks if it is baked."""
-    bricks = field.known("baked")
+    bricks = field.cached("baked")
     return sum(values.nbytes for values in field.state_dict().values()) + (0 if bricks is None else bricks.mpis.nbytes)
 
 

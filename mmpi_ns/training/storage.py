@@ -26,23 +26,23 @@ def prepare_storage(
         least: see ``TexelTables.release_unused``.
         optimizers: of the tables, by name, if there are any; their moments follow.
     """
-    own = [(optimizers[name], getattr(field, name)) for name in TABLES if name in optimizers]
-    phase, factor, left = schedule.phase_at(step), schedule.texel_factor(step), []
+    trained = [(optimizers[name], getattr(field, name)) for name in TABLES if name in optimizers]
+    phase, factor, remaining = schedule.phase_at(step), schedule.texel_factor(step), []
     grows = factor != field.factor
     if grows:
-        for optimizer, table in own:
+        for optimizer, table in trained:
             optimizer.reset_moments(table)
     if grows or schedule.releases_at(step):
         give_back_freed_memory()
     if schedule.releases_at(step):
-        left.append(field.release_unused(FORMING * least if grows else least))
+        remaining.append(field.release_unused(FORMING * least if grows else least))
     if grows:  # what has just been released does not grow
         field.grow(factor)
         give_back_freed_memory()
     elif schedule.sharpened(step) and not schedule.sharpened(step - 1):
         field.look_afresh()
     if phase.name == "blend" and step == phase.start:
-        left.append(field.release_untouched())
-    for kept in left:
-        for optimizer, table in own if kept is not None else ():
+        remaining.append(field.release_untouched())
+    for kept in remaining:
+        for optimizer, table in trained if kept is not None else ():
             optimizer.keep_blocks(table, kept, BRICK)

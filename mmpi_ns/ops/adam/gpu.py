@@ -55,5 +55,5 @@ def adam_rows(param: Tensor, moments: Tensor, rows: Tensor, grad: Tensor, consta
     """See ``ops.adam``."""
     if moments.dtype != torch.bfloat16:
         return reference.adam_rows(param, moments, rows, grad, constants)
-    given, size = (rows.contiguous(), grad.contiguous(), param, moments.view(torch.int16)), grad.numel()
-    launch(adam_kernel, size, BLOCK, *given, size, param.shape[1], *constants, EMPTY=BRICK, BLOCK=BLOCK)
+    tensors, size = (rows.contiguous(), grad.contiguous(), param, moments.view(torch.int16)), grad.numel()
+    launch(adam_kernel, size, BLOCK, *tensors, size, param.shape[1], *constants, EMPTY=BRICK, BLOCK=BLOCK)

@@ -14,7 +14,7 @@ from mmpi_ns.ops.gather.reference import COLORS, RaySums, Taps, split_sums
 
 LANES = 16
 """Gradients of sums are padded to multiples of this many channels."""
-AT_LEAST = 4096
+AT_LEAST = 1 << 14
 """Texels read that are worth another thread."""
 
 

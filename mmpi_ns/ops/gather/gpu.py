@@ -55,7 +55,7 @@ def gather_kernel(
     values, numbers, weights, positions, shares, cube_positions, cube_shares, sums, num_rays, slots, channels, planar,
     HAS_CUBE: tl.constexpr, CHANNELS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Sums over samples of known taps: ``numbers`` says which sample a slot holds; ``planar`` are on planes."""
+    """Sums over samples: ``numbers`` says which sample a slot holds; the first ``planar`` are on planes."""
     ray, column = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK), tl.arange(0, CHANNELS)[None, :]
     inside = ray < num_rays
     mass = ray * 0.0

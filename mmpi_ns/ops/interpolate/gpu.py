@@ -42,8 +42,8 @@ def texel_rows(layout: SceneLayout, heads: Tensor, planes: Tensor, ndc: Tensor) 
     count, scene = len(heads), GpuScene.of(layout)
     rows = torch.empty(count, 4, dtype=torch.int64, device=ndc.device)
     weights = torch.empty(count, 4, device=ndc.device)
-    given, block = (x.contiguous() for x in (heads, planes, ndc)), block_size(ROWS, ndc.device)
-    launch(texel_rows_kernel, count, block, *given, scene.grids, rows, weights, count, BLOCK=block)
+    tensors, block = (x.contiguous() for x in (heads, planes, ndc)), block_size(ROWS, ndc.device)
+    launch(texel_rows_kernel, count, block, *tensors, scene.grids, rows, weights, count, BLOCK=block)
     return rows, weights
 
 
@@ -71,8 +71,10 @@ def weighted_rows(table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
     count, channels = len(rows), table.shape[1]
     out = torch.empty(count, channels, device=table.device)
     block, columns = block_size(ROWS, table.device), triton.next_power_of_2(channels)
-    given = (table, rows.contiguous(), weights.contiguous(), out, count, channels)
-    launch(weighted_rows_kernel, count, block, *given, TAPS=rows.shape[1], CHANNELS=columns, BLOCK=block)
+    tensors = (table, rows.contiguous(), weights.contiguous(), out)
+    launch(
+        weighted_rows_kernel, count, block, *tensors, count, channels, TAPS=rows.shape[1], CHANNELS=columns, BLOCK=block
+    )
     return out
 
 

@@ -25,9 +25,9 @@ def shade(
 ) -> Tensor:
     """See ``ops.shade``."""
     pairs = [(w.contiguous(), b.contiguous()) for x in networks.layers for w, b in zip(x[::2], x[1::2], strict=True)]
-    held, colors = [x.contiguous() for x in (axes, table, directions, *places)], torch.empty(*places.valid.shape, 3)
+    tensors, colors = [x.contiguous() for x in (axes, table, directions, *places)], torch.empty(*places.valid.shape, 3)
     octaves = (networks.position_frequencies, networks.direction_frequencies)
-    shading = _Shading(*arguments(held), *table.shape, colors.shape[1], *octaves)
-    given = (CpuScene.of(layout).grids, len(layout.mpis), len(axes), ctypes.byref(shading), Layer.array(pairs))
-    call_in_parts("mmpi_shade", len(colors), given, (colors,))
+    shading = _Shading(*arguments(tensors), *table.shape, colors.shape[1], *octaves)
+    scene = (CpuScene.of(layout).grids, len(layout.mpis), len(axes), ctypes.byref(shading), Layer.array(pairs))
+    call_in_parts("mmpi_shade", len(colors), scene, (colors,))
     return colors

@@ -22,8 +22,8 @@ class _Variation(torch.autograd.Function):
         gradient, grids = torch.empty_like(values), CpuScene.of(layout).grids
         weights = torch.tensor(scales, dtype=torch.float32)
         totals = torch.zeros(-(-len(rows) // PART), dtype=torch.float64)
-        given = (table.shape[1], table, len(table), grids, len(grids), layout.grids[0].places, weights)
-        call_in_parts("mmpi_total_variation", len(totals), (rows, len(rows)), (*given, gradient, totals), least=1)
+        inputs = (table.shape[1], table, len(table), grids, len(grids), layout.grids[0].places, weights)
+        call_in_parts("mmpi_total_variation", len(totals), (rows, len(rows)), (*inputs, gradient, totals), least=1)
         ctx.save_for_backward(gradient)
         return totals.sum().to(values.dtype)
 

@@ -29,8 +29,8 @@ def variation_kernel(
     inside, is_channel = i < count, (c < channels)[None, :]
     head, plane, y, x, inside = texel_of(grids, tl.load(rows + i, inside, 0), inside, NUM_HEADS)
     grid = grids + head * INTS
-    own = tl.load(values + i[:, None] * channels + c[None, :], inside[:, None] & is_channel, 0.0)
-    slope, total = own * 0, own * 0
+    center = tl.load(values + i[:, None] * channels + c[None, :], inside[:, None] & is_channel, 0.0)
+    slope, total = center * 0, center * 0
     for way in tl.static_range(6):
         axis, side = way // 2, way % 2 * 2 - 1
         nx, ny, nz = x + (side if axis == 0 else 0), y + (side if axis == 1 else 0), plane + (side if axis == 2 else 0)
@@ -38,7 +38,7 @@ def variation_kernel(
         exists = exists & (nz >= 0) & (nz < tl.load(grid + DEPTH))
         row = row_of(grids, head, nz, ny, nx, exists)
         exists = (exists & is_stored(row))[:, None] & is_channel
-        difference = tl.where(exists, own - tl.load(table + row[:, None] * channels + c[None, :], exists, 0.0), 0.0)
+        difference = tl.where(exists, center - tl.load(table + row[:, None] * channels + c[None, :], exists, 0.0), 0.0)
         size, scale = tl.abs(difference), tl.load(scales + 3 * head + axis)[:, None] / 6
         slope += scale * tl.minimum(tl.maximum(difference, -1.0), 1.0)
         total += scale * tl.where(size <= 1, 0.5 * difference * difference, size - 0.5)
@@ -53,9 +53,9 @@ class _Variation(torch.autograd.Function):
         block = block_size(ROWS, values.device)
         gradient, programs = torch.empty_like(values), triton.cdiv(count, block)
         totals = torch.zeros(max(1, programs), device=values.device)
-        given = (rows.contiguous(), values.contiguous(), table, grids, scales, gradient, totals, count, channels)
+        tensors = (rows.contiguous(), values.contiguous(), table, grids, scales, gradient, totals, count, channels)
         sizes = {"CHANNELS": triton.next_power_of_2(channels), "BLOCK": block}
-        launch(variation_kernel, count, block, *given, NUM_HEADS=len(scales), **sizes)
+        launch(variation_kernel, count, block, *tensors, NUM_HEADS=len(scales), **sizes)
         ctx.save_for_backward(gradient)
         return totals.sum()
 

@@ -15,11 +15,11 @@ def total_variation(values: Tensor, table: Tensor, rows: Tensor, layout: SceneLa
     """See ``ops.variation``."""
     total = values.new_zeros(())
     for grid, each in zip(layout.grids, scales, strict=True):
-        own = grid.holds(rows).nonzero()[:, 0]
-        neighbours, exists = grid.neighbours(rows[own])
+        inside = grid.holds(rows).nonzero()[:, 0]
+        neighbours, exists = grid.neighbours(rows[inside])
         weights = exists * torch.tensor([s for s in each for _ in range(2)], device=rows.device)
         around = table[neighbours.reshape(-1)].view(*neighbours.shape, -1)
-        total = total + clamped_differences(values[own], around, weights)
+        total = total + clamped_differences(values[inside], around, weights)
     return total
 
 

@@ -21,19 +21,19 @@ bool holds(const Grid& grid, int64_t place) {
 
 // `place` is the brick's tile (-1 for the empty brick), `head` the one that holds it, or a guess.
 Surroundings around_brick(const Grid* grids, int64_t num_heads, int64_t place, int64_t head) {
-    Surroundings found;
-    if (place < 0) return found;
-    for (found.head = std::max<int64_t>(head, 0); !holds(grids[found.head], place);)
-        found.head = (found.head + 1) % num_heads;
-    const Grid& grid = grids[found.head];
+    Surroundings around;
+    if (place < 0) return around;
+    for (around.head = std::max<int64_t>(head, 0); !holds(grids[around.head], place);)
+        around.head = (around.head + 1) % num_heads;
+    const Grid& grid = grids[around.head];
     const int64_t tile = place - grid.first_tile, across = grid.across, layer = across * grid.down;
     const int64_t x = tile % across, y = tile / across % grid.down, z = tile / layer;
     const bool inside[6] = {x > 0, x + 1 < across, y > 0, y + 1 < grid.down, z > 0, z + 1 < grid.depth};
     const int64_t steps[6] = {-1, 1, -across, across, -layer, layer};
-    for (int i = 0; i < 6; i++) found.beside[i] = inside[i] ? grid.tiles[place + steps[i]] * BRICK : 0;
-    found.columns = std::min<int64_t>(8, grid.width - 8 * x);
-    found.lines = std::min<int64_t>(8, grid.height - 8 * y);
-    return found;
+    for (int i = 0; i < 6; i++) around.beside[i] = inside[i] ? grid.tiles[place + steps[i]] * BRICK : 0;
+    around.columns = std::min<int64_t>(8, grid.width - 8 * x);
+    around.lines = std::min<int64_t>(8, grid.height - 8 * y);
+    return around;
 }
 
 // Rows of one head, each before those of its neighbours; a neighbour that is not stored is the row itself.
@@ -55,9 +55,9 @@ void add_row(Group& group, const Surroundings& at, int64_t row) {
     to[6] = other(beside[5], 0);
 }
 
-// Adds scale * Huber(own - other) and its slope. Numbers that are none stay so.
-void add_difference(Lanes own, Lanes other, float scale, Lanes& slope, Lanes& value) {
-    const Lanes difference = own - other, below = difference > 1.0f ? splat(1) : difference;
+// Adds scale * Huber(center - other) and its slope. Numbers that are none stay so.
+void add_difference(Lanes center, Lanes other, float scale, Lanes& slope, Lanes& value) {
+    const Lanes difference = center - other, below = difference > 1.0f ? splat(1) : difference;
     const Lanes clamped = below < -1.0f ? splat(-1) : below;
     slope += scale * clamped;
     value += scale * clamped * (difference - 0.5f * clamped);
@@ -81,9 +81,9 @@ Lanes vary_octets(const Table& table, const Group& group, const float* scale, fl
         const bool alone = i + 1 == group.size;
         const int64_t *row = group.rows[i], *other = group.rows[alone ? i : i + 1];
         Lanes slope{}, value{};
-        const Lanes own = join(table.octet(row[0]), table.octet(other[0]));
+        const Lanes center = join(table.octet(row[0]), table.octet(other[0]));
         for (int k = 1; k < 7; k++)
-            add_difference(own, join(table.octet(row[k]), table.octet(other[k])), scale[(k - 1) / 2], slope, value);
+            add_difference(center, join(table.octet(row[k]), table.octet(other[k])), scale[(k - 1) / 2], slope, value);
         store(grad + i * OCTET, slope);
         total += IOTA < float(alone ? OCTET : WIDTH) ? value : Lanes{};
     }
@@ -97,9 +97,9 @@ Lanes vary(const Table& table, const Group& group, const float* scale, float* gr
     for (int64_t i = 0; i < group.size; i++)
         for (int64_t first = 0; first < channels; first += WIDTH) {
             Lanes slope{}, value{};
-            const Lanes own = table.read(group.rows[i][0] * channels + first);
+            const Lanes center = table.read(group.rows[i][0] * channels + first);
             for (int k = 0; k < 6; k++)
-                add_difference(own, table.read(group.rows[i][k + 1] * channels + first), scale[k / 2], slope, value);
+                add_difference(center, table.read(group.rows[i][k + 1] * channels + first), scale[k / 2], slope, value);
             store(grad + i * channels + first, slope); // what lies beyond the row is overwritten by the next one
             total += IOTA < float(channels - first) ? value : Lanes{};
         }
