@@ -48,11 +48,11 @@ class SfmModel:
     ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
         """(index into ``image_names``, point, relative position) of the keypoints of these images only."""
         by_name = dict(zip(self.names, self.keypoints, strict=True))
-        found = [(i, *by_name[name]) for i, name in enumerate(image_names) if name in by_name]
-        if not found:
+        rows = [(i, *by_name[name]) for i, name in enumerate(image_names) if name in by_name]
+        if not rows:
             return np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2))
-        cameras = np.concatenate([np.full(len(p), i, np.int64) for i, p, _ in found])
-        return cameras, np.concatenate([p for _, p, _ in found]), np.concatenate([xy for _, _, xy in found])
+        cameras = np.concatenate([np.full(len(points), i, np.int64) for i, points, _ in rows])
+        return cameras, np.concatenate([points for _, points, _ in rows]), np.concatenate([xy for *_, xy in rows])
 
 
 def find_sfm_model(path: Path) -> SfmModel | None:

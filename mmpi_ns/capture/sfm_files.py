@@ -62,15 +62,15 @@ def check_model_files(folder: Path) -> None:
 
 
 def _cameras(file: _Reader) -> set[int]:
-    found = set()
+    cameras = set()
     for _ in range(file.count(24)):
         number, model, _, _ = file.take("<IiQQ")
         if not 0 <= model < len(PARAMETERS):
             raise Damaged(f"cameras.bin has a camera of model {model}, which is not known")
         file.skip(8 * PARAMETERS[model])
-        found.add(number)
+        cameras.add(number)
     file.end()
-    return found
+    return cameras
 
 
 def _images(file: _Reader, cameras: set[int]) -> tuple[dict[int, int], set[int]]:
@@ -93,7 +93,7 @@ def _images(file: _Reader, cameras: set[int]) -> tuple[dict[int, int], set[int]]
 
 
 def _points(file: _Reader, images: dict[int, int]) -> set[int]:
-    found = set()
+    points = set()
     for _ in range(file.count(51)):
         number, *_ = file.take("<Q3d3Bd")
         length = file.count(8)
@@ -102,6 +102,6 @@ def _points(file: _Reader, images: dict[int, int]) -> set[int]:
         for image, keypoint in struct.iter_unpack("<II", file.data[begin : file.at]):
             if keypoint >= images.get(image, 0):
                 raise Damaged(f"points3D.bin names keypoint {keypoint} of image {image}, which images.bin has not")
-        found.add(number)
+        points.add(number)
     file.end()
-    return found
+    return points
