@@ -32,6 +32,8 @@ from mmpi_ns.prepare.verdict import REMEDY, Verdict
 from mmpi_ns.prepare.video import select_frames
 
 WORK = ".prepare"
+LEAST_IMAGES = 3
+"""From which poses can be found; COLMAP's mappers make no smaller model."""
 LEAST_SHARE = 0.5
 """Share of the images that must be registered, unless --allow-partial."""
 
@@ -53,6 +55,11 @@ class Preparation:
             self.photos, self.is_ordered = self._read_input()
             self.masks = self._read_masks()
             self.known = read_poses(s.poses, s.poses_format, s.poses_axes, self.photos) if s.poses else None
+            if self.known is None and len(self.photos) < LEAST_IMAGES:
+                raise PrepareError(
+                    f"Poses cannot be found for {len(self.photos)} images alone, as no third confirms them: take more "
+                    "(better twenty), or give known poses (--poses)."
+                )
             self._split([p.name for p in self.photos])  # refuse a split that is impossible before the work
         self.is_fixed = self._set_cameras()
         with self._timed("features"):

@@ -48,8 +48,6 @@ def write_report(
         notes: listed last.
         scene: folder to write to.
     """
-    (scene / "report").mkdir(parents=True, exist_ok=True)
-    _draw_track(model, findings, scene / "report" / "track.png")
     covered = coverage(model)
     rows = {
         **rows,
@@ -59,8 +57,8 @@ def write_report(
         "points seen by an image": f"{model.compute_mean_observations_per_reg_image():.0f}",
         "coverage": f"{np.mean(list(covered.values())):.0%} on average, {min(covered.values()):.0%} at least",
     }
-    worst_first = sorted(findings, key=lambda f: (f.kind, -f.badness))
-    warnings = [*warnings, *(f"{f.kind} {f.image + ': ' if f.image else ''}{f.says}" for f in worst_first)]
+    for f in sorted(findings, key=lambda f: (f.kind, -f.badness)):
+        warnings = [*warnings, f"{f.kind} {f.image + ': ' if f.image else ''}{f.says}"]
     parts = [
         f"# {title}\n",
         "\n".join(["| | |", "|---|---|", *(f"| {k} | {v} |" for k, v in rows.items())]),
@@ -79,10 +77,12 @@ def write_report(
         "\n".join(f"- {n}" for n in notes) or "None.",
     ]
     write_text(scene / "report.md", "\n".join(parts) + "\n")
+    _draw_track(model, findings, scene / "report" / "track.png")
 
 
 def _draw_track(model: pycolmap.Reconstruction, findings: Sequence[Finding], path: Path) -> None:
     """Cameras and points from above."""
+    path.parent.mkdir(exist_ok=True)
     names, poses = camera_poses(model)
     axes = horizontal_axes(poses)
     centers, facing = poses[:, :3, 3] @ axes, poses[:, :3, 2] @ axes

@@ -306,6 +306,13 @@ def test_too_few_images_are_refused(count, words, tmp_path):
         prepare(Settings(tmp_path / "in", tmp_path / "scene"))
 
 
+def test_two_images_without_poses_are_refused_before_any_work(tmp_path):
+    corridor.write_images(tmp_path / "in", 2)
+    with pytest.raises(PrepareError, match="for 2 images alone, as no third confirms them"):
+        prepare(Settings(tmp_path / "in", tmp_path / "scene", threads=1))
+    assert not (tmp_path / "scene/.prepare/features").exists()
+
+
 def test_truncated_image_is_named(tmp_path):
     save(tmp_path / "in/a.png")
     (tmp_path / "in/b.jpg").write_bytes(save(tmp_path / "whole.jpg", (90, 90)).read_bytes()[:300])
