@@ -246,7 +246,7 @@ def _straightened(
     full_width, full_height = original.sizes[i]
     columns, rows = np.meshgrid(np.arange(shape[1]) + 0.5, np.arange(shape[0]) + 0.5)
     at = np.stack([columns * full_width / file_shape[1], rows * full_height / file_shape[0]], -1).reshape(-1, 1, 2)
-    if not original.distortion[i].any():
+    if not original.is_bent(i):
         fx, fy, cx, cy = original.intrinsics[i]
         return (at[:, 0, 0] - cx) / fx, (at[:, 0, 1] - cy) / fy
     straighten = cv2.fisheye.undistortPoints if original.is_fisheye(i) else cv2.undistortPoints

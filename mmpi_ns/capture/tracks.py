@@ -79,6 +79,10 @@ class PosedImages:
         """Whether image i has a fisheye lens."""
         return bool(np.broadcast_to(self.fisheye, len(self.sizes))[i])
 
+    def is_bent(self, i: int) -> bool:
+        """Whether the lens of image i is no pinhole's; a fisheye's is not, even if all its terms are 0."""
+        return self.is_fisheye(i) or bool(self.distortion[i].any())
+
     def pairs(self) -> list[tuple[int, int]]:
         """Images worth matching."""
         return near_pairs(self.camera_to_worlds, NEIGHBOURS)

@@ -57,7 +57,7 @@ def load_view(images: PosedImages, i: int, width: int) -> View:
     scale = np.array([gray.shape[1] / full_width, gray.shape[0] / full_height])
     pinhole = images.intrinsics[i] * np.tile(scale, 2)
     inside = np.broadcast_to(True, gray.shape)  # of no size
-    if images.distortion[i].any():
+    if images.is_bent(i):
         matrix, size = camera_matrix(pinhole), gray.shape[::-1]
         straighten = cv2.fisheye.initUndistortRectifyMap if images.is_fisheye(i) else cv2.initUndistortRectifyMap
         # OpenCV counts from pixel centres.

@@ -82,9 +82,9 @@ def relative_errors(found, poses):
     return np.abs(error), np.abs(scaled)
 
 
-@pytest.mark.parametrize("lens", [(0.0, 0.0, 0.0, 0.0), LENS])
-def test_most_pixels_get_their_depth_and_know_their_error(tmp_path, lens):
-    images = scene_of(tmp_path, POSES, lens)
+@pytest.mark.parametrize(("lens", "fisheye"), [((0.0,) * 4, False), (LENS, False), ((0.0,) * 4, True)])
+def test_most_pixels_get_their_depth_and_know_their_error(tmp_path, lens, fisheye):
+    images = scene_of(tmp_path, POSES, lens, fisheye)
     found = list(find_depths(images, lambda i: points_on_walls(POSES[i]), WIDTH))
     cover = np.mean([(d.inverse > 0).mean() for _, d in found])
     error, scaled = relative_errors(found, POSES)

@@ -52,7 +52,7 @@ def test_a_panorama_wider_than_sixteen_bits_count_gets_its_distances():
 
 
 @pytest.mark.parametrize(("lens", "fisheye"), [((0, 0, 0, 0), False), ((0.1, -0.05, 0.002, -0.001), False),
-                                               ((0.08, -0.03, 0.02, 0.01), True)])  # fmt: skip
+                                               ((0.08, -0.03, 0.02, 0.01), True), ((0, 0, 0, 0), True)])  # fmt: skip
 def test_a_training_pixel_gets_the_distance_of_what_it_shows(lens, fisheye):
     """Oracle: the training pixels' rays by OpenCV's own lens model, met with the plane."""
     posed = camera(lens, fisheye)
@@ -67,8 +67,8 @@ def test_a_training_pixel_gets_the_distance_of_what_it_shows(lens, fisheye):
     u, v = straight.T.reshape(2, 15, 20)
     expected = (0.5 + 0.2 * u + 0.1 * v) / np.sqrt(u**2 + v**2 + 1)
     known = found[..., 0] > 0
-    assert known.mean() > 0.8
-    assert found[known][:, 0] == pytest.approx(expected[known], rel=0.04 if any(lens) else 1e-3)
+    assert known.mean() > 0.75
+    assert found[known][:, 0] == pytest.approx(expected[known], rel=0.04 if any(lens) or fisheye else 1e-3)
     assert (found[known][:, 1] > 0.009 * found[known][:, 0]).all()
 
 
