@@ -54,8 +54,8 @@ class Preparation:
         with self._timed("reading"):
             self.photos, self.is_ordered = self._read_input()
             self.masks = self._read_masks()
-            self.known = read_poses(s.poses, s.poses_format, s.poses_axes, self.photos) if s.poses else None
-            if self.known is None and len(self.photos) < LEAST_IMAGES:
+            self.known_poses = read_poses(s.poses, s.poses_format, s.poses_axes, self.photos) if s.poses else None
+            if self.known_poses is None and len(self.photos) < LEAST_IMAGES:
                 raise PrepareError(
                     f"Poses cannot be found for {len(self.photos)} images alone, as no third confirms them: take more "
                     "(better twenty), or give known poses (--poses)."
@@ -111,7 +111,7 @@ class Preparation:
     def _set_cameras(self) -> bool:
         """Numbers and cameras of the images; returns whether their intrinsics are to be kept."""
         s = self.settings
-        lenses: dict[str, Intrinsics] = dict(self.known.intrinsics) if self.known else {}
+        lenses: dict[str, Intrinsics] = dict(self.known_poses.intrinsics) if self.known_poses else {}
         if s.camera is not None:
             camera = parse_camera(s.camera, s.lens == "fisheye")
             lenses = {p.name: camera for p in self.photos}
@@ -120,9 +120,9 @@ class Preparation:
         self.numbers = share(self.photos, s.intrinsics, lenses)
         self.cameras = make_cameras(self.photos, self.numbers, lenses, s.focal, s.lens)
         is_given = bool(lenses) or s.focal is not None
-        if self.known is not None and not is_given and not all(p.exif_focal for p in self.photos):
+        if self.known_poses is not None and not is_given and not all(p.exif_focal for p in self.photos):
             raise PrepareError("Known poses need the intrinsics they were made with: give --focal or --camera.")
-        return (is_given or self.known is not None) and not s.refine_intrinsics
+        return (is_given or self.known_poses is not None) and not s.refine_intrinsics
 
     def _features(self) -> Path:
         s = self.settings
@@ -150,7 +150,7 @@ class Preparation:
             (folder / "says.txt").write_text(f"{says}; {verified} of {len(listed)} pairs match", encoding="utf-8")
             return path
 
-        poses = {n: p.tolist() for n, p in self.known.poses.items()} if self.known else None
+        poses = {n: p.tolist() for n, p in self.known_poses.poses.items()} if self.known_poses else None
         path = self.stages.run("matches", [s.matching, s.overlap, poses], stage, lambda folder: folder / "database.db")
         says = (path.parent / "says.txt").read_text(encoding="utf-8")
         say(f"Matching: {says}.")
@@ -158,9 +158,9 @@ class Preparation:
 
     def _pairs(self, database: Path) -> tuple[pairs.Pairs, str]:
         s, names = self.settings, [p.name for p in self.photos]
-        if self.known is not None and s.matching == "auto":
-            places = [i for i, n in enumerate(names) if n in self.known.poses]
-            poses = np.array([self.known.poses[names[i]] for i in places])  # OpenCV axes
+        if self.known_poses is not None and s.matching == "auto":
+            places = [i for i, n in enumerate(names) if n in self.known_poses.poses]
+            poses = np.array([self.known_poses.poses[names[i]] for i in places])  # OpenCV axes
             near = near_pairs(poses[:, :3], 2 * s.overlap)
             return [(places[i], places[j]) for i, j in near], f"the {2 * s.overlap} nearest by pose"
         alike = pairs.image_similarity(database, len(names))
@@ -174,12 +174,12 @@ class Preparation:
 
         def stage(folder: Path) -> None:
             groups: list[list[str]] = []
-            if self.known is not None:
-                poses = {n: rigid3d(p) for n, p in self.known.poses.items()}
+            if self.known_poses is not None:
+                poses = {n: rigid3d(p) for n, p in self.known_poses.poses.items()}
                 model = new_model(self.cameras, names, self.numbers, poses)
                 refine = not self.is_fixed and s.refine_intrinsics
                 model, says = map_known_poses(model, database, self.image_folder, s.refine_poses, refine, s.threads)
-                solution = Solution(model, f"{self.known.says}; {says}")
+                solution = Solution(model, f"{self.known_poses.says}; {says}")
             else:
                 lens, place = not self.is_fixed, s.camera is None or s.refine_intrinsics
                 free = Free(lens, lens and s.lens == "auto", principal_point=place, always=s.refine_principal_point)
@@ -229,7 +229,7 @@ class Preparation:
     def _write(self, solution: Solution, database: Path) -> Verdict:
         """Moves the model into the scene's frame and writes the scene; the verdict, with the findings of the checks."""
         s, model, verdict = self.settings, solution.model, solution.verdict
-        if self.known is not None and s.camera_height is None:
+        if self.known_poses is not None and s.camera_height is None:
             frame = SceneFrame(pycolmap.Sim3d(), "that of the given poses", "that of the given poses")
         else:
             frame = choose_frame(model, s.camera_height)
@@ -239,7 +239,7 @@ class Preparation:
         split = self._split([p.name for p in photos])
         findings = self._findings(model, photos, database)
         grave = [f"{f.says[:1].upper()}{f.says[1:]}." for f in findings if f.is_grave]
-        if grave and self.known is None and verdict.grade == "right":
+        if grave and self.known_poses is None and verdict.grade == "right":
             verdict = Verdict("doubtful", tuple(grave))
         folder, masks, flat, built = self.image_folder, self.masks, self.work / "undistorted", self.work / "scene"
         shutil.rmtree(flat, ignore_errors=True)
@@ -280,8 +280,8 @@ class Preparation:
         s = self.settings
         if s.split_from is not None:
             return export.split_from(read_lists(s.split_from), names, s.split_from.name)
-        if self.known is not None and self.known.split and s.test_every is None and s.train_every is None:
-            return export.split_from(self.known.split, names, f"{s.poses}")
+        if self.known_poses is not None and self.known_poses.split and s.test_every is None and s.train_every is None:
+            return export.split_from(self.known_poses.split, names, f"{s.poses}")
         return export.split_by_count(names, s.test_every, s.train_every)
 
     def _findings(
