@@ -21,7 +21,7 @@ from mmpi_ns.capture.datamanager import OBSERVATIONS, RAYS_PER_STEP, TRAINING_VI
 from mmpi_ns.capture.rays import PinholeRays
 from mmpi_ns.field.mmpi_field import ColourConfig, MMPIField
 from mmpi_ns.ops import dispatch
-from mmpi_ns.ops.march.reference import most_kept
+from mmpi_ns.ops.march import MarchOptions
 from mmpi_ns.placement.rule import PlacementConfig
 from mmpi_ns.placement.split import place_windows
 from mmpi_ns.rendering.baked import BakedWindow, bake, suits_bricks
@@ -290,8 +290,8 @@ class MMPIModel(Model):
         if self.config.eval_num_rays_per_chunk:
             return self.config.eval_num_rays_per_chunk
         most = max(plan.samples_per_ray for plan in self.progress.windows.plans)
-        one_pass = shows_in_one_pass(self.field)
-        return rays_per_chunk(most, self.device, most_kept(most, self.config.rendering.threshold) if one_pass else None)
+        one_pass, kept = shows_in_one_pass(self.field), MarchOptions(self.config.rendering.threshold).most_kept(most)
+        return rays_per_chunk(most, self.device, kept if one_pass else None)
 
     def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
         """Colours without their background, and how opaque each pixel is (ns-render's output "rgba")."""

@@ -9,15 +9,14 @@ import torch
 from random_fields import OracleRay, _places, _table, bundle, random_field, random_rays
 
 from mmpi_ns.ops import dispatch
-from mmpi_ns.ops.march import MarchOptions
-from mmpi_ns.ops.show import show_rays
-from mmpi_ns.rendering.sampler import crossings
+from mmpi_ns.ops.march import MarchOptions, show_rays
+from mmpi_ns.rendering.sampler import rays_of
 
 
 def shown(field, rays, threshold=0.0, blends=False, **chosen):
     """What rays show, whatever heads may answer them."""
     options = MarchOptions(threshold, blends=blends)
-    return show_rays(field.layout, field.tables, field.features.data, crossings(rays, field, **chosen), options)
+    return show_rays(field.layout, field.tables, field.features.data, rays_of(rays, **chosen), options)
 
 
 def compare(field, rays, *how, error=3e-5, **chosen):

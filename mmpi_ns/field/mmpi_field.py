@@ -136,7 +136,8 @@ class MMPIField(TexelTables):
         packed = None if cube is None else geometry.Cube.pack(cube, self.samples_per_voxel, device=device)
         interval = 1.0 / self.samples_per_voxel
         bias = math.log(math.expm1(-math.log1p(-self.cube_alpha) / interval))
-        return SceneLayout(mpis, frames, self.grids, biases, self.depth_scale, packed, bias, interval)
+        near = self.plan.content_near
+        return SceneLayout(mpis, frames, self.grids, biases, self.depth_scale, packed, bias, interval, near)
 
     @property
     def tables(self) -> Tables:

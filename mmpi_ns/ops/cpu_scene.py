@@ -7,10 +7,16 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor
+from typing_extensions import Self
 
 from mmpi_ns.ops.build import address, arguments
-from mmpi_ns.ops.layout import SceneLayout, Tables
+from mmpi_ns.ops.layout import SceneLayout, Tables, shaped
 from mmpi_ns.scene.texels import TexelGrid
+
+
+def addresses(*names: str) -> list[tuple[str, type]]:
+    """Fields of a structure of pointers."""
+    return [(name, ctypes.c_void_p) for name in names]
 
 
 class Grid(ctypes.Structure):
@@ -31,9 +37,7 @@ class Grid(ctypes.Structure):
 class Layer(ctypes.Structure):
     """Of a small network (``cpp/layers.h``)."""
 
-    _fields_ = [(n, ctypes.c_int64) for n in ("outputs", "inputs")] + [
-        (n, ctypes.c_void_p) for n in ("weights", "biases")
-    ]
+    _fields_ = [*((n, ctypes.c_int64) for n in ("outputs", "inputs")), *addresses("weights", "biases")]
 
     @staticmethod
     def array(pairs: Sequence[tuple[Tensor, Tensor]]) -> ctypes.Array:
@@ -41,28 +45,49 @@ class Layer(ctypes.Structure):
         return (Layer * len(pairs))(*(Layer(*w.shape, *arguments((w, b))) for w, b in pairs))
 
 
+class Pointers(ctypes.Structure):
+    """Addresses of tensors, which live as long as it does; null for None."""
+
+    held: tuple[Tensor | None, ...]
+
+    @classmethod
+    def to(cls, *tensors: Tensor | None) -> Self:
+        pointers = cls(*arguments(tensors))
+        pointers.held = tensors
+        return pointers
+
+
 class SceneTables(ctypes.Structure):
     """A plan and its tables."""
 
-    _fields_ = [(n, ctypes.c_int64) for n in ("num_mpis", "num_heads")] + [
-        (n, ctypes.c_void_p) for n in ("mpis", "grids", "biases", "cube", "density", "reliability", "touched")
+    _fields_ = [
+        *((n, ctypes.c_int64) for n in ("num_mpis", "num_heads")),
+        ("content_near", ctypes.c_float),
+        *addresses("mpis", "frames", "grids", "biases", "cube", "density", "reliability", "touched"),
     ]
+    held: list[Tensor]
 
 
 class CpuScene:
     """A layout as structures, which live as long as this does; made once by ``CpuScene.of``."""
 
     def __init__(self, layout: SceneLayout) -> None:
-        self.mpis, self.cube, count = layout.head_rows(), layout.cube_row(), layout.num_heads
+        count, planes = layout.num_heads, [m.planes for m in layout.mpis]
+        self.layout, self.rows = layout, layout.num_rows
+        self.mpis, self.cube = shaped(layout.head_rows(), len(planes), 9), shaped(layout.cube_row(), 12)
         self.grids = (Grid * count)(*map(Grid.of, layout.grids, layout.bias_starts()))
-        self.biases = torch.cat(layout.biases).float().contiguous()
+        self.biases = shaped(torch.cat(layout.biases).float(), sum(planes))
 
     @staticmethod
     def of(layout: SceneLayout) -> CpuScene:
         return layout.once("cpu", CpuScene)
 
     def with_tables(self, tables: Tables) -> SceneTables:
-        """Argument of a compiled function; the tables must outlive it."""
-        plan = (*arguments([self.mpis]), ctypes.addressof(self.grids), *arguments([self.biases, self.cube]))
-        assert tables.density.dtype == tables.reliability.dtype == torch.float32 and tables.touched.dtype == torch.uint8
-        return SceneTables(len(self.mpis), len(self.grids), *plan, *arguments(tables))
+        """Argument of a compiled function; this must outlive it."""
+        density, reliability = (shaped(x, self.rows, 1) for x in (tables.density, tables.reliability))
+        held = [density, reliability, shaped(tables.touched, self.rows, dtype=torch.uint8)]
+        frames, grids = shaped(self.layout.frame_rows(), len(self.mpis), 19), ctypes.addressof(self.grids)
+        plan = (*arguments([self.mpis, frames]), grids, *arguments([self.biases, self.cube]))
+        scene = SceneTables(len(self.mpis), len(self.grids), self.layout.content_near, *plan, *arguments(held))
+        scene.held = held
+        return scene

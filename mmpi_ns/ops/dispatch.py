@@ -26,7 +26,6 @@ Form = Literal["reference", "cpu", "gpu"]
 
 TABLE: dict[str, tuple[str, tuple[Form, ...]]] = {
     # operation: its folder, and which compiled forms there are beside the reference
-    "plane_hits": ("hits", ("cpu", "gpu")),
     "march": ("march", ("cpu", "gpu")),
     "order_by_head": ("interpolate", ("cpu",)),
     "texel_rows": ("interpolate", ("cpu", "gpu")),
@@ -39,9 +38,9 @@ TABLE: dict[str, tuple[str, tuple[Form, ...]]] = {
     "total_variation": ("variation", ("cpu", "gpu")),
     "adam_rows": ("adam", ("cpu", "gpu")),
     "gather_taps": ("gather", ("cpu", "gpu")),
-    "show_rays": ("show", ("cpu", "gpu")),
+    "show_rays": ("march", ("cpu", "gpu")),
     "shade": ("shade", ("cpu",)),
-    "march_baked": ("baked", ("cpu",)),
+    "show_baked": ("baked", ("cpu",)),
     "splat_image": ("splat", ("cpu",)),
     "splat_sums": ("splat", ("cpu",)),
     "splat_opacities": ("splat", ("cpu",)),

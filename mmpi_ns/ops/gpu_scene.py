@@ -7,7 +7,6 @@ Imported only where Triton is wanted (``dispatch.py``): the package runs without
 # pyright: reportGeneralTypeIssues=false, reportCallIssue=false, reportArgumentType=false
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,7 +16,7 @@ import triton.language as tl
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from mmpi_ns.ops.layout import SceneLayout
+from mmpi_ns.ops.layout import SceneLayout, Tables, shaped
 
 # Columns of the constants of an MPI (``SceneLayout.head_rows``).
 STEP = tl.constexpr(0)
@@ -52,9 +51,9 @@ class GpuScene:
     grids: Int[Tensor, "N"]
     """See ``_pack_grids``."""
     biases: Float[Tensor, "P"]
-    cube: Float[Tensor, "9"]
-    most_samples: int
-    """No ray has more: planes of all MPIs, and the cube's diagonal in steps."""
+    cube: Float[Tensor, "12"]
+    rows: int
+    """Of the pooled tables."""
 
     @staticmethod
     def of(layout: SceneLayout) -> GpuScene:
@@ -63,14 +62,17 @@ class GpuScene:
     def constants(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         return self.heads, self.grids, self.biases, self.cube
 
+    def checked(self, tables: Tables) -> Tables:
+        """The tables as the kernels read them."""
+        density, reliability = (shaped(x, self.rows, 1) for x in (tables.density, tables.reliability))
+        return Tables(density, reliability, shaped(tables.touched, self.rows, dtype=torch.uint8))
+
 
 def _pack(layout: SceneLayout) -> GpuScene:
-    device, cube = layout.frames.origins.device, layout.cube
-    most = sum(m.planes for m in layout.mpis)
-    if cube is not None:
-        most += int(2 * math.hypot(*(cube.upper - cube.lower).tolist()) / cube.step) + 2
-    biases = torch.cat(layout.biases).to(device, torch.float32).contiguous()
-    return GpuScene(layout.head_rows(), _pack_grids(layout, device), biases, layout.cube_row(), most)
+    device, planes = layout.frames.origins.device, [m.planes for m in layout.mpis]
+    heads, cube = shaped(layout.head_rows(), len(planes), FLOATS.value), shaped(layout.cube_row(), 12)
+    biases = shaped(torch.cat(layout.biases).to(device, torch.float32), sum(planes))
+    return GpuScene(heads, _pack_grids(layout, device), biases, cube, layout.num_rows)
 
 
 def _pack_grids(layout: SceneLayout, device: torch.device) -> Int[Tensor, "N"]:

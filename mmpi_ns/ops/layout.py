@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -12,7 +13,7 @@ from torch import Tensor
 
 from mmpi_ns.scene.geometry import Cube, Frames
 from mmpi_ns.scene.plan import MPIPlan
-from mmpi_ns.scene.texels import TexelGrid
+from mmpi_ns.scene.texels import BRICK, TexelGrid
 
 
 class Tables(NamedTuple):
@@ -52,6 +53,8 @@ class SceneLayout:
     cube: Cube | None = None
     cube_bias: float = 0.0
     cube_interval: float = 1.0
+    content_near: float = 0.0
+    """Distance to the first content."""
     packed: dict[str, Any] = field(default_factory=dict)
     """The same in the layout of the compiled operations, made by them once."""
 
@@ -65,17 +68,27 @@ class SceneLayout:
         # Where threads make it at once the first one's stays: compiled operations hold addresses in it.
         return self.packed.setdefault(name, make(self)) if found is None else found
 
+    @property
+    def num_rows(self) -> int:
+        """Rows of the pooled tables."""
+        return len(self.grids[0].places) * BRICK
+
+    @property
+    def most_samples(self) -> int:
+        """No ray has more: planes of all MPIs, and the cube's diagonal in steps."""
+        return self.once("most samples", _most_samples)
+
     def frame_rows(self) -> Float[Tensor, "K 19"]:
-        """Of each MPI: origin, axes, extent, disparity between planes and of the last one, number of the first one."""
-        return self.once("frame rows", _frame_rows)
+        """``frame_rows`` of the MPIs."""
+        return self.once("frame rows", lambda layout: frame_rows(layout.frames))
 
     def head_rows(self) -> Float[Tensor, "K 9"]:
         """Of each MPI: disparity between planes and of the last one, 1 - near / far, scale of the NDC s, lower end and
         scale of u and of v, interval."""
         return self.once("head rows", _head_rows)
 
-    def cube_row(self) -> Float[Tensor, "9"]:
-        """Lower corner, extent, step between samples, bias, interval; zeros without a cube."""
+    def cube_row(self) -> Float[Tensor, "12"]:
+        """Lower corner, extent, step between samples, bias, interval, upper corner; zeros without a cube."""
         return self.once("cube row", _cube_row)
 
     def bias_starts(self) -> list[int]:
@@ -93,8 +106,8 @@ class SceneLayout:
         return torch.nn.functional.softplus(raw + bias) * self.interval(k)
 
 
-def _frame_rows(layout: SceneLayout) -> Tensor:
-    frames = layout.frames
+def frame_rows(frames: Frames) -> Float[Tensor, "K 19"]:
+    """Of each MPI: origin, axes, extent, disparity between planes and of the last one, number of the first one."""
     columns = (frames.disparity_steps, frames.last_disparities, frames.num_planes - 1)
     parts = (frames.origins, frames.axes.flatten(1), frames.extents, *(x[:, None] for x in columns))
     return torch.cat([x.float() for x in parts], -1).contiguous()
@@ -106,12 +119,23 @@ def _head_rows(layout: SceneLayout) -> Tensor:
         u0, u1, v0, v1 = mpi.extent
         depth = (step, mpi.last_disparity, mpi.depth_share, 2 * mpi.near / mpi.depth_share)
         rows.append((*depth, u0, 2 / (u1 - u0), v0, 2 / (v1 - v0), layout.interval(k)))
-    return torch.tensor(rows, dtype=torch.float32, device=layout.frames.origins.device)
+    return torch.tensor(rows, dtype=torch.float32, device=layout.frames.origins.device).reshape(len(rows), 9)
 
 
 def _cube_row(layout: SceneLayout) -> Tensor:
-    cube, numbers = layout.cube, [0.0] * 9
+    cube, numbers = layout.cube, [0.0] * 12
     if cube is not None:
         corner, extent = cube.lower.tolist(), (cube.upper - cube.lower).tolist()
-        numbers = [*corner, *extent, cube.step, layout.cube_bias, layout.cube_interval]
+        numbers = [*corner, *extent, cube.step, layout.cube_bias, layout.cube_interval, *cube.upper.tolist()]
     return torch.tensor(numbers, dtype=torch.float32, device=layout.frames.origins.device)
+
+
+def _most_samples(layout: SceneLayout) -> int:
+    cube, planes = layout.cube, sum(m.planes for m in layout.mpis)
+    return planes if cube is None else planes + int(2 * math.hypot(*(cube.upper - cube.lower).tolist()) / cube.step) + 2
+
+
+def shaped(x: Tensor, *shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
+    """A tensor as compiled code reads it, which checks nothing itself: contiguous, of this shape and type."""
+    assert x.shape == shape and x.dtype == dtype, f"{list(x.shape)} {x.dtype} where {list(shape)} {dtype} is read"
+    return x.contiguous()

@@ -17,8 +17,8 @@ from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.adam import AdamConstants
 from mmpi_ns.ops.gather.reference import Taps
 from mmpi_ns.ops.layout import SceneLayout, Tables
-from mmpi_ns.ops.march import Crossings, MarchOptions
-from mmpi_ns.scene.geometry import Cube, Frames, cube_hits, plane_hits
+from mmpi_ns.ops.march import MarchOptions, Rays
+from mmpi_ns.scene.geometry import Cube, Frames
 from mmpi_ns.scene.plan import CubePlan, MPIPlan
 from mmpi_ns.scene.texels import BRICK, make_grids
 
@@ -29,7 +29,7 @@ FEW = 1e-3
 come out either way. Of forty rays none may."""
 RAYS, CHANNELS, ROWS = 40, 9, 300
 MANY_RAYS = 1 << 14
-"""Of so many the march takes more at once."""
+"""From so many on the march takes larger blocks."""
 AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
@@ -137,13 +137,7 @@ def _marches(device: str, many: bool | None = None) -> list[tuple]:
         *([(True, MarchOptions(0.0, blends=True), MANY_RAYS)] if many else []),
     ):
         layout, tables = _scene(device, with_cube)
-        rays = _rays(device, count)
-        hits = plane_hits(*rays, layout.frames)
-        first, counts = hits.m_first, hits.count
-        if layout.cube is not None:
-            start, number = cube_hits(*rays, layout.cube)
-            first, counts = torch.cat([first, start[:, None]], -1), torch.cat([counts, number[:, None]], -1)
-        cases.append((layout, tables, Crossings(*rays[:2], hits, first, counts), options))
+        cases.append((layout, tables, Rays(*_rays(device, count)), options))
     return cases
 
 
@@ -206,7 +200,6 @@ def _pictures(device: str, many: bool | None = None) -> list[tuple]:
 
 
 CASES: dict[str, Callable[[str], list[tuple]]] = {
-    "plane_hits": lambda device: [(*_rays(device), _scene(device, False)[0])],
     "march": _marches,
     "texel_rows": _texels,
     "weighted_rows": lambda device: [

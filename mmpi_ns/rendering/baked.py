@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
-from functools import reduce
 from typing import TypeVar
 
 import torch
@@ -19,10 +18,11 @@ from mmpi_ns.field.baking import bake_shares
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.shading import CHANGE, MOST_CHANGE, RayShader
 from mmpi_ns.ops import dispatch
-from mmpi_ns.ops.baked import march_baked, shade_baked
+from mmpi_ns.ops.baked import shade_baked, show_baked
 from mmpi_ns.ops.blending import blended_optical_depth
+from mmpi_ns.ops.ends import NEGLIGIBLE
 from mmpi_ns.ops.gather import COLORS
-from mmpi_ns.ops.march.reference import NEGLIGIBLE_DEPTH
+from mmpi_ns.ops.march import Rays
 from mmpi_ns.scene.baked import (
     CELLS,
     MOST_CHANNELS,
@@ -37,7 +37,6 @@ from mmpi_ns.scene.baked import (
 from mmpi_ns.scene.bricks import read_planes
 from mmpi_ns.scene.texels import SIDE as STORED_SIDE
 from mmpi_ns.scene.texels import TexelGrid
-from mmpi_ns.utils.parallel import in_order
 
 Item = TypeVar("Item")
 
@@ -63,7 +62,7 @@ def exact_images() -> Iterator[None]:
 def suits_bricks(model_field: MMPIField) -> bool:
     """Whether ``render auto`` uses bricks for a field that is not training: compiled, on a CPU, not for metrics."""
     wanted = not _measuring.get() and not torch.is_grad_enabled()
-    compiled = dispatch.form_of("march_baked", model_field.features.data) == "cpu"
+    compiled = dispatch.form_of("show_baked", model_field.features.data) == "cpu"
     return wanted and compiled and not why_not_baked(model_field)
 
 
@@ -96,16 +95,15 @@ class BakedWindow:
             bounds: nears and fars of the rays; None: from ``ray_near`` to infinity.
             background: colour behind everything; None: the window's own.
         """
-        rays = march_baked(self.mpis, origins, directions, *(bounds or self.unbounded(origins)), self.threshold)
-        rgb = shade_baked(self.shader, rays.sums, rays.mass, directions)
-        rgb = torch.where(rays.mass > 0, rgb, 0.0)
+        shown = show_baked(self.mpis, Rays(origins, directions, *(bounds or self.unbounded(origins))), self.threshold)
+        rgb = torch.where(shown.mass > 0, shade_baked(self.shader, shown.gathered, shown.mass, directions), 0.0)
         behind = self.background if background is None else background
         return {
-            "rgb": (rgb * (1 - rays.passing) + behind * rays.passing).clamp(0, 1),
-            "accumulation": 1 - rays.passing,
-            "depth": 1 / rays.inverse_t.clamp(min=1 / self.farthest),
-            "winning_mpi": rays.winner,
-            "dropped_mass": (1 - rays.passing - rays.mass).clamp(min=0),
+            "rgb": (rgb * shown.accumulation + behind * shown.transmittance).clamp(0, 1),
+            "accumulation": shown.accumulation,
+            "depth": 1 / shown.inverse_t.clamp(min=1 / self.farthest),
+            "winning_mpi": shown.winner,
+            "dropped_mass": shown.dropped_mass,
         }
 
     def unbounded(self, origins: Float[Tensor, "R 3"]) -> tuple[Float[Tensor, "R 1"], Float[Tensor, "R 1"]]:
@@ -119,19 +117,14 @@ class BakedWindow:
         """Largest weight of any sample of some views in each texel.
 
         Args:
-            views: shared out among threads, each with a table of its own.
+            views: whatever ``rays_of`` takes.
             rays_of: origins and unit directions of a view's rays.
         """
-        threads = torch.get_num_threads()
-
-        def peaks_of(thread: int) -> Tensor:
-            peaks = torch.zeros(self.mpis.density.shape)
-            for view in views[thread::threads]:
-                origins, directions = rays_of(view)
-                march_baked(self.mpis, origins, directions, *self.unbounded(origins), self.threshold, peaks)
-            return peaks
-
-        return reduce(torch.maximum, in_order(peaks_of, range(threads)))
+        peaks = torch.zeros(self.mpis.density.shape)
+        for view in views:
+            origins, directions = rays_of(view)
+            show_baked(self.mpis, Rays(origins, directions, *self.unbounded(origins)), self.threshold, peaks)
+        return peaks
 
     def outputs(self, bundle: RayBundle, background: Float[Tensor, "3"]) -> dict[str, Tensor]:
         """The same for a bundle with nears and fars on any device; bricks are read on the CPU."""
@@ -242,7 +235,7 @@ def _raw(model_field: MMPIField, k: int, planes: slice, shares: Tensor | None) -
     share = read_planes(shares, grid, planes)[..., 0].clamp(0, 1)
     tau = torch.nn.functional.softplus(raw) * interval
     blended = blended_optical_depth(tau, share.log(), torch.log1p(-share))
-    tau = torch.where(tau > NEGLIGIBLE_DEPTH, blended, tau / len(model_field.grids)) / interval
+    tau = torch.where(tau > NEGLIGIBLE, blended, tau / len(model_field.grids)) / interval
     return (tau + torch.log(-torch.expm1(-tau.clamp(min=1e-12)))).cpu()
 
 

@@ -16,7 +16,7 @@ from mmpi_ns.utils.errors import InputError
 CPU_RAYS = 4096
 """Their samples fit the caches and stay below the size that the C library returns to the system after each use."""
 SHOWN_RAYS = 4 * CPU_RAYS
-"""On a CPU if images are made in one pass without arrays of samples (``ops.show``)."""
+"""On a CPU if images are made in one pass without arrays of samples (``ops.march``)."""
 GPU_RAYS = 1 << 20
 """A frame of 1242 x 375, or half of one of 1920 x 1080, in one chunk."""
 BYTES_PER_SAMPLE = 128
@@ -33,8 +33,8 @@ def rays_per_chunk(samples_per_ray: int, device: torch.device, kept_in_one_pass:
     Args:
         samples_per_ray: maximum samples of a ray: the planes of all MPIs and the steps through the cube.
         device: where they are rendered.
-        kept_in_one_pass: how many of them a ray can keep, if images are made in one compiled pass (``ops.show``), which
-            stores nothing of the others; None if they are made step by step.
+        kept_in_one_pass: how many of them a ray can keep, if images are made in one compiled pass (``ops.march``),
+            which stores nothing of the others; None if they are made step by step.
 
     Returns:
         A power of two; on a GPU from ``CPU_RAYS`` to ``GPU_RAYS``.

@@ -15,9 +15,7 @@ from nerfstudio.model_components.ray_samplers import Sampler
 from torch import Tensor
 
 from mmpi_ns.field.mmpi_field import MMPIField
-from mmpi_ns.ops.hits import plane_hits
-from mmpi_ns.ops.march import Crossings, MarchOptions, MergedSamples, march
-from mmpi_ns.scene.geometry import PlaneHits, cube_hits, sample_disparity
+from mmpi_ns.ops.march import MarchOptions, MergedSamples, Rays, march
 
 DIRECTION_AT_INFINITY = 1e-10
 """Inverse distances below this become a distance of 1e10 in nerfstudio's starts and ends."""
@@ -46,8 +44,7 @@ class MergeReport:
     dropped_mass: Float[Tensor, "R 1"]
     """Rendering weight of the dropped samples: the error bound of dropping."""
     explained: Bool[Tensor, "R 1"]
-    """Whether the given heads must explain the whole ray: they cover it from before the first content out to infinity,
-    or there are no other heads."""
+    """See ``MergedSamples``."""
     head_counts: tuple[int, ...] | None
     """Samples of each head, if the march counted them."""
 
@@ -83,35 +80,19 @@ class MMPISampler(Sampler):
             ``skipped_before`` and ``tau``, the (blended) optical depth (each [R, S, .]), and what was left out.
         """
         assert ray_bundle is not None
+        options = MarchOptions(threshold, fair_share, blends)
         with torch.no_grad():
-            at = crossings(ray_bundle, field, head_mask, choose)
-            explained = (at.counts > 0).any(-1, keepdim=True)
-            if head_mask is not None or choose is not None:
-                explained &= _sees_all(at.hits, at.counts[:, : len(field.plan.mpis)], field)
-            options = MarchOptions(threshold, fair_share, blends)
-            merged = march(field.layout, field.tables, at, options)
+            merged = march(field.layout, field.tables, rays_of(ray_bundle, head_mask, choose), options)
         left = merged.skipped_total, merged.dropped_mass
-        report = MergeReport(at.counts.sum(-1), *left, explained, merged.head_counts)
+        report = MergeReport(merged.live, *left, merged.explained, merged.head_counts)
         return _ray_samples(ray_bundle, merged), report
 
 
-def crossings(
-    ray_bundle: RayBundle, field: MMPIField, head_mask: Tensor | None = None, choose: Tensor | None = None
-) -> Crossings:
-    """The live samples of rays in the heads that may render them (see ``MMPISampler``)."""
-    origins, directions, nears, fars = ray_bundle.origins, ray_bundle.directions, ray_bundle.nears, ray_bundle.fars
+def rays_of(ray_bundle: RayBundle, head_mask: Tensor | None = None, choose: Tensor | None = None) -> Rays:
+    """Rays for the march, and the heads that may render them (see ``MMPISampler``)."""
+    nears, fars = ray_bundle.nears, ray_bundle.fars
     assert nears is not None and fars is not None
-    hits = plane_hits(origins, directions, nears, fars, field.layout)
-    first, counts = hits.m_first, hits.count
-    if choose is not None:
-        best = torch.where(counts > 0, choose, torch.full_like(choose, -1.0)).argmax(-1, keepdim=True)
-        counts = torch.zeros_like(counts).scatter(1, best, counts.gather(1, best))
-    if field.cube is not None:
-        start, count = cube_hits(origins, directions, nears, fars, field.cube)
-        first, counts = torch.cat([first, start[:, None]], -1), torch.cat([counts, count[:, None]], -1)
-    if head_mask is not None:
-        counts = torch.where(head_mask, counts, torch.zeros_like(counts))
-    return Crossings(origins, directions, hits, first, counts)
+    return Rays(ray_bundle.origins, ray_bundle.directions, nears, fars, head_mask, choose)
 
 
 class _Frustums(Frustums):
@@ -126,20 +107,6 @@ class _Samples(RaySamples):
 
     def __post_init__(self) -> None:
         self._shape = self.frustums.shape
-
-
-def _sees_all(hits: PlaneHits, counts: Int[Tensor, "R K"], field: MMPIField) -> Bool[Tensor, "R 1"]:
-    """Whether some head covers the ray out to infinity, and the first head is entered before the first content."""
-    live = counts > 0
-    # One plane before the first live one bounds the entry: behind the camera means that the ray starts inside.
-    m_before = torch.minimum(hits.m_first + 1, field.frames.num_planes - 1)
-    w = sample_disparity(m_before, field.frames.disparity_steps, field.frames.last_disparities)
-    oz, dz = hits.local_origins[..., 2], hits.local_directions[..., 2]
-    starts_inside = w * oz >= 1
-    entry = torch.where(starts_inside, torch.inf, w * dz / torch.where(starts_inside, 1, 1 - w * oz))
-    entered = (live & (entry * field.plan.content_near >= 1)).any(-1, keepdim=True)
-    to_infinity = (live & (hits.m_first - counts < 0) & (field.frames.last_disparities == 0)).any(-1, keepdim=True)
-    return entered & to_infinity
 
 
 def _ray_samples(ray_bundle: RayBundle, merged: MergedSamples) -> RaySamples:

@@ -9,10 +9,9 @@ from torch import Tensor
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.shading import RayShader
 from mmpi_ns.ops import dispatch
-from mmpi_ns.ops.march import MarchOptions
-from mmpi_ns.ops.show import show_rays
+from mmpi_ns.ops.march import MarchOptions, show_rays
 from mmpi_ns.rendering.rendered import distances_of
-from mmpi_ns.rendering.sampler import crossings
+from mmpi_ns.rendering.sampler import rays_of
 
 
 def shows_in_one_pass(field: MMPIField) -> bool:
@@ -41,7 +40,7 @@ def shown_outputs(
     assert isinstance(field.networks, RayShader)
     options = MarchOptions(threshold, blends=blends)
     scene = (field.layout, field.tables, field.features.data)
-    shown = show_rays(*scene, crossings(bundle, field, head_mask), options)
+    shown = show_rays(*scene, rays_of(bundle, head_mask), options)
     return {
         "rgb": field.networks.shade(shown.gathered, shown.mass, shown.accumulation, bundle.directions),
         "accumulation": shown.accumulation,

@@ -12,7 +12,8 @@ from random_bricks import random_window, rays_into, scene_of
 
 from mmpi_ns.export import files, reader
 from mmpi_ns.export.files import HEADER, read_baked, write_baked
-from mmpi_ns.ops.baked.reference import march_baked
+from mmpi_ns.ops.baked.reference import show_baked
+from mmpi_ns.ops.march import Rays
 
 
 @pytest.fixture
@@ -144,4 +145,4 @@ def test_arrays_are_plain_gzip(folder):
 def test_the_reference_takes_any_window(folder):
     """A scene that was read renders as it stands (the torch reference is the form without a compiler)."""
     window = read_baked(folder).windows[1][1]
-    assert (march_baked(window.mpis, *rays_into(window, 30), window.threshold).mass > 0).any()
+    assert (show_baked(window.mpis, Rays(*rays_into(window, 30)), window.threshold).mass > 0).any()

@@ -17,10 +17,11 @@ from random_fields import OracleRay, bundle, fill, random_field, random_rays, re
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.samples import metadata_of
 from mmpi_ns.ops import blending, composite
-from mmpi_ns.ops.hits import plane_hits
 from mmpi_ns.ops.interpolate import Table
 from mmpi_ns.ops.march import gpu, reference
-from mmpi_ns.rendering.sampler import MMPISampler
+from mmpi_ns.ops.march.gpu_hits import plane_hits
+from mmpi_ns.rendering.sampler import MMPISampler, rays_of
+from mmpi_ns.scene import geometry
 from mmpi_ns.scene.plan import ScenePlan
 
 # Hits ----------------------------------------------------------------------------------------------------------------
@@ -33,7 +34,7 @@ def test_rays_cross_the_planes_that_the_oracle_has(far):
     field = MMPIField(plan)
     origins, directions = random_rays(plan, 60, seed=2)
     rays = bundle(origins, directions, near=0.3, far=far)
-    hits = plane_hits(rays.origins, rays.directions, rays.nears, rays.fars, field.layout)
+    hits = plane_hits(field.layout, rays_of(rays))
     assert hits.count.dtype == hits.m_first.dtype == torch.int64 and (hits.count == 0).any()
     for i in range(60):
         for k, mpi in enumerate(plan.mpis):
@@ -49,8 +50,8 @@ def test_rays_cross_the_planes_that_the_oracle_has(far):
 def test_hits_of_hard_rays_are_those_of_the_reference():
     plan = hard_plan()
     field, rays = MMPIField(plan), hard_rays()
-    found = plane_hits(rays.origins, rays.directions, rays.nears, rays.fars, field.layout)
-    wanted = by_torch(lambda: plane_hits(rays.origins, rays.directions, rays.nears, rays.fars, field.layout))
+    found = plane_hits(field.layout, rays_of(rays))
+    wanted = geometry.plane_hits(*rays_of(rays)[:4], field.frames)
     assert torch.equal(found.count, wanted.count) and (wanted.count > 0).any()
     live = wanted.count > 0
     assert torch.equal(found.m_first[live], wanted.m_first[live])

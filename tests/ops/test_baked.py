@@ -13,15 +13,16 @@ from mmpi_ns.export import reader
 from mmpi_ns.export.files import write_baked
 from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.baked import cpu, reference
+from mmpi_ns.ops.march import Rays
 from mmpi_ns.scene.baked import SIDE, Shader, brick_numbers, columns_from, columns_of
 
 FORMS = {"reference": reference, "cpu": cpu}
 
 
 def marched(form, window, rays, **given):
-    if form == "cpu" and dispatch.form_of("march_baked", torch.zeros(1)) != "cpu":
+    if form == "cpu" and dispatch.form_of("show_baked", torch.zeros(1)) != "cpu":
         pytest.skip("no C++ compiler")
-    return FORMS[form].march_baked(window.mpis, *rays, window.threshold, **given)
+    return FORMS[form].show_baked(window.mpis, Rays(*rays), window.threshold, **given)
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -51,16 +52,16 @@ def test_agrees_with_the_reader(form, settings, tmp_path):
 
 
 def shaded(form, window, found, directions):
-    rgb = FORMS[form].shade_baked(window.shader, found.sums, found.mass, directions)
+    rgb = FORMS[form].shade_baked(window.shader, found.gathered, found.mass, directions)
     rgb = torch.where(found.mass > 0, rgb, 0.0)
-    return (rgb * (1 - found.passing) + 0.5 * found.passing).clamp(0, 1)
+    return (rgb * found.accumulation + 0.5 * found.transmittance).clamp(0, 1)
 
 
 @pytest.mark.parametrize("octaves", [0, 2, 5])
 @pytest.mark.parametrize("sizes", [(7, 3), (64, 64, 3), (5, 9, 6, 3)])
 def test_shading_agrees_with_the_reference(octaves, sizes):
     """Any widths and depths, rays in no multiple of sixteen, black and white, and no mass at all."""
-    if dispatch.form_of("march_baked", torch.zeros(1)) != "cpu":
+    if dispatch.form_of("show_baked", torch.zeros(1)) != "cpu":
         pytest.skip("no C++ compiler")
     g = torch.Generator().manual_seed(octaves)
     whole = (5 + 3 * (1 + 2 * octaves), *sizes)
@@ -81,7 +82,8 @@ def test_the_forms_agree(seed):
     window = random_window(num_mpis=1 + seed, seed=seed, planes=33 + seed)
     rays = rays_into(window, 200, seed)
     compiled, plain = marched("cpu", window, rays), marched("reference", window, [r.double() for r in rays])
-    for name, a, b in zip(compiled._fields, compiled, plain, strict=True):
+    for name, b in vars(plain).items():
+        a = getattr(compiled, name)
         apart = (a.double() - b).abs() > 2e-3 * (1 + b.abs())
         assert apart.float().mean() < 0.03, name
 
@@ -94,7 +96,8 @@ def test_rays_do_not_see_their_neighbours(form):
     whole = marched(form, window, rays)
     parts = [marched(form, window, [x[a:b] for x in rays]) for a, b in ((0, 1), (1, 18), (18, 50))]
     turned = marched(form, window, [x.flip(0) for x in rays])
-    for name, all_, back, *some in zip(whole._fields, whole, turned, *parts, strict=True):
+    for name, all_ in vars(whole).items():
+        some, back = [getattr(part, name) for part in parts], getattr(turned, name)
         assert torch.equal(all_, torch.cat(some)) and torch.equal(all_, back.flip(0)), name
 
 
@@ -109,7 +112,7 @@ def test_peaks_are_the_largest_weights(form):
     kept = window.keep(peaks.amax((1, 2)) > 0)
     assert kept.mpis.num_bricks == int((peaks > 0).any(-1).any(-1).sum())
     again = marched(form, kept, rays_into(window, 16))
-    torch.testing.assert_close(again.sums, found.sums, rtol=1e-4, atol=1e-3)
+    torch.testing.assert_close(again.gathered, found.gathered, rtol=1e-4, atol=1e-3)
 
 
 def test_columns_find_every_brick():
@@ -128,6 +131,6 @@ def test_columns_find_every_brick():
 def test_no_rays_and_no_bricks(form):
     window = random_window(stored=0.0)
     found = marched(form, window, rays_into(window, 20))
-    assert (found.mass == 0).all() and (found.passing == 1).all() and (found.inverse_t == 0).all()
+    assert (found.mass == 0).all() and (found.transmittance == 1).all() and (found.inverse_t == 0).all()
     none = marched(form, random_window(), [x[:0] for x in rays_into(window, 20)])
-    assert len(none.sums) == 0
+    assert len(none.gathered) == 0

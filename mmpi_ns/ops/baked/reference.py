@@ -3,34 +3,19 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import linear, relu
 
+from mmpi_ns.ops.composite import median_inverse_distance, winning_heads
+from mmpi_ns.ops.ends import OPAQUE_BAKED
 from mmpi_ns.ops.gather.reference import COLORS, activate
+from mmpi_ns.ops.march.rays import Rays, Shown
 from mmpi_ns.scene.baked import CELLS, SIDE, BakedMpis, Shader, brick_numbers, columns_of
 from mmpi_ns.scene.geometry import PlaneHits, inverse_distance, plane_hits, sample_disparity
-
-OPAQUE = 1e-2
-"""A ray that lets less light through is over."""
-
-
-class Gathered(NamedTuple):
-    """What rays gathered, and what passes them."""
-
-    sums: Float[Tensor, "R C"]
-    """Sum of weight times colour and features, of samples that weigh more than the threshold."""
-    mass: Float[Tensor, "R 1"]
-    """Sum of the weights of those samples."""
-    passing: Float[Tensor, "R 1"]
-    """Light behind the last sample; 0 once it is less than ``OPAQUE``."""
-    inverse_t: Float[Tensor, "R 1"]
-    """Inverse distance at which half of the mass is gathered; 0 for infinity, and where there is none."""
-    winner: Int[Tensor, "R 1"]
-    """The head that gave most weight."""
 
 
 class _Samples(NamedTuple):
@@ -46,41 +31,35 @@ class _Samples(NamedTuple):
     passing: Float[Tensor, "R 1"]
 
 
-def march_baked(
-    scene: BakedMpis,
-    origins: Tensor,
-    directions: Tensor,
-    nears: Tensor,
-    fars: Tensor,
-    threshold: float,
-    peaks: Any = None,
-) -> Gathered:
+def show_baked(scene: BakedMpis, rays: Rays, threshold: float, peaks: Tensor | None = None) -> Shown:
     """See ``ops.baked``."""
-    samples = _samples(scene, origins, directions, nears, fars)
-    weights = samples.weights
+    samples = _samples(scene, rays)
     if peaks is not None:
-        each = weights[..., None].expand(samples.taps.shape)
+        each = samples.weights[..., None].expand(samples.taps.shape)
         peaks.view(-1).scatter_reduce_(0, samples.taps.flatten(), each.flatten().to(peaks), "amax")
-    weights = torch.where(weights > threshold, weights, 0.0)
+    kept = samples.weights > threshold
+    weights = torch.where(kept, samples.weights, 0.0)
     mass = weights.sum(-1, keepdim=True)
-    half = ((weights.cumsum(-1) >= 0.5 * mass) & (weights > 0)).to(torch.int8).argmax(-1, keepdim=True)
-    votes = weights.new_zeros(len(weights), len(scene.mpis)).scatter_add(1, samples.heads, weights)
-    return Gathered(
-        (weights[..., None] * samples.colors).sum(1),
-        mass,
-        torch.where(samples.passing > OPAQUE, samples.passing, 0.0),
-        torch.where(mass > 0, samples.inverse_t.gather(1, half), 0.0),
-        votes.argmax(-1, keepdim=True),
+    transmittance = torch.where(samples.passing > OPAQUE_BAKED, samples.passing, 0.0)
+    return Shown(
+        gathered=(weights[..., None] * samples.colors).sum(1),
+        mass=mass,
+        transmittance=transmittance,
+        accumulation=1 - transmittance,
+        inverse_t=median_inverse_distance(weights, samples.inverse_t, kept),
+        winner=winning_heads(weights, samples.heads, len(scene.mpis)),
+        dropped_mass=(1 - transmittance - mass).clamp(min=0),
     )
 
 
-def _samples(scene: BakedMpis, origins: Tensor, directions: Tensor, nears: Tensor, fars: Tensor) -> _Samples:
+def _samples(scene: BakedMpis, rays: Rays) -> _Samples:
+    origins = rays.origins
     if scene.num_bricks == 0:
         none = origins.new_zeros(len(origins), 1)
         taps = torch.zeros(len(origins), 1, 4, dtype=torch.int64)
         colors = none[..., None].expand(-1, 1, scene.texels.shape[-1])
         return _Samples(none, none, colors, none.to(torch.int64), taps, taps.to(none), torch.ones_like(none))
-    hits = plane_hits(origins, directions, nears, fars, scene.frames)
+    hits = plane_hits(*rays[:4], scene.frames)
     parts = [_head(scene, k, hits) for k in range(len(scene.mpis))]
     tau, inverse_t, taps, shares = (torch.cat(x, 1) for x in zip(*parts, strict=True))
     heads = torch.cat([torch.full(p[0].shape, k) for k, p in enumerate(parts)], 1)
@@ -89,17 +68,17 @@ def _samples(scene: BakedMpis, origins: Tensor, directions: Tensor, nears: Tenso
     taps, shares = (x.gather(1, order[..., None].expand(x.shape)) for x in (taps, shares))
     after = torch.exp(-tau.cumsum(-1))
     before = torch.cat([torch.ones_like(after[:, :1]), after[:, :-1]], -1)
-    weights = torch.where(before > OPAQUE, before * -torch.expm1(-tau), 0.0)
+    weights = torch.where(before > OPAQUE_BAKED, before * -torch.expm1(-tau), 0.0)
     low, step = (shares.new_tensor([getattr(c, name) for c in scene.channel_codes]) for name in ("low", "step"))
     codes = (scene.texels.view(-1, len(low))[taps] * shares[..., None]).sum(-2)
     colors = activate((low + step * codes).flatten(0, 1)).view(codes.shape)
     return _Samples(weights, inverse_t, colors, heads, taps, shares, after[:, -1:])
 
 
-def shade_baked(shader: Shader, sums: Tensor, mass: Tensor, directions: Tensor) -> Tensor:
+def shade_baked(shader: Shader, gathered: Tensor, mass: Tensor, directions: Tensor) -> Tensor:
     """See ``ops.baked``."""
-    mean = sums / mass.clamp(min=1e-6)
-    octaves = math.pi * 2.0 ** torch.arange(shader.direction_octaves, dtype=sums.dtype)
+    mean = gathered / mass.clamp(min=1e-6)
+    octaves = math.pi * 2.0 ** torch.arange(shader.direction_octaves, dtype=gathered.dtype)
     angles = (directions[:, None] * octaves[:, None]).flatten(1)
     x = torch.cat([mean, directions, angles.sin(), angles.cos()], -1)
     for i, (weights, biases) in enumerate(shader.layers):

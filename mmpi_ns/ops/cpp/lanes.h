@@ -7,6 +7,8 @@ typedef int32_t IntLanes __attribute__((vector_size(64)));
 constexpr int WIDTH = 16;
 const Lanes IOTA = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
 
+const Lanes EIGHT_TWICE = {0, 1, 2, 3, 4, 5, 6, 7, 0, 1, 2, 3, 4, 5, 6, 7};
+
 inline Lanes splat(float x) { return x - Lanes{}; }
 inline Lanes least(Lanes a, Lanes b) { return a < b ? a : b; }
 inline Lanes most(Lanes a, Lanes b) { return a > b ? a : b; }

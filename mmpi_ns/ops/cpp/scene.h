@@ -1,4 +1,4 @@
-// What the kernels know of a plan: MPIs first, the cube last. Filled by ops/march.py, field by field.
+// What the kernels know of a plan: MPIs first, the cube last. Filled by ops/cpu_scene.py, field by field.
 #pragma once
 #include <algorithm>
 #include <cmath>
@@ -12,6 +12,12 @@ struct Mpi {
     float u0, u_scale; // ndc u = (u - u0) * u_scale - 1
     float v0, v_scale;
     float interval; // factor on softplus
+};
+
+// Where an MPI is (layout.frame_rows).
+struct Frame {
+    float origin[3], axes[3][3], extent[4]; // u0, u1, v0, v1
+    float step, end, last;                  // disparity between planes and of the last one; number of the first one
 };
 
 // A head's texels, in bricks of 8 x 8 on one plane (texels.py).
@@ -40,11 +46,14 @@ inline int64_t row_of(const Grid& grid, int64_t z, int64_t y, int64_t x) {
 struct Cube {
     float lower[3], extent[3]; // extent = upper - lower
     float step, bias, interval;
+    float upper[3];
 };
 
 struct Scene {
     int64_t num_mpis, num_heads; // heads = MPIs, and the cube where there is one
+    float content_near;          // distance to the first content
     const Mpi* mpis;
+    const Frame* frames;
     const Grid* grids;
     const float* biases;
     const Cube* cube; // null without one

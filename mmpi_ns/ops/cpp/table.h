@@ -19,6 +19,9 @@ inline Lanes join(Octet a, Octet b) {
     return __builtin_shufflevector(a, b, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
 }
 
+inline Octet lower_half(Lanes x) { return __builtin_shufflevector(x, x, 0, 1, 2, 3, 4, 5, 6, 7); }
+inline Octet upper_half(Lanes x) { return __builtin_shufflevector(x, x, 8, 9, 10, 11, 12, 13, 14, 15); }
+
 // to += share * from.
 inline void add_row(float* to, const float* from, float share, int64_t channels) {
     if (channels == OCTET) {

@@ -29,13 +29,16 @@ inline void prefetch(const Table& table, const Sample& sample) {
     for (int tap = 0; tap < sample.taps; tap++) table.prefetch(sample.rows[tap]);
 }
 
+// Of a table of eight channels.
+inline Octet interpolate(const Table& table, const Sample& sample) {
+    Octet sum{};
+    for (int tap = 0; tap < sample.taps; tap++) sum += sample.shares[tap] * table.octet(sample.rows[tap]);
+    return sum;
+}
+
 // Channels from `first` on.
 inline Lanes interpolate(const Table& table, const Sample& sample, int64_t first) {
-    if (table.channels == OCTET) {
-        Octet sum{};
-        for (int tap = 0; tap < sample.taps; tap++) sum += sample.shares[tap] * table.octet(sample.rows[tap]);
-        return join(sum, Octet{});
-    }
+    if (table.channels == OCTET) return join(interpolate(table, sample), Octet{});
     Lanes sum{};
     for (int tap = 0; tap < sample.taps; tap++)
         sum += sample.shares[tap] * table.read(sample.rows[tap] * table.channels + first);
@@ -48,10 +51,13 @@ struct Texel {
     Lanes value, slope;
 };
 
-// Colours are sigmoids and features hyperbolic tangents, of sixteen channels from `first` on. What is not a number stays so.
-inline Texel activate(Lanes raw, int64_t first) {
-    const auto is_color = IOTA + float(first) < float(COLORS);
+// Colours are sigmoids and features hyperbolic tangents, of sixteen numbers of these channels. What is not a number stays
+// so.
+inline Texel activate(Lanes raw, Lanes channels) {
+    const Mask is_color = channels < float(COLORS);
     const Lanes share = 1.0f / (1.0f + exp_lanes(is_color ? -raw : -2.0f * raw));
     const Lanes rest = share * (1.0f - share), value = is_color ? share : 2.0f * share - 1.0f;
     return {raw == raw ? value : raw, is_color ? rest : 4.0f * rest};
 }
+
+inline Texel activate(Lanes raw, int64_t first) { return activate(raw, IOTA + float(first)); }

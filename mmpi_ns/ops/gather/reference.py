@@ -61,7 +61,7 @@ def gather_places(
     layout: SceneLayout, table: Float[Tensor, "T C"], places: Places, weights: Float[Tensor, "R S"]
 ) -> RaySums:
     """Sums over samples at places in the heads, without gradients; ``table`` holds all texels. In plain torch alone:
-    pictures are made by ``ops.show``."""
+    pictures are made by ``ops.march``."""
     slots, raw = zip(*interpolated(layout, table, places), strict=True)
     return _sums(torch.cat(raw), torch.cat(slots), weights)
 

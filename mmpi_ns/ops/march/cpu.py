@@ -1,4 +1,4 @@
-"""Sample and merge, compiled: ``march.cpp``."""
+"""The march, compiled: ``march.cpp`` to train and ``show.cpp`` for pictures."""
 
 from __future__ import annotations
 
@@ -6,51 +6,60 @@ import ctypes
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
-from mmpi_ns.ops.build import arguments, call_in_parts
-from mmpi_ns.ops.cpu_scene import CpuScene
-from mmpi_ns.ops.layout import SceneLayout, Tables
-from mmpi_ns.ops.march.reference import Crossings, MarchOptions, MergedSamples
+from mmpi_ns.ops.build import call_in_parts
+from mmpi_ns.ops.cpu_scene import CpuScene, Pointers, addresses
+from mmpi_ns.ops.layout import SceneLayout, Tables, shaped
+from mmpi_ns.ops.march.rays import MarchOptions, MergedSamples, Rays, Shown
+from mmpi_ns.scene.baked import columns_from
 
 _FLAT = (torch.int32, torch.int32, *[torch.float32] * 4)
 _SLOTS = (torch.int64, torch.int64, *[torch.float32] * 4, torch.bool)
 
 
-class Rays(ctypes.Structure):
-    """``Crossings`` (``cpp/rays.h``)."""
-
-    _fields_ = [
-        (n, ctypes.c_void_p)
-        for n in ("origins", "directions", "local_origins", "local_directions", "u", "v", "first", "counts")
-    ]
-    held: list[Tensor]
-    """What it points to."""
-
-    @staticmethod
-    def of(rays: Crossings) -> Rays:
-        origins, directions, hits, first, counts = rays
-        parts = (origins, directions, hits.local_origins, hits.local_directions, hits.u, hits.v, first, counts)
-        held = [x.contiguous() for x in parts]
-        made = Rays(*arguments(held))
-        made.held = held
-        return made
+class _Rays(Pointers):
+    _fields_ = addresses("origins", "directions", "nears", "fars", "heads", "priorities")
 
 
-def how(options: MarchOptions) -> tuple[float, float, ctypes.c_bool]:
-    """Threshold, fair share, and whether reliability enters, as the compiled marches take them."""
+class _Tiles(Pointers):
+    _fields_ = addresses("columns", "bricks")
+
+
+class _Outputs(Pointers):
+    _fields_ = addresses("gathered", "mass", "transmittance", "accumulation", "inverse_t", "winner", "dropped")
+
+
+def pointers_to(rays: Rays, num_mpis: int, num_heads: int) -> _Rays:
+    """Rays as the kernels read them (``cpp/crossings.h``)."""
+    count = len(rays.origins)
+    parts = [shaped(x, count, n) for x, n in zip(rays[:4], (3, 3, 1, 1), strict=True)]
+    heads = None if rays.heads is None else shaped(rays.heads, count, num_heads, dtype=torch.bool)
+    return _Rays.to(*parts, heads, None if rays.priorities is None else shaped(rays.priorities, count, num_mpis))
+
+
+def shown(name: str, num_rays: int, channels: int, given: tuple) -> Shown:
+    """What a compiled function of ``(*given, begin, end, outputs)`` shows."""
+    outputs = [torch.empty(num_rays, n) for n in (channels, 1, 1, 1, 1, 1, 1)]
+    call_in_parts(name, num_rays, given, (ctypes.byref(_Outputs.to(*outputs)),))
+    return Shown(*outputs)
+
+
+def _how(options: MarchOptions) -> tuple[float, float, ctypes.c_bool]:
     return float(options.threshold), float(options.fair_share), ctypes.c_bool(options.blends)
 
 
-def march(layout: SceneLayout, tables: Tables, rays: Crossings, options: MarchOptions) -> MergedSamples:
+def march(layout: SceneLayout, tables: Tables, rays: Rays, options: MarchOptions) -> MergedSamples:
     """See ``ops.march``."""
-    scene, packed, total = CpuScene.of(layout).with_tables(tables), Rays.of(rays), rays.counts.sum(-1)
-    starts = total.cumsum(0) - total
-    num_rays, size = len(total), int(total.sum())
-    flat = [torch.empty((size, 3) if i == 2 else size, dtype=t) for i, t in enumerate(_FLAT)]
-    kept, skipped, dropped = torch.empty(num_rays, dtype=torch.int64), *torch.empty(2, num_rays, 1)
-    given = (ctypes.byref(scene), ctypes.byref(packed), starts)
-    call_in_parts("mmpi_march", num_rays, given, (*how(options), kept, skipped, dropped, *flat))
-    return MergedSamples(*_pack(starts, kept, flat), skipped_total=skipped, dropped_mass=dropped)
+    scene, packed = CpuScene.of(layout).with_tables(tables), pointers_to(rays, len(layout.mpis), layout.num_heads)
+    num_rays, room = len(rays.origins), options.most_kept(layout.most_samples)
+    flat = [torch.empty((num_rays * room, 3) if i == 2 else num_rays * room, dtype=t) for i, t in enumerate(_FLAT)]
+    starts, kept, live = torch.empty(3, num_rays, dtype=torch.int64)
+    explained, (skipped, dropped) = torch.empty(num_rays, 1, dtype=torch.bool), torch.empty(2, num_rays, 1)
+    given = (ctypes.byref(scene), ctypes.byref(packed), room, *_how(options))
+    call_in_parts("mmpi_march", num_rays, given, (starts, kept, live, explained, skipped, dropped, *flat))
+    left = {"skipped_total": skipped, "dropped_mass": dropped}
+    return MergedSamples(*_pack(starts, kept, flat), **left, live=live, explained=explained)
 
 
 def _pack(starts: Tensor, kept: Tensor, flat: list[Tensor]) -> list[Tensor]:
@@ -59,3 +68,27 @@ def _pack(starts: Tensor, kept: Tensor, flat: list[Tensor]) -> list[Tensor]:
     slots = [torch.empty((*shape, 3) if i == 2 else shape, dtype=t) for i, t in enumerate(_SLOTS)]
     call_in_parts("mmpi_pack", len(kept), (starts, kept), (shape[1], *flat, *slots))
     return slots
+
+
+def _tiles(layout: SceneLayout) -> _Tiles:
+    """The tiles of all MPIs from which something can be read, so that rays pass over the others: where the lower corner
+    of four texels is in the tile, one of them is stored."""
+    columns, bricks, count = [torch.zeros(0, 2, dtype=torch.int32)], [torch.zeros(1, 4, dtype=torch.int32)], 0
+    for grid in layout.grids[: len(layout.mpis)]:
+        tiles = pad(grid.own_tiles, (0, 1, 0, 1))
+        down, across = ((n - 2) // 8 + 1 for n in (grid.height, grid.width))  # of lower corners
+        corners = torch.stack([tiles[:, y : y + down, x : x + across] for y in (0, 1) for x in (0, 1)], -1)
+        stored, places = columns_from((corners > 0).any(-1), count)
+        columns.append(stored)
+        bricks.append(corners[tuple(places.T)])
+        count += len(places)
+    return _Tiles.to(torch.cat(columns), torch.cat(bricks[1:] + bricks[:1]))
+
+
+def show_rays(layout: SceneLayout, tables: Tables, features: Tensor, rays: Rays, options: MarchOptions) -> Shown:
+    """See ``ops.march``."""
+    scene, packed = CpuScene.of(layout).with_tables(tables), pointers_to(rays, len(layout.mpis), layout.num_heads)
+    rows, channels = features.shape
+    features, tiles = shaped(features, len(tables.density), channels), layout.once("tiles", _tiles)
+    given = (ctypes.byref(scene), ctypes.byref(packed), ctypes.byref(tiles), features, rows, channels, *_how(options))
+    return shown("mmpi_show", len(rays.origins), channels, given)

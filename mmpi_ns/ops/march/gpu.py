@@ -15,9 +15,11 @@ from dataclasses import dataclass
 import torch
 import triton
 import triton.language as tl
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from mmpi_ns.ops import ends
+from mmpi_ns.ops.gather.gpu import sizes
 from mmpi_ns.ops.gpu_scene import (
     BIAS,
     DEPTH,
@@ -43,22 +45,24 @@ from mmpi_ns.ops.gpu_scene import (
     softplus,
     trilinear,
 )
-from mmpi_ns.ops.layout import SceneLayout, Tables
-from mmpi_ns.ops.march.reference import Crossings, MarchOptions, MergedSamples, most_kept
+from mmpi_ns.ops.layout import SceneLayout, Tables, shaped
+from mmpi_ns.ops.march.gpu_hits import plane_hits
+from mmpi_ns.ops.march.gpu_show import show_kernel
+from mmpi_ns.ops.march.rays import MarchOptions, MergedSamples, Rays, Shown
+from mmpi_ns.ops.march.reference import crossings
 
-OPAQUE = tl.constexpr(1e-5)
-"""Light that may be lost behind the end of a ray."""
-NEGLIGIBLE = tl.constexpr(1e-4)
-"""Optical depths below this get an equal share without a lookup."""
-FAR_AWAY = tl.constexpr(1e-10)
-"""Inverse distances are no less where a distance is needed."""
+OPAQUE = tl.constexpr(ends.OPAQUE)
+NEGLIGIBLE = tl.constexpr(ends.NEGLIGIBLE)
+NEAREST_ZERO = tl.constexpr(ends.NEAREST_ZERO)
 ULPS = tl.constexpr(16 * 2.0**-23)
 """Slack of the border test, as in ``geometry.local_to_ndc``."""
 STEPS = 8
 """Samples that a ray looks up at once."""
 RAYS, FEW_RAYS, MANY = 16, 4, 16_384
-"""Rays of a program (one warp), and of one where there are fewer rays than so many: a device has room for thousands of
-programs."""
+"""Rays of a program (one warp); of one where there are few rays; number of rays from which they are many. A device has
+room for thousands of programs."""
+NUMBERS = 256
+"""Rays of a program of ``show_kernel`` times their channels: what its registers hold."""
 
 
 @triton.jit
@@ -209,7 +213,7 @@ def _blend(origins, directions, local_origins, local_directions, constants, grid
             own_vote, highest, others, grids, reliability, touched, k, head, u, v, s, inside, thick
         )
     if HAS_CUBE:
-        x, y, z = _in_cube(origins, directions, cube, ray, 1 / tl.maximum(inverse_t, FAR_AWAY))
+        x, y, z = _in_cube(origins, directions, cube, ray, 1 / tl.maximum(inverse_t, NEAREST_ZERO))
         inside = (inverse_t > 0) & (tl.abs(x) <= 1) & (tl.abs(y) <= 1) & (tl.abs(z) <= 1)
         own_vote, highest, others = _count_vote(
             own_vote, highest, others, grids, reliability, touched, K, head, x, y, z, inside, thick
@@ -345,16 +349,18 @@ class Slots:
     room: int
     skipped_total: Float[Tensor, "R 1"]
     dropped_mass: Float[Tensor, "R 1"]
+    live: Int[Tensor, "R"]
+    explained: Bool[Tensor, "R 1"]
     numbers: Int[Tensor, "1+H"]
     """The most that a ray kept, then what was kept of each head."""
 
 
-def march_into_slots(layout: SceneLayout, tables: Tables, rays: Crossings, options: MarchOptions) -> Slots:
+def march_into_slots(layout: SceneLayout, tables: Tables, rays: Rays, options: MarchOptions) -> Slots:
     """``march`` before anything is waited for."""
-    origins, directions, hits, first, counts = rays
+    origins, directions, hits, first, counts, explained = crossings(layout, rays, plane_hits(layout, rays))
     scene, device, num_rays, threshold = GpuScene.of(layout), origins.device, len(origins), float(options.threshold)
     parts = (origins, directions, hits.local_origins, hits.local_directions, hits.u, hits.v, first, counts)
-    room = most_kept(scene.most_samples, threshold, options.fair_share)
+    room = options.most_kept(layout.most_samples)
     kept = torch.empty(num_rays, dtype=torch.int32, device=device)
     skipped, dropped = (torch.empty(num_rays, 1, device=device) for _ in range(2))
     slots = [torch.empty(num_rays, room, dtype=torch.int32, device=device) for _ in range(2)]
@@ -362,16 +368,16 @@ def march_into_slots(layout: SceneLayout, tables: Tables, rays: Crossings, optio
     numbers = torch.zeros(1 + layout.num_heads, dtype=torch.int32, device=device)
     at_once = block_size(RAYS if num_rays >= MANY else FEW_RAYS, device)
     launch(
-        march_kernel, num_rays, at_once, *(x.contiguous() for x in parts), *scene.constants(), *tables,
+        march_kernel, num_rays, at_once, *(x.contiguous() for x in parts), *scene.constants(), *scene.checked(tables),
         kept, skipped, dropped, *slots, numbers, num_rays, room, threshold, float(options.fair_share),
         K=len(layout.mpis), HEADS=triton.next_power_of_2(layout.num_heads), HAS_CUBE=layout.cube is not None,
         BLENDS=options.blends, KEEP_ALL=threshold <= 0, RAYS=at_once, STEPS=STEPS,
         num_warps=1,
     )  # fmt: skip
-    return Slots(kept, slots, room, skipped, dropped, numbers)
+    return Slots(kept, slots, room, skipped, dropped, counts.sum(-1), explained, numbers)
 
 
-def march(layout: SceneLayout, tables: Tables, rays: Crossings, options: MarchOptions) -> MergedSamples:
+def march(layout: SceneLayout, tables: Tables, rays: Rays, options: MarchOptions) -> MergedSamples:
     """See ``ops.march``. Waits for the device once, to size the result."""
     m = march_into_slots(layout, tables, rays, options)
     widest, *of_heads = m.numbers.tolist()
@@ -381,6 +387,20 @@ def march(layout: SceneLayout, tables: Tables, rays: Crossings, options: MarchOp
     packed = [torch.empty(shape, dtype=t, device=m.kept.device) for shape, t in zip(shapes, types, strict=True)]
     size = num_rays * width
     launch(pack_kernel, size, 1024, m.kept, *m.slots, *packed, size, width, m.room, BLOCK=1024)
-    return MergedSamples(
-        *packed, skipped_total=m.skipped_total, dropped_mass=m.dropped_mass, head_counts=tuple(of_heads)
-    )
+    left = {"skipped_total": m.skipped_total, "dropped_mass": m.dropped_mass}
+    return MergedSamples(*packed, **left, live=m.live, explained=m.explained, head_counts=tuple(of_heads))
+
+
+def show_rays(layout: SceneLayout, tables: Tables, features: Tensor, rays: Rays, options: MarchOptions) -> Shown:
+    """See ``ops.march``. Nothing is packed, and the host need not know how much any ray kept."""
+    m = march_into_slots(layout, tables, rays, options)
+    num_rays, channels, device = len(rays.origins), features.shape[1], features.device
+    gathered = torch.empty(num_rays, channels, device=device)
+    mass, depth, median, winner = (torch.empty(num_rays, 1, device=device) for _ in range(4))
+    columns, block = sizes(channels, device, NUMBERS)
+    launch(
+        show_kernel, num_rays, block, m.kept, *m.slots, m.skipped_total, shaped(features, layout.num_rows, channels),
+        GpuScene.of(layout).grids, gathered, mass, depth, median, winner, num_rays, m.room, channels, len(layout.mpis),
+        HAS_CUBE=layout.cube is not None, HEADS=triton.next_power_of_2(layout.num_heads), CHANNELS=columns, BLOCK=block,
+    )  # fmt: skip
+    return Shown(gathered, mass, torch.exp(-depth), -torch.expm1(-depth), median, winner, m.dropped_mass)

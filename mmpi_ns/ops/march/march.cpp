@@ -1,7 +1,8 @@
-// Rays through all heads at once: every head's samples come near to far, so the merge takes the nearest head at each
-// step, and a ray ends where nothing behind it can matter. The reference is reference.py.
+// Samples of rays to train: one ray at a time, every head's samples near to far in blocks, so the merge takes the nearest
+// head at each step, and a ray ends where nothing behind it can matter. Why not abreast: walk.h. The reference is
+// reference.py.
 #include "cells.h"
-#include "rays.h"
+#include "walk.h"
 
 namespace {
 
@@ -26,12 +27,11 @@ void finish(Run& run, float interval) {
 }
 
 // The next samples of an MPI. Where nothing is stored there is nothing to see: with `skips` such samples are left out.
-void fill_mpi(Run& run, const Scene& scene, const Rays& rays, int64_t ray, int64_t k, bool skips) {
+void fill_mpi(Run& run, const Scene& scene, const Crossing& at, int ray, int64_t k, bool skips) {
     const Mpi& mpi = scene.mpis[k];
     const Grid& grid = scene.grids[k];
-    const int64_t i = ray * scene.num_mpis + k;
-    const float u = rays.u[2 * i], u_slope = rays.u[2 * i + 1], v = rays.v[2 * i], v_slope = rays.v[2 * i + 1];
-    const float oz = rays.local_origins[3 * i + 2], dz = rays.local_directions[3 * i + 2];
+    const float u = at.u[ray], u_slope = at.u_slope[ray], v = at.v[ray], v_slope = at.v_slope[ray];
+    const float oz = at.origin[2][ray], dz = at.direction[2][ray];
     const float *biases = scene.biases + grid.bias, *table = scene.density;
     const int32_t* tiles = grid.tiles + grid.first_tile;
     int size = 0;
@@ -43,20 +43,20 @@ void fill_mpi(Run& run, const Scene& scene, const Rays& rays, int64_t ray, int64
         float ndc[3][WIDTH], inverse_t[WIDTH];
         store(ndc[0], x), store(ndc[1], y), store(ndc[2], 1.0f - mpi.s_scale * (w - mpi.end));
         store(inverse_t, w * dz / (1.0f - w * oz));
-        const PlaneCells at(grid, x, y, __builtin_convertvector(IOTA, IntLanes) + int32_t(first));
+        const PlaneCells cells(grid, x, y, __builtin_convertvector(IOTA, IntLanes) + int32_t(first));
         for (int j = 0; j < count; j++) {
             float corners[4];
-            if (!at.edge[j]) {
-                const int32_t brick = tiles[at.tile[j]];
+            if (!cells.edge[j]) {
+                const int32_t brick = tiles[cells.tile[j]];
                 if (skips && !brick) continue;
-                const float* texel = table + int64_t(brick) * BRICK + at.texel[j];
+                const float* texel = table + int64_t(brick) * BRICK + cells.texel[j];
                 corners[0] = texel[0], corners[1] = texel[1], corners[2] = texel[8], corners[3] = texel[9];
             } else {
-                const Corners found(grid, first + j, at.line[j], at.column[j]);
+                const Corners found(grid, first + j, cells.line[j], cells.column[j]);
                 if (skips && !found.stored) continue;
                 for (int a = 0; a < 4; a++) corners[a] = table[found.row[a]];
             }
-            const float fx = at.fx[j], fy = at.fy[j], gx = 1 - fx, gy = 1 - fy;
+            const float fx = cells.fx[j], fy = cells.fy[j], gx = 1 - fx, gy = 1 - fy;
             run.tau[size] = gx * gy * corners[0] + fx * gy * corners[1] + gx * fy * corners[2] + fx * fy * corners[3] +
                             biases[first + j];
             run.plane[size] = int32_t(first + j);
@@ -70,7 +70,7 @@ void fill_mpi(Run& run, const Scene& scene, const Rays& rays, int64_t ray, int64
     finish(run, mpi.interval);
 }
 
-void fill_cube(Run& run, const Scene& scene, const Rays& rays, int64_t ray, bool skips) {
+void fill_cube(Run& run, const Scene& scene, const Packet& rays, int ray, bool skips) {
     const Cube& cube = *scene.cube;
     const Grid& grid = scene.grids[scene.num_mpis];
     while (run.size < WIDTH && run.begin < run.count) {
@@ -90,80 +90,64 @@ void fill_cube(Run& run, const Scene& scene, const Rays& rays, int64_t ray, bool
     finish(run, cube.interval);
 }
 
-void advance(Run& run, const Scene& scene, const Rays& rays, int64_t ray, int64_t head, bool skips) {
-    if (++run.at < run.size) return;
-    run.size = run.at = 0;
-    if (run.begin == run.count) return;
-    if (head < scene.num_mpis)
-        fill_mpi(run, scene, rays, ray, head, skips);
-    else
-        fill_cube(run, scene, rays, ray, skips);
-}
+// What a ray keeps goes behind what the rays before it kept.
+struct Slots {
+    int32_t *heads, *planes;
+    float *ndc, *inverse_t, *taus, *skipped_before;
+    int64_t size;
 
-} // namespace
+    void keep(const Run& run, int64_t head, float tau, float skipped) {
+        heads[size] = int32_t(head), planes[size] = run.plane[run.at];
+        for (int a = 0; a < 3; a++) ndc[3 * size + a] = run.ndc[run.at][a];
+        inverse_t[size] = run.inverse_t[run.at], taus[size] = tau, skipped_before[size] = skipped;
+        size++;
+    }
+};
 
-extern "C" {
+class Training {
+  public:
+    Training(const Scene& scene, float threshold, float fair_share, bool blends)
+        : scene(scene), threshold(threshold), fair_share(fair_share), blends(blends), runs(scene.num_heads),
+          live(scene.num_heads), nearest(scene.num_heads) {}
 
-// Marches rays [begin, end). What they keep is written one ray behind the other, from `starts[begin]` on; where a ray's
-// samples begin, to `starts[ray]`; how many, to `kept[ray]`.
-void mmpi_march(const Scene* scene, const Rays* rays, int64_t* starts, int64_t begin, int64_t end,
-                float threshold, float fair_share, bool blends, int64_t* kept, float* skipped_total, float* dropped_mass,
-                int32_t* heads, int32_t* planes, float* ndc, float* inverse_t, float* taus, float* skipped_before) {
-    const int64_t H = scene->num_heads;
-    std::vector<Run> runs(H);
-    std::vector<int64_t> live(H);    // heads that have samples left,
-    std::vector<float> nearest(H);   // and the inverse distance of the next one of each
-    std::vector<float> votes;
-    int64_t out = begin < end ? starts[begin] : 0;
-    for (int64_t ray = begin; ray < end; ray++) {
-        int64_t total = 0, alive = 0;
-        for (int64_t h = 0; h < H; h++) {
-            const int64_t count = rays->counts[ray * H + h];
-            if (!count) continue;
-            total += count;
+    // Marches one of sixteen rays.
+    void march(const Packet& rays, const Crossings& crossings, int ray, Slots& to, float& skipped, float& dropped) {
+        int64_t alive = 0;
+        for (int64_t h = 0; h < scene.num_heads; h++) {
+            const bool in_cube = h == scene.num_mpis;
             Run& run = runs[h];
-            run.first = rays->first[ray * H + h];
-            run.count = count;
-            run.begin = 0;
-            run.size = 0;
-            run.at = -1;
-            advance(run, *scene, *rays, ray, h, threshold > 0);
+            run.count = (in_cube ? crossings.cube.count : crossings.mpis[h].count)[ray];
+            if (!run.count) continue;
+            run.first = (in_cube ? crossings.cube.first : crossings.mpis[h].first)[ray];
+            run.begin = 0, run.size = 0, run.at = -1;
+            advance(run, rays, crossings, ray, h);
             if (!run.done()) nearest[alive] = run.next(), live[alive++] = h;
         }
-        const Bounds bounds(threshold, fair_share, total);
-        starts[ray] = out;
-        float light = 1, skipped = 0, dropped = 0;
+        const Bounds bounds = Bounds::exact(threshold, fair_share, crossings.total[ray]);
+        float light = 1;
+        skipped = dropped = 0;
         while (alive) {
             int64_t best = 0;
             for (int64_t i = 1; i < alive; i++) // equal distances: the first head comes first
                 best = nearest[i] > nearest[best] ? i : best;
             const int64_t h = live[best];
             Run& run = runs[h];
-            const int at = run.at;
-            if (light <= bounds.light) {
+            if (is_over(light, bounds.light)) {
                 dropped += light; // no less than what all the rest weighs
                 break;
             }
-            float tau = run.tau[at], pass = run.pass[at];
+            float tau = run.tau[run.at], pass = run.pass[run.at];
             if (blends) {
-                tau = blended(*scene, *rays, ray, h, run.inverse_t[at], tau, votes);
+                tau = blended(scene, rays, crossings, ray, h, run.inverse_t[run.at], tau, votes);
                 pass = std::exp(-tau);
             }
             const float weight = light * (1 - pass);
-            if (weight > bounds.weight) {
-                heads[out] = int32_t(h);
-                planes[out] = run.plane[at];
-                for (int a = 0; a < 3; a++) ndc[3 * out + a] = run.ndc[at][a];
-                inverse_t[out] = run.inverse_t[at];
-                taus[out] = tau;
-                skipped_before[out] = skipped;
-                out++;
-            } else {
-                skipped += tau;
-                dropped += weight;
-            }
+            if (weight > bounds.weight)
+                to.keep(run, h, tau, skipped);
+            else
+                skipped += tau, dropped += weight;
             light *= pass;
-            advance(run, *scene, *rays, ray, h, threshold > 0);
+            advance(run, rays, crossings, ray, h);
             if (!run.done()) {
                 nearest[best] = run.next();
                 continue;
@@ -171,9 +155,50 @@ void mmpi_march(const Scene* scene, const Rays* rays, int64_t* starts, int64_t b
             alive--;
             for (int64_t i = best; i < alive; i++) live[i] = live[i + 1], nearest[i] = nearest[i + 1];
         }
-        kept[ray] = out - starts[ray];
-        skipped_total[ray] = skipped;
-        dropped_mass[ray] = dropped;
+    }
+
+  private:
+    const Scene& scene;
+    const float threshold, fair_share;
+    const bool blends;
+    std::vector<Run> runs;
+    std::vector<int64_t> live;  // heads that have samples left,
+    std::vector<float> nearest; // and the inverse distance of the next one of each
+    std::vector<float> votes;
+
+    void advance(Run& run, const Packet& rays, const Crossings& crossings, int ray, int64_t head) {
+        if (++run.at < run.size) return;
+        run.size = run.at = 0;
+        if (run.begin == run.count) return;
+        if (head < scene.num_mpis)
+            fill_mpi(run, scene, crossings.mpis[head], ray, head, threshold > 0);
+        else
+            fill_cube(run, scene, rays, ray, threshold > 0);
+    }
+};
+
+} // namespace
+
+extern "C" {
+
+// Marches rays [begin, end), each of which keeps `room` samples at most. What they keep is written one ray behind the
+// other, from begin * room on; where a ray's samples begin, to starts[ray]; how many, to kept[ray].
+void mmpi_march(const Scene* scene, const Rays* rays, int64_t room, float threshold, float fair_share, bool blends,
+                int64_t begin, int64_t end, int64_t* starts, int64_t* kept, int64_t* live, bool* explained,
+                float* skipped_total, float* dropped_mass, int32_t* heads, int32_t* planes, float* ndc,
+                float* inverse_t, float* taus, float* skipped_before) {
+    Training training(*scene, threshold, fair_share, blends);
+    Crossings crossings;
+    Slots slots{heads, planes, ndc, inverse_t, taus, skipped_before, begin * room};
+    for (int64_t first = begin; first < end; first += WIDTH) {
+        const Packet packet(*rays, first, std::min<int64_t>(WIDTH, end - first));
+        crossings.cross(*scene, *rays, packet);
+        for (int64_t ray = first; ray < std::min(first + WIDTH, end); ray++) {
+            starts[ray] = slots.size;
+            training.march(packet, crossings, int(ray - first), slots, skipped_total[ray], dropped_mass[ray]);
+            kept[ray] = slots.size - starts[ray];
+            live[ray] = crossings.total[ray - first], explained[ray] = crossings.explained[ray - first];
+        }
     }
 }
 

@@ -12,25 +12,27 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.blending import blended_optical_depth, log_shares
+from mmpi_ns.ops.composite import composite_weights, median_inverse_distance, winning_heads
 from mmpi_ns.ops.composite.reference import exclusive_cumsum
+from mmpi_ns.ops.ends import NEGLIGIBLE
+from mmpi_ns.ops.gather import gather_places
 from mmpi_ns.ops.interpolate import interpolate
-from mmpi_ns.ops.layout import Places, SceneLayout, Tables
-from mmpi_ns.scene.geometry import LocalRays, PlaneHits, inverse_distance, sample_disparity
+from mmpi_ns.ops.layout import SceneLayout, Tables
+from mmpi_ns.ops.march.rays import MarchOptions, MergedSamples, Rays, Shown
+from mmpi_ns.scene.geometry import LocalRays, PlaneHits, cube_hits, inverse_distance, plane_hits, sample_disparity
 
 BLEND_BLOCK = 16
 """Samples of a ray between two checks whether it is already opaque."""
 OPAQUE_DEPTH = 9.2
 """exp(-9.2) = 1e-4 of the light: far below the weight of a kept sample."""
-NEGLIGIBLE_DEPTH = 1e-4
-"""Samples thinner than this get an equal share without a lookup of reliabilities."""
 
 
 class Crossings(NamedTuple):
-    """R rays, and their live samples in H heads."""
+    """The live samples of R rays in the H heads that may answer them."""
 
     origins: Float[Tensor, "R 3"]
-    """World axes, as the unit directions are."""
     directions: Float[Tensor, "R 3"]
     hits: PlaneHits
     """Crossings of the rays with the planes."""
@@ -38,42 +40,8 @@ class Crossings(NamedTuple):
     """m of each head's nearest live plane; the cube's first sample in the last column, where there is a cube."""
     counts: Int[Tensor, "R H"]
     """Live samples of each head."""
-
-
-class MarchOptions(NamedTuple):
-    """Which samples are kept, and how they are blended."""
-
-    threshold: float
-    """Weight below which a sample is dropped; 0 keeps all and ends no ray early."""
-    fair_share: float = float("inf")
-    """Bound on the threshold relative to equal weights (``prune``)."""
-    blends: bool = False
-    """Samples are blended by reliability."""
-
-
-@dataclass(frozen=True)
-class MergedSamples:
-    """The kept samples of R rays, nearest first in S slots of each ray, and the attenuation by the dropped ones."""
-
-    heads: Int[Tensor, "R S"]
-    """0 in empty slots, like all fields."""
-    planes: Int[Tensor, "R S"]
-    ndc: Float[Tensor, "R S 3"]
-    inverse_t: Float[Tensor, "R S"]
-    tau: Float[Tensor, "R S"]
-    """Optical depth, blended if reliability is used."""
-    skipped_before: Float[Tensor, "R S"]
-    """Optical depth of the dropped samples in front of each sample."""
-    valid: Bool[Tensor, "R S"]
-    skipped_total: Float[Tensor, "R 1"]
-    dropped_mass: Float[Tensor, "R 1"]
-    """Sum of the weights of the dropped samples."""
-    head_counts: tuple[int, ...] | None = None
-    """Samples of each head, if known without synchronising."""
-
-    @property
-    def places(self) -> Places:
-        return Places(self.heads, self.planes, self.ndc, self.valid)
+    explained: Bool[Tensor, "R 1"]
+    """See ``MergedSamples``."""
 
 
 @dataclass(frozen=True)
@@ -88,21 +56,17 @@ class LiveSamples:
     tau: Float[Tensor, "N"]
 
 
-def most_kept(samples: int, threshold: float, fair_share: float = float("inf")) -> int:
-    """How many of a ray's samples are kept at most: weights sum to at most 1, and each exceeds ``prune``'s bound."""
-    return samples if threshold <= 0 else min(samples, int(1.01 / min(threshold, fair_share / samples)) + 2)
-
-
-def march(layout: SceneLayout, tables: Tables, rays: Crossings, options: MarchOptions) -> MergedSamples:
+def march(layout: SceneLayout, tables: Tables, rays: Rays, options: MarchOptions) -> MergedSamples:
     """See ``ops.march``."""
-    samples = [_sample_mpi(k, rays.counts[:, k], rays.hits, layout, tables) for k in range(len(layout.mpis))]
+    at = crossings(layout, rays, plane_hits(*rays[:4], layout.frames))
+    samples = [_sample_mpi(k, at.counts[:, k], at.hits, layout, tables) for k in range(len(layout.mpis))]
     if layout.cube is not None:
-        samples.append(_sample_cube(rays, layout, tables))
+        samples.append(_sample_cube(at, layout, tables))
     flat = LiveSamples(*(torch.cat([getattr(s, f) for s in samples]) for f in LiveSamples.__dataclass_fields__))
-    order, valid = _sort(flat, rays.counts)
+    order, valid = _sort(flat, at.counts)
     tau = flat.tau
     if options.blends and tau.numel():
-        tau = _blend_visible(order, valid, flat, rays, layout, tables)
+        tau = _blend_visible(order, valid, flat, at, layout, tables)
     pruned = prune(order, valid, tau, options.threshold, options.fair_share)
     order, valid = pruned.order, pruned.valid
 
@@ -120,7 +84,60 @@ def march(layout: SceneLayout, tables: Tables, rays: Crossings, options: MarchOp
         valid=valid,
         skipped_total=pruned.skipped_total,
         dropped_mass=pruned.dropped_mass,
+        live=at.counts.sum(-1),
+        explained=at.explained,
     )
+
+
+def show_rays(layout: SceneLayout, tables: Tables, features: Tensor, rays: Rays, options: MarchOptions) -> Shown:
+    """See ``ops.march``: march, compositing, and sums of what the samples hold."""
+    m: MergedSamples = dispatch.run("march", layout, tables, rays, options)
+    composite = composite_weights(m.tau, m.valid, m.skipped_before, m.skipped_total)
+    sums = gather_places(layout, features, m.places, composite.weights)
+    return Shown(
+        gathered=sums.gathered,
+        mass=composite.weights.sum(-1, keepdim=True),
+        transmittance=composite.transmittance,
+        accumulation=composite.accumulation,
+        inverse_t=median_inverse_distance(composite.weights, m.inverse_t, m.valid),
+        winner=winning_heads(composite.weights, m.heads, layout.num_heads),
+        dropped_mass=m.dropped_mass,
+    )
+
+
+# Crossings -----------------------------------------------------------------------------------------------------------
+
+
+def crossings(layout: SceneLayout, rays: Rays, hits: PlaneHits) -> Crossings:
+    """The live samples of rays in the heads that may answer them, from their crossings with all planes."""
+    first, counts = hits.m_first, hits.count
+    if rays.priorities is not None:
+        met = torch.where(counts > 0, rays.priorities, torch.full_like(rays.priorities, -1.0))
+        best = met.argmax(-1, keepdim=True)
+        counts = torch.zeros_like(counts).scatter(1, best, counts.gather(1, best))
+    if layout.cube is not None:
+        start, count = cube_hits(*rays[:4], layout.cube)
+        first, counts = torch.cat([first, start[:, None]], -1), torch.cat([counts, count[:, None]], -1)
+    if rays.heads is not None:
+        counts = torch.where(rays.heads, counts, torch.zeros_like(counts))
+    explained = (counts > 0).any(-1, keepdim=True)
+    if rays.heads is not None or rays.priorities is not None:
+        explained &= _sees_all(layout, hits, counts[:, : len(layout.mpis)])
+    return Crossings(rays.origins, rays.directions, hits, first, counts, explained)
+
+
+def _sees_all(layout: SceneLayout, hits: PlaneHits, counts: Int[Tensor, "R K"]) -> Bool[Tensor, "R 1"]:
+    """Whether some head covers the ray out to infinity, and the first head is entered before the first content."""
+    live, frames = counts > 0, layout.frames
+    # One plane before the first live one bounds the entry: behind the camera means that the ray starts inside.
+    m_before = torch.minimum(hits.m_first + 1, frames.num_planes - 1)
+    w = sample_disparity(m_before, frames.disparity_steps, frames.last_disparities)
+    oz, dz = hits.local_origins[..., 2], hits.local_directions[..., 2]
+    starts_inside = w * oz >= 1
+    entry = torch.where(starts_inside, torch.inf, w * dz / torch.where(starts_inside, 1, 1 - w * oz))
+    entered = (live & (entry * layout.content_near >= 1)).any(-1, keepdim=True)
+    to_infinity = (live & (hits.m_first - counts < 0) & (frames.last_disparities == 0)).any(-1, keepdim=True)
+    return entered & to_infinity
 
 
 # Sample --------------------------------------------------------------------------------------------------------------
@@ -218,7 +235,7 @@ def _blend_visible(
     order: Int[Tensor, "R S"],
     valid: Bool[Tensor, "R S"],
     flat: LiveSamples,
-    rays: Crossings,
+    at: Crossings,
     layout: SceneLayout,
     tables: Tables,
 ) -> Float[Tensor, "N"]:
@@ -235,7 +252,7 @@ def _blend_visible(
         index = block[wanted]
         if not index.numel():
             break
-        tau[index] = _blend(index, flat, rays, layout, tables)
+        tau[index] = _blend(index, flat, at, layout, tables)
         passed += torch.where(wanted, tau[block], 0.0).sum(-1)
     return tau
 
@@ -243,15 +260,15 @@ def _blend_visible(
 def _blend(
     index: Int[Tensor, "M"],
     flat: LiveSamples,
-    rays: Crossings,
+    at: Crossings,
     layout: SceneLayout,
     tables: Tables,
 ) -> Float[Tensor, "M"]:
     """Blended optical depth of some samples; those too thin to matter get an equal share without a lookup."""
     tau = flat.tau[index]
-    thick = (tau > NEGLIGIBLE_DEPTH).nonzero()[:, 0]
+    thick = (tau > NEGLIGIBLE).nonzero()[:, 0]
     own = index[thick]
-    local = LocalRays(rays.origins, rays.directions, rays.hits.local_origins, rays.hits.local_directions)
+    local = LocalRays(at.origins, at.directions, at.hits.local_origins, at.hits.local_directions)
     asked = (flat.rays[own], local, flat.inverse_t[own], flat.heads[own])
     shares = log_shares(layout, tables.reliability, tables.touched, *asked)
     blended = tau / layout.num_heads

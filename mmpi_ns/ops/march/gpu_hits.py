@@ -1,4 +1,4 @@
-"""Where rays cross planes, in one launch; the reference is ``geometry.plane_hits``, some eighty."""
+"""Where rays cross planes, in one launch; the reference is ``geometry.plane_hits``, some eighty operations."""
 
 # Triton's language has no types that pyright knows: a kernel's functions seem to return nothing.
 # pyright: reportGeneralTypeIssues=false, reportCallIssue=false, reportArgumentType=false
@@ -7,10 +7,10 @@ from __future__ import annotations
 import torch
 import triton
 import triton.language as tl
-from torch import Tensor
 
 from mmpi_ns.ops.gpu_scene import block_size, launch
-from mmpi_ns.ops.layout import SceneLayout
+from mmpi_ns.ops.layout import SceneLayout, shaped
+from mmpi_ns.ops.march.rays import Rays
 from mmpi_ns.scene.geometry import FACING_EPS, PlaneHits
 
 EPS = tl.constexpr(FACING_EPS)
@@ -114,12 +114,13 @@ def _store(to, x, y, z, exists):
     tl.store(to + 2, z, exists)
 
 
-def plane_hits(origins: Tensor, directions: Tensor, nears: Tensor, fars: Tensor, layout: SceneLayout) -> PlaneHits:
+def plane_hits(layout: SceneLayout, rays: Rays) -> PlaneHits:
     """See ``geometry.plane_hits``; in float32."""
-    frames, count, device = layout.frame_rows(), len(layout.mpis), origins.device
-    shape, size = (len(origins), count), len(origins) * count
+    num_rays, count, device = len(rays.origins), len(layout.mpis), rays.origins.device
+    shape, size, block = (num_rays, count), num_rays * count, block_size(PAIRS, device)
     ranges = [torch.empty(shape, dtype=torch.int64, device=device) for _ in range(2)]
     parts = [torch.empty(*shape, width, device=device) for width in (2, 2, 3, 3)]
-    rays, block = (x.contiguous() for x in (origins, directions, nears, fars)), block_size(PAIRS, device)
-    launch(hits_kernel, size, block, *rays, frames, *ranges, *parts, size, K=count, BLOCK=block)
+    given = [shaped(x, num_rays, n) for x, n in zip(rays[:4], (3, 3, 1, 1), strict=True)]
+    frames = shaped(layout.frame_rows(), count, FLOATS.value)
+    launch(hits_kernel, size, block, *given, frames, *ranges, *parts, size, K=count, BLOCK=block)
     return PlaneHits(*ranges, *parts)

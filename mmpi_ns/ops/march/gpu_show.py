@@ -1,23 +1,17 @@
-"""What rays show, on a GPU: the march, then one kernel over what each ray kept, where the march has written it.
-
-Nothing is packed, and the host need not know how much any ray kept.
-"""
+"""Sums over what each ray kept, for pictures, where the march has written it."""
 
 # Triton's language has no types that pyright knows: a kernel's functions seem to return nothing.
 # pyright: reportGeneralTypeIssues=false, reportCallIssue=false, reportArgumentType=false
 from __future__ import annotations
 
-import torch
 import triton
 import triton.language as tl
-from torch import Tensor
 
-from mmpi_ns.ops.gather.gpu import activate, sizes
-from mmpi_ns.ops.gpu_scene import DEPTH, HEIGHT, INTS, WIDTH, GpuScene, cell, launch, one_minus_exp, row_of
-from mmpi_ns.ops.layout import SceneLayout, Tables
-from mmpi_ns.ops.march.gpu import march_into_slots
-from mmpi_ns.ops.march.reference import Crossings, MarchOptions
-from mmpi_ns.ops.show.reference import Shown
+from mmpi_ns.ops import ends
+from mmpi_ns.ops.gather.gpu import activate
+from mmpi_ns.ops.gpu_scene import DEPTH, HEIGHT, INTS, WIDTH, cell, one_minus_exp, row_of
+
+HALF = tl.constexpr(ends.HALF)
 
 NUMBERS = 256
 """Rays of a program times their channels: what its registers hold."""
@@ -83,22 +77,7 @@ def show_kernel(
         slot, known = start + s, s < count
         weight, depth = _weigh(taus, befores, slot, known, depth)
         passed += weight
-        here = waits & known & (passed >= 0.5 * mass)
+        here = waits & known & (passed >= HALF * mass)
         median = tl.where(here, tl.load(inverse_ts + slot, known, 0.0), median)
-        waits = waits & (passed < 0.5 * mass)
+        waits = waits & (passed < HALF * mass)
     tl.store(medians + ray, median, inside)
-
-
-def show_rays(layout: SceneLayout, tables: Tables, features: Tensor, rays: Crossings, options: MarchOptions) -> Shown:
-    """See ``ops.show``."""
-    m = march_into_slots(layout, tables, rays, options)
-    num_rays, channels, device = len(rays.origins), features.shape[1], features.device
-    gathered = torch.empty(num_rays, channels, device=device)
-    mass, depth, median, winner = (torch.empty(num_rays, 1, device=device) for _ in range(4))
-    columns, block = sizes(channels, device, NUMBERS)
-    launch(
-        show_kernel, num_rays, block, m.kept, *m.slots, m.skipped_total, features.contiguous(),
-        GpuScene.of(layout).grids, gathered, mass, depth, median, winner, num_rays, m.room, channels, len(layout.mpis),
-        HAS_CUBE=layout.cube is not None, HEADS=triton.next_power_of_2(layout.num_heads), CHANNELS=columns, BLOCK=block,
-    )  # fmt: skip
-    return Shown(gathered, mass, torch.exp(-depth), -torch.expm1(-depth), median, winner, m.dropped_mass)

@@ -1,0 +1,69 @@
+// What reliability makes of a sample's optical depth (blending.log_shares, blend_shares and blended_optical_depth).
+#pragma once
+#include "crossings.h"
+
+namespace {
+
+// Where a sample of the cube lies.
+inline void place_in_cube(const Cube& cube, const Packet& rays, int ray, float t, float* ndc) {
+    for (int a = 0; a < 3; a++) {
+        const float x = rays.origin[a][ray] + rays.direction[a][ray] * t;
+        ndc[a] = 2 * (x - cube.lower[a]) / cube.extent[a] - 1;
+    }
+}
+
+// Where a sample of a ray lies in head j; false outside its frustum.
+inline bool place(const Scene& scene, const Packet& rays, const Crossings& crossings, int ray, int64_t j,
+                  float inverse_t, float* ndc) {
+    if (j < scene.num_mpis) {
+        const Mpi& mpi = scene.mpis[j];
+        const Lanes *o = crossings.mpis[j].origin, *d = crossings.mpis[j].direction;
+        const float z = o[2][ray] * inverse_t + d[2][ray];
+        if (!(z > 0)) {
+            ndc[0] = ndc[1] = ndc[2] = 0;
+            return false;
+        }
+        ndc[0] = ((o[0][ray] * inverse_t + d[0][ray]) / z - mpi.u0) * mpi.u_scale - 1;
+        ndc[1] = ((o[1][ray] * inverse_t + d[1][ray]) / z - mpi.v0) * mpi.v_scale - 1;
+        ndc[2] = 1 - (mpi.s_scale * inverse_t / z - mpi.s_scale * mpi.end);
+        const float slack = 16 * std::numeric_limits<float>::epsilon(), s_slack = slack / mpi.share;
+        return std::abs(ndc[0]) <= 1 + slack && std::abs(ndc[1]) <= 1 + slack && std::abs(ndc[2]) <= 1 + s_slack;
+    }
+    place_in_cube(*scene.cube, rays, ray, 1 / std::max(inverse_t, NEAREST_ZERO), ndc);
+    bool inside = inverse_t > 0;
+    for (int a = 0; a < 3; a++) {
+        inside = inside && std::abs(ndc[a]) <= 1;
+        ndc[a] = std::min(std::max(ndc[a], -1.0f), 1.0f);
+    }
+    return inside;
+}
+
+inline float softplus(float x) { return x > 20 ? x : std::log1p(std::exp(x)); }
+
+// Optical depth of a sample of head `own` after blending.
+inline float blended(const Scene& scene, const Packet& rays, const Crossings& crossings, int ray, int64_t own,
+                     float inverse_t, float tau, std::vector<float>& votes) {
+    if (tau <= NEGLIGIBLE) return tau / float(scene.num_heads);
+    float ndc[3], own_vote = 0, highest = -std::numeric_limits<float>::infinity(), others = 0;
+    votes.clear();
+    for (int64_t j = 0; j < scene.num_heads; j++) {
+        if (!place(scene, rays, crossings, ray, j, inverse_t, ndc) && j != own) continue;
+        const Grid& grid = scene.grids[j];
+        if (j == own) {
+            own_vote = trilinear(scene.reliability, grid, ndc);
+        } else if (scene.touched[nearest_texel(grid, ndc)]) {
+            votes.push_back(trilinear(scene.reliability, grid, ndc));
+            highest = std::max(highest, votes.back());
+        }
+    }
+    if (votes.empty()) return tau; // the sole cover
+    for (float vote : votes) others += std::exp(vote - highest);
+    const float odds = highest - own_vote + std::log(others);
+    const float log_share = -softplus(odds), log_rest = -softplus(-odds);
+    const float alpha = -std::expm1(-tau) * std::exp(log_share);
+    if (alpha < 0.5f) return -std::log1p(-alpha);
+    const float a = log_rest, b = log_share - tau;
+    return std::max(-(std::max(a, b) + softplus(-std::abs(a - b))), 0.0f);
+}
+
+} // namespace

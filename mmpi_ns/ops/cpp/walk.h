@@ -1,0 +1,319 @@
+// One walk for all pictures: sixteen rays abreast through all heads, near to far, from one brick that holds something to
+// the next, until each is over; then what the samples that weigh enough hold, ray by ray. Templated on how texels are
+// stored: as floats in the bricks of training (march/show.cpp) or as bytes in baked bricks (baked/baked.cpp).
+//
+// What a walk is made of, and what training (march/march.cpp) shares:
+//   ends.h       when a ray is over and what its depth is; the page's shader reads it too
+//   crossings.h  which planes of which heads a ray meets
+//   blend.h      what reliability makes of a sample
+//   here         stepping abreast, and sums
+// Training steps otherwise, one ray at a time and each head's samples in blocks: its rays are drawn at random, so sixteen
+// of them go different ways. Abreast, 4,096 of them take 2.2 times as long where next to nothing is kept, and a frame's
+// rays, which are neighbours, 0.7 times (docs/performance.md).
+#pragma once
+#include "blend.h"
+#include "table.h"
+
+namespace {
+
+constexpr int WORD = 32;
+
+// The bricks of a tile in 32 consecutive planes (scene/baked.py).
+struct Column {
+    int32_t planes; // a bit each
+    int32_t first;  // brick of the lowest bit; the others follow it
+};
+
+// The planes of one MPI, and where texels and columns are on them.
+struct Stack {
+    float step, end;        // disparity between planes and of the last one
+    float u0, v0;           // texel = (u - u0) x_scale
+    float x_scale, y_scale;
+    int32_t planes, height, width, down, across;
+    int32_t first_column;
+};
+
+inline IntLanes ones(IntLanes x) {
+    return each_lane<IntLanes>(x, [](int32_t word) { return int32_t(__builtin_popcount(uint32_t(word))); });
+}
+
+// Sixteen rays on their way through one MPI. A tile is CELLS x CELLS cells (squares between four texels) of a plane.
+// Planes are counted from the nearest one. What lanes hold whose rays are over is not used.
+template <int CELLS> struct Walks {
+    Lanes x_last, x_step, x_turns, y_last, y_step, y_turns; // texel on the last plane, from plane to plane; turns: 1 / step
+    Lanes oz, dz;
+    Lanes inverse_t;    // of the sample at hand; -1 where there is none
+    IntLanes left, top; // of the tile, texels
+    IntLanes exit, last, plane, brick, word;
+    IntLanes ahead; // planes of the column that are still to come
+
+    // Rays of `going` set out.
+    void begin(const Column* columns, const Stack& stack, const Crossing& at, Mask going) {
+        x_last = (at.u + stack.end * at.u_slope - stack.u0) * stack.x_scale;
+        y_last = (at.v + stack.end * at.v_slope - stack.v0) * stack.y_scale;
+        x_step = -stack.step * at.u_slope * stack.x_scale, y_step = -stack.step * at.v_slope * stack.y_scale;
+        x_turns = 1 / x_step, y_turns = 1 / y_step;
+        oz = at.origin[2], dz = at.direction[2];
+        exit = stack.planes - 2 - at.first, last = exit + at.count;
+        inverse_t = splat(-1), left = top = plane = brick = word = ahead = IntLanes{};
+        next(columns, stack, going & (at.count > 0));
+    }
+
+    // Rays of `going` go on to the next plane that holds something.
+    void next(const Column* columns, const Stack& stack, Mask going) {
+        for (;;) {
+            const IntLanes l = exit + 1;
+            const Mask searching = going & (ahead == 0) & (l <= last);
+            if (!any(searching)) break;
+            search(columns, stack, l, searching);
+        }
+        inverse_t = pick(going, splat(-1), inverse_t);
+        going &= ahead != 0;
+        const IntLanes lowest = ahead & -ahead;
+        plane = pick(going, word * WORD + ones(lowest - 1), plane);
+        ahead = pick(going, ahead ^ lowest, ahead);
+        brick -= going;
+        const Lanes w = real(stack.planes - 1 - plane) * stack.step + stack.end;
+        inverse_t = pick(going, most(w * dz / (1 - w * oz), Lanes{}), inverse_t);
+    }
+
+    // Lower texel in the tile, and fractions.
+    void cell(const Stack& stack, IntLanes& column, IntLanes& row, Lanes& fx, Lanes& fy) const {
+        const Lanes back = real(plane - (stack.planes - 1));
+        column = within(x_last + back * x_step, left, stack.width, fx);
+        row = within(y_last + back * y_step, top, stack.height, fy);
+    }
+
+  private:
+    static IntLanes within(Lanes texel, IntLanes lower, int32_t texels, Lanes& fraction) {
+        const IntLanes cells = least(whole(CELLS), texels - 1 - lower);
+        const Lanes x = least(most(texel - real(lower), Lanes{}), real(cells));
+        const IntLanes cell = least(truncated(x), cells - 1);
+        fraction = x - real(cell);
+        return cell;
+    }
+
+    // Looks up the columns that rays enter at planes l, and how far each goes in its own.
+    void search(const Column* columns, const Stack& stack, IntLanes l, Mask searching) {
+        const Lanes back = real(l - (stack.planes - 1));
+        const IntLanes across = pick(searching, tile(x_last + back * x_step, stack.across), IntLanes{});
+        const IntLanes down = pick(searching, tile(y_last + back * y_step, stack.down), IntLanes{});
+        const IntLanes at_word = pick(searching, l >> 5, IntLanes{});
+        const IntLanes place = stack.first_column + (at_word * stack.down + down) * stack.across + across;
+        const IntLanes planes = each_lane<IntLanes>(place, [&](int32_t at) { return columns[at].planes; });
+        const IntLanes first = each_lane<IntLanes>(place, [&](int32_t at) { return columns[at].first; });
+        const IntLanes at_left = across * CELLS, at_top = down * CELLS;
+        const Lanes leaving = float(stack.planes - 1) + least(leaves(x_last, x_step, x_turns, at_left),
+                                                              leaves(y_last, y_step, y_turns, at_top));
+        IntLanes end = least(last, at_word * WORD + (WORD - 1));
+        end = leaving < real(end) ? most(l, truncated(leaving)) : end;
+        const IntLanes before = ~(whole(-1) << (l & 31)), within = ~(whole(-2) << (end & 31));
+        left = pick(searching, at_left, left), top = pick(searching, at_top, top);
+        word = pick(searching, at_word, word), exit = pick(searching, end, exit);
+        ahead = pick(searching, planes & ~before & within, ahead);
+        brick = pick(searching, first + ones(planes & before) - 1, brick);
+    }
+
+    static IntLanes tile(Lanes texel, int32_t tiles) {
+        return least(most(truncated(texel * (1.0f / CELLS)), IntLanes{}), whole(tiles - 1));
+    }
+
+    // Planes behind the last one at which rays leave a tile along one axis; a ray parallel to it never does.
+    static Lanes leaves(Lanes last, Lanes step, Lanes turns, IntLanes lower) {
+        const Lanes end = real(lower + (step > 0 ? whole(CELLS) : IntLanes{}));
+        return step == 0 ? splat(std::numeric_limits<float>::infinity()) : (end - last) * turns;
+    }
+};
+
+// The same through the cube.
+struct CubeWalks {
+    IntLanes index, last;
+    Lanes inverse_t = splat(-1);
+
+    void arrive(const Cube& cube, Mask going) {
+        const Lanes here = 1 / ((real(index) + 0.5f) * cube.step);
+        inverse_t = pick(going, pick(index <= last, here, splat(-1)), inverse_t);
+    }
+};
+
+// Which samples of a ray are kept, and where it ends.
+struct Bounds {
+    float weight, light; // a sample weighs more; no less light is left
+
+    static Bounds exact(float threshold, float fair_share, int64_t samples) {
+        if (threshold <= 0) return {-1, -1};
+        const float weight = std::min(fair_share / float(std::max<int64_t>(samples, 1)), threshold);
+        return {weight, std::min(weight, OPAQUE)};
+    }
+};
+
+struct Outputs {
+    float *gathered, *mass, *transmittance, *accumulation, *inverse_t, *winner, *dropped; // [R, C], [R, 1]
+};
+
+// Texels tell what sixteen samples read (Reads), what light passes them, and what one of them holds (Lookup).
+template <typename Texels> class Walker {
+  public:
+    explicit Walker(const Texels& texels)
+        : texels(texels), scene(texels.scene), walks(scene.num_mpis), masses(scene.num_heads) {}
+
+    void show(const Rays& rays, int64_t first, int64_t some, const Outputs& to) {
+        const Packet packet(rays, first, some);
+        begin(rays, packet);
+        walk(packet);
+        finish();
+        for (int64_t i = 0; i < some; i++) {
+            sum(seen[i], first + i, to);
+            to.transmittance[first + i] = light[i], to.accumulation[first + i] = 1 - light[i];
+            to.dropped[first + i] = dropped[i];
+        }
+    }
+
+  private:
+    using Reads = typename Texels::Reads;
+
+    // A sample that weighs enough.
+    struct Seen {
+        float weight, inverse_t;
+        int32_t head;
+        typename Texels::Lookup lookup;
+    };
+
+    const Texels& texels;
+    const Scene& scene;
+    Crossings crossings;
+    std::vector<Walks<Texels::CELLS>> walks;
+    CubeWalks cube;
+    std::vector<Seen> seen[WIDTH]; // of each ray, front to back
+    Lanes light, dropped, least_weight, least_light;
+    std::vector<float> votes, masses;
+
+    Lanes next(int32_t head) const {
+        return Texels::HAS_CUBE && head == scene.num_mpis ? cube.inverse_t : walks[head].inverse_t;
+    }
+
+    void begin(const Rays& rays, const Packet& packet) {
+        crossings.cross(scene, rays, packet);
+        light = splat(1), dropped = Lanes{};
+        for (auto& samples : seen) samples.clear();
+        const auto bounds = [&](int32_t samples) { return texels.bounds(samples); };
+        least_weight = each_lane<Lanes>(crossings.total, [&](int32_t samples) { return bounds(samples).weight; });
+        least_light = each_lane<Lanes>(crossings.total, [&](int32_t samples) { return bounds(samples).light; });
+        for (int64_t k = 0; k < scene.num_mpis; k++)
+            walks[k].begin(texels.columns, texels.stacks[k], crossings.mpis[k], packet.there);
+        if constexpr (Texels::HAS_CUBE) {
+            cube.inverse_t = splat(-1), cube.index = crossings.cube.first;
+            cube.last = cube.index + crossings.cube.count - 1;
+            if (scene.num_heads > scene.num_mpis) cube.arrive(*scene.cube, packet.there);
+        }
+    }
+
+    // The ray that is least far on its way goes first, with all that wait for the same head: so they stay abreast, and
+    // each meets its own samples in its own order.
+    void walk(const Packet& packet) {
+        for (;;) {
+            Lanes top = next(0);
+            IntLanes best{};
+            for (int32_t h = 1; h < scene.num_heads; h++) { // ties: the first head
+                best = next(h) > top ? whole(h) : best;
+                top = most(next(h), top);
+            }
+            const Mask left = (top >= 0) & ~(light <= least_light); // is_over
+            if (!any(left)) return;
+            const Lanes waiting = pick(left, top, splat(-1));
+            const int32_t h = best[__builtin_ctz(bits(waiting == largest(waiting)))];
+            step(h, left & (best == h), packet);
+        }
+    }
+
+    // Rays of `going` take their next sample of one head.
+    void step(int32_t h, Mask going, const Packet& packet) {
+        const Lanes inverse_t = next(h);
+        Reads reads;
+        Lanes through;
+        if constexpr (Texels::HAS_CUBE) {
+            Lanes tau = h == scene.num_mpis ? texels.cube_tau(cube.index, packet, going, reads)
+                                            : texels.tau(h, walks[h], going, reads);
+            for (uint32_t lanes = texels.blends ? bits(going) : 0; lanes; lanes &= lanes - 1) {
+                const int i = __builtin_ctz(lanes);
+                tau[i] = blended(scene, packet, crossings, i, h, inverse_t[i], tau[i], votes);
+            }
+            through = exp_lanes(-tau);
+        } else {
+            through = texels.through(h, walks[h], going, reads);
+        }
+        through = pick(going, through, splat(1));
+        const Lanes weight = light * (1 - through);
+        texels.weighed(reads, weight);
+        const Mask kept = going & (weight > least_weight);
+        for (uint32_t lanes = bits(kept); lanes; lanes &= lanes - 1) {
+            const int i = __builtin_ctz(lanes);
+            seen[i].push_back({weight[i], inverse_t[i], h, texels.lookup(reads, i)});
+        }
+        dropped += pick(kept, Lanes{}, weight);
+        light *= through;
+        if (Texels::HAS_CUBE && h == scene.num_mpis)
+            cube.index -= going, cube.arrive(*scene.cube, going);
+        else
+            walks[h].next(texels.columns, texels.stacks[h], going);
+    }
+
+    // What rays leave behind their ends is no less than what the rest of their samples weighs.
+    void finish() {
+        Mask rest = light <= least_light;
+        if (!Texels::ENDS_DARK) {
+            Mask unseen = cube.inverse_t >= 0;
+            for (const auto& walk : walks) unseen |= walk.inverse_t >= 0;
+            rest = unseen;
+        }
+        dropped += pick(rest, light, Lanes{});
+        if (Texels::ENDS_DARK) light = pick(rest, Lanes{}, light);
+    }
+
+    void gather(const std::vector<Seen>& samples, float* to) const {
+        for (int64_t first = 0; first < texels.channels; first += WIDTH) {
+            Lanes total{};
+            for (const Seen& s : samples) total += s.weight * texels.colors(s.lookup, first);
+            for (int64_t c = first; c < std::min(texels.channels, first + WIDTH); c++) to[c] = total[c - first];
+        }
+    }
+
+    // Of eight channels, two samples at once.
+    void gather_pairs(const std::vector<Seen>& samples, float* to) const {
+        Octet total{};
+        for (size_t n = 0; n < samples.size(); n += 2) {
+            const Seen &a = samples[n], &b = samples[std::min(n + 1, samples.size() - 1)];
+            const Lanes values = texels.colors(a.lookup, b.lookup);
+            total += a.weight * lower_half(values);
+            if (&a != &b) total += b.weight * upper_half(values);
+        }
+        __builtin_memcpy(to, &total, sizeof total);
+    }
+
+    // What a ray gathered, its depth, and the head that gave most.
+    void sum(const std::vector<Seen>& samples, int64_t ray, const Outputs& to) {
+        if (texels.channels == OCTET)
+            gather_pairs(samples, to.gathered + ray * OCTET);
+        else
+            gather(samples, to.gathered + ray * texels.channels);
+        std::fill(masses.begin(), masses.end(), 0.0f);
+        float mass = 0, passed = 0;
+        for (const Seen& s : samples) mass += s.weight, masses[s.head] += s.weight;
+        to.mass[ray] = mass, to.inverse_t[ray] = 0;
+        to.winner[ray] = float(std::max_element(masses.begin(), masses.end()) - masses.begin());
+        for (size_t n = 0; n < samples.size() && mass > 0; n++) {
+            to.inverse_t[ray] = samples[n].inverse_t;
+            if (is_depth(passed += samples[n].weight, mass)) break;
+        }
+    }
+};
+
+// Rays [begin, end).
+template <typename Texels>
+void show(const Texels& texels, const Rays& rays, int64_t begin, int64_t end, const Outputs& to) {
+    Walker<Texels> walker(texels);
+    for (int64_t ray = begin; ray < end; ray += WIDTH)
+        walker.show(rays, ray, std::min<int64_t>(WIDTH, end - ray), to);
+}
+
+} // namespace

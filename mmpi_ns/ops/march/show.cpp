@@ -1,0 +1,126 @@
+// What rays show of the bricks of training. The reference is reference.py.
+#include "taps.h"
+#include "walk.h"
+
+namespace {
+
+constexpr int CORNERS = 4;
+
+// The tiles of the MPIs from which something can be read, in the order of their columns.
+struct Tiles {
+    const Column* columns;
+    const int32_t (*bricks)[CORNERS]; // of the tile itself, right of it, below it, and right below
+};
+
+struct Floats {
+    static constexpr int CELLS = 8;
+    static constexpr bool HAS_CUBE = true, ENDS_DARK = false;
+
+    struct Reads {
+        IntLanes rows[8];
+        Lanes shares[8];
+        int taps;
+    };
+    using Lookup = Sample;
+
+    const Scene& scene;
+    const Column* columns;
+    const int32_t* bricks;
+    const Table features;
+    const int64_t channels;
+    const float threshold, fair_share;
+    const bool blends;
+    std::vector<Stack> stacks;
+
+    Floats(const Scene& scene, const Tiles& tiles, const Table& features, float threshold, float fair_share, bool blends)
+        : scene(scene), columns(tiles.columns), bricks(tiles.bricks[0]), features(features), channels(features.channels),
+          threshold(threshold), fair_share(fair_share), blends(blends) {
+        int32_t column = 0;
+        for (int64_t k = 0; k < scene.num_mpis; k++) {
+            const Mpi& mpi = scene.mpis[k];
+            const Grid& grid = scene.grids[k];
+            const auto cells = [](int64_t texels) { return int32_t((texels - 1 + CELLS - 1) / CELLS); };
+            const auto scale = [](float u_scale, int64_t texels) { return 0.5f * u_scale * float(texels - 1); };
+            stacks.push_back({mpi.step, mpi.end, mpi.u0, mpi.v0, scale(mpi.u_scale, grid.width),
+                              scale(mpi.v_scale, grid.height), int32_t(grid.depth), int32_t(grid.height),
+                              int32_t(grid.width), cells(grid.height), cells(grid.width), column});
+            column += (stacks[k].planes + WORD - 1) / WORD * stacks[k].down * stacks[k].across;
+        }
+    }
+
+    Bounds bounds(int32_t samples) const { return Bounds::exact(threshold, fair_share, samples); }
+
+    Lanes tau(int32_t k, const Walks<CELLS>& walk, Mask going, Reads& reads) const {
+        IntLanes column, row;
+        Lanes fx, fy;
+        walk.cell(stacks[k], column, row, fx, fy);
+        const IntLanes tile = pick(going, walk.brick, IntLanes{});
+        reads.taps = CORNERS;
+        for (int tap = 0; tap < CORNERS; tap++) {
+            const IntLanes x = pick(going, column, IntLanes{}) + (tap & 1), y = pick(going, row, IntLanes{}) + (tap >> 1);
+            const IntLanes at = tile * CORNERS + (y >> 3) * 2 + (x >> 3);
+            const IntLanes brick = each_lane<IntLanes>(at, [this](int32_t i) { return bricks[i]; });
+            reads.rows[tap] = brick * int32_t(BRICK) + ((y & 7) << 3) + (x & 7);
+            reads.shares[tap] = (tap & 1 ? fx : 1 - fx) * (tap >> 1 ? fy : 1 - fy);
+        }
+        const float* biases = scene.biases + scene.grids[k].bias;
+        const IntLanes plane = pick(going, walk.plane, IntLanes{});
+        return softplus_lanes(raw(reads) + each_lane<Lanes>(plane, [&](int32_t l) { return biases[l]; })) *
+               scene.mpis[k].interval;
+    }
+
+    Lanes cube_tau(IntLanes index, const Packet& rays, Mask going, Reads& reads) const {
+        for (int tap = 0; tap < 8; tap++) reads.rows[tap] = IntLanes{}, reads.shares[tap] = Lanes{};
+        reads.taps = 8;
+        for (uint32_t lanes = bits(going); lanes; lanes &= lanes - 1) {
+            const int i = __builtin_ctz(lanes);
+            float ndc[3];
+            Sample sample;
+            place_in_cube(*scene.cube, rays, i, (float(index[i]) + 0.5f) * scene.cube->step, ndc);
+            sample.put(scene.grids[scene.num_mpis], true, 0, ndc);
+            for (int tap = 0; tap < 8; tap++)
+                reads.rows[tap][i] = int32_t(sample.rows[tap]), reads.shares[tap][i] = sample.shares[tap];
+        }
+        return softplus_lanes(raw(reads) + scene.cube->bias) * scene.cube->interval;
+    }
+
+    void weighed(const Reads&, Lanes) const {}
+
+    // What one of the samples reads, which is asked for at once.
+    Sample lookup(const Reads& reads, int lane) const {
+        Sample sample;
+        sample.taps = reads.taps;
+        for (int tap = 0; tap < reads.taps; tap++)
+            sample.rows[tap] = reads.rows[tap][lane], sample.shares[tap] = reads.shares[tap][lane];
+        prefetch(features, sample);
+        return sample;
+    }
+
+    Lanes colors(const Sample& sample, int64_t first) const {
+        return activate(interpolate(features, sample, first), first).value;
+    }
+
+    Lanes colors(const Sample& a, const Sample& b) const {
+        return activate(join(interpolate(features, a), interpolate(features, b)), EIGHT_TWICE).value;
+    }
+
+  private:
+    Lanes raw(const Reads& reads) const {
+        Lanes sum{};
+        for (int tap = 0; tap < reads.taps; tap++)
+            sum += reads.shares[tap] * each_lane<Lanes>(reads.rows[tap], [this](int32_t row) { return scene.density[row]; });
+        return sum;
+    }
+};
+
+} // namespace
+
+extern "C" {
+
+void mmpi_show(const Scene* scene, const Rays* rays, const Tiles* tiles, const float* features, int64_t rows,
+               int64_t channels, float threshold, float fair_share, bool blends, int64_t begin, int64_t end,
+               const Outputs* to) {
+    const Floats texels(*scene, *tiles, Table{features, rows, channels}, threshold, fair_share, blends);
+    show(texels, *rays, begin, end, *to);
+}
+}
