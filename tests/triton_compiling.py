@@ -102,7 +102,8 @@ def all_launches(setattr):
     Args:
         setattr: sets an attribute of an object, for as long as the launches are used.
     """
-    march = importlib.import_module("mmpi_ns.ops.march.gpu")
+    march, hits = (importlib.import_module(f"mmpi_ns.ops.march.{name}") for name in ("gpu", "gpu_hits"))
+    setattr(hits, "block_size", lambda wanted, device: wanted)
     setattr(dispatch, "_interpreting", True)
     setattr(dispatch, "_faults", dict.fromkeys(["Triton", *dispatch.TABLE]))
     with launches_noted({}) as noted:

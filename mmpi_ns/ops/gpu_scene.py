@@ -94,9 +94,11 @@ def block_size(wanted: int, device: torch.device) -> int:
 
 
 def launch(kernel: Any, size: int, block: int, *given: Any, **constants: Any) -> None:
-    """Runs a kernel on so many things, ``block`` a program; not at all where there is nothing."""
+    """Runs a kernel for ``size`` items, ``block`` a program, on the device of its tensors; not at all for none."""
     if size:
-        kernel[(triton.cdiv(size, block),)](*given, **constants)
+        # Triton launches on the current device, which is not that of the tensors where a process trains on another GPU.
+        with torch.cuda.device_of(next(x for x in given if isinstance(x, Tensor))):
+            kernel[(triton.cdiv(size, block),)](*given, **constants)
 
 
 # Texels -------------------------------------------------------------------------------------------------------------

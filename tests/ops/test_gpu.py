@@ -26,6 +26,33 @@ def test_kernels_by_the_interpreter():
 
 
 @needs_triton
+def test_kernels_are_launched_on_the_device_of_their_tensors(monkeypatch):
+    """Two GPUs by reading what is passed: tensors say that they are on the second one, the current one is the first."""
+    from mmpi_ns.ops.gpu_scene import launch
+
+    class OnSecond(torch.Tensor):
+        is_cuda = True
+
+        def get_device(self):
+            return 1
+
+    current = [0]
+
+    def exchange(device):
+        before, current[0] = current[0], device
+        return before
+
+    for name in ("_exchange_device", "_maybe_exchange_device"):
+        monkeypatch.setattr(torch.cuda, name, exchange)
+    launches = []
+    kernel = {(2,): lambda *given, **constants: launches.append(current[0])}
+    launch(kernel, 3, 2, OnSecond(torch.zeros(3)), 3)
+    assert launches == [1] and current == [0]
+    launch(kernel, 0, 2, OnSecond(torch.zeros(0)), 0)
+    assert launches == [1], "nothing is launched for nothing"
+
+
+@needs_triton
 def test_kernels_compile_for_a_gpu_without_spilling_registers(monkeypatch):
     """The interpreter takes what the compiler does not: types, shapes, control flow."""
     from triton_compiling import all_launches, spills

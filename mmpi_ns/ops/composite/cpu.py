@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from mmpi_ns.ops.build import call_in_parts
-from mmpi_ns.ops.composite.reference import Composite
+from mmpi_ns.ops.composite.reference import Composite, checked
+from mmpi_ns.ops.layout import shaped
 
 
 class _Weights(torch.autograd.Function):
@@ -22,12 +23,15 @@ class _Weights(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
         tau, *_ = saved = ctx.saved_tensors
-        grad, grads = torch.empty_like(tau), [g.contiguous() for g in grad_outputs]
+        grad, grads = (
+            torch.empty_like(tau),
+            [shaped(g, len(tau), n) for g, n in zip(grad_outputs, (tau.shape[1], 1), strict=True)],
+        )
         call_in_parts("mmpi_composite_back", len(tau), (*saved, *grads), (tau.shape[1], grad))
         return grad, None, None, None
 
 
 def composite_weights(tau: Tensor, valid: Tensor, skipped_before: Tensor, skipped_total: Tensor) -> Composite:
     """See ``ops.composite``."""
-    weights, depth = _Weights.apply(*(x.contiguous() for x in (tau, valid, skipped_before, skipped_total)))  # type: ignore[misc]
+    weights, depth = _Weights.apply(*checked(tau, valid, skipped_before, skipped_total))  # type: ignore[misc]
     return Composite(weights, -torch.expm1(-depth), torch.exp(-depth))

@@ -11,7 +11,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from mmpi_ns.ops.composite.reference import Composite
+from mmpi_ns.ops.composite.reference import Composite, checked
 from mmpi_ns.ops.gpu_scene import block_size, launch, one_minus_exp
 
 SLOTS = 2048
@@ -91,6 +91,5 @@ class _Weights(torch.autograd.Function):
 
 def composite_weights(tau: Tensor, valid: Tensor, skipped_before: Tensor, skipped_total: Tensor) -> Composite:
     """See ``ops.composite``."""
-    parts = (x.contiguous() for x in (tau, valid, skipped_before, skipped_total))
-    weights, depth = _Weights.apply(*parts)  # type: ignore[misc]
+    weights, depth = _Weights.apply(*checked(tau, valid, skipped_before, skipped_total))  # type: ignore[misc]
     return Composite(weights, -torch.expm1(-depth), torch.exp(-depth))

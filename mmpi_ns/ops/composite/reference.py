@@ -12,6 +12,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from mmpi_ns.ops.ends import HALF
+from mmpi_ns.ops.layout import shaped
+
 
 def exclusive_cumsum(values: Float[Tensor, "R S"]) -> Float[Tensor, "R S"]:
     """Sum of all earlier samples on the ray. Shifted, not subtracted: x - x loses what came before a large x."""
@@ -29,6 +32,13 @@ class Composite:
     """1 - transmittance behind the last sample, the dropped ones included."""
     transmittance: Float[Tensor, "R 1"]
     """What passes the whole ray."""
+
+
+def checked(tau: Tensor, valid: Tensor, skipped_before: Tensor, skipped_total: Tensor) -> tuple[Tensor, ...]:
+    """The arguments of ``composite_weights`` as the kernels read them."""
+    shape = tau.shape
+    flags = shaped(valid, *shape, dtype=torch.bool)
+    return shaped(tau, *shape), flags, shaped(skipped_before, *shape), shaped(skipped_total, shape[0], 1)
 
 
 def composite_weights(
@@ -67,7 +77,7 @@ def median_inverse_distance(
     """
     gathered = weights.cumsum(-1)
     total = gathered[:, -1:]
-    reached = (gathered >= 0.5 * total) & valid & (total > 0)
+    reached = (gathered >= HALF * total) & valid & (total > 0)
     index = reached.to(torch.int8).argmax(-1, keepdim=True)
     picked = inverse_t.gather(-1, index)
     return torch.where(reached.any(-1, keepdim=True), picked, torch.zeros_like(picked))
