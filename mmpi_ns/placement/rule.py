@@ -19,7 +19,7 @@ from mmpi_ns.placement.candidates import Candidate, find_candidates
 from mmpi_ns.placement.errors import WORST
 from mmpi_ns.placement.hand_made import drive_plan, room_plan
 from mmpi_ns.placement.observations import Observations
-from mmpi_ns.placement.visibility import VisiblePoints, find_visible_points
+from mmpi_ns.placement.visibility import VisiblePoints, find_visible_points, pixels_per_pixel
 from mmpi_ns.scene.plan import CubePlan, MPIPlan, ScenePlan
 
 MIN_PLANES = 16
@@ -47,8 +47,9 @@ class PlacementConfig:
     """Plane error allowed for four fifths of the points of an MPI, relative to a texel's pixels (automatic)."""
     texel_pixels: float = 1.5
     """Image pixels that a texel spans, seen from the origin of the MPI (automatic)."""
-    rays_per_texel: float = 2.5
-    """Training rays for the footprint of a texel: a short run on large images gets larger texels (automatic)."""
+    rays_per_texel: float = 5.0
+    """Training rays that meet the footprint of a texel, of all images that see it: a short run on large images that
+    overlap little gets larger texels (automatic)."""
     texels_per_ray: float = 8.0
     """Maximum texels for each training ray, in total: more would overfit; 0: no limit (automatic)."""
     height: int = 96
@@ -91,20 +92,28 @@ def place(observations: Observations, config: PlacementConfig, training_rays: in
         half_size = float(np.abs(observations.centers - observations.centers.mean(0)).max()) + visible.near
         near = max(0.5 * visible.near, 1e-6)
         return room_plan(observations, *size, config.cube_voxels, near, half_size)
-    texel_pixels = max(config.texel_pixels, trainable_texel(observations, config, training_rays))
-    config = replace(config, max_texels=affordable_texels(config, training_rays))
-    chosen = _choose(observations, visible, config, texel_pixels)
+    trainable = trainable_texel(observations, visible, config, training_rays)
+    budget = affordable_texels(config, training_rays)
+    finest = max(config.texel_pixels, trainable)
+    chosen, texel_pixels = _choose(observations, visible, replace(config, max_texels=budget), finest)
     mpis = tuple(h for h in chosen if isinstance(h, MPIPlan))
     cube = next((h for h in chosen if isinstance(h, CubePlan)), None)
-    return ScenePlan(_named(mpis), cube, 0.2 * visible.near, visible.near, "automatic placement")
+    if texel_pixels > finest:
+        remedy = "more steps" if budget != config.max_texels else "a larger placement.max-texels"
+    else:
+        remedy = "more steps" if trainable > config.texel_pixels else "a smaller placement.texel-pixels"
+    origin = f"automatic placement, a texel spans {texel_pixels:.1f} pixels: finer with {remedy}"
+    return ScenePlan(_named(mpis), cube, 0.2 * visible.near, visible.near, origin)
 
 
-def trainable_texel(observations: Observations, config: PlacementConfig, training_rays: int | None) -> float:
-    """Pixels that a texel must span to get ``rays_per_texel`` of the training's rays; 0 if these are not known."""
+def trainable_texel(
+    observations: Observations, visible: VisiblePoints, config: PlacementConfig, training_rays: int | None
+) -> float:
+    """Pixels that a texel must span to meet ``rays_per_texel`` of the training's rays; 0 if these are not known."""
     if training_rays is None:
         return 0.0
     rays_per_pixel = training_rays / float(observations.sizes.prod(-1).sum())
-    return (config.rays_per_texel / rays_per_pixel) ** 0.5
+    return (config.rays_per_texel / (rays_per_pixel * pixels_per_pixel(observations, visible))) ** 0.5
 
 
 def affordable_texels(config: PlacementConfig, training_rays: int | None) -> float:
@@ -115,19 +124,20 @@ def affordable_texels(config: PlacementConfig, training_rays: int | None) -> flo
 
 def _choose(
     observations: Observations, visible: VisiblePoints, config: PlacementConfig, texel_pixels: float
-) -> list[MPIPlan | CubePlan]:
-    """The heads for a scene, with texels no finer than the budget allows."""
+) -> tuple[list[MPIPlan | CubePlan], float]:
+    """The heads for a scene, with texels no finer than the budget allows, and the pixels that a texel spans."""
     candidates = find_candidates(observations, visible, with_cubes=config.max_voxels > 0)
-    best: list[MPIPlan | CubePlan] | None = None
+    best: tuple[list[MPIPlan | CubePlan], float] | None = None
     chosen: list[MPIPlan | CubePlan] = []
-    too_fine = None
+    too_fine, tried = None, texel_pixels
     for _ in range(BUDGET_ROUNDS):
+        tried = texel_pixels
         chosen = _Choice(candidates, visible.weights, config, texel_pixels).run()
         mpis = widened([h for h in chosen if isinstance(h, MPIPlan)], observations, visible)
         chosen = [*mpis, *(h for h in chosen if isinstance(h, CubePlan))]
         excess = sum(h.texels for h in chosen) / config.max_texels if config.max_texels else 0.0
         if excess <= 1.0:
-            best = chosen
+            best = chosen, tried
             if too_fine is None or excess > 0.8:
                 break
             texel_pixels = (too_fine * texel_pixels) ** 0.5
@@ -135,7 +145,7 @@ def _choose(
             too_fine = texel_pixels
             # Coarser texels mean fewer rows, columns and planes: nearly a third power.
             texel_pixels *= max(1.04, excess ** (1 / 3)) if best is None else 1.1
-    return chosen if best is None else best
+    return (chosen, tried) if best is None else best
 
 
 class _Choice:
@@ -193,12 +203,12 @@ class _Choice:
                 return chosen
             chosen = [j for n, j in enumerate(chosen) if n != least]
 
-    def _planes(self, j: int, own: NDArray[np.bool_]) -> int:
+    def _planes(self, j: int, served: NDArray[np.bool_]) -> int:
         """Planes at which the error of four fifths of the observations served by candidate j is small enough."""
-        error = self.candidates[j].plane[own]
+        error = self.candidates[j].plane[served]
         error = error[np.isfinite(error)]
-        wanted = float(np.quantile(error, 0.8)) / (self.config.plane_pixels * self.texel_pixels) if len(error) else 0.0
-        return int(np.clip(8 * round((1 + wanted) / 8), MIN_PLANES, self.config.max_planes))
+        steps = float(np.quantile(error, 0.8)) / (self.config.plane_pixels * self.texel_pixels) if len(error) else 0.0
+        return int(np.clip(8 * round((1 + steps) / 8), MIN_PLANES, self.config.max_planes))
 
     def _head(self, candidate: Candidate, planes: int) -> MPIPlan | CubePlan:
         return candidate.at(self.texel_pixels, planes, self.config.max_voxels)

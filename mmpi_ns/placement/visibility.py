@@ -17,6 +17,8 @@ FRUSTUM_SHARE, FEW = 0.15, 10
 Where an image has no keypoints (sky, a white wall) there must be planes all the same."""
 SPAN = (0.25, 0.9)
 """Between these quantiles of depth the points of an image are said to lie."""
+COVERED, LEAST_COVERED = 3000, 0.25
+"""Points whose images are counted, and the share of them that may be seen by fewer pixels than is said."""
 WINDOW, SUPPORT = 1.5, 0.04
 """What a camera sees starts where so many of its observations lie within a factor of WINDOW in depth."""
 
@@ -68,6 +70,29 @@ def find_visible_points(observations: Observations) -> VisiblePoints:
     return _weighed(observations, cameras, points, nearest, typical, near)
 
 
+def pixels_per_pixel(observations: Observations, visible: VisiblePoints) -> float:
+    """Training pixels that fall, in all images together, on what one pixel of an image shows; at least 1.
+
+    An image counts by the square of its magnification relative to the observing one. Three quarters of what the
+    cameras see are covered by at least so many pixels. What may hide a point from an image is not considered.
+    """
+    some = np.linspace(0, len(visible.cameras) - 1, min(COVERED, len(visible.cameras))).round().astype(int)
+    cameras, points, weights = visible.cameras[some], visible.points[some], visible.weights[some]
+    magnification = observations.intrinsics[cameras, 0] / observations.depths(cameras, points)
+    covered = np.zeros(len(some))
+    for i in range(len(observations.centers)):
+        camera = np.full(len(some), i)
+        depths = observations.depths(camera, points)
+        pixels, ahead = observations.project(camera, points)
+        seen = (depths > 0) & (
+            observations.wide[i] | (ahead & ((pixels >= 0) & (pixels <= observations.sizes[i])).all(-1))
+        )
+        covered[seen] += (observations.intrinsics[i, 0] / depths[seen] / magnification[seen]) ** 2
+    order = np.argsort(covered, kind="stable")
+    share = np.cumsum(weights[order])
+    return max(1.0, float(covered[order[np.searchsorted(share, LEAST_COVERED * share[-1])]]))
+
+
 def _start(depth: Array) -> float:
     """The least depth from which on a factor of WINDOW holds SUPPORT of all: a lone outlier in front does not count."""
     ordered = np.sort(depth)
@@ -81,8 +106,8 @@ def _weighed(
     count = len(observations.centers)
     # Evenly spaced in an order that no numbering, pose or unit enters: by depth.
     order = np.argsort(observations.depths(cameras, points) / near, kind="stable")
-    wanted = min(len(order), max(SAMPLED, SAMPLED_PER_CAMERA * count))
-    keep = order[np.linspace(0, len(order) - 1, wanted).round().astype(int)]
+    sampled = min(len(order), max(SAMPLED, SAMPLED_PER_CAMERA * count))
+    keep = order[np.linspace(0, len(order) - 1, sampled).round().astype(int)]
     cameras, points = cameras[keep], points[keep]
     seen = np.bincount(cameras, minlength=count)
     share = (1 - FRUSTUM_SHARE) * seen / (seen + FEW)

@@ -12,6 +12,7 @@ from mmpi_ns.placement.errors import mpi_errors, pixel_errors
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.placement.rule import PlacementConfig, place
 from mmpi_ns.placement.sweep import add_swept_points
+from mmpi_ns.placement.visibility import find_visible_points, pixels_per_pixel
 from mmpi_ns.scene.plan import MPIPlan, ScenePlan
 
 FOCAL, WIDTH, HEIGHT = 180.0, 310.0, 94.0
@@ -115,10 +116,16 @@ def test_still_cameras_side_by_side_get_one_mpi():
 def test_texels_are_no_finer_than_the_rays_of_a_run_can_train():
     observations = street()
     pixels = int(observations.sizes.prod(-1).sum())
-    fine, enough, short = (place(observations, PlacementConfig(), rays) for rays in (None, 10 * pixels, pixels // 10))
+    config = PlacementConfig(texels_per_ray=0, max_texels=0)
+    fine, enough, short = (place(observations, config, rays) for rays in (None, 10 * pixels, pixels // 10))
     assert [m.width for m in enough.mpis] == [m.width for m in fine.mpis]
     tangents = short.mpis[0].extent[1] - short.mpis[0].extent[0]
-    assert tangents * FOCAL / (short.mpis[0].width - 1) == pytest.approx(5.0, rel=0.02)  # (2.5 / 0.1) ** 0.5 pixels
+    # Five rays for the footprint of a texel, where every pixel has a tenth of a ray and several images see the same.
+    sharing = pixels_per_pixel(observations, find_visible_points(observations))
+    assert 3 < sharing < len(observations.centers)
+    spans = tangents * FOCAL / (short.mpis[0].width - 1)
+    assert spans == pytest.approx((5 / (0.1 * sharing)) ** 0.5, rel=0.02)
+    assert f"a texel spans {spans:.1f} pixels: finer with more steps" in short.origin_of_plan
 
 
 def test_every_chosen_mpi_lowers_the_expected_error():

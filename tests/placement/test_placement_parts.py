@@ -15,7 +15,7 @@ from mmpi_ns.placement.errors import WORST, PixelErrors, cube_errors, mpi_errors
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.placement.rule import PlacementConfig, _Choice, _named, place
 from mmpi_ns.placement.show.explain import explain, table
-from mmpi_ns.placement.visibility import find_visible_points
+from mmpi_ns.placement.visibility import find_visible_points, pixels_per_pixel
 from mmpi_ns.scene.plan import CubePlan, MPIPlan, ScenePlan
 
 FX, FY, WIDTH, HEIGHT = 150.0, 100.0, 200, 100
@@ -243,12 +243,17 @@ def test_the_finest_plan_within_the_budget_is_kept_and_the_coarsest_where_none_i
     monkeypatch.setattr(rule, "widened", lambda mpis, *_: mpis)
     observations = orbit()
     config = PlacementConfig(max_texels=2000, texel_pixels=1.5)
-    (found,) = rule._choose(observations, find_visible_points(observations), config, 1.5)
+    (found,), spans = rule._choose(observations, find_visible_points(observations), config, 1.5)
     if finest < 100:
         assert found.texels == 200 and len(tried) == rule.BUDGET_ROUNDS and tried[-1] < finest
-        assert tried[int(found.name) - 1] == min(t for t in tried if t >= finest) == pytest.approx(wanted, abs=0.02)
+        assert (
+            spans
+            == tried[int(found.name) - 1]
+            == min(t for t in tried if t >= finest)
+            == pytest.approx(wanted, abs=0.02)
+        )
     else:
-        assert found.name == str(len(tried)) and tried[-1] == max(tried) > wanted
+        assert found.name == str(len(tried)) and spans == tried[-1] == max(tried) > wanted
 
 
 def test_texels_in_all_follow_the_settings_and_the_rays_whichever_allow_fewer():
@@ -258,6 +263,64 @@ def test_texels_in_all_follow_the_settings_and_the_rays_whichever_allow_fewer():
     assert rule.affordable_texels(replace(config, max_texels=0), 1000) == 8000
     assert rule.affordable_texels(replace(config, texels_per_ray=0), 10) == 2000
     assert rule.affordable_texels(replace(config, max_texels=0), None) == 0
+
+
+def side_by_side(count: int, depths=(-10.0,)) -> Observations:
+    """Cameras within a millimetre of each other that see the same points, or as far apart that none shares any."""
+    points = np.array([[0.01 * x, 0.01 * y, z] for z in depths for x in range(5) for y in range(5)])
+    centers = [[0.001 * i, 0, 0] for i in range(count)]
+    return observed(centers, np.tile(points, (count, 1)), np.arange(count).repeat(len(points)))
+
+
+def test_pixels_that_see_a_pixels_content_are_those_of_all_images_by_their_magnification():
+    random = np.random.default_rng(3)
+    centers = random.uniform([-6, -3, -2], [6, 3, 2], (7, 3))
+    points = random.uniform([-4, -2, -14], [4, 2, -8], (40, 3))
+    cameras, numbers = np.divmod(np.arange(280), 40)
+    offset = points[numbers] - centers[cameras]
+    seen = (np.abs(offset[:, 0] * FX) < -offset[:, 2] * WIDTH / 2) & (
+        np.abs(offset[:, 1] * FY) < -offset[:, 2] * HEIGHT / 2
+    )
+    observations = observed(centers, points[numbers[seen]], cameras[seen])
+    visible = find_visible_points(observations)
+    covered = []
+    for camera, point in zip(visible.cameras, visible.points, strict=True):
+        total = 0.0
+        for center in centers:
+            x, y, z = point - center
+            if z < 0 and abs(FX * x / z) <= WIDTH / 2 and abs(FY * y / z) <= HEIGHT / 2:
+                total += ((point - centers[camera])[2] / z) ** 2
+        covered.append(total)
+    order = np.argsort(covered)
+    share = np.cumsum(visible.weights[order]) / visible.weights.sum()
+    assert pixels_per_pixel(observations, visible) == pytest.approx(max(1, covered[order[(share >= 0.25).argmax()]]))
+    assert 1.2 < pixels_per_pixel(observations, visible) < 7
+
+
+def test_texels_are_as_fine_as_the_rays_of_all_images_that_see_them_train():
+    config = PlacementConfig(rays_per_texel=5)
+    spans = {}
+    for count in (1, 4, 16):
+        observations = side_by_side(count)
+        rays = 0.1 * observations.sizes.prod(-1).sum()  # one ray for ten pixels
+        spans[count] = rule.trainable_texel(observations, find_visible_points(observations), config, rays)
+    assert list(spans.values()) == pytest.approx([50**0.5, 12.5**0.5, 3.125**0.5], rel=0.01)
+    assert rule.trainable_texel(observations, find_visible_points(observations), config, None) == 0
+
+
+@pytest.mark.parametrize(
+    ("changes", "rays", "words"),
+    [
+        ({}, 10**9, "2.0 pixels: finer with a smaller placement.texel-pixels"),
+        ({}, 2000, " pixels: finer with more steps"),
+        ({"texels_per_ray": 1}, 10**5, " pixels: finer with more steps"),
+        ({"max_texels": 2e4}, 10**9, " pixels: finer with a larger placement.max-texels"),
+    ],
+)
+def test_a_plan_says_how_large_texels_are_and_what_makes_them_finer(changes, rays, words):
+    config = replace(PlacementConfig(texel_pixels=2.0, texels_per_ray=0, max_texels=0), **changes)
+    plan = place(side_by_side(4), config, rays)
+    assert plan.origin_of_plan.startswith("automatic placement, a texel spans ") and words in plan.origin_of_plan
 
 
 def test_a_short_training_gets_a_small_plan():
