@@ -29,7 +29,11 @@ def widened(mpis: list[MPIPlan], observations: Observations, visible: VisiblePoi
         visible: points that they see.
     """
     points = border_points(observations, visible)
-    tangents, depths = _in_frames(mpis, points)
+    origins = np.array([m.origin for m in mpis], dtype=np.float64)
+    axes = np.array([m.axes for m in mpis], dtype=np.float64)
+    local = np.einsum("kij,kpj->kpi", axes, points - origins[:, None])
+    depths = local[..., 2]
+    tangents = local[..., :2] / np.where(depths > 0, depths, np.nan)[..., None]
     extents = np.array([m.extent for m in mpis])
     ahead = (depths >= np.array([[m.near] for m in mpis])) & (depths <= np.array([[m.far] for m in mpis]))
     held = ahead & (_outside(tangents, extents).max(-1) <= 0)
@@ -53,15 +57,6 @@ def border_points(observations: Observations, visible: VisiblePoints) -> Array:
         directions = observations.directions(i, shares) @ pose[:, :3].T
         clouds += [pose[:, 3] + depth * directions for depth in depths]
     return np.concatenate(clouds)
-
-
-def _in_frames(mpis: list[MPIPlan], points: Array) -> tuple[Array, Array]:
-    """Tangents [K, P, 2] and depths [K, P] of points in every MPI."""
-    origins = np.array([m.origin for m in mpis], dtype=np.float64)
-    axes = np.array([m.axes for m in mpis], dtype=np.float64)
-    local = np.einsum("kij,kpj->kpi", axes, points - origins[:, None])
-    depth = local[..., 2]
-    return local[..., :2] / np.where(depth > 0, depth, np.nan)[..., None], depth
 
 
 def _outside(tangents: Array, extents: Array) -> Array:

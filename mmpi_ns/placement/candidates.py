@@ -75,7 +75,7 @@ def find_candidates(observations: Observations, visible: VisiblePoints, with_cub
     return [*views, *(_cubes(observations, visible) if with_cubes else [])]
 
 
-def spread_cameras(observations: Observations, visible: VisiblePoints, wanted: int) -> list[int]:
+def spread_cameras(observations: Observations, visible: VisiblePoints, count: int) -> list[int]:
     """Cameras far apart in position or direction, each the farthest from the previous ones.
 
     Starts at the camera farthest from the middle, so the numbering of the cameras does not matter.
@@ -85,7 +85,7 @@ def spread_cameras(observations: Observations, visible: VisiblePoints, wanted: i
     distance = -np.linalg.norm(place - place.mean(0), axis=-1)
     chosen = [int(distance.argmin())]
     distance = np.full(len(place), np.inf)
-    while len(chosen) < min(wanted, len(place)):
+    while len(chosen) < min(count, len(place)):
         distance = np.minimum(distance, np.linalg.norm(place - place[chosen[-1]], axis=-1))
         chosen.append(int(distance.argmax()))
     return chosen
@@ -117,9 +117,9 @@ def _faces(observations: Observations, i: int) -> Iterator[_Face]:
     for face in FACES if observations.wide[i] else FACES[:1]:
         turn: Array = np.array(facing_axes(np.eye(3), face))
         x, y, ahead = local = turn @ seen.T
-        own = ahead >= BESIDE * np.abs(local).max(0) if observations.wide[i] else ahead > 1e-3
-        if own.sum() > 2:
-            u, v = (np.array([t.min(), t.max()]) for t in (x[own] / ahead[own], y[own] / ahead[own]))
+        inside = ahead >= BESIDE * np.abs(local).max(0) if observations.wide[i] else ahead > 1e-3
+        if inside.sum() > 2:
+            u, v = (np.array([t.min(), t.max()]) for t in (x[inside] / ahead[inside], y[inside] / ahead[inside]))
             if min(np.ptp(u), np.ptp(v)) > 1e-3:
                 yield _Face(name if face == "front" else f"{name} {face}", np.matmul(turn, axes), u, v)
 

@@ -111,12 +111,12 @@ def pixel_slopes(
     def slope(direction: Array) -> Array:
         """Length in pixels of a unit step along one of (u, v, w)."""
         moved = direction[:, :2] / depth[:, None] + q[:, :2] * (direction[:, 2] / depth**2)[:, None]
-        found = np.where(seen, np.linalg.norm(moved * focal, axis=-1), np.inf)
+        pixels = np.where(seen, np.linalg.norm(moved * focal, axis=-1), np.inf)
         if wide.any():  # such lenses have about as many pixels for each degree at the borders as in the middle
             some, size = direction[wide], np.linalg.norm(q[wide], axis=-1)
             turned = np.linalg.norm(np.cross(some, q[wide]), axis=-1) / np.maximum(size, 1e-12) ** 2
-            found[wide] = np.where(inside[wide], turned * focal[wide].mean(-1), np.inf)
-        return found
+            pixels[wide] = np.where(inside[wide], turned * focal[wide].mean(-1), np.inf)
+        return pixels
 
     return slope(shift), slope(columns[..., 0]), slope(columns[..., 1])
 

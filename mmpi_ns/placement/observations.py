@@ -110,10 +110,10 @@ class Observations:
         at = shares * (len(grid) - 1)
         first = np.clip(np.floor(at).astype(int), 0, len(grid) - 2)
         (x, y), (u, v) = first.T, (at - first).T[..., None]
-        found = (1 - v) * ((1 - u) * grid[y, x] + u * grid[y, x + 1])
-        found += v * ((1 - u) * grid[y + 1, x] + u * grid[y + 1, x + 1])
-        depth = np.abs(found).max(-1) if self.wide[camera] else -found[:, 2]
-        return found / depth[:, None]
+        directions = (1 - v) * ((1 - u) * grid[y, x] + u * grid[y, x + 1])
+        directions += v * ((1 - u) * grid[y + 1, x] + u * grid[y + 1, x + 1])
+        depth = np.abs(directions).max(-1) if self.wide[camera] else -directions[:, 2]
+        return directions / depth[:, None]
 
     def project(self, cameras: NDArray[np.int64], points: Array) -> tuple[Array, NDArray[np.bool_]]:
         """Pixels [Q, 2] at which cameras [Q] would see points [Q, 3], lens distortion left out, and which lie ahead."""

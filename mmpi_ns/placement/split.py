@@ -40,8 +40,8 @@ def place_windows(
         return WindowedPlan.single(place(observations, config, training_rays))
     windows = []
     for center, radius, margin in balls:
-        own = of_cameras(observations, cameras_in(observations.centers, center, radius + margin))
-        windows.append(Window(tuple(center.tolist()), radius, margin, place(own, config, training_rays)))
+        observed = of_cameras(observations, cameras_in(observations.centers, center, radius + margin))
+        windows.append(Window(tuple(center.tolist()), radius, margin, place(observed, config, training_rays)))
     return WindowedPlan(tuple(windows))
 
 
@@ -124,7 +124,9 @@ def _settled(centers: Array, middles: Array) -> Array:
     """Moves every ball to the middle of the cameras nearest to it (Lloyd)."""
     for _ in range(ROUNDS):
         owner = _nearest(centers, middles)
-        moved = np.stack([_middle(centers[owner == i]) for i in range(len(middles)) if (owner == i).any()])
+        balls = [centers[owner == i] for i in range(len(middles)) if (owner == i).any()]
+        # The centre of the bounding box: balls around it are smaller than around the mean.
+        moved = np.stack([(ball.min(0) + ball.max(0)) / 2 for ball in balls])
         if len(moved) == len(middles) and np.allclose(moved, middles, rtol=1e-9, atol=0):
             break
         middles = moved
@@ -133,11 +135,6 @@ def _settled(centers: Array, middles: Array) -> Array:
 
 def _nearest(centers: Array, middles: Array) -> NDArray[np.int64]:
     return np.array([np.linalg.norm(middles - c, axis=-1).argmin() for c in centers])
-
-
-def _middle(points: Array) -> Array:
-    """Centre of the bounding box of points: balls around it are smaller than around their mean."""
-    return (points.min(0) + points.max(0)) / 2
 
 
 def _without_small(centers: Array, middles: Array) -> Array:

@@ -45,36 +45,33 @@ def add_swept_points(observations: Observations, images: list[Array], num_refere
     """
     count = len(images)
     references = np.unique(np.linspace(0, count - 1, min(num_references, count)).round().astype(int))
-    views = [_view(observations, i, image) for i, image in enumerate(images)]
+    scales = [image.shape[1] / width for image, width in zip(images, observations.sizes[:, 0], strict=True)]
+    views = [
+        _View(image, pose, intrinsics * scale)
+        for image, pose, intrinsics, scale in zip(
+            images, observations.camera_to_worlds, observations.intrinsics, scales, strict=True
+        )
+    ]
     points, cameras, indices = [observations.points], [observations.seen_by], [observations.seen_point]
     total = len(observations.points)
     for i in references:
         neighbours = nearest_views(observations.camera_to_worlds, int(i), 8, MAX_ANGLE)
         if not neighbours:
             continue
-        found = _sweep(views[i], [views[j] for j in neighbours[:4]])
-        points.append(found)
+        swept = _sweep(views[i], [views[j] for j in neighbours[:4]])
+        points.append(swept)
         for j in (int(i), *neighbours):
-            seen = np.nonzero(_in_image(observations, j, found))[0]
+            pixels, ahead = observations.project(np.full(len(swept), j), swept)
+            seen = np.nonzero(ahead & ((pixels >= 0) & (pixels < observations.sizes[j])).all(-1))[0]
             cameras.append(np.full(len(seen), j, np.int64))
             indices.append(total + seen)
-        total += len(found)
+        total += len(swept)
     return replace(
         observations,
         points=np.concatenate(points),
         seen_by=np.concatenate(cameras),
         seen_point=np.concatenate(indices),
     )
-
-
-def _in_image(observations: Observations, camera: int, points: Array) -> NDArray[np.bool_]:
-    pixels, ahead = observations.project(np.full(len(points), camera), points)
-    return ahead & ((pixels >= 0) & (pixels < observations.sizes[camera])).all(-1)
-
-
-def _view(observations: Observations, index: int, image: Array) -> _View:
-    scale = image.shape[1] / observations.sizes[index, 0]
-    return _View(image, observations.camera_to_worlds[index], observations.intrinsics[index] * scale)
 
 
 def _sweep(reference: _View, neighbours: list[_View]) -> Array:
@@ -87,7 +84,12 @@ def _sweep(reference: _View, neighbours: list[_View]) -> Array:
     # The nearest neighbour sets how near points may be: on a walk the others have long turned away from it.
     baseline = max(min(distances), 0.1 * max(distances))
     disparities = np.linspace(0, 0.35 * width / (fx * baseline), HYPOTHESES)
-    scores = np.stack([_score(reference, neighbours, rays, w) for w in disparities])
+    # Of each disparity the mean correlation of the better half of the neighbours.
+    better = max(1, (len(neighbours) + 1) // 2)
+    correlations = (
+        [_correlation(reference.image, *_warp(reference, n, rays, w)) for n in neighbours] for w in disparities
+    )
+    scores = np.stack([np.sort(np.stack(c), 0)[::-1][:better].mean(0) for c in correlations])
     best = scores.argmax(0)
     top = scores.max(0)
     level = np.arange(HYPOTHESES)[:, None, None]
@@ -108,13 +110,6 @@ def _peak_offset(scores: Array, best: NDArray[np.int64]) -> Array:
     bend = below - 2 * top + above
     offset = 0.5 * (below - above) / np.where(bend < -1e-9, bend, -1.0)
     return np.where((bend < -1e-9) & (inner[0] == best), np.clip(offset, -0.5, 0.5), 0.0)
-
-
-def _score(reference: _View, neighbours: list[_View], rays: Array, disparity: float) -> Array:
-    """Mean correlation of the better half of the neighbours, each warped by the plane at this disparity."""
-    correlations = [_correlation(reference.image, *_warp(reference, n, rays, disparity)) for n in neighbours]
-    ranked = np.sort(np.stack(correlations), 0)[::-1]
-    return ranked[: max(1, (len(neighbours) + 1) // 2)].mean(0)
 
 
 def _warp(reference: _View, neighbour: _View, rays: Array, disparity: float) -> tuple[Array, NDArray[np.bool_]]:

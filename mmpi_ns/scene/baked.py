@@ -131,13 +131,13 @@ def brick_numbers(columns: Int[Tensor, "N 2"], mpi: MPIPlan) -> Int[Tensor, "P Y
 
 def neighbours(columns: Int[Tensor, "N 2"], mpis: tuple[MPIPlan, ...], count: int) -> Int[Tensor, "2 B"]:
     """The bricks to the right of each brick and below it, in its plane; -1 if there is none."""
-    found, start = torch.full((2, count), -1), 0
+    bricks, start = torch.full((2, count), -1), 0
     for mpi in mpis:
         numbers = brick_numbers(columns[start : start + columns_of(mpi)], mpi).to(torch.int64)
         beside = torch.nn.functional.pad(numbers, (0, 1, 0, 1), value=-1)
-        found[:, numbers[numbers >= 0]] = torch.stack([beside[:, :-1, 1:], beside[:, 1:, :-1]])[:, numbers >= 0]
+        bricks[:, numbers[numbers >= 0]] = torch.stack([beside[:, :-1, 1:], beside[:, 1:, :-1]])[:, numbers >= 0]
         start += columns_of(mpi)
-    return found
+    return bricks
 
 
 def take_borders(codes: UInt8[Tensor, "B 8 8 ..."], beside: Int[Tensor, "2 B"]) -> None:

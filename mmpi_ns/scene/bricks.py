@@ -68,8 +68,8 @@ def grown_tiles(
     """
     stored = torch.zeros_like(new[0].tiles, dtype=torch.bool)
     for source, target, cube in zip(old, new, is_cube, strict=True):
-        for own, planes in _chunks(target, cube):
-            there = _resize(_stored(source, own).float(), target, cube)[..., 0] > 0
+        for sources, planes in _chunks(target, cube):
+            there = _resize(_stored(source, sources).float(), target, cube)[..., 0] > 0
             reached = pad(there.float(), (0, -target.width % SIDE, 0, -target.height % SIDE))
             tiles = max_pool2d(reached[:, None], SIDE)[:, 0] > 0
             first = target.first_tile + planes.start * target.down * target.across
@@ -89,9 +89,9 @@ def resample(
         return lazy_zeros((int((new[0].tiles > 0).sum() + 1) * BRICK, table.shape[-1]), table.dtype, table.device)
     out = new_table(new[0].tiles, table.shape[-1], empty, table.dtype)
     for source, target, cube in zip(old, new, is_cube, strict=True):
-        for own, planes in _chunks(target, cube):
-            images = read_planes(table, source, own)
-            stored = _stored(source, own).to(table.dtype)
+        for sources, planes in _chunks(target, cube):
+            images = read_planes(table, source, sources)
+            stored = _stored(source, sources).to(table.dtype)
             if bool(stored.all()):
                 write_planes(out, target, planes, _resize(images, target, cube))
                 continue

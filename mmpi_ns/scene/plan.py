@@ -150,7 +150,11 @@ class ScenePlan:
         for i, mpi in enumerate(self.mpis):
             _validate_mpi(mpi, i)
         if self.cube is not None:
-            _validate_cube(self.cube)
+            for name in ("lower", "upper"):
+                check_row(f"The '{name}' of the plan's cube", getattr(self.cube, name), 3, LENGTH)
+            check_row("The 'shape' of the plan's cube", self.cube.shape, 3, Number(2, MOST_VOXELS, whole=True))
+            if not all(a < b for a, b in zip(self.cube.lower, self.cube.upper, strict=True)):
+                raise InputError("The plan's cube needs 'upper' > 'lower' on every axis.")
         check_number("The plan's 'ray_near'", self.ray_near, Number(0, HUGE))
         check_number("The plan's 'content_near'", self.content_near, Number(0, HUGE))
         check_text("The plan's 'origin_of_plan'", self.origin_of_plan)
@@ -213,30 +217,18 @@ def _validate_mpi(mpi: MPIPlan, index: int) -> None:
         raise InputError(f"The 'axes' of {where} must be three rows of three numbers, not {shown(mpi.axes)}.")
     for i, row in enumerate(mpi.axes):
         check_row(f"Row {i + 1} of the 'axes' of {where}", row, 3, Number(-2, 2))
-    _validate_axes(mpi.axes, where)
+    dots = [sum(a * b for a, b in zip(p, q, strict=True)) for p in mpi.axes for q in mpi.axes]
+    if max(abs(d - float(i % 4 == 0)) for i, d in enumerate(dots)) > 1e-4:
+        raise InputError(f"The axes of {where} are not orthonormal: give three perpendicular unit rows.")
+    (a, b, c), (d, e, f), (g, h, i) = mpi.axes
+    if a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) < 0:
+        raise InputError(f"The axes of {where} are left-handed: negate one row, or give x right, y down, z facing.")
     u0, u1, v0, v1 = mpi.extent
     if u0 >= u1 or v0 >= v1:
         raise InputError(f"{where} needs an 'extent' (u0, u1, v0, v1) with u0 < u1 and v0 < v1.")
     far = mpi.far
     if far != math.inf and not Number(SHALLOWEST * mpi.near, HUGE).holds(far):
         raise InputError(f"{where} needs a 'far' beyond its 'near', or null in 'far' for infinity, not {shown(far)}.")
-
-
-def _validate_axes(axes: tuple[Vector, Vector, Vector], where: str) -> None:
-    dots = [sum(a * b for a, b in zip(p, q, strict=True)) for p in axes for q in axes]
-    if max(abs(d - float(i % 4 == 0)) for i, d in enumerate(dots)) > 1e-4:
-        raise InputError(f"The axes of {where} are not orthonormal: give three perpendicular unit rows.")
-    (a, b, c), (d, e, f), (g, h, i) = axes
-    if a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) < 0:
-        raise InputError(f"The axes of {where} are left-handed: negate one row, or give x right, y down, z facing.")
-
-
-def _validate_cube(cube: CubePlan) -> None:
-    for name in ("lower", "upper"):
-        check_row(f"The '{name}' of the plan's cube", getattr(cube, name), 3, LENGTH)
-    check_row("The 'shape' of the plan's cube", cube.shape, 3, Number(2, MOST_VOXELS, whole=True))
-    if not all(a < b for a, b in zip(cube.lower, cube.upper, strict=True)):
-        raise InputError("The plan's cube needs 'upper' > 'lower' on every axis.")
 
 
 def read_object(text: str) -> dict:

@@ -57,8 +57,8 @@ class TexelGrid:
     @property
     def own_tiles(self) -> Int[Tensor, "D Y X"]:
         """Brick of each of the head's tiles."""
-        own = self.tiles[self.first_tile : self.first_tile + self.num_tiles]
-        return own.view(self.depth, self.down, self.across)
+        tiles = self.tiles[self.first_tile : self.first_tile + self.num_tiles]
+        return tiles.view(self.depth, self.down, self.across)
 
     @property
     def rows(self) -> Int[Tensor, "D*H*W"]:
@@ -112,7 +112,7 @@ class TexelGrid:
     def neighbours(self, rows: Int[Tensor, "N"]) -> tuple[Int[Tensor, "N 6"], Float[Tensor, "N 6"]]:
         """Rows of the texels beside each row along x, y and z (-, +); 1 where one is stored, else the row itself."""
         z, y, x = self.texel(rows)
-        found, exists = [], []
+        beside_rows, exists = [], []
         for dz, dy, dx in ((0, 0, -1), (0, 0, 1), (0, -1, 0), (0, 1, 0), (-1, 0, 0), (1, 0, 0)):
             beside = (z + dz, y + dy, x + dx)
             inside = torch.ones_like(rows, dtype=torch.bool)
@@ -120,9 +120,9 @@ class TexelGrid:
                 inside &= (i >= 0) & (i < n)
             other = self.row(*(torch.where(inside, i, j) for i, j in zip(beside, (z, y, x), strict=True)))
             inside &= other >= BRICK
-            found.append(torch.where(inside, other, rows))
+            beside_rows.append(torch.where(inside, other, rows))
             exists.append(inside)
-        return torch.stack(found, -1), torch.stack(exists, -1).to(torch.float32)
+        return torch.stack(beside_rows, -1), torch.stack(exists, -1).to(torch.float32)
 
     def _corners(self, z: Tensor, y: Tensor, x: Tensor) -> Tensor:
         return torch.stack([self.row(z, y + dy, x + dx) for dy in (0, 1) for dx in (0, 1)], -1)

@@ -47,8 +47,8 @@ class TrainingViews:
         normals = [(one, zero, -x.amin(1)), (-one, zero, x.amax(1)), (zero, one, -y.amin(1)), (zero, -one, y.amax(1))]
         inward = torch.stack([torch.stack(n, -1) for n in normals], 1) @ axes.mT
         kinds = cameras.camera_type.reshape(-1, 1)
-        known = (kinds == CameraType.PERSPECTIVE.value) | (kinds == CameraType.FISHEYE.value)
-        bounded = known[:, 0].expand(count) & (ahead > 0.01).all(1)
+        projects = (kinds == CameraType.PERSPECTIVE.value) | (kinds == CameraType.FISHEYE.value)
+        bounded = projects[:, 0].expand(count) & (ahead > 0.01).all(1)
         return TrainingViews(poses[:, :, 3], torch.where(bounded[:, None, None], inward, 0.0))
 
     def some(self, chosen: NDArray[np.int64]) -> TrainingViews:
@@ -68,11 +68,11 @@ def reachable_tiles(views: TrainingViews, plan: ScenePlan) -> Bool[Tensor, "T"]:
         views: the training images.
         plan: the heads, at the resolution in use.
     """
-    found = [_tiles_of(mpi, views).reshape(-1) for mpi in plan.mpis]
+    tiles = [_tiles_of(mpi, views).reshape(-1) for mpi in plan.mpis]
     if plan.cube is not None:
         depth, height, width = plan.cube.shape
-        found.append(torch.ones(depth * -(-height // SIDE) * -(-width // SIDE), dtype=torch.bool))
-    return torch.cat(found)
+        tiles.append(torch.ones(depth * -(-height // SIDE) * -(-width // SIDE), dtype=torch.bool))
+    return torch.cat(tiles)
 
 
 def _tiles_of(mpi: MPIPlan, views: TrainingViews) -> Bool[Tensor, "L Y X"]:
@@ -87,14 +87,14 @@ def _tiles_of(mpi: MPIPlan, views: TrainingViews) -> Bool[Tensor, "L Y X"]:
     along_x = _most(normals[..., 0], mpi.extent[:2], mpi.width)
     along_y = _most(normals[..., 1], mpi.extent[2:], mpi.height)
     shift = (normals * origins[:, None]).sum(-1)
-    found = torch.zeros(mpi.planes, along_y.shape[-1], along_x.shape[-1], dtype=torch.bool)
+    reachable = torch.zeros(mpi.planes, along_y.shape[-1], along_x.shape[-1], dtype=torch.bool)
     for plane in range(mpi.planes):
         w = mpi.last_disparity + (mpi.planes - 1 - plane) * mpi.disparity_step
         before = w * origins[:, 2] < 1
         rest = (normals[..., 2] - w * shift)[before]
         most = along_y[before][..., :, None] + (along_x[before] + rest[..., None])[..., None, :]
-        found[plane] = (most >= 0).all(1).any(0)
-    return found
+        reachable[plane] = (most >= 0).all(1).any(0)
+    return reachable
 
 
 def _most(slope: Float[Tensor, "M 4"], extent: tuple[float, ...], size: int) -> Float[Tensor, "M 4 N"]:

@@ -62,9 +62,9 @@ class SceneCommand:
 
         ranges = {"seed": Number(0, whole=True), "noise": Number(0), "outliers": Number(0, 1)}
         ranges["moving"] = Number(0, 1000, whole=True)
-        given = {"points": Number(1, whole=True), "count": Number(1, whole=True), "length": Number(0, above=True)}
-        given |= {"width": Number(1, 65536, whole=True), "height": Number(1, 65536, whole=True)}
-        ranges |= {name: number for name, number in given.items() if getattr(self, name) is not None}
+        optional = {"points": Number(1, whole=True), "count": Number(1, whole=True), "length": Number(0, above=True)}
+        optional |= {"width": Number(1, 65536, whole=True), "height": Number(1, 65536, whole=True)}
+        ranges |= {name: number for name, number in optional.items() if getattr(self, name) is not None}
         check_options(self, ranges, "--")
         check_folder(self.folder, self.overwrite)
         scene = make_scene(self.name, self.seed, self.count, self.width, self.height, self.length)
@@ -74,19 +74,20 @@ class SceneCommand:
         if points is None:
             points = max(4000, 4 * round(self.length or 0))
         print(f"{self.name}: {len(scene.primitives)} solids, {len(cameras)} cameras; looking for points ...")
-        sfm = (points, self.noise, self.outliers)
         processes = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         others = {"exposure": make_exposure(self.exposure, scene), "progress": _progress, "processes": processes}
-        found = write_dataset(scene, self.folder, *sfm, self.images, self.overwrite, **others)
+        sfm = write_dataset(
+            scene, self.folder, points, self.noise, self.outliers, self.images, self.overwrite, **others
+        )
         test = int(cameras.is_test.sum())
         kind = "images with depths" if self.images else "cameras (no images)"
         print(f"Wrote {self.folder}: {len(cameras)} {kind} of {cameras.width}x{cameras.height} pixels,")
         print(f"  {len(cameras) - test} to train with and {test} to test with;")
         print(
-            f"  {len(found.points)} points in {len(found.camera)} keypoints, {int(found.outlier.sum())} points wrong,"
+            f"  {len(sfm.points)} points in {len(sfm.camera)} keypoints, {int(sfm.outlier.sum())} points wrong,"
             " in colmap/sparse/0 and sparse_pc.ply."
         )
-        if len(found.points) < points:
+        if len(sfm.points) < points:
             print(f"  The cameras see only so many points well enough: {points} were asked for.")
         if self.images:
             print(f"Next: ns-train mmpi-small --data {self.folder}")

@@ -67,10 +67,10 @@ def write_dataset(
         ValueError: a number is out of range.
     """
     check_folder(folder, overwrite)
-    found = sfm_points(scene, points, noise_pixels, outliers)
+    sfm = sfm_points(scene, points, noise_pixels, outliers)
     clear(folder)
     if tracks:
-        model = colmap_model(scene, found)
+        model = colmap_model(scene, sfm)
         (folder / "colmap" / "sparse" / "0").mkdir(parents=True)
         model.write(folder / "colmap" / "sparse" / "0")
         model.export_PLY(folder / "sparse_pc.ply")
@@ -86,7 +86,7 @@ def write_dataset(
         (folder / "exposure.json").write_text(json.dumps(exposure.to_object(names), indent=1))
     # Last, so that a folder with a transforms.json is complete.
     (folder / "transforms.json").write_text(json.dumps(_transforms(scene, images), indent=1))
-    return found
+    return sfm
 
 
 def _write_image(scene: Scene, folder: Path, exposure: Exposure | None, camera: int) -> None:
@@ -187,11 +187,11 @@ def _transforms(scene: Scene, images: bool) -> dict:
     }  # fmt: skip
 
 
-def colmap_model(scene: Scene, found: SfmPoints) -> Any:
+def colmap_model(scene: Scene, sfm: SfmPoints) -> Any:
     """The cameras, points and tracks as a ``pycolmap.Reconstruction``; image and point ids count from 1."""
     import pycolmap  # a machine with a GPU may lack it
 
-    cameras, points = scene.cameras, found.points
+    cameras, points = scene.cameras, sfm.points
     model = pycolmap.Reconstruction()
     intrinsics = [cameras.focal, cameras.focal, *cameras.center]
     model.add_camera_with_trivial_rig(
@@ -203,21 +203,21 @@ def colmap_model(scene: Scene, found: SfmPoints) -> Any:
             camera_id=1,
         )
     )
-    by_camera = np.argsort(found.camera, kind="stable")
-    bounds = np.searchsorted(found.camera[by_camera], np.arange(len(cameras) + 1))
+    by_camera = np.argsort(sfm.camera, kind="stable")
+    bounds = np.searchsorted(sfm.camera[by_camera], np.arange(len(cameras) + 1))
     slot = np.empty(len(by_camera), np.int64)
     for i, pose in enumerate(cameras.camera_to_worlds):
         these = by_camera[bounds[i] : bounds[i + 1]]
         slot[these] = np.arange(len(these))
         # World to camera, with y down and z ahead.
         rotation = np.diag([1.0, -1.0, -1.0]) @ pose[:, :3].T
-        pixels = found.pixel[these]
+        pixels = sfm.pixel[these]
         image = pycolmap.Image(name=image_name(i), camera_id=1, image_id=i + 1, keypoints=pixels)
         rigid = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -rotation @ pose[:, 3])
         model.add_image_with_trivial_frame(image, rigid)
-    starts = np.searchsorted(found.point, np.arange(len(points) + 1))
-    elements = [pycolmap.TrackElement(i, k) for i, k in np.stack([found.camera + 1, slot], -1).tolist()]
-    for p, (xyz, color) in enumerate(zip(points, found.colors, strict=True)):
+    starts = np.searchsorted(sfm.point, np.arange(len(points) + 1))
+    elements = [pycolmap.TrackElement(i, k) for i, k in np.stack([sfm.camera + 1, slot], -1).tolist()]
+    for p, (xyz, color) in enumerate(zip(points, sfm.colors, strict=True)):
         model.add_point3D(xyz, pycolmap.Track(elements[starts[p] : starts[p + 1]]), color)
     model.update_point_3d_errors()
     return model

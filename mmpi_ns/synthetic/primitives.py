@@ -138,10 +138,10 @@ class Tracer:
     def _first(
         self, rows: NDArray[np.int64], origins: Array, directions: Array, reach: float
     ) -> tuple[Array, NDArray[np.int64]]:
-        best, found = np.full(len(directions), np.inf), np.full(len(directions), -1)
+        best, solids = np.full(len(directions), np.inf), np.full(len(directions), -1)
         ray, column = self._touching(rows, origins, directions)
         if not len(ray):
-            return best, found
+            return best, solids
         solid = rows[column]
         t, kind = np.empty(len(ray)), self.primitives.kind[solid]
         for k, distances in ((BOX, box_distance), (SPHERE, sphere_distance), (CYLINDER, cylinder_distance)):
@@ -153,8 +153,8 @@ class Tracer:
         starts = np.flatnonzero(np.diff(ray, prepend=-1))
         best[ray[starts]] = np.minimum.reduceat(t, starts)
         first = np.flatnonzero((t == best[ray]) & np.isfinite(t))[::-1]
-        found[ray[first]] = solid[first]
-        return best, found
+        solids[ray[first]] = solid[first]
+        return best, solids
 
     def _touching(self, rows: NDArray[np.int64], origins: Array, directions: Array) -> tuple[NDArray, NDArray]:
         """Pairs (ray, column of ``rows``) in which the ray meets the solid's bounding sphere, sorted by ray."""

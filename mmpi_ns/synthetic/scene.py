@@ -221,8 +221,8 @@ def render(scene: Scene, camera: int, supersample: int = 2, contrast: float = 0.
     for start in range(0, len(edges), per_packet):
         these = edges[start : start + per_packet]
         rays = cameras.rays(camera, (cameras.pixel_centers[these][:, None] + shifts).reshape(-1, 2))
-        found = scene.trace(*rays, pixel=1 / (cameras.focal * supersample))[1]
-        colors[these] = found.reshape(len(these), -1, 3).mean(1)
+        samples = scene.trace(*rays, pixel=1 / (cameras.focal * supersample))[1]
+        colors[these] = samples.reshape(len(these), -1, 3).mean(1)
     return colors.reshape(h, w, 3), depths.reshape(h, w).astype(np.float32)
 
 

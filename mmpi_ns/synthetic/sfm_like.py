@@ -62,13 +62,13 @@ def sfm_points(scene: Scene, count: int, noise_pixels: float = 0.3, outliers: fl
             f"Points ({count}) and noise ({noise_pixels}) must not be negative, outliers ({outliers}) lie in [0, 1)."
         )
     random = np.random.default_rng([scene.seed, 5])
-    found: list[tuple] = []
+    rounds: list[tuple] = []
     for _ in range(ROUNDS):
-        missing = count - sum(len(f[0]) for f in found)
+        missing = count - sum(len(f[0]) for f in rounds)
         if missing <= 0:
             break
-        found.append(_tracked(scene, int(missing * 1.5) + 16, random))
-    points, colors, tracks = _joined(found, count)
+        rounds.append(_tracked(scene, int(missing * 1.5) + 16, random))
+    points, colors, tracks = _joined(rounds, count)
     camera, point, exact = tracks
     pixel = exact + noise_pixels * random.standard_normal(exact.shape)
     moved, outlier, keep, pixel = _misled(scene, points, tracks, pixel, outliers, random)
@@ -139,15 +139,15 @@ def _long_and_wide(scene: Scene, points: Array, camera: NDArray, point: NDArray)
     return (length >= MIN_TRACK) & (apart <= np.cos(np.radians(MIN_ANGLE)))
 
 
-def _joined(found: list[tuple], count: int) -> tuple[Array, NDArray[np.uint8], tuple[NDArray, NDArray, Array]]:
+def _joined(rounds: list[tuple], count: int) -> tuple[Array, NDArray[np.uint8], tuple[NDArray, NDArray, Array]]:
     """The rounds as one, evenly thinned to ``count`` points."""
-    if not found:
+    if not rounds:
         none = np.zeros(0, np.int64)
         return np.zeros((0, 3)), np.zeros((0, 3), np.uint8), (none, none, np.zeros((0, 2)))
-    before = np.cumsum([0, *(len(f[0]) for f in found)])
-    points, colors = np.concatenate([f[0] for f in found]), np.concatenate([f[1] for f in found])
-    camera, pixel = np.concatenate([f[2][0] for f in found]), np.concatenate([f[2][2] for f in found])
-    point = np.concatenate([f[2][1] + b for f, b in zip(found, before[:-1], strict=True)])
+    before = np.cumsum([0, *(len(f[0]) for f in rounds)])
+    points, colors = np.concatenate([f[0] for f in rounds]), np.concatenate([f[1] for f in rounds])
+    camera, pixel = np.concatenate([f[2][0] for f in rounds]), np.concatenate([f[2][2] for f in rounds])
+    point = np.concatenate([f[2][1] + b for f, b in zip(rounds, before[:-1], strict=True)])
     keep = np.zeros(len(points), bool)
     keep[np.linspace(0, len(points) - 1, min(count, len(points))).round().astype(int)] = True
     kept = keep[point]
@@ -162,8 +162,8 @@ def _misled(scene: Scene, points: Array, tracks: tuple, pixel: Array, share: flo
     """
     camera, point, exact = tracks
     moved, outlier, keep = points.copy(), np.zeros(len(points), bool), np.ones(len(point), bool)
-    wanted = round(share * len(points))
-    if not wanted:
+    count = round(share * len(points))
+    if not count:
         return moved, outlier, keep, pixel
     first = camera[np.searchsorted(point, np.arange(len(points)))]
     center = scene.cameras.camera_to_worlds[first, :, 3]
@@ -173,7 +173,7 @@ def _misled(scene: Scene, points: Array, tracks: tuple, pixel: Array, share: flo
     size = [scene.cameras.width, scene.cameras.height]
     inside = (depth > 0) & ((where > 0) & (where < size)).all(-1)
     able = np.flatnonzero(np.bincount(point, inside, minlength=len(points)) >= MIN_TRACK)
-    outlier[random.permutation(able)[:wanted]] = True
+    outlier[random.permutation(able)[:count]] = True
     moved[outlier] = wrong[outlier]
     of_outlier = outlier[point]
     return moved, outlier, ~of_outlier | inside, np.where(of_outlier[:, None], where + pixel - exact, pixel)

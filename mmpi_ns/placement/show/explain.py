@@ -63,15 +63,15 @@ def explain(plan: ScenePlan, observations: Observations, visible: VisiblePoints)
     heads: list[MPIPlan | CubePlan] = [*plan.mpis, *([plan.cube] if plan.cube else [])]
     reports = []
     for k, head in enumerate(heads):
-        own = (best == k) & held.any(-1)
-        rest = np.delete(combined[own], k, axis=1).min(-1, initial=WORST)
+        served = (best == k) & held.any(-1)
+        rest = np.delete(combined[served], k, axis=1).min(-1, initial=WORST)
         reports.append(
             HeadReport(
                 name=plan.names[k],
                 **_geometry(head, observations),
                 texels=head.texels,
-                share=float(weights[own].sum() / weights.sum()),
-                error_with=_median(combined[own, k]),
+                share=float(weights[served].sum() / weights.sum()),
+                error_with=_median(combined[served, k]),
                 error_without=_median(rest),
             )
         )

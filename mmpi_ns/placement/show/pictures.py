@@ -10,7 +10,6 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
-from numpy.typing import NDArray
 
 from mmpi_ns.placement.errors import WORST
 from mmpi_ns.placement.observations import Array, Observations
@@ -31,7 +30,9 @@ def draw_plan(path: Path, plan: ScenePlan, observations: Observations, visible: 
     """
     base = observations.mean_axes * np.array([[1.0], [-1.0], [1.0]])  # right, up, forward
     middle = observations.centers.mean(0)
-    points = visible.points[_nearby(visible, observations)]
+    # The far ones would shrink everything else to a dot.
+    distance = np.linalg.norm(visible.points - observations.centers[visible.cameras], axis=-1)
+    points = visible.points[distance < 40 * visible.near]
     points = (points[:: max(1, len(points) // SHOWN_POINTS)] - middle) @ base.T
     centers = (observations.centers - middle) @ base.T
     low, high = np.percentile(points, [1, 99], axis=0) if len(points) else (centers.min(0), centers.max(0))
@@ -104,12 +105,6 @@ def draw_errors(path: Path, plan: ScenePlan, report: PlanReport) -> None:
     axes.set_title(f"median {np.median(errors):.2f} px; what nothing holds counts {WORST:.0f} px")
     axes.legend(fontsize=7)
     figure.savefig(path, dpi=110)
-
-
-def _nearby(visible: VisiblePoints, observations: Observations) -> NDArray[np.bool_]:
-    """Points near enough to be drawn: the far ones would shrink everything else to a dot."""
-    distance = np.linalg.norm(visible.points - observations.centers[visible.cameras], axis=-1)
-    return distance < 40 * visible.near
 
 
 def _draw_mpi(axes: Axes, mpi: MPIPlan, picture: Array, middle: Array, reach: float, color: str) -> None:
