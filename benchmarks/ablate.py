@@ -10,10 +10,10 @@ from typing import Literal
 import numpy as np
 from lab import SceneBench, figure, not_run
 from methods import Method
+from report import Cell, Report, Row, commit, page, slug, table, title
 from suites import ABLATIONS
 from trainings import Request, train_apart
 
-from mmpi_ns.bench.report import Cell, Report, Row, commit, page, slug, table, title
 from mmpi_ns.scripts.command import run
 
 NEAR = 0.1

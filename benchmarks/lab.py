@@ -13,8 +13,9 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
-from mmpi_ns.bench.apart import environment_of
-from mmpi_ns.bench.report import Bench, Row, commit, processor, read_json
+from apart import environment_of
+from report import Bench, Row, commit, processor, read_json
+
 from mmpi_ns.bench.trainers import Scene
 
 

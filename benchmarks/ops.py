@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from gpu_parts import copy_rate
 from lab import SceneBench, figure
 from methods import METHODS
+from report import Report, Row, page, slug, table, title
 from torch import Tensor
 
-from mmpi_ns.bench.gpu.parts import copy_rate
-from mmpi_ns.bench.report import Report, Row, page, slug, table, title
 from mmpi_ns.bench.trainers import Steps, median_s
 from mmpi_ns.field.samples import Lookup, metadata_of
 from mmpi_ns.model import MMPIModel

@@ -12,8 +12,8 @@ import torch
 from lab import SceneBench, train_and_evaluate
 from nerfstudio.cameras.lie_groups import exp_map_SO3xR3
 from numpy.typing import NDArray
+from report import Report, Row, page, table
 
-from mmpi_ns.bench.report import Report, Row, page, table
 from mmpi_ns.bench.trainers import Scene
 from mmpi_ns.prepare.alignment import degrees_between
 from mmpi_ns.scripts.command import run

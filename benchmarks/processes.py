@@ -13,8 +13,8 @@ from typing import Any
 import torch
 from lab import run_command
 from methods import Method
+from report import Bench, Report, Row, page, table
 
-from mmpi_ns.bench.report import Bench, Report, Row, page, table
 from mmpi_ns.bench.trainers import Scene
 from mmpi_ns.capture.load import load_observations
 from mmpi_ns.config import mmpi_small

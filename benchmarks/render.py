@@ -16,10 +16,10 @@ import numpy as np
 import torch
 from lab import figure
 from rays import Image, images_of
+from report import Bench, Report, Row, fingerprint, page, table
 
 from mmpi_ns.bench.rendering import Array, in_float64
 from mmpi_ns.bench.rendering import render as render_plainly
-from mmpi_ns.bench.report import Bench, Report, Row, fingerprint, page, table
 from mmpi_ns.export.bake import load_model
 from mmpi_ns.model import MMPIModel
 from mmpi_ns.ops import dispatch
@@ -100,7 +100,7 @@ class Render(Bench):
         checkpoint = sorted((self.load_config.parent / "nerfstudio_models").glob("*.ckpt"))[-1]
         stat = checkpoint.stat()
         made = f"{checkpoint.name} {stat.st_size} {stat.st_mtime_ns} {self.images} {self.exact_rays}"
-        report = Report(self, f"{fingerprint(self)} {made}")
+        report = Report(self, f"{fingerprint()} {made}")
         default = Setting(model.config.rendering.threshold, model.chunk_size, _ops_in_use(model))
         rays = _some_rays(images, self.exact_rays)
         exact = report.kept.get("exact") or exact_colors(model, images, rays).tolist()

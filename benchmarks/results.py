@@ -10,9 +10,9 @@ from pathlib import Path
 
 from lab import SceneBench, figure, train_and_evaluate
 from methods import Method
+from report import Report, Row, page, slug, table
 from suites import DEFAULT, SUITES
 
-from mmpi_ns.bench.report import Report, Row, page, slug, table
 from mmpi_ns.capture.load import load_observations
 from mmpi_ns.placement.errors import pixel_errors
 from mmpi_ns.placement.visibility import find_visible_points

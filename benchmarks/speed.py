@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any, Literal
 
 from all_planes import DenseSteps
+from apart import Tell, run_apart
 from lab import SceneBench, end_helpers, figure
 from methods import METHODS, Method
+from report import Report, Row, page, table
 from trainings import Request, train_apart
 
-from mmpi_ns.bench.apart import Tell, run_apart
-from mmpi_ns.bench.report import Report, Row, page, table
 from mmpi_ns.bench.trainers import P, Steps
 from mmpi_ns.scripts.command import run
 

@@ -9,10 +9,10 @@ from typing import Literal
 
 import torch
 from methods import Method, find_method
+from report import Bench, Report, Row, slug, stamp
 from train_report import QUICK, draw, headline, markdown
 from trainings import Request, train_apart
 
-from mmpi_ns.bench.report import Bench, Report, Row, slug, stamp
 from mmpi_ns.bench.trainers import Scene
 from mmpi_ns.scripts.command import run
 

@@ -10,8 +10,7 @@ import numpy as np
 from curves import Curve, compare
 from lab import figure, not_run
 from methods import METHODS
-
-from mmpi_ns.bench.report import Row, page, slug, table
+from report import Row, page, slug, table
 
 TIMES = (10, 30, 60, 120, 300, 600, 1200, 1800, 3600)
 """Seconds at which the second table compares."""

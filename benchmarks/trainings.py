@@ -19,13 +19,13 @@ from typing import Any
 
 import numpy as np
 import torch
+from apart import Tell, run_apart
 from lab import end_helpers, peak_gib
 from methods import Method
 from numpy.typing import NDArray
 from peers import give_depths, look_up_quickly, read_points_ourselves
+from report import read_json, write_json
 
-from mmpi_ns.bench.apart import Tell, run_apart
-from mmpi_ns.bench.report import read_json, write_json
 from mmpi_ns.bench.score import evenly
 from mmpi_ns.bench.trainers import Scene, clock, config_of, trainer_of
 from mmpi_ns.rendering.metrics import ImageMetrics

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Any
 from demo import Demo
 from figures import animate, shrink
 
-from mmpi_ns.bench.report import commit, processor, read_json, table
+from mmpi_ns.bench.machine import commit, processor
 from mmpi_ns.scene.windows import WindowedPlan
 from mmpi_ns.scripts.command import run
 
@@ -74,8 +75,8 @@ class Gallery:
         made, says = SHOWN[name]
         demo = replace(made, folder=self.folder / name, frames=self.frames)
         results, film = demo.learn()
-        started = read_json(demo.folder / "times.json")["started"]
-        scene = read_json(demo.scene / "transforms.json")
+        started = json.loads((demo.folder / "times.json").read_text(encoding="utf-8"))["started"]
+        scene = json.loads((demo.scene / "transforms.json").read_text(encoding="utf-8"))
         pictures = self.output / "images" / "gallery"
         pictures.mkdir(parents=True, exist_ok=True)
         shrink(demo.folder / "overview.png", pictures / f"{name}.jpg", MOST_PICTURE)
@@ -90,11 +91,12 @@ class Gallery:
 
 def markdown(rows: list[dict[str, Any]]) -> str:
     """The page."""
+    lines = [f"| {' | '.join(cell.format(**row) for cell in COLUMNS.values())} |" for row in rows]
     parts = [
         "# Gallery",
         "Four procedural scenes, each trained with `mmpi-small` for some minutes on one core. PSNR and SSIM are means "
         "over the test images; depths are found in the training images; the exact ones are not used.",
-        table(COLUMNS, rows),
+        "\n".join([f"| {' | '.join(COLUMNS)} |", "|" + "---|" * len(COLUMNS), *lines]),
         f"Made by `make gallery` on {processor()}, commit {commit()}; seconds are from the start of `ns-train` to its "
         "last checkpoint, on a machine that did other things too.",
     ]

@@ -1,16 +1,16 @@
-"""``mmpi-bench gpu --rehearse`` in one process: run by test_bench_gpu.py with TRITON_INTERPRET=1."""
+"""``benchmarks/gpu.py --rehearse`` in one process: run by test_bench_gpu.py with TRITON_INTERPRET=1."""
 
 from __future__ import annotations
 
 import json
 import math
 
+import gpu
 import torch
+from gpu import SHARES, Gpu
 
-from mmpi_ns.bench.gpu import checks as gpu_checks
-from mmpi_ns.bench.gpu import command as gpu
-from mmpi_ns.bench.gpu.command import SHARES, Gpu
-from mmpi_ns.bench.gpu.scenes import random_scene
+from mmpi_ns.bench import checks as gpu_checks
+from mmpi_ns.bench.scenes import random_scene
 from mmpi_ns.ops import dispatch
 
 

@@ -28,7 +28,7 @@ TRAININGS = {"mmpi": (20_000, 110), "splatfacto": (5000, 75), "nerfacto": (5000,
              "instant-ngp": (5000, 60)}  # fmt: skip
 """Steps, and seconds at most, of each method on the capture at full size."""
 BENCH_PARTS = ("checks", "training triton")
-"""Of ``mmpi-bench gpu``; trainings to the end come after it."""
+"""Of ``benchmarks/gpu.py``; trainings to the end come after it."""
 BARE = ("pycolmap", "open3d", "pymeshlab", "wandb", "comet_ml")
 """Packages that the machine is not expected to have."""
 TAIL = 6000
@@ -47,7 +47,7 @@ class Part:
 def parts(data: Path, out: Path, work: Path, rehearse: bool) -> list[Part]:
     """Everything, in the order of what is wanted most."""
     python, bench = [sys.executable], [sys.executable, "-m", "mmpi_ns.scripts.bench"]
-    train = [sys.executable, str(ROOT / "benchmarks" / "train.py")]
+    gpu, train = ([sys.executable, str(ROOT / "benchmarks" / name)] for name in ("gpu.py", "train.py"))
     where = ["--output", str(out), "--work", str(work)]
     look = "import platform, torch; print(platform.python_version(), torch.__version__, torch.version.cuda, flush=True)"
     look += "; import triton; print('Triton', triton.__version__, flush=True)"
@@ -56,9 +56,9 @@ def parts(data: Path, out: Path, work: Path, rehearse: bool) -> list[Part]:
     return [
         Part("device", ["nvidia-smi"], 20),
         Part("environment", [*python, "-c", look], 90),
-        Part("quick", [*bench, "gpu", "--quick", *where], 120),
+        Part("quick", [*bench, "gpu", "--quick", "--folder", str(work / "quick")], 120),
         Part("tests", [*python, "-m", "pytest", "-m", "gpu", "-rs", "-p", "no:cacheprovider", "tests/ops"], 120),
-        Part("bench gpu", [*bench, "gpu", *small, *where, "--seconds", "1800" if rehearse else "120"], 150),
+        Part("bench gpu", [*gpu, *small, *where, "--seconds", "1800" if rehearse else "120"], 150),
         *(
             Part(f"train {name}", [*train, *_training(name, steps, data, rehearse), *where], seconds)
             for name, (steps, seconds) in TRAININGS.items()
@@ -135,7 +135,7 @@ def main() -> int:
     out, start = given.out.resolve(), time.monotonic()
     (out / "logs").mkdir(parents=True, exist_ok=True)
     work = Path(tempfile.mkdtemp(prefix="gpu-session-"))  # checkpoints are too large to bring back
-    data = (given.data or work / "gpu" / "quick-street").resolve()  # which the quick look makes
+    data = (given.data or work / "quick" / "street").resolve()  # which the quick look makes
     os.environ["PYTHONPATH"] = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
     if given.rehearse:
         strip(work / "bare")

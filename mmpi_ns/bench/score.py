@@ -11,11 +11,11 @@ import torch
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from torch import Tensor
 
-from mmpi_ns.bench.report import Bench, Report, Row, page, table
 from mmpi_ns.capture.checks import check_transforms
 from mmpi_ns.capture.dataset import MMPIDataset
 from mmpi_ns.rendering.metrics import ImageMetrics
 from mmpi_ns.rendering.pipeline import summary
+from mmpi_ns.utils.values import Number, check_options
 
 ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 SAME_DB = 119.0
@@ -28,7 +28,7 @@ Scores = list[tuple[str, dict[str, float]]]
 
 
 @dataclass
-class Score(Bench):
+class Score:
     """Scores renderings of a scene's test images, whatever made them, as every other table scores its own.
 
     A rendering bears the name of its test image, with any ending: frame_00002.png for images/frame_00002.jpg. Other
@@ -45,18 +45,14 @@ class Score(Bench):
     """Test images, evenly spaced, that are scored; 0 for all."""
     lpips: Literal["vgg", "alex", "none"] = "vgg"
     """Network of LPIPS; it is left out where the weights cannot be had."""
-    method: str = ""
-    """Name of what made the images: writes a row into score.json and score.md. Without it the scores are only said."""
-    given: str = ""
-    """What that was given beside the training images, for the row."""
-    seconds: float = 0.0
-    """How long it was trained, for the row."""
-    remark: str = ""
-    """For the row."""
 
-    name = "score"
+    def main(self) -> None:
+        self.score()
 
-    def run(self) -> None:
+    def score(self) -> tuple[Scores, dict[str, float]]:
+        """Scores, prints and returns name and metrics of each image, and the means."""
+        counts = {name: Number(0, whole=True) for name in ("downscale_factor", "test_images")}
+        check_options(self, counts, "--")
         truths = test_images_of(self.data, self.downscale_factor)
         chosen = evenly(len(truths), self.test_images)
         files = find_renderings(self.images, [truths.image_filenames[i] for i in chosen])
@@ -72,18 +68,7 @@ class Score(Bench):
         means = {k: float(np.mean([values[k] for _, values in found])) for k in found[0][1]}
         print(summary(found) + "".join(f", {k} {v:.3f}" for k, v in means.items() if k.startswith("lpips")))
         print(PROTOCOL)
-        if self.method:
-            self._keep(found, means)
-
-    def _keep(self, found: Scores, means: dict[str, float]) -> None:
-        report = Report(self)
-        scene = f"{self.data.resolve().name} /{self.downscale_factor}"
-        row: Row = {"method": self.method, "scene": scene, "given": self.given, "seconds": self.seconds}
-        row |= {"remark": self.remark, "images": len(found), **means, "each": dict(found)}
-        row |= {"command": report.content["made"]["command"]}
-        report.rows[f"{self.method} on {scene}, {len(found)} images"] = row
-        head = {f"{key}: {k}": r[k] for key, r in report.rows.items() for k in means if k in r}
-        report.finish(head, markdown(report.content))
+        return found, means
 
 
 def evenly(count: int, wanted: int) -> list[int]:
@@ -147,21 +132,3 @@ def read_rendering(tests: MMPIDataset, file: Path, truth: Tensor) -> Tensor:
             "the --downscale-factor that was rendered at."
         )
     return torch.from_numpy(pixels[..., :3].astype(np.float32) / 255)
-
-
-def markdown(content: Row) -> str:
-    """The page."""
-    columns = {
-        "method": "{method}",
-        "scene": "{scene}",
-        "was given": "{given}",
-        "training, s": lambda r: f"{r['seconds']:.0f}" if r["seconds"] else "",
-        "test images": "{images}",
-        "PSNR": "{psnr:.2f}",
-        "SSIM": lambda r: f"{r['ssim']:.3f}" if "ssim" in r else "",
-        "LPIPS": lambda r: next((f"{v:.3f} ({k[6:]})" for k, v in r.items() if k.startswith("lpips")), "no weights"),
-        "remark": "{remark}",
-    }
-    rows = list(content["rows"].values())
-    commands = ["Rows were made by:", "\n".join(f"    {r['command']}" for r in rows)]
-    return page("Images rendered by other programs", content["made"], PROTOCOL, table(columns, rows), commands)

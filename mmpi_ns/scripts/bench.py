@@ -9,7 +9,10 @@ from mmpi_ns.scripts.command import run, say_version
 
 COMMANDS = {
     "score": ("mmpi_ns.bench.score", "PSNR, SSIM and LPIPS of test images that any program has rendered."),
-    "gpu": ("mmpi_ns.bench.gpu.command", "On a GPU, in minutes: kernels against float64, training and frames."),
+    "gpu": (
+        "mmpi_ns.bench.gpu",
+        "Every kernel of this machine's GPU against float64, and the time of a step and a frame.",
+    ),
 }
 """Module that holds the command, as a class of its name, and what it does. Only the requested one is imported."""
 

@@ -1,22 +1,24 @@
-"""``mmpi-bench gpu`` without a GPU: rehearsed in miniature, and what it says where it cannot measure."""
+"""``mmpi-bench gpu`` and ``benchmarks/gpu.py`` without a GPU: rehearsed, and what they say where none can be tried."""
 
 from __future__ import annotations
 
 import json
 import re
 import sys
+from contextlib import nullcontext
 from types import SimpleNamespace
 
+import gpu
+import gpu_parts as parts
 import gpu_session
 import pytest
 import torch
+from apart import run_apart
+from gpu import Gpu
 from methods import METHODS
 from triton_processes import HERE, needs_triton, python
 
-from mmpi_ns.bench.apart import run_apart
-from mmpi_ns.bench.gpu import command as gpu
-from mmpi_ns.bench.gpu import parts, quick
-from mmpi_ns.bench.gpu.command import Gpu
+from mmpi_ns.bench import gpu as command
 from mmpi_ns.ops import dispatch
 
 
@@ -30,20 +32,21 @@ def test_rehearsal():
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU, which the command would measure")
 def test_without_a_gpu_one_sentence_and_a_status(tmp_path):
-    found = python("-m", "mmpi_ns.scripts.bench", "gpu", "--output", str(tmp_path))
-    assert found.returncode == 1 and "torch sees none" in found.stderr and not list(tmp_path.iterdir())
-    assert "Traceback" not in found.stderr and "--rehearse" in found.stderr
+    found = python("-m", "mmpi_ns.scripts.bench", "gpu", "--folder", str(tmp_path))
+    assert found.returncode == 1 and "torch sees no CUDA device" in found.stderr and not list(tmp_path.iterdir())
+    assert "Traceback" not in found.stderr and "--quick" in found.stderr
+    with pytest.raises(ValueError, match=r"torch sees none.*--rehearse"):
+        Gpu(output=tmp_path).run()
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU, of which more would be said")
 @pytest.mark.commands
 def test_a_quick_look_without_a_gpu_ends_in_an_honest_sentence(tmp_path):
-    where = ["--output", str(tmp_path), "--work", str(tmp_path / "work")]
-    found = python("-m", "mmpi_ns.scripts.bench", "gpu", "--quick", *where)
+    found = python("-m", "mmpi_ns.scripts.bench", "gpu", "--quick", "--folder", str(tmp_path))
     said = found.stdout.strip().splitlines()
     assert found.returncode == 0 and "only a machine with one can say" in said[-1], found.stdout + found.stderr
     assert any("torch sees no GPU" in line for line in said) and any(line.startswith("a step of") for line in said)
-    rows = json.loads((tmp_path / "gpu-quick.json").read_text())["rows"]
+    rows = json.loads((tmp_path / "gpu.json").read_text())
     assert rows["device"] == "cpu" and not rows["well"] and rows["timed"]["step_ms"] > 0
 
 
@@ -55,13 +58,26 @@ def test_a_quick_look_names_what_falls_back(monkeypatch, capsys, tmp_path):
         ({"march": reason}, "1 operation(s) run in plain torch, several times slower: march."),
     ):
         monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-        monkeypatch.setattr(quick, "environment", dict)
-        monkeypatch.setattr(quick, "time_training", lambda *_: {"step_ms": 1.0, "frame_ms": 2.0, "pixels": 3})
+        monkeypatch.setattr(command, "environment", dict)
+        monkeypatch.setattr(command, "time_training", lambda *_: {"step_ms": 1.0, "frame_ms": 2.0, "pixels": 3})
         monkeypatch.setattr(dispatch, "_faults", dict.fromkeys(names) | faults)
-        found = quick.run_quick(tmp_path, tmp_path, 16)
+        found = command.run_quick(tmp_path, tmp_path, 16)
         said = capsys.readouterr().out
         assert found["well"] == (not faults) and wanted in said.splitlines()[-1]
         assert not faults or f"march: plain torch, since {reason}" in said
+
+
+def test_comparisons_that_fail_are_said_and_end_with_an_error(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(command, "street", lambda folder, *_: folder)
+    monkeypatch.setattr(command, "run_quick", lambda *_: {"well": True})
+    for failed in (0, 1):
+        check = {"name": "march", "error": 1.0, "bound": 0.5, "ok": not failed}
+        monkeypatch.setattr(command, "run_checks", lambda *_, f=failed, c=check, **how: {"checks": [c], "failed": f})
+        with pytest.raises(ValueError, match="1 comparisons") if failed else nullcontext():
+            command.Gpu(folder=tmp_path).main()
+        assert f"march: {'WRONG' if failed else 'ok'}" in capsys.readouterr().out
+        assert json.loads((tmp_path / "gpu.json").read_text())["failed"] == failed
 
 
 def test_mistakes_are_named(tmp_path):

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from score import ScoreRow
 
 from mmpi_ns.bench.score import Score
 from mmpi_ns.scripts.bench import entrypoint
@@ -37,12 +38,16 @@ def darker(image: np.ndarray, levels: int) -> np.ndarray:
 
 
 def score(rendered: Path, scene: Path, **settings) -> None:
-    Score(images=rendered, data=scene, lpips="none", output=rendered.parent / "results", **settings).run()
+    Score(images=rendered, data=scene, lpips="none", **settings).main()
+
+
+def score_row(rendered: Path, scene: Path, **settings) -> None:
+    ScoreRow(images=rendered, data=scene, lpips="none", output=rendered.parent / "results", **settings).main()
 
 
 def test_scores_follow_the_definition_and_a_row_is_kept(rendered, scene, tests_of, capsys):
-    score(rendered, scene, method="dark", given="poses", seconds=12.0)
-    score(rendered, scene, method="again")
+    score_row(rendered, scene, method="dark", given="poses", seconds=12.0)
+    score_row(rendered, scene, method="again")
     wanted = []
     for image, off in zip(tests_of.values(), (10, 30), strict=True):
         error = (darker(image, off).astype(np.float64) - image) / 255
@@ -57,9 +62,10 @@ def test_scores_follow_the_definition_and_a_row_is_kept(rendered, scene, tests_o
     assert f"| dark | {scene.name} /1 | poses | 12 | 2 | {np.mean(wanted):.2f} |" in text
 
 
-def test_without_a_name_nothing_is_written(rendered, scene):
+def test_the_command_writes_nothing(rendered, scene):
+    before = set(rendered.parent.rglob("*"))
     score(rendered, scene)
-    assert not (rendered.parent / "results").exists()
+    assert set(rendered.parent.rglob("*")) == before
 
 
 def test_some_of_the_test_images_are_enough_where_some_are_asked_for(rendered, scene, tests_of):

@@ -15,6 +15,7 @@ import pytest
 import torch
 import train
 import trainings
+from apart import run_apart
 from curves import Curve, compare
 from methods import METHODS
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
@@ -23,7 +24,6 @@ from torchmetrics.image import lpip
 from train import Train
 from train_report import headline, markdown
 
-from mmpi_ns.bench.apart import run_apart
 from mmpi_ns.bench.trainers import Steps
 from mmpi_ns.capture.datamanager import MMPIDataManager
 from mmpi_ns.capture.known_depth import KnownDepth

@@ -76,7 +76,7 @@ def test_kernels_compile_for_older_gpus(monkeypatch, architecture):
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 def test_kernels_on_a_gpu():
-    from mmpi_ns.bench.gpu.checks import run_checks
+    from mmpi_ns.bench.checks import run_checks
 
     found = run_checks("cuda", rehearse=False)
     assert found["failed"] == 0 and len(found["checks"]) > 30, [c for c in found["checks"] if not c["ok"]]
@@ -96,7 +96,7 @@ def test_importing_the_package_imports_no_kernel():
     code = (
         "import sys\n"
         "sys.modules |= dict.fromkeys(('triton', 'open3d', 'pymeshlab', 'pycolmap', 'wandb', 'comet_ml'))\n"
-        "import nerfstudio.configs.method_configs, mmpi_ns.scripts.bench, mmpi_ns.bench.gpu.parts\n"
+        "import nerfstudio.configs.method_configs, mmpi_ns.scripts.bench, mmpi_ns.bench.gpu\n"
         "assert not [m for m in sys.modules if m.startswith('mmpi_ns.ops') and 'gpu' in m]"
     )
     found = python("-c", code)

@@ -1,4 +1,4 @@
-"""Writes docs/results/stability.md, errors and bounds: ``PYTHONPATH=tests python tests/stability/table.py``."""
+"""Writes docs/results/stability.md: ``PYTHONPATH=tests:benchmarks python tests/stability/table.py``."""
 
 from __future__ import annotations
 
@@ -6,10 +6,9 @@ from datetime import date
 from pathlib import Path
 
 import torch
+from report import Row, commit, page, processor, table, title
 from stability import blending, geometry, merging, rays
 from stability.cases import PRECISIONS, Case, Error
-
-from mmpi_ns.bench.report import Row, commit, page, processor, table, title
 
 EVERY = [case for group in (geometry, blending, merging, rays) for case in group.cases()]
 SAID = """\

@@ -130,8 +130,7 @@ OTHER_COMMANDS = [
         ("--width", "0"), ("--height", "-3"), ("--count", "0"), ("--length", "nan"), ("--points", "0"),
         ("--seed", "-1"), ("--noise", "nan"), ("--outliers", "2"),
     )),
-    ("mmpi-bench score --images {out} --data {out} --output {out}", "--test-images", "-1"),
-    ("mmpi-bench gpu --output {out}", "--threads", "-1"),
+    ("mmpi-bench score --images {out} --data {out}", "--test-images", "-1"),
 ]  # fmt: skip
 
 

@@ -1,24 +1,24 @@
-"""``mmpi-bench gpu``: on a GPU, in minutes and without a network: correctness first, then training and frames."""
+"""On a GPU, in minutes and without a network: correctness first, then training and frames."""
 
 from __future__ import annotations
 
+import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
+from apart import run_apart
+from gpu_parts import run_part
+from report import Bench, Report, Row, page, slug, table, title
 
-from mmpi_ns.bench.apart import run_apart
-from mmpi_ns.bench.gpu.parts import run_part
-from mmpi_ns.bench.gpu.quick import run_quick
-from mmpi_ns.bench.gpu.report import markdown
-from mmpi_ns.bench.report import Bench, Report, Row, slug
+from mmpi_ns.bench.gpu import street
 from mmpi_ns.bench.trainers import has_pycolmap
+from mmpi_ns.scripts.command import run
 
 SHARES = {"checks": 0.25, "training triton": 0.25, "training torch": 0.2, "kitti": 0.3}
 """The parts in the order in which they run, and their shares of the time; what one leaves, the next ones have."""
-QUICK_RAYS = 1024
-"""Of a step that ``--quick`` times."""
 GRACE = 60.0
 """Seconds that a part may run beyond its time before it is ended from outside: starting Python takes ten."""
 
@@ -41,19 +41,10 @@ class Gpu(Bench):
     """Which parts to run."""
     rehearse: bool = False
     """Run everything in miniature on a CPU, the kernels by Triton's interpreter: to see that it runs, not how fast."""
-    quick: bool = False
-    """In a minute: what there is, whether every kernel does what it should, and the time of a step and a frame. Without
-    a GPU, the same of this processor."""
 
     name = "gpu"
 
     def run(self) -> None:
-        if self.quick:
-            data = self._street(self.folder / "quick-street", 10, 155, 47, 400)
-            report = Report(self, key=None, file="gpu-quick")
-            report.rows.update(run_quick(data, (self.folder / "quick").resolve(), QUICK_RAYS))
-            report.save()
-            return
         self._check()
         start, report = time.monotonic(), Report(self, key=None)
         made, rows = report.content["made"], report.rows
@@ -73,9 +64,7 @@ class Gpu(Bench):
         print(head)
         wrong = [name for name, part in rows.items() if "not_run" in part] if self.rehearse else []
         if head.get("failed_checks") or wrong:
-            raise SystemExit(
-                f"mmpi-bench: a kernel is wrong or a rehearsed part failed ({', '.join(wrong) or 'checks'})."
-            )
+            raise SystemExit(f"gpu: a kernel is wrong or a rehearsed part failed ({', '.join(wrong) or 'checks'}).")
 
     def _check(self) -> None:
         """Raises ValueError where nothing could be measured."""
@@ -93,19 +82,7 @@ class Gpu(Bench):
         if self.data is not None:
             return self.data.resolve()
         sizes = (10, 40, 12, 150) if self.rehearse else (40, 621, 188, 4000)
-        return self._street(self.folder / "street", *sizes)
-
-    @staticmethod
-    def _street(folder: Path, count: int, width: int, height: int, points: int) -> Path:
-        """A procedural scene, made where it is not there yet."""
-        from mmpi_ns.synthetic.catalogue import make_scene
-        from mmpi_ns.synthetic.dataset import write_dataset
-
-        if not (folder / "transforms.json").is_file():
-            print(f"Making a street of {width} x {height} pixels ...", flush=True)
-            scene = make_scene("street", count=count, width=width, height=height)
-            write_dataset(scene, folder, points=points, tracks=has_pycolmap(), overwrite=True)
-        return folder.resolve()
+        return street(self.folder / "street", *sizes)
 
     def _part(self, name: str, data: Path, seconds: float) -> Row:
         part, _, ops = name.partition(" ")
@@ -116,3 +93,32 @@ class Gpu(Bench):
         hidden = {"TRITON_INTERPRET": "1", "CUDA_VISIBLE_DEVICES": ""} if self.rehearse else {}
         threads = 1 if self.rehearse else self.cores
         return run_apart(run_part, request, self.folder / slug(name, "-"), threads, seconds + GRACE, hidden)
+
+
+def markdown(content: Row, head: Row) -> str:
+    """The page: every table of every part."""
+    parts = content["rows"]
+    device = next((part["device"] for part in parts.values() if "device" in part), "no part has run")
+    blocks = [f"On: {device}."]
+    if content["rehearsal"]:
+        blocks.append("**A rehearsal in miniature on a CPU: no number here is a measurement.**")
+    for name, part in parts.items():
+        blocks += [f"## {title(name)} ({part['wall_s']:.0f} s)"]
+        blocks += [f"Not run: {part['not_run']}"] if "not_run" in part else []
+        for said, rows in part.get("tables", {}).items():
+            names = dict.fromkeys(k for row in rows.values() for k in row)
+            columns = {"of": "{row}"}
+            columns |= {n.replace("_", " "): lambda r, n=n: _number(r.get(n)) for n in names}
+            blocks += [said, table(columns, ({"row": name, **row} for name, row in rows.items()))]
+    numbers = ({"name": name, "value": _number(value)} for name, value in head.items())
+    return page("On a GPU", content["made"], blocks, "## Headline", table({"": "{name}", "value": "{value}"}, numbers))
+
+
+def _number(value: Any) -> str:
+    if not isinstance(value, int | float):
+        return "-" if value is None else str(value)
+    return f"{value:,}" if isinstance(value, int) else f"{value:.4g}"
+
+
+if __name__ == "__main__":
+    sys.exit(run("gpu", Gpu))

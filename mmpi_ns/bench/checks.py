@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mmpi_ns.bench.gpu.scenes import CUBE, Scene, gradients_of, random_scene, samples_of
 from mmpi_ns.bench.rendering import of_slots
+from mmpi_ns.bench.scenes import CUBE, Scene, gradients_of, random_scene, samples_of
 from mmpi_ns.ops import dispatch, interpolate, variation
 from mmpi_ns.ops.composite import composite_weights
 from mmpi_ns.ops.interpolate import reference as plain

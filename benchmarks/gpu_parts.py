@@ -1,4 +1,4 @@
-"""What ``mmpi-bench gpu`` times, each part in a process of its own.
+"""What ``benchmarks/gpu.py`` times, each part in a process of its own.
 
 A part that fails, or breaks the device's context, takes no other with it. Parts look at the clock between measurements
 and return what they have when their time is up: the named numbers that they add to the headline, and tables, by what is
@@ -17,12 +17,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from apart import Tell
+from report import Row, slug
 from torch import Tensor
 
-from mmpi_ns.bench.apart import Tell
-from mmpi_ns.bench.gpu.checks import run_checks
-from mmpi_ns.bench.report import Row, slug
-from mmpi_ns.bench.trainers import JOINT, TWO_PHASE, P, Scene, Steps, median_s, train_words
+from mmpi_ns.bench.checks import run_checks
+from mmpi_ns.bench.gpu import drive
+from mmpi_ns.bench.trainers import TWO_PHASE, P, Scene, Steps, median_s, train_words
 from mmpi_ns.model import MMPIModel
 from mmpi_ns.ops import dispatch
 from mmpi_ns.rendering.metrics import ImageMetrics
@@ -44,12 +45,6 @@ def check(request: Row, tell: Tell) -> Row:
 
 
 # Training ------------------------------------------------------------------------------------------------------------
-
-
-def drive(planes: int, rays: int, *more: str) -> tuple[str, ...]:
-    """Four MPIs by hand, trained together."""
-    place = (P + "arrangement", "drive", P + "planes", str(planes), P + "max-planes", str(planes))
-    return (*place, *JOINT, "--pipeline.datamanager.train-num-rays-per-batch", str(rays), *more)
 
 
 def steps_of(request: Row, name: str, method: str, options: tuple[str, ...], steps: int) -> Steps:

@@ -1,28 +1,78 @@
-"""``mmpi-bench gpu --quick``: in a minute, whether training runs on this machine's GPU as it should."""
+"""``mmpi-bench gpu``: whether training runs on this machine's GPU as it should, in a minute or some."""
 
 from __future__ import annotations
 
 import contextlib
 import io
+import json
 import platform
 import warnings
+from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 import torch
 
-from mmpi_ns.bench.gpu.parts import drive
-from mmpi_ns.bench.report import Row, processor
-from mmpi_ns.bench.trainers import Scene, Steps, no_tracks, train_words
+from mmpi_ns.bench.checks import run_checks
+from mmpi_ns.bench.machine import processor
+from mmpi_ns.bench.trainers import JOINT, P, Scene, Steps, has_pycolmap, no_tracks, train_words
 from mmpi_ns.ops import dispatch
+from mmpi_ns.synthetic.catalogue import make_scene
+from mmpi_ns.synthetic.dataset import write_dataset
 
-STEPS = 20
-"""Steps that are timed."""
+STEPS, RAYS = 20, 1024
+"""Steps that are timed, and rays of each."""
 
 
-def environment() -> Row:
+@dataclass
+class Gpu:
+    """Checks every kernel against plain torch and float64 on this machine, and times a step and a frame.
+
+    Ends with status 1 where a kernel is wrong. Times of whole trainings: benchmarks/gpu.py and benchmarks/train.py of
+    the repository.
+    """
+
+    quick: bool = False
+    """Leave the comparisons with float64 out: what there is, which kernels run, and the time of a step and a frame.
+    Without a GPU, the same of this processor."""
+    folder: Path = Path("outputs/gpu")
+    """Folder for a small street, its training, and gpu.json with all that was found."""
+
+    def main(self) -> None:
+        if not self.quick and not torch.cuda.is_available():
+            raise ValueError(
+                "torch sees no CUDA device: run it where there is one, or try this processor with --quick."
+            )
+        found = run_quick(street(self.folder / "street", 10, 155, 47, 400), (self.folder / "run").resolve(), RAYS)
+        if not self.quick:
+            found |= run_checks("cuda", rehearse=False)
+            for check in found["checks"]:
+                print(f"{check['name']}: {'ok' if check['ok'] else 'WRONG'} ({check['error']}, bound {check['bound']})")
+        (self.folder / "gpu.json").write_text(json.dumps(found, indent=1), encoding="utf-8")
+        if found.get("failed"):
+            raise ValueError(f"{found['failed']} comparisons with float64 failed: report {self.folder}/gpu.json.")
+
+
+def street(folder: Path, count: int, width: int, height: int, points: int) -> Path:
+    """The folder of a procedural street, which is made where it is not there yet."""
+    if not (folder / "transforms.json").is_file():
+        print(f"Making a street of {width} x {height} pixels ...", flush=True)
+        scene = make_scene("street", count=count, width=width, height=height)
+        write_dataset(scene, folder, points=points, tracks=has_pycolmap(), overwrite=True)
+    return folder.resolve()
+
+
+def drive(planes: int, rays: int, *more: str) -> tuple[str, ...]:
+    """Four MPIs by hand, trained together."""
+    place = (P + "arrangement", "drive", P + "planes", str(planes), P + "max-planes", str(planes))
+    return (*place, *JOINT, "--pipeline.datamanager.train-num-rays-per-batch", str(rays), *more)
+
+
+def environment() -> dict[str, Any]:
     """What the kernels run on and with."""
-    found: Row = {"Python": platform.python_version(), "torch": torch.__version__, "CUDA of torch": torch.version.cuda}
+    found: dict[str, Any] = {"Python": platform.python_version(), "torch": torch.__version__}
+    found["CUDA of torch"] = torch.version.cuda
     for package in ("triton", "nerfstudio", "gsplat", "nerfacc", "tinycudann"):
         with contextlib.suppress(metadata.PackageNotFoundError):
             found[package] = metadata.version(package)
@@ -41,7 +91,7 @@ def try_operations(device: str) -> dict[str, str | None]:
         return {name: dispatch.fault(name if device == "cuda" else "C++") for name in names}
 
 
-def time_training(device: str, data: Path, work: Path, rays: int) -> Row:
+def time_training(device: str, data: Path, work: Path, rays: int) -> dict[str, Any]:
     """Milliseconds of a step and of a frame of a small street."""
     options = (*drive(64, rays), "--pipeline.datamanager.dense-depth", "False", *no_tracks())
     with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
@@ -53,10 +103,10 @@ def time_training(device: str, data: Path, work: Path, rays: int) -> Row:
     return {"step_ms": 1e3 * seconds, "rays": rays, "frame_ms": 1e3 * frame, "pixels": pixels}
 
 
-def run_quick(data: Path, work: Path, rays: int) -> Row:
+def run_quick(data: Path, work: Path, rays: int) -> dict[str, Any]:
     """Looks, tries, times, and says so line by line: environment, operations (why each falls back, or None), times of
     a small scene, and ``well``, the verdict."""
-    found: Row = {"environment": environment()}
+    found: dict[str, Any] = {"environment": environment()}
     for name, value in found["environment"].items():
         print(f"{name}: {value}", flush=True)
     device = "cuda" if torch.cuda.is_available() else "cpu"

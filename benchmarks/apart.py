@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from mmpi_ns.bench.report import read_json
+from report import read_json
 
 Tell = Callable[[str], None]
 """Says how far it is."""
@@ -51,7 +51,7 @@ def run_apart(
     if module == "__main__":  # of a script, which the other process imports by its name
         module = Path(sys.modules["__main__"].__file__ or "").stem
     environment = {**environment_of(threads), "PYTHONPATH": os.pathsep.join(sys.path), **(extra or {})}
-    words = [sys.executable, "-m", "mmpi_ns.bench.apart", module, work.__qualname__, str(source), str(target)]
+    words = [sys.executable, str(Path(__file__).resolve()), module, work.__qualname__, str(source), str(target)]
     pipes: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
     last = ""
     with (

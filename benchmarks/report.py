@@ -6,14 +6,11 @@ A new benchmark is a file of ``benchmarks/`` with a dataclass that extends ``Ben
 from __future__ import annotations
 
 import hashlib
-import inspect
 import json
 import math
 import os
-import platform
 import re
 import shlex
-import subprocess
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import MISSING, dataclass, fields
 from datetime import date
@@ -22,6 +19,8 @@ from typing import Any, ClassVar
 
 import torch
 
+import mmpi_ns
+from mmpi_ns.bench.machine import commit, processor
 from mmpi_ns.utils.values import Number, check_options
 
 Row = dict[str, Any]
@@ -65,7 +64,7 @@ class Bench:
         own = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("output", "work", *without)}
         own["threads"] = self.cores
         words = (f"{k} {v.resolve().name if isinstance(v, Path) else v}" for k, v in own.items())
-        return f"{fingerprint(self)} {', '.join(words)}"
+        return f"{fingerprint()} {', '.join(words)}"
 
 
 class Report:
@@ -150,33 +149,18 @@ def title(text: str) -> str:
 # Provenance ----------------------------------------------------------------------------------------------------------
 
 
-def processor() -> str:
-    """Cores and model of this machine's CPU."""
-    info = Path("/proc/cpuinfo")
-    text = info.read_text(encoding="utf-8") if info.is_file() else ""
-    names = re.findall(r"model name\s*: (.*)", text)
-    return f"{os.cpu_count()} cores of {names[0] if names else platform.processor()}"
-
-
-def commit() -> str:
-    """Short hash of the commit that this package is checked out at; "unknown" where it is installed."""
-    words = ["git", "-C", str(Path(__file__).resolve().parent), "rev-parse", "--short", "HEAD"]
-    return subprocess.run(words, capture_output=True, text=True, check=False).stdout.strip() or "unknown"
-
-
-def fingerprint(bench: Bench) -> str:
-    """Hash of torch's version and of the sources of this package and the benchmark."""
-    folders = Path(__file__).resolve().parents[1], Path(inspect.getfile(type(bench))).resolve().parent
+def fingerprint() -> str:
+    """Hash of torch's version and of the sources of the package and the benchmarks."""
+    folders = Path(mmpi_ns.__file__).resolve().parent, Path(__file__).resolve().parent
     digest = hashlib.sha256(torch.__version__.encode())
-    for path in sorted({p for folder in folders for p in folder.rglob("*") if p.suffix in (".py", ".cpp", ".h")}):
+    for path in sorted(p for folder in folders for p in folder.rglob("*") if p.suffix in (".py", ".cpp", ".h")):
         digest.update(path.read_bytes())
     return digest.hexdigest()[:16]
 
 
 def command_of(bench: Bench) -> str:
     """The command line that makes these settings: what differs from the defaults."""
-    ours = type(bench).__module__.startswith("mmpi_ns.")
-    words = ["mmpi-bench", bench.name] if ours else ["python", f"benchmarks/{bench.name}.py"]
+    words = ["python", f"benchmarks/{bench.name}.py"]
     for f in fields(bench):
         value = getattr(bench, f.name)
         if value == (f.default_factory() if f.default_factory is not MISSING else f.default):

@@ -1,0 +1,60 @@
+"""PSNR, SSIM and LPIPS of test images that any program has rendered, as a row of a table."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+
+from report import Bench, Report, Row, page, table
+
+from mmpi_ns.bench.score import PROTOCOL, Score
+from mmpi_ns.scripts.command import run
+
+
+@dataclass(kw_only=True)
+class ScoreRow(Bench, Score):
+    """Scores renderings as mmpi-bench score does, and writes a row into score.json and score.md."""
+
+    method: str
+    """Name of what made the images."""
+    given: str = ""
+    """What that was given beside the training images, for the row."""
+    seconds: float = 0.0
+    """How long it was trained, for the row."""
+    remark: str = ""
+    """For the row."""
+
+    name = "score"
+
+    def run(self) -> None:
+        found, means = self.score()
+        report = Report(self)
+        scene = f"{self.data.resolve().name} /{self.downscale_factor}"
+        row: Row = {"method": self.method, "scene": scene, "given": self.given, "seconds": self.seconds}
+        row |= {"remark": self.remark, "images": len(found), **means, "each": dict(found)}
+        row |= {"command": report.content["made"]["command"]}
+        report.rows[f"{self.method} on {scene}, {len(found)} images"] = row
+        head = {f"{key}: {k}": r[k] for key, r in report.rows.items() for k in means if k in r}
+        report.finish(head, markdown(report.content))
+
+
+def markdown(content: Row) -> str:
+    """The page."""
+    columns = {
+        "method": "{method}",
+        "scene": "{scene}",
+        "was given": "{given}",
+        "training, s": lambda r: f"{r['seconds']:.0f}" if r["seconds"] else "",
+        "test images": "{images}",
+        "PSNR": "{psnr:.2f}",
+        "SSIM": lambda r: f"{r['ssim']:.3f}" if "ssim" in r else "",
+        "LPIPS": lambda r: next((f"{v:.3f} ({k[6:]})" for k, v in r.items() if k.startswith("lpips")), "no weights"),
+        "remark": "{remark}",
+    }
+    rows = list(content["rows"].values())
+    commands = ["Rows were made by:", "\n".join(f"    {r['command']}" for r in rows)]
+    return page("Images rendered by other programs", content["made"], PROTOCOL, table(columns, rows), commands)
+
+
+if __name__ == "__main__":
+    sys.exit(run("score", ScoreRow))
