@@ -23,7 +23,7 @@ WORKERS ?= 2
 # Extra arguments for pytest or the demo: make test ARGS="-k geometry -x", make demo ARGS=--fresh
 ARGS ?=
 
-.PHONY: help venv demo test lint docs build wheel figures gallery clean
+.PHONY: help venv demo test lint docs build wheel figures gallery results clean
 
 help: ## List these commands
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -72,6 +72,11 @@ figures: venv ## Draw the figures of the documentation anew, from the demo
 
 gallery: venv ## Train four procedural scenes and write docs/gallery.md with their pictures
 	$(BIN)/python examples/gallery.py $(ARGS)
+
+results: venv ## Make the tables of docs/results that take minutes again, and say how old the others are
+	$(BIN)/python benchmarks/accuracy.py
+	PYTHONPATH=tests:benchmarks $(BIN)/python tests/stability/table.py
+	$(BIN)/python benchmarks/ages.py
 
 clean: ## Remove build products and caches (not .venv)
 	rm -rf build dist *.egg-info .pytest_cache .hypothesis .ruff_cache
