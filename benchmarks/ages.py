@@ -10,7 +10,7 @@ BEGIN, END = "<!-- ages -->", "<!-- /ages -->"
 
 
 def ages(folder: Path) -> str:
-    """A sentence with the tables of each commit, newest first; suites keep commits by row, so they name their oldest."""
+    """A sentence with the tables of each commit, newest first; of a suite, whose rows have commits, the oldest."""
     tables: dict[tuple[str, str], list[str]] = {}
     for path in folder.rglob("*.json"):
         content = json.loads(path.read_text(encoding="utf-8"))
