@@ -6,6 +6,7 @@ import base64
 from pathlib import Path
 
 from mmpi_ns.export.files import HEADER, read_header
+from mmpi_ns.ops import ends
 from mmpi_ns.utils.files import write_atomically
 
 PAGE = Path(__file__).parent / "page"
@@ -41,7 +42,7 @@ def write_single_file(folder: Path, path: Path) -> None:
 
 
 def _html(data: str) -> str:
-    shader = (PAGE / "march.glsl").read_text(encoding="utf-8")
+    shader = (PAGE / "march.glsl").read_text(encoding="utf-8").replace("ENDS", ends.TEXT, 1)
     code = "\n".join((PAGE / name).read_text(encoding="utf-8") for name in ("scene.js", "page.js"))
     page = (PAGE / "index.html").read_text(encoding="utf-8")
     return page.replace("<!--data-->", data).replace("/*code*/", f"const MARCH = `{shader}`;\n{code}")

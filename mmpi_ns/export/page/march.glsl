@@ -5,7 +5,8 @@ precision highp int;
 precision highp sampler2D;
 precision highp usampler2D;
 
-const float OPAQUE = 1e-2;
+ENDS
+
 const int MOST = 4096; // samples of a ray
 
 uniform vec3 eye;
@@ -80,7 +81,8 @@ void advanceK_() {
 
 void beginK_(vec3 direction) {
   vec3 o = (eye - origin[K_]) * axes[K_], d = direction * axes[K_];
-  if (!(d.z > 1e-6) || (alone >= 0 && alone != K_)) return;
+  nextK_ = -1.0;
+  if (!(d.z > FACING) || (alone >= 0 && alone != K_)) return;
   vec2 uv = d.xy / d.z, bend = o.xy - o.z * uv;
   // Half-spaces p w <= q in disparity.
   vec4 p = vec4(bend.x, -bend.x, bend.y, -bend.y);
@@ -115,12 +117,14 @@ vec3 ramp(float x) { // dark blue, red, yellow
 
 vec3 tint(int k) { return 0.55 + 0.45 * cos(6.2832 * (float(k) * 0.381966 + vec3(0.0, 0.33, 0.67))); }
 
-void main() {
-  vec2 at = vec2(gl_FragCoord.x, rows - gl_FragCoord.y);
-  vec3 direction = normalize(turn * vec3((at.x - lens.z) / lens.x, -(at.y - lens.w) / lens.y, -1.0));
-  vec4 sums[GROUPS];
+vec4 sums[GROUPS];
+float light, mass, votes[HEADS];
+
+// Marches a ray. Returns the inverse distance at which it has gathered half of the expected mass; -1 where it never does.
+float march(vec3 direction, float expected) {
   for (int g = 0; g < GROUPS; g++) sums[g] = vec4(0.0);
-  float light = 1.0, mass = 0.0, half_ = -1.0, votes[HEADS];
+  float depth = -1.0;
+  light = 1.0, mass = 0.0;
   /*each*/ beginK_(direction); votes[K_] = 0.0;
   /*end*/
   vec2 size = vec2(textureSize(density, 0));
@@ -146,18 +150,26 @@ void main() {
     if (weight > threshold) {
       GATHER
       mass += weight;
+      if (depth < 0.0 && is_depth(mass, expected)) depth = inverse;
       /*each*/ if (h == K_) votes[K_] += weight;
       /*end*/
     }
     light *= pass;
-    if (half_ < 0.0 && light < 0.5) half_ = inverse;
-    if (light < OPAQUE) { light = 0.0; break; }
+    if (is_over(light, OPAQUE_BAKED)) { light = 0.0; break; }
     /*each*/ if (h == K_) advanceK_();
     /*end*/
   }
+  return depth;
+}
+
+void main() {
+  vec2 at = vec2(gl_FragCoord.x, rows - gl_FragCoord.y);
+  vec3 direction = normalize(turn * vec3((at.x - lens.z) / lens.x, -(at.y - lens.w) / lens.y, -1.0));
+  march(direction, 1.0);
   vec3 color = vec3(0.0);
-  if (mode == 1) {
-    color = ramp((log(1.0 / max(half_, 1e-6)) - depthRange.x) / (depthRange.y - depthRange.x));
+  if (mode == 1) { // half of what a ray gathers is known once it has gathered it
+    float depth = mass > 0.0 ? march(direction, mass) : -1.0;
+    color = ramp((log(1.0 / max(depth, 1e-6)) - depthRange.x) / (depthRange.y - depthRange.x));
   } else if (mode == 2) {
     float most = 0.0;
     /*each*/ if (votes[K_] > most) { most = votes[K_]; color = tint(K_); }

@@ -10,4 +10,4 @@ const float HALF = 0.5;          // share of its weight behind which the depth o
 bool is_over(float light, float least) { return light <= least; }
 
 // Whether the sample at which a ray has gathered so much of its weight is its depth: the first one that is.
-bool is_depth(float gathered, float all) { return gathered >= HALF * all; }
+bool is_depth(float gathered, float mass) { return gathered >= HALF * mass; }

@@ -8,8 +8,8 @@
 //   blend.h      what reliability makes of a sample
 //   here         stepping abreast, and sums
 // Training steps otherwise, one ray at a time and each head's samples in blocks: its rays are drawn at random, so sixteen
-// of them go different ways. Abreast, 4,096 of them take 2.2 times as long where next to nothing is kept, and a frame's
-// rays, which are neighbours, 0.7 times (docs/performance.md).
+// of them go different ways. Abreast, 4,096 of them take 2.2 times as long (40 instead of 18 ms, next to nothing kept), and
+// a frame's rays, which are neighbours, 0.7 times (48 instead of 69 ms).
 #pragma once
 #include "blend.h"
 #include "table.h"
