@@ -1,12 +1,14 @@
-"""Rays of undistorted perspective cameras in one batch.
+"""Rays of perspective and fisheye cameras in one batch.
 
 nerfstudio's ray generator handles every camera type and checks types and distortions some twenty times for each batch,
-which takes 4 of 75 ms of a step on a CPU; on a GPU, each check is a synchronisation.
+which takes 4 of 75 ms of a step on a CPU; on a GPU, each check is a synchronisation. It undistorts every pixel of every
+batch anew: here the directions of a lens are computed once, by nerfstudio, for all cameras that share it.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import torch
 from jaxtyping import Float, Int
@@ -16,10 +18,15 @@ from torch import Tensor
 
 from mmpi_ns.scene.geometry import rotate
 
+MOST_DIRECTIONS = 20_000_000
+"""Pixels of distinct lenses for which directions are kept (12 bytes each); nerfstudio makes the rays of more."""
+CHUNK = 2**18
+"""Pixels undistorted at once."""
+
 
 @dataclass(frozen=True)
 class PinholeRays:
-    """Takes the place of nerfstudio's ``RayGenerator`` for N such cameras."""
+    """Takes the place of nerfstudio's ``RayGenerator`` for N perspective cameras without a lens."""
 
     poses: Float[Tensor, "N 3 4"]
     focal: Float[Tensor, "N 2"]
@@ -27,13 +34,32 @@ class PinholeRays:
 
     @staticmethod
     def of(cameras: Cameras, device: torch.device | str) -> PinholeRays | None:
-        """None if a camera has another type, distortion or a time."""
-        distortion = cameras.distortion_params
-        plain = bool((cameras.camera_type == CameraType.PERSPECTIVE.value).all()) and cameras.times is None
-        if not plain or (distortion is not None and bool((distortion != 0).any())):
+        """Those of perspective and fisheye cameras, ``LensRays`` where one has a lens.
+
+        None if a camera has another type or a time, or if lenses differ so much that their directions need too much
+        memory.
+        """
+        kinds = cameras.camera_type.reshape(-1)
+        is_fisheye = kinds == CameraType.FISHEYE.value
+        if cameras.times is not None or not bool((is_fisheye | (kinds == CameraType.PERSPECTIVE.value)).all()):
             return None
         focal, principal = torch.cat([cameras.fx, cameras.fy], -1), torch.cat([cameras.cx, cameras.cy], -1)
-        return PinholeRays(*(x.to(device, torch.float32) for x in (cameras.camera_to_worlds, focal, principal)))
+        pinholes = PinholeRays(*(x.to(device, torch.float32) for x in (cameras.camera_to_worlds, focal, principal)))
+        lens = cameras.distortion_params
+        if not bool(is_fisheye.any()) and (lens is None or not bool((lens != 0).any())):
+            return pinholes
+        lens = torch.zeros(len(kinds), 6) if lens is None else lens
+        columns = (focal, principal, cameras.width, cameras.height, kinds, lens)
+        rows = torch.cat([x.reshape(len(kinds), -1).double().cpu() for x in columns], -1)
+        distinct, which = torch.unique(rows, dim=0, return_inverse=True)
+        pixels = (distinct[:, 4] * distinct[:, 5]).long()
+        if int(pixels.sum()) > MOST_DIRECTIONS:
+            return None
+        tables = [pixel_directions(tuple(row)) for row in distinct.tolist()]
+        directions = torch.cat(tables) if len(tables) > 1 else tables[0]
+        first, widths = (pixels.cumsum(0) - pixels)[which], distinct[which, 4].long()
+        tables_on_device = (x.to(device) for x in (directions, first, widths))
+        return LensRays(pinholes.poses, pinholes.focal, pinholes.principal, *tables_on_device)
 
     def __call__(self, ray_indices: Int[Tensor, "R 3"]) -> RayBundle:
         """Rays through pixel centres. Pixel areas, which this package does not use, are 1.
@@ -41,17 +67,56 @@ class PinholeRays:
         Args:
             ray_indices: camera, row and column of each.
         """
-        camera, pixel = ray_indices[:, 0], ray_indices[:, 1:].flip(-1) + 0.5
+        camera = ray_indices[:, 0]
         poses = self.poses[camera]
-        u, v = ((pixel - self.principal[camera]) / self.focal[camera]).unbind(-1)
-        directions = torch.nn.functional.normalize(
-            rotate(poses[:, :, :3], torch.stack([u, -v, -torch.ones_like(u)], -1)), dim=-1
-        )
-        one = torch.ones_like(u)[:, None]
+        directions = torch.nn.functional.normalize(rotate(poses[:, :, :3], self.local(ray_indices)), dim=-1)
+        one = torch.ones_like(directions[:, :1])
         return RayBundle(poses[:, :, 3], directions, pixel_area=one, camera_indices=camera[:, None], metadata={})
+
+    def local(self, ray_indices: Int[Tensor, "R 3"]) -> Float[Tensor, "R 3"]:
+        """Directions in the axes of the cameras: right, up, backwards."""
+        camera, pixel = ray_indices[:, 0], ray_indices[:, 1:].flip(-1) + 0.5
+        u, v = ((pixel - self.principal[camera]) / self.focal[camera]).unbind(-1)
+        return torch.stack([u, -v, -torch.ones_like(u)], -1)
 
     def image(self, height: int, width: int) -> RayBundle:
         """Rays [height, width] through all pixels of the first camera."""
         rows, columns = (torch.arange(n, device=self.focal.device) for n in (height, width))
         y, x = torch.meshgrid(rows, columns, indexing="ij")
         return self(torch.stack([torch.zeros_like(x), y, x], -1).view(-1, 3)).reshape((height, width))
+
+
+@dataclass(frozen=True)
+class LensRays(PinholeRays):
+    """The same for cameras with a lens, from a table of the directions of every pixel."""
+
+    directions: Float[Tensor, "T 3"]
+    """Of the pixels of all distinct cameras, in their axes."""
+    first: Int[Tensor, "N"]
+    """Row of each camera's first pixel in the table."""
+    widths: Int[Tensor, "N"]
+    """Of the images, pixels."""
+
+    def local(self, ray_indices: Int[Tensor, "R 3"]) -> Float[Tensor, "R 3"]:
+        """Directions in the axes of the cameras: right, up, backwards."""
+        camera, row, column = ray_indices.unbind(-1)
+        return self.directions[self.first[camera] + row * self.widths[camera] + column]
+
+
+@lru_cache(maxsize=2)
+def pixel_directions(camera: tuple[float, ...]) -> Float[Tensor, "P 3"]:
+    """Unit directions of all pixel centres of a camera, in its axes, row after row; nerfstudio's own.
+
+    Args:
+        camera: fx, fy, cx, cy, width, height, camera type, and nerfstudio's distortion parameters.
+    """
+    fx, fy, cx, cy = camera[:4]
+    width, height, kind = (int(n) for n in camera[4:7])
+    lens = torch.tensor([camera[7:]])
+    alone = Cameras(torch.eye(4)[None, :3], fx, fy, cx, cy, width, height, lens, CameraType(kind))
+    y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    parts = [alone.generate_rays(0, coords=c).directions for c in torch.stack([y, x], -1).view(-1, 2).split(CHUNK)]
+    directions = torch.cat(parts)
+    # nerfstudio divides by 0 in the very middle of a fisheye.
+    finite = torch.isfinite(directions).all(-1, keepdim=True)
+    return torch.where(finite, directions, directions.new_tensor([0.0, 0.0, -1.0]))

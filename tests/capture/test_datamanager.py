@@ -15,10 +15,11 @@ from PIL import Image
 from tiny_scene import HEIGHT, TRAIN, WIDTH, color_of, image_of, name_of, project, wall_points, write_scene
 from training_runs import datamanager, in_capture_frame, plan_of
 
+from mmpi_ns.capture import rays
 from mmpi_ns.capture.checks import say_once
 from mmpi_ns.capture.datamanager import OBSERVATIONS
 from mmpi_ns.capture.ray_sources import KEYPOINT_DEPTH, OWN_PIXEL, PIXEL_DEPTH
-from mmpi_ns.capture.rays import PinholeRays
+from mmpi_ns.capture.rays import LensRays, PinholeRays
 from mmpi_ns.capture.sfm import MIN_TRACK
 from mmpi_ns.placement.rule import PlacementConfig, place
 from mmpi_ns.scene.plan import ScenePlan
@@ -266,11 +267,52 @@ def test_rays_of_pinhole_cameras_are_nerfstudios(scene):
         assert torch.allclose(getattr(image, name), getattr(whole, name), atol=1e-6), name
 
 
-def test_other_cameras_are_left_to_nerfstudio(scene):
+@pytest.mark.parametrize("kind", ["PERSPECTIVE", "FISHEYE", "both"])
+def test_rays_through_a_lens_are_nerfstudios(scene, kind):
+    """Two lenses and two sizes; every pixel of an image, and a batch."""
+    cameras = copy.deepcopy(datamanager(scene).train_dataset.cameras)
+    cameras.distortion_params = torch.tensor([0.05, -0.02, 0.0, 0.0, 0.003, -0.002]).repeat(len(cameras), 1)
+    cameras.camera_type = cameras.camera_type.clone()
+    if kind != "PERSPECTIVE":
+        fisheye = slice(None) if kind == "FISHEYE" else slice(0, 3)
+        cameras.camera_type[fisheye] = CameraType.FISHEYE.value
+        cameras.distortion_params[fisheye] = torch.tensor([0.03, -0.01, 0.002, 0.001, 0.0, 0.0])
+    cameras.distortion_params[1, 0] = 0.02
+    cameras.width[4], cameras.cx[4] = WIDTH - 5, WIDTH / 2 - 3
+    made = PinholeRays.of(cameras, "cpu")
+    assert isinstance(made, LensRays)
+    distinct = 3 + (kind == "both")
+    assert (distinct - 1) * WIDTH * HEIGHT < len(made.directions) < distinct * WIDTH * HEIGHT
+    g = torch.Generator().manual_seed(1)
+    camera = torch.randint(0, len(cameras), (200,), generator=g)
+    sizes = torch.stack([cameras.height[:, 0], cameras.width[:, 0]], -1)[camera]
+    indices = torch.cat([camera[:, None], (torch.rand(200, 2, generator=g) * sizes).long()], -1)
+    ours, theirs = made(indices), RayGenerator(cameras)(indices)
+    for name in ("origins", "directions", "camera_indices"):
+        assert torch.allclose(getattr(ours, name), getattr(theirs, name), atol=1e-6), name
+    for i in (1, 4):
+        alone = PinholeRays.of(cameras[i : i + 1], "cpu")
+        whole = cameras[i : i + 1].generate_rays(camera_indices=0, keep_shape=True)
+        image = alone.image(HEIGHT, int(cameras.width[i]))
+        assert image.directions.shape == whole.directions.shape
+        assert torch.allclose(image.directions, whole.directions, atol=1e-6)
+
+
+def test_the_middle_of_a_fisheye_looks_ahead(scene):
+    cameras = copy.deepcopy(datamanager(scene).train_dataset.cameras)[0:1]
+    cameras.camera_type = torch.full_like(cameras.camera_type, CameraType.FISHEYE.value)
+    cameras.cx[:], cameras.cy[:] = 10.5, 7.5
+    middle = PinholeRays.of(cameras, "cpu")(torch.tensor([[0, 7, 10]])).directions[0]
+    assert torch.allclose(middle, -cameras.camera_to_worlds[0, :, 2], atol=1e-6)
+
+
+def test_other_cameras_are_left_to_nerfstudio(scene, monkeypatch):
     cameras = datamanager(scene).train_dataset.cameras
     bent, round_ = copy.deepcopy(cameras), copy.deepcopy(cameras)
     bent.distortion_params = torch.zeros(len(cameras), 6)
-    assert PinholeRays.of(bent, "cpu") is not None, "a lens model without effect"
+    assert type(PinholeRays.of(bent, "cpu")) is PinholeRays, "a lens model without effect"
     bent.distortion_params[1, 0] = 0.1
-    round_.camera_type[2] = CameraType.FISHEYE.value
-    assert PinholeRays.of(bent, "cpu") is None and PinholeRays.of(round_, "cpu") is None
+    monkeypatch.setattr(rays, "MOST_DIRECTIONS", 2 * WIDTH * HEIGHT - 1)
+    assert PinholeRays.of(bent, "cpu") is None, "two lenses, of too many pixels"
+    round_.camera_type = torch.full_like(round_.camera_type, CameraType.EQUIRECTANGULAR.value)
+    assert PinholeRays.of(round_, "cpu") is None
