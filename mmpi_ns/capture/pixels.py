@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from jaxtyping import Float, Int, Int16, UInt8
@@ -88,6 +89,11 @@ class PixelPool:
         )
         return PixelPool(colors, numbers, image_widths, begins, ends, places, depths)
 
+    @cached_property
+    def count(self) -> int:
+        """How many pixels are drawn from; asked of the device once, not in every step."""
+        return int((self.ends - self.begins).sum())
+
     def draw(
         self, count: int, g: torch.Generator
     ) -> tuple[Float[Tensor, "R C"], Int[Tensor, "R 3"], Float[Tensor, "R 2"]]:
@@ -98,8 +104,7 @@ class PixelPool:
             g: draws them.
         """
         after = (self.ends - self.begins).cumsum(0)
-        total = int(after[-1])
-        drawn = torch.randint(total, (count,), generator=g, device=g.device).to(self.colors.device)
+        drawn = torch.randint(self.count, (count,), generator=g, device=g.device).to(self.colors.device)
         which = torch.searchsorted(after, drawn, right=True)
         chosen = drawn - after[which] + self.ends[which]
         place = chosen - self.begins[which] if self.places is None else self.places[chosen].long()
