@@ -141,7 +141,7 @@ def train_windows(request: dict[str, Any], tell: Tell) -> Row:
     trainer.train_iteration = timed
     for window in some_windows(len(plans), request["windows"]):
         times.clear()
-        trainer._train_window(window) if len(plans) > 1 else trainer.train()
+        trainer.train_window(window) if len(plans) > 1 else trainer.train()
         row = {"step_ms": 1e3 * statistics.median(times[steps // 2 :]), **_look(trainer, window)}
         rows.append(row | {"window_mpis": len(plans[window].mpis), "window_texels": plans[window].texels})
     found: Row = {name: statistics.median(r[name] for r in rows) for name in rows[0]}

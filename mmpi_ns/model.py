@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -118,6 +119,8 @@ class MMPIModel(Model):
         self.store = WindowStore(config.windows_folder, self._new_field, budget, config.rendering.half_windows)
         self.sampler = MMPISampler()
         self.metrics = ImageMetrics(config.lpips_net)
+        self.notes_scores: Callable[[dict[str, Tensor], dict[str, float]], None] | None = None
+        """Called with the batch and the metrics of each image that is scored; it may add to them (the pipeline)."""
         self.show = ViewerDropdown("Show MPI", "all", ["all", *windows.names], hint="One MPI alone, or all")
         self.camera_optimizer: CameraOptimizer = config.camera_optimizer.setup(
             num_cameras=self.num_train_data, device=self.kwargs.get("device", "cpu")
@@ -327,6 +330,15 @@ class MMPIModel(Model):
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
+        values, images = self.scores_and_images(outputs, batch)
+        if self.notes_scores is not None:
+            self.notes_scores(batch, values)
+        return values, images
+
+    def scores_and_images(
+        self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
+    ) -> tuple[dict[str, float], dict[str, Tensor]]:
+        """Metrics of an image, and pictures of it."""
         observed = self.observed(batch).to(outputs["rgb"].device)
         values = self.metrics(outputs["rgb"], observed)
         values["dropped_mass"] = float(outputs["dropped_mass"].mean())

@@ -98,9 +98,10 @@ def in_one_place(centers: NDArray[np.float64], share: float = SAME_PLACE) -> boo
 
 def _read(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     if not path.is_file():
+        seen_from = "" if path.is_absolute() else f" in {Path.cwd()}, from where the path is seen"
         raise InputError(
-            f"There is no {path}: check --data, make one with mmpi-prepare, or name the data parser of another "
-            "format after the options (for example: ns-train mmpi-small --data FOLDER colmap)."
+            f"There is no {path}{seen_from}: check --data, make one with mmpi-prepare, or name the data parser of "
+            "another format after the options (for example: ns-train mmpi-small --data FOLDER colmap)."
         )
     try:
         meta = json.loads(path.read_text(encoding="utf-8"))

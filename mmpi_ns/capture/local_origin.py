@@ -19,6 +19,7 @@ from mmpi_ns.capture.point_cloud import parser_points
 from mmpi_ns.capture.sfm import model_errors
 from mmpi_ns.capture.sfm_files import check_model_files
 from mmpi_ns.utils.errors import InputError
+from mmpi_ns.utils.host import transforms_changed
 
 FAR = 10.0
 """Cameras this many times as far from the origin as from each other get a local origin."""
@@ -70,19 +71,11 @@ class LocalNerfstudio(Nerfstudio):
     _origin: LocalOrigin
 
     def _generate_dataparser_outputs(self, split: str = "train") -> DataparserOutputs:
-        read = nerfstudio_dataparser.load_from_json
-
-        def read_near(path: Path) -> dict[str, Any]:
-            meta = read(path)
+        def subtract(meta: dict[str, Any], path: Path) -> None:
             self._origin = LocalOrigin(meta, path)
-            return meta
 
-        # The parser reads and rounds in one function: this is the one place between.
-        nerfstudio_dataparser.load_from_json = read_near
-        try:
+        with transforms_changed(nerfstudio_dataparser, subtract):
             outputs = super()._generate_dataparser_outputs(split)
-        finally:
-            nerfstudio_dataparser.load_from_json = read
         return self._origin.tell(outputs)
 
     def _load_3D_points(self, ply_file_path: Path, transform_matrix: Tensor, scale_factor: float) -> Any:

@@ -34,34 +34,31 @@ class MMPIPipeline(VanillaPipeline):
 
     def get_average_image_metrics(self, data_loader: Any, image_prefix: str, *args: Any, **kwargs: Any) -> Any:
         """Means over the images of a loader, like nerfstudio's, and a summary line."""
-        found: list[tuple[int, dict[str, float]]] = []
+        scores: list[tuple[int, dict[str, float]]] = []
         model: Any = self.model
-        measure = model.get_image_metrics_and_images
 
-        def noted(outputs: Any, batch: Any) -> Any:
-            values, images = measure(outputs, batch)
+        def note(batch: Any, values: dict[str, float]) -> None:
             if self.config.refine_eval_poses:
-                values |= self._refined_metrics(data_loader.input_dataset.cameras, batch, measure)
-            found.append((int(batch["image_idx"]), dict(values)))
-            return values, images
+                values |= self._refined_metrics(data_loader.input_dataset.cameras, batch)
+            scores.append((int(batch["image_idx"]), dict(values)))
 
-        model.get_image_metrics_and_images = noted
+        model.notes_scores = note
         try:
             with exact_images():
                 means = super().get_average_image_metrics(data_loader, image_prefix, *args, **kwargs)
         finally:
-            del model.get_image_metrics_and_images
+            model.notes_scores = None
         names = [Path(name).name for name in data_loader.input_dataset.image_filenames]
-        say(summary([(names[i], values) for i, values in found]))
+        say(summary([(names[i], values) for i, values in scores]))
         return means
 
-    def _refined_metrics(self, cameras: Any, batch: Any, measure: Any) -> dict[str, float]:
+    def _refined_metrics(self, cameras: Any, batch: Any) -> dict[str, float]:
         """Metrics of an image with its pose refined against the model, and the size of the refinement."""
         model: Any = self.model
         i = int(batch["image_idx"])
         camera, observed = cameras[i : i + 1].to(model.device), model.observed(batch)
         camera, degrees, units = refined_camera(model, camera, observed, model.config.seed + i)
-        values, _ = measure(model.get_outputs_for_camera(camera), batch)
+        values, _ = model.scores_and_images(model.get_outputs_for_camera(camera), batch)
         moved = {"rotation_degrees": degrees, "translation": units}
         return {REFINED + name: value for name, value in (values | moved).items()}
 

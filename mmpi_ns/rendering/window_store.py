@@ -17,7 +17,7 @@ from mmpi_ns.field.tables import TABLES
 from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.utils.errors import InputError, brief
 from mmpi_ns.utils.files import to_text, write_atomically
-from mmpi_ns.utils.threads import Uninterrupted
+from mmpi_ns.utils.host import Uninterrupted
 
 _DAMAGED = (OSError, RuntimeError, EOFError, KeyError, TypeError, pickle.UnpicklingError)
 """Exceptions of reading a damaged file."""

@@ -14,7 +14,8 @@ from mmpi_ns.placement.defaults import DEFAULTS
 from mmpi_ns.placement.options import check_placement
 from mmpi_ns.placement.rule import PlacementConfig
 from mmpi_ns.scripts.command import say_version
-from mmpi_ns.utils.errors import InputError, speak_plainly
+from mmpi_ns.utils.errors import InputError
+from mmpi_ns.utils.host import enter_command
 from mmpi_ns.utils.values import Number, check_options
 
 if TYPE_CHECKING:
@@ -128,7 +129,7 @@ def entrypoint() -> None:
     """The command ``mmpi-plan``; a problem with the scene or the plan ends it with one sentence and status 1."""
     say_version("mmpi-plan")
     command = tyro.cli(PlanCommand, default=_defaults(sys.argv[1:]), description=PlanCommand.__doc__)
-    speak_plainly()
+    enter_command()
     command.main()
 
 

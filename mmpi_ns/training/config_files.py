@@ -1,9 +1,13 @@
-"""config.yml of earlier versions: options that moved into groups are read there, options that left are named."""
+"""config.yml: read from anywhere, also those of earlier versions, whose options were not in groups."""
 
 from __future__ import annotations
 
+import copy
 from dataclasses import fields, is_dataclass
+from pathlib import Path
 from typing import Any
+
+from nerfstudio.engine.trainer import TrainerConfig
 
 from mmpi_ns.utils.errors import InputError
 from mmpi_ns.utils.values import shown
@@ -46,6 +50,20 @@ def grouped(state: dict[str, Any], usual: Any) -> dict[str, Any]:
         if old in state and name in {f.name for f in fields(getattr(usual, group))} and group not in state:
             setattr(getattr(usual, group), name, state.pop(old))
     return vars(usual) | state
+
+
+def with_absolute_paths(config: TrainerConfig) -> TrainerConfig:
+    """The settings of a run as its config.yml keeps them: for any working folder, and without a checkpoint to load."""
+    config = copy.deepcopy(config)
+    config.load_dir = config.load_step = config.load_checkpoint = None
+    manager: Any = config.pipeline.datamanager
+    for settings, name in ((config, "output_dir"), (config, "data"), (manager, "data"), (manager.dataparser, "data")):
+        path = getattr(settings, name)
+        if path not in (None, Path()):
+            setattr(settings, name, path.absolute())
+    model: Any = config.pipeline.model
+    model.windows_folder = model.windows_folder.absolute()
+    return config
 
 
 def check_nothing_left(model: Any) -> None:

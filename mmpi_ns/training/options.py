@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,8 @@ from nerfstudio.engine.trainer import TrainerConfig
 from mmpi_ns.placement.options import check_placement
 from mmpi_ns.training.phases import check_schedule
 from mmpi_ns.utils.errors import InputError
+from mmpi_ns.utils.host import arguments, command
+from mmpi_ns.utils.machine import unused_gpu
 from mmpi_ns.utils.values import Number, check_number, check_options
 
 POSITIVE, NOT_NEGATIVE, COUNT = Number(0, above=True), Number(0), Number(0, whole=True)
@@ -72,16 +73,22 @@ NO_EFFECT = {
 """nerfstudio's options that have no effect on this method."""
 
 
-def check_ffmpeg(command: Sequence[str]) -> None:
-    """Raises InputError if ns-render will need ffmpeg and it is missing; nerfstudio checks only after loading.
-
-    Args:
-        command: the command that runs, and its arguments.
-    """
-    makes_films = Path(command[0]).stem == "ns-render" and "dataset" not in command
+def check_ffmpeg() -> None:
+    """Raises InputError if ns-render will need ffmpeg and it is missing; nerfstudio checks only after loading."""
+    makes_films = command() == "ns-render" and "dataset" not in arguments()
     if makes_films and shutil.which("ffmpeg") is None:
         raise InputError(
             "ns-render needs ffmpeg, for images too, and it is not installed: install it (apt or conda install ffmpeg)."
+        )
+
+
+def check_device(device_type: str) -> None:
+    """Raises InputError if training is to run on a GPU that torch does not see."""
+    usable = {"cuda": torch.cuda.is_available, "mps": torch.backends.mps.is_available}
+    if device_type in usable and not usable[device_type]():
+        raise InputError(
+            f"--machine.device-type {device_type} asks for a GPU, and torch sees none: "
+            f"{unused_gpu() or 'check the driver and the build of torch'}; --machine.device-type cpu trains without."
         )
 
 

@@ -8,7 +8,7 @@ from typing import Any
 from mmpi_ns.field.tables import TABLES, TexelTables
 from mmpi_ns.scene.texels import BRICK
 from mmpi_ns.training.phases import Schedule
-from mmpi_ns.utils.machine import give_back_freed_memory
+from mmpi_ns.utils.host import give_back_freed_memory
 
 FORMING = 0.4
 """Factor of the weight below which bricks are released while surfaces still form."""

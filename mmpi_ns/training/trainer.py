@@ -8,13 +8,12 @@ from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from time import monotonic
-from typing import Any, Literal
+from typing import Any, Literal, NoReturn
 
 import torch
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils import comms, writer
-from nerfstudio.utils.rich_utils import CONSOLE
 
 from mmpi_ns.capture.datamanager import MMPIDataManager
 from mmpi_ns.rendering.rendered import BACKGROUNDS
@@ -29,22 +28,21 @@ from mmpi_ns.training.checkpoints import (
     checkpoints_in,
     read_checkpoint,
 )
-from mmpi_ns.training.config_files import check_nothing_left
+from mmpi_ns.training.config_files import check_nothing_left, with_absolute_paths
 from mmpi_ns.training.learning_rates import following
 from mmpi_ns.training.memory import describe, training_bytes
-from mmpi_ns.training.options import check_ffmpeg, check_run
-from mmpi_ns.training.ranks import patient_group, wait_for_all
+from mmpi_ns.training.options import check_device, check_ffmpeg, check_run
 from mmpi_ns.training.report import TrainingLog, forecast, next_commands, quick_test
 from mmpi_ns.training.run import TrainingRun
 from mmpi_ns.training.run_folder import claim
-from mmpi_ns.training.stopping import end, end_before_training, signals_go_to
-from mmpi_ns.utils.console import duration, keep_quiet, say
-from mmpi_ns.utils.errors import InputError, speak_plainly
+from mmpi_ns.training.shared_windows import WINDOWS_FOLDER, WindowShare
+from mmpi_ns.utils.console import duration, say
+from mmpi_ns.utils.errors import InputError
 from mmpi_ns.utils.files import write_atomically
-from mmpi_ns.utils.machine import keep_freed_memory
+from mmpi_ns.utils.host import arguments, command, enter_command, signals_go_to
+from mmpi_ns.utils.machine import unused_gpu
 
 PLAN_FILE = "plan.json"
-WINDOWS_FOLDER = "windows"
 
 
 @dataclass
@@ -58,8 +56,7 @@ class MMPITrainerConfig(TrainerConfig):
 
     def set_timestamp(self) -> None:
         """The first code of this package that ns-train runs."""
-        speak_plainly()
-        keep_quiet()
+        enter_command()
         super().set_timestamp()
 
     def get_checkpoint_dir(self) -> Path:
@@ -67,9 +64,8 @@ class MMPITrainerConfig(TrainerConfig):
 
         They take every file in this folder for a checkpoint, so the last one is given explicitly.
         """
-        speak_plainly()
-        keep_quiet()
-        check_ffmpeg(sys.argv)
+        enter_command()
+        check_ffmpeg()
         check_nothing_left(self.pipeline.model)
         folder = super().get_checkpoint_dir()
         steps = checkpoints_in(folder)
@@ -83,9 +79,8 @@ class MMPITrainerConfig(TrainerConfig):
 
         ns-viewer takes the address from its own options, whose default is every address of the machine.
         """
-        options = [word.replace("_", "-") for word in sys.argv]
-        asked = any(word.startswith("--viewer.websocket-host") for word in options)
-        if Path(options[0]).stem == "ns-viewer" and not asked:
+        asked = any(word.startswith("--viewer.websocket-host") for word in arguments())
+        if command() == "ns-viewer" and not asked:
             self.viewer.websocket_host = "127.0.0.1"
         return super().get_base_dir()
 
@@ -96,19 +91,14 @@ class MMPITrainerConfig(TrainerConfig):
     def save_config(self) -> None:
         """Checks the options, locks the run's folder, and writes config.yml.
 
-        It tells ns-eval and ns-render where the windows of a long capture are, but not which checkpoint this run
-        resumes from, which they must not load.
+        It tells ns-eval and ns-render where the capture and the windows are, from whatever folder they are started, but
+        not which checkpoint this run resumes from, which they must not load.
         """
         check_run(self)
         folder = self.get_base_dir()
         claim(folder, self.get_checkpoint_dir(), self.load_checkpoint or self.load_dir)
         self.pipeline.model.windows_folder = folder / WINDOWS_FOLDER  # type: ignore[attr-defined]
-        resumes = {name: getattr(self, name) for name in ("load_dir", "load_step", "load_checkpoint")}
-        try:
-            vars(self).update(dict.fromkeys(resumes))
-            super().save_config()
-        finally:
-            vars(self).update(resumes)
+        TrainerConfig.save_config(with_absolute_paths(self))
 
 
 class MMPITrainer(Trainer):
@@ -122,59 +112,62 @@ class MMPITrainer(Trainer):
         assert isinstance(run, TrainingRun), "MMPITrainer trains MMPIModel only"
         return run
 
+    @property
+    def _manager(self) -> MMPIDataManager:
+        manager = self.pipeline.datamanager
+        assert isinstance(manager, MMPIDataManager), "MMPITrainer trains from MMPIDataManager"
+        return manager
+
+    # Before the first step ----------------------------------------------------------------------------------------
+
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         """Prepares the run; a signal during this time ends it with a sentence (of several processes: torchrun's)."""
-        with signals_go_to(end_before_training) if self.world_size == 1 else nullcontext():
+        with signals_go_to(_end_before_training) if self.world_size == 1 else nullcontext():
             self._prepare(test_mode)
 
     def _prepare(self, test_mode: Literal["test", "val", "inference"]) -> None:
-        _check_device(self.config.machine.device_type)
-        keep_freed_memory()
+        enter_command(training=True)
+        check_device(self.config.machine.device_type)
+        if str(self.device).startswith("cuda"):  # kernels start on the current device, which is the first otherwise
+            torch.cuda.set_device(self.local_rank)
         self._stopped_by: int | None = None
         self._log: TrainingLog | None = None
         self._began = monotonic()
-        model_config: Any = self.config.pipeline.model
-        model_config.seed = self.config.pipeline.datamanager.seed = self.config.machine.seed  # type: ignore[attr-defined]
-        self._window_steps = model_config.total_steps = self.config.max_num_iterations
+        config = self.config
+        model_config: Any = config.pipeline.model
+        model_config.seed = config.pipeline.datamanager.seed = config.machine.seed  # type: ignore[attr-defined]
+        self._window_steps = model_config.total_steps = config.max_num_iterations
         model_config.windows_folder = self.base_dir / WINDOWS_FOLDER
-        # Processes share the windows; nerfstudio would make them average their gradients.
-        self._processes, self._process, self.world_size = self.world_size, comms.get_rank(), 1
-        self._resumes_from = self.config.load_dir
-        self._everyone = patient_group() if self._processes > 1 else None
-        if self._processes > 1:
-            self.config.load_dir = None
-        self._says_lines, self.config.logging.local_writer.enable = self.config.logging.local_writer.enable, False
+        self._share: WindowShare | None = None
+        if self.world_size > 1:
+            folders = [self.checkpoint_dir, *([config.load_dir] if config.load_dir else [])]
+            self._share = WindowShare(comms.get_rank(), self.world_size, self._window_steps, folders)
+            # Processes share the windows; nerfstudio would make them average their gradients.
+            self.world_size, config.load_dir = 1, None
+        self._says_lines, config.logging.local_writer.enable = config.logging.local_writer.enable, False
         super().setup(test_mode)
-        self.config.max_num_iterations = self._window_steps
+        config.max_num_iterations = self._window_steps
         plan = self._run.progress.windows
         self.base_dir.mkdir(parents=True, exist_ok=True)
         _write_plan(self.base_dir / PLAN_FILE, plan)
-        self._run.shared = self._processes > 1
+        self._run.shared = self._share is not None
         if len(self._run.field.density) <= BRICK:  # the one that nothing lies in
             raise InputError(
                 "No training image sees anything of the scene plan: its MPIs must stand among the cameras and face as "
                 "they do (mmpi-plan shows where)."
             )
         self._say_what_comes(plan)
-        if 1 < self._processes and len(plan) < self._processes:
-            raise InputError(
-                f"The capture has {len(plan)} window(s), too few to share out among {self._processes} processes: start "
-                "fewer, or make windows shorter with --pipeline.model.placement.window-length."
-            )
+        if self._share is not None:
+            self._share.check(plan)
 
     def _say_what_comes(self, plan: WindowedPlan) -> None:
         """Prints capture, plan and memory together, before the first step."""
-        manager, steps = self._manager, self._total_steps
-        say(manager.describe())
+        say(self._manager.describe())
         say(describe(plan, self._window_steps, *self._expected_memory()))
         if not str(self.device).startswith("cuda"):
-            say(forecast(self.config.method_name or "", steps, manager.get_train_rays_per_batch()))
-
-    @property
-    def _manager(self) -> MMPIDataManager:
-        manager = self.pipeline.datamanager
-        assert isinstance(manager, MMPIDataManager), "MMPITrainer trains from MMPIDataManager"
-        return manager
+            say(forecast(self.config.method_name or "", self._total_steps, self._manager.get_train_rays_per_batch()))
+            if gpu := unused_gpu():
+                say(f"No GPU is used: {gpu}.")
 
     def _expected_memory(self) -> tuple[list[int], list[int]]:
         """Bytes needed for training each window: tables with their moments, and pixels."""
@@ -200,86 +193,61 @@ class MMPITrainer(Trainer):
         }
         return Optimizers(config, self.pipeline.get_param_groups())
 
+    # Steps --------------------------------------------------------------------------------------------------------
+
     def train(self) -> None:
         """Runs max-num-iterations in total (a window); nerfstudio 1.1.5 would run as many again after a resume."""
-        if self._processes > 1:
-            own = range(self._process, len(self._run.progress.windows), self._processes)
-            for window in [w for w in own if not self._is_finished(w)]:
-                self._train_window(window)
-            wait_for_all(self._everyone)
-            return
-        self._last_step = self._start_step - 1
-        self.config.max_num_iterations = max(0, self._total_steps - self._start_step)
-        if self.config.max_num_iterations == 0:
-            CONSOLE.print(
-                f"The checkpoint already holds {self._start_step} of {self._total_steps} steps: nothing to do."
-            )
+        if self._share is not None:
+            for window in self._share.unfinished(self._run.progress.windows, self._run.store):
+                self.train_window(window)
+            self._share.wait_for_all()
             return
         self._began = monotonic()
-        self._log = self._new_log(self._total_steps)
-        try:
-            with signals_go_to(self._stop):
-                super().train()
-        finally:
-            self.config.max_num_iterations = self._window_steps
+        if self._start_step >= self._total_steps:
+            say(f"The checkpoint already holds {self._start_step} of {self._total_steps} steps: nothing to do.")
+            return
+        with signals_go_to(self._stop):
+            self._train_until(self._total_steps)
         if self._stopped_by is not None:
             self.config.logging.profiler = "none"  # nothing more is said
             path = checkpoints_in(self.checkpoint_dir).get(self._last_step)
             if path is None:  # training was paused
-                end_before_training(self._stopped_by)
-            end(
+                _end_before_training(self._stopped_by)
+            _end(
                 self._stopped_by,
                 f"Stopped after step {self._last_step + 1} of {self._total_steps}, which is in {path}: the same "
                 f"command with --load-dir {self.checkpoint_dir} continues from there.",
             )
 
-    def _new_log(self, end: int) -> TrainingLog | None:
-        """Of the steps up to ``end``; None where none is wanted."""
-        rays = self._manager.get_train_rays_per_batch()
-        return TrainingLog(self._run.progress.schedule, rays, self._start_step, end) if self._says_lines else None
-
-    def _stop(self, number: int) -> None:
-        """Makes nerfstudio's loop end after the current step, even if training is paused."""
-        self._stopped_by, self.stop_training = number, True
-
-    def _checkpoints_of(self, window: int) -> dict[int, Path]:
-        """Folders with the checkpoints of one window of several, here and in the run that this one resumes."""
-        steps = range(window * self._window_steps, (window + 1) * self._window_steps)
-        folders = [self.checkpoint_dir, *([self._resumes_from] if self._resumes_from else [])]
-        return {step: path for folder in folders for step, path in checkpoints_in(folder, steps).items()}
-
-    def _is_finished(self, window: int) -> bool:
-        """Whether a window of several is finished; takes over its file if the resumed run finished it."""
-        store, windows = self._run.store, self._run.progress.windows
-        if self._resumes_from:
-            store.adopt(self._resumes_from.parent / WINDOWS_FOLDER, {window: windows.plans[window]})
-        # The last window needs its checkpoint too, because evaluation loads it.
-        is_last = window == len(windows) - 1
-        finished = store.path(window).is_file() and (
-            not is_last or (window + 1) * self._window_steps - 1 in self._checkpoints_of(window)
-        )
-        if finished:
-            CONSOLE.print(f"Window {window} is finished already.")
-        return finished
-
-    def _train_window(self, window: int) -> None:
+    def train_window(self, window: int) -> None:
         """Trains one window of several, from where the resumed run left it."""
-        first, known = window * self._window_steps, self._checkpoints_of(window)
-        self._start_step = first
-        if known:
-            self.config.load_checkpoint = known[max(known)]
+        steps = range(window * self._window_steps, (window + 1) * self._window_steps)
+        checkpoints = {} if self._share is None else self._share.checkpoints_of(window)
+        self._start_step = steps.start
+        if checkpoints:
+            self.config.load_checkpoint = checkpoints[max(checkpoints)]
             self._load_checkpoint()
             self.config.load_checkpoint = None
+        self._train_until(steps.stop)
+        if window != len(self._run.progress.windows) - 1:  # its file is all that is needed of it
+            for path in checkpoints_in(self.checkpoint_dir, steps).values():
+                path.unlink()
+
+    def _train_until(self, end: int) -> None:
+        """Trains from the first step to that before ``end``."""
         self._last_step = self._start_step - 1
-        self.config.max_num_iterations = first + self._window_steps - self._start_step
-        self._log = self._new_log(first + self._window_steps)
+        self.config.max_num_iterations = max(0, end - self._start_step)
+        rays = self._manager.get_train_rays_per_batch()
+        schedule = self._run.progress.schedule
+        self._log = TrainingLog(schedule, rays, self._start_step, end) if self._says_lines else None
         try:
             super().train()
         finally:
             self.config.max_num_iterations = self._window_steps
-        if window != len(self._run.progress.windows) - 1:  # its file is all that is needed of it
-            for path in checkpoints_in(self.checkpoint_dir, range(first, first + self._window_steps)).values():
-                path.unlink()
+
+    def _stop(self, number: int) -> None:
+        """Makes nerfstudio's loop end after the current step, even if training is paused."""
+        self._stopped_by, self.stop_training = number, True
 
     def train_iteration(self, step: int) -> Any:
         """One step; records that it ran, and saves a window of several after its last step."""
@@ -300,7 +268,7 @@ class MMPITrainer(Trainer):
         self.training_state = "completed"
         self.save_checkpoint(self.step)
         writer.write_out_storage()
-        if self._stopped_by is not None or self._processes > 1:
+        if self._stopped_by is not None or self._share is not None:
             return
         seconds = monotonic() - self._began
         say(f"Training finished: {self._last_step + 1 - self._start_step:,} steps in {duration(seconds)}.")
@@ -312,12 +280,14 @@ class MMPITrainer(Trainer):
         if not self.config.viewer.quit_on_train_completion:
             self._train_complete_viewer()
 
+    # Checkpoints --------------------------------------------------------------------------------------------------
+
     def save_checkpoint(self, step: int) -> None:
         """Writes beside the checkpoint folder, then moves the file in, so a kill or a full disk loses nothing.
 
         Names inside the folder are parsed as steps by nerfstudio, so the unfinished file must not lie there.
         """
-        if step < 0 or not (self._processes > 1 or comms.is_main_process()):
+        if step < 0 or not (self._share is not None or comms.is_main_process()):
             return  # stopped before the first step: there is nothing to save
         self.checkpoint_dir.mkdir(parents=True, exist_ok=True)
         path = self.checkpoint_dir / f"step-{step:09d}.ckpt"
@@ -335,9 +305,9 @@ class MMPITrainer(Trainer):
         }
         write_atomically(path, lambda p: torch.save(state, p), self.base_dir)
         if self.config.save_only_latest_checkpoint:
-            first = step - step % self._window_steps if self._processes > 1 else 0
-            own = range(first, first + self._window_steps) if self._processes > 1 else None  # others are others' work
-            for old in checkpoints_in(self.checkpoint_dir, own).values():
+            share = self._share  # checkpoints of other windows are other processes' work
+            steps = None if share is None else share.steps_of(step // self._window_steps)
+            for old in checkpoints_in(self.checkpoint_dir, steps).values():
                 if old != path:
                     old.unlink()
 
@@ -356,7 +326,7 @@ class MMPITrainer(Trainer):
         asked_for, self.config.load_checkpoint = self.config.load_checkpoint, path
         super()._load_checkpoint()
         self.config.load_dir, self.config.load_checkpoint = asked, asked_for
-        if path is not None and self._processes == 1:
+        if path is not None and self._share is None:
             progress = run.progress
             finished = dict(enumerate(progress.windows.plans[: progress.schedule.window_at(self._start_step)]))
             run.store.adopt(path.parent.parent / WINDOWS_FOLDER, finished, needed=True)
@@ -380,10 +350,13 @@ def _detached(value: Any) -> Any:
     return value.detach() if isinstance(value, torch.Tensor) else value
 
 
-def _check_device(device_type: str) -> None:
-    there = {"cuda": torch.cuda.is_available, "mps": torch.backends.mps.is_available}
-    if device_type in there and not there[device_type]():
-        raise InputError(
-            f"--machine.device-type {device_type} asks for a GPU and torch sees none: check the driver and torch's "
-            "build, or train with --machine.device-type cpu."
-        )
+def _end(number: int, sentence: str) -> NoReturn:
+    """Ends the process with the exit status of the signal (130 after Ctrl-C) and a sentence."""
+    sys.stdout.flush()
+    print(sentence, file=sys.stderr, flush=True)
+    raise SystemExit(128 + number)
+
+
+def _end_before_training(number: int) -> NoReturn:
+    """Handles signals that arrive while a run is prepared."""
+    _end(number, "Stopped before the first step: there is nothing to go on from.")

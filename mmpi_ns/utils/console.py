@@ -1,35 +1,8 @@
-"""What nerfstudio's commands print: what a user can do nothing about is left out."""
+"""What is said to the user."""
 
 from __future__ import annotations
 
-import os
-from typing import Any
-
 from nerfstudio.utils.rich_utils import CONSOLE
-
-from mmpi_ns.utils.errors import TRACEBACK
-
-NOT_FOR_USERS = (
-    "Mixed precision is disabled",
-    "No Nerfstudio checkpoint to load",
-    "logging events to:",
-    "[bold yellow]logging events to:",
-    "[NOTE] Not running eval iterations",
-)
-"""How such lines begin. All of ``CONSOLE.log`` is of that kind, and has the line of nerfstudio's code beside it."""
-_print = CONSOLE.print
-
-
-def keep_quiet() -> None:
-    """From now on nerfstudio's notices are not shown in this process; with ``MMPI_TRACEBACK=1`` they are."""
-    if os.environ.get(TRACEBACK) != "1":
-        CONSOLE.log = lambda *_, **__: None  # type: ignore[method-assign]
-        CONSOLE.print = _print_for_users  # type: ignore[method-assign]
-
-
-def _print_for_users(*objects: Any, **how: Any) -> None:
-    if not (objects and isinstance(objects[0], str) and objects[0].startswith(NOT_FOR_USERS)):
-        _print(*objects, **how)
 
 
 def say(text: str) -> None:

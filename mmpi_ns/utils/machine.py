@@ -1,9 +1,9 @@
-"""What the machine has left to give, and what a process keeps of it."""
+"""What the machine has left to give."""
 
 from __future__ import annotations
 
-import ctypes
 import os
+import re
 import sys
 from pathlib import Path
 
@@ -12,35 +12,11 @@ import torch
 from torch import Tensor
 
 CGROUP = Path("/sys/fs/cgroup")
-
-KEPT = 256 << 20
-"""Bytes that are freed and kept for the next use: more than a step takes beside the tables."""
-OWN_MAPPING = 32 << 20
-"""Arrays of so many bytes, which tables are, go back to the system at once: glibc's upper limit."""
-
-
-def keep_freed_memory() -> bool:
-    """Has glibc keep what a training step frees for the next one, which takes the same again.
-
-    Else it gives much of it back to the system, which then hands out zeroed pages: thousands of page faults a step.
-
-    Returns:
-        Whether it does so: other C libraries are left as they are.
-    """
-    trim_threshold, mmap_threshold = -1, -3  # malloc.h
-    try:
-        mallopt = ctypes.CDLL(None).mallopt
-    except (AttributeError, OSError, TypeError):
-        return False
-    return bool(mallopt(trim_threshold, KEPT)) and bool(mallopt(mmap_threshold, OWN_MAPPING))
-
-
-def give_back_freed_memory() -> None:
-    """Has glibc give back what it keeps and nobody uses: before tables grow, which do not fit into what steps leave."""
-    try:
-        ctypes.CDLL(None).malloc_trim(0)
-    except (AttributeError, OSError, TypeError):  # another C library
-        return
+NVIDIA = Path("/proc/driver/nvidia")
+DRIVERS = {13: 580, 12: 525, 11: 450}
+"""Series of NVIDIA's driver that a major version of CUDA needs at least."""
+WHEELS = {12: "cu126", 11: "cu118"}
+"""Builds of torch for CUDA versions that older drivers know."""
 
 
 def lazy_zeros(shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
@@ -76,3 +52,27 @@ def _available() -> int:
         return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:"))
     except (OSError, StopIteration):
         return sys.maxsize
+
+
+def unused_gpu() -> str:
+    """Why torch does not use an NVIDIA GPU that the system has, with the command that mends it; empty where it does,
+    where there is none, and where CUDA_VISIBLE_DEVICES hides it."""
+    if torch.cuda.is_available() or os.environ.get("CUDA_VISIBLE_DEVICES") is not None:
+        return ""
+    try:
+        gpus = [path.read_text(encoding="utf-8") for path in (NVIDIA / "gpus").glob("*/information")]
+        version = re.search(r"\b(\d{3})\.\d+(\.\d+)?\b", (NVIDIA / "version").read_text(encoding="utf-8"))
+    except OSError:
+        return ""
+    if not gpus or version is None:
+        return ""
+    model = re.search(r"Model:\s*(.+)", gpus[0])
+    where = f"this machine has {model[1].strip() if model else 'an NVIDIA GPU'} with driver {version[0]}"
+    driver, cuda = int(version[1]), int((torch.version.cuda or "0").split(".")[0])
+    wheel = next((WHEELS[c] for c in WHEELS if driver >= DRIVERS[c]), None)
+    pip = f"pip install --force-reinstall torch torchvision --index-url https://download.pytorch.org/whl/{wheel}"
+    if driver >= DRIVERS.get(cuda, 0) > 0:
+        return f"{where}, but CUDA does not start: python -c 'import torch; torch.cuda.init()' says why"
+    why = f"needs {DRIVERS[cuda]} or newer" if cuda in DRIVERS else "is built without CUDA"
+    mends = pip if wheel else "update the driver"
+    return f"{where}, and torch {torch.__version__} {why}; to use it: {mends}"

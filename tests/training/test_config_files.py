@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import fields
 from pathlib import Path
 
 import pytest
 import yaml
+from nerfstudio.utils.eval_utils import eval_setup
+from training_runs import datamanager, ready, trainer_config
 
 from mmpi_ns.config import mmpi_kitti, mmpi_small
 from mmpi_ns.model import MMPIModelConfig
@@ -55,3 +58,24 @@ def test_an_option_that_left_and_changes_the_images_is_named():
 def test_a_file_of_this_version_is_read_as_it_was_written(method):
     config = method.config
     assert yaml.load(yaml.dump(config), Loader=yaml.Loader).pipeline.model == config.pipeline.model
+
+
+def test_a_run_is_read_from_another_folder_than_it_was_trained_in(scene, plan_file, tmp_path, monkeypatch):
+    """--data and --output-dir were relative paths, of the folder where ns-train ran."""
+    (tmp_path / "there").mkdir()
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "there")
+    shutil.copytree(scene, "data")
+    config = trainer_config(Path("data"), plan_file, Path("runs"), 2, lpips_net="none")
+    config.save_config()
+    ready(config).train()
+    assert config.output_dir == Path("runs") and config.data == Path("data"), "the run itself keeps what it was given"
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    _, pipeline, checkpoint, step = eval_setup(tmp_path / "there" / config.get_base_dir() / "config.yml")
+    assert step == 1 and checkpoint.parent.parent.parent.name == "mmpi-small" and len(pipeline.datamanager.eval_dataset)
+
+
+def test_a_capture_that_is_not_there_says_from_where_its_path_is_seen(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match=rf"no data/transforms.json in {tmp_path}, from where the path is seen"):
+        datamanager(Path("data"))

@@ -1,0 +1,249 @@
+"""Everything that this package changes in its host (nerfstudio, Python, glibc), with the reason and the undo of each.
+
+Nothing happens at import, nor in a program that makes a model, a pipeline or a trainer itself. ``PATCHES`` last for a
+process and are made in nerfstudio's commands and ours alone (``enter_command``); ``undo`` takes them back. What is
+changed for a block is a context manager below. No other module of the method assigns to what it imports
+(``tests/utils/test_host.py``).
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import sys
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from threading import current_thread, main_thread
+from types import ModuleType, TracebackType
+from typing import Any
+
+from nerfstudio.utils.rich_utils import CONSOLE
+
+from mmpi_ns.utils.errors import InputError
+
+TRACEBACK = "MMPI_TRACEBACK"
+"""Set to 1 in the environment it shows the traceback of every error, and nerfstudio's notices."""
+NOTICES = (
+    "Mixed precision is disabled",
+    "No Nerfstudio checkpoint to load",
+    "logging events to:",
+    "[bold yellow]logging events to:",
+    "[NOTE] Not running eval iterations",
+)
+"""How nerfstudio's lines begin that nobody who trains can do anything about."""
+WARNINGS = (
+    "Using a non-tuple sequence for multidimensional indexing",
+    "`torch.cuda.amp",
+    "Detected call of `lr_scheduler.step\\(\\)` before `optimizer.step\\(\\)`",  # parameters that are frozen at first
+    "Sparse invariant checks are implicitly disabled",
+    "You are using `torch.load` with `weights_only=False`",
+)
+"""How such warnings of torch and nerfstudio begin."""
+TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3
+"""Of mallopt, in malloc.h."""
+KEPT = 256 << 20
+"""Bytes that are freed and kept for the next use: more than a step takes beside the tables."""
+OWN_MAPPING = 32 << 20
+"""Arrays of so many bytes, which tables are, go back to the system at once: glibc's upper limit."""
+MALLOC_DEFAULT = 128 << 10
+"""glibc's value of both thresholds at the start."""
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+Undo = Callable[[], object]
+
+
+@dataclass(frozen=True)
+class Patch:
+    """A change of the host that lasts until it is undone."""
+
+    target: str
+    reason: str
+    make: Callable[[], Undo]
+    training: bool = False
+    """Made for training alone."""
+
+
+def _show_errors() -> Undo:
+    before = sys.excepthook
+
+    def show(kind: type[BaseException], error: BaseException, traceback: TracebackType | None) -> None:
+        if os.environ.get(TRACEBACK) == "1" or not issubclass(kind, InputError):
+            before(kind, error, traceback)
+            return
+        sys.stdout.flush()
+        print(f"{Path(sys.argv[0]).stem}: {error}", file=sys.stderr, flush=True)
+
+    sys.excepthook = show
+    return lambda: setattr(sys, "excepthook", before)
+
+
+def _filter_warnings() -> Undo:
+    before = list(warnings.filters)
+    for message in WARNINGS:
+        warnings.filterwarnings("ignore", message=message)
+    return lambda: warnings.filters.__setitem__(slice(None), before)  # type: ignore[attr-defined]
+
+
+def _quiet_console() -> Undo:
+    plain = CONSOLE.print
+
+    def print_for_users(*objects: Any, **how: Any) -> None:
+        if not (objects and isinstance(objects[0], str) and objects[0].startswith(NOTICES)):
+            plain(*objects, **how)
+
+    if os.environ.get(TRACEBACK) == "1":
+        return lambda: None
+    vars(CONSOLE).update(print=print_for_users, log=lambda *_, **__: None)
+    return lambda: [vars(CONSOLE).pop(name) for name in ("print", "log")]
+
+
+def _keep_freed_memory() -> Undo:
+    malloc_keeps(KEPT, OWN_MAPPING)
+    return lambda: malloc_keeps(MALLOC_DEFAULT, MALLOC_DEFAULT)
+
+
+PATCHES = (
+    Patch("sys.excepthook", "An InputError ends a command with its sentence alone.", _show_errors),
+    Patch("warnings.filters", "Nobody who trains can do anything about these of torch.", _filter_warnings),
+    Patch("CONSOLE.print, CONSOLE.log", "Nor about these, or about the lines of nerfstudio's log.", _quiet_console),
+    Patch(
+        "glibc's malloc",
+        "A step takes again what the last one freed; see malloc_keeps.",
+        _keep_freed_memory,
+        training=True,
+    ),
+)
+_undos: dict[str, Undo] = {}
+
+
+def command() -> str | None:
+    """Name of the command that this process runs, of nerfstudio or ours; None in any other program."""
+    program = Path(sys.argv[0]) if sys.argv and sys.argv[0] else Path("python")
+    if program.stem.startswith(("ns-", "mmpi-")):
+        return program.stem
+    module = program.parent.as_posix().endswith(("nerfstudio/scripts", "mmpi_ns/scripts"))
+    return f"ns-{program.stem}" if module else None
+
+
+def arguments() -> list[str]:
+    """The words after the command's name, with hyphens for underscores; none in a program that is no command."""
+    return [word.replace("_", "-") for word in sys.argv[1:]] if command() else []
+
+
+def enter_command(training: bool = False) -> None:
+    """Makes the patches once, if this process runs a command.
+
+    nerfstudio's commands have no hook for this, so it is called by the first code of ours that each of them runs.
+
+    Args:
+        training: also those that are for training alone.
+    """
+    for patch in PATCHES if command() is not None else ():
+        if patch.target not in _undos and (training or not patch.training):
+            _undos[patch.target] = patch.make()
+
+
+def undo() -> None:
+    """Takes all patches back, the last one first."""
+    while _undos:
+        _undos.popitem()[1]()
+
+
+def malloc_keeps(freed: int, own_mapping: int) -> bool:
+    """Sets from how many bytes on glibc gives freed memory back, and maps an array by itself.
+
+    What a training step frees the next one takes again. glibc's defaults give much of it back to the system, which then
+    hands out zeroed pages: thousands of page faults a step. glibc adapts its defaults and cannot be asked for them, so
+    an undo restores where they begin.
+
+    Returns:
+        Whether it does so: other C libraries are left as they are.
+    """
+    try:
+        mallopt = ctypes.CDLL(None).mallopt
+    except (AttributeError, OSError, TypeError):
+        return False
+    return bool(mallopt(TRIM_THRESHOLD, freed)) and bool(mallopt(MMAP_THRESHOLD, own_mapping))
+
+
+def give_back_freed_memory() -> None:
+    """Has glibc give back what it keeps and nobody uses: before tables grow, which do not fit into what steps leave."""
+    try:
+        ctypes.CDLL(None).malloc_trim(0)
+    except (AttributeError, OSError, TypeError):  # another C library
+        return
+
+
+# For a block ---------------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def transforms_changed(parser: ModuleType, change: Callable[[dict[str, Any], Path], None]) -> Iterator[None]:
+    """Within the block nerfstudio's parser sees a transforms.json after ``change``.
+
+    It reads the file and rounds to float32 in one function: this is the one place between.
+
+    Args:
+        parser: nerfstudio's module of the parser.
+        change: what to do with the content of the file at a path, in place.
+    """
+    read = parser.load_from_json
+
+    def read_and_change(path: Path) -> dict[str, Any]:
+        meta = read(path)
+        change(meta, path)
+        return meta
+
+    parser.load_from_json = read_and_change  # type: ignore[attr-defined]
+    try:
+        yield
+    finally:
+        parser.load_from_json = read  # type: ignore[attr-defined]
+
+
+class Uninterrupted:
+    """No trace function runs in this thread within the block.
+
+    The viewer stops a rendering by a trace function that raises before some line of Python. Where that line is the end
+    of ``with lock:``, the lock would never be released.
+    """
+
+    def __enter__(self) -> None:
+        self._trace: Any = sys.gettrace()
+        sys.settrace(None)
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        sys.settrace(self._trace)
+
+
+@contextmanager
+def signals_go_to(handle: Callable[[int], object]) -> Iterator[None]:
+    """Within the block the first Ctrl-C or SIGTERM calls ``handle`` with its number; the next one has its usual effect.
+
+    Has no effect outside the main thread.
+    """
+    if current_thread() is not main_thread():
+        yield
+        return
+    before = {number: signal.getsignal(number) for number in SIGNALS}
+
+    def restore() -> None:
+        for number, handler in before.items():
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)
+
+    def first(number: int, _: object) -> None:
+        restore()
+        handle(number)
+
+    for number in SIGNALS:
+        signal.signal(number, first)
+    try:
+        yield
+    finally:
+        restore()

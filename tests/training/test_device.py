@@ -1,0 +1,93 @@
+"""The device of a run, and what is said where a GPU lies idle. There is none here: torch and the system are faked."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from nerfstudio.engine.trainer import Trainer
+from training_runs import trainer_config
+
+from mmpi_ns.training import trainer as trainer_module
+from mmpi_ns.training.options import check_device
+from mmpi_ns.utils import machine
+from mmpi_ns.utils.errors import InputError
+
+
+class Stop(Exception):
+    """Ends a preparation where nerfstudio's begins."""
+
+
+@pytest.mark.parametrize("rank", [0, 1])
+def test_each_process_makes_its_gpu_the_current_one_before_anything_is_on_it(monkeypatch, tmp_path, rank):
+    """Tensors of rank 1 lie on cuda:1, and kernels start on the current device, which is cuda:0 otherwise."""
+    events = []
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "set_device", events.append)
+    monkeypatch.setattr(trainer_module.comms, "get_rank", lambda: rank)
+
+    def nerfstudios_setup(self, mode):
+        events.append(self.device)
+        raise Stop
+
+    monkeypatch.setattr(Trainer, "setup", nerfstudios_setup)
+    config = trainer_config(tmp_path, None, tmp_path)
+    config.machine.device_type = "cuda"
+    with pytest.raises(Stop):
+        config.setup(local_rank=rank, world_size=2).setup()
+    assert events == [rank, f"cuda:{rank}"]
+
+
+def test_a_cpu_run_asks_for_no_gpu(monkeypatch, tmp_path):
+    monkeypatch.setattr(torch.cuda, "set_device", lambda _: pytest.fail("no GPU"))
+    monkeypatch.setattr(Trainer, "setup", lambda *_: (_ for _ in ()).throw(Stop))
+    with pytest.raises(Stop):
+        trainer_config(tmp_path, None, tmp_path).setup(local_rank=0, world_size=1).setup()
+
+
+@pytest.fixture
+def system(monkeypatch, tmp_path):
+    """A system with a GPU that torch does not see, with this driver and build of torch."""
+
+    def make(driver, cuda, gpus=1):
+        for i in range(gpus):
+            (tmp_path / "gpus" / str(i)).mkdir(parents=True)
+            (tmp_path / "gpus" / str(i) / "information").write_text("Model: \t\t NVIDIA GeForce RTX 3090\nIRQ: 1\n")
+        (tmp_path / "version").write_text(
+            f"NVRM version: NVIDIA UNIX x86_64 Kernel Module  {driver}  Sat Aug 19 01:15:15 UTC 2023\n"
+            "GCC version:  gcc version 12.3.0\n"
+        )
+        monkeypatch.setattr(machine, "NVIDIA", tmp_path)
+        monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+        monkeypatch.setattr(torch.version, "cuda", cuda)
+        monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+
+    return make
+
+
+@pytest.mark.parametrize(
+    ("driver", "cuda", "words"),
+    [
+        ("535.104.05", "13.0", ["NVIDIA GeForce RTX 3090 with driver 535.104.05", "needs 580 or newer", "whl/cu126"]),
+        ("470.223", "13.0", ["needs 580", "whl/cu118"]),
+        ("390.157", "12.6", ["needs 525", "update the driver"]),
+        ("580.65.06", None, ["is built without CUDA", "whl/cu126"]),
+        ("580.65.06", "13.0", ["does not start", "torch.cuda.init()"]),
+    ],
+)
+def test_a_gpu_that_torch_does_not_see_is_named_with_what_mends_it(system, driver, cuda, words):
+    system(driver, cuda)
+    assert all(word in machine.unused_gpu() for word in words)
+    with pytest.raises(InputError, match="RTX 3090"):
+        check_device("cuda")
+
+
+def test_nothing_is_said_of_a_gpu_that_is_used_hidden_or_not_there(system, monkeypatch):
+    system("535.104.05", "13.0", gpus=0)
+    assert machine.unused_gpu() == ""
+    system("535.104.05", "13.0")
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
+    assert machine.unused_gpu() == ""
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES")
+    assert machine.unused_gpu()
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    assert machine.unused_gpu() == ""

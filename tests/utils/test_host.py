@@ -1,0 +1,166 @@
+"""What the package changes in its host, and that it does so nowhere else, in commands alone, and until it is undone."""
+
+from __future__ import annotations
+
+import ast
+import signal
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+
+import pytest
+from nerfstudio.data.dataparsers import nerfstudio_dataparser
+from nerfstudio.utils.rich_utils import CONSOLE
+from training_runs import ready, trainer_config
+
+import mmpi_ns
+from mmpi_ns.utils import host
+from mmpi_ns.utils.errors import InputError
+
+ROOT = Path(mmpi_ns.__file__).parent
+METHOD = ("utils", "scene", "ops", "placement", "capture", "field", "rendering", "training", "export")
+FILES = [ROOT / "model.py", ROOT / "config.py", *(path for wing in METHOD for path in (ROOT / wing).rglob("*.py"))]
+HOST_CALLS = {"signal.signal", "sys.settrace", "warnings.filterwarnings", "warnings.simplefilter", "setattr"}
+LISTED = {
+    ("capture/sfm.py", "signal.signal"),  # puts back what pycolmap replaces at its import
+}
+
+
+def state():
+    """What PATCHES change, but for malloc, which cannot be asked."""
+    handlers = tuple(signal.getsignal(number) for number in host.SIGNALS)
+    console = {name: vars(CONSOLE).get(name) for name in ("print", "log")}
+    return (
+        sys.excepthook,
+        tuple(warnings.filters),
+        console,
+        handlers,
+        sys.gettrace(),
+        nerfstudio_dataparser.load_from_json,
+    )
+
+
+@pytest.fixture
+def mallocs(monkeypatch):
+    """What malloc is asked to keep, instead of asking it."""
+    asked = []
+    monkeypatch.setattr(host, "malloc_keeps", lambda *sizes: asked.append(sizes))
+    yield asked
+    host.undo()
+
+
+@pytest.mark.parametrize("training", [False, True])
+def test_every_patch_is_undone(monkeypatch, mallocs, training):
+    monkeypatch.setattr(sys, "argv", ["/usr/bin/ns-train", "mmpi-small"])
+    before = state()
+    host.enter_command(training)
+    patched = state()
+    assert all(a != b for a, b in zip(before[:3], patched[:3], strict=True)), "each of them is made"
+    assert mallocs == ([(host.KEPT, host.OWN_MAPPING)] if training else [])
+    host.enter_command(training)
+    assert state() == patched, "once"
+    host.undo()
+    assert state() == before
+    assert mallocs[1:] == ([(host.MALLOC_DEFAULT, host.MALLOC_DEFAULT)] if training else [])
+
+
+def test_patches_say_what_they_change_and_why():
+    assert len({patch.target for patch in host.PATCHES}) == len(host.PATCHES)
+    assert all(patch.reason.endswith(".") for patch in host.PATCHES)
+
+
+@pytest.mark.parametrize(
+    ("program", "name"),
+    [
+        ("/venv/bin/ns-train", "ns-train"),
+        ("mmpi-plan", "mmpi-plan"),
+        ("/site-packages/nerfstudio/scripts/train.py", "ns-train"),
+        ("/src/mmpi_ns/scripts/train.py", "ns-train"),
+        ("/home/me/train.py", None),
+        ("/venv/bin/jupyter", None),
+        ("", None),
+    ],
+)
+def test_a_command_is_known_by_its_program(monkeypatch, program, name):
+    monkeypatch.setattr(sys, "argv", [program, "--viewer.websocket_host=0.0.0.0"])
+    assert host.command() == name
+    assert host.arguments() == (["--viewer.websocket-host=0.0.0.0"] if name else [])
+
+
+def test_a_program_that_trains_with_this_package_keeps_its_own_hooks(scene, plan_file, tmp_path, mallocs):
+    before = state()
+    config = trainer_config(scene, plan_file, tmp_path, 2)
+    config.set_timestamp()
+    config.save_config()
+    ready(config).train()
+    config.get_checkpoint_dir()
+    assert state() == before and mallocs == []
+
+
+def test_nothing_happens_at_import():
+    work = """if True:
+        import importlib, pkgutil, signal, sys, warnings
+        import nerfstudio.scripts.train, nerfstudio.scripts.eval, torch, cv2, PIL.Image
+        from nerfstudio.data.dataparsers import nerfstudio_dataparser
+        from nerfstudio.utils.rich_utils import CONSOLE
+        sys.argv = ["/venv/bin/ns-train"]
+        def state():
+            handlers = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
+            hooks = sys.excepthook, sys.gettrace(), nerfstudio_dataparser.load_from_json, dict(vars(CONSOLE))
+            ours = [f for f in warnings.filters if f[1] is not None and "mmpi" in str(f)]
+            return *hooks, *handlers, ours
+        before = state()
+        import mmpi_ns.config, mmpi_ns.utils.host
+        for wing in ("capture", "rendering", "training", "export"):
+            package = importlib.import_module(f"mmpi_ns.{wing}")
+            for module in pkgutil.walk_packages(package.__path__, f"mmpi_ns.{wing}."):
+                importlib.import_module(module.name)
+        assert state() == before and not mmpi_ns.utils.host._undos
+    """
+    done = subprocess.run([sys.executable, "-c", work], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-2000:]
+
+
+def name_of(node):
+    return f"{name_of(node.value)}.{node.attr}" if isinstance(node, ast.Attribute) else getattr(node, "id", "")
+
+
+@pytest.mark.parametrize("path", [p for p in FILES if p.name != "host.py"], ids=lambda p: str(p.relative_to(ROOT)))
+def test_no_other_module_changes_what_it_imports(path):
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    imports = [node for node in ast.walk(tree) if isinstance(node, ast.Import | ast.ImportFrom)]
+    names = {(alias.asname or alias.name).split(".")[0] for node in imports for alias in node.names}
+    for node in ast.walk(tree):
+        targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
+        for target in targets:
+            if isinstance(target, ast.Attribute):
+                assert name_of(target).split(".")[0] not in names, f"line {target.lineno} assigns to {name_of(target)}"
+        if isinstance(node, ast.Call) and name_of(node.func) in HOST_CALLS:
+            patches = name_of(node.func) != "setattr" or name_of(node.args[0]).split(".")[0] in names
+            place = (path.relative_to(ROOT).as_posix(), name_of(node.func))
+            assert not patches or place in LISTED, f"line {node.lineno} calls {name_of(node.func)}"
+        assert name_of(node) != "sys.argv" or path.parts[-2:] == ("export", "reader.py"), f"line {node.lineno}"
+
+
+def test_an_input_error_is_one_sentence_and_others_keep_their_traceback(monkeypatch, mallocs, capsys):
+    monkeypatch.setattr(sys, "argv", ["ns-train"])
+    shown = []
+    monkeypatch.setattr(sys, "excepthook", lambda *error: shown.append(error))
+    host.enter_command()
+    sys.excepthook(InputError, InputError("The scene is empty."), None)
+    assert capsys.readouterr().err == "ns-train: The scene is empty.\n" and not shown
+    sys.excepthook(KeyError, KeyError("x"), None)
+    assert len(shown) == 1
+
+
+def test_a_transforms_file_is_changed_within_the_block_alone(tmp_path):
+    (tmp_path / "t.json").write_text('{"a": 1}')
+    read = nerfstudio_dataparser.load_from_json
+    with (
+        pytest.raises(KeyError),
+        host.transforms_changed(nerfstudio_dataparser, lambda meta, path: meta.update(b=path.name)),
+    ):
+        assert nerfstudio_dataparser.load_from_json(tmp_path / "t.json") == {"a": 1, "b": "t.json"}
+        raise KeyError
+    assert nerfstudio_dataparser.load_from_json is read
