@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import os
+import struct
 import zipfile
 from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from filelock import FileLock
+from filelock import FileLock, Timeout
 from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
 
@@ -19,6 +21,7 @@ KEPT = 24
 """Results that are kept; the least recently used is removed first."""
 
 Arrays = dict[str, NDArray[np.generic]]
+Pairs = Iterable[tuple[str, NDArray[np.generic]]]
 
 
 def cache_folder() -> Path:
@@ -37,11 +40,17 @@ def digest(files: Iterable[Path], *parts: object) -> str:
     return found.hexdigest()[:32]
 
 
-def remembered(key: str, find: Callable[[], Arrays], folder: Path | None = None) -> Arrays:
+def remembered(key: str, find: Callable[[], Arrays | Pairs], folder: Path | None = None) -> Arrays:
     """The result of ``find``, from the cache if the key is there.
 
-    If several processes ask at once, one computes and the others wait. If the folder is not writable, every process
-    computes the result itself, and says so.
+    Arrays are mapped from the file: they take memory only where they are used, and the system may take it back.
+    Changes are the caller's own and do not reach the file. If several processes ask at once, one computes and the
+    others wait. If the folder is not writable, every process computes the result itself, and says so.
+
+    Args:
+        key: of the result.
+        find: arrays by name; as pairs that are computed one by one they are written at once, never held together.
+        folder: of the cache.
     """
     folder = folder or cache_folder()
     path = folder / f"{key}.npz"
@@ -50,36 +59,64 @@ def remembered(key: str, find: Callable[[], Arrays], folder: Path | None = None)
         lock = FileLock(folder / f"{key}.lock").acquire()
     except OSError as error:
         CONSOLE.print(f"[yellow]{folder} cannot be written to ({error.strerror}): depths are recomputed at each start.")
-        return find()
+        return dict(_pairs(find()))
     with lock:
-        known = _read(path)
-        if known is None:
-            known = find()
+        arrays = _read(path)
+        if arrays is None:
+            result = find()
             try:
-                write_atomically(path, lambda p: _write(p, known))  # type: ignore[arg-type]
+                write_atomically(path, lambda unfinished: _write(unfinished, result))
+                arrays = _read(path)
             except OSError as error:
                 CONSOLE.print(f"[yellow]{error}")
+            if arrays is None:
+                arrays = dict(_pairs(result if isinstance(result, dict) else find()))
         _forget_old(folder)
-    return known
+    return arrays
 
 
-def _write(path: Path, arrays: Arrays) -> None:
-    with path.open("wb") as file:
-        np.savez(file, **arrays)  # type: ignore[arg-type]
+def _pairs(arrays: Any) -> Pairs:
+    return arrays.items() if isinstance(arrays, dict) else arrays
+
+
+def _write(path: Path, arrays: Arrays | Pairs) -> None:
+    with zipfile.ZipFile(path, "w") as file:  # as np.savez, which asks for all arrays at once
+        for name, array in _pairs(arrays):
+            with file.open(f"{name}.npy", "w", force_zip64=True) as entry:
+                np.lib.format.write_array(entry, np.asanyarray(array), allow_pickle=False)
 
 
 def _read(path: Path) -> Arrays | None:
+    """The arrays of an uncompressed .npz, mapped; None if it is missing or damaged."""
+    arrays = {}
     try:
-        with np.load(path) as stored:
-            arrays = {name: stored[name] for name in stored.files}
+        with zipfile.ZipFile(path) as file, path.open("rb") as data:
+            for entry in file.infolist():
+                data.seek(entry.header_offset + 26)  # of a zip's local header: lengths of name and extra field
+                name, extra = struct.unpack("<HH", data.read(4))
+                data.seek(name + extra, os.SEEK_CUR)
+                version = np.lib.format.read_magic(data)
+                header = (
+                    np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+                )
+                shape, fortran, dtype = header(data)
+                order = "F" if fortran else "C"
+                empty = 0 in shape  # nothing to map
+                array = np.zeros(shape, dtype) if empty else np.memmap(path, dtype, "c", data.tell(), shape, order)
+                arrays[entry.filename.removesuffix(".npy")] = np.asarray(array)
         path.touch()
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile):
+    except (OSError, ValueError, EOFError, struct.error, zipfile.BadZipFile):
         return None
     return arrays
 
 
 def _forget_old(folder: Path) -> None:
+    """Removes the results beyond ``KEPT``, but none that a process computes or waits for."""
     files = sorted(folder.glob("*.npz"), key=lambda p: p.stat().st_mtime, reverse=True)
     for path in files[KEPT:]:
-        path.unlink(missing_ok=True)
-        path.with_suffix(".lock").unlink(missing_ok=True)
+        try:
+            with FileLock(path.with_suffix(".lock"), timeout=0):
+                path.unlink(missing_ok=True)
+                path.with_suffix(".lock").unlink(missing_ok=True)
+        except Timeout:
+            continue

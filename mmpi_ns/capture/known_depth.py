@@ -75,8 +75,9 @@ class KnownDepth:
 
     @staticmethod
     def nothing(sizes: NDArray[np.float64]) -> KnownDepth:
-        """For images of these sizes (width, height)."""
-        return KnownDepth(tuple(np.full((int(h), int(w), 2), UNKNOWN, np.int16) for w, h in sizes))
+        """For images of these sizes (width, height). Takes no memory, and cannot be written to."""
+        unknown = np.int16(UNKNOWN)
+        return KnownDepth(tuple(np.broadcast_to(unknown, (int(h), int(w), 2)) for w, h in sizes))
 
     def image(self, i: int) -> Map:
         """The numbers of one image. [H, W, 2]"""

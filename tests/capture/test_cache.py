@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+import weakref
 from concurrent.futures import ThreadPoolExecutor
 from time import sleep
 
 import numpy as np
+from filelock import FileLock
 
 from mmpi_ns.capture import cache
 from mmpi_ns.capture.cache import digest, remembered
@@ -35,6 +37,47 @@ def test_of_several_that_ask_at_once_one_finds_and_the_others_wait(tmp_path):
     with ThreadPoolExecutor(4) as pool:
         found = list(pool.map(lambda _: remembered("key", counting(calls, 0.2), tmp_path), range(4)))
     assert len(calls) == 1 and all(f["x"].tolist() == [0, 1, 2, 3, 4] for f in found)
+
+
+def test_results_are_mapped_and_written_one_by_one(tmp_path):
+    """Pairs are never held together; what is read takes no memory of its own; changes to it stay with the reader."""
+    held = []
+
+    def find():
+        for i in range(5):
+            array = np.full((300, 200), i, np.int16)
+            held.append(weakref.ref(array))
+            yield str(i), array
+            del array
+            assert sum(ref() is not None for ref in held) <= 1
+
+    for _ in range(2):
+        arrays = remembered("key", find, tmp_path)
+        assert list(arrays) == [*"01234"] and len(held) == 5
+        assert all((array == int(name)).all() and not array.flags.owndata for name, array in arrays.items())
+        arrays["3"][:] = 7
+
+
+def test_shapes_and_types_come_back(tmp_path):
+    stored = {
+        "a": np.zeros((0, 3)),
+        "b": np.array(2.5),
+        "c": np.asfortranarray(np.arange(6).reshape(2, 3)),
+        "d": [True],
+    }
+    arrays = remembered("key", lambda: stored, tmp_path)
+    for name, array in stored.items():
+        assert np.array_equal(arrays[name], array) and arrays[name].shape == np.shape(array), name
+
+
+def test_a_result_that_is_being_computed_is_not_forgotten(tmp_path, monkeypatch):
+    """Its lock would be removed under the hands of those who wait for it."""
+    monkeypatch.setattr(cache, "KEPT", 0)
+    for name in ("held", "free"):
+        (tmp_path / f"{name}.npz").write_bytes(b"")
+    with FileLock(tmp_path / "held.lock"):
+        cache._forget_old(tmp_path)
+        assert sorted(p.name for p in tmp_path.glob("*.*")) == ["held.lock", "held.npz"]
 
 
 def test_a_damaged_file_is_found_anew(tmp_path):
