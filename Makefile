@@ -23,7 +23,7 @@ WORKERS ?= 2
 # Extra arguments for pytest or the demo: make test ARGS="-k geometry -x", make demo ARGS=--fresh
 ARGS ?=
 
-.PHONY: help venv demo test lint docs build wheel figures gallery results clean
+.PHONY: help venv demo test lint docs build wheel figures gallery matrix results clean
 
 help: ## List these commands
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -69,6 +69,9 @@ wheel: build ## Build, and run the wheel's commands in an otherwise empty enviro
 
 figures: venv ## Draw the figures of the documentation anew, from the demo
 	$(BIN)/python examples/figures.py
+
+matrix: venv ## Run ordinary captures of 2 to 400 images through the commands (hours) and write docs/results/matrix.md
+	$(BIN)/python benchmarks/matrix.py --folder /tmp/mmpi-matrix $(ARGS)
 
 gallery: venv ## Train four procedural scenes and write docs/gallery.md with their pictures
 	$(BIN)/python examples/gallery.py $(ARGS)

@@ -134,7 +134,8 @@ def compare(pipeline: Any, scene: BakedScene, count: int) -> Compared:
     to_exact: list[float] = []
     rows: dict[str, list[dict[str, float]]] = {"exact": [], "baked": []}
     for i in torch.linspace(0, len(dataset) - 1, min(count, len(dataset))).long().tolist():
-        bundle, truth = dataset.cameras.generate_rays(i), dataset[i]["image"][..., :3]
+        # One camera alone: rays of cameras of several sizes would be a list without rows.
+        bundle, truth = dataset.cameras[i : i + 1].generate_rays(0, keep_shape=True), dataset[i]["image"][..., :3]
         renderers = {
             "exact": lambda bundle=bundle: pipeline.model.get_outputs_for_camera_ray_bundle(bundle)["rgb"],
             "baked": lambda bundle=bundle: render_in_chunks(
