@@ -22,7 +22,13 @@ from mmpi_ns.training.phases import ScheduleConfig
 from mmpi_ns.training.touched_adam import TouchedAdamConfig
 from mmpi_ns.training.trainer import MMPITrainerConfig
 
-PAPER_DATA = {"keypoint_rays": 0, "dense_depth": False, "depth_images": False, "new_view_share": 0.0}
+PAPER_DATA = {
+    "keypoint_rays": 0,
+    "dense_depth": False,
+    "depth_images": False,
+    "new_view_share": 0.0,
+    "correct_exposure": False,
+}
 """The paper trains on the colours of pixels alone."""
 PAPER_SCHEDULE = ScheduleConfig(decay_from=0.0, decay_decades=1.5, growing_rays=1.0, release_weight=0.0)
 """The paper's rates fall from the start, as DVGO's; all rays are drawn at every step, and no bricks are released."""

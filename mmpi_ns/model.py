@@ -18,7 +18,7 @@ from nerfstudio.viewer.viewer_elements import ViewerDropdown
 from torch import Tensor
 from torch.nn import Parameter
 
-from mmpi_ns.capture.datamanager import OBSERVATIONS, RAYS_PER_STEP, TRAINING_VIEWS
+from mmpi_ns.capture.datamanager import GAINS, OBSERVATIONS, RAYS_PER_STEP, TRAINING_VIEWS
 from mmpi_ns.capture.rays import PinholeRays
 from mmpi_ns.field.mmpi_field import ColourConfig, MMPIField
 from mmpi_ns.ops import dispatch
@@ -27,6 +27,7 @@ from mmpi_ns.placement.rule import PlacementConfig
 from mmpi_ns.placement.split import place_windows
 from mmpi_ns.rendering.baked import BakedWindow, bake, suits_bricks
 from mmpi_ns.rendering.chunks import check_crop, rays_per_chunk, render_in_chunks
+from mmpi_ns.rendering.exposure import Exposures
 from mmpi_ns.rendering.metrics import ImageMetrics, depth_metrics, pictures
 from mmpi_ns.rendering.render import images_of, render_rays, sampled_outputs
 from mmpi_ns.rendering.rendered import BACKGROUNDS, RenderedRays, RenderingConfig, background_of, bounded
@@ -117,10 +118,11 @@ class MMPIModel(Model):
         self.field = self._new_field(views_of(windows.windows[0], views))
         budget = config.rendering.resident_gib * 2**30
         self.store = WindowStore(config.windows_folder, self._new_field, budget, config.rendering.half_windows)
+        self.exposures = Exposures(self.kwargs.get("metadata", {}).get(GAINS), None if views is None else views.origins)
         self.sampler = MMPISampler()
         self.metrics = ImageMetrics(config.lpips_net)
-        self.notes_scores: Callable[[dict[str, Tensor], dict[str, float]], None] | None = None
-        """Called with the batch and the metrics of each image that is scored; it may add to them (the pipeline)."""
+        self.scoring: Callable[[dict[str, Tensor], dict[str, Tensor]], tuple[dict, dict]] | None = None
+        """In place of ``scores_and_images`` while the pipeline evaluates images, whose exposures it knows."""
         self.show = ViewerDropdown("Show MPI", "all", ["all", *windows.names], hint="One MPI alone, or all")
         self.camera_optimizer: CameraOptimizer = config.camera_optimizer.setup(
             num_cameras=self.num_train_data, device=self.kwargs.get("device", "cpu")
@@ -244,14 +246,21 @@ class MMPIModel(Model):
         how = {"blends": blends, "threshold": self.config.rendering.threshold, "head_mask": head_mask}
         once = field.shading == "ray" and not torch.is_grad_enabled()
         outputs = (shown_outputs if once else sampled_outputs)(bounded(bundle, field.plan), field, **how)
-        rgb = outputs["rgb"] + outputs.pop("transmittance") * self._behind(outputs["rgb"])
+        behind, exposure = outputs.pop("transmittance") * self._behind(outputs["rgb"]), self.exposures.mean
         winner = outputs["winning_mpi"] + self.progress.windows.first_head(window)
-        return outputs | {"rgb": rgb.clamp(0, 1), "winning_mpi": winner}
+        if exposure is None:
+            return outputs | {"rgb": (outputs["rgb"] + behind).clamp(0, 1), "winning_mpi": winner}
+        if self.config.rendering.exposure == "nearest" and len(bundle):
+            exposure = self.exposures.nearest(bundle.origins[0])
+        radiance = outputs["rgb"] + behind / exposure
+        rgb = (exposure * radiance).clamp(0, 1)
+        return outputs | {"rgb": rgb, "radiance": radiance, "winning_mpi": winner}
 
     def _shows_bricks(self, field: MMPIField) -> bool:
         """Whether images of a field come from its bricks."""
         if self.config.rendering.mode == "auto":
-            return not self.trains and suits_bricks(field)
+            one_exposure = self.exposures.mean is None or self.config.rendering.exposure == "mean"
+            return not self.trains and one_exposure and suits_bricks(field)
         return self.config.rendering.mode == "baked"
 
     def baked(self, field: MMPIField) -> BakedWindow:
@@ -260,7 +269,9 @@ class MMPIModel(Model):
         def make() -> BakedWindow:
             say("Baking, once: a few seconds.")
             background = BACKGROUNDS[self.config.rendering.background]
-            return bake(field, self.config.rendering.threshold, background, self.blends(field))
+            mean = self.exposures.mean
+            exposure = (1.0, 1.0, 1.0) if mean is None else tuple(mean.tolist())
+            return bake(field, self.config.rendering.threshold, background, self.blends(field), exposure)
 
         return field.cached("baked", make)
 
@@ -330,10 +341,7 @@ class MMPIModel(Model):
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
-        values, images = self.scores_and_images(outputs, batch)
-        if self.notes_scores is not None:
-            self.notes_scores(batch, values)
-        return values, images
+        return (self.scoring or self.scores_and_images)(outputs, batch)
 
     def scores_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Tensor]

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager, VanillaDataManagerConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
@@ -17,23 +18,30 @@ from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader, RandIn
 from nerfstudio.model_components.ray_generators import RayGenerator
 from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
+from torch import Tensor
 
 from mmpi_ns.capture.checks import check_parser, check_transforms, say_once
 from mmpi_ns.capture.dataset import MMPIDataset
+from mmpi_ns.capture.exif import light_of
 from mmpi_ns.capture.known_depth import KnownDepth, know_depths, with_known_depths
 from mmpi_ns.capture.local_origin import take_local_origins
-from mmpi_ns.capture.new_views import SharedPoints, find_shared_points
+from mmpi_ns.capture.new_views import SharedPoints, find_shared_points, image_and_mask
 from mmpi_ns.capture.observe import observe, posed_images, sfm_folder
+from mmpi_ns.capture.originals import at_full_size
+from mmpi_ns.capture.photometry import SAME_LIGHT, Gains, color_ratios, image_gains
 from mmpi_ns.capture.pixels import PixelPool, pixel_bytes
 from mmpi_ns.capture.ray_sources import Keypoints, RaySources
 from mmpi_ns.capture.rays import PinholeRays
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.scene.visible_tiles import TrainingViews
+from mmpi_ns.utils.console import say
 from mmpi_ns.utils.errors import InputError
 from mmpi_ns.utils.random_draws import generator
 
 OBSERVATIONS = "mmpi_observations"
 """Key of the scene's Observations in the data set's metadata, for the model."""
+GAINS = "mmpi_gains"
+"""Key of the exposures of the training images (``photometry.Gains``); missing where they are equal."""
 RAYS_PER_STEP = "mmpi_rays_per_step"
 """Key of the pixel rays of a training step."""
 TRAINING_VIEWS = "mmpi_training_views"
@@ -64,6 +72,9 @@ class MMPIDataManagerConfig(VanillaDataManagerConfig):
     new_view_share: float = 0.75
     """Rays of new views for each pixel ray: from between two training cameras to points that both show at the same
     known depth (0: none)."""
+    correct_exposure: bool = True
+    """Calibrate exposure and white balance of the images, by surfaces that several show and by EXIF, and compare each
+    image with the scene at its own exposure, if that explains how images differ."""
     resident_pixels: float = 60e6
     """Training pixels held in memory at once (at most 12 bytes each). Longer captures are read window by window; if a
     window has more pixels, a random subset of this size is used. 0: window by window, all of them."""
@@ -79,6 +90,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
 
     def __init__(self, config: MMPIDataManagerConfig, **kwargs: Any) -> None:
         self.known_depth: KnownDepth | None = None
+        self.gains: Gains | None = None
         self.rays_share = 1.0
         """Share of a step's rays that are drawn; the schedule sets it."""
         self.sources: RaySources | None = None
@@ -148,10 +160,30 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         cameras = self.train_dataset.cameras
         pinhole = PinholeRays.of(cameras, self.device)
         self.train_ray_generator: Any = pinhole or RayGenerator(cameras.to(self.device))
+        self.gains = self._calibrate() if self.config.correct_exposure and self.test_mode == "val" else None
+        if self.gains is not None:
+            self.train_dataset.metadata[GAINS] = self.gains
         self._reads_by_window = bool(self._sizes(None).sum() > self.config.resident_pixels)
         if not self._reads_by_window and self.test_mode == "val":
             CONSOLE.print(f"Reading {len(self.train_dataset)} training images.")
             self.sources = self._resident = self._read_sources(None)
+
+    def _calibrate(self) -> Gains | None:
+        """Exposures of the training images, if they differ by more than errors explain; says what was found."""
+        posed = posed_images(self.observations, self.train_dataset)
+        if self.known_depth is None or posed is None or len(posed.files) < 2:
+            return None
+        light = np.array([light_of(file) for file in at_full_size(posed).files])
+        if np.isfinite(light).all() and np.ptp(np.log(light)) < SAME_LIGHT:
+            say("Exposure: EXIF notes the same for all images.")
+            return None
+        show = lambda i: image_and_mask(self.train_dataset, i)  # noqa: E731
+        ratios = color_ratios(posed, self.known_depth, self.train_ray_generator, show, self.config.seed)
+        if ratios is None:
+            return None
+        gains = image_gains(ratios, len(posed.files), light)
+        say(gains.describe())
+        return gains if gains.matter else None
 
     def get_train_rays_per_batch(self) -> int:
         """Pixel rays of the step at hand."""
@@ -187,8 +219,11 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         keypoints = keypoints if cameras is None else keypoints and keypoints.of_images(torch.from_numpy(cameras))
         return RaySources(
             pixels, new_views, keypoints, self.train_ray_generator, config.new_view_share, config.keypoint_rays,
-            no_new_views,
+            no_new_views, self._exposures(),
         )  # fmt: skip
+
+    def _exposures(self) -> Float[Tensor, "M 3"] | None:
+        return None if self.gains is None else torch.from_numpy(self.gains.from_field).float().to(self.device)
 
     def _find_shared(self, images: Sequence[int]) -> tuple[SharedPoints | None, str]:
         """The points that two of these training images show at the same depth, or why there are none."""
@@ -200,7 +235,8 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         if posed is None:
             return None, "a camera is neither perspective nor fisheye"
         rays, seed = self.train_ray_generator, self.config.seed
-        points = find_shared_points(self.train_dataset, posed, self.known_depth, rays, images, seed, self.device)
+        how = (images, seed, self.device, self._exposures())
+        points = find_shared_points(self.train_dataset, posed, self.known_depth, rays, *how)
         return points, "no two images show a point at the same depth"
 
     def describe(self) -> str:

@@ -44,6 +44,14 @@ def exposure_of(file: Path) -> Exposure | None:
     return None if time is None else Exposure(time, sensitivity, aperture)
 
 
+def light_of(file: Path) -> float:
+    """Light that an image got by its EXIF, in arbitrary units; NaN where it is not noted."""
+    exposure = exposure_of(file)
+    if exposure is None:
+        return float("nan")
+    return exposure.time * (exposure.sensitivity or 100.0) / (exposure.aperture or 1.0) ** 2
+
+
 def positive_number(value: Any) -> float | None:
     """A tag's number; None where it is missing, no number, or not positive (0/0 stands for unknown)."""
     try:

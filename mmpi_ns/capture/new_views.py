@@ -70,7 +70,7 @@ class SharedPoints:
         return replace(self, **{name: getattr(self, name)[own] for name in PARTS}) if len(own) else None
 
     def draw(
-        self, count: int, rays: Rays, g: torch.Generator
+        self, count: int, rays: Rays, g: torch.Generator, exposures: Float[Tensor, "M 3"] | None = None
     ) -> tuple[RayBundle, Float[Tensor, "R C"], Float[Tensor, "R 2"]]:
         """Random rays from between cameras, with their colours and the inverse distances of their points with errors.
 
@@ -78,12 +78,16 @@ class SharedPoints:
             count: number of rays.
             rays: makes rays through pixel centres (image, row, column).
             g: generator for the points and the positions between the cameras.
+            exposures: of all training images; colours are divided by them. None: they are equal.
         """
         device = self.pixels.device
         chosen = torch.randint(len(self.pixels), (count,), generator=g, device=g.device).to(device)
         share = torch.rand(count, 1, generator=g, device=g.device).to(device)
         first = rays(self.pixels[chosen].long())
         depths, colors = self.depths[chosen], self.colors[chosen].float() / 255
+        if exposures is not None:
+            images = torch.stack([self.pixels[chosen, 0], self.other[chosen]], -1).long()
+            colors[..., :3] /= exposures[images]
         origins = torch.lerp(first.origins, self.centers[self.other[chosen].long()], share)
         # Relative to the first camera, so that the direction of distant points stays exact.
         offsets = (first.origins - origins) * depths[:, :1] + first.directions
@@ -101,6 +105,7 @@ def find_shared_points(
     images: Sequence[int],
     seed: int,
     device: str | torch.device = "cpu",
+    exposures: Float[Tensor, "M 3"] | None = None,
 ) -> SharedPoints | None:
     """The points that two of the images show at the same depth; None if there are none.
 
@@ -112,11 +117,14 @@ def find_shared_points(
         images: the images to compare.
         seed: of the draw of pixels where there are more than are kept.
         device: where rays are made and drawn.
+        exposures: of all training images, whose colours are compared after them; None: they are equal.
 
     Raises:
         InputError: an image or mask cannot be used (names the file).
     """
-    show = lru_cache(HELD)(lambda i: (*_image(dataset, i), known.image(i)))  # neighbours mostly stand side by side
+    show = lru_cache(HELD)(
+        lambda i: (*image_and_mask(dataset, i), known.image(i))
+    )  # neighbours mostly stand side by side
     rng, parts, found = np.random.default_rng(seed), [], 0.0
     budget = max(1, MOST // (NEIGHBOURS * max(1, len(images))))
     for i in images:
@@ -133,7 +141,10 @@ def find_shared_points(
         depths = own_depths[rows, columns]
         points, own = posed.camera_to_worlds[i, :, 3] + directions / depths[:, :1], own_image[rows, columns]
         for j in nearest_views(posed.camera_to_worlds, i, NEIGHBOURS, MAX_ANGLE, images):
-            seen, colors = _seen_by(posed, j, points, own, *show(j))
+            expected = own.astype(np.float32)
+            if exposures is not None:
+                expected[:, :3] *= (exposures[j] / exposures[i]).cpu().numpy()
+            seen, colors = _seen_by(posed, j, points, expected.clip(0, 255), *show(j))
             found += len(seen) * count / len(rows)
             both = np.stack([own[seen], colors], 1)
             parts.append((pixels[seen].int(), torch.full((len(colors),), j, dtype=torch.int32), both, depths[seen]))
@@ -147,7 +158,7 @@ def find_shared_points(
     return SharedPoints(*on_device, cover=cover)
 
 
-def _image(dataset: MMPIDataset, i: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+def image_and_mask(dataset: MMPIDataset, i: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
     """Colours of an image [H, W, C] and where it may be used [H, W]."""
     data = dataset.get_data(i, image_type="uint8")
     image = data["image"].numpy()
@@ -169,7 +180,7 @@ def _seen_by(
     posed: PosedImages,
     j: int,
     points: NDArray[np.float64],
-    own: NDArray[np.uint8],
+    own: NDArray[np.float32],
     image: NDArray[np.uint8],
     usable: NDArray[np.uint8],
     depth: NDArray[np.float32],

@@ -20,6 +20,8 @@ KEYPOINT_DEPTH = "keypoint_inverse_distance"
 """Ray-bundle metadata: inverse distance of the SfM point on a keypoint ray, 0 on ordinary rays."""
 PIXEL_DEPTH = "pixel_inverse_distance"
 """Ray-bundle metadata [R, 2]: inverse distance of the content of a pixel and its expected error, 0 where unknown."""
+EXPOSURE = "exposure"
+"""Ray-bundle metadata [R, 3]: colour in the ray's image over colour in the field; only where exposures differ."""
 OWN_PIXEL = "is_own_pixel"
 """Ray-bundle metadata [R, 1]: whether a ray goes through a pixel of a training image."""
 
@@ -80,6 +82,8 @@ class RaySources:
     """Keypoint rays of a step without new views."""
     no_new_views: str
     """Why there are no new views, where there are none."""
+    exposures: Float[Tensor, "M 3"] | None = None
+    """Colours of each training image over those of the field; None if all have the same exposure."""
 
     def of_images(self, images: NDArray[np.int64]) -> RaySources:
         """The sources of some images.
@@ -132,14 +136,17 @@ class RaySources:
             pixels_alone: without new views and keypoints.
 
         Returns:
-            The rays, with KEYPOINT_DEPTH, PIXEL_DEPTH and OWN_PIXEL in their metadata. The batch: ``image``, colours
-            of the rays of pixels and new views [R, C], and ``indices``, image, row and column of the pixels [N, 3].
+            The rays, with KEYPOINT_DEPTH, PIXEL_DEPTH, OWN_PIXEL and EXPOSURE in their metadata. The batch: ``image``,
+            colours of the rays of pixels and new views, at the exposure of the field [R, C], and ``indices``, image,
+            row and column of the pixels [N, 3].
         """
         colors, indices, depths = self.pixels.draw(pixel_rays, g)
+        if self.exposures is not None:
+            colors[:, :3] /= self.exposures[indices[:, 0]]
         bundles, device = [self.rays(indices)], colors.device
         _, new_view_rays, keypoint_rays = (0, 0, 0) if pixels_alone else self.counts(pixel_rays, share)
         if self.new_views is not None and new_view_rays:
-            views, seen, distances = self.new_views.draw(new_view_rays, self.rays, g)
+            views, seen, distances = self.new_views.draw(new_view_rays, self.rays, g, self.exposures)
             bundles.append(views)
             colors, depths = torch.cat([colors, seen]), torch.cat([depths, distances])
         keypoint_depths = torch.zeros(len(colors), 1, device=device)
@@ -152,6 +159,9 @@ class RaySources:
         bundle.metadata[OWN_PIXEL] = (torch.arange(len(bundle), device=device) < len(indices))[:, None]
         bundle.metadata[KEYPOINT_DEPTH] = keypoint_depths
         bundle.metadata[PIXEL_DEPTH] = depths
+        if self.exposures is not None:
+            assert bundle.camera_indices is not None
+            bundle.metadata[EXPOSURE] = self.exposures[bundle.camera_indices[:, 0]]
         return bundle, {"image": colors, "indices": indices}
 
 

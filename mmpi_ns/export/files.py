@@ -116,6 +116,7 @@ def _describe(place: Window, window: BakedWindow) -> dict[str, Any]:
         "threshold": window.threshold,
         "background": window.background,
         "farthest": window.farthest,
+        "exposure": list(window.exposure),
         "content_near": place.plan.content_near,
         "mpis": [m | e for m, e in zip(plan["mpis"], extra, strict=True)],
         "density": mpis.density_codes.__dict__,
@@ -257,7 +258,9 @@ def _read_window(folder: Path, row: dict[str, Any]) -> tuple[Window, BakedWindow
         tuple(Codes(**c) for c in row["channels"]),
     )
     shader = _read_shader(row["shader"], torch.from_numpy(array("network")).float())
-    window = BakedWindow(baked, shader, row["ray_near"], row["threshold"], row["background"], row["farthest"])
+    exposure = tuple(row.get("exposure", (1.0, 1.0, 1.0)))  # before images were shown at one exposure
+    near, far = row["ray_near"], row["farthest"]
+    window = BakedWindow(baked, shader, near, row["threshold"], row["background"], far, exposure)
     return Window(tuple(row["center"]), radius, row["margin"], plan), window
 
 

@@ -141,7 +141,7 @@ def render_ray(window: dict[str, Any], origin: np.ndarray, direction: np.ndarray
             break
     if mass == 0:
         return np.full(3, light * window["background"])
-    color = shade(window, sums / mass, direction)
+    color = shade(window, sums / mass, direction) * window.get("exposure", 1.0)
     return np.clip(color * (1 - light) + light * window["background"], 0, 1)
 
 

@@ -79,6 +79,8 @@ class BakedWindow:
     """Grey level behind everything."""
     farthest: float = 1e3
     """Distance that stands for infinity in depth images."""
+    exposure: tuple[float, ...] = (1.0, 1.0, 1.0)
+    """Colours shown over those of the texels."""
 
     def render(
         self,
@@ -96,7 +98,8 @@ class BakedWindow:
             background: colour behind everything; None: the window's own.
         """
         shown = show_baked(self.mpis, Rays(origins, directions, *(bounds or self.unbounded(origins))), self.threshold)
-        rgb = torch.where(shown.mass > 0, shade_baked(self.shader, shown.gathered, shown.mass, directions), 0.0)
+        shaded = shade_baked(self.shader, shown.gathered, shown.mass, directions)
+        rgb = torch.where(shown.mass > 0, shaded * shaded.new_tensor(self.exposure), 0.0)
         behind = self.background if background is None else background
         return {
             "rgb": (rgb * shown.accumulation + behind * shown.transmittance).clamp(0, 1),
@@ -169,7 +172,13 @@ def shader_of(network: RayShader) -> Shader:
 
 
 @torch.no_grad()
-def bake(model_field: MMPIField, threshold: float, background: float, blends: bool = False) -> BakedWindow:
+def bake(
+    model_field: MMPIField,
+    threshold: float,
+    background: float,
+    blends: bool = False,
+    exposure: tuple[float, ...] = (1.0, 1.0, 1.0),
+) -> BakedWindow:
     """A field as bricks of 8-bit codes: all that are not empty.
 
     Args:
@@ -177,6 +186,7 @@ def bake(model_field: MMPIField, threshold: float, background: float, blends: bo
         threshold: samples of less weight will not be shaded.
         background: grey level behind everything.
         blends: texels keep the optical depths that blending by reliability leaves at them.
+        exposure: of images, relative to the field's.
 
     Raises:
         ValueError: the field has a cube, too many channels, or a network for every sample.
@@ -210,7 +220,7 @@ def bake(model_field: MMPIField, threshold: float, background: float, blends: bo
         channels,
     )
     farthest = 10 * max(m.farthest for m in plan.mpis)
-    return BakedWindow(mpis, shader, plan.ray_near, threshold, background, farthest)
+    return BakedWindow(mpis, shader, plan.ray_near, threshold, background, farthest, exposure)
 
 
 def _planes(model_field: MMPIField, k: int) -> Iterator[slice]:

@@ -24,13 +24,13 @@ class ImageMetrics:
 
     @torch.no_grad()
     def __call__(self, predicted: Float[Tensor, "H W 3"], observed: Float[Tensor, "H W 3"]) -> dict[str, float]:
-        mse = ((predicted.double() - observed.double()) ** 2).mean().clamp(min=1e-12)
         a, b = (torch.moveaxis(x, -1, 0)[None].float() for x in (predicted, observed))
-        values = {"psnr": float(-10 * torch.log10(mse))}
+        values = {"psnr": psnr(predicted, observed)}
         if min(a.shape[-2:]) >= 11:  # SSIM's window
             ssim = structural_similarity_index_measure(a, b, data_range=1.0)
             assert isinstance(ssim, Tensor)
             values["ssim"] = float(ssim)
+        values |= {"cc_psnr": psnr(color_corrected(predicted, observed), observed)}
         lpips = self._load_lpips(a.device)
         if lpips is not None:
             values[f"lpips_{self.lpips_net}"] = float(lpips(a.clamp(0, 1), b.clamp(0, 1)))
@@ -50,6 +50,25 @@ class ImageMetrics:
                     f"({type(error).__name__}). Put them into torch's hub cache to get it."
                 )
         return self._lpips
+
+
+def psnr(predicted: Float[Tensor, "*N 3"], observed: Float[Tensor, "*N 3"]) -> float:
+    """PSNR of colours in [0, 1], dB; at most 120."""
+    mse = ((predicted.double() - observed.double()) ** 2).mean().clamp(min=1e-12)
+    return float(-10 * torch.log10(mse))
+
+
+def color_corrected(predicted: Float[Tensor, "H W 3"], observed: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:
+    """The affine map of the predicted colours (a matrix and an offset) that comes nearest to the observed ones.
+
+    Source: ``cc_psnr`` of nerfstudio's splatfacto, after MultiNeRF.
+    """
+    colors = predicted.reshape(-1, 3).double()
+    design = torch.cat([colors, torch.ones_like(colors[:, :1])], -1)
+    # Normal equations with a little of the identity: images of one colour have many solutions.
+    normal = design.T @ design + 1e-6 * len(design) * torch.eye(4, dtype=design.dtype, device=design.device)
+    target = design.T @ (observed.reshape(-1, 3).double() - colors)
+    return (colors + design @ torch.linalg.solve(normal, target)).clamp(0, 1).view(predicted.shape).to(predicted)
 
 
 def depth_metrics(predicted: Float[Tensor, "H W 1"], true: Float[Tensor, "H W 1"]) -> dict[str, float]:

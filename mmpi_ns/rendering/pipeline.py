@@ -8,9 +8,11 @@ from typing import Any
 
 import numpy as np
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
+from torch import Tensor
 
 from mmpi_ns.rendering.baked import exact_images
 from mmpi_ns.rendering.eval_poses import refined_camera
+from mmpi_ns.rendering.exposure import exposure_of_image
 from mmpi_ns.utils.console import say
 
 REFINED = "refined_"
@@ -36,21 +38,38 @@ class MMPIPipeline(VanillaPipeline):
         """Means over the images of a loader, like nerfstudio's, and a summary line."""
         scores: list[tuple[int, dict[str, float]]] = []
         model: Any = self.model
+        cameras = data_loader.input_dataset.cameras
 
-        def note(batch: Any, values: dict[str, float]) -> None:
+        def score(outputs: dict[str, Tensor], batch: Any) -> tuple[dict[str, float], dict[str, Tensor]]:
+            i = int(batch["image_idx"])
+            outputs = self._as_exposed(cameras[i : i + 1], outputs, model.observed(batch))
+            values, images = model.scores_and_images(outputs, batch)
             if self.config.refine_eval_poses:
-                values |= self._refined_metrics(data_loader.input_dataset.cameras, batch)
-            scores.append((int(batch["image_idx"]), dict(values)))
+                values |= self._refined_metrics(cameras, batch)
+            scores.append((i, dict(values)))
+            return values, images
 
-        model.notes_scores = note
+        model.scoring = score
         try:
             with exact_images():
                 means = super().get_average_image_metrics(data_loader, image_prefix, *args, **kwargs)
         finally:
-            model.notes_scores = None
+            model.scoring = None
         names = [Path(name).name for name in data_loader.input_dataset.image_filenames]
         say(summary([(names[i], values) for i, values in scores]))
         return means
+
+    def _as_exposed(self, camera: Any, outputs: dict[str, Tensor], observed: Tensor) -> dict[str, Tensor]:
+        """The outputs at the exposure of the evaluated image itself, where exposures differ."""
+        model: Any = self.model
+        if "radiance" not in outputs:
+            return outputs
+        manager: Any = self.datamanager
+        exposure = exposure_of_image(model.exposures, manager, camera, observed, outputs)
+        if exposure is None:
+            say("No training image shows what an evaluated one does, or they are gone: it is scored at mean exposure.")
+            return outputs
+        return outputs | {"rgb": (exposure.to(outputs["radiance"]) * outputs["radiance"]).clamp(0, 1)}
 
     def _refined_metrics(self, cameras: Any, batch: Any) -> dict[str, float]:
         """Metrics of an image with its pose refined against the model, and the size of the refinement."""
@@ -58,7 +77,8 @@ class MMPIPipeline(VanillaPipeline):
         i = int(batch["image_idx"])
         camera, observed = cameras[i : i + 1].to(model.device), model.observed(batch)
         camera, degrees, units = refined_camera(model, camera, observed, model.config.seed + i)
-        values, _ = model.scores_and_images(model.get_outputs_for_camera(camera), batch)
+        outputs = self._as_exposed(camera, model.get_outputs_for_camera(camera), observed)
+        values, _ = model.scores_and_images(outputs, batch)
         moved = {"rotation_degrees": degrees, "translation": units}
         return {REFINED + name: value for name, value in (values | moved).items()}
 

@@ -39,6 +39,9 @@ class RenderingConfig:
     """Samples of less weight are not shaded when rendering; their total weight is reported (dropped_mass)."""
     background: Literal["black", "gray", "white"] = "gray"
     """Background when rendering. Training uses random colours where the MPIs cover the whole ray."""
+    exposure: Literal["mean", "nearest"] = "mean"
+    """Exposure of images where that of the training images differs: their mean, so that films do not flicker, or that
+    of the training image taken nearest (rendered exactly)."""
     resident_gib: float = 2.0
     """Device memory for rendering the windows of a long capture, GiB, in addition to the one trained last. As many as
     fit are kept, at least one; the least recently used is evicted first."""

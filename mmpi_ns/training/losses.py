@@ -11,12 +11,14 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mmpi_ns.capture.ray_sources import KEYPOINT_DEPTH, PIXEL_DEPTH
+from mmpi_ns.capture.ray_sources import EXPOSURE, KEYPOINT_DEPTH, PIXEL_DEPTH
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.samples import metadata_of
 from mmpi_ns.ops.composite.reference import Composite, exclusive_cumsum
 from mmpi_ns.rendering.rendered import RenderedRays
 
+CLIPPED = 0.98
+"""Colour of an image above which a channel may be clipped."""
 PLANE_ERROR = 0.6
 """Minimum error of a known depth, in plane spacings."""
 
@@ -45,9 +47,22 @@ class LossWeights:
     """Total variation is added every this many steps, with its weight multiplied by the same number."""
 
 
-def photometric(predicted: Float[Tensor, "R 3"], observed: Float[Tensor, "R 3"]) -> Float[Tensor, ""]:
-    """Mean squared colour error over rays and channels (L_pho)."""
-    return ((predicted - observed) ** 2).mean()
+def photometric(
+    predicted: Float[Tensor, "R 3"], observed: Float[Tensor, "R 3"], exposure: Float[Tensor, "R 3"] | None = None
+) -> Float[Tensor, ""]:
+    """Mean squared colour error over rays and channels (L_pho).
+
+    Args:
+        predicted: colours of the field.
+        observed: colours of the images divided by their exposures.
+        exposure: of each ray's image. Errors are those in the image, and where it is clipped the scene may be brighter.
+            None: all have the same.
+    """
+    error = predicted - observed
+    if exposure is not None:
+        clipped = observed * exposure > CLIPPED
+        error = exposure * torch.where(clipped, error.clamp(max=0), error)
+    return (error**2).mean()
 
 
 def point_color(
@@ -167,7 +182,7 @@ def batch_losses(
         g: draws the colours behind the pixels.
         step: of the training.
     """
-    known = rays.bundle.metadata.get(KEYPOINT_DEPTH)
+    known, exposure = (rays.bundle.metadata.get(name) for name in (KEYPOINT_DEPTH, EXPOSURE))
     # Counted on the host: asking the GPU which rays are pixel rays would be a synchronisation.
     asked, size, device = len(image), len(rays.bundle) // rays.times, image.device
     starts = size * torch.arange(rays.times, device=device)[:, None]
@@ -183,7 +198,7 @@ def batch_losses(
     composite = Composite(*(x.index_select(0, pixels) for x in (c.weights, c.accumulation, c.transmittance)))
     rgb = colors.rgb + composite.transmittance * background
     total = {
-        "rgb_loss": photometric(rgb, observed),
+        "rgb_loss": photometric(rgb, observed, None if exposure is None else exposure.index_select(0, pixels)),
         "point_color": weight.point_color * point_color(colors.mass, colors.first, colors.second, observed),
         "entropy": weight.background_entropy * background_entropy(composite.transmittance),
         "distortion": weight.distortion * _distortion(rays, pixels, composite, field.plan.content_near),

@@ -17,6 +17,7 @@ uniform int mode;      // 0 colour, 1 depth, 2 winning MPI
 uniform int alone;     // this MPI alone; -1 for all
 uniform float share;   // of the window
 uniform float rayNear, threshold, background;
+uniform vec3 exposure;
 uniform vec2 depthRange; // logarithms of the distances at the ends of the ramp
 uniform vec2 densityCodes; // low, step
 uniform vec4 low[GROUPS], step_[GROUPS]; // of the channels; features' doubled, for tanh x = 2 sigmoid(2 x) - 1
@@ -175,7 +176,7 @@ void main() {
     /*each*/ if (votes[K_] > most) { most = votes[K_]; color = tint(K_); }
     /*end*/
   } else {
-    if (mass > 0.0) color = shade(sums, mass, direction) * (1.0 - light);
+    if (mass > 0.0) color = exposure * shade(sums, mass, direction) * (1.0 - light);
     color = clamp(color + light * background, 0.0, 1.0);
   }
   pixel = vec4(share * color, share);

@@ -248,6 +248,7 @@ class WindowOnCard {
     gl.uniform1f(this.uniform("rayNear"), row.ray_near);
     gl.uniform1f(this.uniform("threshold"), row.threshold);
     gl.uniform1f(this.uniform("background"), row.background);
+    gl.uniform3fv(this.uniform("exposure"), row.exposure || [1, 1, 1]);
     gl.uniform2f(this.uniform("densityCodes"), row.density.low, row.density.step);
     const padded = (name, by) =>
       Array.from({ length: 4 * this.groups }, (_, c) => (c < 3 ? by : 2 * by) * (row.channels[c]?.[name] ?? 0));
