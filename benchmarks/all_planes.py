@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from nerfstudio.cameras.rays import RayBundle
 from rays import crossings
-from torch import Tensor
+from torch import Tensor, nn
 
 from mmpi_ns.bench.trainers import Steps, clock
 from mmpi_ns.field.mmpi_field import MMPIField
@@ -63,6 +63,8 @@ class DenseSteps:
         names = ("feature_channels", "hidden_width", "position_frequencies", "direction_frequencies")
         settings = {name: getattr(self.model.config.colour, name) for name in names}
         self.field = MMPIField(self.model.field.full_plan, **settings, shares_depth=True).to(self.model.device)
+        for name in ("density", "features"):  # all rows have gradients here, so tables are plain parameters
+            self.field.register_parameter(name, nn.Parameter(getattr(self.field, name).data))
         self.optimizer = torch.optim.Adam(rates_of(self.field), betas=(0.9, 0.99))
 
     def run(self, count: int) -> float:
