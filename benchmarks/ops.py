@@ -21,7 +21,7 @@ from mmpi_ns.bench.trainers import Steps, median_s
 from mmpi_ns.field.samples import Lookup, metadata_of
 from mmpi_ns.model import MMPIModel
 from mmpi_ns.ops.composite.reference import composite_weights
-from mmpi_ns.ops.interpolate import index_rows, read_rows, sum_rows, weigh_rows
+from mmpi_ns.ops.interpolate import Table, index_rows, read_rows, sum_rows, weigh_rows
 from mmpi_ns.ops.march.reference import merge
 from mmpi_ns.rendering.rendered import bounded
 from mmpi_ns.scripts.command import run
@@ -213,10 +213,23 @@ def _adam(steps: Steps, moved: float) -> Op:
         optimizer.zero_grad()
     torch.stack([loss.reshape(()) for loss in losses.values()]).sum().backward()
 
+    params = [p for o in optimizers for group in o.param_groups for p in group["params"] if p.grad is not None]
+    grads = [(p, getattr(p, "grad_rows", None), p.grad) for p in params]
+
     def work() -> None:
+        for p, rows, grad in grads:
+            p.grad = None
+            if isinstance(p, Table):
+                p.add_grad(rows, grad)
+            else:
+                p.grad = grad
         for optimizer in optimizers:
             optimizer.step()
+        for p in params:
+            p.grad = None  # other operations have gradients of their own
 
+    for p in params:
+        p.grad = None
     return Op("Adam", work, moved)
 
 
