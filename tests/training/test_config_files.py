@@ -37,7 +37,7 @@ def test_a_file_from_before_the_groups_has_every_option_in_its_group():
     assert (model.colour.hidden_width, model.rendering.background, model.rendering.mode) == (12, "white", "exact")
     assert (model.rendering.threshold, model.sampling.threshold) == (0.004, 0.005)
     assert (model.schedule.training, model.schedule.decay_from) == ("two-phase", 0.25)
-    assert model.placement == mmpi_small.config.pipeline.model.placement and model.loss == usual.loss
+    assert (model.placement.rays_per_texel, model.loss.depth_outliers) == (2.5, 0.02), "as the file says"
     assert model.schedule.growth_shares == usual.schedule.growth_shares
     check_nothing_left(model)
     unknown = set(vars(model)) - {f.name for f in fields(model)} - set(LEFT)
