@@ -25,6 +25,8 @@ VIEWS, LOOK_SECONDS = 4, 20.0
 """The quick test: maximum number of test images, and seconds after which no further one is started."""
 CPU_RAYS = 10000.0
 """Rays/s that one core trains with the settings of mmpi-small (docs/results/train.md)."""
+ONE_THREAD = 0.46
+"""Share of a training step that runs on one thread, measured on kitti-street with one thread (commit 94eda72)."""
 LONG = 1800.0
 """Seconds from which a smaller method is suggested."""
 
@@ -67,14 +69,29 @@ class TrainingLog:
         self._said_at, self._said, self._phase, self._drawn = now, done, where, 0.0
 
 
-def forecast(method: str, steps: int, rays: int) -> str:
-    """Training time on this machine's CPU, and the smaller method if that is long."""
-    seconds = steps * rays / (CPU_RAYS * torch.get_num_threads())
+def forecast(method: str, steps: int, rays: int, threads: int, cores: float) -> str:
+    """Training time on this machine's CPU, the smaller method if that is long, and a warning if threads wait for cores.
+
+    Args:
+        method: name of the method that trains.
+        steps: of the run.
+        rays: of a step.
+        threads: that training runs.
+        cores: free ones.
+    """
+    together = max(1.0, min(threads, cores))
+    seconds = steps * rays / CPU_RAYS * (ONE_THREAD + (1 - ONE_THREAD) / together)
     smaller = "; mmpi-small is made for a CPU" if seconds > LONG and method != "mmpi-small" else ""
-    return (
+    text = (
         f"Without a GPU, {steps:,} steps of {rays:,} rays take about {duration(seconds)}, or more with large plans"
         f"{smaller}."
     )
+    if threads > 1 and cores < threads - 0.5:
+        text += (
+            f"\n{threads} threads run and {cores:.1f} cores are free, so they wait for each other: end other programs, "
+            f"or start with OMP_NUM_THREADS={max(1, round(cores))}."
+        )
+    return text
 
 
 @torch.no_grad()

@@ -40,7 +40,7 @@ from mmpi_ns.utils.console import duration, say
 from mmpi_ns.utils.errors import InputError
 from mmpi_ns.utils.files import write_atomically
 from mmpi_ns.utils.host import arguments, command, enter_command, signals_go_to
-from mmpi_ns.utils.machine import unused_gpu
+from mmpi_ns.utils.machine import free_cores, unused_gpu
 
 PLAN_FILE = "plan.json"
 
@@ -165,7 +165,9 @@ class MMPITrainer(Trainer):
         say(self._manager.describe())
         say(describe(plan, self._window_steps, *self._expected_memory()))
         if not str(self.device).startswith("cuda"):
-            say(forecast(self.config.method_name or "", self._total_steps, self._manager.get_train_rays_per_batch()))
+            rays = self._manager.get_train_rays_per_batch()
+            cpu = torch.get_num_threads(), free_cores()
+            say(forecast(self.config.method_name or "", self._total_steps, rays, *cpu))
             if gpu := unused_gpu():
                 say(f"No GPU is used: {gpu}.")
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ import torch
 from torch import Tensor
 
 CGROUP = Path("/sys/fs/cgroup")
+STAT = Path("/proc/stat")
 NVIDIA = Path("/proc/driver/nvidia")
 DRIVERS = {13: 580, 12: 525, 11: 450}
 """Series of NVIDIA's driver that a major version of CUDA needs at least."""
@@ -52,6 +54,28 @@ def _available() -> int:
         return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:"))
     except (OSError, StopIteration):
         return sys.maxsize
+
+
+def free_cores(seconds: float = 0.2) -> float:
+    """Cores that other programs leave to this process, of those that it may use; looks at what is idle for a moment."""
+    most = float(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
+    try:
+        quota, period = (CGROUP / "cpu.max").read_text(encoding="ascii").split()
+        most = min(most, int(quota) / int(period))
+    except (OSError, ValueError):  # no container, or one without a limit
+        pass
+    try:
+        before = _idle_ticks()
+        time.sleep(seconds)
+        idle = (_idle_ticks() - before) / os.sysconf("SC_CLK_TCK") / seconds
+    except (OSError, ValueError):  # not Linux
+        return most
+    return max(0.0, min(most, idle))
+
+
+def _idle_ticks() -> int:
+    """Ticks in which cores were idle or waited for a disk, since the start of the system."""
+    return sum(int(word) for word in STAT.read_text(encoding="ascii").split("\n", 1)[0].split()[4:6])
 
 
 def unused_gpu() -> str:

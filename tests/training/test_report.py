@@ -9,6 +9,7 @@ from training_runs import schedule_of
 from mmpi_ns.rendering.pipeline import summary
 from mmpi_ns.training import report
 from mmpi_ns.training.phases import LONG_RUN
+from mmpi_ns.utils import machine
 from mmpi_ns.utils.console import duration
 
 
@@ -51,10 +52,42 @@ def test_durations_are_in_words():
 
 
 def test_a_long_run_without_a_gpu_names_the_smaller_method():
-    threads = torch.get_num_threads()
-    assert f"{20000 * 4096 / 10000 / threads / 3600:.1f} h" in report.forecast("mmpi", 20000, 4096)
-    assert "mmpi-small" in report.forecast("mmpi", 20000, 4096)
-    assert "mmpi-small" not in report.forecast("mmpi-small", 20000, 4096)
+    alone = report.forecast("mmpi", 20000, 4096, 1, 1.0)
+    assert f"{20000 * 4096 / report.CPU_RAYS / 3600:.1f} h" in alone and "mmpi-small" in alone
+    assert "mmpi-small" not in report.forecast("mmpi-small", 20000, 4096, 1, 1.0)
+
+
+def test_more_threads_help_with_what_is_parallel_alone():
+    for threads, share in ((2, 0.73), (16, 0.46 + 0.54 / 16)):
+        assert f"about {100 * share:.1f} h" in report.forecast("mmpi", 360_000, 10_000, threads, 16.0)
+
+
+def test_threads_that_wait_for_cores_are_told():
+    assert "free" not in report.forecast("mmpi", 10, 10, 8, 7.8)
+    assert "free" not in report.forecast("mmpi", 10, 10, 1, 0.2), "nothing would mend it"
+    busy = report.forecast("mmpi", 10, 10, 8, 2.1)
+    assert "8 threads run and 2.1 cores are free" in busy and "OMP_NUM_THREADS=2" in busy
+    assert report.forecast("mmpi", 10**6, 10, 8, 2.0).split("\n")[0] == report.forecast("mmpi", 10**6, 10, 2, 2.0)
+
+
+def test_free_cores_are_those_that_are_idle_within_what_the_process_may_use(monkeypatch, tmp_path):
+    now = iter([100, 160, 100, 1000, 5, 5])
+    monkeypatch.setattr(machine, "STAT", tmp_path / "stat")
+    monkeypatch.setattr(machine, "CGROUP", tmp_path)
+    monkeypatch.setattr(machine.os, "sched_getaffinity", lambda _: range(8), raising=False)
+
+    def ticks():
+        machine.STAT.write_text(f"cpu 9 9 9 {next(now) - 5} 5 9 9 9\ncpu0 1 2\n")
+        return idle()
+
+    idle = machine._idle_ticks
+    monkeypatch.setattr(machine, "_idle_ticks", ticks)
+    monkeypatch.setattr(machine.time, "sleep", lambda _: None)
+    monkeypatch.setattr(machine.os, "sysconf", lambda _: 100)
+    assert machine.free_cores(0.2) == pytest.approx(3.0)
+    (tmp_path / "cpu.max").write_text("400000 100000\n")
+    assert machine.free_cores(0.2) == 4, "no more than the container has"
+    assert machine.free_cores(0.2) == 0
 
 
 def test_evaluation_is_summed_up_in_a_line():
