@@ -26,7 +26,8 @@ VIEWS, LOOK_SECONDS = 4, 20.0
 CPU_RAYS = 10000.0
 """Rays/s that one core trains with the settings of mmpi-small (docs/results/train.md)."""
 ONE_THREAD = 0.46
-"""Share of a training step that runs on one thread, measured on kitti-street with one thread (commit 94eda72)."""
+"""Share of a training step that runs on one thread: that of kitti-street /4 in a profile of commit 94eda72. It is less
+while texels grow, and more after."""
 LONG = 1800.0
 """Seconds from which a smaller method is suggested."""
 

@@ -12,7 +12,7 @@ import torch
 from nerfstudio.cameras.cameras import CameraType
 from nerfstudio.model_components.ray_generators import RayGenerator
 from PIL import Image
-from tiny_scene import HEIGHT, TRAIN, WIDTH, color_of, image_of, name_of, project, wall_points, write_scene
+from tiny_scene import HEIGHT, TEST, TRAIN, WIDTH, color_of, image_of, name_of, project, wall_points, write_scene
 from training_runs import datamanager, in_capture_frame, plan_of
 
 from mmpi_ns.capture import rays
@@ -23,6 +23,7 @@ from mmpi_ns.capture.rays import LensRays, PinholeRays
 from mmpi_ns.capture.sfm import MIN_TRACK
 from mmpi_ns.placement.rule import PlacementConfig, place
 from mmpi_ns.scene.plan import ScenePlan
+from mmpi_ns.utils.errors import InputError
 
 TRACKED = sum(project(i, wall_points())[1].astype(int) for i in range(8)) >= MIN_TRACK
 
@@ -85,6 +86,15 @@ def test_masks_that_leave_nothing_are_refused(tmp_path):
         Image.fromarray(np.zeros((HEIGHT, WIDTH), np.uint8)).save(data / "masks" / name_of(i))
     with pytest.raises(ValueError, match="masks leave no training pixel"):
         datamanager(data)
+
+
+def test_a_mask_over_all_of_a_test_image_is_named(tmp_path):
+    scene = write_scene(tmp_path / "scene", masks=True)
+    for i in TEST:
+        Image.fromarray(np.zeros((HEIGHT, WIDTH), np.uint8)).save(scene / "masks" / name_of(i))
+    manager = datamanager(scene)
+    with pytest.raises(InputError, match=r"The mask of .* leaves no pixel: correct it\."):
+        manager.next_eval(0)
 
 
 def test_an_image_that_cannot_be_read_is_named(tmp_path):
