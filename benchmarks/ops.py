@@ -220,6 +220,7 @@ def _adam(steps: Steps, moved: float) -> Op:
         for p, rows, grad in grads:
             p.grad = None
             if isinstance(p, Table):
+                assert rows is not None
                 p.add_grad(rows, grad)
             else:
                 p.grad = grad

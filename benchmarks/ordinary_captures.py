@@ -59,8 +59,8 @@ class Capture:
     def size(self, i: int) -> tuple[int, int]:
         """Width and height of an image."""
         long = self.pixels // 2 if self.shape == "mixed" and i % 3 == 2 else self.pixels
-        sides = long, long * 3 // 4
-        return sides if self.shape == "landscape" or (self.shape == "mixed" and i % 2 == 0) else sides[::-1]
+        short = long * 3 // 4
+        return (long, short) if self.shape == "landscape" or (self.shape == "mixed" and i % 2 == 0) else (short, long)
 
     def focal(self, i: int) -> float:
         """65 degrees along the longer side, 130 of a fisheye. Pixels."""
@@ -118,7 +118,7 @@ class Capture:
         drawn = round(width * small), round(height * small)
         colors = street_colors(self.pose(i)[:3, 3], self.directions(i, *drawn))
         picture = (255 * colors).round().astype(np.uint8)
-        return cv2.resize(picture, (width, height), interpolation=cv2.INTER_CUBIC)
+        return np.asarray(cv2.resize(picture, (width, height), interpolation=cv2.INTER_CUBIC), np.uint8)
 
 
 def street_colors(eye: Array, directions: Array) -> Array:
