@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from lab import figure
-from rays import AHEAD
+from plane_crossings import AHEAD
 from report import Bench, Report, Row, page, table
 from solids import Solids, bake
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 from nerfstudio.cameras.rays import RayBundle
-from rays import crossings
+from plane_crossings import crossings
 from torch import Tensor, nn
 
 from mmpi_ns.bench.trainers import Steps, clock

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from lab import figure
-from rays import Image, images_of
+from plane_crossings import Image, images_of
 from report import Bench, Report, Row, fingerprint, page, table
 
 from mmpi_ns.bench.rendering import Array, in_float64

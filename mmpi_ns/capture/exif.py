@@ -45,8 +45,12 @@ def exposure_of(file: Path) -> Exposure | None:
 
 
 def light_of(file: Path) -> float:
-    """Light that an image got by its EXIF, in arbitrary units; NaN where it is not noted."""
-    exposure = exposure_of(file)
+    """Light that an image got by its EXIF, in arbitrary units; NaN where it is not noted or the file is damaged, which
+    is told when its pixels are read."""
+    try:
+        exposure = exposure_of(file)
+    except OSError:
+        exposure = None
     if exposure is None:
         return float("nan")
     return exposure.time * (exposure.sensitivity or 100.0) / (exposure.aperture or 1.0) ** 2

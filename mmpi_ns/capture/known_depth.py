@@ -81,7 +81,7 @@ class KnownDepth:
 
     def image(self, i: int) -> Map:
         """The numbers of one image. [H, W, 2]"""
-        return unpacked(torch.from_numpy(self.codes[i])).numpy()
+        return unpacked(torch.from_numpy(np.require(self.codes[i], requirements="W"))).numpy()
 
     @property
     def share(self) -> float:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int, Int16, UInt8
 from torch import Tensor
@@ -76,7 +77,7 @@ class PixelPool:
             if places is not None:
                 places[rows] = kept.int()
             if depths is not None and known is not None:
-                depths[rows] = torch.from_numpy(known.codes[i]).reshape(-1, 2)[kept]
+                depths[rows] = torch.from_numpy(np.require(known.codes[i], requirements="W")).reshape(-1, 2)[kept]
             starts.append(end)
         if not starts[-1]:
             raise InputError("The masks leave no training pixel: white (non-zero) mask pixels are the ones used.")

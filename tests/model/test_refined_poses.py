@@ -162,7 +162,7 @@ def test_a_test_image_is_scored_twice_and_the_plain_score_stays(turned, capsys):
 
 def test_poses_are_not_refined_against_what_has_no_gradients(turned):
     turned.pipeline.model.config.rendering.mode = "baked"
-    with pytest.raises(InputError, match="render exact"):
+    with pytest.raises(InputError, match=r"rendering\.mode exact"):
         turned.pipeline.get_average_eval_image_metrics()
     turned.pipeline.model.config.rendering.mode = "auto"
 

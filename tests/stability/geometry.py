@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 from hand_made import samples_to_ndc
-from rays import AHEAD, crossings
+from plane_crossings import AHEAD, crossings
 from stability import exact
 from stability.cases import (
     UNIT,

@@ -285,7 +285,7 @@ def test_mmpi_export_names_the_option_that_cannot_be_used(trained, tmp_path, opt
 def test_mmpi_export_names_a_config_that_is_none(finished, text):
     (finished / "config.yml").write_text(text)
     assert (
-        "no config.yml that ns-train wrote"
+        "not a config.yml that ns-train wrote"
         in run("mmpi-export", "bake", "--load-config", finished / "config.yml").sentence
     )
 

@@ -26,7 +26,7 @@ def order_by_head(places: Places, num_heads: int, counts: Sequence[int] | None) 
     heads, planes, ndc, valid = (x.contiguous() for x in places)
     bounds = even_bounds(heads.numel(), AT_LEAST)
     in_parts = torch.zeros(len(bounds) - 1, num_heads, dtype=torch.int64)
-    part_of = {begin: i for i, begin in enumerate(bounds)}
+    part_of = {begin: i for i, begin in enumerate(bounds[:-1])}
     run_in_parts(lambda a, b: call("mmpi_count_heads", heads, valid, a, b, in_parts[part_of[a]]), bounds)
     totals = in_parts.sum(0)
     starts = totals.cumsum(0) - totals + in_parts.cumsum(0) - in_parts
