@@ -160,7 +160,10 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         cameras = self.train_dataset.cameras
         pinhole = PinholeRays.of(cameras, self.device)
         self.train_ray_generator: Any = pinhole or RayGenerator(cameras.to(self.device))
-        self.gains = self._calibrate() if self.config.correct_exposure and self.test_mode == "val" else None
+        gains = self.calibrated() if self.config.correct_exposure and self.test_mode == "val" else None
+        if gains is not None:
+            say(gains.describe())
+        self.gains = gains if gains is not None and gains.matter else None
         if self.gains is not None:
             self.train_dataset.metadata[GAINS] = self.gains
         self._reads_by_window = bool(self._sizes(None).sum() > self.config.resident_pixels)
@@ -168,8 +171,8 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
             CONSOLE.print(f"Reading {len(self.train_dataset)} training images.")
             self.sources = self._resident = self._read_sources(None)
 
-    def _calibrate(self) -> Gains | None:
-        """Exposures of the training images, if they differ by more than errors explain; says what was found."""
+    def calibrated(self) -> Gains | None:
+        """Exposures of the training images; None if EXIF says that they are equal, or nothing tells them."""
         posed = posed_images(self.observations, self.train_dataset)
         if self.known_depth is None or posed is None or len(posed.files) < 2:
             return None
@@ -181,9 +184,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         ratios = color_ratios(posed, self.known_depth, self.train_ray_generator, show, self.config.seed)
         if ratios is None:
             return None
-        gains = image_gains(ratios, len(posed.files), light)
-        say(gains.describe())
-        return gains if gains.matter else None
+        return image_gains(ratios, len(posed.files), light)
 
     def get_train_rays_per_batch(self) -> int:
         """Pixel rays of the step at hand."""

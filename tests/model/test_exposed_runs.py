@@ -1,0 +1,72 @@
+"""Runs on images of several exposures: what is kept, shown and scored."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from nerfstudio.utils.eval_utils import eval_setup
+from PIL import Image
+from tiny_scene import image_of, name_of, write_scene
+from training_runs import ready, trainer_config, write_plan
+
+from mmpi_ns.rendering import pipeline as pipelines
+from mmpi_ns.rendering.metrics import psnr
+
+FACTORS = np.random.default_rng(3).uniform(0.55, 1.0, (8, 3))
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A pipeline loaded from a short run on the tiny scene, each image of which has an exposure of its own."""
+    folder = tmp_path_factory.mktemp("exposed")
+    data = write_scene(folder / "data")
+    for i in range(8):
+        Image.fromarray((255 * image_of(i) * FACTORS[i]).round().astype(np.uint8)).save(data / "images" / name_of(i))
+    config = trainer_config(data, write_plan(data, folder / "plan.json"), folder / "runs", 60, training="joint")
+    config.pipeline.datamanager.new_view_share = 0.75
+    config.save_config()
+    trainer = ready(config)
+    trainer.train()
+    _, pipeline, *_ = eval_setup(config.get_base_dir() / "config.yml", test_mode="test")
+    return trainer.pipeline.model.exposures, pipeline
+
+
+def test_exposures_of_a_run_are_loaded_with_it(run):
+    trained, pipeline = run
+    assert len(trained.factors) == 6
+    for name, values in trained.state_dict().items():
+        assert torch.equal(pipeline.model.exposures.state_dict()[name], values)
+
+
+def test_a_test_image_is_scored_at_its_own_exposure(run, monkeypatch, capsys):
+    _, pipeline = run
+    raw = pipeline.get_average_eval_image_metrics()
+    monkeypatch.setattr(pipelines, "exposure_of_image", lambda *_: None)
+    at_mean = pipeline.get_average_eval_image_metrics()
+    assert raw["psnr"] > at_mean["psnr"] + 1
+    assert raw["cc_psnr"] == pytest.approx(at_mean["cc_psnr"], abs=0.5)
+    assert "scored at mean exposure" in capsys.readouterr().out
+
+
+def test_pictures_are_shown_at_the_mean_exposure_or_at_the_nearest(run, monkeypatch):
+    _, pipeline = run
+    model, cameras = pipeline.model, pipeline.datamanager.train_dataset.cameras
+    monkeypatch.setattr(model.config.rendering, "mode", "exact")
+    mean = model.get_outputs_for_camera(cameras[2:3])
+    torch.testing.assert_close(mean["rgb"], (model.exposures.mean * mean["radiance"]).clamp(0, 1))
+    monkeypatch.setattr(model.config.rendering, "exposure", "nearest")
+    nearest = model.get_outputs_for_camera(cameras[2:3])
+    expected = (model.exposures.factors[2] * nearest["radiance"]).clamp(0, 1)
+    assert psnr(nearest["rgb"], expected) > 60
+    assert psnr(nearest["rgb"], mean["rgb"]) < 40
+
+
+def test_baked_pictures_have_the_same_exposure(run, monkeypatch):
+    _, pipeline = run
+    model, cameras = pipeline.model, pipeline.datamanager.train_dataset.cameras
+    images = {}
+    for mode in ("exact", "baked"):
+        monkeypatch.setattr(model.config.rendering, "mode", mode)
+        images[mode] = model.get_outputs_for_camera(cameras[1:2])["rgb"]
+    assert psnr(images["baked"], images["exact"]) > 35
