@@ -7,12 +7,14 @@ import json
 import sys
 import time
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from lab import train_and_evaluate
 from numpy.typing import NDArray
+from PIL import Image
 from report import Bench, Report, Row, page, table
 
 from mmpi_ns.bench.trainers import Scene
@@ -32,9 +34,8 @@ class ExposureBench(Bench):
     """Calibrates procedural streets, whose exposures are known, and captures; with --steps also trains on them."""
 
     data: tuple[Path, ...] = ()
-    """Captures (folders with transforms.json) beside the streets."""
-    downscale_factor: int = 2
-    """Image size of the captures."""
+    """Captures (folders with transforms.json) beside the streets, at half size if there are copies of it, else a
+    quarter."""
     count: int = 48
     """Images of a street; half of them train."""
     width: int = 256
@@ -48,18 +49,22 @@ class ExposureBench(Bench):
 
     def run(self) -> None:
         report = Report(self, key=self.key("data"))
-        for kind in STREETS:
-            report.row(f"street, {kind}", lambda kind=kind: self._row(self._street(kind), 1))
+        for kind, exif in product(STREETS, (True, False)):
+            name = f"street, {kind}" + ("" if exif else ", no EXIF")
+            report.row(name, lambda kind=kind, exif=exif: self._row(self._street(kind, exif), 1))
         for data in self.data:
-            report.row(data.resolve().name, lambda data=data: self._row(data, self.downscale_factor))
+            factor = next((f for f in (2, 4) if (data / f"images_{f}").is_dir()), 1)
+            report.row(data.resolve().name, lambda data=data, factor=factor: self._row(data, factor))
         report.finish({}, markdown(report.content))
 
-    def _street(self, kind: ExposureName) -> Path:
+    def _street(self, kind: ExposureName, exif: bool) -> Path:
         """A procedural street, written unless it is there."""
-        folder = self.folder / f"street-{kind}"
+        folder = self.folder / (f"street-{kind}" if exif else f"street-{kind}-no-exif")
         if not (folder / "transforms.json").is_file():
             scene = make_scene("street", 0, self.count, self.width, self.height)
             write_dataset(scene, folder, exposure=make_exposure(kind, scene), processes=self.cores)
+            for path in [] if exif else sorted((folder / "images").iterdir()):
+                Image.fromarray(np.asarray(Image.open(path))).save(path)
         return folder
 
     def _row(self, data: Path, downscale_factor: int) -> Row:
@@ -102,7 +107,7 @@ def true_factors(data: Path, names: list[str]) -> NDArray[np.float64] | None:
     """Factors [N, 3] of middle greys in images of known exposure; None where it is not known, ones where it is one."""
     path = data / "exposure.json"
     if not path.is_file():
-        return np.ones((len(names), 3)) if data.name == "street-none" else None
+        return np.ones((len(names), 3)) if data.name.startswith("street-none") else None
     told = {Path(name).name: gains for name, gains in json.loads(path.read_text(encoding="utf-8"))["gains"].items()}
     gains = np.array([told[name] for name in names])
     return np.mean([tone(np.minimum(1, gains * light_of(np.array(v)))) / v for v in GREYS], 0)
