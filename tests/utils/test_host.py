@@ -44,6 +44,7 @@ def state():
 @pytest.fixture
 def mallocs(monkeypatch):
     """What malloc is asked to keep, instead of asking it."""
+    host.undo()  # what another test of this process has left
     asked = []
     monkeypatch.setattr(host, "malloc_keeps", lambda *sizes: asked.append(sizes))
     yield asked
