@@ -25,9 +25,9 @@ VIEWS, LOOK_SECONDS = 4, 20.0
 """The quick test: maximum number of test images, and seconds after which no further one is started."""
 CPU_RAYS = 10000.0
 """Rays/s that one core trains with the settings of mmpi-small (docs/results/train.md)."""
-ONE_THREAD = 0.46
-"""Share of a training step that runs on one thread: that of kitti-street /4 in a profile of commit 94eda72. It is less
-while texels grow, and more after."""
+ONE_THREAD = 0.95
+"""Share of a training that runs on one thread: kitti-street /4, 1,500 steps, took 72 s with one thread and 70 s with two
+on two free cores (docs/log/performance.md)."""
 LONG = 1800.0
 """Seconds from which a smaller method is suggested."""
 
