@@ -26,7 +26,7 @@ VIEWS, LOOK_SECONDS = 4, 20.0
 CPU_RAYS = 10000.0
 """Rays/s that one core trains with the settings of mmpi-small (docs/results/train.md)."""
 ONE_THREAD = 0.95
-"""Share of a training that runs on one thread: kitti-street /4, 1,500 steps, took 72 s with one thread and 70 s with two
+"""Share of a training that runs on one thread: 1,500 steps of kitti-street /4 took 72 s with one thread, 70 s with two
 on two free cores (docs/log/performance.md)."""
 LONG = 1800.0
 """Seconds from which a smaller method is suggested."""
