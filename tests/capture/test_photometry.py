@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from mmpi_ns.capture import photometry
 from mmpi_ns.capture.photometry import ColorRatios, ExposedView, Gains, grouped, image_gains, solve
 
 CONSTANT, FLAT = np.zeros((12, 3)), np.zeros((2, 3))
@@ -126,3 +127,14 @@ def test_span_and_decision_follow_from_factors():
     assert Gains(factors, np.full(11, 0.01), FLAT, 0.1, 0.02).matter
     assert not Gains(factors, np.full(11, 0.1), FLAT, 0.1, 0.02).matter
     assert not Gains(factors, np.full(11, 0.01), FLAT, 0.1, 0.09).matter
+
+
+def test_falloff_is_taken_out_of_an_uncalibrated_image(monkeypatch):
+    """log(second / first) = k_second - k_first + falloff (r_second - r_first), solved for the first."""
+    falloff, change = np.array([[-0.5] * 3, [-0.2] * 3]), np.array([[0.3, 0.1]])
+    own, other = np.log([1.5, 1.2, 0.9]), np.log([0.8, 1.0, 1.1])
+    ratios = ColorRatios(np.array([9]), np.array([1]), other - own + change @ falloff, np.array([0.01]), change)
+    monkeypatch.setattr(photometry, "pair_ratios", lambda *_: ratios)
+    exposures = np.exp(np.stack([np.zeros(3), other]))
+    exposure = photometry.exposure_of_view(None, [None], None, None, None, exposures, falloff)
+    np.testing.assert_allclose(exposure, [1.5, 1.2, 0.9])
