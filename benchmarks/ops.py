@@ -20,9 +20,9 @@ from torch import Tensor
 from mmpi_ns.bench.trainers import Steps, median_s
 from mmpi_ns.field.samples import Lookup, metadata_of
 from mmpi_ns.model import MMPIModel
-from mmpi_ns.ops.composite.reference import composite_weights
+from mmpi_ns.ops.composite import composite_weights
 from mmpi_ns.ops.interpolate import Table, index_rows, read_rows, sum_rows, weigh_rows
-from mmpi_ns.ops.march.reference import merge
+from mmpi_ns.ops.march import merge
 from mmpi_ns.rendering.rendered import bounded
 from mmpi_ns.scripts.command import run
 
@@ -171,10 +171,10 @@ def _shading(field: Any, samples: Any, lookup: Lookup, report: Any) -> list[Op]:
     valid, skipped = meta["valid"][..., 0], meta["skipped_before"][..., 0]
     tau, features = meta["tau"][..., 0].clone().requires_grad_(), lookup.features.detach().requires_grad_()
     lookup = replace(lookup, density=lookup.density.detach(), features=features)
-    fixed = composite_weights(tau.detach(), valid, skipped, report.skipped_total)
+    fixed = composite_weights.reference(tau.detach(), valid, skipped, report.skipped_total)
 
     def weigh() -> Tensor:
-        return composite_weights(tau, valid, skipped, report.skipped_total).weights
+        return composite_weights.reference(tau, valid, skipped, report.skipped_total).weights
 
     def show() -> Tensor:
         return field.render_colors(samples, lookup, fixed).rgb

@@ -10,11 +10,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mmpi_ns.bench.rendering import of_slots
-from mmpi_ns.bench.scenes import CUBE, Scene, gradients_of, random_scene, samples_of
+from mmpi_ns.bench.scenes import CUBE, Scene, gradients_of, of_slots, random_scene, samples_of
 from mmpi_ns.ops import dispatch, interpolate, variation
 from mmpi_ns.ops.composite import composite_weights
-from mmpi_ns.ops.interpolate import reference as plain
 from mmpi_ns.scene.plan import CubePlan
 from mmpi_ns.training.touched_adam import TouchedAdam
 
@@ -33,12 +31,12 @@ class Check:
         return self.error <= self.bound
 
 
-def _relative(found: Any, wanted: Any) -> float:
-    """Largest difference relative to the largest wanted number; infinite where something is not finite."""
-    found, wanted = (torch.as_tensor(x).detach().double().cpu() for x in (found, wanted))
-    if found.shape != wanted.shape or not bool(torch.isfinite(found).all()):
+def _relative(actual: Any, expected: Any) -> float:
+    """Largest difference relative to the largest expected number; infinite where something is not finite."""
+    actual, expected = (torch.as_tensor(x).detach().double().cpu() for x in (actual, expected))
+    if actual.shape != expected.shape or not bool(torch.isfinite(actual).all()):
         return float("inf")
-    return float((found - wanted).abs().max() / wanted.abs().max().clamp(min=1e-12)) if wanted.numel() else 0.0
+    return float((actual - expected).abs().max() / expected.abs().max().clamp(min=1e-12)) if expected.numel() else 0.0
 
 
 def _draw(device: str, *shape: int, seed: int = 0) -> Tensor:
@@ -52,36 +50,36 @@ def whole_rays(s: Scene, name: str, device: str) -> list[Check]:
     """March, interpolation and compositing together, values and gradients, against plain torch in float64."""
     s = s.clear()
     exact, by = s.exact(), np.random.default_rng(0).normal(size=(len(s.bundle), 3))
-    wanted = exact.render()
-    slopes = gradients_of(exact.field, wanted, by)
+    expected = exact.render()
+    slopes = gradients_of(exact.field, expected, by)
     s.field.to(device)
-    found = s.render()
-    made = gradients_of(s.field, found, by)
+    actual = s.render()
+    gradients = gradients_of(s.field, actual, by)
     with torch.no_grad():
         shaded = s.render().colors.rgb
-    wrong = sum(a != b for a, b in zip(samples_of(found)[0], samples_of(wanted)[0], strict=True))
+    wrong = sum(a != b for a, b in zip(samples_of(actual)[0], samples_of(expected)[0], strict=True))
     return [
         *marched(s, name, exact),
         Check(f"{name}: rays with wrong samples, of {len(by)}", wrong, 0),
-        Check(f"{name}: colours", _relative(found.colors.rgb, wanted.colors.rgb), 2e-4),
-        Check(f"{name}: colours without gradients", _relative(shaded, wanted.colors.rgb), 2e-4),
-        *(Check(f"{name}: gradient of {kind}", _relative(made[kind], slopes[kind]), 1e-3) for kind in slopes),
+        Check(f"{name}: colours", _relative(actual.colors.rgb, expected.colors.rgb), 2e-4),
+        Check(f"{name}: colours without gradients", _relative(shaded, expected.colors.rgb), 2e-4),
+        *(Check(f"{name}: gradient of {kind}", _relative(gradients[kind], slopes[kind]), 1e-3) for kind in slopes),
     ]
 
 
 @torch.no_grad()
 def marched(s: Scene, name: str, exact: Scene) -> list[Check]:
     """What the march itself says: optical depths, and which samples it keeps at a threshold."""
-    threshold, wanted = 0.02, exact.render()
-    depth, weights = of_slots(s.render(), "tau").sum(-1), wanted.composite.weights
-    found = s.render(threshold)
-    kept = of_slots(found, "valid").sum(-1).cpu()
+    threshold, expected = 0.02, exact.render()
+    depth, weights = of_slots(s.render(), "tau").sum(-1), expected.composite.weights
+    actual = s.render(threshold)
+    kept = of_slots(actual, "valid").sum(-1).cpu()
     least, most = ((weights > threshold * (1 + sign * 1e-3)).sum(-1) for sign in (1, -1))
     lost = torch.where(weights <= threshold, weights, 0).sum(-1)
     return [
-        Check(f"{name}: optical depths by the march", _relative(depth, of_slots(wanted, "tau").sum(-1)), 1e-4),
+        Check(f"{name}: optical depths by the march", _relative(depth, of_slots(expected, "tau").sum(-1)), 1e-4),
         Check(f"{name}: rays that keep other samples than they should", int(((kept < least) | (kept > most)).sum()), 0),
-        Check(f"{name}: mass of what is dropped", _relative(found.report.dropped_mass[:, 0], lost), 1e-2),
+        Check(f"{name}: mass of what is dropped", _relative(actual.report.dropped_mass[:, 0], lost), 1e-2),
     ]
 
 
@@ -89,11 +87,11 @@ def marches(device: str, rehearse: bool) -> list[Check]:
     """One, four and nine heads, with and without the cube, blended and not."""
     cases: list[tuple[int, bool, CubePlan | None]]
     cases = [(4, True, CUBE), (1, False, None), (4, False, None), (4, True, None), (9, False, CUBE)]
-    found = []
+    checks = []
     for count, blends, cube in cases[: 1 if rehearse else None]:
         name = f"{count} MPIs{' and the cube' if cube else ''}, {'' if blends else 'no '}blending"
-        found += whole_rays(random_scene(count, 4 if rehearse else 200, blends, count, cube), name, device)
-    return found
+        checks += whole_rays(random_scene(count, 4 if rehearse else 200, blends, count, cube), name, device)
+    return checks
 
 
 # Kernels by themselves -----------------------------------------------------------------------------------------------
@@ -101,8 +99,8 @@ def marches(device: str, rehearse: bool) -> list[Check]:
 
 def _twice(bounds: dict[str, float], work: Callable[[torch.dtype], tuple[Tensor, ...]]) -> list[Check]:
     """What ``work`` makes in float32 against the same in float64, for which there is plain torch alone."""
-    made = zip(bounds.items(), work(torch.float32), work(torch.float64), strict=True)
-    return [Check(name, _relative(a, b), bound) for (name, bound), a, b in made]
+    pairs = zip(bounds.items(), work(torch.float32), work(torch.float64), strict=True)
+    return [Check(name, _relative(a, b), bound) for (name, bound), a, b in pairs]
 
 
 def interpolation(device: str, samples: int) -> list[Check]:
@@ -119,7 +117,7 @@ def interpolation(device: str, samples: int) -> list[Check]:
             (read * upstream).sum().backward()
             gradient = table.dense_grad()
         else:
-            read = plain.interpolate(values := table.data.requires_grad_(), rows, weights.to(dtype))
+            read = interpolate.interpolate_densely(values := table.data.requires_grad_(), rows, weights.to(dtype))
             (gradient,) = torch.autograd.grad((read * upstream).sum(), values)
         assert gradient is not None
         return read, gradient
@@ -133,13 +131,13 @@ def distinct_rows(device: str, samples: int) -> list[Check]:
     texels = 40 * samples
     pool = torch.randint(0, texels, (max(1, samples // 3),), generator=g)
     rows = pool[torch.randint(0, len(pool), (samples, 4), generator=g)].to(device)
-    index, wanted = interpolate.index_rows(rows, texels), rows.unique()
-    wrong = int(len(index.unique) != len(wanted)) or int((index.unique != wanted).sum())
+    index, expected = interpolate.index_rows(rows, texels), rows.unique()
+    wrong = int(len(index.unique) != len(expected)) or int((index.unique != expected).sum())
     wrong += int((index.unique[index.positions.long()] != rows).sum())
     values, weights = _draw(device, samples, 9), torch.rand(samples, 4, generator=g).to(device)
 
     def work(dtype: torch.dtype) -> tuple[Tensor, ...]:
-        return (interpolate.sum_rows(index.positions, values.to(dtype), weights.to(dtype), len(wanted)),)
+        return (interpolate.sum_rows(index.positions, values.to(dtype), weights.to(dtype), len(expected)),)
 
     return [Check("distinct rows: wrong", wrong, 0), *_twice({"distinct rows: sums": 5e-6}, work)]
 
@@ -171,10 +169,10 @@ def compositing_kernels(device: str, rays: int, slots: int) -> list[Check]:
 
     def work(dtype: torch.dtype) -> tuple[Tensor, ...]:
         leaf = tau.to(dtype, copy=True).requires_grad_()
-        made = composite_weights(leaf, valid, before.to(dtype), before[:, -1:].to(dtype))
-        ((made.weights * upstream).sum() + made.accumulation.sum()).backward()
+        composite = composite_weights(leaf, valid, before.to(dtype), before[:, -1:].to(dtype))
+        ((composite.weights * upstream).sum() + composite.accumulation.sum()).backward()
         assert leaf.grad is not None
-        return made.weights, made.transmittance, leaf.grad
+        return composite.weights, composite.transmittance, leaf.grad
 
     return _twice({f"compositing: {name}": 5e-6 for name in ("weights", "transmittance", "gradient")}, work)
 
@@ -195,19 +193,6 @@ def adam(device: str, rows: int) -> list[Check]:
     return _twice({"Adam on rows": 1e-2}, work)
 
 
-def everything(device: str, rehearse: bool) -> list[Callable[[], list[Check]]]:
-    """All comparisons, at the sizes of a training step (or small)."""
-    size = 500 if rehearse else 200_000
-    return [
-        lambda: interpolation(device, size),
-        lambda: distinct_rows(device, size),
-        lambda: compositing_kernels(device, 20 if rehearse else 4096, 37 if rehearse else 150),
-        lambda: variations(device, 200 if rehearse else 100_000),
-        lambda: adam(device, size),
-        lambda: marches(device, rehearse),
-    ]
-
-
 def run_checks(device: str, rehearse: bool) -> dict[str, Any]:
     """Every check; one that raises has failed.
 
@@ -215,11 +200,21 @@ def run_checks(device: str, rehearse: bool) -> dict[str, Any]:
         RuntimeError: the kernels are not there to be checked.
     """
     one = torch.zeros(1, device=device)
-    missing = [n for n, (_, forms) in dispatch.TABLE.items() if "gpu" in forms and dispatch.form_of(n, one) != "gpu"]
+    missing = [
+        n for n, of in dispatch.operations().items() if "gpu" in of.compiled and dispatch.form_of(n, one) != "gpu"
+    ]
     if missing:
         raise RuntimeError(f"there are no kernels to be checked for {', '.join(missing)} (the log says why)")
-    rows: list[dict[str, Any]] = []
-    for number, work in enumerate(everything(device, rehearse)):
+    size, rows = 500 if rehearse else 200_000, list[dict[str, Any]]()
+    groups: list[Callable[[], list[Check]]] = [  # at the sizes of a training step, or small
+        lambda: interpolation(device, size),
+        lambda: distinct_rows(device, size),
+        lambda: compositing_kernels(device, 20 if rehearse else 4096, 37 if rehearse else 150),
+        lambda: variations(device, 200 if rehearse else 100_000),
+        lambda: adam(device, size),
+        lambda: marches(device, rehearse),
+    ]
+    for number, work in enumerate(groups):
         try:
             rows += [{**asdict(c), "ok": c.ok} for c in work()]
         except Exception as error:  # the others are still worth knowing

@@ -10,6 +10,7 @@ import warnings
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
+from resource import RUSAGE_SELF, getrusage
 from typing import Any
 
 import torch
@@ -23,6 +24,7 @@ from mmpi_ns.synthetic.dataset import write_dataset
 
 STEPS, RAYS = 20, 1024
 """Steps that are timed, and rays of each."""
+DRIVER = Path("/proc/driver/nvidia/version")
 
 
 @dataclass
@@ -44,14 +46,14 @@ class Gpu:
             raise ValueError(
                 "torch sees no CUDA device: run it where there is one, or try this processor with --quick."
             )
-        found = run_quick(street(self.folder / "street", 10, 155, 47, 400), (self.folder / "run").resolve(), RAYS)
+        report = run_quick(street(self.folder / "street", 10, 155, 47, 400), (self.folder / "run").resolve(), RAYS)
         if not self.quick:
-            found |= run_checks("cuda", rehearse=False)
-            for check in found["checks"]:
+            report |= run_checks("cuda", rehearse=False)
+            for check in report["checks"]:
                 print(f"{check['name']}: {'ok' if check['ok'] else 'WRONG'} ({check['error']}, bound {check['bound']})")
-        (self.folder / "gpu.json").write_text(json.dumps(found, indent=1), encoding="utf-8")
-        if found.get("failed"):
-            raise ValueError(f"{found['failed']} comparisons with float64 failed: report {self.folder}/gpu.json.")
+        (self.folder / "gpu.json").write_text(json.dumps(report, indent=1), encoding="utf-8")
+        if report.get("failed"):
+            raise ValueError(f"{report['failed']} comparisons with float64 failed: report {self.folder}/gpu.json.")
 
 
 def street(folder: Path, count: int, width: int, height: int, points: int) -> Path:
@@ -71,22 +73,24 @@ def drive(planes: int, rays: int, *more: str) -> tuple[str, ...]:
 
 def environment() -> dict[str, Any]:
     """What the kernels run on and with."""
-    found: dict[str, Any] = {"Python": platform.python_version(), "torch": torch.__version__}
-    found["CUDA of torch"] = torch.version.cuda
+    report: dict[str, Any] = {"Python": platform.python_version(), "torch": torch.__version__}
+    report["CUDA of torch"] = torch.version.cuda
     for package in ("triton", "nerfstudio", "gsplat", "nerfacc", "tinycudann"):
         with contextlib.suppress(metadata.PackageNotFoundError):
-            found[package] = metadata.version(package)
-    found["processor"] = processor()
+            report[package] = metadata.version(package)
+    report["processor"] = processor()
+    with contextlib.suppress(OSError):
+        report["driver"] = DRIVER.read_text(encoding="utf-8").splitlines()[0].removeprefix("NVRM version:").strip()
     if torch.cuda.is_available():
         device = torch.cuda.get_device_properties(0)
-        found["GPU"] = f"{device.name}, sm_{device.major}{device.minor}, {device.total_memory / 2**30:.0f} GiB"
-    return found
+        report["GPU"] = f"{device.name}, sm_{device.major}{device.minor}, {device.total_memory / 2**30:.0f} GiB"
+    return report
 
 
 def try_operations(device: str) -> dict[str, str | None]:
     """Every operation with a compiled form for a device: None where it works, else why not."""
     form = "gpu" if device == "cuda" else "cpu"
-    names = [name for name, (_, forms) in dispatch.TABLE.items() if form in forms]
+    names = [name for name, each in dispatch.operations().items() if form in each.compiled]
     with contextlib.redirect_stdout(io.StringIO()):  # the log of dispatch: it is said here
         return {name: dispatch.fault(name if device == "cuda" else "C++") for name in names}
 
@@ -100,37 +104,39 @@ def time_training(device: str, data: Path, work: Path, rays: int) -> dict[str, A
         steps.run(2)  # compiles
         seconds = steps.run(STEPS) / STEPS
         frame, pixels = min(steps.render(larger=2) for _ in range(3))
-    return {"step_ms": 1e3 * seconds, "rays": rays, "frame_ms": 1e3 * frame, "pixels": pixels}
+    timed = {"step_ms": 1e3 * seconds, "rays": rays, "frame_ms": 1e3 * frame, "pixels": pixels}
+    peak = torch.cuda.max_memory_allocated() if device == "cuda" else 1024 * getrusage(RUSAGE_SELF).ru_maxrss
+    return timed | {"peak_gib": peak / 2**30}
 
 
 def run_quick(data: Path, work: Path, rays: int) -> dict[str, Any]:
     """Looks, tries, times, and says so line by line: environment, operations (why each falls back, or None), times of
     a small scene, and ``well``, the verdict."""
-    found: dict[str, Any] = {"environment": environment()}
-    for name, value in found["environment"].items():
+    report: dict[str, Any] = {"environment": environment()}
+    for name, value in report["environment"].items():
         print(f"{name}: {value}", flush=True)
     device = "cuda" if torch.cuda.is_available() else "cpu"
     if device == "cpu":
         print(
             "torch sees no GPU, so nothing is said of one here: what follows is this machine's processor.", flush=True
         )
-    found["device"], found["operations"] = device, try_operations(device)
-    slow = {name: reason for name, reason in found["operations"].items() if reason is not None}
-    for name in found["operations"]:
+    report["device"], report["operations"] = device, try_operations(device)
+    slow = {name: reason for name, reason in report["operations"].items() if reason is not None}
+    for name in report["operations"]:
         print(f"{name}: {'plain torch, since ' + slow[name] if name in slow else 'ok'}", flush=True)
-    found["timed"] = timed = time_training(device, data, work, rays)
-    print(f"a step of {rays} rays: {timed['step_ms']:.1f} ms", flush=True)
-    print(f"a frame of {timed['pixels']} pixels: {timed['frame_ms']:.1f} ms", flush=True)
-    found["well"] = device == "cuda" and not slow
-    print(_verdict(device, slow), flush=True)
-    return found
-
-
-def _verdict(device: str, slow: dict[str, str]) -> str:
+    report["timed"] = timed = time_training(device, data, work, rays)
+    step, frame, pixels = timed["step_ms"], timed["frame_ms"], timed["pixels"]
+    print(f"a step of {rays} rays: {step:.1f} ms, {1e3 * rays / step:,.0f} rays/s", flush=True)
+    print(f"a frame of {pixels} pixels: {frame:.1f} ms, {1e3 / frame:.1f} frames/s", flush=True)
+    print(f"memory: {timed['peak_gib']:.2f} GiB", flush=True)
+    report["well"] = device == "cuda" and not slow
     if slow:
-        return (
-            f"Training works, but {len(slow)} operation(s) run in plain torch, several times slower: {', '.join(slow)}."
+        fate = f"{len(slow)} operation(s) run in plain torch, several times slower: {', '.join(slow)}."
+        print(f"Training works, but {fate}", flush=True)
+    elif device == "cuda":
+        print("All is well: every kernel runs on this GPU and agrees with plain torch.", flush=True)
+    else:
+        print(
+            "Training works on this processor. Whether it would on a GPU, only a machine with one can say.", flush=True
         )
-    if device == "cuda":
-        return "All is well: every kernel runs on this GPU and agrees with plain torch."
-    return "Training works on this processor. Whether it would on a GPU, only a machine with one can say."
+    return report

@@ -1,27 +1,58 @@
-"""Random scenes for the checks of kernels, and the same rays by plain torch in float64."""
+"""Rays as arrays through the package's own renderer, and random scenes to check kernels with, also in float64."""
 
 from __future__ import annotations
 
 import copy
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import torch
 from nerfstudio.cameras.rays import RayBundle
+from numpy.typing import NDArray
 from torch import Tensor
 
-from mmpi_ns.bench.rendering import Array, bundle_of, in_float64, of_slots, render
 from mmpi_ns.field.mmpi_field import MMPIField
+from mmpi_ns.field.samples import metadata_of
+from mmpi_ns.rendering.render import render_rays
 from mmpi_ns.rendering.rendered import RenderedRays
+from mmpi_ns.rendering.sampler import MMPISampler
 from mmpi_ns.scene.plan import CubePlan, MPIPlan, ScenePlan
 
+Array = NDArray[Any]
+"""Of float64; numpy's stubs lose that in too many operations to say so."""
 CUBE = CubePlan((-1.5, -1.25, -1.0), (1.5, 1.5, 2.0), (6, 5, 4))
 CLEAR = 2.0**-18
 """Rays are left out on which moving the inputs by this share changes which samples there are, their order, or (by more
 than ``SAME_DEPTH``) their blended depths: there roundings may decide otherwise."""
 SAME_DEPTH = 1e-2
 TABLES = ("density", "features", "reliability")
+
+
+def bundle_of(origins: Array, directions: Array, near: float = 0.05, far: float = math.inf) -> RayBundle:
+    """float32 rays from arrays [R, 3]."""
+    o, d = (torch.tensor(np.atleast_2d(x), dtype=torch.float32) for x in (origins, directions))
+    column = torch.ones(len(o), 1)
+    return RayBundle(origins=o, directions=d, pixel_area=column * 1e-4, nears=near * column, fars=far * column)
+
+
+def in_float64(bundle: RayBundle) -> RayBundle:
+    """The rays on the CPU in float64, for which every operation has its reference in plain torch alone."""
+    names = ("origins", "directions", "pixel_area", "nears", "fars")
+    return RayBundle(**{name: getattr(bundle, name).cpu().double() for name in names})
+
+
+def render(
+    field: MMPIField, rays: RayBundle, threshold: float = 0.0, blends: bool = False, **sampling: Any
+) -> RenderedRays:
+    """Rays without background; without gradients as images are rendered."""
+    return render_rays(MMPISampler(), rays, field, blends=blends, threshold=threshold, **sampling)
+
+
+def of_slots(rendered: RenderedRays, name: str) -> Tensor:
+    """Data of each sample, by its name in the metadata [R, S]."""
+    return metadata_of(rendered.samples)[name][..., 0]
 
 
 @dataclass(frozen=True)
@@ -50,8 +81,8 @@ class Scene:
             samples, depths = samples_of(exact.render())
             for draw in range(4):
                 moved = samples_of(replace(exact, bundle=_moved(exact.bundle, draw)).render())
-                for i, (own, others, a, b) in enumerate(zip(samples, moved[0], depths, moved[1], strict=True)):
-                    kept[i] &= len(own) > 0 and own == others and bool(((a - b).abs() <= SAME_DEPTH * a).all())
+                for i, (still, others, a, b) in enumerate(zip(samples, moved[0], depths, moved[1], strict=True)):
+                    kept[i] &= len(still) > 0 and still == others and bool(((a - b).abs() <= SAME_DEPTH * a).all())
         if kept.sum() < len(kept) / 4:
             raise ValueError(f"Only {int(kept.sum())} of {len(kept)} rays are clear: choose another seed.")
         return replace(self, bundle=self.bundle[kept])
@@ -59,24 +90,24 @@ class Scene:
 
 def _moved(bundle: RayBundle, seed: int) -> RayBundle:
     """float64 rays with every number moved by up to ``CLEAR`` of it."""
-    g, found = torch.Generator().manual_seed(seed), in_float64(bundle)
-    shape = found.origins.shape
+    g, moved = torch.Generator().manual_seed(seed), in_float64(bundle)
+    shape = moved.origins.shape
     by_origin, by_direction = (1 + CLEAR * (2 * torch.rand(shape, generator=g, dtype=torch.float64) - 1) for _ in "od")
-    found.origins, found.directions = found.origins * by_origin, found.directions * by_direction
-    return found
+    moved.origins, moved.directions = moved.origins * by_origin, moved.directions * by_direction
+    return moved
 
 
-def samples_of(found: RenderedRays) -> tuple[list[list[tuple[int, int]]], list[Tensor]]:
+def samples_of(rendered: RenderedRays) -> tuple[list[list[tuple[int, int]]], list[Tensor]]:
     """Of each ray the (head, plane) of its samples, nearest first, and their optical depths."""
-    valid, heads, planes, tau = (of_slots(found, name).cpu() for name in ("valid", "heads", "planes", "tau"))
+    valid, heads, planes, tau = (of_slots(rendered, name).cpu() for name in ("valid", "heads", "planes", "tau"))
     pairs = [list(zip(h[v].tolist(), p[v].tolist(), strict=True)) for h, p, v in zip(heads, planes, valid, strict=True)]
     return pairs, [t[v] for t, v in zip(tau, valid, strict=True)]
 
 
-def gradients_of(field: MMPIField, found: RenderedRays, by: Array) -> dict[str, Tensor]:
+def gradients_of(field: MMPIField, rendered: RenderedRays, by: Array) -> dict[str, Tensor]:
     """Derivatives of the sum of ``by`` [R, 3] times the rays' colours, by every table."""
     field.zero_grad()
-    found.colors.rgb.backward(torch.tensor(by).to(found.colors.rgb))
+    rendered.colors.rgb.backward(torch.tensor(by).to(rendered.colors.rgb))
     grads = {name: getattr(field, name).dense_grad() for name in TABLES}
     return {n: g.cpu() for n, g in grads.items() if g is not None}
 

@@ -44,7 +44,7 @@ class Score:
     test_images: int = 0
     """Test images, evenly spaced, that are scored; 0 for all."""
     lpips: Literal["vgg", "alex", "none"] = "vgg"
-    """Network of LPIPS; it is left out where the weights cannot be had."""
+    """Network of LPIPS; it is left out where the weights are not available."""
 
     def main(self) -> None:
         self.score()
@@ -57,25 +57,25 @@ class Score:
         chosen = evenly(len(truths), self.test_images)
         files = find_renderings(self.images, [truths.image_filenames[i] for i in chosen])
         metrics = ImageMetrics(self.lpips)
-        found: Scores = []
+        scores: Scores = []
         for i, file in zip(chosen, files, strict=True):
             truth = truths.get_data(i)["image"]
             if truth.shape[-1] != 3:
                 raise ValueError(f"{truths.image_filenames[i]} is see-through: there is no one truth to compare with.")
-            found.append((truths.image_filenames[i].name, metrics(read_rendering(truths, file, truth), truth)))
-        if min(values["psnr"] for _, values in found) > SAME_DB:
+            scores.append((truths.image_filenames[i].name, metrics(read_rendering(truths, file, truth), truth)))
+        if min(values["psnr"] for _, values in scores) > SAME_DB:
             raise ValueError(f"{self.images} holds the test images themselves: give the folder of the renderings.")
-        means = {k: float(np.mean([values[k] for _, values in found])) for k in found[0][1]}
-        print(summary(found) + "".join(f", {k} {v:.3f}" for k, v in means.items() if k.startswith("lpips")))
+        means = {k: float(np.mean([values[k] for _, values in scores])) for k in scores[0][1]}
+        print(summary(scores) + "".join(f", {k} {v:.3f}" for k, v in means.items() if k.startswith("lpips")))
         print(PROTOCOL)
-        return found, means
+        return scores, means
 
 
-def evenly(count: int, wanted: int) -> list[int]:
-    """``wanted`` of 0 ... count - 1, evenly spaced from half a spacing on; all where 0 or more are wanted."""
-    if wanted <= 0 or wanted >= count:
+def evenly(count: int, most: int) -> list[int]:
+    """``most`` of 0 ... count - 1, evenly spaced from half a spacing on; all where that is 0 or more than count."""
+    if most <= 0 or most >= count:
         return list(range(count))
-    return [int((i + 0.5) * count / wanted) for i in range(wanted)]
+    return [int((i + 0.5) * count / most) for i in range(most)]
 
 
 def test_images_of(data: Path, downscale_factor: int) -> MMPIDataset:

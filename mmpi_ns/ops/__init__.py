@@ -1,2 +1,2 @@
-"""Operations: the inner loops. Each is a folder with one signature (``__init__.py``), its plain torch ``reference.py``,
-and its compiled forms: ``cpu.py`` with C++, ``gpu.py`` with Triton. ``dispatch.py`` holds the table and the choice."""
+"""Operations: the inner loops. Each is a folder that defines it in plain torch (``dispatch.operation``), with compiled
+forms of the same signature beside it: ``cpu.py`` with C++, ``gpu.py`` with Triton."""

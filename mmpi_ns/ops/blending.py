@@ -16,17 +16,17 @@ from mmpi_ns.scene.geometry import LocalRays, local_to_ndc
 
 
 def blend_shares(
-    reliability: Float[Tensor, "N H"], cover: Bool[Tensor, "N H"], own: Int[Tensor, "N"]
+    reliability: Float[Tensor, "N H"], cover: Bool[Tensor, "N H"], heads: Int[Tensor, "N"]
 ) -> tuple[Float[Tensor, "N"], Float[Tensor, "N"]]:
     """log P and log(1 - P) of each sample's own head among the heads that cover it.
 
     Args:
         reliability: R of every head at the sample's position; values of heads that do not cover it are ignored.
         cover: which heads cover the position; a sample's own head must be among them.
-        own: the head a sample was taken from.
+        heads: the head that each sample was taken from.
 
     Returns:
-        log softmax over the covering heads at ``own``, and the log of its complement (-inf for a sole cover).
+        log softmax over the covering heads at ``heads``, and the log of its complement (-inf for a sole cover).
 
     Source: paper sec. III-C, P_i = exp(R_i) / sum_j exp(R_j). log(1 - P) comes from the other heads directly:
     from P itself it is wrong beyond R = 17 and has a NaN gradient at P = 1.
@@ -36,7 +36,7 @@ def blend_shares(
     # Only differences matter, and they are exact only for small numbers: the highest becomes 0.
     highest = torch.where(cover, reliability, torch.full_like(reliability, lowest)).amax(-1, keepdim=True).detach()
     reliability = reliability - highest
-    is_own = torch.arange(cover.shape[-1], device=cover.device) == own[:, None]
+    is_own = torch.arange(cover.shape[-1], device=cover.device) == heads[:, None]
     own_value = torch.where(is_own, reliability, torch.zeros_like(reliability)).sum(-1)
     others = cover & ~is_own
     has_others = others.any(-1)
@@ -96,33 +96,26 @@ def log_shares(
     """
     chosen, texels, cover = [], [], []
     for j, grid in enumerate(layout.grids):
-        ndc, inside = _ndc_in_head(layout, j, rays, local, inverse_t)
+        ray = local.table(j).index_select(0, rays)
+        if j < len(layout.mpis):
+            point = ray[:, :3] * inverse_t[:, None] + ray[:, 3:]
+            ndc, inside = (x[:, 0] for x in local_to_ndc(point[:, None], inverse_t[:, None], layout.frames.one(j)))
+        else:
+            assert layout.cube is not None
+            ndc = layout.cube.normalised(ray[:, :3] + ray[:, 3:] / inverse_t.clamp(min=1e-10)[:, None])
+            ndc, inside = ndc.clamp(-1, 1), (ndc.abs() <= 1).all(-1) & (inverse_t > 0)
         is_own = heads == j
-        asked = inside | is_own
+        votes = inside | is_own
         # Counting them would synchronise with a GPU: there all samples are looked up, the others in the empty brick.
-        index = torch.arange(len(heads), device=heads.device) if dispatch.on_device(heads) else asked.nonzero()[:, 0]
-        position, reads = ndc[index], asked[index]
+        index = torch.arange(len(heads), device=heads.device) if dispatch.on_device(heads) else votes.nonzero()[:, 0]
+        position, reads = ndc[index], votes[index]
         rows, weights = grid.trilinear(position)
-        votes = reads & (touched[grid.nearest(position)] > 0)
+        trained = reads & (touched[grid.nearest(position)] > 0)
         chosen.append(index)
         texels.append((rows * reads[:, None], weights))
-        cover.append(torch.zeros_like(is_own).index_copy(0, index, votes) | is_own)
+        cover.append(torch.zeros_like(is_own).index_copy(0, index, trained) | is_own)
     # Read at once: gradients of the table are then one list of rows.
     values = interpolate(reliability, *(torch.cat(parts) for parts in zip(*texels, strict=True)))[:, 0]
     each = zip(values.split([len(i) for i in chosen]), chosen, strict=True)
     columns = [value.new_zeros(len(heads)).index_copy(0, index, value) for value, index in each]
     return blend_shares(torch.stack(columns, -1), torch.stack(cover, -1), heads)
-
-
-def _ndc_in_head(
-    layout: SceneLayout, k: int, rays: Tensor, local: LocalRays, inverse_t: Tensor
-) -> tuple[Float[Tensor, "N 3"], Bool[Tensor, "N"]]:
-    """Positions of samples in one head, and whether they are inside it."""
-    moved = local.table(k).index_select(0, rays)
-    if k < len(layout.mpis):
-        point = moved[:, :3] * inverse_t[:, None] + moved[:, 3:]
-        ndc, inside = local_to_ndc(point[:, None], inverse_t[:, None], layout.frames.one(k))
-        return ndc[:, 0], inside[:, 0]
-    assert layout.cube is not None
-    ndc = layout.cube.normalised(moved[:, :3] + moved[:, 3:] / inverse_t.clamp(min=1e-10)[:, None])
-    return ndc.clamp(-1, 1), (ndc.abs() <= 1).all(-1) & (inverse_t > 0)

@@ -21,6 +21,8 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
+from mmpi_ns.utils.parallel import num_threads
+
 OPS = Path(__file__).parent
 HEADERS = OPS / "cpp"
 FLAGS = ["-std=c++17", "-O3", "-march=native", "-fno-math-errno", "-shared", "-fPIC", f"-I{HEADERS}"]
@@ -56,7 +58,12 @@ def library_file() -> Path:
     if not sources:
         raise CannotCompile(f"{OPS} holds no C++ sources: install the package again")
     texts = [p.read_bytes() for p in [*sources, *sorted(HEADERS.glob("*.h"))]]
-    parts = [*texts, " ".join([*compiler(), *FLAGS]).encode(), _processor()]
+    try:  # what -march=native depends on: different machines may share a home folder
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        processor = "".join(sorted({x for x in lines if x.startswith(("model name", "flags", "Features"))}))
+    except OSError:
+        processor = f"{platform.machine()} {platform.processor()} {platform.node()}"
+    parts = [*texts, " ".join([*compiler(), *FLAGS]).encode(), processor.encode()]
     folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mmpi_ns"
     key = hashlib.sha256(b"\0".join(parts)).hexdigest()[:16]
     return folder / f"kernels-{key}.so"
@@ -87,15 +94,6 @@ def library() -> ctypes.CDLL:
     return built
 
 
-def _processor() -> bytes:
-    """What -march=native depends on: different machines may share a home folder."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-        return "".join(sorted({x for x in lines if x.startswith(("model name", "flags", "Features"))})).encode()
-    except OSError:
-        return f"{platform.machine()} {platform.processor()} {platform.node()}".encode()
-
-
 def address(tensor: Tensor, dtype: torch.dtype = torch.float32) -> ctypes.c_void_p:
     """Address of a tensor's data, for a function that expects it contiguous and of this type."""
     assert tensor.dtype == dtype and tensor.is_contiguous(), (tensor.dtype, tensor.stride())
@@ -124,7 +122,7 @@ def call_in_parts(name: str, count: int, before: Iterable[Any], after: Iterable[
 
 def even_bounds(count: int, least: int = 256) -> list[int]:
     """Bounds of parts of 0..count, one for each of torch's threads, as far as each gets ``least``."""
-    parts = max(1, min(torch.get_num_threads(), count // least))
+    parts = max(1, min(num_threads(), count // least))
     return [count * i // parts for i in range(parts + 1)]
 
 
@@ -149,7 +147,7 @@ def owned_bounds(positions: Sequence[Int[Tensor, "N B"]], count: int, least: int
 
 def run_in_parts(work: Callable[[int, int], Any], bounds: Sequence[int]) -> list[Any]:
     """Results of work(begin, end) for the parts between bounds, each by a thread. Parts must not write to one place."""
-    (first, *others), threads = pairwise(bounds), torch.get_num_threads()
+    (first, *others), threads = pairwise(bounds), num_threads()
     parts = [_pool(threads - 1).submit(work, *part) for part in others]
     try:
         return [work(*first), *(part.result() for part in parts)]

@@ -65,7 +65,7 @@ class SceneTables(ctypes.Structure):
         ("content_near", ctypes.c_float),
         *addresses("mpis", "frames", "grids", "biases", "cube", "density", "reliability", "touched"),
     ]
-    held: list[Tensor]
+    held: Tables
 
 
 class CpuScene:
@@ -73,8 +73,8 @@ class CpuScene:
 
     def __init__(self, layout: SceneLayout) -> None:
         count, planes = layout.num_heads, [m.planes for m in layout.mpis]
-        self.layout, self.rows = layout, layout.num_rows
-        self.mpis, self.cube = shaped(layout.head_rows(), len(planes), 9), shaped(layout.cube_row(), 12)
+        self.layout = layout
+        self.mpis, self.cube = shaped(layout.head_rows, len(planes), 9), shaped(layout.cube_row, 12)
         self.grids = (Grid * count)(*map(Grid.of, layout.grids, layout.bias_starts()))
         self.biases = shaped(torch.cat(layout.biases).float(), sum(planes))
 
@@ -84,9 +84,8 @@ class CpuScene:
 
     def with_tables(self, tables: Tables) -> SceneTables:
         """Argument of a compiled function; this must outlive it."""
-        density, reliability = (shaped(x, self.rows, 1) for x in (tables.density, tables.reliability))
-        held = [density, reliability, shaped(tables.touched, self.rows, dtype=torch.uint8)]
-        frames, grids = shaped(self.layout.frame_rows(), len(self.mpis), 19), ctypes.addressof(self.grids)
+        held, grids = tables.of_rows(self.layout.num_rows), ctypes.addressof(self.grids)
+        frames = shaped(self.layout.frame_rows, len(self.mpis), 19)
         plan = (*arguments([self.mpis, frames]), grids, *arguments([self.biases, self.cube]))
         scene = SceneTables(len(self.mpis), len(self.grids), self.layout.content_near, *plan, *arguments(held))
         scene.held = held

@@ -1,6 +1,6 @@
-"""Choice of the form of an operation: its reference in plain torch, C++ on a CPU, or Triton kernels on a GPU.
+"""Operations, and the choice of their form: the reference in plain torch, C++ on a CPU, or Triton kernels on a GPU.
 
-``--pipeline.model.ops`` chooses for the whole process. Where a compiled form cannot be had, or does not do on this
+``--pipeline.model.ops`` chooses for the whole process. Where a compiled form is not available, or does not do on this
 device what the reference does (``trial.py``), that operation alone falls back to its reference, and the log says why.
 """
 
@@ -8,45 +8,26 @@ from __future__ import annotations
 
 import functools
 import importlib
+import inspect
 import os
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from typing import Any, Literal
+from typing import Any, Generic, Literal, ParamSpec, TypeVar
 
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from mmpi_ns.ops import build
+from mmpi_ns.ops.shapes import check_shapes
 from mmpi_ns.utils.errors import InputError
 
 Route = Literal["auto", "torch", "native"]
 Form = Literal["reference", "cpu", "gpu"]
 
-TABLE: dict[str, tuple[str, tuple[Form, ...]]] = {
-    # operation: its folder, and which compiled forms there are beside the reference
-    "march": ("march", ("cpu", "gpu")),
-    "order_by_head": ("interpolate", ("cpu",)),
-    "texel_rows": ("interpolate", ("cpu", "gpu")),
-    "weighted_rows": ("interpolate", ("gpu",)),
-    "take_rows": ("interpolate", ("cpu",)),
-    "index_rows": ("interpolate", ("cpu", "gpu")),
-    "raise_peaks": ("interpolate", ("cpu",)),
-    "sum_rows": ("interpolate", ("cpu", "gpu")),
-    "composite_weights": ("composite", ("cpu", "gpu")),
-    "total_variation": ("variation", ("cpu", "gpu")),
-    "adam_rows": ("adam", ("cpu", "gpu")),
-    "gather_taps": ("gather", ("cpu", "gpu")),
-    "show_rays": ("march", ("cpu", "gpu")),
-    "shade": ("shade", ("cpu",)),
-    "show_baked": ("baked", ("cpu",)),
-    "splat_image": ("splat", ("cpu",)),
-    "splat_sums": ("splat", ("cpu",)),
-    "splat_opacities": ("splat", ("cpu",)),
-    "shade_baked": ("baked", ("cpu",)),
-}
-"""Every operation. Its function has the same name and signature in ``reference.py``, ``cpu.py`` and ``gpu.py``."""
+P = ParamSpec("P")
+R = TypeVar("R")
 
 OLDEST_TRITON = (3, 1)
 """The kernels compile with this and newer ones; torch brings it since 2.5."""
@@ -59,23 +40,75 @@ _faults: dict[str, str | None] = {}
 _trying = threading.RLock()
 
 
-def run(name: str, *given: Any) -> Any:
-    """Runs the operation in the form that suits the tensors among its arguments."""
-    form = form_of(name, *_tensors(given))
-    if form != "gpu" or _chosen == "native":
-        return function(name, form)(*given)
-    try:
-        return function(name, "gpu")(*given)
-    except Exception as error:
-        if not _did_not_compile(error):
-            raise
-        # A shape that the trial did not have; nothing has run.
-        _faults[name] = _say(f"{name} does not compile for this GPU ({_words(error)})", f"Plain torch for {name}")
-        return function(name, "reference")(*given)
+class Operation(Generic[P, R]):
+    """A function that is defined in plain torch, with compiled forms of the same name and signature in the modules
+    ``cpu`` (C++) and ``gpu`` (Triton) beside it. A call takes the form that suits the tensors among its arguments.
+
+    Raises:
+        ValueError: by a call: the shape of a tensor is not that of its annotation (``shapes.py``).
+    """
+
+    def __init__(
+        self, reference: Callable[P, R], compiled: tuple[Form, ...], check: Callable[..., None] | None
+    ) -> None:
+        functools.update_wrapper(self, reference)
+        self.reference, self.compiled, self.check = reference, compiled, check
+        self.name, self.signature = reference.__name__, inspect.signature(reference)
+        _OPERATIONS[self.name] = self
+
+    def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
+        names = self.signature.parameters
+        if kwargs or len(args) != len(names):
+            bound = self.signature.bind(*args, **kwargs)
+            bound.apply_defaults()
+            arguments = bound.arguments
+        else:
+            arguments = dict(zip(names, args, strict=True))
+        check_shapes(self.reference, arguments)
+        values = tuple(arguments.values())
+        if self.check is not None:
+            self.check(*values)
+        form = form_of(self.name, *_tensors(values))
+        if form != "gpu" or _chosen == "native":
+            return function(self.name, form)(*values)
+        try:
+            return function(self.name, "gpu")(*values)
+        except Exception as error:  # Triton's, its compiler's or the assembler's complaint about a kernel, or another
+            complaint = isinstance(error, RuntimeError) and ("PassManager" in str(error) or "ptxas" in str(error))
+            if not complaint and not isinstance(error, importlib.import_module("triton.errors").TritonError):
+                raise
+            # A shape that the trial did not have; nothing has run.
+            reason = f"{self.name} does not compile for this GPU ({_words(error)})"
+            _faults[self.name] = _say(reason, f"Plain torch for {self.name}")
+            return function(self.name, "reference")(*values)
 
 
-def _tensors(given: Iterable[Any]) -> Iterator[Tensor]:
-    for x in given:
+_OPERATIONS: dict[str, Operation[..., Any]] = {}
+
+
+def operation(*compiled: Form, check: Callable[..., None] | None = None) -> Callable[[Callable[P, R]], Operation[P, R]]:
+    """Makes an operation of a function.
+
+    Args:
+        compiled: the forms that there are besides plain torch.
+        check: takes the same arguments and raises what their annotations cannot say.
+    """
+    return lambda reference: Operation(reference, compiled, check)
+
+
+def operations() -> dict[str, Operation[..., Any]]:
+    """Every operation by its name."""
+    for path in build.OPS.glob("*/__init__.py"):
+        importlib.import_module(f"mmpi_ns.ops.{path.parent.name}")
+    return _OPERATIONS
+
+
+def _named(name: str) -> Operation[..., Any]:
+    return _OPERATIONS[name] if name in _OPERATIONS else operations()[name]
+
+
+def _tensors(arguments: Iterable[Any]) -> Iterator[Tensor]:
+    for x in arguments:
         if isinstance(x, Tensor):
             yield x
         elif isinstance(x, tuple):
@@ -84,7 +117,7 @@ def _tensors(given: Iterable[Any]) -> Iterator[Tensor]:
 
 def form_of(name: str, *tensors: Tensor) -> Form:
     """The form for these tensors: a compiled one takes float32, integers and Adam's bfloat16 on one device."""
-    compiled = TABLE[name][1]
+    compiled = _named(name).compiled
     devices = {t.device.type for t in tensors}
     if _chosen == "torch" or any(t.is_floating_point() and t.dtype not in _PRECISIONS for t in tensors):
         return "reference"
@@ -103,7 +136,8 @@ def on_device(tensor: Tensor) -> bool:
 @functools.cache
 def function(name: str, form: Form) -> Any:
     """One form of an operation."""
-    return getattr(importlib.import_module(f"mmpi_ns.ops.{TABLE[name][0]}.{form}"), name)
+    of = _named(name)
+    return of.reference if form == "reference" else getattr(importlib.import_module(f"{of.__module__}.{form}"), name)
 
 
 def choose(path: Route) -> None:
@@ -117,9 +151,11 @@ def choose(path: Route) -> None:
     if path != "native":
         return
     on_gpu = torch.cuda.is_available() or _interpreting
-    names = ["Triton", *(n for n in TABLE if "gpu" in TABLE[n][1])] if on_gpu else ["C++"]
+    names = ["Triton", *(n for n, each in operations().items() if "gpu" in each.compiled)] if on_gpu else ["C++"]
     if reason := next((r for n in names if (r := fault(n)) is not None), None):
-        raise InputError(f"The compiled operations cannot be had ({reason}): use --pipeline.model.ops auto or torch.")
+        raise InputError(
+            f"The compiled operations are not available ({reason}): use --pipeline.model.ops auto or torch."
+        )
 
 
 @contextmanager
@@ -144,7 +180,7 @@ def interpret(on: bool) -> None:
     if on and os.environ.get("TRITON_INTERPRET") != "1":
         raise ValueError("Triton's interpreter must be asked for before Python starts: set TRITON_INTERPRET=1.")
     if on and (reason := fault("Triton")) is not None:
-        raise ValueError(f"Triton cannot be had: {reason}.")
+        raise ValueError(f"Triton is not available: {reason}.")
     _interpreting = on
 
 
@@ -181,13 +217,6 @@ def _try(name: str) -> str | None:
     except Exception as error:  # a driver, a compiler or a cache folder may fail in many ways: all mean plain torch
         return _say(f"its Triton kernel fails on this device ({_words(error)})", f"Plain torch for {name}")
     return None
-
-
-def _did_not_compile(error: Exception) -> bool:
-    """Whether this is Triton's, its compiler's or the assembler's complaint about a kernel."""
-    if isinstance(error, importlib.import_module("triton.errors").TritonError):
-        return True
-    return isinstance(error, RuntimeError) and ("PassManager" in str(error) or "ptxas" in str(error))
 
 
 def _words(error: Exception) -> str:

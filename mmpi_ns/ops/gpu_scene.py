@@ -16,7 +16,7 @@ import triton.language as tl
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from mmpi_ns.ops.layout import SceneLayout, Tables, shaped
+from mmpi_ns.ops.layout import SceneLayout, shaped
 
 # Columns of the constants of an MPI (``SceneLayout.head_rows``).
 STEP = tl.constexpr(0)
@@ -49,35 +49,18 @@ class GpuScene:
 
     heads: Float[Tensor, "K 9"]
     grids: Int[Tensor, "N"]
-    """See ``_pack_grids``."""
+    """Where the texels of every head are, for ``row_of`` and ``texel_of``: a row of numbers for each head, then the
+    brick of every tile and the tile of every brick."""
     biases: Float[Tensor, "P"]
     cube: Float[Tensor, "12"]
-    rows: int
-    """Of the pooled tables."""
 
     @staticmethod
     def of(layout: SceneLayout) -> GpuScene:
         return layout.once("gpu", _pack)
 
-    def constants(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        return self.heads, self.grids, self.biases, self.cube
-
-    def checked(self, tables: Tables) -> Tables:
-        """The tables as the kernels read them."""
-        density, reliability = (shaped(x, self.rows, 1) for x in (tables.density, tables.reliability))
-        return Tables(density, reliability, shaped(tables.touched, self.rows, dtype=torch.uint8))
-
 
 def _pack(layout: SceneLayout) -> GpuScene:
     device, planes = layout.frames.origins.device, [m.planes for m in layout.mpis]
-    heads, cube = shaped(layout.head_rows(), len(planes), FLOATS.value), shaped(layout.cube_row(), 12)
-    biases = shaped(torch.cat(layout.biases).to(device, torch.float32), sum(planes))
-    return GpuScene(heads, _pack_grids(layout, device), biases, cube, layout.num_rows)
-
-
-def _pack_grids(layout: SceneLayout, device: torch.device) -> Int[Tensor, "N"]:
-    """Where the texels of every head are, for ``row_of`` and ``texel_of``: a row of numbers for each head, then the
-    brick of every tile and the tile of every brick."""
     grids, start = layout.grids, layout.num_heads * INTS.value
     tiles, places = grids[0].tiles, grids[0].places
     rows = [
@@ -85,20 +68,25 @@ def _pack_grids(layout: SceneLayout, device: torch.device) -> Int[Tensor, "N"]:
         for g, b in zip(grids, layout.bias_starts(), strict=True)
     ]
     head = torch.tensor(rows, dtype=torch.int32, device=device).reshape(-1)
-    return torch.cat([head, tiles.to(device), places.to(device, torch.int32)])
+    return GpuScene(
+        shaped(layout.head_rows, len(planes), FLOATS.value),
+        torch.cat([head, tiles.to(device), places.to(device, torch.int32)]),
+        shaped(torch.cat(layout.biases).to(device, torch.float32), sum(planes)),
+        shaped(layout.cube_row, 12),
+    )
 
 
-def block_size(wanted: int, device: torch.device) -> int:
+def block_size(size: int, device: torch.device) -> int:
     """Rays or rows of a program. The interpreter runs programs one after the other, so it should have few."""
-    return wanted if device.type == "cuda" else 16 * wanted
+    return size if device.type == "cuda" else 16 * size
 
 
-def launch(kernel: Any, size: int, block: int, *given: Any, **constants: Any) -> None:
+def launch(kernel: Any, size: int, block: int, *arguments: Any, **constants: Any) -> None:
     """Runs a kernel for ``size`` items, ``block`` a program, on the device of its tensors; not at all for none."""
     if size:
         # Triton launches on the current device, which is not that of the tensors where a process trains on another GPU.
-        with torch.cuda.device_of(next(x for x in given if isinstance(x, Tensor))):
-            kernel[(triton.cdiv(size, block),)](*given, **constants)
+        with torch.cuda.device_of(next(x for x in arguments if isinstance(x, Tensor))):
+            kernel[(triton.cdiv(size, block),)](*arguments, **constants)
 
 
 # Texels -------------------------------------------------------------------------------------------------------------

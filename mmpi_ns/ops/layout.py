@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import torch
@@ -24,6 +25,11 @@ class Tables(NamedTuple):
     reliability: Float[Tensor, "T 1"]
     touched: UInt8[Tensor, "T"]
     """1 where a training ray read the row."""
+
+    def of_rows(self, count: int) -> Tables:
+        """The tables as compiled code reads them."""
+        density, reliability = (shaped(x, count, 1) for x in (self.density, self.reliability))
+        return Tables(density, reliability, shaped(self.touched, count, dtype=torch.uint8))
 
 
 class Places(NamedTuple):
@@ -64,9 +70,8 @@ class SceneLayout:
 
     def once(self, name: str, make: Callable[[SceneLayout], Any]) -> Any:
         """What ``make`` makes of the layout, made at first use."""
-        found = self.packed.get(name)
         # Where threads make it at once the first one's stays: compiled operations hold addresses in it.
-        return self.packed.setdefault(name, make(self)) if found is None else found
+        return self.packed[name] if name in self.packed else self.packed.setdefault(name, make(self))
 
     @property
     def num_rows(self) -> int:
@@ -74,22 +79,42 @@ class SceneLayout:
         return len(self.grids[0].places) * BRICK
 
     @property
+    def sizes(self) -> dict[str, int]:
+        """What letters in shapes stand for: rows of the tables, heads and MPIs."""
+        return {"T": self.num_rows, "H": self.num_heads, "K": len(self.mpis)}
+
+    @cached_property
     def most_samples(self) -> int:
         """No ray has more: planes of all MPIs, and the cube's diagonal in steps."""
-        return self.once("most samples", _most_samples)
+        cube, planes = self.cube, sum(m.planes for m in self.mpis)
+        if cube is None:
+            return planes
+        return planes + int(2 * math.hypot(*(cube.upper - cube.lower).tolist()) / cube.step) + 2
 
+    @cached_property
     def frame_rows(self) -> Float[Tensor, "K 19"]:
         """``frame_rows`` of the MPIs."""
-        return self.once("frame rows", lambda layout: frame_rows(layout.frames))
+        return frame_rows(self.frames)
 
+    @cached_property
     def head_rows(self) -> Float[Tensor, "K 9"]:
         """Of each MPI: disparity between planes and of the last one, 1 - near / far, scale of the NDC s, lower end and
         scale of u and of v, interval."""
-        return self.once("head rows", _head_rows)
+        rows = []
+        for k, (mpi, step) in enumerate(zip(self.mpis, self.frames.disparity_steps.tolist(), strict=True)):
+            u0, u1, v0, v1 = mpi.extent
+            depth = (step, mpi.last_disparity, mpi.depth_share, 2 * mpi.near / mpi.depth_share)
+            rows.append((*depth, u0, 2 / (u1 - u0), v0, 2 / (v1 - v0), self.interval(k)))
+        return torch.tensor(rows, dtype=torch.float32, device=self.frames.origins.device).reshape(len(rows), 9)
 
+    @cached_property
     def cube_row(self) -> Float[Tensor, "12"]:
         """Lower corner, extent, step between samples, bias, interval, upper corner; zeros without a cube."""
-        return self.once("cube row", _cube_row)
+        cube, numbers = self.cube, [0.0] * 12
+        if cube is not None:
+            corner, extent = cube.lower.tolist(), (cube.upper - cube.lower).tolist()
+            numbers = [*corner, *extent, cube.step, self.cube_bias, self.cube_interval, *cube.upper.tolist()]
+        return torch.tensor(numbers, dtype=torch.float32, device=self.frames.origins.device)
 
     def bias_starts(self) -> list[int]:
         """Where each head's planes begin in the list of all biases."""
@@ -111,28 +136,6 @@ def frame_rows(frames: Frames) -> Float[Tensor, "K 19"]:
     columns = (frames.disparity_steps, frames.last_disparities, frames.num_planes - 1)
     parts = (frames.origins, frames.axes.flatten(1), frames.extents, *(x[:, None] for x in columns))
     return torch.cat([x.float() for x in parts], -1).contiguous()
-
-
-def _head_rows(layout: SceneLayout) -> Tensor:
-    rows = []
-    for k, (mpi, step) in enumerate(zip(layout.mpis, layout.frames.disparity_steps.tolist(), strict=True)):
-        u0, u1, v0, v1 = mpi.extent
-        depth = (step, mpi.last_disparity, mpi.depth_share, 2 * mpi.near / mpi.depth_share)
-        rows.append((*depth, u0, 2 / (u1 - u0), v0, 2 / (v1 - v0), layout.interval(k)))
-    return torch.tensor(rows, dtype=torch.float32, device=layout.frames.origins.device).reshape(len(rows), 9)
-
-
-def _cube_row(layout: SceneLayout) -> Tensor:
-    cube, numbers = layout.cube, [0.0] * 12
-    if cube is not None:
-        corner, extent = cube.lower.tolist(), (cube.upper - cube.lower).tolist()
-        numbers = [*corner, *extent, cube.step, layout.cube_bias, layout.cube_interval, *cube.upper.tolist()]
-    return torch.tensor(numbers, dtype=torch.float32, device=layout.frames.origins.device)
-
-
-def _most_samples(layout: SceneLayout) -> int:
-    cube, planes = layout.cube, sum(m.planes for m in layout.mpis)
-    return planes if cube is None else planes + int(2 * math.hypot(*(cube.upper - cube.lower).tolist()) / cube.step) + 2
 
 
 def shaped(x: Tensor, *shape: int, dtype: torch.dtype = torch.float32) -> Tensor:

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.adam import AdamConstants
-from mmpi_ns.ops.gather.reference import Taps
+from mmpi_ns.ops.gather import Taps
 from mmpi_ns.ops.layout import SceneLayout, Tables
 from mmpi_ns.ops.march import MarchOptions, Rays
 from mmpi_ns.scene.geometry import Cube, Frames
@@ -44,52 +44,42 @@ def run(name: str, device: str) -> None:
         Exception: whatever Triton, its compiler or the driver finds amiss.
         Disagreement: the results differ.
     """
-    for given in CASES[name](device):
-        found = _outcome(name, "gpu", given)
+    for arguments in CASES[name](device):
+        kernel = _outcome(name, "gpu", arguments)
         with dispatch.chosen("torch"):
-            wanted = _outcome(name, "reference", given)
-        for a, b in zip(found, wanted, strict=True):
+            reference = _outcome(name, "reference", arguments)
+        for a, b in zip(kernel, reference, strict=True):
             if a.shape != b.shape:
                 raise Disagreement(f"it makes {list(a.shape)} numbers where plain torch makes {list(b.shape)}")
-            share = _share_off(a.double(), b.double(), max(CLOSE, _rounding(b)))
-            if share > FEW:
+            # Numbers of a type with few digits may be rounded up or down.
+            close = max(CLOSE, torch.finfo(b.dtype).eps if b.is_floating_point() else 0.0)
+            a, b = a.double(), b.double()
+            off = ~((a - b).abs() <= close * b.abs().max().clamp(min=1e-6)) if b.numel() else b
+            if off.numel() and (share := float(off.double().mean())) > FEW:
                 raise Disagreement(f"{share:.2g} of its numbers are not those of plain torch")
 
 
-def _outcome(name: str, form: dispatch.Form, given: tuple) -> list[Tensor]:
+def _outcome(name: str, form: dispatch.Form, arguments: tuple) -> list[Tensor]:
     """All numbers that come of an operation, and its gradients where it has them."""
-    copies = tuple(x.detach().clone() if isinstance(x, Tensor) else x for x in given)
+    copies = tuple(x.detach().clone() if isinstance(x, Tensor) else x for x in arguments)
     leaves = [
-        c.requires_grad_() for c, x in zip(copies, given, strict=True) if isinstance(x, Tensor) and x.requires_grad
+        c.requires_grad_() for c, x in zip(copies, arguments, strict=True) if isinstance(x, Tensor) and x.requires_grad
     ]
     taps = [t for x in copies if isinstance(x, list) for t in x if isinstance(t, Taps)]
     leaves += [t.weights for t in taps if t.weights.requires_grad]
     with torch.set_grad_enabled(bool(leaves)):
-        made = dispatch.function(name, form)(*copies)
-    found = _numbers(copies if made is None else made)
+        results = dispatch.function(name, form)(*copies)
+    numbers = _numbers(copies if results is None else results)
     if leaves:
-        loss = sum((x * torch.linspace(-1, 1, x.numel(), device=x.device).view(x.shape)).sum() for x in found)
-        found += list(torch.autograd.grad(loss, leaves))  # type: ignore[arg-type]
-    return [x.detach() for x in found]
+        loss = sum((x * torch.linspace(-1, 1, x.numel(), device=x.device).view(x.shape)).sum() for x in numbers)
+        numbers += list(torch.autograd.grad(loss, leaves))  # type: ignore[arg-type]
+    return [x.detach() for x in numbers]
 
 
-def _share_off(found: Tensor, wanted: Tensor, close: float) -> float:
-    """Which share of the numbers differs by more than a share of the largest one, or is none."""
-    if not wanted.numel():
-        return 0.0
-    off = ~((found - wanted).abs() <= close * wanted.abs().max().clamp(min=1e-6))
-    return float(off.double().mean())
-
-
-def _rounding(x: Tensor) -> float:
-    """What numbers of this type may differ by, as a share, for being rounded up or down; whole ones not at all."""
-    return torch.finfo(x.dtype).eps if x.is_floating_point() else 0.0
-
-
-def _numbers(made: Any) -> list[Tensor]:
-    if isinstance(made, Tensor):
-        return [made]
-    parts = [getattr(made, f.name) for f in fields(made)] if is_dataclass(made) else made
+def _numbers(results: Any) -> list[Tensor]:
+    if isinstance(results, Tensor):
+        return [results]
+    parts = [getattr(results, f.name) for f in fields(results)] if is_dataclass(results) else results
     return [x for part in parts if isinstance(part, Tensor | tuple) for x in _numbers(part)]
 
 
@@ -146,21 +136,6 @@ def _entries(device: str, *shape: int) -> Tensor:
     return (_random(device, *shape) * (ROWS // 3)).long() * 3
 
 
-def _texels(device: str) -> list[tuple]:
-    heads = (torch.arange(RAYS, device=device) * 2) // RAYS
-    return [(_scene(device, True)[0], heads, heads + 2, 2 * _random(device, RAYS, 3) - 1)]
-
-
-def _sums(device: str) -> list[tuple]:
-    values, weights = _random(device, RAYS, CHANNELS), _random(device, RAYS, 4)
-    return [(_entries(device, RAYS, 4).int(), values, weights, ROWS)]
-
-
-def _composites(device: str) -> list[tuple]:
-    tau, valid = _random(device, RAYS, 20) ** 3, torch.arange(20, device=device) < _entries(device, RAYS, 1)
-    return [(tau.requires_grad_(), valid, 0.01 * _random(device, RAYS, 20), _random(device, RAYS, 1))]
-
-
 def _variations(device: str) -> list[tuple]:
     layout = _scene(device, True)[0]
     table = 3 * _random(device, len(layout.grids[0].places) * BRICK, CHANNELS)
@@ -169,26 +144,26 @@ def _variations(device: str) -> list[tuple]:
 
 
 def _adams(device: str) -> list[tuple]:
-    moments = _random(device, ROWS, 2, CHANNELS)
-    grad = _random(device, ROWS // 3, CHANNELS) - 0.5
-    rows = 3 * torch.arange(ROWS // 3, device=device)
-    given = (rows, grad * (grad.abs() > 0.1), AdamConstants(0.9, 0.99, 0.2, 1e-8, 0.1))
-    tables = [(_random(device, ROWS, CHANNELS), m) for m in (moments, moments.bfloat16())]
-    return [(*each, *given) for each in tables]
+    moments, grad = _random(device, ROWS, 2, CHANNELS), _random(device, ROWS // 3, CHANNELS) - 0.5
+    step = (
+        3 * torch.arange(ROWS // 3, device=device),
+        grad * (grad.abs() > 0.1),
+        AdamConstants(0.9, 0.99, 0.2, 1e-8, 0.1),
+    )
+    return [(_random(device, ROWS, CHANNELS), m, *step) for m in (moments, moments.bfloat16())]
 
 
 def _gathers(device: str) -> list[tuple]:
     """Samples with known texels, of planes and of both planes and the cube, that move and that do not; texels with
     gradients and without."""
-    weights, wanted = 0.1 * _random(device, RAYS, 4), torch.arange(RAYS, device=device) % 5 > 0
-    cases = []
-    both = (4, 8)
+    weights, chosen = 0.1 * _random(device, RAYS, 4), torch.arange(RAYS, device=device) % 5 > 0
+    cases, both = [], (4, 8)
     for sizes, learns, moves in (((4,), True, False), (both, False, False), (both, True, False), (both, True, True)):
         shares = [(_random(device, RAYS, n) / n).requires_grad_(moves) for n in sizes]
         taps = [Taps(_entries(device, RAYS, x.shape[1]).int(), x) for x in shares]
         slots = torch.cat([4 * torch.arange(RAYS, device=device) + i for i in range(len(sizes))])
         values = (2 * _random(device, ROWS, CHANNELS) - 1).requires_grad_(learns)
-        cases.append((values, taps, slots, weights.clone().requires_grad_(), wanted))
+        cases.append((values, taps, slots, weights.clone().requires_grad_(), chosen))
     return cases
 
 
@@ -201,13 +176,29 @@ def _pictures(device: str, many: bool | None = None) -> list[tuple]:
 
 CASES: dict[str, Callable[[str], list[tuple]]] = {
     "march": _marches,
-    "texel_rows": _texels,
+    "texel_rows": lambda device: [
+        (
+            _scene(device, True)[0],
+            heads := (torch.arange(RAYS, device=device) * 2) // RAYS,
+            heads + 2,
+            2 * _random(device, RAYS, 3) - 1,
+        )
+    ],
     "weighted_rows": lambda device: [
         (_random(device, ROWS, CHANNELS), _entries(device, RAYS, taps), _random(device, RAYS, taps)) for taps in (4, 8)
     ],
     "index_rows": lambda device: [(_entries(device, RAYS, 4), ROWS, False)],
-    "sum_rows": _sums,
-    "composite_weights": _composites,
+    "sum_rows": lambda device: [
+        (_entries(device, RAYS, 4).int(), _random(device, RAYS, CHANNELS), _random(device, RAYS, 4), ROWS)
+    ],
+    "composite_weights": lambda device: [
+        (
+            (_random(device, RAYS, 20) ** 3).requires_grad_(),
+            torch.arange(20, device=device) < _entries(device, RAYS, 1),
+            0.01 * _random(device, RAYS, 20),
+            _random(device, RAYS, 1),
+        )
+    ],
     "total_variation": _variations,
     "adam_rows": _adams,
     "gather_taps": _gathers,

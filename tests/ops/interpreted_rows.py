@@ -9,10 +9,7 @@ from gather_batches import batch, in_float32, with_gradients
 from interpreting import by_torch, interpreted, normal  # noqa: F401
 
 from mmpi_ns.ops import composite, gather, interpolate
-from mmpi_ns.ops.composite import reference as plain_composite
 from mmpi_ns.ops.interpolate import Table
-from mmpi_ns.ops.interpolate import reference as plain_interpolate
-from mmpi_ns.ops.variation import reference as plain_variation
 from mmpi_ns.ops.variation import total_variation
 from mmpi_ns.training.touched_adam import TouchedAdam
 
@@ -26,7 +23,7 @@ def test_interpolation_and_its_gradient_are_those_of_float64(channels, taps):
     table, exact = Table(normal(50, channels)), normal(50, channels).double().requires_grad_()
     upstream = normal(300, channels, seed=2)
     read = interpolate.interpolate(table, rows, weights)
-    wanted = plain_interpolate.interpolate(exact, rows, weights.double())
+    wanted = interpolate.interpolate_densely(exact, rows, weights.double())
     assert (read.double() - wanted).abs().max() < 2e-6
     (read * upstream).sum().backward()
     (wanted * upstream.double()).sum().backward()
@@ -41,7 +38,7 @@ def test_gathered_rows_are_read_like_the_table_and_have_one_gradient_each():
     values = interpolate.read_rows(table, index.unique)
     read = interpolate.weigh_rows(values, index.positions, weights)
     part = interpolate.weigh_rows(values, index.positions[some], weights[some])
-    wanted = plain_interpolate.interpolate(plain, rows, weights)
+    wanted = interpolate.interpolate_densely(plain, rows, weights)
     assert torch.allclose(read, wanted, atol=1e-6) and torch.allclose(part, wanted[some], atol=1e-6)
     ((read**2).sum() + 2 * part.sum()).backward()
     ((wanted**2).sum() + 2 * wanted[some].sum()).backward()
@@ -112,7 +109,7 @@ def test_variation_equals_the_reference_with_its_gradient(channels):
     texels = torch.cat([g.rows[g.rows >= 64] for g in grids] + [torch.arange(5)])  # and some of the empty brick
     rows = texels[torch.randperm(len(texels), generator=torch.Generator().manual_seed(1))[:-9]]
     scales, found = [(0.5 + k, 2.0, 1.0) for k in range(len(grids))], []
-    for function, dtype in ((total_variation, torch.float32), (plain_variation.total_variation, torch.float64)):
+    for function, dtype in ((total_variation, torch.float32), (total_variation.reference, torch.float64)):
         values = table[rows].to(dtype).requires_grad_()
         value = function(values, table.to(dtype), rows, layout, scales)
         (3 * value).backward()
@@ -150,13 +147,13 @@ def test_gathered_sums_and_their_gradients_are_those_of_float64(channels, in_cub
     given, upstream = batch(channels, rays=40, in_cube=in_cube), [normal(40, n) for n in (channels, 1, 3, 3)]
     if trains:
         found = with_gradients(gather.gather_taps, in_float32(given), upstream, moved)
-        wanted = with_gradients(gather.reference.gather_taps, given, upstream, moved)
+        wanted = with_gradients(gather.gather_taps.reference, given, upstream, moved)
     else:
         values, groups, slots, weights, wanted_rays = in_float32(given)
         sums = gather.gather_taps(values, groups, slots, weights.requires_grad_(), wanted_rays)
         (sums.gathered * upstream[0]).sum().backward()
         found = [weights.grad.double()]
-        wanted = with_gradients(gather.reference.gather_taps, given, [upstream[0], *(0 * u for u in upstream[1:])])[-1:]
+        wanted = with_gradients(gather.gather_taps.reference, given, [upstream[0], *(0 * u for u in upstream[1:])])[-1:]
     for a, b in zip(found, wanted, strict=True):
         assert b.abs().max() > 0.05 and (a - b).abs().max() < 3e-6 * (1 + b.abs().max())
 
@@ -192,7 +189,7 @@ def test_compositing_and_its_gradient_are_those_of_float64(slots):
         return [x.double() for x in (*parts, leaf.grad)]
 
     fast = work(composite.composite_weights, torch.float32)
-    exact = work(plain_composite.composite_weights, torch.float64)
+    exact = work(composite.composite_weights.reference, torch.float64)
     for a, b in zip(fast, exact, strict=True):
         assert ((a - b).abs() <= 3e-6 * (1 + b.abs().amax(1, keepdim=True))).all()
     assert (fast[0][~valid] == 0).all() and (fast[3][~valid] == 0).all()

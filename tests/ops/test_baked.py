@@ -1,4 +1,4 @@
-"""Marching through baked bricks: the compiled form and the torch reference against the NumPy reader, on hard rays."""
+"""Marching through baked bricks: the compiled form, and ours in NumPy, against the reader of files, on hard rays."""
 
 from __future__ import annotations
 
@@ -9,20 +9,19 @@ import pytest
 import torch
 from random_bricks import random_window, rays_into, scene_of
 
-from mmpi_ns.export import reader
 from mmpi_ns.export.files import write_baked
 from mmpi_ns.ops import dispatch
-from mmpi_ns.ops.baked import cpu, reference
+from mmpi_ns.ops.baked import reader
 from mmpi_ns.ops.march import Rays
 from mmpi_ns.scene.baked import SIDE, Shader, brick_numbers, columns_from, columns_of
 
-FORMS = {"reference": reference, "cpu": cpu}
+FORMS = ("reference", "cpu")
 
 
-def marched(form, window, rays, **given):
+def marched(form, window, rays, peaks=None):
     if form == "cpu" and dispatch.form_of("show_baked", torch.zeros(1)) != "cpu":
         pytest.skip("no C++ compiler")
-    return FORMS[form].show_baked(window.mpis, Rays(*rays), window.threshold, **given)
+    return dispatch.function("show_baked", form)(window.mpis, Rays(*rays), window.threshold, peaks)
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -38,8 +37,7 @@ def test_agrees_with_the_reader(form, settings, tmp_path):
     write_baked(scene_of(window), tmp_path)
     raw = reader.read(tmp_path)["windows"][0]
     assert len(raw["network_array"]) == sum(o * (i + 1) for o, i in raw["shader"]["layers"])
-    lines = zip(rays[0].double().numpy(), rays[1].double().numpy(), strict=True)
-    expected = np.array([reader.render_ray(raw, o, d) for o, d in lines])
+    expected = reader.render(raw, rays[0].double().numpy(), rays[1].double().numpy())
     found = marched(form, window, rays)
     shown = shaded(form, window, found, rays[1]).numpy()
     # A ray that meets the border between stored and empty tiles to the last bit may read either.
@@ -52,7 +50,7 @@ def test_agrees_with_the_reader(form, settings, tmp_path):
 
 
 def shaded(form, window, found, directions):
-    rgb = FORMS[form].shade_baked(window.shader, found.gathered, found.mass, directions)
+    rgb = dispatch.function("shade_baked", form)(window.shader, found.gathered, found.mass, directions)
     rgb = torch.where(found.mass > 0, rgb, 0.0)
     return (rgb * found.accumulation + 0.5 * found.transmittance).clamp(0, 1)
 
@@ -71,8 +69,8 @@ def test_shading_agrees_with_the_reference(octaves, sizes):
     sums = mass * (torch.rand(101, 5, generator=g) * torch.tensor([1, 1, 1, 2, 2]) - torch.tensor([0, 0, 0, 1, 1]))
     mass[3], sums[3], sums[4, :3], sums[5, :3] = 0, 0, 0, mass[5]
     directions = torch.nn.functional.normalize(torch.randn(101, 3, generator=g), dim=-1)
-    found = cpu.shade_baked(shader, sums, mass, directions)
-    expected = reference.shade_baked(shader, sums.double(), mass.double(), directions.double())
+    found = dispatch.function("shade_baked", "cpu")(shader, sums, mass, directions)
+    expected = dispatch.function("shade_baked", "reference")(shader, sums.double(), mass.double(), directions.double())
     # White to the last bit is not white, and odds may change by e^8.
     torch.testing.assert_close(found.double(), expected, atol=1e-3, rtol=0)
 

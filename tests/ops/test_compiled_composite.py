@@ -9,7 +9,7 @@ import torch
 from compiled import both, compiled  # noqa: F401
 
 from mmpi_ns.ops import composite
-from mmpi_ns.ops.composite import Composite, reference
+from mmpi_ns.ops.composite import Composite, composite_weights
 
 
 def batch(rays=60, slots=37):
@@ -38,7 +38,7 @@ def weights_and_gradient(function, given, dtype):
 def test_weights_and_their_gradient_equal_float64(slots):
     given = batch(slots=slots)
     found = weights_and_gradient(composite.composite_weights, given, torch.float32)
-    wanted = weights_and_gradient(reference.composite_weights, given, torch.float64)
+    wanted = weights_and_gradient(composite_weights.reference, given, torch.float64)
     for a, b in zip(found, wanted, strict=True):
         assert ((a.double() - b).abs() <= 3e-6 * (1 + b.abs().amax(-1, keepdim=True))).all()
     assert (found[0][~given[1]] == 0).all() and (found[3][~given[1]] == 0).all()
@@ -68,7 +68,7 @@ def test_colours_of_rays_and_their_gradients_equal_float64():
     colors, upstream = torch.rand(60, 37, 3, generator=g), torch.randn(60, 3, generator=g)
     found = []
     for dtype in (torch.float32, torch.float64):
-        made = reference.composite_weights(*(x.to(dtype) if x.is_floating_point() else x for x in given))
+        made = composite_weights.reference(*(x.to(dtype) if x.is_floating_point() else x for x in given))
         weights, own = made.weights.requires_grad_(), colors.detach().to(dtype).requires_grad_()
         rgb = composite.render_colors(Composite(weights, made.accumulation, made.transmittance), own)
         (rgb * upstream).sum().backward()

@@ -13,14 +13,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mmpi_ns.ops.blending import blend_shares, blended_optical_depth
-from mmpi_ns.ops.composite.reference import composite_weights, exclusive_cumsum, median_inverse_distance, render_colors
+from mmpi_ns.ops.composite import composite_weights, exclusive_cumsum, median_inverse_distance, render_colors
 
 F64 = torch.float64
 
 
 def composite_all(tau, valid=None):
     valid = torch.ones_like(tau, dtype=torch.bool) if valid is None else valid
-    return composite_weights(tau, valid, torch.zeros_like(tau), torch.zeros_like(tau[:, :1]))
+    return composite_weights.reference(tau, valid, torch.zeros_like(tau), torch.zeros_like(tau[:, :1]))
 
 
 def test_exclusive_cumsum_sums_what_came_before():
@@ -96,7 +96,7 @@ def test_dropped_samples_keep_their_transmittance():
     kept = rng.random(40) < 0.5
     whole = oracle.composite(tau)
     before = np.array([tau[:i][~kept[:i]].sum() for i in np.flatnonzero(kept)])
-    composite = composite_weights(
+    composite = composite_weights.reference(
         tensor(tau[kept])[None],
         torch.ones(1, int(kept.sum()), dtype=torch.bool),
         tensor(before)[None],
@@ -110,7 +110,7 @@ def test_dropped_samples_keep_their_transmittance():
 def test_dropped_mass_takes_the_mean_colour_of_what_was_kept():
     tau = tensor([[0.2, 0.4]])
     valid = torch.ones(1, 2, dtype=torch.bool)
-    composite = composite_weights(tau, valid, torch.zeros_like(tau), tensor([[0.5]]))
+    composite = composite_weights.reference(tau, valid, torch.zeros_like(tau), tensor([[0.5]]))
     colors = tensor([[[1.0, 0.0, 0.2], [0.0, 1.0, 0.2]]])
     w = oracle.composite([0.2, 0.4]).weights
     expected = (1 - math.exp(-1.1)) * np.array([w[0], w[1], 0.2 * w.sum()]) / w.sum()
@@ -208,10 +208,10 @@ def test_compositing_has_the_gradient_of_finite_differences():
     valid = torch.tensor(rng.random((3, 6)) < 0.8)
 
     def composite(t):
-        c = composite_weights(t, valid, skipped, skipped[:, -1:] + 0.1)
+        c = composite_weights.reference(t, valid, skipped, skipped[:, -1:] + 0.1)
         return c.weights, c.accumulation, c.transmittance
 
     assert torch.autograd.gradcheck(composite, (tau,))
     colors = tensor(rng.random((3, 6, 3))).requires_grad_()
-    fixed = composite_weights(tau.detach(), valid, skipped, skipped[:, -1:] + 0.1)
+    fixed = composite_weights.reference(tau.detach(), valid, skipped, skipped[:, -1:] + 0.1)
     assert torch.autograd.gradcheck(lambda c: render_colors(fixed, c), (colors,))

@@ -11,7 +11,7 @@ from gather_batches import batch, in_float32, parts_of, with_gradients
 from random_fields import bundle, random_field, random_rays
 
 from mmpi_ns.field.samples import metadata_of, places_of
-from mmpi_ns.ops.gather import Taps, cpu, gather_places, gather_taps, reference
+from mmpi_ns.ops.gather import Taps, cpu, gather_places, gather_taps
 from mmpi_ns.rendering.sampler import MMPISampler
 
 CHANNELS = (3, 8, 9, 16, 20)
@@ -35,7 +35,7 @@ def sums_by_hand(values, samples, slots, weights, wanted):
     return out
 
 
-@pytest.mark.parametrize("function", [gather_taps, reference.gather_taps])
+@pytest.mark.parametrize("function", [gather_taps, gather_taps.reference])
 @pytest.mark.parametrize("channels", CHANNELS)
 @pytest.mark.parametrize("in_cube", [False, True])
 def test_sums_are_those_of_loops(function, channels, in_cube):
@@ -62,7 +62,7 @@ def test_gradients_are_those_of_float64(channels, seed, moved):
     upstream = [torch.randn(7, n, generator=g, dtype=torch.float64) for n in (channels, 1, 3, 3)]
     fast, exact = (
         with_gradients(f, x, upstream, moved)
-        for f, x in ((gather_taps, in_float32(given)), (reference.gather_taps, given))
+        for f, x in ((gather_taps, in_float32(given)), (gather_taps.reference, given))
     )
     assert len(fast) == (8 if moved else 6)
     for a, b in zip(fast, exact, strict=True):
@@ -74,10 +74,10 @@ def test_reference_gradients_are_finite_differences():
 
     def sums(values, weights, *shares):
         taps = [Taps(g.positions, s) for g, s in zip(groups, shares or [g.weights for g in groups], strict=True)]
-        return reference.gather_taps(values, taps, slots, weights, wanted).gathered
+        return gather_taps.reference(values, taps, slots, weights, wanted).gathered
 
     def moments(values):
-        found = reference.gather_taps(values, groups, slots, weights, wanted)
+        found = gather_taps.reference(values, groups, slots, weights, wanted)
         return found.first, found.second
 
     shares = [g.weights.clone().requires_grad_() for g in groups]
@@ -85,7 +85,7 @@ def test_reference_gradients_are_finite_differences():
     assert torch.autograd.gradcheck(moments, (values,))
 
 
-@pytest.mark.parametrize("form", [gather_taps, reference.gather_taps])
+@pytest.mark.parametrize("form", [gather_taps, gather_taps.reference])
 def test_moments_hold_the_weights_fixed(form):
     values, groups, slots, weights, wanted = in_float32(batch(9))
     weights.requires_grad_()
@@ -96,7 +96,7 @@ def test_moments_hold_the_weights_fixed(form):
 
 def test_values_that_do_not_train_get_no_gradient_and_weights_do():
     values, groups, slots, weights, wanted = in_float32(batch(9))
-    exact = with_gradients(reference.gather_taps, batch(9), [torch.ones(7, n) for n in (9, 1, 3, 3)])[-1]
+    exact = with_gradients(gather_taps.reference, batch(9), [torch.ones(7, n) for n in (9, 1, 3, 3)])[-1]
     gather_taps(values, groups, slots, weights.requires_grad_(), wanted).gathered.sum().backward()
     assert values.grad is None and (weights.grad - exact).abs().max() < 1e-5
 
@@ -128,7 +128,7 @@ def test_at_places_sums_are_those_at_their_taps(with_cube):
     places = places_of(samples)
     table, everything = field.features.data, torch.ones(60, dtype=torch.bool)
     taps = [Taps(lookup.rows[t.positions], t.weights.double()) for t in lookup.taps]
-    exact = reference.gather_taps(table.double(), taps, lookup.index, weights.double(), everything)
+    exact = gather_taps.reference(table.double(), taps, lookup.index, weights.double(), everything)
     found = gather_places(field.layout, table, places, weights)
     for a, b in zip(parts_of(found), parts_of(exact), strict=True):
         assert b.abs().max() > 1 and (a - b).abs().max() < 2e-5
@@ -138,14 +138,14 @@ def test_at_places_sums_are_those_at_their_taps(with_cube):
 # Hard inputs ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("form", [gather_taps, reference.gather_taps])
+@pytest.mark.parametrize("form", [gather_taps, gather_taps.reference])
 def test_no_samples_gather_nothing(form):
     weights = torch.zeros(3, 2, requires_grad=True)
     sums = form(torch.zeros(0, 9), [], torch.zeros(0, dtype=torch.int64), weights, torch.ones(3, dtype=torch.bool))
     assert all(s.shape[0] == 3 and not s.any() for s in parts_of(sums))
 
 
-@pytest.mark.parametrize("form", [gather_taps, reference.gather_taps])
+@pytest.mark.parametrize("form", [gather_taps, gather_taps.reference])
 def test_saturated_texels_are_colours_and_features_of_0_and_1_with_finite_gradients(form):
     values = torch.tensor([[200.0, -200.0, 30.0, 200.0, -200.0]], requires_grad=True)
     taps = [Taps(torch.zeros(1, 4, dtype=torch.int64), torch.full((1, 4), 0.25))]

@@ -13,6 +13,7 @@ from triton_processes import HERE, needs_triton, python
 from waits import TRAININGS, counted_on_a_gpu, waits_of_phases
 
 from mmpi_ns.ops import dispatch
+from mmpi_ns.ops.interpolate import weighted_rows
 
 
 @needs_triton
@@ -120,7 +121,7 @@ def test_without_triton_plain_torch_runs_and_the_log_says_so(monkeypatch, no_tri
     with pytest.raises(ValueError, match="TRITON_INTERPRET=1"):
         dispatch.interpret(True)
     monkeypatch.setenv("TRITON_INTERPRET", "1")
-    with pytest.raises(ValueError, match="Triton cannot be had"):
+    with pytest.raises(ValueError, match="Triton is not available"):
         dispatch.interpret(True)
     assert not dispatch._interpreting
     said = " ".join(capsys.readouterr().out.split())
@@ -151,10 +152,10 @@ def test_a_kernel_that_does_not_compile_for_a_shape_leaves_its_operation_to_plai
     monkeypatch.setattr(dispatch, "form_of", lambda name, *tensors: "reference" if dispatch._faults[name] else "gpu")
     monkeypatch.setattr(dispatch, "function", lambda name, form: fails if form == "gpu" else right(name, form))
     for _ in range(2):
-        found = dispatch.run("weighted_rows", table, torch.tensor([[2, 0]]), torch.tensor([[1.0, 0.5]]))
+        found = weighted_rows(table, torch.tensor([[2, 0]]), torch.tensor([[1.0, 0.5]]))
         assert found.tolist() == [[4.0, 5.5]]
     assert " ".join(capsys.readouterr().out.split()).count("Plain torch for weighted_rows") == 1
 
 
 def test_on_a_cpu_nothing_takes_the_gpus_kernels():
-    assert all(dispatch.form_of(name, torch.zeros(1)) != "gpu" for name in dispatch.TABLE)
+    assert all(dispatch.form_of(name, torch.zeros(1)) != "gpu" for name in dispatch.operations())

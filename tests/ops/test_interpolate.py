@@ -13,10 +13,10 @@ from mmpi_ns.ops.interpolate import (
     cpu,
     index_rows,
     interpolate,
+    interpolate_densely,
     order_by_head,
     raise_peaks,
     read_rows,
-    reference,
     sum_rows,
     texel_rows,
     weigh_rows,
@@ -38,7 +38,7 @@ def lookup(samples=50, corners=4, rows=30, channels=5, dtype=F64, seed=0):
 def test_interpolation_by_hand():
     table = torch.tensor([[1.0, 10.0], [2.0, 20.0], [4.0, 40.0]])
     rows, weights = torch.tensor([[0, 2], [1, 1]]), torch.tensor([[0.25, 0.75], [0.5, 0.5]])
-    for function in (reference.interpolate, interpolate):
+    for function in (interpolate_densely, interpolate):
         assert function(table, rows, weights).tolist() == [[3.25, 32.5], [2.0, 20.0]]
 
 
@@ -48,7 +48,7 @@ def test_interpolation_by_hand():
 def test_fast_path_equals_the_reference_with_its_gradient(channels, corners, dtype, error):
     values, rows, weights = lookup(channels=channels, corners=corners, dtype=dtype)
     table, plain = Table(values.clone()), values.clone().requires_grad_()
-    out, exact = interpolate(table, rows, weights), reference.interpolate(plain, rows, weights)
+    out, exact = interpolate(table, rows, weights), interpolate_densely(plain, rows, weights)
     assert out.shape == (50, channels) and torch.allclose(out, exact, atol=error, rtol=error)
     upstream = torch.randn(50, channels, generator=torch.Generator().manual_seed(1), dtype=F64).to(dtype)
     out.backward(upstream)
@@ -66,7 +66,7 @@ def test_gradients_of_rows_and_weights_are_finite_differences():
 def test_two_lookups_in_one_table_add_their_gradients():
     values, rows, weights = lookup()
     table, plain = Table(values.clone()), values.clone().requires_grad_()
-    for t, function in ((table, interpolate), (plain, reference.interpolate)):
+    for t, function in ((table, interpolate), (plain, interpolate_densely)):
         (function(t, rows[:9], weights[:9]).sum() + 2 * (function(t, rows[5:20], weights[5:20]) ** 2).sum()).backward()
     assert torch.equal(table.grad_rows, rows[:20].unique()) and torch.allclose(table.dense_grad(), plain.grad)
 
@@ -186,7 +186,7 @@ def test_gathered_rows_are_read_like_the_table_and_have_one_gradient_each(channe
     values = read_rows(table, index.unique)
     read = weigh_rows(values, index.positions, weights)
     part = weigh_rows(values, index.positions[some], weights[some])
-    wanted = reference.interpolate(plain, rows, weights)
+    wanted = interpolate_densely(plain, rows, weights)
     assert torch.allclose(read, wanted, atol=1e-6) and torch.allclose(part, wanted[some], atol=1e-6)
     ((read * upstream).sum() + 2 * part.sum()).backward()
     ((wanted * upstream).sum() + 2 * wanted[some].sum()).backward()

@@ -15,14 +15,13 @@ from shows import as_float64_says, compare, nothing_is_shown_of_nothing, shown
 
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.ops import dispatch
-from mmpi_ns.ops.march import reference
 from mmpi_ns.scene.plan import ScenePlan
 
 
 @pytest.fixture(autouse=True)
 def side_by_side(monkeypatch):
     assert dispatch.form_of("show_rays", torch.zeros(1)) == "cpu"
-    monkeypatch.setattr(reference, "OPAQUE_DEPTH", math.inf)  # the reference stops blending at 1e-4 of the light
+    monkeypatch.setattr("mmpi_ns.ops.march.OPAQUE_DEPTH", math.inf)  # the reference stops blending at 1e-4 of the light
 
 
 @pytest.mark.parametrize("blends", [True, False])

@@ -11,7 +11,7 @@ from compiled import compiled, normal  # noqa: F401
 from hand_made import make_mpi
 
 from mmpi_ns.field.mmpi_field import MMPIField
-from mmpi_ns.ops.variation import reference, total_variation
+from mmpi_ns.ops.variation import total_variation
 from mmpi_ns.ops.variation.cpu import PART
 from mmpi_ns.scene.plan import CubePlan, ScenePlan
 from mmpi_ns.scene.texels import BRICK
@@ -27,7 +27,7 @@ def test_variation_equals_the_reference_with_its_gradient(channels):
     table = normal(len(grids[0].places) * 64, channels) * 2
     rows = texels[torch.randperm(plan.texels, generator=torch.Generator().manual_seed(1))[: plan.texels - 9]]
     found = []
-    for function in (total_variation, reference.total_variation):
+    for function in (total_variation, total_variation.reference):
         values = table[rows].requires_grad_()
         value = function(values, table, rows, layout, [(0.5, 2.0, 1.0), (1.0, 3.0, 0.3), (0.7, 1.0, 2.0)])
         (3 * value).backward()
@@ -55,7 +55,7 @@ def test_variation_of_many_texels_does_not_depend_on_the_number_of_threads(chann
         found.append((value, values.grad))
     assert torch.equal(found[0][0], found[1][0]) and torch.equal(found[0][1], found[1][1])
     values = table[rows].double().requires_grad_()
-    wanted = reference.total_variation(values, table.double(), rows, layout, [(0.5, 2.0, 1.0), (1.0, 3.0, 0.3)])
+    wanted = total_variation.reference(values, table.double(), rows, layout, [(0.5, 2.0, 1.0), (1.0, 3.0, 0.3)])
     wanted.backward()
     assert found[0][0].item() == pytest.approx(wanted.item(), rel=1e-6)
     assert torch.allclose(found[0][1].double(), values.grad, atol=2e-6)

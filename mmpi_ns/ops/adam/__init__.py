@@ -1,14 +1,15 @@
-"""Adam on the rows of a table that a batch touched, in place."""
+"""Adam on the rows of a table that a batch touched: DVGO's masked Adam, in place."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
+import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from mmpi_ns.ops import dispatch
-from mmpi_ns.ops.shapes import check_shapes
+from mmpi_ns.ops.dispatch import operation
+from mmpi_ns.scene.texels import BRICK
 
 
 class AdamConstants(NamedTuple):
@@ -23,6 +24,7 @@ class AdamConstants(NamedTuple):
     """With the first moment's correction: lr / (1 - beta1^step)."""
 
 
+@operation("cpu", "gpu")
 def adam_rows(
     param: Float[Tensor, "T C"],
     moments: Float[Tensor, "T 2 C"],
@@ -39,5 +41,23 @@ def adam_rows(
         grad: of those rows.
         constants: of the step.
     """
-    check_shapes("param T C, moments T 2 C, rows U, grad U C", param, moments, rows, grad)
-    dispatch.run("adam_rows", param, moments, rows, grad, constants)
+    grad = grad.masked_fill((rows < BRICK)[:, None], 0)
+    new_param, new_moments = adam(param.index_select(0, rows), moments.index_select(0, rows), grad, constants)
+    param.index_copy_(0, rows, new_param)
+    moments.index_copy_(0, rows, new_moments)
+
+
+def adam(
+    param: Float[Tensor, "N *C"],
+    moments: Float[Tensor, "N 2 *C"],
+    grad: Float[Tensor, "N *C"],
+    constants: AdamConstants,
+) -> tuple[Tensor, Tensor]:
+    """New values and moments."""
+    beta1, beta2, correction, eps, rate = constants
+    touched, (mean, square) = grad != 0, moments.to(param.dtype).unbind(1)
+    mean = torch.where(touched, mean.lerp(grad, 1 - beta1), mean)
+    square = torch.where(touched, (square * beta2).addcmul_(grad, grad, value=1 - beta2), square)
+    delta = mean / square.sqrt().div_(correction).add_(eps)
+    delta = torch.where(touched, delta, torch.zeros_like(delta))
+    return param - delta.mul_(rate), torch.stack([mean, square], 1).to(moments.dtype)

@@ -1,4 +1,4 @@
-// Adam on the rows of a table that a batch touched. The reference is reference.py.
+// Adam on the rows of a table that a batch touched.
 #include "scene.h"
 #include "table.h"
 

@@ -9,7 +9,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from mmpi_ns.ops.adam import reference
+from mmpi_ns.ops import adam
 from mmpi_ns.ops.gpu_scene import launch
 from mmpi_ns.scene.texels import BRICK
 
@@ -51,9 +51,8 @@ def adam_kernel(
     tl.store(params + at, tl.load(params + at, touched, 0.0) - step, touched)
 
 
-def adam_rows(param: Tensor, moments: Tensor, rows: Tensor, grad: Tensor, constants: tuple) -> None:
-    """See ``ops.adam``."""
+def adam_rows(param: Tensor, moments: Tensor, rows: Tensor, grad: Tensor, constants: adam.AdamConstants) -> None:
     if moments.dtype != torch.bfloat16:
-        return reference.adam_rows(param, moments, rows, grad, constants)
+        return adam.adam_rows.reference(param, moments, rows, grad, constants)
     tensors, size = (rows.contiguous(), grad.contiguous(), param, moments.view(torch.int16)), grad.numel()
     launch(adam_kernel, size, BLOCK, *tensors, size, param.shape[1], *constants, EMPTY=BRICK, BLOCK=BLOCK)

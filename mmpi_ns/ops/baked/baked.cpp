@@ -1,5 +1,5 @@
-// What rays show of baked bricks (scene/baked.py): bytes, of which a sample reads one brick alone. The reference is
-// reference.py.
+// What rays show of baked bricks (scene/baked.py): bytes, of which a sample reads one brick alone. The example in
+// NumPy is reader.py.
 #include "walk.h"
 
 namespace {

@@ -41,7 +41,12 @@ class _Packed:
         assert channels <= MOST_CHANNELS
         self.through = [shaped(baked.steps_of_depth(k), 255 * FINENESS + 1) for k in range(count)]
         self.addresses = (ctypes.c_void_p * count)(*(x.data_ptr() for x in self.through))
-        self.stacks = (_Stack * count)(*(_stack(baked, k) for k in range(count)))
+        self.stacks = (_Stack * count)()
+        for k, mpi in enumerate(baked.mpis):
+            u0, u1, v0, v1 = mpi.extent
+            scales = ((mpi.width - 1) / (u1 - u0), (mpi.height - 1) / (v1 - v0))
+            sizes = (mpi.planes, mpi.height, mpi.width, *tiles_of(mpi)[1:], baked.first_column(k))
+            self.stacks[k] = _Stack(mpi.disparity_step, mpi.last_disparity, u0, v0, *scales, *sizes)
         density = shaped(baked.density, bricks, SIDE, SIDE, dtype=torch.uint8)
         texels = shaped(baked.texels, bricks, SIDE, SIDE, channels, dtype=torch.uint8)
         low, step = (torch.tensor([getattr(c, name) for c in baked.channel_codes]) for name in ("low", "step"))
@@ -57,34 +62,24 @@ class _Packed:
         self.scene = _Scene(count, channels, *plan, *arguments(self.tables))
 
 
-def _stack(baked: BakedMpis, k: int) -> _Stack:
-    mpi = baked.mpis[k]
-    u0, u1, v0, v1 = mpi.extent
-    scales = ((mpi.width - 1) / (u1 - u0), (mpi.height - 1) / (v1 - v0))
-    sizes = (mpi.planes, mpi.height, mpi.width, *tiles_of(mpi)[1:], baked.first_column(k))
-    return _Stack(mpi.disparity_step, mpi.last_disparity, u0, v0, *scales, *sizes)
-
-
 def show_baked(scene: BakedMpis, rays: Rays, threshold: float, peaks: Tensor | None = None) -> Shown:
-    """See ``ops.baked``."""
     if "cpu" not in scene.packed:
         scene.packed["cpu"] = _Packed(scene)
     packed, count = scene.packed["cpu"].scene, len(scene.mpis)
     if peaks is not None:
         assert shaped(peaks, scene.num_bricks, SIDE, SIDE) is peaks, "peaks are written in place"
-    given = (ctypes.byref(packed), ctypes.byref(pointers_to(rays, count, count)), float(threshold), peaks)
-    return shown("mmpi_show_baked", len(rays.origins), len(scene.channel_codes), given)
+    before = (ctypes.byref(packed), ctypes.byref(pointers_to(rays, count, count)), float(threshold), peaks)
+    return shown("mmpi_show_baked", len(rays.origins), len(scene.channel_codes), before)
 
 
 def shade_baked(shader: Shader, gathered: Tensor, mass: Tensor, directions: Tensor) -> Tensor:
-    """See ``ops.baked``."""
     num_rays, channels = gathered.shape
     numbers, inputs = [], channels + 3 * (1 + 2 * shader.direction_octaves)
     for weights, biases in shader.layers:  # alive until the kernel has run
         numbers.append((shaped(weights, len(biases), inputs), shaped(biases, len(biases))))
         inputs = len(biases)
     assert inputs == COLORS, f"a network of {inputs} outputs where a colour is read"
-    given = [shaped(x, num_rays, n) for x, n in ((gathered, channels), (mass, 1), (directions, 3))]
+    sums = [shaped(x, num_rays, n) for x, n in ((gathered, channels), (mass, 1), (directions, 3))]
     rgb, sizes = torch.empty(num_rays, 3), (len(numbers), channels, shader.direction_octaves, float(shader.bound))
-    call_in_parts("mmpi_shade_baked", num_rays, (Layer.array(numbers), *sizes, *given), (rgb,))
+    call_in_parts("mmpi_shade_baked", num_rays, (Layer.array(numbers), *sizes, *sums), (rgb,))
     return rgb

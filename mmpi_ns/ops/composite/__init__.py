@@ -1,16 +1,48 @@
-"""Volume rendering of merged samples (paper sec. III-B): weights, colour, depth, and who won."""
+"""Volume rendering of merged samples in log space (paper sec. III-B): weights, colour, depth, and the winning head.
+
+A sample is carried by its optical depth tau = -log(1 - alpha), never by alpha: alpha = 1 is an infinite slope of
+log(1 - alpha), while tau is an ordinary number. All arithmetic is float32 or wider, also under autocast.
+"""
 
 from __future__ import annotations
 
-from jaxtyping import Bool, Float
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from mmpi_ns.ops import dispatch
-from mmpi_ns.ops.composite.reference import Composite, median_inverse_distance, render_colors, winning_heads
+from mmpi_ns.ops.dispatch import operation
+from mmpi_ns.ops.ends import HALF
+from mmpi_ns.ops.layout import shaped
 
-__all__ = ["Composite", "composite_weights", "median_inverse_distance", "render_colors", "winning_heads"]
+
+def exclusive_cumsum(values: Float[Tensor, "R S"]) -> Float[Tensor, "R S"]:
+    """Sum of all earlier samples on the ray. Shifted, not subtracted: x - x loses what came before a large x."""
+    shifted = torch.nn.functional.pad(values[:, :-1], (1, 0))
+    return shifted.cumsum(-1)
 
 
+@dataclass(frozen=True)
+class Composite:
+    """What a ray has gathered. All values are per ray, weights per sample."""
+
+    weights: Float[Tensor, "R S"]
+    """T_k alpha'_k of the samples that were kept."""
+    accumulation: Float[Tensor, "R 1"]
+    """1 - transmittance behind the last sample, the dropped ones included."""
+    transmittance: Float[Tensor, "R 1"]
+    """What passes the whole ray."""
+
+
+def checked(tau: Tensor, valid: Tensor, skipped_before: Tensor, skipped_total: Tensor) -> tuple[Tensor, ...]:
+    """The arguments of ``composite_weights`` as the kernels read them."""
+    shape = tau.shape
+    flags = shaped(valid, *shape, dtype=torch.bool)
+    return shaped(tau, *shape), flags, shaped(skipped_before, *shape), shaped(skipped_total, shape[0], 1)
+
+
+@operation("cpu", "gpu")
 def composite_weights(
     tau: Float[Tensor, "R S"],
     valid: Bool[Tensor, "R S"],
@@ -30,4 +62,42 @@ def composite_weights(
 
     Source: paper eq. (rendering) and its blended form in sec. III-C.
     """
-    return dispatch.run("composite_weights", tau, valid, skipped_before, skipped_total)
+    tau = torch.where(valid, tau, torch.zeros_like(tau))
+    log_transmittance = -(exclusive_cumsum(tau) + skipped_before)
+    weights = torch.exp(log_transmittance) * -torch.expm1(-tau)
+    weights = torch.where(valid, weights, torch.zeros_like(weights))
+    depth = tau.sum(-1, keepdim=True) + skipped_total
+    return Composite(weights, -torch.expm1(-depth), torch.exp(-depth))
+
+
+def render_colors(composite: Composite, colors: Float[Tensor, "R S 3"]) -> Float[Tensor, "R 3"]:
+    """Colour gathered along each ray, without background, with gradients to weights and colours.
+
+    The mass of the dropped samples is given the mean colour of those kept (a constant factor per ray), so that dropping
+    does not darken the image.
+    """
+    kept = composite.weights.sum(-1, keepdim=True)
+    factor = torch.where(kept > 1e-6, composite.accumulation / kept.clamp(min=1e-6), torch.ones_like(kept))
+    return factor.detach() * (composite.weights[..., None] * colors).sum(-2)
+
+
+@torch.no_grad()
+def median_inverse_distance(
+    weights: Float[Tensor, "R S"], inverse_t: Float[Tensor, "R S"], valid: Bool[Tensor, "R S"]
+) -> Float[Tensor, "R 1"]:
+    """1/t of the sample at which a ray has gathered half of what it gathers; 0 (infinity) for an empty ray.
+
+    Depends on one ray alone, so not on how an image is cut into chunks.
+    """
+    gathered = weights.cumsum(-1)
+    total = gathered[:, -1:]
+    reached = (gathered >= HALF * total) & valid & (total > 0)
+    index = reached.to(torch.int8).argmax(-1, keepdim=True)
+    picked = inverse_t.gather(-1, index)
+    return torch.where(reached.any(-1, keepdim=True), picked, torch.zeros_like(picked))
+
+
+def winning_heads(weights: Float[Tensor, "R S"], heads: Int[Tensor, "R S"], num_heads: int) -> Float[Tensor, "R 1"]:
+    """The head that gives each ray most of its weight, as nerfstudio's images take it; the first of equals."""
+    mass = weights.new_zeros(len(weights), num_heads).scatter_add(1, heads, weights)
+    return mass.argmax(-1, keepdim=True).to(weights.dtype)

@@ -1,4 +1,4 @@
-// Rendering weights of rays with their gradients. The reference is reference.py.
+// Rendering weights of rays with their gradients.
 #include "lanes.h"
 
 #include <algorithm>

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from mmpi_ns.ops.build import call_in_parts
-from mmpi_ns.ops.composite.reference import Composite, checked
+from mmpi_ns.ops.composite import Composite, checked
 from mmpi_ns.ops.layout import shaped
 
 
@@ -32,6 +32,5 @@ class _Weights(torch.autograd.Function):
 
 
 def composite_weights(tau: Tensor, valid: Tensor, skipped_before: Tensor, skipped_total: Tensor) -> Composite:
-    """See ``ops.composite``."""
     weights, depth = _Weights.apply(*checked(tau, valid, skipped_before, skipped_total))  # type: ignore[misc]
     return Composite(weights, -torch.expm1(-depth), torch.exp(-depth))

@@ -1,4 +1,4 @@
-"""Compositing on a GPU, forward and backward in one launch each; the reference is ``reference.composite_weights``."""
+"""Compositing on a GPU, forward and backward in one launch each; the reference is ``composite_weights``."""
 
 # Triton's language has no types that pyright knows: a kernel's functions seem to return nothing.
 # pyright: reportGeneralTypeIssues=false, reportCallIssue=false, reportArgumentType=false
@@ -11,7 +11,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from mmpi_ns.ops.composite.reference import Composite, checked
+from mmpi_ns.ops.composite import Composite, checked
 from mmpi_ns.ops.gpu_scene import block_size, launch, one_minus_exp
 
 SLOTS = 2048
@@ -53,12 +53,12 @@ def composite_backward_kernel(
     at = ray[:, None].to(tl.int64) * slots + slot[None, :]
     inside = (ray < num_rays)[:, None] & (slot < slots)[None, :]
     has, tau, before = _samples(taus, valid, befores, at, inside, slot)
-    own = tl.exp(-(before + tau)) * tl.load(weight_grads + at, has, 0.0)
+    direct = tl.exp(-(before + tau)) * tl.load(weight_grads + at, has, 0.0)
     later = inside & (slot + 1 < slots)[None, :]
     later = later & (tl.load(valid + at + 1, later, 0) != 0)
     behind = tl.load(weights + at + 1, later, 0.0) * tl.load(weight_grads + at + 1, later, 0.0)
     depth = tl.load(depth_grads + ray, ray < num_rays, 0.0)[:, None]
-    grad = own - tl.cumsum(behind, 1, reverse=True) + depth
+    grad = direct - tl.cumsum(behind, 1, reverse=True) + depth
     tl.store(tau_grads + at, tl.where(has, grad, 0.0), inside)
 
 
@@ -74,8 +74,8 @@ class _Weights(torch.autograd.Function):
         num_rays, slots = tau.shape
         weights, depth = torch.empty_like(tau), torch.empty_like(total)
         rays, width = _shape(slots, tau.device)
-        given = (tau, valid, before, total, weights, depth, num_rays, slots)
-        launch(composite_kernel, num_rays, rays, *given, RAYS=rays, SLOTS=width)
+        tensors = (tau, valid, before, total, weights, depth)
+        launch(composite_kernel, num_rays, rays, *tensors, num_rays, slots, RAYS=rays, SLOTS=width)
         ctx.save_for_backward(tau, valid, before, weights)
         return weights, depth
 
@@ -84,12 +84,11 @@ class _Weights(torch.autograd.Function):
         tau, *_ = saved = ctx.saved_tensors
         num_rays, slots = tau.shape
         grad, (rays, width) = torch.empty_like(tau), _shape(slots, tau.device)
-        given = (*saved, *(g.contiguous() for g in grad_outputs), grad, num_rays, slots)
-        launch(composite_backward_kernel, num_rays, rays, *given, RAYS=rays, SLOTS=width)
+        tensors = (*saved, *(g.contiguous() for g in grad_outputs), grad)
+        launch(composite_backward_kernel, num_rays, rays, *tensors, num_rays, slots, RAYS=rays, SLOTS=width)
         return grad, None, None, None
 
 
 def composite_weights(tau: Tensor, valid: Tensor, skipped_before: Tensor, skipped_total: Tensor) -> Composite:
-    """See ``ops.composite``."""
     weights, depth = _Weights.apply(*checked(tau, valid, skipped_before, skipped_total))  # type: ignore[misc]
     return Composite(weights, -torch.expm1(-depth), torch.exp(-depth))

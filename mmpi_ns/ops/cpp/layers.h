@@ -40,7 +40,7 @@ inline void run(const Layer* layers, int64_t count, std::vector<Lanes>& now, std
 
 inline int64_t encoded(int64_t octaves) { return 3 * (1 + 2 * octaves); }
 
-// (x, sin 2^i pi x, cos 2^i pi x) of three numbers in [-1, 1], in the order of reference.positional_encoding.
+// (x, sin 2^i pi x, cos 2^i pi x) of three numbers in [-1, 1], in the order of shade.positional_encoding.
 inline void encode(const Lanes* x, int64_t octaves, Lanes* to) {
     for (int a = 0; a < 3; a++) {
         Lanes sine, cosine;

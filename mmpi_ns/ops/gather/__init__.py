@@ -1,17 +1,63 @@
-"""What rays gather of the texels along them: sums of rendering weight times colour and features."""
+"""What rays gather of the texels along them: sums of rendering weight times colour and features.
+
+A texel's first three channels are logits of a colour, the others arguments of features. Both are interpolated raw; a
+sample has the sigmoids of the first and the hyperbolic tangents of the others.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from mmpi_ns.ops import dispatch
-from mmpi_ns.ops.gather.reference import COLORS, RaySums, Taps, gather_places
-from mmpi_ns.ops.shapes import check_shapes
+from mmpi_ns.ops.dispatch import operation
+from mmpi_ns.ops.interpolate import interpolate_densely
+from mmpi_ns.ops.layout import Places, SceneLayout
 
-__all__ = ["COLORS", "RaySums", "Taps", "gather_places", "gather_taps"]
+COLORS = 3
+"""Channels of a texel that are colours."""
 
 
+@dataclass(frozen=True)
+class Taps:
+    """Texels that samples read: 4 each of planes, or 8 each of the cube."""
+
+    positions: Int[Tensor, "N B"]
+    """Of the texels in the list of values that is read."""
+    weights: Float[Tensor, "N B"]
+    """Of the texels in what is interpolated."""
+
+
+@dataclass(frozen=True)
+class RaySums:
+    """Sums over the samples of each ray. ``mass``, ``first`` and ``second`` hold the weights fixed."""
+
+    gathered: Float[Tensor, "R C"]
+    """Of weight times colour and features."""
+    mass: Float[Tensor, "R 1"]
+    """Of weight."""
+    first: Float[Tensor, "R 3"]
+    """Of weight times colour."""
+    second: Float[Tensor, "R 3"]
+    """Of weight times squared colour."""
+
+
+def activate(raw: Float[Tensor, "N C"]) -> Float[Tensor, "N C"]:
+    """Colours and features of samples."""
+    return torch.cat([raw[:, :COLORS].sigmoid(), raw[:, COLORS:].tanh()], -1)
+
+
+def _check_taps(values: Tensor, taps: list[Taps], slots: Tensor, *_: Tensor) -> None:
+    if (sizes := [each.weights.shape[1] for each in taps]) not in ([], [4], [8], [4, 8]):
+        raise ValueError(f"taps of {sizes} texels where those of planes have 4, and those of the cube after them 8")
+    if (count := sum(len(each.positions) for each in taps)) != len(slots):
+        raise ValueError(f"slots has the shape {list(slots.shape)} where the taps are of {count} samples")
+
+
+@operation("cpu", "gpu", check=_check_taps)
 def gather_taps(
     values: Float[Tensor, "U C"],
     taps: list[Taps],
@@ -28,10 +74,43 @@ def gather_taps(
         weights: rendering weights.
         chosen: rays to sum for; the others get 0.
     """
-    for each in taps:
-        check_shapes("positions N B, tap_weights N B", each.positions, each.weights)
-    if (sizes := [each.weights.shape[1] for each in taps]) not in ([], [4], [8], [4, 8]):
-        raise ValueError(f"taps of {sizes} texels where those of planes have 4, and those of the cube after them 8")
-    count = sum(len(each.positions) for each in taps)
-    check_shapes("values U C, slots N, weights R S, chosen R", values, slots, weights, chosen, N=count)
-    return dispatch.run("gather_taps", values, taps, slots, weights, chosen)
+    if not taps:
+        return _sums(values.new_zeros(0, values.shape[1]), slots, weights)
+    raw = torch.cat([interpolate_densely(values, t.positions, t.weights) for t in taps])
+    samples = chosen[slots // weights.shape[1]].nonzero()[:, 0]
+    return _sums(raw[samples], slots[samples], weights)
+
+
+def gather_places(
+    layout: SceneLayout, table: Float[Tensor, "T C"], places: Places, weights: Float[Tensor, "R S"]
+) -> RaySums:
+    """Sums over samples at places in the heads, without gradients; ``table`` holds all texels. In plain torch alone:
+    pictures are made by ``ops.march``."""
+    slots, raw = zip(*interpolated(layout, table, places), strict=True)
+    return _sums(torch.cat(raw), torch.cat(slots), weights)
+
+
+def interpolated(
+    layout: SceneLayout, table: Float[Tensor, "T C"], places: Places
+) -> Iterator[tuple[Int[Tensor, "N"], Float[Tensor, "N C"]]]:
+    """Of each head the flat slots of its samples, and what the table holds at their places."""
+    for k, grid in enumerate(layout.grids):
+        slots = (places.valid & (places.heads == k)).reshape(-1).nonzero()[:, 0]
+        ndc, planes = places.ndc.reshape(-1, 3)[slots], places.planes.reshape(-1)[slots]
+        rows, weights = grid.bilinear(planes, ndc) if k < len(layout.mpis) else grid.trilinear(ndc)
+        yield slots, interpolate_densely(table, rows, weights)
+
+
+def split_sums(sums: Float[Tensor, "R N"], channels: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The parts of ``RaySums`` from what the compiled forms write: weighted texels, mass, squared colours."""
+    gathered, mass, second = sums.split([channels, 1, COLORS], -1)
+    return gathered, mass, gathered[:, :COLORS].clone(), second
+
+
+def _sums(raw: Tensor, slots: Tensor, weights: Tensor) -> RaySums:
+    rays, num_rays = slots // weights.shape[1], weights.shape[0]
+    value, weight = activate(raw), weights.reshape(-1)[slots][:, None]
+    gathered = value.new_zeros(num_rays, raw.shape[1]).index_add(0, rays, weight * value)
+    weight, colors = weight.detach(), value[:, :COLORS]
+    sums = value.new_zeros(num_rays, 7).index_add(0, rays, torch.cat([weight, weight * colors, weight * colors**2], -1))
+    return RaySums(gathered, sums[:, :1].detach(), sums[:, 1:4], sums[:, 4:])

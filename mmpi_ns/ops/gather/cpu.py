@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from mmpi_ns.ops.build import arguments, call, call_in_parts, owned_bounds, run_in_parts
-from mmpi_ns.ops.gather.reference import COLORS, RaySums, Taps, split_sums
+from mmpi_ns.ops.gather import COLORS, RaySums, Taps, split_sums
 
 LANES = 16
 """Gradients of sums are padded to multiples of this many channels."""
@@ -73,6 +73,6 @@ class _GatherTaps(torch.autograd.Function):
 
 
 def gather_taps(values: Tensor, taps: list[Taps], slots: Tensor, weights: Tensor, chosen: Tensor) -> RaySums:
-    """See ``ops.gather``. Gradients do not depend on the number of threads."""
+    """Gradients do not depend on the number of threads."""
     tensors = [x for t in taps for x in (t.positions.to(torch.int32), t.weights)]
     return RaySums(*_GatherTaps.apply(values, weights, slots, chosen, *tensors))  # type: ignore[misc]

@@ -1,4 +1,4 @@
-// What rays gather of the texels along them, and its gradients. References in ops/gather/reference.py.
+// What rays gather of the texels along them, and its gradients.
 #include "taps.h"
 
 #include <vector>

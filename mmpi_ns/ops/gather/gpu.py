@@ -12,7 +12,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from mmpi_ns.ops.gather.reference import COLORS, RaySums, Taps, split_sums
+from mmpi_ns.ops.gather import COLORS, RaySums, Taps, split_sums
 from mmpi_ns.ops.gpu_scene import block_size, launch
 
 NUMBERS = 512
@@ -160,7 +160,6 @@ class _GatherTaps(torch.autograd.Function):
 
 
 def gather_taps(values: Tensor, taps: list[Taps], slots: Tensor, weights: Tensor, chosen: Tensor) -> RaySums:
-    """See ``ops.gather``."""
     parts = {t.weights.shape[1]: (t.positions, t.weights) for t in taps}
     none = {n: (slots.new_zeros(0, n), weights.new_zeros(0, n)) for n in (4, 8)}
     tensors = [x for pair in (none | parts).values() for x in pair]

@@ -6,20 +6,38 @@ A table has millions of rows of which a step reads a few: backward and optimiser
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from mmpi_ns.ops import dispatch
-from mmpi_ns.ops.interpolate import reference
-from mmpi_ns.ops.interpolate.reference import HeadSamples, RowIndex
+from mmpi_ns.ops.dispatch import operation
 from mmpi_ns.ops.layout import Places, SceneLayout
-from mmpi_ns.ops.shapes import check_shapes
+from mmpi_ns.scene.texels import BRICK
 
-__all__ = ["HeadSamples", "RowIndex", "Table", "index_rows", "interpolate", "order_by_head", "raise_peaks", "read_rows",
-           "sum_rows", "texel_rows", "weigh_rows"]  # fmt: skip
+
+@dataclass(frozen=True)
+class RowIndex:
+    """Distinct rows of a list, and the place of every entry among them."""
+
+    unique: Int[Tensor, "U"]
+    """Rising, except for padding."""
+    positions: Int[Tensor, "..."]
+    """Of every entry in ``unique``; int32 or int64."""
+
+
+class HeadSamples(NamedTuple):
+    """The valid samples of a batch: heads rising, and the slots of each head."""
+
+    slots: Int[Tensor, "N"]
+    """Flat slots [R, S] of the samples."""
+    heads: Int[Tensor, "N"]
+    planes: Int[Tensor, "N"]
+    ndc: Float[Tensor, "N 3"]
+    counts: Sequence[int]
+    """Samples of each head."""
 
 
 class Table(nn.Parameter):
@@ -59,6 +77,7 @@ class Table(nn.Parameter):
         return torch.zeros_like(self.data).index_add_(0, self.grad_rows, self._row_grad)
 
 
+@operation("cpu")
 def order_by_head(places: Places, num_heads: int, counts: Sequence[int] | None = None) -> HeadSamples:
     """Valid samples of a batch, ordered by head and otherwise by slot.
 
@@ -67,10 +86,18 @@ def order_by_head(places: Places, num_heads: int, counts: Sequence[int] | None =
         num_heads: of the scene.
         counts: samples of each head, if known; otherwise this synchronises with a GPU.
     """
-    check_shapes("heads R S, planes R S, ndc R S 3, valid R S", *places)
-    return dispatch.run("order_by_head", places, num_heads, counts)
+    heads, valid = places.heads.reshape(-1), places.valid.reshape(-1)
+    if counts is None:
+        parts = [(valid & (heads == k)).nonzero()[:, 0] for k in range(num_heads)]
+        slots, counts = torch.cat(parts), [len(p) for p in parts]
+    else:
+        keys = torch.where(valid, heads, num_heads)
+        slots = torch.sort(keys.to(torch.int16), stable=True).indices[: sum(counts)]
+    planes, ndc = places.planes.reshape(-1)[slots], places.ndc.reshape(-1, 3)[slots]
+    return HeadSamples(slots, heads[slots], planes, ndc, counts)
 
 
+@operation("cpu", "gpu")
 def texel_rows(
     layout: SceneLayout, heads: Int[Tensor, "N"], planes: Int[Tensor, "N"], ndc: Float[Tensor, "N 3"]
 ) -> tuple[Int[Tensor, "N 4"], Float[Tensor, "N 4"]]:
@@ -83,12 +110,14 @@ def texel_rows(
         planes: plane of each sample.
         ndc: position of each sample in its MPI.
     """
-    check_shapes("heads N, planes N, ndc N 3", heads, planes, ndc)
-    if ndc.requires_grad:
-        return reference.texel_rows(layout, heads, planes, ndc)
-    return dispatch.run("texel_rows", layout, heads, planes, ndc)
+    rows, weights = planes.new_zeros(len(heads), 4), ndc.new_zeros(len(heads), 4)
+    for k, grid in enumerate(layout.grids[: len(layout.mpis)]):
+        here = (heads == k).nonzero()[:, 0]
+        rows[here], weights[here] = grid.bilinear(planes[here], ndc[here])
+    return rows, weights
 
 
+@operation("cpu", "gpu")
 def index_rows(rows: Int[Tensor, "..."], table_rows: int, pads: bool = False) -> RowIndex:
     """Distinct rows of a list, rising.
 
@@ -98,9 +127,10 @@ def index_rows(rows: Int[Tensor, "..."], table_rows: int, pads: bool = False) ->
         pads: row 0, which no entry refers to there, may follow the distinct rows any number of times. A GPU then
             need not be waited for to tell their number.
     """
-    return dispatch.run("index_rows", rows, table_rows, pads)
+    return RowIndex(*torch.unique(rows, return_inverse=True))
 
 
+@operation("cpu", "gpu")
 def sum_rows(
     positions: Int[Tensor, "N B"], values: Float[Tensor, "N C"], weights: Float[Tensor, "N B"], count: int
 ) -> Float[Tensor, "U C"]:
@@ -109,10 +139,12 @@ def sum_rows(
     On a CPU a row's entries are added in order, for any number of threads. On a GPU sums are atomic, so their last bits
     may differ from run to run.
     """
-    check_shapes("positions N B, values N C, weights N B", positions, values, weights)
-    return dispatch.run("sum_rows", positions, values, weights, count)
+    out = torch.zeros(count, values.shape[1], dtype=values.dtype, device=values.device)
+    each = (values[:, None, :] * weights[..., None]).reshape(-1, values.shape[1])
+    return out.index_add_(0, positions.reshape(-1), each)
 
 
+@operation("cpu")
 def raise_peaks(
     peaks: Float[Tensor, "K"], rows: Int[Tensor, "U"], positions: Int[Tensor, "N B"], weights: Float[Tensor, "N"]
 ) -> None:
@@ -124,22 +156,34 @@ def raise_peaks(
         positions: of the rows that each sample reads, among those.
         weights: of the samples.
     """
-    check_shapes("peaks K, rows U, positions N B, weights N", peaks, rows, positions, weights)
-    dispatch.run("raise_peaks", peaks, rows, positions, weights)
+    bricks = (rows // BRICK)[positions.reshape(-1)]
+    peaks.scatter_reduce_(0, bricks, weights.repeat_interleave(positions.shape[1]), "amax")
 
 
 def read_rows(table: Table, rows: Int[Tensor, "U"]) -> Float[Tensor, "U C"]:
     """table[rows] for the distinct rows of ``index_rows``; their gradient goes to the table's ``grad``."""
-    check_shapes("table T C, rows U", table, rows)
     return _ReadRows.apply(table, rows)  # type: ignore[no-any-return]
+
+
+@operation("cpu")
+def take_rows(table: Float[Tensor, "T C"], rows: Int[Tensor, "U"]) -> Float[Tensor, "U C"]:
+    """Values of ``read_rows``."""
+    return table.index_select(0, rows)
 
 
 def weigh_rows(
     values: Float[Tensor, "U C"], positions: Int[Tensor, "N B"], weights: Float[Tensor, "N B"]
 ) -> Float[Tensor, "N C"]:
     """sum_b weights[n, b] values[positions[n, b]], with dense gradients to values and weights."""
-    check_shapes("values U C, positions N B, weights N B", values, positions, weights)
     return _WeighRows.apply(values, positions, weights.to(values.dtype))  # type: ignore[no-any-return]
+
+
+@operation("gpu")
+def weighted_rows(
+    table: Float[Tensor, "T C"], rows: Int[Tensor, "N B"], weights: Float[Tensor, "N B"]
+) -> Float[Tensor, "N C"]:
+    """Values of ``weigh_rows``: torch's embedding bag, on a CPU 3 to 6 times faster than indexing."""
+    return torch.nn.functional.embedding_bag(rows, table, per_sample_weights=weights, mode="sum")
 
 
 def interpolate(
@@ -152,11 +196,18 @@ def interpolate(
     return weigh_rows(read_rows(table, index.unique), index.positions, weights)
 
 
+def interpolate_densely(
+    table: Float[Tensor, "T C"], rows: Int[Tensor, "N B"], weights: Float[Tensor, "N B"]
+) -> Float[Tensor, "N C"]:
+    """``interpolate`` as it is defined, with a dense gradient."""
+    return (table[rows] * weights[..., None]).sum(1)
+
+
 class _ReadRows(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, table: Table, rows: Tensor) -> Tensor:
         ctx.table, ctx.rows = table, rows
-        return dispatch.run("take_rows", table, rows)
+        return take_rows(table, rows)
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[None, None]:
@@ -169,7 +220,7 @@ class _WeighRows(torch.autograd.Function):
     def forward(ctx: Any, values: Tensor, positions: Tensor, weights: Tensor) -> Tensor:
         ctx.save_for_backward(positions, weights, values if ctx.needs_input_grad[2] else None)
         ctx.count = len(values)
-        return dispatch.run("weighted_rows", values, positions, weights)
+        return weighted_rows(values, positions, weights)
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, None, Tensor | None]:

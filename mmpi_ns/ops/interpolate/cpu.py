@@ -8,10 +8,10 @@ from itertools import accumulate
 import torch
 from torch import Tensor
 
+from mmpi_ns.ops import interpolate
 from mmpi_ns.ops.build import call, call_in_parts, even_bounds, owned_bounds, run_in_parts
 from mmpi_ns.ops.cpu_scene import CpuScene
-from mmpi_ns.ops.interpolate import reference
-from mmpi_ns.ops.interpolate.reference import HeadSamples, RowIndex
+from mmpi_ns.ops.interpolate import HeadSamples, RowIndex
 from mmpi_ns.ops.layout import Places, SceneLayout
 from mmpi_ns.scene.texels import BRICK
 
@@ -22,7 +22,6 @@ AT_LEAST = 1 << 15
 
 
 def order_by_head(places: Places, num_heads: int, counts: Sequence[int] | None) -> HeadSamples:
-    """See ``ops.interpolate``."""
     heads, planes, ndc, valid = (x.contiguous() for x in places)
     bounds = even_bounds(heads.numel(), AT_LEAST)
     in_parts = torch.zeros(len(bounds) - 1, num_heads, dtype=torch.int64)
@@ -40,7 +39,8 @@ def order_by_head(places: Places, num_heads: int, counts: Sequence[int] | None) 
 
 
 def texel_rows(layout: SceneLayout, heads: Tensor, planes: Tensor, ndc: Tensor) -> tuple[Tensor, Tensor]:
-    """See ``ops.interpolate``."""
+    if ndc.requires_grad:
+        return interpolate.texel_rows.reference(layout, heads, planes, ndc)
     rows, weights = torch.empty(len(heads), 4, dtype=torch.int64), torch.empty(len(heads), 4)
     samples = (x.contiguous() for x in (heads, planes, ndc))
     call_in_parts("mmpi_texel_rows", len(heads), (CpuScene.of(layout).grids, *samples), (rows, weights), AT_LEAST)
@@ -48,10 +48,9 @@ def texel_rows(layout: SceneLayout, heads: Tensor, planes: Tensor, ndc: Tensor) 
 
 
 def index_rows(rows: Tensor, table_rows: int, pads: bool) -> RowIndex:
-    """See ``ops.interpolate``."""
     count, listed = rows.numel(), rows.long().contiguous()
     if table_rows > MOST_ROWS or not 0 < count < 2**31:
-        return reference.index_rows(rows, table_rows, pads)
+        return interpolate.index_rows.reference(rows, table_rows, pads)
     words = torch.zeros(-(-table_rows // BRICK), dtype=torch.int64)
     before, positions = torch.empty(len(words), dtype=torch.int32), torch.empty(rows.shape, dtype=torch.int32)
     call_in_parts("mmpi_mark_rows", count, (listed,), (words,), AT_LEAST)
@@ -64,9 +63,8 @@ def index_rows(rows: Tensor, table_rows: int, pads: bool) -> RowIndex:
 
 
 def sum_rows(positions: Tensor, values: Tensor, weights: Tensor, count: int) -> Tensor:
-    """See ``ops.interpolate``."""
     if positions.dtype != torch.int32:
-        return reference.sum_rows(positions, values, weights, count)
+        return interpolate.sum_rows.reference(positions, values, weights, count)
     sums, (samples, taps) = torch.zeros(count, values.shape[1]), positions.shape
     entries = (*(x.contiguous() for x in (positions, weights, values)), samples, taps, values.shape[1])
     bounds = owned_bounds([positions], count, AT_LEAST)
@@ -75,17 +73,15 @@ def sum_rows(positions: Tensor, values: Tensor, weights: Tensor, count: int) -> 
 
 
 def raise_peaks(peaks: Tensor, rows: Tensor, positions: Tensor, weights: Tensor) -> None:
-    """See ``ops.interpolate``."""
     if positions.dtype != torch.int32:
-        return reference.raise_peaks(peaks, rows, positions, weights)
+        return interpolate.raise_peaks.reference(peaks, rows, positions, weights)
     samples, after = (positions.contiguous(), weights.contiguous()), (positions.shape[1], rows.contiguous(), peaks)
     call_in_parts("mmpi_raise_peaks", len(positions), samples, after, AT_LEAST)
 
 
 def take_rows(table: Tensor, rows: Tensor) -> Tensor:
-    """See ``ops.interpolate.reference``."""
     if not table.is_contiguous():
-        return reference.take_rows(table, rows)
+        return interpolate.take_rows.reference(table, rows)
     values = torch.empty(len(rows), table.shape[1])
     call_in_parts("mmpi_take_rows", len(rows), (rows.contiguous(),), (table.shape[1], table, values), AT_LEAST)
     return values

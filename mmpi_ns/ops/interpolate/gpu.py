@@ -9,8 +9,9 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from mmpi_ns.ops import interpolate
 from mmpi_ns.ops.gpu_scene import HEIGHT, INTS, WIDTH, GpuScene, block_size, cell, launch, row_of
-from mmpi_ns.ops.interpolate.reference import RowIndex
+from mmpi_ns.ops.interpolate import RowIndex
 from mmpi_ns.ops.layout import SceneLayout
 from mmpi_ns.scene.texels import BRICK
 
@@ -38,7 +39,8 @@ def texel_rows_kernel(heads, planes, ndc, grids, rows, weights, count, BLOCK: tl
 
 
 def texel_rows(layout: SceneLayout, heads: Tensor, planes: Tensor, ndc: Tensor) -> tuple[Tensor, Tensor]:
-    """See ``ops.interpolate``."""
+    if ndc.requires_grad:
+        return interpolate.texel_rows.reference(layout, heads, planes, ndc)
     count, scene = len(heads), GpuScene.of(layout)
     rows = torch.empty(count, 4, dtype=torch.int64, device=ndc.device)
     weights = torch.empty(count, 4, device=ndc.device)
@@ -67,7 +69,6 @@ def weighted_rows_kernel(
 
 
 def weighted_rows(table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
-    """See ``ops.interpolate.reference``."""
     count, channels = len(rows), table.shape[1]
     out = torch.empty(count, channels, device=table.device)
     block, columns = block_size(ROWS, table.device), triton.next_power_of_2(channels)
@@ -94,7 +95,6 @@ def sum_rows_kernel(
 
 
 def sum_rows(positions: Tensor, values: Tensor, weights: Tensor, count: int) -> Tensor:
-    """See ``ops.interpolate``."""
     (samples, channels), block = values.shape, block_size(ROWS, values.device)
     sums = torch.zeros(count, channels, device=values.device)
     tensors, columns = (x.contiguous() for x in (positions, weights, values)), triton.next_power_of_2(channels)
@@ -158,7 +158,7 @@ def position_kernel(rows, words, ends, positions, count, BLOCK: tl.constexpr):
 
 
 def index_rows(rows: Tensor, table_rows: int, pads: bool) -> RowIndex:
-    """See ``ops.interpolate``. A bit for every row of the table, and a running count of them by bricks."""
+    """A bit for every row of the table, and a running count of them by bricks."""
     flat, device, block = rows.reshape(-1).contiguous(), rows.device, block_size(ROWS, rows.device)
     count, bricks = len(flat), -(-table_rows // BRICK)
     positions = torch.empty(rows.shape, dtype=torch.int32, device=device)

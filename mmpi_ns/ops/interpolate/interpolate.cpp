@@ -1,4 +1,4 @@
-// Rows of tables that a batch reads: which, what is there, and their gradients. The reference is reference.py.
+// Rows of tables that a batch reads: which, what is there, and their gradients.
 #include "scene.h"
 #include "table.h"
 

@@ -7,16 +7,56 @@ must weigh to be kept), so a ray costs what lies in front of its first surfaces.
 
 from __future__ import annotations
 
-from jaxtyping import Float
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from mmpi_ns.ops import dispatch
+from mmpi_ns.ops.blending import blended_optical_depth, log_shares
+from mmpi_ns.ops.composite import composite_weights, exclusive_cumsum, median_inverse_distance, winning_heads
+from mmpi_ns.ops.dispatch import operation
+from mmpi_ns.ops.ends import NEGLIGIBLE
+from mmpi_ns.ops.gather import gather_places
+from mmpi_ns.ops.interpolate import interpolate
 from mmpi_ns.ops.layout import SceneLayout, Tables
 from mmpi_ns.ops.march.rays import MarchOptions, MergedSamples, Rays, Shown
+from mmpi_ns.scene.geometry import LocalRays, PlaneHits, cube_hits, inverse_distance, plane_hits, sample_disparity
 
-__all__ = ["MarchOptions", "MergedSamples", "Rays", "Shown", "march", "show_rays"]
+BLEND_BLOCK = 16
+"""Samples of a ray between two checks whether it is already opaque."""
+OPAQUE_DEPTH = 9.2
+"""exp(-9.2) = 1e-4 of the light: far below the weight of a kept sample."""
 
 
+class Crossings(NamedTuple):
+    """The live samples of R rays in the H heads that may answer them."""
+
+    origins: Float[Tensor, "R 3"]
+    directions: Float[Tensor, "R 3"]
+    hits: PlaneHits
+    """Crossings of the rays with the planes."""
+    first: Int[Tensor, "R H"]
+    """m of each head's nearest live plane; the cube's first sample in the last column, where there is a cube."""
+    counts: Int[Tensor, "R H"]
+    """Live samples of each head."""
+    explained: Bool[Tensor, "R 1"]
+    """See ``MergedSamples``."""
+
+
+class LiveSamples(NamedTuple):
+    """A flat list of live samples: head by head, ray by ray, near to far."""
+
+    rays: Int[Tensor, "N"]
+    heads: Int[Tensor, "N"]
+    planes: Int[Tensor, "N"]
+    ndc: Float[Tensor, "N 3"]
+    inverse_t: Float[Tensor, "N"]
+    tau: Float[Tensor, "N"]
+
+
+@operation("cpu", "gpu")
 def march(layout: SceneLayout, tables: Tables, rays: Rays, options: MarchOptions) -> MergedSamples:
     """The samples of each ray that matter.
 
@@ -26,9 +66,38 @@ def march(layout: SceneLayout, tables: Tables, rays: Rays, options: MarchOptions
         rays: R rays.
         options: which samples are kept, and how they are blended.
     """
-    return dispatch.run("march", layout, tables, rays, options)
+    at = crossings(layout, rays, plane_hits(*rays[:4], layout.frames))
+    flat = _live_samples(at, layout, tables)
+    per_ray, number = at.counts.sum(-1), torch.cat([_enumerate(each)[1] for each in at.counts.unbind(-1)])
+    width, before = max(1, int(per_ray.max())) if per_ray.numel() else 1, at.counts.cumsum(-1) - at.counts
+    slots = flat.rays * width + before[flat.rays, flat.heads] + number
+    order, valid = merge(slots, flat.inverse_t, per_ray, presorted=bool(((at.counts > 0).sum(-1) <= 1).all()))
+    tau = flat.tau
+    if options.blends and tau.numel():
+        tau = _blend_visible(order, valid, flat, at, layout, tables)
+    pruned = prune(order, valid, tau, options.threshold, options.fair_share)
+    order, valid = pruned.order, pruned.valid
+
+    def pick(values: Tensor) -> Tensor:
+        kept = values[order] if len(values) else values.new_zeros((*order.shape, *values.shape[1:]))
+        return kept.masked_fill(~(valid[..., None] if values.ndim > 1 else valid), 0)
+
+    return MergedSamples(
+        heads=pick(flat.heads),
+        planes=pick(flat.planes),
+        ndc=pick(flat.ndc),
+        inverse_t=pick(flat.inverse_t),
+        tau=pick(tau),
+        skipped_before=pruned.skipped_before,
+        valid=valid,
+        skipped_total=pruned.skipped_total,
+        dropped_mass=pruned.dropped_mass,
+        live=at.counts.sum(-1),
+        explained=at.explained,
+    )
 
 
+@operation("cpu", "gpu")
 def show_rays(
     layout: SceneLayout, tables: Tables, features: Float[Tensor, "T C"], rays: Rays, options: MarchOptions
 ) -> Shown:
@@ -44,4 +113,224 @@ def show_rays(
         rays: R rays.
         options: which samples are kept, and how they are blended.
     """
-    return dispatch.run("show_rays", layout, tables, features, rays, options)
+    m = march(layout, tables, rays, options)
+    composite = composite_weights(m.tau, m.valid, m.skipped_before, m.skipped_total)
+    sums = gather_places(layout, features, m.places, composite.weights)
+    return Shown(
+        gathered=sums.gathered,
+        mass=composite.weights.sum(-1, keepdim=True),
+        transmittance=composite.transmittance,
+        accumulation=composite.accumulation,
+        inverse_t=median_inverse_distance(composite.weights, m.inverse_t, m.valid),
+        winner=winning_heads(composite.weights, m.heads, layout.num_heads),
+        dropped_mass=m.dropped_mass,
+    )
+
+
+# Crossings -----------------------------------------------------------------------------------------------------------
+
+
+def crossings(layout: SceneLayout, rays: Rays, hits: PlaneHits) -> Crossings:
+    """The live samples of rays in the heads that may answer them, from their crossings with all planes."""
+    first, counts = hits.m_first, hits.count
+    if rays.priorities is not None:
+        met = torch.where(counts > 0, rays.priorities, torch.full_like(rays.priorities, -1.0))
+        best = met.argmax(-1, keepdim=True)
+        counts = torch.zeros_like(counts).scatter(1, best, counts.gather(1, best))
+    if layout.cube is not None:
+        start, count = cube_hits(*rays[:4], layout.cube)
+        first, counts = torch.cat([first, start[:, None]], -1), torch.cat([counts, count[:, None]], -1)
+    if rays.heads is not None:
+        counts = torch.where(rays.heads, counts, torch.zeros_like(counts))
+    explained = (counts > 0).any(-1, keepdim=True)
+    if rays.heads is not None or rays.priorities is not None:
+        # Some head covers the ray out to infinity, and the first one is entered before the first content. One plane
+        # before the first live one bounds the entry: behind the camera means that the ray starts inside.
+        live, frames = counts[:, : len(layout.mpis)] > 0, layout.frames
+        m_before = torch.minimum(hits.m_first + 1, frames.num_planes - 1)
+        w = sample_disparity(m_before, frames.disparity_steps, frames.last_disparities)
+        oz, dz = hits.local_origins[..., 2], hits.local_directions[..., 2]
+        starts_inside = w * oz >= 1
+        entry = torch.where(starts_inside, torch.inf, w * dz / torch.where(starts_inside, 1, 1 - w * oz))
+        endless = live & (hits.m_first - counts[:, : len(layout.mpis)] < 0) & (frames.last_disparities == 0)
+        explained &= (live & (entry * layout.content_near >= 1)).any(-1, keepdim=True)
+        explained &= endless.any(-1, keepdim=True)
+    return Crossings(rays.origins, rays.directions, hits, first, counts, explained)
+
+
+# Sample --------------------------------------------------------------------------------------------------------------
+
+
+def _live_samples(at: Crossings, layout: SceneLayout, tables: Tables) -> LiveSamples:
+    """All live planes of every MPI, and the samples inside the cube, at fixed distances from each camera."""
+    parts, hits, frames = [], at.hits, layout.frames
+    for k, grid in enumerate(layout.grids):
+        rays, index = _enumerate(at.counts[:, k])
+        if k < len(layout.mpis):
+            m, mpi = hits.m_first[:, k][rays] - index, layout.mpis[k]
+            ray = torch.cat(
+                [hits.u[:, k], hits.v[:, k], hits.local_origins[:, k, 2:], hits.local_directions[:, k, 2:]], -1
+            ).index_select(0, rays)
+            w = sample_disparity(m, frames.disparity_steps[k], frames.last_disparities[k])
+            u0, u1, v0, v1 = mpi.extent
+            u = (ray[:, 0] + w * ray[:, 1] - u0) * (2 / (u1 - u0)) - 1
+            v = (ray[:, 2] + w * ray[:, 3] - v0) * (2 / (v1 - v0)) - 1
+            ndc = torch.stack([u, v, 1 - 2 * mpi.near / mpi.depth_share * (w - mpi.last_disparity)], -1)
+            planes, inverse_t = mpi.planes - 1 - m, inverse_distance(w, ray[:, 4], ray[:, 5])
+            texels = grid.bilinear(planes, ndc)
+        else:
+            assert layout.cube is not None
+            planes = at.first[:, -1][rays] + index
+            t = (planes + 0.5).to(at.origins.dtype) * layout.cube.step
+            ndc, inverse_t = layout.cube.normalised(at.origins[rays] + at.directions[rays] * t[:, None]), 1 / t
+            texels = grid.trilinear(ndc)
+        tau = layout.optical_depth(k, interpolate(tables.density, *texels)[:, 0], planes)
+        parts.append((rays, torch.full_like(rays, k), planes, ndc, inverse_t, tau))
+    return LiveSamples(*(torch.cat(columns) for columns in zip(*parts, strict=True)))
+
+
+def _enumerate(counts: Int[Tensor, "R"]) -> tuple[Int[Tensor, "N"], Int[Tensor, "N"]]:
+    """(ray, 0..count-1) for every sample, ray by ray."""
+    rays = torch.repeat_interleave(torch.arange(counts.shape[0], device=counts.device), counts)
+    starts = counts.cumsum(0) - counts
+    return rays, torch.arange(rays.shape[0], device=counts.device) - starts[rays]
+
+
+# Merge ---------------------------------------------------------------------------------------------------------------
+
+
+def merge(
+    slots: Int[Tensor, "N"],
+    inverse_t: Float[Tensor, "N"],
+    counts: Int[Tensor, "R"],
+    presorted: bool,
+) -> tuple[Int[Tensor, "R S"], Bool[Tensor, "R S"]]:
+    """Sort flat samples along their rays, nearest first.
+
+    Ties keep the order of the slots, which run over (head, plane), so the result does not depend on the batch.
+
+    Args:
+        slots: for each flat sample ray * S + position, positions counting (head, plane) within the ray.
+        inverse_t: inverse distance of each flat sample.
+        counts: samples of each ray; S = counts.max().
+        presorted: every ray met one head only, whose planes already come near to far.
+
+    Returns:
+        Index of each slot's sample in the flat list (0 in empty slots), and which slots hold one.
+    """
+    width = max(1, int(counts.max())) if counts.numel() else 1
+    num_rays = counts.shape[0]
+    index = torch.zeros(num_rays * width, dtype=torch.int64, device=slots.device)
+    index[slots] = torch.arange(slots.shape[0], device=slots.device)
+    index = index.view(num_rays, width)
+    valid = torch.arange(width, device=slots.device) < counts[:, None]
+    if presorted:
+        return index, valid
+    keys = torch.full((num_rays * width,), -1.0, dtype=inverse_t.dtype, device=slots.device)
+    keys[slots] = inverse_t
+    _, permutation = torch.sort(keys.view(num_rays, width), dim=-1, descending=True, stable=True)
+    return index.gather(-1, permutation), valid
+
+
+# Blend ---------------------------------------------------------------------------------------------------------------
+
+
+def _blend_visible(
+    order: Int[Tensor, "R S"],
+    valid: Bool[Tensor, "R S"],
+    flat: LiveSamples,
+    at: Crossings,
+    layout: SceneLayout,
+    tables: Tables,
+) -> Float[Tensor, "N"]:
+    """Blended optical depths, front to back, until a ray lets less than exp(-OPAQUE_DEPTH) through.
+
+    Reliability costs a lookup in every head, and most samples lie behind the first surface: those keep their own depth,
+    which changes weights by less than exp(-OPAQUE_DEPTH).
+    """
+    tau = flat.tau.clone()
+    passed = tau.new_zeros(order.shape[0])
+    for start in range(0, order.shape[1], BLEND_BLOCK):
+        block = order[:, start : start + BLEND_BLOCK]
+        visible = valid[:, start : start + BLEND_BLOCK] & (passed < OPAQUE_DEPTH)[:, None]
+        index = block[visible]
+        if not index.numel():
+            break
+        tau[index] = _blend(index, flat, at, layout, tables)
+        passed += torch.where(visible, tau[block], 0.0).sum(-1)
+    return tau
+
+
+def _blend(
+    index: Int[Tensor, "M"],
+    flat: LiveSamples,
+    at: Crossings,
+    layout: SceneLayout,
+    tables: Tables,
+) -> Float[Tensor, "M"]:
+    """Blended optical depth of some samples; those too thin to matter get an equal share without a lookup."""
+    tau = flat.tau[index]
+    thick = (tau > NEGLIGIBLE).nonzero()[:, 0]
+    sample = index[thick]
+    local = LocalRays(at.origins, at.directions, at.hits.local_origins, at.hits.local_directions)
+    places = (flat.rays[sample], local, flat.inverse_t[sample], flat.heads[sample])
+    shares = log_shares(layout, tables.reliability, tables.touched, *places)
+    blended = tau / layout.num_heads
+    return blended.index_copy(0, thick, blended_optical_depth(tau[thick], *shares))
+
+
+# Prune ---------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Pruned:
+    """The kept samples, packed to the left, and the attenuation by the dropped ones."""
+
+    order: Int[Tensor, "R S"]
+    """Index into the flat list (0 in empty slots)."""
+    valid: Bool[Tensor, "R S"]
+    skipped_before: Float[Tensor, "R S"]
+    """Optical depth of the dropped samples in front of each kept sample."""
+    skipped_total: Float[Tensor, "R 1"]
+    dropped_mass: Float[Tensor, "R 1"]
+    """Sum of the weights of the dropped samples."""
+
+
+def prune(
+    order: Int[Tensor, "R S"], valid: Bool[Tensor, "R S"], tau: Float[Tensor, "N"], threshold: float, fair_share: float
+) -> Pruned:
+    """Keep the samples whose weight exceeds min(threshold, fair_share / samples on the ray).
+
+    The second bound matters at the start, when all weights are 1/L: a fixed threshold would keep nothing, and samples
+    that are not kept cannot learn.
+
+    Args:
+        order: all samples, nearest first (see ``merge``).
+        valid: which slots hold one.
+        tau: blended optical depth of the flat samples.
+        threshold: weight below which a sample is dropped once the field has sharpened; 0 keeps all.
+        fair_share: the bound relative to equal weights; inf for the threshold alone.
+    """
+    depth = torch.where(valid, tau[order] if tau.numel() else 0.0, 0.0)
+    weights = torch.exp(-exclusive_cumsum(depth)) * -torch.expm1(-depth)
+    count = valid.sum(-1, keepdim=True).clamp(min=1)
+    bound = (fair_share / count).clamp(max=threshold)
+    kept = valid & (weights > bound) if threshold > 0 else valid
+    skipped = torch.where(kept, torch.zeros_like(depth), depth)
+    before = exclusive_cumsum(skipped)
+
+    number = kept.sum(-1)
+    width = max(1, int(number.max())) if number.numel() else 1
+    rays, positions = kept.nonzero(as_tuple=True)
+    target = rays * width + torch.arange(rays.shape[0], device=rays.device) - (number.cumsum(0) - number)[rays]
+    kept_order = torch.zeros(kept.shape[0] * width, dtype=torch.int64, device=tau.device)
+    kept_order[target] = order[rays, positions]
+    skipped_before = torch.zeros(kept.shape[0] * width, dtype=depth.dtype, device=tau.device)
+    skipped_before[target] = before[rays, positions]
+    return Pruned(
+        order=kept_order.view(-1, width),
+        valid=torch.arange(width, device=tau.device) < number[:, None],
+        skipped_before=skipped_before.view(-1, width),
+        skipped_total=skipped.sum(-1, keepdim=True),
+        dropped_mass=torch.where(kept, 0.0, weights).sum(-1, keepdim=True),
+    )

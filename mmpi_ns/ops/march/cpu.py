@@ -38,10 +38,10 @@ def pointers_to(rays: Rays, num_mpis: int, num_heads: int) -> _Rays:
     return _Rays.to(*parts, heads, None if rays.priorities is None else shaped(rays.priorities, count, num_mpis))
 
 
-def shown(name: str, num_rays: int, channels: int, given: tuple) -> Shown:
-    """What a compiled function of ``(*given, begin, end, outputs)`` shows."""
+def shown(name: str, num_rays: int, channels: int, before: tuple) -> Shown:
+    """What a compiled function of ``(*before, begin, end, outputs)`` shows."""
     outputs = [torch.empty(num_rays, n) for n in (channels, 1, 1, 1, 1, 1, 1)]
-    call_in_parts(name, num_rays, given, (ctypes.byref(_Outputs.to(*outputs)),))
+    call_in_parts(name, num_rays, before, (ctypes.byref(_Outputs.to(*outputs)),))
     return Shown(*outputs)
 
 
@@ -50,24 +50,17 @@ def _how(options: MarchOptions) -> tuple[float, float, ctypes.c_bool]:
 
 
 def march(layout: SceneLayout, tables: Tables, rays: Rays, options: MarchOptions) -> MergedSamples:
-    """See ``ops.march``."""
     scene, packed = CpuScene.of(layout).with_tables(tables), pointers_to(rays, len(layout.mpis), layout.num_heads)
     num_rays, room = len(rays.origins), options.most_kept(layout.most_samples)
     flat = [torch.empty((num_rays * room, 3) if i == 2 else num_rays * room, dtype=t) for i, t in enumerate(_FLAT)]
     starts, kept, live = torch.empty(3, num_rays, dtype=torch.int64)
     explained, (skipped, dropped) = torch.empty(num_rays, 1, dtype=torch.bool), torch.empty(2, num_rays, 1)
-    given = (ctypes.byref(scene), ctypes.byref(packed), room, *_how(options))
-    call_in_parts("mmpi_march", num_rays, given, (starts, kept, live, explained, skipped, dropped, *flat))
-    left = {"skipped_total": skipped, "dropped_mass": dropped}
-    return MergedSamples(*_pack(starts, kept, flat), **left, live=live, explained=explained)
-
-
-def _pack(starts: Tensor, kept: Tensor, flat: list[Tensor]) -> list[Tensor]:
-    """Flat samples in slots, packed to the left."""
-    shape = (len(kept), max(1, int(kept.max())) if kept.numel() else 1)
+    before = (ctypes.byref(scene), ctypes.byref(packed), room, *_how(options))
+    call_in_parts("mmpi_march", num_rays, before, (starts, kept, live, explained, skipped, dropped, *flat))
+    shape = (num_rays, max(1, int(kept.max())) if num_rays else 1)
     slots = [torch.empty((*shape, 3) if i == 2 else shape, dtype=t) for i, t in enumerate(_SLOTS)]
-    call_in_parts("mmpi_pack", len(kept), (starts, kept), (shape[1], *flat, *slots))
-    return slots
+    call_in_parts("mmpi_pack", num_rays, (starts, kept), (shape[1], *flat, *slots))
+    return MergedSamples(*slots, skipped_total=skipped, dropped_mass=dropped, live=live, explained=explained)
 
 
 def _tiles(layout: SceneLayout) -> _Tiles:
@@ -86,9 +79,8 @@ def _tiles(layout: SceneLayout) -> _Tiles:
 
 
 def show_rays(layout: SceneLayout, tables: Tables, features: Tensor, rays: Rays, options: MarchOptions) -> Shown:
-    """See ``ops.march``."""
     scene, packed = CpuScene.of(layout).with_tables(tables), pointers_to(rays, len(layout.mpis), layout.num_heads)
     rows, channels = features.shape
     features, tiles = shaped(features, len(tables.density), channels), layout.once("tiles", _tiles)
-    given = (ctypes.byref(scene), ctypes.byref(packed), ctypes.byref(tiles), features, rows, channels, *_how(options))
-    return shown("mmpi_show", len(rays.origins), channels, given)
+    before = (ctypes.byref(scene), ctypes.byref(packed), ctypes.byref(tiles), features, rows, channels, *_how(options))
+    return shown("mmpi_show", len(rays.origins), channels, before)

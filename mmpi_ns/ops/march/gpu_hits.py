@@ -120,7 +120,7 @@ def plane_hits(layout: SceneLayout, rays: Rays) -> PlaneHits:
     shape, size, block = (num_rays, count), num_rays * count, block_size(PAIRS, device)
     ranges = [torch.empty(shape, dtype=torch.int64, device=device) for _ in range(2)]
     parts = [torch.empty(*shape, width, device=device) for width in (2, 2, 3, 3)]
-    given = [shaped(x, num_rays, n) for x, n in zip(rays[:4], (3, 3, 1, 1), strict=True)]
-    frames = shaped(layout.frame_rows(), count, FLOATS.value)
-    launch(hits_kernel, size, block, *given, frames, *ranges, *parts, size, K=count, BLOCK=block)
+    bounded = [shaped(x, num_rays, n) for x, n in zip(rays[:4], (3, 3, 1, 1), strict=True)]
+    frames = shaped(layout.frame_rows, count, FLOATS.value)
+    launch(hits_kernel, size, block, *bounded, frames, *ranges, *parts, size, K=count, BLOCK=block)
     return PlaneHits(*ranges, *parts)

@@ -34,7 +34,7 @@ class MarchOptions(NamedTuple):
     threshold: float
     """Weight below which a sample is dropped; 0 keeps all and ends no ray early."""
     fair_share: float = float("inf")
-    """Bound on the threshold relative to equal weights (``reference.prune``)."""
+    """Bound on the threshold relative to equal weights (``march.prune``)."""
     blends: bool = False
     """Samples are blended by reliability."""
 

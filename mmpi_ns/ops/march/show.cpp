@@ -1,4 +1,4 @@
-// What rays show of the bricks of training. The reference is reference.py.
+// What rays show of the bricks of training.
 #include "taps.h"
 #include "walk.h"
 

@@ -1,17 +1,78 @@
-"""Colours of samples by a network of each head, without gradients: what rendering asks for with ``shading sample``."""
+"""Colours of samples by a network of each head (paper, MLP^(rgb)): what ``shading sample`` renders and trains."""
 
 from __future__ import annotations
 
+import math
+from typing import NamedTuple
+
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mmpi_ns.ops import dispatch
+from mmpi_ns.ops.dispatch import operation
+from mmpi_ns.ops.gather import interpolated
 from mmpi_ns.ops.layout import Places, SceneLayout
-from mmpi_ns.ops.shade.reference import SampleNetworks
 from mmpi_ns.ops.shapes import check_shapes
-from mmpi_ns.scene.texels import BRICK
+from mmpi_ns.scene.geometry import rotate
 
 
+class Layers(NamedTuple):
+    """Weights and biases of a network."""
+
+    w1: Float[Tensor, "W I"]
+    b1: Float[Tensor, "W"]
+    w2: Float[Tensor, "W W"]
+    b2: Float[Tensor, "W"]
+    w3: Float[Tensor, "3 W"]
+    b3: Float[Tensor, "3"]
+
+
+class SampleNetworks(NamedTuple):
+    """The networks of all heads."""
+
+    layers: tuple[Layers, ...]
+    position_frequencies: int
+    """Octaves of the positional encoding of NDC positions."""
+    direction_frequencies: int
+    """Octaves of that of directions, in the head's axes."""
+
+
+def positional_encoding(x: Float[Tensor, "N 3"], frequencies: int) -> Float[Tensor, "N E"]:
+    """(x, sin 2^i pi x, cos 2^i pi x) for i < frequencies (NeRF eq. 4)."""
+    if frequencies == 0:
+        return x
+    octaves = math.pi * 2.0 ** torch.arange(frequencies, device=x.device, dtype=x.dtype)
+    angles = (x[:, None, :] * octaves[:, None]).flatten(1)
+    return torch.cat([x, angles.sin(), angles.cos()], -1)
+
+
+def run_layers(layers: Layers, inputs: Float[Tensor, "N I"]) -> Float[Tensor, "N 3"]:
+    """What a network makes of its inputs."""
+    w1, b1, w2, b2, w3, b3 = layers
+    hidden = torch.nn.functional.linear(inputs, w1, b1).relu_()
+    hidden = torch.nn.functional.linear(hidden, w2, b2).relu_()
+    return torch.nn.functional.linear(hidden, w3, b3)
+
+
+def sample_colors(
+    layers: Layers, features: Float[Tensor, "N C"], position: Float[Tensor, "N P"], direction: Float[Tensor, "N D"]
+) -> Float[Tensor, "N 3"]:
+    """Colours in [0, 1] of samples whose positions and directions are encoded: the first three features are their
+    logits, to which the network adds what the view changes."""
+    return torch.sigmoid(features[:, :3] + run_layers(layers, torch.cat([features, position, direction], -1)))
+
+
+def _check_networks(
+    layout: SceneLayout, table: Tensor, networks: SampleNetworks, axes: Tensor, directions: Tensor, places: Places
+) -> None:
+    inputs = table.shape[1] + sum(3 * (1 + 2 * octaves) for octaves in networks[1:])
+    for layers in networks.layers:
+        check_shapes(Layers, layers._asdict(), {"I": inputs})
+    if len(networks.layers) != layout.num_heads:
+        raise ValueError(f"networks of {len(networks.layers)} heads where the scene has {layout.num_heads}")
+
+
+@operation("cpu", check=_check_networks)
 def shade(
     layout: SceneLayout,
     table: Float[Tensor, "T C"],
@@ -30,15 +91,10 @@ def shade(
         directions: of each ray, world axes.
         places: of the samples.
     """
-    encoded = [3 * (1 + 2 * n) for n in (networks.position_frequencies, networks.direction_frequencies)]
-    sizes = check_shapes(
-        "table T C, axes H 3 3, directions R 3, heads R S, planes R S, ndc R S 3, valid R S",
-        *(table, axes, directions, *places),
-        T=len(layout.grids[0].places) * BRICK,
-        H=layout.num_heads,
-    )
-    for layers in networks.layers:
-        check_shapes("w1 W I, b1 W, w2 W W, b2 W, w3 3 W, b3 3", *layers, I=sizes["C"] + sum(encoded))
-    if len(networks.layers) != layout.num_heads:
-        raise ValueError(f"networks of {len(networks.layers)} heads where the scene has {layout.num_heads}")
-    return dispatch.run("shade", layout, table, networks, axes, directions, places)
+    _, _, ndc, valid = places
+    colors = table.new_zeros(valid.numel(), 3)
+    for k, (slots, features) in enumerate(interpolated(layout, table, places)):
+        position = positional_encoding(ndc.reshape(-1, 3)[slots], networks.position_frequencies)
+        direction = positional_encoding(rotate(axes[k], directions), networks.direction_frequencies)
+        colors[slots] = sample_colors(networks.layers[k], features, position, direction[slots // valid.shape[1]])
+    return colors.view(*valid.shape, 3)

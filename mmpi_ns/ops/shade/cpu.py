@@ -10,7 +10,7 @@ from torch import Tensor
 from mmpi_ns.ops.build import arguments, call_in_parts
 from mmpi_ns.ops.cpu_scene import CpuScene, Layer
 from mmpi_ns.ops.layout import Places, SceneLayout
-from mmpi_ns.ops.shade.reference import SampleNetworks
+from mmpi_ns.ops.shade import SampleNetworks
 
 
 class _Shading(ctypes.Structure):
@@ -23,7 +23,6 @@ class _Shading(ctypes.Structure):
 def shade(
     layout: SceneLayout, table: Tensor, networks: SampleNetworks, axes: Tensor, directions: Tensor, places: Places
 ) -> Tensor:
-    """See ``ops.shade``."""
     pairs = [(w.contiguous(), b.contiguous()) for x in networks.layers for w, b in zip(x[::2], x[1::2], strict=True)]
     tensors, colors = [x.contiguous() for x in (axes, table, directions, *places)], torch.empty(*places.valid.shape, 3)
     octaves = (networks.position_frequencies, networks.direction_frequencies)

@@ -1,5 +1,5 @@
 // Colours of samples, without gradients: features, encodings and the colour network of sixteen samples of a head at a
-// time. The reference is reference.py.
+// time.
 #include "layers.h"
 #include "taps.h"
 

@@ -1,4 +1,4 @@
-// Gaussians seen by a camera (reference.py): projected, sorted by depth, and laid over each other front to back.
+// Gaussians seen by a camera: projected, sorted by depth, and laid over each other front to back.
 #include <algorithm>
 #include <cmath>
 #include <cstdint>

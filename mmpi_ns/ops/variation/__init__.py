@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from mmpi_ns.ops import dispatch
+from mmpi_ns.ops.dispatch import operation
 from mmpi_ns.ops.layout import SceneLayout
-from mmpi_ns.ops.shapes import check_shapes
-from mmpi_ns.ops.variation.reference import Scales
-from mmpi_ns.scene.texels import BRICK
+
+Scales = list[tuple[float, float, float]]
 
 
+def _check_scales(values: Tensor, table: Tensor, rows: Tensor, layout: SceneLayout, scales: Scales) -> None:
+    if len(scales) != layout.num_heads:
+        raise ValueError(f"scales of {len(scales)} heads where the scene has {layout.num_heads}")
+
+
+@operation("cpu", "gpu", check=_check_scales)
 def total_variation(
     values: Float[Tensor, "U C"],
     table: Float[Tensor, "T C"],
@@ -28,7 +36,43 @@ def total_variation(
         layout: of the scene.
         scales: weight of a difference along x, y and z, of each head.
     """
-    check_shapes("values U C, table T C, rows U", values, table, rows, T=len(layout.grids[0].places) * BRICK)
-    if len(scales) != layout.num_heads:
-        raise ValueError(f"scales of {len(scales)} heads where the scene has {layout.num_heads}")
-    return dispatch.run("total_variation", values, table, rows, layout, scales)
+    total = values.new_zeros(())
+    for grid, each in zip(layout.grids, scales, strict=True):
+        inside = grid.holds(rows).nonzero()[:, 0]
+        neighbours, exists = grid.neighbours(rows[inside])
+        weights = exists * torch.tensor([s for s in each for _ in range(2)], device=rows.device)
+        around = table[neighbours.reshape(-1)].view(*neighbours.shape, -1)
+        total = total + clamped_differences(values[inside], around, weights)
+    return total
+
+
+def clamped_differences(
+    values: Float[Tensor, "N C"], neighbours: Float[Tensor, "N M C"], scales: Float[Tensor, "N M"]
+) -> Float[Tensor, ""]:
+    """Sum of clamped neighbour differences, whose gradient is DVGO's (L_TV).
+
+    DVGO adds ``scale / 6 * clamp(v - v_neighbour, -1, 1)`` to the gradient of each touched texel. That is the gradient
+    of a Huber function of the difference with the neighbour held fixed, so it is an ordinary loss here.
+
+    Args:
+        values: texels that the batch touched, one row each.
+        neighbours: their neighbours along each axis (held fixed).
+        scales: weight of each difference (resolution / 128, 0 where there is no neighbour).
+    """
+    difference = values[:, None, :] - neighbours.detach()
+    size = difference.abs()
+    huber = torch.where(size <= 1, 0.5 * difference**2, size - 0.5)
+    return (scales[..., None] * huber).sum() / 6
+
+
+class WithGradient(torch.autograd.Function):
+    """A loss whose gradient was computed with it."""
+
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, loss: Tensor, gradient: Tensor) -> Tensor:
+        ctx.save_for_backward(gradient)
+        return loss
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor, None, None]:
+        return ctx.saved_tensors[0] * grad_outputs[0], None, None

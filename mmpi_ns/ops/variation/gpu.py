@@ -4,8 +4,6 @@
 # pyright: reportGeneralTypeIssues=false, reportCallIssue=false, reportArgumentType=false
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 import triton
 import triton.language as tl
@@ -13,7 +11,7 @@ from torch import Tensor
 
 from mmpi_ns.ops.gpu_scene import DEPTH, HEIGHT, INTS, WIDTH, GpuScene, block_size, is_stored, launch, row_of, texel_of
 from mmpi_ns.ops.layout import SceneLayout
-from mmpi_ns.ops.variation.reference import Scales
+from mmpi_ns.ops.variation import Scales, WithGradient
 
 ROWS = 128
 """Texels of a program."""
@@ -46,26 +44,13 @@ def variation_kernel(
     tl.store(totals + tl.program_id(0), tl.sum(tl.sum(total, 1), 0))
 
 
-class _Variation(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, values: Tensor, table: Tensor, rows: Tensor, grids: Tensor, scales: Tensor) -> Tensor:
-        count, channels = values.shape
-        block = block_size(ROWS, values.device)
-        gradient, programs = torch.empty_like(values), triton.cdiv(count, block)
-        totals = torch.zeros(max(1, programs), device=values.device)
-        tensors = (rows.contiguous(), values.contiguous(), table, grids, scales, gradient, totals, count, channels)
-        sizes = {"CHANNELS": triton.next_power_of_2(channels), "BLOCK": block}
-        launch(variation_kernel, count, block, *tensors, NUM_HEADS=len(scales), **sizes)
-        ctx.save_for_backward(gradient)
-        return totals.sum()
-
-    @staticmethod
-    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
-        return ctx.saved_tensors[0] * grad_outputs[0], None, None, None, None
-
-
 def total_variation(values: Tensor, table: Tensor, rows: Tensor, layout: SceneLayout, scales: Scales) -> Tensor:
-    """See ``ops.variation``."""
-    device = values.device
+    (count, channels), device, block = values.shape, values.device, block_size(ROWS, values.device)
     weights = layout.once(f"scales {scales}", lambda _: torch.tensor(scales, dtype=torch.float32, device=device))
-    return _Variation.apply(values, table, rows, GpuScene.of(layout).grids, weights)  # type: ignore[no-any-return]
+    gradient, totals = torch.empty_like(values), torch.zeros(max(1, triton.cdiv(count, block)), device=device)
+    tensors = (rows.contiguous(), values.contiguous(), table, GpuScene.of(layout).grids, weights, gradient, totals)
+    launch(
+        variation_kernel, count, block, *tensors, count, channels, NUM_HEADS=len(scales),
+        CHANNELS=triton.next_power_of_2(channels), BLOCK=block,
+    )  # fmt: skip
+    return WithGradient.apply(values, totals.sum(), gradient)  # type: ignore[no-any-return]

@@ -1,4 +1,4 @@
-// Total variation of texels with its gradient. The reference is reference.py.
+// Total variation of texels with its gradient.
 #include "scene.h"
 #include "table.h"
 

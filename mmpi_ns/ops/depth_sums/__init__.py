@@ -1,0 +1,57 @@
+"""What the losses of depth need of a ray's samples: the spread of its weights, and their mass near a known depth."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from mmpi_ns.ops.composite import exclusive_cumsum
+from mmpi_ns.ops.dispatch import operation
+
+REACH = 3.0
+"""Widths within which a sample reaches the target of its ray."""
+
+
+class DepthSums(NamedTuple):
+    """Sums over the samples of each ray."""
+
+    spread: Float[Tensor, "R"]
+    """sum_ij w_i w_j |s_i - s_j| + 1/3 sum_i w_i^2 delta, with s = 1 / (1 + scale / t)."""
+    mass: Float[Tensor, "R"]
+    """sum_i w_i exp(-1/2 ((1/t_i - target) / width)^2)."""
+    reached: Bool[Tensor, "R"]
+    """Whether a sample lies within three widths of the target, and there is one."""
+
+
+@operation("cpu")
+def depth_sums(
+    weights: Float[Tensor, "R S"],
+    inverse_t: Float[Tensor, "R S"],
+    valid: Bool[Tensor, "R S"],
+    intervals: Float[Tensor, "R"],
+    targets: Float[Tensor, "R 2"],
+    scale: float,
+) -> DepthSums:
+    """Spread and mass of each ray, with gradients to the weights of its samples.
+
+    Args:
+        weights: rendering weights, 0 in empty slots.
+        inverse_t: inverse distances of the samples, front to back.
+        valid: which slots hold a sample.
+        intervals: delta, the length of a ray's samples on the map s.
+        targets: inverse distance at which mass counts, 0 for none, and the width of the window round it (> 0).
+        scale: distance that s maps to 1/2.
+
+    Source: spread: mip-NeRF 360 eq. (15), in O(S) a ray by prefix sums as in DVGO v2.
+    """
+    positions = 1 / (1 + scale * inverse_t)
+    before, moment_before = exclusive_cumsum(weights), exclusive_cumsum(weights * positions)
+    spread = 2 * (weights * (positions * before - moment_before)).sum(-1) + (weights**2).sum(-1) * intervals / 3
+    scaled = (inverse_t - targets[:, :1]) / targets[:, 1:]
+    # Bounded from below, since exponentials that underflow take far longer.
+    window = torch.where(valid, torch.exp(-0.5 * scaled.square().clamp(max=120)), torch.zeros_like(scaled))
+    reached = (valid & (scaled.abs() < REACH)).any(-1) & (targets[:, 0] > 0)
+    return DepthSums(spread, (weights * window).sum(-1), reached)

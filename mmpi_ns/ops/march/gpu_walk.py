@@ -1,0 +1,222 @@
+"""A ray's walk through a scene on a GPU: which samples come next, what they hold, and their blending.
+
+The counterpart of ``cpp/walk.h`` and ``cpp/blend.h``. Which samples come next is arithmetic alone: every head's planes
+come near to far, and the nearest of the heads' next ones is taken. So a chunk of samples is chosen first and then
+looked up at once, and its loads do not wait for each other.
+"""
+
+# Triton's language has no types that pyright knows: a kernel's functions seem to return nothing.
+# pyright: reportGeneralTypeIssues=false, reportCallIssue=false, reportArgumentType=false
+from __future__ import annotations
+
+import triton
+import triton.language as tl
+
+from mmpi_ns.ops import ends
+from mmpi_ns.ops.gpu_scene import (
+    BIAS,
+    DEPTH,
+    END,
+    FLOATS,
+    INTERVAL,
+    INTS,
+    S_SCALE,
+    SHARE,
+    STEP,
+    U0,
+    U_SCALE,
+    V0,
+    V_SCALE,
+    bilinear,
+    is_held,
+    minus_log_of_rest,
+    nearest_row,
+    one_minus_exp,
+    softplus,
+    trilinear,
+)
+
+NEGLIGIBLE = tl.constexpr(ends.NEGLIGIBLE)
+NEAREST_ZERO = tl.constexpr(ends.NEAREST_ZERO)
+ULPS = tl.constexpr(16 * 2.0**-23)
+"""Slack of the border test, as in ``geometry.local_to_ndc``."""
+
+
+@triton.jit
+def _on_plane(us, vs, constants, ray, mpi, number, asked, K: tl.constexpr):
+    """Disparity, u and v of planes of MPIs where rays cross them."""
+    row, at = constants + mpi * FLOATS, 2 * (ray[:, None] * K + mpi)
+    w = number.to(tl.float32) * tl.load(row + STEP, asked, 0.0) + tl.load(row + END, asked, 0.0)
+    u = tl.load(us + at, asked, 0.0) + w * tl.load(us + at + 1, asked, 0.0)
+    v = tl.load(vs + at, asked, 0.0) + w * tl.load(vs + at + 1, asked, 0.0)
+    u = (u - tl.load(row + U0, asked, 0.0)) * tl.load(row + U_SCALE, asked, 0.0) - 1
+    return w, u, (v - tl.load(row + V0, asked, 0.0)) * tl.load(row + V_SCALE, asked, 0.0) - 1
+
+
+@triton.jit
+def begin(ray, exists, firsts, counts, local_origins, local_directions, us, vs, constants, grids, K: tl.constexpr,
+          HEADS: tl.constexpr, HAS_CUBE: tl.constexpr, KEEP_ALL: tl.constexpr):  # fmt: skip
+    """Of each head the number of its first sample, samples, how many of them hold nothing before the first that does,
+    and the ray's origin and direction along its axis."""
+    head = tl.arange(0, HEADS)[None, :]
+    at, has = ray[:, None] * (K + HAS_CUBE) + head, exists[:, None] & (head < K + HAS_CUBE)
+    first, count = tl.load(firsts + at, has, 0).to(tl.int32), tl.load(counts + at, has, 0).to(tl.int32)
+    local_z = 3 * (ray[:, None] * K + head) + 2
+    oz, dz = tl.load(local_origins + local_z, head < K, 0.0), tl.load(local_directions + local_z, head < K, 0.0)
+    done = count * 0
+    if not KEEP_ALL:
+        passes = (head < K) & (count > 0)
+        mpi = tl.where(head < K, head, 0) + count * 0
+        while tl.max(tl.max(passes.to(tl.int32), 1), 0) > 0:
+            number = first - done
+            _, u, v = _on_plane(us, vs, constants, ray, mpi, number, passes, K)
+            plane = tl.load(grids + mpi * INTS + DEPTH, passes, 0).to(tl.int32) - 1 - number
+            passes = passes & ~is_held(grids, mpi, plane, u, v, passes)
+            done += passes.to(tl.int32)
+            passes = passes & (done < count)
+    return first, count, done, oz, dz
+
+
+@triton.jit
+def _choose(first, count, done, oz, dz, constants, cube, K: tl.constexpr, HEADS: tl.constexpr, HAS_CUBE: tl.constexpr,
+            RAYS: tl.constexpr, STEPS: tl.constexpr):  # fmt: skip
+    """The next samples of each ray in the order of distance: head, number, 1/t (-1: none). Equal ones by head."""
+    column, head, every = tl.arange(0, STEPS)[None, :], tl.arange(0, HEADS)[None, :], tl.arange(0, HEADS)
+    is_mpi = (every < K)[None, :]
+    step = tl.load(constants + every * FLOATS + STEP, every < K, 0.0)[None, :]
+    end = tl.load(constants + every * FLOATS + END, every < K, 0.0)[None, :]
+    heads, numbers = tl.zeros([RAYS, STEPS], tl.int32), tl.zeros([RAYS, STEPS], tl.int32)
+    inverse_ts = tl.full([RAYS, STEPS], -1.0, tl.float32)
+    for i in tl.static_range(STEPS):
+        next_ones = tl.where(is_mpi, first - done, first + done)  # m of a plane, or number of the cube's sample
+        w = next_ones.to(tl.float32) * step + end
+        distances = w * dz / (1 - w * oz)
+        if HAS_CUBE:
+            in_cube = 1 / ((tl.maximum(next_ones.to(tl.float32), 0.0) + 0.5) * tl.load(cube + 6))
+            distances = tl.where(is_mpi, distances, in_cube)
+        top, best = tl.max(tl.where(done < count, distances, -1.0), 1, return_indices=True)
+        is_best = (head == best[:, None]) & (done < count)
+        here = column == i
+        heads = tl.where(here, best[:, None].to(tl.int32), heads)
+        numbers = tl.where(here, tl.sum(tl.where(is_best, next_ones, 0), 1)[:, None], numbers)
+        inverse_ts = tl.where(here, top[:, None], inverse_ts)
+        done += is_best.to(tl.int32)
+    return heads, numbers, inverse_ts, done
+
+
+@triton.jit
+def _in_cube(origins, directions, cube, ray, t):
+    """Points in the cube at distances t, normalised to [-1, 1]^3."""
+    at = 3 * ray[:, None]
+    x = tl.load(origins + at) + tl.load(directions + at) * t
+    y = tl.load(origins + at + 1) + tl.load(directions + at + 1) * t
+    z = tl.load(origins + at + 2) + tl.load(directions + at + 2) * t
+    x = 2 * (x - tl.load(cube)) / tl.load(cube + 3) - 1
+    y = 2 * (y - tl.load(cube + 1)) / tl.load(cube + 4) - 1
+    return x, y, 2 * (z - tl.load(cube + 2)) / tl.load(cube + 5) - 1
+
+
+@triton.jit
+def _look_up(origins, directions, us, vs, constants, grids, biases, cube, density, ray, head, number, asked,
+             K: tl.constexpr, HAS_CUBE: tl.constexpr):  # fmt: skip
+    """Plane, NDC and optical depth of samples."""
+    is_mpi = head < K
+    mpi, in_mpi = tl.where(is_mpi, head, 0), asked & is_mpi
+    row = constants + mpi * FLOATS
+    w, u, v = _on_plane(us, vs, constants, ray, mpi, number, in_mpi, K)
+    s = 1 - tl.load(row + S_SCALE) * (w - tl.load(row + END))
+    plane = tl.load(grids + mpi * INTS + DEPTH).to(tl.int32) - 1 - number
+    raw = bilinear(density, grids, mpi, plane, u, v, in_mpi)
+    raw += tl.load(biases + tl.load(grids + mpi * INTS + BIAS) + plane, in_mpi, 0.0)
+    tau = softplus(raw) * tl.load(row + INTERVAL)
+    if HAS_CUBE:
+        in_cube = asked & (head == K)
+        t = (tl.where(in_cube, number, 0).to(tl.float32) + 0.5) * tl.load(cube + 6)
+        x, y, z = _in_cube(origins, directions, cube, ray, t)
+        thick = softplus(trilinear(density, grids, K, x, y, z, in_cube) + tl.load(cube + 7))
+        tau = tl.where(is_mpi, tau, thick * tl.load(cube + 8))
+        u, v, s = tl.where(is_mpi, u, x), tl.where(is_mpi, v, y), tl.where(is_mpi, s, z)
+        plane = tl.where(is_mpi, plane, number)
+    return plane, u, v, s, tau
+
+
+@triton.jit
+def _count_vote(own_vote, highest, others, grids, reliability, touched, k, head, u, v, s, inside, thick):
+    """Adds head k's vote on samples: (mpi vote, highest of the others, sum of e^(other - highest))."""
+    is_own = head == k
+    looked_up = thick & (inside | is_own)
+    vote = trilinear(reliability, grids, k, u, v, s, looked_up)
+    counts = looked_up & (head != k)
+    counts = counts & (tl.load(touched + nearest_row(grids, k, u, v, s, counts), counts, 0) > 0)
+    higher = tl.where(counts, tl.maximum(highest, vote), highest)
+    # -1e30 instead of -infinity: differences of it are numbers.
+    others = tl.where(counts, others * tl.exp(highest - higher) + tl.exp(vote - higher), others)
+    return tl.where(is_own, vote, own_vote), higher, others
+
+
+@triton.jit
+def _blend(origins, directions, local_origins, local_directions, constants, grids, cube, reliability, touched,
+           ray, head, inverse_t, tau, asked, K: tl.constexpr, HAS_CUBE: tl.constexpr):  # fmt: skip
+    """Optical depths after blending (``blending.blend_shares`` and ``blended_optical_depth``)."""
+    thick = asked & (tau > NEGLIGIBLE)
+    own_vote, highest, others = tau * 0, tau * 0 - 1e30, tau * 0
+    for k in range(K):
+        at, mpi = 3 * (ray[:, None] * K + k), constants + k * FLOATS
+        origin, direction = local_origins + at, local_directions + at
+        z = tl.load(origin + 2) * inverse_t + tl.load(direction + 2)
+        ahead = z > 0
+        depth = tl.where(ahead, z, 1.0)
+        u = (tl.load(origin) * inverse_t + tl.load(direction)) / depth - tl.load(mpi + U0)
+        v = (tl.load(origin + 1) * inverse_t + tl.load(direction + 1)) / depth - tl.load(mpi + V0)
+        u, v = u * tl.load(mpi + U_SCALE) - 1, v * tl.load(mpi + V_SCALE) - 1
+        s = 1 - tl.load(mpi + S_SCALE) * (inverse_t / depth - tl.load(mpi + END))
+        inside = (tl.abs(u) <= 1 + ULPS) & (tl.abs(v) <= 1 + ULPS) & (tl.abs(s) <= 1 + ULPS / tl.load(mpi + SHARE))
+        u, v, s = tl.where(ahead, u, 0.0), tl.where(ahead, v, 0.0), tl.where(ahead, s, 0.0)
+        own_vote, highest, others = _count_vote(
+            own_vote, highest, others, grids, reliability, touched, k, head, u, v, s, ahead & inside, thick
+        )
+    if HAS_CUBE:
+        x, y, z = _in_cube(origins, directions, cube, ray, 1 / tl.maximum(inverse_t, NEAREST_ZERO))
+        inside = (inverse_t > 0) & (tl.abs(x) <= 1) & (tl.abs(y) <= 1) & (tl.abs(z) <= 1)
+        own_vote, highest, others = _count_vote(
+            own_vote, highest, others, grids, reliability, touched, K, head, x, y, z, inside, thick
+        )
+    sole = others == 0
+    odds = tl.where(sole, 0.0, highest - own_vote + tl.log(tl.where(sole, 1.0, others)))
+    log_share, log_rest = -softplus(odds), -softplus(-odds)
+    alpha, lower = one_minus_exp(tau) * tl.exp(log_share), log_share - tau
+    opaque = tl.maximum(log_rest, lower) + softplus(-tl.abs(log_rest - lower))
+    blended = tl.where(alpha < 0.5, minus_log_of_rest(tl.minimum(alpha, 0.5)), tl.maximum(-opaque, 0.0))
+    blended = tl.where(sole, tau, blended)
+    return tl.where(thick, blended, tau / (K + HAS_CUBE))
+
+
+@triton.jit
+def next_samples(
+    ray, goes_on, first, count, done, oz, dz, origins, directions, local_origins, local_directions, us, vs,
+    constants, grids, biases, cube, density, reliability, touched,
+    K: tl.constexpr, HEADS: tl.constexpr, HAS_CUBE: tl.constexpr, BLENDS: tl.constexpr, RAYS: tl.constexpr,
+    STEPS: tl.constexpr,
+):  # fmt: skip
+    """The next samples of rays that go on: whether there is one, its head, plane, NDC, 1/t and optical depth."""
+    head, number, inverse_t, done = _choose(
+        first, count, done, oz, dz, constants, cube, K, HEADS, HAS_CUBE, RAYS, STEPS
+    )
+    met = (inverse_t >= 0) & goes_on[:, None]
+    plane, u, v, s, tau = _look_up(
+        origins, directions, us, vs, constants, grids, biases, cube, density, ray, head, number, met, K, HAS_CUBE
+    )
+    if BLENDS:
+        tau = _blend(
+            origins, directions, local_origins, local_directions, constants, grids, cube, reliability, touched,
+            ray, head, inverse_t, tau, met, K, HAS_CUBE,
+        )  # fmt: skip
+    return met, head, plane, u, v, s, inverse_t, tl.where(met, tau, 0.0), done
+
+
+@triton.jit
+def before(values, STEPS: tl.constexpr):
+    """Sum of the earlier columns. Summed, not subtracted: x - x loses what came before a large x."""
+    i = tl.arange(0, STEPS)
+    earlier = (i[:, None] > i[None, :])[None, :, :]
+    return tl.sum(tl.where(earlier, values[:, None, :], 0), 2)
