@@ -238,12 +238,18 @@ class Preparation:
         photos = [p for p in self.photos if p.name in names]
         split = self._split([p.name for p in photos])
         findings = self._findings(model, photos, database)
-        grave = [f"{f.says[:1].upper()}{f.says[1:]}." for f in findings if f.is_grave]
-        if grave and self.known_poses is None and verdict.grade == "right":
-            verdict = Verdict("doubtful", tuple(grave))
         folder, masks, flat, built = self.image_folder, self.masks, self.work / "undistorted", self.work / "scene"
         shutil.rmtree(flat, ignore_errors=True)
         shutil.rmtree(built, ignore_errors=True)
+        moves, says = {}, "masks given" if masks else "not looked for"
+        if s.moving == "mask" and masks is None:
+            moves, says = self._mask_moving(model, photos, split)
+            masks = self.work / "moving" if moves else None
+        if s.moving != "warn":
+            findings = [f for f in findings if f.kind != "moving?" or (s.moving == "mask" and f.image not in moves)]
+        grave = [f"{f.says[:1].upper()}{f.says[1:]}." for f in findings if f.is_grave]
+        if grave and self.known_poses is None and verdict.grade == "right":
+            verdict = Verdict("doubtful", tuple(grave))
         if s.undistort:
             model, photos = export.undistort(model, photos, folder, masks, flat, s.threads)
             folder, masks = flat / "images", flat / "masks" if masks else None
@@ -257,6 +263,7 @@ class Preparation:
             "verdict": f"{verdict.grade} {verdict.words()}".strip(),
             "focal length": "given" if self.focal is None else focal_in_words(*self.focal),
             "exposure": report.exposure_in_words([built / "images" / p.name for p in photos]),
+            "what moves": says,
             "up": frame.up,
             "unit": frame.unit,
             "split": f"{len(split.train)} train, {len(split.test)} test: {split.says}",
@@ -275,6 +282,23 @@ class Preparation:
         report.write_report(model, s.input.name, rows, findings, warnings, notes, built)
         publish(built, s, findings, model, verdict, split)
         return verdict
+
+    def _mask_moving(
+        self, model: pycolmap.Reconstruction, photos: Sequence[Photo], split: export.Split
+    ) -> tuple[dict[str, float], str]:
+        """Masks what moves; the masked share of each image that has any, and a sentence."""
+        from mmpi_ns.prepare.moving import write_masks  # imports nerfstudio, which takes seconds
+
+        picture = self.work / "scene" / "report" / "moving.jpg"
+        moves = write_masks(
+            model, photos, split.train, self.image_folder, self.work / "moving", picture, self.settings.threads
+        )
+        if not moves:
+            return {}, "nothing is seen to move"
+        share = sum(moves.values()) / len(split.train)
+        says = f"{share:.1%} of the training pixels, in {len(moves)} of {len(split.train)} images, are masked"
+        say(f"What moves: {says}; report/moving.jpg shows them.")
+        return moves, says
 
     def _split(self, names: Sequence[str]) -> export.Split:
         s = self.settings

@@ -65,6 +65,7 @@ def write_report(
         "\n## Warnings\n",
         "\n".join(f"- {w}" for w in warnings) or "None.",
         "\n## Track from above\n\n![track](report/track.png)\n",
+        *(["## What moves\n\n![masks](report/moving.jpg)\n"] if (scene / "report/moving.jpg").is_file() else []),
         "## Cameras\n",
         *(
             f"- {c.model.name} {c.width}x{c.height}: {c.params_info} = {', '.join(f'{v:.5g}' for v in c.params)}"

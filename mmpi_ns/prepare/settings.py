@@ -28,6 +28,9 @@ class Settings:
     """Folder for the scene."""
     masks: Path | None = None
     """Folder of masks named like the images; black is left out, in SfM and in training."""
+    moving: Literal["mask", "warn", "keep"] = "mask"
+    """What to do about what moves in the training images, unless --masks are given: mask it in training, warn, or
+    neither."""
     poses: Path | None = None
     """Known poses: a KITTI or TUM file, a transforms.json, or a folder of 4x4 text files."""
     poses_format: Literal["auto", "kitti", "tum", "transforms", "matrices"] = "auto"

@@ -1,0 +1,177 @@
+"""What moves in the images of a scene: cars and people that no static scene explains, as masks.
+
+Every image is compared with its neighbours at reduced size (``moving_evidence.py``); what is left over grows to objects
+(``moving_objects.py``). A second pass looks again near images in which something moves, without what moves in them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from nerfstudio.utils.rich_utils import CONSOLE
+from numpy.typing import NDArray
+from rich.progress import track
+
+from mmpi_ns.capture.cache import Arrays, digest, remembered
+from mmpi_ns.capture.dataset import MMPIDataset
+from mmpi_ns.capture.dense import Depth, Parallax, Progress, find_depths
+from mmpi_ns.capture.known_depth import straightened
+from mmpi_ns.capture.moving_evidence import Bytes, Mask, Shot, evidence, ground_of, has_impossible_depth
+from mmpi_ns.capture.moving_objects import followed, grown, seeds
+from mmpi_ns.capture.observe import posed_images
+from mmpi_ns.capture.originals import at_full_size
+from mmpi_ns.capture.tracks import PosedImages
+from mmpi_ns.capture.views import View, look_up, straightened_color
+from mmpi_ns.placement.observations import Observations
+from mmpi_ns.scene.near_views import nearest_views
+from mmpi_ns.utils.parallel import num_threads, one_thread_each
+
+SIDE = 384
+"""Longer side of the images at which is compared, pixels."""
+RANKS = (0, 1, 2, 3, 5, 8)
+"""Neighbours that an image is compared with, by nearness: farther ones see what something slow hides from near ones."""
+MAX_ANGLE = 40.0
+"""Degrees between the facing directions of images that are compared."""
+AFTER = 2
+"""Nearest neighbours from which objects are followed."""
+EDGE = 0.4
+"""Share of a mover around a pixel from which it is masked."""
+VERSION = 2
+"""Version of the algorithm: cached masks of another version are found anew."""
+ENOUGH = 200
+"""Pixels of one depth in both images from which their exposures are compared."""
+
+
+@dataclass(frozen=True)
+class MovingObjects:
+    """Masks of what moves in each image, in its view at working size."""
+
+    views: list[View]
+    masks: list[Mask]
+
+    @property
+    def share(self) -> float:
+        """Share of all pixels."""
+        return sum(int(m.sum()) for m in self.masks) / max(1, sum(m.size for m in self.masks))
+
+
+def find_moving(
+    images: PosedImages,
+    points_of: Callable[[int], NDArray[np.float64]],
+    progress: Progress = lambda work, _: work,
+) -> MovingObjects:
+    """What moves in images, by as many threads as torch has; their number does not change it.
+
+    Args:
+        images: in their originals.
+        points_of: SfM points [P, 3] that an image saw.
+        progress: wraps the images as they are worked on.
+    """
+    width = round(SIDE * float(np.median(np.minimum(1, images.sizes[:, 0] / images.sizes[:, 1]))))
+    pairs = find_depths(images, points_of, width, progress=progress)
+    up = images.camera_to_worlds[:, :, 1].mean(0)
+    up /= max(float(np.linalg.norm(up)), 1e-12)
+    shots = [shot_of(images, i, view, depth, up) for i, (view, depth) in enumerate(pairs)]
+    near = []
+    for i in range(len(shots)):
+        nearest = nearest_views(images.camera_to_worlds, i, RANKS[-1] + 1, MAX_ANGLE)
+        near.append([nearest[rank] for rank in RANKS if rank < len(nearest)])
+    masks = [np.zeros(shot.view.gray.shape, bool) for shot in shots]
+    with one_thread_each(), ThreadPoolExecutor(num_threads()) as pool:
+        first = list(pool.map(lambda i: _moves(shots, near[i], i, masks, None), range(len(shots))))
+        masks = [mask for mask, _ in first]
+        again = [i for i in range(len(shots)) if any(masks[j].any() for j in (i, *near[i]))]
+        second = list(pool.map(lambda i: _moves(shots, near[i], i, masks, first[i][1]), again))
+        for i, (mask, _) in zip(again, second, strict=True):
+            masks[i] = mask
+    return MovingObjects([shot.view for shot in shots], masks)
+
+
+def in_image(view: View, mask: Mask, images: PosedImages, i: int, shape: tuple[int, int]) -> Mask:
+    """A mask of an image's view as a mask of the image itself, lens included.
+
+    Args:
+        view: the image at working size.
+        mask: of the view.
+        images: the originals.
+        i: the image's place in them.
+        shape: height and width that are asked for; the image may be a copy of another size.
+    """
+    x, y = straightened(images, i, shape, shape)
+    fx, fy, cx, cy = view.pinhole
+    at = ((fx * x + cx).reshape(shape), (fy * y + cy).reshape(shape))
+    return look_up(mask.astype(np.float32), *at) > EDGE
+
+
+def moving_masks(observations: Observations, dataset: MMPIDataset) -> list[Mask]:
+    """What moves in each training image [H, W], from the cache if possible; nothing where lenses cannot be undone."""
+    shapes = [(int(h), int(w)) for w, h in observations.sizes]
+    posed = posed_images(observations, dataset)
+    if posed is None:
+        return [np.zeros(shape, bool) for shape in shapes]
+    original, tracked = at_full_size(posed), len(observations.seen_at)
+    seen_by, points = observations.seen_by[:tracked], observations.points[observations.seen_point[:tracked]]
+
+    def find() -> Arrays:
+        CONSOLE.print(f"Looking for what moves in {len(shapes)} images.")
+        shown = find_moving(
+            original, lambda i: points[seen_by == i],
+            progress=lambda work, count: track(work, "Movers", count, console=CONSOLE),
+        )  # fmt: skip
+        views = zip(shown.views, shown.masks, shapes, strict=True)
+        return {f"{i}": np.packbits(in_image(v, m, original, i, s)) for i, (v, m, s) in enumerate(views)}
+
+    cameras = original.camera_to_worlds, original.intrinsics, original.distortion, original.fisheye
+    stored = remembered(digest(original.files, "moving", VERSION, shapes, *cameras, seen_by, points), find)
+    return [
+        np.unpackbits(np.asarray(stored[f"{i}"], np.uint8), count=h * w).reshape(h, w).astype(bool)
+        for i, (h, w) in enumerate(shapes)
+    ]
+
+
+def shot_of(images: PosedImages, i: int, view: View, depth: Depth, up: NDArray[np.float64]) -> Shot:
+    """An image at working size."""
+    color = cv2.GaussianBlur(straightened_color(images, i, view), (0, 0), 1.0)
+    ground, horizon = ground_of(view, depth, up), None
+    if ground is not None:
+        fx, fy, cx, cy = view.pinhole
+        right, down, ahead = np.array([1, -1, -1]) * (view.pose[:, :3].T @ up)
+        x = (np.arange(view.gray.shape[1]) + 0.5 - cx) / fx
+        horizon = cy - fy * (right * x + ahead) / down
+    return Shot(view, np.asarray(color, np.uint8), depth, ground, horizon)
+
+
+def at_exposure_of(shot: Shot, other: Shot) -> Bytes:
+    """Colours of another shot at the exposure of this one, by what both show at one depth. [h, w, 3]"""
+    inverse = shot.depth.inverse
+    x, y, ahead = Parallax.between(shot.view, other.view).pixels(inverse)
+    theirs = look_up(other.depth.inverse, x, y, nearest=True)
+    same = (inverse > 0) & (ahead > 0) & (np.abs(theirs * ahead - inverse) < 0.05 * inverse)
+    if same.sum() < ENOUGH:
+        return other.color
+    logarithms = [np.log(c[same] + 2.0) for c in (shot.color, look_up(other.color, x, y))]
+    gain = np.exp(np.median(logarithms[0] - logarithms[1], 0))
+    return np.rint(other.color * gain).clip(0, 255).astype(np.uint8)
+
+
+def _moves(
+    shots: Sequence[Shot], near: Sequence[int], i: int, masks: Sequence[Mask], impossible: Mask | None
+) -> tuple[Mask, Mask]:
+    """What moves in an image, where it is known what moves in others, and where it has impossible depths."""
+    shot, others = shots[i], [shots[j] for j in near]
+    colors = [at_exposure_of(shot, other) for other in others]
+    if impossible is None:
+        impossible = has_impossible_depth(shot, others, colors)
+    shown = evidence(shot, others, colors, [masks[j] for j in near], impossible)
+    core = np.zeros(shot.view.gray.shape, bool)
+    if len(others) >= 2:
+        core |= seeds(shot, others, colors, shown)
+        flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+        for j in near[:AFTER]:
+            if masks[j].any():
+                core |= followed(shot, shots[j], masks[j], flow)
+    return grown(shot, shown, core), impossible

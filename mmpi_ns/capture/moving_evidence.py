@@ -1,0 +1,275 @@
+"""Evidence that a pixel shows something that moves, from neighbouring images, their depths and the ground.
+
+A static point looks alike in all images that see it. So each pixel is compared with its neighbours at every inverse
+depth that a static point there may have: that of the pixel or of what is next to it, those that the neighbours' depths
+put there, the ground's, and infinity. What none of them explains is unexplained; it moves if two neighbours agree about
+something else behind it, or if it is explained by a depth that is impossible: below the ground or behind the camera, as
+of a car ahead that keeps its distance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mmpi_ns.capture.dense import Depth, Parallax
+from mmpi_ns.capture.views import Map, View, look_up, pixel_grid
+
+Bytes = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
+
+SAME = 12
+"""Levels by which colours of one surface differ, beyond the range of colours of the pixels around."""
+ALIKE = 8
+"""Levels up to which an impossible depth explains a pixel."""
+IMPOSSIBLE = (0.0, 0.5, -0.5)
+"""Depths below the ground that are tried, as multiples of its inverse depth."""
+SOLID = 0.75
+"""Inverse depths below this multiple of the ground's lie below the ground."""
+SLOPE = 0.05
+"""Tangent of the angle below the horizon from which a pixel may show the ground only: roads rise and fall."""
+STEEP = 20.0
+"""Degrees between the normal of the ground and up."""
+GROUND_SHARE, BELOW_SHARE = 0.08, 0.03
+"""Share of the known depths that lie on the ground, at least, and below it, at most."""
+OCCLUDES, NEAR = 1.15, 13
+"""A neighbour shows a point if its inverse depth there is the same but for this factor; depths are asked for in a
+window of so many pixels."""
+NEAREST = 95
+"""Percentile of an image's inverse depths that stands for the nearest content."""
+CONSTANT = 3
+"""Neighbours, at least, that an impossible depth explains."""
+CLEARLY, WINDOW = 80, 5
+"""Levels beyond which a larger difference says no more, and side of the window over which differences are averaged."""
+NOISE = 75
+"""Percentile of the differences of surfaces of known depth that stands for the noise; some of them move."""
+ALL = 255
+
+
+@dataclass(frozen=True)
+class Shot:
+    """An image at working size, with what is known of it."""
+
+    view: View
+    color: Bytes
+    """Blue, green, red, a little blurred. [h, w, 3]"""
+    depth: Depth
+    ground: Map | None
+    """Inverse depth of the ground, 0 near the horizon and above; None where no ground is found. [h, w]"""
+    horizon: NDArray[np.float64] | None = None
+    """Row of the horizon in each column, where a ground is found. [w]"""
+
+    @cached_property
+    def around(self) -> Map:
+        """Inverse depth of the nearest pixel that has one, 0 where none is near. [h, w]"""
+        near = cv2.dilate((self.depth.inverse > 0).astype(np.uint8), np.ones((NEAR, NEAR), np.uint8)) > 0
+        return np.where(near, nearest_known(self.depth.inverse), 0) if near.any() else self.depth.inverse
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Levels from 0 to 255. [h, w] each"""
+
+    strong: Bytes
+    """By which a pixel differs from every neighbour at every possible depth, though neighbours agree about what is
+    behind it or it has an impossible depth."""
+    weak: Bytes
+    """By which it differs from all neighbours but one, two of which agree about what is behind it."""
+    behind: Bytes
+    """By which it differs from what two neighbours agree to be behind it."""
+    noise: float
+    """Levels by which surfaces of known depth differ from all neighbours but one, most of them."""
+
+
+def ground_of(view: View, depth: Depth, up: NDArray[np.float64]) -> Map | None:
+    """Inverse depth of the plane on which most of the content stands; 0 near the horizon and above.
+
+    Args:
+        view: the image.
+        depth: its depths.
+        up: unit vector in the world. [3]
+    """
+    rows, columns = np.nonzero(depth.inverse > 0)
+    random = np.random.default_rng(0)
+    kept = random.permutation(len(rows))[:3000]
+    rows, columns = rows[kept], columns[kept]
+    x, y = pixel_grid(view.gray.shape)
+    fx, fy, cx, cy = view.pinhole
+    rays = np.stack([(x - cx) / fx, (y - cy) / fy, np.ones_like(x)], -1).astype(np.float64)
+    v, q = rays[rows, columns], depth.inverse[rows, columns].astype(np.float64)
+    upward = np.array([1, -1, -1]) * (view.pose[:, :3].T @ up)
+    low = np.flatnonzero(v @ upward < -SLOPE)
+    if len(low) < GROUND_SHARE * len(q) + 50:
+        return None
+    corners = low[random.integers(0, len(low), (300, 3))]
+    corners = corners[np.abs(np.linalg.det(v[corners])) > 1e-5]
+    planes = np.linalg.solve(v[corners], q[corners][..., None])[..., 0]
+    level = -(planes @ upward) > np.cos(np.radians(STEEP)) * np.linalg.norm(planes, axis=-1)
+    planes = planes[level]
+    if not len(planes):
+        return None
+    expected, error = v @ planes.T, (2 * depth.error[rows, columns] + 0.03 * q)[:, None]
+    on, below = np.abs(expected - q[:, None]) < error, expected > q[:, None] + 2 * error
+    best = int((on.sum(0) - below.sum(0)).argmax())
+    if on[:, best].mean() < GROUND_SHARE or below[:, best].mean() > BELOW_SHARE:
+        return None
+    chosen = on[:, best]
+    weight = 1 / error[chosen, 0]
+    plane = np.linalg.lstsq(v[chosen] * weight[:, None], q[chosen] * weight, rcond=None)[0]
+    # Where the ground slopes otherwise than here, a pixel just below the horizon may show something else.
+    seen = (rays @ upward < -SLOPE) & (rays @ plane > 0)
+    return np.where(seen, rays @ plane, 0).astype(np.float32)
+
+
+def splat(shot: Shot, other: Shot) -> Map:
+    """Inverse depths at the pixels of a shot from those of another one, the nearest of several on one. [h, w]"""
+    height, width = shot.view.gray.shape
+    x, y, ahead = Parallax.between(other.view, shot.view).pixels(other.depth.inverse)
+    inverse = np.where(ahead > 0, other.depth.inverse / np.where(ahead > 0, ahead, 1), 0)
+    inside = (x >= 0) & (x < width) & (y >= 0) & (y < height) & (inverse > 0)
+    values = inverse[inside]
+    order = np.argsort(values, kind="stable")
+    at = (y[inside].astype(int) * width + x[inside].astype(int))[order]
+    result = np.zeros(height * width, np.float32)
+    result[at] = values[order]  # the last one written stays
+    result = result.reshape(height, width)
+    for _ in range(2):
+        result = np.where(result > 0, result, cv2.dilate(result, np.ones((3, 3), np.uint8)))
+    return result
+
+
+def nearest_known(inverse: Map) -> Map:
+    """Every pixel's inverse depth, or that of the nearest pixel that has one. [h, w]"""
+    known = inverse > 0
+    _, label = cv2.distanceTransformWithLabels(
+        (~known).astype(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    table = np.zeros(int(label.max()) + 1, np.float32)
+    table[label[known]] = inverse[known]
+    return table[np.asarray(label, np.int64)]
+
+
+def possible_depths(shot: Shot, others: Sequence[Shot]) -> tuple[list[Map], list[Map]]:
+    """Inverse depths that a static point may have, 0 where there is none: those from the image itself, and those of
+    surfaces that other images or the ground put there."""
+    splats = np.stack([splat(shot, other) for other in others])
+    farthest = np.where(splats > 0, splats, np.inf).min(0)
+    behind = [np.where(np.isfinite(farthest), farthest, 0).astype(np.float32), splats.max(0)]
+    if shot.ground is not None:
+        behind.append(shot.ground)
+    inverse, mine = shot.depth.inverse, [np.full_like(shot.depth.inverse, 1e-9)]
+    if inverse.any():
+        mine += [nearest_known(inverse), cv2.dilate(inverse, np.ones((11, 11), np.uint8))]
+    return mine, behind
+
+
+@dataclass(frozen=True)
+class _Comparison:
+    """A shot against its neighbours at some inverse depths."""
+
+    distance: Bytes
+    """Levels by which colours differ, ALL where the neighbour shows nothing, the smallest first. [n, h, w]"""
+    pair: Bytes
+    """Levels by which a shot differs from both of two neighbours that agree and have nothing in front. [h, w]"""
+
+
+def _compare(
+    shot: Shot, others: Sequence[Shot], colors: Sequence[Bytes], masks: Sequence[Mask | None], inverse: Map, pairs: bool
+) -> _Comparison:
+    kernel, three = np.ones((3, 3), np.uint8), shot.color
+    distances, warped, free = [], [], []
+    for other, color, mask in zip(others, colors, masks, strict=True):
+        x, y, ahead = Parallax.between(shot.view, other.view).pixels(inverse)
+        height, width = other.view.gray.shape
+        inside = (x > 1) & (x < width - 1) & (y > 1) & (y < height - 1) & (ahead > 0)
+        shown = look_up(usable(other, mask), x, y, nearest=True) > 0
+        inside &= shown
+        there = look_up(color, x, y)
+        low, high = cv2.erode(there, kernel), cv2.dilate(there, kernel)
+        apart = most_of_channels(cv2.max(cv2.subtract(low, three), cv2.subtract(three, high)))
+        apart = np.asarray(cv2.blur(np.minimum(apart, CLEARLY), (WINDOW, WINDOW)))
+        distances.append(np.where(inside, apart, ALL).astype(np.uint8))
+        if pairs:
+            theirs = look_up(other.around, x, y, nearest=True) * ahead
+            free.append(inside & (theirs <= OCCLUDES * inverse) & (theirs * OCCLUDES >= inverse))
+            warped.append(there)
+    pair = np.zeros(inverse.shape, np.uint8)
+    for a in range(len(warped)):
+        for b in range(max(0, a - 2), a):
+            agree = free[a] & free[b] & (most_of_channels(cv2.absdiff(warped[a], warped[b])) < SAME)
+            away = cv2.min(distances[a], distances[b])
+            pair = np.maximum(pair, np.where(agree, away, 0)).astype(np.uint8)
+    return _Comparison(np.sort(np.stack(distances), 0), pair)
+
+
+def most_of_channels(apart: NDArray[Any]) -> Bytes:
+    """The largest of three channels; NumPy takes three times as long. [h, w]"""
+    blue, green, red = cv2.split(apart)
+    return np.asarray(cv2.max(cv2.max(blue, green), red), np.uint8)
+
+
+def usable(shot: Shot, mask: Mask | None) -> Bytes:
+    """Where the lens shows something that is not known to move. [h, w]"""
+    inside = shot.view.inside if mask is None else shot.view.inside & ~mask
+    return np.ascontiguousarray(inside, np.uint8)
+
+
+def has_impossible_depth(shot: Shot, others: Sequence[Shot], colors: Sequence[Bytes]) -> Mask:
+    """Where a depth below the ground or behind the camera explains a shot's pixels, of these neighbours. [h, w]"""
+    result = np.zeros(shot.view.gray.shape, bool)
+    for share in IMPOSSIBLE if shot.ground is not None and others else ():
+        inverse = share * shot.ground - 1e-9  # type: ignore[operator]
+        distance = _compare(shot, others, colors, [None] * len(others), inverse, False).distance
+        result |= (distance[min(CONSTANT, len(others)) - 1] < ALIKE) & (shot.ground > 0)  # type: ignore[operator]
+    return result
+
+
+def evidence(
+    shot: Shot, others: Sequence[Shot], colors: Sequence[Bytes], masks: Sequence[Mask | None], impossible: Mask
+) -> Evidence:
+    """What of a shot no static scene explains.
+
+    Args:
+        shot: the image.
+        others: its neighbours.
+        colors: of each neighbour, at this image's exposure. [h, w, 3]
+        masks: what moves in each neighbour, as far as is known. [h, w]
+        impossible: by ``has_impossible_depth``. [h, w]
+    """
+    shape = shot.view.gray.shape
+    if len(others) < 2:
+        nothing = np.zeros(shape, np.uint8)
+        return Evidence(nothing, nothing, nothing, 0.0)
+    one, two, behind = np.full(shape, ALL, np.uint8), np.full(shape, ALL, np.uint8), np.zeros(shape, np.uint8)
+    mine, surfaces = possible_depths(shot, others)
+    for n, inverse in enumerate(mine + surfaces):
+        found = _compare(shot, others, colors, masks, inverse, n >= len(mine))
+        possible = inverse > 0
+        if shot.ground is not None:
+            possible &= inverse >= SOLID * shot.ground
+        one = np.where(possible, np.minimum(one, found.distance[0]), one)
+        two = np.where(possible, np.minimum(two, found.distance[1]), two)
+        behind = np.where(possible, np.maximum(behind, found.pair), behind)
+    decided = _would_be_seen(shot, others) & shot.view.inside
+    strong = np.where(decided & (one < ALL), np.minimum(one, np.where(impossible, ALL, behind)), 0).astype(np.uint8)
+    weak = np.where(decided & (two < ALL), np.minimum(two, behind), 0).astype(np.uint8)
+    known = two[(shot.depth.inverse > 0) & (two < ALL)]
+    return Evidence(strong, weak, behind, float(np.percentile(known, NOISE)) if len(known) else 0.0)
+
+
+def _would_be_seen(shot: Shot, others: Sequence[Shot]) -> Mask:
+    """Where at least two neighbours would show even the nearest content: elsewhere nobody can tell. [h, w]"""
+    known = shot.depth.inverse[shot.depth.inverse > 0]
+    nearest = np.full(shot.view.gray.shape, np.percentile(known, NEAREST) if len(known) else 0, np.float32)
+    count = np.zeros(nearest.shape, np.uint8)
+    for other in others:
+        x, y, ahead = Parallax.between(shot.view, other.view).pixels(nearest)
+        height, width = other.view.gray.shape
+        count += (x > 0) & (x < width) & (y > 0) & (y < height) & (ahead > 0)
+    return count >= 2

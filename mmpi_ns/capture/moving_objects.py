@@ -1,0 +1,165 @@
+"""Whole objects from scattered evidence that something moves: seeds, growth along edges, following from image to image.
+
+Conservative where it is doubtful: a seed is an area, not a line, that no depth explains at which two neighbours agree,
+and that two neighbours would show at any depth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mmpi_ns.capture.dense import Parallax, correlation
+from mmpi_ns.capture.moving_evidence import ALL, SOLID, Bytes, Evidence, Mask, Shot
+from mmpi_ns.capture.views import look_up, pixel_grid
+
+LEAST_LEVELS, NOISES = 12.0, 4.0
+"""Levels of strong evidence from which a pixel is a seed: the first, plus this multiple of the image's noise."""
+WEAKER = 1.3
+"""Times as many levels of weak evidence make a seed."""
+STEPS, REACH = 48, 1.2
+"""Inverse depths at which seeds are searched in the neighbours, up to this multiple of the nearest content's."""
+DENSITY, AROUND = 0.35, 7
+"""Share of seeds in a window of this many pixels around a seed that is kept."""
+LEAST_PIXELS, LEAST_SIDE = 20, 4
+"""Seeds of an object, and the shorter side of what they span, pixels at working size."""
+TOGETHER = 15
+"""Pixels across which seeds belong to one object."""
+TALL = 1.15
+"""Height of an object over that of the camera, at most."""
+CERTAIN = 10
+"""Levels of evidence up to which a pixel of known depth is static."""
+ITERATIONS = 3
+"""Of GrabCut."""
+FOLLOWED = 0.7
+"""Correlation with the neighbour from which an object is followed."""
+
+
+def seeds(shot: Shot, others: Sequence[Shot], colors: Sequence[Bytes], evidence: Evidence) -> Mask:
+    """Pixels that show something that moves, beyond doubt. [h, w]"""
+    least = LEAST_LEVELS + NOISES * evidence.noise
+    candidates = (evidence.strong > least) | (evidence.weak > WEAKER * least)
+    result = candidates.copy()
+    result[candidates] = unexplained(shot, others, colors, candidates) > least
+    share = cv2.boxFilter(result.astype(np.float32), -1, (AROUND, AROUND))
+    return result & (share > DENSITY)
+
+
+def unexplained(shot: Shot, others: Sequence[Shot], colors: Sequence[Bytes], candidates: Mask) -> NDArray[np.uint8]:
+    """Levels by which some pixels differ from all neighbours but one, at the depth where they differ least. [P]
+
+    0 where two neighbours show nothing at one of the depths: nobody can tell.
+    """
+    rows, columns = np.nonzero(candidates)
+    known = shot.depth.inverse[shot.depth.inverse > 0]
+    if not len(rows) or not len(known):
+        return np.zeros(len(rows), np.uint8)
+    inverse = np.linspace(0, REACH * np.percentile(known, 98), STEPS, dtype=np.float32)[:, None]
+    if shot.ground is not None:
+        inverse = np.maximum(inverse, SOLID * shot.ground[rows, columns])
+    color, kernel = shot.color[rows, columns].astype(np.int16), np.ones((3, 3), np.uint8)
+    distances = []
+    for other, theirs in zip(others, colors, strict=True):
+        parallax = Parallax.between(shot.view, other.view)
+        right, down, ahead = (
+            (m[0] * (columns + 0.5) + m[1] * (rows + 0.5) + m[2]).astype(np.float32) + inverse * b
+            for m, b in zip(parallax.linear, parallax.b, strict=True)
+        )
+        height, width = other.view.gray.shape
+        ahead = np.where(ahead > 1e-6, ahead, np.nan)
+        with np.errstate(invalid="ignore"):
+            inside = (right >= ahead) & (right < (width - 1) * ahead) & (down >= ahead) & (down < (height - 1) * ahead)
+        x, y = (np.where(inside, part / ahead, 0).astype(np.int32) for part in (right, down))
+        low, high = cv2.erode(theirs, kernel)[y, x].astype(np.int16), cv2.dilate(theirs, kernel)[y, x]
+        apart = np.maximum(low - color, color - high).max(-1).clip(0, ALL - 1)
+        distances.append(np.where(inside, apart, ALL).astype(np.uint8))
+    ordered = np.sort(np.stack(distances), 0)
+    seen = (ordered[1] < ALL).all(0)
+    return np.where(seen, ordered[1].min(0), 0).astype(np.uint8)
+
+
+def grown(shot: Shot, evidence: Evidence, core: Mask) -> Mask:
+    """The objects that seeds lie on, by GrabCut in a box around them. [h, w]"""
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (TOGETHER, TOGETHER))
+    number, labels = cv2.connectedComponents(cv2.dilate(core.astype(np.uint8), kernel))
+    static = (shot.depth.inverse > 0) & (evidence.behind < CERTAIN) & (evidence.weak < CERTAIN)
+    if shot.ground is not None:
+        static &= shot.depth.inverse > SOLID * shot.ground
+    result = np.zeros_like(core)
+    for label in range(1, number):
+        part = core & (labels == label)
+        rows, columns = np.nonzero(part)
+        if len(rows) >= LEAST_PIXELS and min(np.ptp(rows), np.ptp(columns)) >= LEAST_SIDE:
+            result |= _object(shot, part, static)
+    return result
+
+
+def _object(shot: Shot, part: Mask, static: Mask) -> Mask:
+    """The object of some seeds."""
+    height, width = part.shape
+    rows, columns = np.nonzero(part)
+    left, right, top, bottom = columns.min(), columns.max() + 1, rows.min(), rows.max() + 1
+    highest = top - 0.3 * (bottom - top)
+    horizon = bottom if shot.horizon is None else float(shot.horizon[left:right].mean())
+    body = top
+    if bottom > horizon:  # something that stands on the ground, as seen from the camera's height
+        highest = min(top - 0.1 * (bottom - top), bottom - TALL * (bottom - horizon))
+        body = min(top, round(bottom - 0.8 * (bottom - horizon)))
+    aside = max(3, round(0.12 * (right - left)))
+    box = np.zeros_like(part)
+    box[max(0, int(highest)) : bottom + 2, max(0, left - aside) : right + aside] = True
+    labels = np.full(part.shape, cv2.GC_BGD, np.uint8)
+    labels[box & ~static] = cv2.GC_PR_FGD
+    labels[part] = cv2.GC_FGD
+    margin = max(8, round(0.3 * max(right - left, bottom - max(0, int(highest)))))
+    inside = np.s_[
+        max(0, int(highest) - margin) : min(height, bottom + margin),
+        max(0, left - margin) : min(width, right + margin),
+    ]
+    cut = np.ascontiguousarray(labels[inside])
+    cv2.setRNGSeed(0)
+    if (cut == cv2.GC_BGD).any():
+        models = np.zeros((1, 65)), np.zeros((1, 65))
+        cv2.grabCut(np.ascontiguousarray(shot.color[inside]), cut, None, *models, ITERATIONS, cv2.GC_INIT_WITH_MASK)  # type: ignore[call-overload]
+    result = np.zeros_like(part)
+    result[inside] = (cut == cv2.GC_FGD) | (cut == cv2.GC_PR_FGD)
+    # The colours of an object may be those around it; what stands in the columns above its seeds is its body.
+    columns_of = part.any(0)
+    first, last = part.argmax(0), height - 1 - part[::-1].argmax(0)
+    y = np.arange(height)[:, None]
+    result |= columns_of & (y >= np.minimum(first, body)) & (y <= last) & ~static
+    result = cv2.morphologyEx(result.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8)) > 0
+    return without_holes(_touching(result, part))
+
+
+def _touching(mask: Mask, part: Mask) -> Mask:
+    """The connected parts of a mask that hold a pixel of another."""
+    _, labels = cv2.connectedComponents(mask.astype(np.uint8))
+    return np.isin(labels, np.setdiff1d(labels[part & mask], [0]))
+
+
+def without_holes(mask: Mask) -> Mask:
+    """A mask and all that it encloses."""
+    outside = cv2.copyMakeBorder((~mask).astype(np.uint8), 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=(1.0,))
+    _, labels = cv2.connectedComponents(outside, connectivity=4)
+    return (labels != labels[0, 0])[1:-1, 1:-1]
+
+
+def followed(shot: Shot, other: Shot, mask: Mask, flow: cv2.DISOpticalFlow) -> Mask:
+    """Where a shot shows what moves in another one, by optical flow there and back. [h, w]"""
+    height, width = shape = shot.view.gray.shape
+    whole = np.maximum(shape, other.view.gray.shape)  # the flow needs images of one size
+    grays = [
+        np.pad(gray, [(0, n - m) for n, m in zip(whole, gray.shape, strict=True)], mode="edge")
+        for gray in (shot.view.gray, other.view.gray)
+    ]
+    there = np.asarray(flow.calc(*grays, None))[:height, :width]  # type: ignore[call-overload]
+    back = np.asarray(flow.calc(*grays[::-1], None))  # type: ignore[call-overload]
+    x, y = pixel_grid(shape)
+    at = x + there[..., 0], y + there[..., 1]
+    returned = np.abs(there + look_up(back, *at)).max(-1) < 1.5
+    alike, _ = correlation(shot.view.gray, look_up(other.view.gray, *at))
+    return returned & (alike > FOLLOWED) & (look_up(mask.astype(np.uint8), *at, nearest=True) > 0)

@@ -1,0 +1,112 @@
+"""Masks of what moves in the training images of a prepared scene."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pycolmap
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+
+from mmpi_ns.capture.moving import MovingObjects, find_moving, in_image
+from mmpi_ns.capture.tracks import PosedImages
+from mmpi_ns.capture.views import straightened_color
+from mmpi_ns.prepare.alignment import camera_poses
+from mmpi_ns.prepare.cameras import read_intrinsics
+from mmpi_ns.prepare.images import Photo
+from mmpi_ns.prepare.stages import progress
+
+SHOWN, COLUMNS, WIDTH = 24, 4, 320
+"""Images in the picture, those in a row, and pixels across each."""
+
+
+def write_masks(
+    model: pycolmap.Reconstruction,
+    photos: Sequence[Photo],
+    train: Sequence[str],
+    images: Path,
+    target: Path,
+    picture: Path,
+    threads: int,
+) -> dict[str, float]:
+    """Finds what moves in the training images; where anything does, writes a mask for each photo and a picture.
+
+    Args:
+        model: poses, cameras and points.
+        photos: all that get a mask, ``target/NAME.png``: white is used. Those of test images are white.
+        train: names of the training images, which alone are compared with each other.
+        images: folder of the images.
+        target: folder for the masks.
+        picture: file for the picture.
+        threads: processor threads; below 1 for all.
+
+    Returns:
+        The share of each image that is masked, of those in which something moves, by name.
+    """
+    if threads > 0:
+        torch.set_num_threads(threads)
+    names, poses = camera_poses(model)
+    kept = [i for i, name in enumerate(names) if name in set(train)]
+    by_name = {image.name: image for image in model.images.values()}
+    entries = [by_name[names[i]] for i in kept]
+    cameras = [model.cameras[entry.camera_id] for entry in entries]
+    lenses = [read_intrinsics(camera) for camera in cameras]
+    posed = PosedImages(
+        files=tuple(images / entry.name for entry in entries),
+        camera_to_worlds=poses[kept][:, :3] @ np.diag([1.0, -1.0, -1.0, 1.0]),
+        intrinsics=np.array([[lens.fx, lens.fy, lens.cx, lens.cy] for lens in lenses]),
+        sizes=np.array([[camera.width, camera.height] for camera in cameras], np.float64),
+        distortion=np.array([lens.distortion for lens in lenses]),
+        fisheye=np.array([lens.fisheye for lens in lenses]),
+    )
+
+    def points_of(i: int) -> NDArray[np.float64]:
+        seen = [model.points3D[p.point3D_id].xyz for p in entries[i].points2D if p.has_point3D()]
+        return np.array(seen).reshape(-1, 3)
+
+    with progress("Looking for what moves", 2 * len(kept)) as advance:
+
+        def told(work: Iterable[Any], _: int) -> Iterator[Any]:
+            for result in work:
+                advance(1)
+                yield result
+
+        shown = find_moving(posed, points_of, told)
+    if not shown.share:
+        return {}
+    target.mkdir(parents=True, exist_ok=True)
+    number, shares = {entry.name: i for i, entry in enumerate(entries)}, {}
+    for photo in photos:
+        shape, i = (photo.height, photo.width), number.get(photo.name)
+        mask = np.zeros(shape, bool)
+        if i is not None:
+            mask = in_image(shown.views[i], shown.masks[i], posed, i, shape)
+        if mask.any():
+            shares[photo.name] = float(mask.mean())
+        Image.fromarray(np.where(mask, 0, 255).astype(np.uint8)).save(target / f"{photo.name}.png")
+    _draw(posed, shown, picture)
+    return shares
+
+
+def _draw(posed: PosedImages, shown: MovingObjects, path: Path) -> None:
+    """The images in which most is masked, in order, what is masked in red."""
+    most = sorted(range(len(shown.masks)), key=lambda i: -shown.masks[i].mean())[:SHOWN]
+    tiles = []
+    for i in sorted(i for i in most if shown.masks[i].any()):
+        color = straightened_color(posed, i, shown.views[i]).copy()
+        color[shown.masks[i]] = color[shown.masks[i]] // 2 + np.array([0, 0, 127], np.uint8)
+        height = round(WIDTH * color.shape[0] / color.shape[1])
+        tile = cv2.resize(color, (WIDTH, height), interpolation=cv2.INTER_AREA)
+        cv2.putText(tile, posed.files[i].name, (4, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (0, 255, 255), 1)
+        tiles.append(tile)
+    height = max(tile.shape[0] for tile in tiles)
+    tiles = [cv2.copyMakeBorder(t, 0, height - t.shape[0], 0, 0, cv2.BORDER_CONSTANT) for t in tiles]
+    tiles += [np.zeros_like(tiles[0])] * (-len(tiles) % COLUMNS)
+    rows = [np.hstack(tiles[k : k + COLUMNS]) for k in range(0, len(tiles), COLUMNS)]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(path), np.vstack(rows))

@@ -1,0 +1,174 @@
+"""What moves on a short drive is masked, and nothing of it gives rays or depth; what stands still is kept."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from training_runs import datamanager
+
+from mmpi_ns.capture.dense import Depth
+from mmpi_ns.capture.moving import in_image
+from mmpi_ns.capture.moving_evidence import Shot, ground_of, nearest_known, splat
+from mmpi_ns.capture.moving_objects import followed, unexplained, without_holes
+from mmpi_ns.capture.tracks import PosedImages
+from mmpi_ns.capture.views import View, camera_matrix
+from mmpi_ns.synthetic.catalogue import make_scene
+from mmpi_ns.synthetic.dataset import write_dataset
+from mmpi_ns.synthetic.movers import MOVER, with_movers
+
+SIZE = (60, 80)
+PINHOLE = np.array([70.0, 70.0, 40.0, 30.0])
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory):
+    """A street with a car that keeps its distance and an oncoming one."""
+    folder = tmp_path_factory.mktemp("drive")
+    write_dataset(with_movers(make_scene("street", 0, 16, 320, 180, 13.0), 2), folder, 800)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def manager(drive):
+    return datamanager(drive)
+
+
+def test_most_of_the_cars_is_masked_and_little_else(drive, manager):
+    moving, static = [], []
+    for i, file in enumerate(manager.train_dataset.image_filenames):
+        truth = cv2.imread(str(drive / "moving" / file.name), cv2.IMREAD_UNCHANGED)
+        mask = ~manager.train_dataset.get_data(i, image_type="uint8")["mask"][..., 0].numpy()
+        moving.append(mask[truth == MOVER])
+        static.append(mask[truth == 0])
+    assert np.concatenate(moving).mean() > 0.45
+    assert np.concatenate(static).mean() < 0.02
+
+
+def test_masked_pixels_have_no_depth_and_draw_no_ray(manager):
+    masked = [~manager.train_dataset.get_data(i, image_type="uint8")["mask"][..., 0].numpy() for i in range(8)]
+    assert sum(mask.sum() for mask in masked) > 1000
+    for i, mask in enumerate(masked):
+        assert not manager.known_depth.image(i)[mask].any()
+    for step in range(20):
+        image, row, column = manager.next_train(step)[1]["indices"].T.tolist()
+        assert not any(masked[i][r, c] for i, r, c in zip(image, row, column, strict=True))
+
+
+def test_masks_of_the_user_win_and_the_option_leaves_all_pixels(drive, manager):
+    assert manager.train_dataset.has_masks and not manager.eval_dataset.has_masks
+    kept = datamanager(drive, mask_moving=False)
+    assert not kept.train_dataset.has_masks
+    assert kept.known_depth.share > manager.known_depth.share
+
+
+def a_view(shift=0.0, gray=None) -> View:
+    """From a camera that stands so far to the right, facing -z."""
+    pose = np.eye(4)[:3]
+    pose[0, 3] = shift
+    return View(np.zeros(SIZE, np.uint8) if gray is None else gray, PINHOLE, pose, np.ones(SIZE, bool))
+
+
+def a_shot(shift, color, inverse) -> Shot:
+    full = np.full(SIZE, inverse, np.float32)
+    return Shot(a_view(shift), color, Depth(full, 0.01 * full), None)
+
+
+def textured(seed, shape=SIZE, grain=1.5):
+    random = np.random.default_rng(seed).uniform(-1, 1, (*shape, 3)).astype(np.float32)
+    return np.clip(128 + 200 * grain * cv2.GaussianBlur(random, (0, 0), grain), 0, 255).astype(np.uint8)
+
+
+def test_a_wall_is_explained_by_its_depth_and_another_picture_is_not():
+    wide = textured(0, (60, 120))
+    inverse = 0.5
+    shots = [a_shot(0.1 * k, np.ascontiguousarray(wide[:, 10 + round(3.5 * k) :][:, :80]), inverse) for k in (-2, 0, 2)]
+    middle = np.zeros(SIZE, bool)
+    middle[20:40, 30:50] = True
+    colors = [shots[0].color, shots[2].color]
+    assert np.median(unexplained(shots[1], [shots[0], shots[2]], colors, middle)) < 12
+    strange = a_shot(0.0, textured(1), inverse)
+    assert np.median(unexplained(strange, [shots[0], shots[2]], colors, middle)) > 20
+
+
+def test_what_two_neighbours_would_not_show_is_not_judged():
+    shots = [a_shot(5.0 * k, textured(k), 0.5) for k in range(3)]
+    corner = np.zeros(SIZE, bool)
+    corner[:5, :5] = True
+    assert not unexplained(shots[0], shots[1:], [s.color for s in shots[1:]], corner).any()
+
+
+def test_depths_of_another_camera_land_where_they_project():
+    far, near = a_shot(0.0, textured(0), 0.1), a_shot(0.4, textured(0), 0.1)
+    near.depth.inverse[10:20, 30:50] = 0.5
+    seen = splat(far, near)
+    shift = round(70 * 0.4 * 0.5)
+    np.testing.assert_allclose(seen[12:18, 32 + shift : 48 + shift], 0.5, rtol=1e-5)
+
+
+def test_the_ground_is_found_and_a_wall_is_not_ground():
+    rows = np.arange(SIZE[0])[:, None] + 0.5
+    ground = np.repeat(np.maximum((rows - 30) / 70 / 1.5, 0), SIZE[1], 1).astype(np.float32)
+    up = np.array([0.0, 1.0, 0.0])
+    found = ground_of(a_view(), Depth(ground, 0.01 * ground), up)
+    assert found is not None
+    np.testing.assert_allclose(found[40:], ground[40:], rtol=1e-3)
+    wall = np.full(SIZE, 0.2, np.float32)
+    assert ground_of(a_view(), Depth(wall, 0.01 * wall), up) is None
+
+
+@pytest.mark.parametrize("rows", [120, 100, 95])
+def test_a_square_is_followed_to_where_it_moved_also_between_images_of_two_sizes(rows):
+    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+    background = cv2.cvtColor(textured(2, (120, 160), 3.0), cv2.COLOR_BGR2GRAY)
+    square, mask, at = (
+        cv2.cvtColor(textured(3, SIZE, 3.0), cv2.COLOR_BGR2GRAY)[:40, :40],
+        np.zeros((120, 160), bool),
+        [],
+    )
+    for x in (60, 63):
+        gray = background.copy()
+        gray[40:80, x : x + 40] = square
+        color = cv2.cvtColor(gray, cv2.COLOR_GRAY2BGR)
+        nowhere = Depth(*np.zeros((2, 120, 160), np.float32))
+        at.append(Shot(View(gray, PINHOLE, np.eye(4)[:3], np.ones((120, 160), bool)), color, nowhere, None))
+    mask[40:80, 63:103] = True
+    view = at[1].view
+    lower = replace(at[1], view=View(view.gray[:rows], PINHOLE, view.pose, view.inside[:rows]))
+    seen = followed(at[0], lower, mask[:rows], flow)
+    assert followed(lower, at[0], mask, flow).shape == (rows, 160)
+    truth = np.zeros_like(mask)
+    truth[40:80, 60:100] = True
+    assert seen[truth].mean() > 0.7 and seen[~truth].mean() < 0.01
+
+
+def test_holes_are_filled_and_bays_are_not():
+    mask = np.zeros((9, 9), bool)
+    mask[1:8, 1:8] = True
+    mask[3:5, 3:5] = False
+    mask[7, 4] = False
+    filled = without_holes(mask)
+    assert filled[3:5, 3:5].all() and not filled[7, 4] and not filled[0].any()
+
+
+def test_unknown_pixels_take_the_depth_of_the_nearest_known():
+    inverse = np.zeros((5, 9), np.float32)
+    inverse[2, 1], inverse[2, 7] = 0.25, 0.5
+    found = nearest_known(inverse)
+    assert found[2, 2] == 0.25 and found[0, 8] == 0.5
+
+
+def test_a_mask_of_a_straightened_view_lies_where_the_lens_shows_it():
+    distortion = np.array([[-0.2, 0.0, 0.0, 0.0]])
+    images = PosedImages((), np.eye(4)[None, :3], 2 * PINHOLE[None], np.array([[160.0, 120.0]]), distortion)
+    mask = np.zeros(SIZE, bool)
+    mask[8:14, 66:72] = True
+    shown = in_image(a_view(), mask, images, 0, (120, 160))
+    y, x = np.argwhere(shown).mean(0) + 0.5
+    corner = np.array([[[(69 - 40) / 70, (11 - 30) / 70]]])
+    bent = cv2.projectPoints(
+        np.dstack([corner, np.ones((1, 1))]), *np.zeros((2, 3)), camera_matrix(2 * PINHOLE), distortion[0]
+    )
+    np.testing.assert_allclose([x, y], bent[0].ravel(), atol=1.0)
