@@ -14,8 +14,8 @@ from plane_crossings import AHEAD
 from report import Bench, Report, Row, page, table
 from solids import Solids, bake
 
-from mmpi_ns.bench.rendering import Array, bundle_of, of_slots, render
-from mmpi_ns.ops.composite.reference import median_inverse_distance
+from mmpi_ns.bench.scenes import Array, bundle_of, of_slots, render
+from mmpi_ns.ops.composite import median_inverse_distance
 from mmpi_ns.scene.plan import MPIPlan
 from mmpi_ns.scripts.command import run
 

@@ -9,8 +9,8 @@ from torch import Tensor, nn
 
 from mmpi_ns.bench.trainers import Steps, clock
 from mmpi_ns.field.mmpi_field import MMPIField
-from mmpi_ns.ops.composite.reference import composite_weights, render_colors
-from mmpi_ns.ops.interpolate.reference import interpolate as interpolate_reference
+from mmpi_ns.ops.composite import composite_weights, render_colors
+from mmpi_ns.ops.interpolate import interpolate_densely
 from mmpi_ns.rendering.rendered import bounded
 from mmpi_ns.scene.geometry import plane_hits
 
@@ -31,10 +31,10 @@ def render_densely(field: MMPIField, bundle: RayBundle) -> tuple[Tensor, float]:
         ndc = (2 * (u - u0) / (u1 - u0) - 1, 2 * (v - v0) / (v1 - v0) - 1, 2 * planes / (mpi.planes - 1) - 1)
         ndc, planes = torch.stack(ndc, -1).reshape(-1, 3), planes.reshape(-1)
         rows, weights = field.grids[k].bilinear(planes, ndc)
-        raw = interpolate_reference(field.density, rows, weights)[:, 0]
+        raw = interpolate_densely(field.density, rows, weights)[:, 0]
         tau = torch.where(live.reshape(-1), field.layout.optical_depth(k, raw, planes), 0.0)
         chosen = (tau > 1e-4).nonzero()[:, 0]
-        features = interpolate_reference(field.features, rows[chosen], weights[chosen])
+        features = interpolate_densely(field.features, rows[chosen], weights[chosen])
         local = hits.local_directions[:, k].repeat_interleave(mpi.planes, 0)[chosen]
         color = field.networks(k, features, ndc[chosen], local)
         colors.append(torch.zeros(tau.shape[0], 3).index_put((chosen,), color).view(count, -1, 3))
@@ -44,7 +44,7 @@ def render_densely(field: MMPIField, bundle: RayBundle) -> tuple[Tensor, float]:
     tau = torch.cat(taus, -1).gather(-1, order)
     color = torch.cat(colors, 1).gather(1, order[..., None].expand(-1, -1, 3))
     zero = torch.zeros_like(tau)
-    result = composite_weights(tau, tau > 0, zero, zero[:, :1])
+    result = composite_weights.reference(tau, tau > 0, zero, zero[:, :1])
     return render_colors(result, color) + 0.5 * result.transmittance, float(tau.shape[1])
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from mmpi_ns.bench.rendering import Array
+from mmpi_ns.bench.scenes import Array
 
 
 @dataclass(frozen=True)

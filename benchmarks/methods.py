@@ -17,7 +17,7 @@ NO_DEPTH = (
     *("--pipeline.datamanager.depth-images", "False"),
 )
 POSES_ALONE = ("--pipeline.datamanager.sfm-path", "none")
-"""A COLMAP model that the scene has is not read."""
+"""A COLMAP model or point cloud that the scene has is not read."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,9 @@ class Method:
         if rays is not None and self.batch_option is not None:
             options += [self.batch_option, str(rays)]
         words = train_words(self.registered, options, scene, folder, steps, seed, device)
-        return words + (["--load-3D-points", "True"] if self.whole_images else [])
+        if self.whole_images or POSES_ALONE[0] in options:
+            words += ["--load-3D-points", str(self.whole_images)]
+        return words
 
 
 def _nerfacto_options() -> tuple[str, ...]:

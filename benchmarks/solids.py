@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from mmpi_ns.bench.rendering import Array
+from mmpi_ns.bench.scenes import Array
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.scene.plan import MPIPlan, ScenePlan
 

@@ -23,13 +23,14 @@ from mmpi_ns.capture.rays import PinholeRays
 from mmpi_ns.field.mmpi_field import ColourConfig, MMPIField
 from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.march import MarchOptions
+from mmpi_ns.placement.defaults import steps_for
 from mmpi_ns.placement.rule import PlacementConfig
-from mmpi_ns.placement.split import place_windows
+from mmpi_ns.placement.split import most_pixels, place_windows
 from mmpi_ns.rendering.baked import BakedWindow, bake, suits_bricks
 from mmpi_ns.rendering.chunks import check_crop, rays_per_chunk, render_in_chunks
 from mmpi_ns.rendering.exposure import Exposures
 from mmpi_ns.rendering.metrics import ImageMetrics, depth_metrics, pictures
-from mmpi_ns.rendering.render import images_of, render_rays, sampled_outputs
+from mmpi_ns.rendering.render import render_rays, sampled_outputs
 from mmpi_ns.rendering.rendered import BACKGROUNDS, RenderedRays, RenderingConfig, background_of, bounded
 from mmpi_ns.rendering.sampler import MMPISampler, SamplingConfig
 from mmpi_ns.rendering.shown import shown_outputs, shows_in_one_pass
@@ -48,6 +49,7 @@ from mmpi_ns.training.progress import Progress
 from mmpi_ns.training.refined_poses import check_refined_poses, move_rays
 from mmpi_ns.training.run import TrainingRun, views_of
 from mmpi_ns.utils.console import say
+from mmpi_ns.utils.parallel import torch_apart
 from mmpi_ns.utils.random_draws import generator
 
 FAIR_SHARE = 0.1
@@ -87,7 +89,10 @@ class MMPIModelConfig(ModelConfig):
     seed: int = field(default=0, init=False)
     """Not an option: the trainer sets it from --machine.seed."""
     total_steps: int = field(default=1, init=False)
-    """Not an option: the trainer sets it from --max-num-iterations; the phases are shares of it."""
+    """Not an option: the trainer sets it from --max-num-iterations; the phases are shares of it. 0: as many as the
+    capture needs by the defaults of ``method``."""
+    method: str = field(default="", init=False)
+    """Not an option: the trainer sets it to the name of the method."""
     windows_folder: Path | None = field(default=None, init=False)
     """Not an option: the trainer sets it, and config.yml keeps it for evaluation; where the finished windows lie."""
 
@@ -129,20 +134,24 @@ class MMPIModel(Model):
         )
         check_refined_poses(config.camera_optimizer.mode, len(windows))
         poses = self.camera_optimizer.parameters()
-        self.run = TrainingRun(self.progress, self.field, self.store, views, config.schedule.release_weight, [*poses])
+        observations = self.kwargs.get("metadata", {}).get(OBSERVATIONS)
+        free = {"scale_is_free": observations is not None and not len(observations.seen_by)}
+        release = config.schedule.release_weight
+        self.run = TrainingRun(self.progress, self.field, self.store, views, release, [*poses], **free)
         self.register_load_state_dict_post_hook(lambda *_: self._after_loading())
 
     def _plan(self) -> WindowedPlan:
         """The plan that is asked for, or the one that the placement rule makes of what the training cameras saw."""
-        metadata, path = self.kwargs.get("metadata", {}), self.config.plan_file
+        config, metadata = self.config, self.kwargs.get("metadata", {})
         observations = metadata.get(OBSERVATIONS)
-        if path is not None and (observations is not None or path.is_file()):
-            return WindowedPlan.load(path)
+        if observations is not None and config.total_steps == 0:
+            config.total_steps = steps_for(config.method, most_pixels(observations, config.placement))
+        if config.plan_file is not None and (observations is not None or config.plan_file.is_file()):
+            return WindowedPlan.load(config.plan_file)
         if observations is None:
-            check_there_are_checkpoints(self.config.windows_folder)
+            check_there_are_checkpoints(config.windows_folder)
             return WindowedPlan.single(NO_PLAN)
-        rays = self.config.total_steps * metadata[RAYS_PER_STEP]
-        return place_windows(observations, self.config.placement, rays)
+        return place_windows(observations, config.placement, config.total_steps * metadata[RAYS_PER_STEP])
 
     def _new_field(self, views: TrainingViews | None = None) -> MMPIField:
         """A field of this run's settings, of the first window at the first resolution: to train, or to load into."""
@@ -176,7 +185,7 @@ class MMPIModel(Model):
         return self.training_outputs(ray_bundle) if self.training else self.image_outputs(ray_bundle)
 
     def training_outputs(self, bundle: RayBundle) -> dict[str, Any]:
-        """rgb (without background), accumulation, depth, and ``RenderedRays`` for the losses, of the window at hand."""
+        """``RenderedRays`` for the losses, of the window at hand."""
         progress, field = self.progress, self.field
         asked, head_mask, choose = len(bundle), None, None
         move_rays(bundle, self.camera_optimizer)
@@ -190,10 +199,10 @@ class MMPIModel(Model):
         rays = replace(rays, times=len(bundle) // asked)
         if rays.lookup is not None and progress.schedule.watches(progress.step):
             field.note_use(rays.lookup, rays.composite.weights, rays.report.live)
-        return images_of(rays, field) | {"training": rays}
+        return {"training": rays}
 
     def training_bounds(self) -> dict[str, float]:
-        """What a sample must weigh to be kept in training (``march.reference.prune``).
+        """What a sample must weigh to be kept in training (``ops.march.prune``).
 
         While surfaces form, samples of little weight must learn too, and the cube starts nearly empty.
         """
@@ -295,7 +304,8 @@ class MMPIModel(Model):
     @torch.no_grad()
     def get_outputs_for_camera_ray_bundle(self, camera_ray_bundle: RayBundle) -> dict[str, Tensor]:
         """Renders an image: window by window, each as many rays at once as asked for or as suit the device."""
-        outputs = self.image_outputs(camera_ray_bundle.flatten(), self.chunk_size)
+        with torch_apart():
+            outputs = self.image_outputs(camera_ray_bundle.flatten(), self.chunk_size)
         return {name: values.view(*camera_ray_bundle.shape, -1) for name, values in outputs.items()}
 
     @property

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -18,9 +19,9 @@ from mmpi_ns.scene.windows import Window
 
 
 def random_window(num_mpis=2, seed=0, planes=40, channels=5, stored=0.5, density=(0, 255), shares=(0.6, 1.0)):
-    """A window in which so many tiles are stored, with codes drawn from ``density``."""
+    """A window of 2 x 3 tiles a plane, the share ``stored`` of them occupied, with codes drawn from ``density``."""
     rng, g = np.random.default_rng(seed), torch.Generator().manual_seed(seed)
-    mpis = tuple(random_mpi(rng, f"mpi{k}", planes=planes) for k in range(num_mpis))
+    mpis = tuple(replace(random_mpi(rng, f"mpi{k}", planes=planes), height=12, width=19) for k in range(num_mpis))
     columns, count = [], 0
     for mpi in mpis:
         _, down, across = tiles_of(mpi)

@@ -16,7 +16,7 @@ from nerfstudio.field_components.field_heads import FieldHeadNames
 
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.ops.blending import blended_optical_depth
-from mmpi_ns.ops.composite.reference import composite_weights, render_colors
+from mmpi_ns.ops.composite import composite_weights, render_colors
 from mmpi_ns.rendering.sampler import MMPISampler
 from mmpi_ns.scene.plan import CubePlan, ScenePlan
 
@@ -82,7 +82,7 @@ def render(field, rays, threshold=0.0, blends=False, **chosen):
         flat = blended_optical_depth(tau.reshape(-1)[lookup.index], *field.sample_shares(samples, lookup))
         tau = tau.new_zeros(tau.numel()).index_put((lookup.index,), flat).view(tau.shape)
     meta = samples.metadata
-    composite = composite_weights(
+    composite = composite_weights.reference(
         tau, meta["valid"][..., 0], meta["skipped_before"][..., 0], report.skipped_total
     )  # fmt: skip
     colors = field.get_outputs(samples, lookup)[FieldHeadNames.RGB]

@@ -18,7 +18,7 @@ from training_runs import ready, trainer_config, write_plan, write_windows
 
 import mmpi_ns
 from mmpi_ns.export.files import HEADER, read_baked, write_baked
-from mmpi_ns.export.reader import camera_rays
+from mmpi_ns.ops.baked.reader import camera_rays
 from mmpi_ns.rendering.baked import exact_images
 from mmpi_ns.utils.errors import InputError
 

@@ -105,10 +105,10 @@ def all_launches(setattr):
     march, hits = (importlib.import_module(f"mmpi_ns.ops.march.{name}") for name in ("gpu", "gpu_hits"))
     setattr(hits, "block_size", lambda wanted, device: wanted)
     setattr(dispatch, "_interpreting", True)
-    setattr(dispatch, "_faults", dict.fromkeys(["Triton", *dispatch.TABLE]))
+    setattr(dispatch, "_faults", dict.fromkeys(["Triton", *dispatch.operations()]))
     with launches_noted({}) as noted:
         for name, cases in trial.CASES.items():
-            module = importlib.import_module(f"mmpi_ns.ops.{dispatch.TABLE[name][0]}.gpu")
+            module = importlib.import_module(f"{dispatch.operations()[name].__module__}.gpu")
             if hasattr(module, "block_size"):  # arrays on a CPU, but blocks of a GPU's size
                 setattr(module, "block_size", lambda wanted, device: wanted)
             for many in (1 << 30, 1) if name in ("march", "show_rays") else (1,):  # blocks for few rays, and for many

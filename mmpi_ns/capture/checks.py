@@ -70,7 +70,6 @@ def check_transforms(parser: NerfstudioDataParserConfig, data: Path, splits: Seq
         _check_paths(frame, i, path)
     poses = np.stack([_pose(frame, path) for frame in frames])
     _check_whole_file(meta, path)
-    _check_points(parser, meta, path)
     check_lenses(meta, frames, path)
     _check_same_for_all(frames, path)
     _check_splits(meta, frames, splits, path, by_name=(parser.downscale_factor or 1) > 1)
@@ -167,22 +166,13 @@ def _check_whole_file(meta: Mapping[str, Any], path: Path) -> None:
         check_number(f"applied_scale of {path}", meta["applied_scale"], Number(0, 1e18, above=True))
     if "fisheye_crop_radius" in meta:
         check_number(f"fisheye_crop_radius of {path}", meta["fisheye_crop_radius"], Number(0, 1e6, above=True))
+    cloud = meta.get("ply_file_path", "given")
+    if not isinstance(cloud, str):
+        raise InputError(f"ply_file_path of {path} is {shown(cloud)}: give the path of a PLY file, or leave it out.")
     turned = meta.get("orientation_override", "none")
     if turned not in ORIENTATIONS:
         raise InputError(
             f"orientation_override of {path} is {shown(turned)}: leave it out or give one of {', '.join(ORIENTATIONS)}."
-        )
-
-
-def _check_points(parser: NerfstudioDataParserConfig, meta: Mapping[str, Any], path: Path) -> None:
-    """A point cloud, if one is requested: nerfstudio would prompt, or continue without it."""
-    if not parser.load_3D_points:
-        return
-    cloud = meta.get("ply_file_path")
-    if not isinstance(cloud, str) or not (path.parent / cloud).is_file():
-        raise InputError(
-            f"--load-3D-points asks for the point cloud that ply_file_path of {path} names, and it is {shown(cloud)}: "
-            "give the path of a PLY file, or leave the option out."
         )
 
 

@@ -25,8 +25,9 @@ from mmpi_ns.capture.dataset import MMPIDataset
 from mmpi_ns.capture.exif import light_of
 from mmpi_ns.capture.known_depth import KnownDepth, know_depths, with_known_depths
 from mmpi_ns.capture.local_origin import take_local_origins
+from mmpi_ns.capture.moving import moving_masks
 from mmpi_ns.capture.new_views import SharedPoints, find_shared_points, image_and_mask
-from mmpi_ns.capture.observe import observe, posed_images, sfm_folder
+from mmpi_ns.capture.observe import drop_masked, observe, posed_images, sfm_folder
 from mmpi_ns.capture.originals import at_full_size
 from mmpi_ns.capture.photometry import SAME_LIGHT, Gains, color_ratios, image_gains
 from mmpi_ns.capture.pixels import PixelPool, pixel_bytes
@@ -69,6 +70,8 @@ class MMPIDataManagerConfig(VanillaDataManagerConfig):
     second for a million pixels on one core, on all cores; kept in ~/.cache/mmpi_ns for the next start)."""
     depth_images: bool = True
     """Use the depth images that a data parser lists (depth_file_path)."""
+    mask_moving: bool = True
+    """Mask what moves in the training images (cars, people) where no masks are given: its pixels are not trained on."""
     new_view_share: float = 0.75
     """Rays of new views for each pixel ray: from between two training cameras to points that both show at the same
     known depth (0: none)."""
@@ -116,8 +119,16 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         dataset.metadata[RAYS_PER_STEP] = self.config.train_num_rays_per_batch
         dataset.metadata[TRAINING_VIEWS] = TrainingViews.of(dataset.cameras)
         if self.test_mode == "val":  # elsewhere the plan comes from a checkpoint
-            self.known_depth = known = self._known_depth(dataset)
-            seen = self.observations if known is None else with_known_depths(self.observations, known, dataset)
+            if self.config.mask_moving and self.config.dense_depth and not dataset.has_masks:
+                self._mask_moving(dataset)
+            tracks = self.observations
+            known, self.observations = know_depths(
+                self.train_dataparser_outputs, tracks, dataset,
+                dense=self.config.dense_depth, sensor=self.config.depth_images,
+            )  # fmt: skip
+            self.known_depth = known
+            # Of a cloud, placement gets what is in ``known``: one depth of each cell, however dense the cloud is.
+            seen = tracks if known is None else with_known_depths(tracks, known, dataset)
             dataset.metadata[OBSERVATIONS] = seen
             has_keypoints = self.config.keypoint_rays > 0 and len(self.observations.seen_at) > 0
             if not has_keypoints and (known is None or known.share == 0):
@@ -126,12 +137,19 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
                 )
         return dataset
 
-    def _known_depth(self, dataset: MMPIDataset) -> KnownDepth | None:
-        """Depths of pixels, matched or measured, if enabled."""
-        parts = {"dense": self.config.dense_depth, "sensor": self.config.depth_images}
-        if not any(parts.values()):
-            return None
-        return know_depths(self.train_dataparser_outputs, self.observations, dataset, **parts)
+    def _mask_moving(self, dataset: MMPIDataset) -> None:
+        """Masks what moves in the training images, and says how much it is."""
+        masks = moving_masks(self.observations, dataset)
+        shares = np.array([mask.mean() for mask in masks])
+        if not shares.any():
+            say("Nothing is seen to move in the training images.")
+            return
+        say(
+            f"{100 * shares.mean():.1f} % of the training pixels, in {np.count_nonzero(shares)} of {len(masks)} images,"
+            " show what moves and are masked (--pipeline.datamanager.mask-moving False keeps them)."
+        )
+        dataset.moving = masks
+        self.observations = drop_masked(self.observations, dataset)
 
     @cached_property
     def observations(self) -> Observations:

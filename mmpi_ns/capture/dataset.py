@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
@@ -36,9 +37,12 @@ class MMPIDataset(InputDataset):
         """Whether any image has an alpha channel; files that cannot be read are named when they are needed."""
         return any(_header(name)[1] for name in self.image_filenames)
 
+    moving: Sequence[NDArray[np.bool_]] | None = None
+    """What moves in each image [H, W], masked where there are no masks in files."""
+
     @property
     def has_masks(self) -> bool:
-        return self._dataparser_outputs.mask_filenames is not None
+        return self._dataparser_outputs.mask_filenames is not None or self.moving is not None
 
     def get_numpy_image(self, image_idx: int) -> NDArray[np.uint8]:
         """Image [H, W, 3 or 4]: red, green, blue, and alpha where the file has it, in 8 bits."""
@@ -77,6 +81,8 @@ class MMPIDataset(InputDataset):
             )
         if image_type == "float32" and (files := self.metadata.get("depth_filenames")):
             data["distance"] = self._distance(Path(files[image_idx]), image_idx, (rows, columns))
+        if self.moving is not None and "mask" not in data:
+            data["mask"] = torch.from_numpy(~self.moving[image_idx])[..., None]
         return data | {k: data[k][:height, :width] for k in ("image", "mask", "distance") if k in data}
 
     def _distance(self, file: Path, image_idx: int, shape: tuple[int, int]) -> Float[Tensor, "H W 1"]:

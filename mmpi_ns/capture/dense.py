@@ -16,19 +16,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import cv2
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 
 from mmpi_ns.capture.tracks import PosedImages
 from mmpi_ns.capture.views import Map, View, camera_matrix, load_view, look_up, pixel_grid
 from mmpi_ns.scene.near_views import nearest_views
+from mmpi_ns.utils.parallel import num_threads, one_thread_each
 
 T = TypeVar("T")
 Progress = Callable[[Iterable[Any], int], Iterable[Any]]
@@ -107,7 +106,7 @@ def strips(shape: tuple[int, ...]) -> Iterator[slice]:
 
 
 @dataclass(frozen=True)
-class _Parallax:
+class Parallax:
     """Where the points of a view's pixels lie in another view: homogeneous pixels a + q b for inverse depth q."""
 
     linear: NDArray[np.float64]
@@ -115,13 +114,13 @@ class _Parallax:
     b: NDArray[np.float32]
 
     @staticmethod
-    def between(view: View, other: View) -> _Parallax:
+    def between(view: View, other: View) -> Parallax:
         axes = np.diag([1.0, -1.0, -1.0])  # OpenCV's: right, down, ahead
         turn = axes @ other.pose[:, :3].T @ view.pose[:, :3] @ axes
         shift = axes @ other.pose[:, :3].T @ (view.pose[:, 3] - other.pose[:, 3])
         to_pixels = camera_matrix(other.pinhole)
         linear = to_pixels @ turn @ np.linalg.inv(camera_matrix(view.pinhole))
-        return _Parallax(linear, (to_pixels @ shift).astype(np.float32))
+        return Parallax(linear, (to_pixels @ shift).astype(np.float32))
 
     def a(self, rows: slice, width: int) -> list[Map]:
         """The three parts of a at the pixels of some rows. [h, w] each"""
@@ -165,7 +164,7 @@ def measure(view: View, other: View, start: Map, flow: cv2.DISOpticalFlow) -> tu
         start: rough inverse depths. [h, w]
         flow: finds small motions.
     """
-    parallax = _Parallax.between(view, other)
+    parallax = Parallax.between(view, other)
     x, y, _ = parallax.pixels(start)
     motion = np.asarray(flow.calc(view.gray, look_up(other.gray, x, y), None))  # type: ignore[call-overload]
     grid_x, grid_y = pixel_grid(view.gray.shape)
@@ -270,8 +269,8 @@ def find_depths(
     width: int,
     finish: Callable[[int, View, Depth], T] = lambda _, view, depth: (view, depth),
     progress: Progress = lambda work, _: work,
-) -> list[T]:
-    """The depths of all images, by as many threads as torch has; their number does not change the depths.
+) -> Iterator[T]:
+    """The depths of all images in turn, by all threads; their number does not change the depths.
 
     Args:
         images: the training images in their originals.
@@ -282,7 +281,7 @@ def find_depths(
     """
     numbers = range(len(images.files))
     near = [nearest_views(images.camera_to_worlds, i, NEIGHBOURS, MAX_ANGLE) for i in numbers]
-    with _one_thread_each(), ThreadPoolExecutor(torch.get_num_threads()) as pool:
+    with one_thread_each(), ThreadPoolExecutor(num_threads()) as pool:
         views = list(pool.map(lambda i: load_view(images, i, width), numbers))
         depths: list[Depth] = []
 
@@ -293,21 +292,11 @@ def find_depths(
             yield from pool.map(lambda i: matched(views[i], [views[j] for j in near[i]], points_of(i)), numbers)
             yield from pool.map(check, numbers)
 
-        results: list[Any] = []
         for result in progress(work(), 2 * len(numbers)):
-            (depths if len(depths) < len(numbers) else results).append(result)
-    return results
-
-
-@contextmanager
-def _one_thread_each() -> Iterator[None]:
-    """OpenCV works in the calling thread, in which its results are the same at each start."""
-    threads = cv2.getNumThreads()
-    cv2.setNumThreads(1)
-    try:
-        yield
-    finally:
-        cv2.setNumThreads(threads)
+            if len(depths) < len(numbers):
+                depths.append(cast(Depth, result))
+            else:
+                yield cast(T, result)
 
 
 def matched(view: View, others: list[View], points: NDArray[np.float64]) -> Depth:
@@ -345,7 +334,7 @@ def confirmed(view: View, depth: Depth, others: list[tuple[View, Depth]]) -> Dep
     """Keeps the depths confirmed by the depth of at least one other image and by at least as many as contradict it."""
     confirm, contradict = np.zeros(depth.inverse.shape, np.int8), np.zeros(depth.inverse.shape, np.int8)
     for other, theirs in others:
-        x, y, ahead = _Parallax.between(view, other).pixels(depth.inverse)
+        x, y, ahead = Parallax.between(view, other).pixels(depth.inverse)
         inverse, error = (look_up(m, x, y, nearest=True) for m in (theirs.inverse, theirs.error))
         expected = np.where(ahead > 0, depth.inverse / np.where(ahead > 0, ahead, 1), 0)
         tolerance = 3 * np.sqrt(error**2 + depth.error**2) + SAME_DEPTH * expected

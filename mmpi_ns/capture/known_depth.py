@@ -5,10 +5,10 @@ Sources, later ones replacing earlier ones: dense matches (``dense.py``), SfM po
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -21,17 +21,19 @@ from PIL import Image
 from rich.progress import track
 from torch import Tensor
 
-from mmpi_ns.capture.cache import Arrays, digest, remembered
+from mmpi_ns.capture.cache import Pairs, digest, remembered
 from mmpi_ns.capture.dataset import MMPIDataset
 from mmpi_ns.capture.dense import ROUNDS, SECONDS, Depth, find_depths
 from mmpi_ns.capture.depth_images import read_depth_image
 from mmpi_ns.capture.lone_depth import MOST_OTHERS, continued, others_that_see
-from mmpi_ns.capture.observe import posed_images
+from mmpi_ns.capture.loose_points import POINT_ERROR, contradict, see_points
+from mmpi_ns.capture.observe import drop_masked, posed_images
 from mmpi_ns.capture.originals import at_full_size
 from mmpi_ns.capture.tracks import PosedImages
 from mmpi_ns.capture.views import View, camera_matrix, look_up
 from mmpi_ns.placement.observations import Observations
-from mmpi_ns.utils.console import duration
+from mmpi_ns.utils.console import duration, say
+from mmpi_ns.utils.parallel import in_order, num_threads
 
 Map = NDArray[np.float32]
 Codes = NDArray[np.int16]
@@ -44,16 +46,12 @@ MOST_WORKING = 2.5e8
 """Total number of pixels at which images are matched (10 bytes each); larger captures are matched at a smaller size."""
 COVERED = 0.3
 """Fraction of a training pixel's area in which working pixels must have a depth."""
-POINT_ERROR = 0.01
-"""Minimum relative error of the distance of an SfM point."""
 CONTINUED = 320
 """Maximum pixels along the longer side of an image at which surfaces are extrapolated; they are smooth."""
 CELLS = 32
 """Cells along the longer side of an image; placement gets one depth from each."""
 SENSOR_ERROR = 0.01
 """Relative error of a sensor's depth."""
-CONTRADICTS = 6.0
-"""Difference of two sources, in expected errors of both, from which one of them is wrong."""
 UNKNOWN, OCTAVE = -(2**15), 1024
 """Code of a number that is 0, and codes in an octave."""
 
@@ -65,8 +63,8 @@ class KnownDepth:
     Stored in 16 bits each; the relative rounding error of a distance is at most 0.034 %.
     """
 
-    codes: tuple[Codes, ...]
-    """[H, W, 2] each, by ``packed``."""
+    codes: Sequence[Codes]
+    """[H, W, 2] each, by ``packed``; mapped from a file or computed when read, so that they take little memory."""
 
     @staticmethod
     def of(maps: Iterable[Map]) -> KnownDepth:
@@ -90,6 +88,21 @@ class KnownDepth:
         return known / max(1, sum(m[..., 0].size for m in self.codes))
 
 
+class _Changed(Sequence[Codes]):
+    """Codes after a change of each image, computed at every access."""
+
+    def __init__(self, codes: Sequence[Codes], change: Callable[[int, Codes], Codes]) -> None:
+        self.codes, self.change = codes, change
+
+    def __len__(self) -> int:
+        return len(self.codes)
+
+    def __getitem__(self, i: Any) -> Any:
+        if not 0 <= i < len(self):
+            raise IndexError(i)
+        return self.change(i, np.array(self.codes[i]))
+
+
 def packed(values: ArrayLike) -> Codes:
     """Logarithms of positive numbers in steps of 1/1024 of an octave, for 1/t and errors from 2^-31 to 2^31; 0 is kept.
 
@@ -107,32 +120,46 @@ def unpacked(codes: Int16[Tensor, "*N"]) -> Float[Tensor, "*N"]:
 
 def know_depths(
     outputs: DataparserOutputs, observations: Observations, dataset: MMPIDataset, *, dense: bool, sensor: bool
-) -> KnownDepth:
-    """All available depths of the training images.
+) -> tuple[KnownDepth | None, Observations]:
+    """All available depths of the training images, and the observations with the points of a cloud, if there is one.
 
     Args:
         outputs: of the data parser.
-        observations: their cameras and tracks.
+        observations: their cameras, tracks and loose points.
         dataset: the images.
         dense: whether to match neighbouring images.
         sensor: whether to read depth images.
 
+    Returns:
+        The depths; None if there is neither matching, a sensor nor a cloud. The observations.
+
     Raises:
         InputError: an image or a depth image cannot be used (names it).
     """
-    known = KnownDepth.nothing(observations.sizes)
-    posed = posed_images(observations, dataset)
+    if not (dense or sensor or observations.loose is not None):
+        return None, observations
+    known, posed = KnownDepth.nothing(observations.sizes), posed_images(observations, dataset)
     files = outputs.metadata.get("depth_filenames") if sensor else None
-    if posed is None or not (dense or files):
-        return known
-    original = at_full_size(posed)
+    if posed is None or not (dense or files or observations.loose is not None):
+        return known, observations
+    original, seen = at_full_size(posed), observations
+    cloud = None if observations.loose is None else see_points(observations.loose, posed)
+    if cloud is not None:
+        seen = cloud.added_to(observations)
     if dense:
-        known = _remembered_depths(original, posed, observations)
-    known = with_points(known, observations)
+        known = _remembered_depths(original, posed, seen)
+    if dense and cloud is not None:
+        cloud = see_points(cloud.points, posed, known.image)
+        seen = cloud.added_to(observations) if cloud.fits else replace(observations, loose=None)
+        known = known if cloud.fits else _remembered_depths(original, posed, seen)
+    if cloud is not None:
+        say(cloud.describe())
+        seen = drop_masked(seen, dataset)
+    known = without_masked(with_points(known, seen), dataset)
     if files:
         unit = outputs.metadata.get("depth_unit_scale_factor", 1.0) * outputs.dataparser_scale
         known = with_sensor(known, [Path(f) for f in files], float(unit), original, posed)
-    return with_continued(known, posed, dataset)
+    return without_masked(with_continued(known, posed, dataset), dataset), seen
 
 
 def _remembered_depths(original: PosedImages, posed: PosedImages, observations: Observations) -> KnownDepth:
@@ -147,8 +174,8 @@ def _remembered_depths(original: PosedImages, posed: PosedImages, observations: 
     def finish(i: int, view: View, depth: Depth) -> Codes:
         return packed(at_training_pixels(view, depth, original, i, shapes[i], file_shapes[i]))
 
-    def match() -> Arrays:
-        threads = torch.get_num_threads()
+    def match() -> Pairs:
+        threads = num_threads()
         seconds = SECONDS * 1e-6 * sum(float(min(1, width / w) ** 2 * w * h) for w, h in original.sizes) / threads
         CONSOLE.print(
             f"Matching {len(shapes)} images densely, at most {width} pixels wide: about {duration(seconds)} with "
@@ -158,7 +185,7 @@ def _remembered_depths(original: PosedImages, posed: PosedImages, observations: 
             original, lambda i: points[seen_by == i], width, finish,
             progress=lambda work, count: track(work, "Depths", count, console=CONSOLE),
         )  # fmt: skip
-        return {f"{i}": image for i, image in enumerate(codes)}
+        return ((f"{i}", image) for i, image in enumerate(codes))
 
     cameras = original.camera_to_worlds, original.intrinsics, original.distortion, original.fisheye
     key = digest(original.files, "depths", VERSION, ROUNDS, width, shapes, *cameras, seen_by, points)
@@ -174,24 +201,28 @@ def _file_shape(original: PosedImages, posed: PosedImages, i: int) -> tuple[int,
         return image.height, image.width
 
 
+def without_masked(known: KnownDepth, dataset: MMPIDataset) -> KnownDepth:
+    """Drops the distances of masked pixels: what moves is nowhere."""
+    if not dataset.has_masks:
+        return known
+    masks = (dataset.get_data(i, image_type="uint8")["mask"].numpy().astype(bool) for i in range(len(dataset)))
+    return KnownDepth(tuple(np.where(m, c, UNKNOWN).astype(np.int16) for m, c in zip(masks, known.codes, strict=True)))
+
+
 def with_sensor(
     known: KnownDepth, files: list[Path], unit: float, original: PosedImages, posed: PosedImages
 ) -> KnownDepth:
     """Replaces depths by those of sensors where there are any; where both are known and contradict, neither is kept."""
-    codes = []
-    for i, (file, own) in enumerate(zip(files, known.codes, strict=True)):
-        shape = own.shape[0], own.shape[1]
-        measured = packed(read_sensor(file, unit, original, i, shape, _file_shape(original, posed, i)))
-        own = np.where(measured[..., :1] != UNKNOWN, measured, own)
-        own[contradict(unpacked(torch.from_numpy(measured)).numpy(), known.image(i))] = UNKNOWN
-        codes.append(own)
-    return KnownDepth(tuple(codes))
 
+    def replace_depths(i: int, codes: Codes) -> Codes:
+        shape = codes.shape[0], codes.shape[1]
+        measured = packed(read_sensor(files[i], unit, original, i, shape, _file_shape(original, posed, i)))
+        apart = contradict(*(unpacked(torch.from_numpy(x)).numpy() for x in (measured, codes)))
+        codes = np.where(measured[..., :1] != UNKNOWN, measured, codes)
+        codes[apart] = UNKNOWN
+        return codes
 
-def contradict(one: Map, other: Map) -> NDArray[np.bool_]:
-    """Where two sources [H, W, 2] know a distance and differ by more than their errors can explain. [H, W]"""
-    apart = np.abs(one[..., 0] - other[..., 0]) > CONTRADICTS * np.hypot(one[..., 1], other[..., 1])
-    return apart & (one[..., 0] > 0) & (other[..., 0] > 0)
+    return KnownDepth(_Changed(known.codes, replace_depths))
 
 
 def at_training_pixels(
@@ -216,7 +247,7 @@ def at_training_pixels(
     height, width = shape
     small = (width, height)
     mean, error = pooled(depth, (small[1], small[0]))
-    x, y = _straightened(original, i, shape, file_shape)
+    x, y = straightened(original, i, shape, file_shape)
     fx, fy, cx, cy = view.pinhole
     scale_x, scale_y = small[0] / view.gray.shape[1], small[1] / view.gray.shape[0]
     at = (((fx * x + cx) * scale_x).reshape(shape), ((fy * y + cy) * scale_y).reshape(shape))
@@ -240,7 +271,7 @@ def pooled(depth: Depth, shape: tuple[int, int]) -> tuple[Map, Map]:
     return np.where(kept, mean, 0).astype(np.float32), np.where(kept, error, 0).astype(np.float32)
 
 
-def _straightened(
+def straightened(
     original: PosedImages, i: int, shape: tuple[int, int], file_shape: tuple[int, int]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Tangents (right, down) at which a training image's pixels look, lens taken out. [H * W] each"""
@@ -258,35 +289,37 @@ def _straightened(
 def with_continued(known: KnownDepth, posed: PosedImages, dataset: MMPIDataset) -> KnownDepth:
     """Extrapolates surfaces into regions that hardly any other image shows (``lone_depth.py``); cached."""
 
-    def continue_all() -> Arrays:
-        count = len(known.codes)
-        with ThreadPoolExecutor(torch.get_num_threads()) as pool:
-            codes = pool.map(lambda i: _continued_codes(known, i, posed, dataset), range(count))
-            shown = track(codes, "Extrapolating surfaces", count, console=CONSOLE)
-            return {f"{i}": image for i, image in enumerate(shown)}
+    count = len(known.codes)
+
+    def continue_all() -> Pairs:
+        codes = in_order(lambda i: _continued_codes(known, i, posed, dataset), range(count))
+        shown = track(codes, "Extrapolating surfaces", count, console=CONSOLE)
+        return ((f"{i}", image) for i, image in enumerate(shown))
 
     cameras = posed.camera_to_worlds, posed.intrinsics, posed.distortion, posed.fisheye
-    stored = remembered(digest(posed.files, "continued", VERSION, *cameras, *known.codes), continue_all)
-    return KnownDepth(tuple(stored[f"{i}"] for i in range(len(known.codes))))  # type: ignore[arg-type]
+    contents = [digest((), codes) for codes in known.codes]
+    stored = remembered(digest(posed.files, "continued", VERSION, *cameras, contents), continue_all)
+    return KnownDepth(tuple(stored[f"{i}"] for i in range(count)))  # type: ignore[arg-type]
 
 
 def _continued_codes(known: KnownDepth, i: int, posed: PosedImages, dataset: MMPIDataset) -> Codes:
     """Codes of one image with extrapolated surfaces; computed for every n-th pixel of a large image."""
-    own = known.codes[i].copy()
-    step = -(-max(own.shape[:2]) // CONTINUED)
-    rows, columns = (np.minimum(np.arange(0, n, step) + step // 2, n - 1) for n in own.shape[:2])
+    codes = np.array(known.codes[i])
+    step = -(-max(codes.shape[:2]) // CONTINUED)
+    rows, columns = (np.minimum(np.arange(0, n, step) + step // 2, n - 1) for n in codes.shape[:2])
     coords = np.stack(np.meshgrid(rows, columns, indexing="ij"), -1).reshape(-1, 2) + 0.5
     at = torch.full((len(coords), 1), i)
     directions = dataset.cameras.generate_rays(at, coords=torch.from_numpy(coords).float()).directions.numpy()
     directions = directions.reshape(len(rows), len(columns), 3)
-    found = continued(known.image(i)[np.ix_(rows, columns)], directions)
-    down, across = np.nonzero(found[..., 0])
-    points = posed.camera_to_worlds[i, :, 3] + directions[down, across] / found[down, across, :1]
+    sparse = unpacked(torch.from_numpy(codes[np.ix_(rows, columns)])).numpy()
+    extended = continued(sparse, directions)
+    down, across = np.nonzero(extended[..., 0])
+    points = posed.camera_to_worlds[i, :, 3] + directions[down, across] / extended[down, across, :1]
     many = others_that_see(posed, i, points) > MOST_OTHERS
-    found[down[many], across[many]] = 0
-    down, across = np.nonzero(own[..., 0] == UNKNOWN)
-    own[down, across] = packed(found)[down // step, across // step]
-    return own
+    extended[down[many], across[many]] = 0
+    down, across = np.nonzero(codes[..., 0] == UNKNOWN)
+    codes[down, across] = packed(extended)[down // step, across // step]
+    return codes
 
 
 def with_known_depths(observations: Observations, known: KnownDepth, dataset: MMPIDataset) -> Observations:
@@ -330,18 +363,20 @@ def best_of_cells(depth: Map) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 
 def with_points(known: KnownDepth, observations: Observations) -> KnownDepth:
     """Adds the distances of SfM points at the pixels that saw them; the nearest where several fall on one."""
-    codes = [m.copy() for m in known.codes]
     count = len(observations.seen_at)
     cameras, points = observations.seen_by[:count], observations.points[observations.seen_point[:count]]
     distance = np.linalg.norm(points - observations.centers[cameras], axis=-1)
     inverse = packed(np.outer(1 / np.maximum(distance, 1e-30), [1, POINT_ERROR]))
     columns, rows = observations.seen_at.astype(int).T
-    for i, image in enumerate(codes):
-        inside = (rows >= 0) & (rows < image.shape[0]) & (columns >= 0) & (columns < image.shape[1])
+
+    def add(i: int, codes: Codes) -> Codes:
+        inside = (rows >= 0) & (rows < codes.shape[0]) & (columns >= 0) & (columns < codes.shape[1])
         chosen = np.nonzero((cameras == i) & inside & (distance > 0))[0]
         chosen = chosen[np.argsort(-distance[chosen], kind="stable")]  # the last one written stays
-        image[rows[chosen], columns[chosen]] = inverse[chosen]
-    return KnownDepth(tuple(codes))
+        codes[rows[chosen], columns[chosen]] = inverse[chosen]
+        return codes
+
+    return KnownDepth(_Changed(known.codes, add))
 
 
 def read_sensor(
@@ -362,7 +397,7 @@ def read_sensor(
     """
     depth = read_depth_image(file, unit)
     nearest = cv2.resize(depth, file_shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT)[: shape[0], : shape[1]]
-    x, y = _straightened(original, i, shape, file_shape)
+    x, y = straightened(original, i, shape, file_shape)
     longer = np.sqrt(x**2 + y**2 + 1).reshape(shape)
     known = np.isfinite(nearest) & (nearest > 0)
     inverse = np.where(known, 1 / (np.where(known, nearest, 1) * longer), 0)

@@ -38,7 +38,7 @@ def load_observations(data: Path, downscale_factor: int | None = None, parser: P
         InputError: the folder holds no scene, or one that cannot be trained.
     """
     check_there(data)
-    config = MMPIDataManagerConfig(dataparser=NerfstudioDataParserConfig())
+    config = MMPIDataManagerConfig(dataparser=NerfstudioDataParserConfig(load_3D_points=True))
     is_nerfstudio = data.suffix == ".json" or (data / "transforms.json").is_file()
     if parser == "colmap" or (parser == "auto" and not is_nerfstudio):
         model = next((p for p in ("colmap/sparse/0", "sparse/0", "sparse") if (data / p).is_dir()), None)

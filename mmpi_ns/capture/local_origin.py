@@ -69,6 +69,8 @@ class LocalNerfstudio(Nerfstudio):
     """nerfstudio's parser of a transforms.json."""
 
     _origin: LocalOrigin
+    prompted_user, create_pc = True, False
+    """The parser asks no question on the terminal where ``transforms.json`` names no point cloud."""
 
     def _generate_dataparser_outputs(self, split: str = "train") -> DataparserOutputs:
         def subtract(meta: dict[str, Any], path: Path) -> None:
@@ -80,7 +82,14 @@ class LocalNerfstudio(Nerfstudio):
 
     def _load_3D_points(self, ply_file_path: Path, transform_matrix: Tensor, scale_factor: float) -> Any:
         origin = self._origin.place if self._origin.taken else 0.0
-        return parser_points(ply_file_path, transform_matrix, scale_factor, origin)
+        try:
+            points = parser_points(ply_file_path, transform_matrix, scale_factor, origin)
+        except InputError as error:
+            say_once(f"[bold yellow]{error} Training goes on without the point cloud.")
+            return None
+        if points is None:
+            say_once(f"[bold yellow]The point cloud {ply_file_path} holds no point: training goes on without it.")
+        return points
 
 
 class LocalColmap(ColmapDataParser):

@@ -1,44 +1,160 @@
-"""Visibility of points without tracks (``points3D`` of a data parser) in the training images.
+"""Which training images see the points of a cloud (``ply_file_path``), which does not record it.
 
-A point cloud does not record which image saw a point, and projection alone would see through walls. Coarse depth images
-of the cloud decide: a point is visible if no other one lies clearly in front of it, in its cell or a neighbouring one.
+Projection alone would see through walls. Where a pixel's depth is known from matches, a point is visible if it lies
+there, hidden if it lies behind, and contradicted if it lies in front: then the image looks through it. Elsewhere coarse
+depth images of the cloud decide: a point is visible if no other one lies clearly in front of it, in its cell or a
+neighbouring one.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter
 
+from mmpi_ns.capture.checks import say_once
+from mmpi_ns.capture.tracks import PosedImages
+from mmpi_ns.capture.views import project
 from mmpi_ns.placement.observations import Observations
+
+Array = NDArray[np.float64]
+Map = NDArray[np.float32]
 
 CELLS = 48
 """Cells of a coarse depth image along the longer side."""
 BEHIND = 1.15
 """A point farther away than the nearest one around it by this factor is hidden."""
+POINT_ERROR = 0.01
+"""Minimum relative error of the distance of a point."""
+CONTRADICTS = 6.0
+"""Difference of two sources, in expected errors of both, from which one of them is wrong."""
+MOST_POINTS = 100_000
+"""Points that are used of a larger cloud, such as a laser scan's."""
+FARTHEST = 1e5
+"""Distance of a point from the cameras, over their own extent, from which it is a mistake."""
 
 
-def with_visible_points(observations: Observations) -> Observations:
-    """Keypoints of the observations' points in every camera that sees them; lens distortion is ignored."""
-    seen_by, seen_point, seen_at = [observations.seen_by[:0]], [observations.seen_point[:0]], [np.zeros((0, 2))]
-    for camera, (width, height) in enumerate(observations.sizes):
-        cameras = np.full(len(observations.points), camera)
-        at, ahead = observations.project(cameras, observations.points)
-        depth = observations.depths(cameras, observations.points)
-        chosen = np.nonzero(ahead & (at >= 0).all(-1) & (at[:, 0] < width) & (at[:, 1] < height))[0]
-        cell = max(width, height) / CELLS
-        columns, rows = (at[chosen] / cell).astype(int).T
-        nearest = np.full((int(height / cell) + 1, int(width / cell) + 1), np.inf)
-        np.minimum.at(nearest, (rows, columns), depth[chosen])
-        nearest = minimum_filter(nearest, 3, mode="nearest")
-        chosen = chosen[depth[chosen] < BEHIND * nearest[rows, columns]]
-        seen_by.append(np.full(len(chosen), camera))
-        seen_point.append(chosen)
-        seen_at.append(at[chosen])
-    return replace(
-        observations,
-        seen_by=np.concatenate(seen_by),
-        seen_point=np.concatenate(seen_point),
-        seen_at=np.concatenate(seen_at),
-    )
+def contradict(one: Map, other: Map) -> NDArray[np.bool_]:
+    """Where two sources [..., 2] know an inverse distance and differ by more than their errors can explain. [...]"""
+    apart = np.abs(one[..., 0] - other[..., 0]) > CONTRADICTS * np.hypot(one[..., 1], other[..., 1])
+    return apart & (one[..., 0] > 0) & (other[..., 0] > 0)
+
+
+def usable_points(points: Array, centers: Array) -> Array:
+    """The points of a cloud [P, 3] that can be used, a random subset of ``MOST_POINTS`` if there are more.
+
+    Says how many are NaN or absurdly far away.
+
+    Args:
+        points: in scene units.
+        centers: of the cameras. [M, 3]
+    """
+    middle = np.median(centers, axis=0)
+    extent = float(np.ptp(centers, axis=0).max())
+    with np.errstate(invalid="ignore"):
+        usable = np.abs(points - middle).max(-1) < (FARTHEST * extent or np.inf)
+    if not usable.all():
+        say_once(
+            f"{(~usable).sum():,} of {len(usable):,} points of the point cloud are not used: they are no finite "
+            "numbers, or absurdly far away."
+        )
+    points = points[usable]
+    if len(points) <= MOST_POINTS:
+        return points
+    return points[np.sort(np.random.default_rng(0).choice(len(points), MOST_POINTS, replace=False))]
+
+
+@dataclass(frozen=True)
+class Sightings:
+    """Where training images see the points of a cloud."""
+
+    points: Array
+    """[P, 3]"""
+    seen_by: NDArray[np.int64]
+    """[Q] camera."""
+    seen_point: NDArray[np.int64]
+    """[Q] point."""
+    seen_at: Array
+    """[Q, 2] pixel (x, y)."""
+    confirmed: NDArray[np.int64]
+    """[P] images in which a point lies at the known depth of its pixel."""
+    contradicted: NDArray[np.int64]
+    """[P] images whose known depth there is behind it."""
+
+    @property
+    def fits(self) -> bool:
+        """Whether more points are confirmed than contradicted, or none is either."""
+        return bool((self.confirmed > self.contradicted).sum() >= (self.contradicted > self.confirmed).sum())
+
+    def added_to(self, tracks: Observations) -> Observations:
+        """The observations with these after the keypoints of their tracks; contradicted points are left out."""
+        kept = (self.contradicted <= self.confirmed)[self.seen_point]
+        count, first = len(tracks.seen_at), len(tracks.points)
+        return replace(
+            tracks,
+            points=np.concatenate([tracks.points, self.points]),
+            seen_by=np.concatenate([tracks.seen_by[:count], self.seen_by[kept], tracks.seen_by[count:]]),
+            seen_point=np.concatenate(
+                [tracks.seen_point[:count], first + self.seen_point[kept], tracks.seen_point[count:]]
+            ),
+            seen_at=np.concatenate([tracks.seen_at, self.seen_at[kept]]),
+            loose=None,
+        )
+
+    def describe(self) -> str:
+        """How many points are used, and what for, in one line."""
+        out = self.contradicted > self.confirmed
+        if not self.fits:
+            return (
+                f"The point cloud does not fit the images, which look through {out.sum():,} of its points where they "
+                f"confirm {(self.confirmed > 0).sum():,}, so it is not used: state its frame as applied_transform in "
+                "transforms.json."
+            )
+        used = np.unique(self.seen_point[~out[self.seen_point]])
+        left_out = f"; {out.sum():,} are left out, as images look through them" if out.any() else ""
+        return (
+            f"Point cloud: {len(used):,} of {len(self.points):,} points are seen, {(self.confirmed > 0).sum():,} of "
+            f"them where matches have a depth{left_out}. They are used for placement and depths."
+        )
+
+
+def see_points(points: Array, posed: PosedImages, depths: Callable[[int], Map] | None = None) -> Sightings:
+    """Where the training images see points [P, 3].
+
+    Args:
+        points: in scene units.
+        posed: the images.
+        depths: known inverse distances and their errors for an image, 0 where unknown. [H, W, 2]
+    """
+    seen: list[tuple[NDArray[np.int64], NDArray[np.int64], Array]] = []
+    confirmed, contradicted = np.zeros((2, len(points)), np.int64)
+    for i, size in enumerate(posed.sizes):
+        at = project(posed, i, points)
+        inside = np.nonzero(((at >= 0) & (at < size)).all(-1))[0]
+        at = at[inside]
+        distance = np.linalg.norm(points[inside] - posed.camera_to_worlds[i, :, 3], axis=-1)
+        visible = _in_front(at, distance, size)
+        if depths is not None:
+            columns, rows = at.astype(int).T
+            known = depths(i)[rows, columns]
+            own = np.outer(1 / np.maximum(distance, 1e-30), [1, POINT_ERROR]).astype(np.float32)
+            measured, apart = known[:, 0] > 0, contradict(own, known)
+            visible = np.where(measured, ~apart, visible)
+            confirmed[inside] += measured & ~apart
+            contradicted[inside] += apart & (own[:, 0] > known[:, 0])
+        seen.append((np.full(visible.sum(), i), inside[visible], at[visible]))
+    seen_by, seen_point, seen_at = (np.concatenate(parts) for parts in zip(*seen, strict=True))
+    return Sightings(points, seen_by, seen_point, seen_at, confirmed, contradicted)
+
+
+def _in_front(at: Array, distance: Array, size: Array) -> NDArray[np.bool_]:
+    """Which of an image's points, at pixels [K, 2], no other one clearly hides. [K]"""
+    cell = max(size) / CELLS
+    columns, rows = (at / cell).astype(int).T
+    nearest = np.full((int(size[1] / cell) + 1, int(size[0] / cell) + 1), np.inf)
+    np.minimum.at(nearest, (rows, columns), distance)
+    nearest = minimum_filter(nearest, 3, mode="nearest")
+    return distance < BEHIND * nearest[rows, columns]

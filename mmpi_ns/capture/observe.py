@@ -16,10 +16,10 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
 
 from mmpi_ns.capture.cache import Arrays, digest, remembered
-from mmpi_ns.capture.checks import in_one_place
+from mmpi_ns.capture.checks import in_one_place, say_once
 from mmpi_ns.capture.dataset import MMPIDataset
 from mmpi_ns.capture.lens_directions import lens_directions
-from mmpi_ns.capture.loose_points import with_visible_points
+from mmpi_ns.capture.loose_points import usable_points
 from mmpi_ns.capture.originals import at_full_size
 from mmpi_ns.capture.sfm import SfmModel, find_sfm_model
 from mmpi_ns.capture.tracks import PosedImages, triangulate
@@ -65,7 +65,10 @@ def observe(
     if find_points:
         if not len(observations.seen_by):
             observations = _find_points(observations, dataset, triangulates)
-        elif len(observations.seen_at):
+        else:
+            if observations.loose is not None:
+                say_once("Point cloud: not used, as the SfM tracks tell of each point which images saw it.")
+                observations = replace(observations, loose=None)
             angles = keypoint_angles(observations, dataset.cameras)
             off = np.median(angles * observations.intrinsics[observations.seen_by, 0])
             tell_poses(float(off), Path(outputs.image_filenames[0]))
@@ -167,18 +170,17 @@ def read_observations(outputs: DataparserOutputs, cameras: Cameras, sfm: SfmMode
         tracks = sfm.keypoints_of([Path(p).name for p in outputs.image_filenames])
         result = {"points": moved * outputs.dataparser_scale, "seen_by": tracks[0], "seen_point": tracks[1]}
         seen_at = tracks[2] * sizes[tracks[0]]
-    elif "points3D_xyz" in outputs.metadata:
-        result = {**result, "points": outputs.metadata["points3D_xyz"].double().numpy()}
+    cloud = outputs.metadata.get("points3D_xyz")
+    loose = None if cloud is None else usable_points(cloud.double().numpy(), poses[:, :, 3])
     observations = Observations(
         camera_to_worlds=poses,
         intrinsics=np.stack(flat, -1),
         sizes=sizes.astype(np.float64),
         seen_at=seen_at,
         lens=lens_directions(cameras),
+        loose=loose if loose is not None and len(loose) else None,
         **result,
     )
-    if len(observations.points) and not len(observations.seen_by):
-        return with_visible_points(observations)
     return _fitting_tracks(observations, cameras) if len(seen_at) else observations
 
 
@@ -256,7 +258,7 @@ def with_tracks(observations: Observations, model: SfmModel) -> Observations:
 
 def drop_masked(observations: Observations, dataset: MMPIDataset) -> Observations:
     """Drops keypoints on masked pixels: moving objects have no depth to learn from."""
-    if not len(observations.seen_at) or dataset._dataparser_outputs.mask_filenames is None:
+    if not len(observations.seen_at) or not dataset.has_masks:
         return observations
     keep = np.ones(len(observations.seen_by), dtype=bool)
     for i in range(len(dataset)):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -58,14 +59,32 @@ def load_view(images: PosedImages, i: int, width: int) -> View:
     pinhole = images.intrinsics[i] * np.tile(scale, 2)
     inside = np.broadcast_to(True, gray.shape)  # of no size
     if images.is_bent(i):
-        matrix, size = camera_matrix(pinhole), gray.shape[::-1]
-        straighten = cv2.fisheye.initUndistortRectifyMap if images.is_fisheye(i) else cv2.initUndistortRectifyMap
-        # OpenCV counts from pixel centres.
-        matrix[:2, 2] -= 0.5
-        x, y = straighten(matrix, images.distortion[i], np.eye(3), matrix, size, cv2.CV_32FC1)
+        size = gray.shape[::-1]
+        x, y = _unbent(images, i, pinhole, size)
         gray = cv2.remap(gray, x, y, cv2.INTER_LINEAR)
         inside = (x >= 0) & (x <= size[0] - 1) & (y >= 0) & (y <= size[1] - 1)
     return View(np.ascontiguousarray(gray, np.uint8), pinhole, images.camera_to_worlds[i], inside)
+
+
+def _unbent(images: PosedImages, i: int, pinhole: NDArray[np.float64], size: Sequence[int]) -> tuple[Map, Map]:
+    """Where in image i, of a size (width, height), its undistorted view's pixels lie; OpenCV counts from centres."""
+    matrix = camera_matrix(pinhole)
+    straighten = cv2.fisheye.initUndistortRectifyMap if images.is_fisheye(i) else cv2.initUndistortRectifyMap
+    matrix[:2, 2] -= 0.5
+    x, y = straighten(matrix, images.distortion[i], np.eye(3), matrix, size, cv2.CV_32FC1)
+    return np.asarray(x, np.float32), np.asarray(y, np.float32)
+
+
+def straightened_color(images: PosedImages, i: int, view: View) -> NDArray[np.uint8]:
+    """Blue, green and red of image i as its view shows it. [h, w, 3]"""
+    color = cv2.imread(str(images.files[i]), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    if color is None:
+        raise InputError(f"Training image {images.files[i]} cannot be read: repair it or remove its frame.")
+    size = view.gray.shape[::-1]
+    color = cv2.resize(color, size, interpolation=cv2.INTER_AREA)
+    if images.is_bent(i):
+        color = cv2.remap(color, *_unbent(images, i, view.pinhole, size), cv2.INTER_LINEAR)
+    return np.asarray(color, np.uint8)
 
 
 def camera_matrix(pinhole: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -74,15 +93,28 @@ def camera_matrix(pinhole: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def project(posed: PosedImages, j: int, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Pixels [P, 2] at which a camera shows points [P, 3], lens included; far outside where they are behind it."""
+    """Pixels [P, 2] at which a camera shows points [P, 3], lens included; far outside where they are behind it or so
+    far to the side that the lens's polynomial turns back."""
     pose = posed.camera_to_worlds[j]
     local = (points - pose[:, 3]) @ pose[:, :3] * [1, -1, -1]  # OpenCV's axes: right, down, ahead
     ahead = local[:, 2] > 0
+    aside = np.hypot(local[:, 0], local[:, 1])
+    fisheye = posed.is_fisheye(j)
+    radius = np.arctan2(aside, local[:, 2]) if fisheye else aside / np.where(ahead, local[:, 2], 1)
+    ahead &= radius < turning_radius(posed.distortion[j] if fisheye else posed.distortion[j, :2])
     local = np.where(ahead[:, None], local, [0.0, 0.0, 1.0])[:, None]
     matrix, still = camera_matrix(posed.intrinsics[j]), np.zeros(3)
-    bend = cv2.fisheye.projectPoints if posed.is_fisheye(j) else cv2.projectPoints
+    bend = cv2.fisheye.projectPoints if fisheye else cv2.projectPoints
     at = bend(local, still, still, matrix, posed.distortion[j])[0].reshape(-1, 2)
     return np.where(ahead[:, None], at, -1e4)
+
+
+def turning_radius(radial: NDArray[np.float64]) -> float:
+    """Radius r > 0 from which r (1 + k1 r^2 + k2 r^4 + ...) falls; infinite if it never does."""
+    slope = [1.0, *((2 * n + 3) * k for n, k in enumerate(radial))]  # in powers of the squared radius
+    roots = np.polynomial.polynomial.polyroots(np.trim_zeros(slope, "b"))
+    squares = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)]
+    return float(np.sqrt(squares.min())) if len(squares) else np.inf
 
 
 def pixel_grid(shape: tuple[int, ...]) -> tuple[Map, Map]:

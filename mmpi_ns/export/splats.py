@@ -21,9 +21,8 @@ from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 
 from mmpi_ns.export.files import BakedScene, Pose
-from mmpi_ns.ops.gather.reference import COLORS, activate
-from mmpi_ns.ops.splat import splat_image, splat_opacities, splat_sums
-from mmpi_ns.ops.splat.reference import BLUR, Gaussians, View
+from mmpi_ns.ops.gather import COLORS, activate
+from mmpi_ns.ops.splat import BLUR, Gaussians, View, splat_image, splat_opacities, splat_sums
 from mmpi_ns.rendering.baked import BakedWindow
 from mmpi_ns.scene.baked import CELLS, SIDE, brick_numbers, columns_of
 from mmpi_ns.scene.windows import Window, window_shares

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from mmpi_ns.ops.shade.reference import SampleNetworks, positional_encoding, run_layers, sample_colors
+from mmpi_ns.ops.shade import Layers, SampleNetworks, positional_encoding, run_layers, sample_colors
 
 
 class Networks(nn.Module):
@@ -42,10 +42,10 @@ class Networks(nn.Module):
             parts.append((torch.rand(math.prod(shape), generator=generator) * 2 - 1) * bound)
         return torch.cat(parts).repeat(count, 1)
 
-    def layers(self, head: int) -> list[Tensor]:
-        """Weights [out, in] and biases of one head's three layers."""
-        sizes = [math.prod(s) for s in self.shapes]
-        return [p.view(s) for p, s in zip(self.weights[head].split(sizes), self.shapes, strict=True)]
+    def layers(self, head: int) -> Layers:
+        """Three layers of one head's network."""
+        parts = self.weights[head].split([math.prod(s) for s in self.shapes])
+        return Layers(*(p.view(s) for p, s in zip(parts, self.shapes, strict=True)))
 
     def run(self, head: int, inputs: Float[Tensor, "N I"]) -> Float[Tensor, "N 3"]:
         """Output of one head's network."""
@@ -87,5 +87,5 @@ class ColorNetworks(Networks):
 
     def of_heads(self, count: int) -> SampleNetworks:
         """The networks of this many heads, for ``ops.shade``."""
-        layers = tuple(tuple(x.detach() for x in self.layers(k)) for k in range(count))
+        layers = tuple(Layers(*(x.detach() for x in self.layers(k))) for k in range(count))
         return SampleNetworks(layers, self.position_frequencies, self.direction_frequencies)

@@ -16,7 +16,7 @@ from torch import Tensor
 from mmpi_ns.field.color_network import Networks
 from mmpi_ns.ops.composite import Composite
 from mmpi_ns.ops.gather import COLORS, RaySums
-from mmpi_ns.ops.shade.reference import positional_encoding
+from mmpi_ns.ops.shade import positional_encoding
 
 Shading = Literal["ray", "sample"]
 """Whether the network is evaluated once a ray or for every sample."""

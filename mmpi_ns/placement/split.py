@@ -45,6 +45,14 @@ def place_windows(
     return WindowedPlan(tuple(windows))
 
 
+def most_pixels(observations: Observations, config: PlacementConfig) -> float:
+    """Training pixels of the largest window of a capture."""
+    balls = find_balls(observations, config.window_length) if config.window_length > 0 else []
+    pixels = observations.sizes.prod(-1)
+    windows = [cameras_in(observations.centers, center, radius + margin) for center, radius, margin in balls]
+    return float(max((pixels[cameras].sum() for cameras in windows), default=pixels.sum()))
+
+
 def find_balls(observations: Observations, length: float) -> list[tuple[Array, float, float]]:
     """(centre, radius, margin) of the windows, in order along the way; independent of the cameras' order.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -55,6 +56,8 @@ class MMPIPipeline(VanillaPipeline):
                 means = super().get_average_image_metrics(data_loader, image_prefix, *args, **kwargs)
         finally:
             model.scoring = None
+        # Of one image nerfstudio's deviations are NaN, which is no JSON.
+        means = {name: 0.0 if math.isnan(value) and name.endswith("_std") else value for name, value in means.items()}
         names = [Path(name).name for name in data_loader.input_dataset.image_filenames]
         say(summary([(names[i], values) for i, values in scores]))
         return means

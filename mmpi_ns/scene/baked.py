@@ -90,6 +90,11 @@ class BakedMpis:
         return self.packed["frames"]
 
     @property
+    def sizes(self) -> dict[str, int]:
+        """What letters in shapes stand for: bricks, MPIs and heads, which are the same."""
+        return {"B": self.num_bricks, "K": len(self.mpis), "H": len(self.mpis)}
+
+    @property
     def num_bricks(self) -> int:
         return len(self.density)
 

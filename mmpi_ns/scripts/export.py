@@ -107,11 +107,9 @@ class Splats(_Run):
         _check_run(self.load_config)
         if self.output.exists() and not self.overwrite:
             raise ValueError(f"{self.output} is there already: name another file, or give --overwrite.")
-        import torch
-
         from mmpi_ns.ops import dispatch
 
-        if dispatch.form_of("splat_image", torch.zeros(1)) != "cpu":
+        if dispatch.fault("C++") is not None:
             raise ValueError("Colours of splats are fitted by compiled code: install a C++ compiler (g++ or clang++).")
         scene = self.bake()
         from mmpi_ns.export.splats import poses_in, splats_of, write_ply

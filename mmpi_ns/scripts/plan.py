@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 
 import tyro
 
-from mmpi_ns.placement.defaults import DEFAULTS
+from mmpi_ns.placement.defaults import DEFAULTS, steps_for
 from mmpi_ns.placement.options import check_placement
 from mmpi_ns.placement.rule import PlacementConfig
 from mmpi_ns.scripts.command import say_version
@@ -42,20 +42,21 @@ class PlanCommand:
     """Format of the scene."""
     plan_file: Path | None = None
     """Evaluate this plan instead of making a new one."""
-    training_rays: int = 0
-    """Pixel rays of the training for which texels are sized; 0: no limit."""
+    training_rays: int | None = None
+    """Pixel rays of the training for which texels are sized; 0: no limit. None: those of the method's own steps."""
     placement: PlacementConfig = field(default_factory=PlacementConfig)
     """The rule's settings."""
 
     def main(self) -> None:
         # Slow imports, which --help does not need.
         from mmpi_ns.capture.load import check_there, load_observations
-        from mmpi_ns.placement.split import place_windows
+        from mmpi_ns.placement.split import most_pixels, place_windows
         from mmpi_ns.scene.windows import WindowedPlan
         from mmpi_ns.utils.files import write_errors
 
         check_placement(self.placement, "--placement.")
-        check_options(self, {"training_rays": Number(0, whole=True)}, "--")
+        if self.training_rays is not None:
+            check_options(self, {"training_rays": Number(0, whole=True)}, "--")
         check_there(self.scene)
         with write_errors(self.output, "--output"):
             self.output.mkdir(parents=True, exist_ok=True)
@@ -66,7 +67,11 @@ class PlanCommand:
         if self.plan_file is not None:
             windows = WindowedPlan.load(self.plan_file)
         else:
-            windows = place_windows(observations, self.placement, self.training_rays or None)
+            rays = self.training_rays
+            if rays is None:
+                steps = steps_for(self.method, most_pixels(observations, self.placement))
+                rays = steps * DEFAULTS[self.method].rays
+            windows = place_windows(observations, self.placement, rays or None)
         text = self._explain(windows, observations)
         title = f"# Plan of {self.scene.resolve().name}"
         (self.output / "plan.json").write_text(windows.to_json(), encoding="utf-8")
@@ -117,12 +122,11 @@ def _check_not_edited(plan: Path) -> None:
 
 
 def _defaults(arguments: list[str]) -> PlanCommand:
-    """The command with the placement and the rays of the method that the arguments name."""
+    """The command with the placement of the method that the arguments name."""
     words = [w for argument in arguments for w in argument.split("=", 1)]
     named = words[words.index("--method") + 1] if "--method" in words[:-1] else ""
     default = DEFAULTS.get(named, DEFAULTS["mmpi-small"])
-    rays = default.steps * default.rays
-    return PlanCommand(tyro.MISSING, tyro.MISSING, training_rays=rays, placement=default.placement)
+    return PlanCommand(tyro.MISSING, tyro.MISSING, placement=default.placement)
 
 
 def entrypoint() -> None:

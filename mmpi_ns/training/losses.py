@@ -14,13 +14,15 @@ from torch import Tensor
 from mmpi_ns.capture.ray_sources import EXPOSURE, KEYPOINT_DEPTH, PIXEL_DEPTH
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.samples import metadata_of
-from mmpi_ns.ops.composite.reference import Composite, exclusive_cumsum
+from mmpi_ns.ops.depth_sums import DepthSums, depth_sums
 from mmpi_ns.rendering.rendered import RenderedRays
 
 CLIPPED = 0.98
 """Colour of an image above which a channel may be clipped."""
 PLANE_ERROR = 0.6
 """Minimum error of a known depth, in plane spacings."""
+KEYPOINT_WIDTH = 0.06
+"""Standard deviation of the window round an SfM keypoint, relative to its inverse distance."""
 
 
 @dataclass
@@ -85,68 +87,20 @@ def background_entropy(transmittance: Float[Tensor, "R 1"]) -> Float[Tensor, ""]
     return -(p * p.log() + (1 - p) * (1 - p).log()).mean()
 
 
-def distortion(
-    weights: Float[Tensor, "R S"], positions: Float[Tensor, "R S"], intervals: Float[Tensor, "R S"]
-) -> Float[Tensor, ""]:
-    """Spread of a ray's weights (L_dist): sum_ij w_i w_j |s_i - s_j| + 1/3 sum_i w_i^2 delta_i, mean over rays.
+def keypoint_depth(mass: Float[Tensor, "R"], reached: Bool[Tensor, "R"]) -> Float[Tensor, ""]:
+    """-log of the weight mass near SfM keypoints, mean over the rays that can reach theirs.
 
-    O(S) a ray by prefix sums, which needs ``positions`` sorted along the ray.
+    Rays without a sample near their point carry no information about it and are left out.
 
     Args:
-        weights: rendering weights, 0 in empty slots.
-        positions: s, a monotone map of the merged distance into [0, 1].
-        intervals: delta, the length of each sample on that map.
-
-    Source: mip-NeRF 360 eq. (15); O(N) form as in DVGO v2.
+        mass: weights round the point (``ops.depth_sums``, the window KEYPOINT_WIDTH of its inverse distance).
+        reached: rays with a sample near it.
     """
-    before = exclusive_cumsum(weights)
-    moment_before = exclusive_cumsum(weights * positions)
-    between = 2 * (weights * (positions * before - moment_before)).sum(-1)
-    within = (weights**2 * intervals).sum(-1) / 3
-    return (between + within).mean()
+    nll = torch.where(reached, -torch.log(mass + 1e-4), torch.zeros_like(mass))
+    return nll.sum() / reached.sum().clamp(min=1)
 
 
-def keypoint_depth(
-    weights: Float[Tensor, "R S"],
-    inverse_t: Float[Tensor, "R S"],
-    known_inverse_t: Float[Tensor, "R 1"],
-    valid: Bool[Tensor, "R S"],
-    relative_width: float = 0.06,
-) -> Float[Tensor, ""]:
-    """-log of the weight mass near an SfM keypoint's known inverse distance, mean over the rays that can reach it.
-
-    A soft window exp(-1/2 ((q - q0) / (width q0))^2) in inverse distance q. Rays without a sample within three widths
-    carry no information about the point and are left out.
-
-    Args:
-        weights: rendering weights of the keypoint rays.
-        inverse_t: inverse distances of their samples.
-        known_inverse_t: inverse distance of the SfM point; 0 marks a ray without one.
-        valid: which slots hold a sample.
-        relative_width: standard deviation of the window relative to the known inverse distance.
-    """
-    scaled = (inverse_t - known_inverse_t) / (relative_width * known_inverse_t.clamp(min=1e-12))
-    window = _window(scaled, valid)
-    reachable = (valid & (scaled.abs() < 3)).any(-1) & (known_inverse_t[:, 0] > 0)
-    mass = (weights * window).sum(-1)
-    nll = -torch.log(mass + 1e-4)
-    count = reachable.sum().clamp(min=1)
-    return torch.where(reachable, nll, torch.zeros_like(nll)).sum() / count
-
-
-def _window(scaled: Float[Tensor, "R S"], valid: Bool[Tensor, "R S"]) -> Float[Tensor, "R S"]:
-    """exp(-1/2 scaled^2), 0 in empty slots; never below 1e-26, since exponentials that underflow take far longer."""
-    return torch.where(valid, torch.exp(-0.5 * scaled.square().clamp(max=120)), torch.zeros_like(scaled))
-
-
-def known_depth(
-    weights: Float[Tensor, "R S"],
-    inverse_t: Float[Tensor, "R S"],
-    known: Float[Tensor, "R 2"],
-    valid: Bool[Tensor, "R S"],
-    least_error: float,
-    outliers: float = 0.02,
-) -> Float[Tensor, ""]:
+def known_depth(mass: Float[Tensor, "R"], reached: Bool[Tensor, "R"], outliers: float = 0.02) -> Float[Tensor, ""]:
     """-log of the likelihood of measured inverse distances given the weights along their rays, mean over all rays.
 
     A measurement is either right, so that the weights lie within its error, exp(-1/2 ((q - q0) / error)^2), or an
@@ -154,19 +108,12 @@ def known_depth(
     measurement that many views contradict is ignored.
 
     Args:
-        weights: rendering weights.
-        inverse_t: inverse distances of the samples.
-        known: measured inverse distance, 0 if there is none, and its expected error.
-        valid: which slots hold a sample.
-        least_error: lower bound on all errors, from the spacing of planes.
+        mass: weights round the measured inverse distance (``ops.depth_sums``, the window its error).
+        reached: rays with a sample near it.
         outliers: likelihood of an outlier.
     """
-    error = torch.hypot(known[:, 1:], torch.full_like(known[:, 1:], least_error)).clamp(min=1e-12)
-    scaled = (inverse_t - known[:, :1]) / error
-    window = _window(scaled, valid)
-    reachable = (valid & (scaled.abs() < 3)).any(-1) & (known[:, 0] > 0)
-    nll = -torch.log((weights * window).sum(-1) + outliers)
-    return torch.where(reachable, nll, torch.zeros_like(nll)).mean() if len(nll) else weights.sum()
+    nll = torch.where(reached, -torch.log(mass + outliers), torch.zeros_like(mass))
+    return nll.mean() if len(nll) else mass.sum()
 
 
 def batch_losses(
@@ -182,7 +129,7 @@ def batch_losses(
         g: draws the colours behind the pixels.
         step: of the training.
     """
-    known, exposure = (rays.bundle.metadata.get(name) for name in (KEYPOINT_DEPTH, EXPOSURE))
+    exposure = rays.bundle.metadata.get(EXPOSURE)
     # Counted on the host: asking the GPU which rays are pixel rays would be a synchronisation.
     asked, size, device = len(image), len(rays.bundle) // rays.times, image.device
     starts = size * torch.arange(rays.times, device=device)[:, None]
@@ -194,19 +141,23 @@ def batch_losses(
     # If MPIs train separately and cover a ray only in part, they need not explain the remaining transmittance.
     explained = rays.report.explained[pixels]
     background = torch.where(explained, random, observed)
-    c, colors = rays.composite, rays.colors.of_rays(pixels)
-    composite = Composite(*(x.index_select(0, pixels) for x in (c.weights, c.accumulation, c.transmittance)))
-    rgb = colors.rgb + composite.transmittance * background
+    colors, transmittance = rays.colors.of_rays(pixels), rays.composite.transmittance.index_select(0, pixels)
+    rgb = colors.rgb + transmittance * background
+    sums = _depth_sums(rays, field)
     total = {
         "rgb_loss": photometric(rgb, observed, None if exposure is None else exposure.index_select(0, pixels)),
         "point_color": weight.point_color * point_color(colors.mass, colors.first, colors.second, observed),
-        "entropy": weight.background_entropy * background_entropy(composite.transmittance),
-        "distortion": weight.distortion * _distortion(rays, pixels, composite, field.plan.content_near),
+        "entropy": weight.background_entropy * background_entropy(transmittance),
+        "distortion": weight.distortion * sums.spread.index_select(0, pixels).mean(),
     }
-    if known is not None and len(keypoints):
-        total["keypoint_depth"] = weight.keypoint_depth * _keypoint_depth(rays, keypoints, known)
+    if KEYPOINT_DEPTH in rays.bundle.metadata and len(keypoints):
+        total["keypoint_depth"] = weight.keypoint_depth * keypoint_depth(
+            sums.mass.index_select(0, keypoints), sums.reached[keypoints]
+        )
     if PIXEL_DEPTH in rays.bundle.metadata and weight.known_depth > 0:
-        total["known_depth"] = weight.known_depth * _known_depth(rays, pixels, composite, field, weight.depth_outliers)
+        total["known_depth"] = weight.known_depth * known_depth(
+            sums.mass.index_select(0, pixels), sums.reached[pixels], weight.depth_outliers
+        )
     if rays.lookup is not None and step % weight.tv_every == 0 and field.density.requires_grad:
         total["tv"] = field.total_variation(rays.lookup, weight.tv_density, weight.tv_features) * (
             weight.tv_every / max(1, image.shape[0])
@@ -214,31 +165,22 @@ def batch_losses(
     return total
 
 
-def _distortion(rays: RenderedRays, pixels: Tensor, composite: Composite, scale: float) -> Tensor:
-    inverse_t = metadata_of(rays.samples)["inverse_t"][..., 0].index_select(0, pixels)
-    positions = 1 / (1 + inverse_t * scale)
-    intervals = (1 / rays.report.live[pixels].clamp(min=1))[:, None].to(positions.dtype)
-    return distortion(composite.weights, positions, intervals.expand_as(positions))
-
-
-def _known_depth(rays: RenderedRays, pixels: Tensor, composite: Composite, field: MMPIField, outliers: float) -> Tensor:
-    meta = metadata_of(rays.samples)
-    inverse_t, valid = (meta[name][..., 0].index_select(0, pixels) for name in ("inverse_t", "valid"))
-    known = rays.bundle.metadata[PIXEL_DEPTH].index_select(0, pixels)
+def _depth_sums(rays: RenderedRays, field: MMPIField) -> DepthSums:
+    """Of all rays; the target is a keypoint or the known depth of a pixel."""
+    meta, bundle = metadata_of(rays.samples), rays.bundle
+    targets = bundle.metadata.get(PIXEL_DEPTH)
+    targets = bundle.origins.new_zeros(len(bundle), 2) if targets is None else targets
     # The plane spacing in inverse distance; a surface between two planes is represented by both.
     spacings = [1 / (m.near * max(1, m.planes - 1)) for m in field.plan.mpis]
     least = PLANE_ERROR * sum(spacings) / max(1, len(spacings))
-    return known_depth(composite.weights, inverse_t, known, valid, least, outliers)
-
-
-def _keypoint_depth(rays: RenderedRays, chosen: Tensor, known: Tensor) -> Tensor:
-    meta = metadata_of(rays.samples)
-    return keypoint_depth(
-        rays.composite.weights.index_select(0, chosen),
-        meta["inverse_t"][..., 0].index_select(0, chosen),
-        known[chosen],
-        meta["valid"][..., 0].index_select(0, chosen),
-    )
+    targets = torch.stack([targets[:, 0], (targets[:, 1] ** 2 + least**2).sqrt().clamp(min=1e-12)], -1)
+    if KEYPOINT_DEPTH in bundle.metadata:
+        keypoints = bundle.metadata[KEYPOINT_DEPTH]
+        windows = torch.cat([keypoints, KEYPOINT_WIDTH * keypoints], -1)
+        targets = torch.where(keypoints > 0, windows, targets)
+    weights, inverse_t, valid = rays.composite.weights, meta["inverse_t"][..., 0], meta["valid"][..., 0]
+    intervals = 1 / rays.report.live.clamp(min=1).to(weights)
+    return depth_sums(weights, inverse_t, valid, intervals, targets, field.plan.content_near)
 
 
 def over_background(image: Tensor, background: Tensor) -> Tensor:

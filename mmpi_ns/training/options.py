@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from nerfstudio.engine.trainer import TrainerConfig
 
+from mmpi_ns.placement.defaults import DEFAULTS
 from mmpi_ns.placement.options import check_placement
 from mmpi_ns.training.phases import check_schedule
 from mmpi_ns.utils.errors import InputError
@@ -22,7 +23,7 @@ SHARE = Number(0, 1)
 LONGEST_NAME = 255
 """Bytes of a folder's name."""
 RUN = {
-    "max_num_iterations": Number(1, 10**9, whole=True),
+    "max_num_iterations": Number(0, 10**9, whole=True),
     "steps_per_save": COUNT,
     "steps_per_eval_batch": COUNT,
     "steps_per_eval_image": COUNT,
@@ -97,6 +98,8 @@ def check_run(config: TrainerConfig) -> None:
     manager: Any = config.pipeline.datamanager
     model: Any = config.pipeline.model
     check_options(config, RUN, "--")
+    if config.max_num_iterations == 0 and config.method_name not in DEFAULTS:
+        raise InputError(f"{config.method_name} has no number of steps of its own: give --max-num-iterations.")
     check_options(config.machine, MACHINE, "--machine.")
     check_options(config.logging, {"steps_per_log": Number(1, whole=True)}, "--logging.")
     check_options(manager, PIXELS, "--pipeline.datamanager.")

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
 import torch
+from jaxtyping import Float
 from nerfstudio.cameras.camera_optimizers import CameraOptimizer
 from nerfstudio.cameras.rays import RayBundle
-from torch.nn import Parameter
+from torch import Tensor
 
 from mmpi_ns.capture.ray_sources import OWN_PIXEL
 from mmpi_ns.utils.errors import InputError
@@ -23,13 +22,35 @@ def check_refined_poses(mode: str, windows: int) -> None:
 
 
 @torch.no_grad()
-def keep_frame(poses: Iterable[Parameter]) -> None:
-    """Subtracts the mean of the cameras' corrections [N, 6].
+def keep_frame(
+    moves: Float[Tensor, "M 6"], centers: Float[Tensor, "M 3"], distance: float, scale_is_free: bool
+) -> None:
+    """Removes from pose corrections, in place, the motion of the whole capture that no training image shows (gauge).
 
-    The scene would follow a common correction without changing the training images, but test images keep their poses.
+    The scene would follow a rigid motion of all cameras, but test images keep their poses. Cameras that each turn by
+    the same angle where they stand are no rigid motion: images show that, and it stays. The motion is fitted by least
+    squares; what it leaves of the corrections shows the same images, to second order in the corrections.
+
+    Args:
+        moves: shift in scene units and rotation vector of each camera, about the world's axes (nerfstudio's SO3xR3).
+        centers: the cameras' positions before the corrections.
+        distance: of the content, by which a turn weighs as much as the shift of what is seen. Scene units.
+        scale_is_free: no known depth says how large the capture is, so a change of its scale is removed as well.
     """
-    for moves in poses:
-        moves -= moves.mean(0)
+    shifts, turns = moves.double().split(3, -1)
+    places = centers.to(shifts) + shifts
+    places = places - places.mean(0)
+    eye = torch.eye(3).to(places).expand(len(places), 3, 3)
+    shift = torch.cat([eye, torch.linalg.cross(eye, places[:, None].expand(-1, 3, 3)), places[:, None]], 1)
+    turn = torch.cat([torch.zeros_like(eye), eye, torch.zeros_like(places)[:, None]], 1)
+    free = 7 if scale_is_free else 6
+    motions = torch.cat([shift, turn], -1)[:, :free]  # of each camera, by each free motion
+    weight = motions.new_tensor([1.0] * 3 + [max(distance, 1e-6)] * 3)
+    system = (motions * weight).transpose(1, 2).reshape(-1, free)
+    share = torch.linalg.pinv(system.mT @ system, hermitian=True) @ (system.mT @ (moves * weight).flatten())
+    shift, turn = torch.einsum("k,mkc->mc", share, motions).split(3, -1)
+    # exp(-turn) exp(turns), by Baker, Campbell and Hausdorff.
+    moves -= torch.cat([shift, turn + torch.linalg.cross(turn, turns) / 2], -1).to(moves)
 
 
 def move_rays(bundle: RayBundle, poses: CameraOptimizer) -> None:

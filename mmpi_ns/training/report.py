@@ -23,10 +23,11 @@ LEAST_SECONDS, MOST_SECONDS = 2.0, 30.0
 """Between two lines."""
 VIEWS, LOOK_SECONDS = 4, 20.0
 """The quick test: maximum number of test images, and seconds after which no further one is started."""
-CPU_RAYS = 10000.0
-"""Rays/s that one core trains with the settings of mmpi-small (docs/results/train.md)."""
-ONE_THREAD = 0.95
-"""Share of a training that runs on one thread: 1,500 steps of kitti-street /4 took 72 s with one thread, 70 s with two
+CPU_RAYS = 15000.0
+"""Pixel rays/s that one core trains with the settings of mmpi-small: 21,000 on kitti-street at a quarter, 12,000 on
+kitchen at a half (one core of an Intel Xeon)."""
+ONE_THREAD = 0.6
+"""Share of a training that runs on one thread: 1,500 steps of kitti-street /4 took 78 s with one thread, 62 s with two
 on two free cores (docs/log/performance.md)."""
 LONG = 1800.0
 """Seconds from which a smaller method is suggested."""

@@ -51,6 +51,7 @@ class TrainingRun:
         views: the training images; None: every texel is stored.
         release_weight: bricks in which no sample has this weight are released.
         poses: corrections of the cameras' poses, if they are refined.
+        scale_is_free: no known depth fixes the scale of the capture.
     """
 
     def __init__(
@@ -61,9 +62,11 @@ class TrainingRun:
         views: TrainingViews | None,
         release_weight: float,
         poses: list[Parameter] | None = None,
+        scale_is_free: bool = False,
     ) -> None:
         self.progress, self.field, self.store = progress, field, store
-        self.views, self.release_weight, self._poses = views, release_weight, poses or []
+        self.views, self.release_weight = views, release_weight
+        self._poses, self._scale_is_free = poses or [], scale_is_free
         self.shared = False
         """Whether other processes train some of the windows."""
         self._drawn_from: int | None = None
@@ -112,8 +115,8 @@ class TrainingRun:
         field.learns_cover = phase == "individual"
         for kind, params in groups.items():
             params[0].requires_grad_(kind in TRAINS[phase])
-        if "camera_opt" in TRAINS[phase]:
-            keep_frame(self._poses)
+        if "camera_opt" in TRAINS[phase] and self._poses and self.views is not None:
+            keep_frame(self._poses[0], self.views.origins, field.plan.content_near, self._scale_is_free)
 
     def _begin_window(self, window: int, factor: float) -> None:
         """Starts another window with new tables and networks; the trainer has saved the previous one."""

@@ -15,8 +15,7 @@ from nerfstudio.engine.optimizers import OptimizerConfig
 from torch import Tensor
 from torch.nn import Parameter
 
-from mmpi_ns.ops.adam import AdamConstants, adam_rows
-from mmpi_ns.ops.adam.reference import adam
+from mmpi_ns.ops.adam import AdamConstants, adam, adam_rows
 from mmpi_ns.ops.interpolate import Table
 from mmpi_ns.utils.machine import lazy_zeros
 

@@ -41,18 +41,19 @@ from mmpi_ns.utils.errors import InputError
 from mmpi_ns.utils.files import write_atomically
 from mmpi_ns.utils.host import arguments, command, enter_command, signals_go_to
 from mmpi_ns.utils.machine import free_cores, unused_gpu
+from mmpi_ns.utils.parallel import num_threads, torch_apart
 
 PLAN_FILE = "plan.json"
 
 
 @dataclass
 class MMPITrainerConfig(TrainerConfig):
-    """nerfstudio's trainer settings; max-num-iterations is the length of the whole run, resumed or not.
-
-    If a long capture is split into windows, each window gets this many steps.
-    """
+    """nerfstudio's trainer settings."""
 
     _target: type = field(default_factory=lambda: MMPITrainer)
+    max_num_iterations: int = 0
+    """Steps of the whole run, resumed or not; if a long capture is split into windows, of each window. 0: as many as
+    its pixels need (mmpi-small: 4,000 to 16,000; docs/captures.md)."""
 
     def set_timestamp(self) -> None:
         """The first code of this package that ns-train runs."""
@@ -137,6 +138,7 @@ class MMPITrainer(Trainer):
         model_config: Any = config.pipeline.model
         model_config.seed = config.pipeline.datamanager.seed = config.machine.seed  # type: ignore[attr-defined]
         self._window_steps = model_config.total_steps = config.max_num_iterations
+        model_config.method, self._follows_capture = config.method_name, config.max_num_iterations == 0
         model_config.windows_folder = self.base_dir / WINDOWS_FOLDER
         self._share: WindowShare | None = None
         if self.world_size > 1:
@@ -164,9 +166,14 @@ class MMPITrainer(Trainer):
         """Prints capture, plan and memory together, before the first step."""
         say(self._manager.describe())
         say(describe(plan, self._window_steps, *self._expected_memory()))
+        if self._follows_capture:
+            say(
+                f"{self._window_steps:,} steps{' a window' if len(plan) > 1 else ''} for its training pixels; "
+                "--max-num-iterations gives others."
+            )
         if not str(self.device).startswith("cuda"):
             rays = self._manager.get_train_rays_per_batch()
-            cpu = torch.get_num_threads(), free_cores()
+            cpu = num_threads(), free_cores()
             say(forecast(self.config.method_name or "", self._total_steps, rays, *cpu))
             if gpu := unused_gpu():
                 say(f"No GPU is used: {gpu}.")
@@ -187,6 +194,11 @@ class MMPITrainer(Trainer):
     def setup_optimizers(self) -> Optimizers:
         """nerfstudio's optimisers, with schedulers that follow the phases."""
         progress = self._run.progress
+        self._window_steps = progress.schedule.window_steps
+        if self._follows_capture:
+            self.config.steps_per_save = max(self.config.steps_per_save, self._window_steps // 4)
+        if self._share is not None:
+            self._share.window_steps = self._window_steps
         # nerfstudio shows what is left
         self._total_steps = self.config.max_num_iterations = progress.schedule.total_steps
         config: dict[str, Any] = {
@@ -243,7 +255,8 @@ class MMPITrainer(Trainer):
         schedule = self._run.progress.schedule
         self._log = TrainingLog(schedule, rays, self._start_step, end) if self._says_lines else None
         try:
-            super().train()
+            with torch_apart():
+                super().train()
         finally:
             self.config.max_num_iterations = self._window_steps
 

@@ -2,15 +2,72 @@
 
 from __future__ import annotations
 
+import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from typing import TypeVar
 
+import cv2
 import torch
+from threadpoolctl import threadpool_limits
+
+from mmpi_ns.utils.host import Uninterrupted
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
+
+
+class _Apart:
+    """State of ``torch_apart`` in this process, whose threads share it: a viewer renders beside the training."""
+
+    lock = threading.Lock()
+    blocks = 0
+    threads = 0
+
+
+def num_threads() -> int:
+    """Threads that share the work of this package: as many as torch uses, or used before ``torch_apart``."""
+    return _Apart.threads if _Apart.blocks else torch.get_num_threads()
+
+
+@contextmanager
+def torch_apart() -> Iterator[None]:
+    """Within the block torch's own operations take one thread, and ``num_threads`` stays what it was.
+
+    OpenMP's threads wait for torch's next operation spinning, for milliseconds, on the cores that the compiled kernels
+    of this package would use. The arrays of a training step and of a picture are too small for torch's threads to pay.
+    """
+    entered = False
+    try:
+        with Uninterrupted(), _Apart.lock:
+            # A thread that began within a block keeps torch's one thread after it.
+            _Apart.threads = max(_Apart.threads, torch.get_num_threads())
+            _Apart.blocks += 1
+            torch.set_num_threads(1)
+            entered = True
+        yield
+    finally:
+        with Uninterrupted(), _Apart.lock:
+            _Apart.blocks -= entered
+            if entered and _Apart.blocks == 0:
+                torch.set_num_threads(_Apart.threads)
+
+
+@contextmanager
+def one_thread_each() -> Iterator[None]:
+    """Within the block torch, OpenCV and the BLAS of NumPy work in the calling thread, for work shared out by images.
+
+    Their results are then the same at each start, and no library's threads spin on the cores of the others.
+    """
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        with torch_apart(), threadpool_limits(1, user_api="blas"):
+            yield
+    finally:
+        cv2.setNumThreads(threads)
 
 
 def in_order(function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
@@ -22,11 +79,11 @@ def in_order(function: Callable[[Item], Result], items: Iterable[Item]) -> Itera
         function: called from several threads at once.
         items: its arguments.
     """
-    threads = torch.get_num_threads()
+    threads = num_threads()
     if threads == 1:
         yield from map(function, items)
         return
-    with ThreadPoolExecutor(threads) as pool:
+    with one_thread_each(), ThreadPoolExecutor(threads) as pool:
         ahead: deque[Future[Result]] = deque()
         for item in items:
             ahead.append(pool.submit(function, item))

@@ -21,6 +21,9 @@ from triton_processes import HERE, needs_triton, python
 from mmpi_ns.bench import gpu as command
 from mmpi_ns.ops import dispatch
 
+PRINTED = r"a step of \d+ rays: [\d.]+ ms, [\d,]+ rays/s|a frame of \d+ pixels: .* frames/s|memory: [\d.]+ GiB"
+TIMED = {"step_ms": 1.0, "frame_ms": 2.0, "pixels": 3, "peak_gib": 0.5}
+
 
 @needs_triton
 @pytest.mark.commands
@@ -45,21 +48,23 @@ def test_a_quick_look_without_a_gpu_ends_in_an_honest_sentence(tmp_path):
     found = python("-m", "mmpi_ns.scripts.bench", "gpu", "--quick", "--folder", str(tmp_path))
     said = found.stdout.strip().splitlines()
     assert found.returncode == 0 and "only a machine with one can say" in said[-1], found.stdout + found.stderr
-    assert any("torch sees no GPU" in line for line in said) and any(line.startswith("a step of") for line in said)
+    assert (
+        any("torch sees no GPU" in line for line in said) and sum(bool(re.match(PRINTED, line)) for line in said) == 3
+    )
     rows = json.loads((tmp_path / "gpu.json").read_text())
     assert rows["device"] == "cpu" and not rows["well"] and rows["timed"]["step_ms"] > 0
 
 
 def test_a_quick_look_names_what_falls_back(monkeypatch, capsys, tmp_path):
     reason = "its Triton kernel fails on this device (CompilationError: at 3:4)"
-    names = [name for name, (_, forms) in dispatch.TABLE.items() if "gpu" in forms]
+    names = [name for name, each in dispatch.operations().items() if "gpu" in each.compiled]
     for faults, wanted in (
         ({}, "All is well"),
         ({"march": reason}, "1 operation(s) run in plain torch, several times slower: march."),
     ):
         monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
         monkeypatch.setattr(command, "environment", dict)
-        monkeypatch.setattr(command, "time_training", lambda *_: {"step_ms": 1.0, "frame_ms": 2.0, "pixels": 3})
+        monkeypatch.setattr(command, "time_training", lambda *_: TIMED)
         monkeypatch.setattr(dispatch, "_faults", dict.fromkeys(names) | faults)
         found = command.run_quick(tmp_path, tmp_path, 16)
         said = capsys.readouterr().out

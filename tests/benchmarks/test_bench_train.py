@@ -362,13 +362,13 @@ def test_every_method_is_a_line_that_ns_train_takes(scene):
     from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
 
     made = command(scene, Path("x"))
-    for name in ("two-phase", "splatfacto"):
+    for name in ("two-phase", "splatfacto", "poses alone"):
         request = made._request(scene, METHODS[name], 8, 5, Path("x"))
         config = tyro.cli(AnnotatedBaseConfigUnion, args=list(request.words))
         assert config.machine.seed == 5 and config.max_num_iterations == 8 and request.checks == (1, 2, 4, 6, 8)
         assert config.pipeline.datamanager.dataparser.downscale_factor == 1
+        assert config.pipeline.datamanager.dataparser.load_3D_points == (name != "poses alone")
         if name == "splatfacto":
-            assert config.pipeline.datamanager.dataparser.load_3D_points and request.whole_images
-            assert config.pipeline.model.camera_optimizer.mode == "off"
-        else:
+            assert request.whole_images and config.pipeline.model.camera_optimizer.mode == "off"
+        elif name == "two-phase":
             assert config.pipeline.model.schedule.training == "two-phase"

@@ -150,8 +150,8 @@ def test_depths_do_not_depend_on_the_number_of_threads(tmp_path, monkeypatch):
     images = scene_of(tmp_path, POSES)
     results = []
     for threads in (1, 4):
-        monkeypatch.setattr(dense.torch, "get_num_threads", lambda count=threads: count)
-        results.append(find_depths(images, lambda i: points_on_walls(POSES[i]), WIDTH))
+        monkeypatch.setattr(dense, "num_threads", lambda count=threads: count)
+        results.append(list(find_depths(images, lambda i: points_on_walls(POSES[i]), WIDTH)))
     for (_, one), (_, four) in zip(*results, strict=True):
         assert np.array_equal(one.inverse, four.inverse) and np.array_equal(one.error, four.error)
 
@@ -166,9 +166,8 @@ def test_each_image_is_shown_twice_and_finished_once(tmp_path):
             yield result
 
     threads = dense.cv2.getNumThreads()
-    results = find_depths(
-        images, lambda i: points_on_walls(POSES[i]), WIDTH, lambda i, view, depth: (i, depth.inverse.shape), progress
-    )
+    shape_of = lambda i, view, depth: (i, depth.inverse.shape)  # noqa: E731
+    results = list(find_depths(images, lambda i: points_on_walls(POSES[i]), WIDTH, shape_of, progress))
     assert results == [(i, (HEIGHT, WIDTH)) for i in range(3)] == shown[4:] and shown[0] == 6 and len(shown) == 7
     assert dense.cv2.getNumThreads() == threads, "OpenCV's setting is left as it was"
 
@@ -176,7 +175,7 @@ def test_each_image_is_shown_twice_and_finished_once(tmp_path):
 def test_rounds_from_coarse_to_fine_give_the_depths_of_full_size(tmp_path, monkeypatch):
     images = scene_of(tmp_path, POSES)
     monkeypatch.setattr(dense, "SMALLEST", 40)
-    results = find_depths(images, lambda i: points_on_walls(POSES[i]), WIDTH)
+    results = list(find_depths(images, lambda i: points_on_walls(POSES[i]), WIDTH))
     error, scaled = relative_errors(results, POSES)
     assert np.mean([(d.inverse > 0).mean() for _, d in results]) > 0.88
     assert np.median(error) < 0.003 and np.quantile(scaled, 0.9) < 2
@@ -207,7 +206,7 @@ def test_parallax_is_that_of_points_in_both_cameras(seed, monkeypatch):
         pinhole = np.array([30.0, 33.0, 15.0, 11.0]) + rng.normal(size=4)
         views.append(View(np.zeros(shape, np.uint8), pinhole, pose, np.ones(shape, bool)))
     inverse = rng.uniform(0.02, 0.2, shape).astype(F32)
-    parallax = dense._Parallax.between(*views)
+    parallax = dense.Parallax.between(*views)
     x, y, depth = parallax.pixels(inverse)
     columns, rows = np.meshgrid(np.arange(31) + 0.5, np.arange(23) + 0.5)
     fx, fy, cx, cy = views[0].pinhole

@@ -1,26 +1,33 @@
-"""Points without tracks are seen where nothing of the cloud hides them."""
+"""Points without tracks are seen where matches confirm them; elsewhere, where nothing of the cloud hides them."""
 
 from __future__ import annotations
 
-import numpy as np
+from pathlib import Path
 
-from mmpi_ns.capture.loose_points import with_visible_points
+import numpy as np
+import pytest
+
+from mmpi_ns.capture.loose_points import FARTHEST, MOST_POINTS, see_points, usable_points
+from mmpi_ns.capture.tracks import PosedImages
 from mmpi_ns.placement.observations import Observations
 
+BACK = np.concatenate([np.diag([-1.0, 1, -1]), np.zeros((3, 1))], 1)
+SIZE = np.array([400.0, 300])
 
-def looking_ahead(points) -> Observations:
-    """A camera at the origin that looks along -z, one that looks back."""
-    back = np.diag([-1.0, 1, -1])
-    none = np.zeros(0, np.int64)
-    return Observations(
-        camera_to_worlds=np.stack([np.eye(4)[:3], np.concatenate([back, np.zeros((3, 1))], 1)]),
-        intrinsics=np.tile([200.0, 200, 200, 150], (2, 1)),
-        sizes=np.tile([400.0, 300], (2, 1)),
-        points=np.asarray(points, float),
-        seen_by=none,
-        seen_point=none,
-        seen_at=np.zeros((0, 2)),
+
+def cameras(*poses, lens=(0.0, 0, 0, 0)) -> PosedImages:
+    count = len(poses)
+    return PosedImages(
+        files=tuple(Path(f"{i}.png") for i in range(count)),
+        camera_to_worlds=np.stack(poses),
+        intrinsics=np.tile([200.0, 200, 200, 150], (count, 1)),
+        sizes=np.tile(SIZE, (count, 1)),
+        distortion=np.tile(np.array(lens, float), (count, 1)),
     )
+
+
+AHEAD = np.eye(4)[:3]
+BOTH = cameras(AHEAD, BACK)
 
 
 def wall(z, x0, x1, step=0.02):
@@ -30,19 +37,94 @@ def wall(z, x0, x1, step=0.02):
 
 def test_a_wall_hides_what_lies_behind_it_and_not_what_lies_beside_it():
     front, hidden, beside = wall(-2.0, -0.6, 0.0), wall(-4.0, -0.8, -0.3), wall(-4.0, 0.4, 1.0)
-    observations = with_visible_points(looking_ahead(np.concatenate([front, hidden, beside])))
-    assert (observations.seen_by == 0).all()
-    found = np.isin(np.arange(len(observations.points)), observations.seen_point)
-    parts = np.split(found, [len(front), len(front) + len(hidden)])
+    seen = see_points(np.concatenate([front, hidden, beside]), BOTH)
+    assert (seen.seen_by == 0).all()
+    visible = np.isin(np.arange(len(seen.points)), seen.seen_point)
+    parts = np.split(visible, [len(front), len(front) + len(hidden)])
     assert parts[0].all() and not parts[1].any() and parts[2].all()
 
 
 def test_keypoints_are_where_the_points_project_and_each_camera_sees_what_lies_before_it():
-    observations = with_visible_points(looking_ahead([[0.1, 0.2, -2], [0.1, 0.2, 2], [50, 0, -2]]))
-    assert observations.seen_by.tolist() == [0, 1] and observations.seen_point.tolist() == [0, 1]
-    assert np.allclose(observations.seen_at, [[210, 130], [190, 130]])
+    seen = see_points(np.array([[0.1, 0.2, -2], [0.1, 0.2, 2], [50, 0, -2]]), BOTH)
+    assert seen.seen_by.tolist() == [0, 1] and seen.seen_point.tolist() == [0, 1]
+    assert np.allclose(seen.seen_at, [[210, 130], [190, 130]])
 
 
-def test_no_points_no_keypoints():
-    observations = with_visible_points(looking_ahead(np.zeros((0, 3))))
-    assert not len(observations.seen_by) and not len(observations.seen_at)
+def test_keypoints_are_bent_by_the_lens_and_what_it_cannot_show_is_not_seen():
+    lens = (-0.3, 0.0, 0.0, 0.0)
+    seen = see_points(np.array([[0.6, 0.3, -2], [3.2, 0, -2]]), cameras(AHEAD, lens=lens))
+    assert seen.seen_point.tolist() == [0]  # the second, at tangent 1.6, would be bent back to 0.37
+    bend = 1 - 0.3 * (0.3**2 + 0.15**2)
+    assert np.allclose(seen.seen_at, [[200 + 200 * 0.3 * bend, 150 - 200 * 0.15 * bend]])
+
+
+def flat_depth(distance, error=0.01):
+    """Known depths of an image that shows a sphere about the camera; nothing is known in its right half."""
+    image = np.zeros((300, 400, 2), np.float32)
+    image[:, :200] = np.array([1, error]) / distance
+    return lambda i: image
+
+
+def test_matches_confirm_hide_and_contradict_points():
+    at, behind, through, unknown = [-1, 0, -2], [-2, 0, -4], [-0.5, 0, -1], [0.5, 0, -1]
+    near = float(np.linalg.norm(at))
+    seen = see_points(np.array([at, behind, through, unknown]), cameras(AHEAD), flat_depth(near))
+    assert seen.confirmed.tolist() == [1, 0, 0, 0] and seen.contradicted.tolist() == [0, 0, 1, 0]
+    assert seen.seen_point.tolist() == [0, 3]
+
+
+def test_a_point_that_the_cloud_would_hide_is_seen_where_matches_confirm_it():
+    post, ground = [-1.0, 0.0, -2.0], wall(-3.0, -2.0, -1.0)
+    seen = see_points(np.concatenate([[post], ground]), cameras(AHEAD), flat_depth(3.6, error=0.03))
+    assert not np.isin(0, seen.seen_point) and len(seen.seen_point) > 0.8 * len(ground)
+    assert not np.isin(1 + np.arange(len(ground)), see_points(seen.points, cameras(AHEAD)).seen_point).all()
+
+
+def observations(points=0, tracked=0, swept=0) -> Observations:
+    return Observations(
+        camera_to_worlds=BOTH.camera_to_worlds,
+        intrinsics=BOTH.intrinsics,
+        sizes=BOTH.sizes,
+        points=np.full((points, 3), 9.0),
+        seen_by=np.zeros(tracked + swept, np.int64),
+        seen_point=np.arange(tracked + swept) % max(points, 1),
+        seen_at=np.full((tracked, 2), 5.0),
+        loose=np.zeros((1, 3)),
+    )
+
+
+def test_sightings_come_after_the_tracks_and_before_swept_points_without_contradicted_ones():
+    points = np.array([[-0.5, 0, -1.0], [0.5, 0, -1], [0.6, 0.1, -1]])
+    seen = see_points(points, cameras(AHEAD, AHEAD), flat_depth(3.0))
+    assert seen.contradicted.tolist() == [2, 0, 0]
+    joined = seen.added_to(observations(points=4, tracked=2, swept=2))
+    assert len(joined.points) == 7 and joined.loose is None
+    assert joined.seen_point.tolist() == [0, 1, 5, 6, 5, 6, 2, 3]
+    assert joined.seen_by.tolist() == [0, 0, 0, 0, 1, 1, 0, 0]
+    assert len(joined.seen_at) == 6 and np.allclose(joined.seen_at[2], [300, 150])
+
+
+@pytest.mark.parametrize(("scale", "fits"), [(1.0, True), (0.4, False)])
+def test_a_cloud_in_another_unit_does_not_fit(scale, fits):
+    rng = np.random.default_rng(0)
+    directions = rng.normal(size=(500, 3)) * [0.3, 0.3, 0] - [0.4, 0, 1]
+    points = 3 * scale * directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+    seen = see_points(points, cameras(AHEAD), flat_depth(3.0))
+    assert seen.fits == fits
+    assert ("does not fit the images" in seen.describe()) != fits
+    assert see_points(points, cameras(AHEAD)).fits
+
+
+def test_of_an_absurd_cloud_the_usable_points_stay(capsys):
+    centers = np.array([[0.0, 0, 0], [1, 0, 0]])
+    points = np.array([[1, 2, 3], [np.nan, 0, 0], [np.inf, 0, 0], [0, 2 * FARTHEST, 0], [1e30, 0, 0], [4, 5, 6.0]])
+    assert usable_points(points, centers).tolist() == [[1, 2, 3], [4, 5, 6]]
+    assert len(usable_points(points, centers[:1])) == 4  # one place has no extent
+    assert "4 of 6 points of the point cloud are not used" in " ".join(capsys.readouterr().out.split())
+
+
+def test_of_a_laser_scan_the_same_points_are_used_each_time():
+    points = np.arange(3.0 * (MOST_POINTS + 9)).reshape(-1, 3)
+    centers = np.array([[0.0, 0, 0], [1e3, 0, 0]])
+    first, second = usable_points(points, centers), usable_points(points, centers)
+    assert len(first) == MOST_POINTS and np.array_equal(first, second) and (np.diff(first[:, 0]) > 0).all()

@@ -16,6 +16,7 @@ from mmpi_ns.capture import observe as mmpi_observations
 from mmpi_ns.capture.observe import (
     ENOUGH_KEYPOINTS,
     drop_masked,
+    observe,
     posed_images,
     read_observations,
     tell_poses,
@@ -81,18 +82,6 @@ def test_other_cameras_are_not_triangulated():
     assert posed_images(bare(), as_data(kind=CameraType.EQUIRECTANGULAR)) is None
 
 
-def test_points_of_the_data_parser_stand_in_where_there_is_no_model():
-    points = torch.tensor([[0.0, 0.1, -3], [4, 5, 6]])  # ahead, and behind
-    outputs: Any = SimpleNamespace(image_filenames=["a.png", "b.png"], metadata={"points3D_xyz": points})
-    found = read_observations(outputs, as_data().cameras, None)
-    assert found.points.tolist() == points.double().tolist()
-    assert found.seen_by.tolist() == [0, 1] and found.seen_point.tolist() == [0, 0]
-    assert found.seen_at == pytest.approx(np.array([[20, 9]] * 2))
-    assert found.intrinsics.tolist() == [[30, 30, 20, 10]] * 2 and found.sizes.tolist() == [[40, 20]] * 2
-    outputs.metadata = {}
-    assert not len(read_observations(outputs, as_data().cameras, None).points)
-
-
 def model(*keypoints) -> SfmModel:
     """Tracks (camera, point, share of the width, share of the height) of four points."""
     names = ("1", "0")
@@ -138,7 +127,7 @@ def test_a_mask_leaves_out_the_keypoints_on_its_black_pixels():
     mask = torch.ones(20, 40, 1, dtype=torch.uint8)
     mask[10:, :20] = 0
     masks = [{"mask": mask}, {"mask": torch.ones(60, 80, 1, dtype=torch.uint8)}]
-    data = as_data(get_data=lambda i, image_type: masks[i], _dataparser_outputs=SimpleNamespace(mask_filenames=[1]))
+    data = as_data(get_data=lambda i, image_type: masks[i], has_masks=True)
     found = drop_masked(tracks, data)
     assert found.seen_point.tolist() == [0, 2, 3] and len(found.seen_at) == 3
 
@@ -155,3 +144,33 @@ def test_points_that_project_badly_or_that_few_images_see_are_left_out(tmp_path)
     found = find_sfm_model(tmp_path / "model")
     assert found is not None and np.array_equal(found.points, np.delete(whole.points, 3, 0))
     assert sum(len(p) for p, _ in found.keypoints) == sum(len(p) for p, _ in whole.keypoints) - len(long[3][8:]) / 2
+
+
+def cloud_outputs() -> Any:
+    """Outputs of a data parser that read a point cloud of two points, one of them NaN."""
+    points = torch.tensor([[0.0, 0.1, -3], [float("nan"), 0, 0]])
+    return SimpleNamespace(
+        image_filenames=[f"frame_{i + 1:05d}.png" for i in (0, 1)],
+        metadata={"points3D_xyz": points},
+        dataparser_transform=torch.eye(4)[:3],
+        dataparser_scale=1.0,
+    )
+
+
+def test_a_point_cloud_waits_for_depths_and_gives_way_to_tracks(tmp_path, monkeypatch, capsys):
+    outputs, none = cloud_outputs(), tmp_path / "none"
+    cameras = as_data().cameras
+    waiting = read_observations(outputs, cameras, None)
+    assert waiting.loose is not None and not len(waiting.points)
+    assert waiting.loose == pytest.approx(np.array([[0, 0.1, -3]]), abs=1e-6)
+    monkeypatch.setattr(mmpi_observations, "_find_points", lambda found, *_: found)
+    data = as_data()
+    assert observe(outputs, data, none, find_points=True, triangulates=True).loose is not None
+    tracks = SfmModel(
+        np.array([[0.0, 0, -3]]), tuple(outputs.image_filenames), ((np.zeros(1, int), np.full((1, 2), 0.5)),) * 2
+    )
+    monkeypatch.setattr(mmpi_observations, "find_sfm_model", lambda folder: tracks)
+    monkeypatch.setattr(mmpi_observations, "drop_masked", lambda found, data: found)
+    found = observe(outputs, data, none, find_points=True, triangulates=True)
+    assert found.loose is None and len(found.points) == 1
+    assert "Point cloud: not used" in capsys.readouterr().out

@@ -14,8 +14,8 @@ from random_bricks import random_window, scene_of
 
 from mmpi_ns.export import files
 from mmpi_ns.export.files import HEADER, read_baked, write_baked
-from mmpi_ns.export.reader import camera_rays
 from mmpi_ns.export.web import write_page, write_single_file
+from mmpi_ns.ops.baked.reader import camera_rays
 from mmpi_ns.scene.baked import neighbours, take_borders
 from mmpi_ns.scene.windows import window_shares
 

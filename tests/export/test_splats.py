@@ -11,7 +11,7 @@ from random_bricks import random_window, scene_of
 
 from mmpi_ns.export import splats
 from mmpi_ns.export.files import Pose
-from mmpi_ns.ops.splat.reference import View, splat_image
+from mmpi_ns.ops.splat import View, splat_image
 
 
 @pytest.fixture(scope="module")

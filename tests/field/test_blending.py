@@ -11,7 +11,7 @@ import torch
 from hand_made import random_votes, tensor
 
 from mmpi_ns.ops.blending import blend_shares, blended_optical_depth
-from mmpi_ns.ops.composite.reference import composite_weights
+from mmpi_ns.ops.composite import composite_weights
 
 F64 = torch.float64
 
@@ -23,7 +23,7 @@ def shares_of(votes, dtype=F64):
 
 def composite_all(tau, valid=None):
     valid = torch.ones_like(tau, dtype=torch.bool) if valid is None else valid
-    return composite_weights(tau, valid, torch.zeros_like(tau), torch.zeros_like(tau[:, :1]))
+    return composite_weights.reference(tau, valid, torch.zeros_like(tau), torch.zeros_like(tau[:, :1]))
 
 
 # Shares --------------------------------------------------------------------------------------------------------------

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 import torch
+from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader
 from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image
 from tiny_scene import image_of, name_of, write_scene
@@ -70,3 +73,12 @@ def test_baked_pictures_have_the_same_exposure(run, monkeypatch):
         monkeypatch.setattr(model.config.rendering, "mode", mode)
         images[mode] = model.get_outputs_for_camera(cameras[1:2])["rgb"]
     assert psnr(images["baked"], images["exact"]) > 35
+
+
+def test_the_deviation_of_one_image_is_0_and_no_nan(run):
+    _, pipeline = run
+    manager = pipeline.datamanager
+    one = FixedIndicesEvalDataloader(manager.eval_dataset, image_indices=(0,), device="cpu")
+    means = pipeline.get_average_image_metrics(one, "one", get_std=True)
+    assert means["psnr_std"] == 0 and means["psnr"] > 5
+    json.dumps(means, allow_nan=False)

@@ -140,7 +140,6 @@ def turned(tmp_path_factory):
 def test_training_turns_a_pose_back(turned):
     moved = turned.pipeline.model.camera_optimizer.pose_adjustment.detach()[:, 3:]
     others = moved[[0, 1, 3, 4, 5]]
-    assert moved.mean(0).abs().max() < 2e-4, "cameras do not turn together"
     up = turned.pipeline.datamanager.train_dataparser_outputs.dataparser_transform[:, 1]  # the capture's y
     against = (moved[2] - others.mean(0)) @ up
     assert -1.4 * OFF < against < -0.6 * OFF and (others - others.mean(0)).abs().max() < 0.4 * OFF

@@ -11,6 +11,7 @@ from PIL import Image
 from procedural import observations_of
 
 from mmpi_ns.config import mmpi, mmpi_small
+from mmpi_ns.placement.defaults import DEFAULTS
 from mmpi_ns.placement.rule import PlacementConfig, place
 from mmpi_ns.placement.show.explain import describe_facing, explain, table
 from mmpi_ns.placement.visibility import find_visible_points
@@ -53,8 +54,8 @@ def test_the_defaults_are_those_of_the_method():
         for words in (["scene", "--method", name], [f"--method={name}", "scene"]):
             command = _defaults(words)
             assert command.placement == method.config.pipeline.model.placement
-            rays = method.config.max_num_iterations * method.config.pipeline.datamanager.train_num_rays_per_batch
-            assert command.training_rays == rays
+            rays = method.config.pipeline.datamanager.train_num_rays_per_batch
+            assert command.training_rays is None and DEFAULTS[name].rays == rays
     assert _defaults(["scene"]).placement == mmpi_small.config.pipeline.model.placement
 
 

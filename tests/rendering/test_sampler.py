@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import math
 
 import numpy as np
@@ -12,7 +13,6 @@ from random_fields import bundle, compare, fill, random_field, random_rays, rend
 
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.ops import dispatch
-from mmpi_ns.ops.march import reference
 from mmpi_ns.rendering.sampler import MMPISampler
 from mmpi_ns.scene.plan import CubePlan, ScenePlan
 
@@ -200,12 +200,12 @@ def test_stopping_where_a_ray_is_opaque_changes_nothing_visible(monkeypatch):
     monkeypatch.setattr(dispatch, "_chosen", "torch")
     field = random_field(6, True, seed=16, planes=60, log_depths=(-3, 1.2))
     rays = bundle(*random_rays(field.plan, 80, seed=17))
-    looked_up = []
-    blend = reference._blend
-    monkeypatch.setattr(reference, "_blend", lambda index, *rest: looked_up.append(len(index)) or blend(index, *rest))
+    looked_up, march = [], importlib.import_module("mmpi_ns.ops.march")
+    blend = march._blend
+    monkeypatch.setattr(march, "_blend", lambda index, *rest: looked_up.append(len(index)) or blend(index, *rest))
     stopped = render(field, rays, 1e-3, True)
     count = sum(looked_up)
-    monkeypatch.setattr(reference, "OPAQUE_DEPTH", math.inf)
+    monkeypatch.setattr("mmpi_ns.ops.march.OPAQUE_DEPTH", math.inf)
     whole = render(field, rays, 1e-3, True)
     assert count < 0.8 * (sum(looked_up) - count), "nothing was stopped"
     assert (stopped.rgb - whole.rgb).abs().max() < 1e-4

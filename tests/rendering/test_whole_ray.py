@@ -11,7 +11,7 @@ import torch
 from hand_made import make_mpi, random_mpi, rays, samples_to_ndc, unit
 
 from mmpi_ns.ops.blending import blend_shares, blended_optical_depth
-from mmpi_ns.ops.composite.reference import composite_weights, median_inverse_distance, render_colors
+from mmpi_ns.ops.composite import composite_weights, median_inverse_distance, render_colors
 from mmpi_ns.ops.interpolate import interpolate
 from mmpi_ns.scene.geometry import Frames, inverse_distance, plane_hits, sample_disparity
 from mmpi_ns.scene.plan import ScenePlan
@@ -92,7 +92,7 @@ def render_by_modules(scene, origin, direction, dtype):
     order = torch.sort(inverse_t, descending=True, stable=True).indices[0]
     inverse_t, tau, color = inverse_t[:, order], tau[:, order], color[:, order]
     valid = torch.ones_like(tau, dtype=torch.bool)
-    composite = composite_weights(tau, valid, torch.zeros_like(tau), tau.new_zeros(1, 1))
+    composite = composite_weights.reference(tau, valid, torch.zeros_like(tau), tau.new_zeros(1, 1))
     rendered = render_colors(composite, color)
     return composite, rendered, median_inverse_distance(composite.weights, inverse_t, valid) if tau.numel() else None
 

@@ -13,9 +13,7 @@ from random_fields import bundle, compare, random_rays, render
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.tables import ENOUGH_CROSSINGS, RELEASED_DENSITY, TABLES
 from mmpi_ns.ops import dispatch
-from mmpi_ns.ops.interpolate import texel_rows
-from mmpi_ns.ops.interpolate.reference import interpolate as interpolate_reference
-from mmpi_ns.ops.variation import reference as plain_variation
+from mmpi_ns.ops.interpolate import interpolate_densely, texel_rows
 from mmpi_ns.ops.variation import total_variation
 from mmpi_ns.rendering.sampler import MMPISampler
 from mmpi_ns.scene.bricks import grown_tiles, keep_bricks, new_table, read_planes, resample, write_planes
@@ -30,8 +28,8 @@ def test_lookups_read_what_dense_tables_would_give():
     ndc = torch.tensor(np.random.default_rng(1).uniform(-1.1, 1.1, size=(150, 3)))
     for grid, block in zip(grids, blocks, strict=True):
         planes = torch.arange(150) % grid.depth
-        flat = interpolate_reference(table, *grid.bilinear(planes, ndc))
-        solid = interpolate_reference(table, *grid.trilinear(ndc))
+        flat = interpolate_densely(table, *grid.bilinear(planes, ndc))
+        solid = interpolate_densely(table, *grid.trilinear(ndc))
         assert (flat < -1).any() and (flat > -1).any()
         for i in range(150):
             u, v, _ = ndc[i].tolist()
@@ -144,7 +142,7 @@ def test_variation_beside_released_bricks_equals_float64(channels, order):
     rows = rows.sort()[0] if order == "rising" else mixed
     table = torch.randn(len(grids[0].places) * BRICK, channels, generator=torch.Generator().manual_seed(0)) * 2
     scales, found = [(0.5 + k, 2.0, 1.0) for k in range(len(grids))], []
-    for function, dtype in ((total_variation, torch.float32), (plain_variation.total_variation, torch.float64)):
+    for function, dtype in ((total_variation, torch.float32), (total_variation.reference, torch.float64)):
         values = table[rows].to(dtype).requires_grad_()
         value = function(values, table.to(dtype), rows, layout, scales)
         value.backward()

@@ -7,7 +7,7 @@ import oracle
 import pytest
 import torch
 
-from mmpi_ns.ops.interpolate.reference import interpolate as interpolate_reference
+from mmpi_ns.ops.interpolate import interpolate_densely
 from mmpi_ns.scene.bricks import resample
 from mmpi_ns.scene.texels import BRICK, head_grids, make_grids
 
@@ -45,7 +45,7 @@ def test_bilinear_lookup_equals_the_loop_on_every_plane_of_every_mpi(plan, table
     plane = torch.arange(90) % 9
     for grid in head_grids(plan)[:-1]:
         rows, weights = grid.bilinear(plane, uv)
-        found = interpolate_reference(table, rows, weights)
+        found = interpolate_densely(table, rows, weights)
         for i in range(90):
             wanted = oracle.bilinear(block(table, grid)[i % 9], float(uv[i, 0]), float(uv[i, 1]))
             assert np.allclose(found[i], wanted, rtol=1e-12, atol=1e-12)
@@ -54,7 +54,7 @@ def test_bilinear_lookup_equals_the_loop_on_every_plane_of_every_mpi(plan, table
 def test_trilinear_lookup_equals_the_loop_in_every_head(plan, table):
     ndc = positions(90, 3)
     for grid in head_grids(plan):
-        found = interpolate_reference(table, *grid.trilinear(ndc))
+        found = interpolate_densely(table, *grid.trilinear(ndc))
         for i in range(90):
             wanted = oracle.trilinear(block(table, grid), ndc[i].tolist())
             assert np.allclose(found[i], wanted, rtol=1e-12, atol=1e-12)
@@ -64,7 +64,7 @@ def test_corners_of_the_frustum_are_texel_centres(plan, table):
     grid = head_grids(plan)[1]
     values = block(table, grid)
     corners = torch.tensor([[-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0], [1.0, 1.0]], dtype=F64)
-    found = interpolate_reference(table, *grid.bilinear(torch.full((4,), 8), corners))
+    found = interpolate_densely(table, *grid.bilinear(torch.full((4,), 8), corners))
     wanted = [values[8, 0, 0], values[8, 0, -1], values[8, -1, 0], values[8, -1, -1]]
     assert np.array_equal(found, np.array(wanted))
 
@@ -74,8 +74,8 @@ def test_trilinear_on_a_plane_equals_bilinear_on_that_plane(plan, table):
     grid, uv = head_grids(plan)[0], positions(45, 2)
     for plane in range(9):
         s = torch.full((45, 1), 2 * plane / 8 - 1, dtype=F64)
-        flat = interpolate_reference(table, *grid.bilinear(torch.full((45,), plane), uv))
-        assert torch.allclose(flat, interpolate_reference(table, *grid.trilinear(torch.cat([uv, s], -1))))
+        flat = interpolate_densely(table, *grid.bilinear(torch.full((45,), plane), uv))
+        assert torch.allclose(flat, interpolate_densely(table, *grid.trilinear(torch.cat([uv, s], -1))))
 
 
 def test_lookups_stay_in_their_own_block_and_weights_sum_to_one(plan):
@@ -114,7 +114,7 @@ def test_gradient_of_a_lookup_goes_to_the_texels_it_read(plan, table):
     grid = head_grids(plan)[1]
     rows, weights = grid.bilinear(torch.tensor([4]), torch.tensor([[0.1, 0.3]], dtype=F64))
     table.requires_grad_()
-    interpolate_reference(table, rows, weights)[0, 1].backward()
+    interpolate_densely(table, rows, weights)[0, 1].backward()
     assert set(table.grad[:, 1].nonzero()[:, 0].tolist()) == set(rows[0].tolist())
     assert table.grad[:, 1].sum().item() == pytest.approx(1) and table.grad[:, 0].abs().sum() == 0
 

@@ -13,8 +13,9 @@ from hand_made import make_mpi
 from long_road import road
 from training_runs import datamanager, schedule_of
 
+from mmpi_ns.placement.defaults import PIXELS, steps_for
 from mmpi_ns.placement.rule import PlacementConfig
-from mmpi_ns.placement.split import FEWEST, find_balls, of_cameras, place_windows
+from mmpi_ns.placement.split import FEWEST, find_balls, most_pixels, of_cameras, place_windows
 from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.scene.windows import Window, WindowedPlan, window_shares
 
@@ -26,6 +27,15 @@ def test_a_short_capture_is_one_window_and_its_plan_is_written_as_before():
     assert len(plan) == 1 and plan.windows[0].radius == math.inf
     assert "windows" not in json.loads(plan.to_json())
     assert ScenePlan.from_json(plan.to_json()) == plan.plans[0]
+
+
+def test_steps_follow_the_pixels_of_the_largest_window():
+    few, many = road(30), road(400)
+    one, windows = PlacementConfig(window_length=0.0), PlacementConfig(window_length=4.0)
+    assert most_pixels(few, one) == few.sizes.prod(-1).sum() == most_pixels(few, windows)
+    assert 0.05 < most_pixels(many, windows) / many.sizes.prod(-1).sum() < 0.5
+    steps = [steps_for("mmpi-small", pixels) for pixels in (1e4, PIXELS, 4 * PIXELS, 1e12)]
+    assert steps == [4000, 4000, 8000, 16000] and steps_for("mmpi", 1.0) == 20000
 
 
 def test_windows_hold_every_camera_are_no_longer_than_asked_and_grow_with_the_road():

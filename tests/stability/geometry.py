@@ -28,7 +28,7 @@ from stability.cases import (
 )
 from stability.exact import Array
 
-from mmpi_ns.bench.rendering import bundle_of
+from mmpi_ns.bench.scenes import bundle_of
 from mmpi_ns.scene.geometry import Cube, Frames, cube_hits, plane_hits
 from mmpi_ns.scene.plan import CubePlan, MPIPlan
 

@@ -13,9 +13,10 @@ from stability.cases import UNIT, Case, Outcome, Precision, compare, float32, si
 from stability.exact import Array
 from stability.exact_ray import corners_of
 
+from mmpi_ns.ops.depth_sums import depth_sums
 from mmpi_ns.ops.interpolate import interpolate
-from mmpi_ns.ops.march.reference import merge, prune
-from mmpi_ns.ops.variation.reference import clamped_differences
+from mmpi_ns.ops.march import merge, prune
+from mmpi_ns.ops.variation import clamped_differences
 from mmpi_ns.scene.texels import BRICK, make_grids
 from mmpi_ns.training import losses
 from mmpi_ns.training.touched_adam import TouchedAdam
@@ -123,7 +124,8 @@ def _loss(precision: Precision, function: Callable[[torch.Tensor], torch.Tensor]
 
 def _distortion(weights: Array, positions: Array, precision: Precision) -> Outcome:
     """Against the sum over all pairs: sum_j w_j |s_i - s_j|, before and behind, in extended precision."""
-    w, s = (single(x).astype(np.longdouble) for x in (weights, positions))
+    inverse_t = single(1 / np.maximum(positions, 1e-30) - 1)
+    w, s = single(weights).astype(np.longdouble), 1 / (1 + inverse_t.astype(np.longdouble))
     rays, count = s.shape
     before, moment = np.cumsum(w, -1) - w, np.cumsum(w * s, -1) - w * s
     behind = w.sum(-1, keepdims=True) - w - before
@@ -132,10 +134,15 @@ def _distortion(weights: Array, positions: Array, precision: Precision) -> Outco
     value = float((w * pairs).sum() + (w**2).sum() / count / 3) / rays
     slope = 2 * pairs + 2 * w / count / 3
     size = 2 * (s * w.sum(-1, keepdims=True) + (w * s).sum(-1, keepdims=True)) + w / count
-    tensors = float32(positions), torch.full(s.shape, 1 / count)
+    everywhere, nothing = torch.ones(s.shape, dtype=torch.bool), torch.tensor([[0.0, 1.0]]).expand(rays, 2)
+    others = float32(inverse_t), everywhere, torch.full((rays,), 1 / count), nothing, 1.0
+
+    def distortion(x: torch.Tensor) -> torch.Tensor:
+        return depth_sums.reference(x, *others).spread.mean()
+
     wanted = value, (slope / rays).astype(np.float64), (size / rays).astype(np.float64)
     total = float(2 * (w.sum(-1) ** 2).mean()) + 1e-30
-    return _loss(precision, lambda x: losses.distortion(x, *tensors), weights, wanted, total, 4 + 2 * math.log2(count))
+    return _loss(precision, distortion, weights, wanted, total, 4 + 2 * math.log2(count))
 
 
 def _entropy(precision: Precision) -> Outcome:
@@ -151,21 +158,26 @@ def _entropy(precision: Precision) -> Outcome:
 
 def _keypoint(precision: Precision) -> Outcome:
     """Rays with no mass near the point, with all of it there, at 1/t of 1e-6 and 1e6, and without a point."""
-    known = single([[0.5], [0.5], [1e-6], [1e6], [0.0], [0.25]])
-    q = single(np.tile(np.linspace(1.2, 0.8, 9), (6, 1)) * np.where(known > 0, known, 1.0))
+    depths = single([[0.5], [0.5], [1e-6], [1e6], [0.0], [0.25]])
+    q = single(np.tile(np.linspace(1.2, 0.8, 9), (6, 1)) * np.where(depths > 0, depths, 1.0))
     w = single(np.full((6, 9), 0.1))
     w[:2] = 0
     w[1, 4] = 1
     q[5] = 3.0  # nothing within reach of the point
-    x = (q - known) / (0.06 * np.maximum(known, 1e-12))
+    x = (q - depths) / (0.06 * np.maximum(depths, 1e-12))
     window = np.exp(-0.5 * x**2)
-    reach = (np.abs(x) < 3).any(-1) & (known[:, 0] > 0)
+    reach = (np.abs(x) < 3).any(-1) & (depths[:, 0] > 0)
     mass = (w * window).sum(-1) + 1e-4
     slope = np.where(reach[:, None], -window / mass[:, None], 0) / reach.sum()
     # x is a difference of 1/t, 17 widths long: its rounding counts x^2 17 times.
     wanted = float(-np.log(mass)[reach].mean()), slope, np.abs(slope) * (1 + 20 * np.abs(x)) + 1e-30
-    there = float32(q), float32(known), torch.ones(6, 9, dtype=torch.bool)
-    return _loss(precision, lambda v: losses.keypoint_depth(v, *there), w, wanted, 60.0, 16)
+    targets = float32(np.concatenate([depths, 0.06 * np.maximum(depths, 1e-12)], -1))
+    there = float32(q), torch.ones(6, 9, dtype=torch.bool), torch.zeros(6), targets, 1.0
+
+    def keypoint(v: torch.Tensor) -> torch.Tensor:
+        return losses.keypoint_depth(*depth_sums.reference(v, *there)[1:])
+
+    return _loss(precision, keypoint, w, wanted, 60.0, 16)
 
 
 def _variation(precision: Precision) -> Outcome:

@@ -30,7 +30,7 @@ from stability.cases import (
 from stability.exact import Array, Jitter
 from stability.exact_ray import TABLES, ExactField, ExactRay, Gradients
 
-from mmpi_ns.bench.rendering import bundle_of, of_slots, render
+from mmpi_ns.bench.scenes import bundle_of, of_slots, render
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.ops.interpolate import Table
 from mmpi_ns.rendering.rendered import RenderedRays

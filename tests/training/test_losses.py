@@ -12,7 +12,8 @@ from training_runs import datamanager, plan_of, ready, trainer_config
 
 from mmpi_ns.field.shading import RayColors
 from mmpi_ns.ops.composite import Composite
-from mmpi_ns.ops.variation.reference import clamped_differences
+from mmpi_ns.ops.depth_sums import depth_sums
+from mmpi_ns.ops.variation import clamped_differences
 from mmpi_ns.training import losses
 
 F64 = torch.float64
@@ -20,6 +21,29 @@ F64 = torch.float64
 
 def tensor(values, dtype=F64):
     return torch.tensor(np.asarray(values), dtype=dtype)
+
+
+def every(weights):
+    return torch.ones_like(weights, dtype=torch.bool)
+
+
+def distortion(weights, positions, intervals):
+    """The loss of samples at positions in [0, 1]."""
+    targets = weights.new_tensor([[0.0, 1.0]]).expand(len(weights), 2)
+    return depth_sums(weights, 1 / positions - 1, every(weights), intervals, targets, 1.0).spread.mean()
+
+
+def keypoint_depth(weights, inverse_t, known, valid, relative_width=losses.KEYPOINT_WIDTH):
+    targets = torch.cat([known, (relative_width * known).clamp(min=1e-12)], -1)
+    sums = depth_sums(weights, inverse_t, valid, torch.ones_like(known[:, 0]), targets, 1.0)
+    return losses.keypoint_depth(sums.mass, sums.reached)
+
+
+def known_depth(weights, inverse_t, known, valid, least_error, outliers=0.02):
+    error = (known[:, 1:] ** 2 + least_error**2).sqrt().clamp(min=1e-12)
+    targets = torch.cat([known[:, :1], error], -1)
+    sums = depth_sums(weights, inverse_t, valid, torch.ones_like(known[:, 0]), targets, 1.0)
+    return losses.known_depth(sums.mass, sums.reached, outliers)
 
 
 def test_photometric_is_the_mean_squared_error():
@@ -59,9 +83,9 @@ def test_background_entropy_is_largest_for_a_coin_flip_and_nothing_for_a_decisio
 
 
 def test_distortion_of_two_samples_by_hand():
-    weights, positions, intervals = tensor([[0.6, 0.2]]), tensor([[0.1, 0.5]]), tensor([[0.03, 0.06]])
-    expected = 2 * 0.6 * 0.2 * 0.4 + (0.36 * 0.03 + 0.04 * 0.06) / 3
-    assert losses.distortion(weights, positions, intervals).item() == pytest.approx(expected)
+    weights, positions, intervals = tensor([[0.6, 0.2]]), tensor([[0.1, 0.5]]), tensor([0.03])
+    expected = 2 * 0.6 * 0.2 * 0.4 + (0.36 + 0.04) * 0.03 / 3
+    assert distortion(weights, positions, intervals).item() == pytest.approx(expected)
 
 
 def distortion_pairwise(weights, positions, intervals):
@@ -71,7 +95,7 @@ def distortion_pairwise(weights, positions, intervals):
         for i in range(len(w)):
             for j in range(len(w)):
                 total += w[i] * w[j] * abs(s[i] - s[j])
-            total += w[i] ** 2 * delta[i] / 3
+            total += w[i] ** 2 * delta / 3
     return total / len(weights)
 
 
@@ -82,16 +106,16 @@ def test_distortion_equals_the_double_loop(dtype, error):
     weights[1, 30:] = 0  # empty slots
     positions = tensor(np.sort(rng.random((4, 60)), -1), dtype)
     positions[2] = positions[2].round(decimals=1)  # ties
-    intervals = tensor(rng.random((4, 60)) / 60, dtype)
+    intervals = tensor(rng.random(4) / 60, dtype)
     wanted = distortion_pairwise(weights.double(), positions.double(), intervals.double())
-    assert losses.distortion(weights, positions, intervals).item() == pytest.approx(wanted, rel=error)
+    assert distortion(weights, positions, intervals).item() == pytest.approx(wanted, rel=error)
 
 
 def test_distortion_does_not_change_when_the_ray_is_moved():
     rng = np.random.default_rng(1)
     weights, positions = tensor(rng.random((2, 10))), tensor(np.sort(rng.random((2, 10)), -1) / 2)
-    intervals = torch.zeros_like(weights)
-    here, there = (losses.distortion(weights, positions + shift, intervals).item() for shift in (0.0, 0.5))
+    intervals = torch.zeros_like(weights[:, 0])
+    here, there = (distortion(weights, positions + shift, intervals).item() for shift in (0.0, 0.5))
     assert here == pytest.approx(there)
 
 
@@ -123,7 +147,7 @@ def test_keypoint_depth_by_hand():
     weights, inverse_t = tensor([[0.1, 0.4, 0.2, 0.3]]), tensor([[2.4, 2.2, 2.0, 0.5]])
     valid = torch.ones(1, 4, dtype=torch.bool)
     mass = 0.1 * math.exp(-2) + 0.4 * math.exp(-0.5) + 0.2
-    loss = losses.keypoint_depth(weights, inverse_t, tensor([[2.0]]), valid, relative_width=0.1)
+    loss = keypoint_depth(weights, inverse_t, tensor([[2.0]]), valid, relative_width=0.1)
     assert loss.item() == pytest.approx(-math.log(mass + 1e-4), abs=1e-9)
 
 
@@ -132,16 +156,16 @@ def test_keypoint_depth_leaves_out_rays_that_cannot_reach_their_point():
     inverse_t = tensor([[1.0, 0.0], [1.0, 0.0], [1.0, 0.0], [1.0, 0.0]])
     valid = torch.tensor([[True, True], [True, True], [False, True], [True, True]])
     known = tensor([[1.0], [3.0], [1.0], [0.0]])  # reached, too near, sample in an empty slot, no point
-    both = losses.keypoint_depth(weights, inverse_t, known, valid)
-    alone = losses.keypoint_depth(weights[:1], inverse_t[:1], known[:1], valid[:1])
+    both = keypoint_depth(weights, inverse_t, known, valid)
+    alone = keypoint_depth(weights[:1], inverse_t[:1], known[:1], valid[:1])
     assert both.item() == alone.item() == pytest.approx(-math.log(0.5 + 1e-4))
-    none = losses.keypoint_depth(weights[1:], inverse_t[1:], known[1:], valid[1:])
+    none = keypoint_depth(weights[1:], inverse_t[1:], known[1:], valid[1:])
     assert none.item() == 0
 
 
 def test_keypoint_depth_gathers_nothing_from_empty_slots():
     weights, inverse_t = tensor([[0.25, 0.5]]), tensor([[1.0, 1.0]])
-    loss = losses.keypoint_depth(weights, inverse_t, tensor([[1.0]]), torch.tensor([[True, False]]))
+    loss = keypoint_depth(weights, inverse_t, tensor([[1.0]]), torch.tensor([[True, False]]))
     assert loss.item() == pytest.approx(-math.log(0.25 + 1e-4))
 
 
@@ -149,16 +173,16 @@ def test_keypoint_depth_gathers_nothing_from_empty_slots():
 def test_keypoint_depth_does_not_depend_on_the_scene_scale(scale):
     weights, inverse_t, known = tensor([[0.2, 0.5, 0.3]]), tensor([[1.1, 1.0, 0.9]]), tensor([[1.02]])
     valid = torch.ones(1, 3, dtype=torch.bool)
-    loss = losses.keypoint_depth(weights, inverse_t, known, valid)
-    scaled = losses.keypoint_depth(weights, inverse_t / scale, known / scale, valid)
+    loss = keypoint_depth(weights, inverse_t, known, valid)
+    scaled = keypoint_depth(weights, inverse_t / scale, known / scale, valid)
     assert loss.item() == pytest.approx(scaled.item()) and loss.item() > 0.1
 
 
 def test_losses_have_the_gradient_of_finite_differences():
     rng = np.random.default_rng(5)
     weights, colors = (tensor(rng.random(s) + 0.05).requires_grad_() for s in ((3, 5), (3, 5, 3)))
-    positions = tensor(np.sort(rng.random((3, 5)), -1)).requires_grad_()
-    intervals, observed = tensor(rng.random((3, 5))), tensor(rng.random((3, 3)))
+    positions = tensor(np.sort(rng.random((3, 5)), -1))
+    intervals, observed = tensor(rng.random(3)), tensor(rng.random((3, 3)))
     valid = torch.ones(3, 5, dtype=torch.bool)
     known, inverse_t = tensor([[1.0], [2.0], [0.0]]), tensor(1 + rng.random((3, 5)) * 0.2)
     transmittance = tensor([[0.2], [0.7], [0.5]]).requires_grad_()
@@ -168,8 +192,8 @@ def test_losses_have_the_gradient_of_finite_differences():
     assert check(lambda c: losses.photometric(c[:, 0], observed), (colors,))
     assert check(lambda c: point_color(c, weights, observed), (colors,))
     assert check(losses.background_entropy, (transmittance,))
-    assert check(lambda w, s: losses.distortion(w, s, intervals), (weights, positions))
-    assert check(lambda w: losses.keypoint_depth(w, inverse_t, known, valid, 0.1), (weights,))
+    assert check(lambda w: distortion(w, positions, intervals), (weights,))
+    assert check(lambda w: keypoint_depth(w, inverse_t, known, valid, 0.1), (weights,))
     assert check(lambda v: clamped_differences(v, neighbours, scales), (values,))
 
 
@@ -181,8 +205,8 @@ def test_gradients_are_finite_for_empty_and_opaque_rays():
     valid = torch.tensor([[True, True, False]] * 3)
     loss = (
         losses.background_entropy(transmittance)
-        + losses.distortion(weights, torch.tensor([[0.0, 0.5, 1.0]] * 3), torch.zeros(3, 3))
-        + losses.keypoint_depth(weights, inverse_t, known, valid)
+        + distortion(weights, torch.tensor([[0.0, 0.5, 1.0]] * 3), torch.zeros(3))
+        + keypoint_depth(weights, inverse_t, known, valid)
     )
     loss.backward()
     assert torch.isfinite(loss)
@@ -194,7 +218,7 @@ def test_known_depth_by_hand():
     weights, inverse_t = tensor([[0.1, 0.4, 0.2, 0.3]]), tensor([[2.2, 2.1, 2.0, 0.5]])
     valid = torch.ones(1, 4, dtype=torch.bool)
     mass = 0.1 * math.exp(-2) + 0.4 * math.exp(-0.5) + 0.2
-    loss = losses.known_depth(weights, inverse_t, tensor([[2.0, 0.06]]), valid, least_error=0.08, outliers=0.05)
+    loss = known_depth(weights, inverse_t, tensor([[2.0, 0.06]]), valid, least_error=0.08, outliers=0.05)
     assert loss.item() == pytest.approx(-math.log(mass + 0.05), abs=1e-9)
 
 
@@ -202,7 +226,7 @@ def test_a_depth_is_believed_as_its_error_says():
     """The same miss costs a certain depth more than an uncertain one, and planes too coarse to show it cost nothing."""
     weights, inverse_t, valid = tensor([[1.0]]), tensor([[1.1]]), torch.ones(1, 1, dtype=torch.bool)
     cost = [
-        losses.known_depth(weights, inverse_t, tensor([[1.0, e]]), valid, least, 0.02).item()
+        known_depth(weights, inverse_t, tensor([[1.0, e]]), valid, least, 0.02).item()
         for e, least in ((0.05, 0.0), (0.2, 0.0), (0.05, 0.2))
     ]
     assert cost[0] > cost[1] > cost[2] and cost[2] == pytest.approx(0.1, abs=0.05)
@@ -212,7 +236,7 @@ def test_rays_without_a_known_depth_or_out_of_its_reach_cost_nothing_and_count()
     weights, inverse_t = torch.full((4, 2), 0.5, dtype=F64), tensor([[1.0, 0.0]] * 4)
     valid = torch.tensor([[True, True], [True, True], [False, True], [True, True]])
     known = tensor([[1.0, 0.01], [3.0, 0.01], [1.0, 0.01], [0.0, 0.0]])  # reached, too near, empty slot, not known
-    loss = losses.known_depth(weights, inverse_t, known, valid, 0.0, 0.02)
+    loss = known_depth(weights, inverse_t, known, valid, 0.0, 0.02)
     assert loss.item() == pytest.approx(-math.log(0.5 + 0.02) / 4)
 
 
@@ -222,9 +246,7 @@ def test_a_false_depth_pulls_no_harder_than_the_share_of_outliers_allows():
     valid, known = torch.ones(1, 2, dtype=torch.bool), tensor([[1.0, 0.01]])
     pulls = []
     for outliers in (1e-4, 0.02, 0.2):
-        (pull,) = torch.autograd.grad(
-            losses.known_depth(weights, tensor([[2.0, 1.0]]), known, valid, 0.0, outliers), weights
-        )
+        (pull,) = torch.autograd.grad(known_depth(weights, tensor([[2.0, 1.0]]), known, valid, 0.0, outliers), weights)
         pulls.append(-pull[0, 1].item())
     assert pulls == pytest.approx([1e4, 50, 5], rel=1e-4)
 
@@ -238,7 +260,7 @@ def test_many_right_depths_outweigh_a_tenth_of_false_ones():
     for _ in range(300):
         optimizer.zero_grad()
         weights = torch.softmax(logits, -1).expand(100, -1)
-        losses.known_depth(
+        known_depth(
             weights, inverse_t.expand(100, -1), known, torch.ones(100, 20, dtype=torch.bool), 0.05, 0.2
         ).backward()
         optimizer.step()
@@ -251,8 +273,8 @@ def test_many_right_depths_outweigh_a_tenth_of_false_ones():
 def test_known_depth_does_not_depend_on_the_scene_scale(scale):
     weights, inverse_t, known = tensor([[0.2, 0.5, 0.3]]), tensor([[1.1, 1.0, 0.9]]), tensor([[1.02, 0.03]])
     valid = torch.ones(1, 3, dtype=torch.bool)
-    loss = losses.known_depth(weights, inverse_t, known, valid, 0.05)
-    scaled = losses.known_depth(weights, inverse_t / scale, known / scale, valid, 0.05 / scale)
+    loss = known_depth(weights, inverse_t, known, valid, 0.05)
+    scaled = known_depth(weights, inverse_t / scale, known / scale, valid, 0.05 / scale)
     assert loss.item() == pytest.approx(scaled.item()) and loss.item() > 0.1
 
 
@@ -261,10 +283,10 @@ def test_known_depth_has_the_gradient_of_finite_differences_and_a_finite_one_wit
     weights = tensor(rng.random((3, 5)) + 0.05).requires_grad_()
     valid, known = torch.ones(3, 5, dtype=torch.bool), tensor([[1.0, 0.1], [1.2, 0.2], [0.0, 0.0]])
     inverse_t = tensor(1 + rng.random((3, 5)) * 0.2)
-    assert torch.autograd.gradcheck(lambda w: losses.known_depth(w, inverse_t, known, valid, 0.05), (weights,))
+    assert torch.autograd.gradcheck(lambda w: known_depth(w, inverse_t, known, valid, 0.05), (weights,))
     empty = torch.zeros(2, 3, requires_grad=True)
     bare = torch.tensor([[1e-20, 0.0], [5.0, 0.0]])
-    losses.known_depth(
+    known_depth(
         empty, torch.tensor([[1e30, 0.0, 1e-20], [5.0, 5.0, 0.0]]), bare, torch.ones(2, 3, dtype=torch.bool), 0.0
     ).backward()
     assert empty.grad is not None and torch.isfinite(empty.grad).all()

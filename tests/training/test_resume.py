@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 
 import pytest
 import torch
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from training_runs import compared, differences, load, ready, trainer_config, write_plan
 
+from mmpi_ns.placement.defaults import DEFAULTS
 from mmpi_ns.training.phases import LONG_RUN
 
 STEPS = 24
@@ -252,6 +254,17 @@ def test_a_longer_run_keeps_the_schedule_of_the_checkpoint_in_model_and_learning
     assert sorted(int(p.stem[5:]) for p in trainer.checkpoint_dir.iterdir())[-1] == STEPS + 5
     state = load(trainer.checkpoint_dir, STEPS - 1)
     assert differences(compared(load(whole[1], STEPS - 1)), compared(state)) == []
+
+
+@pytest.mark.parametrize("steps", [0, 150])
+def test_without_a_number_of_steps_they_follow_the_pixels(scene, plan_file, tmp_path, monkeypatch, capsys, steps):
+    monkeypatch.setitem(DEFAULTS, "mmpi-small", replace(DEFAULTS["mmpi-small"], steps=100))
+    monkeypatch.setattr("mmpi_ns.placement.defaults.PIXELS", 1.0)
+    config = trainer_config(scene, plan_file, tmp_path, steps=steps)
+    trainer = ready(config)
+    expected = steps or 400
+    assert trainer.pipeline.model.progress.schedule.total_steps == expected == trainer.config.max_num_iterations
+    assert ("400 steps for its training pixels" in capsys.readouterr().out) == (steps == 0)
 
 
 def test_fewer_rays_are_drawn_until_the_texels_have_grown(scene, plan_file, tmp_path):

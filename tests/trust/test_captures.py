@@ -157,6 +157,7 @@ REFUSED = {
     "applied_scale is 0": (file(applied_scale=0), ["applied_scale", "above 0"]),
     "orientation is unknown": (file(orientation_override="left"), ["orientation_override", "'left'"]),
     # Splits
+    "a point cloud that is a number": (file(ply_file_path=3), ["ply_file_path", "3"]),
     "train list with a stranger": (lambda m: m["train_filenames"].append("images/no.png"), ["no.png", "no frame"]),
     "val list is no list": (file(val_filenames="images/a.png"), ["val_filenames", "unusable"]),
     "train list of numbers": (file(train_filenames=[1, 2]), ["train_filenames", "unusable"]),
@@ -174,15 +175,6 @@ def test_a_capture_that_cannot_be_used_is_refused(data, edit, tmp_path, case):
     assert all(word in said for word in words), said
 
 
-@pytest.mark.parametrize("cloud", [..., "no.ply", 3])
-def test_a_point_cloud_that_is_asked_for_and_not_there_is_named(data, edit, tmp_path, cloud):
-    """Where a COLMAP model lies beside it nerfstudio would ask on the terminal whether to make one."""
-    if cloud is not ...:
-        edit(file(ply_file_path=cloud))
-    said = train(data, tmp_path, pipeline__datamanager__dataparser__load_3D_points=True).sentence
-    assert said.startswith("--load-3D-points") and "ply_file_path" in said
-
-
 CLOUDS = {
     "no PLY": b"solid cube", "empty": b"", "cut short": b"ply\nformat binary_little_endian 1.0\nelement vertex 9\n"
     b"property float x\nproperty float y\nproperty float z\nend_header\n123",
@@ -191,11 +183,22 @@ CLOUDS = {
 
 
 @pytest.mark.parametrize("case", CLOUDS)
-def test_a_point_cloud_that_cannot_be_read_is_named(data, edit, tmp_path, case):
+def test_a_point_cloud_that_cannot_be_read_is_named_and_training_goes_on(data, edit, tmp_path, case):
     (data / "cloud.ply").write_bytes(CLOUDS[case])
     edit(file(ply_file_path="cloud.ply"))
-    said = train(data, tmp_path, pipeline__datamanager__dataparser__load_3D_points=True).sentence
-    assert str(data / "cloud.ply") in said and "is not a PLY file of points" in said
+    shown = train(data, tmp_path).shown
+    assert "is not a PLY file of points" in shown and "Training goes on without the point cloud" in shown
+    assert str(data / "cloud.ply") in shown and "Training finished" in shown
+
+
+def test_a_point_cloud_that_is_missing_or_empty_is_named_and_training_goes_on(data, edit, tmp_path):
+    edit(file(ply_file_path="no.ply"))
+    shown = train(data, tmp_path).shown
+    assert f"{data / 'no.ply'} is not a PLY file of points (" in shown and "Training finished" in shown
+    head = "".join(f"property float {name}\n" for name in "xyz")
+    (data / "no.ply").write_text(f"ply\nformat ascii 1.0\nelement vertex 0\n{head}end_header\n")
+    shown = train(data, tmp_path / "again").shown
+    assert f"The point cloud {data / 'no.ply'} holds no point" in shown and "Training finished" in shown
 
 
 def test_names_that_say_no_split_are_refused_where_they_must(data, edit, tmp_path):

@@ -8,11 +8,15 @@ import math
 import pytest
 from forked import run, train
 
+from mmpi_ns.config import mmpi_kitti
+from mmpi_ns.training.options import check_run
+from mmpi_ns.utils.errors import InputError
+
 NAN, INF = math.nan, math.inf
 P, M, D = "pipeline__model__placement__", "pipeline__model__", "pipeline__datamanager__"
 
 REFUSED = {
-    "max_num_iterations": [0, -1],
+    "max_num_iterations": [-1],
     "steps_per_save": [-1],
     "steps_per_eval_batch": [-3],
     "steps_per_eval_image": [-3],
@@ -83,6 +87,14 @@ def test_an_option_out_of_range_is_named(whole_scene, tmp_path, name, value):
 def test_an_option_of_a_data_parser_out_of_range_is_named(whole_scene, tmp_path, name, value):
     said = train(whole_scene, tmp_path, **{D + "dataparser__" + name: value}).sentence
     assert said.startswith(option_of(name) + " must be")
+
+
+def test_a_method_of_the_paper_needs_a_number_of_steps():
+    config = copy.deepcopy(mmpi_kitti.config)
+    check_run(config)
+    config.max_num_iterations = 0
+    with pytest.raises(InputError, match="mmpi-kitti has no number of steps"):
+        check_run(config)
 
 
 def test_images_scaled_down_to_nothing_are_refused(whole_scene, tmp_path):

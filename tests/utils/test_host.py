@@ -141,7 +141,7 @@ def test_no_other_module_changes_what_it_imports(path):
             patches = name_of(node.func) != "setattr" or name_of(node.args[0]).split(".")[0] in names
             place = (path.relative_to(ROOT).as_posix(), name_of(node.func))
             assert not patches or place in LISTED, f"line {node.lineno} calls {name_of(node.func)}"
-        assert name_of(node) != "sys.argv" or path.parts[-2:] == ("export", "reader.py"), f"line {node.lineno}"
+        assert name_of(node) != "sys.argv" or path.parts[-2:] == ("baked", "reader.py"), f"line {node.lineno}"
 
 
 def test_an_input_error_is_one_sentence_and_others_keep_their_traceback(monkeypatch, mallocs, capsys):
