@@ -87,7 +87,7 @@ def launches_noted(noted):
         noted[Launch(self, tuple(given.items()), tuple(constants.items()), num_warps)] = None
         for value in args:
             if isinstance(value, torch.Tensor):
-                value.zero_()
+                value.detach().zero_()
 
     triton.runtime.JITFunction.run = note
     try:
