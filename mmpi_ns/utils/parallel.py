@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from typing import TypeVar
+from typing import ClassVar, TypeVar
 
 import cv2
 import torch
@@ -23,7 +23,7 @@ class _Apart:
     """State of ``torch_apart`` in this process, whose threads share it: a viewer renders beside the training."""
 
     lock = threading.Lock()
-    blocks = 0
+    blocks: ClassVar[set[object]] = set()
     threads = 0
 
 
@@ -39,19 +39,26 @@ def torch_apart() -> Iterator[None]:
     OpenMP's threads wait for torch's next operation spinning, for milliseconds, on the cores that the compiled kernels
     of this package would use. The arrays of a training step and of a picture are too small for torch's threads to pay.
     """
-    entered = False
+    block = object()
     try:
-        with Uninterrupted(), _Apart.lock:
-            # A thread that began within a block keeps torch's one thread after it.
-            _Apart.threads = max(_Apart.threads, torch.get_num_threads())
-            _Apart.blocks += 1
-            torch.set_num_threads(1)
-            entered = True
-        yield
-    finally:
-        with Uninterrupted(), _Apart.lock:
-            _Apart.blocks -= entered
-            if entered and _Apart.blocks == 0:
+        try:
+            with Uninterrupted(), _Apart.lock:
+                # A thread that began within a block keeps torch's one thread after it.
+                _Apart.threads = max(_Apart.threads, torch.get_num_threads())
+                _Apart.blocks.add(block)
+                torch.set_num_threads(1)
+            yield
+        finally:
+            _leave(block)
+    finally:  # A viewer's trace function, which raises once, may raise before the first line of _leave.
+        _leave(block)
+
+
+def _leave(block: object) -> None:
+    with Uninterrupted(), _Apart.lock:
+        if block in _Apart.blocks:
+            _Apart.blocks.remove(block)
+            if not _Apart.blocks:
                 torch.set_num_threads(_Apart.threads)
 
 
