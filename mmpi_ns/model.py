@@ -21,33 +21,30 @@ from torch.nn import Parameter
 from mmpi_ns.capture.datamanager import GAINS, OBSERVATIONS, RAYS_PER_STEP, TRAINING_VIEWS
 from mmpi_ns.capture.rays import PinholeRays
 from mmpi_ns.field.mmpi_field import ColourConfig, MMPIField
+from mmpi_ns.field.samples import metadata_of
 from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.march import MarchOptions
 from mmpi_ns.placement.defaults import steps_for
 from mmpi_ns.placement.rule import PlacementConfig
 from mmpi_ns.placement.split import most_pixels, place_windows
 from mmpi_ns.rendering.baked import BakedWindow, bake, suits_bricks
-from mmpi_ns.rendering.chunks import check_crop, rays_per_chunk, render_in_chunks
 from mmpi_ns.rendering.exposure import Exposures
+from mmpi_ns.rendering.images import check_crop, rays_per_chunk, render_in_chunks, render_windows
 from mmpi_ns.rendering.metrics import ImageMetrics, depth_metrics, pictures
-from mmpi_ns.rendering.render import render_rays, sampled_outputs
+from mmpi_ns.rendering.render import render_rays, sampled_outputs, shown_outputs, shows_in_one_pass
 from mmpi_ns.rendering.rendered import BACKGROUNDS, RenderedRays, RenderingConfig, background_of, bounded
 from mmpi_ns.rendering.sampler import MMPISampler, SamplingConfig
-from mmpi_ns.rendering.shown import shown_outputs, shows_in_one_pass
 from mmpi_ns.rendering.window_store import WindowStore
-from mmpi_ns.rendering.windows import render_windows
 from mmpi_ns.scene.plan import NO_PLAN
 from mmpi_ns.scene.visible_tiles import TrainingViews
 from mmpi_ns.scene.windows import WindowedPlan
+from mmpi_ns.training.batch_rays import check_refined_poses, individual_rays, move_rays
 from mmpi_ns.training.checkpoints import check_there_are_checkpoints
 from mmpi_ns.training.config_files import grouped
-from mmpi_ns.training.individual import individual_rays
 from mmpi_ns.training.losses import LossWeights, batch_losses, over_background, photometric
 from mmpi_ns.training.memory import check_memory
 from mmpi_ns.training.phases import ScheduleConfig, make_schedule
-from mmpi_ns.training.progress import Progress
-from mmpi_ns.training.refined_poses import check_refined_poses, move_rays
-from mmpi_ns.training.run import TrainingRun, views_of
+from mmpi_ns.training.run import Progress, TrainingRun, views_of
 from mmpi_ns.utils.console import say
 from mmpi_ns.utils.parallel import torch_apart
 from mmpi_ns.utils.random_draws import generator
@@ -138,7 +135,7 @@ class MMPIModel(Model):
         free = {"scale_is_free": observations is not None and not len(observations.seen_by)}
         release = config.schedule.release_weight
         self.run = TrainingRun(self.progress, self.field, self.store, views, release, [*poses], **free)
-        self.register_load_state_dict_post_hook(lambda *_: self._after_loading())
+        self.register_load_state_dict_post_hook(type(self)._take_plan)
 
     def _plan(self) -> WindowedPlan:
         """The plan that is asked for, or the one that the placement rule makes of what the training cameras saw."""
@@ -166,8 +163,8 @@ class MMPIModel(Model):
             cube_alpha=self.config.sampling.cube_alpha,
         )
 
-    def _after_loading(self) -> None:
-        """The plan and the schedule are the checkpoint's now."""
+    def _take_plan(self, _: Any) -> None:
+        """Takes over plan and schedule of a checkpoint that was loaded."""
         self.field.shares_depth = self.progress.schedule.is_joint
         self.show.set_options(["all", *self.progress.windows.names])
 
@@ -219,19 +216,19 @@ class MMPIModel(Model):
         """
         windows, trained = self.progress.windows, self.progress.window
         chosen = windows.find(self.show.value)  # by the viewer
-        there = self.run.windows_there() if len(windows) > 1 else [0]
+        present = self.run.windows_there() if len(windows) > 1 else [0]
 
         def render(place: int, rays: Tensor | slice) -> dict[str, Tensor]:
-            window = there[place]
+            window = present[place]
             field = self.field if window == trained else self.store.load(window, self.device)
             outputs = lambda part: self.window_outputs(window, field, part, chosen)  # noqa: E731
             return render_in_chunks(bundle[rays], chunk or len(bundle), self.device, outputs)
 
         if len(windows) == 1:
             return render(0, slice(None))
-        shown = there.index(chosen[0]) if chosen is not None and chosen[0] in there else None
-        in_memory = [i for i, window in enumerate(there) if window in (trained, *self.store.in_memory)]
-        return render_windows(bundle.origins, tuple(windows.windows[w] for w in there), render, shown, in_memory)
+        shown = present.index(chosen[0]) if chosen is not None and chosen[0] in present else None
+        in_memory = [i for i, window in enumerate(present) if window in (trained, *self.store.in_memory)]
+        return render_windows(bundle.origins, tuple(windows.windows[w] for w in present), render, shown, in_memory)
 
     def window_outputs(
         self, window: int, field: MMPIField, bundle: RayBundle, chosen: tuple[int, int] | None = None
@@ -244,9 +241,13 @@ class MMPIModel(Model):
             bundle: the rays.
             chosen: the one (window, head) to show; None for all.
         """
-        if chosen is None and self._shows_bricks(field):
-            outputs = self.baked(field).outputs(bounded(bundle, field.plan), self._behind(bundle.origins))
-            return outputs | {"winning_mpi": outputs["winning_mpi"] + self.progress.windows.first_head(window)}
+        mode, first_head = self.config.rendering.mode, self.progress.windows.first_head(window)
+        background = background_of(self.config.rendering.background, bundle.origins)
+        one_exposure = self.exposures.mean is None or self.config.rendering.exposure == "mean"
+        may_bake = mode == "auto" and not self.trains and one_exposure
+        if chosen is None and (mode == "baked" or (may_bake and suits_bricks(field))):
+            outputs = self.baked(field).outputs(bounded(bundle, field.plan), background)
+            return outputs | {"winning_mpi": outputs["winning_mpi"] + first_head}
         blends, head_mask = self.blends(field), None
         if chosen is not None:
             head = chosen[1] if chosen[0] == window else -1
@@ -255,8 +256,8 @@ class MMPIModel(Model):
         how = {"blends": blends, "threshold": self.config.rendering.threshold, "head_mask": head_mask}
         once = field.shading == "ray" and not torch.is_grad_enabled()
         outputs = (shown_outputs if once else sampled_outputs)(bounded(bundle, field.plan), field, **how)
-        behind, exposure = outputs.pop("transmittance") * self._behind(outputs["rgb"]), self.exposures.mean
-        winner = outputs["winning_mpi"] + self.progress.windows.first_head(window)
+        behind, exposure = outputs.pop("transmittance") * background.to(outputs["rgb"]), self.exposures.mean
+        winner = outputs["winning_mpi"] + first_head
         if exposure is None:
             return outputs | {"rgb": (outputs["rgb"] + behind).clamp(0, 1), "winning_mpi": winner}
         if self.config.rendering.exposure == "nearest" and len(bundle):
@@ -264,13 +265,6 @@ class MMPIModel(Model):
         radiance = outputs["rgb"] + behind / exposure
         rgb = (exposure * radiance).clamp(0, 1)
         return outputs | {"rgb": rgb, "radiance": radiance, "winning_mpi": winner}
-
-    def _shows_bricks(self, field: MMPIField) -> bool:
-        """Whether images of a field come from its bricks."""
-        if self.config.rendering.mode == "auto":
-            one_exposure = self.exposures.mean is None or self.config.rendering.exposure == "mean"
-            return not self.trains and one_exposure and suits_bricks(field)
-        return self.config.rendering.mode == "baked"
 
     def baked(self, field: MMPIField) -> BakedWindow:
         """A field baked, made once, until it is trained on. Raises ValueError where it cannot be."""
@@ -287,9 +281,6 @@ class MMPIModel(Model):
     def blends(self, field: MMPIField) -> bool:
         """Whether reliability enters a field's pictures."""
         return self.config.schedule.training != "joint" and field.plan.num_heads > 1
-
-    def _behind(self, like: Tensor) -> Tensor:
-        return background_of(self.config.rendering.background, like)
 
     # Images ------------------------------------------------------------------------------------------------------
 
@@ -320,9 +311,8 @@ class MMPIModel(Model):
     def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
         """Colours without their background, and how opaque each pixel is (ns-render's output "rgba")."""
         accumulation = outputs["accumulation"]
-        colors = outputs[output_name] - (1 - accumulation) * background_of(
-            self.config.rendering.background, accumulation
-        )
+        background = background_of(self.config.rendering.background, accumulation)
+        colors = outputs[output_name] - (1 - accumulation) * background
         return torch.cat([(colors / accumulation.clamp(min=1e-6)).clamp(0, 1), accumulation], -1)
 
     # Losses and metrics ------------------------------------------------------------------------------------------
@@ -344,9 +334,10 @@ class MMPIModel(Model):
         if "training" not in outputs:
             return {"psnr": -10 * torch.log10(photometric(outputs["rgb"], self.observed(batch)))}
         rays: RenderedRays = outputs["training"]
-        found = rays.counts()
-        self.camera_optimizer.get_metrics_dict(found)
-        return found
+        kept, live = metadata_of(rays.samples)["valid"].float().sum() / len(rays.report.live), rays.report.live.float()
+        counts = {"live_samples": live.mean(), "kept_samples": kept, "dropped_mass": rays.report.dropped_mass.mean()}
+        self.camera_optimizer.get_metrics_dict(counts)
+        return counts
 
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Tensor]

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from mmpi_ns.export.files import BakedScene, Pose
 from mmpi_ns.model import MMPIModel, MMPIModelConfig
-from mmpi_ns.rendering.chunks import CPU_RAYS, render_in_chunks
+from mmpi_ns.rendering.images import CPU_RAYS, render_in_chunks
 from mmpi_ns.rendering.metrics import ImageMetrics
 from mmpi_ns.scene.windows import window_shares
 from mmpi_ns.utils.errors import InputError, brief

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from mmpi_ns.capture.rays import PinholeRays
 from mmpi_ns.rendering.baked import BakedWindow
-from mmpi_ns.rendering.windows import render_windows
+from mmpi_ns.rendering.images import render_windows
 from mmpi_ns.scene.baked import CELLS, SIDE, BakedMpis, Codes, Shader, neighbours, take_borders
 from mmpi_ns.scene.plan import CubePlan, MPIPlan, ScenePlan
 from mmpi_ns.scene.windows import Window

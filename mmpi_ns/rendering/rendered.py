@@ -11,9 +11,9 @@ from nerfstudio.cameras.rays import RayBundle, RaySamples
 from nerfstudio.model_components import renderers
 from torch import Tensor
 
-from mmpi_ns.field.samples import Lookup, metadata_of
+from mmpi_ns.field.samples import Lookup
 from mmpi_ns.field.shading import RayColors
-from mmpi_ns.ops.composite import Composite, median_inverse_distance
+from mmpi_ns.ops.composite import Composite
 from mmpi_ns.rendering.sampler import MergeReport
 from mmpi_ns.scene.plan import ScenePlan
 
@@ -65,12 +65,6 @@ class RenderedRays:
     times: int = 1
     """Repetitions of the batch: all rays, then all rays again."""
 
-    def counts(self) -> dict[str, Tensor]:
-        """Live and kept samples of each ray, and the weight of the dropped ones."""
-        kept = metadata_of(self.samples)["valid"].float().sum() / len(self.report.live)
-        dropped = self.report.dropped_mass.mean()
-        return {"live_samples": self.report.live.float().mean(), "kept_samples": kept, "dropped_mass": dropped}
-
 
 def bounded(bundle: RayBundle, plan: ScenePlan) -> RayBundle:
     """The rays with nears and fars: ``ray_near`` of the plan and infinity, unless a crop has set tighter ones."""
@@ -78,13 +72,6 @@ def bounded(bundle: RayBundle, plan: ScenePlan) -> RayBundle:
     bundle.nears = near if bundle.nears is None else torch.maximum(bundle.nears, near)
     bundle.fars = torch.full_like(near, torch.inf) if bundle.fars is None else bundle.fars
     return bundle
-
-
-@torch.no_grad()
-def median_distance(composite: Composite, samples: RaySamples, plan: ScenePlan) -> Float[Tensor, "R 1"]:
-    """Euclidean distance at which half of the weight is accumulated."""
-    inverse_t, valid = metadata_of(samples)["inverse_t"][..., 0], metadata_of(samples)["valid"][..., 0]
-    return distances_of(median_inverse_distance(composite.weights, inverse_t, valid), plan)
 
 
 def distances_of(inverse_t: Float[Tensor, "R 1"], plan: ScenePlan) -> Float[Tensor, "R 1"]:

@@ -5,7 +5,7 @@ The march has no gradients. The field later differentiates through the samples t
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import torch
@@ -15,7 +15,7 @@ from nerfstudio.model_components.ray_samplers import Sampler
 from torch import Tensor
 
 from mmpi_ns.field.mmpi_field import MMPIField
-from mmpi_ns.ops.march import MarchOptions, MergedSamples, Rays, march
+from mmpi_ns.ops.march import MarchOptions, Rays, march
 
 DIRECTION_AT_INFINITY = 1e-10
 """Inverse distances below this become a distance of 1e10 in nerfstudio's starts and ends."""
@@ -83,9 +83,19 @@ class MMPISampler(Sampler):
         options = MarchOptions(threshold, fair_share, blends)
         with torch.no_grad():
             merged = march(field.layout, field.tables, rays_of(ray_bundle, head_mask, choose), options)
-        left = merged.skipped_total, merged.dropped_mass
-        report = MergeReport(merged.live, *left, merged.explained, merged.head_counts)
-        return _ray_samples(ray_bundle, merged), report
+        shape, names = merged.valid.shape, ("heads", "planes", "inverse_t", "valid", "skipped_before", "tau")
+        # A sample is a point on a plane, so it starts and ends at the same distance.
+        t = 1 / merged.inverse_t[..., None].clamp(min=DIRECTION_AT_INFINITY)
+        frustums = _Frustums(
+            origins=ray_bundle.origins[:, None].expand(*shape, 3),
+            directions=ray_bundle.directions[:, None].expand(*shape, 3),
+            starts=t,
+            ends=t,
+            pixel_area=ray_bundle.pixel_area[:, None].expand(*shape, 1),
+        )
+        metadata = {"ndc": merged.ndc, **{name: getattr(merged, name)[..., None] for name in names}}
+        report = MergeReport(*(getattr(merged, f.name) for f in fields(MergeReport)))
+        return _Samples(frustums=frustums, camera_indices=None, metadata=metadata), report
 
 
 def rays_of(ray_bundle: RayBundle, head_mask: Tensor | None = None, choose: Tensor | None = None) -> Rays:
@@ -107,19 +117,3 @@ class _Samples(RaySamples):
 
     def __post_init__(self) -> None:
         self._shape = self.frustums.shape
-
-
-def _ray_samples(ray_bundle: RayBundle, merged: MergedSamples) -> RaySamples:
-    """nerfstudio's RaySamples; a sample is a point on a plane, so it starts and ends at the same distance."""
-    shape = merged.valid.shape
-    t = 1 / merged.inverse_t[..., None].clamp(min=DIRECTION_AT_INFINITY)
-    frustums = _Frustums(
-        origins=ray_bundle.origins[:, None].expand(*shape, 3),
-        directions=ray_bundle.directions[:, None].expand(*shape, 3),
-        starts=t,
-        ends=t,
-        pixel_area=ray_bundle.pixel_area[:, None].expand(*shape, 1),
-    )
-    names = ("heads", "planes", "inverse_t", "valid", "skipped_before", "tau")
-    metadata = {"ndc": merged.ndc, **{name: getattr(merged, name)[..., None] for name in names}}
-    return _Samples(frustums=frustums, camera_indices=None, metadata=metadata)

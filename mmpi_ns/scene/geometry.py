@@ -33,17 +33,10 @@ class Frames:
 
     @staticmethod
     def pack(mpis: Sequence[MPIPlan], dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Frames:
-        def tensor(values) -> Tensor:
-            return torch.tensor(values, dtype=dtype, device=device)
-
-        return Frames(
-            origins=tensor([m.origin for m in mpis]),
-            axes=tensor([m.axes for m in mpis]),
-            nears=tensor([m.near for m in mpis]),
-            extents=tensor([m.extent for m in mpis]),
-            num_planes=torch.tensor([m.planes for m in mpis], device=device),
-            last_disparities=tensor([m.last_disparity for m in mpis]),
-        )
+        columns = zip(*((m.origin, m.axes, m.near, m.extent, m.last_disparity) for m in mpis), strict=True)
+        origins, axes, nears, extents, ends = (torch.tensor(c, dtype=dtype, device=device) for c in columns)
+        num_planes = torch.tensor([m.planes for m in mpis], device=device)
+        return Frames(origins, axes, nears, extents, num_planes, ends)
 
     @property
     def disparity_steps(self) -> Float[Tensor, "K"]:
@@ -151,13 +144,7 @@ def plane_hits(
     p = torch.stack([dz * nears + oz, -(dz + oz * inverse_far), bend_u, -bend_u, bend_v, -bend_v])
     q = torch.stack([one, -inverse_far * one, u1 - slope_u, slope_u - u0, v1 - slope_v, slope_v - v0])
 
-    last = (frames.num_planes - 1).to(oz.dtype)
-    step, end = frames.disparity_steps, frames.last_disparities
-    low, high = _half_space_range(p, q - p * end, step, last)
-    live = _live_test(p, q, oz, step, end, last)
-    # The division may be off by one plane at a border: the half-space test itself decides.
-    high = torch.where(live(high + 1), high + 1, torch.where(live(high), high, high - 1))
-    low = torch.where(live(low - 1), low - 1, torch.where(live(low), low, low + 1))
+    low, high = _live_range(p, q, oz, frames)
     count = torch.where(facing, (high - low + 1).clamp(min=0), torch.zeros_like(high))
     return PlaneHits(
         m_first=high.to(torch.int64),
@@ -169,26 +156,28 @@ def plane_hits(
     )
 
 
-def _half_space_range(
-    p: Float[Tensor, "C R K"], q: Float[Tensor, "C R K"], step: Float[Tensor, "K"], last: Float[Tensor, "K"]
+def _live_range(
+    p: Float[Tensor, "C R K"], q: Float[Tensor, "C R K"], oz: Float[Tensor, "R K"], frames: Frames
 ) -> tuple[Float[Tensor, "R K"], Float[Tensor, "R K"]]:
-    """Smallest and largest integer m in [0, last] with p m step <= q for all C conditions (low > high: none)."""
-    slope = p * step
-    bound = q / torch.where(slope == 0, torch.ones_like(slope), slope)
+    """Smallest and largest m of a plane with p w <= q for all C conditions (low > high: none)."""
+    last, step, end = (frames.num_planes - 1).to(oz.dtype), frames.disparity_steps, frames.last_disparities
+    slope, offset = p * step, q - p * end
+    bound = offset / torch.where(slope == 0, torch.ones_like(slope), slope)
     upper = torch.where(slope > 0, bound, torch.full_like(bound, torch.inf)).amin(0)
     lower = torch.where(slope < 0, bound, torch.full_like(bound, -torch.inf)).amax(0)
-    never = ((slope == 0) & (q < 0)).any(0)
+    never = ((slope == 0) & (offset < 0)).any(0)
     high = torch.minimum(upper.floor(), last).clamp(min=-1)
     low = torch.minimum(lower.ceil().clamp(min=0), last + 1)
-    return torch.where(never, last + 1, low), torch.where(never, torch.full_like(high, -1), high)
+    low, high = torch.where(never, last + 1, low), torch.where(never, torch.full_like(high, -1), high)
 
-
-def _live_test(p: Tensor, q: Tensor, oz: Tensor, step: Tensor, end: Tensor, last: Tensor):
     def live(m: Float[Tensor, "R K"]) -> Bool[Tensor, "R K"]:
         w = sample_disparity(m, step, end)
         return (p * w <= q).all(0) & (w * oz < 1) & (m >= 0) & (m <= last)
 
-    return live
+    # The division may be off by one plane at a border: the half-space test itself decides.
+    high = torch.where(live(high + 1), high + 1, torch.where(live(high), high, high - 1))
+    low = torch.where(live(low - 1), low - 1, torch.where(live(low), low, low + 1))
+    return low, high
 
 
 def sample_disparity(m: Tensor, step: Tensor, end: Tensor) -> Tensor:

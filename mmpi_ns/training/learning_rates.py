@@ -9,7 +9,7 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
 from mmpi_ns.training.phases import Schedule
-from mmpi_ns.training.progress import Progress
+from mmpi_ns.training.run import Progress
 
 
 @dataclass

@@ -84,10 +84,8 @@ def forecast(method: str, steps: int, rays: int, threads: int, cores: float) -> 
     together = max(1.0, min(threads, cores))
     seconds = steps * rays / CPU_RAYS * (ONE_THREAD + (1 - ONE_THREAD) / together)
     smaller = "; mmpi-small is made for a CPU" if seconds > LONG and method != "mmpi-small" else ""
-    text = (
-        f"Without a GPU, {steps:,} steps of {rays:,} rays take about {duration(seconds)}, or more with large plans"
-        f"{smaller}."
-    )
+    work = f"{steps:,} steps of {rays:,} rays"
+    text = f"Without a GPU, {work} take about {duration(seconds)}, or more with large plans{smaller}."
     if threads > 1 and cores < threads - 0.5:
         text += (
             f"\n{threads} threads run and {cores:.1f} cores are free, so they wait for each other: end other programs, "
@@ -106,31 +104,26 @@ def quick_test(model: Model, images: InputDataset, background: float) -> str:
         background: behind those with transparency.
     """
     model.eval()
-    metrics, found, began = ImageMetrics("none"), [], monotonic()
+    metrics, scores, began = ImageMetrics("none"), [], monotonic()
     count = min(VIEWS, len(images))
     for i in np.linspace(0, len(images) - 1, count).round().astype(int).tolist():
         predicted = model.get_outputs_for_camera(images.cameras[i : i + 1].to(model.device))["rgb"]
         image = images.get_data(i, image_type="float32")["image"].to(predicted)
-        found.append(metrics(predicted, over_background(image, torch.full_like(image[..., :3], background))))
+        scores.append(metrics(predicted, over_background(image, torch.full_like(image[..., :3], background))))
         if monotonic() - began > LOOK_SECONDS:
             break
     model.train()
-    psnr = [values["psnr"] for values in found]
-    ssim = [values["ssim"] for values in found if "ssim" in values]
-    parts = [f"PSNR {np.mean(psnr):.2f} dB ({min(psnr):.1f} to {max(psnr):.1f})"]
-    if ssim:
-        parts.append(f"SSIM {np.mean(ssim):.3f}")
-    return f"Quick test on {len(found)} of {len(images)} test images: {', '.join(parts)}."
+    psnr, ssim = ([values[name] for values in scores if name in values] for name in ("psnr", "ssim"))
+    text = f"PSNR {np.mean(psnr):.2f} dB ({min(psnr):.1f} to {max(psnr):.1f})"
+    text += f", SSIM {np.mean(ssim):.3f}" if ssim else ""
+    return f"Quick test on {len(scores)} of {len(images)} test images: {text}."
 
 
 def next_commands(folder: Path) -> str:
     """The folder of a run, and the next commands."""
     config = folder / "config.yml"
-    return "\n".join(
-        [
-            f"The run is in {folder}. Next:",
-            f"  ns-eval --load-config {config} --output-path {folder / 'eval.json'}",
-            f"  ns-render interpolate --load-config {config} --pose-source train --output-path {folder / 'fly.mp4'}",
-            f"  ns-viewer --load-config {config}",
-        ]
+    return (
+        f"The run is in {folder}. Next:\n  ns-eval --load-config {config} --output-path {folder / 'eval.json'}\n"
+        f"  ns-render interpolate --load-config {config} --pose-source train --output-path {folder / 'fly.mp4'}\n"
+        f"  ns-viewer --load-config {config}"
     )

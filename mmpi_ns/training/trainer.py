@@ -20,12 +20,12 @@ from mmpi_ns.rendering.rendered import BACKGROUNDS
 from mmpi_ns.scene.texels import BRICK
 from mmpi_ns.scene.windows import WindowedPlan
 from mmpi_ns.training.checkpoints import (
+    PLAN_FILE,
     cameras_in_short,
-    check_same_capture,
-    check_same_plan,
-    check_same_refinement,
+    check_same_run,
     checkpoint_to_load,
     checkpoints_in,
+    claim,
     read_checkpoint,
 )
 from mmpi_ns.training.config_files import check_nothing_left, with_absolute_paths
@@ -33,8 +33,7 @@ from mmpi_ns.training.learning_rates import following
 from mmpi_ns.training.memory import describe, training_bytes
 from mmpi_ns.training.options import check_device, check_ffmpeg, check_run
 from mmpi_ns.training.report import TrainingLog, forecast, next_commands, quick_test
-from mmpi_ns.training.run import TrainingRun
-from mmpi_ns.training.run_folder import claim
+from mmpi_ns.training.run import TrainingRun, cameras_of, views_of
 from mmpi_ns.training.shared_windows import WINDOWS_FOLDER, WindowShare
 from mmpi_ns.utils.console import duration, say
 from mmpi_ns.utils.errors import InputError
@@ -42,8 +41,6 @@ from mmpi_ns.utils.files import write_atomically
 from mmpi_ns.utils.host import arguments, command, enter_command, signals_go_to
 from mmpi_ns.utils.machine import free_cores, unused_gpu
 from mmpi_ns.utils.parallel import num_threads, torch_apart
-
-PLAN_FILE = "plan.json"
 
 
 @dataclass
@@ -158,12 +155,12 @@ class MMPITrainer(Trainer):
                 "No training image sees anything of the scene plan: its MPIs must stand among the cameras and face as "
                 "they do (mmpi-plan shows where)."
             )
-        self._say_what_comes(plan)
+        self._announce(plan)
         if self._share is not None:
             self._share.check(plan)
 
-    def _say_what_comes(self, plan: WindowedPlan) -> None:
-        """Prints capture, plan and memory together, before the first step."""
+    def _announce(self, plan: WindowedPlan) -> None:
+        """Prints capture, plan, memory and expected time together, before the first step."""
         say(self._manager.describe())
         say(describe(plan, self._window_steps, *self._expected_memory()))
         if self._follows_capture:
@@ -173,23 +170,18 @@ class MMPITrainer(Trainer):
             )
         if not str(self.device).startswith("cuda"):
             rays = self._manager.get_train_rays_per_batch()
-            cpu = num_threads(), free_cores()
-            say(forecast(self.config.method_name or "", self._total_steps, rays, *cpu))
+            say(forecast(self.config.method_name or "", self._total_steps, rays, num_threads(), free_cores()))
             if gpu := unused_gpu():
                 say(f"No GPU is used: {gpu}.")
 
     def _expected_memory(self) -> tuple[list[int], list[int]]:
         """Bytes needed for training each window: tables with their moments, and pixels."""
-        run, manager = self._run, self._manager
+        run, manager, windows = self._run, self._manager, self._run.progress.windows.windows
         blends = any(phase.name == "blend" for phase in run.progress.schedule.phases)
-        tables = [
-            training_bytes(plan, run.views_of(w), run.field.feature_channels, blends)
-            for w, plan in enumerate(run.progress.windows.plans)
-        ]
-        if len(tables) == 1:
-            return tables, [manager.pixel_bytes()]
-        centers = manager.observations.centers
-        return tables, [manager.pixel_bytes(run.cameras_of(centers, w)) for w in range(len(tables))]
+        centers, channels = manager.observations.centers, run.field.feature_channels
+        tables = [training_bytes(w.plan, views_of(w, run.views), channels, blends) for w in windows]
+        cameras = [None] if len(windows) == 1 else [cameras_of(w, centers) for w in windows]
+        return tables, [manager.pixel_bytes(c) for c in cameras]
 
     def setup_optimizers(self) -> Optimizers:
         """nerfstudio's optimisers, with schedulers that follow the phases."""
@@ -220,7 +212,11 @@ class MMPITrainer(Trainer):
         if self._start_step >= self._total_steps:
             say(f"The checkpoint already holds {self._start_step} of {self._total_steps} steps: nothing to do.")
             return
-        with signals_go_to(self._stop):
+
+        def stop(number: int) -> None:  # nerfstudio's loop ends after the current step, even if training is paused
+            self._stopped_by, self.stop_training = number, True
+
+        with signals_go_to(stop):
             self._train_until(self._total_steps)
         if self._stopped_by is not None:
             self.config.logging.profiler = "none"  # nothing more is said
@@ -260,10 +256,6 @@ class MMPITrainer(Trainer):
         finally:
             self.config.max_num_iterations = self._window_steps
 
-    def _stop(self, number: int) -> None:
-        """Makes nerfstudio's loop end after the current step, even if training is paused."""
-        self._stopped_by, self.stop_training = number, True
-
     def train_iteration(self, step: int) -> Any:
         """One step; records that it ran, and saves a window of several after its last step."""
         loss, *others = super().train_iteration(step)
@@ -275,7 +267,9 @@ class MMPITrainer(Trainer):
         run, progress = self._run, self._run.progress
         if len(progress.windows) > 1 and (step + 1) % progress.schedule.window_steps == 0:
             run.store.save(progress.window, run.field)
-        return loss.detach(), *({k: _detached(v) for k, v in values.items()} for values in others)
+        for values in others:
+            values.update({name: v.detach() for name, v in values.items() if isinstance(v, torch.Tensor)})
+        return loss.detach(), *others
 
     def _after_train(self) -> None:
         """Saves with the number of the last step that ran; nerfstudio 1.1.5 would use the next one after a stop."""
@@ -329,11 +323,9 @@ class MMPITrainer(Trainer):
     def _load_checkpoint(self) -> None:
         path, run = checkpoint_to_load(self.config), self._run
         if path is not None:
-            state = read_checkpoint(path)
-            check_same_capture(state, path, self._manager.get_datapath(), self._manager.observations)
-            check_same_plan(state["pipeline"], path, run.progress.windows, PLAN_FILE)
-            model: Any = self.pipeline.model
-            check_same_refinement(state["pipeline"], path, model.camera_optimizer.config.mode)
+            state, model, capture = read_checkpoint(path), self.pipeline.model, self._manager
+            mode = model.camera_optimizer.config.mode  # type: ignore[union-attr]
+            check_same_run(state, path, capture.get_datapath(), capture.observations, run.progress.windows, mode)
             torch.set_rng_state(state["rng"]["torch"])
             del state
         # nerfstudio takes every file in load_dir for a checkpoint.
@@ -349,20 +341,16 @@ class MMPITrainer(Trainer):
 
 def _write_plan(path: Path, plan: WindowedPlan) -> None:
     """Writes a run's plan for the user to read; one that was edited is kept."""
-    text, told = plan.to_json(), path.with_name(f".{path.name}.sha256")
-    there = path.read_bytes() if path.is_file() else text.encode()
-    written = told.read_text(encoding="ascii") if told.is_file() else ""
-    if there != text.encode() and hashlib.sha256(there).hexdigest() != written:
+    text, digest_file = plan.to_json(), path.with_name(f".{path.name}.sha256")
+    present = path.read_bytes() if path.is_file() else text.encode()
+    digest = digest_file.read_text(encoding="ascii") if digest_file.is_file() else ""
+    if present != text.encode() and hashlib.sha256(present).hexdigest() != digest:
         raise InputError(
             f"{path} is not the plan of this run and was edited, it seems: give it with --pipeline.model.plan-file in "
             "another --timestamp, or remove it."
         )
     write_atomically(path, lambda unfinished: unfinished.write_text(text, encoding="utf-8"))
-    told.write_text(hashlib.sha256(text.encode()).hexdigest(), encoding="ascii")
-
-
-def _detached(value: Any) -> Any:
-    return value.detach() if isinstance(value, torch.Tensor) else value
+    digest_file.write_text(hashlib.sha256(text.encode()).hexdigest(), encoding="ascii")
 
 
 def _end(number: int, sentence: str) -> NoReturn:

@@ -1,14 +1,17 @@
-"""Pose refinement during training: nerfstudio's camera optimiser, and the rays it learns from."""
+"""Rays of a training batch: moved with the poses that are refined, and assigned to MPIs in the individual phase."""
 
 from __future__ import annotations
 
+from typing import Any, Literal
+
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from nerfstudio.cameras.camera_optimizers import CameraOptimizer
 from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 
 from mmpi_ns.capture.ray_sources import OWN_PIXEL
+from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.utils.errors import InputError
 
 
@@ -62,6 +65,32 @@ def move_rays(bundle: RayBundle, poses: CameraOptimizer) -> None:
     if poses.config.mode == "off":
         return
     poses.apply_to_raybundle(bundle)
-    own = bundle.metadata[OWN_PIXEL]
-    bundle.origins = torch.where(own, bundle.origins, bundle.origins.detach())
-    bundle.directions = torch.where(own, bundle.directions, bundle.directions.detach())
+    moves_camera = bundle.metadata[OWN_PIXEL]
+    bundle.origins = torch.where(moves_camera, bundle.origins, bundle.origins.detach())
+    bundle.directions = torch.where(moves_camera, bundle.directions, bundle.directions.detach())
+
+
+def individual_rays(
+    bundle: RayBundle, plan: ScenePlan, rays_per_mpi: Literal["split", "all"], g: torch.Generator
+) -> tuple[RayBundle, Bool[Tensor, "R H"] | None, Float[Tensor, "R K"] | None]:
+    """Rays of the individual phase, each for one of the MPIs it meets or for every MPI in turn, and for the cube (paper
+    sec. III-C, first stage).
+
+    Returns:
+        The rays, (all) the heads that each may meet, and (split) priorities of the MPIs.
+    """
+    num_mpis, device = len(plan.mpis), bundle.origins.device
+    if num_mpis == 1:
+        return bundle, None, None
+    if rays_per_mpi == "split":
+        return bundle, None, torch.rand(len(bundle), num_mpis, generator=g, device=device)
+    heads = torch.arange(num_mpis, device=device).repeat_interleave(len(bundle))
+    mask = torch.arange(plan.num_heads, device=device) == heads[:, None]
+    mask[:, num_mpis:].fill_(True)
+
+    def repeat(x: Tensor | None) -> Any:
+        return None if x is None else x.repeat(num_mpis, *([1] * (x.ndim - 1)))
+
+    names = ("origins", "directions", "pixel_area", "camera_indices", "nears", "fars")
+    metadata = {name: repeat(values) for name, values in bundle.metadata.items()}
+    return RayBundle(**{name: repeat(getattr(bundle, name)) for name in names}, metadata=metadata), mask, None

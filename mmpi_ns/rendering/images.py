@@ -1,16 +1,18 @@
-"""Images in chunks of rays, sized for the caches of a CPU or the memory of a GPU."""
+"""Images of many rays: mixed from the windows that each ray starts in, and rendered in chunks that suit the device."""
 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from threading import current_thread, main_thread
 
 import torch
+from jaxtyping import Float, Int
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.scene_box import OrientedBox
 from torch import Tensor
 
+from mmpi_ns.scene.windows import Window, window_shares
 from mmpi_ns.utils.errors import InputError
 
 CPU_RAYS = 4096
@@ -25,6 +27,40 @@ BYTES_PER_SLOT = 40
 """Bytes of one compiled pass for every sample that a ray may keep."""
 FREE_SHARE = 0.5
 """Fraction of the device's free memory; the rest is left to other programs."""
+
+
+def render_windows(
+    origins: Float[Tensor, "R 3"],
+    windows: tuple[Window, ...],
+    render: Callable[[int, Int[Tensor, "P"]], dict[str, Tensor]],
+    shown: int | None = None,
+    in_memory: Collection[int] = (),
+) -> dict[str, Tensor]:
+    """Outputs of rays from all windows that they start in: colours by shares, depth and winner of the largest share.
+
+    Args:
+        origins: of the rays.
+        windows: those that are trained.
+        render: outputs [P, C] of one window, given its index and the numbers of its rays. Called once for each window,
+            so that a window is read from disk once at most, however many rays there are.
+        shown: index of the window that renders all rays; None: those that they start in.
+        in_memory: windows to render first, before the reading of another one evicts them.
+    """
+    shares = window_shares(origins, windows)
+    if shown is not None:
+        shares = torch.zeros_like(shares).index_fill_(1, torch.tensor([shown], device=shares.device), 1.0)
+    parts = {}
+    for w in sorted((shares > 0).any(0).nonzero()[:, 0].tolist(), key=lambda w: w not in in_memory):
+        rays = (shares[:, w] > 0).nonzero()[:, 0]
+        parts[w] = rays, render(w, rays)
+    mixed: dict[str, Tensor] = {}
+    largest = shares.argmax(-1)
+    for w, (rays, outputs) in sorted(parts.items()):  # sums do not depend on the order of rendering
+        wins = (largest[rays] == w)[:, None]
+        for name, values in outputs.items():
+            image = mixed.setdefault(name, values.new_zeros(len(shares), *values.shape[1:]))
+            image[rays] += values * (wins if name in ("depth", "winning_mpi") else shares[rays, w][:, None])
+    return mixed
 
 
 def rays_per_chunk(samples_per_ray: int, device: torch.device, kept_in_one_pass: int | None = None) -> int:
