@@ -31,8 +31,17 @@ from mmpi_ns.rendering.baked import BakedWindow, bake, suits_bricks
 from mmpi_ns.rendering.exposure import Exposures
 from mmpi_ns.rendering.images import check_crop, rays_per_chunk, render_in_chunks, render_windows
 from mmpi_ns.rendering.metrics import ImageMetrics, depth_metrics, pictures
-from mmpi_ns.rendering.render import render_rays, sampled_outputs, shown_outputs, shows_in_one_pass
-from mmpi_ns.rendering.rendered import BACKGROUNDS, RenderedRays, RenderingConfig, background_of, bounded
+from mmpi_ns.rendering.rendered import (
+    BACKGROUNDS,
+    RenderedRays,
+    RenderingConfig,
+    background_of,
+    bounded,
+    render_rays,
+    sampled_outputs,
+    shown_outputs,
+    shows_in_one_pass,
+)
 from mmpi_ns.rendering.sampler import MMPISampler, SamplingConfig
 from mmpi_ns.rendering.window_store import WindowStore
 from mmpi_ns.scene.plan import NO_PLAN
@@ -40,12 +49,12 @@ from mmpi_ns.scene.visible_tiles import TrainingViews
 from mmpi_ns.scene.windows import WindowedPlan
 from mmpi_ns.training.batch_rays import check_refined_poses, individual_rays, move_rays
 from mmpi_ns.training.checkpoints import check_there_are_checkpoints
-from mmpi_ns.training.config_files import grouped
 from mmpi_ns.training.losses import LossWeights, batch_losses, over_background, photometric
 from mmpi_ns.training.memory import check_memory
+from mmpi_ns.training.options import grouped
 from mmpi_ns.training.phases import ScheduleConfig, make_schedule
 from mmpi_ns.training.run import Progress, TrainingRun, views_of
-from mmpi_ns.utils.console import say
+from mmpi_ns.utils.errors import say
 from mmpi_ns.utils.parallel import torch_apart
 from mmpi_ns.utils.random_draws import generator
 

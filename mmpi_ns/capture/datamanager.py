@@ -35,8 +35,7 @@ from mmpi_ns.capture.ray_sources import Keypoints, RaySources
 from mmpi_ns.capture.rays import PinholeRays
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.scene.visible_tiles import TrainingViews
-from mmpi_ns.utils.console import say
-from mmpi_ns.utils.errors import InputError
+from mmpi_ns.utils.errors import InputError, say
 from mmpi_ns.utils.random_draws import generator
 
 OBSERVATIONS = "mmpi_observations"

@@ -32,7 +32,7 @@ from mmpi_ns.capture.originals import at_full_size
 from mmpi_ns.capture.tracks import PosedImages
 from mmpi_ns.capture.views import View, camera_matrix, look_up
 from mmpi_ns.placement.observations import Observations
-from mmpi_ns.utils.console import duration, say
+from mmpi_ns.utils.errors import duration, say
 from mmpi_ns.utils.parallel import in_order, num_threads
 
 Map = NDArray[np.float32]

@@ -17,8 +17,7 @@ from torch import Tensor
 
 from mmpi_ns.rendering.baked import exact_images
 from mmpi_ns.rendering.exposure import exposure_of_image
-from mmpi_ns.utils.console import say
-from mmpi_ns.utils.errors import InputError
+from mmpi_ns.utils.errors import InputError, say
 from mmpi_ns.utils.random_draws import generator
 
 REFINED = "refined_"

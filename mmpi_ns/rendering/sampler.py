@@ -5,17 +5,17 @@ The march has no gradients. The field later differentiates through the samples t
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from nerfstudio.cameras.rays import Frustums, RayBundle, RaySamples
 from nerfstudio.model_components.ray_samplers import Sampler
 from torch import Tensor
 
 from mmpi_ns.field.mmpi_field import MMPIField
-from mmpi_ns.ops.march import MarchOptions, Rays, march
+from mmpi_ns.ops.march import MarchOptions, MergedSamples, Rays, march
 
 DIRECTION_AT_INFINITY = 1e-10
 """Inverse distances below this become a distance of 1e10 in nerfstudio's starts and ends."""
@@ -33,22 +33,6 @@ class SamplingConfig:
     """Initial alpha of a cube sample: 1e-2 for a small room to 1e-4."""
 
 
-@dataclass(frozen=True)
-class MergeReport:
-    """Output of the sampler for each ray besides its samples."""
-
-    live: Int[Tensor, "R"]
-    """Samples before dropping."""
-    skipped_total: Float[Tensor, "R 1"]
-    """Optical depth of the dropped samples."""
-    dropped_mass: Float[Tensor, "R 1"]
-    """Rendering weight of the dropped samples: the error bound of dropping."""
-    explained: Bool[Tensor, "R 1"]
-    """See ``MergedSamples``."""
-    head_counts: tuple[int, ...] | None
-    """Samples of each head, if the march counted them."""
-
-
 class MMPISampler(Sampler):
     """Samples rays in all MPIs and the cube, and merges by distance."""
 
@@ -63,7 +47,7 @@ class MMPISampler(Sampler):
         choose: Float[Tensor, "R K"] | None = None,
         blends: bool = False,
         **_: Any,
-    ) -> tuple[RaySamples, MergeReport]:
+    ) -> tuple[RaySamples, MergedSamples]:
         """Kept samples of each ray, nearest first.
 
         Args:
@@ -77,7 +61,7 @@ class MMPISampler(Sampler):
 
         Returns:
             RaySamples [R, S] whose metadata holds ``heads``, ``planes``, ``ndc``, ``inverse_t``, ``valid``,
-            ``skipped_before`` and ``tau``, the (blended) optical depth (each [R, S, .]), and what was left out.
+            ``skipped_before`` and ``tau``, the (blended) optical depth (each [R, S, .]), and the march's own report.
         """
         assert ray_bundle is not None
         options = MarchOptions(threshold, fair_share, blends)
@@ -94,8 +78,7 @@ class MMPISampler(Sampler):
             pixel_area=ray_bundle.pixel_area[:, None].expand(*shape, 1),
         )
         metadata = {"ndc": merged.ndc, **{name: getattr(merged, name)[..., None] for name in names}}
-        report = MergeReport(*(getattr(merged, f.name) for f in fields(MergeReport)))
-        return _Samples(frustums=frustums, camera_indices=None, metadata=metadata), report
+        return _Samples(frustums=frustums, camera_indices=None, metadata=metadata), merged
 
 
 def rays_of(ray_bundle: RayBundle, head_mask: Tensor | None = None, choose: Tensor | None = None) -> Rays:

@@ -75,11 +75,6 @@ class MPIPlan:
     def texels(self) -> int:
         return self.planes * self.height * self.width
 
-    def scaled(self, factor: float) -> MPIPlan:
-        """The same frame with ``factor`` times the texels a plane (both sides keep their ratio)."""
-        side = math.sqrt(factor)
-        return replace(self, height=max(2, round(self.height * side)), width=max(2, round(self.width * side)))
-
 
 @dataclass(frozen=True)
 class CubePlan:
@@ -93,11 +88,6 @@ class CubePlan:
     @property
     def texels(self) -> int:
         return self.shape[0] * self.shape[1] * self.shape[2]
-
-    def scaled(self, factor: float) -> CubePlan:
-        side = factor ** (1 / 3)
-        nz, ny, nx = (max(2, round(n * side)) for n in self.shape)
-        return replace(self, shape=(nz, ny, nx))
 
 
 @dataclass(frozen=True)
@@ -147,11 +137,15 @@ class ScenePlan:
         return sum(m.planes for m in self.mpis) + (sum(self.cube.shape) if self.cube else 0)
 
     def scaled(self, factor: float) -> ScenePlan:
-        """The plan at another resolution: ``factor`` times the texels, equal frames and planes."""
+        """The plan at another resolution: ``factor`` times the texels, equal frames, planes and ratios of sides."""
         if factor == 1:
             return self
-        cube = self.cube.scaled(factor) if self.cube else None
-        return replace(self, mpis=tuple(m.scaled(factor) for m in self.mpis), cube=cube)
+        side, cube = math.sqrt(factor), self.cube
+        sizes = [{name: max(2, round(getattr(m, name) * side)) for name in ("height", "width")} for m in self.mpis]
+        if cube is not None:
+            nz, ny, nx = (max(2, round(n * factor ** (1 / 3))) for n in cube.shape)
+            cube = replace(cube, shape=(nz, ny, nx))
+        return replace(self, mpis=tuple(replace(m, **s) for m, s in zip(self.mpis, sizes, strict=True)), cube=cube)
 
     def to_json(self) -> str:
         """Standard JSON: a ``far`` at infinity is written as null."""

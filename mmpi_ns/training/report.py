@@ -15,7 +15,7 @@ from torch import Tensor
 from mmpi_ns.rendering.metrics import ImageMetrics
 from mmpi_ns.training.losses import over_background
 from mmpi_ns.training.phases import Schedule
-from mmpi_ns.utils.console import duration, say
+from mmpi_ns.utils.errors import duration, say
 
 FIRST_LINE, SHARE = 10, 0.025
 """A line after this many steps, then after each such fraction of all steps."""

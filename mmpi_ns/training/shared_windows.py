@@ -14,8 +14,7 @@ import torch.distributed as dist
 from mmpi_ns.rendering.window_store import WindowStore
 from mmpi_ns.scene.windows import WindowedPlan
 from mmpi_ns.training.checkpoints import checkpoints_in
-from mmpi_ns.utils.console import say
-from mmpi_ns.utils.errors import InputError
+from mmpi_ns.utils.errors import InputError, say
 
 PATIENCE = timedelta(days=7)
 """nerfstudio's processes time out half an hour after the first of them has finished."""

@@ -28,15 +28,13 @@ from mmpi_ns.training.checkpoints import (
     claim,
     read_checkpoint,
 )
-from mmpi_ns.training.config_files import check_nothing_left, with_absolute_paths
 from mmpi_ns.training.learning_rates import following
 from mmpi_ns.training.memory import describe, training_bytes
-from mmpi_ns.training.options import check_device, check_ffmpeg, check_run
+from mmpi_ns.training.options import check_device, check_ffmpeg, check_nothing_left, check_run, with_absolute_paths
 from mmpi_ns.training.report import TrainingLog, forecast, next_commands, quick_test
 from mmpi_ns.training.run import TrainingRun, cameras_of, views_of
 from mmpi_ns.training.shared_windows import WINDOWS_FOLDER, WindowShare
-from mmpi_ns.utils.console import duration, say
-from mmpi_ns.utils.errors import InputError
+from mmpi_ns.utils.errors import InputError, duration, say
 from mmpi_ns.utils.files import write_atomically
 from mmpi_ns.utils.host import arguments, command, enter_command, signals_go_to
 from mmpi_ns.utils.machine import free_cores, unused_gpu
@@ -104,23 +102,11 @@ class MMPITrainer(Trainer):
 
     config: MMPITrainerConfig
 
-    @property
-    def _run(self) -> TrainingRun:
-        run = getattr(self.pipeline.model, "run", None)
-        assert isinstance(run, TrainingRun), "MMPITrainer trains MMPIModel only"
-        return run
-
-    @property
-    def _manager(self) -> MMPIDataManager:
-        manager = self.pipeline.datamanager
-        assert isinstance(manager, MMPIDataManager), "MMPITrainer trains from MMPIDataManager"
-        return manager
-
     # Before the first step ----------------------------------------------------------------------------------------
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         """Prepares the run; a signal during this time ends it with a sentence (of several processes: torchrun's)."""
-        with signals_go_to(_end_before_training) if self.world_size == 1 else nullcontext():
+        with signals_go_to(_end) if self.world_size == 1 else nullcontext():
             self._prepare(test_mode)
 
     def _prepare(self, test_mode: Literal["test", "val", "inference"]) -> None:
@@ -185,7 +171,9 @@ class MMPITrainer(Trainer):
 
     def setup_optimizers(self) -> Optimizers:
         """nerfstudio's optimisers, with schedulers that follow the phases."""
-        progress = self._run.progress
+        run, manager = getattr(self.pipeline.model, "run", None), self.pipeline.datamanager
+        assert isinstance(run, TrainingRun) and isinstance(manager, MMPIDataManager), "MMPITrainer trains MMPIModel"
+        self._run, self._manager, progress = run, manager, run.progress
         self._window_steps = progress.schedule.window_steps
         if self._follows_capture:
             self.config.steps_per_save = max(self.config.steps_per_save, self._window_steps // 4)
@@ -222,7 +210,7 @@ class MMPITrainer(Trainer):
             self.config.logging.profiler = "none"  # nothing more is said
             path = checkpoints_in(self.checkpoint_dir).get(self._last_step)
             if path is None:  # training was paused
-                _end_before_training(self._stopped_by)
+                _end(self._stopped_by)
             _end(
                 self._stopped_by,
                 f"Stopped after step {self._last_step + 1} of {self._total_steps}, which is in {path}: the same "
@@ -353,13 +341,8 @@ def _write_plan(path: Path, plan: WindowedPlan) -> None:
     digest_file.write_text(hashlib.sha256(text.encode()).hexdigest(), encoding="ascii")
 
 
-def _end(number: int, sentence: str) -> NoReturn:
+def _end(number: int, sentence: str = "Stopped before the first step: there is nothing to go on from.") -> NoReturn:
     """Ends the process with the exit status of the signal (130 after Ctrl-C) and a sentence."""
     sys.stdout.flush()
     print(sentence, file=sys.stderr, flush=True)
     raise SystemExit(128 + number)
-
-
-def _end_before_training(number: int) -> NoReturn:
-    """Handles signals that arrive while a run is prepared."""
-    _end(number, "Stopped before the first step: there is nothing to go on from.")

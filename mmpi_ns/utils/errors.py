@@ -1,6 +1,8 @@
-"""What is said when something that a user gave cannot be used: one sentence, and no traceback below it."""
+"""What is said to the user: plain lines, and errors of one sentence without a traceback."""
 
 from __future__ import annotations
+
+from nerfstudio.utils.rich_utils import CONSOLE
 
 
 class InputError(ValueError):
@@ -14,3 +16,15 @@ class WriteError(InputError, OSError):
 def brief(error: BaseException) -> str:
     """What an error says, cut after its first sentence: it goes in brackets into a sentence of ours."""
     return str(error).strip().split("\n")[0].split(". ")[0].rstrip(" .")
+
+
+def say(text: str) -> None:
+    """Prints text as it is: no line is broken, so that paths and commands can be copied, and nothing is coloured."""
+    CONSOLE.print(text, soft_wrap=True, highlight=False, markup=False)
+
+
+def duration(seconds: float) -> str:
+    """Seconds in words: 45 s, 12 min, 3.5 h."""
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

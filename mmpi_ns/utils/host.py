@@ -15,7 +15,6 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from threading import current_thread, main_thread
 from types import ModuleType, TracebackType
@@ -56,18 +55,8 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 Undo = Callable[[], object]
 
 
-@dataclass(frozen=True)
-class Patch:
-    """A change of the host that lasts until it is undone."""
-
-    target: str
-    reason: str
-    make: Callable[[], Undo]
-    training: bool = False
-    """Made for training alone."""
-
-
 def _show_errors() -> Undo:
+    """sys.excepthook: an InputError ends a command with its sentence alone."""
     before = sys.excepthook
 
     def show(kind: type[BaseException], error: BaseException, traceback: TracebackType | None) -> None:
@@ -82,6 +71,7 @@ def _show_errors() -> Undo:
 
 
 def _filter_warnings() -> Undo:
+    """warnings.filters: nobody who trains can do anything about ``WARNINGS`` of torch."""
     before = list(warnings.filters)
     for message in WARNINGS:
         warnings.filterwarnings("ignore", message=message)
@@ -89,6 +79,7 @@ def _filter_warnings() -> Undo:
 
 
 def _quiet_console() -> Undo:
+    """CONSOLE.print and CONSOLE.log: nor about ``NOTICES``, or about the lines of nerfstudio's log."""
     plain = CONSOLE.print
 
     def print_for_users(*objects: Any, **how: Any) -> None:
@@ -102,22 +93,15 @@ def _quiet_console() -> Undo:
 
 
 def _keep_freed_memory() -> Undo:
+    """glibc's malloc: a training step takes again what the last one freed; see ``malloc_keeps``."""
     malloc_keeps(KEPT, OWN_MAPPING)
     return lambda: malloc_keeps(MALLOC_DEFAULT, MALLOC_DEFAULT)
 
 
-PATCHES = (
-    Patch("sys.excepthook", "An InputError ends a command with its sentence alone.", _show_errors),
-    Patch("warnings.filters", "Nobody who trains can do anything about these of torch.", _filter_warnings),
-    Patch("CONSOLE.print, CONSOLE.log", "Nor about these, or about the lines of nerfstudio's log.", _quiet_console),
-    Patch(
-        "glibc's malloc",
-        "A step takes again what the last one freed; see malloc_keeps.",
-        _keep_freed_memory,
-        training=True,
-    ),
-)
-_undos: dict[str, Undo] = {}
+PATCHES = (_show_errors, _filter_warnings, _quiet_console)
+TRAINING_PATCHES = (_keep_freed_memory,)
+"""Each makes a change of the host that lasts until it is undone; its docstring says of what, and why."""
+_undos: dict[Callable[[], Undo], Undo] = {}
 
 
 def command() -> str | None:
@@ -142,9 +126,9 @@ def enter_command(training: bool = False) -> None:
     Args:
         training: also those that are for training alone.
     """
-    for patch in PATCHES if command() is not None else ():
-        if patch.target not in _undos and (training or not patch.training):
-            _undos[patch.target] = patch.make()
+    for patch in (*PATCHES, *(TRAINING_PATCHES if training else ())) if command() is not None else ():
+        if patch not in _undos:
+            _undos[patch] = patch()
 
 
 def undo() -> None:
