@@ -40,7 +40,6 @@ from mmpi_ns.rendering.rendered import (
     render_rays,
     sampled_outputs,
     shown_outputs,
-    shows_in_one_pass,
 )
 from mmpi_ns.rendering.sampler import MMPISampler, SamplingConfig
 from mmpi_ns.rendering.window_store import WindowStore
@@ -187,12 +186,10 @@ class MMPIModel(Model):
     # Rendering: nothing is assigned to the model, so threads may render while another trains or saves -------------
 
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:  # type: ignore[override]
-        """Outputs of rays: of a training batch, or of an image."""
-        return self.training_outputs(ray_bundle) if self.training else self.image_outputs(ray_bundle)
-
-    def training_outputs(self, bundle: RayBundle) -> dict[str, Any]:
-        """``RenderedRays`` for the losses, of the window at hand."""
-        progress, field = self.progress, self.field
+        """Outputs of an image's rays; ``RenderedRays`` for the losses of a training batch, of the window at hand."""
+        if not self.training:
+            return self.image_outputs(ray_bundle)
+        progress, field, bundle = self.progress, self.field, ray_bundle
         asked, head_mask, choose = len(bundle), None, None
         move_rays(bundle, self.camera_optimizer)
         bundle = bounded(bundle, field.plan)
@@ -314,7 +311,8 @@ class MMPIModel(Model):
         if self.config.eval_num_rays_per_chunk:
             return self.config.eval_num_rays_per_chunk
         most = max(plan.samples_per_ray for plan in self.progress.windows.plans)
-        one_pass, kept = shows_in_one_pass(self.field), MarchOptions(self.config.rendering.threshold).most_kept(most)
+        field, kept = self.field, MarchOptions(self.config.rendering.threshold).most_kept(most)
+        one_pass = field.shading == "ray" and dispatch.form_of("show_rays", field.features) != "reference"
         return rays_per_chunk(most, self.device, kept if one_pass else None)
 
     def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:

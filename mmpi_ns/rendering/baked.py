@@ -164,6 +164,12 @@ def why_not_baked(model_field: MMPIField) -> str:
     return ""
 
 
+def _shader_of(network: RayShader) -> Shader:
+    numbers = [x.detach().cpu() for x in network.layers(0)]
+    numbers[-2:] = [CHANGE * x for x in numbers[-2:]]
+    return Shader(tuple(zip(numbers[::2], numbers[1::2], strict=True)), network.direction_frequencies, MOST_CHANGE)
+
+
 @torch.no_grad()
 def bake(
     model_field: MMPIField,
@@ -186,11 +192,8 @@ def bake(
     """
     if refusal := why_not_baked(model_field):
         raise ValueError(refusal)
-    network, plan = model_field.networks, model_field.plan
+    plan, network = model_field.plan, model_field.networks
     assert isinstance(network, RayShader)
-    numbers = [x.detach().cpu() for x in network.layers(0)]
-    numbers[-2:] = [CHANGE * x for x in numbers[-2:]]
-    layers = tuple(zip(numbers[::2], numbers[1::2], strict=True))
     shares, heads = bake_shares(model_field) if blends else None, range(len(plan.mpis))
     highest = max(float(_raw(model_field, k, p, shares).max()) for k in heads for p in _planes(model_field, k))
     density_codes = Codes.spanning(THINNEST, max(highest, THINNEST + 1))
@@ -214,9 +217,8 @@ def bake(
         density_codes,
         channels,
     )
-    shader = Shader(layers, network.direction_frequencies, MOST_CHANGE)
     farthest = 10 * max(m.farthest for m in plan.mpis)
-    return BakedWindow(mpis, shader, plan.ray_near, threshold, background, farthest, exposure)
+    return BakedWindow(mpis, _shader_of(network), plan.ray_near, threshold, background, farthest, exposure)
 
 
 def _planes(model_field: MMPIField, k: int) -> Iterator[slice]:

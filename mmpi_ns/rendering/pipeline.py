@@ -99,9 +99,8 @@ class MMPIPipeline(VanillaPipeline):
 def refined_camera(model: Any, camera: Cameras, image: Tensor, seed: int) -> tuple[Cameras, float, float]:
     """A camera moved to the pose from which a frozen model renders its image best.
 
-    If the training poses were wrong, or were refined, the model does not match the given test poses exactly. So the
-    pose of a test image is optimised: six numbers, by the colours of the same pixels that are then scored. This is not
-    a score of view synthesis, and is reported in addition to the plain one, never instead.
+    If the training poses were wrong, or were refined, the model does not match the test poses exactly. The pose is
+    optimised by the colours of the same pixels that are then scored, so this is no score of view synthesis.
 
     Args:
         model: ``MMPIModel``, in evaluation.
@@ -124,10 +123,8 @@ def refined_camera(model: Any, camera: Cameras, image: Tensor, seed: int) -> tup
     decay = torch.optim.lr_scheduler.ExponentialLR(optimizer, (RATES[1] / RATES[0]) ** (1 / STEPS))
     rays = camera.generate_rays(0, keep_shape=True).flatten()
     observed = image.reshape(-1, 3).to(model.device)
-    frozen = [p for p in model.parameters() if p.requires_grad]
+    frozen = [p.requires_grad_(False) for p in model.parameters() if p.requires_grad]
     try:
-        for p in frozen:
-            p.requires_grad_(False)
         for step in range(STEPS):
             chosen = torch.randint(len(observed), (RAYS,), generator=generator(seed, step, "eval poses", "cpu"))
             bundle = rays[chosen.to(model.device)]

@@ -15,7 +15,6 @@ from mmpi_ns.capture.ray_sources import is_pixel_ray
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.samples import Lookup, metadata_of
 from mmpi_ns.field.shading import RayColors, RayShader
-from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.blending import blended_optical_depth
 from mmpi_ns.ops.composite import Composite, composite_weights, median_inverse_distance, winning_heads
 from mmpi_ns.ops.march import MarchOptions, MergedSamples, show_rays
@@ -128,11 +127,6 @@ def sampled_outputs(bundle: RayBundle, field: MMPIField, *, blends: bool, **samp
         "winning_mpi": winning_heads(composite.weights, meta["heads"][..., 0], field.plan.num_heads),
         "dropped_mass": rays.report.dropped_mass,
     }
-
-
-def shows_in_one_pass(field: MMPIField) -> bool:
-    """Whether a compiled form renders images of a field in one pass, without arrays of samples."""
-    return field.shading == "ray" and dispatch.form_of("show_rays", field.features) != "reference"
 
 
 @torch.no_grad()

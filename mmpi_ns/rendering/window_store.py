@@ -128,7 +128,14 @@ class WindowStore:
         for window, plan in plans.items():
             path, source = self.path(window), other / self.path(window).name
             if source.is_file():
-                if _plan_in(source) != plan:
+                try:
+                    state = torch.load(source, map_location="cpu", weights_only=True, mmap=True)
+                    stored = ScenePlan.from_json(to_text(state["field"]["plan_bytes"]))
+                except _DAMAGED as error:
+                    raise InputError(
+                        f"{source} cannot be read ({brief(error)}): copy it anew, or remove it to train again."
+                    ) from error
+                if stored != plan:
                     raise InputError(
                         f"{source} was trained with another scene plan: resume with the settings in its run's "
                         "config.yml, or give that run's plan.json with --pipeline.model.plan-file."
@@ -146,14 +153,3 @@ def _bytes_of(field: MMPIField) -> int:
     """Bytes of its tables, and of its bricks if it is baked."""
     bricks = field.cached("baked")
     return sum(values.nbytes for values in field.state_dict().values()) + (0 if bricks is None else bricks.mpis.nbytes)
-
-
-def _plan_in(source: Path) -> ScenePlan:
-    """Plan of the window in a file. Raises InputError if the file is damaged."""
-    try:
-        state = torch.load(source, map_location="cpu", weights_only=True, mmap=True)
-        return ScenePlan.from_json(to_text(state["field"]["plan_bytes"]))
-    except _DAMAGED as error:
-        raise InputError(
-            f"{source} cannot be read ({brief(error)}): copy it anew, or remove it to train again."
-        ) from error

@@ -78,19 +78,9 @@ def rotate(axes: Float[Tensor, "*#N 3 3"], vectors: Float[Tensor, "*#N 3"]) -> F
     return (axes * vectors[..., None, :]).sum(-1)
 
 
-def rays_in_frames(
-    origins: Float[Tensor, "R 3"], directions: Float[Tensor, "R 3"], frames: Frames
-) -> tuple[Float[Tensor, "R K 3"], Float[Tensor, "R K 3"]]:
-    """Ray origins and directions in each MPI's axes, relative to the MPI's origin (differences first, to keep precision
-    far from the world origin)."""
-    offsets = origins[:, None, :] - frames.origins
-    local_origins = rotate(frames.axes, offsets)
-    return local_origins, rotate(frames.axes, directions[:, None, :])
-
-
 @dataclass(frozen=True)
 class LocalRays:
-    """R rays in world axes and in every MPI's axes."""
+    """R rays in world axes, and in every MPI's axes relative to the MPI's origin."""
 
     origins: Float[Tensor, "R 3"]
     directions: Float[Tensor, "R 3"]
@@ -99,7 +89,9 @@ class LocalRays:
 
     @staticmethod
     def of(origins: Tensor, directions: Tensor, frames: Frames) -> LocalRays:
-        return LocalRays(origins, directions, *rays_in_frames(origins, directions, frames))
+        # Differences first, to keep precision far from the world origin.
+        local_origins = rotate(frames.axes, origins[:, None, :] - frames.origins)
+        return LocalRays(origins, directions, local_origins, rotate(frames.axes, directions[:, None, :]))
 
     def table(self, k: int) -> Float[Tensor, "R 6"]:
         """Origins and directions in MPI k, or in the world for the cube behind the last MPI."""
@@ -132,7 +124,8 @@ def plane_hits(
 
     Source: MMPI paper, sec. III-B ("sample and merge", forward-facing check); docs/how_it_works.md, "Live interval".
     """
-    o, d = rays_in_frames(origins, directions, frames)
+    local = LocalRays.of(origins, directions, frames)
+    o, d = local.local_origins, local.local_directions
     dz, oz = d[..., 2], o[..., 2]
     facing = dz > FACING_EPS
     safe_dz = torch.where(facing, dz, torch.ones_like(dz))

@@ -31,9 +31,9 @@ class PhaseScheduler(Scheduler):
         kind, progress = self.config.kind, self.progress
         return LambdaLR(optimizer, lambda step: progress.schedule.rate_factor(kind, step) if progress else 1.0)
 
-
-def following(config: SchedulerConfig, progress: Progress) -> SchedulerConfig:
-    """The config of a scheduler that follows a run; other schedulers are unchanged."""
-    if not isinstance(config, PhaseSchedulerConfig):
-        return config
-    return replace(config, _target=type("Following", (PhaseScheduler,), {"progress": progress}))
+    @classmethod
+    def following(cls, config: SchedulerConfig, progress: Progress) -> SchedulerConfig:
+        """The config of a scheduler that follows a run; other schedulers are unchanged."""
+        if not isinstance(config, PhaseSchedulerConfig):
+            return config
+        return replace(config, _target=type("Following", (cls,), {"progress": progress}))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import shutil
 from dataclasses import fields, is_dataclass
 from operator import attrgetter
 from pathlib import Path
@@ -17,7 +16,6 @@ from mmpi_ns.placement.options import check_placement
 from mmpi_ns.training.losses import LossWeights
 from mmpi_ns.training.phases import check_schedule
 from mmpi_ns.utils.errors import InputError
-from mmpi_ns.utils.host import arguments, command
 from mmpi_ns.utils.machine import unused_gpu
 from mmpi_ns.utils.values import Number, check_number, check_options, shown
 
@@ -136,15 +134,6 @@ def check_nothing_left(model: Any) -> None:
                     f"The run's config.yml asks for {option} {shown(getattr(group, name))}, which this version lacks: "
                     "use the version that trained the run, or train anew without it."
                 )
-
-
-def check_ffmpeg() -> None:
-    """Raises InputError if ns-render will need ffmpeg and it is missing; nerfstudio checks only after loading."""
-    makes_films = command() == "ns-render" and "dataset" not in arguments()
-    if makes_films and shutil.which("ffmpeg") is None:
-        raise InputError(
-            "ns-render needs ffmpeg, for images too, and it is not installed: install it (apt or conda install ffmpeg)."
-        )
 
 
 def check_device(device_type: str) -> None:

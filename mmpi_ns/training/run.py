@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -76,35 +77,26 @@ def views_of(window: Window, views: TrainingViews | None) -> TrainingViews | Non
     return None if views is None else views.some(cameras_of(window, views.origins.numpy()))
 
 
+@dataclass(eq=False)
 class TrainingRun:
-    """Field, optimised parameters and window store of a run, changed from one step to the next.
+    """Field, optimised parameters and window store of a run, changed from one step to the next."""
 
-    Args:
-        progress: windows, schedule and step.
-        field: of the window that is trained, one after the other.
-        store: where finished windows go.
-        views: the training images; None: every texel is stored.
-        release_weight: bricks in which no sample has this weight are released.
-        poses: corrections of the cameras' poses, if they are refined.
-        scale_is_free: no depth measurement fixes the scale of the capture.
-    """
-
-    def __init__(
-        self,
-        progress: Progress,
-        field: MMPIField,
-        store: WindowStore,
-        views: TrainingViews | None,
-        release_weight: float,
-        poses: list[Parameter] | None = None,
-        scale_is_free: bool = False,
-    ) -> None:
-        self.progress, self.field, self.store = progress, field, store
-        self.views, self.release_weight = views, release_weight
-        self._poses, self._scale_is_free = poses or [], scale_is_free
-        self.shared = False
-        """Whether other processes train some of the windows."""
-        self._drawn_from: int | None = None
+    progress: Progress
+    field: MMPIField
+    """Of the window that is trained, one after the other."""
+    store: WindowStore
+    """Finished windows."""
+    views: TrainingViews | None
+    """The training images; None: every texel is stored."""
+    release_weight: float
+    """Bricks in which no sample has this weight are released."""
+    poses: list[Parameter]
+    """Corrections of the cameras' poses, if they are refined."""
+    scale_is_free: bool
+    """No depth measurement fixes the scale of the capture."""
+    shared: bool = False
+    """Whether other processes train some of the windows."""
+    _drawn_from: int | None = None
 
     def parameters(self) -> dict[str, list[Parameter]]:
         """Parameters by kind (``phases.ParameterKind``); each kind has its own learning rate."""
@@ -115,7 +107,7 @@ class TrainingRun:
             "colour": [field.networks.weights],
             "reliability": [field.reliability],
         }
-        return groups | ({"camera_opt": self._poses} if self._poses else {})
+        return groups | ({"camera_opt": self.poses} if self.poses else {})
 
     def windows_there(self) -> list[int]:
         """Windows that can be rendered: the one being trained, and those that are finished."""
@@ -159,8 +151,8 @@ class TrainingRun:
         field.learns_cover = phase == "individual"
         for kind, params in groups.items():
             params[0].requires_grad_(kind in TRAINS[phase])
-        if "camera_opt" in TRAINS[phase] and self._poses and self.views is not None:
-            keep_frame(self._poses[0], self.views.origins, field.plan.content_near, self._scale_is_free)
+        if "camera_opt" in TRAINS[phase] and self.poses and self.views is not None:
+            keep_frame(self.poses[0], self.views.origins, field.plan.content_near, self.scale_is_free)
 
 
 def prepare_storage(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import shutil
 import sys
 from contextlib import nullcontext
 from dataclasses import dataclass, field
@@ -28,9 +29,9 @@ from mmpi_ns.training.checkpoints import (
     claim,
     read_checkpoint,
 )
-from mmpi_ns.training.learning_rates import following
+from mmpi_ns.training.learning_rates import PhaseScheduler
 from mmpi_ns.training.memory import describe, training_bytes
-from mmpi_ns.training.options import check_device, check_ffmpeg, check_nothing_left, check_run, with_absolute_paths
+from mmpi_ns.training.options import check_device, check_nothing_left, check_run, with_absolute_paths
 from mmpi_ns.training.report import TrainingLog, forecast, next_commands, quick_test
 from mmpi_ns.training.run import TrainingRun, cameras_of, views_of
 from mmpi_ns.training.shared_windows import WINDOWS_FOLDER, WindowShare
@@ -61,7 +62,11 @@ class MMPITrainerConfig(TrainerConfig):
         They take every file in this folder for a checkpoint, so the last one is given explicitly.
         """
         enter_command()
-        check_ffmpeg()
+        if command() == "ns-render" and "dataset" not in arguments() and shutil.which("ffmpeg") is None:
+            raise InputError(  # nerfstudio checks only after loading
+                "ns-render needs ffmpeg, for images too, and it is not installed: install it (apt or conda install "
+                "ffmpeg)."
+            )
         check_nothing_left(self.pipeline.model)
         folder = super().get_checkpoint_dir()
         steps = checkpoints_in(folder)
@@ -182,7 +187,7 @@ class MMPITrainer(Trainer):
         # nerfstudio shows what is left
         self._total_steps = self.config.max_num_iterations = progress.schedule.total_steps
         config: dict[str, Any] = {
-            name: {"optimizer": entry["optimizer"], "scheduler": following(entry["scheduler"], progress)}
+            name: entry | {"scheduler": PhaseScheduler.following(entry["scheduler"], progress)}
             for name, entry in self.config.optimizers.items()
         }
         return Optimizers(config, self.pipeline.get_param_groups())

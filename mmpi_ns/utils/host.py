@@ -70,26 +70,25 @@ def _show_errors() -> Undo:
     return lambda: setattr(sys, "excepthook", before)
 
 
-def _filter_warnings() -> Undo:
-    """warnings.filters: nobody who trains can do anything about ``WARNINGS`` of torch."""
-    before = list(warnings.filters)
+def _hide_notices() -> Undo:
+    """warnings.filters, CONSOLE.print, CONSOLE.log: nobody who trains can do anything about ``WARNINGS``, ``NOTICES``
+    and the lines of nerfstudio's log."""
+    filters, plain = list(warnings.filters), CONSOLE.print
     for message in WARNINGS:
         warnings.filterwarnings("ignore", message=message)
-    return lambda: warnings.filters.__setitem__(slice(None), before)  # type: ignore[attr-defined]
-
-
-def _quiet_console() -> Undo:
-    """CONSOLE.print and CONSOLE.log: nor about ``NOTICES``, or about the lines of nerfstudio's log."""
-    plain = CONSOLE.print
 
     def print_for_users(*objects: Any, **how: Any) -> None:
         if not (objects and isinstance(objects[0], str) and objects[0].startswith(NOTICES)):
             plain(*objects, **how)
 
-    if os.environ.get(TRACEBACK) == "1":
-        return lambda: None
-    vars(CONSOLE).update(print=print_for_users, log=lambda *_, **__: None)
-    return lambda: [vars(CONSOLE).pop(name) for name in ("print", "log")]
+    def undo_both() -> None:
+        warnings.filters[:] = filters  # type: ignore[index]
+        for name in ("print", "log"):
+            vars(CONSOLE).pop(name, None)
+
+    if os.environ.get(TRACEBACK) != "1":
+        vars(CONSOLE).update(print=print_for_users, log=lambda *_, **__: None)
+    return undo_both
 
 
 def _keep_freed_memory() -> Undo:
@@ -98,7 +97,7 @@ def _keep_freed_memory() -> Undo:
     return lambda: malloc_keeps(MALLOC_DEFAULT, MALLOC_DEFAULT)
 
 
-PATCHES = (_show_errors, _filter_warnings, _quiet_console)
+PATCHES = (_show_errors, _hide_notices)
 TRAINING_PATCHES = (_keep_freed_memory,)
 """Each makes a change of the host that lasts until it is undone; its docstring says of what, and why."""
 _undos: dict[Callable[[], Undo], Undo] = {}
