@@ -146,7 +146,7 @@ class MMPIModel(Model):
         self.register_load_state_dict_post_hook(type(self)._take_plan)
 
     def _plan(self) -> WindowedPlan:
-        """The plan that is asked for, or the one that the placement rule makes of what the training cameras saw."""
+        """Scene plan of the option, or of the placement rule for the observations of the training cameras."""
         config, metadata = self.config, self.kwargs.get("metadata", {})
         observations = metadata.get(OBSERVATIONS)
         if observations is not None and config.total_steps == 0:
@@ -205,7 +205,7 @@ class MMPIModel(Model):
         return {"training": rays}
 
     def training_bounds(self) -> dict[str, float]:
-        """What a sample must weigh to be kept in training (``ops.march.prune``).
+        """Minimum weights of samples kept in training (``ops.march.prune``).
 
         While surfaces form, samples of little weight must learn too, and the cube starts nearly empty.
         """
@@ -273,7 +273,7 @@ class MMPIModel(Model):
         return outputs | {"rgb": rgb, "radiance": radiance, "winning_mpi": winner}
 
     def baked(self, field: MMPIField) -> BakedWindow:
-        """A field baked, made once, until it is trained on. Raises ValueError where it cannot be."""
+        """Baked form of a field, cached until the field is trained on. Raises ValueError if it cannot be baked."""
 
         def make() -> BakedWindow:
             say("Baking, once: a few seconds.")
@@ -333,7 +333,7 @@ class MMPIModel(Model):
         g = generator(self.config.seed, step, "background", self.device)
         total = batch_losses(outputs["training"], self.field, image, self.config.loss, g, step)
         self.camera_optimizer.get_loss_dict(total)
-        # A batch that meets nothing that trains would have no gradient at all; this adds 0 with one.
+        # A batch of rays that meet nothing trainable would have no gradient; this adds 0 with a gradient.
         total["rgb_loss"] = total["rgb_loss"] + self.device_indicator_param.sum()
         return total
 

@@ -60,7 +60,7 @@ def exact_images() -> Iterator[None]:
 
 
 def suits_bricks(model_field: MMPIField) -> bool:
-    """Whether ``render auto`` uses bricks for a field that is not training: compiled, on a CPU, not for metrics."""
+    """Decision of ``render auto`` for a field that is not training: bricks if compiled, on a CPU, not for metrics."""
     if _measuring.get() or torch.is_grad_enabled() or why_not_baked(model_field):
         return False
     return dispatch.form_of("show_baked", model_field.features.data) == "cpu"
@@ -150,7 +150,7 @@ class BakedWindow:
 
 
 def why_not_baked(model_field: MMPIField) -> str:
-    """Why a field cannot be baked, and how to train one that can; empty if it can."""
+    """Reason why a field cannot be baked, with the remedy; empty if it can."""
     if not isinstance(model_field.networks, RayShader):
         return (
             "A model whose samples are coloured one by one cannot be baked: train with "

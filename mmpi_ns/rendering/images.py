@@ -16,11 +16,12 @@ from mmpi_ns.scene.windows import Window, window_shares
 from mmpi_ns.utils.errors import InputError
 
 CPU_RAYS = 4096
-"""Their samples fit the caches and stay below the size that the C library returns to the system after each use."""
+"""Rays of a chunk whose samples fit the caches of a CPU and stay below the size that the C library returns to the
+system after each use."""
 SHOWN_RAYS = 4 * CPU_RAYS
-"""On a CPU if images are made in one pass without arrays of samples (``ops.march``)."""
+"""Rays of a chunk on a CPU if images are rendered in one pass without arrays of samples (``ops.march``)."""
 GPU_RAYS = 1 << 20
-"""A frame of 1242 x 375, or half of one of 1920 x 1080, in one chunk."""
+"""Most rays of a chunk on a GPU: a frame of 1242 x 375, or half of one of 1920 x 1080."""
 BYTES_PER_SAMPLE = 128
 """Peak bytes for every plane that a ray may cross: hits, kept samples, colours."""
 BYTES_PER_SLOT = 40
@@ -40,7 +41,7 @@ def render_windows(
 
     Args:
         origins: of the rays.
-        windows: those that are trained.
+        windows: the trained ones.
         render: outputs [P, C] of one window, given its index and the numbers of its rays. Called once for each window,
             so that a window is read from disk once at most, however many rays there are.
         shown: index of the window that renders all rays; None: those that they start in.
@@ -69,8 +70,8 @@ def rays_per_chunk(samples_per_ray: int, device: torch.device, kept_in_one_pass:
     Args:
         samples_per_ray: maximum samples of a ray: the planes of all MPIs and the steps through the cube.
         device: where they are rendered.
-        kept_in_one_pass: how many of them a ray can keep, if images are made in one compiled pass (``ops.march``),
-            which stores nothing of the others; None if they are made step by step.
+        kept_in_one_pass: samples that a ray can keep, if images are rendered in one compiled pass (``ops.march``),
+            which stores nothing of the others; None if they are rendered step by step.
 
     Returns:
         A power of two; on a GPU from ``CPU_RAYS`` to ``GPU_RAYS``.

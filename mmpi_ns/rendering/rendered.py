@@ -22,11 +22,11 @@ from mmpi_ns.rendering.sampler import MMPISampler, rays_of
 from mmpi_ns.scene.plan import ScenePlan
 
 BACKGROUNDS = {"black": 0.0, "gray": 0.5, "white": 1.0}
-"""Names of backgrounds."""
+"""Grey levels of backgrounds by name."""
 
 
 def background_of(name: str, like: Tensor) -> Tensor:
-    """Background colour [3]: that of the viewer or a crop if set, else the one of this name."""
+    """Background colour [3]: of the viewer or a crop if set, else of this name."""
     asked = renderers.BACKGROUND_COLOR_OVERRIDE
     return like.new_full((3,), BACKGROUNDS[name]) if asked is None else asked.to(like)
 

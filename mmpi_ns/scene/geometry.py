@@ -55,7 +55,7 @@ class Frames:
 
 @dataclass(frozen=True)
 class PlaneHits:
-    """Where R rays cross the planes of K MPIs.
+    """Crossings of R rays with the planes of K MPIs.
 
     Planes are counted by m = L - 1 - l, so m = 0 is the last one and the disparity is w = 1/far + m * step.
     The live planes of a ray are m_first, m_first - 1, ..., ``count`` of them, near to far.

@@ -38,7 +38,7 @@ def keep_frame(
         moves: shift in scene units and rotation vector of each camera, about the world's axes (nerfstudio's SO3xR3).
         centers: the cameras' positions before the corrections.
         distance: of the content, by which a turn weighs as much as the shift of what is seen. Scene units.
-        scale_is_free: no known depth says how large the capture is, so a change of its scale is removed as well.
+        scale_is_free: no depth measurement fixes the scale of the capture, so a change of scale is removed as well.
     """
     shifts, turns = moves.double().split(3, -1)
     places = centers.to(shifts) + shifts
@@ -59,8 +59,8 @@ def keep_frame(
 def move_rays(bundle: RayBundle, poses: CameraOptimizer) -> None:
     """Moves a training batch's rays with their cameras, in place.
 
-    Rays of new views and keypoint rays follow their camera but do not move it: they were made from depths found with
-    the given poses, and would pull the camera back to them.
+    Rays of new views and keypoint rays follow their camera but do not move it: their depths come from the original
+    poses and would pull the camera back to them.
     """
     if poses.config.mode == "off":
         return

@@ -21,8 +21,8 @@ class PhaseSchedulerConfig(SchedulerConfig):
 
 
 class PhaseScheduler(Scheduler):
-    """Follows the schedule of ``progress``, also of a checkpoint loaded later; without one (a config used outside this
-    trainer) the rate is constant."""
+    """Rates of the schedule of ``progress``, also if a checkpoint replaces it; constant rates without ``progress`` (a
+    config used outside this trainer)."""
 
     config: PhaseSchedulerConfig
     progress: Progress | None = None

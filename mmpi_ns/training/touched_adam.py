@@ -70,7 +70,7 @@ class TouchedAdam(torch.optim.Optimizer):
             state["moments"] = moments.view(-1, size, *moments.shape[1:])[kept].flatten(0, 1)
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Like torch's own, which would convert moments to the precision of their parameters."""
+        """Loads the state without torch's conversion of moments to the precision of their parameters."""
         super().load_state_dict(state_dict)
         params = [param for group in self.param_groups for param in group["params"]]
         for number, state in state_dict["state"].items():

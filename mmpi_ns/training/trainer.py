@@ -141,7 +141,7 @@ class MMPITrainer(Trainer):
         self.base_dir.mkdir(parents=True, exist_ok=True)
         _write_plan(self.base_dir / PLAN_FILE, plan)
         self._run.shared = self._share is not None
-        if len(self._run.field.density) <= BRICK:  # the one that nothing lies in
+        if len(self._run.field.density) <= BRICK:  # the empty brick alone
             raise InputError(
                 "No training image sees anything of the scene plan: its MPIs must stand among the cameras and face as "
                 "they do (mmpi-plan shows where)."
@@ -333,7 +333,7 @@ class MMPITrainer(Trainer):
 
 
 def _write_plan(path: Path, plan: WindowedPlan) -> None:
-    """Writes a run's plan for the user to read; one that was edited is kept."""
+    """Writes a run's plan for the user to read. Raises InputError if the user has edited the present file."""
     text, digest_file = plan.to_json(), path.with_name(f".{path.name}.sha256")
     present = path.read_bytes() if path.is_file() else text.encode()
     digest = digest_file.read_text(encoding="ascii") if digest_file.is_file() else ""

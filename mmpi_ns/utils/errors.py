@@ -1,4 +1,4 @@
-"""What is said to the user: plain lines, and errors of one sentence without a traceback."""
+"""Messages to the user: plain lines, and errors of one sentence without a traceback."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 
 class InputError(ValueError):
-    """What a user gave cannot be used. The message is one sentence: what is wrong, where, and what to do."""
+    """Unusable input. The message is one sentence: what is wrong, where, and what to do."""
 
 
 class WriteError(InputError, OSError):
-    """A file or folder cannot be written; one sentence as well."""
+    """Failure to write a file or folder; one sentence as well."""
 
 
 def brief(error: BaseException) -> str:
-    """What an error says, cut after its first sentence: it goes in brackets into a sentence of ours."""
+    """First sentence of an error, to quote in brackets in a sentence of ours."""
     return str(error).strip().split("\n")[0].split(". ")[0].rstrip(" .")
 
 

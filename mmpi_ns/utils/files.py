@@ -1,4 +1,4 @@
-"""Files that are whole or not there at all, and text in a checkpoint."""
+"""Atomic files, and text in a checkpoint."""
 
 from __future__ import annotations
 
@@ -61,5 +61,5 @@ def to_bytes(text: str) -> UInt8[Tensor, "B"]:
 
 
 def to_text(data: UInt8[Tensor, "B"]) -> str:
-    """What ``to_bytes`` made of a text."""
+    """Inverse of ``to_bytes``."""
     return bytes(data.cpu().numpy().tolist()).decode()

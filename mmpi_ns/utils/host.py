@@ -33,7 +33,7 @@ NOTICES = (
     "[bold yellow]logging events to:",
     "[NOTE] Not running eval iterations",
 )
-"""How nerfstudio's lines begin that nobody who trains can do anything about."""
+"""Beginnings of nerfstudio's lines that a user can do nothing about."""
 WARNINGS = (
     "Using a non-tuple sequence for multidimensional indexing",
     "`torch.cuda.amp",
@@ -41,13 +41,13 @@ WARNINGS = (
     "Sparse invariant checks are implicitly disabled",
     "You are using `torch.load` with `weights_only=False`",
 )
-"""How such warnings of torch and nerfstudio begin."""
+"""Beginnings of such warnings of torch and nerfstudio."""
 TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3
 """Of mallopt, in malloc.h."""
 KEPT = 256 << 20
-"""Bytes that are freed and kept for the next use: more than a step takes beside the tables."""
+"""Freed bytes that are kept for the next use: more than a step takes beside the tables."""
 OWN_MAPPING = 32 << 20
-"""Arrays of so many bytes, which tables are, go back to the system at once: glibc's upper limit."""
+"""Bytes from which an array, such as a table, goes back to the system at once: glibc's upper limit."""
 MALLOC_DEFAULT = 128 << 10
 """glibc's value of both thresholds at the start."""
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -137,9 +137,9 @@ def undo() -> None:
 
 
 def malloc_keeps(freed: int, own_mapping: int) -> bool:
-    """Sets from how many bytes on glibc gives freed memory back, and maps an array by itself.
+    """Sets glibc's thresholds, in bytes, for giving back freed memory and for mapping an array by itself.
 
-    What a training step frees the next one takes again. glibc's defaults give much of it back to the system, which then
+    A training step takes again what the last one freed. glibc's defaults give much of it back to the system, which then
     hands out zeroed pages: thousands of page faults a step. glibc adapts its defaults and cannot be asked for them, so
     an undo restores where they begin.
 
@@ -154,7 +154,7 @@ def malloc_keeps(freed: int, own_mapping: int) -> bool:
 
 
 def give_back_freed_memory() -> None:
-    """Has glibc give back what it keeps and nobody uses: before tables grow, which do not fit into what steps leave."""
+    """Makes glibc give back its unused memory: tables that grow do not fit into what steps leave."""
     try:
         ctypes.CDLL(None).malloc_trim(0)
     except (AttributeError, OSError, TypeError):  # another C library

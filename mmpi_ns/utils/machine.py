@@ -1,4 +1,4 @@
-"""What the machine has left to give."""
+"""Free memory and cores of the machine, and a GPU that torch does not use."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def free_memory(device: str | torch.device) -> int:
 
 
 def free_cores(seconds: float = 0.2) -> float:
-    """Cores that other programs leave to this process, of those that it may use; looks at what is idle for a moment."""
+    """Idle cores among those that this process may use, observed for ``seconds``."""
     most = float(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
     try:
         quota, period = (CGROUP / "cpu.max").read_text(encoding="ascii").split()

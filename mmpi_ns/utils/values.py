@@ -12,18 +12,18 @@ from typing import Any
 from mmpi_ns.utils.errors import InputError
 
 LARGEST = sys.float_info.max
-"""What floating-point numbers reach; whole numbers in a file may be larger."""
+"""Largest floating-point number; whole numbers in a file may be larger."""
 
 
 @dataclass(frozen=True)
 class Number:
-    """Which numbers will do: finite, from ``low`` to ``high``."""
+    """Range of valid numbers: finite, from ``low`` to ``high``."""
 
     low: float = -math.inf
     high: float = math.inf
     whole: bool = False
     above: bool = False
-    """``low`` itself will not do."""
+    """Whether ``low`` itself is excluded."""
 
     def holds(self, value: Any) -> bool:
         """Whether a value is such a number; truth values and text are not."""
@@ -74,12 +74,12 @@ def check_text(what: str, value: Any) -> None:
 
 
 def cut(text: str, most: int = 120) -> str:
-    """A name as it stands in a sentence: in one line, and no longer than a line."""
+    """A name to quote in a sentence, in one line of at most ``most`` characters."""
     text = " ".join(text.split())
     return text if len(text) <= most else text[: most - 3] + "..."
 
 
 def shown(value: Any, most: int = 60) -> str:
-    """A value as it is quoted in a sentence."""
+    """A value to quote in a sentence."""
     text = repr(value) if not isinstance(value, int) or abs(value) < 10**most else "a longer number"
     return cut(text, most).replace(". ", " ")
