@@ -241,5 +241,5 @@ def _tuples(value: Any) -> Any:
 
 
 _AXES = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
-NO_PLAN = ScenePlan((MPIPlan("none", (0.0,) * 3, _AXES, 1.0, (-1.0, 1.0, -1.0, 1.0), 2, 2, 2),), None, 0.0, 1.0)
+NO_PLAN = ScenePlan((MPIPlan("none", (0.0, 0.0, 0.0), _AXES, 1.0, (-1.0, 1.0, -1.0, 1.0), 2, 2, 2),), None, 0.0, 1.0)
 """The plan of a model that will load a checkpoint, which has its own plan."""

@@ -9,7 +9,7 @@ from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from time import monotonic
-from typing import Any, Literal, NoReturn
+from typing import Any, Literal, NoReturn, cast
 
 import torch
 from nerfstudio.engine.optimizers import Optimizers
@@ -316,8 +316,8 @@ class MMPITrainer(Trainer):
     def _load_checkpoint(self) -> None:
         path, run = checkpoint_to_load(self.config), self._run
         if path is not None:
-            state, model, capture = read_checkpoint(path), self.pipeline.model, self._manager
-            mode = model.camera_optimizer.config.mode  # type: ignore[union-attr]
+            state, model = read_checkpoint(path), cast(Any, self.pipeline.model)
+            capture, mode = self._manager, model.camera_optimizer.config.mode
             check_same_run(state, path, capture.get_datapath(), capture.observations, run.progress.windows, mode)
             torch.set_rng_state(state["rng"]["torch"])
             del state
