@@ -120,29 +120,27 @@ class MMPIModel(Model):
         joint = config.schedule.training == "joint" or all(plan.num_heads == 1 for plan in windows.plans)
         phases = replace(config.schedule, training="joint" if joint else "two-phase")
         self.progress = Progress(windows, make_schedule(phases, max(1, config.total_steps), len(windows)))
-        views = self.kwargs.get("metadata", {}).get(TRAINING_VIEWS)
-        self.trains = OBSERVATIONS in self.kwargs.get("metadata", {})
+        metadata, device = self.kwargs.get("metadata", {}), self.kwargs.get("device", "cpu")
+        views, observations = metadata.get(TRAINING_VIEWS), metadata.get(OBSERVATIONS)
+        self.trains = OBSERVATIONS in metadata
         if self.trains:
-            seen, device = [views_of(window, views) for window in windows.windows], self.kwargs.get("device", "cpu")
+            seen = [views_of(window, views) for window in windows.windows]
             check_memory(windows, seen, config.colour.feature_channels, not joint, device)
         self.field = self._new_field(views_of(windows.windows[0], views))
         budget = config.rendering.resident_gib * 2**30
         self.store = WindowStore(config.windows_folder, self._new_field, budget, config.rendering.half_windows)
-        self.exposures = Exposures(self.kwargs.get("metadata", {}).get(GAINS), None if views is None else views.origins)
+        self.exposures = Exposures(metadata.get(GAINS), None if views is None else views.origins)
         self.sampler = MMPISampler()
         self.metrics = ImageMetrics(config.lpips_net)
         self.scoring: Callable[[dict[str, Tensor], dict[str, Tensor]], tuple[dict, dict]] | None = None
         """In place of ``scores_and_images`` while the pipeline evaluates images, whose exposures it knows."""
         self.show = ViewerDropdown("Show MPI", "all", ["all", *windows.names], hint="One MPI alone, or all")
-        self.camera_optimizer: CameraOptimizer = config.camera_optimizer.setup(
-            num_cameras=self.num_train_data, device=self.kwargs.get("device", "cpu")
-        )
+        poses = config.camera_optimizer.setup(num_cameras=self.num_train_data, device=device)
+        self.camera_optimizer: CameraOptimizer = poses
         check_refined_poses(config.camera_optimizer.mode, len(windows))
-        poses = self.camera_optimizer.parameters()
-        observations = self.kwargs.get("metadata", {}).get(OBSERVATIONS)
-        free = {"scale_is_free": observations is not None and not len(observations.seen_by)}
-        release = config.schedule.release_weight
-        self.run = TrainingRun(self.progress, self.field, self.store, views, release, [*poses], **free)
+        scale_is_free = observations is not None and not len(observations.seen_by)
+        release, moves = config.schedule.release_weight, [*poses.parameters()]
+        self.run = TrainingRun(self.progress, self.field, self.store, views, release, moves, scale_is_free)
         self.register_load_state_dict_post_hook(type(self)._take_plan)
 
     def _plan(self) -> WindowedPlan:
@@ -215,11 +213,7 @@ class MMPIModel(Model):
 
     def image_outputs(self, bundle: RayBundle, chunk: int | None = None) -> dict[str, Tensor]:
         """rgb, accumulation, depth, winning MPI and dropped mass [R, .] of rays, from the windows that they start in.
-
-        Args:
-            bundle: the rays [R].
-            chunk: rays that one window renders at once; None: all.
-        """
+        ``chunk``: rays that a window renders at once; None: all."""
         windows, trained = self.progress.windows, self.progress.window
         chosen = windows.find(self.show.value)  # by the viewer
         present = self.run.windows_there() if len(windows) > 1 else [0]

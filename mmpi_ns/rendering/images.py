@@ -97,15 +97,9 @@ def check_crop(box: OrientedBox | None) -> None:
 def render_in_chunks(
     bundle: RayBundle, size: int, device: torch.device, render: Callable[[RayBundle], dict[str, Tensor]]
 ) -> dict[str, Tensor]:
-    """Outputs [*N, C] of rays [*N], rendered ``size`` at a time, on the device of the rays.
+    """Outputs [*N, C] of rays [*N] on the rays' device, rendered on ``device`` in chunks of ``size`` rays.
 
-    nerfstudio's own loop reads the size from the config, which threads share.
-
-    Args:
-        bundle: the rays of an image.
-        size: of a chunk.
-        device: where they are rendered.
-        render: outputs [R, C] of some of the rays.
+    nerfstudio's own loop reads the size from the config, which threads share. ``render`` gives [R, C] of R rays.
     """
     parts: dict[str, list[Tensor]] = defaultdict(list)
     rays = bundle.flatten()

@@ -149,11 +149,7 @@ def refined_camera(model: Any, camera: Cameras, image: Tensor, seed: int) -> tup
 
 
 def summary(scores: list[tuple[str, dict[str, float]]]) -> str:
-    """PSNR and SSIM of evaluated images, in a line.
-
-    Args:
-        scores: name and metrics of each.
-    """
+    """PSNR and SSIM of evaluated images, given by name and metrics, in a line."""
     psnr = [values["psnr"] for _, values in scores]
     worst, best = (scores[int(i)][0] for i in (np.argmin(psnr), np.argmax(psnr)))
     extremes = f"worst {min(psnr):.2f}, {worst}; best {max(psnr):.2f}, {best}"

@@ -87,15 +87,8 @@ def distances_of(inverse_t: Float[Tensor, "R 1"], plan: ScenePlan) -> Float[Tens
 def render_rays(
     sampler: MMPISampler, bundle: RayBundle, field: MMPIField, *, blends: bool, **sampling: Any
 ) -> RenderedRays:
-    """Renders rays that have nears and fars, with gradients if enabled.
-
-    Args:
-        sampler: samples and merges.
-        bundle: the rays.
-        field: to render.
-        blends: samples are blended by reliability.
-        sampling: further arguments of the sampler.
-    """
+    """Renders rays that have nears and fars, with gradients if enabled. ``blends``: samples are blended by reliability;
+    ``sampling``: further arguments of the sampler."""
     samples, report = sampler(bundle, field=field, blends=blends, **sampling)
     meta, lookup = metadata_of(samples), None
     tau = meta["tau"][..., 0]  # the sampler's own, without gradients

@@ -126,10 +126,6 @@ def window_shares(origins: Float[Tensor, "R 3"], windows: tuple[Window, ...]) ->
 
     Inside its ball a window has full weight, which falls off linearly over its margin beyond it; weights are
     normalised. A ray that starts in no ball uses the nearest.
-
-    Args:
-        origins: of the rays.
-        windows: available windows.
     """
     centers = torch.tensor([w.center for w in windows], dtype=torch.float64, device=origins.device)
     radii, margins = (

@@ -129,16 +129,8 @@ def cameras_in_short(observations: Observations) -> Float[Tensor, "M 18"]:
 def check_same_run(
     state: dict[str, Any], path: Path, data: Path, observations: Observations, plan: WindowedPlan, pose_mode: str
 ) -> None:
-    """Raises InputError if a run cannot resume from a checkpoint: other capture, scene plan, or refinement of poses.
-
-    Args:
-        state: the checkpoint.
-        path: of its file.
-        data: the capture of this run.
-        observations: its training cameras.
-        plan: of this run.
-        pose_mode: of this run's camera optimiser.
-    """
+    """Raises InputError if a run of this capture, its training cameras, plan and mode of the camera optimiser cannot
+    resume from a checkpoint, read from ``path``."""
     theirs, ours = state["capture"]["cameras"], cameras_in_short(observations)
     if theirs.shape != ours.shape or not torch.allclose(theirs, ours, rtol=1e-4, atol=1e-4):
         raise InputError(

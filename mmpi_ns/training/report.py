@@ -72,15 +72,8 @@ class TrainingLog:
 
 
 def forecast(method: str, steps: int, rays: int, threads: int, cores: float) -> str:
-    """Training time on this machine's CPU, the smaller method if that is long, and a warning if threads wait for cores.
-
-    Args:
-        method: name of the method that trains.
-        steps: of the run.
-        rays: of a step.
-        threads: that training runs.
-        cores: free ones.
-    """
+    """Training time on this machine's CPU, the smaller method if that is long, and a warning if threads wait for cores:
+    for a run of ``steps`` with ``rays`` each, given its threads and the free cores."""
     together = max(1.0, min(threads, cores))
     seconds = steps * rays / CPU_RAYS * (ONE_THREAD + (1 - ONE_THREAD) / together)
     smaller = "; mmpi-small is made for a CPU" if seconds > LONG and method != "mmpi-small" else ""
@@ -96,13 +89,7 @@ def forecast(method: str, steps: int, rays: int, threads: int, cores: float) -> 
 
 @torch.no_grad()
 def quick_test(model: Model, images: InputDataset, background: float) -> str:
-    """PSNR and SSIM of a few test images, as a sentence.
-
-    Args:
-        model: in training mode, also afterwards.
-        images: the test images.
-        background: behind those with transparency.
-    """
+    """PSNR and SSIM of a few test images over a grey level, as a sentence. The model is in training mode afterwards."""
     model.eval()
     metrics, scores, began = ImageMetrics("none"), [], monotonic()
     count = min(VIEWS, len(images))

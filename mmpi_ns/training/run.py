@@ -31,12 +31,7 @@ FORMING = 0.4
 
 
 class Progress(nn.Module):
-    """Windows, schedule, step, and the window being trained. All but the step are stored in checkpoints.
-
-    Args:
-        windows: of the capture.
-        schedule: of the whole run.
-    """
+    """Windows, schedule, step, and the window being trained. All but the step are stored in checkpoints."""
 
     def __init__(self, windows: WindowedPlan, schedule: Schedule) -> None:
         super().__init__()

@@ -118,12 +118,9 @@ def arguments() -> list[str]:
 
 
 def enter_command(training: bool = False) -> None:
-    """Makes the patches once, if this process runs a command.
+    """Makes the patches once, those of training if asked for, if this process runs a command.
 
     nerfstudio's commands have no hook for this, so it is called by the first code of ours that each of them runs.
-
-    Args:
-        training: also those that are for training alone.
     """
     for patch in (*PATCHES, *(TRAINING_PATCHES if training else ())) if command() is not None else ():
         if patch not in _undos:
@@ -166,13 +163,9 @@ def give_back_freed_memory() -> None:
 
 @contextmanager
 def transforms_changed(parser: ModuleType, change: Callable[[dict[str, Any], Path], None]) -> Iterator[None]:
-    """Within the block nerfstudio's parser sees a transforms.json after ``change``.
+    """Within the block nerfstudio's parser sees a transforms.json after ``change``, which edits its content in place.
 
-    It reads the file and rounds to float32 in one function: this is the one place between.
-
-    Args:
-        parser: nerfstudio's module of the parser.
-        change: what to do with the content of the file at a path, in place.
+    The parser reads the file and rounds to float32 in one function: this is the only place between.
     """
     read = parser.load_from_json
 
