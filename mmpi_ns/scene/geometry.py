@@ -33,10 +33,11 @@ class Frames:
 
     @staticmethod
     def pack(mpis: Sequence[MPIPlan], dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Frames:
-        columns = zip(*((m.origin, m.axes, m.near, m.extent, m.last_disparity) for m in mpis), strict=True)
-        origins, axes, nears, extents, ends = (torch.tensor(c, dtype=dtype, device=device) for c in columns)
-        num_planes = torch.tensor([m.planes for m in mpis], device=device)
-        return Frames(origins, axes, nears, extents, num_planes, ends)
+        names = {"origins": "origin", "axes": "axes", "nears": "near", "extents": "extent"}
+        columns = {key: [getattr(m, name) for m in mpis] for key, name in names.items()}
+        columns["last_disparities"] = [m.last_disparity for m in mpis]
+        tensors = {key: torch.tensor(column, dtype=dtype, device=device) for key, column in columns.items()}
+        return Frames(**tensors, num_planes=torch.tensor([m.planes for m in mpis], device=device))
 
     @property
     def disparity_steps(self) -> Float[Tensor, "K"]:
