@@ -28,11 +28,11 @@ from mmpi_ns.capture.local_origin import take_local_origins
 from mmpi_ns.capture.moving import moving_masks
 from mmpi_ns.capture.new_views import SharedPoints, find_shared_points, image_and_mask
 from mmpi_ns.capture.observe import drop_masked, observe, posed_images, sfm_folder
-from mmpi_ns.capture.originals import at_full_size
 from mmpi_ns.capture.photometry import SAME_LIGHT, Gains, color_ratios, image_gains
-from mmpi_ns.capture.pixels import PixelPool, pixel_bytes
+from mmpi_ns.capture.pixels import PixelPool
 from mmpi_ns.capture.ray_sources import Keypoints, RaySources
 from mmpi_ns.capture.rays import PinholeRays
+from mmpi_ns.capture.tracks import at_full_size
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.scene.visible_tiles import TrainingViews
 from mmpi_ns.utils.console import say
@@ -122,19 +122,16 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
             if self.config.mask_moving and self.config.dense_depth and not dataset.has_masks:
                 self._mask_moving(dataset)
             tracks = self.observations
-            known, self.observations = know_depths(
+            depths, self.observations = know_depths(
                 self.train_dataparser_outputs, tracks, dataset,
                 dense=self.config.dense_depth, sensor=self.config.depth_images,
             )  # fmt: skip
-            self.known_depth = known
-            # Of a cloud, placement gets what is in ``known``: one depth of each cell, however dense the cloud is.
-            seen = tracks if known is None else with_known_depths(tracks, known, dataset)
-            dataset.metadata[OBSERVATIONS] = seen
+            self.known_depth = depths
+            # Of a cloud, placement gets one depth of each cell, however dense the cloud is.
+            dataset.metadata[OBSERVATIONS] = tracks if depths is None else with_known_depths(tracks, depths, dataset)
             has_keypoints = self.config.keypoint_rays > 0 and len(self.observations.seen_at) > 0
-            if not has_keypoints and (known is None or known.share == 0):
-                CONSOLE.print(
-                    "No depths are known, from tracks, matches or a sensor: geometry is learned from colours alone."
-                )
+            if not has_keypoints and (depths is None or depths.share == 0):
+                say("No depths are known, from tracks, matches or a sensor: geometry is learned from colours alone.")
         return dataset
 
     def _mask_moving(self, dataset: MMPIDataset) -> None:
@@ -230,9 +227,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
                 f"{most / 1e6:.3g} of {total / 1e6:.3g} M training pixels are used, drawn at random: more are "
                 "held with --pipeline.datamanager.resident-pixels."
             )
-        pixels = PixelPool.from_dataset(
-            self.train_dataset, self.device, images, self.known_depth, most, config.seed
-        )  # fmt: skip
+        pixels = PixelPool.from_dataset(self.train_dataset, self.device, images, self.known_depth, most, config.seed)
         new_views, no_new_views = self._find_shared(images)
         keypoints = Keypoints.of(self.observations, self.device) if self.test_mode == "val" else None
         keypoints = keypoints if cameras is None else keypoints and keypoints.of_images(torch.from_numpy(cameras))
@@ -245,7 +240,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         return None if self.gains is None else torch.from_numpy(self.gains.from_field).float().to(self.device)
 
     def _find_shared(self, images: Sequence[int]) -> tuple[SharedPoints | None, str]:
-        """The points that two of these training images show at the same depth, or why there are none."""
+        """Points that two of these training images show at the same depth, and the reason if there are none."""
         if self.config.new_view_share <= 0:
             return None, "--pipeline.datamanager.new-view-share 0"
         if self.known_depth is None or self.known_depth.share == 0:
@@ -253,9 +248,10 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         posed = posed_images(self.observations, self.train_dataset)
         if posed is None:
             return None, "a camera is neither perspective nor fisheye"
-        rays, seed = self.train_ray_generator, self.config.seed
-        how = (images, seed, self.device, self._exposures())
-        points = find_shared_points(self.train_dataset, posed, self.known_depth, rays, *how)
+        points = find_shared_points(
+            self.train_dataset, posed, self.known_depth, self.train_ray_generator,
+            images, self.config.seed, self.device, self._exposures(),
+        )  # fmt: skip
         return points, "no two images show a point at the same depth"
 
     def describe(self) -> str:
@@ -282,11 +278,9 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
             return self._resident.pixels.nbytes
         dataset, sizes, most = self.train_dataset, self._sizes(cameras), int(self.config.resident_pixels)
         share = min(1.0, most / sizes.sum()) if most else 1.0
-        each = pixel_bytes(
-            whole=share == 1 and not dataset.has_masks,
-            depths=self.known_depth is not None,
-            channels=4 if dataset.has_alpha else 3,
-        )
+        # As in ``PixelPool``: colour, place in the image where it must be kept, and depth.
+        place, depth = share < 1 or dataset.has_masks, self.known_depth is not None
+        each = (4 if dataset.has_alpha else 3) + 4 * place + 4 * depth
         return each * sum(int(share * size) for size in sizes.tolist())
 
     def setup_eval(self) -> None:

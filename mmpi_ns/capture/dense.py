@@ -179,17 +179,15 @@ def measure(view: View, other: View, start: Map, flow: cv2.DISOpticalFlow) -> tu
             q, off_line, parallax_squared = parallax.solve(x[rows], y[rows], rows)
             noise = (NOISE**2 + off_line) * (11 - 10 * np.minimum(alike[rows], 1))
             certainty = parallax_squared / noise
-            known = good[rows] & (off_line < MAX_EPIPOLAR**2) & np.isfinite(q) & np.isfinite(certainty)
-            inverse[rows], weight[rows] = np.where(known, q, 0), np.where(known, certainty, 0)
+            measured = good[rows] & (off_line < MAX_EPIPOLAR**2) & np.isfinite(q) & np.isfinite(certainty)
+            inverse[rows], weight[rows] = np.where(measured, q, 0), np.where(measured, certainty, 0)
     return inverse, weight
 
 
 def correlation(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> tuple[Map, Map]:
     """Normalised correlation of two images in a window about each pixel, and the standard deviation of the first."""
     mean_a, mean_b = _mean(a), _mean(b)
-    squares = [
-        np.asarray(cv2.sqrBoxFilter(g, cv2.CV_32F, (WINDOW, WINDOW), borderType=cv2.BORDER_REPLICATE)) for g in (a, b)
-    ]
+    squares = _mean_square(a), _mean_square(b)
     products = _mean(np.asarray(cv2.multiply(a, b, dtype=cv2.CV_16U)))
     alike, contrast = np.empty_like(mean_a), np.empty_like(mean_a)
     for rows in strips(a.shape):
@@ -205,51 +203,46 @@ def _mean(x: NDArray[Any], side: int = WINDOW) -> Map:
     return np.asarray(cv2.boxFilter(x, cv2.CV_32F, (side, side), borderType=cv2.BORDER_REPLICATE), np.float32)
 
 
+def _mean_square(x: NDArray[np.uint8], side: int = WINDOW) -> Map:
+    return np.asarray(cv2.sqrBoxFilter(x, cv2.CV_32F, (side, side), borderType=cv2.BORDER_REPLICATE), np.float32)
+
+
 def fuse(inverse: NDArray[np.float32], weight: NDArray[np.float32]) -> Depth:
     """The mean of the largest consistent subset of n measurements [n, h, w], and its expected error.
 
     A single measurement counts if there is no other; ``confirmed`` checks it in another image. Weights are one over
     squared errors, 0 where there is no measurement. The error is at least the scatter of the measurements averaged.
     """
-    depth = Depth(np.empty(inverse.shape[1:], np.float32), np.empty(inverse.shape[1:], np.float32))
+    depth, count = Depth(*np.empty((2, *inverse.shape[1:]), np.float32)), len(inverse)
     for rows in strips(inverse.shape):
-        depth.inverse[rows], depth.error[rows] = _fused(inverse[:, rows], weight[:, rows])
+        q, weights = inverse[:, rows], weight[:, rows]
+        variance, there = 1 / np.maximum(weights, 1e-30), weights > 0
+        measured, all_weight = there.sum(0, dtype=np.int8), np.maximum(weights.sum(0), 1e-30)
+        best, mean, error = (np.zeros_like(q[0]) for _ in range(3))
+        for k in range(count):
+            # Relative to measurement k, so that sums of squares are exact.
+            number, total = np.ones_like(measured), weights[k].copy()
+            first, second = np.zeros_like(mean), np.zeros_like(mean)
+            for n in (n for n in range(count) if n != k):
+                apart = q[n] - q[k]
+                agrees = there[n] & (apart * apart < AGREE**2 * (variance[n] + variance[k]))
+                w = weights[n] * agrees
+                total += w
+                w *= apart
+                first += w
+                w *= apart
+                second += w
+                number += agrees
+            shift = first / np.maximum(total, 1e-30)
+            average = q[k] + shift
+            scatter = np.maximum(second - first * shift, 0) / np.maximum(number - 1, 1)
+            value = number + total / all_weight
+            better = there[k] & (number >= np.minimum(measured, 2)) & (average > 0) & (value > best)
+            best, mean = np.where(better, value, best), np.where(better, average, mean)
+            error = np.where(better, np.sqrt(np.maximum(scatter, 1) / np.maximum(total, 1e-30)), error)
+        kept = (best > 0) & (error < MAX_RELATIVE * mean)
+        depth.inverse[rows], depth.error[rows] = np.where(kept, mean, 0), np.where(kept, error, 0)
     return depth
-
-
-def _fused(inverse: NDArray[np.float32], weight: NDArray[np.float32]) -> tuple[Map, Map]:
-    """``fuse`` of some rows."""
-    count = len(inverse)
-    variance, there = 1 / np.maximum(weight, 1e-30), weight > 0
-    measured, all_weight = there.sum(0, dtype=np.int8), np.maximum(weight.sum(0), 1e-30)
-    best, mean, error = (np.zeros_like(inverse[0]) for _ in range(3))
-    for k in range(count):
-        # Relative to measurement k, so that sums of squares are exact.
-        number, total, first, second = (
-            np.ones_like(measured),
-            weight[k].copy(),
-            np.zeros_like(mean),
-            np.zeros_like(mean),
-        )
-        for other in (n for n in range(count) if n != k):
-            apart = inverse[other] - inverse[k]
-            agrees = there[other] & (apart * apart < AGREE**2 * (variance[other] + variance[k]))
-            w = weight[other] * agrees
-            total += w
-            w *= apart
-            first += w
-            w *= apart
-            second += w
-            number += agrees
-        shift = first / np.maximum(total, 1e-30)
-        average = inverse[k] + shift
-        scatter = np.maximum(second - first * shift, 0) / np.maximum(number - 1, 1)
-        value = number + total / all_weight
-        better = there[k] & (number >= np.minimum(measured, 2)) & (average > 0) & (value > best)
-        best, mean = np.where(better, value, best), np.where(better, average, mean)
-        error = np.where(better, np.sqrt(np.maximum(scatter, 1) / np.maximum(total, 1e-30)), error)
-    kept = (best > 0) & (error < MAX_RELATIVE * mean)
-    return np.where(kept, mean, 0), np.where(kept, error, 0)
 
 
 def filled(depth: Depth, rough: Map) -> Map:
@@ -322,12 +315,10 @@ def matched(view: View, others: list[View], points: NDArray[np.float64]) -> Dept
 
 def without_fringes(view: View, depth: Depth) -> Depth:
     """Removes the fringe around a foreground object where the background has no texture of its own."""
-    known = depth.inverse > 0
-    least = cv2.erode(np.where(known, depth.inverse, 1e30).astype(np.float32), np.ones((EDGE, EDGE), np.uint8))
-    variance = (
-        cv2.sqrBoxFilter(view.gray, cv2.CV_32F, (3, 3), borderType=cv2.BORDER_REPLICATE) - _mean(view.gray, 3) ** 2
-    )
-    return _only(depth, known & ((depth.inverse / STEP < least) | (variance > OWN_CONTRAST**2)))
+    has_depth = depth.inverse > 0
+    least = cv2.erode(np.where(has_depth, depth.inverse, 1e30).astype(np.float32), np.ones((EDGE, EDGE), np.uint8))
+    variance = _mean_square(view.gray, 3) - _mean(view.gray, 3) ** 2
+    return _only(depth, has_depth & ((depth.inverse / STEP < least) | (variance > OWN_CONTRAST**2)))
 
 
 def confirmed(view: View, depth: Depth, others: list[tuple[View, Depth]]) -> Depth:

@@ -42,7 +42,7 @@ class PixelPool:
         dataset: MMPIDataset,
         device: str | torch.device,
         images: Sequence[int] | None = None,
-        known: KnownDepth | None = None,
+        known_depth: KnownDepth | None = None,
         most: int = 0,
         seed: int = 0,
     ) -> PixelPool:
@@ -52,7 +52,7 @@ class PixelPool:
             dataset: the training images.
             device: of the pixels.
             images: which of them; None for all.
-            known: their known depths.
+            known_depth: their depths.
             most: maximum number of pixels; beyond it, a random subset, the same fraction of each image. 0: no limit.
             seed: of the subset.
 
@@ -67,28 +67,25 @@ class PixelPool:
         room = sum(int(share * size) for size in sizes)
         colors = torch.empty(room, 4 if dataset.has_alpha else 3, dtype=torch.uint8)
         places = None if whole else torch.empty(room, dtype=torch.int32)
-        depths = None if known is None else torch.empty(room, 2, dtype=torch.int16)
+        depths = None if known_depth is None else torch.empty(room, 2, dtype=torch.int16)
         starts = [0]
         for i in images:
             image, kept = _pixels_of(dataset, i, share, seed)
-            end = starts[-1] + len(kept)
-            rows = slice(starts[-1], end)
-            colors[rows] = _with_alpha(image, colors.shape[1])[kept]
+            starts.append(starts[-1] + len(kept))
+            rows = slice(*starts[-2:])
+            colors[rows, : image.shape[1]] = image[kept]
+            colors[rows, image.shape[1] :] = 255  # opaque where the image has no alpha and another one has
             if places is not None:
                 places[rows] = kept.int()
-            if depths is not None and known is not None:
-                depths[rows] = torch.from_numpy(np.require(known.codes[i], requirements="W")).reshape(-1, 2)[kept]
-            starts.append(end)
+            if depths is not None and known_depth is not None:
+                depths[rows] = torch.from_numpy(np.require(known_depth.codes[i], requirements="W")).reshape(-1, 2)[kept]
         if not starts[-1]:
             raise InputError("The masks leave no training pixel: white (non-zero) mask pixels are the ones used.")
-        colors, places, depths = (
-            None if x is None else x[: starts[-1]].to(device) for x in (colors, places, depths)
-        )  # fmt: skip
-        assert colors is not None
-        numbers, image_widths, begins, ends = (
-            torch.tensor(list(x), device=device) for x in (images, [widths[i] for i in images], starts[:-1], starts[1:])
-        )
-        return PixelPool(colors, numbers, image_widths, begins, ends, places, depths)
+        rows = slice(starts[-1])
+        places, depths = (None if x is None else x[rows].to(device) for x in (places, depths))
+        columns = list(images), [widths[i] for i in images], starts[:-1], starts[1:]
+        tables = (torch.tensor(column, device=device) for column in columns)
+        return PixelPool(colors[rows].to(device), *tables, places, depths)
 
     @cached_property
     def count(self) -> int:
@@ -128,16 +125,12 @@ class PixelPool:
 
     @property
     def nbytes(self) -> int:
+        """Bytes of the pixels themselves."""
         return sum(x.nbytes for x in (self.colors, self.places, self.depths) if x is not None)
 
 
-def pixel_bytes(*, whole: bool, depths: bool, channels: int) -> int:
-    """Bytes of a pixel in a pool: its colour, its place in the image where it must be kept, and its depth."""
-    return channels + (0 if whole else 4) + (4 if depths else 0)
-
-
 def _pixels_of(dataset: MMPIDataset, i: int, share: float, seed: int) -> tuple[UInt8[Tensor, "N C"], Int[Tensor, "n"]]:
-    """The pixels of an image, and which of them are kept: a fraction of those that no mask hides."""
+    """The pixels of an image, and the indices to keep: a fraction of those that no mask hides."""
     data = dataset.get_data(i, image_type="uint8")
     image = data["image"].reshape(-1, data["image"].shape[-1])
     kept = torch.arange(len(image))
@@ -147,10 +140,3 @@ def _pixels_of(dataset: MMPIDataset, i: int, share: float, seed: int) -> tuple[U
     if "mask" in data:
         kept = kept[data["mask"].reshape(-1).bool()[kept]]
     return image, kept
-
-
-def _with_alpha(colors: UInt8[Tensor, "N C"], channels: int) -> UInt8[Tensor, "N D"]:
-    """Opaque where the image has no alpha and another one has."""
-    if colors.shape[1] == channels:
-        return colors
-    return torch.cat([colors, torch.full_like(colors[:, :1], 255)], -1)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import reduce
 
 import numpy as np
 import torch
@@ -40,7 +39,7 @@ class Keypoints:
 
     @staticmethod
     def of(observations: Observations, device: str | torch.device) -> Keypoints | None:
-        """Those of all training images; None if there are none."""
+        """Keypoint rays of all training images; None if there are none."""
         # Points of a plane sweep come after those of the tracks: too rough to supervise depth.
         tracked = slice(len(observations.seen_at))
         cameras, points = observations.seen_by[tracked], observations.points[observations.seen_point[tracked]]
@@ -52,19 +51,16 @@ class Keypoints:
         return Keypoints(torch.from_numpy(cameras).to(device), *(torch.from_numpy(x).float().to(device) for x in parts))
 
     def of_images(self, images: Int[Tensor, "I"]) -> Keypoints | None:
-        """Those of the given images; None if there are none."""
+        """Keypoint rays of some images; None if there are none."""
         kept = torch.isin(self.cameras, images.to(self.cameras)).nonzero()[:, 0]
         return Keypoints(*(x[kept] for x in vars(self).values())) if len(kept) else None
 
     def draw(self, count: int, g: torch.Generator) -> tuple[RayBundle, Float[Tensor, "R 1"]]:
         """Random rays and the inverse distances of their points."""
         chosen = torch.randint(len(self.cameras), (count,), generator=g, device=g.device).to(self.cameras.device)
-        inverse = self.inverse_distances[chosen][:, None]
-        camera = self.cameras[chosen][:, None]
-        bundle = RayBundle(
-            self.origins[chosen], self.directions[chosen], torch.ones_like(inverse), camera_indices=camera
-        )
-        return bundle, inverse
+        cameras, origins, directions, inverse = (x[chosen] for x in vars(self).values())
+        area = torch.ones_like(inverse[:, None])
+        return RayBundle(origins, directions, area, camera_indices=cameras[:, None]), inverse[:, None]
 
 
 @dataclass(frozen=True)
@@ -81,7 +77,7 @@ class RaySources:
     keypoint_rays: int
     """Keypoint rays of a step without new views."""
     no_new_views: str
-    """Why there are no new views, where there are none."""
+    """Reason why there are no new views, if there are none."""
     exposures: Float[Tensor, "M 3"] | None = None
     """Colours of each training image over those of the field; None if all have the same exposure."""
 
@@ -111,12 +107,8 @@ class RaySources:
     def describe(self, pixel_rays: int) -> str:
         """The share of each source in a step, with the reason where it is none, in one line."""
         counts = self.counts(pixel_rays, 1.0)
-        if self.keypoint_rays == 0:
-            no_keypoints = "--pipeline.datamanager.keypoint-rays 0"
-        elif self.keypoints is None:
-            no_keypoints = "no SfM tracks"
-        else:
-            no_keypoints = "new views take their place"
+        no_keypoints = "no SfM tracks" if self.keypoints is None else "new views take their place"
+        no_keypoints = no_keypoints if self.keypoint_rays else "--pipeline.datamanager.keypoint-rays 0"
         reasons = ("", self.no_new_views, no_keypoints)
         shares = [
             f"{round(100 * count / sum(counts))} % {name}" + ("" if count else f" ({reason})")
@@ -155,25 +147,13 @@ class RaySources:
             bundles.append(targets)
             keypoint_depths = torch.cat([keypoint_depths, inverse])
             depths = torch.cat([depths, depths.new_zeros(len(inverse), 2)])
-        bundle = reduce(_join, bundles)
-        bundle.metadata[OWN_PIXEL] = (torch.arange(len(bundle), device=device) < len(indices))[:, None]
-        bundle.metadata[KEYPOINT_DEPTH] = keypoint_depths
-        bundle.metadata[PIXEL_DEPTH] = depths
+        fields = ("origins", "directions", "pixel_area", "camera_indices")
+        joined = {name: torch.cat([getattr(bundle, name) for bundle in bundles]) for name in fields}
+        is_own_pixel = (torch.arange(len(depths), device=device) < len(indices))[:, None]
+        metadata = {OWN_PIXEL: is_own_pixel, KEYPOINT_DEPTH: keypoint_depths, PIXEL_DEPTH: depths}
         if self.exposures is not None:
-            assert bundle.camera_indices is not None
-            bundle.metadata[EXPOSURE] = self.exposures[bundle.camera_indices[:, 0]]
-        return bundle, {"image": colors, "indices": indices}
-
-
-def _join(a: RayBundle, b: RayBundle) -> RayBundle:
-    assert a.camera_indices is not None and b.camera_indices is not None
-    return RayBundle(
-        origins=torch.cat([a.origins, b.origins]),
-        directions=torch.cat([a.directions, b.directions]),
-        pixel_area=torch.cat([a.pixel_area, b.pixel_area]),
-        camera_indices=torch.cat([a.camera_indices, b.camera_indices]),
-        metadata={},
-    )
+            metadata[EXPOSURE] = self.exposures[joined["camera_indices"][:, 0]]
+        return RayBundle(**joined, metadata=metadata), {"image": colors, "indices": indices}
 
 
 def is_pixel_ray(bundle: RayBundle) -> Bool[Tensor, "R"]:
