@@ -70,7 +70,7 @@ def remembered(key: str, find: Callable[[], Arrays | Pairs], folder: Path | None
             except OSError as error:
                 CONSOLE.print(f"[yellow]{error}")
             if arrays is None:
-                arrays = dict(result if isinstance(result, dict) else find())
+                arrays = result if isinstance(result, dict) else dict(find())
         _forget_old(folder)
     return arrays
 

@@ -53,8 +53,17 @@ class MMPIDataset(InputDataset):
         """Image [H, W, 3 or 4]: red, green, blue, and alpha where the file has it, in 8 bits."""
         name = self.image_filenames[image_idx]
         try:
-            with Image.open(name) as image:
-                pixels = _eight_bits(image)
+            with Image.open(name) as image:  # gray, a palette, CMYK, 16 bits
+                if image.mode == "F":
+                    raise ValueError("its pixels are floating-point numbers")
+                if image.mode in SIXTEEN_BIT:
+                    deep = np.asarray(image).astype(np.int64)
+                    if deep.min() < 0 or deep.max() > 65535:
+                        raise ValueError("its pixels have more than 16 bits")
+                    gray = (deep // 257).astype(np.uint8)  # 65535 becomes 255
+                    pixels = np.repeat(gray[..., None], 3, axis=-1)
+                else:
+                    pixels = np.array(image.convert("RGBA" if image.has_transparency_data else "RGB"))
         except UNREADABLE as error:
             raise UnusableFile(
                 f"Image {name} cannot be read ({brief(error)}): repair it or remove its frame."
@@ -123,16 +132,3 @@ def read_depth_image(file: Path, unit: float) -> NDArray[np.float32]:
         raise InputError(f"Depth image {file} is not one channel of depths: give a 16-bit PNG or a .npy file.")
     depth = depth * unit
     return np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)
-
-
-def _eight_bits(image: Image.Image) -> NDArray[np.uint8]:
-    """[H, W, 3 or 4] of whatever Pillow reads: gray, palettes, CMYK, 16 bits."""
-    if image.mode in SIXTEEN_BIT:
-        deep = np.asarray(image).astype(np.int64)
-        if deep.min() < 0 or deep.max() > 65535:
-            raise ValueError("its pixels have more than 16 bits")
-        gray = (deep // 257).astype(np.uint8)  # 65535 becomes 255
-        return np.repeat(gray[..., None], 3, axis=-1)
-    if image.mode == "F":
-        raise ValueError("its pixels are floating-point numbers")
-    return np.array(image.convert("RGBA" if image.has_transparency_data else "RGB"))

@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
@@ -114,11 +114,11 @@ class Parallax:
     b: NDArray[np.float32]
 
     @staticmethod
-    def between(view: View, other: View) -> Parallax:
+    def between(view: View, neighbour: View) -> Parallax:
         axes = np.diag([1.0, -1.0, -1.0])  # OpenCV's: right, down, ahead
-        turn = axes @ other.pose[:, :3].T @ view.pose[:, :3] @ axes
-        shift = axes @ other.pose[:, :3].T @ (view.pose[:, 3] - other.pose[:, 3])
-        to_pixels = camera_matrix(other.pinhole)
+        turn = axes @ neighbour.pose[:, :3].T @ view.pose[:, :3] @ axes
+        shift = axes @ neighbour.pose[:, :3].T @ (view.pose[:, 3] - neighbour.pose[:, 3])
+        to_pixels = camera_matrix(neighbour.pinhole)
         linear = to_pixels @ turn @ np.linalg.inv(camera_matrix(view.pinhole))
         return Parallax(linear, (to_pixels @ shift).astype(np.float32))
 
@@ -155,23 +155,23 @@ class Parallax:
         return inverse, ((r1 + inverse * s1) ** 2 + (r2 + inverse * s2) ** 2) * per_depth, squared * per_depth
 
 
-def measure(view: View, other: View, start: Map, flow: cv2.DISOpticalFlow) -> tuple[Map, Map]:
+def measure(view: View, neighbour: View, start: Map, flow: cv2.DISOpticalFlow) -> tuple[Map, Map]:
     """Inverse depths of a view's pixels by comparison with another view, and one over their squared errors (0: none).
 
     Args:
         view: the image that gets depths.
-        other: the image that it is compared with.
+        neighbour: the image that it is compared with.
         start: rough inverse depths. [h, w]
         flow: finds small motions.
     """
-    parallax = Parallax.between(view, other)
+    parallax = Parallax.between(view, neighbour)
     x, y, _ = parallax.pixels(start)
-    motion = np.asarray(flow.calc(view.gray, look_up(other.gray, x, y), None))  # type: ignore[call-overload]
+    motion = np.asarray(flow.calc(view.gray, look_up(neighbour.gray, x, y), None))  # type: ignore[call-overload]
     grid_x, grid_y = pixel_grid(view.gray.shape)
     moved = grid_x + motion[..., 0], grid_y + motion[..., 1]
     x, y = look_up(x, *moved), look_up(y, *moved)
-    seen = look_up(np.ascontiguousarray(other.inside, np.uint8), x, y, nearest=True) > 0
-    alike, contrast = correlation(view.gray, look_up(other.gray, x, y))
+    seen = look_up(np.ascontiguousarray(neighbour.inside, np.uint8), x, y, nearest=True) > 0
+    alike, contrast = correlation(view.gray, look_up(neighbour.gray, x, y))
     good = view.inside & seen & (alike > MIN_CORRELATION) & (contrast > MIN_CONTRAST)
     inverse, weight = np.empty_like(start), np.empty_like(start)
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
@@ -278,18 +278,18 @@ def find_depths(
         views = list(pool.map(lambda i: load_view(images, i, width), numbers))
         depths: list[Depth] = []
 
-        def check(i: int) -> T:
-            return finish(i, views[i], confirmed(views[i], depths[i], [(views[j], depths[j]) for j in near[i]]))
+        def work() -> Iterator[Any]:
+            for depth in pool.map(lambda i: matched(views[i], [views[j] for j in near[i]], points_of(i)), numbers):
+                depths.append(depth)
+                yield depth
+            yield from pool.map(
+                lambda i: finish(i, views[i], confirmed(views[i], depths[i], [(views[j], depths[j]) for j in near[i]])),
+                numbers,
+            )
 
-        def work() -> Iterator[Depth | T]:
-            yield from pool.map(lambda i: matched(views[i], [views[j] for j in near[i]], points_of(i)), numbers)
-            yield from pool.map(check, numbers)
-
-        for result in progress(work(), 2 * len(numbers)):
-            if len(depths) < len(numbers):
-                depths.append(cast(Depth, result))
-            else:
-                yield cast(T, result)
+        for n, result in enumerate(progress(work(), 2 * len(numbers))):
+            if n >= len(numbers):
+                yield result
 
 
 def matched(view: View, others: list[View], points: NDArray[np.float64]) -> Depth:
@@ -308,7 +308,7 @@ def matched(view: View, others: list[View], points: NDArray[np.float64]) -> Dept
         else:
             rough = filled(depth, rough)
             rough = np.asarray(cv2.resize(rough, small.gray.shape[::-1], interpolation=cv2.INTER_LINEAR), np.float32)
-        pairs = [measure(small, other.reduced(factor), rough, flow) for other in others]
+        pairs = [measure(small, neighbour.reduced(factor), rough, flow) for neighbour in others]
         depth = without_fringes(small, fuse(*(np.stack(part) for part in zip(*pairs, strict=True))))
     return depth
 
@@ -324,8 +324,8 @@ def without_fringes(view: View, depth: Depth) -> Depth:
 def confirmed(view: View, depth: Depth, others: list[tuple[View, Depth]]) -> Depth:
     """Keeps the depths confirmed by the depth of at least one other image and by at least as many as contradict it."""
     confirm, contradict = np.zeros(depth.inverse.shape, np.int8), np.zeros(depth.inverse.shape, np.int8)
-    for other, theirs in others:
-        x, y, ahead = Parallax.between(view, other).pixels(depth.inverse)
+    for neighbour, theirs in others:
+        x, y, ahead = Parallax.between(view, neighbour).pixels(depth.inverse)
         inverse, error = (look_up(m, x, y, nearest=True) for m in (theirs.inverse, theirs.error))
         expected = np.where(ahead > 0, depth.inverse / np.where(ahead > 0, ahead, 1), 0)
         tolerance = 3 * np.sqrt(error**2 + depth.error**2) + SAME_DEPTH * expected

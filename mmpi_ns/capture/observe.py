@@ -32,6 +32,8 @@ POSES_OFF = 0.5
 """Error of the poses, in training pixels, above which it is reported."""
 TRACKS_VERSION = 3
 """Version of the algorithm: cached tracks of another version are recomputed."""
+THUMBNAIL = 128
+"""Maximum pixels along a side of the gray images for the plane sweep, box-filtered."""
 ENOUGH_KEYPOINTS = 20
 """Average number of keypoints in an image above which no plane sweep is needed."""
 
@@ -86,7 +88,14 @@ def _find_points(observations: Observations, dataset: MMPIDataset, triangulates:
         tell_poses(model.off * float(images.sizes[:, 0].mean()), images.files[0])
     if len(observations.seen_by) < ENOUGH_KEYPOINTS * len(dataset):
         CONSOLE.print("Few or no tracks: a quick plane sweep locates the content.")
-        observations = add_swept_points(observations, [_thumbnail(dataset, i) for i in range(len(dataset))])
+        thumbnails = []
+        for i in range(len(dataset)):
+            image = dataset.get_data(i, image_type="uint8")["image"][..., :3].float().mean(-1) / 255
+            scale = max(1.0, max(image.shape) / THUMBNAIL)
+            size = [max(8, round(n / scale)) for n in image.shape]
+            small = torch.nn.functional.interpolate(image[None, None], size=size, mode="area")
+            thumbnails.append(small[0, 0].double().numpy())
+        observations = add_swept_points(observations, thumbnails)
     return observations
 
 
@@ -116,17 +125,9 @@ def _remembered_tracks(images: PosedImages) -> SfmModel:
 
     cameras = images.camera_to_worlds, images.intrinsics, images.distortion, images.fisheye
     stored: Mapping[str, Any] = remembered(digest(images.files, "tracks", TRACKS_VERSION, *cameras), find)
-    model = SfmModel(**{**stored, "off": float(stored["off"])})
+    model = SfmModel(**{**stored, "off": stored["off"].item()})
     CONSOLE.print(f"{len(model.points)} triangulated points, seen {len(model.seen_by)} times.")
     return model
-
-
-def _thumbnail(dataset: MMPIDataset, index: int, side: int = 128) -> NDArray[np.float64]:
-    """Gray image of at most ``side`` pixels a side, box-filtered."""
-    image = dataset.get_data(index, image_type="uint8")["image"][..., :3].float().mean(-1) / 255
-    scale = max(1.0, max(image.shape) / side)
-    size = [max(8, round(n / scale)) for n in image.shape]
-    return torch.nn.functional.interpolate(image[None, None], size=size, mode="area")[0, 0].double().numpy()
 
 
 def read_observations(outputs: DataparserOutputs, cameras: Cameras, sfm: SfmModel | None) -> Observations:

@@ -121,7 +121,8 @@ def read_reconstruction(model: pycolmap.Reconstruction, min_track: int = MIN_TRA
                 keypoints.append((m, row[p.point3D_id], x / camera.width, y / camera.height))
     table = np.array(keypoints, dtype=np.float64).reshape(-1, 4)
     names = np.array([Path(image.name).name for image in images], dtype=np.str_)
-    return SfmModel(points, names, *table[:, :2].astype(np.int64).T, table[:, 2:])
+    seen_by, seen_point = table[:, :2].astype(np.int64).T
+    return SfmModel(points, names, seen_by, seen_point, table[:, 2:])
 
 
 class _Reader:
@@ -159,7 +160,7 @@ def _check_binary_files(folder: Path) -> None:
     """
     sizes = {"cameras": 24, "images": 73, "points3D": 51}
     files = [_Reader(folder / f"{name}.bin", least) for name, least in sizes.items()]
-    cameras, images, points, seen = set(), {}, set(), [NO_POINT[None]]
+    cameras, images, points, seen = set(), {}, set(), [np.array([NO_POINT])]
     for _ in range(files[0].records):
         number, model, _, _ = files[0].take("<IiQQ")
         if not 0 <= model < len(PARAMETERS):

@@ -26,6 +26,7 @@ from mmpi_ns.capture.matching import (
     quiet,
     rigid3d,
     triangulate_points,
+    verified_matches,
     write_images,
 )
 from mmpi_ns.capture.sfm import SfmModel, load_pycolmap, read_reconstruction
@@ -205,12 +206,9 @@ def _epipolar_error(database: Path, model: Any) -> float:
     pycolmap, distances = load_pycolmap(), []
     cameras = {i: model.cameras[image.camera_id] for i, image in model.images.items()}
     with pycolmap.Database.open(database) as opened:
-        pairs, geometries = opened.read_two_view_geometries()
         keypoints = {i: np.asarray(opened.read_keypoints(i), np.float64).reshape(-1, 6)[:, :2] for i in model.images}
     rays = {i: np.asarray(cameras[i].cam_from_img(points)) for i, points in keypoints.items()}
-    for pair, geometry in zip(pairs, geometries, strict=True):
-        a, b = pycolmap.pair_id_to_image_pair(pair)
-        matches = np.asarray(geometry.inlier_matches).astype(int).reshape(-1, 2)
+    for a, b, matches in verified_matches(database):
         distance = epipolar_distances(model, a, b, (rays[a][matches[:, 0]], rays[b][matches[:, 1]]))
         distances.append(distance * cameras[a].mean_focal_length() / cameras[a].width)
     return float(np.median(np.concatenate(distances))) if sum(map(len, distances)) else np.nan

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -48,9 +49,7 @@ class View:
 
 def load_view(images: PosedImages, i: int, width: int) -> View:
     """Image i in gray, at most ``width`` pixels wide, its lens distortion taken out."""
-    gray = cv2.imread(str(images.files[i]), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
-    if gray is None:
-        raise InputError(f"Training image {images.files[i]} cannot be read: repair it or remove its frame.")
+    gray = _read(images.files[i], cv2.IMREAD_GRAYSCALE)
     full_height, full_width = gray.shape
     if full_width > width:
         height = max(1, round(full_height * width / full_width))
@@ -66,6 +65,13 @@ def load_view(images: PosedImages, i: int, width: int) -> View:
     return View(np.ascontiguousarray(gray, np.uint8), pinhole, images.camera_to_worlds[i], inside)
 
 
+def _read(file: Path, mode: int) -> NDArray[Any]:
+    pixels = cv2.imread(str(file), mode | cv2.IMREAD_IGNORE_ORIENTATION)
+    if pixels is None:
+        raise InputError(f"Training image {file} cannot be read: repair it or remove its frame.")
+    return pixels
+
+
 def _unbent(images: PosedImages, i: int, pinhole: NDArray[np.float64], size: Sequence[int]) -> tuple[Map, Map]:
     """Where in image i, of a size (width, height), its undistorted view's pixels lie; OpenCV counts from centres."""
     matrix = camera_matrix(pinhole)
@@ -77,11 +83,8 @@ def _unbent(images: PosedImages, i: int, pinhole: NDArray[np.float64], size: Seq
 
 def straightened_color(images: PosedImages, i: int, view: View) -> NDArray[np.uint8]:
     """Blue, green and red of image i as its view shows it. [h, w, 3]"""
-    color = cv2.imread(str(images.files[i]), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    if color is None:
-        raise InputError(f"Training image {images.files[i]} cannot be read: repair it or remove its frame.")
     size = view.gray.shape[::-1]
-    color = cv2.resize(color, size, interpolation=cv2.INTER_AREA)
+    color = cv2.resize(_read(images.files[i], cv2.IMREAD_COLOR), size, interpolation=cv2.INTER_AREA)
     if images.is_bent(i):
         color = cv2.remap(color, *_unbent(images, i, view.pinhole, size), cv2.INTER_LINEAR)
     return np.asarray(color, np.uint8)
@@ -132,7 +135,7 @@ def look_up(image: NDArray[Any], x: NDArray[Any], y: NDArray[Any], *, nearest: b
         nearest: take the nearest pixel.
 
     Returns:
-        The shape of ``x``, and channels where there are several.
+        The shape of ``x``, and channels if the image has several.
     """
     at_x, at_y = x.astype(np.float32) - 0.5, y.astype(np.float32) - 0.5
     mode = cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR
@@ -155,6 +158,6 @@ def look_up(image: NDArray[Any], x: NDArray[Any], y: NDArray[Any], *, nearest: b
             chosen = inside[begin : begin + REMAP_PART**2]
             rows = np.zeros((2, -(-len(chosen) // REMAP_PART), REMAP_PART), np.float32)
             rows.reshape(2, -1)[:, : len(chosen)] = flat_x[chosen] - left, flat_y[chosen] - top
-            found = cv2.remap(view, rows[0], rows[1], mode, borderMode=border, borderValue=(0.0,))
-            values[chosen] = found.reshape(-1, *image.shape[2:])[: len(chosen)]
+            folded = cv2.remap(view, rows[0], rows[1], mode, borderMode=border, borderValue=(0.0,))
+            values[chosen] = folded.reshape(-1, *image.shape[2:])[: len(chosen)]
     return values.reshape(*x.shape, *image.shape[2:])

@@ -93,6 +93,24 @@ def pixels_per_pixel(observations: Observations, visible: VisiblePoints) -> floa
     return max(1.0, float(covered[order[np.searchsorted(share, LEAST_COVERED * share[-1])]]))
 
 
+def farthest_first(places: Array, count: int | None = None, radius: float = 0.0) -> list[int]:
+    """Places far apart, each the farthest from the previous ones (farthest-point traversal, Gonzalez 1985).
+
+    Starts at the place farthest from the middle, so the numbering does not matter.
+
+    Args:
+        places: [M, D]
+        count: number of places; None: as many as it takes until balls of ``radius`` around them contain all.
+        radius: of the balls.
+    """
+    chosen = [int(np.linalg.norm(places - places.mean(0), axis=-1).argmax())]
+    distance = np.linalg.norm(places - places[chosen[0]], axis=-1)
+    while distance.max() > radius if count is None else len(chosen) < count:
+        chosen.append(int(distance.argmax()))
+        distance = np.minimum(distance, np.linalg.norm(places - places[chosen[-1]], axis=-1))
+    return chosen
+
+
 def _start(depth: Array) -> float:
     """The least depth from which on a factor of WINDOW holds SUPPORT of all: a lone outlier in front does not count."""
     ordered = np.sort(depth)
