@@ -9,6 +9,7 @@ import zipfile
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from filelock import FileLock, Timeout
@@ -63,7 +64,7 @@ def remembered(key: str, find: Callable[[], Arrays | Pairs], folder: Path | None
     with lock:
         arrays = _read(path)
         if arrays is None:
-            result = find()
+            result: Any = find()
             try:
                 write_atomically(path, lambda unfinished: _write(unfinished, result))
                 arrays = _read(path)

@@ -89,7 +89,7 @@ def say_once(text: str) -> None:
 
 
 def in_one_place(centers: NDArray[np.float64], share: float = SAME_PLACE) -> bool:
-    """Whether camera centres [M, 3] are equal up to rounding, which is relative to their distance from the origin."""
+    """Test of camera centres [M, 3] for equality up to rounding, relative to their distance from the origin."""
     return float(np.ptp(centers, axis=0).max()) <= share * max(1.0, float(np.abs(centers).max()))
 
 

@@ -94,7 +94,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         self.rays_share = 1.0
         """Share of a step's rays that are drawn; the schedule sets it."""
         self.sources: RaySources | None = None
-        """What a step draws from now."""
+        """Sources that a step draws from now."""
         self._resident: RaySources | None = None
         """The sources of all cameras, if they are in memory all the time."""
         parser = config.dataparser
@@ -144,7 +144,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
 
     @cached_property
     def observations(self) -> Observations:
-        """What the training cameras saw. Only training searches the images, which may be absent later, for points."""
+        """Observations of the training cameras. Only training searches the images, later perhaps absent, for points."""
         return observe(
             self.train_dataparser_outputs,
             self.train_dataset,
@@ -240,7 +240,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         return RaySources(pixels, new_views, keypoints, rays, *counts, no_new_views, exposures)
 
     def describe(self) -> str:
-        """What the capture holds, in one line."""
+        """Size of the capture in images, points and depths, in one line."""
         cameras, seen = self.train_dataset.cameras, self.observations
         sizes = sorted({(int(w), int(h)) for w, h in zip(cameras.width.view(-1), cameras.height.view(-1), strict=True)})
         shapes = f"{sizes[0][0]} x {sizes[0][1]}" + (f" to {sizes[-1][0]} x {sizes[-1][1]}" if len(sizes) > 1 else "")

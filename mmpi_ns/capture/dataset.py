@@ -43,7 +43,7 @@ class MMPIDataset(InputDataset):
         return False
 
     moving: Sequence[NDArray[np.bool_]] | None = None
-    """What moves in each image [H, W], masked where there are no masks in files."""
+    """Masks of what moves in each image [H, W], used if no mask files are given."""
 
     @property
     def has_masks(self) -> bool:

@@ -44,7 +44,7 @@ SMALLEST = 320
 SECONDS = 1.0
 """Processor seconds for a million working pixels of an image, for the forecast (docs/log/performance.md)."""
 STRIDE, ITERATIONS = 5, 8
-"""Of the optical flow: pixels between its patches, and iterations of each."""
+"""Pixels between the patches of the optical flow, and iterations of each."""
 NOISE = 0.3
 """Standard deviation of a match, working pixels, where images look alike."""
 MAX_EPIPOLAR = 1.0
@@ -107,7 +107,7 @@ def strips(shape: tuple[int, ...]) -> Iterator[slice]:
 
 @dataclass(frozen=True)
 class Parallax:
-    """Where the points of a view's pixels lie in another view: homogeneous pixels a + q b for inverse depth q."""
+    """Places of a view's pixels in a neighbouring view: homogeneous pixels a + q b for inverse depth q."""
 
     linear: NDArray[np.float64]
     """a at a pixel (x, y) is this times (x, y, 1). [3, 3]"""

@@ -25,7 +25,7 @@ from mmpi_ns.utils.host import transforms_changed
 FAR = 10.0
 """Cameras this many times as far from the origin as from each other get a local origin."""
 GRAY = 128
-"""Of points without colours."""
+"""Gray level of points without colours."""
 
 
 class MapOutputs(DataparserOutputs):
@@ -38,7 +38,7 @@ class MapOutputs(DataparserOutputs):
 
 
 class LocalOrigin:
-    """The origin of one capture, in the axes in which its poses are saved."""
+    """Origin of one capture, in the axes in which its poses are saved."""
 
     def __init__(self, meta: dict[str, Any], source: Path) -> None:
         """Subtracts the local origin from poses of a transforms.json or a COLMAP model that are far from the origin."""
@@ -80,9 +80,7 @@ class LocalNerfstudio(Nerfstudio):
     """The parser asks no question on the terminal where ``transforms.json`` names no point cloud."""
 
     def _generate_dataparser_outputs(self, split: str = "train") -> DataparserOutputs:
-        def subtract(meta: dict[str, Any], path: Path) -> None:
-            self._origin = LocalOrigin(meta, path)
-
+        subtract = lambda meta, path: setattr(self, "_origin", LocalOrigin(meta, path))  # noqa: E731
         with transforms_changed(nerfstudio_dataparser, subtract):
             outputs = super()._generate_dataparser_outputs(split)
         return self._origin.tell(outputs)

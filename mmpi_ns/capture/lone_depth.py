@@ -109,7 +109,7 @@ def _planes(
 
 
 def others_that_see(posed: PosedImages, i: int, points: NDArray[np.float64]) -> NDArray[np.int64]:
-    """In how many of the images near image i the points [P, 3] lie, which it shows."""
+    """Number of images near image i that may show each of its points [P, 3]. [P]"""
     count = np.zeros(len(points), np.int64)
     for j in nearest_views(posed.camera_to_worlds, i, NEAREST) if len(points) else []:
         at = project(posed, j, points)

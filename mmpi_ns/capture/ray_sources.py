@@ -1,4 +1,4 @@
-"""What a training step draws from: pixels, points that two images share, and SfM keypoints, of some of the cameras."""
+"""Sources of the rays of a training step: pixels, points that two images share, and SfM keypoints."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ class PixelPool:
 
     @cached_property
     def count(self) -> int:
-        """How many pixels are drawn from; asked of the device once, not in every step."""
+        """Number of pixels that are drawn from; asked of the device once, not in every step."""
         return int((self.ends - self.begins).sum())
 
     def draw(
@@ -195,7 +195,7 @@ class Keypoints:
 
 @dataclass(frozen=True)
 class RaySources:
-    """What a step draws from, for all training cameras or for those of one window."""
+    """Sources of the rays of a step, for all training cameras or for one window's."""
 
     pixels: PixelPool
     new_views: SharedPoints | None

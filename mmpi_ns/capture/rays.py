@@ -96,11 +96,11 @@ class LensRays(PinholeRays):
     """The same for cameras with a lens, from a table of the directions of every pixel."""
 
     directions: Float[Tensor, "T 3"]
-    """Of the pixels of all distinct cameras, in their axes."""
+    """Directions of the pixels of all distinct cameras, in their axes."""
     first: Int[Tensor, "N"]
     """Row of each camera's first pixel in the table."""
     widths: Int[Tensor, "N"]
-    """Of the images, pixels."""
+    """Widths of the images, pixels."""
 
     def local(self, ray_indices: Int[Tensor, "R 3"]) -> Float[Tensor, "R 3"]:
         """Directions in the axes of the cameras: right, up, backwards."""

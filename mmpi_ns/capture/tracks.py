@@ -84,7 +84,7 @@ class PosedImages:
         return bool(np.broadcast_to(self.fisheye, len(self.sizes))[i])
 
     def is_bent(self, i: int) -> bool:
-        """Whether the lens of image i is no pinhole's; a fisheye's is not, even if all its terms are 0."""
+        """True if the lens of image i is not a pinhole's; a fisheye never is, even if all its terms are 0."""
         return self.is_fisheye(i) or bool(self.distortion[i].any())
 
 

@@ -17,7 +17,7 @@ from mmpi_ns.utils.errors import InputError
 Map = NDArray[np.float32]
 
 REMAP_SIDE, REMAP_PART = 32766, 8192
-"""Largest side of what OpenCV's remap reads and writes, and side of the parts of anything larger."""
+"""Largest side of an image for OpenCV's remap, and side of the parts into which larger ones are cut."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ def _read(file: Path, mode: int) -> NDArray[Any]:
 
 
 def _unbent(images: PosedImages, i: int, pinhole: NDArray[np.float64], size: Sequence[int]) -> tuple[Map, Map]:
-    """Where in image i, of a size (width, height), its undistorted view's pixels lie; OpenCV counts from centres."""
+    """Places in image i, of a size (width, height), of its undistorted view's pixels; OpenCV counts from centres."""
     matrix = camera_matrix(pinhole)
     straighten = cv2.fisheye.initUndistortRectifyMap if images.is_fisheye(i) else cv2.initUndistortRectifyMap
     matrix[:2, 2] -= 0.5
@@ -96,15 +96,19 @@ def camera_matrix(pinhole: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def project(posed: PosedImages, j: int, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Pixels [P, 2] at which a camera shows points [P, 3], lens included; far outside where they are behind it or so
-    far to the side that the lens's polynomial turns back."""
+    """Pixels [P, 2] at which a camera shows points [P, 3], lens included; far outside for points behind it or so far to
+    the side that the lens's polynomial turns back."""
     pose = posed.camera_to_worlds[j]
     local = (points - pose[:, 3]) @ pose[:, :3] * [1, -1, -1]  # OpenCV's axes: right, down, ahead
     ahead = local[:, 2] > 0
     aside = np.hypot(local[:, 0], local[:, 1])
     fisheye = posed.is_fisheye(j)
     radius = np.arctan2(aside, local[:, 2]) if fisheye else aside / np.where(ahead, local[:, 2], 1)
-    ahead &= radius < turning_radius(posed.distortion[j] if fisheye else posed.distortion[j, :2])
+    # The radius r > 0 from which r (1 + k1 r^2 + k2 r^4 + ...) falls, if it ever does, by its slope's roots in r^2.
+    slope = [1.0, *((2 * n + 3) * k for n, k in enumerate(posed.distortion[j, : 4 if fisheye else 2]))]
+    roots = np.polynomial.polynomial.polyroots(np.trim_zeros(slope, "b"))
+    squares = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)]
+    ahead &= radius < np.sqrt(squares.min(initial=np.inf))
     local = np.where(ahead[:, None], local, [0.0, 0.0, 1.0])[:, None]
     matrix, still = camera_matrix(posed.intrinsics[j]), np.zeros(3)
     bend = cv2.fisheye.projectPoints if fisheye else cv2.projectPoints
@@ -112,16 +116,8 @@ def project(posed: PosedImages, j: int, points: NDArray[np.float64]) -> NDArray[
     return np.where(ahead[:, None], at, -1e4)
 
 
-def turning_radius(radial: NDArray[np.float64]) -> float:
-    """Radius r > 0 from which r (1 + k1 r^2 + k2 r^4 + ...) falls; infinite if it never does."""
-    slope = [1.0, *((2 * n + 3) * k for n, k in enumerate(radial))]  # in powers of the squared radius
-    roots = np.polynomial.polynomial.polyroots(np.trim_zeros(slope, "b"))
-    squares = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)]
-    return float(np.sqrt(squares.min())) if len(squares) else np.inf
-
-
 def pixel_grid(shape: tuple[int, ...]) -> tuple[Map, Map]:
-    """x and y of pixel centres. [h, w] each"""
+    """Coordinates x and y of pixel centres. [h, w] each"""
     x, y = np.meshgrid(np.arange(shape[1], dtype=np.float32) + 0.5, np.arange(shape[0], dtype=np.float32) + 0.5)
     return x, y
 

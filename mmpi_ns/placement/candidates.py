@@ -28,7 +28,7 @@ BESIDE = 0.9
 MARGINS = (1.12, 1.4, 1.75)
 """Frusta of views, relative to the camera's own."""
 PULL_BACKS = (0.0, 1.0, 2.0)
-"""How far behind the camera an MPI may stand, relative to where points start."""
+"""Distances of an MPI behind its camera, relative to where points start."""
 NEAR_SHARE = 0.6
 """First plane, relative to where points start."""
 CUBE_SIZES = (0.4, 0.7, 1.0)

@@ -12,12 +12,12 @@ from mmpi_ns.utils.values import Number, check_options, shown
 
 @dataclass(frozen=True)
 class Default:
-    """What the size of a method's texels follows from."""
+    """Length of a method's training and its placement, from which the size of texels follows."""
 
     steps: int
-    """Of a small capture."""
+    """Training steps of a small capture."""
     rays: int
-    """Of a step."""
+    """Rays of a step."""
     placement: PlacementConfig
 
 

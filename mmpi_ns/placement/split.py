@@ -117,7 +117,7 @@ def of_cameras(observations: Observations, cameras: NDArray[np.int64]) -> Observ
 
 
 def _fewest(centers: Array, start: Array, radius: float) -> Array:
-    """As few of ``start`` as possible, moved to the middle of their cameras; balls hardly larger than ``radius``."""
+    """Middles of the fewest balls, hardly larger than ``radius``, that hold all cameras; some of ``start``, moved."""
     low, high = 1, len(start)  # farthest points are at most twice as many as are needed
     best = _settled(centers, start)
     while low < high:
