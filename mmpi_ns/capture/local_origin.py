@@ -112,7 +112,8 @@ class LocalColmap(ColmapDataParser):
         model = self.config.data / self.config.colmap_path
         if not model.is_dir():
             raise InputError(f"There is no COLMAP model at {model}: check --data, and --colmap-path after colmap.")
-        return self._origin.tell(super()._generate_dataparser_outputs(split, **kwargs))
+        outputs = super()._generate_dataparser_outputs(split, **kwargs)
+        return self._origin.tell(outputs)
 
     def _load_3D_points(self, colmap_path: Path, transform_matrix: Tensor, scale_factor: float) -> Any:
         return {}  # in float32; ``find_sfm_model`` reads the model's points and tracks in float64
