@@ -13,6 +13,7 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 from tiny_scene import write_colmap
 
 from mmpi_ns.capture import observe as mmpi_observations
+from mmpi_ns.capture.checks import say_once
 from mmpi_ns.capture.observe import (
     ENOUGH_KEYPOINTS,
     drop_masked,
@@ -158,6 +159,7 @@ def cloud_outputs() -> Any:
 
 
 def test_a_point_cloud_waits_for_depths_and_gives_way_to_tracks(tmp_path, monkeypatch, capsys):
+    say_once.cache_clear()
     outputs, none = cloud_outputs(), tmp_path / "none"
     cameras = as_data().cameras
     waiting = read_observations(outputs, cameras, None)
