@@ -7,6 +7,7 @@ import os
 import struct
 import zipfile
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 from mmpi_ns.utils.files import write_atomically
 
 KEPT = 24
-"""Results that are kept; the least recently used is removed first."""
+"""Number of cached results; the least recently used is removed first."""
 
 Arrays = dict[str, NDArray[np.generic]]
 Pairs = Iterable[tuple[str, NDArray[np.generic]]]
@@ -31,13 +32,13 @@ def cache_folder() -> Path:
 
 def digest(files: Iterable[Path], *parts: object) -> str:
     """A key made of files (path, size, modification time), arrays and settings."""
-    found = hashlib.sha256()
+    key = hashlib.sha256()
     for file in files:
         stat = file.stat()
-        found.update(f"{file.resolve()} {stat.st_size} {stat.st_mtime_ns}\n".encode())
+        key.update(f"{file.resolve()} {stat.st_size} {stat.st_mtime_ns}\n".encode())
     for part in parts:
-        found.update(np.ascontiguousarray(part).tobytes() if isinstance(part, np.ndarray) else repr(part).encode())
-    return found.hexdigest()[:32]
+        key.update(np.ascontiguousarray(part).tobytes() if isinstance(part, np.ndarray) else repr(part).encode())
+    return key.hexdigest()[:32]
 
 
 def remembered(key: str, find: Callable[[], Arrays | Pairs], folder: Path | None = None) -> Arrays:
@@ -59,31 +60,27 @@ def remembered(key: str, find: Callable[[], Arrays | Pairs], folder: Path | None
         lock = FileLock(folder / f"{key}.lock").acquire()
     except OSError as error:
         CONSOLE.print(f"[yellow]{folder} cannot be written to ({error.strerror}): depths are recomputed at each start.")
-        return dict(_pairs(find()))
+        return dict(find())
     with lock:
         arrays = _read(path)
         if arrays is None:
-            result = find()
+            result: Any = find()
             try:
                 write_atomically(path, lambda unfinished: _write(unfinished, result))
                 arrays = _read(path)
             except OSError as error:
                 CONSOLE.print(f"[yellow]{error}")
             if arrays is None:
-                arrays = dict(_pairs(result if isinstance(result, dict) else find()))
+                arrays = result if isinstance(result, dict) else dict(find())
         _forget_old(folder)
     return arrays
 
 
-def _pairs(arrays: Any) -> Pairs:
-    return arrays.items() if isinstance(arrays, dict) else arrays
-
-
 def _write(path: Path, arrays: Arrays | Pairs) -> None:
     with zipfile.ZipFile(path, "w") as file:  # as np.savez, which asks for all arrays at once
-        for name, array in _pairs(arrays):
+        for name, array in arrays.items() if isinstance(arrays, dict) else arrays:
             with file.open(f"{name}.npy", "w", force_zip64=True) as entry:
-                np.lib.format.write_array(entry, np.asanyarray(array), allow_pickle=False)
+                np.lib.format.write_array(entry, np.asanyarray(array), version=(1, 0), allow_pickle=False)
 
 
 def _read(path: Path) -> Arrays | None:
@@ -93,13 +90,9 @@ def _read(path: Path) -> Arrays | None:
         with zipfile.ZipFile(path) as file, path.open("rb") as data:
             for entry in file.infolist():
                 data.seek(entry.header_offset + 26)  # of a zip's local header: lengths of name and extra field
-                name, extra = struct.unpack("<HH", data.read(4))
-                data.seek(name + extra, os.SEEK_CUR)
-                version = np.lib.format.read_magic(data)
-                header = (
-                    np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-                )
-                shape, fortran, dtype = header(data)
+                data.seek(sum(struct.unpack("<HH", data.read(4))), os.SEEK_CUR)
+                np.lib.format.read_magic(data)
+                shape, fortran, dtype = np.lib.format.read_array_header_1_0(data)
                 order = "F" if fortran else "C"
                 empty = 0 in shape  # nothing to map
                 array = np.zeros(shape, dtype) if empty else np.memmap(path, dtype, "c", data.tell(), shape, order)
@@ -114,9 +107,6 @@ def _forget_old(folder: Path) -> None:
     """Removes the results beyond ``KEPT``, but none that a process computes or waits for."""
     files = sorted(folder.glob("*.npz"), key=lambda p: p.stat().st_mtime, reverse=True)
     for path in files[KEPT:]:
-        try:
-            with FileLock(path.with_suffix(".lock"), timeout=0):
-                path.unlink(missing_ok=True)
-                path.with_suffix(".lock").unlink(missing_ok=True)
-        except Timeout:
-            continue
+        with suppress(Timeout), FileLock(path.with_suffix(".lock"), timeout=0):
+            path.unlink(missing_ok=True)
+            path.with_suffix(".lock").unlink(missing_ok=True)

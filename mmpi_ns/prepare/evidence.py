@@ -20,7 +20,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from mmpi_ns.capture.matching import MIN_INLIERS, epipolar_distances
+from mmpi_ns.capture.matching import MIN_INLIERS, epipolar_distances, verified_matches
 from mmpi_ns.prepare.alignment import Array, camera_poses, degrees_between, rotation_between, similarity_between
 
 Places = NDArray[np.int64]
@@ -140,13 +140,10 @@ def _pair_evidence(
     """For every verified pair of registered images, how many matches became points and how well they fit the poses."""
     place = {image_id: i for i, image_id in enumerate(sorted(points))}
     rows: list[tuple[int, ...]] = []
-    with pycolmap.Database.open(database) as opened:
-        numbers, geometries = opened.read_two_view_geometries()
-    for number, geometry in zip(numbers, geometries, strict=True):
-        a, b = pycolmap.pair_id_to_image_pair(number)
-        if a not in place or b not in place or len(geometry.inlier_matches) < MIN_INLIERS:
+    for a, b, matches in verified_matches(database):
+        if a not in place or b not in place or len(matches) < MIN_INLIERS:
             continue
-        left, right = np.asarray(geometry.inlier_matches).astype(int).T
+        left, right = matches.T
         tracked = (points[a][left] == points[b][right]) & (points[a][left] >= 0)
         camera = model.cameras[model.images[a].camera_id]
         fit = FIT_PX * max(camera.width, camera.height) / 1000 / camera.mean_focal_length()

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Literal
 
 import tyro
 
-from mmpi_ns.placement.defaults import DEFAULTS, steps_for
-from mmpi_ns.placement.options import check_placement
+from mmpi_ns.placement.defaults import DEFAULTS, check_placement, steps_for
 from mmpi_ns.placement.rule import PlacementConfig
 from mmpi_ns.scripts.command import say_version
 from mmpi_ns.utils.errors import InputError

@@ -11,8 +11,7 @@ from typing import Any
 import torch
 from nerfstudio.engine.trainer import TrainerConfig
 
-from mmpi_ns.placement.defaults import DEFAULTS
-from mmpi_ns.placement.options import check_placement
+from mmpi_ns.placement.defaults import DEFAULTS, check_placement
 from mmpi_ns.training.losses import LossWeights
 from mmpi_ns.training.phases import check_schedule
 from mmpi_ns.utils.errors import InputError
