@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
 from functools import partial
 from multiprocessing import get_all_start_methods, get_context
 from pathlib import Path
@@ -70,17 +69,12 @@ def write_dataset(
     sfm = sfm_points(scene, points, noise_pixels, outliers)
     clear(folder)
     if tracks:
-        model = colmap_model(scene, sfm)
-        (folder / "colmap" / "sparse" / "0").mkdir(parents=True)
-        model.write(folder / "colmap" / "sparse" / "0")
+        model, sparse = colmap_model(scene, sfm), folder / "colmap" / "sparse" / "0"
+        sparse.mkdir(parents=True)
+        model.write(sparse)
         model.export_PLY(folder / "sparse_pc.ply")
-    for part in ("images", "depths", *(["moving"] if scene.movers else [])) if images else ():
-        (folder / part).mkdir()
     if images:
-        write = partial(_write_image, scene, folder, exposure)
-        with _side_by_side(write, len(scene.cameras), processes) as written:
-            for _ in progress(range(len(scene.cameras))):
-                next(written)
+        _write_images(scene, folder, exposure, progress, processes)
     if exposure is not None:
         names = [f"images/{image_name(i)}" for i in range(len(scene.cameras))]
         (folder / "exposure.json").write_text(json.dumps(exposure.to_object(names), indent=1))
@@ -120,24 +114,35 @@ _job: Callable[[int], None]
 """What each process of a pool does with a number: inherited, as closures cannot be sent."""
 
 
+def _adopt(job: Callable[[int], None]) -> None:
+    global _job
+    _job = job
+
+
 def _do(number: int) -> None:
     _job(number)
 
 
-@contextmanager
-def _side_by_side(job: Callable[[int], None], count: int, processes: int) -> Iterator[Iterator[None]]:
-    """``job`` of 0 to count - 1, in order, by forked processes if there are several and the system can fork."""
+def _write_images(
+    scene: Scene,
+    folder: Path,
+    exposure: Exposure | None,
+    progress: Callable[[Iterable[int]], Iterable[int]],
+    processes: int,
+) -> None:
+    """Renders and writes all images, by forked processes if there are several and the system can fork."""
+    for part in ("images", "depths", *(["moving"] if scene.movers else [])):
+        (folder / part).mkdir()
+    job, count = partial(_write_image, scene, folder, exposure), len(scene.cameras)
     if min(processes, count) < 2 or "fork" not in get_all_start_methods():
-        yield map(job, range(count))
+        for camera in progress(range(count)):
+            job(camera)
         return
-
-    def adopt() -> None:
-        global _job
-        _job = job
-
-    pool = ProcessPoolExecutor(min(processes, count), get_context("fork"), adopt)
+    pool = ProcessPoolExecutor(min(processes, count), get_context("fork"), _adopt, (job,))
     try:
-        yield pool.map(_do, range(count))
+        written = pool.map(_do, range(count))
+        for _ in progress(range(count)):
+            next(written)
     finally:
         pool.shutdown(cancel_futures=True)
 

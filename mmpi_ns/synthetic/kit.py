@@ -64,10 +64,10 @@ class Kit:
 
     def done(self) -> Primitives:
         kind, center, half, yaw, material, colors, offset = zip(*self.rows, strict=True)
-        return Primitives(
+        return Primitives.merged(Primitives(
             np.array(kind), np.array(center, float), np.array(half, float), np.array(yaw, float),
             np.array(material), np.array(colors, float), np.array(offset, float),
-        ).sorted()  # fmt: skip
+        ))[0]  # fmt: skip
 
 
 def look(places: Array, yaw: Array, pitch: Array) -> Array:
@@ -77,9 +77,3 @@ def look(places: Array, yaw: Array, pitch: Array) -> Array:
     back = np.stack([-cp * cy, -cp * sy, -sp], -1)
     up = np.cross(back, right)
     return np.asarray(np.stack([right, up, back, places], -1), dtype=np.float64)
-
-
-def look_at(places: Array, target: Array) -> Array:
-    """Poses [M, 3, 4] at places [M, 3] that face a point [3]."""
-    toward = target - places
-    return look(places, np.arctan2(toward[:, 1], toward[:, 0]), np.arctan2(toward[:, 2], np.hypot(*toward[:, :2].T)))

@@ -47,36 +47,34 @@ class Movers:
         return (self.along - self.along[0]) / (WALKING if self.walks else DRIVING)
 
     def solids(self, camera: int) -> Primitives:
-        """The movers when an image is taken."""
-        now, kits = float(self.seconds[camera]), []
+        """The movers when an image is taken: in turns oncoming, ahead of the camera, crossing, on the pavement, and
+        overtaking."""
+        now, rows, speed = float(self.seconds[camera]), [], WALKING if self.walks else DRIVING
+        ego = float(np.interp(now, self.seconds, self.along))
         for number in range(self.count):
             # The same draws for every image: a mover keeps its looks.
             kit = Street(self.seed, self.road, topic=100 + number)
-            self._add(kit, number, now)
-            kits += kit.rows
-        everything = Street(self.seed, self.road)
-        everything.rows = kits
-        return everything.done()
-
-    def _add(self, kit: Street, number: int, now: float) -> None:
-        """One mover: in turns oncoming, ahead of the camera, crossing, on the pavement, overtaking."""
-        meets = float(kit.random.uniform(0.1, 0.9)) * float(self.seconds[-1])
-        since, speed = now - meets, WALKING if self.walks else DRIVING
-        camera = float(np.interp(now, self.seconds, self.along))
-        met = float(np.interp(meets, self.seconds, self.along))
-        paint, side = kit.pick(PAINTS), float(kit.random.choice([-1, 1]))
-        if number % 5 == 0:
-            kit.car(met + 8 - DRIVING * since, LANE, paint)
-        elif number % 5 == 1 and self.walks:
-            _add_person(kit, camera + float(kit.random.uniform(4, 8)), float(kit.random.uniform(-1.2, 0.6)), paint, now)
-        elif number % 5 == 1:
-            kit.car(camera + 9, -LANE, paint)
-        elif number % 5 == 2:
-            _add_person(kit, met + (7 if self.walks else 18), side * WALKING * since, paint, now)
-        elif number % 5 == 3:
-            _add_person(kit, met + 5 - WALKING * since, side * PAVEMENT, paint, now)
-        else:
-            kit.car(met + 8 + (speed + 4) * since, LANE, paint)
+            meets = float(kit.random.uniform(0.1, 0.9)) * float(self.seconds[-1])
+            since, met = now - meets, float(np.interp(meets, self.seconds, self.along))
+            paint, side = kit.pick(PAINTS), float(kit.random.choice([-1, 1]))
+            if number % 5 == 0:
+                kit.car(met + 8 - DRIVING * since, LANE, paint)
+            elif number % 5 == 1 and self.walks:
+                _add_person(
+                    kit, ego + float(kit.random.uniform(4, 8)), float(kit.random.uniform(-1.2, 0.6)), paint, now
+                )
+            elif number % 5 == 1:
+                kit.car(ego + 9, -LANE, paint)
+            elif number % 5 == 2:
+                _add_person(kit, met + (7 if self.walks else 18), side * WALKING * since, paint, now)
+            elif number % 5 == 3:
+                _add_person(kit, met + 5 - WALKING * since, side * PAVEMENT, paint, now)
+            else:
+                kit.car(met + 8 + (speed + 4) * since, LANE, paint)
+            rows += kit.rows
+        movers = Street(self.seed, self.road)
+        movers.rows = rows
+        return movers.done()
 
 
 def _add_person(kit: Street, along: float, aside: float, paint, now: float) -> None:
@@ -90,7 +88,7 @@ def _add_person(kit: Street, along: float, aside: float, paint, now: float) -> N
 
 
 def with_movers(scene: Scene, count: int) -> Scene:
-    """The scene with so many movers in its training images.
+    """The scene with ``count`` movers in its training images.
 
     Raises:
         ValueError: the scene has no road.

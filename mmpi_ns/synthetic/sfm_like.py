@@ -95,7 +95,16 @@ def visible(scene: Scene, camera: int, points: Array) -> tuple[NDArray[np.bool_]
 
 def _tracked(scene: Scene, count: int, random: np.random.Generator) -> tuple:
     """Points [P, 3] at random pixels, their colours, and the (camera, point, exact pixel) of tracks worth keeping."""
-    points, colors = _drawn(scene, count, random)
+    drawn = np.sort(random.integers(len(scene.cameras), size=count))
+    pixels = random.uniform(0, 1, (count, 2)) * [scene.cameras.width, scene.cameras.height]
+    parts = []
+    for i in np.unique(drawn):
+        origins, directions = scene.cameras.rays(i, pixels[drawn == i])
+        distance, color = scene.trace(origins, directions, 1 / scene.cameras.focal)
+        near = distance < scene.track_range
+        surface = origins[near] + distance[near, None] * directions[near]
+        parts.append((surface, (color[near] * 255).round().astype(np.uint8)))
+    points, colors = (np.concatenate(column) for column in zip(*parts, strict=True))
     order = np.argsort(points[:, 0], kind="stable")
     points, colors = points[order], colors[order]
     cameras, rows, pixels = [], [], []
@@ -108,35 +117,13 @@ def _tracked(scene: Scene, count: int, random: np.random.Generator) -> tuple:
     camera, point, pixel = (np.concatenate(x) for x in (cameras, rows, pixels))
     order = np.lexsort((camera, point))
     camera, point, pixel = camera[order], point[order], pixel[order]
-    good = _long_and_wide(scene, points, camera, point)
-    kept = good[point]
-    return points[good], colors[good], (camera[kept], (np.cumsum(good) - 1)[point[kept]], pixel[kept])
-
-
-def _drawn(scene: Scene, count: int, random: np.random.Generator) -> tuple[Array, NDArray[np.uint8]]:
-    """Surface points [P, 3] behind random pixels of random cameras, and their colours."""
-    cameras = scene.cameras
-    chosen = np.sort(random.integers(len(cameras), size=count))
-    pixels = random.uniform(0, 1, (count, 2)) * [cameras.width, cameras.height]
-    points, colors = [], []
-    for i in np.unique(chosen):
-        origins, directions = cameras.rays(i, pixels[chosen == i])
-        distance, color = scene.trace(origins, directions, 1 / cameras.focal)
-        near = distance < scene.track_range
-        points.append(origins[near] + distance[near, None] * directions[near])
-        colors.append((color[near] * 255).round().astype(np.uint8))
-    return np.concatenate(points), np.concatenate(colors)
-
-
-def _long_and_wide(scene: Scene, points: Array, camera: NDArray, point: NDArray) -> NDArray[np.bool_]:
-    """[P] points with enough keypoints and rays that are far enough apart."""
-    length = np.bincount(point, minlength=len(points))
     rays = scene.cameras.camera_to_worlds[camera, :, 3] - points[point]
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-    first = np.searchsorted(point, np.arange(len(points)))
-    apart = np.full(len(points), 1.0)
-    np.minimum.at(apart, point, dot(rays, rays[first[point]]))
-    return (length >= MIN_TRACK) & (apart <= np.cos(np.radians(MIN_ANGLE)))
+    first, cosine = np.searchsorted(point, np.arange(len(points))), np.full(len(points), 1.0)
+    np.minimum.at(cosine, point, dot(rays, rays[first[point]]))
+    good = (np.bincount(point, minlength=len(points)) >= MIN_TRACK) & (cosine <= np.cos(np.radians(MIN_ANGLE)))
+    kept = good[point]
+    return points[good], colors[good], (camera[kept], (np.cumsum(good) - 1)[point[kept]], pixel[kept])
 
 
 def _joined(rounds: list[tuple], count: int) -> tuple[Array, NDArray[np.uint8], tuple[NDArray, NDArray, Array]]:
