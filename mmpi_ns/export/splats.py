@@ -11,7 +11,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean
-from typing import Any
 
 import numpy as np
 import torch
@@ -242,18 +241,13 @@ def _placed(window: BakedWindow, texels: _Texels, group: Tensor, level: Tensor, 
         means[in_mpi] = torch.tensor(mpi.origin) + local @ torch.tensor(mpi.axes)
         sides = torch.stack([size[in_mpi] * du, size[in_mpi] * dv], -1)
         scales[in_mpi] = torch.cat([WIDTH * sides, THICKNESS * sides[:, :1]], -1) * z[:, None]
-        rotations[in_mpi] = quaternion(mpi.axes)
+        qx, qy, qz, qw = Rotation.from_matrix(np.transpose(mpi.axes)).as_quat()
+        rotations[in_mpi] = torch.tensor([qw, qx, qy, qz], dtype=torch.float32)
         # Overlapping splats of this spacing sum to this multiple of their centre value, after a rasteriser's blur.
         overlap = 2 * math.pi * (WIDTH**2 + BLUR / (focal * sides) ** 2).prod(-1).sqrt()
         alphas[in_mpi] = -torch.expm1(-DENSER * depth[in_mpi] / overlap)
     colors = torch.cat([mean(texels.channels[:, :COLORS])[:, None], torch.zeros(total, 3, COLORS)], 1)
     return Splats(means, scales, rotations, alphas.clamp(max=0.999), colors)
-
-
-def quaternion(axes: Any) -> Float[Tensor, "4"]:
-    """Unit quaternion (w, x, y, z) that turns x, y, z into the three axes given."""
-    x, y, z, w = Rotation.from_matrix(np.transpose(axes)).as_quat()
-    return torch.tensor([w, x, y, z], dtype=torch.float32)
 
 
 def write_ply(splats: Splats, path: Path) -> int:

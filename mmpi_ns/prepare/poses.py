@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -48,8 +48,15 @@ def read_poses(path: Path, form: str, axes: str, photos: Sequence[Photo]) -> Kno
     Raises:
         PrepareError: the file is not understood, or fits fewer than two images.
     """
-    form = _guess_format(path) if form == "auto" else form
+    if form == "auto" and (path.is_dir() or path.suffix.lower() == ".json"):
+        form = "matrices" if path.is_dir() else "transforms"
+    elif form == "auto":
+        _, fields = next(_lines(path), (0, []))
+        form = {8: "tum", 12: "kitti"}.get(len(fields), form)
     readers = {"kitti": _read_kitti, "tum": _read_tum, "transforms": _read_transforms, "matrices": _read_matrices}
+    if form not in readers:
+        formats = "KITTI has 12 numbers a line, TUM 8 (time, position, quaternion x y z w)"
+        raise PrepareError(f"--poses {path} is not understood: {formats}.")
     read = readers[form](path, photos)
     opengl = axes == "opengl" or (axes == "auto" and form == "transforms")
     flip = np.diag([1.0, -1.0, -1.0, 1.0]) if opengl else np.eye(4)
@@ -68,33 +75,21 @@ def read_poses(path: Path, form: str, axes: str, photos: Sequence[Photo]) -> Kno
     return replace(read, poses=poses)
 
 
-def _guess_format(path: Path) -> str:
-    if path.is_dir():
-        return "matrices"
-    if path.suffix.lower() == ".json":
-        return "transforms"
-    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
-        fields = line.split("#")[0].replace(",", " ").split()
-        if fields:
-            if len(fields) in (8, 12):
-                return "tum" if len(fields) == 8 else "kitti"
-            break
-    raise PrepareError(
-        f"--poses {path} is not understood: KITTI has 12 numbers a line, TUM 8 (time, position, quaternion x y z w)."
-    )
+def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
+    """Number and fields of each line of a text file that has any; # begins a comment."""
+    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
+        if fields := line.split("#")[0].replace(",", " ").split():
+            yield number, fields
 
 
 def _read_rows(path: Path, width: int) -> Array:
     rows = []
-    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
-        fields = line.split("#")[0].replace(",", " ").split()
-        if not fields:
-            continue
+    for number, fields in _lines(path):
         try:
             rows.append([float(f) for f in fields])
         except ValueError as error:
             raise PrepareError(f"{path}, line {number}: {error}.") from error
-        if len(rows[-1]) != width:
+        if len(fields) != width:
             raise PrepareError(f"{path}, line {number}: {len(fields)} numbers, not {width}.")
     return np.array(rows, dtype=np.float64).reshape(-1, width)
 

@@ -34,7 +34,7 @@ def write_report(
     rows: Mapping[str, str],
     findings: Sequence[Finding],
     warnings: Sequence[str],
-    notes: Sequence[str],
+    note: str,
     scene: Path,
 ) -> None:
     """Writes report.md and report/track.png.
@@ -45,7 +45,7 @@ def write_report(
         rows: what the table says beyond the model's figures, by their names.
         findings: of the checks; listed as warnings and marked in the drawing.
         warnings: further ones, listed first.
-        notes: listed last.
+        note: the last line.
         scene: folder to write to.
     """
     covered = coverage(model)
@@ -75,7 +75,7 @@ def write_report(
         "Share of an image's cells (8 x 6) that hold a keypoint with a point; the least:\n",
         *(f"- {n}: {v:.0%}" for n, v in sorted(covered.items(), key=lambda x: x[1])[:WORST]),
         "\n## Notes\n",
-        "\n".join(f"- {n}" for n in notes) or "None.",
+        f"- {note}",
     ]
     write_text(scene / "report.md", "\n".join(parts) + "\n")
     _draw_track(model, findings, scene / "report" / "track.png")
