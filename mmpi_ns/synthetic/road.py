@@ -35,10 +35,9 @@ class Road:
 
     def curve(self, x: Array) -> tuple[Array, Array]:
         """The curve's y and slope at x."""
-        none, turns = np.zeros_like(x), [(a, w, 2 * np.pi * x / w + p) for a, w, p in self.waves]
-        return sum((a * np.sin(t) for a, _, t in turns), none), sum(
-            (a * 2 * np.pi / w * np.cos(t) for a, w, t in turns), none
-        )
+        turns = [(a, w, 2 * np.pi * x / w + p) for a, w, p in self.waves]
+        slopes = (a * 2 * np.pi / w * np.cos(turn) for a, w, turn in turns)
+        return sum((a * np.sin(turn) for a, _, turn in turns), np.zeros_like(x)), sum(slopes, np.zeros_like(x))
 
     @cached_property
     def _table(self) -> tuple[Array, Array]:
@@ -50,7 +49,7 @@ class Road:
         return x, arc - np.interp(0.0, x, arc)
 
     def at(self, along: Array, aside: Array | float = 0.0) -> tuple[Array, Array]:
-        """Places [N, 2] at an arc length and so far to the left of the middle line, and the heading there [N]."""
+        """Places [N, 2] at arc lengths, ``aside`` to the left of the middle line, and the headings there [N]."""
         x, arc = self._table
         x = np.interp(along, arc, x)
         y, slope = self.curve(x)

@@ -19,7 +19,7 @@ Colors = NDArray[np.float32]
 Ground = Callable[[Array, Array, Array, Noise], Colors]
 """Colours [N, 3] of points [N, 2] on z = 0, seen along unit directions [N, 3] with pixels [N] metres wide."""
 Sky = Callable[[Array, float, Noise], Colors]
-"""Colours [N, 3] of unit directions [N, 3], for pixels so many radians wide."""
+"""Colours [N, 3] of unit directions [N, 3], for pixels of a width in radians."""
 TILE = 64
 """Side of the image tiles whose rays are traced together, pixels."""
 
