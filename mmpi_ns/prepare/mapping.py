@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -182,7 +183,11 @@ def _run(
     folder, total = task.work / "incremental" / attempt.name, len(task.offered)
     done = folder / "done"
     if not done.exists():
-        start = _latest_snapshot(folder / "snapshots") or start
+        for snapshot in sorted((folder / "snapshots").glob("*"), reverse=True):
+            with suppress(ValueError, RuntimeError, OSError):  # the last one may be truncated
+                pycolmap.Reconstruction(snapshot)
+                start = snapshot
+                break
         shutil.rmtree(folder / "models", ignore_errors=True)
         (folder / "models").mkdir(parents=True)
         (folder / "snapshots").mkdir(exist_ok=True)
@@ -214,17 +219,6 @@ def largest_model(folder: Path) -> tuple[pycolmap.Reconstruction, Path] | None:
     """The model with the most images in the subfolders of a folder, and its subfolder; None if there is none."""
     models = [(pycolmap.Reconstruction(p), p) for p in sorted(folder.iterdir()) if p.is_dir()]
     return max(models, key=lambda m: m[0].num_reg_images(), default=None)
-
-
-def _latest_snapshot(folder: Path) -> Path | None:
-    """The newest readable snapshot; the last one may be truncated."""
-    for path in sorted(folder.glob("*"), reverse=True) if folder.is_dir() else ():
-        try:
-            pycolmap.Reconstruction(path)
-        except (ValueError, RuntimeError, OSError):
-            continue
-        return path
-    return None
 
 
 def mapper_options(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +31,7 @@ def exposure_in_words(images: Sequence[Path]) -> str:
 def write_report(
     model: pycolmap.Reconstruction,
     title: str,
-    rows: Mapping[str, str],
+    rows: dict[str, str],
     findings: Sequence[Finding],
     warnings: Sequence[str],
     note: str,
@@ -49,16 +49,15 @@ def write_report(
         scene: folder to write to.
     """
     covered = coverage(model)
-    rows = {
-        **rows,
+    rows = rows | {
         "reprojection error": f"{model.compute_mean_reprojection_error():.3f} px",
         "points": f"{model.num_points3D()}",
         "track length": f"{model.compute_mean_track_length():.1f} images",
         "points seen by an image": f"{model.compute_mean_observations_per_reg_image():.0f}",
         "coverage": f"{np.mean(list(covered.values())):.0%} on average, {min(covered.values()):.0%} at least",
     }
-    for f in sorted(findings, key=lambda f: (f.kind, -f.badness)):
-        warnings = [*warnings, f"{f.kind} {f.image + ': ' if f.image else ''}{f.says}"]
+    by_badness = sorted(findings, key=lambda f: (f.kind, -f.badness))
+    warnings = [*warnings, *(f"{f.kind} {f.image + ': ' if f.image else ''}{f.says}" for f in by_badness)]
     parts = [
         f"# {title}\n",
         "\n".join(["| | |", "|---|---|", *(f"| {k} | {v} |" for k, v in rows.items())]),
