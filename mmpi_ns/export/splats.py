@@ -73,12 +73,12 @@ class Splats:
         return Gaussians(self.means, half @ half.mT, self.alphas)
 
     def basis(self, eye: Float[Tensor, "3"]) -> Float[Tensor, "N 4"]:
-        """(1, d) of each, seen from a point."""
+        """Directional basis (1, d) of each splat, seen from a point."""
         directions = torch.nn.functional.normalize(self.means - eye, dim=-1)
         return torch.cat([torch.ones_like(directions[:, :1]), directions], -1)
 
     def seen_from(self, eye: Float[Tensor, "3"]) -> Float[Tensor, "N 3"]:
-        """Their colours, seen from a point."""
+        """Colours of all splats, seen from a point."""
         return (self.basis(eye)[:, :, None] * self.colors).sum(1).clamp(0, 1)
 
 
@@ -129,7 +129,7 @@ def poses_in(place: Window, scene: BakedScene) -> list[Pose]:
 
 
 def between(poses: list[Pose], fraction: float) -> list[Pose]:
-    """Cameras this far on the way from each to the next one."""
+    """Cameras interpolated at a fraction of the way from each to the next."""
     cameras = []
     for a, b in zip(poses, [*poses[1:], poses[-1]], strict=True):
         (a_turn, a_eye), (b_turn, b_eye) = ((x[:, :3], x[:, 3:]) for x in (np.array(a.to_world), np.array(b.to_world)))
@@ -198,7 +198,7 @@ def _texels(window: BakedWindow, peaks: Float[Tensor, "B 8 8"]) -> _Texels:
 
 
 def _merged(texels: _Texels, is_seen: Bool[Tensor, "T"]) -> tuple[Int[Tensor, "T"], Int[Tensor, "T"]]:
-    """Group of each texel that is seen (-1 for the others), and how often four became one in it."""
+    """Group of each visible texel (-1 for the others), and the number of times that four became one in it."""
     tolerance = texels.channels.new_tensor([AGREEING_ALPHA] + [AGREEING_COLOR] * COLORS)
     tolerance = torch.cat([tolerance, tolerance.new_full((texels.channels.shape[1] - COLORS,), AGREEING_FEATURE)])
     values = torch.cat([texels.alphas[:, None], texels.channels], -1)[is_seen] / tolerance

@@ -20,7 +20,7 @@ WORTH = 0.97
 LARGEST_ERROR = 4.0
 """Reprojection error in pixels above which an observation is dropped."""
 ENOUGH_POINTS = 300
-"""Points of each image, those that most images see, on which a choice between camera models rests."""
+"""Points of each image, the ones that most images see, on which a choice between camera models rests."""
 PARTS = 20
 """Number of images from which the two halves of a capture are also used separately to judge the focal length."""
 WIDE = 0.08
@@ -29,7 +29,7 @@ WIDE = 0.08
 
 @dataclass(frozen=True)
 class Free:
-    """What may be refined of the cameras."""
+    """Camera parameters that may be refined."""
 
     lens: bool
     """Focal length and distortion."""

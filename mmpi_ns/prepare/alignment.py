@@ -70,7 +70,7 @@ def similarity_between(source: Array, target: Array) -> pycolmap.Sim3d:
 
 @dataclass(frozen=True)
 class SceneFrame:
-    """How the model was transformed into the scene."""
+    """Transform from the model to the scene, and its sources in words."""
 
     similarity: pycolmap.Sim3d
     """Scene from model."""

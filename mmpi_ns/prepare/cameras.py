@@ -1,4 +1,4 @@
-"""Which images share a camera, and the intrinsics that SfM starts from."""
+"""Cameras shared by images, and the intrinsics that SfM starts from."""
 
 from __future__ import annotations
 

@@ -137,7 +137,7 @@ def witness_of(name: str, model: pycolmap.Reconstruction, database: Path, offere
 def _pair_evidence(
     model: pycolmap.Reconstruction, database: Path, points: dict[int, Places], rays: dict[int, Array]
 ) -> Pairs:
-    """For every verified pair of registered images, how many matches became points and how well they fit the poses."""
+    """Matches of every verified pair of registered images that became points, and that fit the poses."""
     place = {image_id: i for i, image_id in enumerate(sorted(points))}
     rows: list[tuple[int, ...]] = []
     with pycolmap.Database.open(database) as opened:
@@ -159,12 +159,12 @@ def _pair_evidence(
 
 
 def share(part: Array, whole: Array) -> float:
-    """Sum over sum; 0 of nothing."""
+    """Ratio of two sums; 0 if the second is 0."""
     return float(part.sum() / max(float(whole.sum()), 1.0))
 
 
 def bridges(pairs: Pairs, count: int, part: Array, whole: Array | None = None) -> Array:
-    """For each gap between two registered images, the fraction of the matches across it that hold.
+    """Fraction of the matches across each gap between two registered images that hold.
 
     Args:
         pairs: of the model.

@@ -52,7 +52,7 @@ LEAST_SHARE = 0.2
 
 @dataclass(frozen=True)
 class Task:
-    """What is to be mapped, and where."""
+    """Input of a mapping: matches, images, and the folder for its models."""
 
     database: Path
     """Features and verified matches."""
@@ -216,7 +216,7 @@ def _run(
 
 
 def largest_model(folder: Path) -> tuple[pycolmap.Reconstruction, Path] | None:
-    """The model with the most images in the subfolders of a folder, and its subfolder; None if there is none."""
+    """The model with the most images in the subfolders of a folder, and its subfolder; None without a model."""
     models = [(pycolmap.Reconstruction(p), p) for p in sorted(folder.iterdir()) if p.is_dir()]
     return max(models, key=lambda m: m[0].num_reg_images(), default=None)
 

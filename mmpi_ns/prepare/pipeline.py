@@ -38,7 +38,7 @@ LEAST_SHARE = 0.5
 
 
 class Preparation:
-    """One run of mmpi-prepare; the work folder holds what an interrupted one left."""
+    """A run of mmpi-prepare; the work folder holds what an interrupted run left."""
 
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
@@ -188,7 +188,7 @@ class Preparation:
         return solution, says["focal"], says["groups"]
 
     def _check(self, solution: Solution) -> None:
-        """Refuses a scene of few of the images, and one whose track is wrong."""
+        """Refuses a scene of few of the images, and a scene whose track is wrong."""
         s, count, total = self.settings, solution.model.num_reg_images(), len(self.photos)
         if count < LEAST_SHARE * total and not s.allow_partial:
             groups = "".join(f" Another group of {len(g)}: {in_short(g, 4)}." for g in self.groups)

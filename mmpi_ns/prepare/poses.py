@@ -95,7 +95,7 @@ def _read_rows(path: Path, width: int) -> Array:
 
 
 def _read_kitti(path: Path, photos: Sequence[Photo]) -> KnownPoses:
-    """One line for each image; if there are more lines, the numbers in the file names choose them (counted from 0)."""
+    """KITTI poses: one line for each image; of more lines, the numbers in the file names choose (counted from 0)."""
     rows = _read_rows(path, 12)
     matrices = np.concatenate([rows.reshape(-1, 3, 4), np.tile([[[0.0, 0.0, 0.0, 1.0]]], (len(rows), 1, 1))], 1)
     places: Sequence[int] = range(len(photos))
@@ -110,7 +110,7 @@ def _read_kitti(path: Path, photos: Sequence[Photo]) -> KnownPoses:
 
 
 def _read_tum(path: Path, photos: Sequence[Photo]) -> KnownPoses:
-    """By time stamp if the file names are time stamps, else one line for each image."""
+    """TUM poses: by time stamp if the file names are time stamps, else one line for each image."""
     rows = _read_rows(path, 8)
     if not len(rows):
         raise PrepareError(f"{path} holds no pose.")
@@ -137,7 +137,7 @@ def _read_tum(path: Path, photos: Sequence[Photo]) -> KnownPoses:
 
 
 def _read_matrices(path: Path, photos: Sequence[Photo]) -> KnownPoses:
-    """One text file for each image, by name, else in order."""
+    """4x4 matrices: one text file for each image, by name, else in order."""
     if not path.is_dir():
         raise PrepareError(f"--poses {path}: 4x4 matrices are read from a folder with one text file for each image.")
     files = sorted(
@@ -169,7 +169,7 @@ def _pose_stem(path: Path) -> str:
 
 
 def _read_transforms(path: Path, photos: Sequence[Photo]) -> KnownPoses:
-    """By file name, with intrinsics and lists of train and test files if the file has them."""
+    """Poses of a transforms.json by file name, with its intrinsics and its lists of train and test files, if any."""
     path = path / "transforms.json" if path.is_dir() else path
     try:
         meta = json.loads(path.read_text(encoding="utf-8"))
@@ -190,7 +190,7 @@ def _read_transforms(path: Path, photos: Sequence[Photo]) -> KnownPoses:
 
 
 def _frame_of(photo: Photo, files: Sequence[Path]) -> int | None:
-    """The frame with an image's name, and its folder if several have that name; None if there is none."""
+    """Number of the frame with an image's name, and its folder if several have that name; None without one."""
     for path in (Path(photo.name), Path(photo.source)):
         named = [n for n, f in enumerate(files) if f.stem == path.stem]
         folders = path.parent.parts

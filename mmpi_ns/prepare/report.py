@@ -20,7 +20,7 @@ WORST = 5
 
 
 def exposure_in_words(images: Sequence[Path]) -> str:
-    """How much the exposure of some images varies by their EXIF, for the report."""
+    """Range of the exposures of images by their EXIF, in words."""
     exposures = [e for e in map(exposure_of, images) if e is not None]
     light = [e.time * (e.sensitivity or 1.0) / (e.aperture or 1.0) ** 2 for e in exposures]
     if not light:

@@ -108,7 +108,7 @@ class PlanCommand:
 
 
 def _mark(plan: Path) -> str:
-    """Tells a plan that was edited later from one that was not; a reader of plan.md does not see it."""
+    """Comment with a plan's hash, which reveals later edits of the plan; plan.md does not show it."""
     return f"<!-- plan.json: {hashlib.sha256(plan.read_bytes()).hexdigest()} -->"
 
 

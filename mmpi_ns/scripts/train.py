@@ -50,7 +50,7 @@ def main() -> None:
 
 
 def _end_early(folder: Path) -> NoReturn:
-    """torchrun ends all processes when one dies, and gives them little time to say so."""
+    """Ends this process with a message; torchrun ends all when one dies, and leaves little time for it."""
     message = (
         "Ended early: another process died (see above) or the run was stopped. Finished windows lie in "
         f"{folder / 'windows'}; the same command with --load-dir {folder / 'nerfstudio_models'} goes on from them, "
@@ -61,7 +61,7 @@ def _end_early(folder: Path) -> NoReturn:
 
 
 def _agree(config: TrainerConfig, rank: int) -> None:
-    """One folder for all processes, with one config.yml."""
+    """Gives all processes the same folder, with one config.yml."""
     if config.data:
         config.pipeline.datamanager.data = config.data
     config.set_timestamp()

@@ -29,7 +29,7 @@ PAINTS: tuple[Color, ...] = (
 
 
 class Kit:
-    """Adds solids one by one; all randomness comes from its generator."""
+    """Solids added one by one; all randomness comes from the kit's generator."""
 
     def __init__(self, seed: int, topic: int) -> None:
         self.random = np.random.default_rng([seed, topic])
@@ -56,13 +56,14 @@ class Kit:
         self._add(CYLINDER, center, (radius, radius, height / 2), 0.0, material, colors)
 
     def varied(self, color: Color, by: float = 0.07) -> Color:
-        """A colour near this one."""
+        """A colour near another."""
         return tuple((np.array(color) * (1 + self.random.uniform(-by, by, 3))).clip(0, 1))
 
     def pick(self, colors: Sequence[Color]) -> Color:
         return self.varied(colors[self.random.integers(len(colors))])
 
     def done(self) -> Primitives:
+        """All solids."""
         kind, center, half, yaw, material, colors, offset = zip(*self.rows, strict=True)
         return Primitives.merged(Primitives(
             np.array(kind), np.array(center, float), np.array(half, float), np.array(yaw, float),

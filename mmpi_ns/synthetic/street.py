@@ -35,7 +35,7 @@ STRIDE = (0.03, 0.025)
 
 
 class Street(Kit):
-    """Adds what stands along a road."""
+    """What stands along a road: houses, parked cars, trees, lamps."""
 
     def __init__(self, seed: int, road: Road, topic: int = 1) -> None:
         super().__init__(seed, topic)
