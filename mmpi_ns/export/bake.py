@@ -104,7 +104,7 @@ def poses_of(pipeline: Any) -> list[Pose]:
 
 @dataclass(frozen=True)
 class Compared:
-    """Means over test images."""
+    """Baked and exact images compared: means over test images."""
 
     to_exact: float
     """PSNR of baked images against the exact renderer's, dB."""
