@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from mmpi_ns.capture.matching import new_model
 from mmpi_ns.synthetic.exposure import Exposure
 from mmpi_ns.synthetic.movers import moving_mask
 from mmpi_ns.synthetic.scene import Colors, Scene, render
@@ -201,18 +200,18 @@ def colmap_model(scene: Scene, sfm: SfmPoints) -> Any:
     params = [cameras.focal, cameras.focal, *cameras.center, *(cameras.distortion if is_bent else ())]
     size = {"width": cameras.width, "height": cameras.height}
     camera = pycolmap.Camera(model="OPENCV" if is_bent else "PINHOLE", params=params, camera_id=1, **size)
-    names, poses = [image_name(i) for i in range(len(cameras))], {}
-    for name, pose in zip(names, cameras.camera_to_worlds, strict=True):
-        rotation = np.diag([1.0, -1.0, -1.0]) @ pose[:, :3].T  # world to camera, with y down and z ahead
-        poses[name] = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -rotation @ pose[:, 3])
-    model = new_model([camera], names, [1] * len(names), poses)
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(camera)
     by_camera = np.argsort(sfm.camera, kind="stable")
     bounds = np.searchsorted(sfm.camera[by_camera], np.arange(len(cameras) + 1))
     slot = np.empty(len(by_camera), np.int64)
-    for i in range(len(cameras)):
+    for i, pose in enumerate(cameras.camera_to_worlds):
         rows = by_camera[bounds[i] : bounds[i + 1]]
         slot[rows] = np.arange(len(rows))
-        model.images[i + 1].points2D = pycolmap.Point2DList([pycolmap.Point2D(xy) for xy in sfm.pixel[rows]])
+        rotation = np.diag([1.0, -1.0, -1.0]) @ pose[:, :3].T  # world to camera, with y down and z ahead
+        image = pycolmap.Image(name=image_name(i), camera_id=1, image_id=i + 1, keypoints=sfm.pixel[rows])
+        rigid = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -rotation @ pose[:, 3])
+        model.add_image_with_trivial_frame(image, rigid)
     starts = np.searchsorted(sfm.point, np.arange(len(points) + 1))
     elements = [pycolmap.TrackElement(i, k) for i, k in np.stack([sfm.camera + 1, slot], -1).tolist()]
     for p, (xyz, color) in enumerate(zip(points, sfm.colors, strict=True)):

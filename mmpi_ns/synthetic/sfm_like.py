@@ -62,20 +62,21 @@ def sfm_points(scene: Scene, count: int, noise_pixels: float = 0.3, outliers: fl
             f"Points ({count}) and noise ({noise_pixels}) must not be negative, outliers ({outliers}) lie in [0, 1)."
         )
     random = np.random.default_rng([scene.seed, 5])
-    none = np.zeros(0, np.int64)
-    points, colors, tracks = np.zeros((0, 3)), np.zeros((0, 3), np.uint8), (none, none, np.zeros((0, 2)))
+    points, colors, exact = np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros((0, 2))
+    camera = point = np.zeros(0, np.int64)
     for _ in range(ROUNDS):
         missing = count - len(points)
         if missing <= 0:
             break
-        more_points, more_colors, (camera, point, exact) = _tracked(scene, int(missing * 1.5) + 16, random)
-        more = (camera, point + len(points), exact)
-        tracks = tuple(np.concatenate(columns) for columns in zip(tracks, more, strict=True))
-        points, colors = np.concatenate([points, more_points]), np.concatenate([colors, more_colors])
-    keep = np.zeros(len(points), bool)  # evenly thinned to ``count``
-    keep[np.linspace(0, len(points) - 1, min(count, len(points))).round().astype(int)] = True
-    camera, point, exact = (column[keep[tracks[1]]] for column in tracks)
-    points, colors, point = points[keep], colors[keep], (np.cumsum(keep) - 1)[point]
+        more, more_colors, (cameras, rows, pixels) = _tracked(scene, int(missing * 1.5) + 16, random)
+        camera, point = np.concatenate([camera, cameras]), np.concatenate([point, rows + len(points)])
+        exact = np.concatenate([exact, pixels])
+        points, colors = np.concatenate([points, more]), np.concatenate([colors, more_colors])
+    thinned = np.zeros(len(points), bool)  # evenly, to ``count``
+    thinned[np.linspace(0, len(points) - 1, min(count, len(points))).round().astype(int)] = True
+    keep = thinned[point]
+    camera, point, exact = camera[keep], (np.cumsum(thinned) - 1)[point[keep]], exact[keep]
+    points, colors = points[thinned], colors[thinned]
     pixel = exact + noise_pixels * random.standard_normal(exact.shape)
     moved, outlier, keep, pixel = _misled(scene, points, (camera, point, exact), pixel, outliers, random)
     placed = _triangulated(scene, moved, camera[keep], point[keep], pixel[keep])
