@@ -43,7 +43,7 @@ from mmpi_ns.training.checkpoints import check_there_are_checkpoints
 from mmpi_ns.training.config_files import grouped
 from mmpi_ns.training.individual import individual_rays
 from mmpi_ns.training.losses import LossWeights, batch_losses, over_background, photometric
-from mmpi_ns.training.memory import check_memory
+from mmpi_ns.training.memory import Work, fit_memory
 from mmpi_ns.training.phases import ScheduleConfig, make_schedule
 from mmpi_ns.training.progress import Progress
 from mmpi_ns.training.refined_poses import check_refined_poses, move_rays
@@ -110,16 +110,11 @@ class MMPIModel(Model):
         super().populate_modules()
         config = self.config
         dispatch.choose(config.ops)
-        windows = self._plan()
-        # One head has nothing to blend with, so it trains in one go.
-        joint = config.schedule.training == "joint" or all(plan.num_heads == 1 for plan in windows.plans)
-        phases = replace(config.schedule, training="joint" if joint else "two-phase")
-        self.progress = Progress(windows, make_schedule(phases, max(1, config.total_steps), len(windows)))
         views = self.kwargs.get("metadata", {}).get(TRAINING_VIEWS)
         self.trains = OBSERVATIONS in self.kwargs.get("metadata", {})
-        if self.trains:
-            seen, device = [views_of(window, views) for window in windows.windows], self.kwargs.get("device", "cpu")
-            check_memory(windows, seen, config.colour.feature_channels, not joint, device)
+        windows = self._fitting_plan(views) if self.trains else self._plan(config.placement)
+        phases = replace(config.schedule, training="joint" if self._is_joint(windows) else "two-phase")
+        self.progress = Progress(windows, make_schedule(phases, max(1, config.total_steps), len(windows)))
         self.field = self._new_field(views_of(windows.windows[0], views))
         budget = config.rendering.resident_gib * 2**30
         self.store = WindowStore(config.windows_folder, self._new_field, budget, config.rendering.half_windows)
@@ -140,18 +135,36 @@ class MMPIModel(Model):
         self.run = TrainingRun(self.progress, self.field, self.store, views, release, [*poses], **free)
         self.register_load_state_dict_post_hook(lambda *_: self._after_loading())
 
-    def _plan(self) -> WindowedPlan:
+    def _is_joint(self, windows: WindowedPlan) -> bool:
+        """Whether all MPIs train in one go. One head has nothing to blend with."""
+        return self.config.schedule.training == "joint" or all(plan.num_heads == 1 for plan in windows.plans)
+
+    def _fitting_plan(self, views: TrainingViews | None) -> WindowedPlan:
+        """The plan, with fewer texels than the rule would like where they do not fit in the memory that is free."""
+        config = self.config
+        windows, placement, schedule = self._plan(config.placement), config.placement, config.schedule
+        joint, rays = self._is_joint(windows), self.kwargs["metadata"][RAYS_PER_STEP]
+        work = Work(
+            config.colour.feature_channels, not joint, rays, config.sampling.threshold,
+            all_mpis=not joint and schedule.rays_per_mpi == "all",
+        )  # fmt: skip
+        fixed = config.plan_file is not None or placement.arrangement != "automatic"
+        again = None if fixed else lambda most: self._plan(replace(placement, max_texels=most))
+        device = self.kwargs.get("device", "cpu")
+        return fit_memory(windows, lambda window: views_of(window, views), work, device, again)
+
+    def _plan(self, placement: PlacementConfig) -> WindowedPlan:
         """The plan that is asked for, or the one that the placement rule makes of what the training cameras saw."""
         config, metadata = self.config, self.kwargs.get("metadata", {})
         observations = metadata.get(OBSERVATIONS)
         if observations is not None and config.total_steps == 0:
-            config.total_steps = steps_for(config.method, most_pixels(observations, config.placement))
+            config.total_steps = steps_for(config.method, most_pixels(observations, placement))
         if config.plan_file is not None and (observations is not None or config.plan_file.is_file()):
             return WindowedPlan.load(config.plan_file)
         if observations is None:
             check_there_are_checkpoints(config.windows_folder)
             return WindowedPlan.single(NO_PLAN)
-        return place_windows(observations, config.placement, config.total_steps * metadata[RAYS_PER_STEP])
+        return place_windows(observations, placement, config.total_steps * metadata[RAYS_PER_STEP])
 
     def _new_field(self, views: TrainingViews | None = None) -> MMPIField:
         """A field of this run's settings, of the first window at the first resolution: to train, or to load into."""

@@ -30,7 +30,7 @@ from mmpi_ns.training.checkpoints import (
 )
 from mmpi_ns.training.config_files import check_nothing_left, with_absolute_paths
 from mmpi_ns.training.learning_rates import following
-from mmpi_ns.training.memory import describe, training_bytes
+from mmpi_ns.training.memory import Work, describe, training_bytes
 from mmpi_ns.training.options import check_device, check_ffmpeg, check_run
 from mmpi_ns.training.report import TrainingLog, forecast, next_commands, quick_test
 from mmpi_ns.training.run import TrainingRun
@@ -182,8 +182,9 @@ class MMPITrainer(Trainer):
         """Bytes needed for training each window: tables with their moments, and pixels."""
         run, manager = self._run, self._manager
         blends = any(phase.name == "blend" for phase in run.progress.schedule.phases)
+        work = Work(run.field.feature_channels, blends)
         tables = [
-            training_bytes(plan, run.views_of(w), run.field.feature_channels, blends)
+            training_bytes(plan, run.views_of(w), work, self.device)
             for w, plan in enumerate(run.progress.windows.plans)
         ]
         if len(tables) == 1:
