@@ -23,6 +23,7 @@ from mmpi_ns.capture.rays import PinholeRays
 from mmpi_ns.field.mmpi_field import ColourConfig, MMPIField
 from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.march import MarchOptions
+from mmpi_ns.ops.trial import Shapes
 from mmpi_ns.placement.defaults import steps_for
 from mmpi_ns.placement.rule import PlacementConfig
 from mmpi_ns.placement.split import most_pixels, place_windows
@@ -111,12 +112,14 @@ class MMPIModel(Model):
     def populate_modules(self) -> None:
         super().populate_modules()
         config = self.config
-        dispatch.choose(config.ops)
         views = self.kwargs.get("metadata", {}).get(TRAINING_VIEWS)
         self.trains = OBSERVATIONS in self.kwargs.get("metadata", {})
         windows = self._fitting_plan(views) if self.trains else self._plan(config.placement)
         phases = replace(config.schedule, training="joint" if self._is_joint(windows) else "two-phase")
-        self.progress = Progress(windows, make_schedule(phases, max(1, config.total_steps), len(windows), config.rays_times))
+        count = len(windows)
+        self.progress = Progress(windows, make_schedule(phases, max(1, config.total_steps), count, config.rays_times))
+        self._expect_shapes()
+        dispatch.choose(config.ops)
         self.field = self._new_field(views_of(windows.windows[0], views))
         budget = config.rendering.resident_gib * 2**30
         self.store = WindowStore(config.windows_folder, self._new_field, budget, config.rendering.half_windows)
@@ -186,6 +189,12 @@ class MMPIModel(Model):
         """The plan and the schedule are the checkpoint's now."""
         self.field.shares_depth = self.progress.schedule.is_joint
         self.show.set_options(["all", *self.progress.windows.names])
+        self._expect_shapes()
+
+    def _expect_shapes(self) -> None:
+        """Says what a GPU's kernels will be compiled for."""
+        joint, channels = self.progress.schedule.is_joint, self.config.colour.feature_channels
+        dispatch.expect(Shapes.of(self.progress.windows.plans, blends=not joint, channels=channels))
 
     def get_param_groups(self) -> dict[str, list[Parameter]]:
         return self.run.parameters()

@@ -96,10 +96,11 @@ def launches_noted(noted):
         triton.runtime.JITFunction.run = run
 
 
-def all_launches(setattr):
+def all_launches(setattr, shapes=trial.SMALL):
     """Every kernel launched as on a GPU, with the arguments of the trials.
 
     Args:
+        shapes: of the trials.
         setattr: sets an attribute of an object, for as long as the launches are used.
     """
     march, hits = (importlib.import_module(f"mmpi_ns.ops.march.{name}") for name in ("gpu", "gpu_hits"))
@@ -113,7 +114,7 @@ def all_launches(setattr):
                 setattr(module, "block_size", lambda wanted, device: wanted)
             for many in (1 << 30, 1) if name in ("march", "show_rays") else (1,):  # blocks for few rays, and for many
                 setattr(march, "MANY", many)
-                for given in cases("cpu"):
+                for given in cases("cpu", shapes):
                     trial._outcome(name, "gpu", given)
     return list(noted)
 
