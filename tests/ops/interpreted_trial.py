@@ -11,6 +11,6 @@ from mmpi_ns.ops import trial
 @pytest.mark.parametrize("name", trial.CASES)
 def test_kernels_pass_their_trial_with_the_shapes_of_large_plans(name):
     """Many heads, rays of several hundred samples, eight channels; trials of two-phase training and without it."""
-    trial.run(name, "cpu", trial.Shapes((1, 9), most_samples=600))
-    if name != "show_rays":  # which takes what the march keeps
+    trial.run(name, "cpu", trial.Shapes((9,), cube=name != "show_rays", most_samples=600))
+    if name != "show_rays":  # it takes what the march keeps
         trial.run(name, "cpu", trial.Shapes((33,), cube=False, blends=False))
