@@ -24,6 +24,7 @@ from mmpi_ns.field.mmpi_field import ColourConfig, MMPIField
 from mmpi_ns.field.samples import metadata_of
 from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.march import MarchOptions
+from mmpi_ns.ops.trial import Shapes
 from mmpi_ns.placement.defaults import steps_for
 from mmpi_ns.placement.rule import PlacementConfig
 from mmpi_ns.placement.split import most_pixels, place_windows
@@ -49,7 +50,7 @@ from mmpi_ns.scene.windows import WindowedPlan
 from mmpi_ns.training.batch_rays import check_refined_poses, individual_rays, move_rays
 from mmpi_ns.training.checkpoints import check_there_are_checkpoints
 from mmpi_ns.training.losses import LossWeights, batch_losses, over_background, photometric
-from mmpi_ns.training.memory import check_memory
+from mmpi_ns.training.memory import Work, fit_memory
 from mmpi_ns.training.options import grouped
 from mmpi_ns.training.phases import ScheduleConfig, make_schedule
 from mmpi_ns.training.run import Progress, TrainingRun, views_of
@@ -96,6 +97,8 @@ class MMPIModelConfig(ModelConfig):
     total_steps: int = field(default=1, init=False)
     """Not an option: the trainer sets it from --max-num-iterations; the phases are shares of it. 0: as many as the
     capture needs by the defaults of ``method``."""
+    rays_times: int = field(default=1, init=False)
+    """Not an option: the trainer sets it; how many times the method's rays a step draws on this GPU."""
     method: str = field(default="", init=False)
     """Not an option: the trainer sets it to the name of the method."""
     windows_folder: Path | None = field(default=None, init=False)
@@ -114,18 +117,15 @@ class MMPIModel(Model):
     def populate_modules(self) -> None:
         super().populate_modules()
         config = self.config
-        dispatch.choose(config.ops)
-        windows = self._plan()
-        # One head has nothing to blend with, so it trains in one go.
-        joint = config.schedule.training == "joint" or all(plan.num_heads == 1 for plan in windows.plans)
-        phases = replace(config.schedule, training="joint" if joint else "two-phase")
-        self.progress = Progress(windows, make_schedule(phases, max(1, config.total_steps), len(windows)))
         metadata, device = self.kwargs.get("metadata", {}), self.kwargs.get("device", "cpu")
         views, observations = metadata.get(TRAINING_VIEWS), metadata.get(OBSERVATIONS)
         self.trains = OBSERVATIONS in metadata
-        if self.trains:
-            seen = [views_of(window, views) for window in windows.windows]
-            check_memory(windows, seen, config.colour.feature_channels, not joint, device)
+        windows = self._fitting_plan(views) if self.trains else self._plan(config.placement)
+        phases = replace(config.schedule, training="joint" if self._is_joint(windows) else "two-phase")
+        count = len(windows)
+        self.progress = Progress(windows, make_schedule(phases, max(1, config.total_steps), count, config.rays_times))
+        self._expect_shapes()
+        dispatch.choose(config.ops)
         self.field = self._new_field(views_of(windows.windows[0], views))
         budget = config.rendering.resident_gib * 2**30
         self.store = WindowStore(config.windows_folder, self._new_field, budget, config.rendering.half_windows)
@@ -143,18 +143,37 @@ class MMPIModel(Model):
         self.run = TrainingRun(self.progress, self.field, self.store, views, release, moves, scale_is_free)
         self.register_load_state_dict_post_hook(type(self)._take_plan)
 
-    def _plan(self) -> WindowedPlan:
+    def _is_joint(self, windows: WindowedPlan) -> bool:
+        """Whether all MPIs train in one go. One head has nothing to blend with."""
+        return self.config.schedule.training == "joint" or all(plan.num_heads == 1 for plan in windows.plans)
+
+    def _fitting_plan(self, views: TrainingViews | None) -> WindowedPlan:
+        """The plan, with fewer texels than the rule would like where they do not fit in the memory that is free."""
+        config = self.config
+        windows, placement, schedule = self._plan(config.placement), config.placement, config.schedule
+        joint, rays = self._is_joint(windows), self.kwargs["metadata"][RAYS_PER_STEP]
+        work = Work(
+            config.colour.feature_channels, not joint, rays, config.sampling.threshold,
+            all_mpis=not joint and schedule.rays_per_mpi == "all",
+        )  # fmt: skip
+        fixed = config.plan_file is not None or placement.arrangement != "automatic"
+        again = None if fixed else lambda most: self._plan(replace(placement, max_texels=most))
+        device = self.kwargs.get("device", "cpu")
+        return fit_memory(windows, lambda window: views_of(window, views), work, device, again)
+
+    def _plan(self, placement: PlacementConfig) -> WindowedPlan:
         """Scene plan of the option, or of the placement rule for the observations of the training cameras."""
         config, metadata = self.config, self.kwargs.get("metadata", {})
         observations = metadata.get(OBSERVATIONS)
         if observations is not None and config.total_steps == 0:
-            config.total_steps = steps_for(config.method, most_pixels(observations, config.placement))
+            pixels = most_pixels(observations, placement)
+            config.total_steps = steps_for(config.method, pixels, config.rays_times)
         if config.plan_file is not None and (observations is not None or config.plan_file.is_file()):
             return WindowedPlan.load(config.plan_file)
         if observations is None:
             check_there_are_checkpoints(config.windows_folder)
             return WindowedPlan.single(NO_PLAN)
-        return place_windows(observations, config.placement, config.total_steps * metadata[RAYS_PER_STEP])
+        return place_windows(observations, placement, config.total_steps * metadata[RAYS_PER_STEP])
 
     def _new_field(self, views: TrainingViews | None = None) -> MMPIField:
         """A field of this run's settings, of the first window at the first resolution: to train, or to load into."""
@@ -173,6 +192,12 @@ class MMPIModel(Model):
         """Takes over plan and schedule of a checkpoint that was loaded."""
         self.field.shares_depth = self.progress.schedule.is_joint
         self.show.set_options(["all", *self.progress.windows.names])
+        self._expect_shapes()
+
+    def _expect_shapes(self) -> None:
+        """Says what a GPU's kernels will be compiled for."""
+        joint, channels = self.progress.schedule.is_joint, self.config.colour.feature_channels
+        dispatch.expect(Shapes.of(self.progress.windows.plans, blends=not joint, channels=channels))
 
     def get_param_groups(self) -> dict[str, list[Parameter]]:
         return self.run.parameters()

@@ -5,17 +5,23 @@ that by compiling each kernel once, with the most in it):
 
     pip install --no-deps --target triton-3.1 triton==3.1.0
     PYTHONPATH=triton-3.1:.:tests python tests/triton_compiling.py 75 80 86 89 90
+
+Registers, shared memory, occupancy and traffic of every kernel (docs/results/kernels.md):
+
+    PYTHONPATH=.:tests python tests/triton_compiling.py 80 86 89 90 --write docs/results/kernels.json
 """
 
 from __future__ import annotations
 
 import importlib
+import json
+import re
 import subprocess
 import sys
 import tempfile
 import time
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
@@ -47,6 +53,8 @@ class Launch:
     signature: tuple[tuple[str, str], ...]
     constants: tuple[tuple[str, object], ...]
     num_warps: int
+    bytes_per_item: float = field(default=0.0, compare=False)
+    """Of the arrays with an entry for each ray, sample or row that the kernel works on."""
 
     @property
     def name(self):
@@ -69,6 +77,13 @@ def _type(value):
     return "fp32" if isinstance(value, float) else "i64" if abs(value) >= 2**31 else "i32"
 
 
+def _bytes_per_item(given):
+    """Of a launch, by its arguments: each entry is read or written once at least."""
+    count = next((given[name] for name in ("size", "count", "num_rays") if name in given), 0)
+    arrays = [x for x in given.values() if isinstance(x, torch.Tensor) and count and x.numel() % count == 0]
+    return sum(x.numel() * x.element_size() for x in arrays) / max(1, count)
+
+
 @contextmanager
 def launches_noted(noted):
     """Within, a launch is added to ``noted`` (a dict, for its order) and runs nothing.
@@ -82,9 +97,10 @@ def launches_noted(noted):
         given = dict(zip(self.arg_names, args, strict=False))
         # As a launch does: an integer of 1 becomes a constant.
         ones = {n: 1 for n, v in given.items() if type(v) is int and v == 1 and n not in self.do_not_specialize}
+        moved = _bytes_per_item(given)
         given = {name: _type(value) for name, value in given.items() if name not in ones}
         constants |= ones
-        noted[Launch(self, tuple(given.items()), tuple(constants.items()), num_warps)] = None
+        noted[Launch(self, tuple(given.items()), tuple(constants.items()), num_warps, moved)] = None
         for value in args:
             if isinstance(value, torch.Tensor):
                 value.detach().zero_()
@@ -96,10 +112,11 @@ def launches_noted(noted):
         triton.runtime.JITFunction.run = run
 
 
-def all_launches(setattr):
+def all_launches(setattr, shapes=trial.SMALL):
     """Every kernel launched as on a GPU, with the arguments of the trials.
 
     Args:
+        shapes: of the trials.
         setattr: sets an attribute of an object, for as long as the launches are used.
     """
     march, hits = (importlib.import_module(f"mmpi_ns.ops.march.{name}") for name in ("gpu", "gpu_hits"))
@@ -113,7 +130,7 @@ def all_launches(setattr):
                 setattr(module, "block_size", lambda wanted, device: wanted)
             for many in (1 << 30, 1) if name in ("march", "show_rays") else (1,):  # blocks for few rays, and for many
                 setattr(march, "MANY", many)
-                for given in cases("cpu"):
+                for given in cases("cpu", shapes):
                     trial._outcome(name, "gpu", given)
     return list(noted)
 
@@ -144,6 +161,76 @@ def spills(kernel):
     return "STACK:0" not in found and "REG:255" in found
 
 
+WARPS = {80: 64, 86: 48, 89: 48, 90: 64}
+"""That a multiprocessor holds at most,"""
+PROGRAMS = {80: 32, 86: 16, 89: 24, 90: 32}
+"""programs,"""
+SHARED = {80: 164, 86: 100, 89: 100, 90: 228}
+"""and KiB of shared memory, of which each program takes one more than it asks for."""
+REGISTERS = 65536
+BANDWIDTH = {80: 2039e9, 86: 936e9, 89: 1008e9, 90: 3350e9}
+"""Bytes a second of an A100 80 GB, RTX 3090, RTX 4090 and H100 SXM (their makers' figures)."""
+SHAPES = trial.Shapes((9,), most_samples=300)
+"""Nine MPIs and a cube, blended, eight channels, some three hundred samples a ray."""
+
+
+def occupancy(registers, shared, warps, architecture):
+    """Warps of a kernel that a multiprocessor has at a time, and the share of those that it could have."""
+    per_warp = -(-registers * 32 // 256) * 256
+    programs = min(PROGRAMS[architecture], WARPS[architecture] // warps, REGISTERS // per_warp // warps,
+                   int(SHARED[architecture] * 1024 // (shared + 1024)))  # fmt: skip
+    return programs * warps, programs * warps / WARPS[architecture]
+
+
+def measured(launch, architecture):
+    """A row of the table."""
+    kernel = launch.compiled(architecture)
+    said = resources(kernel)
+    registers, stack = (int(re.search(rf"{name}:(\d+)", said)[1]) for name in ("REG", "STACK"))
+    warps, share = occupancy(registers, kernel.metadata.shared, launch.num_warps, architecture)
+    row = {"registers": registers, "shared": kernel.metadata.shared, "stack": stack, "warps": warps}
+    row |= {"spills": spills(kernel), "occupancy": round(share, 2)}
+    bytes_per_item = round(launch.bytes_per_item, 1)
+    roof = round(BANDWIDTH[architecture] / bytes_per_item / 1e6) if bytes_per_item else None
+    return row | {"bytes_per_item": bytes_per_item, "million_items_per_s": roof}
+
+
+def write_table(path, architectures):
+    """Writes what every kernel takes on every architecture, as JSON and, beside it, as a page."""
+    rows = {}
+    for launch in largest_launches(all_launches(setattr, SHAPES)):
+        rows[launch.name] = {f"sm_{a}": measured(launch, a) for a in architectures}
+        print(launch.name, rows[launch.name], flush=True)
+        content = {"triton": triton.__version__, "shapes": SHAPES._asdict(), "rows": rows}
+        path.write_text(json.dumps(content, indent=1), encoding="utf-8")
+        path.with_suffix(".md").write_text(page(content), encoding="utf-8")
+
+
+def page(content):
+    """The table as a page."""
+    names = list(next(iter(content["rows"].values())))
+    lines = [
+        "# What the GPU's kernels take", "",
+        "From their compiled form, without a device: `PYTHONPATH=.:tests python tests/triton_compiling.py "
+        f"{' '.join(n.removeprefix('sm_') for n in names)} --write docs/results/kernels.json` (Triton "
+        f"{content['triton']}, the launch of each kernel with the most in it, for nine MPIs and a cube, blended, eight "
+        "channels and some three hundred samples a ray).", "",
+        "Each cell: registers of a thread / bytes of shared memory of a program / occupancy, the share of a "
+        "multiprocessor's warps that fit. Bytes are those of the arrays with an entry for each ray, sample or row, "
+        "read or written once; what kernels look up in tables comes on top. The roof is the memory's bandwidth over "
+        "these bytes.", "",
+        "| kernel | " + " | ".join(names) + " | spills | bytes an item | roof, A100 / H100, million items/s |",
+        "|---|" + "---|" * (len(names) + 3),
+    ]  # fmt: skip
+    for name, row in content["rows"].items():
+        cells = [f"{row[n]['registers']} / {row[n]['shared']} / {100 * row[n]['occupancy']:.0f} %" for n in names]
+        spilling = [n for n in names if row[n]["spills"]]
+        roofs = " / ".join(f"{row[n]['million_items_per_s'] or '-'}" for n in ("sm_80", "sm_90") if n in row)
+        cells += [", ".join(spilling) or "none", str(row[names[0]]["bytes_per_item"]), roofs]
+        lines.append(f"| `{name}` | {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
+
+
 def main(architectures, largest):
     """Compiles all, or the largest of each kernel, and says what does not compile."""
     launches, failed = all_launches(setattr), 0
@@ -165,4 +252,7 @@ def main(architectures, largest):
 
 
 if __name__ == "__main__":
+    if "--write" in sys.argv:
+        place = Path(sys.argv[sys.argv.index("--write") + 1])
+        sys.exit(write_table(place, [int(word) for word in sys.argv[1:] if word.isdigit()] or list(WARPS)))
     sys.exit(main([int(word) for word in sys.argv[1:] if word.isdigit()] or ARCHITECTURES, "--largest" in sys.argv))

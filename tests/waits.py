@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import traceback
 import warnings
+import weakref
 from collections import Counter, defaultdict
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,6 +17,7 @@ from training_runs import ready, trainer_config
 
 import mmpi_ns
 from mmpi_ns.capture.rays import PinholeRays
+from mmpi_ns.training.memory import Work, step_bytes
 
 WAITING = {
     "_local_scalar_dense",
@@ -46,6 +48,10 @@ class Waits(TorchDispatchMode):
         self.found: Counter[str] = Counter()
         self.launches = 0
         """Kernels, torch's and ours: operations that are no views and allocate nothing alone."""
+        self.live = self.peak = 0
+        """Bytes of arrays that were made within and are there still, and the most that there were."""
+        self.reserved = 0
+        """Bytes that are kept free for a step (``memory.step_bytes``)."""
         self._paused = False
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
@@ -57,7 +63,22 @@ class Waits(TorchDispatchMode):
         if name in WAITING or by_mask or by_counts:
             self.note(name)
         self.launches += not (self._paused or func.is_view or name.startswith(NO_LAUNCH))
-        return func(*args, **(kwargs or {}))
+        made = func(*args, **(kwargs or {}))
+        if not (self._paused or func.is_view or name.endswith("_")):
+            for x in made if isinstance(made, tuple | list) else [made]:
+                if isinstance(x, torch.Tensor):
+                    self._weigh(x.untyped_storage())
+        return made
+
+    def _weigh(self, storage) -> None:
+        size = storage.nbytes()
+
+        def gone() -> None:
+            self.live -= size
+
+        self.live += size
+        self.peak = max(self.peak, self.live)
+        weakref.finalize(storage, gone)
 
     def note(self, name: str) -> None:
         if self._paused:
@@ -159,6 +180,9 @@ def waits_of_phases(scene, plan_file, folder, training, device, counted):
     config.machine.device_type = device
     trainer = ready(config)
     trainer.pipeline.train()
+    model = trainer.pipeline.model
+    work = Work(model.field.feature_channels, training == "two-phase", 16, model.config.sampling.threshold)
+    reserved = step_bytes(model.progress.windows.plans[0], work)
     manager, found = trainer.pipeline.datamanager, {}
     del manager.train_ray_generator
     manager.train_ray_generator = PinholeRays.of(manager.train_dataset.cameras, device)  # on a CPU as on a GPU
@@ -169,6 +193,7 @@ def waits_of_phases(scene, plan_file, folder, training, device, counted):
             with counted() as waits:
                 _run(trainer, step)
             found[phase] = waits
+            waits.reserved = reserved
         else:
             _run(trainer, step)  # packs the scene's constants
     return found

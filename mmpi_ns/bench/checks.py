@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -84,9 +85,9 @@ def marched(s: Scene, name: str, exact: Scene) -> list[Check]:
 
 
 def marches(device: str, rehearse: bool) -> list[Check]:
-    """One, four and nine heads, with and without the cube, blended and not."""
+    """One, four, nine and 33 MPIs, with and without the cube, blended and not."""
     cases: list[tuple[int, bool, CubePlan | None]]
-    cases = [(4, True, CUBE), (1, False, None), (4, False, None), (4, True, None), (9, False, CUBE)]
+    cases = [(4, True, CUBE), (1, False, None), (4, False, None), (4, True, None), (9, False, CUBE), (33, True, None)]
     checks = []
     for count, blends, cube in cases[: 1 if rehearse else None]:
         name = f"{count} MPIs{' and the cube' if cube else ''}, {'' if blends else 'no '}blending"
@@ -146,7 +147,9 @@ def variations(device: str, texels: int) -> list[Check]:
     """Total variation of MPIs and a cube with its gradient."""
     field = random_scene(3, 1, False, cube=CUBE).field.to(device)
     table = _draw(device, len(field.density), 9) * 2
-    rows = torch.randperm(len(table), generator=torch.Generator().manual_seed(1))[:texels].to(device)
+    rows = torch.cat([grid.rows for grid in field.grids])  # not those of bricks that stick out over a plane's border
+    some = torch.randperm(len(rows), generator=torch.Generator().manual_seed(1))[:texels]
+    rows = rows[some.to(rows.device)].sort().values.to(device)
 
     def work(dtype: torch.dtype) -> tuple[Tensor, ...]:
         values = table[rows].to(dtype).requires_grad_()
@@ -174,7 +177,9 @@ def compositing_kernels(device: str, rays: int, slots: int) -> list[Check]:
         assert leaf.grad is not None
         return composite.weights, composite.transmittance, leaf.grad
 
-    return _twice({f"compositing: {name}": 5e-6 for name in ("weights", "transmittance", "gradient")}, work)
+    return _twice(
+        {f"compositing {slots} samples: {name}": 5e-6 for name in ("weights", "transmittance", "gradient")}, work
+    )
 
 
 def adam(device: str, rows: int) -> list[Check]:
@@ -209,7 +214,7 @@ def run_checks(device: str, rehearse: bool) -> dict[str, Any]:
     groups: list[Callable[[], list[Check]]] = [  # at the sizes of a training step, or small
         lambda: interpolation(device, size),
         lambda: distinct_rows(device, size),
-        lambda: compositing_kernels(device, 20 if rehearse else 4096, 37 if rehearse else 150),
+        *(partial(compositing_kernels, device, 20 if rehearse else 4096, slots) for slots in (16, 37, 64, 300, 1000)),
         lambda: variations(device, 200 if rehearse else 100_000),
         lambda: adam(device, size),
         lambda: marches(device, rehearse),

@@ -7,6 +7,7 @@ import io
 import json
 import platform
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -19,6 +20,7 @@ from mmpi_ns.bench.checks import run_checks
 from mmpi_ns.bench.machine import processor
 from mmpi_ns.bench.trainers import JOINT, P, Scene, Steps, has_pycolmap, no_tracks, train_words
 from mmpi_ns.ops import dispatch
+from mmpi_ns.ops.trial import EVERY, SMALL, Shapes
 from mmpi_ns.synthetic.catalogue import make_scene
 from mmpi_ns.synthetic.dataset import write_dataset
 
@@ -46,7 +48,8 @@ class Gpu:
             raise ValueError(
                 "torch sees no CUDA device: run it where there is one, or try this processor with --quick."
             )
-        report = run_quick(street(self.folder / "street", 10, 155, 47, 400), (self.folder / "run").resolve(), RAYS)
+        data, shapes = street(self.folder / "street", 10, 155, 47, 400), (SMALL,) if self.quick else EVERY
+        report = run_quick(data, (self.folder / "run").resolve(), RAYS, shapes)
         if not self.quick:
             report |= run_checks("cuda", rehearse=False)
             for check in report["checks"]:
@@ -87,12 +90,16 @@ def environment() -> dict[str, Any]:
     return report
 
 
-def try_operations(device: str) -> dict[str, str | None]:
-    """Every operation with a compiled form for a device: None where it works, else why not."""
+def try_operations(device: str, every: Sequence[Shapes] = (SMALL,)) -> dict[str, str | None]:
+    """Every operation with a compiled form for a device: None where it works for all shapes, else why not."""
     form = "gpu" if device == "cuda" else "cpu"
-    names = [name for name, each in dispatch.operations().items() if form in each.compiled]
+    faults: dict[str, str | None] = {n: None for n, each in dispatch.operations().items() if form in each.compiled}
     with contextlib.redirect_stdout(io.StringIO()):  # the log of dispatch: it is said here
-        return {name: dispatch.fault(name if device == "cuda" else "C++") for name in names}
+        for shapes in every:
+            dispatch.expect(shapes, afresh=True)
+            for name, reason in faults.items():
+                faults[name] = reason or dispatch.fault(name if device == "cuda" else "C++")
+    return faults
 
 
 def time_training(device: str, data: Path, work: Path, rays: int) -> dict[str, Any]:
@@ -109,7 +116,7 @@ def time_training(device: str, data: Path, work: Path, rays: int) -> dict[str, A
     return timed | {"peak_gib": peak / 2**30}
 
 
-def run_quick(data: Path, work: Path, rays: int) -> dict[str, Any]:
+def run_quick(data: Path, work: Path, rays: int, every: Sequence[Shapes] = (SMALL,)) -> dict[str, Any]:
     """Looks, tries, times, and says so line by line: environment, operations (why each falls back, or None), times of
     a small scene, and ``well``, the verdict."""
     report: dict[str, Any] = {"environment": environment()}
@@ -120,7 +127,7 @@ def run_quick(data: Path, work: Path, rays: int) -> dict[str, Any]:
         print(
             "torch sees no GPU, so nothing is said of one here: what follows is this machine's processor.", flush=True
         )
-    report["device"], report["operations"] = device, try_operations(device)
+    report["device"], report["operations"] = device, try_operations(device, every)
     slow = {name: reason for name, reason in report["operations"].items() if reason is not None}
     for name in report["operations"]:
         print(f"{name}: {'plain torch, since ' + slow[name] if name in slow else 'ok'}", flush=True)

@@ -177,7 +177,7 @@ class TexelTables(Field):
         return kept
 
     def _reachable(self) -> Bool[Tensor, "T"] | None:
-        return None if self.views is None else reachable_tiles(self.views, self.plan)
+        return None if self.views is None else reachable_tiles(self.views, self.plan, self.density.device)
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
         """Takes plan, resolution and tiles from the checkpoint first, so that all shapes fit."""

@@ -64,9 +64,13 @@ def library_file() -> Path:
     except OSError:
         processor = f"{platform.machine()} {platform.processor()} {platform.node()}"
     parts = [*texts, " ".join([*compiler(), *FLAGS]).encode(), processor.encode()]
-    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mmpi_ns"
     key = hashlib.sha256(b"\0".join(parts)).hexdigest()[:16]
-    return folder / f"kernels-{key}.so"
+    return cache_folder() / f"kernels-{key}.so"
+
+
+def cache_folder() -> Path:
+    """Where what was compiled, or tried, is remembered."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mmpi_ns"
 
 
 @functools.cache

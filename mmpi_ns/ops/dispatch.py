@@ -10,10 +10,13 @@ import functools
 import importlib
 import inspect
 import os
+import subprocess
+import sysconfig
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from typing import Any, Generic, Literal, ParamSpec, TypeVar
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Generic, Literal, ParamSpec, TypeVar
 
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -22,6 +25,9 @@ from torch import Tensor
 from mmpi_ns.ops import build
 from mmpi_ns.ops.shapes import check_shapes
 from mmpi_ns.utils.errors import InputError
+
+if TYPE_CHECKING:
+    from mmpi_ns.ops.trial import Shapes
 
 Route = Literal["auto", "torch", "native"]
 Form = Literal["reference", "cpu", "gpu"]
@@ -38,6 +44,9 @@ _interpreting = False
 _faults: dict[str, str | None] = {}
 """What is known of the compiler ("C++"), of Triton, and of each operation's GPU form: None is well, else why not."""
 _trying = threading.RLock()
+_shapes: Shapes | None = None
+"""What kernels are tried with; None: two MPIs and a cube."""
+_tries_afresh = False
 
 
 class Operation(Generic[P, R]):
@@ -158,6 +167,23 @@ def choose(path: Route) -> None:
         )
 
 
+def expect(shapes: Shapes, afresh: bool = False) -> None:
+    """Kernels that have not been tried with these shapes are, before they are used.
+
+    Args:
+        shapes: of the run at hand.
+        afresh: also what passed on this device before.
+    """
+    global _shapes, _tries_afresh
+    with _trying:
+        if afresh or (shapes != _shapes and not _interpreting):  # the interpreter would take minutes
+            _shapes, _tries_afresh = shapes, afresh
+            for name, each in operations().items():
+                if "gpu" in each.compiled:
+                    _faults.pop(name, None)
+            _announce.cache_clear()
+
+
 @contextmanager
 def chosen(path: Route) -> Iterator[None]:
     """Within the block, operations use these forms."""
@@ -212,10 +238,49 @@ def _try(name: str) -> str | None:
         return None
     if (reason := fault("Triton")) is not None:
         return reason
-    try:  # the module tries operations, so it comes after this one
-        importlib.import_module("mmpi_ns.ops.trial").run(name, "cpu" if _interpreting else "cuda")
+    try:
+        _try_kernels(name)
     except Exception as error:  # a driver, a compiler or a cache folder may fail in many ways: all mean plain torch
+        if lacking := _lacking(error):
+            _faults["Triton"] = _say(lacking)  # no other kernel will do better
+            return lacking
         return _say(f"its Triton kernel fails on this device ({_words(error)})", f"Plain torch for {name}")
+    return None
+
+
+def _try_kernels(name: str) -> None:
+    """Tries an operation's kernels with the shapes at hand, unless they passed before on this device.
+
+    Raises:
+        Exception: whatever is amiss with them.
+    """
+    trial = importlib.import_module("mmpi_ns.ops.trial")  # which tries operations, so it comes after this one
+    shapes = _shapes or trial.SMALL
+    if _interpreting:
+        return trial.run(name, "cpu", shapes)
+    record: Path = trial.record(name, shapes)
+    if _tries_afresh or not record.is_file():
+        _announce()
+        trial.run(name, "cuda", shapes)
+        record.parent.mkdir(parents=True, exist_ok=True)
+        record.touch()
+
+
+@functools.cache
+def _announce() -> None:
+    CONSOLE.print(f"Compiling kernels for {torch.cuda.get_device_name()}: about a minute, once.")
+
+
+def _lacking(error: Exception) -> str | None:
+    """What Triton lacks to start any kernel: it has a piece of C compiled for each."""
+    if isinstance(error, RuntimeError) and "C compiler" in str(error):
+        return "Triton finds no C compiler: install gcc"
+    if isinstance(error, subprocess.CalledProcessError):
+        include = Path(sysconfig.get_paths()["include"])
+        if not (include / "Python.h").is_file():
+            version = sysconfig.get_python_version()
+            return f"Triton needs Python's headers, and {include / 'Python.h'} is missing: install python{version}-dev"
+        return f"{Path(error.cmd[0]).name} cannot compile what starts Triton's kernels; its words are above"
     return None
 
 

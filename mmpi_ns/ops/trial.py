@@ -1,25 +1,28 @@
-"""Tries an operation's GPU form on a toy scene: on the current device it must agree with the reference.
+"""Tries an operation's GPU form on toy scenes: on the current device it must agree with the reference.
 
-This also compiles the kernels, so that an incompatible Triton release, driver or architecture is noticed here and not
-in the first step of a training.
+The scenes have the shapes that kernels are compiled for in the run at hand: heads, channels, samples of a ray. So an
+incompatible Triton release, driver or architecture is noticed here and not in the first step of a training, or never.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import hashlib
+from collections.abc import Callable, Iterable
 from dataclasses import fields, is_dataclass
-from typing import Any
+from importlib import import_module
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from mmpi_ns.ops import dispatch
+from mmpi_ns.ops import build, dispatch
 from mmpi_ns.ops.adam import AdamConstants
 from mmpi_ns.ops.gather import Taps
 from mmpi_ns.ops.layout import SceneLayout, Tables
 from mmpi_ns.ops.march import MarchOptions, Rays
 from mmpi_ns.scene.geometry import Cube, Frames
-from mmpi_ns.scene.plan import CubePlan, MPIPlan
+from mmpi_ns.scene.plan import CubePlan, MPIPlan, ScenePlan
 from mmpi_ns.scene.texels import BRICK, make_grids
 
 CLOSE = 1e-3
@@ -27,9 +30,12 @@ CLOSE = 1e-3
 FEW = 1e-3
 """Share of numbers that may differ: two samples at nearly one distance, or half of a ray's mass at nearly one sample,
 come out either way. Of forty rays none may."""
-RAYS, CHANNELS, ROWS = 40, 9, 300
+RAYS, ROWS = 40, 300
 MANY_RAYS = 1 << 14
 """From so many on the march takes larger blocks."""
+WIDTHS = tuple(1 << n for n in range(4, 14))
+"""Widths that compositing is compiled for."""
+DRIVER = Path("/proc/driver/nvidia/version")
 AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
@@ -37,14 +43,45 @@ class Disagreement(Exception):
     """A kernel ran and disagrees with its reference."""
 
 
-def run(name: str, device: str) -> None:
+class Shapes(NamedTuple):
+    """What kernels are compiled for in a run."""
+
+    mpis: tuple[int, ...] = (2,)
+    """Numbers of MPIs of the windows."""
+    cube: bool = True
+    blends: bool = True
+    """Whether samples are blended by reliability."""
+    channels: int = 8
+    """Of the colour features of a texel; density and reliability have one."""
+    most_samples: int = 20
+    """Of a ray."""
+
+    @staticmethod
+    def of(plans: Iterable[ScenePlan], blends: bool, channels: int) -> Shapes:
+        """The shapes of a run's windows."""
+        plans = tuple(plans)
+        mpis, cube = tuple(sorted({len(p.mpis) for p in plans})), any(p.cube is not None for p in plans)
+        return Shapes(mpis, cube, blends, channels, max(p.samples_per_ray for p in plans))
+
+    @property
+    def widths(self) -> list[int]:
+        """Samples of the widest ray of batches, one number for each width that compositing is compiled for."""
+        return [5 * w // 8 for w in WIDTHS if w // 2 < max(self.most_samples, 10)]
+
+
+SMALL = Shapes()
+EVERY = (Shapes((1, 2, 5, 9, 33), most_samples=1000), Shapes((1, 4, 16, 64), cube=False, channels=9))
+"""What plans commonly need: for checks that no plan asks for."""
+
+
+def run(name: str, device: str, shapes: Shapes = SMALL) -> None:
     """Tries one operation on a device.
 
     Raises:
         Exception: whatever Triton, its compiler or the driver finds amiss.
         Disagreement: the results differ.
     """
-    for arguments in CASES[name](device):
+    for arguments in CASES[name](device, shapes):
         kernel = _outcome(name, "gpu", arguments)
         with dispatch.chosen("torch"):
             reference = _outcome(name, "reference", arguments)
@@ -57,6 +94,16 @@ def run(name: str, device: str) -> None:
             off = ~((a - b).abs() <= close * b.abs().max().clamp(min=1e-6)) if b.numel() else b
             if off.numel() and (share := float(off.double().mean())) > FEW:
                 raise Disagreement(f"{share:.2g} of its numbers are not those of plain torch")
+
+
+def record(name: str, shapes: Shapes) -> Path:
+    """The file that is there once an operation has passed its trial on this GPU, with these versions and sources."""
+    device = torch.cuda.get_device_properties(torch.cuda.current_device())
+    driver = DRIVER.read_bytes() if DRIVER.is_file() else b""
+    versions = (device.name, device.major, device.minor, torch.__version__, import_module("triton").__version__)
+    sources = (path.read_bytes() for path in sorted(build.OPS.rglob("*.py")))
+    key = hashlib.sha256(b"\0".join([repr((name, shapes, versions)).encode(), driver, *sources])).hexdigest()
+    return build.cache_folder() / f"tried-{name}-{key[:16]}"
 
 
 def _outcome(name: str, form: dispatch.Form, arguments: tuple) -> list[Tensor]:
@@ -90,20 +137,19 @@ def _random(device: str, *shape: int) -> Tensor:
     return torch.rand(*shape, generator=torch.Generator().manual_seed(sum(shape))).to(device)
 
 
-def _scene(device: str, with_cube: bool) -> tuple[SceneLayout, Tables]:
-    """Two thin MPIs that face the same way, with all texels stored, and a cube among their planes."""
-    mpis = tuple(
-        MPIPlan(str(k), (0.31 * k, 0.0, -0.53 * k), AXES, 1.0, (-1.0, 1.0, -0.8, 0.8), 6, 9, 11) for k in range(2)
-    )
-    shapes, cube = [(m.planes, m.height, m.width) for m in mpis], None
+def _scene(device: str, with_cube: bool, count: int = 2) -> tuple[SceneLayout, Tables]:
+    """Thin MPIs that face the same way, with all texels stored, and a cube among their planes."""
+    places = ((0.31 * (k % 5), 0.003 * k, -0.53 * (k % 7) - 0.0137 * (k // 7)) for k in range(count))
+    mpis = tuple(MPIPlan(str(k), place, AXES, 1.0, (-1.0, 1.0, -0.8, 0.8), 6, 9, 11) for k, place in enumerate(places))
+    sizes, cube = [(m.planes, m.height, m.width) for m in mpis], None
     if with_cube:
         plan = CubePlan((-1.1, -0.9, 1.9), (0.95, 1.05, 4.3), (4, 5, 6))
-        shapes, cube = [*shapes, plan.shape], Cube.pack(plan, 1.0, device=device)
-    tiles = torch.arange(1, make_grids(shapes)[0].tiles.numel() + 1, dtype=torch.int32)
-    grids = make_grids(shapes, tiles.to(device))
+        sizes, cube = [*sizes, plan.shape], Cube.pack(plan, 1.0, device=device)
+    tiles = torch.arange(1, make_grids(sizes)[0].tiles.numel() + 1, dtype=torch.int32)
+    grids = make_grids(sizes, tiles.to(device))
     frames, rows = Frames.pack(mpis, device=device), len(grids[0].places) * BRICK
     biases = [torch.full((m.planes,), -5.0, device=device) for m in mpis]
-    layout = SceneLayout(mpis, frames, grids, biases, 1.0, cube, -5.0, 1.0)
+    layout = SceneLayout(mpis, frames, grids, biases, min(1.0, 2 / count), cube, -5.0, 1.0)  # not opaque
     touched = (_random(device, rows) > 0.2).to(torch.uint8)
     return layout, Tables(_random(device, rows, 1) - 0.5, _random(device, rows, 1), touched)
 
@@ -116,18 +162,19 @@ def _rays(device: str, count: int = RAYS) -> tuple[Tensor, Tensor, Tensor, Tenso
     return origins, torch.nn.functional.normalize(directions, dim=-1), near, torch.full_like(near, torch.inf)
 
 
-def _marches(device: str, many: bool | None = None) -> list[tuple]:
+def _marches(device: str, shapes: Shapes, many: bool | None = None) -> list[tuple]:
     """Also of many rays where the kernels do not take minutes for them, by Triton's interpreter."""
-    many, cases = device == "cuda" if many is None else many, []
-    for with_cube, options, count in (
-        (True, MarchOptions(0.0), RAYS),
-        (True, MarchOptions(0.01, blends=True), RAYS),
-        (False, MarchOptions(0.01), RAYS),
-        # All are kept: some sample would weigh what the threshold says.
-        *([(True, MarchOptions(0.0, blends=True), MANY_RAYS)] if many else []),
-    ):
-        layout, tables = _scene(device, with_cube)
-        cases.append((layout, tables, Rays(*_rays(device, count)), options))
+    counts = (RAYS, MANY_RAYS) if (device == "cuda" if many is None else many) else (RAYS,)
+    cases = []
+    for mpis in shapes.mpis:
+        # Many are all kept: some sample would weigh what the threshold says.
+        ways = [(count, MarchOptions(0.02 / max(mpis, 2) if count == RAYS else 0.0)) for count in counts]
+        ways += [(count, options._replace(blends=True)) for count, options in ways] if shapes.blends else []
+        layout, tables = _scene(device, shapes.cube, mpis)
+        cases += [
+            (layout, tables, Rays(*_rays(device, count)), options)
+            for count, options in [*ways, (RAYS, MarchOptions(0.0))]
+        ]
     return cases
 
 
@@ -136,24 +183,46 @@ def _entries(device: str, *shape: int) -> Tensor:
     return (_random(device, *shape) * (ROWS // 3)).long() * 3
 
 
-def _variations(device: str) -> list[tuple]:
-    layout = _scene(device, True)[0]
-    table = 3 * _random(device, len(layout.grids[0].places) * BRICK, CHANNELS)
-    rows = torch.cat([grid.rows for grid in layout.grids])[::3]
-    return [(table[rows].requires_grad_(), table, rows, layout, [(0.5, 2.0, 1.0)] * layout.num_heads)]
+def _texel_rows(device: str, shapes: Shapes) -> list[tuple]:
+    heads = (torch.arange(RAYS, device=device) * 2) // RAYS
+    return [(_scene(device, shapes.cube)[0], heads, heads + 2, 2 * _random(device, RAYS, 3) - 1)]
 
 
-def _adams(device: str) -> list[tuple]:
-    moments, grad = _random(device, ROWS, 2, CHANNELS), _random(device, ROWS // 3, CHANNELS) - 0.5
-    step = (
-        3 * torch.arange(ROWS // 3, device=device),
-        grad * (grad.abs() > 0.1),
-        AdamConstants(0.9, 0.99, 0.2, 1e-8, 0.1),
-    )
-    return [(_random(device, ROWS, CHANNELS), m, *step) for m in (moments, moments.bfloat16())]
+def _composites(device: str, shapes: Shapes) -> list[tuple]:
+    """Rays of every width, at whose ends some light is left, thin samples and opaque ones among theirs."""
+    return [
+        (
+            (_random(device, RAYS, slots) ** 3 * min(1.0, 20 / slots)).requires_grad_(),
+            torch.arange(slots, device=device) < _entries(device, RAYS, 1) * slots // 20,
+            0.01 * _random(device, RAYS, slots),
+            _random(device, RAYS, 1),
+        )
+        for slots in shapes.widths
+    ]
 
 
-def _gathers(device: str) -> list[tuple]:
+def _variations(device: str, shapes: Shapes) -> list[tuple]:
+    cases = []
+    for mpis in shapes.mpis:
+        layout = _scene(device, shapes.cube, mpis)[0]
+        rows = torch.cat([grid.rows for grid in layout.grids])[::3]
+        for channels in (1, shapes.channels):
+            table = 3 * _random(device, len(layout.grids[0].places) * BRICK, channels)
+            scales = [(0.5, 2.0, 1.0)] * layout.num_heads
+            cases.append((table[rows].requires_grad_(), table, rows, layout, scales))
+    return cases
+
+
+def _adams(device: str, shapes: Shapes) -> list[tuple]:
+    cases, rows = [], 3 * torch.arange(ROWS // 3, device=device)
+    for channels in (1, shapes.channels):
+        moments, grad = _random(device, ROWS, 2, channels), _random(device, ROWS // 3, channels) - 0.5
+        step = (rows, grad * (grad.abs() > 0.1), AdamConstants(0.9, 0.99, 0.2, 1e-8, 0.1))
+        cases += [(_random(device, ROWS, channels), m, *step) for m in (moments, moments.bfloat16())]
+    return cases
+
+
+def _gathers(device: str, shapes: Shapes) -> list[tuple]:
     """Samples with known texels, of planes and of both planes and the cube, that move and that do not; texels with
     gradients and without."""
     weights, chosen = 0.1 * _random(device, RAYS, 4), torch.arange(RAYS, device=device) % 5 > 0
@@ -162,43 +231,33 @@ def _gathers(device: str) -> list[tuple]:
         shares = [(_random(device, RAYS, n) / n).requires_grad_(moves) for n in sizes]
         taps = [Taps(_entries(device, RAYS, x.shape[1]).int(), x) for x in shares]
         slots = torch.cat([4 * torch.arange(RAYS, device=device) + i for i in range(len(sizes))])
-        values = (2 * _random(device, ROWS, CHANNELS) - 1).requires_grad_(learns)
+        values = (2 * _random(device, ROWS, shapes.channels) - 1).requires_grad_(learns)
         cases.append((values, taps, slots, weights.clone().requires_grad_(), chosen))
     return cases
 
 
-def _pictures(device: str, many: bool | None = None) -> list[tuple]:
+def _pictures(device: str, shapes: Shapes, many: bool | None = None) -> list[tuple]:
     return [
-        (layout, tables, 2 * _random(device, len(tables.density), CHANNELS) - 1, *how)
-        for layout, tables, *how in _marches(device, many)
+        (layout, tables, 2 * _random(device, len(tables.density), shapes.channels) - 1, *how)
+        for layout, tables, *how in _marches(device, shapes, many)
     ]
 
 
-CASES: dict[str, Callable[[str], list[tuple]]] = {
+CASES: dict[str, Callable[[str, Shapes], list[tuple]]] = {
     "march": _marches,
-    "texel_rows": lambda device: [
-        (
-            _scene(device, True)[0],
-            heads := (torch.arange(RAYS, device=device) * 2) // RAYS,
-            heads + 2,
-            2 * _random(device, RAYS, 3) - 1,
-        )
+    "texel_rows": _texel_rows,
+    "weighted_rows": lambda device, shapes: [
+        (_random(device, ROWS, channels), _entries(device, RAYS, taps), _random(device, RAYS, taps))
+        for taps in (4, 8)
+        for channels in (1, shapes.channels)
     ],
-    "weighted_rows": lambda device: [
-        (_random(device, ROWS, CHANNELS), _entries(device, RAYS, taps), _random(device, RAYS, taps)) for taps in (4, 8)
+    "index_rows": lambda device, _: [(_entries(device, RAYS, 4), ROWS, False)],
+    "sum_rows": lambda device, shapes: [
+        (_entries(device, RAYS, taps).int(), _random(device, RAYS, channels), _random(device, RAYS, taps), ROWS)
+        for taps in (4, 8)
+        for channels in (1, shapes.channels)
     ],
-    "index_rows": lambda device: [(_entries(device, RAYS, 4), ROWS, False)],
-    "sum_rows": lambda device: [
-        (_entries(device, RAYS, 4).int(), _random(device, RAYS, CHANNELS), _random(device, RAYS, 4), ROWS)
-    ],
-    "composite_weights": lambda device: [
-        (
-            (_random(device, RAYS, 20) ** 3).requires_grad_(),
-            torch.arange(20, device=device) < _entries(device, RAYS, 1),
-            0.01 * _random(device, RAYS, 20),
-            _random(device, RAYS, 1),
-        )
-    ],
+    "composite_weights": _composites,
     "total_variation": _variations,
     "adam_rows": _adams,
     "gather_taps": _gathers,

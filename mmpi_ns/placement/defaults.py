@@ -29,6 +29,11 @@ PIXELS = 6e6
 """Training pixels of a window up to which it is a small capture."""
 MOST_TIMES = 4.0
 """Largest multiple of a small capture's steps."""
+RAYS_PER_PROCESSOR = 256
+"""Pixel rays of a step for each multiprocessor of a GPU. By its registers the march has eight programs of 16 rays there
+at a time, so these and the rays of new views are some three rounds of them."""
+MOST_RAYS_TIMES = 8
+"""Largest multiple of a method's rays: steps become as many times fewer."""
 POSITIVE, NOT_NEGATIVE = Number(0, above=True), Number(0)
 RANGES = {
     "max_mpis": Number(1, 10_000, whole=True),
@@ -52,15 +57,27 @@ RANGES = {
 FACES = ("front", "left", "right", "below")
 
 
-def steps_for(method: str, pixels: float) -> int:
+def rays_times(method: str, processors: int) -> int:
+    """How many times its rays a method draws in a step, in as many times fewer steps; a power of two.
+
+    Args:
+        method: with defaults.
+        processors: multiprocessors of the GPU; 0 on a CPU.
+    """
+    fit = RAYS_PER_PROCESSOR * processors // DEFAULTS[method].rays
+    return min(1 << max(fit, 1).bit_length() - 1, MOST_RAYS_TIMES)
+
+
+def steps_for(method: str, pixels: float, times: int = 1) -> int:
     """Training steps of a window, in hundreds: more for captures of many pixels, as their square root.
 
     Args:
         method: with defaults.
         pixels: training pixels of the window.
+        times: how many times the method's rays a step draws (``rays_times``).
     """
-    times = min(max(1.0, (pixels / PIXELS) ** 0.5), MOST_TIMES)
-    return 100 * round(DEFAULTS[method].steps * times / 100)
+    multiple = min(max(1.0, (pixels / PIXELS) ** 0.5), MOST_TIMES)
+    return 100 * round(DEFAULTS[method].steps * multiple / 100) // times
 
 
 def check_placement(config: PlacementConfig, prefix: str) -> None:

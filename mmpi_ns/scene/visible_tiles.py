@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
+from functools import cached_property, lru_cache
 
 import numpy as np
 import torch
@@ -18,6 +20,10 @@ BORDER_RAYS = 33
 """Rays along each border of an image, enough to follow lens distortion."""
 MARGIN = 0.25
 """Texels added on each side of a tile: rays are drawn in float32."""
+AT_ONCE = 8
+"""Cameras that are compared with all tiles of a plane that none of the earlier ones can read."""
+REMEMBERED = 128
+"""Plans and cameras whose tiles are remembered, a bit each; the windows of a long capture have a plan each."""
 
 
 @dataclass(frozen=True)
@@ -51,49 +57,88 @@ class TrainingViews:
         bounded = projects[:, 0].expand(count) & (ahead > 0.01).all(1)
         return TrainingViews(poses[:, :, 3], torch.where(bounded[:, None, None], inward, 0.0))
 
+    @cached_property
+    def digest(self) -> bytes:
+        """Equal for equal cameras."""
+        return hashlib.sha256(self.origins.numpy().tobytes() + self.inward.contiguous().numpy().tobytes()).digest()
+
     def some(self, chosen: NDArray[np.int64]) -> TrainingViews:
         """Those of the chosen images."""
         index = torch.from_numpy(chosen)
         return TrainingViews(self.origins[index], self.inward[index])
 
 
-def reachable_tiles(views: TrainingViews, plan: ScenePlan) -> Bool[Tensor, "T"]:
+def reachable_tiles(views: TrainingViews, plan: ScenePlan, device: str | torch.device = "cpu") -> Bool[Tensor, "T"]:
     """Tiles (in the order of ``texels``) with a texel that a ray through a training image can read.
 
     A tile is left out if it lies outside one of the four planes of every image, or on a plane that no camera is in
     front of. This is conservative: a few too many are marked at the corners of images. All tiles of the cube are
-    marked.
+    marked. Computed once for each plan and remembered.
 
     Args:
         views: the training images.
         plan: the heads, at the resolution in use.
+        device: where it is computed, in float64.
+
+    Returns:
+        On the CPU.
     """
-    tiles = [_tiles_of(mpi, views).reshape(-1) for mpi in plan.mpis]
-    if plan.cube is not None:
-        depth, height, width = plan.cube.shape
+    marks, count = _packed_tiles(_Key(views, plan, torch.device(device)))
+    return torch.from_numpy(np.unpackbits(marks, count=count).view(bool))
+
+
+@dataclass(frozen=True)
+class _Key:
+    """What tiles in reach depend on; equal where cameras and plan are equal, on whatever device."""
+
+    views: TrainingViews
+    plan: ScenePlan
+    device: torch.device
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Key) and (self.views.digest, self.plan) == (other.views.digest, other.plan)
+
+    def __hash__(self) -> int:
+        return hash((self.views.digest, self.plan))
+
+
+@lru_cache(REMEMBERED)
+def _packed_tiles(key: _Key) -> tuple[NDArray[np.uint8], int]:
+    """Marks of all tiles, eight in a byte, and their number."""
+    tiles = [_tiles_of(mpi, key.views, key.device).reshape(-1).cpu() for mpi in key.plan.mpis]
+    if key.plan.cube is not None:
+        depth, height, width = key.plan.cube.shape
         tiles.append(torch.ones(depth * -(-height // SIDE) * -(-width // SIDE), dtype=torch.bool))
-    return torch.cat(tiles)
+    marks = torch.cat(tiles).numpy()
+    return np.packbits(marks), len(marks)
 
 
-def _tiles_of(mpi: MPIPlan, views: TrainingViews) -> Bool[Tensor, "L Y X"]:
+def _tiles_of(mpi: MPIPlan, views: TrainingViews, device: torch.device) -> Bool[Tensor, "L Y X"]:
     """Tiles of one MPI that some image can read.
 
     From a camera at o (in the MPI's axes) the point with tangents (u, v) on the plane of disparity w lies in direction
     (u, v, 1) - w o, which is affine in u and v: over a tile, the maximum of normal . direction is a sum of two maxima.
+    Most tiles are in reach of several cameras, so cameras far from each other come first, and each group is compared
+    with the tiles alone that none has reached.
     """
     axes = torch.tensor(mpi.axes, dtype=torch.float64)
-    origins = (views.origins - torch.tensor(mpi.origin, dtype=torch.float64)) @ axes.T
-    normals = views.inward @ axes.T
-    along_x = _most(normals[..., 0], mpi.extent[:2], mpi.width)
-    along_y = _most(normals[..., 1], mpi.extent[2:], mpi.height)
-    shift = (normals * origins[:, None]).sum(-1)
-    reachable = torch.zeros(mpi.planes, along_y.shape[-1], along_x.shape[-1], dtype=torch.bool)
+    spread = torch.cat([torch.arange(len(views.origins))[i::AT_ONCE] for i in range(AT_ONCE)])
+    origins = (views.origins[spread] - torch.tensor(mpi.origin, dtype=torch.float64)) @ axes.T
+    normals = views.inward[spread] @ axes.T
+    along_x = _most(normals[..., 0], mpi.extent[:2], mpi.width).to(device)
+    along_y = _most(normals[..., 1], mpi.extent[2:], mpi.height).to(device)
+    shift, ahead = (normals * origins[:, None]).sum(-1), normals[..., 2]
+    reachable = torch.zeros(mpi.planes, along_y.shape[-1], along_x.shape[-1], dtype=torch.bool, device=device)
     for plane in range(mpi.planes):
         w = mpi.last_disparity + (mpi.planes - 1 - plane) * mpi.disparity_step
-        before = w * origins[:, 2] < 1
-        rest = (normals[..., 2] - w * shift)[before]
-        most = along_y[before][..., :, None] + (along_x[before] + rest[..., None])[..., None, :]
+        rest = (ahead - w * shift).to(device)
+        first, *others = (w * origins[:, 2] < 1).nonzero()[:, 0].to(device).split(AT_ONCE)
+        most = along_y[first][..., :, None] + (along_x[first] + rest[first][..., None])[..., None, :]
         reachable[plane] = (most >= 0).all(1).any(0)
+        for some in others:
+            y, x = (~reachable[plane]).nonzero(as_tuple=True)
+            most = along_y[some][..., y] + (along_x[some][..., x] + rest[some][..., None])
+            reachable[plane, y, x] = (most >= 0).all(1).any(0)
     return reachable
 
 

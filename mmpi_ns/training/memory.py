@@ -2,52 +2,140 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import torch
 
+from mmpi_ns.ops.march import MarchOptions
+from mmpi_ns.rendering.images import BYTES_PER_SLOT as BYTES_IN_ONE_PASS
+from mmpi_ns.rendering.images import CPU_RAYS
 from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.scene.texels import BRICK, SIDE, head_shapes
 from mmpi_ns.scene.visible_tiles import TrainingViews, reachable_tiles
-from mmpi_ns.scene.windows import WindowedPlan
-from mmpi_ns.utils.errors import InputError
+from mmpi_ns.scene.windows import Window, WindowedPlan
+from mmpi_ns.utils.errors import InputError, say
 from mmpi_ns.utils.machine import free_memory
 
 GIB = 2**30
 LEAST_SHARE = 0.02
 """Fraction of a plan's texels assumed to be in reach of training rays; computing it takes time."""
+RAYS_PER_PIXEL_RAY = 2
+"""Rays of a step for each pixel ray at most: new views and keypoints too."""
+TYPICAL_WIDTH, TYPICAL_KEPT = 256, 64
+"""Samples that the widest ray of a batch keeps once surfaces have formed, and that rays keep on average, at most."""
+BYTES_PER_HIT = 96
+"""Of a step for each ray and MPI: ranges of planes, affine maps, origin and direction in the MPI's axes."""
+BYTES_PER_SLOT = 32
+"""Of a step for each sample that a ray may keep, before the samples are packed."""
+BYTES_PER_PACKED = 112
+"""Of a step for each ray and slot of the widest ray: what is packed, weights, losses, and their gradients."""
+BYTES_PER_TAP = 24
+"""Of a step for each texel that a kept sample reads: row, place among the distinct rows, weights and gradients."""
+COPIES = 4
+"""Of the distinct rows that a step reads: values, gradients, what total variation adds, the optimiser's."""
+ALLOCATOR_SHARE, ALLOCATOR_BYTES = 0.1, 2**28
+"""What torch's allocator cannot reuse, and what libraries and compiled kernels take on a GPU."""
+SMALLEST_PLAN = 1e5
+"""Texels below which a window is not worth training."""
+ATTEMPTS = 4
+"""Plans that are tried with fewer and fewer texels."""
 
 
-def check_memory(
+@dataclass(frozen=True)
+class Work:
+    """What a training needs memory for, besides its plan."""
+
+    feature_channels: int
+    """Colour features of a texel."""
+    two_phase: bool
+    """Whether reliability is trained, so that it has moments."""
+    pixel_rays: int = 0
+    """Of a step."""
+    threshold: float = 3e-3
+    """Weight that a sample must have to be kept once surfaces have formed."""
+    all_mpis: bool = False
+    """Whether each MPI renders all rays for a while."""
+
+
+def fit_memory(
     windows: WindowedPlan,
-    views: Sequence[TrainingViews | None],
-    feature_channels: int,
-    two_phase: bool,
+    views_of: Callable[[Window], TrainingViews | None],
+    work: Work,
     device: str | torch.device,
-) -> None:
-    """Compares the memory that the largest window needs in training with what is free, before anything is allocated.
+    again: Callable[[float], WindowedPlan] | None = None,
+) -> WindowedPlan:
+    """A plan whose largest window can be trained in the memory that is free, before anything is allocated.
 
     Args:
         windows: of the capture.
-        views: training images of each window.
-        feature_channels, two_phase: see ``training_bytes``.
+        views_of: training images of a window.
+        work: what else is kept in memory.
         device: on which it will be trained.
+        again: plans anew with at most so many texels a window; None where a plan was asked for.
+
+    Returns:
+        ``windows`` if they fit, or planned again.
 
     Raises:
         InputError: not enough memory is free.
     """
-    free = free_memory(device)
-    for plan, seen in zip(windows.plans, views, strict=True):
-        everything = training_bytes(plan, None, feature_channels, two_phase)
-        needed = max(_bytes_to_look(plan, seen), int(LEAST_SHARE * everything))
-        if needed <= free < everything:
-            needed = training_bytes(plan, seen, feature_channels, two_phase)
-        if needed > free:
+    for attempts_left in reversed(range(ATTEMPTS)):
+        short = _shortage(windows, views_of, work, device)
+        if short is None:
+            return windows
+        plan, needed, free = short
+        most = 0.95 * plan.texels * max(0.0, free) / needed
+        if again is None or most < SMALLEST_PLAN or not attempts_left:
             raise InputError(
                 f"The tables of this plan ({plan.texels / 1e6:.0f} M texels) take at least {needed / GIB:.1f} GiB in "
-                f"training and {free / GIB:.1f} GiB are free: give fewer texels, in the plan or with "
+                f"training and {max(0.0, free) / GIB:.1f} GiB are free: give fewer texels, in the plan or with "
                 "--pipeline.model.placement.max-texels."
             )
+        say(
+            f"{needed / GIB:.1f} GiB would be needed in training and {free / GIB:.1f} are free: texels are made "
+            f"larger, {most / 1e6:.3g} M of them a window instead of {plan.texels / 1e6:.3g} M."
+        )
+        windows = again(most)
+    raise AssertionError("the last attempt returns or raises")
+
+
+def _shortage(
+    windows: WindowedPlan, views_of: Callable[[Window], TrainingViews | None], work: Work, device: str | torch.device
+) -> tuple[ScenePlan, float, float] | None:
+    """The first window that does not fit, the bytes that its tables need, and those that are free for them."""
+    for window in windows.windows:
+        plan, seen = window.plan, views_of(window)
+        free = free_memory(device) - reserved_bytes(plan, work, device)
+        everything = training_bytes(plan, None, work)
+        needed = max(_bytes_to_look(plan, seen), int(LEAST_SHARE * everything))
+        if needed <= free < everything:
+            needed = training_bytes(plan, seen, work, device)
+        if needed > free:
+            return plan, needed, free
+    return None
+
+
+def reserved_bytes(plan: ScenePlan, work: Work, device: str | torch.device) -> int:
+    """Bytes of a GPU that tables must leave: for a step, for a picture in the viewer, and for torch's allocator.
+
+    A machine without a GPU has its program and a step's buffers in memory that it can swap: 0.
+    """
+    if torch.device(device).type != "cuda":
+        return 0
+    kept = MarchOptions(work.threshold).most_kept(plan.samples_per_ray)
+    step = step_bytes(plan, work) + BYTES_IN_ONE_PASS * kept * CPU_RAYS
+    return int((1 + ALLOCATOR_SHARE) * step) + ALLOCATOR_BYTES
+
+
+def step_bytes(plan: ScenePlan, work: Work) -> int:
+    """Peak bytes of a training step's own arrays on a GPU at full resolution, when rays end at surfaces."""
+    rays = RAYS_PER_PIXEL_RAY * work.pixel_rays * (len(plan.mpis) if work.all_mpis else 1)
+    room = MarchOptions(work.threshold).most_kept(plan.samples_per_ray)
+    width, kept, taps = min(room, TYPICAL_WIDTH), min(room, TYPICAL_KEPT), 8 if plan.cube else 4
+    row = 4 * COPIES * (1 + work.feature_channels + work.two_phase)
+    each = BYTES_PER_HIT * len(plan.mpis) + BYTES_PER_SLOT * room + BYTES_PER_PACKED * width
+    return rays * (each + kept * taps * BYTES_PER_TAP) + min(rays * kept * taps, plan.texels) * row
 
 
 def _bytes_to_look(plan: ScenePlan, views: TrainingViews | None) -> int:
@@ -63,19 +151,19 @@ def count_tiles(plan: ScenePlan) -> int:
     return sum(depth * -(-height // SIDE) * -(-width // SIDE) for depth, height, width in head_shapes(plan))
 
 
-def training_bytes(plan: ScenePlan, views: TrainingViews | None, feature_channels: int, two_phase: bool) -> int:
+def training_bytes(plan: ScenePlan, views: TrainingViews | None, work: Work, device: str | torch.device = "cpu") -> int:
     """Bytes of the tables of one window at full resolution, and of their moments, before bricks are released.
 
     Args:
         plan: MPIs and cube.
         views: training images; texels that none can reach are not stored. None: all are stored.
-        feature_channels: colour features of a texel.
-        two_phase: whether reliability is trained, so that it has moments.
+        work: what is trained.
+        device: where tiles in reach are looked for.
     """
     tiles = count_tiles(plan)
-    stored = tiles if views is None else int(reachable_tiles(views, plan).sum())
-    learned = 1 + feature_channels + two_phase
-    numbers, moments = 1 + feature_channels + 1, 2 * learned  # density, features, reliability; in float32, bfloat16
+    stored = tiles if views is None else int(reachable_tiles(views, plan, device).sum())
+    learned = 1 + work.feature_channels + work.two_phase
+    numbers, moments = 1 + work.feature_channels + 1, 2 * learned  # density, features, reliability; float32, bfloat16
     # Also marks of touched texels, peaks of bricks, and the tile map.
     return (stored + 1) * (BRICK * (4 * numbers + 2 * moments + 1) + 4) + 4 * tiles
 

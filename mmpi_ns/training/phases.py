@@ -168,13 +168,14 @@ class Schedule:
         return Schedule(phases=phases, **lists, **data)
 
 
-def make_schedule(config: ScheduleConfig, total_steps: int, windows: int = 1) -> Schedule:
+def make_schedule(config: ScheduleConfig, total_steps: int, windows: int = 1, times: int = 1) -> Schedule:
     """The schedule of a run of ``total_steps`` steps a window.
 
     Args:
         config: phases, growth, rates and release of bricks; nothing is released before surfaces have formed.
         total_steps: all steps of a window.
         windows: windows of a long capture, trained one after the other.
+        times: how many times the method's rays a step draws, on a GPU.
 
     Raises:
         InputError: no step is left for the first phase, growth goes backwards, or rates never fall.
@@ -186,7 +187,7 @@ def make_schedule(config: ScheduleConfig, total_steps: int, windows: int = 1) ->
     first = phases[0].end
     growth = tuple(max(1, round(s * first)) for s in config.growth_shares)
     # Shorter runs would see too few rays.
-    growing_rays = min(1.0, float(config.growing_rays) * max(1.0, LONG_RUN / total_steps))
+    growing_rays = min(1.0, float(config.growing_rays) * max(1.0, LONG_RUN / (total_steps * times)))
     rates = float(config.decay_decades), float(config.decay_from), float(config.finetune_rate)
     schedule = Schedule(phases, growth, *rates, windows, growing_rays=growing_rays)
     release = sorted({round(s * first) for s in config.release_shares}) if config.release_weight > 0 else []

@@ -17,6 +17,7 @@ from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils import comms, writer
 
 from mmpi_ns.capture.datamanager import MMPIDataManager
+from mmpi_ns.placement.defaults import DEFAULTS, rays_times
 from mmpi_ns.rendering.rendered import BACKGROUNDS
 from mmpi_ns.scene.texels import BRICK
 from mmpi_ns.scene.windows import WindowedPlan
@@ -30,7 +31,7 @@ from mmpi_ns.training.checkpoints import (
     read_checkpoint,
 )
 from mmpi_ns.training.learning_rates import PhaseScheduler
-from mmpi_ns.training.memory import describe, training_bytes
+from mmpi_ns.training.memory import Work, describe, training_bytes
 from mmpi_ns.training.options import check_device, check_nothing_left, check_run, with_absolute_paths
 from mmpi_ns.training.report import TrainingLog, forecast, next_commands, quick_test
 from mmpi_ns.training.run import TrainingRun, cameras_of, views_of
@@ -128,6 +129,7 @@ class MMPITrainer(Trainer):
         self._window_steps = model_config.total_steps = config.max_num_iterations
         model_config.method, self._follows_capture = config.method_name, config.max_num_iterations == 0
         model_config.windows_folder = self.base_dir / WINDOWS_FOLDER
+        self._suit_device(model_config, config.pipeline.datamanager)
         self._share: WindowShare | None = None
         if self.world_size > 1:
             folders = [self.checkpoint_dir, *([config.load_dir] if config.load_dir else [])]
@@ -150,14 +152,27 @@ class MMPITrainer(Trainer):
         if self._share is not None:
             self._share.check(plan)
 
+    def _suit_device(self, model_config: Any, manager: Any) -> None:
+        """Draws more rays a step on a large GPU, in as many fewer steps, where neither was asked for."""
+        asked = any(word.startswith("--pipeline.datamanager.train-num-rays-per-batch") for word in arguments())
+        if asked or not self._follows_capture or not str(self.device).startswith("cuda"):
+            return
+        method, rays = model_config.method, manager.train_num_rays_per_batch
+        if rays == DEFAULTS[method].rays:
+            processors = torch.cuda.get_device_properties(self.device).multi_processor_count
+            model_config.rays_times = times = rays_times(method, processors)
+            manager.train_num_rays_per_batch, manager.keypoint_rays = times * rays, times * manager.keypoint_rays
+
     def _announce(self, plan: WindowedPlan) -> None:
         """Prints capture, plan, memory and expected time together, before the first step."""
         say(self._manager.describe())
         say(describe(plan, self._window_steps, *self._expected_memory()))
         if self._follows_capture:
+            rays, times = self._manager.config.train_num_rays_per_batch, self.config.pipeline.model.rays_times  # type: ignore[attr-defined]
             say(
                 f"{self._window_steps:,} steps{' a window' if len(plan) > 1 else ''} for its training pixels; "
                 "--max-num-iterations gives others."
+                + (f" {rays:,} rays a step, {times} times the method's, suit this GPU." if times > 1 else "")
             )
         if not str(self.device).startswith("cuda"):
             rays = self._manager.get_train_rays_per_batch()
@@ -169,9 +184,9 @@ class MMPITrainer(Trainer):
         """Bytes needed for training each window: tables with their moments, and pixels."""
         run, manager, windows = self._run, self._manager, self._run.progress.windows.windows
         blends = any(phase.name == "blend" for phase in run.progress.schedule.phases)
-        centers, channels = manager.observations.centers, run.field.feature_channels
-        tables = [training_bytes(w.plan, views_of(w, run.views), channels, blends) for w in windows]
-        cameras = [None] if len(windows) == 1 else [cameras_of(w, centers) for w in windows]
+        work = Work(run.field.feature_channels, blends)
+        tables = [training_bytes(w.plan, views_of(w, run.views), work, self.device) for w in windows]
+        cameras = [None] if len(windows) == 1 else [cameras_of(w, manager.observations.centers) for w in windows]
         return tables, [manager.pixel_bytes(c) for c in cameras]
 
     def setup_optimizers(self) -> Optimizers:

@@ -18,8 +18,10 @@ from gpu import Gpu
 from methods import METHODS
 from triton_processes import HERE, needs_triton, python
 
+from mmpi_ns.bench import checks
 from mmpi_ns.bench import gpu as command
 from mmpi_ns.ops import dispatch
+from mmpi_ns.ops.trial import EVERY
 
 PRINTED = r"a step of \d+ rays: [\d.]+ ms, [\d,]+ rays/s|a frame of \d+ pixels: .* frames/s|memory: [\d.]+ GiB"
 TIMED = {"step_ms": 1.0, "frame_ms": 2.0, "pixels": 3, "peak_gib": 0.5}
@@ -55,6 +57,31 @@ def test_a_quick_look_without_a_gpu_ends_in_an_honest_sentence(tmp_path):
     assert rows["device"] == "cpu" and not rows["well"] and rows["timed"]["step_ms"] > 0
 
 
+@pytest.mark.parametrize("work", [checks.interpolation, checks.distinct_rows, checks.variations, checks.adam])
+def test_checks_pass_on_the_forms_of_this_machine(work):
+    """They compare whatever runs with float64, here the compiled forms of a CPU."""
+    assert dispatch.form_of("total_variation", torch.zeros(1)) == "cpu"
+    found = work("cpu", 500)
+    assert found and all(c.ok for c in found), found
+
+
+@pytest.mark.parametrize("slots", [16, 64, 300, 1000])
+def test_compositing_is_checked_at_every_width(slots):
+    assert all(c.ok for c in checks.compositing_kernels("cpu", 50, slots))
+
+
+def test_a_full_look_tries_every_shape_afresh(monkeypatch, tmp_path):
+    tried = []
+    monkeypatch.setattr(dispatch, "expect", lambda shapes, afresh: tried.append((shapes, afresh)))
+    monkeypatch.setattr(
+        dispatch, "fault", lambda name: "wrong" if tried[-1][0] == EVERY[0] and name == "march" else None
+    )
+    found = command.try_operations("cuda", EVERY)
+    assert tried == [(shapes, True) for shapes in EVERY] and len(found) == 10
+    assert {name for name, reason in found.items() if reason} == {"march"}, "what failed once has failed"
+    assert {1, 2, 5, 9, 33} <= set(EVERY[0].mpis) and EVERY[0].blends and EVERY[0].widths[-1] == 640
+
+
 def test_a_quick_look_names_what_falls_back(monkeypatch, capsys, tmp_path):
     reason = "its Triton kernel fails on this device (CompilationError: at 3:4)"
     names = [name for name, each in dispatch.operations().items() if "gpu" in each.compiled]
@@ -65,6 +92,7 @@ def test_a_quick_look_names_what_falls_back(monkeypatch, capsys, tmp_path):
         monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
         monkeypatch.setattr(command, "environment", dict)
         monkeypatch.setattr(command, "time_training", lambda *_: TIMED)
+        monkeypatch.setattr(dispatch, "expect", lambda *_, **__: None)
         monkeypatch.setattr(dispatch, "_faults", dict.fromkeys(names) | faults)
         found = command.run_quick(tmp_path, tmp_path, 16)
         said = capsys.readouterr().out

@@ -61,7 +61,7 @@ def test_a_kernel_that_only_rounds_otherwise_passes_its_trial(monkeypatch, name)
     monkeypatch.setattr(dispatch, "function", lambda name, form: exactly if form == "gpu" else right(name, form))
     cases = {"march": trial._marches, "show_rays": trial._pictures}.get(name)
     if cases:
-        monkeypatch.setitem(trial.CASES, name, lambda device: cases(device, many=True))
+        monkeypatch.setitem(trial.CASES, name, lambda device, shapes: cases(device, shapes, many=True))
     trial.run(name, "cpu")
 
 

@@ -11,6 +11,7 @@ from training_runs import datamanager, plan_of
 
 from mmpi_ns.capture.datamanager import TRAINING_VIEWS
 from mmpi_ns.field.mmpi_field import MMPIField
+from mmpi_ns.scene import visible_tiles
 from mmpi_ns.scene.geometry import Frames, plane_hits, sample_disparity
 from mmpi_ns.scene.plan import CubePlan, ScenePlan
 from mmpi_ns.scene.texels import BRICK, head_grids
@@ -96,6 +97,23 @@ def test_every_tile_that_a_pixel_reads_is_reachable_and_few_others_are(lens, see
     assert (found | ~wanted).all()
     extra = (found & ~wanted)[:mpis].sum() / mpis
     assert wanted[:mpis].float().mean() < 0.75 and extra < 0.06, (wanted[:mpis].float().mean(), extra)
+
+
+@pytest.mark.parametrize("count", [1, 7, 30])
+def test_tiles_of_all_images_are_those_of_each_alone_and_found_once(monkeypatch, count):
+    """Also behind, before and among the planes; on whatever device, and for equal cameras in other arrays."""
+    views, plan, looks = TrainingViews.of(cameras(5, count, turn=0.8)), plan_around(1), []
+    tiles_of = visible_tiles._tiles_of
+    monkeypatch.setattr(visible_tiles, "_tiles_of", lambda *given: looks.append(given) or tiles_of(*given))
+    visible_tiles._packed_tiles.cache_clear()
+    whole = reachable_tiles(views, plan)
+    alone = [reachable_tiles(views.some(np.array([i])), plan) for i in range(count)]
+    assert torch.equal(whole, torch.stack(alone).any(0)) and not whole.all()
+    before = len(looks)
+    again = reachable_tiles(views.some(np.arange(count)), plan, "cuda")
+    assert torch.equal(again, whole) and len(looks) == before
+    again[:] = True
+    assert torch.equal(reachable_tiles(views, plan), whole), "nobody writes into what is remembered"
 
 
 def test_an_mpi_that_faces_away_stores_nothing():

@@ -13,11 +13,12 @@ from hand_made import make_mpi
 from long_road import road
 from training_runs import datamanager, schedule_of
 
-from mmpi_ns.placement.defaults import PIXELS, steps_for
+from mmpi_ns.placement.defaults import DEFAULTS, PIXELS, rays_times, steps_for
 from mmpi_ns.placement.rule import PlacementConfig
 from mmpi_ns.placement.split import FEWEST, find_balls, most_pixels, of_cameras, place_windows
 from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.scene.windows import Window, WindowedPlan, window_shares
+from mmpi_ns.training.phases import ScheduleConfig, make_schedule
 
 # Splitting -----------------------------------------------------------------------------------------------------------
 
@@ -36,6 +37,22 @@ def test_steps_follow_the_pixels_of_the_largest_window():
     assert 0.05 < most_pixels(many, windows) / many.sizes.prod(-1).sum() < 0.5
     steps = [steps_for("mmpi-small", pixels) for pixels in (1e4, PIXELS, 4 * PIXELS, 1e12)]
     assert steps == [4000, 4000, 8000, 16000] and steps_for("mmpi", 1.0) == 20000
+
+
+@pytest.mark.parametrize(
+    ("processors", "rays"),
+    [(0, 4096), (28, 4096), (40, 8192), (82, 16384), (108, 16384), (132, 32768), (1000, 32768)],  # CPU, 3060, T4 ...
+)
+def test_a_larger_gpu_draws_more_rays_a_step_and_as_many_in_all(processors, rays):
+    times = rays_times("mmpi", processors)
+    assert times * DEFAULTS["mmpi"].rays == rays and rays_times("mmpi-small", processors) in (1, 4, 8)
+    for pixels in (1.0, 4 * PIXELS):
+        assert times * steps_for("mmpi", pixels, times) == steps_for("mmpi", pixels)
+    whole, fewer = (make_schedule(ScheduleConfig(), 2000 // n, times=n) for n in (1, times))
+    assert fewer.rays_share(0) == whole.rays_share(0) == 1.0
+    assert [abs(times * a - b) < times for a, b in zip(fewer.growth, whole.growth, strict=True)] == [True] * 4
+    whole, fewer = (make_schedule(ScheduleConfig(), 20000 // n, times=n) for n in (1, times))
+    assert fewer.rays_share(0) == whole.rays_share(0) == 0.5
 
 
 def test_windows_hold_every_camera_are_no_longer_than_asked_and_grow_with_the_road():

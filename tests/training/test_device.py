@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import copy
+from types import SimpleNamespace
+
 import pytest
 import torch
 from nerfstudio.engine.trainer import Trainer
 from training_runs import trainer_config
 
+from mmpi_ns.config import mmpi_small
 from mmpi_ns.training import trainer as trainer_module
 from mmpi_ns.training.options import check_device
 from mmpi_ns.utils import machine
@@ -35,6 +39,31 @@ def test_each_process_makes_its_gpu_the_current_one_before_anything_is_on_it(mon
     with pytest.raises(Stop):
         config.setup(local_rank=rank, world_size=2).setup()
     assert events == [rank, f"cuda:{rank}"]
+
+
+@pytest.mark.parametrize(
+    ("device", "steps", "asked", "rays", "keypoints"),
+    [("cuda", 0, False, 8192, 3072), ("cuda", 500, False, 1024, 384), ("cuda", 0, True, 1024, 384),
+     ("cpu", 0, False, 1024, 384)],
+)  # fmt: skip
+def test_a_large_gpu_draws_more_rays_a_step_unless_rays_or_steps_were_asked_for(
+    monkeypatch, tmp_path, device, steps, asked, rays, keypoints
+):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "set_device", lambda _: None)
+    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda _: SimpleNamespace(multi_processor_count=132))
+    option = "--pipeline.datamanager.train-num-rays-per-batch"
+    monkeypatch.setattr(trainer_module, "arguments", lambda: [option, "1024"] if asked else [])
+    monkeypatch.setattr(Trainer, "setup", lambda *_: (_ for _ in ()).throw(Stop))
+    config = copy.deepcopy(mmpi_small.config)
+    config.machine.device_type, config.max_num_iterations = device, steps
+    config.output_dir, config.experiment_name, config.timestamp = tmp_path, "tiny", "run"
+    for _ in range(2):  # a config may be set up again
+        with pytest.raises(Stop):
+            config.setup(local_rank=0, world_size=1).setup()
+        manager = config.pipeline.datamanager
+        assert (manager.train_num_rays_per_batch, manager.keypoint_rays) == (rays, keypoints)
+        assert config.pipeline.model.rays_times == rays // 1024
 
 
 def test_a_cpu_run_asks_for_no_gpu(monkeypatch, tmp_path):

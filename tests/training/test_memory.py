@@ -14,9 +14,12 @@ from hand_made import make_mpi
 from tiny_scene import TRAIN, WIDTH, image_of, write_scene
 from training_runs import datamanager, load, ready, trainer_config
 
+from mmpi_ns.scene import visible_tiles
 from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.scene.windows import Window, WindowedPlan
-from mmpi_ns.training.memory import describe
+from mmpi_ns.training import memory
+from mmpi_ns.training.memory import Work, describe, fit_memory, reserved_bytes, training_bytes
+from mmpi_ns.utils.errors import InputError
 
 
 def bytes_of(state) -> int:
@@ -133,3 +136,96 @@ def test_what_steps_leave_is_given_back_before_tables_grow_and_zeros_take_nothin
     said = subprocess.run([sys.executable, "-c", work], capture_output=True, text=True, check=True).stdout
     given, taken = map(int, said.split())
     assert given > 120 and taken < 20, said
+
+
+def test_tiles_in_reach_are_looked_for_once_in_a_run(scene, plan_file, tmp_path, monkeypatch):
+    """To size the tables, to say so, and to fill them: three times the same at full resolution."""
+    looked, tiles_of = [], visible_tiles._tiles_of
+    monkeypatch.setattr(visible_tiles, "_tiles_of", lambda mpi, *given: looked.append(mpi) or tiles_of(mpi, *given))
+    visible_tiles._packed_tiles.cache_clear()
+    trainer = ready(trainer_config(scene, plan_file, tmp_path, 16, training="joint"))
+    trainer.train()
+    full = [mpi for mpi in looked if mpi in trainer.pipeline.model.progress.windows.plans[0].mpis]
+    assert len(full) == len(set(looked) & set(full)) == 2 and len(looked) == len(set(looked)) == 6
+
+
+GPU = "cuda:1"
+WORK = Work(8, False, pixel_rays=16384)
+
+
+def large_plan(texels: float) -> ScenePlan:
+    side = round((texels / 512) ** 0.5)
+    return ScenePlan(tuple(make_mpi(str(k), planes=128, height=side, width=side) for k in range(4)), None, 0.05, 1.5)
+
+
+@pytest.fixture
+def free(monkeypatch):
+    """Says how much memory of a GPU, which is not there, is free."""
+
+    def say(gib):
+        monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (int(gib * 2**30), 80 * 2**30))
+
+    return say
+
+
+def windows_of(plan: ScenePlan) -> WindowedPlan:
+    return WindowedPlan.single(plan)
+
+
+def test_a_gpu_keeps_room_for_a_step_a_picture_and_the_allocator(free):
+    """14.5 GiB of tables do not fit in 14.6: a step would find no room at full resolution."""
+    windows = windows_of(large_plan(200e6))
+    tables, reserve = training_bytes(windows.plans[0], None, WORK), reserved_bytes(windows.plans[0], WORK, GPU)
+    assert 1 << 30 < reserve < 4 << 30 and reserved_bytes(windows.plans[0], WORK, "cpu") == 0
+    free((tables + reserve) / 2**30 + 0.01)
+    assert fit_memory(windows, lambda _: None, WORK, GPU) is windows
+    free(tables / 2**30 + 0.1)
+    with pytest.raises(InputError, match="fewer texels"):
+        fit_memory(windows, lambda _: None, WORK, GPU)
+
+
+def test_the_reserve_follows_the_rays_and_what_renders_them():
+    plan = large_plan(1e7)
+    small, large = (memory.step_bytes(plan, Work(8, False, rays)) for rays in (1024, 16384))
+    assert 10 * small < large <= 16 * small
+    assert memory.step_bytes(plan, Work(8, True, 1024, all_mpis=True)) > 3 * small
+    assert memory.step_bytes(plan, Work(8, False, 1024, threshold=0.0)) > small
+
+
+@pytest.mark.parametrize(("gib", "places"), [(64, 0), (12, 1), (6, 1)])
+def test_texels_of_an_automatic_plan_follow_the_free_memory(free, capsys, gib, places):
+    free(gib)
+    asked = []
+
+    def again(most):
+        asked.append(most)
+        return windows_of(large_plan(most))
+
+    windows = fit_memory(windows_of(large_plan(200e6)), lambda _: None, WORK, GPU, again)
+    assert len(asked) == places and capsys.readouterr().out.count("texels are made larger") == places
+    held = training_bytes(windows.plans[0], None, WORK) + reserved_bytes(windows.plans[0], WORK, GPU)
+    assert held <= gib * 2**30 and (not places or held > 0.85 * gib * 2**30)
+
+
+@pytest.mark.parametrize("stubborn", [True, False])
+def test_where_hardly_any_texel_fits_a_run_is_refused(free, stubborn):
+    free(6 if stubborn else 0.5)
+    plan, asked = windows_of(large_plan(200e6)), []
+    with pytest.raises(InputError, match="GiB are free"):
+        fit_memory(plan, lambda _: None, WORK, GPU, lambda most: asked.append(most) or plan)
+    assert len(asked) == (memory.ATTEMPTS - 1 if stubborn else 0)
+
+
+def test_a_run_without_room_for_its_texels_plans_larger_ones(scene, tmp_path, monkeypatch, capsys):
+    """Of the rule's plan; a plan of the user's is refused."""
+    config = trainer_config(scene, None, tmp_path, 3000, training="joint")
+    texels = ready(config).pipeline.model.progress.windows.plans[0].texels
+    monkeypatch.setattr(memory, "free_memory", lambda device: 35 * texels)
+    monkeypatch.setattr(memory, "SMALLEST_PLAN", 1e3)
+    monkeypatch.setattr(memory, "LEAST_SHARE", 1.0)
+    model = ready(trainer_config(scene, None, tmp_path / "less", 3000, training="joint")).pipeline.model
+    assert model.progress.windows.plans[0].texels < 0.9 * texels
+    assert "texels are made larger" in capsys.readouterr().out
+    plan = tmp_path / "tiny" / "mmpi-small" / "run" / "plan.json"
+    with pytest.raises(InputError, match="fewer texels"):
+        ready(trainer_config(scene, plan, tmp_path / "asked", 3000, training="joint"))

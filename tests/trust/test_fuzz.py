@@ -97,12 +97,12 @@ def use_plan(folder):
     """Reads a plan, and builds the field of one that is small enough."""
     from mmpi_ns.field.mmpi_field import MMPIField
     from mmpi_ns.scene.windows import WindowedPlan
-    from mmpi_ns.training.memory import check_memory
+    from mmpi_ns.training.memory import Work, fit_memory
 
     def use(text):
         (folder / "plan.json").write_text(text)
         windows = WindowedPlan.load(folder / "plan.json")
-        check_memory(windows, [None], 9, False, "cpu")
+        fit_memory(windows, lambda window: None, Work(9, False), "cpu")
         if windows.plans[0].texels < 1e5:
             MMPIField(windows.plans[0], shading="ray")
 

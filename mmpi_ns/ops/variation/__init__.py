@@ -32,7 +32,7 @@ def total_variation(
     Args:
         values: the texels, gathered from the table; with gradients.
         table: the pooled table (held fixed).
-        rows: where they came from; those of a brick together.
+        rows: where they came from, those of a brick together; none of a brick's that lie beyond the border of a plane.
         layout: of the scene.
         scales: weight of a difference along x, y and z, of each head.
     """
