@@ -170,8 +170,8 @@ SHARED = {80: 164, 86: 100, 89: 100, 90: 228}
 REGISTERS = 65536
 BANDWIDTH = {80: 2039e9, 86: 936e9, 89: 1008e9, 90: 3350e9}
 """Bytes a second of an A100 80 GB, RTX 3090, RTX 4090 and H100 SXM (their makers' figures)."""
-SHAPES = trial.Shapes((9,), most_samples=300)
-"""Nine MPIs and a cube, blended, eight channels, some three hundred samples a ray."""
+SHAPES = trial.Shapes((4,), cube=False, blends=False, most_samples=300)
+"""Four MPIs, not blended, eight channels, some three hundred samples a ray."""
 
 
 def occupancy(registers, shared, warps, architecture):
@@ -213,7 +213,7 @@ def page(content):
         "# What the GPU's kernels take", "",
         "From their compiled form, without a device: `PYTHONPATH=.:tests python tests/triton_compiling.py "
         f"{' '.join(n.removeprefix('sm_') for n in names)} --write docs/results/kernels.json` (Triton "
-        f"{content['triton']}, the launch of each kernel with the most in it, for nine MPIs and a cube, blended, eight "
+        f"{content['triton']}, the launch of each kernel with the most in it, for four MPIs, not blended, eight "
         "channels and some three hundred samples a ray).", "",
         "Each cell: registers of a thread / bytes of shared memory of a program / occupancy, the share of a "
         "multiprocessor's warps that fit. Bytes are those of the arrays with an entry for each ray, sample or row, "
