@@ -22,6 +22,8 @@ import tempfile
 import time
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from itertools import accumulate
+from operator import mul
 from pathlib import Path
 
 import torch
@@ -78,9 +80,13 @@ def _type(value):
 
 
 def _bytes_per_item(given):
-    """Of a launch, by its arguments: each entry is read or written once at least."""
+    """Of a launch, by its arguments: each entry of the arrays that have some for every item, and those alone."""
     count = next((given[name] for name in ("size", "count", "num_rays") if name in given), 0)
-    arrays = [x for x in given.values() if isinstance(x, torch.Tensor) and count and x.numel() % count == 0]
+
+    def is_for_items(x):
+        return count in accumulate(x.shape, mul) or x.shape == (2 * count,)
+
+    arrays = [x for x in given.values() if isinstance(x, torch.Tensor) and is_for_items(x)]
     return sum(x.numel() * x.element_size() for x in arrays) / max(1, count)
 
 
@@ -170,8 +176,8 @@ SHARED = {80: 164, 86: 100, 89: 100, 90: 228}
 REGISTERS = 65536
 BANDWIDTH = {80: 2039e9, 86: 936e9, 89: 1008e9, 90: 3350e9}
 """Bytes a second of an A100 80 GB, RTX 3090, RTX 4090 and H100 SXM (their makers' figures)."""
-SHAPES = trial.Shapes((9,), most_samples=300)
-"""Nine MPIs and a cube, blended, eight channels, some three hundred samples a ray."""
+SHAPES = trial.Shapes((4,), cube=False, blends=False, most_samples=300)
+"""Four MPIs, not blended, eight channels, up to 320 samples a ray."""
 
 
 def occupancy(registers, shared, warps, architecture):
@@ -197,11 +203,15 @@ def measured(launch, architecture):
 
 def write_table(path, architectures):
     """Writes what every kernel takes on every architecture, as JSON and, beside it, as a page."""
-    rows = {}
+    rows, commit = {}, ["git", "rev-parse", "--short", "HEAD"]
+    made = {"command": " ".join(["python", *sys.argv]), "triton": triton.__version__, "shapes": SHAPES._asdict()}
+    made["commit"] = subprocess.run(commit, capture_output=True, text=True, check=True).stdout.strip()
+    made["date"] = time.strftime("%Y-%m-%d")
     for launch in largest_launches(all_launches(setattr, SHAPES)):
         rows[launch.name] = {f"sm_{a}": measured(launch, a) for a in architectures}
         print(launch.name, rows[launch.name], flush=True)
-        content = {"triton": triton.__version__, "shapes": SHAPES._asdict(), "rows": rows}
+        spilling = sum(row["spills"] for each in rows.values() for row in each.values())
+        content = {"headline": {"kernels": len(rows), "spilling": spilling}, "made": made, "rows": rows}
         path.write_text(json.dumps(content, indent=1), encoding="utf-8")
         path.with_suffix(".md").write_text(page(content), encoding="utf-8")
 
@@ -213,8 +223,8 @@ def page(content):
         "# What the GPU's kernels take", "",
         "From their compiled form, without a device: `PYTHONPATH=.:tests python tests/triton_compiling.py "
         f"{' '.join(n.removeprefix('sm_') for n in names)} --write docs/results/kernels.json` (Triton "
-        f"{content['triton']}, the launch of each kernel with the most in it, for nine MPIs and a cube, blended, eight "
-        "channels and some three hundred samples a ray).", "",
+        f"{content['made']['triton']}, the launch of each kernel with the most in it, for four MPIs, not blended, eight "
+        "channels; the march and pictures of 24 planes, compositing of rays of 320 samples).", "",
         "Each cell: registers of a thread / bytes of shared memory of a program / occupancy, the share of a "
         "multiprocessor's warps that fit. Bytes are those of the arrays with an entry for each ray, sample or row, "
         "read or written once; what kernels look up in tables comes on top. The roof is the memory's bandwidth over "

@@ -80,13 +80,11 @@ def fit_memory(
     Raises:
         InputError: not enough memory is free.
     """
-    for attempts_left in reversed(range(ATTEMPTS)):
-        short = _shortage(windows, views_of, work, device)
-        if short is None:
-            return windows
+    attempts = 1
+    while short := _shortage(windows, views_of, work, device):
         plan, needed, free = short
         most = 0.95 * plan.texels * max(0.0, free) / needed
-        if again is None or most < SMALLEST_PLAN or not attempts_left:
+        if again is None or most < SMALLEST_PLAN or attempts == ATTEMPTS:
             raise InputError(
                 f"The tables of this plan ({plan.texels / 1e6:.0f} M texels) take at least {needed / GIB:.1f} GiB in "
                 f"training and {max(0.0, free) / GIB:.1f} GiB are free: give fewer texels, in the plan or with "
@@ -96,8 +94,8 @@ def fit_memory(
             f"{needed / GIB:.1f} GiB would be needed in training and {free / GIB:.1f} are free: texels are made "
             f"larger, {most / 1e6:.3g} M of them a window instead of {plan.texels / 1e6:.3g} M."
         )
-        windows = again(most)
-    raise AssertionError("the last attempt returns or raises")
+        windows, attempts = again(most), attempts + 1
+    return windows
 
 
 def _shortage(

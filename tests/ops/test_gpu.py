@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import sys
 from types import SimpleNamespace
@@ -62,6 +63,35 @@ def test_kernels_compile_for_a_gpu_without_spilling_registers(monkeypatch):
     assert {"hits_kernel", "march_kernel", "pack_kernel", "gather_kernel", "adam_kernel"} < {x.name for x in launches}
     for launch in launches:
         assert not spills(launch.compiled(90)), (launch.name, launch.constants)
+
+
+@needs_triton
+@pytest.mark.parametrize("name", ["hits_kernel", "adam_kernel"])
+def test_the_table_of_kernels_is_what_they_compile_to(monkeypatch, name):
+    """Two rows of docs/results/kernels.json, which tests/triton_compiling.py --write makes."""
+    import triton
+    from triton_compiling import SHAPES, all_launches, largest_launches, measured, page
+
+    content = json.loads((TABLE := HERE.parent / "docs/results/kernels.json").read_text(encoding="utf-8"))
+    assert TABLE.with_suffix(".md").read_text(encoding="utf-8") == page(content)
+    if triton.__version__ != content["made"]["triton"]:
+        pytest.skip(f"the table is of Triton {content['made']['triton']}")
+    launches = {launch.name: launch for launch in largest_launches(all_launches(monkeypatch.setattr, SHAPES))}
+    assert set(launches) == set(content["rows"])
+    assert measured(launches[name], 90) == content["rows"][name]["sm_90"]
+
+
+@pytest.mark.parametrize(
+    ("registers", "shared", "warps", "architecture", "at_a_time"),
+    [(64, 0, 1, 90, 32), (253, 0, 1, 90, 8), (253, 0, 4, 80, 8), (32, 0, 4, 86, 48), (32, 48 * 1024, 4, 90, 16)],
+)
+def test_occupancy_is_bounded_by_registers_programs_warps_and_shared_memory(
+    registers, shared, warps, architecture, at_a_time
+):
+    pytest.importorskip("triton")
+    from triton_compiling import occupancy
+
+    assert occupancy(registers, shared, warps, architecture)[0] == at_a_time
 
 
 @needs_triton

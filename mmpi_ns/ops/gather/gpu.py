@@ -117,6 +117,11 @@ def sizes(channels: int, device: torch.device, numbers: int = NUMBERS) -> tuple[
     return columns, block_size(max(8, numbers // columns), device)
 
 
+def lanes(block: int) -> int:
+    """Warps of a program with so many rays or samples: a lane for each, so that none repeats what another does."""
+    return min(4, max(1, block // 32))
+
+
 class _GatherTaps(torch.autograd.Function):
     @staticmethod
     def forward(
@@ -132,7 +137,7 @@ class _GatherTaps(torch.autograd.Function):
         tensors = (values, numbers, weights, positions, shares, cube_positions, cube_shares, sums)
         launch(
             gather_kernel, num_rays if len(slots) else 0, block, *tensors, num_rays, width, channels, len(positions),
-            HAS_CUBE=len(cube_positions) > 0, CHANNELS=columns, BLOCK=block,
+            HAS_CUBE=len(cube_positions) > 0, CHANNELS=columns, BLOCK=block, num_warps=lanes(block),
         )  # fmt: skip
         ctx.save_for_backward(*saved)
         parts = split_sums(sums, channels)
@@ -153,6 +158,7 @@ class _GatherTaps(torch.autograd.Function):
                 gather_back_kernel, len(positions), block, values, slots, chosen, weights, positions, shares,
                 to_sums, to_first, to_second, to_values, to_weights, to, first, len(positions), weights.shape[1],
                 channels, NEEDED=needed, MOVED=moved, TAPS=shares.shape[1], CHANNELS=columns, BLOCK=block,
+                num_warps=lanes(block),
             )  # fmt: skip
             first += len(positions)
         tensors = (x if moved else None for to in to_shares for x in (None, to))

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mmpi_ns.ops import ends
-from mmpi_ns.ops.gather.gpu import activate, sizes
+from mmpi_ns.ops.gather.gpu import activate, lanes, sizes
 from mmpi_ns.ops.gpu_scene import (
     DEPTH,
     HEIGHT,
@@ -267,5 +267,6 @@ def show_rays(layout: SceneLayout, tables: Tables, features: Tensor, rays: Rays,
         show_kernel, num_rays, block, m.kept, *m.slots, m.skipped_total, shaped(features, layout.num_rows, channels),
         GpuScene.of(layout).grids, gathered, mass, depth, median, winner, num_rays, m.room, channels, len(layout.mpis),
         HAS_CUBE=layout.cube is not None, HEADS=triton.next_power_of_2(layout.num_heads), CHANNELS=columns, BLOCK=block,
+        num_warps=lanes(block),
     )  # fmt: skip
     return Shown(gathered, mass, torch.exp(-depth), -torch.expm1(-depth), median, winner, m.dropped_mass)
