@@ -164,12 +164,10 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
 
     def create_eval_dataset(self) -> MMPIDataset:
         dataset = super().create_eval_dataset()
-        if not len(dataset):
-            raise InputError(
-                f"No image of {self.config.data} is left for evaluation: give more images, or --eval-mode all after "
-                "the name of the data parser."
-            )
-        return dataset
+        if len(dataset):
+            return dataset
+        say("The capture has no test images: scores are of training images, and say nothing about new views.")
+        return self.dataset_type(self.train_dataparser_outputs, scale_factor=self.config.camera_res_scale_factor)
 
     def setup_train(self) -> None:
         """Reads the pixels into memory, unless there are too many, instead of nerfstudio's image cache."""
