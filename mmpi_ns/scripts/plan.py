@@ -14,7 +14,7 @@ from mmpi_ns.placement.defaults import DEFAULTS, steps_for
 from mmpi_ns.placement.options import check_placement
 from mmpi_ns.placement.rule import PlacementConfig
 from mmpi_ns.scripts.command import say_version
-from mmpi_ns.utils.errors import InputError
+from mmpi_ns.utils.errors import InputError, quoted
 from mmpi_ns.utils.host import enter_command
 from mmpi_ns.utils.values import Number, check_options
 
@@ -79,9 +79,8 @@ class PlanCommand:
         (self.output / "plan.md").write_text(f"{title}\n\n{mark}\n\n{text}\n", encoding="utf-8")
         print(text)
         print(f"\nWrote plan.json, plan.md and pictures in {self.output}.")
-        print(
-            f"Train with it: ns-train {self.method} --pipeline.model.plan-file {self.output / 'plan.json'} --data ..."
-        )
+        plan = quoted(self.output / "plan.json")
+        print(f"Train with it: ns-train {self.method} --pipeline.model.plan-file {plan} --data ...")
 
     def _explain(self, windows: WindowedPlan, observations: Observations) -> str:
         """Draws the pictures and returns the tables: for each window, over the observations of its own cameras."""

@@ -7,7 +7,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from mmpi_ns.training.checkpoints import checkpoints_in
-from mmpi_ns.utils.errors import InputError
+from mmpi_ns.utils.errors import InputError, quoted
 from mmpi_ns.utils.files import write_errors
 
 LOCK = ".lock"
@@ -38,8 +38,8 @@ def claim(folder: Path, checkpoints: Path, resumes_from: Path | None) -> None:
     goes_on = resumes_from is not None and bool(own & {resumes_from.resolve(), resumes_from.resolve().parent})
     if checkpoints_in(checkpoints) and not goes_on:
         raise InputError(
-            f"{checkpoints} holds checkpoints of an earlier run: go on from them with --load-dir {checkpoints}, or "
-            "give another --timestamp."
+            f"{checkpoints} holds checkpoints of an earlier run: go on from them with --load-dir "
+            f"{quoted(checkpoints)}, or give another --timestamp."
         )
     for unfinished in [*folder.glob(".*.tmp"), *folder.glob("windows/.*.tmp")]:
         unfinished.unlink(missing_ok=True)

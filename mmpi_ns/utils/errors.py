@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import shlex
+from pathlib import Path
+
 
 class InputError(ValueError):
     """What a user gave cannot be used. The message is one sentence: what is wrong, where, and what to do."""
@@ -14,3 +17,8 @@ class WriteError(InputError, OSError):
 def brief(error: BaseException) -> str:
     """What an error says, cut after its first sentence: it goes in brackets into a sentence of ours."""
     return str(error).strip().split("\n")[0].split(". ")[0].rstrip(" .")
+
+
+def quoted(path: Path) -> str:
+    """A path as a shell takes it, for a command to be copied."""
+    return shlex.quote(str(path))
