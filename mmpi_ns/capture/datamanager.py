@@ -20,6 +20,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
 from torch import Tensor
 
+from mmpi_ns.capture.ahead import DrawnAhead
 from mmpi_ns.capture.checks import check_parser, check_transforms, say_once
 from mmpi_ns.capture.dataset import MMPIDataset
 from mmpi_ns.capture.exif import light_of
@@ -173,6 +174,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         """Reads the pixels into memory, unless there are too many, instead of nerfstudio's image cache."""
         # Samples nothing: ns-export sets its batches' size here.
         self.train_pixel_sampler = self._get_pixel_sampler(self.train_dataset, self.config.train_num_rays_per_batch)
+        self._rays = DrawnAhead(self.config.seed, self.device)
         cameras = self.train_dataset.cameras
         pinhole = PinholeRays.of(cameras, self.device)
         self.train_ray_generator: Any = pinhole or RayGenerator(cameras.to(self.device))
@@ -325,5 +327,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         if self.sources is None:  # nobody said which window
             self.use_cameras(None)
         assert self.sources is not None
-        g = generator(self.config.seed, step if self.training else self.train_count, "pixels", self.device)
-        return self.sources.draw(self.get_train_rays_per_batch(), self.rays_share, g, pixels_alone=not self.training)
+        if self.training:
+            return self._rays.draw(self.sources, step, self.get_train_rays_per_batch(), self.rays_share)
+        g = generator(self.config.seed, self.train_count, "pixels", self.device)
+        return self.sources.draw(self.get_train_rays_per_batch(), self.rays_share, g, pixels_alone=True)
