@@ -16,7 +16,7 @@ from suites import DEFAULT, SUITES
 from mmpi_ns.capture.load import load_observations
 from mmpi_ns.placement.errors import pixel_errors
 from mmpi_ns.placement.visibility import find_visible_points
-from mmpi_ns.scene.plan import ScenePlan
+from mmpi_ns.scene.windows import WindowedPlan
 from mmpi_ns.scripts.command import run
 
 RAYS_PER_STEP = 1024
@@ -57,7 +57,10 @@ class Results(SceneBench):
         row = {k: results[k] for k in ("psnr", "ssim", "num_rays_per_sec", "dropped_mass") if k in results}
         row |= {k: v for k, v in results.items() if k.startswith("lpips") and not k.endswith("std")}
         # MPIs, texels and expected pixel errors of the plan that the run used.
-        plan, observations = ScenePlan.load(run / "plan.json"), _observations(self.data, self.downscale_factor)
+        plan, observations = (
+            WindowedPlan.load(run / "plan.json").plans[0],
+            _observations(self.data, self.downscale_factor),
+        )
         visible = find_visible_points(observations)
         row |= {"mpis": len(plan.mpis), "texels": plan.texels}
         row |= pixel_errors(plan, observations, visible.cameras, visible.points).summary()

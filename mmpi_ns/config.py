@@ -36,16 +36,15 @@ POSE_RATE = 1e-4
 """Learning rate of refined poses, radians and scene units: a tenth of nerfacto's (docs/log/experiments.md)."""
 
 
-def _optimizers(colour: float) -> dict:
-    rates = {"density": 0.1, "features": 0.1, "colour": colour, "reliability": 0.1}
-    optimizers: dict = {kind: TouchedAdamConfig(lr=lr) for kind, lr in rates.items()}
-    optimizers["camera_opt"] = AdamOptimizerConfig(lr=POSE_RATE, eps=1e-15)
-    return {kind: {"optimizer": x, "scheduler": PhaseSchedulerConfig(kind=kind)} for kind, x in optimizers.items()}
-
-
 def _method(
     name: str, description: str, *, steps: int, rays: int, model: MMPIModelConfig, paper: bool = False
 ) -> MethodSpecification:
+    rates = {"density": 0.1, "features": 0.1, "colour": 1e-3 if paper else 3e-3, "reliability": 0.1}
+    optimizers: dict = {kind: TouchedAdamConfig(lr=lr) for kind, lr in rates.items()}
+    optimizers["camera_opt"] = AdamOptimizerConfig(lr=POSE_RATE, eps=1e-15)
+    if paper:  # from DVGO: total variation and nine features; and a network evaluated for every sample
+        model.loss = LossWeights(tv_density=1e-5, tv_features=1e-6)
+        model.colour = ColourConfig(shading="sample", feature_channels=9)
     config = MMPITrainerConfig(
         method_name=name,
         max_num_iterations=steps,
@@ -63,17 +62,11 @@ def _method(
             ),
             model=model,
         ),
-        optimizers=_optimizers(colour=1e-3 if paper else 3e-3),
+        optimizers={k: {"optimizer": x, "scheduler": PhaseSchedulerConfig(kind=k)} for k, x in optimizers.items()},
         viewer=ViewerConfig(websocket_host="127.0.0.1", num_rays_per_chunk=1 << 14, quit_on_train_completion=True),
         vis="viewer+tensorboard",
     )
     return MethodSpecification(config=config, description=description)
-
-
-def _paper() -> dict:
-    """What the paper takes from DVGO: total variation and nine features; and a network evaluated for every sample."""
-    loss = LossWeights(tv_density=1e-5, tv_features=1e-6)
-    return {"loss": loss, "colour": ColourConfig(shading="sample", feature_channels=9)}
 
 
 mmpi = _method(
@@ -101,34 +94,26 @@ mmpi_kitti = _method(
         schedule=replace(
             PAPER_SCHEDULE, training="two-phase", rays_per_mpi="split", blend_share=0.25, finetune_share=0.0
         ),
-        **_paper(),
     ),
 )
 
 
-def _scannet() -> MMPIModelConfig:
-    return MMPIModelConfig(
-        placement=PlacementConfig(
-            arrangement="room", window_length=0.0, planes=128, height=192, width=192, cube_voxels=160
+mmpi_scannet, mmpi_scannet_short = (
+    _method(
+        name,
+        f"MMPI with the paper's ScanNet settings{what}.",
+        steps=steps,
+        rays=4096,
+        paper=True,
+        model=MMPIModelConfig(
+            placement=PlacementConfig(
+                arrangement="room", window_length=0.0, planes=128, height=192, width=192, cube_voxels=160
+            ),
+            schedule=replace(PAPER_SCHEDULE, training="joint"),
         ),
-        schedule=replace(PAPER_SCHEDULE, training="joint"),
-        **_paper(),
     )
-
-
-mmpi_scannet = _method(
-    "mmpi-scannet",
-    "MMPI with the paper's ScanNet settings: five MPIs and a cube, all together.",
-    steps=30000,
-    rays=4096,
-    paper=True,
-    model=_scannet(),
-)
-mmpi_scannet_short = _method(
-    "mmpi-scannet-short",
-    "MMPI with the paper's ScanNet settings and a third of the steps.",
-    steps=10000,
-    rays=4096,
-    paper=True,
-    model=_scannet(),
+    for name, what, steps in (
+        ("mmpi-scannet", ": five MPIs and a cube, all together", 30000),
+        ("mmpi-scannet-short", " and a third of the steps", 10000),
+    )
 )

@@ -18,7 +18,7 @@ from torch import Tensor
 from mmpi_ns.capture.rays import PinholeRays
 from mmpi_ns.export.bake import read_run_config
 from mmpi_ns.export.files import HEADER, BakedScene, read_baked
-from mmpi_ns.rendering.chunks import SHOWN_RAYS, render_in_chunks
+from mmpi_ns.rendering.images import SHOWN_RAYS, render_in_chunks
 from mmpi_ns.scene.windows import WindowedPlan
 from mmpi_ns.training.checkpoints import checkpoints_in, read_checkpoint
 from mmpi_ns.utils.errors import InputError

@@ -21,34 +21,39 @@ from torch.nn import Parameter
 from mmpi_ns.capture.datamanager import GAINS, OBSERVATIONS, RAYS_PER_STEP, TRAINING_VIEWS
 from mmpi_ns.capture.rays import PinholeRays
 from mmpi_ns.field.mmpi_field import ColourConfig, MMPIField
+from mmpi_ns.field.samples import metadata_of
 from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.march import MarchOptions
 from mmpi_ns.placement.defaults import steps_for
 from mmpi_ns.placement.rule import PlacementConfig
 from mmpi_ns.placement.split import most_pixels, place_windows
 from mmpi_ns.rendering.baked import BakedWindow, bake, suits_bricks
-from mmpi_ns.rendering.chunks import check_crop, rays_per_chunk, render_in_chunks
 from mmpi_ns.rendering.exposure import Exposures
+from mmpi_ns.rendering.images import check_crop, rays_per_chunk, render_in_chunks, render_windows
 from mmpi_ns.rendering.metrics import ImageMetrics, depth_metrics, pictures
-from mmpi_ns.rendering.render import render_rays, sampled_outputs
-from mmpi_ns.rendering.rendered import BACKGROUNDS, RenderedRays, RenderingConfig, background_of, bounded
+from mmpi_ns.rendering.rendered import (
+    BACKGROUNDS,
+    RenderedRays,
+    RenderingConfig,
+    background_of,
+    bounded,
+    render_rays,
+    sampled_outputs,
+    shown_outputs,
+)
 from mmpi_ns.rendering.sampler import MMPISampler, SamplingConfig
-from mmpi_ns.rendering.shown import shown_outputs, shows_in_one_pass
 from mmpi_ns.rendering.window_store import WindowStore
-from mmpi_ns.rendering.windows import render_windows
 from mmpi_ns.scene.plan import NO_PLAN
 from mmpi_ns.scene.visible_tiles import TrainingViews
 from mmpi_ns.scene.windows import WindowedPlan
+from mmpi_ns.training.batch_rays import check_refined_poses, individual_rays, move_rays
 from mmpi_ns.training.checkpoints import check_there_are_checkpoints
-from mmpi_ns.training.config_files import grouped
-from mmpi_ns.training.individual import individual_rays
 from mmpi_ns.training.losses import LossWeights, batch_losses, over_background, photometric
 from mmpi_ns.training.memory import check_memory
+from mmpi_ns.training.options import grouped
 from mmpi_ns.training.phases import ScheduleConfig, make_schedule
-from mmpi_ns.training.progress import Progress
-from mmpi_ns.training.refined_poses import check_refined_poses, move_rays
-from mmpi_ns.training.run import TrainingRun, views_of
-from mmpi_ns.utils.console import say
+from mmpi_ns.training.run import Progress, TrainingRun, views_of
+from mmpi_ns.utils.errors import say
 from mmpi_ns.utils.parallel import torch_apart
 from mmpi_ns.utils.random_draws import generator
 
@@ -115,33 +120,31 @@ class MMPIModel(Model):
         joint = config.schedule.training == "joint" or all(plan.num_heads == 1 for plan in windows.plans)
         phases = replace(config.schedule, training="joint" if joint else "two-phase")
         self.progress = Progress(windows, make_schedule(phases, max(1, config.total_steps), len(windows)))
-        views = self.kwargs.get("metadata", {}).get(TRAINING_VIEWS)
-        self.trains = OBSERVATIONS in self.kwargs.get("metadata", {})
+        metadata, device = self.kwargs.get("metadata", {}), self.kwargs.get("device", "cpu")
+        views, observations = metadata.get(TRAINING_VIEWS), metadata.get(OBSERVATIONS)
+        self.trains = OBSERVATIONS in metadata
         if self.trains:
-            seen, device = [views_of(window, views) for window in windows.windows], self.kwargs.get("device", "cpu")
+            seen = [views_of(window, views) for window in windows.windows]
             check_memory(windows, seen, config.colour.feature_channels, not joint, device)
         self.field = self._new_field(views_of(windows.windows[0], views))
         budget = config.rendering.resident_gib * 2**30
         self.store = WindowStore(config.windows_folder, self._new_field, budget, config.rendering.half_windows)
-        self.exposures = Exposures(self.kwargs.get("metadata", {}).get(GAINS), None if views is None else views.origins)
+        self.exposures = Exposures(metadata.get(GAINS), None if views is None else views.origins)
         self.sampler = MMPISampler()
         self.metrics = ImageMetrics(config.lpips_net)
         self.scoring: Callable[[dict[str, Tensor], dict[str, Tensor]], tuple[dict, dict]] | None = None
         """In place of ``scores_and_images`` while the pipeline evaluates images, whose exposures it knows."""
         self.show = ViewerDropdown("Show MPI", "all", ["all", *windows.names], hint="One MPI alone, or all")
-        self.camera_optimizer: CameraOptimizer = config.camera_optimizer.setup(
-            num_cameras=self.num_train_data, device=self.kwargs.get("device", "cpu")
-        )
+        poses = config.camera_optimizer.setup(num_cameras=self.num_train_data, device=device)
+        self.camera_optimizer: CameraOptimizer = poses
         check_refined_poses(config.camera_optimizer.mode, len(windows))
-        poses = self.camera_optimizer.parameters()
-        observations = self.kwargs.get("metadata", {}).get(OBSERVATIONS)
-        free = {"scale_is_free": observations is not None and not len(observations.seen_by)}
-        release = config.schedule.release_weight
-        self.run = TrainingRun(self.progress, self.field, self.store, views, release, [*poses], **free)
-        self.register_load_state_dict_post_hook(lambda *_: self._after_loading())
+        scale_is_free = observations is not None and not len(observations.seen_by)
+        release, moves = config.schedule.release_weight, [*poses.parameters()]
+        self.run = TrainingRun(self.progress, self.field, self.store, views, release, moves, scale_is_free)
+        self.register_load_state_dict_post_hook(type(self)._take_plan)
 
     def _plan(self) -> WindowedPlan:
-        """The plan that is asked for, or the one that the placement rule makes of what the training cameras saw."""
+        """Scene plan of the option, or of the placement rule for the observations of the training cameras."""
         config, metadata = self.config, self.kwargs.get("metadata", {})
         observations = metadata.get(OBSERVATIONS)
         if observations is not None and config.total_steps == 0:
@@ -166,8 +169,8 @@ class MMPIModel(Model):
             cube_alpha=self.config.sampling.cube_alpha,
         )
 
-    def _after_loading(self) -> None:
-        """The plan and the schedule are the checkpoint's now."""
+    def _take_plan(self, _: Any) -> None:
+        """Takes over plan and schedule of a checkpoint that was loaded."""
         self.field.shares_depth = self.progress.schedule.is_joint
         self.show.set_options(["all", *self.progress.windows.names])
 
@@ -181,12 +184,10 @@ class MMPIModel(Model):
     # Rendering: nothing is assigned to the model, so threads may render while another trains or saves -------------
 
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:  # type: ignore[override]
-        """Outputs of rays: of a training batch, or of an image."""
-        return self.training_outputs(ray_bundle) if self.training else self.image_outputs(ray_bundle)
-
-    def training_outputs(self, bundle: RayBundle) -> dict[str, Any]:
-        """``RenderedRays`` for the losses, of the window at hand."""
-        progress, field = self.progress, self.field
+        """Outputs of an image's rays; ``RenderedRays`` for the losses of a training batch, of the window at hand."""
+        if not self.training:
+            return self.image_outputs(ray_bundle)
+        progress, field, bundle = self.progress, self.field, ray_bundle
         asked, head_mask, choose = len(bundle), None, None
         move_rays(bundle, self.camera_optimizer)
         bundle = bounded(bundle, field.plan)
@@ -202,7 +203,7 @@ class MMPIModel(Model):
         return {"training": rays}
 
     def training_bounds(self) -> dict[str, float]:
-        """What a sample must weigh to be kept in training (``ops.march.prune``).
+        """Minimum weights of samples kept in training (``ops.march.prune``).
 
         While surfaces form, samples of little weight must learn too, and the cube starts nearly empty.
         """
@@ -212,26 +213,22 @@ class MMPIModel(Model):
 
     def image_outputs(self, bundle: RayBundle, chunk: int | None = None) -> dict[str, Tensor]:
         """rgb, accumulation, depth, winning MPI and dropped mass [R, .] of rays, from the windows that they start in.
-
-        Args:
-            bundle: the rays [R].
-            chunk: rays that one window renders at once; None: all.
-        """
+        ``chunk``: rays that a window renders at once; None: all."""
         windows, trained = self.progress.windows, self.progress.window
         chosen = windows.find(self.show.value)  # by the viewer
-        there = self.run.windows_there() if len(windows) > 1 else [0]
+        present = self.run.windows_there() if len(windows) > 1 else [0]
 
         def render(place: int, rays: Tensor | slice) -> dict[str, Tensor]:
-            window = there[place]
+            window = present[place]
             field = self.field if window == trained else self.store.load(window, self.device)
             outputs = lambda part: self.window_outputs(window, field, part, chosen)  # noqa: E731
             return render_in_chunks(bundle[rays], chunk or len(bundle), self.device, outputs)
 
         if len(windows) == 1:
             return render(0, slice(None))
-        shown = there.index(chosen[0]) if chosen is not None and chosen[0] in there else None
-        in_memory = [i for i, window in enumerate(there) if window in (trained, *self.store.in_memory)]
-        return render_windows(bundle.origins, tuple(windows.windows[w] for w in there), render, shown, in_memory)
+        shown = present.index(chosen[0]) if chosen is not None and chosen[0] in present else None
+        in_memory = [i for i, window in enumerate(present) if window in (trained, *self.store.in_memory)]
+        return render_windows(bundle.origins, tuple(windows.windows[w] for w in present), render, shown, in_memory)
 
     def window_outputs(
         self, window: int, field: MMPIField, bundle: RayBundle, chosen: tuple[int, int] | None = None
@@ -244,9 +241,13 @@ class MMPIModel(Model):
             bundle: the rays.
             chosen: the one (window, head) to show; None for all.
         """
-        if chosen is None and self._shows_bricks(field):
-            outputs = self.baked(field).outputs(bounded(bundle, field.plan), self._behind(bundle.origins))
-            return outputs | {"winning_mpi": outputs["winning_mpi"] + self.progress.windows.first_head(window)}
+        mode, first_head = self.config.rendering.mode, self.progress.windows.first_head(window)
+        background = background_of(self.config.rendering.background, bundle.origins)
+        one_exposure = self.exposures.mean is None or self.config.rendering.exposure == "mean"
+        may_bake = mode == "auto" and not self.trains and one_exposure
+        if chosen is None and (mode == "baked" or (may_bake and suits_bricks(field))):
+            outputs = self.baked(field).outputs(bounded(bundle, field.plan), background)
+            return outputs | {"winning_mpi": outputs["winning_mpi"] + first_head}
         blends, head_mask = self.blends(field), None
         if chosen is not None:
             head = chosen[1] if chosen[0] == window else -1
@@ -255,8 +256,8 @@ class MMPIModel(Model):
         how = {"blends": blends, "threshold": self.config.rendering.threshold, "head_mask": head_mask}
         once = field.shading == "ray" and not torch.is_grad_enabled()
         outputs = (shown_outputs if once else sampled_outputs)(bounded(bundle, field.plan), field, **how)
-        behind, exposure = outputs.pop("transmittance") * self._behind(outputs["rgb"]), self.exposures.mean
-        winner = outputs["winning_mpi"] + self.progress.windows.first_head(window)
+        behind, exposure = outputs.pop("transmittance") * background.to(outputs["rgb"]), self.exposures.mean
+        winner = outputs["winning_mpi"] + first_head
         if exposure is None:
             return outputs | {"rgb": (outputs["rgb"] + behind).clamp(0, 1), "winning_mpi": winner}
         if self.config.rendering.exposure == "nearest" and len(bundle):
@@ -265,15 +266,8 @@ class MMPIModel(Model):
         rgb = (exposure * radiance).clamp(0, 1)
         return outputs | {"rgb": rgb, "radiance": radiance, "winning_mpi": winner}
 
-    def _shows_bricks(self, field: MMPIField) -> bool:
-        """Whether images of a field come from its bricks."""
-        if self.config.rendering.mode == "auto":
-            one_exposure = self.exposures.mean is None or self.config.rendering.exposure == "mean"
-            return not self.trains and one_exposure and suits_bricks(field)
-        return self.config.rendering.mode == "baked"
-
     def baked(self, field: MMPIField) -> BakedWindow:
-        """A field baked, made once, until it is trained on. Raises ValueError where it cannot be."""
+        """Baked form of a field, cached until the field is trained on. Raises ValueError if it cannot be baked."""
 
         def make() -> BakedWindow:
             say("Baking, once: a few seconds.")
@@ -287,9 +281,6 @@ class MMPIModel(Model):
     def blends(self, field: MMPIField) -> bool:
         """Whether reliability enters a field's pictures."""
         return self.config.schedule.training != "joint" and field.plan.num_heads > 1
-
-    def _behind(self, like: Tensor) -> Tensor:
-        return background_of(self.config.rendering.background, like)
 
     # Images ------------------------------------------------------------------------------------------------------
 
@@ -314,15 +305,15 @@ class MMPIModel(Model):
         if self.config.eval_num_rays_per_chunk:
             return self.config.eval_num_rays_per_chunk
         most = max(plan.samples_per_ray for plan in self.progress.windows.plans)
-        one_pass, kept = shows_in_one_pass(self.field), MarchOptions(self.config.rendering.threshold).most_kept(most)
+        field, kept = self.field, MarchOptions(self.config.rendering.threshold).most_kept(most)
+        one_pass = field.shading == "ray" and dispatch.form_of("show_rays", field.features) != "reference"
         return rays_per_chunk(most, self.device, kept if one_pass else None)
 
     def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
         """Colours without their background, and how opaque each pixel is (ns-render's output "rgba")."""
         accumulation = outputs["accumulation"]
-        colors = outputs[output_name] - (1 - accumulation) * background_of(
-            self.config.rendering.background, accumulation
-        )
+        background = background_of(self.config.rendering.background, accumulation)
+        colors = outputs[output_name] - (1 - accumulation) * background
         return torch.cat([(colors / accumulation.clamp(min=1e-6)).clamp(0, 1), accumulation], -1)
 
     # Losses and metrics ------------------------------------------------------------------------------------------
@@ -336,7 +327,7 @@ class MMPIModel(Model):
         g = generator(self.config.seed, step, "background", self.device)
         total = batch_losses(outputs["training"], self.field, image, self.config.loss, g, step)
         self.camera_optimizer.get_loss_dict(total)
-        # A batch that meets nothing that trains would have no gradient at all; this adds 0 with one.
+        # A batch of rays that meet nothing trainable would have no gradient; this adds 0 with a gradient.
         total["rgb_loss"] = total["rgb_loss"] + self.device_indicator_param.sum()
         return total
 
@@ -344,9 +335,10 @@ class MMPIModel(Model):
         if "training" not in outputs:
             return {"psnr": -10 * torch.log10(photometric(outputs["rgb"], self.observed(batch)))}
         rays: RenderedRays = outputs["training"]
-        found = rays.counts()
-        self.camera_optimizer.get_metrics_dict(found)
-        return found
+        kept, live = metadata_of(rays.samples)["valid"].float().sum() / len(rays.report.live), rays.report.live.float()
+        counts = {"live_samples": live.mean(), "kept_samples": kept, "dropped_mass": rays.report.dropped_mass.mean()}
+        self.camera_optimizer.get_metrics_dict(counts)
+        return counts
 
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Tensor]

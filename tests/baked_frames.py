@@ -36,7 +36,7 @@ def main(folder: tyro.conf.Positional[Path], scale: int = 1, frames: int = 8, ro
 
     from mmpi_ns.export.files import read_baked
     from mmpi_ns.ops.baked.reader import camera_rays
-    from mmpi_ns.rendering.chunks import CPU_RAYS
+    from mmpi_ns.rendering.images import CPU_RAYS
 
     torch.set_num_threads(1)
     say("and what reads and renders")

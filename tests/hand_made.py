@@ -9,7 +9,7 @@ import torch
 from hypothesis import assume
 from hypothesis import strategies as st
 
-from mmpi_ns.scene.geometry import local_to_ndc, rays_in_frames, rotate
+from mmpi_ns.scene.geometry import LocalRays, local_to_ndc, rotate
 from mmpi_ns.scene.plan import MPIPlan
 
 IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -29,7 +29,8 @@ def world_to_ndc(points, inverse_t, frames):
 
 def samples_to_ndc(origins, directions, inverse_t, frames):
     """``local_to_ndc`` of the points origins + t directions, from differences to each MPI's origin (exact far away)."""
-    local_origins, local_directions = rays_in_frames(origins, directions, frames)
+    local = LocalRays.of(origins, directions, frames)
+    local_origins, local_directions = local.local_origins, local.local_directions
     return local_to_ndc(local_origins * inverse_t[:, None, None] + local_directions, inverse_t[:, None], frames)
 
 

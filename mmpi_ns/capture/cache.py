@@ -7,6 +7,7 @@ import os
 import struct
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 from mmpi_ns.utils.files import write_atomically
 
 KEPT = 24
-"""Results that are kept; the least recently used is removed first."""
+"""Number of cached results; the least recently used is removed first."""
 
 MOST_BYTES = 10e9
 """Of all results that are kept; the last one is kept whatever its size."""
@@ -35,13 +36,13 @@ def cache_folder() -> Path:
 
 def digest(files: Iterable[Path], *parts: object) -> str:
     """A key made of files (path, size, modification time), arrays and settings."""
-    found = hashlib.sha256()
+    key = hashlib.sha256()
     for file in files:
         stat = file.stat()
-        found.update(f"{file.resolve()} {stat.st_size} {stat.st_mtime_ns}\n".encode())
+        key.update(f"{file.resolve()} {stat.st_size} {stat.st_mtime_ns}\n".encode())
     for part in parts:
-        found.update(np.ascontiguousarray(part).tobytes() if isinstance(part, np.ndarray) else repr(part).encode())
-    return found.hexdigest()[:32]
+        key.update(np.ascontiguousarray(part).tobytes() if isinstance(part, np.ndarray) else repr(part).encode())
+    return key.hexdigest()[:32]
 
 
 class Computed(Sequence[T]):
@@ -78,31 +79,27 @@ def remembered(key: str, find: Callable[[], Arrays | Pairs], folder: Path | None
         lock = FileLock(folder / f"{key}.lock").acquire()
     except OSError as error:
         CONSOLE.print(f"[yellow]{folder} cannot be written to ({error.strerror}): depths are recomputed at each start.")
-        return dict(_pairs(find()))
+        return dict(find())
     with lock:
         arrays = _read(path)
         if arrays is None:
-            result = find()
+            result: Any = find()
             try:
                 write_atomically(path, lambda unfinished: _write(unfinished, result))
                 arrays = _read(path)
             except OSError as error:
                 CONSOLE.print(f"[yellow]{error}")
             if arrays is None:
-                arrays = dict(_pairs(result if isinstance(result, Mapping) else find()))
+                arrays = result if isinstance(result, Mapping) else dict(find())
         _forget_old(folder)
     return arrays
 
 
-def _pairs(arrays: Any) -> Pairs:
-    return arrays.items() if isinstance(arrays, Mapping) else arrays
-
-
 def _write(path: Path, arrays: Arrays | Pairs) -> None:
     with zipfile.ZipFile(path, "w") as file:  # as np.savez, which asks for all arrays at once
-        for name, array in _pairs(arrays):
+        for name, array in arrays.items() if isinstance(arrays, Mapping) else arrays:
             with file.open(f"{name}.npy", "w", force_zip64=True) as entry:
-                np.lib.format.write_array(entry, np.asanyarray(array), allow_pickle=False)
+                np.lib.format.write_array(entry, np.asanyarray(array), version=(1, 0), allow_pickle=False)
 
 
 class _Mapped(Mapping[str, NDArray[np.generic]]):
@@ -115,13 +112,9 @@ class _Mapped(Mapping[str, NDArray[np.generic]]):
         with zipfile.ZipFile(self.data) as file:
             for entry in file.infolist():
                 self.data.seek(entry.header_offset + 26)  # of a zip's local header: lengths of name and extra field
-                name, extra = struct.unpack("<HH", self.data.read(4))
-                self.data.seek(name + extra, os.SEEK_CUR)
-                version = np.lib.format.read_magic(self.data)
-                header = (
-                    np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-                )
-                shape, fortran, dtype = header(self.data)
+                self.data.seek(sum(struct.unpack("<HH", self.data.read(4))), os.SEEK_CUR)
+                np.lib.format.read_magic(self.data)
+                shape, fortran, dtype = np.lib.format.read_array_header_1_0(self.data)
                 place = dtype, self.data.tell(), shape, "F" if fortran else "C"
                 self.places[entry.filename.removesuffix(".npy")] = place
 
@@ -156,9 +149,6 @@ def _forget_old(folder: Path) -> None:
     sizes = np.cumsum([file.stat().st_size for file in files])
     kept = min(KEPT, max(1, int((sizes <= MOST_BYTES).sum())))
     for path in files[kept:]:
-        try:
-            with FileLock(path.with_suffix(".lock"), timeout=0):
-                path.unlink(missing_ok=True)
-                path.with_suffix(".lock").unlink(missing_ok=True)
-        except Timeout:
-            continue
+        with suppress(Timeout), FileLock(path.with_suffix(".lock"), timeout=0):
+            path.unlink(missing_ok=True)
+            path.with_suffix(".lock").unlink(missing_ok=True)

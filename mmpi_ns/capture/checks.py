@@ -33,6 +33,7 @@ FAR_OFF = 1000.0
 """A camera this many times as far away as all but a few others is a mistake."""
 FEW = 0.1
 """Fraction of the cameras that counts as a few."""
+SPLITS = ("train_filenames", "val_filenames", "test_filenames")
 PATHS = ("file_path", "mask_path", "depth_file_path")
 PARSER = {
     "scale_factor": Number(0, 1e9, above=True),
@@ -62,18 +63,15 @@ def check_transforms(parser: NerfstudioDataParserConfig, data: Path, splits: Seq
         opens: the parser takes its downscale factor from the first image, unless one is given, or from its copies.
 
     Raises:
-        InputError: one sentence with the file, the frame where there is one, and what to do.
+        InputError: one sentence with the file, the frame if it is of one, and what to do.
     """
     path = data if data.suffix == ".json" else data / "transforms.json"
     meta, frames = _read(path)
-    for i, frame in enumerate(frames):
-        _check_paths(frame, i, path)
+    _check_files(parser, meta, frames, path)
     poses = np.stack([_pose(frame, path) for frame in frames])
     _check_whole_file(meta, path)
     check_lenses(meta, frames, path)
-    _check_same_for_all(frames, path)
     _check_splits(meta, frames, splits, path, by_name=(parser.downscale_factor or 1) > 1)
-    _check_names(parser, meta, frames, path)
     if opens:
         _check_first_image(parser.downscale_factor, path.parent, frames[0]["file_path"])
     names = [str(frame["file_path"]) for frame in frames]
@@ -91,7 +89,7 @@ def say_once(text: str) -> None:
 
 
 def in_one_place(centers: NDArray[np.float64], share: float = SAME_PLACE) -> bool:
-    """Whether camera centres [M, 3] are equal up to rounding, which is relative to their distance from the origin."""
+    """Test of camera centres [M, 3] for equality up to rounding, relative to their distance from the origin."""
     return float(np.ptp(centers, axis=0).max()) <= share * max(1.0, float(np.abs(centers).max()))
 
 
@@ -112,16 +110,30 @@ def _read(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     return meta, frames
 
 
-def _check_paths(frame: Mapping[str, Any], index: int, path: Path) -> None:
-    for key in ("file_path", "transform_matrix"):
-        if key not in frame:
-            name = cut(str(frame.get("file_path", f"number {index + 1}")))
-            raise InputError(f"Frame {name} of {path} has no {key}: add it or remove the frame.")
-    for key in PATHS:
-        value = frame.get(key, "given")
-        if not isinstance(value, str) or not value.strip() or "\0" in value:
+def _check_files(parser: NerfstudioDataParserConfig, meta: Mapping[str, Any], frames: Frames, path: Path) -> None:
+    """Fields of each frame that must be there, and its paths: text, and in all frames or none."""
+    for i, frame in enumerate(frames):
+        for key in ("file_path", "transform_matrix"):
+            if key not in frame:
+                name = cut(str(frame.get("file_path", f"number {i + 1}")))
+                raise InputError(f"Frame {name} of {path} has no {key}: add it or remove the frame.")
+        for key in PATHS:
+            value = frame.get(key, "given")
+            if not isinstance(value, str) or not value.strip() or "\0" in value:
+                raise InputError(
+                    f"The {key} of frame number {i + 1} of {path} is {shown(value)}: give the path of a file as text."
+                )
+    for key in ("mask_path", "depth_file_path"):
+        having = [key in frame for frame in frames]
+        if any(having) and not all(having):
+            name = cut(frames[having.index(False)]["file_path"])
+            raise InputError(f"Frame {name} of {path} has no {key} and others have one: give all frames one, or none.")
+    names = [] if any(key in meta for key in SPLITS) else [frame["file_path"] for frame in frames]
+    for name in names if parser.eval_mode == "filename" else ():
+        if not re.search("train|eval", Path(name).name):
             raise InputError(
-                f"The {key} of frame number {index + 1} of {path} is {shown(value)}: give the path of a file as text."
+                f"The file name of frame {cut(name)} of {path} has neither train nor eval in it: rename it, or give "
+                "another --eval-mode."
             )
 
 
@@ -176,45 +188,21 @@ def _check_whole_file(meta: Mapping[str, Any], path: Path) -> None:
         )
 
 
-def _check_names(parser: NerfstudioDataParserConfig, meta: Mapping[str, Any], frames: Frames, path: Path) -> None:
-    """File names that determine the split, if --eval-mode filename is used."""
-    if parser.eval_mode != "filename" or any(f"{split}_filenames" in meta for split in ("train", "val", "test")):
-        return
-    for frame in frames:
-        if not re.search("train|eval", Path(frame["file_path"]).name):
-            raise InputError(
-                f"The file name of frame {cut(frame['file_path'])} of {path} has neither train nor eval in it: rename "
-                "it, or give another --eval-mode."
-            )
-
-
-def _check_same_for_all(frames: Frames, path: Path) -> None:
-    for key in ("mask_path", "depth_file_path"):
-        having = [key in frame for frame in frames]
-        if any(having) and not all(having):
-            name = cut(frames[having.index(False)]["file_path"])
-            raise InputError(f"Frame {name} of {path} has no {key} and others have one: give all frames one, or none.")
-
-
 def _check_splits(meta: Mapping[str, Any], frames: Frames, splits: Sequence[str], path: Path, *, by_name: bool) -> None:
-    """Lists of training and evaluation frames: if there is one, all requested splits need theirs."""
-    keys = [f"{split}_filenames" for split in ("train", "val", "test")]
-    if not any(key in meta for key in keys):
+    """Lists of training and evaluation frames: if the file holds any, all requested splits need theirs."""
+    if not any(key in meta for key in SPLITS):
         return
-
-    def known(name: str) -> str | Path:
-        return Path(name).name if by_name else Path(name)
-
-    names = {known(frame["file_path"]) for frame in frames}
+    kind = (lambda name: Path(name).name) if by_name else Path
+    names = {kind(frame["file_path"]) for frame in frames}
     for key in dict.fromkeys(f"{split}_filenames" for split in splits):
         listed = meta.get(key)
         if not isinstance(listed, list) or not listed or not all(isinstance(x, str) for x in listed):
-            others = ", ".join(k for k in keys if k in meta and k != key) or "one of them"
+            others = ", ".join(k for k in SPLITS if k in meta and k != key) or "one of them"
             raise InputError(
                 f"{path} has {others} and {'no list ' if listed is None else 'an unusable '}{key}: list the file_path "
                 "of every frame in it, or remove the three lists."
             )
-        lost = [x for x in listed if known(x) not in names]
+        lost = [x for x in listed if kind(x) not in names]
         if lost:
             raise InputError(
                 f"{shown(lost[0])}, listed in {key} of {path}, is the file_path of no frame ({len(lost)} such in "
@@ -223,16 +211,16 @@ def _check_splits(meta: Mapping[str, Any], frames: Frames, splits: Sequence[str]
 
 
 def _check_first_image(factor: int | None, folder: Path, first: str) -> None:
-    if factor is not None and not Number(1, 1024, whole=True).holds(factor):
-        raise InputError(f"--downscale-factor must be a whole number of at least 1, not {factor}.")
-    copy = folder / f"images_{factor}" / Path(first).name
-    if factor is not None and factor > 1 and not copy.is_file():
-        there = sorted(p.name for p in folder.glob("images_*") if p.is_dir())
-        raise InputError(
-            f"There is no {copy}, a copy at 1/{factor} of its size: make copies (mmpi-prepare does) or give another "
-            f"--downscale-factor (there are {', '.join(there) or 'no copies'})."
-        )
     if factor is not None:
+        if not Number(1, 1024, whole=True).holds(factor):
+            raise InputError(f"--downscale-factor must be a whole number of at least 1, not {factor}.")
+        copy = folder / f"images_{factor}" / Path(first).name
+        if factor > 1 and not copy.is_file():
+            copies = ", ".join(sorted(p.name for p in folder.glob("images_*") if p.is_dir())) or "no copies"
+            raise InputError(
+                f"There is no {copy}, a copy at 1/{factor} of its size: make copies (mmpi-prepare does) or give "
+                f"another --downscale-factor (there are {copies})."
+            )
         return
     try:
         with Image.open(folder / first):

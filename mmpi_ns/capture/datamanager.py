@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager, VanillaDataManagerConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
@@ -18,7 +17,6 @@ from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader, RandIn
 from nerfstudio.model_components.ray_generators import RayGenerator
 from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
-from torch import Tensor
 
 from mmpi_ns.capture.ahead import DrawnAhead
 from mmpi_ns.capture.checks import check_parser, check_transforms, say_once
@@ -27,17 +25,15 @@ from mmpi_ns.capture.exif import light_of
 from mmpi_ns.capture.known_depth import KnownDepth, know_depths, with_known_depths
 from mmpi_ns.capture.local_origin import take_local_origins
 from mmpi_ns.capture.moving import moving_masks
-from mmpi_ns.capture.new_views import SharedPoints, find_shared_points, image_and_mask
+from mmpi_ns.capture.new_views import find_shared_points, image_and_mask
 from mmpi_ns.capture.observe import drop_masked, observe, posed_images, sfm_folder
-from mmpi_ns.capture.originals import at_full_size
 from mmpi_ns.capture.photometry import SAME_LIGHT, Gains, color_ratios, image_gains
-from mmpi_ns.capture.pixels import PixelPool, pixel_bytes
-from mmpi_ns.capture.ray_sources import Keypoints, RaySources
+from mmpi_ns.capture.ray_sources import Keypoints, PixelPool, RaySources
 from mmpi_ns.capture.rays import PinholeRays
+from mmpi_ns.capture.tracks import at_full_size
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.scene.visible_tiles import TrainingViews
-from mmpi_ns.utils.console import say
-from mmpi_ns.utils.errors import InputError
+from mmpi_ns.utils.errors import InputError, say
 from mmpi_ns.utils.random_draws import generator
 
 OBSERVATIONS = "mmpi_observations"
@@ -98,7 +94,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         self.rays_share = 1.0
         """Share of a step's rays that are drawn; the schedule sets it."""
         self.sources: RaySources | None = None
-        """What a step draws from now."""
+        """Sources that a step draws from now."""
         self._resident: RaySources | None = None
         """The sources of all cameras, if they are in memory all the time."""
         parser = config.dataparser
@@ -121,40 +117,34 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         dataset.metadata[TRAINING_VIEWS] = TrainingViews.of(dataset.cameras)
         if self.test_mode == "val":  # elsewhere the plan comes from a checkpoint
             if self.config.mask_moving and self.config.dense_depth and not dataset.has_masks:
-                self._mask_moving(dataset)
+                masks = moving_masks(self.observations, dataset)
+                shares = np.array([mask.mean() for mask in masks])
+                if shares.any():
+                    dataset.moving = masks
+                    self.observations = drop_masked(self.observations, dataset)
+                    say(
+                        f"{100 * shares.mean():.1f} % of the training pixels, in {np.count_nonzero(shares)} of "
+                        f"{len(masks)} images, show what moves and are masked (--pipeline.datamanager.mask-moving "
+                        "False keeps them)."
+                    )
+                else:
+                    say("Nothing is seen to move in the training images.")
             tracks = self.observations
-            known, self.observations = know_depths(
+            depths, self.observations = know_depths(
                 self.train_dataparser_outputs, tracks, dataset,
                 dense=self.config.dense_depth, sensor=self.config.depth_images,
             )  # fmt: skip
-            self.known_depth = known
-            # Of a cloud, placement gets what is in ``known``: one depth of each cell, however dense the cloud is.
-            seen = tracks if known is None else with_known_depths(tracks, known, dataset)
-            dataset.metadata[OBSERVATIONS] = seen
+            self.known_depth = depths
+            # Of a cloud, placement gets one depth of each cell, however dense the cloud is.
+            dataset.metadata[OBSERVATIONS] = tracks if depths is None else with_known_depths(tracks, depths, dataset)
             has_keypoints = self.config.keypoint_rays > 0 and len(self.observations.seen_at) > 0
-            if not has_keypoints and (known is None or known.share == 0):
-                CONSOLE.print(
-                    "No depths are known, from tracks, matches or a sensor: geometry is learned from colours alone."
-                )
+            if not has_keypoints and (depths is None or depths.share == 0):
+                say("No depths are known, from tracks, matches or a sensor: geometry is learned from colours alone.")
         return dataset
-
-    def _mask_moving(self, dataset: MMPIDataset) -> None:
-        """Masks what moves in the training images, and says how much it is."""
-        masks = moving_masks(self.observations, dataset)
-        shares = np.array([mask.mean() for mask in masks])
-        if not shares.any():
-            say("Nothing is seen to move in the training images.")
-            return
-        say(
-            f"{100 * shares.mean():.1f} % of the training pixels, in {np.count_nonzero(shares)} of {len(masks)} images,"
-            " show what moves and are masked (--pipeline.datamanager.mask-moving False keeps them)."
-        )
-        dataset.moving = masks
-        self.observations = drop_masked(self.observations, dataset)
 
     @cached_property
     def observations(self) -> Observations:
-        """What the training cameras saw. Only training searches the images, which may be absent later, for points."""
+        """Observations of the training cameras. Only training searches the images, later perhaps absent, for points."""
         return observe(
             self.train_dataparser_outputs,
             self.train_dataset,
@@ -230,36 +220,26 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
                 f"{most / 1e6:.3g} of {total / 1e6:.3g} M training pixels are used, drawn at random: more are "
                 "held with --pipeline.datamanager.resident-pixels."
             )
-        pixels = PixelPool.from_dataset(
-            self.train_dataset, self.device, images, self.known_depth, most, config.seed
-        )  # fmt: skip
-        new_views, no_new_views = self._find_shared(images)
+        exposures = None if self.gains is None else torch.from_numpy(self.gains.from_field).float().to(self.device)
+        depths, rays = self.known_depth, self.train_ray_generator
+        pixels = PixelPool.from_dataset(self.train_dataset, self.device, images, depths, most, config.seed)
+        new_views, no_new_views = None, "no two images show a point at the same depth"
+        if config.new_view_share <= 0:
+            no_new_views = "--pipeline.datamanager.new-view-share 0"
+        elif depths is None or depths.share == 0:
+            no_new_views = "no pixel has a known depth"
+        elif (posed := posed_images(self.observations, self.train_dataset)) is None:
+            no_new_views = "a camera is neither perspective nor fisheye"
+        else:
+            chosen = images, config.seed, self.device, exposures
+            new_views = find_shared_points(self.train_dataset, posed, depths, rays, *chosen)
         keypoints = Keypoints.of(self.observations, self.device) if self.test_mode == "val" else None
         keypoints = keypoints if cameras is None else keypoints and keypoints.of_images(torch.from_numpy(cameras))
-        return RaySources(
-            pixels, new_views, keypoints, self.train_ray_generator, config.new_view_share, config.keypoint_rays,
-            no_new_views, self._exposures(),
-        )  # fmt: skip
-
-    def _exposures(self) -> Float[Tensor, "M 3"] | None:
-        return None if self.gains is None else torch.from_numpy(self.gains.from_field).float().to(self.device)
-
-    def _find_shared(self, images: Sequence[int]) -> tuple[SharedPoints | None, str]:
-        """The points that two of these training images show at the same depth, or why there are none."""
-        if self.config.new_view_share <= 0:
-            return None, "--pipeline.datamanager.new-view-share 0"
-        if self.known_depth is None or self.known_depth.share == 0:
-            return None, "no pixel has a known depth"
-        posed = posed_images(self.observations, self.train_dataset)
-        if posed is None:
-            return None, "a camera is neither perspective nor fisheye"
-        rays, seed = self.train_ray_generator, self.config.seed
-        how = (images, seed, self.device, self._exposures())
-        points = find_shared_points(self.train_dataset, posed, self.known_depth, rays, *how)
-        return points, "no two images show a point at the same depth"
+        counts = config.new_view_share, config.keypoint_rays
+        return RaySources(pixels, new_views, keypoints, rays, *counts, no_new_views, exposures)
 
     def describe(self) -> str:
-        """What the capture holds, in one line."""
+        """Size of the capture in images, points and depths, in one line."""
         cameras, seen = self.train_dataset.cameras, self.observations
         sizes = sorted({(int(w), int(h)) for w, h in zip(cameras.width.view(-1), cameras.height.view(-1), strict=True)})
         shapes = f"{sizes[0][0]} x {sizes[0][1]}" + (f" to {sizes[-1][0]} x {sizes[-1][1]}" if len(sizes) > 1 else "")
@@ -282,11 +262,9 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
             return self._resident.pixels.nbytes
         dataset, sizes, most = self.train_dataset, self._sizes(cameras), int(self.config.resident_pixels)
         share = min(1.0, most / sizes.sum()) if most else 1.0
-        each = pixel_bytes(
-            whole=share == 1 and not dataset.has_masks,
-            depths=self.known_depth is not None,
-            channels=4 if dataset.has_alpha else 3,
-        )
+        # As in ``PixelPool``: colour, place in the image where it must be kept, and depth.
+        place, depth = share < 1 or dataset.has_masks, self.known_depth is not None
+        each = (4 if dataset.has_alpha else 3) + 4 * place + 4 * depth
         return each * sum(int(share * size) for size in sizes.tolist())
 
     def setup_eval(self) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
@@ -11,12 +12,12 @@ import cv2
 import numpy as np
 import torch
 from jaxtyping import Float
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
-from mmpi_ns.capture.depth_images import read_depth_image
 from mmpi_ns.utils.errors import InputError, brief
 
 # Pillow reports damaged files by any of these (SyntaxError: a broken PNG chunk), nerfstudio odd shapes by assertions.
@@ -35,10 +36,14 @@ class MMPIDataset(InputDataset):
     @cached_property
     def has_alpha(self) -> bool:
         """Whether any image has an alpha channel; files that cannot be read are named when they are needed."""
-        return any(_header(name)[1] for name in self.image_filenames)
+        for name in self.image_filenames:
+            with suppress(*UNREADABLE), Image.open(name) as image:  # the header, without the pixels
+                if image.has_transparency_data:
+                    return True
+        return False
 
     moving: Sequence[NDArray[np.bool_]] | None = None
-    """What moves in each image [H, W], masked where there are no masks in files."""
+    """Masks of what moves in each image [H, W], used if no mask files are given."""
 
     @property
     def has_masks(self) -> bool:
@@ -48,8 +53,17 @@ class MMPIDataset(InputDataset):
         """Image [H, W, 3 or 4]: red, green, blue, and alpha where the file has it, in 8 bits."""
         name = self.image_filenames[image_idx]
         try:
-            with Image.open(name) as image:
-                pixels = _eight_bits(image)
+            with Image.open(name) as image:  # gray, a palette, CMYK, 16 bits
+                if image.mode == "F":
+                    raise ValueError("its pixels are floating-point numbers")
+                if image.mode in SIXTEEN_BIT:
+                    deep = np.asarray(image).astype(np.int64)
+                    if deep.min() < 0 or deep.max() > 65535:
+                        raise ValueError("its pixels have more than 16 bits")
+                    gray = (deep // 257).astype(np.uint8)  # 65535 becomes 255
+                    pixels = np.repeat(gray[..., None], 3, axis=-1)
+                else:
+                    pixels = np.array(image.convert("RGBA" if image.has_transparency_data else "RGB"))
         except UNREADABLE as error:
             raise UnusableFile(
                 f"Image {name} cannot be read ({brief(error)}): repair it or remove its frame."
@@ -80,7 +94,10 @@ class MMPIDataset(InputDataset):
                 f"{height}: correct the camera's size or give the images that the cameras belong to."
             )
         if image_type == "float32" and (files := self.metadata.get("depth_filenames")):
-            data["distance"] = self._distance(Path(files[image_idx]), image_idx, (rows, columns))
+            unit = self.metadata.get("depth_unit_scale_factor", 1.0) * self._dataparser_outputs.dataparser_scale
+            depth = read_depth_image(Path(files[image_idx]), unit)
+            depth = cv2.resize(depth, (columns, rows), interpolation=cv2.INTER_NEAREST_EXACT)
+            data["distance"] = distances(torch.from_numpy(depth), self.cameras[image_idx : image_idx + 1])
         if self.moving is not None and "mask" not in data:
             data["mask"] = torch.from_numpy(~self.moving[image_idx])[..., None]
         return data | {k: data[k][:height, :width] for k in ("image", "mask", "distance") if k in data}
@@ -93,35 +110,33 @@ class MMPIDataset(InputDataset):
             return ~self.moving[image_idx]
         return np.ones([int(n.reshape(-1)[image_idx]) for n in (self.cameras.height, self.cameras.width)], bool)
 
-    def _distance(self, file: Path, image_idx: int, shape: tuple[int, int]) -> Float[Tensor, "H W 1"]:
-        """Distance of the content of each pixel of an evaluated image, from its depth image; 0 where unknown."""
-        unit = self.metadata.get("depth_unit_scale_factor", 1.0) * self._dataparser_outputs.dataparser_scale
-        depth = cv2.resize(read_depth_image(file, unit), shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
-        camera = self.cameras[image_idx : image_idx + 1]
-        y, x = torch.meshgrid(torch.arange(shape[0]) + 0.5, torch.arange(shape[1]) + 0.5, indexing="ij")
-        first = torch.zeros(*shape, 1, dtype=torch.long)
-        directions = camera.generate_rays(camera_indices=first, coords=torch.stack([y, x], -1)).directions
-        along_axis = -(directions * camera.camera_to_worlds[0, :, 2]).sum(-1)
-        return (torch.from_numpy(depth) / along_axis.clamp(min=1e-6))[..., None]
+
+def distances(depth: Float[Tensor, "H W"], camera: Cameras) -> Float[Tensor, "H W 1"]:
+    """Distance of the content of each pixel from a camera, by its depth along the optical axis."""
+    y, x = torch.meshgrid(*(torch.arange(n) + 0.5 for n in depth.shape), indexing="ij")
+    first = torch.zeros(*depth.shape, 1, dtype=torch.long)
+    directions = camera.generate_rays(camera_indices=first, coords=torch.stack([y, x], -1)).directions
+    along_axis = -(directions * camera.camera_to_worlds[0, :, 2]).sum(-1)
+    return (depth / along_axis.clamp(min=1e-6))[..., None]
 
 
-def _header(name: Path) -> tuple[tuple[int, int], bool]:
-    """(width, height) of an image and whether it has alpha, without reading its pixels."""
+def read_depth_image(file: Path, unit: float) -> NDArray[np.float32]:
+    """Depths of a sensor along the optical axis [h, w], scene units; 0 where unknown.
+
+    Args:
+        file: 16-bit PNG or .npy, as nerfstudio's data parsers list it (depth_file_path).
+        unit: length of a depth of 1 (depth_unit_scale_factor), scene units.
+
+    Raises:
+        InputError: the file cannot be read or holds something else (names it).
+    """
     try:
-        with Image.open(name) as image:
-            return image.size, image.has_transparency_data
-    except UNREADABLE:
-        return (0, 0), False
-
-
-def _eight_bits(image: Image.Image) -> NDArray[np.uint8]:
-    """[H, W, 3 or 4] of whatever Pillow reads: gray, palettes, CMYK, 16 bits."""
-    if image.mode in SIXTEEN_BIT:
-        deep = np.asarray(image).astype(np.int64)
-        if deep.min() < 0 or deep.max() > 65535:
-            raise ValueError("its pixels have more than 16 bits")
-        gray = (deep // 257).astype(np.uint8)  # 65535 becomes 255
-        return np.repeat(gray[..., None], 3, axis=-1)
-    if image.mode == "F":
-        raise ValueError("its pixels are floating-point numbers")
-    return np.array(image.convert("RGBA" if image.has_transparency_data else "RGB"))
+        is_array = file.suffix == ".npy"
+        depth = np.load(file) if is_array else cv2.imdecode(np.fromfile(file, np.uint8), cv2.IMREAD_UNCHANGED)
+        depth = None if depth is None or np.iscomplexobj(depth) else np.squeeze(depth).astype(np.float32)
+    except (OSError, ValueError, EOFError, cv2.error) as error:
+        raise InputError(f"Depth image {file} cannot be read ({brief(error)}): repair or remove it.") from error
+    if depth is None or depth.ndim != 2 or not depth.size:
+        raise InputError(f"Depth image {file} is not one channel of depths: give a 16-bit PNG or a .npy file.")
+    depth = depth * unit
+    return np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)

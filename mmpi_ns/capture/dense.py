@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
@@ -44,7 +44,7 @@ SMALLEST = 320
 SECONDS = 1.0
 """Processor seconds for a million working pixels of an image, for the forecast (docs/log/performance.md)."""
 STRIDE, ITERATIONS = 5, 8
-"""Of the optical flow: pixels between its patches, and iterations of each."""
+"""Pixels between the patches of the optical flow, and iterations of each."""
 NOISE = 0.3
 """Standard deviation of a match, working pixels, where images look alike."""
 MAX_EPIPOLAR = 1.0
@@ -107,18 +107,18 @@ def strips(shape: tuple[int, ...]) -> Iterator[slice]:
 
 @dataclass(frozen=True)
 class Parallax:
-    """Where the points of a view's pixels lie in another view: homogeneous pixels a + q b for inverse depth q."""
+    """Places of a view's pixels in a neighbouring view: homogeneous pixels a + q b for inverse depth q."""
 
     linear: NDArray[np.float64]
     """a at a pixel (x, y) is this times (x, y, 1). [3, 3]"""
     b: NDArray[np.float32]
 
     @staticmethod
-    def between(view: View, other: View) -> Parallax:
+    def between(view: View, neighbour: View) -> Parallax:
         axes = np.diag([1.0, -1.0, -1.0])  # OpenCV's: right, down, ahead
-        turn = axes @ other.pose[:, :3].T @ view.pose[:, :3] @ axes
-        shift = axes @ other.pose[:, :3].T @ (view.pose[:, 3] - other.pose[:, 3])
-        to_pixels = camera_matrix(other.pinhole)
+        turn = axes @ neighbour.pose[:, :3].T @ view.pose[:, :3] @ axes
+        shift = axes @ neighbour.pose[:, :3].T @ (view.pose[:, 3] - neighbour.pose[:, 3])
+        to_pixels = camera_matrix(neighbour.pinhole)
         linear = to_pixels @ turn @ np.linalg.inv(camera_matrix(view.pinhole))
         return Parallax(linear, (to_pixels @ shift).astype(np.float32))
 
@@ -155,23 +155,23 @@ class Parallax:
         return inverse, ((r1 + inverse * s1) ** 2 + (r2 + inverse * s2) ** 2) * per_depth, squared * per_depth
 
 
-def measure(view: View, other: View, start: Map, flow: cv2.DISOpticalFlow) -> tuple[Map, Map]:
+def measure(view: View, neighbour: View, start: Map, flow: cv2.DISOpticalFlow) -> tuple[Map, Map]:
     """Inverse depths of a view's pixels by comparison with another view, and one over their squared errors (0: none).
 
     Args:
         view: the image that gets depths.
-        other: the image that it is compared with.
+        neighbour: the image that it is compared with.
         start: rough inverse depths. [h, w]
         flow: finds small motions.
     """
-    parallax = Parallax.between(view, other)
+    parallax = Parallax.between(view, neighbour)
     x, y, _ = parallax.pixels(start)
-    motion = np.asarray(flow.calc(view.gray, look_up(other.gray, x, y), None))  # type: ignore[call-overload]
+    motion = np.asarray(flow.calc(view.gray, look_up(neighbour.gray, x, y), None))  # type: ignore[call-overload]
     grid_x, grid_y = pixel_grid(view.gray.shape)
     moved = grid_x + motion[..., 0], grid_y + motion[..., 1]
     x, y = look_up(x, *moved), look_up(y, *moved)
-    seen = look_up(np.ascontiguousarray(other.inside, np.uint8), x, y, nearest=True) > 0
-    alike, contrast = correlation(view.gray, look_up(other.gray, x, y))
+    seen = look_up(np.ascontiguousarray(neighbour.inside, np.uint8), x, y, nearest=True) > 0
+    alike, contrast = correlation(view.gray, look_up(neighbour.gray, x, y))
     good = view.inside & seen & (alike > MIN_CORRELATION) & (contrast > MIN_CONTRAST)
     inverse, weight = np.empty_like(start), np.empty_like(start)
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
@@ -179,17 +179,15 @@ def measure(view: View, other: View, start: Map, flow: cv2.DISOpticalFlow) -> tu
             q, off_line, parallax_squared = parallax.solve(x[rows], y[rows], rows)
             noise = (NOISE**2 + off_line) * (11 - 10 * np.minimum(alike[rows], 1))
             certainty = parallax_squared / noise
-            known = good[rows] & (off_line < MAX_EPIPOLAR**2) & np.isfinite(q) & np.isfinite(certainty)
-            inverse[rows], weight[rows] = np.where(known, q, 0), np.where(known, certainty, 0)
+            measured = good[rows] & (off_line < MAX_EPIPOLAR**2) & np.isfinite(q) & np.isfinite(certainty)
+            inverse[rows], weight[rows] = np.where(measured, q, 0), np.where(measured, certainty, 0)
     return inverse, weight
 
 
 def correlation(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> tuple[Map, Map]:
     """Normalised correlation of two images in a window about each pixel, and the standard deviation of the first."""
     mean_a, mean_b = _mean(a), _mean(b)
-    squares = [
-        np.asarray(cv2.sqrBoxFilter(g, cv2.CV_32F, (WINDOW, WINDOW), borderType=cv2.BORDER_REPLICATE)) for g in (a, b)
-    ]
+    squares = _mean_square(a), _mean_square(b)
     products = _mean(np.asarray(cv2.multiply(a, b, dtype=cv2.CV_16U)))
     alike, contrast = np.empty_like(mean_a), np.empty_like(mean_a)
     for rows in strips(a.shape):
@@ -205,51 +203,46 @@ def _mean(x: NDArray[Any], side: int = WINDOW) -> Map:
     return np.asarray(cv2.boxFilter(x, cv2.CV_32F, (side, side), borderType=cv2.BORDER_REPLICATE), np.float32)
 
 
+def _mean_square(x: NDArray[np.uint8], side: int = WINDOW) -> Map:
+    return np.asarray(cv2.sqrBoxFilter(x, cv2.CV_32F, (side, side), borderType=cv2.BORDER_REPLICATE), np.float32)
+
+
 def fuse(inverse: NDArray[np.float32], weight: NDArray[np.float32]) -> Depth:
     """The mean of the largest consistent subset of n measurements [n, h, w], and its expected error.
 
     A single measurement counts if there is no other; ``confirmed`` checks it in another image. Weights are one over
     squared errors, 0 where there is no measurement. The error is at least the scatter of the measurements averaged.
     """
-    depth = Depth(np.empty(inverse.shape[1:], np.float32), np.empty(inverse.shape[1:], np.float32))
+    depth, count = Depth(*np.empty((2, *inverse.shape[1:]), np.float32)), len(inverse)
     for rows in strips(inverse.shape):
-        depth.inverse[rows], depth.error[rows] = _fused(inverse[:, rows], weight[:, rows])
+        q, weights = inverse[:, rows], weight[:, rows]
+        variance, there = 1 / np.maximum(weights, 1e-30), weights > 0
+        measured, all_weight = there.sum(0, dtype=np.int8), np.maximum(weights.sum(0), 1e-30)
+        best, mean, error = (np.zeros_like(q[0]) for _ in range(3))
+        for k in range(count):
+            # Relative to measurement k, so that sums of squares are exact.
+            number, total = np.ones_like(measured), weights[k].copy()
+            first, second = np.zeros_like(mean), np.zeros_like(mean)
+            for n in (n for n in range(count) if n != k):
+                apart = q[n] - q[k]
+                agrees = there[n] & (apart * apart < AGREE**2 * (variance[n] + variance[k]))
+                w = weights[n] * agrees
+                total += w
+                w *= apart
+                first += w
+                w *= apart
+                second += w
+                number += agrees
+            shift = first / np.maximum(total, 1e-30)
+            average = q[k] + shift
+            scatter = np.maximum(second - first * shift, 0) / np.maximum(number - 1, 1)
+            value = number + total / all_weight
+            better = there[k] & (number >= np.minimum(measured, 2)) & (average > 0) & (value > best)
+            best, mean = np.where(better, value, best), np.where(better, average, mean)
+            error = np.where(better, np.sqrt(np.maximum(scatter, 1) / np.maximum(total, 1e-30)), error)
+        kept = (best > 0) & (error < MAX_RELATIVE * mean)
+        depth.inverse[rows], depth.error[rows] = np.where(kept, mean, 0), np.where(kept, error, 0)
     return depth
-
-
-def _fused(inverse: NDArray[np.float32], weight: NDArray[np.float32]) -> tuple[Map, Map]:
-    """``fuse`` of some rows."""
-    count = len(inverse)
-    variance, there = 1 / np.maximum(weight, 1e-30), weight > 0
-    measured, all_weight = there.sum(0, dtype=np.int8), np.maximum(weight.sum(0), 1e-30)
-    best, mean, error = (np.zeros_like(inverse[0]) for _ in range(3))
-    for k in range(count):
-        # Relative to measurement k, so that sums of squares are exact.
-        number, total, first, second = (
-            np.ones_like(measured),
-            weight[k].copy(),
-            np.zeros_like(mean),
-            np.zeros_like(mean),
-        )
-        for other in (n for n in range(count) if n != k):
-            apart = inverse[other] - inverse[k]
-            agrees = there[other] & (apart * apart < AGREE**2 * (variance[other] + variance[k]))
-            w = weight[other] * agrees
-            total += w
-            w *= apart
-            first += w
-            w *= apart
-            second += w
-            number += agrees
-        shift = first / np.maximum(total, 1e-30)
-        average = inverse[k] + shift
-        scatter = np.maximum(second - first * shift, 0) / np.maximum(number - 1, 1)
-        value = number + total / all_weight
-        better = there[k] & (number >= np.minimum(measured, 2)) & (average > 0) & (value > best)
-        best, mean = np.where(better, value, best), np.where(better, average, mean)
-        error = np.where(better, np.sqrt(np.maximum(scatter, 1) / np.maximum(total, 1e-30)), error)
-    kept = (best > 0) & (error < MAX_RELATIVE * mean)
-    return np.where(kept, mean, 0), np.where(kept, error, 0)
 
 
 def filled(depth: Depth, rough: Map) -> Map:
@@ -285,18 +278,18 @@ def find_depths(
         views = list(pool.map(lambda i: load_view(images, i, width), numbers))
         depths: list[Depth] = []
 
-        def check(i: int) -> T:
-            return finish(i, views[i], confirmed(views[i], depths[i], [(views[j], depths[j]) for j in near[i]]))
+        def work() -> Iterator[Any]:
+            for depth in pool.map(lambda i: matched(views[i], [views[j] for j in near[i]], points_of(i)), numbers):
+                depths.append(depth)
+                yield depth
+            yield from pool.map(
+                lambda i: finish(i, views[i], confirmed(views[i], depths[i], [(views[j], depths[j]) for j in near[i]])),
+                numbers,
+            )
 
-        def work() -> Iterator[Depth | T]:
-            yield from pool.map(lambda i: matched(views[i], [views[j] for j in near[i]], points_of(i)), numbers)
-            yield from pool.map(check, numbers)
-
-        for result in progress(work(), 2 * len(numbers)):
-            if len(depths) < len(numbers):
-                depths.append(cast(Depth, result))
-            else:
-                yield cast(T, result)
+        for n, result in enumerate(progress(work(), 2 * len(numbers))):
+            if n >= len(numbers):
+                yield result
 
 
 def matched(view: View, others: list[View], points: NDArray[np.float64]) -> Depth:
@@ -315,26 +308,24 @@ def matched(view: View, others: list[View], points: NDArray[np.float64]) -> Dept
         else:
             rough = filled(depth, rough)
             rough = np.asarray(cv2.resize(rough, small.gray.shape[::-1], interpolation=cv2.INTER_LINEAR), np.float32)
-        pairs = [measure(small, other.reduced(factor), rough, flow) for other in others]
+        pairs = [measure(small, neighbour.reduced(factor), rough, flow) for neighbour in others]
         depth = without_fringes(small, fuse(*(np.stack(part) for part in zip(*pairs, strict=True))))
     return depth
 
 
 def without_fringes(view: View, depth: Depth) -> Depth:
     """Removes the fringe around a foreground object where the background has no texture of its own."""
-    known = depth.inverse > 0
-    least = cv2.erode(np.where(known, depth.inverse, 1e30).astype(np.float32), np.ones((EDGE, EDGE), np.uint8))
-    variance = (
-        cv2.sqrBoxFilter(view.gray, cv2.CV_32F, (3, 3), borderType=cv2.BORDER_REPLICATE) - _mean(view.gray, 3) ** 2
-    )
-    return _only(depth, known & ((depth.inverse / STEP < least) | (variance > OWN_CONTRAST**2)))
+    has_depth = depth.inverse > 0
+    least = cv2.erode(np.where(has_depth, depth.inverse, 1e30).astype(np.float32), np.ones((EDGE, EDGE), np.uint8))
+    variance = _mean_square(view.gray, 3) - _mean(view.gray, 3) ** 2
+    return _only(depth, has_depth & ((depth.inverse / STEP < least) | (variance > OWN_CONTRAST**2)))
 
 
 def confirmed(view: View, depth: Depth, others: list[tuple[View, Depth]]) -> Depth:
     """Keeps the depths confirmed by the depth of at least one other image and by at least as many as contradict it."""
     confirm, contradict = np.zeros(depth.inverse.shape, np.int8), np.zeros(depth.inverse.shape, np.int8)
-    for other, theirs in others:
-        x, y, ahead = Parallax.between(view, other).pixels(depth.inverse)
+    for neighbour, theirs in others:
+        x, y, ahead = Parallax.between(view, neighbour).pixels(depth.inverse)
         inverse, error = (look_up(m, x, y, nearest=True) for m in (theirs.inverse, theirs.error))
         expected = np.where(ahead > 0, depth.inverse / np.where(ahead > 0, ahead, 1), 0)
         tolerance = 3 * np.sqrt(error**2 + depth.error**2) + SAME_DEPTH * expected

@@ -23,17 +23,15 @@ from rich.progress import track
 from torch import Tensor
 
 from mmpi_ns.capture.cache import Arrays, Computed, Pairs, digest, remembered
-from mmpi_ns.capture.dataset import MMPIDataset
+from mmpi_ns.capture.dataset import MMPIDataset, read_depth_image
 from mmpi_ns.capture.dense import ROUNDS, SECONDS, Depth, find_depths
-from mmpi_ns.capture.depth_images import read_depth_image
 from mmpi_ns.capture.lone_depth import MOST_OTHERS, continued, others_that_see
 from mmpi_ns.capture.loose_points import POINT_ERROR, contradict, see_points
 from mmpi_ns.capture.observe import drop_masked, posed_images
-from mmpi_ns.capture.originals import at_full_size
-from mmpi_ns.capture.tracks import PosedImages
+from mmpi_ns.capture.tracks import PosedImages, at_full_size
 from mmpi_ns.capture.views import View, camera_matrix, look_up
 from mmpi_ns.placement.observations import Observations
-from mmpi_ns.utils.console import duration, say
+from mmpi_ns.utils.errors import duration, say
 from mmpi_ns.utils.parallel import in_order, num_threads
 
 Map = NDArray[np.float32]

@@ -43,18 +43,18 @@ def check_lenses(meta: Mapping[str, Any], frames: Sequence[Mapping[str, Any]], p
         lacking = next((f for f in frames if key not in f), None) if key not in meta else None
         if lacking is not None:
             raise InputError(f"{path} has no {key}, neither for all frames nor in {cut(lacking['file_path'])}: add it.")
-    # One coefficient for all frames, and nerfstudio reads none of the frames' own.
-    own_lens = not set(meta) & {"k1", "k2", "k3", *TANGENTIAL, "distortion_params"}
-    seen: set[tuple] = set()
+    # With one coefficient for all frames nerfstudio reads none of a frame.
+    is_shared = bool(set(meta) & {"k1", "k2", "k3", *TANGENTIAL, "distortion_params"})
+    checked: set[tuple] = set()
     for frame in frames:
-        own = {k: v for k, v in frame.items() if k not in meta}
-        lens = {k: v for k, v in (own if own_lens else meta).items() if k in (*RADIAL, *TANGENTIAL)}
-        params = (own if own_lens else meta).get("distortion_params")
-        camera = {k: meta.get(k, own.get(k)) for k in CAMERA}
+        source = meta if is_shared else {k: v for k, v in frame.items() if k not in meta}
+        lens = {k: v for k, v in source.items() if k in (*RADIAL, *TANGENTIAL)}
+        params = source.get("distortion_params")
+        camera = {k: meta.get(k, frame.get(k)) for k in CAMERA}
         key = (repr(camera), repr(lens), repr(params))
-        if key not in seen:
-            seen.add(key)
-            where = path if set(meta) >= set(CAMERA) and not own_lens else f"{cut(frame['file_path'])} in {path}"
+        if key not in checked:
+            checked.add(key)
+            where = path if is_shared and set(meta) >= set(CAMERA) else f"{cut(frame['file_path'])} in {path}"
             _check_camera(camera, MODELS[model], str(where))
             _check_distortion(camera, lens, params, MODELS[model], str(where))
 

@@ -1,8 +1,10 @@
-"""Captures in map coordinates: a local origin is subtracted in float64 before nerfstudio's parsers round to float32."""
+"""nerfstudio's data parsers for map coordinates: a local origin is subtracted in float64, before they round to float32.
+
+Point clouds (PLY) are read in float64 too, and without open3d, which is often missing or lacks system libraries.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -12,17 +14,18 @@ from nerfstudio.data.dataparsers import nerfstudio_dataparser
 from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig, DataparserOutputs
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParser
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio
+from numpy.typing import NDArray
 from torch import Tensor
 
 from mmpi_ns.capture.checks import say_once
-from mmpi_ns.capture.point_cloud import parser_points
-from mmpi_ns.capture.sfm import model_errors
-from mmpi_ns.capture.sfm_files import check_model_files
+from mmpi_ns.capture.sfm import checked_model
 from mmpi_ns.utils.errors import InputError
 from mmpi_ns.utils.host import transforms_changed
 
 FAR = 10.0
 """Cameras this many times as far from the origin as from each other get a local origin."""
+GRAY = 128
+"""Gray level of points without colours."""
 
 
 class MapOutputs(DataparserOutputs):
@@ -35,34 +38,38 @@ class MapOutputs(DataparserOutputs):
 
 
 class LocalOrigin:
-    """The origin of one capture, in the axes in which its poses are saved."""
+    """Origin of one capture, in the axes in which its poses are saved."""
 
     def __init__(self, meta: dict[str, Any], source: Path) -> None:
         """Subtracts the local origin from poses of a transforms.json or a COLMAP model that are far from the origin."""
         poses = np.array([frame["transform_matrix"] for frame in meta["frames"]], dtype=np.float64)
-        applied = np.array(meta.get("applied_transform", np.eye(4)[:3]), dtype=np.float64)
         centers = poses[:, :3, 3]
-        self.place, self.applied = centers.mean(0), applied[:, 3]
+        self.place, self.applied = centers.mean(0), self._applied(meta)[:, 3]
         extent = float(np.ptp(centers, axis=0).max())
         self.taken = bool(max(np.abs(self.place).max(), np.abs(self.applied).max()) > FAR * extent)
-        self._meta: Mapping[str, Any] = meta
-        if not self.taken:
-            return
-        poses[:, :3, 3] -= self.place
-        for frame, pose in zip(meta["frames"], poses, strict=True):
-            frame["transform_matrix"] = pose.tolist()
-        if "applied_transform" in meta:
-            meta["applied_transform"] = np.c_[applied[:, :3], np.zeros(3)].tolist()
-        say_once(f"{source} has map coordinates: they are taken from ({', '.join(f'{x:.10g}' for x in self.place)}).")
+        self._meta = meta
+        if self.taken:
+            centers -= self.place  # in ``poses``
+            for frame, pose in zip(meta["frames"], poses, strict=True):
+                frame["transform_matrix"] = pose.tolist()
+            if "applied_transform" in meta:
+                meta["applied_transform"] = np.c_[self._applied(meta)[:, :3], np.zeros(3)].tolist()
+            place = ", ".join(f"{x:.10g}" for x in self.place)
+            say_once(f"{source} has map coordinates: they are taken from ({place}).")
+
+    @staticmethod
+    def _applied(meta: dict[str, Any]) -> NDArray[np.float64]:
+        return np.array(meta.get("applied_transform", np.eye(4)[:3]), dtype=np.float64)
 
     def tell(self, outputs: DataparserOutputs) -> DataparserOutputs:
         """Gives the transform from the capture's own coordinates, in float64, for the points of a model."""
-        if self.taken:
-            own = np.array(self._meta.get("applied_transform", np.eye(4)[:3]), dtype=np.float64)  # the parser adds one
-            found = outputs.dataparser_transform.double().numpy().copy()
-            found[:, 3] += found[:, :3] @ np.linalg.solve(own[:, :3], self.applied - self.place)
-            return MapOutputs(**{**vars(outputs), "dataparser_transform": torch.from_numpy(found)})
-        return outputs
+        if not self.taken:
+            return outputs
+        transform = outputs.dataparser_transform.double().numpy().copy()
+        # The parser adds an applied_transform where the file has none.
+        to_file = np.linalg.solve(self._applied(self._meta)[:, :3], self.applied - self.place)
+        transform[:, 3] += transform[:, :3] @ to_file
+        return MapOutputs(**{**vars(outputs), "dataparser_transform": torch.from_numpy(transform)})
 
 
 class LocalNerfstudio(Nerfstudio):
@@ -73,9 +80,7 @@ class LocalNerfstudio(Nerfstudio):
     """The parser asks no question on the terminal where ``transforms.json`` names no point cloud."""
 
     def _generate_dataparser_outputs(self, split: str = "train") -> DataparserOutputs:
-        def subtract(meta: dict[str, Any], path: Path) -> None:
-            self._origin = LocalOrigin(meta, path)
-
+        subtract = lambda meta, path: setattr(self, "_origin", LocalOrigin(meta, path))  # noqa: E731
         with transforms_changed(nerfstudio_dataparser, subtract):
             outputs = super()._generate_dataparser_outputs(split)
         return self._origin.tell(outputs)
@@ -98,8 +103,7 @@ class LocalColmap(ColmapDataParser):
     _origin: LocalOrigin
 
     def _get_all_images_and_cameras(self, recon_dir: Path) -> dict[str, Any]:
-        with model_errors(recon_dir):
-            check_model_files(recon_dir)
+        with checked_model(recon_dir):
             meta = super()._get_all_images_and_cameras(recon_dir)
         self._origin = LocalOrigin(meta, recon_dir)
         return meta
@@ -119,5 +123,42 @@ TARGETS: dict[type, type] = {Nerfstudio: LocalNerfstudio, ColmapDataParser: Loca
 
 
 def take_local_origins(config: DataParserConfig) -> None:
-    """Makes a parser's settings build the one that reads map coordinates, where there is one."""
+    """Makes a parser's settings build the one that reads map coordinates, if there is one."""
     config._target = TARGETS.get(config._target, config._target)
+
+
+def read_ply(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    """Positions [P, 3] and colours [P, 3] of a PLY file of points.
+
+    Raises:
+        InputError: it is no such file.
+    """
+    from plyfile import PlyData, PlyParseError  # slow to import; comes with nerfstudio's viewer
+
+    try:
+        points = PlyData.read(path)["vertex"]
+        xyz = np.stack([np.asarray(points[name], dtype=np.float64) for name in "xyz"], -1)
+        named = {p.name for p in points.properties} >= {"red", "green", "blue"}
+        rgb = [np.asarray(points[name]) if named else np.full(len(xyz), GRAY) for name in ("red", "green", "blue")]
+    except (PlyParseError, KeyError, ValueError, TypeError, OSError) as error:
+        raise InputError(f"{path} is not a PLY file of points ({error}): write it again.") from error
+    return xyz, np.stack(rgb, -1).astype(np.uint8)
+
+
+def parser_points(
+    path: Path, transform_matrix: Tensor, scale_factor: float, origin: NDArray[np.float64] | float = 0.0
+) -> dict[str, Tensor] | None:
+    """A point cloud as nerfstudio's data parser returns it; None if it holds no point.
+
+    Args:
+        path: PLY file.
+        transform_matrix: [3, 4], from the file's axes to the scene's.
+        scale_factor: of the scene.
+        origin: taken off the points before they are rounded to float32.
+    """
+    xyz, colors = read_ply(path)
+    if not len(xyz):
+        return None
+    local = torch.from_numpy(xyz - origin).float()
+    points = (local @ transform_matrix[:, :3].T + transform_matrix[:, 3]) * scale_factor
+    return {"points3D_xyz": points, "points3D_rgb": torch.from_numpy(colors)}

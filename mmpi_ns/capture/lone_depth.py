@@ -34,46 +34,45 @@ MOST_OTHERS = 1
 """Other images in which an extrapolated point may lie; with more, matches and colours are more reliable."""
 
 
-def continued(known: Map, directions: Map) -> Map:
-    """Inverse distances of unknown pixels of an image, from planes fitted to the known pixels around them.
+def continued(depths: Map, directions: Map) -> Map:
+    """Inverse distances of pixels without a depth, from planes fitted to the pixels with one around them.
 
     Args:
-        known: [H, W, 2] inverse distance, 0 where unknown, and its expected error.
+        depths: [H, W, 2] inverse distance, 0 where unknown, and its expected error.
         directions: [H, W, 3] unit directions of the pixels.
 
     Returns:
-        [H, W, 2] the same for the unknown pixels only: 0 where known, and where no plane fits.
+        [H, W, 2] the same for the other pixels only: 0 where a depth is known, and where no plane fits.
     """
-    inverse, error = known[..., 0].astype(np.float64), known[..., 1].astype(np.float64)
-    there = inverse > 0
-    found, best = np.zeros(known.shape, np.float32), np.where(there, 0, MOST_ERROR)
-    if not there.any():
-        return found
-    scale = float(np.median(inverse[there]))
+    inverse, error = depths[..., 0].astype(np.float64), depths[..., 1].astype(np.float64)
+    has_depth = inverse > 0
+    extended, best = np.zeros(depths.shape, np.float32), np.where(has_depth, 0, MOST_ERROR)
+    if not has_depth.any():
+        return extended
+    scale = float(np.median(inverse[has_depth]))
     q, v = inverse / scale, directions.astype(np.float64)
-    trust = np.where(there, 1 / (1 + (error / np.maximum(LEAST_ERROR * inverse, 1e-30)) ** 2), 0)
+    trust = np.where(has_depth, 1 / (1 + (error / np.maximum(LEAST_ERROR * inverse, 1e-30)) ** 2), 0)
     parts = [trust, trust * q * q, *(trust * q * v[..., i] for i in range(3))]
     parts += [trust * v[..., i] * v[..., j] for i, j in _PAIRS]
     for share in WIDTHS:
         sums = [_blurred(p, share * max(inverse.shape)) for p in parts]
-        rows, columns = np.nonzero(~there & (sums[0] > ENOUGH))
+        rows, columns = np.nonzero(~has_depth & (sums[0] > ENOUGH))
         at = np.stack([s[rows, columns] for s in sums], -1)
         value, deviation = _planes(at, v[rows, columns])
         relative = np.where(value > 0, np.maximum(deviation / np.maximum(value, 1e-12), LEAST_ERROR), np.inf)
         good = relative < best[rows, columns]
         rows, columns, value, relative = rows[good], columns[good], value[good], relative[good]
         best[rows, columns] = relative
-        found[rows, columns] = scale * np.stack([value, relative * value], -1)
-    return found
+        extended[rows, columns] = scale * np.stack([value, relative * value], -1)
+    return extended
 
 
 def _blurred(image: NDArray[np.float64], deviation: float) -> NDArray[np.float64]:
     """An image after a wide blur with zero padding, computed on a smaller image."""
     height, width = image.shape
     shrink = max(1.0, deviation / PIXELS)
-    small = cv2.resize(
-        image, (max(1, round(width / shrink)), max(1, round(height / shrink))), interpolation=cv2.INTER_AREA
-    )
+    size = max(1, round(width / shrink)), max(1, round(height / shrink))
+    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     small = cv2.GaussianBlur(small, (0, 0), deviation / shrink, borderType=cv2.BORDER_CONSTANT)
     return np.asarray(cv2.resize(small, (width, height), interpolation=cv2.INTER_LINEAR), np.float64)
 
@@ -110,7 +109,7 @@ def _planes(
 
 
 def others_that_see(posed: PosedImages, i: int, points: NDArray[np.float64]) -> NDArray[np.int64]:
-    """In how many of the images near image i the points [P, 3] lie, which it shows."""
+    """Number of images near image i that may show each of its points [P, 3]. [P]"""
     count = np.zeros(len(points), np.int64)
     for j in nearest_views(posed.camera_to_worlds, i, NEAREST) if len(points) else []:
         at = project(posed, j, points)

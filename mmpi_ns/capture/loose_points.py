@@ -1,4 +1,4 @@
-"""Which training images see the points of a cloud (``ply_file_path``), which does not record it.
+"""Visibility of the points of a cloud (``ply_file_path``) in the training images, which the file does not record.
 
 Projection alone would see through walls. Where a pixel's depth is known from matches, a point is visible if it lies
 there, hidden if it lies behind, and contradicted if it lies in front: then the image looks through it. Elsewhere coarse
@@ -37,10 +37,10 @@ FARTHEST = 1e5
 """Distance of a point from the cameras, over their own extent, from which it is a mistake."""
 
 
-def contradict(one: Map, other: Map) -> NDArray[np.bool_]:
-    """Where two sources [..., 2] know an inverse distance and differ by more than their errors can explain. [...]"""
-    apart = np.abs(one[..., 0] - other[..., 0]) > CONTRADICTS * np.hypot(one[..., 1], other[..., 1])
-    return apart & (one[..., 0] > 0) & (other[..., 0] > 0)
+def contradict(a: Map, b: Map) -> NDArray[np.bool_]:
+    """Mask [...] of two sources' inverse distances [..., 2] that differ by more than their errors can explain."""
+    apart = np.abs(a[..., 0] - b[..., 0]) > CONTRADICTS * np.hypot(a[..., 1], b[..., 1])
+    return apart & (a[..., 0] > 0) & (b[..., 0] > 0)
 
 
 def usable_points(points: Array, centers: Array) -> Array:
@@ -69,7 +69,7 @@ def usable_points(points: Array, centers: Array) -> Array:
 
 @dataclass(frozen=True)
 class Sightings:
-    """Where training images see the points of a cloud."""
+    """Places at which training images see the points of a cloud."""
 
     points: Array
     """[P, 3]"""
@@ -86,7 +86,7 @@ class Sightings:
 
     @property
     def fits(self) -> bool:
-        """Whether more points are confirmed than contradicted, or none is either."""
+        """True if at least as many points are confirmed as contradicted."""
         return bool((self.confirmed > self.contradicted).sum() >= (self.contradicted > self.confirmed).sum())
 
     def added_to(self, tracks: Observations) -> Observations:
@@ -105,7 +105,7 @@ class Sightings:
         )
 
     def describe(self) -> str:
-        """How many points are used, and what for, in one line."""
+        """Number of points that are used, and their use, in one line."""
         out = self.contradicted > self.confirmed
         if not self.fits:
             return (
@@ -122,7 +122,7 @@ class Sightings:
 
 
 def see_points(points: Array, posed: PosedImages, depths: Callable[[int], Map] | None = None) -> Sightings:
-    """Where the training images see points [P, 3].
+    """Sightings of points [P, 3] in the training images.
 
     Args:
         points: in scene units.
@@ -136,25 +136,19 @@ def see_points(points: Array, posed: PosedImages, depths: Callable[[int], Map] |
         inside = np.nonzero(((at >= 0) & (at < size)).all(-1))[0]
         at = at[inside]
         distance = np.linalg.norm(points[inside] - posed.camera_to_worlds[i, :, 3], axis=-1)
-        visible = _in_front(at, distance, size)
+        cell = max(size) / CELLS
+        columns, rows = (at / cell).astype(int).T
+        nearest = np.full((int(size[1] / cell) + 1, int(size[0] / cell) + 1), np.inf)
+        np.minimum.at(nearest, (rows, columns), distance)
+        visible = distance < BEHIND * minimum_filter(nearest, 3, mode="nearest")[rows, columns]
         if depths is not None:
             columns, rows = at.astype(int).T
-            known = depths(i)[rows, columns]
-            own = np.outer(1 / np.maximum(distance, 1e-30), [1, POINT_ERROR]).astype(np.float32)
-            measured, apart = known[:, 0] > 0, contradict(own, known)
-            visible = np.where(measured, ~apart, visible)
-            confirmed[inside] += measured & ~apart
-            contradicted[inside] += apart & (own[:, 0] > known[:, 0])
+            measured = depths(i)[rows, columns]
+            expected = np.outer(1 / np.maximum(distance, 1e-30), [1, POINT_ERROR]).astype(np.float32)
+            has_depth, apart = measured[:, 0] > 0, contradict(expected, measured)
+            visible = np.where(has_depth, ~apart, visible)
+            confirmed[inside] += has_depth & ~apart
+            contradicted[inside] += apart & (expected[:, 0] > measured[:, 0])
         seen.append((np.full(visible.sum(), i), inside[visible], at[visible]))
     seen_by, seen_point, seen_at = (np.concatenate(parts) for parts in zip(*seen, strict=True))
     return Sightings(points, seen_by, seen_point, seen_at, confirmed, contradicted)
-
-
-def _in_front(at: Array, distance: Array, size: Array) -> NDArray[np.bool_]:
-    """Which of an image's points, at pixels [K, 2], no other one clearly hides. [K]"""
-    cell = max(size) / CELLS
-    columns, rows = (at / cell).astype(int).T
-    nearest = np.full((int(size[1] / cell) + 1, int(size[0] / cell) + 1), np.inf)
-    np.minimum.at(nearest, (rows, columns), distance)
-    nearest = minimum_filter(nearest, 3, mode="nearest")
-    return distance < BEHIND * nearest[rows, columns]

@@ -111,6 +111,15 @@ def match_pairs(
         pycolmap.match_image_pairs(database, **options)
 
 
+def verified_matches(database: Path) -> Iterator[tuple[int, int, NDArray[np.int64]]]:
+    """(image, image, keypoints [N, 2] of both) of every pair of images with verified matches; images by their ids."""
+    pycolmap = load_pycolmap()
+    with pycolmap.Database.open(database) as opened:
+        pairs, geometries = opened.read_two_view_geometries()
+    for pair, geometry in zip(pairs, geometries, strict=True):
+        yield *pycolmap.pair_id_to_image_pair(pair), np.asarray(geometry.inlier_matches).astype(int).reshape(-1, 2)
+
+
 def triangulate_points(
     model: Any, database: Path, images: Path, threads: int = -1, max_error: float = 4.0, pairs_alone: bool = False
 ) -> Any:

@@ -23,8 +23,7 @@ from mmpi_ns.capture.known_depth import straightened
 from mmpi_ns.capture.moving_evidence import Bytes, Mask, Shot, evidence, ground_of, has_impossible_depth
 from mmpi_ns.capture.moving_objects import followed, grown, seeds
 from mmpi_ns.capture.observe import posed_images
-from mmpi_ns.capture.originals import at_full_size
-from mmpi_ns.capture.tracks import PosedImages
+from mmpi_ns.capture.tracks import PosedImages, at_full_size
 from mmpi_ns.capture.views import View, look_up, straightened_color
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.scene.near_views import nearest_views

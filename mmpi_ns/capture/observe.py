@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,11 +18,10 @@ from numpy.typing import NDArray
 from mmpi_ns.capture.cache import Arrays, digest, remembered
 from mmpi_ns.capture.checks import in_one_place, say_once
 from mmpi_ns.capture.dataset import MMPIDataset
-from mmpi_ns.capture.lens_directions import lens_directions
 from mmpi_ns.capture.loose_points import usable_points
-from mmpi_ns.capture.originals import at_full_size
+from mmpi_ns.capture.rays import lens_directions
 from mmpi_ns.capture.sfm import SfmModel, find_sfm_model
-from mmpi_ns.capture.tracks import PosedImages, triangulate
+from mmpi_ns.capture.tracks import PosedImages, at_full_size, triangulate
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.placement.sweep import add_swept_points
 from mmpi_ns.utils.errors import InputError, quoted
@@ -31,8 +30,10 @@ MAX_REPROJECTION = 0.02
 """Median angle between keypoints and points, as a fraction of the image, above which a model is in another frame."""
 POSES_OFF = 0.5
 """Error of the poses, in training pixels, above which it is reported."""
-TRACKS_VERSION = 2
+TRACKS_VERSION = 3
 """Version of the algorithm: cached tracks of another version are recomputed."""
+THUMBNAIL = 128
+"""Maximum pixels along a side of the gray images for the plane sweep, box-filtered."""
 ENOUGH_KEYPOINTS = 20
 """Average number of keypoints in an image above which no plane sweep is needed."""
 
@@ -84,10 +85,17 @@ def _find_points(observations: Observations, dataset: MMPIDataset, triangulates:
     elif triangulates:
         model = _remembered_tracks(at_full_size(images))
         observations = with_tracks(observations, model)
-        tell_poses((model.off or 0.0) * float(images.sizes[:, 0].mean()), images.files[0])
+        tell_poses(model.off * float(images.sizes[:, 0].mean()), images.files[0])
     if len(observations.seen_by) < ENOUGH_KEYPOINTS * len(dataset):
         CONSOLE.print("Few or no tracks: a quick plane sweep locates the content.")
-        observations = add_swept_points(observations, [_thumbnail(dataset, i) for i in range(len(dataset))])
+        thumbnails = []
+        for i in range(len(dataset)):
+            image = dataset.get_data(i, image_type="uint8")["image"][..., :3].float().mean(-1) / 255
+            scale = max(1.0, max(image.shape) / THUMBNAIL)
+            size = [max(8, round(n / scale)) for n in image.shape]
+            small = torch.nn.functional.interpolate(image[None, None], size=size, mode="area")
+            thumbnails.append(small[0, 0].double().numpy())
+        observations = add_swept_points(observations, thumbnails)
     return observations
 
 
@@ -98,7 +106,7 @@ def tell_poses(off: float, image: Path) -> None:
         off: median distance of matches or keypoints from their positions predicted by the poses, training pixels.
         image: one of the training images.
     """
-    if off <= POSES_OFF:
+    if not off > POSES_OFF:  # or not a number, as nothing matched
         return
     folder = image.parent
     full = folder.with_name(re.sub(r"_\d+$", "", folder.name))  # images for images_2
@@ -114,31 +122,13 @@ def _remembered_tracks(images: PosedImages) -> SfmModel:
     def find() -> Arrays:
         width, height = images.sizes.max(0).astype(int)
         CONSOLE.print(f"No SfM tracks: matching the features of {len(images.files)} images of {width} x {height}.")
-        model = triangulate(images)
-        keypoints = [np.concatenate([points[:, None], at], -1) for points, at in model.keypoints]
-        sizes = np.array([len(k) for k in keypoints], np.int64)
-        table = np.concatenate(keypoints) if keypoints else np.zeros((0, 3))
-        off = np.array([np.nan if model.off is None else model.off])
-        names = np.array(model.names, "U16")
-        return {"points": model.points, "names": names, "keypoints": table, "sizes": sizes, "off": off}
+        return {name: np.asarray(value) for name, value in vars(triangulate(images)).items()}
 
     cameras = images.camera_to_worlds, images.intrinsics, images.distortion, images.fisheye
-    stored = remembered(digest(images.files, "tracks", TRACKS_VERSION, *cameras), find)
-    tables = np.split(stored["keypoints"], np.cumsum(stored["sizes"].astype(np.int64))[:-1])
-    keypoints = tuple((t[:, 0].astype(np.int64), t[:, 1:]) for t in tables) if len(stored["sizes"]) else ()
-    off = float(stored["off"][0])
-    names = tuple(str(name) for name in stored["names"])
-    model = SfmModel(stored["points"], names, keypoints, off if np.isfinite(off) else None)  # type: ignore[arg-type]
-    CONSOLE.print(f"{len(model.points)} triangulated points, seen {len(stored['keypoints'])} times.")
+    stored: Mapping[str, Any] = remembered(digest(images.files, "tracks", TRACKS_VERSION, *cameras), find)
+    model = SfmModel(**{**stored, "off": stored["off"].item()})
+    CONSOLE.print(f"{len(model.points)} triangulated points, seen {len(model.seen_by)} times.")
     return model
-
-
-def _thumbnail(dataset: MMPIDataset, index: int, side: int = 128) -> NDArray[np.float64]:
-    """Gray image of at most ``side`` pixels a side, box-filtered."""
-    image = dataset.get_data(index, image_type="uint8")["image"][..., :3].float().mean(-1) / 255
-    scale = max(1.0, max(image.shape) / side)
-    size = [max(8, round(n / scale)) for n in image.shape]
-    return torch.nn.functional.interpolate(image[None, None], size=size, mode="area")[0, 0].double().numpy()
 
 
 def read_observations(outputs: DataparserOutputs, cameras: Cameras, sfm: SfmModel | None) -> Observations:
@@ -161,28 +151,17 @@ def read_observations(outputs: DataparserOutputs, cameras: Cameras, sfm: SfmMode
     left, _, right = np.linalg.svd(poses[:, :, :3])
     poses[:, :, :3] = left @ right
     sizes = np.stack([cameras.width.cpu().numpy().reshape(-1), cameras.height.cpu().numpy().reshape(-1)], -1)
-    empty = np.zeros(0, dtype=np.int64)
-    result: Mapping[str, Any] = {"points": np.zeros((0, 3)), "seen_by": empty, "seen_point": empty}
-    seen_at = np.zeros((0, 2))
-    if sfm is not None:
-        transform = torch.eye(4, dtype=torch.float64)
-        transform[:3] = outputs.dataparser_transform.double()[:3]
-        moved = sfm.points @ transform[:3, :3].numpy().T + transform[:3, 3].numpy()
-        tracks = sfm.keypoints_of([Path(p).name for p in outputs.image_filenames])
-        result = {"points": moved * outputs.dataparser_scale, "seen_by": tracks[0], "seen_point": tracks[1]}
-        seen_at = tracks[2] * sizes[tracks[0]]
+    observations = Observations.of_cameras(poses, np.stack(flat, -1), sizes)
     cloud = outputs.metadata.get("points3D_xyz")
     loose = None if cloud is None else usable_points(cloud.double().numpy(), poses[:, :, 3])
-    observations = Observations(
-        camera_to_worlds=poses,
-        intrinsics=np.stack(flat, -1),
-        sizes=sizes.astype(np.float64),
-        seen_at=seen_at,
-        lens=lens_directions(cameras),
-        loose=loose if loose is not None and len(loose) else None,
-        **result,
-    )
-    return _fitting_tracks(observations, cameras) if len(seen_at) else observations
+    loose = loose if loose is not None and len(loose) else None
+    observations = replace(observations, lens=lens_directions(cameras), loose=loose)
+    if sfm is None:
+        return observations
+    transform = outputs.dataparser_transform.double().numpy()
+    points = (sfm.points @ transform[:3, :3].T + transform[:3, 3]) * outputs.dataparser_scale
+    tracked = with_tracks(observations, replace(sfm, points=points), [Path(p).name for p in outputs.image_filenames])
+    return _fitting_tracks(tracked, cameras) if len(tracked.seen_at) else tracked
 
 
 def _fitting_tracks(observations: Observations, cameras: Cameras) -> Observations:
@@ -194,8 +173,7 @@ def _fitting_tracks(observations: Observations, cameras: Cameras) -> Observation
             "[bold yellow]The COLMAP model does not fit the cameras (its points project elsewhere), so its tracks are "
             "not used: state its frame as applied_transform in transforms.json."
         )
-        empty = np.zeros(0, dtype=np.int64)
-        return replace(observations, points=np.zeros((0, 3)), seen_by=empty, seen_point=empty, seen_at=np.zeros((0, 2)))
+        return _keep_keypoints(replace(observations, points=np.zeros((0, 3))), np.zeros(len(angles), np.bool_))
     ahead = angles < np.pi / 2
     if not ahead.all():
         CONSOLE.print(
@@ -227,34 +205,30 @@ def _keep_keypoints(observations: Observations, keep: NDArray[np.bool_]) -> Obse
 
 def posed_images(observations: Observations, dataset: MMPIDataset) -> PosedImages | None:
     """The training images with their cameras and lenses; None where a camera is neither perspective nor fisheye."""
-    cameras = dataset.cameras
-    kinds = cameras.camera_type.reshape(-1).cpu()
+    kinds = dataset.cameras.camera_type.reshape(-1).cpu()
     is_fisheye = kinds == CameraType.FISHEYE.value
     if not (is_fisheye | (kinds == CameraType.PERSPECTIVE.value)).all():
         return None
-    lens = cameras.distortion_params  # k1, k2, k3, k4, p1, p2
+    lens = dataset.cameras.distortion_params  # k1, k2, k3, k4, p1, p2
     lens = torch.zeros(len(dataset), 6) if lens is None else lens.reshape(len(dataset), 6).cpu()
     lens = torch.where(is_fisheye[:, None], lens[:, :4], lens[:, [0, 1, 4, 5]])
-    return PosedImages(
-        files=tuple(Path(name) for name in dataset.image_filenames),
-        camera_to_worlds=observations.camera_to_worlds,
-        intrinsics=observations.intrinsics,
-        sizes=observations.sizes,
-        distortion=lens.double().numpy(),
-        fisheye=is_fisheye.numpy(),
-    )
+    files = tuple(map(Path, dataset.image_filenames))
+    cameras = observations.camera_to_worlds, observations.intrinsics, observations.sizes
+    return PosedImages(files, *cameras, distortion=lens.double().numpy(), fisheye=is_fisheye.numpy())
 
 
-def with_tracks(observations: Observations, model: SfmModel) -> Observations:
-    """The observations with the points of a model whose image names are indices of the training images."""
-    seen_by, seen_point, relative = model.keypoints_of([str(i) for i in range(len(observations.centers))])
-    return replace(
-        observations,
-        points=model.points,
-        seen_by=seen_by,
-        seen_point=seen_point,
-        seen_at=relative * observations.sizes[seen_by],
-    )
+def with_tracks(observations: Observations, model: SfmModel, names: Sequence[str] | None = None) -> Observations:
+    """The observations with the points of a model.
+
+    Args:
+        observations: the cameras.
+        model: tracks in their frame.
+        names: of the training images in the model; None for their indices.
+    """
+    names = [str(i) for i in range(len(observations.centers))] if names is None else names
+    seen_by, seen_point, relative = model.keypoints_of(names)
+    seen_at = relative * observations.sizes[seen_by]
+    return replace(observations, points=model.points, seen_by=seen_by, seen_point=seen_point, seen_at=seen_at)
 
 
 def drop_masked(observations: Observations, dataset: MMPIDataset) -> Observations:
@@ -264,7 +238,7 @@ def drop_masked(observations: Observations, dataset: MMPIDataset) -> Observation
     keep = np.ones(len(observations.seen_by), dtype=bool)
     for i in range(len(dataset)):
         mask = dataset.usable(i)
-        own = np.nonzero(observations.seen_by[: len(observations.seen_at)] == i)[0]
-        x, y = observations.seen_at[own].astype(int).T
-        keep[own] = mask[y.clip(0, mask.shape[0] - 1), x.clip(0, mask.shape[1] - 1)]
+        keypoints = np.nonzero(observations.seen_by[: len(observations.seen_at)] == i)[0]
+        x, y = observations.seen_at[keypoints].astype(int).T
+        keep[keypoints] = mask[y.clip(0, mask.shape[0] - 1), x.clip(0, mask.shape[1] - 1)]
     return _keep_keypoints(observations, keep)

@@ -1,20 +1,24 @@
-"""What a training step draws from: pixels, points that two images share, and SfM keypoints, of some of the cameras."""
+"""Sources of the rays of a training step: pixels, points that two images share, and SfM keypoints."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import reduce
+from functools import cached_property
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Int16, UInt8
 from nerfstudio.cameras.rays import RayBundle
 from numpy.typing import NDArray
 from torch import Tensor
 
+from mmpi_ns.capture.dataset import MMPIDataset
+from mmpi_ns.capture.known_depth import KnownDepth, unpacked
 from mmpi_ns.capture.new_views import Rays, SharedPoints
-from mmpi_ns.capture.pixels import PixelPool
 from mmpi_ns.placement.observations import Observations
+from mmpi_ns.utils.errors import InputError
+from mmpi_ns.utils.random_draws import generator
 
 KEYPOINT_DEPTH = "keypoint_inverse_distance"
 """Ray-bundle metadata: inverse distance of the SfM point on a keypoint ray, 0 on ordinary rays."""
@@ -24,6 +28,131 @@ EXPOSURE = "exposure"
 """Ray-bundle metadata [R, 3]: colour in the ray's image over colour in the field; only where exposures differ."""
 OWN_PIXEL = "is_own_pixel"
 """Ray-bundle metadata [R, 1]: whether a ray goes through a pixel of a training image."""
+
+
+@dataclass(frozen=True)
+class PixelPool:
+    """The pixels P of some images, image by image, on the device; those of images I are drawn.
+
+    If all pixels of an image are here, row and column of a pixel follow from its index.
+    """
+
+    colors: UInt8[Tensor, "P C"]
+    """C = 3 or 4."""
+    images: Int[Tensor, "I"]
+    """Numbers of the images in the data set."""
+    widths: Int[Tensor, "I"]
+    begins: Int[Tensor, "I"]
+    """Index of each image's first pixel."""
+    ends: Int[Tensor, "I"]
+    places: Int[Tensor, "P"] | None
+    """row * width + column of each pixel; None if all pixels are here."""
+    depths: Int16[Tensor, "P 2"] | None
+    """Inverse distance of each pixel and its expected error, as ``known_depth.packed``; None if none is known."""
+
+    @staticmethod
+    def from_dataset(
+        dataset: MMPIDataset,
+        device: str | torch.device,
+        images: Sequence[int] | None = None,
+        known_depth: KnownDepth | None = None,
+        most: int = 0,
+        seed: int = 0,
+    ) -> PixelPool:
+        """Reads images once; masked pixels are left out.
+
+        Args:
+            dataset: the training images.
+            device: of the pixels.
+            images: which of them; None for all.
+            known_depth: their depths.
+            most: maximum number of pixels; beyond it, a random subset, the same fraction of each image. 0: no limit.
+            seed: of the subset.
+
+        Raises:
+            InputError: an image or mask cannot be used (names the file), or the masks leave nothing.
+        """
+        images = range(len(dataset)) if images is None else images
+        widths, heights = (x.reshape(-1).tolist() for x in (dataset.cameras.width, dataset.cameras.height))
+        sizes = [widths[i] * heights[i] for i in images]
+        share = min(1.0, most / sum(sizes)) if most else 1.0
+        whole = share == 1.0 and not dataset.has_masks
+        room = sum(int(share * size) for size in sizes)
+        colors = torch.empty(room, 4 if dataset.has_alpha else 3, dtype=torch.uint8)
+        places = None if whole else torch.empty(room, dtype=torch.int32)
+        depths = None if known_depth is None else torch.empty(room, 2, dtype=torch.int16)
+        starts = [0]
+        for i in images:
+            image, kept = _pixels_of(dataset, i, share, seed)
+            starts.append(starts[-1] + len(kept))
+            rows = slice(*starts[-2:])
+            colors[rows, : image.shape[1]] = image[kept]
+            colors[rows, image.shape[1] :] = 255  # opaque where the image has no alpha and another one has
+            if places is not None:
+                places[rows] = kept.int()
+            if depths is not None and known_depth is not None:
+                depths[rows] = torch.from_numpy(np.require(known_depth.codes[i], requirements="W")).reshape(-1, 2)[kept]
+        if not starts[-1]:
+            raise InputError("The masks leave no training pixel: white (non-zero) mask pixels are the ones used.")
+        rows = slice(starts[-1])
+        places, depths = (None if x is None else x[rows].to(device) for x in (places, depths))
+        columns = list(images), [widths[i] for i in images], starts[:-1], starts[1:]
+        numbers, image_widths, begins, ends = (torch.tensor(column, device=device) for column in columns)
+        return PixelPool(colors[rows].to(device), numbers, image_widths, begins, ends, places, depths)
+
+    @cached_property
+    def count(self) -> int:
+        """Number of pixels that are drawn from; asked of the device once, not in every step."""
+        return int((self.ends - self.begins).sum())
+
+    def draw(
+        self, count: int, g: torch.Generator
+    ) -> tuple[Float[Tensor, "R C"], Int[Tensor, "R 3"], Float[Tensor, "R 2"]]:
+        """Colours, (image, row, column) and depths of random pixels.
+
+        Args:
+            count: R.
+            g: draws them.
+        """
+        after = (self.ends - self.begins).cumsum(0)
+        drawn = torch.randint(self.count, (count,), generator=g, device=g.device).to(self.colors.device)
+        which = torch.searchsorted(after, drawn, right=True)
+        chosen = drawn - after[which] + self.ends[which]
+        place = chosen - self.begins[which] if self.places is None else self.places[chosen].long()
+        width = self.widths[which]
+        indices = torch.stack([self.images[which], place // width, place % width], -1)
+        nothing = torch.zeros(count, 2, device=self.colors.device)
+        depths = nothing if self.depths is None else unpacked(self.depths[chosen])
+        return self.colors[chosen].float() / 255, indices, depths
+
+    def of_images(self, images: Int[Tensor, "A"]) -> PixelPool:
+        """Draws from some of the images, given by their numbers; shares the pixels.
+
+        Raises:
+            InputError: they have no pixel here.
+        """
+        kept = (torch.isin(self.images, images.to(self.images)) & (self.ends > self.begins)).nonzero()[:, 0]
+        if not len(kept):
+            raise InputError("The masks leave no training pixel in one stretch of the capture: use longer windows.")
+        return replace(self, **{name: getattr(self, name)[kept] for name in ("images", "widths", "begins", "ends")})
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the pixels themselves."""
+        return sum(x.nbytes for x in (self.colors, self.places, self.depths) if x is not None)
+
+
+def _pixels_of(dataset: MMPIDataset, i: int, share: float, seed: int) -> tuple[UInt8[Tensor, "N C"], Int[Tensor, "n"]]:
+    """The pixels of an image, and the indices to keep: a fraction of those that no mask hides."""
+    data = dataset.get_data(i, image_type="uint8")
+    image = data["image"].reshape(-1, data["image"].shape[-1])
+    kept = torch.arange(len(image))
+    if share < 1:
+        kept = torch.randperm(len(image), generator=generator(seed, i, "resident"))[: int(share * len(image))]
+        kept = kept.sort().values
+    if "mask" in data:
+        kept = kept[data["mask"].reshape(-1).bool()[kept]]
+    return image, kept
 
 
 @dataclass(frozen=True)
@@ -40,7 +169,7 @@ class Keypoints:
 
     @staticmethod
     def of(observations: Observations, device: str | torch.device) -> Keypoints | None:
-        """Those of all training images; None if there are none."""
+        """Keypoint rays of all training images; None if there are none."""
         # Points of a plane sweep come after those of the tracks: too rough to supervise depth.
         tracked = slice(len(observations.seen_at))
         cameras, points = observations.seen_by[tracked], observations.points[observations.seen_point[tracked]]
@@ -52,24 +181,21 @@ class Keypoints:
         return Keypoints(torch.from_numpy(cameras).to(device), *(torch.from_numpy(x).float().to(device) for x in parts))
 
     def of_images(self, images: Int[Tensor, "I"]) -> Keypoints | None:
-        """Those of the given images; None if there are none."""
+        """Keypoint rays of some images; None if there are none."""
         kept = torch.isin(self.cameras, images.to(self.cameras)).nonzero()[:, 0]
         return Keypoints(*(x[kept] for x in vars(self).values())) if len(kept) else None
 
     def draw(self, count: int, g: torch.Generator) -> tuple[RayBundle, Float[Tensor, "R 1"]]:
         """Random rays and the inverse distances of their points."""
         chosen = torch.randint(len(self.cameras), (count,), generator=g, device=g.device).to(self.cameras.device)
-        inverse = self.inverse_distances[chosen][:, None]
-        camera = self.cameras[chosen][:, None]
-        bundle = RayBundle(
-            self.origins[chosen], self.directions[chosen], torch.ones_like(inverse), camera_indices=camera
-        )
-        return bundle, inverse
+        cameras, origins, directions, inverse = (x[chosen] for x in vars(self).values())
+        area = torch.ones_like(inverse[:, None])
+        return RayBundle(origins, directions, area, camera_indices=cameras[:, None]), inverse[:, None]
 
 
 @dataclass(frozen=True)
 class RaySources:
-    """What a step draws from, for all training cameras or for those of one window."""
+    """Sources of the rays of a step, for all training cameras or for one window's."""
 
     pixels: PixelPool
     new_views: SharedPoints | None
@@ -81,7 +207,7 @@ class RaySources:
     keypoint_rays: int
     """Keypoint rays of a step without new views."""
     no_new_views: str
-    """Why there are no new views, where there are none."""
+    """Reason why there are no new views, if there are none."""
     exposures: Float[Tensor, "M 3"] | None = None
     """Colours of each training image over those of the field; None if all have the same exposure."""
 
@@ -111,12 +237,8 @@ class RaySources:
     def describe(self, pixel_rays: int) -> str:
         """The share of each source in a step, with the reason where it is none, in one line."""
         counts = self.counts(pixel_rays, 1.0)
-        if self.keypoint_rays == 0:
-            no_keypoints = "--pipeline.datamanager.keypoint-rays 0"
-        elif self.keypoints is None:
-            no_keypoints = "no SfM tracks"
-        else:
-            no_keypoints = "new views take their place"
+        no_keypoints = "no SfM tracks" if self.keypoints is None else "new views take their place"
+        no_keypoints = no_keypoints if self.keypoint_rays else "--pipeline.datamanager.keypoint-rays 0"
         reasons = ("", self.no_new_views, no_keypoints)
         shares = [
             f"{round(100 * count / sum(counts))} % {name}" + ("" if count else f" ({reason})")
@@ -155,25 +277,13 @@ class RaySources:
             bundles.append(targets)
             keypoint_depths = torch.cat([keypoint_depths, inverse])
             depths = torch.cat([depths, depths.new_zeros(len(inverse), 2)])
-        bundle = reduce(_join, bundles)
-        bundle.metadata[OWN_PIXEL] = (torch.arange(len(bundle), device=device) < len(indices))[:, None]
-        bundle.metadata[KEYPOINT_DEPTH] = keypoint_depths
-        bundle.metadata[PIXEL_DEPTH] = depths
+        fields = ("origins", "directions", "pixel_area", "camera_indices")
+        joined = {name: torch.cat([getattr(bundle, name) for bundle in bundles]) for name in fields}
+        is_own_pixel = (torch.arange(len(depths), device=device) < len(indices))[:, None]
+        metadata = {OWN_PIXEL: is_own_pixel, KEYPOINT_DEPTH: keypoint_depths, PIXEL_DEPTH: depths}
         if self.exposures is not None:
-            assert bundle.camera_indices is not None
-            bundle.metadata[EXPOSURE] = self.exposures[bundle.camera_indices[:, 0]]
-        return bundle, {"image": colors, "indices": indices}
-
-
-def _join(a: RayBundle, b: RayBundle) -> RayBundle:
-    assert a.camera_indices is not None and b.camera_indices is not None
-    return RayBundle(
-        origins=torch.cat([a.origins, b.origins]),
-        directions=torch.cat([a.directions, b.directions]),
-        pixel_area=torch.cat([a.pixel_area, b.pixel_area]),
-        camera_indices=torch.cat([a.camera_indices, b.camera_indices]),
-        metadata={},
-    )
+            metadata[EXPOSURE] = self.exposures[joined["camera_indices"][:, 0]]
+        return RayBundle(**joined, metadata=metadata), {"image": colors, "indices": indices}
 
 
 def is_pixel_ray(bundle: RayBundle) -> Bool[Tensor, "R"]:

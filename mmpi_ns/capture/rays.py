@@ -1,4 +1,4 @@
-"""Rays of perspective and fisheye cameras in one batch.
+"""Rays of perspective and fisheye cameras in one batch, and the directions of a lens.
 
 nerfstudio's ray generator handles every camera type and checks types and distortions some twenty times for each batch,
 which takes 4 of 75 ms of a step on a CPU; on a GPU, each check is a synchronisation. It undistorts every pixel of every
@@ -10,10 +10,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import lru_cache
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.cameras.rays import RayBundle
+from numpy.typing import NDArray
 from torch import Tensor
 
 from mmpi_ns.scene.geometry import rotate
@@ -22,6 +24,10 @@ MOST_DIRECTIONS = 20_000_000
 """Pixels of distinct lenses for which directions are kept (12 bytes each); nerfstudio makes the rays of more."""
 CHUNK = 2**18
 """Pixels undistorted at once."""
+GRID = 17
+"""Grid points along each side of an image, for placement."""
+BENT = (CameraType.FISHEYE, CameraType.FISHEYE624, CameraType.EQUIRECTANGULAR)
+"""Camera types that are not pinholes, whatever their distortion."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +40,7 @@ class PinholeRays:
 
     @staticmethod
     def of(cameras: Cameras, device: torch.device | str) -> PinholeRays | None:
-        """Those of perspective and fisheye cameras, ``LensRays`` where one has a lens.
+        """Rays of perspective and fisheye cameras, ``LensRays`` if any has a lens.
 
         None if a camera has another type or a time, or if lenses differ so much that their directions need too much
         memory.
@@ -56,10 +62,9 @@ class PinholeRays:
         if int(pixels.sum()) > MOST_DIRECTIONS:
             return None
         tables = [pixel_directions(tuple(row)) for row in distinct.tolist()]
-        directions = torch.cat(tables) if len(tables) > 1 else tables[0]
-        first, widths = (pixels.cumsum(0) - pixels)[which], distinct[which, 4].long()
-        tables_on_device = (x.to(device) for x in (directions, first, widths))
-        return LensRays(pinholes.poses, pinholes.focal, pinholes.principal, *tables_on_device)
+        directions = torch.cat(tables) if len(tables) > 1 else tables[0]  # without a copy
+        lenses = directions, (pixels.cumsum(0) - pixels)[which], distinct[which, 4].long()
+        return LensRays(*vars(pinholes).values(), *(x.to(device) for x in lenses))
 
     def __call__(self, ray_indices: Int[Tensor, "R 3"]) -> RayBundle:
         """Rays through pixel centres. Pixel areas, which this package does not use, are 1.
@@ -70,8 +75,8 @@ class PinholeRays:
         camera = ray_indices[:, 0]
         poses = self.poses[camera]
         directions = torch.nn.functional.normalize(rotate(poses[:, :, :3], self.local(ray_indices)), dim=-1)
-        one = torch.ones_like(directions[:, :1])
-        return RayBundle(poses[:, :, 3], directions, pixel_area=one, camera_indices=camera[:, None], metadata={})
+        area = torch.ones_like(directions[:, :1])
+        return RayBundle(poses[:, :, 3], directions, pixel_area=area, camera_indices=camera[:, None], metadata={})
 
     def local(self, ray_indices: Int[Tensor, "R 3"]) -> Float[Tensor, "R 3"]:
         """Directions in the axes of the cameras: right, up, backwards."""
@@ -91,11 +96,11 @@ class LensRays(PinholeRays):
     """The same for cameras with a lens, from a table of the directions of every pixel."""
 
     directions: Float[Tensor, "T 3"]
-    """Of the pixels of all distinct cameras, in their axes."""
+    """Directions of the pixels of all distinct cameras, in their axes."""
     first: Int[Tensor, "N"]
     """Row of each camera's first pixel in the table."""
     widths: Int[Tensor, "N"]
-    """Of the images, pixels."""
+    """Widths of the images, pixels."""
 
     def local(self, ray_indices: Int[Tensor, "R 3"]) -> Float[Tensor, "R 3"]:
         """Directions in the axes of the cameras: right, up, backwards."""
@@ -116,7 +121,29 @@ def pixel_directions(camera: tuple[float, ...]) -> Float[Tensor, "P 3"]:
     alone = Cameras(torch.eye(4)[None, :3], fx, fy, cx, cy, width, height, lens, CameraType(kind))
     y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
     parts = [alone.generate_rays(0, coords=c).directions for c in torch.stack([y, x], -1).view(-1, 2).split(CHUNK)]
-    directions = torch.cat(parts)
-    # nerfstudio divides by 0 in the very middle of a fisheye.
+    return _without_nan(torch.cat(parts))
+
+
+def lens_directions(cameras: Cameras) -> NDArray[np.float64] | None:
+    """Unit directions [M, G, G, 3] in camera axes (x right, y up, z backwards), row after row, borders included.
+
+    None if all cameras are pinholes, or of types without a single centre of projection.
+    """
+    kinds = cameras.camera_type.reshape(-1)
+    bent = torch.isin(kinds, torch.tensor([kind.value for kind in BENT]).to(kinds))
+    distorted = cameras.distortion_params is not None and bool((cameras.distortion_params != 0).any())
+    if not bool((bent | (kinds == CameraType.PERSPECTIVE.value)).all()) or not (distorted or bool(bent.any())):
+        return None
+    cameras, count, shares = cameras.to("cpu"), len(cameras), torch.linspace(0, 1, GRID)
+    coords = torch.cartesian_prod(shares, shares) * torch.cat([cameras.height, cameras.width], -1).view(count, 1, 2)
+    index = torch.arange(count).repeat_interleave(GRID * GRID)[:, None]
+    rays = cameras.generate_rays(camera_indices=index, coords=coords.view(-1, 2))
+    poses = cameras.camera_to_worlds.reshape(count, 3, 4).double()
+    local = _without_nan(rays.directions.double().view(count, -1, 3) @ poses[:, :, :3])
+    return torch.nn.functional.normalize(local, dim=-1).view(count, GRID, GRID, 3).numpy()
+
+
+def _without_nan(directions: Float[Tensor, "*N 3"]) -> Float[Tensor, "*N 3"]:
+    """Local directions with the middle of a fisheye straight ahead, where nerfstudio divides by 0."""
     finite = torch.isfinite(directions).all(-1, keepdim=True)
     return torch.where(finite, directions, directions.new_tensor([0.0, 0.0, -1.0]))

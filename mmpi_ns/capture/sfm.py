@@ -1,4 +1,4 @@
-"""Reads a COLMAP model: points, and which image saw which point at which pixel."""
+"""COLMAP models: points, and which image saw which point at which pixel."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mmpi_ns.capture.sfm_files import check_model_files
 from mmpi_ns.utils.errors import InputError, brief
 
 if TYPE_CHECKING:
@@ -27,51 +26,59 @@ MIN_TRACK = 3
 """Points seen by fewer images are too uncertain to supervise depth."""
 MAX_ERROR_PX = 2.0
 """Points with a larger mean reprojection error are left out."""
+PARAMETERS = (3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16, 16)
+"""Parameters of COLMAP's camera models, by model number."""
+KEYPOINT = np.dtype([("place", "<f8", 2), ("point", "<u8")])
+NO_POINT = np.uint64(2**64 - 1)
 
 
 @dataclass(frozen=True)
 class SfmModel:
-    """Sparse points and their keypoints."""
+    """Sparse points and their keypoints, image after image."""
 
     points: NDArray[np.float64]
     """[P, 3] in the model's frame."""
-    names: tuple[str, ...]
-    """Image file names."""
-    keypoints: tuple[tuple[NDArray[np.int64], NDArray[np.float64]], ...]
-    """For each image: point of each keypoint [Q], and its position relative to width and height [Q, 2]."""
-    off: float | None = None
-    """Median distance of the matches from the epipolar lines of given poses, relative to the width of the image; None
+    names: NDArray[np.str_]
+    """[M] image file names."""
+    seen_by: NDArray[np.int64]
+    """[Q] image of each keypoint."""
+    seen_point: NDArray[np.int64]
+    """[Q] point of each keypoint."""
+    seen_at: NDArray[np.float64]
+    """[Q, 2] position of each keypoint relative to width and height."""
+    off: float = np.nan
+    """Median distance of the matches from the epipolar lines of given poses, relative to the width of the image; NaN
     for a model read from files."""
 
     def keypoints_of(
         self, image_names: Sequence[str]
     ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
         """(index into ``image_names``, point, relative position) of the keypoints of these images only."""
-        by_name = dict(zip(self.names, self.keypoints, strict=True))
-        rows = [(i, *by_name[name]) for i, name in enumerate(image_names) if name in by_name]
-        if not rows:
-            return np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2))
-        cameras = np.concatenate([np.full(len(points), i, np.int64) for i, points, _ in rows])
-        return cameras, np.concatenate([points for _, points, _ in rows]), np.concatenate([xy for *_, xy in rows])
+        number = {name: m for m, name in enumerate(self.names.tolist())}
+        images = np.array([number.get(name, -1) for name in image_names], np.int64)
+        begins, ends = (np.searchsorted(self.seen_by, images, side) for side in ("left", "right"))
+        order = np.concatenate([np.zeros(0, np.int64), *map(np.arange, begins, ends)])
+        return np.repeat(np.arange(len(images)), ends - begins), self.seen_point[order], self.seen_at[order]
 
 
 def find_sfm_model(path: Path) -> SfmModel | None:
-    """The COLMAP model in a folder; None where there is none.
+    """The COLMAP model in a folder; None if there is none.
 
     Raises:
         InputError: the folder holds a model that cannot be read.
     """
     if not (path / "images.bin").is_file() and not (path / "images.txt").is_file():
         return None
-    with model_errors(path):
-        check_model_files(path)
+    with checked_model(path):
         return read_reconstruction(load_pycolmap().Reconstruction(str(path)))
 
 
 @contextmanager
-def model_errors(path: Path) -> Iterator[None]:
-    """Turns any error while reading a model into one InputError."""
+def checked_model(path: Path) -> Iterator[None]:
+    """Checks the files of a model, and turns any error while reading it into one InputError."""
     try:
+        if all((path / f"{name}.bin").is_file() for name in ("cameras", "images", "points3D")):
+            _check_binary_files(path)
         yield
     except (ValueError, RuntimeError, OSError, LookupError, MemoryError, AssertionError, struct.error) as error:
         raise InputError(f"The COLMAP model in {path} cannot be read ({brief(error)}): repair or remove it.") from error
@@ -104,11 +111,82 @@ def read_reconstruction(model: pycolmap.Reconstruction, min_track: int = MIN_TRA
     good = [i for i, p in sorted(model.points3D.items()) if p.track.length() >= min_track and p.error <= MAX_ERROR_PX]
     row = {point: n for n, point in enumerate(good)}
     points = np.array([model.points3D[i].xyz for i in good], dtype=np.float64).reshape(-1, 3)
-    names, keypoints = [], []
-    for _, image in sorted(model.images.items()):
+    images = [image for _, image in sorted(model.images.items())]
+    keypoints = []
+    for m, image in enumerate(images):
         camera = model.cameras[image.camera_id]
-        seen = [(row[p.point3D_id], *p.xy) for p in image.points2D if p.has_point3D() and p.point3D_id in row]
-        table = np.array(seen, dtype=np.float64).reshape(-1, 3)
-        names.append(Path(image.name).name)
-        keypoints.append((table[:, 0].astype(np.int64), table[:, 1:] / [camera.width, camera.height]))
-    return SfmModel(points, tuple(names), tuple(keypoints))
+        for p in image.points2D:
+            if p.has_point3D() and p.point3D_id in row:
+                x, y = p.xy
+                keypoints.append((m, row[p.point3D_id], x / camera.width, y / camera.height))
+    table = np.array(keypoints, dtype=np.float64).reshape(-1, 4)
+    names = np.array([Path(image.name).name for image in images], dtype=np.str_)
+    seen_by, seen_point = table[:, :2].astype(np.int64).T
+    return SfmModel(points, names, seen_by, seen_point, table[:, 2:])
+
+
+class _Reader:
+    """A binary file of COLMAP, which starts with the number of its records; never read past its end."""
+
+    def __init__(self, path: Path, least: int) -> None:
+        self.name, self.data, self.at = path.name, path.read_bytes(), 0
+        self.records = self.count(least)
+
+    def skip(self, size: int) -> int:
+        """Skips bytes and returns the place of the first."""
+        self.at += size
+        if self.at > len(self.data):
+            raise ValueError(f"{self.name} ends too early, after {len(self.data)} bytes")
+        return self.at - size
+
+    def take(self, form: str) -> tuple:
+        return struct.unpack_from(form, self.data, self.skip(struct.calcsize(form)))
+
+    def count(self, least: int) -> int:
+        """A number of records of at least this many bytes each, which must fit into the rest of the file."""
+        (number,) = self.take("<Q")
+        if number * least > len(self.data) - self.at:
+            raise ValueError(f"{self.name} says it has {number} records and has room for fewer")
+        return number
+
+
+def _check_binary_files(folder: Path) -> None:
+    """Checks that the binary files of a model (https://colmap.github.io/format.html) are complete and consistent.
+
+    pycolmap trusts the counts in the files: a truncated file makes it allocate gigabytes or end the process.
+
+    Raises:
+        ValueError: a file is truncated or refers to records that are missing.
+    """
+    sizes = {"cameras": 24, "images": 73, "points3D": 51}
+    files = [_Reader(folder / f"{name}.bin", least) for name, least in sizes.items()]
+    cameras, images, points, seen = set(), {}, set(), [np.array([NO_POINT])]
+    for _ in range(files[0].records):
+        number, model, _, _ = files[0].take("<IiQQ")
+        if not 0 <= model < len(PARAMETERS):
+            raise ValueError(f"cameras.bin has a camera of model {model}, which is not known")
+        files[0].skip(8 * PARAMETERS[model])
+        cameras.add(number)
+    for _ in range(files[1].records):
+        number, *_, camera = files[1].take("<I7dI")
+        if camera not in cameras:
+            raise ValueError(f"images.bin names camera {camera}, which cameras.bin has not")
+        end = files[1].data.find(b"\0", files[1].at)
+        if end < 0:
+            raise ValueError("images.bin ends within a name")
+        files[1].at = end + 1
+        images[number] = files[1].count(24)
+        begin = files[1].skip(24 * images[number])
+        seen.append(np.frombuffer(files[1].data, KEYPOINT, images[number], begin)["point"])
+    for _ in range(files[2].records):
+        points.add(files[2].take("<Q3d3Bd")[0])
+        begin = files[2].skip(8 * files[2].count(8))
+        for image, keypoint in struct.iter_unpack("<II", files[2].data[begin : files[2].at]):
+            if keypoint >= images.get(image, 0):
+                raise ValueError(f"points3D.bin names keypoint {keypoint} of image {image}, which images.bin has not")
+    for file in files:
+        if file.at != len(file.data):
+            raise ValueError(f"{file.name} has {len(file.data) - file.at} bytes too many")
+    lost = set(np.unique(np.concatenate(seen)).tolist()) - {int(NO_POINT)} - points
+    if lost:
+        raise ValueError(f"images.bin names point {min(lost)}, which points3D.bin has not")

@@ -1,4 +1,4 @@
-"""Tracks for scenes that come with poses alone: features of the training images, matched and triangulated by pycolmap.
+"""Images with poses, and tracks triangulated from their features by pycolmap if a scene has none.
 
 Poses and intrinsics are kept fixed. The result is what a COLMAP model would contain: points, and their keypoints in the
 training images. Placement uses them to locate content, and training to supervise depth.
@@ -7,14 +7,15 @@ training images. Placement uses them to locate content, and training to supervis
 from __future__ import annotations
 
 import os
+import re
 import tempfile
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from mmpi_ns.capture.matching import (
     count_features,
@@ -25,11 +26,12 @@ from mmpi_ns.capture.matching import (
     quiet,
     rigid3d,
     triangulate_points,
+    verified_matches,
     write_images,
 )
 from mmpi_ns.capture.sfm import SfmModel, load_pycolmap, read_reconstruction
 from mmpi_ns.scene.near_views import nearest_views
-from mmpi_ns.utils.errors import InputError
+from mmpi_ns.utils.errors import InputError, brief
 
 NEIGHBOURS = 8
 """Maximum number of images that each image is matched with: the nearest with a similar viewing direction."""
@@ -39,6 +41,8 @@ MAX_ANGLE = 60.0
 """Maximum angle in degrees between the viewing directions of matched images."""
 MIN_TRACK = 2
 """Minimum number of images of a point; with given poses, two are enough."""
+COPIES = re.compile(r"(.+)_(\d+)")
+"""Name of a folder of downscaled copies: that of the originals, and the factor."""
 ENOUGH = 100
 """Average number of keypoints in an image above which the thorough search is skipped."""
 
@@ -80,12 +84,45 @@ class PosedImages:
         return bool(np.broadcast_to(self.fisheye, len(self.sizes))[i])
 
     def is_bent(self, i: int) -> bool:
-        """Whether the lens of image i is no pinhole's; a fisheye's is not, even if all its terms are 0."""
+        """True if the lens of image i is not a pinhole's; a fisheye never is, even if all its terms are 0."""
         return self.is_fisheye(i) or bool(self.distortion[i].any())
 
-    def pairs(self) -> list[tuple[int, int]]:
-        """Images worth matching."""
-        return near_pairs(self.camera_to_worlds, NEIGHBOURS)
+
+def original_of(file: Path) -> tuple[Path, int]:
+    """The original of a downscaled copy (``images/x.jpg`` of ``images_2/x.jpg``) and its factor, or the file and 1."""
+    for folder in file.parents:
+        if name := COPIES.fullmatch(folder.name):
+            original = folder.parent / name[1] / file.relative_to(folder)
+            if original.is_file():
+                return original, int(name[2])
+    return file, 1
+
+
+def at_full_size(images: PosedImages) -> PosedImages:
+    """The same views in their originals, which are sharper; a view whose original has another shape stays as it is.
+
+    A copy shows the whole original, however its size was rounded: a position relative to width and height is the same
+    in both. Focal lengths are those of the copy times the factor, as nerfstudio divided them by it.
+
+    Raises:
+        InputError: an image file cannot be read (names it).
+    """
+    files, sizes, intrinsics = [], images.sizes.copy(), images.intrinsics.copy()
+    for i, file in enumerate(images.files):
+        for candidate, factor in (original_of(file), (file, 1)):
+            try:
+                with Image.open(candidate) as image:
+                    size = np.array(image.size, np.float64)
+            except OSError as error:
+                raise InputError(
+                    f"Training image {candidate} cannot be read ({brief(error)}): repair it or remove its frame."
+                ) from error
+            if factor == 1 or (np.abs(size - factor * images.sizes[i]) <= factor).all():
+                break
+        files.append(candidate)
+        sizes[i] = size
+        intrinsics[i] *= factor
+    return replace(images, files=tuple(files), sizes=sizes, intrinsics=intrinsics)
 
 
 def near_pairs(camera_to_worlds: NDArray[np.float64], neighbours: int) -> list[tuple[int, int]]:
@@ -116,18 +153,16 @@ def triangulate(images: PosedImages) -> SfmModel:
     Raises:
         InputError: an image file cannot be read.
     """
-    tracks = None
     with quiet():
-        for effort in EFFORTS:
+        for effort in EFFORTS[:-1]:
             tracks = _attempt(images, effort)
-            if sum(len(points) for points, _ in tracks.keypoints) >= ENOUGH * len(images.files):
-                break
-    assert tracks is not None
-    return tracks
+            if len(tracks.seen_by) >= ENOUGH * len(images.files):
+                return tracks
+        return _attempt(images, EFFORTS[-1])
 
 
 def _attempt(images: PosedImages, effort: Effort) -> SfmModel:
-    pycolmap, pairs, error = load_pycolmap(), images.pairs(), None
+    pycolmap, pairs, error = load_pycolmap(), near_pairs(images.camera_to_worlds, NEIGHBOURS), np.nan
     with tempfile.TemporaryDirectory(prefix="mmpi-tracks-") as folder:
         work, database = Path(folder) / "images", Path(folder) / "database.db"
         work.mkdir()
@@ -135,7 +170,16 @@ def _attempt(images: PosedImages, effort: Effort) -> SfmModel:
         names = [f"{i:06d}{file.suffix.lower()}" for i, file in enumerate(images.files)]
         for name, file in zip(names, images.files, strict=True):
             os.symlink(file.resolve(), work / name)
-        model = _posed_model(images, names)
+        cameras = []
+        for i, (width, height) in enumerate(images.sizes.astype(int).tolist()):
+            lens = "OPENCV_FISHEYE" if images.is_fisheye(i) else "OPENCV"
+            params = [*images.intrinsics[i], *images.distortion[i]]
+            camera = pycolmap.Camera(model=lens, width=width, height=height, params=params, camera_id=i + 1)
+            camera.has_prior_focal_length = True
+            cameras.append(camera)
+        opencv = images.camera_to_worlds @ np.diag([1.0, -1.0, -1.0, 1.0])
+        poses = dict(zip(names, map(rigid3d, opencv), strict=True))
+        model = new_model(cameras, names, range(1, len(names) + 1), poses)
         write_images(model, database)
         options = pycolmap.FeatureExtractionOptions()
         options.max_image_size = LARGE
@@ -151,24 +195,10 @@ def _attempt(images: PosedImages, effort: Effort) -> SfmModel:
             error = _epipolar_error(database, model)
             model = triangulate_points(model, database, work, pairs_alone=True)
         tracks = read_reconstruction(model, MIN_TRACK)
-        return replace(tracks, names=tuple(str(names.index(name)) for name in tracks.names), off=error)
+        return replace(tracks, names=np.array([str(names.index(name)) for name in tracks.names], np.str_), off=error)
 
 
-def _posed_model(images: PosedImages, names: Sequence[str]) -> Any:
-    """A model of the given cameras, one for each image, without points."""
-    pycolmap, cameras, poses = load_pycolmap(), [], {}
-    for i, name in enumerate(names):
-        width, height = (int(n) for n in images.sizes[i])
-        params = [*images.intrinsics[i], *images.distortion[i]]
-        lens = "OPENCV_FISHEYE" if images.is_fisheye(i) else "OPENCV"
-        cameras.append(pycolmap.Camera(model=lens, width=width, height=height, params=params, camera_id=i + 1))
-        cameras[-1].has_prior_focal_length = True
-        opencv = images.camera_to_worlds[i] @ np.diag([1.0, -1.0, -1.0, 1.0])
-        poses[name] = rigid3d(opencv)
-    return new_model(cameras, names, range(1, len(names) + 1), poses)
-
-
-def _epipolar_error(database: Path, model: Any) -> float | None:
+def _epipolar_error(database: Path, model: Any) -> float:
     """Median distance of the verified matches from the epipolar lines of a model's poses, relative to the width.
 
     Unlike reprojection errors of points it is not truncated: matches that fit the poses badly never become points.
@@ -176,12 +206,9 @@ def _epipolar_error(database: Path, model: Any) -> float | None:
     pycolmap, distances = load_pycolmap(), []
     cameras = {i: model.cameras[image.camera_id] for i, image in model.images.items()}
     with pycolmap.Database.open(database) as opened:
-        pairs, geometries = opened.read_two_view_geometries()
         keypoints = {i: np.asarray(opened.read_keypoints(i), np.float64).reshape(-1, 6)[:, :2] for i in model.images}
     rays = {i: np.asarray(cameras[i].cam_from_img(points)) for i, points in keypoints.items()}
-    for pair, geometry in zip(pairs, geometries, strict=True):
-        a, b = pycolmap.pair_id_to_image_pair(pair)
-        matches = np.asarray(geometry.inlier_matches).astype(int).reshape(-1, 2)
+    for a, b, matches in verified_matches(database):
         distance = epipolar_distances(model, a, b, (rays[a][matches[:, 0]], rays[b][matches[:, 1]]))
         distances.append(distance * cameras[a].mean_focal_length() / cameras[a].width)
-    return float(np.median(np.concatenate(distances))) if sum(map(len, distances)) else None
+    return float(np.median(np.concatenate(distances))) if sum(map(len, distances)) else np.nan

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -16,7 +17,7 @@ from mmpi_ns.utils.errors import InputError
 Map = NDArray[np.float32]
 
 REMAP_SIDE, REMAP_PART = 32766, 8192
-"""Largest side of what OpenCV's remap reads and writes, and side of the parts of anything larger."""
+"""Largest side of an image for OpenCV's remap, and side of the parts into which larger ones are cut."""
 
 
 @dataclass(frozen=True)
@@ -48,9 +49,7 @@ class View:
 
 def load_view(images: PosedImages, i: int, width: int) -> View:
     """Image i in gray, at most ``width`` pixels wide, its lens distortion taken out."""
-    gray = cv2.imread(str(images.files[i]), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
-    if gray is None:
-        raise InputError(f"Training image {images.files[i]} cannot be read: repair it or remove its frame.")
+    gray = _read(images.files[i], cv2.IMREAD_GRAYSCALE)
     full_height, full_width = gray.shape
     if full_width > width:
         height = max(1, round(full_height * width / full_width))
@@ -66,8 +65,15 @@ def load_view(images: PosedImages, i: int, width: int) -> View:
     return View(np.ascontiguousarray(gray, np.uint8), pinhole, images.camera_to_worlds[i], inside)
 
 
+def _read(file: Path, mode: int) -> NDArray[Any]:
+    pixels = cv2.imread(str(file), mode | cv2.IMREAD_IGNORE_ORIENTATION)
+    if pixels is None:
+        raise InputError(f"Training image {file} cannot be read: repair it or remove its frame.")
+    return pixels
+
+
 def _unbent(images: PosedImages, i: int, pinhole: NDArray[np.float64], size: Sequence[int]) -> tuple[Map, Map]:
-    """Where in image i, of a size (width, height), its undistorted view's pixels lie; OpenCV counts from centres."""
+    """Places in image i, of a size (width, height), of its undistorted view's pixels; OpenCV counts from centres."""
     matrix = camera_matrix(pinhole)
     straighten = cv2.fisheye.initUndistortRectifyMap if images.is_fisheye(i) else cv2.initUndistortRectifyMap
     matrix[:2, 2] -= 0.5
@@ -77,11 +83,8 @@ def _unbent(images: PosedImages, i: int, pinhole: NDArray[np.float64], size: Seq
 
 def straightened_color(images: PosedImages, i: int, view: View) -> NDArray[np.uint8]:
     """Blue, green and red of image i as its view shows it. [h, w, 3]"""
-    color = cv2.imread(str(images.files[i]), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    if color is None:
-        raise InputError(f"Training image {images.files[i]} cannot be read: repair it or remove its frame.")
     size = view.gray.shape[::-1]
-    color = cv2.resize(color, size, interpolation=cv2.INTER_AREA)
+    color = cv2.resize(_read(images.files[i], cv2.IMREAD_COLOR), size, interpolation=cv2.INTER_AREA)
     if images.is_bent(i):
         color = cv2.remap(color, *_unbent(images, i, view.pinhole, size), cv2.INTER_LINEAR)
     return np.asarray(color, np.uint8)
@@ -93,15 +96,19 @@ def camera_matrix(pinhole: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def project(posed: PosedImages, j: int, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Pixels [P, 2] at which a camera shows points [P, 3], lens included; far outside where they are behind it or so
-    far to the side that the lens's polynomial turns back."""
+    """Pixels [P, 2] at which a camera shows points [P, 3], lens included; far outside for points behind it or so far to
+    the side that the lens's polynomial turns back."""
     pose = posed.camera_to_worlds[j]
     local = (points - pose[:, 3]) @ pose[:, :3] * [1, -1, -1]  # OpenCV's axes: right, down, ahead
     ahead = local[:, 2] > 0
     aside = np.hypot(local[:, 0], local[:, 1])
     fisheye = posed.is_fisheye(j)
     radius = np.arctan2(aside, local[:, 2]) if fisheye else aside / np.where(ahead, local[:, 2], 1)
-    ahead &= radius < turning_radius(posed.distortion[j] if fisheye else posed.distortion[j, :2])
+    # The radius r > 0 from which r (1 + k1 r^2 + k2 r^4 + ...) falls, if it ever does, by its slope's roots in r^2.
+    slope = [1.0, *((2 * n + 3) * k for n, k in enumerate(posed.distortion[j, : 4 if fisheye else 2]))]
+    roots = np.polynomial.polynomial.polyroots(np.trim_zeros(slope, "b"))
+    squares = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)]
+    ahead &= radius < np.sqrt(squares.min(initial=np.inf))
     local = np.where(ahead[:, None], local, [0.0, 0.0, 1.0])[:, None]
     matrix, still = camera_matrix(posed.intrinsics[j]), np.zeros(3)
     bend = cv2.fisheye.projectPoints if fisheye else cv2.projectPoints
@@ -109,16 +116,8 @@ def project(posed: PosedImages, j: int, points: NDArray[np.float64]) -> NDArray[
     return np.where(ahead[:, None], at, -1e4)
 
 
-def turning_radius(radial: NDArray[np.float64]) -> float:
-    """Radius r > 0 from which r (1 + k1 r^2 + k2 r^4 + ...) falls; infinite if it never does."""
-    slope = [1.0, *((2 * n + 3) * k for n, k in enumerate(radial))]  # in powers of the squared radius
-    roots = np.polynomial.polynomial.polyroots(np.trim_zeros(slope, "b"))
-    squares = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)]
-    return float(np.sqrt(squares.min())) if len(squares) else np.inf
-
-
 def pixel_grid(shape: tuple[int, ...]) -> tuple[Map, Map]:
-    """x and y of pixel centres. [h, w] each"""
+    """Coordinates x and y of pixel centres. [h, w] each"""
     x, y = np.meshgrid(np.arange(shape[1], dtype=np.float32) + 0.5, np.arange(shape[0], dtype=np.float32) + 0.5)
     return x, y
 
@@ -132,7 +131,7 @@ def look_up(image: NDArray[Any], x: NDArray[Any], y: NDArray[Any], *, nearest: b
         nearest: take the nearest pixel.
 
     Returns:
-        The shape of ``x``, and channels where there are several.
+        The shape of ``x``, and channels if the image has several.
     """
     at_x, at_y = x.astype(np.float32) - 0.5, y.astype(np.float32) - 0.5
     mode = cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR
@@ -155,6 +154,6 @@ def look_up(image: NDArray[Any], x: NDArray[Any], y: NDArray[Any], *, nearest: b
             chosen = inside[begin : begin + REMAP_PART**2]
             rows = np.zeros((2, -(-len(chosen) // REMAP_PART), REMAP_PART), np.float32)
             rows.reshape(2, -1)[:, : len(chosen)] = flat_x[chosen] - left, flat_y[chosen] - top
-            found = cv2.remap(view, rows[0], rows[1], mode, borderMode=border, borderValue=(0.0,))
-            values[chosen] = found.reshape(-1, *image.shape[2:])[: len(chosen)]
+            folded = cv2.remap(view, rows[0], rows[1], mode, borderMode=border, borderValue=(0.0,))
+            values[chosen] = folded.reshape(-1, *image.shape[2:])[: len(chosen)]
     return values.reshape(*x.shape, *image.shape[2:])

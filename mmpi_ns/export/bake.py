@@ -19,7 +19,7 @@ from torch import Tensor
 
 from mmpi_ns.export.files import BakedScene, Pose
 from mmpi_ns.model import MMPIModel, MMPIModelConfig
-from mmpi_ns.rendering.chunks import CPU_RAYS, render_in_chunks
+from mmpi_ns.rendering.images import CPU_RAYS, render_in_chunks
 from mmpi_ns.rendering.metrics import ImageMetrics
 from mmpi_ns.scene.windows import window_shares
 from mmpi_ns.utils.errors import InputError, brief
@@ -104,7 +104,7 @@ def poses_of(pipeline: Any) -> list[Pose]:
 
 @dataclass(frozen=True)
 class Compared:
-    """Means over test images."""
+    """Baked and exact images compared: means over test images."""
 
     to_exact: float
     """PSNR of baked images against the exact renderer's, dB."""

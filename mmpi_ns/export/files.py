@@ -19,10 +19,11 @@ from torch import Tensor
 
 from mmpi_ns.capture.rays import PinholeRays
 from mmpi_ns.rendering.baked import BakedWindow
-from mmpi_ns.rendering.windows import render_windows
+from mmpi_ns.rendering.images import render_windows
 from mmpi_ns.scene.baked import CELLS, SIDE, BakedMpis, Codes, Shader, neighbours, take_borders
-from mmpi_ns.scene.plan import CubePlan, MPIPlan, ScenePlan
+from mmpi_ns.scene.plan import MPIPlan, ScenePlan
 from mmpi_ns.scene.windows import Window
+from mmpi_ns.utils.errors import InputError
 from mmpi_ns.utils.files import write_atomically
 from mmpi_ns.utils.parallel import in_order
 
@@ -171,19 +172,19 @@ def _gzip(data: bytes) -> bytes:
 def _differences(codes: UInt8[Tensor, "B 8 8"], beside: Int[Tensor, "2 B"]) -> NDArray[np.uint8]:
     """Stored form of one channel: differences along rows and columns, and of first texels along bricks; 0 for border
     texels that a neighbour also contains. [B, 64]"""
-    made, (right, below) = codes.numpy(), (beside >= 0).numpy()
+    stored, (right, below) = codes.numpy(), (beside >= 0).numpy()
     for axis in (2, 1):
-        made = np.diff(made, axis=axis, prepend=np.uint8(0))
-    made[:, 0, 0] = np.diff(made[:, 0, 0], prepend=np.uint8(0))
-    made[right, :CELLS, CELLS] = made[right & ~below, CELLS, CELLS] = made[below, CELLS] = 0
-    return made.reshape(-1, SIDE * SIDE)
+        stored = np.diff(stored, axis=axis, prepend=np.uint8(0))
+    stored[:, 0, 0] = np.diff(stored[:, 0, 0], prepend=np.uint8(0))
+    stored[right, :CELLS, CELLS] = stored[right & ~below, CELLS, CELLS] = stored[below, CELLS] = 0
+    return stored.reshape(-1, SIDE * SIDE)
 
 
-def _sums(kept: NDArray[np.uint8], beside: Int[Tensor, "2 B"]) -> UInt8[Tensor, "B 8 8"]:
-    """The codes again."""
-    made = kept.reshape(-1, SIDE, SIDE)
-    made[:, 0, 0] = np.cumsum(made[:, 0, 0], dtype=np.uint8)
-    codes = torch.from_numpy(made.cumsum(1, dtype=np.uint8).cumsum(2, dtype=np.uint8))
+def _sums(stored: NDArray[np.uint8], beside: Int[Tensor, "2 B"]) -> UInt8[Tensor, "B 8 8"]:
+    """Codes of one channel from their stored form."""
+    stored = stored.reshape(-1, SIDE, SIDE)
+    stored[:, 0, 0] = np.cumsum(stored[:, 0, 0], dtype=np.uint8)
+    codes = torch.from_numpy(stored.cumsum(1, dtype=np.uint8).cumsum(2, dtype=np.uint8))
     take_borders(codes, beside)
     return codes
 
@@ -197,9 +198,10 @@ def read_baked(folder: Path) -> BakedScene:
     header = read_header(folder)
     try:
         windows = [_read_window(folder, row) for row in header["windows"]]
-        path = [_read_pose(pose) for pose in header["path"]]
+        vectors = ("size", "focal", "center")
+        path = [Pose(p["to_world"], *(tuple(p[v]) for v in vectors), test=p["test"]) for p in header["path"]]
         return BakedScene(header["name"], tuple(header["up"]), path, windows)
-    except (KeyError, TypeError) as error:
+    except (KeyError, TypeError, InputError) as error:
         raise ValueError(f"{folder / HEADER} is damaged ({error!r}): bake the scene again.") from error
 
 
@@ -240,16 +242,14 @@ def _read_window(folder: Path, row: dict[str, Any]) -> tuple[Window, BakedWindow
                 f"{path} is damaged ('{name}': {error}): copy it anew, or bake the scene again."
             ) from error
 
-    names = [n for n in MPIPlan.__dataclass_fields__ if n != "far"]
-    fields = [{n: m[n] for n in names} | {"far": math.inf if m["far"] is None else m["far"]} for m in row["mpis"]]
-    mpis = tuple(MPIPlan(**{k: _tuples(v) for k, v in m.items()}) for m in fields)
-    no_cube: CubePlan | None = None
+    mpi_rows = [{name: m[name] for name in MPIPlan.__dataclass_fields__} for m in row["mpis"]]
+    nears = {"ray_near": row["ray_near"], "content_near": row["content_near"]}
+    plan = ScenePlan.from_object({"mpis": mpi_rows, "cube": None, "origin_of_plan": "baked", **nears})
     radius = math.inf if row["radius"] is None else row["radius"]
-    plan = ScenePlan(mpis, no_cube, row["ray_near"], row["content_near"], "baked")
     columns, density = torch.from_numpy(array("columns").view(np.int32)), array("density")
-    beside = neighbours(columns, mpis, len(density))
+    beside = neighbours(columns, plan.mpis, len(density))
     baked = BakedMpis(
-        mpis,
+        plan.mpis,
         tuple(m["interval"] for m in row["mpis"]),
         columns,
         _sums(density, beside),
@@ -257,25 +257,13 @@ def _read_window(folder: Path, row: dict[str, Any]) -> tuple[Window, BakedWindow
         Codes(**row["density"]),
         tuple(Codes(**c) for c in row["channels"]),
     )
-    shader = _read_shader(row["shader"], torch.from_numpy(array("network")).float())
+    layers, numbers, start = [], torch.from_numpy(array("network")).float(), 0
+    for outputs, inputs in row["shader"]["layers"]:
+        weights, biases = numbers[start : start + outputs * inputs], numbers[start + outputs * inputs :][:outputs]
+        layers.append((weights.view(outputs, inputs), biases))
+        start += outputs * (inputs + 1)
+    shader = Shader(tuple(layers), row["shader"]["direction_octaves"], row["shader"]["bound"])
     exposure = tuple(row.get("exposure", (1.0, 1.0, 1.0)))  # before images were shown at one exposure
     near, far = row["ray_near"], row["farthest"]
     window = BakedWindow(baked, shader, near, row["threshold"], row["background"], far, exposure)
     return Window(tuple(row["center"]), radius, row["margin"], plan), window
-
-
-def _read_pose(row: dict[str, Any]) -> Pose:
-    return Pose(row["to_world"], *(tuple(row[name]) for name in ("size", "focal", "center")), test=row["test"])
-
-
-def _read_shader(row: dict[str, Any], numbers: torch.Tensor) -> Shader:
-    layers, at = [], 0
-    for outputs, inputs in row["layers"]:
-        weights, biases = numbers[at : at + outputs * inputs], numbers[at + outputs * inputs :][:outputs]
-        layers.append((weights.view(outputs, inputs), biases))
-        at += outputs * (inputs + 1)
-    return Shader(tuple(layers), row["direction_octaves"], row["bound"])
-
-
-def _tuples(value: Any) -> Any:
-    return tuple(_tuples(v) for v in value) if isinstance(value, list) else value

@@ -11,7 +11,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean
-from typing import Any
 
 import numpy as np
 import torch
@@ -74,12 +73,12 @@ class Splats:
         return Gaussians(self.means, half @ half.mT, self.alphas)
 
     def basis(self, eye: Float[Tensor, "3"]) -> Float[Tensor, "N 4"]:
-        """(1, d) of each, seen from a point."""
+        """Directional basis (1, d) of each splat, seen from a point."""
         directions = torch.nn.functional.normalize(self.means - eye, dim=-1)
         return torch.cat([torch.ones_like(directions[:, :1]), directions], -1)
 
     def seen_from(self, eye: Float[Tensor, "3"]) -> Float[Tensor, "N 3"]:
-        """Their colours, seen from a point."""
+        """Colours of all splats, seen from a point."""
         return (self.basis(eye)[:, :, None] * self.colors).sum(1).clamp(0, 1)
 
 
@@ -130,7 +129,7 @@ def poses_in(place: Window, scene: BakedScene) -> list[Pose]:
 
 
 def between(poses: list[Pose], fraction: float) -> list[Pose]:
-    """Cameras this far on the way from each to the next one."""
+    """Cameras interpolated at a fraction of the way from each to the next."""
     cameras = []
     for a, b in zip(poses, [*poses[1:], poses[-1]], strict=True):
         (a_turn, a_eye), (b_turn, b_eye) = ((x[:, :3], x[:, 3:]) for x in (np.array(a.to_world), np.array(b.to_world)))
@@ -199,7 +198,7 @@ def _texels(window: BakedWindow, peaks: Float[Tensor, "B 8 8"]) -> _Texels:
 
 
 def _merged(texels: _Texels, is_seen: Bool[Tensor, "T"]) -> tuple[Int[Tensor, "T"], Int[Tensor, "T"]]:
-    """Group of each texel that is seen (-1 for the others), and how often four became one in it."""
+    """Group of each visible texel (-1 for the others), and the number of times that four became one in it."""
     tolerance = texels.channels.new_tensor([AGREEING_ALPHA] + [AGREEING_COLOR] * COLORS)
     tolerance = torch.cat([tolerance, tolerance.new_full((texels.channels.shape[1] - COLORS,), AGREEING_FEATURE)])
     values = torch.cat([texels.alphas[:, None], texels.channels], -1)[is_seen] / tolerance
@@ -242,18 +241,13 @@ def _placed(window: BakedWindow, texels: _Texels, group: Tensor, level: Tensor, 
         means[in_mpi] = torch.tensor(mpi.origin) + local @ torch.tensor(mpi.axes)
         sides = torch.stack([size[in_mpi] * du, size[in_mpi] * dv], -1)
         scales[in_mpi] = torch.cat([WIDTH * sides, THICKNESS * sides[:, :1]], -1) * z[:, None]
-        rotations[in_mpi] = quaternion(mpi.axes)
+        qx, qy, qz, qw = Rotation.from_matrix(np.transpose(mpi.axes)).as_quat()
+        rotations[in_mpi] = torch.tensor([qw, qx, qy, qz], dtype=torch.float32)
         # Overlapping splats of this spacing sum to this multiple of their centre value, after a rasteriser's blur.
         overlap = 2 * math.pi * (WIDTH**2 + BLUR / (focal * sides) ** 2).prod(-1).sqrt()
         alphas[in_mpi] = -torch.expm1(-DENSER * depth[in_mpi] / overlap)
     colors = torch.cat([mean(texels.channels[:, :COLORS])[:, None], torch.zeros(total, 3, COLORS)], 1)
     return Splats(means, scales, rotations, alphas.clamp(max=0.999), colors)
-
-
-def quaternion(axes: Any) -> Float[Tensor, "4"]:
-    """Unit quaternion (w, x, y, z) that turns x, y, z into the three axes given."""
-    x, y, z, w = Rotation.from_matrix(np.transpose(axes)).as_quat()
-    return torch.tensor([w, x, y, z], dtype=torch.float32)
 
 
 def write_ply(splats: Splats, path: Path) -> int:

@@ -33,10 +33,12 @@ def write_single_file(folder: Path, path: Path) -> None:
         OSError: the disk is full or cannot be written.
     """
     header = read_header(folder)
-    blocks = [_block(HEADER, "application/json", (folder / HEADER).read_text(encoding="utf-8").replace("<", "\\u003c"))]
+    block = '<script type="{}" id="{}">{}</script>'
+    text = (folder / HEADER).read_text(encoding="utf-8").replace("<", "\\u003c")
+    blocks = [block.format("application/json", HEADER, text)]
     for row in header["windows"]:
         data = base64.b64encode((folder / row["file"]).read_bytes()).decode()
-        blocks.append(_block(row["file"], "application/octet-stream", data))
+        blocks.append(block.format("application/octet-stream", row["file"], data))
     html = _html("\n".join(blocks))
     write_atomically(path, lambda unfinished: unfinished.write_text(html, encoding="utf-8"))
 
@@ -46,7 +48,3 @@ def _html(data: str) -> str:
     code = "\n".join((PAGE / name).read_text(encoding="utf-8") for name in ("scene.js", "page.js"))
     page = (PAGE / "index.html").read_text(encoding="utf-8")
     return page.replace("<!--data-->", data).replace("/*code*/", f"const MARCH = `{shader}`;\n{code}")
-
-
-def _block(name: str, kind: str, text: str) -> str:
-    return f'<script type="{kind}" id="{name}">{text}</script>'

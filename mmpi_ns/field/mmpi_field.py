@@ -172,7 +172,7 @@ class MMPIField(TexelTables):
 
         Args:
             ray_samples: merged samples.
-            head_counts: samples of each head, if known (``MergeReport``).
+            head_counts: samples of each head, if known (``MergedSamples``).
         """
         lookup = self._lookup(ray_samples, head_counts)
         if self.training and self.learns_cover:

@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from mmpi_ns.ops.layout import SceneLayout
-from mmpi_ns.scene.geometry import FACING_EPS, rays_in_frames, sample_disparity
+from mmpi_ns.scene.geometry import FACING_EPS, LocalRays, sample_disparity
 
 
 def moving(
@@ -54,7 +54,8 @@ def _on_planes(
 ) -> Float[Tensor, "N 3"]:
     """NDC (u, v, .) at which rays cross planes, up to a constant."""
     frames = layout.frames
-    o, d = rays_in_frames(origins, directions, frames)
+    local = LocalRays.of(origins, directions, frames)
+    o, d = local.local_origins, local.local_directions
     facing = d[..., 2:] > FACING_EPS  # where it is not there are no samples
     slope = d[..., :2] / torch.where(facing, d[..., 2:], 1)
     bend = o[..., :2] - o[..., 2:] * slope

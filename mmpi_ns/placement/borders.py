@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mmpi_ns.placement.observations import Array, Observations
 from mmpi_ns.placement.visibility import VisiblePoints
@@ -44,7 +43,12 @@ def widened(mpis: list[MPIPlan], observations: Observations, visible: VisiblePoi
         u, v = tangents[k, p]
         u0, u1, v0, v1 = extents[k]
         extents[k] = min(u0, u), max(u1, u), min(v0, v), max(v1, v)
-    return [_resized(m, extent) for m, extent in zip(mpis, extents, strict=True)]
+    result = []
+    for mpi, (u0, u1, v0, v1) in zip(mpis, extents.tolist(), strict=True):
+        across, down = (u1 - u0) / (mpi.extent[1] - mpi.extent[0]), (v1 - v0) / (mpi.extent[3] - mpi.extent[2])
+        width, height = round((mpi.width - 1) * across) + 1, round((mpi.height - 1) * down) + 1
+        result.append(replace(mpi, extent=(u0, u1, v0, v1), width=width, height=height))
+    return result
 
 
 def border_points(observations: Observations, visible: VisiblePoints) -> Array:
@@ -65,14 +69,3 @@ def _outside(tangents: Array, extents: Array) -> Array:
     u0, u1, v0, v1 = (extents[:, i].reshape(shape) for i in range(4))
     u, v = tangents[..., 0], tangents[..., 1]
     return np.stack([np.maximum(u0 - u, u - u1), np.maximum(v0 - v, v - v1)], -1)
-
-
-def _resized(mpi: MPIPlan, extent: NDArray[np.float64]) -> MPIPlan:
-    u0, u1, v0, v1 = (float(x) for x in extent)
-    across, down = ((u1 - u0) / (mpi.extent[1] - mpi.extent[0]), (v1 - v0) / (mpi.extent[3] - mpi.extent[2]))
-    return replace(
-        mpi,
-        extent=(u0, u1, v0, v1),
-        width=round((mpi.width - 1) * across) + 1,
-        height=round((mpi.height - 1) * down) + 1,
-    )

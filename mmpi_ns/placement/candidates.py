@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from mmpi_ns.placement.errors import cube_errors, pixel_slopes
 from mmpi_ns.placement.hand_made import facing_axes, vector
 from mmpi_ns.placement.observations import Array, Observations
-from mmpi_ns.placement.visibility import VisiblePoints
+from mmpi_ns.placement.visibility import VisiblePoints, farthest_first
 from mmpi_ns.scene.plan import CubePlan, MPIPlan
 
 MAX_VIEWS, MAX_WIDE_VIEWS = 96, 32
@@ -28,7 +28,7 @@ BESIDE = 0.9
 MARGINS = (1.12, 1.4, 1.75)
 """Frusta of views, relative to the camera's own."""
 PULL_BACKS = (0.0, 1.0, 2.0)
-"""How far behind the camera an MPI may stand, relative to where points start."""
+"""Distances of an MPI behind its camera, relative to where points start."""
 NEAR_SHARE = 0.6
 """First plane, relative to where points start."""
 CUBE_SIZES = (0.4, 0.7, 1.0)
@@ -76,42 +76,25 @@ def find_candidates(observations: Observations, visible: VisiblePoints, with_cub
 
 
 def spread_cameras(observations: Observations, visible: VisiblePoints, count: int) -> list[int]:
-    """Cameras far apart in position or direction, each the farthest from the previous ones.
-
-    Starts at the camera farthest from the middle, so the numbering of the cameras does not matter.
-    """
+    """Cameras far apart in position or direction, each the farthest from the previous ones."""
     reach = max(visible.near, 1e-12)
     place = np.concatenate([observations.centers / reach, observations.camera_to_worlds[:, :, 2] * 2], -1)
-    distance = -np.linalg.norm(place - place.mean(0), axis=-1)
-    chosen = [int(distance.argmin())]
-    distance = np.full(len(place), np.inf)
-    while len(chosen) < min(count, len(place)):
-        distance = np.minimum(distance, np.linalg.norm(place - place[chosen[-1]], axis=-1))
-        chosen.append(int(distance.argmax()))
-    return chosen
+    return farthest_first(place, count=min(count, len(place)))
 
 
-@dataclass(frozen=True)
-class _Face:
-    """A facing direction for MPIs at a camera."""
+def _faces(observations: Observations, i: int) -> Iterator[tuple[str, Array, Array, Array]]:
+    """Facing directions for MPIs at a camera: its own, and for a wide lens also its sides.
 
-    name: str
-    axes: Array
-    """Rows right, down, facing, in world axes."""
-    u: Array
-    """Smallest and largest tangent to the right that the camera sees there."""
-    v: Array
-    """The same downwards."""
-
-
-def _faces(observations: Observations, i: int) -> Iterator[_Face]:
-    """The direction of the camera, with the extent of its lens; for a wide lens also its sides, each with its part."""
+    Yields:
+        Name, axes (rows right, down, facing), and the smallest and largest tangents that the camera sees there to the
+        right and downwards.
+    """
     right, up, back = observations.camera_to_worlds[i, :, :3].T
     axes, name = np.stack([right, -up, -back]), f"view {i + 1}"
     if observations.lens is None:
         fx, fy, cx, cy = observations.intrinsics[i]
         width, height = observations.sizes[i]
-        yield _Face(name, axes, np.array([-cx, width - cx]) / fx, np.array([-cy, height - cy]) / fy)
+        yield name, axes, np.array([-cx, width - cx]) / fx, np.array([-cy, height - cy]) / fy
         return
     seen = observations.lens[i].reshape(-1, 3) * [1, -1, -1]
     for face in FACES if observations.wide[i] else FACES[:1]:
@@ -121,26 +104,19 @@ def _faces(observations: Observations, i: int) -> Iterator[_Face]:
         if inside.sum() > 2:
             u, v = (np.array([t.min(), t.max()]) for t in (x[inside] / ahead[inside], y[inside] / ahead[inside]))
             if min(np.ptp(u), np.ptp(v)) > 1e-3:
-                yield _Face(name if face == "front" else f"{name} {face}", np.matmul(turn, axes), u, v)
+                yield name if face == "front" else f"{name} {face}", np.matmul(turn, axes), u, v
 
 
 def _views(
-    observations: Observations, visible: VisiblePoints, i: int, face: _Face, pull_back: float
+    observations: Observations, visible: VisiblePoints, i: int, face: tuple[str, Array, Array, Array], pull_back: float
 ) -> Iterator[Candidate]:
     """One MPI for each margin. They differ only in extent, so the errors are computed once, in the widest."""
     fx, fy = observations.intrinsics[i, :2]
-    axes, u, v = face.axes, face.u, face.v
+    name, axes, u, v = face
     origin = observations.centers[i] - pull_back * axes[2]
-    frame = MPIPlan(
-        name=face.name,
-        origin=vector(origin),
-        axes=(vector(axes[0]), vector(axes[1]), vector(axes[2])),
-        near=float(NEAR_SHARE * min(visible.nearest[i], visible.near) + pull_back),
-        extent=_widened(u, v, max(MARGINS)),
-        planes=2,
-        height=2,
-        width=2,
-    )
+    near = float(NEAR_SHARE * min(visible.nearest[i], visible.near) + pull_back)
+    rows = vector(axes[0]), vector(axes[1]), vector(axes[2])
+    frame = MPIPlan(name, vector(origin), rows, near, _widened(u, v, max(MARGINS)), planes=2, height=2, width=2)
     plane, across, down = pixel_slopes(frame, observations, visible.cameras, visible.points)
     plane, texel = 0.5 / frame.near * plane, np.maximum(across / fx, down / fy)
     local = (visible.points - origin) @ axes.T
@@ -159,14 +135,21 @@ def _widened(u: Array, v: Array, margin: float) -> tuple[float, float, float, fl
 
 
 def _cubes(observations: Observations, visible: VisiblePoints) -> Iterator[Candidate]:
-    """Cubes around the point that the cameras look at; none if there is no such point.
+    """Cubes around the point nearest to all viewing axes; none if most cameras do not face it.
 
-    Their voxels span the wanted number of pixels in the median over the observations inside.
+    Their voxels span the number of pixels asked for in the median over the observations inside.
     """
-    center, distance = _looked_at(observations)
-    if center is None:
+    forward = -observations.camera_to_worlds[:, :, 2]
+    across = np.eye(3) - forward[:, :, None] * forward[:, None, :]
+    total = across.sum(0)
+    if np.linalg.cond(total) > 1e4:  # all look the same way
         return
-    for half in (size * distance for size in CUBE_SIZES):
+    center = np.linalg.solve(total, np.einsum("mij,mj->i", across, observations.centers))
+    offset = center - observations.centers
+    distances = np.linalg.norm(offset, axis=-1)
+    if np.mean(np.einsum("mi,mi->m", offset, forward) > 0.8 * distances) < 0.8:
+        return
+    for half in (size * float(np.median(distances)) for size in CUBE_SIZES):
         frame = CubePlan(vector(center - half), vector(center + half), (2, 2, 2))
         # A voxel as large as half the cube spans this many pixels.
         pixels = cube_errors(frame, observations, visible.cameras, visible.points)
@@ -175,19 +158,3 @@ def _cubes(observations: Observations, visible: VisiblePoints) -> Iterator[Candi
             side = 2 * float(np.median(pixels[inside]))
             plane = np.where(inside, 0.0, np.inf).astype(np.float32)
             yield Candidate(frame, side, side, plane, (2 * pixels / side).astype(np.float32))
-
-
-def _looked_at(observations: Observations) -> tuple[Array | None, float]:
-    """The point nearest to all viewing axes and its median distance; no point if most cameras do not face it."""
-    forward = -observations.camera_to_worlds[:, :, 2]
-    across = np.eye(3) - forward[:, :, None] * forward[:, None, :]
-    total = across.sum(0)
-    if np.linalg.cond(total) > 1e4:  # all look the same way
-        return None, 0.0
-    point = np.linalg.solve(total, np.einsum("mij,mj->i", across, observations.centers))
-    offset = point - observations.centers
-    along = np.einsum("mi,mi->m", offset, forward)
-    distance = np.linalg.norm(offset, axis=-1)
-    if np.mean(along > 0.8 * distance) < 0.8:
-        return None, 0.0
-    return point, float(np.median(distance))

@@ -15,7 +15,7 @@ def vector(v: Array) -> Vector:
 def facing_axes(base: Array, name: str) -> tuple[Vector, Vector, Vector]:
     """Rows x, y, z of an MPI that faces ``name`` in a frame with rows right, down, forward."""
     right, down, forward = base
-    rows = {
+    x, y, z = {
         "front": (right, down, forward),
         "back": (-right, down, -forward),
         "left": (forward, down, -right),
@@ -23,8 +23,7 @@ def facing_axes(base: Array, name: str) -> tuple[Vector, Vector, Vector]:
         "below": (right, -forward, down),
         "above": (right, forward, -down),
     }[name]
-    x, y, z = (vector(row) for row in rows)
-    return (x, y, z)
+    return vector(x), vector(y), vector(z)
 
 
 def drive_plan(
@@ -93,21 +92,8 @@ def room_plan(
     """
     base = observations.mean_axes
     center = (observations.centers.min(0) + observations.centers.max(0)) / 2
-    mpis = tuple(
-        MPIPlan(
-            name,
-            vector(center),
-            facing_axes(base, name),
-            near,
-            (-tangent, tangent, -tangent, tangent),
-            planes,
-            height,
-            width,
-        )
-        for name in names
-    )
-    cube = None
-    if cube_voxels:
-        shape = (cube_voxels, cube_voxels, cube_voxels)
-        cube = CubePlan(vector(center - cube_half_size), vector(center + cube_half_size), shape)
-    return ScenePlan(mpis, cube, 0.1 * near, near, "hand-made room")
+    extent = (-tangent, tangent, -tangent, tangent)
+    mpis = (MPIPlan(n, vector(center), facing_axes(base, n), near, extent, planes, height, width) for n in names)
+    corners = vector(center - cube_half_size), vector(center + cube_half_size)
+    cube = CubePlan(*corners, (cube_voxels, cube_voxels, cube_voxels)) if cube_voxels else None
+    return ScenePlan(tuple(mpis), cube, 0.1 * near, near, "hand-made room")

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mmpi_ns.placement.observations import Array, Observations
 from mmpi_ns.placement.rule import PlacementConfig, place
-from mmpi_ns.placement.visibility import find_visible_points
+from mmpi_ns.placement.visibility import farthest_first, find_visible_points
 from mmpi_ns.scene.windows import Window, WindowedPlan
 
 MARGIN = 0.08
@@ -35,7 +35,7 @@ def place_windows(
     Raises:
         ValueError: the cameras leave nothing to place.
     """
-    balls = find_balls(observations, config.window_length) if config.window_length > 0 else []
+    balls = find_balls(observations, config.window_length)
     if len(balls) < 2:
         return WindowedPlan.single(place(observations, config, training_rays))
     windows = []
@@ -47,7 +47,7 @@ def place_windows(
 
 def most_pixels(observations: Observations, config: PlacementConfig) -> float:
     """Training pixels of the largest window of a capture."""
-    balls = find_balls(observations, config.window_length) if config.window_length > 0 else []
+    balls = find_balls(observations, config.window_length)
     pixels = observations.sizes.prod(-1)
     windows = [cameras_in(observations.centers, center, radius + margin) for center, radius, margin in balls]
     return float(max((pixels[cameras].sum() for cameras in windows), default=pixels.sum()))
@@ -58,20 +58,32 @@ def find_balls(observations: Observations, length: float) -> list[tuple[Array, f
 
     Args:
         observations: the cameras.
-        length: maximum length of a window, in median distances of the content.
+        length: maximum length of a window, in median distances of the content; 0 for no windows.
     """
+    if length <= 0:
+        return []
     visible = find_visible_points(observations)
     longest = length * float(np.median(np.linalg.norm(visible.points - observations.centers[visible.cameras], axis=-1)))
     centers = observations.centers
     spread = np.linalg.norm(centers - centers.mean(0), axis=-1)
     if 2 * spread.max() <= longest:
         return []
-    middles = _fewest(centers, _spread_out(centers, spread, longest / 2), longest / 2)
-    middles = _without_small(centers, middles)
+    middles = _fewest(centers, centers[farthest_first(centers, radius=longest / 2)], longest / 2)
+    while len(middles) > 1:  # without windows of too few cameras, smallest first; neighbours take these over
+        counts = np.bincount(_nearest(centers, middles), minlength=len(middles))
+        if counts.min() >= FEWEST:
+            break
+        middles = np.delete(middles, counts.argmin(), axis=0)
     owner = _nearest(centers, middles)
-    margin = MARGIN * longest
     radii = [float(np.linalg.norm(centers[owner == i] - m, axis=-1).max()) for i, m in enumerate(middles)]
-    return [(middles[i], radii[i], margin) for i in _along(middles)]
+    # Neighbours follow each other: from the window farthest from the middle of all, always to the nearest.
+    order, left = [], list(range(len(middles)))
+    at = middles[np.linalg.norm(middles - middles.mean(0), axis=-1).argmax()]
+    while left:
+        order.append(min(left, key=lambda i: float(np.linalg.norm(middles[i] - at))))
+        left.remove(order[-1])
+        at = middles[order[-1]]
+    return [(middles[i], radii[i], MARGIN * longest) for i in order]
 
 
 def cameras_of(window: Window, observations: Observations) -> Observations:
@@ -104,18 +116,8 @@ def of_cameras(observations: Observations, cameras: NDArray[np.int64]) -> Observ
     )
 
 
-def _spread_out(centers: Array, spread: Array, radius: float) -> Array:
-    """Cameras such that balls of ``radius`` around them contain all (farthest-point traversal, Gonzalez 1985)."""
-    chosen = [int(spread.argmax())]
-    distance = np.linalg.norm(centers - centers[chosen[0]], axis=-1)
-    while distance.max() > radius:
-        chosen.append(int(distance.argmax()))
-        distance = np.minimum(distance, np.linalg.norm(centers - centers[chosen[-1]], axis=-1))
-    return centers[chosen]
-
-
 def _fewest(centers: Array, start: Array, radius: float) -> Array:
-    """As few of ``start`` as possible, moved to the middle of their cameras; balls hardly larger than ``radius``."""
+    """Middles of the fewest balls, hardly larger than ``radius``, that hold all cameras; some of ``start``, moved."""
     low, high = 1, len(start)  # farthest points are at most twice as many as are needed
     best = _settled(centers, start)
     while low < high:
@@ -142,25 +144,4 @@ def _settled(centers: Array, middles: Array) -> Array:
 
 
 def _nearest(centers: Array, middles: Array) -> NDArray[np.int64]:
-    return np.array([np.linalg.norm(middles - c, axis=-1).argmin() for c in centers])
-
-
-def _without_small(centers: Array, middles: Array) -> Array:
-    """Removes, smallest first, windows with too few cameras; neighbours take these over."""
-    while len(middles) > 1:
-        counts = np.bincount(_nearest(centers, middles), minlength=len(middles))
-        if counts.min() >= FEWEST:
-            break
-        middles = np.delete(middles, counts.argmin(), axis=0)
-    return middles
-
-
-def _along(middles: Array) -> list[int]:
-    """An order in which neighbours follow each other: from the one farthest from all others, always to the nearest."""
-    left = list(range(len(middles)))
-    order = [int(np.linalg.norm(middles - middles.mean(0), axis=-1).argmax())]
-    left.remove(order[0])
-    while left:
-        order.append(min(left, key=lambda i: float(np.linalg.norm(middles[i] - middles[order[-1]]))))
-        left.remove(order[-1])
-    return order
+    return np.linalg.norm(middles - centers[:, None], axis=-1).argmin(-1)

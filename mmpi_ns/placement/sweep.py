@@ -7,6 +7,7 @@ resolution; pixels with one clear match become points. Takes a few seconds.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,19 +44,14 @@ def add_swept_points(observations: Observations, images: list[Array], num_refere
     Returns:
         The observations with points; each counts as seen by every camera near its reference whose image it falls on.
     """
-    count = len(images)
+    count, poses, pinholes = len(images), observations.camera_to_worlds, observations.intrinsics
     references = np.unique(np.linspace(0, count - 1, min(num_references, count)).round().astype(int))
     scales = [image.shape[1] / width for image, width in zip(images, observations.sizes[:, 0], strict=True)]
-    views = [
-        _View(image, pose, intrinsics * scale)
-        for image, pose, intrinsics, scale in zip(
-            images, observations.camera_to_worlds, observations.intrinsics, scales, strict=True
-        )
-    ]
+    views = [_View(image, poses[i], pinholes[i] * scales[i]) for i, image in enumerate(images)]
     points, cameras, indices = [observations.points], [observations.seen_by], [observations.seen_point]
     total = len(observations.points)
     for i in references:
-        neighbours = nearest_views(observations.camera_to_worlds, int(i), 8, MAX_ANGLE)
+        neighbours = nearest_views(poses, int(i), 8, MAX_ANGLE)
         if not neighbours:
             continue
         swept = _sweep(views[i], [views[j] for j in neighbours[:4]])
@@ -66,12 +62,8 @@ def add_swept_points(observations: Observations, images: list[Array], num_refere
             cameras.append(np.full(len(seen), j, np.int64))
             indices.append(total + seen)
         total += len(swept)
-    return replace(
-        observations,
-        points=np.concatenate(points),
-        seen_by=np.concatenate(cameras),
-        seen_point=np.concatenate(indices),
-    )
+    seen_by, seen_point = np.concatenate(cameras), np.concatenate(indices)
+    return replace(observations, points=np.concatenate(points), seen_by=seen_by, seen_point=seen_point)
 
 
 def _sweep(reference: _View, neighbours: list[_View]) -> Array:
@@ -97,14 +89,11 @@ def _sweep(reference: _View, neighbours: list[_View]) -> Array:
     good = (top > MIN_SCORE) & (top - second > MIN_MARGIN) & (best > 0)
     inverse_depth = np.where(good, (best + _peak_offset(scores, best)) * disparities[1], 1.0)
     world = (rays / inverse_depth[..., None]) @ reference.pose[:, :3].T + reference.pose[:, 3]
-    rows, columns = np.nonzero(good)
-    keep = slice(None, None, max(1, len(rows) // 400))
-    rows, columns = rows[keep], columns[keep]
-    return world[rows, columns]
+    return world[good][:: max(1, good.sum() // 400)]
 
 
 def _peak_offset(scores: Array, best: NDArray[np.int64]) -> Array:
-    """Where between the hypotheses the peak lies: vertex of the parabola through the best and its neighbours."""
+    """Place of the peak between the hypotheses: vertex of the parabola through the best and its neighbours."""
     inner = np.clip(best, 1, HYPOTHESES - 2)[None]
     below, top, above = (np.take_along_axis(scores, inner + d, 0)[0] for d in (-1, 0, 1))
     bend = below - 2 * top + above
@@ -128,14 +117,9 @@ def _warp(reference: _View, neighbour: _View, rays: Array, disparity: float) -> 
 
 def _correlation(a: Array, b: Array, inside: NDArray[np.bool_]) -> Array:
     """Zero-mean normalised correlation over windows; -1 where a window leaves the image or holds no texture."""
-    b = np.where(inside, b, 0.0)
-    mean_a, mean_b = _mean(a), _mean(b)
-    variance_a, variance_b = _mean(a * a) - mean_a**2, _mean(b * b) - mean_b**2
-    covariance = _mean(a * b) - mean_a * mean_b
-    textured = (variance_a > 1e-4) & (variance_b > 1e-4) & (_mean(inside.astype(float)) > 0.999)
+    b, mean = np.where(inside, b, 0.0), partial(uniform_filter, size=WINDOW, mode="nearest")
+    mean_a, mean_b = mean(a), mean(b)
+    variance_a, variance_b = mean(a * a) - mean_a**2, mean(b * b) - mean_b**2
+    covariance = mean(a * b) - mean_a * mean_b
+    textured = (variance_a > 1e-4) & (variance_b > 1e-4) & (mean(inside.astype(float)) > 0.999)
     return np.where(textured, covariance / np.sqrt(np.maximum(variance_a * variance_b, 1e-12)), -1.0)
-
-
-def _mean(image: Array) -> Array:
-    """Mean over WINDOW x WINDOW pixels, edges repeated."""
-    return uniform_filter(image, WINDOW, mode="nearest")

@@ -11,16 +11,17 @@ from mmpi_ns.placement.observations import Array, Observations, frustum_points
 from mmpi_ns.utils.errors import InputError
 
 SAMPLED, SAMPLED_PER_CAMERA = 6000, 16
-"""Observations that the choice is based on: so many, or so many a camera where that is more."""
+"""Minimum number of observations that the choice is based on, in all and for each camera, if there are as many."""
 FRUSTUM_SHARE, FEW = 0.15, 10
-"""Weight, in every image, of points that fill its frustum: a share, and most of it where there are so FEW keypoints.
-Where an image has no keypoints (sky, a white wall) there must be planes all the same."""
+"""Weight, in every image, of points that fill its frustum: a share, and most of it with FEW keypoints or less. An
+image without keypoints (sky, a white wall) needs planes too."""
 SPAN = (0.25, 0.9)
-"""Between these quantiles of depth the points of an image are said to lie."""
+"""Quantiles of depth between which the points of an image are said to lie."""
 COVERED, LEAST_COVERED = 3000, 0.25
-"""Points whose images are counted, and the share of them that may be seen by fewer pixels than is said."""
+"""Points whose images are counted, and the share of them that fewer pixels than stated may see."""
 WINDOW, SUPPORT = 1.5, 0.04
-"""What a camera sees starts where so many of its observations lie within a factor of WINDOW in depth."""
+"""Content starts, for a camera, at the least depth from which a factor of WINDOW holds the share SUPPORT of its
+observations."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +75,7 @@ def pixels_per_pixel(observations: Observations, visible: VisiblePoints) -> floa
     """Training pixels that fall, in all images together, on what one pixel of an image shows; at least 1.
 
     An image counts by the square of its magnification relative to the observing one. Three quarters of what the
-    cameras see are covered by at least so many pixels. What may hide a point from an image is not considered.
+    cameras see are covered by at least this many pixels. Occlusion is not considered.
     """
     some = np.linspace(0, len(visible.cameras) - 1, min(COVERED, len(visible.cameras))).round().astype(int)
     cameras, points, weights = visible.cameras[some], visible.points[some], visible.weights[some]
@@ -91,6 +92,24 @@ def pixels_per_pixel(observations: Observations, visible: VisiblePoints) -> floa
     order = np.argsort(covered, kind="stable")
     share = np.cumsum(weights[order])
     return max(1.0, float(covered[order[np.searchsorted(share, LEAST_COVERED * share[-1])]]))
+
+
+def farthest_first(places: Array, count: int | None = None, radius: float = 0.0) -> list[int]:
+    """Places far apart, each the farthest from the previous ones (farthest-point traversal, Gonzalez 1985).
+
+    Starts at the place farthest from the middle, so the numbering does not matter.
+
+    Args:
+        places: [M, D]
+        count: number of places; None: as many as it takes until balls of ``radius`` around them contain all.
+        radius: of the balls.
+    """
+    chosen = [int(np.linalg.norm(places - places.mean(0), axis=-1).argmax())]
+    distance = np.linalg.norm(places - places[chosen[0]], axis=-1)
+    while distance.max() > radius if count is None else len(chosen) < count:
+        chosen.append(int(distance.argmax()))
+        distance = np.minimum(distance, np.linalg.norm(places - places[chosen[-1]], axis=-1))
+    return chosen
 
 
 def _start(depth: Array) -> float:

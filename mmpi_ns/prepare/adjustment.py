@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,7 +20,7 @@ WORTH = 0.97
 LARGEST_ERROR = 4.0
 """Reprojection error in pixels above which an observation is dropped."""
 ENOUGH_POINTS = 300
-"""Points of each image, those that most images see, on which a choice between camera models rests."""
+"""Points of each image, the ones that most images see, on which a choice between camera models rests."""
 PARTS = 20
 """Number of images from which the two halves of a capture are also used separately to judge the focal length."""
 WIDE = 0.08
@@ -30,7 +29,7 @@ WIDE = 0.08
 
 @dataclass(frozen=True)
 class Free:
-    """What may be refined of the cameras."""
+    """Camera parameters that may be refined."""
 
     lens: bool
     """Focal length and distortion."""
@@ -81,36 +80,36 @@ def polish(model: pycolmap.Reconstruction, free: Free, threads: int) -> pycolmap
         free: what may be refined.
         threads: CPU threads; below 1 for all.
     """
-    trials: list[tuple[str, Callable[[pycolmap.Reconstruction], None], bool]] = []
+    trials = []  # in words, and whether it is the four lens terms; else the principal point
     if free.principal_point and not free.always:
-        trials.append(("the principal point free", lambda model: None, True))
+        trials.append(("the principal point free", False))
     if free.full_lens and any(c.model.name == "SIMPLE_RADIAL" for c in model.cameras.values()):
-        trials.append(("OpenCV's four lens terms", _give_four_terms, False))
-    place = free.always
+        trials.append(("OpenCV's four lens terms", True))
+    center, four_terms = free.always, False
     with progress("Fitting the lens", 1 + len(trials)) as advance:
         best = copy.deepcopy(model)
-        if place:
-            adjust(best, threads, free.lens, place)
+        if center:
+            adjust(best, threads, free.lens, center)
         advance()
         light = with_fewer_points(best)
         if trials:
-            adjust(light, threads, free.lens, place)
-        changes = []
-        for says, change, moves_center in trials:
+            adjust(light, threads, free.lens, center)
+        is_changed = False
+        for says, is_lens in trials:
             trial = copy.deepcopy(light)
-            change(trial)
-            adjust(trial, threads, free.lens, place or moves_center)
+            if is_lens:
+                _give_four_terms(trial)
+            adjust(trial, threads, free.lens, center or not is_lens)
             advance()
             before, after = rms_error(light), rms_error(trial)
             is_better = after < WORTH * before
             say(f"Lens: {before:.3f} px, {after:.3f} px with {says}: {'kept' if is_better else 'not kept'}.")
             if is_better:
-                light, place = trial, place or moves_center
-                changes.append(change)
-        if changes:
-            for change in changes:
-                change(best)
-            adjust(best, threads, free.lens, place)
+                light, center, four_terms, is_changed = trial, center or not is_lens, four_terms or is_lens, True
+        if four_terms:
+            _give_four_terms(best)
+        if is_changed:
+            adjust(best, threads, free.lens, center)
     return best
 
 

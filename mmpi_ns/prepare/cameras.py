@@ -1,4 +1,4 @@
-"""Which images share a camera, and the intrinsics that SfM starts from."""
+"""Cameras shared by images, and the intrinsics that SfM starts from."""
 
 from __future__ import annotations
 
@@ -106,12 +106,9 @@ def read_intrinsics(camera: pycolmap.Camera) -> Intrinsics:
     """
     name, p = camera.model.name, [float(v) for v in camera.params]
     f = (camera.focal_length_x, camera.focal_length_y, camera.principal_point_x, camera.principal_point_y)
-    if name in ("SIMPLE_PINHOLE", "PINHOLE"):
-        return Intrinsics(*f)
-    if name == "SIMPLE_RADIAL":
-        return Intrinsics(*f, distortion=(p[3], 0.0, 0.0, 0.0))
-    if name == "RADIAL":
-        return Intrinsics(*f, distortion=(p[3], p[4], 0.0, 0.0))
-    if name in ("OPENCV", "OPENCV_FISHEYE"):
-        return Intrinsics(*f, distortion=(p[4], p[5], p[6], p[7]), fisheye=name == "OPENCV_FISHEYE")
-    raise PrepareError(f"Lens model {name} is not supported in transforms.json.")
+    terms = {"SIMPLE_PINHOLE": [], "PINHOLE": [], "SIMPLE_RADIAL": p[3:], "RADIAL": p[3:]}
+    terms |= {"OPENCV": p[4:], "OPENCV_FISHEYE": p[4:]}
+    if name not in terms:
+        raise PrepareError(f"Lens model {name} is not supported in transforms.json.")
+    k1, k2, k3, k4 = (*terms[name], 0.0, 0.0, 0.0, 0.0)[:4]
+    return Intrinsics(*f, distortion=(k1, k2, k3, k4), fisheye=name == "OPENCV_FISHEYE")

@@ -40,7 +40,7 @@ FOCAL_HELPS = (0.95, 0.85)
 
 @dataclass(frozen=True)
 class Finding:
-    """A warning."""
+    """Warning of a check."""
 
     kind: str
     """One word and a question mark: the suspected problem."""

@@ -20,7 +20,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from mmpi_ns.capture.matching import MIN_INLIERS, epipolar_distances
+from mmpi_ns.capture.matching import MIN_INLIERS, epipolar_distances, verified_matches
 from mmpi_ns.prepare.alignment import Array, camera_poses, degrees_between, rotation_between, similarity_between
 
 Places = NDArray[np.int64]
@@ -59,7 +59,7 @@ class Pairs:
     fitting: Array
     """Of these, matches that lie on the epipolar lines of the two poses. [P]"""
     beside: Array
-    """Of these, matches that lie close beside them: a bent track has many. Those far off are false, or the poses are
+    """Of these, matches that lie close beside them: a bent track has many. Matches far off are false, or the poses are
     broken. [P]"""
 
 
@@ -103,7 +103,7 @@ def witness_of(name: str, model: pycolmap.Reconstruction, database: Path, offere
         name: of the mapper.
         model: poses and points, with the keypoints of the database.
         database: verified matches.
-        offered: names of all images given, in order.
+        offered: names of all images of the capture, in order.
     """
     names, poses = camera_poses(model)
     images = [model.images[i] for i in sorted(model.reg_image_ids())]
@@ -137,16 +137,13 @@ def witness_of(name: str, model: pycolmap.Reconstruction, database: Path, offere
 def _pair_evidence(
     model: pycolmap.Reconstruction, database: Path, points: dict[int, Places], rays: dict[int, Array]
 ) -> Pairs:
-    """For every verified pair of registered images, how many matches became points and how well they fit the poses."""
+    """Matches of every verified pair of registered images that became points, and that fit the poses."""
     place = {image_id: i for i, image_id in enumerate(sorted(points))}
     rows: list[tuple[int, ...]] = []
-    with pycolmap.Database.open(database) as opened:
-        numbers, geometries = opened.read_two_view_geometries()
-    for number, geometry in zip(numbers, geometries, strict=True):
-        a, b = pycolmap.pair_id_to_image_pair(number)
-        if a not in place or b not in place or len(geometry.inlier_matches) < MIN_INLIERS:
+    for a, b, matches in verified_matches(database):
+        if a not in place or b not in place or len(matches) < MIN_INLIERS:
             continue
-        left, right = np.asarray(geometry.inlier_matches).astype(int).T
+        left, right = matches.T
         tracked = (points[a][left] == points[b][right]) & (points[a][left] >= 0)
         camera = model.cameras[model.images[a].camera_id]
         fit = FIT_PX * max(camera.width, camera.height) / 1000 / camera.mean_focal_length()
@@ -159,12 +156,12 @@ def _pair_evidence(
 
 
 def share(part: Array, whole: Array) -> float:
-    """Sum over sum; 0 of nothing."""
+    """Ratio of two sums; 0 if the second is 0."""
     return float(part.sum() / max(float(whole.sum()), 1.0))
 
 
 def bridges(pairs: Pairs, count: int, part: Array, whole: Array | None = None) -> Array:
-    """For each gap between two registered images, the fraction of the matches across it that hold.
+    """Fraction of the matches across each gap between two registered images that hold.
 
     Args:
         pairs: of the model.
@@ -284,15 +281,15 @@ def speed_changes(witness: Witness) -> Array:
     return result
 
 
-def agreement(one: Witness, other: Witness) -> Agreement | None:
+def agreement(first: Witness, second: Witness) -> Agreement | None:
     """Difference of two witnesses in the images that both have; None if there are fewer than three.
 
     Centres and rotations are aligned each for itself: another principal point turns all cameras alike.
     """
-    common = [n for n in one.images if n in set(other.images)]
+    common = [n for n in first.images if n in set(second.images)]
     if len(common) < 3:
         return None
-    a, b = (w.poses[[list(w.images).index(n) for n in common]] for w in (one, other))
+    a, b = (w.poses[[list(w.images).index(n) for n in common]] for w in (first, second))
     similarity = similarity_between(a, b).matrix()
     moved = a[:, :3, 3] @ similarity[:, :3].T + similarity[:, 3]
     extent = max(float(np.linalg.norm(np.ptp(b[:, :3, 3], axis=0))), 1e-12)

@@ -31,7 +31,7 @@ QUALITY = 97
 
 @dataclass(frozen=True)
 class Split:
-    """Which images train and which test."""
+    """Names of the training and the test images."""
 
     train: tuple[str, ...]
     test: tuple[str, ...]
@@ -158,7 +158,7 @@ def downscale(source: Path, target: Path, factor: int, mask: bool = False) -> No
 
 
 def write_scene(model: pycolmap.Reconstruction, scene: Path, content: dict[str, Any]) -> None:
-    """Everything that is derived from the model; transforms.json last."""
+    """Writes the COLMAP model, the points, and last transforms.json."""
     (scene / "colmap" / "sparse" / "0").mkdir(parents=True, exist_ok=True)
     model.write(scene / "colmap" / "sparse" / "0")
     model.export_PLY(scene / "sparse_pc.ply")

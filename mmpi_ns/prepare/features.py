@@ -17,6 +17,7 @@ from mmpi_ns.capture.matching import (
     match_pairs,
     new_model,
     quiet,
+    verified_matches,
     write_images,
 )
 from mmpi_ns.prepare.images import Photo
@@ -128,11 +129,8 @@ def connected(database: Path, places: Sequence[int]) -> list[list[int]]:
 def matched_keypoints(database: Path, image_ids: Sequence[int]) -> int:
     """Keypoints of these images with a verified match in another of them."""
     matched: dict[int, set[int]] = {i: set() for i in image_ids}
-    with pycolmap.Database.open(database) as opened:
-        pairs, geometries = opened.read_two_view_geometries()
-    for pair, geometry in zip(pairs, geometries, strict=True):
-        ids = pycolmap.pair_id_to_image_pair(pair)
-        if all(i in matched for i in ids):
-            for side, i in enumerate(ids):
-                matched[i].update(geometry.inlier_matches[:, side].tolist())
+    for *pair, matches in verified_matches(database):
+        if all(i in matched for i in pair):
+            for i, keypoints in zip(pair, matches.T, strict=True):
+                matched[i].update(keypoints.tolist())
     return sum(map(len, matched.values()))

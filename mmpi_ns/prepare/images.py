@@ -45,7 +45,7 @@ class Photo:
 
 
 def find_images(folder: Path) -> list[Path]:
-    """The images in a folder in natural order; those of its subfolders if it has none itself.
+    """The images in a folder in natural order; in its subfolders if it has none itself.
 
     Raises:
         PrepareError: fewer than two images.
@@ -85,17 +85,17 @@ def reads_heif() -> bool:
 
 
 def in_short(names: Sequence[str], most: int = 4) -> str:
-    """The first names, and how many more there are."""
+    """The first names, and the number of the others."""
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 def natural_key(text: str) -> list[tuple[int, int | str]]:
-    """Sorts 9 before 10."""
+    """Sort key by which 9 comes before 10."""
     return [(0, int(part)) if part.isdigit() else (1, part) for part in re.split(r"(\d+)", text) if part]
 
 
 def scene_names(files: Sequence[Path], folder: Path) -> list[str]:
-    """Unique names in the scene: those of the files, prefixed with their subfolders if there are any."""
+    """Unique names in the scene: the file names, prefixed with the names of their subfolders."""
     names, used = [], set()
     for file in files:
         # COLMAP's list of pairs is split at blanks
@@ -150,7 +150,7 @@ def write_photos(photos: Sequence[Photo], target: Path) -> None:
 
 
 def read_photos(target: Path) -> list[Photo]:
-    """The images that ``gather`` or the frame selection left."""
+    """Photos as ``gather`` or the frame selection noted them."""
     return [Photo(**entry) for entry in json.loads((target / "photos.json").read_text(encoding="utf-8"))]
 
 

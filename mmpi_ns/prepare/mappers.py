@@ -13,16 +13,14 @@ from pathlib import Path
 import pycolmap
 
 from mmpi_ns.capture.matching import SEED, quiet
-from mmpi_ns.prepare.adjustment import Free, polish, with_all_points
+from mmpi_ns.prepare.adjustment import polish, with_all_points
 from mmpi_ns.prepare.evidence import Witness, agreement, witness_of
-from mmpi_ns.prepare.mapping import ATTEMPTS, map_globally, reconstruct
+from mmpi_ns.prepare.mapping import ATTEMPTS, Task, map_globally, reconstruct
 from mmpi_ns.prepare.stages import PrepareError, progress, say
 from mmpi_ns.prepare.verdict import NEARLY_ALL, ORDER, Grade, Verdict, agrees, best_first, judge_alone, judge_together
 
 STARTS = (0.7, 1.2)
 """Focal lengths over the longer side that are tried where none is known: telephones and cars, then COLMAP's guess."""
-PLACED = 100
-"""Images of a sequence that the global mapper places at least, if there are so many."""
 NEAR = 0.1
 """Relative difference below which two initial focal lengths count as the same."""
 
@@ -35,36 +33,6 @@ class Solution:
     says: str
     """The mappers in words."""
     verdict: Verdict = field(default_factory=lambda: Verdict("right"))
-
-
-@dataclass(frozen=True)
-class Task:
-    """What is to be mapped, and where."""
-
-    database: Path
-    """Features and verified matches."""
-    images: Path
-    """Folder of the images."""
-    work: Path
-    """Folder for databases, models and snapshots; holds those of an interrupted run."""
-    offered: Sequence[str]
-    """Names of all images, in order."""
-    free: Free
-    """What may be refined of the intrinsics."""
-    threads: int
-    """CPU threads; below 1 for all."""
-    is_sequence: bool
-    """Matched as a sequence: the incremental mapper begins with settings for forward motion."""
-    is_ordered: bool
-    """The images come in the order of the motion, so that breaks between neighbours can be looked for."""
-
-    @property
-    def placed(self) -> Sequence[str]:
-        """Names of the images that the global mapper places first: of a long sequence every second, third and so on.
-
-        That is enough to find the focal length and to confirm the incremental mapper's track, in a part of the time.
-        """
-        return self.offered[:: max(1, len(self.offered) // PLACED)] if self.is_ordered else self.offered
 
 
 @dataclass(frozen=True)
@@ -113,7 +81,7 @@ def _best_first(candidates: Sequence[Candidate], task: Task) -> list[Candidate]:
 def _candidates(task: Task) -> list[Candidate]:
     """The models of both mappers, of the global one from several focal lengths.
 
-    Where the global mapper has placed a part of a long sequence, it places all images if the incremental one fails.
+    A global mapper that placed a part of a long sequence places all images if the incremental one fails.
     """
     starts, candidates, is_settled = _starts(task), [], False
     for some in (starts[:2], starts[2:]):
@@ -130,9 +98,7 @@ def _candidates(task: Task) -> list[Candidate]:
     failed: PrepareError | None = None
     try:
         attempts = 1 if is_settled and not is_part else len(ATTEMPTS)
-        mapping = reconstruct(
-            start, task.images, task.work / "incremental", task.free.lens, task.threads, task.is_sequence, attempts
-        )
+        mapping = reconstruct(task, start, attempts)
         tried = ", ".join(f"{name} {size}" for name, size in mapping.tried)
         says = f"incremental, '{mapping.attempt}' settings ({tried})"
         candidates.append(_judged("incremental", mapping.model, says, task))
@@ -195,25 +161,23 @@ def _globally(starts: Sequence[tuple[str, Path]], names: Sequence[str], task: Ta
     cores = task.threads if task.threads > 0 else os.cpu_count() or 1
     workers = min(cores, len(starts))
 
-    def run(start: tuple[str, Path]) -> tuple[pycolmap.Reconstruction, Path] | None:
+    def run(start: tuple[str, Path]) -> pycolmap.Reconstruction | None:
         name, path = start
-        refine, threads = task.free.lens, max(1, cores // workers)
-        result = map_globally(path, task.images, task.work / name, names, refine, threads)
+        model = map_globally(task, name, path, names, max(1, cores // workers))
         advance()
-        return result
+        return model
 
     with (
         progress("Global mapping", len(starts)) as advance,
         quiet(),  # outermost: each mapper's own would end before the other is done
         ThreadPoolExecutor(workers) as pool,
     ):
-        results = list(pool.map(run, starts))
+        models = list(pool.map(run, starts))
     candidates = []
-    for (name, _), result in zip(starts, results, strict=True):
-        if not result:
+    for (name, _), model in zip(starts, models, strict=True):
+        if model is None:
             say(f"Mapping, {name}: no model.")
             continue
-        model, _ = result
         focal = ", ".join(f"{c.mean_focal_length():.1f}" for _, c in sorted(model.cameras.items())[:3])
         error = model.compute_mean_reprojection_error()
         says = f"{model.num_reg_images()} of {len(names)} images, {error:.2f} px, focal length {focal} px"

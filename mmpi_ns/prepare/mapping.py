@@ -11,7 +11,8 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
@@ -19,7 +20,7 @@ import numpy as np
 import pycolmap
 
 from mmpi_ns.capture.matching import MIN_ANGLE, MIN_INLIERS, SEED, quiet, triangulate_points
-from mmpi_ns.prepare.adjustment import STILL, adjust, with_all_points
+from mmpi_ns.prepare.adjustment import STILL, Free, adjust, with_all_points
 from mmpi_ns.prepare.alignment import camera_poses, degrees_between, similarity_between
 from mmpi_ns.prepare.features import matched_keypoints, matching_pairs
 from mmpi_ns.prepare.stages import PrepareError, progress, say
@@ -34,6 +35,8 @@ SNAPSHOT = 40
 """Images registered between two snapshots, from which an interrupted run resumes."""
 MANY = 100
 """Number of images from which repeated global bundle adjustment would dominate the time."""
+PLACED = 100
+"""Images of a sequence that the global mapper places at least; all of fewer."""
 PLACED_ROUNDS = 2
 """Times that a globally placed model is given all points and adjusted: after one, the focal length may be far off."""
 TRACKS_PER_VIEW = 500
@@ -48,27 +51,56 @@ LEAST_SHARE = 0.2
 
 
 @dataclass(frozen=True)
+class Task:
+    """Input of a mapping: matches, images, and the folder for its models."""
+
+    database: Path
+    """Features and verified matches."""
+    images: Path
+    """Folder of the images."""
+    work: Path
+    """Folder for databases, models and snapshots; holds those of an interrupted run."""
+    offered: Sequence[str]
+    """Names of all images, in order."""
+    free: Free
+    """What may be refined of the intrinsics."""
+    threads: int
+    """CPU threads; below 1 for all."""
+    is_sequence: bool
+    """Matched as a sequence: the incremental mapper begins with the settings for forward motion. They carry any motion
+    of a sequence, while COLMAP's defaults try all pairs before they give up (a minute for 64 images)."""
+    is_ordered: bool
+    """The images come in the order of the motion, so that breaks between neighbours can be looked for."""
+
+    @property
+    def placed(self) -> Sequence[str]:
+        """Names of the images that the global mapper places first: of a long sequence every second, third and so on.
+
+        That is enough to find the focal length and to confirm the incremental mapper's track, in a part of the time.
+        """
+        return self.offered[:: max(1, len(self.offered) // PLACED)] if self.is_ordered else self.offered
+
+
+@dataclass(frozen=True)
 class Attempt:
     """One way to run the incremental mapper."""
 
     name: str
     says: str
     min_matches: int = 15
-    init_min_tri_angle: float = 16.0
-    init_max_forward_motion: float = 0.95
-    init_min_num_inliers: int = 100
-    filter_min_tri_angle: float = 1.5
     min_angle: float = 1.5
-    abs_pose_min_num_inliers: int = 30
-    abs_pose_min_inlier_ratio: float = 0.25
+    """Degrees between the rays of a point."""
+    mapper: dict[str, float] = field(default_factory=dict)
+    """Options of ``pycolmap.IncrementalMapperOptions`` that differ from COLMAP's defaults."""
 
 
+FORWARD = {"init_min_tri_angle": 3.0, "init_max_forward_motion": 1.0, "filter_min_tri_angle": 0.5}
+LOOSE = FORWARD | {"init_min_tri_angle": 1.0, "filter_min_tri_angle": 0.25, "init_min_num_inliers": 40}
+LOOSE |= {"abs_pose_min_num_inliers": 15, "abs_pose_min_inlier_ratio": 0.12}
 ATTEMPTS = (
     Attempt("ordinary", "COLMAP's defaults"),
-    Attempt(
-        "forward", "small angles and forward motion allowed", 15, 3.0, 1.0, filter_min_tri_angle=0.5, min_angle=0.5
-    ),
-    Attempt("loose", "few matches and tiny angles allowed", 10, 1.0, 1.0, 40, 0.25, 0.25, 15, 0.12),
+    Attempt("forward", "small angles and forward motion allowed", 15, 0.5, FORWARD),
+    Attempt("loose", "few matches and tiny angles allowed", 10, 0.25, LOOSE),
 )
 
 
@@ -84,30 +116,21 @@ class Mapping:
     """(attempt, images in its largest model) in order."""
 
 
-def reconstruct(
-    database: Path, images: Path, work: Path, refine: bool, threads: int, is_sequence: bool = False, attempts: int = 3
-) -> Mapping:
+def reconstruct(task: Task, database: Path, attempts: int = len(ATTEMPTS)) -> Mapping:
     """Runs the attempts in order until one registers nearly all images; returns the best.
 
-    An attempt continues the best model so far if that is sound and contains the fraction ``CARRIES`` of the images:
-    often it stopped at one stretch with few matches, and the rest need not be computed again.
+    An attempt continues the best model of the earlier ones if that is sound and contains the fraction ``CARRIES`` of
+    the images: often it stopped at one stretch with few matches, and the rest need not be computed again.
 
     Args:
-        database: features and matches.
-        images: folder of the images, for the points' colours.
-        work: folder for models and snapshots; holds those of an interrupted run.
-        refine: refine intrinsics.
-        threads: CPU threads; below 1 for all.
-        is_sequence: begin with the settings for forward motion. They carry any motion of a sequence, while COLMAP's
-            defaults look through all pairs before they give up (a minute for 64 images).
+        task: what is to be mapped.
+        database: features, verified matches and the cameras to start from.
         attempts: maximum number of attempts.
 
     Raises:
         PrepareError: no attempt found an initial pair.
     """
-    with pycolmap.Database.open(database) as opened:
-        total = opened.num_images()
-    pairs = len(matching_pairs(database))
+    total, pairs = len(task.offered), len(matching_pairs(database))
     if not pairs:
         raise PrepareError(
             "No two images have enough matches in common: they do not overlap, or show too little texture. "
@@ -115,10 +138,10 @@ def reconstruct(
         )
     best: Mapping | None = None
     tried: list[tuple[str, int]] = []
-    for attempt in ATTEMPTS[1 if is_sequence else 0 :][:attempts]:
+    for attempt in ATTEMPTS[1 if task.is_sequence else 0 :][:attempts]:
         carries = best is not None and not is_bent(best.model) and best.model.num_reg_images() >= CARRIES * total
         start = best.folder if best is not None and carries else None
-        result = _run(attempt, database, images, work / attempt.name, total, refine, threads, start)
+        result = _run(task, attempt, database, start)
         size = result[0].num_reg_images() if result else 0
         tried.append((attempt.name, size))
         says = f", {result[0].compute_mean_reprojection_error():.2f} px" if result else ""
@@ -136,7 +159,7 @@ def reconstruct(
 
 
 def _quality(model: pycolmap.Reconstruction) -> tuple[bool, int, float]:
-    """Sorts models: sound ones first, then those with more images, then those that fit better.
+    """Sorts models by soundness, then by number of images, then by fit.
 
     Errors are those at an image width of 1,000 pixels, or in pixels of smaller images.
     """
@@ -151,26 +174,24 @@ def is_bent(model: pycolmap.Reconstruction) -> bool:
 
 
 def _run(
-    attempt: Attempt,
-    database: Path,
-    images: Path,
-    folder: Path,
-    total: int,
-    refine: bool,
-    threads: int,
-    start: Path | None,
+    task: Task, attempt: Attempt, database: Path, start: Path | None
 ) -> tuple[pycolmap.Reconstruction, Path] | None:
     """The largest model of one attempt and its folder; read back where it was finished before.
 
     It begins with the newest snapshot of an interrupted run, or else with the model in ``start``.
     """
+    folder, total = task.work / "incremental" / attempt.name, len(task.offered)
     done = folder / "done"
     if not done.exists():
-        start = _latest_snapshot(folder / "snapshots") or start
+        for snapshot in sorted((folder / "snapshots").glob("*"), reverse=True):
+            with suppress(ValueError, RuntimeError, OSError):  # the last one may be truncated
+                pycolmap.Reconstruction(snapshot)
+                start = snapshot
+                break
         shutil.rmtree(folder / "models", ignore_errors=True)
         (folder / "models").mkdir(parents=True)
         (folder / "snapshots").mkdir(exist_ok=True)
-        options = mapper_options(attempt, refine, threads, total > MANY)
+        options = mapper_options(attempt, task.free.lens, task.threads, total > MANY)
         options.snapshot_path, options.snapshot_frames_freq = folder / "snapshots", SNAPSHOT
         before = pycolmap.Reconstruction(start).num_reg_images() if start is not None else 0
         if before:
@@ -179,7 +200,7 @@ def _run(
             advance(before)
             models = pycolmap.incremental_mapping(
                 database,
-                images,
+                task.images,
                 folder / "models",
                 options,
                 input_path=start or "",
@@ -195,20 +216,9 @@ def _run(
 
 
 def largest_model(folder: Path) -> tuple[pycolmap.Reconstruction, Path] | None:
-    """The model with the most images in the subfolders of a folder, and its subfolder; None if there is none."""
+    """The model with the most images in the subfolders of a folder, and its subfolder; None without a model."""
     models = [(pycolmap.Reconstruction(p), p) for p in sorted(folder.iterdir()) if p.is_dir()]
     return max(models, key=lambda m: m[0].num_reg_images(), default=None)
-
-
-def _latest_snapshot(folder: Path) -> Path | None:
-    """The newest readable snapshot; the last one may be truncated."""
-    for path in sorted(folder.glob("*"), reverse=True) if folder.is_dir() else ():
-        try:
-            pycolmap.Reconstruction(path)
-        except (ValueError, RuntimeError, OSError):
-            continue
-        return path
-    return None
 
 
 def mapper_options(
@@ -225,12 +235,8 @@ def mapper_options(
     options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = SEED
     options.num_threads = options.mapper.num_threads = threads
     mapper = options.mapper
-    mapper.init_min_tri_angle = attempt.init_min_tri_angle
-    mapper.init_max_forward_motion = attempt.init_max_forward_motion
-    mapper.init_min_num_inliers = attempt.init_min_num_inliers
-    mapper.filter_min_tri_angle = attempt.filter_min_tri_angle
-    mapper.abs_pose_min_num_inliers = attempt.abs_pose_min_num_inliers
-    mapper.abs_pose_min_inlier_ratio = attempt.abs_pose_min_inlier_ratio
+    for name, value in attempt.mapper.items():
+        setattr(mapper, name, value)
     options.triangulation.min_angle = attempt.min_angle
     options.ba_refine_focal_length = options.ba_refine_extra_params = refine
     options.ba_global_function_tolerance = options.ba_local_function_tolerance = STILL
@@ -243,25 +249,21 @@ def mapper_options(
 
 
 def map_globally(
-    database: Path, images: Path, folder: Path, names: Sequence[str], refine: bool, threads: int
-) -> tuple[pycolmap.Reconstruction, Path] | None:
-    """The largest model of the global mapper and its folder; read back where it was made before.
+    task: Task, name: str, database: Path, names: Sequence[str], threads: int
+) -> pycolmap.Reconstruction | None:
+    """The largest model of the global mapper, None if there is none; read back where it was made before.
 
     Every random draw is seeded, small angles are kept, and given intrinsics left alone.
 
     Args:
+        task: what is to be mapped.
+        name: of the folder for the models.
         database: features, verified matches and the cameras to start from.
-        images: folder of the images, for the points' colours.
-        folder: for the models.
         names: the images to place.
-        refine: refine intrinsics.
-        threads: CPU threads; below 1 for all.
-
-    Returns:
-        None if there is no model.
+        threads: CPU threads.
     """
-    done, folders = folder / "done", folder / "models"
-    if not done.exists():
+    folder, folders, refine = task.work / name, task.work / name / "models", task.free.lens
+    if not (folder / "done").exists():
         shutil.rmtree(folder, ignore_errors=True)
         folders.mkdir(parents=True)
         options = pycolmap.GlobalPipelineOptions()
@@ -275,13 +277,14 @@ def map_globally(
         mapper.min_tri_angle_deg, mapper.skip_retriangulation = MIN_ANGLE, True
         mapper.bundle_adjustment.refine_focal_length = mapper.bundle_adjustment.refine_extra_params = refine
         with quiet():
-            models = pycolmap.global_mapping(database, images, folders, options)
+            models = pycolmap.global_mapping(database, task.images, folders, options)
             for number, model in models.items():
                 (folders / str(number)).mkdir(exist_ok=True)
-                full = with_all_points(model, database, images, refine, threads, PLACED_ROUNDS)
+                full = with_all_points(model, database, task.images, refine, threads, PLACED_ROUNDS)
                 full.write(folders / str(number))
-        done.touch()
-    return largest_model(folders)
+        (folder / "done").touch()
+    largest = largest_model(folders)
+    return largest and largest[0]
 
 
 def map_known_poses(

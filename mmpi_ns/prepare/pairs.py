@@ -77,7 +77,7 @@ def are_numbered(names: Sequence[str]) -> bool:
 
 
 def choose(matching: Matching, names: Sequence[str], alike: NDArray[np.float32], from_video: bool) -> tuple[str, str]:
-    """(matching, why in words)."""
+    """Way of matching, and the reason in words."""
     count = len(names)
     if matching != "auto":
         return matching, "as asked"
@@ -114,7 +114,7 @@ def revisits(alike: NDArray[np.float32], overlap: int) -> Pairs:
 
 
 def _look_alikes(alike: NDArray[np.float32], number: int) -> Pairs:
-    """Each image with the most similar other images, of those with a finite similarity."""
+    """Pairs of each image and the images most similar to it; infinite similarities do not count."""
     alike = np.where(np.eye(len(alike), dtype=bool), -np.inf, alike)
     order = np.argsort(-alike, axis=-1, kind="stable")[:, :number]
     return sorted({(min(i, int(j)), max(i, int(j))) for i, row in enumerate(order) for j in row if alike[i, j] > -1e9})

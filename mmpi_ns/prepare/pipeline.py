@@ -18,12 +18,11 @@ from mmpi_ns.capture.sfm import load_pycolmap
 from mmpi_ns.capture.tracks import near_pairs
 from mmpi_ns.prepare import checks, export, features, images, pairs, report
 from mmpi_ns.prepare.adjustment import Free, focal_in_words, focal_interval
-from mmpi_ns.prepare.alignment import camera_poses
+from mmpi_ns.prepare.alignment import SceneFrame, camera_poses, choose_frame
 from mmpi_ns.prepare.cameras import Intrinsics, make_cameras, parse_camera, share
-from mmpi_ns.prepare.frame import SceneFrame, choose_frame
 from mmpi_ns.prepare.images import Photo, in_short
-from mmpi_ns.prepare.mappers import Solution, Task, map_and_judge
-from mmpi_ns.prepare.mapping import map_known_poses
+from mmpi_ns.prepare.mappers import Solution, map_and_judge
+from mmpi_ns.prepare.mapping import Task, map_known_poses
 from mmpi_ns.prepare.poses import read_poses
 from mmpi_ns.prepare.settings import Settings, check_options, read_lists
 from mmpi_ns.prepare.stages import PrepareError, Stages, only_one, progress, say, whole
@@ -39,7 +38,7 @@ LEAST_SHARE = 0.5
 
 
 class Preparation:
-    """One run of mmpi-prepare; the work folder holds what an interrupted one left."""
+    """A run of mmpi-prepare; the work folder holds what an interrupted run left."""
 
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
@@ -52,8 +51,7 @@ class Preparation:
         """Input to scene; how far it can be believed."""
         s = self.settings
         with self._timed("reading"):
-            self.photos, self.is_ordered = self._read_input()
-            self.masks = self._read_masks()
+            self._read_input()
             self.known_poses = read_poses(s.poses, s.poses_format, s.poses_axes, self.photos) if s.poses else None
             if self.known_poses is None and len(self.photos) < LEAST_IMAGES:
                 raise PrepareError(
@@ -63,7 +61,12 @@ class Preparation:
             self._split([p.name for p in self.photos])  # refuse a split that is impossible before the work
         self.is_fixed = self._set_cameras()
         with self._timed("features"):
-            database = self._features()
+            source = [[c.summary() for c in self.cameras], self.numbers, s.max_features, bool(self.masks)]
+            with self.stages.stage("features", source) as (folder, is_done):
+                database = folder / "database.db"
+                if not is_done:
+                    features.create_database(database, self.photos, self.numbers, self.cameras)
+                    features.extract(database, self.image_folder, self.photos, self.masks, s.max_features, s.threads)
         with self._timed("matching"):
             database, self.matching = self._matches(database)
         with self._timed("mapping"):
@@ -78,35 +81,28 @@ class Preparation:
         yield
         self.times[name] = self.times.get(name, 0.0) + time.monotonic() - start
 
-    def _read_input(self) -> tuple[list[Photo], bool]:
-        """The images, and whether they come in the order of the motion."""
+    def _read_input(self) -> None:
+        """The images, whether they come in the order of the motion, and the folder of their masks."""
         s = self.settings
         self.is_video = s.input.is_file()
-        if self.is_video:
-            if s.input.suffix.lower() not in images.VIDEOS:
-                raise PrepareError(f"{s.input} is neither a folder nor a video ({', '.join(images.VIDEOS)}).")
-            source = [str(s.input), s.input.stat().st_size, s.input.stat().st_mtime, s.max_frames, s.frame_motion]
-            photos = self.stages.run(
-                "input",
-                source,
-                lambda folder: select_frames(s.input, folder, s.max_frames, s.frame_motion),
-                images.read_photos,
-            )
-        else:
-            files = images.find_images(s.input)
-            source = [(str(p), p.stat().st_size, p.stat().st_mtime) for p in files]
-            photos = self.stages.run(
-                "input", source, lambda folder: images.gather(s.input, files, folder), images.read_photos
-            )
-        return photos, self.is_video or pairs.are_numbered([p.name for p in photos])
-
-    def _read_masks(self) -> Path | None:
-        folder = self.settings.masks
-        if folder is None:
-            return None
-        source = [(str(p), p.stat().st_mtime) for p in sorted(folder.rglob("*"))] if folder.is_dir() else str(folder)
-        self.stages.run("masks", source, lambda to: images.gather_masks(folder, self.photos, to), lambda _: 0)
-        return self.work / "masks"
+        if self.is_video and s.input.suffix.lower() not in images.VIDEOS:
+            raise PrepareError(f"{s.input} is neither a folder nor a video ({', '.join(images.VIDEOS)}).")
+        files = [s.input] if self.is_video else images.find_images(s.input)
+        source = [(str(p), p.stat().st_size, p.stat().st_mtime) for p in files]
+        source = [*source[0], s.max_frames, s.frame_motion] if self.is_video else source
+        with self.stages.stage("input", source) as (folder, is_done):
+            if self.is_video and not is_done:
+                select_frames(s.input, folder, s.max_frames, s.frame_motion)
+            elif not is_done:
+                images.gather(s.input, files, folder)
+        self.photos = images.read_photos(folder)
+        self.is_ordered = self.is_video or pairs.are_numbered([p.name for p in self.photos])
+        self.masks = None
+        if s.masks is not None:
+            stamps = [(str(p), p.stat().st_mtime) for p in sorted(s.masks.rglob("*"))]
+            with self.stages.stage("masks", stamps) as (self.masks, is_done):
+                if not is_done:
+                    images.gather_masks(s.masks, self.photos, self.masks)
 
     def _set_cameras(self) -> bool:
         """Numbers and cameras of the images; returns whether their intrinsics are to be kept."""
@@ -124,39 +120,25 @@ class Preparation:
             raise PrepareError("Known poses need the intrinsics they were made with: give --focal or --camera.")
         return (is_given or self.known_poses is not None) and not s.refine_intrinsics
 
-    def _features(self) -> Path:
-        s = self.settings
-
-        def stage(folder: Path) -> Path:
-            path = folder / "database.db"
-            features.create_database(path, self.photos, self.numbers, self.cameras)
-            features.extract(path, self.image_folder, self.photos, self.masks, s.max_features, s.threads)
-            return path
-
-        source = [[c.summary() for c in self.cameras], self.numbers, s.max_features, bool(self.masks)]
-        return self.stages.run("features", source, stage, lambda folder: folder / "database.db")
-
     def _matches(self, database: Path) -> tuple[Path, str]:
         """The database with verified matches, and what was matched in words."""
         s = self.settings
-
-        def stage(folder: Path) -> Path:
-            path = folder / "database.db"
-            if not path.exists():
-                with whole(path) as partial:
-                    shutil.copyfile(database, partial)
-            listed, says = self._pairs(path)
-            verified = features.match(path, self.photos, listed, s.threads)
-            (folder / "says.txt").write_text(f"{says}; {verified} of {len(listed)} pairs match", encoding="utf-8")
-            return path
-
         poses = {n: p.tolist() for n, p in self.known_poses.poses.items()} if self.known_poses else None
-        path = self.stages.run("matches", [s.matching, s.overlap, poses], stage, lambda folder: folder / "database.db")
-        says = (path.parent / "says.txt").read_text(encoding="utf-8")
+        with self.stages.stage("matches", [s.matching, s.overlap, poses]) as (folder, is_done):
+            path = folder / "database.db"
+            if not is_done:
+                if not path.exists():
+                    with whole(path) as partial:
+                        shutil.copyfile(database, partial)
+                listed, says = self._pairs(path)
+                verified = features.match(path, self.photos, listed, s.threads)
+                (folder / "says.txt").write_text(f"{says}; {verified} of {len(listed)} pairs match", encoding="utf-8")
+        says = (folder / "says.txt").read_text(encoding="utf-8")
         say(f"Matching: {says}.")
         return path, says
 
     def _pairs(self, database: Path) -> tuple[pairs.Pairs, str]:
+        """The pairs to match, as indices of photos, and how they were chosen in words."""
         s, names = self.settings, [p.name for p in self.photos]
         if self.known_poses is not None and s.matching == "auto":
             places = [i for i, n in enumerate(names) if n in self.known_poses.poses]
@@ -171,47 +153,42 @@ class Preparation:
     def _solve(self, database: Path) -> tuple[Solution, tuple[float, float] | None, list[list[str]]]:
         """Poses and points; the interval of a refined focal length; connected groups of images without a pose."""
         s, names = self.settings, [p.name for p in self.photos]
-
-        def stage(folder: Path) -> None:
-            groups: list[list[str]] = []
-            if self.known_poses is not None:
-                poses = {n: rigid3d(p) for n, p in self.known_poses.poses.items()}
-                model = new_model(self.cameras, names, self.numbers, poses)
-                refine = not self.is_fixed and s.refine_intrinsics
-                model, says = map_known_poses(model, database, self.image_folder, s.refine_poses, refine, s.threads)
-                solution = Solution(model, f"{self.known_poses.says}; {says}")
-            else:
-                lens, place = not self.is_fixed, s.camera is None or s.refine_intrinsics
-                free = Free(lens, lens and s.lens == "auto", principal_point=place, always=s.refine_principal_point)
-                is_sequence = self.matching.startswith("sequential")
-                solution = map_and_judge(
-                    Task(database, self.image_folder, folder, names, free, s.threads, is_sequence, self.is_ordered)
-                )
-                lost = sorted(set(range(len(names))) - {i - 1 for i in solution.model.reg_image_ids()})
-                groups = [[names[i] for i in group] for group in features.connected(database, lost)]
-            (folder / "model").mkdir(exist_ok=True)
-            solution.model.write(folder / "model")
-            focal = None
-            if not self.is_fixed:
-                with progress("Checking the focal length", 1) as advance:
-                    focal = focal_interval(solution.model, s.threads)
-                    advance()
-            says = {"mapping": solution.says, "groups": groups, "focal": focal}
-            says |= {"grade": solution.verdict.grade, "reasons": solution.verdict.reasons}
-            (folder / "says.json").write_text(json.dumps(says), encoding="utf-8")
-
         source = [s.refine_poses, s.refine_intrinsics, s.refine_principal_point, s.lens, self.is_fixed]
-        self.stages.run("model", source, stage, lambda _: None)
-        says = json.loads((self.work / "model" / "says.json").read_text(encoding="utf-8"))
-        model = pycolmap.Reconstruction(self.work / "model" / "model")
-        return (
-            Solution(model, says["mapping"], Verdict(says["grade"], tuple(says["reasons"]))),
-            says["focal"],
-            says["groups"],
-        )
+        with self.stages.stage("model", source) as (folder, is_done):
+            if not is_done:
+                groups: list[list[str]] = []
+                if self.known_poses is not None:
+                    poses = {n: rigid3d(p) for n, p in self.known_poses.poses.items()}
+                    model = new_model(self.cameras, names, self.numbers, poses)
+                    refine = not self.is_fixed and s.refine_intrinsics
+                    model, says = map_known_poses(model, database, self.image_folder, s.refine_poses, refine, s.threads)
+                    solution = Solution(model, f"{self.known_poses.says}; {says}")
+                else:
+                    lens, place = not self.is_fixed, s.camera is None or s.refine_intrinsics
+                    free = Free(lens, lens and s.lens == "auto", principal_point=place, always=s.refine_principal_point)
+                    is_sequence = self.matching.startswith("sequential")
+                    solution = map_and_judge(
+                        Task(database, self.image_folder, folder, names, free, s.threads, is_sequence, self.is_ordered)
+                    )
+                    lost = sorted(set(range(len(names))) - {i - 1 for i in solution.model.reg_image_ids()})
+                    groups = [[names[i] for i in group] for group in features.connected(database, lost)]
+                (folder / "model").mkdir(exist_ok=True)
+                solution.model.write(folder / "model")
+                focal = None
+                if not self.is_fixed:
+                    with progress("Checking the focal length", 1) as advance:
+                        focal = focal_interval(solution.model, s.threads)
+                        advance()
+                says = {"mapping": solution.says, "groups": groups, "focal": focal}
+                says |= {"grade": solution.verdict.grade, "reasons": solution.verdict.reasons}
+                (folder / "says.json").write_text(json.dumps(says), encoding="utf-8")
+        says = json.loads((folder / "says.json").read_text(encoding="utf-8"))
+        verdict = Verdict(says["grade"], tuple(says["reasons"]))
+        solution = Solution(pycolmap.Reconstruction(folder / "model"), says["mapping"], verdict)
+        return solution, says["focal"], says["groups"]
 
     def _check(self, solution: Solution) -> None:
-        """Refuses a scene of few of the images, and one whose track is wrong."""
+        """Refuses a scene of few of the images, and a scene whose track is wrong."""
         s, count, total = self.settings, solution.model.num_reg_images(), len(self.photos)
         if count < LEAST_SHARE * total and not s.allow_partial:
             groups = "".join(f" Another group of {len(g)}: {in_short(g, 4)}." for g in self.groups)
@@ -229,9 +206,8 @@ class Preparation:
     def _write(self, solution: Solution, database: Path) -> Verdict:
         """Moves the model into the scene's frame and writes the scene; the verdict, with the findings of the checks."""
         s, model, verdict = self.settings, solution.model, solution.verdict
-        if self.known_poses is not None and s.camera_height is None:
-            frame = SceneFrame(pycolmap.Sim3d(), "that of the given poses", "that of the given poses")
-        else:
+        frame = SceneFrame(pycolmap.Sim3d(), "that of the given poses", "that of the given poses")
+        if self.known_poses is None or s.camera_height is not None:
             frame = choose_frame(model, s.camera_height)
             model.transform(frame.similarity)
         names = set(camera_poses(model)[0])
@@ -269,19 +245,20 @@ class Preparation:
             "split": f"{len(split.train)} train, {len(split.test)} test: {split.says}",
             "times": ", ".join(f"{name} {seconds:.0f} s" for name, seconds in self.times.items()),
         }
-        grouped = {name for group in self.groups for name in group}
-        lost = [p.name for p in self.photos if p.name not in names | grouped]
-        warnings = [f"{len(lost)} images have no pose and are left out: {in_short(lost, 8)}"] if lost else []
-        apart = "images form a group of their own, not connected to the scene"
-        warnings += [f"{len(group)} {apart}: {in_short(group, 8)}" for group in self.groups]
-        kept, lens = (
-            "given and kept" if self.is_fixed else "refined",
-            "undone" if s.undistort else "kept in transforms.json",
-        )
-        notes = [f"Intrinsics {kept}; {len(self.cameras)} camera(s); lens distortion {lens}."]
-        report.write_report(model, s.input.name, rows, findings, warnings, notes, built)
-        publish(built, s, findings, model, verdict, split)
+        intrinsics = "given and kept" if self.is_fixed else "refined"
+        lens = "undone" if s.undistort else "kept in transforms.json"
+        note = f"Intrinsics {intrinsics}; {len(self.cameras)} camera(s); lens distortion {lens}."
+        report.write_report(model, s.input.name, rows, findings, self._left_out(names), note, built)
+        self._publish(findings, model, verdict, split)
         return verdict
+
+    def _left_out(self, registered: set[str]) -> list[str]:
+        """Sentences on the images without a pose."""
+        grouped = {name for group in self.groups for name in group}
+        lost = [p.name for p in self.photos if p.name not in registered | grouped]
+        apart = "images form a group of their own, not connected to the scene"
+        sentences = [f"{len(lost)} images have no pose and are left out: {in_short(lost, 8)}"] if lost else []
+        return sentences + [f"{len(group)} {apart}: {in_short(group, 8)}" for group in self.groups]
 
     def _mask_moving(
         self, model: pycolmap.Reconstruction, photos: Sequence[Photo], split: export.Split
@@ -327,6 +304,33 @@ class Preparation:
             findings += checks.misplaced(order, [offered.index(n) for n in order], poses)
         return findings + checks.moving(model, database, names)
 
+    def _publish(
+        self,
+        findings: Sequence[checks.Finding],
+        model: pycolmap.Reconstruction,
+        verdict: Verdict,
+        split: export.Split,
+    ) -> None:
+        """Moves the scene into place and reports the result; doubtful ones in red."""
+        scene = self.settings.scene
+        aside = scene / next(f"previous-{i}" for i in range(1, 10_000) if not (scene / f"previous-{i}").exists())
+        export.publish(self.work / "scene", scene, aside)
+        if aside.exists():
+            say(f"What {scene} held is in {aside}.")
+        if not self.settings.keep_work:
+            shutil.rmtree(self.work)
+        for line in checks.by_kind(findings):
+            say(line, "yellow")
+        is_right = verdict.grade == "right"
+        if not is_right:
+            say(f"This scene is {verdict.grade}: {verdict.words()} {REMEDY}", "bold red")
+        say(
+            f"{scene}: {model.num_reg_images()} images, {model.compute_mean_reprojection_error():.2f} px, "
+            f"{len(split.train)} train, {len(split.test)} test; report.md says more. Train with:",
+            "bold red" if not is_right else "" if findings else "green",
+        )
+        say(f"ns-train mmpi-small --data {quoted(scene)}")
+
 
 def check_folders(settings: Settings) -> None:
     """Refuses output folders whose use would lose something.
@@ -347,35 +351,6 @@ def check_folders(settings: Settings) -> None:
             f"{settings.scene} already holds {', '.join(taken)}: name another folder, or give --overwrite "
             "(the old files are then moved aside)."
         )
-
-
-def publish(
-    built: Path,
-    settings: Settings,
-    findings: Sequence[checks.Finding],
-    model: pycolmap.Reconstruction,
-    verdict: Verdict,
-    split: export.Split,
-) -> None:
-    """Moves the scene into place and reports the result; doubtful ones in red."""
-    scene = settings.scene
-    aside = scene / next(f"previous-{i}" for i in range(1, 10_000) if not (scene / f"previous-{i}").exists())
-    export.publish(built, scene, aside)
-    if aside.exists():
-        say(f"What {scene} held is in {aside}.")
-    if not settings.keep_work:
-        shutil.rmtree(scene / WORK)
-    for line in checks.by_kind(findings):
-        say(line, "yellow")
-    is_right = verdict.grade == "right"
-    if not is_right:
-        say(f"This scene is {verdict.grade}: {verdict.words()} {REMEDY}", "bold red")
-    say(
-        f"{scene}: {model.num_reg_images()} images, {model.compute_mean_reprojection_error():.2f} px, "
-        f"{len(split.train)} train, {len(split.test)} test; report.md says more. Train with:",
-        "bold red" if not is_right else "" if findings else "green",
-    )
-    say(f"ns-train mmpi-small --data {quoted(scene)}")
 
 
 def prepare(settings: Settings) -> Verdict:

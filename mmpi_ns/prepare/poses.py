@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -48,8 +48,15 @@ def read_poses(path: Path, form: str, axes: str, photos: Sequence[Photo]) -> Kno
     Raises:
         PrepareError: the file is not understood, or fits fewer than two images.
     """
-    form = _guess_format(path) if form == "auto" else form
+    if form == "auto" and (path.is_dir() or path.suffix.lower() == ".json"):
+        form = "matrices" if path.is_dir() else "transforms"
+    elif form == "auto":
+        _, fields = next(_lines(path), (0, []))
+        form = {8: "tum", 12: "kitti"}.get(len(fields), form)
     readers = {"kitti": _read_kitti, "tum": _read_tum, "transforms": _read_transforms, "matrices": _read_matrices}
+    if form not in readers:
+        formats = "KITTI has 12 numbers a line, TUM 8 (time, position, quaternion x y z w)"
+        raise PrepareError(f"--poses {path} is not understood: {formats}.")
     read = readers[form](path, photos)
     opengl = axes == "opengl" or (axes == "auto" and form == "transforms")
     flip = np.diag([1.0, -1.0, -1.0, 1.0]) if opengl else np.eye(4)
@@ -68,39 +75,27 @@ def read_poses(path: Path, form: str, axes: str, photos: Sequence[Photo]) -> Kno
     return replace(read, poses=poses)
 
 
-def _guess_format(path: Path) -> str:
-    if path.is_dir():
-        return "matrices"
-    if path.suffix.lower() == ".json":
-        return "transforms"
-    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
-        fields = line.split("#")[0].replace(",", " ").split()
-        if fields:
-            if len(fields) in (8, 12):
-                return "tum" if len(fields) == 8 else "kitti"
-            break
-    raise PrepareError(
-        f"--poses {path} is not understood: KITTI has 12 numbers a line, TUM 8 (time, position, quaternion x y z w)."
-    )
+def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
+    """Number and fields of each line of a text file that has any; # begins a comment."""
+    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
+        if fields := line.split("#")[0].replace(",", " ").split():
+            yield number, fields
 
 
 def _read_rows(path: Path, width: int) -> Array:
     rows = []
-    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
-        fields = line.split("#")[0].replace(",", " ").split()
-        if not fields:
-            continue
+    for number, fields in _lines(path):
         try:
             rows.append([float(f) for f in fields])
         except ValueError as error:
             raise PrepareError(f"{path}, line {number}: {error}.") from error
-        if len(rows[-1]) != width:
+        if len(fields) != width:
             raise PrepareError(f"{path}, line {number}: {len(fields)} numbers, not {width}.")
     return np.array(rows, dtype=np.float64).reshape(-1, width)
 
 
 def _read_kitti(path: Path, photos: Sequence[Photo]) -> KnownPoses:
-    """One line for each image; if there are more lines, the numbers in the file names choose them (counted from 0)."""
+    """KITTI poses: one line for each image; of more lines, the numbers in the file names choose (counted from 0)."""
     rows = _read_rows(path, 12)
     matrices = np.concatenate([rows.reshape(-1, 3, 4), np.tile([[[0.0, 0.0, 0.0, 1.0]]], (len(rows), 1, 1))], 1)
     places: Sequence[int] = range(len(photos))
@@ -115,7 +110,7 @@ def _read_kitti(path: Path, photos: Sequence[Photo]) -> KnownPoses:
 
 
 def _read_tum(path: Path, photos: Sequence[Photo]) -> KnownPoses:
-    """By time stamp if the file names are time stamps, else one line for each image."""
+    """TUM poses: by time stamp if the file names are time stamps, else one line for each image."""
     rows = _read_rows(path, 8)
     if not len(rows):
         raise PrepareError(f"{path} holds no pose.")
@@ -142,7 +137,7 @@ def _read_tum(path: Path, photos: Sequence[Photo]) -> KnownPoses:
 
 
 def _read_matrices(path: Path, photos: Sequence[Photo]) -> KnownPoses:
-    """One text file for each image, by name, else in order."""
+    """4x4 matrices: one text file for each image, by name, else in order."""
     if not path.is_dir():
         raise PrepareError(f"--poses {path}: 4x4 matrices are read from a folder with one text file for each image.")
     files = sorted(
@@ -174,7 +169,7 @@ def _pose_stem(path: Path) -> str:
 
 
 def _read_transforms(path: Path, photos: Sequence[Photo]) -> KnownPoses:
-    """By file name, with intrinsics and lists of train and test files if the file has them."""
+    """Poses of a transforms.json by file name, with its intrinsics and its lists of train and test files, if any."""
     path = path / "transforms.json" if path.is_dir() else path
     try:
         meta = json.loads(path.read_text(encoding="utf-8"))
@@ -195,7 +190,7 @@ def _read_transforms(path: Path, photos: Sequence[Photo]) -> KnownPoses:
 
 
 def _frame_of(photo: Photo, files: Sequence[Path]) -> int | None:
-    """The frame with an image's name, and its folder if several have that name; None if there is none."""
+    """Number of the frame with an image's name, and its folder if several have that name; None without one."""
     for path in (Path(photo.name), Path(photo.source)):
         named = [n for n, f in enumerate(files) if f.stem == path.stem]
         folders = path.parent.parts

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +20,7 @@ WORST = 5
 
 
 def exposure_in_words(images: Sequence[Path]) -> str:
-    """How much the exposure of some images varies by their EXIF, for the report."""
+    """Range of the exposures of images by their EXIF, in words."""
     exposures = [e for e in map(exposure_of, images) if e is not None]
     light = [e.time * (e.sensitivity or 1.0) / (e.aperture or 1.0) ** 2 for e in exposures]
     if not light:
@@ -31,10 +31,10 @@ def exposure_in_words(images: Sequence[Path]) -> str:
 def write_report(
     model: pycolmap.Reconstruction,
     title: str,
-    rows: Mapping[str, str],
+    rows: dict[str, str],
     findings: Sequence[Finding],
     warnings: Sequence[str],
-    notes: Sequence[str],
+    note: str,
     scene: Path,
 ) -> None:
     """Writes report.md and report/track.png.
@@ -45,20 +45,19 @@ def write_report(
         rows: what the table says beyond the model's figures, by their names.
         findings: of the checks; listed as warnings and marked in the drawing.
         warnings: further ones, listed first.
-        notes: listed last.
+        note: the last line.
         scene: folder to write to.
     """
     covered = coverage(model)
-    rows = {
-        **rows,
+    rows = rows | {
         "reprojection error": f"{model.compute_mean_reprojection_error():.3f} px",
         "points": f"{model.num_points3D()}",
         "track length": f"{model.compute_mean_track_length():.1f} images",
         "points seen by an image": f"{model.compute_mean_observations_per_reg_image():.0f}",
         "coverage": f"{np.mean(list(covered.values())):.0%} on average, {min(covered.values()):.0%} at least",
     }
-    for f in sorted(findings, key=lambda f: (f.kind, -f.badness)):
-        warnings = [*warnings, f"{f.kind} {f.image + ': ' if f.image else ''}{f.says}"]
+    by_badness = sorted(findings, key=lambda f: (f.kind, -f.badness))
+    warnings = [*warnings, *(f"{f.kind} {f.image + ': ' if f.image else ''}{f.says}" for f in by_badness)]
     parts = [
         f"# {title}\n",
         "\n".join(["| | |", "|---|---|", *(f"| {k} | {v} |" for k, v in rows.items())]),
@@ -75,7 +74,7 @@ def write_report(
         "Share of an image's cells (8 x 6) that hold a keypoint with a point; the least:\n",
         *(f"- {n}: {v:.0%}" for n, v in sorted(covered.items(), key=lambda x: x[1])[:WORST]),
         "\n## Notes\n",
-        "\n".join(f"- {n}" for n in notes) or "None.",
+        f"- {note}",
     ]
     write_text(scene / "report.md", "\n".join(parts) + "\n")
     _draw_track(model, findings, scene / "report" / "track.png")

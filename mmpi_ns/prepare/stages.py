@@ -10,15 +10,13 @@ import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from filelock import FileLock, Timeout
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from mmpi_ns.utils.errors import InputError
-
-T = TypeVar("T")
 
 CONSOLE = Console(width=120)
 FULL = (errno.ENOSPC, errno.EDQUOT)
@@ -43,14 +41,13 @@ class Stages:
         self._key = ""
         work.mkdir(parents=True, exist_ok=True)
 
-    def run(self, name: str, settings: Any, stage: Callable[[Path], T], load: Callable[[Path], T]) -> T:
-        """Runs a stage in its own folder, or loads its result from there.
+    @contextmanager
+    def stage(self, name: str, settings: Any) -> Iterator[tuple[Path, bool]]:
+        """A stage's own folder, and whether it was finished before; it counts as finished when the block ends.
 
         Args:
             name: the folder's name.
             settings: everything the result depends on besides the earlier stages; JSON or text.
-            stage: makes the result; may find its own partial output in the folder.
-            load: reads the result of a finished stage.
         """
         text = self._key + name + json.dumps(settings, sort_keys=True, default=str)
         self._key = hashlib.sha256(text.encode()).hexdigest()
@@ -64,11 +61,11 @@ class Stages:
             write_text(stamp, json.dumps({"key": self._key, "finished": False}))
         elif state.get("finished"):
             CONSOLE.print(f"[dim]{name}: done before[/dim]")
-            return load(folder)
+            yield folder, True
+            return
         folder.mkdir(exist_ok=True)
-        result = stage(folder)
+        yield folder, False
         write_text(stamp, json.dumps({"key": self._key, "finished": True}))
-        return result
 
 
 def say(text: str, style: str = "") -> None:

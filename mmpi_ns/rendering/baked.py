@@ -60,10 +60,10 @@ def exact_images() -> Iterator[None]:
 
 
 def suits_bricks(model_field: MMPIField) -> bool:
-    """Whether ``render auto`` uses bricks for a field that is not training: compiled, on a CPU, not for metrics."""
-    wanted = not _measuring.get() and not torch.is_grad_enabled()
-    compiled = dispatch.form_of("show_baked", model_field.features.data) == "cpu"
-    return wanted and compiled and not why_not_baked(model_field)
+    """Decision of ``render auto`` for a field that is not training: bricks if compiled, on a CPU, not for metrics."""
+    if _measuring.get() or torch.is_grad_enabled() or why_not_baked(model_field):
+        return False
+    return dispatch.form_of("show_baked", model_field.features.data) == "cpu"
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,15 +142,15 @@ class BakedWindow:
         for k, mpi in enumerate(mpis.mpis):
             start = mpis.first_column(k)
             numbers = brick_numbers(mpis.columns[start : start + columns_of(mpi)], mpi)
-            found, bricks = columns_from((numbers >= 0) & kept[numbers.clamp(min=0)], first)
-            columns.append(found)
-            first += len(bricks)
+            columns_here, places = columns_from((numbers >= 0) & kept[numbers.clamp(min=0)], first)
+            columns.append(columns_here)
+            first += len(places)
         tables = {"columns": torch.cat(columns), "density": mpis.density[kept], "texels": mpis.texels[kept]}
         return replace(self, mpis=replace(mpis, **tables, packed={}))
 
 
 def why_not_baked(model_field: MMPIField) -> str:
-    """Why a field cannot be baked, and how to train one that can; empty if it can."""
+    """Reason why a field cannot be baked, with the remedy; empty if it can."""
     if not isinstance(model_field.networks, RayShader):
         return (
             "A model whose samples are coloured one by one cannot be baked: train with "
@@ -164,8 +164,7 @@ def why_not_baked(model_field: MMPIField) -> str:
     return ""
 
 
-def shader_of(network: RayShader) -> Shader:
-    """The network that shades a field's rays."""
+def _shader_of(network: RayShader) -> Shader:
     numbers = [x.detach().cpu() for x in network.layers(0)]
     numbers[-2:] = [CHANGE * x for x in numbers[-2:]]
     return Shader(tuple(zip(numbers[::2], numbers[1::2], strict=True)), network.direction_frequencies, MOST_CHANGE)
@@ -193,26 +192,25 @@ def bake(
     """
     if refusal := why_not_baked(model_field):
         raise ValueError(refusal)
-    assert isinstance(model_field.networks, RayShader)
-    shader = shader_of(model_field.networks)
-    plan = model_field.plan
-    shares = bake_shares(model_field) if blends else None
-    highest = max(float((_raw(model_field, k, p, shares)).max()) for k, p in _all_planes(model_field))
+    plan, network = model_field.plan, model_field.networks
+    assert isinstance(network, RayShader)
+    shares, heads = bake_shares(model_field) if blends else None, range(len(plan.mpis))
+    highest = max(float(_raw(model_field, k, p, shares).max()) for k in heads for p in _planes(model_field, k))
     density_codes = Codes.spanning(THINNEST, max(highest, THINNEST + 1))
     channels = _channel_codes(model_field)
     columns, density, texels, count = [], [], [], 0
-    for k, _ in enumerate(plan.mpis):
+    for k in heads:
         raw = torch.cat([_raw(model_field, k, p, shares) for p in _planes(model_field, k)])
         codes = density_codes.encode(raw)
         blocks = _tiled(codes[..., None])[..., 0]
-        found, places = columns_from(_stored(model_field.grids[k]).cpu() & (blocks.amax((-1, -2)) > 0), count)
-        columns.append(found)
+        columns_here, places = columns_from(_stored(model_field.grids[k]).cpu() & (blocks.amax((-1, -2)) > 0), count)
+        columns.append(columns_here)
         density.append(blocks[tuple(places.T)])
         texels.append(_texel_codes(model_field, k, channels, places))
         count += len(places)
     mpis = BakedMpis(
         plan.mpis,
-        tuple(model_field.layout.interval(k) for k in range(len(plan.mpis))),
+        tuple(model_field.layout.interval(k) for k in heads),
         torch.cat(columns),
         torch.cat(density).contiguous(),
         torch.cat(texels).contiguous(),
@@ -220,19 +218,13 @@ def bake(
         channels,
     )
     farthest = 10 * max(m.farthest for m in plan.mpis)
-    return BakedWindow(mpis, shader, plan.ray_near, threshold, background, farthest, exposure)
+    return BakedWindow(mpis, _shader_of(network), plan.ray_near, threshold, background, farthest, exposure)
 
 
 def _planes(model_field: MMPIField, k: int) -> Iterator[slice]:
     """A few planes at a time."""
     for start in range(0, model_field.plan.mpis[k].planes, 16):
         yield slice(start, min(start + 16, model_field.plan.mpis[k].planes))
-
-
-def _all_planes(model_field: MMPIField) -> Iterator[tuple[int, slice]]:
-    for k in range(len(model_field.plan.mpis)):
-        for planes in _planes(model_field, k):
-            yield k, planes
 
 
 def _raw(model_field: MMPIField, k: int, planes: slice, shares: Tensor | None) -> Float[Tensor, "P H W"]:
@@ -261,14 +253,14 @@ def _texel_codes(
     model_field: MMPIField, k: int, channels: tuple[Codes, ...], places: Tensor
 ) -> UInt8[Tensor, "B 8 8 C"]:
     """Codes of the channels in some bricks of one MPI."""
-    made = torch.empty(len(places), SIDE, SIDE, len(channels), dtype=torch.uint8)
+    bricks = torch.empty(len(places), SIDE, SIDE, len(channels), dtype=torch.uint8)
     for planes in _planes(model_field, k):
-        own = ((places[:, 0] >= planes.start) & (places[:, 0] < planes.stop)).nonzero()[:, 0]
+        chosen = ((places[:, 0] >= planes.start) & (places[:, 0] < planes.stop)).nonzero()[:, 0]
         values = read_planes(model_field.features.data, model_field.grids[k], planes).cpu()
         codes = torch.stack([c.encode(values[..., i]) for i, c in enumerate(channels)], -1)
-        plane, row, column = places[own].unbind(-1)
-        made[own] = _tiled(codes)[plane - planes.start, row, column]
-    return made
+        plane, row, column = places[chosen].unbind(-1)
+        bricks[chosen] = _tiled(codes)[plane - planes.start, row, column]
+    return bricks
 
 
 def _tiled(images: Tensor) -> Tensor:

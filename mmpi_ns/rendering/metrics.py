@@ -31,25 +31,21 @@ class ImageMetrics:
             assert isinstance(ssim, Tensor)
             values["ssim"] = float(ssim)
         values |= {"cc_psnr": psnr(color_corrected(predicted, observed), observed)}
-        lpips = self._load_lpips(a.device)
-        if lpips is not None:
-            values[f"lpips_{self.lpips_net}"] = float(lpips(a.clamp(0, 1), b.clamp(0, 1)))
-        return values
-
-    def _load_lpips(self, device: torch.device) -> nn.Module | None:
         if self.lpips_net != "none" and not self._lpips_tried:
             self._lpips_tried = True
             try:
                 from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
 
                 metric = LearnedPerceptualImagePatchSimilarity(net_type=self.lpips_net, normalize=True)
-                self._lpips = metric.to(device)
+                self._lpips = metric.to(a.device)
             except (OSError, RuntimeError, ImportError) as error:
                 CONSOLE.print(
-                    f"[yellow]LPIPS is left out: the weights of its {self.lpips_net} network cannot be had "
-                    f"({type(error).__name__}). Put them into torch's hub cache to get it."
+                    f"[yellow]LPIPS is left out: the weights of its {self.lpips_net} network are not "
+                    f"available ({type(error).__name__}). Put them into torch's hub cache to get it."
                 )
-        return self._lpips
+        if self._lpips is not None:
+            values[f"lpips_{self.lpips_net}"] = float(self._lpips(a.clamp(0, 1), b.clamp(0, 1)))
+        return values
 
 
 def psnr(predicted: Float[Tensor, "*N 3"], observed: Float[Tensor, "*N 3"]) -> float:
@@ -72,11 +68,11 @@ def color_corrected(predicted: Float[Tensor, "H W 3"], observed: Float[Tensor, "
 
 
 def depth_metrics(predicted: Float[Tensor, "H W 1"], true: Float[Tensor, "H W 1"]) -> dict[str, float]:
-    """Relative error of rendered distances where the true ones are known: median, and fraction above a tenth."""
-    known = true > 0
-    if not bool(known.any()):
+    """Relative error of rendered distances at the pixels with a true one: median, and fraction above a tenth."""
+    measured = true > 0
+    if not bool(measured.any()):
         return {}
-    error = (predicted[known] / true[known] - 1).abs()
+    error = (predicted[measured] / true[measured] - 1).abs()
     return {"depth_error": float(error.median()), "depth_outliers": float((error > 0.1).float().mean())}
 
 

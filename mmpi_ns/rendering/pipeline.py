@@ -2,22 +2,32 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
+from nerfstudio.cameras.camera_optimizers import CameraOptimizer, CameraOptimizerConfig
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from torch import Tensor
 
 from mmpi_ns.rendering.baked import exact_images
-from mmpi_ns.rendering.eval_poses import refined_camera
 from mmpi_ns.rendering.exposure import exposure_of_image
-from mmpi_ns.utils.console import say
+from mmpi_ns.utils.errors import InputError, say
+from mmpi_ns.utils.random_draws import generator
 
 REFINED = "refined_"
 """Prefix of metrics of images whose own poses were refined against the model."""
+STEPS = 80
+"""Optimisation steps for each image."""
+RAYS = 1024
+"""Pixels of each step."""
+RATES = (2e-3, 5e-5)
+"""Learning rates at the start and at the end: radians, and scene units."""
 
 
 @dataclass
@@ -86,20 +96,68 @@ class MMPIPipeline(VanillaPipeline):
         return {REFINED + name: value for name, value in (values | moved).items()}
 
 
-def summary(found: list[tuple[str, dict[str, float]]]) -> str:
-    """PSNR and SSIM of evaluated images, in a line.
+def refined_camera(model: Any, camera: Cameras, image: Tensor, seed: int) -> tuple[Cameras, float, float]:
+    """A camera moved to the pose from which a frozen model renders its image best.
+
+    If the training poses were wrong, or were refined, the model does not match the test poses exactly. The pose is
+    optimised by the colours of the same pixels that are then scored, so this is no score of view synthesis.
 
     Args:
-        found: name and metrics of each.
+        model: ``MMPIModel``, in evaluation.
+        camera: one.
+        image: [H, W, 3] of it, over the model's background.
+        seed: of the draw of pixels.
+
+    Returns:
+        The moved camera, its rotation in degrees, and its translation in scene units.
+
+    Raises:
+        InputError: the model renders what has no gradients.
     """
-    psnr = [values["psnr"] for _, values in found]
-    worst, best = (found[int(i)][0] for i in (np.argmin(psnr), np.argmax(psnr)))
+    if model.config.rendering.mode == "baked":
+        raise InputError(
+            "Poses are refined by gradients: use --pipeline.model.rendering.mode exact, or no refine-eval-poses."
+        )
+    moves: CameraOptimizer = CameraOptimizerConfig(mode="SO3xR3").setup(num_cameras=1, device=model.device)
+    optimizer = torch.optim.Adam(moves.parameters(), lr=RATES[0])
+    decay = torch.optim.lr_scheduler.ExponentialLR(optimizer, (RATES[1] / RATES[0]) ** (1 / STEPS))
+    rays = camera.generate_rays(0, keep_shape=True).flatten()
+    observed = image.reshape(-1, 3).to(model.device)
+    frozen = [p.requires_grad_(False) for p in model.parameters() if p.requires_grad]
+    try:
+        for step in range(STEPS):
+            chosen = torch.randint(len(observed), (RAYS,), generator=generator(seed, step, "eval poses", "cpu"))
+            bundle = rays[chosen.to(model.device)]
+            bundle.camera_indices = torch.zeros_like(chosen, device=model.device)[:, None]
+            with torch.enable_grad():
+                moves.apply_to_raybundle(bundle)
+                loss = ((model.image_outputs(bundle)["rgb"] - observed[chosen]) ** 2).mean()
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+            decay.step()
+    finally:
+        for p in frozen:
+            p.requires_grad_(True)
+    moved = copy.deepcopy(camera)
+    moved.metadata = {"cam_idx": 0}
+    with torch.no_grad():
+        moved.camera_to_worlds = moves.apply_to_camera(moved)
+    sizes: dict[str, Any] = {}
+    moves.get_metrics_dict(sizes)
+    return moved, float(sizes["camera_opt_rotation_max"]), float(sizes["camera_opt_translation_max"])
+
+
+def summary(scores: list[tuple[str, dict[str, float]]]) -> str:
+    """PSNR and SSIM of evaluated images, given by name and metrics, in a line."""
+    psnr = [values["psnr"] for _, values in scores]
+    worst, best = (scores[int(i)][0] for i in (np.argmin(psnr), np.argmax(psnr)))
     extremes = f"worst {min(psnr):.2f}, {worst}; best {max(psnr):.2f}, {best}"
-    text = f"{len(found)} images: PSNR {np.mean(psnr):.2f} dB ({extremes})"
-    ssim = [values["ssim"] for _, values in found if "ssim" in values]
+    text = f"{len(scores)} images: PSNR {np.mean(psnr):.2f} dB ({extremes})"
+    ssim = [values["ssim"] for _, values in scores if "ssim" in values]
     text += f", SSIM {np.mean(ssim):.3f} ({min(ssim):.3f} to {max(ssim):.3f})" if ssim else ""
-    if not all(REFINED + "psnr" in values for _, values in found):
+    if not all(REFINED + "psnr" in values for _, values in scores):
         return text
     names = [REFINED + name for name in ("psnr", "rotation_degrees")]
-    again, degrees = (float(np.mean([values[name] for _, values in found])) for name in names)
+    again, degrees = (float(np.mean([values[name] for _, values in scores])) for name in names)
     return f"{text}; {again:.2f} dB with each image's own pose refined against the model, by {degrees:.2f} degrees"

@@ -1,9 +1,9 @@
-"""Rays after rendering: their samples, with weights and colours."""
+"""Rays through one field: sampling, merging, blending, compositing and shading (docs/how_it_works.md)."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float
@@ -11,18 +11,22 @@ from nerfstudio.cameras.rays import RayBundle, RaySamples
 from nerfstudio.model_components import renderers
 from torch import Tensor
 
+from mmpi_ns.capture.ray_sources import is_pixel_ray
+from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.samples import Lookup, metadata_of
-from mmpi_ns.field.shading import RayColors
-from mmpi_ns.ops.composite import Composite, median_inverse_distance
-from mmpi_ns.rendering.sampler import MergeReport
+from mmpi_ns.field.shading import RayColors, RayShader
+from mmpi_ns.ops.blending import blended_optical_depth
+from mmpi_ns.ops.composite import Composite, composite_weights, median_inverse_distance, winning_heads
+from mmpi_ns.ops.march import MarchOptions, MergedSamples, show_rays
+from mmpi_ns.rendering.sampler import MMPISampler, rays_of
 from mmpi_ns.scene.plan import ScenePlan
 
 BACKGROUNDS = {"black": 0.0, "gray": 0.5, "white": 1.0}
-"""Names of backgrounds."""
+"""Grey levels of backgrounds by name."""
 
 
 def background_of(name: str, like: Tensor) -> Tensor:
-    """Background colour [3]: that of the viewer or a crop if set, else the one of this name."""
+    """Background colour [3]: of the viewer or a crop if set, else of this name."""
     asked = renderers.BACKGROUND_COLOR_OVERRIDE
     return like.new_full((3,), BACKGROUNDS[name]) if asked is None else asked.to(like)
 
@@ -59,17 +63,11 @@ class RenderedRays:
     samples: RaySamples
     composite: Composite
     colors: RayColors
-    report: MergeReport
+    report: MergedSamples
     lookup: Lookup | None
     """Texels read from the field; None without gradients."""
     times: int = 1
     """Repetitions of the batch: all rays, then all rays again."""
-
-    def counts(self) -> dict[str, Tensor]:
-        """Live and kept samples of each ray, and the weight of the dropped ones."""
-        kept = metadata_of(self.samples)["valid"].float().sum() / len(self.report.live)
-        dropped = self.report.dropped_mass.mean()
-        return {"live_samples": self.report.live.float().mean(), "kept_samples": kept, "dropped_mass": dropped}
 
 
 def bounded(bundle: RayBundle, plan: ScenePlan) -> RayBundle:
@@ -80,14 +78,77 @@ def bounded(bundle: RayBundle, plan: ScenePlan) -> RayBundle:
     return bundle
 
 
-@torch.no_grad()
-def median_distance(composite: Composite, samples: RaySamples, plan: ScenePlan) -> Float[Tensor, "R 1"]:
-    """Euclidean distance at which half of the weight is accumulated."""
-    inverse_t, valid = metadata_of(samples)["inverse_t"][..., 0], metadata_of(samples)["valid"][..., 0]
-    return distances_of(median_inverse_distance(composite.weights, inverse_t, valid), plan)
-
-
 def distances_of(inverse_t: Float[Tensor, "R 1"], plan: ScenePlan) -> Float[Tensor, "R 1"]:
     """Distances from inverse ones; infinity becomes ten times the farthest finite plane."""
     farthest = 10 * max(m.farthest for m in plan.mpis)
     return 1 / inverse_t.clamp(min=1 / farthest)
+
+
+def render_rays(
+    sampler: MMPISampler, bundle: RayBundle, field: MMPIField, *, blends: bool, **sampling: Any
+) -> RenderedRays:
+    """Renders rays that have nears and fars, with gradients if enabled. ``blends``: samples are blended by reliability;
+    ``sampling``: further arguments of the sampler."""
+    samples, report = sampler(bundle, field=field, blends=blends, **sampling)
+    meta, lookup = metadata_of(samples), None
+    tau = meta["tau"][..., 0]  # the sampler's own, without gradients
+    if torch.is_grad_enabled():
+        density, lookup = field.get_density(samples, report.head_counts)
+        tau = density[..., 0]
+        if blends and lookup.index.numel():
+            shares = field.sample_shares(samples, lookup)
+            blended = blended_optical_depth(tau.reshape(-1)[lookup.index], *shares)
+            tau = tau.new_zeros(tau.numel()).index_put((lookup.index,), blended).view(tau.shape)
+    valid, before = meta["valid"][..., 0], meta["skipped_before"][..., 0]
+    composite = composite_weights(tau, valid, before, report.skipped_total)
+    # Keypoint rays are supervised in depth alone: no colours for them.
+    colors = field.render_colors(samples, lookup, composite, lookup and is_pixel_ray(bundle))
+    return RenderedRays(bundle, samples, composite, colors, report, lookup)
+
+
+def sampled_outputs(bundle: RayBundle, field: MMPIField, *, blends: bool, **sampling: Any) -> dict[str, Tensor]:
+    """``shown_outputs`` for any field, also with gradients."""
+    rays = render_rays(MMPISampler(), bundle, field, blends=blends, **sampling)
+    meta, composite = metadata_of(rays.samples), rays.composite
+    with torch.no_grad():
+        inverse_t = median_inverse_distance(composite.weights, meta["inverse_t"][..., 0], meta["valid"][..., 0])
+    return {
+        "rgb": rays.colors.rgb,
+        "accumulation": composite.accumulation,
+        "transmittance": composite.transmittance,
+        "depth": distances_of(inverse_t, field.plan),
+        "winning_mpi": winning_heads(composite.weights, meta["heads"][..., 0], field.plan.num_heads),
+        "dropped_mass": rays.report.dropped_mass,
+    }
+
+
+@torch.no_grad()
+def shown_outputs(
+    bundle: RayBundle,
+    field: MMPIField,
+    *,
+    blends: bool,
+    threshold: float,
+    head_mask: Tensor | None,
+) -> dict[str, Tensor]:
+    """rgb (without background), accumulation, transmittance, depth, winning head and dropped mass of rays [R, .].
+
+    Args:
+        bundle: the rays.
+        field: with ``shading ray``.
+        blends: samples are blended by reliability.
+        threshold: weight below which a sample is dropped.
+        head_mask: heads that may render each ray; None for all.
+    """
+    assert isinstance(field.networks, RayShader)
+    options = MarchOptions(threshold, blends=blends)
+    scene = (field.layout, field.tables, field.features.data)
+    shown = show_rays(*scene, rays_of(bundle, head_mask), options)
+    return {
+        "rgb": field.networks.shade(shown.gathered, shown.mass, shown.accumulation, bundle.directions),
+        "accumulation": shown.accumulation,
+        "transmittance": shown.transmittance,
+        "depth": distances_of(shown.inverse_t, field.plan),
+        "winning_mpi": shown.winner,
+        "dropped_mass": shown.dropped_mass,
+    }

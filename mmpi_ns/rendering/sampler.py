@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from nerfstudio.cameras.rays import Frustums, RayBundle, RaySamples
 from nerfstudio.model_components.ray_samplers import Sampler
 from torch import Tensor
@@ -33,22 +33,6 @@ class SamplingConfig:
     """Initial alpha of a cube sample: 1e-2 for a small room to 1e-4."""
 
 
-@dataclass(frozen=True)
-class MergeReport:
-    """Output of the sampler for each ray besides its samples."""
-
-    live: Int[Tensor, "R"]
-    """Samples before dropping."""
-    skipped_total: Float[Tensor, "R 1"]
-    """Optical depth of the dropped samples."""
-    dropped_mass: Float[Tensor, "R 1"]
-    """Rendering weight of the dropped samples: the error bound of dropping."""
-    explained: Bool[Tensor, "R 1"]
-    """See ``MergedSamples``."""
-    head_counts: tuple[int, ...] | None
-    """Samples of each head, if the march counted them."""
-
-
 class MMPISampler(Sampler):
     """Samples rays in all MPIs and the cube, and merges by distance."""
 
@@ -63,7 +47,7 @@ class MMPISampler(Sampler):
         choose: Float[Tensor, "R K"] | None = None,
         blends: bool = False,
         **_: Any,
-    ) -> tuple[RaySamples, MergeReport]:
+    ) -> tuple[RaySamples, MergedSamples]:
         """Kept samples of each ray, nearest first.
 
         Args:
@@ -77,15 +61,24 @@ class MMPISampler(Sampler):
 
         Returns:
             RaySamples [R, S] whose metadata holds ``heads``, ``planes``, ``ndc``, ``inverse_t``, ``valid``,
-            ``skipped_before`` and ``tau``, the (blended) optical depth (each [R, S, .]), and what was left out.
+            ``skipped_before`` and ``tau``, the (blended) optical depth (each [R, S, .]), and the march's own report.
         """
         assert ray_bundle is not None
         options = MarchOptions(threshold, fair_share, blends)
         with torch.no_grad():
             merged = march(field.layout, field.tables, rays_of(ray_bundle, head_mask, choose), options)
-        left = merged.skipped_total, merged.dropped_mass
-        report = MergeReport(merged.live, *left, merged.explained, merged.head_counts)
-        return _ray_samples(ray_bundle, merged), report
+        shape, names = merged.valid.shape, ("heads", "planes", "inverse_t", "valid", "skipped_before", "tau")
+        # A sample is a point on a plane, so it starts and ends at the same distance.
+        t = 1 / merged.inverse_t[..., None].clamp(min=DIRECTION_AT_INFINITY)
+        frustums = _Frustums(
+            origins=ray_bundle.origins[:, None].expand(*shape, 3),
+            directions=ray_bundle.directions[:, None].expand(*shape, 3),
+            starts=t,
+            ends=t,
+            pixel_area=ray_bundle.pixel_area[:, None].expand(*shape, 1),
+        )
+        metadata = {"ndc": merged.ndc, **{name: getattr(merged, name)[..., None] for name in names}}
+        return _Samples(frustums=frustums, camera_indices=None, metadata=metadata), merged
 
 
 def rays_of(ray_bundle: RayBundle, head_mask: Tensor | None = None, choose: Tensor | None = None) -> Rays:
@@ -107,19 +100,3 @@ class _Samples(RaySamples):
 
     def __post_init__(self) -> None:
         self._shape = self.frustums.shape
-
-
-def _ray_samples(ray_bundle: RayBundle, merged: MergedSamples) -> RaySamples:
-    """nerfstudio's RaySamples; a sample is a point on a plane, so it starts and ends at the same distance."""
-    shape = merged.valid.shape
-    t = 1 / merged.inverse_t[..., None].clamp(min=DIRECTION_AT_INFINITY)
-    frustums = _Frustums(
-        origins=ray_bundle.origins[:, None].expand(*shape, 3),
-        directions=ray_bundle.directions[:, None].expand(*shape, 3),
-        starts=t,
-        ends=t,
-        pixel_area=ray_bundle.pixel_area[:, None].expand(*shape, 1),
-    )
-    names = ("heads", "planes", "inverse_t", "valid", "skipped_before", "tau")
-    metadata = {"ndc": merged.ndc, **{name: getattr(merged, name)[..., None] for name in names}}
-    return _Samples(frustums=frustums, camera_indices=None, metadata=metadata)

@@ -10,7 +10,6 @@ from threading import Lock
 from weakref import WeakValueDictionary
 
 import torch
-from torch import Tensor
 
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.tables import TABLES
@@ -100,20 +99,18 @@ class WindowStore:
             )
         try:
             state = torch.load(path, map_location="cpu", weights_only=True, mmap=True)["field"]
-            self._make_room(sum(values.numel() * _itemsize(values) for values in state.values()))
+            half = {name for name, values in state.items() if values.dtype == torch.float16}
+            needed = sum(values.nbytes * (2 if name in half else 1) for name, values in state.items())
+            while self._held and needed + sum(map(_bytes_of, self._held.values())) > self.budget:
+                del self._held[next(iter(self._held))]  # the least recently used
             field = self._empty()
-            field.load_state_dict({name: _widened(values) for name, values in state.items()})
+            field.load_state_dict({name: x.float() if name in half else x for name, x in state.items()})
         except (*_DAMAGED, AttributeError) as error:
             raise InputError(
                 f"Window {window} of this run is damaged: {path} cannot be read ({brief(error)}). Copy it anew, or "
                 "train it again: resume from a checkpoint of before its end with --load-step."
             ) from error
         return field
-
-    def _make_room(self, needed: int) -> None:
-        """Evicts windows, least recently used first, until ``needed`` bytes fit into the budget."""
-        while self._held and needed + sum(map(_bytes_of, self._held.values())) > self.budget:
-            del self._held[next(iter(self._held))]
 
     def adopt(self, other: Path, plans: dict[int, ScenePlan], needed: bool = False) -> None:
         """Takes over finished windows of the run that this one resumes.
@@ -131,7 +128,18 @@ class WindowStore:
         for window, plan in plans.items():
             path, source = self.path(window), other / self.path(window).name
             if source.is_file():
-                _check_plan(source, plan)
+                try:
+                    state = torch.load(source, map_location="cpu", weights_only=True, mmap=True)
+                    stored = ScenePlan.from_json(to_text(state["field"]["plan_bytes"]))
+                except _DAMAGED as error:
+                    raise InputError(
+                        f"{source} cannot be read ({brief(error)}): copy it anew, or remove it to train again."
+                    ) from error
+                if stored != plan:
+                    raise InputError(
+                        f"{source} was trained with another scene plan: resume with the settings in its run's "
+                        "config.yml, or give that run's plan.json with --pipeline.model.plan-file."
+                    )
                 path.parent.mkdir(parents=True, exist_ok=True)
                 write_atomically(path, lambda unfinished, source=source: shutil.copyfile(source, unfinished))
             elif needed:
@@ -141,32 +149,7 @@ class WindowStore:
                 )
 
 
-def _itemsize(values: Tensor) -> int:
-    """Bytes of a number once it is read."""
-    return 4 if values.dtype == torch.float16 else values.element_size()
-
-
-def _widened(values: Tensor) -> Tensor:
-    return values.float() if values.dtype == torch.float16 else values
-
-
 def _bytes_of(field: MMPIField) -> int:
     """Bytes of its tables, and of its bricks if it is baked."""
     bricks = field.cached("baked")
     return sum(values.nbytes for values in field.state_dict().values()) + (0 if bricks is None else bricks.mpis.nbytes)
-
-
-def _check_plan(source: Path, plan: ScenePlan) -> None:
-    """Raises InputError where a window's file is damaged or holds another plan."""
-    try:
-        state = torch.load(source, map_location="cpu", weights_only=True, mmap=True)
-        stored = ScenePlan.from_json(to_text(state["field"]["plan_bytes"]))
-    except _DAMAGED as error:
-        raise InputError(
-            f"{source} cannot be read ({brief(error)}): copy it anew, or remove it to train again."
-        ) from error
-    if stored != plan:
-        raise InputError(
-            f"{source} was trained with another scene plan: resume with the settings in its run's config.yml, or give "
-            "that run's plan.json with --pipeline.model.plan-file."
-        )

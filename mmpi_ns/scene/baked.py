@@ -81,7 +81,7 @@ class BakedMpis:
     density_codes: Codes
     channel_codes: tuple[Codes, ...]
     packed: dict[str, Any] = field(default_factory=dict)
-    """The same in the layout of a compiled operation, made by it once."""
+    """The scene in the layout of a compiled operation, which fills it once."""
 
     @property
     def frames(self) -> Frames:
@@ -91,7 +91,7 @@ class BakedMpis:
 
     @property
     def sizes(self) -> dict[str, int]:
-        """What letters in shapes stand for: bricks, MPIs and heads, which are the same."""
+        """Sizes of the letters in shapes: bricks, and MPIs, which are also the heads."""
         return {"B": self.num_bricks, "K": len(self.mpis), "H": len(self.mpis)}
 
     @property

@@ -33,17 +33,11 @@ class Frames:
 
     @staticmethod
     def pack(mpis: Sequence[MPIPlan], dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Frames:
-        def tensor(values) -> Tensor:
-            return torch.tensor(values, dtype=dtype, device=device)
-
-        return Frames(
-            origins=tensor([m.origin for m in mpis]),
-            axes=tensor([m.axes for m in mpis]),
-            nears=tensor([m.near for m in mpis]),
-            extents=tensor([m.extent for m in mpis]),
-            num_planes=torch.tensor([m.planes for m in mpis], device=device),
-            last_disparities=tensor([m.last_disparity for m in mpis]),
-        )
+        names = {"origins": "origin", "axes": "axes", "nears": "near", "extents": "extent"}
+        columns = {key: [getattr(m, name) for m in mpis] for key, name in names.items()}
+        columns["last_disparities"] = [m.last_disparity for m in mpis]
+        tensors = {key: torch.tensor(column, dtype=dtype, device=device) for key, column in columns.items()}
+        return Frames(**tensors, num_planes=torch.tensor([m.planes for m in mpis], device=device))
 
     @property
     def disparity_steps(self) -> Float[Tensor, "K"]:
@@ -62,7 +56,7 @@ class Frames:
 
 @dataclass(frozen=True)
 class PlaneHits:
-    """Where R rays cross the planes of K MPIs.
+    """Crossings of R rays with the planes of K MPIs.
 
     Planes are counted by m = L - 1 - l, so m = 0 is the last one and the disparity is w = 1/far + m * step.
     The live planes of a ray are m_first, m_first - 1, ..., ``count`` of them, near to far.
@@ -85,19 +79,9 @@ def rotate(axes: Float[Tensor, "*#N 3 3"], vectors: Float[Tensor, "*#N 3"]) -> F
     return (axes * vectors[..., None, :]).sum(-1)
 
 
-def rays_in_frames(
-    origins: Float[Tensor, "R 3"], directions: Float[Tensor, "R 3"], frames: Frames
-) -> tuple[Float[Tensor, "R K 3"], Float[Tensor, "R K 3"]]:
-    """Ray origins and directions in each MPI's axes, relative to the MPI's origin (differences first, to keep precision
-    far from the world origin)."""
-    offsets = origins[:, None, :] - frames.origins
-    local_origins = rotate(frames.axes, offsets)
-    return local_origins, rotate(frames.axes, directions[:, None, :])
-
-
 @dataclass(frozen=True)
 class LocalRays:
-    """R rays in world axes and in every MPI's axes."""
+    """R rays in world axes, and in every MPI's axes relative to the MPI's origin."""
 
     origins: Float[Tensor, "R 3"]
     directions: Float[Tensor, "R 3"]
@@ -106,7 +90,9 @@ class LocalRays:
 
     @staticmethod
     def of(origins: Tensor, directions: Tensor, frames: Frames) -> LocalRays:
-        return LocalRays(origins, directions, *rays_in_frames(origins, directions, frames))
+        # Differences first, to keep precision far from the world origin.
+        local_origins = rotate(frames.axes, origins[:, None, :] - frames.origins)
+        return LocalRays(origins, directions, local_origins, rotate(frames.axes, directions[:, None, :]))
 
     def table(self, k: int) -> Float[Tensor, "R 6"]:
         """Origins and directions in MPI k, or in the world for the cube behind the last MPI."""
@@ -139,7 +125,8 @@ def plane_hits(
 
     Source: MMPI paper, sec. III-B ("sample and merge", forward-facing check); docs/how_it_works.md, "Live interval".
     """
-    o, d = rays_in_frames(origins, directions, frames)
+    local = LocalRays.of(origins, directions, frames)
+    o, d = local.local_origins, local.local_directions
     dz, oz = d[..., 2], o[..., 2]
     facing = dz > FACING_EPS
     safe_dz = torch.where(facing, dz, torch.ones_like(dz))
@@ -151,13 +138,7 @@ def plane_hits(
     p = torch.stack([dz * nears + oz, -(dz + oz * inverse_far), bend_u, -bend_u, bend_v, -bend_v])
     q = torch.stack([one, -inverse_far * one, u1 - slope_u, slope_u - u0, v1 - slope_v, slope_v - v0])
 
-    last = (frames.num_planes - 1).to(oz.dtype)
-    step, end = frames.disparity_steps, frames.last_disparities
-    low, high = _half_space_range(p, q - p * end, step, last)
-    live = _live_test(p, q, oz, step, end, last)
-    # The division may be off by one plane at a border: the half-space test itself decides.
-    high = torch.where(live(high + 1), high + 1, torch.where(live(high), high, high - 1))
-    low = torch.where(live(low - 1), low - 1, torch.where(live(low), low, low + 1))
+    low, high = _live_range(p, q, oz, frames)
     count = torch.where(facing, (high - low + 1).clamp(min=0), torch.zeros_like(high))
     return PlaneHits(
         m_first=high.to(torch.int64),
@@ -169,26 +150,28 @@ def plane_hits(
     )
 
 
-def _half_space_range(
-    p: Float[Tensor, "C R K"], q: Float[Tensor, "C R K"], step: Float[Tensor, "K"], last: Float[Tensor, "K"]
+def _live_range(
+    p: Float[Tensor, "C R K"], q: Float[Tensor, "C R K"], oz: Float[Tensor, "R K"], frames: Frames
 ) -> tuple[Float[Tensor, "R K"], Float[Tensor, "R K"]]:
-    """Smallest and largest integer m in [0, last] with p m step <= q for all C conditions (low > high: none)."""
-    slope = p * step
-    bound = q / torch.where(slope == 0, torch.ones_like(slope), slope)
+    """Smallest and largest m of a plane with p w <= q for all C conditions (low > high: none)."""
+    last, step, end = (frames.num_planes - 1).to(oz.dtype), frames.disparity_steps, frames.last_disparities
+    slope, offset = p * step, q - p * end
+    bound = offset / torch.where(slope == 0, torch.ones_like(slope), slope)
     upper = torch.where(slope > 0, bound, torch.full_like(bound, torch.inf)).amin(0)
     lower = torch.where(slope < 0, bound, torch.full_like(bound, -torch.inf)).amax(0)
-    never = ((slope == 0) & (q < 0)).any(0)
+    never = ((slope == 0) & (offset < 0)).any(0)
     high = torch.minimum(upper.floor(), last).clamp(min=-1)
     low = torch.minimum(lower.ceil().clamp(min=0), last + 1)
-    return torch.where(never, last + 1, low), torch.where(never, torch.full_like(high, -1), high)
+    low, high = torch.where(never, last + 1, low), torch.where(never, torch.full_like(high, -1), high)
 
-
-def _live_test(p: Tensor, q: Tensor, oz: Tensor, step: Tensor, end: Tensor, last: Tensor):
     def live(m: Float[Tensor, "R K"]) -> Bool[Tensor, "R K"]:
         w = sample_disparity(m, step, end)
         return (p * w <= q).all(0) & (w * oz < 1) & (m >= 0) & (m <= last)
 
-    return live
+    # The division may be off by one plane at a border: the half-space test itself decides.
+    high = torch.where(live(high + 1), high + 1, torch.where(live(high), high, high - 1))
+    low = torch.where(live(low - 1), low - 1, torch.where(live(low), low, low + 1))
+    return low, high
 
 
 def sample_disparity(m: Tensor, step: Tensor, end: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""The nearest views that face the same way: those whose images can be compared with one."""
+"""Nearest views that face the same way, whose images can be compared."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ def nearest_views(
     among: Sequence[int] | NDArray[np.int64] | None = None,
     apart: bool = True,
 ) -> list[int]:
-    """Cameras nearest to one that have a similar viewing direction, nearest first.
+    """Cameras nearest to camera ``i`` with a similar viewing direction, nearest first.
 
     Args:
         camera_to_worlds: poses of all cameras, axes in columns, z backwards or forwards. [M, 3, 4]
         i: the camera.
-        count: at most so many.
+        count: maximum number of cameras.
         max_angle: between viewing directions, degrees.
         among: the cameras to choose from; None for all.
         apart: only those in another place, whose images have a parallax.

@@ -8,16 +8,13 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
 from dataclasses import MISSING, asdict, dataclass, fields, replace
-from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from mmpi_ns.utils.errors import InputError, brief
 from mmpi_ns.utils.values import Number, check_number, check_row, check_text, shown
 
 Vector = tuple[float, float, float]
-Plan = TypeVar("Plan")
 
 SHALLOWEST = 1.001
 """Minimum ratio of the depths of an MPI's last and first plane: float32 could not distinguish closer ones."""
@@ -78,11 +75,6 @@ class MPIPlan:
     def texels(self) -> int:
         return self.planes * self.height * self.width
 
-    def scaled(self, factor: float) -> MPIPlan:
-        """The same frame with ``factor`` times the texels a plane (both sides keep their ratio)."""
-        side = math.sqrt(factor)
-        return replace(self, height=max(2, round(self.height * side)), width=max(2, round(self.width * side)))
-
 
 @dataclass(frozen=True)
 class CubePlan:
@@ -96,11 +88,6 @@ class CubePlan:
     @property
     def texels(self) -> int:
         return self.shape[0] * self.shape[1] * self.shape[2]
-
-    def scaled(self, factor: float) -> CubePlan:
-        side = factor ** (1 / 3)
-        nz, ny, nx = (max(2, round(n * side)) for n in self.shape)
-        return replace(self, shape=(nz, ny, nx))
 
 
 @dataclass(frozen=True)
@@ -117,7 +104,20 @@ class ScenePlan:
     """The rule that made the plan, for information."""
 
     def __post_init__(self) -> None:
-        self.validate()
+        """Raises InputError with one sentence that names the MPI and the field that cannot be used."""
+        if not self.mpis:
+            raise InputError("A scene plan needs at least one MPI, this one has none: add one to its list 'mpis'.")
+        for i, mpi in enumerate(self.mpis):
+            _validate_mpi(mpi, _mpi_name(mpi, i))
+        if self.cube is not None:
+            for name in ("lower", "upper"):
+                check_row(f"The '{name}' of the plan's cube", getattr(self.cube, name), 3, LENGTH)
+            check_row("The 'shape' of the plan's cube", self.cube.shape, 3, Number(2, MOST_VOXELS, whole=True))
+            if not all(a < b for a, b in zip(self.cube.lower, self.cube.upper, strict=True)):
+                raise InputError("The plan's cube needs 'upper' > 'lower' on every axis.")
+        check_number("The plan's 'ray_near'", self.ray_near, Number(0, HUGE))
+        check_number("The plan's 'content_near'", self.content_near, Number(0, HUGE))
+        check_text("The plan's 'origin_of_plan'", self.origin_of_plan)
 
     @property
     def num_heads(self) -> int:
@@ -137,27 +137,15 @@ class ScenePlan:
         return sum(m.planes for m in self.mpis) + (sum(self.cube.shape) if self.cube else 0)
 
     def scaled(self, factor: float) -> ScenePlan:
-        """The plan at another resolution: ``factor`` times the texels, equal frames and planes."""
+        """The plan at another resolution: ``factor`` times the texels, equal frames, planes and ratios of sides."""
         if factor == 1:
             return self
-        cube = self.cube.scaled(factor) if self.cube else None
-        return replace(self, mpis=tuple(m.scaled(factor) for m in self.mpis), cube=cube)
-
-    def validate(self) -> None:
-        """Raises InputError with one sentence that names the MPI and the field that cannot be used."""
-        if not self.mpis:
-            raise InputError("A scene plan needs at least one MPI, this one has none: add one to its list 'mpis'.")
-        for i, mpi in enumerate(self.mpis):
-            _validate_mpi(mpi, i)
-        if self.cube is not None:
-            for name in ("lower", "upper"):
-                check_row(f"The '{name}' of the plan's cube", getattr(self.cube, name), 3, LENGTH)
-            check_row("The 'shape' of the plan's cube", self.cube.shape, 3, Number(2, MOST_VOXELS, whole=True))
-            if not all(a < b for a, b in zip(self.cube.lower, self.cube.upper, strict=True)):
-                raise InputError("The plan's cube needs 'upper' > 'lower' on every axis.")
-        check_number("The plan's 'ray_near'", self.ray_near, Number(0, HUGE))
-        check_number("The plan's 'content_near'", self.content_near, Number(0, HUGE))
-        check_text("The plan's 'origin_of_plan'", self.origin_of_plan)
+        side, cube = math.sqrt(factor), self.cube
+        sizes = [{name: max(2, round(getattr(m, name) * side)) for name in ("height", "width")} for m in self.mpis]
+        if cube is not None:
+            nz, ny, nx = (max(2, round(n * factor ** (1 / 3))) for n in cube.shape)
+            cube = replace(cube, shape=(nz, ny, nx))
+        return replace(self, mpis=tuple(replace(m, **s) for m, s in zip(self.mpis, sizes, strict=True)), cube=cube)
 
     def to_json(self) -> str:
         """Standard JSON: a ``far`` at infinity is written as null."""
@@ -177,26 +165,16 @@ class ScenePlan:
         if isinstance(data, dict) and not isinstance(data.get("mpis", []), list):
             raise InputError("The scene plan's 'mpis' is not a list: compare it with docs/how_it_works.md.")
         check_fields(ScenePlan, data, "The scene plan")
-        mpis = tuple(_build(MPIPlan, _with_far(m), _mpi_name(m, i)) for i, m in enumerate(data["mpis"]))
-        cube = None if data["cube"] is None else _build(CubePlan, data["cube"], "The plan's cube")
-        return ScenePlan(**{**data, "mpis": mpis, "cube": cube})
-
-    @staticmethod
-    def load(path: Path) -> ScenePlan:
-        """Reads a file. Raises InputError naming the file and what is wrong in it."""
-        return load_plan(path, ScenePlan.from_json)
-
-
-def load_plan(path: Path, read: Callable[[str], Plan]) -> Plan:
-    """Reads the text of a plan file; errors name the file."""
-    if not path.is_file():
-        raise InputError(f"There is no scene plan at {path}: check the path given to --pipeline.model.plan-file.")
-    try:
-        return read(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} cannot be read ({brief(error)}): save it as UTF-8 text.") from error
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
+        mpis = []
+        for i, row in enumerate(data["mpis"]):
+            check_fields(MPIPlan, row, _mpi_name(row, i))
+            far = math.inf if row.get("far") is None else row["far"]
+            mpis.append(MPIPlan(**{**_tuples(row), "far": far}))
+        cube = data["cube"]
+        if cube is not None:
+            check_fields(CubePlan, cube, "The plan's cube")
+            cube = CubePlan(**_tuples(cube))
+        return ScenePlan(**{**data, "mpis": tuple(mpis), "cube": cube})
 
 
 def _mpi_name(mpi: Any, index: int) -> str:
@@ -204,8 +182,7 @@ def _mpi_name(mpi: Any, index: int) -> str:
     return f"MPI {shown(name)}" if isinstance(name, str) and name else f"MPI number {index + 1}"
 
 
-def _validate_mpi(mpi: MPIPlan, index: int) -> None:
-    where = _mpi_name(mpi, index)
+def _validate_mpi(mpi: MPIPlan, where: str) -> None:
     check_text(f"The name of {where}", mpi.name)
     check_row(f"The 'origin' of {where}", mpi.origin, 3, LENGTH)
     check_number(f"The 'near' of {where}", mpi.near, Number(1 / HUGE, HUGE))
@@ -256,35 +233,13 @@ def check_fields(cls: type, data: Any, where: str) -> None:
         raise InputError(f"{where} {wrong}: compare it with docs/how_it_works.md.")
 
 
-def _build(cls: type, data: Any, where: str) -> Any:
-    check_fields(cls, data, where)
-    return cls(**{k: _tuples(v) for k, v in data.items()})
-
-
-def _with_far(mpi: Any) -> Any:
-    """Null, or a missing value, stands for infinity."""
-    return {**mpi, "far": math.inf if mpi.get("far") is None else mpi["far"]} if isinstance(mpi, dict) else mpi
-
-
 def _tuples(value: Any) -> Any:
+    """A JSON value with tuples for its lists."""
+    if isinstance(value, dict):
+        return {name: _tuples(v) for name, v in value.items()}
     return tuple(_tuples(v) for v in value) if isinstance(value, list) else value
 
 
-NO_PLAN = ScenePlan(
-    (
-        MPIPlan(
-            "none",
-            (0.0, 0.0, 0.0),
-            ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
-            1.0,
-            (-1.0, 1.0, -1.0, 1.0),
-            2,
-            2,
-            2,
-        ),
-    ),
-    None,
-    0.0,
-    1.0,
-)
+_AXES = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
+NO_PLAN = ScenePlan((MPIPlan("none", (0.0, 0.0, 0.0), _AXES, 1.0, (-1.0, 1.0, -1.0, 1.0), 2, 2, 2),), None, 0.0, 1.0)
 """The plan of a model that will load a checkpoint, which has its own plan."""

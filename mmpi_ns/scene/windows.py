@@ -12,14 +12,13 @@ import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mmpi_ns.scene.plan import HUGE, LENGTH, ScenePlan, Vector, check_fields, load_plan, read_object
-from mmpi_ns.utils.errors import InputError
+from mmpi_ns.scene.plan import HUGE, LENGTH, ScenePlan, Vector, check_fields, read_object
+from mmpi_ns.utils.errors import InputError, brief
 from mmpi_ns.utils.values import Number, check_number, check_row
 
 
@@ -72,12 +71,8 @@ class WindowedPlan:
 
     def find(self, name: str) -> tuple[int, int] | None:
         """Window and head of one of ``names``; None for any other name."""
-        names = self.names
-        if name not in names:
-            return None
-        number = names.index(name)
-        window = max(w for w in range(len(self)) if self.first_head(w) <= number)
-        return window, number - self.first_head(window)
+        heads = [(w, head) for w, plan in enumerate(self.plans) for head in range(plan.num_heads)]
+        return dict(zip(reversed(self.names), reversed(heads), strict=True)).get(name)
 
     @staticmethod
     def single(plan: ScenePlan) -> WindowedPlan:
@@ -102,22 +97,28 @@ class WindowedPlan:
         rows = data["windows"]
         if set(data) != {"windows"} or not isinstance(rows, list):
             raise InputError("A plan of several windows needs one list 'windows' and nothing else: correct it.")
-        return WindowedPlan(tuple(_read_window(row, i) for i, row in enumerate(rows)))
+        windows = []
+        for i, row in enumerate(rows):
+            check_fields(Window, row, f"Window {i} of the plan")
+            center = tuple(row["center"]) if isinstance(row["center"], list) else row["center"]
+            try:
+                plan = ScenePlan.from_object(row["plan"])
+            except InputError as error:
+                raise InputError(f"Window {i} of the plan: {error}") from error
+            windows.append(Window(center, row["radius"], row["margin"], plan))
+        return WindowedPlan(tuple(windows))
 
     @staticmethod
     def load(path: Path) -> WindowedPlan:
         """Reads a file. Raises InputError naming the file and what is wrong in it."""
-        return load_plan(path, WindowedPlan.from_json)
-
-
-def _read_window(row: Any, index: int) -> Window:
-    check_fields(Window, row, f"Window {index} of the plan")
-    try:
-        plan = ScenePlan.from_object(row["plan"])
-    except InputError as error:
-        raise InputError(f"Window {index} of the plan: {error}") from error
-    center = row["center"]
-    return Window(tuple(center) if isinstance(center, list) else center, row["radius"], row["margin"], plan)
+        if not path.is_file():
+            raise InputError(f"There is no scene plan at {path}: check the path given to --pipeline.model.plan-file.")
+        try:
+            return WindowedPlan.from_json(path.read_text(encoding="utf-8"))
+        except (OSError, UnicodeDecodeError) as error:
+            raise InputError(f"{path} cannot be read ({brief(error)}): save it as UTF-8 text.") from error
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from error
 
 
 def window_shares(origins: Float[Tensor, "R 3"], windows: tuple[Window, ...]) -> Float[Tensor, "R W"]:
@@ -125,10 +126,6 @@ def window_shares(origins: Float[Tensor, "R 3"], windows: tuple[Window, ...]) ->
 
     Inside its ball a window has full weight, which falls off linearly over its margin beyond it; weights are
     normalised. A ray that starts in no ball uses the nearest.
-
-    Args:
-        origins: of the rays.
-        windows: available windows.
     """
     centers = torch.tensor([w.center for w in windows], dtype=torch.float64, device=origins.device)
     radii, margins = (

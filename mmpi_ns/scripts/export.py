@@ -116,9 +116,7 @@ class Splats(_Run):
         from mmpi_ns.export.splats import poses_in, splats_of, write_ply
 
         for number, (place, window) in enumerate(scene.windows):
-            path = self.output
-            if len(scene.windows) > 1:
-                path = path.with_stem(f"{path.stem}-{number:05d}")
+            path = self.output.with_stem(f"{self.output.stem}-{number:05d}") if len(scene.windows) > 1 else self.output
             splats = splats_of(window, poses_in(place, scene), self.weight, self.most)
             size = write_ply(splats, path)
             print(f"Wrote {path}: {len(splats.means)} splats, {size / 1e6:.1f} MB.")

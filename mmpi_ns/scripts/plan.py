@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Literal
 
 import tyro
 
-from mmpi_ns.placement.defaults import DEFAULTS, steps_for
-from mmpi_ns.placement.options import check_placement
+from mmpi_ns.placement.defaults import DEFAULTS, check_placement, steps_for
 from mmpi_ns.placement.rule import PlacementConfig
 from mmpi_ns.scripts.command import say_version
 from mmpi_ns.utils.errors import InputError, quoted
@@ -60,13 +59,16 @@ class PlanCommand:
         check_there(self.scene)
         with write_errors(self.output, "--output"):
             self.output.mkdir(parents=True, exist_ok=True)
-        if self.plan_file is not None:  # report an error in it before the images are read
-            WindowedPlan.load(self.plan_file)
-        _check_not_edited(self.output / "plan.json")
+        # Before the images are read, so that an error in it is reported at once.
+        windows = None if self.plan_file is None else WindowedPlan.load(self.plan_file)
+        plan, table = self.output / "plan.json", self.output / "plan.md"
+        if plan.is_file() and not (table.is_file() and _mark(plan) in table.read_text("utf-8", errors="replace")):
+            raise InputError(
+                f"{plan} was edited since mmpi-plan wrote it, or is not from there: "
+                "give another --output, or remove it."
+            )
         observations = load_observations(self.scene, self.downscale_factor, self.parser)
-        if self.plan_file is not None:
-            windows = WindowedPlan.load(self.plan_file)
-        else:
+        if windows is None:
             rays = self.training_rays
             if rays is None:
                 steps = steps_for(self.method, most_pixels(observations, self.placement))
@@ -74,13 +76,11 @@ class PlanCommand:
             windows = place_windows(observations, self.placement, rays or None)
         text = self._explain(windows, observations)
         title = f"# Plan of {self.scene.resolve().name}"
-        (self.output / "plan.json").write_text(windows.to_json(), encoding="utf-8")
-        mark = _mark(self.output / "plan.json")
-        (self.output / "plan.md").write_text(f"{title}\n\n{mark}\n\n{text}\n", encoding="utf-8")
+        plan.write_text(windows.to_json(), encoding="utf-8")
+        table.write_text(f"{title}\n\n{_mark(plan)}\n\n{text}\n", encoding="utf-8")
         print(text)
         print(f"\nWrote plan.json, plan.md and pictures in {self.output}.")
-        plan = quoted(self.output / "plan.json")
-        print(f"Train with it: ns-train {self.method} --pipeline.model.plan-file {plan} --data ...")
+        print(f"Train with it: ns-train {self.method} --pipeline.model.plan-file {quoted(plan)} --data ...")
 
     def _explain(self, windows: WindowedPlan, observations: Observations) -> str:
         """Draws the pictures and returns the tables: for each window, over the observations of its own cameras."""
@@ -91,13 +91,13 @@ class PlanCommand:
 
         parts = []
         for i, window in enumerate(windows.windows):
-            own = cameras_of(window, observations)
-            visible = find_visible_points(own)
-            report = explain(window.plan, own, visible)
+            part = cameras_of(window, observations)
+            visible = find_visible_points(part)
+            report = explain(window.plan, part, visible)
             suffix = f"-{i}" if len(windows) > 1 else ""
-            draw_plan(self.output / f"plan{suffix}.png", window.plan, own, visible)
+            draw_plan(self.output / f"plan{suffix}.png", window.plan, part, visible)
             draw_errors(self.output / f"errors{suffix}.png", window.plan, report)
-            title = f"## Window {i}: {len(own.centers)} training cameras\n\n" if len(windows) > 1 else ""
+            title = f"## Window {i}: {len(part.centers)} training cameras\n\n" if len(windows) > 1 else ""
             parts.append(title + table(report))
         if len(windows) > 1:
             draw_windows(self.output / "plan.png", windows, observations)
@@ -107,24 +107,15 @@ class PlanCommand:
 
 
 def _mark(plan: Path) -> str:
-    """Tells a plan that was edited later from one that was not; a reader of plan.md does not see it."""
+    """Comment with a plan's hash, which reveals later edits of the plan; plan.md does not show it."""
     return f"<!-- plan.json: {hashlib.sha256(plan.read_bytes()).hexdigest()} -->"
-
-
-def _check_not_edited(plan: Path) -> None:
-    """Raises InputError if there is a plan that this command did not write, or that was edited."""
-    told = plan.with_suffix(".md")
-    if plan.is_file() and not (told.is_file() and _mark(plan) in told.read_text(encoding="utf-8", errors="replace")):
-        raise InputError(
-            f"{plan} was edited since mmpi-plan wrote it, or is not from there: give another --output, or remove it."
-        )
 
 
 def _defaults(arguments: list[str]) -> PlanCommand:
     """The command with the placement of the method that the arguments name."""
     words = [w for argument in arguments for w in argument.split("=", 1)]
-    named = words[words.index("--method") + 1] if "--method" in words[:-1] else ""
-    default = DEFAULTS.get(named, DEFAULTS["mmpi-small"])
+    method = words[words.index("--method") + 1] if "--method" in words[:-1] else ""
+    default = DEFAULTS.get(method, DEFAULTS["mmpi-small"])
     return PlanCommand(tyro.MISSING, tyro.MISSING, placement=default.placement)
 
 

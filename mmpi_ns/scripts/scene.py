@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -55,31 +55,32 @@ class SceneCommand:
     """Replace a data set in the folder."""
 
     def main(self) -> None:
+        from rich.progress import track
+
         from mmpi_ns.synthetic.catalogue import make_scene
         from mmpi_ns.synthetic.dataset import check_folder, write_dataset
         from mmpi_ns.synthetic.exposure import make_exposure
         from mmpi_ns.synthetic.movers import with_movers
         from mmpi_ns.utils.values import Number, check_options
 
-        ranges = {"seed": Number(0, whole=True), "noise": Number(0), "outliers": Number(0, 1)}
-        ranges["moving"] = Number(0, 1000, whole=True)
-        optional = {"points": Number(1, whole=True), "count": Number(1, whole=True), "length": Number(0, above=True)}
-        optional |= {"width": Number(1, 65536, whole=True), "height": Number(1, 65536, whole=True)}
-        ranges |= {name: number for name, number in optional.items() if getattr(self, name) is not None}
-        check_options(self, ranges, "--")
+        size = Number(1, 65536, whole=True)
+        ranges = {
+            "seed": Number(0, whole=True), "noise": Number(0), "outliers": Number(0, 1),
+            "moving": Number(0, 1000, whole=True), "points": Number(1, whole=True), "count": Number(1, whole=True),
+            "length": Number(0, above=True), "width": size, "height": size,
+        }  # fmt: skip
+        check_options(self, {name: r for name, r in ranges.items() if getattr(self, name) is not None}, "--")
         check_folder(self.folder, self.overwrite)
         scene = make_scene(self.name, self.seed, self.count, self.width, self.height, self.length)
         if self.moving:
             scene = with_movers(scene, self.moving)
-        cameras, points = scene.cameras, self.points
-        if points is None:
-            points = max(4000, 4 * round(self.length or 0))
+        cameras, points = scene.cameras, self.points or max(4000, 4 * round(self.length or 0))
         print(f"{self.name}: {len(scene.primitives)} solids, {len(cameras)} cameras; looking for points ...")
         processes = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        others = {"exposure": make_exposure(self.exposure, scene), "progress": _progress, "processes": processes}
         sfm = write_dataset(
-            scene, self.folder, points, self.noise, self.outliers, self.images, self.overwrite, **others
-        )
+            scene, self.folder, points, self.noise, self.outliers, self.images, self.overwrite,
+            partial(track, description="Rendering"), exposure=make_exposure(self.exposure, scene), processes=processes,
+        )  # fmt: skip
         test = int(cameras.is_test.sum())
         kind = "images with depths" if self.images else "cameras (no images)"
         print(f"Wrote {self.folder}: {len(cameras)} {kind} of {cameras.width}x{cameras.height} pixels,")
@@ -89,15 +90,9 @@ class SceneCommand:
             " in colmap/sparse/0 and sparse_pc.ply."
         )
         if len(sfm.points) < points:
-            print(f"  The cameras see only so many points well enough: {points} were asked for.")
+            print(f"  The cameras see no more points well enough, and {points} were asked for.")
         if self.images:
             print(f"Next: ns-train mmpi-small --data {quoted(self.folder)}")
-
-
-def _progress(images: Iterable[int]) -> Iterator[int]:
-    from rich.progress import track
-
-    yield from track(images, description="Rendering")
 
 
 def entrypoint() -> None:

@@ -40,7 +40,10 @@ def main() -> None:
         _agree(config, rank)
         signal.signal(signal.SIGTERM, lambda *_: _end_early(config.get_base_dir()))
         train_loop(rank, processes, config)
-        _wait_for_others(config.get_base_dir())
+        try:
+            dist.barrier()
+        except RuntimeError:  # gloo's own words name a socket
+            _end_early(config.get_base_dir())
         if rank == 0:
             print(f"All windows are trained: ns-eval --load-config {quoted(config.get_base_dir() / 'config.yml')}")
     finally:
@@ -49,7 +52,7 @@ def main() -> None:
 
 
 def _end_early(folder: Path) -> NoReturn:
-    """torchrun ends all processes when one dies, and gives them little time to say so."""
+    """Ends this process with a message; torchrun ends all when one dies, and leaves little time for it."""
     message = (
         "Ended early: another process died (see above) or the run was stopped. Finished windows lie in "
         f"{folder / 'windows'}; the same command with --load-dir {quoted(folder / 'nerfstudio_models')} goes on from "
@@ -59,21 +62,14 @@ def _end_early(folder: Path) -> NoReturn:
     sys.exit(1)
 
 
-def _wait_for_others(folder: Path) -> None:
-    try:
-        dist.barrier()
-    except RuntimeError:  # gloo's own words name a socket
-        _end_early(folder)
-
-
 def _agree(config: TrainerConfig, rank: int) -> None:
-    """One folder for all processes, with one config.yml."""
+    """Gives all processes the same folder, with one config.yml."""
     if config.data:
         config.pipeline.datamanager.data = config.data
     config.set_timestamp()
-    said = [config.timestamp]
-    dist.broadcast_object_list(said, src=0)
-    config.timestamp = said[0]
+    timestamps = [config.timestamp]
+    dist.broadcast_object_list(timestamps, src=0)
+    config.timestamp = timestamps[0]
     if rank == 0:
         config.print_to_terminal()
         config.save_config()

@@ -24,7 +24,7 @@ class Cameras:
     width: int
     height: int
     test_every: int
-    """One image in so many is held out."""
+    """Each n-th image is held out."""
     distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     """k1, k2, p1, p2 of OpenCV's lens model; zeros: a pinhole."""
 
@@ -51,12 +51,6 @@ class Cameras:
     def central_tangents(self) -> Array:
         """[H * W, 2] tangents of the pixel centres, row after row."""
         return self.tangents(self.pixel_centers)
-
-    @cached_property
-    def _widest_tangent(self) -> float:
-        """A little beyond what the corners see."""
-        corners = np.array([[x, y] for x in (0.0, self.width) for y in (0.0, self.height)])
-        return 1.05 * float(np.linalg.norm(self.tangents(corners), axis=-1).max())
 
     def tangents(self, pixels: Array) -> Array:
         """Tangents [N, 2] (to the right, downwards) at which the lens sees pixels [N, 2]."""
@@ -108,7 +102,9 @@ class Cameras:
         tangents = np.stack([local[:, 0], -local[:, 1]], -1) / safe[:, None]
         if any(self.distortion):
             # Beyond the corners the polynomial would fold back into the image: from there on it is extended straight.
-            shrink = np.maximum(np.linalg.norm(tangents, axis=-1, keepdims=True) / self._widest_tangent, 1)
+            corners = np.array([[x, y] for x in (0.0, self.width) for y in (0.0, self.height)])
+            widest = 1.05 * float(np.linalg.norm(self.tangents(corners), axis=-1).max())
+            shrink = np.maximum(np.linalg.norm(tangents, axis=-1, keepdims=True) / widest, 1)
             tangents = self._distort(tangents / shrink)[0] * shrink
         return tangents * self.focal + self.center, depth
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from mmpi_ns.synthetic import indoor, street, walk
+from mmpi_ns.synthetic import indoor, street
 from mmpi_ns.synthetic.scene import Scene
 
 
@@ -25,7 +25,7 @@ class Entry:
 SCENES: dict[str, Entry] = {
     "street": Entry(street.street, 320, 96, 64, 40.0),
     "long-road": Entry(street.long_road, 320, 96, 0, 1000.0),
-    "walk": Entry(walk.walk, 960, 540, 300, 60.0),
+    "walk": Entry(street.walk, 960, 540, 300, 60.0),
     "room": Entry(indoor.room),
     "look-round": Entry(indoor.look_round, count=36),
     "object": Entry(indoor.orbited, count=48),
@@ -60,9 +60,7 @@ def make_scene(
     sizes = {"width": entry.width if width is None else width, "height": entry.height if height is None else height}
     if length is not None and entry.length is None:
         raise ValueError(f"The scene {name} has no length: leave it out, or choose street, long-road or walk.")
-    drive: dict[str, float] = {}
-    if entry.length is not None:
-        drive["length"] = entry.length if length is None else length
+    drive: dict[str, float] = {} if entry.length is None else {"length": entry.length if length is None else length}
     images = count if count is not None else entry.count or int(drive["length"] / FRAME_SPACING) + 1
     for what, value in {"count": images, **sizes, **drive}.items():
         if not value > 0:

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
 from functools import partial
 from multiprocessing import get_all_start_methods, get_context
 from pathlib import Path
@@ -70,17 +69,12 @@ def write_dataset(
     sfm = sfm_points(scene, points, noise_pixels, outliers)
     clear(folder)
     if tracks:
-        model = colmap_model(scene, sfm)
-        (folder / "colmap" / "sparse" / "0").mkdir(parents=True)
-        model.write(folder / "colmap" / "sparse" / "0")
+        model, sparse = colmap_model(scene, sfm), folder / "colmap" / "sparse" / "0"
+        sparse.mkdir(parents=True)
+        model.write(sparse)
         model.export_PLY(folder / "sparse_pc.ply")
-    for part in ("images", "depths", *(["moving"] if scene.movers else [])) if images else ():
-        (folder / part).mkdir()
     if images:
-        write = partial(_write_image, scene, folder, exposure)
-        with _side_by_side(write, len(scene.cameras), processes) as written:
-            for _ in progress(range(len(scene.cameras))):
-                next(written)
+        _write_images(scene, folder, exposure, progress, processes)
     if exposure is not None:
         names = [f"images/{image_name(i)}" for i in range(len(scene.cameras))]
         (folder / "exposure.json").write_text(json.dumps(exposure.to_object(names), indent=1))
@@ -120,24 +114,35 @@ _job: Callable[[int], None]
 """What each process of a pool does with a number: inherited, as closures cannot be sent."""
 
 
+def _adopt(job: Callable[[int], None]) -> None:
+    global _job
+    _job = job
+
+
 def _do(number: int) -> None:
     _job(number)
 
 
-@contextmanager
-def _side_by_side(job: Callable[[int], None], count: int, processes: int) -> Iterator[Iterator[None]]:
-    """``job`` of 0 to count - 1, in order, by forked processes if there are several and the system can fork."""
+def _write_images(
+    scene: Scene,
+    folder: Path,
+    exposure: Exposure | None,
+    progress: Callable[[Iterable[int]], Iterable[int]],
+    processes: int,
+) -> None:
+    """Renders and writes all images, by forked processes if there are several and the system can fork."""
+    for part in ("images", "depths", *(["moving"] if scene.movers else [])):
+        (folder / part).mkdir()
+    job, count = partial(_write_image, scene, folder, exposure), len(scene.cameras)
     if min(processes, count) < 2 or "fork" not in get_all_start_methods():
-        yield map(job, range(count))
+        for camera in progress(range(count)):
+            job(camera)
         return
-
-    def adopt() -> None:
-        global _job
-        _job = job
-
-    pool = ProcessPoolExecutor(min(processes, count), get_context("fork"), adopt)
+    pool = ProcessPoolExecutor(min(processes, count), get_context("fork"), _adopt, (job,))
     try:
-        yield pool.map(_do, range(count))
+        written = pool.map(_do, range(count))
+        for _ in progress(range(count)):
+            next(written)
     finally:
         pool.shutdown(cancel_futures=True)
 
@@ -191,28 +196,20 @@ def colmap_model(scene: Scene, sfm: SfmPoints) -> Any:
     """The cameras, points and tracks as a ``pycolmap.Reconstruction``; image and point ids count from 1."""
     import pycolmap  # a machine with a GPU may lack it
 
-    cameras, points = scene.cameras, sfm.points
+    cameras, points, is_bent = scene.cameras, sfm.points, any(scene.cameras.distortion)
+    params = [cameras.focal, cameras.focal, *cameras.center, *(cameras.distortion if is_bent else ())]
+    size = {"width": cameras.width, "height": cameras.height}
+    camera = pycolmap.Camera(model="OPENCV" if is_bent else "PINHOLE", params=params, camera_id=1, **size)
     model = pycolmap.Reconstruction()
-    intrinsics = [cameras.focal, cameras.focal, *cameras.center]
-    model.add_camera_with_trivial_rig(
-        pycolmap.Camera(
-            model="OPENCV" if any(cameras.distortion) else "PINHOLE",
-            width=cameras.width,
-            height=cameras.height,
-            params=[*intrinsics, *(cameras.distortion if any(cameras.distortion) else ())],
-            camera_id=1,
-        )
-    )
+    model.add_camera_with_trivial_rig(camera)
     by_camera = np.argsort(sfm.camera, kind="stable")
     bounds = np.searchsorted(sfm.camera[by_camera], np.arange(len(cameras) + 1))
     slot = np.empty(len(by_camera), np.int64)
     for i, pose in enumerate(cameras.camera_to_worlds):
-        these = by_camera[bounds[i] : bounds[i + 1]]
-        slot[these] = np.arange(len(these))
-        # World to camera, with y down and z ahead.
-        rotation = np.diag([1.0, -1.0, -1.0]) @ pose[:, :3].T
-        pixels = sfm.pixel[these]
-        image = pycolmap.Image(name=image_name(i), camera_id=1, image_id=i + 1, keypoints=pixels)
+        rows = by_camera[bounds[i] : bounds[i + 1]]
+        slot[rows] = np.arange(len(rows))
+        rotation = np.diag([1.0, -1.0, -1.0]) @ pose[:, :3].T  # world to camera, with y down and z ahead
+        image = pycolmap.Image(name=image_name(i), camera_id=1, image_id=i + 1, keypoints=sfm.pixel[rows])
         rigid = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -rotation @ pose[:, 3])
         model.add_image_with_trivial_frame(image, rigid)
     starts = np.searchsorted(sfm.point, np.arange(len(points) + 1))

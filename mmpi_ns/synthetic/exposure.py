@@ -92,8 +92,12 @@ def make_exposure(name: ExposureName, scene: Scene) -> Exposure | None:
         return None
     count, log_gains = len(scene.cameras), np.zeros((len(scene.cameras), 3))
     if name == "auto":
-        metered = np.log([_light_seen(scene, i) for i in range(count)])
-        followed = metered.copy()
+        cameras, (across, down) = scene.cameras, METERED
+        x, y = np.meshgrid((np.arange(across) + 0.5) / across, (np.arange(down) + 0.5) / down)
+        pixels: Array = np.stack([x, y], -1).reshape(-1, 2) * np.array([cameras.width, cameras.height], np.float64)
+        pixel = cameras.width / across / cameras.focal
+        seen = (scene.trace(*cameras.rays(i, pixels), pixel)[1] for i in range(count))
+        followed = np.log([float(light_of(colors).mean()) for colors in seen])
         for i in range(1, count):
             followed[i] += (1 - 1 / LAG) * (followed[i - 1] - followed[i])
         spread = np.ptp(followed)
@@ -104,12 +108,3 @@ def make_exposure(name: ExposureName, scene: Scene) -> Exposure | None:
         warmth = np.log1p(WHITE_BALANCE) * np.sin(2 * np.pi * np.arange(count) / period + phase)
         log_gains += warmth[:, None] * [1.0, 0.0, -1.0]
     return Exposure(np.exp(log_gains), LOST[name])
-
-
-def _light_seen(scene: Scene, camera: int) -> float:
-    """Mean light of an image, from a few of its rays."""
-    cameras, (across, down) = scene.cameras, METERED
-    x, y = np.meshgrid((np.arange(across) + 0.5) / across, (np.arange(down) + 0.5) / down)
-    pixels: Array = np.stack([x, y], -1).reshape(-1, 2) * np.array([cameras.width, cameras.height], np.float64)
-    pixel = cameras.width / across / cameras.focal
-    return float(light_of(scene.trace(*cameras.rays(camera, pixels), pixel)[1]).mean())

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import numpy as np
 
 from mmpi_ns.synthetic.cameras import Cameras
-from mmpi_ns.synthetic.kit import BEIGE, BROWN, GRAY, GREEN, PAINTS, PALE_GREEN, WALLS, WHITE, Kit, look, look_at
+from mmpi_ns.synthetic.kit import BEIGE, BROWN, GRAY, GREEN, PAINTS, PALE_GREEN, WALLS, WHITE, Kit, look
 from mmpi_ns.synthetic.scene import Light, Scene
 from mmpi_ns.synthetic.surroundings import floor_inside, meadow, open_sky
 
@@ -22,34 +24,24 @@ class Room(Kit):
         super().__init__(seed, 11)
         self.shell()
         self.table()
-        self.along_walls()
-        self.pictures()
+        self.walls()
 
     def shell(self) -> None:
         (w, d, h), t = ROOM, 0.16
         paper = (self.pick(WALLS), self.pick(WALLS), self.varied(WHITE))
         self.box((0, 0, h + t / 2), (w, d, t), "wood", WHITE, (0.8, 0.77, 0.68))
-        self.box(
-            (w / 2 + t / 2, 0, h / 2), (t, d, h), "bricks", paper[0], self.varied(paper[0], 0.2), (0.8, 0.78, 0.72)
-        )
+        mortar = (0.8, 0.78, 0.72)
+        self.box((w / 2 + t / 2, 0, h / 2), (t, d, h), "bricks", paper[0], self.varied(paper[0], 0.2), mortar)
         self.box((-w / 2 - t / 2, 0, h / 2), (t, d, h), "stripes", *paper)
         self.box((0, -d / 2 - t / 2, h / 2), (w, t, h), "plaster", paper[1], self.varied(paper[1], 0.2))
         # The far wall has a window: four pieces round a hole, through which the sky shows.
         left, right, sill, top = -1.3, 1.1, 0.95, 2.15
         y = d / 2 + t / 2
         for x0, x1, z0, z1 in (
-            (-w / 2, left, 0, h),
-            (right, w / 2, 0, h),
-            (left, right, 0, sill),
-            (left, right, top, h),
-        ):
-            self.box(
-                ((x0 + x1) / 2, y, (z0 + z1) / 2),
-                (x1 - x0, t, z1 - z0),
-                "checker",
-                paper[1],
-                self.varied(paper[1], 0.2),
-            )
+            (-w / 2, left, 0, h), (right, w / 2, 0, h), (left, right, 0, sill), (left, right, top, h),
+        ):  # fmt: skip
+            center, size = ((x0 + x1) / 2, y, (z0 + z1) / 2), (x1 - x0, t, z1 - z0)
+            self.box(center, size, "checker", paper[1], self.varied(paper[1], 0.2))
         for x in (left + 0.04, (left + right) / 2, right - 0.04):
             self.box((x, y, (sill + top) / 2), (0.08, 0.1, top - sill), "wood", WHITE, (0.85, 0.82, 0.75))
         for z in (sill + 0.04, top - 0.04):
@@ -61,36 +53,29 @@ class Room(Kit):
 
     def table(self) -> None:
         self.standing((0, 0, 0.72), (1.7, 1.0, 0.05), "wood", OAK, DARK_OAK)
-        for x in (-0.75, 0.75):
-            for y in (-0.4, 0.4):
-                self.standing((x, y, 0), (0.08, 0.08, 0.72), "wood", DARK_OAK, BROWN)
+        for x, y in product((-0.75, 0.75), (-0.4, 0.4)):
+            self.standing((x, y, 0), (0.08, 0.08, 0.72), "wood", DARK_OAK, BROWN)
         self.standing((0, 0, 0), (2.6, 1.9, 0.012), "checker", (0.66, 0.2, 0.18), (0.86, 0.72, 0.5))
         for x, y, yaw in ((-0.42, -0.8, 0.15), (0.45, -0.78, -0.1), (-0.4, 0.82, 3.2), (0.42, 0.8, 2.9)):
-            self.chair(x, y, yaw)
+            c, s, seat = np.cos(yaw), np.sin(yaw), self.pick(PAINTS)
+            colors = (seat, self.varied(seat, 0.4), WHITE)
+            self.standing((x, y, 0.42), (0.44, 0.44, 0.05), "stripes", *colors, yaw=yaw)
+            back = (x + s * 0.2, y - c * 0.2, 0.47)
+            self.standing(back, (0.44, 0.04, 0.46), "wood", OAK, DARK_OAK, yaw=yaw)
+            for u, v in product((-0.19, 0.19), repeat=2):
+                leg = (x + c * u - s * v, y + s * u + c * v, 0)
+                self.standing(leg, (0.04, 0.04, 0.42), "wood", DARK_OAK, BROWN, yaw=yaw)
         self.sphere((0.1, 0.05, 0.77 + 0.16), 0.16, "stripes", (0.2, 0.4, 0.62), WHITE, (0.85, 0.6, 0.2))
         self.cylinder((-0.3, 0.12, 0.77), 0.09, 0.24, "checker", (0.75, 0.5, 0.2), (0.25, 0.2, 0.3))
         self.sphere((-0.3, 0.12, 1.15), 0.2, "foliage", GREEN, PALE_GREEN)
-        self.standing(
-            (0.5, -0.18, 0.77), (0.3, 0.22, 0.06), "painting", *(self.pick(PAINTS) for _ in range(3)), yaw=0.4
-        )
+        covers = [self.pick(PAINTS) for _ in range(3)]
+        self.standing((0.5, -0.18, 0.77), (0.3, 0.22, 0.06), "painting", *covers, yaw=0.4)
         self.standing((0.52, -0.17, 0.83), (0.24, 0.18, 0.05), "checker", self.pick(PAINTS), WHITE, yaw=0.7)
         self.cylinder((-0.55, -0.25, 0.77), 0.05, 0.11, "stripes", WHITE, (0.8, 0.25, 0.2))
         self.cylinder((0, 0, ROOM[2] - 0.07), 0.22, 0.07, "plaster", WHITE, (1.0, 0.95, 0.8))
 
-    def chair(self, x: float, y: float, yaw: float) -> None:
-        c, s = np.cos(yaw), np.sin(yaw)
-
-        def at(u: float, v: float, z: float):
-            return (x + c * u - s * v, y + s * u + c * v, z)
-
-        seat = self.pick(PAINTS)
-        self.standing(at(0, 0, 0.42), (0.44, 0.44, 0.05), "stripes", seat, self.varied(seat, 0.4), WHITE, yaw=yaw)
-        self.standing(at(0, -0.2, 0.47), (0.44, 0.04, 0.46), "wood", OAK, DARK_OAK, yaw=yaw)
-        for u in (-0.19, 0.19):
-            for v in (-0.19, 0.19):
-                self.standing(at(u, v, 0), (0.04, 0.04, 0.42), "wood", DARK_OAK, BROWN, yaw=yaw)
-
-    def along_walls(self) -> None:
+    def walls(self) -> None:
+        """Furniture along the walls, and pictures on them."""
         w, d, _ = ROOM
         self.standing((-w / 2 + 0.18, 0.9, 0), (0.34, 1.9, 2.1), "books", OAK, DARK_OAK)
         self.standing((-w / 2 + 0.22, -1.4, 0), (0.42, 1.5, 0.8), "wood", DARK_OAK, OAK)
@@ -111,9 +96,6 @@ class Room(Kit):
         self.standing((2.0, -d / 2 + 0.3, 0), (0.5, 0.5, 0.6), "checker", DARK_OAK, OAK)
         self.cylinder((2.0, -d / 2 + 0.3, 0.6), 0.04, 0.35, "stripes", GRAY, WHITE)
         self.cylinder((2.0, -d / 2 + 0.3, 0.95), 0.17, 0.24, "stripes", BEIGE, WHITE, (0.8, 0.6, 0.3))
-
-    def pictures(self) -> None:
-        w, d, _ = ROOM
         for x, z, size in ((-2.0, 1.6, 0.8), (-0.6, 1.65, 0.65), (0.75, 1.6, 0.95), (2.3, 1.55, 0.55)):
             colors = [self.pick(PAINTS), self.pick(PAINTS), DARK_OAK]
             self.box((x, -d / 2 + 0.02, z), (size, 0.04, size * 0.75), "painting", *colors)
@@ -172,6 +154,7 @@ def orbited(seed: int, count: int, width: int, height: int) -> Scene:
             kit.standing(place, (0.4, 3.2, 2.3), "bricks", wall, kit.varied(wall, 0.2), GRAY, yaw=angle)
     angle = 2 * np.pi * np.arange(count) / count
     places = np.stack([4.1 * np.cos(angle), 4.1 * np.sin(angle), 1.75 + 0.65 * np.sin(3 * angle + seed)], -1)
-    poses = look_at(places, np.array([0.0, 0.0, 0.85]))
-    cameras = Cameras(poses, 1.05 * width, width, height, test_every=8)
+    toward = np.array([0.0, 0.0, 0.85]) - places
+    yaw, pitch = np.arctan2(toward[:, 1], toward[:, 0]), np.arctan2(toward[:, 2], np.hypot(*toward[:, :2].T))
+    cameras = Cameras(look(places, yaw, pitch), 1.05 * width, width, height, test_every=8)
     return Scene("object", seed, kit.done(), meadow, open_sky, Light((-0.5, -0.35, 0.8)), cameras)

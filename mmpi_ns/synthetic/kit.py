@@ -29,7 +29,7 @@ PAINTS: tuple[Color, ...] = (
 
 
 class Kit:
-    """Adds solids one by one; all randomness comes from its generator."""
+    """Solids added one by one; all randomness comes from the kit's generator."""
 
     def __init__(self, seed: int, topic: int) -> None:
         self.random = np.random.default_rng([seed, topic])
@@ -56,18 +56,19 @@ class Kit:
         self._add(CYLINDER, center, (radius, radius, height / 2), 0.0, material, colors)
 
     def varied(self, color: Color, by: float = 0.07) -> Color:
-        """A colour near this one."""
+        """A colour near another."""
         return tuple((np.array(color) * (1 + self.random.uniform(-by, by, 3))).clip(0, 1))
 
     def pick(self, colors: Sequence[Color]) -> Color:
         return self.varied(colors[self.random.integers(len(colors))])
 
     def done(self) -> Primitives:
+        """All solids."""
         kind, center, half, yaw, material, colors, offset = zip(*self.rows, strict=True)
-        return Primitives(
+        return Primitives.merged(Primitives(
             np.array(kind), np.array(center, float), np.array(half, float), np.array(yaw, float),
             np.array(material), np.array(colors, float), np.array(offset, float),
-        ).sorted()  # fmt: skip
+        ))[0]  # fmt: skip
 
 
 def look(places: Array, yaw: Array, pitch: Array) -> Array:
@@ -77,9 +78,3 @@ def look(places: Array, yaw: Array, pitch: Array) -> Array:
     back = np.stack([-cp * cy, -cp * sy, -sp], -1)
     up = np.cross(back, right)
     return np.asarray(np.stack([right, up, back, places], -1), dtype=np.float64)
-
-
-def look_at(places: Array, target: Array) -> Array:
-    """Poses [M, 3, 4] at places [M, 3] that face a point [3]."""
-    toward = target - places
-    return look(places, np.arctan2(toward[:, 1], toward[:, 0]), np.arctan2(toward[:, 2], np.hypot(*toward[:, :2].T)))

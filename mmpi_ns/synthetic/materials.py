@@ -48,9 +48,8 @@ Material = Callable[[Surface, Noise], Array]
 
 def plaster(s: Surface, noise: Noise) -> Array:
     """One colour, stained: concrete, cloth, ceilings."""
-    return (
-        mix(s.colors[:, 0], s.colors[:, 1], 0.5 + 0.8 * s.noise(noise, 1.7)) * (1 + 0.16 * s.noise(noise, 0.3))[:, None]
-    )
+    color = mix(s.colors[:, 0], s.colors[:, 1], 0.5 + 0.8 * s.noise(noise, 1.7))
+    return color * (1 + 0.16 * s.noise(noise, 0.3))[:, None]
 
 
 def foliage(s: Surface, noise: Noise) -> Array:
@@ -85,12 +84,8 @@ def stripes(s: Surface, noise: Noise) -> Array:
     return color * (1 + 0.2 * s.noise(noise, 2.0))[:, None]
 
 
-def bricks(s: Surface, noise: Noise) -> Array:
-    """Bricks of 0.5 x 0.25 m in bond, mortar of colour 2."""
-    return _bricks(s, noise, 0.5, 0.25)
-
-
-def _bricks(s: Surface, noise: Noise, length: float, height: float) -> Array:
+def bricks(s: Surface, noise: Noise, length: float = 0.5, height: float = 0.25) -> Array:
+    """Bricks in bond, mortar of colour 2."""
     row = np.floor(s.v / height)
     x = s.u / length + 0.5 * (row % 2)
     joint = np.maximum(pulse(x, s.du / length, 0.0, 0.05), pulse(s.v / height, s.dv / height, 0.0, 0.1))
@@ -111,18 +106,13 @@ def facade(s: Surface, noise: Noise) -> Array:
     bottom, top = np.where(is_door, 0.02, 0.3).astype(np.float32), np.where(is_door, 0.76, 0.8).astype(np.float32)
     side = np.where(is_door, 0.34, 0.27).astype(np.float32)
     stone = cell_hash(np.zeros_like(s.u), np.zeros_like(s.u), s.offset[:, 0]) < 0.5
-    wall = np.where(stone[:, None], _bricks(s, noise, 0.62, 0.31), plaster(s, noise))
+    wall = np.where(stone[:, None], bricks(s, noise, 0.62, 0.31), plaster(s, noise))
     wall = mix(wall, s.colors[:, 2], band(s.v, s.dv, s.height - 0.35, s.height) * 0.8)
     wall = mix(wall, wall * 0.62, band(s.v, s.dv, 0.0, 0.55))
     wall = mix(wall, wall * 0.7, 0.6 * pulse(y, dy, 0.0, 0.045) * (floor > 0))
     frame = pulse(x, dx, side - 0.05, 0.95 - side + 0.1) * pulse(y, dy, np.maximum(bottom - 0.05, 0), top + 0.05)
     wall = mix(wall, s.colors[:, 2], frame)
-    return _panes(s, noise, wall, (x, dx, side), (y, dy, bottom, top), is_door)
-
-
-def _panes(s: Surface, noise: Noise, wall: Array, across: tuple, up: tuple, is_door: NDArray[np.bool_]) -> Array:
-    """Glass and door leaves into the frames of a facade."""
-    (x, dx, side), (y, dy, bottom, top) = across, up
+    # Glass and door leaves in the frames.
     pane = pulse(x, dx, side, 1 - side) * pulse(y, dy, bottom, top)
     tone = cell_hash(np.floor(x), np.floor(y), s.offset[:, 0] + 3)
     share = np.clip(y - np.floor(y), 0, 1)

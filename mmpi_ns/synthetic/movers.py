@@ -5,7 +5,8 @@ Test images hold none of them: their truth is the street without movers.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,54 +30,44 @@ CHANGED = 1 / 255
 """Change of a colour from which on a shadow counts."""
 
 
-@dataclass(frozen=True)
-class Movers:
-    """N cars and people along a road, as functions of time."""
+def movers_at(seed: int, road: Road, count: int, along: Array, walks: bool, camera: int) -> Primitives:
+    """Cars and people when an image is taken: in turns oncoming, ahead of the camera, crossing, on the pavement, and
+    overtaking.
 
-    seed: int
-    road: Road
-    count: int
-    along: Array
-    """[M] metres along the road of each camera."""
-    walks: bool
-    """Whether the cameras walk; else they drive."""
-
-    @property
-    def seconds(self) -> Array:
-        """[M] at which each image is taken."""
-        return (self.along - self.along[0]) / (WALKING if self.walks else DRIVING)
-
-    def solids(self, camera: int) -> Primitives:
-        """The movers when an image is taken."""
-        now, kits = float(self.seconds[camera]), []
-        for number in range(self.count):
-            # The same draws for every image: a mover keeps its looks.
-            kit = Street(self.seed, self.road, topic=100 + number)
-            self._add(kit, number, now)
-            kits += kit.rows
-        everything = Street(self.seed, self.road)
-        everything.rows = kits
-        return everything.done()
-
-    def _add(self, kit: Street, number: int, now: float) -> None:
-        """One mover: in turns oncoming, ahead of the camera, crossing, on the pavement, overtaking."""
-        meets = float(kit.random.uniform(0.1, 0.9)) * float(self.seconds[-1])
-        since, speed = now - meets, WALKING if self.walks else DRIVING
-        camera = float(np.interp(now, self.seconds, self.along))
-        met = float(np.interp(meets, self.seconds, self.along))
+    Args:
+        seed: of their places and looks.
+        road: along which they move.
+        count: of cars and people.
+        along: metres along the road of each camera. [M]
+        walks: whether the cameras walk; else they drive.
+        camera: number of the image.
+    """
+    speed, rows = WALKING if walks else DRIVING, []
+    seconds = (along - along[0]) / speed
+    now = float(seconds[camera])
+    ego = float(np.interp(now, seconds, along))
+    for number in range(count):
+        # The same draws for every image: a mover keeps its looks.
+        kit = Street(seed, road, topic=100 + number)
+        meets = float(kit.random.uniform(0.1, 0.9)) * float(seconds[-1])
+        since, met = now - meets, float(np.interp(meets, seconds, along))
         paint, side = kit.pick(PAINTS), float(kit.random.choice([-1, 1]))
         if number % 5 == 0:
             kit.car(met + 8 - DRIVING * since, LANE, paint)
-        elif number % 5 == 1 and self.walks:
-            _add_person(kit, camera + float(kit.random.uniform(4, 8)), float(kit.random.uniform(-1.2, 0.6)), paint, now)
+        elif number % 5 == 1 and walks:
+            _add_person(kit, ego + float(kit.random.uniform(4, 8)), float(kit.random.uniform(-1.2, 0.6)), paint, now)
         elif number % 5 == 1:
-            kit.car(camera + 9, -LANE, paint)
+            kit.car(ego + 9, -LANE, paint)
         elif number % 5 == 2:
-            _add_person(kit, met + (7 if self.walks else 18), side * WALKING * since, paint, now)
+            _add_person(kit, met + (7 if walks else 18), side * WALKING * since, paint, now)
         elif number % 5 == 3:
             _add_person(kit, met + 5 - WALKING * since, side * PAVEMENT, paint, now)
         else:
             kit.car(met + 8 + (speed + 4) * since, LANE, paint)
+        rows += kit.rows
+    movers = Street(seed, road)
+    movers.rows = rows
+    return movers.done()
 
 
 def _add_person(kit: Street, along: float, aside: float, paint, now: float) -> None:
@@ -90,7 +81,7 @@ def _add_person(kit: Street, along: float, aside: float, paint, now: float) -> N
 
 
 def with_movers(scene: Scene, count: int) -> Scene:
-    """The scene with so many movers in its training images.
+    """The scene with ``count`` movers in its training images.
 
     Raises:
         ValueError: the scene has no road.
@@ -98,7 +89,7 @@ def with_movers(scene: Scene, count: int) -> Scene:
     if scene.road is None:
         raise ValueError(f"Nothing moves in the scene {scene.name}: choose street, long-road or walk.")
     along = scene.road.locate(scene.cameras.camera_to_worlds[:, :2, 3])[0]
-    return replace(scene, movers=Movers(scene.seed, scene.road, count, along, scene.name == "walk").solids)
+    return replace(scene, movers=partial(movers_at, scene.seed, scene.road, count, along, scene.name == "walk"))
 
 
 def moving_mask(scene: Scene, camera: int, supersample: int = 3) -> NDArray[np.uint8]:

@@ -50,13 +50,12 @@ class Primitives:
     def take(self, rows: NDArray[np.int64]) -> Primitives:
         return Primitives(*(getattr(self, f.name)[rows] for f in fields(self)))
 
-    def joined(self, other: Primitives) -> Primitives:
-        """These and others, sorted."""
-        both = (np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self))
-        return Primitives(*both).sorted()
-
-    def sorted(self) -> Primitives:
-        return self.take(np.argsort(self.center[:, 0], kind="stable"))
+    @staticmethod
+    def merged(*parts: Primitives) -> tuple[Primitives, NDArray[np.int64]]:
+        """All parts as one, sorted, and the number of the part that each solid comes from. [P]"""
+        every = Primitives(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Primitives)))
+        order = np.argsort(every.center[:, 0], kind="stable")
+        return every.take(order), np.repeat(np.arange(len(parts)), [len(p) for p in parts])[order]
 
 
 def to_local(vectors: Array, yaw: Array) -> Array:
@@ -91,12 +90,12 @@ class Tracer:
     def __call__(
         self, origins: Array, directions: Array, limit: float | None = None
     ) -> tuple[Array, NDArray[np.int64]]:
-        """Distance [R] to the first solid within reach (inf where there is none) and its row (-1).
+        """Distance [R] to the first solid within reach (inf for none) and its row (-1).
 
         Args:
             origins: [R, 3]
             directions: [R, 3] unit vectors.
-            limit: nothing farther is asked for, where that is less than the reach.
+            limit: distance beyond which hits do not count, if less than the reach.
         """
         distance, row = np.full(len(directions), np.inf), np.full(len(directions), -1)
         if not len(directions) or not len(self.primitives):
@@ -104,24 +103,47 @@ class Tracer:
         reach = self.reach if limit is None else min(limit, self.reach)
         near = self.near(origins[:, 0].min(), origins[:, 0].max(), reach)
         for start in range(0, len(directions), PACKET):
-            self._packet(
-                near, origins, directions, slice(start, min(start + PACKET, len(directions))), reach, distance, row
-            )
+            s = slice(start, start + PACKET)
+            distance[s], row[s] = self._packet(near, origins[s], directions[s], reach)
         return distance, row
 
-    def _packet(self, rows, origins, directions, rays: slice, reach: float, distance: Array, row: NDArray) -> None:
-        """Fills in a packet; halves it where it would have to be tested against too much."""
-        rows = self.in_cone(rows, origins[rays], directions[rays], reach)
-        size = rays.stop - rays.start
+    def _packet(
+        self, rows: NDArray[np.int64], origins: Array, directions: Array, reach: float
+    ) -> tuple[Array, NDArray[np.int64]]:
+        """First hits of a packet among ``rows``; a packet that would be tested against too much is halved."""
+        rows, size = self.in_cone(rows, origins, directions, reach), len(directions)
         if size > 256 and size * len(rows) > 100_000:
-            middle = rays.start + size // 2
-            for half in (slice(rays.start, middle), slice(middle, rays.stop)):
-                self._packet(rows, origins, directions, half, reach, distance, row)
-        elif len(rows):
-            distance[rays], row[rays] = self._first(rows, origins[rays], directions[rays], reach)
+            halves = (slice(None, size // 2), slice(size // 2, None))
+            hits = [self._packet(rows, origins[h], directions[h], reach) for h in halves]
+            return np.concatenate([d for d, _ in hits]), np.concatenate([solids for _, solids in hits])
+        nearest, first_solid = np.full(size, np.inf), np.full(size, -1)
+        # Pairs in which a ray meets a solid's bounding sphere, sorted by ray.
+        apex = origins[0]
+        center, start = self.primitives.center[rows] - apex, origins - apex
+        square = (self.radius[rows] * (1 + 1e-6) + 1e-6) ** 2
+        along = directions @ center.T - dot(start, directions)[:, None]
+        away = dot(center, center) + dot(start, start)[:, None]
+        if start.any():
+            away -= 2 * start @ center.T
+        ray, column = np.nonzero((away - along**2 <= square) & ((along > 0) | (away <= square)))
+        if not len(ray):
+            return nearest, first_solid
+        solid = rows[column]
+        t, kind = np.empty(len(ray)), self.primitives.kind[solid]
+        for k, distances in ((BOX, box_distance), (SPHERE, sphere_distance), (CYLINDER, cylinder_distance)):
+            pairs = np.flatnonzero(kind == k)
+            shape = (getattr(self.primitives, name)[solid[pairs]] for name in ("center", "half", "yaw"))
+            t[pairs] = distances(origins[ray[pairs]], directions[ray[pairs]], *shape)
+        t[t >= reach] = np.inf
+        # The nearest of each ray is a minimum over a run of pairs.
+        starts = np.flatnonzero(np.diff(ray, prepend=-1))
+        nearest[ray[starts]] = np.minimum.reduceat(t, starts)
+        first = np.flatnonzero((t == nearest[ray]) & np.isfinite(t))[::-1]
+        first_solid[ray[first]] = solid[first]
+        return nearest, first_solid
 
     def in_cone(self, rows: NDArray[np.int64], origins: Array, directions: Array, reach: float) -> NDArray[np.int64]:
-        """Those of ``rows`` that the rays of a packet may meet."""
+        """The subset of ``rows`` that the rays of a packet may meet."""
         apex, axis = origins.mean(0), directions.mean(0)
         shift = origins - apex
         spread = np.sqrt(dot(shift, shift).max())
@@ -135,92 +157,51 @@ class Tracer:
         inside = angle <= np.arccos(np.clip(cosine, -1, 1)) + 1e-6
         return rows[touching | (inside & (distance - radius < reach))]
 
-    def _first(
-        self, rows: NDArray[np.int64], origins: Array, directions: Array, reach: float
-    ) -> tuple[Array, NDArray[np.int64]]:
-        best, solids = np.full(len(directions), np.inf), np.full(len(directions), -1)
-        ray, column = self._touching(rows, origins, directions)
-        if not len(ray):
-            return best, solids
-        solid = rows[column]
-        t, kind = np.empty(len(ray)), self.primitives.kind[solid]
-        for k, distances in ((BOX, box_distance), (SPHERE, sphere_distance), (CYLINDER, cylinder_distance)):
-            these = np.flatnonzero(kind == k)
-            shape = Shape(*(getattr(self.primitives, f)[solid[these]] for f in ("center", "half", "yaw")))
-            t[these] = distances(origins[ray[these]], directions[ray[these]], shape)
-        t[t >= reach] = np.inf
-        # Pairs come sorted by ray, so the nearest of each ray is a minimum over a run.
-        starts = np.flatnonzero(np.diff(ray, prepend=-1))
-        best[ray[starts]] = np.minimum.reduceat(t, starts)
-        first = np.flatnonzero((t == best[ray]) & np.isfinite(t))[::-1]
-        solids[ray[first]] = solid[first]
-        return best, solids
-
-    def _touching(self, rows: NDArray[np.int64], origins: Array, directions: Array) -> tuple[NDArray, NDArray]:
-        """Pairs (ray, column of ``rows``) in which the ray meets the solid's bounding sphere, sorted by ray."""
-        apex = origins[0]
-        center, start = self.primitives.center[rows] - apex, origins - apex
-        square = (self.radius[rows] * (1 + 1e-6) + 1e-6) ** 2
-        along = directions @ center.T - dot(start, directions)[:, None]
-        away = dot(center, center) + dot(start, start)[:, None]
-        if start.any():
-            away -= 2 * start @ center.T
-        meets = (away - along**2 <= square) & ((along > 0) | (away <= square))
-        ray, column = np.nonzero(meets)
-        return ray, column
-
-
-@dataclass(frozen=True)
-class Shape:
-    """One solid for each ray."""
-
-    center: Array
-    """[R, 3]"""
-    half: Array
-    """[R, 3] as in Primitives."""
-    yaw: Array
-    """[R]"""
-
 
 def _inverse(x: Array) -> Array:
     return 1.0 / np.where(np.abs(x) < 1e-14, 1e-14, x)
 
 
-def box_distance(origins: Array, directions: Array, box: Shape) -> Array:
-    """Distance [R] at which rays enter a box, inf where they miss it or start inside."""
-    o, d = (origins - box.center).T, directions.T
-    c, sn = np.cos(box.yaw), np.sin(box.yaw)
+def box_distance(origins: Array, directions: Array, center: Array, half: Array, yaw: Array) -> Array:
+    """Distance [R] at which rays enter a box, each its own, inf where they miss it or start inside.
+
+    Args:
+        origins, directions: of the rays. [R, 3]
+        center, half, yaw: of the boxes, as in ``Primitives``; [R, 3], [R, 3] and [R].
+    """
+    o, d = (origins - center).T, directions.T
+    c, sn = np.cos(yaw), np.sin(yaw)
     enter, leave = np.full(len(directions), -np.inf), np.full(len(directions), np.inf)
-    for axis, half in enumerate(box.half.T):
+    for axis, extent in enumerate(half.T):
         # Along the box's own axes; the third is the world's.
         start, step = (v[2] if axis == 2 else c * v[axis] + (sn if axis == 0 else -sn) * v[1 - axis] for v in (o, d))
         inverse = _inverse(step)
-        middle, reach = -start * inverse, half * np.abs(inverse)
+        middle, reach = -start * inverse, extent * np.abs(inverse)
         enter, leave = np.maximum(enter, middle - reach), np.minimum(leave, middle + reach)
     return np.where((enter <= leave) & (enter > START), enter, np.inf)
 
 
-def sphere_distance(origins: Array, directions: Array, sphere: Shape) -> Array:
-    """Distance [R] at which rays enter a sphere, inf where they miss it or start inside."""
-    o = origins - sphere.center
+def sphere_distance(origins: Array, directions: Array, center: Array, half: Array, yaw: Array) -> Array:
+    """The same for spheres."""
+    o = origins - center
     along = dot(o, directions)
     # From the nearest point of the ray: |o|^2 - along^2 would lose the digits of a far, small sphere.
     nearest = o - along[:, None] * directions
     aside = dot(nearest, nearest)
-    inside = sphere.half[:, 0] ** 2 - aside
+    inside = half[:, 0] ** 2 - aside
     t = -along - np.sqrt(np.maximum(inside, 0))
     return np.where((inside > 0) & (t > START), t, np.inf)
 
 
-def cylinder_distance(origins: Array, directions: Array, cylinder: Shape) -> Array:
-    """Distance [R] at which rays enter an upright cylinder, inf where they miss it or start inside."""
-    o, d, (radius, _, half) = origins - cylinder.center, directions, cylinder.half.T
+def cylinder_distance(origins: Array, directions: Array, center: Array, half: Array, yaw: Array) -> Array:
+    """The same for upright cylinders."""
+    o, d, (radius, _, half_height) = origins - center, directions, half.T
     flat = np.maximum(dot(d[:, :2], d[:, :2]), 1e-28)
     along = dot(o[:, :2], d[:, :2]) / flat
     nearest = o[:, :2] - along[:, None] * d[:, :2]
     aside = dot(nearest, nearest)
     root = np.sqrt(np.maximum(radius**2 - aside, 0) / flat)
     inverse = _inverse(d[:, 2])
-    middle, reach = -o[:, 2] * inverse, half * np.abs(inverse)
+    middle, reach = -o[:, 2] * inverse, half_height * np.abs(inverse)
     enter, leave = np.maximum(-along - root, middle - reach), np.minimum(-along + root, middle + reach)
     return np.where((aside < radius**2) & (enter <= leave) & (enter > START), enter, np.inf)

@@ -33,27 +33,27 @@ class Road:
     pavement: float = 8.6
     """... to the house fronts."""
 
-    def y(self, x: Array) -> Array:
-        return sum((a * np.sin(2 * np.pi * x / w + p) for a, w, p in self.waves), np.zeros_like(x))
-
-    def slope(self, x: Array) -> Array:
-        return sum((a * 2 * np.pi / w * np.cos(2 * np.pi * x / w + p) for a, w, p in self.waves), np.zeros_like(x))
+    def curve(self, x: Array) -> tuple[Array, Array]:
+        """The curve's y and slope at x."""
+        turns = [(a, w, 2 * np.pi * x / w + p) for a, w, p in self.waves]
+        slopes = (a * 2 * np.pi / w * np.cos(turn) for a, w, turn in turns)
+        return sum((a * np.sin(turn) for a, _, turn in turns), np.zeros_like(x)), sum(slopes, np.zeros_like(x))
 
     @cached_property
     def _table(self) -> tuple[Array, Array]:
         """Knots x and the arc length from x = 0 there."""
         x = np.arange(-self.before - 50, self.length + self.beyond + 50, STEP)
         # Simpson's rule on each interval.
-        speed = [np.hypot(1, self.slope(x + k * STEP / 2)) for k in range(3)]
+        speed = [np.hypot(1, self.curve(x + k * STEP / 2)[1]) for k in range(3)]
         arc = np.concatenate([[0.0], np.cumsum(STEP / 6 * (speed[0] + 4 * speed[1] + speed[2]))[:-1]])
         return x, arc - np.interp(0.0, x, arc)
 
     def at(self, along: Array, aside: Array | float = 0.0) -> tuple[Array, Array]:
-        """Places [N, 2] at an arc length and so far to the left of the middle line, and the heading there [N]."""
+        """Places [N, 2] at arc lengths, ``aside`` to the left of the middle line, and the headings there [N]."""
         x, arc = self._table
         x = np.interp(along, arc, x)
-        heading = np.arctan(self.slope(x))
-        middle = np.stack([x, self.y(x)], -1)
+        y, slope = self.curve(x)
+        heading, middle = np.arctan(slope), np.stack([x, y], -1)
         return middle + np.stack([-np.sin(heading), np.cos(heading)], -1) * np.asarray(aside)[..., None], heading
 
     def locate(self, places: Array) -> tuple[Array, Array, Array]:
@@ -62,11 +62,11 @@ class Road:
             return places[:, 0], places[:, 1], np.zeros(len(places))
         foot = places[:, 0]
         for _ in range(2):
-            slope = self.slope(foot)
+            y, slope = self.curve(foot)
             # Newton on the foot of the perpendicular; the second derivative is left out, as bends are wide.
-            foot = foot + ((places[:, 0] - foot) + (places[:, 1] - self.y(foot)) * slope) / (1 + slope**2)
+            foot = foot + ((places[:, 0] - foot) + (places[:, 1] - y) * slope) / (1 + slope**2)
         x, arc = self._table
-        heading = np.arctan(self.slope(foot))
-        offset = places - np.stack([foot, self.y(foot)], -1)
+        y, slope = self.curve(foot)
+        heading, offset = np.arctan(slope), places - np.stack([foot, y], -1)
         aside = offset[:, 1] * np.cos(heading) - offset[:, 0] * np.sin(heading)
         return np.interp(foot, x, arc), aside, heading

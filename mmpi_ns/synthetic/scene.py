@@ -19,7 +19,7 @@ Colors = NDArray[np.float32]
 Ground = Callable[[Array, Array, Array, Noise], Colors]
 """Colours [N, 3] of points [N, 2] on z = 0, seen along unit directions [N, 3] with pixels [N] metres wide."""
 Sky = Callable[[Array, float, Noise], Colors]
-"""Colours [N, 3] of unit directions [N, 3], for pixels so many radians wide."""
+"""Colours [N, 3] of unit directions [N, 3], for pixels of a width in radians."""
 TILE = 64
 """Side of the image tiles whose rays are traced together, pixels."""
 
@@ -66,9 +66,8 @@ class Scene:
         """The scene when an image is taken: with its movers, unless the image is held out for testing."""
         if self.movers is None or self.cameras.is_test[camera]:
             return self if self.movers is None else replace(self, movers=None)
-        movers = self.movers(camera)
-        order = np.argsort(np.concatenate([self.primitives.center, movers.center])[:, 0], kind="stable")
-        return replace(self, primitives=self.primitives.joined(movers), moving=order >= len(self.primitives))
+        primitives, part = Primitives.merged(self.primitives, self.movers(camera))
+        return replace(self, primitives=primitives, moving=part == 1)
 
     @cached_property
     def tracer(self) -> Tracer:
@@ -112,48 +111,38 @@ class Scene:
         if floor.any():
             colors[floor] = self.ground(points[floor, :2], directions[floor], distance[floor] * pixel, self.noise)
         if solid.any():
-            these = self.primitives.take(row[solid])
-            surface, normals[solid] = surface_of(these, points[solid], directions[solid], distance[solid] * pixel)
-            colors[solid] = self._albedo(these.material, surface)
+            solids = self.primitives.take(row[solid])
+            surface, normals[solid] = surface_of(solids, points[solid], directions[solid], distance[solid] * pixel)
+            for number, material in enumerate(MATERIALS.values()):
+                rows = solids.material == number
+                if rows.any():
+                    colors[np.flatnonzero(solid)[rows]] = material(surface.take(rows), self.noise)
             patch[solid] = 8 * row[solid] + 2 * surface.side
         light, in_sun = self._lit(points[finite], normals[finite])
         colors[finite] *= light[:, None]
         patch[finite] += in_sun
         return colors.clip(0, 1), patch
 
-    def _albedo(self, material: NDArray[np.int64], surface: Surface) -> Colors:
-        colors = np.empty((len(material), 3), np.float32)
-        functions = list(MATERIALS.values())
-        for m in np.unique(material):
-            rows = material == m
-            colors[rows] = functions[m](surface.take(rows), self.noise)
-        return colors
-
     def _lit(self, points: Array, normals: Array) -> tuple[Colors, NDArray[np.bool_]]:
-        """Light [N] that falls on points, and whether the sun or lamp reaches them [N]."""
+        """Light [N] that falls on points [N, 3], and whether the sun or lamp reaches them [N]."""
         light = self.light
         toward = np.array(light.toward) - (points if light.is_lamp else 0.0) + np.zeros_like(points)
         far = np.sqrt(dot(toward, toward))
         toward /= far[:, None]
         cosine = dot(normals, toward)
-        facing = cosine > 1e-3
-        if light.casts_shadows and facing.any():
-            facing[facing] = self._sees_light(points[facing] + 1e-4 * normals[facing], toward[facing], far[facing])
-        direct = np.where(facing, cosine, 0) * light.strength
-        return (light.ambient * (0.85 + 0.15 * normals[:, 2]) + direct).astype(np.float32), facing
-
-    def _sees_light(self, points: Array, toward: Array, far: Array) -> NDArray[np.bool_]:
-        """Whether nothing stands between points [N, 3] and the light [N], ``far`` [N] away."""
-        if self.light.is_lamp:
+        in_light = cosine > 1e-3
+        if light.casts_shadows and in_light.any():
+            starts, toward, far = (points + 1e-4 * normals)[in_light], toward[in_light], far[in_light]
             limit = float(far.max())
-        else:
-            far = np.full(len(points), np.inf)
-            limit = max(self.tracer.top / max(float(toward[0, 2]), 0.05), 1e-3)
-        # Neighbours in space go into one packet.
-        order = np.argsort(points[:, np.argmax(np.ptp(points, axis=0))], kind="stable")
-        visible = np.empty(len(points), bool)
-        visible[order] = self.tracer(points[order], toward[order], limit)[0] >= far[order] * (1 - 1e-6)
-        return visible
+            if not light.is_lamp:
+                far, limit = np.full_like(far, np.inf), max(self.tracer.top / max(float(toward[0, 2]), 0.05), 1e-3)
+            # Neighbours in space go into one packet.
+            order = np.argsort(starts[:, np.argmax(np.ptp(starts, axis=0))], kind="stable")
+            visible = np.empty(len(starts), bool)
+            visible[order] = self.tracer(starts[order], toward[order], limit)[0] >= far[order] * (1 - 1e-6)
+            in_light[in_light] = visible
+        direct = np.where(in_light, cosine, 0) * light.strength
+        return (light.ambient * (0.85 + 0.15 * normals[:, 2]) + direct).astype(np.float32), in_light
 
 
 def surface_of(these: Primitives, points: Array, directions: Array, pixel: Array) -> tuple[Surface, Array]:
@@ -214,7 +203,13 @@ def render(scene: Scene, camera: int, supersample: int = 2, contrast: float = 0.
         rays = cameras.rays_at(camera, cameras.central_tangents[these])
         depths[these], row = scene.hit(*rays)
         colors[these], patch[these] = scene.shade(*rays, depths[these], row, 1 / cameras.focal)
-    edges = order[_differs(colors.reshape(h, w, 3), patch.reshape(h, w), contrast).reshape(-1)[order]]
+    differs = np.full((h, w), contrast <= 0)  # from one of its neighbours
+    for axis in (0, 1):
+        color_change = np.abs(np.diff(colors.reshape(h, w, 3), axis=axis)).max(-1) > contrast
+        change = color_change | (np.diff(patch.reshape(h, w), axis=axis) != 0)
+        for sides in ((1, 0), (0, 1)):
+            differs |= np.pad(change, [sides if k == axis else (0, 0) for k in (0, 1)])
+    edges = order[differs.reshape(-1)[order]]
     inner = (np.arange(supersample) + 0.5) / supersample - 0.5
     shifts: Array = np.stack(np.meshgrid(inner, inner), -1).reshape(-1, 2)
     per_packet = max(PACKET // len(shifts), 1)
@@ -230,14 +225,3 @@ def tile_order(height: int, width: int) -> NDArray[np.int64]:
     """Flat pixel indices tile by tile, so that packets of rays lie close together."""
     y, x = np.divmod(np.arange(height * width), width)
     return np.lexsort((x, y, x // TILE, y // TILE))
-
-
-def _differs(colors: Colors, patch: NDArray[np.int64], contrast: float) -> NDArray[np.bool_]:
-    """[H, W] pixels that show another face or another colour than one of their neighbours."""
-    result = np.full(patch.shape, contrast <= 0)
-    for axis in (0, 1):
-        change = (np.diff(patch, axis=axis) != 0) | (np.abs(np.diff(colors, axis=axis)).max(-1) > contrast)
-        before = [(1, 0) if k == axis else (0, 0) for k in (0, 1)]
-        after = [(0, 1) if k == axis else (0, 0) for k in (0, 1)]
-        result |= np.pad(change, before) | np.pad(change, after)
-    return result

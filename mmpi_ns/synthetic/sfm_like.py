@@ -50,7 +50,7 @@ def sfm_points(scene: Scene, count: int, noise_pixels: float = 0.3, outliers: fl
     """Points on what the cameras see, and who saw them where.
 
     Args:
-        count: points wanted; fewer come back where the cameras do not see so many from enough sides.
+        count: number of points; fewer come back where the cameras see too few from enough sides.
         noise_pixels: standard deviation of the keypoints' noise along x and along y.
         outliers: share of the points that are wrong.
 
@@ -62,16 +62,23 @@ def sfm_points(scene: Scene, count: int, noise_pixels: float = 0.3, outliers: fl
             f"Points ({count}) and noise ({noise_pixels}) must not be negative, outliers ({outliers}) lie in [0, 1)."
         )
     random = np.random.default_rng([scene.seed, 5])
-    rounds: list[tuple] = []
+    points, colors, exact = np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros((0, 2))
+    camera = point = np.zeros(0, np.int64)
     for _ in range(ROUNDS):
-        missing = count - sum(len(f[0]) for f in rounds)
+        missing = count - len(points)
         if missing <= 0:
             break
-        rounds.append(_tracked(scene, int(missing * 1.5) + 16, random))
-    points, colors, tracks = _joined(rounds, count)
-    camera, point, exact = tracks
+        more, more_colors, (cameras, rows, pixels) = _tracked(scene, int(missing * 1.5) + 16, random)
+        camera, point = np.concatenate([camera, cameras]), np.concatenate([point, rows + len(points)])
+        exact = np.concatenate([exact, pixels])
+        points, colors = np.concatenate([points, more]), np.concatenate([colors, more_colors])
+    thinned = np.zeros(len(points), bool)  # evenly, to ``count``
+    thinned[np.linspace(0, len(points) - 1, min(count, len(points))).round().astype(int)] = True
+    keep = thinned[point]
+    camera, point, exact = camera[keep], (np.cumsum(thinned) - 1)[point[keep]], exact[keep]
+    points, colors = points[thinned], colors[thinned]
     pixel = exact + noise_pixels * random.standard_normal(exact.shape)
-    moved, outlier, keep, pixel = _misled(scene, points, tracks, pixel, outliers, random)
+    moved, outlier, keep, pixel = _misled(scene, points, (camera, point, exact), pixel, outliers, random)
     placed = _triangulated(scene, moved, camera[keep], point[keep], pixel[keep])
     return SfmPoints(placed, points, colors, outlier, camera[keep], point[keep], pixel[keep])
 
@@ -95,7 +102,16 @@ def visible(scene: Scene, camera: int, points: Array) -> tuple[NDArray[np.bool_]
 
 def _tracked(scene: Scene, count: int, random: np.random.Generator) -> tuple:
     """Points [P, 3] at random pixels, their colours, and the (camera, point, exact pixel) of tracks worth keeping."""
-    points, colors = _drawn(scene, count, random)
+    drawn = np.sort(random.integers(len(scene.cameras), size=count))
+    pixels = random.uniform(0, 1, (count, 2)) * [scene.cameras.width, scene.cameras.height]
+    parts = []
+    for i in np.unique(drawn):
+        origins, directions = scene.cameras.rays(i, pixels[drawn == i])
+        distance, color = scene.trace(origins, directions, 1 / scene.cameras.focal)
+        near = distance < scene.track_range
+        surface = origins[near] + distance[near, None] * directions[near]
+        parts.append((surface, (color[near] * 255).round().astype(np.uint8)))
+    points, colors = (np.concatenate(column) for column in zip(*parts, strict=True))
     order = np.argsort(points[:, 0], kind="stable")
     points, colors = points[order], colors[order]
     cameras, rows, pixels = [], [], []
@@ -108,50 +124,13 @@ def _tracked(scene: Scene, count: int, random: np.random.Generator) -> tuple:
     camera, point, pixel = (np.concatenate(x) for x in (cameras, rows, pixels))
     order = np.lexsort((camera, point))
     camera, point, pixel = camera[order], point[order], pixel[order]
-    good = _long_and_wide(scene, points, camera, point)
-    kept = good[point]
-    return points[good], colors[good], (camera[kept], (np.cumsum(good) - 1)[point[kept]], pixel[kept])
-
-
-def _drawn(scene: Scene, count: int, random: np.random.Generator) -> tuple[Array, NDArray[np.uint8]]:
-    """Surface points [P, 3] behind random pixels of random cameras, and their colours."""
-    cameras = scene.cameras
-    chosen = np.sort(random.integers(len(cameras), size=count))
-    pixels = random.uniform(0, 1, (count, 2)) * [cameras.width, cameras.height]
-    points, colors = [], []
-    for i in np.unique(chosen):
-        origins, directions = cameras.rays(i, pixels[chosen == i])
-        distance, color = scene.trace(origins, directions, 1 / cameras.focal)
-        near = distance < scene.track_range
-        points.append(origins[near] + distance[near, None] * directions[near])
-        colors.append((color[near] * 255).round().astype(np.uint8))
-    return np.concatenate(points), np.concatenate(colors)
-
-
-def _long_and_wide(scene: Scene, points: Array, camera: NDArray, point: NDArray) -> NDArray[np.bool_]:
-    """[P] points with enough keypoints and rays that are far enough apart."""
-    length = np.bincount(point, minlength=len(points))
     rays = scene.cameras.camera_to_worlds[camera, :, 3] - points[point]
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-    first = np.searchsorted(point, np.arange(len(points)))
-    apart = np.full(len(points), 1.0)
-    np.minimum.at(apart, point, dot(rays, rays[first[point]]))
-    return (length >= MIN_TRACK) & (apart <= np.cos(np.radians(MIN_ANGLE)))
-
-
-def _joined(rounds: list[tuple], count: int) -> tuple[Array, NDArray[np.uint8], tuple[NDArray, NDArray, Array]]:
-    """The rounds as one, evenly thinned to ``count`` points."""
-    if not rounds:
-        none = np.zeros(0, np.int64)
-        return np.zeros((0, 3)), np.zeros((0, 3), np.uint8), (none, none, np.zeros((0, 2)))
-    before = np.cumsum([0, *(len(f[0]) for f in rounds)])
-    points, colors = np.concatenate([f[0] for f in rounds]), np.concatenate([f[1] for f in rounds])
-    camera, pixel = np.concatenate([f[2][0] for f in rounds]), np.concatenate([f[2][2] for f in rounds])
-    point = np.concatenate([f[2][1] + b for f, b in zip(rounds, before[:-1], strict=True)])
-    keep = np.zeros(len(points), bool)
-    keep[np.linspace(0, len(points) - 1, min(count, len(points))).round().astype(int)] = True
-    kept = keep[point]
-    return points[keep], colors[keep], (camera[kept], (np.cumsum(keep) - 1)[point[kept]], pixel[kept])
+    first, cosine = np.searchsorted(point, np.arange(len(points))), np.full(len(points), 1.0)
+    np.minimum.at(cosine, point, dot(rays, rays[first[point]]))
+    good = (np.bincount(point, minlength=len(points)) >= MIN_TRACK) & (cosine <= np.cos(np.radians(MIN_ANGLE)))
+    kept = good[point]
+    return points[good], colors[good], (camera[kept], (np.cumsum(good) - 1)[point[kept]], pixel[kept])
 
 
 def _misled(scene: Scene, points: Array, tracks: tuple, pixel: Array, share: float, random: np.random.Generator):

@@ -1,10 +1,10 @@
-"""A street driven along: house fronts, parked cars, lamps, trees; straight or bending, of any length."""
+"""A street, driven or walked along: house fronts, parked cars, lamps, trees; straight or bending, of any length."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from mmpi_ns.synthetic.cameras import Cameras
+from mmpi_ns.synthetic.cameras import Array, Cameras
 from mmpi_ns.synthetic.kit import BROWN, GRAY, GREEN, PAINTS, PALE_GREEN, WALLS, WHITE, Kit, look
 from mmpi_ns.synthetic.road import Road
 from mmpi_ns.synthetic.scene import Light, Scene
@@ -14,10 +14,28 @@ CAMERA_HEIGHT = 1.65
 SUN = (-0.45, -0.4, 0.8)
 FOCAL_SHARE = 0.58
 """Focal length as a share of the image width, as on KITTI."""
+EYE = 1.6
+"""Metres from the ground to the phone."""
+PACE, STEPS = 1.3, 1.9
+"""Metres and steps a second."""
+PHONE_FOCAL_SHARE = 0.76
+"""Focal length as a share of the image width, as of a phone's video."""
+LENS = (-0.11, 0.045, 0.0012, -0.0008)
+"""k1, k2, p1, p2: pixels at the corners of a wide image are 4 % nearer to its middle than in a pinhole."""
+ASIDE, WEAVE = -2.2, 0.8
+"""Metres to the left of the middle line, and by how much that changes: the right side of the carriageway."""
+TURN, GLANCE, NOD = 0.7, 0.2, 0.05
+"""Radians: slow turns towards the house fronts, faster and smaller ones, and up and down."""
+SHAKE = (0.009, 0.008, 0.012)
+"""Standard deviation of yaw, pitch and roll by a shaking hand, radians."""
+SLOWEST, FASTEST = 0.7, 6.0
+"""Shakes a second."""
+STRIDE = (0.03, 0.025)
+"""Metres of sway from step to step, and of bob with each."""
 
 
 class Street(Kit):
-    """Adds what stands along a road."""
+    """What stands along a road: houses, parked cars, trees, lamps."""
 
     def __init__(self, seed: int, road: Road, topic: int = 1) -> None:
         super().__init__(seed, topic)
@@ -33,12 +51,13 @@ class Street(Kit):
         along = first
         while along < last:
             width, depth = self.random.uniform(7.5, 13), self.random.uniform(7, 10)
+            middle = along + width / 2
             if self.random.random() < 0.16:
-                place, yaw = self.place(along + width / 2, side * (self.road.pavement + 1.5))
+                place, yaw = self.place(middle, side * (self.road.pavement + 1.5))
                 self.standing(place, (width, 0.9, self.random.uniform(1.3, 2)), "foliage", GREEN, PALE_GREEN, yaw=yaw)
                 self.tree(along + width * 0.6, side * (self.road.pavement + 5), 1.5)
             else:
-                self.house(along + width / 2, side, width, depth)
+                self.house(middle, side, width, depth)
             along += width + (0.0 if self.random.random() < 0.6 else self.random.uniform(0.6, 2.5))
 
     def house(self, along: float, side: int, width: float, depth: float) -> None:
@@ -48,9 +67,8 @@ class Street(Kit):
         place, yaw = self.place(along, side * (back + depth / 2))
         wall = self.pick(WALLS)
         # Fronts face the street on both sides: the solid's own left must be the street's.
-        self.standing(
-            place, (width, depth, height), "facade", wall, self.varied(wall, 0.15), self.varied(WHITE), yaw=yaw
-        )
+        colors = (wall, self.varied(wall, 0.15), self.varied(WHITE))
+        self.standing(place, (width, depth, height), "facade", *colors, yaw=yaw)
         roof = self.varied((0.5, 0.27, 0.2) if self.random.random() < 0.6 else (0.33, 0.34, 0.37))
         dark = tuple(0.75 * c for c in roof)
         top = (place[0], place[1], height)
@@ -92,7 +110,15 @@ class Street(Kit):
             if self.random.random() < 0.55:
                 self.tree(along, side * (self.road.kerb + 0.75), self.random.uniform(0.8, 1.15))
             else:
-                self.lamp(along, side)
+                metal = (0.24, 0.3, 0.28)
+                place, yaw = self.place(along, side * (self.road.kerb + 0.4))
+                self.cylinder(place, 0.07, 5.4, "plaster", metal, (0.3, 0.36, 0.34))
+                arm, _ = self.place(along, side * (self.road.kerb - 0.3), 5.4)
+                self.box(arm, (0.1, 1.5, 0.1), "plaster", metal, metal, yaw=yaw)
+                self.sphere((arm[0], arm[1], 5.25), 0.2, "plaster", WHITE, (0.9, 0.85, 0.6))
+                if self.random.random() < 0.6:
+                    sign, _ = self.place(along, side * (self.road.kerb + 0.4), 2.5)
+                    self.box(sign, (0.08, 0.75, 0.75), "painting", self.pick(PAINTS), WHITE, self.pick(PAINTS), yaw=yaw)
             along += self.random.uniform(9, 16)
 
     def tree(self, along: float, aside: float, scale: float) -> None:
@@ -105,17 +131,6 @@ class Street(Kit):
             shift = self.random.uniform(-0.8, 0.8, 3) * scale * [1, 1, 0.8]
             center = (place[0] + shift[0], place[1] + shift[1], height + (0.75 * scale + shift[2]))
             self.sphere(center, self.random.uniform(0.85, 1.3) * scale, "foliage", leaf, bright)
-
-    def lamp(self, along: float, side: int) -> None:
-        place, yaw = self.place(along, side * (self.road.kerb + 0.4))
-        metal = (0.24, 0.3, 0.28)
-        self.cylinder(place, 0.07, 5.4, "plaster", metal, (0.3, 0.36, 0.34))
-        arm, _ = self.place(along, side * (self.road.kerb - 0.3), 5.4)
-        self.box(arm, (0.1, 1.5, 0.1), "plaster", metal, metal, yaw=yaw)
-        self.sphere((arm[0], arm[1], 5.25), 0.2, "plaster", WHITE, (0.9, 0.85, 0.6))
-        if self.random.random() < 0.6:
-            sign, _ = self.place(along, side * (self.road.kerb + 0.4), 2.5)
-            self.box(sign, (0.08, 0.75, 0.75), "painting", self.pick(PAINTS), WHITE, self.pick(PAINTS), yaw=yaw)
 
 
 def drive_cameras(road: Road, seed: int, count: int, width: int, height: int) -> Cameras:
@@ -157,3 +172,31 @@ def long_road(seed: int, count: int, width: int, height: int, length: float) -> 
     waves = ((9.0, 250.0, float(phases[0])), (38.0, 900.0, float(phases[1])))
     road = Road(length, waves)
     return make_street("long-road", road, seed, drive_cameras(road, seed, count, width, height))
+
+
+def walk(seed: int, count: int, width: int, height: int, length: float) -> Scene:
+    """A hand-held walk down a gently bending street: a phone's lens, steps, a shaking hand, slow turns of the head."""
+    random = np.random.default_rng([seed, 17])
+    road = Road(length, ((5.0, 170.0, float(random.uniform(0, 2 * np.pi))),), beyond=150.0)
+    along = np.linspace(0, length, count) if count > 1 else np.zeros(1)
+    seconds = along / PACE
+    phases = random.uniform(0, 2 * np.pi, 6)
+
+    def wave(k: int, size: float, turns: Array) -> Array:
+        return size * np.sin(2 * np.pi * turns + phases[k])
+
+    sway, bob = wave(0, STRIDE[0], seconds * STEPS / 2), wave(1, STRIDE[1], seconds * STEPS)
+    xy, heading = road.at(along, ASIDE + wave(2, WEAVE, along / 35) + sway)
+    shakes = []
+    for size in SHAKE:  # band-limited noise: equal waves at random frequencies
+        frequencies = np.exp(random.uniform(np.log(SLOWEST), np.log(FASTEST), 12))
+        turns = seconds[:, None] * frequencies + random.uniform(0, 1, 12)
+        shakes.append(size * np.sqrt(2 / 12) * np.sin(2 * np.pi * turns).sum(-1))
+    yaw_shake, pitch_shake, roll = shakes
+    yaw = heading + wave(3, TURN, along / 27) + wave(4, GLANCE, along / 10) + yaw_shake
+    poses = look(np.column_stack([xy, EYE + bob]), yaw, wave(5, NOD, along / 14) + pitch_shake)
+    c, s = np.cos(roll)[:, None], np.sin(roll)[:, None]
+    right, up = poses[:, :, 0], poses[:, :, 1]
+    poses[:, :, 0], poses[:, :, 1] = c * right + s * up, c * up - s * right
+    cameras = Cameras(poses, PHONE_FOCAL_SHARE * width, width, height, test_every=8, distortion=LENS)
+    return make_street("walk", road, seed, cameras)

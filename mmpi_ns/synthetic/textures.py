@@ -61,7 +61,13 @@ class Noise:
         random = np.random.default_rng([seed, 77])
         tile = np.zeros((TEXELS, TEXELS))
         for octave in range(7):
-            tile += 0.62**octave * _smooth_cells(random.uniform(-1, 1, (4 << octave, 4 << octave)), TEXELS)
+            n = 4 << octave
+            cells, x = random.uniform(-1, 1, (n, n)), (np.arange(TEXELS) + 0.5) * n / TEXELS - 0.5
+            i = np.floor(x).astype(int)
+            f = x - i
+            f = f * f * (3 - 2 * f)
+            rows = cells[i % n] * (1 - f)[:, None] + cells[(i + 1) % n] * f[:, None]
+            tile += 0.62**octave * (rows[:, i % n] * (1 - f) + rows[:, (i + 1) % n] * f)
         levels = [(tile / tile.std() / 2).astype(np.float32)]
         while levels[-1].shape[0] > 1:
             t = levels[-1]
@@ -88,14 +94,3 @@ class Noise:
         top = self.flat[row + i] * (1 - x) + self.flat[row + right] * x
         bottom = self.flat[below + i] * (1 - x) + self.flat[below + right] * x
         return (top + (bottom - top) * y).astype(np.float32)
-
-
-def _smooth_cells(cells: NDArray[np.float64], size: int) -> NDArray[np.float64]:
-    """Periodic cells enlarged to size x size, smoothly."""
-    n = len(cells)
-    x = (np.arange(size) + 0.5) * n / size - 0.5
-    i = np.floor(x).astype(int)
-    f = x - i
-    f = f * f * (3 - 2 * f)
-    rows = cells[i % n] * (1 - f)[:, None] + cells[(i + 1) % n] * f[:, None]
-    return rows[:, i % n] * (1 - f) + rows[:, (i + 1) % n] * f

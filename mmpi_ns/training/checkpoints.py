@@ -1,4 +1,4 @@
-"""Checkpoint files: finding them, and checking that a run can resume from one."""
+"""Folder of a run: its lock, and its checkpoints, from which only a run of the same capture and plan can resume."""
 
 from __future__ import annotations
 
@@ -10,25 +10,63 @@ from typing import Any
 
 import numpy as np
 import torch
+from filelock import FileLock, Timeout
 from jaxtyping import Float
 from nerfstudio.engine.trainer import TrainerConfig
 from torch import Tensor
 
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.scene.windows import WindowedPlan
-from mmpi_ns.utils.errors import InputError, brief
-from mmpi_ns.utils.files import to_text
+from mmpi_ns.utils.errors import InputError, brief, quoted
+from mmpi_ns.utils.files import to_text, write_errors
 from mmpi_ns.utils.values import shown
 
 HOLDS = {"step", "pipeline", "optimizers", "schedulers", "scalers", "rng", "capture"}
 """Keys of every checkpoint of this method."""
+PLAN_FILE = "plan.json"
+LOCK = ".lock"
+_held: dict[Path, FileLock] = {}
 
 
 def checkpoints_in(folder: Path, steps: range | None = None) -> dict[int, Path]:
     """The checkpoints in a folder by their steps, all or those of some steps."""
     named = ((re.fullmatch(r"step-(\d+)\.ckpt", path.name), path) for path in folder.glob("step-*.ckpt"))
-    found = {int(name[1]): path for name, path in named if name and path.is_file()}
-    return {step: path for step, path in found.items() if steps is None or step in steps}
+    numbered = ((int(name[1]), path) for name, path in named if name and path.is_file())
+    return {step: path for step, path in numbered if steps is None or step in steps}
+
+
+def claim(folder: Path, checkpoints: Path, resumes_from: Path | None) -> None:
+    """Locks a run's folder for this process until it ends, and removes files left half-written by killed runs.
+
+    Args:
+        folder: of the run.
+        checkpoints: its folder of checkpoints.
+        resumes_from: folder or file of the checkpoint that the run resumes from.
+
+    Raises:
+        InputError: another run is writing there, or its checkpoints are there and this run does not resume from them.
+        WriteError: the folder cannot be written.
+    """
+    try:
+        with write_errors(folder, "--output-dir"):
+            folder.mkdir(parents=True, exist_ok=True)
+            if folder.resolve() not in _held:  # the system releases it when the process ends, however that happens
+                lock = FileLock(folder.resolve() / LOCK)
+                lock.acquire(timeout=0)
+                _held[folder.resolve()] = lock
+    except Timeout as error:
+        raise InputError(
+            f"Another run is writing into {folder}: wait for its end, or give another --timestamp."
+        ) from error
+    source = None if resumes_from is None else resumes_from.resolve()
+    resumes = source is not None and checkpoints.resolve() in (source, source.parent)
+    if checkpoints_in(checkpoints) and not resumes:
+        raise InputError(
+            f"{checkpoints} holds checkpoints of an earlier run: go on from them with --load-dir "
+            f"{quoted(checkpoints)}, or give another --timestamp."
+        )
+    for unfinished in [*folder.glob(".*.tmp"), *folder.glob("windows/.*.tmp")]:
+        unfinished.unlink(missing_ok=True)
 
 
 def check_there_are_checkpoints(windows_folder: Path | None) -> None:
@@ -88,67 +126,41 @@ def cameras_in_short(observations: Observations) -> Float[Tensor, "M 18"]:
     return torch.from_numpy(np.concatenate([poses, observations.intrinsics, observations.sizes], -1)).float()
 
 
-def check_same_capture(state: dict[str, Any], path: Path, data: Path, observations: Observations) -> None:
-    """Raises InputError if a checkpoint was trained on another capture.
-
-    Args:
-        state: the checkpoint.
-        path: of its file.
-        data: the capture of this run.
-        observations: its training cameras.
-    """
+def check_same_run(
+    state: dict[str, Any], path: Path, data: Path, observations: Observations, plan: WindowedPlan, pose_mode: str
+) -> None:
+    """Raises InputError if a run of this capture, its training cameras, plan and mode of the camera optimiser cannot
+    resume from a checkpoint, read from ``path``."""
     theirs, ours = state["capture"]["cameras"], cameras_in_short(observations)
     if theirs.shape != ours.shape or not torch.allclose(theirs, ours, rtol=1e-4, atol=1e-4):
         raise InputError(
             f"{path} was trained on another capture ({state['capture']['data']}, and {data} here, whose training "
             "cameras are not the same): resume with the same --data, or train anew."
         )
-
-
-def check_same_plan(state: dict[str, Any], path: Path, ours: WindowedPlan, plan_file: str) -> None:
-    """Raises InputError if a checkpoint was trained with another plan.
-
-    Args:
-        state: of the pipeline, in the checkpoint.
-        path: the checkpoint.
-        ours: the plan of this run.
-        plan_file: file name of a run's plan.
-    """
-    theirs = WindowedPlan.from_json(to_text(state["_model.progress.windows_bytes"]))
-    if theirs != ours:
+    stored = WindowedPlan.from_json(to_text(state["pipeline"]["_model.progress.windows_bytes"]))
+    if stored != plan:
         raise InputError(
-            f"{path} was trained with another scene plan ({_difference(theirs, ours)}): "
-            f"resume with the settings in its config.yml, or give its {plan_file} with --pipeline.model.plan-file."
+            f"{path} was trained with another scene plan ({_difference(stored, plan)}): resume with the settings in "
+            f"its config.yml, or give its {PLAN_FILE} with --pipeline.model.plan-file."
         )
-
-
-def check_same_refinement(state: dict[str, Any], path: Path, mode: str) -> None:
-    """Raises InputError if a checkpoint refines poses and this run does not, or vice versa.
-
-    Args:
-        state: of the pipeline, in the checkpoint.
-        path: the checkpoint.
-        mode: of this run's camera optimiser.
-    """
-    if ("_model.camera_optimizer.pose_adjustment" in state) == (mode == "off"):
-        there, as_there = ("unrefined", "off") if mode != "off" else ("refined", "SO3xR3")
+    if ("_model.camera_optimizer.pose_adjustment" in state["pipeline"]) == (pose_mode == "off"):
+        there, as_there = ("unrefined", "off") if pose_mode != "off" else ("refined", "SO3xR3")
         raise InputError(
             f"{path} was trained with {there} poses: resume with --pipeline.model.camera-optimizer.mode {as_there}."
         )
 
 
 def _difference(theirs: WindowedPlan, ours: WindowedPlan) -> str:
-    """The first difference between two plans."""
+    """First difference between two plans."""
     shapes = [(len(p), sum(len(plan.mpis) for plan in p.plans)) for p in (theirs, ours)]
     if shapes[0] != shapes[1]:
         there, here = (f"{mpis} MPIs" if w == 1 else f"{w} windows with {mpis} MPIs" for w, mpis in shapes)
         return f"{there} there, {here} here"
     for w, (a, b) in enumerate(zip(theirs.plans, ours.plans, strict=True)):
-        pairs = [*zip(a.mpis, b.mpis, strict=False), (a, b)]
-        for one, other in pairs:
-            for f in fields(one):
-                if f.name != "mpis" and getattr(one, f.name) != getattr(other, f.name):
-                    where = f" of MPI {one.name!r}" if one is not a else ""
-                    there, here = shown(getattr(one, f.name)), shown(getattr(other, f.name))
-                    return f"{f.name!r}{where}{f' in window {w}' if len(ours) > 1 else ''}: {there} there, {here} here"
+        for x, y in [*zip(a.mpis, b.mpis, strict=False), (a, b)]:
+            for name in [f.name for f in fields(x) if f.name != "mpis"]:
+                there, here = getattr(x, name), getattr(y, name)
+                if there != here:
+                    where = (f" of MPI {x.name!r}" if x is not a else "") + (f" in window {w}" if len(ours) > 1 else "")
+                    return f"{name!r}{where}: {shown(there)} there, {shown(here)} here"
     return "other borders of windows"

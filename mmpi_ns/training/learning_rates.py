@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from nerfstudio.engine.schedulers import Scheduler, SchedulerConfig
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
-from mmpi_ns.training.phases import Schedule
-from mmpi_ns.training.progress import Progress
+from mmpi_ns.training.run import Progress
 
 
 @dataclass
@@ -22,25 +21,19 @@ class PhaseSchedulerConfig(SchedulerConfig):
 
 
 class PhaseScheduler(Scheduler):
-    """Follows a ``Schedule``; without one (a config used outside this trainer) the rate is constant."""
+    """Rates of the schedule of ``progress``, also if a checkpoint replaces it; constant rates without ``progress`` (a
+    config used outside this trainer)."""
 
     config: PhaseSchedulerConfig
-    schedule: Schedule | None = None
+    progress: Progress | None = None
 
     def get_scheduler(self, optimizer: Optimizer, lr_init: float) -> LambdaLR:
-        kind = self.config.kind
-        return LambdaLR(optimizer, lambda step: self.schedule.rate_factor(kind, step) if self.schedule else 1.0)
+        kind, progress = self.config.kind, self.progress
+        return LambdaLR(optimizer, lambda step: progress.schedule.rate_factor(kind, step) if progress else 1.0)
 
-
-def following(config: SchedulerConfig, progress: Progress) -> SchedulerConfig:
-    """The config of a scheduler that follows a run's schedule, even if a checkpoint loaded later has its own; other
-    schedulers are unchanged."""
-    if not isinstance(config, PhaseSchedulerConfig):
-        return config
-
-    class Following(PhaseScheduler):
-        @property
-        def schedule(self) -> Schedule:  # type: ignore[override]
-            return progress.schedule
-
-    return PhaseSchedulerConfig(_target=Following, kind=config.kind)
+    @classmethod
+    def following(cls, config: SchedulerConfig, progress: Progress) -> SchedulerConfig:
+        """The config of a scheduler that follows a run; other schedulers are unchanged."""
+        if not isinstance(config, PhaseSchedulerConfig):
+            return config
+        return replace(config, _target=type("Following", (cls,), {"progress": progress}))

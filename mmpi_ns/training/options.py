@@ -1,62 +1,72 @@
-"""Options of a run that cannot be used, or that have no effect here, are refused before anything is written."""
+"""Options of a run: read from a config.yml of any version, and checked before anything is written."""
 
 from __future__ import annotations
 
-import shutil
-from dataclasses import fields
+import copy
+from dataclasses import fields, is_dataclass
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
 import torch
 from nerfstudio.engine.trainer import TrainerConfig
 
-from mmpi_ns.placement.defaults import DEFAULTS
-from mmpi_ns.placement.options import check_placement
+from mmpi_ns.placement.defaults import DEFAULTS, check_placement
+from mmpi_ns.training.losses import LossWeights
 from mmpi_ns.training.phases import check_schedule
 from mmpi_ns.utils.errors import InputError
-from mmpi_ns.utils.host import arguments, command
 from mmpi_ns.utils.machine import unused_gpu
-from mmpi_ns.utils.values import Number, check_number, check_options
+from mmpi_ns.utils.values import Number, check_number, check_options, shown
 
 POSITIVE, NOT_NEGATIVE, COUNT = Number(0, above=True), Number(0), Number(0, whole=True)
 SHARE = Number(0, 1)
 LONGEST_NAME = 255
 """Bytes of a folder's name."""
-RUN = {
-    "max_num_iterations": Number(0, 10**9, whole=True),
-    "steps_per_save": COUNT,
-    "steps_per_eval_batch": COUNT,
-    "steps_per_eval_image": COUNT,
-    "steps_per_eval_all_images": COUNT,
+RANGES = {
+    "": {
+        "max_num_iterations": Number(0, 10**9, whole=True),
+        "steps_per_save": COUNT,
+        "steps_per_eval_batch": COUNT,
+        "steps_per_eval_image": COUNT,
+        "steps_per_eval_all_images": COUNT,
+    },
+    "machine": {"seed": Number(0, 2**32 - 1, whole=True), "num_devices": Number(1, 10**4, whole=True)},
+    "logging": {"steps_per_log": Number(1, whole=True)},
+    "pipeline.datamanager": {
+        "train_num_rays_per_batch": Number(1, 10**8, whole=True),
+        "eval_num_rays_per_batch": Number(1, 10**8, whole=True),
+        "keypoint_rays": Number(0, 10**8, whole=True),
+        "new_view_share": NOT_NEGATIVE,
+        "resident_pixels": NOT_NEGATIVE,
+        "camera_res_scale_factor": POSITIVE,
+    },
+    "pipeline.model": {"eval_num_rays_per_chunk": COUNT},
+    "pipeline.model.schedule": {
+        "blend_share": SHARE,
+        "finetune_share": SHARE,
+        "finetune_rate": NOT_NEGATIVE,
+        "decay_decades": NOT_NEGATIVE,
+        "decay_from": SHARE,
+        "growth_shares": SHARE,
+        "growing_rays": Number(0, 1, above=True),
+        "release_shares": SHARE,
+        "release_weight": NOT_NEGATIVE,
+    },
+    "pipeline.model.sampling": {
+        "samples_per_voxel": POSITIVE,
+        "cube_alpha": Number(0, 1, above=True),
+        "threshold": SHARE,
+    },
+    "pipeline.model.colour": {
+        "feature_channels": Number(3, 256, whole=True),
+        "hidden_width": Number(1, 4096, whole=True),
+        "position_frequencies": Number(0, 32, whole=True),
+        "direction_frequencies": Number(0, 32, whole=True),
+    },
+    "pipeline.model.rendering": {"threshold": SHARE, "resident_gib": NOT_NEGATIVE},
+    "pipeline.model.loss": {f.name: NOT_NEGATIVE for f in fields(LossWeights)} | {"tv_every": Number(1, whole=True)},
 }
-MACHINE = {"seed": Number(0, 2**32 - 1, whole=True), "num_devices": Number(1, 10**4, whole=True)}
-PIXELS = {
-    "train_num_rays_per_batch": Number(1, 10**8, whole=True),
-    "eval_num_rays_per_batch": Number(1, 10**8, whole=True),
-    "keypoint_rays": Number(0, 10**8, whole=True),
-    "new_view_share": NOT_NEGATIVE,
-    "resident_pixels": NOT_NEGATIVE,
-    "camera_res_scale_factor": POSITIVE,
-}
-SCHEDULE = {
-    "blend_share": SHARE,
-    "finetune_share": SHARE,
-    "finetune_rate": NOT_NEGATIVE,
-    "decay_decades": NOT_NEGATIVE,
-    "decay_from": SHARE,
-    "growth_shares": SHARE,
-    "growing_rays": Number(0, 1, above=True),
-    "release_shares": SHARE,
-    "release_weight": NOT_NEGATIVE,
-}
-COLOUR = {
-    "feature_channels": Number(3, 256, whole=True),
-    "hidden_width": Number(1, 4096, whole=True),
-    "position_frequencies": Number(0, 32, whole=True),
-    "direction_frequencies": Number(0, 32, whole=True),
-}
-SAMPLING = {"samples_per_voxel": POSITIVE, "cube_alpha": Number(0, 1, above=True), "threshold": SHARE}
-RENDERING = {"threshold": SHARE, "resident_gib": NOT_NEGATIVE}
+"""Values of the options that a run can use, by the options' group."""
 NO_EFFECT = {
     "pipeline.datamanager": (
         "train_num_images_to_sample_from",
@@ -72,15 +82,57 @@ NO_EFFECT = {
     "pipeline.model": ("enable_collider", "collider_params", "loss_coefficients", "prompt"),
 }
 """nerfstudio's options that have no effect on this method."""
+RENAMED = {
+    "sampling.threshold": "train_threshold",
+    "rendering.threshold": "render_threshold",
+    "rendering.mode": "render",
+}
+"""Names of the model's options before they were in groups, where the name has changed."""
+LEFT = {"blend_form": "paper", "shared_colour": False, "render_shares": "exact"}
+"""Options that this version may lack, with the value that it stands for."""
 
 
-def check_ffmpeg() -> None:
-    """Raises InputError if ns-render will need ffmpeg and it is missing; nerfstudio checks only after loading."""
-    makes_films = command() == "ns-render" and "dataset" not in arguments()
-    if makes_films and shutil.which("ffmpeg") is None:
-        raise InputError(
-            "ns-render needs ffmpeg, for images too, and it is not installed: install it (apt or conda install ffmpeg)."
-        )
+def grouped(state: dict[str, Any], usual: Any) -> dict[str, Any]:
+    """The attributes of a model's config with every option in its group.
+
+    Args:
+        state: attributes as a config.yml has them; those of old versions have no groups.
+        usual: a config with the default groups, which is filled. Options without a group stay where they are.
+    """
+    state = dict(state)
+    for group in {"schedule", "sampling", "colour", "rendering"} - state.keys():
+        for f in fields(getattr(usual, group)):
+            name = RENAMED.get(f"{group}.{f.name}", f.name)
+            if name in state:
+                setattr(getattr(usual, group), f.name, state.pop(name))
+    return vars(usual) | state
+
+
+def with_absolute_paths(config: TrainerConfig) -> TrainerConfig:
+    """The settings of a run as its config.yml keeps them: for any working folder, and without a checkpoint to load."""
+    config = copy.deepcopy(config)
+    config.load_dir = config.load_step = config.load_checkpoint = None
+    manager: Any = config.pipeline.datamanager
+    for settings, name in ((config, "output_dir"), (config, "data"), (manager, "data"), (manager.dataparser, "data")):
+        path = getattr(settings, name)
+        if path not in (None, Path()):
+            setattr(settings, name, path.absolute())
+    model: Any = config.pipeline.model
+    model.windows_folder = model.windows_folder.absolute()
+    return config
+
+
+def check_nothing_left(model: Any) -> None:
+    """Raises InputError naming an option of a loaded config that this version lacks and that changes the images."""
+    groups = {"": model} | {f"{name}.": group for name, group in vars(model).items() if is_dataclass(group)}
+    for prefix, group in groups.items():
+        for name in vars(group).keys() - {f.name for f in fields(group)}:
+            if name not in LEFT or getattr(group, name) != LEFT[name]:
+                option = f"--pipeline.model.{prefix}{name}".replace("_", "-")
+                raise InputError(
+                    f"The run's config.yml asks for {option} {shown(getattr(group, name))}, which this version lacks: "
+                    "use the version that trained the run, or train anew without it."
+                )
 
 
 def check_device(device_type: str) -> None:
@@ -97,17 +149,10 @@ def check_run(config: TrainerConfig) -> None:
     """Raises InputError naming the option that cannot be used, or that would be ignored."""
     manager: Any = config.pipeline.datamanager
     model: Any = config.pipeline.model
-    check_options(config, RUN, "--")
+    for group, ranges in RANGES.items():
+        check_options(attrgetter(group)(config) if group else config, ranges, f"--{group}." if group else "--")
     if config.max_num_iterations == 0 and config.method_name not in DEFAULTS:
         raise InputError(f"{config.method_name} has no number of steps of its own: give --max-num-iterations.")
-    check_options(config.machine, MACHINE, "--machine.")
-    check_options(config.logging, {"steps_per_log": Number(1, whole=True)}, "--logging.")
-    check_options(manager, PIXELS, "--pipeline.datamanager.")
-    check_options(model, {"eval_num_rays_per_chunk": COUNT}, "--pipeline.model.")
-    weights = {f.name: NOT_NEGATIVE for f in fields(model.loss)} | {"tv_every": Number(1, whole=True)}
-    groups = {"schedule": SCHEDULE, "sampling": SAMPLING, "colour": COLOUR, "rendering": RENDERING, "loss": weights}
-    for name, ranges in groups.items():
-        check_options(getattr(model, name), ranges, f"--pipeline.model.{name}.")
     check_schedule(model.schedule)
     check_placement(model.placement, "--pipeline.model.placement.")
     for name, entry in config.optimizers.items():

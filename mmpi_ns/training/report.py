@@ -15,8 +15,7 @@ from torch import Tensor
 from mmpi_ns.rendering.metrics import ImageMetrics
 from mmpi_ns.training.losses import over_background
 from mmpi_ns.training.phases import Schedule
-from mmpi_ns.utils.console import duration, say
-from mmpi_ns.utils.errors import quoted
+from mmpi_ns.utils.errors import duration, quoted, say
 
 FIRST_LINE, SHARE = 10, 0.025
 """A line after this many steps, then after each such fraction of all steps."""
@@ -73,22 +72,13 @@ class TrainingLog:
 
 
 def forecast(method: str, steps: int, rays: int, threads: int, cores: float) -> str:
-    """Training time on this machine's CPU, the smaller method if that is long, and a warning if threads wait for cores.
-
-    Args:
-        method: name of the method that trains.
-        steps: of the run.
-        rays: of a step.
-        threads: that training runs.
-        cores: free ones.
-    """
+    """Training time on this machine's CPU, the smaller method if that is long, and a warning if threads wait for cores:
+    for a run of ``steps`` with ``rays`` each, given its threads and the free cores."""
     together = max(1.0, min(threads, cores))
     seconds = steps * rays / CPU_RAYS * (ONE_THREAD + (1 - ONE_THREAD) / together)
     smaller = "; mmpi-small is made for a CPU" if seconds > LONG and method != "mmpi-small" else ""
-    text = (
-        f"Without a GPU, {steps:,} steps of {rays:,} rays take about {duration(seconds)}, or more with large plans"
-        f"{smaller}."
-    )
+    work = f"{steps:,} steps of {rays:,} rays"
+    text = f"Without a GPU, {work} take about {duration(seconds)}, or more with large plans{smaller}."
     if threads > 1 and cores < threads - 0.5:
         text += (
             f"\n{threads} threads run and {cores:.1f} cores are free, so they wait for each other: end other programs, "
@@ -99,39 +89,28 @@ def forecast(method: str, steps: int, rays: int, threads: int, cores: float) -> 
 
 @torch.no_grad()
 def quick_test(model: Model, images: InputDataset, background: float) -> str:
-    """PSNR and SSIM of a few test images, as a sentence.
-
-    Args:
-        model: in training mode, also afterwards.
-        images: the test images.
-        background: behind those with transparency.
-    """
+    """PSNR and SSIM of a few test images over a grey level, as a sentence. The model is in training mode afterwards."""
     model.eval()
-    metrics, found, began = ImageMetrics("none"), [], monotonic()
+    metrics, scores, began = ImageMetrics("none"), [], monotonic()
     count = min(VIEWS, len(images))
     for i in np.linspace(0, len(images) - 1, count).round().astype(int).tolist():
         predicted = model.get_outputs_for_camera(images.cameras[i : i + 1].to(model.device))["rgb"]
         image = images.get_data(i, image_type="float32")["image"].to(predicted)
-        found.append(metrics(predicted, over_background(image, torch.full_like(image[..., :3], background))))
+        scores.append(metrics(predicted, over_background(image, torch.full_like(image[..., :3], background))))
         if monotonic() - began > LOOK_SECONDS:
             break
     model.train()
-    psnr = [values["psnr"] for values in found]
-    ssim = [values["ssim"] for values in found if "ssim" in values]
-    parts = [f"PSNR {np.mean(psnr):.2f} dB ({min(psnr):.1f} to {max(psnr):.1f})"]
-    if ssim:
-        parts.append(f"SSIM {np.mean(ssim):.3f}")
-    return f"Quick test on {len(found)} of {len(images)} test images: {', '.join(parts)}."
+    psnr, ssim = ([values[name] for values in scores if name in values] for name in ("psnr", "ssim"))
+    text = f"PSNR {np.mean(psnr):.2f} dB ({min(psnr):.1f} to {max(psnr):.1f})"
+    text += f", SSIM {np.mean(ssim):.3f}" if ssim else ""
+    return f"Quick test on {len(scores)} of {len(images)} test images: {text}."
 
 
 def next_commands(folder: Path) -> str:
     """The folder of a run, and the next commands."""
     config, scores, film = (quoted(folder / name) for name in ("config.yml", "eval.json", "fly.mp4"))
-    return "\n".join(
-        [
-            f"The run is in {folder}. Next:",
-            f"  ns-eval --load-config {config} --output-path {scores}",
-            f"  ns-render interpolate --load-config {config} --pose-source train --output-path {film}",
-            f"  ns-viewer --load-config {config}",
-        ]
+    return (
+        f"The run is in {folder}. Next:\n  ns-eval --load-config {config} --output-path {scores}\n"
+        f"  ns-render interpolate --load-config {config} --pose-source train --output-path {film}\n"
+        f"  ns-viewer --load-config {config}"
     )

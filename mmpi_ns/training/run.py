@@ -1,91 +1,111 @@
-"""State changes of a training run between two steps: window, resolution, pixels, and trainable parameters."""
+"""State of a training run, and its changes between two steps: window, resolution, bricks, pixels, what trains."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import torch
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes
 from numpy.typing import NDArray
+from torch import Tensor, nn
 from torch.nn import Parameter
 
 from mmpi_ns.capture.datamanager import MMPIDataManager
 from mmpi_ns.field.mmpi_field import MMPIField
+from mmpi_ns.field.tables import TABLES, TexelTables
 from mmpi_ns.placement.split import cameras_in
 from mmpi_ns.rendering.window_store import WindowStore
+from mmpi_ns.scene.texels import BRICK
 from mmpi_ns.scene.visible_tiles import TrainingViews
-from mmpi_ns.scene.windows import Window
-from mmpi_ns.training.phases import TRAINS
-from mmpi_ns.training.progress import Progress
-from mmpi_ns.training.refined_poses import keep_frame
-from mmpi_ns.training.storage import prepare_storage
+from mmpi_ns.scene.windows import Window, WindowedPlan
+from mmpi_ns.training.batch_rays import keep_frame
+from mmpi_ns.training.phases import TRAINS, Phase, Schedule
+from mmpi_ns.utils.files import to_bytes, to_text
+from mmpi_ns.utils.host import give_back_freed_memory
+
+FORMING = 0.4
+"""Factor of the weight below which bricks are released while surfaces still form."""
 
 
-def parameters_by_kind(field: MMPIField) -> dict[str, list[Parameter]]:
-    """What has a learning rate of its own (``phases.ParameterKind``)."""
-    return {
-        "density": [field.density],
-        "features": [field.features],
-        "colour": [field.networks.weights],
-        "reliability": [field.reliability],
-    }
+class Progress(nn.Module):
+    """Windows, schedule, step, and the window being trained. All but the step are stored in checkpoints."""
+
+    def __init__(self, windows: WindowedPlan, schedule: Schedule) -> None:
+        super().__init__()
+        self.windows, self.schedule = windows, schedule
+        self.step = 0
+        self.window = 0
+        """The window being trained; earlier ones are finished, later ones do not exist yet."""
+        self.windows_bytes: Tensor
+        self.schedule_bytes: Tensor
+        self.window_number: Tensor
+        self.register_buffer("windows_bytes", to_bytes(windows.to_json()))
+        self.register_buffer("schedule_bytes", to_bytes(schedule.to_json()))
+        self.register_buffer("window_number", torch.tensor(0))
+
+    @property
+    def phase(self) -> Phase:
+        return self.schedule.phase_at(self.step)
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
+        """Plan and schedule of a run come from its checkpoint, whatever config and capture say now."""
+        for name in ("windows_bytes", "schedule_bytes"):
+            stored = state_dict.get(prefix + name)
+            if stored is not None:  # nerfstudio loads the pipeline's own, empty state in a second pass
+                setattr(self, name, torch.empty_like(stored, device=self.window_number.device))
+        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
+        self.windows = WindowedPlan.from_json(to_text(self.windows_bytes))
+        self.schedule = Schedule.from_json(to_text(self.schedule_bytes))
+        self.window = int(self.window_number)
 
 
 def cameras_of(window: Window, centers: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Those of the cameras that ask a window; all where there is one window alone."""
+    """Cameras whose rays the window renders; all cameras if there is only one window."""
     return cameras_in(centers, np.asarray(window.center), window.radius + window.margin)
 
 
 def views_of(window: Window, views: TrainingViews | None) -> TrainingViews | None:
-    """The training images that ask a window."""
+    """Training images whose rays the window renders."""
     return None if views is None else views.some(cameras_of(window, views.origins.numpy()))
 
 
+@dataclass(eq=False)
 class TrainingRun:
-    """What is trained, and its changes from one step to the next.
+    """Field, optimised parameters and window store of a run, changed from one step to the next."""
 
-    Args:
-        progress: windows, schedule and step.
-        field: of the window that is trained, one after the other.
-        store: where finished windows go.
-        views: the training images; None: every texel is stored.
-        release_weight: bricks in which no sample has this weight are released.
-        poses: corrections of the cameras' poses, if they are refined.
-        scale_is_free: no known depth fixes the scale of the capture.
-    """
-
-    def __init__(
-        self,
-        progress: Progress,
-        field: MMPIField,
-        store: WindowStore,
-        views: TrainingViews | None,
-        release_weight: float,
-        poses: list[Parameter] | None = None,
-        scale_is_free: bool = False,
-    ) -> None:
-        self.progress, self.field, self.store = progress, field, store
-        self.views, self.release_weight = views, release_weight
-        self._poses, self._scale_is_free = poses or [], scale_is_free
-        self.shared = False
-        """Whether other processes train some of the windows."""
-        self._drawn_from: int | None = None
+    progress: Progress
+    field: MMPIField
+    """Of the window that is trained, one after the other."""
+    store: WindowStore
+    """Finished windows."""
+    views: TrainingViews | None
+    """The training images; None: every texel is stored."""
+    release_weight: float
+    """Bricks in which no sample has this weight are released."""
+    poses: list[Parameter]
+    """Corrections of the cameras' poses, if they are refined."""
+    scale_is_free: bool
+    """No depth measurement fixes the scale of the capture."""
+    shared: bool = False
+    """Whether other processes train some of the windows."""
+    _drawn_from: int | None = None
 
     def parameters(self) -> dict[str, list[Parameter]]:
-        """What trains, by what has a learning rate of its own."""
-        return parameters_by_kind(self.field) | ({"camera_opt": self._poses} if self._poses else {})
-
-    def cameras_of(self, centers: NDArray[np.float64], window: int) -> NDArray[np.int64]:
-        """Those of the cameras that ask a window."""
-        return cameras_of(self.progress.windows.windows[window], centers)
-
-    def views_of(self, window: int) -> TrainingViews | None:
-        """The training images that ask a window."""
-        return views_of(self.progress.windows.windows[window], self.views)
+        """Parameters by kind (``phases.ParameterKind``); each kind has its own learning rate."""
+        field = self.field
+        groups = {
+            "density": [field.density],
+            "features": [field.features],
+            "colour": [field.networks.weights],
+            "reliability": [field.reliability],
+        }
+        return groups | ({"camera_opt": self.poses} if self.poses else {})
 
     def windows_there(self) -> list[int]:
-        """Windows that can be rendered: trained in order, those after the present one are not there yet; where other
-        processes train some, those that they have finished."""
+        """Windows that can be rendered: the one being trained, and those that are finished."""
         count, trained = len(self.progress.windows), self.progress.window
         if self.shared:
             return [w for w in range(count) if w == trained or self.store.path(w).is_file()]
@@ -98,41 +118,67 @@ class TrainingRun:
             attributes: the trainer's optimisers and data manager; None without a trainer.
             step: about to run.
         """
-        progress, field = self.progress, self.field
+        progress, field, schedule = self.progress, self.field, self.progress.schedule
         progress.step = step
         field.forget_baked()
         optimizers = attributes.optimizers.optimizers if attributes and attributes.optimizers else {}
-        groups = self.parameters()
-        if progress.schedule.window_at(step) != progress.window:
-            self._begin_window(progress.schedule.window_at(step), progress.schedule.texel_factor(step))
+        groups, window = self.parameters(), schedule.window_at(step)
+        if window != progress.window:  # the trainer has saved the previous one
+            self.store.forget(window)
+            field.views = views_of(progress.windows.windows[window], self.views)
+            field.build(progress.windows.plans[window], schedule.texel_factor(step))
+            field.renew_networks()
+            progress.window_number.fill_(window)
+            progress.window = window
             for kind, params in groups.items():
                 if kind in optimizers:
                     optimizers[kind].reset_moments(params[0])
-        prepare_storage(field, progress.schedule, step, self.release_weight, optimizers)
+        prepare_storage(field, schedule, step, self.release_weight, optimizers)
         if attributes is not None and attributes.pipeline is not None:
-            self._prepare_draws(attributes.pipeline.datamanager)
+            manager = attributes.pipeline.datamanager
+            assert isinstance(manager, MMPIDataManager), "training needs MMPIDataManager"
+            manager.rays_share = schedule.rays_share(step)
+            if self._drawn_from != window:
+                centers, windows = manager.observations.centers, progress.windows.windows
+                manager.use_cameras(cameras_of(windows[window], centers) if len(windows) > 1 else None)
+                self._drawn_from = window
         phase = progress.phase.name
         field.learns_cover = phase == "individual"
         for kind, params in groups.items():
             params[0].requires_grad_(kind in TRAINS[phase])
-        if "camera_opt" in TRAINS[phase] and self._poses and self.views is not None:
-            keep_frame(self._poses[0], self.views.origins, field.plan.content_near, self._scale_is_free)
+        if "camera_opt" in TRAINS[phase] and self.poses and self.views is not None:
+            keep_frame(self.poses[0], self.views.origins, field.plan.content_near, self.scale_is_free)
 
-    def _begin_window(self, window: int, factor: float) -> None:
-        """Starts another window with new tables and networks; the trainer has saved the previous one."""
-        field = self.field
-        self.store.forget(window)
-        field.views = self.views_of(window)
-        field.build(self.progress.windows.plans[window], factor)
-        field.renew_networks()
-        self.progress.begin(window)
 
-    def _prepare_draws(self, manager: Any) -> None:
-        """Makes the data manager draw the rays of the current step, from the cameras of the current window."""
-        assert isinstance(manager, MMPIDataManager), "training needs MMPIDataManager"
-        progress = self.progress
-        manager.rays_share = progress.schedule.rays_share(progress.step)
-        if self._drawn_from != progress.window:
-            several = len(progress.windows) > 1
-            manager.use_cameras(self.cameras_of(manager.observations.centers, progress.window) if several else None)
-            self._drawn_from = progress.window
+def prepare_storage(
+    field: TexelTables, schedule: Schedule, step: int, least: float, optimizers: Mapping[str, Any]
+) -> None:
+    """Grows tables and releases bricks as scheduled for a step; the optimisers' moments follow.
+
+    Args:
+        field: the field that is trained.
+        schedule: of the whole run.
+        step: that is about to run.
+        least: see ``TexelTables.release_unused``.
+        optimizers: of the tables, by name, if there are any.
+    """
+    trained = [(optimizers[name], getattr(field, name)) for name in TABLES if name in optimizers]
+    phase, factor, remaining = schedule.phase_at(step), schedule.texel_factor(step), []
+    grows, releases = factor != field.factor, schedule.releases_at(step)
+    if grows:
+        for optimizer, table in trained:
+            optimizer.reset_moments(table)
+    if grows or releases:
+        give_back_freed_memory()
+    if releases:
+        remaining.append(field.release_unused(FORMING * least if grows else least))
+    if grows:  # what has just been released does not grow
+        field.grow(factor)
+        give_back_freed_memory()
+    elif schedule.sharpened(step) and not schedule.sharpened(step - 1):
+        field.look_afresh()
+    if phase.name == "blend" and step == phase.start:
+        remaining.append(field.release_untouched())
+    for kept in remaining:
+        for optimizer, table in trained if kept is not None else ():
+            optimizer.keep_blocks(table, kept, BRICK)

@@ -1,4 +1,4 @@
-"""Windows of a long capture shared out among processes; docs/how_it_works.md, "Windows".
+"""Windows of a long capture shared among processes; docs/how_it_works.md, "Windows".
 
 The processes exchange nothing: each trains every n-th window, and waits for the others at the end.
 """
@@ -14,8 +14,7 @@ import torch.distributed as dist
 from mmpi_ns.rendering.window_store import WindowStore
 from mmpi_ns.scene.windows import WindowedPlan
 from mmpi_ns.training.checkpoints import checkpoints_in
-from mmpi_ns.utils.console import say
-from mmpi_ns.utils.errors import InputError
+from mmpi_ns.utils.errors import InputError, say
 
 PATIENCE = timedelta(days=7)
 """nerfstudio's processes time out half an hour after the first of them has finished."""
@@ -57,7 +56,7 @@ class WindowShare:
         return {step: path for folder in self.folders for step, path in checkpoints_in(folder, steps).items()}
 
     def unfinished(self, windows: WindowedPlan, store: WindowStore) -> Iterator[int]:
-        """Windows that this process still has to train; files of those that the resumed run finished are taken over."""
+        """Windows that this process still has to train; takes over the files that the resumed run finished."""
         last = len(windows) - 1
         for window in range(self.rank, len(windows), self.processes):
             for folder in self.folders[1:]:

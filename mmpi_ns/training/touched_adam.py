@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from jaxtyping import Float
 from nerfstudio.engine.optimizers import OptimizerConfig
 from torch import Tensor
 from torch.nn import Parameter
@@ -43,9 +42,15 @@ class TouchedAdam(torch.optim.Optimizer):
                     continue
                 state = self.state[param]
                 if not state:
-                    state["step"], state["moments"] = 0, _no_moments(param)
+                    # Mean and uncentred variance. Those of a table are in bfloat16 (docs/log/performance.md has what
+                    # that costs), and take no memory on a CPU until they are written to: most rows may never be.
+                    table = isinstance(param, Table) and param.dtype == torch.float32
+                    dtype, shape = torch.bfloat16 if table else param.dtype, (len(param), 2, *param.shape[1:])
+                    state["step"], state["moments"] = 0, lazy_zeros(shape, dtype, param.device)
                 state["step"] += 1
-                old, constants = (param.data, state["moments"]), _constants(state["step"], group)
+                old, (beta1, beta2), steps = (param.data, state["moments"]), group["betas"], state["step"]
+                correction, rate = (1 - beta2**steps) ** 0.5, group["lr"] / (1 - beta1**steps)
+                constants = AdamConstants(beta1, beta2, correction, group["eps"], rate)
                 if isinstance(param, Table):
                     assert param.grad_rows is not None
                     adam_rows(*old, param.grad_rows, param.grad, constants)
@@ -65,24 +70,11 @@ class TouchedAdam(torch.optim.Optimizer):
             state["moments"] = moments.view(-1, size, *moments.shape[1:])[kept].flatten(0, 1)
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Like torch's own, which would convert moments to the precision of their parameters."""
+        """Loads the state without torch's conversion of moments to the precision of their parameters."""
         super().load_state_dict(state_dict)
         params = [param for group in self.param_groups for param in group["params"]]
         for number, state in state_dict["state"].items():
             self.state[params[number]]["moments"] = state["moments"].to(params[number].device)
-
-
-def _no_moments(param: Parameter) -> Float[Tensor, "N 2 *C"]:
-    """Zeros, mean and uncentred variance. Those of a table are in bfloat16 (docs/log/performance.md has what that
-    costs), and take no memory on a CPU until they are written to: most rows may never be."""
-    dtype = torch.bfloat16 if isinstance(param, Table) and param.dtype == torch.float32 else param.dtype
-    return lazy_zeros((len(param), 2, *param.shape[1:]), dtype, param.device)
-
-
-def _constants(step: int, group: dict[str, Any]) -> AdamConstants:
-    beta1, beta2 = group["betas"]
-    correction = (1 - beta2**step) ** 0.5
-    return AdamConstants(beta1, beta2, correction, group["eps"], group["lr"] / (1 - beta1**step))
 
 
 @dataclass

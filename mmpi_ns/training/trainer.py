@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import hashlib
+import shutil
 import sys
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from time import monotonic
-from typing import Any, Literal, NoReturn
+from typing import Any, Literal, NoReturn, cast
 
 import torch
 from nerfstudio.engine.optimizers import Optimizers
@@ -20,30 +21,25 @@ from mmpi_ns.rendering.rendered import BACKGROUNDS
 from mmpi_ns.scene.texels import BRICK
 from mmpi_ns.scene.windows import WindowedPlan
 from mmpi_ns.training.checkpoints import (
+    PLAN_FILE,
     cameras_in_short,
-    check_same_capture,
-    check_same_plan,
-    check_same_refinement,
+    check_same_run,
     checkpoint_to_load,
     checkpoints_in,
+    claim,
     read_checkpoint,
 )
-from mmpi_ns.training.config_files import check_nothing_left, with_absolute_paths
-from mmpi_ns.training.learning_rates import following
+from mmpi_ns.training.learning_rates import PhaseScheduler
 from mmpi_ns.training.memory import describe, training_bytes
-from mmpi_ns.training.options import check_device, check_ffmpeg, check_run
+from mmpi_ns.training.options import check_device, check_nothing_left, check_run, with_absolute_paths
 from mmpi_ns.training.report import TrainingLog, forecast, next_commands, quick_test
-from mmpi_ns.training.run import TrainingRun
-from mmpi_ns.training.run_folder import claim
+from mmpi_ns.training.run import TrainingRun, cameras_of, views_of
 from mmpi_ns.training.shared_windows import WINDOWS_FOLDER, WindowShare
-from mmpi_ns.utils.console import duration, say
-from mmpi_ns.utils.errors import InputError, quoted
+from mmpi_ns.utils.errors import InputError, duration, quoted, say
 from mmpi_ns.utils.files import write_atomically
 from mmpi_ns.utils.host import arguments, command, enter_command, signals_go_to
 from mmpi_ns.utils.machine import free_cores, unused_gpu
 from mmpi_ns.utils.parallel import num_threads, torch_apart
-
-PLAN_FILE = "plan.json"
 
 
 @dataclass
@@ -66,7 +62,11 @@ class MMPITrainerConfig(TrainerConfig):
         They take every file in this folder for a checkpoint, so the last one is given explicitly.
         """
         enter_command()
-        check_ffmpeg()
+        if command() == "ns-render" and "dataset" not in arguments() and shutil.which("ffmpeg") is None:
+            raise InputError(  # nerfstudio checks only after loading
+                "ns-render needs ffmpeg, for images too, and it is not installed: install it (apt or conda install "
+                "ffmpeg)."
+            )
         check_nothing_left(self.pipeline.model)
         folder = super().get_checkpoint_dir()
         steps = checkpoints_in(folder)
@@ -107,23 +107,11 @@ class MMPITrainer(Trainer):
 
     config: MMPITrainerConfig
 
-    @property
-    def _run(self) -> TrainingRun:
-        run = getattr(self.pipeline.model, "run", None)
-        assert isinstance(run, TrainingRun), "MMPITrainer trains MMPIModel only"
-        return run
-
-    @property
-    def _manager(self) -> MMPIDataManager:
-        manager = self.pipeline.datamanager
-        assert isinstance(manager, MMPIDataManager), "MMPITrainer trains from MMPIDataManager"
-        return manager
-
     # Before the first step ----------------------------------------------------------------------------------------
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         """Prepares the run; a signal during this time ends it with a sentence (of several processes: torchrun's)."""
-        with signals_go_to(_end_before_training) if self.world_size == 1 else nullcontext():
+        with signals_go_to(_end) if self.world_size == 1 else nullcontext():
             self._prepare(test_mode)
 
     def _prepare(self, test_mode: Literal["test", "val", "inference"]) -> None:
@@ -153,17 +141,17 @@ class MMPITrainer(Trainer):
         self.base_dir.mkdir(parents=True, exist_ok=True)
         _write_plan(self.base_dir / PLAN_FILE, plan)
         self._run.shared = self._share is not None
-        if len(self._run.field.density) <= BRICK:  # the one that nothing lies in
+        if len(self._run.field.density) <= BRICK:  # the empty brick alone
             raise InputError(
                 "No training image sees anything of the scene plan: its MPIs must stand among the cameras and face as "
                 "they do (mmpi-plan shows where)."
             )
-        self._say_what_comes(plan)
+        self._announce(plan)
         if self._share is not None:
             self._share.check(plan)
 
-    def _say_what_comes(self, plan: WindowedPlan) -> None:
-        """Prints capture, plan and memory together, before the first step."""
+    def _announce(self, plan: WindowedPlan) -> None:
+        """Prints capture, plan, memory and expected time together, before the first step."""
         say(self._manager.describe())
         say(describe(plan, self._window_steps, *self._expected_memory()))
         if self._follows_capture:
@@ -173,27 +161,24 @@ class MMPITrainer(Trainer):
             )
         if not str(self.device).startswith("cuda"):
             rays = self._manager.get_train_rays_per_batch()
-            cpu = num_threads(), free_cores()
-            say(forecast(self.config.method_name or "", self._total_steps, rays, *cpu))
+            say(forecast(self.config.method_name or "", self._total_steps, rays, num_threads(), free_cores()))
             if gpu := unused_gpu():
                 say(f"No GPU is used: {gpu}.")
 
     def _expected_memory(self) -> tuple[list[int], list[int]]:
         """Bytes needed for training each window: tables with their moments, and pixels."""
-        run, manager = self._run, self._manager
+        run, manager, windows = self._run, self._manager, self._run.progress.windows.windows
         blends = any(phase.name == "blend" for phase in run.progress.schedule.phases)
-        tables = [
-            training_bytes(plan, run.views_of(w), run.field.feature_channels, blends)
-            for w, plan in enumerate(run.progress.windows.plans)
-        ]
-        if len(tables) == 1:
-            return tables, [manager.pixel_bytes()]
-        centers = manager.observations.centers
-        return tables, [manager.pixel_bytes(run.cameras_of(centers, w)) for w in range(len(tables))]
+        centers, channels = manager.observations.centers, run.field.feature_channels
+        tables = [training_bytes(w.plan, views_of(w, run.views), channels, blends) for w in windows]
+        cameras = [None] if len(windows) == 1 else [cameras_of(w, centers) for w in windows]
+        return tables, [manager.pixel_bytes(c) for c in cameras]
 
     def setup_optimizers(self) -> Optimizers:
         """nerfstudio's optimisers, with schedulers that follow the phases."""
-        progress = self._run.progress
+        run, manager = getattr(self.pipeline.model, "run", None), self.pipeline.datamanager
+        assert isinstance(run, TrainingRun) and isinstance(manager, MMPIDataManager), "MMPITrainer trains MMPIModel"
+        self._run, self._manager, progress = run, manager, run.progress
         self._window_steps = progress.schedule.window_steps
         if self._follows_capture:
             self.config.steps_per_save = max(self.config.steps_per_save, self._window_steps // 4)
@@ -202,7 +187,7 @@ class MMPITrainer(Trainer):
         # nerfstudio shows what is left
         self._total_steps = self.config.max_num_iterations = progress.schedule.total_steps
         config: dict[str, Any] = {
-            name: {"optimizer": entry["optimizer"], "scheduler": following(entry["scheduler"], progress)}
+            name: entry | {"scheduler": PhaseScheduler.following(entry["scheduler"], progress)}
             for name, entry in self.config.optimizers.items()
         }
         return Optimizers(config, self.pipeline.get_param_groups())
@@ -220,13 +205,17 @@ class MMPITrainer(Trainer):
         if self._start_step >= self._total_steps:
             say(f"The checkpoint already holds {self._start_step} of {self._total_steps} steps: nothing to do.")
             return
-        with signals_go_to(self._stop):
+
+        def stop(number: int) -> None:  # nerfstudio's loop ends after the current step, even if training is paused
+            self._stopped_by, self.stop_training = number, True
+
+        with signals_go_to(stop):
             self._train_until(self._total_steps)
         if self._stopped_by is not None:
             self.config.logging.profiler = "none"  # nothing more is said
             path = checkpoints_in(self.checkpoint_dir).get(self._last_step)
             if path is None:  # training was paused
-                _end_before_training(self._stopped_by)
+                _end(self._stopped_by)
             _end(
                 self._stopped_by,
                 f"Stopped after step {self._last_step + 1} of {self._total_steps}, which is in {path}: the same "
@@ -260,10 +249,6 @@ class MMPITrainer(Trainer):
         finally:
             self.config.max_num_iterations = self._window_steps
 
-    def _stop(self, number: int) -> None:
-        """Makes nerfstudio's loop end after the current step, even if training is paused."""
-        self._stopped_by, self.stop_training = number, True
-
     def train_iteration(self, step: int) -> Any:
         """One step; records that it ran, and saves a window of several after its last step."""
         loss, *others = super().train_iteration(step)
@@ -275,7 +260,9 @@ class MMPITrainer(Trainer):
         run, progress = self._run, self._run.progress
         if len(progress.windows) > 1 and (step + 1) % progress.schedule.window_steps == 0:
             run.store.save(progress.window, run.field)
-        return loss.detach(), *({k: _detached(v) for k, v in values.items()} for values in others)
+        for values in others:
+            values.update({name: v.detach() for name, v in values.items() if isinstance(v, torch.Tensor)})
+        return loss.detach(), *others
 
     def _after_train(self) -> None:
         """Saves with the number of the last step that ran; nerfstudio 1.1.5 would use the next one after a stop."""
@@ -329,11 +316,9 @@ class MMPITrainer(Trainer):
     def _load_checkpoint(self) -> None:
         path, run = checkpoint_to_load(self.config), self._run
         if path is not None:
-            state = read_checkpoint(path)
-            check_same_capture(state, path, self._manager.get_datapath(), self._manager.observations)
-            check_same_plan(state["pipeline"], path, run.progress.windows, PLAN_FILE)
-            model: Any = self.pipeline.model
-            check_same_refinement(state["pipeline"], path, model.camera_optimizer.config.mode)
+            state, model = read_checkpoint(path), cast(Any, self.pipeline.model)
+            capture, mode = self._manager, model.camera_optimizer.config.mode
+            check_same_run(state, path, capture.get_datapath(), capture.observations, run.progress.windows, mode)
             torch.set_rng_state(state["rng"]["torch"])
             del state
         # nerfstudio takes every file in load_dir for a checkpoint.
@@ -348,30 +333,21 @@ class MMPITrainer(Trainer):
 
 
 def _write_plan(path: Path, plan: WindowedPlan) -> None:
-    """Writes a run's plan for the user to read; one that was edited is kept."""
-    text, told = plan.to_json(), path.with_name(f".{path.name}.sha256")
-    there = path.read_bytes() if path.is_file() else text.encode()
-    written = told.read_text(encoding="ascii") if told.is_file() else ""
-    if there != text.encode() and hashlib.sha256(there).hexdigest() != written:
+    """Writes a run's plan for the user to read. Raises InputError if the user has edited the present file."""
+    text, digest_file = plan.to_json(), path.with_name(f".{path.name}.sha256")
+    present = path.read_bytes() if path.is_file() else text.encode()
+    digest = digest_file.read_text(encoding="ascii") if digest_file.is_file() else ""
+    if present != text.encode() and hashlib.sha256(present).hexdigest() != digest:
         raise InputError(
             f"{path} is not the plan of this run and was edited, it seems: give it with --pipeline.model.plan-file in "
             "another --timestamp, or remove it."
         )
     write_atomically(path, lambda unfinished: unfinished.write_text(text, encoding="utf-8"))
-    told.write_text(hashlib.sha256(text.encode()).hexdigest(), encoding="ascii")
+    digest_file.write_text(hashlib.sha256(text.encode()).hexdigest(), encoding="ascii")
 
 
-def _detached(value: Any) -> Any:
-    return value.detach() if isinstance(value, torch.Tensor) else value
-
-
-def _end(number: int, sentence: str) -> NoReturn:
+def _end(number: int, sentence: str = "Stopped before the first step: there is nothing to go on from.") -> NoReturn:
     """Ends the process with the exit status of the signal (130 after Ctrl-C) and a sentence."""
     sys.stdout.flush()
     print(sentence, file=sys.stderr, flush=True)
     raise SystemExit(128 + number)
-
-
-def _end_before_training(number: int) -> NoReturn:
-    """Handles signals that arrive while a run is prepared."""
-    _end(number, "Stopped before the first step: there is nothing to go on from.")

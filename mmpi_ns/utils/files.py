@@ -1,4 +1,4 @@
-"""Files that are whole or not there at all, and text in a checkpoint."""
+"""Atomic files, and text in a checkpoint."""
 
 from __future__ import annotations
 
@@ -29,7 +29,8 @@ def write_atomically(path: Path, write: Callable[[Path], object], folder: Path |
     temporary = (folder or path.parent) / f".{path.name}.{os.getpid()}.tmp"
     try:
         write(temporary)
-        _to_disk(temporary)
+        with open(temporary, "rb+") as file:  # on the disk before the name is: a power cut would leave an empty file
+            os.fsync(file.fileno())
         os.replace(temporary, path)
     except (OSError, RuntimeError) as error:  # torch.save has a RuntimeError, without a reason, for a full disk
         free = shutil.disk_usage(temporary.parent).free / 2**20
@@ -45,7 +46,7 @@ def write_atomically(path: Path, write: Callable[[Path], object], folder: Path |
 
 @contextmanager
 def write_errors(folder: Path, option: str) -> Iterator[None]:
-    """Where a folder cannot be written this is said with the option that would name another."""
+    """Errors of writing in a folder, within the block: WriteError with the option that names another folder."""
     try:
         yield
     except TimeoutError:  # of a lock that another process holds
@@ -54,17 +55,11 @@ def write_errors(folder: Path, option: str) -> Iterator[None]:
         raise WriteError(f"{folder} cannot be written ({brief(error)}): choose another {option}.") from error
 
 
-def _to_disk(path: Path) -> None:
-    """Waits until a file is on the disk: a rename may get there first, and a power cut would leave an empty file."""
-    with open(path, "rb+") as file:
-        os.fsync(file.fileno())
-
-
 def to_bytes(text: str) -> UInt8[Tensor, "B"]:
     """Text as a buffer of a module."""
     return torch.frombuffer(bytearray(text.encode()), dtype=torch.uint8)
 
 
 def to_text(data: UInt8[Tensor, "B"]) -> str:
-    """What ``to_bytes`` made of a text."""
+    """Inverse of ``to_bytes``."""
     return bytes(data.cpu().numpy().tolist()).decode()

@@ -15,7 +15,6 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from threading import current_thread, main_thread
 from types import ModuleType, TracebackType
@@ -34,7 +33,7 @@ NOTICES = (
     "[bold yellow]logging events to:",
     "[NOTE] Not running eval iterations",
 )
-"""How nerfstudio's lines begin that nobody who trains can do anything about."""
+"""Beginnings of nerfstudio's lines that a user can do nothing about."""
 WARNINGS = (
     "Using a non-tuple sequence for multidimensional indexing",
     "`torch.cuda.amp",
@@ -42,13 +41,13 @@ WARNINGS = (
     "Sparse invariant checks are implicitly disabled",
     "You are using `torch.load` with `weights_only=False`",
 )
-"""How such warnings of torch and nerfstudio begin."""
+"""Beginnings of such warnings of torch and nerfstudio."""
 TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3
 """Of mallopt, in malloc.h."""
 KEPT = 256 << 20
-"""Bytes that are freed and kept for the next use: more than a step takes beside the tables."""
+"""Freed bytes that are kept for the next use: more than a step takes beside the tables."""
 OWN_MAPPING = 32 << 20
-"""Arrays of so many bytes, which tables are, go back to the system at once: glibc's upper limit."""
+"""Bytes from which an array, such as a table, goes back to the system at once: glibc's upper limit."""
 MALLOC_DEFAULT = 128 << 10
 """glibc's value of both thresholds at the start."""
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -56,18 +55,8 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 Undo = Callable[[], object]
 
 
-@dataclass(frozen=True)
-class Patch:
-    """A change of the host that lasts until it is undone."""
-
-    target: str
-    reason: str
-    make: Callable[[], Undo]
-    training: bool = False
-    """Made for training alone."""
-
-
 def _show_errors() -> Undo:
+    """sys.excepthook: an InputError ends a command with its sentence alone."""
     before = sys.excepthook
 
     def show(kind: type[BaseException], error: BaseException, traceback: TracebackType | None) -> None:
@@ -81,43 +70,37 @@ def _show_errors() -> Undo:
     return lambda: setattr(sys, "excepthook", before)
 
 
-def _filter_warnings() -> Undo:
-    before = list(warnings.filters)
+def _hide_notices() -> Undo:
+    """warnings.filters, CONSOLE.print, CONSOLE.log: nobody who trains can do anything about ``WARNINGS``, ``NOTICES``
+    and the lines of nerfstudio's log."""
+    filters, plain = list(warnings.filters), CONSOLE.print
     for message in WARNINGS:
         warnings.filterwarnings("ignore", message=message)
-    return lambda: warnings.filters.__setitem__(slice(None), before)  # type: ignore[attr-defined]
-
-
-def _quiet_console() -> Undo:
-    plain = CONSOLE.print
 
     def print_for_users(*objects: Any, **how: Any) -> None:
         if not (objects and isinstance(objects[0], str) and objects[0].startswith(NOTICES)):
             plain(*objects, **how)
 
-    if os.environ.get(TRACEBACK) == "1":
-        return lambda: None
-    vars(CONSOLE).update(print=print_for_users, log=lambda *_, **__: None)
-    return lambda: [vars(CONSOLE).pop(name) for name in ("print", "log")]
+    def undo_both() -> None:
+        warnings.filters[:] = filters  # type: ignore[index]
+        for name in ("print", "log"):
+            vars(CONSOLE).pop(name, None)
+
+    if os.environ.get(TRACEBACK) != "1":
+        vars(CONSOLE).update(print=print_for_users, log=lambda *_, **__: None)
+    return undo_both
 
 
 def _keep_freed_memory() -> Undo:
+    """glibc's malloc: a training step takes again what the last one freed; see ``malloc_keeps``."""
     malloc_keeps(KEPT, OWN_MAPPING)
     return lambda: malloc_keeps(MALLOC_DEFAULT, MALLOC_DEFAULT)
 
 
-PATCHES = (
-    Patch("sys.excepthook", "An InputError ends a command with its sentence alone.", _show_errors),
-    Patch("warnings.filters", "Nobody who trains can do anything about these of torch.", _filter_warnings),
-    Patch("CONSOLE.print, CONSOLE.log", "Nor about these, or about the lines of nerfstudio's log.", _quiet_console),
-    Patch(
-        "glibc's malloc",
-        "A step takes again what the last one freed; see malloc_keeps.",
-        _keep_freed_memory,
-        training=True,
-    ),
-)
-_undos: dict[str, Undo] = {}
+PATCHES = (_show_errors, _hide_notices)
+TRAINING_PATCHES = (_keep_freed_memory,)
+"""Each makes a change of the host that lasts until it is undone; its docstring says of what, and why."""
+_undos: dict[Callable[[], Undo], Undo] = {}
 
 
 def command() -> str | None:
@@ -135,16 +118,13 @@ def arguments() -> list[str]:
 
 
 def enter_command(training: bool = False) -> None:
-    """Makes the patches once, if this process runs a command.
+    """Makes the patches once, those of training if asked for, if this process runs a command.
 
     nerfstudio's commands have no hook for this, so it is called by the first code of ours that each of them runs.
-
-    Args:
-        training: also those that are for training alone.
     """
-    for patch in PATCHES if command() is not None else ():
-        if patch.target not in _undos and (training or not patch.training):
-            _undos[patch.target] = patch.make()
+    for patch in (*PATCHES, *(TRAINING_PATCHES if training else ())) if command() is not None else ():
+        if patch not in _undos:
+            _undos[patch] = patch()
 
 
 def undo() -> None:
@@ -154,9 +134,9 @@ def undo() -> None:
 
 
 def malloc_keeps(freed: int, own_mapping: int) -> bool:
-    """Sets from how many bytes on glibc gives freed memory back, and maps an array by itself.
+    """Sets glibc's thresholds, in bytes, for giving back freed memory and for mapping an array by itself.
 
-    What a training step frees the next one takes again. glibc's defaults give much of it back to the system, which then
+    A training step takes again what the last one freed. glibc's defaults give much of it back to the system, which then
     hands out zeroed pages: thousands of page faults a step. glibc adapts its defaults and cannot be asked for them, so
     an undo restores where they begin.
 
@@ -171,7 +151,7 @@ def malloc_keeps(freed: int, own_mapping: int) -> bool:
 
 
 def give_back_freed_memory() -> None:
-    """Has glibc give back what it keeps and nobody uses: before tables grow, which do not fit into what steps leave."""
+    """Makes glibc give back its unused memory: tables that grow do not fit into what steps leave."""
     try:
         ctypes.CDLL(None).malloc_trim(0)
     except (AttributeError, OSError, TypeError):  # another C library
@@ -183,13 +163,9 @@ def give_back_freed_memory() -> None:
 
 @contextmanager
 def transforms_changed(parser: ModuleType, change: Callable[[dict[str, Any], Path], None]) -> Iterator[None]:
-    """Within the block nerfstudio's parser sees a transforms.json after ``change``.
+    """Within the block nerfstudio's parser sees a transforms.json after ``change``, which edits its content in place.
 
-    It reads the file and rounds to float32 in one function: this is the one place between.
-
-    Args:
-        parser: nerfstudio's module of the parser.
-        change: what to do with the content of the file at a path, in place.
+    The parser reads the file and rounds to float32 in one function: this is the only place between.
     """
     read = parser.load_from_json
 

@@ -1,4 +1,4 @@
-"""What the machine has left to give."""
+"""Free memory and cores of the machine, and a GPU that torch does not use."""
 
 from __future__ import annotations
 
@@ -32,7 +32,12 @@ def free_memory(device: str | torch.device) -> int:
     """Bytes that this process can still take on a device: of the machine, its container, and its own limits."""
     if torch.device(device).type == "cuda":
         return torch.cuda.mem_get_info(device)[0]
-    left = [_available()]
+    left = [sys.maxsize]
+    try:
+        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+        left += [int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")]
+    except OSError:  # not Linux
+        pass
     try:
         left.append(int((CGROUP / "memory.max").read_text()) - int((CGROUP / "memory.current").read_text()))
     except (OSError, ValueError):  # no container, or one without a limit
@@ -47,17 +52,8 @@ def free_memory(device: str | torch.device) -> int:
     return max(0, min(left))
 
 
-def _available() -> int:
-    """Bytes that the system says it can give without swapping; all there are where it does not say."""
-    try:
-        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
-        return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:"))
-    except (OSError, StopIteration):
-        return sys.maxsize
-
-
 def free_cores(seconds: float = 0.2) -> float:
-    """Cores that other programs leave to this process, of those that it may use; looks at what is idle for a moment."""
+    """Idle cores among those that this process may use, observed for ``seconds``."""
     most = float(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
     try:
         quota, period = (CGROUP / "cpu.max").read_text(encoding="ascii").split()

@@ -1,4 +1,4 @@
-"""Work shared out among as many threads as torch uses."""
+"""Work shared among torch's number of threads."""
 
 from __future__ import annotations
 
@@ -80,11 +80,7 @@ def one_thread_each() -> Iterator[None]:
 def in_order(function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
     """Results of a function that releases Python's lock for most of its time, in the order of its arguments.
 
-    At most one result more than there are threads is held, so what is summed from them stays small.
-
-    Args:
-        function: called from several threads at once.
-        items: its arguments.
+    The function is called from several threads at once. At most one result more than there are threads is in memory.
     """
     threads = num_threads()
     if threads == 1:

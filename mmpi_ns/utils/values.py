@@ -12,18 +12,18 @@ from typing import Any
 from mmpi_ns.utils.errors import InputError
 
 LARGEST = sys.float_info.max
-"""What floating-point numbers reach; whole numbers in a file may be larger."""
+"""Largest floating-point number; whole numbers in a file may be larger."""
 
 
 @dataclass(frozen=True)
 class Number:
-    """Which numbers will do: finite, from ``low`` to ``high``."""
+    """Range of valid numbers: finite, from ``low`` to ``high``."""
 
     low: float = -math.inf
     high: float = math.inf
     whole: bool = False
     above: bool = False
-    """``low`` itself will not do."""
+    """Whether ``low`` itself is excluded."""
 
     def holds(self, value: Any) -> bool:
         """Whether a value is such a number; truth values and text are not."""
@@ -33,14 +33,12 @@ class Number:
         return self.low <= number <= self.high and not (self.above and number == self.low) and abs(number) <= LARGEST
 
     def __str__(self) -> str:
-        kind = "a whole number" if self.whole else "a finite number"
+        kind, bounded = "a whole number" if self.whole else "a finite number", self.high < math.inf
         if self.low == -math.inf:
             return kind
         if self.above:
-            return f"{kind} above {self.low:g}" + (f" and at most {self.high:g}" if self.high < math.inf else "")
-        return (
-            f"{kind} from {self.low:g} to {self.high:g}" if self.high < math.inf else f"{kind} of at least {self.low:g}"
-        )
+            return f"{kind} above {self.low:g}" + (f" and at most {self.high:g}" if bounded else "")
+        return f"{kind} from {self.low:g} to {self.high:g}" if bounded else f"{kind} of at least {self.low:g}"
 
 
 def check_number(what: str, value: Any, number: Number) -> None:
@@ -65,8 +63,8 @@ def check_options(settings: Any, ranges: Mapping[str, Number], prefix: str) -> N
     """
     for name, number in ranges.items():
         value = getattr(settings, name)
-        for one in value if isinstance(value, tuple) else (value,):
-            check_number(prefix + name.replace("_", "-"), one, number)
+        for element in value if isinstance(value, tuple) else (value,):
+            check_number(prefix + name.replace("_", "-"), element, number)
 
 
 def check_text(what: str, value: Any) -> None:
@@ -76,12 +74,12 @@ def check_text(what: str, value: Any) -> None:
 
 
 def cut(text: str, most: int = 120) -> str:
-    """A name as it stands in a sentence: in one line, and no longer than a line."""
+    """A name to quote in a sentence, in one line of at most ``most`` characters."""
     text = " ".join(text.split())
     return text if len(text) <= most else text[: most - 3] + "..."
 
 
 def shown(value: Any, most: int = 60) -> str:
-    """A value as it is quoted in a sentence."""
-    text = " ".join(repr(value).split()) if not isinstance(value, int) or abs(value) < 10**most else "a longer number"
-    return (text if len(text) <= most else text[: most - 3] + "...").replace(". ", " ")
+    """A value to quote in a sentence."""
+    text = repr(value) if not isinstance(value, int) or abs(value) < 10**most else "a longer number"
+    return cut(text, most).replace(". ", " ")

@@ -13,6 +13,7 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 from tiny_scene import write_colmap
 
 from mmpi_ns.capture import observe as mmpi_observations
+from mmpi_ns.capture.checks import say_once
 from mmpi_ns.capture.observe import (
     ENOUGH_KEYPOINTS,
     drop_masked,
@@ -85,9 +86,9 @@ def test_other_cameras_are_not_triangulated():
 
 def model(*keypoints) -> SfmModel:
     """Tracks (camera, point, share of the width, share of the height) of four points."""
-    names = ("1", "0")
-    own = [np.array([k[1:] for k in keypoints if k[0] == name]).reshape(-1, 3) for name in (1, 0)]
-    return SfmModel(np.arange(12.0).reshape(4, 3), names, tuple((k[:, 0].astype(np.int64), k[:, 1:]) for k in own))
+    rows = np.array([(row, *k[1:]) for row, name in enumerate((1, 0)) for k in keypoints if k[0] == name])
+    seen_by, seen_point = rows[:, :2].astype(np.int64).T
+    return SfmModel(np.arange(12.0).reshape(4, 3), np.array(["1", "0"]), seen_by, seen_point, rows[:, 2:])
 
 
 def test_tracks_come_in_pixels_of_the_camera_whose_place_names_them():
@@ -143,7 +144,7 @@ def test_points_that_project_badly_or_that_few_images_see_are_left_out(tmp_path)
     path.write_text("\n".join(" ".join(r) for r in rows) + "\n")
     found = find_sfm_model(tmp_path / "model")
     assert found is not None and np.array_equal(found.points, np.delete(whole.points, 3, 0))
-    assert sum(len(p) for p, _ in found.keypoints) == sum(len(p) for p, _ in whole.keypoints) - len(long[3][8:]) / 2
+    assert len(found.seen_by) == len(whole.seen_by) - len(long[3][8:]) / 2
 
 
 def cloud_outputs() -> Any:
@@ -165,6 +166,7 @@ def test_a_capture_without_training_images_is_refused():
 
 
 def test_a_point_cloud_waits_for_depths_and_gives_way_to_tracks(tmp_path, monkeypatch, capsys):
+    say_once.cache_clear()
     outputs, none = cloud_outputs(), tmp_path / "none"
     cameras = as_data().cameras
     waiting = read_observations(outputs, cameras, None)
@@ -173,9 +175,8 @@ def test_a_point_cloud_waits_for_depths_and_gives_way_to_tracks(tmp_path, monkey
     monkeypatch.setattr(mmpi_observations, "_find_points", lambda found, *_: found)
     data = as_data()
     assert observe(outputs, data, none, find_points=True, triangulates=True).loose is not None
-    tracks = SfmModel(
-        np.array([[0.0, 0, -3]]), tuple(outputs.image_filenames), ((np.zeros(1, int), np.full((1, 2), 0.5)),) * 2
-    )
+    names, seen_point = np.array(outputs.image_filenames), np.zeros(2, int)
+    tracks = SfmModel(np.array([[0.0, 0, -3]]), names, np.arange(2), seen_point, np.full((2, 2), 0.5))
     monkeypatch.setattr(mmpi_observations, "find_sfm_model", lambda folder: tracks)
     monkeypatch.setattr(mmpi_observations, "drop_masked", lambda found, data: found)
     found = observe(outputs, data, none, find_points=True, triangulates=True)

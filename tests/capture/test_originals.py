@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mmpi_ns.capture.originals import at_full_size, original_of
-from mmpi_ns.capture.tracks import PosedImages
+from mmpi_ns.capture.tracks import PosedImages, at_full_size, original_of
 
 
 def write(path: Path, width: int, height: int) -> Path:

@@ -315,7 +315,9 @@ def test_the_winning_mpi_is_the_one_that_gives_most_of_the_light(model, camera):
 
 
 @pytest.mark.parametrize("error", [OSError("no route"), RuntimeError("broken file"), ModuleNotFoundError("lpips")])
-def test_lpips_is_left_out_with_a_message_where_its_weights_cannot_be_had(trained, model, monkeypatch, capsys, error):
+def test_lpips_is_left_out_with_a_message_where_its_weights_are_not_available(
+    trained, model, monkeypatch, capsys, error
+):
     calls = []
 
     def refuse(*args, **kwargs):

@@ -15,7 +15,6 @@ from mmpi_ns.placement.defaults import DEFAULTS
 from mmpi_ns.placement.rule import PlacementConfig, place
 from mmpi_ns.placement.show.explain import describe_facing, explain, table
 from mmpi_ns.placement.visibility import find_visible_points
-from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.scene.windows import WindowedPlan
 from mmpi_ns.scripts.plan import _defaults, entrypoint
 from mmpi_ns.synthetic.catalogue import make_scene
@@ -30,7 +29,7 @@ def run(monkeypatch, *words):
 
 def test_it_writes_a_plan_a_table_and_pictures(scene, tmp_path, monkeypatch, capsys):
     run(monkeypatch, scene, "--output", tmp_path / "plan", "--placement.max-mpis", 2)
-    plan = ScenePlan.load(tmp_path / "plan" / "plan.json")
+    plan = WindowedPlan.load(tmp_path / "plan" / "plan.json").plans[0]
     printed = capsys.readouterr().out
     assert all(f"| {m.name} |" in printed for m in plan.mpis) and 1 <= len(plan.mpis) <= 2
     assert printed.split("\n\nWrote")[0].strip().endswith((tmp_path / "plan" / "plan.md").read_text().strip()[-200:])
@@ -46,7 +45,9 @@ def test_an_edited_plan_is_explained_and_kept(scene, tmp_path, monkeypatch, caps
     (tmp_path / "edited.json").write_text(json.dumps(data))
     run(monkeypatch, scene, "--output", tmp_path / "b", "--plan-file", tmp_path / "edited.json")
     assert "| moved by hand |" in capsys.readouterr().out
-    assert ScenePlan.load(tmp_path / "b" / "plan.json") == ScenePlan.load(tmp_path / "edited.json")
+    assert (
+        WindowedPlan.load(tmp_path / "b" / "plan.json").plans[0] == WindowedPlan.load(tmp_path / "edited.json").plans[0]
+    )
 
 
 def test_the_defaults_are_those_of_the_method():

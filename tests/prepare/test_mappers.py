@@ -12,11 +12,12 @@ import pycolmap
 import pytest
 from PIL import Image
 
-from mmpi_ns.prepare import adjustment, features, mappers
+from mmpi_ns.prepare import adjustment, features, mappers, mapping
 from mmpi_ns.prepare.adjustment import Free, with_all_points, with_fewer_points
 from mmpi_ns.prepare.alignment import camera_poses, similarity_between
 from mmpi_ns.prepare.images import Photo, read_photos
-from mmpi_ns.prepare.mappers import Task, map_and_judge
+from mmpi_ns.prepare.mappers import map_and_judge
+from mmpi_ns.prepare.mapping import Task
 from mmpi_ns.prepare.pipeline import WORK, prepare
 from mmpi_ns.prepare.settings import Settings
 from mmpi_ns.prepare.stages import PrepareError
@@ -57,7 +58,7 @@ def test_of_a_long_sequence_a_hundred_images_are_placed_first(task, count, step)
 
 
 def test_a_long_sequence_is_confirmed_by_a_part_of_it(task, monkeypatch):
-    monkeypatch.setattr(mappers, "PLACED", COUNT // 2)
+    monkeypatch.setattr(mapping, "PLACED", COUNT // 2)
     believed = map_and_judge(task)
     assert believed.verdict.grade == "right" and believed.model.num_reg_images() == COUNT
     assert f"{COUNT // 2} of {COUNT // 2} images" in believed.says and "global-all" not in believed.says
@@ -68,7 +69,7 @@ def test_all_images_are_placed_at_once_where_the_incremental_mapper_fails(task, 
     def fail(*args):
         raise PrepareError("no pair can start")
 
-    monkeypatch.setattr(mappers, "PLACED", COUNT // 2)
+    monkeypatch.setattr(mapping, "PLACED", COUNT // 2)
     monkeypatch.setattr(mappers, "reconstruct", fail)
     believed = map_and_judge(task)
     assert believed.model.num_reg_images() == COUNT and believed.says.startswith("global-all")

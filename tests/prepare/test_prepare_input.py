@@ -12,8 +12,8 @@ from PIL.TiffImagePlugin import IFDRational
 
 from mmpi_ns.capture.exif import Exposure, exposure_of
 from mmpi_ns.prepare import checks, export, features, pairs
+from mmpi_ns.prepare.alignment import up_from_cameras
 from mmpi_ns.prepare.cameras import make_cameras, parse_camera, read_intrinsics, share
-from mmpi_ns.prepare.frame import up_from_cameras
 from mmpi_ns.prepare.images import Photo, find_images, gather, gather_masks, reads_heif, scene_names
 from mmpi_ns.prepare.pipeline import prepare
 from mmpi_ns.prepare.report import exposure_in_words

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -16,9 +15,8 @@ from PIL import Image
 from mmpi_ns.capture.matching import rigid3d
 from mmpi_ns.prepare import export, mapping, pairs
 from mmpi_ns.prepare.adjustment import Free, adjust, polish
-from mmpi_ns.prepare.alignment import similarity_between
+from mmpi_ns.prepare.alignment import choose_frame, similarity_between
 from mmpi_ns.prepare.cameras import Intrinsics, make_cameras, read_intrinsics, share
-from mmpi_ns.prepare.frame import choose_frame
 from mmpi_ns.prepare.images import Photo
 from mmpi_ns.prepare.stages import PrepareError
 from mmpi_ns.prepare.video import Measured, choose_frames, median_motion
@@ -235,17 +233,17 @@ def test_a_sound_model_beats_a_bent_one_with_more_images_and_errors_are_judged_b
 def test_looser_settings_go_on_from_a_sound_model_of_most_images(first, starts, tmp_path, monkeypatch):
     seen = []
 
-    def run(attempt, database, images, folder, total, refine, threads, start):
+    def run(task, attempt, database, start):
         seen.append(start)
         return first if len(seen) == 1 else found_model(99, 0.6), Path(attempt.name)
 
-    database = SimpleNamespace(num_images=lambda: 100)
-    monkeypatch.setattr(mapping.pycolmap.Database, "open", lambda path: nullcontext(database))
     monkeypatch.setattr(mapping, "matching_pairs", lambda path: [(1, 2)] * 500)
     monkeypatch.setattr(mapping, "_run", run)
-    found = mapping.reconstruct(tmp_path / "database", tmp_path, tmp_path, True, 1, is_sequence=True)
+    names, free = [f"{i}.jpg" for i in range(100)], Free(lens=True, full_lens=False, principal_point=False)
+    task = mapping.Task(tmp_path / "database", tmp_path, tmp_path, names, free, 1, is_sequence=True, is_ordered=True)
+    best = mapping.reconstruct(task, task.database)
     assert seen == starts
-    assert found.model.num_reg_images() == (96 if len(starts) == 1 else 99)
+    assert best.model.num_reg_images() == (96 if len(starts) == 1 else 99)
 
 
 def test_given_intrinsics_are_left_alone_and_others_refined():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from mmpi_ns.rendering.chunks import (
+from mmpi_ns.rendering.images import (
     BYTES_PER_SAMPLE,
     CPU_RAYS,
     FREE_SHARE,

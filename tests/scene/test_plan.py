@@ -10,6 +10,7 @@ import pytest
 from hand_made import make_mpi
 
 from mmpi_ns.scene.plan import CubePlan, MPIPlan, ScenePlan
+from mmpi_ns.scene.windows import WindowedPlan
 
 
 def refused(**changes):
@@ -58,12 +59,12 @@ def test_far_end_is_a_number_or_null_in_json_and_may_be_left_out():
 def test_plan_is_loaded_from_a_file(plan, tmp_path):
     path = tmp_path / "plan.json"
     path.write_text(plan.to_json(), encoding="utf-8")
-    assert ScenePlan.load(path) == plan
+    assert WindowedPlan.load(path).plans[0] == plan
 
 
 def test_missing_plan_file_names_the_path_and_the_option(tmp_path):
     with pytest.raises(ValueError, match=r"nowhere\.json.*plan-file"):
-        ScenePlan.load(tmp_path / "nowhere.json")
+        WindowedPlan.load(tmp_path / "nowhere.json")
 
 
 def test_heads_are_the_mpis_and_then_the_cube(plan):

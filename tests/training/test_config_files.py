@@ -13,7 +13,7 @@ from training_runs import datamanager, ready, trainer_config
 
 from mmpi_ns.config import mmpi_kitti, mmpi_small
 from mmpi_ns.model import MMPIModelConfig
-from mmpi_ns.training.config_files import LEFT, check_nothing_left
+from mmpi_ns.training.options import LEFT, check_nothing_left
 from mmpi_ns.utils.errors import InputError
 
 BEFORE_GROUPS = Path(__file__).with_name("config_before_groups.yml").read_text()

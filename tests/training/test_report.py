@@ -13,7 +13,7 @@ from mmpi_ns.rendering.pipeline import summary
 from mmpi_ns.training import report
 from mmpi_ns.training.phases import LONG_RUN
 from mmpi_ns.utils import machine
-from mmpi_ns.utils.console import duration
+from mmpi_ns.utils.errors import duration
 
 
 def lines_of(monkeypatch, capsys, steps, seconds_a_step, **how):

@@ -1,4 +1,4 @@
-"""In which order tables grow and bricks are released (training/storage.py)."""
+"""In which order tables grow and bricks are released (training.run.py)."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 from training_runs import schedule_of
 
-from mmpi_ns.training.storage import FORMING, prepare_storage
+from mmpi_ns.training.run import FORMING, prepare_storage
 
 
 def test_what_is_released_at_a_growth_is_released_before_it_and_by_a_lower_weight():
