@@ -57,8 +57,6 @@ def options(capture: Capture) -> dict[str, Any]:
     return {
         "pipeline.model.placement.window_length": length,
         "pipeline.datamanager.dense_depth": capture.megapixels <= MOST_MATCHED,
-        # nerfstudio's own split leaves no test image of two
-        "pipeline.datamanager.dataparser.eval_mode": "all" if capture.images == 2 else "fraction",
         "pipeline.datamanager.dataparser.load_3D_points": capture.depth == "points",
     }
 

@@ -6,10 +6,10 @@ import hashlib
 import os
 import struct
 import zipfile
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from filelock import FileLock, Timeout
@@ -21,7 +21,11 @@ from mmpi_ns.utils.files import write_atomically
 KEPT = 24
 """Number of cached results; the least recently used is removed first."""
 
-Arrays = dict[str, NDArray[np.generic]]
+MOST_BYTES = 10e9
+"""Of all results that are kept; the last one is kept whatever its size."""
+
+T = TypeVar("T")
+Arrays = Mapping[str, NDArray[np.generic]]
 Pairs = Iterable[tuple[str, NDArray[np.generic]]]
 
 
@@ -41,11 +45,26 @@ def digest(files: Iterable[Path], *parts: object) -> str:
     return key.hexdigest()[:32]
 
 
+class Computed(Sequence[T]):
+    """Results of a function of 0 to n - 1, computed at every access, so that they take no memory."""
+
+    def __init__(self, count: int, function: Callable[[int], T]) -> None:
+        self.count, self.function = count, function
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __getitem__(self, i: Any) -> Any:
+        if not 0 <= i < self.count:
+            raise IndexError(i)
+        return self.function(i)
+
+
 def remembered(key: str, find: Callable[[], Arrays | Pairs], folder: Path | None = None) -> Arrays:
     """The result of ``find``, from the cache if the key is there.
 
-    Arrays are mapped from the file: they take memory only where they are used, and the system may take it back.
-    Changes are the caller's own and do not reach the file. If several processes ask at once, one computes and the
+    Arrays are mapped from the file at each access: they take memory only while they are used. Changes are the caller's
+    own and reach neither the file nor the next access. If several processes ask at once, one computes and the
     others wait. If the folder is not writable, every process computes the result itself, and says so.
 
     Args:
@@ -71,32 +90,53 @@ def remembered(key: str, find: Callable[[], Arrays | Pairs], folder: Path | None
             except OSError as error:
                 CONSOLE.print(f"[yellow]{error}")
             if arrays is None:
-                arrays = result if isinstance(result, dict) else dict(find())
+                arrays = result if isinstance(result, Mapping) else dict(find())
         _forget_old(folder)
     return arrays
 
 
 def _write(path: Path, arrays: Arrays | Pairs) -> None:
     with zipfile.ZipFile(path, "w") as file:  # as np.savez, which asks for all arrays at once
-        for name, array in arrays.items() if isinstance(arrays, dict) else arrays:
+        for name, array in arrays.items() if isinstance(arrays, Mapping) else arrays:
             with file.open(f"{name}.npy", "w", force_zip64=True) as entry:
                 np.lib.format.write_array(entry, np.asanyarray(array), version=(1, 0), allow_pickle=False)
 
 
-def _read(path: Path) -> Arrays | None:
-    """The arrays of an uncompressed .npz, mapped; None if it is missing or damaged."""
-    arrays = {}
-    try:
-        with zipfile.ZipFile(path) as file, path.open("rb") as data:
+class _Mapped(Mapping[str, NDArray[np.generic]]):
+    """The arrays of an uncompressed .npz, which stays open: others may remove it meanwhile."""
+
+    def __init__(self, path: Path) -> None:
+        self.data = path.open("rb")
+        self.places: dict[str, tuple[Any, int, tuple[int, ...], Literal["C", "F"]]] = {}
+        """Type, offset, shape and order of each."""
+        with zipfile.ZipFile(self.data) as file:
             for entry in file.infolist():
-                data.seek(entry.header_offset + 26)  # of a zip's local header: lengths of name and extra field
-                data.seek(sum(struct.unpack("<HH", data.read(4))), os.SEEK_CUR)
-                np.lib.format.read_magic(data)
-                shape, fortran, dtype = np.lib.format.read_array_header_1_0(data)
-                order = "F" if fortran else "C"
-                empty = 0 in shape  # nothing to map
-                array = np.zeros(shape, dtype) if empty else np.memmap(path, dtype, "c", data.tell(), shape, order)
-                arrays[entry.filename.removesuffix(".npy")] = np.asarray(array)
+                self.data.seek(entry.header_offset + 26)  # of a zip's local header: lengths of name and extra field
+                self.data.seek(sum(struct.unpack("<HH", self.data.read(4))), os.SEEK_CUR)
+                np.lib.format.read_magic(self.data)
+                shape, fortran, dtype = np.lib.format.read_array_header_1_0(self.data)
+                place = dtype, self.data.tell(), shape, "F" if fortran else "C"
+                self.places[entry.filename.removesuffix(".npy")] = place
+
+    def __getitem__(self, name: str) -> NDArray[np.generic]:
+        dtype, offset, shape, order = self.places[name]
+        if 0 in shape:  # nothing to map
+            return np.zeros(shape, dtype)
+        return np.asarray(np.memmap(self.data, dtype, "c", offset, shape, order))
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.places)
+
+    def __len__(self) -> int:
+        return len(self.places)
+
+
+def _read(path: Path) -> Arrays | None:
+    """The arrays of an uncompressed .npz; None if it is missing or damaged."""
+    try:
+        arrays = _Mapped(path)
+        for name in arrays:  # a file that was cut off
+            arrays[name]
         path.touch()
     except (OSError, ValueError, EOFError, struct.error, zipfile.BadZipFile):
         return None
@@ -104,9 +144,11 @@ def _read(path: Path) -> Arrays | None:
 
 
 def _forget_old(folder: Path) -> None:
-    """Removes the results beyond ``KEPT``, but none that a process computes or waits for."""
+    """Removes the results beyond ``KEPT`` and ``MOST_BYTES``, but none that a process computes or waits for."""
     files = sorted(folder.glob("*.npz"), key=lambda p: p.stat().st_mtime, reverse=True)
-    for path in files[KEPT:]:
+    sizes = np.cumsum([file.stat().st_size for file in files])
+    kept = min(KEPT, max(1, int((sizes <= MOST_BYTES).sum())))
+    for path in files[kept:]:
         with suppress(Timeout), FileLock(path.with_suffix(".lock"), timeout=0):
             path.unlink(missing_ok=True)
             path.with_suffix(".lock").unlink(missing_ok=True)

@@ -238,7 +238,7 @@ def _check_places(centers: NDArray[np.float64], names: Sequence[str], path: Path
             return
         raise InputError(
             f"All {len(centers)} camera(s) of {path} stand in one place, so no distance can be learned: give images "
-            "from two places, or learn colours alone (nerfstudio-data --auto-scale-poses False --eval-mode all)."
+            "from two places, or learn colours alone (nerfstudio-data --auto-scale-poses False)."
         )
     middle = np.median(centers, axis=0)
     off = np.linalg.norm(centers - middle, axis=-1)

@@ -18,6 +18,7 @@ from nerfstudio.model_components.ray_generators import RayGenerator
 from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
 
+from mmpi_ns.capture.ahead import DrawnAhead
 from mmpi_ns.capture.checks import check_parser, check_transforms, say_once
 from mmpi_ns.capture.dataset import MMPIDataset
 from mmpi_ns.capture.exif import light_of
@@ -154,17 +155,16 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
 
     def create_eval_dataset(self) -> MMPIDataset:
         dataset = super().create_eval_dataset()
-        if not len(dataset):
-            raise InputError(
-                f"No image of {self.config.data} is left for evaluation: give more images, or --eval-mode all after "
-                "the name of the data parser."
-            )
-        return dataset
+        if len(dataset):
+            return dataset
+        say("The capture has no test images: scores are of training images, and say nothing about new views.")
+        return self.dataset_type(self.train_dataparser_outputs, scale_factor=self.config.camera_res_scale_factor)
 
     def setup_train(self) -> None:
         """Reads the pixels into memory, unless there are too many, instead of nerfstudio's image cache."""
         # Samples nothing: ns-export sets its batches' size here.
         self.train_pixel_sampler = self._get_pixel_sampler(self.train_dataset, self.config.train_num_rays_per_batch)
+        self._rays = DrawnAhead(self.config.seed, self.device)
         cameras = self.train_dataset.cameras
         pinhole = PinholeRays.of(cameras, self.device)
         self.train_ray_generator: Any = pinhole or RayGenerator(cameras.to(self.device))
@@ -305,5 +305,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         if self.sources is None:  # nobody said which window
             self.use_cameras(None)
         assert self.sources is not None
-        g = generator(self.config.seed, step if self.training else self.train_count, "pixels", self.device)
-        return self.sources.draw(self.get_train_rays_per_batch(), self.rays_share, g, pixels_alone=not self.training)
+        if self.training:
+            return self._rays.draw(self.sources, step, self.get_train_rays_per_batch(), self.rays_share)
+        g = generator(self.config.seed, self.train_count, "pixels", self.device)
+        return self.sources.draw(self.get_train_rays_per_batch(), self.rays_share, g, pixels_alone=True)

@@ -102,6 +102,14 @@ class MMPIDataset(InputDataset):
             data["mask"] = torch.from_numpy(~self.moving[image_idx])[..., None]
         return data | {k: data[k][:height, :width] for k in ("image", "mask", "distance") if k in data}
 
+    def usable(self, image_idx: int) -> NDArray[np.bool_]:
+        """Where an image is not masked. [H, W]"""
+        if self._dataparser_outputs.mask_filenames is not None:
+            return self.get_data(image_idx, image_type="uint8")["mask"][..., 0].numpy().astype(bool)
+        if self.moving is not None:
+            return ~self.moving[image_idx]
+        return np.ones([int(n.reshape(-1)[image_idx]) for n in (self.cameras.height, self.cameras.width)], bool)
+
 
 def distances(depth: Float[Tensor, "H W"], camera: Cameras) -> Float[Tensor, "H W 1"]:
     """Distance of the content of each pixel from a camera, by its depth along the optical axis."""

@@ -5,10 +5,11 @@ Sources, later ones replacing earlier ones: dense matches (``dense.py``), SfM po
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import cast
 
 import cv2
 import numpy as np
@@ -21,7 +22,7 @@ from PIL import Image
 from rich.progress import track
 from torch import Tensor
 
-from mmpi_ns.capture.cache import Pairs, digest, remembered
+from mmpi_ns.capture.cache import Arrays, Computed, Pairs, digest, remembered
 from mmpi_ns.capture.dataset import MMPIDataset, read_depth_image
 from mmpi_ns.capture.dense import ROUNDS, SECONDS, Depth, find_depths
 from mmpi_ns.capture.lone_depth import MOST_OTHERS, continued, others_that_see
@@ -62,7 +63,7 @@ class KnownDepth:
     """
 
     codes: Sequence[Codes]
-    """[H, W, 2] each, by ``packed``; mapped from a file or computed when read, so that they take little memory."""
+    """[H, W, 2] each, by ``packed``; mapped from a file or computed when read, so that they take no memory."""
 
     @staticmethod
     def of(maps: Iterable[Map]) -> KnownDepth:
@@ -79,26 +80,11 @@ class KnownDepth:
         """The numbers of one image. [H, W, 2]"""
         return unpacked(torch.from_numpy(np.require(self.codes[i], requirements="W"))).numpy()
 
-    @property
+    @cached_property
     def share(self) -> float:
         """Share of all pixels whose distance is known."""
         known = sum(int((m[..., 0] != UNKNOWN).sum()) for m in self.codes)
         return known / max(1, sum(m[..., 0].size for m in self.codes))
-
-
-class _Changed(Sequence[Codes]):
-    """Codes after a change of each image, computed at every access."""
-
-    def __init__(self, codes: Sequence[Codes], change: Callable[[int, Codes], Codes]) -> None:
-        self.codes, self.change = codes, change
-
-    def __len__(self) -> int:
-        return len(self.codes)
-
-    def __getitem__(self, i: Any) -> Any:
-        if not 0 <= i < len(self):
-            raise IndexError(i)
-        return self.change(i, np.array(self.codes[i]))
 
 
 def packed(values: ArrayLike) -> Codes:
@@ -153,11 +139,11 @@ def know_depths(
     if cloud is not None:
         say(cloud.describe())
         seen = drop_masked(seen, dataset)
-    known = without_masked(with_points(known, seen), dataset)
+    known = with_points(known, seen)
     if files:
         unit = outputs.metadata.get("depth_unit_scale_factor", 1.0) * outputs.dataparser_scale
         known = with_sensor(known, [Path(f) for f in files], float(unit), original, posed)
-    return without_masked(with_continued(known, posed, dataset), dataset), seen
+    return with_continued(known, posed, dataset), seen
 
 
 def _remembered_depths(original: PosedImages, posed: PosedImages, observations: Observations) -> KnownDepth:
@@ -188,7 +174,12 @@ def _remembered_depths(original: PosedImages, posed: PosedImages, observations: 
     cameras = original.camera_to_worlds, original.intrinsics, original.distortion, original.fisheye
     key = digest(original.files, "depths", VERSION, ROUNDS, width, shapes, *cameras, seen_by, points)
     stored = remembered(key, match)
-    return KnownDepth(tuple(stored[f"{i}"] for i in range(len(shapes))))  # type: ignore[arg-type]
+    return _stored(stored)
+
+
+def _stored(arrays: Arrays) -> KnownDepth:
+    """What was stored by the numbers of the images."""
+    return KnownDepth(Computed(len(arrays), lambda i: cast(Codes, arrays[f"{i}"])))
 
 
 def _file_shape(original: PosedImages, posed: PosedImages, i: int) -> tuple[int, int]:
@@ -199,20 +190,13 @@ def _file_shape(original: PosedImages, posed: PosedImages, i: int) -> tuple[int,
         return image.height, image.width
 
 
-def without_masked(known: KnownDepth, dataset: MMPIDataset) -> KnownDepth:
-    """Drops the distances of masked pixels: what moves is nowhere."""
-    if not dataset.has_masks:
-        return known
-    masks = (dataset.get_data(i, image_type="uint8")["mask"].numpy().astype(bool) for i in range(len(dataset)))
-    return KnownDepth(tuple(np.where(m, c, UNKNOWN).astype(np.int16) for m, c in zip(masks, known.codes, strict=True)))
-
-
 def with_sensor(
     known: KnownDepth, files: list[Path], unit: float, original: PosedImages, posed: PosedImages
 ) -> KnownDepth:
     """Replaces depths by those of sensors where there are any; where both are known and contradict, neither is kept."""
 
-    def replace_depths(i: int, codes: Codes) -> Codes:
+    def replaced(i: int) -> Codes:
+        codes = known.codes[i]
         shape = codes.shape[0], codes.shape[1]
         measured = packed(read_sensor(files[i], unit, original, i, shape, _file_shape(original, posed, i)))
         apart = contradict(*(unpacked(torch.from_numpy(x)).numpy() for x in (measured, codes)))
@@ -220,7 +204,7 @@ def with_sensor(
         codes[apart] = UNKNOWN
         return codes
 
-    return KnownDepth(_Changed(known.codes, replace_depths))
+    return KnownDepth(Computed(len(files), replaced))
 
 
 def at_training_pixels(
@@ -285,24 +269,28 @@ def straightened(
 
 
 def with_continued(known: KnownDepth, posed: PosedImages, dataset: MMPIDataset) -> KnownDepth:
-    """Extrapolates surfaces into regions that hardly any other image shows (``lone_depth.py``); cached."""
+    """Extrapolates surfaces into regions that hardly any other image shows (``lone_depth.py``); cached.
 
+    Masked pixels have no distance: what moves is nowhere.
+    """
     count = len(known.codes)
 
     def continue_all() -> Pairs:
-        codes = in_order(lambda i: _continued_codes(known, i, posed, dataset), range(count))
+        codes = in_order(lambda i: _continued_codes(known.codes[i], i, posed, dataset), range(count))
         shown = track(codes, "Extrapolating surfaces", count, console=CONSOLE)
         return ((f"{i}", image) for i, image in enumerate(shown))
 
     cameras = posed.camera_to_worlds, posed.intrinsics, posed.distortion, posed.fisheye
+    masks = [digest((), dataset.usable(i)) for i in range(count)] if dataset.has_masks else []
     contents = [digest((), codes) for codes in known.codes]
-    stored = remembered(digest(posed.files, "continued", VERSION, *cameras, contents), continue_all)
-    return KnownDepth(tuple(stored[f"{i}"] for i in range(count)))  # type: ignore[arg-type]
+    key = digest(posed.files, "continued", VERSION, *cameras, contents, masks)
+    return _stored(remembered(key, continue_all))
 
 
-def _continued_codes(known: KnownDepth, i: int, posed: PosedImages, dataset: MMPIDataset) -> Codes:
+def _continued_codes(codes: Codes, i: int, posed: PosedImages, dataset: MMPIDataset) -> Codes:
     """Codes of one image with extrapolated surfaces; computed for every n-th pixel of a large image."""
-    codes = np.array(known.codes[i])
+    codes, hidden = np.array(codes), ~dataset.usable(i)
+    codes[hidden] = UNKNOWN
     step = -(-max(codes.shape[:2]) // CONTINUED)
     rows, columns = (np.minimum(np.arange(0, n, step) + step // 2, n - 1) for n in codes.shape[:2])
     coords = np.stack(np.meshgrid(rows, columns, indexing="ij"), -1).reshape(-1, 2) + 0.5
@@ -317,6 +305,7 @@ def _continued_codes(known: KnownDepth, i: int, posed: PosedImages, dataset: MMP
     extended[down[many], across[many]] = 0
     down, across = np.nonzero(codes[..., 0] == UNKNOWN)
     codes[down, across] = packed(extended)[down // step, across // step]
+    codes[hidden] = UNKNOWN
     return codes
 
 
@@ -367,14 +356,15 @@ def with_points(known: KnownDepth, observations: Observations) -> KnownDepth:
     inverse = packed(np.outer(1 / np.maximum(distance, 1e-30), [1, POINT_ERROR]))
     columns, rows = observations.seen_at.astype(int).T
 
-    def add(i: int, codes: Codes) -> Codes:
+    def added(i: int) -> Codes:
+        codes = np.array(known.codes[i])
         inside = (rows >= 0) & (rows < codes.shape[0]) & (columns >= 0) & (columns < codes.shape[1])
         chosen = np.nonzero((cameras == i) & inside & (distance > 0))[0]
         chosen = chosen[np.argsort(-distance[chosen], kind="stable")]  # the last one written stays
         codes[rows[chosen], columns[chosen]] = inverse[chosen]
         return codes
 
-    return KnownDepth(_Changed(known.codes, add))
+    return KnownDepth(Computed(len(known.codes), added))
 
 
 def read_sensor(

@@ -16,7 +16,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
 from rich.progress import track
 
-from mmpi_ns.capture.cache import Arrays, digest, remembered
+from mmpi_ns.capture.cache import Arrays, Computed, digest, remembered
 from mmpi_ns.capture.dataset import MMPIDataset
 from mmpi_ns.capture.dense import Depth, Parallax, Progress, find_depths
 from mmpi_ns.capture.known_depth import straightened
@@ -106,7 +106,7 @@ def in_image(view: View, mask: Mask, images: PosedImages, i: int, shape: tuple[i
     return look_up(mask.astype(np.float32), *at) > EDGE
 
 
-def moving_masks(observations: Observations, dataset: MMPIDataset) -> list[Mask]:
+def moving_masks(observations: Observations, dataset: MMPIDataset) -> Sequence[Mask]:
     """What moves in each training image [H, W], from the cache if possible; nothing where lenses cannot be undone."""
     shapes = [(int(h), int(w)) for w, h in observations.sizes]
     posed = posed_images(observations, dataset)
@@ -126,10 +126,12 @@ def moving_masks(observations: Observations, dataset: MMPIDataset) -> list[Mask]
 
     cameras = original.camera_to_worlds, original.intrinsics, original.distortion, original.fisheye
     stored = remembered(digest(original.files, "moving", VERSION, shapes, *cameras, seen_by, points), find)
-    return [
-        np.unpackbits(np.asarray(stored[f"{i}"], np.uint8), count=h * w).reshape(h, w).astype(bool)
-        for i, (h, w) in enumerate(shapes)
-    ]
+
+    def unpacked(i: int) -> Mask:
+        height, width = shapes[i]
+        return np.unpackbits(np.asarray(stored[f"{i}"], np.uint8), count=height * width).reshape(height, width) > 0
+
+    return Computed(len(shapes), unpacked)
 
 
 def shot_of(images: PosedImages, i: int, view: View, depth: Depth, up: NDArray[np.float64]) -> Shot:

@@ -24,7 +24,7 @@ from mmpi_ns.capture.sfm import SfmModel, find_sfm_model
 from mmpi_ns.capture.tracks import PosedImages, at_full_size, triangulate
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.placement.sweep import add_swept_points
-from mmpi_ns.utils.errors import InputError
+from mmpi_ns.utils.errors import InputError, quoted
 
 MAX_REPROJECTION = 0.02
 """Median angle between keypoints and points, as a fraction of the image, above which a model is in another frame."""
@@ -110,7 +110,8 @@ def tell_poses(off: float, image: Path) -> None:
         return
     folder = image.parent
     full = folder.with_name(re.sub(r"_\d+$", "", folder.name))  # images for images_2
-    command = f"mmpi-prepare {full} {full.parent}-refined --poses {full.parent / 'transforms.json'} --refine-poses"
+    refined, poses = full.parent.with_name(f"{full.parent.name}-refined"), full.parent / "transforms.json"
+    command = f"mmpi-prepare {quoted(full)} {quoted(refined)} --poses {quoted(poses)} --refine-poses"
     says = f"The poses are off by {off:.1f} training pixels (median over the matches of the images)"
     CONSOLE.print(f"{says}: {command} mends them.", style="bold yellow", markup=False, soft_wrap=True)
 
@@ -236,7 +237,7 @@ def drop_masked(observations: Observations, dataset: MMPIDataset) -> Observation
         return observations
     keep = np.ones(len(observations.seen_by), dtype=bool)
     for i in range(len(dataset)):
-        mask = dataset.get_data(i, image_type="uint8")["mask"][..., 0].numpy().astype(bool)
+        mask = dataset.usable(i)
         keypoints = np.nonzero(observations.seen_by[: len(observations.seen_at)] == i)[0]
         x, y = observations.seen_at[keypoints].astype(int).T
         keep[keypoints] = mask[y.clip(0, mask.shape[0] - 1), x.clip(0, mask.shape[1] - 1)]

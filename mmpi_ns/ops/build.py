@@ -12,8 +12,6 @@ import shutil
 import subprocess
 import tempfile
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -94,7 +92,6 @@ def library() -> ctypes.CDLL:
         raise CannotCompile(f"{program[0]} failed: {(error.stderr or '').strip().splitlines()[:1]}") from error
     except (OSError, subprocess.TimeoutExpired) as error:
         raise CannotCompile(str(error)) from error
-    built.mmpi_count_rows.restype = ctypes.c_int64
     return built
 
 
@@ -112,16 +109,26 @@ def arguments(values: Iterable[Any]) -> list[Any]:
     ]
 
 
-def call(name: str, *values: Any) -> int:
-    """Calls a compiled function."""
-    return getattr(library(), name)(*arguments(values))
+@functools.cache
+def _in_parts(name: str) -> Callable[..., None]:
+    """A compiled function for all parts between bounds (``cpp/parts.h``)."""
+    return ctypes.CFUNCTYPE(None)(ctypes.c_void_p.in_dll(library(), f"{name}_in_parts").value)
+
+
+def run_in_parts(name: str, bounds: Sequence[int], before: Iterable[Any], after: Iterable[Any]) -> None:
+    """Calls a compiled function of ``(*before, begin, end, *after)`` for the parts between bounds, each by a thread.
+
+    Parts must not write to one place.
+    """
+    tensors = list(before), list(after)  # which live until all parts are done
+    first, last = (arguments(x) for x in tensors)
+    how = (ctypes.c_int64 * len(bounds))(*bounds), *arguments((len(bounds) - 1, len(first)))
+    _in_parts(name)(*how, *first, *arguments((0, 0)), *last)
 
 
 def call_in_parts(name: str, count: int, before: Iterable[Any], after: Iterable[Any], least: int = 256) -> None:
-    """Calls a compiled function of ``(*before, begin, end, *after)`` for parts of 0..count (see ``run_in_parts``)."""
-    function, tensors = getattr(library(), name), (list(before), list(after))  # which live until all parts are done
-    first, last = (arguments(x) for x in tensors)
-    run_in_parts(lambda a, b: function(*first, *arguments((a, b)), *last), even_bounds(count, least))
+    """``run_in_parts`` for even parts of 0..count (see ``even_bounds``)."""
+    run_in_parts(name, even_bounds(count, least), before, after)
 
 
 def even_bounds(count: int, least: int = 256) -> list[int]:
@@ -147,18 +154,3 @@ def owned_bounds(positions: Sequence[Int[Tensor, "N B"]], count: int, least: int
     some = torch.cat([p.reshape(-1)[:: 1 + entries // ENTRIES_PER_PART // parts] for p in positions]).sort().values
     inner = some[[len(some) * i // parts for i in range(1, parts)]].tolist()
     return [0, *sorted({n for n in inner if 0 < n < count}), count]
-
-
-def run_in_parts(work: Callable[[int, int], Any], bounds: Sequence[int]) -> list[Any]:
-    """Results of work(begin, end) for the parts between bounds, each by a thread. Parts must not write to one place."""
-    (first, *others), threads = pairwise(bounds), num_threads()
-    parts = [_pool(threads - 1).submit(work, *part) for part in others]
-    try:
-        return [work(*first), *(part.result() for part in parts)]
-    finally:
-        wait(parts)  # also when interrupted: the caller's tensors are freed then, and the kernels write to them
-
-
-@functools.cache
-def _pool(threads: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(threads, thread_name_prefix="mmpi")

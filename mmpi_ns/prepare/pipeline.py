@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shlex
 import shutil
 import time
 from collections.abc import Iterator, Sequence
@@ -29,6 +28,7 @@ from mmpi_ns.prepare.settings import Settings, check_options, read_lists
 from mmpi_ns.prepare.stages import PrepareError, Stages, only_one, progress, say, whole
 from mmpi_ns.prepare.verdict import REMEDY, Verdict
 from mmpi_ns.prepare.video import select_frames
+from mmpi_ns.utils.errors import quoted
 
 WORK = ".prepare"
 LEAST_IMAGES = 3
@@ -329,7 +329,7 @@ class Preparation:
             f"{len(split.train)} train, {len(split.test)} test; report.md says more. Train with:",
             "bold red" if not is_right else "" if findings else "green",
         )
-        say(f"ns-train mmpi-small --data {shlex.quote(str(scene))}")
+        say(f"ns-train mmpi-small --data {quoted(scene)}")
 
 
 def check_folders(settings: Settings) -> None:

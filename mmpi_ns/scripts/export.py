@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from mmpi_ns.scripts.command import run
+from mmpi_ns.utils.errors import quoted
 from mmpi_ns.utils.values import Number, check_options
 
 if TYPE_CHECKING:
@@ -89,7 +90,7 @@ class Web(_Run):
         size = write_baked(scene, self.output)
         write_page(self.output)
         print(f"Wrote {self.output}: {size / 1e6:.1f} MB. To look at it:")
-        print(f"  python -m http.server --directory {self.output}    # and open http://localhost:8000")
+        print(f"  python -m http.server --directory {quoted(self.output)}    # and open http://localhost:8000")
 
 
 @dataclass

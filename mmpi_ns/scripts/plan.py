@@ -13,7 +13,7 @@ import tyro
 from mmpi_ns.placement.defaults import DEFAULTS, check_placement, steps_for
 from mmpi_ns.placement.rule import PlacementConfig
 from mmpi_ns.scripts.command import say_version
-from mmpi_ns.utils.errors import InputError
+from mmpi_ns.utils.errors import InputError, quoted
 from mmpi_ns.utils.host import enter_command
 from mmpi_ns.utils.values import Number, check_options
 
@@ -80,7 +80,7 @@ class PlanCommand:
         table.write_text(f"{title}\n\n{_mark(plan)}\n\n{text}\n", encoding="utf-8")
         print(text)
         print(f"\nWrote plan.json, plan.md and pictures in {self.output}.")
-        print(f"Train with it: ns-train {self.method} --pipeline.model.plan-file {plan} --data ...")
+        print(f"Train with it: ns-train {self.method} --pipeline.model.plan-file {quoted(plan)} --data ...")
 
     def _explain(self, windows: WindowedPlan, observations: Observations) -> str:
         """Draws the pictures and returns the tables: for each window, over the observations of its own cameras."""

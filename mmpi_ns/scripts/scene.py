@@ -13,6 +13,7 @@ import tyro
 
 from mmpi_ns.scripts.command import run
 from mmpi_ns.synthetic.exposure import ExposureName
+from mmpi_ns.utils.errors import quoted
 
 Name = Literal["street", "long-road", "walk", "room", "look-round", "object"]
 
@@ -91,7 +92,7 @@ class SceneCommand:
         if len(sfm.points) < points:
             print(f"  The cameras see no more points well enough, and {points} were asked for.")
         if self.images:
-            print(f"Next: ns-train mmpi-small --data {self.folder}")
+            print(f"Next: ns-train mmpi-small --data {quoted(self.folder)}")
 
 
 def entrypoint() -> None:

@@ -23,6 +23,8 @@ from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.scripts.train import train_loop
 from nerfstudio.utils import profiler
 
+from mmpi_ns.utils.errors import quoted
+
 TIMEOUT = timedelta(days=7)
 """Time that processes with less work wait for the others; if one dies, torchrun ends the run at once."""
 
@@ -43,7 +45,7 @@ def main() -> None:
         except RuntimeError:  # gloo's own words name a socket
             _end_early(config.get_base_dir())
         if rank == 0:
-            print(f"All windows are trained: ns-eval --load-config {config.get_base_dir() / 'config.yml'}")
+            print(f"All windows are trained: ns-eval --load-config {quoted(config.get_base_dir() / 'config.yml')}")
     finally:
         profiler.flush_profiler(config.logging)
         dist.destroy_process_group()
@@ -53,8 +55,8 @@ def _end_early(folder: Path) -> NoReturn:
     """Ends this process with a message; torchrun ends all when one dies, and leaves little time for it."""
     message = (
         "Ended early: another process died (see above) or the run was stopped. Finished windows lie in "
-        f"{folder / 'windows'}; the same command with --load-dir {folder / 'nerfstudio_models'} goes on from them, "
-        "with any number of processes."
+        f"{folder / 'windows'}; the same command with --load-dir {quoted(folder / 'nerfstudio_models')} goes on from "
+        "them, with any number of processes."
     )
     print(message, file=sys.stderr, flush=True)
     sys.exit(1)

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.scene.windows import WindowedPlan
-from mmpi_ns.utils.errors import InputError, brief
+from mmpi_ns.utils.errors import InputError, brief, quoted
 from mmpi_ns.utils.files import to_text, write_errors
 from mmpi_ns.utils.values import shown
 
@@ -62,8 +62,8 @@ def claim(folder: Path, checkpoints: Path, resumes_from: Path | None) -> None:
     resumes = source is not None and checkpoints.resolve() in (source, source.parent)
     if checkpoints_in(checkpoints) and not resumes:
         raise InputError(
-            f"{checkpoints} holds checkpoints of an earlier run: go on from them with --load-dir {checkpoints}, or "
-            "give another --timestamp."
+            f"{checkpoints} holds checkpoints of an earlier run: go on from them with --load-dir "
+            f"{quoted(checkpoints)}, or give another --timestamp."
         )
     for unfinished in [*folder.glob(".*.tmp"), *folder.glob("windows/.*.tmp")]:
         unfinished.unlink(missing_ok=True)

@@ -15,7 +15,7 @@ from torch import Tensor
 from mmpi_ns.rendering.metrics import ImageMetrics
 from mmpi_ns.training.losses import over_background
 from mmpi_ns.training.phases import Schedule
-from mmpi_ns.utils.errors import duration, say
+from mmpi_ns.utils.errors import duration, quoted, say
 
 FIRST_LINE, SHARE = 10, 0.025
 """A line after this many steps, then after each such fraction of all steps."""
@@ -108,9 +108,9 @@ def quick_test(model: Model, images: InputDataset, background: float) -> str:
 
 def next_commands(folder: Path) -> str:
     """The folder of a run, and the next commands."""
-    config = folder / "config.yml"
+    config, scores, film = (quoted(folder / name) for name in ("config.yml", "eval.json", "fly.mp4"))
     return (
-        f"The run is in {folder}. Next:\n  ns-eval --load-config {config} --output-path {folder / 'eval.json'}\n"
-        f"  ns-render interpolate --load-config {config} --pose-source train --output-path {folder / 'fly.mp4'}\n"
+        f"The run is in {folder}. Next:\n  ns-eval --load-config {config} --output-path {scores}\n"
+        f"  ns-render interpolate --load-config {config} --pose-source train --output-path {film}\n"
         f"  ns-viewer --load-config {config}"
     )

@@ -36,7 +36,7 @@ from mmpi_ns.training.options import check_device, check_nothing_left, check_run
 from mmpi_ns.training.report import TrainingLog, forecast, next_commands, quick_test
 from mmpi_ns.training.run import TrainingRun, cameras_of, views_of
 from mmpi_ns.training.shared_windows import WINDOWS_FOLDER, WindowShare
-from mmpi_ns.utils.errors import InputError, duration, say
+from mmpi_ns.utils.errors import InputError, duration, quoted, say
 from mmpi_ns.utils.files import write_atomically
 from mmpi_ns.utils.host import arguments, command, enter_command, signals_go_to
 from mmpi_ns.utils.machine import free_cores, unused_gpu
@@ -234,7 +234,7 @@ class MMPITrainer(Trainer):
             _end(
                 self._stopped_by,
                 f"Stopped after step {self._last_step + 1} of {self._total_steps}, which is in {path}: the same "
-                f"command with --load-dir {self.checkpoint_dir} continues from there.",
+                f"command with --load-dir {quoted(self.checkpoint_dir)} continues from there.",
             )
 
     def train_window(self, window: int) -> None:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import shlex
+from pathlib import Path
+
 from nerfstudio.utils.rich_utils import CONSOLE
 
 
@@ -16,6 +19,11 @@ class WriteError(InputError, OSError):
 def brief(error: BaseException) -> str:
     """First sentence of an error, to quote in brackets in a sentence of ours."""
     return str(error).strip().split("\n")[0].split(". ")[0].rstrip(" .")
+
+
+def quoted(path: Path) -> str:
+    """A path as a shell takes it, for a command to be copied."""
+    return shlex.quote(str(path))
 
 
 def say(text: str) -> None:

@@ -73,7 +73,7 @@ def test_one_place_can_be_trained_on_request_and_says_what_it_cannot_learn(data,
     edit(data, change)
     shutil.rmtree(data / "colmap")
     config = trainer_config(data, None, tmp_path, 4, training="joint")
-    config.pipeline.datamanager.dataparser = NerfstudioDataParserConfig(auto_scale_poses=False, eval_mode="all")
+    config.pipeline.datamanager.dataparser = NerfstudioDataParserConfig(auto_scale_poses=False)
     trainer = ready(config)
     assert "one place: no distance can be learned" in " ".join(capsys.readouterr().out.split())
     trainer.train()
@@ -81,10 +81,11 @@ def test_one_place_can_be_trained_on_request_and_says_what_it_cannot_learn(data,
     assert all(torch.isfinite(p).all() for p in trainer.pipeline.model.parameters())
 
 
-def test_a_capture_that_leaves_no_image_for_evaluation_says_so(data):
+def test_without_test_images_training_images_are_scored_and_it_says_so(data, capsys):
     edit(data, keep_one)
-    parser = NerfstudioDataParserConfig(auto_scale_poses=False)
-    refusal(lambda: datamanager(data, dataparser=parser), "evaluation", "--eval-mode all")
+    manager = datamanager(data, dataparser=NerfstudioDataParserConfig(auto_scale_poses=False))
+    assert manager.eval_dataset.image_filenames == manager.train_dataset.image_filenames
+    assert "no test images" in " ".join(capsys.readouterr().out.split())
 
 
 # Images and masks ----------------------------------------------------------------------------------------------------

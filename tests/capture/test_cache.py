@@ -56,6 +56,21 @@ def test_results_are_mapped_and_written_one_by_one(tmp_path):
         assert list(arrays) == [*"01234"] and len(held) == 5
         assert all((array == int(name)).all() and not array.flags.owndata for name, array in arrays.items())
         arrays["3"][:] = 7
+        assert (arrays["3"] == 3).all()
+
+
+def test_a_result_that_is_read_may_be_forgotten_meanwhile(tmp_path):
+    arrays = remembered("key", counting([]), tmp_path)
+    (tmp_path / "key.npz").unlink()
+    assert arrays["x"].tolist() == [0, 1, 2, 3, 4]
+
+
+def test_results_are_forgotten_beyond_a_size(tmp_path, monkeypatch):
+    monkeypatch.setattr(cache, "MOST_BYTES", 1)
+    for n in range(3):
+        remembered(f"key{n}", counting([]), tmp_path)
+        os.utime(tmp_path / f"key{n}.npz", (n, n))
+    assert [p.name for p in tmp_path.glob("*.npz")] == ["key2.npz"]
 
 
 def test_shapes_and_types_come_back(tmp_path):

@@ -132,10 +132,15 @@ def test_the_border_of_the_first_image_of_a_drive_gets_a_depth(between, most, mo
     cameras = Cameras(
         torch.tensor(images.camera_to_worlds).float(), FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, width=WIDTH, height=HEIGHT
     )
-    dataset: Any = SimpleNamespace(cameras=cameras)
+    usable = np.ones((HEIGHT, WIDTH), bool)
+    dataset: Any = SimpleNamespace(cameras=cameras, has_masks=False, usable=lambda i: usable)
     found = with_continued(KnownDepth.of(known), images, dataset)
     again = with_continued(KnownDepth.of(known), images, dataset)
     assert all(np.array_equal(a, b) for a, b in zip(found.codes, again.codes, strict=True))
+    usable[:3] = False
+    dataset.has_masks = True
+    masked = with_continued(KnownDepth.of(known), images, dataset).image(0)
+    assert not masked[:3].any() and np.count_nonzero(masked) > 0.8 * np.count_nonzero(found.image(0)[3:])
     first, exact = found.image(0), plane((0, 0, -1), 10, d)
     points = d / exact[..., None]
     shown = np.maximum(np.abs(points[..., 0]) / 0.8, np.abs(points[..., 1]) / (HEIGHT / 2 / FOCAL)) <= 6 - (most < 320)

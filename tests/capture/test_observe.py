@@ -25,6 +25,7 @@ from mmpi_ns.capture.observe import (
 )
 from mmpi_ns.capture.sfm import SfmModel, find_sfm_model
 from mmpi_ns.placement.observations import Observations
+from mmpi_ns.utils.errors import InputError
 
 SIZES = np.array([[40.0, 20.0], [80.0, 60.0]])
 
@@ -125,10 +126,9 @@ def test_poses_that_are_off_are_told_with_the_command_that_mends_them(capsys):
 def test_a_mask_leaves_out_the_keypoints_on_its_black_pixels():
     """Rows and columns differ, so that neither can stand for the other; what the sweep found has no keypoint."""
     tracks = with_tracks(bare(), model((0, 0, 0.7, 0.1), (0, 1, 0.1, 0.7), (1, 2, 0.7, 0.1), (1, 3, 0.999, 0.999)))
-    mask = torch.ones(20, 40, 1, dtype=torch.uint8)
-    mask[10:, :20] = 0
-    masks = [{"mask": mask}, {"mask": torch.ones(60, 80, 1, dtype=torch.uint8)}]
-    data = as_data(get_data=lambda i, image_type: masks[i], has_masks=True)
+    masks = [np.ones((20, 40), bool), np.ones((60, 80), bool)]
+    masks[0][10:, :20] = False
+    data = as_data(usable=lambda i: masks[i], has_masks=True)
     found = drop_masked(tracks, data)
     assert found.seen_point.tolist() == [0, 2, 3] and len(found.seen_at) == 3
 
@@ -156,6 +156,13 @@ def cloud_outputs() -> Any:
         dataparser_transform=torch.eye(4)[:3],
         dataparser_scale=1.0,
     )
+
+
+def test_a_capture_without_training_images_is_refused():
+    outputs = cloud_outputs()
+    outputs.image_filenames = []
+    with pytest.raises(InputError, match="no training image"):
+        read_observations(outputs, as_data().cameras, None)
 
 
 def test_a_point_cloud_waits_for_depths_and_gives_way_to_tracks(tmp_path, monkeypatch, capsys):

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import shlex
+from pathlib import Path
+
 import pytest
 import torch
 from training_runs import schedule_of
@@ -24,6 +27,13 @@ def lines_of(monkeypatch, capsys, steps, seconds_a_step, **how):
         now[0] += seconds_a_step + (60 if step == 0 else 0)
         log.note(step, torch.tensor(0.01, requires_grad=True))
     return capsys.readouterr().out.splitlines()
+
+
+def test_the_next_commands_can_be_copied_from_any_folder():
+    _, *commands = report.next_commands(Path("/my photos/r")).splitlines()
+    assert [shlex.split(line)[shlex.split(line).index("--load-config") + 1] for line in commands] == [
+        "/my photos/r/config.yml"
+    ] * 3
 
 
 def test_a_line_says_phase_speed_psnr_and_time_left(monkeypatch, capsys):

@@ -1,4 +1,5 @@
 // Adam on the rows of a table that a batch touched.
+#include "parts.h"
 #include "scene.h"
 #include "table.h"
 
@@ -56,3 +57,5 @@ void mmpi_adam_rows(const int64_t* rows, int64_t begin, int64_t end, int64_t cha
     }
 }
 }
+
+IN_PARTS(mmpi_adam_rows)

@@ -1,5 +1,6 @@
 // What rays show of baked bricks (scene/baked.py): bytes, of which a sample reads one brick alone. The example in
 // NumPy is reader.py.
+#include "parts.h"
 #include "walk.h"
 
 namespace {
@@ -148,3 +149,5 @@ void mmpi_show_baked(const BakedScene* scene, const Rays* rays, float threshold,
     show(Bytes(*scene, threshold, peaks), *rays, begin, end, *to);
 }
 }
+
+IN_PARTS(mmpi_show_baked)

@@ -1,5 +1,6 @@
 // The network that shades a ray once (rendering/baked.py, Shader), sixteen rays at a time.
 #include "layers.h"
+#include "parts.h"
 
 extern "C" {
 
@@ -30,3 +31,5 @@ void mmpi_shade_baked(const Layer* layers, int64_t num_layers, int64_t channels,
     }
 }
 }
+
+IN_PARTS(mmpi_shade_baked)

@@ -1,5 +1,6 @@
 // Rendering weights of rays with their gradients.
 #include "lanes.h"
+#include "parts.h"
 
 #include <algorithm>
 #include <vector>
@@ -81,3 +82,6 @@ void mmpi_composite_back(const float* tau, const bool* valid, const float* skipp
     }
 }
 }
+
+IN_PARTS(mmpi_composite)
+IN_PARTS(mmpi_composite_back)

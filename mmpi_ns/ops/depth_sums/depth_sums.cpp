@@ -1,4 +1,6 @@
 // Spread and mass of the weights of rays, with their gradients.
+#include "parts.h"
+
 #include <cmath>
 #include <cstdint>
 #include <vector>
@@ -69,3 +71,6 @@ void mmpi_depth_sums_back(const float* weights, const float* inverse_t, const bo
     }
 }
 }
+
+IN_PARTS(mmpi_depth_sums)
+IN_PARTS(mmpi_depth_sums_back)

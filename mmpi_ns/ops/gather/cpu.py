@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from mmpi_ns.ops.build import arguments, call, call_in_parts, owned_bounds, run_in_parts
+from mmpi_ns.ops.build import arguments, call_in_parts, owned_bounds, run_in_parts
 from mmpi_ns.ops.gather import COLORS, RaySums, Taps, split_sums
 
 LANES = 16
@@ -45,8 +45,7 @@ class _GatherTaps(torch.autograd.Function):
         saved = [x.contiguous() for x in (values, weights, slots, chosen, *taps)]
         values, weights, slots, chosen = saved[:4]
         numbers = torch.full((num_rays, width), -1, dtype=torch.int32)
-        numbers.view(-1)[slots] = torch.arange(len(slots), dtype=torch.int32)
-        numbers[~chosen] = -1
+        call_in_parts("mmpi_number_samples", len(slots), (slots,), (chosen, width, numbers), AT_LEAST)
         sums = torch.empty(num_rays, channels + 1 + COLORS)
         before = (values, *values.shape, _Taps.both(saved[4:]), numbers, weights)
         call_in_parts("mmpi_gather_taps", num_rays, before, (width, sums))
@@ -59,16 +58,14 @@ class _GatherTaps(torch.autograd.Function):
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
         values, weights, slots, chosen, *taps = ctx.saved_tensors
         to_sums, _, to_first, to_second = grad_outputs
-        to_values = torch.zeros_like(values) if ctx.needs_input_grad[0] else None
+        to_values = torch.empty_like(values) if ctx.needs_input_grad[0] else None
         to_weights = torch.zeros_like(weights)
         moved = zip(taps[1::2], ctx.needs_input_grad[5::2], strict=True)
         to_taps = [torch.zeros_like(x) if moves else None for x, moves in moved]
         batch = (values, *values.shape, _Taps.both(taps, to_taps), slots, chosen, weights)
         grads = [pad(g, (0, -g.shape[1] % LANES)).contiguous() for g in (to_sums, to_first, 2 * to_second)]
-        run_in_parts(
-            lambda a, b: call("mmpi_gather_back", *batch, *grads, weights.shape[1], a, b, to_values, to_weights),
-            owned_bounds(taps[::2], len(values), AT_LEAST),
-        )
+        bounds = owned_bounds(taps[::2], len(values), AT_LEAST)
+        run_in_parts("mmpi_gather_back", bounds, (*batch, *grads, weights.shape[1]), (to_values, to_weights))
         return to_values, to_weights, None, None, *(x for to in to_taps for x in (None, to))
 
 

@@ -1,4 +1,5 @@
 // What rays gather of the texels along them, and its gradients.
+#include "parts.h"
 #include "taps.h"
 
 #include <vector>
@@ -93,8 +94,15 @@ void mmpi_gather_taps(const float* values, int64_t rows, int64_t channels, const
     }
 }
 
-// Gradients of values [rows, channels] (added to what is there; null if not asked for), of the taps' weights (likewise,
-// in the taps) and of weights [R, S] from those of the sums [R, padded] and, except for the weights, of the sums of
+// numbers[slots[n]] = n for samples [begin, end) of rays that are chosen.
+void mmpi_number_samples(const int64_t* slots, int64_t begin, int64_t end, const bool* chosen, int64_t slots_per_ray,
+                         int32_t* numbers) {
+    for (int64_t n = begin; n < end; n++)
+        if (chosen[slots[n] / slots_per_ray]) numbers[slots[n]] = int32_t(n);
+}
+
+// Gradients of values [rows, channels] (null if not asked for), of the taps' weights (in the taps, added to what is there)
+// and of weights [R, S] from those of the sums [R, padded] and, except for the weights, of the sums of
 // colours and twice those of squared colours [R, 16], padded with zeros. Samples of rays that are not `chosen` have none.
 // Rows [begin, end) have one owner, who adds the samples in the order of `slots`: sums do not depend on the threads. The
 // owner of a sample's first row writes the other gradients.
@@ -104,6 +112,7 @@ void mmpi_gather_back(const float* values, int64_t rows, int64_t channels, const
                       float* grad_weights) {
     const Table table{values, rows, channels};
     const Owned owned{begin, end};
+    if (grad_values) std::fill(grad_values + begin * channels, grad_values + end * channels, 0.0f);
     const int64_t padded = (channels + WIDTH - 1) / WIDTH * WIDTH, count = groups[0].count + groups[1].count;
     constexpr int64_t AHEAD = 6;
     for (int64_t n = 0; n < count; n++) {
@@ -147,3 +156,7 @@ void mmpi_gather_back(const float* values, int64_t rows, int64_t channels, const
     }
 }
 }
+
+IN_PARTS(mmpi_gather_taps)
+IN_PARTS(mmpi_number_samples)
+IN_PARTS(mmpi_gather_back)

@@ -178,11 +178,11 @@ def weigh_rows(
     return _WeighRows.apply(values, positions, weights.to(values.dtype))  # type: ignore[no-any-return]
 
 
-@operation("gpu")
+@operation("cpu", "gpu")
 def weighted_rows(
     table: Float[Tensor, "T C"], rows: Int[Tensor, "N B"], weights: Float[Tensor, "N B"]
 ) -> Float[Tensor, "N C"]:
-    """Values of ``weigh_rows``: torch's embedding bag, on a CPU 3 to 6 times faster than indexing."""
+    """Values of ``weigh_rows``."""
     return torch.nn.functional.embedding_bag(rows, table, per_sample_weights=weights, mode="sum")
 
 

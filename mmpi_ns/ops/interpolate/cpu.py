@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import accumulate
 
 import torch
 from torch import Tensor
 
 from mmpi_ns.ops import interpolate
-from mmpi_ns.ops.build import call, call_in_parts, even_bounds, owned_bounds, run_in_parts
+from mmpi_ns.ops.build import call_in_parts, even_bounds, owned_bounds, run_in_parts
 from mmpi_ns.ops.cpu_scene import CpuScene
 from mmpi_ns.ops.interpolate import HeadSamples, RowIndex
 from mmpi_ns.ops.layout import Places, SceneLayout
@@ -25,16 +24,13 @@ def order_by_head(places: Places, num_heads: int, counts: Sequence[int] | None) 
     heads, planes, ndc, valid = (x.contiguous() for x in places)
     bounds = even_bounds(heads.numel(), AT_LEAST)
     in_parts = torch.zeros(len(bounds) - 1, num_heads, dtype=torch.int64)
-    part_of = {begin: i for i, begin in enumerate(bounds[:-1])}
-    run_in_parts(lambda a, b: call("mmpi_count_heads", heads, valid, a, b, in_parts[part_of[a]]), bounds)
+    run_in_parts("mmpi_count_heads", bounds, (heads, valid), (num_heads, in_parts))
     totals = in_parts.sum(0)
     starts = totals.cumsum(0) - totals + in_parts.cumsum(0) - in_parts
     count = int(totals.sum())
     slots, of_heads, of_planes = (torch.empty(count, dtype=torch.int64) for _ in range(3))
     columns = (slots, of_heads, of_planes, torch.empty(count, 3))
-    run_in_parts(
-        lambda a, b: call("mmpi_order_by_head", heads, planes, ndc, valid, a, b, starts[part_of[a]], *columns), bounds
-    )
+    run_in_parts("mmpi_order_by_head", bounds, (heads, planes, ndc, valid), (num_heads, starts, *columns))
     return HeadSamples(*columns, totals.tolist())
 
 
@@ -55,9 +51,11 @@ def index_rows(rows: Tensor, table_rows: int, pads: bool) -> RowIndex:
     before, positions = torch.empty(len(words), dtype=torch.int32), torch.empty(rows.shape, dtype=torch.int32)
     call_in_parts("mmpi_mark_rows", count, (listed,), (words,), AT_LEAST)
     bounds = even_bounds(len(words), AT_LEAST)
-    ends = [0, *accumulate(run_in_parts(lambda a, b: call("mmpi_count_rows", a, b, words), bounds))]
-    starts, unique = dict(zip(bounds, ends, strict=True)), torch.empty(ends[-1], dtype=torch.int64)
-    run_in_parts(lambda a, b: call("mmpi_list_rows", a, b, words, starts[a], before, unique), bounds)
+    counts = torch.empty(len(bounds) - 1, dtype=torch.int64)
+    run_in_parts("mmpi_count_rows", bounds, (), (words, counts))
+    ends = counts.cumsum(0)
+    unique = torch.empty(int(ends[-1]), dtype=torch.int64)
+    run_in_parts("mmpi_list_rows", bounds, (), (words, ends - counts, before, unique))
     call_in_parts("mmpi_place_rows", count, (listed,), (words, before, positions), AT_LEAST)
     return RowIndex(unique, positions)
 
@@ -65,11 +63,20 @@ def index_rows(rows: Tensor, table_rows: int, pads: bool) -> RowIndex:
 def sum_rows(positions: Tensor, values: Tensor, weights: Tensor, count: int) -> Tensor:
     if positions.dtype != torch.int32:
         return interpolate.sum_rows.reference(positions, values, weights, count)
-    sums, (samples, taps) = torch.zeros(count, values.shape[1]), positions.shape
+    sums, (samples, taps) = torch.empty(count, values.shape[1]), positions.shape
     entries = (*(x.contiguous() for x in (positions, weights, values)), samples, taps, values.shape[1])
     bounds = owned_bounds([positions], count, AT_LEAST)
-    run_in_parts(lambda a, b: call("mmpi_sum_rows", *entries, a, b, sums), bounds)
+    run_in_parts("mmpi_sum_rows", bounds, entries, (sums,))
     return sums
+
+
+def weighted_rows(table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
+    if rows.dtype != torch.int32 or not table.is_contiguous():
+        return interpolate.weighted_rows.reference(table, rows, weights)
+    (count, taps), channels = rows.shape, table.shape[1]
+    values, before = torch.empty(count, channels), (table, channels, rows.contiguous(), weights.contiguous(), taps)
+    call_in_parts("mmpi_weigh_rows", count, before, (values,), AT_LEAST)
+    return values
 
 
 def raise_peaks(peaks: Tensor, rows: Tensor, positions: Tensor, weights: Tensor) -> None:

@@ -1,4 +1,5 @@
 // Rows of tables that a batch reads: which, what is there, and their gradients.
+#include "parts.h"
 #include "scene.h"
 #include "table.h"
 
@@ -16,15 +17,18 @@ void mmpi_mark_rows(const int64_t* rows, int64_t begin, int64_t end, uint64_t* w
     }
 }
 
-// How many rows are marked in bricks [begin, end).
-int64_t mmpi_count_rows(int64_t begin, int64_t end, const uint64_t* words) {
+// How many rows are marked in bricks [begin, end), to the part's place in `counts`.
+void mmpi_count_rows(int64_t begin, int64_t end, const uint64_t* words, int64_t* counts) {
     int64_t count = 0;
     for (int64_t b = begin; b < end; b++) count += __builtin_popcountll(words[b]);
-    return count;
+    counts[this_part] = count;
 }
 
-// Lists the marked rows of bricks [begin, end) from place `at` on; `before` [bricks] is how many come before a brick's.
-void mmpi_list_rows(int64_t begin, int64_t end, const uint64_t* words, int64_t at, int32_t* before, int64_t* unique) {
+// Lists the marked rows of bricks [begin, end) from the part's place in `starts` on; `before` [bricks] is how many come
+// before a brick's.
+void mmpi_list_rows(int64_t begin, int64_t end, const uint64_t* words, const int64_t* starts, int32_t* before,
+                    int64_t* unique) {
+    int64_t at = starts[this_part];
     for (int64_t b = begin; b < end; b++) {
         if (words[b]) before[b] = int32_t(at);
         for (uint64_t left = words[b]; left; left &= left - 1) unique[at++] = b * BRICK + __builtin_ctzll(left);
@@ -63,25 +67,43 @@ void mmpi_raise_peaks(const int32_t* positions, const float* weights, int64_t be
     }
 }
 
-// values[positions[n, b]] += weights[n, b] * grad[n], of the entries at positions [begin, end): each has one owner, who
-// adds in the order of samples.
+// The sum of weights[n, b] * table[positions[n, b]] over b, of samples [begin, end).
+void mmpi_weigh_rows(const float* table, int64_t channels, const int32_t* positions, const float* weights, int64_t taps,
+                     int64_t begin, int64_t end, float* values) {
+    for (int64_t n = begin; n < end; n++) {
+        if (n + AHEAD < end)
+            for (int64_t i = (n + AHEAD) * taps; i < (n + AHEAD + 1) * taps; i++)
+                __builtin_prefetch(table + positions[i] * channels);
+        float* sum = values + n * channels;
+        std::fill_n(sum, channels, 0.0f);
+        for (int64_t i = n * taps; i < (n + 1) * taps; i++)
+            for (int64_t c = 0; c < channels; c++) sum[c] += weights[i] * table[positions[i] * channels + c];
+    }
+}
+
+// values[positions[n, b]] is the sum of weights[n, b] * grad[n], of the entries at positions [begin, end): each has one
+// owner, who adds in the order of samples.
 void mmpi_sum_rows(const int32_t* positions, const float* weights, const float* grad, int64_t samples, int64_t taps,
                    int64_t channels, int64_t begin, int64_t end, float* values) {
+    std::fill(values + begin * channels, values + end * channels, 0.0f);
     for (int64_t i = 0; i < samples * taps; i++)
         if (begin <= positions[i] && positions[i] < end)
             add_row(values + positions[i] * channels, grad + i / taps * channels, weights[i], channels);
 }
 
-// Adds to `counts` [heads] how many of slots [begin, end) hold a sample of each head.
-void mmpi_count_heads(const int64_t* heads, const bool* valid, int64_t begin, int64_t end, int64_t* counts) {
+// Adds to the part's `counts` [parts, num_heads] how many of slots [begin, end) hold a sample of each head.
+void mmpi_count_heads(const int64_t* heads, const bool* valid, int64_t begin, int64_t end, int64_t num_heads,
+                      int64_t* counts) {
+    counts += this_part * num_heads;
     for (int64_t i = begin; i < end; i++) counts[heads[i]] += valid[i];
 }
 
-// Writes slot, head, plane and position of each sample in slots [begin, end) to the next place of its head; `next` [heads]
-// is advanced.
+// Writes slot, head, plane and position of each sample in slots [begin, end) to the next place of its head; the
+// part's `next` [parts, num_heads] is advanced.
 void mmpi_order_by_head(const int64_t* heads, const int64_t* planes, const float* ndc, const bool* valid, int64_t begin,
-                        int64_t end, int64_t* next, int64_t* slots, int64_t* of_heads, int64_t* of_planes,
-                        float* of_ndc) {
+                        int64_t end, int64_t num_heads, int64_t* next, int64_t* slots, int64_t* of_heads,
+                        int64_t* of_planes, float* of_ndc) {
+    next += this_part * num_heads;
     for (int64_t i = begin; i < end; i++) {
         if (!valid[i]) continue;
         const int64_t to = next[heads[i]]++;
@@ -107,3 +129,15 @@ void mmpi_texel_rows(const Grid* grids, const int64_t* heads, const int64_t* pla
     }
 }
 }
+
+IN_PARTS(mmpi_mark_rows)
+IN_PARTS(mmpi_count_rows)
+IN_PARTS(mmpi_list_rows)
+IN_PARTS(mmpi_place_rows)
+IN_PARTS(mmpi_take_rows)
+IN_PARTS(mmpi_raise_peaks)
+IN_PARTS(mmpi_weigh_rows)
+IN_PARTS(mmpi_sum_rows)
+IN_PARTS(mmpi_count_heads)
+IN_PARTS(mmpi_order_by_head)
+IN_PARTS(mmpi_texel_rows)

@@ -1,5 +1,6 @@
 // Samples of rays to train: one ray at a time, every head's samples near to far in blocks, so the merge takes the nearest
 // head at each step, and a ray ends where nothing behind it can matter. Why not abreast: walk.h.
+#include "parts.h"
 #include "walk.h"
 
 namespace {
@@ -255,3 +256,6 @@ void mmpi_pack(const int64_t* starts, const int64_t* kept, int64_t begin, int64_
     }
 }
 }
+
+IN_PARTS(mmpi_march)
+IN_PARTS(mmpi_pack)

@@ -1,4 +1,5 @@
 // What rays show of the bricks of training.
+#include "parts.h"
 #include "taps.h"
 #include "walk.h"
 
@@ -124,3 +125,5 @@ void mmpi_show(const Scene* scene, const Rays* rays, const Tiles* tiles, const f
     show(texels, *rays, begin, end, *to);
 }
 }
+
+IN_PARTS(mmpi_show)

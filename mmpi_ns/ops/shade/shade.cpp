@@ -1,6 +1,7 @@
 // Colours of samples, without gradients: features, encodings and the colour network of sixteen samples of a head at a
 // time.
 #include "layers.h"
+#include "parts.h"
 #include "taps.h"
 
 namespace {
@@ -75,3 +76,5 @@ void mmpi_shade(const Grid* grids, int64_t num_mpis, int64_t num_heads, const Sh
         if (heads[h].size) shade_head(h);
 }
 }
+
+IN_PARTS(mmpi_shade)

@@ -1,4 +1,5 @@
 // Total variation of texels with its gradient.
+#include "parts.h"
 #include "scene.h"
 #include "table.h"
 
@@ -161,3 +162,5 @@ void mmpi_total_variation(const int64_t* rows, int64_t count, int64_t begin, int
     }
 }
 }
+
+IN_PARTS(mmpi_total_variation)

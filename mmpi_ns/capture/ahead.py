@@ -1,0 +1,52 @@
+"""The rays of the next step are drawn while a step runs."""
+
+from __future__ import annotations
+
+import functools
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any
+
+import torch
+from nerfstudio.cameras.rays import RayBundle
+
+from mmpi_ns.capture.ray_sources import RaySources
+from mmpi_ns.utils.parallel import num_threads
+from mmpi_ns.utils.random_draws import generator
+
+Batch = tuple[RayBundle, dict[str, Any]]
+
+
+class DrawnAhead:
+    """Draws the rays of steps, keyed on (seed, step); where there are several threads, one of them draws those of the
+    next step before they are asked for. Drawing is small operations of torch, which take the time of one core."""
+
+    def __init__(self, seed: int, device: str | torch.device) -> None:
+        self.seed, self.device = seed, device
+        self._next: tuple[RaySources, tuple[int, int, float], Future[Batch]] | None = None
+
+    def draw(self, sources: RaySources, step: int, pixel_rays: int, share: float) -> Batch:
+        """What ``RaySources.draw`` draws for a step.
+
+        Args:
+            sources: of the rays.
+            step: of the training.
+            pixel_rays: rays through pixels.
+            share: of the step's rays that are drawn.
+        """
+        batch, asked = None, (step, pixel_rays, share)
+        if self._next is not None:
+            of, key, future = self._next
+            batch = future.result() if of is sources and key == asked else None
+        batch = batch or self._drawn(sources, *asked)
+        if num_threads() > 1 and torch.device(self.device).type == "cpu":
+            following = step + 1, pixel_rays, share
+            self._next = sources, following, _thread().submit(self._drawn, sources, *following)
+        return batch
+
+    def _drawn(self, sources: RaySources, step: int, pixel_rays: int, share: float) -> Batch:
+        return sources.draw(pixel_rays, share, generator(self.seed, step, "pixels", self.device))
+
+
+@functools.cache
+def _thread() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(1, thread_name_prefix="mmpi-rays")
