@@ -74,10 +74,21 @@ def training_bytes(plan: ScenePlan, views: TrainingViews | None, feature_channel
     """
     tiles = count_tiles(plan)
     stored = tiles if views is None else int(reachable_tiles(views, plan).sum())
+    return stored_bytes(stored, tiles, feature_channels, two_phase)
+
+
+def stored_bytes(bricks: int, tiles: int, feature_channels: int, two_phase: bool) -> int:
+    """Bytes of tables with so many bricks besides the empty one, and of their moments.
+
+    Args:
+        bricks: that hold a tile.
+        tiles: of all planes, stored or not.
+        feature_channels, two_phase: see ``training_bytes``.
+    """
     learned = 1 + feature_channels + two_phase
     numbers, moments = 1 + feature_channels + 1, 2 * learned  # density, features, reliability; in float32, bfloat16
     # Also marks of touched texels, peaks of bricks, and the tile map.
-    return (stored + 1) * (BRICK * (4 * numbers + 2 * moments + 1) + 4) + 4 * tiles
+    return (bricks + 1) * (BRICK * (4 * numbers + 2 * moments + 1) + 4) + 4 * tiles
 
 
 def describe(windows: WindowedPlan, steps: int, tables: Sequence[int], pixels: Sequence[int]) -> str:

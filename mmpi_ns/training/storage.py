@@ -5,13 +5,19 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from torch import Tensor
+
 from mmpi_ns.field.tables import TABLES, TexelTables
-from mmpi_ns.scene.texels import BRICK
+from mmpi_ns.scene.plan import MOST_TEXELS
+from mmpi_ns.scene.texels import BRICK, head_shapes
+from mmpi_ns.training.memory import stored_bytes, training_bytes
 from mmpi_ns.training.phases import Schedule
 from mmpi_ns.utils.host import give_back_freed_memory
 
 FORMING = 0.4
 """Factor of the weight below which bricks are released while surfaces still form."""
+WORTH = 1.25
+"""Least multiple of texels for which tables grow beyond the plan."""
 
 
 def prepare_storage(
@@ -28,7 +34,7 @@ def prepare_storage(
     """
     trained = [(optimizers[name], getattr(field, name)) for name in TABLES if name in optimizers]
     phase, factor, remaining = schedule.phase_at(step), schedule.texel_factor(step), []
-    grows = factor != field.factor
+    grows = factor > field.factor
     if grows:
         for optimizer, table in trained:
             optimizer.reset_moments(table)
@@ -46,3 +52,33 @@ def prepare_storage(
     for kept in remaining:
         for optimizer, table in trained if kept is not None else ():
             optimizer.keep_blocks(table, kept, BRICK)
+    if schedule.refines_at(step):
+        refine(field, any(p.name == "blend" for p in schedule.phases), trained)
+
+
+def refine(field: TexelTables, two_phase: bool, trained: list[tuple[Any, Any]]) -> None:
+    """Makes texels finer than planned where bricks were released: as fine as the plan allows within its bytes.
+
+    Args:
+        field: the field that is trained.
+        two_phase: see ``training_bytes``.
+        trained: optimisers and their tables.
+    """
+    plan = field.full_plan
+    budget = training_bytes(plan, field.views, field.feature_channels, two_phase)
+
+    def bytes_of(tiles: Tensor) -> int:
+        return stored_bytes(int((tiles > 0).sum()), len(tiles), field.feature_channels, two_phase)
+
+    longest = max(n for shape in head_shapes(plan) for n in shape[1:])
+    factor = min(plan.detail, (MOST_TEXELS / longest) ** 2, field.factor * budget / bytes_of(field.tiles))
+    while factor >= WORTH * field.factor:
+        tiles = field.tiles_at(factor)
+        if bytes_of(tiles) <= budget:
+            for optimizer, table in trained:
+                optimizer.reset_moments(table)
+            give_back_freed_memory()
+            field.grow(factor, tiles)
+            give_back_freed_memory()
+            return
+        factor *= min(0.98, budget / bytes_of(tiles))
