@@ -28,6 +28,8 @@ EMPTY = {"density": RELEASED_DENSITY, "features": 0.0, "reliability": 0.0}
 """Content of the empty brick in each table."""
 TABLES = tuple(EMPTY)
 """The parameters that have a row for every texel."""
+MIDDLE = 0.5
+"""Share of stored texels in a texel between those and empty ones."""
 ENOUGH_CROSSINGS = 32
 """Average number of training samples for each brick before any brick may be released."""
 
@@ -118,9 +120,14 @@ class TexelTables(Field):
 
     @torch.no_grad()
     def tiles_at(self, factor: float) -> Int[Tensor, "T"]:
-        """``tiles`` with ``factor`` times the plan's texels, if the tables grew to that now."""
-        plan = self.full_plan.scaled(factor)
-        return grown_tiles(self.grids, head_grids(plan), self._is_cube, self._reachable(plan)).to(self.density.device)
+        """``tiles`` with ``factor`` times the plan's texels, if the tables grew to that now.
+
+        Surfaces have formed when texels become finer than planned: what lies beyond the middle between a stored texel
+        and an empty one stays empty then. Otherwise a rim of tiles would be stored again each time.
+        """
+        plan, least = self.full_plan.scaled(factor), MIDDLE if factor > 1 else 0.0
+        tiles = grown_tiles(self.grids, head_grids(plan), self._is_cube, self._reachable(plan), least)
+        return tiles.to(self.density.device)
 
     @torch.no_grad()
     def grow(self, factor: float, tiles: Int[Tensor, "T"] | None = None) -> None:

@@ -12,6 +12,7 @@ from mmpi_ns.scene.plan import MOST_TEXELS
 from mmpi_ns.scene.texels import BRICK, head_shapes
 from mmpi_ns.training.memory import stored_bytes, training_bytes
 from mmpi_ns.training.phases import Schedule
+from mmpi_ns.utils.console import say
 from mmpi_ns.utils.host import give_back_freed_memory
 
 FORMING = 0.4
@@ -80,5 +81,6 @@ def refine(field: TexelTables, two_phase: bool, trained: list[tuple[Any, Any]]) 
             give_back_freed_memory()
             field.grow(factor, tiles)
             give_back_freed_memory()
+            say(f"Texels are {factor:.1f} times as many as planned now, in the room that released ones left.")
             return
         factor *= min(0.98, budget / bytes_of(tiles))
