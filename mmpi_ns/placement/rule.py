@@ -100,7 +100,7 @@ def place(observations: Observations, config: PlacementConfig, training_rays: in
     cube = next((h for h in chosen if isinstance(h, CubePlan)), None)
     if texel_pixels > finest:
         remedy = "more steps" if budget != config.max_texels else "a larger placement.max-texels"
-        remedy += f", and down to {finest:.1f} as empty ones are released"
+        remedy += f", or down to {finest:.1f} in training in the room of released ones"
     else:
         remedy = "more steps" if trainable > config.texel_pixels else "a smaller placement.texel-pixels"
     origin = f"automatic placement, a texel spans {texel_pixels:.1f} pixels: finer with {remedy}"
