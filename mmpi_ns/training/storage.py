@@ -15,7 +15,7 @@ from mmpi_ns.training.phases import Schedule
 from mmpi_ns.utils.console import say
 from mmpi_ns.utils.host import give_back_freed_memory
 
-FORMING = 0.1
+FORMING = 0.4
 """Factor of the weight below which bricks are released while surfaces still form."""
 WORTH = 1.25
 """Least multiple of texels for which tables grow beyond the plan."""

@@ -276,8 +276,10 @@ def test_a_longer_run_keeps_the_schedule_of_the_checkpoint_in_model_and_learning
     assert schedule.total_steps == STEPS
     trainer.train()
     assert sorted(int(p.stem[5:]) for p in trainer.checkpoint_dir.iterdir())[-1] == STEPS + 5
-    state = load(trainer.checkpoint_dir, STEPS - 1)
-    assert differences(compared(load(whole[1], STEPS - 1)), compared(state)) == []
+    before, state = (load(trainer.checkpoint_dir, step) for step in (STEPS - 2, STEPS - 1))
+    assert differences(compared(load(whole[1], STEPS - 2)), compared(before)) == []
+    assert differences(load(whole[1], STEPS - 1)["pipeline"], state["pipeline"]) == []
+    assert state["optimizers"]["density"]["state"], "this run goes on, and its moments with it"
 
 
 @pytest.mark.parametrize("steps", [0, 150])
