@@ -223,7 +223,7 @@ def page(content):
         "# What the GPU's kernels take", "",
         "From their compiled form, without a device: `PYTHONPATH=.:tests python tests/triton_compiling.py "
         f"{' '.join(n.removeprefix('sm_') for n in names)} --write docs/results/kernels.json` (Triton "
-        f"{content['made']['triton']}, the launch of each kernel with the most in it, for four MPIs, not blended, eight "
+        f"{content['made']['triton']}, the launch of each kernel with most in it, for four MPIs, not blended, eight "
         "channels; the march and pictures of 24 planes, compositing of rays of 320 samples).", "",
         "Each cell: registers of a thread / bytes of shared memory of a program / occupancy, the share of a "
         "multiprocessor's warps that fit. Bytes are those of the arrays with an entry for each ray, sample or row, "

@@ -48,14 +48,14 @@ def digest(files: Iterable[Path], *parts: object) -> str:
 class Computed(Sequence[T]):
     """Results of a function of 0 to n - 1, computed at every access, so that they take no memory."""
 
-    def __init__(self, count: int, function: Callable[[int], T]) -> None:
-        self.count, self.function = count, function
+    def __init__(self, length: int, function: Callable[[int], T]) -> None:
+        self.length, self.function = length, function
 
     def __len__(self) -> int:
-        return self.count
+        return self.length
 
     def __getitem__(self, i: Any) -> Any:
-        if not 0 <= i < self.count:
+        if not 0 <= i < self.length:
             raise IndexError(i)
         return self.function(i)
 

@@ -28,6 +28,8 @@ EMPTY = {"density": RELEASED_DENSITY, "features": 0.0, "reliability": 0.0}
 """Content of the empty brick in each table."""
 TABLES = tuple(EMPTY)
 """The parameters that have a row for every texel."""
+MIDDLE = 0.5
+"""Share of stored texels in a texel between those and empty ones."""
 ENOUGH_CROSSINGS = 32
 """Average number of training samples for each brick before any brick may be released."""
 
@@ -104,7 +106,7 @@ class TexelTables(Field):
         self.full_plan, self.plan, self.factor = plan, plan.scaled(factor), factor
         device = self.density.device
         if tiles is None:
-            reached = self._reachable()
+            reached = self._reachable(self.plan)
             tiles = head_grids(self.plan)[0].tiles if reached is None else number_tiles(reached)
         self.tiles = tiles.to(device, copy=True)
         for name in TABLES:
@@ -117,12 +119,26 @@ class TexelTables(Field):
         self.look_afresh()
 
     @torch.no_grad()
-    def grow(self, factor: float) -> None:
-        """Resamples every table to ``factor`` times the plan's texels (paper sec. IV; bilinear on each plane)."""
-        old, self.plan, self.factor = self.grids, self.full_plan.scaled(factor), factor
-        is_cube = [k >= len(self.plan.mpis) for k in range(self.plan.num_heads)]
-        reached = self._reachable()
-        tiles = grown_tiles(old, head_grids(self.plan), is_cube, reached).to(self.density.device)
+    def tiles_at(self, factor: float) -> Int[Tensor, "T"]:
+        """``tiles`` with ``factor`` times the plan's texels, if the tables grew to that now.
+
+        Surfaces have formed when texels become finer than planned: what lies beyond the middle between a stored texel
+        and an empty one stays empty then. Otherwise a rim of tiles would be stored again each time.
+        """
+        plan, least = self.full_plan.scaled(factor), MIDDLE if factor > 1 else 0.0
+        tiles = grown_tiles(self.grids, head_grids(plan), self._is_cube, self._reachable(plan), least)
+        return tiles.to(self.density.device)
+
+    @torch.no_grad()
+    def grow(self, factor: float, tiles: Int[Tensor, "T"] | None = None) -> None:
+        """Resamples every table to ``factor`` times the plan's texels (paper sec. IV; bilinear on each plane).
+
+        Args:
+            factor: texels, as a share of the plan's.
+            tiles: to store, of ``tiles_at(factor)``; None: those.
+        """
+        tiles = self.tiles_at(factor) if tiles is None else tiles
+        old, is_cube, self.plan, self.factor = self.grids, self._is_cube, self.full_plan.scaled(factor), factor
         new = head_grids(self.plan, tiles)
         for name in TABLES:
             table = getattr(self, name)
@@ -176,8 +192,12 @@ class TexelTables(Field):
         self._packed = {}
         return kept
 
-    def _reachable(self) -> Bool[Tensor, "T"] | None:
-        return None if self.views is None else reachable_tiles(self.views, self.plan, self.density.device)
+    @property
+    def _is_cube(self) -> list[bool]:
+        return [k >= len(self.plan.mpis) for k in range(self.plan.num_heads)]
+
+    def _reachable(self, plan: ScenePlan) -> Bool[Tensor, "T"] | None:
+        return None if self.views is None else reachable_tiles(self.views, plan, self.density.device)
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
         """Takes plan, resolution and tiles from the checkpoint first, so that all shapes fit."""

@@ -20,7 +20,7 @@ from mmpi_ns.placement.errors import WORST
 from mmpi_ns.placement.hand_made import drive_plan, room_plan
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.placement.visibility import VisiblePoints, find_visible_points, pixels_per_pixel
-from mmpi_ns.scene.plan import CubePlan, MPIPlan, ScenePlan
+from mmpi_ns.scene.plan import MOST_DETAIL, CubePlan, MPIPlan, ScenePlan
 
 MIN_PLANES = 16
 BUDGET_ROUNDS = 8
@@ -100,10 +100,12 @@ def place(observations: Observations, config: PlacementConfig, training_rays: in
     cube = next((h for h in chosen if isinstance(h, CubePlan)), None)
     if texel_pixels > finest:
         remedy = "more steps" if budget != config.max_texels else "a larger placement.max-texels"
+        remedy += f", or down to {finest:.1f} in training in the room of released ones"
     else:
         remedy = "more steps" if trainable > config.texel_pixels else "a smaller placement.texel-pixels"
     origin = f"automatic placement, a texel spans {texel_pixels:.1f} pixels: finer with {remedy}"
-    return ScenePlan(_named(mpis), cube, 0.2 * visible.near, visible.near, origin)
+    detail = min(max(1.0, (texel_pixels / finest) ** 2), MOST_DETAIL)
+    return ScenePlan(_named(mpis), cube, 0.2 * visible.near, visible.near, origin, detail)
 
 
 def trainable_texel(

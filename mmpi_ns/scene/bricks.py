@@ -56,7 +56,11 @@ def take_bricks(table: Float[Tensor, "N C"], kept: Int[Tensor, "K"]) -> Float[Te
 
 
 def grown_tiles(
-    old: list[TexelGrid], new: list[TexelGrid], is_cube: list[bool], reachable: Bool[Tensor, "T"] | None
+    old: list[TexelGrid],
+    new: list[TexelGrid],
+    is_cube: list[bool],
+    reachable: Bool[Tensor, "T"] | None,
+    least: float = 0.0,
 ) -> Int[Tensor, "T"]:
     """``tiles`` at another resolution: those that a stored texel of the old one reaches, and a training ray too.
 
@@ -65,11 +69,13 @@ def grown_tiles(
         new: heads at the new resolution; their tiles are not read.
         is_cube: which of them is the cube.
         reachable: tiles that training rays cross; None for all.
+        least: share of stored texels in an interpolated one from which (0: above which) it is stored.
     """
     stored = torch.zeros_like(new[0].tiles, dtype=torch.bool)
     for source, target, cube in zip(old, new, is_cube, strict=True):
         for sources, planes in _chunks(target, cube):
-            there = _resize(_stored(source, sources).float(), target, cube)[..., 0] > 0
+            share = _resize(_stored(source, sources).float(), target, cube)[..., 0]
+            there = share >= least if least else share > 0
             reached = pad(there.float(), (0, -target.width % SIDE, 0, -target.height % SIDE))
             tiles = max_pool2d(reached[:, None], SIDE)[:, 0] > 0
             first = target.first_tile + planes.start * target.down * target.across

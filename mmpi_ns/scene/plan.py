@@ -24,7 +24,7 @@ HUGE = 1e18
 LENGTH = Number(-HUGE, HUGE)
 WIDEST = 1e6
 """Largest tangent of a frustum."""
-MOST_PLANES, MOST_TEXELS, MOST_VOXELS = 4096, 16384, 4096
+MOST_PLANES, MOST_TEXELS, MOST_VOXELS, MOST_DETAIL = 4096, 16384, 4096, 64
 """Planes of an MPI, texels along a side of a plane, voxels along a side of the cube."""
 
 
@@ -102,6 +102,8 @@ class ScenePlan:
     """Distance from the cameras to the first content: an MPI entered later covers a ray only in part."""
     origin_of_plan: str = "by hand"
     """The rule that made the plan, for information."""
+    detail: float = 1.0
+    """Largest multiple of the texels that training may use: where released bricks leave room it makes planes finer."""
 
     def __post_init__(self) -> None:
         """Raises InputError with one sentence that names the MPI and the field that cannot be used."""
@@ -118,6 +120,7 @@ class ScenePlan:
         check_number("The plan's 'ray_near'", self.ray_near, Number(0, HUGE))
         check_number("The plan's 'content_near'", self.content_near, Number(0, HUGE))
         check_text("The plan's 'origin_of_plan'", self.origin_of_plan)
+        check_number("The plan's 'detail'", self.detail, Number(1, MOST_DETAIL))
 
     @property
     def num_heads(self) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 import re
+from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -99,6 +100,12 @@ def checkpoint_to_load(config: TrainerConfig) -> Path | None:
     if step not in steps:
         raise InputError(f"There is no step {step} in {config.load_dir}: it holds {sorted(steps)}.")
     return steps[step]
+
+
+def written_short(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Tensors as a checkpoint holds them: those of zeros alone, as untrained reliability, take one number each."""
+    zeros = {k: v.new_zeros(()).expand(v.shape) for k, v in state.items() if v.numel() > 1 and not v.any()}
+    return dict(state) | zeros
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:

@@ -160,10 +160,21 @@ def training_bytes(plan: ScenePlan, views: TrainingViews | None, work: Work, dev
     """
     tiles = count_tiles(plan)
     stored = tiles if views is None else int(reachable_tiles(views, plan, device).sum())
+    return stored_bytes(stored, tiles, work)
+
+
+def stored_bytes(bricks: int, tiles: int, work: Work) -> int:
+    """Bytes of tables with a number of bricks besides the empty one, and of their moments.
+
+    Args:
+        bricks: that hold a tile.
+        tiles: of all planes, stored or not.
+        work: what is trained.
+    """
     learned = 1 + work.feature_channels + work.two_phase
     numbers, moments = 1 + work.feature_channels + 1, 2 * learned  # density, features, reliability; float32, bfloat16
     # Also marks of touched texels, peaks of bricks, and the tile map.
-    return (stored + 1) * (BRICK * (4 * numbers + 2 * moments + 1) + 4) + 4 * tiles
+    return (bricks + 1) * (BRICK * (4 * numbers + 2 * moments + 1) + 4) + 4 * tiles
 
 
 def describe(windows: WindowedPlan, steps: int, tables: Sequence[int], pixels: Sequence[int]) -> str:

@@ -138,6 +138,12 @@ class Schedule:
         """Whether bricks are released before this step."""
         return self._local(step) in self.release
 
+    def refines_at(self, step: int) -> bool:
+        """Whether texels may become finer than planned before this step: at releases after the last growth, as long as
+        rates are high."""
+        high = self._sharp_from < self._local(step) <= self.decay_from * self.phases[0].end
+        return high and self.releases_at(step)
+
     def watches(self, step: int) -> bool:
         """Whether the samples of a step count for the next release of bricks."""
         return bool(self.release) and self._watched_from <= self._local(step) < self.release[-1]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,19 +14,14 @@ from torch.nn import Parameter
 
 from mmpi_ns.capture.datamanager import MMPIDataManager
 from mmpi_ns.field.mmpi_field import MMPIField
-from mmpi_ns.field.tables import TABLES, TexelTables
 from mmpi_ns.placement.split import cameras_in
 from mmpi_ns.rendering.window_store import WindowStore
-from mmpi_ns.scene.texels import BRICK
 from mmpi_ns.scene.visible_tiles import TrainingViews
 from mmpi_ns.scene.windows import Window, WindowedPlan
 from mmpi_ns.training.batch_rays import keep_frame
 from mmpi_ns.training.phases import TRAINS, Phase, Schedule
+from mmpi_ns.training.storage import prepare_storage
 from mmpi_ns.utils.files import to_bytes, to_text
-from mmpi_ns.utils.host import give_back_freed_memory
-
-FORMING = 0.4
-"""Factor of the weight below which bricks are released while surfaces still form."""
 
 
 class Progress(nn.Module):
@@ -148,37 +142,3 @@ class TrainingRun:
             params[0].requires_grad_(kind in TRAINS[phase])
         if "camera_opt" in TRAINS[phase] and self.poses and self.views is not None:
             keep_frame(self.poses[0], self.views.origins, field.plan.content_near, self.scale_is_free)
-
-
-def prepare_storage(
-    field: TexelTables, schedule: Schedule, step: int, least: float, optimizers: Mapping[str, Any]
-) -> None:
-    """Grows tables and releases bricks as scheduled for a step; the optimisers' moments follow.
-
-    Args:
-        field: the field that is trained.
-        schedule: of the whole run.
-        step: that is about to run.
-        least: see ``TexelTables.release_unused``.
-        optimizers: of the tables, by name, if there are any.
-    """
-    trained = [(optimizers[name], getattr(field, name)) for name in TABLES if name in optimizers]
-    phase, factor, remaining = schedule.phase_at(step), schedule.texel_factor(step), []
-    grows, releases = factor != field.factor, schedule.releases_at(step)
-    if grows:
-        for optimizer, table in trained:
-            optimizer.reset_moments(table)
-    if grows or releases:
-        give_back_freed_memory()
-    if releases:
-        remaining.append(field.release_unused(FORMING * least if grows else least))
-    if grows:  # what has just been released does not grow
-        field.grow(factor)
-        give_back_freed_memory()
-    elif schedule.sharpened(step) and not schedule.sharpened(step - 1):
-        field.look_afresh()
-    if phase.name == "blend" and step == phase.start:
-        remaining.append(field.release_untouched())
-    for kept in remaining:
-        for optimizer, table in trained if kept is not None else ():
-            optimizer.keep_blocks(table, kept, BRICK)

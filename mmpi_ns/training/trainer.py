@@ -29,6 +29,7 @@ from mmpi_ns.training.checkpoints import (
     checkpoints_in,
     claim,
     read_checkpoint,
+    written_short,
 )
 from mmpi_ns.training.learning_rates import PhaseScheduler
 from mmpi_ns.training.memory import Work, describe, training_bytes
@@ -308,10 +309,11 @@ class MMPITrainer(Trainer):
             return  # stopped before the first step: there is nothing to save
         self.checkpoint_dir.mkdir(parents=True, exist_ok=True)
         path = self.checkpoint_dir / f"step-{step:09d}.ckpt"
+        goes_on = step + 1 < self._total_steps
         state = {
             "step": step,
-            "pipeline": self.pipeline.state_dict(),
-            "optimizers": {k: v.state_dict() for k, v in self.optimizers.optimizers.items()},
+            "pipeline": written_short(self.pipeline.state_dict()),
+            "optimizers": {k: _state_of(v, goes_on) for k, v in self.optimizers.optimizers.items()},
             "schedulers": {k: v.state_dict() for k, v in self.optimizers.schedulers.items()},
             "scalers": self.grad_scaler.state_dict(),
             "rng": {"torch": torch.get_rng_state()},
@@ -359,6 +361,12 @@ def _write_plan(path: Path, plan: WindowedPlan) -> None:
         )
     write_atomically(path, lambda unfinished: unfinished.write_text(text, encoding="utf-8"))
     digest_file.write_text(hashlib.sha256(text.encode()).hexdigest(), encoding="ascii")
+
+
+def _state_of(optimizer: torch.optim.Optimizer, goes_on: bool) -> dict[str, Any]:
+    """What a checkpoint holds of an optimiser: after the last step nobody needs its moments, which are half of all."""
+    state = optimizer.state_dict()
+    return state if goes_on else state | {"state": {}}
 
 
 def _end(number: int, sentence: str = "Stopped before the first step: there is nothing to go on from.") -> NoReturn:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -321,6 +322,9 @@ def test_a_plan_says_how_large_texels_are_and_what_makes_them_finer(changes, ray
     config = replace(PlacementConfig(texel_pixels=2.0, texels_per_ray=0, max_texels=0), **changes)
     plan = place(side_by_side(4), config, rays)
     assert plan.origin_of_plan.startswith("automatic placement, a texel spans ") and words in plan.origin_of_plan
+    numbers = [float(n) for n in re.findall(r"(?:spans|down to) ([\d.]+)", plan.origin_of_plan)]
+    assert plan.detail == pytest.approx((numbers[0] / numbers[-1]) ** 2, rel=0.1) and numbers[-1] >= 2.0
+    assert (plan.detail > 1) == (len(numbers) == 2) == ("max_texels" in changes or "texels_per_ray" in changes)
 
 
 def test_a_short_training_gets_a_small_plan():

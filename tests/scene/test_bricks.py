@@ -17,7 +17,7 @@ from mmpi_ns.ops.interpolate import interpolate_densely, texel_rows
 from mmpi_ns.ops.variation import total_variation
 from mmpi_ns.rendering.sampler import MMPISampler
 from mmpi_ns.scene.bricks import grown_tiles, keep_bricks, new_table, read_planes, resample, write_planes
-from mmpi_ns.scene.texels import BRICK, make_grids
+from mmpi_ns.scene.texels import BRICK, make_grids, number_tiles
 from mmpi_ns.training.touched_adam import TouchedAdam
 
 # Rows ----------------------------------------------------------------------------------------------------------------
@@ -225,6 +225,25 @@ def test_growth_equals_dense_growth_where_everything_around_is_stored_and_goes_o
         exact += int(alike.sum())
         assert partly.any() and (rows < BRICK).any()
     assert exact > 500
+
+
+@pytest.mark.parametrize("wider", [(47, 61), (48, 64), (24, 31)])
+def test_a_tile_is_stored_where_half_of_a_texel_comes_from_stored_ones(wider):
+    """By loops over texels, in float64."""
+    old = make_grids([(3, 24, 31)], number_tiles(chance(3 * 3 * 4, 0.4)))
+    new = make_grids([(3, *wider)])
+    stored = (old[0].rows >= BRICK).double().view(3, 24, 31).numpy()
+    wanted = np.zeros(new[0].own_tiles.shape, bool)
+    for z, y, x in np.ndindex(3, *wider):
+        v, u = y * 23 / (wider[0] - 1), x * 30 / (wider[1] - 1)
+        below, right = min(int(v), 22), min(int(u), 29)
+        (a, b), (c, d) = stored[z, below : below + 2, right : right + 2]
+        fy, fx = v - below, u - right
+        share = (a * (1 - fx) + b * fx) * (1 - fy) + (c * (1 - fx) + d * fx) * fy
+        wanted[z, y // 8, x // 8] |= share > 0.4999
+    kept = grown_tiles(old, new, [False], None, 0.4999).view(wanted.shape) > 0
+    assert np.array_equal(kept.numpy(), wanted)
+    assert wanted.sum() < (grown_tiles(old, new, [False], None) > 0).sum() or wider == (24, 31)
 
 
 def test_growth_stores_only_what_training_rays_reach():

@@ -153,6 +153,14 @@ def test_bricks_may_be_released_just_before_the_texels_double():
     assert [s for s in range(1_000) if once.watches(s)] == [*range(300)]
 
 
+def test_texels_may_become_finer_at_releases_after_growth_while_rates_are_high():
+    shares = {"release_shares": (3 / 15, 4 / 15, 0.3, 0.5, 0.75), "decay_from": 0.5}
+    schedule = schedule_of("joint", 1_000, windows=2, **shares)
+    assert [s for s in range(2_000) if schedule.refines_at(s)] == [300, 500, 1_300, 1_500]
+    schedule = schedule_of("joint", 1_000, **(shares | {"release_weight": 0.0}))
+    assert not any(schedule.refines_at(s) for s in range(1_000)), "nothing is released"
+
+
 def test_bricks_are_given_up_after_growth_and_what_is_seen_before_does_not_count():
     schedule = schedule_of("joint", 1_000, release_shares=(0.1, 0.5, 0.75, 0.5), windows=2)
     assert schedule.growth[-1] == 267 and schedule.release == (500, 750), "not before surfaces have formed, and once"

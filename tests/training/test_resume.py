@@ -11,20 +11,26 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocati
 from training_runs import compared, differences, load, ready, trainer_config, write_plan
 
 from mmpi_ns.placement.defaults import DEFAULTS
+from mmpi_ns.scene.windows import WindowedPlan
 from mmpi_ns.training.phases import LONG_RUN
 
 STEPS = 24
 """individual 0-11 with doublings at 3 and 6 and releases of bricks before 6 and 11, blend 12-17, finetune 18-23; joint
-0-23 with doublings at 6 and 12 and releases before 12 and 22."""
+0-23 with doublings at 6 and 12 and releases before 12 and 22; finer is joint with finer texels from 17 on."""
 BOUNDARIES = (3, 6, 12, 18)
 
 
-@pytest.fixture(scope="module", params=["split", "all", "joint"])
+@pytest.fixture(scope="module", params=["split", "all", "joint", "finer"])
 def whole(request, scene, plan_file, tmp_path_factory):
     """Settings, and the checkpoints of every step of an uninterrupted run."""
-    settings = {"training": "joint"} if request.param == "joint" else {"rays_per_mpi": request.param}
+    joint = request.param in ("joint", "finer")
+    settings = {"training": "joint"} if joint else {"rays_per_mpi": request.param}
     settings |= {"shading": "sample" if request.param == "all" else "ray"}
     settings |= {"release_shares": (0.5, 0.9), "release_weight": 0.06}
+    if request.param == "finer":
+        plan = tmp_path_factory.mktemp("finer") / "plan.json"
+        plan.write_text(replace(WindowedPlan.load(plan_file).plans[0], detail=4.0).to_json())
+        settings |= {"plan_file": plan, "release_shares": (0.5, 0.7, 0.9), "decay_from": 0.8}
     config = trainer_config(scene, plan_file, tmp_path_factory.mktemp("whole"), STEPS, **settings)
     trainer = ready(config)
     trainer.train()
@@ -47,15 +53,20 @@ def resumed(whole, scene, plan_file, tmp_path):
 @pytest.mark.parametrize("step", [*(b + d for b in BOUNDARIES for d in (-2, -1, 0)), STEPS - 3, STEPS - 2])
 def test_a_resumed_run_ends_as_the_uninterrupted_one(whole, resumed, step):
     folder = resumed(step)
-    wanted, found = load(whole[1], STEPS - 1), load(folder, STEPS - 1)
-    assert differences(compared(wanted), compared(found)) == []
+    for last in range(max(step + 1, STEPS - 2), STEPS):
+        wanted, found = load(whole[1], last), load(folder, last)
+        assert differences(compared(wanted), compared(found)) == []
     assert sorted(int(p.stem[5:]) for p in folder.iterdir()) == list(range(step + 1, STEPS))
-    assert set(found["optimizers"]["density"]["state"][0]) == {"step", "moments"}
+    last, first = (load(folder, s)["optimizers"]["density"]["state"] for s in (STEPS - 1, step + 1))
+    assert not last, "after the last step nobody needs moments"
+    assert step + 1 == STEPS - 1 or set(first[0]) == {"step", "moments"}
 
 
 def test_bricks_were_given_up_on_the_way_and_checkpoints_hold_the_others_alone(whole):
     """Between steps 6 or 12, when resolution stops growing, and the end of the first phase."""
-    steps = range(12, STEPS) if "training" in whole[0] else range(6, 14)
+    if "plan_file" in whole[0]:
+        pytest.skip("texels become finer on the way")
+    steps = range(12, STEPS - 1) if "training" in whole[0] else range(6, 14)
     states = [load(whole[1], step) for step in steps]
     rows = [len(state["pipeline"]["_model.field.density"]) for state in states]
     assert rows == sorted(rows, reverse=True) and rows[-1] < rows[0]
@@ -69,8 +80,21 @@ def test_bricks_were_given_up_on_the_way_and_checkpoints_hold_the_others_alone(w
     assert counts == sorted(counts) and counts[0] == 1, "moments go on where bricks go"
 
 
+def test_texels_become_finer_where_the_plan_allows_it_and_never_coarser(whole):
+    factors = [float(load(whole[1], step)["pipeline"]["_model.field.texel_factor"]) for step in range(1, STEPS)]
+    assert factors == sorted(factors) and factors[15] == 1
+    assert 1.25 <= factors[16] <= 4 if "plan_file" in whole[0] else factors[-1] == 1
+
+
 def test_steps_differ_so_the_comparison_can_fail(whole):
     assert len(differences(compared(load(whole[1], STEPS - 1)), compared(load(whole[1], STEPS - 2)))) > 5
+
+
+def test_untrained_reliability_takes_no_bytes_of_a_checkpoint(whole):
+    state = load(whole[1], 11)["pipeline"]
+    reliability, density = (state[f"_model.field.{name}"] for name in ("reliability", "density"))
+    assert reliability.shape == density.shape and not reliability.any() and density.any()
+    assert (reliability.untyped_storage().nbytes(), density.untyped_storage().nbytes()) == (4, 4 * len(density))
 
 
 def test_a_finished_run_has_nothing_to_do(whole, resumed):
@@ -252,8 +276,10 @@ def test_a_longer_run_keeps_the_schedule_of_the_checkpoint_in_model_and_learning
     assert schedule.total_steps == STEPS
     trainer.train()
     assert sorted(int(p.stem[5:]) for p in trainer.checkpoint_dir.iterdir())[-1] == STEPS + 5
-    state = load(trainer.checkpoint_dir, STEPS - 1)
-    assert differences(compared(load(whole[1], STEPS - 1)), compared(state)) == []
+    before, state = (load(trainer.checkpoint_dir, step) for step in (STEPS - 2, STEPS - 1))
+    assert differences(compared(load(whole[1], STEPS - 2)), compared(before)) == []
+    assert differences(load(whole[1], STEPS - 1)["pipeline"], state["pipeline"]) == []
+    assert state["optimizers"]["density"]["state"], "this run goes on, and its moments with it"
 
 
 @pytest.mark.parametrize("steps", [0, 150])

@@ -2,11 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
+import pytest
+import torch
+from hand_made import make_mpi
 from training_runs import schedule_of
 
-from mmpi_ns.training.run import FORMING, prepare_storage
+from mmpi_ns.field.mmpi_field import MMPIField
+from mmpi_ns.field.tables import TABLES
+from mmpi_ns.scene.plan import ScenePlan
+from mmpi_ns.scene.texels import BRICK
+from mmpi_ns.training.memory import Work, training_bytes
+from mmpi_ns.training.storage import FORMING, prepare_storage, refine
+from mmpi_ns.training.touched_adam import TouchedAdam
 
 
 def test_what_is_released_at_a_growth_is_released_before_it_and_by_a_lower_weight():
@@ -24,3 +34,45 @@ def test_what_is_released_at_a_growth_is_released_before_it_and_by_a_lower_weigh
     for step in (51, 74, 75, 76):
         prepare_storage(field, schedule, step, 0.01, {})
     assert calls[2:] == [("release", 0.01)]
+
+
+def half_empty(detail: float, share: float) -> MMPIField:
+    """A field of 256 tiles of which the first share of each plane holds something."""
+    plan = ScenePlan((make_mpi(planes=4, height=64, width=64),), None, 0.05, 1.5, detail=detail)
+    field = MMPIField(plan, shading="ray", feature_channels=8)
+    field.features.data.normal_(generator=torch.Generator().manual_seed(0))
+    field.peak[1:] = (torch.arange(64) < 64 * share).repeat(4)
+    field.crossings.fill_(1e9)
+    field.release_unused(0.5)
+    return field
+
+
+def used_bytes(field: MMPIField, optimizer: TouchedAdam) -> int:
+    """Of the tables, what belongs to them, and the moments that training the density and the features would take."""
+    buffers = [field.tiles, field.touched, field.peak, *(getattr(field, name).data for name in TABLES)]
+    for table in (field.density, field.features):
+        table.add_grad(torch.tensor([BRICK]), torch.ones(1, table.shape[1]))
+    optimizer.step()
+    moments = [optimizer.state[table]["moments"] for table in (field.density, field.features)]
+    return sum(x.nbytes for x in [*buffers, *moments])
+
+
+@pytest.mark.parametrize(("detail", "share", "factor"), [(1.0, 0.25, 1.0), (1.5, 0.25, 1.5), (8.0, 0.9, 1.0)])
+def test_texels_become_as_fine_as_rays_can_train_unless_hardly_anything_was_released(detail, share, factor):
+    field = half_empty(detail, share)
+    before = field.features.data.clone()
+    refine(field, Work(8, False), [])
+    assert field.factor == factor
+    assert (factor > 1) != torch.equal(field.features.data, before)
+
+
+@pytest.mark.parametrize("share", [0.05, 0.25, 0.5, 0.7])
+def test_texels_become_as_fine_as_fits_in_the_bytes_that_the_plan_takes_and_moments_go(share):
+    field = half_empty(64.0, share)
+    optimizer = TouchedAdam([field.density, field.features], lr=0.1)
+    used_bytes(field, optimizer)
+    refine(field, Work(8, False), [(optimizer, field.density), (optimizer, field.features)])
+    assert not optimizer.state and 1.25 <= field.factor <= 1 / share
+    budget, used = training_bytes(field.full_plan, None, Work(8, False)), used_bytes(field, optimizer)
+    assert 0.75 * budget < used <= budget
+    assert field.plan == replace(field.full_plan, mpis=(field.full_plan.mpis[0].scaled(field.factor),))
