@@ -24,7 +24,7 @@ from mmpi_ns.field.mmpi_field import ColourConfig, MMPIField
 from mmpi_ns.field.samples import metadata_of
 from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.march import MarchOptions
-from mmpi_ns.ops.trial import Shapes
+from mmpi_ns.ops.plan_shapes import Shapes
 from mmpi_ns.placement.defaults import steps_for
 from mmpi_ns.placement.rule import PlacementConfig
 from mmpi_ns.placement.split import most_pixels, place_windows

@@ -32,6 +32,7 @@ from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 
 from mmpi_ns.ops import dispatch, trial
+from mmpi_ns.ops.plan_shapes import SMALL, Shapes
 
 ARCHITECTURES = (75, 80, 86, 89, 90)
 """Turing, Ampere (A100), Ampere (RTX 30), Ada, Hopper."""
@@ -118,7 +119,7 @@ def launches_noted(noted):
         triton.runtime.JITFunction.run = run
 
 
-def all_launches(setattr, shapes=trial.SMALL):
+def all_launches(setattr, shapes=SMALL):
     """Every kernel launched as on a GPU, with the arguments of the trials.
 
     Args:
@@ -176,7 +177,7 @@ SHARED = {80: 164, 86: 100, 89: 100, 90: 228}
 REGISTERS = 65536
 BANDWIDTH = {80: 2039e9, 86: 936e9, 89: 1008e9, 90: 3350e9}
 """Bytes a second of an A100 80 GB, RTX 3090, RTX 4090 and H100 SXM (their makers' figures)."""
-SHAPES = trial.Shapes((4,), cube=False, blends=False, most_samples=300)
+SHAPES = Shapes((4,), cube=False, blends=False, most_samples=300)
 """Four MPIs, not blended, eight channels, up to 320 samples a ray."""
 
 
@@ -223,8 +224,8 @@ def page(content):
         "# What the GPU's kernels take", "",
         "From their compiled form, without a device: `PYTHONPATH=.:tests python tests/triton_compiling.py "
         f"{' '.join(n.removeprefix('sm_') for n in names)} --write docs/results/kernels.json` (Triton "
-        f"{content['made']['triton']}, the launch of each kernel with most in it, for four MPIs, not blended, eight "
-        "channels; the march and pictures of 24 planes, compositing of rays of 320 samples).", "",
+        f"{content['made']['triton']}, the launch of each kernel with the most in it, for four MPIs, not blended, "
+        "eight channels; the march and pictures of 24 planes, compositing of rays of 320 samples).", "",
         "Each cell: registers of a thread / bytes of shared memory of a program / occupancy, the share of a "
         "multiprocessor's warps that fit. Bytes are those of the arrays with an entry for each ray, sample or row, "
         "read or written once; what kernels look up in tables comes on top. The roof is the memory's bandwidth over "

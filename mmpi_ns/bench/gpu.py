@@ -20,7 +20,7 @@ from mmpi_ns.bench.checks import run_checks
 from mmpi_ns.bench.machine import processor
 from mmpi_ns.bench.trainers import JOINT, P, Scene, Steps, has_pycolmap, no_tracks, train_words
 from mmpi_ns.ops import dispatch
-from mmpi_ns.ops.trial import EVERY, SMALL, Shapes
+from mmpi_ns.ops.plan_shapes import EVERY, SMALL, Shapes
 from mmpi_ns.synthetic.catalogue import make_scene
 from mmpi_ns.synthetic.dataset import write_dataset
 

@@ -16,18 +16,16 @@ import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Generic, Literal, ParamSpec, TypeVar
+from typing import Any, Generic, Literal, ParamSpec, TypeVar
 
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from mmpi_ns.ops import build
+from mmpi_ns.ops.plan_shapes import SMALL, Shapes
 from mmpi_ns.ops.shapes import check_shapes
 from mmpi_ns.utils.errors import InputError
-
-if TYPE_CHECKING:
-    from mmpi_ns.ops.trial import Shapes
 
 Route = Literal["auto", "torch", "native"]
 Form = Literal["reference", "cpu", "gpu"]
@@ -44,8 +42,8 @@ _interpreting = False
 _faults: dict[str, str | None] = {}
 """What is known of the compiler ("C++"), of Triton, and of each operation's GPU form: None is well, else why not."""
 _trying = threading.RLock()
-_shapes: Shapes | None = None
-"""What kernels are tried with; None: two MPIs and a cube."""
+_shapes = SMALL
+"""What kernels are tried with."""
 _tries_afresh = False
 
 
@@ -255,13 +253,12 @@ def _try_kernels(name: str) -> None:
         Exception: whatever is amiss with them.
     """
     trial = importlib.import_module("mmpi_ns.ops.trial")  # which tries operations, so it comes after this one
-    shapes = _shapes or trial.SMALL
     if _interpreting:
-        return trial.run(name, "cpu", shapes)
-    record: Path = trial.record(name, shapes)
+        return trial.run(name, "cpu", _shapes)
+    record: Path = trial.record(name, _shapes)
     if _tries_afresh or not record.is_file():
         _announce()
-        trial.run(name, "cuda", shapes)
+        trial.run(name, "cuda", _shapes)
         record.parent.mkdir(parents=True, exist_ok=True)
         record.touch()
 

@@ -7,11 +7,11 @@ incompatible Triton release, driver or architecture is noticed here and not in t
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import fields, is_dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -21,8 +21,9 @@ from mmpi_ns.ops.adam import AdamConstants
 from mmpi_ns.ops.gather import Taps
 from mmpi_ns.ops.layout import SceneLayout, Tables
 from mmpi_ns.ops.march import MarchOptions, Rays
+from mmpi_ns.ops.plan_shapes import SMALL, Shapes
 from mmpi_ns.scene.geometry import Cube, Frames
-from mmpi_ns.scene.plan import CubePlan, MPIPlan, ScenePlan
+from mmpi_ns.scene.plan import CubePlan, MPIPlan
 from mmpi_ns.scene.texels import BRICK, make_grids
 
 CLOSE = 1e-3
@@ -33,45 +34,12 @@ come out either way. Of forty rays none may."""
 RAYS, ROWS = 40, 300
 MANY_RAYS = 1 << 14
 """From so many on the march takes larger blocks."""
-WIDTHS = tuple(1 << n for n in range(4, 14))
-"""Widths that compositing is compiled for."""
 DRIVER = Path("/proc/driver/nvidia/version")
 AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 class Disagreement(Exception):
     """A kernel ran and disagrees with its reference."""
-
-
-class Shapes(NamedTuple):
-    """What kernels are compiled for in a run."""
-
-    mpis: tuple[int, ...] = (2,)
-    """Numbers of MPIs of the windows."""
-    cube: bool = True
-    blends: bool = True
-    """Whether samples are blended by reliability."""
-    channels: int = 8
-    """Of the colour features of a texel; density and reliability have one."""
-    most_samples: int = 20
-    """Of a ray."""
-
-    @staticmethod
-    def of(plans: Iterable[ScenePlan], blends: bool, channels: int) -> Shapes:
-        """The shapes of a run's windows."""
-        plans = tuple(plans)
-        mpis, cube = tuple(sorted({len(p.mpis) for p in plans})), any(p.cube is not None for p in plans)
-        return Shapes(mpis, cube, blends, channels, max(p.samples_per_ray for p in plans))
-
-    @property
-    def widths(self) -> list[int]:
-        """Samples of the widest ray of batches, one number for each width that compositing is compiled for."""
-        return [5 * w // 8 for w in WIDTHS if w // 2 < max(self.most_samples, 10)]
-
-
-SMALL = Shapes()
-EVERY = (Shapes((1, 2, 5, 9, 33), most_samples=1000), Shapes((1, 4, 16, 64), cube=False, channels=9))
-"""What plans commonly need: for checks that no plan asks for."""
 
 
 def run(name: str, device: str, shapes: Shapes = SMALL) -> None:

@@ -6,11 +6,13 @@ import pytest
 from interpreting import interpreted  # noqa: F401
 
 from mmpi_ns.ops import trial
+from mmpi_ns.ops.plan_shapes import Shapes
 
 
 @pytest.mark.parametrize("name", trial.CASES)
 def test_kernels_pass_their_trial_with_the_shapes_of_large_plans(name):
     """Many heads, rays of several hundred samples, eight channels; trials of two-phase training and without it."""
-    trial.run(name, "cpu", trial.Shapes((9,), cube=name != "show_rays", most_samples=600))
-    if name != "show_rays":  # it takes what the march keeps
-        trial.run(name, "cpu", trial.Shapes((33,), cube=False, blends=False))
+    rest = name != "show_rays"  # which takes what the march keeps
+    trial.run(name, "cpu", Shapes((9,), rest, rest, most_samples=600))
+    if rest:
+        trial.run(name, "cpu", Shapes((33,), cube=False, blends=False))
