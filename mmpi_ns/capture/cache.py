@@ -49,15 +49,15 @@ class Computed(Sequence[T]):
     """Results of a function of 0 to n - 1, computed at every access, so that they take no memory."""
 
     def __init__(self, count: int, function: Callable[[int], T]) -> None:
-        self.count, self.function = count, function
+        self._length, self._function = count, function
 
     def __len__(self) -> int:
-        return self.count
+        return self._length
 
     def __getitem__(self, i: Any) -> Any:
-        if not 0 <= i < self.count:
+        if not 0 <= i < self._length:
             raise IndexError(i)
-        return self.function(i)
+        return self._function(i)
 
 
 def remembered(key: str, find: Callable[[], Arrays | Pairs], folder: Path | None = None) -> Arrays:

@@ -108,7 +108,9 @@ def arguments(values: Iterable[Any]) -> list[Any]:
 @functools.cache
 def _in_parts(name: str) -> Callable[..., None]:
     """A compiled function for all parts between bounds (``cpp/parts.h``)."""
-    return ctypes.CFUNCTYPE(None)(ctypes.c_void_p.in_dll(library(), f"{name}_in_parts").value)
+    place = ctypes.c_void_p.in_dll(library(), f"{name}_in_parts").value
+    assert place is not None
+    return ctypes.CFUNCTYPE(None)(place)
 
 
 def run_in_parts(name: str, bounds: Sequence[int], before: Iterable[Any], after: Iterable[Any]) -> None:
