@@ -99,7 +99,7 @@ def masked_shares(data: Path, downscale_factor: int) -> Row:
     return row
 
 
-def mean_of(masks: list[NDArray[np.bool_]]) -> float:
+def mean_of(masks: Sequence[NDArray[np.bool_]]) -> float:
     """Share of all pixels."""
     return sum(int(mask.sum()) for mask in masks) / sum(mask.size for mask in masks)
 

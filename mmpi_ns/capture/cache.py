@@ -48,16 +48,16 @@ def digest(files: Iterable[Path], *parts: object) -> str:
 class Computed(Sequence[T]):
     """Results of a function of 0 to n - 1, computed at every access, so that they take no memory."""
 
-    def __init__(self, length: int, function: Callable[[int], T]) -> None:
-        self.length, self.function = length, function
+    def __init__(self, count: int, function: Callable[[int], T]) -> None:
+        self._length, self._function = count, function
 
     def __len__(self) -> int:
-        return self.length
+        return self._length
 
     def __getitem__(self, i: Any) -> Any:
-        if not 0 <= i < self.length:
+        if not 0 <= i < self._length:
             raise IndexError(i)
-        return self.function(i)
+        return self._function(i)
 
 
 def remembered(key: str, find: Callable[[], Arrays | Pairs], folder: Path | None = None) -> Arrays:

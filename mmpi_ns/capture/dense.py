@@ -27,6 +27,7 @@ from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 from mmpi_ns.capture.tracks import PosedImages
 from mmpi_ns.capture.views import Map, View, camera_matrix, load_view, look_up, pixel_grid
 from mmpi_ns.scene.near_views import nearest_views
+from mmpi_ns.utils.host import give_back_freed_memory
 from mmpi_ns.utils.parallel import num_threads, one_thread_each
 
 T = TypeVar("T")
@@ -67,6 +68,8 @@ MAX_RELATIVE = 0.15
 """Depths with a larger relative error are discarded."""
 PRIOR_ERROR = 0.5
 """Relative error of the initial rough depths, against which measured ones are weighted."""
+TRIMMED = 8
+"""Images after which memory that is free goes back: each thread keeps its own, in pieces."""
 STRIP = 2**16
 """Pixels that are worked on at once: their numbers stay in a core's cache."""
 
@@ -288,6 +291,8 @@ def find_depths(
             )
 
         for n, result in enumerate(progress(work(), 2 * len(numbers))):
+            if n % TRIMMED == 0:
+                give_back_freed_memory()
             if n >= len(numbers):
                 yield result
 

@@ -32,6 +32,7 @@ from mmpi_ns.capture.tracks import PosedImages, at_full_size
 from mmpi_ns.capture.views import View, camera_matrix, look_up
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.utils.errors import duration, say
+from mmpi_ns.utils.host import give_back_freed_memory
 from mmpi_ns.utils.parallel import in_order, num_threads
 
 Map = NDArray[np.float32]
@@ -143,7 +144,9 @@ def know_depths(
     if files:
         unit = outputs.metadata.get("depth_unit_scale_factor", 1.0) * outputs.dataparser_scale
         known = with_sensor(known, [Path(f) for f in files], float(unit), original, posed)
-    return with_continued(known, posed, dataset), seen
+    known = with_continued(known, posed, dataset)
+    give_back_freed_memory()
+    return known, seen
 
 
 def _remembered_depths(original: PosedImages, posed: PosedImages, observations: Observations) -> KnownDepth:

@@ -112,7 +112,8 @@ def arguments(values: Iterable[Any]) -> list[Any]:
 @functools.cache
 def _in_parts(name: str) -> Callable[..., None]:
     """A compiled function for all parts between bounds (``cpp/parts.h``)."""
-    place: Any = ctypes.c_void_p.in_dll(library(), f"{name}_in_parts").value
+    place = ctypes.c_void_p.in_dll(library(), f"{name}_in_parts").value
+    assert place is not None
     return ctypes.CFUNCTYPE(None)(place)
 
 
