@@ -13,6 +13,7 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 from tiny_scene import write_colmap
 
 from mmpi_ns.capture import observe as mmpi_observations
+from mmpi_ns.capture.checks import say_once
 from mmpi_ns.capture.observe import (
     ENOUGH_KEYPOINTS,
     drop_masked,
@@ -171,6 +172,7 @@ def test_a_point_cloud_waits_for_depths_and_gives_way_to_tracks(tmp_path, monkey
     )
     monkeypatch.setattr(mmpi_observations, "find_sfm_model", lambda folder: tracks)
     monkeypatch.setattr(mmpi_observations, "drop_masked", lambda found, data: found)
+    say_once.cache_clear()
     found = observe(outputs, data, none, find_points=True, triangulates=True)
     assert found.loose is None and len(found.points) == 1
     assert "Point cloud: not used" in capsys.readouterr().out
