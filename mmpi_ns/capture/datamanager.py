@@ -23,7 +23,7 @@ from torch import Tensor
 from mmpi_ns.capture.checks import check_parser, check_transforms, say_once
 from mmpi_ns.capture.dataset import MMPIDataset
 from mmpi_ns.capture.exif import light_of
-from mmpi_ns.capture.known_depth import KnownDepth, know_depths, with_known_depths
+from mmpi_ns.capture.known_depth import KnownDepth, know_depths, of_cells
 from mmpi_ns.capture.local_origin import take_local_origins
 from mmpi_ns.capture.moving import moving_masks
 from mmpi_ns.capture.new_views import SharedPoints, find_shared_points, image_and_mask
@@ -121,15 +121,13 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         if self.test_mode == "val":  # elsewhere the plan comes from a checkpoint
             if self.config.mask_moving and self.config.dense_depth and not dataset.has_masks:
                 self._mask_moving(dataset)
-            tracks = self.observations
             known, self.observations = know_depths(
-                self.train_dataparser_outputs, tracks, dataset,
+                self.train_dataparser_outputs, self.observations, dataset,
                 dense=self.config.dense_depth, sensor=self.config.depth_images,
             )  # fmt: skip
             self.known_depth = known
-            # Of a cloud, placement gets what is in ``known``: one depth of each cell, however dense the cloud is.
-            seen = tracks if known is None else with_known_depths(tracks, known, dataset)
-            dataset.metadata[OBSERVATIONS] = seen
+            seen = self.observations
+            dataset.metadata[OBSERVATIONS] = seen if known is None else of_cells(seen, known, dataset)
             has_keypoints = self.config.keypoint_rays > 0 and len(self.observations.seen_at) > 0
             if not has_keypoints and (known is None or known.share == 0):
                 CONSOLE.print(
