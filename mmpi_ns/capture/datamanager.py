@@ -22,7 +22,7 @@ from mmpi_ns.capture.ahead import DrawnAhead
 from mmpi_ns.capture.checks import check_parser, check_transforms, say_once
 from mmpi_ns.capture.dataset import MMPIDataset
 from mmpi_ns.capture.exif import light_of
-from mmpi_ns.capture.known_depth import KnownDepth, know_depths, with_known_depths
+from mmpi_ns.capture.known_depth import KnownDepth, know_depths, of_cells
 from mmpi_ns.capture.local_origin import take_local_origins
 from mmpi_ns.capture.moving import moving_masks
 from mmpi_ns.capture.new_views import find_shared_points, image_and_mask
@@ -129,14 +129,12 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
                     )
                 else:
                     say("Nothing is seen to move in the training images.")
-            tracks = self.observations
             depths, self.observations = know_depths(
-                self.train_dataparser_outputs, tracks, dataset,
+                self.train_dataparser_outputs, self.observations, dataset,
                 dense=self.config.dense_depth, sensor=self.config.depth_images,
             )  # fmt: skip
-            self.known_depth = depths
-            # Of a cloud, placement gets one depth of each cell, however dense the cloud is.
-            dataset.metadata[OBSERVATIONS] = tracks if depths is None else with_known_depths(tracks, depths, dataset)
+            self.known_depth, seen = depths, self.observations
+            dataset.metadata[OBSERVATIONS] = seen if depths is None else of_cells(seen, depths, dataset)
             has_keypoints = self.config.keypoint_rays > 0 and len(self.observations.seen_at) > 0
             if not has_keypoints and (depths is None or depths.share == 0):
                 say("No depths are known, from tracks, matches or a sensor: geometry is learned from colours alone.")

@@ -312,13 +312,13 @@ def _continued_codes(codes: Codes, i: int, posed: PosedImages, dataset: MMPIData
     return codes
 
 
-def with_known_depths(observations: Observations, known: KnownDepth, dataset: MMPIDataset) -> Observations:
-    """Adds depths to the observations for placement: the most certain pixel of each image cell.
+def of_cells(observations: Observations, known: KnownDepth, dataset: MMPIDataset) -> Observations:
+    """The observations that placement weighs: of each image cell the pixel with the most certain depth.
 
-    Each cell counts once, however many SfM points or matches lie in it. These observations have no track and come
-    after the keypoints.
+    Each cell counts once, however many keypoints or matches lie in it. Keypoints are among the known depths, so a cell
+    with one has a depth. Where no depth is known at all, the observations stay as they are.
     """
-    seen_by, points = [observations.seen_by[:0]], [observations.points[:0]]
+    seen_by, points = [], []
     for i in range(len(known.codes)):
         depth = known.image(i)
         rows, columns = best_of_cells(depth)
@@ -328,14 +328,11 @@ def with_known_depths(observations: Observations, known: KnownDepth, dataset: MM
         rays = dataset.cameras.generate_rays(torch.full((len(rows), 1), i), coords=coords)
         seen_by.append(np.full(len(rows), i))
         points.append(observations.centers[i] + rays.directions.double().numpy() / depth[rows, columns, :1])
-    count = len(observations.points)
-    added = np.concatenate(points)
-    return replace(
-        observations,
-        points=np.concatenate([observations.points, added]),
-        seen_by=np.concatenate([observations.seen_by, *seen_by]),
-        seen_point=np.concatenate([observations.seen_point, count + np.arange(len(added))]),
-    )
+    if not points:
+        return observations
+    cells = np.concatenate(points)
+    numbers, at = np.arange(len(cells)), observations.seen_at[:0]
+    return replace(observations, points=cells, seen_by=np.concatenate(seen_by), seen_point=numbers, seen_at=at)
 
 
 def best_of_cells(depth: Map) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -15,9 +15,10 @@ from PIL import Image
 from tiny_scene import HEIGHT, TEST, TRAIN, WIDTH, color_of, image_of, name_of, project, wall_points, write_scene
 from training_runs import datamanager, in_capture_frame, plan_of
 
-from mmpi_ns.capture import rays
+from mmpi_ns.capture import known_depth, rays
 from mmpi_ns.capture.checks import say_once
 from mmpi_ns.capture.datamanager import OBSERVATIONS
+from mmpi_ns.capture.known_depth import UNKNOWN, KnownDepth
 from mmpi_ns.capture.ray_sources import KEYPOINT_DEPTH, OWN_PIXEL, PIXEL_DEPTH
 from mmpi_ns.capture.rays import LensRays, PinholeRays
 from mmpi_ns.capture.sfm import MIN_TRACK
@@ -131,8 +132,6 @@ def test_transparency_reaches_the_batch(tmp_path):
 
 def test_keypoints_are_those_of_training_images_and_lie_on_the_wall(manager):
     observations = manager.observations
-    placed = manager.train_dataset.metadata[OBSERVATIONS]
-    assert np.array_equal(placed.seen_at, observations.seen_at), "what is matched densely comes after the keypoints"
     wall = wall_in_scene_units(manager)
     assert len(observations.points) == TRACKED.sum() > 20
     gaps = np.linalg.norm(observations.points[:, None] - wall[TRACKED][None], axis=-1)
@@ -143,6 +142,29 @@ def test_keypoints_are_those_of_training_images_and_lie_on_the_wall(manager):
     for camera, point, at in zip(observations.seen_by, observations.seen_point, observations.seen_at, strict=True):
         pixels, _ = project(TRAIN[camera], wall_points()[TRACKED])
         assert np.abs(pixels[row[point]] - at).max() < 1e-6
+
+
+def test_placement_weighs_every_cell_of_an_image_once_however_many_keypoints_lie_in_it(manager, monkeypatch):
+    assert (
+        len(manager.train_dataset.metadata[OBSERVATIONS].seen_by)
+        == (np.stack(manager.known_depth.codes)[..., 0] > UNKNOWN).sum()
+    )
+    monkeypatch.setattr(known_depth, "CELLS", 4)  # of 8 x 8 pixels
+    placed = known_depth.of_cells(manager.observations, manager.known_depth, manager.train_dataset)
+    expected = []
+    for i in range(6):
+        inverse, error = np.moveaxis(manager.known_depth.image(i), -1, 0)
+        for row, column in np.ndindex(3, 4):
+            part = slice(8 * row, 8 * row + 8), slice(8 * column, 8 * column + 8)
+            known = inverse[part] > 0
+            if known.any():
+                best = (error[part][known] / inverse[part][known]).argmin()
+                expected.append((i, 1 / inverse[part][known][best]))
+    distances = np.linalg.norm(placed.points[placed.seen_point] - placed.centers[placed.seen_by], axis=-1)
+    assert len(expected) > 30 and len(placed.seen_at) == 0
+    assert np.allclose(np.stack([placed.seen_by, distances], -1), expected, rtol=1e-5)
+    nothing = KnownDepth.nothing(manager.observations.sizes)
+    assert known_depth.of_cells(manager.observations, nothing, manager.train_dataset) is manager.observations
 
 
 def test_a_keypoint_ray_ends_on_its_point_at_the_known_distance(manager):

@@ -179,6 +179,7 @@ def test_a_point_cloud_waits_for_depths_and_gives_way_to_tracks(tmp_path, monkey
     tracks = SfmModel(np.array([[0.0, 0, -3]]), names, np.arange(2), seen_point, np.full((2, 2), 0.5))
     monkeypatch.setattr(mmpi_observations, "find_sfm_model", lambda folder: tracks)
     monkeypatch.setattr(mmpi_observations, "drop_masked", lambda found, data: found)
+    say_once.cache_clear()
     found = observe(outputs, data, none, find_points=True, triangulates=True)
     assert found.loose is None and len(found.points) == 1
     assert "Point cloud: not used" in capsys.readouterr().out
