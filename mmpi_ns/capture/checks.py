@@ -71,7 +71,7 @@ def check_transforms(parser: NerfstudioDataParserConfig, data: Path, splits: Seq
     poses = np.stack([_pose(frame, path) for frame in frames])
     _check_whole_file(meta, path)
     check_lenses(meta, frames, path)
-    _check_same_for_all(frames, path)
+    _check_depth_files(frames, path)
     _check_splits(meta, frames, splits, path, by_name=(parser.downscale_factor or 1) > 1)
     _check_names(parser, meta, frames, path)
     if opens:
@@ -188,12 +188,13 @@ def _check_names(parser: NerfstudioDataParserConfig, meta: Mapping[str, Any], fr
             )
 
 
-def _check_same_for_all(frames: Frames, path: Path) -> None:
-    for key in ("mask_path", "depth_file_path"):
-        having = [key in frame for frame in frames]
-        if any(having) and not all(having):
-            name = cut(frames[having.index(False)]["file_path"])
-            raise InputError(f"Frame {name} of {path} has no {key} and others have one: give all frames one, or none.")
+def _check_depth_files(frames: Frames, path: Path) -> None:
+    having = ["depth_file_path" in frame for frame in frames]
+    if any(having) and not all(having):
+        name = cut(frames[having.index(False)]["file_path"])
+        raise InputError(
+            f"Frame {name} of {path} has no depth_file_path and others have one: give all frames one, or none."
+        )
 
 
 def _check_splits(meta: Mapping[str, Any], frames: Frames, splits: Sequence[str], path: Path, *, by_name: bool) -> None:

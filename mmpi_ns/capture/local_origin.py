@@ -15,6 +15,7 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio
 from torch import Tensor
 
 from mmpi_ns.capture.checks import say_once
+from mmpi_ns.capture.dataset import NO_MASK
 from mmpi_ns.capture.point_cloud import parser_points
 from mmpi_ns.capture.sfm import model_errors
 from mmpi_ns.capture.sfm_files import check_model_files
@@ -75,6 +76,9 @@ class LocalNerfstudio(Nerfstudio):
     def _generate_dataparser_outputs(self, split: str = "train") -> DataparserOutputs:
         def subtract(meta: dict[str, Any], path: Path) -> None:
             self._origin = LocalOrigin(meta, path)
+            if any("mask_path" in frame for frame in meta["frames"]):
+                for frame in meta["frames"]:
+                    frame.setdefault("mask_path", NO_MASK)
 
         with transforms_changed(nerfstudio_dataparser, subtract):
             outputs = super()._generate_dataparser_outputs(split)

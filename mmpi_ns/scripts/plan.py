@@ -33,7 +33,8 @@ class PlanCommand:
     scene: tyro.conf.Positional[Path]
     """Folder with transforms.json, or with images and a COLMAP model."""
     output: Path
-    """Folder for plan.json, plan.md, plan.png and errors.png (for a long capture, also of each window)."""
+    """Folder for plan.json, plan.md, plan.png and errors.png (for a long capture, also of each window), and moving.jpg
+    where anything moves."""
     method: Literal["mmpi", "mmpi-small"] = "mmpi-small"
     """Method whose defaults are used."""
     downscale_factor: int | None = None
@@ -63,7 +64,9 @@ class PlanCommand:
         if self.plan_file is not None:  # report an error in it before the images are read
             WindowedPlan.load(self.plan_file)
         _check_not_edited(self.output / "plan.json")
-        observations = load_observations(self.scene, self.downscale_factor, self.parser)
+        picture = self.output / "moving.jpg"
+        picture.unlink(missing_ok=True)
+        observations, moves = load_observations(self.scene, self.downscale_factor, self.parser, picture)
         if self.plan_file is not None:
             windows = WindowedPlan.load(self.plan_file)
         else:
@@ -73,6 +76,8 @@ class PlanCommand:
                 rays = steps * DEFAULTS[self.method].rays
             windows = place_windows(observations, self.placement, rays or None)
         text = self._explain(windows, observations)
+        if moves:
+            text += f"\n\n{moves}{': moving.jpg shows it' if picture.is_file() else ''}."
         title = f"# Plan of {self.scene.resolve().name}"
         (self.output / "plan.json").write_text(windows.to_json(), encoding="utf-8")
         mark = _mark(self.output / "plan.json")
