@@ -60,7 +60,7 @@ FOLDS = 5
 AGREEMENT = 0.8
 """Gains are used if they lower the median error of pairs that were left out to less than this fraction,"""
 SPAN, SPAN_ERRORS = 0.03, 6.0
-"""and if 20 % of the pairs of images that show the same differ by this log gain, and by this many of its errors."""
+"""and if 80 % of the log gains span at least this, and this many of their errors."""
 SAME_LIGHT = 0.03
 """Range of log exposures in EXIF within which they are equal."""
 ROUNDS = 20
@@ -94,11 +94,8 @@ class Gains:
 
     factors: Float[ndarray, "N 3"]
     """Colour in the image over colour at the reference exposure, each channel's geometric mean 1."""
-    pairs: Int[ndarray, "P 2"]
-    """Numbers of the images that show the same,"""
-    errors: Float[ndarray, "P"]
-    """and the expected errors of the differences of their log factors. Those of the factors themselves are larger, as
-    errors add up from image to image; but no surface is seen across them."""
+    errors: Float[ndarray, "N"]
+    """Expected errors of their logarithms."""
     falloff: Float[ndarray, "2 3"]
     """Log colour per r^2 and r^4, towards the corners."""
     disagreement: float
@@ -131,8 +128,8 @@ class Gains:
     @property
     def matter(self) -> bool:
         """Whether images differ by more than errors explain, and held-out pairs confirm the gains."""
-        first, second = np.log(self.factors[self.pairs.T, 1])
-        wide = np.quantile(np.abs(second - first), 0.8) > max(SPAN, SPAN_ERRORS * float(np.median(self.errors)))
+        spread = np.log(self.span)
+        wide = spread > max(SPAN, SPAN_ERRORS * float(np.median(self.errors)))
         return bool(wide and self.corrected < AGREEMENT * self.disagreement)
 
 
@@ -267,8 +264,8 @@ def color_ratios(
 
 def solve(
     ratios: ColorRatios, count: int, exposures: Float[ndarray, "N"] | None = None, *, gains: bool = True
-) -> tuple[Float[ndarray, "N 3"], Float[ndarray, "N N"], Float[ndarray, "2 3"]]:
-    """Log gains of ``count`` images, their covariance, and the fall-off towards the corners, by robust least squares.
+) -> tuple[Float[ndarray, "N 3"], Float[ndarray, "N"], Float[ndarray, "2 3"]]:
+    """Log gains of ``count`` images, their errors, and the fall-off towards the corners, by robust least squares.
 
     Args:
         ratios: colours of pairs of images.
@@ -307,7 +304,7 @@ def solve(
     # Without the error of the mean, which no ratio determines and no image needs.
     center = np.eye(count) - 1 / count
     covariance = center @ np.linalg.inv(normal)[:count, :count] @ center
-    return logs, covariance * scale**2, solution[count : count + 2]
+    return logs, np.sqrt(np.maximum(np.diag(covariance), 0)) * scale, solution[count : count + 2]
 
 
 def exposure_of_view(
@@ -353,10 +350,6 @@ def image_gains(ratios: ColorRatios, count: int, exposures: Float[ndarray, "N"] 
         for gains, errors in left.items():
             logs, _, falloff = solve(ratios.some(fold != held_out), count, exposures, gains=gains)
             errors.append(np.abs(residuals(ratios.some(fold == held_out), logs, falloff)).ravel())
-    logs, covariance, falloff = solve(ratios, count, exposures)
-    images = np.stack(np.divmod(np.unique(pairs), count), -1)
-    first, second = images.T
-    variances = np.diag(covariance)[first] + np.diag(covariance)[second] - 2 * covariance[first, second]
-    errors = np.sqrt(np.maximum(variances, 0))
+    logs, errors, falloff = solve(ratios, count, exposures)
     without, corrected = (float(np.median(np.concatenate(left[gains]))) for gains in (False, True))
-    return Gains(np.exp(logs), images, errors, falloff, without, corrected)
+    return Gains(np.exp(logs), errors, falloff, without, corrected)

@@ -34,8 +34,7 @@ def wandering(count=12, seed=1):
 
 def test_known_gains_are_recovered_within_their_errors():
     truth = wandering()
-    logs, covariance, _ = solve(drive(truth), 12)
-    errors = np.sqrt(np.diag(covariance))
+    logs, errors, _ = solve(drive(truth), 12)
     assert np.abs(logs - truth).max() < 0.03
     assert (np.abs(logs[:, 1] - truth[:, 1]) < 4 * errors).all()
 
@@ -99,8 +98,7 @@ def test_unknown_exposures_of_some_images_change_nothing_else():
 
 def test_an_image_without_matches_keeps_the_mean_exposure():
     truth = wandering(11)
-    logs, covariance, _ = solve(drive(truth), 12)
-    errors = np.sqrt(np.diag(covariance))
+    logs, errors, _ = solve(drive(truth), 12)
     assert np.abs(logs[11]).max() < 1e-9
     assert errors[11] > 5 * np.median(errors)
 
@@ -125,26 +123,10 @@ def test_clipped_windows_and_borders_are_left_out():
 
 def test_span_and_decision_follow_from_factors():
     factors = np.exp(np.linspace(-0.2, 0.2, 11))[:, None].repeat(3, 1)
-    every = np.stack([np.arange(10), np.arange(1, 11)], -1)  # neighbours differ by 0.04
-    sure = np.full(10, 0.005)
-    assert Gains(factors, every, sure, FLAT, 0.1, 0.02).span == pytest.approx(np.exp(0.32))
-    assert Gains(factors, every, sure, FLAT, 0.1, 0.02).matter
-    assert not Gains(factors, every, 2 * sure, FLAT, 0.1, 0.02).matter
-    assert not Gains(factors, every, sure, FLAT, 0.1, 0.09).matter
-    assert not Gains(factors**0.5, every, sure, FLAT, 0.1, 0.02).matter
-
-
-def test_errors_of_differences_do_not_grow_along_a_path():
-    """A chain of images, each tied to the next alone, knows its steps better than its ends."""
-    logs = np.random.default_rng(0).normal(0, 0.2, (60, 3))
-    first = np.arange(59).repeat(4)
-    flat = np.random.default_rng(1).normal(0, 0.3, (len(first), 2))
-    ratios = ColorRatios(first, first + 1, logs[first + 1] - logs[first], np.full(len(first), 0.06), flat)
-    covariance = solve(ratios, 60)[1]
-    gains = image_gains(ratios, 60)
-    assert gains.pairs.tolist() == [[i, i + 1] for i in range(59)]
-    np.testing.assert_allclose(gains.errors, 0.03, rtol=0.2)
-    assert np.sqrt(covariance[0, 0]) > 3 * gains.errors.max()
+    assert Gains(factors, np.full(11, 0.01), FLAT, 0.1, 0.02).span == pytest.approx(np.exp(0.32))
+    assert Gains(factors, np.full(11, 0.01), FLAT, 0.1, 0.02).matter
+    assert not Gains(factors, np.full(11, 0.1), FLAT, 0.1, 0.02).matter
+    assert not Gains(factors, np.full(11, 0.01), FLAT, 0.1, 0.09).matter
 
 
 def test_falloff_is_taken_out_of_an_uncalibrated_image(monkeypatch):
