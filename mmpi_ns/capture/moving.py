@@ -21,8 +21,7 @@ from mmpi_ns.capture.dataset import MMPIDataset
 from mmpi_ns.capture.dense import Depth, Parallax, Progress, find_depths
 from mmpi_ns.capture.known_depth import straightened
 from mmpi_ns.capture.moving_evidence import Bytes, Mask, Shot, evidence, ground_of, has_impossible_depth
-from mmpi_ns.capture.moving_flow import floats, moves_apart
-from mmpi_ns.capture.moving_objects import followed, grown, is_static, seeds, solid
+from mmpi_ns.capture.moving_objects import followed, grown, seeds
 from mmpi_ns.capture.observe import posed_images
 from mmpi_ns.capture.originals import at_full_size
 from mmpi_ns.capture.tracks import PosedImages
@@ -39,11 +38,9 @@ MAX_ANGLE = 40.0
 """Degrees between the facing directions of images that are compared."""
 AFTER = 2
 """Nearest neighbours from which objects are followed."""
-NEAR = 15
-"""Pixels across which weaker evidence around a mover counts."""
 EDGE = 0.4
 """Share of a mover around a pixel from which it is masked."""
-VERSION = 3
+VERSION = 2
 """Version of the algorithm: cached masks of another version are found anew."""
 ENOUGH = 200
 """Pixels of one depth in both images from which their exposures are compared."""
@@ -175,35 +172,20 @@ def at_exposure_of(shot: Shot, other: Shot) -> Bytes:
     return np.rint(other.color * gain).clip(0, 255).astype(np.uint8)
 
 
-@dataclass(frozen=True)
-class _Clues:
-    """What does not depend on what moves in the neighbours. [h, w] each"""
-
-    impossible: Mask
-    """Where an impossible depth explains the image."""
-    apart: Mask
-    """Where matches lie below the ground."""
-    floats: Mask
-    """Where a thing hangs in the air."""
-
-
 def _moves(
-    shots: Sequence[Shot], near: Sequence[int], i: int, masks: Sequence[Mask], clues: _Clues | None
-) -> tuple[Mask, _Clues]:
-    """What moves in an image, where it is known what moves in others, and the clues of an earlier pass."""
+    shots: Sequence[Shot], near: Sequence[int], i: int, masks: Sequence[Mask], impossible: Mask | None
+) -> tuple[Mask, Mask]:
+    """What moves in an image, where it is known what moves in others, and where it has impossible depths."""
     shot, others = shots[i], [shots[j] for j in near]
     colors = [at_exposure_of(shot, other) for other in others]
-    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
-    if clues is None:
+    if impossible is None:
         impossible = has_impossible_depth(shot, others, colors)
-        clues = _Clues(impossible, moves_apart(shot, others, flow), floats(shot, others))
-    shown = evidence(shot, others, colors, [masks[j] for j in near], clues.impossible)
-    apart = clues.apart & ~is_static(shot, shown)
-    core = solid(apart) | clues.floats
+    shown = evidence(shot, others, colors, [masks[j] for j in near], impossible)
+    core = np.zeros(shot.view.gray.shape, bool)
     if len(others) >= 2:
         core |= seeds(shot, others, colors, shown)
+        flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
         for j in near[:AFTER]:
             if masks[j].any():
                 core |= followed(shot, shots[j], masks[j], flow)
-    core |= apart & (cv2.dilate(core.astype(np.uint8), np.ones((NEAR, NEAR), np.uint8)) > 0)
-    return grown(shot, shown, core), clues
+    return grown(shot, shown, core), impossible
