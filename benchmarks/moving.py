@@ -83,7 +83,7 @@ def masked_shares(data: Path, downscale_factor: int) -> Row:
     """Shares of a capture's training pixels that are masked, and of what moves and stands where that is known."""
     config: Any = copy.deepcopy(mmpi_small.config.pipeline.datamanager)
     config.data, config.new_view_share, config.correct_exposure = data, 0.0, False
-    config.dense_depth = config.depth_images = False
+    config.dense_depth = config.depth_images = config.mask_moving = False
     config.dataparser.downscale_factor = downscale_factor
     manager = config.setup(device="cpu", test_mode="val")
     dataset, start = manager.train_dataset, time.process_time()

@@ -60,7 +60,7 @@ class Processes(Bench):
     def _plan(self) -> int:
         """Places MPIs for the steps of the longer run; returns how many windows there are."""
         settings: Any = mmpi_small.config.pipeline
-        observations = load_observations(self.data, downscale_factor=self.downscale_factor)
+        observations = load_observations(self.data, downscale_factor=self.downscale_factor)[0]
         rays = self.steps * settings.datamanager.train_num_rays_per_batch
         plan = place_windows(observations, settings.model.placement, rays)
         if len(plan) < self.processes:

@@ -114,7 +114,7 @@ def draw_budgets(path: Path, rows: dict[str, Row]) -> None:
 
 @functools.cache
 def _observations(data: Path, downscale_factor: int):
-    return load_observations(data, downscale_factor)
+    return load_observations(data, downscale_factor)[0]
 
 
 def steps_of(run: Path) -> int:

@@ -88,7 +88,7 @@ def plan_road(request: dict[str, Any], tell: Tell) -> Row:
     folder, length = Path(request["folder"]), request["length"]
     data, scene = folder / "data", catalogue.make_scene("long-road", length=length)
     write_dataset(scene, data, max(4000, 4 * round(length)), images=False, overwrite=True)
-    observations = load_observations(data, downscale_factor=1)
+    observations = load_observations(data, downscale_factor=1)[0]
     config = _config(folder, request["steps"]).pipeline.model.placement
     start = time.perf_counter()
     plan = place_windows(observations, config, request["steps"] * RAYS)

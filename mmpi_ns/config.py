@@ -26,6 +26,7 @@ PAPER_DATA = {
     "keypoint_rays": 0,
     "dense_depth": False,
     "depth_images": False,
+    "mask_moving": False,
     "new_view_share": 0.0,
     "correct_exposure": False,
 }

@@ -24,7 +24,7 @@ from mmpi_ns.capture.dataset import MMPIDataset
 from mmpi_ns.capture.exif import light_of
 from mmpi_ns.capture.known_depth import KnownDepth, know_depths, of_cells
 from mmpi_ns.capture.local_origin import take_local_origins
-from mmpi_ns.capture.moving import moving_masks
+from mmpi_ns.capture.moving import moving_masks, share_of_moving
 from mmpi_ns.capture.new_views import find_shared_points, image_and_mask
 from mmpi_ns.capture.observe import drop_masked, observe, posed_images, sfm_folder
 from mmpi_ns.capture.photometry import SAME_LIGHT, Gains, color_ratios, image_gains
@@ -68,7 +68,7 @@ class MMPIDataManagerConfig(VanillaDataManagerConfig):
     depth_images: bool = True
     """Use the depth images that a data parser lists (depth_file_path)."""
     mask_moving: bool = True
-    """Mask what moves in the training images (cars, people) where no masks are given: its pixels are not trained on."""
+    """Mask what moves (cars, people) in the training images that have no mask: its pixels are not trained on."""
     new_view_share: float = 0.75
     """Rays of new views for each pixel ray: from between two training cameras to points that both show at the same
     known depth (0: none)."""
@@ -91,6 +91,8 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
     def __init__(self, config: MMPIDataManagerConfig, **kwargs: Any) -> None:
         self.known_depth: KnownDepth | None = None
         self.gains: Gains | None = None
+        self.moves = ""
+        """How much of the training images moves, in a sentence; empty where nobody looked."""
         self.rays_share = 1.0
         """Share of a step's rays that are drawn; the schedule sets it."""
         self.sources: RaySources | None = None
@@ -116,19 +118,8 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         dataset.metadata[RAYS_PER_STEP] = self.config.train_num_rays_per_batch
         dataset.metadata[TRAINING_VIEWS] = TrainingViews.of(dataset.cameras)
         if self.test_mode == "val":  # elsewhere the plan comes from a checkpoint
-            if self.config.mask_moving and self.config.dense_depth and not dataset.has_masks:
-                masks = moving_masks(self.observations, dataset)
-                shares = np.array([mask.mean() for mask in masks])
-                if shares.any():
-                    dataset.moving = masks
-                    self.observations = drop_masked(self.observations, dataset)
-                    say(
-                        f"{100 * shares.mean():.1f} % of the training pixels, in {np.count_nonzero(shares)} of "
-                        f"{len(masks)} images, show what moves and are masked (--pipeline.datamanager.mask-moving "
-                        "False keeps them)."
-                    )
-                else:
-                    say("Nothing is seen to move in the training images.")
+            if self.config.mask_moving and None in dataset.mask_files:
+                self._mask_moving(dataset)
             depths, self.observations = know_depths(
                 self.train_dataparser_outputs, self.observations, dataset,
                 dense=self.config.dense_depth, sensor=self.config.depth_images,
@@ -139,6 +130,19 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
             if not has_keypoints and (depths is None or depths.share == 0):
                 say("No depths are known, from tracks, matches or a sensor: geometry is learned from colours alone.")
         return dataset
+
+    def _mask_moving(self, dataset: MMPIDataset) -> None:
+        """Masks what moves in the training images, and says how much it is."""
+        masks = moving_masks(self.observations, dataset)
+        # Masks of the user win.
+        masks = [m & (file is None) for m, file in zip(masks, dataset.mask_files, strict=True)]
+        self.moves = share_of_moving(masks)
+        if not any(mask.any() for mask in masks):
+            say(f"{self.moves}.")
+            return
+        say(f"{self.moves} (--pipeline.datamanager.mask-moving False keeps them).")
+        dataset.moving = masks
+        self.observations = drop_masked(self.observations, dataset)
 
     @cached_property
     def observations(self) -> Observations:

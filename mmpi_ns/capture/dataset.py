@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
@@ -11,9 +12,11 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.datasets.base_dataset import InputDataset
+from nerfstudio.data.utils.data_utils import get_image_mask_tensor_from_path
 from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
@@ -24,6 +27,8 @@ from mmpi_ns.utils.errors import InputError, brief
 UNREADABLE = (OSError, SyntaxError, ValueError, AssertionError, EOFError, Image.DecompressionBombError)
 SIXTEEN_BIT = ("I", "I;16", "I;16B", "I;16L", "I;16N")
 """Pillow's modes of gray images with up to 16 bits a pixel."""
+NO_MASK = "no mask"
+"""Name of the mask file of a frame that has none where others have one: nerfstudio's parser knows all or none."""
 
 
 class UnusableFile(InputError):
@@ -43,11 +48,17 @@ class MMPIDataset(InputDataset):
         return False
 
     moving: Sequence[NDArray[np.bool_]] | None = None
-    """Masks of what moves in each image [H, W], used if no mask files are given."""
+    """Masks of what moves in each image [H, W], used in images that have no mask file."""
+
+    def __init__(self, dataparser_outputs: DataparserOutputs, scale_factor: float = 1.0) -> None:
+        masks = dataparser_outputs.mask_filenames or [Path(NO_MASK)] * len(dataparser_outputs.image_filenames)
+        self.mask_files = [None if file.name == NO_MASK else file for file in masks]
+        # Masks are read here: nerfstudio's data set would ask for one of each image.
+        super().__init__(replace(dataparser_outputs, mask_filenames=None), scale_factor)
 
     @property
     def has_masks(self) -> bool:
-        return self._dataparser_outputs.mask_filenames is not None or self.moving is not None
+        return self.moving is not None or any(file is not None for file in self.mask_files)
 
     def get_numpy_image(self, image_idx: int) -> NDArray[np.uint8]:
         """Image [H, W, 3 or 4]: red, green, blue, and alpha where the file has it, in 8 bits."""
@@ -74,17 +85,10 @@ class MMPIDataset(InputDataset):
         return np.array(Image.fromarray(pixels).resize(size, resample=Image.Resampling.BILINEAR))
 
     def get_data(self, image_idx: int, image_type: Literal["uint8", "float32"] = "float32") -> dict[str, Any]:
-        """The image, and its mask where there are masks."""
-        try:
-            data = super().get_data(image_idx, image_type)
-        except UnusableFile:
-            raise
-        except UNREADABLE as error:
-            masks = self._dataparser_outputs.mask_filenames
-            name = masks[image_idx] if masks is not None else self.image_filenames[image_idx]
-            raise UnusableFile(
-                f"Mask {name} cannot be used ({brief(error)}): give one channel of the image's size, white where used."
-            ) from error
+        """The image, and its mask where any image has one."""
+        data = super().get_data(image_idx, image_type)
+        if self.has_masks:
+            data["mask"] = self._mask(image_idx, data["image"].shape[:2])
         height, width = (int(n.reshape(-1)[image_idx]) for n in (self.cameras.height, self.cameras.width))
         rows, columns = data["image"].shape[:2]
         # Downscaled images may have been rounded up where cameras are rounded down: one pixel is cut off.
@@ -98,17 +102,31 @@ class MMPIDataset(InputDataset):
             depth = read_depth_image(Path(files[image_idx]), unit)
             depth = cv2.resize(depth, (columns, rows), interpolation=cv2.INTER_NEAREST_EXACT)
             data["distance"] = distances(torch.from_numpy(depth), self.cameras[image_idx : image_idx + 1])
-        if self.moving is not None and "mask" not in data:
-            data["mask"] = torch.from_numpy(~self.moving[image_idx])[..., None]
         return data | {k: data[k][:height, :width] for k in ("image", "mask", "distance") if k in data}
 
     def usable(self, image_idx: int) -> NDArray[np.bool_]:
         """Where an image is not masked. [H, W]"""
-        if self._dataparser_outputs.mask_filenames is not None:
+        if self.mask_files[image_idx] is not None:
             return self.get_data(image_idx, image_type="uint8")["mask"][..., 0].numpy().astype(bool)
         if self.moving is not None:
             return ~self.moving[image_idx]
         return np.ones([int(n.reshape(-1)[image_idx]) for n in (self.cameras.height, self.cameras.width)], bool)
+
+    def _mask(self, image_idx: int, shape: Sequence[int]) -> Bool[Tensor, "H W 1"]:
+        """Where an image may be used: its mask file, else what does not move, else everywhere."""
+        file = self.mask_files[image_idx]
+        if file is None:
+            usable = np.ones(shape, bool) if self.moving is None else ~self.moving[image_idx]
+            return torch.from_numpy(usable)[..., None]
+        try:
+            mask = get_image_mask_tensor_from_path(file, self.scale_factor)
+            if mask.shape[:2] != tuple(shape):
+                raise ValueError(f"it has {mask.shape[1]} x {mask.shape[0]} pixels")
+        except UNREADABLE as error:
+            raise UnusableFile(
+                f"Mask {file} cannot be used ({brief(error)}): give one channel of the image's size, white where used."
+            ) from error
+        return mask
 
 
 def distances(depth: Float[Tensor, "H W"], camera: Cameras) -> Float[Tensor, "H W 1"]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -13,6 +14,7 @@ from mmpi_ns.capture.checks import check_transforms
 from mmpi_ns.capture.datamanager import MMPIDataManagerConfig
 from mmpi_ns.capture.dataset import MMPIDataset
 from mmpi_ns.capture.local_origin import take_local_origins
+from mmpi_ns.capture.moving_picture import draw_moving
 from mmpi_ns.capture.observe import observe, sfm_folder
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.utils.errors import InputError
@@ -26,13 +28,16 @@ def check_there(data: Path) -> None:
         raise InputError(f"There is no scene at {data}: check the path.")
 
 
-def load_observations(data: Path, downscale_factor: int | None = None, parser: Parser = "auto") -> Observations:
-    """The observations that training on a scene would use.
+def load_observations(
+    data: Path, downscale_factor: int | None = None, parser: Parser = "auto", moving: Path | None = None
+) -> tuple[Observations, str]:
+    """The observations that training on a scene would use, and a sentence on what moves in its images.
 
     Args:
         data: the scene's folder.
         downscale_factor: size of the images, as for the data parser; None leaves it to the parser.
         parser: format of the scene; auto means nerfstudio's format if there is a transforms.json.
+        moving: file for a picture of what moves. None: nobody looks, and nothing is masked.
 
     Raises:
         InputError: the folder holds no scene, or one that cannot be trained.
@@ -56,7 +61,14 @@ def load_observations(data: Path, downscale_factor: int | None = None, parser: P
     if any(Path(name).is_file() for name in outputs.image_filenames):
         # As ns-train does, so that it refuses what ns-train would refuse; placement asks for no depths of pixels.
         config.dense_depth = config.depth_images = False
-        return config.setup(device="cpu", test_mode="val").observations
+        config.mask_moving = moving is not None
+        manager = config.setup(device="cpu", test_mode="val")
+        masks = manager.train_dataset.moving
+        if moving is not None and masks is not None:
+            names = [Path(name).name for name in outputs.image_filenames]
+            colors = (manager.train_dataset.get_data(i, "uint8")["image"][..., :3] for i in range(len(names)))
+            draw_moving(moving, zip(names, (np.flip(x.numpy(), -1) for x in colors), strict=True), masks)
+        return manager.observations, manager.moves
     CONSOLE.print(f"The images of {data} are not there: its cameras and points alone are judged.")
     folder = sfm_folder(parser_config, config.sfm_path)
-    return observe(outputs, MMPIDataset(outputs), folder, find_points=True, triangulates=config.triangulate)
+    return observe(outputs, MMPIDataset(outputs), folder, find_points=True, triangulates=config.triangulate), ""

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mmpi_ns.capture.checks import say_once
+from mmpi_ns.capture.dataset import NO_MASK
 from mmpi_ns.capture.sfm import checked_model
 from mmpi_ns.utils.errors import InputError
 from mmpi_ns.utils.host import transforms_changed
@@ -80,7 +81,12 @@ class LocalNerfstudio(Nerfstudio):
     """The parser asks no question on the terminal where ``transforms.json`` names no point cloud."""
 
     def _generate_dataparser_outputs(self, split: str = "train") -> DataparserOutputs:
-        subtract = lambda meta, path: setattr(self, "_origin", LocalOrigin(meta, path))  # noqa: E731
+        def subtract(meta: dict[str, Any], path: Path) -> None:
+            self._origin = LocalOrigin(meta, path)
+            if any("mask_path" in frame for frame in meta["frames"]):
+                for frame in meta["frames"]:
+                    frame.setdefault("mask_path", NO_MASK)
+
         with transforms_changed(nerfstudio_dataparser, subtract):
             outputs = super()._generate_dataparser_outputs(split)
         return self._origin.tell(outputs)

@@ -116,6 +116,8 @@ def moving_masks(observations: Observations, dataset: MMPIDataset) -> Sequence[M
     seen_by, points = observations.seen_by[:tracked], observations.points[observations.seen_point[:tracked]]
 
     def find() -> Arrays:
+        for i in range(len(dataset)):  # names a damaged file, of which OpenCV would print warnings first
+            dataset.get_data(i, image_type="uint8")
         CONSOLE.print(f"Looking for what moves in {len(shapes)} images.")
         shown = find_moving(
             original, lambda i: points[seen_by == i],
@@ -132,6 +134,18 @@ def moving_masks(observations: Observations, dataset: MMPIDataset) -> Sequence[M
         return np.unpackbits(np.asarray(stored[f"{i}"], np.uint8), count=height * width).reshape(height, width) > 0
 
     return Computed(len(shapes), unpacked)
+
+
+def share_of_moving(masks: Sequence[Mask]) -> str:
+    """How much of the training images moves, in one sentence."""
+    shares = np.array([mask.mean() for mask in masks])
+    if not shares.any():
+        return "Nothing is seen to move in the training images"
+    count = np.count_nonzero(shares)
+    return (
+        f"{100 * shares.mean():.1f} % of the training pixels, in {count} of {len(masks)} images, show what moves and "
+        "are masked"
+    )
 
 
 def shot_of(images: PosedImages, i: int, view: View, depth: Depth, up: NDArray[np.float64]) -> Shot:

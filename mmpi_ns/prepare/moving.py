@@ -6,23 +6,20 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pycolmap
 import torch
 from numpy.typing import NDArray
 from PIL import Image
 
-from mmpi_ns.capture.moving import MovingObjects, find_moving, in_image
+from mmpi_ns.capture.moving import find_moving, in_image
+from mmpi_ns.capture.moving_picture import draw_moving
 from mmpi_ns.capture.tracks import PosedImages
 from mmpi_ns.capture.views import straightened_color
 from mmpi_ns.prepare.alignment import camera_poses
 from mmpi_ns.prepare.cameras import read_intrinsics
 from mmpi_ns.prepare.images import Photo
 from mmpi_ns.prepare.stages import progress
-
-SHOWN, COLUMNS, WIDTH = 24, 4, 320
-"""Images in the picture, those in a row, and pixels across each."""
 
 
 def write_masks(
@@ -89,24 +86,6 @@ def write_masks(
         if mask.any():
             shares[photo.name] = float(mask.mean())
         Image.fromarray(np.where(mask, 0, 255).astype(np.uint8)).save(target / f"{photo.name}.png")
-    _draw(posed, shown, picture)
+    colors = ((entry.name, straightened_color(posed, i, shown.views[i])) for i, entry in enumerate(entries))
+    draw_moving(picture, colors, shown.masks)
     return shares
-
-
-def _draw(posed: PosedImages, shown: MovingObjects, path: Path) -> None:
-    """The images in which most is masked, in order, what is masked in red."""
-    most = sorted(range(len(shown.masks)), key=lambda i: -shown.masks[i].mean())[:SHOWN]
-    tiles = []
-    for i in sorted(i for i in most if shown.masks[i].any()):
-        color = straightened_color(posed, i, shown.views[i]).copy()
-        color[shown.masks[i]] = color[shown.masks[i]] // 2 + np.array([0, 0, 127], np.uint8)
-        height = round(WIDTH * color.shape[0] / color.shape[1])
-        tile = cv2.resize(color, (WIDTH, height), interpolation=cv2.INTER_AREA)
-        cv2.putText(tile, posed.files[i].name, (4, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (0, 255, 255), 1)
-        tiles.append(tile)
-    height = max(tile.shape[0] for tile in tiles)
-    tiles = [cv2.copyMakeBorder(t, 0, height - t.shape[0], 0, 0, cv2.BORDER_CONSTANT) for t in tiles]
-    tiles += [np.zeros_like(tiles[0])] * (-len(tiles) % COLUMNS)
-    rows = [np.hstack(tiles[k : k + COLUMNS]) for k in range(0, len(tiles), COLUMNS)]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    cv2.imwrite(str(path), np.vstack(rows))

@@ -32,7 +32,8 @@ class PlanCommand:
     scene: tyro.conf.Positional[Path]
     """Folder with transforms.json, or with images and a COLMAP model."""
     output: Path
-    """Folder for plan.json, plan.md, plan.png and errors.png (for a long capture, also of each window)."""
+    """Folder for plan.json, plan.md, plan.png and errors.png (for a long capture, also of each window), and moving.jpg
+    where anything moves."""
     method: Literal["mmpi", "mmpi-small"] = "mmpi-small"
     """Method whose defaults are used."""
     downscale_factor: int | None = None
@@ -67,7 +68,9 @@ class PlanCommand:
                 f"{plan} was edited since mmpi-plan wrote it, or is not from there: "
                 "give another --output, or remove it."
             )
-        observations = load_observations(self.scene, self.downscale_factor, self.parser)
+        picture = self.output / "moving.jpg"
+        picture.unlink(missing_ok=True)
+        observations, moves = load_observations(self.scene, self.downscale_factor, self.parser, picture)
         if windows is None:
             rays = self.training_rays
             if rays is None:
@@ -75,6 +78,8 @@ class PlanCommand:
                 rays = steps * DEFAULTS[self.method].rays
             windows = place_windows(observations, self.placement, rays or None)
         text = self._explain(windows, observations)
+        if moves:
+            text += f"\n\n{moves}{': moving.jpg shows it' if picture.is_file() else ''}."
         title = f"# Plan of {self.scene.resolve().name}"
         plan.write_text(windows.to_json(), encoding="utf-8")
         table.write_text(f"{title}\n\n{_mark(plan)}\n\n{text}\n", encoding="utf-8")

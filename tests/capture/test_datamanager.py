@@ -98,6 +98,22 @@ def test_masked_pixels_are_never_drawn(tmp_path):
     assert columns.max() == WIDTH / 2 - 1 and columns.min() == 0
 
 
+def test_frames_without_a_mask_beside_some_that_have_one_are_used_as_a_whole(tmp_path):
+    data = write_scene(tmp_path / "partly", masks=True)
+    meta = json.loads((data / "transforms.json").read_text())
+    for i in (*TRAIN[:2], TEST[0]):
+        del meta["frames"][i]["mask_path"]
+    (data / "transforms.json").write_text(json.dumps(meta))
+    manager = datamanager(data)
+    assert [file is None for file in manager.train_dataset.mask_files] == [True] * 2 + [False] * (len(TRAIN) - 2)
+    masks = [manager.train_dataset.get_data(i, "uint8")["mask"][..., 0] for i in range(len(TRAIN))]
+    assert all(mask.all() for mask in masks[:2])
+    assert all(mask[:, : WIDTH // 2].all() and not mask[:, WIDTH // 2 :].any() for mask in masks[2:])
+    assert manager.eval_dataset.get_data(0)["mask"].all()
+    drawn = torch.cat([manager.next_train(step)[1]["indices"] for step in range(30)])
+    assert drawn[drawn[:, 0] < 2, 2].max() == WIDTH - 1 and drawn[drawn[:, 0] >= 2, 2].max() == WIDTH // 2 - 1
+
+
 def test_masks_that_leave_nothing_are_refused(tmp_path):
     data = write_scene(tmp_path / "black", masks=True)
     for i in range(8):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import re
 from dataclasses import replace
 
 import cv2
@@ -10,6 +12,7 @@ import pytest
 from training_runs import datamanager
 
 from mmpi_ns.capture.dense import Depth
+from mmpi_ns.capture.load import load_observations
 from mmpi_ns.capture.moving import in_image
 from mmpi_ns.capture.moving_evidence import Shot, ground_of, nearest_known, splat
 from mmpi_ns.capture.moving_objects import followed, unexplained, without_holes
@@ -62,6 +65,37 @@ def test_masks_of_the_user_win_and_the_option_leaves_all_pixels(drive, manager):
     kept = datamanager(drive, mask_moving=False)
     assert not kept.train_dataset.has_masks
     assert kept.known_depth.share > manager.known_depth.share
+
+
+def test_masks_of_some_frames_win_and_what_moves_in_the_others_is_masked(drive, manager, tmp_path):
+    meta = json.loads((drive / "transforms.json").read_text())
+    moving = [mask.any() for mask in manager.train_dataset.moving]
+    number = moving.index(True)
+    name = manager.train_dataset.image_filenames[number].name
+    frame = next(frame for frame in meta["frames"] if frame["file_path"].endswith(name))
+    frame["mask_path"] = "by-hand.png"
+    cv2.imwrite(str(tmp_path / "by-hand.png"), np.full((180, 320), 255, np.uint8))
+    (tmp_path / "transforms.json").write_text(json.dumps(meta))
+    for entry in drive.iterdir():
+        if entry.name != "transforms.json":
+            (tmp_path / entry.name).symlink_to(entry)
+    partly = datamanager(tmp_path)
+    assert partly.train_dataset.get_data(number, "uint8")["mask"].all()
+    assert "in 7 of 8 images" in partly.moves or not all(moving)
+    for i in set(range(8)) - {number}:
+        np.testing.assert_array_equal(partly.train_dataset.moving[i], manager.train_dataset.moving[i])
+
+
+def test_the_plan_shows_what_moves(drive, manager, tmp_path):
+    _, moves = load_observations(drive, moving=tmp_path / "report" / "moving.jpg")
+    assert moves == manager.moves and re.fullmatch(r".* % of the training pixels, in \d of 8 images, show .*", moves)
+    picture = cv2.imread(str(tmp_path / "report" / "moving.jpg"))
+    assert picture.shape == (2 * 180, 4 * 320, 3)
+    original = cv2.imread(str(manager.train_dataset.image_filenames[0]))
+    redder = picture[:180, :320, 2].astype(int) - original[..., 2] > 30
+    mask = manager.train_dataset.moving[0]
+    assert redder[mask].mean() > 0.5 and redder[~mask].mean() < 0.02
+    assert load_observations(drive)[1] == ""
 
 
 def a_view(shift=0.0, gray=None) -> View:

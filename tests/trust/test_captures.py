@@ -94,7 +94,6 @@ REFUSED = {
     "file is empty": (frame(file_path=" "), ["file_path", "number 4"]),
     "file is a list": (frame(file_path=["a.png"]), ["file_path", "number 4"]),
     "mask is null": (frame(mask_path=None), ["mask_path", "number 4"]),
-    "one mask alone": (frame(mask_path="masks/a.png"), ["has no mask_path and others have one"]),
     "one depth alone": (frame(depth_file_path="a.png"), ["has no depth_file_path and others have one"]),
     # Poses
     "pose with NaN": (pose(lambda m: m * [1, NAN, 1, 1]), [NAME, "4 x 4 matrix of finite numbers"]),
