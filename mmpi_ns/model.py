@@ -246,8 +246,10 @@ class MMPIModel(Model):
         def render(place: int, rays: Tensor | slice) -> dict[str, Tensor]:
             window = present[place]
             field = self.field if window == trained else self.store.load(window, self.device)
-            outputs = lambda part: self.window_outputs(window, field, part, chosen)  # noqa: E731
-            return render_in_chunks(bundle[rays], chunk or len(bundle), self.device, outputs)
+            return render_in_chunks(
+                bundle[rays], chunk or len(bundle), self.device,
+                lambda part: self.window_outputs(window, field, part, chosen),
+            )  # fmt: skip
 
         if len(windows) == 1:
             return render(0, slice(None))

@@ -190,8 +190,10 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         if np.isfinite(light).all() and np.ptp(np.log(light)) < SAME_LIGHT:
             say("Exposure: EXIF notes the same for all images.")
             return None
-        show = lambda i: image_and_mask(self.train_dataset, i)  # noqa: E731
-        ratios = color_ratios(posed, self.known_depth, self.train_ray_generator, show, self.config.seed)
+        ratios = color_ratios(
+            posed, self.known_depth, self.train_ray_generator,
+            lambda i: image_and_mask(self.train_dataset, i), self.config.seed,
+        )  # fmt: skip
         if ratios is None:
             return None
         return image_gains(ratios, len(posed.files), light)

@@ -183,7 +183,10 @@ def _texels(window: BakedWindow, peaks: Float[Tensor, "B 8 8"]) -> _Texels:
         keys[numbers[plane, row, column].to(torch.int64)] = torch.where((y < mpi.height) & (x < mpi.width), key, -1)
     inside = keys.flatten() >= 0
     texels, flat = keys.flatten()[inside].unique(return_inverse=True)
-    gather = lambda values: values.new_zeros(len(texels), *values.shape[1:]).index_copy(0, flat, values[inside])  # noqa: E731
+
+    def gather(values: Tensor) -> Tensor:
+        return values.new_zeros(len(texels), *values.shape[1:]).index_copy(0, flat, values[inside])
+
     head = torch.searchsorted(starts, texels, right=True) - 1
     place, (_, height, width) = texels - starts[head], sizes[head].unbind(-1)
     places = torch.stack([head, place // (height * width), place // width % height, place % width], -1)
@@ -205,15 +208,18 @@ def _merged(texels: _Texels, is_seen: Bool[Tensor, "T"]) -> tuple[Int[Tensor, "T
     head, plane, y, x = texels.places[is_seen].unbind(-1)
     wide = int(texels.places.max()) + 1
     level = torch.zeros_like(x)
-    name = lambda depth: ((head * wide + plane) * wide + (y >> depth)) * wide + (x >> depth)  # noqa: E731
+
+    def cells(depth: int | Tensor) -> Tensor:
+        return ((head * wide + plane) * wide + (y >> depth)) * wide + (x >> depth)
+
     for depth in range(1, LARGEST + 1):
-        _, parent, count = name(depth).unique(return_inverse=True, return_counts=True)
+        _, parent, count = cells(depth).unique(return_inverse=True, return_counts=True)
         index = parent[:, None].expand(values.shape)
         none = values.new_zeros(len(count), values.shape[1])
         high, low = (none.scatter_reduce(0, index, values, how, include_self=False) for how in ("amax", "amin"))
         agrees = (count == 4**depth) & ((high - low).amax(-1) < 1)
         level = torch.where(agrees[parent], depth, level)
-    _, group = (name(level) * (LARGEST + 1) + level).unique(return_inverse=True)
+    _, group = (cells(level) * (LARGEST + 1) + level).unique(return_inverse=True)
     groups, levels = torch.full(is_seen.shape, -1), torch.zeros(is_seen.shape, dtype=torch.int64)
     groups[is_seen], levels[is_seen] = group, level
     return groups, levels
@@ -224,7 +230,10 @@ def _placed(window: BakedWindow, texels: _Texels, group: Tensor, level: Tensor, 
     inside = (group >= 0).nonzero()[:, 0]
     group, level, total = group[inside], level[inside], int(group.max()) + 1
     count = torch.bincount(group, minlength=total).float()
-    mean = lambda x: torch.zeros(total, x.shape[1]).index_add(0, group, x[inside].float()) / count[:, None]  # noqa: E731
+
+    def mean(values: Tensor) -> Tensor:
+        return torch.zeros(total, values.shape[1]).index_add(0, group, values[inside].float()) / count[:, None]
+
     first = torch.empty_like(count, dtype=torch.int64).index_copy(0, group, inside)
     head, plane = texels.places[first, :2].unbind(-1)
     size = 2.0 ** torch.empty_like(first).index_copy(0, group, level)
