@@ -236,7 +236,7 @@ def test_checkpoints_are_written_outside_their_folder(whole, scene, plan_file, t
 )
 def test_a_checkpoint_of_another_plan_is_refused_in_one_sentence(whole, scene, tmp_path, settings):
     plan = write_plan(scene, tmp_path / "plan.json", **settings)
-    config = trainer_config(scene, plan, tmp_path / "out", STEPS, **whole[0])
+    config = trainer_config(scene, plan, tmp_path / "out", STEPS, **(whole[0] | {"plan_file": plan}))
     with pytest.raises(ValueError, match="another scene plan") as error:
         ready(config, load_dir=whole[1], load_step=5)
     assert "\n" not in str(error.value) and str(whole[1]) in str(error.value)
@@ -249,7 +249,7 @@ def test_a_checkpoint_of_another_method_is_refused(whole, scene, plan_file, tmp_
     folder.mkdir()
     torch.save(state, folder / "step-000000005.ckpt")
     with pytest.raises(ValueError, match="not written by this method"):
-        ready(trainer_config(scene, plan_file, tmp_path / "out", STEPS), load_dir=folder)
+        ready(trainer_config(scene, plan_file, tmp_path / "out", STEPS, **whole[0]), load_dir=folder)
 
 
 def test_a_folder_without_checkpoints_is_named(scene, plan_file, tmp_path):
