@@ -54,6 +54,8 @@ SENSOR_ERROR = 0.01
 """Relative error of a sensor's depth."""
 UNKNOWN, OCTAVE = -(2**15), 1024
 """Code of a number that is 0, and codes in an octave."""
+MOST_KEYPOINTS = 3.0
+"""Multiple of the cells with a depth above which placement leaves keypoints out."""
 
 
 @dataclass(frozen=True)
@@ -315,10 +317,11 @@ def _continued_codes(codes: Codes, i: int, posed: PosedImages, dataset: MMPIData
 def of_cells(observations: Observations, known: KnownDepth, dataset: MMPIDataset) -> Observations:
     """The observations that placement weighs: of each image cell the pixel with the most certain depth.
 
-    Each cell counts once, however many keypoints or matches lie in it. Keypoints are among the known depths, so a cell
-    with one has a depth. Where no depth is known at all, the observations stay as they are.
+    Each cell counts once. Keypoints come before them unless they are ``MOST_KEYPOINTS`` times as many: they would then
+    draw MPIs and texels to the parts of the images that an SfM model or a cloud is densest in. Where no depth is known
+    at all, the observations stay as they are.
     """
-    seen_by, points = [], []
+    seen_by, points = [observations.seen_by[:0]], [observations.points[:0]]
     for i in range(len(known.codes)):
         depth = known.image(i)
         rows, columns = best_of_cells(depth)
@@ -328,11 +331,19 @@ def of_cells(observations: Observations, known: KnownDepth, dataset: MMPIDataset
         rays = dataset.cameras.generate_rays(torch.full((len(rows), 1), i), coords=coords)
         seen_by.append(np.full(len(rows), i))
         points.append(observations.centers[i] + rays.directions.double().numpy() / depth[rows, columns, :1])
-    if not points:
-        return observations
     cells = np.concatenate(points)
-    numbers, at = np.arange(len(cells)), observations.seen_at[:0]
-    return replace(observations, points=cells, seen_by=np.concatenate(seen_by), seen_point=numbers, seen_at=at)
+    if not len(cells):
+        return observations
+    if len(observations.seen_by) > MOST_KEYPOINTS * len(cells):
+        observations = replace(
+            observations, points=points[0], seen_by=seen_by[0], seen_point=seen_by[0], seen_at=observations.seen_at[:0]
+        )
+    return replace(
+        observations,
+        points=np.concatenate([observations.points, cells]),
+        seen_by=np.concatenate([observations.seen_by, *seen_by]),
+        seen_point=np.concatenate([observations.seen_point, len(observations.points) + np.arange(len(cells))]),
+    )
 
 
 def best_of_cells(depth: Map) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -98,13 +98,15 @@ def place(observations: Observations, config: PlacementConfig, training_rays: in
     chosen, texel_pixels = _choose(observations, visible, replace(config, max_texels=budget), finest)
     mpis = tuple(h for h in chosen if isinstance(h, MPIPlan))
     cube = next((h for h in chosen if isinstance(h, CubePlan)), None)
-    if texel_pixels > finest:
-        remedy = "more steps" if budget != config.max_texels else "a larger placement.max-texels"
-        remedy += f", or down to {finest:.1f} in training in the room of released ones"
+    detail = 1.0
+    if texel_pixels > finest and budget != config.max_texels:
+        remedy = "more steps"
+    elif texel_pixels > finest:  # there are rays for finer texels, and released ones leave room
+        detail = min((texel_pixels / finest) ** 2, MOST_DETAIL)
+        remedy = f"a larger placement.max-texels, or down to {finest:.1f} in training in the room of released ones"
     else:
         remedy = "more steps" if trainable > config.texel_pixels else "a smaller placement.texel-pixels"
     origin = f"automatic placement, a texel spans {texel_pixels:.1f} pixels: finer with {remedy}"
-    detail = min(max(1.0, (texel_pixels / finest) ** 2), MOST_DETAIL)
     return ScenePlan(_named(mpis), cube, 0.2 * visible.near, visible.near, origin, detail)
 
 

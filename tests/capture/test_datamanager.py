@@ -17,7 +17,6 @@ from training_runs import datamanager, in_capture_frame, plan_of
 
 from mmpi_ns.capture import known_depth, rays
 from mmpi_ns.capture.checks import say_once
-from mmpi_ns.capture.datamanager import OBSERVATIONS
 from mmpi_ns.capture.known_depth import UNKNOWN, KnownDepth
 from mmpi_ns.capture.ray_sources import KEYPOINT_DEPTH, OWN_PIXEL, PIXEL_DEPTH
 from mmpi_ns.capture.rays import LensRays, PinholeRays
@@ -161,10 +160,14 @@ def test_keypoints_are_those_of_training_images_and_lie_on_the_wall(manager):
 
 
 def test_placement_weighs_every_cell_of_an_image_once_however_many_keypoints_lie_in_it(manager, monkeypatch):
-    assert (
-        len(manager.train_dataset.metadata[OBSERVATIONS].seen_by)
-        == (np.stack(manager.known_depth.codes)[..., 0] > UNKNOWN).sum()
-    )
+    seen, depths, dataset = manager.observations, manager.known_depth, manager.train_dataset
+    keypoints, cells = len(seen.seen_by), (np.stack(depths.codes)[..., 0] > UNKNOWN).sum()  # a cell is one pixel here
+    for most, both in ((keypoints / cells + 0.01, True), (keypoints / cells - 0.01, False)):
+        monkeypatch.setattr(known_depth, "MOST_KEYPOINTS", most)
+        placed = known_depth.of_cells(seen, depths, dataset)
+        assert len(placed.seen_by) == cells + both * keypoints and len(placed.seen_at) == both * len(seen.seen_at)
+        assert np.array_equal(placed.seen_by[: both * keypoints], seen.seen_by[: both * keypoints])
+        assert len(placed.points) == cells + both * len(seen.points)
     monkeypatch.setattr(known_depth, "CELLS", 4)  # of 8 x 8 pixels
     placed = known_depth.of_cells(manager.observations, manager.known_depth, manager.train_dataset)
     expected = []

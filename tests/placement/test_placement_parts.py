@@ -324,7 +324,7 @@ def test_a_plan_says_how_large_texels_are_and_what_makes_them_finer(changes, ray
     assert plan.origin_of_plan.startswith("automatic placement, a texel spans ") and words in plan.origin_of_plan
     numbers = [float(n) for n in re.findall(r"(?:spans|down to) ([\d.]+)", plan.origin_of_plan)]
     assert plan.detail == pytest.approx((numbers[0] / numbers[-1]) ** 2, rel=0.1) and numbers[-1] >= 2.0
-    assert (plan.detail > 1) == (len(numbers) == 2) == ("max_texels" in changes or "texels_per_ray" in changes)
+    assert (plan.detail > 1) == (len(numbers) == 2) == ("max_texels" in changes)
 
 
 def test_a_short_training_gets_a_small_plan():
