@@ -10,7 +10,7 @@ import numpy as np
 import pycolmap
 
 from mmpi_ns.capture.matching import MIN_ANGLE, quiet, triangulate_points
-from mmpi_ns.prepare.stages import progress, say
+from mmpi_ns.utils.errors import progress, say
 
 STILL = 1e-6
 """Relative change of the cost at which an adjustment ends. COLMAP goes on to 100 iterations: of 64 images of a drive

@@ -61,8 +61,7 @@ def share(photos: Sequence[Photo], sharing: Sharing, lenses: dict[str, Intrinsic
         listed = ", ".join(f"{w}x{h}" for w, h in sorted(sizes))
         raise PrepareError(f"--intrinsics shared, but the images are of different sizes ({listed}): use auto.")
     numbers: dict[Any, int] = {}
-    lens = "" if sharing == "shared" else None
-    keys = [(p.width, p.height, p.lens if lens is None else lens, lenses.get(p.name)) for p in photos]
+    keys = [(p.width, p.height, "" if sharing == "shared" else p.lens, lenses.get(p.name)) for p in photos]
     return [numbers.setdefault(key, len(numbers) + 1) for key in keys]
 
 

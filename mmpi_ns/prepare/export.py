@@ -19,7 +19,9 @@ from mmpi_ns.capture.matching import quiet
 from mmpi_ns.prepare.alignment import camera_poses
 from mmpi_ns.prepare.cameras import read_intrinsics
 from mmpi_ns.prepare.images import Photo
-from mmpi_ns.prepare.stages import PrepareError, progress, whole, write_text
+from mmpi_ns.prepare.stages import PrepareError
+from mmpi_ns.utils.errors import progress
+from mmpi_ns.utils.files import whole, write_text
 
 IDENTITY = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]]
 """Written explicitly: without it, nerfstudio-data assumes an axis swap if colmap/sparse/0 exists."""

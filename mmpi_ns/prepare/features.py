@@ -21,7 +21,9 @@ from mmpi_ns.capture.matching import (
     write_images,
 )
 from mmpi_ns.prepare.images import Photo
-from mmpi_ns.prepare.stages import PrepareError, progress, whole
+from mmpi_ns.prepare.stages import PrepareError
+from mmpi_ns.utils.errors import progress
+from mmpi_ns.utils.files import whole
 
 BATCH = 8
 """Images extracted at a time: the most that an interruption loses."""

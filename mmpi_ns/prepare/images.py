@@ -13,7 +13,9 @@ import numpy as np
 from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 
 from mmpi_ns.capture.exif import kept_tags, positive_number
-from mmpi_ns.prepare.stages import PrepareError, progress, say, whole, write_text
+from mmpi_ns.prepare.stages import PrepareError
+from mmpi_ns.utils.errors import progress, say
+from mmpi_ns.utils.files import whole, write_text
 
 IMAGES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
 HEIF = (".heic", ".heif")

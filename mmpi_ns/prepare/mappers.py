@@ -16,8 +16,9 @@ from mmpi_ns.capture.matching import SEED, quiet
 from mmpi_ns.prepare.adjustment import polish, with_all_points
 from mmpi_ns.prepare.evidence import Witness, agreement, witness_of
 from mmpi_ns.prepare.mapping import ATTEMPTS, Task, map_globally, reconstruct
-from mmpi_ns.prepare.stages import PrepareError, progress, say
+from mmpi_ns.prepare.stages import PrepareError
 from mmpi_ns.prepare.verdict import NEARLY_ALL, ORDER, Grade, Verdict, agrees, best_first, judge_alone, judge_together
+from mmpi_ns.utils.errors import progress, say
 
 STARTS = (0.7, 1.2)
 """Focal lengths over the longer side that are tried where none is known: telephones and cars, then COLMAP's guess."""

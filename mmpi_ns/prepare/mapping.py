@@ -23,7 +23,8 @@ from mmpi_ns.capture.matching import MIN_ANGLE, MIN_INLIERS, SEED, quiet, triang
 from mmpi_ns.prepare.adjustment import STILL, Free, adjust, with_all_points
 from mmpi_ns.prepare.alignment import camera_poses, degrees_between, similarity_between
 from mmpi_ns.prepare.features import matched_keypoints, matching_pairs
-from mmpi_ns.prepare.stages import PrepareError, progress, say
+from mmpi_ns.prepare.stages import PrepareError
+from mmpi_ns.utils.errors import progress, say
 
 ENOUGH = 0.95
 """Fraction of registered images at which no further attempt is made."""

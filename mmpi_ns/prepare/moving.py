@@ -19,7 +19,7 @@ from mmpi_ns.capture.views import straightened_color
 from mmpi_ns.prepare.alignment import camera_poses
 from mmpi_ns.prepare.cameras import read_intrinsics
 from mmpi_ns.prepare.images import Photo
-from mmpi_ns.prepare.stages import progress
+from mmpi_ns.utils.errors import progress
 
 
 def write_masks(

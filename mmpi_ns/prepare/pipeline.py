@@ -25,10 +25,11 @@ from mmpi_ns.prepare.mappers import Solution, map_and_judge
 from mmpi_ns.prepare.mapping import Task, map_known_poses
 from mmpi_ns.prepare.poses import read_poses
 from mmpi_ns.prepare.settings import Settings, check_options, read_lists
-from mmpi_ns.prepare.stages import PrepareError, Stages, only_one, progress, say, whole
+from mmpi_ns.prepare.stages import PrepareError, Stages, only_one
 from mmpi_ns.prepare.verdict import REMEDY, Verdict
 from mmpi_ns.prepare.video import select_frames
-from mmpi_ns.utils.errors import quoted
+from mmpi_ns.utils.errors import progress, quoted, say
+from mmpi_ns.utils.files import whole
 
 WORK = ".prepare"
 LEAST_IMAGES = 3

@@ -15,7 +15,8 @@ import pycolmap
 from mmpi_ns.prepare.alignment import Array, nearest_rotation
 from mmpi_ns.prepare.cameras import Intrinsics
 from mmpi_ns.prepare.images import IMAGES, Photo, natural_key
-from mmpi_ns.prepare.stages import PrepareError, say
+from mmpi_ns.prepare.stages import PrepareError
+from mmpi_ns.utils.errors import say
 
 MAX_LAG = 0.05
 """Maximum time in seconds between an image and its pose."""

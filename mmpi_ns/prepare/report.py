@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from mmpi_ns.capture.exif import exposure_of
 from mmpi_ns.prepare.alignment import camera_poses
 from mmpi_ns.prepare.checks import Finding, coverage
-from mmpi_ns.prepare.stages import write_text
+from mmpi_ns.utils.files import write_text
 
 WORST = 5
 """Number of images with the least coverage that are listed."""

@@ -5,20 +5,17 @@ from __future__ import annotations
 import errno
 import hashlib
 import json
-import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from filelock import FileLock, Timeout
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from mmpi_ns.utils.errors import InputError
+from mmpi_ns.utils.errors import InputError, say
+from mmpi_ns.utils.files import write_text
 
-CONSOLE = Console(width=120)
 FULL = (errno.ENOSPC, errno.EDQUOT)
 LEFT = 1 << 20
 """Free bytes below which a failure to write is attributed to a full disk; COLMAP's errors give no reason."""
@@ -60,32 +57,12 @@ class Stages:
             shutil.rmtree(folder, ignore_errors=True)
             write_text(stamp, json.dumps({"key": self._key, "finished": False}))
         elif state.get("finished"):
-            CONSOLE.print(f"[dim]{name}: done before[/dim]")
+            say(f"{name}: done before", "dim")
             yield folder, True
             return
         folder.mkdir(exist_ok=True)
         yield folder, False
         write_text(stamp, json.dumps({"key": self._key, "finished": True}))
-
-
-def say(text: str, style: str = "") -> None:
-    """Prints a line as it is, not wrapped: names may hold brackets, and commands are copied."""
-    CONSOLE.print(text, style=style, markup=False, highlight=False, soft_wrap=True)
-
-
-@contextmanager
-def whole(path: Path) -> Iterator[Path]:
-    """A temporary path to write to, which replaces the file at the end, so that the file is complete or absent."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".partial")
-    yield partial
-    os.replace(partial, path)
-
-
-def write_text(path: Path, text: str) -> None:
-    """Writes a file atomically."""
-    with whole(path) as partial:
-        partial.write_text(text, encoding="utf-8")
 
 
 @contextmanager
@@ -109,17 +86,3 @@ def only_one(work: Path) -> Iterator[None]:
             says = f"The disk of {work.parent} is full ({free / 2**20:.0f} MB free): make room and repeat the command."
             raise PrepareError(says) from error
         raise
-
-
-@contextmanager
-def progress(what: str, total: int | None) -> Iterator[Callable[..., None]]:
-    """A progress bar; yields a function that advances it by a count, from ``start`` where it begins anew."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=CONSOLE) as bar:
-        task = bar.add_task(what, total=total)
-
-        def advance(count: int = 1, start: float | None = None) -> None:
-            done = count + (bar.tasks[task].completed if start is None else start)
-            bar.update(task, completed=done if total is None else min(done, total))
-
-        yield advance

@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 
 from mmpi_ns.prepare.checks import sharpness
 from mmpi_ns.prepare.images import Photo, write_photos
-from mmpi_ns.prepare.stages import PrepareError, progress, say, whole, write_text
+from mmpi_ns.prepare.stages import PrepareError
+from mmpi_ns.utils.errors import progress, say
+from mmpi_ns.utils.files import whole, write_text
 
 TRACK_WIDTH = 320
 """Width at which motion is measured."""

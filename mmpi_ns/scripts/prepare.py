@@ -22,8 +22,7 @@ def main() -> int:
     import tyro
 
     from mmpi_ns.prepare.settings import Settings
-    from mmpi_ns.prepare.stages import say
-    from mmpi_ns.utils.errors import InputError
+    from mmpi_ns.utils.errors import InputError, say
 
     settings = tyro.cli(Settings, description=Settings.__doc__)
     from mmpi_ns.prepare.pipeline import prepare

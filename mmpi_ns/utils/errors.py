@@ -1,11 +1,14 @@
-"""Messages to the user: plain lines, and errors of one sentence without a traceback."""
+"""Messages to the user: plain lines, progress bars, and errors of one sentence without a traceback."""
 
 from __future__ import annotations
 
 import shlex
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from nerfstudio.utils.rich_utils import CONSOLE
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 
 class InputError(ValueError):
@@ -26,9 +29,23 @@ def quoted(path: Path) -> str:
     return shlex.quote(str(path))
 
 
-def say(text: str) -> None:
-    """Prints text as it is: no line is broken, so that paths and commands can be copied, and nothing is coloured."""
-    CONSOLE.print(text, soft_wrap=True, highlight=False, markup=False)
+def say(text: str, style: str = "") -> None:
+    """Prints text as it is: names may hold brackets, and no line is broken, so that commands can be copied."""
+    CONSOLE.print(text, style=style, soft_wrap=True, highlight=False, markup=False)
+
+
+@contextmanager
+def progress(what: str, total: int | None) -> Iterator[Callable[..., None]]:
+    """A progress bar; yields a function that advances it by a count, from ``start`` where it begins anew."""
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=CONSOLE) as bar:
+        task = bar.add_task(what, total=total)
+
+        def advance(count: int = 1, start: float | None = None) -> None:
+            done = count + (bar.tasks[task].completed if start is None else start)
+            bar.update(task, completed=done if total is None else min(done, total))
+
+        yield advance
 
 
 def duration(seconds: float) -> str:

@@ -7,12 +7,13 @@ import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-
-import torch
-from jaxtyping import UInt8
-from torch import Tensor
+from typing import TYPE_CHECKING
 
 from mmpi_ns.utils.errors import WriteError, brief
+
+if TYPE_CHECKING:
+    from jaxtyping import UInt8
+    from torch import Tensor
 
 
 def write_atomically(path: Path, write: Callable[[Path], object], folder: Path | None = None) -> None:
@@ -45,6 +46,25 @@ def write_atomically(path: Path, write: Callable[[Path], object], folder: Path |
 
 
 @contextmanager
+def whole(path: Path) -> Iterator[Path]:
+    """A temporary path to write to, which replaces the file at the end, so that the file is complete or absent.
+
+    For one of many files that are made again after an interruption: it says nothing of errors and does not wait for the
+    disk, as ``write_atomically`` does.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(path.name + ".partial")
+    yield partial
+    os.replace(partial, path)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Writes a ``whole`` file."""
+    with whole(path) as partial:
+        partial.write_text(text, encoding="utf-8")
+
+
+@contextmanager
 def write_errors(folder: Path, option: str) -> Iterator[None]:
     """Errors of writing in a folder, within the block: WriteError with the option that names another folder."""
     try:
@@ -57,6 +77,8 @@ def write_errors(folder: Path, option: str) -> Iterator[None]:
 
 def to_bytes(text: str) -> UInt8[Tensor, "B"]:
     """Text as a buffer of a module."""
+    import torch  # takes seconds, and most who write files need none of it
+
     return torch.frombuffer(bytearray(text.encode()), dtype=torch.uint8)
 
 

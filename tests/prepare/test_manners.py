@@ -20,8 +20,8 @@ from mmpi_ns.prepare import images
 from mmpi_ns.prepare.checks import Finding, by_kind
 from mmpi_ns.prepare.pipeline import WORK, prepare
 from mmpi_ns.prepare.settings import Settings
-from mmpi_ns.prepare.stages import PrepareError, only_one, progress
-from mmpi_ns.utils.errors import InputError
+from mmpi_ns.prepare.stages import PrepareError, only_one
+from mmpi_ns.utils.errors import InputError, progress
 
 NAN = float("nan")
 
