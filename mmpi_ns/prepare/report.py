@@ -10,7 +10,7 @@ import pycolmap
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from mmpi_ns.capture.exif import exposure_of
+from mmpi_ns.capture.exif import light_of
 from mmpi_ns.prepare.alignment import camera_poses
 from mmpi_ns.prepare.checks import Finding, coverage
 from mmpi_ns.utils.files import write_text
@@ -21,8 +21,7 @@ WORST = 5
 
 def exposure_in_words(images: Sequence[Path]) -> str:
     """Range of the exposures of images by their EXIF, in words."""
-    exposures = [e for e in map(exposure_of, images) if e is not None]
-    light = [e.time * (e.sensitivity or 1.0) / (e.aperture or 1.0) ** 2 for e in exposures]
+    light = [x for x in map(light_of, images) if np.isfinite(x)]
     if not light:
         return "not known: no EXIF"
     return f"varies {max(light) / min(light):.1f}-fold by the EXIF of {len(light)} images"
