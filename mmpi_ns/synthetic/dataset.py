@@ -111,12 +111,8 @@ def write_depths(scene: Scene, folder: Path, camera: int, distances: Colors) -> 
 
 
 _job: Callable[[int], None]
-"""What each process of a pool does with a number: inherited, as closures cannot be sent."""
-
-
-def _adopt(job: Callable[[int], None]) -> None:
-    global _job
-    _job = job
+"""What each process of a pool does with the number of an image: forks inherit it, as a scene's functions cannot be
+sent."""
 
 
 def _do(number: int) -> None:
@@ -131,14 +127,15 @@ def _write_images(
     processes: int,
 ) -> None:
     """Renders and writes all images, by forked processes if there are several and the system can fork."""
+    global _job
     for part in ("images", "depths", *(["moving"] if scene.movers else [])):
         (folder / part).mkdir()
-    job, count = partial(_write_image, scene, folder, exposure), len(scene.cameras)
+    _job, count = partial(_write_image, scene, folder, exposure), len(scene.cameras)
     if min(processes, count) < 2 or "fork" not in get_all_start_methods():
         for camera in progress(range(count)):
-            job(camera)
+            _job(camera)
         return
-    pool = ProcessPoolExecutor(min(processes, count), get_context("fork"), _adopt, (job,))
+    pool = ProcessPoolExecutor(min(processes, count), get_context("fork"))
     try:
         written = pool.map(_do, range(count))
         for _ in progress(range(count)):
