@@ -37,7 +37,17 @@ def main() -> None:
     dist.init_process_group("gloo", timeout=TIMEOUT)
     rank, processes = dist.get_rank(), dist.get_world_size()
     try:
-        _agree(config, rank)
+        # All processes get the same folder, with one config.yml.
+        if config.data:
+            config.pipeline.datamanager.data = config.data
+        config.set_timestamp()
+        timestamps = [config.timestamp]
+        dist.broadcast_object_list(timestamps, src=0)
+        config.timestamp = timestamps[0]
+        if rank == 0:
+            config.print_to_terminal()
+            config.save_config()
+        dist.barrier()
         signal.signal(signal.SIGTERM, lambda *_: _end_early(config.get_base_dir()))
         train_loop(rank, processes, config)
         try:
@@ -60,20 +70,6 @@ def _end_early(folder: Path) -> NoReturn:
     )
     print(message, file=sys.stderr, flush=True)
     sys.exit(1)
-
-
-def _agree(config: TrainerConfig, rank: int) -> None:
-    """Gives all processes the same folder, with one config.yml."""
-    if config.data:
-        config.pipeline.datamanager.data = config.data
-    config.set_timestamp()
-    timestamps = [config.timestamp]
-    dist.broadcast_object_list(timestamps, src=0)
-    config.timestamp = timestamps[0]
-    if rank == 0:
-        config.print_to_terminal()
-        config.save_config()
-    dist.barrier()
 
 
 if __name__ == "__main__":
