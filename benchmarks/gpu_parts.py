@@ -18,12 +18,14 @@ from typing import Any
 
 import torch
 from apart import Tell
+from lab import median_s
+from methods import TWO_PHASE
 from report import Row, slug
 from torch import Tensor
 
 from mmpi_ns.bench.checks import run_checks
 from mmpi_ns.bench.gpu import drive
-from mmpi_ns.bench.trainers import TWO_PHASE, P, Scene, Steps, median_s, train_words
+from mmpi_ns.bench.trainers import P, Scene, Steps, train_words
 from mmpi_ns.model import MMPIModel
 from mmpi_ns.ops import dispatch
 from mmpi_ns.rendering.metrics import ImageMetrics

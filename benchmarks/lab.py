@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import resource
+import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import date
@@ -16,7 +17,7 @@ from typing import Any
 from apart import environment_of
 from report import Bench, Row, commit, processor, read_json
 
-from mmpi_ns.bench.trainers import Scene
+from mmpi_ns.bench.trainers import Scene, clock
 
 
 @dataclass(kw_only=True)
@@ -31,6 +32,17 @@ class SceneBench(Bench):
     @property
     def scene(self) -> Scene:
         return Scene(self.data, self.downscale_factor)
+
+
+def median_s(work: Callable[[], Any], repeats: int) -> float:
+    """Median seconds, the device waited for, after a call that is not timed (it may compile)."""
+    work()
+    times = []
+    for _ in range(repeats):
+        start = clock()
+        work()
+        times.append(clock() - start)
+    return statistics.median(times)
 
 
 def run_command(words: list[str], log: Path, threads: int, **how: Any) -> None:

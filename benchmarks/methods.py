@@ -8,8 +8,10 @@ from pathlib import Path
 
 import torch
 
-from mmpi_ns.bench.trainers import TWO_PHASE, P, Scene, train_words
+from mmpi_ns.bench.trainers import P, Scene, train_words
 
+TWO_PHASE = ("--pipeline.model.schedule.training", "two-phase")
+"""All rays for each MPI, a little blending, and a long fine-tune at full rates, unless more options follow."""
 SPLIT = ("--pipeline.model.schedule.rays-per-mpi", "split")
 NO_DEPTH = (
     *("--pipeline.datamanager.keypoint-rays", "0"),

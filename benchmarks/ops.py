@@ -12,12 +12,12 @@ from typing import Any
 
 import torch
 from gpu_parts import copy_rate
-from lab import SceneBench, figure
+from lab import SceneBench, figure, median_s
 from methods import METHODS
 from report import Report, Row, page, slug, table, title
 from torch import Tensor
 
-from mmpi_ns.bench.trainers import Steps, median_s
+from mmpi_ns.bench.trainers import Steps
 from mmpi_ns.field.samples import Lookup, metadata_of
 from mmpi_ns.model import MMPIModel
 from mmpi_ns.ops.composite import composite_weights

@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 import torch
 from apart import Tell, run_apart
-from lab import figure, peak_gib
+from lab import figure, median_s, peak_gib
 from methods import Method
 from PIL import Image
 from report import Bench, Report, Row, page, table
 
-from mmpi_ns.bench.trainers import Scene, config_of, median_s, trainer_of
+from mmpi_ns.bench.trainers import Scene, config_of, trainer_of
 from mmpi_ns.capture.load import load_observations
 from mmpi_ns.placement.split import place_windows
 from mmpi_ns.rendering.metrics import ImageMetrics

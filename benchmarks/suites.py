@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from methods import NO_DEPTH, POSES_ALONE, SPLIT, Method
+from methods import NO_DEPTH, POSES_ALONE, SPLIT, TWO_PHASE, Method
 
-from mmpi_ns.bench.trainers import JOINT, TWO_PHASE, P
+from mmpi_ns.bench.trainers import JOINT, P
 
 DRIVE = (P + "arrangement", "drive")
 BY_HAND = (*DRIVE, *JOINT)

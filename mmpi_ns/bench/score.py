@@ -53,7 +53,11 @@ class Score:
         """Scores, prints and returns name and metrics of each image, and the means."""
         counts = {name: Number(0, whole=True) for name in ("downscale_factor", "test_images")}
         check_options(self, counts, "--")
-        truths = test_images_of(self.data, self.downscale_factor)
+        if not self.data.exists():
+            raise ValueError(f"There is no scene at {self.data}: check the path.")
+        parser = NerfstudioDataParserConfig(data=self.data, downscale_factor=self.downscale_factor)
+        check_transforms(parser, self.data, ("test",), opens=True)
+        truths = MMPIDataset(parser.setup().get_dataparser_outputs(split="test"))
         chosen = evenly(len(truths), self.test_images)
         files = find_renderings(self.images, [truths.image_filenames[i] for i in chosen])
         metrics = ImageMetrics(self.lpips)
@@ -76,19 +80,6 @@ def evenly(count: int, most: int) -> list[int]:
     if most <= 0 or most >= count:
         return list(range(count))
     return [int((i + 0.5) * count / most) for i in range(most)]
-
-
-def test_images_of(data: Path, downscale_factor: int) -> MMPIDataset:
-    """The images of a scene's test list.
-
-    Raises:
-        ValueError: there is no scene, or one that cannot be used.
-    """
-    if not data.exists():
-        raise ValueError(f"There is no scene at {data}: check the path.")
-    config = NerfstudioDataParserConfig(data=data, downscale_factor=downscale_factor)
-    check_transforms(config, data, ("test",), opens=True)
-    return MMPIDataset(config.setup().get_dataparser_outputs(split="test"))
 
 
 def find_renderings(folder: Path, tests: list[Path]) -> list[Path]:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import importlib.util
-import statistics
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,8 +14,6 @@ from torch import nn
 
 P = "--pipeline.model.placement."
 JOINT = ("--pipeline.model.schedule.training", "joint")
-TWO_PHASE = ("--pipeline.model.schedule.training", "two-phase")
-"""All rays for each MPI, a little blending, and a long fine-tune at full rates, unless more options follow."""
 
 
 @dataclass(frozen=True)
@@ -103,17 +100,6 @@ def clock() -> float:
     if torch.cuda.is_available():
         torch.cuda.synchronize()
     return time.perf_counter()
-
-
-def median_s(work: Callable[[], Any], repeats: int) -> float:
-    """Median seconds, the device waited for, after a call that is not timed (it may compile)."""
-    work()
-    times = []
-    for _ in range(repeats):
-        start = clock()
-        work()
-        times.append(clock() - start)
-    return statistics.median(times)
 
 
 class Steps:

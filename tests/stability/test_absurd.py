@@ -11,9 +11,10 @@ from typing import Any
 
 import pytest
 import torch
+from methods import TWO_PHASE
 from still_life import still_life
 
-from mmpi_ns.bench.trainers import TWO_PHASE, Scene, config_of, train_words, trainer_of
+from mmpi_ns.bench.trainers import Scene, config_of, train_words, trainer_of
 from mmpi_ns.scene.plan import MPIPlan
 from mmpi_ns.synthetic.dataset import write_dataset
 from mmpi_ns.training.trainer import MMPITrainer
