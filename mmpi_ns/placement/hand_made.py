@@ -7,6 +7,9 @@ import numpy as np
 from mmpi_ns.placement.observations import Array, Observations
 from mmpi_ns.scene.plan import CubePlan, MPIPlan, ScenePlan, Vector
 
+OVERLAPPING = 1.25
+"""Half the extent of each MPI of a room, a tangent: above 1 neighbours overlap."""
+
 
 def vector(v: Array) -> Vector:
     return (float(v[0]), float(v[1]), float(v[2]))
@@ -32,8 +35,8 @@ def drive_plan(
     planes: int,
     height: int,
     width: int,
-    names: tuple[str, ...] = ("front", "left", "right", "below"),
-    pull_back: float = 0.45,
+    names: tuple[str, ...],
+    pull_back: float,
 ) -> ScenePlan:
     """Four MPIs along a straight drive, placed by hand in metres (fixed, as a baseline).
 
@@ -74,8 +77,6 @@ def room_plan(
     cube_voxels: int,
     near: float,
     cube_half_size: float,
-    names: tuple[str, ...] = ("front", "back", "left", "right", "below"),
-    tangent: float = 1.25,
 ) -> ScenePlan:
     """The paper's ScanNet arrangement: five MPIs around the cameras' centre and a cube (sec. IV).
 
@@ -87,12 +88,11 @@ def room_plan(
         cube_voxels: voxels along each side of the cube; 0 for none.
         near: depth of the first plane, scene units.
         cube_half_size: half the cube's side, scene units.
-        names: the directions to face.
-        tangent: half the extent of each MPI; above 1 neighbours overlap.
     """
     base = observations.mean_axes
     center = (observations.centers.min(0) + observations.centers.max(0)) / 2
-    extent = (-tangent, tangent, -tangent, tangent)
+    extent = (-OVERLAPPING, OVERLAPPING, -OVERLAPPING, OVERLAPPING)
+    names = ("front", "back", "left", "right", "below")
     mpis = (MPIPlan(n, vector(center), facing_axes(base, n), near, extent, planes, height, width) for n in names)
     corners = vector(center - cube_half_size), vector(center + cube_half_size)
     cube = CubePlan(*corners, (cube_voxels, cube_voxels, cube_voxels)) if cube_voxels else None

@@ -68,7 +68,23 @@ def find_visible_points(observations: Observations) -> VisiblePoints:
     typical = np.tile(np.quantile(depth, SPAN), (len(centers), 1))
     for i in starts:
         typical[i] = np.quantile(depth[cameras == i], SPAN)
-    return _weighed(observations, cameras, points, nearest, typical, near)
+    # Evenly spaced in an order that no numbering, pose or unit enters: by depth.
+    order = np.argsort(observations.depths(cameras, points) / near, kind="stable")
+    sampled = min(len(order), max(SAMPLED, SAMPLED_PER_CAMERA * len(centers)))
+    keep = order[np.linspace(0, len(order) - 1, sampled).round().astype(int)]
+    cameras, points = cameras[keep], points[keep]
+    seen = np.bincount(cameras, minlength=len(centers))
+    share = (1 - FRUSTUM_SHARE) * seen / (seen + FEW)
+    filling = frustum_points(observations, nearest)
+    each = len(filling) // len(centers)
+    return VisiblePoints(
+        cameras=np.concatenate([cameras, np.repeat(np.arange(len(centers)), each)]),
+        points=np.concatenate([points, filling]),
+        weights=np.concatenate([(share / np.maximum(seen, 1))[cameras], np.repeat((1 - share) / each, each)]),
+        nearest=nearest,
+        typical=typical,
+        near=near,
+    )
 
 
 def pixels_per_pixel(observations: Observations, visible: VisiblePoints) -> float:
@@ -117,26 +133,3 @@ def _start(depth: Array) -> float:
     ordered = np.sort(depth)
     inside = np.searchsorted(ordered, ordered * WINDOW, side="right") - np.arange(len(ordered))
     return float(ordered[np.argmax(inside >= max(1.0, SUPPORT * len(ordered)))])
-
-
-def _weighed(
-    observations: Observations, cameras: NDArray[np.int64], points: Array, nearest: Array, typical: Array, near: float
-) -> VisiblePoints:
-    count = len(observations.centers)
-    # Evenly spaced in an order that no numbering, pose or unit enters: by depth.
-    order = np.argsort(observations.depths(cameras, points) / near, kind="stable")
-    sampled = min(len(order), max(SAMPLED, SAMPLED_PER_CAMERA * count))
-    keep = order[np.linspace(0, len(order) - 1, sampled).round().astype(int)]
-    cameras, points = cameras[keep], points[keep]
-    seen = np.bincount(cameras, minlength=count)
-    share = (1 - FRUSTUM_SHARE) * seen / (seen + FEW)
-    filling = frustum_points(observations, nearest)
-    each = len(filling) // count
-    return VisiblePoints(
-        cameras=np.concatenate([cameras, np.repeat(np.arange(count), each)]),
-        points=np.concatenate([points, filling]),
-        weights=np.concatenate([(share / np.maximum(seen, 1))[cameras], np.repeat((1 - share) / each, each)]),
-        nearest=nearest,
-        typical=typical,
-        near=near,
-    )

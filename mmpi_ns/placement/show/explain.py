@@ -65,16 +65,16 @@ def explain(plan: ScenePlan, observations: Observations, visible: VisiblePoints)
     for k, head in enumerate(heads):
         served = (best == k) & held.any(-1)
         rest = np.delete(combined[served], k, axis=1).min(-1, initial=WORST)
-        reports.append(
-            HeadReport(
-                name=plan.names[k],
-                **_geometry(head, observations),
-                texels=head.texels,
-                share=float(weights[served].sum() / weights.sum()),
-                error_with=_median(combined[served, k]),
-                error_without=_median(rest),
-            )
-        )
+        share = float(weights[served].sum() / weights.sum())
+        figures = head.texels, share, _median(combined[served, k]), _median(rest)
+        if isinstance(head, MPIPlan):
+            facing = describe_facing(np.asarray(head.axes[2]), observations.mean_axes)
+            frame = facing, head.origin, head.near, head.far, head.extent, (head.planes, head.height, head.width)
+        else:
+            lower, upper = np.asarray(head.lower), np.asarray(head.upper)
+            half, box = float((upper - lower).max() / 2), (*head.lower, *head.upper)
+            frame = "all round", tuple((lower + upper) / 2), half, float("nan"), box, head.shape
+        reports.append(HeadReport(plan.names[k], *frame, *figures))
     unserved = float(weights[~held.any(-1)].sum() / weights.sum())
     return PlanReport(tuple(reports), unserved, float(held.sum(-1) @ weights / weights.sum()), errors)
 
@@ -113,19 +113,6 @@ def table(report: PlanReport) -> str:
 
 def _median(values: Array) -> float:
     return float(np.median(values)) if len(values) else float("nan")
-
-
-def _geometry(head: MPIPlan | CubePlan, observations: Observations) -> dict:
-    if isinstance(head, CubePlan):
-        center = (np.asarray(head.lower) + np.asarray(head.upper)) / 2
-        half = float((np.asarray(head.upper) - np.asarray(head.lower)).max() / 2)
-        box = (*head.lower, *head.upper)
-        depth = {"near": half, "far": float("nan")}
-        return {"facing": "all round", "origin": tuple(center), **depth, "extent": box, "size": head.shape}
-    facing = describe_facing(np.asarray(head.axes[2]), observations.mean_axes)
-    size = (head.planes, head.height, head.width)
-    depth = {"near": head.near, "far": head.far}
-    return {"facing": facing, "origin": head.origin, **depth, "extent": head.extent, "size": size}
 
 
 def describe_facing(direction: Array, base: Array) -> str:

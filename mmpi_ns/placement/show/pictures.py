@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
@@ -41,7 +40,6 @@ def draw_plan(path: Path, plan: ScenePlan, observations: Observations, visible: 
     low, high = low - 0.05 * reach, high + 0.05 * reach
     facing = -observations.camera_to_worlds[:, :, 2] @ base.T * 0.025 * reach
     figure = Figure(figsize=(13, 8), layout="constrained")
-    FigureCanvasAgg(figure)
     # Forward to the right in both, so that a drive fills the width; seen from above, left is then up.
     for row, (title, up, name) in enumerate((("from above", 0, "left"), ("from the side", 1, "up"))):
         sign = -1.0 if up == 0 else 1.0
@@ -70,7 +68,6 @@ def draw_windows(path: Path, windows: WindowedPlan, observations: Observations) 
     middle = observations.centers.mean(0)
     centers = (observations.centers - middle) @ map_axes.T
     figure = Figure(figsize=(13, 8), layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.add_subplot(aspect="equal", title="windows, from above", xlabel="forward", ylabel="left")
     points = (observations.points[:: max(1, len(observations.points) // SHOWN_POINTS)] - middle) @ map_axes.T
     axes.scatter(*points.T, s=1, c="0.8", linewidths=0)
@@ -94,7 +91,6 @@ def draw_windows(path: Path, windows: WindowedPlan, observations: Observations) 
 def draw_errors(path: Path, plan: ScenePlan, report: PlanReport) -> None:
     """Writes a histogram (PNG) of the expected pixel error, coloured by the MPI that serves each observation."""
     figure = Figure(figsize=(8, 4), layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.add_subplot(xlabel="expected error, pixels", ylabel="observations", xscale="log")
     errors, best = report.served_errors, report.errors.best
     bins = np.geomspace(0.1, WORST, 49)
@@ -125,17 +121,14 @@ def _draw_mpi(axes: Axes, mpi: MPIPlan, picture: Array, middle: Array, reach: fl
     end = min(mpi.far, reach)
     depths = np.append(depths[depths < end], end)
     corners = np.array([[u, v, 1.0] for u in (u0, u1) for v in (v0, v1)]) @ np.asarray(mpi.axes) @ picture.T
-    planes = np.array([_widest(origin + depth * corners) for depth in depths])
+    # Of a plane the two corners that lie farthest apart in the picture.
+    apart = np.linalg.norm(corners[:, None] - corners[None], axis=-1)
+    diagonal = corners[list(np.unravel_index(int(apart.argmax()), apart.shape))]
+    planes = np.array([origin + depth * diagonal for depth in depths])
     axes.add_collection(LineCollection(list(planes), colors=color, linewidths=0.6, zorder=2))
     borders = [np.stack([origin, end]) for end in planes[-1]]
     axes.add_collection(LineCollection(borders, colors=color, linewidths=1.2, zorder=2, label=mpi.name))
     axes.plot(*origin, marker="x", color=color, zorder=5)
-
-
-def _widest(outline: Array) -> Array:
-    """[2, 2] the two of a plane's corners that lie farthest apart in the picture."""
-    apart = np.linalg.norm(outline[:, None] - outline[None], axis=-1)
-    return outline[list(np.unravel_index(int(apart.argmax()), apart.shape))]
 
 
 def _box_edges(lower: Array, upper: Array) -> Array:
