@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from mmpi_ns.ops.shade import Layers, SampleNetworks, positional_encoding, run_layers, sample_colors
+from mmpi_ns.ops.shade import Layers, SampleNetworks, positional_encoding, sample_colors
 
 
 class Networks(nn.Module):
@@ -46,10 +46,6 @@ class Networks(nn.Module):
         """Three layers of one head's network."""
         parts = self.weights[head].split([math.prod(s) for s in self.shapes])
         return Layers(*(p.view(s) for p, s in zip(parts, self.shapes, strict=True)))
-
-    def run(self, head: int, inputs: Float[Tensor, "N I"]) -> Float[Tensor, "N 3"]:
-        """Output of one head's network."""
-        return run_layers(self.layers(head), inputs)
 
 
 class ColorNetworks(Networks):

@@ -16,7 +16,7 @@ from torch import Tensor
 from mmpi_ns.field.color_network import Networks
 from mmpi_ns.ops.composite import Composite
 from mmpi_ns.ops.gather import COLORS, RaySums
-from mmpi_ns.ops.shade import positional_encoding
+from mmpi_ns.ops.shade import positional_encoding, run_layers
 
 Shading = Literal["ray", "sample"]
 """Whether the network is evaluated once a ray or for every sample."""
@@ -96,7 +96,8 @@ class RayShader(Networks):
         """
         mean = gathered / mass.clamp(min=LEAST_MASS)
         encoded = positional_encoding(directions, self.direction_frequencies)
-        return accumulation * change_odds(mean[:, :COLORS], self.run(0, torch.cat([mean, encoded], -1)))
+        said = run_layers(self.layers(0), torch.cat([mean, encoded], -1))
+        return accumulation * change_odds(mean[:, :COLORS], said)
 
 
 def change_odds(color: Float[Tensor, "R 3"], said: Float[Tensor, "R 3"]) -> Float[Tensor, "R 3"]:

@@ -34,9 +34,7 @@ from mmpi_ns.scene.baked import (
     columns_from,
     columns_of,
 )
-from mmpi_ns.scene.bricks import read_planes
-from mmpi_ns.scene.texels import SIDE as STORED_SIDE
-from mmpi_ns.scene.texels import TexelGrid
+from mmpi_ns.scene.bricks import read_planes, stored_texels
 
 Item = TypeVar("Item")
 
@@ -203,7 +201,8 @@ def bake(
         raw = torch.cat([_raw(model_field, k, p, shares) for p in _planes(model_field, k)])
         codes = density_codes.encode(raw)
         blocks = _tiled(codes[..., None])[..., 0]
-        columns_here, places = columns_from(_stored(model_field.grids[k]).cpu() & (blocks.amax((-1, -2)) > 0), count)
+        holds_texels = _tiled(stored_texels(model_field.grids[k], slice(None)).byte())[..., 0].amax((-1, -2)) > 0
+        columns_here, places = columns_from(holds_texels.cpu() & (blocks.amax((-1, -2)) > 0), count)
         columns.append(columns_here)
         density.append(blocks[tuple(places.T)])
         texels.append(_texel_codes(model_field, k, channels, places))
@@ -269,10 +268,3 @@ def _tiled(images: Tensor) -> Tensor:
     below, right = -(height - 1) % CELLS, -(width - 1) % CELLS
     padded = pad(images, (0, 0, 0, right, 0, below))
     return padded.unfold(1, SIDE, CELLS).unfold(2, SIDE, CELLS).permute(0, 1, 2, 4, 5, 3)
-
-
-def _stored(grid: TexelGrid) -> Bool[Tensor, "P Y X"]:
-    """Baked tiles in which the field stores a texel."""
-    wide = (grid.own_tiles > 0).repeat_interleave(STORED_SIDE, 1).repeat_interleave(STORED_SIDE, 2)
-    texels = wide[:, : grid.height, : grid.width, None].to(torch.uint8)
-    return _tiled(texels)[..., 0].amax((-1, -2)) > 0

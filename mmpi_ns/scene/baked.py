@@ -110,11 +110,6 @@ class BakedMpis:
         raw = self.density_codes.low + self.density_codes.step * codes
         return torch.nn.functional.softplus(raw) * self.intervals[k]
 
-    def steps_of_depth(self, k: int) -> Float[Tensor, "2041"]:
-        """e^-tau of head k at codes 0, 1/8, 2/8, ... 255."""
-        codes = torch.arange(255 * FINENESS + 1, dtype=torch.float64) / FINENESS
-        return torch.exp(-self.optical_depth(k, codes)).float()
-
 
 def tiles_of(mpi: MPIPlan) -> tuple[int, int, int]:
     """Words of planes, and rows and columns of tiles, of an MPI."""

@@ -74,7 +74,7 @@ def grown_tiles(
     stored = torch.zeros_like(new[0].tiles, dtype=torch.bool)
     for source, target, cube in zip(old, new, is_cube, strict=True):
         for sources, planes in _chunks(target, cube):
-            share = _resize(_stored(source, sources).float(), target, cube)[..., 0]
+            share = _resize(stored_texels(source, sources).float(), target, cube)[..., 0]
             there = share >= least if least else share > 0
             reached = pad(there.float(), (0, -target.width % SIDE, 0, -target.height % SIDE))
             tiles = max_pool2d(reached[:, None], SIDE)[:, 0] > 0
@@ -97,7 +97,7 @@ def resample(
     for source, target, cube in zip(old, new, is_cube, strict=True):
         for sources, planes in _chunks(target, cube):
             images = read_planes(table, source, sources)
-            stored = _stored(source, sources).to(table.dtype)
+            stored = stored_texels(source, sources).to(table.dtype)
             if bool(stored.all()):
                 write_planes(out, target, planes, _resize(images, target, cube))
                 continue
@@ -115,7 +115,7 @@ def _chunks(target: TexelGrid, is_cube: bool) -> Iterator[tuple[slice, slice]]:
         yield (slice(None) if is_cube else planes), planes
 
 
-def _stored(grid: TexelGrid, planes: slice) -> Bool[Tensor, "P h w 1"]:
+def stored_texels(grid: TexelGrid, planes: slice) -> Bool[Tensor, "P h w 1"]:
     """Which texels of some planes are stored."""
     wide = (grid.own_tiles[planes] > 0).repeat_interleave(SIDE, 1).repeat_interleave(SIDE, 2)
     return wide[:, : grid.height, : grid.width, None]

@@ -156,18 +156,12 @@ def make_grids(shapes: list[tuple[int, int, int]], tiles: Int[Tensor, "T"] | Non
     if tiles is None:
         tiles = torch.arange(1, sum(counts) + 1, dtype=torch.int32)
     assert len(tiles) == sum(counts), (len(tiles), shapes)
-    places = brick_places(tiles)
+    stored = tiles.nonzero()[:, 0]
+    places = torch.full((len(stored) + 1,), -1, dtype=torch.int64, device=tiles.device)
+    places[tiles[stored].to(torch.int64)] = stored
     return [TexelGrid(*s, sum(counts[:k]), tiles, places) for k, s in enumerate(shapes)]
 
 
 def number_tiles(stored: Bool[Tensor, "T"]) -> Int[Tensor, "T"]:
     """``tiles`` in which the chosen tiles have a brick each."""
     return torch.where(stored, stored.cumsum(0), 0).to(torch.int32)
-
-
-def brick_places(tiles: Int[Tensor, "T"]) -> Int[Tensor, "B"]:
-    """Tile of every brick; -1 for the empty one."""
-    stored = tiles.nonzero()[:, 0]
-    places = torch.full((len(stored) + 1,), -1, dtype=torch.int64, device=tiles.device)
-    places[tiles[stored].to(torch.int64)] = stored
-    return places

@@ -39,7 +39,9 @@ class _Packed:
     def __init__(self, baked: BakedMpis) -> None:
         count, bricks, channels = len(baked.mpis), baked.num_bricks, len(baked.channel_codes)
         assert channels <= MOST_CHANNELS
-        self.through = [shaped(baked.steps_of_depth(k), 255 * FINENESS + 1) for k in range(count)]
+        codes = torch.arange(255 * FINENESS + 1, dtype=torch.float64) / FINENESS
+        self.through = [torch.exp(-baked.optical_depth(k, codes)).float().contiguous() for k in range(count)]
+        """Light that passes a sample of each MPI, at codes 0, 1/8, 2/8, ... 255."""
         self.addresses = (ctypes.c_void_p * count)(*(x.data_ptr() for x in self.through))
         self.stacks = (_Stack * count)()
         for k, mpi in enumerate(baked.mpis):
