@@ -12,7 +12,7 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.datasets.base_dataset import InputDataset
@@ -87,10 +87,21 @@ class MMPIDataset(InputDataset):
     def get_data(self, image_idx: int, image_type: Literal["uint8", "float32"] = "float32") -> dict[str, Any]:
         """The image, and its mask where any image has one."""
         data = super().get_data(image_idx, image_type)
-        if self.has_masks:
-            data["mask"] = self._mask(image_idx, data["image"].shape[:2])
+        file, shape = self.mask_files[image_idx], data["image"].shape[:2]
+        if self.has_masks and file is None:
+            data["mask"] = torch.from_numpy(self.usable(image_idx))[..., None]
+        elif file is not None:
+            try:
+                data["mask"] = mask = get_image_mask_tensor_from_path(file, self.scale_factor)
+                if mask.shape[:2] != shape:
+                    raise ValueError(f"it has {mask.shape[1]} x {mask.shape[0]} pixels")
+            except UNREADABLE as error:
+                raise UnusableFile(
+                    f"Mask {file} cannot be used ({brief(error)}): give one channel of the image's size, white where "
+                    "used."
+                ) from error
         height, width = (int(n.reshape(-1)[image_idx]) for n in (self.cameras.height, self.cameras.width))
-        rows, columns = data["image"].shape[:2]
+        rows, columns = shape
         # Downscaled images may have been rounded up where cameras are rounded down: one pixel is cut off.
         if not (0 <= rows - height <= 1 and 0 <= columns - width <= 1):
             raise UnusableFile(
@@ -111,22 +122,6 @@ class MMPIDataset(InputDataset):
         if self.moving is not None:
             return ~self.moving[image_idx]
         return np.ones([int(n.reshape(-1)[image_idx]) for n in (self.cameras.height, self.cameras.width)], bool)
-
-    def _mask(self, image_idx: int, shape: Sequence[int]) -> Bool[Tensor, "H W 1"]:
-        """Where an image may be used: its mask file, else what does not move, else everywhere."""
-        file = self.mask_files[image_idx]
-        if file is None:
-            usable = np.ones(shape, bool) if self.moving is None else ~self.moving[image_idx]
-            return torch.from_numpy(usable)[..., None]
-        try:
-            mask = get_image_mask_tensor_from_path(file, self.scale_factor)
-            if mask.shape[:2] != tuple(shape):
-                raise ValueError(f"it has {mask.shape[1]} x {mask.shape[0]} pixels")
-        except UNREADABLE as error:
-            raise UnusableFile(
-                f"Mask {file} cannot be used ({brief(error)}): give one channel of the image's size, white where used."
-            ) from error
-        return mask
 
 
 def distances(depth: Float[Tensor, "H W"], camera: Cameras) -> Float[Tensor, "H W 1"]:

@@ -66,8 +66,8 @@ class SharedPoints:
     def of_images(self, images: Int[Tensor, "I"]) -> SharedPoints | None:
         """The points shared by two of the given images; None if there is none."""
         images = images.to(self.pixels)
-        own = (torch.isin(self.pixels[:, 0], images) & torch.isin(self.other, images)).nonzero()[:, 0]
-        return replace(self, **{name: getattr(self, name)[own] for name in PARTS}) if len(own) else None
+        shared = (torch.isin(self.pixels[:, 0], images) & torch.isin(self.other, images)).nonzero()[:, 0]
+        return replace(self, **{name: getattr(self, name)[shared] for name in PARTS}) if len(shared) else None
 
     def draw(
         self, count: int, rays: Rays, g: torch.Generator, exposures: Float[Tensor, "M 3"] | None = None
@@ -100,7 +100,7 @@ class SharedPoints:
 def find_shared_points(
     dataset: MMPIDataset,
     posed: PosedImages,
-    known: KnownDepth,
+    depth: KnownDepth,
     rays: Rays,
     images: Sequence[int],
     seed: int,
@@ -112,7 +112,7 @@ def find_shared_points(
     Args:
         dataset: the training images.
         posed: their cameras.
-        known: depths of their pixels.
+        depth: of their pixels.
         rays: makes rays through pixel centres (image, row, column).
         images: the images to compare.
         seed: of the draw of pixels where there are more than are kept.
@@ -122,14 +122,14 @@ def find_shared_points(
     Raises:
         InputError: an image or mask cannot be used (names the file).
     """
-    show = lru_cache(HELD)(
-        lambda i: (*image_and_mask(dataset, i), known.image(i))
-    )  # neighbours mostly stand side by side
-    rng, parts, found = np.random.default_rng(seed), [], 0.0
+    # Neighbours mostly stand side by side, so an image is asked for several times.
+    show = lru_cache(HELD)(lambda i: (*image_and_mask(dataset, i), depth.image(i)))
+    rng, parts, total = np.random.default_rng(seed), [], 0.0
     budget = max(1, MOST // (NEIGHBOURS * max(1, len(images))))
     for i in images:
-        own_image, usable, own_depths = show(i)
-        rows, columns = _certain(own_depths, usable)
+        image, usable, measured = show(i)
+        certain = (measured[..., 0] > 0) & (measured[..., 1] < CERTAIN * measured[..., 0]) & (usable > 0)
+        rows, columns = np.nonzero(certain)
         count = len(rows)
         if count > budget:
             chosen = np.sort(rng.choice(count, budget, replace=False))
@@ -138,22 +138,22 @@ def find_shared_points(
             continue
         pixels = torch.from_numpy(np.stack([np.full(len(rows), i), rows, columns], -1))
         directions = rays(pixels.to(device)).directions.double().cpu().numpy()
-        depths = own_depths[rows, columns]
-        points, own = posed.camera_to_worlds[i, :, 3] + directions / depths[:, :1], own_image[rows, columns]
+        depths, shown = measured[rows, columns], image[rows, columns]
+        points = posed.camera_to_worlds[i, :, 3] + directions / depths[:, :1]
         for j in nearest_views(posed.camera_to_worlds, i, NEIGHBOURS, MAX_ANGLE, images):
-            expected = own.astype(np.float32)
+            expected = shown.astype(np.float32)
             if exposures is not None:
                 expected[:, :3] *= (exposures[j] / exposures[i]).cpu().numpy()
             seen, colors = _seen_by(posed, j, points, expected.clip(0, 255), *show(j))
-            found += len(seen) * count / len(rows)
-            both = np.stack([own[seen], colors], 1)
+            total += len(seen) * count / len(rows)
+            both = np.stack([shown[seen], colors], 1)
             parts.append((pixels[seen].int(), torch.full((len(colors),), j, dtype=torch.int32), both, depths[seen]))
-    if found == 0:
+    if total == 0:
         return None
     pixels, other = (torch.cat([part[n] for part in parts]) for n in (0, 1))
     colors, depths = (torch.from_numpy(np.concatenate([part[n] for part in parts])) for n in (2, 3))
     centers = torch.from_numpy(posed.camera_to_worlds[:, :, 3]).float()
-    cover = found / sum(known.codes[i][..., 0].size for i in images)
+    cover = total / sum(depth.codes[i][..., 0].size for i in images)
     on_device = (x.to(device) for x in (pixels, other, colors, depths, centers))
     return SharedPoints(*on_device, cover=cover)
 
@@ -170,22 +170,16 @@ def image_and_mask(dataset: MMPIDataset, i: int) -> tuple[NDArray[np.uint8], NDA
     return image, usable
 
 
-def _certain(depth: NDArray[np.float32], usable: NDArray[np.uint8]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows and columns of the pixels with an accurate depth."""
-    rows, columns = np.nonzero((depth[..., 0] > 0) & (depth[..., 1] < CERTAIN * depth[..., 0]) & (usable > 0))
-    return rows, columns
-
-
 def _seen_by(
     posed: PosedImages,
     j: int,
     points: NDArray[np.float64],
-    own: NDArray[np.float32],
+    colors: NDArray[np.float32],
     image: NDArray[np.uint8],
     usable: NDArray[np.uint8],
     depth: NDArray[np.float32],
 ) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
-    """Which points an image shows at their own distance and with about the same colour, and the colours there."""
+    """Which points an image shows at their distance and with about their colours, and the colours there."""
     at = project(posed, j, points)
     about = np.ones((3, 3), np.uint8)
     inverse, may, darkest, brightest = (
@@ -194,6 +188,6 @@ def _seen_by(
     )
     expected = 1 / np.maximum(np.linalg.norm(points - posed.camera_to_worlds[j, :, 3], axis=-1), 1e-12)
     same_depth = (inverse > 0) & (np.abs(inverse - expected) < SAME_DEPTH * expected)
-    same_color = (own >= darkest.astype(int) - SAME_COLOR).all(-1) & (own <= brightest.astype(int) + SAME_COLOR).all(-1)
-    seen = np.nonzero(same_depth & same_color & (may > 0))[0]
+    low, high = darkest.astype(int) - SAME_COLOR, brightest.astype(int) + SAME_COLOR
+    seen = np.nonzero(same_depth & ((colors >= low) & (colors <= high)).all(-1) & (may > 0))[0]
     return seen, look_up(image, *at[seen].T)
