@@ -16,7 +16,7 @@ from filelock import FileLock, Timeout
 from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
 
-from mmpi_ns.utils.files import write_atomically
+from mmpi_ns.utils.files import cache_folder, write_atomically
 
 KEPT = 24
 """Number of cached results; the least recently used is removed first."""
@@ -27,11 +27,6 @@ MOST_BYTES = 10e9
 T = TypeVar("T")
 Arrays = Mapping[str, NDArray[np.generic]]
 Pairs = Iterable[tuple[str, NDArray[np.generic]]]
-
-
-def cache_folder() -> Path:
-    """``$XDG_CACHE_HOME/mmpi_ns``, by default in ``~/.cache``."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mmpi_ns"
 
 
 def digest(files: Iterable[Path], *parts: object) -> str:

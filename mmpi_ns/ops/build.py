@@ -19,6 +19,7 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
+from mmpi_ns.utils.files import cache_folder
 from mmpi_ns.utils.parallel import num_threads
 
 OPS = Path(__file__).parent
@@ -64,11 +65,6 @@ def library_file() -> Path:
     parts = [*texts, " ".join([*compiler(), *FLAGS]).encode(), processor.encode()]
     key = hashlib.sha256(b"\0".join(parts)).hexdigest()[:16]
     return cache_folder() / f"kernels-{key}.so"
-
-
-def cache_folder() -> Path:
-    """Where what was compiled, or tried, is remembered."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mmpi_ns"
 
 
 @functools.cache

@@ -86,12 +86,9 @@ def find_balls(observations: Observations, length: float) -> list[tuple[Array, f
     return [(middles[i], radii[i], MARGIN * longest) for i in order]
 
 
-def cameras_of(window: Window, observations: Observations) -> Observations:
-    """Observations of the cameras with a share in a window, which its placement and training use."""
-    if window.radius == np.inf:
-        return observations
-    middle = np.asarray(window.center)
-    return of_cameras(observations, cameras_in(observations.centers, middle, window.radius + window.margin))
+def cameras_of(window: Window, centers: Array) -> NDArray[np.int64]:
+    """Cameras with a share in a window, which its placement and training use; all cameras if there is only one."""
+    return cameras_in(centers, np.asarray(window.center), window.radius + window.margin)
 
 
 def cameras_in(centers: Array, middle: Array, radius: float) -> NDArray[np.int64]:

@@ -91,12 +91,12 @@ class PlanCommand:
         """Draws the pictures and returns the tables: for each window, over the observations of its own cameras."""
         from mmpi_ns.placement.show.explain import explain, table
         from mmpi_ns.placement.show.pictures import draw_errors, draw_plan, draw_windows
-        from mmpi_ns.placement.split import cameras_of
+        from mmpi_ns.placement.split import cameras_of, of_cameras
         from mmpi_ns.placement.visibility import find_visible_points
 
         parts = []
         for i, window in enumerate(windows.windows):
-            part = cameras_of(window, observations)
+            part = of_cameras(observations, cameras_of(window, observations.centers))
             visible = find_visible_points(part)
             report = explain(window.plan, part, visible)
             suffix = f"-{i}" if len(windows) > 1 else ""

@@ -106,7 +106,11 @@ def _shortage(
         plan, seen = window.plan, views_of(window)
         free = free_memory(device) - reserved_bytes(plan, work, device)
         everything = training_bytes(plan, None, work)
-        needed = max(_bytes_to_look(plan, seen), int(LEAST_SHARE * everything))
+        # To find the tiles in reach: marks, and the 4 side planes of every image at the tiles of one plane.
+        cameras = 0 if seen is None else len(seen.origins)
+        largest = max(-(-height // SIDE) * -(-width // SIDE) for _, height, width in head_shapes(plan))
+        looking = 8 * count_tiles(plan) + 4 * 8 * 3 * cameras * largest
+        needed = max(looking, int(LEAST_SHARE * everything))
         if needed <= free < everything:
             needed = training_bytes(plan, seen, work, device)
         if needed > free:
@@ -134,14 +138,6 @@ def step_bytes(plan: ScenePlan, work: Work) -> int:
     row = 4 * COPIES * (1 + work.feature_channels + work.two_phase)
     each = BYTES_PER_HIT * len(plan.mpis) + BYTES_PER_SLOT * room + BYTES_PER_PACKED * width
     return rays * (each + kept * taps * BYTES_PER_TAP) + min(rays * kept * taps, plan.texels) * row
-
-
-def _bytes_to_look(plan: ScenePlan, views: TrainingViews | None) -> int:
-    """Bytes needed to find the tiles that training rays can reach: marks, and the 4 side planes of every image at the
-    tiles of one plane (``visible_tiles``)."""
-    cameras = 0 if views is None else len(views.origins)
-    largest = max(-(-height // SIDE) * -(-width // SIDE) for _, height, width in head_shapes(plan))
-    return 8 * count_tiles(plan) + 4 * 8 * 3 * cameras * largest
 
 
 def count_tiles(plan: ScenePlan) -> int:

@@ -146,12 +146,11 @@ class Schedule:
 
     def watches(self, step: int) -> bool:
         """Whether the samples of a step count for the next release of bricks."""
-        return bool(self.release) and self._watched_from <= self._local(step) < self.release[-1]
-
-    @property
-    def _watched_from(self) -> int:
-        """The texels have the size that they have before the first release."""
-        return max([s for s in self.growth if s < self.release[0]], default=0) if self.growth else self._sharp_from
+        if not self.release:
+            return False
+        # From when on the texels have the size that they have before the first release.
+        first = max([s for s in self.growth if s < self.release[0]], default=0) if self.growth else self._sharp_from
+        return first <= self._local(step) < self.release[-1]
 
     def rate_factor(self, kind: str, step: int) -> float:
         """Learning rate of a parameter kind relative to its start value; 0 where it is frozen."""

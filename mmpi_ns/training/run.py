@@ -5,16 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import torch
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes
-from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import Parameter
 
 from mmpi_ns.capture.datamanager import MMPIDataManager
 from mmpi_ns.field.mmpi_field import MMPIField
-from mmpi_ns.placement.split import cameras_in
+from mmpi_ns.placement.split import cameras_of
 from mmpi_ns.rendering.window_store import WindowStore
 from mmpi_ns.scene.visible_tiles import TrainingViews
 from mmpi_ns.scene.windows import Window, WindowedPlan
@@ -54,11 +52,6 @@ class Progress(nn.Module):
         self.windows = WindowedPlan.from_json(to_text(self.windows_bytes))
         self.schedule = Schedule.from_json(to_text(self.schedule_bytes))
         self.window = int(self.window_number)
-
-
-def cameras_of(window: Window, centers: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Cameras whose rays the window renders; all cameras if there is only one window."""
-    return cameras_in(centers, np.asarray(window.center), window.radius + window.margin)
 
 
 def views_of(window: Window, views: TrainingViews | None) -> TrainingViews | None:

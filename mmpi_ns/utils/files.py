@@ -75,6 +75,11 @@ def write_errors(folder: Path, option: str) -> Iterator[None]:
         raise WriteError(f"{folder} cannot be written ({brief(error)}): choose another {option}.") from error
 
 
+def cache_folder() -> Path:
+    """``$XDG_CACHE_HOME/mmpi_ns``, by default in ``~/.cache``: what was computed, compiled or tried is remembered."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mmpi_ns"
+
+
 def to_bytes(text: str) -> UInt8[Tensor, "B"]:
     """Text as a buffer of a module."""
     import torch  # takes seconds, and most who write files need none of it
