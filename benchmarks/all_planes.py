@@ -22,11 +22,11 @@ def render_densely(field: MMPIField, bundle: RayBundle) -> tuple[Tensor, float]:
         Colours over grey [R, 3], and samples a ray.
     """
     assert bundle.nears is not None and bundle.fars is not None
-    hits = plane_hits(bundle.origins, bundle.directions, bundle.nears, bundle.fars, field.frames)
+    hits = plane_hits(bundle.origins, bundle.directions, bundle.nears, bundle.fars, field.layout.frames)
     taus, keys, colors = [], [], []
     count = len(bundle)
     for k, mpi in enumerate(field.plan.mpis):
-        live, u, v, inverse_t = crossings(hits, field.frames, k, mpi.planes)
+        live, u, v, inverse_t = crossings(hits, field.layout.frames, k, mpi.planes)
         planes, (u0, u1, v0, v1) = torch.arange(mpi.planes).expand(count, -1), mpi.extent
         ndc = (2 * (u - u0) / (u1 - u0) - 1, 2 * (v - v0) / (v1 - v0) - 1, 2 * planes / (mpi.planes - 1) - 1)
         ndc, planes = torch.stack(ndc, -1).reshape(-1, 3), planes.reshape(-1)

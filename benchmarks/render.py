@@ -107,7 +107,7 @@ class Render(Bench):
         facts = {"exact": exact, "default": default.name, "device": str(model.device)}
         report.content |= {**facts, "pixels": int(images[0][1].shape[0] * images[0][1].shape[1])}
         report.save()
-        bakes = model.field.shading == "ray" and model.field.cube is None
+        bakes = model.field.shading == "ray" and model.field.plan.cube is None
         wanted = [s for s in self._settings(default, bakes) if s.name not in report.rows]
         for number in range(self.rounds if wanted else 0):
             for setting in wanted:

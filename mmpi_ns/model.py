@@ -233,7 +233,7 @@ class MMPIModel(Model):
         While surfaces form, samples of little weight must learn too, and the cube starts nearly empty.
         """
         sampling, forming = self.config.sampling, not self.progress.schedule.sharpened(self.progress.step)
-        cube = 0.1 * sampling.cube_alpha if forming and self.field.cube is not None else float("inf")
+        cube = 0.1 * sampling.cube_alpha if forming and self.field.plan.cube is not None else float("inf")
         return {"threshold": min(sampling.threshold, cube), "fair_share": FAIR_SHARE if forming else float("inf")}
 
     def image_outputs(self, bundle: RayBundle, chunk: int | None = None) -> dict[str, Tensor]:

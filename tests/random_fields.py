@@ -113,7 +113,7 @@ def _encode(x, frequencies):
 
 
 def _color(networks, k, features, ndc, direction):
-    flat = networks.weights.detach().double().numpy()[k if networks.count > 1 else 0]
+    flat = networks.weights.detach().double().numpy()[k if len(networks.weights) > 1 else 0]
     layers, start = [], 0
     for shape in networks.shapes:
         layers.append(flat[start : start + math.prod(shape)].reshape(shape))

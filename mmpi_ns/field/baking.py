@@ -31,7 +31,7 @@ def bake_shares(field: MMPIField) -> Float[Tensor, "N 1"]:
         ndc = (2 * torch.stack([x, y, z], -1)[exists] / (sizes - 1) - 1).to(shares.dtype)
         for part, places in zip(stored[exists].split(AT_ONCE), ndc.split(AT_ONCE), strict=True):
             origins, directions, inverse_t = rays_to(field, k, places)
-            local = geometry.LocalRays.of(origins, directions, field.frames)
+            local = geometry.LocalRays.of(origins, directions, field.layout.frames)
             numbers = torch.arange(len(part), device=part.device)
             log_share, _ = field.log_shares(numbers, local, inverse_t, torch.full_like(numbers, k))
             shares[part, 0] = log_share.exp()
@@ -51,11 +51,11 @@ def rays_to(
     Returns:
         Origins, directions (not of unit length), and inverse distances in units of those.
     """
-    cube = field.cube
+    cube = field.layout.cube
     if k == len(field.plan.mpis):
         assert cube is not None
         return cube.lower.expand_as(ndc), (ndc + 1) / 2 * (cube.upper - cube.lower), torch.ones_like(ndc[:, 0])
-    mpi, frames = field.plan.mpis[k], field.frames
+    mpi, frames = field.plan.mpis[k], field.layout.frames
     u0, u1, v0, v1 = mpi.extent
     u, v = u0 + (ndc[:, 0] + 1) / 2 * (u1 - u0), v0 + (ndc[:, 1] + 1) / 2 * (v1 - v0)
     disparity = (1 - ndc[:, 2]) / 2 / mpi.near * mpi.depth_share + mpi.last_disparity

@@ -24,10 +24,6 @@ class Networks(nn.Module):
         self.weights = nn.Parameter(torch.empty(0, sum(math.prod(s) for s in self.shapes)))
         self.resize(count)
 
-    @property
-    def count(self) -> int:
-        return self.weights.shape[0]
-
     @torch.no_grad()
     def resize(self, count: int) -> None:
         """Allocates ``count`` new networks."""

@@ -118,7 +118,7 @@ class MMPIField(TexelTables):
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
         """Takes the number of colour networks from the checkpoint first."""
         stored = state_dict.get(prefix + "networks.weights")
-        if stored is not None and stored.shape[0] != self.networks.count:
+        if stored is not None and stored.shape[0] != len(self.networks.weights):
             self.networks.resize(stored.shape[0])
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
@@ -143,14 +143,6 @@ class MMPIField(TexelTables):
     def tables(self) -> Tables:
         """What the march reads."""
         return Tables(self.density.data, self.reliability.data, self.touched)
-
-    @property
-    def frames(self) -> geometry.Frames:
-        return self.layout.frames
-
-    @property
-    def cube(self) -> geometry.Cube | None:
-        return self.layout.cube
 
     @property
     def depth_scale(self) -> float:
@@ -209,8 +201,8 @@ class MMPIField(TexelTables):
         self, ray_samples: RaySamples, density_embedding: Lookup | None = None
     ) -> dict[FieldHeadNames, Tensor]:
         """Colours of the valid samples (diffuse ones where a ray is shaded once); empty slots are black."""
-        directions, axes, networks = ray_samples.frustums.directions[:, 0], self.frames.axes, self.networks
-        if self.cube is not None:
+        directions, axes, networks = ray_samples.frustums.directions[:, 0], self.layout.frames.axes, self.networks
+        if self.layout.cube is not None:
             axes = torch.cat([axes, torch.eye(3, device=axes.device)[None]])
         if isinstance(networks, ColorNetworks) and density_embedding is None and not torch.is_grad_enabled():
             shading = (networks.of_heads(len(axes)), axes, directions, places_of(ray_samples))
@@ -275,7 +267,7 @@ class MMPIField(TexelTables):
         frustums = ray_samples.frustums
         # Shares do not move with poses.
         origins, directions = frustums.origins[:, 0].detach(), frustums.directions[:, 0].detach()
-        local = geometry.LocalRays.of(origins, directions, self.frames)
+        local = geometry.LocalRays.of(origins, directions, self.layout.frames)
         inverse_t = metadata_of(ray_samples)["inverse_t"].reshape(-1)[lookup.index]
         return self.log_shares(lookup.rays, local, inverse_t, lookup.heads)
 

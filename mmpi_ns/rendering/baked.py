@@ -154,7 +154,7 @@ def why_not_baked(model_field: MMPIField) -> str:
             "A model whose samples are coloured one by one cannot be baked: train with "
             "--pipeline.model.colour.shading ray."
         )
-    if model_field.cube is not None:
+    if model_field.plan.cube is not None:
         return "A model with a cube cannot be baked: train one of MPIs alone (placement.cube-voxels 0)."
     channels = model_field.feature_channels
     if channels > MOST_CHANNELS:

@@ -22,7 +22,7 @@ def encoded(x, octaves):
 
 def by_formula(networks, head, features, ndc, directions, rays, octaves):
     """sigmoid(features + network(features, PE(ndc), PE(direction))), from the pooled numbers."""
-    numbers, layers, at = networks.weights[min(head, networks.count - 1)].double(), [], 0
+    numbers, layers, at = networks.weights[min(head, len(networks.weights) - 1)].double(), [], 0
     sizes = (features.shape[1] + 3 * (1 + 2 * octaves[0]) + 3 * (1 + 2 * octaves[1]), networks.width, networks.width, 3)
     for inputs, outputs in pairwise(sizes):
         matrix = numbers[at : at + inputs * outputs].view(outputs, inputs)

@@ -145,7 +145,7 @@ def test_a_head_votes_inside_its_frustum_where_it_was_trained_and_a_sample_count
     """Ray along z from the origin: 'front' holds it all, 'left' and the cube a part."""
     field = fill(MMPIField(plan), seed=4)
     rays = bundle([[0, 0, 0]], [[0, 0, 1]])
-    local = LocalRays.of(rays.origins, rays.directions, field.frames)
+    local = LocalRays.of(rays.origins, rays.directions, field.layout.frames)
     t = torch.tensor([1.5, 3.0, 6.0, 100.0])  # before the cube, in all three heads, behind it twice
     rows, own = torch.zeros(4, dtype=torch.int64), torch.zeros(4, dtype=torch.int64)
     field.reliability.data.fill_(0.0)  # equal votes: P = 1 / number of heads that cover the point

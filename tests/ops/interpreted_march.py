@@ -51,7 +51,7 @@ def test_hits_of_hard_rays_are_those_of_the_reference():
     plan = hard_plan()
     field, rays = MMPIField(plan), hard_rays()
     found = plane_hits(field.layout, rays_of(rays))
-    wanted = geometry.plane_hits(*rays_of(rays)[:4], field.frames)
+    wanted = geometry.plane_hits(*rays_of(rays)[:4], field.layout.frames)
     assert torch.equal(found.count, wanted.count) and (wanted.count > 0).any()
     live = wanted.count > 0
     assert torch.equal(found.m_first[live], wanted.m_first[live])
