@@ -153,8 +153,7 @@ def know_depths(
 
 def _remembered_depths(original: PosedImages, posed: PosedImages, observations: Observations) -> KnownDepth:
     """Depths by dense matching, from the cache if possible."""
-    tracked = len(observations.seen_at)
-    seen_by, points = observations.seen_by[:tracked], observations.points[observations.seen_point[:tracked]]
+    seen_by, points = observations.tracked
     shapes = [(int(h), int(w)) for w, h in observations.sizes]
     file_shapes = [_file_shape(original, posed, i) for i in range(len(shapes))]
     widest, pixels = max(w for _, w in shapes), sum(w * h for h, w in shapes)
@@ -361,8 +360,7 @@ def best_of_cells(depth: Map) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 
 def with_points(depths: KnownDepth, observations: Observations) -> KnownDepth:
     """Adds the distances of SfM points at the pixels that saw them; the nearest where several fall on one."""
-    count = len(observations.seen_at)
-    cameras, points = observations.seen_by[:count], observations.points[observations.seen_point[:count]]
+    cameras, points = observations.tracked
     distance = np.linalg.norm(points - observations.centers[cameras], axis=-1)
     inverse = packed(np.outer(1 / np.maximum(distance, 1e-30), [1, POINT_ERROR]))
     columns, rows = observations.seen_at.astype(int).T

@@ -170,9 +170,7 @@ class Keypoints:
     @staticmethod
     def of(observations: Observations, device: str | torch.device) -> Keypoints | None:
         """Keypoint rays of all training images; None if there are none."""
-        # Points of a plane sweep come after those of the tracks: too rough to supervise depth.
-        tracked = slice(len(observations.seen_at))
-        cameras, points = observations.seen_by[tracked], observations.points[observations.seen_point[tracked]]
+        cameras, points = observations.tracked
         if not len(cameras):
             return None
         origins = observations.centers[cameras]

@@ -55,6 +55,12 @@ class Observations:
         return self.camera_to_worlds[:, :, 3]
 
     @property
+    def tracked(self) -> tuple[NDArray[np.int64], Array]:
+        """Camera [S] and point [S, 3] of each keypoint of SfM; those of a plane sweep are too rough for depths."""
+        count = len(self.seen_at)
+        return self.seen_by[:count], self.points[self.seen_point[:count]]
+
+    @property
     def mean_axes(self) -> Array:
         """Rows x (right), y (down), z (facing) of the mean camera; gravity is the cameras' mean up vector.
 
