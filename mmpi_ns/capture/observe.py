@@ -173,14 +173,14 @@ def _fitting_tracks(observations: Observations, cameras: Cameras) -> Observation
             "[bold yellow]The COLMAP model does not fit the cameras (its points project elsewhere), so its tracks are "
             "not used: state its frame as applied_transform in transforms.json."
         )
-        return _keep_keypoints(replace(observations, points=np.zeros((0, 3))), np.zeros(len(angles), np.bool_))
+        return replace(observations.with_keypoints(np.zeros(len(angles), np.bool_)), points=np.zeros((0, 3)))
     ahead = angles < np.pi / 2
     if not ahead.all():
         CONSOLE.print(
             f"[bold yellow]{(~ahead).sum()} of {len(ahead)} keypoints have their point behind the camera and are not "
             "used: check the COLMAP model."
         )
-    return _keep_keypoints(observations, ahead)
+    return observations.with_keypoints(ahead)
 
 
 def keypoint_angles(observations: Observations, cameras: Cameras) -> NDArray[np.float64]:
@@ -192,15 +192,6 @@ def keypoint_angles(observations: Observations, cameras: Cameras) -> NDArray[np.
     offsets = observations.points[observations.seen_point] - observations.centers[observations.seen_by]
     across = np.linalg.norm(np.cross(directions, offsets), axis=-1)
     return np.arctan2(across, (directions * offsets).sum(-1))
-
-
-def _keep_keypoints(observations: Observations, keep: NDArray[np.bool_]) -> Observations:
-    return replace(
-        observations,
-        seen_by=observations.seen_by[keep],
-        seen_point=observations.seen_point[keep],
-        seen_at=observations.seen_at[keep[: len(observations.seen_at)]],
-    )
 
 
 def posed_images(observations: Observations, dataset: MMPIDataset) -> PosedImages | None:
@@ -241,4 +232,4 @@ def drop_masked(observations: Observations, dataset: MMPIDataset) -> Observation
         keypoints = np.nonzero(observations.seen_by[: len(observations.seen_at)] == i)[0]
         x, y = observations.seen_at[keypoints].astype(int).T
         keep[keypoints] = mask[y.clip(0, mask.shape[0] - 1), x.clip(0, mask.shape[1] - 1)]
-    return _keep_keypoints(observations, keep)
+    return observations.with_keypoints(keep)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -59,6 +59,11 @@ class Observations:
         """Camera [S] and point [S, 3] of each keypoint of SfM; those of a plane sweep are too rough for depths."""
         count = len(self.seen_at)
         return self.seen_by[:count], self.points[self.seen_point[:count]]
+
+    def with_keypoints(self, keep: NDArray[np.bool_]) -> Observations:
+        """The observations with these keypoints [Q] alone. Points keep their numbers."""
+        seen_at = self.seen_at[keep[: len(self.seen_at)]]
+        return replace(self, seen_by=self.seen_by[keep], seen_point=self.seen_point[keep], seen_at=seen_at)
 
     @property
     def mean_axes(self) -> Array:

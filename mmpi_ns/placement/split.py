@@ -100,15 +100,13 @@ def of_cameras(observations: Observations, cameras: NDArray[np.int64]) -> Observ
     """Observations of some of the cameras. Points keep their numbers."""
     number = np.full(len(observations.centers), -1)
     number[cameras] = np.arange(len(cameras))
-    keep = number[observations.seen_by] >= 0
+    observations = observations.with_keypoints(number[observations.seen_by] >= 0)
     return replace(
         observations,
         camera_to_worlds=observations.camera_to_worlds[cameras],
         intrinsics=observations.intrinsics[cameras],
         sizes=observations.sizes[cameras],
-        seen_by=number[observations.seen_by[keep]],
-        seen_point=observations.seen_point[keep],
-        seen_at=observations.seen_at[keep[: len(observations.seen_at)]],
+        seen_by=number[observations.seen_by],
         lens=None if observations.lens is None else observations.lens[cameras],
     )
 
