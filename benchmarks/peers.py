@@ -1,5 +1,5 @@
 """What nerfstudio's methods lack on a bare machine or beside ours: a reader of point clouds that does not need open3d,
-lookups in hash tables that are quick without a GPU, and the depths that our methods find."""
+lookups in hash tables that are quick without a GPU, no weights of LPIPS, and the depths that our methods find."""
 
 from __future__ import annotations
 
@@ -8,10 +8,28 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from mmpi_ns.capture.local_origin import parser_points
 from mmpi_ns.ops.interpolate import weigh_rows
+
+
+class NoLPIPS(nn.Module):
+    """Stands in for the metric that nerfstudio's models build in their constructors."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__()
+
+    def forward(self, *args: Any) -> Tensor:
+        return torch.tensor(float("nan"))
+
+
+def leave_lpips_out() -> None:
+    """Makes nerfstudio's models of this process take ``NoLPIPS``, if they are imported later: the weights of LPIPS may
+    be out of reach."""
+    import torchmetrics.image.lpip as home
+
+    home.LearnedPerceptualImagePatchSimilarity = NoLPIPS  # type: ignore[misc]
 
 
 def read_points_ourselves() -> None:

@@ -12,6 +12,7 @@ from all_planes import DenseSteps
 from apart import Tell, run_apart
 from lab import SceneBench, end_helpers, figure
 from methods import METHODS, Method
+from peers import leave_lpips_out
 from report import Report, Row, page, table
 from trainings import Request, train_apart
 
@@ -94,6 +95,7 @@ def take_turns(request: dict[str, Any], tell: Tell) -> Row:
         Rays/s of each round for ours, dense and nerfacto; after training, seconds of a frame and of a large one and
         rays/s of nerfacto's rendering; pixels of the frames; samples a ray of the dense reference.
     """
+    leave_lpips_out()
     ours = Steps(request["ours"])
     dense, nerfacto = DenseSteps(ours), Steps(request["nerfacto"])
     assert nerfacto.rays == ours.rays

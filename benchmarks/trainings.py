@@ -23,7 +23,7 @@ from apart import Tell, run_apart
 from lab import end_helpers, peak_gib
 from methods import Method
 from numpy.typing import NDArray
-from peers import give_depths, look_up_quickly, read_points_ourselves
+from peers import give_depths, leave_lpips_out, look_up_quickly, read_points_ourselves
 from report import read_json, write_json
 
 from mmpi_ns.bench.score import evenly
@@ -251,6 +251,7 @@ def train(asked: dict[str, Any], tell: Tell = print) -> dict[str, Any]:
     """
     plain: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in asked.items()}
     request = Request(**plain)
+    leave_lpips_out()
     read_points_ourselves()
     if request.quick_hashes:
         look_up_quickly()

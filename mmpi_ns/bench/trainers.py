@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import nn
 
 P = "--pipeline.model.placement."
 JOINT = ("--pipeline.model.schedule.training", "joint")
@@ -61,23 +60,11 @@ def no_tracks() -> tuple[str, ...]:
     return ("--pipeline.datamanager.sfm-path", "none", "--pipeline.datamanager.triangulate", "False")
 
 
-class NoLPIPS(nn.Module):
-    """Stands in for the metric that peers build in their constructors, whose weights may be out of reach."""
-
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__()
-
-    def forward(self, *args: Any) -> torch.Tensor:
-        return torch.tensor(float("nan"))
-
-
 def config_of(words: Sequence[str]) -> Any:
-    """The config that ``ns-train`` would train with. Models that it makes take ``NoLPIPS``."""
-    import torchmetrics.image.lpip as home
+    """The config that ``ns-train`` would train with."""
     import tyro
     from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
 
-    home.LearnedPerceptualImagePatchSimilarity = NoLPIPS  # type: ignore[misc]
     config: Any = tyro.cli(AnnotatedBaseConfigUnion, args=list(words))
     config.pipeline.datamanager.data = config.data
     return config

@@ -230,12 +230,10 @@ def at_training_pixels(
     Returns:
         [H, W, 2] inverse distance and expected error.
     """
-    height, width = shape
-    small = (width, height)
-    mean, error = pooled(depth, (small[1], small[0]))
+    mean, error = pooled(depth, shape)
     x, y = straightened(original, i, shape, file_shape)
     fx, fy, cx, cy = view.pinhole
-    scale_x, scale_y = small[0] / view.gray.shape[1], small[1] / view.gray.shape[0]
+    scale_y, scale_x = shape[0] / view.gray.shape[0], shape[1] / view.gray.shape[1]
     at = (((fx * x + cx) * scale_x).reshape(shape), ((fy * y + cy) * scale_y).reshape(shape))
     longer = np.sqrt(x**2 + y**2 + 1).reshape(shape)
     take = [look_up(m, *at, nearest=True) / longer for m in (mean, error)]

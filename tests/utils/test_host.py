@@ -19,11 +19,16 @@ from mmpi_ns.utils import host
 from mmpi_ns.utils.errors import InputError
 
 ROOT = Path(mmpi_ns.__file__).parent
-METHOD = ("utils", "scene", "ops", "placement", "capture", "field", "rendering", "training", "export")
-FILES = [ROOT / "model.py", ROOT / "config.py", *(path for wing in METHOD for path in (ROOT / wing).rglob("*.py"))]
+WINGS = (
+    *("utils", "scene", "ops", "placement", "capture", "field", "rendering", "training", "export"),
+    *("prepare", "synthetic", "bench"),
+)
+FILES = [*ROOT.glob("*.py"), *(path for wing in WINGS for path in (ROOT / wing).rglob("*.py"))]
 HOST_CALLS = {"signal.signal", "sys.settrace", "warnings.filterwarnings", "warnings.simplefilter", "setattr"}
 LISTED = {
     ("capture/sfm.py", "signal.signal"),  # puts back what pycolmap replaces at its import
+    ("prepare/pairs.py", "warnings.simplefilter"),  # in a block that puts the filters back
+    ("bench/gpu.py", "warnings.simplefilter"),  # likewise
 }
 
 
