@@ -86,8 +86,8 @@ class KnownDepth:
     @cached_property
     def share(self) -> float:
         """Share of all pixels whose distance is known."""
-        count = sum(int((m[..., 0] != UNKNOWN).sum()) for m in self.codes)
-        return count / max(1, sum(m[..., 0].size for m in self.codes))
+        known = sum(int((m[..., 0] != UNKNOWN).sum()) for m in self.codes)
+        return known / max(1, sum(m[..., 0].size for m in self.codes))
 
 
 def packed(values: ArrayLike) -> Codes:
@@ -125,30 +125,30 @@ def know_depths(
     """
     if not (dense or sensor or observations.loose is not None):
         return None, observations
-    depths, posed = KnownDepth.nothing(observations.sizes), posed_images(observations, dataset)
+    known, posed = KnownDepth.nothing(observations.sizes), posed_images(observations, dataset)
     files = outputs.metadata.get("depth_filenames") if sensor else None
     if posed is None or not (dense or files or observations.loose is not None):
-        return depths, observations
+        return known, observations
     original, seen = at_full_size(posed), observations
     cloud = None if observations.loose is None else see_points(observations.loose, posed)
     if cloud is not None:
         seen = cloud.added_to(observations)
     if dense:
-        depths = _remembered_depths(original, posed, seen)
+        known = _remembered_depths(original, posed, seen)
     if dense and cloud is not None:
-        cloud = see_points(cloud.points, posed, depths.image)
+        cloud = see_points(cloud.points, posed, known.image)
         seen = cloud.added_to(observations) if cloud.fits else replace(observations, loose=None)
-        depths = depths if cloud.fits else _remembered_depths(original, posed, seen)
+        known = known if cloud.fits else _remembered_depths(original, posed, seen)
     if cloud is not None:
         say(cloud.describe())
         seen = drop_masked(seen, dataset)
-    depths = with_points(depths, seen)
+    known = with_points(known, seen)
     if files:
         unit = outputs.metadata.get("depth_unit_scale_factor", 1.0) * outputs.dataparser_scale
-        depths = with_sensor(depths, [Path(f) for f in files], float(unit), original, posed)
-    depths = with_continued(depths, posed, dataset)
+        known = with_sensor(known, [Path(f) for f in files], float(unit), original, posed)
+    known = with_continued(known, posed, dataset)
     give_back_freed_memory()
-    return depths, seen
+    return known, seen
 
 
 def _remembered_depths(original: PosedImages, posed: PosedImages, observations: Observations) -> KnownDepth:
@@ -195,12 +195,12 @@ def _file_shape(original: PosedImages, posed: PosedImages, i: int) -> tuple[int,
 
 
 def with_sensor(
-    depths: KnownDepth, files: list[Path], unit: float, original: PosedImages, posed: PosedImages
+    known: KnownDepth, files: list[Path], unit: float, original: PosedImages, posed: PosedImages
 ) -> KnownDepth:
     """Replaces depths by those of sensors where there are any; where both are known and contradict, neither is kept."""
 
     def replaced(i: int) -> Codes:
-        codes = depths.codes[i]
+        codes = known.codes[i]
         shape = codes.shape[0], codes.shape[1]
         measured = packed(read_sensor(files[i], unit, original, i, shape, _file_shape(original, posed, i)))
         apart = contradict(*(unpacked(torch.from_numpy(x)).numpy() for x in (measured, codes)))
@@ -230,10 +230,12 @@ def at_training_pixels(
     Returns:
         [H, W, 2] inverse distance and expected error.
     """
-    mean, error = pooled(depth, shape)
+    height, width = shape
+    small = (width, height)
+    mean, error = pooled(depth, (small[1], small[0]))
     x, y = straightened(original, i, shape, file_shape)
     fx, fy, cx, cy = view.pinhole
-    scale_y, scale_x = shape[0] / view.gray.shape[0], shape[1] / view.gray.shape[1]
+    scale_x, scale_y = small[0] / view.gray.shape[1], small[1] / view.gray.shape[0]
     at = (((fx * x + cx) * scale_x).reshape(shape), ((fy * y + cy) * scale_y).reshape(shape))
     longer = np.sqrt(x**2 + y**2 + 1).reshape(shape)
     take = [look_up(m, *at, nearest=True) / longer for m in (mean, error)]
@@ -242,11 +244,11 @@ def at_training_pixels(
 
 def pooled(depth: Depth, shape: tuple[int, int]) -> tuple[Map, Map]:
     """Inverse depth and error over the areas of a coarser grid [h, w]; 0 where too little of an area is known."""
-    measured = (depth.inverse > 0).astype(np.float32)
-    weight = measured / np.maximum(depth.error, 1e-12) ** 2
+    known = (depth.inverse > 0).astype(np.float32)
+    weight = known / np.maximum(depth.error, 1e-12) ** 2
     cover, total, first, second = (
         cv2.resize(m.astype(np.float64), shape[::-1], interpolation=cv2.INTER_AREA)
-        for m in (measured, weight, weight * depth.inverse, weight * depth.inverse**2)
+        for m in (known, weight, weight * depth.inverse, weight * depth.inverse**2)
     )
     mean = first / np.maximum(total, 1e-30)
     spread = np.maximum(second / np.maximum(total, 1e-30) - mean**2, 0)
@@ -266,25 +268,25 @@ def straightened(
         fx, fy, cx, cy = original.intrinsics[i]
         return (at[:, 0, 0] - cx) / fx, (at[:, 0, 1] - cy) / fy
     straighten = cv2.fisheye.undistortPoints if original.is_fisheye(i) else cv2.undistortPoints
-    tangents = straighten(at, camera_matrix(original.intrinsics[i]), original.distortion[i])[:, 0]
-    return np.asarray(tangents[:, 0], np.float64), np.asarray(tangents[:, 1], np.float64)
+    found = straighten(at, camera_matrix(original.intrinsics[i]), original.distortion[i])[:, 0]
+    return np.asarray(found[:, 0], np.float64), np.asarray(found[:, 1], np.float64)
 
 
-def with_continued(depths: KnownDepth, posed: PosedImages, dataset: MMPIDataset) -> KnownDepth:
+def with_continued(known: KnownDepth, posed: PosedImages, dataset: MMPIDataset) -> KnownDepth:
     """Extrapolates surfaces into regions that hardly any other image shows (``lone_depth.py``); cached.
 
     Masked pixels have no distance: what moves is nowhere.
     """
-    count = len(depths.codes)
+    count = len(known.codes)
 
     def continue_all() -> Pairs:
-        codes = in_order(lambda i: _continued_codes(depths.codes[i], i, posed, dataset), range(count))
+        codes = in_order(lambda i: _continued_codes(known.codes[i], i, posed, dataset), range(count))
         shown = track(codes, "Extrapolating surfaces", count, console=CONSOLE)
         return ((f"{i}", image) for i, image in enumerate(shown))
 
     cameras = posed.camera_to_worlds, posed.intrinsics, posed.distortion, posed.fisheye
     masks = [digest((), dataset.usable(i)) for i in range(count)] if dataset.has_masks else []
-    contents = [digest((), codes) for codes in depths.codes]
+    contents = [digest((), codes) for codes in known.codes]
     key = digest(posed.files, "continued", VERSION, *cameras, contents, masks)
     return _stored(remembered(key, continue_all))
 
@@ -311,7 +313,7 @@ def _continued_codes(codes: Codes, i: int, posed: PosedImages, dataset: MMPIData
     return codes
 
 
-def of_cells(observations: Observations, depths: KnownDepth, dataset: MMPIDataset) -> Observations:
+def of_cells(observations: Observations, known: KnownDepth, dataset: MMPIDataset) -> Observations:
     """The observations that placement weighs: of each image cell the pixel with the most certain depth.
 
     Each cell counts once. Keypoints come before them unless they are ``MOST_KEYPOINTS`` times as many: they would then
@@ -319,8 +321,8 @@ def of_cells(observations: Observations, depths: KnownDepth, dataset: MMPIDatase
     at all, the observations stay as they are.
     """
     seen_by, points = [observations.seen_by[:0]], [observations.points[:0]]
-    for i in range(len(depths.codes)):
-        depth = depths.image(i)
+    for i in range(len(known.codes)):
+        depth = known.image(i)
         rows, columns = best_of_cells(depth)
         if not len(rows):
             continue
@@ -356,7 +358,7 @@ def best_of_cells(depth: Map) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     return down * side + best[kept] // side, across * side + best[kept] % side
 
 
-def with_points(depths: KnownDepth, observations: Observations) -> KnownDepth:
+def with_points(known: KnownDepth, observations: Observations) -> KnownDepth:
     """Adds the distances of SfM points at the pixels that saw them; the nearest where several fall on one."""
     cameras, points = observations.tracked
     distance = np.linalg.norm(points - observations.centers[cameras], axis=-1)
@@ -364,14 +366,14 @@ def with_points(depths: KnownDepth, observations: Observations) -> KnownDepth:
     columns, rows = observations.seen_at.astype(int).T
 
     def added(i: int) -> Codes:
-        codes = np.array(depths.codes[i])
+        codes = np.array(known.codes[i])
         inside = (rows >= 0) & (rows < codes.shape[0]) & (columns >= 0) & (columns < codes.shape[1])
         chosen = np.nonzero((cameras == i) & inside & (distance > 0))[0]
         chosen = chosen[np.argsort(-distance[chosen], kind="stable")]  # the last one written stays
         codes[rows[chosen], columns[chosen]] = inverse[chosen]
         return codes
 
-    return KnownDepth(Computed(len(depths.codes), added))
+    return KnownDepth(Computed(len(known.codes), added))
 
 
 def read_sensor(
@@ -394,6 +396,6 @@ def read_sensor(
     nearest = cv2.resize(depth, file_shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT)[: shape[0], : shape[1]]
     x, y = straightened(original, i, shape, file_shape)
     longer = np.sqrt(x**2 + y**2 + 1).reshape(shape)
-    measured = np.isfinite(nearest) & (nearest > 0)
-    inverse = np.where(measured, 1 / (np.where(measured, nearest, 1) * longer), 0)
+    known = np.isfinite(nearest) & (nearest > 0)
+    inverse = np.where(known, 1 / (np.where(known, nearest, 1) * longer), 0)
     return np.stack([inverse, SENSOR_ERROR * inverse], -1).astype(np.float32)

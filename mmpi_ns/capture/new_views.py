@@ -100,7 +100,7 @@ class SharedPoints:
 def find_shared_points(
     dataset: MMPIDataset,
     posed: PosedImages,
-    depth: KnownDepth,
+    known: KnownDepth,
     rays: Rays,
     images: Sequence[int],
     seed: int,
@@ -112,7 +112,7 @@ def find_shared_points(
     Args:
         dataset: the training images.
         posed: their cameras.
-        depth: of their pixels.
+        known: depths of their pixels.
         rays: makes rays through pixel centres (image, row, column).
         images: the images to compare.
         seed: of the draw of pixels where there are more than are kept.
@@ -122,9 +122,10 @@ def find_shared_points(
     Raises:
         InputError: an image or mask cannot be used (names the file).
     """
-    # Neighbours mostly stand side by side, so an image is asked for several times.
-    show = lru_cache(HELD)(lambda i: (*image_and_mask(dataset, i), depth.image(i)))
-    rng, parts, total = np.random.default_rng(seed), [], 0.0
+    show = lru_cache(HELD)(
+        lambda i: (*image_and_mask(dataset, i), known.image(i))
+    )  # neighbours mostly stand side by side
+    rng, parts, found = np.random.default_rng(seed), [], 0.0
     budget = max(1, MOST // (NEIGHBOURS * max(1, len(images))))
     for i in images:
         image, usable, measured = show(i)
@@ -145,15 +146,15 @@ def find_shared_points(
             if exposures is not None:
                 expected[:, :3] *= (exposures[j] / exposures[i]).cpu().numpy()
             seen, colors = _seen_by(posed, j, points, expected.clip(0, 255), *show(j))
-            total += len(seen) * count / len(rows)
+            found += len(seen) * count / len(rows)
             both = np.stack([shown[seen], colors], 1)
             parts.append((pixels[seen].int(), torch.full((len(colors),), j, dtype=torch.int32), both, depths[seen]))
-    if total == 0:
+    if found == 0:
         return None
     pixels, other = (torch.cat([part[n] for part in parts]) for n in (0, 1))
     colors, depths = (torch.from_numpy(np.concatenate([part[n] for part in parts])) for n in (2, 3))
     centers = torch.from_numpy(posed.camera_to_worlds[:, :, 3]).float()
-    cover = total / sum(depth.codes[i][..., 0].size for i in images)
+    cover = found / sum(known.codes[i][..., 0].size for i in images)
     on_device = (x.to(device) for x in (pixels, other, colors, depths, centers))
     return SharedPoints(*on_device, cover=cover)
 
