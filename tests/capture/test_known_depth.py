@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import cv2
 import numpy as np
 import pytest
@@ -178,7 +176,5 @@ def test_a_depth_image_that_cannot_be_read_is_named(tmp_path, content):
 
 
 def test_the_observations_need_no_points():
-    observations = SimpleNamespace(
-        **vars(seen(np.zeros((0, 3)), np.zeros(0, int), np.zeros((0, 2)))), centers=np.zeros((2, 3))
-    )
-    assert with_points(KnownDepth.nothing(observations.sizes), observations).share == 0  # type: ignore[arg-type]
+    observations = seen(np.zeros((0, 3)), np.zeros(0, int), np.zeros((0, 2)))
+    assert with_points(KnownDepth.nothing(observations.sizes), observations).share == 0
