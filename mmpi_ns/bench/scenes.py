@@ -79,21 +79,17 @@ class Scene:
         with torch.no_grad():
             samples, depths = samples_of(exact.render())
             for draw in range(4):
-                moved = samples_of(replace(exact, bundle=_moved(exact.bundle, draw)).render())
+                # Every number of the rays moved by up to CLEAR of it.
+                g, rays = torch.Generator().manual_seed(draw), in_float64(exact.bundle)
+                draws = (2 * torch.rand(rays.origins.shape, generator=g, dtype=torch.float64) - 1 for _ in "od")
+                by_origin, by_direction = (1 + CLEAR * x for x in draws)
+                rays.origins, rays.directions = rays.origins * by_origin, rays.directions * by_direction
+                moved = samples_of(replace(exact, bundle=rays).render())
                 for i, (still, others, a, b) in enumerate(zip(samples, moved[0], depths, moved[1], strict=True)):
                     kept[i] &= len(still) > 0 and still == others and bool(((a - b).abs() <= SAME_DEPTH * a).all())
         if kept.sum() < len(kept) / 4:
             raise ValueError(f"Only {int(kept.sum())} of {len(kept)} rays are clear: choose another seed.")
         return replace(self, bundle=self.bundle[kept])
-
-
-def _moved(bundle: RayBundle, seed: int) -> RayBundle:
-    """float64 rays with every number moved by up to ``CLEAR`` of it."""
-    g, moved = torch.Generator().manual_seed(seed), in_float64(bundle)
-    shape = moved.origins.shape
-    by_origin, by_direction = (1 + CLEAR * (2 * torch.rand(shape, generator=g, dtype=torch.float64) - 1) for _ in "od")
-    moved.origins, moved.directions = moved.origins * by_origin, moved.directions * by_direction
-    return moved
 
 
 def samples_of(rendered: RenderedRays) -> tuple[list[list[tuple[int, int]]], list[Tensor]]:

@@ -41,26 +41,20 @@ def moving(
         ndc: their positions.
     """
     count = len(heads) if layout.cube is None else int(torch.searchsorted(heads, len(layout.mpis)))
-    parts = [_on_planes(layout, origins, directions, rays[:count], heads[:count], planes[:count])]
-    if layout.cube is not None:
-        in_cube = rays[count:]
-        parts.append(layout.cube.normalised(origins[in_cube] + directions[in_cube] / inverse_t[count:, None]))
-    moved = torch.cat(parts)
-    return ndc + (moved - moved.detach())
-
-
-def _on_planes(
-    layout: SceneLayout, origins: Tensor, directions: Tensor, rays: Tensor, heads: Tensor, planes: Tensor
-) -> Float[Tensor, "N 3"]:
-    """NDC (u, v, .) at which rays cross planes, up to a constant."""
-    frames = layout.frames
+    frames, mpis = layout.frames, heads[:count]
     local = LocalRays.of(origins, directions, frames)
     o, d = local.local_origins, local.local_directions
     facing = d[..., 2:] > FACING_EPS  # where it is not there are no samples
     slope = d[..., :2] / torch.where(facing, d[..., 2:], 1)
     bend = o[..., :2] - o[..., 2:] * slope
-    line = torch.cat([slope, bend], -1).flatten(0, 1).index_select(0, rays * len(layout.mpis) + heads)
-    m = frames.num_planes[heads] - 1 - planes
-    w = sample_disparity(m, frames.disparity_steps[heads], frames.last_disparities[heads])[:, None]
-    size = (frames.extents[:, 1::2] - frames.extents[:, ::2])[heads]
-    return torch.nn.functional.pad((line[:, :2] + w * line[:, 2:]) * (2 / size), (0, 1))
+    line = torch.cat([slope, bend], -1).flatten(0, 1).index_select(0, rays[:count] * len(layout.mpis) + mpis)
+    m = frames.num_planes[mpis] - 1 - planes[:count]
+    w = sample_disparity(m, frames.disparity_steps[mpis], frames.last_disparities[mpis])[:, None]
+    size = (frames.extents[:, 1::2] - frames.extents[:, ::2])[mpis]
+    # NDC (u, v, .) up to a constant.
+    parts = [torch.nn.functional.pad((line[:, :2] + w * line[:, 2:]) * (2 / size), (0, 1))]
+    if layout.cube is not None:
+        in_cube = rays[count:]
+        parts.append(layout.cube.normalised(origins[in_cube] + directions[in_cube] / inverse_t[count:, None]))
+    moved = torch.cat(parts)
+    return ndc + (moved - moved.detach())

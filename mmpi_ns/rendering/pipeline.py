@@ -52,11 +52,15 @@ class MMPIPipeline(VanillaPipeline):
         cameras = data_loader.input_dataset.cameras
 
         def score(outputs: dict[str, Tensor], batch: Any) -> tuple[dict[str, float], dict[str, Tensor]]:
-            i = int(batch["image_idx"])
-            outputs = self._as_exposed(cameras[i : i + 1], outputs, model.observed(batch))
-            values, images = model.scores_and_images(outputs, batch)
+            i, observed = int(batch["image_idx"]), model.observed(batch)
+            values, images = model.scores_and_images(self._as_exposed(cameras[i : i + 1], outputs, observed), batch)
             if self.config.refine_eval_poses:
-                values |= self._refined_metrics(cameras, batch)
+                camera = cameras[i : i + 1].to(model.device)
+                camera, degrees, units = refined_camera(model, camera, observed, model.config.seed + i)
+                outputs = self._as_exposed(camera, model.get_outputs_for_camera(camera), observed)
+                refined = model.scores_and_images(outputs, batch)[0]
+                refined |= {"rotation_degrees": degrees, "translation": units}
+                values |= {REFINED + name: value for name, value in refined.items()}
             scores.append((i, dict(values)))
             return values, images
 
@@ -83,17 +87,6 @@ class MMPIPipeline(VanillaPipeline):
             say("No training image shows what an evaluated one does, or they are gone: it is scored at mean exposure.")
             return outputs
         return outputs | {"rgb": (exposure.to(outputs["radiance"]) * outputs["radiance"]).clamp(0, 1)}
-
-    def _refined_metrics(self, cameras: Any, batch: Any) -> dict[str, float]:
-        """Metrics of an image with its pose refined against the model, and the size of the refinement."""
-        model: Any = self.model
-        i = int(batch["image_idx"])
-        camera, observed = cameras[i : i + 1].to(model.device), model.observed(batch)
-        camera, degrees, units = refined_camera(model, camera, observed, model.config.seed + i)
-        outputs = self._as_exposed(camera, model.get_outputs_for_camera(camera), observed)
-        values, _ = model.scores_and_images(outputs, batch)
-        moved = {"rotation_degrees": degrees, "translation": units}
-        return {REFINED + name: value for name, value in (values | moved).items()}
 
 
 def refined_camera(model: Any, camera: Cameras, image: Tensor, seed: int) -> tuple[Cameras, float, float]:

@@ -52,45 +52,38 @@ def street_ground(road: Road):
         down = np.maximum(-directions[:, 2], 0.01)
         ds = (width * np.hypot(1, (directions[:, 0] * c + directions[:, 1] * sn) / down)).astype(np.float32)
         dd = (width * np.hypot(1, (directions[:, 1] * c - directions[:, 0] * sn) / down)).astype(np.float32)
-        grass = meadow(places, directions, width, noise)
-        edge = road.pavement
-        on_street = band(np.abs(d), dd, 0.0, edge)
         blurred = np.maximum(np.sqrt(ds * dd), ds / 3)
-        return mix(grass, _street(s, d, ds, dd, blurred, road, noise), on_street)
+        fine, coarse = noise(s, d, blurred), noise(s * 0.21, d * 0.21 + 5, blurred * 0.21)
+        streaks = noise(s * 0.06, d * 1.3, np.maximum(blurred * 0.06, dd * 1.3))
+        tone = 1 + 0.16 * fine + 0.14 * coarse + 0.13 * streaks
+        color = rgb(0.36, 0.36, 0.38) * tone[:, None]
+        side = np.abs(d)
+        # Patches of newer tar and lids, so that the road has something to hold on to.
+        patch = (noise(s * 0.05 + 3, np.sign(d) * 4, blurred * 0.05) > 0.45) * band(side, dd, 0.5, 2.6)
+        color = mix(color, color * 0.72, patch)
+        white = np.full_like(color, 0.92) * (1 + 0.1 * fine)[:, None]
+        marks = pulse(s / 6, ds / 6, 0.0, 0.5) * band(d, dd, -0.08, 0.08) + band(
+            side, dd, road.half_width - 0.4, road.half_width - 0.26
+        )
+        crossing = (
+            pulse(s / 55, ds / 55, 0.32, 0.385)
+            * pulse(d / 1.1, dd / 1.1, 0.2, 0.75)
+            * band(side, dd, 0, road.half_width - 0.5)
+        )
+        color = mix(color, white, np.clip(marks + crossing, 0, 1) * np.clip(0.85 + 0.3 * coarse, 0, 1))
+        bays = rgb(0.45, 0.44, 0.43) * tone[:, None]
+        bays = mix(bays, white, pulse(s / 5.6, ds / 5.6, 0.0, 0.02))
+        color = mix(color, bays, band(side, dd, road.half_width, road.kerb))
+        slab = np.maximum(pulse(s / 0.8, ds / 0.8, 0.0, 0.045), pulse(side / 0.6, dd / 0.6, 0.0, 0.06))
+        paving = rgb(0.66, 0.62, 0.57) * (1 + 0.2 * fine + 0.14 * coarse)[:, None]
+        color = mix(color, mix(paving, paving * 0.55, slab), band(side, dd, road.kerb, road.pavement))
+        stone = np.full_like(color, 0.78) * (1 + 0.15 * fine)[:, None]
+        stone = mix(stone, stone * 0.6, pulse(s / 1.0, ds, 0.0, 0.03))
+        color = mix(color, stone, band(side, dd, road.kerb, road.kerb + 0.22))
+        grass = meadow(places, directions, width, noise)
+        return mix(grass, color, band(side, dd, 0.0, road.pavement))
 
     return ground
-
-
-def _street(s, d, ds, dd, blurred, road: Road, noise: Noise) -> Colors:
-    """Colours of the street at (along, aside), with footprints along both."""
-    fine, coarse = noise(s, d, blurred), noise(s * 0.21, d * 0.21 + 5, blurred * 0.21)
-    streaks = noise(s * 0.06, d * 1.3, np.maximum(blurred * 0.06, dd * 1.3))
-    tone = 1 + 0.16 * fine + 0.14 * coarse + 0.13 * streaks
-    color = rgb(0.36, 0.36, 0.38) * tone[:, None]
-    side = np.abs(d)
-    # Patches of newer tar and lids, so that the road has something to hold on to.
-    patch = (noise(s * 0.05 + 3, np.sign(d) * 4, blurred * 0.05) > 0.45) * band(side, dd, 0.5, 2.6)
-    color = mix(color, color * 0.72, patch)
-    white = np.full_like(color, 0.92) * (1 + 0.1 * fine)[:, None]
-    marks = pulse(s / 6, ds / 6, 0.0, 0.5) * band(d, dd, -0.08, 0.08) + band(
-        side, dd, road.half_width - 0.4, road.half_width - 0.26
-    )
-    crossing = (
-        pulse(s / 55, ds / 55, 0.32, 0.385)
-        * pulse(d / 1.1, dd / 1.1, 0.2, 0.75)
-        * band(side, dd, 0, road.half_width - 0.5)
-    )
-    color = mix(color, white, np.clip(marks + crossing, 0, 1) * np.clip(0.85 + 0.3 * coarse, 0, 1))
-    bay = band(side, dd, road.half_width, road.kerb)
-    bays = rgb(0.45, 0.44, 0.43) * tone[:, None]
-    bays = mix(bays, white, pulse(s / 5.6, ds / 5.6, 0.0, 0.02))
-    color = mix(color, bays, bay)
-    slab = np.maximum(pulse(s / 0.8, ds / 0.8, 0.0, 0.045), pulse(side / 0.6, dd / 0.6, 0.0, 0.06))
-    paving = rgb(0.66, 0.62, 0.57) * (1 + 0.2 * fine + 0.14 * coarse)[:, None]
-    color = mix(color, mix(paving, paving * 0.55, slab), band(side, dd, road.kerb, road.pavement))
-    stone = np.full_like(color, 0.78) * (1 + 0.15 * fine)[:, None]
-    stone = mix(stone, stone * 0.6, pulse(s / 1.0, ds, 0.0, 0.03))
-    return mix(color, stone, band(side, dd, road.kerb, road.kerb + 0.22))
 
 
 def floor_inside(width: float, depth: float):

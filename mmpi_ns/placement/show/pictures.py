@@ -50,7 +50,10 @@ def draw_plan(path: Path, plan: ScenePlan, observations: Observations, visible: 
         for k, mpi in enumerate(plan.mpis):
             _draw_mpi(axes, mpi, flip @ base, middle, reach, COLORS[k % len(COLORS)])
         if plan.cube is not None:
-            edges = (_box_edges(np.asarray(plan.cube.lower), np.asarray(plan.cube.upper)) - middle) @ (flip @ base).T
+            steps = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
+            pairs = [(i, j) for i in range(8) for j in range(i) if np.abs(steps[i] - steps[j]).sum() == 1]
+            corners = plan.cube.lower + steps * np.subtract(plan.cube.upper, plan.cube.lower)
+            edges = ((corners - middle) @ (flip @ base).T)[pairs]
             axes.add_collection(LineCollection(list(edges), colors="black", linewidths=0.8, zorder=3, label="cube"))
         axes.scatter(*(centers @ flip.T).T, s=10, c="black", zorder=4)
         looks = np.stack([centers, centers + facing], 1) @ flip.T
@@ -129,11 +132,3 @@ def _draw_mpi(axes: Axes, mpi: MPIPlan, picture: Array, middle: Array, reach: fl
     borders = [np.stack([origin, end]) for end in planes[-1]]
     axes.add_collection(LineCollection(borders, colors=color, linewidths=1.2, zorder=2, label=mpi.name))
     axes.plot(*origin, marker="x", color=color, zorder=5)
-
-
-def _box_edges(lower: Array, upper: Array) -> Array:
-    """[12, 2, 3] the edges of a box."""
-    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
-    pairs = [(i, j) for i in range(8) for j in range(i) if np.abs(corners[i] - corners[j]).sum() == 1]
-    at = lower + corners * (upper - lower)
-    return np.array([[at[i], at[j]] for i, j in pairs])
