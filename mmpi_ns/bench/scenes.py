@@ -111,9 +111,15 @@ def random_scene(count: int, rays: int, blends: bool, seed: int = 0, cube: CubeP
     """MPIs side by side that face about the same way, so that most points are covered by several; all texels trained,
     optical depths of a sample from 1e-3 to 1."""
     rng, g = np.random.default_rng(seed), torch.Generator().manual_seed(seed)
-    mpis = tuple(_mpi(rng, f"mpi{k}") for k in range(count))
+    mpis: list[MPIPlan] = []
+    for k in range(count):
+        turn, r = np.linalg.qr(np.eye(3) + 0.1 * rng.normal(size=(3, 3)))
+        axes = tuple(tuple(row) for row in (turn * np.sign(np.diag(r))).T.tolist())
+        extent = tuple((rng.uniform(0.7, 1.3, 4) * [-1, 1, -1, 1]).tolist())
+        origin, near = tuple((rng.normal(size=3) * 0.4).tolist()), float(rng.uniform(0.8, 1.6))
+        mpis.append(MPIPlan(f"mpi{k}", origin, axes, near, extent, 12, 5, 7))  # type: ignore[arg-type]
     settings: dict[str, Any] = {"feature_channels": 5, "hidden_width": 6, "samples_per_voxel": 1.5}
-    field = MMPIField(ScenePlan(mpis, cube, 0.05, 1.0), **settings).eval().requires_grad_()
+    field = MMPIField(ScenePlan(tuple(mpis), cube, 0.05, 1.0), **settings).eval().requires_grad_()
     field.density.data.uniform_(-4, 2, generator=g)
     for table, size in ((field.features, 1.0), (field.reliability, 3.0), (field.networks.weights, 0.3)):
         table.data.normal_(generator=g).mul_(size)
@@ -125,11 +131,3 @@ def random_scene(count: int, rays: int, blends: bool, seed: int = 0, cube: CubeP
                         for m, t in zip(aimed, tangents, strict=True)])  # fmt: skip
     away = targets - origins
     return Scene(field, bundle_of(origins, away / np.linalg.norm(away, axis=-1, keepdims=True)), blends)
-
-
-def _mpi(rng: np.random.Generator, name: str) -> MPIPlan:
-    turn, r = np.linalg.qr(np.eye(3) + 0.1 * rng.normal(size=(3, 3)))
-    axes = tuple(tuple(row) for row in (turn * np.sign(np.diag(r))).T.tolist())
-    extent = tuple((rng.uniform(0.7, 1.3, 4) * [-1, 1, -1, 1]).tolist())
-    origin, near = tuple((rng.normal(size=3) * 0.4).tolist()), float(rng.uniform(0.8, 1.6))
-    return MPIPlan(name, origin, axes, near, extent, 12, 5, 7)  # type: ignore[arg-type]

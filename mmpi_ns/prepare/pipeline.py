@@ -333,12 +333,14 @@ class Preparation:
         say(f"ns-train mmpi-small --data {quoted(scene)}")
 
 
-def check_folders(settings: Settings) -> None:
-    """Refuses output folders whose use would lose something.
+def prepare(settings: Settings) -> Verdict:
+    """Makes the scene; returns how far it can be believed.
 
     Raises:
-        PrepareError: the input is missing or in the scene's way, or the scene folder is in use.
+        PrepareError: the input is missing, cannot be made into a scene, or something would be lost in its folder.
     """
+    load_pycolmap()  # in a version that is new enough
+    check_options(settings)
     source, scene = settings.input.resolve(), settings.scene.resolve()
     if not source.exists():
         raise PrepareError(f"{settings.input} does not exist.")
@@ -352,16 +354,5 @@ def check_folders(settings: Settings) -> None:
             f"{settings.scene} already holds {', '.join(taken)}: name another folder, or give --overwrite "
             "(the old files are then moved aside)."
         )
-
-
-def prepare(settings: Settings) -> Verdict:
-    """Makes the scene; returns how far it can be believed.
-
-    Raises:
-        PrepareError: the input cannot be made into a scene.
-    """
-    load_pycolmap()  # in a version that is new enough
-    check_options(settings)
-    check_folders(settings)
     with only_one(settings.scene / WORK):
         return Preparation(settings).run()
