@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pycolmap
 import torch
+from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
 from PIL import Image
+from rich.progress import track
 
 from mmpi_ns.capture.moving import find_moving, in_image
 from mmpi_ns.capture.moving_picture import draw_moving
@@ -19,7 +20,6 @@ from mmpi_ns.capture.views import straightened_color
 from mmpi_ns.prepare.alignment import camera_poses
 from mmpi_ns.prepare.cameras import read_intrinsics
 from mmpi_ns.prepare.images import Photo
-from mmpi_ns.utils.errors import progress
 
 
 def write_masks(
@@ -66,14 +66,9 @@ def write_masks(
         seen = [model.points3D[p.point3D_id].xyz for p in entries[i].points2D if p.has_point3D()]
         return np.array(seen).reshape(-1, 3)
 
-    with progress("Looking for what moves", 2 * len(kept)) as advance:
-
-        def told(work: Iterable[Any], _: int) -> Iterator[Any]:
-            for result in work:
-                advance(1)
-                yield result
-
-        shown = find_moving(posed, points_of, told)
+    shown = find_moving(
+        posed, points_of, lambda work, count: track(work, "Looking for what moves", count, console=CONSOLE)
+    )
     if not shown.share:
         return {}
     target.mkdir(parents=True, exist_ok=True)
