@@ -352,7 +352,9 @@ class MMPIModel(Model):
             return {"rgb_loss": photometric(outputs["rgb"], self.observed(batch))}
         image, step = batch["image"].to(self.device), self.progress.step
         g = generator(self.config.seed, step, "background", self.device)
-        total = batch_losses(outputs["training"], self.field, image, self.config.loss, g, step)
+        weight = self.config.loss
+        weight = replace(weight, known_depth=weight.known_depth * self.progress.schedule.decay(step))
+        total = batch_losses(outputs["training"], self.field, image, weight, g, step)
         self.camera_optimizer.get_loss_dict(total)
         # A batch of rays that meet nothing trainable would have no gradient; this adds 0 with a gradient.
         total["rgb_loss"] = total["rgb_loss"] + self.device_indicator_param.sum()

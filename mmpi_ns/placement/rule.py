@@ -37,7 +37,7 @@ class PlacementConfig:
     """Maximum number of MPIs (automatic)."""
     max_texels: float = 16e6
     """Approximate maximum of texels and voxels in total; texels are made larger to meet it; 0: no limit (automatic)."""
-    min_gain: float = 1.5
+    min_gain: float = 1.0
     """Minimum gain of an MPI in bits: how often it must halve the expected error of one training image (automatic)."""
     planes: int = 64
     """Planes of every MPI (drive, room)."""

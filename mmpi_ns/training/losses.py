@@ -38,7 +38,8 @@ class LossWeights:
     keypoint_depth: float = 0.02
     """-log of the weights near an SfM keypoint (scenes with tracks)."""
     known_depth: float = 0.01
-    """-log of the likelihood of a pixel's known depth, from dense matches, an SfM point or a sensor."""
+    """-log of the likelihood of a pixel's known depth, from dense matches, an SfM point or a sensor. Falls with the
+    learning rates: in the end colours are more accurate."""
     depth_outliers: float = 0.02
     """Likelihood of a known depth where a ray has no weight: the larger, the less influence false depths have."""
     tv_density: float = 1e-4

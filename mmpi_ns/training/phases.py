@@ -155,12 +155,15 @@ class Schedule:
     def rate_factor(self, kind: str, step: int) -> float:
         """Learning rate of a parameter kind relative to its start value; 0 where it is frozen."""
         phase = self.phase_at(step)
-        if kind not in TRAINS[phase.name]:
-            return 0.0
+        base = self.finetune_rate if phase.name == "finetune" else 1.0
+        return base * self.decay(step) if kind in TRAINS[phase.name] else 0.0
+
+    def decay(self, step: int) -> float:
+        """What rates have fallen to at a step, relative to the start of its phase."""
+        phase = self.phase_at(step)
         progress = (step - phase.start) / max(1, phase.end - phase.start)
         falls = (min(progress, 1.0) - self.decay_from) / (1 - self.decay_from)
-        base = self.finetune_rate if phase.name == "finetune" else 1.0
-        return float(base * 10.0 ** (-self.decay_decades * max(falls, 0.0)))
+        return float(10.0 ** (-self.decay_decades * max(falls, 0.0)))
 
     def to_json(self) -> str:
         return json.dumps(asdict(self))
