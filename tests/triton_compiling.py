@@ -126,8 +126,7 @@ def all_launches(setattr, shapes=SMALL):
         shapes: of the trials.
         setattr: sets an attribute of an object, for as long as the launches are used.
     """
-    march, hits = (importlib.import_module(f"mmpi_ns.ops.march.{name}") for name in ("gpu", "gpu_hits"))
-    setattr(hits, "block_size", lambda wanted, device: wanted)
+    march = importlib.import_module("mmpi_ns.ops.march.gpu")
     setattr(dispatch, "_interpreting", True)
     setattr(dispatch, "_faults", dict.fromkeys(["Triton", *dispatch.operations()]))
     with launches_noted({}) as noted:
