@@ -144,8 +144,8 @@ def _marches(device: str, shapes: Shapes, many: bool | None = None) -> list[tupl
             for count, options in [*ways, (RAYS, MarchOptions(0.0))]
         ]
         if shapes.blends:  # before that, each MPI answers rays of its own
-            named, chosen = _random(device, RAYS, layout.num_heads) < 0.5, _random(device, RAYS, mpis)
-            cases += [(layout, tables, Rays(*_rays(device), *which), ways[0][1]) for which in ((named,), (None, chosen))]
+            for which in ((_random(device, RAYS, layout.num_heads) < 0.5, None), (None, _random(device, RAYS, mpis))):
+                cases.append((layout, tables, Rays(*_rays(device), *which), ways[0][1]))
     return cases
 
 

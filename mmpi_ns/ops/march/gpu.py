@@ -43,6 +43,8 @@ STEPS = 8
 RAYS, FEW_RAYS, MANY = 16, 4, 16_384
 """Rays of a program (one warp); of one where there are few rays; number of rays from which they are many. A device has
 room for thousands of programs."""
+RANGES = 256
+"""Rays of a program times their heads, of each of which it holds nine numbers: twice as many do not fit registers."""
 NUMBERS = 256
 """Rays of a program of ``show_kernel`` times their channels: what its registers hold."""
 
@@ -100,7 +102,7 @@ def march_kernel(
     number_kept, of_heads, depth, skipped, dropped = left * 0, head_of * 0, bound * 0, bound * 0, bound * 0
     while tl.max(left, 0) > 0:
         met, head, plane, p, q, s, inverse_t, tau, done = next_samples(
-            left > 0, first, count, done, local_z, local_dz, x, y, z, dx, dy, dz,
+            left > 0, first, count, done, u, bend_u, v, bend_v, local_z, local_dz, x, y, z, dx, dy, dz,
             constants, grids, biases, cube, density, reliability, touched, K, HEADS, HAS_CUBE, BLENDS, RAYS, STEPS,
         )  # fmt: skip
         light = tl.exp(-(depth[:, None] + before(tau, STEPS)))
@@ -250,13 +252,14 @@ def march_into_slots(layout: SceneLayout, tables: Tables, rays: Rays, options: M
     slots = [torch.empty(num_rays, room, dtype=torch.int32, device=device) for _ in range(2)]
     slots += [torch.empty(num_rays, room, width, device=device) for width in (3, 1, 1, 1)]
     numbers = torch.zeros(1 + num_heads, dtype=torch.int32, device=device)
-    at_once = block_size(RAYS if num_rays >= MANY else FEW_RAYS, device)
+    heads = triton.next_power_of_2(num_heads)
+    at_once = block_size(max(1, min(RAYS if num_rays >= MANY else FEW_RAYS, RANGES // heads)), device)
     launch(
         march_kernel, num_rays, at_once, *parts,
         scene.heads, scene.grids, scene.biases, scene.cube, *tables.of_rows(layout.num_rows),
         live, explained, kept, skipped, dropped, *slots, numbers,
         num_rays, room, threshold, float(options.fair_share), float(layout.content_near),
-        K=len(layout.mpis), HEADS=triton.next_power_of_2(num_heads), HAS_CUBE=layout.cube is not None,
+        K=len(layout.mpis), HEADS=heads, HAS_CUBE=layout.cube is not None,
         ALLOWS=rays.heads is not None, CHOOSES=rays.priorities is not None, BLENDS=options.blends,
         KEEP_ALL=threshold <= 0, RAYS=at_once, STEPS=STEPS, num_warps=1,
     )  # fmt: skip

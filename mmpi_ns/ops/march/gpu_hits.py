@@ -40,7 +40,7 @@ def local_ray(frame, x, y, z, dx, dy, dz):
 
 
 @triton.jit
-def tangents(ox, oy, oz, dx, dy, dz):
+def _tangents(ox, oy, oz, dx, dy, dz):
     """Of a ray in an MPI's axes (u, bend_u, v, bend_v): its tangents on the plane of disparity w are u + w bend_u and
     v + w bend_v."""
     depth = tl.where(dz > EPS, dz, 1.0)
@@ -145,7 +145,7 @@ def cross(ray, exists, x, y, z, dx, dy, dz, nears, fars, allowed, priorities, sc
     is_mpi, near, far = head < K, tl.load(nears + at), tl.load(fars + at)
     frame = scene + tl.where(is_mpi, head, 0) * FLOATS
     ox, oy, oz, lx, ly, lz = local_ray(frame, x, y, z, dx, dy, dz)
-    u, bend_u, v, bend_v = tangents(ox, oy, oz, lx, ly, lz)
+    u, bend_u, v, bend_v = _tangents(ox, oy, oz, lx, ly, lz)
     first, count = _live_range(frame, u, bend_u, v, bend_v, oz, lz, near, far)
     count = tl.where(exists[:, None] & is_mpi, count, 0)
     if CHOOSES:

@@ -35,7 +35,7 @@ from mmpi_ns.ops.gpu_scene import (
     softplus,
     trilinear,
 )
-from mmpi_ns.ops.march.gpu_hits import local_ray, tangents
+from mmpi_ns.ops.march.gpu_hits import local_ray
 
 NEGLIGIBLE = tl.constexpr(ends.NEGLIGIBLE)
 NEAREST_ZERO = tl.constexpr(ends.NEAREST_ZERO)
@@ -67,15 +67,23 @@ def pass_empty(first, count, u, bend_u, v, bend_v, constants, grids, K: tl.const
 
 
 @triton.jit
-def _choose(first, count, done, oz, dz, constants, cube, K: tl.constexpr, HEADS: tl.constexpr, HAS_CUBE: tl.constexpr,
-            RAYS: tl.constexpr, STEPS: tl.constexpr):  # fmt: skip
-    """The next samples of each ray in the order of distance: head, number, 1/t (-1: none). Equal ones by head."""
+def _put(values, of_heads, is_best, here):
+    """Puts the best head's value into a column."""
+    return tl.where(here, tl.sum(tl.where(is_best, of_heads, 0), 1)[:, None], values)
+
+
+@triton.jit
+def _choose(first, count, done, u, bend_u, v, bend_v, oz, dz, constants, cube, K: tl.constexpr, HEADS: tl.constexpr,
+            HAS_CUBE: tl.constexpr, RAYS: tl.constexpr, STEPS: tl.constexpr):  # fmt: skip
+    """The next samples of each ray in the order of distance: head, number, 1/t (-1: none), tangents on the head's
+    planes. Equal ones by head."""
     column, head, every = tl.arange(0, STEPS)[None, :], tl.arange(0, HEADS)[None, :], tl.arange(0, HEADS)
     is_mpi = (every < K)[None, :]
     step = tl.load(constants + every * FLOATS + STEP, every < K, 0.0)[None, :]
     end = tl.load(constants + every * FLOATS + END, every < K, 0.0)[None, :]
     heads, numbers = tl.zeros([RAYS, STEPS], tl.int32), tl.zeros([RAYS, STEPS], tl.int32)
     inverse_ts = tl.full([RAYS, STEPS], -1.0, tl.float32)
+    us, bends_u, vs, bends_v = inverse_ts * 0, inverse_ts * 0, inverse_ts * 0, inverse_ts * 0
     for i in tl.static_range(STEPS):
         next_ones = tl.where(is_mpi, first - done, first + done)  # m of a plane, or number of the cube's sample
         w = next_ones.to(tl.float32) * step + end
@@ -87,22 +95,22 @@ def _choose(first, count, done, oz, dz, constants, cube, K: tl.constexpr, HEADS:
         is_best = (head == best[:, None]) & (done < count)
         here = column == i
         heads = tl.where(here, best[:, None].to(tl.int32), heads)
-        numbers = tl.where(here, tl.sum(tl.where(is_best, next_ones, 0), 1)[:, None], numbers)
         inverse_ts = tl.where(here, top[:, None], inverse_ts)
+        numbers = _put(numbers, next_ones, is_best, here)
+        # Computed anew from the head's axes, these would take more registers.
+        us, bends_u = _put(us, u, is_best, here), _put(bends_u, bend_u, is_best, here)
+        vs, bends_v = _put(vs, v, is_best, here), _put(bends_v, bend_v, is_best, here)
         done += is_best.to(tl.int32)
-    return heads, numbers, inverse_ts, done
+    return heads, numbers, inverse_ts, us, bends_u, vs, bends_v, done
 
 
 @triton.jit
-def _look_up(x, y, z, dx, dy, dz, constants, grids, biases, cube, density, head, number, asked, K: tl.constexpr,
-             HAS_CUBE: tl.constexpr):  # fmt: skip
+def _look_up(x, y, z, dx, dy, dz, u, bend_u, v, bend_v, constants, grids, biases, cube, density, head, number, asked,
+             K: tl.constexpr, HAS_CUBE: tl.constexpr):  # fmt: skip
     """Plane, NDC and optical depth of samples."""
     is_mpi = head < K
     mpi, in_mpi = tl.where(is_mpi, head, 0), asked & is_mpi
     row = constants + mpi * FLOATS
-    # Tangents anew: kept from the crossings, those of all heads would take the registers of the whole walk.
-    ox, oy, oz, lx, ly, lz = local_ray(row, x, y, z, dx, dy, dz)
-    u, bend_u, v, bend_v = tangents(ox, oy, oz, lx, ly, lz)
     w, u, v = _on_plane(row, u, bend_u, v, bend_v, number)
     s = 1 - tl.load(row + S_SCALE) * (w - tl.load(row + END))
     plane = tl.load(grids + mpi * INTS + DEPTH).to(tl.int32) - 1 - number
@@ -180,19 +188,20 @@ def _blend(x, y, z, dx, dy, dz, constants, grids, cube, reliability, touched, he
 
 @triton.jit
 def next_samples(
-    goes_on, first, count, done, local_z, local_dz, x, y, z, dx, dy, dz,
+    goes_on, first, count, done, u, bend_u, v, bend_v, local_z, local_dz, x, y, z, dx, dy, dz,
     constants, grids, biases, cube, density, reliability, touched,
     K: tl.constexpr, HEADS: tl.constexpr, HAS_CUBE: tl.constexpr, BLENDS: tl.constexpr, RAYS: tl.constexpr,
     STEPS: tl.constexpr,
 ):  # fmt: skip
     """The next samples of rays that go on: whether there is one, its head, plane, NDC, 1/t and optical depth."""
-    head, number, inverse_t, done = _choose(
-        first, count, done, local_z, local_dz, constants, cube, K, HEADS, HAS_CUBE, RAYS, STEPS
+    head, number, inverse_t, u, bend_u, v, bend_v, done = _choose(
+        first, count, done, u, bend_u, v, bend_v, local_z, local_dz, constants, cube, K, HEADS, HAS_CUBE, RAYS, STEPS
     )
     met = (inverse_t >= 0) & goes_on[:, None]
     plane, u, v, s, tau = _look_up(
-        x, y, z, dx, dy, dz, constants, grids, biases, cube, density, head, number, met, K, HAS_CUBE
-    )
+        x, y, z, dx, dy, dz, u, bend_u, v, bend_v, constants, grids, biases, cube, density, head, number, met, K,
+        HAS_CUBE,
+    )  # fmt: skip
     if BLENDS:
         tau = _blend(
             x, y, z, dx, dy, dz, constants, grids, cube, reliability, touched, head, inverse_t, tau, met, K, HAS_CUBE
