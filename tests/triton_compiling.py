@@ -87,8 +87,8 @@ def _bytes_per_item(given):
     def is_for_items(x):
         return count in accumulate(x.shape, mul) or x.shape == (2 * count,)
 
-    arrays = [x for x in given.values() if isinstance(x, torch.Tensor) and is_for_items(x)]
-    return sum(x.numel() * x.element_size() for x in arrays) / max(1, count)
+    arrays = {x.data_ptr(): x for x in given.values() if isinstance(x, torch.Tensor) and is_for_items(x)}
+    return sum(x.numel() * x.element_size() for x in arrays.values()) / max(1, count)
 
 
 @contextmanager
@@ -126,8 +126,7 @@ def all_launches(setattr, shapes=SMALL):
         shapes: of the trials.
         setattr: sets an attribute of an object, for as long as the launches are used.
     """
-    march, hits = (importlib.import_module(f"mmpi_ns.ops.march.{name}") for name in ("gpu", "gpu_hits"))
-    setattr(hits, "block_size", lambda wanted, device: wanted)
+    march = importlib.import_module("mmpi_ns.ops.march.gpu")
     setattr(dispatch, "_interpreting", True)
     setattr(dispatch, "_faults", dict.fromkeys(["Triton", *dispatch.operations()]))
     with launches_noted({}) as noted:
@@ -143,13 +142,16 @@ def all_launches(setattr, shapes=SMALL):
 
 
 def largest_launches(launches):
-    """Of each kernel the launch with the most in it."""
-    found = {}
+    """Of each kernel the launch with the most in it; the march's two, for few rays and for many, by their name."""
+    largest = {}
     for launch in launches:
-        size = sum(int(value) for _, value in launch.constants)
-        if launch.name not in found or size > found[launch.name][0]:
-            found[launch.name] = size, launch
-    return [launch for _, launch in found.values()]
+        constants = dict(launch.constants)
+        name = f"{launch.name}, {constants['RAYS']} rays" if launch.name == "march_kernel" else launch.name
+        # What keeps all samples passes over no empty tiles.
+        size = sum(int(value) for value in constants.values()) - 2 * constants.get("KEEP_ALL", False)
+        if name not in largest or size > largest[name][0]:
+            largest[name] = size, launch
+    return {name: launch for name, (_, launch) in largest.items()}
 
 
 def resources(kernel):
@@ -177,8 +179,18 @@ SHARED = {80: 164, 86: 100, 89: 100, 90: 228}
 REGISTERS = 65536
 BANDWIDTH = {80: 2039e9, 86: 936e9, 89: 1008e9, 90: 3350e9}
 """Bytes a second of an A100 80 GB, RTX 3090, RTX 4090 and H100 SXM (their makers' figures)."""
-SHAPES = Shapes((4,), cube=False, blends=False, most_samples=300)
-"""Four MPIs, not blended, eight channels, up to 320 samples a ray."""
+PLANS = {n: Shapes((n,), cube=False, blends=False, most_samples=300) for n in (4, 9, 64)}
+"""Not blended, eight channels, up to 320 samples a ray: by the number of MPIs."""
+
+
+def launches_of_plans(setattr):
+    """The launches in the table, by number of MPIs and name: of larger plans those that smaller ones do not have."""
+    seen, plans = set(), {}
+    for number, shapes in PLANS.items():
+        launches = largest_launches(all_launches(setattr, shapes))
+        plans[number] = {name: launch for name, launch in launches.items() if launch not in seen}
+        seen |= set(launches.values())
+    return plans
 
 
 def occupancy(registers, shared, warps, architecture):
@@ -204,48 +216,61 @@ def measured(launch, architecture):
 
 def write_table(path, architectures):
     """Writes what every kernel takes on every architecture, as JSON and, beside it, as a page."""
-    rows, commit = {}, ["git", "rev-parse", "--short", "HEAD"]
-    made = {"command": " ".join(["python", *sys.argv]), "triton": triton.__version__, "shapes": SHAPES._asdict()}
+    plans, commit = {}, ["git", "rev-parse", "--short", "HEAD"]
+    made = {"command": " ".join(["python", *sys.argv]), "triton": triton.__version__}
+    made["shapes"] = PLANS[4]._asdict() | {"mpis": list(PLANS)}
     made["commit"] = subprocess.run(commit, capture_output=True, text=True, check=True).stdout.strip()
     made["date"] = time.strftime("%Y-%m-%d")
-    for launch in largest_launches(all_launches(setattr, SHAPES)):
-        rows[launch.name] = {f"sm_{a}": measured(launch, a) for a in architectures}
-        print(launch.name, rows[launch.name], flush=True)
-        spilling = sum(row["spills"] for each in rows.values() for row in each.values())
-        content = {"headline": {"kernels": len(rows), "spilling": spilling}, "made": made, "rows": rows}
-        path.write_text(json.dumps(content, indent=1), encoding="utf-8")
-        path.with_suffix(".md").write_text(page(content), encoding="utf-8")
+    for number, launches in launches_of_plans(setattr).items():
+        rows = plans[str(number)] = {}
+        for name, launch in launches.items():
+            rows[name] = {f"sm_{a}": measured(launch, a) for a in architectures}
+            print(number, name, rows[name], flush=True)
+    spilling = sum(cell["spills"] for rows in plans.values() for row in rows.values() for cell in row.values())
+    headline = {"kernels": len({name.split(",")[0] for name in plans["4"]}), "spilling": spilling}
+    content = {"headline": headline, "made": made, "plans": plans}
+    path.write_text(json.dumps(content, indent=1), encoding="utf-8")
+    path.with_suffix(".md").write_text(page(content), encoding="utf-8")
 
 
 def page(content):
-    """The table as a page."""
-    names = list(next(iter(content["rows"].values())))
+    """The tables as a page."""
+    names = list(next(iter(content["plans"]["4"].values())))
     lines = [
         "# What the GPU's kernels take", "",
         "From their compiled form, without a device: `PYTHONPATH=.:tests python tests/triton_compiling.py "
         f"{' '.join(n.removeprefix('sm_') for n in names)} --write docs/results/kernels.json` (Triton "
-        f"{content['made']['triton']}, the launch of each kernel with the most in it, for four MPIs, not blended, "
-        "eight channels; the march and pictures of 24 planes, compositing of rays of 320 samples).", "",
+        f"{content['made']['triton']}, the launch of each kernel with the most in it, not blended, eight channels; the "
+        "march and pictures of 6 planes an MPI, compositing of rays of 320 samples).", "",
         "Each cell: registers of a thread / bytes of shared memory of a program / occupancy, the share of a "
         "multiprocessor's warps that fit. Bytes are those of the arrays with an entry for each ray, sample or row, "
         "read or written once; what kernels look up in tables comes on top. The roof is the memory's bandwidth over "
-        "these bytes.", "",
+        "these bytes. The march takes fewer rays a program where there are few, or many heads.",
+    ]  # fmt: skip
+    for number, rows in content["plans"].items():
+        title = f"## {number} MPIs" if number == "4" else f"## {number} MPIs, where that changes a kernel"
+        lines += ["", title, "", *_table(rows, names)]
+    return "\n".join(lines) + "\n"
+
+
+def _table(rows, names):
+    lines = [
         "| kernel | " + " | ".join(names) + " | spills | bytes an item | roof, A100 / H100, million items/s |",
         "|---|" + "---|" * (len(names) + 3),
-    ]  # fmt: skip
-    for name, row in content["rows"].items():
+    ]
+    for name, row in rows.items():
         cells = [f"{row[n]['registers']} / {row[n]['shared']} / {100 * row[n]['occupancy']:.0f} %" for n in names]
         spilling = [n for n in names if row[n]["spills"]]
         roofs = " / ".join(f"{row[n]['million_items_per_s'] or '-'}" for n in ("sm_80", "sm_90") if n in row)
         cells += [", ".join(spilling) or "none", str(row[names[0]]["bytes_per_item"]), roofs]
         lines.append(f"| `{name}` | {' | '.join(cells)} |")
-    return "\n".join(lines) + "\n"
+    return lines
 
 
 def main(architectures, largest):
     """Compiles all, or the largest of each kernel, and says what does not compile."""
     launches, failed = all_launches(setattr), 0
-    launches = largest_launches(launches) if largest else launches
+    launches = list(largest_launches(launches).values()) if largest else launches
     print(f"Triton {triton.__version__}: {len(launches)} kernels", flush=True)
     for architecture in architectures:
         start, spilling = time.monotonic(), []

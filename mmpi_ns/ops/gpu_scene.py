@@ -18,17 +18,21 @@ from torch import Tensor
 
 from mmpi_ns.ops.layout import SceneLayout, shaped
 
-# Columns of the constants of an MPI (``SceneLayout.head_rows``).
-STEP = tl.constexpr(0)
-END = tl.constexpr(1)
-SHARE = tl.constexpr(2)
-S_SCALE = tl.constexpr(3)
-U0 = tl.constexpr(4)
-U_SCALE = tl.constexpr(5)
-V0 = tl.constexpr(6)
-V_SCALE = tl.constexpr(7)
-INTERVAL = tl.constexpr(8)
-FLOATS = tl.constexpr(9)
+# Columns of the constants of an MPI: those of ``SceneLayout.frame_rows``, and what ``head_rows`` has besides.
+ORIGIN = tl.constexpr(0)
+AXES = tl.constexpr(3)
+EXTENT = tl.constexpr(12)
+STEP = tl.constexpr(16)
+END = tl.constexpr(17)
+LAST = tl.constexpr(18)
+SHARE = tl.constexpr(19)
+S_SCALE = tl.constexpr(20)
+U0 = tl.constexpr(21)
+U_SCALE = tl.constexpr(22)
+V0 = tl.constexpr(23)
+V_SCALE = tl.constexpr(24)
+INTERVAL = tl.constexpr(25)
+FLOATS = tl.constexpr(26)
 # Columns of a head's layout. BRICK_OF_TILE and TILE_OF_BRICK say where in the same tensor the brick of the head's first
 # tile, and the tile of the first brick of all, are.
 FIRST_TILE = tl.constexpr(0)
@@ -47,7 +51,7 @@ INTS = tl.constexpr(9)
 class GpuScene:
     """A layout on the device (``CpuScene`` for the GPU), made once by ``GpuScene.of``."""
 
-    heads: Float[Tensor, "K 9"]
+    heads: Float[Tensor, "K 26"]
     grids: Int[Tensor, "N"]
     """Where the texels of every head are, for ``row_of`` and ``texel_of``: a row of numbers for each head, then the
     brick of every tile and the tile of every brick."""
@@ -69,7 +73,7 @@ def _pack(layout: SceneLayout) -> GpuScene:
     ]
     head = torch.tensor(rows, dtype=torch.int32, device=device).reshape(-1)
     return GpuScene(
-        shaped(layout.head_rows, len(planes), FLOATS.value),
+        shaped(torch.cat([layout.frame_rows, layout.head_rows[:, 2:]], -1), len(planes), FLOATS.value),
         torch.cat([head, tiles.to(device), places.to(device, torch.int32)]),
         shaped(torch.cat(layout.biases).to(device, torch.float32), sum(planes)),
         shaped(layout.cube_row, 12),

@@ -117,7 +117,7 @@ def _scene(device: str, with_cube: bool, count: int = 2) -> tuple[SceneLayout, T
     grids = make_grids(sizes, tiles.to(device))
     frames, rows = Frames.pack(mpis, device=device), len(grids[0].places) * BRICK
     biases = [torch.full((m.planes,), -5.0, device=device) for m in mpis]
-    layout = SceneLayout(mpis, frames, grids, biases, min(1.0, 2 / count), cube, -5.0, 1.0)  # not opaque
+    layout = SceneLayout(mpis, frames, grids, biases, min(1.0, 2 / count), cube, -5.0, 1.0, 0.7)  # not opaque
     touched = (_random(device, rows) > 0.2).to(torch.uint8)
     return layout, Tables(_random(device, rows, 1) - 0.5, _random(device, rows, 1), touched)
 
@@ -143,6 +143,9 @@ def _marches(device: str, shapes: Shapes, many: bool | None = None) -> list[tupl
             (layout, tables, Rays(*_rays(device, count)), options)
             for count, options in [*ways, (RAYS, MarchOptions(0.0))]
         ]
+        if shapes.blends:  # before that, each MPI answers rays of its own
+            for which in ((_random(device, RAYS, layout.num_heads) < 0.5, None), (None, _random(device, RAYS, mpis))):
+                cases.append((layout, tables, Rays(*_rays(device), *which), ways[0][1]))
     return cases
 
 

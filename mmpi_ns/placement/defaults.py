@@ -32,8 +32,9 @@ MOST_TIMES = 4.0
 RAYS_PER_PROCESSOR = 256
 """Pixel rays of a step for each multiprocessor of a GPU. By its registers the march has eight programs of 16 rays there
 at a time, so these and the rays of new views are some three rounds of them."""
-MOST_RAYS_TIMES = 8
-"""Largest multiple of a method's rays: steps become as many times fewer."""
+MOST_RAYS_TIMES = 4
+"""Largest multiple of a method's rays: steps become as many times fewer. As many rays in a quarter of the steps give
+images as good, in an eighth worse ones (docs/log/performance.md)."""
 POSITIVE, NOT_NEGATIVE = Number(0, above=True), Number(0)
 RANGES = {
     "max_mpis": Number(1, 10_000, whole=True),

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.scene.windows import WindowedPlan
+from mmpi_ns.training.phases import Schedule
 from mmpi_ns.utils.errors import InputError, brief, quoted
 from mmpi_ns.utils.files import to_text, write_errors
 from mmpi_ns.utils.values import shown
@@ -154,6 +155,24 @@ def check_same_run(
         there, as_there = ("unrefined", "off") if pose_mode != "off" else ("refined", "SO3xR3")
         raise InputError(
             f"{path} was trained with {there} poses: resume with --pipeline.model.camera-optimizer.mode {as_there}."
+        )
+
+
+def check_same_rays(state: dict[str, Any], path: Path, rays: dict[str, int]) -> None:
+    """Raises InputError if rays and steps follow the device, and a checkpoint's run began on one of other size.
+
+    Args:
+        state: content of the checkpoint.
+        path: that it was read from.
+        rays: pixel rays and keypoint rays of a step here.
+    """
+    theirs = state.get("rays", rays)  # earlier versions drew as many on all devices
+    if theirs != rays:
+        steps = Schedule.from_json(to_text(state["pipeline"]["_model.progress.schedule_bytes"])).window_steps
+        raise InputError(
+            f"{path} is of a run of {steps:,} steps of {theirs['pixel']:,} rays, and {rays['pixel']:,} a step suit "
+            f"this device: resume with --max-num-iterations {steps} --pipeline.datamanager.train-num-rays-per-batch "
+            f"{theirs['pixel']} --pipeline.datamanager.keypoint-rays {theirs['keypoint']}."
         )
 
 

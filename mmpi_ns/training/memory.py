@@ -24,8 +24,6 @@ RAYS_PER_PIXEL_RAY = 2
 """Rays of a step for each pixel ray at most: new views and keypoints too."""
 TYPICAL_WIDTH, TYPICAL_KEPT = 256, 64
 """Samples that the widest ray of a batch keeps once surfaces have formed, and that rays keep on average, at most."""
-BYTES_PER_HIT = 96
-"""Of a step for each ray and MPI: ranges of planes, affine maps, origin and direction in the MPI's axes."""
 BYTES_PER_SLOT = 32
 """Of a step for each sample that a ray may keep, before the samples are packed."""
 BYTES_PER_PACKED = 112
@@ -136,7 +134,7 @@ def step_bytes(plan: ScenePlan, work: Work) -> int:
     room = MarchOptions(work.threshold).most_kept(plan.samples_per_ray)
     width, kept, taps = min(room, TYPICAL_WIDTH), min(room, TYPICAL_KEPT), 8 if plan.cube else 4
     row = 4 * COPIES * (1 + work.feature_channels + work.two_phase)
-    each = BYTES_PER_HIT * len(plan.mpis) + BYTES_PER_SLOT * room + BYTES_PER_PACKED * width
+    each = BYTES_PER_SLOT * room + BYTES_PER_PACKED * width
     return rays * (each + kept * taps * BYTES_PER_TAP) + min(rays * kept * taps, plan.texels) * row
 
 

@@ -24,6 +24,7 @@ from mmpi_ns.scene.windows import WindowedPlan
 from mmpi_ns.training.checkpoints import (
     PLAN_FILE,
     cameras_in_short,
+    check_same_rays,
     check_same_run,
     checkpoint_to_load,
     checkpoints_in,
@@ -163,6 +164,12 @@ class MMPITrainer(Trainer):
             processors = torch.cuda.get_device_properties(self.device).multi_processor_count
             model_config.rays_times = times = rays_times(method, processors)
             manager.train_num_rays_per_batch, manager.keypoint_rays = times * rays, times * manager.keypoint_rays
+
+    @property
+    def _rays(self) -> dict[str, int]:
+        """Rays of a step by kind; those of new views follow the pixels'."""
+        config = self._manager.config
+        return {"pixel": config.train_num_rays_per_batch, "keypoint": config.keypoint_rays}
 
     def _announce(self, plan: WindowedPlan) -> None:
         """Prints capture, plan, memory and expected time together, before the first step."""
@@ -317,6 +324,7 @@ class MMPITrainer(Trainer):
             "schedulers": {k: v.state_dict() for k, v in self.optimizers.schedulers.items()},
             "scalers": self.grad_scaler.state_dict(),
             "rng": {"torch": torch.get_rng_state()},
+            "rays": self._rays,
             "capture": {
                 "data": str(self._manager.get_datapath()),
                 "cameras": cameras_in_short(self._manager.observations),
@@ -335,6 +343,8 @@ class MMPITrainer(Trainer):
         if path is not None:
             state, model = read_checkpoint(path), cast(Any, self.pipeline.model)
             capture, mode = self._manager, model.camera_optimizer.config.mode
+            if self._follows_capture:
+                check_same_rays(state, path, self._rays)
             check_same_run(state, path, capture.get_datapath(), capture.observations, run.progress.windows, mode)
             torch.set_rng_state(state["rng"]["torch"])
             del state

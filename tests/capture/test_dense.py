@@ -148,12 +148,14 @@ def test_equal_images_give_equal_depths(tmp_path):
 
 def test_depths_do_not_depend_on_the_number_of_threads(tmp_path, monkeypatch):
     images = scene_of(tmp_path, POSES)
-    results = []
+    results, pools, executor = [], [], dense.ThreadPoolExecutor
+    monkeypatch.setattr(dense, "ThreadPoolExecutor", lambda count: pools.append(count) or executor(count))
     for threads in (1, 4):
         monkeypatch.setattr(dense, "num_threads", lambda count=threads: count)
         results.append(list(find_depths(images, lambda i: points_on_walls(POSES[i]), WIDTH)))
     for (_, one), (_, four) in zip(*results, strict=True):
         assert np.array_equal(one.inverse, four.inverse) and np.array_equal(one.error, four.error)
+    assert pools == [1, 4]
 
 
 def test_each_image_is_shown_twice_and_finished_once(tmp_path):

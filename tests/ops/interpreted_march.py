@@ -18,45 +18,75 @@ from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.samples import metadata_of
 from mmpi_ns.ops import blending, composite
 from mmpi_ns.ops.interpolate import Table
-from mmpi_ns.ops.march import gpu
-from mmpi_ns.ops.march.gpu_hits import plane_hits
+from mmpi_ns.ops.march import MarchOptions, gpu, march
 from mmpi_ns.rendering.sampler import MMPISampler, rays_of
-from mmpi_ns.scene import geometry
-from mmpi_ns.scene.plan import ScenePlan
+from mmpi_ns.scene.plan import CubePlan, ScenePlan
 
-# Hits ----------------------------------------------------------------------------------------------------------------
+# Crossings -----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("far", [math.inf, 6.0])
 def test_rays_cross_the_planes_that_the_oracle_has(far):
-    rng, checked = np.random.default_rng(1), 0
+    rng, checked, missed = np.random.default_rng(1), 0, 0
     plan = ScenePlan((*(random_mpi(rng, f"{k}", deep=d) for k, d in enumerate((math.inf, 1.01, 8.0))),), None, 0.3, 1.0)
     field = MMPIField(plan)
     origins, directions = random_rays(plan, 60, seed=2)
-    rays = bundle(origins, directions, near=0.3, far=far)
-    hits = plane_hits(field.layout, rays_of(rays))
-    assert hits.count.dtype == hits.m_first.dtype == torch.int64 and (hits.count == 0).any()
+    m = march(field.layout, field.tables, rays_of(bundle(origins, directions, near=0.3, far=far)), MarchOptions(0.0))
+    assert torch.equal(m.live, m.valid.sum(1))
     for i in range(60):
         for k, mpi in enumerate(plan.mpis):
-            found = oracle.crossings(mpi, origins[i], directions[i], 0.3, far)
-            if min(c.margin for c in found) < 1e-5:
+            expected = oracle.crossings(mpi, origins[i], directions[i], 0.3, far)
+            if min(c.margin for c in expected) < 1e-5:
                 continue
-            live, checked = [c.plane for c in found if c.live], checked + 1
-            assert hits.count[i, k] == len(live)
-            assert not live or mpi.planes - 1 - int(hits.m_first[i, k]) == min(live)
-    assert checked > 100
+            live, checked = [c for c in expected if c.live], checked + 1
+            missed += not live
+            mine = m.valid[i] & (m.heads[i] == k)
+            assert m.planes[i][mine].tolist() == [c.plane for c in live]
+            (u0, u1, v0, v1), places = mpi.extent, m.ndc[i][mine].double().numpy()
+            for c, (u, v, _), inverse_t in zip(live, places, m.inverse_t[i][mine].tolist(), strict=True):
+                scaled = 2 * (c.u - u0) / (u1 - u0) - 1, 2 * (c.v - v0) / (v1 - v0) - 1
+                assert (u, v) == pytest.approx(scaled, abs=2e-5) and inverse_t == pytest.approx(c.inverse_t, rel=1e-4)
+    assert checked > 100 and missed > 10
 
 
-def test_hits_of_hard_rays_are_those_of_the_reference():
-    plan = hard_plan()
-    field, rays = MMPIField(plan), hard_rays()
-    found = plane_hits(field.layout, rays_of(rays))
-    wanted = geometry.plane_hits(*rays_of(rays)[:4], field.layout.frames)
-    assert torch.equal(found.count, wanted.count) and (wanted.count > 0).any()
-    live = wanted.count > 0
-    assert torch.equal(found.m_first[live], wanted.m_first[live])
-    for name in ("u", "v", "local_origins", "local_directions"):
-        assert torch.allclose(getattr(found, name), getattr(wanted, name), rtol=1e-5, atol=1e-5), name
+@pytest.mark.parametrize("near", [0.3, 2.53])
+def test_rays_meet_the_samples_of_the_cube_that_float64_has(near):
+    """Sample i lies at distance (i + 1/2) step; of those within the cube all are met."""
+    cube, rng = CubePlan((-1.0, -0.8, 1.5), (0.9, 1.1, 3.5), (6, 5, 4)), np.random.default_rng(3)
+    field = MMPIField(ScenePlan((make_mpi(planes=2),), cube, 0.05, 1.0), samples_per_voxel=4.0)
+    directions = rng.normal(size=(40, 3)) * [0.4, 0.4, 1] + [0, 0, 1]
+    directions[:4] = [[0, 0, 1], [1, 0, 0], [0, 0, -1], [0, 0.1, 1]]  # along an axis: no bound within a slab
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    origins = rng.normal(size=(40, 3)) * 0.3
+    m = march(field.layout, field.tables, rays_of(bundle(origins, directions, near=near)), MarchOptions(0.0))
+    step, checked = float(field.layout.cube.step), 0
+    for i in range(40):
+        t = (np.arange(400) + 0.5) * step
+        points = origins[i] + t[:, None] * directions[i]
+        depth = np.minimum(points - np.array(cube.lower), np.array(cube.upper) - points).min(1)
+        if min(np.abs(depth).min(), np.abs(t - near).min()) < 1e-5:
+            continue
+        inside, checked = (depth > 0) & (t > near), checked + 1
+        mine = m.valid[i] & (m.heads[i] == 1)
+        assert m.planes[i][mine].tolist() == inside.nonzero()[0].tolist()
+        assert m.inverse_t[i][mine].tolist() == pytest.approx(1 / t[inside], rel=1e-5)
+    assert checked > 30 and (m.heads[m.valid] == 1).sum() > 100
+
+
+@pytest.mark.parametrize("cube", [True, False])
+def test_only_heads_that_may_answer_a_ray_do_and_it_is_explained_as_by_the_reference(cube):
+    """Heads by name, the MPI of highest priority, and both; one MPI ends, one is entered late, one reaches infinity."""
+    g = torch.Generator().manual_seed(1)
+    plan = random_field(3, cube, seed=3, planes=14).plan
+    plan = ScenePlan((*plan.mpis, make_mpi("ends", far=9.0, planes=7)), plan.cube, 0.05, 0.7)
+    field = fill(MMPIField(plan, feature_channels=5, hidden_width=6), 3)
+    rays, seen = bundle(*random_rays(plan, 60, seed=1)), set()
+    mask = torch.rand(60, plan.num_heads, generator=g) < 0.5
+    priorities = torch.rand(60, 4, generator=g)
+    for chosen in ({"head_mask": mask}, {"choose": priorities}, {"head_mask": mask, "choose": priorities}):
+        _, plain = compare(field, rays, 1e-3, **chosen)
+        seen |= set(plain.report.explained.flatten().tolist())
+    assert seen == {True, False}
 
 
 # March ---------------------------------------------------------------------------------------------------------------
@@ -80,6 +110,7 @@ def compare(field, rays, threshold, blends=False, **chosen):
     before = [m["skipped_before"][same][valid] for m in (kept, wanted)]
     assert torch.allclose(*before, atol=2e-5)
     assert torch.equal(fast.report.live, plain.report.live)
+    assert torch.equal(fast.report.explained, plain.report.explained)
     difference = (fast.report.dropped_mass - plain.report.dropped_mass)[same]
     if difference.numel():
         assert difference.min() > -2e-6 and difference.max() < 1.2e-5, "what is not visited counts as dropped"

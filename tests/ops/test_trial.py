@@ -23,6 +23,8 @@ from mmpi_ns.scene.plan import ScenePlan
 WRONG_AT = {
     "more than two hundred samples a ray": ("composite_weights", lambda tau, *_: tau.shape[1] > 200),
     "nine MPIs": ("march", lambda layout, *_: len(layout.mpis) == 9),
+    "heads by name": ("march", lambda layout, tables, rays, options: rays.heads is not None),
+    "one MPI a ray": ("show_rays", lambda layout, tables, features, rays, options: rays.priorities is not None),
     "a picture of one MPI without a cube": ("show_rays", lambda layout, *_: layout.num_heads == 1),
     "eight channels": ("gather_taps", lambda values, *_: values.shape[1] == 8),
     "one channel": ("adam_rows", lambda param, *_: param.shape[1] == 1),

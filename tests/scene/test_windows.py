@@ -41,11 +41,11 @@ def test_steps_follow_the_pixels_of_the_largest_window():
 
 @pytest.mark.parametrize(
     ("processors", "rays"),
-    [(0, 4096), (28, 4096), (40, 8192), (82, 16384), (108, 16384), (132, 32768), (1000, 32768)],  # CPU, 3060, T4 ...
+    [(0, 4096), (28, 4096), (40, 8192), (82, 16384), (108, 16384), (132, 16384), (1000, 16384)],  # CPU, 3060, T4 ...
 )
 def test_a_larger_gpu_draws_more_rays_a_step_and_as_many_in_all(processors, rays):
     times = rays_times("mmpi", processors)
-    assert times * DEFAULTS["mmpi"].rays == rays and rays_times("mmpi-small", processors) in (1, 4, 8)
+    assert times * DEFAULTS["mmpi"].rays == rays and rays_times("mmpi-small", processors) in (1, 4)
     for pixels in (1.0, 4 * PIXELS):
         assert times * steps_for("mmpi", pixels, times) == steps_for("mmpi", pixels)
     whole, fewer = (make_schedule(ScheduleConfig(), 2000 // n, times=n) for n in (1, times))

@@ -43,7 +43,7 @@ def test_each_process_makes_its_gpu_the_current_one_before_anything_is_on_it(mon
 
 @pytest.mark.parametrize(
     ("device", "steps", "asked", "rays", "keypoints"),
-    [("cuda", 0, False, 8192, 3072), ("cuda", 500, False, 1024, 384), ("cuda", 0, True, 1024, 384),
+    [("cuda", 0, False, 4096, 1536), ("cuda", 500, False, 1024, 384), ("cuda", 0, True, 1024, 384),
      ("cpu", 0, False, 1024, 384)],
 )  # fmt: skip
 def test_a_large_gpu_draws_more_rays_a_step_unless_rays_or_steps_were_asked_for(

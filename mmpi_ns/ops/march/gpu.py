@@ -32,9 +32,8 @@ from mmpi_ns.ops.gpu_scene import (
     row_of,
 )
 from mmpi_ns.ops.layout import SceneLayout, Tables, shaped
-from mmpi_ns.ops.march import crossings
-from mmpi_ns.ops.march.gpu_hits import plane_hits
-from mmpi_ns.ops.march.gpu_walk import before, begin, next_samples
+from mmpi_ns.ops.march.gpu_hits import cross
+from mmpi_ns.ops.march.gpu_walk import before, next_samples, pass_empty
 from mmpi_ns.ops.march.rays import MarchOptions, MergedSamples, Rays, Shown
 
 OPAQUE = tl.constexpr(ends.OPAQUE)
@@ -44,6 +43,8 @@ STEPS = 8
 RAYS, FEW_RAYS, MANY = 16, 4, 16_384
 """Rays of a program (one warp); of one where there are few rays; number of rays from which they are many. A device has
 room for thousands of programs."""
+RANGES = 256
+"""Rays of a program times their heads, of each of which it holds nine numbers: twice as many do not fit registers."""
 NUMBERS = 256
 """Rays of a program of ``show_kernel`` times their channels: what its registers hold."""
 
@@ -62,30 +63,46 @@ def _store_samples(
     tl.store(skipped_before + to, skipped, keep)
 
 
+@triton.jit
+def _vectors(vectors, ray):
+    """Vectors of rays, an array for each axis."""
+    at = vectors + 3 * ray[:, None]
+    return tl.load(at), tl.load(at + 1), tl.load(at + 2)
+
+
 @triton.jit(do_not_specialize=("num_rays", "room"))
 def march_kernel(
-    origins, directions, local_origins, local_directions, us, vs, firsts, counts,
+    origins, directions, nears, fars, allowed, priorities,
     constants, grids, biases, cube, density, reliability, touched,
-    kept, skipped_total, dropped_mass, heads, planes, ndc, inverse_ts, taus, skipped_before, numbers,
-    num_rays, room, threshold, fair_share, K: tl.constexpr, HEADS: tl.constexpr, HAS_CUBE: tl.constexpr,
-    BLENDS: tl.constexpr, KEEP_ALL: tl.constexpr, RAYS: tl.constexpr, STEPS: tl.constexpr,
+    live, explained, kept, skipped_total, dropped_mass, heads, planes, ndc, inverse_ts, taus, skipped_before, numbers,
+    num_rays, room, threshold, fair_share, content_near, K: tl.constexpr, HEADS: tl.constexpr, HAS_CUBE: tl.constexpr,
+    ALLOWS: tl.constexpr, CHOOSES: tl.constexpr, BLENDS: tl.constexpr, KEEP_ALL: tl.constexpr, RAYS: tl.constexpr,
+    STEPS: tl.constexpr,
 ):  # fmt: skip
     """Marches RAYS rays. What ray r keeps is written from r * room on; how much, to kept[r]. ``numbers``: the most that
     a ray keeps, then what is kept of each head."""
     row, head_of = tl.program_id(0) * RAYS + tl.arange(0, RAYS), tl.arange(0, HEADS)
     exists = row < num_rays
     ray = tl.where(exists, row, 0)
-    first, count, done, oz, dz = begin(ray, exists, firsts, counts, local_origins, local_directions, us, vs, constants,
-                                       grids, K, HEADS, HAS_CUBE, KEEP_ALL)  # fmt: skip
-    left = tl.sum(count, 1)
+    x, y, z = _vectors(origins, ray)
+    dx, dy, dz = _vectors(directions, ray)
+    first, count, u, bend_u, v, bend_v, local_z, local_dz, is_explained = cross(
+        ray, exists, x, y, z, dx, dy, dz, nears, fars, allowed, priorities, constants, cube, content_near,
+        K, HEADS, HAS_CUBE, ALLOWS, CHOOSES,
+    )  # fmt: skip
+    left, done = tl.sum(count, 1), count * 0
+    tl.store(live + row, left.to(tl.int64), exists)
+    tl.store(explained + row, is_explained, exists)
+    if not KEEP_ALL:
+        done = pass_empty(first, count, u, bend_u, v, bend_v, constants, grids, K, HEADS)
     bound = tl.minimum(fair_share / tl.maximum(left, 1).to(tl.float32), threshold)
     bound = bound * 0 - 1 if KEEP_ALL else bound
     end_of_light = tl.minimum(bound, OPAQUE)
     left -= tl.sum(done, 1)
     number_kept, of_heads, depth, skipped, dropped = left * 0, head_of * 0, bound * 0, bound * 0, bound * 0
     while tl.max(left, 0) > 0:
-        met, head, plane, u, v, s, inverse_t, tau, done = next_samples(
-            ray, left > 0, first, count, done, oz, dz, origins, directions, local_origins, local_directions, us, vs,
+        met, head, plane, p, q, s, inverse_t, tau, done = next_samples(
+            left > 0, first, count, done, u, bend_u, v, bend_v, local_z, local_dz, x, y, z, dx, dy, dz,
             constants, grids, biases, cube, density, reliability, touched, K, HEADS, HAS_CUBE, BLENDS, RAYS, STEPS,
         )  # fmt: skip
         light = tl.exp(-(depth[:, None] + before(tau, STEPS)))
@@ -94,7 +111,7 @@ def march_kernel(
         slot = number_kept[:, None] + before(keep.to(tl.int32), STEPS)
         keep = keep & (slot < room)
         to, in_front = ray[:, None].to(tl.int64) * room + slot, skipped[:, None] + before(skip, STEPS)
-        _store_samples(to, keep, head, plane, u, v, s, inverse_t, tau, in_front,
+        _store_samples(to, keep, head, plane, p, q, s, inverse_t, tau, in_front,
                        heads, planes, ndc, inverse_ts, taus, skipped_before)  # fmt: skip
         number_kept += tl.sum(keep.to(tl.int32), 1)
         for k in range(K + HAS_CUBE):
@@ -222,24 +239,31 @@ class Slots:
 
 def march_into_slots(layout: SceneLayout, tables: Tables, rays: Rays, options: MarchOptions) -> Slots:
     """``march`` before anything is waited for."""
-    origins, directions, hits, first, counts, explained = crossings(layout, rays, plane_hits(layout, rays))
-    scene, device, num_rays, threshold = GpuScene.of(layout), origins.device, len(origins), float(options.threshold)
-    parts = (origins, directions, hits.local_origins, hits.local_directions, hits.u, hits.v, first, counts)
-    room = options.most_kept(layout.most_samples)
+    num_rays, num_heads, device = len(rays.origins), layout.num_heads, rays.origins.device
+    scene, threshold, room = GpuScene.of(layout), float(options.threshold), options.most_kept(layout.most_samples)
+    parts = [shaped(x, num_rays, width) for x, width in zip(rays[:4], (3, 3, 1, 1), strict=True)]
+    # Where all heads may answer, what stands for the choice is not read.
+    parts.append(parts[0] if rays.heads is None else shaped(rays.heads, num_rays, num_heads, dtype=torch.bool))
+    parts.append(parts[0] if rays.priorities is None else shaped(rays.priorities, num_rays, len(layout.mpis)))
+    live = torch.empty(num_rays, dtype=torch.int64, device=device)
+    explained = torch.empty(num_rays, 1, dtype=torch.bool, device=device)
     kept = torch.empty(num_rays, dtype=torch.int32, device=device)
     skipped, dropped = (torch.empty(num_rays, 1, device=device) for _ in range(2))
     slots = [torch.empty(num_rays, room, dtype=torch.int32, device=device) for _ in range(2)]
     slots += [torch.empty(num_rays, room, width, device=device) for width in (3, 1, 1, 1)]
-    numbers = torch.zeros(1 + layout.num_heads, dtype=torch.int32, device=device)
-    at_once = block_size(RAYS if num_rays >= MANY else FEW_RAYS, device)
+    numbers = torch.zeros(1 + num_heads, dtype=torch.int32, device=device)
+    heads = triton.next_power_of_2(num_heads)
+    at_once = block_size(max(1, min(RAYS if num_rays >= MANY else FEW_RAYS, RANGES // heads)), device)
     launch(
-        march_kernel, num_rays, at_once, *(x.contiguous() for x in parts),
+        march_kernel, num_rays, at_once, *parts,
         scene.heads, scene.grids, scene.biases, scene.cube, *tables.of_rows(layout.num_rows),
-        kept, skipped, dropped, *slots, numbers, num_rays, room, threshold, float(options.fair_share),
-        K=len(layout.mpis), HEADS=triton.next_power_of_2(layout.num_heads), HAS_CUBE=layout.cube is not None,
-        BLENDS=options.blends, KEEP_ALL=threshold <= 0, RAYS=at_once, STEPS=STEPS, num_warps=1,
+        live, explained, kept, skipped, dropped, *slots, numbers,
+        num_rays, room, threshold, float(options.fair_share), float(layout.content_near),
+        K=len(layout.mpis), HEADS=heads, HAS_CUBE=layout.cube is not None,
+        ALLOWS=rays.heads is not None, CHOOSES=rays.priorities is not None, BLENDS=options.blends,
+        KEEP_ALL=threshold <= 0, RAYS=at_once, STEPS=STEPS, num_warps=1,
     )  # fmt: skip
-    return Slots(kept, slots, room, skipped, dropped, counts.sum(-1), explained, numbers)
+    return Slots(kept, slots, room, skipped, dropped, live, explained, numbers)
 
 
 def march(layout: SceneLayout, tables: Tables, rays: Rays, options: MarchOptions) -> MergedSamples:

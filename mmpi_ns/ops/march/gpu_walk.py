@@ -35,6 +35,7 @@ from mmpi_ns.ops.gpu_scene import (
     softplus,
     trilinear,
 )
+from mmpi_ns.ops.march.gpu_hits import local_ray
 
 NEGLIGIBLE = tl.constexpr(ends.NEGLIGIBLE)
 NEAREST_ZERO = tl.constexpr(ends.NEAREST_ZERO)
@@ -43,50 +44,46 @@ ULPS = tl.constexpr(16 * 2.0**-23)
 
 
 @triton.jit
-def _on_plane(us, vs, constants, ray, mpi, number, asked, K: tl.constexpr):
+def _on_plane(row, u, bend_u, v, bend_v, number):
     """Disparity, u and v of planes of MPIs where rays cross them."""
-    row, at = constants + mpi * FLOATS, 2 * (ray[:, None] * K + mpi)
-    w = number.to(tl.float32) * tl.load(row + STEP, asked, 0.0) + tl.load(row + END, asked, 0.0)
-    u = tl.load(us + at, asked, 0.0) + w * tl.load(us + at + 1, asked, 0.0)
-    v = tl.load(vs + at, asked, 0.0) + w * tl.load(vs + at + 1, asked, 0.0)
-    u = (u - tl.load(row + U0, asked, 0.0)) * tl.load(row + U_SCALE, asked, 0.0) - 1
-    return w, u, (v - tl.load(row + V0, asked, 0.0)) * tl.load(row + V_SCALE, asked, 0.0) - 1
+    w = number.to(tl.float32) * tl.load(row + STEP) + tl.load(row + END)
+    u, v = u + w * bend_u - tl.load(row + U0), v + w * bend_v - tl.load(row + V0)
+    return w, u * tl.load(row + U_SCALE) - 1, v * tl.load(row + V_SCALE) - 1
 
 
 @triton.jit
-def begin(ray, exists, firsts, counts, local_origins, local_directions, us, vs, constants, grids, K: tl.constexpr,
-          HEADS: tl.constexpr, HAS_CUBE: tl.constexpr, KEEP_ALL: tl.constexpr):  # fmt: skip
-    """Of each head the number of its first sample, samples, how many of them hold nothing before the first that does,
-    and the ray's origin and direction along its axis."""
-    head = tl.arange(0, HEADS)[None, :]
-    at, has = ray[:, None] * (K + HAS_CUBE) + head, exists[:, None] & (head < K + HAS_CUBE)
-    first, count = tl.load(firsts + at, has, 0).to(tl.int32), tl.load(counts + at, has, 0).to(tl.int32)
-    local_z = 3 * (ray[:, None] * K + head) + 2
-    oz, dz = tl.load(local_origins + local_z, head < K, 0.0), tl.load(local_directions + local_z, head < K, 0.0)
-    done = count * 0
-    if not KEEP_ALL:
-        passes = (head < K) & (count > 0)
-        mpi = tl.where(head < K, head, 0) + count * 0
-        while tl.max(tl.max(passes.to(tl.int32), 1), 0) > 0:
-            number = first - done
-            _, u, v = _on_plane(us, vs, constants, ray, mpi, number, passes, K)
-            plane = tl.load(grids + mpi * INTS + DEPTH, passes, 0).to(tl.int32) - 1 - number
-            passes = passes & ~is_held(grids, mpi, plane, u, v, passes)
-            done += passes.to(tl.int32)
-            passes = passes & (done < count)
-    return first, count, done, oz, dz
+def pass_empty(first, count, u, bend_u, v, bend_v, constants, grids, K: tl.constexpr, HEADS: tl.constexpr):
+    """How many of each head's samples hold nothing before the first that does: planes of MPIs in empty tiles."""
+    head, done = tl.arange(0, HEADS)[None, :], count * 0
+    passes, mpi = (head < K) & (count > 0), tl.where(head < K, head, 0) + done
+    while tl.max(tl.max(passes.to(tl.int32), 1), 0) > 0:
+        number = first - done
+        _, x, y = _on_plane(constants + mpi * FLOATS, u, bend_u, v, bend_v, number)
+        plane = tl.load(grids + mpi * INTS + DEPTH, passes, 0).to(tl.int32) - 1 - number
+        passes = passes & ~is_held(grids, mpi, plane, x, y, passes)
+        done += passes.to(tl.int32)
+        passes = passes & (done < count)
+    return done
 
 
 @triton.jit
-def _choose(first, count, done, oz, dz, constants, cube, K: tl.constexpr, HEADS: tl.constexpr, HAS_CUBE: tl.constexpr,
-            RAYS: tl.constexpr, STEPS: tl.constexpr):  # fmt: skip
-    """The next samples of each ray in the order of distance: head, number, 1/t (-1: none). Equal ones by head."""
+def _put(values, of_heads, is_best, here):
+    """Puts the best head's value into a column."""
+    return tl.where(here, tl.sum(tl.where(is_best, of_heads, 0), 1)[:, None], values)
+
+
+@triton.jit
+def _choose(first, count, done, u, bend_u, v, bend_v, oz, dz, constants, cube, K: tl.constexpr, HEADS: tl.constexpr,
+            HAS_CUBE: tl.constexpr, RAYS: tl.constexpr, STEPS: tl.constexpr):  # fmt: skip
+    """The next samples of each ray in the order of distance: head, number, 1/t (-1: none), tangents on the head's
+    planes. Equal ones by head."""
     column, head, every = tl.arange(0, STEPS)[None, :], tl.arange(0, HEADS)[None, :], tl.arange(0, HEADS)
     is_mpi = (every < K)[None, :]
     step = tl.load(constants + every * FLOATS + STEP, every < K, 0.0)[None, :]
     end = tl.load(constants + every * FLOATS + END, every < K, 0.0)[None, :]
     heads, numbers = tl.zeros([RAYS, STEPS], tl.int32), tl.zeros([RAYS, STEPS], tl.int32)
     inverse_ts = tl.full([RAYS, STEPS], -1.0, tl.float32)
+    us, bends_u, vs, bends_v = inverse_ts * 0, inverse_ts * 0, inverse_ts * 0, inverse_ts * 0
     for i in tl.static_range(STEPS):
         next_ones = tl.where(is_mpi, first - done, first + done)  # m of a plane, or number of the cube's sample
         w = next_ones.to(tl.float32) * step + end
@@ -98,32 +95,23 @@ def _choose(first, count, done, oz, dz, constants, cube, K: tl.constexpr, HEADS:
         is_best = (head == best[:, None]) & (done < count)
         here = column == i
         heads = tl.where(here, best[:, None].to(tl.int32), heads)
-        numbers = tl.where(here, tl.sum(tl.where(is_best, next_ones, 0), 1)[:, None], numbers)
         inverse_ts = tl.where(here, top[:, None], inverse_ts)
+        numbers = _put(numbers, next_ones, is_best, here)
+        # Computed anew from the head's axes, these would take more registers.
+        us, bends_u = _put(us, u, is_best, here), _put(bends_u, bend_u, is_best, here)
+        vs, bends_v = _put(vs, v, is_best, here), _put(bends_v, bend_v, is_best, here)
         done += is_best.to(tl.int32)
-    return heads, numbers, inverse_ts, done
+    return heads, numbers, inverse_ts, us, bends_u, vs, bends_v, done
 
 
 @triton.jit
-def _in_cube(origins, directions, cube, ray, t):
-    """Points in the cube at distances t, normalised to [-1, 1]^3."""
-    at = 3 * ray[:, None]
-    x = tl.load(origins + at) + tl.load(directions + at) * t
-    y = tl.load(origins + at + 1) + tl.load(directions + at + 1) * t
-    z = tl.load(origins + at + 2) + tl.load(directions + at + 2) * t
-    x = 2 * (x - tl.load(cube)) / tl.load(cube + 3) - 1
-    y = 2 * (y - tl.load(cube + 1)) / tl.load(cube + 4) - 1
-    return x, y, 2 * (z - tl.load(cube + 2)) / tl.load(cube + 5) - 1
-
-
-@triton.jit
-def _look_up(origins, directions, us, vs, constants, grids, biases, cube, density, ray, head, number, asked,
+def _look_up(x, y, z, dx, dy, dz, u, bend_u, v, bend_v, constants, grids, biases, cube, density, head, number, asked,
              K: tl.constexpr, HAS_CUBE: tl.constexpr):  # fmt: skip
     """Plane, NDC and optical depth of samples."""
     is_mpi = head < K
     mpi, in_mpi = tl.where(is_mpi, head, 0), asked & is_mpi
     row = constants + mpi * FLOATS
-    w, u, v = _on_plane(us, vs, constants, ray, mpi, number, in_mpi, K)
+    w, u, v = _on_plane(row, u, bend_u, v, bend_v, number)
     s = 1 - tl.load(row + S_SCALE) * (w - tl.load(row + END))
     plane = tl.load(grids + mpi * INTS + DEPTH).to(tl.int32) - 1 - number
     raw = bilinear(density, grids, mpi, plane, u, v, in_mpi)
@@ -132,12 +120,20 @@ def _look_up(origins, directions, us, vs, constants, grids, biases, cube, densit
     if HAS_CUBE:
         in_cube = asked & (head == K)
         t = (tl.where(in_cube, number, 0).to(tl.float32) + 0.5) * tl.load(cube + 6)
-        x, y, z = _in_cube(origins, directions, cube, ray, t)
-        thick = softplus(trilinear(density, grids, K, x, y, z, in_cube) + tl.load(cube + 7))
+        p, q, r = _in_cube(cube, x + dx * t, y + dy * t, z + dz * t)
+        thick = softplus(trilinear(density, grids, K, p, q, r, in_cube) + tl.load(cube + 7))
         tau = tl.where(is_mpi, tau, thick * tl.load(cube + 8))
-        u, v, s = tl.where(is_mpi, u, x), tl.where(is_mpi, v, y), tl.where(is_mpi, s, z)
+        u, v, s = tl.where(is_mpi, u, p), tl.where(is_mpi, v, q), tl.where(is_mpi, s, r)
         plane = tl.where(is_mpi, plane, number)
     return plane, u, v, s, tau
+
+
+@triton.jit
+def _in_cube(cube, x, y, z):
+    """Points normalised to [-1, 1]^3 over the cube."""
+    x = 2 * (x - tl.load(cube)) / tl.load(cube + 3) - 1
+    y = 2 * (y - tl.load(cube + 1)) / tl.load(cube + 4) - 1
+    return x, y, 2 * (z - tl.load(cube + 2)) / tl.load(cube + 5) - 1
 
 
 @triton.jit
@@ -155,19 +151,17 @@ def _count_vote(own_vote, highest, others, grids, reliability, touched, k, head,
 
 
 @triton.jit
-def _blend(origins, directions, local_origins, local_directions, constants, grids, cube, reliability, touched,
-           ray, head, inverse_t, tau, asked, K: tl.constexpr, HAS_CUBE: tl.constexpr):  # fmt: skip
+def _blend(x, y, z, dx, dy, dz, constants, grids, cube, reliability, touched, head, inverse_t, tau, asked,
+           K: tl.constexpr, HAS_CUBE: tl.constexpr):  # fmt: skip
     """Optical depths after blending (``blending.blend_shares`` and ``blended_optical_depth``)."""
     thick = asked & (tau > NEGLIGIBLE)
     own_vote, highest, others = tau * 0, tau * 0 - 1e30, tau * 0
     for k in range(K):
-        at, mpi = 3 * (ray[:, None] * K + k), constants + k * FLOATS
-        origin, direction = local_origins + at, local_directions + at
-        z = tl.load(origin + 2) * inverse_t + tl.load(direction + 2)
-        ahead = z > 0
-        depth = tl.where(ahead, z, 1.0)
-        u = (tl.load(origin) * inverse_t + tl.load(direction)) / depth - tl.load(mpi + U0)
-        v = (tl.load(origin + 1) * inverse_t + tl.load(direction + 1)) / depth - tl.load(mpi + V0)
+        mpi = constants + k * FLOATS
+        ox, oy, oz, lx, ly, lz = local_ray(mpi, x, y, z, dx, dy, dz)
+        ahead = oz * inverse_t + lz > 0
+        depth = tl.where(ahead, oz * inverse_t + lz, 1.0)
+        u, v = (ox * inverse_t + lx) / depth - tl.load(mpi + U0), (oy * inverse_t + ly) / depth - tl.load(mpi + V0)
         u, v = u * tl.load(mpi + U_SCALE) - 1, v * tl.load(mpi + V_SCALE) - 1
         s = 1 - tl.load(mpi + S_SCALE) * (inverse_t / depth - tl.load(mpi + END))
         inside = (tl.abs(u) <= 1 + ULPS) & (tl.abs(v) <= 1 + ULPS) & (tl.abs(s) <= 1 + ULPS / tl.load(mpi + SHARE))
@@ -176,10 +170,11 @@ def _blend(origins, directions, local_origins, local_directions, constants, grid
             own_vote, highest, others, grids, reliability, touched, k, head, u, v, s, ahead & inside, thick
         )
     if HAS_CUBE:
-        x, y, z = _in_cube(origins, directions, cube, ray, 1 / tl.maximum(inverse_t, NEAREST_ZERO))
-        inside = (inverse_t > 0) & (tl.abs(x) <= 1) & (tl.abs(y) <= 1) & (tl.abs(z) <= 1)
+        t = 1 / tl.maximum(inverse_t, NEAREST_ZERO)
+        u, v, s = _in_cube(cube, x + dx * t, y + dy * t, z + dz * t)
+        inside = (inverse_t > 0) & (tl.abs(u) <= 1) & (tl.abs(v) <= 1) & (tl.abs(s) <= 1)
         own_vote, highest, others = _count_vote(
-            own_vote, highest, others, grids, reliability, touched, K, head, x, y, z, inside, thick
+            own_vote, highest, others, grids, reliability, touched, K, head, u, v, s, inside, thick
         )
     sole = others == 0
     odds = tl.where(sole, 0.0, highest - own_vote + tl.log(tl.where(sole, 1.0, others)))
@@ -193,24 +188,24 @@ def _blend(origins, directions, local_origins, local_directions, constants, grid
 
 @triton.jit
 def next_samples(
-    ray, goes_on, first, count, done, oz, dz, origins, directions, local_origins, local_directions, us, vs,
+    goes_on, first, count, done, u, bend_u, v, bend_v, local_z, local_dz, x, y, z, dx, dy, dz,
     constants, grids, biases, cube, density, reliability, touched,
     K: tl.constexpr, HEADS: tl.constexpr, HAS_CUBE: tl.constexpr, BLENDS: tl.constexpr, RAYS: tl.constexpr,
     STEPS: tl.constexpr,
 ):  # fmt: skip
     """The next samples of rays that go on: whether there is one, its head, plane, NDC, 1/t and optical depth."""
-    head, number, inverse_t, done = _choose(
-        first, count, done, oz, dz, constants, cube, K, HEADS, HAS_CUBE, RAYS, STEPS
+    head, number, inverse_t, u, bend_u, v, bend_v, done = _choose(
+        first, count, done, u, bend_u, v, bend_v, local_z, local_dz, constants, cube, K, HEADS, HAS_CUBE, RAYS, STEPS
     )
     met = (inverse_t >= 0) & goes_on[:, None]
     plane, u, v, s, tau = _look_up(
-        origins, directions, us, vs, constants, grids, biases, cube, density, ray, head, number, met, K, HAS_CUBE
-    )
+        x, y, z, dx, dy, dz, u, bend_u, v, bend_v, constants, grids, biases, cube, density, head, number, met, K,
+        HAS_CUBE,
+    )  # fmt: skip
     if BLENDS:
         tau = _blend(
-            origins, directions, local_origins, local_directions, constants, grids, cube, reliability, touched,
-            ray, head, inverse_t, tau, met, K, HAS_CUBE,
-        )  # fmt: skip
+            x, y, z, dx, dy, dz, constants, grids, cube, reliability, touched, head, inverse_t, tau, met, K, HAS_CUBE
+        )
     return met, head, plane, u, v, s, inverse_t, tl.where(met, tau, 0.0), done
 
 
