@@ -25,9 +25,10 @@ from torch import Tensor
 from mmpi_ns.capture.cache import Arrays, Computed, Pairs, digest, remembered
 from mmpi_ns.capture.dataset import MMPIDataset, read_depth_image
 from mmpi_ns.capture.dense import ROUNDS, SECONDS, Depth, find_depths
-from mmpi_ns.capture.lone_depth import MOST_OTHERS, continued, others_that_see
+from mmpi_ns.capture.lone_depth import continued, is_lone
 from mmpi_ns.capture.loose_points import POINT_ERROR, contradict, see_points
 from mmpi_ns.capture.observe import drop_masked, posed_images
+from mmpi_ns.capture.rays import Rays
 from mmpi_ns.capture.tracks import PosedImages, at_full_size
 from mmpi_ns.capture.views import View, camera_matrix, look_up
 from mmpi_ns.placement.observations import Observations
@@ -106,7 +107,13 @@ def unpacked(codes: Int16[Tensor, "*N"]) -> Float[Tensor, "*N"]:
 
 
 def know_depths(
-    outputs: DataparserOutputs, observations: Observations, dataset: MMPIDataset, *, dense: bool, sensor: bool
+    outputs: DataparserOutputs,
+    observations: Observations,
+    dataset: MMPIDataset,
+    rays: Rays,
+    *,
+    dense: bool,
+    sensor: bool,
 ) -> tuple[KnownDepth | None, Observations]:
     """All available depths of the training images, and the observations with the points of a cloud, if there is one.
 
@@ -114,6 +121,7 @@ def know_depths(
         outputs: of the data parser.
         observations: their cameras, tracks and loose points.
         dataset: the images.
+        rays: makes rays through their pixel centres (image, row, column).
         dense: whether to match neighbouring images.
         sensor: whether to read depth images.
 
@@ -146,7 +154,7 @@ def know_depths(
     if files:
         unit = outputs.metadata.get("depth_unit_scale_factor", 1.0) * outputs.dataparser_scale
         known = with_sensor(known, [Path(f) for f in files], float(unit), original, posed)
-    known = with_continued(known, posed, dataset)
+    known = with_continued(known, posed, dataset, rays)
     give_back_freed_memory()
     return known, seen
 
@@ -273,7 +281,7 @@ def straightened(
     return np.asarray(found[:, 0], np.float64), np.asarray(found[:, 1], np.float64)
 
 
-def with_continued(known: KnownDepth, posed: PosedImages, dataset: MMPIDataset) -> KnownDepth:
+def with_continued(known: KnownDepth, posed: PosedImages, dataset: MMPIDataset, rays: Rays) -> KnownDepth:
     """Extrapolates surfaces into regions that hardly any other image shows (``lone_depth.py``); cached.
 
     Masked pixels have no distance: what moves is nowhere.
@@ -281,7 +289,7 @@ def with_continued(known: KnownDepth, posed: PosedImages, dataset: MMPIDataset) 
     count = len(known.codes)
 
     def continue_all() -> Pairs:
-        codes = in_order(lambda i: _continued_codes(known.codes[i], i, posed, dataset), range(count))
+        codes = in_order(lambda i: _continued_codes(known.codes[i], i, posed, dataset, rays), range(count))
         shown = track(codes, "Extrapolating surfaces", count, console=CONSOLE)
         return ((f"{i}", image) for i, image in enumerate(shown))
 
@@ -292,22 +300,20 @@ def with_continued(known: KnownDepth, posed: PosedImages, dataset: MMPIDataset) 
     return _stored(remembered(key, continue_all))
 
 
-def _continued_codes(codes: Codes, i: int, posed: PosedImages, dataset: MMPIDataset) -> Codes:
+def _continued_codes(codes: Codes, i: int, posed: PosedImages, dataset: MMPIDataset, rays: Rays) -> Codes:
     """Codes of one image with extrapolated surfaces; computed for every n-th pixel of a large image."""
     codes, hidden = np.array(codes), ~dataset.usable(i)
     codes[hidden] = UNKNOWN
     step = -(-max(codes.shape[:2]) // CONTINUED)
     rows, columns = (np.minimum(np.arange(0, n, step) + step // 2, n - 1) for n in codes.shape[:2])
-    coords = np.stack(np.meshgrid(rows, columns, indexing="ij"), -1).reshape(-1, 2) + 0.5
-    at = torch.full((len(coords), 1), i)
-    directions = dataset.cameras.generate_rays(at, coords=torch.from_numpy(coords).float()).directions.numpy()
-    directions = directions.reshape(len(rows), len(columns), 3)
+    pixels = np.stack(np.meshgrid(i, rows, columns, indexing="ij"), -1).reshape(-1, 3)
+    directions = rays(torch.from_numpy(pixels)).directions.cpu().numpy().reshape(len(rows), len(columns), 3)
     sparse = unpacked(torch.from_numpy(codes[np.ix_(rows, columns)])).numpy()
     extended = continued(sparse, directions)
     down, across = np.nonzero(extended[..., 0])
     points = posed.camera_to_worlds[i, :, 3] + directions[down, across] / extended[down, across, :1]
-    many = others_that_see(posed, i, points) > MOST_OTHERS
-    extended[down[many], across[many]] = 0
+    seen = ~is_lone(posed, i, points)
+    extended[down[seen], across[seen]] = 0
     down, across = np.nonzero(codes[..., 0] == UNKNOWN)
     codes[down, across] = packed(extended)[down // step, across // step]
     codes[hidden] = UNKNOWN

@@ -124,7 +124,10 @@ def moving_masks(observations: Observations, dataset: MMPIDataset) -> Sequence[M
             progress=lambda work, count: track(work, "Movers", count, console=CONSOLE),
         )  # fmt: skip
         views = zip(shown.views, shown.masks, shapes, strict=True)
-        return {f"{i}": np.packbits(in_image(v, m, original, i, s)) for i, (v, m, s) in enumerate(views)}
+        return {
+            f"{i}": np.packbits(in_image(v, m, original, i, s) if m.any() else np.zeros(s, bool))
+            for i, (v, m, s) in enumerate(views)
+        }
 
     cameras = original.camera_to_worlds, original.intrinsics, original.distortion, original.fisheye
     stored = remembered(digest(original.files, "moving", VERSION, shapes, *cameras, seen_by, points), find)
