@@ -24,7 +24,7 @@ from torch import Tensor
 
 from mmpi_ns.capture.cache import Arrays, Computed, Pairs, digest, remembered
 from mmpi_ns.capture.dataset import MMPIDataset, read_depth_image
-from mmpi_ns.capture.dense import ROUNDS, SECONDS, Depth, find_depths
+from mmpi_ns.capture.dense import ROUNDS, SECONDS, STRIP, Depth, find_depths, strips
 from mmpi_ns.capture.lone_depth import continued, is_lone
 from mmpi_ns.capture.loose_points import POINT_ERROR, contradict, see_points
 from mmpi_ns.capture.observe import drop_masked, posed_images
@@ -97,8 +97,13 @@ def packed(values: ArrayLike) -> Codes:
     Relative steps, as a distance's error is relative too, whatever the unit of the scene.
     """
     values = np.asarray(values, np.float32)
-    logarithms = np.log2(np.where(values > 0, values, 1))
-    return np.where(values > 0, np.rint(OCTAVE * logarithms.clip(-31, 31)), UNKNOWN).astype(np.int16)
+    codes, flat = np.empty(values.shape, np.int16), values.reshape(-1)
+    for first in range(0, flat.size, STRIP):
+        part = flat[first : first + STRIP]
+        logarithms = np.log2(np.where(part > 0, part, 1))
+        coded = np.where(part > 0, np.rint(OCTAVE * logarithms.clip(-31, 31)), UNKNOWN)
+        codes.reshape(-1)[first : first + STRIP] = coded
+    return codes
 
 
 def unpacked(codes: Int16[Tensor, "*N"]) -> Float[Tensor, "*N"]:
@@ -226,7 +231,7 @@ def at_training_pixels(
     """Distances of a training image's pixels from the depths of its view at working size.
 
     A training pixel takes the mean over its area, weighted by certainty; the spread within the area, large at an
-    edge, is added to its error.
+    edge, is added to its error. One that is smaller than a working pixel takes the depth of that.
 
     Args:
         view: the image at working size.
@@ -239,16 +244,17 @@ def at_training_pixels(
     Returns:
         [H, W, 2] inverse distance and expected error.
     """
-    height, width = shape
-    small = (width, height)
-    mean, error = pooled(depth, (small[1], small[0]))
-    x, y = straightened(original, i, shape, file_shape)
+    height, width = (min(pair) for pair in zip(shape, view.gray.shape, strict=True))
+    maps, distances = pooled(depth, (height, width)), np.empty((*shape, 2), np.float32)
     fx, fy, cx, cy = view.pinhole
-    scale_x, scale_y = small[0] / view.gray.shape[1], small[1] / view.gray.shape[0]
-    at = (((fx * x + cx) * scale_x).reshape(shape), ((fy * y + cy) * scale_y).reshape(shape))
-    longer = np.sqrt(x**2 + y**2 + 1).reshape(shape)
-    take = [look_up(m, *at, nearest=True) / longer for m in (mean, error)]
-    return np.stack(take, -1).astype(np.float32)
+    scale_x, scale_y = width / view.gray.shape[1], height / view.gray.shape[0]
+    for rows in strips(shape):
+        x, y = straightened(original, i, shape, file_shape, rows)
+        at = (((fx * x + cx) * scale_x).reshape(-1, shape[1]), ((fy * y + cy) * scale_y).reshape(-1, shape[1]))
+        longer = np.sqrt(x**2 + y**2 + 1).reshape(-1, shape[1])
+        for n, values in enumerate(maps):
+            distances[rows, :, n] = look_up(values, *at, nearest=True) / longer
+    return distances
 
 
 def pooled(depth: Depth, shape: tuple[int, int]) -> tuple[Map, Map]:
@@ -267,11 +273,11 @@ def pooled(depth: Depth, shape: tuple[int, int]) -> tuple[Map, Map]:
 
 
 def straightened(
-    original: PosedImages, i: int, shape: tuple[int, int], file_shape: tuple[int, int]
+    original: PosedImages, i: int, shape: tuple[int, int], file_shape: tuple[int, int], some: slice = slice(None)
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Tangents (right, down) at which a training image's pixels look, lens taken out. [H * W] each"""
+    """Tangents (right, down) at which a training image's pixels look, lens taken out; of some rows. [H * W] each"""
     full_width, full_height = original.sizes[i]
-    columns, rows = np.meshgrid(np.arange(shape[1]) + 0.5, np.arange(shape[0]) + 0.5)
+    columns, rows = np.meshgrid(np.arange(shape[1]) + 0.5, np.arange(shape[0])[some] + 0.5)
     at = np.stack([columns * full_width / file_shape[1], rows * full_height / file_shape[0]], -1).reshape(-1, 1, 2)
     if not original.is_bent(i):
         fx, fy, cx, cy = original.intrinsics[i]
@@ -314,8 +320,10 @@ def _continued_codes(codes: Codes, i: int, posed: PosedImages, dataset: MMPIData
     points = posed.camera_to_worlds[i, :, 3] + directions[down, across] / extended[down, across, :1]
     seen = ~is_lone(posed, i, points)
     extended[down[seen], across[seen]] = 0
-    down, across = np.nonzero(codes[..., 0] == UNKNOWN)
-    codes[down, across] = packed(extended)[down // step, across // step]
+    for first, fine in zip(range(0, len(codes), step), packed(extended), strict=True):
+        part = codes[first : first + step]
+        unknown = part[..., 0] == UNKNOWN
+        part[unknown] = np.broadcast_to(np.repeat(fine, step, 0)[: part.shape[1]], part.shape)[unknown]
     codes[hidden] = UNKNOWN
     return codes
 
