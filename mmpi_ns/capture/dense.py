@@ -333,7 +333,7 @@ class _Pipeline(Generic[T]):
         for i in self.numbers:
             self.depths[i] = self.match(i)
             yield self.depths[i], None
-            while first < len(self.numbers) and max(first, *self.near[first]) <= i:
+            while first < len(self.numbers) and max([first, *self.near[first]]) <= i:
                 yield self.confirm(first), first
                 first += 1
 
