@@ -58,17 +58,18 @@ def psnr(predicted: Float[Tensor, "*N 3"], observed: Float[Tensor, "*N 3"]) -> f
 
 
 def ssim(predicted: Float[Tensor, "H W 3"], observed: Float[Tensor, "H W 3"]) -> float:
-    """Mean structural similarity of the windows of two images in [0, 1]."""
-    height, width = predicted.shape[0] - WINDOW + 1, predicted.shape[1]
-    rows, total = max(1, PART // width), 0.0
+    """Mean structural similarity of the windows about all pixels of two images in [0, 1], mirrored at their borders."""
+    height, width = predicted.shape[:2]
+    rows, total, border = max(1, PART // width), 0.0, WINDOW // 2
+    images = [torch.moveaxis(x, -1, 0)[None].float() for x in (predicted, observed)]
+    a, b = (torch.nn.functional.pad(x, (0, 0, border, border), "reflect") for x in images)
     for first in range(0, height, rows):
-        count = min(rows, height - first)
-        strips = (x[first : first + count + WINDOW - 1] for x in (predicted, observed))
-        a, b = (torch.moveaxis(x, -1, 0)[None].float() for x in strips)
-        similarity = structural_similarity_index_measure(a, b, data_range=1.0)
-        assert isinstance(similarity, Tensor)
-        total += count * float(similarity)
-    return total / height
+        part = slice(first, min(first + rows, height) + 2 * border)
+        _, values = structural_similarity_index_measure(
+            a[:, :, part], b[:, :, part], data_range=1.0, return_full_image=True
+        )
+        total += float(values[:, :, border:-border].double().sum())
+    return total / predicted.numel()
 
 
 def color_corrected(predicted: Float[Tensor, "H W 3"], observed: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:

@@ -43,7 +43,8 @@ def test_the_plan_is_that_of_training(scene, tmp_path, monkeypatch):
     run(monkeypatch, scene, "--output", tmp_path / "plan", "--placement.max-texels", 1e5)
     config = copy.deepcopy(mmpi_small.config.pipeline)
     config.datamanager.data = scene
-    config.model.method, config.model.placement.max_texels, config.model.lpips_net = "mmpi-small", 1e5, "none"
+    config.model.method, config.model.total_steps, config.model.lpips_net = "mmpi-small", 0, "none"  # as the trainer
+    config.model.placement.max_texels = 1e5
     pipeline = config.setup(device="cpu", test_mode="val")
     assert pipeline.datamanager.known_depth.share > 0.1
     assert pipeline.model.progress.windows == WindowedPlan.load(tmp_path / "plan" / "plan.json")

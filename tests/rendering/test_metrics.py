@@ -12,7 +12,8 @@ from mmpi_ns.rendering.metrics import color_corrected, pictures, psnr, ssim
 
 
 def ssim_of(a, b):
-    """SSIM of whole images, by its formula with a Gaussian of 1.5 pixels in windows of 11. Float64."""
+    """SSIM of whole images, by its formula with a Gaussian of 1.5 pixels in windows of 11, mirrored. Float64."""
+    a, b = (np.pad(x, ((5, 5), (5, 5), (0, 0)), "reflect") for x in (a, b))
 
     def mean(x):
         return gaussian_filter(x, (1.5, 1.5, 0), truncate=5 / 1.5, mode="constant")[5:-5, 5:-5]
