@@ -45,7 +45,7 @@ ROUNDS = (4, 2, 1)
 """Rounds of matching, each at the working size divided by this; each starts from the depths of the previous one."""
 SMALLEST = 320
 """Pixels along the longer side below which images are not reduced further."""
-SECONDS = 1.0
+SECONDS = 1.2
 """Processor seconds for a million working pixels of an image, for the forecast (docs/log/performance.md)."""
 STRIDE, ITERATIONS = 5, 8
 """Pixels between the patches of the optical flow, and iterations of each."""
@@ -72,7 +72,7 @@ MAX_RELATIVE = 0.15
 PRIOR_ERROR = 0.5
 """Relative error of the initial rough depths, against which measured ones are weighted."""
 TRIMMED = 8
-"""Images after which memory that is free goes back: each thread keeps its own, in pieces."""
+"""Images after which memory that is free goes back: glibc keeps it in pieces, for each thread its own."""
 STRIP = 2**16
 """Pixels that are worked on at once: their numbers stay in a core's cache."""
 

@@ -27,6 +27,7 @@ from mmpi_ns.capture.tracks import PosedImages, at_full_size
 from mmpi_ns.capture.views import View, look_up, straightened_color
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.scene.near_views import nearest_views
+from mmpi_ns.utils.errors import duration
 from mmpi_ns.utils.parallel import num_threads, one_thread_each
 
 SIDE = 384
@@ -39,6 +40,8 @@ AFTER = 2
 """Nearest neighbours from which objects are followed."""
 EDGE = 0.4
 """Share of a mover around a pixel from which it is masked."""
+SECONDS = 0.4
+"""Processor seconds for an image, for the forecast (docs/log/performance.md)."""
 VERSION = 2
 """Version of the algorithm: cached masks of another version are found anew."""
 ENOUGH = 200
@@ -118,7 +121,8 @@ def moving_masks(observations: Observations, dataset: MMPIDataset) -> Sequence[M
     def find() -> Arrays:
         for i in range(len(dataset)):  # names a damaged file, of which OpenCV would print warnings first
             dataset.get_data(i, image_type="uint8")
-        CONSOLE.print(f"Looking for what moves in {len(shapes)} images.")
+        seconds = duration(SECONDS * len(shapes) / num_threads())
+        CONSOLE.print(f"Looking for what moves in {len(shapes)} images: about {seconds}.")
         shown = find_moving(
             original, lambda i: points[seen_by == i],
             progress=lambda work, count: track(work, "Movers", count, console=CONSOLE),

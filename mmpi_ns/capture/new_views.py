@@ -21,11 +21,13 @@ from torch import Tensor
 
 from mmpi_ns.capture.cache import images_held
 from mmpi_ns.capture.dataset import MMPIDataset
+from mmpi_ns.capture.dense import TRIMMED
 from mmpi_ns.capture.known_depth import KnownDepth
 from mmpi_ns.capture.rays import Rays
 from mmpi_ns.capture.tracks import PosedImages
 from mmpi_ns.capture.views import look_up, project
 from mmpi_ns.scene.near_views import nearest_views
+from mmpi_ns.utils.host import give_back_freed_memory
 
 NEIGHBOURS = 4
 """Number of cameras, the nearest facing the same way, in which a point of an image is searched."""
@@ -127,7 +129,9 @@ def find_shared_points(
     )  # neighbours mostly stand side by side
     rng, parts, found = np.random.default_rng(seed), [], 0.0
     budget = max(1, MOST // (NEIGHBOURS * max(1, len(images))))
-    for i in images:
+    for n, i in enumerate(images):
+        if n % TRIMMED == 0:
+            give_back_freed_memory()
         own_image, usable, own_depths = show(i)
         rows, columns = _certain(own_depths, usable)
         count = len(rows)
