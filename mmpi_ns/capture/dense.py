@@ -136,16 +136,16 @@ class Parallax:
     def pixels(self, inverse: Map) -> tuple[Map, Map, Map]:
         """Pixels x and y at which points lie at these inverse depths, far outside where they are behind, and their
         depths there over those here. [h, w] each"""
-        x, y, depth = (np.empty_like(inverse) for _ in range(3))
+        maps = x, y, depth = np.empty_like(inverse), np.empty_like(inverse), np.empty_like(inverse)
         for rows in strips(inverse.shape):
-            right, down, ahead = (
-                a + inverse[rows] * b for a, b in zip(self.a(rows, inverse.shape[1]), self.b, strict=True)
-            )
-            there = ahead > 1e-6
-            depth[rows] = np.where(there, ahead, 1)
-            x[rows] = np.where(there, right / depth[rows], -1e4)
-            y[rows] = np.where(there, down / depth[rows], -1e4)
-            depth[rows] = np.where(there, ahead, 0)
+            for part, a, b in zip(maps, self.a(rows, inverse.shape[1]), self.b, strict=True):
+                np.multiply(inverse[rows], b, out=part[rows])
+                part[rows] += a
+            ahead = depth[rows] > 1e-6
+            for part in (x, y):
+                np.divide(part[rows], depth[rows], out=part[rows], where=ahead)
+                part[rows][~ahead] = -1e4
+            depth[rows][~ahead] = 0
         return x, y, depth
 
     def solve(self, x: Map, y: Map, rows: slice) -> tuple[Map, Map, Map]:
