@@ -141,11 +141,12 @@ class Parallax:
             for part, a, b in zip(maps, self.a(rows, inverse.shape[1]), self.b, strict=True):
                 np.multiply(inverse[rows], b, out=part[rows])
                 part[rows] += a
-            ahead = depth[rows] > 1e-6
-            for part in (x, y):
-                np.divide(part[rows], depth[rows], out=part[rows], where=ahead)
-                part[rows][~ahead] = -1e4
-            depth[rows][~ahead] = 0
+            behind = ~(depth[rows] > 1e-6)
+            np.copyto(depth[rows], 1, where=behind)
+            x[rows] /= depth[rows]
+            y[rows] /= depth[rows]
+            for part, far in ((x, -1e4), (y, -1e4), (depth, 0)):
+                np.copyto(part[rows], far, where=behind)
         return x, y, depth
 
     def solve(self, x: Map, y: Map, rows: slice) -> tuple[Map, Map, Map]:
