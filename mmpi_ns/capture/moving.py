@@ -6,6 +6,7 @@ Every image is compared with its neighbours at reduced size (``moving_evidence.p
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -28,7 +29,7 @@ from mmpi_ns.capture.views import View, look_up, straightened_color
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.scene.near_views import nearest_views
 from mmpi_ns.utils.errors import duration
-from mmpi_ns.utils.parallel import num_threads, one_thread_each
+from mmpi_ns.utils.parallel import in_order, num_threads, one_thread_each
 
 SIDE = 384
 """Longer side of the images at which is compared, pixels."""
@@ -119,8 +120,8 @@ def moving_masks(observations: Observations, dataset: MMPIDataset) -> Sequence[M
     seen_by, points = observations.seen_by[:tracked], observations.points[observations.seen_point[:tracked]]
 
     def find() -> Arrays:
-        for i in range(len(dataset)):  # names a damaged file, of which OpenCV would print warnings first
-            dataset.get_data(i, image_type="uint8")
+        # Names a damaged file, of which OpenCV would print warnings first.
+        deque(in_order(lambda i: dataset.get_data(i, image_type="uint8"), range(len(dataset))), maxlen=0)
         seconds = duration(SECONDS * len(shapes) / num_threads())
         CONSOLE.print(f"Looking for what moves in {len(shapes)} images: about {seconds}.")
         shown = find_moving(
