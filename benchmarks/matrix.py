@@ -45,7 +45,7 @@ class Matrix:
         rows: dict[str, Any] = json.loads(done.read_text()) if done.is_file() else {}
         for capture in sorted(MATRIX, key=lambda capture: capture.megapixels):
             if capture.name not in rows and capture.megapixels <= self.most:
-                rows[capture.name] = run_capture(capture, self.folder / "capture")
+                rows[capture.name] = run_capture(capture, self.folder / "capture") | {"commit": commit()}
                 print(capture.name, json.dumps(rows[capture.name]), flush=True)
                 done.write_text(json.dumps(rows))
         self.output.write_text(report(rows), encoding="utf-8")
@@ -113,16 +113,21 @@ def run_command(command: list[str], folder: Path) -> dict[str, Any]:
     return {"outcome": outcome, "seconds": usage.ru_utime + usage.ru_stime, "gib": usage.ru_maxrss / 2**20}
 
 
+def commit() -> str:
+    """Of the code."""
+    command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+
+
 def report(rows: dict[str, Any]) -> str:
     """The page."""
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True).stdout.strip()
     processor = next(
         (x.split(":")[1].strip() for x in Path("/proc/cpuinfo").read_text().splitlines() if "model name" in x), "?"
     )
     lines = [
         "# Ordinary captures",
         "",
-        f"`python benchmarks/matrix.py --folder FOLDER`, commit {commit}, one thread of an {processor}.",
+        f"`python benchmarks/matrix.py --folder FOLDER`, one thread of an {processor}. The last column is the commit.",
         "",
         f"Each capture was trained for {STEPS} steps a window (`ns-train mmpi-small`), evaluated (`ns-eval`) and "
         "exported (`mmpi-export web`). The rows hold every number of images with every size, and every other pair of "
@@ -131,8 +136,8 @@ def report(rows: dict[str, Any]) -> str:
         f"Captures of more than {MOST_MATCHED} megapixels were trained without dense matching. Seconds are of the "
         "processor, memory is the peak of each command.",
         "",
-        "| images | pixels | shape | lens | depth | windows | train | | eval | | web | | PSNR |",
-        "|---|---|---|---|---|---|---|---|---|---|---|---|---|",
+        "| images | pixels | shape | lens | depth | windows | train | | eval | | web | | PSNR | commit |",
+        "|---|---|---|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     peaks = []
     for capture in MATRIX:
@@ -144,7 +149,7 @@ def report(rows: dict[str, Any]) -> str:
             ends = "" if part is None else "" if part["outcome"] == "well" else part["outcome"] + ", "
             cells += ["", ""] if part is None else [f"{ends}{part['seconds']:.0f} s", f"{part['gib']:.1f} GiB"]
         peaks.append(row["train"]["gib"])
-        cells.append("" if row["psnr"] is None else f"{row['psnr']:.1f}")
+        cells += ["" if row["psnr"] is None else f"{row['psnr']:.1f}", row["commit"]]
         lines.append(f"| {' | '.join(cells)} |")
     missing = [capture.name for capture in MATRIX if capture.name not in rows]
     lines += ["", f"Training peaks at {max(peaks):.1f} GiB at most, {median(peaks):.1f} in the median."]

@@ -24,6 +24,9 @@ KEPT = 24
 MOST_BYTES = 10e9
 """Of all results that are kept; the last one is kept whatever its size."""
 
+HELD, HELD_BYTES = 32, 2**28
+"""Images that are kept while their neighbours are compared with them, and the bytes that they may take."""
+
 T = TypeVar("T")
 Arrays = Mapping[str, NDArray[np.generic]]
 Pairs = Iterable[tuple[str, NDArray[np.generic]]]
@@ -53,6 +56,12 @@ class Computed(Sequence[T]):
         if not 0 <= i < self._length:
             raise IndexError(i)
         return self._function(i)
+
+
+def images_held(sizes: NDArray[np.float64], bytes_of_pixel: int, least: int) -> int:
+    """Images that are kept in memory at once, of these sizes [M, 2]: as many as an image is compared with at least."""
+    bytes_of_image = bytes_of_pixel * float(sizes.prod(-1).max())
+    return max(least, min(HELD, int(HELD_BYTES / bytes_of_image)))
 
 
 def remembered(key: str, find: Callable[[], Arrays | Pairs], folder: Path | None = None) -> Arrays:

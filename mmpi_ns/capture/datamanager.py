@@ -117,11 +117,13 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
             )
         dataset.metadata[RAYS_PER_STEP] = self.config.train_num_rays_per_batch
         dataset.metadata[TRAINING_VIEWS] = TrainingViews.of(dataset.cameras)
+        self._pinhole = PinholeRays.of(dataset.cameras, self.device)
         if self.test_mode == "val":  # elsewhere the plan comes from a checkpoint
             if self.config.mask_moving and None in dataset.mask_files:
                 self._mask_moving(dataset)
+            rays = self._ray_generator()
             depths, self.observations = know_depths(
-                self.train_dataparser_outputs, self.observations, dataset,
+                self.train_dataparser_outputs, self.observations, dataset, lambda pixels: rays(pixels.to(self.device)),
                 dense=self.config.dense_depth, sensor=self.config.depth_images,
             )  # fmt: skip
             self.known_depth, seen = depths, self.observations
@@ -130,6 +132,10 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
             if not has_keypoints and (depths is None or depths.share == 0):
                 say("No depths are known, from tracks, matches or a sensor: geometry is learned from colours alone.")
         return dataset
+
+    def _ray_generator(self) -> Any:
+        """Makes rays through pixel centres of training images; no attribute, as nn.Module takes none before its own."""
+        return self._pinhole or RayGenerator(self.train_dataset.cameras.to(self.device))
 
     def _mask_moving(self, dataset: MMPIDataset) -> None:
         """Masks what moves in the training images, and says how much it is."""
@@ -167,9 +173,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         # Samples nothing: ns-export sets its batches' size here.
         self.train_pixel_sampler = self._get_pixel_sampler(self.train_dataset, self.config.train_num_rays_per_batch)
         self._rays = DrawnAhead(self.config.seed, self.device)
-        cameras = self.train_dataset.cameras
-        pinhole = PinholeRays.of(cameras, self.device)
-        self.train_ray_generator: Any = pinhole or RayGenerator(cameras.to(self.device))
+        self.train_ray_generator: Any = self._ray_generator()
         gains = self.calibrated() if self.config.correct_exposure and self.test_mode == "val" else None
         if gains is not None:
             say(gains.describe())

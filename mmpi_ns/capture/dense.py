@@ -4,7 +4,8 @@ Every image is compared with its nearest neighbours. A rough depth, interpolated
 into the image, so that the remaining displacement, found by DIS optical flow, is small whatever the motion was. A match
 on its epipolar line gives an inverse depth; consistent matches of several neighbours are averaged. The first rounds run
 at a fraction of the size; each starts from the depths of the previous one. Images are independent of each other but for
-a last check, so that threads share them: OpenCV and NumPy release Python's lock.
+a last check, so that threads share them: OpenCV and NumPy release Python's lock. An image is in memory while its
+neighbours are worked on, so that memory does not grow with the length of a capture in order.
 
 A point at inverse depth q appears in the neighbour at the homogeneous pixel a + q b, where a is linear in the pixel. A
 match there gives two linear equations r + q s = 0, in pixels once divided by the point's depth: q is their
@@ -14,10 +15,12 @@ for each unit of q.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from itertools import chain, repeat
+from typing import Any, Generic, TypeVar
 
 import cv2
 import numpy as np
@@ -42,7 +45,7 @@ ROUNDS = (4, 2, 1)
 """Rounds of matching, each at the working size divided by this; each starts from the depths of the previous one."""
 SMALLEST = 320
 """Pixels along the longer side below which images are not reduced further."""
-SECONDS = 1.0
+SECONDS = 1.2
 """Processor seconds for a million working pixels of an image, for the forecast (docs/log/performance.md)."""
 STRIDE, ITERATIONS = 5, 8
 """Pixels between the patches of the optical flow, and iterations of each."""
@@ -69,7 +72,7 @@ MAX_RELATIVE = 0.15
 PRIOR_ERROR = 0.5
 """Relative error of the initial rough depths, against which measured ones are weighted."""
 TRIMMED = 8
-"""Images after which memory that is free goes back: each thread keeps its own, in pieces."""
+"""Images after which memory that is free goes back: glibc keeps it in pieces, for each thread its own."""
 STRIP = 2**16
 """Pixels that are worked on at once: their numbers stay in a core's cache."""
 
@@ -133,16 +136,17 @@ class Parallax:
     def pixels(self, inverse: Map) -> tuple[Map, Map, Map]:
         """Pixels x and y at which points lie at these inverse depths, far outside where they are behind, and their
         depths there over those here. [h, w] each"""
-        x, y, depth = (np.empty_like(inverse) for _ in range(3))
+        maps = x, y, depth = np.empty_like(inverse), np.empty_like(inverse), np.empty_like(inverse)
         for rows in strips(inverse.shape):
-            right, down, ahead = (
-                a + inverse[rows] * b for a, b in zip(self.a(rows, inverse.shape[1]), self.b, strict=True)
-            )
-            there = ahead > 1e-6
-            depth[rows] = np.where(there, ahead, 1)
-            x[rows] = np.where(there, right / depth[rows], -1e4)
-            y[rows] = np.where(there, down / depth[rows], -1e4)
-            depth[rows] = np.where(there, ahead, 0)
+            for part, a, b in zip(maps, self.a(rows, inverse.shape[1]), self.b, strict=True):
+                np.multiply(inverse[rows], b, out=part[rows])
+                part[rows] += a
+            behind = ~(depth[rows] > 1e-6)
+            np.copyto(depth[rows], 1, where=behind)
+            x[rows] /= depth[rows]
+            y[rows] /= depth[rows]
+            for part, far in ((x, -1e4), (y, -1e4), (depth, 0)):
+                np.copyto(part[rows], far, where=behind)
         return x, y, depth
 
     def solve(self, x: Map, y: Map, rows: slice) -> tuple[Map, Map, Map]:
@@ -275,26 +279,85 @@ def find_depths(
         finish: makes the result of an image from its number, its view at working size, and its depths.
         progress: wraps the images as they are worked on, each twice.
     """
-    numbers = range(len(images.files))
-    near = [nearest_views(images.camera_to_worlds, i, NEIGHBOURS, MAX_ANGLE) for i in numbers]
     with one_thread_each(), ThreadPoolExecutor(num_threads()) as pool:
-        views = list(pool.map(lambda i: load_view(images, i, width), numbers))
-        depths: list[Depth] = []
-
-        def work() -> Iterator[Any]:
-            for depth in pool.map(lambda i: matched(views[i], [views[j] for j in near[i]], points_of(i)), numbers):
-                depths.append(depth)
-                yield depth
-            yield from pool.map(
-                lambda i: finish(i, views[i], confirmed(views[i], depths[i], [(views[j], depths[j]) for j in near[i]])),
-                numbers,
-            )
-
-        for n, result in enumerate(progress(work(), 2 * len(numbers))):
+        results = _Pipeline(images, points_of, width, finish, pool).results(num_threads() + 1)
+        for n, (is_last, result) in enumerate(progress(results, 2 * len(images.files))):
             if n % TRIMMED == 0:
                 give_back_freed_memory()
-            if n >= len(numbers):
+            if is_last:
                 yield result
+
+
+class _Pipeline(Generic[T]):
+    """Images on their way through a pool of threads: matched, then confirmed, then forgotten, in order."""
+
+    def __init__(
+        self,
+        images: PosedImages,
+        points_of: Callable[[int], NDArray[np.float64]],
+        width: int,
+        finish: Callable[[int, View, Depth], T],
+        pool: ThreadPoolExecutor,
+    ) -> None:
+        """Arguments as of ``find_depths``."""
+        self.images, self.points_of, self.width, self.finish, self.pool = images, points_of, width, finish, pool
+        self.numbers = range(len(images.files))
+        self.near = [nearest_views(images.camera_to_worlds, i, NEIGHBOURS, MAX_ANGLE) for i in self.numbers]
+        self.freed: list[list[int]] = [[] for _ in self.numbers]
+        """Images that none needs after this one."""
+        for j, last in enumerate(last_uses(self.near)):
+            self.freed[last].append(j)
+        self.views: dict[int, Future[View]] = {}
+        self.depths: dict[int, Future[Depth]] = {}
+
+    def match(self, i: int) -> Future[Depth]:
+        for j in (i, *self.near[i]):
+            if j not in self.views:
+                self.views[j] = self.pool.submit(load_view, self.images, j, self.width)
+        mine, others = self.views[i], [self.views[j] for j in self.near[i]]
+        return self.pool.submit(lambda: matched(mine.result(), [v.result() for v in others], self.points_of(i)))
+
+    def confirm(self, i: int) -> Future[T]:
+        view, depth = self.views[i], self.depths[i]
+        others = [(self.views[j], self.depths[j]) for j in self.near[i]]
+
+        def run() -> T:
+            known = confirmed(view.result(), depth.result(), [(v.result(), d.result()) for v, d in others])
+            return self.finish(i, view.result(), known)
+
+        return self.pool.submit(run)
+
+    def tasks(self) -> Iterator[tuple[Future[Any], int | None]]:
+        """Each after what it waits for, so that no thread waits for one that has not begun; an image's last task with
+        its number."""
+        first = 0
+        for i in self.numbers:
+            self.depths[i] = self.match(i)
+            yield self.depths[i], None
+            while first < len(self.numbers) and max([first, *self.near[first]]) <= i:
+                yield self.confirm(first), first
+                first += 1
+
+    def results(self, ahead: int) -> Iterator[tuple[bool, Any]]:
+        """Results of the tasks, of which so many are worked on at once, and whether they are an image's last."""
+        waiting: deque[tuple[Future[Any], int | None]] = deque()
+        for task in chain(self.tasks(), repeat(None, ahead)):
+            if len(waiting) == ahead or (task is None and waiting):
+                future, number = waiting.popleft()
+                yield number is not None, future.result()
+                for j in [] if number is None else self.freed[number]:
+                    del self.views[j], self.depths[j]
+            if task is not None:
+                waiting.append(task)
+
+
+def last_uses(near: list[list[int]]) -> list[int]:
+    """The last image that needs each image, itself or as a neighbour."""
+    last = list(range(len(near)))
+    for i, neighbours in enumerate(near):
+        for j in neighbours:
+            last[j] = max(last[j], i)
+    return last
 
 
 def matched(view: View, others: list[View], points: NDArray[np.float64]) -> Depth:

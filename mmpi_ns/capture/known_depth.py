@@ -24,10 +24,11 @@ from torch import Tensor
 
 from mmpi_ns.capture.cache import Arrays, Computed, Pairs, digest, remembered
 from mmpi_ns.capture.dataset import MMPIDataset, read_depth_image
-from mmpi_ns.capture.dense import ROUNDS, SECONDS, Depth, find_depths
-from mmpi_ns.capture.lone_depth import MOST_OTHERS, continued, others_that_see
+from mmpi_ns.capture.dense import ROUNDS, SECONDS, STRIP, Depth, find_depths, strips
+from mmpi_ns.capture.lone_depth import continued, is_lone
 from mmpi_ns.capture.loose_points import POINT_ERROR, contradict, see_points
 from mmpi_ns.capture.observe import drop_masked, posed_images
+from mmpi_ns.capture.rays import Rays
 from mmpi_ns.capture.tracks import PosedImages, at_full_size
 from mmpi_ns.capture.views import View, camera_matrix, look_up
 from mmpi_ns.placement.observations import Observations
@@ -96,8 +97,13 @@ def packed(values: ArrayLike) -> Codes:
     Relative steps, as a distance's error is relative too, whatever the unit of the scene.
     """
     values = np.asarray(values, np.float32)
-    logarithms = np.log2(np.where(values > 0, values, 1))
-    return np.where(values > 0, np.rint(OCTAVE * logarithms.clip(-31, 31)), UNKNOWN).astype(np.int16)
+    codes, flat = np.empty(values.shape, np.int16), values.reshape(-1)
+    for first in range(0, flat.size, STRIP):
+        part = flat[first : first + STRIP]
+        logarithms = np.log2(np.where(part > 0, part, 1))
+        coded = np.where(part > 0, np.rint(OCTAVE * logarithms.clip(-31, 31)), UNKNOWN)
+        codes.reshape(-1)[first : first + STRIP] = coded
+    return codes
 
 
 def unpacked(codes: Int16[Tensor, "*N"]) -> Float[Tensor, "*N"]:
@@ -106,7 +112,13 @@ def unpacked(codes: Int16[Tensor, "*N"]) -> Float[Tensor, "*N"]:
 
 
 def know_depths(
-    outputs: DataparserOutputs, observations: Observations, dataset: MMPIDataset, *, dense: bool, sensor: bool
+    outputs: DataparserOutputs,
+    observations: Observations,
+    dataset: MMPIDataset,
+    rays: Rays,
+    *,
+    dense: bool,
+    sensor: bool,
 ) -> tuple[KnownDepth | None, Observations]:
     """All available depths of the training images, and the observations with the points of a cloud, if there is one.
 
@@ -114,6 +126,7 @@ def know_depths(
         outputs: of the data parser.
         observations: their cameras, tracks and loose points.
         dataset: the images.
+        rays: makes rays through their pixel centres (image, row, column).
         dense: whether to match neighbouring images.
         sensor: whether to read depth images.
 
@@ -146,7 +159,7 @@ def know_depths(
     if files:
         unit = outputs.metadata.get("depth_unit_scale_factor", 1.0) * outputs.dataparser_scale
         known = with_sensor(known, [Path(f) for f in files], float(unit), original, posed)
-    known = with_continued(known, posed, dataset)
+    known = with_continued(known, posed, dataset, rays)
     give_back_freed_memory()
     return known, seen
 
@@ -217,7 +230,7 @@ def at_training_pixels(
     """Distances of a training image's pixels from the depths of its view at working size.
 
     A training pixel takes the mean over its area, weighted by certainty; the spread within the area, large at an
-    edge, is added to its error.
+    edge, is added to its error. One that is smaller than a working pixel takes the depth of that.
 
     Args:
         view: the image at working size.
@@ -230,16 +243,17 @@ def at_training_pixels(
     Returns:
         [H, W, 2] inverse distance and expected error.
     """
-    height, width = shape
-    small = (width, height)
-    mean, error = pooled(depth, (small[1], small[0]))
-    x, y = straightened(original, i, shape, file_shape)
+    height, width = (min(pair) for pair in zip(shape, view.gray.shape, strict=True))
+    maps, distances = pooled(depth, (height, width)), np.empty((*shape, 2), np.float32)
     fx, fy, cx, cy = view.pinhole
-    scale_x, scale_y = small[0] / view.gray.shape[1], small[1] / view.gray.shape[0]
-    at = (((fx * x + cx) * scale_x).reshape(shape), ((fy * y + cy) * scale_y).reshape(shape))
-    longer = np.sqrt(x**2 + y**2 + 1).reshape(shape)
-    take = [look_up(m, *at, nearest=True) / longer for m in (mean, error)]
-    return np.stack(take, -1).astype(np.float32)
+    scale_x, scale_y = width / view.gray.shape[1], height / view.gray.shape[0]
+    for rows in strips(shape):
+        x, y = straightened(original, i, shape, file_shape, rows)
+        at = (((fx * x + cx) * scale_x).reshape(-1, shape[1]), ((fy * y + cy) * scale_y).reshape(-1, shape[1]))
+        longer = np.sqrt(x**2 + y**2 + 1).reshape(-1, shape[1])
+        for n, values in enumerate(maps):
+            distances[rows, :, n] = look_up(values, *at, nearest=True) / longer
+    return distances
 
 
 def pooled(depth: Depth, shape: tuple[int, int]) -> tuple[Map, Map]:
@@ -258,11 +272,11 @@ def pooled(depth: Depth, shape: tuple[int, int]) -> tuple[Map, Map]:
 
 
 def straightened(
-    original: PosedImages, i: int, shape: tuple[int, int], file_shape: tuple[int, int]
+    original: PosedImages, i: int, shape: tuple[int, int], file_shape: tuple[int, int], some: slice = slice(None)
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Tangents (right, down) at which a training image's pixels look, lens taken out. [H * W] each"""
+    """Tangents (right, down) at which a training image's pixels look, lens taken out; of some rows. [H * W] each"""
     full_width, full_height = original.sizes[i]
-    columns, rows = np.meshgrid(np.arange(shape[1]) + 0.5, np.arange(shape[0]) + 0.5)
+    columns, rows = np.meshgrid(np.arange(shape[1]) + 0.5, np.arange(shape[0])[some] + 0.5)
     at = np.stack([columns * full_width / file_shape[1], rows * full_height / file_shape[0]], -1).reshape(-1, 1, 2)
     if not original.is_bent(i):
         fx, fy, cx, cy = original.intrinsics[i]
@@ -272,7 +286,7 @@ def straightened(
     return np.asarray(found[:, 0], np.float64), np.asarray(found[:, 1], np.float64)
 
 
-def with_continued(known: KnownDepth, posed: PosedImages, dataset: MMPIDataset) -> KnownDepth:
+def with_continued(known: KnownDepth, posed: PosedImages, dataset: MMPIDataset, rays: Rays) -> KnownDepth:
     """Extrapolates surfaces into regions that hardly any other image shows (``lone_depth.py``); cached.
 
     Masked pixels have no distance: what moves is nowhere.
@@ -280,7 +294,7 @@ def with_continued(known: KnownDepth, posed: PosedImages, dataset: MMPIDataset) 
     count = len(known.codes)
 
     def continue_all() -> Pairs:
-        codes = in_order(lambda i: _continued_codes(known.codes[i], i, posed, dataset), range(count))
+        codes = in_order(lambda i: _continued_codes(known.codes[i], i, posed, dataset, rays), range(count))
         shown = track(codes, "Extrapolating surfaces", count, console=CONSOLE)
         return ((f"{i}", image) for i, image in enumerate(shown))
 
@@ -291,24 +305,24 @@ def with_continued(known: KnownDepth, posed: PosedImages, dataset: MMPIDataset) 
     return _stored(remembered(key, continue_all))
 
 
-def _continued_codes(codes: Codes, i: int, posed: PosedImages, dataset: MMPIDataset) -> Codes:
+def _continued_codes(codes: Codes, i: int, posed: PosedImages, dataset: MMPIDataset, rays: Rays) -> Codes:
     """Codes of one image with extrapolated surfaces; computed for every n-th pixel of a large image."""
     codes, hidden = np.array(codes), ~dataset.usable(i)
     codes[hidden] = UNKNOWN
     step = -(-max(codes.shape[:2]) // CONTINUED)
     rows, columns = (np.minimum(np.arange(0, n, step) + step // 2, n - 1) for n in codes.shape[:2])
-    coords = np.stack(np.meshgrid(rows, columns, indexing="ij"), -1).reshape(-1, 2) + 0.5
-    at = torch.full((len(coords), 1), i)
-    directions = dataset.cameras.generate_rays(at, coords=torch.from_numpy(coords).float()).directions.numpy()
-    directions = directions.reshape(len(rows), len(columns), 3)
+    pixels = np.stack(np.meshgrid(i, rows, columns, indexing="ij"), -1).reshape(-1, 3)
+    directions = rays(torch.from_numpy(pixels)).directions.cpu().numpy().reshape(len(rows), len(columns), 3)
     sparse = unpacked(torch.from_numpy(codes[np.ix_(rows, columns)])).numpy()
     extended = continued(sparse, directions)
     down, across = np.nonzero(extended[..., 0])
     points = posed.camera_to_worlds[i, :, 3] + directions[down, across] / extended[down, across, :1]
-    many = others_that_see(posed, i, points) > MOST_OTHERS
-    extended[down[many], across[many]] = 0
-    down, across = np.nonzero(codes[..., 0] == UNKNOWN)
-    codes[down, across] = packed(extended)[down // step, across // step]
+    seen = ~is_lone(posed, i, points)
+    extended[down[seen], across[seen]] = 0
+    for first, fine in zip(range(0, len(codes), step), packed(extended), strict=True):
+        part = codes[first : first + step]
+        unknown = part[..., 0] == UNKNOWN
+        part[unknown] = np.broadcast_to(np.repeat(fine, step, 0)[: part.shape[1]], part.shape)[unknown]
     codes[hidden] = UNKNOWN
     return codes
 

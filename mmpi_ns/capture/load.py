@@ -11,7 +11,7 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from mmpi_ns.capture.checks import check_transforms
-from mmpi_ns.capture.datamanager import MMPIDataManagerConfig
+from mmpi_ns.capture.datamanager import OBSERVATIONS, MMPIDataManagerConfig
 from mmpi_ns.capture.dataset import MMPIDataset
 from mmpi_ns.capture.local_origin import take_local_origins
 from mmpi_ns.capture.moving_picture import draw_moving
@@ -37,7 +37,8 @@ def load_observations(
         data: the scene's folder.
         downscale_factor: size of the images, as for the data parser; None leaves it to the parser.
         parser: format of the scene; auto means nerfstudio's format if there is a transforms.json.
-        moving: file for a picture of what moves. None: nobody looks, and nothing is masked.
+        moving: file for a picture of what moves. None: nobody looks for it, nor for the depths of pixels, which take
+            minutes; tracks or a plane sweep take their place.
 
     Raises:
         InputError: the folder holds no scene, or one that cannot be trained.
@@ -59,16 +60,16 @@ def load_observations(
     take_local_origins(parser_config)
     outputs = parser_config.setup().get_dataparser_outputs(split="train")
     if any(Path(name).is_file() for name in outputs.image_filenames):
-        # As ns-train does, so that it refuses what ns-train would refuse; placement asks for no depths of pixels.
-        config.dense_depth = config.depth_images = False
-        config.mask_moving = moving is not None
+        # As ns-train does, so that it refuses what ns-train would refuse, and finds the depths that it would find.
+        config.mask_moving = config.dense_depth = config.depth_images = moving is not None
+        config.new_view_share, config.correct_exposure = 0.0, False  # placement asks for neither
         manager = config.setup(device="cpu", test_mode="val")
         masks = manager.train_dataset.moving
         if moving is not None and masks is not None:
             names = [Path(name).name for name in outputs.image_filenames]
             colors = (manager.train_dataset.get_data(i, "uint8")["image"][..., :3] for i in range(len(names)))
             draw_moving(moving, zip(names, (np.flip(x.numpy(), -1) for x in colors), strict=True), masks)
-        return manager.observations, manager.moves
+        return manager.train_dataset.metadata[OBSERVATIONS], manager.moves
     CONSOLE.print(f"The images of {data} are not there: its cameras and points alone are judged.")
     folder = sfm_folder(parser_config, config.sfm_path)
     return observe(outputs, MMPIDataset(outputs), folder, find_points=True, triangulates=config.triangulate), ""

@@ -31,7 +31,7 @@ MOST_ERROR = 0.3
 NEAREST = 16
 """Nearby images that are checked for a point."""
 MOST_OTHERS = 1
-"""Other images in which an extrapolated point may lie; with more, matches and colours are more reliable."""
+"""Other images in which a lone point may lie; with more, matches and colours are more reliable."""
 
 
 def continued(depths: Map, directions: Map) -> Map:
@@ -108,10 +108,13 @@ def _planes(
     return value, np.sqrt((scatter + (0.2 * LEAST_ERROR * value) ** 2) * leverage)
 
 
-def others_that_see(posed: PosedImages, i: int, points: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Number of images near image i that may show each of its points [P, 3]. [P]"""
-    count = np.zeros(len(points), np.int64)
-    for j in nearest_views(posed.camera_to_worlds, i, NEAREST) if len(points) else []:
-        at = project(posed, j, points)
-        count += ((at >= 0) & (at <= posed.sizes[j])).all(-1)
-    return count
+def is_lone(posed: PosedImages, i: int, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Whether at most ``MOST_OTHERS`` images near image i may show each of its points [P, 3]. [P]"""
+    count, lone = np.zeros(len(points), np.int64), np.arange(len(points))
+    for j in nearest_views(posed.camera_to_worlds, i, NEAREST):
+        if not len(lone):
+            break
+        at = project(posed, j, points[lone])
+        count[lone] += ((at >= 0) & (at <= posed.sizes[j])).all(-1)
+        lone = lone[count[lone] <= MOST_OTHERS]
+    return count <= MOST_OTHERS

@@ -21,10 +21,10 @@ SEED = 0
 
 
 @contextmanager
-def quiet() -> Iterator[None]:
-    """Keeps COLMAP's log to errors."""
+def quiet(shows_errors: bool = True) -> Iterator[None]:
+    """Keeps COLMAP's log to errors, or to what ends the program."""
     log = load_pycolmap().logging
-    level, log.minloglevel = log.minloglevel, int(log.Level.ERROR)
+    level, log.minloglevel = log.minloglevel, int(log.Level.ERROR if shows_errors else log.Level.FATAL)
     try:
         yield
     finally:

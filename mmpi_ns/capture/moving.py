@@ -6,6 +6,7 @@ Every image is compared with its neighbours at reduced size (``moving_evidence.p
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -27,7 +28,8 @@ from mmpi_ns.capture.tracks import PosedImages, at_full_size
 from mmpi_ns.capture.views import View, look_up, straightened_color
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.scene.near_views import nearest_views
-from mmpi_ns.utils.parallel import num_threads, one_thread_each
+from mmpi_ns.utils.errors import duration
+from mmpi_ns.utils.parallel import in_order, num_threads, one_thread_each
 
 SIDE = 384
 """Longer side of the images at which is compared, pixels."""
@@ -39,6 +41,8 @@ AFTER = 2
 """Nearest neighbours from which objects are followed."""
 EDGE = 0.4
 """Share of a mover around a pixel from which it is masked."""
+SECONDS = 0.4
+"""Processor seconds for an image, for the forecast (docs/log/performance.md)."""
 VERSION = 2
 """Version of the algorithm: cached masks of another version are found anew."""
 ENOUGH = 200
@@ -116,15 +120,19 @@ def moving_masks(observations: Observations, dataset: MMPIDataset) -> Sequence[M
     seen_by, points = observations.seen_by[:tracked], observations.points[observations.seen_point[:tracked]]
 
     def find() -> Arrays:
-        for i in range(len(dataset)):  # names a damaged file, of which OpenCV would print warnings first
-            dataset.get_data(i, image_type="uint8")
-        CONSOLE.print(f"Looking for what moves in {len(shapes)} images.")
+        # Names a damaged file, of which OpenCV would print warnings first.
+        deque(in_order(lambda i: dataset.get_data(i, image_type="uint8"), range(len(dataset))), maxlen=0)
+        seconds = duration(SECONDS * len(shapes) / num_threads())
+        CONSOLE.print(f"Looking for what moves in {len(shapes)} images: about {seconds}.")
         shown = find_moving(
             original, lambda i: points[seen_by == i],
             progress=lambda work, count: track(work, "Movers", count, console=CONSOLE),
         )  # fmt: skip
         views = zip(shown.views, shown.masks, shapes, strict=True)
-        return {f"{i}": np.packbits(in_image(v, m, original, i, s)) for i, (v, m, s) in enumerate(views)}
+        return {
+            f"{i}": np.packbits(in_image(v, m, original, i, s) if m.any() else np.zeros(s, bool))
+            for i, (v, m, s) in enumerate(views)
+        }
 
     cameras = original.camera_to_worlds, original.intrinsics, original.distortion, original.fisheye
     stored = remembered(digest(original.files, "moving", VERSION, shapes, *cameras, seen_by, points), find)

@@ -7,7 +7,7 @@ new view and, since they end at the point, the empty space in front of it, which
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -19,11 +19,15 @@ from nerfstudio.cameras.rays import RayBundle
 from numpy.typing import NDArray
 from torch import Tensor
 
+from mmpi_ns.capture.cache import images_held
 from mmpi_ns.capture.dataset import MMPIDataset
+from mmpi_ns.capture.dense import TRIMMED
 from mmpi_ns.capture.known_depth import KnownDepth
+from mmpi_ns.capture.rays import Rays
 from mmpi_ns.capture.tracks import PosedImages
 from mmpi_ns.capture.views import look_up, project
 from mmpi_ns.scene.near_views import nearest_views
+from mmpi_ns.utils.host import give_back_freed_memory
 
 NEIGHBOURS = 4
 """Number of cameras, the nearest facing the same way, in which a point of an image is searched."""
@@ -35,15 +39,13 @@ SAME_DEPTH = 0.03
 """Maximum relative difference between the distances of a point in two images."""
 SAME_COLOR = 24
 """Tolerance, in levels, beyond the range of colours within a pixel of the projection in the other image."""
-HELD = 32
-"""Images in memory at once."""
+BYTES_OF_IMAGE = 12
+"""Of a pixel of an image with its mask and depths."""
 MOST = 2_000_000
 """Maximum number of pixel pairs (30 bytes each), spread over the images."""
 
 PARTS = ("pixels", "other", "colors", "depths")
 """What is known of every point."""
-
-Rays = Callable[[Int[Tensor, "R 3"]], RayBundle]
 
 
 @dataclass(frozen=True)
@@ -122,12 +124,14 @@ def find_shared_points(
     Raises:
         InputError: an image or mask cannot be used (names the file).
     """
-    show = lru_cache(HELD)(
+    show = lru_cache(images_held(posed.sizes, BYTES_OF_IMAGE, NEIGHBOURS + 1))(
         lambda i: (*image_and_mask(dataset, i), known.image(i))
     )  # neighbours mostly stand side by side
     rng, parts, found = np.random.default_rng(seed), [], 0.0
     budget = max(1, MOST // (NEIGHBOURS * max(1, len(images))))
-    for i in images:
+    for n, i in enumerate(images):
+        if n % TRIMMED == 0:
+            give_back_freed_memory()
         image, usable, measured = show(i)
         certain = (measured[..., 0] > 0) & (measured[..., 1] < CERTAIN * measured[..., 0]) & (usable > 0)
         rows, columns = np.nonzero(certain)

@@ -27,16 +27,19 @@ from numpy import ndarray
 from numpy.typing import NDArray
 from scipy import sparse
 
+from mmpi_ns.capture.cache import images_held
+from mmpi_ns.capture.dense import TRIMMED
 from mmpi_ns.capture.known_depth import KnownDepth
-from mmpi_ns.capture.new_views import Rays
+from mmpi_ns.capture.rays import Rays
 from mmpi_ns.capture.tracks import PosedImages
 from mmpi_ns.capture.views import look_up, project
 from mmpi_ns.scene.near_views import nearest_views
+from mmpi_ns.utils.host import give_back_freed_memory
 
 NEIGHBOURS, MAX_ANGLE = 6, 40.0
 """Nearest views that each image is compared with, and the largest angle in degrees between their directions."""
-HELD = 32
-"""Images in memory at once."""
+BYTES_OF_VIEW = 17
+"""Of a pixel of an ``ExposedView``."""
 HIDDEN = 0.3
 """Log ratio from the median beyond which another surface is taken to hide one, where distances are not known."""
 
@@ -243,11 +246,13 @@ def color_ratios(
     """
     rng, parts = np.random.default_rng(seed), []
 
-    @lru_cache(HELD)
+    @lru_cache(images_held(cameras.sizes, BYTES_OF_VIEW, NEIGHBOURS + 1))
     def view_of(i: int) -> ExposedView:
-        return ExposedView.of(*image_of(i), depths.image(i)[..., 0], i)
+        return ExposedView.of(*image_of(i), depths.image(i)[..., 0].copy(), i)
 
     for i in range(len(cameras.files)):
+        if i % TRIMMED == 0:
+            give_back_freed_memory()
         view, depth = view_of(i), depths.image(i)
         certain = np.argwhere(view.exposed & (depth[..., 0] > 0) & (depth[..., 1] < CERTAIN * depth[..., 0]))
         pixels = certain[rng.choice(len(certain), min(SAMPLES, len(certain)), replace=False)]

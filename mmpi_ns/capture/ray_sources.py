@@ -15,7 +15,8 @@ from torch import Tensor
 
 from mmpi_ns.capture.dataset import MMPIDataset
 from mmpi_ns.capture.known_depth import KnownDepth, unpacked
-from mmpi_ns.capture.new_views import Rays, SharedPoints
+from mmpi_ns.capture.new_views import SharedPoints
+from mmpi_ns.capture.rays import Rays
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.utils.errors import InputError
 from mmpi_ns.utils.random_draws import generator

@@ -7,6 +7,7 @@ batch anew: here the directions of a lens are computed once, by nerfstudio, for 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -20,10 +21,12 @@ from torch import Tensor
 
 from mmpi_ns.scene.geometry import rotate
 
+Rays = Callable[[Int[Tensor, "R 3"]], RayBundle]
+"""Makes rays through pixel centres (camera, row, column)."""
 MOST_DIRECTIONS = 20_000_000
 """Pixels of distinct lenses for which directions are kept (12 bytes each); nerfstudio makes the rays of more."""
 CHUNK = 2**18
-"""Pixels undistorted at once."""
+"""Pixels whose rays are made at once."""
 GRID = 17
 """Grid points along each side of an image, for placement."""
 BENT = (CameraType.FISHEYE, CameraType.FISHEYE624, CameraType.EQUIRECTANGULAR)
@@ -87,8 +90,13 @@ class PinholeRays:
     def image(self, height: int, width: int) -> RayBundle:
         """Rays [height, width] through all pixels of the first camera."""
         rows, columns = (torch.arange(n, device=self.focal.device) for n in (height, width))
-        y, x = torch.meshgrid(rows, columns, indexing="ij")
-        return self(torch.stack([torch.zeros_like(x), y, x], -1).view(-1, 3)).reshape((height, width))
+        parts = []
+        for some in rows.split(max(1, CHUNK // width)):
+            y, x = torch.meshgrid(some, columns, indexing="ij")
+            parts.append(self(torch.stack([torch.zeros_like(x), y, x], -1).view(-1, 3)))
+        fields = ("origins", "directions", "pixel_area", "camera_indices")
+        joined = {name: torch.cat([getattr(part, name) for part in parts]) for name in fields}
+        return RayBundle(**joined, metadata={}).reshape((height, width))
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ import pycolmap
 
 from mmpi_ns.capture.matching import SEED, quiet
 from mmpi_ns.prepare.adjustment import polish, with_all_points
-from mmpi_ns.prepare.evidence import Witness, agreement, witness_of
+from mmpi_ns.prepare.evidence import Witness, agreement, share, witness_of
 from mmpi_ns.prepare.mapping import ATTEMPTS, Task, map_globally, reconstruct
 from mmpi_ns.prepare.stages import PrepareError
 from mmpi_ns.prepare.verdict import NEARLY_ALL, ORDER, Grade, Verdict, agrees, best_first, judge_alone, judge_together
@@ -24,6 +24,9 @@ STARTS = (0.7, 1.2)
 """Focal lengths over the longer side that are tried where none is known: telephones and cars, then COLMAP's guess."""
 NEAR = 0.1
 """Relative difference below which two initial focal lengths count as the same."""
+LEAST_POINTS = 0.05
+"""Share of the matches that must have become points of the global mapper's model, or it is none: it places every image
+whatever the focal length, and drops the points that do not fit."""
 
 
 @dataclass(frozen=True)
@@ -182,6 +185,11 @@ def _globally(starts: Sequence[tuple[str, Path]], names: Sequence[str], task: Ta
         focal = ", ".join(f"{c.mean_focal_length():.1f}" for _, c in sorted(model.cameras.items())[:3])
         error = model.compute_mean_reprojection_error()
         says = f"{model.num_reg_images()} of {len(names)} images, {error:.2f} px, focal length {focal} px"
+        candidate = _judged("global", model, f"{name} ({says})", task)
+        pairs = candidate.witness.pairs
+        if share(pairs.tracked, pairs.matches) < LEAST_POINTS:
+            says += "; left out, as hardly any match became a point"
+        else:
+            candidates.append(candidate)
         say(f"Mapping, {name}: {says}.")
-        candidates.append(_judged("global", model, f"{name} ({says})", task))
     return candidates

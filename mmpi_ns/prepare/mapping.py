@@ -197,7 +197,8 @@ def _run(
         before = pycolmap.Reconstruction(start).num_reg_images() if start is not None else 0
         if before:
             say(f"Mapping, {attempt.name}: goes on from {before} images.")
-        with progress(f"Mapping, {attempt.name}", total) as advance, quiet():
+        # An attempt that fails is reported in words.
+        with progress(f"Mapping, {attempt.name}", total) as advance, quiet(shows_errors=False):
             advance(before)
             models = pycolmap.incremental_mapping(
                 database,

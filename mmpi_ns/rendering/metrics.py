@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Literal
 
 import torch
@@ -12,6 +13,10 @@ from torchmetrics.functional.image import structural_similarity_index_measure
 
 MOST_SORTED = 1 << 20
 """Pixels used for the brightness range of a depth image; torch computes quantiles of at most 16.7 M."""
+PART = 1 << 20
+"""Pixels that are compared at once: all of a photo of 12 megapixels would take 8 GiB."""
+WINDOW = 11
+"""Side of SSIM's window, pixels."""
 
 
 class ImageMetrics:
@@ -24,12 +29,9 @@ class ImageMetrics:
 
     @torch.no_grad()
     def __call__(self, predicted: Float[Tensor, "H W 3"], observed: Float[Tensor, "H W 3"]) -> dict[str, float]:
-        a, b = (torch.moveaxis(x, -1, 0)[None].float() for x in (predicted, observed))
         values = {"psnr": psnr(predicted, observed)}
-        if min(a.shape[-2:]) >= 11:  # SSIM's window
-            ssim = structural_similarity_index_measure(a, b, data_range=1.0)
-            assert isinstance(ssim, Tensor)
-            values["ssim"] = float(ssim)
+        if min(predicted.shape[:2]) >= WINDOW:
+            values["ssim"] = ssim(predicted, observed)
         values |= {"cc_psnr": psnr(color_corrected(predicted, observed), observed)}
         if self.lpips_net != "none" and not self._lpips_tried:
             self._lpips_tried = True
@@ -37,21 +39,37 @@ class ImageMetrics:
                 from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
 
                 metric = LearnedPerceptualImagePatchSimilarity(net_type=self.lpips_net, normalize=True)
-                self._lpips = metric.to(a.device)
+                self._lpips = metric.to(predicted.device)
             except (OSError, RuntimeError, ImportError) as error:
                 CONSOLE.print(
                     f"[yellow]LPIPS is left out: the weights of its {self.lpips_net} network are not "
                     f"available ({type(error).__name__}). Put them into torch's hub cache to get it."
                 )
         if self._lpips is not None:
-            values[f"lpips_{self.lpips_net}"] = float(self._lpips(a.clamp(0, 1), b.clamp(0, 1)))
+            a, b = (torch.moveaxis(x, -1, 0)[None].float().clamp(0, 1) for x in (predicted, observed))
+            values[f"lpips_{self.lpips_net}"] = float(self._lpips(a, b))
         return values
 
 
 def psnr(predicted: Float[Tensor, "*N 3"], observed: Float[Tensor, "*N 3"]) -> float:
     """PSNR of colours in [0, 1], dB; at most 120."""
-    mse = ((predicted.double() - observed.double()) ** 2).mean().clamp(min=1e-12)
-    return float(-10 * torch.log10(mse))
+    squares = [((a.double() - b.double()) ** 2).sum() for a, b in _parts(predicted, observed)]
+    return float(-10 * torch.log10((torch.stack(squares).sum() / predicted.numel()).clamp(min=1e-12)))
+
+
+def ssim(predicted: Float[Tensor, "H W 3"], observed: Float[Tensor, "H W 3"]) -> float:
+    """Mean structural similarity of the windows about all pixels of two images in [0, 1], mirrored at their borders."""
+    height, width = predicted.shape[:2]
+    rows, total, border = max(1, PART // width), 0.0, WINDOW // 2
+    images = [torch.moveaxis(x, -1, 0)[None].float() for x in (predicted, observed)]
+    a, b = (torch.nn.functional.pad(x, (0, 0, border, border), "reflect") for x in images)
+    for first in range(0, height, rows):
+        part = slice(first, min(first + rows, height) + 2 * border)
+        _, values = structural_similarity_index_measure(
+            a[:, :, part], b[:, :, part], data_range=1.0, return_full_image=True
+        )
+        total += float(values[:, :, border:-border].double().sum())
+    return total / predicted.numel()
 
 
 def color_corrected(predicted: Float[Tensor, "H W 3"], observed: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:
@@ -59,12 +77,25 @@ def color_corrected(predicted: Float[Tensor, "H W 3"], observed: Float[Tensor, "
 
     Source: ``cc_psnr`` of nerfstudio's splatfacto, after MultiNeRF.
     """
-    colors = predicted.reshape(-1, 3).double()
-    design = torch.cat([colors, torch.ones_like(colors[:, :1])], -1)
     # Normal equations with a little of the identity: images of one colour have many solutions.
-    normal = design.T @ design + 1e-6 * len(design) * torch.eye(4, dtype=design.dtype, device=design.device)
-    target = design.T @ (observed.reshape(-1, 3).double() - colors)
-    return (colors + design @ torch.linalg.solve(normal, target)).clamp(0, 1).view(predicted.shape).to(predicted)
+    normal = 1e-6 * predicted[..., 0].numel() * torch.eye(4, dtype=torch.float64, device=predicted.device)
+    target = normal.new_zeros(4, 3)
+    for colors, aim in _parts(predicted, observed):
+        design = _with_one(colors)
+        normal += design.T @ design
+        target += design.T @ (aim.double() - colors.double())
+    change = torch.linalg.solve(normal, target)
+    corrected = [(a.double() + _with_one(a) @ change).clamp(0, 1).to(a) for a, _ in _parts(predicted, observed)]
+    return torch.cat(corrected).view(predicted.shape)
+
+
+def _parts(predicted: Float[Tensor, "*N 3"], observed: Float[Tensor, "*N 3"]) -> Iterator[tuple[Tensor, Tensor]]:
+    """Colours [P, 3] of both images, a part at a time."""
+    return zip(predicted.reshape(-1, 3).split(PART), observed.reshape(-1, 3).split(PART), strict=True)
+
+
+def _with_one(colors: Float[Tensor, "P 3"]) -> Float[Tensor, "P 4"]:
+    return torch.nn.functional.pad(colors.double(), (0, 1), value=1.0)
 
 
 def depth_metrics(predicted: Float[Tensor, "H W 1"], true: Float[Tensor, "H W 1"]) -> dict[str, float]:

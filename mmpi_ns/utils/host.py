@@ -40,6 +40,7 @@ WARNINGS = (
     "Detected call of `lr_scheduler.step\\(\\)` before `optimizer.step\\(\\)`",  # parameters that are frozen at first
     "Sparse invariant checks are implicitly disabled",
     "You are using `torch.load` with `weights_only=False`",
+    "std_mean\\(\\): degrees of freedom",  # of the scores of one test image
 )
 """Beginnings of such warnings of torch and nerfstudio."""
 TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3

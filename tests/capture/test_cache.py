@@ -11,7 +11,7 @@ import numpy as np
 from filelock import FileLock
 
 from mmpi_ns.capture import cache
-from mmpi_ns.capture.cache import digest, remembered
+from mmpi_ns.capture.cache import digest, images_held, remembered
 
 
 def counting(calls, delay=0.0):
@@ -128,3 +128,10 @@ def test_keys_tell_files_poses_and_settings_apart(tmp_path):
     file.write_text("other")
     others.append(digest([file], "tracks", 1, poses))
     assert key not in others and len(set(others)) == 4
+
+
+def test_of_large_images_few_are_held_but_as_many_as_are_compared():
+    sizes = np.array([[960.0, 540.0], [10.0, 10.0]])
+    assert images_held(sizes, 17, 7) == 2**28 // (17 * 960 * 540) == 30
+    assert images_held(sizes, 12, 7) == images_held(sizes[1:], 12, 7) == 32
+    assert images_held(np.array([[4000.0, 3000.0]]), 17, 7) == 7

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from dataclasses import replace
 
 import numpy as np
@@ -170,8 +171,42 @@ def test_each_image_is_shown_twice_and_finished_once(tmp_path):
     threads = dense.cv2.getNumThreads()
     shape_of = lambda i, view, depth: (i, depth.inverse.shape)  # noqa: E731
     results = list(find_depths(images, lambda i: points_on_walls(POSES[i]), WIDTH, shape_of, progress))
-    assert results == [(i, (HEIGHT, WIDTH)) for i in range(3)] == shown[4:] and shown[0] == 6 and len(shown) == 7
+    assert results == [(i, (HEIGHT, WIDTH)) for i in range(3)] and shown[0] == 6 and len(shown) == 7
+    assert shown[4:] == [(True, result) for result in results] and not any(is_last for is_last, _ in shown[1:4])
     assert dense.cv2.getNumThreads() == threads, "OpenCV's setting is left as it was"
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+@pytest.mark.parametrize("is_in_order", [True, False])
+def test_images_are_in_memory_while_their_neighbours_are_worked_on(tmp_path, monkeypatch, threads, is_in_order):
+    """Of a walk in order few at once; of one out of order as many as it takes, with the same depths."""
+    count = 40
+    places = np.arange(count) if is_in_order else np.random.default_rng(0).permutation(count)
+    poses = np.tile(np.eye(4)[:3], (count, 1, 1))
+    poses[:, 0, 3] = places + 0.1 * np.sin(places)  # no two as far apart as two others
+    images = replace(scene_of(tmp_path, POSES[:1]), files=(tmp_path,) * count, camera_to_worlds=poses)
+    alive, most = [], 0
+
+    def load(images, i, width):
+        nonlocal most
+        view = View(np.full((2, 2), i, np.uint8), np.ones(4), images.camera_to_worlds[i], np.ones((2, 2), bool))
+        alive.append(weakref.ref(view.gray))
+        most = max(most, sum(ref() is not None for ref in alive))
+        return view
+
+    monkeypatch.setattr(dense, "load_view", load)
+    monkeypatch.setattr(dense, "num_threads", lambda: threads)
+    at = lambda views: {v.pose[0, 3] for v in views}  # noqa: E731
+    monkeypatch.setattr(dense, "matched", lambda view, others, points: (view.pose[0, 3], at(others)))
+    monkeypatch.setattr(dense, "confirmed", lambda view, depth, others: (depth, at(v for v, _ in others)))
+    shown = lambda i, view, depth: (i, view.pose[0, 3], depth)  # noqa: E731
+    results = list(find_depths(images, lambda i: np.zeros((0, 3)), 2, shown))
+    x = poses[:, 0, 3]
+    for i, (number, place, ((mine, others), again)) in enumerate(results):
+        nearest = np.sort(np.abs(x - x[i]))[1 : dense.NEIGHBOURS + 1]
+        assert number == i and place == mine == x[i] and others == again
+        assert np.allclose(sorted(abs(other - x[i]) for other in others), nearest)
+    assert len(results) == len(alive) == count and (not is_in_order or most <= 9 + threads)
 
 
 def test_rounds_from_coarse_to_fine_give_the_depths_of_full_size(tmp_path, monkeypatch):

@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 import torch
 from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.model_components.ray_generators import RayGenerator
 
 from mmpi_ns.capture import known_depth
 from mmpi_ns.capture.known_depth import KnownDepth, with_continued
-from mmpi_ns.capture.lone_depth import LEAST_ERROR, MOST_ERROR, continued, others_that_see
+from mmpi_ns.capture.lone_depth import LEAST_ERROR, MOST_ERROR, continued, is_lone
 from mmpi_ns.capture.tracks import PosedImages
 
 F32 = np.float32
@@ -106,14 +107,26 @@ def posed(*places, lens=(0.0, 0.0, 0.0, 0.0)):
     return PosedImages((Path(__file__),) * count, poses, intrinsics, sizes, np.tile(lens, (count, 1)).astype(float))  # type: ignore[arg-type]
 
 
-def test_the_images_that_show_a_point_are_counted():
+def test_a_point_is_lone_that_at_most_one_other_image_shows():
     """The second camera stands further on: it sees the middle of what the first one sees, nothing behind itself."""
     images = posed((0, 0, 0), (0, 0, -3), (0, 0, -3.5))
     points = np.array([[0.0, 0, -10], [7.0, 0, -10], [0.0, 0, -2], [5.4, 0.0, -10]])
-    assert others_that_see(images, 0, points).tolist() == [2, 0, 0, 1]  # the border: 0.8 (10 - 3) and 0.8 (10 - 3.5)
-    assert others_that_see(images, 1, points[:1]).tolist() == [2]
-    assert others_that_see(posed((0, 0, 0)), 0, points).tolist() == [0] * 4
-    assert others_that_see(images, 0, np.zeros((0, 3))).shape == (0,)
+    assert is_lone(images, 0, points).tolist() == [False, True, True, True]  # borders: 0.8 (10 - 3), 0.8 (10 - 3.5)
+    assert is_lone(images, 1, points[:1]).tolist() == [False]
+    assert is_lone(posed((0, 0, 0)), 0, points).tolist() == [True] * 4
+    assert is_lone(images, 0, np.zeros((0, 3))).shape == (0,)
+
+
+def test_lone_points_are_those_of_every_image_by_itself():
+    rng = np.random.default_rng(0)
+    images = posed(*rng.uniform(-2, 2, (9, 3)))
+    points = rng.uniform([-12, -9, -15], [12, 9, 1], (5000, 3))
+    count = np.zeros(len(points), int)
+    for j in range(1, 9):
+        away = points - images.camera_to_worlds[j, :, 3]
+        x, y = (FOCAL * away[:, k] / np.minimum(away[:, 2], -1e-9) for k in (0, 1))
+        count += (away[:, 2] < 0) & (np.abs(x) <= WIDTH / 2) & (np.abs(y) <= HEIGHT / 2)
+    assert np.array_equal(is_lone(images, 0, points), count <= 1) and {0, 1, 2, 3} <= set(count)
 
 
 @pytest.mark.parametrize("between", [0, 1])
@@ -133,13 +146,14 @@ def test_the_border_of_the_first_image_of_a_drive_gets_a_depth(between, most, mo
         torch.tensor(images.camera_to_worlds).float(), FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, width=WIDTH, height=HEIGHT
     )
     usable = np.ones((HEIGHT, WIDTH), bool)
-    dataset: Any = SimpleNamespace(cameras=cameras, has_masks=False, usable=lambda i: usable)
-    found = with_continued(KnownDepth.of(known), images, dataset)
-    again = with_continued(KnownDepth.of(known), images, dataset)
+    dataset: Any = SimpleNamespace(has_masks=False, usable=lambda i: usable)
+    rays = RayGenerator(cameras)
+    found = with_continued(KnownDepth.of(known), images, dataset, rays)
+    again = with_continued(KnownDepth.of(known), images, dataset, rays)
     assert all(np.array_equal(a, b) for a, b in zip(found.codes, again.codes, strict=True))
     usable[:3] = False
     dataset.has_masks = True
-    masked = with_continued(KnownDepth.of(known), images, dataset).image(0)
+    masked = with_continued(KnownDepth.of(known), images, dataset, rays).image(0)
     assert not masked[:3].any() and np.count_nonzero(masked) > 0.8 * np.count_nonzero(found.image(0)[3:])
     first, exact = found.image(0), plane((0, 0, -1), 10, d)
     points = d / exact[..., None]

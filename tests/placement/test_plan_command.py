@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import sys
 
@@ -36,6 +37,17 @@ def test_it_writes_a_plan_a_table_and_pictures(scene, tmp_path, monkeypatch, cap
     for name in ("plan.png", "errors.png"):
         picture = np.asarray(Image.open(tmp_path / "plan" / name).convert("RGB"))
         assert min(picture.shape[:2]) > 200 and len(np.unique(picture.reshape(-1, 3), axis=0)) > 20
+
+
+def test_the_plan_is_that_of_training(scene, tmp_path, monkeypatch):
+    run(monkeypatch, scene, "--output", tmp_path / "plan", "--placement.max-texels", 1e5)
+    config = copy.deepcopy(mmpi_small.config.pipeline)
+    config.datamanager.data = scene
+    config.model.method, config.model.total_steps, config.model.lpips_net = "mmpi-small", 0, "none"  # as the trainer
+    config.model.placement.max_texels = 1e5
+    pipeline = config.setup(device="cpu", test_mode="val")
+    assert pipeline.datamanager.known_depth.share > 0.1
+    assert pipeline.model.progress.windows == WindowedPlan.load(tmp_path / "plan" / "plan.json")
 
 
 def test_an_edited_plan_is_explained_and_kept(scene, tmp_path, monkeypatch, capsys):

@@ -80,6 +80,26 @@ def test_all_images_are_placed_at_once_where_the_incremental_mapper_fails(task, 
         map_and_judge(replace(task, work=task.work / "none"))
 
 
+def test_a_global_model_without_points_neither_counts_nor_gives_its_focal_length(task, monkeypatch):
+    place, build, starts = mappers.map_globally, mappers.reconstruct, []
+
+    def without_points(*args):
+        model = place(*args)
+        for number in list(model.points3D):
+            model.delete_point3D(number)
+        return model
+
+    def watch(task, start, attempts):
+        starts.append(start)
+        return build(task, start, attempts)
+
+    monkeypatch.setattr(mappers, "map_globally", without_points)
+    monkeypatch.setattr(mappers, "reconstruct", watch)
+    believed = map_and_judge(task)
+    assert believed.says.startswith("incremental") and "global" not in believed.says
+    assert starts == [task.database] and error_of(believed.model) < 0.01
+
+
 def test_a_placed_model_is_given_the_points_of_all_matches_and_adjusted(task):
     exact = pycolmap.Reconstruction(task.database.parents[1] / "model/model")
     before = exact.num_points3D()

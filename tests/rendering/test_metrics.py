@@ -2,9 +2,41 @@
 
 from __future__ import annotations
 
+import numpy as np
+import pytest
 import torch
+from scipy.ndimage import gaussian_filter
 
-from mmpi_ns.rendering.metrics import pictures
+from mmpi_ns.rendering import metrics
+from mmpi_ns.rendering.metrics import color_corrected, pictures, psnr, ssim
+
+
+def ssim_of(a, b):
+    """SSIM of whole images, by its formula with a Gaussian of 1.5 pixels in windows of 11, mirrored. Float64."""
+    a, b = (np.pad(x, ((5, 5), (5, 5), (0, 0)), "reflect") for x in (a, b))
+
+    def mean(x):
+        return gaussian_filter(x, (1.5, 1.5, 0), truncate=5 / 1.5, mode="constant")[5:-5, 5:-5]
+
+    mean_a, mean_b = mean(a), mean(b)
+    cov, var = mean(a * b) - mean_a * mean_b, mean(a * a) - mean_a**2 + mean(b * b) - mean_b**2
+    near, like = 2 * mean_a * mean_b + 1e-4, 2 * cov + 9e-4
+    return (near * like / ((mean_a**2 + mean_b**2 + 1e-4) * (var + 9e-4))).mean()
+
+
+@pytest.mark.parametrize("part", [1, 700, 1 << 20])
+@pytest.mark.parametrize("shape", [(37, 53), (11, 64), (64, 11)])
+def test_scores_do_not_depend_on_the_parts_in_which_images_are_compared(part, shape, monkeypatch):
+    monkeypatch.setattr(metrics, "PART", part)
+    rng = np.random.default_rng(0)
+    b = rng.random((*shape, 3))
+    a = (0.8 * b + 0.2 * rng.random((*shape, 3)) * b[::-1]).clip(0, 1)
+    predicted, observed = torch.from_numpy(a), torch.from_numpy(b)
+    assert ssim(predicted, observed) == pytest.approx(ssim_of(a, b), abs=1e-5)
+    assert psnr(predicted, observed) == pytest.approx(-10 * np.log10(((a - b) ** 2).mean()), abs=1e-9)
+    design = np.c_[a.reshape(-1, 3), np.ones(a[..., 0].size)]
+    fitted = (design @ np.linalg.lstsq(design, b.reshape(-1, 3), rcond=None)[0]).clip(0, 1)
+    assert np.allclose(color_corrected(predicted, observed).reshape(-1, 3), fitted, atol=1e-3)
 
 
 def test_pictures_of_more_pixels_than_torch_sorts_are_made():

@@ -10,6 +10,7 @@ import warnings
 from pathlib import Path
 
 import pytest
+import torch
 from nerfstudio.data.dataparsers import nerfstudio_dataparser
 from nerfstudio.utils.rich_utils import CONSOLE
 from training_runs import ready, trainer_config
@@ -159,6 +160,17 @@ def test_an_input_error_is_one_sentence_and_others_keep_their_traceback(monkeypa
     assert capsys.readouterr().err == "ns-train: The scene is empty.\n" and not shown
     sys.excepthook(KeyError, KeyError("x"), None)
     assert len(shown) == 1
+
+
+def test_scores_of_one_test_image_come_without_a_warning(monkeypatch, mallocs):
+    monkeypatch.setattr(sys, "argv", ["ns-eval"])
+    with warnings.catch_warnings(record=True) as shown:
+        warnings.simplefilter("always")
+        host.enter_command()
+        assert torch.std_mean(torch.ones(1))[0].isnan() and not shown
+        host.undo()
+        torch.std_mean(torch.ones(1))
+    assert len(shown) == 1, "torch still warns"
 
 
 def test_a_transforms_file_is_changed_within_the_block_alone(tmp_path):
