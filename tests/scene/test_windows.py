@@ -51,7 +51,7 @@ def test_a_larger_gpu_draws_more_rays_a_step_and_as_many_in_all(processors, rays
     whole, fewer = (make_schedule(ScheduleConfig(), 2000 // n, times=n) for n in (1, times))
     assert fewer.rays_share(0) == whole.rays_share(0) == 1.0
     assert [abs(times * a - b) < times for a, b in zip(fewer.growth, whole.growth, strict=True)] == [True] * 4
-    whole, fewer = (make_schedule(ScheduleConfig(), 20000 // n, times=n) for n in (1, times))
+    whole, fewer = (make_schedule(ScheduleConfig(), 8000 // n, times=n) for n in (1, times))
     assert fewer.rays_share(0) == whole.rays_share(0) == 0.5
 
 
