@@ -13,7 +13,7 @@ from torchmetrics.functional.image import structural_similarity_index_measure
 
 MOST_SORTED = 1 << 20
 """Pixels used for the brightness range of a depth image; torch computes quantiles of at most 16.7 M."""
-PART = 1 << 20
+PART = 1 << 18
 """Pixels that are compared at once: all of a photo of 12 megapixels would take 8 GiB."""
 WINDOW = 11
 """Side of SSIM's window, pixels."""

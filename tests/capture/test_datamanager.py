@@ -15,7 +15,7 @@ from PIL import Image
 from tiny_scene import HEIGHT, TEST, TRAIN, WIDTH, color_of, image_of, name_of, project, wall_points, write_scene
 from training_runs import datamanager, in_capture_frame, plan_of
 
-from mmpi_ns.capture import known_depth
+from mmpi_ns.capture import known_depth, rays
 from mmpi_ns.capture.checks import say_once
 from mmpi_ns.capture.known_depth import UNKNOWN, KnownDepth
 from mmpi_ns.capture.ray_sources import KEYPOINT_DEPTH, OWN_PIXEL, PIXEL_DEPTH
@@ -338,7 +338,7 @@ def test_rays_of_pinhole_cameras_are_nerfstudios(scene):
 @pytest.mark.parametrize("kind", ["PERSPECTIVE", "FISHEYE", "both"])
 def test_rays_through_a_lens_are_nerfstudios(scene, kind, monkeypatch):
     """Two lenses and two sizes; every pixel of an image, made in parts, and a batch."""
-    monkeypatch.setattr("mmpi_ns.capture.rays.CHUNK", 5 * WIDTH + 3)
+    monkeypatch.setattr(rays, "CHUNK", 5 * WIDTH + 3)
     cameras = copy.deepcopy(datamanager(scene).train_dataset.cameras)
     cameras.distortion_params = torch.tensor([0.05, -0.02, 0.0, 0.0, 0.003, -0.002]).repeat(len(cameras), 1)
     cameras.camera_type = cameras.camera_type.clone()
