@@ -322,8 +322,8 @@ class _Pipeline(Generic[T]):
         others = [(self.views[j], self.depths[j]) for j in self.near[i]]
 
         def run() -> T:
-            known = confirmed(view.result(), depth.result(), [(v.result(), d.result()) for v, d in others])
-            return self.finish(i, view.result(), known)
+            agreed = confirmed(view.result(), depth.result(), [(v.result(), d.result()) for v, d in others])
+            return self.finish(i, view.result(), agreed)
 
         return self.pool.submit(run)
 

@@ -87,8 +87,8 @@ class KnownDepth:
     @cached_property
     def share(self) -> float:
         """Share of all pixels whose distance is known."""
-        known = sum(int((m[..., 0] != UNKNOWN).sum()) for m in self.codes)
-        return known / max(1, sum(m[..., 0].size for m in self.codes))
+        count = sum(int((m[..., 0] != UNKNOWN).sum()) for m in self.codes)
+        return count / max(1, sum(m[..., 0].size for m in self.codes))
 
 
 def packed(values: ArrayLike) -> Codes:
@@ -138,30 +138,30 @@ def know_depths(
     """
     if not (dense or sensor or observations.loose is not None):
         return None, observations
-    known, posed = KnownDepth.nothing(observations.sizes), posed_images(observations, dataset)
+    depths, posed = KnownDepth.nothing(observations.sizes), posed_images(observations, dataset)
     files = outputs.metadata.get("depth_filenames") if sensor else None
     if posed is None or not (dense or files or observations.loose is not None):
-        return known, observations
+        return depths, observations
     original, seen = at_full_size(posed), observations
     cloud = None if observations.loose is None else see_points(observations.loose, posed)
     if cloud is not None:
         seen = cloud.added_to(observations)
     if dense:
-        known = _remembered_depths(original, posed, seen)
+        depths = _remembered_depths(original, posed, seen)
     if dense and cloud is not None:
-        cloud = see_points(cloud.points, posed, known.image)
+        cloud = see_points(cloud.points, posed, depths.image)
         seen = cloud.added_to(observations) if cloud.fits else replace(observations, loose=None)
-        known = known if cloud.fits else _remembered_depths(original, posed, seen)
+        depths = depths if cloud.fits else _remembered_depths(original, posed, seen)
     if cloud is not None:
         say(cloud.describe())
         seen = drop_masked(seen, dataset)
-    known = with_points(known, seen)
+    depths = with_points(depths, seen)
     if files:
         unit = outputs.metadata.get("depth_unit_scale_factor", 1.0) * outputs.dataparser_scale
-        known = with_sensor(known, [Path(f) for f in files], float(unit), original, posed)
-    known = with_continued(known, posed, dataset, rays)
+        depths = with_sensor(depths, [Path(f) for f in files], float(unit), original, posed)
+    depths = with_continued(depths, posed, dataset, rays)
     give_back_freed_memory()
-    return known, seen
+    return depths, seen
 
 
 def _remembered_depths(original: PosedImages, posed: PosedImages, observations: Observations) -> KnownDepth:
@@ -258,11 +258,11 @@ def at_training_pixels(
 
 def pooled(depth: Depth, shape: tuple[int, int]) -> tuple[Map, Map]:
     """Inverse depth and error over the areas of a coarser grid [h, w]; 0 where too little of an area is known."""
-    known = (depth.inverse > 0).astype(np.float32)
-    weight = known / np.maximum(depth.error, 1e-12) ** 2
+    measured = (depth.inverse > 0).astype(np.float32)
+    weight = measured / np.maximum(depth.error, 1e-12) ** 2
     cover, total, first, second = (
         cv2.resize(m.astype(np.float64), shape[::-1], interpolation=cv2.INTER_AREA)
-        for m in (known, weight, weight * depth.inverse, weight * depth.inverse**2)
+        for m in (measured, weight, weight * depth.inverse, weight * depth.inverse**2)
     )
     mean = first / np.maximum(total, 1e-30)
     spread = np.maximum(second / np.maximum(total, 1e-30) - mean**2, 0)
@@ -282,8 +282,8 @@ def straightened(
         fx, fy, cx, cy = original.intrinsics[i]
         return (at[:, 0, 0] - cx) / fx, (at[:, 0, 1] - cy) / fy
     straighten = cv2.fisheye.undistortPoints if original.is_fisheye(i) else cv2.undistortPoints
-    found = straighten(at, camera_matrix(original.intrinsics[i]), original.distortion[i])[:, 0]
-    return np.asarray(found[:, 0], np.float64), np.asarray(found[:, 1], np.float64)
+    tangents = straighten(at, camera_matrix(original.intrinsics[i]), original.distortion[i])[:, 0]
+    return np.asarray(tangents[:, 0], np.float64), np.asarray(tangents[:, 1], np.float64)
 
 
 def with_continued(known: KnownDepth, posed: PosedImages, dataset: MMPIDataset, rays: Rays) -> KnownDepth:
@@ -410,6 +410,6 @@ def read_sensor(
     nearest = cv2.resize(depth, file_shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT)[: shape[0], : shape[1]]
     x, y = straightened(original, i, shape, file_shape)
     longer = np.sqrt(x**2 + y**2 + 1).reshape(shape)
-    known = np.isfinite(nearest) & (nearest > 0)
-    inverse = np.where(known, 1 / (np.where(known, nearest, 1) * longer), 0)
+    hit = np.isfinite(nearest) & (nearest > 0)
+    inverse = np.where(hit, 1 / (np.where(hit, nearest, 1) * longer), 0)
     return np.stack([inverse, SENSOR_ERROR * inverse], -1).astype(np.float32)

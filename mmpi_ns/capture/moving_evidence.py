@@ -146,12 +146,12 @@ def splat(shot: Shot, other: Shot) -> Map:
 
 def nearest_known(inverse: Map) -> Map:
     """Every pixel's inverse depth, or that of the nearest pixel that has one. [h, w]"""
-    known = inverse > 0
+    measured = inverse > 0
     _, label = cv2.distanceTransformWithLabels(
-        (~known).astype(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL
+        (~measured).astype(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL
     )
     table = np.zeros(int(label.max()) + 1, np.float32)
-    table[label[known]] = inverse[known]
+    table[label[measured]] = inverse[measured]
     return table[np.asarray(label, np.int64)]
 
 
@@ -249,24 +249,24 @@ def evidence(
     one, two, behind = np.full(shape, ALL, np.uint8), np.full(shape, ALL, np.uint8), np.zeros(shape, np.uint8)
     mine, surfaces = possible_depths(shot, others)
     for n, inverse in enumerate(mine + surfaces):
-        found = _compare(shot, others, colors, masks, inverse, n >= len(mine))
+        compared = _compare(shot, others, colors, masks, inverse, n >= len(mine))
         possible = inverse > 0
         if shot.ground is not None:
             possible &= inverse >= SOLID * shot.ground
-        one = np.where(possible, np.minimum(one, found.distance[0]), one)
-        two = np.where(possible, np.minimum(two, found.distance[1]), two)
-        behind = np.where(possible, np.maximum(behind, found.pair), behind)
+        one = np.where(possible, np.minimum(one, compared.distance[0]), one)
+        two = np.where(possible, np.minimum(two, compared.distance[1]), two)
+        behind = np.where(possible, np.maximum(behind, compared.pair), behind)
     decided = _would_be_seen(shot, others) & shot.view.inside
     strong = np.where(decided & (one < ALL), np.minimum(one, np.where(impossible, ALL, behind)), 0).astype(np.uint8)
     weak = np.where(decided & (two < ALL), np.minimum(two, behind), 0).astype(np.uint8)
-    known = two[(shot.depth.inverse > 0) & (two < ALL)]
-    return Evidence(strong, weak, behind, float(np.percentile(known, NOISE)) if len(known) else 0.0)
+    differences = two[(shot.depth.inverse > 0) & (two < ALL)]
+    return Evidence(strong, weak, behind, float(np.percentile(differences, NOISE)) if len(differences) else 0.0)
 
 
 def _would_be_seen(shot: Shot, others: Sequence[Shot]) -> Mask:
     """Where at least two neighbours would show even the nearest content: elsewhere nobody can tell. [h, w]"""
-    known = shot.depth.inverse[shot.depth.inverse > 0]
-    nearest = np.full(shot.view.gray.shape, np.percentile(known, NEAREST) if len(known) else 0, np.float32)
+    measured = shot.depth.inverse[shot.depth.inverse > 0]
+    nearest = np.full(shot.view.gray.shape, np.percentile(measured, NEAREST) if len(measured) else 0, np.float32)
     count = np.zeros(nearest.shape, np.uint8)
     for other in others:
         x, y, ahead = Parallax.between(shot.view, other.view).pixels(nearest)

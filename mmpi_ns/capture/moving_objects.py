@@ -54,10 +54,10 @@ def unexplained(shot: Shot, others: Sequence[Shot], colors: Sequence[Bytes], can
     0 where two neighbours show nothing at one of the depths: nobody can tell.
     """
     rows, columns = np.nonzero(candidates)
-    known = shot.depth.inverse[shot.depth.inverse > 0]
-    if not len(rows) or not len(known):
+    measured = shot.depth.inverse[shot.depth.inverse > 0]
+    if not len(rows) or not len(measured):
         return np.zeros(len(rows), np.uint8)
-    inverse = np.linspace(0, REACH * np.percentile(known, 98), STEPS, dtype=np.float32)[:, None]
+    inverse = np.linspace(0, REACH * np.percentile(measured, 98), STEPS, dtype=np.float32)[:, None]
     if shot.ground is not None:
         inverse = np.maximum(inverse, SOLID * shot.ground[rows, columns])
     color, kernel = shot.color[rows, columns].astype(np.int16), np.ones((3, 3), np.uint8)

@@ -127,7 +127,7 @@ def find_shared_points(
     show = lru_cache(images_held(posed.sizes, BYTES_OF_IMAGE, NEIGHBOURS + 1))(
         lambda i: (*image_and_mask(dataset, i), known.image(i))
     )  # neighbours mostly stand side by side
-    rng, parts, found = np.random.default_rng(seed), [], 0.0
+    rng, parts, matches = np.random.default_rng(seed), [], 0.0
     budget = max(1, MOST // (NEIGHBOURS * max(1, len(images))))
     for n, i in enumerate(images):
         if n % TRIMMED == 0:
@@ -150,15 +150,15 @@ def find_shared_points(
             if exposures is not None:
                 expected[:, :3] *= (exposures[j] / exposures[i]).cpu().numpy()
             seen, colors = _seen_by(posed, j, points, expected.clip(0, 255), *show(j))
-            found += len(seen) * count / len(rows)
+            matches += len(seen) * count / len(rows)
             both = np.stack([shown[seen], colors], 1)
             parts.append((pixels[seen].int(), torch.full((len(colors),), j, dtype=torch.int32), both, depths[seen]))
-    if found == 0:
+    if matches == 0:
         return None
     pixels, other = (torch.cat([part[n] for part in parts]) for n in (0, 1))
     colors, depths = (torch.from_numpy(np.concatenate([part[n] for part in parts])) for n in (2, 3))
     centers = torch.from_numpy(posed.camera_to_worlds[:, :, 3]).float()
-    cover = found / sum(known.codes[i][..., 0].size for i in images)
+    cover = matches / sum(known.codes[i][..., 0].size for i in images)
     on_device = (x.to(device) for x in (pixels, other, colors, depths, centers))
     return SharedPoints(*on_device, cover=cover)
 

@@ -114,9 +114,14 @@ class Gains:
 
     def describe(self) -> str:
         """Whether and how much exposure varies, in one sentence."""
+        before, after, error = (100 * x for x in (self.disagreement, self.corrected, float(np.median(self.errors))))
+        if not self.matter and self.confirmed and np.log(self.span) > SPAN:
+            return (
+                f"Exposure is not corrected: where images show the same, colours differ by {before:.1f} %, but too few "
+                f"surfaces are shared to tell by how much exposures do (expected error {error:.1f} %)."
+            )
         if not self.matter:
-            return f"Exposure: equal to within {100 * self.disagreement:.1f} % where images show the same."
-        before, after = 100 * self.disagreement, 100 * self.corrected
+            return f"Exposure: equal to within {before:.1f} % where images show the same."
         return (
             f"Exposure varies {self.span:.2f}-fold between images and is corrected: where two show the same, colours "
             f"that differed by {before:.1f} % differ by {after:.1f} %."
@@ -129,11 +134,14 @@ class Gains:
         return self.factors / np.clip(self.factors.min(), MOST_HEADROOM, 1)
 
     @property
+    def confirmed(self) -> bool:
+        """Whether pairs that were left out agree better with the gains than without."""
+        return self.corrected < AGREEMENT * self.disagreement
+
+    @property
     def matter(self) -> bool:
-        """Whether images differ by more than errors explain, and held-out pairs confirm the gains."""
-        spread = np.log(self.span)
-        wide = spread > max(SPAN, SPAN_ERRORS * float(np.median(self.errors)))
-        return bool(wide and self.corrected < AGREEMENT * self.disagreement)
+        """Whether images differ by more than errors explain, and the gains are confirmed."""
+        return bool(self.confirmed and np.log(self.span) > max(SPAN, SPAN_ERRORS * float(np.median(self.errors))))
 
 
 def grouped(

@@ -129,6 +129,15 @@ def test_span_and_decision_follow_from_factors():
     assert not Gains(factors, np.full(11, 0.01), FLAT, 0.1, 0.09).matter
 
 
+def test_why_images_are_not_corrected_is_said():
+    factors = np.exp(np.linspace(-0.2, 0.2, 11))[:, None].repeat(3, 1)
+    uncertain = Gains(factors, np.full(11, 0.1), FLAT, 0.1, 0.02).describe()
+    assert "not corrected" in uncertain and "expected error 10.0 %" in uncertain
+    assert "equal to within 10.0 %" in Gains(factors, np.full(11, 0.01), FLAT, 0.1, 0.09).describe()
+    assert "equal to within 1.0 %" in Gains(np.ones((11, 3)), np.full(11, 0.1), FLAT, 0.01, 0.002).describe()
+    assert "is corrected" in Gains(factors, np.full(11, 0.01), FLAT, 0.1, 0.02).describe()
+
+
 def test_falloff_is_taken_out_of_an_uncalibrated_image(monkeypatch):
     """log(second / first) = k_second - k_first + falloff (r_second - r_first), solved for the first."""
     falloff, change = np.array([[-0.5] * 3, [-0.2] * 3]), np.array([[0.3, 0.1]])
