@@ -131,7 +131,7 @@ def test_depth_nerfacto_is_given_the_depths_that_ours_finds(scene, tmp_path, mon
     maps = [np.full((24, 32, 2), 0.25 + 0.01 * i, np.float32) for i in range(6)]
     maps[0][:12] = 0  # half of an image is not known
     known = KnownDepth.of(maps)
-    monkeypatch.setattr(datamanager, "know_depths", lambda outputs, tracks, dataset, **how: (known, tracks))
+    monkeypatch.setattr(datamanager, "know_depths", lambda outputs, tracks, dataset, rays, **how: (known, tracks))
     for name in ("__init__", "get_metadata"):  # put back afterwards
         monkeypatch.setattr(DepthDataset, name, getattr(DepthDataset, name))
     monkeypatch.setattr(train, "train_apart", in_this_process)
