@@ -33,11 +33,13 @@ class Frames:
 
     @staticmethod
     def pack(mpis: Sequence[MPIPlan], dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Frames:
-        names = {"origins": "origin", "axes": "axes", "nears": "near", "extents": "extent"}
-        columns = {key: [getattr(m, name) for m in mpis] for key, name in names.items()}
-        columns["last_disparities"] = [m.last_disparity for m in mpis]
-        tensors = {key: torch.tensor(column, dtype=dtype, device=device) for key, column in columns.items()}
-        return Frames(**tensors, num_planes=torch.tensor([m.planes for m in mpis], device=device))
+        def column(name: str, *shape: int) -> Tensor:
+            values = torch.tensor([getattr(m, name) for m in mpis], dtype=dtype, device=device)
+            return values.reshape(len(mpis), *shape)
+
+        parts = column("origin", 3), column("axes", 3, 3), column("near"), column("extent", 4)
+        planes = torch.tensor([m.planes for m in mpis], dtype=torch.int64, device=device)
+        return Frames(*parts, num_planes=planes, last_disparities=column("last_disparity"))
 
     @property
     def disparity_steps(self) -> Float[Tensor, "K"]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import sys
 import threading
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -20,6 +21,7 @@ from mmpi_ns.field.shading import RayShader
 from mmpi_ns.ops import dispatch
 from mmpi_ns.rendering import baked as baking
 from mmpi_ns.rendering.baked import exact_images
+from mmpi_ns.scene.plan import CubePlan
 from mmpi_ns.scripts import export
 
 
@@ -183,7 +185,8 @@ def test_what_cannot_be_baked_is_refused(trainer, monkeypatch):
     with pytest.raises(ValueError, match="16 is the most"):
         model.baked(model.field)
     monkeypatch.undo()
-    monkeypatch.setattr(type(model.field), "cube", property(lambda _: object()))
+    cube = CubePlan((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (2, 2, 2))
+    monkeypatch.setattr(model.field, "plan", replace(model.field.plan, cube=cube))
     with pytest.raises(ValueError, match="cube"):
         model.baked(model.field)
     monkeypatch.undo()
