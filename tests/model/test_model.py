@@ -14,6 +14,7 @@ from nerfstudio.model_components import renderers
 from tiny_scene import HEIGHT, WIDTH, write_scene
 from training_runs import plan_of, ready, trainer_config, write_plan
 
+import mmpi_ns.model
 from mmpi_ns import model as mmpi_model
 from mmpi_ns.config import mmpi_small
 from mmpi_ns.training.phases import TRAINS
@@ -134,6 +135,23 @@ def test_one_mpi_has_nothing_to_blend_with_and_trains_in_one_go(scene, tmp_path)
     for step in (0, 12, 23):
         _, losses, _ = run_step(trainer, step)
         assert all(torch.isfinite(v) for v in losses.values())
+
+
+def test_the_weight_of_known_depths_falls_with_the_rates(scene, plan_file, tmp_path, monkeypatch):
+    trainer, weights = trainer_of(scene, plan_file, tmp_path, training="joint"), []
+    real = mmpi_ns.model.batch_losses
+
+    def recorded(*args):
+        weights.append(args[3].known_depth)
+        return real(*args)
+
+    monkeypatch.setattr(mmpi_ns.model, "batch_losses", recorded)
+    model = trainer.pipeline.model
+    half, last = model.progress.schedule.total_steps // 2, model.progress.schedule.total_steps - 1
+    for step in (0, half, last):
+        run_step(trainer, step)
+    fallen = 10.0 ** -((last / (2 * half) - 0.5) / 0.5)
+    assert weights == pytest.approx([0.01, 0.01, 0.01 * fallen])
 
 
 @pytest.mark.parametrize("training", ["two-phase", "joint"])
