@@ -17,6 +17,7 @@ from mmpi_ns.rendering.window_store import WindowStore
 from mmpi_ns.scene.visible_tiles import TrainingViews
 from mmpi_ns.scene.windows import Window, WindowedPlan
 from mmpi_ns.training.batch_rays import keep_frame
+from mmpi_ns.training.initial import start_from_depths
 from mmpi_ns.training.phases import TRAINS, Phase, Schedule
 from mmpi_ns.training.storage import prepare_storage
 from mmpi_ns.utils.files import to_bytes, to_text
@@ -129,6 +130,8 @@ class TrainingRun:
                 centers, windows = manager.observations.centers, progress.windows.windows
                 manager.use_cameras(cameras_of(windows[window], centers) if len(windows) > 1 else None)
                 self._drawn_from = window
+                if step == window * schedule.window_steps and manager.sources is not None:
+                    start_from_depths(field, manager.sources, manager.config.seed)
         phase = progress.phase.name
         field.learns_cover = phase == "individual"
         for kind, params in groups.items():

@@ -1,0 +1,133 @@
+"""Tables before the first step: surfaces where depths are known (docs/how_it_works.md, "Initial surfaces").
+
+Without it every plane starts with the same weight, and surfaces form out of fog: a ray then has hundreds of samples
+that all learn. A ray of known depth says where its surface is, and that the planes before it are empty.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mmpi_ns.capture.ray_sources import PIXEL_DEPTH, RaySources
+from mmpi_ns.field.mmpi_field import MMPIField
+from mmpi_ns.ops.layout import SceneLayout
+from mmpi_ns.scene.geometry import inverse_distance, plane_hits, sample_disparity
+from mmpi_ns.scene.texels import BRICK
+from mmpi_ns.utils.random_draws import generator
+
+BATCHES, BATCH = 20, 4096
+"""Batches of rays that vote, and pixel rays of a batch; rays of new views come on top."""
+PRIOR = 64.0
+"""Votes that the equal weight of all planes counts as."""
+PLANE_ERROR = 0.6
+"""Minimum error of a depth, in plane spacings: a surface between two planes is on both."""
+EMPTY_FROM = 2.0
+"""Errors before a surface from which on a ray's planes are empty."""
+DARKEST = 0.02
+"""Colours start between this and its complement, so that their logits can still move."""
+
+
+class Votes:
+    """What rays of known depth say of each row of the tables.
+
+    Args:
+        rows: T, rows of the tables.
+        device: of the votes.
+    """
+
+    def __init__(self, rows: int, device: torch.device | str) -> None:
+        self.surface: Float[Tensor, "T"] = torch.zeros(rows, device=device)
+        """Votes for a surface: of one ray, all planes within the error of its depth together have about one."""
+        self.empty: Float[Tensor, "T"] = torch.zeros(rows, device=device)
+        """Rays that pass and reach their surface behind."""
+        self.colors: Float[Tensor, "T 3"] = torch.zeros(rows, 3, device=device)
+        """Colours of the votes for a surface, summed."""
+
+    def add(
+        self,
+        layout: SceneLayout,
+        origins: Float[Tensor, "R 3"],
+        directions: Float[Tensor, "R 3"],
+        depths: Float[Tensor, "R 2"],
+        colors: Float[Tensor, "R 3"],
+        ray_near: float,
+    ) -> None:
+        """Adds the votes of rays, each for the texel nearest to it on every plane that it crosses.
+
+        Args:
+            layout: MPIs and texels at the resolution in use.
+            origins: of the rays, world axes.
+            directions: unit vectors.
+            depths: inverse distance of a ray's surface, and its expected error.
+            colors: of the surfaces.
+            ray_near: distance at which rays start.
+        """
+        ends = torch.full_like(origins[:, :1], ray_near), torch.full_like(origins[:, :1], torch.inf)
+        hits = plane_hits(origins, directions, *ends, layout.frames)
+        for k, (mpi, grid) in enumerate(zip(layout.mpis, layout.grids, strict=False)):
+            m = torch.arange(mpi.planes, device=origins.device)
+            last = hits.m_first[:, k, None] - hits.count[:, k, None]
+            w = sample_disparity(m, layout.frames.disparity_steps[k], layout.frames.last_disparities[k])
+            oz, dz = hits.local_origins[:, k, 2:], hits.local_directions[:, k, 2:]
+            # How far apart planes are along the ray, in inverse distance; at the camera itself they are no surface.
+            spacing = mpi.disparity_step * dz.abs() / (1 - w * oz).clamp(min=1e-3) ** 2
+            error = torch.maximum(depths[:, 1:], PLANE_ERROR * spacing)
+            before = (inverse_distance(w, oz, dz) - depths[:, :1]) / error
+            votes = (m > last) & (m <= hits.m_first[:, k, None]) & ((before.abs() <= 1) | (before > EMPTY_FROM))
+            rays, behind = votes.nonzero(as_tuple=True)
+            u0, u1, v0, v1 = mpi.extent
+            x, y = (
+                ((slopes[rays, k, 0] + w[behind] * slopes[rays, k, 1] - low) / (high - low) * (n - 1)).round().long()
+                for slopes, low, high, n in ((hits.u, u0, u1, grid.width), (hits.v, v0, v1, grid.height))
+            )
+            rows = grid.row(mpi.planes - 1 - behind, y.clamp(0, grid.height - 1), x.clamp(0, grid.width - 1))
+            surface = before[rays, behind] <= 1
+            self.empty.index_add_(0, rows, (~surface).float())
+            share = (spacing / error).clamp(max=1)[rays, behind] * surface
+            self.surface.index_add_(0, rows, share)
+            self.colors.index_add_(0, rows, share[:, None] * colors[rays])
+
+
+@torch.no_grad()
+def start_from_votes(field: MMPIField, votes: Votes) -> None:
+    """Sets densities and diffuse colours of the texels that have votes.
+
+    The alpha of a texel is the share of its votes that are for a surface, among PRIOR votes for the alpha with which
+    all planes have equal weight. Texels without votes, and the empty brick, stay as they are.
+    """
+    layout = field.layout
+    for k, (mpi, grid) in enumerate(zip(layout.mpis, layout.grids, strict=False)):
+        for plane in range(mpi.planes):
+            bricks = grid.own_tiles[plane][grid.own_tiles[plane] > 0].long()
+            rows = (bricks[:, None] * BRICK + torch.arange(BRICK, device=bricks.device)).reshape(-1)
+            rows = rows[votes.surface[rows] + votes.empty[rows] > 0]
+            surface, empty = votes.surface[rows], votes.empty[rows]
+            start = -torch.expm1(-layout.optical_depth(k, surface.new_zeros(1), rows.new_full((1,), plane)))
+            alpha = (surface + PRIOR * start) / (surface + empty + PRIOR)
+            softplus = -torch.log1p(-alpha) / layout.interval(k)
+            raw = softplus + torch.log(-torch.expm1(-softplus))  # the inverse of softplus, without overflow
+            field.density.data[rows, 0] = raw - layout.biases[k][plane]
+            shown = surface > 0
+            colors = votes.colors[rows[shown]] / surface[shown, None]
+            field.features.data[rows[shown], :3] = colors.clamp(DARKEST, 1 - DARKEST).logit()
+
+
+def start_from_depths(field: MMPIField, sources: RaySources, seed: int) -> None:
+    """Starts a field from the known depths of the training pixels and new views that a window draws from.
+
+    Args:
+        field: just built.
+        sources: of its rays.
+        seed: of the run.
+    """
+    votes = Votes(len(field.density), field.density.device)
+    for i in range(BATCHES):
+        rays, batch = sources.draw(BATCH, 1.0, generator(seed, i, "initial", field.density.device))
+        count = len(batch["image"])
+        depths = rays.metadata[PIXEL_DEPTH][:count]
+        known = (depths[:, 0] > 0).nonzero()[:, 0]
+        parts = rays.origins[known], rays.directions[known], depths[known], batch["image"][known, :3]
+        votes.add(field.layout, *parts, field.plan.ray_near)
+    start_from_votes(field, votes)

@@ -1,0 +1,158 @@
+"""Initial surfaces: votes of rays with known depth against loops in float64, and what densities and colours follow."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import oracle
+import pytest
+import torch
+from hand_made import make_mpi
+from random_fields import random_plan, random_rays
+
+from mmpi_ns.field.mmpi_field import MMPIField
+from mmpi_ns.scene.plan import ScenePlan
+from mmpi_ns.training.initial import DARKEST, EMPTY_FROM, PLANE_ERROR, PRIOR, Votes, start_from_votes
+
+TOO_CLOSE = 1e-4
+"""Relative margin of a decision within which single and double precision may differ."""
+
+
+def field_of(plan, **options):
+    return MMPIField(plan, shading="ray", feature_channels=8, shares_depth=True, **options)
+
+
+def votes_of(field, origins, directions, depths, colors):
+    votes = Votes(len(field.density), "cpu")
+    parts = (torch.tensor(np.asarray(x), dtype=torch.float32) for x in (origins, directions, depths, colors))
+    votes.add(field.layout, *parts, field.plan.ray_near)
+    return votes
+
+
+def slow_votes(plan, origins, directions, depths, colors):
+    """{(head, plane, y, x): [surface, empty, color sums]} by loops; None in the place of anything too close to call."""
+    out, unsure = {}, set()
+    for origin, direction, (inverse, error), color in zip(origins, directions, depths, colors, strict=True):
+        for k, mpi in enumerate(plan.mpis):
+            for c in oracle.crossings(mpi, origin, direction, plan.ray_near):
+                u0, u1, v0, v1 = mpi.extent
+                x, y = (c.u - u0) / (u1 - u0) * (mpi.width - 1), (c.v - v0) / (v1 - v0) * (mpi.height - 1)
+                if (not c.live and c.margin > TOO_CLOSE) or math.isnan(x):
+                    continue
+                # The next plane's inverse distance, from the slope of 1/t over the disparity w of planes.
+                w = 1 / oracle.plane_depth(mpi, c.plane)
+                o, d = oracle.to_local(mpi, origin), oracle.to_local(mpi, direction, is_direction=True)
+                step = (1 / mpi.near - 1 / mpi.far) / (mpi.planes - 1)
+                h = 1e-6 * step
+                slope = ((w + h) * d[2] / (1 - (w + h) * o[2]) - (w - h) * d[2] / (1 - (w - h) * o[2])) / (2 * h)
+                spacing = step * abs(slope)
+                width = max(error, PLANE_ERROR * spacing)
+                before = (c.inverse_t - inverse) / width
+                texel = (
+                    k,
+                    c.plane,
+                    round(float(np.clip(y, 0, mpi.height - 1))),
+                    round(float(np.clip(x, 0, mpi.width - 1))),
+                )
+                near = min(abs(abs(before) - 1), abs(before - EMPTY_FROM), abs(x % 1 - 0.5), abs(y % 1 - 0.5), c.margin)
+                if near < TOO_CLOSE or abs(1 - w * o[2]) < 2e-3:
+                    unsure.update((k, c.plane, b, a) for b in _near(y, mpi.height) for a in _near(x, mpi.width))
+                    continue
+                entry = out.setdefault(texel, np.zeros(5))
+                if abs(before) <= 1:
+                    share = min(1.0, spacing / width)
+                    entry[0] += share
+                    entry[2:] += share * np.asarray(color)
+                elif before > EMPTY_FROM:
+                    entry[1] += 1
+    return out, unsure
+
+
+def _near(x, size):
+    return {min(max(math.floor(x) + i, 0), size - 1) for i in (-1, 0, 1, 2)}
+
+
+@pytest.mark.parametrize(("mpis", "seed"), [(1, 0), (3, 1), (4, 2)])
+def test_votes_are_those_of_loops_over_rays_and_planes(mpis, seed):
+    plan, rng = random_plan(mpis, mpis == 3, seed), np.random.default_rng(seed)
+    field = field_of(plan)
+    origins, directions = random_rays(plan, 60, seed)
+    depths = np.stack([10 ** rng.uniform(-2, 0.3, 60), 10 ** rng.uniform(-3, -0.5, 60)], -1)
+    colors = rng.uniform(size=(60, 3))
+    votes = votes_of(field, origins, directions, depths, colors)
+    slow, unsure = slow_votes(plan, origins, directions, depths, colors)
+    compared = 0
+    for k in range(mpis):
+        grid = field.grids[k]
+        shape = grid.depth, grid.height, grid.width
+        surface, empty = votes.surface[grid.rows].view(shape), votes.empty[grid.rows].view(shape)
+        sums = votes.colors[grid.rows].view(*shape, 3)
+        for plane, y, x in np.ndindex(*shape):
+            if (k, plane, y, x) in unsure:
+                continue
+            expected = slow.get((k, plane, y, x), np.zeros(5))
+            got = [surface[plane, y, x], empty[plane, y, x], *sums[plane, y, x]]
+            np.testing.assert_allclose(np.array(got), expected, rtol=1e-3, atol=1e-5)
+            compared += expected.any()
+    assert compared > 100
+
+
+def straight(planes=9, **size):
+    """A field of one MPI that faces along z, and rays along its axis with a surface at depth 2."""
+    plan = ScenePlan((make_mpi(extent=(-1.0, 1.0, -1.0, 1.0), planes=planes, **size),), None, 0.05, 1.0)
+    return field_of(plan), [[0.0, 0.0, 0.0]] * 500, [[0.0, 0.0, 1.0]] * 500, [[0.5, 1e-4]] * 500
+
+
+def alphas(field):
+    """Of every plane, at the texel in the middle."""
+    grid = field.grids[0]
+    rows = grid.row(torch.arange(grid.depth), torch.tensor(grid.height // 2), torch.tensor(grid.width // 2))
+    raw = field.density.data[rows, 0]
+    tau = field.layout.optical_depth(0, raw, torch.arange(grid.depth))
+    return -torch.expm1(-tau), rows
+
+
+def test_planes_before_a_surface_are_empty_the_surface_is_dense_and_what_lies_behind_is_as_before():
+    field, *rays = straight(width=9, height=9)
+    before, rows = alphas(field)
+    start_from_votes(field, votes_of(field, *rays, [[0.9, 0.5, 0.1]] * 500))
+    after, _ = alphas(field)
+    depths = np.array([oracle.plane_depth(field.plan.mpis[0], p) for p in range(9)])
+    surface = int(np.abs(1 / depths - 0.5).argmin())
+    assert (after[: surface - 1] < 0.2 * before[: surface - 1]).all()
+    assert after[surface - 1] == before[surface - 1], "within two errors of the surface: no vote"
+    assert after[surface].item() == pytest.approx((500 + PRIOR * before[surface].item()) / (500 + PRIOR), rel=1e-3)
+    assert torch.equal(after[surface + 1 :], before[surface + 1 :])
+    shown = field.features.data[rows[surface], :3].sigmoid()
+    assert torch.allclose(shown, torch.tensor([0.9, 0.5, 0.1]), atol=1e-4)
+    assert not field.features.data[rows[:surface]].any()
+
+
+def test_black_and_white_surfaces_keep_a_logit_that_can_move():
+    field, *rays = straight(width=9, height=9)
+    start_from_votes(field, votes_of(field, *rays, [[0.0, 1.0, 0.0]] * 500))
+    assert field.features.data[:, :3].abs().max().item() == pytest.approx(math.log((1 - DARKEST) / DARKEST), rel=1e-4)
+
+
+@pytest.mark.parametrize("planes", [2, 64, 256])
+@pytest.mark.parametrize("mpis", [1, 64])
+def test_densities_stay_finite_for_any_number_of_planes_and_mpis(planes, mpis):
+    many = tuple(
+        make_mpi(f"m{k}", extent=(-1.0, 1.0, -1.0, 1.0), planes=planes, width=8, height=8) for k in range(mpis)
+    )
+    field = field_of(ScenePlan(many, None, 0.05, 1.0))
+    rays = [[0.0, 0.0, 0.0]] * 40, [[0.0, 0.0, 1.0]] * 40
+    for inverse, error in ((0.0, 1e-9), (1e-6, 1e-9), (0.3, 10.0), (1e4, 1e-3)):  # at infinity, unsure, at the camera
+        start_from_votes(field, votes_of(field, *rays, [[inverse, error]] * 40, [[0.5] * 3] * 40))
+        assert torch.isfinite(field.density.data).all()
+        assert torch.isfinite(field.features.data).all()
+
+
+def test_rays_that_meet_nothing_and_no_rays_change_nothing():
+    field, *_ = straight(width=9, height=9)
+    before = field.density.data.clone(), field.features.data.clone()
+    for rays in ([[[0.0, 0.0, 0.0]], [[0.0, 0.0, -1.0]], [[0.5, 1e-3]]], [np.zeros((0, n)) for n in (3, 3, 2)]):
+        start_from_votes(field, votes_of(field, *rays, np.zeros((len(rays[0]), 3))))
+    assert torch.equal(before[0], field.density.data)
+    assert torch.equal(before[1], field.features.data)
