@@ -123,7 +123,7 @@ class MMPIModel(Model):
         windows = self._fitting_plan(views) if self.trains else self._plan(config.placement)
         phases = replace(config.schedule, training="joint" if self._is_joint(windows) else "two-phase")
         count = len(windows)
-        self.progress = Progress(windows, make_schedule(phases, max(1, config.total_steps), count, config.rays_times))
+        self.progress = Progress(windows, make_schedule(phases, max(1, config.total_steps), count))
         self._expect_shapes()
         dispatch.choose(config.ops)
         self.field = self._new_field(views_of(windows.windows[0], views))

@@ -22,29 +22,28 @@ class DrawnAhead:
 
     def __init__(self, seed: int, device: str | torch.device) -> None:
         self.seed, self.device = seed, device
-        self._next: tuple[RaySources, tuple[int, int, float], Future[Batch]] | None = None
+        self._next: tuple[RaySources, tuple[int, int], Future[Batch]] | None = None
 
-    def draw(self, sources: RaySources, step: int, pixel_rays: int, share: float) -> Batch:
+    def draw(self, sources: RaySources, step: int, pixel_rays: int) -> Batch:
         """What ``RaySources.draw`` draws for a step.
 
         Args:
             sources: of the rays.
             step: of the training.
             pixel_rays: rays through pixels.
-            share: of the step's rays that are drawn.
         """
-        batch, asked = None, (step, pixel_rays, share)
+        batch, asked = None, (step, pixel_rays)
         if self._next is not None:
             of, key, future = self._next
             batch = future.result() if of is sources and key == asked else None
         batch = batch or self._drawn(sources, *asked)
         if num_threads() > 1 and torch.device(self.device).type == "cpu":
-            following = step + 1, pixel_rays, share
+            following = step + 1, pixel_rays
             self._next = sources, following, _thread().submit(self._drawn, sources, *following)
         return batch
 
-    def _drawn(self, sources: RaySources, step: int, pixel_rays: int, share: float) -> Batch:
-        return sources.draw(pixel_rays, share, generator(self.seed, step, "pixels", self.device))
+    def _drawn(self, sources: RaySources, step: int, pixel_rays: int) -> Batch:
+        return sources.draw(pixel_rays, generator(self.seed, step, "pixels", self.device))
 
 
 @functools.cache

@@ -93,7 +93,6 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         self.gains: Gains | None = None
         self.moves = ""
         """How much of the training images moves, in a sentence; empty where nobody looked."""
-        self.rays_share = 1.0
         """Share of a step's rays that are drawn; the schedule sets it."""
         self.sources: RaySources | None = None
         """Sources that a step draws from now."""
@@ -202,10 +201,6 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
             return None
         return image_gains(ratios, len(posed.files), light)
 
-    def get_train_rays_per_batch(self) -> int:
-        """Pixel rays of the step at hand."""
-        return max(1, round(self.rays_share * super().get_train_rays_per_batch()))
-
     def use_cameras(self, cameras: NDArray[np.int64] | None) -> None:
         """Draws from these training cameras from now on, None for all, and prints the share of each source.
 
@@ -217,7 +212,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
             self.sources = self._read_sources(cameras)
         else:
             self.sources = self._resident if cameras is None else self._resident.of_images(cameras)
-        say_once(self.sources.describe(super().get_train_rays_per_batch()))
+        say_once(self.sources.describe(self.get_train_rays_per_batch()))
 
     def _read_sources(self, cameras: NDArray[np.int64] | None) -> RaySources:
         """The pixels, new views and keypoints of all training cameras, or of some; notes if pixels are left out."""
@@ -314,6 +309,6 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
             self.use_cameras(None)
         assert self.sources is not None
         if self.training:
-            return self._rays.draw(self.sources, step, self.get_train_rays_per_batch(), self.rays_share)
+            return self._rays.draw(self.sources, step, self.get_train_rays_per_batch())
         g = generator(self.config.seed, self.train_count, "pixels", self.device)
-        return self.sources.draw(self.get_train_rays_per_batch(), self.rays_share, g, pixels_alone=True)
+        return self.sources.draw(self.get_train_rays_per_batch(), g, pixels_alone=True)

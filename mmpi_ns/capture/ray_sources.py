@@ -225,17 +225,17 @@ class RaySources:
             no_new_views=self.no_new_views if self.new_views is None else "no two of these images show a point alike",
         )
 
-    def counts(self, pixel_rays: int, share: float) -> tuple[int, int, int]:
-        """Rays of pixels, new views and keypoints in a step that draws a share of its rays, this many of pixels."""
+    def counts(self, pixel_rays: int) -> tuple[int, int, int]:
+        """Rays of pixels, new views and keypoints in a step of so many pixel rays."""
         cover = 0.0 if self.new_views is None else min(1.0, self.new_views.cover)
         new_view_rays = round(cover * round(self.new_view_share * pixel_rays))
         # Points shared by two images are more informative than keypoints, which replace the missing ones.
-        keypoint_rays = 0 if self.keypoints is None else round((1 - cover) * share * self.keypoint_rays)
+        keypoint_rays = 0 if self.keypoints is None else round((1 - cover) * self.keypoint_rays)
         return pixel_rays, new_view_rays, keypoint_rays
 
     def describe(self, pixel_rays: int) -> str:
         """The share of each source in a step, with the reason where it is none, in one line."""
-        counts = self.counts(pixel_rays, 1.0)
+        counts = self.counts(pixel_rays)
         no_keypoints = "no SfM tracks" if self.keypoints is None else "new views take their place"
         no_keypoints = no_keypoints if self.keypoint_rays else "--pipeline.datamanager.keypoint-rays 0"
         reasons = ("", self.no_new_views, no_keypoints)
@@ -246,13 +246,12 @@ class RaySources:
         return f"Rays of a step: {', '.join(shares)}."
 
     def draw(
-        self, pixel_rays: int, share: float, g: torch.Generator, pixels_alone: bool = False
+        self, pixel_rays: int, g: torch.Generator, pixels_alone: bool = False
     ) -> tuple[RayBundle, dict[str, Tensor]]:
         """Rays of pixels, of new views and of keypoints, in this order, and what the images say of them.
 
         Args:
             pixel_rays: rays through pixels.
-            share: of the step's rays that are drawn.
             g: draws them.
             pixels_alone: without new views and keypoints.
 
@@ -265,7 +264,7 @@ class RaySources:
         if self.exposures is not None:
             colors[:, :3] /= self.exposures[indices[:, 0]]
         bundles, device = [self.rays(indices)], colors.device
-        _, new_view_rays, keypoint_rays = (0, 0, 0) if pixels_alone else self.counts(pixel_rays, share)
+        _, new_view_rays, keypoint_rays = (0, 0, 0) if pixels_alone else self.counts(pixel_rays)
         if self.new_views is not None and new_view_rays:
             views, seen, distances = self.new_views.draw(new_view_rays, self.rays, g, self.exposures)
             bundles.append(views)

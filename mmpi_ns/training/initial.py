@@ -124,7 +124,7 @@ def start_from_depths(field: MMPIField, sources: RaySources, seed: int) -> None:
     """
     votes = Votes(len(field.density), field.density.device)
     for i in range(BATCHES):
-        rays, batch = sources.draw(BATCH, 1.0, generator(seed, i, "initial", field.density.device))
+        rays, batch = sources.draw(BATCH, generator(seed, i, "initial", field.density.device))
         count = len(batch["image"])
         depths = rays.metadata[PIXEL_DEPTH][:count]
         known = (depths[:, 0] > 0).nonzero()[:, 0]

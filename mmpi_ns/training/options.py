@@ -48,7 +48,6 @@ RANGES = {
         "decay_decades": NOT_NEGATIVE,
         "decay_from": SHARE,
         "growth_shares": SHARE,
-        "growing_rays": Number(0, 1, above=True),
         "release_shares": SHARE,
         "release_weight": NOT_NEGATIVE,
     },
@@ -90,6 +89,8 @@ RENAMED = {
 """Names of the model's options before they were in groups, where the name has changed."""
 LEFT = {"blend_form": "paper", "shared_colour": False, "render_shares": "exact"}
 """Options that this version may lack, with the value that it stands for."""
+TRAINED = {"growing_rays"}
+"""Options that this version lacks and that changed the training alone."""
 
 
 def grouped(state: dict[str, Any], usual: Any) -> dict[str, Any]:
@@ -126,7 +127,7 @@ def check_nothing_left(model: Any) -> None:
     """Raises InputError naming an option of a loaded config that this version lacks and that changes the images."""
     groups = {"": model} | {f"{name}.": group for name, group in vars(model).items() if is_dataclass(group)}
     for prefix, group in groups.items():
-        for name in vars(group).keys() - {f.name for f in fields(group)}:
+        for name in vars(group).keys() - {f.name for f in fields(group)} - TRAINED:
             if name not in LEFT or getattr(group, name) != LEFT[name]:
                 option = f"--pipeline.model.{prefix}{name}".replace("_", "-")
                 raise InputError(

@@ -17,8 +17,6 @@ PhaseName = Literal["individual", "blend", "finetune", "joint"]
 ParameterKind = Literal["density", "features", "colour", "reliability", "camera_opt"]
 Training = Literal["two-phase", "joint"]
 
-LONG_RUN = 4000
-"""Steps from which on the rays while the texels grow are more than enough."""
 TRAINS: dict[str, frozenset[str]] = {
     "individual": frozenset({"density", "features", "colour", "camera_opt"}),
     "joint": frozenset({"density", "features", "colour", "camera_opt"}),
@@ -47,12 +45,9 @@ class ScheduleConfig:
     """Decades that learning rates fall over a phase (paper: x0.1 per 20k of 30k steps = 1.5),"""
     decay_from: float = 0.5
     """after being constant for this fraction of it."""
-    growth_shares: tuple[float, ...] = (1 / 15, 2 / 15, 3 / 15, 4 / 15)
+    growth_shares: tuple[float, ...] = (1 / 60, 2 / 60, 3 / 60, 4 / 60)
     """When the texels of a plane double, as shares of the first phase."""
-    growing_rays: float = 0.5
-    """Share of the batch drawn while resolution grows, when rays cost most. Runs shorter than 4,000 steps draw
-    proportionally more."""
-    release_shares: tuple[float, ...] = (3 / 15, 4 / 15, 0.3, 0.5, 0.75, 0.95)
+    release_shares: tuple[float, ...] = (3 / 60, 4 / 60, 0.15, 0.3, 0.5, 0.75, 0.95)
     """When empty bricks (8 x 8 texels of a plane) are released, as fractions of the first phase: after growth, or just
     before the texels double."""
     release_weight: float = 5e-3
@@ -85,8 +80,6 @@ class Schedule:
     release: tuple[int, ...] = ()
     """Steps before which empty bricks are released, judging by the samples since the previous such step or the last
     growth."""
-    growing_rays: float = 1.0
-    """Fraction of a step's rays that are drawn until surfaces have formed."""
 
     @property
     def is_joint(self) -> bool:
@@ -130,10 +123,6 @@ class Schedule:
     def _sharp_from(self) -> int:
         return self.growth[-1] if self.growth else self.phases[0].end // 10
 
-    def rays_share(self, step: int) -> float:
-        """Share of the rays of a step that are drawn."""
-        return 1.0 if self.sharpened(step) else self.growing_rays
-
     def releases_at(self, step: int) -> bool:
         """Whether bricks are released before this step."""
         return self._local(step) in self.release
@@ -173,17 +162,17 @@ class Schedule:
         data = json.loads(text)
         phases = tuple(Phase(**p) for p in data.pop("phases"))
         lists = {name: tuple(data.pop(name, ())) for name in ("growth", "release")}
+        data.pop("growing_rays", None)  # of older runs
         return Schedule(phases=phases, **lists, **data)
 
 
-def make_schedule(config: ScheduleConfig, total_steps: int, windows: int = 1, times: int = 1) -> Schedule:
+def make_schedule(config: ScheduleConfig, total_steps: int, windows: int = 1) -> Schedule:
     """The schedule of a run of ``total_steps`` steps a window.
 
     Args:
         config: phases, growth, rates and release of bricks; nothing is released before surfaces have formed.
         total_steps: all steps of a window.
         windows: windows of a long capture, trained one after the other.
-        times: how many times the method's rays a step draws, on a GPU.
 
     Raises:
         InputError: no step is left for the first phase, growth goes backwards, or rates never fall.
@@ -194,10 +183,8 @@ def make_schedule(config: ScheduleConfig, total_steps: int, windows: int = 1, ti
     phases = _phases(config, total_steps)
     first = phases[0].end
     growth = tuple(max(1, round(s * first)) for s in config.growth_shares)
-    # Shorter runs would see too few rays.
-    growing_rays = min(1.0, float(config.growing_rays) * max(1.0, LONG_RUN / (total_steps * times)))
     rates = float(config.decay_decades), float(config.decay_from), float(config.finetune_rate)
-    schedule = Schedule(phases, growth, *rates, windows, growing_rays=growing_rays)
+    schedule = Schedule(phases, growth, *rates, windows)
     release = sorted({round(s * first) for s in config.release_shares}) if config.release_weight > 0 else []
     # A release at a growth step comes before it, so that less grows.
     return replace(schedule, release=tuple(s for s in release if s > schedule._sharp_from or s in growth))

@@ -46,15 +46,13 @@ class TrainingLog:
     def __init__(self, schedule: Schedule, rays: int, first: int, end: int) -> None:
         self.schedule, self.rays, self.first, self.end = schedule, rays, first, end
         self._said_at, self._said = monotonic(), first
-        self._phase, self._drawn = "", 0.0
+        self._phase = ""
 
     def note(self, step: int, rgb_loss: Tensor) -> None:
         """Called after each step with its squared colour error; prints if a line is due."""
         done, now = step + 1, monotonic()
         if done - self.first == 1:  # the first step includes compilation
             self._said_at, self._said = now, done
-        else:
-            self._drawn += self.rays * self.schedule.rays_share(step)
         window, phase = self.schedule.window_at(step), self.schedule.phase_at(step).name
         where = phase if self.schedule.windows == 1 else f"window {window + 1} of {self.schedule.windows}, {phase}"
         since, seconds = done - self._said, now - self._said_at
@@ -65,10 +63,10 @@ class TrainingLog:
         each = seconds / since
         psnr = -10 * math.log10(max(float(rgb_loss.detach()), 1e-12))
         say(
-            f"step {done:,} of {self.end:,} | {where} | {self._drawn / max(seconds, 1e-9):,.0f} rays/s | batch PSNR "
-            f"{psnr:.1f} dB | {duration(each * (self.end - done))} left"
+            f"step {done:,} of {self.end:,} | {where} | {self.rays * since / max(seconds, 1e-9):,.0f} rays/s | "
+            f"batch PSNR {psnr:.1f} dB | {duration(each * (self.end - done))} left"
         )
-        self._said_at, self._said, self._phase, self._drawn = now, done, where, 0.0
+        self._said_at, self._said, self._phase = now, done, where
 
 
 def forecast(method: str, steps: int, rays: int, threads: int, cores: float) -> str:

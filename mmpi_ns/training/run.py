@@ -125,7 +125,6 @@ class TrainingRun:
         if attributes is not None and attributes.pipeline is not None:
             manager = attributes.pipeline.datamanager
             assert isinstance(manager, MMPIDataManager), "training needs MMPIDataManager"
-            manager.rays_share = schedule.rays_share(step)
             if self._drawn_from != window:
                 centers, windows = manager.observations.centers, progress.windows.windows
                 manager.use_cameras(cameras_of(windows[window], centers) if len(windows) > 1 else None)

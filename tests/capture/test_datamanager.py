@@ -63,8 +63,6 @@ def test_rays_drawn_ahead_are_those_of_the_step_whatever_comes_between(scene, ma
         following = ahead._rays._next[2].result()
         assert ahead.next_train(1) is following and same(alone[1], following)
         assert same(alone[3], ahead.next_train(3))
-        ahead.rays_share = 0.5
-        assert len(ahead.next_train(4)[1]["indices"]) == 32
         ahead.use_cameras(np.array([2]))
         assert set(ahead.next_train(5)[1]["indices"][:, 0].tolist()) == {2}
     finally:
@@ -204,16 +202,6 @@ def with_cover(manager, cover):
     """The manager's sources as if this share of the pixels had points shared by two images."""
     new_views = dataclasses.replace(manager.sources.new_views, cover=cover)
     return dataclasses.replace(manager.sources, new_views=new_views)
-
-
-def test_a_share_of_a_steps_rays_is_drawn_of_each_kind(scene):
-    manager = datamanager(scene, new_view_share=1.0)
-    manager.sources = with_cover(manager, 0.5)
-    assert len(manager.next_train(2)[0]) == 64 + 32 + 8 and manager.get_train_rays_per_batch() == 64
-    manager.rays_share = 0.25
-    rays, batch = manager.next_train(2)
-    assert len(rays) == 16 + 8 + 2 and batch["image"].shape == (16 + 8, 3)
-    assert manager.get_train_rays_per_batch() == 16, "what nerfstudio counts"
 
 
 def test_rays_of_new_views_come_after_the_pixels_and_leave_fewer_keypoint_rays(scene):

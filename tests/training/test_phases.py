@@ -97,13 +97,13 @@ def test_paper_rates_fall_tenfold_in_20k_of_30k_steps():
 
 def test_texels_double_at_each_growth_step():
     schedule = schedule_of("joint", 30_000)
-    assert schedule.growth == (2_000, 4_000, 6_000, 8_000)
-    steps = (0, 1_999, 2_000, 3_999, 4_000, 6_000, 7_999, 8_000, 30_000)
+    assert schedule.growth == (1_000, 2_000, 3_000, 4_000)
+    steps = (0, 999, 1_000, 1_999, 2_000, 3_000, 3_999, 4_000, 30_000)
     assert [schedule.texel_factor(s) for s in steps] == [1 / 16, 1 / 16, 1 / 8, 1 / 8, 1 / 4, 1 / 2, 1 / 2, 1, 1]
 
 
 def test_growth_follows_the_first_phase_and_not_the_whole_run():
-    assert two_phase().growth == (2_000, 4_000, 6_000, 8_000)
+    assert two_phase().growth == (1_000, 2_000, 3_000, 4_000)
 
 
 def test_growth_is_over_within_the_first_phase_of_any_length():
@@ -128,33 +128,20 @@ def test_shares_that_leave_nothing_for_the_first_phase_are_refused(blend, finetu
         schedule_of("two-phase", 1000, blend_share=blend, finetune_share=finetune)
 
 
-def test_fewer_rays_are_drawn_until_surfaces_have_formed():
-    schedule = schedule_of("joint", 6000, growing_rays=0.25, windows=2)
-    assert [schedule.rays_share(step) for step in (0, 1599, 1600, 5999, 6000, 7599, 7600)] == [
-        0.25, 0.25, 1, 1, 0.25, 0.25, 1,
-    ]  # fmt: skip
-    assert schedule_of("joint", 6000).rays_share(0) == 1, "as it was, unless fewer are asked for"
-
-
-def test_a_short_run_draws_no_fewer_rays_than_it_needs():
-    shares = [schedule_of("joint", steps, growing_rays=0.5).rays_share(0) for steps in (20_000, 4000, 3000, 750)]
-    assert shares == [0.5, 0.5, pytest.approx(2 / 3), 1]
-
-
 def test_without_growth_all_texels_are_there_from_the_start():
     assert schedule_of("joint", 10, growth_shares=()).texel_factor(0) == 1
 
 
 def test_bricks_may_be_released_just_before_the_texels_double():
-    schedule = schedule_of("joint", 1_000, release_shares=(0.1, 3 / 15, 4 / 15, 0.5))
-    assert schedule.growth == (67, 133, 200, 267) and schedule.release == (200, 267, 500)
-    assert [s for s in range(1_000) if schedule.watches(s)] == [*range(133, 500)]
+    schedule = schedule_of("joint", 1_000, release_shares=(0.05, 3 / 30, 4 / 30, 0.5))
+    assert schedule.growth == (33, 67, 100, 133) and schedule.release == (100, 133, 500)
+    assert [s for s in range(1_000) if schedule.watches(s)] == [*range(67, 500)]
     once = schedule_of("joint", 1_000, growth_shares=(0.3,), release_shares=(0.3,))
     assert [s for s in range(1_000) if once.watches(s)] == [*range(300)]
 
 
 def test_texels_may_become_finer_at_releases_after_growth_while_rates_are_high():
-    shares = {"release_shares": (3 / 15, 4 / 15, 0.3, 0.5, 0.75), "decay_from": 0.5}
+    shares = {"release_shares": (3 / 30, 4 / 30, 0.3, 0.5, 0.75), "decay_from": 0.5}
     schedule = schedule_of("joint", 1_000, windows=2, **shares)
     assert [s for s in range(2_000) if schedule.refines_at(s)] == [300, 500, 1_300, 1_500]
     schedule = schedule_of("joint", 1_000, **(shares | {"release_weight": 0.0}))
@@ -162,11 +149,11 @@ def test_texels_may_become_finer_at_releases_after_growth_while_rates_are_high()
 
 
 def test_bricks_are_given_up_after_growth_and_what_is_seen_before_does_not_count():
-    schedule = schedule_of("joint", 1_000, release_shares=(0.1, 0.5, 0.75, 0.5), windows=2)
-    assert schedule.growth[-1] == 267 and schedule.release == (500, 750), "not before surfaces have formed, and once"
+    schedule = schedule_of("joint", 1_000, release_shares=(0.09, 0.5, 0.75, 0.5), windows=2)
+    assert schedule.growth[-1] == 133 and schedule.release == (500, 750), "not before surfaces have formed, and once"
     assert [s for s in range(2_000) if schedule.releases_at(s)] == [500, 750, 1_500, 1_750]
     watched = [s for s in range(2_000) if schedule.watches(s)]
-    assert watched == [*range(267, 750), *range(1_267, 1_750)]
+    assert watched == [*range(133, 750), *range(1_133, 1_750)]
     assert not any(schedule_of("joint", 100).watches(s) for s in range(100))
     assert schedule_of("joint", 100, growth_shares=(), release_shares=(0.1, 0.2)).release == (20,)
     assert schedule_of("two-phase", 1_000, release_shares=(1.0,)).release == (750,), "shares of the first phase"
@@ -217,9 +204,8 @@ def test_impossible_schedules_name_the_setting(settings, word):
 
 
 def test_a_models_schedule_is_made_of_its_options():
-    options = ScheduleConfig("two-phase", decay_decades=2.0, decay_from=0.25, finetune_rate=0.3, growing_rays=0.7)
+    options = ScheduleConfig("two-phase", decay_decades=2.0, decay_from=0.25, finetune_rate=0.3)
     schedule = make_schedule(options, 5000, 3)
-    assert schedule.growing_rays == 0.7
     assert (schedule.decay_decades, schedule.decay_from, schedule.finetune_rate) == (2.0, 0.25, 0.3)
     assert schedule.windows == 3
 
@@ -228,5 +214,6 @@ def test_a_models_schedule_is_made_of_its_options():
 def test_the_papers_methods_keep_its_rates(method):
     model, optimizers = method.config.pipeline.model, method.config.optimizers
     assert (model.schedule.decay_decades, model.schedule.decay_from) == (1.5, 0.0)
-    assert (model.schedule.growing_rays, model.colour.feature_channels) == (1.0, 9)
+    assert model.colour.feature_channels == 9
+    assert model.schedule.growth_shares == (1 / 15, 2 / 15, 3 / 15, 4 / 15)
     assert optimizers["colour"]["optimizer"].lr == 1e-3

@@ -12,7 +12,6 @@ from training_runs import compared, differences, load, ready, trainer_config, wr
 
 from mmpi_ns.placement.defaults import DEFAULTS
 from mmpi_ns.scene.windows import WindowedPlan
-from mmpi_ns.training.phases import LONG_RUN
 from mmpi_ns.utils.errors import InputError
 
 STEPS = 24
@@ -316,15 +315,3 @@ def test_without_a_number_of_steps_they_follow_the_pixels(scene, plan_file, tmp_
     expected = steps or 400
     assert trainer.pipeline.model.progress.schedule.total_steps == expected == trainer.config.max_num_iterations
     assert ("400 steps for its training pixels" in capsys.readouterr().out) == (steps == 0)
-
-
-def test_fewer_rays_are_drawn_until_the_texels_have_grown(scene, plan_file, tmp_path):
-    few = 0.25 * STEPS / LONG_RUN
-    trainer = ready(trainer_config(scene, plan_file, tmp_path, STEPS, growing_rays=few))
-    drawn = []
-    for step in (0, 5, 6):
-        for callback in trainer.callbacks:
-            callback.run_callback_at_location(step, location=TrainingCallbackLocation.BEFORE_TRAIN_ITERATION)
-        rays, _ = trainer.pipeline.datamanager.next_train(step)
-        drawn.append(len(rays))
-    assert drawn == [20, 20, 80]
