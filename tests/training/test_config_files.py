@@ -12,7 +12,6 @@ from nerfstudio.utils.eval_utils import eval_setup
 from training_runs import datamanager, ready, trainer_config
 
 from mmpi_ns.config import mmpi_kitti, mmpi_small
-from mmpi_ns.model import MMPIModelConfig
 from mmpi_ns.training.options import LEFT, TRAINED, check_nothing_left
 from mmpi_ns.utils.errors import InputError
 

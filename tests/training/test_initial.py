@@ -9,10 +9,13 @@ import oracle
 import pytest
 import torch
 from hand_made import make_mpi
+from nerfstudio.engine.callbacks import TrainingCallbackLocation
 from random_fields import random_plan, random_rays
+from training_runs import ready, trainer_config
 
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.scene.plan import ScenePlan
+from mmpi_ns.scene.texels import BRICK
 from mmpi_ns.training.initial import DARKEST, EMPTY_FROM, PLANE_ERROR, PRIOR, Votes, start_from_votes
 
 TOO_CLOSE = 1e-4
@@ -156,3 +159,31 @@ def test_rays_that_meet_nothing_and_no_rays_change_nothing():
         start_from_votes(field, votes_of(field, *rays, np.zeros((len(rays[0]), 3))))
     assert torch.equal(before[0], field.density.data)
     assert torch.equal(before[1], field.features.data)
+
+
+def prepared(scene, plan_file, folder, steps, **settings):
+    """The field of a run after the callbacks before each of these steps."""
+    config = trainer_config(scene, plan_file, folder, 60)
+    for name, value in settings.items():
+        setattr(config.pipeline.datamanager, name, value)
+    trainer = ready(config)
+    for step in steps:
+        for callback in trainer.callbacks:
+            callback.run_callback_at_location(step, location=TrainingCallbackLocation.BEFORE_TRAIN_ITERATION)
+    return trainer.pipeline.model.field
+
+
+def test_a_run_starts_from_the_depths_of_its_pixels_once(scene, plan_file, tmp_path):
+    field = prepared(scene, plan_file, tmp_path / "a", [0])
+    changed = (field.density.data != 0).any(-1)
+    assert changed.any() and (field.features.data[:, :3] != 0).any()
+    assert not field.features.data[:, 3:].any(), "view dependence is learned"
+    again = prepared(scene, plan_file, tmp_path / "b", [0, 1])
+    assert torch.equal(field.density.data, again.density.data)
+    later = prepared(scene, plan_file, tmp_path / "c", [1])
+    assert not later.density.data[BRICK:].any(), "a run that goes on has surfaces already"
+
+
+def test_without_known_depths_every_plane_starts_alike(scene, plan_file, tmp_path):
+    field = prepared(scene, plan_file, tmp_path, [0], dense_depth=False, depth_images=False, sfm_path="none")
+    assert not field.density.data[BRICK:].any() and not field.features.data.any()
