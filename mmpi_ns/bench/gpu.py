@@ -61,14 +61,8 @@ def noise(folder: Path, count: int = 10, width: int = 155, height: int = 47) -> 
             pose = np.vstack([np.eye(3, 4), [0, 0, 0, 1]])
             pose[2, 3] = -float(i)
             frames.append({"file_path": f"images/{i}.png", "transform_matrix": pose.tolist()})
-        camera = {
-            "fl_x": 0.58 * width,
-            "fl_y": 0.58 * width,
-            "cx": width / 2,
-            "cy": height / 2,
-            "w": width,
-            "h": height,
-        }
+        focal = {"fl_x": 0.58 * width, "fl_y": 0.58 * width}
+        camera = focal | {"cx": width / 2, "cy": height / 2, "w": width, "h": height}
         (folder / "transforms.json").write_text(json.dumps(camera | {"frames": frames}), encoding="utf-8")
     return folder.resolve()
 
@@ -109,7 +103,8 @@ def try_operations(device: str, every: Sequence[Shapes] = (SMALL,)) -> dict[str,
 
 def time_training(device: str, data: Path, work: Path, rays: int) -> dict[str, Any]:
     """Milliseconds of a step and of a frame of a small capture."""
-    options = (*drive(64, rays), "--pipeline.datamanager.dense-depth", "False", *no_tracks())
+    manager = [f"--pipeline.datamanager.{name}" for name in ("dense-depth", "mask-moving", "correct-exposure")]
+    options = (*drive(64, rays), *(word for name in manager for word in (name, "False")), *no_tracks())
     with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of others' deprecations
         steps = Steps(train_words("mmpi-small", options, Scene(data, 1), work, 10 * STEPS, 0, device))
