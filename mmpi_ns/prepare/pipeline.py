@@ -53,7 +53,7 @@ class Preparation:
         s = self.settings
         with self._timed("reading"):
             self._read_input()
-            self.known_poses = read_poses(s.poses, s.poses_format, s.poses_axes, self.photos) if s.poses else None
+            self.known_poses = read_poses(s.poses, s.poses_axes, self.photos) if s.poses else None
             if self.known_poses is None and len(self.photos) < LEAST_IMAGES:
                 raise PrepareError(
                     f"Poses cannot be found for {len(self.photos)} images alone, as no third confirms them: take more "
@@ -154,7 +154,7 @@ class Preparation:
     def _solve(self, database: Path) -> tuple[Solution, tuple[float, float] | None, list[list[str]]]:
         """Poses and points; the interval of a refined focal length; connected groups of images without a pose."""
         s, names = self.settings, [p.name for p in self.photos]
-        source = [s.refine_poses, s.refine_intrinsics, s.refine_principal_point, s.lens, self.is_fixed]
+        source = [s.refine_poses, s.refine_intrinsics, s.lens, self.is_fixed]
         with self.stages.stage("model", source) as (folder, is_done):
             if not is_done:
                 groups: list[list[str]] = []
@@ -166,7 +166,7 @@ class Preparation:
                     solution = Solution(model, f"{self.known_poses.says}; {says}")
                 else:
                     lens, place = not self.is_fixed, s.camera is None or s.refine_intrinsics
-                    free = Free(lens, lens and s.lens == "auto", principal_point=place, always=s.refine_principal_point)
+                    free = Free(lens, lens and s.lens == "auto", principal_point=place)
                     is_sequence = self.matching.startswith("sequential")
                     solution = map_and_judge(
                         Task(database, self.image_folder, folder, names, free, s.threads, is_sequence, self.is_ordered)

@@ -68,7 +68,7 @@ def test_the_defaults_are_those_of_the_method():
             command = _defaults(words)
             assert command.placement == method.config.pipeline.model.placement
             rays = method.config.pipeline.datamanager.train_num_rays_per_batch
-            assert command.training_rays is None and DEFAULTS[name].rays == rays
+            assert DEFAULTS[name].rays == rays
     assert _defaults(["scene"]).placement == mmpi_small.config.pipeline.model.placement
 
 
