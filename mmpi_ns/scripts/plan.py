@@ -96,7 +96,7 @@ class PlanCommand:
             draw_errors(self.output / f"errors{suffix}.png", window.plan, report)
             title = f"## Window {i}: {len(part.centers)} training cameras\n\n" if len(windows) > 1 else ""
             rule = window.plan.origin_of_plan
-            parts.append(f"{title}{table(report)}\n\n{rule[0].upper()}{rule[1:]}.")
+            parts.append(f"{title}{table(window.plan, part, report)}\n\n{rule[0].upper()}{rule[1:]}.")
         if len(windows) > 1:
             draw_windows(self.output / "plan.png", windows, observations)
             total = sum(plan.texels for plan in windows.plans) / 1e6
