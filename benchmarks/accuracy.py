@@ -11,10 +11,10 @@ import numpy as np
 import torch
 from lab import figure
 from plane_crossings import AHEAD
+from random_scenes import Array, bundle_of, of_slots, render
 from report import Bench, Report, Row, page, table
 from solids import Solids, bake
 
-from mmpi_ns.bench.scenes import Array, bundle_of, of_slots, render
 from mmpi_ns.ops.composite import median_inverse_distance
 from mmpi_ns.scene.plan import MPIPlan
 from mmpi_ns.scripts.command import run

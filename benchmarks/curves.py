@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-
-from mmpi_ns.bench.scenes import Array
+from random_scenes import Array
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,10 @@ from apart import run_apart
 from gpu_parts import run_part
 from report import Bench, Report, Row, page, slug, table, title
 
-from mmpi_ns.bench.gpu import street
 from mmpi_ns.bench.trainers import has_pycolmap
 from mmpi_ns.scripts.command import run
+from mmpi_ns.synthetic.catalogue import make_scene
+from mmpi_ns.synthetic.dataset import write_dataset
 
 SHARES = {"checks": 0.25, "training triton": 0.25, "training torch": 0.2, "kitti": 0.3}
 """The parts in the order in which they run, and their shares of the time; what one leaves, the next ones have."""
@@ -81,8 +82,13 @@ class Gpu(Bench):
         """The data set, or a street that is made now."""
         if self.data is not None:
             return self.data.resolve()
-        sizes = (10, 40, 12, 150) if self.rehearse else (40, 621, 188, 4000)
-        return street(self.folder / "street", *sizes)
+        count, width, height, points = (10, 40, 12, 150) if self.rehearse else (40, 621, 188, 4000)
+        folder = self.folder / "street"
+        if not (folder / "transforms.json").is_file():
+            print(f"Making a street of {width} x {height} pixels ...", flush=True)
+            scene = make_scene("street", count=count, width=width, height=height)
+            write_dataset(scene, folder, points=points, tracks=has_pycolmap(), overwrite=True)
+        return folder.resolve()
 
     def _part(self, name: str, data: Path, seconds: float) -> Row:
         part, _, ops = name.partition(" ")

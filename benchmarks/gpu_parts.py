@@ -18,12 +18,12 @@ from typing import Any
 
 import torch
 from apart import Tell
+from kernel_checks import run_checks
 from lab import median_s
 from methods import TWO_PHASE
 from report import Row, slug
 from torch import Tensor
 
-from mmpi_ns.bench.checks import run_checks
 from mmpi_ns.bench.gpu import drive
 from mmpi_ns.bench.trainers import P, Scene, Steps, train_words
 from mmpi_ns.model import MMPIModel

@@ -16,10 +16,10 @@ import numpy as np
 import torch
 from lab import figure
 from plane_crossings import Image, images_of
+from random_scenes import Array, in_float64
+from random_scenes import render as render_plainly
 from report import Bench, Report, Row, fingerprint, page, table
 
-from mmpi_ns.bench.scenes import Array, in_float64
-from mmpi_ns.bench.scenes import render as render_plainly
 from mmpi_ns.export.bake import load_model
 from mmpi_ns.model import MMPIModel
 from mmpi_ns.ops import dispatch

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from random_scenes import Array
 
-from mmpi_ns.bench.scenes import Array
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.scene.plan import MPIPlan, ScenePlan
 

@@ -34,6 +34,7 @@ def pytest_configure(config):
 
 LONGEST = (
     "test_gpu", "test_bench_gpu", "test_bench_roads", "test_commands", "test_bench_train", "test_window_training",
+    "test_shared_windows",
 )  # fmt: skip
 """Files whose few tests take minutes."""
 

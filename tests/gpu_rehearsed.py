@@ -6,11 +6,11 @@ import json
 import math
 
 import gpu
+import kernel_checks
 import torch
 from gpu import SHARES, Gpu
+from random_scenes import random_scene
 
-from mmpi_ns.bench import checks as gpu_checks
-from mmpi_ns.bench.scenes import random_scene
 from mmpi_ns.ops import dispatch
 
 
@@ -39,7 +39,7 @@ def test_all_parts_end_to_end(tmp_path, monkeypatch):
 
 def test_wrong_kernels_are_found(monkeypatch):
     dispatch.interpret(True)
-    assert all(c.ok for c in gpu_checks.interpolation("cpu", 50))
+    assert all(c.ok for c in kernel_checks.interpolation("cpu", 50))
     wrong = {
         "sum_rows": lambda _, values, w, count: torch.zeros(count, values.shape[1]),
         "march": lambda *given: march(*given[:-1], given[-1]._replace(blends=False)),  # without blending
@@ -48,6 +48,6 @@ def test_wrong_kernels_are_found(monkeypatch):
     monkeypatch.setattr(
         dispatch, "function", lambda name, form: wrong[name] if form == "gpu" and name in wrong else right(name, form)
     )
-    assert [c.ok for c in gpu_checks.interpolation("cpu", 50)] == [True, False]
+    assert [c.ok for c in kernel_checks.interpolation("cpu", 50)] == [True, False]
     s = random_scene(2, 4, True).clear()
-    assert len(s.bundle) >= 2 and not all(c.ok for c in gpu_checks.marched(s, "wrong", s.exact()))
+    assert len(s.bundle) >= 2 and not all(c.ok for c in kernel_checks.marched(s, "wrong", s.exact()))

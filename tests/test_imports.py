@@ -20,7 +20,7 @@ COMMANDS = {
     "export": set(METHOD),
     "functional": set(METHOD) | {"export"},
     "": {"functional"},
-    "bench": set(METHOD) | {"synthetic"},
+    "bench": set(METHOD),
     "scripts": set(METHOD) | {"export", "prepare", "synthetic", "bench"},
 }
 """The method never imports these."""

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.engine import trainer as nerfstudio_trainer
 
 from mmpi_ns.capture.datamanager import MMPIDataManagerConfig
@@ -15,6 +16,9 @@ from mmpi_ns.config import mmpi_small
 from mmpi_ns.scene.plan import CubePlan, MPIPlan, ScenePlan
 from mmpi_ns.scene.windows import Window, WindowedPlan
 from mmpi_ns.training.phases import ScheduleConfig, make_schedule
+
+WINDOW_STEPS = 6
+"""Of each window in the runs of `tests/training`."""
 
 
 def datamanager(data: Path, test_mode="val", **settings):
@@ -152,3 +156,16 @@ def load(folder, step):
 
 def compared(state):
     return {k: state[k] for k in ("step", "pipeline", "optimizers", "schedulers", "scalers")}
+
+
+def facing(model, origins) -> torch.Tensor:
+    """Rays along the axis of the first MPI."""
+    axis = np.asarray(model.progress.windows.plans[0].mpis[0].axes)[2]
+    return torch.tensor(axis).float().expand(len(origins), 3)
+
+
+def rendered(model, origins) -> dict[str, torch.Tensor]:
+    ones = torch.ones(len(origins), 1)
+    bundle = RayBundle(origins, facing(model, origins), ones, torch.zeros_like(ones).long())
+    with torch.no_grad():
+        return model.eval().get_outputs(bundle)

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import hashlib
-import os
-import struct
 import zipfile
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from filelock import FileLock, Timeout
@@ -67,7 +65,7 @@ def images_held(sizes: NDArray[np.float64], bytes_of_pixel: int, least: int) -> 
 def remembered(key: str, find: Callable[[], Arrays | Pairs], folder: Path | None = None) -> Arrays:
     """The result of ``find``, from the cache if the key is there.
 
-    Arrays are mapped from the file at each access: they take memory only while they are used. Changes are the caller's
+    Arrays are read from the file at each access: they take memory only while they are used. Changes are the caller's
     own and reach neither the file nor the next access. If several processes ask at once, one computes and the
     others wait. If the folder is not writable, every process computes the result itself, and says so.
 
@@ -106,43 +104,12 @@ def _write(path: Path, arrays: Arrays | Pairs) -> None:
                 np.lib.format.write_array(entry, np.asanyarray(array), version=(1, 0), allow_pickle=False)
 
 
-class _Mapped(Mapping[str, NDArray[np.generic]]):
-    """The arrays of an uncompressed .npz, which stays open: others may remove it meanwhile."""
-
-    def __init__(self, path: Path) -> None:
-        self.data = path.open("rb")
-        self.places: dict[str, tuple[Any, int, tuple[int, ...], Literal["C", "F"]]] = {}
-        """Type, offset, shape and order of each."""
-        with zipfile.ZipFile(self.data) as file:
-            for entry in file.infolist():
-                self.data.seek(entry.header_offset + 26)  # of a zip's local header: lengths of name and extra field
-                self.data.seek(sum(struct.unpack("<HH", self.data.read(4))), os.SEEK_CUR)
-                np.lib.format.read_magic(self.data)
-                shape, fortran, dtype = np.lib.format.read_array_header_1_0(self.data)
-                place = dtype, self.data.tell(), shape, "F" if fortran else "C"
-                self.places[entry.filename.removesuffix(".npy")] = place
-
-    def __getitem__(self, name: str) -> NDArray[np.generic]:
-        dtype, offset, shape, order = self.places[name]
-        if 0 in shape:  # nothing to map
-            return np.zeros(shape, dtype)
-        return np.asarray(np.memmap(self.data, dtype, "c", offset, shape, order))
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.places)
-
-    def __len__(self) -> int:
-        return len(self.places)
-
-
 def _read(path: Path) -> Arrays | None:
-    """The arrays of an uncompressed .npz; None if it is missing or damaged."""
+    """The arrays of an .npz, which stays open, as others may remove it meanwhile; None if it is missing or damaged."""
     try:
-        arrays = _Mapped(path)
-        for name in arrays:  # a file that was cut off
-            arrays[name]
+        arrays = np.load(path)
         path.touch()
-    except (OSError, ValueError, EOFError, struct.error, zipfile.BadZipFile):
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile):
         return None
     return arrays
 

@@ -71,7 +71,6 @@ def check_transforms(parser: NerfstudioDataParserConfig, data: Path, splits: Seq
     poses = np.stack([_pose(frame, path) for frame in frames])
     _check_whole_file(meta, path)
     check_lenses(meta, frames, path)
-    _check_depth_files(frames, path)
     _check_splits(meta, frames, splits, path, by_name=(parser.downscale_factor or 1) > 1)
     if opens:
         _check_first_image(parser.downscale_factor, path.parent, frames[0]["file_path"])
@@ -124,6 +123,12 @@ def _check_files(parser: NerfstudioDataParserConfig, meta: Mapping[str, Any], fr
                 raise InputError(
                     f"The {key} of frame number {i + 1} of {path} is {shown(value)}: give the path of a file as text."
                 )
+    bare = next((f for f in frames if "depth_file_path" not in f), None)
+    if bare is not None and any("depth_file_path" in f for f in frames):
+        raise InputError(
+            f"Frame {cut(bare['file_path'])} of {path} has no depth_file_path and others have one: give all frames "
+            "one, or none."
+        )
     names = [] if any(key in meta for key in SPLITS) else [frame["file_path"] for frame in frames]
     for name in names if parser.eval_mode == "filename" else ():
         if not re.search("train|eval", Path(name).name):
@@ -181,15 +186,6 @@ def _check_whole_file(meta: Mapping[str, Any], path: Path) -> None:
     if turned not in ORIENTATIONS:
         raise InputError(
             f"orientation_override of {path} is {shown(turned)}: leave it out or give one of {', '.join(ORIENTATIONS)}."
-        )
-
-
-def _check_depth_files(frames: Frames, path: Path) -> None:
-    having = ["depth_file_path" in frame for frame in frames]
-    if any(having) and not all(having):
-        name = cut(frames[having.index(False)]["file_path"])
-        raise InputError(
-            f"Frame {name} of {path} has no depth_file_path and others have one: give all frames one, or none."
         )
 
 

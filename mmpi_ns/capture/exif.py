@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,42 +17,20 @@ SHOT = (
 """Tags about body and shot. The others (orientation, sizes, thumbnails, maker notes) are wrong in a changed copy."""
 
 
-@dataclass(frozen=True)
-class Exposure:
-    """What the camera chose for one photo: the light recorded grows as time * sensitivity / aperture squared."""
+def light_of(file: Path) -> float:
+    """Light that an image got by its EXIF, in arbitrary units: time * sensitivity / aperture squared.
 
-    time: float
-    """Seconds."""
-    sensitivity: float | None
-    """ISO."""
-    aperture: float | None
-    """Focal length over the diameter of the aperture (f-number)."""
-
-
-def exposure_of(file: Path) -> Exposure | None:
-    """Exposure of an image file by its EXIF; None where it has none, as frames of videos do.
-
-    Raises:
-        OSError: the file is no image.
+    NaN where no time is noted, as in frames of videos, or the file is damaged, which is told when its pixels are read.
 
     Source: CIPA DC-008 (Exif 2.32), tags ExposureTime, PhotographicSensitivity and FNumber.
     """
-    with Image.open(file) as image:
-        tags = image.getexif().get_ifd(ExifTags.IFD.Exif)
-    time, sensitivity, aperture = (positive_number(tags.get(tag)) for tag in SHOT[:1] + SHOT[2:3] + SHOT[1:2])
-    return None if time is None else Exposure(time, sensitivity, aperture)
-
-
-def light_of(file: Path) -> float:
-    """Light that an image got by its EXIF, in arbitrary units; NaN where it is not noted or the file is damaged, which
-    is told when its pixels are read."""
     try:
-        exposure = exposure_of(file)
+        with Image.open(file) as image:
+            tags = image.getexif().get_ifd(ExifTags.IFD.Exif)
     except OSError:
-        exposure = None
-    if exposure is None:
         return float("nan")
-    return exposure.time * (exposure.sensitivity or 100.0) / (exposure.aperture or 1.0) ** 2
+    time, aperture, sensitivity = (positive_number(tags.get(tag)) for tag in SHOT[:3])
+    return (time or float("nan")) * (sensitivity or 100.0) / (aperture or 1.0) ** 2
 
 
 def positive_number(value: Any) -> float | None:

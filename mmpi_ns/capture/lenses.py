@@ -93,21 +93,17 @@ def _check_distortion(
         lens = dict(zip(RADIAL, params or (), strict=False))
     if kind not in (CameraType.PERSPECTIVE, CameraType.FISHEYE):
         return
-    corner = math.hypot(0.5 * camera["w"] / camera["fl_x"], 0.5 * camera["h"] / camera["fl_y"])
-    if not _can_be_undone([float(lens.get(k, 0)) for k in RADIAL], 0.5 * corner):
+    # The radial polynomial must rise up to half way to a corner (a tangent, or the angle of a fisheye).
+    radius = 0.25 * math.hypot(camera["w"] / camera["fl_x"], camera["h"] / camera["fl_y"])
+    r = radius * np.linspace(0, STRETCH, 2001)[1:]
+    with np.errstate(over="ignore", invalid="ignore"):
+        distorted = r + sum(float(lens.get(k, 0)) * r ** (2 * n + 3) for n, k in enumerate(RADIAL))
+        reached = np.nonzero(~(distorted < radius))[0]
+        first = int(reached[0]) if len(reached) else len(r) - 1
+        rises = bool((np.diff(np.append(0.0, distorted[: first + 1])) > 0).all())
+    if not (len(reached) > 0 and rises and float(r[first]) >= radius / STRETCH):
         said = ", ".join(f"{k} {lens[k]:g}" for k in RADIAL if k in lens)
         raise InputError(
             f"The distortion of {where} ({said}) cannot be undone half way to the image's corners: give OpenCV's "
             "coefficients for this camera_model, or undistorted images without any."
         )
-
-
-def _can_be_undone(k: Sequence[float], radius: float) -> bool:
-    """Whether a radial polynomial increases up to about ``radius`` (tangent, or angle of a fisheye)."""
-    r = radius * np.linspace(0, STRETCH, 2001)[1:]
-    with np.errstate(over="ignore", invalid="ignore"):
-        distorted = r + sum(c * r ** (2 * n + 3) for n, c in enumerate(k))
-        reached = np.nonzero(~(distorted < radius))[0]
-        first = int(reached[0]) if len(reached) else len(r) - 1
-        rises = bool((np.diff(np.append(0.0, distorted[: first + 1])) > 0).all())
-    return len(reached) > 0 and rises and float(r[first]) >= radius / STRETCH

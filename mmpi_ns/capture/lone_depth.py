@@ -83,16 +83,8 @@ _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 def _planes(
     sums: NDArray[np.float64], directions: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Fits w.v to weighted pixels and evaluates it along directions.
-
-    Args:
-        sums: [P, 11] of weights, weights times q^2, q v (3) and v v^T (6, ``_PAIRS``).
-        directions: [P, 3]
-
-    Returns:
-        q along the directions [P] and its expected error: the scatter about the plane, increased by the distance of the
-        extrapolation.
-    """
+    """Of w.v fitted to pixels by sums [P, 11] of weights, w q^2, w q v (3) and w v v^T (6, ``_PAIRS``): q along
+    directions [P, 3], and its expected error, the scatter about the plane, larger the farther it is extrapolated."""
     mean = sums / sums[:, :1]
     matrix = np.empty((3, len(sums), 3))
     for n, (i, j) in enumerate(_PAIRS):

@@ -151,13 +151,8 @@ class _Reader:
 
 
 def _check_binary_files(folder: Path) -> None:
-    """Checks that the binary files of a model (https://colmap.github.io/format.html) are complete and consistent.
-
-    pycolmap trusts the counts in the files: a truncated file makes it allocate gigabytes or end the process.
-
-    Raises:
-        ValueError: a file is truncated or refers to records that are missing.
-    """
+    """Raises ValueError where a binary file (https://colmap.github.io/format.html) is truncated or names a missing
+    record: pycolmap trusts the counts in the files, and would allocate gigabytes or end the process."""
     sizes = {"cameras": 24, "images": 73, "points3D": 51}
     files = [_Reader(folder / f"{name}.bin", least) for name, least in sizes.items()]
     cameras, images, points, seen = set(), {}, set(), [np.array([NO_POINT])]

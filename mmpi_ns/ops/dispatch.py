@@ -247,11 +247,7 @@ def _try(name: str) -> str | None:
 
 
 def _try_kernels(name: str) -> None:
-    """Tries an operation's kernels with the shapes at hand, unless they passed before on this device.
-
-    Raises:
-        Exception: whatever is amiss with them.
-    """
+    """Tries an operation's kernels with the shapes at hand, unless they passed before here; raises what is amiss."""
     trial = importlib.import_module("mmpi_ns.ops.trial")  # which tries operations, so it comes after this one
     if _interpreting:
         return trial.run(name, "cpu", _shapes)

@@ -83,12 +83,8 @@ def spread_cameras(observations: Observations, visible: VisiblePoints, count: in
 
 
 def _faces(observations: Observations, i: int) -> Iterator[tuple[str, Array, Array, Array]]:
-    """Facing directions for MPIs at a camera: its own, and for a wide lens also its sides.
-
-    Yields:
-        Name, axes (rows right, down, facing), and the smallest and largest tangents that the camera sees there to the
-        right and downwards.
-    """
+    """Of each facing direction for MPIs at a camera, its own, and for a wide lens also its sides: name, axes (rows
+    right, down, facing), and the smallest and largest tangents that the camera sees to the right and downwards."""
     right, up, back = observations.camera_to_worlds[i, :, :3].T
     axes, name = np.stack([right, -up, -back]), f"view {i + 1}"
     if observations.lens is None:

@@ -6,8 +6,9 @@ resolution; pixels with one clear match become points. Takes a few seconds.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,8 +27,7 @@ MIN_MARGIN = 0.08
 """Minimum lead over every match at another depth."""
 
 
-@dataclass(frozen=True)
-class _View:
+class _View(NamedTuple):
     image: Array
     pose: Array
     intrinsics: Array
@@ -87,18 +87,15 @@ def _sweep(reference: _View, neighbours: list[_View]) -> Array:
     level = np.arange(HYPOTHESES)[:, None, None]
     second = np.where(np.abs(level - best) > 3, scores, -1).max(0)
     good = (top > MIN_SCORE) & (top - second > MIN_MARGIN) & (best > 0)
-    inverse_depth = np.where(good, (best + _peak_offset(scores, best)) * disparities[1], 1.0)
+    # The peak lies between the hypotheses, at the vertex of the parabola through the best and its neighbours.
+    inner = np.clip(best, 1, HYPOTHESES - 2)[None]
+    below, middle, above = (np.take_along_axis(scores, inner + d, 0)[0] for d in (-1, 0, 1))
+    bend = below - 2 * middle + above
+    is_peak = (bend < -1e-9) & (inner[0] == best)
+    offset = np.where(is_peak, np.clip(0.5 * (below - above) / np.where(is_peak, bend, -1.0), -0.5, 0.5), 0.0)
+    inverse_depth = np.where(good, (best + offset) * disparities[1], 1.0)
     world = (rays / inverse_depth[..., None]) @ reference.pose[:, :3].T + reference.pose[:, 3]
     return world[good][:: max(1, good.sum() // 400)]
-
-
-def _peak_offset(scores: Array, best: NDArray[np.int64]) -> Array:
-    """Place of the peak between the hypotheses: vertex of the parabola through the best and its neighbours."""
-    inner = np.clip(best, 1, HYPOTHESES - 2)[None]
-    below, top, above = (np.take_along_axis(scores, inner + d, 0)[0] for d in (-1, 0, 1))
-    bend = below - 2 * top + above
-    offset = 0.5 * (below - above) / np.where(bend < -1e-9, bend, -1.0)
-    return np.where((bend < -1e-9) & (inner[0] == best), np.clip(offset, -0.5, 0.5), 0.0)
 
 
 def _warp(reference: _View, neighbour: _View, rays: Array, disparity: float) -> tuple[Array, NDArray[np.bool_]]:

@@ -37,8 +37,6 @@ class Free:
     """OpenCV's four lens terms in place of one radial term, if they fit clearly better."""
     principal_point: bool
     """The principal point, if that fits clearly better. It is hardly observable on straight stretches, but in bends."""
-    always: bool = False
-    """The principal point, in any case."""
 
 
 def adjust(
@@ -81,20 +79,17 @@ def polish(model: pycolmap.Reconstruction, free: Free, threads: int) -> pycolmap
         threads: CPU threads; below 1 for all.
     """
     trials = []  # in words, and whether it is the four lens terms; else the principal point
-    if free.principal_point and not free.always:
+    if free.principal_point:
         trials.append(("the principal point free", False))
     if free.full_lens and any(c.model.name == "SIMPLE_RADIAL" for c in model.cameras.values()):
         trials.append(("OpenCV's four lens terms", True))
-    center, four_terms = free.always, False
+    if not trials:
+        return model
+    center = four_terms = False
     with progress("Fitting the lens", 1 + len(trials)) as advance:
-        best = copy.deepcopy(model)
-        if center:
-            adjust(best, threads, free.lens, center)
+        light = with_fewer_points(model)
+        adjust(light, threads, free.lens)
         advance()
-        light = with_fewer_points(best)
-        if trials:
-            adjust(light, threads, free.lens, center)
-        is_changed = False
         for says, is_lens in trials:
             trial = copy.deepcopy(light)
             if is_lens:
@@ -105,11 +100,13 @@ def polish(model: pycolmap.Reconstruction, free: Free, threads: int) -> pycolmap
             is_better = after < WORTH * before
             say(f"Lens: {before:.3f} px, {after:.3f} px with {says}: {'kept' if is_better else 'not kept'}.")
             if is_better:
-                light, center, four_terms, is_changed = trial, center or not is_lens, four_terms or is_lens, True
-        if four_terms:
-            _give_four_terms(best)
-        if is_changed:
-            adjust(best, threads, free.lens, center)
+                light, center, four_terms = trial, center or not is_lens, four_terms or is_lens
+    if not center and not four_terms:
+        return model
+    best = copy.deepcopy(model)
+    if four_terms:
+        _give_four_terms(best)
+    adjust(best, threads, free.lens, center)
     return best
 
 

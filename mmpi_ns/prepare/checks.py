@@ -1,11 +1,9 @@
-"""Checks of a prepared scene: misplaced, blurred or moving frames, and intrinsics that do not fit."""
+"""Checks of a prepared scene: misplaced or blurred frames, and intrinsics that do not fit."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -27,11 +25,7 @@ JUMP = 5.0
 TURN = 8.0
 """Minimum angle of such a turn, degrees."""
 CELLS = (6, 8)
-"""Rows and columns of the grid for coverage and motion."""
-MOVED_PX = 4.0
-"""Distance from its epipolar line, in pixels of an image 640 wide, from which a match counts as moving."""
-LEAST_CELLS = 3
-"""Moving cells of an image from which they are reported; one or two are as often wrong matches."""
+"""Rows and columns of the grid for coverage."""
 FOCAL_OFF = (0.03, 0.05)
 """Relative change of a given focal length, when refined, from which it is doubted, and the scene with it..."""
 FOCAL_HELPS = (0.95, 0.85)
@@ -113,60 +107,15 @@ def misplaced(names: Sequence[str], places: Sequence[int], poses: Array) -> list
     return findings
 
 
-def cells(points: Array, camera: pycolmap.Camera) -> NDArray[np.int64]:
-    """Number of the cell of each pixel position in the grid of an image. [N]"""
-    place = np.clip(points / [camera.width, camera.height], 0, 1 - 1e-9) * CELLS[::-1]
-    return place[:, 1].astype(int) * CELLS[1] + place[:, 0].astype(int)
-
-
 def coverage(model: pycolmap.Reconstruction) -> dict[str, float]:
     """Fraction of an image's cells that contain a keypoint with a point, for each image."""
     shares = {}
     for i in model.reg_image_ids():
-        image = model.images[i]
+        image, camera = model.images[i], model.cameras[model.images[i].camera_id]
         seen = np.array([p.xy for p in image.points2D if p.has_point3D()]).reshape(-1, 2)
-        shares[image.name] = len(np.unique(cells(seen, model.cameras[image.camera_id]))) / (CELLS[0] * CELLS[1])
+        cell = (np.clip(seen / [camera.width, camera.height], 0, 1 - 1e-9) * CELLS[::-1]).astype(int)
+        shares[image.name] = len(np.unique(cell, axis=0)) / (CELLS[0] * CELLS[1])
     return shares
-
-
-def moving(model: pycolmap.Reconstruction, database: Path, names: Sequence[str]) -> list[Finding]:
-    """Images in which clustered matches with the next image leave their epipolar lines: something moves there.
-
-    Motion along the epipolar line (a car driving ahead) is not detected.
-    """
-    by_name, findings = {model.images[i].name: i for i in model.reg_image_ids()}, []
-    with pycolmap.Database.open(database) as opened:
-        for name, after in pairwise(names):
-            pair = by_name[name], by_name[after]
-            matches = np.asarray(opened.read_matches(*pair)) if opened.exists_matches(*pair) else np.zeros((0, 2))
-            if len(matches) < 30:
-                continue
-            share = len(moving_cells(model, pair, matches.astype(int))) / (CELLS[0] * CELLS[1])
-            if share >= LEAST_CELLS / (CELLS[0] * CELLS[1]):
-                says = f"{share:.0%} of the image's cells do not follow the camera's motion: mask it (--masks)"
-                findings.append(Finding("moving?", name, says, share))
-    return findings
-
-
-def moving_cells(model: pycolmap.Reconstruction, pair: tuple[int, int], matches: NDArray[np.int64]) -> list[int]:
-    """Cells of the first image where most of at least six matches are off their epipolar lines, alike."""
-    images = [model.images[i] for i in pair]
-    cameras = [model.cameras[image.camera_id] for image in images]
-    pixels = [np.array([p.xy for p in image.points2D])[matches[:, k]] for k, image in enumerate(images)]
-    rays = [np.c_[c.cam_from_img(p), np.ones(len(p))] for c, p in zip(cameras, pixels, strict=True)]
-    relative = images[1].cam_from_world() * images[0].cam_from_world().inverse()
-    lines = rays[0] @ pycolmap.essential_matrix_from_pose(relative).T
-    off = np.abs((lines * rays[1]).sum(-1)) / np.maximum(np.linalg.norm(lines[:, :2], axis=-1), 1e-12)
-    is_off = off * cameras[1].mean_focal_length() * SIDE / cameras[1].width > MOVED_PX
-    cell, flow, moved = cells(pixels[0], cameras[0]), pixels[1] - pixels[0], []
-    for number in np.unique(cell[is_off]):
-        inside = cell == number
-        if inside.sum() >= 6 and is_off[inside].mean() > 0.6:
-            some = flow[inside & is_off]
-            spread = np.median(np.abs(some - np.median(some, axis=0)), axis=0)
-            if spread.max() < 0.01 * cameras[0].width:  # wrong matches point everywhere; a moving object moves as one
-                moved.append(int(number))
-    return moved
 
 
 def doubtful_intrinsics(

@@ -102,10 +102,7 @@ def _candidates(task: Task) -> list[Candidate]:
     failed: PrepareError | None = None
     try:
         attempts = 1 if is_settled and not is_part else len(ATTEMPTS)
-        mapping = reconstruct(task, start, attempts)
-        tried = ", ".join(f"{name} {size}" for name, size in mapping.tried)
-        says = f"incremental, '{mapping.attempt}' settings ({tried})"
-        candidates.append(_judged("incremental", mapping.model, says, task))
+        candidates.append(_judged("incremental", *reconstruct(task, start, attempts), task))
     except PrepareError as error:
         failed = error
     nearly_all = NEARLY_ALL * len(task.offered)

@@ -12,7 +12,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
@@ -105,20 +105,8 @@ ATTEMPTS = (
 )
 
 
-@dataclass(frozen=True)
-class Mapping:
-    """Result of the incremental mapper."""
-
-    model: pycolmap.Reconstruction
-    folder: Path
-    """Folder of the model."""
-    attempt: str
-    tried: tuple[tuple[str, int], ...]
-    """(attempt, images in its largest model) in order."""
-
-
-def reconstruct(task: Task, database: Path, attempts: int = len(ATTEMPTS)) -> Mapping:
-    """Runs the attempts in order until one registers nearly all images; returns the best.
+def reconstruct(task: Task, database: Path, attempts: int = len(ATTEMPTS)) -> tuple[pycolmap.Reconstruction, str]:
+    """Runs the attempts in order until one registers nearly all images; returns the best model, and words about it.
 
     An attempt continues the best model of the earlier ones if that is sound and contains the fraction ``CARRIES`` of
     the images: often it stopped at one stretch with few matches, and the rest need not be computed again.
@@ -137,18 +125,17 @@ def reconstruct(task: Task, database: Path, attempts: int = len(ATTEMPTS)) -> Ma
             "No two images have enough matches in common: they do not overlap, or show too little texture. "
             "Take views with more overlap (two thirds and more)."
         )
-    best: Mapping | None = None
-    tried: list[tuple[str, int]] = []
+    best: tuple[pycolmap.Reconstruction, Path] | None = None
+    chosen, tried = "", []
     for attempt in ATTEMPTS[1 if task.is_sequence else 0 :][:attempts]:
-        carries = best is not None and not is_bent(best.model) and best.model.num_reg_images() >= CARRIES * total
-        start = best.folder if best is not None and carries else None
-        result = _run(task, attempt, database, start)
+        carries = best is not None and not is_bent(best[0]) and best[0].num_reg_images() >= CARRIES * total
+        result = _run(task, attempt, database, best[1] if best is not None and carries else None)
         size = result[0].num_reg_images() if result else 0
-        tried.append((attempt.name, size))
+        tried.append(f"{attempt.name} {size}")
         says = f", {result[0].compute_mean_reprojection_error():.2f} px" if result else ""
         say(f"Mapping, {attempt.name} ({attempt.says}): {size} of {total} images{says}.")
-        if result and (best is None or _quality(result[0]) > _quality(best.model)):
-            best = Mapping(*result, attempt.name, ())
+        if result and (best is None or _quality(result[0]) > _quality(best[0])):
+            best, chosen = result, attempt.name
         if result and size >= ENOUGH * total and not is_bent(result[0]):
             break
     if best is None:
@@ -156,7 +143,7 @@ def reconstruct(task: Task, database: Path, attempts: int = len(ATTEMPTS)) -> Ma
             f"No pair of images can start a reconstruction ({pairs} pairs have matches): the camera hardly moved "
             "(turning on the spot gives no depth), or the focal length is far off: check --focal and --camera."
         )
-    return replace(best, tried=tuple(tried))
+    return best[0], f"incremental, '{chosen}' settings ({', '.join(tried)})"
 
 
 def _quality(model: pycolmap.Reconstruction) -> tuple[bool, int, float]:

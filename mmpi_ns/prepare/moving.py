@@ -17,7 +17,6 @@ from mmpi_ns.capture.moving import find_moving, in_image
 from mmpi_ns.capture.moving_picture import draw_moving
 from mmpi_ns.capture.tracks import PosedImages
 from mmpi_ns.capture.views import straightened_color
-from mmpi_ns.prepare.alignment import camera_poses
 from mmpi_ns.prepare.cameras import read_intrinsics
 from mmpi_ns.prepare.images import Photo
 
@@ -47,20 +46,8 @@ def write_masks(
     """
     if threads > 0:
         torch.set_num_threads(threads)
-    names, poses = camera_poses(model)
-    kept = [i for i, name in enumerate(names) if name in set(train)]
-    by_name = {image.name: image for image in model.images.values()}
-    entries = [by_name[names[i]] for i in kept]
-    cameras = [model.cameras[entry.camera_id] for entry in entries]
-    lenses = [read_intrinsics(camera) for camera in cameras]
-    posed = PosedImages(
-        files=tuple(images / entry.name for entry in entries),
-        camera_to_worlds=poses[kept][:, :3] @ np.diag([1.0, -1.0, -1.0, 1.0]),
-        intrinsics=np.array([[lens.fx, lens.fy, lens.cx, lens.cy] for lens in lenses]),
-        sizes=np.array([[camera.width, camera.height] for camera in cameras], np.float64),
-        distortion=np.array([lens.distortion for lens in lenses]),
-        fisheye=np.array([lens.fisheye for lens in lenses]),
-    )
+    entries = [model.images[i] for i in sorted(model.reg_image_ids()) if model.images[i].name in set(train)]
+    posed = _posed_images(model, entries, images)
 
     def points_of(i: int) -> NDArray[np.float64]:
         seen = [model.points3D[p.point3D_id].xyz for p in entries[i].points2D if p.has_point3D()]
@@ -84,3 +71,17 @@ def write_masks(
     colors = ((entry.name, straightened_color(posed, i, shown.views[i])) for i, entry in enumerate(entries))
     draw_moving(picture, colors, shown.masks)
     return shares
+
+
+def _posed_images(model: pycolmap.Reconstruction, entries: Sequence[pycolmap.Image], folder: Path) -> PosedImages:
+    cameras = [model.cameras[entry.camera_id] for entry in entries]
+    lenses = [read_intrinsics(camera) for camera in cameras]
+    poses = np.stack([entry.cam_from_world().inverse().matrix() for entry in entries])
+    return PosedImages(
+        files=tuple(folder / entry.name for entry in entries),
+        camera_to_worlds=poses @ np.diag([1.0, -1.0, -1.0, 1.0]),
+        intrinsics=np.array([[lens.fx, lens.fy, lens.cx, lens.cy] for lens in lenses]),
+        sizes=np.array([[camera.width, camera.height] for camera in cameras], np.float64),
+        distortion=np.array([lens.distortion for lens in lenses]),
+        fisheye=np.array([lens.fisheye for lens in lenses]),
+    )

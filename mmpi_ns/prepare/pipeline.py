@@ -53,7 +53,7 @@ class Preparation:
         s = self.settings
         with self._timed("reading"):
             self._read_input()
-            self.known_poses = read_poses(s.poses, s.poses_format, s.poses_axes, self.photos) if s.poses else None
+            self.known_poses = read_poses(s.poses, s.poses_axes, self.photos) if s.poses else None
             if self.known_poses is None and len(self.photos) < LEAST_IMAGES:
                 raise PrepareError(
                     f"Poses cannot be found for {len(self.photos)} images alone, as no third confirms them: take more "
@@ -74,7 +74,7 @@ class Preparation:
             solution, self.focal, self.groups = self._solve(database)
         self._check(solution)
         with self._timed("writing"):
-            return self._write(solution, database)
+            return self._write(solution)
 
     @contextmanager
     def _timed(self, name: str) -> Iterator[None]:
@@ -154,7 +154,7 @@ class Preparation:
     def _solve(self, database: Path) -> tuple[Solution, tuple[float, float] | None, list[list[str]]]:
         """Poses and points; the interval of a refined focal length; connected groups of images without a pose."""
         s, names = self.settings, [p.name for p in self.photos]
-        source = [s.refine_poses, s.refine_intrinsics, s.refine_principal_point, s.lens, self.is_fixed]
+        source = [s.refine_poses, s.refine_intrinsics, s.lens, self.is_fixed]
         with self.stages.stage("model", source) as (folder, is_done):
             if not is_done:
                 groups: list[list[str]] = []
@@ -166,7 +166,7 @@ class Preparation:
                     solution = Solution(model, f"{self.known_poses.says}; {says}")
                 else:
                     lens, place = not self.is_fixed, s.camera is None or s.refine_intrinsics
-                    free = Free(lens, lens and s.lens == "auto", principal_point=place, always=s.refine_principal_point)
+                    free = Free(lens, lens and s.lens == "auto", principal_point=place)
                     is_sequence = self.matching.startswith("sequential")
                     solution = map_and_judge(
                         Task(database, self.image_folder, folder, names, free, s.threads, is_sequence, self.is_ordered)
@@ -204,7 +204,7 @@ class Preparation:
                 "To look at it all the same: --allow-doubtful."
             )
 
-    def _write(self, solution: Solution, database: Path) -> Verdict:
+    def _write(self, solution: Solution) -> Verdict:
         """Moves the model into the scene's frame and writes the scene; the verdict, with the findings of the checks."""
         s, model, verdict = self.settings, solution.model, solution.verdict
         frame = SceneFrame(pycolmap.Sim3d(), "that of the given poses", "that of the given poses")
@@ -214,16 +214,18 @@ class Preparation:
         names = set(camera_poses(model)[0])
         photos = [p for p in self.photos if p.name in names]
         split = self._split([p.name for p in photos])
-        findings = self._findings(model, photos, database)
+        findings = self._findings(model, photos)
         folder, masks, flat, built = self.image_folder, self.masks, self.work / "undistorted", self.work / "scene"
         shutil.rmtree(flat, ignore_errors=True)
         shutil.rmtree(built, ignore_errors=True)
-        moves, says = {}, "masks given" if masks else "not looked for"
-        if s.moving == "mask" and masks is None:
-            moves, says = self._mask_moving(model, photos, split)
-            masks = self.work / "moving" if moves else None
-        if s.moving != "warn":
-            findings = [f for f in findings if f.kind != "moving?" or (s.moving == "mask" and f.image not in moves)]
+        says = "masks given" if masks else "not looked for"
+        if s.moving != "keep" and masks is None:
+            moves, says = self._look_for_moving(model, photos, split)
+            if s.moving == "mask":
+                masks = self.work / "moving" if moves else None
+            else:
+                words = "of the image moves: mask it (--moving mask, or --masks)"
+                findings += [checks.Finding("moving?", name, f"{x:.0%} {words}", x) for name, x in moves.items()]
         grave = [f"{f.says[:1].upper()}{f.says[1:]}." for f in findings if f.is_grave]
         if grave and self.known_poses is None and verdict.grade == "right":
             verdict = Verdict("doubtful", tuple(grave))
@@ -261,10 +263,10 @@ class Preparation:
         sentences = [f"{len(lost)} images have no pose and are left out: {in_short(lost, 8)}"] if lost else []
         return sentences + [f"{len(group)} {apart}: {in_short(group, 8)}" for group in self.groups]
 
-    def _mask_moving(
+    def _look_for_moving(
         self, model: pycolmap.Reconstruction, photos: Sequence[Photo], split: export.Split
     ) -> tuple[dict[str, float], str]:
-        """Masks what moves; the masked share of each image that has any, and a sentence."""
+        """Masks of what moves; their share of each image that has any, and a sentence."""
         from mmpi_ns.prepare.moving import write_masks  # imports nerfstudio, which takes seconds
 
         picture = self.work / "scene" / "report" / "moving.jpg"
@@ -274,7 +276,8 @@ class Preparation:
         if not moves:
             return {}, "nothing is seen to move"
         share = sum(moves.values()) / len(split.train)
-        says = f"{share:.1%} of the training pixels, in {len(moves)} of {len(split.train)} images, are masked"
+        fate = "are masked" if self.settings.moving == "mask" else "move"
+        says = f"{share:.1%} of the training pixels, in {len(moves)} of {len(split.train)} images, {fate}"
         say(f"What moves: {says}; report/moving.jpg shows them.")
         return moves, says
 
@@ -286,9 +289,7 @@ class Preparation:
             return export.split_from(self.known_poses.split, names, f"{s.poses}")
         return export.split_by_count(names, s.test_every, s.train_every)
 
-    def _findings(
-        self, model: pycolmap.Reconstruction, photos: Sequence[Photo], database: Path
-    ) -> list[checks.Finding]:
+    def _findings(self, model: pycolmap.Reconstruction, photos: Sequence[Photo]) -> list[checks.Finding]:
         names, sharp = [p.name for p in photos], np.zeros(len(photos))
         findings = checks.doubtful_intrinsics(model, self.is_fixed, self.focal, self.settings.threads)
         with progress("Checking images", len(names)) as advance:
@@ -303,7 +304,7 @@ class Preparation:
             order, poses = camera_poses(model)
             offered = [p.name for p in self.photos]
             findings += checks.misplaced(order, [offered.index(n) for n in order], poses)
-        return findings + checks.moving(model, database, names)
+        return findings
 
     def _publish(
         self,

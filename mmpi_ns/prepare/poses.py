@@ -37,29 +37,27 @@ class KnownPoses:
     """A transforms.json's lists of files."""
 
 
-def read_poses(path: Path, form: str, axes: str, photos: Sequence[Photo]) -> KnownPoses:
+def read_poses(path: Path, axes: str, photos: Sequence[Photo]) -> KnownPoses:
     """Reads known poses and matches them with the images.
 
     Args:
         path: a file, or a folder of 4x4 text files.
-        form: kitti, tum, transforms, matrices, or auto.
         axes: opencv, opengl, or auto (opengl for transforms.json only).
         photos: the images.
 
     Raises:
         PrepareError: the file is not understood, or fits fewer than two images.
     """
-    if form == "auto" and (path.is_dir() or path.suffix.lower() == ".json"):
-        form = "matrices" if path.is_dir() else "transforms"
-    elif form == "auto":
-        _, fields = next(_lines(path), (0, []))
-        form = {8: "tum", 12: "kitti"}.get(len(fields), form)
-    readers = {"kitti": _read_kitti, "tum": _read_tum, "transforms": _read_transforms, "matrices": _read_matrices}
-    if form not in readers:
-        formats = "KITTI has 12 numbers a line, TUM 8 (time, position, quaternion x y z w)"
-        raise PrepareError(f"--poses {path} is not understood: {formats}.")
-    read = readers[form](path, photos)
-    opengl = axes == "opengl" or (axes == "auto" and form == "transforms")
+    is_transforms = path.suffix.lower() == ".json"
+    if path.is_dir() or is_transforms:
+        read = (_read_transforms if is_transforms else _read_matrices)(path, photos)
+    else:
+        numbers = len(next(_lines(path), (0, []))[1])
+        if numbers not in (8, 12):
+            formats = "KITTI has 12 numbers a line, TUM 8 (time, position, quaternion x y z w)"
+            raise PrepareError(f"--poses {path} is not understood: {formats}.")
+        read = (_read_tum if numbers == 8 else _read_kitti)(path, photos)
+    opengl = axes == "opengl" or (axes == "auto" and is_transforms)
     flip = np.diag([1.0, -1.0, -1.0, 1.0]) if opengl else np.eye(4)
     poses = {n: p @ flip for n, p in read.poses.items() if np.isfinite(p).all()}
     for name, pose in poses.items():
@@ -139,8 +137,6 @@ def _read_tum(path: Path, photos: Sequence[Photo]) -> KnownPoses:
 
 def _read_matrices(path: Path, photos: Sequence[Photo]) -> KnownPoses:
     """4x4 matrices: one text file for each image, by name, else in order."""
-    if not path.is_dir():
-        raise PrepareError(f"--poses {path}: 4x4 matrices are read from a folder with one text file for each image.")
     files = sorted(
         (p for p in path.iterdir() if p.suffix.lower() in (".txt", ".mat", "")), key=lambda p: natural_key(p.name)
     )
@@ -171,7 +167,6 @@ def _pose_stem(path: Path) -> str:
 
 def _read_transforms(path: Path, photos: Sequence[Photo]) -> KnownPoses:
     """Poses of a transforms.json by file name, with its intrinsics and its lists of train and test files, if any."""
-    path = path / "transforms.json" if path.is_dir() else path
     try:
         meta = json.loads(path.read_text(encoding="utf-8"))
         frames: list[dict[str, Any]] = meta["frames"]

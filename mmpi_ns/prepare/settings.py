@@ -33,8 +33,6 @@ class Settings:
     neither."""
     poses: Path | None = None
     """Known poses: a KITTI or TUM file, a transforms.json, or a folder of 4x4 text files."""
-    poses_format: Literal["auto", "kitti", "tum", "transforms", "matrices"] = "auto"
-    """Format of --poses."""
     poses_axes: Literal["auto", "opencv", "opengl"] = "auto"
     """Camera axes of --poses (camera to world): auto is opengl for transforms.json and opencv for the others."""
     refine_poses: bool = False
@@ -49,8 +47,6 @@ class Settings:
     """auto: images with the same size, EXIF body and lens share a camera."""
     refine_intrinsics: bool = False
     """Refine given intrinsics."""
-    refine_principal_point: bool = False
-    """Refine the principal point as well, at the end; otherwise it stays at the centre of the image."""
     undistort: bool = False
     """Undistort the images instead of writing the distortion to transforms.json."""
     matching: Matching = "auto"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -24,16 +23,6 @@ MOST_MOTION = 0.15
 """Motion between chosen frames beyond which SfM gets difficult."""
 
 
-@dataclass(frozen=True)
-class Measured:
-    """Results of the first pass over a video, for each frame."""
-
-    motion: NDArray[np.float64]
-    """Median motion since the frame before, as a share of the width. [N]"""
-    sharp: NDArray[np.float64]
-    """Sharpness. [N]"""
-
-
 def select_frames(video: Path, target: Path, max_frames: int, step: float) -> list[Photo]:
     """Writes the chosen frames of a video to ``target/images``.
 
@@ -41,13 +30,12 @@ def select_frames(video: Path, target: Path, max_frames: int, step: float) -> li
         PrepareError: the video cannot be read, or shows no motion.
     """
     (target / "images").mkdir(parents=True, exist_ok=True)
-    log = target / "motion.json"
+    log = target / "measured.json"
     if not log.exists():
-        measured = measure(video)
-        write_text(log, json.dumps({"motion": measured.motion.tolist(), "sharp": measured.sharp.tolist()}))
-    measured = Measured(**{name: np.array(row) for name, row in json.loads(log.read_text(encoding="utf-8")).items()})
-    chosen, used = choose_frames(measured, max_frames, step)
-    frames = len(measured.motion)
+        write_text(log, json.dumps(measure(video)))
+    motion, sharp = np.array(json.loads(log.read_text(encoding="utf-8")))
+    chosen, used = choose_frames(motion, sharp, max_frames, step)
+    frames = len(motion)
     if len(chosen) < 2:
         raise PrepareError(f"{video} shows no motion in {frames} frames: there is no second view.")
     say(f"{len(chosen)} of {frames} frames taken: the sharpest for every {used:.1%} of the width of motion.")
@@ -78,8 +66,8 @@ def select_frames(video: Path, target: Path, max_frames: int, step: float) -> li
     return photos
 
 
-def measure(video: Path) -> Measured:
-    """First pass: motion and sharpness of every frame; holds two small frames at a time.
+def measure(video: Path) -> tuple[list[float], list[float]]:
+    """First pass, with two small frames in memory: motion of each since the one before over the width, and sharpness.
 
     Raises:
         PrepareError: the video cannot be read.
@@ -104,7 +92,7 @@ def measure(video: Path) -> Measured:
         raise PrepareError(f"{video} holds no frame that can be read: it is damaged, or its codec is unknown here.")
     if total and len(motion) < 0.9 * total:
         say(f"{video.name} breaks off after {len(motion)} of {total} frames: the rest is left out.", "yellow")
-    return Measured(np.array(motion), np.array(sharp))
+    return motion, sharp
 
 
 def _open(video: Path) -> tuple[cv2.VideoCapture, int]:
@@ -127,20 +115,23 @@ def median_motion(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> float:
     return float(np.median(np.linalg.norm(moved - corners, axis=-1).ravel()[good])) / before.shape[1]
 
 
-def choose_frames(measured: Measured, max_frames: int, step: float) -> tuple[list[int], float]:
+def choose_frames(
+    motion: NDArray[np.float64], sharp: NDArray[np.float64], max_frames: int, step: float
+) -> tuple[list[int], float]:
     """The sharpest frame of every stretch of equal motion.
 
     A camera that stands still adds no frame. The first and last stretch count like the others.
 
     Args:
-        measured: motion and sharpness of every frame.
+        motion: since the frame before, as a share of the width. [N]
+        sharp: sharpness of every frame. [N]
         max_frames: maximum number of frames; the step is increased if necessary.
         step: motion of a stretch, as a share of the width.
 
     Returns:
         Indices of the frames, and the step used.
     """
-    path = np.cumsum(measured.motion)
+    path = np.cumsum(motion)
     used = max(step, float(path[-1]) / max(max_frames - 1, 1) * (1 + 1e-9))
     stretch = np.floor(path / used + 0.5).astype(int)
     chosen = []
@@ -148,5 +139,5 @@ def choose_frames(measured: Measured, max_frames: int, step: float) -> tuple[lis
         frames = np.nonzero(stretch == number)[0]
         # near the middle of its stretch unless another is clearly sharper, to keep the spacing even
         off = np.abs(path[frames] / used - number)
-        chosen.append(int(frames[np.argmax(measured.sharp[frames] * (1 - 0.5 * off))]))
+        chosen.append(int(frames[np.argmax(sharp[frames] * (1 - 0.5 * off))]))
     return chosen, used

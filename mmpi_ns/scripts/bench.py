@@ -11,7 +11,7 @@ COMMANDS = {
     "score": ("mmpi_ns.bench.score", "PSNR, SSIM and LPIPS of test images that any program has rendered."),
     "gpu": (
         "mmpi_ns.bench.gpu",
-        "Every kernel of this machine's GPU against float64, and the time of a step and a frame.",
+        "Every kernel of this machine's GPU against plain torch, and the time of a step and a frame.",
     ),
 }
 """Module that holds the command, as a class of its name, and what it does. Only the requested one is imported."""

@@ -15,7 +15,6 @@ from mmpi_ns.placement.rule import PlacementConfig
 from mmpi_ns.scripts.command import say_version
 from mmpi_ns.utils.errors import InputError, quoted
 from mmpi_ns.utils.host import enter_command
-from mmpi_ns.utils.values import Number, check_options
 
 if TYPE_CHECKING:
     from mmpi_ns.placement.observations import Observations
@@ -42,8 +41,6 @@ class PlanCommand:
     """Format of the scene."""
     plan_file: Path | None = None
     """Evaluate this plan instead of making a new one."""
-    training_rays: int | None = None
-    """Pixel rays of the training for which texels are sized; 0: no limit. None: those of the method's own steps."""
     placement: PlacementConfig = field(default_factory=PlacementConfig)
     """The rule's settings."""
 
@@ -55,8 +52,6 @@ class PlanCommand:
         from mmpi_ns.utils.files import write_errors
 
         check_placement(self.placement, "--placement.")
-        if self.training_rays is not None:
-            check_options(self, {"training_rays": Number(0, whole=True)}, "--")
         check_there(self.scene)
         with write_errors(self.output, "--output"):
             self.output.mkdir(parents=True, exist_ok=True)
@@ -72,11 +67,8 @@ class PlanCommand:
         picture.unlink(missing_ok=True)
         observations, moves = load_observations(self.scene, self.downscale_factor, self.parser, picture)
         if windows is None:
-            rays = self.training_rays
-            if rays is None:
-                steps = steps_for(self.method, most_pixels(observations, self.placement))
-                rays = steps * DEFAULTS[self.method].rays
-            windows = place_windows(observations, self.placement, rays or None)
+            steps = steps_for(self.method, most_pixels(observations, self.placement))
+            windows = place_windows(observations, self.placement, steps * DEFAULTS[self.method].rays)
         text = self._explain(windows, observations)
         if moves:
             text += f"\n\n{moves}{': moving.jpg shows it' if picture.is_file() else ''}."
@@ -104,7 +96,7 @@ class PlanCommand:
             draw_errors(self.output / f"errors{suffix}.png", window.plan, report)
             title = f"## Window {i}: {len(part.centers)} training cameras\n\n" if len(windows) > 1 else ""
             rule = window.plan.origin_of_plan
-            parts.append(f"{title}{table(report)}\n\n{rule[0].upper()}{rule[1:]}.")
+            parts.append(f"{title}{table(window.plan, part, report)}\n\n{rule[0].upper()}{rule[1:]}.")
         if len(windows) > 1:
             draw_windows(self.output / "plan.png", windows, observations)
             total = sum(plan.texels for plan in windows.plans) / 1e6

@@ -316,11 +316,12 @@ class MMPITrainer(Trainer):
             return  # stopped before the first step: there is nothing to save
         self.checkpoint_dir.mkdir(parents=True, exist_ok=True)
         path = self.checkpoint_dir / f"step-{step:09d}.ckpt"
-        goes_on = step + 1 < self._total_steps
+        # After the last step nobody needs the moments, which are half of all.
+        unused: dict[str, Any] = {} if step + 1 < self._total_steps else {"state": {}}
         state = {
             "step": step,
             "pipeline": written_short(self.pipeline.state_dict()),
-            "optimizers": {k: _state_of(v, goes_on) for k, v in self.optimizers.optimizers.items()},
+            "optimizers": {k: v.state_dict() | unused for k, v in self.optimizers.optimizers.items()},
             "schedulers": {k: v.state_dict() for k, v in self.optimizers.schedulers.items()},
             "scalers": self.grad_scaler.state_dict(),
             "rng": {"torch": torch.get_rng_state()},
@@ -371,12 +372,6 @@ def _write_plan(path: Path, plan: WindowedPlan) -> None:
         )
     write_atomically(path, lambda unfinished: unfinished.write_text(text, encoding="utf-8"))
     digest_file.write_text(hashlib.sha256(text.encode()).hexdigest(), encoding="ascii")
-
-
-def _state_of(optimizer: torch.optim.Optimizer, goes_on: bool) -> dict[str, Any]:
-    """What a checkpoint holds of an optimiser: after the last step nobody needs its moments, which are half of all."""
-    state = optimizer.state_dict()
-    return state if goes_on else state | {"state": {}}
 
 
 def _end(number: int, sentence: str = "Stopped before the first step: there is nothing to go on from.") -> NoReturn:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 import re
 import sys
-from contextlib import nullcontext
 from types import SimpleNamespace
 
 import gpu
 import gpu_parts as parts
 import gpu_session
+import kernel_checks as checks
 import pytest
 import torch
 from apart import run_apart
@@ -18,7 +18,6 @@ from gpu import Gpu
 from methods import METHODS
 from triton_processes import HERE, needs_triton, python
 
-from mmpi_ns.bench import checks
 from mmpi_ns.bench import gpu as command
 from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.plan_shapes import EVERY
@@ -98,19 +97,6 @@ def test_a_quick_look_names_what_falls_back(monkeypatch, capsys, tmp_path):
         said = capsys.readouterr().out
         assert found["well"] == (not faults) and wanted in said.splitlines()[-1]
         assert not faults or f"march: plain torch, since {reason}" in said
-
-
-def test_comparisons_that_fail_are_said_and_end_with_an_error(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    monkeypatch.setattr(command, "street", lambda folder, *_: folder)
-    monkeypatch.setattr(command, "run_quick", lambda *_: {"well": True})
-    for failed in (0, 1):
-        check = {"name": "march", "error": 1.0, "bound": 0.5, "ok": not failed}
-        monkeypatch.setattr(command, "run_checks", lambda *_, f=failed, c=check, **how: {"checks": [c], "failed": f})
-        with pytest.raises(ValueError, match="1 comparisons") if failed else nullcontext():
-            command.Gpu(folder=tmp_path).main()
-        assert f"march: {'WRONG' if failed else 'ok'}" in capsys.readouterr().out
-        assert json.loads((tmp_path / "gpu.json").read_text())["failed"] == failed
 
 
 def test_mistakes_are_named(tmp_path):

@@ -108,7 +108,7 @@ def test_kernels_compile_for_older_gpus(monkeypatch, architecture):
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 def test_kernels_on_a_gpu():
-    from mmpi_ns.bench.checks import run_checks
+    from kernel_checks import run_checks
 
     found = run_checks("cuda", rehearse=False)
     assert found["failed"] == 0 and len(found["checks"]) > 30, [c for c in found["checks"] if not c["ok"]]

@@ -10,7 +10,7 @@ import pytest
 from PIL import ExifTags, Image
 from PIL.TiffImagePlugin import IFDRational
 
-from mmpi_ns.capture.exif import Exposure, exposure_of
+from mmpi_ns.capture.exif import light_of
 from mmpi_ns.prepare import checks, export, features, pairs
 from mmpi_ns.prepare.alignment import up_from_cameras
 from mmpi_ns.prepare.cameras import make_cameras, parse_camera, read_intrinsics, share
@@ -19,7 +19,7 @@ from mmpi_ns.prepare.pipeline import prepare
 from mmpi_ns.prepare.report import exposure_in_words
 from mmpi_ns.prepare.settings import Settings
 from mmpi_ns.prepare.stages import PrepareError
-from mmpi_ns.prepare.video import Measured, choose_frames, measure, select_frames
+from mmpi_ns.prepare.video import choose_frames, measure, select_frames
 
 
 def save(path, size=(40, 30), value=100, **more):
@@ -73,9 +73,7 @@ def test_every_written_image_keeps_its_exposure(suffix, turned, tmp_path):
     for folder in ("images", "images_2"):
         files = [tmp_path / "scene" / folder / photo.name for photo in photos]
         for n, file in enumerate(files):
-            exposure = exposure_of(file)
-            assert exposure is not None and exposure.time == pytest.approx(1 / (250 + n))
-            assert exposure.sensitivity == 80 and exposure.aperture == pytest.approx(1.8)
+            assert light_of(file) == pytest.approx(80 / (250 + n) / 1.8**2)
             with Image.open(file) as image:
                 assert image.getexif().get(ExifTags.Base.Orientation, 1) == 1
                 assert image.getexif()[ExifTags.Base.Model] == "Phone"
@@ -83,14 +81,14 @@ def test_every_written_image_keeps_its_exposure(suffix, turned, tmp_path):
 
 
 def test_exif_that_says_nothing_gives_no_exposure(tmp_path):
-    assert exposure_of(save(tmp_path / "bare.jpg")) is None
+    assert np.isnan(light_of(save(tmp_path / "bare.jpg")))
     for n, time in enumerate((IFDRational(0, 1), IFDRational(0, 0))):
         exif = Image.Exif()
         exif[ExifTags.IFD.Exif] = {ExifTags.Base.ExposureTime: time, ExifTags.Base.FNumber: IFDRational(2, 1)}
-        assert exposure_of(save(tmp_path / f"{n}.jpg", exif=exif)) is None
+        assert np.isnan(light_of(save(tmp_path / f"{n}.jpg", exif=exif)))
     exif = Image.Exif()
     exif[ExifTags.IFD.Exif] = {ExifTags.Base.ExposureTime: IFDRational(1, 8)}
-    assert exposure_of(save(tmp_path / "time.jpg", exif=exif)) == Exposure(0.125, None, None)
+    assert light_of(save(tmp_path / "time.jpg", exif=exif)) == 12.5
     assert exposure_in_words([tmp_path / "bare.jpg"]) == "not known: no EXIF"
 
 
@@ -123,8 +121,7 @@ def test_undistorted_images_keep_exposure_and_alpha_and_masks_stay_black_and_whi
         with Image.open(tmp_path / "flat/images" / photo.name) as image:
             assert image.size == (photo.width, photo.height)
             colors = np.asarray(image.convert("RGBA")).astype(int)
-        exposure = exposure_of(tmp_path / "flat/images" / photo.name)
-        assert exposure is not None and exposure.time == pytest.approx(1 / 60, abs=1e-6)
+        assert light_of(tmp_path / "flat/images" / photo.name) == pytest.approx(100 / 60, abs=1e-4)
         mask = np.asarray(Image.open(tmp_path / f"flat/masks/{photo.name}.png"))
         row = photo.height // 2
         for values in (mask[row], colors[row, :, 0], *([colors[row, :, 3]] if photo.name == "b.png" else [])):
@@ -283,8 +280,7 @@ def test_frames_are_chosen_by_motion_and_sharpness(drive, tmp_path):
 
 
 def test_no_more_frames_than_asked():
-    measured = Measured(np.full(500, 0.05), np.ones(500))
-    chosen, used = choose_frames(measured, 40, 0.01)
+    chosen, used = choose_frames(np.full(500, 0.05), np.ones(500), 40, 0.01)
     assert len(chosen) <= 40 and used > 0.5 and chosen == sorted(set(chosen))
 
 

@@ -53,8 +53,8 @@ def write_transforms(path, poses, **more):
     return path
 
 
-def read(path, form="auto", photos=PHOTOS):
-    known = read_poses(path, form, "auto", photos)
+def read(path, photos=PHOTOS):
+    known = read_poses(path, "auto", photos)
     return known, np.array([known.poses[p.name] for p in photos if p.name in known.poses])
 
 

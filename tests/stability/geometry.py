@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from hand_made import samples_to_ndc
 from plane_crossings import AHEAD, crossings
+from random_scenes import bundle_of
 from stability import exact
 from stability.cases import (
     UNIT,
@@ -28,7 +29,6 @@ from stability.cases import (
 )
 from stability.exact import Array
 
-from mmpi_ns.bench.scenes import bundle_of
 from mmpi_ns.scene.geometry import Cube, Frames, cube_hits, plane_hits
 from mmpi_ns.scene.plan import CubePlan, MPIPlan
 

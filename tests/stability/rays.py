@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 from nerfstudio.cameras.rays import RayBundle
+from random_scenes import bundle_of, of_slots, render
 from stability.cases import (
     UNIT,
     Case,
@@ -30,7 +31,6 @@ from stability.cases import (
 from stability.exact import Array, Jitter
 from stability.exact_ray import TABLES, ExactField, ExactRay, Gradients
 
-from mmpi_ns.bench.scenes import bundle_of, of_slots, render
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.ops.interpolate import Table
 from mmpi_ns.rendering.rendered import RenderedRays

@@ -129,9 +129,7 @@ def test_options_that_say_nothing_together_are_refused(whole_scene, tmp_path, ch
     assert all(word in said for word in words), said
 
 
-@pytest.mark.parametrize(
-    ("name", "value"), [("--placement.texel-pixels", "nan"), ("--placement.max-mpis", "0"), ("--training-rays", "-1")]
-)
+@pytest.mark.parametrize(("name", "value"), [("--placement.texel-pixels", "nan"), ("--placement.max-mpis", "0")])
 def test_mmpi_plan_refuses_the_same_options(whole_scene, tmp_path, name, value):
     ended = run("mmpi-plan", whole_scene, "--output", tmp_path / "o", name, value)
     assert name in ended.sentence

@@ -13,35 +13,15 @@ from mmpi_ns.scene.plan import CubePlan, MPIPlan, ScenePlan
 
 
 @dataclass(frozen=True)
-class HeadReport:
-    """One head of a plan."""
-
-    name: str
-    facing: str
-    """Relative to the cameras' mean direction and gravity: 'front', 'left', 'front-right 35', ..."""
-    origin: tuple[float, ...]
-    near: float
-    """Depth of the first plane; half the side of a cube."""
-    far: float
-    """Depth of the last plane; not a number for a cube."""
-    extent: tuple[float, ...]
-    """Tangents (u0, u1, v0, v1); the box of a cube."""
-    size: tuple[int, ...]
-    """Planes, rows, columns."""
-    texels: int
-    share: float
-    """Of the observations, those that this head serves best."""
-    error_with: float
-    """Expected error of those, median in pixels."""
-    error_without: float
-    """The same if this head were left out."""
-
-
-@dataclass(frozen=True)
 class PlanReport:
-    """A whole plan."""
+    """Shares and expected errors of the K heads of a plan (MPIs, then the cube), over what placement weighs."""
 
-    heads: tuple[HeadReport, ...]
+    shares: Array
+    """[K] of the observations, those that a head serves best."""
+    error_with: Array
+    """[K] expected error of those, median in pixels."""
+    error_without: Array
+    """[K] the same if the head were left out."""
     unserved: float
     """Share of the observations that nothing holds."""
     overlap: float
@@ -57,62 +37,46 @@ class PlanReport:
 def explain(plan: ScenePlan, observations: Observations, visible: VisiblePoints) -> PlanReport:
     """Shares and expected errors of every head, over the observations that placement weighs."""
     errors = pixel_errors(plan, observations, visible.cameras, visible.points)
-    combined = np.minimum(errors.combined, WORST)
-    best, weights = errors.best, visible.weights
-    held = np.isfinite(errors.combined)
-    heads: list[MPIPlan | CubePlan] = [*plan.mpis, *([plan.cube] if plan.cube else [])]
-    reports = []
-    for k, head in enumerate(heads):
-        served = (best == k) & held.any(-1)
+    combined, weights = np.minimum(errors.combined, WORST), visible.weights / visible.weights.sum()
+    held, figures = np.isfinite(errors.combined), np.full((3, plan.num_heads), np.nan)
+    for k in range(plan.num_heads):
+        served = (errors.best == k) & held.any(-1)
         rest = np.delete(combined[served], k, axis=1).min(-1, initial=WORST)
-        share = float(weights[served].sum() / weights.sum())
-        figures = head.texels, share, _median(combined[served, k]), _median(rest)
-        if isinstance(head, MPIPlan):
-            facing = describe_facing(np.asarray(head.axes[2]), observations.mean_axes)
-            frame = facing, head.origin, head.near, head.far, head.extent, (head.planes, head.height, head.width)
-        else:
-            lower, upper = np.asarray(head.lower), np.asarray(head.upper)
-            half, box = float((upper - lower).max() / 2), (*head.lower, *head.upper)
-            frame = "all round", tuple((lower + upper) / 2), half, float("nan"), box, head.shape
-        reports.append(HeadReport(plan.names[k], *frame, *figures))
-    unserved = float(weights[~held.any(-1)].sum() / weights.sum())
-    return PlanReport(tuple(reports), unserved, float(held.sum(-1) @ weights / weights.sum()), errors)
+        figures[0, k] = weights[served].sum()
+        if served.any():
+            figures[1:, k] = np.median(combined[served, k]), np.median(rest)
+    return PlanReport(*figures, float(weights[~held.any(-1)].sum()), float(held.sum(-1) @ weights), errors)
 
 
-def table(report: PlanReport) -> str:
+def table(plan: ScenePlan, observations: Observations, report: PlanReport) -> str:
     """The report as a Markdown table and a line about the whole."""
     lines = [
         "| MPI | faces | origin | depths | tangents | planes x rows x columns | M texels "
         "| serves | error px | without |",
         "|---|---|---|---|---|---|---|---|---|---|",
     ]
-    for h in report.heads:
-        cells = [
-            h.name,
-            h.facing,
-            ", ".join(f"{x:.3g}" for x in h.origin),
-            f"{h.near:.3g}" if np.isnan(h.far) else f"{h.near:.3g} to {h.far:.3g}",
-            ", ".join(f"{x:.2f}" for x in h.extent),
-            " x ".join(str(n) for n in h.size),
-            f"{h.texels / 1e6:.2f}",
-            f"{100 * h.share:.0f} %",
-            f"{h.error_with:.2f}",
-            f"{h.error_without:.2f}",
-        ]
-        lines.append("| " + " | ".join(cells) + " |")
-    total = sum(h.texels for h in report.heads) / 1e6
+    heads: list[MPIPlan | CubePlan] = [*plan.mpis, *([plan.cube] if plan.cube else [])]
+    for k, head in enumerate(heads):
+        if isinstance(head, MPIPlan):
+            facing = describe_facing(np.asarray(head.axes[2]), observations.mean_axes)
+            depths, size = f"{head.near:.3g} to {head.far:.3g}", (head.planes, head.height, head.width)
+            origin, extent = head.origin, head.extent
+        else:
+            lower, upper = np.asarray(head.lower), np.asarray(head.upper)
+            facing, depths, size = "all round", f"{(upper - lower).max() / 2:.3g}", head.shape
+            origin, extent = (lower + upper) / 2, (*head.lower, *head.upper)
+        numbers = ", ".join(f"{x:.3g}" for x in origin), depths, ", ".join(f"{x:.2f}" for x in extent)
+        errors = f"{report.error_with[k]:.2f}", f"{report.error_without[k]:.2f}"
+        figures = " x ".join(map(str, size)), f"{head.texels / 1e6:.2f}", f"{100 * report.shares[k]:.0f} %", *errors
+        lines.append("| " + " | ".join((plan.names[k], facing, *numbers, *figures)) + " |")
     median, worst = np.percentile(report.served_errors, [50, 90])
     lines += [
         "",
-        f"{total:.2f} M texels in all. Expected error {median:.2f} px in the median, {worst:.2f} px at nine tenths; "
-        f"{100 * report.unserved:.1f} % of what the cameras saw lies in no MPI. "
+        f"{plan.texels / 1e6:.2f} M texels in all. Expected error {median:.2f} px in the median, {worst:.2f} px at "
+        f"nine tenths; {100 * report.unserved:.1f} % of what the cameras saw lies in no MPI. "
         f"A point lies in {report.overlap:.1f} of them on average.",
     ]
     return "\n".join(lines)
-
-
-def _median(values: Array) -> float:
-    return float(np.median(values)) if len(values) else float("nan")
 
 
 def describe_facing(direction: Array, base: Array) -> str:

@@ -107,16 +107,7 @@ def draw_errors(path: Path, plan: ScenePlan, report: PlanReport) -> None:
 
 
 def _draw_mpi(axes: Axes, mpi: MPIPlan, picture: Array, middle: Array, reach: float, color: str) -> None:
-    """The outline of a frustum and some of its planes, seen along the picture's third axis.
-
-    Args:
-        axes: where to draw.
-        mpi: the MPI.
-        picture: rows are the picture's two axes in world coordinates. [2, 3]
-        middle: world point at the picture's origin. [3]
-        reach: how far to draw, scene units.
-        color: of its lines.
-    """
+    """Outline of a frustum and some planes up to ``reach``, in a picture of two world axes (rows) about ``middle``."""
     u0, u1, v0, v1 = mpi.extent
     origin = (np.asarray(mpi.origin) - middle) @ picture.T
     shown = np.linspace(0, 1, min(SHOWN_PLANES, mpi.planes), endpoint=False)

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 import torch
+from random_scenes import CUBE, Scene, gradients_of, of_slots, random_scene, samples_of
 from torch import Tensor
 
-from mmpi_ns.bench.scenes import CUBE, Scene, gradients_of, of_slots, random_scene, samples_of
 from mmpi_ns.ops import dispatch, interpolate, variation
 from mmpi_ns.ops.composite import composite_weights
 from mmpi_ns.scene.plan import CubePlan
