@@ -31,14 +31,8 @@ PAPER_DATA = {
     "correct_exposure": False,
 }
 """The paper trains on the colours of pixels alone; no point cloud is read either."""
-PAPER_SCHEDULE = ScheduleConfig(
-    decay_from=0.0,
-    decay_decades=1.5,
-    growth_shares=(1 / 15, 2 / 15, 3 / 15, 4 / 15),
-    release_weight=0.0,
-)
-"""The paper's rates fall from the start, as DVGO's, and no bricks are released.
-Surfaces form out of fog, which takes longer than from known depths."""
+PAPER_SCHEDULE = ScheduleConfig(decay_from=0.0, decay_decades=1.5, release_weight=0.0)
+"""The paper's rates fall from the start, as DVGO's, and no bricks are released."""
 POSE_RATE = 1e-4
 """Learning rate of refined poses, radians and scene units: a tenth of nerfacto's (docs/log/experiments.md)."""
 

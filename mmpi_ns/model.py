@@ -18,7 +18,7 @@ from nerfstudio.viewer.viewer_elements import ViewerDropdown
 from torch import Tensor
 from torch.nn import Parameter
 
-from mmpi_ns.capture.datamanager import GAINS, OBSERVATIONS, RAYS_PER_STEP, TRAINING_VIEWS
+from mmpi_ns.capture.datamanager import DEPTHS_KNOWN, GAINS, OBSERVATIONS, RAYS_PER_STEP, TRAINING_VIEWS
 from mmpi_ns.capture.rays import PinholeRays
 from mmpi_ns.field.mmpi_field import ColourConfig, MMPIField
 from mmpi_ns.field.samples import metadata_of
@@ -123,7 +123,9 @@ class MMPIModel(Model):
         windows = self._fitting_plan(views) if self.trains else self._plan(config.placement)
         phases = replace(config.schedule, training="joint" if self._is_joint(windows) else "two-phase")
         count = len(windows)
-        self.progress = Progress(windows, make_schedule(phases, max(1, config.total_steps), count))
+        self.progress = Progress(
+            windows, make_schedule(phases, max(1, config.total_steps), count, metadata.get(DEPTHS_KNOWN, False))
+        )
         self._expect_shapes()
         dispatch.choose(config.ops)
         self.field = self._new_field(views_of(windows.windows[0], views))

@@ -40,6 +40,10 @@ OBSERVATIONS = "mmpi_observations"
 """Key of the scene's Observations in the data set's metadata, for the model."""
 GAINS = "mmpi_gains"
 """Key of the exposures of the training images (``photometry.Gains``); missing where they are equal."""
+DEPTHS_KNOWN = "mmpi_depths_known"
+"""Metadata: whether so many training pixels have a known depth that training starts with surfaces."""
+MANY_DEPTHS = 0.4
+"""Share of the training pixels: two thirds in most captures, a fifth in one whose images hardly overlap."""
 RAYS_PER_STEP = "mmpi_rays_per_step"
 """Key of the pixel rays of a training step."""
 TRAINING_VIEWS = "mmpi_training_views"
@@ -126,6 +130,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
                 dense=self.config.dense_depth, sensor=self.config.depth_images,
             )  # fmt: skip
             self.known_depth, seen = depths, self.observations
+            dataset.metadata[DEPTHS_KNOWN] = depths is not None and depths.share >= MANY_DEPTHS
             dataset.metadata[OBSERVATIONS] = seen if depths is None else of_cells(seen, depths, dataset)
             has_keypoints = self.config.keypoint_rays > 0 and len(self.observations.seen_at) > 0
             if not has_keypoints and (depths is None or depths.share == 0):

@@ -17,6 +17,8 @@ PhaseName = Literal["individual", "blend", "finetune", "joint"]
 ParameterKind = Literal["density", "features", "colour", "reliability", "camera_opt"]
 Training = Literal["two-phase", "joint"]
 
+SOONER = 4
+"""Texels double so many times as early where depths are known, and surfaces need not form."""
 TRAINS: dict[str, frozenset[str]] = {
     "individual": frozenset({"density", "features", "colour", "camera_opt"}),
     "joint": frozenset({"density", "features", "colour", "camera_opt"}),
@@ -45,9 +47,9 @@ class ScheduleConfig:
     """Decades that learning rates fall over a phase (paper: x0.1 per 20k of 30k steps = 1.5),"""
     decay_from: float = 0.5
     """after being constant for this fraction of it."""
-    growth_shares: tuple[float, ...] = (1 / 60, 2 / 60, 3 / 60, 4 / 60)
-    """When the texels of a plane double, as shares of the first phase."""
-    release_shares: tuple[float, ...] = (3 / 60, 4 / 60, 0.15, 0.3, 0.5, 0.75, 0.95)
+    growth_shares: tuple[float, ...] = (1 / 15, 2 / 15, 3 / 15, 4 / 15)
+    """When the texels of a plane double, as shares of the first phase; four times as early if depths are known."""
+    release_shares: tuple[float, ...] = (0.15, 3 / 15, 4 / 15, 0.3, 0.5, 0.75, 0.95)
     """When empty bricks (8 x 8 texels of a plane) are released, as fractions of the first phase: after growth, or just
     before the texels double."""
     release_weight: float = 5e-3
@@ -166,13 +168,14 @@ class Schedule:
         return Schedule(phases=phases, **lists, **data)
 
 
-def make_schedule(config: ScheduleConfig, total_steps: int, windows: int = 1) -> Schedule:
+def make_schedule(config: ScheduleConfig, total_steps: int, windows: int = 1, depths_known: bool = False) -> Schedule:
     """The schedule of a run of ``total_steps`` steps a window.
 
     Args:
         config: phases, growth, rates and release of bricks; nothing is released before surfaces have formed.
         total_steps: all steps of a window.
         windows: windows of a long capture, trained one after the other.
+        depths_known: training starts with surfaces (``initial.py``).
 
     Raises:
         InputError: no step is left for the first phase, growth goes backwards, or rates never fall.
@@ -182,10 +185,13 @@ def make_schedule(config: ScheduleConfig, total_steps: int, windows: int = 1) ->
     check_schedule(config)
     phases = _phases(config, total_steps)
     first = phases[0].end
-    growth = tuple(max(1, round(s * first)) for s in config.growth_shares)
+    doublings = {s: s / SOONER if depths_known else s for s in config.growth_shares}
+    growth = tuple(max(1, round(s * first)) for s in doublings.values())
     rates = float(config.decay_decades), float(config.decay_from), float(config.finetune_rate)
     schedule = Schedule(phases, growth, *rates, windows)
-    release = sorted({round(s * first) for s in config.release_shares}) if config.release_weight > 0 else []
+    release = (
+        sorted({round(doublings.get(s, s) * first) for s in config.release_shares}) if config.release_weight > 0 else []
+    )
     # A release at a growth step comes before it, so that less grows.
     return replace(schedule, release=tuple(s for s in release if s > schedule._sharp_from or s in growth))
 

@@ -97,13 +97,13 @@ def test_paper_rates_fall_tenfold_in_20k_of_30k_steps():
 
 def test_texels_double_at_each_growth_step():
     schedule = schedule_of("joint", 30_000)
-    assert schedule.growth == (1_000, 2_000, 3_000, 4_000)
-    steps = (0, 999, 1_000, 1_999, 2_000, 3_000, 3_999, 4_000, 30_000)
+    assert schedule.growth == (2_000, 4_000, 6_000, 8_000)
+    steps = (0, 1_999, 2_000, 3_999, 4_000, 6_000, 7_999, 8_000, 30_000)
     assert [schedule.texel_factor(s) for s in steps] == [1 / 16, 1 / 16, 1 / 8, 1 / 8, 1 / 4, 1 / 2, 1 / 2, 1, 1]
 
 
 def test_growth_follows_the_first_phase_and_not_the_whole_run():
-    assert two_phase().growth == (1_000, 2_000, 3_000, 4_000)
+    assert two_phase().growth == (2_000, 4_000, 6_000, 8_000)
 
 
 def test_growth_is_over_within_the_first_phase_of_any_length():
@@ -133,15 +133,22 @@ def test_without_growth_all_texels_are_there_from_the_start():
 
 
 def test_bricks_may_be_released_just_before_the_texels_double():
-    schedule = schedule_of("joint", 1_000, release_shares=(0.05, 3 / 30, 4 / 30, 0.5))
-    assert schedule.growth == (33, 67, 100, 133) and schedule.release == (100, 133, 500)
-    assert [s for s in range(1_000) if schedule.watches(s)] == [*range(67, 500)]
+    schedule = schedule_of("joint", 1_000, release_shares=(0.1, 3 / 15, 4 / 15, 0.5))
+    assert schedule.growth == (67, 133, 200, 267) and schedule.release == (200, 267, 500)
+    assert [s for s in range(1_000) if schedule.watches(s)] == [*range(133, 500)]
     once = schedule_of("joint", 1_000, growth_shares=(0.3,), release_shares=(0.3,))
     assert [s for s in range(1_000) if once.watches(s)] == [*range(300)]
 
 
+def test_texels_double_four_times_as_early_where_depths_are_known_and_the_releases_before_that_follow():
+    shares = ScheduleConfig(release_shares=(0.15, 3 / 15, 4 / 15, 0.5))
+    fog, known = (make_schedule(shares, 3_000, depths_known=known) for known in (False, True))
+    assert fog.growth == (200, 400, 600, 800) and fog.release == (600, 800, 1_500)
+    assert known.growth == (50, 100, 150, 200) and known.release == (150, 200, 450, 1_500)
+
+
 def test_texels_may_become_finer_at_releases_after_growth_while_rates_are_high():
-    shares = {"release_shares": (3 / 30, 4 / 30, 0.3, 0.5, 0.75), "decay_from": 0.5}
+    shares = {"release_shares": (3 / 15, 4 / 15, 0.3, 0.5, 0.75), "decay_from": 0.5}
     schedule = schedule_of("joint", 1_000, windows=2, **shares)
     assert [s for s in range(2_000) if schedule.refines_at(s)] == [300, 500, 1_300, 1_500]
     schedule = schedule_of("joint", 1_000, **(shares | {"release_weight": 0.0}))
@@ -149,11 +156,11 @@ def test_texels_may_become_finer_at_releases_after_growth_while_rates_are_high()
 
 
 def test_bricks_are_given_up_after_growth_and_what_is_seen_before_does_not_count():
-    schedule = schedule_of("joint", 1_000, release_shares=(0.09, 0.5, 0.75, 0.5), windows=2)
-    assert schedule.growth[-1] == 133 and schedule.release == (500, 750), "not before surfaces have formed, and once"
+    schedule = schedule_of("joint", 1_000, release_shares=(0.1, 0.5, 0.75, 0.5), windows=2)
+    assert schedule.growth[-1] == 267 and schedule.release == (500, 750), "not before surfaces have formed, and once"
     assert [s for s in range(2_000) if schedule.releases_at(s)] == [500, 750, 1_500, 1_750]
     watched = [s for s in range(2_000) if schedule.watches(s)]
-    assert watched == [*range(133, 750), *range(1_133, 1_750)]
+    assert watched == [*range(267, 750), *range(1_267, 1_750)]
     assert not any(schedule_of("joint", 100).watches(s) for s in range(100))
     assert schedule_of("joint", 100, growth_shares=(), release_shares=(0.1, 0.2)).release == (20,)
     assert schedule_of("two-phase", 1_000, release_shares=(1.0,)).release == (750,), "shares of the first phase"
@@ -215,5 +222,4 @@ def test_the_papers_methods_keep_its_rates(method):
     model, optimizers = method.config.pipeline.model, method.config.optimizers
     assert (model.schedule.decay_decades, model.schedule.decay_from) == (1.5, 0.0)
     assert model.colour.feature_channels == 9
-    assert model.schedule.growth_shares == (1 / 15, 2 / 15, 3 / 15, 4 / 15)
     assert optimizers["colour"]["optimizer"].lr == 1e-3
