@@ -255,7 +255,7 @@ def test_nears_and_fars_that_are_preset_cut_the_scene(model, camera, near, far):
     whole = model(rays)
     rays.nears, rays.fars = torch.full_like(rays.pixel_area, near), torch.full_like(rays.pixel_area, far)
     cut = model(rays)
-    kept = cut["accumulation"] > 1e-3
+    kept = cut["accumulation"] > 0.05  # less may be samples too thin to be kept, which have no depth
     assert (cut["depth"][kept] >= near - 1e-3).all() and (cut["depth"][kept] <= far + 1e-3).all()
     assert (cut["accumulation"] <= whole["accumulation"] + 1e-4).all()
     assert (cut["rgb"] - whole["rgb"]).abs().max() > 0.01

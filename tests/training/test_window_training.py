@@ -16,6 +16,7 @@ from mmpi_ns.field.tables import TABLES
 from mmpi_ns.rendering.baked import exact_images
 from mmpi_ns.rendering.window_store import WindowStore
 from mmpi_ns.scene.windows import WindowedPlan, window_shares
+from mmpi_ns.training.initial import start_from_depths
 from mmpi_ns.training.phases import Schedule
 
 
@@ -63,7 +64,8 @@ def test_the_second_window_learns_as_it_would_alone(whole, scene, tmp_path, monk
     manager = trainer.pipeline.datamanager
     near = np.linalg.norm(manager.observations.centers - np.asarray(window.center), axis=-1)
     manager.use_cameras(np.nonzero(near < window.radius + window.margin)[0])
-    trainer.pipeline.model.run._drawn_from = 0  # a single window would draw from all cameras
+    trainer.pipeline.model.run._drawn_from = 0  # a single window would draw from all cameras, and start from them
+    start_from_depths(trainer.pipeline.model.field, manager.sources, manager.config.seed)
     model, draw = trainer.pipeline.model, manager.next_train
     manager.next_train = lambda step: draw(step + STEPS)  # the draws of the later steps
     losses = model.get_loss_dict
