@@ -76,7 +76,7 @@ def write_masks(
 def _posed_images(model: pycolmap.Reconstruction, entries: Sequence[pycolmap.Image], folder: Path) -> PosedImages:
     cameras = [model.cameras[entry.camera_id] for entry in entries]
     lenses = [read_intrinsics(camera) for camera in cameras]
-    poses = np.stack([entry.cam_from_world().inverse().matrix() for entry in entries])
+    poses = np.array([entry.cam_from_world().inverse().matrix() for entry in entries], np.float64)
     return PosedImages(
         files=tuple(folder / entry.name for entry in entries),
         camera_to_worlds=poses @ np.diag([1.0, -1.0, -1.0, 1.0]),

@@ -45,7 +45,9 @@ def explain(plan: ScenePlan, observations: Observations, visible: VisiblePoints)
         figures[0, k] = weights[served].sum()
         if served.any():
             figures[1:, k] = np.median(combined[served, k]), np.median(rest)
-    return PlanReport(*figures, float(weights[~held.any(-1)].sum()), float(held.sum(-1) @ weights), errors)
+    shares, error_with, error_without = figures
+    unserved, overlap = float(weights[~held.any(-1)].sum()), float(held.sum(-1) @ weights)
+    return PlanReport(shares, error_with, error_without, unserved, overlap, errors)
 
 
 def table(plan: ScenePlan, observations: Observations, report: PlanReport) -> str:
