@@ -56,7 +56,7 @@ def continued(depths: Map, directions: Map) -> Map:
     parts += [trust * v[..., i] * v[..., j] for i, j in _PAIRS]
     for share in WIDTHS:
         sums = [_blurred(p, share * max(inverse.shape)) for p in parts]
-        rows, columns = np.nonzero(~has_depth & (sums[0] > ENOUGH))
+        rows, columns = np.nonzero((sums[0] > ENOUGH) & (best > LEAST_ERROR))
         at = np.stack([s[rows, columns] for s in sums], -1)
         value, deviation = _planes(at, v[rows, columns])
         relative = np.where(value > 0, np.maximum(deviation / np.maximum(value, 1e-12), LEAST_ERROR), np.inf)

@@ -45,8 +45,8 @@ SECONDS = 0.4
 """Processor seconds for an image, for the forecast (docs/log/performance.md)."""
 VERSION = 2
 """Version of the algorithm: cached masks of another version are found anew."""
-ENOUGH = 200
-"""Pixels of one depth in both images from which their exposures are compared."""
+ENOUGH, SAMPLES = 200, 5000
+"""Pixels of one depth in both images from which their exposures are compared, at least and at most."""
 
 
 @dataclass(frozen=True)
@@ -75,10 +75,9 @@ def find_moving(
         progress: wraps the images as they are worked on.
     """
     width = round(SIDE * float(np.median(np.minimum(1, images.sizes[:, 0] / images.sizes[:, 1]))))
-    pairs = find_depths(images, points_of, width, progress=progress)
     up = images.camera_to_worlds[:, :, 1].mean(0)
     up /= max(float(np.linalg.norm(up)), 1e-12)
-    shots = [shot_of(images, i, view, depth, up) for i, (view, depth) in enumerate(pairs)]
+    shots = list(find_depths(images, points_of, width, lambda *known: shot_of(images, *known, up), progress))
     near = []
     for i in range(len(shots)):
         nearest = nearest_views(images.camera_to_worlds, i, RANKS[-1] + 1, MAX_ANGLE)
@@ -87,7 +86,7 @@ def find_moving(
     with one_thread_each(), ThreadPoolExecutor(num_threads()) as pool:
         first = list(pool.map(lambda i: _moves(shots, near[i], i, masks, None), range(len(shots))))
         masks = [mask for mask, _ in first]
-        again = [i for i in range(len(shots)) if any(masks[j].any() for j in (i, *near[i]))]
+        again = [i for i in range(len(shots)) if any(masks[j].any() for j in near[i])]
         second = list(pool.map(lambda i: _moves(shots, near[i], i, masks, first[i][1]), again))
         for i, (mask, _) in zip(again, second, strict=True):
             masks[i] = mask
@@ -106,8 +105,7 @@ def in_image(view: View, mask: Mask, images: PosedImages, i: int, shape: tuple[i
     """
     x, y = straightened(images, i, shape, shape)
     fx, fy, cx, cy = view.pinhole
-    at = ((fx * x + cx).reshape(shape), (fy * y + cy).reshape(shape))
-    return look_up(mask.astype(np.float32), *at) > EDGE
+    return look_up(mask.astype(np.float32), fx * x + cx, fy * y + cy) > EDGE
 
 
 def moving_masks(observations: Observations, dataset: MMPIDataset) -> Sequence[Mask]:
@@ -174,9 +172,13 @@ def at_exposure_of(shot: Shot, other: Shot) -> Bytes:
     x, y, ahead = Parallax.between(shot.view, other.view).pixels(inverse)
     theirs = look_up(other.depth.inverse, x, y, nearest=True)
     same = (inverse > 0) & (ahead > 0) & (np.abs(theirs * ahead - inverse) < 0.05 * inverse)
-    if same.sum() < ENOUGH:
+    rows, columns = np.nonzero(same)
+    if len(rows) < ENOUGH:
         return other.color
-    logarithms = [np.log(c[same] + 2.0) for c in (shot.color, look_up(other.color, x, y))]
+    some = np.s_[:: -(-len(rows) // SAMPLES)]
+    rows, columns = rows[some], columns[some]
+    theirs = look_up(other.color, x[rows, columns], y[rows, columns])
+    logarithms = [np.log(c + 2.0) for c in (shot.color[rows, columns], theirs)]
     gain = np.exp(np.median(logarithms[0] - logarithms[1], 0))
     return np.rint(other.color * gain).clip(0, 255).astype(np.uint8)
 

@@ -133,11 +133,8 @@ def splat(shot: Shot, other: Shot) -> Map:
     x, y, ahead = Parallax.between(other.view, shot.view).pixels(other.depth.inverse)
     inverse = np.where(ahead > 0, other.depth.inverse / np.where(ahead > 0, ahead, 1), 0)
     inside = (x >= 0) & (x < width) & (y >= 0) & (y < height) & (inverse > 0)
-    values = inverse[inside]
-    order = np.argsort(values, kind="stable")
-    at = (y[inside].astype(int) * width + x[inside].astype(int))[order]
     result = np.zeros(height * width, np.float32)
-    result[at] = values[order]  # the last one written stays
+    np.maximum.at(result, y[inside].astype(int) * width + x[inside].astype(int), inverse[inside])
     result = result.reshape(height, width)
     for _ in range(2):
         result = np.where(result > 0, result, cv2.dilate(result, np.ones((3, 3), np.uint8)))
@@ -169,19 +166,15 @@ def possible_depths(shot: Shot, others: Sequence[Shot]) -> tuple[list[Map], list
     return mine, behind
 
 
-@dataclass(frozen=True)
-class _Comparison:
-    """A shot against its neighbours at some inverse depths."""
-
-    distance: Bytes
-    """Levels by which colours differ, ALL where the neighbour shows nothing, the smallest first. [n, h, w]"""
-    pair: Bytes
-    """Levels by which a shot differs from both of two neighbours that agree and have nothing in front. [h, w]"""
-
-
 def _compare(
     shot: Shot, others: Sequence[Shot], colors: Sequence[Bytes], masks: Sequence[Mask | None], inverse: Map, pairs: bool
-) -> _Comparison:
+) -> tuple[list[Bytes], Bytes]:
+    """A shot against its neighbours at some inverse depths.
+
+    Returns:
+        Levels by which the colours of each neighbour differ, ALL where it shows nothing. [h, w] each
+        Levels by which the shot differs from both of two neighbours that agree and have nothing in front. [h, w]
+    """
     kernel, three = np.ones((3, 3), np.uint8), shot.color
     distances, warped, free = [], [], []
     for other, color, mask in zip(others, colors, masks, strict=True):
@@ -205,7 +198,7 @@ def _compare(
             agree = free[a] & free[b] & (most_of_channels(cv2.absdiff(warped[a], warped[b])) < SAME)
             away = cv2.min(distances[a], distances[b])
             pair = np.maximum(pair, np.where(agree, away, 0)).astype(np.uint8)
-    return _Comparison(np.sort(np.stack(distances), 0), pair)
+    return distances, pair
 
 
 def most_of_channels(apart: NDArray[Any]) -> Bytes:
@@ -225,8 +218,9 @@ def has_impossible_depth(shot: Shot, others: Sequence[Shot], colors: Sequence[By
     result = np.zeros(shot.view.gray.shape, bool)
     for share in IMPOSSIBLE if shot.ground is not None and others else ():
         inverse = share * shot.ground - 1e-9  # type: ignore[operator]
-        distance = _compare(shot, others, colors, [None] * len(others), inverse, False).distance
-        result |= (distance[min(CONSTANT, len(others)) - 1] < ALIKE) & (shot.ground > 0)  # type: ignore[operator]
+        distances, _ = _compare(shot, others, colors, [None] * len(others), inverse, False)
+        alike = np.sum([distance < ALIKE for distance in distances], 0, np.uint8)
+        result |= (alike >= min(CONSTANT, len(others))) & (shot.ground > 0)  # type: ignore[operator]
     return result
 
 
@@ -249,13 +243,17 @@ def evidence(
     one, two, behind = np.full(shape, ALL, np.uint8), np.full(shape, ALL, np.uint8), np.zeros(shape, np.uint8)
     mine, surfaces = possible_depths(shot, others)
     for n, inverse in enumerate(mine + surfaces):
-        compared = _compare(shot, others, colors, masks, inverse, n >= len(mine))
+        distances, pair = _compare(shot, others, colors, masks, inverse, n >= len(mine))
         possible = inverse > 0
         if shot.ground is not None:
             possible &= inverse >= SOLID * shot.ground
-        one = np.where(possible, np.minimum(one, compared.distance[0]), one)
-        two = np.where(possible, np.minimum(two, compared.distance[1]), two)
-        behind = np.where(possible, np.maximum(behind, compared.pair), behind)
+        first, second = np.full((2, *shape), ALL, np.uint8)
+        for distance in distances:
+            second = cv2.min(second, cv2.max(first, distance))
+            first = cv2.min(first, distance)
+        for nearest, of_depth in ((one, first), (two, second)):
+            np.minimum(nearest, of_depth, out=nearest, where=possible)
+        np.maximum(behind, pair, out=behind, where=possible)
     decided = _would_be_seen(shot, others) & shot.view.inside
     strong = np.where(decided & (one < ALL), np.minimum(one, np.where(impossible, ALL, behind)), 0).astype(np.uint8)
     weak = np.where(decided & (two < ALL), np.minimum(two, behind), 0).astype(np.uint8)

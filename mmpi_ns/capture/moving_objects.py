@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mmpi_ns.capture.dense import Parallax, correlation
+from mmpi_ns.capture.dense import Parallax, correlation, mean_and_contrast
 from mmpi_ns.capture.moving_evidence import ALL, SOLID, Bytes, Evidence, Mask, Shot
 from mmpi_ns.capture.views import look_up, pixel_grid
 
@@ -161,5 +161,5 @@ def followed(shot: Shot, other: Shot, mask: Mask, flow: cv2.DISOpticalFlow) -> M
     x, y = pixel_grid(shape)
     at = x + there[..., 0], y + there[..., 1]
     returned = np.abs(there + look_up(back, *at)).max(-1) < 1.5
-    alike, _ = correlation(shot.view.gray, look_up(other.view.gray, *at))
+    alike = correlation(shot.view.gray, look_up(other.view.gray, *at), mean_and_contrast(shot.view.gray))
     return returned & (alike > FOLLOWED) & (look_up(mask.astype(np.uint8), *at, nearest=True) > 0)
