@@ -41,14 +41,14 @@ NEIGHBOURS = 4
 """Neighbours that each image is compared with."""
 MAX_ANGLE = 40.0
 """Degrees between the facing directions of images that are compared."""
-ROUNDS = (4, 2, 1)
+ROUNDS = (2, 1)
 """Rounds of matching, each at the working size divided by this; each starts from the depths of the previous one."""
 SMALLEST = 192
 """Pixels along the longer side below which images are not reduced further."""
 SECONDS = 1.2
 """Processor seconds for a million working pixels of an image, for the forecast (docs/log/performance.md)."""
-STRIDE, ITERATIONS = 6, 8
-"""Pixels between the patches of the optical flow, and iterations of each."""
+STRIDE, WIDER_STRIDE, ITERATIONS = 5, 6, 8
+"""Pixels between the patches of the optical flow in small and in other images, and iterations of each."""
 NOISE = 0.3
 """Standard deviation of a match, working pixels, where images look alike."""
 MAX_EPIPOLAR = 1.0
@@ -377,10 +377,10 @@ def matched(view: View, others: list[View], points: NDArray[np.float64]) -> Dept
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
     flow.setFinestScale(0)
     flow.setVariationalRefinementIterations(0)
-    flow.setPatchStride(STRIDE)
     flow.setGradientDescentIterations(ITERATIONS)
     rough, depth = None, Depth(*np.zeros((2, *view.gray.shape), np.float32))
     least = max(1, max(view.gray.shape) // SMALLEST)
+    flow.setPatchStride(WIDER_STRIDE if least > 1 else STRIDE)
     for factor in (min(factor, least) for factor in ROUNDS) if others else ():
         small = view.reduced(factor)
         if rough is None:

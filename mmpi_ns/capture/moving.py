@@ -21,7 +21,7 @@ from mmpi_ns.capture.cache import Arrays, Computed, digest, remembered
 from mmpi_ns.capture.dataset import MMPIDataset
 from mmpi_ns.capture.dense import Depth, Parallax, Progress, find_depths
 from mmpi_ns.capture.known_depth import straightened
-from mmpi_ns.capture.moving_evidence import Bytes, Mask, Shot, evidence, ground_of, has_impossible_depth
+from mmpi_ns.capture.moving_evidence import Mask, Neighbour, Shot, evidence, ground_of, has_impossible_depth
 from mmpi_ns.capture.moving_objects import followed, grown, seeds
 from mmpi_ns.capture.observe import posed_images
 from mmpi_ns.capture.tracks import PosedImages, at_full_size
@@ -43,7 +43,7 @@ EDGE = 0.4
 """Share of a mover around a pixel from which it is masked."""
 SECONDS = 0.4
 """Processor seconds for an image, for the forecast (docs/log/performance.md)."""
-VERSION = 2
+VERSION = 3
 """Version of the algorithm: cached masks of another version are found anew."""
 ENOUGH, SAMPLES = 200, 5000
 """Pixels of one depth in both images from which their exposures are compared, at least and at most."""
@@ -166,35 +166,35 @@ def shot_of(images: PosedImages, i: int, view: View, depth: Depth, up: NDArray[n
     return Shot(view, np.asarray(color, np.uint8), depth, ground, horizon)
 
 
-def at_exposure_of(shot: Shot, other: Shot) -> Bytes:
-    """Colours of another shot at the exposure of this one, by what both show at one depth. [h, w, 3]"""
-    inverse = shot.depth.inverse
-    x, y, ahead = Parallax.between(shot.view, other.view).pixels(inverse)
+def at_exposure_of(shot: Shot, other: Shot) -> Neighbour:
+    """Another shot with its colours at the exposure of this one, by what both show at one depth."""
+    inverse, parallax = shot.depth.inverse, Parallax.between(shot.view, other.view)
+    x, y, ahead = parallax.pixels(inverse)
     theirs = look_up(other.depth.inverse, x, y, nearest=True)
     same = (inverse > 0) & (ahead > 0) & (np.abs(theirs * ahead - inverse) < 0.05 * inverse)
     rows, columns = np.nonzero(same)
     if len(rows) < ENOUGH:
-        return other.color
+        return Neighbour(other, other.color, parallax)
     some = np.s_[:: -(-len(rows) // SAMPLES)]
     rows, columns = rows[some], columns[some]
     theirs = look_up(other.color, x[rows, columns], y[rows, columns])
     logarithms = [np.log(c + 2.0) for c in (shot.color[rows, columns], theirs)]
     gain = np.exp(np.median(logarithms[0] - logarithms[1], 0))
-    return np.rint(other.color * gain).clip(0, 255).astype(np.uint8)
+    return Neighbour(other, np.rint(other.color * gain).clip(0, 255).astype(np.uint8), parallax)
 
 
 def _moves(
     shots: Sequence[Shot], near: Sequence[int], i: int, masks: Sequence[Mask], impossible: Mask | None
 ) -> tuple[Mask, Mask]:
     """What moves in an image, where it is known what moves in others, and where it has impossible depths."""
-    shot, others = shots[i], [shots[j] for j in near]
-    colors = [at_exposure_of(shot, other) for other in others]
+    shot = shots[i]
+    others = [at_exposure_of(shot, shots[j]) for j in near]
     if impossible is None:
-        impossible = has_impossible_depth(shot, others, colors)
-    shown = evidence(shot, others, colors, [masks[j] for j in near], impossible)
+        impossible = has_impossible_depth(shot, others)
+    shown = evidence(shot, others, [masks[j] for j in near], impossible)
     core = np.zeros(shot.view.gray.shape, bool)
     if len(others) >= 2:
-        core |= seeds(shot, others, colors, shown)
+        core |= seeds(shot, others, shown)
         flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
         for j in near[:AFTER]:
             if masks[j].any():

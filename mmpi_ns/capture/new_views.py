@@ -102,7 +102,7 @@ class SharedPoints:
 
 
 @dataclass(frozen=True)
-class _Shown:
+class ShownImage:
     """An image prepared for comparison with others."""
 
     image: UInt8[ndarray, "H W C"]
@@ -114,11 +114,10 @@ class _Shown:
     depth: Float[ndarray, "H W 2"]
 
     @staticmethod
-    def of(dataset: MMPIDataset, known: KnownDepth, i: int) -> _Shown:
-        image, usable = image_and_mask(dataset, i)
+    def of(image: UInt8[ndarray, "H W C"], usable: UInt8[ndarray, "H W"], depth: Float[ndarray, "H W 2"]) -> ShownImage:
         around = np.ones((3, 3), np.uint8)
         darkest, brightest = (np.asarray(bound(image, around), np.uint8) for bound in (cv2.erode, cv2.dilate))
-        return _Shown(image, darkest, brightest, usable, known.image(i))
+        return ShownImage(image, darkest, brightest, usable, depth)
 
     @property
     def certain(self) -> Bool[ndarray, "H W"]:
@@ -166,7 +165,10 @@ def find_shared_points(
         InputError: an image or mask cannot be used (names the file).
     """
     # Neighbours mostly stand side by side.
-    show = held(lambda i: _Shown.of(dataset, known, i), posed.sizes, BYTES_OF_IMAGE, NEIGHBOURS + 1)
+    show = held(
+        lambda i: ShownImage.of(*image_and_mask(dataset, i), known.image(i)),
+        posed.sizes, BYTES_OF_IMAGE, NEIGHBOURS + 1,
+    )  # fmt: skip
     budget = max(1, MOST // (NEIGHBOURS * max(1, len(images))))
 
     def shared(i: int) -> tuple[list[tuple[Any, ...]], float]:
