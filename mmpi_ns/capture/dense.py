@@ -2,10 +2,10 @@
 
 Every image is compared with its nearest neighbours. A rough depth, interpolated from SfM points, warps the neighbour
 into the image, so that the remaining displacement, found by DIS optical flow, is small whatever the motion was. A match
-on its epipolar line gives an inverse depth; consistent matches of several neighbours are averaged. The first rounds run
-at a fraction of the size; each starts from the depths of the previous one. Images are independent of each other but for
-a last check, so that threads share them: OpenCV and NumPy release Python's lock. An image is in memory while its
-neighbours are worked on, so that memory does not grow with the length of a capture in order.
+on its epipolar line gives an inverse depth; consistent matches of several neighbours are averaged. The first round runs
+at half the size; the second starts from its depths. Images are independent of each other but for a last
+check, so that threads share them: OpenCV and NumPy release Python's lock. An image is in memory while its neighbours
+are worked on, so that memory does not grow with the length of a capture in order.
 
 A point at inverse depth q appears in the neighbour at the homogeneous pixel a + q b, where a is linear in the pixel. A
 match there gives two linear equations r + q s = 0, in pixels once divided by the point's depth: q is their
@@ -41,14 +41,12 @@ NEIGHBOURS = 4
 """Neighbours that each image is compared with."""
 MAX_ANGLE = 40.0
 """Degrees between the facing directions of images that are compared."""
-ROUNDS = (2, 1)
-"""Rounds of matching, each at the working size divided by this; each starts from the depths of the previous one."""
-SMALLEST = 192
-"""Pixels along the longer side below which images are not reduced further."""
-SECONDS = 1.2
+HALVED = 384
+"""Pixels along the longer side from which the first of two rounds of matching runs at half the size."""
+SECONDS = 0.95
 """Processor seconds for a million working pixels of an image, for the forecast (docs/log/performance.md)."""
 STRIDE, WIDER_STRIDE, ITERATIONS = 5, 6, 8
-"""Pixels between the patches of the optical flow in small and in other images, and iterations of each."""
+"""Pixels between the patches of the optical flow in images below and above that size, and iterations of each."""
 NOISE = 0.3
 """Standard deviation of a match, working pixels, where images look alike."""
 MAX_EPIPOLAR = 1.0
@@ -379,9 +377,9 @@ def matched(view: View, others: list[View], points: NDArray[np.float64]) -> Dept
     flow.setVariationalRefinementIterations(0)
     flow.setGradientDescentIterations(ITERATIONS)
     rough, depth = None, Depth(*np.zeros((2, *view.gray.shape), np.float32))
-    least = max(1, max(view.gray.shape) // SMALLEST)
-    flow.setPatchStride(WIDER_STRIDE if least > 1 else STRIDE)
-    for factor in (min(factor, least) for factor in ROUNDS) if others else ():
+    halved = max(view.gray.shape) >= HALVED
+    flow.setPatchStride(WIDER_STRIDE if halved else STRIDE)
+    for factor in (1 + halved, 1) if others else ():
         small = view.reduced(factor)
         if rough is None:
             rough = rough_inverse_depth(small, points)

@@ -24,7 +24,7 @@ from torch import Tensor
 
 from mmpi_ns.capture.cache import Arrays, Computed, Pairs, digest, remembered
 from mmpi_ns.capture.dataset import MMPIDataset, read_depth_image
-from mmpi_ns.capture.dense import ROUNDS, SECONDS, STRIP, Depth, find_depths, strips
+from mmpi_ns.capture.dense import SECONDS, STRIP, Depth, find_depths, strips
 from mmpi_ns.capture.lone_depth import continued, is_lone
 from mmpi_ns.capture.loose_points import POINT_ERROR, contradict, see_points
 from mmpi_ns.capture.observe import drop_masked, posed_images
@@ -189,7 +189,7 @@ def _remembered_depths(original: PosedImages, posed: PosedImages, observations: 
         return ((f"{i}", image) for i, image in enumerate(codes))
 
     cameras = original.camera_to_worlds, original.intrinsics, original.distortion, original.fisheye
-    key = digest(original.files, "depths", VERSION, ROUNDS, width, shapes, *cameras, seen_by, points)
+    key = digest(original.files, "depths", VERSION, width, shapes, *cameras, seen_by, points)
     stored = remembered(key, match)
     return _stored(stored)
 

@@ -41,7 +41,7 @@ AFTER = 2
 """Nearest neighbours from which objects are followed."""
 EDGE = 0.4
 """Share of a mover around a pixel from which it is masked."""
-SECONDS = 0.4
+SECONDS = 0.3
 """Processor seconds for an image, for the forecast (docs/log/performance.md)."""
 VERSION = 3
 """Version of the algorithm: cached masks of another version are found anew."""
