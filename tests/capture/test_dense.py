@@ -209,9 +209,9 @@ def test_images_are_in_memory_while_their_neighbours_are_worked_on(tmp_path, mon
     assert len(results) == len(alive) == count and (not is_in_order or most <= 9 + threads)
 
 
-def test_rounds_from_coarse_to_fine_give_the_depths_of_full_size(tmp_path, monkeypatch):
+def test_a_first_round_at_half_size_gives_the_depths_of_full_size(tmp_path, monkeypatch):
     images = scene_of(tmp_path, POSES)
-    monkeypatch.setattr(dense, "SMALLEST", 40)
+    monkeypatch.setattr(dense, "HALVED", 40)
     results = list(find_depths(images, lambda i: points_on_walls(POSES[i]), WIDTH))
     error, scaled = relative_errors(results, POSES)
     assert np.mean([(d.inverse > 0).mean() for _, d in results]) > 0.88
