@@ -151,6 +151,16 @@ def test_what_is_kept_is_bounded_and_spread_over_the_images(monkeypatch):
     assert torch.equal(points.pixels, find().pixels), "the same with each start"
 
 
+def test_the_number_of_threads_does_not_change_the_points(monkeypatch):
+    monkeypatch.setattr(new_views, "MOST", 1000)
+    points = []
+    for threads in (1, 3):
+        monkeypatch.setattr("mmpi_ns.utils.parallel.num_threads", lambda threads=threads: threads)
+        points.append(find())
+    for name in new_views.PARTS:
+        assert torch.equal(*(getattr(p, name) for p in points))
+
+
 def test_some_images_alone():
     some = find().of_images(torch.tensor([1, 2, 3]))
     assert set(some.pixels[:, 0].tolist()) | set(some.other.tolist()) == {1, 2, 3}
