@@ -77,7 +77,11 @@ def find_moving(
     width = round(SIDE * float(np.median(np.minimum(1, images.sizes[:, 0] / images.sizes[:, 1]))))
     up = images.camera_to_worlds[:, :, 1].mean(0)
     up /= max(float(np.linalg.norm(up)), 1e-12)
-    shots = list(find_depths(images, points_of, width, lambda *known: shot_of(images, *known, up), progress))
+
+    def finish(i: int, view: View, depth: Depth) -> Shot:
+        return shot_of(images, i, view, depth, up)
+
+    shots = list(find_depths(images, points_of, width, finish, progress))
     near = []
     for i in range(len(shots)):
         nearest = nearest_views(images.camera_to_worlds, i, RANKS[-1] + 1, MAX_ANGLE)

@@ -193,9 +193,9 @@ class ExposedView:
         """Of an image, where a mask does not hide it."""
         rgb, kernel = np.ascontiguousarray(image[..., :3]), np.ones((WINDOW, WINDOW), np.uint8)
         colors = np.asarray(cv2.boxFilter(rgb, cv2.CV_32F, (WINDOW, WINDOW)), np.float32) / 255
-        lit = cv2.inRange(cv2.erode(rgb, kernel), (DARK + 1,) * 3, (255,) * 3)
-        unclipped = cv2.inRange(cv2.dilate(rgb, kernel), (0,) * 3, (BRIGHT - 1,) * 3)
-        exposed = (lit & unclipped & cv2.erode(usable, kernel)) > 0
+        lit = cv2.inRange(cv2.erode(rgb, kernel), np.full(3, DARK + 1.0), np.full(3, 255.0))
+        unclipped = cv2.inRange(cv2.dilate(rgb, kernel), np.zeros(3), np.full(3, BRIGHT - 1.0))
+        exposed = (lit > 0) & (unclipped > 0) & (cv2.erode(usable, kernel) > 0)
         border = WINDOW // 2
         exposed[:border] = exposed[-border:] = exposed[:, :border] = exposed[:, -border:] = False
         return ExposedView(colors, exposed, distance, number)
