@@ -2,8 +2,8 @@
 
 Every image is compared with its nearest neighbours. A rough depth, interpolated from SfM points, warps the neighbour
 into the image, so that the remaining displacement, found by DIS optical flow, is small whatever the motion was. A match
-on its epipolar line gives an inverse depth; consistent matches of several neighbours are averaged. The first round runs
-at half the size; the second starts from its depths. Images are independent of each other but for a last
+on its epipolar line gives an inverse depth; consistent matches of several neighbours are averaged. A large image is
+matched at half its size first; each round starts from the depths of the previous one. Images are independent of each other but for a last
 check, so that threads share them: OpenCV and NumPy release Python's lock. An image is in memory while its neighbours
 are worked on, so that memory does not grow with the length of a capture in order.
 
@@ -16,7 +16,7 @@ for each unit of q.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import chain, repeat
@@ -41,12 +41,15 @@ NEIGHBOURS = 4
 """Neighbours that each image is compared with."""
 MAX_ANGLE = 40.0
 """Degrees between the facing directions of images that are compared."""
-HALVED = 384
-"""Pixels along the longer side from which the first of two rounds of matching runs at half the size."""
+LARGE = 640
+"""Pixels along the longer side of a large image."""
+ROUNDS = {False: (1, 1, 1), True: (2, 1)}
+"""Rounds of matching of small and of large images, each at the working size divided by this; each starts from the
+depths of the previous one."""
 SECONDS = 0.95
 """Processor seconds for a million working pixels of an image, for the forecast (docs/log/performance.md)."""
-STRIDE, WIDER_STRIDE, ITERATIONS = 5, 6, 8
-"""Pixels between the patches of the optical flow in images below and above that size, and iterations of each."""
+STRIDE, ITERATIONS = {False: 5, True: 6}, 8
+"""Pixels between the patches of the optical flow in small and in large images, and iterations of each."""
 NOISE = 0.3
 """Standard deviation of a match, working pixels, where images look alike."""
 MAX_EPIPOLAR = 1.0
@@ -279,6 +282,7 @@ def find_depths(
     width: int,
     finish: Callable[[int, View, Depth], T] = lambda _, view, depth: (view, depth),
     progress: Progress = lambda work, _: work,
+    rounds: Sequence[int] | None = None,
 ) -> Iterator[T]:
     """The depths of all images in turn, by all threads; their number does not change the depths.
 
@@ -288,9 +292,10 @@ def find_depths(
         width: working size, pixels.
         finish: makes the result of an image from its number, its view at working size, and its depths.
         progress: wraps the images as they are worked on, each twice.
+        rounds: of matching; None for those of ``ROUNDS``.
     """
     with one_thread_each(), ThreadPoolExecutor(num_threads()) as pool:
-        results = _Pipeline(images, points_of, width, finish, pool).results(num_threads() + 1)
+        results = _Pipeline(images, points_of, width, finish, pool, rounds).results(num_threads() + 1)
         for n, (is_last, result) in enumerate(progress(results, 2 * len(images.files))):
             if n % TRIMMED == 0:
                 give_back_freed_memory()
@@ -308,8 +313,10 @@ class _Pipeline(Generic[T]):
         width: int,
         finish: Callable[[int, View, Depth], T],
         pool: ThreadPoolExecutor,
+        rounds: Sequence[int] | None,
     ) -> None:
         """Arguments as of ``find_depths``."""
+        self.rounds = rounds
         self.images, self.points_of, self.width, self.finish, self.pool = images, points_of, width, finish, pool
         self.numbers = range(len(images.files))
         self.near = [nearest_views(images.camera_to_worlds, i, NEIGHBOURS, MAX_ANGLE) for i in self.numbers]
@@ -325,7 +332,9 @@ class _Pipeline(Generic[T]):
             if j not in self.views:
                 self.views[j] = self.pool.submit(load_view, self.images, j, self.width)
         mine, others = self.views[i], [self.views[j] for j in self.near[i]]
-        return self.pool.submit(lambda: matched(mine.result(), [v.result() for v in others], self.points_of(i)))
+        return self.pool.submit(
+            lambda: matched(mine.result(), [v.result() for v in others], self.points_of(i), self.rounds)
+        )
 
     def confirm(self, i: int) -> Future[T]:
         view, depth = self.views[i], self.depths[i]
@@ -370,16 +379,16 @@ def last_uses(near: list[list[int]]) -> list[int]:
     return last
 
 
-def matched(view: View, others: list[View], points: NDArray[np.float64]) -> Depth:
-    """The depths of a view by comparison with other views, from coarse to fine."""
+def matched(view: View, others: list[View], points: NDArray[np.float64], rounds: Sequence[int] | None = None) -> Depth:
+    """The depths of a view by comparison with other views, in rounds from coarse to fine."""
+    is_large = max(view.gray.shape) >= LARGE
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
     flow.setFinestScale(0)
     flow.setVariationalRefinementIterations(0)
     flow.setGradientDescentIterations(ITERATIONS)
     rough, depth = None, Depth(*np.zeros((2, *view.gray.shape), np.float32))
-    halved = max(view.gray.shape) >= HALVED
-    flow.setPatchStride(WIDER_STRIDE if halved else STRIDE)
-    for factor in (1 + halved, 1) if others else ():
+    flow.setPatchStride(STRIDE[is_large])
+    for factor in (rounds or ROUNDS[is_large]) if others else ():
         small = view.reduced(factor)
         if rough is None:
             rough = rough_inverse_depth(small, points)

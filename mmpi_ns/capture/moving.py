@@ -37,6 +37,8 @@ RANKS = (0, 1, 2, 3, 5, 8)
 """Neighbours that an image is compared with, by nearness: farther ones see what something slow hides from near ones."""
 MAX_ANGLE = 40.0
 """Degrees between the facing directions of images that are compared."""
+ROUNDS = (2, 1)
+"""Of dense matching: at half the size, then at that size."""
 AFTER = 2
 """Nearest neighbours from which objects are followed."""
 EDGE = 0.4
@@ -81,7 +83,7 @@ def find_moving(
     def finish(i: int, view: View, depth: Depth) -> Shot:
         return shot_of(images, i, view, depth, up)
 
-    shots = list(find_depths(images, points_of, width, finish, progress))
+    shots = list(find_depths(images, points_of, width, finish, progress, ROUNDS))
     near = []
     for i in range(len(shots)):
         nearest = nearest_views(images.camera_to_worlds, i, RANKS[-1] + 1, MAX_ANGLE)
