@@ -3,9 +3,9 @@
 Every image is compared with its nearest neighbours. A rough depth, interpolated from SfM points, warps the neighbour
 into the image, so that the remaining displacement, found by DIS optical flow, is small whatever the motion was. A match
 on its epipolar line gives an inverse depth; consistent matches of several neighbours are averaged. A large image is
-matched at half its size first; each round starts from the depths of the previous one. Images are independent of each other but for a last
-check, so that threads share them: OpenCV and NumPy release Python's lock. An image is in memory while its neighbours
-are worked on, so that memory does not grow with the length of a capture in order.
+matched at half its size first; each round starts from the depths of the previous one. Images are independent of each
+other but for a last check, so that threads share them: OpenCV and NumPy release Python's lock. An image is in memory
+while its neighbours are worked on, so that memory does not grow with the length of a capture in order.
 
 A point at inverse depth q appears in the neighbour at the homogeneous pixel a + q b, where a is linear in the pixel. A
 match there gives two linear equations r + q s = 0, in pixels once divided by the point's depth: q is their
