@@ -6,7 +6,9 @@ import hashlib
 import zipfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
+from functools import lru_cache
 from pathlib import Path
+from threading import Lock
 from typing import Any, TypeVar
 
 import numpy as np
@@ -56,10 +58,33 @@ class Computed(Sequence[T]):
         return self._function(i)
 
 
-def images_held(sizes: NDArray[np.float64], bytes_of_pixel: int, least: int) -> int:
-    """Images that are kept in memory at once, of these sizes [M, 2]: as many as an image is compared with at least."""
+def held(
+    function: Callable[[int], T], sizes: NDArray[np.float64], bytes_of_pixel: int, least: int
+) -> Callable[[int], T]:
+    """A function of an image's number that keeps its last results while neighbours are compared with them.
+
+    Threads that ask for the same image at once share one call.
+
+    Args:
+        function: of an image's number.
+        sizes: of the images [M, 2]; results are kept as long as they take ``HELD_BYTES`` at most.
+        bytes_of_pixel: that a result takes.
+        least: results that are kept at least: as many as an image is compared with.
+    """
     bytes_of_image = bytes_of_pixel * float(sizes.prod(-1).max())
-    return max(least, min(HELD, int(HELD_BYTES / bytes_of_image)))
+
+    @lru_cache(max(least, min(HELD, int(HELD_BYTES / bytes_of_image))))
+    def entry(_: int) -> tuple[Lock, list[T]]:
+        return Lock(), []
+
+    def result(i: int) -> T:
+        lock, results = entry(i)
+        with lock:
+            if not results:
+                results.append(function(i))
+        return results[0]
+
+    return result
 
 
 def remembered(key: str, find: Callable[[], Arrays | Pairs], folder: Path | None = None) -> Arrays:

@@ -2,10 +2,10 @@
 
 Every image is compared with its nearest neighbours. A rough depth, interpolated from SfM points, warps the neighbour
 into the image, so that the remaining displacement, found by DIS optical flow, is small whatever the motion was. A match
-on its epipolar line gives an inverse depth; consistent matches of several neighbours are averaged. The first rounds run
-at a fraction of the size; each starts from the depths of the previous one. Images are independent of each other but for
-a last check, so that threads share them: OpenCV and NumPy release Python's lock. An image is in memory while its
-neighbours are worked on, so that memory does not grow with the length of a capture in order.
+on its epipolar line gives an inverse depth; consistent matches of several neighbours are averaged. A large image is
+matched at half its size first; each round starts from the depths of the previous one. Images are independent of each
+other but for a last check, so that threads share them: OpenCV and NumPy release Python's lock. An image is in memory
+while its neighbours are worked on, so that memory does not grow with the length of a capture in order.
 
 A point at inverse depth q appears in the neighbour at the homogeneous pixel a + q b, where a is linear in the pixel. A
 match there gives two linear equations r + q s = 0, in pixels once divided by the point's depth: q is their
@@ -16,7 +16,7 @@ for each unit of q.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import chain, repeat
@@ -41,14 +41,15 @@ NEIGHBOURS = 4
 """Neighbours that each image is compared with."""
 MAX_ANGLE = 40.0
 """Degrees between the facing directions of images that are compared."""
-ROUNDS = (4, 2, 1)
-"""Rounds of matching, each at the working size divided by this; each starts from the depths of the previous one."""
-SMALLEST = 320
-"""Pixels along the longer side below which images are not reduced further."""
-SECONDS = 1.2
+LARGE = 640
+"""Pixels along the longer side of a large image."""
+ROUNDS = {False: (1, 1, 1), True: (2, 1)}
+"""Rounds of matching of small and of large images, each at the working size divided by this; each starts from the
+depths of the previous one."""
+SECONDS = 0.95
 """Processor seconds for a million working pixels of an image, for the forecast (docs/log/performance.md)."""
-STRIDE, ITERATIONS = 5, 8
-"""Pixels between the patches of the optical flow, and iterations of each."""
+STRIDE, ITERATIONS = {False: 5, True: 6}, 8
+"""Pixels between the patches of the optical flow in small and in large images, and iterations of each."""
 NOISE = 0.3
 """Standard deviation of a match, working pixels, where images look alike."""
 MAX_EPIPOLAR = 1.0
@@ -155,14 +156,17 @@ class Parallax:
         a = self.a(rows, x.shape[1])
         r1, s1 = a[0] - x * a[2], self.b[0] - x * self.b[2]
         r2, s2 = a[1] - y * a[2], self.b[1] - y * self.b[2]
-        squared = s1 * s1 + s2 * s2
-        inverse = -(r1 * s1 + r2 * s2) / np.maximum(squared, 1e-20)
+        squared = np.maximum(s1 * s1 + s2 * s2, 1e-20)
+        inverse = -(r1 * s1 + r2 * s2) / squared
         depth = a[2] + inverse * self.b[2]
-        per_depth = np.where(depth > 1e-6, 1 / (depth * depth), np.nan)
-        return inverse, ((r1 + inverse * s1) ** 2 + (r2 + inverse * s2) ** 2) * per_depth, squared * per_depth
+        depth_squared = np.where(depth > 1e-6, depth * depth, np.nan)
+        across = r1 * s2 - r2 * s1  # of r and s, as r + q s is what of r is not along s
+        return inverse, across * across / (squared * depth_squared), squared / depth_squared
 
 
-def measure(view: View, neighbour: View, start: Map, flow: cv2.DISOpticalFlow) -> tuple[Map, Map]:
+def measure(
+    view: View, neighbour: View, start: Map, flow: cv2.DISOpticalFlow, of_view: tuple[Map, Map]
+) -> tuple[Map, Map]:
     """Inverse depths of a view's pixels by comparison with another view, and one over their squared errors (0: none).
 
     Args:
@@ -170,16 +174,17 @@ def measure(view: View, neighbour: View, start: Map, flow: cv2.DISOpticalFlow) -
         neighbour: the image that it is compared with.
         start: rough inverse depths. [h, w]
         flow: finds small motions.
+        of_view: its ``mean_and_contrast``.
     """
     parallax = Parallax.between(view, neighbour)
     x, y, _ = parallax.pixels(start)
     motion = np.asarray(flow.calc(view.gray, look_up(neighbour.gray, x, y), None))  # type: ignore[call-overload]
-    grid_x, grid_y = pixel_grid(view.gray.shape)
-    moved = grid_x + motion[..., 0], grid_y + motion[..., 1]
+    right, down = (np.arange(n, dtype=np.float32) + 0.5 for n in view.gray.shape[::-1])
+    moved = motion[..., 0] + right, motion[..., 1] + down[:, None]
     x, y = look_up(x, *moved), look_up(y, *moved)
     seen = look_up(np.ascontiguousarray(neighbour.inside, np.uint8), x, y, nearest=True) > 0
-    alike, contrast = correlation(view.gray, look_up(neighbour.gray, x, y))
-    good = view.inside & seen & (alike > MIN_CORRELATION) & (contrast > MIN_CONTRAST)
+    alike = correlation(view.gray, look_up(neighbour.gray, x, y), of_view)
+    good = view.inside & seen & (alike > MIN_CORRELATION) & (of_view[1] > MIN_CONTRAST)
     inverse, weight = np.empty_like(start), np.empty_like(start)
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         for rows in strips(start.shape):
@@ -191,19 +196,22 @@ def measure(view: View, neighbour: View, start: Map, flow: cv2.DISOpticalFlow) -
     return inverse, weight
 
 
-def correlation(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> tuple[Map, Map]:
-    """Normalised correlation of two images in a window about each pixel, and the standard deviation of the first."""
-    mean_a, mean_b = _mean(a), _mean(b)
-    squares = _mean_square(a), _mean_square(b)
-    products = _mean(np.asarray(cv2.multiply(a, b, dtype=cv2.CV_16U)))
-    alike, contrast = np.empty_like(mean_a), np.empty_like(mean_a)
+def mean_and_contrast(image: NDArray[np.uint8]) -> tuple[Map, Map]:
+    """Mean and standard deviation in a window about each pixel of an image."""
+    mean, contrast = _mean(image), _mean_square(image)
+    for rows in strips(image.shape):
+        contrast[rows] -= mean[rows] * mean[rows]
+        np.sqrt(np.maximum(contrast[rows], 0, out=contrast[rows]), out=contrast[rows])
+    return mean, contrast
+
+
+def correlation(a: NDArray[np.uint8], b: NDArray[np.uint8], of_a: tuple[Map, Map]) -> Map:
+    """Normalised correlation of two images in a window about each pixel, by ``mean_and_contrast`` of the first."""
+    of_b, alike = mean_and_contrast(b), _mean(np.asarray(cv2.multiply(a, b, dtype=cv2.CV_16U)))
     for rows in strips(a.shape):
-        var_a = np.maximum(squares[0][rows] - mean_a[rows] ** 2, 0)
-        var_b = squares[1][rows] - mean_b[rows] ** 2
-        both = products[rows] - mean_a[rows] * mean_b[rows]
-        alike[rows] = both / np.sqrt(np.maximum(var_a, 1) * np.maximum(var_b, 1))
-        contrast[rows] = np.sqrt(var_a)
-    return alike, contrast
+        alike[rows] -= of_a[0][rows] * of_b[0][rows]
+        alike[rows] /= np.maximum(of_a[1][rows], 1) * np.maximum(of_b[1][rows], 1)
+    return alike
 
 
 def _mean(x: NDArray[Any], side: int = WINDOW) -> Map:
@@ -223,20 +231,24 @@ def fuse(inverse: NDArray[np.float32], weight: NDArray[np.float32]) -> Depth:
     depth, count = Depth(*np.empty((2, *inverse.shape[1:]), np.float32)), len(inverse)
     for rows in strips(inverse.shape):
         q, weights = inverse[:, rows], weight[:, rows]
-        variance, there = 1 / np.maximum(weights, 1e-30), weights > 0
+        variance, there = AGREE**2 / np.maximum(weights, 1e-30), weights > 0
         measured, all_weight = there.sum(0, dtype=np.int8), np.maximum(weights.sum(0), 1e-30)
         best, mean, error = (np.zeros_like(q[0]) for _ in range(3))
+        pairs = {}
         for k in range(count):
             # Relative to measurement k, so that sums of squares are exact.
             number, total = np.ones_like(measured), weights[k].copy()
             first, second = np.zeros_like(mean), np.zeros_like(mean)
             for n in (n for n in range(count) if n != k):
-                apart = q[n] - q[k]
-                agrees = there[n] & (apart * apart < AGREE**2 * (variance[n] + variance[k]))
+                if n > k:
+                    apart = q[n] - q[k]
+                    agrees = there[n] & there[k] & (apart * apart < variance[n] + variance[k])
+                    pairs[k, n] = apart, agrees
+                apart, agrees = pairs[min(k, n), max(k, n)]
                 w = weights[n] * agrees
                 total += w
                 w *= apart
-                first += w
+                first += w if n > k else -w
                 w *= apart
                 second += w
                 number += agrees
@@ -245,8 +257,9 @@ def fuse(inverse: NDArray[np.float32], weight: NDArray[np.float32]) -> Depth:
             scatter = np.maximum(second - first * shift, 0) / np.maximum(number - 1, 1)
             value = number + total / all_weight
             better = there[k] & (number >= np.minimum(measured, 2)) & (average > 0) & (value > best)
-            best, mean = np.where(better, value, best), np.where(better, average, mean)
-            error = np.where(better, np.sqrt(np.maximum(scatter, 1) / np.maximum(total, 1e-30)), error)
+            np.copyto(best, value, where=better)
+            np.copyto(mean, average, where=better)
+            np.copyto(error, np.sqrt(np.maximum(scatter, 1) / np.maximum(total, 1e-30)), where=better)
         kept = (best > 0) & (error < MAX_RELATIVE * mean)
         depth.inverse[rows], depth.error[rows] = np.where(kept, mean, 0), np.where(kept, error, 0)
     return depth
@@ -269,6 +282,7 @@ def find_depths(
     width: int,
     finish: Callable[[int, View, Depth], T] = lambda _, view, depth: (view, depth),
     progress: Progress = lambda work, _: work,
+    rounds: Sequence[int] | None = None,
 ) -> Iterator[T]:
     """The depths of all images in turn, by all threads; their number does not change the depths.
 
@@ -278,9 +292,10 @@ def find_depths(
         width: working size, pixels.
         finish: makes the result of an image from its number, its view at working size, and its depths.
         progress: wraps the images as they are worked on, each twice.
+        rounds: of matching; None for those of ``ROUNDS``.
     """
     with one_thread_each(), ThreadPoolExecutor(num_threads()) as pool:
-        results = _Pipeline(images, points_of, width, finish, pool).results(num_threads() + 1)
+        results = _Pipeline(images, points_of, width, finish, pool, rounds).results(num_threads() + 1)
         for n, (is_last, result) in enumerate(progress(results, 2 * len(images.files))):
             if n % TRIMMED == 0:
                 give_back_freed_memory()
@@ -298,8 +313,10 @@ class _Pipeline(Generic[T]):
         width: int,
         finish: Callable[[int, View, Depth], T],
         pool: ThreadPoolExecutor,
+        rounds: Sequence[int] | None,
     ) -> None:
         """Arguments as of ``find_depths``."""
+        self.rounds = rounds
         self.images, self.points_of, self.width, self.finish, self.pool = images, points_of, width, finish, pool
         self.numbers = range(len(images.files))
         self.near = [nearest_views(images.camera_to_worlds, i, NEIGHBOURS, MAX_ANGLE) for i in self.numbers]
@@ -315,7 +332,9 @@ class _Pipeline(Generic[T]):
             if j not in self.views:
                 self.views[j] = self.pool.submit(load_view, self.images, j, self.width)
         mine, others = self.views[i], [self.views[j] for j in self.near[i]]
-        return self.pool.submit(lambda: matched(mine.result(), [v.result() for v in others], self.points_of(i)))
+        return self.pool.submit(
+            lambda: matched(mine.result(), [v.result() for v in others], self.points_of(i), self.rounds)
+        )
 
     def confirm(self, i: int) -> Future[T]:
         view, depth = self.views[i], self.depths[i]
@@ -360,23 +379,24 @@ def last_uses(near: list[list[int]]) -> list[int]:
     return last
 
 
-def matched(view: View, others: list[View], points: NDArray[np.float64]) -> Depth:
-    """The depths of a view by comparison with other views, from coarse to fine."""
+def matched(view: View, others: list[View], points: NDArray[np.float64], rounds: Sequence[int] | None = None) -> Depth:
+    """The depths of a view by comparison with other views, in rounds from coarse to fine."""
+    is_large = max(view.gray.shape) >= LARGE
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
     flow.setFinestScale(0)
     flow.setVariationalRefinementIterations(0)
-    flow.setPatchStride(STRIDE)
     flow.setGradientDescentIterations(ITERATIONS)
     rough, depth = None, Depth(*np.zeros((2, *view.gray.shape), np.float32))
-    least = max(1, max(view.gray.shape) // SMALLEST)
-    for factor in (min(factor, least) for factor in ROUNDS) if others else ():
+    flow.setPatchStride(STRIDE[is_large])
+    for factor in (rounds or ROUNDS[is_large]) if others else ():
         small = view.reduced(factor)
         if rough is None:
             rough = rough_inverse_depth(small, points)
         else:
             rough = filled(depth, rough)
             rough = np.asarray(cv2.resize(rough, small.gray.shape[::-1], interpolation=cv2.INTER_LINEAR), np.float32)
-        pairs = [measure(small, neighbour.reduced(factor), rough, flow) for neighbour in others]
+        of_view = mean_and_contrast(small.gray)
+        pairs = [measure(small, neighbour.reduced(factor), rough, flow, of_view) for neighbour in others]
         depth = without_fringes(small, fuse(*(np.stack(part) for part in zip(*pairs, strict=True))))
     return depth
 
@@ -394,12 +414,14 @@ def confirmed(view: View, depth: Depth, others: list[tuple[View, Depth]]) -> Dep
     confirm, contradict = np.zeros(depth.inverse.shape, np.int8), np.zeros(depth.inverse.shape, np.int8)
     for neighbour, theirs in others:
         x, y, ahead = Parallax.between(view, neighbour).pixels(depth.inverse)
-        inverse, error = (look_up(m, x, y, nearest=True) for m in (theirs.inverse, theirs.error))
-        expected = np.where(ahead > 0, depth.inverse / np.where(ahead > 0, ahead, 1), 0)
-        tolerance = 3 * np.sqrt(error**2 + depth.error**2) + SAME_DEPTH * expected
-        both = (inverse > 0) & (expected > 0)
-        confirm += both & (np.abs(inverse - expected) < tolerance)
-        contradict += both & (inverse < expected - tolerance)
+        there = look_up(np.stack([theirs.inverse, theirs.error], -1), x, y, nearest=True)
+        for rows in strips(ahead.shape):
+            inverse, error = there[rows, :, 0], there[rows, :, 1]  # 0 behind the neighbour
+            expected = depth.inverse[rows] / np.maximum(ahead[rows], 1e-6)
+            tolerance = 3 * np.sqrt(error * error + depth.error[rows] ** 2) + SAME_DEPTH * expected
+            both, apart = (inverse > 0) & (expected > 0), inverse - expected
+            confirm[rows] += both & (np.abs(apart) < tolerance)
+            contradict[rows] += both & (apart < -tolerance)
     return _only(depth, (confirm >= 1) & (confirm > contradict))
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import cast
 
@@ -24,7 +24,7 @@ from torch import Tensor
 
 from mmpi_ns.capture.cache import Arrays, Computed, Pairs, digest, remembered
 from mmpi_ns.capture.dataset import MMPIDataset, read_depth_image
-from mmpi_ns.capture.dense import ROUNDS, SECONDS, STRIP, Depth, find_depths, strips
+from mmpi_ns.capture.dense import SECONDS, STRIP, Depth, find_depths, strips
 from mmpi_ns.capture.lone_depth import continued, is_lone
 from mmpi_ns.capture.loose_points import POINT_ERROR, contradict, see_points
 from mmpi_ns.capture.observe import drop_masked, posed_images
@@ -39,7 +39,7 @@ from mmpi_ns.utils.parallel import in_order, num_threads
 Map = NDArray[np.float32]
 Codes = NDArray[np.int16]
 
-VERSION = 5
+VERSION = 6
 """Version of the algorithm: cached depths of another version are recomputed."""
 FINER, WIDEST = 2.0, 1600
 """Images are matched at this multiple of the training size, and at most this wide, if the originals are available."""
@@ -189,7 +189,7 @@ def _remembered_depths(original: PosedImages, posed: PosedImages, observations: 
         return ((f"{i}", image) for i, image in enumerate(codes))
 
     cameras = original.camera_to_worlds, original.intrinsics, original.distortion, original.fisheye
-    key = digest(original.files, "depths", VERSION, ROUNDS, width, shapes, *cameras, seen_by, points)
+    key = digest(original.files, "depths", VERSION, width, shapes, *cameras, seen_by, points)
     stored = remembered(key, match)
     return _stored(stored)
 
@@ -249,8 +249,7 @@ def at_training_pixels(
     scale_x, scale_y = width / view.gray.shape[1], height / view.gray.shape[0]
     for rows in strips(shape):
         x, y = straightened(original, i, shape, file_shape, rows)
-        at = (((fx * x + cx) * scale_x).reshape(-1, shape[1]), ((fy * y + cy) * scale_y).reshape(-1, shape[1]))
-        longer = np.sqrt(x**2 + y**2 + 1).reshape(-1, shape[1])
+        at, longer = ((fx * x + cx) * scale_x, (fy * y + cy) * scale_y), np.sqrt(x**2 + y**2 + 1)
         for n, values in enumerate(maps):
             distances[rows, :, n] = look_up(values, *at, nearest=True) / longer
     return distances
@@ -258,6 +257,8 @@ def at_training_pixels(
 
 def pooled(depth: Depth, shape: tuple[int, int]) -> tuple[Map, Map]:
     """Inverse depth and error over the areas of a coarser grid [h, w]; 0 where too little of an area is known."""
+    if depth.inverse.shape == shape:
+        return depth.inverse, depth.error
     measured = (depth.inverse > 0).astype(np.float32)
     weight = measured / np.maximum(depth.error, 1e-12) ** 2
     cover, total, first, second = (
@@ -272,18 +273,39 @@ def pooled(depth: Depth, shape: tuple[int, int]) -> tuple[Map, Map]:
 
 
 def straightened(
-    original: PosedImages, i: int, shape: tuple[int, int], file_shape: tuple[int, int], some: slice = slice(None)
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Tangents (right, down) at which a training image's pixels look, lens taken out; of some rows. [H * W] each"""
-    full_width, full_height = original.sizes[i]
-    columns, rows = np.meshgrid(np.arange(shape[1]) + 0.5, np.arange(shape[0])[some] + 0.5)
-    at = np.stack([columns * full_width / file_shape[1], rows * full_height / file_shape[0]], -1).reshape(-1, 1, 2)
-    if not original.is_bent(i):
-        fx, fy, cx, cy = original.intrinsics[i]
-        return (at[:, 0, 0] - cx) / fx, (at[:, 0, 1] - cy) / fy
-    straighten = cv2.fisheye.undistortPoints if original.is_fisheye(i) else cv2.undistortPoints
-    tangents = straighten(at, camera_matrix(original.intrinsics[i]), original.distortion[i])[:, 0]
-    return np.asarray(tangents[:, 0], np.float64), np.asarray(tangents[:, 1], np.float64)
+    original: PosedImages, i: int, shape: tuple[int, int], file_shape: tuple[int, int], some: slice | None = None
+) -> NDArray[np.float64]:
+    """Tangents (right, down) at which a training image's pixels look, lens taken out; of some rows. [2, H, W]"""
+    lens = tuple(original.distortion[i]) if original.is_bent(i) else ()
+    camera = tuple(original.sizes[i]), tuple(original.intrinsics[i]), lens, original.is_fisheye(i)
+    parts = [
+        _straightened_rows(*camera, shape[1], file_shape, rows.start, rows.stop)
+        for rows in ([some] if some else strips(shape))
+    ]
+    return parts[0] if some else np.concatenate(parts, 1)
+
+
+@lru_cache(maxsize=32)
+def _straightened_rows(
+    size: tuple[float, float],
+    pinhole: tuple[float, ...],
+    lens: tuple[float, ...],
+    fisheye: bool,
+    width: int,
+    file_shape: tuple[int, int],
+    first: int,
+    last: int,
+) -> NDArray[np.float64]:
+    """The same of a strip of rows: cameras of one lens share them."""
+    columns, rows = np.meshgrid(np.arange(width) + 0.5, np.arange(first, last) + 0.5)
+    at = np.stack([columns * size[0] / file_shape[1], rows * size[1] / file_shape[0]], -1).reshape(-1, 1, 2)
+    fx, fy, cx, cy = pinhole
+    if lens:
+        straighten = cv2.fisheye.undistortPoints if fisheye else cv2.undistortPoints
+        tangents = straighten(at, camera_matrix(np.array(pinhole)), np.array(lens))
+    else:
+        tangents = (at - [cx, cy]) / [fx, fy]
+    return np.ascontiguousarray(np.moveaxis(tangents.reshape(*columns.shape, 2), -1, 0), np.float64)
 
 
 def with_continued(known: KnownDepth, posed: PosedImages, dataset: MMPIDataset, rays: Rays) -> KnownDepth:
@@ -321,8 +343,7 @@ def _continued_codes(codes: Codes, i: int, posed: PosedImages, dataset: MMPIData
     extended[down[seen], across[seen]] = 0
     for first, fine in zip(range(0, len(codes), step), packed(extended), strict=True):
         part = codes[first : first + step]
-        unknown = part[..., 0] == UNKNOWN
-        part[unknown] = np.broadcast_to(np.repeat(fine, step, 0)[: part.shape[1]], part.shape)[unknown]
+        np.copyto(part, np.repeat(fine, step, 0)[: part.shape[1]], where=part[..., :1] == UNKNOWN)
     codes[hidden] = UNKNOWN
     return codes
 
@@ -334,27 +355,27 @@ def of_cells(observations: Observations, known: KnownDepth, dataset: MMPIDataset
     draw MPIs and texels to the parts of the images that an SfM model or a cloud is densest in. Where no depth is known
     at all, the observations stay as they are.
     """
-    seen_by, points = [observations.seen_by[:0]], [observations.points[:0]]
-    for i in range(len(known.codes)):
+
+    def points_of(i: int) -> NDArray[np.float64]:
         depth = known.image(i)
         rows, columns = best_of_cells(depth)
-        if not len(rows):
-            continue
         coords = torch.from_numpy(np.stack([rows, columns], -1) + 0.5).float()
         rays = dataset.cameras.generate_rays(torch.full((len(rows), 1), i), coords=coords)
-        seen_by.append(np.full(len(rows), i))
-        points.append(observations.centers[i] + rays.directions.double().numpy() / depth[rows, columns, :1])
+        return observations.centers[i] + rays.directions.double().numpy() / depth[rows, columns, :1]
+
+    points = list(in_order(points_of, range(len(known.codes))))
     cells = np.concatenate(points)
     if not len(cells):
         return observations
     if len(observations.seen_by) > MOST_KEYPOINTS * len(cells):
         observations = replace(
-            observations, points=points[0], seen_by=seen_by[0], seen_point=seen_by[0], seen_at=observations.seen_at[:0]
-        )
+            observations, points=cells[:0], seen_at=observations.seen_at[:0],
+            seen_by=observations.seen_by[:0], seen_point=observations.seen_point[:0],
+        )  # fmt: skip
     return replace(
         observations,
         points=np.concatenate([observations.points, cells]),
-        seen_by=np.concatenate([observations.seen_by, *seen_by]),
+        seen_by=np.concatenate([observations.seen_by, np.repeat(np.arange(len(points)), [len(p) for p in points])]),
         seen_point=np.concatenate([observations.seen_point, len(observations.points) + np.arange(len(cells))]),
     )
 
@@ -409,7 +430,7 @@ def read_sensor(
     depth = read_depth_image(file, unit)
     nearest = cv2.resize(depth, file_shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT)[: shape[0], : shape[1]]
     x, y = straightened(original, i, shape, file_shape)
-    longer = np.sqrt(x**2 + y**2 + 1).reshape(shape)
+    longer = np.sqrt(x**2 + y**2 + 1)
     hit = np.isfinite(nearest) & (nearest > 0)
     inverse = np.where(hit, 1 / (np.where(hit, nearest, 1) * longer), 0)
     return np.stack([inverse, SENSOR_ERROR * inverse], -1).astype(np.float32)

@@ -8,6 +8,8 @@ for any lens. So w.v is fitted to the inverse distances of the known pixels arou
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -50,15 +52,14 @@ def continued(depths: Map, directions: Map) -> Map:
     if not has_depth.any():
         return extended
     scale = float(np.median(inverse[has_depth]))
-    q, v = inverse / scale, directions.astype(np.float64)
+    q, v = inverse / scale, np.moveaxis(directions, -1, 0).astype(np.float64, order="C")
     trust = np.where(has_depth, 1 / (1 + (error / np.maximum(LEAST_ERROR * inverse, 1e-30)) ** 2), 0)
-    parts = [trust, trust * q * q, *(trust * q * v[..., i] for i in range(3))]
-    parts += [trust * v[..., i] * v[..., j] for i, j in _PAIRS]
+    parts = [trust, trust * q * q, *(trust * q * axis for axis in v)]
+    parts += [trust * v[i] * v[j] for i, j in _PAIRS]
     for share in WIDTHS:
         sums = [_blurred(p, share * max(inverse.shape)) for p in parts]
-        rows, columns = np.nonzero(~has_depth & (sums[0] > ENOUGH))
-        at = np.stack([s[rows, columns] for s in sums], -1)
-        value, deviation = _planes(at, v[rows, columns])
+        rows, columns = np.nonzero((sums[0] > ENOUGH) & (best > LEAST_ERROR))
+        value, deviation = _planes([s[rows, columns] for s in sums], [axis[rows, columns] for axis in v])
         relative = np.where(value > 0, np.maximum(deviation / np.maximum(value, 1e-12), LEAST_ERROR), np.inf)
         good = relative < best[rows, columns]
         rows, columns, value, relative = rows[good], columns[good], value[good], relative[good]
@@ -81,23 +82,31 @@ _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
 def _planes(
-    sums: NDArray[np.float64], directions: NDArray[np.float64]
+    sums: Sequence[NDArray[np.float64]], directions: Sequence[NDArray[np.float64]]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Of w.v fitted to pixels by sums [P, 11] of weights, w q^2, w q v (3) and w v v^T (6, ``_PAIRS``): q along
-    directions [P, 3], and its expected error, the scatter about the plane, larger the farther it is extrapolated."""
-    mean = sums / sums[:, :1]
-    matrix = np.empty((3, len(sums), 3))
-    for n, (i, j) in enumerate(_PAIRS):
-        matrix[i, :, j] = matrix[j, :, i] = mean[:, 5 + n]
-    matrix += 1e-7 * np.eye(3)[:, None]
-    # In closed form: LAPACK takes these one by one, and where OpenBLAS has several threads each waits for all of them.
-    cofactors = np.stack([np.cross(matrix[n - 2], matrix[n - 1]) for n in range(3)])
-    inverse = cofactors / (matrix[0] * cofactors[0]).sum(-1, keepdims=True)
-    plane, spread = (np.einsum("ipj,pj->pi", inverse, right) for right in (mean[:, 2:5], directions))
-    scatter = np.maximum(mean[:, 1] - (plane * mean[:, 2:5]).sum(-1), 0)
-    leverage = np.maximum((spread * directions).sum(-1), 1)
-    value = (plane * directions).sum(-1)
+    """Of w.v fitted to pixels by sums [P] of weights, w q^2, w q v (3) and w v v^T (6, ``_PAIRS``): q along directions,
+    their three parts [P], and its expected error, the scatter about the plane, larger the farther extrapolated."""
+    _, squares, *right, xx, xy, xz, yy, yz, zz = (part / sums[0] for part in sums)
+    xx, yy, zz = xx + 1e-7, yy + 1e-7, zz + 1e-7
+    # In closed form, part by part: LAPACK takes matrices one by one, and NumPy is slow along short axes.
+    cofactors = (
+        (yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy),
+        (xz * yz - xy * zz, xx * zz - xz * xz, xy * xz - xx * yz),
+        (xy * yz - xz * yy, xy * xz - xx * yz, xx * yy - xy * xy),
+    )
+    determinant = xx * cofactors[0][0] + xy * cofactors[0][1] + xz * cofactors[0][2]
+
+    def solved(vector: Sequence[NDArray[np.float64]]) -> list[NDArray[np.float64]]:
+        return [_dot(row, vector) / determinant for row in cofactors]
+
+    plane, spread = solved(right), solved(directions)
+    scatter, value = np.maximum(squares - _dot(plane, right), 0), _dot(plane, directions)
+    leverage = np.maximum(_dot(spread, directions), 1)
     return value, np.sqrt((scatter + (0.2 * LEAST_ERROR * value) ** 2) * leverage)
+
+
+def _dot(a: Sequence[NDArray[np.float64]], b: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def is_lone(posed: PosedImages, i: int, points: NDArray[np.float64]) -> NDArray[np.bool_]:

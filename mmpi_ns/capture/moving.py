@@ -21,7 +21,7 @@ from mmpi_ns.capture.cache import Arrays, Computed, digest, remembered
 from mmpi_ns.capture.dataset import MMPIDataset
 from mmpi_ns.capture.dense import Depth, Parallax, Progress, find_depths
 from mmpi_ns.capture.known_depth import straightened
-from mmpi_ns.capture.moving_evidence import Bytes, Mask, Shot, evidence, ground_of, has_impossible_depth
+from mmpi_ns.capture.moving_evidence import Mask, Neighbour, Shot, evidence, ground_of, has_impossible_depth
 from mmpi_ns.capture.moving_objects import followed, grown, seeds
 from mmpi_ns.capture.observe import posed_images
 from mmpi_ns.capture.tracks import PosedImages, at_full_size
@@ -37,16 +37,18 @@ RANKS = (0, 1, 2, 3, 5, 8)
 """Neighbours that an image is compared with, by nearness: farther ones see what something slow hides from near ones."""
 MAX_ANGLE = 40.0
 """Degrees between the facing directions of images that are compared."""
+ROUNDS = (2, 1)
+"""Of dense matching: at half the size, then at that size."""
 AFTER = 2
 """Nearest neighbours from which objects are followed."""
 EDGE = 0.4
 """Share of a mover around a pixel from which it is masked."""
-SECONDS = 0.4
+SECONDS = 0.3
 """Processor seconds for an image, for the forecast (docs/log/performance.md)."""
-VERSION = 2
+VERSION = 3
 """Version of the algorithm: cached masks of another version are found anew."""
-ENOUGH = 200
-"""Pixels of one depth in both images from which their exposures are compared."""
+ENOUGH, SAMPLES = 200, 5000
+"""Pixels of one depth in both images from which their exposures are compared, at least and at most."""
 
 
 @dataclass(frozen=True)
@@ -75,10 +77,13 @@ def find_moving(
         progress: wraps the images as they are worked on.
     """
     width = round(SIDE * float(np.median(np.minimum(1, images.sizes[:, 0] / images.sizes[:, 1]))))
-    pairs = find_depths(images, points_of, width, progress=progress)
     up = images.camera_to_worlds[:, :, 1].mean(0)
     up /= max(float(np.linalg.norm(up)), 1e-12)
-    shots = [shot_of(images, i, view, depth, up) for i, (view, depth) in enumerate(pairs)]
+
+    def finish(i: int, view: View, depth: Depth) -> Shot:
+        return shot_of(images, i, view, depth, up)
+
+    shots = list(find_depths(images, points_of, width, finish, progress, ROUNDS))
     near = []
     for i in range(len(shots)):
         nearest = nearest_views(images.camera_to_worlds, i, RANKS[-1] + 1, MAX_ANGLE)
@@ -87,7 +92,7 @@ def find_moving(
     with one_thread_each(), ThreadPoolExecutor(num_threads()) as pool:
         first = list(pool.map(lambda i: _moves(shots, near[i], i, masks, None), range(len(shots))))
         masks = [mask for mask, _ in first]
-        again = [i for i in range(len(shots)) if any(masks[j].any() for j in (i, *near[i]))]
+        again = [i for i in range(len(shots)) if any(masks[j].any() for j in near[i])]
         second = list(pool.map(lambda i: _moves(shots, near[i], i, masks, first[i][1]), again))
         for i, (mask, _) in zip(again, second, strict=True):
             masks[i] = mask
@@ -106,8 +111,7 @@ def in_image(view: View, mask: Mask, images: PosedImages, i: int, shape: tuple[i
     """
     x, y = straightened(images, i, shape, shape)
     fx, fy, cx, cy = view.pinhole
-    at = ((fx * x + cx).reshape(shape), (fy * y + cy).reshape(shape))
-    return look_up(mask.astype(np.float32), *at) > EDGE
+    return look_up(mask.astype(np.float32), fx * x + cx, fy * y + cy) > EDGE
 
 
 def moving_masks(observations: Observations, dataset: MMPIDataset) -> Sequence[Mask]:
@@ -168,31 +172,35 @@ def shot_of(images: PosedImages, i: int, view: View, depth: Depth, up: NDArray[n
     return Shot(view, np.asarray(color, np.uint8), depth, ground, horizon)
 
 
-def at_exposure_of(shot: Shot, other: Shot) -> Bytes:
-    """Colours of another shot at the exposure of this one, by what both show at one depth. [h, w, 3]"""
-    inverse = shot.depth.inverse
-    x, y, ahead = Parallax.between(shot.view, other.view).pixels(inverse)
+def at_exposure_of(shot: Shot, other: Shot) -> Neighbour:
+    """Another shot with its colours at the exposure of this one, by what both show at one depth."""
+    inverse, parallax = shot.depth.inverse, Parallax.between(shot.view, other.view)
+    x, y, ahead = parallax.pixels(inverse)
     theirs = look_up(other.depth.inverse, x, y, nearest=True)
     same = (inverse > 0) & (ahead > 0) & (np.abs(theirs * ahead - inverse) < 0.05 * inverse)
-    if same.sum() < ENOUGH:
-        return other.color
-    logarithms = [np.log(c[same] + 2.0) for c in (shot.color, look_up(other.color, x, y))]
+    rows, columns = np.nonzero(same)
+    if len(rows) < ENOUGH:
+        return Neighbour(other, other.color, parallax)
+    some = np.s_[:: -(-len(rows) // SAMPLES)]
+    rows, columns = rows[some], columns[some]
+    theirs = look_up(other.color, x[rows, columns], y[rows, columns])
+    logarithms = [np.log(c + 2.0) for c in (shot.color[rows, columns], theirs)]
     gain = np.exp(np.median(logarithms[0] - logarithms[1], 0))
-    return np.rint(other.color * gain).clip(0, 255).astype(np.uint8)
+    return Neighbour(other, np.rint(other.color * gain).clip(0, 255).astype(np.uint8), parallax)
 
 
 def _moves(
     shots: Sequence[Shot], near: Sequence[int], i: int, masks: Sequence[Mask], impossible: Mask | None
 ) -> tuple[Mask, Mask]:
     """What moves in an image, where it is known what moves in others, and where it has impossible depths."""
-    shot, others = shots[i], [shots[j] for j in near]
-    colors = [at_exposure_of(shot, other) for other in others]
+    shot = shots[i]
+    others = [at_exposure_of(shot, shots[j]) for j in near]
     if impossible is None:
-        impossible = has_impossible_depth(shot, others, colors)
-    shown = evidence(shot, others, colors, [masks[j] for j in near], impossible)
+        impossible = has_impossible_depth(shot, others)
+    shown = evidence(shot, others, [masks[j] for j in near], impossible)
     core = np.zeros(shot.view.gray.shape, bool)
     if len(others) >= 2:
-        core |= seeds(shot, others, colors, shown)
+        core |= seeds(shot, others, shown)
         flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
         for j in near[:AFTER]:
             if masks[j].any():

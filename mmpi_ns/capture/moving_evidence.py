@@ -133,11 +133,8 @@ def splat(shot: Shot, other: Shot) -> Map:
     x, y, ahead = Parallax.between(other.view, shot.view).pixels(other.depth.inverse)
     inverse = np.where(ahead > 0, other.depth.inverse / np.where(ahead > 0, ahead, 1), 0)
     inside = (x >= 0) & (x < width) & (y >= 0) & (y < height) & (inverse > 0)
-    values = inverse[inside]
-    order = np.argsort(values, kind="stable")
-    at = (y[inside].astype(int) * width + x[inside].astype(int))[order]
     result = np.zeros(height * width, np.float32)
-    result[at] = values[order]  # the last one written stays
+    np.maximum.at(result, y[inside].astype(int) * width + x[inside].astype(int), inverse[inside])
     result = result.reshape(height, width)
     for _ in range(2):
         result = np.where(result > 0, result, cv2.dilate(result, np.ones((3, 3), np.uint8)))
@@ -155,10 +152,10 @@ def nearest_known(inverse: Map) -> Map:
     return table[np.asarray(label, np.int64)]
 
 
-def possible_depths(shot: Shot, others: Sequence[Shot]) -> tuple[list[Map], list[Map]]:
+def possible_depths(shot: Shot, others: Sequence[Neighbour]) -> tuple[list[Map], list[Map]]:
     """Inverse depths that a static point may have, 0 where there is none: those from the image itself, and those of
     surfaces that other images or the ground put there."""
-    splats = np.stack([splat(shot, other) for other in others])
+    splats = np.stack([splat(shot, other.shot) for other in others])
     farthest = np.where(splats > 0, splats, np.inf).min(0)
     behind = [np.where(np.isfinite(farthest), farthest, 0).astype(np.float32), splats.max(0)]
     if shot.ground is not None:
@@ -170,33 +167,39 @@ def possible_depths(shot: Shot, others: Sequence[Shot]) -> tuple[list[Map], list
 
 
 @dataclass(frozen=True)
-class _Comparison:
-    """A shot against its neighbours at some inverse depths."""
+class Neighbour:
+    """Another image as it is compared with a shot."""
 
-    distance: Bytes
-    """Levels by which colours differ, ALL where the neighbour shows nothing, the smallest first. [n, h, w]"""
-    pair: Bytes
-    """Levels by which a shot differs from both of two neighbours that agree and have nothing in front. [h, w]"""
+    shot: Shot
+    color: Bytes
+    """At the exposure of the shot. [h, w, 3]"""
+    parallax: Parallax
+    """From the shot."""
 
 
 def _compare(
-    shot: Shot, others: Sequence[Shot], colors: Sequence[Bytes], masks: Sequence[Mask | None], inverse: Map, pairs: bool
-) -> _Comparison:
+    shot: Shot, others: Sequence[Neighbour], masks: Sequence[Mask | None], inverse: Map, pairs: bool
+) -> tuple[list[Bytes], Bytes]:
+    """A shot against its neighbours at some inverse depths.
+
+    Returns:
+        Levels by which the colours of each neighbour differ, ALL where it shows nothing. [h, w] each
+        Levels by which the shot differs from both of two neighbours that agree and have nothing in front. [h, w]
+    """
     kernel, three = np.ones((3, 3), np.uint8), shot.color
     distances, warped, free = [], [], []
-    for other, color, mask in zip(others, colors, masks, strict=True):
-        x, y, ahead = Parallax.between(shot.view, other.view).pixels(inverse)
-        height, width = other.view.gray.shape
+    for other, mask in zip(others, masks, strict=True):
+        x, y, ahead = other.parallax.pixels(inverse)
+        height, width = other.shot.view.gray.shape
         inside = (x > 1) & (x < width - 1) & (y > 1) & (y < height - 1) & (ahead > 0)
-        shown = look_up(usable(other, mask), x, y, nearest=True) > 0
-        inside &= shown
-        there = look_up(color, x, y)
+        inside &= look_up(usable(other.shot, mask), x, y, nearest=True) > 0
+        there = look_up(other.color, x, y)
         low, high = cv2.erode(there, kernel), cv2.dilate(there, kernel)
         apart = most_of_channels(cv2.max(cv2.subtract(low, three), cv2.subtract(three, high)))
         apart = np.asarray(cv2.blur(np.minimum(apart, CLEARLY), (WINDOW, WINDOW)))
         distances.append(np.where(inside, apart, ALL).astype(np.uint8))
         if pairs:
-            theirs = look_up(other.around, x, y, nearest=True) * ahead
+            theirs = look_up(other.shot.around, x, y, nearest=True) * ahead
             free.append(inside & (theirs <= OCCLUDES * inverse) & (theirs * OCCLUDES >= inverse))
             warped.append(there)
     pair = np.zeros(inverse.shape, np.uint8)
@@ -205,7 +208,7 @@ def _compare(
             agree = free[a] & free[b] & (most_of_channels(cv2.absdiff(warped[a], warped[b])) < SAME)
             away = cv2.min(distances[a], distances[b])
             pair = np.maximum(pair, np.where(agree, away, 0)).astype(np.uint8)
-    return _Comparison(np.sort(np.stack(distances), 0), pair)
+    return distances, pair
 
 
 def most_of_channels(apart: NDArray[Any]) -> Bytes:
@@ -220,25 +223,23 @@ def usable(shot: Shot, mask: Mask | None) -> Bytes:
     return np.ascontiguousarray(inside, np.uint8)
 
 
-def has_impossible_depth(shot: Shot, others: Sequence[Shot], colors: Sequence[Bytes]) -> Mask:
+def has_impossible_depth(shot: Shot, others: Sequence[Neighbour]) -> Mask:
     """Where a depth below the ground or behind the camera explains a shot's pixels, of these neighbours. [h, w]"""
     result = np.zeros(shot.view.gray.shape, bool)
     for share in IMPOSSIBLE if shot.ground is not None and others else ():
         inverse = share * shot.ground - 1e-9  # type: ignore[operator]
-        distance = _compare(shot, others, colors, [None] * len(others), inverse, False).distance
-        result |= (distance[min(CONSTANT, len(others)) - 1] < ALIKE) & (shot.ground > 0)  # type: ignore[operator]
+        distances, _ = _compare(shot, others, [None] * len(others), inverse, False)
+        alike = np.sum([distance < ALIKE for distance in distances], 0, np.uint8)
+        result |= (alike >= min(CONSTANT, len(others))) & (shot.ground > 0)  # type: ignore[operator]
     return result
 
 
-def evidence(
-    shot: Shot, others: Sequence[Shot], colors: Sequence[Bytes], masks: Sequence[Mask | None], impossible: Mask
-) -> Evidence:
+def evidence(shot: Shot, others: Sequence[Neighbour], masks: Sequence[Mask | None], impossible: Mask) -> Evidence:
     """What of a shot no static scene explains.
 
     Args:
         shot: the image.
         others: its neighbours.
-        colors: of each neighbour, at this image's exposure. [h, w, 3]
         masks: what moves in each neighbour, as far as is known. [h, w]
         impossible: by ``has_impossible_depth``. [h, w]
     """
@@ -249,13 +250,17 @@ def evidence(
     one, two, behind = np.full(shape, ALL, np.uint8), np.full(shape, ALL, np.uint8), np.zeros(shape, np.uint8)
     mine, surfaces = possible_depths(shot, others)
     for n, inverse in enumerate(mine + surfaces):
-        compared = _compare(shot, others, colors, masks, inverse, n >= len(mine))
+        distances, pair = _compare(shot, others, masks, inverse, n >= len(mine))
         possible = inverse > 0
         if shot.ground is not None:
             possible &= inverse >= SOLID * shot.ground
-        one = np.where(possible, np.minimum(one, compared.distance[0]), one)
-        two = np.where(possible, np.minimum(two, compared.distance[1]), two)
-        behind = np.where(possible, np.maximum(behind, compared.pair), behind)
+        first, second = np.full((2, *shape), ALL, np.uint8)
+        for distance in distances:
+            second = cv2.min(second, cv2.max(first, distance))
+            first = cv2.min(first, distance)
+        for nearest, of_depth in ((one, first), (two, second)):
+            np.minimum(nearest, of_depth, out=nearest, where=possible)
+        np.maximum(behind, pair, out=behind, where=possible)
     decided = _would_be_seen(shot, others) & shot.view.inside
     strong = np.where(decided & (one < ALL), np.minimum(one, np.where(impossible, ALL, behind)), 0).astype(np.uint8)
     weak = np.where(decided & (two < ALL), np.minimum(two, behind), 0).astype(np.uint8)
@@ -263,13 +268,13 @@ def evidence(
     return Evidence(strong, weak, behind, float(np.percentile(differences, NOISE)) if len(differences) else 0.0)
 
 
-def _would_be_seen(shot: Shot, others: Sequence[Shot]) -> Mask:
+def _would_be_seen(shot: Shot, others: Sequence[Neighbour]) -> Mask:
     """Where at least two neighbours would show even the nearest content: elsewhere nobody can tell. [h, w]"""
     measured = shot.depth.inverse[shot.depth.inverse > 0]
     nearest = np.full(shot.view.gray.shape, np.percentile(measured, NEAREST) if len(measured) else 0, np.float32)
     count = np.zeros(nearest.shape, np.uint8)
     for other in others:
-        x, y, ahead = Parallax.between(shot.view, other.view).pixels(nearest)
-        height, width = other.view.gray.shape
+        x, y, ahead = other.parallax.pixels(nearest)
+        height, width = other.shot.view.gray.shape
         count += (x > 0) & (x < width) & (y > 0) & (y < height) & (ahead > 0)
     return count >= 2

@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mmpi_ns.capture.dense import Parallax, correlation
-from mmpi_ns.capture.moving_evidence import ALL, SOLID, Bytes, Evidence, Mask, Shot
+from mmpi_ns.capture.dense import correlation, mean_and_contrast
+from mmpi_ns.capture.moving_evidence import ALL, SOLID, Evidence, Mask, Neighbour, Shot
 from mmpi_ns.capture.views import look_up, pixel_grid
 
 LEAST_LEVELS, NOISES = 12.0, 4.0
@@ -38,17 +38,17 @@ FOLLOWED = 0.7
 """Correlation with the neighbour from which an object is followed."""
 
 
-def seeds(shot: Shot, others: Sequence[Shot], colors: Sequence[Bytes], evidence: Evidence) -> Mask:
+def seeds(shot: Shot, others: Sequence[Neighbour], evidence: Evidence) -> Mask:
     """Pixels that show something that moves, beyond doubt. [h, w]"""
     least = LEAST_LEVELS + NOISES * evidence.noise
     candidates = (evidence.strong > least) | (evidence.weak > WEAKER * least)
     result = candidates.copy()
-    result[candidates] = unexplained(shot, others, colors, candidates) > least
+    result[candidates] = unexplained(shot, others, candidates) > least
     share = cv2.boxFilter(result.astype(np.float32), -1, (AROUND, AROUND))
     return result & (share > DENSITY)
 
 
-def unexplained(shot: Shot, others: Sequence[Shot], colors: Sequence[Bytes], candidates: Mask) -> NDArray[np.uint8]:
+def unexplained(shot: Shot, others: Sequence[Neighbour], candidates: Mask) -> NDArray[np.uint8]:
     """Levels by which some pixels differ from all neighbours but one, at the depth where they differ least. [P]
 
     0 where two neighbours show nothing at one of the depths: nobody can tell.
@@ -62,18 +62,17 @@ def unexplained(shot: Shot, others: Sequence[Shot], colors: Sequence[Bytes], can
         inverse = np.maximum(inverse, SOLID * shot.ground[rows, columns])
     color, kernel = shot.color[rows, columns].astype(np.int16), np.ones((3, 3), np.uint8)
     distances = []
-    for other, theirs in zip(others, colors, strict=True):
-        parallax = Parallax.between(shot.view, other.view)
+    for other in others:
         right, down, ahead = (
             (m[0] * (columns + 0.5) + m[1] * (rows + 0.5) + m[2]).astype(np.float32) + inverse * b
-            for m, b in zip(parallax.linear, parallax.b, strict=True)
+            for m, b in zip(other.parallax.linear, other.parallax.b, strict=True)
         )
-        height, width = other.view.gray.shape
+        height, width = other.shot.view.gray.shape
         ahead = np.where(ahead > 1e-6, ahead, np.nan)
         with np.errstate(invalid="ignore"):
             inside = (right >= ahead) & (right < (width - 1) * ahead) & (down >= ahead) & (down < (height - 1) * ahead)
         x, y = (np.where(inside, part / ahead, 0).astype(np.int32) for part in (right, down))
-        low, high = cv2.erode(theirs, kernel)[y, x].astype(np.int16), cv2.dilate(theirs, kernel)[y, x]
+        low, high = cv2.erode(other.color, kernel)[y, x].astype(np.int16), cv2.dilate(other.color, kernel)[y, x]
         apart = np.maximum(low - color, color - high).max(-1).clip(0, ALL - 1)
         distances.append(np.where(inside, apart, ALL).astype(np.uint8))
     ordered = np.sort(np.stack(distances), 0)
@@ -161,5 +160,5 @@ def followed(shot: Shot, other: Shot, mask: Mask, flow: cv2.DISOpticalFlow) -> M
     x, y = pixel_grid(shape)
     at = x + there[..., 0], y + there[..., 1]
     returned = np.abs(there + look_up(back, *at)).max(-1) < 1.5
-    alike, _ = correlation(shot.view.gray, look_up(other.view.gray, *at))
+    alike = correlation(shot.view.gray, look_up(other.view.gray, *at), mean_and_contrast(shot.view.gray))
     return returned & (alike > FOLLOWED) & (look_up(mask.astype(np.uint8), *at, nearest=True) > 0)

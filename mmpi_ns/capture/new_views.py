@@ -9,17 +9,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from typing import Any
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from nerfstudio.cameras.rays import RayBundle
+from numpy import ndarray
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mmpi_ns.capture.cache import images_held
+from mmpi_ns.capture.cache import held
 from mmpi_ns.capture.dataset import MMPIDataset
 from mmpi_ns.capture.dense import TRIMMED
 from mmpi_ns.capture.known_depth import KnownDepth
@@ -28,6 +29,7 @@ from mmpi_ns.capture.tracks import PosedImages
 from mmpi_ns.capture.views import look_up, project
 from mmpi_ns.scene.near_views import nearest_views
 from mmpi_ns.utils.host import give_back_freed_memory
+from mmpi_ns.utils.parallel import in_order
 
 NEIGHBOURS = 4
 """Number of cameras, the nearest facing the same way, in which a point of an image is searched."""
@@ -39,8 +41,8 @@ SAME_DEPTH = 0.03
 """Maximum relative difference between the distances of a point in two images."""
 SAME_COLOR = 24
 """Tolerance, in levels, beyond the range of colours within a pixel of the projection in the other image."""
-BYTES_OF_IMAGE = 12
-"""Of a pixel of an image with its mask and depths."""
+BYTES_OF_IMAGE = 18
+"""Of a pixel of an image with the range of colours around, its mask and depths."""
 MOST = 2_000_000
 """Maximum number of pixel pairs (30 bytes each), spread over the images."""
 
@@ -99,6 +101,44 @@ class SharedPoints:
         return bundle, torch.lerp(colors[:, 0], colors[:, 1], share), depths / torch.cat([length, length**2], -1)
 
 
+@dataclass(frozen=True)
+class ShownImage:
+    """An image prepared for comparison with others."""
+
+    image: UInt8[ndarray, "H W C"]
+    darkest: UInt8[ndarray, "H W C"]
+    """Of the pixels around,"""
+    brightest: UInt8[ndarray, "H W C"]
+    """and the brightest."""
+    usable: UInt8[ndarray, "H W"]
+    depth: Float[ndarray, "H W 2"]
+
+    @staticmethod
+    def of(image: UInt8[ndarray, "H W C"], usable: UInt8[ndarray, "H W"], depth: Float[ndarray, "H W 2"]) -> ShownImage:
+        around = np.ones((3, 3), np.uint8)
+        darkest, brightest = (np.asarray(bound(image, around), np.uint8) for bound in (cv2.erode, cv2.dilate))
+        return ShownImage(image, darkest, brightest, usable, depth)
+
+    @property
+    def certain(self) -> Bool[ndarray, "H W"]:
+        """Pixels whose depth is known well."""
+        inverse, error = self.depth[..., 0], self.depth[..., 1]
+        return (inverse > 0) & (error < CERTAIN * inverse) & (self.usable > 0)
+
+    def shows(
+        self, posed: PosedImages, j: int, points: Float[ndarray, "P 3"], colors: Float[ndarray, "P C"]
+    ) -> tuple[Int[ndarray, "S"], UInt8[ndarray, "S C"]]:
+        """Which points image j, this one, shows at their distance and with about their colours, and its colours."""
+        at = project(posed, j, points)
+        maps = self.depth[..., 0], self.usable, self.darkest, self.brightest
+        inverse, may, darkest, brightest = (look_up(m, *at.T, nearest=True) for m in maps)
+        expected = 1 / np.maximum(np.linalg.norm(points - posed.camera_to_worlds[j, :, 3], axis=-1), 1e-12)
+        same_depth = (inverse > 0) & (np.abs(inverse - expected) < SAME_DEPTH * expected)
+        low, high = darkest.astype(int) - SAME_COLOR, brightest.astype(int) + SAME_COLOR
+        seen = np.nonzero(same_depth & ((colors >= low) & (colors <= high)).all(-1) & (may > 0))[0]
+        return seen, look_up(self.image, *at[seen].T)
+
+
 def find_shared_points(
     dataset: MMPIDataset,
     posed: PosedImages,
@@ -124,35 +164,41 @@ def find_shared_points(
     Raises:
         InputError: an image or mask cannot be used (names the file).
     """
-    show = lru_cache(images_held(posed.sizes, BYTES_OF_IMAGE, NEIGHBOURS + 1))(
-        lambda i: (*image_and_mask(dataset, i), known.image(i))
-    )  # neighbours mostly stand side by side
-    rng, parts, matches = np.random.default_rng(seed), [], 0.0
+    # Neighbours mostly stand side by side.
+    show = held(
+        lambda i: ShownImage.of(*image_and_mask(dataset, i), known.image(i)),
+        posed.sizes, BYTES_OF_IMAGE, NEIGHBOURS + 1,
+    )  # fmt: skip
     budget = max(1, MOST // (NEIGHBOURS * max(1, len(images))))
-    for n, i in enumerate(images):
-        if n % TRIMMED == 0:
-            give_back_freed_memory()
-        image, usable, measured = show(i)
-        certain = (measured[..., 0] > 0) & (measured[..., 1] < CERTAIN * measured[..., 0]) & (usable > 0)
-        rows, columns = np.nonzero(certain)
+
+    def shared(i: int) -> tuple[list[tuple[Any, ...]], float]:
+        parts, matches, shown = [], 0.0, show(i)
+        rows, columns = np.nonzero(shown.certain)
         count = len(rows)
         if count > budget:
-            chosen = np.sort(rng.choice(count, budget, replace=False))
+            chosen = np.sort(np.random.default_rng((seed, i)).choice(count, budget, replace=False))
             rows, columns = rows[chosen], columns[chosen]
         if not len(rows):
-            continue
+            return parts, matches
         pixels = torch.from_numpy(np.stack([np.full(len(rows), i), rows, columns], -1))
         directions = rays(pixels.to(device)).directions.double().cpu().numpy()
-        depths, shown = measured[rows, columns], image[rows, columns]
+        depths, colors = shown.depth[rows, columns], shown.image[rows, columns]
         points = posed.camera_to_worlds[i, :, 3] + directions / depths[:, :1]
         for j in nearest_views(posed.camera_to_worlds, i, NEIGHBOURS, MAX_ANGLE, images):
-            expected = shown.astype(np.float32)
+            expected = colors.astype(np.float32)
             if exposures is not None:
                 expected[:, :3] *= (exposures[j] / exposures[i]).cpu().numpy()
-            seen, colors = _seen_by(posed, j, points, expected.clip(0, 255), *show(j))
+            seen, theirs = show(j).shows(posed, j, points, expected.clip(0, 255))
             matches += len(seen) * count / len(rows)
-            both = np.stack([shown[seen], colors], 1)
-            parts.append((pixels[seen].int(), torch.full((len(colors),), j, dtype=torch.int32), both, depths[seen]))
+            both, other = np.stack([colors[seen], theirs], 1), torch.full((len(seen),), j, dtype=torch.int32)
+            parts.append((pixels[seen].int(), other, both, depths[seen]))
+        return parts, matches
+
+    parts, matches = [], 0.0
+    for n, (some, number) in enumerate(in_order(shared, images)):
+        parts, matches = parts + some, matches + number
+        if n % TRIMMED == 0:
+            give_back_freed_memory()
     if matches == 0:
         return None
     pixels, other = (torch.cat([part[n] for part in parts]) for n in (0, 1))
@@ -173,26 +219,3 @@ def image_and_mask(dataset: MMPIDataset, i: int) -> tuple[NDArray[np.uint8], NDA
     elif dataset.has_alpha:
         image = np.concatenate([image, np.full_like(image[..., :1], 255)], -1)
     return image, usable
-
-
-def _seen_by(
-    posed: PosedImages,
-    j: int,
-    points: NDArray[np.float64],
-    colors: NDArray[np.float32],
-    image: NDArray[np.uint8],
-    usable: NDArray[np.uint8],
-    depth: NDArray[np.float32],
-) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
-    """Which points an image shows at their distance and with about their colours, and the colours there."""
-    at = project(posed, j, points)
-    about = np.ones((3, 3), np.uint8)
-    inverse, may, darkest, brightest = (
-        look_up(m, *at.T, nearest=True)
-        for m in (depth[..., 0], usable, cv2.erode(image, about), cv2.dilate(image, about))
-    )
-    expected = 1 / np.maximum(np.linalg.norm(points - posed.camera_to_worlds[j, :, 3], axis=-1), 1e-12)
-    same_depth = (inverse > 0) & (np.abs(inverse - expected) < SAME_DEPTH * expected)
-    low, high = darkest.astype(int) - SAME_COLOR, brightest.astype(int) + SAME_COLOR
-    seen = np.nonzero(same_depth & ((colors >= low) & (colors <= high)).all(-1) & (may > 0))[0]
-    return seen, look_up(image, *at[seen].T)

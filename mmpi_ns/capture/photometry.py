@@ -17,7 +17,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -27,7 +26,7 @@ from numpy import ndarray
 from numpy.typing import NDArray
 from scipy import sparse
 
-from mmpi_ns.capture.cache import images_held
+from mmpi_ns.capture.cache import held
 from mmpi_ns.capture.dense import TRIMMED
 from mmpi_ns.capture.known_depth import KnownDepth
 from mmpi_ns.capture.rays import Rays
@@ -35,11 +34,12 @@ from mmpi_ns.capture.tracks import PosedImages
 from mmpi_ns.capture.views import look_up, project
 from mmpi_ns.scene.near_views import nearest_views
 from mmpi_ns.utils.host import give_back_freed_memory
+from mmpi_ns.utils.parallel import in_order
 
 NEIGHBOURS, MAX_ANGLE = 6, 40.0
 """Nearest views that each image is compared with, and the largest angle in degrees between their directions."""
-BYTES_OF_VIEW = 17
-"""Of a pixel of an ``ExposedView``."""
+BYTES_OF_VIEW = 21
+"""Of a pixel of an ``ExposedView`` and its depths."""
 HIDDEN = 0.3
 """Log ratio from the median beyond which another surface is taken to hide one, where distances are not known."""
 
@@ -192,9 +192,10 @@ class ExposedView:
     ) -> ExposedView:
         """Of an image, where a mask does not hide it."""
         rgb, kernel = np.ascontiguousarray(image[..., :3]), np.ones((WINDOW, WINDOW), np.uint8)
-        colors = cv2.blur(rgb.astype(np.float32) / 255, (WINDOW, WINDOW))
-        darkest = np.where(usable > 0, rgb.min(-1), 0).astype(np.uint8)
-        exposed = (cv2.erode(darkest, kernel) > DARK) & (cv2.dilate(rgb.max(-1), kernel) < BRIGHT)
+        colors = np.asarray(cv2.boxFilter(rgb, cv2.CV_32F, (WINDOW, WINDOW)), np.float32) / 255
+        lit = cv2.inRange(cv2.erode(rgb, kernel), np.full(3, DARK + 1.0), np.full(3, 255.0))
+        unclipped = cv2.inRange(cv2.dilate(rgb, kernel), np.zeros(3), np.full(3, BRIGHT - 1.0))
+        exposed = (lit > 0) & (unclipped > 0) & (cv2.erode(usable, kernel) > 0)
         border = WINDOW // 2
         exposed[:border] = exposed[-border:] = exposed[:, :border] = exposed[:, -border:] = False
         return ExposedView(colors, exposed, distance, number)
@@ -218,7 +219,7 @@ def pair_ratios(
     """
     rows, columns = pixels.T
     at = project(cameras, second.number, points)
-    shown = look_up(second.exposed.astype(np.uint8), *at.T, nearest=True) > 0
+    shown = look_up(second.exposed.view(np.uint8), *at.T, nearest=True) > 0
     if second.inverse_distance is not None:
         center = cameras.camera_to_worlds[second.number, :, 3]
         expected = 1 / np.maximum(np.linalg.norm(points - center, axis=-1), 1e-12)
@@ -252,26 +253,30 @@ def color_ratios(
         image_of: colours [H, W, C] of an image, and where it may be used [H, W].
         seed: of the draw of pixels.
     """
-    rng, parts = np.random.default_rng(seed), []
 
-    @lru_cache(images_held(cameras.sizes, BYTES_OF_VIEW, NEIGHBOURS + 1))
-    def view_of(i: int) -> ExposedView:
-        return ExposedView.of(*image_of(i), depths.image(i)[..., 0].copy(), i)
+    def prepared(i: int) -> tuple[ExposedView, NDArray[np.float32]]:
+        depth = depths.image(i)
+        return ExposedView.of(*image_of(i), depth[..., 0], i), depth
 
-    for i in range(len(cameras.files)):
-        if i % TRIMMED == 0:
-            give_back_freed_memory()
-        view, depth = view_of(i), depths.image(i)
+    view_of = held(prepared, cameras.sizes, BYTES_OF_VIEW, NEIGHBOURS + 1)
+
+    def ratios_of(i: int) -> list[ColorRatios | None]:
+        (view, depth), rng = view_of(i), np.random.default_rng((seed, i))
         certain = np.argwhere(view.exposed & (depth[..., 0] > 0) & (depth[..., 1] < CERTAIN * depth[..., 0]))
         pixels = certain[rng.choice(len(certain), min(SAMPLES, len(certain)), replace=False)]
         if len(pixels) < FEWEST:
-            continue
+            return []
         numbers = torch.from_numpy(np.concatenate([np.full((len(pixels), 1), i), pixels], -1))
         directions = rays(numbers).directions.double().cpu().numpy()
         points = cameras.camera_to_worlds[i, :, 3] + directions / depth[pixels[:, 0], pixels[:, 1], :1]
         others = nearest_views(cameras.camera_to_worlds, i, NEIGHBOURS, MAX_ANGLE, apart=False)
-        parts += [pair_ratios(view, view_of(j), cameras, pixels, points) for j in others]
-    ratios = [part for part in parts if part is not None]
+        return [pair_ratios(view, view_of(j)[0], cameras, pixels, points) for j in others]
+
+    ratios: list[ColorRatios] = []
+    for i, parts in enumerate(in_order(ratios_of, range(len(cameras.files)))):
+        ratios += [part for part in parts if part is not None]
+        if i % TRIMMED == 0:
+            give_back_freed_memory()
     return ColorRatios.join(ratios) if ratios else None
 
 

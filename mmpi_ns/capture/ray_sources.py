@@ -19,6 +19,7 @@ from mmpi_ns.capture.new_views import SharedPoints
 from mmpi_ns.capture.rays import Rays
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.utils.errors import InputError
+from mmpi_ns.utils.parallel import in_order
 from mmpi_ns.utils.random_draws import generator
 
 KEYPOINT_DEPTH = "keypoint_inverse_distance"
@@ -83,8 +84,9 @@ class PixelPool:
         places = None if whole else torch.empty(room, dtype=torch.int32)
         depths = None if known_depth is None else torch.empty(room, 2, dtype=torch.int16)
         starts = [0]
-        for i in images:
-            image, kept = _pixels_of(dataset, i, share, seed)
+        for i, (image, kept) in zip(
+            images, in_order(lambda i: _pixels_of(dataset, i, share, seed), images), strict=True
+        ):
             starts.append(starts[-1] + len(kept))
             rows = slice(*starts[-2:])
             colors[rows, : image.shape[1]] = image[kept]
@@ -149,8 +151,8 @@ def _pixels_of(dataset: MMPIDataset, i: int, share: float, seed: int) -> tuple[U
     image = data["image"].reshape(-1, data["image"].shape[-1])
     kept = torch.arange(len(image))
     if share < 1:
-        kept = torch.randperm(len(image), generator=generator(seed, i, "resident"))[: int(share * len(image))]
-        kept = kept.sort().values
+        chosen = torch.randperm(len(image), generator=generator(seed, i, "resident"))[: int(share * len(image))]
+        kept = torch.zeros(len(image), dtype=torch.bool).index_fill_(0, chosen, True).nonzero()[:, 0]
     if "mask" in data:
         kept = kept[data["mask"].reshape(-1).bool()[kept]]
     return image, kept

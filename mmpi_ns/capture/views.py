@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -74,10 +75,17 @@ def _read(file: Path, mode: int) -> NDArray[Any]:
 
 def _unbent(images: PosedImages, i: int, pinhole: NDArray[np.float64], size: Sequence[int]) -> tuple[Map, Map]:
     """Places in image i, of a size (width, height), of its undistorted view's pixels; OpenCV counts from centres."""
-    matrix = camera_matrix(pinhole)
-    straighten = cv2.fisheye.initUndistortRectifyMap if images.is_fisheye(i) else cv2.initUndistortRectifyMap
+    return _unbent_camera(images.is_fisheye(i), tuple(images.distortion[i]), tuple(pinhole), tuple(size))
+
+
+@lru_cache(maxsize=2)
+def _unbent_camera(
+    fisheye: bool, distortion: tuple[float, ...], pinhole: tuple[float, ...], size: tuple[int, int]
+) -> tuple[Map, Map]:
+    matrix = camera_matrix(np.array(pinhole))
+    straighten = cv2.fisheye.initUndistortRectifyMap if fisheye else cv2.initUndistortRectifyMap
     matrix[:2, 2] -= 0.5
-    x, y = straighten(matrix, images.distortion[i], np.eye(3), matrix, size, cv2.CV_32FC1)
+    x, y = straighten(matrix, np.array(distortion), np.eye(3), matrix, size, cv2.CV_32FC1)
     return np.asarray(x, np.float32), np.asarray(y, np.float32)
 
 
@@ -133,11 +141,13 @@ def look_up(image: NDArray[Any], x: NDArray[Any], y: NDArray[Any], *, nearest: b
     Returns:
         The shape of ``x``, and channels if the image has several.
     """
-    at_x, at_y = x.astype(np.float32) - 0.5, y.astype(np.float32) - 0.5
+    at_x, at_y = (np.subtract(c, 0.5, dtype=np.float32) for c in (x, y))
     mode = cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR
     border = cv2.BORDER_CONSTANT if nearest else cv2.BORDER_REPLICATE
-    if at_x.ndim == 2 and max(*image.shape[:2], *at_x.shape) <= REMAP_SIDE:
-        return np.asarray(cv2.remap(image, at_x, at_y, mode, borderMode=border, borderValue=(0.0,)))
+    if at_x.ndim <= 2 and at_x.size and max(*image.shape[:2], *at_x.shape) <= REMAP_SIDE:
+        rows = (at_x[None], at_y[None]) if at_x.ndim == 1 else (at_x, at_y)
+        values = cv2.remap(image, *rows, mode, borderMode=border, borderValue=(0.0,))
+        return np.asarray(values).reshape(*at_x.shape, *image.shape[2:])
     # OpenCV counts rows and columns in 16 bits: places are folded into rows, and large images are read in parts.
     flat_x, flat_y = at_x.reshape(-1), at_y.reshape(-1)
     values = np.zeros((len(flat_x), *image.shape[2:]), image.dtype)

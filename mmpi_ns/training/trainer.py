@@ -42,7 +42,7 @@ from mmpi_ns.utils.errors import InputError, duration, quoted, say
 from mmpi_ns.utils.files import write_atomically
 from mmpi_ns.utils.host import arguments, command, enter_command, signals_go_to
 from mmpi_ns.utils.machine import free_cores, unused_gpu
-from mmpi_ns.utils.parallel import num_threads, torch_apart
+from mmpi_ns.utils.parallel import num_threads, one_thread_each, torch_apart
 
 
 @dataclass
@@ -114,7 +114,8 @@ class MMPITrainer(Trainer):
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         """Prepares the run; a signal during this time ends it with a sentence (of several processes: torchrun's)."""
-        with signals_go_to(_end) if self.world_size == 1 else nullcontext():
+        # Images are shared among threads; those of the libraries would only spin between small operations.
+        with signals_go_to(_end) if self.world_size == 1 else nullcontext(), one_thread_each():
             self._prepare(test_mode)
 
     def _prepare(self, test_mode: Literal["test", "val", "inference"]) -> None:

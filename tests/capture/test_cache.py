@@ -11,7 +11,7 @@ import numpy as np
 from filelock import FileLock
 
 from mmpi_ns.capture import cache
-from mmpi_ns.capture.cache import digest, images_held, remembered
+from mmpi_ns.capture.cache import digest, held, remembered
 
 
 def counting(calls, delay=0.0):
@@ -131,8 +131,28 @@ def test_keys_tell_files_poses_and_settings_apart(tmp_path):
     assert key not in others and len(set(others)) == 4
 
 
+def images_held(sizes, bytes_of_pixel, least):
+    """Images whose results are still there after 40 have been asked for."""
+    calls = []
+    result = held(lambda i: calls.append(i) or 2 * i, np.array(sizes), bytes_of_pixel, least)
+    assert [result(i) for i in range(40)] == list(range(0, 80, 2)) and len(calls) == 40
+    for i in reversed(range(40)):
+        result(i)
+        if len(calls) > 40:
+            return 39 - i
+    return 40
+
+
 def test_of_large_images_few_are_held_but_as_many_as_are_compared():
-    sizes = np.array([[960.0, 540.0], [10.0, 10.0]])
+    sizes = [[960.0, 540.0], [10.0, 10.0]]
     assert images_held(sizes, 17, 7) == 2**28 // (17 * 960 * 540) == 30
     assert images_held(sizes, 12, 7) == images_held(sizes[1:], 12, 7) == 32
-    assert images_held(np.array([[4000.0, 3000.0]]), 17, 7) == 7
+    assert images_held([[4000.0, 3000.0]], 17, 7) == 7
+
+
+def test_threads_that_ask_for_one_image_at_once_share_one_call():
+    calls = []
+    result = held(lambda i: sleep(0.05) or calls.append(i) or i, np.array([[10.0, 10.0]]), 1, 4)
+    with ThreadPoolExecutor(4) as pool:
+        assert list(pool.map(result, [0, 0, 1, 1, 0, 2])) == [0, 0, 1, 1, 0, 2]
+    assert sorted(calls) == [0, 1, 2]

@@ -197,7 +197,7 @@ def test_images_are_in_memory_while_their_neighbours_are_worked_on(tmp_path, mon
     monkeypatch.setattr(dense, "load_view", load)
     monkeypatch.setattr(dense, "num_threads", lambda: threads)
     at = lambda views: {v.pose[0, 3] for v in views}  # noqa: E731
-    monkeypatch.setattr(dense, "matched", lambda view, others, points: (view.pose[0, 3], at(others)))
+    monkeypatch.setattr(dense, "matched", lambda view, others, points, _: (view.pose[0, 3], at(others)))
     monkeypatch.setattr(dense, "confirmed", lambda view, depth, others: (depth, at(v for v, _ in others)))
     shown = lambda i, view, depth: (i, view.pose[0, 3], depth)  # noqa: E731
     results = list(find_depths(images, lambda i: np.zeros((0, 3)), 2, shown))
@@ -209,9 +209,9 @@ def test_images_are_in_memory_while_their_neighbours_are_worked_on(tmp_path, mon
     assert len(results) == len(alive) == count and (not is_in_order or most <= 9 + threads)
 
 
-def test_rounds_from_coarse_to_fine_give_the_depths_of_full_size(tmp_path, monkeypatch):
+def test_a_first_round_at_half_size_gives_the_depths_of_full_size(tmp_path, monkeypatch):
     images = scene_of(tmp_path, POSES)
-    monkeypatch.setattr(dense, "SMALLEST", 40)
+    monkeypatch.setattr(dense, "LARGE", 40)
     results = list(find_depths(images, lambda i: points_on_walls(POSES[i]), WIDTH))
     error, scaled = relative_errors(results, POSES)
     assert np.mean([(d.inverse > 0).mean() for _, d in results]) > 0.88

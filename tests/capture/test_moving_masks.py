@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from training_runs import datamanager
 
-from mmpi_ns.capture.dense import Depth
+from mmpi_ns.capture.dense import Depth, Parallax
 from mmpi_ns.capture.load import load_observations
 from mmpi_ns.capture.moving import in_image
-from mmpi_ns.capture.moving_evidence import Shot, ground_of, nearest_known, splat
+from mmpi_ns.capture.moving_evidence import Neighbour, Shot, ground_of, nearest_known, splat
 from mmpi_ns.capture.moving_objects import followed, unexplained, without_holes
 from mmpi_ns.capture.tracks import PosedImages
 from mmpi_ns.capture.views import View, camera_matrix
@@ -115,23 +115,26 @@ def textured(seed, shape=SIZE, grain=1.5):
     return np.clip(128 + 200 * grain * cv2.GaussianBlur(random, (0, 0), grain), 0, 255).astype(np.uint8)
 
 
+def neighbours(shot, *others):
+    return [Neighbour(other, other.color, Parallax.between(shot.view, other.view)) for other in others]
+
+
 def test_a_wall_is_explained_by_its_depth_and_another_picture_is_not():
     wide = textured(0, (60, 120))
     inverse = 0.5
     shots = [a_shot(0.1 * k, np.ascontiguousarray(wide[:, 10 + round(3.5 * k) :][:, :80]), inverse) for k in (-2, 0, 2)]
     middle = np.zeros(SIZE, bool)
     middle[20:40, 30:50] = True
-    colors = [shots[0].color, shots[2].color]
-    assert np.median(unexplained(shots[1], [shots[0], shots[2]], colors, middle)) < 12
+    assert np.median(unexplained(shots[1], neighbours(shots[1], shots[0], shots[2]), middle)) < 12
     strange = a_shot(0.0, textured(1), inverse)
-    assert np.median(unexplained(strange, [shots[0], shots[2]], colors, middle)) > 20
+    assert np.median(unexplained(strange, neighbours(strange, shots[0], shots[2]), middle)) > 20
 
 
 def test_what_two_neighbours_would_not_show_is_not_judged():
     shots = [a_shot(5.0 * k, textured(k), 0.5) for k in range(3)]
     corner = np.zeros(SIZE, bool)
     corner[:5, :5] = True
-    assert not unexplained(shots[0], shots[1:], [s.color for s in shots[1:]], corner).any()
+    assert not unexplained(shots[0], neighbours(*shots), corner).any()
 
 
 def test_depths_of_another_camera_land_where_they_project():

@@ -151,6 +151,16 @@ def test_what_is_kept_is_bounded_and_spread_over_the_images(monkeypatch):
     assert torch.equal(points.pixels, find().pixels), "the same with each start"
 
 
+def test_the_number_of_threads_does_not_change_the_points(monkeypatch):
+    monkeypatch.setattr(new_views, "MOST", 1000)
+    points = []
+    for threads in (1, 3):
+        monkeypatch.setattr("mmpi_ns.utils.parallel.num_threads", lambda threads=threads: threads)
+        points.append(find())
+    for name in new_views.PARTS:
+        assert torch.equal(*(getattr(p, name) for p in points))
+
+
 def test_some_images_alone():
     some = find().of_images(torch.tensor([1, 2, 3]))
     assert set(some.pixels[:, 0].tolist()) | set(some.other.tolist()) == {1, 2, 3}
@@ -208,5 +218,5 @@ def test_an_image_of_more_points_than_sixteen_bits_count():
     depth[..., 0] = 0.4 / np.sqrt(((columns - WIDTH / 2) / FOCAL) ** 2 + ((HEIGHT / 2 - rows) / FOCAL) ** 2 + 1)
     own = image[y.astype(int), x.astype(int)]
     usable = np.ones((HEIGHT, WIDTH), np.uint8)
-    seen, colors = new_views._seen_by(posed(), 1, points, own, image, usable, depth)
+    seen, colors = new_views.ShownImage.of(image, usable, depth).shows(posed(), 1, points, own)
     assert np.array_equal(seen, np.arange(count)) and colors.shape == (count, 3)
