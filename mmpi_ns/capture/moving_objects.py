@@ -32,6 +32,8 @@ TALL = 1.15
 """Height of an object over that of the camera, at most."""
 CERTAIN = 10
 """Levels of evidence up to which a pixel of known depth is static."""
+STATIC = 0.3
+"""Share of static pixels from which what looks like a person is none."""
 ITERATIONS = 3
 """Of GrabCut."""
 FOLLOWED = 0.7
@@ -82,7 +84,7 @@ def unexplained(shot: Shot, others: Sequence[Shot], colors: Sequence[Bytes], can
 
 
 def grown(shot: Shot, evidence: Evidence, core: Mask) -> Mask:
-    """The objects that seeds lie on, by GrabCut in a box around them. [h, w]"""
+    """The objects that seeds lie on, and people, by GrabCut in a box around them. [h, w]"""
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (TOGETHER, TOGETHER))
     number, labels = cv2.connectedComponents(cv2.dilate(core.astype(np.uint8), kernel))
     static = (shot.depth.inverse > 0) & (evidence.behind < CERTAIN) & (evidence.weak < CERTAIN)
@@ -94,6 +96,12 @@ def grown(shot: Shot, evidence: Evidence, core: Mask) -> Mask:
         rows, columns = np.nonzero(part)
         if len(rows) >= LEAST_PIXELS and min(np.ptp(rows), np.ptp(columns)) >= LEAST_SIDE:
             result |= _object(shot, part, static)
+    for left, top, right, bottom in shot.people:
+        # What a person surely covers: a third of the width, from the head to the knees.
+        body, third, tall = np.zeros_like(core), max(1, (right - left) // 3), bottom - top
+        body[max(0, top) : top + 3 * tall // 4, max(0, left + third) : right - third] = True
+        if body.any() and static[body].mean() < STATIC:
+            result |= _object(shot, body, static)
     return result
 
 
