@@ -24,7 +24,7 @@ from mmpi_ns.capture.known_depth import straightened
 from mmpi_ns.capture.moving_evidence import Bytes, Mask, Shot, evidence, ground_of, has_impossible_depth
 from mmpi_ns.capture.moving_objects import followed, grown, seeds
 from mmpi_ns.capture.observe import posed_images
-from mmpi_ns.capture.people import horizon_of, people_in
+from mmpi_ns.capture.people import horizon_of, people_in, upright
 from mmpi_ns.capture.tracks import PosedImages, at_full_size
 from mmpi_ns.capture.views import View, look_up, straightened_color
 from mmpi_ns.placement.observations import Observations
@@ -77,8 +77,7 @@ def find_moving(
     """
     width = round(SIDE * float(np.median(np.minimum(1, images.sizes[:, 0] / images.sizes[:, 1]))))
     pairs = find_depths(images, points_of, width, progress=progress)
-    up = images.camera_to_worlds[:, :, 1].mean(0)
-    up /= max(float(np.linalg.norm(up)), 1e-12)
+    up = upright(images.camera_to_worlds)
     shots = [shot_of(images, i, view, depth, up) for i, (view, depth) in enumerate(pairs)]
     near = []
     for i in range(len(shots)):

@@ -32,7 +32,7 @@ TALL = 1.15
 """Height of an object over that of the camera, at most."""
 CERTAIN = 10
 """Levels of evidence up to which a pixel of known depth is static."""
-STATIC = 0.3
+STATIC = 0.5
 """Share of static pixels from which what looks like a person is none."""
 ITERATIONS = 3
 """Of GrabCut."""

@@ -23,10 +23,22 @@ ABOVE, BELOW = 0.12, 0.3
 """Rows that are searched, from above the horizon to below it, in widths of the image."""
 SCORE = 0.6
 """Of the detector, least."""
-HEIGHTS = (0.45, 1.35)
+HEIGHTS = (0.6, 1.3)
 """Height of the camera over that of a person."""
+SLOPE = 0.3
+"""Sine of the pitch up to which cameras may all be tilted on a level path."""
 MARGIN = np.array([1 / 4, 1 / 8])
 """Around the person in the detector's window, at each side, as a share of its width and height."""
+
+
+def upright(camera_to_worlds: Float[ndarray, "M 3 4"]) -> Float[ndarray, "3"]:
+    """Upwards in the world: what the cameras take for it, made perpendicular to their path, which is about level."""
+    up, centers = camera_to_worlds[:, :, 1].mean(0), camera_to_worlds[:, :, 3]
+    up /= max(float(np.linalg.norm(up)), 1e-12)
+    along = np.linalg.svd(centers - centers.mean(0))[2][0]
+    slope = float(up @ along)
+    up = up - slope * along if abs(slope) < SLOPE else up
+    return up / max(float(np.linalg.norm(up)), 1e-12)
 
 
 def horizon_of(view: View, up: Float[ndarray, "3"]) -> Float[ndarray, "w"] | None:
@@ -62,7 +74,7 @@ def people_in(images: PosedImages, i: int, view: View, up: Float[ndarray, "3"]) 
         return nobody
     detector.setSVMDetector(cv2.HOGDescriptor.getDefaultPeopleDetector())
     rows = cv2.resize(wide.gray[first:last], size, interpolation=cv2.INTER_LINEAR)
-    windows, scores = detector.detectMultiScale(rows, winStride=(8, 8), scale=1.1)
+    windows, scores = detector.detectMultiScale(rows, winStride=(8, 8), scale=1.1, groupThreshold=1)
     windows = np.asarray(windows, np.float64).reshape(-1, 4)[np.ravel(scores) > SCORE]
     low, extent = windows[:, :2] + MARGIN * windows[:, 2:], (1 - 2 * MARGIN) * windows[:, 2:]
     boxes = (np.concatenate([low, low + extent], -1) / scale + [0, first, 0, first]) * view.gray.shape[0] / height

@@ -63,7 +63,7 @@ def test_the_horizon_is_where_what_lies_level_appears(tmp_path):
 def test_a_figure_on_the_ground_is_a_person(tmp_path):
     boxes = found(tmp_path, figure(COLUMN, FEET))
     assert len(boxes) == 1
-    assert np.abs(boxes[0] - [COLUMN - 25, FEET - TALL, COLUMN + 25, FEET]).max() < 25
+    assert np.abs(boxes[0] - [COLUMN - 25, FEET - TALL, COLUMN + 25, FEET]).max() < 0.3 * TALL
 
 
 @pytest.mark.parametrize("feet", [200, 460], ids=["above the horizon", "twice as low as the camera is high"])
