@@ -84,12 +84,6 @@ class Depth:
     inverse: Map
     error: Map
 
-    def completed(self, coarse: Depth) -> Depth:
-        """With coarser depths where there is none: what images show at different sizes may match at the smaller one."""
-        size, known = self.inverse.shape[::-1], self.inverse > 0
-        inverse, error = (cv2.resize(m, size, interpolation=cv2.INTER_NEAREST) for m in (coarse.inverse, coarse.error))
-        return Depth(np.where(known, self.inverse, inverse), np.where(known, self.error, error))
-
 
 def rough_inverse_depth(view: View, points: NDArray[np.float64], step: int = 8) -> Map:
     """Inverse depth of every pixel [h, w], interpolated between SfM points [P, 3] that the image saw."""
@@ -383,8 +377,7 @@ def matched(view: View, others: list[View], points: NDArray[np.float64]) -> Dept
             rough = filled(depth, rough)
             rough = np.asarray(cv2.resize(rough, small.gray.shape[::-1], interpolation=cv2.INTER_LINEAR), np.float32)
         pairs = [measure(small, neighbour.reduced(factor), rough, flow) for neighbour in others]
-        fused = fuse(*(np.stack(part) for part in zip(*pairs, strict=True)))
-        depth = without_fringes(small, fused).completed(depth)
+        depth = without_fringes(small, fuse(*(np.stack(part) for part in zip(*pairs, strict=True))))
     return depth
 
 

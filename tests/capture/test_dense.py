@@ -326,12 +326,6 @@ def test_a_depth_of_large_error_is_not_kept():
     assert fuse(stack(1.0, 1.0), stack(5000.0, 5000.0)).inverse.all()
 
 
-def test_coarser_depths_stand_where_there_are_none():
-    fine = Depth(np.array([[1, 0, 0, 2]] * 2, F32), np.array([[0.1, 0, 0, 0.2]] * 2, F32))
-    depth = fine.completed(Depth(np.array([[5, 6]], F32), np.array([[0.5, 0]], F32)))
-    assert (depth.inverse == [1, 5, 6, 2]).all() and np.allclose(depth.error, [0.1, 0.5, 0, 0.2])
-
-
 def flat_view(tmp_path, pose, gray=128):
     view = load_view(scene_of(tmp_path, [pose]), 0, WIDTH)
     return replace(view, gray=np.full_like(view.gray, gray))
