@@ -27,7 +27,7 @@ HEIGHTS = (0.6, 1.3)
 """Height of the camera over that of a person."""
 SLOPE = 0.3
 """Sine of the pitch up to which cameras may all be tilted on a level path."""
-MARGIN = np.array([1 / 4, 1 / 8])
+MARGIN = np.array([1 / 8, 1 / 8])
 """Around the person in the detector's window, at each side, as a share of its width and height."""
 
 
