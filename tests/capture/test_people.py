@@ -9,7 +9,7 @@ import pytest
 from mmpi_ns.capture.dense import Depth
 from mmpi_ns.capture.moving_evidence import Evidence, Shot
 from mmpi_ns.capture.moving_objects import grown
-from mmpi_ns.capture.people import horizon_of, people_in
+from mmpi_ns.capture.people import horizon_of, people_in, upright
 from mmpi_ns.capture.tracks import PosedImages
 from mmpi_ns.capture.views import load_view, straightened_color
 
@@ -58,6 +58,14 @@ def test_the_horizon_is_where_what_lies_level_appears(tmp_path):
         expected = (HEIGHT / 2 - 500 * np.tan(np.radians(pitch))) * 384 / WIDTH
         np.testing.assert_allclose(horizon_of(view, UP), expected, atol=1e-6)
     assert horizon_of(of_a_level_camera(tmp_path, figure(COLUMN, FEET), 80.0)[1], UP) is None
+
+
+@pytest.mark.parametrize(("direction", "tilt"), [([0, 0, -1], 0.0), ([0, 1, 0], 6.0)], ids=["ahead", "up"])
+def test_cameras_that_all_look_down_on_a_level_path_do_not_tilt_the_world(direction, tilt):
+    c, s = np.cos(np.radians(6.0)), np.sin(np.radians(6.0))
+    poses = np.tile(np.array([[1, 0, 0, 0], [0, c, s, 0], [0, -s, c, 0]], float), (5, 1, 1))
+    poses[:, :, 3] = np.arange(5)[:, None] * np.array(direction)
+    assert np.degrees(np.arccos(min(1, upright(poses) @ UP))) == pytest.approx(tilt, abs=1e-4)
 
 
 def test_a_figure_on_the_ground_is_a_person(tmp_path):
