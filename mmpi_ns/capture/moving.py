@@ -24,6 +24,7 @@ from mmpi_ns.capture.known_depth import straightened
 from mmpi_ns.capture.moving_evidence import Mask, Neighbour, Shot, evidence, ground_of, has_impossible_depth
 from mmpi_ns.capture.moving_objects import followed, grown, seeds
 from mmpi_ns.capture.observe import posed_images
+from mmpi_ns.capture.people import horizon_of, people_in, upright
 from mmpi_ns.capture.tracks import PosedImages, at_full_size
 from mmpi_ns.capture.views import View, look_up, straightened_color
 from mmpi_ns.placement.observations import Observations
@@ -77,8 +78,7 @@ def find_moving(
         progress: wraps the images as they are worked on.
     """
     width = round(SIDE * float(np.median(np.minimum(1, images.sizes[:, 0] / images.sizes[:, 1]))))
-    up = images.camera_to_worlds[:, :, 1].mean(0)
-    up /= max(float(np.linalg.norm(up)), 1e-12)
+    up = upright(images.camera_to_worlds)
 
     def finish(i: int, view: View, depth: Depth) -> Shot:
         return shot_of(images, i, view, depth, up)
@@ -163,13 +163,9 @@ def share_of_moving(masks: Sequence[Mask]) -> str:
 def shot_of(images: PosedImages, i: int, view: View, depth: Depth, up: NDArray[np.float64]) -> Shot:
     """An image at working size."""
     color = cv2.GaussianBlur(straightened_color(images, i, view), (0, 0), 1.0)
-    ground, horizon = ground_of(view, depth, up), None
-    if ground is not None:
-        fx, fy, cx, cy = view.pinhole
-        right, down, ahead = np.array([1, -1, -1]) * (view.pose[:, :3].T @ up)
-        x = (np.arange(view.gray.shape[1]) + 0.5 - cx) / fx
-        horizon = cy - fy * (right * x + ahead) / down
-    return Shot(view, np.asarray(color, np.uint8), depth, ground, horizon)
+    ground = ground_of(view, depth, up)
+    horizon = None if ground is None else horizon_of(view, up)
+    return Shot(view, np.asarray(color, np.uint8), depth, ground, horizon, people_in(images, i, view, up))
 
 
 def at_exposure_of(shot: Shot, other: Shot) -> Neighbour:

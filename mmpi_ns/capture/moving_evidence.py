@@ -10,7 +10,7 @@ of a car ahead that keeps its distance.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -64,6 +64,8 @@ class Shot:
     """Inverse depth of the ground, 0 near the horizon and above; None where no ground is found. [h, w]"""
     horizon: NDArray[np.float64] | None = None
     """Row of the horizon in each column, where a ground is found. [w]"""
+    people: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 4), int))
+    """Left, top, right and bottom of what looks like a person. [n, 4]"""
 
     @cached_property
     def around(self) -> Map:

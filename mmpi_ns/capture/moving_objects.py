@@ -32,6 +32,8 @@ TALL = 1.15
 """Height of an object over that of the camera, at most."""
 CERTAIN = 10
 """Levels of evidence up to which a pixel of known depth is static."""
+STATIC = 0.5
+"""Share of static pixels from which what looks like a person is none."""
 ITERATIONS = 3
 """Of GrabCut."""
 FOLLOWED = 0.7
@@ -81,7 +83,7 @@ def unexplained(shot: Shot, others: Sequence[Neighbour], candidates: Mask) -> ND
 
 
 def grown(shot: Shot, evidence: Evidence, core: Mask) -> Mask:
-    """The objects that seeds lie on, by GrabCut in a box around them. [h, w]"""
+    """The objects that seeds lie on, and people, by GrabCut in a box around them. [h, w]"""
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (TOGETHER, TOGETHER))
     number, labels = cv2.connectedComponents(cv2.dilate(core.astype(np.uint8), kernel))
     static = (shot.depth.inverse > 0) & (evidence.behind < CERTAIN) & (evidence.weak < CERTAIN)
@@ -92,14 +94,18 @@ def grown(shot: Shot, evidence: Evidence, core: Mask) -> Mask:
         part = core & (labels == label)
         rows, columns = np.nonzero(part)
         if len(rows) >= LEAST_PIXELS and min(np.ptp(rows), np.ptp(columns)) >= LEAST_SIDE:
-            result |= _object(shot, part, static)
+            result |= _object(shot, part, static, *_room(shot, rows, columns))
+    for left, top, right, bottom in shot.people:
+        # What a person surely covers: the third in the middle.
+        body, third = np.zeros_like(core), (right - left) // 3
+        body[max(0, top) : bottom, max(0, left + third) : right - third] = True
+        if body.any() and static[body].mean() < STATIC:
+            result |= _object(shot, body, static, (left, top, right, bottom), top)
     return result
 
 
-def _object(shot: Shot, part: Mask, static: Mask) -> Mask:
-    """The object of some seeds."""
-    height, width = part.shape
-    rows, columns = np.nonzero(part)
+def _room(shot: Shot, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> tuple[tuple[int, int, int, int], int]:
+    """Left, top, right and bottom of what the object of some seeds may cover, and the row from which it is its body."""
     left, right, top, bottom = columns.min(), columns.max() + 1, rows.min(), rows.max() + 1
     highest = top - 0.3 * (bottom - top)
     horizon = bottom if shot.horizon is None else float(shot.horizon[left:right].mean())
@@ -108,16 +114,19 @@ def _object(shot: Shot, part: Mask, static: Mask) -> Mask:
         highest = min(top - 0.1 * (bottom - top), bottom - TALL * (bottom - horizon))
         body = min(top, round(bottom - 0.8 * (bottom - horizon)))
     aside = max(3, round(0.12 * (right - left)))
+    return (left - aside, int(highest), right + aside, bottom + 2), body
+
+
+def _object(shot: Shot, part: Mask, static: Mask, room: tuple[int, int, int, int], body: int) -> Mask:
+    """The object that covers some pixels for certain and others in its room perhaps."""
+    height, (left, top, right, bottom) = len(part), room
     box = np.zeros_like(part)
-    box[max(0, int(highest)) : bottom + 2, max(0, left - aside) : right + aside] = True
+    box[max(0, top) : bottom, max(0, left) : right] = True
     labels = np.full(part.shape, cv2.GC_BGD, np.uint8)
     labels[box & ~static] = cv2.GC_PR_FGD
     labels[part] = cv2.GC_FGD
-    margin = max(8, round(0.3 * max(right - left, bottom - max(0, int(highest)))))
-    inside = np.s_[
-        max(0, int(highest) - margin) : min(height, bottom + margin),
-        max(0, left - margin) : min(width, right + margin),
-    ]
+    margin = max(8, round(0.3 * max(right - left, bottom - max(0, top))))
+    inside = np.s_[max(0, top - margin) : bottom + margin, max(0, left - margin) : right + margin]
     cut = np.ascontiguousarray(labels[inside])
     cv2.setRNGSeed(0)
     if (cut == cv2.GC_BGD).any():

@@ -1,0 +1,84 @@
+"""People in an image: what OpenCV's detector proposes, where it stands on the ground as tall as people are.
+
+Sources: N. Dalal and B. Triggs, Histograms of Oriented Gradients for Human Detection, CVPR 2005 (``cv2.HOGDescriptor``
+with the default detector, which ships with OpenCV). Above a level ground every point at the height of the camera lies
+on the horizon, so that the feet of a person lie below it by the height of the camera over that of the person, times the
+height in the image.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Int
+from numpy import ndarray
+
+from mmpi_ns.capture.tracks import PosedImages
+from mmpi_ns.capture.views import View, load_view
+
+SIDE, ENLARGED = 2048, 2.0
+"""Longer side of the image in which people are searched, pixels, and its size over that of the original, at most: the
+detector finds people from 96 pixels in height."""
+ABOVE, BELOW = 0.12, 0.3
+"""Rows that are searched, from above the horizon to below it, in widths of the image."""
+SCORE = 0.6
+"""Of the detector, least."""
+HEIGHTS = (0.6, 1.3)
+"""Height of the camera over that of a person."""
+SLOPE = 0.3
+"""Sine of the pitch up to which cameras may all be tilted on a level path."""
+MARGIN = np.array([1 / 8, 1 / 8])
+"""Around the person in the detector's window, at each side, as a share of its width and height."""
+
+
+def upright(camera_to_worlds: Float[ndarray, "M 3 4"]) -> Float[ndarray, "3"]:
+    """Upwards in the world: what the cameras take for it, made perpendicular to their path, which is about level."""
+    up, centers = camera_to_worlds[:, :, 1].mean(0), camera_to_worlds[:, :, 3]
+    up /= max(float(np.linalg.norm(up)), 1e-12)
+    along = np.linalg.svd(centers - centers.mean(0))[2][0]
+    slope = float(up @ along)
+    up = up - slope * along if abs(slope) < SLOPE else up
+    return up / max(float(np.linalg.norm(up)), 1e-12)
+
+
+def horizon_of(view: View, up: Float[ndarray, "3"]) -> Float[ndarray, "w"] | None:
+    """Row of the horizon in each column of a view; None where it looks steeply up or down."""
+    fx, fy, cx, cy = view.pinhole
+    right, down, ahead = np.array([1, -1, -1]) * (view.pose[:, :3].T @ up)
+    if abs(down) < 0.5:
+        return None
+    x = (np.arange(view.gray.shape[1]) + 0.5 - cx) / fx
+    return cy - fy * (right * x + ahead) / down
+
+
+def people_in(images: PosedImages, i: int, view: View, up: Float[ndarray, "3"]) -> Int[ndarray, "N 4"]:
+    """Left, top, right and bottom of the people in an image, in pixels of its view at working size.
+
+    Args:
+        images: the originals.
+        i: the image.
+        view: the same at working size.
+        up: unit vector in the world.
+    """
+    nobody, horizon = np.zeros((0, 4), int), horizon_of(view, up)
+    if horizon is None:
+        return nobody
+    wide = load_view(images, i, SIDE)
+    height, width = wide.gray.shape
+    scale = min(ENLARGED, SIDE / max(height, width))
+    level = float(horizon.mean()) * height / view.gray.shape[0]
+    first, last = (int(np.clip(level + share * width, 0, height)) for share in (-ABOVE, BELOW))
+    size = round(scale * width), round(scale * (last - first))
+    detector = cv2.HOGDescriptor()
+    if size[0] < detector.winSize[0] or size[1] < detector.winSize[1]:
+        return nobody
+    detector.setSVMDetector(cv2.HOGDescriptor.getDefaultPeopleDetector())
+    rows = cv2.resize(wide.gray[first:last], size, interpolation=cv2.INTER_LINEAR)
+    windows, scores = detector.detectMultiScale(rows, winStride=(8, 8), scale=1.1, groupThreshold=1)
+    windows = np.asarray(windows, np.float64).reshape(-1, 4)[np.ravel(scores) > SCORE]
+    low, extent = windows[:, :2] + MARGIN * windows[:, 2:], (1 - 2 * MARGIN) * windows[:, 2:]
+    boxes = (np.concatenate([low, low + extent], -1) / scale + [0, first, 0, first]) * view.gray.shape[0] / height
+    camera = (boxes[:, 3] - np.interp(boxes[:, [0, 2]].mean(1), np.arange(len(horizon)) + 0.5, horizon)) / (
+        boxes[:, 3] - boxes[:, 1]
+    )
+    return boxes[(camera > HEIGHTS[0]) & (camera < HEIGHTS[1])].round().astype(int)
