@@ -23,7 +23,7 @@ class Default:
 
 DEFAULTS = {
     "mmpi": Default(20000, 4096, PlacementConfig(texel_pixels=1.2, max_planes=256, max_texels=200e6)),
-    "mmpi-small": Default(4000, 1024, PlacementConfig(texel_pixels=1.0)),
+    "mmpi-small": Default(5000, 1024, PlacementConfig(texel_pixels=1.0)),
 }
 PIXELS = 6e6
 """Training pixels of a window up to which it is a small capture."""
@@ -70,14 +70,14 @@ def rays_times(method: str, processors: int) -> int:
 
 
 def steps_for(method: str, pixels: float, times: int = 1) -> int:
-    """Training steps of a window, in hundreds: more for captures of many pixels, as their square root.
+    """Training steps of a window, in hundreds: more for captures of many pixels, as their power of 0.75.
 
     Args:
         method: with defaults.
         pixels: training pixels of the window.
         times: how many times the method's rays a step draws (``rays_times``).
     """
-    multiple = min(max(1.0, (pixels / PIXELS) ** 0.5), MOST_TIMES)
+    multiple = min(max(1.0, (pixels / PIXELS) ** 0.75), MOST_TIMES)
     return 100 * round(DEFAULTS[method].steps * multiple / 100) // times
 
 
