@@ -43,6 +43,8 @@ MAX_ANGLE = 40.0
 """Degrees between the facing directions of images that are compared."""
 LARGE = 640
 """Pixels along the longer side of a large image."""
+LEAST_FLOW = 16
+"""Pixels of an image's shorter side from which on it is matched at a reduced size; optical flow needs a few."""
 ROUNDS = {False: (1, 1, 1), True: (2, 1)}
 """Rounds of matching of small and of large images, each at the working size divided by this; each starts from the
 depths of the previous one."""
@@ -389,6 +391,8 @@ def matched(view: View, others: list[View], points: NDArray[np.float64], rounds:
     rough, depth = None, Depth(*np.zeros((2, *view.gray.shape), np.float32))
     flow.setPatchStride(STRIDE[is_large])
     for factor in (rounds or ROUNDS[is_large]) if others else ():
+        if factor > 1 and min(view.gray.shape) < LEAST_FLOW * factor:
+            continue
         small = view.reduced(factor)
         if rough is None:
             rough = rough_inverse_depth(small, points)

@@ -359,6 +359,8 @@ def of_cells(observations: Observations, known: KnownDepth, dataset: MMPIDataset
     def points_of(i: int) -> NDArray[np.float64]:
         depth = known.image(i)
         rows, columns = best_of_cells(depth)
+        if not len(rows):  # some of nerfstudio's lenses cannot make no rays
+            return observations.points[:0]
         coords = torch.from_numpy(np.stack([rows, columns], -1) + 0.5).float()
         rays = dataset.cameras.generate_rays(torch.full((len(rows), 1), i), coords=coords)
         return observations.centers[i] + rays.directions.double().numpy() / depth[rows, columns, :1]

@@ -218,6 +218,13 @@ def test_a_first_round_at_half_size_gives_the_depths_of_full_size(tmp_path, monk
     assert np.median(error) < 0.003 and np.quantile(scaled, 0.9) < 2
 
 
+@pytest.mark.parametrize("width", [16, 24, 32])
+def test_images_of_few_pixels_are_matched_at_their_size_alone(tmp_path, width):
+    images = scene_of(tmp_path, POSES)
+    results = list(find_depths(images, lambda i: points_on_walls(POSES[i]), width, rounds=(2, 1)))
+    assert all(max(d.inverse.shape) == width and np.isfinite(d.inverse).all() for _, d in results)
+
+
 def test_a_reduced_view_shows_the_same(tmp_path):
     images = scene_of(tmp_path, POSES[:1], LENS)
     view = load_view(images, 0, WIDTH)

@@ -22,7 +22,7 @@ def test_a_step_waits_twice_at_most_and_kernels_are_not_compiled_for_sizes(
         print(phase, dict(waits.found), waits.launches, "launches")
         assert 1 <= sum(waits.found.values()) <= 2, (phase, waits.found)
         print(phase, waits.peak, "bytes of arrays of", waits.reserved)
-        assert 0.1 * waits.reserved < waits.peak <= waits.reserved
+        assert 0.05 * waits.reserved < waits.peak <= waits.reserved
     print(training, {name: len(kinds) for name, kinds in sorted(variants.items())})
     many = {name: kinds for name, kinds in variants.items() if len(kinds) > 4}
     assert not many, many  # one or nine channels, four or eight texels

@@ -15,8 +15,8 @@ from mmpi_ns.scene.windows import WindowedPlan
 from mmpi_ns.utils.errors import InputError
 
 STEPS = 24
-"""individual 0-11 with doublings at 3 and 6 and releases of bricks before 6 and 11, blend 12-17, finetune 18-23; joint
-0-23 with doublings at 6 and 12 and releases before 12 and 22; finer is joint with finer texels from 17 on."""
+"""individual 0-11 with doublings at 2 and 3 and releases of bricks before 6 and 11, blend 12-17, finetune 18-23; joint
+0-23 with doublings at 3 and 6 and releases before 12 and 22; finer is joint with finer texels from 17 on."""
 BOUNDARIES = (3, 6, 12, 18)
 
 
@@ -63,10 +63,10 @@ def test_a_resumed_run_ends_as_the_uninterrupted_one(whole, resumed, step):
 
 
 def test_bricks_were_given_up_on_the_way_and_checkpoints_hold_the_others_alone(whole):
-    """Between steps 6 or 12, when resolution stops growing, and the end of the first phase."""
+    """Between steps 3 or 6, when resolution stops growing, and the end of the first phase."""
     if "plan_file" in whole[0]:
         pytest.skip("texels become finer on the way")
-    steps = range(12, STEPS - 1) if "training" in whole[0] else range(6, 14)
+    steps = range(6, STEPS - 1) if "training" in whole[0] else range(3, 14)
     states = [load(whole[1], step) for step in steps]
     rows = [len(state["pipeline"]["_model.field.density"]) for state in states]
     assert rows == sorted(rows, reverse=True) and rows[-1] < rows[0]
@@ -119,8 +119,8 @@ def test_frozen_parameters_stay_bit_identical(whole):
 
 
 def test_checkpoints_load_as_plain_data_and_hold_plan_schedule_and_resolution(whole):
-    state = load(whole[1], 4)
-    assert state["step"] == 4 and float(state["pipeline"]["_model.field.texel_factor"]) < 1
+    state = load(whole[1], 1)
+    assert state["step"] == 1 and float(state["pipeline"]["_model.field.texel_factor"]) < 1
     assert {"_model.field.plan_bytes", "_model.progress.schedule_bytes"} <= set(state["pipeline"])
     rates = [g["lr"] for o in state["optimizers"].values() for g in o["param_groups"]]
     assert all(type(r) is float for r in rates)
