@@ -27,8 +27,8 @@ def torchrun(scene, windows_file, output, processes, *options):
     command += ["--pipeline.model.colour.hidden-width", "8", "--pipeline.model.colour.feature-channels", "4"]
     command += [
         "--pipeline.model.schedule.growth-shares",
-        "0.25",
         "0.5",
+        "1.0",
         "--pipeline.model.schedule.release-weight",
         "0.0",
     ]
