@@ -72,7 +72,7 @@ def people_in(images: PosedImages, i: int, view: View, up: Float[ndarray, "3"]) 
     detector = cv2.HOGDescriptor()
     if size[0] < detector.winSize[0] or size[1] < detector.winSize[1]:
         return nobody
-    detector.setSVMDetector(cv2.HOGDescriptor.getDefaultPeopleDetector())
+    detector.setSVMDetector(np.array(cv2.HOGDescriptor.getDefaultPeopleDetector(), np.float32))
     rows = cv2.resize(wide.gray[first:last], size, interpolation=cv2.INTER_LINEAR)
     windows, scores = detector.detectMultiScale(rows, winStride=(8, 8), scale=1.1, groupThreshold=1)
     windows = np.asarray(windows, np.float64).reshape(-1, 4)[np.ravel(scores) > SCORE]
