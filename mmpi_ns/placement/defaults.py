@@ -23,11 +23,11 @@ class Default:
 
 DEFAULTS = {
     "mmpi": Default(20000, 4096, PlacementConfig(texel_pixels=1.2, max_planes=256, max_texels=200e6)),
-    "mmpi-small": Default(5000, 1024, PlacementConfig(texel_pixels=1.0)),
+    "mmpi-small": Default(4000, 1024, PlacementConfig(texel_pixels=1.0)),
 }
-PIXELS = 6e6
+PIXELS = 5.5e6
 """Training pixels of a window up to which it is a small capture."""
-MOST_TIMES = 4.0
+MOST_TIMES = 3.0
 """Largest multiple of a small capture's steps."""
 RAYS_PER_PROCESSOR = 256
 """Pixel rays of a step for each multiprocessor of a GPU. By its registers the march has eight programs of 16 rays there
@@ -70,14 +70,14 @@ def rays_times(method: str, processors: int) -> int:
 
 
 def steps_for(method: str, pixels: float, times: int = 1) -> int:
-    """Training steps of a window, in hundreds: more for captures of many pixels, as their power of 0.75.
+    """Training steps of a window, in hundreds: more for captures of many pixels, in proportion.
 
     Args:
         method: with defaults.
         pixels: training pixels of the window.
         times: how many times the method's rays a step draws (``rays_times``).
     """
-    multiple = min(max(1.0, (pixels / PIXELS) ** 0.75), MOST_TIMES)
+    multiple = min(max(1.0, pixels / PIXELS), MOST_TIMES)
     return 100 * round(DEFAULTS[method].steps * multiple / 100) // times
 
 

@@ -35,8 +35,8 @@ def test_steps_follow_the_pixels_of_the_largest_window():
     one, windows = PlacementConfig(window_length=0.0), PlacementConfig(window_length=4.0)
     assert most_pixels(few, one) == few.sizes.prod(-1).sum() == most_pixels(few, windows)
     assert 0.05 < most_pixels(many, windows) / many.sizes.prod(-1).sum() < 0.5
-    steps = [steps_for("mmpi-small", pixels) for pixels in (1e4, PIXELS, 16 ** (1 / 3) * PIXELS, 1e12)]
-    assert steps == [5000, 5000, 10000, 20000] and steps_for("mmpi", 1.0) == 20000
+    steps = [steps_for("mmpi-small", pixels) for pixels in (1e4, PIXELS, 2 * PIXELS, 1e12)]
+    assert steps == [4000, 4000, 8000, 12000] and steps_for("mmpi", 1.0) == 20000
 
 
 @pytest.mark.parametrize(

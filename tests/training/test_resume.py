@@ -312,6 +312,6 @@ def test_without_a_number_of_steps_they_follow_the_pixels(scene, plan_file, tmp_
     monkeypatch.setattr("mmpi_ns.placement.defaults.PIXELS", 1.0)
     config = trainer_config(scene, plan_file, tmp_path, steps=steps)
     trainer = ready(config)
-    expected = steps or 400
+    expected = steps or 300
     assert trainer.pipeline.model.progress.schedule.total_steps == expected == trainer.config.max_num_iterations
-    assert ("400 steps for its training pixels" in capsys.readouterr().out) == (steps == 0)
+    assert ("300 steps for its training pixels" in capsys.readouterr().out) == (steps == 0)
