@@ -97,7 +97,6 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         self.gains: Gains | None = None
         self.moves = ""
         """How much of the training images moves, in a sentence; empty where nobody looked."""
-        """Share of a step's rays that are drawn; the schedule sets it."""
         self.sources: RaySources | None = None
         """Sources that a step draws from now."""
         self._resident: RaySources | None = None
