@@ -6,7 +6,7 @@ which nerfstudio fixes before K is known. Row arithmetic is in ``texels.py``, wo
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
@@ -28,6 +28,8 @@ EMPTY = {"density": RELEASED_DENSITY, "features": 0.0, "reliability": 0.0}
 """Content of the empty brick in each table."""
 TABLES = tuple(EMPTY)
 """The parameters that have a row for every texel."""
+HALF_LARGEST = 65504.0
+"""Largest number of half precision."""
 MIDDLE = 0.5
 """Share of stored texels in a texel between those and empty ones."""
 ENOUGH_CROSSINGS = 32
@@ -221,3 +223,12 @@ def replace_data(parameter: nn.Parameter, data: Tensor) -> None:
     parameter.grad = None
     parameter.data = torch.empty(0, dtype=torch.float64, device=data.device)
     parameter.data = data
+
+
+def in_half_precision(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The state of a field that is trained, for its file: tables take half of the bytes, under whatever prefix.
+
+    Images change by a fraction of a grey level (docs/performance.md).
+    """
+    tables = {name: x for name, x in state.items() if name.rpartition(".")[2] in TABLES}
+    return dict(state) | {name: x.clamp(-HALF_LARGEST, HALF_LARGEST).half() for name, x in tables.items()}

@@ -12,7 +12,7 @@ from weakref import WeakValueDictionary
 import torch
 
 from mmpi_ns.field.mmpi_field import MMPIField
-from mmpi_ns.field.tables import TABLES
+from mmpi_ns.field.tables import in_half_precision
 from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.utils.errors import InputError, brief
 from mmpi_ns.utils.files import to_text, write_atomically
@@ -68,7 +68,7 @@ class WindowStore:
         path.parent.mkdir(parents=True, exist_ok=True)
         tables = field.state_dict()
         if self.half:
-            tables |= {name: tables[name].half() for name in TABLES}
+            tables = in_half_precision(tables)
         state = {"window": window, "field": tables}
         write_atomically(path, lambda unfinished: torch.save(state, unfinished))
 

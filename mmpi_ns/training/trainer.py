@@ -17,6 +17,7 @@ from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils import comms, writer
 
 from mmpi_ns.capture.datamanager import MMPIDataManager
+from mmpi_ns.field.tables import in_half_precision
 from mmpi_ns.placement.defaults import DEFAULTS, rays_times
 from mmpi_ns.rendering.rendered import BACKGROUNDS
 from mmpi_ns.scene.texels import BRICK
@@ -317,11 +318,12 @@ class MMPITrainer(Trainer):
             return  # stopped before the first step: there is nothing to save
         self.checkpoint_dir.mkdir(parents=True, exist_ok=True)
         path = self.checkpoint_dir / f"step-{step:09d}.ckpt"
-        # After the last step nobody needs the moments, which are half of all.
-        unused: dict[str, Any] = {} if step + 1 < self._total_steps else {"state": {}}
+        # After the last step nobody needs the moments, which are half of all, nor more digits than images show.
+        goes_on, fields = step + 1 < self._total_steps, self.pipeline.state_dict()
+        unused: dict[str, Any] = {} if goes_on else {"state": {}}
         state = {
             "step": step,
-            "pipeline": written_short(self.pipeline.state_dict()),
+            "pipeline": written_short(fields if goes_on else in_half_precision(fields)),
             "optimizers": {k: v.state_dict() | unused for k, v in self.optimizers.optimizers.items()},
             "schedulers": {k: v.state_dict() for k, v in self.optimizers.schedulers.items()},
             "scalers": self.grad_scaler.state_dict(),

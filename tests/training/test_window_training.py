@@ -12,7 +12,7 @@ from nerfstudio.utils.eval_utils import eval_setup
 from training_runs import WINDOW_STEPS as STEPS
 from training_runs import compared, differences, facing, load, ready, rendered, trainer_config
 
-from mmpi_ns.field.tables import TABLES
+from mmpi_ns.field.tables import TABLES, in_half_precision
 from mmpi_ns.rendering.baked import exact_images
 from mmpi_ns.rendering.window_store import WindowStore
 from mmpi_ns.scene.windows import WindowedPlan, window_shares
@@ -128,8 +128,11 @@ def test_evaluation_reads_the_windows_back(whole):
     _, pipeline, _, _ = eval_setup(whole.base_dir / "config.yml", test_mode="inference")
     model = whole.pipeline.model
     origins = torch.stack([torch.tensor(w.center).float() for w in model.progress.windows.windows])
+    state = {name: x.clone() for name, x in model.field.state_dict().items()}
+    model.field.load_state_dict(in_half_precision(state))  # as the last checkpoint has it
     with exact_images():
         a, b = rendered(model, origins), rendered(pipeline.model, origins)
+    model.field.load_state_dict(state)
     for name in ("rgb", "depth", "winning_mpi"):
         assert torch.equal(a[name], b[name]), name
 
