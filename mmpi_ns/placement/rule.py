@@ -35,7 +35,7 @@ class PlacementConfig:
     """automatic: by the expected pixel error; drive: front, left, right, below; room: five around the centre."""
     max_mpis: int = 64
     """Maximum number of MPIs (automatic)."""
-    max_texels: float = 16e6
+    max_texels: float = 24e6
     """Approximate maximum of texels and voxels in total; texels are made larger to meet it; 0: no limit (automatic)."""
     min_gain: float = 1.0
     """Minimum gain of an MPI in bits: how often it must halve the expected error of one training image (automatic)."""
@@ -142,7 +142,7 @@ def _choose(
         excess = sum(h.texels for h in chosen) / config.max_texels if config.max_texels else 0.0
         if excess <= 1.0:
             best = chosen, tried
-            if too_fine is None or excess > 0.8:
+            if too_fine is None or excess > 0.9:
                 break
             texel_pixels = (too_fine * texel_pixels) ** 0.5
         else:
