@@ -23,6 +23,8 @@ from mmpi_ns.placement.visibility import VisiblePoints, find_visible_points, pix
 from mmpi_ns.scene.plan import MOST_DETAIL, CubePlan, MPIPlan, ScenePlan
 
 MIN_PLANES = 16
+REFINED = 1.6
+"""Multiple of ``texels_per_ray`` that texels may reach in training, when most of them have been released."""
 BUDGET_ROUNDS = 8
 """Attempts at keeping to the budget of texels; each starts with coarser ones."""
 
@@ -102,8 +104,10 @@ def place(observations: Observations, config: PlacementConfig, training_rays: in
     if texel_pixels > finest and budget != config.max_texels:
         remedy = "more steps"
     elif texel_pixels > finest:  # there are rays for finer texels, and released ones leave room
-        detail = min((texel_pixels / finest) ** 2, MOST_DETAIL)
-        remedy = f"a larger placement.max-texels, or down to {finest:.1f} in training in the room of released ones"
+        most = REFINED * config.texels_per_ray * (training_rays or 0) / sum(h.texels for h in chosen) or MOST_DETAIL
+        detail = min((texel_pixels / finest) ** 2, max(most, 1.0), MOST_DETAIL)
+        smallest = texel_pixels / detail**0.5
+        remedy = f"a larger placement.max-texels, or down to {smallest:.1f} in training in the room of released ones"
     else:
         remedy = "more steps" if trainable > config.texel_pixels else "a smaller placement.texel-pixels"
     origin = f"automatic placement, a texel spans {texel_pixels:.1f} pixels: finer with {remedy}"
