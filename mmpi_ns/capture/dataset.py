@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
+from mmpi_ns.capture.rays import image_rays
 from mmpi_ns.utils.errors import InputError, brief
 
 # Pillow reports damaged files by any of these (SyntaxError: a broken PNG chunk), nerfstudio odd shapes by assertions.
@@ -112,7 +113,8 @@ class MMPIDataset(InputDataset):
             unit = self.metadata.get("depth_unit_scale_factor", 1.0) * self._dataparser_outputs.dataparser_scale
             depth = read_depth_image(Path(files[image_idx]), unit)
             depth = cv2.resize(depth, (columns, rows), interpolation=cv2.INTER_NEAREST_EXACT)
-            data["distance"] = distances(torch.from_numpy(depth), self.cameras[image_idx : image_idx + 1])
+            depth = torch.from_numpy(depth[:height, :width])
+            data["distance"] = distances(depth, self.cameras[image_idx : image_idx + 1])
         return data | {k: data[k][:height, :width] for k in ("image", "mask", "distance") if k in data}
 
     def usable(self, image_idx: int) -> NDArray[np.bool_]:
@@ -126,10 +128,7 @@ class MMPIDataset(InputDataset):
 
 def distances(depth: Float[Tensor, "H W"], camera: Cameras) -> Float[Tensor, "H W 1"]:
     """Distance of the content of each pixel from a camera, by its depth along the optical axis."""
-    y, x = torch.meshgrid(*(torch.arange(n) + 0.5 for n in depth.shape), indexing="ij")
-    first = torch.zeros(*depth.shape, 1, dtype=torch.long)
-    directions = camera.generate_rays(camera_indices=first, coords=torch.stack([y, x], -1)).directions
-    along_axis = -(directions * camera.camera_to_worlds[0, :, 2]).sum(-1)
+    along_axis = -(image_rays(camera).directions * camera.camera_to_worlds[0, :, 2]).sum(-1)
     return (depth / along_axis.clamp(min=1e-6))[..., None]
 
 

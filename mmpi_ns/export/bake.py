@@ -17,6 +17,7 @@ from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.utils.eval_utils import eval_setup
 from torch import Tensor
 
+from mmpi_ns.capture.rays import image_rays
 from mmpi_ns.export.files import BakedScene, Pose
 from mmpi_ns.model import MMPIModel, MMPIModelConfig
 from mmpi_ns.rendering.images import CPU_RAYS, render_in_chunks
@@ -72,7 +73,7 @@ def bake_run(pipeline: Any, least: float, say: Say = print) -> BakedScene:
     )
 
     def camera_rays(camera: int) -> tuple[Tensor, Tensor]:
-        rays = cameras.generate_rays(camera).flatten()
+        rays = image_rays(cameras[camera : camera + 1]).flatten()
         return rays.origins.contiguous(), rays.directions.contiguous()
 
     windows = []
@@ -134,8 +135,7 @@ def compare(pipeline: Any, scene: BakedScene, count: int) -> Compared:
     to_exact: list[float] = []
     rows: dict[str, list[dict[str, float]]] = {"exact": [], "baked": []}
     for i in torch.linspace(0, len(dataset) - 1, min(count, len(dataset))).long().tolist():
-        # One camera alone: rays of cameras of several sizes would be a list without rows.
-        bundle, truth = dataset.cameras[i : i + 1].generate_rays(0, keep_shape=True), dataset[i]["image"][..., :3]
+        bundle, truth = image_rays(dataset.cameras[i : i + 1]), dataset[i]["image"][..., :3]
         renderers = {
             "exact": lambda bundle=bundle: pipeline.model.get_outputs_for_camera_ray_bundle(bundle)["rgb"],
             "baked": lambda bundle=bundle: render_in_chunks(

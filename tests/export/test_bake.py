@@ -178,6 +178,36 @@ def test_a_run_is_baked_and_read_again(trainer, tmp_path):
     assert bake_run(trainer.pipeline, 0, said.append).windows[0][1] is whole
 
 
+def test_the_weights_of_an_image_are_looked_at_in_parts(trainer, monkeypatch):
+    """A photo of 12 megapixels at once would take gigabytes."""
+    window = filled(trainer).baked(trainer.pipeline.model.field)
+    rays = bundle_of(trainer.pipeline.model.field.plan)
+    largest: list[int] = []
+    shown = baking.show_baked
+
+    def counted(mpis, rays, *arguments):
+        largest.append(len(rays.origins))
+        return shown(mpis, rays, *arguments)
+
+    whole = window.peaks([rays], lambda view: (view.origins, view.directions))
+    monkeypatch.setattr(baking, "AT_ONCE", 37)
+    monkeypatch.setattr(baking, "show_baked", counted)
+    assert torch.equal(window.peaks([rays], lambda view: (view.origins, view.directions)), whole)
+    assert whole.max() > 0.01 and max(largest) == 37 and sum(largest) == len(rays)
+
+
+def test_lenses_are_undistorted_once(trainer, monkeypatch):
+    """nerfstudio undistorts an image three times over, all of it at once."""
+    filled(trainer)
+    manager = trainer.pipeline.datamanager
+    for dataset in (manager.train_dataset, manager.eval_dataset):
+        lens = torch.tensor([0.05, -0.02, 0.0, 0.0, 0.003, -0.002]).repeat(len(dataset.cameras), 1)
+        monkeypatch.setattr(dataset.cameras, "distortion_params", lens)
+    monkeypatch.setattr(type(manager.eval_dataset.cameras), "generate_rays", None)
+    scene = bake_run(trainer.pipeline, 0.003, lambda words: None)
+    assert compare(trainer.pipeline, scene, 2).to_exact > 35
+
+
 def test_what_cannot_be_baked_is_refused(trainer, monkeypatch):
     model = filled(trainer)
     model.field.forget_baked()
