@@ -90,16 +90,16 @@ class PinholeRays:
         u, v = ((pixel - self.principal[camera]) / self.focal[camera]).unbind(-1)
         return torch.stack([u, -v, -torch.ones_like(u)], -1)
 
-    def image(self, height: int, width: int) -> RayBundle:
-        """Rays [height, width] through all pixels of the first camera."""
-        rows, columns = (torch.arange(n, device=self.focal.device) for n in (height, width))
+    def image(self, height: int, width: int, step: int = 1) -> RayBundle:
+        """Rays [H, W] through all pixels of the first camera, or through those of every n-th row and column."""
+        rows, columns = (torch.arange(min(step, n) // 2, n, step, device=self.focal.device) for n in (height, width))
         parts = []
-        for some in rows.split(max(1, CHUNK // width)):
+        for some in rows.split(max(1, CHUNK // len(columns))):
             y, x = torch.meshgrid(some, columns, indexing="ij")
             parts.append(self(torch.stack([torch.zeros_like(x), y, x], -1).view(-1, 3)))
         fields = ("origins", "directions", "pixel_area", "camera_indices")
         joined = {name: torch.cat([getattr(part, name) for part in parts]) for name in fields}
-        return RayBundle(**joined, metadata={}).reshape((height, width))
+        return RayBundle(**joined, metadata={}).reshape((len(rows), len(columns)))
 
 
 @dataclass(frozen=True)
@@ -119,12 +119,12 @@ class LensRays(PinholeRays):
         return self.directions[self.first[camera] + row * self.widths[camera] + column]
 
 
-def image_rays(camera: Cameras) -> RayBundle:
-    """Rays [H, W] through all pixels of one camera, nerfstudio's own where it has another type."""
+def image_rays(camera: Cameras, step: int = 1) -> RayBundle:
+    """Rays [H, W] through the pixels of one camera, as of ``PinholeRays.image``; nerfstudio's for other types."""
     rays = PinholeRays.of(camera, camera.device)
     if rays is None:
-        return camera.generate_rays(0, keep_shape=True)
-    return rays.image(int(camera.height), int(camera.width))
+        return camera.generate_rays(0, keep_shape=True)[::step, ::step]
+    return rays.image(int(camera.height), int(camera.width), step)
 
 
 @lru_cache(maxsize=2)
