@@ -52,6 +52,11 @@ class MMPIDataset(InputDataset):
     """Masks of what moves in each image [H, W], used in images that have no mask file."""
 
     def __init__(self, dataparser_outputs: DataparserOutputs, scale_factor: float = 1.0) -> None:
+        if not dataparser_outputs.cameras.shape:  # nerfstudio's parser for Instant NGP: [4, 3] of a 4 x 4 matrix
+            raise InputError(
+                f"nerfstudio's data parser loses the pose of {dataparser_outputs.image_filenames[0]}, the only image "
+                "of its split: let two or more be evaluated (--train-split-fraction, --eval-mode)."
+            )
         masks = dataparser_outputs.mask_filenames or [Path(NO_MASK)] * len(dataparser_outputs.image_filenames)
         self.mask_files = [None if file.name == NO_MASK else file for file in masks]
         # Masks are read here: nerfstudio's data set would ask for one of each image.
