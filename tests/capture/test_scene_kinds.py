@@ -178,6 +178,6 @@ def test_the_only_test_image_of_instant_ngp_is_named(tmp_path):
     data = write_scene(tmp_path / "data")
     edit(data, lambda meta: [meta.pop(key, None) for key in ("train_filenames", "val_filenames", "test_filenames")])
     with pytest.raises(InputError, match=r"loses the pose of .*, the only image of its split"):
-        datamanager(data, dataparser=InstantNGPDataParserConfig())
+        datamanager(data, dataparser=InstantNGPDataParserConfig(train_split_fraction=0.8))
     two = datamanager(data, dataparser=InstantNGPDataParserConfig(train_split_fraction=0.7))
     assert two.eval_dataset.cameras.shape == (2,)
