@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from mmpi_ns.capture.datamanager import DEPTHS_KNOWN, GAINS, OBSERVATIONS, RAYS_PER_STEP, TRAINING_VIEWS
-from mmpi_ns.capture.rays import PinholeRays
+from mmpi_ns.capture.rays import image_rays
 from mmpi_ns.field.mmpi_field import ColourConfig, MMPIField
 from mmpi_ns.field.samples import metadata_of
 from mmpi_ns.ops import dispatch
@@ -316,10 +316,9 @@ class MMPIModel(Model):
     def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
         """Renders a camera's image, or what of it lies in a box. Raises InputError where the box has no size."""
         check_crop(obb_box)
-        rays = PinholeRays.of(camera, self.device) if obb_box is None else None
-        if rays is None:
+        if obb_box is not None:
             return super().get_outputs_for_camera(camera, obb_box)
-        return self.get_outputs_for_camera_ray_bundle(rays.image(int(camera.height), int(camera.width)))
+        return self.get_outputs_for_camera_ray_bundle(image_rays(camera.to(self.device)))
 
     @torch.no_grad()
     def get_outputs_for_camera_ray_bundle(self, camera_ray_bundle: RayBundle) -> dict[str, Tensor]:

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
+from mmpi_ns.capture.rays import image_rays
 from mmpi_ns.utils.errors import InputError, brief
 
 # Pillow reports damaged files by any of these (SyntaxError: a broken PNG chunk), nerfstudio odd shapes by assertions.
@@ -51,6 +52,11 @@ class MMPIDataset(InputDataset):
     """Masks of what moves in each image [H, W], used in images that have no mask file."""
 
     def __init__(self, dataparser_outputs: DataparserOutputs, scale_factor: float = 1.0) -> None:
+        if not dataparser_outputs.cameras.shape:  # nerfstudio's parser for Instant NGP: [4, 3] of a 4 x 4 matrix
+            raise InputError(
+                f"nerfstudio's data parser loses the pose of {dataparser_outputs.image_filenames[0]}, the only image "
+                "of its split: let two or more be evaluated (--train-split-fraction, --eval-mode)."
+            )
         masks = dataparser_outputs.mask_filenames or [Path(NO_MASK)] * len(dataparser_outputs.image_filenames)
         self.mask_files = [None if file.name == NO_MASK else file for file in masks]
         # Masks are read here: nerfstudio's data set would ask for one of each image.
@@ -112,7 +118,8 @@ class MMPIDataset(InputDataset):
             unit = self.metadata.get("depth_unit_scale_factor", 1.0) * self._dataparser_outputs.dataparser_scale
             depth = read_depth_image(Path(files[image_idx]), unit)
             depth = cv2.resize(depth, (columns, rows), interpolation=cv2.INTER_NEAREST_EXACT)
-            data["distance"] = distances(torch.from_numpy(depth), self.cameras[image_idx : image_idx + 1])
+            depth = torch.from_numpy(depth[:height, :width])
+            data["distance"] = distances(depth, self.cameras[image_idx : image_idx + 1])
         return data | {k: data[k][:height, :width] for k in ("image", "mask", "distance") if k in data}
 
     def usable(self, image_idx: int) -> NDArray[np.bool_]:
@@ -126,10 +133,7 @@ class MMPIDataset(InputDataset):
 
 def distances(depth: Float[Tensor, "H W"], camera: Cameras) -> Float[Tensor, "H W 1"]:
     """Distance of the content of each pixel from a camera, by its depth along the optical axis."""
-    y, x = torch.meshgrid(*(torch.arange(n) + 0.5 for n in depth.shape), indexing="ij")
-    first = torch.zeros(*depth.shape, 1, dtype=torch.long)
-    directions = camera.generate_rays(camera_indices=first, coords=torch.stack([y, x], -1)).directions
-    along_axis = -(directions * camera.camera_to_worlds[0, :, 2]).sum(-1)
+    along_axis = -(image_rays(camera).directions * camera.camera_to_worlds[0, :, 2]).sum(-1)
     return (depth / along_axis.clamp(min=1e-6))[..., None]
 
 

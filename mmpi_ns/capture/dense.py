@@ -44,7 +44,9 @@ MAX_ANGLE = 40.0
 LARGE = 640
 """Pixels along the longer side of a large image."""
 LEAST_FLOW = 16
-"""Pixels of an image's shorter side from which on it is matched at a reduced size; optical flow needs a few."""
+"""Pixels of an image's shorter side from which on it is matched at a reduced size."""
+SMALLEST = 12
+"""Pixels of the longer side that OpenCV's optical flow needs."""
 ROUNDS = {False: (1, 1, 1), True: (2, 1)}
 """Rounds of matching of small and of large images, each at the working size divided by this; each starts from the
 depths of the previous one."""
@@ -391,7 +393,7 @@ def matched(view: View, others: list[View], points: NDArray[np.float64], rounds:
     rough, depth = None, Depth(*np.zeros((2, *view.gray.shape), np.float32))
     flow.setPatchStride(STRIDE[is_large])
     for factor in (rounds or ROUNDS[is_large]) if others else ():
-        if factor > 1 and min(view.gray.shape) < LEAST_FLOW * factor:
+        if (factor > 1 and min(view.gray.shape) < LEAST_FLOW * factor) or max(view.gray.shape) < SMALLEST:
             continue
         small = view.reduced(factor)
         if rough is None:

@@ -18,6 +18,8 @@ SIDE = Number(1, 65536)
 """Pixels along a side of an image."""
 FOCAL_SHARES = (1e-3, 1e4)
 """Plausible focal lengths, in widths of the image."""
+WHOLE_SPHERE = {"fl_x": 0.5, "fl_y": 1.0}
+"""Focal lengths of an equirectangular image all round, in sides of the image; smaller ones would show it twice."""
 MODELS = {
     name: kind for name, kind in CAMERA_MODEL_TO_TYPE.items() if not name.startswith(("OMNIDIRECTIONALSTEREO", "VR180"))
 }
@@ -64,11 +66,12 @@ def _check_camera(camera: Mapping[str, Any], kind: CameraType, where: str) -> No
         check_number(f"The {key} of {where}", camera[key], SIDE)
         if camera[key] != int(camera[key]):
             raise InputError(f"The {key} of {where} must be whole pixels, not {shown(camera[key])}.")
-    least, most = FOCAL_SHARES
     for key, side in (("fl_x", "w"), ("fl_y", "h")):
         check_number(f"The focal length {key} of {where}", camera[key], POSITIVE)
-        share = camera[key] / camera[side]
-        if kind != CameraType.ORTHOPHOTO and not least <= share <= most:
+        share, (least, most) = camera[key] / camera[side], FOCAL_SHARES
+        if kind == CameraType.EQUIRECTANGULAR:
+            least = WHOLE_SPHERE[key]
+        if kind != CameraType.ORTHOPHOTO and not 0.99 * least <= share <= most:
             raise InputError(
                 f"The focal length {key} of {where} is {camera[key]:g} pixels in an image of {camera[side]:g}: give "
                 f"it in pixels, between {least:g} and {most:g} times the image's side."

@@ -2,11 +2,12 @@
 
 nerfstudio's ray generator handles every camera type and checks types and distortions some twenty times for each batch,
 which takes 4 of 75 ms of a step on a CPU; on a GPU, each check is a synchronisation. It undistorts every pixel of every
-batch anew: here the directions of a lens are computed once, by nerfstudio, for all cameras that share it.
+batch anew: here the directions of a lens are computed once for all cameras that share it.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
@@ -14,6 +15,7 @@ from functools import lru_cache
 import numpy as np
 import torch
 from jaxtyping import Float, Int
+from nerfstudio.cameras.camera_utils import radial_and_tangential_undistort
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.cameras.rays import RayBundle
 from numpy.typing import NDArray
@@ -24,7 +26,9 @@ from mmpi_ns.scene.geometry import rotate
 Rays = Callable[[Int[Tensor, "R 3"]], RayBundle]
 """Makes rays through pixel centres (camera, row, column)."""
 MOST_DIRECTIONS = 20_000_000
-"""Pixels of distinct lenses for which directions are kept (12 bytes each); nerfstudio makes the rays of more."""
+"""Pixels of several lenses for which directions are kept (12 bytes each); nerfstudio makes the rays of more."""
+UNDISTORTED = 2**16
+"""Pixels that are undistorted at once: their intermediate numbers fit the caches of a CPU."""
 CHUNK = 2**18
 """Pixels whose rays are made at once."""
 GRID = 17
@@ -45,8 +49,7 @@ class PinholeRays:
     def of(cameras: Cameras, device: torch.device | str) -> PinholeRays | None:
         """Rays of perspective and fisheye cameras, ``LensRays`` if any has a lens.
 
-        None if a camera has another type or a time, or if lenses differ so much that their directions need too much
-        memory.
+        None if a camera has another type or a time, or if several lenses have more pixels than ``MOST_DIRECTIONS``.
         """
         kinds = cameras.camera_type.reshape(-1)
         is_fisheye = kinds == CameraType.FISHEYE.value
@@ -62,7 +65,7 @@ class PinholeRays:
         rows = torch.cat([x.reshape(len(kinds), -1).double().cpu() for x in columns], -1)
         distinct, which = torch.unique(rows, dim=0, return_inverse=True)
         pixels = (distinct[:, 4] * distinct[:, 5]).long()
-        if int(pixels.sum()) > MOST_DIRECTIONS:
+        if len(distinct) > 1 and int(pixels.sum()) > MOST_DIRECTIONS:
             return None
         tables = [pixel_directions(tuple(row)) for row in distinct.tolist()]
         directions = torch.cat(tables) if len(tables) > 1 else tables[0]  # without a copy
@@ -87,16 +90,16 @@ class PinholeRays:
         u, v = ((pixel - self.principal[camera]) / self.focal[camera]).unbind(-1)
         return torch.stack([u, -v, -torch.ones_like(u)], -1)
 
-    def image(self, height: int, width: int) -> RayBundle:
-        """Rays [height, width] through all pixels of the first camera."""
-        rows, columns = (torch.arange(n, device=self.focal.device) for n in (height, width))
+    def image(self, height: int, width: int, step: int = 1) -> RayBundle:
+        """Rays [H, W] through all pixels of the first camera, or through those of every n-th row and column."""
+        rows, columns = (torch.arange(min(step, n) // 2, n, step, device=self.focal.device) for n in (height, width))
         parts = []
-        for some in rows.split(max(1, CHUNK // width)):
+        for some in rows.split(max(1, CHUNK // len(columns))):
             y, x = torch.meshgrid(some, columns, indexing="ij")
             parts.append(self(torch.stack([torch.zeros_like(x), y, x], -1).view(-1, 3)))
         fields = ("origins", "directions", "pixel_area", "camera_indices")
         joined = {name: torch.cat([getattr(part, name) for part in parts]) for name in fields}
-        return RayBundle(**joined, metadata={}).reshape((height, width))
+        return RayBundle(**joined, metadata={}).reshape((len(rows), len(columns)))
 
 
 @dataclass(frozen=True)
@@ -116,19 +119,39 @@ class LensRays(PinholeRays):
         return self.directions[self.first[camera] + row * self.widths[camera] + column]
 
 
+def image_rays(camera: Cameras, step: int = 1) -> RayBundle:
+    """Rays [H, W] through the pixels of one camera, as of ``PinholeRays.image``; nerfstudio's for other types."""
+    rays = PinholeRays.of(camera, camera.device)
+    if rays is None:
+        return camera.generate_rays(0, keep_shape=True)[::step, ::step]
+    return rays.image(int(camera.height), int(camera.width), step)
+
+
 @lru_cache(maxsize=2)
 def pixel_directions(camera: tuple[float, ...]) -> Float[Tensor, "P 3"]:
-    """Unit directions of all pixel centres of a camera, in its axes, row after row; nerfstudio's own.
+    """Unit directions of all pixel centres of a camera, in its axes, row after row; the bits of nerfstudio's.
 
     Args:
-        camera: fx, fy, cx, cy, width, height, camera type, and nerfstudio's distortion parameters.
+        camera: fx, fy, cx, cy, width, height, camera type (perspective or fisheye), and nerfstudio's distortion
+            parameters.
+
+    Source: ``Cameras._generate_rays_from_coords``, which also makes the two neighbours of every pixel and needs ten
+    times as long.
     """
-    fx, fy, cx, cy = camera[:4]
+    focal, center, lens = (torch.tensor(camera[part]) for part in (slice(0, 2), slice(2, 4), slice(7, None)))
     width, height, kind = (int(n) for n in camera[4:7])
-    lens = torch.tensor([camera[7:]])
-    alone = Cameras(torch.eye(4)[None, :3], fx, fy, cx, cy, width, height, lens, CameraType(kind))
-    y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
-    parts = [alone.generate_rays(0, coords=c).directions for c in torch.stack([y, x], -1).view(-1, 2).split(CHUNK)]
+    parts = []
+    for rows in torch.arange(height).split(max(1, UNDISTORTED // width)):
+        y, x = torch.meshgrid(rows + 0.5, torch.arange(width) + 0.5, indexing="ij")
+        at = (torch.stack([x, y], -1).view(-1, 2) - center) / focal
+        if bool((lens != 0).any()):
+            at = radial_and_tangential_undistort(at, lens)
+        (u, v), ahead = at.unbind(-1), torch.ones_like(at[:, 0])
+        if kind == CameraType.FISHEYE.value:
+            angle = at.square().sum(-1).sqrt().clip(0, math.pi)
+            u, v, ahead = u * angle.sin() / angle, v * angle.sin() / angle, angle.cos()
+        local = torch.stack([u, -v, -ahead], -1)
+        parts.append(local / torch.linalg.vector_norm(local, dim=-1, keepdim=True))
     return _without_nan(torch.cat(parts))
 
 

@@ -17,14 +17,19 @@ from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.utils.eval_utils import eval_setup
 from torch import Tensor
 
+from mmpi_ns.capture.rays import image_rays
 from mmpi_ns.export.files import BakedScene, Pose
 from mmpi_ns.model import MMPIModel, MMPIModelConfig
+from mmpi_ns.rendering.baked import BakedWindow
 from mmpi_ns.rendering.images import CPU_RAYS, render_in_chunks
 from mmpi_ns.rendering.metrics import ImageMetrics
 from mmpi_ns.scene.windows import window_shares
 from mmpi_ns.utils.errors import InputError, brief
 
 Say = Callable[[str], None]
+
+MOST_LOOKED_AT = 60e6
+"""Training pixels of a window that decide which bricks are seen; of more, those of every n-th row and column."""
 
 
 def read_run_config(path: Path) -> MMPIModelConfig:
@@ -71,17 +76,23 @@ def bake_run(pipeline: Any, least: float, say: Say = print) -> BakedScene:
         window_shares(cameras.camera_to_worlds[:, :, 3], places) if len(places) > 1 else torch.ones(len(cameras), 1)
     )
 
-    def camera_rays(camera: int) -> tuple[Tensor, Tensor]:
-        rays = cameras.generate_rays(camera).flatten()
-        return rays.origins.contiguous(), rays.directions.contiguous()
+    def seen_weights(window: BakedWindow, views: list[int]) -> Tensor:
+        alike = sorted(views, key=lambda i: [float(x[i]) for x in (cameras.width, cameras.height, cameras.fx)])
+        pixels = float((cameras.width * cameras.height)[views].sum())
+        step = math.ceil((pixels / MOST_LOOKED_AT) ** 0.5)
+
+        def rays_of(i: int) -> tuple[Tensor, Tensor]:
+            rays = image_rays(cameras[i : i + 1], step).flatten()
+            return rays.origins.contiguous(), rays.directions.contiguous()
+
+        return window.peaks(alike, rays_of).amax((1, 2))
 
     windows = []
     for number, place in enumerate(places):
         field = model.field if number == model.progress.window else model.store.load(number, model.device)
         whole = kept = model.baked(field)
         if least > 0:
-            peaks = whole.peaks((shares[:, number] > 0).nonzero()[:, 0].tolist(), camera_rays)
-            kept = whole.keep(peaks.amax((1, 2)) >= least)
+            kept = whole.keep(seen_weights(whole, (shares[:, number] > 0).nonzero()[:, 0].tolist()) >= least)
         say(f"Window {number}: {kept.mpis.num_bricks} of {whole.mpis.num_bricks} bricks are seen ({least:g} or more).")
         windows.append((replace(place, plan=replace(place.plan, mpis=kept.mpis.mpis, cube=None)), kept))
     path = poses_of(pipeline)
@@ -134,8 +145,7 @@ def compare(pipeline: Any, scene: BakedScene, count: int) -> Compared:
     to_exact: list[float] = []
     rows: dict[str, list[dict[str, float]]] = {"exact": [], "baked": []}
     for i in torch.linspace(0, len(dataset) - 1, min(count, len(dataset))).long().tolist():
-        # One camera alone: rays of cameras of several sizes would be a list without rows.
-        bundle, truth = dataset.cameras[i : i + 1].generate_rays(0, keep_shape=True), dataset[i]["image"][..., :3]
+        bundle, truth = image_rays(dataset.cameras[i : i + 1]), dataset[i]["image"][..., :3]
         renderers = {
             "exact": lambda bundle=bundle: pipeline.model.get_outputs_for_camera_ray_bundle(bundle)["rgb"],
             "baked": lambda bundle=bundle: render_in_chunks(

@@ -18,6 +18,7 @@ from mmpi_ns.placement.hand_made import facing_axes, vector
 from mmpi_ns.placement.observations import Array, Observations
 from mmpi_ns.placement.visibility import VisiblePoints, farthest_first
 from mmpi_ns.scene.plan import CubePlan, MPIPlan
+from mmpi_ns.utils.errors import InputError
 
 MAX_VIEWS, MAX_WIDE_VIEWS = 96, 32
 """Number of training cameras used for candidates, spread over all; fewer for wide lenses, which have several each."""
@@ -63,7 +64,11 @@ class Candidate:
 
 
 def find_candidates(observations: Observations, visible: VisiblePoints, with_cubes: bool) -> list[Candidate]:
-    """Views of training cameras that are spread over the capture, and cubes."""
+    """Views of training cameras that are spread over the capture, and cubes.
+
+    Raises:
+        InputError: no camera has a field of view that an MPI can have.
+    """
     spread = spread_cameras(observations, visible, MAX_WIDE_VIEWS if observations.wide.any() else MAX_VIEWS)
     views = [
         view
@@ -72,6 +77,10 @@ def find_candidates(observations: Observations, visible: VisiblePoints, with_cub
         for pull_back in PULL_BACKS
         for view in _views(observations, visible, i, face, pull_back * visible.near)
     ]
+    if not views:
+        raise InputError(
+            "No MPI fits the field of view of any training camera: check camera_model, focal lengths and distortion."
+        )
     return [*views, *(_cubes(observations, visible) if with_cubes else [])]
 
 

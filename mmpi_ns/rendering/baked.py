@@ -43,6 +43,8 @@ THINNEST = -12.0
 HIGHEST_COLOR, HIGHEST_FEATURE = 191, 96
 """Largest codes of a colour channel and of a feature. These lose 0.0007 of SSIM; 255 for both loses 0.0003 and is a
 fifth larger, 127 for both loses 0.0011 (docs/export.md)."""
+AT_ONCE = 2**18
+"""Rays whose weights are looked at together: all of a photo of 12 megapixels would take gigabytes."""
 
 _measuring: ContextVar[bool] = ContextVar("measuring", default=False)
 
@@ -123,8 +125,8 @@ class BakedWindow:
         """
         peaks = torch.zeros(self.mpis.density.shape)
         for view in views:
-            origins, directions = rays_of(view)
-            show_baked(self.mpis, Rays(origins, directions, *self.unbounded(origins)), self.threshold, peaks)
+            for o, d in zip(*(x.split(AT_ONCE) for x in rays_of(view)), strict=True):
+                show_baked(self.mpis, Rays(o, d, *self.unbounded(o)), self.threshold, peaks)
         return peaks
 
     def outputs(self, bundle: RayBundle, background: Float[Tensor, "3"]) -> dict[str, Tensor]:

@@ -15,6 +15,7 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from torch import Tensor
 
+from mmpi_ns.capture.rays import image_rays
 from mmpi_ns.rendering.baked import exact_images
 from mmpi_ns.rendering.exposure import exposure_of_image
 from mmpi_ns.utils.errors import InputError, say
@@ -114,7 +115,7 @@ def refined_camera(model: Any, camera: Cameras, image: Tensor, seed: int) -> tup
     moves: CameraOptimizer = CameraOptimizerConfig(mode="SO3xR3").setup(num_cameras=1, device=model.device)
     optimizer = torch.optim.Adam(moves.parameters(), lr=RATES[0])
     decay = torch.optim.lr_scheduler.ExponentialLR(optimizer, (RATES[1] / RATES[0]) ** (1 / STEPS))
-    rays = camera.generate_rays(0, keep_shape=True).flatten()
+    rays = image_rays(camera).flatten()
     observed = image.reshape(-1, 3).to(model.device)
     frozen = [p.requires_grad_(False) for p in model.parameters() if p.requires_grad]
     try:

@@ -92,11 +92,20 @@ def test_without_test_images_training_images_are_scored_and_it_says_so(data, cap
 
 
 def test_an_image_that_was_rounded_up_by_a_pixel_is_cut_to_its_camera(data):
+    """Its depths too; they are along the optical axis."""
+    (data / "depths").mkdir()
     for i in range(8):
         Image.fromarray(np.zeros((HEIGHT + 1, WIDTH + 1, 3), np.uint8)).save(data / "images" / name_of(i))
+        Image.fromarray(np.full((HEIGHT, WIDTH), 4000, np.uint16)).save(data / "depths" / name_of(i))
+    edit(data, lambda meta: [f.update(depth_file_path=f"depths/{name_of(i)}") for i, f in enumerate(meta["frames"])])
     manager = datamanager(data)
     assert len(manager.sources.pixels.colors) == len(TRAIN) * WIDTH * HEIGHT
     assert manager.eval_dataset[0]["image"].shape == (HEIGHT, WIDTH, 3)
+    far, camera = manager.eval_dataset[0]["distance"], manager.eval_dataset.cameras[0]
+    u, v = (0.5 - float(camera.cx)) / float(camera.fx), (0.5 - float(camera.cy)) / float(camera.fy)
+    unit = manager.eval_dataset.metadata["depth_unit_scale_factor"] * manager.train_dataparser_outputs.dataparser_scale
+    assert far.shape == (HEIGHT, WIDTH, 1)
+    assert float(far[0, 0]) == pytest.approx(4000 * unit * (1 + u * u + v * v) ** 0.5, rel=1e-5)
 
 
 @pytest.mark.parametrize("i", [TRAIN[2], TEST[1]])

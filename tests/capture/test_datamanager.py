@@ -9,7 +9,7 @@ import json
 import numpy as np
 import pytest
 import torch
-from nerfstudio.cameras.cameras import CameraType
+from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.model_components.ray_generators import RayGenerator
 from PIL import Image
 from tiny_scene import HEIGHT, TEST, TRAIN, WIDTH, color_of, image_of, name_of, project, wall_points, write_scene
@@ -320,6 +320,7 @@ def test_rays_of_pinhole_cameras_are_nerfstudios(scene):
     image, whole = made.image(HEIGHT, WIDTH), cameras[0:1].generate_rays(camera_indices=0, keep_shape=True)
     for name in ("origins", "directions", "camera_indices"):
         assert getattr(image, name).shape == getattr(whole, name).shape
+        assert torch.equal(getattr(made.image(HEIGHT, WIDTH, 3), name), getattr(image, name)[1::3, 1::3]), name
         assert torch.allclose(getattr(image, name), getattr(whole, name), atol=1e-6), name
 
 
@@ -355,6 +356,24 @@ def test_rays_through_a_lens_are_nerfstudios(scene, kind, monkeypatch):
         assert torch.allclose(image.directions, whole.directions, atol=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("kind", "lens"),
+    [
+        (CameraType.PERSPECTIVE, (-0.08, 0.02, 0.0, 0.0, 1e-3, -5e-4)),
+        (CameraType.FISHEYE, (0.02, -0.005, 1e-3, 0.0, 0.0, 0.0)),
+        (CameraType.FISHEYE, (0.0,) * 6),
+    ],
+)
+def test_the_directions_of_a_lens_have_nerfstudios_bits(kind, lens, monkeypatch):
+    """In parts that end within the image; the principal point lies between pixels."""
+    monkeypatch.setattr(rays, "UNDISTORTED", 7 * 50)
+    sizes = {"fx": 40.0, "fy": 41.5, "cx": 24.3, "cy": 20.0, "width": 50, "height": 40}
+    camera = Cameras(torch.eye(4)[None, :3], **sizes, distortion_params=torch.tensor([lens]), camera_type=kind)
+    theirs = camera.generate_rays(0, keep_shape=True).directions
+    ours = rays.pixel_directions((*sizes.values(), kind.value, *lens))
+    assert torch.equal(ours, theirs.view(-1, 3))
+
+
 def test_the_middle_of_a_fisheye_looks_ahead(scene):
     cameras = copy.deepcopy(datamanager(scene).train_dataset.cameras)[0:1]
     cameras.camera_type = torch.full_like(cameras.camera_type, CameraType.FISHEYE.value)
@@ -371,5 +390,9 @@ def test_other_cameras_are_left_to_nerfstudio(scene, monkeypatch):
     bent.distortion_params[1, 0] = 0.1
     monkeypatch.setattr(rays, "MOST_DIRECTIONS", 2 * WIDTH * HEIGHT - 1)
     assert PinholeRays.of(bent, "cpu") is None, "two lenses, of too many pixels"
+    monkeypatch.setattr(rays, "MOST_DIRECTIONS", WIDTH * HEIGHT - 1)
+    assert isinstance(PinholeRays.of(bent[1:2], "cpu"), LensRays), "one lens, of any number of pixels"
     round_.camera_type = torch.full_like(round_.camera_type, CameraType.EQUIRECTANGULAR.value)
     assert PinholeRays.of(round_, "cpu") is None
+    whole = round_[:1].generate_rays(camera_indices=0, keep_shape=True)
+    assert torch.equal(rays.image_rays(round_[:1]).directions, whole.directions)

@@ -218,7 +218,7 @@ def test_a_first_round_at_half_size_gives_the_depths_of_full_size(tmp_path, monk
     assert np.median(error) < 0.003 and np.quantile(scaled, 0.9) < 2
 
 
-@pytest.mark.parametrize("width", [16, 24, 32])
+@pytest.mark.parametrize("width", [2, 11, 16, 24, 32])
 def test_images_of_few_pixels_are_matched_at_their_size_alone(tmp_path, width):
     images = scene_of(tmp_path, POSES)
     results = list(find_depths(images, lambda i: points_on_walls(POSES[i]), width, rounds=(2, 1)))

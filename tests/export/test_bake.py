@@ -15,6 +15,7 @@ from nerfstudio.utils.eval_utils import eval_setup
 from random_fields import random_rays
 from training_runs import ready, trainer_config, write_plan
 
+from mmpi_ns.export import bake as bake_module
 from mmpi_ns.export.bake import bake_run, compare
 from mmpi_ns.export.files import read_baked, write_baked
 from mmpi_ns.field.shading import RayShader
@@ -176,6 +177,55 @@ def test_a_run_is_baked_and_read_again(trainer, tmp_path):
         assert abs(found.exact["ssim"] - found.baked["ssim"]) < 0.01 and found.baked["seconds"] > 0
         assert "dB to the exact" in str(found)
     assert bake_run(trainer.pipeline, 0, said.append).windows[0][1] is whole
+
+
+def test_the_weights_of_an_image_are_looked_at_in_parts(trainer, monkeypatch):
+    """A photo of 12 megapixels at once would take gigabytes."""
+    window = filled(trainer).baked(trainer.pipeline.model.field)
+    rays = bundle_of(trainer.pipeline.model.field.plan)
+    largest: list[int] = []
+    shown = baking.show_baked
+
+    def counted(mpis, rays, *arguments):
+        largest.append(len(rays.origins))
+        return shown(mpis, rays, *arguments)
+
+    whole = window.peaks([rays], lambda view: (view.origins, view.directions))
+    monkeypatch.setattr(baking, "AT_ONCE", 37)
+    monkeypatch.setattr(baking, "show_baked", counted)
+    assert torch.equal(window.peaks([rays], lambda view: (view.origins, view.directions)), whole)
+    assert whole.max() > 0.01 and max(largest) == 37 and sum(largest) == len(rays)
+
+
+def test_of_many_pixels_every_nth_row_and_column_decides_which_bricks_are_seen(trainer, monkeypatch):
+    filled(trainer)
+    cameras = trainer.pipeline.datamanager.train_dataset.cameras
+    total, looked_at = int((cameras.width * cameras.height).sum()), []
+    peaks = baking.BakedWindow.peaks
+
+    def counted(window, views, rays_of):
+        looked_at.append(sum(len(rays_of(view)[0]) for view in views))
+        return peaks(window, views, rays_of)
+
+    monkeypatch.setattr(baking.BakedWindow, "peaks", counted)
+    bricks = []
+    for most in (total, total / 4):
+        monkeypatch.setattr(bake_module, "MOST_LOOKED_AT", most)
+        bricks.append(bake_run(trainer.pipeline, 0.003, lambda words: None).windows[0][1].mpis.num_bricks)
+    assert looked_at == [total, total // 4]
+    assert 0.8 * bricks[0] < bricks[1] <= bricks[0]
+
+
+def test_lenses_are_undistorted_once(trainer, monkeypatch):
+    """nerfstudio undistorts an image three times over, all of it at once."""
+    filled(trainer)
+    manager = trainer.pipeline.datamanager
+    for dataset in (manager.train_dataset, manager.eval_dataset):
+        lens = torch.tensor([0.05, -0.02, 0.0, 0.0, 0.003, -0.002]).repeat(len(dataset.cameras), 1)
+        monkeypatch.setattr(dataset.cameras, "distortion_params", lens)
+    monkeypatch.setattr(type(manager.eval_dataset.cameras), "generate_rays", None)
+    scene = bake_run(trainer.pipeline, 0.003, lambda words: None)
+    assert compare(trainer.pipeline, scene, 2).to_exact > 35
 
 
 def test_what_cannot_be_baked_is_refused(trainer, monkeypatch):

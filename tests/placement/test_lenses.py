@@ -12,6 +12,7 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 from mmpi_ns.capture.rays import lens_directions
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.placement.rule import PlacementConfig, place
+from mmpi_ns.utils.errors import InputError
 
 SIDE, COUNT = 160, 10
 
@@ -94,3 +95,10 @@ def test_a_fisheyes_pixels_lie_in_mpis(degrees):
     for distance in (9.0, 1e4):
         lost = share_in_no_mpi(plan, cameras, distance)
         assert lost < 0.5 * share_in_no_mpi(pinholes, cameras, distance), (distance, plan.names)
+
+
+def test_cameras_that_see_nothing_are_refused():
+    """All pixels of a lens look the same way, as those of a panorama of whole turns between the grid's points do."""
+    found, _ = walk(150)
+    with pytest.raises(InputError, match="No MPI fits the field of view"):
+        place(replace(found, lens=np.broadcast_to(found.lens[:, 8:9, 8:9], found.lens.shape)), PlacementConfig())

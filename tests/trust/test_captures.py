@@ -124,6 +124,10 @@ REFUSED = {
     **{f"{k} is 0": (file(**{k: 0}), [f"{k} of"]) for k in ("fl_x", "fl_y", "w", "h")},
     "w is not whole": (file(w=32.5), ["w of", "whole pixels"]),
     "w is huge": (file(w=10**9), ["w of", "65536"]),
+    "a panorama of two turns": (
+        file(camera_model="EQUIRECTANGULAR", fl_x=0.2 * WIDTH, fl_y=HEIGHT),
+        ["focal length fl_x", "between 0.5 and"],
+    ),
     "focal length 1e12": (file(fl_x=1e12), ["focal length fl_x", "1e+12"]),
     "focal length 1e-9": (file(fl_y=1e-9), ["focal length fl_y", "1e-09"]),
     "cx outside the image": (file(cx=960), ["principal point cx", "960", "outside the image of 32"]),
