@@ -47,14 +47,14 @@ from mmpi_ns.rendering.window_store import WindowStore
 from mmpi_ns.scene.plan import NO_PLAN
 from mmpi_ns.scene.visible_tiles import TrainingViews
 from mmpi_ns.scene.windows import WindowedPlan
-from mmpi_ns.training.batch_rays import check_refined_poses, individual_rays, move_rays
+from mmpi_ns.training.batch_rays import individual_rays, move_rays
 from mmpi_ns.training.checkpoints import check_there_are_checkpoints
 from mmpi_ns.training.losses import LossWeights, batch_losses, over_background, photometric
 from mmpi_ns.training.memory import Work, fit_memory
 from mmpi_ns.training.options import grouped
 from mmpi_ns.training.phases import ScheduleConfig, make_schedule
 from mmpi_ns.training.run import Progress, TrainingRun, views_of
-from mmpi_ns.utils.errors import say
+from mmpi_ns.utils.errors import InputError, say
 from mmpi_ns.utils.parallel import torch_apart
 from mmpi_ns.utils.random_draws import generator
 
@@ -139,7 +139,11 @@ class MMPIModel(Model):
         self.show = ViewerDropdown("Show MPI", "all", ["all", *windows.names], hint="One MPI alone, or all")
         poses = config.camera_optimizer.setup(num_cameras=self.num_train_data, device=device)
         self.camera_optimizer: CameraOptimizer = poses
-        check_refined_poses(config.camera_optimizer.mode, len(windows))
+        if config.camera_optimizer.mode != "off" and count > 1:
+            raise InputError(
+                f"The capture is trained in {count} windows, one after the other, and poses are refined in one alone: "
+                "refine them before (mmpi-prepare --refine-poses), or give --pipeline.model.placement.window-length 0."
+            )
         scale_is_free = observations is not None and not len(observations.seen_by)
         release, moves = config.schedule.release_weight, [*poses.parameters()]
         self.run = TrainingRun(self.progress, self.field, self.store, views, release, moves, scale_is_free)
