@@ -45,14 +45,11 @@ def blend_shares(
     other_values = torch.where(has_others[:, None], other_values, torch.zeros_like(other_values))
     odds = torch.logsumexp(other_values, -1) - own_value
     # With softplus, both logs and both slopes are exact at P near 0 and 1; differences from the sum would cancel there.
-    log_share = torch.where(has_others, -_softplus(odds), torch.zeros_like(odds))
-    log_rest = torch.where(has_others, -_softplus(-odds), torch.full_like(odds, -torch.inf))
+    # From the threshold on torch returns its argument: at the default of 20, float64 could tell them apart.
+    over, under = (torch.nn.functional.softplus(x, threshold=50) for x in (odds, -odds))
+    log_share = torch.where(has_others, -over, torch.zeros_like(odds))
+    log_rest = torch.where(has_others, -under, torch.full_like(odds, -torch.inf))
     return log_share, log_rest
-
-
-def _softplus(x: Tensor) -> Tensor:
-    """log(1 + e^x); torch's own returns x from 20 on, which float64 can tell from it."""
-    return torch.nn.functional.softplus(x, threshold=50)
 
 
 def blended_optical_depth(

@@ -11,7 +11,7 @@ import shlex
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -91,37 +91,29 @@ def library() -> ctypes.CDLL:
     return built
 
 
-def address(tensor: Tensor, dtype: torch.dtype = torch.float32) -> ctypes.c_void_p:
-    """Address of a tensor's data, for a function that expects it contiguous and of this type."""
-    assert tensor.dtype == dtype and tensor.is_contiguous(), (tensor.dtype, tensor.stride())
-    return ctypes.c_void_p(tensor.data_ptr())
-
-
 def arguments(values: Iterable[Any]) -> list[Any]:
-    """Arguments of the compiled functions: addresses of tensors, 64-bit integers, 32-bit floats; others unchanged."""
-    forms = {int: ctypes.c_int64, bool: ctypes.c_int64, float: ctypes.c_float}
-    return [
-        address(x, x.dtype) if isinstance(x, Tensor) else forms[type(x)](x) if type(x) in forms else x for x in values
-    ]
-
-
-@functools.cache
-def _in_parts(name: str) -> Callable[..., None]:
-    """A compiled function for all parts between bounds (``cpp/parts.h``)."""
-    place = ctypes.c_void_p.in_dll(library(), f"{name}_in_parts").value
-    assert place is not None
-    return ctypes.CFUNCTYPE(None)(place)
+    """Arguments of the compiled functions: addresses of contiguous tensors, 64-bit integers, 32-bit floats; others
+    unchanged."""
+    forms, passed = {int: ctypes.c_int64, bool: ctypes.c_int64, float: ctypes.c_float}, []
+    for x in values:
+        if isinstance(x, Tensor):
+            assert x.is_contiguous(), x.stride()
+            passed.append(ctypes.c_void_p(x.data_ptr()))
+        else:
+            passed.append(forms[type(x)](x) if type(x) in forms else x)
+    return passed
 
 
 def run_in_parts(name: str, bounds: Sequence[int], before: Iterable[Any], after: Iterable[Any]) -> None:
-    """Calls a compiled function of ``(*before, begin, end, *after)`` for the parts between bounds, each by a thread.
-
-    Parts must not write to one place.
+    """Calls a compiled function of ``(*before, begin, end, *after)`` for the parts between bounds, each by a thread
+    (``cpp/parts.h``). Parts must not write to one place.
     """
+    function = ctypes.c_void_p.in_dll(library(), f"{name}_in_parts").value
+    assert function is not None
     tensors = list(before), list(after)  # which live until all parts are done
     first, last = (arguments(x) for x in tensors)
     how = (ctypes.c_int64 * len(bounds))(*bounds), *arguments((len(bounds) - 1, len(first)))
-    _in_parts(name)(*how, *first, *arguments((0, 0)), *last)
+    ctypes.CFUNCTYPE(None)(function)(*how, *first, *arguments((0, 0)), *last)
 
 
 def call_in_parts(name: str, count: int, before: Iterable[Any], after: Iterable[Any], least: int = 256) -> None:

@@ -29,7 +29,19 @@ def show_baked(scene: BakedMpis, rays: Rays, threshold: float, peaks: Float[Tens
         threshold: samples of less weight are left out of the sums.
         peaks: of every texel, raised to the largest weight of a sample that reads it.
     """
-    window = _window(scene)
+    window: reader.Window = {  # as the reader has it from a file
+        "mpis": [
+            vars(mpi)
+            | {"far": None if math.isinf(mpi.far) else mpi.far}
+            | {"interval": interval, "first_column": scene.first_column(k)}
+            for k, (mpi, interval) in enumerate(zip(scene.mpis, scene.intervals, strict=True))
+        ],
+        "density": vars(scene.density_codes),
+        "channels": [vars(c) for c in scene.channel_codes],
+        "columns_array": scene.columns.numpy().view("uint32"),
+        "density_array": scene.density.numpy(),
+        "texels_array": scene.texels.numpy(),
+    }
     samples = reader.march(window, *(x.double().numpy() for x in rays[:4]))
     inverse_t, weights, heads, texels, _, light = map(torch.from_numpy, samples)
     if peaks is not None and len(scene.density):
@@ -48,24 +60,6 @@ def show_baked(scene: BakedMpis, rays: Rays, threshold: float, peaks: Float[Tens
         (1 - transmittance - mass).clamp(min=0),
     )
     return Shown(*(x.to(rays.origins) for x in shown))
-
-
-def _window(scene: BakedMpis) -> reader.Window:
-    """The bricks as the reader has them from a file."""
-    parts = enumerate(zip(scene.mpis, scene.intervals, strict=True))
-    return {
-        "mpis": [
-            vars(mpi)
-            | {"far": None if math.isinf(mpi.far) else mpi.far}
-            | {"interval": interval, "first_column": scene.first_column(k)}
-            for k, (mpi, interval) in parts
-        ],
-        "density": vars(scene.density_codes),
-        "channels": [vars(c) for c in scene.channel_codes],
-        "columns_array": scene.columns.numpy().view("uint32"),
-        "density_array": scene.density.numpy(),
-        "texels_array": scene.texels.numpy(),
-    }
 
 
 @operation("cpu")
