@@ -182,14 +182,6 @@ def nearest(coordinate, size):
     return (down + up).to(tl.int64)
 
 
-@triton.jit
-def nearest_row(grids, head, u, v, s, mask):
-    """Row of the texel nearest to NDC (u, v, s)."""
-    grid = grids + head * INTS
-    x, y = nearest(u, tl.load(grid + WIDTH)), nearest(v, tl.load(grid + HEIGHT))
-    return row_of(grids, head, nearest(s, tl.load(grid + DEPTH)), y, x, mask)
-
-
 # Arithmetic that avoids cancellation ---------------------------------------------------------
 
 
@@ -226,9 +218,3 @@ def one_minus_exp(tau):
     p = 1 - t * (1.0 / 3) * p
     p = 1 - t * (1.0 / 2) * p
     return tl.where(tau < 0.5, t * p, 1 - tl.exp(-tau))
-
-
-@triton.jit
-def minus_log_of_rest(alpha):
-    """-log(1 - alpha) for alpha in [0, 1/2)."""
-    return twice_atanh(alpha / (2 - alpha))

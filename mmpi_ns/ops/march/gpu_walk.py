@@ -18,6 +18,7 @@ from mmpi_ns.ops.gpu_scene import (
     DEPTH,
     END,
     FLOATS,
+    HEIGHT,
     INTERVAL,
     INTS,
     S_SCALE,
@@ -27,13 +28,15 @@ from mmpi_ns.ops.gpu_scene import (
     U_SCALE,
     V0,
     V_SCALE,
+    WIDTH,
     bilinear,
     is_held,
-    minus_log_of_rest,
-    nearest_row,
+    nearest,
     one_minus_exp,
+    row_of,
     softplus,
     trilinear,
+    twice_atanh,
 )
 from mmpi_ns.ops.march.gpu_hits import local_ray
 
@@ -143,7 +146,10 @@ def _count_vote(own_vote, highest, others, grids, reliability, touched, k, head,
     looked_up = thick & (inside | is_own)
     vote = trilinear(reliability, grids, k, u, v, s, looked_up)
     counts = looked_up & (head != k)
-    counts = counts & (tl.load(touched + nearest_row(grids, k, u, v, s, counts), counts, 0) > 0)
+    grid = grids + k * INTS
+    x, y = nearest(u, tl.load(grid + WIDTH)), nearest(v, tl.load(grid + HEIGHT))
+    row = row_of(grids, k, nearest(s, tl.load(grid + DEPTH)), y, x, counts)
+    counts = counts & (tl.load(touched + row, counts, 0) > 0)
     higher = tl.where(counts, tl.maximum(highest, vote), highest)
     # -1e30 instead of -infinity: differences of it are numbers.
     others = tl.where(counts, others * tl.exp(highest - higher) + tl.exp(vote - higher), others)
@@ -181,7 +187,9 @@ def _blend(x, y, z, dx, dy, dz, constants, grids, cube, reliability, touched, he
     log_share, log_rest = -softplus(odds), -softplus(-odds)
     alpha, lower = one_minus_exp(tau) * tl.exp(log_share), log_share - tau
     opaque = tl.maximum(log_rest, lower) + softplus(-tl.abs(log_rest - lower))
-    blended = tl.where(alpha < 0.5, minus_log_of_rest(tl.minimum(alpha, 0.5)), tl.maximum(-opaque, 0.0))
+    thin = tl.minimum(alpha, 0.5)
+    thin = twice_atanh(thin / (2 - thin))  # -log(1 - alpha)
+    blended = tl.where(alpha < 0.5, thin, tl.maximum(-opaque, 0.0))
     blended = tl.where(sole, tau, blended)
     return tl.where(thick, blended, tau / (K + HAS_CUBE))
 
