@@ -68,11 +68,7 @@ class MMPIField(TexelTables):
 
     Args:
         plan: frames and resolutions.
-        shading: whether the network is evaluated once a ray or for every sample (``shading.py``).
-        feature_channels: channels of the colour features; the first three are colour logits.
-        hidden_width: width of the colour networks' hidden layers.
-        position_frequencies: octaves of the positional encoding of NDC positions.
-        direction_frequencies: octaves of the positional encoding of directions in the MPI's frame.
+        shading: with the next four, see ``ColourConfig``.
         shares_depth: K MPIs train jointly from the start, so each has 1/K of the optical depth.
         samples_per_voxel: samples along a ray per voxel side of the cube.
         cube_alpha: initial alpha of a cube sample.
@@ -156,13 +152,10 @@ class MMPIField(TexelTables):
     def get_density(  # type: ignore[override]
         self, ray_samples: RaySamples, head_counts: Sequence[int] | None = None
     ) -> tuple[Float[Tensor, "R S 1"], Lookup]:
-        """Optical depth of each valid sample (0 in empty slots), and where the lookups went.
+        """Optical depth of each valid sample (0 in empty slots), and where the lookups went. ``head_counts``: samples
+        of each head, if known (``MergedSamples``).
 
         nerfstudio's "density" times interval: on a plane there is no interval, so the product itself is learned.
-
-        Args:
-            ray_samples: merged samples.
-            head_counts: samples of each head, if known (``MergedSamples``).
         """
         lookup = self._lookup(ray_samples, head_counts)
         if self.training and self.learns_cover:
@@ -227,14 +220,8 @@ class MMPIField(TexelTables):
         composite: Composite,
         chosen: Bool[Tensor, "R"] | None = None,
     ) -> RayColors:
-        """Colours of rays.
-
-        Args:
-            ray_samples: merged samples.
-            lookup: where they read the tables; None without gradients.
-            composite: weights of the samples.
-            chosen: rays whose colours are needed; others may be left out to save time. None for all.
-        """
+        """Colours of rays from their merged samples and the weights of these. ``lookup``: where they read the tables;
+        None without gradients. ``chosen``: rays whose colours are needed, others may be left out; None for all."""
         if not isinstance(self.networks, RayShader):
             lookup = lookup if lookup is None or chosen is None else lookup.of_rays(chosen)
             colors = self.get_outputs(ray_samples, lookup)[FieldHeadNames.RGB]

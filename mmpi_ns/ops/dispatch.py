@@ -163,12 +163,8 @@ def choose(path: Route) -> None:
 
 
 def expect(shapes: Shapes, afresh: bool = False) -> None:
-    """Kernels that have not been tried with these shapes are, before they are used.
-
-    Args:
-        shapes: of the run at hand.
-        afresh: also what passed on this device before.
-    """
+    """Has kernels tried with the shapes of this run before they are used. ``afresh``: also those that passed on this
+    device before."""
     global _shapes, _tries_afresh
     with _trying:
         if afresh or (shapes != _shapes and not _interpreting):  # the interpreter would take minutes

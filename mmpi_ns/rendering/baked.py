@@ -87,14 +87,9 @@ class BakedWindow:
         bounds: tuple[Float[Tensor, "R 1"], Float[Tensor, "R 1"]] | None = None,
         background: Float[Tensor, "3"] | None = None,
     ) -> dict[str, Tensor]:
-        """rgb, accumulation, depth, winning MPI and dropped mass of rays, like those of the model.
-
-        Args:
-            origins: of the rays.
-            directions: of the rays, unit vectors.
-            bounds: nears and fars of the rays; None: from ``ray_near`` to infinity.
-            background: colour behind everything; None: the window's own.
-        """
+        """rgb, accumulation, depth, winning MPI and dropped mass of rays with unit directions, like those of the model.
+        ``bounds``: nears and fars, ``ray_near`` and infinity unless given. ``background``: colour behind everything,
+        the window's own unless given."""
         shown = show_baked(self.mpis, Rays(origins, directions, *(bounds or self.unbounded(origins))), self.threshold)
         shaded = shade_baked(self.shader, shown.gathered, shown.mass, directions)
         rgb = torch.where(shown.mass > 0, shaded * shaded.new_tensor(self.exposure), 0.0)
@@ -115,12 +110,8 @@ class BakedWindow:
     def peaks(
         self, views: Sequence[Item], rays_of: Callable[[Item], tuple[Float[Tensor, "R 3"], Float[Tensor, "R 3"]]]
     ) -> Float[Tensor, "B 8 8"]:
-        """Largest weight of any sample of some views in each texel.
-
-        Args:
-            views: whatever ``rays_of`` takes.
-            rays_of: origins and unit directions of a view's rays.
-        """
+        """Largest weight of any sample of some views in each texel. ``rays_of``: origins and unit directions of a
+        view's rays."""
         peaks = torch.zeros(self.mpis.density.shape)
         for view in views:
             origins, directions = rays_of(view)

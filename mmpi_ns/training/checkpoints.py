@@ -136,17 +136,8 @@ def check_same_run(
     pose_mode: str,
     rays: dict[str, int] | None,
 ) -> None:
-    """Raises InputError if a run of this capture cannot resume from a checkpoint.
-
-    Args:
-        state: content of the checkpoint.
-        path: that it was read from.
-        data: of the run here.
-        observations: of its training cameras.
-        plan: of its windows.
-        pose_mode: of its camera optimiser.
-        rays: pixel rays and keypoint rays of a step, if they and the steps follow the device; None: any will do.
-    """
+    """Raises InputError if a run of this capture, its training cameras, plan and mode of the camera optimiser cannot
+    resume from a checkpoint, read from ``path``. ``rays``: of a step; None if they do not follow the device."""
     drawn = state.get("rays", rays)  # earlier versions drew as many on all devices
     if rays is not None and drawn != rays:
         steps = Schedule.from_json(to_text(state["pipeline"]["_model.progress.schedule_bytes"])).window_steps
