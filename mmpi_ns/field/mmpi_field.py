@@ -121,17 +121,16 @@ class MMPIField(TexelTables):
     @property
     def layout(self) -> SceneLayout:
         """The plan's constants at the resolution in use, on the parameters' device."""
-        return self.cached("layout", self._layout)
-
-    def _layout(self) -> SceneLayout:
+        if (layout := self.cached("layout")) is not None:
+            return layout
         mpis, device, cube = self.plan.mpis, self.density.device, self.plan.cube
         frames = geometry.Frames.pack(mpis, device=device)
         biases = [plane_biases(m.planes, m.last_disparity / m.disparity_step).to(device) for m in mpis]
         packed = None if cube is None else geometry.Cube.pack(cube, self.samples_per_voxel, device=device)
         interval = 1.0 / self.samples_per_voxel
         bias = math.log(math.expm1(-math.log1p(-self.cube_alpha) / interval))
-        near = self.plan.content_near
-        return SceneLayout(mpis, frames, self.grids, biases, self.depth_scale, packed, bias, interval, near)
+        depths = (biases, self.depth_scale, packed, bias, interval)
+        return self.cached("layout", lambda: SceneLayout(mpis, frames, self.grids, *depths, self.plan.content_near))
 
     @property
     def tables(self) -> Tables:

@@ -156,8 +156,11 @@ class MMPITrainer(Trainer):
                     "as they do (mmpi-plan shows where)."
                 )
             self._announce(plan)
-            if self._share is not None:
-                self._share.check(plan)
+            if self._share is not None and len(plan) < self._share.processes:
+                raise InputError(
+                    f"The capture has {len(plan)} window(s), too few to share out among {self._share.processes} "
+                    "processes: start fewer, or make windows shorter with --pipeline.model.placement.window-length."
+                )
 
     def _suit_device(self, model_config: Any, manager: Any) -> None:
         """Draws more rays a step on a large GPU, in as many fewer steps, where neither was asked for."""
