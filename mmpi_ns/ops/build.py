@@ -35,11 +35,7 @@ class CannotCompile(Exception):
 
 
 def compiler() -> list[str]:
-    """The compiler and its arguments.
-
-    Raises:
-        CannotCompile: there is none.
-    """
+    """The compiler and its arguments. Raises CannotCompile if there is none."""
     asked = shlex.split(os.environ.get("CXX", ""))  # a program and its arguments, ccache g++ for example
     program = asked or [path for name in ("g++", "clang++") if (path := shutil.which(name))][:1]
     if not program:
@@ -48,11 +44,8 @@ def compiler() -> list[str]:
 
 
 def library_file() -> Path:
-    """Path of the compiled library, with a name for each combination of sources, compiler and processor.
-
-    Raises:
-        CannotCompile: there is no compiler, or there are no sources.
-    """
+    """Path of the compiled library, with a name for each combination of sources, compiler and processor. Raises
+    CannotCompile if there is no compiler, or there are no sources."""
     sources = sorted(OPS.glob("*/*.cpp"))
     if not sources:
         raise CannotCompile(f"{OPS} holds no C++ sources: install the package again")
@@ -69,11 +62,8 @@ def library_file() -> Path:
 
 @functools.cache
 def library() -> ctypes.CDLL:
-    """All compiled functions, from the cache if they have been compiled before.
-
-    Raises:
-        CannotCompile: there is no compiler, or it fails.
-    """
+    """All compiled functions, from the cache if they have been compiled before. Raises CannotCompile if there is no
+    compiler, or it fails."""
     target, program = library_file(), compiler()
     try:
         if not target.is_file():

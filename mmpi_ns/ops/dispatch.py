@@ -94,12 +94,8 @@ _OPERATIONS: dict[str, Operation[..., Any]] = {}
 
 
 def operation(*compiled: Form, check: Callable[..., None] | None = None) -> Callable[[Callable[P, R]], Operation[P, R]]:
-    """Makes an operation of a function.
-
-    Args:
-        compiled: the forms that there are besides plain torch.
-        check: takes the same arguments and raises what their annotations cannot say.
-    """
+    """Makes an operation of a function. ``compiled``: its forms besides plain torch. ``check`` takes the same arguments
+    and raises what their annotations cannot say."""
     return lambda reference: Operation(reference, compiled, check)
 
 
@@ -145,11 +141,8 @@ def function(name: str, form: Form) -> Any:
 
 
 def choose(path: Route) -> None:
-    """Sets the forms of the operations in this process.
-
-    Raises:
-        ValueError: ``native`` is asked for, and an operation has no compiled form here (says why).
-    """
+    """Sets the forms of the operations in this process. Raises InputError if ``native`` is asked for and an operation
+    has no compiled form here (says why)."""
     global _chosen
     _chosen = path
     if path != "native":
@@ -188,11 +181,8 @@ def chosen(path: Route) -> Iterator[None]:
 
 
 def interpret(on: bool) -> None:
-    """Makes Triton's interpreter run the GPU kernels on CPU tensors, for tests and rehearsals; very slow.
-
-    Raises:
-        ValueError: TRITON_INTERPRET=1 was not in the environment when the process started, or there is no Triton.
-    """
+    """Makes Triton's interpreter run the GPU kernels on CPU tensors, for tests and rehearsals; very slow. Raises
+    ValueError if TRITON_INTERPRET=1 was not in the environment when the process started, or there is no Triton."""
     global _interpreting
     if on and os.environ.get("TRITON_INTERPRET") != "1":
         raise ValueError("Triton's interpreter must be asked for before Python starts: set TRITON_INTERPRET=1.")

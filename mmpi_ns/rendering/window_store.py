@@ -59,11 +59,7 @@ class WindowStore:
             self._alive.pop(window, None)
 
     def save(self, window: int, field: MMPIField) -> None:
-        """Writes a finished window atomically.
-
-        Raises:
-            OSError: the disk is full or cannot be written.
-        """
+        """Writes a finished window atomically. Raises WriteError if the disk is full or cannot be written."""
         path = self.path(window)
         path.parent.mkdir(parents=True, exist_ok=True)
         tables = field.state_dict()
@@ -73,11 +69,8 @@ class WindowStore:
         write_atomically(path, lambda unfinished: torch.save(state, unfinished))
 
     def load(self, window: int, device: torch.device) -> MMPIField:
-        """A finished window, ready to render. It stays valid for the caller even if the store evicts it.
-
-        Raises:
-            InputError: the file is missing or damaged (says which, and what to do).
-        """
+        """A finished window, ready to render. It stays valid for the caller even if the store evicts it. Raises
+        InputError if the file is missing or damaged (says which, and what to do)."""
         with Uninterrupted(), self._lock:
             field = self._alive.get(window)
             if field is None:

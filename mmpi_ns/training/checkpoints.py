@@ -81,11 +81,7 @@ def check_there_are_checkpoints(windows_folder: Path | None) -> None:
 
 
 def checkpoint_to_load(config: TrainerConfig) -> Path | None:
-    """The checkpoint that a run resumes from; None for a new run.
-
-    Raises:
-        InputError: it is not there.
-    """
+    """The checkpoint that a run resumes from; None for a new run. Raises InputError if it is not there."""
     path = config.load_checkpoint
     if path is not None:
         if not path.is_file():
@@ -103,11 +99,7 @@ def checkpoint_to_load(config: TrainerConfig) -> Path | None:
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
-    """The content of a checkpoint.
-
-    Raises:
-        InputError: it is damaged.
-    """
+    """The content of a checkpoint. Raises InputError if it is damaged."""
     try:
         # Memory-mapped: only what is used is read, but a truncated file is still detected.
         state = torch.load(path, map_location="cpu", weights_only=True, mmap=True)

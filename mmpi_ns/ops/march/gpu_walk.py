@@ -108,30 +108,6 @@ def _choose(first, count, done, u, bend_u, v, bend_v, oz, dz, constants, cube, K
 
 
 @triton.jit
-def _look_up(x, y, z, dx, dy, dz, u, bend_u, v, bend_v, constants, grids, biases, cube, density, head, number, asked,
-             K: tl.constexpr, HAS_CUBE: tl.constexpr):  # fmt: skip
-    """Plane, NDC and optical depth of samples."""
-    is_mpi = head < K
-    mpi, in_mpi = tl.where(is_mpi, head, 0), asked & is_mpi
-    row = constants + mpi * FLOATS
-    w, u, v = _on_plane(row, u, bend_u, v, bend_v, number)
-    s = 1 - tl.load(row + S_SCALE) * (w - tl.load(row + END))
-    plane = tl.load(grids + mpi * INTS + DEPTH).to(tl.int32) - 1 - number
-    raw = bilinear(density, grids, mpi, plane, u, v, in_mpi)
-    raw += tl.load(biases + tl.load(grids + mpi * INTS + BIAS) + plane, in_mpi, 0.0)
-    tau = softplus(raw) * tl.load(row + INTERVAL)
-    if HAS_CUBE:
-        in_cube = asked & (head == K)
-        t = (tl.where(in_cube, number, 0).to(tl.float32) + 0.5) * tl.load(cube + 6)
-        p, q, r = _in_cube(cube, x + dx * t, y + dy * t, z + dz * t)
-        thick = softplus(trilinear(density, grids, K, p, q, r, in_cube) + tl.load(cube + 7))
-        tau = tl.where(is_mpi, tau, thick * tl.load(cube + 8))
-        u, v, s = tl.where(is_mpi, u, p), tl.where(is_mpi, v, q), tl.where(is_mpi, s, r)
-        plane = tl.where(is_mpi, plane, number)
-    return plane, u, v, s, tau
-
-
-@triton.jit
 def _in_cube(cube, x, y, z):
     """Points normalised to [-1, 1]^3 over the cube."""
     x = 2 * (x - tl.load(cube)) / tl.load(cube + 3) - 1
@@ -206,10 +182,23 @@ def next_samples(
         first, count, done, u, bend_u, v, bend_v, local_z, local_dz, constants, cube, K, HEADS, HAS_CUBE, RAYS, STEPS
     )
     met = (inverse_t >= 0) & goes_on[:, None]
-    plane, u, v, s, tau = _look_up(
-        x, y, z, dx, dy, dz, u, bend_u, v, bend_v, constants, grids, biases, cube, density, head, number, met, K,
-        HAS_CUBE,
-    )  # fmt: skip
+    is_mpi = head < K
+    mpi, in_mpi = tl.where(is_mpi, head, 0), met & is_mpi
+    row = constants + mpi * FLOATS
+    w, u, v = _on_plane(row, u, bend_u, v, bend_v, number)
+    s = 1 - tl.load(row + S_SCALE) * (w - tl.load(row + END))
+    plane = tl.load(grids + mpi * INTS + DEPTH).to(tl.int32) - 1 - number
+    raw = bilinear(density, grids, mpi, plane, u, v, in_mpi)
+    raw += tl.load(biases + tl.load(grids + mpi * INTS + BIAS) + plane, in_mpi, 0.0)
+    tau = softplus(raw) * tl.load(row + INTERVAL)
+    if HAS_CUBE:
+        in_cube = met & (head == K)
+        t = (tl.where(in_cube, number, 0).to(tl.float32) + 0.5) * tl.load(cube + 6)
+        p, q, r = _in_cube(cube, x + dx * t, y + dy * t, z + dz * t)
+        thick = softplus(trilinear(density, grids, K, p, q, r, in_cube) + tl.load(cube + 7))
+        tau = tl.where(is_mpi, tau, thick * tl.load(cube + 8))
+        u, v, s = tl.where(is_mpi, u, p), tl.where(is_mpi, v, q), tl.where(is_mpi, s, r)
+        plane = tl.where(is_mpi, plane, number)
     if BLENDS:
         tau = _blend(
             x, y, z, dx, dy, dz, constants, grids, cube, reliability, touched, head, inverse_t, tau, met, K, HAS_CUBE
