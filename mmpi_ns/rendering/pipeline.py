@@ -90,12 +90,11 @@ class MMPIPipeline(VanillaPipeline):
 
 
 def refined_camera(model: Any, camera: Cameras, image: Tensor, seed: int) -> tuple[Cameras, float, float]:
-    """A camera moved to the pose from which a frozen model renders its image [H, W, 3], over the model's background,
-    best.
+    """A camera moved to the pose from which a frozen model renders its image best.
 
     If the training poses were wrong, or were refined, the model does not match the test poses exactly. The pose is
-    optimised by the colours of the same pixels that are then scored, so this is no score of view synthesis. ``seed``:
-    of the draw of pixels.
+    optimised by the colours of the same pixels that are then scored, so this is no score of view synthesis. The image
+    [H, W, 3] lies over the model's background.
 
     Returns:
         The moved camera, its rotation in degrees, and its translation in scene units.
