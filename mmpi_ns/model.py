@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from threading import current_thread, main_thread
 from typing import Any, Literal
 
 import torch
@@ -30,7 +31,7 @@ from mmpi_ns.placement.rule import PlacementConfig
 from mmpi_ns.placement.split import most_pixels, place_windows
 from mmpi_ns.rendering.baked import BakedWindow, bake, suits_bricks
 from mmpi_ns.rendering.exposure import Exposures
-from mmpi_ns.rendering.images import check_crop, rays_per_chunk, render_in_chunks, render_windows
+from mmpi_ns.rendering.images import rays_per_chunk, render_in_chunks, render_windows
 from mmpi_ns.rendering.metrics import ImageMetrics, depth_metrics, pictures
 from mmpi_ns.rendering.rendered import (
     BACKGROUNDS,
@@ -47,14 +48,14 @@ from mmpi_ns.rendering.window_store import WindowStore
 from mmpi_ns.scene.plan import NO_PLAN
 from mmpi_ns.scene.visible_tiles import TrainingViews
 from mmpi_ns.scene.windows import WindowedPlan
-from mmpi_ns.training.batch_rays import check_refined_poses, individual_rays, move_rays
+from mmpi_ns.training.batch_rays import individual_rays, move_rays
 from mmpi_ns.training.checkpoints import check_there_are_checkpoints
 from mmpi_ns.training.losses import LossWeights, batch_losses, over_background, photometric
 from mmpi_ns.training.memory import Work, fit_memory
 from mmpi_ns.training.options import grouped
 from mmpi_ns.training.phases import ScheduleConfig, make_schedule
 from mmpi_ns.training.run import Progress, TrainingRun, views_of
-from mmpi_ns.utils.errors import say
+from mmpi_ns.utils.errors import InputError, say
 from mmpi_ns.utils.parallel import torch_apart
 from mmpi_ns.utils.random_draws import generator
 
@@ -139,7 +140,11 @@ class MMPIModel(Model):
         self.show = ViewerDropdown("Show MPI", "all", ["all", *windows.names], hint="One MPI alone, or all")
         poses = config.camera_optimizer.setup(num_cameras=self.num_train_data, device=device)
         self.camera_optimizer: CameraOptimizer = poses
-        check_refined_poses(config.camera_optimizer.mode, len(windows))
+        if config.camera_optimizer.mode != "off" and count > 1:
+            raise InputError(
+                f"The capture is trained in {count} windows, one after the other, and poses are refined in one alone: "
+                "refine them before (mmpi-prepare --refine-poses), or give --pipeline.model.placement.window-length 0."
+            )
         scale_is_free = observations is not None and not len(observations.seen_by)
         release, moves = config.schedule.release_weight, [*poses.parameters()]
         self.run = TrainingRun(self.progress, self.field, self.store, views, release, moves, scale_is_free)
@@ -243,7 +248,9 @@ class MMPIModel(Model):
         ``chunk``: rays that a window renders at once; None: all."""
         windows, trained = self.progress.windows, self.progress.window
         chosen = windows.find(self.show.value)  # by the viewer
-        present = self.run.windows_there() if len(windows) > 1 else [0]
+        present = [*range(trained + 1)]  # finished windows, and the one being trained
+        if self.run.shared:  # other processes train some of them
+            present = [w for w in range(len(windows)) if w == trained or self.store.path(w).is_file()]
 
         def render(place: int, rays: Tensor | slice) -> dict[str, Tensor]:
             window = present[place]
@@ -262,14 +269,8 @@ class MMPIModel(Model):
     def window_outputs(
         self, window: int, field: MMPIField, bundle: RayBundle, chosen: tuple[int, int] | None = None
     ) -> dict[str, Tensor]:
-        """``image_outputs`` of one window; winning MPIs are counted through all windows.
-
-        Args:
-            window: its number.
-            field: its field.
-            bundle: the rays.
-            chosen: the one (window, head) to show; None for all.
-        """
+        """``image_outputs`` of one window; winning MPIs are counted through all windows. ``chosen``: the one (window,
+        head) to show; None for all."""
         mode, first_head = self.config.rendering.mode, self.progress.windows.first_head(window)
         background = background_of(self.config.rendering.background, bundle.origins)
         one_exposure = self.exposures.mean is None or self.config.rendering.exposure == "mean"
@@ -297,15 +298,13 @@ class MMPIModel(Model):
 
     def baked(self, field: MMPIField) -> BakedWindow:
         """Baked form of a field, cached until the field is trained on. Raises ValueError if it cannot be baked."""
-
-        def make() -> BakedWindow:
-            say("Baking, once: a few seconds.")
-            background = BACKGROUNDS[self.config.rendering.background]
-            mean = self.exposures.mean
-            exposure = (1.0, 1.0, 1.0) if mean is None else tuple(mean.tolist())
-            return bake(field, self.config.rendering.threshold, background, self.blends(field), exposure)
-
-        return field.cached("baked", make)
+        if (window := field.cached("baked")) is not None:
+            return window
+        say("Baking, once: a few seconds.")
+        rendering, mean = self.config.rendering, self.exposures.mean
+        exposure = (1.0, 1.0, 1.0) if mean is None else tuple(mean.tolist())
+        shown = (rendering.threshold, BACKGROUNDS[rendering.background], self.blends(field), exposure)
+        return field.cached("baked", lambda: bake(field, *shown))
 
     def blends(self, field: MMPIField) -> bool:
         """Whether reliability enters a field's pictures."""
@@ -315,7 +314,12 @@ class MMPIModel(Model):
 
     def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
         """Renders a camera's image, or what of it lies in a box. Raises InputError where the box has no size."""
-        check_crop(obb_box)
+        # In the viewer an error would end the render thread while the user types a size: it shows the background.
+        if obb_box is not None and not bool((obb_box.S > 0).all()) and current_thread() is main_thread():
+            raise InputError(
+                f"The crop box has no size (its sides are {[round(float(s), 6) for s in obb_box.S]}): give crop_scale "
+                "three positive lengths, or leave the crop out."
+            )
         if obb_box is not None:
             return super().get_outputs_for_camera(camera, obb_box)
         return self.get_outputs_for_camera_ray_bundle(image_rays(camera.to(self.device)))

@@ -83,11 +83,7 @@ def evenly(count: int, most: int) -> list[int]:
 
 
 def find_renderings(folder: Path, tests: list[Path]) -> list[Path]:
-    """The rendering of each test image, in their order.
-
-    Raises:
-        ValueError: one is missing, or there twice.
-    """
+    """The rendering of each test image, in their order. Raises ValueError if one is missing, or there twice."""
     if not folder.is_dir():
         raise ValueError(f"There is no folder {folder}: give the one that holds the renderings.")
     by_name: dict[str, list[Path]] = {}
@@ -107,11 +103,8 @@ def find_renderings(folder: Path, tests: list[Path]) -> list[Path]:
 
 
 def read_rendering(tests: MMPIDataset, file: Path, truth: Tensor) -> Tensor:
-    """The rendering of a test image [H, W, 3], from 0 to 1.
-
-    Raises:
-        ValueError: it cannot be read, is see-through, or is not of the size of the truth [H, W, 3].
-    """
+    """The rendering of a test image [H, W, 3], from 0 to 1. Raises ValueError if it cannot be read, is see-through, or
+    is not of the size of the truth [H, W, 3]."""
     outputs = replace(tests._dataparser_outputs, image_filenames=[file])
     pixels = MMPIDataset(outputs).get_numpy_image(0)
     if pixels.shape[-1] == 4 and pixels[..., 3].min() < 255:

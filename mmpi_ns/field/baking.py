@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mmpi_ns.field.mmpi_field import MMPIField
+from mmpi_ns.ops.blending import log_shares
 from mmpi_ns.scene import geometry
 from mmpi_ns.scene.texels import BRICK
 
@@ -33,7 +34,8 @@ def bake_shares(field: MMPIField) -> Float[Tensor, "N 1"]:
             origins, directions, inverse_t = rays_to(field, k, places)
             local = geometry.LocalRays.of(origins, directions, field.layout.frames)
             numbers = torch.arange(len(part), device=part.device)
-            log_share, _ = field.log_shares(numbers, local, inverse_t, torch.full_like(numbers, k))
+            samples = (numbers, local, inverse_t, torch.full_like(numbers, k))
+            log_share, _ = log_shares(field.layout, field.reliability, field.touched, *samples)
             shares[part, 0] = log_share.exp()
     return shares
 
@@ -41,12 +43,7 @@ def bake_shares(field: MMPIField) -> Float[Tensor, "N 1"]:
 def rays_to(
     field: MMPIField, k: int, ndc: Float[Tensor, "N 3"]
 ) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 3"], Float[Tensor, "N"]]:
-    """Rays from a head's own origin to positions in it, to keep precision far from the world origin.
-
-    Args:
-        field: of the head.
-        k: its number.
-        ndc: positions in it.
+    """Rays from the origin of head k to positions in it, to keep precision far from the world origin.
 
     Returns:
         Origins, directions (not of unit length), and inverse distances in units of those.

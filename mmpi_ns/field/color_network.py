@@ -8,7 +8,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from mmpi_ns.ops.shade import Layers, SampleNetworks, positional_encoding, sample_colors
+from mmpi_ns.field.tables import replace_data
+from mmpi_ns.ops.shade import Layers, positional_encoding, sample_colors
 
 
 class Networks(nn.Module):
@@ -24,19 +25,14 @@ class Networks(nn.Module):
         self.weights = nn.Parameter(torch.empty(0, sum(math.prod(s) for s in self.shapes)))
         self.resize(count)
 
-    @torch.no_grad()
     def resize(self, count: int) -> None:
-        """Allocates ``count`` new networks."""
-        self.weights.data = self.fresh(count).to(self.weights.device)
-
-    def fresh(self, count: int) -> Float[Tensor, "count P"]:
-        """``count`` networks with PyTorch's default initialisation; equal for all, from a fixed seed."""
+        """Starts ``count`` networks anew, equal ones, with PyTorch's default initialisation from a fixed seed."""
         generator = torch.Generator().manual_seed(0)
         parts = []
         for fan_in, shape in zip((s[-1] for s in self.shapes[::2] for _ in range(2)), self.shapes, strict=True):
             bound = 0.0 if shape[0] == 3 else 1 / math.sqrt(fan_in)
             parts.append((torch.rand(math.prod(shape), generator=generator) * 2 - 1) * bound)
-        return torch.cat(parts).repeat(count, 1)
+        replace_data(self.weights, torch.cat(parts).repeat(count, 1).to(self.weights.device))
 
     def layers(self, head: int) -> Layers:
         """Three layers of one head's network."""
@@ -63,21 +59,9 @@ class ColorNetworks(Networks):
         directions: Float[Tensor, "R 3"],
         rays: Int[Tensor, "N"] | None = None,
     ) -> Float[Tensor, "N 3"]:
-        """Colours in [0, 1] of one head's samples.
-
-        Args:
-            head: of the network.
-            features: of each sample.
-            ndc: position of each sample.
-            directions: of each ray, in the head's axes; encoded once a ray.
-            rays: ray of each sample; None if there is one sample for each ray.
-        """
+        """Colours in [0, 1] of one head's samples. Directions [R, 3] are in the head's axes and encoded once a ray.
+        ``rays``: of each sample; None if there is one sample for each ray."""
         position = positional_encoding(ndc, self.position_frequencies)
         direction = positional_encoding(directions, self.direction_frequencies)
         direction = direction if rays is None else direction.index_select(0, rays)
         return sample_colors(self.layers(head), features, position, direction)
-
-    def of_heads(self, count: int) -> SampleNetworks:
-        """The networks of this many heads, for ``ops.shade``."""
-        layers = tuple(Layers(*(x.detach() for x in self.layers(k))) for k in range(count))
-        return SampleNetworks(layers, self.position_frequencies, self.direction_frequencies)

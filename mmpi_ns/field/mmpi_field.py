@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from nerfstudio.cameras.rays import RaySamples
 from nerfstudio.field_components.field_heads import FieldHeadNames
 from torch import Tensor
@@ -20,13 +20,13 @@ from mmpi_ns.field.color_network import ColorNetworks
 from mmpi_ns.field.moving import moving
 from mmpi_ns.field.samples import Lookup, head_spans, metadata_of, places_of
 from mmpi_ns.field.shading import RayColors, RayShader, Shading
-from mmpi_ns.field.tables import TexelTables, replace_data
+from mmpi_ns.field.tables import TexelTables
 from mmpi_ns.ops.blending import log_shares
 from mmpi_ns.ops.composite import Composite, render_colors
 from mmpi_ns.ops.gather import Taps, gather_places, gather_taps
 from mmpi_ns.ops.interpolate import index_rows, order_by_head, read_rows, texel_rows
 from mmpi_ns.ops.layout import SceneLayout, Tables
-from mmpi_ns.ops.shade import shade
+from mmpi_ns.ops.shade import SampleNetworks, shade
 from mmpi_ns.ops.variation import total_variation
 from mmpi_ns.scene import geometry
 from mmpi_ns.scene.plan import ScenePlan
@@ -34,17 +34,16 @@ from mmpi_ns.scene.texels import BRICK
 from mmpi_ns.scene.visible_tiles import TrainingViews
 
 
-def plane_biases(planes: int, missing: float = 0.0) -> tuple[Float[Tensor, "L"], float]:
-    """Density biases b_l with which all planes start at equal rendering weight 1/L, and the interval 256/L.
+def plane_biases(planes: int, missing: float) -> Float[Tensor, "L"]:
+    """Density biases b_l with which all planes start at equal rendering weight 1/L.
 
-    alpha_l = 1 / (L - l), the last one clamped; alpha = 1 - exp(-softplus(b) interval) solved for b.
+    alpha_l = 1 / (L - l), the last one clamped; alpha = 1 - exp(-softplus(b) 256 / L) solved for b.
     An MPI with a finite far starts like one to infinity without its last ``missing`` planes, alpha_l =
     1 / (L + missing - l): their share of the weight is left to content behind it.
     Source: DVGO v2's MPI; docs/how_it_works.md, "Density".
     """
-    interval = 256.0 / planes
     alpha = (1.0 / (planes + missing - torch.arange(planes, dtype=torch.float64))).clamp(max=0.999)
-    return torch.log(torch.expm1(-torch.log1p(-alpha) / interval)).float(), interval
+    return torch.log(torch.expm1(-torch.log1p(-alpha) / (256.0 / planes))).float()
 
 
 @dataclass
@@ -69,11 +68,7 @@ class MMPIField(TexelTables):
 
     Args:
         plan: frames and resolutions.
-        shading: whether the network is evaluated once a ray or for every sample (``shading.py``).
-        feature_channels: channels of the colour features; the first three are colour logits.
-        hidden_width: width of the colour networks' hidden layers.
-        position_frequencies: octaves of the positional encoding of NDC positions.
-        direction_frequencies: octaves of the positional encoding of directions in the MPI's frame.
+        shading: with the next four, see ``ColourConfig``.
         shares_depth: K MPIs train jointly from the start, so each has 1/K of the optical depth.
         samples_per_voxel: samples along a ray per voxel side of the cube.
         cube_alpha: initial alpha of a cube sample.
@@ -111,9 +106,8 @@ class MMPIField(TexelTables):
             self.networks = ColorNetworks(plan.num_heads, *sizes)
 
     def renew_networks(self) -> None:
-        """Creates new networks for the current plan in the same Parameter."""
-        weights, count = self.networks.weights, 1 if self.shading == "ray" else self.full_plan.num_heads
-        replace_data(weights, self.networks.fresh(count).to(weights.device))
+        """Starts the networks anew, as many as the current plan needs."""
+        self.networks.resize(1 if self.shading == "ray" else self.full_plan.num_heads)
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
         """Takes the number of colour networks from the checkpoint first."""
@@ -127,17 +121,16 @@ class MMPIField(TexelTables):
     @property
     def layout(self) -> SceneLayout:
         """The plan's constants at the resolution in use, on the parameters' device."""
-        return self.cached("layout", self._layout)
-
-    def _layout(self) -> SceneLayout:
+        if (layout := self.cached("layout")) is not None:
+            return layout
         mpis, device, cube = self.plan.mpis, self.density.device, self.plan.cube
         frames = geometry.Frames.pack(mpis, device=device)
-        biases = [plane_biases(m.planes, m.last_disparity / m.disparity_step)[0].to(device) for m in mpis]
+        biases = [plane_biases(m.planes, m.last_disparity / m.disparity_step).to(device) for m in mpis]
         packed = None if cube is None else geometry.Cube.pack(cube, self.samples_per_voxel, device=device)
         interval = 1.0 / self.samples_per_voxel
         bias = math.log(math.expm1(-math.log1p(-self.cube_alpha) / interval))
-        near = self.plan.content_near
-        return SceneLayout(mpis, frames, self.grids, biases, self.depth_scale, packed, bias, interval, near)
+        depths = (biases, self.depth_scale, packed, bias, interval)
+        return self.cached("layout", lambda: SceneLayout(mpis, frames, self.grids, *depths, self.plan.content_near))
 
     @property
     def tables(self) -> Tables:
@@ -158,13 +151,10 @@ class MMPIField(TexelTables):
     def get_density(  # type: ignore[override]
         self, ray_samples: RaySamples, head_counts: Sequence[int] | None = None
     ) -> tuple[Float[Tensor, "R S 1"], Lookup]:
-        """Optical depth of each valid sample (0 in empty slots), and where the lookups went.
+        """Optical depth of each valid sample (0 in empty slots), and where the lookups went. ``head_counts``: samples
+        of each head, if known (``MergedSamples``).
 
         nerfstudio's "density" times interval: on a plane there is no interval, so the product itself is learned.
-
-        Args:
-            ray_samples: merged samples.
-            head_counts: samples of each head, if known (``MergedSamples``).
         """
         lookup = self._lookup(ray_samples, head_counts)
         if self.training and self.learns_cover:
@@ -205,8 +195,10 @@ class MMPIField(TexelTables):
         if self.layout.cube is not None:
             axes = torch.cat([axes, torch.eye(3, device=axes.device)[None]])
         if isinstance(networks, ColorNetworks) and density_embedding is None and not torch.is_grad_enabled():
-            shading = (networks.of_heads(len(axes)), axes, directions, places_of(ray_samples))
-            return {FieldHeadNames.RGB: shade(self.layout, self.features.data, *shading)}
+            octaves = (networks.position_frequencies, networks.direction_frequencies)
+            of_heads = SampleNetworks(tuple(networks.layers(k) for k in range(len(axes))), *octaves)
+            samples = (directions, places_of(ray_samples))
+            return {FieldHeadNames.RGB: shade(self.layout, self.features.data, of_heads, axes, *samples)}
         lookup = density_embedding or self._lookup(ray_samples)
         features = lookup.read(lookup.features)
         if isinstance(networks, ColorNetworks):
@@ -227,14 +219,8 @@ class MMPIField(TexelTables):
         composite: Composite,
         chosen: Bool[Tensor, "R"] | None = None,
     ) -> RayColors:
-        """Colours of rays.
-
-        Args:
-            ray_samples: merged samples.
-            lookup: where they read the tables; None without gradients.
-            composite: weights of the samples.
-            chosen: rays whose colours are needed; others may be left out to save time. None for all.
-        """
+        """Colours of rays from their merged samples and the weights of these. ``lookup``: where they read the tables;
+        None without gradients. ``chosen``: rays whose colours are needed, others may be left out; None for all."""
         if not isinstance(self.networks, RayShader):
             lookup = lookup if lookup is None or chosen is None else lookup.of_rays(chosen)
             colors = self.get_outputs(ray_samples, lookup)[FieldHeadNames.RGB]
@@ -245,7 +231,9 @@ class MMPIField(TexelTables):
             if chosen is None:
                 chosen = torch.ones(lookup.shape[0], dtype=torch.bool, device=lookup.rows.device)
             sums = gather_taps(lookup.features, lookup.taps, lookup.index, composite.weights, chosen)
-        return self.networks(sums, composite, ray_samples.frustums.directions[:, 0])
+        mass, directions = composite.weights.sum(-1, keepdim=True), ray_samples.frustums.directions[:, 0]
+        rgb = self.networks.shade(sums.gathered, mass, composite.accumulation, directions)
+        return RayColors(rgb, sums.mass, sums.first, sums.second)
 
     def total_variation(self, lookup: Lookup, density_weight: float, feature_weight: float) -> Tensor:
         """Weighted total variation of the texels that the batch touched, in DVGO's normalisation (not yet per ray)."""
@@ -269,10 +257,5 @@ class MMPIField(TexelTables):
         origins, directions = frustums.origins[:, 0].detach(), frustums.directions[:, 0].detach()
         local = geometry.LocalRays.of(origins, directions, self.layout.frames)
         inverse_t = metadata_of(ray_samples)["inverse_t"].reshape(-1)[lookup.index]
-        return self.log_shares(lookup.rays, local, inverse_t, lookup.heads)
-
-    def log_shares(
-        self, rays: Int[Tensor, "N"], local: geometry.LocalRays, inverse_t: Float[Tensor, "N"], heads: Int[Tensor, "N"]
-    ) -> tuple[Float[Tensor, "N"], Float[Tensor, "N"]]:
-        """``blending.log_shares`` in this field."""
-        return log_shares(self.layout, self.reliability, self.touched, rays, local, inverse_t, heads)
+        samples = (lookup.rays, local, inverse_t, lookup.heads)
+        return log_shares(self.layout, self.reliability, self.touched, *samples)

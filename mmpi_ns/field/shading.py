@@ -15,7 +15,7 @@ from torch import Tensor
 
 from mmpi_ns.field.color_network import Networks
 from mmpi_ns.ops.composite import Composite
-from mmpi_ns.ops.gather import COLORS, RaySums
+from mmpi_ns.ops.gather import COLORS
 from mmpi_ns.ops.shade import positional_encoding, run_layers
 
 Shading = Literal["ray", "sample"]
@@ -56,28 +56,11 @@ class RayColors:
 
 class RayShader(Networks):
     """One network (colour, features, PE(direction)) -> view-dependent change of the composited colour of a ray.
-
-    Args:
-        channels: of a texel: three of the diffuse colour, the others features.
-        width: of the hidden layers.
-        direction_frequencies: octaves of the positional encoding of directions in world axes.
-    """
+    Directions are in world axes."""
 
     def __init__(self, channels: int, width: int, direction_frequencies: int) -> None:
         super().__init__(1, channels + 3 * (1 + 2 * direction_frequencies), width)
         self.direction_frequencies = direction_frequencies
-
-    def forward(self, sums: RaySums, composite: Composite, directions: Float[Tensor, "R 3"]) -> RayColors:
-        """Colours of rays.
-
-        Args:
-            sums: composited colours and features.
-            composite: the weights used.
-            directions: unit, world axes.
-        """
-        mass = composite.weights.sum(-1, keepdim=True)
-        rgb = self.shade(sums.gathered, mass, composite.accumulation, directions)
-        return RayColors(rgb, sums.mass, sums.first, sums.second)
 
     def shade(
         self,

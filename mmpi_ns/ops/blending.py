@@ -45,14 +45,11 @@ def blend_shares(
     other_values = torch.where(has_others[:, None], other_values, torch.zeros_like(other_values))
     odds = torch.logsumexp(other_values, -1) - own_value
     # With softplus, both logs and both slopes are exact at P near 0 and 1; differences from the sum would cancel there.
-    log_share = torch.where(has_others, -_softplus(odds), torch.zeros_like(odds))
-    log_rest = torch.where(has_others, -_softplus(-odds), torch.full_like(odds, -torch.inf))
+    # From the threshold on torch returns its argument: at the default of 20, float64 could tell them apart.
+    over, under = (torch.nn.functional.softplus(x, threshold=50) for x in (odds, -odds))
+    log_share = torch.where(has_others, -over, torch.zeros_like(odds))
+    log_rest = torch.where(has_others, -under, torch.full_like(odds, -torch.inf))
     return log_share, log_rest
-
-
-def _softplus(x: Tensor) -> Tensor:
-    """log(1 + e^x); torch's own returns x from 20 on, which float64 can tell from it."""
-    return torch.nn.functional.softplus(x, threshold=50)
 
 
 def blended_optical_depth(
@@ -83,16 +80,9 @@ def log_shares(
 ) -> tuple[Float[Tensor, "N"], Float[Tensor, "N"]]:
     """log P and log(1 - P) of samples among the heads that cover them, with gradients to the reliability.
 
-    A head covers a point in its frustum if the nearest texel was trained; a sample's own head always covers it.
-
-    Args:
-        layout: of the scene.
-        reliability: R of all texels.
-        touched: for every row [T]: 1 if a training ray read it.
-        rays: ray of each sample.
-        local: the rays in every head's axes.
-        inverse_t: inverse distance of each sample.
-        heads: head that each sample was taken from.
+    A head covers a point in its frustum if the nearest texel was trained (``touched`` [T] is 1 where a training ray
+    read a row); a sample's own head always covers it. ``local``: the rays in every head's axes; ``rays``, ``inverse_t``
+    and ``heads``: of each sample.
     """
     chosen, texels, cover = [], [], []
     for j, grid in enumerate(layout.grids):

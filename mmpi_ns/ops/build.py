@@ -11,7 +11,7 @@ import shlex
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -35,11 +35,7 @@ class CannotCompile(Exception):
 
 
 def compiler() -> list[str]:
-    """The compiler and its arguments.
-
-    Raises:
-        CannotCompile: there is none.
-    """
+    """The compiler and its arguments. Raises CannotCompile if there is none."""
     asked = shlex.split(os.environ.get("CXX", ""))  # a program and its arguments, ccache g++ for example
     program = asked or [path for name in ("g++", "clang++") if (path := shutil.which(name))][:1]
     if not program:
@@ -48,11 +44,8 @@ def compiler() -> list[str]:
 
 
 def library_file() -> Path:
-    """Path of the compiled library, with a name for each combination of sources, compiler and processor.
-
-    Raises:
-        CannotCompile: there is no compiler, or there are no sources.
-    """
+    """Path of the compiled library, with a name for each combination of sources, compiler and processor. Raises
+    CannotCompile if there is no compiler, or there are no sources."""
     sources = sorted(OPS.glob("*/*.cpp"))
     if not sources:
         raise CannotCompile(f"{OPS} holds no C++ sources: install the package again")
@@ -69,11 +62,8 @@ def library_file() -> Path:
 
 @functools.cache
 def library() -> ctypes.CDLL:
-    """All compiled functions, from the cache if they have been compiled before.
-
-    Raises:
-        CannotCompile: there is no compiler, or it fails.
-    """
+    """All compiled functions, from the cache if they have been compiled before. Raises CannotCompile if there is no
+    compiler, or it fails."""
     target, program = library_file(), compiler()
     try:
         if not target.is_file():
@@ -91,37 +81,29 @@ def library() -> ctypes.CDLL:
     return built
 
 
-def address(tensor: Tensor, dtype: torch.dtype = torch.float32) -> ctypes.c_void_p:
-    """Address of a tensor's data, for a function that expects it contiguous and of this type."""
-    assert tensor.dtype == dtype and tensor.is_contiguous(), (tensor.dtype, tensor.stride())
-    return ctypes.c_void_p(tensor.data_ptr())
-
-
 def arguments(values: Iterable[Any]) -> list[Any]:
-    """Arguments of the compiled functions: addresses of tensors, 64-bit integers, 32-bit floats; others unchanged."""
-    forms = {int: ctypes.c_int64, bool: ctypes.c_int64, float: ctypes.c_float}
-    return [
-        address(x, x.dtype) if isinstance(x, Tensor) else forms[type(x)](x) if type(x) in forms else x for x in values
-    ]
-
-
-@functools.cache
-def _in_parts(name: str) -> Callable[..., None]:
-    """A compiled function for all parts between bounds (``cpp/parts.h``)."""
-    place = ctypes.c_void_p.in_dll(library(), f"{name}_in_parts").value
-    assert place is not None
-    return ctypes.CFUNCTYPE(None)(place)
+    """Arguments of the compiled functions: addresses of contiguous tensors, 64-bit integers, 32-bit floats; others
+    unchanged."""
+    forms, passed = {int: ctypes.c_int64, bool: ctypes.c_int64, float: ctypes.c_float}, []
+    for x in values:
+        if isinstance(x, Tensor):
+            assert x.is_contiguous(), x.stride()
+            passed.append(ctypes.c_void_p(x.data_ptr()))
+        else:
+            passed.append(forms[type(x)](x) if type(x) in forms else x)
+    return passed
 
 
 def run_in_parts(name: str, bounds: Sequence[int], before: Iterable[Any], after: Iterable[Any]) -> None:
-    """Calls a compiled function of ``(*before, begin, end, *after)`` for the parts between bounds, each by a thread.
-
-    Parts must not write to one place.
+    """Calls a compiled function of ``(*before, begin, end, *after)`` for the parts between bounds, each by a thread
+    (``cpp/parts.h``). Parts must not write to one place.
     """
+    function = ctypes.c_void_p.in_dll(library(), f"{name}_in_parts").value
+    assert function is not None
     tensors = list(before), list(after)  # which live until all parts are done
     first, last = (arguments(x) for x in tensors)
     how = (ctypes.c_int64 * len(bounds))(*bounds), *arguments((len(bounds) - 1, len(first)))
-    _in_parts(name)(*how, *first, *arguments((0, 0)), *last)
+    ctypes.CFUNCTYPE(None)(function)(*how, *first, *arguments((0, 0)), *last)
 
 
 def call_in_parts(name: str, count: int, before: Iterable[Any], after: Iterable[Any], least: int = 256) -> None:
@@ -136,14 +118,10 @@ def even_bounds(count: int, least: int = 256) -> list[int]:
 
 
 def owned_bounds(positions: Sequence[Int[Tensor, "N B"]], count: int, least: int) -> list[int]:
-    """Bounds of parts of rows 0..count with about as many entries each, for sums by row.
+    """Bounds of parts of rows 0..count for sums by row, with about as many entries (``positions``, of which some are
+    looked at) in each part, and at least ``least``.
 
     A row has one owner, who adds all its entries in order: no sum depends on where the bounds lie.
-
-    Args:
-        positions: rows of all entries; some of them are looked at.
-        count: of the rows.
-        least: entries that each part gets (see ``even_bounds``).
     """
     entries = sum(p.numel() for p in positions)
     parts = len(even_bounds(entries, least)) - 1

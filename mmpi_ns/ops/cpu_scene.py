@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 from typing_extensions import Self
 
-from mmpi_ns.ops.build import address, arguments
-from mmpi_ns.ops.layout import SceneLayout, Tables, shaped
+from mmpi_ns.ops.build import arguments
+from mmpi_ns.ops.layout import SceneLayout, Tables, frame_rows, shaped
 from mmpi_ns.scene.texels import TexelGrid
 
 
@@ -29,9 +29,10 @@ class Grid(ctypes.Structure):
     ]
 
     @staticmethod
-    def of(grid: TexelGrid, bias: int = 0) -> Grid:
+    def of(grid: TexelGrid, bias: int) -> Grid:
         numbers = (grid.depth, grid.height, grid.width, grid.down, grid.across, grid.first_tile)
-        return Grid(*numbers, address(grid.tiles, torch.int32), bias)
+        assert grid.tiles.dtype == torch.int32
+        return Grid(*numbers, *arguments((grid.tiles, bias)))
 
 
 class Layer(ctypes.Structure):
@@ -77,6 +78,7 @@ class CpuScene:
         self.mpis, self.cube = shaped(layout.head_rows, len(planes), 9), shaped(layout.cube_row, 12)
         self.grids = (Grid * count)(*map(Grid.of, layout.grids, layout.bias_starts()))
         self.biases = shaped(torch.cat(layout.biases).float(), sum(planes))
+        self.frames = shaped(frame_rows(layout.frames), len(planes), 19)
 
     @staticmethod
     def of(layout: SceneLayout) -> CpuScene:
@@ -85,8 +87,7 @@ class CpuScene:
     def with_tables(self, tables: Tables) -> SceneTables:
         """Argument of a compiled function; this must outlive it."""
         held, grids = tables.of_rows(self.layout.num_rows), ctypes.addressof(self.grids)
-        frames = shaped(self.layout.frame_rows, len(self.mpis), 19)
-        plan = (*arguments([self.mpis, frames]), grids, *arguments([self.biases, self.cube]))
+        plan = (*arguments([self.mpis, self.frames]), grids, *arguments([self.biases, self.cube]))
         scene = SceneTables(len(self.mpis), len(self.grids), self.layout.content_near, *plan, *arguments(held))
         scene.held = held
         return scene

@@ -94,24 +94,17 @@ _OPERATIONS: dict[str, Operation[..., Any]] = {}
 
 
 def operation(*compiled: Form, check: Callable[..., None] | None = None) -> Callable[[Callable[P, R]], Operation[P, R]]:
-    """Makes an operation of a function.
-
-    Args:
-        compiled: the forms that there are besides plain torch.
-        check: takes the same arguments and raises what their annotations cannot say.
-    """
+    """Makes an operation of a function. ``compiled``: its forms besides plain torch. ``check`` takes the same arguments
+    and raises what their annotations cannot say."""
     return lambda reference: Operation(reference, compiled, check)
 
 
+@functools.cache
 def operations() -> dict[str, Operation[..., Any]]:
     """Every operation by its name."""
     for path in build.OPS.glob("*/__init__.py"):
         importlib.import_module(f"mmpi_ns.ops.{path.parent.name}")
     return _OPERATIONS
-
-
-def _named(name: str) -> Operation[..., Any]:
-    return _OPERATIONS[name] if name in _OPERATIONS else operations()[name]
 
 
 def _tensors(arguments: Iterable[Any]) -> Iterator[Tensor]:
@@ -124,7 +117,7 @@ def _tensors(arguments: Iterable[Any]) -> Iterator[Tensor]:
 
 def form_of(name: str, *tensors: Tensor) -> Form:
     """The form for these tensors: a compiled one takes float32, integers and Adam's bfloat16 on one device."""
-    compiled = _named(name).compiled
+    compiled = operations()[name].compiled
     devices = {t.device.type for t in tensors}
     if _chosen == "torch" or any(t.is_floating_point() and t.dtype not in _PRECISIONS for t in tensors):
         return "reference"
@@ -143,16 +136,13 @@ def on_device(tensor: Tensor) -> bool:
 @functools.cache
 def function(name: str, form: Form) -> Any:
     """One form of an operation."""
-    of = _named(name)
+    of = operations()[name]
     return of.reference if form == "reference" else getattr(importlib.import_module(f"{of.__module__}.{form}"), name)
 
 
 def choose(path: Route) -> None:
-    """Sets the forms of the operations in this process.
-
-    Raises:
-        ValueError: ``native`` is asked for, and an operation has no compiled form here (says why).
-    """
+    """Sets the forms of the operations in this process. Raises InputError if ``native`` is asked for and an operation
+    has no compiled form here (says why)."""
     global _chosen
     _chosen = path
     if path != "native":
@@ -166,12 +156,8 @@ def choose(path: Route) -> None:
 
 
 def expect(shapes: Shapes, afresh: bool = False) -> None:
-    """Kernels that have not been tried with these shapes are, before they are used.
-
-    Args:
-        shapes: of the run at hand.
-        afresh: also what passed on this device before.
-    """
+    """Has kernels tried with the shapes of this run before they are used. ``afresh``: also those that passed on this
+    device before."""
     global _shapes, _tries_afresh
     with _trying:
         if afresh or (shapes != _shapes and not _interpreting):  # the interpreter would take minutes
@@ -195,11 +181,8 @@ def chosen(path: Route) -> Iterator[None]:
 
 
 def interpret(on: bool) -> None:
-    """Makes Triton's interpreter run the GPU kernels on CPU tensors, for tests and rehearsals; very slow.
-
-    Raises:
-        ValueError: TRITON_INTERPRET=1 was not in the environment when the process started, or there is no Triton.
-    """
+    """Makes Triton's interpreter run the GPU kernels on CPU tensors, for tests and rehearsals; very slow. Raises
+    ValueError if TRITON_INTERPRET=1 was not in the environment when the process started, or there is no Triton."""
     global _interpreting
     if on and os.environ.get("TRITON_INTERPRET") != "1":
         raise ValueError("Triton's interpreter must be asked for before Python starts: set TRITON_INTERPRET=1.")
@@ -236,27 +219,22 @@ def _try(name: str) -> str | None:
         return None
     if (reason := fault("Triton")) is not None:
         return reason
-    try:
-        _try_kernels(name)
+    try:  # the kernels with the shapes at hand, unless they passed before on this device
+        trial = importlib.import_module("mmpi_ns.ops.trial")  # which tries operations, so it comes after this one
+        record: Path | None = None if _interpreting else trial.record(name, _shapes)
+        if record is None:
+            trial.run(name, "cpu", _shapes)
+        elif _tries_afresh or not record.is_file():
+            _announce()
+            trial.run(name, "cuda", _shapes)
+            record.parent.mkdir(parents=True, exist_ok=True)
+            record.touch()
     except Exception as error:  # a driver, a compiler or a cache folder may fail in many ways: all mean plain torch
         if lacking := _lacking(error):
             _faults["Triton"] = _say(lacking)  # no other kernel will do better
             return lacking
         return _say(f"its Triton kernel fails on this device ({_words(error)})", f"Plain torch for {name}")
     return None
-
-
-def _try_kernels(name: str) -> None:
-    """Tries an operation's kernels with the shapes at hand, unless they passed before here; raises what is amiss."""
-    trial = importlib.import_module("mmpi_ns.ops.trial")  # which tries operations, so it comes after this one
-    if _interpreting:
-        return trial.run(name, "cpu", _shapes)
-    record: Path = trial.record(name, _shapes)
-    if _tries_afresh or not record.is_file():
-        _announce()
-        trial.run(name, "cuda", _shapes)
-        record.parent.mkdir(parents=True, exist_ok=True)
-        record.touch()
 
 
 @functools.cache

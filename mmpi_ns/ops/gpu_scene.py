@@ -16,9 +16,9 @@ import triton.language as tl
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from mmpi_ns.ops.layout import SceneLayout, shaped
+from mmpi_ns.ops.layout import SceneLayout, frame_rows, shaped
 
-# Columns of the constants of an MPI: those of ``SceneLayout.frame_rows``, and what ``head_rows`` has besides.
+# Columns of the constants of an MPI: those of ``frame_rows``, and what ``head_rows`` has besides.
 ORIGIN = tl.constexpr(0)
 AXES = tl.constexpr(3)
 EXTENT = tl.constexpr(12)
@@ -73,7 +73,7 @@ def _pack(layout: SceneLayout) -> GpuScene:
     ]
     head = torch.tensor(rows, dtype=torch.int32, device=device).reshape(-1)
     return GpuScene(
-        shaped(torch.cat([layout.frame_rows, layout.head_rows[:, 2:]], -1), len(planes), FLOATS.value),
+        shaped(torch.cat([frame_rows(layout.frames), layout.head_rows[:, 2:]], -1), len(planes), FLOATS.value),
         torch.cat([head, tiles.to(device), places.to(device, torch.int32)]),
         shaped(torch.cat(layout.biases).to(device, torch.float32), sum(planes)),
         shaped(layout.cube_row, 12),
@@ -182,14 +182,6 @@ def nearest(coordinate, size):
     return (down + up).to(tl.int64)
 
 
-@triton.jit
-def nearest_row(grids, head, u, v, s, mask):
-    """Row of the texel nearest to NDC (u, v, s)."""
-    grid = grids + head * INTS
-    x, y = nearest(u, tl.load(grid + WIDTH)), nearest(v, tl.load(grid + HEIGHT))
-    return row_of(grids, head, nearest(s, tl.load(grid + DEPTH)), y, x, mask)
-
-
 # Arithmetic that avoids cancellation ---------------------------------------------------------
 
 
@@ -226,9 +218,3 @@ def one_minus_exp(tau):
     p = 1 - t * (1.0 / 3) * p
     p = 1 - t * (1.0 / 2) * p
     return tl.where(tau < 0.5, t * p, 1 - tl.exp(-tau))
-
-
-@triton.jit
-def minus_log_of_rest(alpha):
-    """-log(1 - alpha) for alpha in [0, 1/2)."""
-    return twice_atanh(alpha / (2 - alpha))

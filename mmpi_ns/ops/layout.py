@@ -92,11 +92,6 @@ class SceneLayout:
         return planes + int(2 * math.hypot(*(cube.upper - cube.lower).tolist()) / cube.step) + 2
 
     @cached_property
-    def frame_rows(self) -> Float[Tensor, "K 19"]:
-        """``frame_rows`` of the MPIs."""
-        return frame_rows(self.frames)
-
-    @cached_property
     def head_rows(self) -> Float[Tensor, "K 9"]:
         """Of each MPI: disparity between planes and of the last one, 1 - near / far, scale of the NDC s, lower end and
         scale of u and of v, interval."""

@@ -43,12 +43,8 @@ class Disagreement(Exception):
 
 
 def run(name: str, device: str, shapes: Shapes = SMALL) -> None:
-    """Tries one operation on a device.
-
-    Raises:
-        Exception: whatever Triton, its compiler or the driver finds amiss.
-        Disagreement: the results differ.
-    """
+    """Tries one operation on a device. Raises Disagreement if the results differ, or whatever Triton, its compiler or
+    the driver finds amiss."""
     for arguments in CASES[name](device, shapes):
         kernel = _outcome(name, "gpu", arguments)
         with dispatch.chosen("torch"):

@@ -89,14 +89,9 @@ class BakedWindow:
         bounds: tuple[Float[Tensor, "R 1"], Float[Tensor, "R 1"]] | None = None,
         background: Float[Tensor, "3"] | None = None,
     ) -> dict[str, Tensor]:
-        """rgb, accumulation, depth, winning MPI and dropped mass of rays, like those of the model.
-
-        Args:
-            origins: of the rays.
-            directions: of the rays, unit vectors.
-            bounds: nears and fars of the rays; None: from ``ray_near`` to infinity.
-            background: colour behind everything; None: the window's own.
-        """
+        """rgb, accumulation, depth, winning MPI and dropped mass of rays with unit directions, like those of the model.
+        ``bounds``: nears and fars, ``ray_near`` and infinity unless given. ``background``: colour behind everything,
+        the window's own unless given."""
         shown = show_baked(self.mpis, Rays(origins, directions, *(bounds or self.unbounded(origins))), self.threshold)
         shaded = shade_baked(self.shader, shown.gathered, shown.mass, directions)
         rgb = torch.where(shown.mass > 0, shaded * shaded.new_tensor(self.exposure), 0.0)
@@ -117,12 +112,8 @@ class BakedWindow:
     def peaks(
         self, views: Sequence[Item], rays_of: Callable[[Item], tuple[Float[Tensor, "R 3"], Float[Tensor, "R 3"]]]
     ) -> Float[Tensor, "B 8 8"]:
-        """Largest weight of any sample of some views in each texel.
-
-        Args:
-            views: whatever ``rays_of`` takes.
-            rays_of: origins and unit directions of a view's rays.
-        """
+        """Largest weight of any sample of some views in each texel. ``rays_of``: origins and unit directions of a
+        view's rays."""
         peaks = torch.zeros(self.mpis.density.shape)
         for view in views:
             for o, d in zip(*(x.split(AT_ONCE) for x in rays_of(view)), strict=True):
@@ -164,12 +155,6 @@ def why_not_baked(model_field: MMPIField) -> str:
     return ""
 
 
-def _shader_of(network: RayShader) -> Shader:
-    numbers = [x.detach().cpu() for x in network.layers(0)]
-    numbers[-2:] = [CHANGE * x for x in numbers[-2:]]
-    return Shader(tuple(zip(numbers[::2], numbers[1::2], strict=True)), network.direction_frequencies, MOST_CHANGE)
-
-
 @torch.no_grad()
 def bake(
     model_field: MMPIField,
@@ -178,18 +163,9 @@ def bake(
     blends: bool = False,
     exposure: tuple[float, ...] = (1.0, 1.0, 1.0),
 ) -> BakedWindow:
-    """A field as bricks of 8-bit codes: all that are not empty.
-
-    Args:
-        model_field: what to bake.
-        threshold: samples of less weight will not be shaded.
-        background: grey level behind everything.
-        blends: texels keep the optical depths that blending by reliability leaves at them.
-        exposure: of images, relative to the field's.
-
-    Raises:
-        ValueError: the field has a cube, too many channels, or a network for every sample.
-    """
+    """A field as bricks of 8-bit codes, all that are not empty; where it ``blends``, with the optical depths that
+    reliability leaves at its texels. ``exposure``: of images, relative to the field's. Raises ValueError if the field
+    has a cube, too many channels, or a network for every sample."""
     if refusal := why_not_baked(model_field):
         raise ValueError(refusal)
     plan, network = model_field.plan, model_field.networks
@@ -197,7 +173,10 @@ def bake(
     shares, heads = bake_shares(model_field) if blends else None, range(len(plan.mpis))
     highest = max(float(_raw(model_field, k, p, shares).max()) for k in heads for p in _planes(model_field, k))
     density_codes = Codes.spanning(THINNEST, max(highest, THINNEST + 1))
-    channels = _channel_codes(model_field)
+    features = model_field.features.data
+    most = [HIGHEST_COLOR] * COLORS + [HIGHEST_FEATURE] * (features.shape[1] - COLORS)
+    ranges = zip(features.amin(0).tolist(), features.amax(0).tolist(), most, strict=True)
+    channels = tuple(Codes.spanning(*each) for each in ranges)
     columns, density, texels, count = [], [], [], 0
     for k in heads:
         raw = torch.cat([_raw(model_field, k, p, shares) for p in _planes(model_field, k)])
@@ -219,7 +198,11 @@ def bake(
         channels,
     )
     farthest = 10 * max(m.farthest for m in plan.mpis)
-    return BakedWindow(mpis, _shader_of(network), plan.ray_near, threshold, background, farthest, exposure)
+    numbers = [x.detach().cpu() for x in network.layers(0)]
+    numbers[-2:] = [CHANGE * x for x in numbers[-2:]]
+    layers = tuple(zip(numbers[::2], numbers[1::2], strict=True))
+    shader = Shader(layers, network.direction_frequencies, MOST_CHANGE)
+    return BakedWindow(mpis, shader, plan.ray_near, threshold, background, farthest, exposure)
 
 
 def _planes(model_field: MMPIField, k: int) -> Iterator[slice]:
@@ -240,14 +223,6 @@ def _raw(model_field: MMPIField, k: int, planes: slice, shares: Tensor | None) -
     blended = blended_optical_depth(tau, share.log(), torch.log1p(-share))
     tau = torch.where(tau > NEGLIGIBLE, blended, tau / len(model_field.grids)) / interval
     return (tau + torch.log(-torch.expm1(-tau.clamp(min=1e-12)))).cpu()
-
-
-def _channel_codes(model_field: MMPIField) -> tuple[Codes, ...]:
-    """Ranges of the channels, over all texels."""
-    values = model_field.features.data
-    highest = [HIGHEST_COLOR] * COLORS + [HIGHEST_FEATURE] * (values.shape[1] - COLORS)
-    bounds = zip(values.amin(0).tolist(), values.amax(0).tolist(), highest, strict=True)
-    return tuple(Codes.spanning(*bound) for bound in bounds)
 
 
 def _texel_codes(

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Collection
-from threading import current_thread, main_thread
 
 import torch
 from jaxtyping import Float, Int
 from nerfstudio.cameras.rays import RayBundle
-from nerfstudio.data.scene_box import OrientedBox
 from torch import Tensor
 
 from mmpi_ns.scene.windows import Window, window_shares
-from mmpi_ns.utils.errors import InputError
 
 CPU_RAYS = 4096
 """Rays of a chunk whose samples fit the caches of a CPU and stay below the size that the C library returns to the
@@ -82,16 +79,6 @@ def rays_per_chunk(samples_per_ray: int, device: torch.device, kept_in_one_pass:
     held = BYTES_PER_SAMPLE * samples_per_ray if kept_in_one_pass is None else BYTES_PER_SLOT * kept_in_one_pass
     fit = int(FREE_SHARE * free / max(held, 1))
     return min(max(1 << max(fit, 1).bit_length() - 1, CPU_RAYS), GPU_RAYS)
-
-
-def check_crop(box: OrientedBox | None) -> None:
-    """Raises InputError if a crop has no size. In the viewer an error would end the render thread while the user types
-    a size, so the background is shown there instead."""
-    if box is not None and not bool((box.S > 0).all()) and current_thread() is main_thread():
-        raise InputError(
-            f"The crop box has no size (its sides are {[round(float(s), 6) for s in box.S]}): give crop_scale "
-            "three positive lengths, or leave the crop out."
-        )
 
 
 def render_in_chunks(

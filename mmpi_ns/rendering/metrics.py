@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor, nn
+from torch.nn.functional import pad
 from torchmetrics.functional.image import structural_similarity_index_measure
 
 MOST_SORTED = 1 << 20
@@ -62,7 +63,7 @@ def ssim(predicted: Float[Tensor, "H W 3"], observed: Float[Tensor, "H W 3"]) ->
     height, width = predicted.shape[:2]
     rows, total, border = max(1, PART // width), 0.0, WINDOW // 2
     images = [torch.moveaxis(x, -1, 0)[None].float() for x in (predicted, observed)]
-    a, b = (torch.nn.functional.pad(x, (0, 0, border, border), "reflect") for x in images)
+    a, b = (pad(x, (0, 0, border, border), "reflect") for x in images)
     for first in range(0, height, rows):
         part = slice(first, min(first + rows, height) + 2 * border)
         _, values = structural_similarity_index_measure(
@@ -81,21 +82,20 @@ def color_corrected(predicted: Float[Tensor, "H W 3"], observed: Float[Tensor, "
     normal = 1e-6 * predicted[..., 0].numel() * torch.eye(4, dtype=torch.float64, device=predicted.device)
     target = normal.new_zeros(4, 3)
     for colors, aim in _parts(predicted, observed):
-        design = _with_one(colors)
+        design = pad(colors.double(), (0, 1), value=1.0)
         normal += design.T @ design
         target += design.T @ (aim.double() - colors.double())
     change = torch.linalg.solve(normal, target)
-    corrected = [(a.double() + _with_one(a) @ change).clamp(0, 1).to(a) for a, _ in _parts(predicted, observed)]
+    corrected = [
+        (colors.double() + pad(colors.double(), (0, 1), value=1.0) @ change).clamp(0, 1).to(colors)
+        for colors, _ in _parts(predicted, observed)
+    ]
     return torch.cat(corrected).view(predicted.shape)
 
 
 def _parts(predicted: Float[Tensor, "*N 3"], observed: Float[Tensor, "*N 3"]) -> Iterator[tuple[Tensor, Tensor]]:
     """Colours [P, 3] of both images, a part at a time."""
     return zip(predicted.reshape(-1, 3).split(PART), observed.reshape(-1, 3).split(PART), strict=True)
-
-
-def _with_one(colors: Float[Tensor, "P 3"]) -> Float[Tensor, "P 4"]:
-    return torch.nn.functional.pad(colors.double(), (0, 1), value=1.0)
 
 
 def depth_metrics(predicted: Float[Tensor, "H W 1"], true: Float[Tensor, "H W 1"]) -> dict[str, float]:

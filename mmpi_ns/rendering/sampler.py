@@ -53,11 +53,9 @@ class MMPISampler(Sampler):
         Args:
             ray_bundle: R rays; nears and fars bound the samples.
             field: heads to sample, with their optical depths.
-            threshold: see ``ops.march.MarchOptions``.
-            fair_share: likewise.
+            threshold: with fair_share and blends, see ``ops.march.MarchOptions``.
             head_mask: heads that may render each ray; None for all.
             choose: priorities; each ray is rendered by the MPI of highest priority among those it meets (and the cube).
-            blends: samples are blended by reliability.
 
         Returns:
             RaySamples [R, S] whose metadata holds ``heads``, ``planes``, ``ndc``, ``inverse_t``, ``valid``,

@@ -14,27 +14,6 @@ PR_SET_PDEATHSIG = 1
 """Of prctl: the signal that a process gets when its parent ends."""
 
 
-def main() -> int:
-    """Runs mmpi-prepare; returns the exit status: 1 without a scene, 3 with a doubtful one."""
-    # Before pycolmap is loaded: it has threads of its own, and each of them would start as many again for its matrices.
-    for library in ("OMP", "OPENBLAS"):
-        os.environ.setdefault(f"{library}_NUM_THREADS", "1")
-    import tyro
-
-    from mmpi_ns.prepare.settings import Settings
-    from mmpi_ns.utils.errors import InputError, say
-
-    settings = tyro.cli(Settings, description=Settings.__doc__)
-    from mmpi_ns.prepare.pipeline import prepare
-
-    try:
-        verdict = prepare(settings)
-    except InputError as error:
-        say(f"mmpi-prepare: {error}", "bold red")
-        return 1
-    return 0 if verdict.grade == "right" else 3
-
-
 def end_at_once_on_signals() -> None:
     """SIGINT and SIGTERM end the command with one sentence, also in the middle of COLMAP's work.
 
@@ -61,10 +40,26 @@ def end_at_once_on_signals() -> None:
 
 
 def entrypoint() -> None:
-    """The command ``mmpi-prepare``."""
+    """The command ``mmpi-prepare``; exit status 1 without a scene, 3 with a doubtful one."""
     say_version("mmpi-prepare")
     end_at_once_on_signals()
-    sys.exit(main())
+    # Before pycolmap is loaded: it has threads of its own, and each of them would start as many again for its matrices.
+    for library in ("OMP", "OPENBLAS"):
+        os.environ.setdefault(f"{library}_NUM_THREADS", "1")
+    import tyro
+
+    from mmpi_ns.prepare.settings import Settings
+    from mmpi_ns.utils.errors import InputError, say
+
+    settings = tyro.cli(Settings, description=Settings.__doc__)
+    from mmpi_ns.prepare.pipeline import prepare
+
+    try:
+        verdict = prepare(settings)
+    except InputError as error:
+        say(f"mmpi-prepare: {error}", "bold red")
+        sys.exit(1)
+    sys.exit(0 if verdict.grade == "right" else 3)
 
 
 if __name__ == "__main__":

@@ -12,16 +12,6 @@ from torch import Tensor
 
 from mmpi_ns.capture.ray_sources import OWN_PIXEL
 from mmpi_ns.scene.plan import ScenePlan
-from mmpi_ns.utils.errors import InputError
-
-
-def check_refined_poses(mode: str, windows: int) -> None:
-    """Raises InputError if poses of a capture in several windows are to be refined, since windows do not share them."""
-    if mode != "off" and windows > 1:
-        raise InputError(
-            f"The capture is trained in {windows} windows, one after the other, and poses are refined in one alone: "
-            "refine them before (mmpi-prepare --refine-poses), or give --pipeline.model.placement.window-length 0."
-        )
 
 
 @torch.no_grad()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pickle
 import re
-from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -39,11 +38,7 @@ def checkpoints_in(folder: Path, steps: range | None = None) -> dict[int, Path]:
 
 def claim(folder: Path, checkpoints: Path, resumes_from: Path | None) -> None:
     """Locks a run's folder for this process until it ends, and removes files left half-written by killed runs.
-
-    Args:
-        folder: of the run.
-        checkpoints: its folder of checkpoints.
-        resumes_from: folder or file of the checkpoint that the run resumes from.
+    ``resumes_from``: folder or file of the checkpoint that the run resumes from.
 
     Raises:
         InputError: another run is writing there, or its checkpoints are there and this run does not resume from them.
@@ -82,11 +77,7 @@ def check_there_are_checkpoints(windows_folder: Path | None) -> None:
 
 
 def checkpoint_to_load(config: TrainerConfig) -> Path | None:
-    """The checkpoint that a run resumes from; None for a new run.
-
-    Raises:
-        InputError: it is not there.
-    """
+    """The checkpoint that a run resumes from; None for a new run. Raises InputError if it is not there."""
     path = config.load_checkpoint
     if path is not None:
         if not path.is_file():
@@ -103,18 +94,8 @@ def checkpoint_to_load(config: TrainerConfig) -> Path | None:
     return steps[step]
 
 
-def written_short(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Tensors as a checkpoint holds them: those of zeros alone, as untrained reliability, take one number each."""
-    zeros = {k: v.new_zeros(()).expand(v.shape) for k, v in state.items() if v.numel() > 1 and not v.any()}
-    return dict(state) | zeros
-
-
 def read_checkpoint(path: Path) -> dict[str, Any]:
-    """The content of a checkpoint.
-
-    Raises:
-        InputError: it is damaged.
-    """
+    """The content of a checkpoint. Raises InputError if it is damaged."""
     try:
         # Memory-mapped: only what is used is read, but a truncated file is still detected.
         state = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
@@ -135,10 +116,24 @@ def cameras_in_short(observations: Observations) -> Float[Tensor, "M 18"]:
 
 
 def check_same_run(
-    state: dict[str, Any], path: Path, data: Path, observations: Observations, plan: WindowedPlan, pose_mode: str
+    state: dict[str, Any],
+    path: Path,
+    data: Path,
+    observations: Observations,
+    plan: WindowedPlan,
+    pose_mode: str,
+    rays: dict[str, int] | None,
 ) -> None:
     """Raises InputError if a run of this capture, its training cameras, plan and mode of the camera optimiser cannot
-    resume from a checkpoint, read from ``path``."""
+    resume from a checkpoint, read from ``path``. ``rays``: of a step; None if they do not follow the device."""
+    drawn = state.get("rays", rays)  # earlier versions drew as many on all devices
+    if rays is not None and drawn != rays:
+        steps = Schedule.from_json(to_text(state["pipeline"]["_model.progress.schedule_bytes"])).window_steps
+        raise InputError(
+            f"{path} is of a run of {steps:,} steps of {drawn['pixel']:,} rays, and {rays['pixel']:,} a step suit "
+            f"this device: resume with --max-num-iterations {steps} --pipeline.datamanager.train-num-rays-per-batch "
+            f"{drawn['pixel']} --pipeline.datamanager.keypoint-rays {drawn['keypoint']}."
+        )
     theirs, ours = state["capture"]["cameras"], cameras_in_short(observations)
     if theirs.shape != ours.shape or not torch.allclose(theirs, ours, rtol=1e-4, atol=1e-4):
         raise InputError(
@@ -155,24 +150,6 @@ def check_same_run(
         there, as_there = ("unrefined", "off") if pose_mode != "off" else ("refined", "SO3xR3")
         raise InputError(
             f"{path} was trained with {there} poses: resume with --pipeline.model.camera-optimizer.mode {as_there}."
-        )
-
-
-def check_same_rays(state: dict[str, Any], path: Path, rays: dict[str, int]) -> None:
-    """Raises InputError if rays and steps follow the device, and a checkpoint's run began on one of other size.
-
-    Args:
-        state: content of the checkpoint.
-        path: that it was read from.
-        rays: pixel rays and keypoint rays of a step here.
-    """
-    theirs = state.get("rays", rays)  # earlier versions drew as many on all devices
-    if theirs != rays:
-        steps = Schedule.from_json(to_text(state["pipeline"]["_model.progress.schedule_bytes"])).window_steps
-        raise InputError(
-            f"{path} is of a run of {steps:,} steps of {theirs['pixel']:,} rays, and {rays['pixel']:,} a step suit "
-            f"this device: resume with --max-num-iterations {steps} --pipeline.datamanager.train-num-rays-per-batch "
-            f"{theirs['pixel']} --pipeline.datamanager.keypoint-rays {theirs['keypoint']}."
         )
 
 

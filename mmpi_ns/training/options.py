@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from dataclasses import fields, is_dataclass
 from operator import attrgetter
 from pathlib import Path
@@ -94,12 +93,8 @@ TRAINED = {"growing_rays"}
 
 
 def grouped(state: dict[str, Any], usual: Any) -> dict[str, Any]:
-    """The attributes of a model's config with every option in its group.
-
-    Args:
-        state: attributes as a config.yml has them; those of old versions have no groups.
-        usual: a config with the default groups, which is filled. Options without a group stay where they are.
-    """
+    """The attributes of a model's config, as a config.yml of any version has them, with every option in its group.
+    ``usual``: a config with the default groups, which are filled; options without a group stay where they are."""
     state = dict(state)
     for group in {"schedule", "sampling", "colour", "rendering"} - state.keys():
         for f in fields(getattr(usual, group)):
@@ -107,20 +102,6 @@ def grouped(state: dict[str, Any], usual: Any) -> dict[str, Any]:
             if name in state:
                 setattr(getattr(usual, group), f.name, state.pop(name))
     return vars(usual) | state
-
-
-def with_absolute_paths(config: TrainerConfig) -> TrainerConfig:
-    """The settings of a run as its config.yml keeps them: for any working folder, and without a checkpoint to load."""
-    config = copy.deepcopy(config)
-    config.load_dir = config.load_step = config.load_checkpoint = None
-    manager: Any = config.pipeline.datamanager
-    for settings, name in ((config, "output_dir"), (config, "data"), (manager, "data"), (manager.dataparser, "data")):
-        path = getattr(settings, name)
-        if path not in (None, Path()):
-            setattr(settings, name, path.absolute())
-    model: Any = config.pipeline.model
-    model.windows_folder = model.windows_folder.absolute()
-    return config
 
 
 def check_nothing_left(model: Any) -> None:

@@ -169,13 +169,8 @@ class Schedule:
 
 
 def make_schedule(config: ScheduleConfig, total_steps: int, windows: int = 1, depths_known: bool = False) -> Schedule:
-    """The schedule of a run of ``total_steps`` steps a window.
-
-    Args:
-        config: phases, growth, rates and release of bricks; nothing is released before surfaces have formed.
-        total_steps: all steps of a window.
-        windows: windows of a long capture, trained one after the other.
-        depths_known: training starts with surfaces (``initial.py``).
+    """The schedule of a run of ``total_steps`` steps a window. Nothing is released before surfaces have formed.
+    ``depths_known``: training starts with surfaces (``initial.py``).
 
     Raises:
         InputError: no step is left for the first phase, growth goes backwards, or rates never fall.
@@ -183,7 +178,13 @@ def make_schedule(config: ScheduleConfig, total_steps: int, windows: int = 1, de
     if total_steps < 1:
         raise InputError(f"Training needs at least 1 step, got {total_steps}: raise --max-num-iterations.")
     check_schedule(config)
-    phases = _phases(config, total_steps)
+    lengths = {"joint": total_steps}
+    if config.training == "two-phase":  # the first phase has a step, even if rounding up the others would take them all
+        blend = min(round(total_steps * config.blend_share), total_steps - 1)
+        finetune = min(round(total_steps * config.finetune_share), total_steps - 1 - blend)
+        lengths = {"individual": total_steps - blend - finetune, "blend": blend, "finetune": finetune}
+    ends = accumulate(lengths.values())
+    phases = tuple(Phase(name, end - n, end) for (name, n), end in zip(lengths.items(), ends, strict=True) if n > 0)
     first = phases[0].end
     doublings = {s: s / SOONER if depths_known else s for s in config.growth_shares}
     growth = tuple(max(1, round(s * first)) for s in doublings.values())
@@ -211,14 +212,3 @@ def check_schedule(config: ScheduleConfig) -> None:
         raise InputError(
             f"{option}decay-from must be a finite number from 0 to 1, 1 excluded, not {config.decay_from}."
         )
-
-
-def _phases(config: ScheduleConfig, total_steps: int) -> tuple[Phase, ...]:
-    """Phases of at least one step; the first has one even if rounding up the others would take all of them."""
-    if config.training == "joint":
-        return (Phase("joint", 0, total_steps),)
-    blend = min(round(total_steps * config.blend_share), total_steps - 1)
-    finetune = min(round(total_steps * config.finetune_share), total_steps - 1 - blend)
-    lengths = {"individual": total_steps - blend - finetune, "blend": blend, "finetune": finetune}
-    ends = accumulate(lengths.values())
-    return tuple(Phase(name, end - n, end) for (name, n), end in zip(lengths.items(), ends, strict=True) if n > 0)

@@ -92,20 +92,9 @@ class TrainingRun:
         }
         return groups | ({"camera_opt": self.poses} if self.poses else {})
 
-    def windows_there(self) -> list[int]:
-        """Windows that can be rendered: the one being trained, and those that are finished."""
-        count, trained = len(self.progress.windows), self.progress.window
-        if self.shared:
-            return [w for w in range(count) if w == trained or self.store.path(w).is_file()]
-        return [*range(trained + 1)]
-
     def prepare_step(self, attributes: TrainingCallbackAttributes | None, step: int) -> None:
-        """Applies the schedule of a step: window, resolution, storage and frozen parameters.
-
-        Args:
-            attributes: the trainer's optimisers and data manager; None without a trainer.
-            step: about to run.
-        """
+        """Applies the schedule of a step about to run: window, resolution, storage and frozen parameters.
+        ``attributes``: the trainer's optimisers and data manager; None without a trainer."""
         progress, field, schedule = self.progress, self.field, self.progress.schedule
         progress.step = step
         field.forget_baked()

@@ -14,7 +14,7 @@ import torch.distributed as dist
 from mmpi_ns.rendering.window_store import WindowStore
 from mmpi_ns.scene.windows import WindowedPlan
 from mmpi_ns.training.checkpoints import checkpoints_in
-from mmpi_ns.utils.errors import InputError, say
+from mmpi_ns.utils.errors import say
 
 PATIENCE = timedelta(days=7)
 """nerfstudio's processes time out half an hour after the first of them has finished."""
@@ -22,14 +22,8 @@ WINDOWS_FOLDER = "windows"
 
 
 class WindowShare:
-    """The windows of one process of several.
-
-    Args:
-        rank: number of this process.
-        processes: all of them.
-        window_steps: steps of a window.
-        folders: with checkpoints: of this run, and of the run that it resumes.
-    """
+    """The windows of process ``rank`` of several. ``folders``: with checkpoints, of this run and of the run that it
+    resumes."""
 
     def __init__(self, rank: int, processes: int, window_steps: int, folders: list[Path]) -> None:
         self.rank, self.processes, self.window_steps, self.folders = rank, processes, window_steps, folders
@@ -38,14 +32,6 @@ class WindowShare:
             group = dist.new_group(backend="gloo", timeout=PATIENCE)
             assert isinstance(group, dist.ProcessGroup)
             self._group = group
-
-    def check(self, windows: WindowedPlan) -> None:
-        """Raises InputError if there are more processes than windows."""
-        if len(windows) < self.processes:
-            raise InputError(
-                f"The capture has {len(windows)} window(s), too few to share out among {self.processes} processes: "
-                "start fewer, or make windows shorter with --pipeline.model.placement.window-length."
-            )
 
     def steps_of(self, window: int) -> range:
         return range(window * self.window_steps, (window + 1) * self.window_steps)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import shutil
 import sys
@@ -25,17 +26,15 @@ from mmpi_ns.scene.windows import WindowedPlan
 from mmpi_ns.training.checkpoints import (
     PLAN_FILE,
     cameras_in_short,
-    check_same_rays,
     check_same_run,
     checkpoint_to_load,
     checkpoints_in,
     claim,
     read_checkpoint,
-    written_short,
 )
 from mmpi_ns.training.learning_rates import PhaseScheduler
 from mmpi_ns.training.memory import Work, describe, training_bytes
-from mmpi_ns.training.options import check_device, check_nothing_left, check_run, with_absolute_paths
+from mmpi_ns.training.options import check_device, check_nothing_left, check_run
 from mmpi_ns.training.report import TrainingLog, forecast, next_commands, quick_test
 from mmpi_ns.training.run import TrainingRun, cameras_of, views_of
 from mmpi_ns.training.shared_windows import WINDOWS_FOLDER, WindowShare
@@ -103,7 +102,15 @@ class MMPITrainerConfig(TrainerConfig):
         folder = self.get_base_dir()
         claim(folder, self.get_checkpoint_dir(), self.load_checkpoint or self.load_dir)
         self.pipeline.model.windows_folder = folder / WINDOWS_FOLDER  # type: ignore[attr-defined]
-        TrainerConfig.save_config(with_absolute_paths(self))
+        written = copy.deepcopy(self)
+        written.load_dir = written.load_step = written.load_checkpoint = None
+        manager: Any = written.pipeline.datamanager
+        for part, name in ((written, "output_dir"), (written, "data"), (manager, "data"), (manager.dataparser, "data")):
+            path = getattr(part, name)
+            if path not in (None, Path()):
+                setattr(part, name, path.absolute())
+        written.pipeline.model.windows_folder = (folder / WINDOWS_FOLDER).absolute()  # type: ignore[attr-defined]
+        TrainerConfig.save_config(written)
 
 
 class MMPITrainer(Trainer):
@@ -117,44 +124,44 @@ class MMPITrainer(Trainer):
         """Prepares the run; a signal during this time ends it with a sentence (of several processes: torchrun's)."""
         # Images are shared among threads; those of the libraries would only spin between small operations.
         with signals_go_to(_end) if self.world_size == 1 else nullcontext(), one_thread_each():
-            self._prepare(test_mode)
-
-    def _prepare(self, test_mode: Literal["test", "val", "inference"]) -> None:
-        enter_command(training=True)
-        check_device(self.config.machine.device_type)
-        if str(self.device).startswith("cuda"):  # kernels start on the current device, which is the first otherwise
-            torch.cuda.set_device(self.local_rank)
-        self._stopped_by: int | None = None
-        self._log: TrainingLog | None = None
-        self._began = monotonic()
-        config = self.config
-        model_config: Any = config.pipeline.model
-        model_config.seed = config.pipeline.datamanager.seed = config.machine.seed  # type: ignore[attr-defined]
-        self._window_steps = model_config.total_steps = config.max_num_iterations
-        model_config.method, self._follows_capture = config.method_name, config.max_num_iterations == 0
-        model_config.windows_folder = self.base_dir / WINDOWS_FOLDER
-        self._suit_device(model_config, config.pipeline.datamanager)
-        self._share: WindowShare | None = None
-        if self.world_size > 1:
-            folders = [self.checkpoint_dir, *([config.load_dir] if config.load_dir else [])]
-            self._share = WindowShare(comms.get_rank(), self.world_size, self._window_steps, folders)
-            # Processes share the windows; nerfstudio would make them average their gradients.
-            self.world_size, config.load_dir = 1, None
-        self._says_lines, config.logging.local_writer.enable = config.logging.local_writer.enable, False
-        super().setup(test_mode)
-        config.max_num_iterations = self._window_steps
-        plan = self._run.progress.windows
-        self.base_dir.mkdir(parents=True, exist_ok=True)
-        _write_plan(self.base_dir / PLAN_FILE, plan)
-        self._run.shared = self._share is not None
-        if len(self._run.field.density) <= BRICK:  # the empty brick alone
-            raise InputError(
-                "No training image sees anything of the scene plan: its MPIs must stand among the cameras and face as "
-                "they do (mmpi-plan shows where)."
-            )
-        self._announce(plan)
-        if self._share is not None:
-            self._share.check(plan)
+            enter_command(training=True)
+            check_device(self.config.machine.device_type)
+            if str(self.device).startswith("cuda"):  # kernels start on the current device, which is the first otherwise
+                torch.cuda.set_device(self.local_rank)
+            self._stopped_by: int | None = None
+            self._log: TrainingLog | None = None
+            self._began = monotonic()
+            config = self.config
+            model_config: Any = config.pipeline.model
+            model_config.seed = config.pipeline.datamanager.seed = config.machine.seed  # type: ignore[attr-defined]
+            self._window_steps = model_config.total_steps = config.max_num_iterations
+            model_config.method, self._follows_capture = config.method_name, config.max_num_iterations == 0
+            model_config.windows_folder = self.base_dir / WINDOWS_FOLDER
+            self._suit_device(model_config, config.pipeline.datamanager)
+            self._share: WindowShare | None = None
+            if self.world_size > 1:
+                folders = [self.checkpoint_dir, *([config.load_dir] if config.load_dir else [])]
+                self._share = WindowShare(comms.get_rank(), self.world_size, self._window_steps, folders)
+                # Processes share the windows; nerfstudio would make them average their gradients.
+                self.world_size, config.load_dir = 1, None
+            self._says_lines, config.logging.local_writer.enable = config.logging.local_writer.enable, False
+            super().setup(test_mode)
+            config.max_num_iterations = self._window_steps
+            plan = self._run.progress.windows
+            self.base_dir.mkdir(parents=True, exist_ok=True)
+            _write_plan(self.base_dir / PLAN_FILE, plan)
+            self._run.shared = self._share is not None
+            if len(self._run.field.density) <= BRICK:  # the empty brick alone
+                raise InputError(
+                    "No training image sees anything of the scene plan: its MPIs must stand among the cameras and face "
+                    "as they do (mmpi-plan shows where)."
+                )
+            self._announce(plan)
+            if self._share is not None and len(plan) < self._share.processes:
+                raise InputError(
+                    f"The capture has {len(plan)} window(s), too few to share out among {self._share.processes} "
+                    "processes: start fewer, or make windows shorter with --pipeline.model.placement.window-length."
+                )
 
     def _suit_device(self, model_config: Any, manager: Any) -> None:
         """Draws more rays a step on a large GPU, in as many fewer steps, where neither was asked for."""
@@ -319,11 +326,14 @@ class MMPITrainer(Trainer):
         self.checkpoint_dir.mkdir(parents=True, exist_ok=True)
         path = self.checkpoint_dir / f"step-{step:09d}.ckpt"
         # After the last step nobody needs the moments, which are half of all, nor more digits than images show.
-        goes_on, fields = step + 1 < self._total_steps, self.pipeline.state_dict()
+        goes_on, pipeline = step + 1 < self._total_steps, self.pipeline.state_dict()
         unused: dict[str, Any] = {} if goes_on else {"state": {}}
+        pipeline = pipeline if goes_on else in_half_precision(pipeline)
+        # A tensor of zeros alone, as untrained reliability, takes one number.
+        zeros = {k: v.new_zeros(()).expand(v.shape) for k, v in pipeline.items() if v.numel() > 1 and not v.any()}
         state = {
             "step": step,
-            "pipeline": written_short(fields if goes_on else in_half_precision(fields)),
+            "pipeline": {**pipeline, **zeros},
             "optimizers": {k: v.state_dict() | unused for k, v in self.optimizers.optimizers.items()},
             "schedulers": {k: v.state_dict() for k, v in self.optimizers.schedulers.items()},
             "scalers": self.grad_scaler.state_dict(),
@@ -347,9 +357,9 @@ class MMPITrainer(Trainer):
         if path is not None:
             state, model = read_checkpoint(path), cast(Any, self.pipeline.model)
             capture, mode = self._manager, model.camera_optimizer.config.mode
-            if self._follows_capture:
-                check_same_rays(state, path, self._rays)
-            check_same_run(state, path, capture.get_datapath(), capture.observations, run.progress.windows, mode)
+            rays = self._rays if self._follows_capture else None
+            run_here = (capture.get_datapath(), capture.observations, run.progress.windows, mode, rays)
+            check_same_run(state, path, *run_here)
             torch.set_rng_state(state["rng"]["torch"])
             del state
         # nerfstudio takes every file in load_dir for a checkpoint.

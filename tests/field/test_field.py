@@ -12,6 +12,7 @@ from nerfstudio.field_components.field_heads import FieldHeadNames
 from random_fields import bundle, fill, random_field, random_plan, random_rays, render
 
 from mmpi_ns.field.mmpi_field import MMPIField
+from mmpi_ns.ops.blending import log_shares
 from mmpi_ns.rendering.sampler import MMPISampler
 from mmpi_ns.scene.geometry import LocalRays
 from mmpi_ns.scene.plan import CubePlan, ScenePlan
@@ -151,7 +152,8 @@ def test_a_head_votes_inside_its_frustum_where_it_was_trained_and_a_sample_count
     field.reliability.data.fill_(0.0)  # equal votes: P = 1 / number of heads that cover the point
 
     def shares(head):
-        return (1 / field.log_shares(rows, local, 1 / t, torch.full_like(own, head))[0].exp()).round().tolist()
+        tables = (field.layout, field.reliability, field.touched)
+        return (1 / log_shares(*tables, rows, local, 1 / t, torch.full_like(own, head))[0].exp()).round().tolist()
 
     # 'left' stands at (2, 0, 3), looks along -x from 2 units on, and reaches |z - 3| <= depth.
     assert shares(0) == [2, 3, 1, 1]

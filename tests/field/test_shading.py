@@ -13,8 +13,7 @@ from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.samples import metadata_of
 from mmpi_ns.field.shading import RayShader, change_odds
 from mmpi_ns.ops import dispatch
-from mmpi_ns.ops.composite import Composite, composite_weights
-from mmpi_ns.ops.gather import RaySums
+from mmpi_ns.ops.composite import composite_weights
 from mmpi_ns.rendering.sampler import MMPISampler
 
 F64 = torch.float64
@@ -150,9 +149,7 @@ def shade(weights, texels, network=0.3, channels=7):
     weights, texels = (torch.tensor(x, dtype=torch.float32).requires_grad_() for x in (weights, texels))
     gathered = (weights[..., None] * texels).sum(1)
     accumulation = weights.sum(-1, keepdim=True)
-    none = torch.zeros(1, 3)
-    made = Composite(weights, accumulation, 1 - accumulation)
-    rgb = shader(RaySums(gathered, none[:, :1], none, none), made, torch.tensor([[0.6, 0.0, 0.8]])).rgb
+    rgb = shader.shade(gathered, weights.sum(-1, keepdim=True), accumulation, torch.tensor([[0.6, 0.0, 0.8]]))
     rgb.sum().backward()
     return rgb.detach()[0], weights.grad, texels.grad
 

@@ -15,7 +15,7 @@ from random_fields import bundle, random_field, random_rays
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.samples import places_of
 from mmpi_ns.ops import dispatch
-from mmpi_ns.ops.shade import shade
+from mmpi_ns.ops.shade import Layers, SampleNetworks, shade
 from mmpi_ns.rendering.sampler import MMPISampler
 
 
@@ -92,10 +92,11 @@ def test_colours_say_where_a_feature_is_not_a_number():
 )
 def test_arrays_of_a_wrong_shape_are_refused(change):
     field, samples = shaded()
+    layers = tuple(Layers(*(x.detach() for x in field.networks.layers(k))) for k in range(5))
     given = {
         "layout": field.layout,
         "table": field.features.data,
-        "networks": field.networks.of_heads(5),
+        "networks": SampleNetworks(layers, 2, 2),
         "axes": torch.eye(3).expand(5, 3, 3),
         "directions": samples.frustums.directions[:, 0],
         "places": places_of(samples),

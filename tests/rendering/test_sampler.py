@@ -201,8 +201,8 @@ def test_stopping_where_a_ray_is_opaque_changes_nothing_visible(monkeypatch):
     field = random_field(6, True, seed=16, planes=60, log_depths=(-3, 1.2))
     rays = bundle(*random_rays(field.plan, 80, seed=17))
     looked_up, march = [], importlib.import_module("mmpi_ns.ops.march")
-    blend = march._blend
-    monkeypatch.setattr(march, "_blend", lambda index, *rest: looked_up.append(len(index)) or blend(index, *rest))
+    shares = march.log_shares
+    monkeypatch.setattr(march, "log_shares", lambda *args: looked_up.append(len(args[-1])) or shares(*args))
     stopped = render(field, rays, 1e-3, True)
     count = sum(looked_up)
     monkeypatch.setattr("mmpi_ns.ops.march.OPAQUE_DEPTH", math.inf)

@@ -21,15 +21,21 @@ from mmpi_ns.scene.baked import BakedMpis, Shader
 
 @operation("cpu")
 def show_baked(scene: BakedMpis, rays: Rays, threshold: float, peaks: Float[Tensor, "B 8 8"] | None = None) -> Shown:
-    """What each ray gathers, front to back.
-
-    Args:
-        scene: the bricks.
-        rays: R rays; all MPIs answer them.
-        threshold: samples of less weight are left out of the sums.
-        peaks: of every texel, raised to the largest weight of a sample that reads it.
-    """
-    window = _window(scene)
+    """What each ray gathers, front to back; all MPIs answer it. Samples of less weight than the threshold are left out
+    of the sums; ``peaks`` of texels are raised to the largest weight of a sample that reads them."""
+    window: reader.Window = {  # as the reader has it from a file
+        "mpis": [
+            vars(mpi)
+            | {"far": None if math.isinf(mpi.far) else mpi.far}
+            | {"interval": interval, "first_column": scene.first_column(k)}
+            for k, (mpi, interval) in enumerate(zip(scene.mpis, scene.intervals, strict=True))
+        ],
+        "density": vars(scene.density_codes),
+        "channels": [vars(c) for c in scene.channel_codes],
+        "columns_array": scene.columns.numpy().view("uint32"),
+        "density_array": scene.density.numpy(),
+        "texels_array": scene.texels.numpy(),
+    }
     samples = reader.march(window, *(x.double().numpy() for x in rays[:4]))
     inverse_t, weights, heads, texels, _, light = map(torch.from_numpy, samples)
     if peaks is not None and len(scene.density):
@@ -50,24 +56,6 @@ def show_baked(scene: BakedMpis, rays: Rays, threshold: float, peaks: Float[Tens
     return Shown(*(x.to(rays.origins) for x in shown))
 
 
-def _window(scene: BakedMpis) -> reader.Window:
-    """The bricks as the reader has them from a file."""
-    parts = enumerate(zip(scene.mpis, scene.intervals, strict=True))
-    return {
-        "mpis": [
-            vars(mpi)
-            | {"far": None if math.isinf(mpi.far) else mpi.far}
-            | {"interval": interval, "first_column": scene.first_column(k)}
-            for k, (mpi, interval) in parts
-        ],
-        "density": vars(scene.density_codes),
-        "channels": [vars(c) for c in scene.channel_codes],
-        "columns_array": scene.columns.numpy().view("uint32"),
-        "density_array": scene.density.numpy(),
-        "texels_array": scene.texels.numpy(),
-    }
-
-
 @operation("cpu")
 def shade_baked(
     shader: Shader,
@@ -75,14 +63,7 @@ def shade_baked(
     mass: Float[Tensor, "R 1"],
     directions: Float[Tensor, "R 3"],
 ) -> Float[Tensor, "R 3"]:
-    """Colours of rays from what they gathered.
-
-    Args:
-        shader: the network.
-        gathered: see ``Shown``.
-        mass: likewise.
-        directions: unit, world axes.
-    """
+    """Colours of rays from what they gathered and its mass (``Shown``). Directions are unit vectors in world axes."""
     numbers = torch.cat([x.flatten() for layer in shader.layers for x in layer])
     layers = [tuple(weights.shape) for weights, _ in shader.layers]
     network = {"direction_octaves": shader.direction_octaves, "layers": layers, "bound": shader.bound}

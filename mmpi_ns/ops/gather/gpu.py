@@ -27,15 +27,6 @@ def activate(raw, column):
 
 
 @triton.jit
-def store_sums(sums, ray, inside, channels, total, mass, squares, column):
-    """A ray's sums: weight times texel, weight, weight times squared colour."""
-    to = sums + ray[:, None] * (channels + 4)
-    tl.store(to + column, total, inside[:, None] & (column < channels))
-    tl.store(sums + ray * (channels + 4) + channels, mass, inside)
-    tl.store(to + channels + 1 + column, squares, inside[:, None] & (column < 3))
-
-
-@triton.jit
 def read_taps(values, positions, shares, number, inside, channels, column, TAPS: tl.constexpr):
     """Interpolated texels of samples."""
     raw = number[:, None] * column * 0.0
@@ -55,7 +46,8 @@ def gather_kernel(
     values, numbers, weights, positions, shares, cube_positions, cube_shares, sums, num_rays, slots, channels, planar,
     HAS_CUBE: tl.constexpr, CHANNELS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Sums over samples: ``numbers`` says which sample a slot holds; the first ``planar`` are on planes."""
+    """Sums over samples of weight times texel, of weight, and of weight times squared colour. ``numbers`` says which
+    sample a slot holds; the first ``planar`` are on planes."""
     ray, column = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK), tl.arange(0, CHANNELS)[None, :]
     inside = ray < num_rays
     mass = ray * 0.0
@@ -73,7 +65,10 @@ def gather_kernel(
         total += value
         squares += value * activate(raw, column)
         mass += weight
-    store_sums(sums, ray, inside, channels, total, mass, squares, column)
+    to = sums + ray[:, None] * (channels + 4)
+    tl.store(to + column, total, inside[:, None] & (column < channels))
+    tl.store(sums + ray * (channels + 4) + channels, mass, inside)
+    tl.store(to + channels + 1 + column, squares, inside[:, None] & (column < 3))
 
 
 @triton.jit(

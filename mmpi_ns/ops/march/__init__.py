@@ -58,14 +58,7 @@ class LiveSamples(NamedTuple):
 
 @operation("cpu", "gpu")
 def march(layout: SceneLayout, tables: Tables, rays: Rays, options: MarchOptions) -> MergedSamples:
-    """The samples of each ray that matter.
-
-    Args:
-        layout: the scene.
-        tables: densities, reliabilities and which texels were trained.
-        rays: R rays.
-        options: which samples are kept, and how they are blended.
-    """
+    """The samples of each ray that matter."""
     at = crossings(layout, rays, plane_hits(*rays[:4], layout.frames))
     flat = _live_samples(at, layout, tables)
     per_ray, number = at.counts.sum(-1), torch.cat([_enumerate(each)[1] for each in at.counts.unbind(-1)])
@@ -105,13 +98,6 @@ def show_rays(
 
     On a GPU nothing is waited for. The compiled form on a CPU takes sixteen rays abreast and passes over tiles that are
     not stored, also where the threshold is 0.
-
-    Args:
-        layout: the scene.
-        tables: densities, reliabilities and which texels were trained.
-        features: colours and features of all texels (``ops.gather``).
-        rays: R rays.
-        options: which samples are kept, and how they are blended.
     """
     m = march(layout, tables, rays, options)
     composite = composite_weights(m.tau, m.valid, m.skipped_before, m.skipped_total)
@@ -246,8 +232,9 @@ def _blend_visible(
     """Blended optical depths, front to back, until a ray lets less than exp(-OPAQUE_DEPTH) through.
 
     Reliability costs a lookup in every head, and most samples lie behind the first surface: those keep their own depth,
-    which changes weights by less than exp(-OPAQUE_DEPTH).
+    which changes weights by less than exp(-OPAQUE_DEPTH). Samples too thin to matter get an equal share without one.
     """
+    local = LocalRays(at.origins, at.directions, at.hits.local_origins, at.hits.local_directions)
     tau = flat.tau.clone()
     passed = tau.new_zeros(order.shape[0])
     for start in range(0, order.shape[1], BLEND_BLOCK):
@@ -256,27 +243,15 @@ def _blend_visible(
         index = block[visible]
         if not index.numel():
             break
-        tau[index] = _blend(index, flat, at, layout, tables)
+        depth = flat.tau[index]
+        thick = (depth > NEGLIGIBLE).nonzero()[:, 0]
+        sample = index[thick]
+        places = (flat.rays[sample], local, flat.inverse_t[sample], flat.heads[sample])
+        shares = log_shares(layout, tables.reliability, tables.touched, *places)
+        blended = blended_optical_depth(depth[thick], *shares)
+        tau[index] = (depth / layout.num_heads).index_copy(0, thick, blended)
         passed += torch.where(visible, tau[block], 0.0).sum(-1)
     return tau
-
-
-def _blend(
-    index: Int[Tensor, "M"],
-    flat: LiveSamples,
-    at: Crossings,
-    layout: SceneLayout,
-    tables: Tables,
-) -> Float[Tensor, "M"]:
-    """Blended optical depth of some samples; those too thin to matter get an equal share without a lookup."""
-    tau = flat.tau[index]
-    thick = (tau > NEGLIGIBLE).nonzero()[:, 0]
-    sample = index[thick]
-    local = LocalRays(at.origins, at.directions, at.hits.local_origins, at.hits.local_directions)
-    places = (flat.rays[sample], local, flat.inverse_t[sample], flat.heads[sample])
-    shares = log_shares(layout, tables.reliability, tables.touched, *places)
-    blended = tau / layout.num_heads
-    return blended.index_copy(0, thick, blended_optical_depth(tau[thick], *shares))
 
 
 # Prune ---------------------------------------------------------------------------------------------------------------

@@ -40,15 +40,6 @@ def local_ray(frame, x, y, z, dx, dy, dz):
 
 
 @triton.jit
-def _tangents(ox, oy, oz, dx, dy, dz):
-    """Of a ray in an MPI's axes (u, bend_u, v, bend_v): its tangents on the plane of disparity w are u + w bend_u and
-    v + w bend_v."""
-    depth = tl.where(dz > EPS, dz, 1.0)
-    u, v = dx / depth, dy / depth
-    return u, ox - oz * u, v, oy - oz * v
-
-
-@triton.jit
 def _narrow(low, high, never, p, q, step, end):
     """The range of m within p (m step + end) <= q too."""
     slope, rest = p * step, q - p * end
@@ -122,19 +113,6 @@ def _cube_range(cube, x, y, z, dx, dy, dz, near, far):
 
 
 @triton.jit
-def _sees_all(frame, is_mpi, first, count, oz, dz, content_near):
-    """Whether an MPI reaches to infinity, and the first one is entered before the first content."""
-    live, step, end = is_mpi & (count > 0), tl.load(frame + STEP), tl.load(frame + END)
-    # One plane before the first live one bounds the entry; behind the camera: the ray starts inside.
-    w = tl.minimum((first + 1).to(tl.float32), tl.load(frame + LAST)) * step + end
-    starts_inside = w * oz >= 1
-    entry = w * dz / tl.where(starts_inside, 1.0, 1 - w * oz)
-    entered = live & (starts_inside | (entry * content_near >= 1))
-    endless = live & (first - count < 0) & (end == 0)
-    return (tl.max(entered.to(tl.int32), 1) > 0) & (tl.max(endless.to(tl.int32), 1) > 0)
-
-
-@triton.jit
 def cross(ray, exists, x, y, z, dx, dy, dz, nears, fars, allowed, priorities, scene, cube, content_near,
           K: tl.constexpr, HEADS: tl.constexpr, HAS_CUBE: tl.constexpr, ALLOWS: tl.constexpr,
           CHOOSES: tl.constexpr):  # fmt: skip
@@ -145,7 +123,10 @@ def cross(ray, exists, x, y, z, dx, dy, dz, nears, fars, allowed, priorities, sc
     is_mpi, near, far = head < K, tl.load(nears + at), tl.load(fars + at)
     frame = scene + tl.where(is_mpi, head, 0) * FLOATS
     ox, oy, oz, lx, ly, lz = local_ray(frame, x, y, z, dx, dy, dz)
-    u, bend_u, v, bend_v = _tangents(ox, oy, oz, lx, ly, lz)
+    # A ray's tangents on the plane of disparity w are u + w bend_u and v + w bend_v.
+    depth = tl.where(lz > EPS, lz, 1.0)
+    u, v = lx / depth, ly / depth
+    bend_u, bend_v = ox - oz * u, oy - oz * v
     first, count = _live_range(frame, u, bend_u, v, bend_v, oz, lz, near, far)
     count = tl.where(exists[:, None] & is_mpi, count, 0)
     if CHOOSES:
@@ -160,5 +141,13 @@ def cross(ray, exists, x, y, z, dx, dy, dz, nears, fars, allowed, priorities, sc
         count = tl.where(may != 0, count, 0)
     explained = tl.max(count, 1) > 0
     if ALLOWS + CHOOSES > 0:
-        explained = explained & _sees_all(frame, is_mpi, first, count, oz, lz, content_near)
+        # An MPI reaches to infinity, and the first one is entered before the first content. One plane before the
+        # first live one bounds the entry; behind the camera: the ray starts inside.
+        live, step, end = is_mpi & (count > 0), tl.load(frame + STEP), tl.load(frame + END)
+        w = tl.minimum((first + 1).to(tl.float32), tl.load(frame + LAST)) * step + end
+        starts_inside = w * oz >= 1
+        entry = w * lz / tl.where(starts_inside, 1.0, 1 - w * oz)
+        entered = live & (starts_inside | (entry * content_near >= 1))
+        endless = live & (first - count < 0) & (end == 0)
+        explained = explained & (tl.max(entered.to(tl.int32), 1) > 0) & (tl.max(endless.to(tl.int32), 1) > 0)
     return first, count, u, bend_u, v, bend_v, oz, lz, explained

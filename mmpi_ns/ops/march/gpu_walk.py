@@ -18,6 +18,7 @@ from mmpi_ns.ops.gpu_scene import (
     DEPTH,
     END,
     FLOATS,
+    HEIGHT,
     INTERVAL,
     INTS,
     S_SCALE,
@@ -27,13 +28,15 @@ from mmpi_ns.ops.gpu_scene import (
     U_SCALE,
     V0,
     V_SCALE,
+    WIDTH,
     bilinear,
     is_held,
-    minus_log_of_rest,
-    nearest_row,
+    nearest,
     one_minus_exp,
+    row_of,
     softplus,
     trilinear,
+    twice_atanh,
 )
 from mmpi_ns.ops.march.gpu_hits import local_ray
 
@@ -105,30 +108,6 @@ def _choose(first, count, done, u, bend_u, v, bend_v, oz, dz, constants, cube, K
 
 
 @triton.jit
-def _look_up(x, y, z, dx, dy, dz, u, bend_u, v, bend_v, constants, grids, biases, cube, density, head, number, asked,
-             K: tl.constexpr, HAS_CUBE: tl.constexpr):  # fmt: skip
-    """Plane, NDC and optical depth of samples."""
-    is_mpi = head < K
-    mpi, in_mpi = tl.where(is_mpi, head, 0), asked & is_mpi
-    row = constants + mpi * FLOATS
-    w, u, v = _on_plane(row, u, bend_u, v, bend_v, number)
-    s = 1 - tl.load(row + S_SCALE) * (w - tl.load(row + END))
-    plane = tl.load(grids + mpi * INTS + DEPTH).to(tl.int32) - 1 - number
-    raw = bilinear(density, grids, mpi, plane, u, v, in_mpi)
-    raw += tl.load(biases + tl.load(grids + mpi * INTS + BIAS) + plane, in_mpi, 0.0)
-    tau = softplus(raw) * tl.load(row + INTERVAL)
-    if HAS_CUBE:
-        in_cube = asked & (head == K)
-        t = (tl.where(in_cube, number, 0).to(tl.float32) + 0.5) * tl.load(cube + 6)
-        p, q, r = _in_cube(cube, x + dx * t, y + dy * t, z + dz * t)
-        thick = softplus(trilinear(density, grids, K, p, q, r, in_cube) + tl.load(cube + 7))
-        tau = tl.where(is_mpi, tau, thick * tl.load(cube + 8))
-        u, v, s = tl.where(is_mpi, u, p), tl.where(is_mpi, v, q), tl.where(is_mpi, s, r)
-        plane = tl.where(is_mpi, plane, number)
-    return plane, u, v, s, tau
-
-
-@triton.jit
 def _in_cube(cube, x, y, z):
     """Points normalised to [-1, 1]^3 over the cube."""
     x = 2 * (x - tl.load(cube)) / tl.load(cube + 3) - 1
@@ -143,7 +122,10 @@ def _count_vote(own_vote, highest, others, grids, reliability, touched, k, head,
     looked_up = thick & (inside | is_own)
     vote = trilinear(reliability, grids, k, u, v, s, looked_up)
     counts = looked_up & (head != k)
-    counts = counts & (tl.load(touched + nearest_row(grids, k, u, v, s, counts), counts, 0) > 0)
+    grid = grids + k * INTS
+    x, y = nearest(u, tl.load(grid + WIDTH)), nearest(v, tl.load(grid + HEIGHT))
+    row = row_of(grids, k, nearest(s, tl.load(grid + DEPTH)), y, x, counts)
+    counts = counts & (tl.load(touched + row, counts, 0) > 0)
     higher = tl.where(counts, tl.maximum(highest, vote), highest)
     # -1e30 instead of -infinity: differences of it are numbers.
     others = tl.where(counts, others * tl.exp(highest - higher) + tl.exp(vote - higher), others)
@@ -181,7 +163,9 @@ def _blend(x, y, z, dx, dy, dz, constants, grids, cube, reliability, touched, he
     log_share, log_rest = -softplus(odds), -softplus(-odds)
     alpha, lower = one_minus_exp(tau) * tl.exp(log_share), log_share - tau
     opaque = tl.maximum(log_rest, lower) + softplus(-tl.abs(log_rest - lower))
-    blended = tl.where(alpha < 0.5, minus_log_of_rest(tl.minimum(alpha, 0.5)), tl.maximum(-opaque, 0.0))
+    thin = tl.minimum(alpha, 0.5)
+    thin = twice_atanh(thin / (2 - thin))  # -log(1 - alpha)
+    blended = tl.where(alpha < 0.5, thin, tl.maximum(-opaque, 0.0))
     blended = tl.where(sole, tau, blended)
     return tl.where(thick, blended, tau / (K + HAS_CUBE))
 
@@ -198,10 +182,23 @@ def next_samples(
         first, count, done, u, bend_u, v, bend_v, local_z, local_dz, constants, cube, K, HEADS, HAS_CUBE, RAYS, STEPS
     )
     met = (inverse_t >= 0) & goes_on[:, None]
-    plane, u, v, s, tau = _look_up(
-        x, y, z, dx, dy, dz, u, bend_u, v, bend_v, constants, grids, biases, cube, density, head, number, met, K,
-        HAS_CUBE,
-    )  # fmt: skip
+    is_mpi = head < K
+    mpi, in_mpi = tl.where(is_mpi, head, 0), met & is_mpi
+    row = constants + mpi * FLOATS
+    w, u, v = _on_plane(row, u, bend_u, v, bend_v, number)
+    s = 1 - tl.load(row + S_SCALE) * (w - tl.load(row + END))
+    plane = tl.load(grids + mpi * INTS + DEPTH).to(tl.int32) - 1 - number
+    raw = bilinear(density, grids, mpi, plane, u, v, in_mpi)
+    raw += tl.load(biases + tl.load(grids + mpi * INTS + BIAS) + plane, in_mpi, 0.0)
+    tau = softplus(raw) * tl.load(row + INTERVAL)
+    if HAS_CUBE:
+        in_cube = met & (head == K)
+        t = (tl.where(in_cube, number, 0).to(tl.float32) + 0.5) * tl.load(cube + 6)
+        p, q, r = _in_cube(cube, x + dx * t, y + dy * t, z + dz * t)
+        thick = softplus(trilinear(density, grids, K, p, q, r, in_cube) + tl.load(cube + 7))
+        tau = tl.where(is_mpi, tau, thick * tl.load(cube + 8))
+        u, v, s = tl.where(is_mpi, u, p), tl.where(is_mpi, v, q), tl.where(is_mpi, s, r)
+        plane = tl.where(is_mpi, plane, number)
     if BLENDS:
         tau = _blend(
             x, y, z, dx, dy, dz, constants, grids, cube, reliability, touched, head, inverse_t, tau, met, K, HAS_CUBE
