@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
@@ -21,7 +20,7 @@ from PIL import Image
 
 from mmpi_ns.capture.lenses import check_lenses
 from mmpi_ns.utils.errors import InputError, brief
-from mmpi_ns.utils.values import Number, check_number, check_options, check_row, cut, shown
+from mmpi_ns.utils.values import Number, check_number, check_row, cut, shown
 
 SAME_PLACE = 1e-6
 """Cameras closer together than this fraction of their distance from the origin count as one place, in float32."""
@@ -35,7 +34,7 @@ FEW = 0.1
 """Fraction of the cameras that counts as a few."""
 SPLITS = ("train_filenames", "val_filenames", "test_filenames")
 PATHS = ("file_path", "mask_path", "depth_file_path")
-PARSER = {
+PARSER_OPTIONS = {
     "scale_factor": Number(0, 1e9, above=True),
     "scene_scale": Number(0, above=True),
     "train_split_fraction": Number(0, 1, above=True),
@@ -46,11 +45,6 @@ PARSER = {
 ORIENTATIONS = ("pca", "up", "vertical", "none")
 
 Frames = Sequence[Mapping[str, Any]]
-
-
-def check_parser(parser: DataParserConfig) -> None:
-    """Raises InputError naming the option of a data parser that cannot be used."""
-    check_options(parser, {name: number for name, number in PARSER.items() if hasattr(parser, name)}, "--")
 
 
 def check_transforms(parser: NerfstudioDataParserConfig, data: Path, splits: Sequence[str], *, opens: bool) -> None:

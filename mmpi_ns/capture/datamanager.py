@@ -19,7 +19,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
 
 from mmpi_ns.capture.ahead import DrawnAhead
-from mmpi_ns.capture.checks import check_parser, check_transforms, say_once
+from mmpi_ns.capture.checks import PARSER_OPTIONS, check_transforms, say_once
 from mmpi_ns.capture.dataset import MMPIDataset
 from mmpi_ns.capture.exif import light_of
 from mmpi_ns.capture.known_depth import KnownDepth, know_depths, of_cells
@@ -35,6 +35,7 @@ from mmpi_ns.placement.observations import Observations
 from mmpi_ns.scene.visible_tiles import TrainingViews
 from mmpi_ns.utils.errors import InputError, say
 from mmpi_ns.utils.random_draws import generator
+from mmpi_ns.utils.values import check_options
 
 OBSERVATIONS = "mmpi_observations"
 """Key of the scene's Observations in the data set's metadata, for the model."""
@@ -97,13 +98,12 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         self.gains: Gains | None = None
         self.moves = ""
         """How much of the training images moves, in a sentence; empty where nobody looked."""
-        """Share of a step's rays that are drawn; the schedule sets it."""
         self.sources: RaySources | None = None
         """Sources that a step draws from now."""
         self._resident: RaySources | None = None
         """The sources of all cameras, if they are in memory all the time."""
         parser = config.dataparser
-        check_parser(parser)
+        check_options(parser, {name: number for name, number in PARSER_OPTIONS.items() if hasattr(parser, name)}, "--")
         if isinstance(parser, NerfstudioDataParserConfig):
             mode = kwargs.get("test_mode", "val")
             splits = ("train", "val" if mode == "val" else "test")
@@ -120,13 +120,22 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
             )
         dataset.metadata[RAYS_PER_STEP] = self.config.train_num_rays_per_batch
         dataset.metadata[TRAINING_VIEWS] = TrainingViews.of(dataset.cameras)
-        self._pinhole = PinholeRays.of(dataset.cameras, self.device)
+        device = self.device
+        generate = PinholeRays.of(dataset.cameras, device) or RayGenerator(dataset.cameras.to(device))
+        self.train_ray_generator: Any = lambda pixels: generate(pixels.to(device))
         if self.test_mode == "val":  # elsewhere the plan comes from a checkpoint
             if self.config.mask_moving and None in dataset.mask_files:
-                self._mask_moving(dataset)
-            rays = self._ray_generator()
+                # A mask file of the user wins over what is seen to move.
+                masks = zip(moving_masks(self.observations, dataset), dataset.mask_files, strict=True)
+                masks = [mask & (file is None) for mask, file in masks]
+                self.moves = share_of_moving(masks)
+                is_masked = any(mask.any() for mask in masks)
+                say(self.moves + (" (--pipeline.datamanager.mask-moving False keeps them)." if is_masked else "."))
+                if is_masked:
+                    dataset.moving = masks
+                    self.observations = drop_masked(self.observations, dataset)
             depths, self.observations = know_depths(
-                self.train_dataparser_outputs, self.observations, dataset, lambda pixels: rays(pixels.to(self.device)),
+                self.train_dataparser_outputs, self.observations, dataset, self.train_ray_generator,
                 dense=self.config.dense_depth, sensor=self.config.depth_images,
             )  # fmt: skip
             self.known_depth, seen = depths, self.observations
@@ -136,23 +145,6 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
             if not has_keypoints and (depths is None or depths.share == 0):
                 say("No depths are known, from tracks, matches or a sensor: geometry is learned from colours alone.")
         return dataset
-
-    def _ray_generator(self) -> Any:
-        """Makes rays through pixel centres of training images; no attribute, as nn.Module takes none before its own."""
-        return self._pinhole or RayGenerator(self.train_dataset.cameras.to(self.device))
-
-    def _mask_moving(self, dataset: MMPIDataset) -> None:
-        """Masks what moves in the training images, and says how much it is."""
-        masks = moving_masks(self.observations, dataset)
-        # Masks of the user win.
-        masks = [m & (file is None) for m, file in zip(masks, dataset.mask_files, strict=True)]
-        self.moves = share_of_moving(masks)
-        if not any(mask.any() for mask in masks):
-            say(f"{self.moves}.")
-            return
-        say(f"{self.moves} (--pipeline.datamanager.mask-moving False keeps them).")
-        dataset.moving = masks
-        self.observations = drop_masked(self.observations, dataset)
 
     @cached_property
     def observations(self) -> Observations:
@@ -177,7 +169,6 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         # Samples nothing: ns-export sets its batches' size here.
         self.train_pixel_sampler = self._get_pixel_sampler(self.train_dataset, self.config.train_num_rays_per_batch)
         self._rays = DrawnAhead(self.config.seed, self.device)
-        self.train_ray_generator: Any = self._ray_generator()
         gains = self.calibrated() if self.config.correct_exposure and self.test_mode == "val" else None
         if gains is not None:
             say(gains.describe())
@@ -202,9 +193,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
             posed, self.known_depth, self.train_ray_generator,
             lambda i: image_and_mask(self.train_dataset, i), self.config.seed,
         )  # fmt: skip
-        if ratios is None:
-            return None
-        return image_gains(ratios, len(posed.files), light)
+        return None if ratios is None else image_gains(ratios, len(posed.files), light)
 
     def use_cameras(self, cameras: NDArray[np.int64] | None) -> None:
         """Draws from these training cameras from now on, None for all, and prints the share of each source.
@@ -305,9 +294,9 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         return self.eval_ray_generator(batch["indices"]), batch
 
     def next_train(self, step: int) -> tuple[RayBundle, dict]:
-        """The rays of a step, keyed on (seed, step), as ``RaySources.draw`` gives them.
+        """The rays of a step, keyed on (seed, step), as by ``RaySources.draw``.
 
-        Outside training (ns-export always requests step 0) there are only pixel rays, different ones in each call.
+        Outside training (ns-export always requests step 0) only pixel rays, different ones in each call.
         """
         self.train_count += 1
         if self.sources is None:  # nobody said which window

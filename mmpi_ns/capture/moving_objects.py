@@ -139,14 +139,9 @@ def _object(shot: Shot, part: Mask, static: Mask, room: tuple[int, int, int, int
     first, last = part.argmax(0), height - 1 - part[::-1].argmax(0)
     y = np.arange(height)[:, None]
     result |= columns_of & (y >= np.minimum(first, body)) & (y <= last) & ~static
-    result = cv2.morphologyEx(result.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8)) > 0
-    return without_holes(_touching(result, part))
-
-
-def _touching(mask: Mask, part: Mask) -> Mask:
-    """The connected parts of a mask that hold a pixel of another."""
-    _, labels = cv2.connectedComponents(mask.astype(np.uint8))
-    return np.isin(labels, np.setdiff1d(labels[part & mask], [0]))
+    closed = cv2.morphologyEx(result.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
+    _, labels = cv2.connectedComponents(closed)
+    return without_holes(np.isin(labels, np.setdiff1d(labels[part & (closed > 0)], [0])))
 
 
 def without_holes(mask: Mask) -> Mask:

@@ -83,7 +83,18 @@ def _find_points(observations: Observations, dataset: MMPIDataset, triangulates:
     if images is None:
         CONSOLE.print("Cameras that are neither perspective nor fisheye: no features are matched.")
     elif triangulates:
-        model = _remembered_tracks(at_full_size(images))
+        originals = at_full_size(images)
+
+        def find() -> Arrays:
+            width, height = originals.sizes.max(0).astype(int)
+            size = f"{len(originals.files)} images of {width} x {height}"
+            CONSOLE.print(f"No SfM tracks: matching the features of {size}.")
+            return {name: np.asarray(value) for name, value in vars(triangulate(originals)).items()}
+
+        cameras = originals.camera_to_worlds, originals.intrinsics, originals.distortion, originals.fisheye
+        stored: Mapping[str, Any] = remembered(digest(originals.files, "tracks", TRACKS_VERSION, *cameras), find)
+        model = SfmModel(**{**stored, "off": stored["off"].item()})
+        CONSOLE.print(f"{len(model.points)} triangulated points, seen {len(model.seen_by)} times.")
         observations = with_tracks(observations, model)
         tell_poses(model.off * float(images.sizes[:, 0].mean()), images.files[0])
     if len(observations.seen_by) < ENOUGH_KEYPOINTS * len(dataset):
@@ -114,21 +125,6 @@ def tell_poses(off: float, image: Path) -> None:
     command = f"mmpi-prepare {quoted(full)} {quoted(refined)} --poses {quoted(poses)} --refine-poses"
     says = f"The poses are off by {off:.1f} training pixels (median over the matches of the images)"
     CONSOLE.print(f"{says}: {command} mends them.", style="bold yellow", markup=False, soft_wrap=True)
-
-
-def _remembered_tracks(images: PosedImages) -> SfmModel:
-    """The tracks of posed images, from the cache if possible."""
-
-    def find() -> Arrays:
-        width, height = images.sizes.max(0).astype(int)
-        CONSOLE.print(f"No SfM tracks: matching the features of {len(images.files)} images of {width} x {height}.")
-        return {name: np.asarray(value) for name, value in vars(triangulate(images)).items()}
-
-    cameras = images.camera_to_worlds, images.intrinsics, images.distortion, images.fisheye
-    stored: Mapping[str, Any] = remembered(digest(images.files, "tracks", TRACKS_VERSION, *cameras), find)
-    model = SfmModel(**{**stored, "off": stored["off"].item()})
-    CONSOLE.print(f"{len(model.points)} triangulated points, seen {len(model.seen_by)} times.")
-    return model
 
 
 def read_observations(outputs: DataparserOutputs, cameras: Cameras, sfm: SfmModel | None) -> Observations:

@@ -53,10 +53,10 @@ def write_masks(
         seen = [model.points3D[p.point3D_id].xyz for p in entries[i].points2D if p.has_point3D()]
         return np.array(seen).reshape(-1, 3)
 
-    shown = find_moving(
+    views, moving = find_moving(
         posed, points_of, lambda work, count: track(work, "Looking for what moves", count, console=CONSOLE)
     )
-    if not shown.share:
+    if not any(mask.any() for mask in moving):
         return {}
     target.mkdir(parents=True, exist_ok=True)
     number, shares = {entry.name: i for i, entry in enumerate(entries)}, {}
@@ -64,12 +64,12 @@ def write_masks(
         shape, i = (photo.height, photo.width), number.get(photo.name)
         mask = np.zeros(shape, bool)
         if i is not None:
-            mask = in_image(shown.views[i], shown.masks[i], posed, i, shape)
+            mask = in_image(views[i], moving[i], posed, i, shape)
         if mask.any():
             shares[photo.name] = float(mask.mean())
         Image.fromarray(np.where(mask, 0, 255).astype(np.uint8)).save(target / f"{photo.name}.png")
-    colors = ((entry.name, straightened_color(posed, i, shown.views[i])) for i, entry in enumerate(entries))
-    draw_moving(picture, colors, shown.masks)
+    colors = ((entry.name, straightened_color(posed, i, views[i])) for i, entry in enumerate(entries))
+    draw_moving(picture, colors, moving)
     return shares
 
 
