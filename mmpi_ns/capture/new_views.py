@@ -121,7 +121,7 @@ class ShownImage:
     def shows(
         self, posed: PosedImages, j: int, points: Float[ndarray, "P 3"], colors: Float[ndarray, "P C"]
     ) -> tuple[Int[ndarray, "S"], UInt8[ndarray, "S C"]]:
-        """Numbers and colours of the points that image j, this one, shows at their distance and in about its colours."""
+        """Numbers and colours of the points that image j, this one, shows at their distance, coloured alike."""
         at = project(posed, j, points)
         maps = self.depth[..., 0], self.usable, self.darkest, self.brightest
         inverse, may, darkest, brightest = (look_up(m, *at.T, nearest=True) for m in maps)

@@ -354,20 +354,17 @@ def exposure_of_view(
     return np.exp(np.median(logs, 0))
 
 
-def residuals(ratios: ColorRatios, logs: Float[ndarray, "N 3"], falloff: Float[ndarray, "2 3"]) -> NDArray[np.float64]:
-    """What gains and fall-off leave of the log ratios. [M, 3]"""
-    return ratios.log_ratios - (logs[ratios.second] - logs[ratios.first]) - ratios.falloff @ falloff
-
-
 def image_gains(ratios: ColorRatios, count: int, exposures: Float[ndarray, "N"] | None = None) -> Gains:
     """Gains of ``count`` images with how well they predict pairs of images that were left out of their estimate."""
     pairs = np.minimum(ratios.first, ratios.second) * count + np.maximum(ratios.first, ratios.second)
     fold = np.unique(pairs, return_inverse=True)[1] % FOLDS
-    left: dict[bool, list[NDArray[np.float64]]] = {False: [], True: []}
-    for held_out in np.unique(fold):
-        for gains, errors in left.items():
-            logs, _, falloff = solve(ratios.some(fold != held_out), count, exposures, gains=gains)
-            errors.append(np.abs(residuals(ratios.some(fold == held_out), logs, falloff)).ravel())
+    residuals: dict[bool, list[NDArray[np.float64]]] = {False: [], True: []}
+    for number in np.unique(fold):
+        left_out = ratios.some(fold == number)
+        for gains, parts in residuals.items():
+            logs, _, falloff = solve(ratios.some(fold != number), count, exposures, gains=gains)
+            change = logs[left_out.second] - logs[left_out.first]
+            parts.append(np.abs(left_out.log_ratios - change - left_out.falloff @ falloff).ravel())
     logs, errors, falloff = solve(ratios, count, exposures)
-    without, corrected = (float(np.median(np.concatenate(left[gains]))) for gains in (False, True))
+    without, corrected = (float(np.median(np.concatenate(residuals[gains]))) for gains in (False, True))
     return Gains(np.exp(logs), errors, falloff, without, corrected)
