@@ -260,23 +260,19 @@ def evidence(shot: Shot, others: Sequence[Neighbour], masks: Sequence[Mask | Non
         for distance in distances:
             second = cv2.min(second, cv2.max(first, distance))
             first = cv2.min(first, distance)
-        for nearest, of_depth in ((one, first), (two, second)):
-            np.minimum(nearest, of_depth, out=nearest, where=possible)
+        for least, of_depth in ((one, first), (two, second)):
+            np.minimum(least, of_depth, out=least, where=possible)
         np.maximum(behind, pair, out=behind, where=possible)
-    decided = _would_be_seen(shot, others) & shot.view.inside
+    # Nobody can tell where fewer than two neighbours would show even the nearest content.
+    measured = shot.depth.inverse[shot.depth.inverse > 0]
+    nearest = np.full(shape, np.percentile(measured, NEAREST) if len(measured) else 0, np.float32)
+    showing = np.zeros(shape, np.uint8)
+    for other in others:
+        x, y, ahead = other.parallax.pixels(nearest)
+        height, width = other.shot.view.gray.shape
+        showing += (x > 0) & (x < width) & (y > 0) & (y < height) & (ahead > 0)
+    decided = (showing >= 2) & shot.view.inside
     strong = np.where(decided & (one < ALL), np.minimum(one, np.where(impossible, ALL, behind)), 0).astype(np.uint8)
     weak = np.where(decided & (two < ALL), np.minimum(two, behind), 0).astype(np.uint8)
     differences = two[(shot.depth.inverse > 0) & (two < ALL)]
     return Evidence(strong, weak, behind, float(np.percentile(differences, NOISE)) if len(differences) else 0.0)
-
-
-def _would_be_seen(shot: Shot, others: Sequence[Neighbour]) -> Mask:
-    """Where at least two neighbours would show even the nearest content: elsewhere nobody can tell. [h, w]"""
-    measured = shot.depth.inverse[shot.depth.inverse > 0]
-    nearest = np.full(shot.view.gray.shape, np.percentile(measured, NEAREST) if len(measured) else 0, np.float32)
-    count = np.zeros(nearest.shape, np.uint8)
-    for other in others:
-        x, y, ahead = other.parallax.pixels(nearest)
-        height, width = other.shot.view.gray.shape
-        count += (x > 0) & (x < width) & (y > 0) & (y < height) & (ahead > 0)
-    return count >= 2

@@ -107,7 +107,8 @@ def place(observations: Observations, config: PlacementConfig, training_rays: in
     else:
         remedy = "more steps" if trainable > config.texel_pixels else "a smaller placement.texel-pixels"
     origin = f"automatic placement, a texel spans {texel_pixels:.1f} pixels: finer with {remedy}"
-    return ScenePlan(_named(mpis), cube, 0.2 * visible.near, visible.near, origin, detail)
+    mpis = tuple(replace(m, name=f"{m.name} ({i})") for i, m in enumerate(mpis))  # two may be placed at one camera
+    return ScenePlan(mpis, cube, 0.2 * visible.near, visible.near, origin, detail)
 
 
 def trainable_texel(
@@ -161,7 +162,7 @@ class _Choice:
         self.candidates, self.weights, self.config, self.texel_pixels = candidates, weights, config, texel_pixels
         self.cost: NDArray[np.float32] = np.stack([self._bits(c) for c in candidates])
         self.nothing = np.full(self.cost.shape[1], self.cost.max(), np.float32)
-        texels = [self._head(c, config.max_planes).texels for c in candidates]
+        texels = [c.at(texel_pixels, config.max_planes, config.max_voxels).texels for c in candidates]
         self.price = np.array(texels, dtype=np.float64) ** config.texel_cost
         self.is_cube = np.array([isinstance(c.frame, CubePlan) for c in candidates])
 
@@ -177,7 +178,8 @@ class _Choice:
                 break
             chosen = grown
         owner = self.cost[chosen].argmin(0)
-        return [self._head(self.candidates[j], self._planes(j, owner == n)) for n, j in enumerate(chosen)]
+        heads = ((self.candidates[j], self._planes(j, owner == n)) for n, j in enumerate(chosen))
+        return [head.at(self.texel_pixels, planes, self.config.max_voxels) for head, planes in heads]
 
     def _total(self, chosen: list[int]) -> float:
         """Remaining expected error, in bits, summed over images."""
@@ -214,9 +216,6 @@ class _Choice:
         steps = float(np.quantile(error, 0.8)) / (self.config.plane_pixels * self.texel_pixels) if len(error) else 0.0
         return int(np.clip(8 * round((1 + steps) / 8), MIN_PLANES, self.config.max_planes))
 
-    def _head(self, candidate: Candidate, planes: int) -> MPIPlan | CubePlan:
-        return candidate.at(self.texel_pixels, planes, self.config.max_voxels)
-
     def _bits(self, candidate: Candidate) -> NDArray[np.float32]:
         """Cost of each observation if served here: log2 of the expected pixel error over ``enough``."""
         enough = self.config.enough * self.texel_pixels
@@ -224,8 +223,3 @@ class _Choice:
         plane, texel = candidate.plane / (self.config.max_planes - 1), 0.5 * size * candidate.texel
         worst = max(WORST, 2 * enough)
         return np.log2(np.clip(np.hypot(plane, texel), enough, worst) / enough).astype(np.float32)
-
-
-def _named(mpis: tuple[MPIPlan, ...]) -> tuple[MPIPlan, ...]:
-    """Unique names, also if two MPIs are placed at one camera."""
-    return tuple(replace(m, name=f"{m.name} ({i})") for i, m in enumerate(mpis))

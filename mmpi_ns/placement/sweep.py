@@ -11,7 +11,6 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates, uniform_filter
 
 from mmpi_ns.placement.observations import Array, Observations
@@ -78,9 +77,7 @@ def _sweep(reference: _View, neighbours: list[_View]) -> Array:
     disparities = np.linspace(0, 0.35 * width / (fx * baseline), HYPOTHESES)
     # Of each disparity the mean correlation of the better half of the neighbours.
     better = max(1, (len(neighbours) + 1) // 2)
-    correlations = (
-        [_correlation(reference.image, *_warp(reference, n, rays, w)) for n in neighbours] for w in disparities
-    )
+    correlations = ([_correlation(reference, n, rays, w) for n in neighbours] for w in disparities)
     scores = np.stack([np.sort(np.stack(c), 0)[::-1][:better].mean(0) for c in correlations])
     best = scores.argmax(0)
     top = scores.max(0)
@@ -98,8 +95,9 @@ def _sweep(reference: _View, neighbours: list[_View]) -> Array:
     return world[good][:: max(1, good.sum() // 400)]
 
 
-def _warp(reference: _View, neighbour: _View, rays: Array, disparity: float) -> tuple[Array, NDArray[np.bool_]]:
-    """The neighbour's colours where the reference's pixels fall on it, and whether they do."""
+def _correlation(reference: _View, neighbour: _View, rays: Array, disparity: float) -> Array:
+    """Zero-mean normalised correlation, over windows, of the reference with the neighbour warped at a disparity; -1
+    where a window leaves the neighbour or holds no texture."""
     direction = rays @ reference.pose[:, :3].T + disparity * (reference.pose[:, 3] - neighbour.pose[:, 3])
     local = direction @ neighbour.pose[:, :3]
     depth = -local[..., 2]
@@ -109,11 +107,7 @@ def _warp(reference: _View, neighbour: _View, rays: Array, disparity: float) -> 
     x, y = fx * local[..., 0] / safe + cx - 0.5, -fy * local[..., 1] / safe + cy - 0.5
     height, width = neighbour.image.shape
     inside = ahead & (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
-    return map_coordinates(neighbour.image, np.where(inside, [y, x], 0.0), order=1), inside
-
-
-def _correlation(a: Array, b: Array, inside: NDArray[np.bool_]) -> Array:
-    """Zero-mean normalised correlation over windows; -1 where a window leaves the image or holds no texture."""
+    a, b = reference.image, map_coordinates(neighbour.image, np.where(inside, [y, x], 0.0), order=1)
     b, mean = np.where(inside, b, 0.0), partial(uniform_filter, size=WINDOW, mode="nearest")
     mean_a, mean_b = mean(a), mean(b)
     variance_a, variance_b = mean(a * a) - mean_a**2, mean(b * b) - mean_b**2

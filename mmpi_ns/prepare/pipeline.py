@@ -131,25 +131,23 @@ class Preparation:
                 if not path.exists():
                     with whole(path) as partial:
                         shutil.copyfile(database, partial)
-                listed, says = self._pairs(path)
+                names = [p.name for p in self.photos]
+                if self.known_poses is not None and s.matching == "auto":
+                    places = [i for i, n in enumerate(names) if n in self.known_poses.poses]
+                    poses = np.array([self.known_poses.poses[names[i]] for i in places])  # OpenCV axes
+                    listed = [(places[i], places[j]) for i, j in near_pairs(poses[:, :3], 2 * s.overlap)]
+                    says = f"the {2 * s.overlap} nearest by pose"
+                else:
+                    alike = pairs.image_similarity(path, len(names))
+                    chosen, why = pairs.choose(s.matching, names, alike, self.is_video)
+                    listed, says = pairs.list_pairs(chosen, alike, s.overlap), f"{chosen} ({why})"
+                    if chosen == "sequential":
+                        says += f", {len(pairs.revisits(alike, s.overlap))} pairs that may be revisits"
                 verified = features.match(path, self.photos, listed, s.threads)
                 (folder / "says.txt").write_text(f"{says}; {verified} of {len(listed)} pairs match", encoding="utf-8")
         says = (folder / "says.txt").read_text(encoding="utf-8")
         say(f"Matching: {says}.")
         return path, says
-
-    def _pairs(self, database: Path) -> tuple[pairs.Pairs, str]:
-        """The pairs to match, as indices of photos, and how they were chosen in words."""
-        s, names = self.settings, [p.name for p in self.photos]
-        if self.known_poses is not None and s.matching == "auto":
-            places = [i for i, n in enumerate(names) if n in self.known_poses.poses]
-            poses = np.array([self.known_poses.poses[names[i]] for i in places])  # OpenCV axes
-            near = near_pairs(poses[:, :3], 2 * s.overlap)
-            return [(places[i], places[j]) for i, j in near], f"the {2 * s.overlap} nearest by pose"
-        alike = pairs.image_similarity(database, len(names))
-        chosen, why = pairs.choose(s.matching, names, alike, self.is_video)
-        revisits = f", {len(pairs.revisits(alike, s.overlap))} pairs that may be revisits"
-        return pairs.list_pairs(chosen, alike, s.overlap), f"{chosen} ({why}){revisits * (chosen == 'sequential')}"
 
     def _solve(self, database: Path) -> tuple[Solution, tuple[float, float] | None, list[list[str]]]:
         """Poses and points; the interval of a refined focal length; connected groups of images without a pose."""

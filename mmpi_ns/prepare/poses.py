@@ -175,10 +175,18 @@ def _read_transforms(path: Path, photos: Sequence[Photo]) -> KnownPoses:
         _check_apart(places, path)
         poses, intrinsics = {}, {}
         for photo in (p for p in photos if p.name in places):
-            frame = frames[places[photo.name]]
+            frame = meta | frames[places[photo.name]]
             poses[photo.name] = np.array(frame["transform_matrix"], dtype=np.float64).reshape(4, 4)
-            if "fl_x" in meta or "fl_x" in frame:
-                intrinsics[photo.name] = _frame_intrinsics({**meta, **frame}, photo)
+            if "fl_x" in frame:  # for images that may be smaller or larger than those of the file
+                fisheye = frame.get("camera_model") in FISHEYE
+                keys = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2")
+                sx, sy = photo.width / frame.get("w", photo.width), photo.height / frame.get("h", photo.height)
+                if abs(sx / sy - 1) > 0.02:
+                    raise PrepareError(f"{photo.name} is {photo.width}x{photo.height}, transforms.json says otherwise.")
+                fx, fy = float(frame["fl_x"]), float(frame.get("fl_y", frame["fl_x"]))
+                cx, cy = float(frame.get("cx", photo.width / sx / 2)), float(frame.get("cy", photo.height / sy / 2))
+                lens = tuple(float(frame.get(k, 0.0)) for k in keys)
+                intrinsics[photo.name] = Intrinsics(fx * sx, fy * sy, cx * sx, cy * sy, lens, fisheye)  # type: ignore[arg-type]
     except (ValueError, KeyError, TypeError) as error:
         raise PrepareError(f"--poses {path} is no transforms.json as nerfstudio writes it ({error!r}).") from error
     split = meta if "train_filenames" in meta and "test_filenames" in meta else None
@@ -205,16 +213,3 @@ def _check_apart(poses: dict[str, Any], path: Path) -> None:
                 f"{path} has one pose for {first[pose]} and {name}: images of one name in two folders need two."
             )
         first[pose] = name
-
-
-def _frame_intrinsics(frame: dict[str, Any], photo: Photo) -> Intrinsics:
-    """Intrinsics of a frame, for images that may be smaller or larger than those of the file."""
-    fisheye = frame.get("camera_model") in FISHEYE
-    keys = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2")
-    sx, sy = photo.width / frame.get("w", photo.width), photo.height / frame.get("h", photo.height)
-    if abs(sx / sy - 1) > 0.02:
-        raise PrepareError(f"{photo.name} is {photo.width}x{photo.height}, transforms.json says otherwise.")
-    fx, fy = float(frame["fl_x"]), float(frame.get("fl_y", frame["fl_x"]))
-    cx, cy = float(frame.get("cx", photo.width / sx / 2)), float(frame.get("cy", photo.height / sy / 2))
-    lens = tuple(float(frame.get(k, 0.0)) for k in keys)
-    return Intrinsics(fx * sx, fy * sy, cx * sx, cy * sy, lens, fisheye)  # type: ignore[arg-type]

@@ -10,6 +10,7 @@ tiles.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -47,18 +48,14 @@ class TexelGrid:
         return -(-self.width // SIDE)
 
     @property
-    def num_tiles(self) -> int:
-        return self.depth * self.down * self.across
-
-    @property
     def texels(self) -> int:
         return self.depth * self.height * self.width
 
     @property
     def own_tiles(self) -> Int[Tensor, "D Y X"]:
         """Brick of each of the head's tiles."""
-        tiles = self.tiles[self.first_tile : self.first_tile + self.num_tiles]
-        return tiles.view(self.depth, self.down, self.across)
+        shape = self.depth, self.down, self.across
+        return self.tiles[self.first_tile :][: math.prod(shape)].view(shape)
 
     @property
     def rows(self) -> Int[Tensor, "D*H*W"]:
@@ -100,7 +97,7 @@ class TexelGrid:
     def holds(self, rows: Int[Tensor, "N"]) -> Bool[Tensor, "N"]:
         """Which rows belong to this head; those of the empty brick belong to none."""
         place = self.places[rows >> 6]
-        return (place >= self.first_tile) & (place < self.first_tile + self.num_tiles)
+        return (place >= self.first_tile) & (place < self.first_tile + self.own_tiles.numel())
 
     def texel(self, rows: Int[Tensor, "N"]) -> tuple[Int[Tensor, "N"], Int[Tensor, "N"], Int[Tensor, "N"]]:
         """(plane, y, x) of rows that this head ``holds``: the inverse of ``row``."""

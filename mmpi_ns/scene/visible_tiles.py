@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 
 import numpy as np
@@ -83,7 +83,7 @@ def reachable_tiles(views: TrainingViews, plan: ScenePlan, device: str | torch.d
     Returns:
         On the CPU.
     """
-    marks, count = _packed_tiles(_Key(views, plan, torch.device(device)))
+    marks, count = _packed_tiles(_Key(views.digest, plan, views, torch.device(device)))
     return torch.from_numpy(np.unpackbits(marks, count=count).view(bool))
 
 
@@ -91,15 +91,10 @@ def reachable_tiles(views: TrainingViews, plan: ScenePlan, device: str | torch.d
 class _Key:
     """What tiles in reach depend on; equal where cameras and plan are equal, on whatever device."""
 
-    views: TrainingViews
+    digest: bytes
     plan: ScenePlan
-    device: torch.device
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Key) and (self.views.digest, self.plan) == (other.views.digest, other.plan)
-
-    def __hash__(self) -> int:
-        return hash((self.views.digest, self.plan))
+    views: TrainingViews = field(compare=False)
+    device: torch.device = field(compare=False)
 
 
 @lru_cache(REMEMBERED)

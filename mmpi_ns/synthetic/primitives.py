@@ -7,11 +7,13 @@ bounding spheres touch the cone around it.
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+Arrays = TypeVar("Arrays", bound=Any)
 BOX, SPHERE, CYLINDER = 0, 1, 2
 PACKET = 4096
 """Rays tested together."""
@@ -47,15 +49,17 @@ class Primitives:
         flat = np.hypot(self.half[:, 0], np.where(self.kind == BOX, self.half[:, 1], 0.0))
         return np.where(self.kind == SPHERE, self.half[:, 0], np.hypot(flat, self.half[:, 2]))
 
-    def take(self, rows: NDArray[np.int64]) -> Primitives:
-        return Primitives(*(getattr(self, f.name)[rows] for f in fields(self)))
-
     @staticmethod
     def merged(*parts: Primitives) -> tuple[Primitives, NDArray[np.int64]]:
         """All parts as one, sorted, and the number of the part that each solid comes from. [P]"""
         every = Primitives(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Primitives)))
         order = np.argsort(every.center[:, 0], kind="stable")
-        return every.take(order), np.repeat(np.arange(len(parts)), [len(p) for p in parts])[order]
+        return take(every, order), np.repeat(np.arange(len(parts)), [len(p) for p in parts])[order]
+
+
+def take(arrays: Arrays, rows: NDArray[Any]) -> Arrays:
+    """Some rows of a dataclass of arrays."""
+    return type(arrays)(*(getattr(arrays, f.name)[rows] for f in fields(arrays)))
 
 
 def to_local(vectors: Array, yaw: Array) -> Array:

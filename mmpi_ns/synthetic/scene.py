@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mmpi_ns.synthetic.cameras import Cameras
 from mmpi_ns.synthetic.materials import MATERIALS, Surface
-from mmpi_ns.synthetic.primitives import CYLINDER, PACKET, SPHERE, Array, Primitives, Tracer, dot, to_local
+from mmpi_ns.synthetic.primitives import CYLINDER, PACKET, SPHERE, Array, Primitives, Tracer, dot, take, to_local
 from mmpi_ns.synthetic.road import Road
 from mmpi_ns.synthetic.textures import Noise
 
@@ -111,12 +111,12 @@ class Scene:
         if floor.any():
             colors[floor] = self.ground(points[floor, :2], directions[floor], distance[floor] * pixel, self.noise)
         if solid.any():
-            solids = self.primitives.take(row[solid])
+            solids = take(self.primitives, row[solid])
             surface, normals[solid] = surface_of(solids, points[solid], directions[solid], distance[solid] * pixel)
             for number, material in enumerate(MATERIALS.values()):
                 rows = solids.material == number
                 if rows.any():
-                    colors[np.flatnonzero(solid)[rows]] = material(surface.take(rows), self.noise)
+                    colors[np.flatnonzero(solid)[rows]] = material(take(surface, rows), self.noise)
             patch[solid] = 8 * row[solid] + 2 * surface.side
         light, in_sun = self._lit(points[finite], normals[finite])
         colors[finite] *= light[:, None]
