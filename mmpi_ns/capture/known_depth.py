@@ -119,14 +119,14 @@ def know_depths(
 
     Args:
         outputs: of the data parser.
-        observations: their cameras, tracks and loose points.
+        observations: cameras, tracks and loose points of the images.
         dataset: the images.
-        rays: makes rays through their pixel centres (image, row, column).
-        dense: whether to match neighbouring images.
-        sensor: whether to read depth images.
+        rays: makes rays through pixel centres (image, row, column).
+        dense: match neighbouring images.
+        sensor: read depth images.
 
     Returns:
-        The depths; None if there is neither matching, a sensor nor a cloud. The observations.
+        The depths, None if there is neither matching, a sensor nor a cloud; the observations.
 
     Raises:
         InputError: an image or depth image cannot be used (names it).
@@ -219,21 +219,17 @@ def with_sensor(
 def at_training_pixels(
     view: View, depth: Depth, original: PosedImages, i: int, shape: tuple[int, int], file_shape: tuple[int, int]
 ) -> Map:
-    """Distances of a training image's pixels from the depths of its view at working size.
+    """Inverse distances of a training image's pixels and their errors [H, W, 2] from its depths at working size.
 
     A pixel takes the mean over its area, weighted by certainty; the spread within, large at an edge, is added to its
     error. One that is smaller than a working pixel takes its depth.
 
     Args:
         view: the image at working size.
-        depth: its depths.
-        original: cameras of the originals.
-        i: the image's place in them.
+        depth: at working size.
+        original: cameras of the originals; i is the image's place in them.
         shape: height and width of the training image.
         file_shape: height and width of its file, which may have a row or column more.
-
-    Returns:
-        [H, W, 2] inverse distance and expected error.
     """
     height, width = (min(pair) for pair in zip(shape, view.gray.shape, strict=True))
     maps, distances = pooled(depth, (height, width)), np.empty((*shape, 2), np.float32)
@@ -366,15 +362,9 @@ def with_points(known: KnownDepth, observations: Observations) -> KnownDepth:
 def read_sensor(
     file: Path, unit: float, original: PosedImages, i: int, shape: tuple[int, int], file_shape: tuple[int, int]
 ) -> Map:
-    """Distances from a depth image (along the optical axis, 0 where unknown), for a training image's pixels.
+    """Inverse distances of a training image's pixels and their errors [H, W, 2] from a depth image; 0 where unknown.
 
-    Args:
-        file: 16-bit PNG or .npy.
-        unit: length of a depth of 1, scene units.
-        original: cameras of the originals.
-        i: the image's place in them.
-        shape: height and width of the training image.
-        file_shape: height and width of its file.
+    Arguments as of ``at_training_pixels``, but for the file and ``unit``, the scene units of a depth of 1.
 
     Raises:
         InputError: the file cannot be read (names it).

@@ -75,14 +75,9 @@ class SharedPoints:
     def draw(
         self, count: int, rays: Rays, g: torch.Generator, exposures: Float[Tensor, "M 3"] | None = None
     ) -> tuple[RayBundle, Float[Tensor, "R C"], Float[Tensor, "R 2"]]:
-        """Random rays from between cameras, with their colours and the inverse distances of their points with errors.
-
-        Args:
-            count: number of rays.
-            rays: makes rays through pixel centres (image, row, column).
-            g: generator for the points and the positions between the cameras.
-            exposures: of all training images; colours are divided by them. None: they are equal.
-        """
+        """Random rays from between cameras, their colours, and inverse distances of their points with errors. ``rays``
+        makes rays through pixel centres (image, row, column); colours are divided by the exposures of all images, if
+        they differ."""
         device = self.pixels.device
         chosen = torch.randint(len(self.pixels), (count,), generator=g, device=g.device).to(device)
         share = torch.rand(count, 1, generator=g, device=g.device).to(device)
@@ -149,10 +144,10 @@ def find_shared_points(
         posed: their cameras.
         known: depths of their pixels.
         rays: makes rays through pixel centres (image, row, column).
-        images: the images to compare.
+        images: numbers of the images to compare.
         seed: of the choice among more than ``MOST`` pixels.
         device: of the result.
-        exposures: of all training images, by which colours are divided to compare them; None: they are equal.
+        exposures: of all training images, by which colours are divided; None: they are equal.
 
     Raises:
         InputError: an image or mask cannot be used (names the file).

@@ -54,8 +54,8 @@ def observe(
         outputs: data parser outputs of the training images.
         dataset: the training images.
         sfm: folder of a COLMAP model, which need not exist.
-        find_points: whether to find points in the images if there are no tracks. Reads the images.
-        triangulates: whether to match features for this before a plane sweep.
+        find_points: search the images for points if there are no tracks.
+        triangulates: match features for this before a plane sweep.
 
     Raises:
         InputError: poses or intrinsics that cannot be used.
@@ -111,12 +111,8 @@ def _find_points(observations: Observations, dataset: MMPIDataset, triangulates:
 
 
 def tell_poses(off: float, image: Path) -> None:
-    """Reports inaccurate poses, with the command that refines them.
-
-    Args:
-        off: median distance of matches or keypoints from their positions predicted by the poses, training pixels.
-        image: one of the training images.
-    """
+    """Reports poses that are off by this median distance of matches from where they predict them, in training pixels,
+    with the command that refines them."""
     if not off > POSES_OFF:  # or not a number, as nothing matched
         return
     folder = image.parent
@@ -205,13 +201,8 @@ def posed_images(observations: Observations, dataset: MMPIDataset) -> PosedImage
 
 
 def with_tracks(observations: Observations, model: SfmModel, names: Sequence[str] | None = None) -> Observations:
-    """The observations with the points of a model.
-
-    Args:
-        observations: the cameras.
-        model: tracks in their frame.
-        names: of the training images in the model; None for their indices.
-    """
+    """The observations with the points of a model in their frame; images are known in the model by ``names``, or by
+    their indices."""
     names = [str(i) for i in range(len(observations.centers))] if names is None else names
     seen_by, seen_point, relative = model.keypoints_of(names)
     seen_at = relative * observations.sizes[seen_by]

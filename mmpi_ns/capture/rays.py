@@ -43,11 +43,8 @@ class PinholeRays:
 
     @staticmethod
     def of(cameras: Cameras, device: torch.device | str) -> PinholeRays | None:
-        """Rays of perspective and fisheye cameras, ``LensRays`` if any has a lens.
-
-        None if a camera has another type or a time, or if lenses differ so much that their directions need too much
-        memory.
-        """
+        """Rays of perspective and fisheye cameras, ``LensRays`` if any has a lens. None if a camera has another type or
+        a time, or if the directions of different lenses need too much memory."""
         kinds = cameras.camera_type.reshape(-1)
         is_fisheye = kinds == CameraType.FISHEYE.value
         if cameras.times is not None or not bool((is_fisheye | (kinds == CameraType.PERSPECTIVE.value)).all()):
@@ -70,11 +67,7 @@ class PinholeRays:
         return LensRays(*vars(pinholes).values(), *(x.to(device) for x in lenses))
 
     def __call__(self, ray_indices: Int[Tensor, "R 3"]) -> RayBundle:
-        """Rays through pixel centres. Pixel areas, which this package does not use, are 1.
-
-        Args:
-            ray_indices: camera, row and column of each.
-        """
+        """Rays through pixel centres (camera, row, column). Pixel areas, which this package does not use, are 1."""
         camera = ray_indices[:, 0]
         poses = self.poses[camera]
         directions = torch.nn.functional.normalize(rotate(poses[:, :, :3], self.local(ray_indices)), dim=-1)
@@ -118,11 +111,8 @@ class LensRays(PinholeRays):
 
 @lru_cache(maxsize=2)
 def pixel_directions(camera: tuple[float, ...]) -> Float[Tensor, "P 3"]:
-    """Unit directions of all pixel centres of a camera, in its axes, row after row; nerfstudio's own.
-
-    Args:
-        camera: fx, fy, cx, cy, width, height, camera type, and nerfstudio's distortion parameters.
-    """
+    """Unit directions of all pixel centres of a camera, in its axes, row after row; nerfstudio's own. A camera is fx,
+    fy, cx, cy, width, height, type, and nerfstudio's distortion parameters."""
     fx, fy, cx, cy = camera[:4]
     width, height, kind = (int(n) for n in camera[4:7])
     lens = torch.tensor([camera[7:]])
