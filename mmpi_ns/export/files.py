@@ -74,14 +74,8 @@ class BakedScene:
 
 
 def write_baked(scene: BakedScene, folder: Path) -> int:
-    """Writes a scene into a folder, the header last, so that a scene with a header is complete.
-
-    Returns:
-        Bytes that were written.
-
-    Raises:
-        OSError: the disk is full or cannot be written.
-    """
+    """Writes a scene into a folder, the header last, so that a scene with a header is complete; returns the bytes
+    written. Raises OSError if the disk is full or cannot be written."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / HEADER).unlink(missing_ok=True)
     rows, total = [], 0
@@ -151,11 +145,8 @@ def _pack(window: BakedWindow) -> tuple[bytes, dict[str, Any]]:
 
 
 def _gzip(data: bytes) -> bytes:
-    """A gzip file. Its blocks are compressed on all threads; their number does not change a byte.
-
-    Each block ends at a full byte and begins with what precedes it as its dictionary, so the blocks together are one
-    stream (the way of pigz).
-    """
+    """A gzip file, compressed in blocks on all threads; their number does not change a byte. Each block ends at a full
+    byte and has what precedes it as its dictionary, so the blocks together are one stream (as of pigz)."""
 
     def compress(start: int) -> bytes:
         before, ends = data[max(0, start - (1 << 15)) : start], start + BLOCK >= len(data)
@@ -190,11 +181,8 @@ def _sums(stored: NDArray[np.uint8], beside: Int[Tensor, "2 B"]) -> UInt8[Tensor
 
 
 def read_baked(folder: Path) -> BakedScene:
-    """Reads what ``write_baked`` wrote.
-
-    Raises:
-        ValueError: it is missing, damaged or of another version (says which, and what to do).
-    """
+    """Reads what ``write_baked`` wrote. Raises ValueError if it is missing, damaged or of another version (says what to
+    do)."""
     header = read_header(folder)
     try:
         windows = [_read_window(folder, row) for row in header["windows"]]

@@ -109,12 +109,8 @@ class Observations:
         return depths
 
     def directions(self, camera: int, shares: Array) -> Array:
-        """Directions [N, 3], in camera axes and of depth 1, through places [N, 2] of an image.
-
-        Args:
-            camera: number of the camera.
-            shares: x and y as shares of the image's sides; a little beyond the borders will do.
-        """
+        """Directions [N, 3], in camera axes and of depth 1, through places [N, 2] of an image: x and y as shares of its
+        sides, a little beyond the borders too."""
         if self.lens is None:
             (fx, fy, cx, cy), (w, h) = self.intrinsics[camera], self.sizes[camera]
             x, y = (shares[:, 0] * w - cx) / fx, (shares[:, 1] * h - cy) / fy
@@ -139,17 +135,10 @@ class Observations:
 
 
 def frustum_points(observations: Observations, near: Array, per_camera: int = 24) -> Array:
-    """Points filling the camera frusta, uniform in pixels and in disparity; the last of each camera far away.
+    """Points [M * per_camera, 3] that fill the camera frusta from depths ``near`` [M] on, camera after camera, uniform
+    in pixels and in disparity; the last of each camera far away.
 
     Deterministic (a low-discrepancy sequence), so equal scenes give equal points.
-
-    Args:
-        observations: the cameras.
-        near: [M] depth at which each camera's points start.
-        per_camera: points of each camera.
-
-    Returns:
-        [M * per_camera, 3] camera after camera.
     """
     index = np.arange(per_camera)
     uvw = np.stack([(index * g) % 1.0 for g in (0.7548776662, 0.5698402910, 0.8191725134)], -1)

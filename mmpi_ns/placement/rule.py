@@ -73,10 +73,10 @@ class PlacementConfig:
 
 
 def place(observations: Observations, config: PlacementConfig, training_rays: int | None = None) -> ScenePlan:
-    """The scene plan for some training cameras and points.
+    """The scene plan for some training cameras and what they saw.
 
     Args:
-        observations: training cameras and what they saw.
+        observations: training cameras and points.
         config: the rule's settings.
         training_rays: pixel rays of the whole training, if known: texels are no finer than these can train.
 

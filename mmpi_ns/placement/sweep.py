@@ -33,15 +33,13 @@ class _View(NamedTuple):
 
 
 def add_swept_points(observations: Observations, images: list[Array], num_references: int = 16) -> Observations:
-    """The observations with points found by a plane sweep, each seen by its reference view.
+    """The observations with points found by a plane sweep, each seen by its reference view and every near one it falls
+    on.
 
     Args:
         observations: cameras; points that they already have, with or without keypoints, stay first.
         images: gray images [h, w] in [0, 1] of all cameras, about 128 pixels a side.
         num_references: views to sweep, evenly spread over the capture.
-
-    Returns:
-        The observations with points; each counts as seen by every camera near its reference whose image it falls on.
     """
     count, poses, pinholes = len(images), observations.camera_to_worlds, observations.intrinsics
     references = np.unique(np.linspace(0, count - 1, min(num_references, count)).round().astype(int))

@@ -45,8 +45,8 @@ class VisiblePoints:
 def find_visible_points(observations: Observations) -> VisiblePoints:
     """The observations that placement weighs: keypoints, and points that fill the cameras' frusta.
 
-    Keypoints that are not finite or lie behind their camera are left out. Without any the nearest point is taken to
-    lie at a tenth of the cameras' spread.
+    Keypoints that are not finite or lie behind their camera are left out. Without any the nearest point is taken to lie
+    at a tenth of the cameras' spread.
 
     Raises:
         InputError: there are keypoints, and none of them can be used.
@@ -111,14 +111,10 @@ def pixels_per_pixel(observations: Observations, visible: VisiblePoints) -> floa
 
 
 def farthest_first(places: Array, count: int | None = None, radius: float = 0.0) -> list[int]:
-    """Places far apart, each the farthest from the previous ones (farthest-point traversal, Gonzalez 1985).
+    """Places [M, D] far apart, each the farthest from the previous ones (farthest-point traversal, Gonzalez 1985).
 
-    Starts at the place farthest from the middle, so the numbering does not matter.
-
-    Args:
-        places: [M, D]
-        count: number of places; None: as many as it takes until balls of ``radius`` around them contain all.
-        radius: of the balls.
+    Starts at the place farthest from the middle, so the numbering does not matter. Without ``count``, as many as it
+    takes until balls of ``radius`` around them contain all.
     """
     chosen = [int(np.linalg.norm(places - places.mean(0), axis=-1).argmax())]
     distance = np.linalg.norm(places - places[chosen[0]], axis=-1)

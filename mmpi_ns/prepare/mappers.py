@@ -58,10 +58,8 @@ def _judged(mapper: str, model: pycolmap.Reconstruction, says: str, task: Task) 
 def map_and_judge(task: Task) -> Solution:
     """Runs the global mapper, then the incremental one from the focal length that fits, and chooses by the evidence.
 
-    The chosen model is given all points and adjusted (``polish``), unless that makes the evidence worse.
-
-    Raises:
-        PrepareError: neither mapper makes a model.
+    The chosen model is given all points and adjusted (``polish``), unless that makes the evidence worse. Raises
+    PrepareError if neither mapper makes a model.
     """
     chosen, *others = _best_first(_candidates(task), task)
     with progress("Adding points", 1) as advance:
@@ -114,12 +112,9 @@ def _candidates(task: Task) -> list[Candidate]:
 
 
 def _starts(task: Task) -> list[tuple[str, Path]]:
-    """Databases for the global mapper, by name: unchanged if the focal length is known, else one for each guess.
-
-    The first guess comes from the fundamental matrices of the pairs, if they determine it (in a straight drive they
-    do not): the focal lengths for which they become essential matrices. The others are fixed multiples of the image
-    side.
-    """
+    """Databases for the global mapper, by name: unchanged if the focal length is known, else one for each guess. The
+    first guess is the focal length for which the fundamental matrices of the pairs become essential ones, if they
+    determine it (in a straight drive they do not). The others are fixed multiples of the image side."""
     database, work = task.database, task.work
     with pycolmap.Database.open(database) as opened:
         unknown = [c for c in opened.read_all_cameras() if not c.has_prior_focal_length]

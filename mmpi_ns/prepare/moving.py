@@ -35,14 +35,14 @@ def write_masks(
     Args:
         model: poses, cameras and points.
         photos: all that get a mask, ``target/NAME.png``: white is used. Those of test images are white.
-        train: names of the training images, which alone are compared with each other.
+        train: names of the training images, which alone are compared.
         images: folder of the images.
         target: folder for the masks.
         picture: file for the picture.
         threads: processor threads; below 1 for all.
 
     Returns:
-        The share of each image that is masked, of those in which something moves, by name.
+        The share that is masked of each image in which something moves, by name.
     """
     if threads > 0:
         torch.set_num_threads(threads)

@@ -333,11 +333,8 @@ class Preparation:
 
 
 def prepare(settings: Settings) -> Verdict:
-    """Makes the scene; returns how far it can be believed.
-
-    Raises:
-        PrepareError: the input is missing, cannot be made into a scene, or something would be lost in its folder.
-    """
+    """Makes the scene; returns how far it can be believed. Raises PrepareError if the input is missing or cannot be
+    made into a scene, or something would be lost in its folder."""
     load_pycolmap()  # in a version that is new enough
     check_options(settings)
     source, scene = settings.input.resolve(), settings.scene.resolve()

@@ -36,17 +36,8 @@ def write_report(
     note: str,
     scene: Path,
 ) -> None:
-    """Writes report.md and report/track.png.
-
-    Args:
-        model: in the frame of the scene.
-        title: of the report.
-        rows: what the table says beyond the model's figures, by their names.
-        findings: of the checks; listed as warnings and marked in the drawing.
-        warnings: further ones, listed first.
-        note: the last line.
-        scene: folder to write to.
-    """
+    """Writes report.md and report/track.png: ``rows`` beside the model's figures in the table, the further ``warnings``
+    before the findings of the checks, and a note at the end."""
     covered = coverage(model)
     rows = rows | {
         "reprojection error": f"{model.compute_mean_reprojection_error():.3f} px",

@@ -31,16 +31,11 @@ CHANGED = 1 / 255
 
 
 def movers_at(seed: int, road: Road, count: int, along: Array, walks: bool, camera: int) -> Primitives:
-    """Cars and people when an image is taken: in turns oncoming, ahead of the camera, crossing, on the pavement, and
-    overtaking.
+    """Cars and people when image ``camera`` is taken: oncoming, ahead, crossing, on the pavement, and overtaking, in
+    turns.
 
-    Args:
-        seed: of their places and looks.
-        road: along which they move.
-        count: of cars and people.
-        along: metres along the road of each camera. [M]
-        walks: whether the cameras walk; else they drive.
-        camera: number of the image.
+    They move along a road, as do the cameras, which walk or drive and are ``along`` it, metres [M]. ``seed`` is of
+    their places and looks.
     """
     speed, rows = WALKING if walks else DRIVING, []
     seconds = (along - along[0]) / speed
@@ -81,11 +76,7 @@ def _add_person(kit: Street, along: float, aside: float, paint, now: float) -> N
 
 
 def with_movers(scene: Scene, count: int) -> Scene:
-    """The scene with ``count`` movers in its training images.
-
-    Raises:
-        ValueError: the scene has no road.
-    """
+    """The scene with ``count`` movers in its training images. Raises ValueError if it has no road."""
     if scene.road is None:
         raise ValueError(f"Nothing moves in the scene {scene.name}: choose street, long-road or walk.")
     along = scene.road.locate(scene.cameras.camera_to_worlds[:, :2, 3])[0]
@@ -93,13 +84,8 @@ def with_movers(scene: Scene, count: int) -> Scene:
 
 
 def moving_mask(scene: Scene, camera: int, supersample: int = 3) -> NDArray[np.uint8]:
-    """Where an image [H, W] shows a mover or its shadow; zeros elsewhere.
-
-    Args:
-        scene: with movers.
-        camera: number of the image.
-        supersample: rays along each side of a pixel, of which one that meets a mover is enough.
-    """
+    """Where an image [H, W] shows a mover or its shadow; zeros elsewhere. Of ``supersample`` rays along each side of a
+    pixel one that meets a mover is enough."""
     cameras, filmed = scene.cameras, scene.filmed_by(camera)
     mask = np.zeros(cameras.height * cameras.width, np.uint8)
     if filmed.movers is None or scene.movers is None:
