@@ -189,7 +189,8 @@ def _compare(
         x, y, ahead = other.parallax.pixels(inverse)
         height, width = other.shot.view.gray.shape
         inside = (x > 1) & (x < width - 1) & (y > 1) & (y < height - 1) & (ahead > 0)
-        inside &= look_up(usable(other.shot, mask), x, y, nearest=True) > 0
+        still = other.shot.view.inside if mask is None else other.shot.view.inside & ~mask
+        inside &= look_up(np.ascontiguousarray(still, np.uint8), x, y, nearest=True) > 0
         there = look_up(other.color, x, y)
         low, high = cv2.erode(there, kernel), cv2.dilate(there, kernel)
         apart = most_of_channels(cv2.max(cv2.subtract(low, three), cv2.subtract(three, high)))
@@ -212,12 +213,6 @@ def most_of_channels(apart: NDArray[Any]) -> Bytes:
     """The largest of three channels; NumPy takes three times as long. [h, w]"""
     blue, green, red = cv2.split(apart)
     return np.asarray(cv2.max(cv2.max(blue, green), red), np.uint8)
-
-
-def usable(shot: Shot, mask: Mask | None) -> Bytes:
-    """Where the lens shows something that is not known to move. [h, w]"""
-    inside = shot.view.inside if mask is None else shot.view.inside & ~mask
-    return np.ascontiguousarray(inside, np.uint8)
 
 
 def has_impossible_depth(shot: Shot, others: Sequence[Neighbour]) -> Mask:

@@ -78,13 +78,7 @@ def write_baked(scene: BakedScene, folder: Path) -> int:
     written. Raises OSError if the disk is full or cannot be written."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / HEADER).unlink(missing_ok=True)
-    rows, total = [], 0
-    for i, (place, window) in enumerate(scene.windows):
-        blob, arrays = _pack(window)
-        name = f"window-{i:05d}.bin"
-        write_atomically(folder / name, lambda path, blob=blob: path.write_bytes(blob))
-        rows.append({"file": name, "bytes": len(blob), **_describe(place, window), "arrays": arrays})
-        total += len(blob)
+    rows = [_write_window(folder / f"window-{i:05d}.bin", *window) for i, window in enumerate(scene.windows)]
     header = {
         "format": FORMAT,
         "version": VERSION,
@@ -95,15 +89,31 @@ def write_baked(scene: BakedScene, folder: Path) -> int:
     }
     text = json.dumps(header, allow_nan=False)
     write_atomically(folder / HEADER, lambda path: path.write_text(text, encoding="utf-8"))
-    return total + len(text)
+    return sum(row["bytes"] for row in rows) + len(text)
 
 
-def _describe(place: Window, window: BakedWindow) -> dict[str, Any]:
-    """Header of a window, without its arrays."""
+def _write_window(file: Path, place: Window, window: BakedWindow) -> dict[str, Any]:
+    """Writes a window's arrays one after the other, each compressed; returns the window's part of the header."""
     mpis, shader = window.mpis, window.shader
+    beside = neighbours(mpis.columns, mpis.mpis, mpis.num_bricks)
+    network = [x.detach().half().reshape(-1) for layer in shader.layers for x in layer]
+    arrays = {
+        "columns": mpis.columns.numpy().view(np.uint32),
+        "density": _differences(mpis.density, beside),
+        "texels": np.stack(list(in_order(lambda channel: _differences(channel, beside), mpis.texels.unbind(-1)))),
+        "network": torch.cat(network).numpy() if network else np.zeros(0, np.float16),
+    }
+    blob, places = b"", {}
+    for name, array in arrays.items():
+        data = _gzip(np.ascontiguousarray(array).tobytes())
+        places[name] = {"type": str(array.dtype), "shape": array.shape, "offset": len(blob), "bytes": len(data)}
+        blob += data
+    write_atomically(file, lambda path: path.write_bytes(blob))
     plan = json.loads(place.plan.to_json())
     extra = [{"interval": interval, "first_column": mpis.first_column(k)} for k, interval in enumerate(mpis.intervals)]
     return {
+        "file": file.name,
+        "bytes": len(blob),
         "center": place.center,
         "radius": None if math.isinf(place.radius) else place.radius,
         "margin": place.margin,
@@ -122,26 +132,8 @@ def _describe(place: Window, window: BakedWindow) -> dict[str, Any]:
             "layers": [list(weights.shape) for weights, _ in shader.layers],
             "bound": shader.bound,
         },
+        "arrays": places,
     }
-
-
-def _pack(window: BakedWindow) -> tuple[bytes, dict[str, Any]]:
-    """A window's arrays one after the other, each compressed, and the position of each."""
-    mpis = window.mpis
-    beside = neighbours(mpis.columns, mpis.mpis, mpis.num_bricks)
-    network = [x.detach().half().reshape(-1) for layer in window.shader.layers for x in layer]
-    arrays = {
-        "columns": mpis.columns.numpy().view(np.uint32),
-        "density": _differences(mpis.density, beside),
-        "texels": np.stack(list(in_order(lambda channel: _differences(channel, beside), mpis.texels.unbind(-1)))),
-        "network": torch.cat(network).numpy() if network else np.zeros(0, np.float16),
-    }
-    blob, rows = b"", {}
-    for name, array in arrays.items():
-        data = _gzip(np.ascontiguousarray(array).tobytes())
-        rows[name] = {"type": str(array.dtype), "shape": array.shape, "offset": len(blob), "bytes": len(data)}
-        blob += data
-    return blob, rows
 
 
 def _gzip(data: bytes) -> bytes:

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from mmpi_ns.capture.exif import light_of
 from mmpi_ns.prepare.alignment import camera_poses
@@ -74,7 +73,16 @@ def _draw_track(model: pycolmap.Reconstruction, findings: Sequence[Finding], pat
     """Cameras and points from above."""
     path.parent.mkdir(exist_ok=True)
     names, poses = camera_poses(model)
-    axes = horizontal_axes(poses)
+    # Two axes across the cameras' mean up, whatever frame the scene is in; its own where one of them is about vertical.
+    up = -poses[:, :3, 1].mean(0)
+    up /= max(float(np.linalg.norm(up)), 1e-12)
+    vertical = np.argmax(np.abs(up))
+    if abs(up[vertical]) > 0.9:
+        pair = np.eye(3)[[i for i in range(3) if i != vertical]]
+        axes = (pair[::-1] if np.dot(np.cross(*pair), up) < 0 else pair).T
+    else:
+        right = np.linalg.svd(np.eye(3) - np.outer(up, up))[0][:, 0]
+        axes = np.stack([right, np.cross(up, right)], -1)
     centers, facing = poses[:, :3, 3] @ axes, poses[:, :3, 2] @ axes
     points = np.array([p.xyz for p in model.points3D.values()]).reshape(-1, 3) @ axes
     reach = 0.6 * max(float(np.ptp(centers, axis=0).max()), 1e-9)
@@ -89,18 +97,3 @@ def _draw_track(model: pycolmap.Reconstruction, findings: Sequence[Finding], pat
     plot.annotate(names[0], centers[0])
     plot.annotate(names[-1], centers[-1])
     figure.savefig(path, dpi=110)
-
-
-def horizontal_axes(poses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Two axes across the cameras' mean up, whatever frame the scene is in. [3, 2]"""
-    up = -poses[:, :3, 1].mean(0)
-    up /= max(float(np.linalg.norm(up)), 1e-12)
-    nearest = np.argmax(np.abs(up))
-    if abs(up[nearest]) > 0.9:  # keep the scene's own axes where one of them is about vertical
-        kept = [i for i in range(3) if i != nearest]
-        axes = np.eye(3)[kept]
-        if np.dot(np.cross(*axes), up) < 0:
-            axes = axes[::-1]
-        return axes.T
-    right = np.linalg.svd(np.eye(3) - np.outer(up, up))[0][:, 0]
-    return np.stack([right, np.cross(up, right)], -1)
