@@ -17,6 +17,8 @@ SQUEEZED = 1.3
 """Such a lens sees farther than a pinhole of its focal length would, by this factor in tangents."""
 BEYOND_LENS = 0.05
 """Cosines by which a keypoint may lie beyond the borders of its lens."""
+FILLING = 24
+"""Points that fill the frustum of a camera."""
 
 
 @dataclass(frozen=True)
@@ -134,13 +136,13 @@ class Observations:
         return np.stack([fx * local[:, 0] / depth + cx, cy - fy * local[:, 1] / depth], -1), ahead
 
 
-def frustum_points(observations: Observations, near: Array, per_camera: int = 24) -> Array:
-    """Points [M * per_camera, 3] that fill the camera frusta from depths ``near`` [M] on, camera after camera, uniform
-    in pixels and in disparity; the last of each camera far away.
+def frustum_points(observations: Observations, near: Array) -> Array:
+    """Points [M * FILLING, 3] that fill the camera frusta from depths ``near`` [M] on, camera after camera, uniform in
+    pixels and in disparity; the last of each camera far away.
 
     Deterministic (a low-discrepancy sequence), so equal scenes give equal points.
     """
-    index = np.arange(per_camera)
+    index = np.arange(FILLING)
     uvw = np.stack([(index * g) % 1.0 for g in (0.7548776662, 0.5698402910, 0.8191725134)], -1)
     clouds = []
     for i, (pose, start) in enumerate(zip(observations.camera_to_worlds, near, strict=True)):

@@ -16,6 +16,8 @@ from scipy.ndimage import map_coordinates, uniform_filter
 from mmpi_ns.placement.observations import Array, Observations
 from mmpi_ns.scene.near_views import nearest_views
 
+REFERENCES = 16
+"""Views that are swept, evenly spread over the capture."""
 HYPOTHESES = 64
 WINDOW = 7
 MAX_ANGLE = 30.0
@@ -32,17 +34,12 @@ class _View(NamedTuple):
     intrinsics: Array
 
 
-def add_swept_points(observations: Observations, images: list[Array], num_references: int = 16) -> Observations:
+def add_swept_points(observations: Observations, images: list[Array]) -> Observations:
     """The observations with points found by a plane sweep, each seen by its reference view and every near one it falls
-    on.
-
-    Args:
-        observations: cameras; points that they already have, with or without keypoints, stay first.
-        images: gray images [h, w] in [0, 1] of all cameras, about 128 pixels a side.
-        num_references: views to sweep, evenly spread over the capture.
-    """
+    on. Earlier points, with or without keypoints, stay first. Images of all cameras are gray [h, w], in [0, 1], about
+    128 pixels a side."""
     count, poses, pinholes = len(images), observations.camera_to_worlds, observations.intrinsics
-    references = np.unique(np.linspace(0, count - 1, min(num_references, count)).round().astype(int))
+    references = np.unique(np.linspace(0, count - 1, min(REFERENCES, count)).round().astype(int))
     scales = [image.shape[1] / width for image, width in zip(images, observations.sizes[:, 0], strict=True)]
     views = [_View(image, poses[i], pinholes[i] * scales[i]) for i, image in enumerate(images)]
     points, cameras, indices = [observations.points], [observations.seen_by], [observations.seen_point]

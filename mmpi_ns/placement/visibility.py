@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mmpi_ns.placement.observations import Array, Observations, frustum_points
+from mmpi_ns.placement.observations import FILLING, Array, Observations, frustum_points
 from mmpi_ns.utils.errors import InputError
 
 SAMPLED, SAMPLED_PER_CAMERA = 6000, 16
@@ -76,11 +76,10 @@ def find_visible_points(observations: Observations) -> VisiblePoints:
     seen = np.bincount(cameras, minlength=len(centers))
     share = (1 - FRUSTUM_SHARE) * seen / (seen + FEW)
     filling = frustum_points(observations, nearest)
-    each = len(filling) // len(centers)
     return VisiblePoints(
-        cameras=np.concatenate([cameras, np.repeat(np.arange(len(centers)), each)]),
+        cameras=np.concatenate([cameras, np.repeat(np.arange(len(centers)), FILLING)]),
         points=np.concatenate([points, filling]),
-        weights=np.concatenate([(share / np.maximum(seen, 1))[cameras], np.repeat((1 - share) / each, each)]),
+        weights=np.concatenate([(share / np.maximum(seen, 1))[cameras], np.repeat((1 - share) / FILLING, FILLING)]),
         nearest=nearest,
         typical=typical,
         near=near,

@@ -87,7 +87,7 @@ def up_from_cameras(poses: Array) -> Array:
     return level if turns_enough and level @ mean > 0.5 else mean
 
 
-def fit_ground(points: Array, centers: Array, up: Array, seed: int = 0) -> tuple[Array, float]:
+def fit_ground(points: Array, centers: Array, up: Array) -> tuple[Array, float]:
     """The plane that the cameras stand over: the most populous among roughly level ones, by RANSAC.
 
     Args:
@@ -113,7 +113,7 @@ def fit_ground(points: Array, centers: Array, up: Array, seed: int = 0) -> tuple
             f"--camera-height: only {len(below)} points lie below the cameras: too few to find the ground."
         )
     tolerance = 0.04 * abs(float(np.median(-((below - np.median(centers, axis=0)) @ up))))
-    rng, inside = np.random.default_rng(seed), np.zeros(len(below), dtype=bool)
+    rng, inside = np.random.default_rng(0), np.zeros(len(below), dtype=bool)
     for _ in range(TRIALS):
         a, b, c = below[rng.choice(len(below), 3, replace=False)]
         normal = np.cross(b - a, c - a)

@@ -83,9 +83,8 @@ def with_movers(scene: Scene, count: int) -> Scene:
     return replace(scene, movers=partial(movers_at, scene.seed, scene.road, count, along, scene.name == "walk"))
 
 
-def moving_mask(scene: Scene, camera: int, supersample: int = 3) -> NDArray[np.uint8]:
-    """Where an image [H, W] shows a mover or its shadow; zeros elsewhere. Of ``supersample`` rays along each side of a
-    pixel one that meets a mover is enough."""
+def moving_mask(scene: Scene, camera: int) -> NDArray[np.uint8]:
+    """Where an image [H, W] shows a mover, if only by one of 3 x 3 rays of a pixel, or its shadow; zeros elsewhere."""
     cameras, filmed = scene.cameras, scene.filmed_by(camera)
     mask = np.zeros(cameras.height * cameras.width, np.uint8)
     if filmed.movers is None or scene.movers is None:
@@ -102,7 +101,7 @@ def moving_mask(scene: Scene, camera: int, supersample: int = 3) -> NDArray[np.u
     rays, pixel = (origins[dark], directions[dark]), 1 / cameras.focal
     change = np.abs(scene.trace(*rays, pixel)[1] - filmed.trace(*rays, pixel)[1]).max(-1, initial=0)
     mask[order[dark[change > CHANGED]]] = SHADOW
-    inner = (np.arange(supersample) + 0.5) / supersample - 0.5
+    inner = (np.arange(3) + 0.5) / 3 - 0.5
     for shift in np.stack(np.meshgrid(inner, inner), -1).reshape(-1, 2):
         origins, directions = cameras.rays(camera, cameras.pixel_centers[order] + shift)
         near = np.flatnonzero(np.isfinite(movers(origins, directions)[0]))
