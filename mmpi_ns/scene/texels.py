@@ -76,15 +76,14 @@ class TexelGrid:
         x, fx = _cell(uv[:, 0], self.width)
         y, fy = _cell(uv[:, 1], self.height)
         gx, gy = 1 - fx, 1 - fy
-        return self._corners(plane, y, x), torch.stack([gx * gy, fx * gy, gx * fy, fx * fy], -1)
+        rows = torch.stack([self.row(plane, y + dy, x + dx) for dy in (0, 1) for dx in (0, 1)], -1)
+        return rows, torch.stack([gx * gy, fx * gy, gx * fy, fx * fy], -1)
 
     def trilinear(self, ndc: Float[Tensor, "N 3"]) -> tuple[Int[Tensor, "N 8"], Float[Tensor, "N 8"]]:
         """Rows and weights at NDC (u, v, s) in [-1, 1]^3, s running over planes (or z layers)."""
         z, fz = _cell(ndc[:, 2], self.depth)
-        rows, weights = self.bilinear(z, ndc)
-        x, y = _cell(ndc[:, 0], self.width)[0], _cell(ndc[:, 1], self.height)[0]
-        rows = torch.cat([rows, self._corners(z + 1, y, x)], -1)
-        return rows, torch.cat([weights * (1 - fz)[:, None], weights * fz[:, None]], -1)
+        (near, weights), (far, _) = self.bilinear(z, ndc), self.bilinear(z + 1, ndc)
+        return torch.cat([near, far], -1), torch.cat([weights * (1 - fz)[:, None], weights * fz[:, None]], -1)
 
     def nearest(self, ndc: Float[Tensor, "N 3"]) -> Int[Tensor, "N"]:
         """Row of the texel nearest to NDC (u, v, s)."""
@@ -120,9 +119,6 @@ class TexelGrid:
             beside_rows.append(torch.where(inside, other, rows))
             exists.append(inside)
         return torch.stack(beside_rows, -1), torch.stack(exists, -1).to(torch.float32)
-
-    def _corners(self, z: Tensor, y: Tensor, x: Tensor) -> Tensor:
-        return torch.stack([self.row(z, y + dy, x + dx) for dy in (0, 1) for dx in (0, 1)], -1)
 
 
 def _cell(coordinate: Float[Tensor, "N"], size: int) -> tuple[Int[Tensor, "N"], Float[Tensor, "N"]]:
