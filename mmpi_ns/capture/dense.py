@@ -317,7 +317,7 @@ class _Pipeline(Generic[T]):
         return self.finish(i, view, confirmed(view, depth, others))
 
     def tasks(self, pool: ThreadPoolExecutor) -> Iterator[tuple[Future[Any], int | None]]:
-        """Each after those that it waits for, so that no thread waits for ever; an image's last one with its number."""
+        """In an order in which no thread waits for a later task; an image's last one comes with its number."""
         first = 0
         for i, neighbours in enumerate(self.near):
             for j in (i, *neighbours):

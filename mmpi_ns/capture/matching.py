@@ -88,7 +88,7 @@ def count_features(database: Path) -> list[int | None]:
 def match_pairs(
     database: Path, pairs: Iterable[tuple[str, str]], threads: int = -1, guided: bool = False, least: int = MIN_INLIERS
 ) -> None:
-    """Matches and verifies pairs of images, by name, in a database of their features; those that it has are skipped.
+    """Matches and verifies pairs of images, by name, in a database of their features, unless it has their matches.
 
     ``guided`` matches a pair again along the epipolar lines of its first matches; ``least`` is the minimum of inliers.
     """

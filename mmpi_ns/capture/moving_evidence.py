@@ -1,10 +1,9 @@
 """Evidence that a pixel shows something that moves, from neighbouring images, their depths and the ground.
 
 A static point looks alike in all images that see it. So each pixel is compared with its neighbours at every inverse
-depth that a static point there may have: that of the pixel or of what is next to it, those that the neighbours' depths
-put there, the ground's, and infinity. What none of them explains is unexplained; it moves if two neighbours agree about
-something else behind it, or if it is explained by a depth that is impossible: below the ground or behind the camera, as
-of a car ahead that keeps its distance.
+depth that a static point there may have: its own or that of a pixel beside it, the depths of the neighbours, the
+ground's, and infinity. A pixel that none of them explains moves if two neighbours agree about something else behind it,
+or if an impossible depth explains it: below the ground or behind the camera, as of a car ahead that keeps its distance.
 """
 
 from __future__ import annotations
@@ -39,8 +38,7 @@ STEEP = 20.0
 GROUND_SHARE, BELOW_SHARE = 0.08, 0.03
 """Share of the known depths that lie on the ground, at least, and below it, at most."""
 OCCLUDES, NEAR = 1.15, 13
-"""A neighbour shows a point if its inverse depth there is the same but for this factor; depths are asked for in a
-window of so many pixels."""
+"""A neighbour shows a point if its inverse depth in a window of this many pixels is the same but for this factor."""
 NEAREST = 95
 """Percentile of an image's inverse depths that stands for the nearest content."""
 CONSTANT = 3

@@ -52,7 +52,7 @@ CERTAIN, SAME_DISTANCE = 0.03, 0.03
 SAMPLES, FEWEST = 4000, 30
 """Pixels of an image that are looked up in another one, and the fewest matches that count."""
 GROUPS, GROUP = 6, 40
-"""Matches of a pair are summarised by medians of at most so many groups by radius, each of at least so many matches."""
+"""Most groups by radius whose medians summarise the matches of a pair, and least matches of a group."""
 LEAST_ERROR = 0.01
 """Error of a median that the surroundings cause: reflections, blur. Log ratio."""
 TONE, TONE_ERROR, EXIF_ERROR = 0.5, 0.25, 0.1

@@ -132,7 +132,7 @@ class PixelPool:
 
 
 def _pixels_of(dataset: MMPIDataset, i: int, share: float, seed: int) -> tuple[UInt8[Tensor, "N C"], Int[Tensor, "n"]]:
-    """The pixels of an image, and the indices to keep: a fraction of those that no mask hides."""
+    """The pixels of an image, and the indices to keep: a share of the pixels outside the mask."""
     data = dataset.get_data(i, image_type="uint8")
     image = data["image"].reshape(-1, data["image"].shape[-1])
     kept = torch.arange(len(image))
@@ -210,7 +210,7 @@ class RaySources:
         )
 
     def counts(self, pixel_rays: int) -> tuple[int, int, int]:
-        """Rays of pixels, new views and keypoints in a step of so many pixel rays."""
+        """Rays of pixels, new views and keypoints in a step."""
         cover = 0.0 if self.new_views is None else min(1.0, self.new_views.cover)
         new_view_rays = round(cover * round(self.new_view_share * pixel_rays))
         # Points shared by two images are more informative than keypoints, which replace the missing ones.
