@@ -175,8 +175,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         self.gains = gains if gains is not None and gains.matter else None
         if self.gains is not None:
             self.train_dataset.metadata[GAINS] = self.gains
-        self._reads_by_window = bool(self._sizes(None).sum() > self.config.resident_pixels)
-        if not self._reads_by_window and self.test_mode == "val":
+        if self._sizes(None).sum() <= self.config.resident_pixels and self.test_mode == "val":
             CONSOLE.print(f"Reading {len(self.train_dataset)} training images.")
             self.sources = self._resident = self._read_sources(None)
 

@@ -153,26 +153,23 @@ def read_observations(outputs: DataparserOutputs, cameras: Cameras, sfm: SfmMode
     transform = outputs.dataparser_transform.double().numpy()
     points = (sfm.points @ transform[:3, :3].T + transform[:3, 3]) * outputs.dataparser_scale
     tracked = with_tracks(observations, replace(sfm, points=points), [Path(p).name for p in outputs.image_filenames])
-    return _fitting_tracks(tracked, cameras) if len(tracked.seen_at) else tracked
-
-
-def _fitting_tracks(observations: Observations, cameras: Cameras) -> Observations:
-    """Drops points behind the camera that saw them, and all tracks if the model is in another frame."""
-    angles = keypoint_angles(observations, cameras)
-    width = np.arctan(0.5 * observations.sizes[:, 0] / observations.intrinsics[:, 0]) * 2
-    if np.median(angles / width[observations.seen_by]) > MAX_REPROJECTION:
+    if not len(tracked.seen_at):
+        return tracked
+    angles = keypoint_angles(tracked, cameras)
+    width = np.arctan(0.5 * tracked.sizes[:, 0] / tracked.intrinsics[:, 0]) * 2
+    if np.median(angles / width[tracked.seen_by]) > MAX_REPROJECTION:
         CONSOLE.print(
             "[bold yellow]The COLMAP model does not fit the cameras (its points project elsewhere), so its tracks are "
             "not used: state its frame as applied_transform in transforms.json."
         )
-        return replace(observations.with_keypoints(np.zeros(len(angles), np.bool_)), points=np.zeros((0, 3)))
+        return replace(tracked.with_keypoints(np.zeros(len(angles), np.bool_)), points=np.zeros((0, 3)))
     ahead = angles < np.pi / 2
     if not ahead.all():
         CONSOLE.print(
             f"[bold yellow]{(~ahead).sum()} of {len(ahead)} keypoints have their point behind the camera and are not "
             "used: check the COLMAP model."
         )
-    return observations.with_keypoints(ahead)
+    return tracked.with_keypoints(ahead)
 
 
 def keypoint_angles(observations: Observations, cameras: Cameras) -> NDArray[np.float64]:
