@@ -117,6 +117,8 @@ def know_depths(
 ) -> tuple[KnownDepth | None, Observations]:
     """All available depths of the training images, and the observations with the points of a cloud, if there is one.
 
+    The depths are None if there is neither matching, a sensor nor a cloud.
+
     Args:
         outputs: of the data parser.
         observations: cameras, tracks and loose points of the images.
@@ -124,9 +126,6 @@ def know_depths(
         rays: makes rays through pixel centres (image, row, column).
         dense: match neighbouring images.
         sensor: read depth images.
-
-    Returns:
-        The depths, None if there is neither matching, a sensor nor a cloud; the observations.
 
     Raises:
         InputError: an image or depth image cannot be used (names it).
@@ -182,10 +181,10 @@ def _remembered_depths(original: PosedImages, posed: PosedImages, observations: 
         return ((f"{i}", image) for i, image in enumerate(codes))
 
     cameras = original.camera_to_worlds, original.intrinsics, original.distortion, original.fisheye
-    return _remembered(digest(original.files, "depths", VERSION, width, shapes, *cameras, seen_by, points), match)
+    return _from_cache(digest(original.files, "depths", VERSION, width, shapes, *cameras, seen_by, points), match)
 
 
-def _remembered(key: str, find: Callable[[], Pairs]) -> KnownDepth:
+def _from_cache(key: str, find: Callable[[], Pairs]) -> KnownDepth:
     """Codes by the numbers of their images, from the cache if the key is there."""
     arrays = remembered(key, find)
     return KnownDepth(Computed(len(arrays), lambda i: cast(Codes, arrays[f"{i}"])))
@@ -275,7 +274,7 @@ def with_continued(known: KnownDepth, posed: PosedImages, dataset: MMPIDataset, 
     cameras = posed.camera_to_worlds, posed.intrinsics, posed.distortion, posed.fisheye
     masks = [digest((), dataset.usable(i)) for i in range(count)] if dataset.has_masks else []
     contents = [digest((), codes) for codes in known.codes]
-    return _remembered(digest(posed.files, "continued", VERSION, *cameras, contents, masks), continue_all)
+    return _from_cache(digest(posed.files, "continued", VERSION, *cameras, contents, masks), continue_all)
 
 
 def _continued_codes(codes: Codes, i: int, posed: PosedImages, dataset: MMPIDataset, rays: Rays) -> Codes:
