@@ -168,7 +168,8 @@ def find_shared_points(
         return None
     joined = (torch.cat(column).to(device) for column in zip(*parts, strict=True))
     centers = torch.from_numpy(posed.camera_to_worlds[:, :, 3]).float().to(device)
-    return SharedPoints(*joined, centers, matches / sum(known.codes[i][..., 0].size for i in images))
+    cover = matches / sum(known.codes[i][..., 0].size for i in images)
+    return SharedPoints(*joined, centers=centers, cover=cover)
 
 
 def _matches(
