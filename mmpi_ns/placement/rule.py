@@ -160,7 +160,13 @@ class _Choice:
         self, candidates: list[Candidate], weights: NDArray[np.float64], config: PlacementConfig, texel_pixels: float
     ) -> None:
         self.candidates, self.weights, self.config, self.texel_pixels = candidates, weights, config, texel_pixels
-        self.cost: NDArray[np.float32] = np.stack([self._bits(c) for c in candidates])
+        # Of each observation if a candidate serves it: log2 of the expected pixel error over ``enough``.
+        enough, cost = config.enough * texel_pixels, []
+        for c in candidates:
+            size = max(texel_pixels, c.coarsest(config.max_voxels))
+            error = np.hypot(c.plane / (config.max_planes - 1), 0.5 * size * c.texel)
+            cost.append(np.log2(np.clip(error, enough, max(WORST, 2 * enough)) / enough).astype(np.float32))
+        self.cost: NDArray[np.float32] = np.stack(cost)
         self.nothing = np.full(self.cost.shape[1], self.cost.max(), np.float32)
         texels = [c.at(texel_pixels, config.max_planes, config.max_voxels).texels for c in candidates]
         self.price = np.array(texels, dtype=np.float64) ** config.texel_cost
@@ -177,9 +183,15 @@ class _Choice:
             if chosen and self._total(grown) >= self._total(chosen):  # it makes itself or its better superfluous
                 break
             chosen = grown
-        owner = self.cost[chosen].argmin(0)
-        heads = ((self.candidates[j], self._planes(j, owner == n)) for n, j in enumerate(chosen))
-        return [head.at(self.texel_pixels, planes, self.config.max_voxels) for head, planes in heads]
+        owner, heads, config = self.cost[chosen].argmin(0), [], self.config
+        for n, candidate in enumerate(self.candidates[j] for j in chosen):
+            # Planes at which the error of four fifths of the observations that it serves is small enough.
+            error = candidate.plane[owner == n]
+            error = error[np.isfinite(error)]
+            steps = float(np.quantile(error, 0.8)) / (config.plane_pixels * self.texel_pixels) if len(error) else 0.0
+            planes = int(np.clip(8 * round((1 + steps) / 8), MIN_PLANES, config.max_planes))
+            heads.append(candidate.at(self.texel_pixels, planes, config.max_voxels))
+        return heads
 
     def _total(self, chosen: list[int]) -> float:
         """Remaining expected error, in bits, summed over images."""
@@ -208,18 +220,3 @@ class _Choice:
             if least is None or losses[least] >= self.config.min_gain:
                 return chosen
             chosen = [j for n, j in enumerate(chosen) if n != least]
-
-    def _planes(self, j: int, served: NDArray[np.bool_]) -> int:
-        """Planes at which the error of four fifths of the observations served by candidate j is small enough."""
-        error = self.candidates[j].plane[served]
-        error = error[np.isfinite(error)]
-        steps = float(np.quantile(error, 0.8)) / (self.config.plane_pixels * self.texel_pixels) if len(error) else 0.0
-        return int(np.clip(8 * round((1 + steps) / 8), MIN_PLANES, self.config.max_planes))
-
-    def _bits(self, candidate: Candidate) -> NDArray[np.float32]:
-        """Cost of each observation if served here: log2 of the expected pixel error over ``enough``."""
-        enough = self.config.enough * self.texel_pixels
-        size = max(self.texel_pixels, candidate.coarsest(self.config.max_voxels))
-        plane, texel = candidate.plane / (self.config.max_planes - 1), 0.5 * size * candidate.texel
-        worst = max(WORST, 2 * enough)
-        return np.log2(np.clip(np.hypot(plane, texel), enough, worst) / enough).astype(np.float32)

@@ -61,7 +61,7 @@ def map_and_judge(task: Task) -> Solution:
     The chosen model is given all points and adjusted (``polish``), unless that makes the evidence worse. Raises
     PrepareError if neither mapper makes a model.
     """
-    chosen, *others = _best_first(_candidates(task), task)
+    chosen, *others = _candidates(task)
     with progress("Adding points", 1) as advance:
         model = copy.deepcopy(chosen.model)
         model = with_all_points(model, task.database, task.images, task.free.lens, task.threads)
@@ -76,12 +76,8 @@ def map_and_judge(task: Task) -> Solution:
     return Solution(chosen.model, "; beside it ".join([chosen.says, *beside]), verdict)
 
 
-def _best_first(candidates: Sequence[Candidate], task: Task) -> list[Candidate]:
-    return [candidates[i] for i in best_first([c.witness for c in candidates], task.is_ordered)]
-
-
 def _candidates(task: Task) -> list[Candidate]:
-    """The models of both mappers, of the global one from several focal lengths.
+    """The models of both mappers, of the global one from several focal lengths, the most credible first.
 
     A global mapper that placed a part of a long sequence places all images if the incremental one fails.
     """
@@ -92,11 +88,11 @@ def _candidates(task: Task) -> list[Candidate]:
             right = [c.witness for c in candidates if c.grade == "right"]
             differences = [agreement(right[0], w) for w in right[1:]]
             is_settled = bool(right) and all(d is not None and agrees(d) for d in differences)
-    candidates = _best_first(candidates, task)
     start, is_part = task.database, len(task.placed) < len(task.offered)
     if candidates and task.free.lens:
+        best = candidates[best_first([c.witness for c in candidates], task.is_ordered)[0]].model
         start = task.work / "from-global.db"
-        start_from(task.database, start, {n: c.mean_focal_length() for n, c in candidates[0].model.cameras.items()})
+        start_from(task.database, start, {n: c.mean_focal_length() for n, c in best.cameras.items()})
     failed: PrepareError | None = None
     try:
         attempts = 1 if is_settled and not is_part else len(ATTEMPTS)
@@ -108,7 +104,7 @@ def _candidates(task: Task) -> list[Candidate]:
         candidates += _globally([("global-all", start)], task.offered, task)
     if failed and not candidates:
         raise failed
-    return candidates
+    return [candidates[i] for i in best_first([c.witness for c in candidates], task.is_ordered)]
 
 
 def _starts(task: Task) -> list[tuple[str, Path]]:

@@ -157,10 +157,6 @@ class Tracer:
         return rows[touching | (inside & (distance - radius < reach))]
 
 
-def _inverse(x: Array) -> Array:
-    return 1.0 / np.where(np.abs(x) < 1e-14, 1e-14, x)
-
-
 def box_distance(origins: Array, directions: Array, center: Array, half: Array, yaw: Array) -> Array:
     """Distance [R] at which rays [R, 3] enter a box, each its own, as in ``Primitives``; inf where they miss it or
     start inside."""
@@ -170,7 +166,7 @@ def box_distance(origins: Array, directions: Array, center: Array, half: Array, 
     for axis, extent in enumerate(half.T):
         # Along the box's own axes; the third is the world's.
         start, step = (v[2] if axis == 2 else c * v[axis] + (sn if axis == 0 else -sn) * v[1 - axis] for v in (o, d))
-        inverse = _inverse(step)
+        inverse = 1.0 / np.where(np.abs(step) < 1e-14, 1e-14, step)
         middle, reach = -start * inverse, extent * np.abs(inverse)
         enter, leave = np.maximum(enter, middle - reach), np.minimum(leave, middle + reach)
     return np.where((enter <= leave) & (enter > START), enter, np.inf)
@@ -196,7 +192,7 @@ def cylinder_distance(origins: Array, directions: Array, center: Array, half: Ar
     nearest = o[:, :2] - along[:, None] * d[:, :2]
     aside = dot(nearest, nearest)
     root = np.sqrt(np.maximum(radius**2 - aside, 0) / flat)
-    inverse = _inverse(d[:, 2])
+    inverse = 1.0 / np.where(np.abs(d[:, 2]) < 1e-14, 1e-14, d[:, 2])
     middle, reach = -o[:, 2] * inverse, half_height * np.abs(inverse)
     enter, leave = np.maximum(-along - root, middle - reach), np.minimum(-along + root, middle + reach)
     return np.where((aside < radius**2) & (enter <= leave) & (enter > START), enter, np.inf)
