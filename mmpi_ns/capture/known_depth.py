@@ -5,9 +5,9 @@ Sources, later ones replacing earlier ones: dense matches (``dense.py``), SfM po
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import cast
 
@@ -22,7 +22,7 @@ from PIL import Image
 from rich.progress import track
 from torch import Tensor
 
-from mmpi_ns.capture.cache import Computed, Pairs, digest, remembered
+from mmpi_ns.capture.cache import Computed, digest, remembered
 from mmpi_ns.capture.dataset import MMPIDataset, read_depth_image
 from mmpi_ns.capture.dense import SECONDS, Depth, find_depths
 from mmpi_ns.capture.lone_depth import continued, is_lone
@@ -166,27 +166,26 @@ def _remembered_depths(original: PosedImages, posed: PosedImages, observations: 
     widest, pixels = max(w for _, w in shapes), sum(w * h for h, w in shapes)
     width = int(min(WIDEST, widest * min(FINER, (MOST_WORKING / pixels) ** 0.5)))
 
-    def match() -> Pairs:
+    def match() -> Iterable[Codes]:
         threads = num_threads()
         seconds = SECONDS * 1e-6 * sum(float(min(1, width / w) ** 2 * w * h) for w, h in original.sizes) / threads
         CONSOLE.print(
             f"Matching {len(shapes)} images densely, at most {width} pixels wide: about {duration(seconds)} with "
             f"{threads} thread(s)."
         )
-        codes = find_depths(
+        return find_depths(
             original, lambda i: points[seen_by == i], width,
             lambda i, view, depth: packed(at_training_pixels(view, depth, original, i, shapes[i], file_shapes[i])),
             progress=lambda work, count: track(work, "Depths", count, console=CONSOLE),
         )  # fmt: skip
-        return ((f"{i}", image) for i, image in enumerate(codes))
 
     cameras = original.camera_to_worlds, original.intrinsics, original.distortion, original.fisheye
     return _from_cache(digest(original.files, "depths", VERSION, width, shapes, *cameras, seen_by, points), match)
 
 
-def _from_cache(key: str, find: Callable[[], Pairs]) -> KnownDepth:
-    """Codes by the numbers of their images, from the cache if the key is there."""
-    arrays = remembered(key, find)
+def _from_cache(key: str, find: Callable[[], Iterable[Codes]]) -> KnownDepth:
+    """The codes of all images in turn, from the cache if the key is there."""
+    arrays = remembered(key, lambda: ((f"{i}", codes) for i, codes in enumerate(find())))
     return KnownDepth(Computed(len(arrays), lambda i: cast(Codes, arrays[f"{i}"])))
 
 
@@ -265,21 +264,19 @@ def with_continued(known: KnownDepth, posed: PosedImages, dataset: MMPIDataset, 
     Masked pixels have no distance: what moves is nowhere.
     """
     count = len(known.codes)
-
-    def continue_all() -> Pairs:
-        codes = in_order(lambda i: _continued_codes(known.codes[i], i, posed, dataset, rays), range(count))
-        shown = track(codes, "Extrapolating surfaces", count, console=CONSOLE)
-        return ((f"{i}", image) for i, image in enumerate(shown))
-
     cameras = posed.camera_to_worlds, posed.intrinsics, posed.distortion, posed.fisheye
     masks = [digest((), dataset.usable(i)) for i in range(count)] if dataset.has_masks else []
     contents = [digest((), codes) for codes in known.codes]
-    return _from_cache(digest(posed.files, "continued", VERSION, *cameras, contents, masks), continue_all)
+    key = digest(posed.files, "continued", VERSION, *cameras, contents, masks)
+    codes_of = partial(_continued_codes, known, posed, dataset, rays)
+    return _from_cache(
+        key, lambda: track(in_order(codes_of, range(count)), "Extrapolating surfaces", count, console=CONSOLE)
+    )
 
 
-def _continued_codes(codes: Codes, i: int, posed: PosedImages, dataset: MMPIDataset, rays: Rays) -> Codes:
+def _continued_codes(known: KnownDepth, posed: PosedImages, dataset: MMPIDataset, rays: Rays, i: int) -> Codes:
     """Codes of one image with extrapolated surfaces; computed for every n-th pixel of a large image."""
-    codes, hidden = np.array(codes), ~dataset.usable(i)
+    codes, hidden = np.array(known.codes[i]), ~dataset.usable(i)
     codes[hidden] = UNKNOWN
     step = -(-max(codes.shape[:2]) // CONTINUED)
     rows, columns = (np.minimum(np.arange(0, n, step) + step // 2, n - 1) for n in codes.shape[:2])
