@@ -24,8 +24,6 @@ JUMP = 5.0
 """Times its neighbours' step (or turn) from which a step counts as a jump."""
 TURN = 8.0
 """Minimum angle of such a turn, degrees."""
-CELLS = (6, 8)
-"""Rows and columns of the grid for coverage."""
 FOCAL_OFF = (0.03, 0.05)
 """Relative change of a given focal length, when refined, from which it is doubted, and the scene with it..."""
 FOCAL_HELPS = (0.95, 0.85)
@@ -100,17 +98,6 @@ def misplaced(names: Sequence[str], places: Sequence[int], poses: Array) -> list
         elif turns[i] > JUMP * usual_turn[i] + TURN:
             findings.append(Finding("misplaced?", names[i + 1], f"a turn of {turns[i]:.0f} degrees {where}", turns[i]))
     return findings
-
-
-def coverage(model: pycolmap.Reconstruction) -> dict[str, float]:
-    """Fraction of an image's cells that contain a keypoint with a point, for each image."""
-    shares = {}
-    for i in model.reg_image_ids():
-        image, camera = model.images[i], model.cameras[model.images[i].camera_id]
-        seen = np.array([p.xy for p in image.points2D if p.has_point3D()]).reshape(-1, 2)
-        cell = (np.clip(seen / [camera.width, camera.height], 0, 1 - 1e-9) * CELLS[::-1]).astype(int)
-        shares[image.name] = len(np.unique(cell, axis=0)) / (CELLS[0] * CELLS[1])
-    return shares
 
 
 def doubtful_intrinsics(

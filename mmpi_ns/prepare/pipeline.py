@@ -72,7 +72,19 @@ class Preparation:
             database, self.matching = self._matches(database)
         with self._timed("mapping"):
             solution, self.focal, self.groups = self._solve(database)
-        self._check(solution)
+        count, total = solution.model.num_reg_images(), len(self.photos)
+        if count < LEAST_SHARE * total and not s.allow_partial:
+            groups = "".join(f" Another group of {len(g)}: {in_short(g, 4)}." for g in self.groups)
+            raise PrepareError(
+                f"Only {count} of {total} images could be registered: {in_short(camera_poses(solution.model)[0], 4)}."
+                f"{groups} The groups need images that connect them. For a scene of the {count} alone: "
+                "--allow-partial. What was found so far is kept, and a new run goes on from it."
+            )
+        if solution.verdict.grade == "broken" and not s.allow_doubtful:
+            raise PrepareError(
+                f"The track that was found is wrong, so no scene was made. {solution.verdict.words()} {REMEDY} "
+                "To look at it all the same: --allow-doubtful."
+            )
         with self._timed("writing"):
             return self._write(solution)
 
@@ -185,22 +197,6 @@ class Preparation:
         verdict = Verdict(says["grade"], tuple(says["reasons"]))
         solution = Solution(pycolmap.Reconstruction(folder / "model"), says["mapping"], verdict)
         return solution, says["focal"], says["groups"]
-
-    def _check(self, solution: Solution) -> None:
-        """Refuses a scene of few of the images, and a scene whose track is wrong."""
-        s, count, total = self.settings, solution.model.num_reg_images(), len(self.photos)
-        if count < LEAST_SHARE * total and not s.allow_partial:
-            groups = "".join(f" Another group of {len(g)}: {in_short(g, 4)}." for g in self.groups)
-            raise PrepareError(
-                f"Only {count} of {total} images could be registered: {in_short(camera_poses(solution.model)[0], 4)}."
-                f"{groups} The groups need images that connect them. For a scene of the {count} alone: "
-                "--allow-partial. What was found so far is kept, and a new run goes on from it."
-            )
-        if solution.verdict.grade == "broken" and not s.allow_doubtful:
-            raise PrepareError(
-                f"The track that was found is wrong, so no scene was made. {solution.verdict.words()} {REMEDY} "
-                "To look at it all the same: --allow-doubtful."
-            )
 
     def _write(self, solution: Solution) -> Verdict:
         """Moves the model into the scene's frame and writes the scene; the verdict, with the findings of the checks."""

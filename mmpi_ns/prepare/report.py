@@ -11,11 +11,13 @@ from matplotlib.figure import Figure
 
 from mmpi_ns.capture.exif import light_of
 from mmpi_ns.prepare.alignment import camera_poses
-from mmpi_ns.prepare.checks import Finding, coverage
+from mmpi_ns.prepare.checks import Finding
 from mmpi_ns.utils.files import write_text
 
 WORST = 5
 """Number of images with the least coverage that are listed."""
+CELLS = (8, 6)
+"""Columns and rows of the grid for coverage."""
 
 
 def exposure_in_words(images: Sequence[Path]) -> str:
@@ -37,7 +39,12 @@ def write_report(
 ) -> None:
     """Writes report.md and report/track.png: ``rows`` beside the model's figures in the table, the further ``warnings``
     before the findings of the checks, and a note at the end."""
-    covered = coverage(model)
+    covered = {}  # share of each image's cells that hold a keypoint with a point
+    for i in model.reg_image_ids():
+        image, camera = model.images[i], model.cameras[model.images[i].camera_id]
+        seen = np.array([p.xy for p in image.points2D if p.has_point3D()]).reshape(-1, 2)
+        cell = (np.clip(seen / [camera.width, camera.height], 0, 1 - 1e-9) * CELLS).astype(int)
+        covered[image.name] = len(np.unique(cell, axis=0)) / (CELLS[0] * CELLS[1])
     rows = rows | {
         "reprojection error": f"{model.compute_mean_reprojection_error():.3f} px",
         "points": f"{model.num_points3D()}",
