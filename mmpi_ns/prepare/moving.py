@@ -9,7 +9,6 @@ import numpy as np
 import pycolmap
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
-from numpy.typing import NDArray
 from PIL import Image
 from rich.progress import track
 
@@ -48,13 +47,12 @@ def write_masks(
         torch.set_num_threads(threads)
     entries = [model.images[i] for i in sorted(model.reg_image_ids()) if model.images[i].name in set(train)]
     posed = _posed_images(model, entries, images)
-
-    def points_of(i: int) -> NDArray[np.float64]:
-        seen = [model.points3D[p.point3D_id].xyz for p in entries[i].points2D if p.has_point3D()]
-        return np.array(seen).reshape(-1, 3)
-
     views, moving = find_moving(
-        posed, points_of, lambda work, count: track(work, "Looking for what moves", count, console=CONSOLE)
+        posed,
+        lambda i: np.reshape(
+            [model.points3D[p.point3D_id].xyz for p in entries[i].points2D if p.has_point3D()], (-1, 3)
+        ),
+        lambda work, count: track(work, "Looking for what moves", count, console=CONSOLE),
     )
     if not any(mask.any() for mask in moving):
         return {}

@@ -48,10 +48,6 @@ class TexelGrid:
         return -(-self.width // SIDE)
 
     @property
-    def texels(self) -> int:
-        return self.depth * self.height * self.width
-
-    @property
     def own_tiles(self) -> Int[Tensor, "D Y X"]:
         """Brick of each of the head's tiles."""
         shape = self.depth, self.down, self.across

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from itertools import product
 
 import numpy as np
@@ -104,7 +105,7 @@ def _room(name: str, seed: int, cameras: Cameras) -> Scene:
     kit.shell()
     kit.table()
     kit.walls()
-    return Scene(name, seed, kit.done(), floor_inside(*ROOM[:2]), open_sky, lamp, cameras)
+    return Scene(name, seed, kit.done(), partial(floor_inside, ROOM[:2]), open_sky, lamp, cameras)
 
 
 def room(seed: int, count: int, width: int, height: int) -> Scene:
