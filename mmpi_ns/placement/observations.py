@@ -74,13 +74,15 @@ class Observations:
         Only sums of camera axes are used, so a rotated scene gives the rotated frame. If the cameras look in all
         directions, the mean is ill-defined, and the horizontal direction of the first camera is used instead.
         """
-        up = _unit(self.camera_to_worlds[:, :, 1].mean(0))
+        up = self.camera_to_worlds[:, :, 1].mean(0)
+        up = up / max(float(np.linalg.norm(up)), 1e-12)
         mean_facing = -self.camera_to_worlds[:, :, 2].mean(0)
         facing = mean_facing if np.linalg.norm(mean_facing) > 0.3 else -self.camera_to_worlds[0, :, 2]
         right = np.cross(facing, up)
         if np.linalg.norm(right) < 1e-3:  # looking straight up or down: any horizontal axis will do
             right = self.camera_to_worlds[0, :, 0]
-        right = _unit(right - right.dot(up) * up)
+        right = right - right.dot(up) * up
+        right = right / max(float(np.linalg.norm(right)), 1e-12)
         return np.stack([right, -up, np.cross(right, -up)])
 
     @cached_property
@@ -150,7 +152,3 @@ def frustum_points(observations: Observations, near: Array) -> Array:
         local = observations.directions(i, uvw[:, :2]) * depth[:, None]
         clouds.append(local @ pose[:, :3].T + pose[:, 3])
     return np.concatenate(clouds)
-
-
-def _unit(v: Array) -> Array:
-    return v / max(float(np.linalg.norm(v)), 1e-12)
