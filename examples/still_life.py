@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -47,7 +48,7 @@ def still_life(seed: int = 0, count: int = 25, width: int = 240, height: int = 1
     places = np.stack([np.full(count, -2.1), y, z], -1) + jitter
     cameras = Cameras(look(places, np.zeros(count), np.full(count, -0.06)), 0.95 * width, width, height, test_every=8)
     light = Light((-0.7, 0.45, 0.75))
-    return Scene("still-life", seed, kit.done(), floor_inside(20.0, 20.0), open_sky, light, cameras)
+    return Scene("still-life", seed, kit.done(), partial(floor_inside, (20.0, 20.0)), open_sky, light, cameras)
 
 
 @dataclass

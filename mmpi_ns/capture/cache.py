@@ -61,16 +61,8 @@ class Computed(Sequence[T]):
 def held(
     function: Callable[[int], T], sizes: NDArray[np.float64], bytes_of_pixel: int, least: int
 ) -> Callable[[int], T]:
-    """A function of an image's number that keeps its last results while neighbours are compared with them.
-
-    Threads that ask for the same image at once share one call.
-
-    Args:
-        function: of an image's number.
-        sizes: of the images [M, 2]; results are kept as long as they take ``HELD_BYTES`` at most.
-        bytes_of_pixel: that a result takes.
-        least: results that are kept at least: as many as an image is compared with.
-    """
+    """A function of an image's number that keeps its last results; threads that ask for one image share its call. As
+    many are kept as fit into ``HELD_BYTES``, but at least ``least``. Sizes are [M, 2], pixels."""
     bytes_of_image = bytes_of_pixel * float(sizes.prod(-1).max())
 
     @lru_cache(max(least, min(HELD, int(HELD_BYTES / bytes_of_image))))
@@ -90,13 +82,13 @@ def held(
 def remembered(key: str, find: Callable[[], Arrays | Pairs], folder: Path | None = None) -> Arrays:
     """The result of ``find``, from the cache if the key is there.
 
-    Arrays are read from the file at each access: they take memory only while they are used. Changes are the caller's
-    own and reach neither the file nor the next access. If several processes ask at once, one computes and the
-    others wait. If the folder is not writable, every process computes the result itself, and says so.
+    Arrays are read from the file at each access, so they take memory only while they are used, and changes to them are
+    not kept. If several processes ask at once, one computes and the others wait. If the folder is not writable, every
+    process computes the result itself, and says so.
 
     Args:
         key: of the result.
-        find: arrays by name; as pairs that are computed one by one they are written at once, never held together.
+        find: arrays by name; pairs that are computed one by one are written one by one.
         folder: of the cache.
     """
     folder = folder or cache_folder()
@@ -118,7 +110,13 @@ def remembered(key: str, find: Callable[[], Arrays | Pairs], folder: Path | None
                 CONSOLE.print(f"[yellow]{error}")
             if arrays is None:
                 arrays = result if isinstance(result, Mapping) else dict(find())
-        _forget_old(folder)
+        # Results beyond KEPT and MOST_BYTES go, but none that a process computes or waits for.
+        files = sorted(folder.glob("*.npz"), key=lambda p: p.stat().st_mtime, reverse=True)
+        sizes = np.cumsum([file.stat().st_size for file in files])
+        for old in files[min(KEPT, max(1, int((sizes <= MOST_BYTES).sum()))) :]:
+            with suppress(Timeout), FileLock(old.with_suffix(".lock"), timeout=0):
+                old.unlink(missing_ok=True)
+                old.with_suffix(".lock").unlink(missing_ok=True)
     return arrays
 
 
@@ -137,14 +135,3 @@ def _read(path: Path) -> Arrays | None:
     except (OSError, ValueError, EOFError, zipfile.BadZipFile):
         return None
     return arrays
-
-
-def _forget_old(folder: Path) -> None:
-    """Removes the results beyond ``KEPT`` and ``MOST_BYTES``, but none that a process computes or waits for."""
-    files = sorted(folder.glob("*.npz"), key=lambda p: p.stat().st_mtime, reverse=True)
-    sizes = np.cumsum([file.stat().st_size for file in files])
-    kept = min(KEPT, max(1, int((sizes <= MOST_BYTES).sum())))
-    for path in files[kept:]:
-        with suppress(Timeout), FileLock(path.with_suffix(".lock"), timeout=0):
-            path.unlink(missing_ok=True)
-            path.with_suffix(".lock").unlink(missing_ok=True)

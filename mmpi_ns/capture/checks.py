@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
@@ -21,7 +20,7 @@ from PIL import Image
 
 from mmpi_ns.capture.lenses import check_lenses
 from mmpi_ns.utils.errors import InputError, brief
-from mmpi_ns.utils.values import Number, check_number, check_options, check_row, cut, shown
+from mmpi_ns.utils.values import Number, check_number, check_row, cut, shown
 
 SAME_PLACE = 1e-6
 """Cameras closer together than this fraction of their distance from the origin count as one place, in float32."""
@@ -35,7 +34,7 @@ FEW = 0.1
 """Fraction of the cameras that counts as a few."""
 SPLITS = ("train_filenames", "val_filenames", "test_filenames")
 PATHS = ("file_path", "mask_path", "depth_file_path")
-PARSER = {
+PARSER_OPTIONS = {
     "scale_factor": Number(0, 1e9, above=True),
     "scene_scale": Number(0, above=True),
     "train_split_fraction": Number(0, 1, above=True),
@@ -46,11 +45,6 @@ PARSER = {
 ORIENTATIONS = ("pca", "up", "vertical", "none")
 
 Frames = Sequence[Mapping[str, Any]]
-
-
-def check_parser(parser: DataParserConfig) -> None:
-    """Raises InputError naming the option of a data parser that cannot be used."""
-    check_options(parser, {name: number for name, number in PARSER.items() if hasattr(parser, name)}, "--")
 
 
 def check_transforms(parser: NerfstudioDataParserConfig, data: Path, splits: Sequence[str], *, opens: bool) -> None:
@@ -69,9 +63,8 @@ def check_transforms(parser: NerfstudioDataParserConfig, data: Path, splits: Seq
     meta, frames = _read(path)
     _check_files(parser, meta, frames, path)
     poses = np.stack([_pose(frame, path) for frame in frames])
-    _check_whole_file(meta, path)
+    _check_whole_file(meta, frames, splits, path, by_name=(parser.downscale_factor or 1) > 1)
     check_lenses(meta, frames, path)
-    _check_splits(meta, frames, splits, path, by_name=(parser.downscale_factor or 1) > 1)
     if opens:
         _check_first_image(parser.downscale_factor, path.parent, frames[0]["file_path"])
     names = [str(frame["file_path"]) for frame in frames]
@@ -165,8 +158,11 @@ def _pose(frame: Mapping[str, Any], path: Path) -> NDArray[np.float64]:
     return pose
 
 
-def _check_whole_file(meta: Mapping[str, Any], path: Path) -> None:
-    """Fields that hold for all frames."""
+def _check_whole_file(
+    meta: Mapping[str, Any], frames: Frames, splits: Sequence[str], path: Path, *, by_name: bool
+) -> None:
+    """Fields that hold for all frames, and lists of training and evaluation frames: if there is any, all requested
+    splits need theirs."""
     if "applied_transform" in meta:
         rows = meta["applied_transform"]
         if not isinstance(rows, list) or len(rows) != 3:
@@ -187,15 +183,10 @@ def _check_whole_file(meta: Mapping[str, Any], path: Path) -> None:
         raise InputError(
             f"orientation_override of {path} is {shown(turned)}: leave it out or give one of {', '.join(ORIENTATIONS)}."
         )
-
-
-def _check_splits(meta: Mapping[str, Any], frames: Frames, splits: Sequence[str], path: Path, *, by_name: bool) -> None:
-    """Lists of training and evaluation frames: if the file holds any, all requested splits need theirs."""
-    if not any(key in meta for key in SPLITS):
-        return
     kind = (lambda name: Path(name).name) if by_name else Path
     names = {kind(frame["file_path"]) for frame in frames}
-    for key in dict.fromkeys(f"{split}_filenames" for split in splits):
+    has_lists = any(key in meta for key in SPLITS)
+    for key in dict.fromkeys(f"{split}_filenames" for split in splits) if has_lists else ():
         listed = meta.get(key)
         if not isinstance(listed, list) or not listed or not all(isinstance(x, str) for x in listed):
             others = ", ".join(k for k in SPLITS if k in meta and k != key) or "one of them"

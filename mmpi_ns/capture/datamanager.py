@@ -19,7 +19,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
 
 from mmpi_ns.capture.ahead import DrawnAhead
-from mmpi_ns.capture.checks import check_parser, check_transforms, say_once
+from mmpi_ns.capture.checks import PARSER_OPTIONS, check_transforms, say_once
 from mmpi_ns.capture.dataset import MMPIDataset
 from mmpi_ns.capture.exif import light_of
 from mmpi_ns.capture.known_depth import KnownDepth, know_depths, of_cells
@@ -35,15 +35,16 @@ from mmpi_ns.placement.observations import Observations
 from mmpi_ns.scene.visible_tiles import TrainingViews
 from mmpi_ns.utils.errors import InputError, say
 from mmpi_ns.utils.random_draws import generator
+from mmpi_ns.utils.values import check_options
 
 OBSERVATIONS = "mmpi_observations"
 """Key of the scene's Observations in the data set's metadata, for the model."""
 GAINS = "mmpi_gains"
 """Key of the exposures of the training images (``photometry.Gains``); missing where they are equal."""
 DEPTHS_KNOWN = "mmpi_depths_known"
-"""Metadata: whether so many training pixels have a known depth that training starts with surfaces."""
+"""Metadata: whether enough training pixels have a known depth to start training with surfaces."""
 MANY_DEPTHS = 0.4
-"""Share of the training pixels: two thirds in most captures, a fifth in one whose images hardly overlap."""
+"""That share of the training pixels: two thirds in most captures, a fifth in one whose images hardly overlap."""
 RAYS_PER_STEP = "mmpi_rays_per_step"
 """Key of the pixel rays of a training step."""
 TRAINING_VIEWS = "mmpi_training_views"
@@ -102,7 +103,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         self._resident: RaySources | None = None
         """The sources of all cameras, if they are in memory all the time."""
         parser = config.dataparser
-        check_parser(parser)
+        check_options(parser, {name: number for name, number in PARSER_OPTIONS.items() if hasattr(parser, name)}, "--")
         if isinstance(parser, NerfstudioDataParserConfig):
             mode = kwargs.get("test_mode", "val")
             splits = ("train", "val" if mode == "val" else "test")
@@ -119,13 +120,22 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
             )
         dataset.metadata[RAYS_PER_STEP] = self.config.train_num_rays_per_batch
         dataset.metadata[TRAINING_VIEWS] = TrainingViews.of(dataset.cameras)
-        self._pinhole = PinholeRays.of(dataset.cameras, self.device)
+        device = self.device
+        generate = PinholeRays.of(dataset.cameras, device) or RayGenerator(dataset.cameras.to(device))
+        self.train_ray_generator: Any = lambda pixels: generate(pixels.to(device))
         if self.test_mode == "val":  # elsewhere the plan comes from a checkpoint
             if self.config.mask_moving and None in dataset.mask_files:
-                self._mask_moving(dataset)
-            rays = self._ray_generator()
+                # A mask file of the user wins over what is seen to move.
+                masks = zip(moving_masks(self.observations, dataset), dataset.mask_files, strict=True)
+                masks = [mask & (file is None) for mask, file in masks]
+                self.moves = share_of_moving(masks)
+                is_masked = any(mask.any() for mask in masks)
+                say(self.moves + (" (--pipeline.datamanager.mask-moving False keeps them)." if is_masked else "."))
+                if is_masked:
+                    dataset.moving = masks
+                    self.observations = drop_masked(self.observations, dataset)
             depths, self.observations = know_depths(
-                self.train_dataparser_outputs, self.observations, dataset, lambda pixels: rays(pixels.to(self.device)),
+                self.train_dataparser_outputs, self.observations, dataset, self.train_ray_generator,
                 dense=self.config.dense_depth, sensor=self.config.depth_images,
             )  # fmt: skip
             self.known_depth, seen = depths, self.observations
@@ -135,23 +145,6 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
             if not has_keypoints and (depths is None or depths.share == 0):
                 say("No depths are known, from tracks, matches or a sensor: geometry is learned from colours alone.")
         return dataset
-
-    def _ray_generator(self) -> Any:
-        """Makes rays through pixel centres of training images; no attribute, as nn.Module takes none before its own."""
-        return self._pinhole or RayGenerator(self.train_dataset.cameras.to(self.device))
-
-    def _mask_moving(self, dataset: MMPIDataset) -> None:
-        """Masks what moves in the training images, and says how much it is."""
-        masks = moving_masks(self.observations, dataset)
-        # Masks of the user win.
-        masks = [m & (file is None) for m, file in zip(masks, dataset.mask_files, strict=True)]
-        self.moves = share_of_moving(masks)
-        if not any(mask.any() for mask in masks):
-            say(f"{self.moves}.")
-            return
-        say(f"{self.moves} (--pipeline.datamanager.mask-moving False keeps them).")
-        dataset.moving = masks
-        self.observations = drop_masked(self.observations, dataset)
 
     @cached_property
     def observations(self) -> Observations:
@@ -176,15 +169,13 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         # Samples nothing: ns-export sets its batches' size here.
         self.train_pixel_sampler = self._get_pixel_sampler(self.train_dataset, self.config.train_num_rays_per_batch)
         self._rays = DrawnAhead(self.config.seed, self.device)
-        self.train_ray_generator: Any = self._ray_generator()
         gains = self.calibrated() if self.config.correct_exposure and self.test_mode == "val" else None
         if gains is not None:
             say(gains.describe())
         self.gains = gains if gains is not None and gains.matter else None
         if self.gains is not None:
             self.train_dataset.metadata[GAINS] = self.gains
-        self._reads_by_window = bool(self._sizes(None).sum() > self.config.resident_pixels)
-        if not self._reads_by_window and self.test_mode == "val":
+        if self._sizes(None).sum() <= self.config.resident_pixels and self.test_mode == "val":
             CONSOLE.print(f"Reading {len(self.train_dataset)} training images.")
             self.sources = self._resident = self._read_sources(None)
 
@@ -201,9 +192,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
             posed, self.known_depth, self.train_ray_generator,
             lambda i: image_and_mask(self.train_dataset, i), self.config.seed,
         )  # fmt: skip
-        if ratios is None:
-            return None
-        return image_gains(ratios, len(posed.files), light)
+        return None if ratios is None else image_gains(ratios, len(posed.files), light)
 
     def use_cameras(self, cameras: NDArray[np.int64] | None) -> None:
         """Draws from these training cameras from now on, None for all, and prints the share of each source.
@@ -304,9 +293,9 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         return self.eval_ray_generator(batch["indices"]), batch
 
     def next_train(self, step: int) -> tuple[RayBundle, dict]:
-        """The rays of a step, keyed on (seed, step), as ``RaySources.draw`` gives them.
+        """The rays of a step, keyed on (seed, step), as by ``RaySources.draw``.
 
-        Outside training (ns-export always requests step 0) there are only pixel rays, different ones in each call.
+        Outside training (ns-export always requests step 0) only pixel rays, different ones in each call.
         """
         self.train_count += 1
         if self.sources is None:  # nobody said which window

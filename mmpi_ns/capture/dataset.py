@@ -141,8 +141,8 @@ def read_depth_image(file: Path, unit: float) -> NDArray[np.float32]:
     """Depths of a sensor along the optical axis [h, w], scene units; 0 where unknown.
 
     Args:
-        file: 16-bit PNG or .npy, as nerfstudio's data parsers list it (depth_file_path).
-        unit: length of a depth of 1 (depth_unit_scale_factor), scene units.
+        file: 16-bit PNG or .npy (nerfstudio's depth_file_path).
+        unit: scene units of a depth of 1 (nerfstudio's depth_unit_scale_factor).
 
     Raises:
         InputError: the file cannot be read or holds something else (names it).

@@ -1,11 +1,10 @@
 """Depth of most pixels of the training images: dense matches between neighbouring views, each with its error.
 
 Every image is compared with its nearest neighbours. A rough depth, interpolated from SfM points, warps the neighbour
-into the image, so that the remaining displacement, found by DIS optical flow, is small whatever the motion was. A match
-on its epipolar line gives an inverse depth; consistent matches of several neighbours are averaged. A large image is
-matched at half its size first; each round starts from the depths of the previous one. Images are independent of each
-other but for a last check, so that threads share them: OpenCV and NumPy release Python's lock. An image is in memory
-while its neighbours are worked on, so that memory does not grow with the length of a capture in order.
+into the image, so that the remaining displacement, found by DIS optical flow, is small. A match on its epipolar line
+gives an inverse depth; consistent matches of several neighbours are averaged. A large image is matched at half its size
+first; each round starts from the depths of the previous one. Threads share the images (OpenCV and NumPy release
+Python's lock), and an image is in memory only while its neighbours are worked on.
 
 A point at inverse depth q appears in the neighbour at the homogeneous pixel a + q b, where a is linear in the pixel. A
 match there gives two linear equations r + q s = 0, in pixels once divided by the point's depth: q is their
@@ -28,7 +27,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 
 from mmpi_ns.capture.tracks import PosedImages
-from mmpi_ns.capture.views import Map, View, camera_matrix, load_view, look_up, pixel_grid
+from mmpi_ns.capture.views import Map, View, camera_matrix, load_view, look_up, pixel_grid, strips
 from mmpi_ns.scene.near_views import nearest_views
 from mmpi_ns.utils.host import give_back_freed_memory
 from mmpi_ns.utils.parallel import num_threads, one_thread_each
@@ -37,10 +36,8 @@ T = TypeVar("T")
 Progress = Callable[[Iterable[Any], int], Iterable[Any]]
 """Wraps what is worked on, of which there is this much."""
 
-NEIGHBOURS = 4
-"""Neighbours that each image is compared with."""
-MAX_ANGLE = 40.0
-"""Degrees between the facing directions of images that are compared."""
+NEIGHBOURS, MAX_ANGLE = 4, 40.0
+"""Nearest views that each image is compared with, and the largest angle in degrees between their directions."""
 LARGE = 640
 """Pixels along the longer side of a large image."""
 LEAST_FLOW = 16
@@ -48,26 +45,21 @@ LEAST_FLOW = 16
 SMALLEST = 12
 """Pixels of the longer side that OpenCV's optical flow needs."""
 ROUNDS = {False: (1, 1, 1), True: (2, 1)}
-"""Rounds of matching of small and of large images, each at the working size divided by this; each starts from the
-depths of the previous one."""
+"""Rounds of matching, of small and of large images, each at the working size divided by this."""
 SECONDS = 0.95
 """Processor seconds for a million working pixels of an image, for the forecast (docs/log/performance.md)."""
 STRIDE, ITERATIONS = {False: 5, True: 6}, 8
-"""Pixels between the patches of the optical flow in small and in large images, and iterations of each."""
-NOISE = 0.3
-"""Standard deviation of a match, working pixels, where images look alike."""
-MAX_EPIPOLAR = 1.0
-"""Working pixels that a match may lie off its epipolar line."""
+"""Pixels between patches of the optical flow, in small and in large images, and iterations."""
+NOISE, MAX_EPIPOLAR = 0.3, 1.0
+"""Standard deviation of a match where images look alike, and its largest epipolar distance, working pixels."""
 WINDOW = 7
 """Side of the window in which images are compared, working pixels."""
-MIN_CORRELATION = 0.5
-MIN_CONTRAST = 1.0
-"""Standard deviation of gray levels in a window below which there is nothing to match."""
+MIN_CORRELATION, MIN_CONTRAST = 0.5, 1.0
+"""Least correlation of windows that match, and least standard deviation of their gray levels."""
 AGREE = 2.5
 """Matches agree if they differ by at most this many standard deviations."""
 EDGE, STEP = 9, 1.1
-"""An edge: inverse depths that differ by this factor within a window of this many pixels. Background there takes on the
-motion of the foreground, because windows reach across."""
+"""An edge: inverse depths that differ by this factor in a window of this many pixels. Background there moves along."""
 OWN_CONTRAST = 4.0
 """Standard deviation of gray levels in 3 x 3 pixels that a match near an edge needs."""
 SAME_DEPTH = 0.03
@@ -77,9 +69,7 @@ MAX_RELATIVE = 0.15
 PRIOR_ERROR = 0.5
 """Relative error of the initial rough depths, against which measured ones are weighted."""
 TRIMMED = 8
-"""Images after which memory that is free goes back: glibc keeps it in pieces, for each thread its own."""
-STRIP = 2**16
-"""Pixels that are worked on at once: their numbers stay in a core's cache."""
+"""Images after which free memory goes back: glibc keeps it in pieces, for each thread its own."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +80,7 @@ class Depth:
     error: Map
 
 
-def rough_inverse_depth(view: View, points: NDArray[np.float64], step: int = 8) -> Map:
+def rough_inverse_depth(view: View, points: NDArray[np.float64]) -> Map:
     """Inverse depth of every pixel [h, w], interpolated between SfM points [P, 3] that the image saw."""
     height, width = view.gray.shape
     local = (points - view.pose[:, 3]) @ view.pose[:, :3]
@@ -103,17 +93,12 @@ def rough_inverse_depth(view: View, points: NDArray[np.float64], step: int = 8) 
     if len(at) < 4 or np.linalg.matrix_rank(at - at.mean(0), tol=1.0) < 2:
         middle = float(np.median(inverse)) if len(inverse) else 0.0
         return np.full((height, width), middle, np.float32)
+    step = 8
     x, y = np.meshgrid(np.arange(0, width + step, step), np.arange(0, height + step, step))
     between, nearest = LinearNDInterpolator(at, inverse)(x, y), NearestNDInterpolator(at, inverse)(x, y)
     coarse = np.where(np.isfinite(between), between, nearest).astype(np.float32)
     grid_x, grid_y = pixel_grid((height, width))
     return look_up(coarse, grid_x / step + 0.5, grid_y / step + 0.5)
-
-
-def strips(shape: tuple[int, ...]) -> Iterator[slice]:
-    """Rows of an image of this shape, in parts of about ``STRIP`` pixels."""
-    rows = max(1, STRIP // shape[-1])
-    return (slice(first, min(first + rows, shape[-2])) for first in range(0, shape[-2], rows))
 
 
 @dataclass(frozen=True)
@@ -139,8 +124,7 @@ class Parallax:
         return [(m[0] * x).astype(np.float32) + (m[1] * y + m[2]).astype(np.float32) for m in self.linear]
 
     def pixels(self, inverse: Map) -> tuple[Map, Map, Map]:
-        """Pixels x and y at which points lie at these inverse depths, far outside where they are behind, and their
-        depths there over those here. [h, w] each"""
+        """Pixels x and y of points at these inverse depths, far outside if behind, and their depths over those here."""
         maps = x, y, depth = np.empty_like(inverse), np.empty_like(inverse), np.empty_like(inverse)
         for rows in strips(inverse.shape):
             for part, a, b in zip(maps, self.a(rows, inverse.shape[1]), self.b, strict=True):
@@ -155,8 +139,7 @@ class Parallax:
         return x, y, depth
 
     def solve(self, x: Map, y: Map, rows: slice) -> tuple[Map, Map, Map]:
-        """Inverse depth of matches at pixels (x, y) of some rows, and the squares of their distance from the epipolar
-        line and of the parallax."""
+        """Inverse depth of matches at pixels (x, y) of some rows, and squares of epipolar distance and parallax."""
         a = self.a(rows, x.shape[1])
         r1, s1 = a[0] - x * a[2], self.b[0] - x * self.b[2]
         r2, s2 = a[1] - y * a[2], self.b[1] - y * self.b[2]
@@ -173,12 +156,7 @@ def measure(
 ) -> tuple[Map, Map]:
     """Inverse depths of a view's pixels by comparison with another view, and one over their squared errors (0: none).
 
-    Args:
-        view: the image that gets depths.
-        neighbour: the image that it is compared with.
-        start: rough inverse depths. [h, w]
-        flow: finds small motions.
-        of_view: its ``mean_and_contrast``.
+    ``start`` holds rough inverse depths [h, w], ``flow`` finds small motions, ``of_view`` is ``mean_and_contrast``.
     """
     parallax = Parallax.between(view, neighbour)
     x, y, _ = parallax.pixels(start)
@@ -202,7 +180,7 @@ def measure(
 
 def mean_and_contrast(image: NDArray[np.uint8]) -> tuple[Map, Map]:
     """Mean and standard deviation in a window about each pixel of an image."""
-    mean, contrast = _mean(image), _mean_square(image)
+    mean, contrast = _mean(image), _mean(image, squared=True)
     for rows in strips(image.shape):
         contrast[rows] -= mean[rows] * mean[rows]
         np.sqrt(np.maximum(contrast[rows], 0, out=contrast[rows]), out=contrast[rows])
@@ -218,19 +196,16 @@ def correlation(a: NDArray[np.uint8], b: NDArray[np.uint8], of_a: tuple[Map, Map
     return alike
 
 
-def _mean(x: NDArray[Any], side: int = WINDOW) -> Map:
-    return np.asarray(cv2.boxFilter(x, cv2.CV_32F, (side, side), borderType=cv2.BORDER_REPLICATE), np.float32)
-
-
-def _mean_square(x: NDArray[np.uint8], side: int = WINDOW) -> Map:
-    return np.asarray(cv2.sqrBoxFilter(x, cv2.CV_32F, (side, side), borderType=cv2.BORDER_REPLICATE), np.float32)
+def _mean(x: NDArray[Any], side: int = WINDOW, *, squared: bool = False) -> Map:
+    """Mean of an image, or of its squares, in a square about each pixel."""
+    box_filter = cv2.sqrBoxFilter if squared else cv2.boxFilter
+    return np.asarray(box_filter(x, cv2.CV_32F, (side, side), borderType=cv2.BORDER_REPLICATE), np.float32)
 
 
 def fuse(inverse: NDArray[np.float32], weight: NDArray[np.float32]) -> Depth:
-    """The mean of the largest consistent subset of n measurements [n, h, w], and its expected error.
+    """The mean of the largest consistent subset of n measurements [n, h, w], and its error, at least their scatter.
 
-    A single measurement counts if there is no other; ``confirmed`` checks it in another image. Weights are one over
-    squared errors, 0 where there is no measurement. The error is at least the scatter of the measurements averaged.
+    Weights are one over squared errors, 0 without a measurement. A single one counts if there is no other.
     """
     depth, count = Depth(*np.empty((2, *inverse.shape[1:]), np.float32)), len(inverse)
     for rows in strips(inverse.shape):
@@ -294,12 +269,12 @@ def find_depths(
         images: the training images in their originals.
         points_of: SfM points [P, 3] that an image saw.
         width: working size, pixels.
-        finish: makes the result of an image from its number, its view at working size, and its depths.
+        finish: makes an image's result from its number, its view at working size, and its depths.
         progress: wraps the images as they are worked on, each twice.
-        rounds: of matching; None for those of ``ROUNDS``.
+        rounds: of matching; None: by size.
     """
     with one_thread_each(), ThreadPoolExecutor(num_threads()) as pool:
-        results = _Pipeline(images, points_of, width, finish, pool, rounds).results(num_threads() + 1)
+        results = _Pipeline(images, points_of, width, finish, rounds).results(pool, num_threads() + 1)
         for n, (is_last, result) in enumerate(progress(results, 2 * len(images.files))):
             if n % TRIMMED == 0:
                 give_back_freed_memory()
@@ -308,7 +283,10 @@ def find_depths(
 
 
 class _Pipeline(Generic[T]):
-    """Images on their way through a pool of threads: matched, then confirmed, then forgotten, in order."""
+    """Images on their way through a pool of threads: matched, then confirmed, then forgotten, in order.
+
+    Arguments as of ``find_depths``.
+    """
 
     def __init__(
         self,
@@ -316,55 +294,47 @@ class _Pipeline(Generic[T]):
         points_of: Callable[[int], NDArray[np.float64]],
         width: int,
         finish: Callable[[int, View, Depth], T],
-        pool: ThreadPoolExecutor,
         rounds: Sequence[int] | None,
     ) -> None:
-        """Arguments as of ``find_depths``."""
-        self.rounds = rounds
-        self.images, self.points_of, self.width, self.finish, self.pool = images, points_of, width, finish, pool
-        self.numbers = range(len(images.files))
-        self.near = [nearest_views(images.camera_to_worlds, i, NEIGHBOURS, MAX_ANGLE) for i in self.numbers]
-        self.freed: list[list[int]] = [[] for _ in self.numbers]
+        self.images, self.points_of, self.width, self.finish, self.rounds = images, points_of, width, finish, rounds
+        count = len(images.files)
+        self.near = [nearest_views(images.camera_to_worlds, i, NEIGHBOURS, MAX_ANGLE) for i in range(count)]
+        last_uses = list(range(count))
+        for i, neighbours in enumerate(self.near):
+            for j in neighbours:
+                last_uses[j] = max(last_uses[j], i)
+        self.freed: list[list[int]] = [[] for _ in range(count)]
         """Images that none needs after this one."""
-        for j, last in enumerate(last_uses(self.near)):
+        for j, last in enumerate(last_uses):
             self.freed[last].append(j)
         self.views: dict[int, Future[View]] = {}
         self.depths: dict[int, Future[Depth]] = {}
 
-    def match(self, i: int) -> Future[Depth]:
-        for j in (i, *self.near[i]):
-            if j not in self.views:
-                self.views[j] = self.pool.submit(load_view, self.images, j, self.width)
-        mine, others = self.views[i], [self.views[j] for j in self.near[i]]
-        return self.pool.submit(
-            lambda: matched(mine.result(), [v.result() for v in others], self.points_of(i), self.rounds)
-        )
+    def match(self, i: int) -> Depth:
+        view, *others = (self.views[j].result() for j in (i, *self.near[i]))
+        return matched(view, others, self.points_of(i), self.rounds)
 
-    def confirm(self, i: int) -> Future[T]:
-        view, depth = self.views[i], self.depths[i]
-        others = [(self.views[j], self.depths[j]) for j in self.near[i]]
+    def confirm(self, i: int) -> T:
+        (view, depth), *others = ((self.views[j].result(), self.depths[j].result()) for j in (i, *self.near[i]))
+        return self.finish(i, view, confirmed(view, depth, others))
 
-        def run() -> T:
-            agreed = confirmed(view.result(), depth.result(), [(v.result(), d.result()) for v, d in others])
-            return self.finish(i, view.result(), agreed)
-
-        return self.pool.submit(run)
-
-    def tasks(self) -> Iterator[tuple[Future[Any], int | None]]:
-        """Each after what it waits for, so that no thread waits for one that has not begun; an image's last task with
-        its number."""
+    def tasks(self, pool: ThreadPoolExecutor) -> Iterator[tuple[Future[Any], int | None]]:
+        """In an order in which no thread waits for a later task; an image's last one comes with its number."""
         first = 0
-        for i in self.numbers:
-            self.depths[i] = self.match(i)
+        for i, neighbours in enumerate(self.near):
+            for j in (i, *neighbours):
+                if j not in self.views:
+                    self.views[j] = pool.submit(load_view, self.images, j, self.width)
+            self.depths[i] = pool.submit(self.match, i)
             yield self.depths[i], None
-            while first < len(self.numbers) and max([first, *self.near[first]]) <= i:
-                yield self.confirm(first), first
+            while first < len(self.near) and max([first, *self.near[first]]) <= i:
+                yield pool.submit(self.confirm, first), first
                 first += 1
 
-    def results(self, ahead: int) -> Iterator[tuple[bool, Any]]:
-        """Results of the tasks, of which so many are worked on at once, and whether they are an image's last."""
+    def results(self, pool: ThreadPoolExecutor, ahead: int) -> Iterator[tuple[bool, Any]]:
+        """Results of the tasks, ``ahead`` of which are in work at once, and whether they are an image's last."""
         waiting: deque[tuple[Future[Any], int | None]] = deque()
-        for task in chain(self.tasks(), repeat(None, ahead)):
+        for task in chain(self.tasks(pool), repeat(None, ahead)):
             if len(waiting) == ahead or (task is None and waiting):
                 future, number = waiting.popleft()
                 yield number is not None, future.result()
@@ -372,15 +342,6 @@ class _Pipeline(Generic[T]):
                     del self.views[j], self.depths[j]
             if task is not None:
                 waiting.append(task)
-
-
-def last_uses(near: list[list[int]]) -> list[int]:
-    """The last image that needs each image, itself or as a neighbour."""
-    last = list(range(len(near)))
-    for i, neighbours in enumerate(near):
-        for j in neighbours:
-            last[j] = max(last[j], i)
-    return last
 
 
 def matched(view: View, others: list[View], points: NDArray[np.float64], rounds: Sequence[int] | None = None) -> Depth:
@@ -411,8 +372,9 @@ def without_fringes(view: View, depth: Depth) -> Depth:
     """Removes the fringe around a foreground object where the background has no texture of its own."""
     has_depth = depth.inverse > 0
     least = cv2.erode(np.where(has_depth, depth.inverse, 1e30).astype(np.float32), np.ones((EDGE, EDGE), np.uint8))
-    variance = _mean_square(view.gray, 3) - _mean(view.gray, 3) ** 2
-    return _only(depth, has_depth & ((depth.inverse / STEP < least) | (variance > OWN_CONTRAST**2)))
+    variance = _mean(view.gray, 3, squared=True) - _mean(view.gray, 3) ** 2
+    kept = has_depth & ((depth.inverse / STEP < least) | (variance > OWN_CONTRAST**2))
+    return Depth(np.where(kept, depth.inverse, 0), np.where(kept, depth.error, 0))
 
 
 def confirmed(view: View, depth: Depth, others: list[tuple[View, Depth]]) -> Depth:
@@ -428,8 +390,5 @@ def confirmed(view: View, depth: Depth, others: list[tuple[View, Depth]]) -> Dep
             both, apart = (inverse > 0) & (expected > 0), inverse - expected
             confirm[rows] += both & (np.abs(apart) < tolerance)
             contradict[rows] += both & (apart < -tolerance)
-    return _only(depth, (confirm >= 1) & (confirm > contradict))
-
-
-def _only(depth: Depth, kept: NDArray[np.bool_]) -> Depth:
+    kept = (confirm >= 1) & (confirm > contradict)
     return Depth(np.where(kept, depth.inverse, 0), np.where(kept, depth.error, 0))

@@ -5,9 +5,9 @@ Sources, later ones replacing earlier ones: dense matches (``dense.py``), SfM po
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property, partial
 from pathlib import Path
 from typing import cast
 
@@ -22,15 +22,15 @@ from PIL import Image
 from rich.progress import track
 from torch import Tensor
 
-from mmpi_ns.capture.cache import Arrays, Computed, Pairs, digest, remembered
+from mmpi_ns.capture.cache import Computed, digest, remembered
 from mmpi_ns.capture.dataset import MMPIDataset, read_depth_image
-from mmpi_ns.capture.dense import SECONDS, STRIP, Depth, find_depths, strips
+from mmpi_ns.capture.dense import SECONDS, Depth, find_depths
 from mmpi_ns.capture.lone_depth import continued, is_lone
 from mmpi_ns.capture.loose_points import POINT_ERROR, contradict, see_points
 from mmpi_ns.capture.observe import drop_masked, posed_images
 from mmpi_ns.capture.rays import Rays
 from mmpi_ns.capture.tracks import PosedImages, at_full_size
-from mmpi_ns.capture.views import View, camera_matrix, look_up
+from mmpi_ns.capture.views import STRIP, View, look_up, straightened, strips
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.utils.errors import duration, say
 from mmpi_ns.utils.host import give_back_freed_memory
@@ -70,13 +70,8 @@ class KnownDepth:
     """[H, W, 2] each, by ``packed``; mapped from a file or computed when read, so that they take no memory."""
 
     @staticmethod
-    def of(maps: Iterable[Map]) -> KnownDepth:
-        """From the numbers themselves [H, W, 2]."""
-        return KnownDepth(tuple(packed(m) for m in maps))
-
-    @staticmethod
     def nothing(sizes: NDArray[np.float64]) -> KnownDepth:
-        """For images of these sizes (width, height). Takes no memory, and cannot be written to."""
+        """For images of these sizes (width, height); takes no memory."""
         unknown = np.int16(UNKNOWN)
         return KnownDepth(tuple(np.broadcast_to(unknown, (int(h), int(w), 2)) for w, h in sizes))
 
@@ -94,7 +89,7 @@ class KnownDepth:
 def packed(values: ArrayLike) -> Codes:
     """Logarithms of positive numbers in steps of 1/1024 of an octave, for 1/t and errors from 2^-31 to 2^31; 0 is kept.
 
-    Relative steps, as a distance's error is relative too, whatever the unit of the scene.
+    Steps are relative, as the error of a distance is.
     """
     values = np.asarray(values, np.float32)
     codes, flat = np.empty(values.shape, np.int16), values.reshape(-1)
@@ -107,7 +102,7 @@ def packed(values: ArrayLike) -> Codes:
 
 
 def unpacked(codes: Int16[Tensor, "*N"]) -> Float[Tensor, "*N"]:
-    """The numbers that ``packed`` made codes of."""
+    """The inverse of ``packed``."""
     return torch.where(codes == UNKNOWN, 0.0, torch.exp2(codes.float() / OCTAVE))
 
 
@@ -122,19 +117,18 @@ def know_depths(
 ) -> tuple[KnownDepth | None, Observations]:
     """All available depths of the training images, and the observations with the points of a cloud, if there is one.
 
+    The depths are None if there is neither matching, a sensor nor a cloud.
+
     Args:
         outputs: of the data parser.
-        observations: their cameras, tracks and loose points.
+        observations: cameras, tracks and loose points of the images.
         dataset: the images.
-        rays: makes rays through their pixel centres (image, row, column).
-        dense: whether to match neighbouring images.
-        sensor: whether to read depth images.
-
-    Returns:
-        The depths; None if there is neither matching, a sensor nor a cloud. The observations.
+        rays: makes rays through pixel centres (image, row, column).
+        dense: match neighbouring images.
+        sensor: read depth images.
 
     Raises:
-        InputError: an image or a depth image cannot be used (names it).
+        InputError: an image or depth image cannot be used (names it).
     """
     if not (dense or sensor or observations.loose is not None):
         return None, observations
@@ -172,30 +166,26 @@ def _remembered_depths(original: PosedImages, posed: PosedImages, observations: 
     widest, pixels = max(w for _, w in shapes), sum(w * h for h, w in shapes)
     width = int(min(WIDEST, widest * min(FINER, (MOST_WORKING / pixels) ** 0.5)))
 
-    def finish(i: int, view: View, depth: Depth) -> Codes:
-        return packed(at_training_pixels(view, depth, original, i, shapes[i], file_shapes[i]))
-
-    def match() -> Pairs:
+    def match() -> Iterable[Codes]:
         threads = num_threads()
         seconds = SECONDS * 1e-6 * sum(float(min(1, width / w) ** 2 * w * h) for w, h in original.sizes) / threads
         CONSOLE.print(
             f"Matching {len(shapes)} images densely, at most {width} pixels wide: about {duration(seconds)} with "
             f"{threads} thread(s)."
         )
-        codes = find_depths(
-            original, lambda i: points[seen_by == i], width, finish,
+        return find_depths(
+            original, lambda i: points[seen_by == i], width,
+            lambda i, view, depth: packed(at_training_pixels(view, depth, original, i, shapes[i], file_shapes[i])),
             progress=lambda work, count: track(work, "Depths", count, console=CONSOLE),
         )  # fmt: skip
-        return ((f"{i}", image) for i, image in enumerate(codes))
 
     cameras = original.camera_to_worlds, original.intrinsics, original.distortion, original.fisheye
-    key = digest(original.files, "depths", VERSION, width, shapes, *cameras, seen_by, points)
-    stored = remembered(key, match)
-    return _stored(stored)
+    return _from_cache(digest(original.files, "depths", VERSION, width, shapes, *cameras, seen_by, points), match)
 
 
-def _stored(arrays: Arrays) -> KnownDepth:
-    """What was stored by the numbers of the images."""
+def _from_cache(key: str, find: Callable[[], Iterable[Codes]]) -> KnownDepth:
+    """The codes of all images in turn, from the cache if the key is there."""
+    arrays = remembered(key, lambda: ((f"{i}", codes) for i, codes in enumerate(find())))
     return KnownDepth(Computed(len(arrays), lambda i: cast(Codes, arrays[f"{i}"])))
 
 
@@ -227,21 +217,17 @@ def with_sensor(
 def at_training_pixels(
     view: View, depth: Depth, original: PosedImages, i: int, shape: tuple[int, int], file_shape: tuple[int, int]
 ) -> Map:
-    """Distances of a training image's pixels from the depths of its view at working size.
+    """Inverse distances of a training image's pixels and their errors [H, W, 2] from its depths at working size.
 
-    A training pixel takes the mean over its area, weighted by certainty; the spread within the area, large at an
-    edge, is added to its error. One that is smaller than a working pixel takes the depth of that.
+    A pixel takes the mean over its area, weighted by certainty; the spread within, large at an edge, is added to its
+    error. One that is smaller than a working pixel takes its depth.
 
     Args:
         view: the image at working size.
-        depth: its depths.
-        original: cameras of the originals.
-        i: the image's place in them.
+        depth: at working size.
+        original: cameras of the originals; i is the image's place in them.
         shape: height and width of the training image.
         file_shape: height and width of its file, which may have a row or column more.
-
-    Returns:
-        [H, W, 2] inverse distance and expected error.
     """
     height, width = (min(pair) for pair in zip(shape, view.gray.shape, strict=True))
     maps, distances = pooled(depth, (height, width)), np.empty((*shape, 2), np.float32)
@@ -272,64 +258,25 @@ def pooled(depth: Depth, shape: tuple[int, int]) -> tuple[Map, Map]:
     return np.where(kept, mean, 0).astype(np.float32), np.where(kept, error, 0).astype(np.float32)
 
 
-def straightened(
-    original: PosedImages, i: int, shape: tuple[int, int], file_shape: tuple[int, int], some: slice | None = None
-) -> NDArray[np.float64]:
-    """Tangents (right, down) at which a training image's pixels look, lens taken out; of some rows. [2, H, W]"""
-    lens = tuple(original.distortion[i]) if original.is_bent(i) else ()
-    camera = tuple(original.sizes[i]), tuple(original.intrinsics[i]), lens, original.is_fisheye(i)
-    parts = [
-        _straightened_rows(*camera, shape[1], file_shape, rows.start, rows.stop)
-        for rows in ([some] if some else strips(shape))
-    ]
-    return parts[0] if some else np.concatenate(parts, 1)
-
-
-@lru_cache(maxsize=32)
-def _straightened_rows(
-    size: tuple[float, float],
-    pinhole: tuple[float, ...],
-    lens: tuple[float, ...],
-    fisheye: bool,
-    width: int,
-    file_shape: tuple[int, int],
-    first: int,
-    last: int,
-) -> NDArray[np.float64]:
-    """The same of a strip of rows: cameras of one lens share them."""
-    columns, rows = np.meshgrid(np.arange(width) + 0.5, np.arange(first, last) + 0.5)
-    at = np.stack([columns * size[0] / file_shape[1], rows * size[1] / file_shape[0]], -1).reshape(-1, 1, 2)
-    fx, fy, cx, cy = pinhole
-    if lens:
-        straighten = cv2.fisheye.undistortPoints if fisheye else cv2.undistortPoints
-        tangents = straighten(at, camera_matrix(np.array(pinhole)), np.array(lens))
-    else:
-        tangents = (at - [cx, cy]) / [fx, fy]
-    return np.ascontiguousarray(np.moveaxis(tangents.reshape(*columns.shape, 2), -1, 0), np.float64)
-
-
 def with_continued(known: KnownDepth, posed: PosedImages, dataset: MMPIDataset, rays: Rays) -> KnownDepth:
     """Extrapolates surfaces into regions that hardly any other image shows (``lone_depth.py``); cached.
 
     Masked pixels have no distance: what moves is nowhere.
     """
     count = len(known.codes)
-
-    def continue_all() -> Pairs:
-        codes = in_order(lambda i: _continued_codes(known.codes[i], i, posed, dataset, rays), range(count))
-        shown = track(codes, "Extrapolating surfaces", count, console=CONSOLE)
-        return ((f"{i}", image) for i, image in enumerate(shown))
-
     cameras = posed.camera_to_worlds, posed.intrinsics, posed.distortion, posed.fisheye
     masks = [digest((), dataset.usable(i)) for i in range(count)] if dataset.has_masks else []
     contents = [digest((), codes) for codes in known.codes]
     key = digest(posed.files, "continued", VERSION, *cameras, contents, masks)
-    return _stored(remembered(key, continue_all))
+    codes_of = partial(_continued_codes, known, posed, dataset, rays)
+    return _from_cache(
+        key, lambda: track(in_order(codes_of, range(count)), "Extrapolating surfaces", count, console=CONSOLE)
+    )
 
 
-def _continued_codes(codes: Codes, i: int, posed: PosedImages, dataset: MMPIDataset, rays: Rays) -> Codes:
+def _continued_codes(known: KnownDepth, posed: PosedImages, dataset: MMPIDataset, rays: Rays, i: int) -> Codes:
     """Codes of one image with extrapolated surfaces; computed for every n-th pixel of a large image."""
-    codes, hidden = np.array(codes), ~dataset.usable(i)
+    codes, hidden = np.array(known.codes[i]), ~dataset.usable(i)
     codes[hidden] = UNKNOWN
     step = -(-max(codes.shape[:2]) // CONTINUED)
     rows, columns = (np.minimum(np.arange(0, n, step) + step // 2, n - 1) for n in codes.shape[:2])
@@ -351,14 +298,22 @@ def _continued_codes(codes: Codes, i: int, posed: PosedImages, dataset: MMPIData
 def of_cells(observations: Observations, known: KnownDepth, dataset: MMPIDataset) -> Observations:
     """The observations that placement weighs: of each image cell the pixel with the most certain depth.
 
-    Each cell counts once. Keypoints come before them unless they are ``MOST_KEYPOINTS`` times as many: they would then
-    draw MPIs and texels to the parts of the images that an SfM model or a cloud is densest in. Where no depth is known
-    at all, the observations stay as they are.
+    Keypoints come before them unless they are ``MOST_KEYPOINTS`` times as many: they would then draw MPIs and texels
+    to the parts of the images that an SfM model or a cloud is densest in. Without depths nothing changes.
     """
 
     def points_of(i: int) -> NDArray[np.float64]:
         depth = known.image(i)
-        rows, columns = best_of_cells(depth)
+        height, width = depth.shape[:2]
+        side = max(1, -(-max(height, width) // CELLS))
+        relative = np.full((-(-height // side) * side, -(-width // side) * side), np.inf, np.float32)
+        relative[:height, :width] = np.where(
+            depth[..., 0] > 0, depth[..., 1] / np.maximum(depth[..., 0], 1e-12), np.inf
+        )
+        cells = relative.reshape(len(relative) // side, side, -1, side).swapaxes(1, 2).reshape(-1, side * side)
+        best, known_cells = cells.argmin(1), np.nonzero(np.isfinite(cells.min(1)))[0]
+        down, across = np.divmod(known_cells, relative.shape[1] // side)
+        rows, columns = down * side + best[known_cells] // side, across * side + best[known_cells] % side
         if not len(rows):  # some of nerfstudio's lenses cannot make no rays
             return observations.points[:0]
         coords = torch.from_numpy(np.stack([rows, columns], -1) + 0.5).float()
@@ -382,19 +337,6 @@ def of_cells(observations: Observations, known: KnownDepth, dataset: MMPIDataset
     )
 
 
-def best_of_cells(depth: Map) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Row and column of the most certain pixel of every cell of an image [H, W, 2] that has one."""
-    height, width = depth.shape[:2]
-    side = max(1, -(-max(height, width) // CELLS))
-    padded = np.full((-(-height // side) * side, -(-width // side) * side), np.inf, np.float32)
-    padded[:height, :width] = np.where(depth[..., 0] > 0, depth[..., 1] / np.maximum(depth[..., 0], 1e-12), np.inf)
-    cells = padded.reshape(padded.shape[0] // side, side, -1, side).swapaxes(1, 2).reshape(-1, side * side)
-    best = cells.argmin(1)
-    kept = np.nonzero(np.isfinite(cells.min(1)))[0]
-    down, across = np.divmod(kept, padded.shape[1] // side)
-    return down * side + best[kept] // side, across * side + best[kept] % side
-
-
 def with_points(known: KnownDepth, observations: Observations) -> KnownDepth:
     """Adds the distances of SfM points at the pixels that saw them; the nearest where several fall on one."""
     cameras, points = observations.tracked
@@ -416,15 +358,9 @@ def with_points(known: KnownDepth, observations: Observations) -> KnownDepth:
 def read_sensor(
     file: Path, unit: float, original: PosedImages, i: int, shape: tuple[int, int], file_shape: tuple[int, int]
 ) -> Map:
-    """Distances from a depth image (along the optical axis, 0 where unknown), for a training image's pixels.
+    """Inverse distances of a training image's pixels and their errors [H, W, 2] from a depth image; 0 where unknown.
 
-    Args:
-        file: 16-bit PNG or .npy.
-        unit: length of a depth of 1, scene units.
-        original: cameras of the originals.
-        i: the image's place in them.
-        shape: height and width of the training image.
-        file_shape: height and width of its file.
+    Arguments as of ``at_training_pixels``, but for the file and ``unit``, the scene units of a depth of 1.
 
     Raises:
         InputError: the file cannot be read (names it).

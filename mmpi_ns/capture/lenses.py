@@ -57,11 +57,12 @@ def check_lenses(meta: Mapping[str, Any], frames: Sequence[Mapping[str, Any]], p
         if key not in checked:
             checked.add(key)
             where = path if is_shared and set(meta) >= set(CAMERA) else f"{cut(frame['file_path'])} in {path}"
-            _check_camera(camera, MODELS[model], str(where))
-            _check_distortion(camera, lens, params, MODELS[model], str(where))
+            _check_camera(camera, lens, params, MODELS[model], str(where))
 
 
-def _check_camera(camera: Mapping[str, Any], kind: CameraType, where: str) -> None:
+def _check_camera(
+    camera: Mapping[str, Any], lens: Mapping[str, Any], params: Any, kind: CameraType, where: str
+) -> None:
     for key in ("w", "h"):
         check_number(f"The {key} of {where}", camera[key], SIDE)
         if camera[key] != int(camera[key]):
@@ -83,11 +84,6 @@ def _check_camera(camera: Mapping[str, Any], kind: CameraType, where: str) -> No
                 f"The principal point {key} of {where} is {camera[key]:g}, outside the image of {camera[side]:g} "
                 "pixels: give cx, cy, w and h for images of one size."
             )
-
-
-def _check_distortion(
-    camera: Mapping[str, Any], lens: Mapping[str, Any], params: Any, kind: CameraType, where: str
-) -> None:
     for key, value in lens.items():
         check_number(f"The distortion {key} of {where}", value, Number(-1, 1) if key in TANGENTIAL else Number())
     if params is not None or kind == CameraType.FISHEYE624:

@@ -37,7 +37,7 @@ def load_observations(
         data: the scene's folder.
         downscale_factor: size of the images, as for the data parser; None leaves it to the parser.
         parser: format of the scene; auto means nerfstudio's format if there is a transforms.json.
-        moving: file for a picture of what moves. None: nobody looks for it, nor for the depths of pixels, which take
+        moving: file for a picture of what moves. None: neither movers nor depths of pixels are searched, which takes
             minutes; tracks or a plane sweep take their place.
 
     Raises:

@@ -37,14 +37,10 @@ MOST_OTHERS = 1
 
 
 def continued(depths: Map, directions: Map) -> Map:
-    """Inverse distances of pixels without a depth, from planes fitted to the pixels with one around them.
+    """Inverse distances and errors of pixels without a depth, from planes fitted to the pixels with one around them.
 
-    Args:
-        depths: [H, W, 2] inverse distance, 0 where unknown, and its expected error.
-        directions: [H, W, 3] unit directions of the pixels.
-
-    Returns:
-        [H, W, 2] the same for the other pixels only: 0 where a depth is known, and where no plane fits.
+    Takes the same of all pixels [H, W, 2], 0 where unknown, and their unit directions [H, W, 3]. The result [H, W, 2]
+    is 0 where a depth is known, and where no plane fits.
     """
     inverse, error = depths[..., 0].astype(np.float64), depths[..., 1].astype(np.float64)
     has_depth = inverse > 0
@@ -56,8 +52,16 @@ def continued(depths: Map, directions: Map) -> Map:
     trust = np.where(has_depth, 1 / (1 + (error / np.maximum(LEAST_ERROR * inverse, 1e-30)) ** 2), 0)
     parts = [trust, trust * q * q, *(trust * q * axis for axis in v)]
     parts += [trust * v[i] * v[j] for i, j in _PAIRS]
+    height, width = inverse.shape
     for share in WIDTHS:
-        sums = [_blurred(p, share * max(inverse.shape)) for p in parts]
+        # Sums under a wide Gaussian, zero outside, from smaller images.
+        shrink = max(1.0, share * max(height, width) / PIXELS)
+        size, sums = (max(1, round(width / shrink)), max(1, round(height / shrink))), []
+        for part in parts:
+            small = cv2.resize(part, size, interpolation=cv2.INTER_AREA)
+            deviation = share * max(height, width) / shrink
+            small = cv2.GaussianBlur(small, (0, 0), deviation, borderType=cv2.BORDER_CONSTANT)
+            sums.append(cv2.resize(small, (width, height), interpolation=cv2.INTER_LINEAR))
         rows, columns = np.nonzero((sums[0] > ENOUGH) & (best > LEAST_ERROR))
         value, deviation = _planes([s[rows, columns] for s in sums], [axis[rows, columns] for axis in v])
         relative = np.where(value > 0, np.maximum(deviation / np.maximum(value, 1e-12), LEAST_ERROR), np.inf)
@@ -66,16 +70,6 @@ def continued(depths: Map, directions: Map) -> Map:
         best[rows, columns] = relative
         extended[rows, columns] = scale * np.stack([value, relative * value], -1)
     return extended
-
-
-def _blurred(image: NDArray[np.float64], deviation: float) -> NDArray[np.float64]:
-    """An image after a wide blur with zero padding, computed on a smaller image."""
-    height, width = image.shape
-    shrink = max(1.0, deviation / PIXELS)
-    size = max(1, round(width / shrink)), max(1, round(height / shrink))
-    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-    small = cv2.GaussianBlur(small, (0, 0), deviation / shrink, borderType=cv2.BORDER_CONSTANT)
-    return np.asarray(cv2.resize(small, (width, height), interpolation=cv2.INTER_LINEAR), np.float64)
 
 
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -20,13 +19,12 @@ from rich.progress import track
 from mmpi_ns.capture.cache import Arrays, Computed, digest, remembered
 from mmpi_ns.capture.dataset import MMPIDataset
 from mmpi_ns.capture.dense import Depth, Parallax, Progress, find_depths
-from mmpi_ns.capture.known_depth import straightened
 from mmpi_ns.capture.moving_evidence import Mask, Neighbour, Shot, evidence, ground_of, has_impossible_depth
 from mmpi_ns.capture.moving_objects import followed, grown, seeds
 from mmpi_ns.capture.observe import posed_images
 from mmpi_ns.capture.people import horizon_of, people_in, upright
 from mmpi_ns.capture.tracks import PosedImages, at_full_size
-from mmpi_ns.capture.views import View, look_up, straightened_color
+from mmpi_ns.capture.views import View, look_up, straightened, straightened_color
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.scene.near_views import nearest_views
 from mmpi_ns.utils.errors import duration
@@ -52,38 +50,28 @@ ENOUGH, SAMPLES = 200, 5000
 """Pixels of one depth in both images from which their exposures are compared, at least and at most."""
 
 
-@dataclass(frozen=True)
-class MovingObjects:
-    """Masks of what moves in each image, in its view at working size."""
-
-    views: list[View]
-    masks: list[Mask]
-
-    @property
-    def share(self) -> float:
-        """Share of all pixels."""
-        return sum(int(m.sum()) for m in self.masks) / max(1, sum(m.size for m in self.masks))
-
-
 def find_moving(
     images: PosedImages,
     points_of: Callable[[int], NDArray[np.float64]],
     progress: Progress = lambda work, _: work,
-) -> MovingObjects:
-    """What moves in images, by as many threads as torch has; their number does not change it.
+) -> tuple[list[View], list[Mask]]:
+    """Views of images at working size, and masks of what moves in them; the number of threads does not change it.
 
     Args:
-        images: in their originals.
+        images: the originals.
         points_of: SfM points [P, 3] that an image saw.
         progress: wraps the images as they are worked on.
     """
     width = round(SIDE * float(np.median(np.minimum(1, images.sizes[:, 0] / images.sizes[:, 1]))))
     up = upright(images.camera_to_worlds)
 
-    def finish(i: int, view: View, depth: Depth) -> Shot:
-        return shot_of(images, i, view, depth, up)
+    def shot_of(i: int, view: View, depth: Depth) -> Shot:
+        color = cv2.GaussianBlur(straightened_color(images, i, view), (0, 0), 1.0)
+        ground = ground_of(view, depth, up)
+        horizon = None if ground is None else horizon_of(view, up)
+        return Shot(view, np.asarray(color, np.uint8), depth, ground, horizon, people_in(images, i, view, up))
 
-    shots = list(find_depths(images, points_of, width, finish, progress, ROUNDS))
+    shots = list(find_depths(images, points_of, width, shot_of, progress, ROUNDS))
     near = []
     for i in range(len(shots)):
         nearest = nearest_views(images.camera_to_worlds, i, RANKS[-1] + 1, MAX_ANGLE)
@@ -96,19 +84,12 @@ def find_moving(
         second = list(pool.map(lambda i: _moves(shots, near[i], i, masks, first[i][1]), again))
         for i, (mask, _) in zip(again, second, strict=True):
             masks[i] = mask
-    return MovingObjects([shot.view for shot in shots], masks)
+    return [shot.view for shot in shots], masks
 
 
 def in_image(view: View, mask: Mask, images: PosedImages, i: int, shape: tuple[int, int]) -> Mask:
-    """A mask of an image's view as a mask of the image itself, lens included.
-
-    Args:
-        view: the image at working size.
-        mask: of the view.
-        images: the originals.
-        i: the image's place in them.
-        shape: height and width that are asked for; the image may be a copy of another size.
-    """
+    """A mask of image i at working size as a mask of the image itself, lens included; the image has this height and
+    width, and may be a copy of another size than the original."""
     x, y = straightened(images, i, shape, shape)
     fx, fy, cx, cy = view.pinhole
     return look_up(mask.astype(np.float32), fx * x + cx, fy * y + cy) > EDGE
@@ -120,22 +101,20 @@ def moving_masks(observations: Observations, dataset: MMPIDataset) -> Sequence[M
     posed = posed_images(observations, dataset)
     if posed is None:
         return [np.zeros(shape, bool) for shape in shapes]
-    original, tracked = at_full_size(posed), len(observations.seen_at)
-    seen_by, points = observations.seen_by[:tracked], observations.points[observations.seen_point[:tracked]]
+    original, (seen_by, points) = at_full_size(posed), observations.tracked
 
     def find() -> Arrays:
         # Names a damaged file, of which OpenCV would print warnings first.
         deque(in_order(lambda i: dataset.get_data(i, image_type="uint8"), range(len(dataset))), maxlen=0)
-        seconds = duration(SECONDS * len(shapes) / num_threads())
-        CONSOLE.print(f"Looking for what moves in {len(shapes)} images: about {seconds}.")
-        shown = find_moving(
+        forecast = duration(SECONDS * len(shapes) / num_threads())
+        CONSOLE.print(f"Looking for what moves in {len(shapes)} images: about {forecast}.")
+        views, masks = find_moving(
             original, lambda i: points[seen_by == i],
             progress=lambda work, count: track(work, "Movers", count, console=CONSOLE),
         )  # fmt: skip
-        views = zip(shown.views, shown.masks, shapes, strict=True)
         return {
             f"{i}": np.packbits(in_image(v, m, original, i, s) if m.any() else np.zeros(s, bool))
-            for i, (v, m, s) in enumerate(views)
+            for i, (v, m, s) in enumerate(zip(views, masks, shapes, strict=True))
         }
 
     cameras = original.camera_to_worlds, original.intrinsics, original.distortion, original.fisheye
@@ -158,14 +137,6 @@ def share_of_moving(masks: Sequence[Mask]) -> str:
         f"{100 * shares.mean():.1f} % of the training pixels, in {count} of {len(masks)} images, show what moves and "
         "are masked"
     )
-
-
-def shot_of(images: PosedImages, i: int, view: View, depth: Depth, up: NDArray[np.float64]) -> Shot:
-    """An image at working size."""
-    color = cv2.GaussianBlur(straightened_color(images, i, view), (0, 0), 1.0)
-    ground = ground_of(view, depth, up)
-    horizon = None if ground is None else horizon_of(view, up)
-    return Shot(view, np.asarray(color, np.uint8), depth, ground, horizon, people_in(images, i, view, up))
 
 
 def at_exposure_of(shot: Shot, other: Shot) -> Neighbour:

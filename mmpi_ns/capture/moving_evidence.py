@@ -1,10 +1,9 @@
 """Evidence that a pixel shows something that moves, from neighbouring images, their depths and the ground.
 
 A static point looks alike in all images that see it. So each pixel is compared with its neighbours at every inverse
-depth that a static point there may have: that of the pixel or of what is next to it, those that the neighbours' depths
-put there, the ground's, and infinity. What none of them explains is unexplained; it moves if two neighbours agree about
-something else behind it, or if it is explained by a depth that is impossible: below the ground or behind the camera, as
-of a car ahead that keeps its distance.
+depth that a static point there may have: its own or that of a pixel beside it, the depths of the neighbours, the
+ground's, and infinity. A pixel that none of them explains moves if two neighbours agree about something else behind it,
+or if an impossible depth explains it: below the ground or behind the camera, as of a car ahead that keeps its distance.
 """
 
 from __future__ import annotations
@@ -39,8 +38,7 @@ STEEP = 20.0
 GROUND_SHARE, BELOW_SHARE = 0.08, 0.03
 """Share of the known depths that lie on the ground, at least, and below it, at most."""
 OCCLUDES, NEAR = 1.15, 13
-"""A neighbour shows a point if its inverse depth there is the same but for this factor; depths are asked for in a
-window of so many pixels."""
+"""A neighbour shows a point if its inverse depth in a window of this many pixels is the same but for this factor."""
 NEAREST = 95
 """Percentile of an image's inverse depths that stands for the nearest content."""
 CONSTANT = 3
@@ -90,13 +88,8 @@ class Evidence:
 
 
 def ground_of(view: View, depth: Depth, up: NDArray[np.float64]) -> Map | None:
-    """Inverse depth of the plane on which most of the content stands; 0 near the horizon and above.
-
-    Args:
-        view: the image.
-        depth: its depths.
-        up: unit vector in the world. [3]
-    """
+    """Inverse depth of the plane on which most of the content stands; 0 near the horizon and above. ``up`` is a unit
+    vector in the world. [3]"""
     rows, columns = np.nonzero(depth.inverse > 0)
     random = np.random.default_rng(0)
     kept = random.permutation(len(rows))[:3000]
@@ -194,7 +187,8 @@ def _compare(
         x, y, ahead = other.parallax.pixels(inverse)
         height, width = other.shot.view.gray.shape
         inside = (x > 1) & (x < width - 1) & (y > 1) & (y < height - 1) & (ahead > 0)
-        inside &= look_up(usable(other.shot, mask), x, y, nearest=True) > 0
+        still = other.shot.view.inside if mask is None else other.shot.view.inside & ~mask
+        inside &= look_up(np.ascontiguousarray(still, np.uint8), x, y, nearest=True) > 0
         there = look_up(other.color, x, y)
         low, high = cv2.erode(there, kernel), cv2.dilate(there, kernel)
         apart = most_of_channels(cv2.max(cv2.subtract(low, three), cv2.subtract(three, high)))
@@ -219,12 +213,6 @@ def most_of_channels(apart: NDArray[Any]) -> Bytes:
     return np.asarray(cv2.max(cv2.max(blue, green), red), np.uint8)
 
 
-def usable(shot: Shot, mask: Mask | None) -> Bytes:
-    """Where the lens shows something that is not known to move. [h, w]"""
-    inside = shot.view.inside if mask is None else shot.view.inside & ~mask
-    return np.ascontiguousarray(inside, np.uint8)
-
-
 def has_impossible_depth(shot: Shot, others: Sequence[Neighbour]) -> Mask:
     """Where a depth below the ground or behind the camera explains a shot's pixels, of these neighbours. [h, w]"""
     result = np.zeros(shot.view.gray.shape, bool)
@@ -237,14 +225,8 @@ def has_impossible_depth(shot: Shot, others: Sequence[Neighbour]) -> Mask:
 
 
 def evidence(shot: Shot, others: Sequence[Neighbour], masks: Sequence[Mask | None], impossible: Mask) -> Evidence:
-    """What of a shot no static scene explains.
-
-    Args:
-        shot: the image.
-        others: its neighbours.
-        masks: what moves in each neighbour, as far as is known. [h, w]
-        impossible: by ``has_impossible_depth``. [h, w]
-    """
+    """What of a shot no static scene explains, given masks of what is known to move in its neighbours, and where the
+    shot's depth is impossible. [h, w] each"""
     shape = shot.view.gray.shape
     if len(others) < 2:
         nothing = np.zeros(shape, np.uint8)
@@ -260,23 +242,19 @@ def evidence(shot: Shot, others: Sequence[Neighbour], masks: Sequence[Mask | Non
         for distance in distances:
             second = cv2.min(second, cv2.max(first, distance))
             first = cv2.min(first, distance)
-        for nearest, of_depth in ((one, first), (two, second)):
-            np.minimum(nearest, of_depth, out=nearest, where=possible)
+        for least, of_depth in ((one, first), (two, second)):
+            np.minimum(least, of_depth, out=least, where=possible)
         np.maximum(behind, pair, out=behind, where=possible)
-    decided = _would_be_seen(shot, others) & shot.view.inside
+    # Nobody can tell where fewer than two neighbours would show even the nearest content.
+    measured = shot.depth.inverse[shot.depth.inverse > 0]
+    nearest = np.full(shape, np.percentile(measured, NEAREST) if len(measured) else 0, np.float32)
+    showing = np.zeros(shape, np.uint8)
+    for other in others:
+        x, y, ahead = other.parallax.pixels(nearest)
+        height, width = other.shot.view.gray.shape
+        showing += (x > 0) & (x < width) & (y > 0) & (y < height) & (ahead > 0)
+    decided = (showing >= 2) & shot.view.inside
     strong = np.where(decided & (one < ALL), np.minimum(one, np.where(impossible, ALL, behind)), 0).astype(np.uint8)
     weak = np.where(decided & (two < ALL), np.minimum(two, behind), 0).astype(np.uint8)
     differences = two[(shot.depth.inverse > 0) & (two < ALL)]
     return Evidence(strong, weak, behind, float(np.percentile(differences, NOISE)) if len(differences) else 0.0)
-
-
-def _would_be_seen(shot: Shot, others: Sequence[Neighbour]) -> Mask:
-    """Where at least two neighbours would show even the nearest content: elsewhere nobody can tell. [h, w]"""
-    measured = shot.depth.inverse[shot.depth.inverse > 0]
-    nearest = np.full(shot.view.gray.shape, np.percentile(measured, NEAREST) if len(measured) else 0, np.float32)
-    count = np.zeros(nearest.shape, np.uint8)
-    for other in others:
-        x, y, ahead = other.parallax.pixels(nearest)
-        height, width = other.shot.view.gray.shape
-        count += (x > 0) & (x < width) & (y > 0) & (y < height) & (ahead > 0)
-    return count >= 2

@@ -93,8 +93,17 @@ def grown(shot: Shot, evidence: Evidence, core: Mask) -> Mask:
     for label in range(1, number):
         part = core & (labels == label)
         rows, columns = np.nonzero(part)
-        if len(rows) >= LEAST_PIXELS and min(np.ptp(rows), np.ptp(columns)) >= LEAST_SIDE:
-            result |= _object(shot, part, static, *_room(shot, rows, columns))
+        if len(rows) < LEAST_PIXELS or min(np.ptp(rows), np.ptp(columns)) < LEAST_SIDE:
+            continue
+        # What the object of these seeds may cover, and the row from which it is its body.
+        left, right, top, bottom = columns.min(), columns.max() + 1, rows.min(), rows.max() + 1
+        highest, body = top - 0.3 * (bottom - top), top
+        horizon = bottom if shot.horizon is None else float(shot.horizon[left:right].mean())
+        if bottom > horizon:  # something that stands on the ground, as seen from the camera's height
+            highest = min(top - 0.1 * (bottom - top), bottom - TALL * (bottom - horizon))
+            body = min(top, round(bottom - 0.8 * (bottom - horizon)))
+        aside = max(3, round(0.12 * (right - left)))
+        result |= _object(shot, part, static, (left - aside, int(highest), right + aside, bottom + 2), body)
     for left, top, right, bottom in shot.people:
         # What a person surely covers: the third in the middle.
         body, third = np.zeros_like(core), (right - left) // 3
@@ -102,19 +111,6 @@ def grown(shot: Shot, evidence: Evidence, core: Mask) -> Mask:
         if body.any() and static[body].mean() < STATIC:
             result |= _object(shot, body, static, (left, top, right, bottom), top)
     return result
-
-
-def _room(shot: Shot, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> tuple[tuple[int, int, int, int], int]:
-    """Left, top, right and bottom of what the object of some seeds may cover, and the row from which it is its body."""
-    left, right, top, bottom = columns.min(), columns.max() + 1, rows.min(), rows.max() + 1
-    highest = top - 0.3 * (bottom - top)
-    horizon = bottom if shot.horizon is None else float(shot.horizon[left:right].mean())
-    body = top
-    if bottom > horizon:  # something that stands on the ground, as seen from the camera's height
-        highest = min(top - 0.1 * (bottom - top), bottom - TALL * (bottom - horizon))
-        body = min(top, round(bottom - 0.8 * (bottom - horizon)))
-    aside = max(3, round(0.12 * (right - left)))
-    return (left - aside, int(highest), right + aside, bottom + 2), body
 
 
 def _object(shot: Shot, part: Mask, static: Mask, room: tuple[int, int, int, int], body: int) -> Mask:
@@ -139,14 +135,9 @@ def _object(shot: Shot, part: Mask, static: Mask, room: tuple[int, int, int, int
     first, last = part.argmax(0), height - 1 - part[::-1].argmax(0)
     y = np.arange(height)[:, None]
     result |= columns_of & (y >= np.minimum(first, body)) & (y <= last) & ~static
-    result = cv2.morphologyEx(result.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8)) > 0
-    return without_holes(_touching(result, part))
-
-
-def _touching(mask: Mask, part: Mask) -> Mask:
-    """The connected parts of a mask that hold a pixel of another."""
-    _, labels = cv2.connectedComponents(mask.astype(np.uint8))
-    return np.isin(labels, np.setdiff1d(labels[part & mask], [0]))
+    closed = cv2.morphologyEx(result.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
+    _, labels = cv2.connectedComponents(closed)
+    return without_holes(np.isin(labels, np.setdiff1d(labels[part & (closed > 0)], [0])))
 
 
 def without_holes(mask: Mask) -> Mask:

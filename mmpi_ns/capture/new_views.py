@@ -7,14 +7,13 @@ new view and, since they end at the point, the empty space in front of it, which
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Float, Int, UInt8
 from nerfstudio.cameras.rays import RayBundle
 from numpy import ndarray
 from numpy.typing import NDArray
@@ -76,14 +75,9 @@ class SharedPoints:
     def draw(
         self, count: int, rays: Rays, g: torch.Generator, exposures: Float[Tensor, "M 3"] | None = None
     ) -> tuple[RayBundle, Float[Tensor, "R C"], Float[Tensor, "R 2"]]:
-        """Random rays from between cameras, with their colours and the inverse distances of their points with errors.
-
-        Args:
-            count: number of rays.
-            rays: makes rays through pixel centres (image, row, column).
-            g: generator for the points and the positions between the cameras.
-            exposures: of all training images; colours are divided by them. None: they are equal.
-        """
+        """Random rays from between cameras, their colours, and inverse distances of their points with errors. ``rays``
+        makes rays through pixel centres (image, row, column); colours are divided by the exposures of all images, if
+        they differ."""
         device = self.pixels.device
         chosen = torch.randint(len(self.pixels), (count,), generator=g, device=g.device).to(device)
         share = torch.rand(count, 1, generator=g, device=g.device).to(device)
@@ -119,16 +113,10 @@ class ShownImage:
         darkest, brightest = (np.asarray(bound(image, around), np.uint8) for bound in (cv2.erode, cv2.dilate))
         return ShownImage(image, darkest, brightest, usable, depth)
 
-    @property
-    def certain(self) -> Bool[ndarray, "H W"]:
-        """Pixels whose depth is known well."""
-        inverse, error = self.depth[..., 0], self.depth[..., 1]
-        return (inverse > 0) & (error < CERTAIN * inverse) & (self.usable > 0)
-
     def shows(
         self, posed: PosedImages, j: int, points: Float[ndarray, "P 3"], colors: Float[ndarray, "P C"]
     ) -> tuple[Int[ndarray, "S"], UInt8[ndarray, "S C"]]:
-        """Which points image j, this one, shows at their distance and with about their colours, and its colours."""
+        """Numbers and colours of the points that image j, this one, shows at their distance, coloured alike."""
         at = project(posed, j, points)
         maps = self.depth[..., 0], self.usable, self.darkest, self.brightest
         inverse, may, darkest, brightest = (look_up(m, *at.T, nearest=True) for m in maps)
@@ -156,10 +144,10 @@ def find_shared_points(
         posed: their cameras.
         known: depths of their pixels.
         rays: makes rays through pixel centres (image, row, column).
-        images: the images to compare.
-        seed: of the draw of pixels where there are more than are kept.
-        device: where rays are made and drawn.
-        exposures: of all training images, whose colours are compared after them; None: they are equal.
+        images: numbers of the images to compare.
+        seed: of the choice among more than ``MOST`` pixels.
+        device: of the result.
+        exposures: of all training images, by which colours are divided; None: they are equal.
 
     Raises:
         InputError: an image or mask cannot be used (names the file).
@@ -170,43 +158,56 @@ def find_shared_points(
         posed.sizes, BYTES_OF_IMAGE, NEIGHBOURS + 1,
     )  # fmt: skip
     budget = max(1, MOST // (NEIGHBOURS * max(1, len(images))))
-
-    def shared(i: int) -> tuple[list[tuple[Any, ...]], float]:
-        parts, matches, shown = [], 0.0, show(i)
-        rows, columns = np.nonzero(shown.certain)
-        count = len(rows)
-        if count > budget:
-            chosen = np.sort(np.random.default_rng((seed, i)).choice(count, budget, replace=False))
-            rows, columns = rows[chosen], columns[chosen]
-        if not len(rows):
-            return parts, matches
-        pixels = torch.from_numpy(np.stack([np.full(len(rows), i), rows, columns], -1))
-        directions = rays(pixels.to(device)).directions.double().cpu().numpy()
-        depths, colors = shown.depth[rows, columns], shown.image[rows, columns]
-        points = posed.camera_to_worlds[i, :, 3] + directions / depths[:, :1]
-        for j in nearest_views(posed.camera_to_worlds, i, NEIGHBOURS, MAX_ANGLE, images):
-            expected = colors.astype(np.float32)
-            if exposures is not None:
-                expected[:, :3] *= (exposures[j] / exposures[i]).cpu().numpy()
-            seen, theirs = show(j).shows(posed, j, points, expected.clip(0, 255))
-            matches += len(seen) * count / len(rows)
-            both, other = np.stack([colors[seen], theirs], 1), torch.full((len(seen),), j, dtype=torch.int32)
-            parts.append((pixels[seen].int(), other, both, depths[seen]))
-        return parts, matches
-
     parts, matches = [], 0.0
-    for n, (some, number) in enumerate(in_order(shared, images)):
+    shared = in_order(lambda i: _matches(i, images, show, posed, rays, budget, seed, exposures), images)
+    for n, (some, number) in enumerate(shared):
         parts, matches = parts + some, matches + number
         if n % TRIMMED == 0:
             give_back_freed_memory()
     if matches == 0:
         return None
-    pixels, other = (torch.cat([part[n] for part in parts]) for n in (0, 1))
-    colors, depths = (torch.from_numpy(np.concatenate([part[n] for part in parts])) for n in (2, 3))
-    centers = torch.from_numpy(posed.camera_to_worlds[:, :, 3]).float()
+    joined = (torch.cat(column).to(device) for column in zip(*parts, strict=True))
+    centers = torch.from_numpy(posed.camera_to_worlds[:, :, 3]).float().to(device)
     cover = matches / sum(known.codes[i][..., 0].size for i in images)
-    on_device = (x.to(device) for x in (pixels, other, colors, depths, centers))
-    return SharedPoints(*on_device, cover=cover)
+    return SharedPoints(*joined, centers=centers, cover=cover)
+
+
+def _matches(
+    i: int,
+    images: Sequence[int],
+    show: Callable[[int], ShownImage],
+    posed: PosedImages,
+    rays: Rays,
+    most: int,
+    seed: int,
+    exposures: Float[Tensor, "M 3"] | None,
+) -> tuple[list[tuple[Tensor, ...]], float]:
+    """Points that image i shares with its neighbours among others, each as the ``PARTS`` of ``SharedPoints``.
+
+    Its pixels of certain depth are compared, ``most`` at most; second comes the number of matches that all would have.
+    """
+    shown = show(i)
+    inverse, error = shown.depth[..., 0], shown.depth[..., 1]
+    rows, columns = np.nonzero((inverse > 0) & (error < CERTAIN * inverse) & (shown.usable > 0))
+    count, parts, matches = len(rows), [], 0.0
+    if count > most:
+        chosen = np.sort(np.random.default_rng((seed, i)).choice(count, most, replace=False))
+        rows, columns = rows[chosen], columns[chosen]
+    if not count:
+        return parts, matches
+    pixels = torch.from_numpy(np.stack([np.full(len(rows), i), rows, columns], -1))
+    depths, colors = shown.depth[rows, columns], shown.image[rows, columns]
+    directions = rays(pixels).directions.double().cpu().numpy()
+    points = posed.camera_to_worlds[i, :, 3] + directions / depths[:, :1]
+    for j in nearest_views(posed.camera_to_worlds, i, NEIGHBOURS, MAX_ANGLE, images):
+        expected = colors.astype(np.float32)
+        if exposures is not None:
+            expected[:, :3] *= (exposures[j] / exposures[i]).cpu().numpy()
+        seen, theirs = show(j).shows(posed, j, points, expected.clip(0, 255))
+        matches += len(seen) * count / len(rows)
+        other, both = torch.full((len(seen),), j, dtype=torch.int32), np.stack([colors[seen], theirs], 1)
+        parts.append((pixels[seen].int(), other, torch.from_numpy(both), torch.from_numpy(depths[seen])))
+    return parts, matches
 
 
 def image_and_mask(dataset: MMPIDataset, i: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:

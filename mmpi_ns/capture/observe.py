@@ -54,8 +54,8 @@ def observe(
         outputs: data parser outputs of the training images.
         dataset: the training images.
         sfm: folder of a COLMAP model, which need not exist.
-        find_points: whether to find points in the images if there are no tracks. Reads the images.
-        triangulates: whether to match features for this before a plane sweep.
+        find_points: search the images for points if there are no tracks.
+        triangulates: match features for this before a plane sweep.
 
     Raises:
         InputError: poses or intrinsics that cannot be used.
@@ -83,7 +83,18 @@ def _find_points(observations: Observations, dataset: MMPIDataset, triangulates:
     if images is None:
         CONSOLE.print("Cameras that are neither perspective nor fisheye: no features are matched.")
     elif triangulates:
-        model = _remembered_tracks(at_full_size(images))
+        originals = at_full_size(images)
+
+        def find() -> Arrays:
+            width, height = originals.sizes.max(0).astype(int)
+            size = f"{len(originals.files)} images of {width} x {height}"
+            CONSOLE.print(f"No SfM tracks: matching the features of {size}.")
+            return {name: np.asarray(value) for name, value in vars(triangulate(originals)).items()}
+
+        cameras = originals.camera_to_worlds, originals.intrinsics, originals.distortion, originals.fisheye
+        stored: Mapping[str, Any] = remembered(digest(originals.files, "tracks", TRACKS_VERSION, *cameras), find)
+        model = SfmModel(**{**stored, "off": stored["off"].item()})
+        CONSOLE.print(f"{len(model.points)} triangulated points, seen {len(model.seen_by)} times.")
         observations = with_tracks(observations, model)
         tell_poses(model.off * float(images.sizes[:, 0].mean()), images.files[0])
     if len(observations.seen_by) < ENOUGH_KEYPOINTS * len(dataset):
@@ -100,12 +111,8 @@ def _find_points(observations: Observations, dataset: MMPIDataset, triangulates:
 
 
 def tell_poses(off: float, image: Path) -> None:
-    """Reports inaccurate poses, with the command that refines them.
-
-    Args:
-        off: median distance of matches or keypoints from their positions predicted by the poses, training pixels.
-        image: one of the training images.
-    """
+    """Reports poses that are off by this median distance of matches from where they predict them, in training pixels,
+    with the command that refines them."""
     if not off > POSES_OFF:  # or not a number, as nothing matched
         return
     folder = image.parent
@@ -114,21 +121,6 @@ def tell_poses(off: float, image: Path) -> None:
     command = f"mmpi-prepare {quoted(full)} {quoted(refined)} --poses {quoted(poses)} --refine-poses"
     says = f"The poses are off by {off:.1f} training pixels (median over the matches of the images)"
     CONSOLE.print(f"{says}: {command} mends them.", style="bold yellow", markup=False, soft_wrap=True)
-
-
-def _remembered_tracks(images: PosedImages) -> SfmModel:
-    """The tracks of posed images, from the cache if possible."""
-
-    def find() -> Arrays:
-        width, height = images.sizes.max(0).astype(int)
-        CONSOLE.print(f"No SfM tracks: matching the features of {len(images.files)} images of {width} x {height}.")
-        return {name: np.asarray(value) for name, value in vars(triangulate(images)).items()}
-
-    cameras = images.camera_to_worlds, images.intrinsics, images.distortion, images.fisheye
-    stored: Mapping[str, Any] = remembered(digest(images.files, "tracks", TRACKS_VERSION, *cameras), find)
-    model = SfmModel(**{**stored, "off": stored["off"].item()})
-    CONSOLE.print(f"{len(model.points)} triangulated points, seen {len(model.seen_by)} times.")
-    return model
 
 
 def read_observations(outputs: DataparserOutputs, cameras: Cameras, sfm: SfmModel | None) -> Observations:
@@ -161,26 +153,23 @@ def read_observations(outputs: DataparserOutputs, cameras: Cameras, sfm: SfmMode
     transform = outputs.dataparser_transform.double().numpy()
     points = (sfm.points @ transform[:3, :3].T + transform[:3, 3]) * outputs.dataparser_scale
     tracked = with_tracks(observations, replace(sfm, points=points), [Path(p).name for p in outputs.image_filenames])
-    return _fitting_tracks(tracked, cameras) if len(tracked.seen_at) else tracked
-
-
-def _fitting_tracks(observations: Observations, cameras: Cameras) -> Observations:
-    """Drops points behind the camera that saw them, and all tracks if the model is in another frame."""
-    angles = keypoint_angles(observations, cameras)
-    width = np.arctan(0.5 * observations.sizes[:, 0] / observations.intrinsics[:, 0]) * 2
-    if np.median(angles / width[observations.seen_by]) > MAX_REPROJECTION:
+    if not len(tracked.seen_at):
+        return tracked
+    angles = keypoint_angles(tracked, cameras)
+    width = np.arctan(0.5 * tracked.sizes[:, 0] / tracked.intrinsics[:, 0]) * 2
+    if np.median(angles / width[tracked.seen_by]) > MAX_REPROJECTION:
         CONSOLE.print(
             "[bold yellow]The COLMAP model does not fit the cameras (its points project elsewhere), so its tracks are "
             "not used: state its frame as applied_transform in transforms.json."
         )
-        return replace(observations.with_keypoints(np.zeros(len(angles), np.bool_)), points=np.zeros((0, 3)))
+        return replace(tracked.with_keypoints(np.zeros(len(angles), np.bool_)), points=np.zeros((0, 3)))
     ahead = angles < np.pi / 2
     if not ahead.all():
         CONSOLE.print(
             f"[bold yellow]{(~ahead).sum()} of {len(ahead)} keypoints have their point behind the camera and are not "
             "used: check the COLMAP model."
         )
-    return observations.with_keypoints(ahead)
+    return tracked.with_keypoints(ahead)
 
 
 def keypoint_angles(observations: Observations, cameras: Cameras) -> NDArray[np.float64]:
@@ -209,13 +198,8 @@ def posed_images(observations: Observations, dataset: MMPIDataset) -> PosedImage
 
 
 def with_tracks(observations: Observations, model: SfmModel, names: Sequence[str] | None = None) -> Observations:
-    """The observations with the points of a model.
-
-    Args:
-        observations: the cameras.
-        model: tracks in their frame.
-        names: of the training images in the model; None for their indices.
-    """
+    """The observations with the points of a model in their frame; images are known in the model by ``names``, or by
+    their indices."""
     names = [str(i) for i in range(len(observations.centers))] if names is None else names
     seen_by, seen_point, relative = model.keypoints_of(names)
     seen_at = relative * observations.sizes[seen_by]

@@ -52,7 +52,7 @@ CERTAIN, SAME_DISTANCE = 0.03, 0.03
 SAMPLES, FEWEST = 4000, 30
 """Pixels of an image that are looked up in another one, and the fewest matches that count."""
 GROUPS, GROUP = 6, 40
-"""Matches of a pair are summarised by medians of at most so many groups by radius, each of at least so many matches."""
+"""Most groups by radius whose medians summarise the matches of a pair, and least matches of a group."""
 LEAST_ERROR = 0.01
 """Error of a median that the surroundings cause: reflections, blur. Log ratio."""
 TONE, TONE_ERROR, EXIF_ERROR = 0.5, 0.25, 0.1
@@ -147,14 +147,8 @@ class Gains:
 def grouped(
     first: int, second: int, log_ratios: Float[ndarray, "P 3"], radii: tuple[Float[ndarray, "P"], Float[ndarray, "P"]]
 ) -> ColorRatios | None:
-    """Medians of the matches of a pair of images, in groups of similar change of radius; None for too few.
-
-    Args:
-        first: number of the first image.
-        second: of the other.
-        log_ratios: of each match.
-        radii: squared radius of each match in the first and in the second image.
-    """
+    """Medians of the matches of a pair of images, in groups of similar change of radius; None for too few. ``radii``
+    are the squared radii of each match in the first and in the second image."""
     if len(log_ratios) < FEWEST:
         return None
     change = np.stack([radii[1] - radii[0], radii[1] ** 2 - radii[0] ** 2], -1)
@@ -208,15 +202,8 @@ def pair_ratios(
     pixels: Int[ndarray, "P 2"],
     points: Float[ndarray, "P 3"],
 ) -> ColorRatios | None:
-    """Colours of surfaces that one image shows, in another; None if it shows too few of them.
-
-    Args:
-        first: the image that shows them. If ``second`` has no distances, what it shows instead is told by colour.
-        second: the other image.
-        cameras: of both.
-        pixels: row and column of each surface in the first image.
-        points: where the surfaces are.
-    """
+    """Colours of surfaces at some pixels (row, column) of one image, in another; None if it shows too few of them. If
+    the second image has no distances, colours tell what it shows instead."""
     rows, columns = pixels.T
     at = project(cameras, second.number, points)
     shown = look_up(second.exposed.view(np.uint8), *at.T, nearest=True) > 0
@@ -288,7 +275,7 @@ def solve(
     Args:
         ratios: colours of pairs of images.
         count: N.
-        exposures: light that each image got according to EXIF, in any unit; NaN where it is not known.
+        exposures: light of each image by its EXIF, in any unit; NaN where unknown.
         gains: False solves for the fall-off alone.
     """
     rows = np.arange(len(ratios.first))
@@ -334,17 +321,9 @@ def exposure_of_view(
     exposures: Float[ndarray, "N 3"],
     falloff: Float[ndarray, "2 3"],
 ) -> Float[ndarray, "3"] | None:
-    """Exposure of an image that was not calibrated, by what it and calibrated images show; None if they show nothing.
-
-    Args:
-        view: the image.
-        others: calibrated images nearby.
-        cameras: of the calibrated images.
-        pixels: row and column of some of the image's pixels.
-        points: the surfaces that they show.
-        exposures: of the calibrated images.
-        falloff: towards the corners.
-    """
+    """Exposure of an image that was not calibrated, by the calibrated ones nearby that show the same surfaces, given as
+    pixels (row, column) and points; None if they show none of them. ``cameras`` and ``exposures`` are of all calibrated
+    images."""
     parts = [pair_ratios(view, other, cameras, pixels, points) for other in others]
     ratios = [part for part in parts if part is not None]
     if not ratios:
@@ -354,20 +333,17 @@ def exposure_of_view(
     return np.exp(np.median(logs, 0))
 
 
-def residuals(ratios: ColorRatios, logs: Float[ndarray, "N 3"], falloff: Float[ndarray, "2 3"]) -> NDArray[np.float64]:
-    """What gains and fall-off leave of the log ratios. [M, 3]"""
-    return ratios.log_ratios - (logs[ratios.second] - logs[ratios.first]) - ratios.falloff @ falloff
-
-
 def image_gains(ratios: ColorRatios, count: int, exposures: Float[ndarray, "N"] | None = None) -> Gains:
     """Gains of ``count`` images with how well they predict pairs of images that were left out of their estimate."""
     pairs = np.minimum(ratios.first, ratios.second) * count + np.maximum(ratios.first, ratios.second)
     fold = np.unique(pairs, return_inverse=True)[1] % FOLDS
-    left: dict[bool, list[NDArray[np.float64]]] = {False: [], True: []}
-    for held_out in np.unique(fold):
-        for gains, errors in left.items():
-            logs, _, falloff = solve(ratios.some(fold != held_out), count, exposures, gains=gains)
-            errors.append(np.abs(residuals(ratios.some(fold == held_out), logs, falloff)).ravel())
+    residuals: dict[bool, list[NDArray[np.float64]]] = {False: [], True: []}
+    for number in np.unique(fold):
+        left_out = ratios.some(fold == number)
+        for gains, parts in residuals.items():
+            logs, _, falloff = solve(ratios.some(fold != number), count, exposures, gains=gains)
+            change = logs[left_out.second] - logs[left_out.first]
+            parts.append(np.abs(left_out.log_ratios - change - left_out.falloff @ falloff).ravel())
     logs, errors, falloff = solve(ratios, count, exposures)
-    without, corrected = (float(np.median(np.concatenate(left[gains]))) for gains in (False, True))
+    without, corrected = (float(np.median(np.concatenate(residuals[gains]))) for gains in (False, True))
     return Gains(np.exp(logs), errors, falloff, without, corrected)

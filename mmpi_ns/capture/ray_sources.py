@@ -61,15 +61,10 @@ class PixelPool:
         most: int = 0,
         seed: int = 0,
     ) -> PixelPool:
-        """Reads images once; masked pixels are left out.
+        """Reads images once, all unless numbers are given; masked pixels are left out.
 
-        Args:
-            dataset: the training images.
-            device: of the pixels.
-            images: which of them; None for all.
-            known_depth: their depths.
-            most: maximum number of pixels; beyond it, a random subset, the same fraction of each image. 0: no limit.
-            seed: of the subset.
+        ``most`` is the maximum number of pixels, 0 for no limit; beyond it, ``seed`` draws a random subset, the same
+        fraction of each image.
 
         Raises:
             InputError: an image or mask cannot be used (names the file), or the masks leave nothing.
@@ -111,12 +106,7 @@ class PixelPool:
     def draw(
         self, count: int, g: torch.Generator
     ) -> tuple[Float[Tensor, "R C"], Int[Tensor, "R 3"], Float[Tensor, "R 2"]]:
-        """Colours, (image, row, column) and depths of random pixels.
-
-        Args:
-            count: R.
-            g: draws them.
-        """
+        """Colours, (image, row, column) and depths of random pixels."""
         after = (self.ends - self.begins).cumsum(0)
         drawn = torch.randint(self.count, (count,), generator=g, device=g.device).to(self.colors.device)
         which = torch.searchsorted(after, drawn, right=True)
@@ -129,11 +119,7 @@ class PixelPool:
         return self.colors[chosen].float() / 255, indices, depths
 
     def of_images(self, images: Int[Tensor, "A"]) -> PixelPool:
-        """Draws from some of the images, given by their numbers; shares the pixels.
-
-        Raises:
-            InputError: they have no pixel here.
-        """
+        """Draws from some of the images, given by their numbers. Raises InputError if they have no pixel here."""
         kept = (torch.isin(self.images, images.to(self.images)) & (self.ends > self.begins)).nonzero()[:, 0]
         if not len(kept):
             raise InputError("The masks leave no training pixel in one stretch of the capture: use longer windows.")
@@ -146,7 +132,7 @@ class PixelPool:
 
 
 def _pixels_of(dataset: MMPIDataset, i: int, share: float, seed: int) -> tuple[UInt8[Tensor, "N C"], Int[Tensor, "n"]]:
-    """The pixels of an image, and the indices to keep: a fraction of those that no mask hides."""
+    """The pixels of an image, and the indices to keep: a share of the pixels outside the mask."""
     data = dataset.get_data(i, image_type="uint8")
     image = data["image"].reshape(-1, data["image"].shape[-1])
     kept = torch.arange(len(image))
@@ -213,11 +199,7 @@ class RaySources:
     """Colours of each training image over those of the field; None if all have the same exposure."""
 
     def of_images(self, images: NDArray[np.int64]) -> RaySources:
-        """The sources of some images.
-
-        Raises:
-            InputError: the masks leave them no pixel.
-        """
+        """The sources of some images. Raises InputError if masks leave them no pixel."""
         numbers = torch.from_numpy(images)
         return replace(
             self,
@@ -228,7 +210,7 @@ class RaySources:
         )
 
     def counts(self, pixel_rays: int) -> tuple[int, int, int]:
-        """Rays of pixels, new views and keypoints in a step of so many pixel rays."""
+        """Rays of pixels, new views and keypoints in a step."""
         cover = 0.0 if self.new_views is None else min(1.0, self.new_views.cover)
         new_view_rays = round(cover * round(self.new_view_share * pixel_rays))
         # Points shared by two images are more informative than keypoints, which replace the missing ones.
@@ -250,12 +232,7 @@ class RaySources:
     def draw(
         self, pixel_rays: int, g: torch.Generator, pixels_alone: bool = False
     ) -> tuple[RayBundle, dict[str, Tensor]]:
-        """Rays of pixels, of new views and of keypoints, in this order, and what the images say of them.
-
-        Args:
-            pixel_rays: rays through pixels.
-            g: draws them.
-            pixels_alone: without new views and keypoints.
+        """Rays of pixels, then of new views and keypoints unless ``pixels_alone``, and their batch.
 
         Returns:
             The rays, with KEYPOINT_DEPTH, PIXEL_DEPTH, OWN_PIXEL and EXPOSURE in their metadata. The batch: ``image``,

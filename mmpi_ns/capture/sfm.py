@@ -62,11 +62,7 @@ class SfmModel:
 
 
 def find_sfm_model(path: Path) -> SfmModel | None:
-    """The COLMAP model in a folder; None if there is none.
-
-    Raises:
-        InputError: the folder holds a model that cannot be read.
-    """
+    """The COLMAP model in a folder; None if there is none. Raises InputError if it cannot be read."""
     if not (path / "images.bin").is_file() and not (path / "images.txt").is_file():
         return None
     with checked_model(path):
@@ -85,9 +81,8 @@ def checked_model(path: Path) -> Iterator[None]:
 
 
 def load_pycolmap() -> ModuleType:
-    """pycolmap, which is slow to import, with SIGTERM left as it was.
-
-    It installs glog's handler, which prints a stack trace and may wait for ever, instead of whatever was there.
+    """pycolmap, which is slow to import. SIGTERM stays as it was: glog's handler prints a stack trace and may wait for
+    ever.
 
     Raises:
         InputError: pycolmap is too old.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -19,6 +19,8 @@ Map = NDArray[np.float32]
 
 REMAP_SIDE, REMAP_PART = 32766, 8192
 """Largest side of an image for OpenCV's remap, and side of the parts into which larger ones are cut."""
+STRIP = 2**16
+"""Pixels that are worked on at once: their numbers stay in a core's cache."""
 
 
 @dataclass(frozen=True)
@@ -59,8 +61,8 @@ def load_view(images: PosedImages, i: int, width: int) -> View:
     pinhole = images.intrinsics[i] * np.tile(scale, 2)
     inside = np.broadcast_to(True, gray.shape)  # of no size
     if images.is_bent(i):
-        size = gray.shape[::-1]
-        x, y = _unbent(images, i, pinhole, size)
+        size = gray.shape[1], gray.shape[0]
+        x, y = _bent_places(images.is_fisheye(i), tuple(images.distortion[i]), tuple(pinhole), size)
         gray = cv2.remap(gray, x, y, cv2.INTER_LINEAR)
         inside = (x >= 0) & (x <= size[0] - 1) & (y >= 0) & (y <= size[1] - 1)
     return View(np.ascontiguousarray(gray, np.uint8), pinhole, images.camera_to_worlds[i], inside)
@@ -73,15 +75,11 @@ def _read(file: Path, mode: int) -> NDArray[Any]:
     return pixels
 
 
-def _unbent(images: PosedImages, i: int, pinhole: NDArray[np.float64], size: Sequence[int]) -> tuple[Map, Map]:
-    """Places in image i, of a size (width, height), of its undistorted view's pixels; OpenCV counts from centres."""
-    return _unbent_camera(images.is_fisheye(i), tuple(images.distortion[i]), tuple(pinhole), tuple(size))
-
-
 @lru_cache(maxsize=2)
-def _unbent_camera(
+def _bent_places(
     fisheye: bool, distortion: tuple[float, ...], pinhole: tuple[float, ...], size: tuple[int, int]
 ) -> tuple[Map, Map]:
+    """Places in an image (width, height) of the pixels of its undistorted view; OpenCV counts from centres."""
     matrix = camera_matrix(np.array(pinhole))
     straighten = cv2.fisheye.initUndistortRectifyMap if fisheye else cv2.initUndistortRectifyMap
     matrix[:2, 2] -= 0.5
@@ -91,11 +89,46 @@ def _unbent_camera(
 
 def straightened_color(images: PosedImages, i: int, view: View) -> NDArray[np.uint8]:
     """Blue, green and red of image i as its view shows it. [h, w, 3]"""
-    size = view.gray.shape[::-1]
+    size = view.gray.shape[1], view.gray.shape[0]
     color = cv2.resize(_read(images.files[i], cv2.IMREAD_COLOR), size, interpolation=cv2.INTER_AREA)
     if images.is_bent(i):
-        color = cv2.remap(color, *_unbent(images, i, view.pinhole, size), cv2.INTER_LINEAR)
+        places = _bent_places(images.is_fisheye(i), tuple(images.distortion[i]), tuple(view.pinhole), size)
+        color = cv2.remap(color, *places, cv2.INTER_LINEAR)
     return np.asarray(color, np.uint8)
+
+
+def straightened(
+    original: PosedImages, i: int, shape: tuple[int, int], file_shape: tuple[int, int], some: slice | None = None
+) -> NDArray[np.float64]:
+    """Tangents (right, down) at which a training image's pixels look, lens taken out; of some rows. [2, H, W]"""
+    lens = tuple(original.distortion[i]) if original.is_bent(i) else ()
+    camera = tuple(original.sizes[i]), tuple(original.intrinsics[i]), lens, original.is_fisheye(i)
+    rows = [some] if some else strips(shape)
+    parts = [_straightened_rows(*camera, shape[1], file_shape, part.start, part.stop) for part in rows]
+    return parts[0] if some else np.concatenate(parts, 1)
+
+
+@lru_cache(maxsize=32)
+def _straightened_rows(
+    size: tuple[float, float], pinhole: tuple[float, ...], lens: tuple[float, ...], fisheye: bool,
+    width: int, file_shape: tuple[int, int], first: int, last: int,
+) -> NDArray[np.float64]:  # fmt: skip
+    """The same of a strip of rows: cameras of one lens share them."""
+    columns, rows = np.meshgrid(np.arange(width) + 0.5, np.arange(first, last) + 0.5)
+    at = np.stack([columns * size[0] / file_shape[1], rows * size[1] / file_shape[0]], -1).reshape(-1, 1, 2)
+    fx, fy, cx, cy = pinhole
+    if lens:
+        straighten = cv2.fisheye.undistortPoints if fisheye else cv2.undistortPoints
+        tangents = straighten(at, camera_matrix(np.array(pinhole)), np.array(lens))
+    else:
+        tangents = (at - [cx, cy]) / [fx, fy]
+    return np.ascontiguousarray(np.moveaxis(tangents.reshape(*columns.shape, 2), -1, 0), np.float64)
+
+
+def strips(shape: tuple[int, ...]) -> Iterator[slice]:
+    """Rows of an image of this shape, in parts of about ``STRIP`` pixels."""
+    rows = max(1, STRIP // shape[-1])
+    return (slice(first, min(first + rows, shape[-2])) for first in range(0, shape[-2], rows))
 
 
 def camera_matrix(pinhole: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -131,16 +164,8 @@ def pixel_grid(shape: tuple[int, ...]) -> tuple[Map, Map]:
 
 
 def look_up(image: NDArray[Any], x: NDArray[Any], y: NDArray[Any], *, nearest: bool = False) -> NDArray[Any]:
-    """Values of an image at pixel places, centres at halves: interpolated, or the nearest pixel's and 0 outside.
-
-    Args:
-        image: [H, W] or [H, W, C], of any size.
-        x, y: places, of any one shape and number.
-        nearest: take the nearest pixel.
-
-    Returns:
-        The shape of ``x``, and channels if the image has several.
-    """
+    """Values of an image [H, W] or [H, W, C] at pixel places x and y of any one shape, centres at halves: interpolated,
+    or the nearest pixel's and 0 outside. Has the shape of ``x``, and channels if the image has."""
     at_x, at_y = (np.subtract(c, 0.5, dtype=np.float32) for c in (x, y))
     mode = cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR
     border = cv2.BORDER_CONSTANT if nearest else cv2.BORDER_REPLICATE

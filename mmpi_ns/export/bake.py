@@ -33,11 +33,8 @@ MOST_LOOKED_AT = 60e6
 
 
 def read_run_config(path: Path) -> MMPIModelConfig:
-    """The model's settings in a run's config.yml.
-
-    Raises:
-        InputError: ns-train did not write it, or trained another method.
-    """
+    """The model's settings in a run's config.yml. Raises InputError if ns-train did not write it, or trained another
+    method."""
     try:
         config = yaml.load(path.read_text(encoding="utf-8"), Loader=yaml.Loader)
     except (yaml.YAMLError, UnicodeDecodeError) as error:
@@ -59,10 +56,10 @@ def load_model(load_config: Path) -> Any:
 
 
 def bake_run(pipeline: Any, least: float, say: Say = print) -> BakedScene:
-    """All windows of a run, baked.
+    """All windows of a finished run, baked.
 
     Args:
-        pipeline: of a finished run.
+        pipeline: of the run.
         least: bricks in which no training view sees this weight are left out; 0 keeps all.
         say: called with progress messages.
 
@@ -134,13 +131,7 @@ class Compared:
 
 @torch.no_grad()
 def compare(pipeline: Any, scene: BakedScene, count: int) -> Compared:
-    """Compares baked test images with exact ones and the ground truth.
-
-    Args:
-        pipeline: of the run.
-        scene: its baked scene.
-        count: number of test images, evenly spaced; all if there are fewer.
-    """
+    """Compares ``count`` baked test images, evenly spaced, at most all, with exact ones and the ground truth."""
     dataset, metrics = pipeline.datamanager.eval_dataset, ImageMetrics("none")
     to_exact: list[float] = []
     rows: dict[str, list[dict[str, float]]] = {"exact": [], "baked": []}

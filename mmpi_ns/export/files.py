@@ -74,23 +74,11 @@ class BakedScene:
 
 
 def write_baked(scene: BakedScene, folder: Path) -> int:
-    """Writes a scene into a folder, the header last, so that a scene with a header is complete.
-
-    Returns:
-        Bytes that were written.
-
-    Raises:
-        OSError: the disk is full or cannot be written.
-    """
+    """Writes a scene into a folder, the header last, so that a scene with a header is complete; returns the bytes
+    written. Raises OSError if the disk is full or cannot be written."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / HEADER).unlink(missing_ok=True)
-    rows, total = [], 0
-    for i, (place, window) in enumerate(scene.windows):
-        blob, arrays = _pack(window)
-        name = f"window-{i:05d}.bin"
-        write_atomically(folder / name, lambda path, blob=blob: path.write_bytes(blob))
-        rows.append({"file": name, "bytes": len(blob), **_describe(place, window), "arrays": arrays})
-        total += len(blob)
+    rows = [_write_window(folder / f"window-{i:05d}.bin", *window) for i, window in enumerate(scene.windows)]
     header = {
         "format": FORMAT,
         "version": VERSION,
@@ -101,15 +89,31 @@ def write_baked(scene: BakedScene, folder: Path) -> int:
     }
     text = json.dumps(header, allow_nan=False)
     write_atomically(folder / HEADER, lambda path: path.write_text(text, encoding="utf-8"))
-    return total + len(text)
+    return sum(row["bytes"] for row in rows) + len(text)
 
 
-def _describe(place: Window, window: BakedWindow) -> dict[str, Any]:
-    """Header of a window, without its arrays."""
+def _write_window(file: Path, place: Window, window: BakedWindow) -> dict[str, Any]:
+    """Writes a window's arrays one after the other, each compressed; returns the window's part of the header."""
     mpis, shader = window.mpis, window.shader
+    beside = neighbours(mpis.columns, mpis.mpis, mpis.num_bricks)
+    network = [x.detach().half().reshape(-1) for layer in shader.layers for x in layer]
+    arrays = {
+        "columns": mpis.columns.numpy().view(np.uint32),
+        "density": _differences(mpis.density, beside),
+        "texels": np.stack(list(in_order(lambda channel: _differences(channel, beside), mpis.texels.unbind(-1)))),
+        "network": torch.cat(network).numpy() if network else np.zeros(0, np.float16),
+    }
+    blob, places = b"", {}
+    for name, array in arrays.items():
+        data = _gzip(np.ascontiguousarray(array).tobytes())
+        places[name] = {"type": str(array.dtype), "shape": array.shape, "offset": len(blob), "bytes": len(data)}
+        blob += data
+    write_atomically(file, lambda path: path.write_bytes(blob))
     plan = json.loads(place.plan.to_json())
     extra = [{"interval": interval, "first_column": mpis.first_column(k)} for k, interval in enumerate(mpis.intervals)]
     return {
+        "file": file.name,
+        "bytes": len(blob),
         "center": place.center,
         "radius": None if math.isinf(place.radius) else place.radius,
         "margin": place.margin,
@@ -128,34 +132,13 @@ def _describe(place: Window, window: BakedWindow) -> dict[str, Any]:
             "layers": [list(weights.shape) for weights, _ in shader.layers],
             "bound": shader.bound,
         },
+        "arrays": places,
     }
-
-
-def _pack(window: BakedWindow) -> tuple[bytes, dict[str, Any]]:
-    """A window's arrays one after the other, each compressed, and the position of each."""
-    mpis = window.mpis
-    beside = neighbours(mpis.columns, mpis.mpis, mpis.num_bricks)
-    network = [x.detach().half().reshape(-1) for layer in window.shader.layers for x in layer]
-    arrays = {
-        "columns": mpis.columns.numpy().view(np.uint32),
-        "density": _differences(mpis.density, beside),
-        "texels": np.stack(list(in_order(lambda channel: _differences(channel, beside), mpis.texels.unbind(-1)))),
-        "network": torch.cat(network).numpy() if network else np.zeros(0, np.float16),
-    }
-    blob, rows = b"", {}
-    for name, array in arrays.items():
-        data = _gzip(np.ascontiguousarray(array).tobytes())
-        rows[name] = {"type": str(array.dtype), "shape": array.shape, "offset": len(blob), "bytes": len(data)}
-        blob += data
-    return blob, rows
 
 
 def _gzip(data: bytes) -> bytes:
-    """A gzip file. Its blocks are compressed on all threads; their number does not change a byte.
-
-    Each block ends at a full byte and begins with what precedes it as its dictionary, so the blocks together are one
-    stream (the way of pigz).
-    """
+    """A gzip file, compressed in blocks on all threads; their number does not change a byte. Each block ends at a full
+    byte and has what precedes it as its dictionary, so the blocks together are one stream (as of pigz)."""
 
     def compress(start: int) -> bytes:
         before, ends = data[max(0, start - (1 << 15)) : start], start + BLOCK >= len(data)
@@ -190,11 +173,8 @@ def _sums(stored: NDArray[np.uint8], beside: Int[Tensor, "2 B"]) -> UInt8[Tensor
 
 
 def read_baked(folder: Path) -> BakedScene:
-    """Reads what ``write_baked`` wrote.
-
-    Raises:
-        ValueError: it is missing, damaged or of another version (says which, and what to do).
-    """
+    """Reads what ``write_baked`` wrote. Raises ValueError if it is missing, damaged or of another version (says what to
+    do)."""
     header = read_header(folder)
     try:
         windows = [_read_window(folder, row) for row in header["windows"]]

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,18 +71,30 @@ def find_candidates(observations: Observations, visible: VisiblePoints, with_cub
         InputError: no camera has a field of view that an MPI can have.
     """
     spread = spread_cameras(observations, visible, MAX_WIDE_VIEWS if observations.wide.any() else MAX_VIEWS)
-    views = [
-        view
-        for i in spread
-        for face in _faces(observations, i)
-        for pull_back in PULL_BACKS
-        for view in _views(observations, visible, i, face, pull_back * visible.near)
-    ]
-    if not views:
+    candidates = []
+    for i in spread:
+        fx, fy = observations.intrinsics[i, :2]
+        for (name, axes, u, v), pull_back in product(_faces(observations, i), PULL_BACKS):
+            behind = pull_back * visible.near
+            origin = observations.centers[i] - behind * axes[2]
+            near = float(NEAR_SHARE * min(visible.nearest[i], visible.near) + behind)
+            frame = vector(origin), (vector(axes[0]), vector(axes[1]), vector(axes[2])), near
+            # Views that differ in their margin alone have the errors of the widest.
+            widest = MPIPlan(name, *frame, _widened(u, v, max(MARGINS)), planes=2, height=2, width=2)
+            plane, across, down = pixel_slopes(widest, observations, visible.cameras, visible.points)
+            plane, texel = 0.5 / near * plane, np.maximum(across / fx, down / fy)
+            x, y, z = ((visible.points - origin) @ axes.T).T
+            for margin in MARGINS:
+                u0, u1, v0, v1 = extent = _widened(u, v, margin)
+                held = (x >= u0 * z) & (x <= u1 * z) & (y >= v0 * z) & (y <= v1 * z)
+                errors = (np.where(held, values, np.inf).astype(np.float32) for values in (plane, texel))
+                view = replace(widest, extent=extent)
+                candidates.append(Candidate(view, float((v1 - v0) * fy), float((u1 - u0) * fx), *errors))
+    if not candidates:
         raise InputError(
             "No MPI fits the field of view of any training camera: check camera_model, focal lengths and distortion."
         )
-    return [*views, *(_cubes(observations, visible) if with_cubes else [])]
+    return [*candidates, *(_cubes(observations, visible) if with_cubes else [])]
 
 
 def spread_cameras(observations: Observations, visible: VisiblePoints, count: int) -> list[int]:
@@ -110,27 +123,6 @@ def _faces(observations: Observations, i: int) -> Iterator[tuple[str, Array, Arr
             u, v = (np.array([t.min(), t.max()]) for t in (x[inside] / ahead[inside], y[inside] / ahead[inside]))
             if min(np.ptp(u), np.ptp(v)) > 1e-3:
                 yield name if face == "front" else f"{name} {face}", np.matmul(turn, axes), u, v
-
-
-def _views(
-    observations: Observations, visible: VisiblePoints, i: int, face: tuple[str, Array, Array, Array], pull_back: float
-) -> Iterator[Candidate]:
-    """One MPI for each margin. They differ only in extent, so the errors are computed once, in the widest."""
-    fx, fy = observations.intrinsics[i, :2]
-    name, axes, u, v = face
-    origin = observations.centers[i] - pull_back * axes[2]
-    near = float(NEAR_SHARE * min(visible.nearest[i], visible.near) + pull_back)
-    rows = vector(axes[0]), vector(axes[1]), vector(axes[2])
-    frame = MPIPlan(name, vector(origin), rows, near, _widened(u, v, max(MARGINS)), planes=2, height=2, width=2)
-    plane, across, down = pixel_slopes(frame, observations, visible.cameras, visible.points)
-    plane, texel = 0.5 / frame.near * plane, np.maximum(across / fx, down / fy)
-    local = (visible.points - origin) @ axes.T
-    for margin in MARGINS:
-        u0, u1, v0, v1 = extent = _widened(u, v, margin)
-        x, y, z = local.T
-        held = (x >= u0 * z) & (x <= u1 * z) & (y >= v0 * z) & (y <= v1 * z)
-        errors = (np.where(held, values, np.inf).astype(np.float32) for values in (plane, texel))
-        yield Candidate(replace(frame, extent=extent), float((v1 - v0) * fy), float((u1 - u0) * fx), *errors)
 
 
 def _widened(u: Array, v: Array, margin: float) -> tuple[float, float, float, float]:

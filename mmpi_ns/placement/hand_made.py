@@ -43,9 +43,7 @@ def drive_plan(
     Args:
         observations: training cameras; the drive runs along their mean direction.
         metre: scene units in a metre.
-        planes: planes of every MPI.
-        height: texel rows of every MPI.
-        width: texel columns of every MPI.
+        planes, height, width: planes of every MPI, and their texel rows and columns.
         names: which of the four to use.
         pull_back: distance of the front MPI behind the first camera, as a fraction of the travel.
     """
@@ -82,9 +80,7 @@ def room_plan(
 
     Args:
         observations: training cameras.
-        planes: planes of every MPI.
-        height: texel rows of every MPI.
-        width: texel columns of every MPI.
+        planes, height, width: planes of every MPI, and their texel rows and columns.
         cube_voxels: voxels along each side of the cube; 0 for none.
         near: depth of the first plane, scene units.
         cube_half_size: half the cube's side, scene units.

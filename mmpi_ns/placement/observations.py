@@ -17,6 +17,8 @@ SQUEEZED = 1.3
 """Such a lens sees farther than a pinhole of its focal length would, by this factor in tangents."""
 BEYOND_LENS = 0.05
 """Cosines by which a keypoint may lie beyond the borders of its lens."""
+FILLING = 24
+"""Points that fill the frustum of a camera."""
 
 
 @dataclass(frozen=True)
@@ -72,13 +74,15 @@ class Observations:
         Only sums of camera axes are used, so a rotated scene gives the rotated frame. If the cameras look in all
         directions, the mean is ill-defined, and the horizontal direction of the first camera is used instead.
         """
-        up = _unit(self.camera_to_worlds[:, :, 1].mean(0))
+        up = self.camera_to_worlds[:, :, 1].mean(0)
+        up = up / max(float(np.linalg.norm(up)), 1e-12)
         mean_facing = -self.camera_to_worlds[:, :, 2].mean(0)
         facing = mean_facing if np.linalg.norm(mean_facing) > 0.3 else -self.camera_to_worlds[0, :, 2]
         right = np.cross(facing, up)
         if np.linalg.norm(right) < 1e-3:  # looking straight up or down: any horizontal axis will do
             right = self.camera_to_worlds[0, :, 0]
-        right = _unit(right - right.dot(up) * up)
+        right = right - right.dot(up) * up
+        right = right / max(float(np.linalg.norm(right)), 1e-12)
         return np.stack([right, -up, np.cross(right, -up)])
 
     @cached_property
@@ -109,12 +113,8 @@ class Observations:
         return depths
 
     def directions(self, camera: int, shares: Array) -> Array:
-        """Directions [N, 3], in camera axes and of depth 1, through places [N, 2] of an image.
-
-        Args:
-            camera: number of the camera.
-            shares: x and y as shares of the image's sides; a little beyond the borders will do.
-        """
+        """Directions [N, 3], in camera axes and of depth 1, through places [N, 2] of an image: x and y as shares of its
+        sides, a little beyond the borders too."""
         if self.lens is None:
             (fx, fy, cx, cy), (w, h) = self.intrinsics[camera], self.sizes[camera]
             x, y = (shares[:, 0] * w - cx) / fx, (shares[:, 1] * h - cy) / fy
@@ -138,20 +138,13 @@ class Observations:
         return np.stack([fx * local[:, 0] / depth + cx, cy - fy * local[:, 1] / depth], -1), ahead
 
 
-def frustum_points(observations: Observations, near: Array, per_camera: int = 24) -> Array:
-    """Points filling the camera frusta, uniform in pixels and in disparity; the last of each camera far away.
+def frustum_points(observations: Observations, near: Array) -> Array:
+    """Points [M * FILLING, 3] that fill the camera frusta from depths ``near`` [M] on, camera after camera, uniform in
+    pixels and in disparity; the last of each camera far away.
 
     Deterministic (a low-discrepancy sequence), so equal scenes give equal points.
-
-    Args:
-        observations: the cameras.
-        near: [M] depth at which each camera's points start.
-        per_camera: points of each camera.
-
-    Returns:
-        [M * per_camera, 3] camera after camera.
     """
-    index = np.arange(per_camera)
+    index = np.arange(FILLING)
     uvw = np.stack([(index * g) % 1.0 for g in (0.7548776662, 0.5698402910, 0.8191725134)], -1)
     clouds = []
     for i, (pose, start) in enumerate(zip(observations.camera_to_worlds, near, strict=True)):
@@ -159,7 +152,3 @@ def frustum_points(observations: Observations, near: Array, per_camera: int = 24
         local = observations.directions(i, uvw[:, :2]) * depth[:, None]
         clouds.append(local @ pose[:, :3].T + pose[:, 3])
     return np.concatenate(clouds)
-
-
-def _unit(v: Array) -> Array:
-    return v / max(float(np.linalg.norm(v)), 1e-12)

@@ -75,10 +75,10 @@ class PlacementConfig:
 
 
 def place(observations: Observations, config: PlacementConfig, training_rays: int | None = None) -> ScenePlan:
-    """The scene plan for some training cameras and points.
+    """The scene plan for some training cameras and what they saw.
 
     Args:
-        observations: training cameras and what they saw.
+        observations: training cameras and points.
         config: the rule's settings.
         training_rays: pixel rays of the whole training, if known: texels are no finer than these can train.
 
@@ -111,7 +111,8 @@ def place(observations: Observations, config: PlacementConfig, training_rays: in
     else:
         remedy = "more steps" if trainable > config.texel_pixels else "a smaller placement.texel-pixels"
     origin = f"automatic placement, a texel spans {texel_pixels:.1f} pixels: finer with {remedy}"
-    return ScenePlan(_named(mpis), cube, 0.2 * visible.near, visible.near, origin, detail)
+    mpis = tuple(replace(m, name=f"{m.name} ({i})") for i, m in enumerate(mpis))  # two may be placed at one camera
+    return ScenePlan(mpis, cube, 0.2 * visible.near, visible.near, origin, detail)
 
 
 def trainable_texel(
@@ -163,9 +164,15 @@ class _Choice:
         self, candidates: list[Candidate], weights: NDArray[np.float64], config: PlacementConfig, texel_pixels: float
     ) -> None:
         self.candidates, self.weights, self.config, self.texel_pixels = candidates, weights, config, texel_pixels
-        self.cost: NDArray[np.float32] = np.stack([self._bits(c) for c in candidates])
+        # Of each observation if a candidate serves it: log2 of the expected pixel error over ``enough``.
+        enough, cost = config.enough * texel_pixels, []
+        for c in candidates:
+            size = max(texel_pixels, c.coarsest(config.max_voxels))
+            error = np.hypot(c.plane / (config.max_planes - 1), 0.5 * size * c.texel)
+            cost.append(np.log2(np.clip(error, enough, max(WORST, 2 * enough)) / enough).astype(np.float32))
+        self.cost: NDArray[np.float32] = np.stack(cost)
         self.nothing = np.full(self.cost.shape[1], self.cost.max(), np.float32)
-        texels = [self._head(c, config.max_planes).texels for c in candidates]
+        texels = [c.at(texel_pixels, config.max_planes, config.max_voxels).texels for c in candidates]
         self.price = np.array(texels, dtype=np.float64) ** config.texel_cost
         self.is_cube = np.array([isinstance(c.frame, CubePlan) for c in candidates])
 
@@ -180,8 +187,15 @@ class _Choice:
             if chosen and self._total(grown) >= self._total(chosen):  # it makes itself or its better superfluous
                 break
             chosen = grown
-        owner = self.cost[chosen].argmin(0)
-        return [self._head(self.candidates[j], self._planes(j, owner == n)) for n, j in enumerate(chosen)]
+        owner, heads, config = self.cost[chosen].argmin(0), [], self.config
+        for n, candidate in enumerate(self.candidates[j] for j in chosen):
+            # Planes at which the error of four fifths of the observations that it serves is small enough.
+            error = candidate.plane[owner == n]
+            error = error[np.isfinite(error)]
+            steps = float(np.quantile(error, 0.8)) / (config.plane_pixels * self.texel_pixels) if len(error) else 0.0
+            planes = int(np.clip(8 * round((1 + steps) / 8), MIN_PLANES, config.max_planes))
+            heads.append(candidate.at(self.texel_pixels, planes, config.max_voxels))
+        return heads
 
     def _total(self, chosen: list[int]) -> float:
         """Remaining expected error, in bits, summed over images."""
@@ -210,26 +224,3 @@ class _Choice:
             if least is None or losses[least] >= self.config.min_gain:
                 return chosen
             chosen = [j for n, j in enumerate(chosen) if n != least]
-
-    def _planes(self, j: int, served: NDArray[np.bool_]) -> int:
-        """Planes at which the error of four fifths of the observations served by candidate j is small enough."""
-        error = self.candidates[j].plane[served]
-        error = error[np.isfinite(error)]
-        steps = float(np.quantile(error, 0.8)) / (self.config.plane_pixels * self.texel_pixels) if len(error) else 0.0
-        return int(np.clip(8 * round((1 + steps) / 8), MIN_PLANES, self.config.max_planes))
-
-    def _head(self, candidate: Candidate, planes: int) -> MPIPlan | CubePlan:
-        return candidate.at(self.texel_pixels, planes, self.config.max_voxels)
-
-    def _bits(self, candidate: Candidate) -> NDArray[np.float32]:
-        """Cost of each observation if served here: log2 of the expected pixel error over ``enough``."""
-        enough = self.config.enough * self.texel_pixels
-        size = max(self.texel_pixels, candidate.coarsest(self.config.max_voxels))
-        plane, texel = candidate.plane / (self.config.max_planes - 1), 0.5 * size * candidate.texel
-        worst = max(WORST, 2 * enough)
-        return np.log2(np.clip(np.hypot(plane, texel), enough, worst) / enough).astype(np.float32)
-
-
-def _named(mpis: tuple[MPIPlan, ...]) -> tuple[MPIPlan, ...]:
-    """Unique names, also if two MPIs are placed at one camera."""
-    return tuple(replace(m, name=f"{m.name} ({i})") for i, m in enumerate(mpis))

@@ -25,16 +25,8 @@ ROUNDS = 50
 def place_windows(
     observations: Observations, config: PlacementConfig, training_rays: int | None = None
 ) -> WindowedPlan:
-    """A plan for each window of a capture; a single one for a short capture.
-
-    Args:
-        observations: training cameras and what they saw.
-        config: the rule's settings; budgets are those of one window.
-        training_rays: pixel rays of one window's training, if known.
-
-    Raises:
-        ValueError: the cameras leave nothing to place.
-    """
+    """A plan for each window of a capture; a single one for a short capture. Settings and training rays are those of
+    one window. Raises ValueError if the cameras leave nothing to place."""
     balls = find_balls(observations, config.window_length)
     if len(balls) < 2:
         return WindowedPlan.single(place(observations, config, training_rays))
@@ -54,12 +46,8 @@ def most_pixels(observations: Observations, config: PlacementConfig) -> float:
 
 
 def find_balls(observations: Observations, length: float) -> list[tuple[Array, float, float]]:
-    """(centre, radius, margin) of the windows, in order along the way; independent of the cameras' order.
-
-    Args:
-        observations: the cameras.
-        length: maximum length of a window, in median distances of the content; 0 for no windows.
-    """
+    """(centre, radius, margin) of the windows, in order along the way; independent of the cameras' order. Their maximum
+    length is in median distances of the content; 0 for no windows."""
     if length <= 0:
         return []
     visible = find_visible_points(observations)
@@ -68,7 +56,16 @@ def find_balls(observations: Observations, length: float) -> list[tuple[Array, f
     spread = np.linalg.norm(centers - centers.mean(0), axis=-1)
     if 2 * spread.max() <= longest:
         return []
-    middles = _fewest(centers, centers[farthest_first(centers, radius=longest / 2)], longest / 2)
+    # The fewest balls, hardly longer than allowed, that hold all cameras: of places far apart, at most twice as many.
+    start = centers[farthest_first(centers, radius=longest / 2)]
+    middles, low, high = _settled(centers, start), 1, len(start)
+    while low < high:
+        count = (low + high) // 2
+        fewer = _settled(centers, start[:count])
+        if np.linalg.norm(centers - fewer[_nearest(centers, fewer)], axis=-1).max() <= SLACK * longest / 2:
+            middles, high = fewer, count
+        else:
+            low = count + 1
     while len(middles) > 1:  # without windows of too few cameras, smallest first; neighbours take these over
         counts = np.bincount(_nearest(centers, middles), minlength=len(middles))
         if counts.min() >= FEWEST:
@@ -109,20 +106,6 @@ def of_cameras(observations: Observations, cameras: NDArray[np.int64]) -> Observ
         seen_by=number[observations.seen_by],
         lens=None if observations.lens is None else observations.lens[cameras],
     )
-
-
-def _fewest(centers: Array, start: Array, radius: float) -> Array:
-    """Middles of the fewest balls, hardly larger than ``radius``, that hold all cameras; some of ``start``, moved."""
-    low, high = 1, len(start)  # farthest points are at most twice as many as are needed
-    best = _settled(centers, start)
-    while low < high:
-        count = (low + high) // 2
-        middles = _settled(centers, start[:count])
-        if np.linalg.norm(centers - middles[_nearest(centers, middles)], axis=-1).max() <= SLACK * radius:
-            best, high = middles, count
-        else:
-            low = count + 1
-    return best
 
 
 def _settled(centers: Array, middles: Array) -> Array:

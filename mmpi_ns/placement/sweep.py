@@ -11,12 +11,13 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates, uniform_filter
 
 from mmpi_ns.placement.observations import Array, Observations
 from mmpi_ns.scene.near_views import nearest_views
 
+REFERENCES = 16
+"""Views that are swept, evenly spread over the capture."""
 HYPOTHESES = 64
 WINDOW = 7
 MAX_ANGLE = 30.0
@@ -33,19 +34,12 @@ class _View(NamedTuple):
     intrinsics: Array
 
 
-def add_swept_points(observations: Observations, images: list[Array], num_references: int = 16) -> Observations:
-    """The observations with points found by a plane sweep, each seen by its reference view.
-
-    Args:
-        observations: cameras; points that they already have, with or without keypoints, stay first.
-        images: gray images [h, w] in [0, 1] of all cameras, about 128 pixels a side.
-        num_references: views to sweep, evenly spread over the capture.
-
-    Returns:
-        The observations with points; each counts as seen by every camera near its reference whose image it falls on.
-    """
+def add_swept_points(observations: Observations, images: list[Array]) -> Observations:
+    """The observations with points found by a plane sweep, each seen by its reference view and every near one it falls
+    on. Earlier points, with or without keypoints, stay first. Images of all cameras are gray [h, w], in [0, 1], about
+    128 pixels a side."""
     count, poses, pinholes = len(images), observations.camera_to_worlds, observations.intrinsics
-    references = np.unique(np.linspace(0, count - 1, min(num_references, count)).round().astype(int))
+    references = np.unique(np.linspace(0, count - 1, min(REFERENCES, count)).round().astype(int))
     scales = [image.shape[1] / width for image, width in zip(images, observations.sizes[:, 0], strict=True)]
     views = [_View(image, poses[i], pinholes[i] * scales[i]) for i, image in enumerate(images)]
     points, cameras, indices = [observations.points], [observations.seen_by], [observations.seen_point]
@@ -78,9 +72,7 @@ def _sweep(reference: _View, neighbours: list[_View]) -> Array:
     disparities = np.linspace(0, 0.35 * width / (fx * baseline), HYPOTHESES)
     # Of each disparity the mean correlation of the better half of the neighbours.
     better = max(1, (len(neighbours) + 1) // 2)
-    correlations = (
-        [_correlation(reference.image, *_warp(reference, n, rays, w)) for n in neighbours] for w in disparities
-    )
+    correlations = ([_correlation(reference, n, rays, w) for n in neighbours] for w in disparities)
     scores = np.stack([np.sort(np.stack(c), 0)[::-1][:better].mean(0) for c in correlations])
     best = scores.argmax(0)
     top = scores.max(0)
@@ -98,8 +90,9 @@ def _sweep(reference: _View, neighbours: list[_View]) -> Array:
     return world[good][:: max(1, good.sum() // 400)]
 
 
-def _warp(reference: _View, neighbour: _View, rays: Array, disparity: float) -> tuple[Array, NDArray[np.bool_]]:
-    """The neighbour's colours where the reference's pixels fall on it, and whether they do."""
+def _correlation(reference: _View, neighbour: _View, rays: Array, disparity: float) -> Array:
+    """Zero-mean normalised correlation, over windows, of the reference with the neighbour warped at a disparity; -1
+    where a window leaves the neighbour or holds no texture."""
     direction = rays @ reference.pose[:, :3].T + disparity * (reference.pose[:, 3] - neighbour.pose[:, 3])
     local = direction @ neighbour.pose[:, :3]
     depth = -local[..., 2]
@@ -109,11 +102,7 @@ def _warp(reference: _View, neighbour: _View, rays: Array, disparity: float) -> 
     x, y = fx * local[..., 0] / safe + cx - 0.5, -fy * local[..., 1] / safe + cy - 0.5
     height, width = neighbour.image.shape
     inside = ahead & (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
-    return map_coordinates(neighbour.image, np.where(inside, [y, x], 0.0), order=1), inside
-
-
-def _correlation(a: Array, b: Array, inside: NDArray[np.bool_]) -> Array:
-    """Zero-mean normalised correlation over windows; -1 where a window leaves the image or holds no texture."""
+    a, b = reference.image, map_coordinates(neighbour.image, np.where(inside, [y, x], 0.0), order=1)
     b, mean = np.where(inside, b, 0.0), partial(uniform_filter, size=WINDOW, mode="nearest")
     mean_a, mean_b = mean(a), mean(b)
     variance_a, variance_b = mean(a * a) - mean_a**2, mean(b * b) - mean_b**2

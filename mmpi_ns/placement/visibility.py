@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mmpi_ns.placement.observations import Array, Observations, frustum_points
+from mmpi_ns.placement.observations import FILLING, Array, Observations, frustum_points
 from mmpi_ns.utils.errors import InputError
 
 SAMPLED, SAMPLED_PER_CAMERA = 6000, 16
@@ -45,8 +45,8 @@ class VisiblePoints:
 def find_visible_points(observations: Observations) -> VisiblePoints:
     """The observations that placement weighs: keypoints, and points that fill the cameras' frusta.
 
-    Keypoints that are not finite or lie behind their camera are left out. Without any the nearest point is taken to
-    lie at a tenth of the cameras' spread.
+    Keypoints that are not finite or lie behind their camera are left out. Without any the nearest point is taken to lie
+    at a tenth of the cameras' spread.
 
     Raises:
         InputError: there are keypoints, and none of them can be used.
@@ -76,11 +76,10 @@ def find_visible_points(observations: Observations) -> VisiblePoints:
     seen = np.bincount(cameras, minlength=len(centers))
     share = (1 - FRUSTUM_SHARE) * seen / (seen + FEW)
     filling = frustum_points(observations, nearest)
-    each = len(filling) // len(centers)
     return VisiblePoints(
-        cameras=np.concatenate([cameras, np.repeat(np.arange(len(centers)), each)]),
+        cameras=np.concatenate([cameras, np.repeat(np.arange(len(centers)), FILLING)]),
         points=np.concatenate([points, filling]),
-        weights=np.concatenate([(share / np.maximum(seen, 1))[cameras], np.repeat((1 - share) / each, each)]),
+        weights=np.concatenate([(share / np.maximum(seen, 1))[cameras], np.repeat((1 - share) / FILLING, FILLING)]),
         nearest=nearest,
         typical=typical,
         near=near,
@@ -111,14 +110,10 @@ def pixels_per_pixel(observations: Observations, visible: VisiblePoints) -> floa
 
 
 def farthest_first(places: Array, count: int | None = None, radius: float = 0.0) -> list[int]:
-    """Places far apart, each the farthest from the previous ones (farthest-point traversal, Gonzalez 1985).
+    """Places [M, D] far apart, each the farthest from the previous ones (farthest-point traversal, Gonzalez 1985).
 
-    Starts at the place farthest from the middle, so the numbering does not matter.
-
-    Args:
-        places: [M, D]
-        count: number of places; None: as many as it takes until balls of ``radius`` around them contain all.
-        radius: of the balls.
+    Starts at the place farthest from the middle, so the numbering does not matter. Without ``count``, as many as it
+    takes until balls of ``radius`` around them contain all.
     """
     chosen = [int(np.linalg.norm(places - places.mean(0), axis=-1).argmax())]
     distance = np.linalg.norm(places - places[chosen[0]], axis=-1)

@@ -50,13 +50,10 @@ def nearest_rotation(matrix: Array) -> Array:
 
 
 def similarity_between(source: Array, target: Array) -> pycolmap.Sim3d:
-    """The similarity that aligns camera poses with other poses of the same cameras.
+    """The similarity that aligns camera poses (camera to world, [N, 4, 4]) with other poses of the same cameras.
 
     Uses centres and rotations: the centres of a straight track do not fix its roll, and noise tilts a short one.
     (``pycolmap.estimate_sim3d`` uses centres alone, and gives up where they lie on a line or a plane, as drives do.)
-
-    Args:
-        source, target: camera to world. [N, 4, 4]
     """
     a = source[:, :3, 3] - source[:, :3, 3].mean(0)
     b = target[:, :3, 3] - target[:, :3, 3].mean(0)
@@ -90,7 +87,7 @@ def up_from_cameras(poses: Array) -> Array:
     return level if turns_enough and level @ mean > 0.5 else mean
 
 
-def fit_ground(points: Array, centers: Array, up: Array, seed: int = 0) -> tuple[Array, float]:
+def fit_ground(points: Array, centers: Array, up: Array) -> tuple[Array, float]:
     """The plane that the cameras stand over: the most populous among roughly level ones, by RANSAC.
 
     Args:
@@ -99,7 +96,7 @@ def fit_ground(points: Array, centers: Array, up: Array, seed: int = 0) -> tuple
         up: rough up. [3]
 
     Returns:
-        Unit normal towards the cameras [3], and the cameras' median height above the plane, in the points' units.
+        Unit normal towards the cameras [3], and the cameras' median height above the plane.
 
     Raises:
         PrepareError: too few points below the cameras, or no plane among them.
@@ -116,7 +113,7 @@ def fit_ground(points: Array, centers: Array, up: Array, seed: int = 0) -> tuple
             f"--camera-height: only {len(below)} points lie below the cameras: too few to find the ground."
         )
     tolerance = 0.04 * abs(float(np.median(-((below - np.median(centers, axis=0)) @ up))))
-    rng, inside = np.random.default_rng(seed), np.zeros(len(below), dtype=bool)
+    rng, inside = np.random.default_rng(0), np.zeros(len(below), dtype=bool)
     for _ in range(TRIALS):
         a, b, c = below[rng.choice(len(below), 3, replace=False)]
         normal = np.cross(b - a, c - a)
@@ -134,12 +131,8 @@ def fit_ground(points: Array, centers: Array, up: Array, seed: int = 0) -> tuple
 
 
 def choose_frame(model: pycolmap.Reconstruction, camera_height: float | None) -> SceneFrame:
-    """Up to +z, the first camera's heading to +y, the cameras' middle (or the ground below it) as origin.
-
-    Args:
-        model: in its own frame.
-        camera_height: metres above the ground, or None: then one unit is the extent of the track.
-    """
+    """Up to +z, the first camera's heading to +y, the cameras' middle (or the ground below it) as origin. The camera
+    height is in metres above the ground; None: one unit is the extent of the track."""
     _, poses = camera_poses(model)
     centers = poses[:, :3, 3]
     up = up_from_cameras(poses)

@@ -33,11 +33,7 @@ class Intrinsics:
 
 
 def parse_camera(values: Sequence[float], fisheye: bool) -> Intrinsics:
-    """The camera of ``--camera``.
-
-    Raises:
-        PrepareError: their count fits no camera, or a focal length is not positive.
-    """
+    """The camera of ``--camera``. Raises PrepareError if the numbers fit none or a focal length is not positive."""
     if len(values) not in GIVEN_COUNTS:
         raise PrepareError(f"--camera takes {' or '.join(GIVEN_COUNTS.values())}, not {len(values)} numbers.")
     if len(values) == 3:
@@ -49,11 +45,8 @@ def parse_camera(values: Sequence[float], fisheye: bool) -> Intrinsics:
 
 
 def share(photos: Sequence[Photo], sharing: Sharing, lenses: dict[str, Intrinsics]) -> list[int]:
-    """Camera of each image, numbered from 1: images of one size, lens and given intrinsics share one.
-
-    Raises:
-        PrepareError: images of different sizes are to share one camera.
-    """
+    """Camera of each image, numbered from 1: images of one size, lens and given intrinsics share one. Raises
+    PrepareError if images of different sizes are to share one camera."""
     if sharing == "per-image":
         return list(range(1, len(photos) + 1))
     sizes = {(p.width, p.height) for p in photos}
@@ -68,15 +61,9 @@ def share(photos: Sequence[Photo], sharing: Sharing, lenses: dict[str, Intrinsic
 def make_cameras(
     photos: Sequence[Photo], numbers: Sequence[int], lenses: dict[str, Intrinsics], focal: float | None, lens: Lens
 ) -> list[pycolmap.Camera]:
-    """One pycolmap camera for each number, from given intrinsics, else from EXIF, else guessed.
-
-    Args:
-        photos: the images.
-        numbers: camera of each image.
-        lenses: known intrinsics by image name.
-        focal: focal length in pixels, from the command line.
-        lens: distortion model if none is given.
-    """
+    """One pycolmap camera for each of the images' numbers, from known intrinsics (``lenses``, by image name), else from
+    the focal length of the command line (pixels) or of EXIF, else guessed. ``lens`` is the distortion model where none
+    is known."""
     cameras: dict[int, pycolmap.Camera] = {}
     for photo, number in zip(photos, numbers, strict=True):
         if number in cameras:
@@ -98,11 +85,7 @@ def make_cameras(
 
 
 def read_intrinsics(camera: pycolmap.Camera) -> Intrinsics:
-    """A pycolmap camera as OpenCV's.
-
-    Raises:
-        PrepareError: nerfstudio-data does not support the lens model.
-    """
+    """A pycolmap camera as OpenCV's. Raises PrepareError if nerfstudio-data does not support the lens model."""
     name, p = camera.model.name, [float(v) for v in camera.params]
     f = (camera.focal_length_x, camera.focal_length_y, camera.principal_point_x, camera.principal_point_y)
     terms = {"SIMPLE_PINHOLE": [], "PINHOLE": [], "SIMPLE_RADIAL": p[3:], "RADIAL": p[3:]}

@@ -24,8 +24,6 @@ JUMP = 5.0
 """Times its neighbours' step (or turn) from which a step counts as a jump."""
 TURN = 8.0
 """Minimum angle of such a turn, degrees."""
-CELLS = (6, 8)
-"""Rows and columns of the grid for coverage."""
 FOCAL_OFF = (0.03, 0.05)
 """Relative change of a given focal length, when refined, from which it is doubted, and the scene with it..."""
 FOCAL_HELPS = (0.95, 0.85)
@@ -82,13 +80,8 @@ def blurred(names: Sequence[str], sharp: Array, ordered: bool) -> list[Finding]:
 
 
 def misplaced(names: Sequence[str], places: Sequence[int], poses: Array) -> list[Finding]:
-    """Frames of a sequence where the track jumps or the camera turns abruptly.
-
-    Args:
-        names: images in order.
-        places: their indices in the input, so that a gap of two frames may be twice as long.
-        poses: camera to world, OpenCV axes. [N, 4, 4]
-    """
+    """Frames of a sequence where the track jumps or the camera turns abruptly. ``places`` are their indices in the
+    input: a gap of two frames may be twice as long. Poses are camera to world, OpenCV axes. [N, 4, 4]"""
     if len(names) < 5:
         return []
     gaps = np.diff(places)
@@ -107,28 +100,11 @@ def misplaced(names: Sequence[str], places: Sequence[int], poses: Array) -> list
     return findings
 
 
-def coverage(model: pycolmap.Reconstruction) -> dict[str, float]:
-    """Fraction of an image's cells that contain a keypoint with a point, for each image."""
-    shares = {}
-    for i in model.reg_image_ids():
-        image, camera = model.images[i], model.cameras[model.images[i].camera_id]
-        seen = np.array([p.xy for p in image.points2D if p.has_point3D()]).reshape(-1, 2)
-        cell = (np.clip(seen / [camera.width, camera.height], 0, 1 - 1e-9) * CELLS[::-1]).astype(int)
-        shares[image.name] = len(np.unique(cell, axis=0)) / (CELLS[0] * CELLS[1])
-    return shares
-
-
 def doubtful_intrinsics(
     model: pycolmap.Reconstruction, is_fixed: bool, focal: tuple[float, float] | None, threads: int
 ) -> list[Finding]:
-    """Models, focal lengths and lenses that do not fit.
-
-    Args:
-        model: the final model.
-        is_fixed: intrinsics were given and kept; they are refined in a copy and compared.
-        focal: the interval of the focal length in pixels, where it was refined.
-        threads: CPU threads; below 1 for all.
-    """
+    """Models, focal lengths and lenses that do not fit. Fixed intrinsics are refined in a copy and compared; ``focal``
+    is the interval of a refined focal length, pixels."""
     findings = []
     if focal is not None and focal[1] - focal[0] >= WIDE * focal[1]:
         says = f"the images hardly determine the focal length ({focal_in_words(*focal)})"

@@ -41,11 +41,7 @@ class Split:
 
 
 def split_by_count(names: Sequence[str], test_every: int | None, train_every: int | None) -> Split:
-    """Every n-th image tests, or trains, starting from the middle of the first n.
-
-    Raises:
-        PrepareError: a side would be empty.
-    """
+    """Every n-th image tests, or trains, from the middle of the first n on. Raises PrepareError if none is left."""
     if test_every == 0:
         return Split(
             tuple(names),
@@ -64,11 +60,8 @@ def split_by_count(names: Sequence[str], test_every: int | None, train_every: in
 
 
 def split_from(lists: dict[str, Any], names: Sequence[str], source: str) -> Split:
-    """The split of another scene's transforms.json; images it does not list are left out of both.
-
-    Raises:
-        PrepareError: the lists name none of the images.
-    """
+    """The split of another scene's transforms.json; images it does not list are left out of both. Raises PrepareError
+    if the lists name none of the images."""
     sides = []
     for key in ("train_filenames", "test_filenames"):
         listed = {Path(str(n)).name for n in lists[key]}
@@ -79,11 +72,8 @@ def split_from(lists: dict[str, Any], names: Sequence[str], source: str) -> Spli
 
 
 def transforms(model: pycolmap.Reconstruction, split: Split, masks: bool, notes: dict[str, Any]) -> dict[str, Any]:
-    """transforms.json for the registered images. Intrinsics are at the top level if all images share them.
-
-    Raises:
-        PrepareError: nerfstudio-data reads no scene with these lenses.
-    """
+    """transforms.json for the registered images; intrinsics that all share are at the top level. Raises PrepareError if
+    nerfstudio-data reads no scene with these lenses."""
     lenses = {number: read_intrinsics(camera) for number, camera in model.cameras.items()}
     if len({lens.fisheye for lens in lenses.values()}) > 1:
         raise PrepareError("Fisheye and perspective lenses in one scene: prepare them separately, or with --undistort.")
@@ -192,19 +182,8 @@ def undistort(
     target: Path,
     threads: int,
 ) -> tuple[pycolmap.Reconstruction, list[Photo]]:
-    """Writes undistorted images, with their EXIF, and masks.
-
-    Args:
-        model: not changed.
-        photos: registered images.
-        images: folder of the images.
-        masks: folder of the masks (``NAME.png``), or None.
-        target: gets ``images`` and ``masks``.
-        threads: CPU threads; below 1 for all.
-
-    Returns:
-        The model with pinhole cameras and moved keypoints, and the images with their new sizes.
-    """
+    """Writes undistorted images, with their EXIF, and masks (``NAME.png``) to ``target/images`` and ``target/masks``.
+    Returns the model with pinhole cameras and moved keypoints, and the images with their new sizes."""
     (target / "bent").mkdir(parents=True)
     model.write(target / "bent")
     names = [photo.name for photo in photos]

@@ -47,11 +47,8 @@ class Photo:
 
 
 def find_images(folder: Path) -> list[Path]:
-    """The images in a folder in natural order; in its subfolders if it has none itself.
-
-    Raises:
-        PrepareError: fewer than two images.
-    """
+    """The images in a folder in natural order; in its subfolders if it has none itself. Raises PrepareError for fewer
+    than two."""
     if not folder.is_dir():
         raise PrepareError(f"{folder} is no folder of images and no video ({', '.join(VIDEOS)}).")
     readable = (*IMAGES, *(HEIF if reads_heif() else ()))
@@ -112,11 +109,8 @@ def scene_names(files: Sequence[Path], folder: Path) -> list[str]:
 
 
 def gather(folder: Path, files: Sequence[Path], target: Path) -> list[Photo]:
-    """Copies images upright into ``target/images`` and notes their sizes and EXIF; skips those already there.
-
-    Raises:
-        PrepareError: an image cannot be read; names the file.
-    """
+    """Copies images upright into ``target/images``, unless they are there, and notes their sizes and EXIF. Raises
+    PrepareError naming an image that cannot be read."""
     (target / "images").mkdir(parents=True, exist_ok=True)
     photos = []
     with progress("Reading images", len(files)) as advance:
@@ -157,11 +151,7 @@ def read_photos(target: Path) -> list[Photo]:
 
 
 def open_image(path: Path) -> Image.Image:
-    """An image, decoded.
-
-    Raises:
-        PrepareError: it cannot be read; names the file.
-    """
+    """An image, decoded. Raises PrepareError naming the file if it cannot be read."""
     try:
         with Image.open(path) as image:
             image.load()
@@ -187,8 +177,7 @@ def _convert(image: Image.Image, path: Path, suffix: str) -> None:
 def gather_masks(folder: Path, photos: Sequence[Photo], target: Path) -> int:
     """Writes a mask for each image to ``target/NAME.png``: white is used, black (zero) is left out.
 
-    Returns:
-        Images that had a mask; the others get an all-white one, since nerfstudio wants all or none.
+    Returns the number of images that had one; the others get a white one, since nerfstudio wants all or none.
 
     Raises:
         PrepareError: no mask fits an image, or one has another size.

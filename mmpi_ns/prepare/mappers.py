@@ -58,12 +58,10 @@ def _judged(mapper: str, model: pycolmap.Reconstruction, says: str, task: Task) 
 def map_and_judge(task: Task) -> Solution:
     """Runs the global mapper, then the incremental one from the focal length that fits, and chooses by the evidence.
 
-    The chosen model is given all points and adjusted (``polish``), unless that makes the evidence worse.
-
-    Raises:
-        PrepareError: neither mapper makes a model.
+    The chosen model is given all points and adjusted (``polish``), unless that makes the evidence worse. Raises
+    PrepareError if neither mapper makes a model.
     """
-    chosen, *others = _best_first(_candidates(task), task)
+    chosen, *others = _candidates(task)
     with progress("Adding points", 1) as advance:
         model = copy.deepcopy(chosen.model)
         model = with_all_points(model, task.database, task.images, task.free.lens, task.threads)
@@ -78,12 +76,8 @@ def map_and_judge(task: Task) -> Solution:
     return Solution(chosen.model, "; beside it ".join([chosen.says, *beside]), verdict)
 
 
-def _best_first(candidates: Sequence[Candidate], task: Task) -> list[Candidate]:
-    return [candidates[i] for i in best_first([c.witness for c in candidates], task.is_ordered)]
-
-
 def _candidates(task: Task) -> list[Candidate]:
-    """The models of both mappers, of the global one from several focal lengths.
+    """The models of both mappers, of the global one from several focal lengths, the most credible first.
 
     A global mapper that placed a part of a long sequence places all images if the incremental one fails.
     """
@@ -94,11 +88,11 @@ def _candidates(task: Task) -> list[Candidate]:
             right = [c.witness for c in candidates if c.grade == "right"]
             differences = [agreement(right[0], w) for w in right[1:]]
             is_settled = bool(right) and all(d is not None and agrees(d) for d in differences)
-    candidates = _best_first(candidates, task)
     start, is_part = task.database, len(task.placed) < len(task.offered)
     if candidates and task.free.lens:
+        best = candidates[best_first([c.witness for c in candidates], task.is_ordered)[0]].model
         start = task.work / "from-global.db"
-        start_from(task.database, start, {n: c.mean_focal_length() for n, c in candidates[0].model.cameras.items()})
+        start_from(task.database, start, {n: c.mean_focal_length() for n, c in best.cameras.items()})
     failed: PrepareError | None = None
     try:
         attempts = 1 if is_settled and not is_part else len(ATTEMPTS)
@@ -110,16 +104,13 @@ def _candidates(task: Task) -> list[Candidate]:
         candidates += _globally([("global-all", start)], task.offered, task)
     if failed and not candidates:
         raise failed
-    return candidates
+    return [candidates[i] for i in best_first([c.witness for c in candidates], task.is_ordered)]
 
 
 def _starts(task: Task) -> list[tuple[str, Path]]:
-    """Databases for the global mapper, by name: unchanged if the focal length is known, else one for each guess.
-
-    The first guess comes from the fundamental matrices of the pairs, if they determine it (in a straight drive they
-    do not): the focal lengths for which they become essential matrices. The others are fixed multiples of the image
-    side.
-    """
+    """Databases for the global mapper, by name: unchanged if the focal length is known, else one for each guess. The
+    first guess is the focal length for which the fundamental matrices of the pairs become essential ones, if they
+    determine it (in a straight drive they do not). The others are fixed multiples of the image side."""
     database, work = task.database, task.work
     with pycolmap.Database.open(database) as opened:
         unknown = [c for c in opened.read_all_cameras() if not c.has_prior_focal_length]

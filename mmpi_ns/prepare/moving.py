@@ -9,7 +9,6 @@ import numpy as np
 import pycolmap
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
-from numpy.typing import NDArray
 from PIL import Image
 from rich.progress import track
 
@@ -35,28 +34,27 @@ def write_masks(
     Args:
         model: poses, cameras and points.
         photos: all that get a mask, ``target/NAME.png``: white is used. Those of test images are white.
-        train: names of the training images, which alone are compared with each other.
+        train: names of the training images, which alone are compared.
         images: folder of the images.
         target: folder for the masks.
         picture: file for the picture.
         threads: processor threads; below 1 for all.
 
     Returns:
-        The share of each image that is masked, of those in which something moves, by name.
+        The share that is masked of each image in which something moves, by name.
     """
     if threads > 0:
         torch.set_num_threads(threads)
     entries = [model.images[i] for i in sorted(model.reg_image_ids()) if model.images[i].name in set(train)]
     posed = _posed_images(model, entries, images)
-
-    def points_of(i: int) -> NDArray[np.float64]:
-        seen = [model.points3D[p.point3D_id].xyz for p in entries[i].points2D if p.has_point3D()]
-        return np.array(seen).reshape(-1, 3)
-
-    shown = find_moving(
-        posed, points_of, lambda work, count: track(work, "Looking for what moves", count, console=CONSOLE)
+    views, moving = find_moving(
+        posed,
+        lambda i: np.reshape(
+            [model.points3D[p.point3D_id].xyz for p in entries[i].points2D if p.has_point3D()], (-1, 3)
+        ),
+        lambda work, count: track(work, "Looking for what moves", count, console=CONSOLE),
     )
-    if not shown.share:
+    if not any(mask.any() for mask in moving):
         return {}
     target.mkdir(parents=True, exist_ok=True)
     number, shares = {entry.name: i for i, entry in enumerate(entries)}, {}
@@ -64,12 +62,12 @@ def write_masks(
         shape, i = (photo.height, photo.width), number.get(photo.name)
         mask = np.zeros(shape, bool)
         if i is not None:
-            mask = in_image(shown.views[i], shown.masks[i], posed, i, shape)
+            mask = in_image(views[i], moving[i], posed, i, shape)
         if mask.any():
             shares[photo.name] = float(mask.mean())
         Image.fromarray(np.where(mask, 0, 255).astype(np.uint8)).save(target / f"{photo.name}.png")
-    colors = ((entry.name, straightened_color(posed, i, shown.views[i])) for i, entry in enumerate(entries))
-    draw_moving(picture, colors, shown.masks)
+    colors = ((entry.name, straightened_color(posed, i, views[i])) for i, entry in enumerate(entries))
+    draw_moving(picture, colors, moving)
     return shares
 
 

@@ -72,7 +72,19 @@ class Preparation:
             database, self.matching = self._matches(database)
         with self._timed("mapping"):
             solution, self.focal, self.groups = self._solve(database)
-        self._check(solution)
+        count, total = solution.model.num_reg_images(), len(self.photos)
+        if count < LEAST_SHARE * total and not s.allow_partial:
+            groups = "".join(f" Another group of {len(g)}: {in_short(g, 4)}." for g in self.groups)
+            raise PrepareError(
+                f"Only {count} of {total} images could be registered: {in_short(camera_poses(solution.model)[0], 4)}."
+                f"{groups} The groups need images that connect them. For a scene of the {count} alone: "
+                "--allow-partial. What was found so far is kept, and a new run goes on from it."
+            )
+        if solution.verdict.grade == "broken" and not s.allow_doubtful:
+            raise PrepareError(
+                f"The track that was found is wrong, so no scene was made. {solution.verdict.words()} {REMEDY} "
+                "To look at it all the same: --allow-doubtful."
+            )
         with self._timed("writing"):
             return self._write(solution)
 
@@ -131,25 +143,23 @@ class Preparation:
                 if not path.exists():
                     with whole(path) as partial:
                         shutil.copyfile(database, partial)
-                listed, says = self._pairs(path)
+                names = [p.name for p in self.photos]
+                if self.known_poses is not None and s.matching == "auto":
+                    places = [i for i, n in enumerate(names) if n in self.known_poses.poses]
+                    poses = np.array([self.known_poses.poses[names[i]] for i in places])  # OpenCV axes
+                    listed = [(places[i], places[j]) for i, j in near_pairs(poses[:, :3], 2 * s.overlap)]
+                    says = f"the {2 * s.overlap} nearest by pose"
+                else:
+                    alike = pairs.image_similarity(path, len(names))
+                    chosen, why = pairs.choose(s.matching, names, alike, self.is_video)
+                    listed, says = pairs.list_pairs(chosen, alike, s.overlap), f"{chosen} ({why})"
+                    if chosen == "sequential":
+                        says += f", {len(pairs.revisits(alike, s.overlap))} pairs that may be revisits"
                 verified = features.match(path, self.photos, listed, s.threads)
                 (folder / "says.txt").write_text(f"{says}; {verified} of {len(listed)} pairs match", encoding="utf-8")
         says = (folder / "says.txt").read_text(encoding="utf-8")
         say(f"Matching: {says}.")
         return path, says
-
-    def _pairs(self, database: Path) -> tuple[pairs.Pairs, str]:
-        """The pairs to match, as indices of photos, and how they were chosen in words."""
-        s, names = self.settings, [p.name for p in self.photos]
-        if self.known_poses is not None and s.matching == "auto":
-            places = [i for i, n in enumerate(names) if n in self.known_poses.poses]
-            poses = np.array([self.known_poses.poses[names[i]] for i in places])  # OpenCV axes
-            near = near_pairs(poses[:, :3], 2 * s.overlap)
-            return [(places[i], places[j]) for i, j in near], f"the {2 * s.overlap} nearest by pose"
-        alike = pairs.image_similarity(database, len(names))
-        chosen, why = pairs.choose(s.matching, names, alike, self.is_video)
-        revisits = f", {len(pairs.revisits(alike, s.overlap))} pairs that may be revisits"
-        return pairs.list_pairs(chosen, alike, s.overlap), f"{chosen} ({why}){revisits * (chosen == 'sequential')}"
 
     def _solve(self, database: Path) -> tuple[Solution, tuple[float, float] | None, list[list[str]]]:
         """Poses and points; the interval of a refined focal length; connected groups of images without a pose."""
@@ -187,22 +197,6 @@ class Preparation:
         verdict = Verdict(says["grade"], tuple(says["reasons"]))
         solution = Solution(pycolmap.Reconstruction(folder / "model"), says["mapping"], verdict)
         return solution, says["focal"], says["groups"]
-
-    def _check(self, solution: Solution) -> None:
-        """Refuses a scene of few of the images, and a scene whose track is wrong."""
-        s, count, total = self.settings, solution.model.num_reg_images(), len(self.photos)
-        if count < LEAST_SHARE * total and not s.allow_partial:
-            groups = "".join(f" Another group of {len(g)}: {in_short(g, 4)}." for g in self.groups)
-            raise PrepareError(
-                f"Only {count} of {total} images could be registered: {in_short(camera_poses(solution.model)[0], 4)}."
-                f"{groups} The groups need images that connect them. For a scene of the {count} alone: "
-                "--allow-partial. What was found so far is kept, and a new run goes on from it."
-            )
-        if solution.verdict.grade == "broken" and not s.allow_doubtful:
-            raise PrepareError(
-                f"The track that was found is wrong, so no scene was made. {solution.verdict.words()} {REMEDY} "
-                "To look at it all the same: --allow-doubtful."
-            )
 
     def _write(self, solution: Solution) -> Verdict:
         """Moves the model into the scene's frame and writes the scene; the verdict, with the findings of the checks."""
@@ -335,11 +329,8 @@ class Preparation:
 
 
 def prepare(settings: Settings) -> Verdict:
-    """Makes the scene; returns how far it can be believed.
-
-    Raises:
-        PrepareError: the input is missing, cannot be made into a scene, or something would be lost in its folder.
-    """
+    """Makes the scene; returns how far it can be believed. Raises PrepareError if the input is missing or cannot be
+    made into a scene, or something would be lost in its folder."""
     load_pycolmap()  # in a version that is new enough
     check_options(settings)
     source, scene = settings.input.resolve(), settings.scene.resolve()

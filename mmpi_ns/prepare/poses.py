@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -38,12 +38,9 @@ class KnownPoses:
 
 
 def read_poses(path: Path, axes: str, photos: Sequence[Photo]) -> KnownPoses:
-    """Reads known poses and matches them with the images.
+    """Reads known poses, from a file or a folder of 4x4 text files, and matches them with the images.
 
-    Args:
-        path: a file, or a folder of 4x4 text files.
-        axes: opencv, opengl, or auto (opengl for transforms.json only).
-        photos: the images.
+    Axes are opencv, opengl, or auto (opengl for transforms.json only).
 
     Raises:
         PrepareError: the file is not understood, or fits fewer than two images.
@@ -52,11 +49,8 @@ def read_poses(path: Path, axes: str, photos: Sequence[Photo]) -> KnownPoses:
     if path.is_dir() or is_transforms:
         read = (_read_transforms if is_transforms else _read_matrices)(path, photos)
     else:
-        numbers = len(next(_lines(path), (0, []))[1])
-        if numbers not in (8, 12):
-            formats = "KITTI has 12 numbers a line, TUM 8 (time, position, quaternion x y z w)"
-            raise PrepareError(f"--poses {path} is not understood: {formats}.")
-        read = (_read_tum if numbers == 8 else _read_kitti)(path, photos)
+        rows = _read_rows(path)
+        read = (_read_tum if rows.shape[1] == 8 else _read_kitti)(rows, path, photos)
     opengl = axes == "opengl" or (axes == "auto" and is_transforms)
     flip = np.diag([1.0, -1.0, -1.0, 1.0]) if opengl else np.eye(4)
     poses = {n: p @ flip for n, p in read.poses.items() if np.isfinite(p).all()}
@@ -74,28 +68,28 @@ def read_poses(path: Path, axes: str, photos: Sequence[Photo]) -> KnownPoses:
     return replace(read, poses=poses)
 
 
-def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """Number and fields of each line of a text file that has any; # begins a comment."""
-    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
-        if fields := line.split("#")[0].replace(",", " ").split():
-            yield number, fields
-
-
-def _read_rows(path: Path, width: int) -> Array:
-    rows = []
-    for number, fields in _lines(path):
+def _read_rows(path: Path) -> Array:
+    """The numbers of a text file, 8 or 12 in each line; # begins a comment. [N, 8 or 12]"""
+    text = path.read_text(encoding="utf-8", errors="replace")
+    lines = [line.split("#")[0].replace(",", " ").split() for line in text.splitlines()]
+    width, rows = len(next(filter(None, lines), [])), []
+    if width not in (8, 12):
+        formats = "KITTI has 12 numbers a line, TUM 8 (time, position, quaternion x y z w)"
+        raise PrepareError(f"--poses {path} is not understood: {formats}.")
+    for number, fields in enumerate(lines, 1):
+        if not fields:
+            continue
         try:
             rows.append([float(f) for f in fields])
         except ValueError as error:
             raise PrepareError(f"{path}, line {number}: {error}.") from error
         if len(fields) != width:
             raise PrepareError(f"{path}, line {number}: {len(fields)} numbers, not {width}.")
-    return np.array(rows, dtype=np.float64).reshape(-1, width)
+    return np.array(rows, dtype=np.float64)
 
 
-def _read_kitti(path: Path, photos: Sequence[Photo]) -> KnownPoses:
+def _read_kitti(rows: Array, path: Path, photos: Sequence[Photo]) -> KnownPoses:
     """KITTI poses: one line for each image; of more lines, the numbers in the file names choose (counted from 0)."""
-    rows = _read_rows(path, 12)
     matrices = np.concatenate([rows.reshape(-1, 3, 4), np.tile([[[0.0, 0.0, 0.0, 1.0]]], (len(rows), 1, 1))], 1)
     places: Sequence[int] = range(len(photos))
     says = "KITTI poses, one line for each image"
@@ -108,11 +102,8 @@ def _read_kitti(path: Path, photos: Sequence[Photo]) -> KnownPoses:
     return KnownPoses({p.name: matrices[i] for p, i in zip(photos, places, strict=True)}, says)
 
 
-def _read_tum(path: Path, photos: Sequence[Photo]) -> KnownPoses:
+def _read_tum(rows: Array, path: Path, photos: Sequence[Photo]) -> KnownPoses:
     """TUM poses: by time stamp if the file names are time stamps, else one line for each image."""
-    rows = _read_rows(path, 8)
-    if not len(rows):
-        raise PrepareError(f"{path} holds no pose.")
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     for pose, row in zip(poses, rows, strict=True):
         pose[:3, :3] = pycolmap.Rotation3d(row[4:8]).matrix() if np.linalg.norm(row[4:8]) > 0 else np.nan
@@ -175,10 +166,18 @@ def _read_transforms(path: Path, photos: Sequence[Photo]) -> KnownPoses:
         _check_apart(places, path)
         poses, intrinsics = {}, {}
         for photo in (p for p in photos if p.name in places):
-            frame = frames[places[photo.name]]
+            frame = meta | frames[places[photo.name]]
             poses[photo.name] = np.array(frame["transform_matrix"], dtype=np.float64).reshape(4, 4)
-            if "fl_x" in meta or "fl_x" in frame:
-                intrinsics[photo.name] = _frame_intrinsics({**meta, **frame}, photo)
+            if "fl_x" in frame:  # for images that may be smaller or larger than those of the file
+                fisheye = frame.get("camera_model") in FISHEYE
+                keys = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2")
+                sx, sy = photo.width / frame.get("w", photo.width), photo.height / frame.get("h", photo.height)
+                if abs(sx / sy - 1) > 0.02:
+                    raise PrepareError(f"{photo.name} is {photo.width}x{photo.height}, transforms.json says otherwise.")
+                fx, fy = float(frame["fl_x"]), float(frame.get("fl_y", frame["fl_x"]))
+                cx, cy = float(frame.get("cx", photo.width / sx / 2)), float(frame.get("cy", photo.height / sy / 2))
+                lens = tuple(float(frame.get(k, 0.0)) for k in keys)
+                intrinsics[photo.name] = Intrinsics(fx * sx, fy * sy, cx * sx, cy * sy, lens, fisheye)  # type: ignore[arg-type]
     except (ValueError, KeyError, TypeError) as error:
         raise PrepareError(f"--poses {path} is no transforms.json as nerfstudio writes it ({error!r}).") from error
     split = meta if "train_filenames" in meta and "test_filenames" in meta else None
@@ -205,16 +204,3 @@ def _check_apart(poses: dict[str, Any], path: Path) -> None:
                 f"{path} has one pose for {first[pose]} and {name}: images of one name in two folders need two."
             )
         first[pose] = name
-
-
-def _frame_intrinsics(frame: dict[str, Any], photo: Photo) -> Intrinsics:
-    """Intrinsics of a frame, for images that may be smaller or larger than those of the file."""
-    fisheye = frame.get("camera_model") in FISHEYE
-    keys = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2")
-    sx, sy = photo.width / frame.get("w", photo.width), photo.height / frame.get("h", photo.height)
-    if abs(sx / sy - 1) > 0.02:
-        raise PrepareError(f"{photo.name} is {photo.width}x{photo.height}, transforms.json says otherwise.")
-    fx, fy = float(frame["fl_x"]), float(frame.get("fl_y", frame["fl_x"]))
-    cx, cy = float(frame.get("cx", photo.width / sx / 2)), float(frame.get("cy", photo.height / sy / 2))
-    lens = tuple(float(frame.get(k, 0.0)) for k in keys)
-    return Intrinsics(fx * sx, fy * sy, cx * sx, cy * sy, lens, fisheye)  # type: ignore[arg-type]

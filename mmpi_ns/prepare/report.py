@@ -8,15 +8,16 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from mmpi_ns.capture.exif import light_of
 from mmpi_ns.prepare.alignment import camera_poses
-from mmpi_ns.prepare.checks import Finding, coverage
+from mmpi_ns.prepare.checks import Finding
 from mmpi_ns.utils.files import write_text
 
 WORST = 5
 """Number of images with the least coverage that are listed."""
+CELLS = (8, 6)
+"""Columns and rows of the grid for coverage."""
 
 
 def exposure_in_words(images: Sequence[Path]) -> str:
@@ -36,18 +37,14 @@ def write_report(
     note: str,
     scene: Path,
 ) -> None:
-    """Writes report.md and report/track.png.
-
-    Args:
-        model: in the frame of the scene.
-        title: of the report.
-        rows: what the table says beyond the model's figures, by their names.
-        findings: of the checks; listed as warnings and marked in the drawing.
-        warnings: further ones, listed first.
-        note: the last line.
-        scene: folder to write to.
-    """
-    covered = coverage(model)
+    """Writes report.md and report/track.png: ``rows`` beside the model's figures in the table, the further ``warnings``
+    before the findings of the checks, and a note at the end."""
+    covered = {}  # share of each image's cells that hold a keypoint with a point
+    for i in model.reg_image_ids():
+        image, camera = model.images[i], model.cameras[model.images[i].camera_id]
+        seen = np.array([p.xy for p in image.points2D if p.has_point3D()]).reshape(-1, 2)
+        cell = (np.clip(seen / [camera.width, camera.height], 0, 1 - 1e-9) * CELLS).astype(int)
+        covered[image.name] = len(np.unique(cell, axis=0)) / (CELLS[0] * CELLS[1])
     rows = rows | {
         "reprojection error": f"{model.compute_mean_reprojection_error():.3f} px",
         "points": f"{model.num_points3D()}",
@@ -83,7 +80,16 @@ def _draw_track(model: pycolmap.Reconstruction, findings: Sequence[Finding], pat
     """Cameras and points from above."""
     path.parent.mkdir(exist_ok=True)
     names, poses = camera_poses(model)
-    axes = horizontal_axes(poses)
+    # Two axes across the cameras' mean up, whatever frame the scene is in; its own where one of them is about vertical.
+    up = -poses[:, :3, 1].mean(0)
+    up /= max(float(np.linalg.norm(up)), 1e-12)
+    vertical = np.argmax(np.abs(up))
+    if abs(up[vertical]) > 0.9:
+        pair = np.eye(3)[[i for i in range(3) if i != vertical]]
+        axes = (pair[::-1] if np.dot(np.cross(*pair), up) < 0 else pair).T
+    else:
+        right = np.linalg.svd(np.eye(3) - np.outer(up, up))[0][:, 0]
+        axes = np.stack([right, np.cross(up, right)], -1)
     centers, facing = poses[:, :3, 3] @ axes, poses[:, :3, 2] @ axes
     points = np.array([p.xyz for p in model.points3D.values()]).reshape(-1, 3) @ axes
     reach = 0.6 * max(float(np.ptp(centers, axis=0).max()), 1e-9)
@@ -98,18 +104,3 @@ def _draw_track(model: pycolmap.Reconstruction, findings: Sequence[Finding], pat
     plot.annotate(names[0], centers[0])
     plot.annotate(names[-1], centers[-1])
     figure.savefig(path, dpi=110)
-
-
-def horizontal_axes(poses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Two axes across the cameras' mean up, whatever frame the scene is in. [3, 2]"""
-    up = -poses[:, :3, 1].mean(0)
-    up /= max(float(np.linalg.norm(up)), 1e-12)
-    nearest = np.argmax(np.abs(up))
-    if abs(up[nearest]) > 0.9:  # keep the scene's own axes where one of them is about vertical
-        kept = [i for i in range(3) if i != nearest]
-        axes = np.eye(3)[kept]
-        if np.dot(np.cross(*axes), up) < 0:
-            axes = axes[::-1]
-        return axes.T
-    right = np.linalg.svd(np.eye(3) - np.outer(up, up))[0][:, 0]
-    return np.stack([right, np.cross(up, right)], -1)

@@ -82,11 +82,8 @@ class Settings:
 
 
 def check_options(s: Settings) -> None:
-    """Checks the options before any work.
-
-    Raises:
-        PrepareError: a number is out of range, two options contradict each other, or a file is missing.
-    """
+    """Checks the options before any work. Raises PrepareError if one is out of range, contradicts another, or names no
+    file."""
     numbers = {
         "--focal": s.focal, "--camera-height": s.camera_height, "--frame-motion": s.frame_motion,
         "--overlap": s.overlap, "--max-features": s.max_features,
@@ -120,11 +117,7 @@ def check_options(s: Settings) -> None:
 
 
 def read_lists(path: Path) -> dict[str, list[str]]:
-    """The train and test files that a JSON file lists.
-
-    Raises:
-        PrepareError: it cannot be read, or lists none.
-    """
+    """The train and test files that a JSON file lists. Raises PrepareError if it cannot be read, or lists none."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         return {key: [str(n) for n in content[key]] for key in ("train_filenames", "test_filenames")}

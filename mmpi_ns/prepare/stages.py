@@ -28,9 +28,8 @@ class PrepareError(InputError):
 class Stages:
     """Stages of a preparation, run in order; a stage that was finished with the same settings is skipped.
 
-    The outputs of a stage are valid while its own settings and those of all earlier stages are unchanged. The first
-    stage whose settings changed is emptied, and so are all after it. An interrupted stage finds its own partial
-    output again.
+    A stage is valid while its own settings and those of all earlier ones are unchanged; the first that changed is
+    emptied, and so are all after it. An interrupted stage finds its own partial output again.
     """
 
     def __init__(self, work: Path) -> None:
@@ -41,11 +40,7 @@ class Stages:
     @contextmanager
     def stage(self, name: str, settings: Any) -> Iterator[tuple[Path, bool]]:
         """A stage's own folder, and whether it was finished before; it counts as finished when the block ends.
-
-        Args:
-            name: the folder's name.
-            settings: everything the result depends on besides the earlier stages; JSON or text.
-        """
+        ``settings``, JSON or text, are everything the result depends on besides the earlier stages."""
         text = self._key + name + json.dumps(settings, sort_keys=True, default=str)
         self._key = hashlib.sha256(text.encode()).hexdigest()
         folder, stamp = self.work / name, self.work / f"{name}.json"
@@ -67,11 +62,7 @@ class Stages:
 
 @contextmanager
 def only_one(work: Path) -> Iterator[None]:
-    """Locks a work folder against a second run, and reports a full disk.
-
-    Raises:
-        PrepareError: another run is at work there, or the disk is full.
-    """
+    """Locks a work folder against a second run. Raises PrepareError if one is at work there, or the disk is full."""
     work.mkdir(parents=True, exist_ok=True)
     try:
         with FileLock(work / "lock", blocking=False):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -82,12 +83,7 @@ def worse(value: float, limits: tuple[float, float]) -> Grade:
 
 
 def judge_alone(witness: Witness, is_sequence: bool) -> Verdict:
-    """The verdict on a mapper's model by its own evidence.
-
-    Args:
-        witness: of the mapper.
-        is_sequence: the images are in the order of the drive or walk.
-    """
+    """The verdict on a mapper's model by its own evidence; a sequence is in the order of the drive or walk."""
     pairs, count = witness.pairs, len(witness.images)
     tracked, fitting = share(pairs.tracked, pairs.matches), share(pairs.fitting, pairs.fitting + pairs.beside)
     problems: list[tuple[Grade, str]] = [
@@ -95,9 +91,7 @@ def judge_alone(witness: Witness, is_sequence: bool) -> Verdict:
         (worse(fitting, FITTING), f"{1 - fitting:.0%} of the verified matches miss the poses by a little."),
     ]
     if is_sequence:
-        across = bridges(pairs, count, pairs.tracked)
-        if not np.isnan(across).all():
-            problems += [_break(witness, across), *_contradictions(witness), *_leaps(witness, across)]
+        problems += _problems_along(witness)
     else:
         held = held_by_image(pairs, count)
         loose = [witness.images[int(i)] for i in np.flatnonzero(held < LOOSE)]
@@ -107,22 +101,23 @@ def judge_alone(witness: Witness, is_sequence: bool) -> Verdict:
     return Verdict(severe[0][0], tuple(says for _, says in severe)) if severe else Verdict("right")
 
 
-def _break(witness: Witness, across: Array) -> tuple[Grade, str]:
-    """The worst gap of a sequence by the share of the matches across it that became points; few matches say nothing."""
+def _problems_along(witness: Witness) -> list[tuple[Grade, str]]:
+    """Where the track of a sequence breaks, bends and leaps; nothing where few matches join its images."""
+    pairs, count = witness.pairs, len(witness.images)
+    across = bridges(pairs, count, pairs.tracked)
+    if np.isnan(across).all():
+        return []
+    between = [f"between {one} and {next_one}" for one, next_one in pairwise(witness.images)]
+    # The worst gap by the share of the matches across it that became points.
     usual, grades = float(np.nanmedian(across)), []
     for gap, held in enumerate(across):
         grade = max(worse(held, BRIDGED), worse(held / max(usual, 1e-9), BRIDGED_OF_USUAL), key=ORDER.index)
         at_an_end = min(gap + 1, len(across) - gap) < EDGE  # a few images may have few points and still be right
         grades.append("doubtful" if at_an_end and grade == "broken" else grade)
-    worst = max(range(len(across)), key=lambda gap: (ORDER.index(grades[gap]), -np.nan_to_num(across[gap], nan=1.0)))
-    says = f"{across[worst]:.0%} of the matches across became points, {usual:.0%} elsewhere."
-    return grades[worst], f"The track breaks {_between(witness, worst)}: {says}"
-
-
-def _contradictions(witness: Witness) -> list[tuple[Grade, str]]:
-    """Where matches lie beside or far from the epipolar lines of the poses: the worst gaps, and the worst image."""
-    pairs, count = witness.pairs, len(witness.images)
-    problems: list[tuple[Grade, str]] = []
+    at = max(range(len(across)), key=lambda gap: (ORDER.index(grades[gap]), -np.nan_to_num(across[gap], nan=1.0)))
+    says = f"{across[at]:.0%} of the matches across became points, {usual:.0%} elsewhere."
+    problems: list[tuple[Grade, str]] = [(grades[at], f"The track breaks {between[at]}: {says}")]
+    # The worst gaps by matches beside, and far from, the epipolar lines of the poses, and the worst image.
     for word, limits, whole in (
         ("bent", FITTING_ACROSS, pairs.fitting + pairs.beside),
         ("broken", HELD_ACROSS, pairs.matches),
@@ -131,29 +126,29 @@ def _contradictions(witness: Witness) -> list[tuple[Grade, str]]:
         if np.isfinite(fitting).any():
             at = int(np.nanargmin(fitting))
             says = f"{fitting[at]:.0%} of the matches across fit its poses."
-            problems.append((worse(float(fitting[at]), limits), f"The track is {word} {_between(witness, at)}: {says}"))
+            problems.append((worse(float(fitting[at]), limits), f"The track is {word} {between[at]}: {says}"))
     held = held_by_side(pairs, count)
     if np.isfinite(held).any():
         side, at = divmod(int(np.nanargmin(held)), count)
         others, fitting = ("later" if side else "earlier"), float(held[side, at])
         says = f"{witness.images[at]} is misplaced: {fitting:.0%} of its matches with {others} images fit its pose."
         problems.append((worse(fitting, HELD_BY_SIDE), says))
-    return problems
+    return problems + _leaps(witness, across, between)
 
 
-def _leaps(witness: Witness, across: Array) -> list[tuple[Grade, str]]:
+def _leaps(witness: Witness, across: Array, between: Sequence[str]) -> list[tuple[Grade, str]]:
     """The largest change of scale, and jumps and changes of speed where few matches hold across a gap."""
     problems: list[tuple[Grade, str]] = []
     if np.isfinite(witness.scales).any():
         at = int(np.nanargmax(np.abs(witness.scales)))
         change = float(abs(witness.scales[at]))
         grade: Grade = "right" if change < SCALE[0] else "doubtful" if change < SCALE[1] else "broken"
-        problems.append((grade, f"The scale changes by {np.expm1(change):.0%} {_between(witness, at)}."))
+        problems.append((grade, f"The scale changes by {np.expm1(change):.0%} {between[at]}."))
     is_weak = across < WEAK * float(np.nanmedian(across))
     leaps = np.where(is_weak, jumps(witness), 0.0)
     if leaps.max(initial=0.0) > JUMP:
         at = int(leaps.argmax())
-        says = f"{_between(witness, at)}, {leaps[at]:.0f} usual steps, and few matches across it hold."
+        says = f"{between[at]}, {leaps[at]:.0f} usual steps, and few matches across it hold."
         problems.append(("broken", f"The track jumps {says}"))
     beside_weak = np.append(is_weak, False) | np.append(False, is_weak)
     changes = np.where(beside_weak, speed_changes(witness), 1.0)
@@ -162,10 +157,6 @@ def _leaps(witness: Witness, across: Array) -> list[tuple[Grade, str]]:
         says = f"{changes[at]:.1f} times at {witness.images[at]}"
         problems.append(("doubtful", f"The speed changes {says}, where few matches hold: the scale may break there."))
     return problems
-
-
-def _between(witness: Witness, gap: int) -> str:
-    return f"between {witness.images[gap]} and {witness.images[gap + 1]}"
 
 
 def agrees(difference: Agreement) -> bool:

@@ -62,7 +62,7 @@ def grown_tiles(
     reachable: Bool[Tensor, "T"] | None,
     least: float = 0.0,
 ) -> Int[Tensor, "T"]:
-    """``tiles`` at another resolution: those that a stored texel of the old one reaches, and a training ray too.
+    """``tiles`` at another resolution, with the tiles that a stored texel of the old one and a training ray reach.
 
     Args:
         old: current heads.

@@ -22,12 +22,12 @@ def nearest_views(
     """Cameras nearest to camera ``i`` with a similar viewing direction, nearest first.
 
     Args:
-        camera_to_worlds: poses of all cameras, axes in columns, z backwards or forwards. [M, 3, 4]
+        camera_to_worlds: poses, axes in columns, z backwards or forwards. [M, 3, 4]
         i: the camera.
         count: maximum number of cameras.
         max_angle: between viewing directions, degrees.
         among: the cameras to choose from; None for all.
-        apart: only those in another place, whose images have a parallax.
+        apart: only cameras in another place, whose images have a parallax.
     """
     others = np.arange(len(camera_to_worlds)) if among is None else np.asarray(among, np.int64)
     distance = np.linalg.norm(camera_to_worlds[others, :, 3] - camera_to_worlds[i, :, 3], axis=-1)

@@ -10,6 +10,7 @@ tiles.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -47,18 +48,10 @@ class TexelGrid:
         return -(-self.width // SIDE)
 
     @property
-    def num_tiles(self) -> int:
-        return self.depth * self.down * self.across
-
-    @property
-    def texels(self) -> int:
-        return self.depth * self.height * self.width
-
-    @property
     def own_tiles(self) -> Int[Tensor, "D Y X"]:
         """Brick of each of the head's tiles."""
-        tiles = self.tiles[self.first_tile : self.first_tile + self.num_tiles]
-        return tiles.view(self.depth, self.down, self.across)
+        shape = self.depth, self.down, self.across
+        return self.tiles[self.first_tile :][: math.prod(shape)].view(shape)
 
     @property
     def rows(self) -> Int[Tensor, "D*H*W"]:
@@ -79,15 +72,14 @@ class TexelGrid:
         x, fx = _cell(uv[:, 0], self.width)
         y, fy = _cell(uv[:, 1], self.height)
         gx, gy = 1 - fx, 1 - fy
-        return self._corners(plane, y, x), torch.stack([gx * gy, fx * gy, gx * fy, fx * fy], -1)
+        rows = torch.stack([self.row(plane, y + dy, x + dx) for dy in (0, 1) for dx in (0, 1)], -1)
+        return rows, torch.stack([gx * gy, fx * gy, gx * fy, fx * fy], -1)
 
     def trilinear(self, ndc: Float[Tensor, "N 3"]) -> tuple[Int[Tensor, "N 8"], Float[Tensor, "N 8"]]:
         """Rows and weights at NDC (u, v, s) in [-1, 1]^3, s running over planes (or z layers)."""
         z, fz = _cell(ndc[:, 2], self.depth)
-        rows, weights = self.bilinear(z, ndc)
-        x, y = _cell(ndc[:, 0], self.width)[0], _cell(ndc[:, 1], self.height)[0]
-        rows = torch.cat([rows, self._corners(z + 1, y, x)], -1)
-        return rows, torch.cat([weights * (1 - fz)[:, None], weights * fz[:, None]], -1)
+        (near, weights), (far, _) = self.bilinear(z, ndc), self.bilinear(z + 1, ndc)
+        return torch.cat([near, far], -1), torch.cat([weights * (1 - fz)[:, None], weights * fz[:, None]], -1)
 
     def nearest(self, ndc: Float[Tensor, "N 3"]) -> Int[Tensor, "N"]:
         """Row of the texel nearest to NDC (u, v, s)."""
@@ -100,7 +92,7 @@ class TexelGrid:
     def holds(self, rows: Int[Tensor, "N"]) -> Bool[Tensor, "N"]:
         """Which rows belong to this head; those of the empty brick belong to none."""
         place = self.places[rows >> 6]
-        return (place >= self.first_tile) & (place < self.first_tile + self.num_tiles)
+        return (place >= self.first_tile) & (place < self.first_tile + self.own_tiles.numel())
 
     def texel(self, rows: Int[Tensor, "N"]) -> tuple[Int[Tensor, "N"], Int[Tensor, "N"], Int[Tensor, "N"]]:
         """(plane, y, x) of rows that this head ``holds``: the inverse of ``row``."""
@@ -124,9 +116,6 @@ class TexelGrid:
             exists.append(inside)
         return torch.stack(beside_rows, -1), torch.stack(exists, -1).to(torch.float32)
 
-    def _corners(self, z: Tensor, y: Tensor, x: Tensor) -> Tensor:
-        return torch.stack([self.row(z, y + dy, x + dx) for dy in (0, 1) for dx in (0, 1)], -1)
-
 
 def _cell(coordinate: Float[Tensor, "N"], size: int) -> tuple[Int[Tensor, "N"], Float[Tensor, "N"]]:
     """Lower texel and fraction of a coordinate in [-1, 1] over ``size`` texels; outside it clamps to the border."""
@@ -136,12 +125,7 @@ def _cell(coordinate: Float[Tensor, "N"], size: int) -> tuple[Int[Tensor, "N"], 
 
 
 def head_grids(plan: ScenePlan, tiles: Int[Tensor, "T"] | None = None) -> list[TexelGrid]:
-    """The texels of every head, MPIs first, the cube last.
-
-    Args:
-        plan: sizes of the heads.
-        tiles: brick of every tile; None stores all of them in order.
-    """
+    """The texels of every head, MPIs first, the cube last; all tiles are stored in order unless bricks are given."""
     return make_grids(head_shapes(plan), tiles)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 
 import numpy as np
@@ -69,21 +69,13 @@ class TrainingViews:
 
 
 def reachable_tiles(views: TrainingViews, plan: ScenePlan, device: str | torch.device = "cpu") -> Bool[Tensor, "T"]:
-    """Tiles (in the order of ``texels``) with a texel that a ray through a training image can read.
+    """Tiles (in the order of ``texels``) with a texel that a ray through a training image can read, on the CPU.
 
     A tile is left out if it lies outside one of the four planes of every image, or on a plane that no camera is in
-    front of. This is conservative: a few too many are marked at the corners of images. All tiles of the cube are
-    marked. Computed once for each plan and remembered.
-
-    Args:
-        views: the training images.
-        plan: the heads, at the resolution in use.
-        device: where it is computed, in float64.
-
-    Returns:
-        On the CPU.
+    front of: a few too many are marked at the corners of images, and all tiles of the cube. Computed in float64 on a
+    device, once for each plan.
     """
-    marks, count = _packed_tiles(_Key(views, plan, torch.device(device)))
+    marks, count = _packed_tiles(_Key(views.digest, plan, views, torch.device(device)))
     return torch.from_numpy(np.unpackbits(marks, count=count).view(bool))
 
 
@@ -91,15 +83,10 @@ def reachable_tiles(views: TrainingViews, plan: ScenePlan, device: str | torch.d
 class _Key:
     """What tiles in reach depend on; equal where cameras and plan are equal, on whatever device."""
 
-    views: TrainingViews
+    digest: bytes
     plan: ScenePlan
-    device: torch.device
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Key) and (self.views.digest, self.plan) == (other.views.digest, other.plan)
-
-    def __hash__(self) -> int:
-        return hash((self.views.digest, self.plan))
+    views: TrainingViews = field(compare=False)
+    device: torch.device = field(compare=False)
 
 
 @lru_cache(REMEMBERED)
@@ -117,9 +104,8 @@ def _tiles_of(mpi: MPIPlan, views: TrainingViews, device: torch.device) -> Bool[
     """Tiles of one MPI that some image can read.
 
     From a camera at o (in the MPI's axes) the point with tangents (u, v) on the plane of disparity w lies in direction
-    (u, v, 1) - w o, which is affine in u and v: over a tile, the maximum of normal . direction is a sum of two maxima.
-    Most tiles are in reach of several cameras, so cameras far from each other come first, and each group is compared
-    with the tiles alone that none has reached.
+    (u, v, 1) - w o, affine in u and v: over a tile, the maximum of normal . direction is a sum of two maxima. Cameras
+    far from each other come first, and each group is compared with the tiles alone that none has reached.
     """
     axes = torch.tensor(mpi.axes, dtype=torch.float64)
     spread = torch.cat([torch.arange(len(views.origins))[i::AT_ONCE] for i in range(AT_ONCE)])

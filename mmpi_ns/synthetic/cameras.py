@@ -107,7 +107,3 @@ class Cameras:
             shrink = np.maximum(np.linalg.norm(tangents, axis=-1, keepdims=True) / widest, 1)
             tangents = self._distort(tangents / shrink)[0] * shrink
         return tangents * self.focal + self.center, depth
-
-    def depths(self, distances: NDArray) -> NDArray:
-        """Depths [H, W] along the optical axis of what lies at distances [H, W] along the rays of pixel centres."""
-        return distances / np.sqrt(1 + (self.central_tangents**2).sum(-1)).reshape(distances.shape)

@@ -48,16 +48,14 @@ def write_dataset(
     """Writes images, depths (along the optical axis), transforms.json, sparse_pc.ply and colmap/sparse/0.
 
     With movers also their exact masks (moving/), which transforms.json does not name: finding them is what is tried.
-    With an exposure also exposure.json.
-
-    Everything is in the scene's own frame, which applied_transform states, as Nerfstudio would guess another.
+    With an exposure also exposure.json. All is in the scene's own frame, which applied_transform states.
 
     Args:
         points, noise_pixels, outliers: see ``sfm_points``.
         images: False writes cameras and points alone.
         overwrite: replaces a data set that is in the folder.
         progress: wraps the image numbers as they are rendered.
-        tracks: False writes no points and no COLMAP model, for which it takes pycolmap.
+        tracks: False writes no points and no COLMAP model, which need pycolmap.
         exposure: of the images; None: pixel values are the scene's colours.
         processes: render side by side; the files do not depend on their number.
 
@@ -97,15 +95,10 @@ def _write_image(scene: Scene, folder: Path, exposure: Exposure | None, camera: 
 
 
 def write_depths(scene: Scene, folder: Path, camera: int, distances: Colors) -> None:
-    """Writes the depth image of a camera: millimetres along the optical axis, 0 where that is too far.
-
-    Args:
-        scene: whose cameras these are.
-        folder: of the data set.
-        camera: number of the camera.
-        distances: along the rays [H, W], metres.
-    """
-    depths = scene.cameras.depths(1000 * distances)
+    """Writes the depth image of a camera, millimetres along the optical axis, 0 where that is too far, from distances
+    along the rays [H, W] in metres."""
+    slant = np.sqrt(1 + (scene.cameras.central_tangents**2).sum(-1)).reshape(distances.shape)
+    depths = 1000 * distances / slant
     millimetres = np.where(depths <= MILLIMETRES, depths, 0).round().astype(np.uint16)
     Image.fromarray(millimetres).save(folder / "depths" / image_name(camera))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from itertools import product
 
 import numpy as np
@@ -19,12 +20,6 @@ EYE = 1.5
 
 class Room(Kit):
     """A living room with a window in the far wall and a table in the middle."""
-
-    def __init__(self, seed: int) -> None:
-        super().__init__(seed, 11)
-        self.shell()
-        self.table()
-        self.walls()
 
     def shell(self) -> None:
         (w, d, h), t = ROOM, 0.16
@@ -106,8 +101,11 @@ class Room(Kit):
 
 
 def _room(name: str, seed: int, cameras: Cameras) -> Scene:
-    lamp = Light((0.0, 0.0, 2.38), is_lamp=True, strength=0.42, ambient=0.62)
-    return Scene(name, seed, Room(seed).done(), floor_inside(*ROOM[:2]), open_sky, lamp, cameras)
+    lamp, kit = Light((0.0, 0.0, 2.38), is_lamp=True, strength=0.42, ambient=0.62), Room(seed, 11)
+    kit.shell()
+    kit.table()
+    kit.walls()
+    return Scene(name, seed, kit.done(), partial(floor_inside, ROOM[:2]), open_sky, lamp, cameras)
 
 
 def room(seed: int, count: int, width: int, height: int) -> Scene:

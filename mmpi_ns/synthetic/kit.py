@@ -47,8 +47,8 @@ class Kit:
         """A box by the middle of its bottom."""
         self.box((place[0], place[1], place[2] + size[2] / 2), size, material, *colors, yaw=yaw)
 
-    def sphere(self, center: Color, radius: float, material: str, *colors: Color, yaw: float = 0.0) -> None:
-        self._add(SPHERE, center, (radius,) * 3, yaw, material, colors)
+    def sphere(self, center: Color, radius: float, material: str, *colors: Color) -> None:
+        self._add(SPHERE, center, (radius,) * 3, 0.0, material, colors)
 
     def cylinder(self, place: Color, radius: float, height: float, material: str, *colors: Color) -> None:
         """An upright cylinder by the middle of its bottom."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,9 +33,6 @@ class Surface:
     """[N, 3, 3] of the solid."""
     offset: Array
     """[N, 2] of the solid's noise."""
-
-    def take(self, rows: NDArray[np.bool_]) -> Surface:
-        return Surface(*(getattr(self, f.name)[rows] for f in fields(self)))
 
     def noise(self, noise: Noise, scale: float | Array = 1.0, stretch: float = 1.0) -> Array:
         """[N] noise, finer by ``scale``, and by ``stretch`` along u."""

@@ -31,16 +31,11 @@ CHANGED = 1 / 255
 
 
 def movers_at(seed: int, road: Road, count: int, along: Array, walks: bool, camera: int) -> Primitives:
-    """Cars and people when an image is taken: in turns oncoming, ahead of the camera, crossing, on the pavement, and
-    overtaking.
+    """Cars and people when image ``camera`` is taken: oncoming, ahead, crossing, on the pavement, and overtaking, in
+    turns.
 
-    Args:
-        seed: of their places and looks.
-        road: along which they move.
-        count: of cars and people.
-        along: metres along the road of each camera. [M]
-        walks: whether the cameras walk; else they drive.
-        camera: number of the image.
+    They move along a road, as do the cameras, which walk or drive and are ``along`` it, metres [M]. ``seed`` is of
+    their places and looks.
     """
     speed, rows = WALKING if walks else DRIVING, []
     seconds = (along - along[0]) / speed
@@ -81,25 +76,15 @@ def _add_person(kit: Street, along: float, aside: float, paint, now: float) -> N
 
 
 def with_movers(scene: Scene, count: int) -> Scene:
-    """The scene with ``count`` movers in its training images.
-
-    Raises:
-        ValueError: the scene has no road.
-    """
+    """The scene with ``count`` movers in its training images. Raises ValueError if it has no road."""
     if scene.road is None:
         raise ValueError(f"Nothing moves in the scene {scene.name}: choose street, long-road or walk.")
     along = scene.road.locate(scene.cameras.camera_to_worlds[:, :2, 3])[0]
     return replace(scene, movers=partial(movers_at, scene.seed, scene.road, count, along, scene.name == "walk"))
 
 
-def moving_mask(scene: Scene, camera: int, supersample: int = 3) -> NDArray[np.uint8]:
-    """Where an image [H, W] shows a mover or its shadow; zeros elsewhere.
-
-    Args:
-        scene: with movers.
-        camera: number of the image.
-        supersample: rays along each side of a pixel, of which one that meets a mover is enough.
-    """
+def moving_mask(scene: Scene, camera: int) -> NDArray[np.uint8]:
+    """Where an image [H, W] shows a mover, if only by one of 3 x 3 rays of a pixel, or its shadow; zeros elsewhere."""
     cameras, filmed = scene.cameras, scene.filmed_by(camera)
     mask = np.zeros(cameras.height * cameras.width, np.uint8)
     if filmed.movers is None or scene.movers is None:
@@ -116,7 +101,7 @@ def moving_mask(scene: Scene, camera: int, supersample: int = 3) -> NDArray[np.u
     rays, pixel = (origins[dark], directions[dark]), 1 / cameras.focal
     change = np.abs(scene.trace(*rays, pixel)[1] - filmed.trace(*rays, pixel)[1]).max(-1, initial=0)
     mask[order[dark[change > CHANGED]]] = SHADOW
-    inner = (np.arange(supersample) + 0.5) / supersample - 0.5
+    inner = (np.arange(3) + 0.5) / 3 - 0.5
     for shift in np.stack(np.meshgrid(inner, inner), -1).reshape(-1, 2):
         origins, directions = cameras.rays(camera, cameras.pixel_centers[order] + shift)
         near = np.flatnonzero(np.isfinite(movers(origins, directions)[0]))

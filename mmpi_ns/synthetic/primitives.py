@@ -7,11 +7,13 @@ bounding spheres touch the cone around it.
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+Arrays = TypeVar("Arrays", bound=Any)
 BOX, SPHERE, CYLINDER = 0, 1, 2
 PACKET = 4096
 """Rays tested together."""
@@ -47,15 +49,17 @@ class Primitives:
         flat = np.hypot(self.half[:, 0], np.where(self.kind == BOX, self.half[:, 1], 0.0))
         return np.where(self.kind == SPHERE, self.half[:, 0], np.hypot(flat, self.half[:, 2]))
 
-    def take(self, rows: NDArray[np.int64]) -> Primitives:
-        return Primitives(*(getattr(self, f.name)[rows] for f in fields(self)))
-
     @staticmethod
     def merged(*parts: Primitives) -> tuple[Primitives, NDArray[np.int64]]:
         """All parts as one, sorted, and the number of the part that each solid comes from. [P]"""
         every = Primitives(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Primitives)))
         order = np.argsort(every.center[:, 0], kind="stable")
-        return every.take(order), np.repeat(np.arange(len(parts)), [len(p) for p in parts])[order]
+        return take(every, order), np.repeat(np.arange(len(parts)), [len(p) for p in parts])[order]
+
+
+def take(arrays: Arrays, rows: NDArray[Any]) -> Arrays:
+    """Some rows of a dataclass of arrays."""
+    return type(arrays)(*(getattr(arrays, f.name)[rows] for f in fields(arrays)))
 
 
 def to_local(vectors: Array, yaw: Array) -> Array:
@@ -90,13 +94,8 @@ class Tracer:
     def __call__(
         self, origins: Array, directions: Array, limit: float | None = None
     ) -> tuple[Array, NDArray[np.int64]]:
-        """Distance [R] to the first solid within reach (inf for none) and its row (-1).
-
-        Args:
-            origins: [R, 3]
-            directions: [R, 3] unit vectors.
-            limit: distance beyond which hits do not count, if less than the reach.
-        """
+        """Distance [R] of rays [R, 3], of unit directions, to the first solid within reach and ``limit``, inf for none,
+        and its row, -1 for none."""
         distance, row = np.full(len(directions), np.inf), np.full(len(directions), -1)
         if not len(directions) or not len(self.primitives):
             return distance, row
@@ -158,24 +157,16 @@ class Tracer:
         return rows[touching | (inside & (distance - radius < reach))]
 
 
-def _inverse(x: Array) -> Array:
-    return 1.0 / np.where(np.abs(x) < 1e-14, 1e-14, x)
-
-
 def box_distance(origins: Array, directions: Array, center: Array, half: Array, yaw: Array) -> Array:
-    """Distance [R] at which rays enter a box, each its own, inf where they miss it or start inside.
-
-    Args:
-        origins, directions: of the rays. [R, 3]
-        center, half, yaw: of the boxes, as in ``Primitives``; [R, 3], [R, 3] and [R].
-    """
+    """Distance [R] at which rays [R, 3] enter a box, each its own, as in ``Primitives``; inf where they miss it or
+    start inside."""
     o, d = (origins - center).T, directions.T
     c, sn = np.cos(yaw), np.sin(yaw)
     enter, leave = np.full(len(directions), -np.inf), np.full(len(directions), np.inf)
     for axis, extent in enumerate(half.T):
         # Along the box's own axes; the third is the world's.
         start, step = (v[2] if axis == 2 else c * v[axis] + (sn if axis == 0 else -sn) * v[1 - axis] for v in (o, d))
-        inverse = _inverse(step)
+        inverse = 1.0 / np.where(np.abs(step) < 1e-14, 1e-14, step)
         middle, reach = -start * inverse, extent * np.abs(inverse)
         enter, leave = np.maximum(enter, middle - reach), np.minimum(leave, middle + reach)
     return np.where((enter <= leave) & (enter > START), enter, np.inf)
@@ -201,7 +192,7 @@ def cylinder_distance(origins: Array, directions: Array, center: Array, half: Ar
     nearest = o[:, :2] - along[:, None] * d[:, :2]
     aside = dot(nearest, nearest)
     root = np.sqrt(np.maximum(radius**2 - aside, 0) / flat)
-    inverse = _inverse(d[:, 2])
+    inverse = 1.0 / np.where(np.abs(d[:, 2]) < 1e-14, 1e-14, d[:, 2])
     middle, reach = -o[:, 2] * inverse, half_height * np.abs(inverse)
     enter, leave = np.maximum(-along - root, middle - reach), np.minimum(-along + root, middle + reach)
     return np.where((aside < radius**2) & (enter <= leave) & (enter > START), enter, np.inf)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mmpi_ns.synthetic.cameras import Cameras
 from mmpi_ns.synthetic.materials import MATERIALS, Surface
-from mmpi_ns.synthetic.primitives import CYLINDER, PACKET, SPHERE, Array, Primitives, Tracer, dot, to_local
+from mmpi_ns.synthetic.primitives import CYLINDER, PACKET, SPHERE, Array, Primitives, Tracer, dot, take, to_local
 from mmpi_ns.synthetic.road import Road
 from mmpi_ns.synthetic.textures import Noise
 
@@ -82,13 +82,8 @@ class Scene:
         return np.where(below, ground, distance), np.where(below, -1, row)
 
     def trace(self, origins: Array, directions: Array, pixel: float = 0.0) -> tuple[Array, Colors]:
-        """Distance [R] of what each ray meets first, inf for the sky, and its colour [R, 3] in [0, 1].
-
-        Args:
-            origins: [R, 3] metres.
-            directions: [R, 3] unit vectors.
-            pixel: angle that a ray stands for, radians; textures are averaged over it.
-        """
+        """Distance [R] of what each ray meets first, inf for the sky, and its colour [R, 3] in [0, 1]. Directions are
+        unit vectors; textures are averaged over the angle that a ray stands for, ``pixel``, radians."""
         distance, colors = np.empty(len(directions)), np.empty((len(directions), 3), np.float32)
         for start in range(0, len(directions), PACKET):
             s = slice(start, start + PACKET)
@@ -111,12 +106,12 @@ class Scene:
         if floor.any():
             colors[floor] = self.ground(points[floor, :2], directions[floor], distance[floor] * pixel, self.noise)
         if solid.any():
-            solids = self.primitives.take(row[solid])
+            solids = take(self.primitives, row[solid])
             surface, normals[solid] = surface_of(solids, points[solid], directions[solid], distance[solid] * pixel)
             for number, material in enumerate(MATERIALS.values()):
                 rows = solids.material == number
                 if rows.any():
-                    colors[np.flatnonzero(solid)[rows]] = material(surface.take(rows), self.noise)
+                    colors[np.flatnonzero(solid)[rows]] = material(take(surface, rows), self.noise)
             patch[solid] = 8 * row[solid] + 2 * surface.side
         light, in_sun = self._lit(points[finite], normals[finite])
         colors[finite] *= light[:, None]
@@ -146,13 +141,8 @@ class Scene:
 
 
 def surface_of(these: Primitives, points: Array, directions: Array, pixel: Array) -> tuple[Surface, Array]:
-    """Coordinates on the faces of the solids hit, and the normals [N, 3] there.
-
-    Args:
-        these: the solid that each point lies on.
-        points, directions: [N, 3] hits and the rays that met them.
-        pixel: width of a pixel at each point, across the ray. [N] metres
-    """
+    """Coordinates on the faces of the solids hit, and the normals [N, 3] there, where rays of some directions met them;
+    ``pixel`` is the width of a pixel at each point, across the ray. [N] metres"""
     n = np.arange(len(points))
     q, d = to_local(points - these.center, these.yaw), to_local(directions, these.yaw)
     h = these.half

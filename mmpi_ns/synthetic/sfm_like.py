@@ -41,10 +41,6 @@ class SfmPoints:
     pixel: Array
     """[Q, 2] (x, y)"""
 
-    def errors(self, scene: Scene) -> Array:
-        """Distance [Q] between each keypoint and where its point projects to, pixels."""
-        return np.linalg.norm(scene.cameras.project(self.camera, self.points[self.point])[0] - self.pixel, axis=-1)
-
 
 def sfm_points(scene: Scene, count: int, noise_pixels: float = 0.3, outliers: float = 0.02) -> SfmPoints:
     """Points on what the cameras see, and who saw them where.

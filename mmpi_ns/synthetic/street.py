@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 
-from mmpi_ns.synthetic.cameras import Array, Cameras
+from mmpi_ns.synthetic.cameras import Cameras
 from mmpi_ns.synthetic.kit import BROWN, GRAY, GREEN, PAINTS, PALE_GREEN, WALLS, WHITE, Kit, look
 from mmpi_ns.synthetic.road import Road
 from mmpi_ns.synthetic.scene import Light, Scene
@@ -138,13 +140,11 @@ def drive_cameras(road: Road, seed: int, count: int, width: int, height: int) ->
     random = np.random.default_rng([seed, 2])
     along = np.linspace(0, road.length, count) if count > 1 else np.zeros(1)
     phases = random.uniform(0, 2 * np.pi, 4)
-
-    def sway(k: int, size: float, period: float):
-        return size * np.sin(2 * np.pi * along / period + phases[k])
-
-    xy, heading = road.at(along, -1.7 + sway(0, 0.2, 31))
-    places = np.concatenate([xy, CAMERA_HEIGHT + sway(1, 0.03, 17)[:, None]], -1)
-    poses = look(places, heading + sway(2, 0.015, 23), sway(3, 0.008, 13) + 0.01)
+    sizes, periods = np.array([[0.2, 0.03, 0.015, 0.008], [31, 17, 23, 13]])
+    aside, up, yaw, pitch = sizes[:, None] * np.sin(2 * np.pi * along / periods[:, None] + phases[:, None])
+    xy, heading = road.at(along, -1.7 + aside)
+    places = np.concatenate([xy, CAMERA_HEIGHT + up[:, None]], -1)
+    poses = look(places, heading + yaw, pitch + 0.01)
     return Cameras(poses, FOCAL_SHARE * width, width, height, test_every=2)
 
 
@@ -156,7 +156,7 @@ def make_street(name: str, road: Road, seed: int, cameras: Cameras) -> Scene:
         kit.houses(side, first + kit.random.uniform(0, 4), last)
         kit.parked(side, first + kit.random.uniform(0, 4), last)
         kit.kerbside(side, first + kit.random.uniform(0, 8), last)
-    return Scene(name, seed, kit.done(), street_ground(road), open_sky, Light(SUN), cameras, road=road)
+    return Scene(name, seed, kit.done(), partial(street_ground, road), open_sky, Light(SUN), cameras, road=road)
 
 
 def street(seed: int, count: int, width: int, height: int, length: float) -> Scene:
@@ -181,20 +181,18 @@ def walk(seed: int, count: int, width: int, height: int, length: float) -> Scene
     along = np.linspace(0, length, count) if count > 1 else np.zeros(1)
     seconds = along / PACE
     phases = random.uniform(0, 2 * np.pi, 6)
-
-    def wave(k: int, size: float, turns: Array) -> Array:
-        return size * np.sin(2 * np.pi * turns + phases[k])
-
-    sway, bob = wave(0, STRIDE[0], seconds * STEPS / 2), wave(1, STRIDE[1], seconds * STEPS)
-    xy, heading = road.at(along, ASIDE + wave(2, WEAVE, along / 35) + sway)
+    turns = np.stack([seconds * STEPS / 2, seconds * STEPS, along / 35, along / 27, along / 10, along / 14])
+    sizes = np.array([*STRIDE, WEAVE, TURN, GLANCE, NOD])
+    sway, bob, weave, turn, glance, nod = sizes[:, None] * np.sin(2 * np.pi * turns + phases[:, None])
+    xy, heading = road.at(along, ASIDE + weave + sway)
     shakes = []
     for size in SHAKE:  # band-limited noise: equal waves at random frequencies
         frequencies = np.exp(random.uniform(np.log(SLOWEST), np.log(FASTEST), 12))
         turns = seconds[:, None] * frequencies + random.uniform(0, 1, 12)
         shakes.append(size * np.sqrt(2 / 12) * np.sin(2 * np.pi * turns).sum(-1))
     yaw_shake, pitch_shake, roll = shakes
-    yaw = heading + wave(3, TURN, along / 27) + wave(4, GLANCE, along / 10) + yaw_shake
-    poses = look(np.column_stack([xy, EYE + bob]), yaw, wave(5, NOD, along / 14) + pitch_shake)
+    yaw = heading + turn + glance + yaw_shake
+    poses = look(np.column_stack([xy, EYE + bob]), yaw, nod + pitch_shake)
     c, s = np.cos(roll)[:, None], np.sin(roll)[:, None]
     right, up = poses[:, :, 0], poses[:, :, 1]
     poses[:, :, 0], poses[:, :, 1] = c * right + s * up, c * up - s * right

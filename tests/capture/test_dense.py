@@ -239,7 +239,7 @@ def test_a_reduced_view_shows_the_same(tmp_path):
 @pytest.mark.parametrize("seed", range(3))
 def test_parallax_is_that_of_points_in_both_cameras(seed, monkeypatch):
     """Oracle: the points themselves, in float64; many strips. Solving returns the inverse depths."""
-    monkeypatch.setattr(dense, "STRIP", 100)
+    monkeypatch.setattr("mmpi_ns.capture.views.STRIP", 100)
     rng = np.random.default_rng(seed)
     shape = (23, 31)
     views = []
@@ -287,7 +287,7 @@ def fused_slowly(inverse, weight):
 
 
 def test_fusing_is_that_of_single_pixels(monkeypatch):
-    monkeypatch.setattr(dense, "STRIP", 40)
+    monkeypatch.setattr("mmpi_ns.capture.views.STRIP", 40)
     rng = np.random.default_rng(0)
     inverse = rng.choice([0.2, 0.201, 0.21, 0.3, -0.1], (4, 20, 30)) + rng.normal(0, 5e-4, (4, 20, 30))
     weight = rng.choice([0, 1e4, 1e6, 1e7], (4, 20, 30))

@@ -12,6 +12,7 @@ from mmpi_ns.capture.known_depth import (
     SENSOR_ERROR,
     KnownDepth,
     at_training_pixels,
+    packed,
     pooled,
     read_sensor,
     with_points,
@@ -98,7 +99,7 @@ def test_stored_distances_are_off_by_a_tenth_of_their_least_error_and_0_stays_un
     numbers = (
         np.concatenate([[0.0], 10 ** np.random.default_rng(0).uniform(-9, 9, 9999)]).astype(F32).reshape(50, 100, 2)
     )
-    found = KnownDepth.of([numbers]).image(0)
+    found = KnownDepth([packed(numbers)]).image(0)
     assert np.allclose(found, numbers, rtol=STEP, atol=0) and STEP < 0.1 * min(POINT_ERROR, SENSOR_ERROR)
     assert found[0, 0, 0] == 0 and (found.reshape(-1)[1:] > 0).all()
 
@@ -144,7 +145,7 @@ def test_a_sensor_goes_before_other_sources_where_it_knows_something(tmp_path):
     depth = np.zeros((HEIGHT, WIDTH), np.uint16)
     depth[:30] = 2000
     cv2.imwrite(str(tmp_path / "d.png"), depth)
-    before = KnownDepth.of([np.full((HEIGHT, WIDTH, 2), 0.25, F32)])
+    before = KnownDepth([packed(np.full((HEIGHT, WIDTH, 2), 0.25))])
     found = with_sensor(before, [tmp_path / "d.png"], 1e-3, camera(), camera()).image(0)
     assert (found[30:] == 0.25).all() and found[29, 40, 0] == pytest.approx(0.5, rel=1e-3)
 
@@ -154,13 +155,13 @@ def test_a_sensor_and_matches_that_contradict_each_other_are_both_left_out(tmp_p
     depth[:, 40:] = 0
     cv2.imwrite(str(tmp_path / "d.png"), depth)
     sensor = with_sensor(
-        KnownDepth.of([np.zeros((HEIGHT, WIDTH, 2), F32)]), [tmp_path / "d.png"], 1e-3, camera(), camera()
+        KnownDepth([packed(np.zeros((HEIGHT, WIDTH, 2)))]), [tmp_path / "d.png"], 1e-3, camera(), camera()
     ).image(0)
     matched = np.stack([1.8 * sensor[..., 0], np.full((HEIGHT, WIDTH), 0.01, F32)], -1)  # as a mirror shows
     matched[:20, :, 0] = 1.02 * sensor[:20, :, 0]  # within the errors
     matched[:, 40:] = 0.25  # the sensor says nothing
     matched[50:] = 0  # the matches say nothing
-    found = with_sensor(KnownDepth.of([matched]), [tmp_path / "d.png"], 1e-3, camera(), camera()).image(0)
+    found = with_sensor(KnownDepth([packed(matched)]), [tmp_path / "d.png"], 1e-3, camera(), camera()).image(0)
     assert (found[20:50, :40] == 0).all()
     assert (found[:20, :40] == sensor[:20, :40]).all() and (found[50:, :40] == sensor[50:, :40]).all()
     assert (found[:50, 40:] == 0.25).all() and sensor[0, 0, 0] > 0.3

@@ -13,7 +13,7 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.model_components.ray_generators import RayGenerator
 
 from mmpi_ns.capture import known_depth
-from mmpi_ns.capture.known_depth import KnownDepth, with_continued
+from mmpi_ns.capture.known_depth import KnownDepth, packed, with_continued
 from mmpi_ns.capture.lone_depth import LEAST_ERROR, MOST_ERROR, continued, is_lone
 from mmpi_ns.capture.tracks import PosedImages
 
@@ -148,12 +148,12 @@ def test_the_border_of_the_first_image_of_a_drive_gets_a_depth(between, most, mo
     usable = np.ones((HEIGHT, WIDTH), bool)
     dataset: Any = SimpleNamespace(has_masks=False, usable=lambda i: usable)
     rays = RayGenerator(cameras)
-    found = with_continued(KnownDepth.of(known), images, dataset, rays)
-    again = with_continued(KnownDepth.of(known), images, dataset, rays)
+    found = with_continued(KnownDepth(list(map(packed, known))), images, dataset, rays)
+    again = with_continued(KnownDepth(list(map(packed, known))), images, dataset, rays)
     assert all(np.array_equal(a, b) for a, b in zip(found.codes, again.codes, strict=True))
     usable[:3] = False
     dataset.has_masks = True
-    masked = with_continued(KnownDepth.of(known), images, dataset, rays).image(0)
+    masked = with_continued(KnownDepth(list(map(packed, known))), images, dataset, rays).image(0)
     assert not masked[:3].any() and np.count_nonzero(masked) > 0.8 * np.count_nonzero(found.image(0)[3:])
     first, exact = found.image(0), plane((0, 0, -1), 10, d)
     points = d / exact[..., None]
@@ -165,4 +165,4 @@ def test_the_border_of_the_first_image_of_a_drive_gets_a_depth(between, most, mo
     else:
         assert added[~middle()].mean() > 0.8
     assert first[added][:, 0] == pytest.approx(exact[added], rel=0.02)
-    assert np.array_equal(first[middle()], KnownDepth.of(known).image(0)[middle()])
+    assert np.array_equal(first[middle()], KnownDepth(list(map(packed, known))).image(0)[middle()])

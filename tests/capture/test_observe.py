@@ -101,7 +101,9 @@ def test_tracks_come_in_pixels_of_the_camera_whose_place_names_them():
 @pytest.mark.parametrize(("each", "swept"), [(ENOUGH_KEYPOINTS, False), (ENOUGH_KEYPOINTS - 1, True)])
 def test_images_are_swept_only_where_triangulation_finds_too_few_keypoints(monkeypatch, each, swept):
     tracks = [(camera, 0, 0.5, 0.5) for camera in (0, 1) for _ in range(each)]
-    monkeypatch.setattr(mmpi_observations, "_remembered_tracks", lambda images: model(*tracks))
+    monkeypatch.setattr(mmpi_observations, "digest", lambda *parts: "key")
+    monkeypatch.setattr(mmpi_observations, "remembered", lambda key, find: find())
+    monkeypatch.setattr(mmpi_observations, "triangulate", lambda images: model(*tracks))
     monkeypatch.setattr(mmpi_observations, "at_full_size", lambda images: images)
     calls = []
     monkeypatch.setattr(mmpi_observations, "add_swept_points", lambda found, images: calls.append(images) or found)

@@ -29,7 +29,7 @@ def _lookup(side: int, positions: Array, precision: Precision) -> Outcome:
     rng = np.random.default_rng(0)
     (grid,) = make_grids([(2, side, 3)])
     uv, planes = single(positions), np.arange(len(positions)) % 2
-    values, by = single(rng.normal(size=(grid.texels, 2))), single(rng.normal(size=(len(uv), 2)))
+    values, by = single(rng.normal(size=(len(grid.rows), 2))), single(rng.normal(size=(len(uv), 2)))
     table = torch.zeros(len(grid.places) * BRICK, 2)
     table[grid.rows] = float32(values)
     rows, weights = grid.bilinear(torch.tensor(planes), float32(uv))

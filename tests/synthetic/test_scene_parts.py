@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pycolmap
 import pytest
+from procedural import keypoint_errors
 
 from mmpi_ns.synthetic import Scene, make_scene, sfm_points, write_dataset
 from mmpi_ns.synthetic.kit import Kit
@@ -119,4 +120,4 @@ def test_files_hold_the_points_their_colours_and_tracks(street, tmp_path):
         own = found.point == p
         track = [(e.image_id - 1, *model.images[e.image_id].points2D[e.point2D_idx].xy) for e in point.track.elements]
         assert np.allclose(track, np.column_stack([found.camera[own], found.pixel[own]]), atol=1e-4)
-        assert point.error == pytest.approx(found.errors(street)[own].mean(), abs=1e-4)
+        assert point.error == pytest.approx(keypoint_errors(street, found)[own].mean(), abs=1e-4)

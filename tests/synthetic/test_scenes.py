@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from procedural import keypoint_errors
 from reprojection import median_reprojection_error
 
 from mmpi_ns.capture.sfm import find_sfm_model
@@ -225,7 +226,7 @@ def test_keypoint_noise_is_as_asked(street, street_points):
         assert np.abs((found.pixel[rows] - exact).std(0) - 0.4).max() < 0.08
         assert np.abs((found.pixel[rows] - exact).mean()) < 0.08
     # Triangulation takes up three of two numbers a keypoint.
-    error = found.errors(street)
+    error = keypoint_errors(street, found)
     share = 1 - 3 * len(found.points) / (2 * len(found.point))
     assert np.isclose(np.sqrt((error**2).mean() / 2), 0.4 * np.sqrt(share), rtol=0.08)
 
@@ -237,7 +238,7 @@ def test_outliers_are_as_many_as_asked_and_fit_their_keypoints(street, street_po
     eye = street.cameras.camera_to_worlds[found.camera[np.searchsorted(found.point, np.arange(400))], :, 3]
     relative = moved / np.linalg.norm(found.true_points - eye, axis=-1)
     assert np.median(relative[found.outlier]) > 0.2 and np.median(relative[~found.outlier]) < 0.05
-    assert np.median(found.errors(street)[found.outlier[found.point]]) < 1.0
+    assert np.median(keypoint_errors(street, found)[found.outlier[found.point]]) < 1.0
     exact = sfm_points(street, 100, noise_pixels=0.0, outliers=0.0)
     assert not exact.outlier.any() and np.abs(exact.points - exact.true_points).max() < 1e-6
 

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from procedural import keypoint_errors
 
 from mmpi_ns.synthetic import make_scene, sfm_points, write_dataset
 
@@ -71,7 +72,7 @@ def test_points_and_depths_agree_with_the_lens(walk, folder):
     import pycolmap
 
     found = sfm_points(walk, 100, noise_pixels=0.0, outliers=0.0)
-    assert np.abs(found.points - found.true_points).max() < 1e-6 and found.errors(walk).max() < 1e-6
+    assert np.abs(found.points - found.true_points).max() < 1e-6 and keypoint_errors(walk, found).max() < 1e-6
     model = pycolmap.Reconstruction(str(folder / "colmap/sparse/0"))
     assert model.cameras[1].model.name == "OPENCV" and max(p.error for p in model.points3D.values()) < 1e-4
     meta = json.loads((folder / "transforms.json").read_text())

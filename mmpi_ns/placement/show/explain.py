@@ -17,7 +17,7 @@ class PlanReport:
     """Shares and expected errors of the K heads of a plan (MPIs, then the cube), over what placement weighs."""
 
     shares: Array
-    """[K] of the observations, those that a head serves best."""
+    """[K] share of the observations that a head serves best."""
     error_with: Array
     """[K] expected error of those, median in pixels."""
     error_without: Array
