@@ -30,8 +30,17 @@ class Scene:
 def train_words(
     method: str, options: Sequence[str], scene: Scene, folder: Path, steps: int, seed: int, device: str
 ) -> list[str]:
-    """An ``ns-train`` line that leaves evaluating and saving to the caller: it saves once, at the end. Options of the
-    method come first, so that later words win."""
+    """An ``ns-train`` line that leaves evaluating and saving to the caller: it saves once, at the end.
+
+    Args:
+        method: nerfstudio's name of it.
+        options: of the method; they come first, so that later words win.
+        scene: to train.
+        folder: of the run.
+        steps: of the run.
+        seed: of every random draw.
+        device: cpu or cuda.
+    """
     tracks = no_tracks() if method.startswith("mmpi") and not has_pycolmap() else ()
     words = [method, *options, *tracks, "--machine.seed", str(seed)]
     words += ["--output-dir", str(folder), "--experiment-name", "run", "--timestamp", "1", "--vis", "tensorboard"]

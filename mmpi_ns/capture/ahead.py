@@ -26,7 +26,13 @@ class DrawnAhead:
         self._next: tuple[RaySources, tuple[int, int], Future[Batch]] | None = None
 
     def draw(self, sources: RaySources, step: int, pixel_rays: int) -> Batch:
-        """The rays and the batch of a step with this many pixel rays, as by ``RaySources.draw``."""
+        """What ``RaySources.draw`` draws for a step.
+
+        Args:
+            sources: of the rays.
+            step: of the training.
+            pixel_rays: rays through pixels.
+        """
         batch = None
         if self._next is not None:
             of, key, future = self._next

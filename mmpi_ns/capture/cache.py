@@ -61,8 +61,16 @@ class Computed(Sequence[T]):
 def held(
     function: Callable[[int], T], sizes: NDArray[np.float64], bytes_of_pixel: int, least: int
 ) -> Callable[[int], T]:
-    """A function of an image's number that keeps its last results; threads that ask for one image share its call. As
-    many are kept as fit into ``HELD_BYTES``, but at least ``least``. Sizes are [M, 2], pixels."""
+    """A function of an image's number that keeps its last results while neighbours are compared with them.
+
+    Threads that ask for the same image at once share one call.
+
+    Args:
+        function: of an image's number.
+        sizes: of the images [M, 2]; results are kept as long as they take ``HELD_BYTES`` at most.
+        bytes_of_pixel: that a result takes.
+        least: results that are kept at least: as many as an image is compared with.
+    """
     bytes_of_image = bytes_of_pixel * float(sizes.prod(-1).max())
 
     @lru_cache(max(least, min(HELD, int(HELD_BYTES / bytes_of_image))))

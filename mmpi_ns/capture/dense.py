@@ -156,7 +156,12 @@ def measure(
 ) -> tuple[Map, Map]:
     """Inverse depths of a view's pixels by comparison with another view, and one over their squared errors (0: none).
 
-    ``start`` holds rough inverse depths [h, w], ``flow`` finds small motions, ``of_view`` is ``mean_and_contrast``.
+    Args:
+        view: the image that gets depths.
+        neighbour: the image that it is compared with.
+        start: rough inverse depths. [h, w]
+        flow: finds small motions.
+        of_view: its ``mean_and_contrast``.
     """
     parallax = Parallax.between(view, neighbour)
     x, y, _ = parallax.pixels(start)

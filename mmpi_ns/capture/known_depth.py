@@ -117,18 +117,19 @@ def know_depths(
 ) -> tuple[KnownDepth | None, Observations]:
     """All available depths of the training images, and the observations with the points of a cloud, if there is one.
 
-    The depths are None if there is neither matching, a sensor nor a cloud.
-
     Args:
         outputs: of the data parser.
-        observations: cameras, tracks and loose points of the images.
+        observations: their cameras, tracks and loose points.
         dataset: the images.
-        rays: makes rays through pixel centres (image, row, column).
-        dense: match neighbouring images.
-        sensor: read depth images.
+        rays: makes rays through their pixel centres (image, row, column).
+        dense: whether to match neighbouring images.
+        sensor: whether to read depth images.
+
+    Returns:
+        The depths; None if there is neither matching, a sensor nor a cloud. The observations.
 
     Raises:
-        InputError: an image or depth image cannot be used (names it).
+        InputError: an image or a depth image cannot be used (names it).
     """
     if not (dense or sensor or observations.loose is not None):
         return None, observations
@@ -217,17 +218,21 @@ def with_sensor(
 def at_training_pixels(
     view: View, depth: Depth, original: PosedImages, i: int, shape: tuple[int, int], file_shape: tuple[int, int]
 ) -> Map:
-    """Inverse distances of a training image's pixels and their errors [H, W, 2] from its depths at working size.
+    """Distances of a training image's pixels from the depths of its view at working size.
 
-    A pixel takes the mean over its area, weighted by certainty; the spread within, large at an edge, is added to its
-    error. One that is smaller than a working pixel takes its depth.
+    A training pixel takes the mean over its area, weighted by certainty; the spread within the area, large at an
+    edge, is added to its error. One that is smaller than a working pixel takes the depth of that.
 
     Args:
         view: the image at working size.
-        depth: at working size.
-        original: cameras of the originals; i is the image's place in them.
+        depth: its depths.
+        original: cameras of the originals.
+        i: the image's place in them.
         shape: height and width of the training image.
         file_shape: height and width of its file, which may have a row or column more.
+
+    Returns:
+        [H, W, 2] inverse distance and expected error.
     """
     height, width = (min(pair) for pair in zip(shape, view.gray.shape, strict=True))
     maps, distances = pooled(depth, (height, width)), np.empty((*shape, 2), np.float32)
@@ -358,9 +363,15 @@ def with_points(known: KnownDepth, observations: Observations) -> KnownDepth:
 def read_sensor(
     file: Path, unit: float, original: PosedImages, i: int, shape: tuple[int, int], file_shape: tuple[int, int]
 ) -> Map:
-    """Inverse distances of a training image's pixels and their errors [H, W, 2] from a depth image; 0 where unknown.
+    """Distances from a depth image (along the optical axis, 0 where unknown), for a training image's pixels.
 
-    Arguments as of ``at_training_pixels``, but for the file and ``unit``, the scene units of a depth of 1.
+    Args:
+        file: 16-bit PNG or .npy.
+        unit: length of a depth of 1, scene units.
+        original: cameras of the originals.
+        i: the image's place in them.
+        shape: height and width of the training image.
+        file_shape: height and width of its file.
 
     Raises:
         InputError: the file cannot be read (names it).

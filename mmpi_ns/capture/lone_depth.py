@@ -37,10 +37,14 @@ MOST_OTHERS = 1
 
 
 def continued(depths: Map, directions: Map) -> Map:
-    """Inverse distances and errors of pixels without a depth, from planes fitted to the pixels with one around them.
+    """Inverse distances of pixels without a depth, from planes fitted to the pixels with one around them.
 
-    Takes the same of all pixels [H, W, 2], 0 where unknown, and their unit directions [H, W, 3]. The result [H, W, 2]
-    is 0 where a depth is known, and where no plane fits.
+    Args:
+        depths: [H, W, 2] inverse distance, 0 where unknown, and its expected error.
+        directions: [H, W, 3] unit directions of the pixels.
+
+    Returns:
+        [H, W, 2] the same for the other pixels only: 0 where a depth is known, and where no plane fits.
     """
     inverse, error = depths[..., 0].astype(np.float64), depths[..., 1].astype(np.float64)
     has_depth = inverse > 0

@@ -44,8 +44,14 @@ def contradict(a: Map, b: Map) -> NDArray[np.bool_]:
 
 
 def usable_points(points: Array, centers: Array) -> Array:
-    """The points of a cloud [P, 3] that are neither NaN nor absurdly far from the camera centres [M, 3], a random
-    subset of ``MOST_POINTS`` if there are more. Says how many are not used."""
+    """The points of a cloud [P, 3] that can be used, a random subset of ``MOST_POINTS`` if there are more.
+
+    Says how many are NaN or absurdly far away.
+
+    Args:
+        points: in scene units.
+        centers: of the cameras. [M, 3]
+    """
     middle = np.median(centers, axis=0)
     extent = float(np.ptp(centers, axis=0).max())
     with np.errstate(invalid="ignore"):
@@ -116,8 +122,13 @@ class Sightings:
 
 
 def see_points(points: Array, posed: PosedImages, depths: Callable[[int], Map] | None = None) -> Sightings:
-    """Sightings of points [P, 3] in the training images; ``depths`` returns the known inverse distances of an image and
-    their errors [H, W, 2], 0 where unknown."""
+    """Sightings of points [P, 3] in the training images.
+
+    Args:
+        points: in scene units.
+        posed: the images.
+        depths: known inverse distances and their errors for an image, 0 where unknown. [H, W, 2]
+    """
     seen: list[tuple[NDArray[np.int64], NDArray[np.int64], Array]] = []
     confirmed, contradicted = np.zeros((2, len(points)), np.int64)
     for i, size in enumerate(posed.sizes):

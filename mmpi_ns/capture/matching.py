@@ -67,8 +67,15 @@ def write_images(model: Any, database: Path) -> None:
 
 
 def find_features(database: Path, images: Path, names: Sequence[str], options: Any, masks: Path | None = None) -> None:
-    """SIFT features of the named images in a folder, for a database that lists them; images that have theirs are
-    skipped. ``masks`` is a folder of masks (``NAME.png``): no features where they are black."""
+    """SIFT features of images that the database lists; images that have theirs are skipped.
+
+    Args:
+        database: gets keypoints and descriptors.
+        images: folder of the images.
+        names: of the images, below the folder.
+        options: pycolmap.FeatureExtractionOptions.
+        masks: folder of masks (``NAME.png``): no features where they are black.
+    """
     pycolmap = load_pycolmap()
     reader = pycolmap.ImageReaderOptions()
     if masks is not None:
@@ -136,8 +143,13 @@ def triangulate_points(
 def epipolar_distances(
     model: Any, first: int, second: int, rays: tuple[NDArray[np.float64], NDArray[np.float64]]
 ) -> NDArray[np.float64]:
-    """Sampson distances [M] of matches from the epipolar lines of two images' poses, over the focal length. Images are
-    named by their ids, matches are keypoints of each image in the plane z = 1 [M, 2]."""
+    """Sampson distances of matches from the epipolar lines of two images' poses, over the focal length. [M]
+
+    Args:
+        model: poses and cameras.
+        first, second: ids of the images.
+        rays: matched keypoints of each image in the plane z = 1. [M, 2]
+    """
     pycolmap = load_pycolmap()
     relative = model.images[second].cam_from_world() * model.images[first].cam_from_world().inverse()
     essential = pycolmap.essential_matrix_from_pose(relative)

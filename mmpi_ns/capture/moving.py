@@ -88,8 +88,15 @@ def find_moving(
 
 
 def in_image(view: View, mask: Mask, images: PosedImages, i: int, shape: tuple[int, int]) -> Mask:
-    """A mask of image i at working size as a mask of the image itself, lens included; the image has this height and
-    width, and may be a copy of another size than the original."""
+    """A mask of an image's view as a mask of the image itself, lens included.
+
+    Args:
+        view: the image at working size.
+        mask: of the view.
+        images: the originals.
+        i: the image's place in them.
+        shape: height and width that are asked for; the image may be a copy of another size.
+    """
     x, y = straightened(images, i, shape, shape)
     fx, fy, cx, cy = view.pinhole
     return look_up(mask.astype(np.float32), fx * x + cx, fy * y + cy) > EDGE

@@ -88,8 +88,13 @@ class Evidence:
 
 
 def ground_of(view: View, depth: Depth, up: NDArray[np.float64]) -> Map | None:
-    """Inverse depth of the plane on which most of the content stands; 0 near the horizon and above. ``up`` is a unit
-    vector in the world. [3]"""
+    """Inverse depth of the plane on which most of the content stands; 0 near the horizon and above.
+
+    Args:
+        view: the image.
+        depth: its depths.
+        up: unit vector in the world. [3]
+    """
     rows, columns = np.nonzero(depth.inverse > 0)
     random = np.random.default_rng(0)
     kept = random.permutation(len(rows))[:3000]
@@ -225,8 +230,14 @@ def has_impossible_depth(shot: Shot, others: Sequence[Neighbour]) -> Mask:
 
 
 def evidence(shot: Shot, others: Sequence[Neighbour], masks: Sequence[Mask | None], impossible: Mask) -> Evidence:
-    """What of a shot no static scene explains, given masks of what is known to move in its neighbours, and where the
-    shot's depth is impossible. [h, w] each"""
+    """What of a shot no static scene explains.
+
+    Args:
+        shot: the image.
+        others: its neighbours.
+        masks: what moves in each neighbour, as far as is known. [h, w]
+        impossible: by ``has_impossible_depth``. [h, w]
+    """
     shape = shot.view.gray.shape
     if len(others) < 2:
         nothing = np.zeros(shape, np.uint8)

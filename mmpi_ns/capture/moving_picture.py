@@ -19,8 +19,13 @@ RED = (0, 0, 127)
 def draw_moving(
     path: Path, images: Iterable[tuple[str, UInt8[ndarray, "H W 3"]]], masks: Sequence[Bool[ndarray, "H W"]]
 ) -> None:
-    """Writes the images in which most moves, in order, with what moves in red. ``images`` are names with blue, green
-    and red; something moves in one of the masks at least."""
+    """Writes the images in which most moves, in order, with what moves in red.
+
+    Args:
+        path: file of the picture; its folder is made.
+        images: name, and blue, green and red of each image.
+        masks: what moves in each image; something in at least one.
+    """
     shares = [float(mask.mean()) for mask in masks]
     most = {i for i in sorted(range(len(masks)), key=lambda i: -shares[i])[:SHOWN] if shares[i] > 0}
     tiles = []

@@ -75,9 +75,14 @@ class SharedPoints:
     def draw(
         self, count: int, rays: Rays, g: torch.Generator, exposures: Float[Tensor, "M 3"] | None = None
     ) -> tuple[RayBundle, Float[Tensor, "R C"], Float[Tensor, "R 2"]]:
-        """Random rays from between cameras, their colours, and inverse distances of their points with errors. ``rays``
-        makes rays through pixel centres (image, row, column); colours are divided by the exposures of all images, if
-        they differ."""
+        """Random rays from between cameras, with their colours and the inverse distances of their points with errors.
+
+        Args:
+            count: number of rays.
+            rays: makes rays through pixel centres (image, row, column).
+            g: generator for the points and the positions between the cameras.
+            exposures: of all training images; colours are divided by them. None: they are equal.
+        """
         device = self.pixels.device
         chosen = torch.randint(len(self.pixels), (count,), generator=g, device=g.device).to(device)
         share = torch.rand(count, 1, generator=g, device=g.device).to(device)

@@ -111,8 +111,12 @@ def _find_points(observations: Observations, dataset: MMPIDataset, triangulates:
 
 
 def tell_poses(off: float, image: Path) -> None:
-    """Reports poses that are off by this median distance of matches from where they predict them, in training pixels,
-    with the command that refines them."""
+    """Reports inaccurate poses, with the command that refines them.
+
+    Args:
+        off: median distance of matches or keypoints from their positions predicted by the poses, training pixels.
+        image: one of the training images.
+    """
     if not off > POSES_OFF:  # or not a number, as nothing matched
         return
     folder = image.parent
@@ -198,8 +202,13 @@ def posed_images(observations: Observations, dataset: MMPIDataset) -> PosedImage
 
 
 def with_tracks(observations: Observations, model: SfmModel, names: Sequence[str] | None = None) -> Observations:
-    """The observations with the points of a model in their frame; images are known in the model by ``names``, or by
-    their indices."""
+    """The observations with the points of a model.
+
+    Args:
+        observations: the cameras.
+        model: tracks in their frame.
+        names: of the training images in the model; None for their indices.
+    """
     names = [str(i) for i in range(len(observations.centers))] if names is None else names
     seen_by, seen_point, relative = model.keypoints_of(names)
     seen_at = relative * observations.sizes[seen_by]

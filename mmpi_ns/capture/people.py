@@ -52,8 +52,14 @@ def horizon_of(view: View, up: Float[ndarray, "3"]) -> Float[ndarray, "w"] | Non
 
 
 def people_in(images: PosedImages, i: int, view: View, up: Float[ndarray, "3"]) -> Int[ndarray, "N 4"]:
-    """Left, top, right and bottom of the people in image i, in pixels of its view at working size; ``up`` is a unit
-    vector in the world."""
+    """Left, top, right and bottom of the people in an image, in pixels of its view at working size.
+
+    Args:
+        images: the originals.
+        i: the image.
+        view: the same at working size.
+        up: unit vector in the world.
+    """
     nobody, horizon = np.zeros((0, 4), int), horizon_of(view, up)
     if horizon is None:
         return nobody

@@ -147,8 +147,14 @@ class Gains:
 def grouped(
     first: int, second: int, log_ratios: Float[ndarray, "P 3"], radii: tuple[Float[ndarray, "P"], Float[ndarray, "P"]]
 ) -> ColorRatios | None:
-    """Medians of the matches of a pair of images, in groups of similar change of radius; None for too few. ``radii``
-    are the squared radii of each match in the first and in the second image."""
+    """Medians of the matches of a pair of images, in groups of similar change of radius; None for too few.
+
+    Args:
+        first: number of the first image.
+        second: of the other.
+        log_ratios: of each match.
+        radii: squared radius of each match in the first and in the second image.
+    """
     if len(log_ratios) < FEWEST:
         return None
     change = np.stack([radii[1] - radii[0], radii[1] ** 2 - radii[0] ** 2], -1)
@@ -202,8 +208,15 @@ def pair_ratios(
     pixels: Int[ndarray, "P 2"],
     points: Float[ndarray, "P 3"],
 ) -> ColorRatios | None:
-    """Colours of surfaces at some pixels (row, column) of one image, in another; None if it shows too few of them. If
-    the second image has no distances, colours tell what it shows instead."""
+    """Colours of surfaces that one image shows, in another; None if it shows too few of them.
+
+    Args:
+        first: the image that shows them. If ``second`` has no distances, what it shows instead is told by colour.
+        second: the other image.
+        cameras: of both.
+        pixels: row and column of each surface in the first image.
+        points: where the surfaces are.
+    """
     rows, columns = pixels.T
     at = project(cameras, second.number, points)
     shown = look_up(second.exposed.view(np.uint8), *at.T, nearest=True) > 0
@@ -321,9 +334,17 @@ def exposure_of_view(
     exposures: Float[ndarray, "N 3"],
     falloff: Float[ndarray, "2 3"],
 ) -> Float[ndarray, "3"] | None:
-    """Exposure of an image that was not calibrated, by the calibrated ones nearby that show the same surfaces, given as
-    pixels (row, column) and points; None if they show none of them. ``cameras`` and ``exposures`` are of all calibrated
-    images."""
+    """Exposure of an image that was not calibrated, by what it and calibrated images show; None if they show nothing.
+
+    Args:
+        view: the image.
+        others: calibrated images nearby.
+        cameras: of the calibrated images.
+        pixels: row and column of some of the image's pixels.
+        points: the surfaces that they show.
+        exposures: of the calibrated images.
+        falloff: towards the corners.
+    """
     parts = [pair_ratios(view, other, cameras, pixels, points) for other in others]
     ratios = [part for part in parts if part is not None]
     if not ratios:

@@ -61,10 +61,15 @@ class PixelPool:
         most: int = 0,
         seed: int = 0,
     ) -> PixelPool:
-        """Reads images once, all unless numbers are given; masked pixels are left out.
+        """Reads images once; masked pixels are left out.
 
-        ``most`` is the maximum number of pixels, 0 for no limit; beyond it, ``seed`` draws a random subset, the same
-        fraction of each image.
+        Args:
+            dataset: the training images.
+            device: of the pixels.
+            images: which of them; None for all.
+            known_depth: their depths.
+            most: maximum number of pixels; beyond it, a random subset, the same fraction of each image. 0: no limit.
+            seed: of the subset.
 
         Raises:
             InputError: an image or mask cannot be used (names the file), or the masks leave nothing.
@@ -106,7 +111,12 @@ class PixelPool:
     def draw(
         self, count: int, g: torch.Generator
     ) -> tuple[Float[Tensor, "R C"], Int[Tensor, "R 3"], Float[Tensor, "R 2"]]:
-        """Colours, (image, row, column) and depths of random pixels."""
+        """Colours, (image, row, column) and depths of random pixels.
+
+        Args:
+            count: R.
+            g: draws them.
+        """
         after = (self.ends - self.begins).cumsum(0)
         drawn = torch.randint(self.count, (count,), generator=g, device=g.device).to(self.colors.device)
         which = torch.searchsorted(after, drawn, right=True)
@@ -232,7 +242,12 @@ class RaySources:
     def draw(
         self, pixel_rays: int, g: torch.Generator, pixels_alone: bool = False
     ) -> tuple[RayBundle, dict[str, Tensor]]:
-        """Rays of pixels, then of new views and keypoints unless ``pixels_alone``, and their batch.
+        """Rays of pixels, of new views and of keypoints, in this order, and what the images say of them.
+
+        Args:
+            pixel_rays: rays through pixels.
+            g: draws them.
+            pixels_alone: without new views and keypoints.
 
         Returns:
             The rays, with KEYPOINT_DEPTH, PIXEL_DEPTH, OWN_PIXEL and EXPOSURE in their metadata. The batch: ``image``,

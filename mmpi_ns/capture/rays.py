@@ -73,7 +73,11 @@ class PinholeRays:
         return LensRays(*vars(pinholes).values(), *(x.to(device) for x in lenses))
 
     def __call__(self, ray_indices: Int[Tensor, "R 3"]) -> RayBundle:
-        """Rays through pixel centres (camera, row, column). Pixel areas, which this package does not use, are 1."""
+        """Rays through pixel centres. Pixel areas, which this package does not use, are 1.
+
+        Args:
+            ray_indices: camera, row and column of each.
+        """
         camera = ray_indices[:, 0]
         poses = self.poses[camera]
         directions = torch.nn.functional.normalize(rotate(poses[:, :, :3], self.local(ray_indices)), dim=-1)

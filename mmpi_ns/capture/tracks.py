@@ -126,8 +126,12 @@ def at_full_size(images: PosedImages) -> PosedImages:
 
 
 def near_pairs(camera_to_worlds: NDArray[np.float64], neighbours: int) -> list[tuple[int, int]]:
-    """Pairs (i, j) with i < j, in order, of each camera with its nearest ones that have a similar viewing direction,
-    ``neighbours`` at most. Poses are [M, 3, 4]."""
+    """Pairs (i, j) with i < j, in order, of each camera with its nearest ones that have a similar viewing direction.
+
+    Args:
+        camera_to_worlds: poses. [M, 3, 4]
+        neighbours: maximum number of cameras chosen by each.
+    """
     near = [
         nearest_views(camera_to_worlds, i, neighbours, MAX_ANGLE, apart=False) for i in range(len(camera_to_worlds))
     ]
@@ -135,10 +139,16 @@ def near_pairs(camera_to_worlds: NDArray[np.float64], neighbours: int) -> list[t
 
 
 def triangulate(images: PosedImages) -> SfmModel:
-    """Points seen in several images, and their keypoints, in the frame of the poses; none if nothing matches.
+    """Points seen in several images, and their keypoints.
 
-    Deterministic. A quick search, a third of a second for each image on one core, is followed by a thorough one, a
-    second, if it finds too little. Image names of the model are indices of ``images``.
+    Deterministic for equal images and poses. A quick search is followed by a thorough one if it finds too little.
+    The quick search takes about a third of a second for each image on one core, the thorough one a second.
+
+    Args:
+        images: image files with their cameras, whose poses are in any one frame.
+
+    Returns:
+        Points in the frame of the poses; none if nothing matches. Image names are their indices in ``images``.
 
     Raises:
         InputError: an image file cannot be read.

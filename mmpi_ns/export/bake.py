@@ -131,7 +131,13 @@ class Compared:
 
 @torch.no_grad()
 def compare(pipeline: Any, scene: BakedScene, count: int) -> Compared:
-    """Compares ``count`` baked test images, evenly spaced, at most all, with exact ones and the ground truth."""
+    """Compares baked test images with exact ones and the ground truth.
+
+    Args:
+        pipeline: of the run.
+        scene: its baked scene.
+        count: number of test images, evenly spaced; all if there are fewer.
+    """
     dataset, metrics = pipeline.datamanager.eval_dataset, ImageMetrics("none")
     to_exact: list[float] = []
     rows: dict[str, list[dict[str, float]]] = {"exact": [], "baked": []}

@@ -74,8 +74,14 @@ class BakedScene:
 
 
 def write_baked(scene: BakedScene, folder: Path) -> int:
-    """Writes a scene into a folder, the header last, so that a scene with a header is complete; returns the bytes
-    written. Raises OSError if the disk is full or cannot be written."""
+    """Writes a scene into a folder, the header last, so that a scene with a header is complete.
+
+    Returns:
+        Bytes that were written.
+
+    Raises:
+        OSError: the disk is full or cannot be written.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     (folder / HEADER).unlink(missing_ok=True)
     rows = [_write_window(folder / f"window-{i:05d}.bin", *window) for i, window in enumerate(scene.windows)]

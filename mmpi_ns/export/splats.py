@@ -260,8 +260,14 @@ def _placed(window: BakedWindow, texels: _Texels, group: Tensor, level: Tensor, 
 
 
 def write_ply(splats: Splats, path: Path) -> int:
-    """Writes the layout of Kerbl et al. (2023): logits of opacity, logarithms of scales, spherical harmonics. Returns
-    the bytes written. Raises OSError if the disk is full or cannot be written."""
+    """Writes the layout of Kerbl et al. (2023): logits of opacity, logarithms of scales, spherical harmonics.
+
+    Returns:
+        Bytes that were written.
+
+    Raises:
+        OSError: the disk is full or cannot be written.
+    """
     constant, x, y, z = (splats.colors[:, i] for i in range(4))
     harmonics = torch.stack([-y, z, -x], -1) / SH1  # [N, colour, 3]
     columns = torch.cat([

@@ -22,7 +22,11 @@ def write_page(folder: Path) -> Path:
 
 
 def write_single_file(folder: Path, path: Path) -> None:
-    """Writes one HTML file that contains a baked scene, given by its folder, and opens by a double click.
+    """Writes one HTML file that contains a baked scene and opens by a double click.
+
+    Args:
+        folder: of the baked scene.
+        path: the file to write.
 
     Raises:
         ValueError: the scene is missing or of another version.

@@ -43,7 +43,12 @@ def bake_shares(field: MMPIField) -> Float[Tensor, "N 1"]:
 def rays_to(
     field: MMPIField, k: int, ndc: Float[Tensor, "N 3"]
 ) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 3"], Float[Tensor, "N"]]:
-    """Rays from the origin of head k to positions in it, to keep precision far from the world origin.
+    """Rays from a head's own origin to positions in it, to keep precision far from the world origin.
+
+    Args:
+        field: of the head.
+        k: its number.
+        ndc: positions in it.
 
     Returns:
         Origins, directions (not of unit length), and inverse distances in units of those.

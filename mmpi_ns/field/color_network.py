@@ -59,8 +59,15 @@ class ColorNetworks(Networks):
         directions: Float[Tensor, "R 3"],
         rays: Int[Tensor, "N"] | None = None,
     ) -> Float[Tensor, "N 3"]:
-        """Colours in [0, 1] of one head's samples. Directions [R, 3] are in the head's axes and encoded once a ray.
-        ``rays``: of each sample; None if there is one sample for each ray."""
+        """Colours in [0, 1] of one head's samples.
+
+        Args:
+            head: of the network.
+            features: of each sample.
+            ndc: position of each sample.
+            directions: of each ray, in the head's axes; encoded once a ray.
+            rays: ray of each sample; None if there is one sample for each ray.
+        """
         position = positional_encoding(ndc, self.position_frequencies)
         direction = positional_encoding(directions, self.direction_frequencies)
         direction = direction if rays is None else direction.index_select(0, rays)

@@ -151,10 +151,13 @@ class MMPIField(TexelTables):
     def get_density(  # type: ignore[override]
         self, ray_samples: RaySamples, head_counts: Sequence[int] | None = None
     ) -> tuple[Float[Tensor, "R S 1"], Lookup]:
-        """Optical depth of each valid sample (0 in empty slots), and where the lookups went. ``head_counts``: samples
-        of each head, if known (``MergedSamples``).
+        """Optical depth of each valid sample (0 in empty slots), and where the lookups went.
 
         nerfstudio's "density" times interval: on a plane there is no interval, so the product itself is learned.
+
+        Args:
+            ray_samples: merged samples.
+            head_counts: samples of each head, if known (``MergedSamples``).
         """
         lookup = self._lookup(ray_samples, head_counts)
         if self.training and self.learns_cover:
@@ -219,8 +222,14 @@ class MMPIField(TexelTables):
         composite: Composite,
         chosen: Bool[Tensor, "R"] | None = None,
     ) -> RayColors:
-        """Colours of rays from their merged samples and the weights of these. ``lookup``: where they read the tables;
-        None without gradients. ``chosen``: rays whose colours are needed, others may be left out; None for all."""
+        """Colours of rays.
+
+        Args:
+            ray_samples: merged samples.
+            lookup: where they read the tables; None without gradients.
+            composite: weights of the samples.
+            chosen: rays whose colours are needed; others may be left out to save time. None for all.
+        """
         if not isinstance(self.networks, RayShader):
             lookup = lookup if lookup is None or chosen is None else lookup.of_rays(chosen)
             colors = self.get_outputs(ray_samples, lookup)[FieldHeadNames.RGB]

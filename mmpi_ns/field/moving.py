@@ -28,8 +28,18 @@ def moving(
     inverse_t: Float[Tensor, "N"],
     ndc: Float[Tensor, "N 3"],
 ) -> Float[Tensor, "N 3"]:
-    """The positions of samples, bit for bit unchanged, with gradients to the rays (origins and unit directions in world
-    axes). ``heads`` rise: samples of the cube come last."""
+    """The positions of samples, bit for bit unchanged, with gradients to the rays.
+
+    Args:
+        layout: of the scene.
+        origins: of the rays, world axes.
+        directions: likewise, unit.
+        rays: ray of each sample.
+        heads: of each sample, rising: those of the cube come last.
+        planes: of each sample.
+        inverse_t: inverse distances of the samples.
+        ndc: their positions.
+    """
     count = len(heads) if layout.cube is None else int(torch.searchsorted(heads, len(layout.mpis)))
     frames, mpis = layout.frames, heads[:count]
     local = LocalRays.of(origins, directions, frames)

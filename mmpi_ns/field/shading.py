@@ -56,7 +56,12 @@ class RayColors:
 
 class RayShader(Networks):
     """One network (colour, features, PE(direction)) -> view-dependent change of the composited colour of a ray.
-    Directions are in world axes."""
+
+    Args:
+        channels: of a texel: three of the diffuse colour, the others features.
+        width: of the hidden layers.
+        direction_frequencies: octaves of the positional encoding of directions in world axes.
+    """
 
     def __init__(self, channels: int, width: int, direction_frequencies: int) -> None:
         super().__init__(1, channels + 3 * (1 + 2 * direction_frequencies), width)

@@ -37,8 +37,14 @@ ENOUGH_CROSSINGS = 32
 
 
 class TexelTables(Field):
-    """Density, features and reliability of all stored texels, at ``factor`` times the plan's texels. Those that none of
-    the training images ``views`` can reach are not stored; None stores all."""
+    """Density, features and reliability of all stored texels.
+
+    Args:
+        plan: frames and resolutions.
+        feature_channels: channels of the colour features.
+        factor: texels in use, as a share of the plan's.
+        views: training images; texels that none of them can reach are not stored. None stores all.
+    """
 
     def __init__(
         self, plan: ScenePlan, feature_channels: int, factor: float = 1.0, views: TrainingViews | None = None
@@ -93,7 +99,12 @@ class TexelTables(Field):
 
     def build(self, plan: ScenePlan, factor: float, tiles: Int[Tensor, "T"] | None = None) -> None:
         """Allocates new tables for ``plan`` at ``factor`` times its texels. Parameters stay the same objects.
-        ``tiles``: to store; None for those that training rays can reach."""
+
+        Args:
+            plan: frames and resolutions.
+            factor: texels in use, as a share of the plan's.
+            tiles: tiles to store; None for those that training rays can reach.
+        """
         self.full_plan, self.plan, self.factor = plan, plan.scaled(factor), factor
         device = self.density.device
         if tiles is None:
@@ -123,7 +134,11 @@ class TexelTables(Field):
     @torch.no_grad()
     def grow(self, factor: float, tiles: Int[Tensor, "T"] | None = None) -> None:
         """Resamples every table to ``factor`` times the plan's texels (paper sec. IV; bilinear on each plane).
-        ``tiles``: to store, those of ``tiles_at(factor)`` unless given."""
+
+        Args:
+            factor: texels, as a share of the plan's.
+            tiles: to store, of ``tiles_at(factor)``; None: those.
+        """
         tiles = self.tiles_at(factor) if tiles is None else tiles
         old, is_cube, self.plan, self.factor = self.grids, self._is_cube, self.full_plan.scaled(factor), factor
         new = head_grids(self.plan, tiles)

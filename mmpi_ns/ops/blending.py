@@ -80,9 +80,16 @@ def log_shares(
 ) -> tuple[Float[Tensor, "N"], Float[Tensor, "N"]]:
     """log P and log(1 - P) of samples among the heads that cover them, with gradients to the reliability.
 
-    A head covers a point in its frustum if the nearest texel was trained (``touched`` [T] is 1 where a training ray
-    read a row); a sample's own head always covers it. ``local``: the rays in every head's axes; ``rays``, ``inverse_t``
-    and ``heads``: of each sample.
+    A head covers a point in its frustum if the nearest texel was trained; a sample's own head always covers it.
+
+    Args:
+        layout: of the scene.
+        reliability: R of all texels.
+        touched: for every row [T]: 1 if a training ray read it.
+        rays: ray of each sample.
+        local: the rays in every head's axes.
+        inverse_t: inverse distance of each sample.
+        heads: head that each sample was taken from.
     """
     chosen, texels, cover = [], [], []
     for j, grid in enumerate(layout.grids):

@@ -118,10 +118,14 @@ def even_bounds(count: int, least: int = 256) -> list[int]:
 
 
 def owned_bounds(positions: Sequence[Int[Tensor, "N B"]], count: int, least: int) -> list[int]:
-    """Bounds of parts of rows 0..count for sums by row, with about as many entries (``positions``, of which some are
-    looked at) in each part, and at least ``least``.
+    """Bounds of parts of rows 0..count with about as many entries each, for sums by row.
 
     A row has one owner, who adds all its entries in order: no sum depends on where the bounds lie.
+
+    Args:
+        positions: rows of all entries; some of them are looked at.
+        count: of the rows.
+        least: entries that each part gets (see ``even_bounds``).
     """
     entries = sum(p.numel() for p in positions)
     parts = len(even_bounds(entries, least)) - 1

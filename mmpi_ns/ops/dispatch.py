@@ -94,8 +94,12 @@ _OPERATIONS: dict[str, Operation[..., Any]] = {}
 
 
 def operation(*compiled: Form, check: Callable[..., None] | None = None) -> Callable[[Callable[P, R]], Operation[P, R]]:
-    """Makes an operation of a function. ``compiled``: its forms besides plain torch. ``check`` takes the same arguments
-    and raises what their annotations cannot say."""
+    """Makes an operation of a function.
+
+    Args:
+        compiled: the forms that there are besides plain torch.
+        check: takes the same arguments and raises what their annotations cannot say.
+    """
     return lambda reference: Operation(reference, compiled, check)
 
 
@@ -156,8 +160,12 @@ def choose(path: Route) -> None:
 
 
 def expect(shapes: Shapes, afresh: bool = False) -> None:
-    """Has kernels tried with the shapes of this run before they are used. ``afresh``: also those that passed on this
-    device before."""
+    """Kernels that have not been tried with these shapes are, before they are used.
+
+    Args:
+        shapes: of the run at hand.
+        afresh: also what passed on this device before.
+    """
     global _shapes, _tries_afresh
     with _trying:
         if afresh or (shapes != _shapes and not _interpreting):  # the interpreter would take minutes

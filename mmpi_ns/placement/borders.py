@@ -21,6 +21,11 @@ def widened(mpis: list[MPIPlan], observations: Observations, visible: VisiblePoi
 
     A border is tested at the depths between which the image's points lie. Each border point outside all MPIs is
     assigned to the MPI that must grow least for it.
+
+    Args:
+        mpis: the chosen MPIs.
+        observations: the training cameras.
+        visible: points that they see.
     """
     points = border_points(observations, visible)
     origins = np.array([m.origin for m in mpis], dtype=np.float64)

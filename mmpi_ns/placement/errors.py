@@ -52,8 +52,14 @@ class PixelErrors:
 
 
 def pixel_errors(plan: ScenePlan, observations: Observations, cameras: NDArray[np.int64], points: Array) -> PixelErrors:
-    """e_p and e_t of observed points [Q, 3], each seen by a camera [Q], in every head of a plan: its MPIs, then the
-    cube if there is one."""
+    """e_p and e_t of observed points in every head of a plan: its MPIs, then the cube if there is one.
+
+    Args:
+        plan: the MPIs and the cube.
+        observations: the cameras.
+        cameras: [Q] camera of each observation.
+        points: [Q, 3] world position of each observed point.
+    """
     pairs = [mpi_errors(m, observations, cameras, points) for m in plan.mpis]
     if plan.cube is not None:
         texel = cube_errors(plan.cube, observations, cameras, points)
@@ -74,8 +80,12 @@ def mpi_errors(
 def pixel_slopes(
     mpi: MPIPlan, observations: Observations, cameras: NDArray[np.int64], points: Array
 ) -> tuple[Array, Array, Array]:
-    """Pixels that an observed point moves per unit of its disparity, tangent u and tangent v in an MPI's frame; inf if
-    the MPI does not contain the point. [Q] each. Planes and texels of the MPI do not enter, and can be chosen by them.
+    """Pixels that an observed point moves per unit of its disparity, tangent u and tangent v in an MPI's frame.
+
+    Independent of the planes and texels of the MPI, which can be chosen by these slopes.
+
+    Returns:
+        Three arrays [Q]; inf if the MPI does not contain the point.
     """
     axes, origin = np.asarray(mpi.axes), np.asarray(mpi.origin)
     local = (points - origin) @ axes.T

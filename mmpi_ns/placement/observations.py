@@ -113,8 +113,12 @@ class Observations:
         return depths
 
     def directions(self, camera: int, shares: Array) -> Array:
-        """Directions [N, 3], in camera axes and of depth 1, through places [N, 2] of an image: x and y as shares of its
-        sides, a little beyond the borders too."""
+        """Directions [N, 3], in camera axes and of depth 1, through places [N, 2] of an image.
+
+        Args:
+            camera: number of the camera.
+            shares: x and y as shares of the image's sides; a little beyond the borders will do.
+        """
         if self.lens is None:
             (fx, fy, cx, cy), (w, h) = self.intrinsics[camera], self.sizes[camera]
             x, y = (shares[:, 0] * w - cx) / fx, (shares[:, 1] * h - cy) / fy

@@ -110,10 +110,14 @@ def pixels_per_pixel(observations: Observations, visible: VisiblePoints) -> floa
 
 
 def farthest_first(places: Array, count: int | None = None, radius: float = 0.0) -> list[int]:
-    """Places [M, D] far apart, each the farthest from the previous ones (farthest-point traversal, Gonzalez 1985).
+    """Places far apart, each the farthest from the previous ones (farthest-point traversal, Gonzalez 1985).
 
-    Starts at the place farthest from the middle, so the numbering does not matter. Without ``count``, as many as it
-    takes until balls of ``radius`` around them contain all.
+    Starts at the place farthest from the middle, so the numbering does not matter.
+
+    Args:
+        places: [M, D]
+        count: number of places; None: as many as it takes until balls of ``radius`` around them contain all.
+        radius: of the balls.
     """
     chosen = [int(np.linalg.norm(places - places.mean(0), axis=-1).argmax())]
     distance = np.linalg.norm(places - places[chosen[0]], axis=-1)

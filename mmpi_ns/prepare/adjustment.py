@@ -42,8 +42,15 @@ class Free:
 def adjust(
     model: pycolmap.Reconstruction, threads: int, lens: bool, principal_point: bool = False, poses: bool = True
 ) -> None:
-    """Bundle adjustment of points, and of lens (focal length and distortion), principal point and poses if asked for,
-    over all images with a robust loss, in place. Below 1, ``threads`` are all."""
+    """Bundle adjustment over all images with a robust loss, in place.
+
+    Args:
+        model: adjusted; its points always are.
+        threads: CPU threads; below 1 for all.
+        lens: refine focal length and distortion.
+        principal_point: refine the principal point.
+        poses: refine poses.
+    """
     options, config = pycolmap.BundleAdjustmentOptions(), pycolmap.BundleAdjustmentConfig()
     options.refine_rig_from_world = poses
     options.refine_focal_length = options.refine_extra_params = lens
@@ -62,8 +69,15 @@ def adjust(
 
 
 def polish(model: pycolmap.Reconstruction, free: Free, threads: int) -> pycolmap.Reconstruction:
-    """A copy of the model adjusted with more parameters free, if that lowers the error. Parameters that do not lower it
-    absorb other errors: driving forward, lens terms absorb the principal point."""
+    """The model adjusted with more parameters free, if that lowers the error.
+
+    Parameters that do not lower it absorb other errors: driving forward, lens terms absorb the principal point.
+
+    Args:
+        model: adjusted; not changed.
+        free: what may be refined.
+        threads: CPU threads; below 1 for all.
+    """
     trials = []  # in words, and whether it is the four lens terms; else the principal point
     if free.principal_point:
         trials.append(("the principal point free", False))
@@ -144,9 +158,15 @@ def with_all_points(
 
 
 def focal_interval(model: pycolmap.Reconstruction, threads: int) -> tuple[float, float]:
-    """Focal lengths, in pixels, that bundle adjustments of one model end at under different assumptions: principal
-    point in the middle or free, and each half of the images alone. (The statistical error of one adjustment is far
-    smaller and means little.) Of several cameras, the first."""
+    """Focal lengths, in pixels, that bundle adjustments of one model end at under different assumptions.
+
+    Principal point in the middle; principal point free; each half of the images alone. The statistical error of one
+    adjustment is far smaller and means little, because the assumptions dominate. Of several cameras, the first.
+
+    Args:
+        model: not changed.
+        threads: CPU threads; below 1 for all.
+    """
     light, ids = with_fewer_points(model), sorted(model.reg_image_ids())
     middle = len(ids) // 2
     trials: list[tuple[list[int], bool]] = [(ids, True)]

@@ -50,10 +50,13 @@ def nearest_rotation(matrix: Array) -> Array:
 
 
 def similarity_between(source: Array, target: Array) -> pycolmap.Sim3d:
-    """The similarity that aligns camera poses (camera to world, [N, 4, 4]) with other poses of the same cameras.
+    """The similarity that aligns camera poses with other poses of the same cameras.
 
     Uses centres and rotations: the centres of a straight track do not fix its roll, and noise tilts a short one.
     (``pycolmap.estimate_sim3d`` uses centres alone, and gives up where they lie on a line or a plane, as drives do.)
+
+    Args:
+        source, target: camera to world. [N, 4, 4]
     """
     a = source[:, :3, 3] - source[:, :3, 3].mean(0)
     b = target[:, :3, 3] - target[:, :3, 3].mean(0)
@@ -131,8 +134,12 @@ def fit_ground(points: Array, centers: Array, up: Array) -> tuple[Array, float]:
 
 
 def choose_frame(model: pycolmap.Reconstruction, camera_height: float | None) -> SceneFrame:
-    """Up to +z, the first camera's heading to +y, the cameras' middle (or the ground below it) as origin. The camera
-    height is in metres above the ground; None: one unit is the extent of the track."""
+    """Up to +z, the first camera's heading to +y, the cameras' middle (or the ground below it) as origin.
+
+    Args:
+        model: in its own frame.
+        camera_height: metres above the ground, or None: then one unit is the extent of the track.
+    """
     _, poses = camera_poses(model)
     centers = poses[:, :3, 3]
     up = up_from_cameras(poses)

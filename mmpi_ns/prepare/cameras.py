@@ -61,9 +61,15 @@ def share(photos: Sequence[Photo], sharing: Sharing, lenses: dict[str, Intrinsic
 def make_cameras(
     photos: Sequence[Photo], numbers: Sequence[int], lenses: dict[str, Intrinsics], focal: float | None, lens: Lens
 ) -> list[pycolmap.Camera]:
-    """One pycolmap camera for each of the images' numbers, from known intrinsics (``lenses``, by image name), else from
-    the focal length of the command line (pixels) or of EXIF, else guessed. ``lens`` is the distortion model where none
-    is known."""
+    """One pycolmap camera for each number, from given intrinsics, else from EXIF, else guessed.
+
+    Args:
+        photos: the images.
+        numbers: camera of each image.
+        lenses: known intrinsics by image name.
+        focal: focal length in pixels, from the command line.
+        lens: distortion model if none is given.
+    """
     cameras: dict[int, pycolmap.Camera] = {}
     for photo, number in zip(photos, numbers, strict=True):
         if number in cameras:

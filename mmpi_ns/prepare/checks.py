@@ -80,8 +80,13 @@ def blurred(names: Sequence[str], sharp: Array, ordered: bool) -> list[Finding]:
 
 
 def misplaced(names: Sequence[str], places: Sequence[int], poses: Array) -> list[Finding]:
-    """Frames of a sequence where the track jumps or the camera turns abruptly. ``places`` are their indices in the
-    input: a gap of two frames may be twice as long. Poses are camera to world, OpenCV axes. [N, 4, 4]"""
+    """Frames of a sequence where the track jumps or the camera turns abruptly.
+
+    Args:
+        names: images in order.
+        places: their indices in the input, so that a gap of two frames may be twice as long.
+        poses: camera to world, OpenCV axes. [N, 4, 4]
+    """
     if len(names) < 5:
         return []
     gaps = np.diff(places)
@@ -103,8 +108,14 @@ def misplaced(names: Sequence[str], places: Sequence[int], poses: Array) -> list
 def doubtful_intrinsics(
     model: pycolmap.Reconstruction, is_fixed: bool, focal: tuple[float, float] | None, threads: int
 ) -> list[Finding]:
-    """Models, focal lengths and lenses that do not fit. Fixed intrinsics are refined in a copy and compared; ``focal``
-    is the interval of a refined focal length, pixels."""
+    """Models, focal lengths and lenses that do not fit.
+
+    Args:
+        model: the final model.
+        is_fixed: intrinsics were given and kept; they are refined in a copy and compared.
+        focal: the interval of the focal length in pixels, where it was refined.
+        threads: CPU threads; below 1 for all.
+    """
     findings = []
     if focal is not None and focal[1] - focal[0] >= WIDE * focal[1]:
         says = f"the images hardly determine the focal length ({focal_in_words(*focal)})"

@@ -97,8 +97,14 @@ class Agreement:
 
 
 def witness_of(name: str, model: pycolmap.Reconstruction, database: Path, offered: Sequence[str]) -> Witness:
-    """The evidence on a mapper's model, which has the keypoints of the database of verified matches; ``offered`` are
-    the names of all images of the capture, in order."""
+    """The evidence on a mapper's model.
+
+    Args:
+        name: of the mapper.
+        model: poses and points, with the keypoints of the database.
+        database: verified matches.
+        offered: names of all images of the capture, in order.
+    """
     names, poses = camera_poses(model)
     images = [model.images[i] for i in sorted(model.reg_image_ids())]
     points = {  # the point that each keypoint sees, -1 for none
@@ -155,9 +161,17 @@ def share(part: Array, whole: Array) -> float:
 
 
 def bridges(pairs: Pairs, count: int, part: Array, whole: Array | None = None) -> Array:
-    """Fraction of the matches across each gap between two of ``count`` registered images that hold; NaN if few cross.
-    [N - 1] ``part`` is ``pairs.tracked`` or ``pairs.fitting``, ``whole`` what it is a part of, all matches unless
-    given. [P]"""
+    """Fraction of the matches across each gap between two registered images that hold.
+
+    Args:
+        pairs: of the model.
+        count: registered images, N.
+        part: ``pairs.tracked`` or ``pairs.fitting``. [P]
+        whole: what it is a part of; all matches unless given. [P]
+
+    Returns:
+        Fractions; NaN if there are too few matches across. [N - 1]
+    """
     near = pairs.second - pairs.first <= REACH
     totals = np.zeros((2, count + 1))
     for row, values in enumerate((part, pairs.matches if whole is None else whole)):

@@ -182,8 +182,19 @@ def undistort(
     target: Path,
     threads: int,
 ) -> tuple[pycolmap.Reconstruction, list[Photo]]:
-    """Writes undistorted images, with their EXIF, and masks (``NAME.png``) to ``target/images`` and ``target/masks``.
-    Returns the model with pinhole cameras and moved keypoints, and the images with their new sizes."""
+    """Writes undistorted images, with their EXIF, and masks.
+
+    Args:
+        model: not changed.
+        photos: registered images.
+        images: folder of the images.
+        masks: folder of the masks (``NAME.png``), or None.
+        target: gets ``images`` and ``masks``.
+        threads: CPU threads; below 1 for all.
+
+    Returns:
+        The model with pinhole cameras and moved keypoints, and the images with their new sizes.
+    """
     (target / "bent").mkdir(parents=True)
     model.write(target / "bent")
     names = [photo.name for photo in photos]

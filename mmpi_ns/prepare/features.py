@@ -55,9 +55,12 @@ def create_database(
 def extract(
     database: Path, images: Path, photos: Sequence[Photo], masks: Path | None, max_features: int, threads: int
 ) -> list[int]:
-    """Number of SIFT features of each image, which are found unless the database has them.
+    """SIFT features of all images; images that have theirs are skipped.
 
     Weak features count too if most of a sample of the images have less than half of the features that they may have.
+
+    Returns:
+        Features of each image.
 
     Raises:
         PrepareError: an image cannot be read, or hardly any has features.
@@ -94,7 +97,11 @@ def extract(
 
 
 def match(database: Path, photos: Sequence[Photo], pairs: Sequence[tuple[int, int]], threads: int) -> int:
-    """Matches and verifies pairs of images (indices into ``photos``), unless they were; returns how many match."""
+    """Matches and verifies pairs of images (indices into ``photos``); pairs matched before are skipped.
+
+    Returns:
+        Pairs with verified matches.
+    """
     with progress("Matching pairs", len(pairs)) as advance, quiet():
         for start in range(0, len(pairs), PAIR_BATCH):
             batch = pairs[start : start + PAIR_BATCH]

@@ -177,7 +177,8 @@ def _convert(image: Image.Image, path: Path, suffix: str) -> None:
 def gather_masks(folder: Path, photos: Sequence[Photo], target: Path) -> int:
     """Writes a mask for each image to ``target/NAME.png``: white is used, black (zero) is left out.
 
-    Returns the number of images that had one; the others get a white one, since nerfstudio wants all or none.
+    Returns:
+        Images that had a mask; the others get an all-white one, since nerfstudio wants all or none.
 
     Raises:
         PrepareError: no mask fits an image, or one has another size.

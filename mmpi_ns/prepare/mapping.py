@@ -109,7 +109,12 @@ def reconstruct(task: Task, database: Path, attempts: int = len(ATTEMPTS)) -> tu
     """Runs the attempts in order until one registers nearly all images; returns the best model, and words about it.
 
     An attempt continues the best model of the earlier ones if that is sound and contains the fraction ``CARRIES`` of
-    the images: often it stopped at one stretch with few matches. The cameras start as in the database.
+    the images: often it stopped at one stretch with few matches, and the rest need not be computed again.
+
+    Args:
+        task: what is to be mapped.
+        database: features, verified matches and the cameras to start from.
+        attempts: maximum number of attempts.
 
     Raises:
         PrepareError: no attempt found an initial pair.
@@ -235,9 +240,17 @@ def mapper_options(
 def map_globally(
     task: Task, name: str, database: Path, names: Sequence[str], threads: int
 ) -> pycolmap.Reconstruction | None:
-    """The largest model of the global mapper, None if there is none; read back where it was made before. Every random
-    draw is seeded, small angles are kept, and given intrinsics left alone. ``name`` is a folder for the models, the
-    database has the cameras to start from, ``names`` are the images to place."""
+    """The largest model of the global mapper, None if there is none; read back where it was made before.
+
+    Every random draw is seeded, small angles are kept, and given intrinsics left alone.
+
+    Args:
+        task: what is to be mapped.
+        name: of the folder for the models.
+        database: features, verified matches and the cameras to start from.
+        names: the images to place.
+        threads: CPU threads.
+    """
     folder, folders, refine = task.work / name, task.work / name / "models", task.free.lens
     if not (folder / "done").exists():
         shutil.rmtree(folder, ignore_errors=True)
@@ -266,9 +279,18 @@ def map_globally(
 def map_known_poses(
     model: pycolmap.Reconstruction, database: Path, images: Path, refine_poses: bool, refine_lens: bool, threads: int
 ) -> tuple[pycolmap.Reconstruction, str]:
-    """Triangulates points from the poses of a model without points, and refines poses and intrinsics if asked to.
+    """Triangulates points from the poses of a model, and refines these.
 
-    Refined poses are aligned with the given ones. Returns the model with points, and what was done in words.
+    Args:
+        model: cameras and posed images without points; changed in place.
+        database: features and matches.
+        images: folder of the images.
+        refine_poses: bundle-adjust poses; the result is aligned with the given scale and frame.
+        refine_lens: bundle-adjust intrinsics as well.
+        threads: CPU threads; below 1 for all.
+
+    Returns:
+        The model with points, and what was done in words.
 
     Raises:
         PrepareError: the poses do not fit the matches.

@@ -38,9 +38,12 @@ class KnownPoses:
 
 
 def read_poses(path: Path, axes: str, photos: Sequence[Photo]) -> KnownPoses:
-    """Reads known poses, from a file or a folder of 4x4 text files, and matches them with the images.
+    """Reads known poses and matches them with the images.
 
-    Axes are opencv, opengl, or auto (opengl for transforms.json only).
+    Args:
+        path: a file, or a folder of 4x4 text files.
+        axes: opencv, opengl, or auto (opengl for transforms.json only).
+        photos: the images.
 
     Raises:
         PrepareError: the file is not understood, or fits fewer than two images.

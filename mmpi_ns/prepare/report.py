@@ -37,8 +37,17 @@ def write_report(
     note: str,
     scene: Path,
 ) -> None:
-    """Writes report.md and report/track.png: ``rows`` beside the model's figures in the table, the further ``warnings``
-    before the findings of the checks, and a note at the end."""
+    """Writes report.md and report/track.png.
+
+    Args:
+        model: in the frame of the scene.
+        title: of the report.
+        rows: what the table says beyond the model's figures, by their names.
+        findings: of the checks; listed as warnings and marked in the drawing.
+        warnings: further ones, listed first.
+        note: the last line.
+        scene: folder to write to.
+    """
     covered = {}  # share of each image's cells that hold a keypoint with a point
     for i in model.reg_image_ids():
         image, camera = model.images[i], model.cameras[model.images[i].camera_id]

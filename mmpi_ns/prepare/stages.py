@@ -40,7 +40,11 @@ class Stages:
     @contextmanager
     def stage(self, name: str, settings: Any) -> Iterator[tuple[Path, bool]]:
         """A stage's own folder, and whether it was finished before; it counts as finished when the block ends.
-        ``settings``, JSON or text, are everything the result depends on besides the earlier stages."""
+
+        Args:
+            name: the folder's name.
+            settings: everything the result depends on besides the earlier stages; JSON or text.
+        """
         text = self._key + name + json.dumps(settings, sort_keys=True, default=str)
         self._key = hashlib.sha256(text.encode()).hexdigest()
         folder, stamp = self.work / name, self.work / f"{name}.json"

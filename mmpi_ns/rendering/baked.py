@@ -89,9 +89,14 @@ class BakedWindow:
         bounds: tuple[Float[Tensor, "R 1"], Float[Tensor, "R 1"]] | None = None,
         background: Float[Tensor, "3"] | None = None,
     ) -> dict[str, Tensor]:
-        """rgb, accumulation, depth, winning MPI and dropped mass of rays with unit directions, like those of the model.
-        ``bounds``: nears and fars, ``ray_near`` and infinity unless given. ``background``: colour behind everything,
-        the window's own unless given."""
+        """rgb, accumulation, depth, winning MPI and dropped mass of rays, like those of the model.
+
+        Args:
+            origins: of the rays.
+            directions: of the rays, unit vectors.
+            bounds: nears and fars of the rays; None: from ``ray_near`` to infinity.
+            background: colour behind everything; None: the window's own.
+        """
         shown = show_baked(self.mpis, Rays(origins, directions, *(bounds or self.unbounded(origins))), self.threshold)
         shaded = shade_baked(self.shader, shown.gathered, shown.mass, directions)
         rgb = torch.where(shown.mass > 0, shaded * shaded.new_tensor(self.exposure), 0.0)
@@ -112,8 +117,12 @@ class BakedWindow:
     def peaks(
         self, views: Sequence[Item], rays_of: Callable[[Item], tuple[Float[Tensor, "R 3"], Float[Tensor, "R 3"]]]
     ) -> Float[Tensor, "B 8 8"]:
-        """Largest weight of any sample of some views in each texel. ``rays_of``: origins and unit directions of a
-        view's rays."""
+        """Largest weight of any sample of some views in each texel.
+
+        Args:
+            views: whatever ``rays_of`` takes.
+            rays_of: origins and unit directions of a view's rays.
+        """
         peaks = torch.zeros(self.mpis.density.shape)
         for view in views:
             for o, d in zip(*(x.split(AT_ONCE) for x in rays_of(view)), strict=True):
@@ -163,9 +172,18 @@ def bake(
     blends: bool = False,
     exposure: tuple[float, ...] = (1.0, 1.0, 1.0),
 ) -> BakedWindow:
-    """A field as bricks of 8-bit codes, all that are not empty; where it ``blends``, with the optical depths that
-    reliability leaves at its texels. ``exposure``: of images, relative to the field's. Raises ValueError if the field
-    has a cube, too many channels, or a network for every sample."""
+    """A field as bricks of 8-bit codes: all that are not empty.
+
+    Args:
+        model_field: what to bake.
+        threshold: samples of less weight will not be shaded.
+        background: grey level behind everything.
+        blends: texels keep the optical depths that blending by reliability leaves at them.
+        exposure: of images, relative to the field's.
+
+    Raises:
+        ValueError: the field has a cube, too many channels, or a network for every sample.
+    """
     if refusal := why_not_baked(model_field):
         raise ValueError(refusal)
     plan, network = model_field.plan, model_field.networks

@@ -22,8 +22,12 @@ OPAQUE = 0.9
 
 
 class Exposures(torch.nn.Module):
-    """Colours of each training image over those of the field, with the positions of the cameras; empty where all images
-    have the same exposure."""
+    """Colours of each training image over those of the field; empty where all have the same exposure.
+
+    Args:
+        gains: of the training images, if they differ.
+        centers: positions of the training cameras; None without gains.
+    """
 
     factors: Float[Tensor, "N 3"]
     falloff: Float[Tensor, "2 3"]
@@ -60,7 +64,14 @@ def exposure_of_image(
     exposures: Exposures, manager: MMPIDataManager, camera: Cameras, observed: Tensor, outputs: dict[str, Tensor]
 ) -> Float[Tensor, "3"] | None:
     """Exposure of an evaluated image, by surfaces that training images near it show too; None if they show nothing.
-    ``observed``: its colours [H, W, 3]; ``outputs``: its rendering, for the depths."""
+
+    Args:
+        exposures: of the training images.
+        manager: holds the training images.
+        camera: of the evaluated image.
+        observed: its colours. [H, W, 3]
+        outputs: its rendering, for the depths.
+    """
     dataset, posed = manager.train_dataset, posed_images(manager.observations, manager.train_dataset)
     if posed is None:
         return None

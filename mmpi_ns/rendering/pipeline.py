@@ -94,8 +94,13 @@ def refined_camera(model: Any, camera: Cameras, image: Tensor, seed: int) -> tup
     """A camera moved to the pose from which a frozen model renders its image best.
 
     If the training poses were wrong, or were refined, the model does not match the test poses exactly. The pose is
-    optimised by the colours of the same pixels that are then scored, so this is no score of view synthesis. The image
-    [H, W, 3] lies over the model's background.
+    optimised by the colours of the same pixels that are then scored, so this is no score of view synthesis.
+
+    Args:
+        model: ``MMPIModel``, in evaluation.
+        camera: one.
+        image: [H, W, 3] of it, over the model's background.
+        seed: of the draw of pixels.
 
     Returns:
         The moved camera, its rotation in degrees, and its translation in scene units.

@@ -131,8 +131,15 @@ def shown_outputs(
     threshold: float,
     head_mask: Tensor | None,
 ) -> dict[str, Tensor]:
-    """rgb (without background), accumulation, transmittance, depth, winning head and dropped mass of rays [R, .]
-    through a field with ``shading ray``. ``head_mask``: heads that may render each ray; None for all."""
+    """rgb (without background), accumulation, transmittance, depth, winning head and dropped mass of rays [R, .].
+
+    Args:
+        bundle: the rays.
+        field: with ``shading ray``.
+        blends: samples are blended by reliability.
+        threshold: weight below which a sample is dropped.
+        head_mask: heads that may render each ray; None for all.
+    """
     assert isinstance(field.networks, RayShader)
     options = MarchOptions(threshold, blends=blends)
     scene = (field.layout, field.tables, field.features.data)

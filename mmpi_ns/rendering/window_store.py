@@ -69,8 +69,15 @@ class WindowStore:
         write_atomically(path, lambda unfinished: torch.save(state, unfinished))
 
     def load(self, window: int, device: torch.device) -> MMPIField:
-        """A finished window, ready to render. It stays valid for the caller even if the store evicts it. Raises
-        InputError if the file is missing or damaged (says which, and what to do)."""
+        """A finished window, ready to render. It stays valid for the caller even if the store evicts it.
+
+        Args:
+            window: its number.
+            device: to load it to.
+
+        Raises:
+            InputError: the file is missing or damaged (says which, and what to do).
+        """
         with Uninterrupted(), self._lock:
             field = self._alive.get(window)
             if field is None:
@@ -102,8 +109,12 @@ class WindowStore:
         return field
 
     def adopt(self, other: Path, plans: dict[int, ScenePlan], needed: bool = False) -> None:
-        """Takes over finished windows from the folder of the run that this one resumes. ``needed``: all of them must
-        exist.
+        """Takes over finished windows of the run that this one resumes.
+
+        Args:
+            other: that run's folder of windows.
+            plans: of the windows to take over, by number.
+            needed: whether all of them must exist.
 
         Raises:
             InputError: a needed one is missing, one is damaged, or was trained with another plan.

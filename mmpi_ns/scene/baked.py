@@ -150,8 +150,12 @@ def take_borders(codes: UInt8[Tensor, "B 8 8 ..."], beside: Int[Tensor, "2 B"]) 
 
 
 def columns_from(stored: Tensor, first: int) -> tuple[Int[Tensor, "N 2"], Int[Tensor, "B 3"]]:
-    """Columns of one MPI, and (plane, row, column) of its bricks in their order; ``stored`` marks the occupied tiles
-    [planes, down, across], ``first`` counts the bricks of the MPIs before."""
+    """Columns of one MPI, and (plane, row, column) of its bricks in their order.
+
+    Args:
+        stored: bool [planes, down, across], which tiles are occupied.
+        first: bricks of the MPIs before.
+    """
     planes, down, across = stored.shape
     padded = torch.nn.functional.pad(stored, (0, 0, 0, 0, 0, -planes % WORD))
     bits = padded.view(-1, WORD, down, across).permute(0, 2, 3, 1).reshape(-1, WORD)

@@ -69,11 +69,19 @@ class TrainingViews:
 
 
 def reachable_tiles(views: TrainingViews, plan: ScenePlan, device: str | torch.device = "cpu") -> Bool[Tensor, "T"]:
-    """Tiles (in the order of ``texels``) with a texel that a ray through a training image can read, on the CPU.
+    """Tiles (in the order of ``texels``) with a texel that a ray through a training image can read.
 
     A tile is left out if it lies outside one of the four planes of every image, or on a plane that no camera is in
-    front of: a few too many are marked at the corners of images, and all tiles of the cube. Computed in float64 on a
-    device, once for each plan.
+    front of. This is conservative: a few too many are marked at the corners of images. All tiles of the cube are
+    marked. Computed once for each plan and remembered.
+
+    Args:
+        views: the training images.
+        plan: the heads, at the resolution in use.
+        device: where it is computed, in float64.
+
+    Returns:
+        On the CPU.
     """
     marks, count = _packed_tiles(_Key(views.digest, plan, views, torch.device(device)))
     return torch.from_numpy(np.unpackbits(marks, count=count).view(bool))

@@ -17,8 +17,13 @@ def say_version(name: str) -> None:
 
 
 def run(name: str, command: Any, **how: Any) -> int:
-    """Builds a command's options from the arguments by tyro, runs its ``main`` and returns the exit status. ``name``:
-    of the command, for its messages."""
+    """Reads a command's options, runs its ``main`` and returns the exit status.
+
+    Args:
+        name: of the command, for its messages.
+        command: type that tyro builds from the arguments.
+        how: for tyro.
+    """
     say_version(name)
     try:
         tyro.cli(command, **{"prog": name, **how}).main()

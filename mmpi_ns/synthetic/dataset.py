@@ -95,8 +95,14 @@ def _write_image(scene: Scene, folder: Path, exposure: Exposure | None, camera: 
 
 
 def write_depths(scene: Scene, folder: Path, camera: int, distances: Colors) -> None:
-    """Writes the depth image of a camera, millimetres along the optical axis, 0 where that is too far, from distances
-    along the rays [H, W] in metres."""
+    """Writes the depth image of a camera: millimetres along the optical axis, 0 where that is too far.
+
+    Args:
+        scene: whose cameras these are.
+        folder: of the data set.
+        camera: number of the camera.
+        distances: along the rays [H, W], metres.
+    """
     slant = np.sqrt(1 + (scene.cameras.central_tangents**2).sum(-1)).reshape(distances.shape)
     depths = 1000 * distances / slant
     millimetres = np.where(depths <= MILLIMETRES, depths, 0).round().astype(np.uint16)

@@ -31,11 +31,16 @@ CHANGED = 1 / 255
 
 
 def movers_at(seed: int, road: Road, count: int, along: Array, walks: bool, camera: int) -> Primitives:
-    """Cars and people when image ``camera`` is taken: oncoming, ahead, crossing, on the pavement, and overtaking, in
-    turns.
+    """Cars and people when an image is taken: in turns oncoming, ahead of the camera, crossing, on the pavement, and
+    overtaking.
 
-    They move along a road, as do the cameras, which walk or drive and are ``along`` it, metres [M]. ``seed`` is of
-    their places and looks.
+    Args:
+        seed: of their places and looks.
+        road: along which they move.
+        count: of cars and people.
+        along: metres along the road of each camera. [M]
+        walks: whether the cameras walk; else they drive.
+        camera: number of the image.
     """
     speed, rows = WALKING if walks else DRIVING, []
     seconds = (along - along[0]) / speed

@@ -82,8 +82,13 @@ class Scene:
         return np.where(below, ground, distance), np.where(below, -1, row)
 
     def trace(self, origins: Array, directions: Array, pixel: float = 0.0) -> tuple[Array, Colors]:
-        """Distance [R] of what each ray meets first, inf for the sky, and its colour [R, 3] in [0, 1]. Directions are
-        unit vectors; textures are averaged over the angle that a ray stands for, ``pixel``, radians."""
+        """Distance [R] of what each ray meets first, inf for the sky, and its colour [R, 3] in [0, 1].
+
+        Args:
+            origins: [R, 3] metres.
+            directions: [R, 3] unit vectors.
+            pixel: angle that a ray stands for, radians; textures are averaged over it.
+        """
         distance, colors = np.empty(len(directions)), np.empty((len(directions), 3), np.float32)
         for start in range(0, len(directions), PACKET):
             s = slice(start, start + PACKET)
@@ -141,8 +146,13 @@ class Scene:
 
 
 def surface_of(these: Primitives, points: Array, directions: Array, pixel: Array) -> tuple[Surface, Array]:
-    """Coordinates on the faces of the solids hit, and the normals [N, 3] there, where rays of some directions met them;
-    ``pixel`` is the width of a pixel at each point, across the ray. [N] metres"""
+    """Coordinates on the faces of the solids hit, and the normals [N, 3] there.
+
+    Args:
+        these: the solid that each point lies on.
+        points, directions: [N, 3] hits and the rays that met them.
+        pixel: width of a pixel at each point, across the ray. [N] metres
+    """
     n = np.arange(len(points))
     q, d = to_local(points - these.center, these.yaw), to_local(directions, these.yaw)
     h = these.half

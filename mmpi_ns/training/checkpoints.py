@@ -38,7 +38,11 @@ def checkpoints_in(folder: Path, steps: range | None = None) -> dict[int, Path]:
 
 def claim(folder: Path, checkpoints: Path, resumes_from: Path | None) -> None:
     """Locks a run's folder for this process until it ends, and removes files left half-written by killed runs.
-    ``resumes_from``: folder or file of the checkpoint that the run resumes from.
+
+    Args:
+        folder: of the run.
+        checkpoints: its folder of checkpoints.
+        resumes_from: folder or file of the checkpoint that the run resumes from.
 
     Raises:
         InputError: another run is writing there, or its checkpoints are there and this run does not resume from them.

@@ -63,15 +63,17 @@ def fit_memory(
     device: str | torch.device,
     again: Callable[[float], WindowedPlan] | None = None,
 ) -> WindowedPlan:
-    """``windows``, or the plan made ``again`` with fewer texels, so that the largest window can be trained in the
-    memory that is free, before anything is allocated.
+    """A plan whose largest window can be trained in the memory that is free, before anything is allocated.
 
     Args:
         windows: of the capture.
         views_of: training images of a window.
         work: what else is kept in memory.
         device: on which it will be trained.
-        again: plans with at most so many texels a window; None where this plan was asked for.
+        again: plans anew with at most so many texels a window; None where a plan was asked for.
+
+    Returns:
+        ``windows`` if they fit, or planned again.
 
     Raises:
         InputError: not enough memory is free.
@@ -142,16 +144,27 @@ def count_tiles(plan: ScenePlan) -> int:
 
 
 def training_bytes(plan: ScenePlan, views: TrainingViews | None, work: Work, device: str | torch.device = "cpu") -> int:
-    """Bytes of the tables of one window at full resolution, and of their moments, before bricks are released. Texels
-    that none of the training images ``views`` can reach, looked for on ``device``, are not stored; None: all are."""
+    """Bytes of the tables of one window at full resolution, and of their moments, before bricks are released.
+
+    Args:
+        plan: MPIs and cube.
+        views: training images; texels that none can reach are not stored. None: all are stored.
+        work: what is trained.
+        device: where tiles in reach are looked for.
+    """
     tiles = count_tiles(plan)
     stored = tiles if views is None else int(reachable_tiles(views, plan, device).sum())
     return stored_bytes(stored, tiles, work)
 
 
 def stored_bytes(bricks: int, tiles: int, work: Work) -> int:
-    """Bytes of tables with a number of bricks besides the empty one, and of their moments. ``tiles``: of all planes,
-    stored or not."""
+    """Bytes of tables with a number of bricks besides the empty one, and of their moments.
+
+    Args:
+        bricks: that hold a tile.
+        tiles: of all planes, stored or not.
+        work: what is trained.
+    """
     learned = 1 + work.feature_channels + work.two_phase
     numbers, moments = 1 + work.feature_channels + 1, 2 * learned  # density, features, reliability; float32, bfloat16
     # Also marks of touched texels, peaks of bricks, and the tile map.
@@ -159,8 +172,14 @@ def stored_bytes(bricks: int, tiles: int, work: Work) -> int:
 
 
 def describe(windows: WindowedPlan, steps: int, tables: Sequence[int], pixels: Sequence[int]) -> str:
-    """The plan and the memory it needs, as text: from the steps of a window, and each window's ``training_bytes`` and
-    bytes of training pixels."""
+    """The plan and the memory it needs, as text.
+
+    Args:
+        windows: of the capture.
+        steps: of each window.
+        tables: ``training_bytes`` of each window.
+        pixels: bytes of training pixels in memory while each window trains.
+    """
     most = max(range(len(windows)), key=lambda w: tables[w] + pixels[w])
     memory = (
         f"Memory in training: at most {(tables[most] + pixels[most]) / GIB:.2f} GiB (tables and moments "

@@ -93,8 +93,12 @@ TRAINED = {"growing_rays"}
 
 
 def grouped(state: dict[str, Any], usual: Any) -> dict[str, Any]:
-    """The attributes of a model's config, as a config.yml of any version has them, with every option in its group.
-    ``usual``: a config with the default groups, which are filled; options without a group stay where they are."""
+    """The attributes of a model's config with every option in its group.
+
+    Args:
+        state: attributes as a config.yml has them; those of old versions have no groups.
+        usual: a config with the default groups, which is filled. Options without a group stay where they are.
+    """
     state = dict(state)
     for group in {"schedule", "sampling", "colour", "rendering"} - state.keys():
         for f in fields(getattr(usual, group)):

@@ -169,8 +169,13 @@ class Schedule:
 
 
 def make_schedule(config: ScheduleConfig, total_steps: int, windows: int = 1, depths_known: bool = False) -> Schedule:
-    """The schedule of a run of ``total_steps`` steps a window. Nothing is released before surfaces have formed.
-    ``depths_known``: training starts with surfaces (``initial.py``).
+    """The schedule of a run of ``total_steps`` steps a window.
+
+    Args:
+        config: phases, growth, rates and release of bricks; nothing is released before surfaces have formed.
+        total_steps: all steps of a window.
+        windows: windows of a long capture, trained one after the other.
+        depths_known: training starts with surfaces (``initial.py``).
 
     Raises:
         InputError: no step is left for the first phase, growth goes backwards, or rates never fall.

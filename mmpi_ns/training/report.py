@@ -34,8 +34,14 @@ LONG = 1800.0
 
 
 class TrainingLog:
-    """Prints the progress of a run from step ``first`` to the one before ``end``. ``rays``: of a step after the texels
-    have grown."""
+    """Prints the progress of a run.
+
+    Args:
+        schedule: of the run.
+        rays: of a step after the texels have grown.
+        first: first step.
+        end: step after the last one.
+    """
 
     def __init__(self, schedule: Schedule, rays: int, first: int, end: int) -> None:
         self.schedule, self.rays, self.first, self.end = schedule, rays, first, end

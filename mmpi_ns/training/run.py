@@ -93,8 +93,12 @@ class TrainingRun:
         return groups | ({"camera_opt": self.poses} if self.poses else {})
 
     def prepare_step(self, attributes: TrainingCallbackAttributes | None, step: int) -> None:
-        """Applies the schedule of a step about to run: window, resolution, storage and frozen parameters.
-        ``attributes``: the trainer's optimisers and data manager; None without a trainer."""
+        """Applies the schedule of a step: window, resolution, storage and frozen parameters.
+
+        Args:
+            attributes: the trainer's optimisers and data manager; None without a trainer.
+            step: about to run.
+        """
         progress, field, schedule = self.progress, self.field, self.progress.schedule
         progress.step = step
         field.forget_baked()

@@ -22,8 +22,14 @@ WINDOWS_FOLDER = "windows"
 
 
 class WindowShare:
-    """The windows of process ``rank`` of several. ``folders``: with checkpoints, of this run and of the run that it
-    resumes."""
+    """The windows of one process of several.
+
+    Args:
+        rank: number of this process.
+        processes: all of them.
+        window_steps: steps of a window.
+        folders: with checkpoints: of this run, and of the run that it resumes.
+    """
 
     def __init__(self, rank: int, processes: int, window_steps: int, folders: list[Path]) -> None:
         self.rank, self.processes, self.window_steps, self.folders = rank, processes, window_steps, folders

@@ -24,8 +24,15 @@ WORTH = 1.25
 def prepare_storage(
     field: TexelTables, schedule: Schedule, step: int, least: float, optimizers: Mapping[str, Any]
 ) -> None:
-    """Grows tables and releases bricks as scheduled for a step about to run; the moments of their optimisers, if there
-    are any, follow. ``least``: see ``TexelTables.release_unused``."""
+    """Grows tables and releases bricks as scheduled for a step.
+
+    Args:
+        field: the field that is trained.
+        schedule: of the whole run.
+        step: that is about to run.
+        least: see ``TexelTables.release_unused``.
+        optimizers: of the tables, by name, if there are any; their moments follow.
+    """
     trained = [(optimizers[name], getattr(field, name)) for name in TABLES if name in optimizers]
     phase, factor, remaining = schedule.phase_at(step), schedule.texel_factor(step), []
     grows = factor > field.factor
@@ -52,7 +59,12 @@ def prepare_storage(
 
 def refine(field: TexelTables, work: Work, trained: list[tuple[Any, Any]]) -> None:
     """Makes texels finer than planned where bricks were released: as fine as the plan allows within its bytes.
-    ``trained``: optimisers and their tables."""
+
+    Args:
+        field: the field that is trained.
+        work: what is trained.
+        trained: optimisers and their tables.
+    """
     plan = field.full_plan
     budget = training_bytes(plan, field.views, work, field.density.device)
 

@@ -21,7 +21,14 @@ from mmpi_ns.utils.machine import lazy_zeros
 
 class TouchedAdam(torch.optim.Optimizer):
     """Adam over the rows of a ``Table`` that were read, but for its empty brick, or over entries of other parameters
-    whose gradient is not 0. ``betas``: decay of the two moments; ``eps`` is added to the root of the second."""
+    whose gradient is not 0.
+
+    Args:
+        params: parameters.
+        lr: learning rate.
+        betas: decay of the two moments (paper settings: 0.9, 0.99).
+        eps: added to the root of the second moment.
+    """
 
     def __init__(self, params: Any, lr: float, betas: tuple[float, float] = (0.9, 0.99), eps: float = 1e-8, **_: Any):
         super().__init__(params, {"lr": lr, "betas": betas, "eps": eps})

@@ -17,8 +17,12 @@ if TYPE_CHECKING:
 
 
 def write_atomically(path: Path, write: Callable[[Path], object], folder: Path | None = None) -> None:
-    """Has ``write`` write to a temporary file on the same disk, in ``folder`` or beside the finished one, and renames
-    it; removes it when writing fails.
+    """Writes to a temporary file on the same disk and renames it; removes it when writing fails.
+
+    Args:
+        path: the finished file.
+        write: writes to the path it is given.
+        folder: where the unfinished file lies; beside the finished one unless given.
 
     Raises:
         WriteError: it could not be written (says why and what is left).

@@ -54,8 +54,13 @@ def check_row(what: str, row: Any, count: int, number: Number) -> None:
 
 
 def check_options(settings: Any, ranges: Mapping[str, Number], prefix: str) -> None:
-    """Raises InputError naming the option of ``settings`` that has no value within its range, by the fields' names; of
-    a tuple, each element. ``prefix``: of the options on the command line, "--placement." for example."""
+    """Raises InputError naming the option of ``settings`` that has no value within its range.
+
+    Args:
+        settings: an object with these fields; a tuple's elements are checked one by one.
+        ranges: by the fields' names.
+        prefix: of the options on the command line, "--placement." for example.
+    """
     for name, number in ranges.items():
         value = getattr(settings, name)
         for element in value if isinstance(value, tuple) else (value,):

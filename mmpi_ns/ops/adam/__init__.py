@@ -32,10 +32,14 @@ def adam_rows(
     grad: Float[Tensor, "U C"],
     constants: AdamConstants,
 ) -> None:
-    """One step of Adam on distinct rows of a table, in place. The empty brick, and entries whose gradient is exactly 0,
-    are left alone.
+    """One step of Adam on distinct rows. The empty brick, and entries whose gradient is exactly 0, are left alone.
 
-    Moments are the mean and the uncentred variance of the gradients, in bfloat16 or in the table's precision.
+    Args:
+        param: the table.
+        moments: mean and uncentred variance of the gradients, in bfloat16 or in the table's precision.
+        rows: of the gradient (``Table.grad_rows``).
+        grad: of those rows.
+        constants: of the step.
     """
     grad = grad.masked_fill((rows < BRICK)[:, None], 0)
     new_param, new_moments = adam(param.index_select(0, rows), moments.index_select(0, rows), grad, constants)

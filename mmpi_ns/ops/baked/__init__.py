@@ -21,8 +21,14 @@ from mmpi_ns.scene.baked import BakedMpis, Shader
 
 @operation("cpu")
 def show_baked(scene: BakedMpis, rays: Rays, threshold: float, peaks: Float[Tensor, "B 8 8"] | None = None) -> Shown:
-    """What each ray gathers, front to back; all MPIs answer it. Samples of less weight than the threshold are left out
-    of the sums; ``peaks`` of texels are raised to the largest weight of a sample that reads them."""
+    """What each ray gathers, front to back.
+
+    Args:
+        scene: the bricks.
+        rays: R rays; all MPIs answer them.
+        threshold: samples of less weight are left out of the sums.
+        peaks: of every texel, raised to the largest weight of a sample that reads it.
+    """
     window: reader.Window = {  # as the reader has it from a file
         "mpis": [
             vars(mpi)
@@ -63,7 +69,14 @@ def shade_baked(
     mass: Float[Tensor, "R 1"],
     directions: Float[Tensor, "R 3"],
 ) -> Float[Tensor, "R 3"]:
-    """Colours of rays from what they gathered and its mass (``Shown``). Directions are unit vectors in world axes."""
+    """Colours of rays from what they gathered.
+
+    Args:
+        shader: the network.
+        gathered: see ``Shown``.
+        mass: likewise.
+        directions: unit, world axes.
+    """
     numbers = torch.cat([x.flatten() for layer in shader.layers for x in layer])
     layers = [tuple(weights.shape) for weights, _ in shader.layers]
     network = {"direction_octaves": shader.direction_octaves, "layers": layers, "bound": shader.bound}

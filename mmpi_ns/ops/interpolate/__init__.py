@@ -79,8 +79,13 @@ class Table(nn.Parameter):
 
 @operation("cpu")
 def order_by_head(places: Places, num_heads: int, counts: Sequence[int] | None = None) -> HeadSamples:
-    """Valid samples of a batch, ordered by head and otherwise by slot. Without ``counts``, the samples of each head,
-    this synchronises with a GPU."""
+    """Valid samples of a batch, ordered by head and otherwise by slot.
+
+    Args:
+        places: of the samples.
+        num_heads: of the scene.
+        counts: samples of each head, if known; otherwise this synchronises with a GPU.
+    """
     heads, valid = places.heads.reshape(-1), places.valid.reshape(-1)
     if counts is None:
         parts = [(valid & (heads == k)).nonzero()[:, 0] for k in range(num_heads)]
@@ -96,8 +101,15 @@ def order_by_head(places: Places, num_heads: int, counts: Sequence[int] | None =
 def texel_rows(
     layout: SceneLayout, heads: Int[Tensor, "N"], planes: Int[Tensor, "N"], ndc: Float[Tensor, "N 3"]
 ) -> tuple[Int[Tensor, "N 4"], Float[Tensor, "N 4"]]:
-    """Rows and weights of the four texels around samples on planes of MPIs (``TexelGrid.bilinear``), with gradients to
-    ``ndc`` where it requires them."""
+    """Rows and weights of the four texels around samples of several MPIs (``TexelGrid.bilinear``), with gradients to
+    ``ndc`` where it requires them.
+
+    Args:
+        layout: of the scene.
+        heads: MPI of each sample.
+        planes: plane of each sample.
+        ndc: position of each sample in its MPI.
+    """
     rows, weights = planes.new_zeros(len(heads), 4), ndc.new_zeros(len(heads), 4)
     for k, grid in enumerate(layout.grids[: len(layout.mpis)]):
         here = (heads == k).nonzero()[:, 0]
@@ -109,8 +121,11 @@ def texel_rows(
 def index_rows(rows: Int[Tensor, "..."], table_rows: int, pads: bool = False) -> RowIndex:
     """Distinct rows of a list, rising.
 
-    ``pads``: row 0, which no entry refers to then, may follow the distinct rows any number of times, so that a GPU need
-    not be waited for to tell their number.
+    Args:
+        rows: the list.
+        table_rows: rows of the table.
+        pads: row 0, which no entry refers to there, may follow the distinct rows any number of times. A GPU then
+            need not be waited for to tell their number.
     """
     return RowIndex(*torch.unique(rows, return_inverse=True))
 
@@ -133,8 +148,14 @@ def sum_rows(
 def raise_peaks(
     peaks: Float[Tensor, "K"], rows: Int[Tensor, "U"], positions: Int[Tensor, "N B"], weights: Float[Tensor, "N"]
 ) -> None:
-    """Raises each brick's peak to the largest weight of the samples that read its rows, in place. ``positions``: of the
-    rows that each sample reads, among ``rows``."""
+    """Raises each brick's peak to the largest weight of the samples that read its rows, in place.
+
+    Args:
+        peaks: of all bricks.
+        rows: distinct rows.
+        positions: of the rows that each sample reads, among those.
+        weights: of the samples.
+    """
     bricks = (rows // BRICK)[positions.reshape(-1)]
     peaks.scatter_reduce_(0, bricks, weights.repeat_interleave(positions.shape[1]), "amax")
 

@@ -58,7 +58,14 @@ class LiveSamples(NamedTuple):
 
 @operation("cpu", "gpu")
 def march(layout: SceneLayout, tables: Tables, rays: Rays, options: MarchOptions) -> MergedSamples:
-    """The samples of each ray that matter."""
+    """The samples of each ray that matter.
+
+    Args:
+        layout: the scene.
+        tables: densities, reliabilities and which texels were trained.
+        rays: R rays.
+        options: which samples are kept, and how they are blended.
+    """
     at = crossings(layout, rays, plane_hits(*rays[:4], layout.frames))
     flat = _live_samples(at, layout, tables)
     per_ray, number = at.counts.sum(-1), torch.cat([_enumerate(each)[1] for each in at.counts.unbind(-1)])
@@ -98,6 +105,13 @@ def show_rays(
 
     On a GPU nothing is waited for. The compiled form on a CPU takes sixteen rays abreast and passes over tiles that are
     not stored, also where the threshold is 0.
+
+    Args:
+        layout: the scene.
+        tables: densities, reliabilities and which texels were trained.
+        features: colours and features of all texels (``ops.gather``).
+        rays: R rays.
+        options: which samples are kept, and how they are blended.
     """
     m = march(layout, tables, rays, options)
     composite = composite_weights(m.tau, m.valid, m.skipped_before, m.skipped_total)

@@ -81,8 +81,16 @@ def shade(
     directions: Float[Tensor, "R 3"],
     places: Places,
 ) -> Float[Tensor, "R S 3"]:
-    """Colours of the valid samples by the networks of their heads; empty slots are black. ``axes``: of each head, as
-    rows; directions are in world axes."""
+    """Colours of the valid samples; empty slots are black.
+
+    Args:
+        layout: of the scene.
+        table: colour features of all texels.
+        networks: of all heads.
+        axes: of each head, as rows.
+        directions: of each ray, world axes.
+        places: of the samples.
+    """
     _, _, ndc, valid = places
     colors = table.new_zeros(valid.numel(), 3)
     for k, (slots, features) in enumerate(interpolated(layout, table, places)):

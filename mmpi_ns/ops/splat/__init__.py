@@ -41,16 +41,25 @@ class View(NamedTuple):
 
 
 def splat_image(gaussians: Gaussians, view: View, colors: Float[Tensor, "N 3"]) -> Float[Tensor, "H W 4"]:
-    """Red, green, blue without a background, and the light that passes. ``colors``: of each Gaussian, as this camera
-    sees it."""
+    """Red, green, blue without a background, and the light that passes.
+
+    Args:
+        gaussians: what is seen.
+        view: the camera.
+        colors: of each Gaussian, as this camera sees it.
+    """
     image = torch.zeros(*view.size[::-1], 4)
     _run(splat_image, gaussians, view, colors=colors, out=image)
     return image
 
 
 def splat_sums(gaussians: Gaussians, view: View, image: Float[Tensor, "H W 3"]) -> Float[Tensor, "N 4"]:
-    """The adjoint of ``splat_image``: what an image of the camera, an error for example, holds where each Gaussian is
-    seen.
+    """What an image holds where each Gaussian is seen: the adjoint of ``splat_image``.
+
+    Args:
+        gaussians: what is seen.
+        view: the camera.
+        image: an image of that camera; an error for example.
 
     Returns:
         Sum over pixels of the weight that a Gaussian has there times (red, green, blue, 1).
@@ -67,7 +76,14 @@ def splat_opacities(
     shown: Float[Tensor, "H W 3"],
     errors: Float[Tensor, "H W 3"],
 ) -> Float[Tensor, "N 2"]:
-    """How opacities should change for an image to change by its errors. ``shown``: the image with its background.
+    """How opacities should change for an image to change by its errors.
+
+    Args:
+        gaussians: what is seen.
+        view: the camera.
+        colors: of each Gaussian, as this camera sees it.
+        shown: the image with its background.
+        errors: what is missing in it.
 
     Returns:
         With J the change of a number of the image with the logit of a Gaussian's opacity, the sums over the image's

@@ -49,11 +49,15 @@ def total_variation(
 def clamped_differences(
     values: Float[Tensor, "N C"], neighbours: Float[Tensor, "N M C"], scales: Float[Tensor, "N M"]
 ) -> Float[Tensor, ""]:
-    """Sum of clamped differences between texels and their neighbours, which are held fixed; its gradient is DVGO's
-    (L_TV). ``scales``: weight of each difference (resolution / 128, 0 where there is no neighbour).
+    """Sum of clamped neighbour differences, whose gradient is DVGO's (L_TV).
 
     DVGO adds ``scale / 6 * clamp(v - v_neighbour, -1, 1)`` to the gradient of each touched texel. That is the gradient
     of a Huber function of the difference with the neighbour held fixed, so it is an ordinary loss here.
+
+    Args:
+        values: texels that the batch touched, one row each.
+        neighbours: their neighbours along each axis (held fixed).
+        scales: weight of each difference (resolution / 128, 0 where there is no neighbour).
     """
     difference = values[:, None, :] - neighbours.detach()
     size = difference.abs()
