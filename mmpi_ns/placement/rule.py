@@ -23,8 +23,6 @@ from mmpi_ns.placement.visibility import VisiblePoints, find_visible_points, pix
 from mmpi_ns.scene.plan import MOST_DETAIL, CubePlan, MPIPlan, ScenePlan
 
 MIN_PLANES = 16
-REFINED = 1.6
-"""Multiple of ``texels_per_ray`` that texels may reach in training, when most of them have been released."""
 BUDGET_ROUNDS = 8
 """Attempts at keeping to the budget of texels; each starts with coarser ones."""
 
@@ -37,7 +35,7 @@ class PlacementConfig:
     """automatic: by the expected pixel error; drive: front, left, right, below; room: five around the centre."""
     max_mpis: int = 64
     """Maximum number of MPIs (automatic)."""
-    max_texels: float = 24e6
+    max_texels: float = 16e6
     """Approximate maximum of texels and voxels in total; texels are made larger to meet it; 0: no limit (automatic)."""
     min_gain: float = 1.0
     """Minimum gain of an MPI in bits: how often it must halve the expected error of one training image (automatic)."""
@@ -104,10 +102,8 @@ def place(observations: Observations, config: PlacementConfig, training_rays: in
     if texel_pixels > finest and budget != config.max_texels:
         remedy = "more steps"
     elif texel_pixels > finest:  # there are rays for finer texels, and released ones leave room
-        most = REFINED * config.texels_per_ray * (training_rays or 0) / sum(h.texels for h in chosen) or MOST_DETAIL
-        detail = min((texel_pixels / finest) ** 2, max(most, 1.0), MOST_DETAIL)
-        smallest = texel_pixels / detail**0.5
-        remedy = f"a larger placement.max-texels, or down to {smallest:.1f} in training in the room of released ones"
+        detail = min((texel_pixels / finest) ** 2, MOST_DETAIL)
+        remedy = f"a larger placement.max-texels, or down to {finest:.1f} in training in the room of released ones"
     else:
         remedy = "more steps" if trainable > config.texel_pixels else "a smaller placement.texel-pixels"
     origin = f"automatic placement, a texel spans {texel_pixels:.1f} pixels: finer with {remedy}"
@@ -147,7 +143,7 @@ def _choose(
         excess = sum(h.texels for h in chosen) / config.max_texels if config.max_texels else 0.0
         if excess <= 1.0:
             best = chosen, tried
-            if too_fine is None or excess > 0.9:
+            if too_fine is None or excess > 0.8:
                 break
             texel_pixels = (too_fine * texel_pixels) ** 0.5
         else:

@@ -298,15 +298,6 @@ def test_a_plan_says_how_large_texels_are_and_what_makes_them_finer(changes, ray
     assert (plan.detail > 1) == (len(numbers) == 2) == ("max_texels" in changes)
 
 
-def test_the_rays_of_a_training_limit_how_fine_texels_become_in_it():
-    config = PlacementConfig(texel_pixels=0.25, rays_per_texel=1e-3, texels_per_ray=8, max_texels=2e4)
-    texels = [
-        sum(h.texels for h in plan.mpis) * plan.detail
-        for plan in (place(side_by_side(4), config, rays) for rays in (4000, 8000))
-    ]
-    assert texels == pytest.approx([1.6 * 8 * 4000, 1.6 * 8 * 8000])
-
-
 def test_a_short_training_gets_a_small_plan():
     random = np.random.default_rng(0)
     points = random.uniform([-8, -4, -40], [8, 4, -6], (300, 3))
