@@ -12,6 +12,7 @@ from nerfstudio.field_components.field_heads import FieldHeadNames
 from random_fields import bundle, fill, random_field, random_plan, random_rays, render
 
 from mmpi_ns.field.mmpi_field import MMPIField
+from mmpi_ns.field.tables import in_half_precision
 from mmpi_ns.ops.blending import log_shares
 from mmpi_ns.rendering.sampler import MMPISampler
 from mmpi_ns.scene.geometry import LocalRays
@@ -303,3 +304,17 @@ def test_filling_a_random_field_sets_the_depths_it_says():
     field = random_field(2, True, seed=0)
     tau = render(field, bundle(*random_rays(field.plan, 20, seed=0))).composite
     assert tau.weights.max() > 0.1 and torch.isfinite(tau.weights).all()
+
+
+def test_tables_in_half_precision_stay_finite_and_nothing_else_changes():
+    state = {
+        "_model.field.density": torch.tensor([[-20.0], [0.1], [1e9], [-1e9]]),
+        "features": torch.tensor([[0.3, -0.7]]),
+        "_model.field.tiles": torch.tensor([70_000], dtype=torch.int32),
+        "_model.field.networks.weights": torch.tensor([0.1]),
+    }
+    half = in_half_precision(state)
+    assert {name for name, x in half.items() if x.dtype == torch.float16} == {"_model.field.density", "features"}
+    assert half["_model.field.density"].float().tolist() == [[-20.0], [pytest.approx(0.1, rel=1e-3)], [65504], [-65504]]
+    assert all(half[name] is state[name] for name in ("_model.field.tiles", "_model.field.networks.weights"))
+    assert state["features"].dtype == torch.float32
