@@ -229,10 +229,7 @@ class MMPIModel(Model):
         blends = progress.schedule.blends_at(progress.step) and self.blends(field)
         sampling = {"head_mask": head_mask, "choose": choose, **self.training_bounds()}
         rays = render_rays(self.sampler, bundle, field, blends=blends, **sampling)
-        rays = replace(rays, times=len(bundle) // asked)
-        if rays.lookup is not None and progress.schedule.watches(progress.step):
-            field.note_use(rays.lookup, rays.composite.weights, rays.report.live)
-        return {"training": rays}
+        return {"training": replace(rays, times=len(bundle) // asked)}
 
     def training_bounds(self) -> dict[str, float]:
         """Minimum weights of samples kept in training (``ops.march.prune``).
@@ -283,17 +280,18 @@ class MMPIModel(Model):
         may_bake = mode == "auto" and not self.trains and one_exposure
         if chosen is None and (mode == "baked" or (may_bake and suits_bricks(field))):
             outputs = self.baked(field).outputs(bounded(bundle, field.plan), background)
-            return outputs | {"winning_mpi": outputs["winning_mpi"] + first_head}
+            return outputs | {"winning_mpi": field.planned_heads(outputs["winning_mpi"]) + first_head}
         blends, head_mask = self.blends(field), None
         if chosen is not None:
             head = chosen[1] if chosen[0] == window else -1
-            head_mask = (torch.arange(field.plan.num_heads, device=self.device) == head).expand(len(bundle), -1)
+            heads = field.planned_heads(torch.arange(field.plan.num_heads, device=self.device))
+            head_mask = (heads == head).expand(len(bundle), -1)
             blends = False
         how = {"blends": blends, "threshold": self.config.rendering.threshold, "head_mask": head_mask}
         once = field.shading == "ray" and not torch.is_grad_enabled()
         outputs = (shown_outputs if once else sampled_outputs)(bounded(bundle, field.plan), field, **how)
         behind, exposure = outputs.pop("transmittance") * background.to(outputs["rgb"]), self.exposures.mean
-        winner = outputs["winning_mpi"] + first_head
+        winner = field.planned_heads(outputs["winning_mpi"]) + first_head
         if exposure is None:
             return outputs | {"rgb": (outputs["rgb"] + behind).clamp(0, 1), "winning_mpi": winner}
         if self.config.rendering.exposure == "nearest" and len(bundle):
@@ -342,7 +340,7 @@ class MMPIModel(Model):
         """Rays of an image that are rendered at once."""
         if self.config.eval_num_rays_per_chunk:
             return self.config.eval_num_rays_per_chunk
-        most = max(plan.samples_per_ray for plan in self.progress.windows.plans)
+        most = max(plan.largest.samples_per_ray for plan in self.progress.windows.plans)
         field, kept = self.field, MarchOptions(self.config.rendering.threshold).most_kept(most)
         one_pass = field.shading == "ray" and dispatch.form_of("show_rays", field.features) != "reference"
         return rays_per_chunk(most, self.device, kept if one_pass else None)
@@ -365,7 +363,10 @@ class MMPIModel(Model):
         g = generator(self.config.seed, step, "background", self.device)
         weight = self.config.loss
         weight = replace(weight, known_depth=weight.known_depth * self.progress.schedule.decay(step))
-        total = batch_losses(outputs["training"], self.field, image, weight, g, step)
+        rays: RenderedRays = outputs["training"]
+        total, errors = batch_losses(rays, self.field, image, weight, g, step)
+        if rays.lookup is not None and self.progress.schedule.watches(step):
+            self.field.note_use(rays.lookup, rays.composite.weights, rays.report.live, errors)
         self.camera_optimizer.get_loss_dict(total)
         # A batch of rays that meet nothing trainable would have no gradient; this adds 0 with a gradient.
         total["rgb_loss"] = total["rgb_loss"] + self.device_indicator_param.sum()

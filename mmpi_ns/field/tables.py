@@ -16,9 +16,9 @@ from torch import Tensor, nn
 
 from mmpi_ns.field.samples import Lookup
 from mmpi_ns.ops.interpolate import Table, raise_peaks
-from mmpi_ns.scene.bricks import grown_tiles, keep_bricks, new_table, resample, take_bricks
+from mmpi_ns.scene.bricks import grown_tiles, keep_bricks, new_table, resample, take_bricks, tiles_with_copies
 from mmpi_ns.scene.plan import ScenePlan
-from mmpi_ns.scene.texels import BRICK, TexelGrid, head_grids, number_tiles
+from mmpi_ns.scene.texels import BRICK, TexelGrid, head_grids, make_grids, number_tiles
 from mmpi_ns.scene.visible_tiles import TrainingViews, reachable_tiles
 from mmpi_ns.utils.files import to_bytes, to_text
 
@@ -63,19 +63,26 @@ class TexelTables(Field):
             ("tiles", torch.int32),
             ("touched", torch.uint8),
             ("peak", torch.float32),
+            ("gain", torch.float32),
             ("plan_bytes", torch.uint8),
         ):
             self.register_buffer(name, torch.empty(0, dtype=dtype))
         self.register_buffer("crossings", torch.tensor(0.0, dtype=torch.float64))
         self.register_buffer("texel_factor", torch.tensor(1.0, dtype=torch.float64))
+        self.register_buffer("copied", torch.tensor(False))
         self.tiles: Tensor
         """Brick of every tile of all heads (``texels.py``)."""
         self.touched: Tensor
         """For every row: 1 if a training ray read it."""
         self.peak: Tensor
         """For every brick: the largest weight of a training sample in it since the last release."""
+        self.gain: Tensor
+        """For every brick: squared errors of training rays, times the weights of their samples in it, since the last
+        release."""
         self.crossings: Tensor
         """Training samples since the last release."""
+        self.copied: Tensor
+        """Whether MPIs have finer copies."""
         self.plan_bytes: Tensor
         self.texel_factor: Tensor
         self.build(plan, factor)
@@ -97,16 +104,22 @@ class TexelTables(Field):
         # Where threads make it at once the first one's stays: kernels hold addresses in it, not references.
         return self._packed.setdefault(key, make()) if constant is None and make is not None else constant
 
-    def build(self, plan: ScenePlan, factor: float, tiles: Int[Tensor, "T"] | None = None) -> None:
+    def build(
+        self, plan: ScenePlan, factor: float, tiles: Int[Tensor, "T"] | None = None, copied: bool = False
+    ) -> None:
         """Allocates new tables for ``plan`` at ``factor`` times its texels. Parameters stay the same objects.
 
         Args:
             plan: frames and resolutions.
             factor: texels in use, as a share of the plan's.
             tiles: tiles to store; None for those that training rays can reach.
+            copied: MPIs have finer copies, before them.
         """
         self.full_plan, self.plan, self.factor = plan, plan.scaled(factor), factor
+        if copied:
+            self.plan = self.plan.with_copies()
         device = self.density.device
+        self.copied = torch.tensor(copied, device=device)
         if tiles is None:
             reached = self._reachable(self.plan)
             tiles = head_grids(self.plan)[0].tiles if reached is None else number_tiles(reached)
@@ -152,11 +165,50 @@ class TexelTables(Field):
         self.look_afresh()
 
     @torch.no_grad()
-    def note_use(self, lookup: Lookup, weights: Float[Tensor, "R S"], live: Int[Tensor, "R"]) -> None:
-        """Records the bricks, weights and number of the samples of a training batch."""
-        parts = weights.reshape(-1)[lookup.index].split([len(taps.positions) for taps in lookup.taps])
-        for taps, weight in zip(lookup.taps, parts, strict=True):
+    def copy_finely(self, chosen: Bool[Tensor, "T"]) -> None:
+        """Puts finer copies of the MPIs before all heads, which hold the chosen tiles (``tiles_with_copies``)."""
+        old, copies, is_cube = self.grids, self.copy_grids(), self._is_cube
+        fine, kept = tiles_with_copies(old, copies, chosen)
+        copies = self.copy_grids(number_tiles(fine))
+        remaining = self.tiles[kept].to(torch.int64)
+        for name in TABLES:
+            table = getattr(self, name)
+            finer = resample(table.data, old[: len(copies)], copies, is_cube[: len(copies)], EMPTY[name])
+            replace_data(table, torch.cat([finer, take_bricks(table.data, remaining)]))
+        touched = resample(self.touched[:, None].float(), old[: len(copies)], copies, is_cube[: len(copies)])
+        self.touched = torch.cat([(touched[:, 0] > 0).to(torch.uint8), take_bricks(self.touched, remaining)])
+        self.tiles, self.plan = number_tiles(torch.cat([fine, kept])), self.plan.with_copies()
+        self.copied = torch.ones_like(self.copied)
+        self._packed = {}
+        self.look_afresh()
+
+    def copy_grids(self, tiles: Int[Tensor, "S"] | None = None) -> list[TexelGrid]:
+        """Texels of finer copies of the MPIs, of which there are none yet; ``tiles``: None stores all."""
+        mpis = self.plan.with_copies().mpis[: len(self.plan.mpis)]
+        return make_grids([(m.planes, m.height, m.width) for m in mpis], tiles)
+
+    def planned_heads(self, heads: Tensor) -> Tensor:
+        """Numbers of heads in the plan, where a finer copy has that of its MPI."""
+        copies = len(self.plan.mpis) - len(self.full_plan.mpis)
+        return torch.where(heads >= copies, heads - copies, heads)
+
+    @torch.no_grad()
+    def note_use(
+        self, lookup: Lookup, weights: Float[Tensor, "R S"], live: Int[Tensor, "R"], errors: Float[Tensor, "R"]
+    ) -> None:
+        """Records the bricks of the samples of a training batch.
+
+        Args:
+            lookup: where the samples read the tables.
+            weights: of the samples.
+            live: samples of each ray.
+            errors: squared errors of the rays' colours, 0 where a ray has none.
+        """
+        weights = weights.reshape(-1)[lookup.index]
+        sizes, shares = [len(taps.positions) for taps in lookup.taps], weights * errors[lookup.rays]
+        for taps, weight, share in zip(lookup.taps, weights.split(sizes), shares.split(sizes), strict=True):
             raise_peaks(self.peak, lookup.rows, taps.positions, weight)
+            self.gain.index_add_(0, lookup.rows[taps.positions[:, 0]] // BRICK, share)
         self.crossings += live.sum()
 
     @torch.no_grad()
@@ -175,6 +227,7 @@ class TexelTables(Field):
     def look_afresh(self) -> None:
         """Resets the records on the use of bricks."""
         self.peak = torch.zeros(self.num_bricks + 1, device=self.density.device)
+        self.gain = torch.zeros_like(self.peak)
         self.crossings = torch.zeros_like(self.crossings)
 
     @torch.no_grad()
@@ -190,7 +243,7 @@ class TexelTables(Field):
         for name in TABLES:
             table = getattr(self, name)
             replace_data(table, take_bricks(table.data, kept))
-        self.touched, self.peak = take_bricks(self.touched, kept), self.peak[kept]
+        self.touched, self.peak, self.gain = take_bricks(self.touched, kept), self.peak[kept], self.gain[kept]
         self._packed = {}
         return kept
 
@@ -209,7 +262,10 @@ class TexelTables(Field):
                 return  # nerfstudio loads the pipeline's own, empty state in a second pass
             raise ValueError("The checkpoint holds no scene plan: it was not written by this method.")
         plan = ScenePlan.from_json(to_text(plan_bytes))
-        self.build(plan, float(state_dict[prefix + "texel_factor"]), state_dict[prefix + "tiles"])
+        copied = bool(state_dict.get(prefix + "copied", False))
+        self.build(plan, float(state_dict[prefix + "texel_factor"]), state_dict[prefix + "tiles"], copied)
+        for name in ("copied", "gain"):  # not in older files
+            state_dict.setdefault(prefix + name, getattr(self, name))
         self.plan_bytes = plan_bytes.clone().to(self.density.device)  # as it was written, whatever a plan has now
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 

@@ -28,8 +28,9 @@ class Shapes(NamedTuple):
     def of(plans: Iterable[ScenePlan], blends: bool, channels: int) -> Shapes:
         """The shapes of a run's windows."""
         plans = tuple(plans)
-        mpis, cube = tuple(sorted({len(p.mpis) for p in plans})), any(p.cube is not None for p in plans)
-        return Shapes(mpis, cube, blends, channels, max(p.samples_per_ray for p in plans))
+        mpis = tuple(sorted({len(each.mpis) for p in plans for each in (p, p.largest)}))
+        cube, most = any(p.cube is not None for p in plans), max(p.largest.samples_per_ray for p in plans)
+        return Shapes(mpis, cube, blends, channels, most)
 
     @property
     def widths(self) -> list[int]:

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import interpolate, max_pool2d, pad
 
+from mmpi_ns.scene.plan import FINER
 from mmpi_ns.scene.texels import BRICK, SIDE, TexelGrid, number_tiles
 from mmpi_ns.utils.machine import lazy_zeros
 
@@ -83,6 +84,44 @@ def grown_tiles(
     return number_tiles(stored if reachable is None else stored & reachable)
 
 
+def tiles_with_copies(
+    grids: list[TexelGrid], copies: list[TexelGrid], chosen: Bool[Tensor, "T"]
+) -> tuple[Bool[Tensor, "S"], Bool[Tensor, "T"]]:
+    """Tiles that finer copies of MPIs store of chosen ones, and those that the MPIs themselves go on storing.
+
+    A chosen tile has FINER x FINER tiles in the copy. The MPI gives it up where all stored tiles around it are chosen
+    too, so copy and MPI overlap by a tile and no seam is seen.
+
+    Args:
+        grids: all heads, MPIs first.
+        copies: of the MPIs, at their resolution; their tiles are not read.
+        chosen: stored tiles of MPIs.
+
+    Returns:
+        Tiles of the copies, and of all heads.
+    """
+    stored, fine = grids[0].tiles > 0, torch.zeros_like(copies[0].tiles, dtype=torch.bool)
+    kept = stored.clone()
+    for grid, copy in zip(grids, copies, strict=False):
+        here = slice(grid.first_tile, grid.first_tile + grid.own_tiles.numel())
+        taken = chosen[here].view(grid.own_tiles.shape)
+        beside = max_pool2d((stored[here].view_as(taken) & ~taken)[:, None].float(), 3, 1, 1)[:, 0] > 0
+        kept[here] &= (~taken | beside).reshape(-1)
+        wide = taken.repeat_interleave(FINER, 1).repeat_interleave(FINER, 2)[:, : copy.down, : copy.across]
+        fine[copy.first_tile :][: wide.numel()] = wide.reshape(-1)
+    return fine, kept
+
+
+def widened_tiles(grids: list[TexelGrid], chosen: Bool[Tensor, "T"]) -> Bool[Tensor, "T"]:
+    """Chosen tiles and the stored ones around them, on their planes."""
+    wide = chosen.clone()
+    for grid in grids:
+        here = slice(grid.first_tile, grid.first_tile + grid.own_tiles.numel())
+        images = chosen[here].view(grid.own_tiles.shape)[:, None].float()
+        wide[here] |= (max_pool2d(images, 3, 1, 1) > 0).reshape(-1)
+    return wide & (grids[0].tiles > 0)
+
+
 def resample(
     table: Float[Tensor, "N C"], old: list[TexelGrid], new: list[TexelGrid], is_cube: list[bool], empty: float = 0.0
 ) -> Float[Tensor, "M C"]:
@@ -96,6 +135,8 @@ def resample(
     out = new_table(new[0].tiles, table.shape[-1], empty, table.dtype)
     for source, target, cube in zip(old, new, is_cube, strict=True):
         for sources, planes in _chunks(target, cube):
+            if not bool(target.own_tiles[planes].any()):
+                continue
             images = read_planes(table, source, sources)
             stored = stored_texels(source, sources).to(table.dtype)
             if bool(stored.all()):

@@ -26,6 +26,8 @@ WIDEST = 1e6
 """Largest tangent of a frustum."""
 MOST_PLANES, MOST_TEXELS, MOST_VOXELS, MOST_DETAIL = 4096, 16384, 4096, 64
 """Planes of an MPI, texels along a side of a plane, voxels along a side of the cube."""
+FINER = 2
+"""Cells of a finer copy along each side of a cell of its MPI."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +105,8 @@ class ScenePlan:
     origin_of_plan: str = "by hand"
     """The rule that made the plan, for information."""
     detail: float = 1.0
-    """Largest multiple of the texels that training may use: where released bricks leave room it makes planes finer."""
+    """Largest multiple of the texels that training may use: where released bricks leave room it makes planes finer, and
+    of what shows errors finer copies."""
 
     def __post_init__(self) -> None:
         """Raises InputError with one sentence that names the MPI and the field that cannot be used."""
@@ -149,6 +152,20 @@ class ScenePlan:
             nz, ny, nx = (max(2, round(n * factor ** (1 / 3))) for n in cube.shape)
             cube = replace(cube, shape=(nz, ny, nx))
         return replace(self, mpis=tuple(replace(m, **s) for m, s in zip(self.mpis, sizes, strict=True)), cube=cube)
+
+    def with_copies(self) -> ScenePlan:
+        """The plan with a copy of each MPI, in the same order before all MPIs: equal frame and planes, FINER times as
+        many cells along each side. At equal distances a copy hides what it replaces."""
+        copies = (
+            replace(m, name=f"{m.name}, finer", height=FINER * (m.height - 1) + 1, width=FINER * (m.width - 1) + 1)
+            for m in self.mpis
+        )
+        return replace(self, mpis=(*copies, *self.mpis))
+
+    @property
+    def largest(self) -> ScenePlan:
+        """The plan with all heads that training may add."""
+        return self.with_copies() if self.detail >= FINER**2 else self
 
     def to_json(self) -> str:
         """Standard JSON: a ``far`` at infinity is written as null."""

@@ -119,8 +119,8 @@ def known_depth(mass: Float[Tensor, "R"], reached: Bool[Tensor, "R"], outliers: 
 
 def batch_losses(
     rays: RenderedRays, field: MMPIField, image: Tensor, weight: LossWeights, g: torch.Generator, step: int
-) -> dict[str, Tensor]:
-    """All losses of a training batch, each times its weight.
+) -> tuple[dict[str, Tensor], Float[Tensor, "R"]]:
+    """All losses of a training batch, each times its weight; and the squared colour error of each ray.
 
     Args:
         rays: pixel rays, then keypoint rays.
@@ -129,6 +129,9 @@ def batch_losses(
         weight: of each loss.
         g: draws the colours behind the pixels.
         step: of the training.
+
+    Returns:
+        Losses by name, and errors without gradients, 0 for keypoint rays.
     """
     exposure = rays.bundle.metadata.get(EXPOSURE)
     # Counted on the host: asking the GPU which rays are pixel rays would be a synchronisation.
@@ -163,7 +166,8 @@ def batch_losses(
         total["tv"] = field.total_variation(rays.lookup, weight.tv_density, weight.tv_features) * (
             weight.tv_every / max(1, image.shape[0])
         )
-    return total
+    errors = ((rgb - observed).detach() ** 2).sum(-1)
+    return total, errors.new_zeros(len(rays.bundle)).index_copy(0, pixels, errors)
 
 
 def _depth_sums(rays: RenderedRays, field: MMPIField) -> DepthSums:

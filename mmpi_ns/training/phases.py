@@ -19,6 +19,8 @@ Training = Literal["two-phase", "joint"]
 
 SOONER = 4
 """Texels double so many times as early where depths are known, and surfaces need not form."""
+COPIES_FROM = 0.75
+"""Share of the time of high rates after which MPIs may get finer copies."""
 TRAINS: dict[str, frozenset[str]] = {
     "individual": frozenset({"density", "features", "colour", "camera_opt"}),
     "joint": frozenset({"density", "features", "colour", "camera_opt"}),
@@ -49,7 +51,7 @@ class ScheduleConfig:
     """after being constant for this fraction of it."""
     growth_shares: tuple[float, ...] = (1 / 15, 2 / 15, 3 / 15, 4 / 15)
     """When the texels of a plane double, as shares of the first phase; four times as early if depths are known."""
-    release_shares: tuple[float, ...] = (0.15, 3 / 15, 4 / 15, 0.3, 0.5, 0.75, 0.95)
+    release_shares: tuple[float, ...] = (0.15, 3 / 15, 4 / 15, 0.3, 0.4, 0.5, 0.75, 0.95)
     """When empty bricks (8 x 8 texels of a plane) are released, as fractions of the first phase: after growth, or just
     before the texels double."""
     release_weight: float = 5e-3
@@ -134,6 +136,11 @@ class Schedule:
         rates are high."""
         high = self._sharp_from < self._local(step) <= self.decay_from * self.phases[0].end
         return high and self.releases_at(step)
+
+    def copies_at(self, step: int) -> bool:
+        """Whether MPIs may get finer copies before this step: where texels may become finer, but not before all of them
+        had time to."""
+        return self.refines_at(step) and self._local(step) > COPIES_FROM * self.decay_from * self.phases[0].end
 
     def watches(self, step: int) -> bool:
         """Whether the samples of a step count for the next release of bricks."""

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Mapping
 from typing import Any
 
+import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from mmpi_ns.field.tables import TABLES, TexelTables
-from mmpi_ns.scene.plan import MOST_TEXELS
+from mmpi_ns.scene.bricks import tiles_with_copies, widened_tiles
+from mmpi_ns.scene.plan import FINER, MOST_TEXELS
 from mmpi_ns.scene.texels import BRICK, head_shapes
 from mmpi_ns.training.memory import Work, stored_bytes, training_bytes
 from mmpi_ns.training.phases import Schedule
@@ -19,6 +23,8 @@ FORMING = 0.4
 """Factor of the weight below which bricks are released while surfaces still form."""
 WORTH = 1.25
 """Least multiple of texels for which tables grow beyond the plan."""
+MOST_COPIED = 0.1
+"""Share of the bricks that get a finer copy for their own errors; those beside them get one, too."""
 
 
 def prepare_storage(
@@ -41,6 +47,7 @@ def prepare_storage(
             optimizer.reset_moments(table)
     if grows or schedule.releases_at(step):
         give_back_freed_memory()
+    gain = field.gain if schedule.copies_at(step) else None
     if schedule.releases_at(step):
         remaining.append(field.release_unused(FORMING * least if grows else least))
     if grows:  # what has just been released does not grow
@@ -51,22 +58,28 @@ def prepare_storage(
     if phase.name == "blend" and step == phase.start:
         remaining.append(field.release_untouched())
     for kept in remaining:
+        gain = gain if gain is None or kept is None else gain[kept]
         for optimizer, table in trained if kept is not None else ():
             optimizer.keep_blocks(table, kept, BRICK)
-    if schedule.refines_at(step):
-        refine(field, Work(field.feature_channels, any(p.name == "blend" for p in schedule.phases)), trained)
+    if schedule.refines_at(step) and not field.copied:
+        work = Work(field.feature_channels, two_phase=not schedule.is_joint)
+        budget = training_bytes(field.full_plan, field.views, work, field.density.device)
+        if gain is not None and schedule.is_joint and field.full_plan.detail >= FINER**2 * field.factor:
+            copy_finely(field, gain, work, budget, trained)
+        else:
+            refine(field, work, budget, trained)
 
 
-def refine(field: TexelTables, work: Work, trained: list[tuple[Any, Any]]) -> None:
+def refine(field: TexelTables, work: Work, budget: int, trained: list[tuple[Any, Any]]) -> None:
     """Makes texels finer than planned where bricks were released: as fine as the plan allows within its bytes.
 
     Args:
         field: the field that is trained.
         work: what is trained.
+        budget: bytes of tables and moments.
         trained: optimisers and their tables.
     """
     plan = field.full_plan
-    budget = training_bytes(plan, field.views, work, field.density.device)
 
     def bytes_of(tiles: Tensor) -> int:
         return stored_bytes(int((tiles > 0).sum()), len(tiles), work)
@@ -84,3 +97,45 @@ def refine(field: TexelTables, work: Work, trained: list[tuple[Any, Any]]) -> No
             say(f"Texels are {factor:.1f} times as many as planned now, in the room that released ones left.")
             return
         factor *= min(0.98, budget / bytes_of(tiles))
+
+
+def copy_finely(
+    field: TexelTables, gain: Float[Tensor, "B"], work: Work, budget: int, trained: list[tuple[Any, Any]]
+) -> None:
+    """Gives MPIs finer copies of the bricks in which training rays have the largest errors, and of those beside them.
+
+    Args:
+        field: the field that is trained, without copies.
+        gain: of each brick (``TexelTables.gain``).
+        work: what is trained.
+        budget: bytes of tables and moments.
+        trained: optimisers and their tables.
+    """
+    grids, copies = field.grids, field.copy_grids()
+    first_voxel = sum(grid.own_tiles.numel() for grid in grids[: len(copies)])
+    order = gain[1:].argsort(descending=True, stable=True) + 1
+    order = order[grids[0].places[order] < first_voxel]  # the cube has no copy
+
+    def chosen(count: int) -> Tensor:
+        tiles = torch.zeros_like(field.tiles, dtype=torch.bool)
+        tiles[grids[0].places[order[:count]]] = True
+        return widened_tiles(grids[: len(copies)], tiles)
+
+    def fits(count: int) -> bool:
+        fine, kept = tiles_with_copies(grids, copies, chosen(count))
+        return stored_bytes(int(fine.sum()) + int(kept.sum()), len(fine) + len(kept), work) <= budget
+
+    # More bricks take more room, so all up to some number fit.
+    most = int(MOST_COPIED * len(order))
+    count = bisect_left(range(1, most + 1), True, key=lambda n: not fits(n))
+    if not count or not float(gain.sum()) > 0:
+        return
+    for optimizer, table in trained:
+        optimizer.reset_moments(table)
+    tiles = chosen(count)
+    share = float(gain[field.tiles[tiles].to(torch.int64)].sum() / gain.sum())
+    stored = int(tiles.sum()) / field.num_bricks
+    give_back_freed_memory()
+    field.copy_finely(tiles)
+    give_back_freed_memory()
+    say(f"{stored:.0%} of the bricks, with {share:.0%} of the errors, have {FINER**2} times as many texels now.")

@@ -17,20 +17,23 @@ from mmpi_ns.utils.errors import InputError
 
 STEPS = 24
 """individual 0-11 with doublings at 2 and 3 and releases of bricks before 6 and 11, blend 12-17, finetune 18-23; joint
-0-23 with doublings at 3 and 6 and releases before 12 and 22; finer is joint with finer texels from 17 on."""
+0-23 with doublings at 3 and 6 and releases before 12 and 22; finer is joint with finer texels from 12
+on, and copies with finer copies from 17 on."""
 BOUNDARIES = (3, 6, 12, 18)
 
 
-@pytest.fixture(scope="module", params=["split", "all", "joint", "finer"])
+@pytest.fixture(scope="module", params=["split", "all", "joint", "finer", "copies"])
 def whole(request, scene, plan_file, tmp_path_factory):
     """Settings, and the checkpoints of every step of an uninterrupted run."""
-    joint = request.param in ("joint", "finer")
+    joint = request.param in ("joint", "finer", "copies")
     settings = {"training": "joint"} if joint else {"rays_per_mpi": request.param}
     settings |= {"shading": "sample" if request.param == "all" else "ray"}
     settings |= {"release_shares": (0.5, 0.9), "release_weight": 0.06}
-    if request.param == "finer":
+    if request.param in ("finer", "copies"):
         plan = tmp_path_factory.mktemp("finer") / "plan.json"
-        plan.write_text(replace(WindowedPlan.load(plan_file).plans[0], detail=4.0).to_json())
+        plan.write_text(
+            replace(WindowedPlan.load(plan_file).plans[0], detail=2.0 if request.param == "finer" else 64.0).to_json()
+        )
         settings |= {"plan_file": plan, "release_shares": (0.5, 0.7, 0.9), "decay_from": 0.8}
     config = trainer_config(scene, plan_file, tmp_path_factory.mktemp("whole"), STEPS, **settings)
     trainer = ready(config)

@@ -14,7 +14,7 @@ from mmpi_ns.field.tables import TABLES
 from mmpi_ns.scene.plan import ScenePlan
 from mmpi_ns.scene.texels import BRICK
 from mmpi_ns.training.memory import Work, training_bytes
-from mmpi_ns.training.storage import FORMING, prepare_storage, refine
+from mmpi_ns.training.storage import FORMING, MOST_COPIED, copy_finely, prepare_storage, refine
 from mmpi_ns.training.touched_adam import TouchedAdam
 
 
@@ -48,7 +48,7 @@ def half_empty(detail: float, share: float) -> MMPIField:
 
 def used_bytes(field: MMPIField, optimizer: TouchedAdam) -> int:
     """Of the tables, what belongs to them, and the moments that training the density and the features would take."""
-    buffers = [field.tiles, field.touched, field.peak, *(getattr(field, name).data for name in TABLES)]
+    buffers = [field.tiles, field.touched, field.peak, field.gain, *(getattr(field, name).data for name in TABLES)]
     for table in (field.density, field.features):
         table.add_grad(torch.tensor([BRICK]), torch.ones(1, table.shape[1]))
     optimizer.step()
@@ -60,7 +60,7 @@ def used_bytes(field: MMPIField, optimizer: TouchedAdam) -> int:
 def test_texels_become_as_fine_as_rays_can_train_unless_hardly_anything_was_released(detail, share, factor):
     field = half_empty(detail, share)
     before = field.features.data.clone()
-    refine(field, Work(8, False), [])
+    refine(field, Work(8, False), training_bytes(field.full_plan, None, Work(8, False)), [])
     assert field.factor == factor
     assert (factor > 1) != torch.equal(field.features.data, before)
 
@@ -70,8 +70,36 @@ def test_texels_become_as_fine_as_fits_in_the_bytes_that_the_plan_takes_and_mome
     field = half_empty(64.0, share)
     optimizer = TouchedAdam([field.density, field.features], lr=0.1)
     used_bytes(field, optimizer)
-    refine(field, Work(8, False), [(optimizer, field.density), (optimizer, field.features)])
+    budget = training_bytes(field.full_plan, None, Work(8, False))
+    refine(field, Work(8, False), budget, [(optimizer, field.density), (optimizer, field.features)])
     assert not optimizer.state and 1.25 <= field.factor <= 1 / share
-    budget, used = training_bytes(field.full_plan, None, Work(8, False)), used_bytes(field, optimizer)
-    assert 0.75 * budget < used <= budget
+    assert 0.75 * budget < used_bytes(field, optimizer) <= budget
     assert field.plan == field.full_plan.scaled(field.factor)
+
+
+@pytest.mark.parametrize(("share", "room"), [(0.25, 1.0), (0.5, 1.0), (1.0, 1.0), (1.0, 1.2), (0.25, 0.3)])
+def test_bricks_of_the_largest_gain_get_copies_within_the_bytes_of_the_plan(share, room):
+    field = half_empty(64.0, share)
+    optimizer = TouchedAdam([field.density, field.features], lr=0.1)
+    trained = [(optimizer, field.density), (optimizer, field.features)]
+    budget = int(room * training_bytes(field.full_plan, None, Work(8, False)))
+    gain = torch.zeros(field.num_bricks + 1)
+    count, best = field.num_bricks, field.num_bricks // 2
+    gain[1:], gain[best] = 0.1, 5.0
+    place = int(field.grids[0].places[best])
+    copy_finely(field, gain, Work(8, False), budget, trained)
+    if (share, room) == (1.0, 1.0):  # everything is stored: no copy has room
+        assert not field.copied and field.num_bricks == count
+        return
+    assert field.copied and not optimizer.state and used_bytes(field, optimizer) <= budget
+    copy, mpi = field.grids
+    assert count < field.num_bricks <= count + 4 * 9 * MOST_COPIED * count
+    plane, y, x = place // 64, place // 8 % 8, place % 8
+    assert (copy.own_tiles[plane, 2 * y : 2 * y + 2, 2 * x : 2 * x + 2] > 0).all(), "the brick of the largest gain"
+    assert mpi.own_tiles[plane, y, x] == 0, "which the MPI gives up"
+
+
+def test_without_errors_nothing_is_copied():
+    field = half_empty(64.0, 0.25)
+    copy_finely(field, torch.zeros(field.num_bricks + 1), Work(8, False), 10**12, [])
+    assert not field.copied
