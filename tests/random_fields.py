@@ -165,10 +165,12 @@ class OracleRay:
             tables = [oracle.trilinear(_table(field, t, k), ndc) for t in (field.density, field.features)]
             axes, bias = np.eye(3), biases[0]
         votes = [self._vote(j, place, j == k, ndc) for j, place in enumerate(places)]
+        copies = len(field.plan.mpis) - len(field.full_plan.mpis)
+        network = k - copies if k >= copies else k  # a finer copy has that of its MPI
         return oracle.RaySample(
             k, plane, inverse_t,
             float(np.logaddexp(0, tables[0][0] + bias) * scale),
-            _color(field.networks, k, tables[1], ndc, axes @ self.direction),
+            _color(field.networks, network, tables[1], ndc, axes @ self.direction),
             np.array([v for v, _ in votes]),
             np.array([c for _, c in votes]),
         )  # fmt: skip

@@ -195,18 +195,19 @@ class MMPIField(TexelTables):
     ) -> dict[FieldHeadNames, Tensor]:
         """Colours of the valid samples (diffuse ones where a ray is shaded once); empty slots are black."""
         directions, axes, networks = ray_samples.frustums.directions[:, 0], self.layout.frames.axes, self.networks
+        numbers = self.planned_heads(torch.arange(self.plan.num_heads)).tolist()  # a copy has its MPI's network
         if self.layout.cube is not None:
             axes = torch.cat([axes, torch.eye(3, device=axes.device)[None]])
         if isinstance(networks, ColorNetworks) and density_embedding is None and not torch.is_grad_enabled():
             octaves = (networks.position_frequencies, networks.direction_frequencies)
-            of_heads = SampleNetworks(tuple(networks.layers(k) for k in range(len(axes))), *octaves)
+            of_heads = SampleNetworks(tuple(networks.layers(k) for k in numbers), *octaves)
             samples = (directions, places_of(ray_samples))
             return {FieldHeadNames.RGB: shade(self.layout, self.features.data, of_heads, axes, *samples)}
         lookup = density_embedding or self._lookup(ray_samples)
         features = lookup.read(lookup.features)
         if isinstance(networks, ColorNetworks):
             colors = [
-                networks(k, part, lookup.ndc[here], geometry.rotate(axes[k], directions), lookup.rays[here])
+                networks(numbers[k], part, lookup.ndc[here], geometry.rotate(axes[k], directions), lookup.rays[here])
                 for k, here, part in lookup.by_head(features)
             ]
             colors = torch.cat(colors) if colors else features.new_zeros(0, 3)

@@ -78,7 +78,7 @@ class TexelTables(Field):
         """For every brick: the largest weight of a training sample in it since the last release."""
         self.gain: Tensor
         """For every brick: squared errors of training rays, times the weights of their samples in it, since the last
-        release."""
+        release; until there are copies."""
         self.crossings: Tensor
         """Training samples since the last release."""
         self.copied: Tensor
@@ -189,8 +189,12 @@ class TexelTables(Field):
 
     def planned_heads(self, heads: Tensor) -> Tensor:
         """Numbers of heads in the plan, where a finer copy has that of its MPI."""
-        copies = len(self.plan.mpis) - len(self.full_plan.mpis)
-        return torch.where(heads >= copies, heads - copies, heads)
+        return torch.where(heads >= self.num_copies, heads - self.num_copies, heads)
+
+    @property
+    def num_copies(self) -> int:
+        """Finer copies, which come before the MPIs."""
+        return len(self.plan.mpis) - len(self.full_plan.mpis)
 
     @torch.no_grad()
     def note_use(
@@ -205,10 +209,13 @@ class TexelTables(Field):
             errors: squared errors of the rays' colours, 0 where a ray has none.
         """
         weights = weights.reshape(-1)[lookup.index]
-        sizes, shares = [len(taps.positions) for taps in lookup.taps], weights * errors[lookup.rays]
-        for taps, weight, share in zip(lookup.taps, weights.split(sizes), shares.split(sizes), strict=True):
+        sizes = [len(taps.positions) for taps in lookup.taps]
+        for taps, weight in zip(lookup.taps, weights.split(sizes), strict=True):
             raise_peaks(self.peak, lookup.rows, taps.positions, weight)
-            self.gain.index_add_(0, lookup.rows[taps.positions[:, 0]] // BRICK, share)
+        if self.num_copies == 0:
+            shares = weights * errors[lookup.rays]
+            for taps, share in zip(lookup.taps, shares.split(sizes), strict=True):
+                self.gain.index_add_(0, lookup.rows[taps.positions[:, 0]] // BRICK, share)
         self.crossings += live.sum()
 
     @torch.no_grad()

@@ -28,6 +28,9 @@ MOST_PLANES, MOST_TEXELS, MOST_VOXELS, MOST_DETAIL = 4096, 16384, 4096, 64
 """Planes of an MPI, texels along a side of a plane, voxels along a side of the cube."""
 FINER = 2
 """Cells of a finer copy along each side of a cell of its MPI."""
+WORTH_COPIES = 3.0
+"""Multiple of the texels in use that rays could train from which MPIs get finer copies: four times as many texels of
+some bricks are a few too many for them, but those bricks have more rays than others."""
 
 
 @dataclass(frozen=True)
@@ -165,7 +168,7 @@ class ScenePlan:
     @property
     def largest(self) -> ScenePlan:
         """The plan with all heads that training may add."""
-        return self.with_copies() if self.detail >= FINER**2 else self
+        return self.with_copies() if self.detail >= WORTH_COPIES else self
 
     def to_json(self) -> str:
         """Standard JSON: a ``far`` at infinity is written as null."""

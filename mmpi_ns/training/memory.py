@@ -167,8 +167,8 @@ def stored_bytes(bricks: int, tiles: int, work: Work) -> int:
     """
     learned = 1 + work.feature_channels + work.two_phase
     numbers, moments = 1 + work.feature_channels + 1, 2 * learned  # density, features, reliability; float32, bfloat16
-    # Also marks of touched texels, peaks of bricks, and the tile map.
-    return (bricks + 1) * (BRICK * (4 * numbers + 2 * moments + 1) + 4) + 4 * tiles
+    # Also marks of touched texels, peaks and gains of bricks, and the tile map.
+    return (bricks + 1) * (BRICK * (4 * numbers + 2 * moments + 1) + 8) + 4 * tiles
 
 
 def describe(windows: WindowedPlan, steps: int, tables: Sequence[int], pixels: Sequence[int]) -> str:

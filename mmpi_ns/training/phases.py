@@ -51,7 +51,7 @@ class ScheduleConfig:
     """after being constant for this fraction of it."""
     growth_shares: tuple[float, ...] = (1 / 15, 2 / 15, 3 / 15, 4 / 15)
     """When the texels of a plane double, as shares of the first phase; four times as early if depths are known."""
-    release_shares: tuple[float, ...] = (0.15, 3 / 15, 4 / 15, 0.3, 0.4, 0.5, 0.75, 0.95)
+    release_shares: tuple[float, ...] = (0.15, 3 / 15, 4 / 15, 0.3, 0.5, 0.75, 0.95)
     """When empty bricks (8 x 8 texels of a plane) are released, as fractions of the first phase: after growth, or just
     before the texels double."""
     release_weight: float = 5e-3

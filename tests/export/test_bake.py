@@ -22,6 +22,7 @@ from mmpi_ns.field.shading import RayShader
 from mmpi_ns.ops import dispatch
 from mmpi_ns.rendering import baked as baking
 from mmpi_ns.rendering.baked import exact_images
+from mmpi_ns.rendering.rendered import bounded, shown_outputs
 from mmpi_ns.scene.plan import CubePlan
 from mmpi_ns.scripts import export
 
@@ -75,6 +76,31 @@ def test_baked_images_are_the_exact_ones(trainer, monkeypatch):
     torch.testing.assert_close(exact["accumulation"], baked["accumulation"], atol=0.02, rtol=0)
     assert ((exact["depth"] / baked["depth"]).log().abs() < 0.01).float().mean() > 0.9
     assert (exact["winning_mpi"] == baked["winning_mpi"]).float().mean() > 0.95
+
+
+def test_finer_copies_are_baked_and_shown_as_parts_of_their_mpis(trainer, monkeypatch, request):
+    model = filled(trainer)
+    field, count = model.field, len(model.field.plan.mpis)
+    plan, factor = field.full_plan, field.factor
+    monkeypatch.setattr(model.config.schedule, "training", "joint")
+    rays = bundle_of(field.plan)
+    chosen = (field.tiles > 0) & (torch.rand(len(field.tiles), generator=torch.Generator().manual_seed(1)) < 0.6)
+    field.copy_finely(chosen)
+    request.addfinalizer(lambda: field.build(plan, factor))
+    field.forget_baked()
+    exact, baked = outputs(model, "exact", rays), outputs(model, "baked", rays)
+    assert (exact["rgb"] - baked["rgb"]).square().mean() < 1e-4 and exact["rgb"].std() > 0.05
+    for each in (exact, baked):
+        assert 0 <= each["winning_mpi"].min() and each["winning_mpi"].max() < count
+    assert (exact["winning_mpi"] == baked["winning_mpi"]).float().mean() > 0.95
+    model.show.value = model.progress.windows.names[0]
+    alone = outputs(model, "exact", rays)
+    model.show.value = "all"
+    head_mask = (torch.arange(2 * count) % count == 0).expand(len(rays), -1)
+    shown = shown_outputs(bounded(rays, field.plan), field, blends=False, threshold=3e-3, head_mask=head_mask)
+    torch.testing.assert_close(alone["accumulation"], shown["accumulation"])
+    torch.testing.assert_close(alone["depth"], shown["depth"])
+    assert (alone["depth"] / exact["depth"] - 1).abs().max() > 0.1
 
 
 def test_blending_is_baked_into_the_bricks(trainer, monkeypatch):

@@ -26,7 +26,9 @@ def bytes_of(state) -> int:
     """Tensors of a field's tables and of their moments in a checkpoint."""
     field = {k.removeprefix("_model.field."): v for k, v in state["pipeline"].items() if "_model.field." in k}
     tables = sum(
-        v.nbytes for k, v in field.items() if k not in ("networks.weights", "plan_bytes", "crossings", "texel_factor")
+        v.nbytes
+        for k, v in field.items()
+        if k not in ("networks.weights", "plan_bytes", "crossings", "copied", "texel_factor")
     )
     moments = [state["optimizers"][k]["state"].get(0, {}) for k in ("density", "features", "reliability")]
     return tables + sum(m[k].nbytes for m in moments for k in m if k != "step")

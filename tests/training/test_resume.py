@@ -84,10 +84,13 @@ def test_bricks_were_given_up_on_the_way_and_checkpoints_hold_the_others_alone(w
     assert counts == sorted(counts) and counts[0] == 1, "moments go on where bricks go"
 
 
-def test_texels_become_finer_where_the_plan_allows_it_and_never_coarser(whole):
-    factors = [float(load(whole[1], step)["pipeline"]["_model.field.texel_factor"]) for step in range(1, STEPS)]
-    assert factors == sorted(factors) and factors[15] == 1
-    assert 1.25 <= factors[16] <= 4 if "plan_file" in whole[0] else factors[-1] == 1
+def test_texels_become_finer_or_get_copies_where_the_plan_allows_it(whole):
+    states = [load(whole[1], step)["pipeline"] for step in range(1, STEPS)]
+    factors, copied = ([float(state[f"_model.field.{n}"]) for state in states] for n in ("texel_factor", "copied"))
+    assert factors == sorted(factors) and factors[15] == 1 and not any(copied[:16])
+    detail = WindowedPlan.load(whole[0]["plan_file"]).plans[0].detail if "plan_file" in whole[0] else 1.0
+    assert 1.25 <= factors[16] <= detail if detail == 2 else factors[-1] == 1
+    assert copied[16:] == [float(detail > 2)] * (STEPS - 17)
 
 
 def test_steps_differ_so_the_comparison_can_fail(whole):

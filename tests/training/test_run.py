@@ -77,7 +77,7 @@ def test_texels_become_as_fine_as_fits_in_the_bytes_that_the_plan_takes_and_mome
     assert field.plan == field.full_plan.scaled(field.factor)
 
 
-@pytest.mark.parametrize(("share", "room"), [(0.25, 1.0), (0.5, 1.0), (1.0, 1.0), (1.0, 1.2), (0.25, 0.3)])
+@pytest.mark.parametrize(("share", "room"), [(0.25, 1.0), (0.5, 1.0), (1.0, 1.0), (1.0, 1.2), (0.25, 0.5), (0.25, 0.3)])
 def test_bricks_of_the_largest_gain_get_copies_within_the_bytes_of_the_plan(share, room):
     field = half_empty(64.0, share)
     optimizer = TouchedAdam([field.density, field.features], lr=0.1)
@@ -88,7 +88,7 @@ def test_bricks_of_the_largest_gain_get_copies_within_the_bytes_of_the_plan(shar
     gain[1:], gain[best] = 0.1, 5.0
     place = int(field.grids[0].places[best])
     copy_finely(field, gain, Work(8, False), budget, trained)
-    if (share, room) == (1.0, 1.0):  # everything is stored: no copy has room
+    if (share, room) in ((1.0, 1.0), (0.25, 0.3)):  # a brick and its neighbours have no room
         assert not field.copied and field.num_bricks == count
         return
     assert field.copied and not optimizer.state and used_bytes(field, optimizer) <= budget
