@@ -165,10 +165,16 @@ class ScenePlan:
         )
         return replace(self, mpis=(*copies, *self.mpis))
 
+    def may_be_copied(self, factor: float = 1.0) -> bool:
+        """Whether rays could train finer copies of planes that have ``factor`` times the planned texels, and plans of
+        that size are allowed."""
+        longest = max(side for m in self.scaled(factor).mpis for side in (m.height, m.width))
+        return self.detail >= WORTH_COPIES * factor and FINER * longest <= MOST_TEXELS
+
     @property
     def largest(self) -> ScenePlan:
         """The plan with all heads that training may add."""
-        return self.with_copies() if self.detail >= WORTH_COPIES else self
+        return self.with_copies() if self.may_be_copied() else self
 
     def to_json(self) -> str:
         """Standard JSON: a ``far`` at infinity is written as null."""

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from mmpi_ns.field.tables import TABLES, TexelTables
 from mmpi_ns.scene.bricks import tiles_with_copies, widened_tiles
-from mmpi_ns.scene.plan import FINER, MOST_TEXELS, WORTH_COPIES
+from mmpi_ns.scene.plan import FINER, MOST_TEXELS
 from mmpi_ns.scene.texels import BRICK, head_shapes
 from mmpi_ns.training.memory import Work, stored_bytes, training_bytes
 from mmpi_ns.training.phases import Schedule
@@ -64,7 +64,7 @@ def prepare_storage(
     if schedule.refines_at(step) and field.num_copies == 0:
         work = Work(field.feature_channels, two_phase=not schedule.is_joint)
         budget = training_bytes(field.full_plan, field.views, work, field.density.device)
-        if gain is not None and schedule.is_joint and field.full_plan.detail >= WORTH_COPIES * field.factor:
+        if gain is not None and schedule.is_joint and field.full_plan.may_be_copied(field.factor):
             copy_finely(field, gain, work, budget, trained)
         else:
             refine(field, work, budget, trained)
