@@ -125,7 +125,7 @@ def copy_finely(
         fine, kept = tiles_with_copies(grids, copies, chosen(count))
         return stored_bytes(int(fine.sum()) + int(kept.sum()), len(fine) + len(kept), work) <= budget
 
-    # More bricks nearly always take more room. What is found fits, whether or not a few more would.
+    # More bricks nearly always take more room. The number taken fits, whether or not a few more would.
     most = int(MOST_COPIED * len(order))
     count = bisect_left(range(1, most + 1), True, key=lambda n: not fits(n))
     if not count or not float(gain.sum()) > 0:
