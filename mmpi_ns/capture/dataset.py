@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
+from mmpi_ns.capture.exif import is_turned
 from mmpi_ns.capture.rays import image_rays
 from mmpi_ns.utils.errors import InputError, brief
 
@@ -110,9 +111,12 @@ class MMPIDataset(InputDataset):
         rows, columns = shape
         # Downscaled images may have been rounded up where cameras are rounded down: one pixel is cut off.
         if not (0 <= rows - height <= 1 and 0 <= columns - width <= 1):
+            name = self.image_filenames[image_idx]
+            remedy = "correct the camera's size or give the images that the cameras belong to"
+            if 0 <= columns - height <= 1 and 0 <= rows - width <= 1 and is_turned(name):
+                remedy = "its EXIF alone turns it, so turn its pixels, as mmpi-prepare does"
             raise UnusableFile(
-                f"Image {self.image_filenames[image_idx]} has {columns} x {rows} pixels and its camera {width} x "
-                f"{height}: correct the camera's size or give the images that the cameras belong to."
+                f"Image {name} has {columns} x {rows} pixels and its camera {width} x {height}: {remedy}."
             )
         if image_type == "float32" and (files := self.metadata.get("depth_filenames")):
             unit = self.metadata.get("depth_unit_scale_factor", 1.0) * self._dataparser_outputs.dataparser_scale

@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 from forked import run, train
-from PIL import Image
+from PIL import ExifTags, Image
 from tiny_scene import HEIGHT, WIDTH, name_of
 
 NAN, INF = math.nan, math.inf
@@ -338,7 +338,17 @@ def test_an_image_that_cannot_be_read_is_named(data, tmp_path, case, i):
 
 def test_an_image_of_another_size_is_named(data, tmp_path):
     save(data, 3, np.zeros((HEIGHT, WIDTH + 2, 3), np.uint8))
-    assert f"{WIDTH + 2} x {HEIGHT} pixels and its camera {WIDTH} x {HEIGHT}" in train(data, tmp_path).sentence
+    said = train(data, tmp_path).sentence
+    assert f"{WIDTH + 2} x {HEIGHT} pixels and its camera {WIDTH} x {HEIGHT}" in said and "EXIF" not in said
+
+
+@pytest.mark.parametrize(("orientation", "named"), [(6, True), (8, True), (3, False)])
+def test_an_image_that_its_exif_alone_turns_is_refused_with_the_reason(data, tmp_path, orientation, named):
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = orientation
+    Image.fromarray(np.zeros((WIDTH, HEIGHT, 3), np.uint8)).save(data / "images" / name_of(3), exif=exif)
+    said = train(data, tmp_path).sentence
+    assert f"{HEIGHT} x {WIDTH} pixels and its camera {WIDTH} x {HEIGHT}" in said and ("EXIF" in said) == named
 
 
 ARRAYS = {
