@@ -111,12 +111,13 @@ class MMPIDataset(InputDataset):
         rows, columns = shape
         # Downscaled images may have been rounded up where cameras are rounded down: one pixel is cut off.
         if not (0 <= rows - height <= 1 and 0 <= columns - width <= 1):
-            name = self.image_filenames[image_idx]
-            remedy = "correct the camera's size or give the images that the cameras belong to"
+            name, size = self.image_filenames[image_idx], f"{columns} x {rows} pixels and its camera {width} x {height}"
             if 0 <= columns - height <= 1 and 0 <= rows - width <= 1 and is_turned(name):
-                remedy = "its EXIF alone turns it, so turn its pixels, as mmpi-prepare does"
+                raise UnusableFile(
+                    f"Image {name} has {size}: its EXIF alone turns it, so turn its pixels, as mmpi-prepare does."
+                )
             raise UnusableFile(
-                f"Image {name} has {columns} x {rows} pixels and its camera {width} x {height}: {remedy}."
+                f"Image {name} has {size}: correct the camera's size or give the images that the cameras belong to."
             )
         if image_type == "float32" and (files := self.metadata.get("depth_filenames")):
             unit = self.metadata.get("depth_unit_scale_factor", 1.0) * self._dataparser_outputs.dataparser_scale
