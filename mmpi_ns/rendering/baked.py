@@ -81,6 +81,8 @@ class BakedWindow:
     """Distance that stands for infinity in depth images."""
     exposure: tuple[float, ...] = (1.0, 1.0, 1.0)
     """Colours shown over those of the texels."""
+    seen: Float[Tensor, "B"] | None = None
+    """How much training views see of each brick: the largest weights in its texels, summed. None: not looked at."""
 
     def render(
         self,
@@ -146,7 +148,8 @@ class BakedWindow:
             columns.append(columns_here)
             first += len(places)
         tables = {"columns": torch.cat(columns), "density": mpis.density[kept], "texels": mpis.texels[kept]}
-        return replace(self, mpis=replace(mpis, **tables, packed={}))
+        seen = None if self.seen is None else self.seen[kept]
+        return replace(self, mpis=replace(mpis, **tables, packed={}), seen=seen)
 
 
 def why_not_baked(model_field: MMPIField) -> str:

@@ -24,6 +24,10 @@ CLOSE = 48.0
 """dB between the canvas and our renderer: a canvas holds 8 bits, and a card interpolates codes with 8 bits too."""
 
 
+WHOLE = "[...mmpi.windows.values()].every((w) => w && w.whole)"
+"""All of the windows at hand has come, not the first part alone."""
+
+
 def smooth_window(seed, **settings):
     """A window whose codes change at the borders of bricks alone, for a card interpolates with 8 bits."""
     window = random_window(seed=seed, density=(120, 200), **settings)
@@ -53,6 +57,7 @@ def tab(tmp_path_factory):
 def opened(tab, site):
     with served(site) as address:
         assert tab.open(f"{address}/index.html") == "ready", tab.evaluate("document.body.innerText")
+        tab.until(WHOLE)
         yield tab
 
 
@@ -80,7 +85,7 @@ def test_windows_are_mixed(opened, site):
     scene = read_baked(site)
     middle = np.add(scene.windows[0][0].center, (2.0, 0.0, 0.0))
     opened.evaluate(f"mmpi.path[0].eye = {middle.tolist()}; mmpi.camera = structuredClone(mmpi.path[0]); mmpi.feed()")
-    opened.until("mmpi.windows.get(0) && mmpi.windows.get(1)")
+    opened.until("mmpi.windows.get(0)?.whole && mmpi.windows.get(1)?.whole")
     pose = scene.path[0]
     for row, value in zip(pose.to_world, middle, strict=True):
         row[3] = float(value)
@@ -203,7 +208,7 @@ def test_a_long_capture_keeps_few_windows(tab, tmp_path):
             assert tab.evaluate(NEEDED_LAST)
             shares = window_shares(torch.tensor(path[number].to_world)[None, :, 3], tuple(w for w, _ in scene.windows))
             for w in shares[0].nonzero()[:, 0].tolist():
-                tab.until(f"mmpi.windows.get({w})")
+                tab.until(f"mmpi.windows.get({w})?.whole")
             assert tab.evaluate("mmpi.windows.size") <= 4
             assert ours(tmp_path, path[number]).std() > 0.01 and -10 * np.log10(difference(number)) > CLOSE - 4
             tab.evaluate("mmpi.press('m')")
@@ -217,6 +222,7 @@ def test_a_long_capture_keeps_few_windows(tab, tmp_path):
 def test_one_file_opens_from_the_disk(tab, site, tmp_path):
     write_single_file(site, tmp_path / "one.html")
     assert tab.open((tmp_path / "one.html").as_uri()) == "ready"
+    tab.until(WHOLE)
     assert shown(tab, 0).std() > 0.02
 
 
