@@ -313,6 +313,7 @@ def test_baked_codes_are_those_of_the_planes(trainer, monkeypatch, request):
     plan, factor = field.full_plan, field.factor
     field.copy_finely((field.tiles > 0) & (torch.rand(len(field.tiles), generator=g) < 0.4))
     request.addfinalizer(lambda: field.build(plan, factor))
+    field._keep(torch.rand(field.num_bricks + 1, generator=g) < 0.6)
     field.density.data[64:][torch.rand(len(field.density) - 64, generator=g) < 0.3] = -20.0
     monkeypatch.setattr(baking, "AT_ONCE_BRICKS", 7)
     baked, seen = baking.bake(field, 3e-3, 0.5).mpis, 0
