@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import json
+import math
 import time
 from dataclasses import replace
 
@@ -217,6 +219,51 @@ def test_a_long_capture_keeps_few_windows(tab, tmp_path):
             if number == len(windows) - 1:
                 assert not tab.evaluate("window.first.some((t) => mmpi.gl.isTexture(t)) || mmpi.windows.has(0)")
     assert tab.messages == []
+
+
+DECODED = """(async () => {
+    const row = mmpi.header.windows[0], [first, rest] = mmpi.source(row, () => {}), shown = [[], []];
+    const { addAtlas } = WindowOnCard.prototype;
+    const into = (which) => { WindowOnCard.prototype.addAtlas = (codes) => which.push(...codes.map((c) => [...c])); };
+    into(shown[0]);
+    const card = await WindowOnCard.load(mmpi.gl, row, await first);
+    into(shown[1]);
+    await card.complete(await rest);
+    WindowOnCard.prototype.addAtlas = addAtlas;
+    return shown;
+})()"""
+"""Codes of density and channels that the page decodes, from the first part of a file and from all of it."""
+
+
+def halved(codes):
+    """Codes [B, 8, 8] with all but every second row and column replaced by means, texel by texel."""
+    codes = codes.to(torch.int64)
+    for y, x in [*itertools.product(range(0, 8, 2), range(1, 8, 2)), *itertools.product(range(1, 8, 2), range(8))]:
+        dy, dx = (0, 1) if y % 2 == 0 else (1, 0)
+        after = codes[:, y + dy, x + dx] if max(y + dy, x + dx) < 8 else codes[:, y - dy, x - dx]
+        codes[:, y, x] = (codes[:, y - dy, x - dx] + after) // 2
+    return codes.to(torch.uint8)
+
+
+def test_the_bricks_that_are_seen_most_come_first_at_half_of_their_resolution(tab, tmp_path):
+    """And then all of them, bit for bit; the first part is a small one."""
+    window = random_window(seed=6)
+    seen = torch.rand(window.mpis.num_bricks, generator=torch.Generator().manual_seed(0))
+    write_baked(scene_of(replace(window, seen=seen)), tmp_path)
+    write_page(tmp_path)
+    row = json.loads((tmp_path / HEADER).read_text())["windows"][0]
+    assert row["first_bytes"] < 0.2 * row["bytes"]  # of noise, whose means tell nothing
+    with served(tmp_path) as address:
+        assert tab.open(f"{address}/index.html") == "ready"
+        tab.until(WHOLE)
+        first, whole = (torch.tensor(x, dtype=torch.uint8) for x in tab.evaluate(DECODED))
+    mpis, count = window.mpis, math.ceil(0.2 * window.mpis.num_bricks)
+    assert torch.equal(whole, torch.stack([mpis.density, *mpis.texels.unbind(-1)]).flatten(2).flatten(1))
+    kept = window.keep(seen >= seen.sort(descending=True).values[count - 1]).mpis
+    expected = [halved(x) for x in (kept.density, *kept.texels.unbind(-1))]
+    for codes in expected:
+        take_borders(codes, neighbours(kept.columns, kept.mpis, kept.num_bricks))
+    assert torch.equal(first, torch.stack(expected).flatten(2).flatten(1))
 
 
 def test_one_file_opens_from_the_disk(tab, site, tmp_path):
