@@ -42,6 +42,7 @@ from mmpi_ns.rendering.rendered import (
     render_rays,
     sampled_outputs,
     shown_outputs,
+    winners,
 )
 from mmpi_ns.rendering.sampler import MMPISampler, SamplingConfig
 from mmpi_ns.rendering.window_store import WindowStore
@@ -241,8 +242,8 @@ class MMPIModel(Model):
         return {"threshold": min(sampling.threshold, cube), "fair_share": FAIR_SHARE if forming else float("inf")}
 
     def image_outputs(self, bundle: RayBundle, chunk: int | None = None) -> dict[str, Tensor]:
-        """rgb, accumulation, depth, winning MPI and dropped mass [R, .] of rays, from the windows that they start in.
-        ``chunk``: rays that a window renders at once; None: all."""
+        """rgb, accumulation, depth, winning MPI, pixels of its texels and dropped mass [R, .] of rays, from the windows
+        that they start in. ``chunk``: rays that a window renders at once; None: all."""
         windows, trained = self.progress.windows, self.progress.window
         chosen = windows.find(self.show.value)  # by the viewer
         present = [*range(trained + 1)]  # finished windows, and the one being trained
@@ -280,7 +281,7 @@ class MMPIModel(Model):
         may_bake = mode == "auto" and not self.trains and one_exposure
         if chosen is None and (mode == "baked" or (may_bake and suits_bricks(field))):
             outputs = self.baked(field).outputs(bounded(bundle, field.plan), background)
-            return outputs | {"winning_mpi": field.planned_heads(outputs["winning_mpi"]) + first_head}
+            return outputs | winners(outputs, bundle, field, first_head)
         blends, head_mask = self.blends(field), None
         if chosen is not None:
             head = chosen[1] if chosen[0] == window else -1
@@ -291,14 +292,14 @@ class MMPIModel(Model):
         once = field.shading == "ray" and not torch.is_grad_enabled()
         outputs = (shown_outputs if once else sampled_outputs)(bounded(bundle, field.plan), field, **how)
         behind, exposure = outputs.pop("transmittance") * background.to(outputs["rgb"]), self.exposures.mean
-        winner = field.planned_heads(outputs["winning_mpi"]) + first_head
+        outputs |= winners(outputs, bundle, field, first_head)
         if exposure is None:
-            return outputs | {"rgb": (outputs["rgb"] + behind).clamp(0, 1), "winning_mpi": winner}
+            return outputs | {"rgb": (outputs["rgb"] + behind).clamp(0, 1)}
         if self.config.rendering.exposure == "nearest" and len(bundle):
             exposure = self.exposures.nearest(bundle.origins[0])
         radiance = outputs["rgb"] + behind / exposure
         rgb = (exposure * radiance).clamp(0, 1)
-        return outputs | {"rgb": rgb, "radiance": radiance, "winning_mpi": winner}
+        return outputs | {"rgb": rgb, "radiance": radiance}
 
     def baked(self, field: MMPIField) -> BakedWindow:
         """Baked form of a field, cached until the field is trained on. Raises ValueError if it cannot be baked."""

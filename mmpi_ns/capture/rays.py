@@ -73,15 +73,16 @@ class PinholeRays:
         return LensRays(*vars(pinholes).values(), *(x.to(device) for x in lenses))
 
     def __call__(self, ray_indices: Int[Tensor, "R 3"]) -> RayBundle:
-        """Rays through pixel centres. Pixel areas, which this package does not use, are 1.
+        """Rays through pixel centres. Pixel areas are those at distance 1; of a lens, those at its centre.
 
         Args:
             ray_indices: camera, row and column of each.
         """
         camera = ray_indices[:, 0]
         poses = self.poses[camera]
-        directions = torch.nn.functional.normalize(rotate(poses[:, :, :3], self.local(ray_indices)), dim=-1)
-        area = torch.ones_like(directions[:, :1])
+        local = self.local(ray_indices)
+        directions = torch.nn.functional.normalize(rotate(poses[:, :, :3], local), dim=-1)
+        area = 1 / (self.focal[camera].prod(-1, keepdim=True) * local.square().sum(-1, keepdim=True))
         return RayBundle(poses[:, :, 3], directions, pixel_area=area, camera_indices=camera[:, None], metadata={})
 
     def local(self, ray_indices: Int[Tensor, "R 3"]) -> Float[Tensor, "R 3"]:

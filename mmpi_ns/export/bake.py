@@ -73,7 +73,7 @@ def bake_run(pipeline: Any, least: float, say: Say = print) -> BakedScene:
         window_shares(cameras.camera_to_worlds[:, :, 3], places) if len(places) > 1 else torch.ones(len(cameras), 1)
     )
 
-    def seen_weights(window: BakedWindow, views: list[int]) -> Tensor:
+    def seen_peaks(window: BakedWindow, views: list[int]) -> Tensor:
         alike = sorted(views, key=lambda i: [float(x[i]) for x in (cameras.width, cameras.height, cameras.fx)])
         pixels = float((cameras.width * cameras.height)[views].sum())
         step = math.ceil((pixels / MOST_LOOKED_AT) ** 0.5)
@@ -82,14 +82,14 @@ def bake_run(pipeline: Any, least: float, say: Say = print) -> BakedScene:
             rays = image_rays(cameras[i : i + 1], step).flatten()
             return rays.origins.contiguous(), rays.directions.contiguous()
 
-        return window.peaks(alike, rays_of).amax((1, 2))
+        return window.peaks(alike, rays_of)
 
     windows = []
     for number, place in enumerate(places):
         field = model.field if number == model.progress.window else model.store.load(number, model.device)
-        whole = kept = model.baked(field)
-        if least > 0:
-            kept = whole.keep(seen_weights(whole, (shares[:, number] > 0).nonzero()[:, 0].tolist()) >= least)
+        whole = model.baked(field)
+        peaks = seen_peaks(whole, (shares[:, number] > 0).nonzero()[:, 0].tolist())
+        kept = replace(whole, seen=peaks.sum((1, 2))).keep(peaks.amax((1, 2)) >= least)
         say(f"Window {number}: {kept.mpis.num_bricks} of {whole.mpis.num_bricks} bricks are seen ({least:g} or more).")
         windows.append((replace(place, plan=replace(place.plan, mpis=kept.mpis.mpis, cube=None)), kept))
     path = poses_of(pipeline)

@@ -13,24 +13,27 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, UInt8
 from numpy.typing import NDArray
 from torch import Tensor
 
 from mmpi_ns.capture.rays import PinholeRays
+from mmpi_ns.export.codes import coarse_codes, coarse_differences, joined_codes, split_codes
 from mmpi_ns.rendering.baked import BakedWindow
 from mmpi_ns.rendering.images import render_windows
-from mmpi_ns.scene.baked import CELLS, SIDE, BakedMpis, Codes, Shader, neighbours, take_borders
+from mmpi_ns.scene.baked import SIDE, BakedMpis, Codes, Shader, bits_of, neighbours, numbered_columns
 from mmpi_ns.scene.plan import MPIPlan, ScenePlan
 from mmpi_ns.scene.windows import Window
 from mmpi_ns.utils.errors import InputError
 from mmpi_ns.utils.files import write_atomically
 from mmpi_ns.utils.parallel import in_order
 
-FORMAT, VERSION = "mmpi-baked", 2
+FORMAT, VERSION = "mmpi-baked", 3
 HEADER = "scene.json"
 BLOCK = 1 << 20
 """Bytes that one thread compresses at a time."""
+EARLY = 0.2
+"""Share of the bricks whose coarse texels come first: those that training views see most of. A tenth of the bytes."""
 
 
 @dataclass(frozen=True)
@@ -101,13 +104,24 @@ def write_baked(scene: BakedScene, folder: Path) -> int:
 def _write_window(file: Path, place: Window, window: BakedWindow) -> dict[str, Any]:
     """Writes a window's arrays one after the other, each compressed; returns the window's part of the header."""
     mpis, shader = window.mpis, window.shader
+    seen = torch.zeros(mpis.num_bricks) if window.seen is None else window.seen
+    early = torch.zeros(mpis.num_bricks, dtype=torch.bool)
+    early[seen.argsort(descending=True, stable=True)[: math.ceil(EARLY * len(seen))]] = True
     beside = neighbours(mpis.columns, mpis.mpis, mpis.num_bricks)
+    channels = [mpis.density, *mpis.texels.unbind(-1)]
+    parts = list(in_order(lambda channel: split_codes(channel, beside), channels))
+
+    def coarse(bricks: Tensor) -> NDArray[np.uint8]:
+        return np.stack([coarse_differences(coarse[bricks.numpy()]) for coarse, _ in parts])
+
     network = [x.detach().half().reshape(-1) for layer in shader.layers for x in layer]
     arrays = {
-        "columns": mpis.columns.numpy().view(np.uint32),
-        "density": _differences(mpis.density, beside),
-        "texels": np.stack(list(in_order(lambda channel: _differences(channel, beside), mpis.texels.unbind(-1)))),
+        "early_columns": window.keep(early).mpis.columns[:, 0].numpy().view(np.uint32),
+        "early": coarse(early),
         "network": torch.cat(network).numpy() if network else np.zeros(0, np.float16),
+        "columns": mpis.columns[:, 0].numpy().view(np.uint32),
+        "late": coarse(~early),
+        "fine": np.stack([fine for _, fine in parts]),
     }
     blob, places = b"", {}
     for name, array in arrays.items():
@@ -120,6 +134,7 @@ def _write_window(file: Path, place: Window, window: BakedWindow) -> dict[str, A
     return {
         "file": file.name,
         "bytes": len(blob),
+        "first_bytes": places["columns"]["offset"],
         "center": place.center,
         "radius": None if math.isinf(place.radius) else place.radius,
         "margin": place.margin,
@@ -156,26 +171,6 @@ def _gzip(data: bytes) -> bytes:
     blocks = in_order(compress, range(0, max(len(data), 1), BLOCK))
     header = b"\x1f\x8b\x08" + bytes(6) + b"\xff"  # deflate, no name, no time, unknown system
     return header + b"".join(blocks) + struct.pack("<II", zlib.crc32(data), len(data) % 2**32)
-
-
-def _differences(codes: UInt8[Tensor, "B 8 8"], beside: Int[Tensor, "2 B"]) -> NDArray[np.uint8]:
-    """Stored form of one channel: differences along rows and columns, and of first texels along bricks; 0 for border
-    texels that a neighbour also contains. [B, 64]"""
-    stored, (right, below) = codes.numpy(), (beside >= 0).numpy()
-    for axis in (2, 1):
-        stored = np.diff(stored, axis=axis, prepend=np.uint8(0))
-    stored[:, 0, 0] = np.diff(stored[:, 0, 0], prepend=np.uint8(0))
-    stored[right, :CELLS, CELLS] = stored[right & ~below, CELLS, CELLS] = stored[below, CELLS] = 0
-    return stored.reshape(-1, SIDE * SIDE)
-
-
-def _sums(stored: NDArray[np.uint8], beside: Int[Tensor, "2 B"]) -> UInt8[Tensor, "B 8 8"]:
-    """Codes of one channel from their stored form."""
-    stored = stored.reshape(-1, SIDE, SIDE)
-    stored[:, 0, 0] = np.cumsum(stored[:, 0, 0], dtype=np.uint8)
-    codes = torch.from_numpy(stored.cumsum(1, dtype=np.uint8).cumsum(2, dtype=np.uint8))
-    take_borders(codes, beside)
-    return codes
 
 
 def read_baked(folder: Path) -> BakedScene:
@@ -232,14 +227,23 @@ def _read_window(folder: Path, row: dict[str, Any]) -> tuple[Window, BakedWindow
     nears = {"ray_near": row["ray_near"], "content_near": row["content_near"]}
     plan = ScenePlan.from_object({"mpis": mpi_rows, "cube": None, "origin_of_plan": "baked", **nears})
     radius = math.inf if row["radius"] is None else row["radius"]
-    columns, density = torch.from_numpy(array("columns").view(np.int32)), array("density")
-    beside = neighbours(columns, plan.mpis, len(density))
+    masks, early_masks = (torch.from_numpy(array(name).view(np.int32)) for name in ("columns", "early_columns"))
+    columns, early = numbered_columns(masks), bits_of(early_masks)[bits_of(masks) > 0] > 0
+    beside = neighbours(columns, plan.mpis, len(early))
+
+    def joined(parts: tuple[NDArray[np.uint8], ...]) -> UInt8[Tensor, "B 8 8"]:
+        coarse = np.empty((len(early), SIDE // 2, SIDE // 2), np.uint8)
+        for part, which in zip(parts[:2], (early, ~early), strict=True):
+            coarse[which.numpy()] = coarse_codes(part)
+        return joined_codes(coarse, parts[2], beside)
+
+    density, *texels = map(joined, zip(*map(array, ("early", "late", "fine")), strict=True))
     baked = BakedMpis(
         plan.mpis,
         tuple(m["interval"] for m in row["mpis"]),
         columns,
-        _sums(density, beside),
-        torch.stack([_sums(channel, beside) for channel in array("texels")], -1),
+        density,
+        torch.stack(texels, -1),
         Codes(**row["density"]),
         tuple(Codes(**c) for c in row["channels"]),
     )
@@ -251,5 +255,5 @@ def _read_window(folder: Path, row: dict[str, Any]) -> tuple[Window, BakedWindow
     shader = Shader(tuple(layers), row["shader"]["direction_octaves"], row["shader"]["bound"])
     exposure = tuple(row.get("exposure", (1.0, 1.0, 1.0)))  # before images were shown at one exposure
     near, far = row["ray_near"], row["farthest"]
-    window = BakedWindow(baked, shader, near, row["threshold"], row["background"], far, exposure)
+    window = BakedWindow(baked, shader, near, row["threshold"], row["background"], far, exposure, early.float())
     return Window(tuple(row["center"]), radius, row["margin"], plan), window

@@ -16,7 +16,7 @@ def write_page(folder: Path) -> Path:
     """Writes ``index.html`` beside a baked scene."""
     read_header(folder)
     path = folder / "index.html"
-    html = _html("")
+    html = _html("", "")
     write_atomically(path, lambda unfinished: unfinished.write_text(html, encoding="utf-8"))
     return path
 
@@ -35,16 +35,19 @@ def write_single_file(folder: Path, path: Path) -> None:
     header = read_header(folder)
     block = '<script type="{}" id="{}">{}</script>'
     text = (folder / HEADER).read_text(encoding="utf-8").replace("<", "\\u003c")
-    blocks = [block.format("application/json", HEADER, text)]
+    first, rest = [block.format("application/json", HEADER, text)], []
     for row in header["windows"]:
-        data = base64.b64encode((folder / row["file"]).read_bytes()).decode()
-        blocks.append(block.format("application/octet-stream", row["file"], data))
-    html = _html("\n".join(blocks))
+        data, kind = (folder / row["file"]).read_bytes(), "application/octet-stream"
+        parts = [base64.b64encode(part).decode() for part in (data[: row["first_bytes"]], data[row["first_bytes"] :])]
+        first.append(block.format(kind, row["file"], parts[0]))
+        rest.append(block.format(kind, f"{row['file']}.rest", parts[1]))
+    html = _html("\n".join(first), "\n".join(rest))  # the code between them runs before the rest is there
     write_atomically(path, lambda unfinished: unfinished.write_text(html, encoding="utf-8"))
 
 
-def _html(data: str) -> str:
+def _html(first: str, rest: str) -> str:
     shader = (PAGE / "march.glsl").read_text(encoding="utf-8").replace("ENDS", ends.TEXT, 1)
     code = "\n".join((PAGE / name).read_text(encoding="utf-8") for name in ("scene.js", "page.js"))
     page = (PAGE / "index.html").read_text(encoding="utf-8")
-    return page.replace("<!--data-->", data).replace("/*code*/", f"const MARCH = `{shader}`;\n{code}")
+    page = page.replace("/*code*/", f"const MARCH = `{shader}`;\n{code}")
+    return page.replace("<!--data-->", first).replace("<!--rest-->", rest)

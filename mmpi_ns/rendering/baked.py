@@ -9,10 +9,9 @@ from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int
 from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
-from torch.nn.functional import pad
 
 from mmpi_ns.field.baking import bake_shares
 from mmpi_ns.field.mmpi_field import MMPIField
@@ -34,7 +33,8 @@ from mmpi_ns.scene.baked import (
     columns_from,
     columns_of,
 )
-from mmpi_ns.scene.bricks import read_planes, stored_texels
+from mmpi_ns.scene.texels import SIDE as TILE
+from mmpi_ns.scene.texels import TexelGrid
 
 Item = TypeVar("Item")
 
@@ -43,6 +43,8 @@ THINNEST = -12.0
 HIGHEST_COLOR, HIGHEST_FEATURE = 191, 96
 """Largest codes of a colour channel and of a feature. These lose 0.0007 of SSIM; 255 for both loses 0.0003 and is a
 fifth larger, 127 for both loses 0.0011 (docs/export.md)."""
+AT_ONCE_BRICKS = 2**13
+"""Bricks that are baked together."""
 AT_ONCE = 2**18
 """Rays whose weights are looked at together: all of a photo of 12 megapixels would take gigabytes."""
 
@@ -81,6 +83,8 @@ class BakedWindow:
     """Distance that stands for infinity in depth images."""
     exposure: tuple[float, ...] = (1.0, 1.0, 1.0)
     """Colours shown over those of the texels."""
+    seen: Float[Tensor, "B"] | None = None
+    """How much training views see of each brick: the largest weights in its texels, summed. None: not looked at."""
 
     def render(
         self,
@@ -146,7 +150,8 @@ class BakedWindow:
             columns.append(columns_here)
             first += len(places)
         tables = {"columns": torch.cat(columns), "density": mpis.density[kept], "texels": mpis.texels[kept]}
-        return replace(self, mpis=replace(mpis, **tables, packed={}))
+        seen = None if self.seen is None else self.seen[kept]
+        return replace(self, mpis=replace(mpis, **tables, packed={}), seen=seen)
 
 
 def why_not_baked(model_field: MMPIField) -> str:
@@ -189,7 +194,9 @@ def bake(
     plan, network = model_field.plan, model_field.networks
     assert isinstance(network, RayShader)
     shares, heads = bake_shares(model_field) if blends else None, range(len(plan.mpis))
-    highest = max(float(_raw(model_field, k, p, shares).max()) for k in heads for p in _planes(model_field, k))
+    reached = [_reached(grid) for grid in model_field.grids[: len(heads)]]
+    parts = [(k, part) for k in heads for part in reached[k].nonzero().split(AT_ONCE_BRICKS)]
+    highest = max((float(_raw(model_field, k, part, shares).max()) for k, part in parts), default=THINNEST)
     density_codes = Codes.spanning(THINNEST, max(highest, THINNEST + 1))
     features = model_field.features.data
     most = [HIGHEST_COLOR] * COLORS + [HIGHEST_FEATURE] * (features.shape[1] - COLORS)
@@ -197,15 +204,17 @@ def bake(
     channels = tuple(Codes.spanning(*each) for each in ranges)
     columns, density, texels, count = [], [], [], 0
     for k in heads:
-        raw = torch.cat([_raw(model_field, k, p, shares) for p in _planes(model_field, k)])
-        codes = density_codes.encode(raw)
-        blocks = _tiled(codes[..., None])[..., 0]
-        holds_texels = _tiled(stored_texels(model_field.grids[k], slice(None)).byte())[..., 0].amax((-1, -2)) > 0
-        columns_here, places = columns_from(holds_texels.cpu() & (blocks.amax((-1, -2)) > 0), count)
+        for part in reached[k].nonzero().split(AT_ONCE_BRICKS):  # what shows nothing is left out
+            codes = density_codes.encode(_raw(model_field, k, part, shares))
+            reached[k][tuple(part.T)] = codes.amax((-1, -2)) > 0
+        columns_here, places = columns_from(reached[k], count)
         columns.append(columns_here)
-        density.append(blocks[tuple(places.T)])
-        texels.append(_texel_codes(model_field, k, channels, places))
         count += len(places)
+        for part in places.split(AT_ONCE_BRICKS):
+            density.append(density_codes.encode(_raw(model_field, k, part, shares)))
+            rows, exists = _rows(model_field.grids[k], part)
+            codes = torch.stack([c.encode(features[rows, i]) for i, c in enumerate(channels)], -1)
+            texels.append((codes * exists[..., None]).cpu())
     mpis = BakedMpis(
         plan.mpis,
         tuple(model_field.layout.interval(k) for k in heads),
@@ -223,43 +232,37 @@ def bake(
     return BakedWindow(mpis, shader, plan.ray_near, threshold, background, farthest, exposure)
 
 
-def _planes(model_field: MMPIField, k: int) -> Iterator[slice]:
-    """A few planes at a time."""
-    for start in range(0, model_field.plan.mpis[k].planes, 16):
-        yield slice(start, min(start + 16, model_field.plan.mpis[k].planes))
+def _reached(grid: TexelGrid) -> Bool[Tensor, "P Y X"]:
+    """Baked bricks of a head that hold a stored texel."""
+    stored = grid.own_tiles.cpu() > 0
+    for axis, size in ((1, grid.height), (2, grid.width)):
+        first = torch.arange(-(-(size - 1) // CELLS)) * CELLS
+        ends = [x.clamp(max=size - 1) // TILE for x in (first, first + CELLS)]
+        stored = stored.index_select(axis, ends[0]) | stored.index_select(axis, ends[1])
+    return stored
 
 
-def _raw(model_field: MMPIField, k: int, planes: slice, shares: Tensor | None) -> Float[Tensor, "P H W"]:
-    """Raw densities including the biases of the planes, whose softplus gives the blended optical depth."""
-    grid = model_field.grids[k]
-    raw = read_planes(model_field.density.data, grid, planes)[..., 0] + model_field.layout.biases[k][planes, None, None]
-    if shares is None:
-        return raw.cpu()
-    interval = model_field.layout.interval(k)
-    share = read_planes(shares, grid, planes)[..., 0].clamp(0, 1)
-    tau = torch.nn.functional.softplus(raw) * interval
-    blended = blended_optical_depth(tau, share.log(), torch.log1p(-share))
-    tau = torch.where(tau > NEGLIGIBLE, blended, tau / len(model_field.grids)) / interval
-    return (tau + torch.log(-torch.expm1(-tau.clamp(min=1e-12)))).cpu()
+def _rows(grid: TexelGrid, places: Int[Tensor, "B 3"]) -> tuple[Int[Tensor, "B 8 8"], Bool[Tensor, "B 8 8"]]:
+    """Rows of the texels of baked bricks at (plane, row, column), and which exist: bricks extend beyond planes."""
+    plane, row, column = (x[:, None, None].to(grid.tiles.device) for x in places.unbind(-1))
+    steps = torch.arange(SIDE, device=plane.device)
+    y, x = row * CELLS + steps[:, None], column * CELLS + steps
+    rows = grid.row(plane, y.clamp(max=grid.height - 1), x.clamp(max=grid.width - 1))
+    return rows, (y < grid.height) & (x < grid.width)
 
 
-def _texel_codes(
-    model_field: MMPIField, k: int, channels: tuple[Codes, ...], places: Tensor
-) -> UInt8[Tensor, "B 8 8 C"]:
-    """Codes of the channels in some bricks of one MPI."""
-    bricks = torch.empty(len(places), SIDE, SIDE, len(channels), dtype=torch.uint8)
-    for planes in _planes(model_field, k):
-        chosen = ((places[:, 0] >= planes.start) & (places[:, 0] < planes.stop)).nonzero()[:, 0]
-        values = read_planes(model_field.features.data, model_field.grids[k], planes).cpu()
-        codes = torch.stack([c.encode(values[..., i]) for i, c in enumerate(channels)], -1)
-        plane, row, column = places[chosen].unbind(-1)
-        bricks[chosen] = _tiled(codes)[plane - planes.start, row, column]
-    return bricks
-
-
-def _tiled(images: Tensor) -> Tensor:
-    """Planes [P, H, W, C] in baked bricks [P, Y, X, 8, 8, C], neighbours sharing their border texels."""
-    _, height, width, _ = images.shape
-    below, right = -(height - 1) % CELLS, -(width - 1) % CELLS
-    padded = pad(images, (0, 0, 0, right, 0, below))
-    return padded.unfold(1, SIDE, CELLS).unfold(2, SIDE, CELLS).permute(0, 1, 2, 4, 5, 3)
+def _raw(
+    model_field: MMPIField, k: int, places: Int[Tensor, "B 3"], shares: Float[Tensor, "N 1"] | None
+) -> Float[Tensor, "B 8 8"]:
+    """Raw densities including the biases of the planes, whose softplus gives the blended optical depth; those of
+    texels that do not exist have code 0."""
+    rows, exists = _rows(model_field.grids[k], places)
+    biases = model_field.layout.biases[k]
+    raw = model_field.density.data[rows, 0] + biases[places[:, 0].to(biases.device), None, None]
+    if shares is not None:
+        interval, share = model_field.layout.interval(k), shares[rows, 0].clamp(0, 1)
+        tau = torch.nn.functional.softplus(raw) * interval
+        blended = blended_optical_depth(tau, share.log(), torch.log1p(-share))
+        tau = torch.where(tau > NEGLIGIBLE, blended, tau / len(model_field.grids)) / interval
+        raw = tau + torch.log(-torch.expm1(-tau.clamp(min=1e-12)))
+    return torch.where(exists, raw, THINNEST).cpu()

@@ -7,6 +7,7 @@ from typing import Literal
 
 import torch
 from jaxtyping import Float
+from nerfstudio.utils.colormaps import apply_float_colormap
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor, nn
 from torch.nn.functional import pad
@@ -108,7 +109,7 @@ def depth_metrics(predicted: Float[Tensor, "H W 1"], true: Float[Tensor, "H W 1"
 
 
 def pictures(observed: Float[Tensor, "H W 3"], outputs: dict[str, Tensor], num_heads: int) -> dict[str, Tensor]:
-    """Images for display of a rendered image."""
+    """Images for display of a rendered image. Pixels that a texel spans: blue from 1/2, green 2, red from 8 on."""
     near = 1 / outputs["depth"].clamp(min=1e-9)
     some = near.flatten()[:: 1 + near.numel() // MOST_SORTED]
     return {
@@ -116,6 +117,7 @@ def pictures(observed: Float[Tensor, "H W 3"], outputs: dict[str, Tensor], num_h
         "accumulation": outputs["accumulation"].expand(-1, -1, 3),
         "inverse_depth": (near / some.quantile(0.98).clamp(min=1e-9)).clamp(0, 1).expand(-1, -1, 3),
         "winning_mpi": head_palette(num_heads, observed.device)[outputs["winning_mpi"][..., 0].long()],
+        "texel_pixels": apply_float_colormap((outputs["texel_pixels"].clamp(0.5, 8).log2() + 1) / 4, "turbo"),
     }
 
 

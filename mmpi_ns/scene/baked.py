@@ -121,10 +121,21 @@ def columns_of(mpi: MPIPlan) -> int:
     return words * down * across
 
 
+def bits_of(masks: Int[Tensor, "N"]) -> Int[Tensor, "N 32"]:
+    """The bits of columns, lowest first."""
+    return (masks[:, None] >> torch.arange(WORD)) & 1
+
+
+def numbered_columns(masks: Int[Tensor, "N"]) -> Int[Tensor, "N 2"]:
+    """Columns from their bits: bricks are numbered in the order of columns, and of planes in them."""
+    counts = bits_of(masks).sum(-1)
+    return torch.stack([masks, counts.cumsum(0) - counts], -1).to(torch.int32)
+
+
 def brick_numbers(columns: Int[Tensor, "N 2"], mpi: MPIPlan) -> Int[Tensor, "P Y X"]:
     """Brick of every tile of one MPI from its columns; -1 if it is empty."""
     words, down, across = tiles_of(mpi)
-    bits = (columns[:, :1] >> torch.arange(WORD)) & 1
+    bits = bits_of(columns[:, 0])
     numbers = torch.where(bits > 0, columns[:, 1:] + bits.cumsum(1) - bits, -1)
     return numbers.view(words, down, across, WORD).permute(0, 3, 1, 2).reshape(-1, down, across)[: mpi.planes]
 

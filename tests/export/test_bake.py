@@ -8,6 +8,7 @@ import threading
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from nerfstudio.cameras.rays import RayBundle
@@ -23,6 +24,7 @@ from mmpi_ns.ops import dispatch
 from mmpi_ns.rendering import baked as baking
 from mmpi_ns.rendering.baked import exact_images
 from mmpi_ns.rendering.rendered import bounded, shown_outputs
+from mmpi_ns.scene.baked import brick_numbers, columns_of
 from mmpi_ns.scene.plan import CubePlan
 from mmpi_ns.scripts import export
 
@@ -202,7 +204,7 @@ def test_a_run_is_baked_and_read_again(trainer, tmp_path):
         assert found.to_exact > 35 and abs(found.exact["psnr"] - found.baked["psnr"]) < 0.3
         assert abs(found.exact["ssim"] - found.baked["ssim"]) < 0.01 and found.baked["seconds"] > 0
         assert "dB to the exact" in str(found)
-    assert bake_run(trainer.pipeline, 0, said.append).windows[0][1] is whole
+    assert bake_run(trainer.pipeline, 0, said.append).windows[0][1].mpis.num_bricks == whole.mpis.num_bricks
 
 
 def test_the_weights_of_an_image_are_looked_at_in_parts(trainer, monkeypatch):
@@ -303,3 +305,36 @@ def test_mistakes_are_one_sentence(arguments, words, tmp_path, monkeypatch, caps
     said = capsys.readouterr().err.strip()
     assert caught.value.code == 1 and said.startswith("mmpi-export: ") and words in said and "\n" not in said
     assert all(Path(name).read_text() == "{}" for name in files)
+
+
+def test_baked_codes_are_those_of_the_planes(trainer, monkeypatch, request):
+    """Bricks hold the codes of the whole planes, read texel by texel, and no tile with a code above 0 is missing."""
+    field, g = filled(trainer, 4).field, torch.Generator().manual_seed(2)
+    plan, factor = field.full_plan, field.factor
+    field.copy_finely((field.tiles > 0) & (torch.rand(len(field.tiles), generator=g) < 0.4))
+    request.addfinalizer(lambda: field.build(plan, factor))
+    field._keep(torch.rand(field.num_bricks + 1, generator=g) < 0.6)
+    field.density.data[64:][torch.rand(len(field.density) - 64, generator=g) < 0.3] = -20.0
+    monkeypatch.setattr(baking, "AT_ONCE_BRICKS", 7)
+    baked, seen = baking.bake(field, 3e-3, 0.5).mpis, 0
+    assert (field.tiles == 0).any() and baked.num_bricks > 50
+    for k, mpi in enumerate(baked.mpis):
+        grid, first = field.grids[k], baked.first_column(k)
+        planes = field.density.data[grid.rows, 0].view(grid.depth, grid.height, grid.width)
+        codes = baked.density_codes.encode(planes + field.layout.biases[k][:, None, None])
+        features = field.features.data[grid.rows].view(grid.depth, grid.height, grid.width, -1)
+        stored = (grid.rows >= 64).view(grid.depth, grid.height, grid.width)
+        numbers = brick_numbers(baked.columns[first : first + columns_of(mpi)], mpi)
+        for (plane, row, column), number in zip(np.ndindex(numbers.shape), numbers.flatten().tolist(), strict=True):
+            place = plane, slice(7 * row, 7 * row + 8), slice(7 * column, 7 * column + 8)
+            shows = bool(stored[place].any()) and bool((codes[place] > 0).any())
+            assert (number >= 0) == shows
+            if number < 0:
+                continue
+            height, width = codes[place].shape
+            assert torch.equal(baked.density[number, :height, :width], codes[place])
+            for i, channel in enumerate(baked.channel_codes):
+                assert torch.equal(baked.texels[number, :height, :width, i], channel.encode(features[place][..., i]))
+            assert not baked.density[number, height:].any() and not baked.texels[number, :, width:].any()
+            seen += 1
+    assert seen == baked.num_bricks

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import json
+import math
 import time
 from dataclasses import replace
 
@@ -22,6 +24,10 @@ from mmpi_ns.scene.windows import window_shares
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium to open the page with (apt-get install chromium)")
 CLOSE = 48.0
 """dB between the canvas and our renderer: a canvas holds 8 bits, and a card interpolates codes with 8 bits too."""
+
+
+WHOLE = "[...mmpi.windows.values()].every((w) => w && w.whole)"
+"""All of the windows at hand has come, not the first part alone."""
 
 
 def smooth_window(seed, **settings):
@@ -53,6 +59,7 @@ def tab(tmp_path_factory):
 def opened(tab, site):
     with served(site) as address:
         assert tab.open(f"{address}/index.html") == "ready", tab.evaluate("document.body.innerText")
+        tab.until(WHOLE)
         yield tab
 
 
@@ -80,7 +87,7 @@ def test_windows_are_mixed(opened, site):
     scene = read_baked(site)
     middle = np.add(scene.windows[0][0].center, (2.0, 0.0, 0.0))
     opened.evaluate(f"mmpi.path[0].eye = {middle.tolist()}; mmpi.camera = structuredClone(mmpi.path[0]); mmpi.feed()")
-    opened.until("mmpi.windows.get(0) && mmpi.windows.get(1)")
+    opened.until("mmpi.windows.get(0)?.whole && mmpi.windows.get(1)?.whole")
     pose = scene.path[0]
     for row, value in zip(pose.to_world, middle, strict=True):
         row[3] = float(value)
@@ -203,7 +210,7 @@ def test_a_long_capture_keeps_few_windows(tab, tmp_path):
             assert tab.evaluate(NEEDED_LAST)
             shares = window_shares(torch.tensor(path[number].to_world)[None, :, 3], tuple(w for w, _ in scene.windows))
             for w in shares[0].nonzero()[:, 0].tolist():
-                tab.until(f"mmpi.windows.get({w})")
+                tab.until(f"mmpi.windows.get({w})?.whole")
             assert tab.evaluate("mmpi.windows.size") <= 4
             assert ours(tmp_path, path[number]).std() > 0.01 and -10 * np.log10(difference(number)) > CLOSE - 4
             tab.evaluate("mmpi.press('m')")
@@ -214,9 +221,55 @@ def test_a_long_capture_keeps_few_windows(tab, tmp_path):
     assert tab.messages == []
 
 
+DECODED = """(async () => {
+    const row = mmpi.header.windows[0], [first, rest] = mmpi.source(row, () => {}), shown = [[], []];
+    const { addAtlas } = WindowOnCard.prototype;
+    const into = (which) => { WindowOnCard.prototype.addAtlas = (codes) => which.push(...codes.map((c) => [...c])); };
+    into(shown[0]);
+    const card = await WindowOnCard.load(mmpi.gl, row, await first);
+    into(shown[1]);
+    await card.complete(await rest);
+    WindowOnCard.prototype.addAtlas = addAtlas;
+    return shown;
+})()"""
+"""Codes of density and channels that the page decodes, from the first part of a file and from all of it."""
+
+
+def halved(codes):
+    """Codes [B, 8, 8] with all but every second row and column replaced by means, texel by texel."""
+    codes = codes.to(torch.int64)
+    for y, x in [*itertools.product(range(0, 8, 2), range(1, 8, 2)), *itertools.product(range(1, 8, 2), range(8))]:
+        dy, dx = (0, 1) if y % 2 == 0 else (1, 0)
+        after = codes[:, y + dy, x + dx] if max(y + dy, x + dx) < 8 else codes[:, y - dy, x - dx]
+        codes[:, y, x] = (codes[:, y - dy, x - dx] + after) // 2
+    return codes.to(torch.uint8)
+
+
+def test_the_bricks_that_are_seen_most_come_first_at_half_of_their_resolution(tab, tmp_path):
+    """And then all of them, bit for bit; the first part is a small one."""
+    window = random_window(seed=6)
+    seen = torch.rand(window.mpis.num_bricks, generator=torch.Generator().manual_seed(0))
+    write_baked(scene_of(replace(window, seen=seen)), tmp_path)
+    write_page(tmp_path)
+    row = json.loads((tmp_path / HEADER).read_text())["windows"][0]
+    assert row["first_bytes"] < 0.2 * row["bytes"]  # of noise, whose means tell nothing
+    with served(tmp_path) as address:
+        assert tab.open(f"{address}/index.html") == "ready"
+        tab.until(WHOLE)
+        first, whole = (torch.tensor(x, dtype=torch.uint8) for x in tab.evaluate(DECODED))
+    mpis, count = window.mpis, math.ceil(0.2 * window.mpis.num_bricks)
+    assert torch.equal(whole, torch.stack([mpis.density, *mpis.texels.unbind(-1)]).flatten(2).flatten(1))
+    kept = window.keep(seen >= seen.sort(descending=True).values[count - 1]).mpis
+    expected = [halved(x) for x in (kept.density, *kept.texels.unbind(-1))]
+    for codes in expected:
+        take_borders(codes, neighbours(kept.columns, kept.mpis, kept.num_bricks))
+    assert torch.equal(first, torch.stack(expected).flatten(2).flatten(1))
+
+
 def test_one_file_opens_from_the_disk(tab, site, tmp_path):
     write_single_file(site, tmp_path / "one.html")
     assert tab.open((tmp_path / "one.html").as_uri()) == "ready"
+    tab.until(WHOLE)
     assert shown(tab, 0).std() > 0.02
 
 

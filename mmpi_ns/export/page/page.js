@@ -55,15 +55,16 @@ class Page {
         this.windows.set(w, window);
       } else {
         this.windows.set(w, null);
+        const row = this.header.windows[w];
+        const told = (part) => report(part < 1 ? `Loading ${this.header.name} … ${Math.round(100 * part)} %` : "");
+        const [first, rest] = this.source(row, told);
         try {
-          const row = this.header.windows[w];
-          const bytes = await this.source(row, (part) => report(`Loading ${this.header.name} … ${Math.round(100 * part)} %`));
-          this.windows.set(w, await WindowOnCard.load(this.gl, row, bytes));
-          report("");
+          const window = await WindowOnCard.load(this.gl, row, await first);
+          this.windows.set(w, window);
           this.dirty = true;
+          rest.then((bytes) => window.complete(bytes)).then(() => { told(1); this.dirty = true; }).catch((e) => this.fail(e));
         } catch (error) {
-          this.failed = true;
-          refuse(error);
+          this.fail(error);
         }
       }
     }
@@ -72,6 +73,11 @@ class Page {
         window.free();
         this.windows.delete(w);
       }
+  }
+
+  fail(error) {
+    this.failed = true;
+    refuse(error);
   }
 
   // Draws what a camera sees into the whole canvas of this size.
@@ -235,26 +241,41 @@ function refuse(error) {
   report(error instanceof Refusal ? error.message : `This page does not work here (${error}): reload it, or try another browser.`);
 }
 
-// Bytes of a window: from the page itself where they are in it, else from beside it.
-async function fetchWindow(row, progress) {
-  const inside = $(row.file);
-  if (inside) {
-    const text = atob(inside.textContent.trim()), bytes = new Uint8Array(text.length);
-    for (let i = 0; i < text.length; i++) bytes[i] = text.charCodeAt(i);
-    return bytes;
-  }
+const parsed = new Promise((done) =>
+  document.readyState === "loading" ? document.addEventListener("DOMContentLoaded", done) : done());
+
+function decoded(id) {
+  const text = atob($(id).textContent.trim()), bytes = new Uint8Array(text.length);
+  for (let i = 0; i < text.length; i++) bytes[i] = text.charCodeAt(i);
+  return bytes;
+}
+
+// Bytes of a window, its first part and the rest: from the page itself where they are in it, else from beside it.
+function fetchWindow(row, progress) {
+  if ($(row.file)) return [Promise.resolve(decoded(row.file)), parsed.then(() => decoded(`${row.file}.rest`))];
+  let first, failed;
+  const part = new Promise((...both) => { [first, failed] = both; });
+  const rest = readWindow(row, progress, first);
+  rest.catch(failed);
+  return [part, rest];
+}
+
+async function readWindow(row, progress, first) {
   const response = await fetch(row.file, { cache: "no-cache" });
   if (!response.ok) throw new Refusal(`${row.file} is missing beside this page: copy the whole folder.`);
   const reader = response.body.getReader(), bytes = new Uint8Array(row.bytes);
   let at = 0;
   for (;;) {
     const { done, value } = await reader.read();
-    if (done) return bytes.subarray(0, at);
+    if (done) break;
     if (at + value.length > row.bytes) throw new Refusal(`${row.file} is longer than scene.json says: copy the folder anew.`);
     bytes.set(value, at);
     at += value.length;
-    progress(at / row.bytes);
+    if (at >= row.first_bytes) first(bytes.subarray(0, row.first_bytes));
+    progress(Math.min(at / row.bytes, 0.99));
   }
+  if (at < row.bytes) throw new Refusal(`${row.file} is cut short (${at} of ${row.bytes} bytes): copy it anew.`);
+  return bytes.subarray(row.first_bytes);
 }
 
 async function fetchHeader() {

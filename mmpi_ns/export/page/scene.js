@@ -5,60 +5,101 @@ class Refusal extends Error {} // an error whose message is a sentence for the r
 
 const CHUNK = 8, WORD_WIDTH = 2048;
 
-async function unpack(bytes, spec) {
-  const part = bytes.subarray(spec.offset, spec.offset + spec.bytes);
+// An array of a window, from bytes that begin at `from` in its file.
+async function unpack(bytes, spec, from = 0) {
+  const part = bytes.subarray(spec.offset - from, spec.offset - from + spec.bytes);
   try {
     const stream = new Blob([part]).stream().pipeThrough(new DecompressionStream("gzip"));
     const data = await new Response(stream).arrayBuffer();
     const size = { uint8: 1, uint32: 4, float16: 2 }[spec.type];
     if (data.byteLength !== size * spec.shape.reduce((a, b) => a * b, 1)) throw new Error("wrong length");
-    return data;
+    return new { uint8: Uint8Array, uint32: Uint32Array, float16: Uint16Array }[spec.type](data);
   } catch (error) {
     throw new Refusal(`A file of this scene is damaged (${error.message}): copy it anew, or export the scene again.`);
   }
 }
 
+const ones = (v) => { let n = 0; for (; v; v &= v - 1) n++; return n; };
+
+// Columns as the shader reads them: bits of the planes, and the number of the first brick.
+function numberedColumns(masks) {
+  const columns = new Uint32Array(2 * masks.length);
+  let bricks = 0;
+  masks.forEach((mask, c) => { columns[2 * c] = mask; columns[2 * c + 1] = bricks; bricks += ones(mask); });
+  return columns;
+}
+
+// Numbers of the bricks of `early`, and of the others, among all of `masks`.
+function earlyAndLate(masks, early) {
+  const numbers = [[], []];
+  let brick = 0;
+  masks.forEach((mask, c) => {
+    for (let bit = 0; bit < 32; bit++) if (mask >>> bit & 1) numbers[early[c] >>> bit & 1 ? 0 : 1].push(brick++);
+  });
+  return numbers;
+}
+
 // For each brick the ones right of it and below it in its plane, as they are in `columns`; -1 for none.
 function neighbours(mpis, columns, bricks) {
   const right = new Int32Array(bricks).fill(-1), below = new Int32Array(bricks).fill(-1);
-  const ones = (v) => { let n = 0; for (; v; v &= v - 1) n++; return n; };
   const number = (column, bit) =>
     columns[2 * column] >>> bit & 1 ? columns[2 * column + 1] + ones(columns[2 * column] & ~(-1 << bit)) : -1;
   for (const m of mpis) {
     const across = Math.ceil((m.width - 1) / 7), down = Math.ceil((m.height - 1) / 7), words = Math.ceil(m.planes / 32);
-    for (let c = 0; c < words * down * across; c++)
+    for (let c = 0; c < words * down * across; c++) {
+      if (!columns[2 * (m.first_column + c)]) continue;
       for (let bit = 0; bit < 32; bit++) {
-        const column = m.first_column + c, own = number(column, bit);
-        if (own < 0) continue;
-        if (c % across + 1 < across) right[own] = number(column + 1, bit);
-        if (Math.floor(c / across) % down + 1 < down) below[own] = number(column + across, bit);
+        const column = m.first_column + c, brick = number(column, bit);
+        if (brick < 0) continue;
+        if (c % across + 1 < across) right[brick] = number(column + 1, bit);
+        if (Math.floor(c / across) % down + 1 < down) below[brick] = number(column + across, bit);
       }
+    }
   }
   return { right, below };
 }
 
-// Codes of one channel from the differences that are kept, and border texels from the neighbours.
-function sumDifferences(codes, { right, below }) {
+// Codes of every second row and column from their differences, both [16, bricks], in place.
+function sumDifferences(stored) {
+  const bricks = stored.length / 16;
+  for (let b = 1; b < bricks; b++) stored[b] += stored[b - 1];
+  for (let p = 1; p < 16; p++)
+    if (p % 4) for (let b = 0; b < bricks; b++) stored[p * bricks + b] += stored[(p - 1) * bricks + b];
+  for (let at = 4 * bricks; at < stored.length; at++) stored[at] += stored[at - 4 * bricks];
+  return stored;
+}
+
+// Puts such codes into the 8 x 8 of the bricks of these numbers.
+function placeCoarse(codes, coarse, numbers) {
+  for (let p = 0; p < 16; p++)
+    for (let i = 0; i < numbers.length; i++)
+      codes[64 * numbers[i] + 16 * (p >> 2) + 2 * (p & 3)] = coarse[p * numbers.length + i];
+}
+
+// The other codes: means of those beside them, and the differences from these, [48, bricks], where they are there.
+function addFine(codes, fine) {
   const bricks = codes.length / 64;
-  for (let at = 0; at < codes.length; at += 64) {
-    if (at) codes[at] += codes[at - 64];
-    for (let i = 1; i < 8; i++) codes[at + i] += codes[at + i - 1];
-    for (let row = at + 8; row < at + 64; row += 8) {
-      let sum = 0;
-      for (let x = 0; x < 8; x++) codes[row + x] = codes[row + x - 8] + (sum += codes[row + x]);
-    }
-  }
+  const add = (p, from, step, isLast) => {
+    const row = fine && fine.subarray(from * bricks, (from + 1) * bricks), after = isLast ? -step : step;
+    for (let b = 0, at = p; b < bricks; b++, at += 64) codes[at] = (row ? row[b] : 0) + (codes[at - step] + codes[at + after] >> 1);
+  };
+  for (let y = 0; y < 8; y += 2) for (let x = 1; x < 8; x += 2) add(8 * y + x, 6 * y + (x >> 1), 1, x === 7);
+  for (let y = 1; y < 8; y += 2) for (let x = 0; x < 8; x++) add(8 * y + x, 6 * y - 2 + x, 8, y === 7);
+}
+
+// Border texels from the neighbours that hold them too.
+function takeBorders(codes, { right, below }) {
+  const bricks = codes.length / 64;
   for (let b = 0; b < bricks; b++)
     if (right[b] >= 0) for (let y = 0; y < 7; y++) codes[64 * b + 8 * y + 7] = codes[64 * right[b] + 8 * y];
   for (let b = 0; b < bricks; b++)
     if (below[b] >= 0) for (let x = 0; x < 8; x++) codes[64 * b + 56 + x] = codes[64 * below[b] + x];
   for (let b = 0; b < bricks; b++)
     if (right[b] >= 0 && below[b] < 0) codes[64 * b + 63] = codes[64 * right[b] + 56];
-  return codes;
 }
 
 function halves(data) {
-  return Float32Array.from(new Uint16Array(data), (bits) => {
+  return Float32Array.from(data, (bits) => {
     const exponent = (bits >> 10) & 31, fraction = bits & 1023, sign = bits >> 15 ? -1 : 1;
     if (exponent === 0) return sign * fraction * 2 ** -24;
     return exponent === 31 ? sign * Infinity : sign * (1 + fraction / 1024) * 2 ** (exponent - 15);
@@ -67,8 +108,8 @@ function halves(data) {
 
 function checkHeader(header) {
   if (!header || header.format !== "mmpi-baked") throw new Refusal("scene.json is not the header of a baked scene.");
-  if (header.version !== 2)
-    throw new Refusal(`This scene is of version ${header.version}, and this page reads version 2: export it again.`);
+  if (header.version !== 3)
+    throw new Refusal(`This scene is of version ${header.version}, and this page reads version 3: export it again.`);
   return header;
 }
 
@@ -147,36 +188,59 @@ function networkBlock(shader, numbers, size) {
   return block;
 }
 
-// One window on the graphics card.
+// One window on the graphics card: first the bricks that are seen most, at half of their resolution, then all of it.
 class WindowOnCard {
   static async load(gl, row, bytes) {
-    if (bytes.length !== row.bytes)
-      throw new Refusal(`${row.file} is cut short (${bytes.length} of ${row.bytes} bytes): copy it anew.`);
-    const own = new WindowOnCard();
-    Object.assign(own, { gl, row, textures: [], heads: row.mpis.length });
-    const arrays = row.arrays, channels = row.channels.length, bricks = arrays.density.shape[0];
-    const per = gl.getParameter(gl.MAX_TEXTURE_SIZE) >= 4096 ? 512 : 256;
-    if (Math.ceil(bricks / per) * 8 > gl.getParameter(gl.MAX_TEXTURE_SIZE))
+    const { arrays, channels } = row, limit = gl.getParameter(gl.MAX_TEXTURE_SIZE), per = limit >= 4096 ? 512 : 256;
+    const card = Object.assign(new WindowOnCard(), { gl, row, per, textures: [], heads: row.mpis.length, whole: false });
+    if (Math.ceil(arrays.fine.shape[2] / per) * 8 > limit)
       throw new Refusal("This scene is larger than the textures of this graphics card: export fewer bricks (--least).");
-    const network = networkSource(row.shader, channels);
+    const network = networkSource(row.shader, channels.length);
     if (network.size * 16 > gl.getParameter(gl.MAX_UNIFORM_BLOCK_SIZE))
       throw new Refusal("The network of this scene is too wide for this graphics card.");
-    own.groups = Math.ceil(channels / 4);
-    own.program = own.compile(network.source);
-    const columns = new Uint32Array(await unpack(bytes, arrays.columns));
-    const beside = neighbours(row.mpis, columns, bricks);
-    own.addColumns(columns);
-    const density = sumDifferences(new Uint8Array(await unpack(bytes, arrays.density)), beside);
-    own.addAtlas([density], bricks, per, 1);
-    const texels = new Uint8Array(await unpack(bytes, arrays.texels));
-    for (let g = 0; g < own.groups; g++) {
+    card.groups = Math.ceil(channels.length / 4);
+    card.program = card.compile(network.source);
+    card.earlyMasks = await unpack(bytes, arrays.early_columns);
+    card.early = await unpack(bytes, arrays.early);
+    const numbers = halves(await unpack(bytes, arrays.network)), each = card.early.length / (channels.length + 1);
+    for (let c = 0; c <= channels.length; c++) sumDifferences(card.early.subarray(c * each, (c + 1) * each));
+    card.fill(card.earlyMasks, [[card.early, Array.from({ length: arrays.early.shape[2] }, (_, b) => b)]], null);
+    card.setConstants(networkBlock(row.shader, numbers, network.size));
+    return card;
+  }
+
+  // The rest of the file.
+  async complete(bytes) {
+    const { arrays, channels, first_bytes } = this.row;
+    const masks = await unpack(bytes, arrays.columns, first_bytes), late = await unpack(bytes, arrays.late, first_bytes);
+    const fine = await unpack(bytes, arrays.fine, first_bytes), [first, others] = earlyAndLate(masks, this.earlyMasks);
+    if (this.freed) return;
+    const each = late.length / (channels.length + 1);
+    for (let c = 0; c <= channels.length; c++) sumDifferences(late.subarray(c * each, (c + 1) * each));
+    this.fill(masks, [[this.early, first], [late, others]], fine);
+    this.early = this.earlyMasks = null;
+    this.whole = true;
+  }
+
+  // Textures of the bricks of `masks`. `parts`: coarse codes of all channels, and the numbers of their bricks.
+  fill(masks, parts, fine) {
+    const { row, groups } = this, channels = row.channels.length, bricks = parts.reduce((n, [, numbers]) => n + numbers.length, 0);
+    const columns = numberedColumns(masks), beside = neighbours(row.mpis, columns, bricks);
+    const codesOf = (channel) => {
+      const codes = new Uint8Array(64 * bricks);
+      for (const [coarse, numbers] of parts) placeCoarse(codes, coarse.subarray(channel * 16 * numbers.length, (channel + 1) * 16 * numbers.length), numbers);
+      addFine(codes, fine && fine.subarray(channel * 48 * bricks, (channel + 1) * 48 * bricks));
+      takeBorders(codes, beside);
+      return codes;
+    };
+    this.freeTextures();
+    this.addColumns(columns);
+    this.addAtlas([codesOf(0)], bricks, this.per, 1);
+    for (let g = 0; g < groups; g++) {
       const some = [];
-      for (let c = 4 * g; c < Math.min(channels, 4 * g + 4); c++)
-        some.push(sumDifferences(texels.subarray(c * bricks * 64, (c + 1) * bricks * 64), beside));
-      own.addAtlas(some, bricks, per, 4);
+      for (let c = 4 * g; c < Math.min(channels, 4 * g + 4); c++) some.push(codesOf(1 + c));
+      this.addAtlas(some, bricks, this.per, 4);
     }
-    own.setConstants(networkBlock(row.shader, halves(await unpack(bytes, arrays.network)), network.size));
-    return own;
   }
 
   compile(network) {
@@ -284,8 +348,13 @@ class WindowOnCard {
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
+  freeTextures() {
+    for (const texture of this.textures.splice(0)) this.gl.deleteTexture(texture);
+  }
+
   free() {
-    for (const texture of this.textures) this.gl.deleteTexture(texture);
+    this.freed = true;
+    this.freeTextures();
     this.gl.deleteProgram(this.program);
     this.gl.deleteBuffer(this.buffer);
   }

@@ -36,20 +36,36 @@ class Samples(NamedTuple):
 def read(folder: Path) -> dict[str, Any]:
     """The header, with each window's arrays decoded."""
     scene = json.loads((folder / "scene.json").read_text(encoding="utf-8"))
-    assert scene["format"] == "mmpi-baked" and scene["version"] == 2
+    assert scene["format"] == "mmpi-baked" and scene["version"] == 3
     for window in scene["windows"]:
         blob = (folder / window["file"]).read_bytes()
         for name, a in window["arrays"].items():
             data = gzip.decompress(blob[a["offset"] : a["offset"] + a["bytes"]])
             window[name + "_array"] = np.frombuffer(data, a["type"]).reshape(a["shape"])
-        for name in ("density_array", "texels_array"):  # differences along rows and columns, and from brick to brick
-            codes = window[name].reshape(-1, len(window["density_array"]), 8, 8).copy()
-            codes[:, :, 0, 0] = np.cumsum(codes[:, :, 0, 0], axis=1, dtype=np.uint8)
-            codes = codes.cumsum(-1, dtype=np.uint8).cumsum(-2, dtype=np.uint8)
-            take_borders(window, codes)
-            window[name] = codes.reshape(window[name].shape)
-        window["texels_array"] = np.moveaxis(window["texels_array"], 0, -1)
+        codes = decode(window)
+        window["density_array"], window["texels_array"] = codes[0], np.moveaxis(codes[1:], 0, -1)
     return scene
+
+
+def decode(window: Window) -> np.ndarray:
+    """Codes [channels, B, 64] of the density and the other channels; fills in the numbers of bricks in the columns."""
+    bits, early = (window[name][:, None] >> np.arange(32) & 1 for name in ("columns_array", "early_columns_array"))
+    counts, early = bits.sum(1), early[bits > 0] > 0
+    window["columns_array"] = np.stack([window["columns_array"], counts.cumsum() - counts], 1)
+    codes = np.zeros((len(window["fine_array"]), len(early), 8, 8), np.uint8)
+    for name, which in (("early_array", early), ("late_array", ~early)):  # every second row and column
+        part = np.moveaxis(window[name], 1, -1).reshape(len(codes), -1, 4, 4).copy()
+        part[:, :, 0, 0] = np.cumsum(part[:, :, 0, 0], axis=1, dtype=np.uint8)
+        codes[:, which, ::2, ::2] = part.cumsum(-1, dtype=np.uint8).cumsum(-2, dtype=np.uint8)
+    is_fine = (np.arange(64) % 16 >= 8) | (np.arange(64) % 2 > 0)
+    codes.reshape(*codes.shape[:2], 64)[..., is_fine] = np.moveaxis(window["fine_array"], 1, -1)
+    after = [1, 2, 3, 3]  # the last row and column have nothing behind them
+    even = codes[:, :, ::2, ::2].astype(np.uint16)
+    codes[:, :, ::2, 1::2] += ((even + even[..., after]) // 2).astype(np.uint8)
+    even = codes[:, :, ::2].astype(np.uint16)
+    codes[:, :, 1::2] += ((even + even[:, :, after]) // 2).astype(np.uint8)
+    take_borders(window, codes)
+    return codes.reshape(*codes.shape[:2], 64)
 
 
 def brick_numbers(window: Window, mpi: dict[str, Any]) -> np.ndarray:
