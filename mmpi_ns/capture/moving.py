@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -21,6 +22,7 @@ from mmpi_ns.capture.dataset import MMPIDataset
 from mmpi_ns.capture.dense import Depth, Parallax, Progress, find_depths
 from mmpi_ns.capture.moving_evidence import Mask, Neighbour, Shot, evidence, ground_of, has_impossible_depth
 from mmpi_ns.capture.moving_objects import followed, grown, seeds
+from mmpi_ns.capture.moving_sweep import floats, sweep
 from mmpi_ns.capture.observe import posed_images
 from mmpi_ns.capture.people import horizon_of, people_in, upright
 from mmpi_ns.capture.tracks import PosedImages, at_full_size
@@ -40,6 +42,10 @@ ROUNDS = (2, 1)
 """Of dense matching: at half the size, then at that size."""
 AFTER = 2
 """Nearest neighbours from which objects are followed."""
+ERODE = 5
+USE_FLOATS = True
+NEAR = 15
+"""Pixels across which weaker evidence around a mover counts."""
 EDGE = 0.4
 """Share of a mover around a pixel from which it is masked."""
 SECONDS = 0.3
@@ -163,20 +169,35 @@ def at_exposure_of(shot: Shot, other: Shot) -> Neighbour:
     return Neighbour(other, np.rint(other.color * gain).clip(0, 255).astype(np.uint8), parallax)
 
 
+@dataclass(frozen=True)
+class _Clues:
+    """What does not depend on what moves in the neighbours. [h, w] each"""
+
+    impossible: Mask
+    """Where an impossible depth explains the image."""
+    apart: Mask
+    """Where it has a depth that nothing static has."""
+
+
 def _moves(
-    shots: Sequence[Shot], near: Sequence[int], i: int, masks: Sequence[Mask], impossible: Mask | None
-) -> tuple[Mask, Mask]:
-    """What moves in an image, where it is known what moves in others, and where it has impossible depths."""
+    shots: Sequence[Shot], near: Sequence[int], i: int, masks: Sequence[Mask], clues: _Clues | None
+) -> tuple[Mask, _Clues]:
+    """What moves in an image, where it is known what moves in others, and the clues of an earlier pass."""
     shot = shots[i]
     others = [at_exposure_of(shot, shots[j]) for j in near]
-    if impossible is None:
-        impossible = has_impossible_depth(shot, others)
-    shown = evidence(shot, others, [masks[j] for j in near], impossible)
-    core = np.zeros(shot.view.gray.shape, bool)
+    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+    if clues is None:
+        clues = _Clues(has_impossible_depth(shot, others), np.zeros(shot.view.gray.shape, bool))
+        swept = sweep(shot, others)
+        if swept is not None:
+            size = shot.view.gray.shape[::-1]
+            apart = swept.impossible | (floats(shot, others, swept.inverse) if USE_FLOATS else False)
+            clues = replace(clues, apart=cv2.resize(apart.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0)
+    shown = evidence(shot, others, [masks[j] for j in near], clues.impossible)
+    core = cv2.erode(clues.apart.astype(np.uint8), np.ones((ERODE, ERODE), np.uint8)) > 0
     if len(others) >= 2:
         core |= seeds(shot, others, shown)
-        flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
         for j in near[:AFTER]:
             if masks[j].any():
                 core |= followed(shot, shots[j], masks[j], flow)
-    return grown(shot, shown, core), impossible
+    return grown(shot, shown, core), clues
