@@ -21,7 +21,7 @@ from mmpi_ns.capture.cache import Arrays, Computed, digest, remembered
 from mmpi_ns.capture.dataset import MMPIDataset
 from mmpi_ns.capture.dense import Depth, Parallax, Progress, find_depths
 from mmpi_ns.capture.moving_evidence import Mask, Neighbour, Shot, evidence, ground_of, has_impossible_depth
-from mmpi_ns.capture.moving_objects import followed, grown, seeds
+from mmpi_ns.capture.moving_objects import followed, grown, is_static, seeds
 from mmpi_ns.capture.moving_sweep import floats, sweep
 from mmpi_ns.capture.observe import posed_images
 from mmpi_ns.capture.people import horizon_of, people_in, upright
@@ -195,6 +195,7 @@ def _moves(
             clues = replace(clues, apart=cv2.resize(apart.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0)
     shown = evidence(shot, others, [masks[j] for j in near], clues.impossible)
     core = cv2.erode(clues.apart.astype(np.uint8), np.ones((ERODE, ERODE), np.uint8)) > 0
+    core &= ~is_static(shot, shown)
     if len(others) >= 2:
         core |= seeds(shot, others, shown)
         for j in near[:AFTER]:

@@ -28,7 +28,7 @@ LEAST_PIXELS, LEAST_SIDE = 20, 4
 """Seeds of an object, and the shorter side of what they span, pixels at working size."""
 SOLID_SIDE, SOLID_PIXELS = 5, 50
 """Width of motion that flow shows, and its pixels, at least."""
-EXPLAINED = -1
+ROAD = 6
 TOGETHER = 15
 """Pixels across which seeds belong to one object."""
 TALL = 1.15
@@ -89,7 +89,7 @@ def is_static(shot: Shot, evidence: Evidence) -> Mask:
     """Where a possible depth is known and nothing contradicts it. [h, w]"""
     static = (shot.depth.inverse > 0) & (evidence.behind < CERTAIN) & (evidence.weak < CERTAIN)
     static = static if shot.ground is None else static & (shot.depth.inverse > SOLID * shot.ground)
-    return static | (evidence.static < EXPLAINED)
+    return static | (evidence.road < ROAD)
 
 
 def solid(mask: Mask) -> Mask:

@@ -28,6 +28,7 @@ BELOW, MARGIN = 0.6, 0.02
 ALIKE, BETTER, CONTRAST = 0.8, 0.15, 3.0
 """Correlation at an impossible depth, what it has over the best possible one, and standard deviation of gray levels
 around a pixel, at least, for the pixel to move."""
+COHERENT = 1.1
 SMOOTH, LEAST_PIXELS, STANDS = 5, 30, 0.3
 """Pixels across which most must move, pixels of what moves, and share of them below the horizon, at half the size."""
 
@@ -64,7 +65,7 @@ def sweep(shot: Shot, others: Sequence[Neighbour]) -> Sweep | None:
     near = [halved(other.shot.view) for other in others[:NEIGHBOURS]]
     parallax = [Parallax.between(view, other) for other in near]
     moves, stands = np.full((2, *shape), -1, np.float32)
-    inverse, best = np.zeros((2, *shape), np.float32)
+    inverse, best, wrong = np.zeros((3, *shape), np.float32)
     behind = np.linspace(-largest / 2, 0, NEGATIVE, endpoint=False)
     for q in np.concatenate([behind, np.linspace(0, largest, POSITIVE)]).astype(np.float32):
         alike = []
@@ -75,12 +76,15 @@ def sweep(shot: Shot, others: Sequence[Neighbour]) -> Sweep | None:
             alike.append(np.where(inside, correlation(view.gray, look_up(other.gray, x, y), of_view), -1))
         both = np.sort(np.stack(alike), 0)[-CONFIRM:].mean(0)
         impossible = q < least
+        np.copyto(wrong, q, where=impossible & (both > moves))
         np.maximum(moves, both, out=moves, where=impossible)
         np.maximum(stands, both, out=stands, where=~impossible)
         np.copyto(inverse, q, where=both > best)
         np.maximum(best, both, out=best)
+    step = largest / POSITIVE
+    coherent = np.abs(wrong - cv2.medianBlur(wrong, 5)) <= COHERENT * step
     textured = view.inside & (of_view[1] > CONTRAST)
-    impossible = (moves > ALIKE) & (stands < moves - BETTER) & textured
+    impossible = (moves > ALIKE) & (stands < moves - BETTER) & textured & coherent
     return Sweep(np.where((best > 0.7) & (of_view[1] > 2.0), inverse, 0), solid(impossible, ground))
 
 
