@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -20,9 +19,9 @@ from rich.progress import track
 from mmpi_ns.capture.cache import Arrays, Computed, digest, remembered
 from mmpi_ns.capture.dataset import MMPIDataset
 from mmpi_ns.capture.dense import Depth, Parallax, Progress, find_depths
-from mmpi_ns.capture.moving_evidence import Mask, Neighbour, Shot, evidence, ground_of, has_impossible_depth
+from mmpi_ns.capture.moving_evidence import Mask, Neighbour, Shot, evidence, ground_of
 from mmpi_ns.capture.moving_objects import followed, grown, is_static, seeds
-from mmpi_ns.capture.moving_sweep import floats, sweep
+from mmpi_ns.capture.moving_sweep import Sweep, sweep
 from mmpi_ns.capture.observe import posed_images
 from mmpi_ns.capture.people import horizon_of, people_in, upright
 from mmpi_ns.capture.tracks import PosedImages, at_full_size
@@ -42,10 +41,6 @@ ROUNDS = (2, 1)
 """Of dense matching: at half the size, then at that size."""
 AFTER = 2
 """Nearest neighbours from which objects are followed."""
-ERODE = 5
-USE_FLOATS = True
-NEAR = 15
-"""Pixels across which weaker evidence around a mover counts."""
 EDGE = 0.4
 """Share of a mover around a pixel from which it is masked."""
 SECONDS = 0.3
@@ -169,36 +164,20 @@ def at_exposure_of(shot: Shot, other: Shot) -> Neighbour:
     return Neighbour(other, np.rint(other.color * gain).clip(0, 255).astype(np.uint8), parallax)
 
 
-@dataclass(frozen=True)
-class _Clues:
-    """What does not depend on what moves in the neighbours. [h, w] each"""
-
-    impossible: Mask
-    """Where an impossible depth explains the image."""
-    apart: Mask
-    """Where it has a depth that nothing static has."""
-
-
 def _moves(
-    shots: Sequence[Shot], near: Sequence[int], i: int, masks: Sequence[Mask], clues: _Clues | None
-) -> tuple[Mask, _Clues]:
-    """What moves in an image, where it is known what moves in others, and the clues of an earlier pass."""
+    shots: Sequence[Shot], near: Sequence[int], i: int, masks: Sequence[Mask], swept: Sweep | None
+) -> tuple[Mask, Sweep]:
+    """What moves in an image, where it is known what moves in others, and its sweep, which does not depend on that."""
     shot = shots[i]
     others = [at_exposure_of(shot, shots[j]) for j in near]
-    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
-    if clues is None:
-        clues = _Clues(has_impossible_depth(shot, others), np.zeros(shot.view.gray.shape, bool))
+    if swept is None:
         swept = sweep(shot, others)
-        if swept is not None:
-            size = shot.view.gray.shape[::-1]
-            apart = swept.impossible | (floats(shot, others, swept.inverse) if USE_FLOATS else False)
-            clues = replace(clues, apart=cv2.resize(apart.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0)
-    shown = evidence(shot, others, [masks[j] for j in near], clues.impossible)
-    core = cv2.erode(clues.apart.astype(np.uint8), np.ones((ERODE, ERODE), np.uint8)) > 0
-    core &= ~is_static(shot, shown)
+    shown = evidence(shot, others, [masks[j] for j in near], swept.impossible)
+    core = swept.certain & ~is_static(shot, shown)
     if len(others) >= 2:
         core |= seeds(shot, others, shown)
+        flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
         for j in near[:AFTER]:
             if masks[j].any():
                 core |= followed(shot, shots[j], masks[j], flow)
-    return grown(shot, shown, core), clues
+    return grown(shot, shown, core), swept

@@ -26,9 +26,7 @@ DENSITY, AROUND = 0.35, 7
 """Share of seeds in a window of this many pixels around a seed that is kept."""
 LEAST_PIXELS, LEAST_SIDE = 20, 4
 """Seeds of an object, and the shorter side of what they span, pixels at working size."""
-SOLID_SIDE, SOLID_PIXELS = 5, 50
-"""Width of motion that flow shows, and its pixels, at least."""
-ROAD = 6
+ROAD = 0
 TOGETHER = 15
 """Pixels across which seeds belong to one object."""
 TALL = 1.15
@@ -88,25 +86,14 @@ def unexplained(shot: Shot, others: Sequence[Neighbour], candidates: Mask) -> ND
 def is_static(shot: Shot, evidence: Evidence) -> Mask:
     """Where a possible depth is known and nothing contradicts it. [h, w]"""
     static = (shot.depth.inverse > 0) & (evidence.behind < CERTAIN) & (evidence.weak < CERTAIN)
-    static = static if shot.ground is None else static & (shot.depth.inverse > SOLID * shot.ground)
-    return static | (evidence.road < ROAD)
-
-
-def solid(mask: Mask) -> Mask:
-    """The parts of a mask that are areas instead of lines or spots. [h, w]"""
-    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (SOLID_SIDE, SOLID_SIDE))
-    opened = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, kernel)
-    _, labels, boxes, _ = cv2.connectedComponentsWithStats(opened)
-    kept = boxes[:, cv2.CC_STAT_AREA] >= SOLID_PIXELS
-    kept[0] = False
-    return kept[labels]
+    return static if shot.ground is None else static & (shot.depth.inverse > SOLID * shot.ground)
 
 
 def grown(shot: Shot, evidence: Evidence, core: Mask) -> Mask:
     """The objects that seeds lie on, and people, by GrabCut in a box around them. [h, w]"""
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (TOGETHER, TOGETHER))
     number, labels = cv2.connectedComponents(cv2.dilate(core.astype(np.uint8), kernel))
-    static = is_static(shot, evidence)
+    static = is_static(shot, evidence) | (evidence.road < ROAD)
     result = np.zeros_like(core)
     for label in range(1, number):
         part = core & (labels == label)

@@ -1,9 +1,9 @@
 """What moves along with the camera or towards it, by depths that nothing static can have.
 
-Something that moves parallel to the camera's path is seen as a static thing is, but at a wrong inverse depth: q (1 - v),
-with v its speed over the camera's. A car ahead that keeps its distance seems infinitely far, below the road; one that
-overtakes seems to lie behind the camera; one that comes towards it seems nearer and smaller than it is, and hangs in the
-air. So each image is compared with its neighbours at a range of inverse depths that reaches below 0, at half the size.
+Something that moves parallel to the camera's path looks like a static thing at a wrong inverse depth: its own times
+1 - v, with v its speed over the camera's. A car ahead that keeps its distance seems infinitely far, below the road; one
+that overtakes seems to lie behind the camera; one that comes towards it seems nearer and smaller than it is, so that it
+hangs in the air. So a shot is compared with its neighbours at inverse depths that reach below 0, at half its size.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from mmpi_ns.capture.dense import Parallax, correlation, mean_and_contrast
 from mmpi_ns.capture.moving_evidence import Mask, Neighbour, Shot
@@ -29,18 +28,51 @@ ALIKE, BETTER, CONTRAST = 0.8, 0.15, 3.0
 """Correlation at an impossible depth, what it has over the best possible one, and standard deviation of gray levels
 around a pixel, at least, for the pixel to move."""
 COHERENT = 1.1
+"""Steps by which the impossible depth may differ from the median around it: chance makes scattered ones."""
 SMOOTH, LEAST_PIXELS, STANDS = 5, 30, 0.3
 """Pixels across which most must move, pixels of what moves, and share of them below the horizon, at half the size."""
+INSIDE = 9
+"""Pixels across which all must move, at the size of the shot: windows reach beyond what moves."""
+MEASURED, MEASURED_CONTRAST = 0.7, 2.0
+"""Correlation and contrast from which a depth is taken for what hangs in the air."""
+FLOATS = 1.4
+"""Inverse depth of a thing over that of the ground just below it, at least, for it to hang in the air."""
+EDGE, PIECE = 1.25, 20
+"""Factor by which inverse depths next to each other differ at the edge of a thing, and pixels of one, at least."""
+GAP, ON_GROUND, BARE = 12, 0.2, 0.6
+"""Pixels below it in which the first measured depth must be the ground's but for this share, and share of its columns
+where it is."""
+STRAIGHT = 0.05
+"""Distance of cameras from a straight line over the length of their path, at most: else depths are what they seem."""
+FAR = 1e30
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """Where the neighbours look most alike. [h, w] each, at half the size"""
+    """Where a shot shows what moves parallel to the camera's path. [h, w] each"""
 
-    inverse: Map
-    """Inverse depth, also negative; 0 where nothing is alike."""
     impossible: Mask
-    """Where only an impossible inverse depth is alike."""
+    """Neighbours look alike at a depth below the ground or behind the camera, and at no possible one."""
+    certain: Mask
+    """The inner part of it, and what hangs in the air."""
+
+
+def sweep(shot: Shot, others: Sequence[Neighbour]) -> Sweep:
+    """Compares a shot with its neighbours at depths that static things may have, and at others."""
+    nothing, measured = np.zeros(shot.view.gray.shape, bool), shot.depth.inverse[shot.depth.inverse > 0]
+    if shot.ground is None or not len(measured) or len(others) < CONFIRM:
+        return Sweep(nothing, nothing)
+    view, largest = halved(shot.view), REACH * float(np.percentile(measured, 98))
+    ground = cv2.resize(shot.ground, view.gray.shape[::-1], interpolation=cv2.INTER_NEAREST)
+    inverse, below = _at_all_depths(view, [halved(other.shot.view) for other in others[:NEIGHBOURS]], ground, largest)
+    views = [shot.view, *(other.shot.view for other in others)]
+    air = floats(inverse, ground) if is_straight(views) else np.zeros_like(below)
+    below, air = (
+        cv2.resize(mask.astype(np.uint8), nothing.shape[::-1], interpolation=cv2.INTER_NEAREST)
+        for mask in (solid(below, ground), air)
+    )
+    inner = cv2.erode(below, np.ones((INSIDE, INSIDE), np.uint8))
+    return Sweep(below > 0, (inner | air) > 0)
 
 
 def halved(view: View) -> View:
@@ -52,40 +84,31 @@ def halved(view: View) -> View:
     return View(np.asarray(gray, np.uint8), view.pinhole * scale, view.pose, inside)
 
 
-def sweep(shot: Shot, others: Sequence[Neighbour]) -> Sweep | None:
-    """Compares a shot with its neighbours at depths that static things may have, and others; None without a ground."""
-    measured = shot.depth.inverse[shot.depth.inverse > 0]
-    if shot.ground is None or not len(measured) or len(others) < CONFIRM:
-        return None
-    view, largest = halved(shot.view), REACH * float(np.percentile(measured, 98))
-    shape = view.gray.shape
-    ground = cv2.resize(shot.ground, shape[::-1], interpolation=cv2.INTER_NEAREST)
-    least = BELOW * ground - MARGIN * largest
-    of_view = mean_and_contrast(view.gray)
-    near = [halved(other.shot.view) for other in others[:NEIGHBOURS]]
-    parallax = [Parallax.between(view, other) for other in near]
-    moves, stands = np.full((2, *shape), -1, np.float32)
-    inverse, best, wrong = np.zeros((3, *shape), np.float32)
-    behind = np.linspace(-largest / 2, 0, NEGATIVE, endpoint=False)
-    for q in np.concatenate([behind, np.linspace(0, largest, POSITIVE)]).astype(np.float32):
-        alike = []
-        for other, there in zip(near, parallax, strict=True):
+def _at_all_depths(view: View, others: Sequence[View], ground: Map, largest: float) -> tuple[Map, Mask]:
+    """The inverse depth at which most is alike, 0 where nothing is, and where only impossible ones are. [h, w] each"""
+    shape, of_view = view.gray.shape, mean_and_contrast(view.gray)
+    parallax = [Parallax.between(view, other) for other in others]
+    least, step = BELOW * ground - MARGIN * largest, largest / POSITIVE
+    moves, stands, best = np.full((3, *shape), -1, np.float32)
+    inverse, false = np.zeros((2, *shape), np.float32)
+    for n in range(-NEGATIVE, POSITIVE + 1):
+        q, alike = np.float32(n * step), []
+        for other, there in zip(others, parallax, strict=True):
             x, y, ahead = there.pixels(np.full(shape, q))
             height, width = other.gray.shape
             inside = (x > 0.5) & (x < width - 0.5) & (y > 0.5) & (y < height - 0.5) & (ahead > 0)
             alike.append(np.where(inside, correlation(view.gray, look_up(other.gray, x, y), of_view), -1))
-        both = np.sort(np.stack(alike), 0)[-CONFIRM:].mean(0)
+        confirmed = np.sort(np.stack(alike), 0)[-CONFIRM:].mean(0)
         impossible = q < least
-        np.copyto(wrong, q, where=impossible & (both > moves))
-        np.maximum(moves, both, out=moves, where=impossible)
-        np.maximum(stands, both, out=stands, where=~impossible)
-        np.copyto(inverse, q, where=both > best)
-        np.maximum(best, both, out=best)
-    step = largest / POSITIVE
-    coherent = np.abs(wrong - cv2.medianBlur(wrong, 5)) <= COHERENT * step
+        np.copyto(false, q, where=impossible & (confirmed > moves))
+        np.maximum(moves, confirmed, out=moves, where=impossible)
+        np.maximum(stands, confirmed, out=stands, where=~impossible)
+        np.copyto(inverse, q, where=confirmed > best)
+        np.maximum(best, confirmed, out=best)
+    inverse = np.where((best > MEASURED) & (of_view[1] > MEASURED_CONTRAST), inverse, 0)
+    coherent = np.abs(false - cv2.medianBlur(false, 5)) <= COHERENT * step
     textured = view.inside & (of_view[1] > CONTRAST)
-    impossible = (moves > ALIKE) & (stands < moves - BETTER) & textured & coherent
-    return Sweep(np.where((best > 0.7) & (of_view[1] > 2.0), inverse, 0), solid(impossible, ground))
+    return inverse, (moves > ALIKE) & (stands < moves - BETTER) & textured & coherent
 
 
 def solid(moves: Mask, ground: Map) -> Mask:
@@ -98,45 +121,36 @@ def solid(moves: Mask, ground: Map) -> Mask:
     return kept[labels]
 
 
-FLOATS = 1.4
-"""Inverse depth of a thing over that of the ground just below it, at least, for it to hang in the air."""
-EDGE, PIECE = 1.25, 20
-"""Factor by which inverse depths next to each other differ at the edge of a thing, and pixels of one, at least."""
-GAP, BARE = 12, 0.6
-"""Pixels below it in which the first known depth must be the ground's, and share of its columns where it is."""
-STRAIGHT = 0.05
-"""Distance of cameras from a straight line over the length of their path, at most: else depths are what they seem."""
-FAR = 1e30
+def is_straight(views: Sequence[View]) -> bool:
+    """Whether cameras stand on a straight line: then one thing that moves along it has one false depth in all."""
+    centers = np.stack([view.pose[:, 3] for view in views])
+    sizes = np.linalg.svd(centers - centers.mean(0), compute_uv=False)
+    return len(centers) >= 3 and bool(sizes[1] <= STRAIGHT * sizes[0])
 
 
-def floats(shot: Shot, others: Sequence[Neighbour], inverse: Map) -> Mask:
-    """What seems to hang in the air, as a car does that comes towards a camera: nearer than it is, and smaller. [h, w]
+def floats(inverse: Map, ground: Map) -> Mask:
+    """What seems to hang in the air, as a car does that comes towards the camera: nearer than it is, and smaller.
 
-    A camera that goes straight on cannot tell it from a static thing but by where it stands.
+    Args:
+        inverse: inverse depth, 0 or less where unknown. [h, w]
+        ground: inverse depth of the ground, 0 near the horizon and above. [h, w]
     """
     result = np.zeros(inverse.shape, bool)
-    centers = np.stack([s.view.pose[:, 3] for s in (shot, *(other.shot for other in others))])
-    sizes = np.linalg.svd(centers - centers.mean(0), compute_uv=False)
-    if shot.ground is None or len(centers) < 3 or sizes[1] > STRAIGHT * sizes[0]:
-        return result
-    ground = cv2.resize(shot.ground, inverse.shape[::-1], interpolation=cv2.INTER_NEAREST)
     inverse = cv2.medianBlur(np.maximum(inverse, 0), 5)
     kernel = np.ones((3, 3), np.uint8)
     smallest = cv2.erode(np.where(inverse > 0, inverse, FAR).astype(np.float32), kernel)
-    whole = cv2.dilate(inverse, kernel) < EDGE * smallest  # things end where depth jumps
-    stands = (inverse > FLOATS * ground) & (inverse > 0) & whole
-    on_ground = (inverse > 0) & (np.abs(inverse - ground) < 0.2 * ground)
-    _, labels, boxes, _ = cv2.connectedComponentsWithStats(stands.astype(np.uint8))
+    whole = (inverse > 0) & (cv2.dilate(inverse, kernel) < EDGE * smallest)  # things end where depth jumps
+    on_ground = np.abs(inverse - ground) < ON_GROUND * ground
+    _, labels, boxes, _ = cv2.connectedComponentsWithStats(((inverse > FLOATS * ground) & whole).astype(np.uint8))
     for label in np.flatnonzero(boxes[:, cv2.CC_STAT_AREA] >= PIECE)[1:]:
         left, top, width, height = boxes[label, :4]
         window = np.s_[top : top + height + GAP, left : left + width]
         part = labels[window] == label
         last = len(part) - 1 - part[::-1].argmax(0)
-        columns = np.flatnonzero(part.any(0))
-        below = np.arange(len(part))[:, None] > last[columns]
-        shown = ((inverse > 0) & whole)[window][:, columns] & below
+        columns = np.arange(part.shape[1])
+        shown = whole[window] & (np.arange(len(part))[:, None] > last)
         first = shown.argmax(0)
-        bare = shown.any(0) & on_ground[window][first, columns] & (ground[window][last[columns], columns] > 0)
-        if bare.mean() > BARE:
-            result[top : top + len(part), left : left + width] |= part
+        bare = shown.any(0) & on_ground[window][first, columns] & (ground[window][last, columns] > 0)
+        if bare[part.any(0)].mean() > BARE:
+            result[window] |= part
     return result
