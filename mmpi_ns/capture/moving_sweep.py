@@ -13,13 +13,14 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from mmpi_ns.capture.dense import Parallax, correlation, mean_and_contrast
 from mmpi_ns.capture.moving_evidence import Mask, Neighbour, Shot
-from mmpi_ns.capture.views import Map, View, look_up
+from mmpi_ns.capture.views import Map, View
 
-NEIGHBOURS, CONFIRM = 4, 2
-"""Nearest neighbours that are compared, and those whose correlations count, the best at each depth."""
+NEIGHBOURS = 4
+"""Nearest neighbours that are compared; the mean of the two best correlations counts at each depth."""
 NEGATIVE, POSITIVE, REACH = 24, 48, 1.2
 """Inverse depths behind the camera and before it, up to this multiple of the nearest content's; half of it behind."""
 BELOW, MARGIN = 0.6, 0.02
@@ -60,7 +61,7 @@ class Sweep:
 def sweep(shot: Shot, others: Sequence[Neighbour]) -> Sweep:
     """Compares a shot with its neighbours at depths that static things may have, and at others."""
     nothing, measured = np.zeros(shot.view.gray.shape, bool), shot.depth.inverse[shot.depth.inverse > 0]
-    if shot.ground is None or not len(measured) or len(others) < CONFIRM:
+    if shot.ground is None or not len(measured) or len(others) < 2:
         return Sweep(nothing, nothing)
     view, largest = halved(shot.view), REACH * float(np.percentile(measured, 98))
     ground = cv2.resize(shot.ground, view.gray.shape[::-1], interpolation=cv2.INTER_NEAREST)
@@ -92,13 +93,13 @@ def _at_all_depths(view: View, others: Sequence[View], ground: Map, largest: flo
     moves, stands, best = np.full((3, *shape), -1, np.float32)
     inverse, false = np.zeros((2, *shape), np.float32)
     for n in range(-NEGATIVE, POSITIVE + 1):
-        q, alike = np.float32(n * step), []
+        q = np.float32(n * step)
+        first, second = np.full((2, *shape), -1, np.float32)
         for other, there in zip(others, parallax, strict=True):
-            x, y, ahead = there.pixels(np.full(shape, q))
-            height, width = other.gray.shape
-            inside = (x > 0.5) & (x < width - 0.5) & (y > 0.5) & (y < height - 0.5) & (ahead > 0)
-            alike.append(np.where(inside, correlation(view.gray, look_up(other.gray, x, y), of_view), -1))
-        confirmed = np.sort(np.stack(alike), 0)[-CONFIRM:].mean(0)
+            alike = _alike(view, other, there.linear + np.outer(there.b, [0, 0, q]), of_view)
+            second = np.maximum(second, np.minimum(first, alike))
+            first = np.maximum(first, alike)
+        confirmed = (first + second) / 2
         impossible = q < least
         np.copyto(false, q, where=impossible & (confirmed > moves))
         np.maximum(moves, confirmed, out=moves, where=impossible)
@@ -109,6 +110,21 @@ def _at_all_depths(view: View, others: Sequence[View], ground: Map, largest: flo
     coherent = np.abs(false - cv2.medianBlur(false, 5)) <= COHERENT * step
     textured = view.inside & (of_view[1] > CONTRAST)
     return inverse, (moves > ALIKE) & (stands < moves - BETTER) & textured & coherent
+
+
+def _alike(view: View, other: View, plane: NDArray[np.float64], of_view: tuple[Map, Map]) -> Map:
+    """Correlation with another view through a plane; -1 where it shows nothing. [h, w]"""
+    height, width = view.gray.shape
+    corners = plane[2] @ [[0, width, 0, width], [0, 0, height, height], [1, 1, 1, 1]]
+    if corners.min() <= 0:  # in part behind the other camera
+        return np.full(view.gray.shape, -1, np.float32)
+    middle = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])  # OpenCV counts from the middle of the first pixel
+    places = np.linalg.inv(middle) @ plane @ middle
+    seen, inside = (
+        cv2.warpPerspective(image, places, (width, height), flags=mode | cv2.WARP_INVERSE_MAP)
+        for image, mode in ((other.gray, cv2.INTER_LINEAR), (other.inside.astype(np.uint8), cv2.INTER_NEAREST))
+    )
+    return np.where(inside > 0, correlation(view.gray, np.asarray(seen, np.uint8), of_view), -1)
 
 
 def solid(moves: Mask, ground: Map) -> Mask:
