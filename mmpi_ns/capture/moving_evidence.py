@@ -77,8 +77,6 @@ class Evidence:
     """By which it differs from all neighbours but one, two of which agree about what is behind it."""
     behind: Bytes
     """By which it differs from what two neighbours agree to be behind it."""
-    road: Bytes
-    """By which it differs from all neighbours but one at the depth of the ground."""
     noise: float
     """Levels by which surfaces of known depth differ from all neighbours but one, most of them."""
 
@@ -226,9 +224,8 @@ def evidence(shot: Shot, others: Sequence[Neighbour], masks: Sequence[Mask | Non
     shape = shot.view.gray.shape
     if len(others) < 2:
         nothing = np.zeros(shape, np.uint8)
-        return Evidence(nothing, nothing, nothing, nothing, 0.0)
+        return Evidence(nothing, nothing, nothing, 0.0)
     one, two, behind = np.full(shape, ALL, np.uint8), np.full(shape, ALL, np.uint8), np.zeros(shape, np.uint8)
-    road = np.full(shape, ALL, np.uint8)
     mine, surfaces = possible_depths(shot, others)
     for n, inverse in enumerate(mine + surfaces):
         distances, pair = _compare(shot, others, masks, inverse, n >= len(mine))
@@ -241,8 +238,6 @@ def evidence(shot: Shot, others: Sequence[Neighbour], masks: Sequence[Mask | Non
             first = cv2.min(first, distance)
         for least, of_depth in ((one, first), (two, second)):
             np.minimum(least, of_depth, out=least, where=possible)
-        if inverse is shot.ground:
-            np.copyto(road, second, where=possible)
         np.maximum(behind, pair, out=behind, where=possible)
     # Nobody can tell where fewer than two neighbours would show even the nearest content.
     measured = shot.depth.inverse[shot.depth.inverse > 0]
@@ -256,4 +251,4 @@ def evidence(shot: Shot, others: Sequence[Neighbour], masks: Sequence[Mask | Non
     strong = np.where(decided & (one < ALL), np.minimum(one, np.where(impossible, ALL, behind)), 0).astype(np.uint8)
     weak = np.where(decided & (two < ALL), np.minimum(two, behind), 0).astype(np.uint8)
     differences = two[(shot.depth.inverse > 0) & (two < ALL)]
-    return Evidence(strong, weak, behind, road, float(np.percentile(differences, NOISE)) if len(differences) else 0.0)
+    return Evidence(strong, weak, behind, float(np.percentile(differences, NOISE)) if len(differences) else 0.0)

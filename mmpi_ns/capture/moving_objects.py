@@ -26,7 +26,6 @@ DENSITY, AROUND = 0.35, 7
 """Share of seeds in a window of this many pixels around a seed that is kept."""
 LEAST_PIXELS, LEAST_SIDE = 20, 4
 """Seeds of an object, and the shorter side of what they span, pixels at working size."""
-ROAD = 0
 TOGETHER = 15
 """Pixels across which seeds belong to one object."""
 TALL = 1.15
@@ -93,7 +92,7 @@ def grown(shot: Shot, evidence: Evidence, core: Mask) -> Mask:
     """The objects that seeds lie on, and people, by GrabCut in a box around them. [h, w]"""
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (TOGETHER, TOGETHER))
     number, labels = cv2.connectedComponents(cv2.dilate(core.astype(np.uint8), kernel))
-    static = is_static(shot, evidence) | (evidence.road < ROAD)
+    static = is_static(shot, evidence)
     result = np.zeros_like(core)
     for label in range(1, number):
         part = core & (labels == label)

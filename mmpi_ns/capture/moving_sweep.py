@@ -32,7 +32,7 @@ COHERENT = 1.1
 """Steps by which the impossible depth may differ from the median around it: chance makes scattered ones."""
 SMOOTH, LEAST_PIXELS, STANDS = 5, 30, 0.3
 """Pixels across which most must move, pixels of what moves, and share of them below the horizon, at half the size."""
-INSIDE = 9
+INSIDE = 11
 """Pixels across which all must move, at the size of the shot: windows reach beyond what moves."""
 MEASURED, MEASURED_CONTRAST = 0.7, 2.0
 """Correlation and contrast from which a depth is taken for what hangs in the air."""
