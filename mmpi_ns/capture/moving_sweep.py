@@ -64,7 +64,7 @@ def sweep(shot: Shot, others: Sequence[Neighbour]) -> Sweep:
     if shot.ground is None or not len(measured) or len(others) < 2:
         return Sweep(nothing, nothing)
     view, largest = halved(shot.view), REACH * float(np.percentile(measured, 98))
-    ground = cv2.resize(shot.ground, view.gray.shape[::-1], interpolation=cv2.INTER_NEAREST)
+    ground = np.asarray(cv2.resize(shot.ground, view.gray.shape[::-1], interpolation=cv2.INTER_NEAREST), np.float32)
     inverse, below = _at_all_depths(view, [halved(other.shot.view) for other in others[:NEIGHBOURS]], ground, largest)
     views = [shot.view, *(other.shot.view for other in others)]
     air = floats(inverse, ground) if is_straight(views) else np.zeros_like(below)
@@ -93,10 +93,10 @@ def _at_all_depths(view: View, others: Sequence[View], ground: Map, largest: flo
     moves, stands, best = np.full((3, *shape), -1, np.float32)
     inverse, false = np.zeros((2, *shape), np.float32)
     for n in range(-NEGATIVE, POSITIVE + 1):
-        q = np.float32(n * step)
+        q = n * step
         first, second = np.full((2, *shape), -1, np.float32)
         for other, there in zip(others, parallax, strict=True):
-            alike = _alike(view, other, there.linear + np.outer(there.b, [0, 0, q]), of_view)
+            alike = _alike(view, other, there.linear + np.outer(there.b, np.array([0, 0, q])), of_view)
             second = np.maximum(second, np.minimum(first, alike))
             first = np.maximum(first, alike)
         confirmed = (first + second) / 2
@@ -134,7 +134,7 @@ def solid(moves: Mask, ground: Map) -> Mask:
     stands = np.bincount(labels.ravel(), (ground > 0).ravel(), number) / boxes[:, cv2.CC_STAT_AREA]
     kept = (boxes[:, cv2.CC_STAT_AREA] >= LEAST_PIXELS) & (stands > STANDS)
     kept[0] = False
-    return kept[labels]
+    return kept[np.asarray(labels, np.int64)]
 
 
 def is_straight(views: Sequence[View]) -> bool:
@@ -152,7 +152,7 @@ def floats(inverse: Map, ground: Map) -> Mask:
         ground: inverse depth of the ground, 0 near the horizon and above. [h, w]
     """
     result = np.zeros(inverse.shape, bool)
-    inverse = cv2.medianBlur(np.maximum(inverse, 0), 5)
+    inverse = np.asarray(cv2.medianBlur(np.maximum(inverse, 0), 5), np.float32)
     kernel = np.ones((3, 3), np.uint8)
     smallest = cv2.erode(np.where(inverse > 0, inverse, FAR).astype(np.float32), kernel)
     whole = (inverse > 0) & (cv2.dilate(inverse, kernel) < EDGE * smallest)  # things end where depth jumps
