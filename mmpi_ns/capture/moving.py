@@ -1,7 +1,8 @@
 """What moves in the images of a scene: cars and people that no static scene explains, as masks.
 
 Every image is compared with its neighbours at reduced size (``moving_evidence.py``), also at depths that only something
-that moves can seem to have (``moving_sweep.py``); what is left over grows to objects (``moving_objects.py``). A second pass looks again near images in which something moves, without what moves in them.
+that moves can seem to have (``moving_sweep.py``); what is left over grows to objects (``moving_objects.py``). A second
+pass looks again near images in which something moves, without what moves in them.
 """
 
 from __future__ import annotations
