@@ -1,7 +1,8 @@
 """What moves in the images of a scene: cars and people that no static scene explains, as masks.
 
-Every image is compared with its neighbours at reduced size (``moving_evidence.py``); what is left over grows to objects
-(``moving_objects.py``). A second pass looks again near images in which something moves, without what moves in them.
+Every image is compared with its neighbours at reduced size (``moving_evidence.py``), also at depths that only something
+that moves can seem to have (``moving_sweep.py``); what is left over grows to objects (``moving_objects.py``). A second
+pass looks again near images in which something moves, without what moves in them.
 """
 
 from __future__ import annotations
@@ -19,8 +20,9 @@ from rich.progress import track
 from mmpi_ns.capture.cache import Arrays, Computed, digest, remembered
 from mmpi_ns.capture.dataset import MMPIDataset
 from mmpi_ns.capture.dense import Depth, Parallax, Progress, find_depths
-from mmpi_ns.capture.moving_evidence import Mask, Neighbour, Shot, evidence, ground_of, has_impossible_depth
-from mmpi_ns.capture.moving_objects import followed, grown, seeds
+from mmpi_ns.capture.moving_evidence import Mask, Neighbour, Shot, evidence, ground_of
+from mmpi_ns.capture.moving_objects import followed, grown, is_static, seeds
+from mmpi_ns.capture.moving_sweep import Sweep, sweep
 from mmpi_ns.capture.observe import posed_images
 from mmpi_ns.capture.people import horizon_of, people_in, upright
 from mmpi_ns.capture.tracks import PosedImages, at_full_size
@@ -44,7 +46,7 @@ EDGE = 0.4
 """Share of a mover around a pixel from which it is masked."""
 SECONDS = 0.3
 """Processor seconds for an image, for the forecast (docs/log/performance.md)."""
-VERSION = 3
+VERSION = 4
 """Version of the algorithm: cached masks of another version are found anew."""
 ENOUGH, SAMPLES = 200, 5000
 """Pixels of one depth in both images from which their exposures are compared, at least and at most."""
@@ -164,19 +166,19 @@ def at_exposure_of(shot: Shot, other: Shot) -> Neighbour:
 
 
 def _moves(
-    shots: Sequence[Shot], near: Sequence[int], i: int, masks: Sequence[Mask], impossible: Mask | None
-) -> tuple[Mask, Mask]:
-    """What moves in an image, where it is known what moves in others, and where it has impossible depths."""
+    shots: Sequence[Shot], near: Sequence[int], i: int, masks: Sequence[Mask], swept: Sweep | None
+) -> tuple[Mask, Sweep]:
+    """What moves in an image, where it is known what moves in others, and its sweep, which does not depend on that."""
     shot = shots[i]
     others = [at_exposure_of(shot, shots[j]) for j in near]
-    if impossible is None:
-        impossible = has_impossible_depth(shot, others)
-    shown = evidence(shot, others, [masks[j] for j in near], impossible)
-    core = np.zeros(shot.view.gray.shape, bool)
+    if swept is None:
+        swept = sweep(shot, others)
+    shown = evidence(shot, others, [masks[j] for j in near], swept.impossible)
+    core = swept.certain & ~is_static(shot, shown)
     if len(others) >= 2:
         core |= seeds(shot, others, shown)
         flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
         for j in near[:AFTER]:
             if masks[j].any():
                 core |= followed(shot, shots[j], masks[j], flow)
-    return grown(shot, shown, core), impossible
+    return grown(shot, shown, core), swept

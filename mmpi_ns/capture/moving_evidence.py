@@ -3,7 +3,7 @@
 A static point looks alike in all images that see it. So each pixel is compared with its neighbours at every inverse
 depth that a static point there may have: its own or that of a pixel beside it, the depths of the neighbours, the
 ground's, and infinity. A pixel that none of them explains moves if two neighbours agree about something else behind it,
-or if an impossible depth explains it: below the ground or behind the camera, as of a car ahead that keeps its distance.
+or if an impossible depth explains it (``moving_sweep.py``).
 """
 
 from __future__ import annotations
@@ -25,10 +25,6 @@ Mask = NDArray[np.bool_]
 
 SAME = 12
 """Levels by which colours of one surface differ, beyond the range of colours of the pixels around."""
-ALIKE = 8
-"""Levels up to which an impossible depth explains a pixel."""
-IMPOSSIBLE = (0.0, 0.5, -0.5)
-"""Depths below the ground that are tried, as multiples of its inverse depth."""
 SOLID = 0.75
 """Inverse depths below this multiple of the ground's lie below the ground."""
 SLOPE = 0.05
@@ -41,8 +37,6 @@ OCCLUDES, NEAR = 1.15, 13
 """A neighbour shows a point if its inverse depth in a window of this many pixels is the same but for this factor."""
 NEAREST = 95
 """Percentile of an image's inverse depths that stands for the nearest content."""
-CONSTANT = 3
-"""Neighbours, at least, that an impossible depth explains."""
 CLEARLY, WINDOW = 80, 5
 """Levels beyond which a larger difference says no more, and side of the window over which differences are averaged."""
 NOISE = 75
@@ -218,17 +212,6 @@ def most_of_channels(apart: NDArray[Any]) -> Bytes:
     return np.asarray(cv2.max(cv2.max(blue, green), red), np.uint8)
 
 
-def has_impossible_depth(shot: Shot, others: Sequence[Neighbour]) -> Mask:
-    """Where a depth below the ground or behind the camera explains a shot's pixels, of these neighbours. [h, w]"""
-    result = np.zeros(shot.view.gray.shape, bool)
-    for share in IMPOSSIBLE if shot.ground is not None and others else ():
-        inverse = share * shot.ground - 1e-9  # type: ignore[operator]
-        distances, _ = _compare(shot, others, [None] * len(others), inverse, False)
-        alike = np.sum([distance < ALIKE for distance in distances], 0, np.uint8)
-        result |= (alike >= min(CONSTANT, len(others))) & (shot.ground > 0)  # type: ignore[operator]
-    return result
-
-
 def evidence(shot: Shot, others: Sequence[Neighbour], masks: Sequence[Mask | None], impossible: Mask) -> Evidence:
     """What of a shot no static scene explains.
 
@@ -236,7 +219,7 @@ def evidence(shot: Shot, others: Sequence[Neighbour], masks: Sequence[Mask | Non
         shot: the image.
         others: its neighbours.
         masks: what moves in each neighbour, as far as is known. [h, w]
-        impossible: by ``has_impossible_depth``. [h, w]
+        impossible: where only an impossible depth is alike (``moving_sweep.py``). [h, w]
     """
     shape = shot.view.gray.shape
     if len(others) < 2:

@@ -82,13 +82,17 @@ def unexplained(shot: Shot, others: Sequence[Neighbour], candidates: Mask) -> ND
     return np.where(seen, ordered[1].min(0), 0).astype(np.uint8)
 
 
+def is_static(shot: Shot, evidence: Evidence) -> Mask:
+    """Where a possible depth is known and nothing contradicts it. [h, w]"""
+    static = (shot.depth.inverse > 0) & (evidence.behind < CERTAIN) & (evidence.weak < CERTAIN)
+    return static if shot.ground is None else static & (shot.depth.inverse > SOLID * shot.ground)
+
+
 def grown(shot: Shot, evidence: Evidence, core: Mask) -> Mask:
     """The objects that seeds lie on, and people, by GrabCut in a box around them. [h, w]"""
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (TOGETHER, TOGETHER))
     number, labels = cv2.connectedComponents(cv2.dilate(core.astype(np.uint8), kernel))
-    static = (shot.depth.inverse > 0) & (evidence.behind < CERTAIN) & (evidence.weak < CERTAIN)
-    if shot.ground is not None:
-        static &= shot.depth.inverse > SOLID * shot.ground
+    static = is_static(shot, evidence)
     result = np.zeros_like(core)
     for label in range(1, number):
         part = core & (labels == label)

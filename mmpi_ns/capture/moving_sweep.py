@@ -1,0 +1,172 @@
+"""What moves along with the camera or towards it, by depths that nothing static can have.
+
+Something that moves parallel to the camera's path looks like a static thing at a wrong inverse depth: its own times
+1 - v, with v its speed over the camera's. A car ahead that keeps its distance seems infinitely far, below the road; one
+that overtakes seems to lie behind the camera; one that comes towards it seems nearer and smaller than it is, so that it
+hangs in the air. So a shot is compared with its neighbours at inverse depths that reach below 0, at half its size.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mmpi_ns.capture.dense import Parallax, correlation, mean_and_contrast
+from mmpi_ns.capture.moving_evidence import Mask, Neighbour, Shot
+from mmpi_ns.capture.views import Map, View
+
+NEIGHBOURS = 4
+"""Nearest neighbours that are compared; the mean of the two best correlations counts at each depth."""
+NEGATIVE, POSITIVE, REACH = 24, 48, 1.2
+"""Inverse depths behind the camera and before it, up to this multiple of the nearest content's; half of it behind."""
+BELOW, MARGIN = 0.6, 0.02
+"""An inverse depth is impossible below this multiple of the ground's less this multiple of the largest."""
+ALIKE, BETTER, CONTRAST = 0.8, 0.15, 3.0
+"""Correlation at an impossible depth, what it has over the best possible one, and standard deviation of gray levels
+around a pixel, at least, for the pixel to move."""
+COHERENT = 1.1
+"""Steps by which the impossible depth may differ from the median around it: chance makes scattered ones."""
+SMOOTH, LEAST_PIXELS, STANDS = 5, 30, 0.3
+"""Pixels across which most must move, pixels of what moves, and share of them below the horizon, at half the size."""
+INSIDE = 11
+"""Pixels across which all must move, at the size of the shot: windows reach beyond what moves."""
+MEASURED, MEASURED_CONTRAST = 0.7, 2.0
+"""Correlation and contrast from which a depth is taken for what hangs in the air."""
+FLOATS = 1.4
+"""Inverse depth of a thing over that of the ground just below it, at least, for it to hang in the air."""
+EDGE, PIECE = 1.25, 20
+"""Factor by which inverse depths next to each other differ at the edge of a thing, and pixels of one, at least."""
+GAP, ON_GROUND, BARE = 12, 0.2, 0.6
+"""Pixels below it in which the first measured depth must be the ground's but for this share, and share of its columns
+where it is."""
+STRAIGHT = 0.05
+"""Distance of cameras from a straight line over the length of their path, at most: else depths are what they seem."""
+FAR = 1e30
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """Where a shot shows what moves parallel to the camera's path. [h, w] each"""
+
+    impossible: Mask
+    """Neighbours look alike at a depth below the ground or behind the camera, and at no possible one."""
+    certain: Mask
+    """The inner part of it, and what hangs in the air."""
+
+
+def sweep(shot: Shot, others: Sequence[Neighbour]) -> Sweep:
+    """Compares a shot with its neighbours at depths that static things may have, and at others."""
+    nothing, measured = np.zeros(shot.view.gray.shape, bool), shot.depth.inverse[shot.depth.inverse > 0]
+    if shot.ground is None or not len(measured) or len(others) < 2:
+        return Sweep(nothing, nothing)
+    view, largest = halved(shot.view), REACH * float(np.percentile(measured, 98))
+    ground = np.asarray(cv2.resize(shot.ground, view.gray.shape[::-1], interpolation=cv2.INTER_NEAREST), np.float32)
+    inverse, below = _at_all_depths(view, [halved(other.shot.view) for other in others[:NEIGHBOURS]], ground, largest)
+    views = [shot.view, *(other.shot.view for other in others)]
+    air = floats(inverse, ground) if is_straight(views) else np.zeros_like(below)
+    below, air = (
+        cv2.resize(mask.astype(np.uint8), nothing.shape[::-1], interpolation=cv2.INTER_NEAREST)
+        for mask in (solid(below, ground), air)
+    )
+    inner = cv2.erode(below, np.ones((INSIDE, INSIDE), np.uint8))
+    return Sweep(below > 0, (inner | air) > 0)
+
+
+def halved(view: View) -> View:
+    """A view at half its size."""
+    height, width = (n // 2 for n in view.gray.shape)
+    scale = np.array([width / view.gray.shape[1], height / view.gray.shape[0]] * 2)
+    inside = cv2.resize(view.inside.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
+    gray = cv2.resize(view.gray, (width, height), interpolation=cv2.INTER_AREA)
+    return View(np.asarray(gray, np.uint8), view.pinhole * scale, view.pose, inside)
+
+
+def _at_all_depths(view: View, others: Sequence[View], ground: Map, largest: float) -> tuple[Map, Mask]:
+    """The inverse depth at which most is alike, 0 where nothing is, and where only impossible ones are. [h, w] each"""
+    shape, of_view = view.gray.shape, mean_and_contrast(view.gray)
+    parallax = [Parallax.between(view, other) for other in others]
+    least, step = BELOW * ground - MARGIN * largest, largest / POSITIVE
+    moves, stands, best = np.full((3, *shape), -1, np.float32)
+    inverse, false = np.zeros((2, *shape), np.float32)
+    for n in range(-NEGATIVE, POSITIVE + 1):
+        q = n * step
+        first, second = np.full((2, *shape), -1, np.float32)
+        for other, there in zip(others, parallax, strict=True):
+            alike = _alike(view, other, there.linear + np.outer(there.b, np.array([0, 0, q])), of_view)
+            second = np.maximum(second, np.minimum(first, alike))
+            first = np.maximum(first, alike)
+        confirmed = (first + second) / 2
+        impossible = q < least
+        np.copyto(false, q, where=impossible & (confirmed > moves))
+        np.maximum(moves, confirmed, out=moves, where=impossible)
+        np.maximum(stands, confirmed, out=stands, where=~impossible)
+        np.copyto(inverse, q, where=confirmed > best)
+        np.maximum(best, confirmed, out=best)
+    inverse = np.where((best > MEASURED) & (of_view[1] > MEASURED_CONTRAST), inverse, 0)
+    coherent = np.abs(false - cv2.medianBlur(false, 5)) <= COHERENT * step
+    textured = view.inside & (of_view[1] > CONTRAST)
+    return inverse, (moves > ALIKE) & (stands < moves - BETTER) & textured & coherent
+
+
+def _alike(view: View, other: View, plane: NDArray[np.float64], of_view: tuple[Map, Map]) -> Map:
+    """Correlation with another view through a plane; -1 where it shows nothing. [h, w]"""
+    height, width = view.gray.shape
+    corners = plane[2] @ [[0, width, 0, width], [0, 0, height, height], [1, 1, 1, 1]]
+    if corners.min() <= 0:  # in part behind the other camera
+        return np.full(view.gray.shape, -1, np.float32)
+    middle = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])  # OpenCV counts from the middle of the first pixel
+    places = np.linalg.inv(middle) @ plane @ middle
+    seen, inside = (
+        cv2.warpPerspective(image, places, (width, height), flags=mode | cv2.WARP_INVERSE_MAP)
+        for image, mode in ((other.gray, cv2.INTER_LINEAR), (other.inside.astype(np.uint8), cv2.INTER_NEAREST))
+    )
+    return np.where(inside > 0, correlation(view.gray, np.asarray(seen, np.uint8), of_view), -1)
+
+
+def solid(moves: Mask, ground: Map) -> Mask:
+    """What moves without specks, lines, and what does not reach below the horizon. [h, w]"""
+    filled = cv2.boxFilter(moves.astype(np.float32), -1, (SMOOTH, SMOOTH)) > 0.5
+    number, labels, boxes, _ = cv2.connectedComponentsWithStats(filled.astype(np.uint8))
+    stands = np.bincount(labels.ravel(), (ground > 0).ravel(), number) / boxes[:, cv2.CC_STAT_AREA]
+    kept = (boxes[:, cv2.CC_STAT_AREA] >= LEAST_PIXELS) & (stands > STANDS)
+    kept[0] = False
+    return kept[np.asarray(labels, np.int64)]
+
+
+def is_straight(views: Sequence[View]) -> bool:
+    """Whether cameras stand on a straight line: then one thing that moves along it has one false depth in all."""
+    centers = np.stack([view.pose[:, 3] for view in views])
+    sizes = np.linalg.svd(centers - centers.mean(0), compute_uv=False)
+    return len(centers) >= 3 and bool(sizes[1] <= STRAIGHT * sizes[0])
+
+
+def floats(inverse: Map, ground: Map) -> Mask:
+    """What seems to hang in the air, as a car does that comes towards the camera: nearer than it is, and smaller.
+
+    Args:
+        inverse: inverse depth, 0 or less where unknown. [h, w]
+        ground: inverse depth of the ground, 0 near the horizon and above. [h, w]
+    """
+    result = np.zeros(inverse.shape, bool)
+    inverse = np.asarray(cv2.medianBlur(np.maximum(inverse, 0), 5), np.float32)
+    kernel = np.ones((3, 3), np.uint8)
+    smallest = cv2.erode(np.where(inverse > 0, inverse, FAR).astype(np.float32), kernel)
+    whole = (inverse > 0) & (cv2.dilate(inverse, kernel) < EDGE * smallest)  # things end where depth jumps
+    on_ground = np.abs(inverse - ground) < ON_GROUND * ground
+    _, labels, boxes, _ = cv2.connectedComponentsWithStats(((inverse > FLOATS * ground) & whole).astype(np.uint8))
+    for label in np.flatnonzero(boxes[:, cv2.CC_STAT_AREA] >= PIECE)[1:]:
+        left, top, width, height = boxes[label, :4]
+        window = np.s_[top : top + height + GAP, left : left + width]
+        part = labels[window] == label
+        last = len(part) - 1 - part[::-1].argmax(0)
+        columns = np.arange(part.shape[1])
+        shown = whole[window] & (np.arange(len(part))[:, None] > last)
+        first = shown.argmax(0)
+        bare = shown.any(0) & on_ground[window][first, columns] & (ground[window][last, columns] > 0)
+        if bare[part.any(0)].mean() > BARE:
+            result[window] |= part
+    return result
