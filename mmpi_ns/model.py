@@ -24,8 +24,8 @@ from mmpi_ns.capture.rays import image_rays
 from mmpi_ns.field.mmpi_field import ColourConfig, MMPIField
 from mmpi_ns.field.samples import metadata_of
 from mmpi_ns.ops import dispatch
+from mmpi_ns.ops.layout import Shapes
 from mmpi_ns.ops.march import MarchOptions
-from mmpi_ns.ops.plan_shapes import Shapes
 from mmpi_ns.placement.defaults import steps_for
 from mmpi_ns.placement.rule import PlacementConfig
 from mmpi_ns.placement.split import most_pixels, place_windows
@@ -35,26 +35,26 @@ from mmpi_ns.rendering.images import rays_per_chunk, render_in_chunks, render_wi
 from mmpi_ns.rendering.metrics import ImageMetrics, depth_metrics, pictures
 from mmpi_ns.rendering.rendered import (
     BACKGROUNDS,
+    MMPISampler,
     RenderedRays,
     RenderingConfig,
+    SamplingConfig,
     background_of,
     bounded,
     render_rays,
     sampled_outputs,
     shown_outputs,
 )
-from mmpi_ns.rendering.sampler import MMPISampler, SamplingConfig
 from mmpi_ns.rendering.window_store import WindowStore
 from mmpi_ns.scene.plan import NO_PLAN
 from mmpi_ns.scene.visible_tiles import TrainingViews
 from mmpi_ns.scene.windows import WindowedPlan
-from mmpi_ns.training.batch_rays import individual_rays, move_rays
 from mmpi_ns.training.checkpoints import check_there_are_checkpoints
 from mmpi_ns.training.losses import LossWeights, batch_losses, over_background, photometric
 from mmpi_ns.training.memory import Work, fit_memory
 from mmpi_ns.training.options import grouped
 from mmpi_ns.training.phases import ScheduleConfig, make_schedule
-from mmpi_ns.training.run import Progress, TrainingRun, views_of
+from mmpi_ns.training.run import Progress, TrainingRun, individual_rays, move_rays, views_of
 from mmpi_ns.utils.errors import InputError, say
 from mmpi_ns.utils.parallel import torch_apart
 from mmpi_ns.utils.random_draws import generator

@@ -21,7 +21,7 @@ from PIL import Image
 from mmpi_ns.bench.machine import processor
 from mmpi_ns.bench.trainers import JOINT, P, Scene, Steps, no_tracks, train_words
 from mmpi_ns.ops import dispatch
-from mmpi_ns.ops.plan_shapes import EVERY, SMALL, Shapes
+from mmpi_ns.ops.layout import EVERY, SMALL, Shapes
 
 STEPS, RAYS = 20, 1024
 """Steps that are timed, and rays of each."""
