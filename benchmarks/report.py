@@ -20,7 +20,7 @@ from typing import Any, ClassVar
 import torch
 
 import mmpi_ns
-from mmpi_ns.bench.machine import commit, processor
+from mmpi_ns.utils.machine import commit, processor
 from mmpi_ns.utils.values import Number, check_options
 
 Row = dict[str, Any]

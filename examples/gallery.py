@@ -11,9 +11,9 @@ from typing import Any
 from demo import Demo
 from figures import animate, shrink
 
-from mmpi_ns.bench.machine import commit, processor
 from mmpi_ns.scene.windows import WindowedPlan
 from mmpi_ns.scripts.command import run
+from mmpi_ns.utils.machine import commit, processor
 
 SHOWN = {
     "street": (

@@ -13,7 +13,7 @@ from PIL import Image, ImageDraw
 from views import Picture, Run, View, render_alone, render_view, truth_of
 
 from mmpi_ns.placement.observations import Array
-from mmpi_ns.placement.show.explain import describe_facing
+from mmpi_ns.placement.show import describe_facing
 from mmpi_ns.scene.plan import CubePlan
 
 LABELS, VIEW, GAP = 400, 360, 6

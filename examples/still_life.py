@@ -14,7 +14,7 @@ from mmpi_ns.scripts.command import run
 from mmpi_ns.synthetic.cameras import Cameras
 from mmpi_ns.synthetic.dataset import write_dataset
 from mmpi_ns.synthetic.indoor import DARK_OAK, OAK
-from mmpi_ns.synthetic.kit import BEIGE, BROWN, PAINTS, WALLS, WHITE, Kit, look
+from mmpi_ns.synthetic.primitives import BEIGE, BROWN, PAINTS, WALLS, WHITE, Kit, look
 from mmpi_ns.synthetic.scene import Light, Scene
 from mmpi_ns.synthetic.surroundings import floor_inside, open_sky
 

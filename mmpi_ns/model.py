@@ -9,7 +9,7 @@ from threading import current_thread, main_thread
 from typing import Any, Literal
 
 import torch
-from nerfstudio.cameras.camera_optimizers import CameraOptimizer, CameraOptimizerConfig
+from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.scene_box import OrientedBox
@@ -24,8 +24,8 @@ from mmpi_ns.capture.rays import image_rays
 from mmpi_ns.field.mmpi_field import ColourConfig, MMPIField
 from mmpi_ns.field.samples import metadata_of
 from mmpi_ns.ops import dispatch
+from mmpi_ns.ops.layout import Shapes
 from mmpi_ns.ops.march import MarchOptions
-from mmpi_ns.ops.plan_shapes import Shapes
 from mmpi_ns.placement.defaults import steps_for
 from mmpi_ns.placement.rule import PlacementConfig
 from mmpi_ns.placement.split import most_pixels, place_windows
@@ -35,8 +35,10 @@ from mmpi_ns.rendering.images import rays_per_chunk, render_in_chunks, render_wi
 from mmpi_ns.rendering.metrics import ImageMetrics, depth_metrics, pictures
 from mmpi_ns.rendering.rendered import (
     BACKGROUNDS,
+    MMPISampler,
     RenderedRays,
     RenderingConfig,
+    SamplingConfig,
     background_of,
     bounded,
     render_rays,
@@ -44,18 +46,16 @@ from mmpi_ns.rendering.rendered import (
     shown_outputs,
     winners,
 )
-from mmpi_ns.rendering.sampler import MMPISampler, SamplingConfig
 from mmpi_ns.rendering.window_store import WindowStore
 from mmpi_ns.scene.plan import NO_PLAN
 from mmpi_ns.scene.visible_tiles import TrainingViews
 from mmpi_ns.scene.windows import WindowedPlan
-from mmpi_ns.training.batch_rays import individual_rays, move_rays
 from mmpi_ns.training.checkpoints import check_there_are_checkpoints
 from mmpi_ns.training.losses import LossWeights, batch_losses, over_background, photometric
 from mmpi_ns.training.memory import Work, fit_memory
 from mmpi_ns.training.options import grouped
 from mmpi_ns.training.phases import ScheduleConfig, make_schedule
-from mmpi_ns.training.run import Progress, TrainingRun, views_of
+from mmpi_ns.training.run import Progress, TrainingRun, individual_rays, move_rays, views_of
 from mmpi_ns.utils.errors import InputError, say
 from mmpi_ns.utils.parallel import torch_apart
 from mmpi_ns.utils.random_draws import generator
@@ -125,9 +125,8 @@ class MMPIModel(Model):
         windows = self._fitting_plan(views) if self.trains else self._plan(config.placement)
         phases = replace(config.schedule, training="joint" if self._is_joint(windows) else "two-phase")
         count = len(windows)
-        self.progress = Progress(
-            windows, make_schedule(phases, max(1, config.total_steps), count, metadata.get(DEPTHS_KNOWN, False))
-        )
+        schedule = make_schedule(phases, max(1, config.total_steps), count, metadata.get(DEPTHS_KNOWN, False))
+        self.progress = Progress(windows, schedule)
         self._expect_shapes()
         dispatch.choose(config.ops)
         self.field = self._new_field(views_of(windows.windows[0], views))
@@ -139,15 +138,14 @@ class MMPIModel(Model):
         self.scoring: Callable[[dict[str, Tensor], dict[str, Tensor]], tuple[dict, dict]] | None = None
         """In place of ``scores_and_images`` while the pipeline evaluates images, whose exposures it knows."""
         self.show = ViewerDropdown("Show MPI", "all", ["all", *windows.names], hint="One MPI alone, or all")
-        poses = config.camera_optimizer.setup(num_cameras=self.num_train_data, device=device)
-        self.camera_optimizer: CameraOptimizer = poses
+        self.camera_optimizer = config.camera_optimizer.setup(num_cameras=self.num_train_data, device=device)
         if config.camera_optimizer.mode != "off" and count > 1:
             raise InputError(
                 f"The capture is trained in {count} windows, one after the other, and poses are refined in one alone: "
                 "refine them before (mmpi-prepare --refine-poses), or give --pipeline.model.placement.window-length 0."
             )
         scale_is_free = observations is not None and not len(observations.seen_by)
-        release, moves = config.schedule.release_weight, [*poses.parameters()]
+        release, moves = config.schedule.release_weight, [*self.camera_optimizer.parameters()]
         self.run = TrainingRun(self.progress, self.field, self.store, views, release, moves, scale_is_free)
         self.register_load_state_dict_post_hook(type(self)._take_plan)
 
@@ -166,16 +164,16 @@ class MMPIModel(Model):
         )  # fmt: skip
         fixed = config.plan_file is not None or placement.arrangement != "automatic"
         again = None if fixed else lambda most: self._plan(replace(placement, max_texels=most))
-        device = self.kwargs.get("device", "cpu")
-        return fit_memory(windows, lambda window: views_of(window, views), work, device, again)
+        return fit_memory(
+            windows, lambda window: views_of(window, views), work, self.kwargs.get("device", "cpu"), again
+        )
 
     def _plan(self, placement: PlacementConfig) -> WindowedPlan:
         """Scene plan of the option, or of the placement rule for the observations of the training cameras."""
         config, metadata = self.config, self.kwargs.get("metadata", {})
         observations = metadata.get(OBSERVATIONS)
         if observations is not None and config.total_steps == 0:
-            pixels = most_pixels(observations, placement)
-            config.total_steps = steps_for(config.method, pixels, config.rays_times)
+            config.total_steps = steps_for(config.method, most_pixels(observations, placement), config.rays_times)
         if config.plan_file is not None and (observations is not None or config.plan_file.is_file()):
             return WindowedPlan.load(config.plan_file)
         if observations is None:
@@ -211,8 +209,8 @@ class MMPIModel(Model):
         return self.run.parameters()
 
     def get_training_callbacks(self, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:  # type: ignore[override]
-        before = [TrainingCallbackLocation.BEFORE_TRAIN_ITERATION]
-        return [TrainingCallback(before, self.run.prepare_step, args=[attributes])]
+        location = TrainingCallbackLocation.BEFORE_TRAIN_ITERATION
+        return [TrainingCallback([location], self.run.prepare_step, args=[attributes])]
 
     # Rendering: nothing is assigned to the model, so threads may render while another trains or saves -------------
 
@@ -360,11 +358,9 @@ class MMPIModel(Model):
     ) -> dict[str, Tensor]:
         if "training" not in outputs:  # an evaluation batch during training
             return {"rgb_loss": photometric(outputs["rgb"], self.observed(batch))}
-        image, step = batch["image"].to(self.device), self.progress.step
-        g = generator(self.config.seed, step, "background", self.device)
-        weight = self.config.loss
+        rays, image, step = outputs["training"], batch["image"].to(self.device), self.progress.step
+        g, weight = generator(self.config.seed, step, "background", self.device), self.config.loss
         weight = replace(weight, known_depth=weight.known_depth * self.progress.schedule.decay(step))
-        rays: RenderedRays = outputs["training"]
         total, errors = batch_losses(rays, self.field, image, weight, g, step)
         if rays.lookup is not None and self.progress.schedule.watches(step):
             self.field.note_use(rays.lookup, rays.composite.weights, rays.report.live, errors)

@@ -32,7 +32,7 @@ from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 
 from mmpi_ns.ops import dispatch, trial
-from mmpi_ns.ops.plan_shapes import SMALL, Shapes
+from mmpi_ns.ops.layout import SMALL, Shapes
 
 ARCHITECTURES = (75, 80, 86, 89, 90)
 """Turing, Ampere (A100), Ampere (RTX 30), Ada, Hopper."""

@@ -18,10 +18,10 @@ import numpy as np
 import torch
 from PIL import Image
 
-from mmpi_ns.bench.machine import processor
 from mmpi_ns.bench.trainers import JOINT, P, Scene, Steps, no_tracks, train_words
 from mmpi_ns.ops import dispatch
-from mmpi_ns.ops.plan_shapes import EVERY, SMALL, Shapes
+from mmpi_ns.ops.layout import EVERY, SMALL, Shapes
+from mmpi_ns.utils.machine import processor
 
 STEPS, RAYS = 20, 1024
 """Steps that are timed, and rays of each."""

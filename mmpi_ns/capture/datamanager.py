@@ -1,12 +1,13 @@
-"""nerfstudio's data manager: training batches, and the training cameras, SfM points and depths for the model."""
+"""nerfstudio's data manager: training batches, drawn ahead, and the cameras, SfM points and depths for the model."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -18,7 +19,6 @@ from nerfstudio.model_components.ray_generators import RayGenerator
 from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
 
-from mmpi_ns.capture.ahead import DrawnAhead
 from mmpi_ns.capture.checks import PARSER_OPTIONS, check_transforms, say_once
 from mmpi_ns.capture.dataset import MMPIDataset
 from mmpi_ns.capture.exif import light_of
@@ -34,9 +34,11 @@ from mmpi_ns.capture.tracks import at_full_size
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.scene.visible_tiles import TrainingViews
 from mmpi_ns.utils.errors import InputError, say
+from mmpi_ns.utils.parallel import num_threads
 from mmpi_ns.utils.random_draws import generator
 from mmpi_ns.utils.values import check_options
 
+Batch = tuple[RayBundle, dict[str, Any]]
 OBSERVATIONS = "mmpi_observations"
 """Key of the scene's Observations in the data set's metadata, for the model."""
 GAINS = "mmpi_gains"
@@ -49,6 +51,38 @@ RAYS_PER_STEP = "mmpi_rays_per_step"
 """Key of the pixel rays of a training step."""
 TRAINING_VIEWS = "mmpi_training_views"
 """Key of the positions and fields of view of the training cameras (``TrainingViews``)."""
+
+
+class DrawnAhead:
+    """Draws the rays of steps, keyed on (seed, step); with several threads, one of them draws those of the next step
+    meanwhile. Drawing is small operations of torch, which take the time of one core."""
+
+    _thread: ClassVar = ThreadPoolExecutor(1, thread_name_prefix="mmpi-rays")
+
+    def __init__(self, seed: int, device: str | torch.device) -> None:
+        self.seed, self.device = seed, device
+        self._next: tuple[RaySources, tuple[int, int], Future[Batch]] | None = None
+
+    def draw(self, sources: RaySources, step: int, pixel_rays: int) -> Batch:
+        """What ``RaySources.draw`` draws for a step.
+
+        Args:
+            sources: of the rays.
+            step: of the training.
+            pixel_rays: rays through pixels.
+        """
+        batch = None
+        if self._next is not None:
+            of, key, future = self._next
+            batch = future.result() if of is sources and key == (step, pixel_rays) else None
+        batch = batch or self._drawn(sources, step, pixel_rays)
+        if num_threads() > 1 and torch.device(self.device).type == "cpu":
+            following = step + 1, pixel_rays
+            self._next = sources, following, self._thread.submit(self._drawn, sources, *following)
+        return batch
+
+    def _drawn(self, sources: RaySources, step: int, pixel_rays: int) -> Batch:
+        return sources.draw(pixel_rays, generator(self.seed, step, "pixels", self.device))
 
 
 @dataclass

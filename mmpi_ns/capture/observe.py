@@ -22,8 +22,7 @@ from mmpi_ns.capture.loose_points import usable_points
 from mmpi_ns.capture.rays import lens_directions
 from mmpi_ns.capture.sfm import SfmModel, find_sfm_model
 from mmpi_ns.capture.tracks import PosedImages, at_full_size, triangulate
-from mmpi_ns.placement.observations import Observations
-from mmpi_ns.placement.sweep import add_swept_points
+from mmpi_ns.placement.observations import Observations, add_swept_points
 from mmpi_ns.utils.errors import InputError, quoted
 
 MAX_REPROJECTION = 0.02

@@ -1,22 +1,23 @@
-"""Shading: the colour of a ray from the texels along it.
+"""Networks and shading: the colour of a ray from the texels along it.
 
 ``ray``: a texel stores a diffuse colour and features for view dependence; both are composited along the ray, and one
-network shades the ray once. ``sample``: a network gives every sample its colour (the paper).
+network shades the ray once. ``sample``: a network gives every sample its colour (the paper, eq. for MLP^(rgb)).
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor
+from torch import Tensor, nn
 
-from mmpi_ns.field.color_network import Networks
+from mmpi_ns.field.tables import replace_data
 from mmpi_ns.ops.composite import Composite
 from mmpi_ns.ops.gather import COLORS
-from mmpi_ns.ops.shade import positional_encoding, run_layers
+from mmpi_ns.ops.shade import Layers, positional_encoding, run_layers, sample_colors
 
 Shading = Literal["ray", "sample"]
 """Whether the network is evaluated once a ray or for every sample."""
@@ -28,6 +29,68 @@ MOST_CHANGE = 8.0
 """Bound of that change."""
 LEAST_MASS = 1e-6
 """Rays with less accumulated weight are almost invisible, whatever their colour."""
+
+
+class Networks(nn.Module):
+    """``count`` networks of two hidden layers, inputs -> three numbers, in one pooled parameter.
+
+    Their last layer starts at zero, so the tables learn at their own rate from the first step.
+    """
+
+    def __init__(self, count: int, inputs: int, width: int) -> None:
+        super().__init__()
+        self.width = width
+        self.shapes = [(width, inputs), (width,), (width, width), (width,), (3, width), (3,)]
+        self.weights = nn.Parameter(torch.empty(0, sum(math.prod(s) for s in self.shapes)))
+        self.resize(count)
+
+    def resize(self, count: int) -> None:
+        """Starts ``count`` networks anew, equal ones, with PyTorch's default initialisation from a fixed seed."""
+        generator = torch.Generator().manual_seed(0)
+        parts = []
+        for fan_in, shape in zip((s[-1] for s in self.shapes[::2] for _ in range(2)), self.shapes, strict=True):
+            bound = 0.0 if shape[0] == 3 else 1 / math.sqrt(fan_in)
+            parts.append((torch.rand(math.prod(shape), generator=generator) * 2 - 1) * bound)
+        replace_data(self.weights, torch.cat(parts).repeat(count, 1).to(self.weights.device))
+
+    def layers(self, head: int) -> Layers:
+        """Three layers of one head's network."""
+        parts = self.weights[head].split([math.prod(s) for s in self.shapes])
+        return Layers(*(p.view(s) for p, s in zip(parts, self.shapes, strict=True)))
+
+
+class ColorNetworks(Networks):
+    """Networks (features, PE(position), PE(direction)) -> rgb for every sample, one for each head.
+
+    The first three features are colour logits, to which the network adds the view-dependent part.
+    """
+
+    def __init__(self, count: int, channels: int, width: int, position_frequencies: int, direction_frequencies: int):
+        inputs = channels + 3 * (1 + 2 * position_frequencies) + 3 * (1 + 2 * direction_frequencies)
+        super().__init__(count, inputs, width)
+        self.position_frequencies, self.direction_frequencies = position_frequencies, direction_frequencies
+
+    def forward(
+        self,
+        head: int,
+        features: Float[Tensor, "N C"],
+        ndc: Float[Tensor, "N 3"],
+        directions: Float[Tensor, "R 3"],
+        rays: Int[Tensor, "N"] | None = None,
+    ) -> Float[Tensor, "N 3"]:
+        """Colours in [0, 1] of one head's samples.
+
+        Args:
+            head: of the network.
+            features: of each sample.
+            ndc: position of each sample.
+            directions: of each ray, in the head's axes; encoded once a ray.
+            rays: ray of each sample; None if there is one sample for each ray.
+        """
+        position = positional_encoding(ndc, self.position_frequencies)
+        direction = positional_encoding(directions, self.direction_frequencies)
+        direction = direction if rays is None else direction.index_select(0, rays)
+        return sample_colors(self.layers(head), features, position, direction)
 
 
 @dataclass(frozen=True)

@@ -23,8 +23,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from mmpi_ns.ops import build
-from mmpi_ns.ops.plan_shapes import SMALL, Shapes
-from mmpi_ns.ops.shapes import check_shapes
+from mmpi_ns.ops.layout import SMALL, Shapes, check_shapes
 from mmpi_ns.utils.errors import InputError
 
 Route = Literal["auto", "torch", "native"]
@@ -52,7 +51,7 @@ class Operation(Generic[P, R]):
     ``cpu`` (C++) and ``gpu`` (Triton) beside it. A call takes the form that suits the tensors among its arguments.
 
     Raises:
-        ValueError: by a call: the shape of a tensor is not that of its annotation (``shapes.py``).
+        ValueError: by a call: the shape of a tensor is not that of its annotation (``layout.py``).
     """
 
     def __init__(

@@ -1,20 +1,24 @@
-"""Scene data of the operations: MPIs and cube, layout of texels, and raw density to optical depth."""
+"""Scene data of the operations and the shapes of their tensors: MPIs and cube, texels, raw density to optical depth."""
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, is_dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args, get_type_hints
 
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from mmpi_ns.scene.geometry import Cube, Frames
-from mmpi_ns.scene.plan import MPIPlan
+from mmpi_ns.scene.plan import MPIPlan, ScenePlan
 from mmpi_ns.scene.texels import BRICK, TexelGrid
+
+WIDTHS = tuple(1 << n for n in range(4, 14))
+"""Widths that compositing is compiled for."""
 
 
 class Tables(NamedTuple):
@@ -137,3 +141,79 @@ def shaped(x: Tensor, *shape: int, dtype: torch.dtype = torch.float32) -> Tensor
     """A tensor as compiled code reads it, which checks nothing itself: contiguous, of this shape and type."""
     assert x.shape == shape and x.dtype == dtype, f"{list(x.shape)} {x.dtype} where {list(shape)} {dtype} is read"
     return x.contiguous()
+
+
+class Shapes(NamedTuple):
+    """What kernels are compiled for in a run."""
+
+    mpis: tuple[int, ...] = (2,)
+    """Numbers of MPIs of the windows."""
+    cube: bool = True
+    blends: bool = True
+    """Whether samples are blended by reliability."""
+    channels: int = 8
+    """Of the colour features of a texel; density and reliability have one."""
+    most_samples: int = 20
+    """Of a ray."""
+
+    @staticmethod
+    def of(plans: Iterable[ScenePlan], blends: bool, channels: int) -> Shapes:
+        """The shapes of a run's windows."""
+        plans = tuple(plans)
+        mpis = tuple(sorted({len(each.mpis) for p in plans for each in (p, p.largest)}))
+        cube, most = any(p.cube is not None for p in plans), max(p.largest.samples_per_ray for p in plans)
+        return Shapes(mpis, cube, blends, channels, most)
+
+    @property
+    def widths(self) -> list[int]:
+        """Samples of the widest ray of batches, one number for each width that compositing is compiled for."""
+        return [5 * w // 8 for w in WIDTHS if w // 2 < max(self.most_samples, 10)]
+
+
+SMALL = Shapes()
+EVERY = (Shapes((1, 2, 5, 9, 33), most_samples=1000), Shapes((1, 4, 16, 64), cube=False, channels=9))
+"""What plans commonly need: for checks that no plan asks for."""
+
+
+def check_shapes(owner: Callable[..., Any], values: Mapping[str, Any], sizes: dict[str, int] | None = None) -> None:
+    """Compares tensors with their annotations: a letter stands for one size wherever it occurs.
+
+    This is the border to C++ and Triton, which read and write memory by shapes and check nothing. Tensors within named
+    tuples are compared too; those of each dataclass in a list have letters of their own.
+
+    Args:
+        owner: a function or class with annotations such as ``Float[Tensor, "R S 3"]``.
+        values: its arguments or fields by name. What has ``sizes`` (a layout, a baked scene) sets letters first.
+        sizes: letters that are set already; others are added.
+
+    Raises:
+        ValueError: a tensor has another shape (names it).
+    """
+    letters = {} if sizes is None else sizes
+    for value in values.values():
+        letters |= {} if isinstance(value, Tensor) else getattr(value, "sizes", {})
+    for name, value in values.items():
+        if isinstance(value, Tensor):
+            form = _annotated(owner).get(name)
+            if form is None:
+                continue
+            expected = [letters.setdefault(x, n) if isinstance(x, str) else x for x, n in zip(form, value.shape)]  # noqa: B905
+            if len(form) != value.ndim or expected != list(value.shape):
+                needed = f"{list(form)} is needed, with { {x: n for x, n in letters.items() if x in form} }"
+                raise ValueError(f"{name} has the shape {list(value.shape)} where {needed}")
+        elif isinstance(value, tuple) and hasattr(value, "_fields"):
+            check_shapes(type(value), value._asdict(), letters)  # type: ignore[attr-defined]
+        elif isinstance(value, list):
+            for each in filter(is_dataclass, value):
+                check_shapes(type(each), vars(each))
+
+
+@functools.cache
+def _annotated(owner: Callable[..., Any]) -> dict[str, tuple[str | int, ...]]:
+    """Sizes of the tensors of an owner by name; those of any shape are left out."""
+    forms = {}
+    for name, hint in get_type_hints(owner).items():
+        texts = [t for part in (hint, *get_args(hint)) if isinstance(t := getattr(part, "dim_str", None), str)]
+        if texts and "..." not in texts[0]:
+            forms[name] = tuple(int(x) if x.isdigit() else x for x in texts[0].split())
+    return forms

@@ -19,9 +19,8 @@ from torch import Tensor
 from mmpi_ns.ops import build, dispatch
 from mmpi_ns.ops.adam import AdamConstants
 from mmpi_ns.ops.gather import Taps
-from mmpi_ns.ops.layout import SceneLayout, Tables
+from mmpi_ns.ops.layout import SMALL, SceneLayout, Shapes, Tables
 from mmpi_ns.ops.march import MarchOptions, Rays
-from mmpi_ns.ops.plan_shapes import SMALL, Shapes
 from mmpi_ns.scene.geometry import Cube, Frames
 from mmpi_ns.scene.plan import CubePlan, MPIPlan
 from mmpi_ns.scene.texels import BRICK, make_grids

@@ -17,8 +17,7 @@ from PIL import Image
 from mmpi_ns.capture.exif import kept_tags
 from mmpi_ns.capture.matching import quiet
 from mmpi_ns.prepare.alignment import camera_poses
-from mmpi_ns.prepare.cameras import read_intrinsics
-from mmpi_ns.prepare.images import Photo
+from mmpi_ns.prepare.images import Photo, read_intrinsics
 from mmpi_ns.prepare.stages import PrepareError
 from mmpi_ns.utils.errors import progress
 from mmpi_ns.utils.files import whole, write_text

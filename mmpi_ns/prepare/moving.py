@@ -16,8 +16,7 @@ from mmpi_ns.capture.moving import find_moving, in_image
 from mmpi_ns.capture.moving_picture import draw_moving
 from mmpi_ns.capture.tracks import PosedImages
 from mmpi_ns.capture.views import straightened_color
-from mmpi_ns.prepare.cameras import read_intrinsics
-from mmpi_ns.prepare.images import Photo
+from mmpi_ns.prepare.images import Photo, read_intrinsics
 
 
 def write_masks(

@@ -16,11 +16,10 @@ import pycolmap
 from mmpi_ns.capture.matching import new_model, rigid3d
 from mmpi_ns.capture.sfm import load_pycolmap
 from mmpi_ns.capture.tracks import near_pairs
-from mmpi_ns.prepare import checks, export, features, images, pairs, report
+from mmpi_ns.prepare import checks, export, features, images
 from mmpi_ns.prepare.adjustment import Free, focal_in_words, focal_interval
 from mmpi_ns.prepare.alignment import SceneFrame, camera_poses, choose_frame
-from mmpi_ns.prepare.cameras import Intrinsics, make_cameras, parse_camera, share
-from mmpi_ns.prepare.images import Photo, in_short
+from mmpi_ns.prepare.images import Intrinsics, Photo, in_short, make_cameras, parse_camera, share
 from mmpi_ns.prepare.mappers import Solution, map_and_judge
 from mmpi_ns.prepare.mapping import Task, map_known_poses
 from mmpi_ns.prepare.poses import read_poses
@@ -109,7 +108,7 @@ class Preparation:
             elif not is_done:
                 images.gather(s.input, files, folder)
         self.photos = images.read_photos(folder)
-        self.is_ordered = self.is_video or pairs.are_numbered([p.name for p in self.photos])
+        self.is_ordered = self.is_video or features.are_numbered([p.name for p in self.photos])
         self.masks = None
         if s.masks is not None:
             stamps = [(str(p), p.stat().st_mtime) for p in sorted(s.masks.rglob("*"))]
@@ -150,11 +149,11 @@ class Preparation:
                     listed = [(places[i], places[j]) for i, j in near_pairs(poses[:, :3], 2 * s.overlap)]
                     says = f"the {2 * s.overlap} nearest by pose"
                 else:
-                    alike = pairs.image_similarity(path, len(names))
-                    chosen, why = pairs.choose(s.matching, names, alike, self.is_video)
-                    listed, says = pairs.list_pairs(chosen, alike, s.overlap), f"{chosen} ({why})"
+                    alike = features.image_similarity(path, len(names))
+                    chosen, why = features.choose(s.matching, names, alike, self.is_video)
+                    listed, says = features.list_pairs(chosen, alike, s.overlap), f"{chosen} ({why})"
                     if chosen == "sequential":
-                        says += f", {len(pairs.revisits(alike, s.overlap))} pairs that may be revisits"
+                        says += f", {len(features.revisits(alike, s.overlap))} pairs that may be revisits"
                 verified = features.match(path, self.photos, listed, s.threads)
                 (folder / "says.txt").write_text(f"{says}; {verified} of {len(listed)} pairs match", encoding="utf-8")
         says = (folder / "says.txt").read_text(encoding="utf-8")
@@ -235,7 +234,7 @@ class Preparation:
             "mapping": solution.says,
             "verdict": f"{verdict.grade} {verdict.words()}".strip(),
             "focal length": "given" if self.focal is None else focal_in_words(*self.focal),
-            "exposure": report.exposure_in_words([built / "images" / p.name for p in photos]),
+            "exposure": checks.exposure_in_words([built / "images" / p.name for p in photos]),
             "what moves": says,
             "up": frame.up,
             "unit": frame.unit,
@@ -245,7 +244,7 @@ class Preparation:
         intrinsics = "given and kept" if self.is_fixed else "refined"
         lens = "undone" if s.undistort else "kept in transforms.json"
         note = f"Intrinsics {intrinsics}; {len(self.cameras)} camera(s); lens distortion {lens}."
-        report.write_report(model, s.input.name, rows, findings, self._left_out(names), note, built)
+        checks.write_report(model, s.input.name, rows, findings, self._left_out(names), note, built)
         self._publish(findings, model, verdict, split)
         return verdict
 
@@ -322,7 +321,7 @@ class Preparation:
             say(f"This scene is {verdict.grade}: {verdict.words()} {REMEDY}", "bold red")
         say(
             f"{scene}: {model.num_reg_images()} images, {model.compute_mean_reprojection_error():.2f} px, "
-            f"{len(split.train)} train, {len(split.test)} test; report.md says more. Train with:",
+            f"{len(split.train)} train, {len(split.test)} test; checks.md says more. Train with:",
             "bold red" if not is_right else "" if findings else "green",
         )
         say(f"ns-train mmpi-small --data {quoted(scene)}")

@@ -13,8 +13,7 @@ import numpy as np
 import pycolmap
 
 from mmpi_ns.prepare.alignment import Array, nearest_rotation
-from mmpi_ns.prepare.cameras import Intrinsics
-from mmpi_ns.prepare.images import IMAGES, Photo, natural_key
+from mmpi_ns.prepare.images import IMAGES, Intrinsics, Photo, natural_key
 from mmpi_ns.prepare.stages import PrepareError
 from mmpi_ns.utils.errors import say
 

@@ -10,8 +10,8 @@ from typing import Annotated, Literal
 
 import tyro
 
-from mmpi_ns.prepare.cameras import Lens, Sharing
-from mmpi_ns.prepare.pairs import Matching
+from mmpi_ns.prepare.features import Matching
+from mmpi_ns.prepare.images import Lens, Sharing
 from mmpi_ns.prepare.stages import PrepareError
 
 

@@ -81,8 +81,7 @@ class PlanCommand:
 
     def _explain(self, windows: WindowedPlan, observations: Observations) -> str:
         """Draws the pictures and returns the tables: for each window, over the observations of its own cameras."""
-        from mmpi_ns.placement.show.explain import explain, table
-        from mmpi_ns.placement.show.pictures import draw_errors, draw_plan, draw_windows
+        from mmpi_ns.placement.show import draw_errors, draw_plan, draw_windows, explain, table
         from mmpi_ns.placement.split import cameras_of, of_cameras
         from mmpi_ns.placement.visibility import find_visible_points
 

@@ -12,7 +12,7 @@ from typing import Literal
 import tyro
 
 from mmpi_ns.scripts.command import run
-from mmpi_ns.synthetic.exposure import ExposureName
+from mmpi_ns.synthetic.dataset import ExposureName
 from mmpi_ns.utils.errors import quoted
 
 Name = Literal["street", "long-road", "walk", "room", "look-round", "object"]
@@ -58,8 +58,7 @@ class SceneCommand:
         from rich.progress import track
 
         from mmpi_ns.synthetic.catalogue import make_scene
-        from mmpi_ns.synthetic.dataset import check_folder, write_dataset
-        from mmpi_ns.synthetic.exposure import make_exposure
+        from mmpi_ns.synthetic.dataset import check_folder, make_exposure, write_dataset
         from mmpi_ns.synthetic.movers import with_movers
         from mmpi_ns.utils.values import Number, check_options
 

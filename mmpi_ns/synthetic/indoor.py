@@ -8,7 +8,7 @@ from itertools import product
 import numpy as np
 
 from mmpi_ns.synthetic.cameras import Cameras
-from mmpi_ns.synthetic.kit import BEIGE, BROWN, GRAY, GREEN, PAINTS, PALE_GREEN, WALLS, WHITE, Kit, look
+from mmpi_ns.synthetic.primitives import BEIGE, BROWN, GRAY, GREEN, PAINTS, PALE_GREEN, WALLS, WHITE, Kit, look
 from mmpi_ns.synthetic.scene import Light, Scene
 from mmpi_ns.synthetic.surroundings import floor_inside, meadow, open_sky
 

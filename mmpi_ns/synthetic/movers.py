@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mmpi_ns.synthetic.cameras import Array
-from mmpi_ns.synthetic.kit import PAINTS, WHITE
-from mmpi_ns.synthetic.primitives import Primitives, Tracer
+from mmpi_ns.synthetic.primitives import PAINTS, WHITE, Primitives, Tracer
 from mmpi_ns.synthetic.road import Road
 from mmpi_ns.synthetic.scene import Scene, tile_order
 from mmpi_ns.synthetic.street import Street

@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 
 from mmpi_ns.synthetic.cameras import Cameras
-from mmpi_ns.synthetic.kit import BROWN, GRAY, GREEN, PAINTS, PALE_GREEN, WALLS, WHITE, Kit, look
+from mmpi_ns.synthetic.primitives import BROWN, GRAY, GREEN, PAINTS, PALE_GREEN, WALLS, WHITE, Kit, look
 from mmpi_ns.synthetic.road import Road
 from mmpi_ns.synthetic.scene import Light, Scene
 from mmpi_ns.synthetic.surroundings import open_sky, street_ground

@@ -1,9 +1,11 @@
-"""Free memory and cores of the machine, and a GPU that torch does not use."""
+"""Processor, free memory and cores of the machine, a GPU that torch does not use, and the commit of this package."""
 
 from __future__ import annotations
 
 import os
+import platform
 import re
+import subprocess
 import sys
 import time
 from pathlib import Path
@@ -96,3 +98,17 @@ def unused_gpu() -> str:
     why = f"needs {DRIVERS[cuda]} or newer" if cuda in DRIVERS else "is built without CUDA"
     mends = pip if wheel else "update the driver"
     return f"{where}, and torch {torch.__version__} {why}; to use it: {mends}"
+
+
+def processor() -> str:
+    """Cores and model of this machine's CPU."""
+    info = Path("/proc/cpuinfo")
+    text = info.read_text(encoding="utf-8") if info.is_file() else ""
+    names = re.findall(r"model name\s*: (.*)", text)
+    return f"{os.cpu_count()} cores of {names[0] if names else platform.processor()}"
+
+
+def commit() -> str:
+    """Short hash of the commit that this package is checked out at; "unknown" where it is installed."""
+    words = ["git", "-C", str(Path(__file__).resolve().parent), "rev-parse", "--short", "HEAD"]
+    return subprocess.run(words, capture_output=True, text=True, check=False).stdout.strip() or "unknown"

@@ -20,7 +20,7 @@ from triton_processes import HERE, needs_triton, python
 
 from mmpi_ns.bench import gpu as command
 from mmpi_ns.ops import dispatch
-from mmpi_ns.ops.plan_shapes import EVERY
+from mmpi_ns.ops.layout import EVERY
 
 PRINTED = r"a step of \d+ rays: [\d.]+ ms, [\d,]+ rays/s|a frame of \d+ pixels: .* frames/s|memory: [\d.]+ GiB"
 TIMED = {"step_ms": 1.0, "frame_ms": 2.0, "pixels": 3, "peak_gib": 0.5}

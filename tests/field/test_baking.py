@@ -11,8 +11,8 @@ import torch
 from hand_made import make_mpi
 from random_fields import _places, _table, fill, random_field
 
-from mmpi_ns.field.baking import bake_shares, rays_to
 from mmpi_ns.field.mmpi_field import MMPIField
+from mmpi_ns.rendering.baked import bake_shares, rays_to
 from mmpi_ns.scene.plan import CubePlan, ScenePlan
 from mmpi_ns.scene.texels import BRICK
 

@@ -8,7 +8,7 @@ from itertools import pairwise
 import pytest
 import torch
 
-from mmpi_ns.field.color_network import ColorNetworks
+from mmpi_ns.field.shading import ColorNetworks
 
 
 def normal(*shape, seed=0):

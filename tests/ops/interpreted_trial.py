@@ -6,7 +6,7 @@ import pytest
 from interpreting import interpreted  # noqa: F401
 
 from mmpi_ns.ops import trial
-from mmpi_ns.ops.plan_shapes import Shapes
+from mmpi_ns.ops.layout import Shapes
 
 
 @pytest.mark.parametrize("name", trial.CASES)

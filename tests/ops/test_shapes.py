@@ -1,4 +1,4 @@
-"""Tensors of a wrong shape never reach C++ or Triton (ops/shapes.py)."""
+"""Tensors of a wrong shape never reach C++ or Triton (ops/layout.py)."""
 
 from __future__ import annotations
 
@@ -13,9 +13,8 @@ from torch import Tensor
 
 from mmpi_ns.ops import trial
 from mmpi_ns.ops.baked import show_baked
-from mmpi_ns.ops.layout import Tables
+from mmpi_ns.ops.layout import Tables, check_shapes
 from mmpi_ns.ops.march import MarchOptions, Rays, march, show_rays
-from mmpi_ns.ops.shapes import check_shapes
 
 
 class Pair(NamedTuple):

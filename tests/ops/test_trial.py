@@ -16,7 +16,7 @@ from training_runs import ready, trainer_config
 from triton_processes import needs_triton
 
 from mmpi_ns.ops import dispatch, trial
-from mmpi_ns.ops.plan_shapes import SMALL, Shapes
+from mmpi_ns.ops.layout import SMALL, Shapes
 from mmpi_ns.ops.trial import Disagreement
 from mmpi_ns.scene.plan import ScenePlan
 

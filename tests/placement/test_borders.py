@@ -9,8 +9,7 @@ import pytest
 from procedural import observations_of
 from still_life import still_life
 
-from mmpi_ns.placement.borders import WIDEST, border_points, widened
-from mmpi_ns.placement.rule import PlacementConfig, place
+from mmpi_ns.placement.rule import WIDEST, PlacementConfig, border_points, place, widened
 from mmpi_ns.placement.visibility import find_visible_points
 from mmpi_ns.scene.plan import MPIPlan
 from mmpi_ns.synthetic.catalogue import make_scene

@@ -11,12 +11,22 @@ from PIL import ExifTags, Image
 from PIL.TiffImagePlugin import IFDRational
 
 from mmpi_ns.capture.exif import light_of
-from mmpi_ns.prepare import checks, export, features, pairs
+from mmpi_ns.prepare import checks, export, features
 from mmpi_ns.prepare.alignment import up_from_cameras
-from mmpi_ns.prepare.cameras import make_cameras, parse_camera, read_intrinsics, share
-from mmpi_ns.prepare.images import Photo, find_images, gather, gather_masks, reads_heif, scene_names
+from mmpi_ns.prepare.checks import exposure_in_words
+from mmpi_ns.prepare.images import (
+    Photo,
+    find_images,
+    gather,
+    gather_masks,
+    make_cameras,
+    parse_camera,
+    read_intrinsics,
+    reads_heif,
+    scene_names,
+    share,
+)
 from mmpi_ns.prepare.pipeline import prepare
-from mmpi_ns.prepare.report import exposure_in_words
 from mmpi_ns.prepare.settings import Settings
 from mmpi_ns.prepare.stages import PrepareError
 from mmpi_ns.prepare.video import choose_frames, measure, select_frames
@@ -206,17 +216,17 @@ def test_matching_is_chosen_by_count_and_order():
     numbered = [f"f{i:03d}.jpg" for i in range(200)]
     shuffled = np.random.default_rng(0).permutation(200)
     mixed = chain(200)[np.ix_(shuffled, shuffled)]
-    assert pairs.choose("auto", numbered[:20], chain(20), False)[0] == "exhaustive"
-    assert pairs.choose("auto", numbered, chain(200), False)[0] == "sequential"
-    assert pairs.choose("auto", numbered, mixed, False)[0] == "retrieval"
-    assert pairs.choose("auto", numbered[:100], mixed[:100, :100], False)[0] == "exhaustive"
-    assert pairs.choose("auto", numbered, mixed, True)[0] == "sequential"
+    assert features.choose("auto", numbered[:20], chain(20), False)[0] == "exhaustive"
+    assert features.choose("auto", numbered, chain(200), False)[0] == "sequential"
+    assert features.choose("auto", numbered, mixed, False)[0] == "retrieval"
+    assert features.choose("auto", numbered[:100], mixed[:100, :100], False)[0] == "exhaustive"
+    assert features.choose("auto", numbered, mixed, True)[0] == "sequential"
 
 
 def test_revisits_close_the_loop_and_a_straight_drive_has_none():
-    found = pairs.revisits(chain(150, loop=10), 10)
+    found = features.revisits(chain(150, loop=10), 10)
     assert (0, 140) in found and all(i < 20 and j >= 130 for i, j in found)
-    assert pairs.revisits(chain(150), 10) == []
+    assert features.revisits(chain(150), 10) == []
 
 
 def test_look_alikes_are_found_by_their_features(tmp_path):
@@ -226,7 +236,7 @@ def test_look_alikes_are_found_by_their_features(tmp_path):
     database = tmp_path / "database.db"
     features.create_database(database, photos, [1] * 4, make_cameras(photos, [1] * 4, {}, None, "auto"))
     features.extract(database, tmp_path / "images", photos, None, 1000, 1)
-    alike = pairs.image_similarity(database, 4)
+    alike = features.image_similarity(database, 4)
     assert alike.argmax(-1).tolist() == [1, 0, 3, 2]
 
 

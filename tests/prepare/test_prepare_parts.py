@@ -13,11 +13,10 @@ import pytest
 from PIL import Image
 
 from mmpi_ns.capture.matching import rigid3d
-from mmpi_ns.prepare import export, mapping, pairs
+from mmpi_ns.prepare import export, features, mapping
 from mmpi_ns.prepare.adjustment import Free, adjust, polish
 from mmpi_ns.prepare.alignment import choose_frame, similarity_between
-from mmpi_ns.prepare.cameras import Intrinsics, make_cameras, read_intrinsics, share
-from mmpi_ns.prepare.images import Photo
+from mmpi_ns.prepare.images import Intrinsics, Photo, make_cameras, read_intrinsics, share
 from mmpi_ns.prepare.stages import PrepareError
 from mmpi_ns.prepare.video import choose_frames, median_motion
 
@@ -43,12 +42,12 @@ def test_a_sequence_is_matched_with_near_and_far_frames_and_where_it_comes_back(
     place[115:] = place[:5]  # comes back to its start
     alike = np.exp(-((place[:, None] - place) ** 2) / 50).astype(np.float32)
     np.fill_diagonal(alike, -1)
-    found = pairs.list_pairs("sequential", alike, 4)
+    found = features.list_pairs("sequential", alike, 4)
     steps = {j - i for i, j in found if j < 115}
     assert steps == {1, 2, 3, 4, 15, 20, 30, 45}
     assert sum(j - i == 45 for i, j in found) == 120 - 45
     assert {(i, 115 + i) for i in range(5)} <= set(found)
-    assert len(pairs.list_pairs("exhaustive", alike[:7, :7], 4)) == 21
+    assert len(features.list_pairs("exhaustive", alike[:7, :7], 4)) == 21
 
 
 # The scene's frame ---------------------------------------------------------------------------------------------------

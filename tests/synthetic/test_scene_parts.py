@@ -10,8 +10,7 @@ import pytest
 from procedural import keypoint_errors
 
 from mmpi_ns.synthetic import Scene, make_scene, sfm_points, write_dataset
-from mmpi_ns.synthetic.kit import Kit
-from mmpi_ns.synthetic.primitives import BOX, SPHERE, Tracer
+from mmpi_ns.synthetic.primitives import BOX, SPHERE, Kit, Tracer
 
 
 @pytest.fixture(scope="module")

@@ -16,11 +16,11 @@ from mmpi_ns.capture.sfm import find_sfm_model
 from mmpi_ns.scripts.scene import SceneCommand
 from mmpi_ns.synthetic import SCENES, Cameras, Scene, make_scene, render, sfm_points, write_dataset
 from mmpi_ns.synthetic.dataset import PARTS
-from mmpi_ns.synthetic.kit import Kit, look
+from mmpi_ns.synthetic.materials import Noise, pulse
+from mmpi_ns.synthetic.primitives import Kit, look
 from mmpi_ns.synthetic.road import Road
 from mmpi_ns.synthetic.scene import Light
 from mmpi_ns.synthetic.surroundings import meadow, open_sky
-from mmpi_ns.synthetic.textures import Noise, pulse
 
 SMALL = {"count": 6, "width": 64, "height": 32}
 EAST = np.zeros(1)

@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from mmpi_ns.training.batch_rays import keep_frame
+from mmpi_ns.training.run import keep_frame
 
 CONTENT = 3.0
 

@@ -28,7 +28,7 @@ FILES = [*ROOT.glob("*.py"), *(path for wing in WINGS for path in (ROOT / wing).
 HOST_CALLS = {"signal.signal", "sys.settrace", "warnings.filterwarnings", "warnings.simplefilter", "setattr"}
 LISTED = {
     ("capture/sfm.py", "signal.signal"),  # puts back what pycolmap replaces at its import
-    ("prepare/pairs.py", "warnings.simplefilter"),  # in a block that puts the filters back
+    ("prepare/features.py", "warnings.simplefilter"),  # in a block that puts the filters back
     ("bench/gpu.py", "warnings.simplefilter"),  # likewise
 }
 

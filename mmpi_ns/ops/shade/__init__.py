@@ -11,8 +11,7 @@ from torch import Tensor
 
 from mmpi_ns.ops.dispatch import operation
 from mmpi_ns.ops.gather import interpolated
-from mmpi_ns.ops.layout import Places, SceneLayout
-from mmpi_ns.ops.shapes import check_shapes
+from mmpi_ns.ops.layout import Places, SceneLayout, check_shapes
 from mmpi_ns.scene.geometry import rotate
 
 

@@ -14,8 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mmpi_ns.ops.build import arguments, library
-from mmpi_ns.ops.layout import shaped
-from mmpi_ns.ops.shapes import check_shapes
+from mmpi_ns.ops.layout import check_shapes, shaped
 
 BLUR = 0.3
 """Variance that is added to a projected Gaussian, square pixels (as in ``splat.cpp``)."""

@@ -1,1 +1,0 @@
-"""Words and pictures about a plan, for mmpi-plan."""
