@@ -56,7 +56,9 @@ class Page {
       } else {
         this.windows.set(w, null);
         const row = this.header.windows[w];
-        const told = (part) => report(part < 1 ? `Loading ${this.header.name} … ${Math.round(100 * part)} %` : "");
+        const told = (part) => {
+          if (!this.failed) report(part < 1 ? `Loading ${this.header.name} … ${Math.round(100 * part)} %` : "");
+        };
         const [first, rest] = this.source(row, told);
         try {
           const window = await WindowOnCard.load(this.gl, row, await first);
