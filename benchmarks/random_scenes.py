@@ -15,7 +15,8 @@ from torch import Tensor
 
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.samples import metadata_of
-from mmpi_ns.rendering.rendered import MMPISampler, RenderedRays, render_rays
+from mmpi_ns.rendering.rendered import RenderedRays, render_rays
+from mmpi_ns.rendering.sampler import MMPISampler
 from mmpi_ns.scene.plan import CubePlan, MPIPlan, ScenePlan
 
 Array = NDArray[Any]

@@ -35,10 +35,8 @@ from mmpi_ns.rendering.images import rays_per_chunk, render_in_chunks, render_wi
 from mmpi_ns.rendering.metrics import ImageMetrics, depth_metrics, pictures
 from mmpi_ns.rendering.rendered import (
     BACKGROUNDS,
-    MMPISampler,
     RenderedRays,
     RenderingConfig,
-    SamplingConfig,
     background_of,
     bounded,
     render_rays,
@@ -46,6 +44,7 @@ from mmpi_ns.rendering.rendered import (
     shown_outputs,
     winners,
 )
+from mmpi_ns.rendering.sampler import MMPISampler, SamplingConfig
 from mmpi_ns.rendering.window_store import WindowStore
 from mmpi_ns.scene.plan import NO_PLAN
 from mmpi_ns.scene.visible_tiles import TrainingViews

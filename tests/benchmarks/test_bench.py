@@ -15,7 +15,8 @@ from random_fields import bundle, random_field, random_rays
 from suites import DEFAULT, SUITES
 
 from mmpi_ns.bench.trainers import Scene
-from mmpi_ns.rendering.rendered import MMPISampler, render_rays
+from mmpi_ns.rendering.rendered import render_rays
+from mmpi_ns.rendering.sampler import MMPISampler
 
 
 def test_the_dense_reference_renders_what_the_sampler_renders():

@@ -14,7 +14,7 @@ from random_fields import bundle, fill, random_field, random_plan, random_rays, 
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.tables import in_half_precision
 from mmpi_ns.ops.blending import log_shares
-from mmpi_ns.rendering.rendered import MMPISampler
+from mmpi_ns.rendering.sampler import MMPISampler
 from mmpi_ns.scene.geometry import LocalRays
 from mmpi_ns.scene.plan import CubePlan, ScenePlan
 

@@ -10,7 +10,8 @@ from random_fields import OracleRay, bundle, fill, random_field, random_plan, ra
 
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.ops import dispatch
-from mmpi_ns.rendering.rendered import MMPISampler, render_rays
+from mmpi_ns.rendering.rendered import render_rays
+from mmpi_ns.rendering.sampler import MMPISampler
 from mmpi_ns.scene.plan import ScenePlan
 
 STEP = 1e-6

@@ -14,7 +14,7 @@ from mmpi_ns.field.samples import metadata_of
 from mmpi_ns.field.shading import RayShader, change_odds
 from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.composite import composite_weights
-from mmpi_ns.rendering.rendered import MMPISampler
+from mmpi_ns.rendering.sampler import MMPISampler
 
 F64 = torch.float64
 

@@ -12,7 +12,7 @@ from random_fields import bundle, random_field, random_rays
 
 from mmpi_ns.field.samples import metadata_of, places_of
 from mmpi_ns.ops.gather import Taps, cpu, gather_places, gather_taps
-from mmpi_ns.rendering.rendered import MMPISampler
+from mmpi_ns.rendering.sampler import MMPISampler
 
 CHANNELS = (3, 8, 9, 16, 20)
 

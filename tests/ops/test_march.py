@@ -11,7 +11,7 @@ from hand_made import make_mpi
 from random_fields import bundle, random_field, random_rays, render
 
 from mmpi_ns.field.mmpi_field import MMPIField
-from mmpi_ns.rendering.rendered import MMPISampler
+from mmpi_ns.rendering.sampler import MMPISampler
 from mmpi_ns.scene.plan import ScenePlan
 
 

@@ -16,7 +16,7 @@ from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.samples import places_of
 from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.shade import Layers, SampleNetworks, shade
-from mmpi_ns.rendering.rendered import MMPISampler
+from mmpi_ns.rendering.sampler import MMPISampler
 
 
 def shaded(channels=9, width=32, octaves=(2, 2)):

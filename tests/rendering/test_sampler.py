@@ -13,7 +13,7 @@ from random_fields import bundle, compare, fill, random_field, random_rays, rend
 
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.ops import dispatch
-from mmpi_ns.rendering.rendered import MMPISampler
+from mmpi_ns.rendering.sampler import MMPISampler
 from mmpi_ns.scene.plan import CubePlan, ScenePlan
 
 

@@ -15,7 +15,7 @@ from mmpi_ns.field.tables import ENOUGH_CROSSINGS, RELEASED_DENSITY, TABLES
 from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.interpolate import interpolate_densely, texel_rows
 from mmpi_ns.ops.variation import total_variation
-from mmpi_ns.rendering.rendered import MMPISampler
+from mmpi_ns.rendering.sampler import MMPISampler
 from mmpi_ns.scene.bricks import (
     grown_tiles,
     keep_bricks,

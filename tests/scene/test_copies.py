@@ -11,7 +11,7 @@ from random_fields import bundle, compare, random_rays, render
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.field.tables import RELEASED_DENSITY
 from mmpi_ns.ops import dispatch
-from mmpi_ns.rendering.rendered import MMPISampler
+from mmpi_ns.rendering.sampler import MMPISampler
 from mmpi_ns.scene.bricks import tiles_with_copies
 from mmpi_ns.scene.texels import BRICK
 
