@@ -44,8 +44,8 @@ AFTER = 2
 """Nearest neighbours from which objects are followed."""
 EDGE = 0.4
 """Share of a mover around a pixel from which it is masked."""
-SECONDS = 0.3
-"""Processor seconds for an image, for the forecast (docs/log/performance.md)."""
+SECONDS = 0.7
+"""Processor seconds for an image, for the forecast (docs/results/moving.md)."""
 VERSION = 4
 """Version of the algorithm: cached masks of another version are found anew."""
 ENOUGH, SAMPLES = 200, 5000
