@@ -16,9 +16,10 @@ from mmpi_ns.model import MMPIModelConfig
 from mmpi_ns.placement.defaults import DEFAULTS
 from mmpi_ns.placement.rule import PlacementConfig
 from mmpi_ns.rendering.pipeline import MMPIPipelineConfig
+from mmpi_ns.training.learning_rates import PhaseSchedulerConfig
 from mmpi_ns.training.losses import LossWeights
 from mmpi_ns.training.phases import ScheduleConfig
-from mmpi_ns.training.touched_adam import PhaseSchedulerConfig, TouchedAdamConfig
+from mmpi_ns.training.touched_adam import TouchedAdamConfig
 from mmpi_ns.training.trainer import MMPITrainerConfig
 
 PAPER_DATA = {

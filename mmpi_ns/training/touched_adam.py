@@ -1,4 +1,4 @@
-"""Adam that updates only the rows of tables that a batch read (DVGO's masked Adam), and rates that follow the phases.
+"""Adam that updates only the rows of tables that a batch read (DVGO's masked Adam).
 
 Equal to dense Adam in which entries without a gradient are skipped, with values and moments unchanged.
 """
@@ -6,20 +6,16 @@ Equal to dense Adam in which entries without a gradient are skipped, with values
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 from nerfstudio.engine.optimizers import OptimizerConfig
-from nerfstudio.engine.schedulers import Scheduler, SchedulerConfig
 from torch import Tensor
 from torch.nn import Parameter
-from torch.optim import Optimizer
-from torch.optim.lr_scheduler import LambdaLR
 
 from mmpi_ns.ops.adam import AdamConstants, adam, adam_rows
 from mmpi_ns.ops.interpolate import Table
-from mmpi_ns.training.run import Progress
 from mmpi_ns.utils.machine import lazy_zeros
 
 
@@ -92,31 +88,3 @@ class TouchedAdamConfig(OptimizerConfig):
     """Decay of the first and second moment."""
     eps: float = 1e-8
     """Keeps the update finite where the second moment is zero."""
-
-
-@dataclass
-class PhaseSchedulerConfig(SchedulerConfig):
-    """Learning rate of one parameter kind: 0 where it is frozen, decaying over each phase in which it trains."""
-
-    _target: type = field(default_factory=lambda: PhaseScheduler)
-    kind: str = "density"
-    """Parameter kind of the group."""
-
-
-class PhaseScheduler(Scheduler):
-    """Rates of the schedule of ``progress``, also if a checkpoint replaces it; constant rates without ``progress`` (a
-    config used outside this trainer)."""
-
-    config: PhaseSchedulerConfig
-    progress: Progress | None = None
-
-    def get_scheduler(self, optimizer: Optimizer, lr_init: float) -> LambdaLR:
-        kind, progress = self.config.kind, self.progress
-        return LambdaLR(optimizer, lambda step: progress.schedule.rate_factor(kind, step) if progress else 1.0)
-
-    @classmethod
-    def following(cls, config: SchedulerConfig, progress: Progress) -> SchedulerConfig:
-        """The config of a scheduler that follows a run; other schedulers are unchanged."""
-        if not isinstance(config, PhaseSchedulerConfig):
-            return config
-        return replace(config, _target=type("Following", (cls,), {"progress": progress}))

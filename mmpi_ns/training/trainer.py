@@ -32,12 +32,12 @@ from mmpi_ns.training.checkpoints import (
     claim,
     read_checkpoint,
 )
+from mmpi_ns.training.learning_rates import PhaseScheduler
 from mmpi_ns.training.memory import Work, describe, training_bytes
 from mmpi_ns.training.options import check_device, check_nothing_left, check_run
 from mmpi_ns.training.report import TrainingLog, forecast, next_commands, quick_test
 from mmpi_ns.training.run import TrainingRun, cameras_of, views_of
 from mmpi_ns.training.shared_windows import WINDOWS_FOLDER, WindowShare
-from mmpi_ns.training.touched_adam import PhaseScheduler
 from mmpi_ns.utils.errors import InputError, duration, quoted, say
 from mmpi_ns.utils.files import write_atomically
 from mmpi_ns.utils.host import arguments, command, enter_command, signals_go_to
