@@ -205,7 +205,7 @@ def test_outputs_are_one_row_a_ray(model, camera):
     shapes = {name: tuple(value.shape) for name, value in outputs.items()}
     count = WIDTH * HEIGHT
     assert shapes == {"rgb": (count, 3)} | {
-        name: (count, 1) for name in ("accumulation", "depth", "winning_mpi", "dropped_mass")
+        name: (count, 1) for name in ("accumulation", "depth", "winning_mpi", "texel_pixels", "dropped_mass")
     }
     assert all(torch.isfinite(v).all() for v in outputs.values())
     assert 0 <= outputs["rgb"].min() and outputs["rgb"].max() <= 1 and outputs["accumulation"].max() <= 1
@@ -353,7 +353,7 @@ def test_lpips_is_left_out_with_a_message_where_its_weights_are_not_available(
         assert all(isinstance(v, float) and np.isfinite(v) for v in values.values())
     assert len(calls) == 1, "one attempt is enough"
     assert "LPIPS is left out" in " ".join(capsys.readouterr().out.split())
-    assert set(images) == {"img", "accumulation", "inverse_depth", "winning_mpi"}
+    assert set(images) == {"img", "accumulation", "inverse_depth", "winning_mpi", "texel_pixels"}
     for name, image in images.items():
         assert image.shape == (HEIGHT, WIDTH * (2 if name == "img" else 1), 3), name
         assert image.min() >= 0 and image.max() <= 1
