@@ -24,7 +24,7 @@ from mmpi_ns.synthetic.catalogue import make_scene
 from mmpi_ns.synthetic.dataset import write_dataset
 from mmpi_ns.synthetic.movers import MOVER, with_movers
 
-STREETS = (("street", 0), ("street", 1), ("walk", 0))
+STREETS = (*(("street", seed) for seed in range(5)), *(("walk", seed) for seed in range(3)))
 """Names and seeds of the procedural scenes with movers."""
 
 
