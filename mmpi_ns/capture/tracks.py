@@ -98,31 +98,46 @@ def original_of(file: Path) -> tuple[Path, int]:
     return file, 1
 
 
-def at_full_size(images: PosedImages) -> PosedImages:
-    """The same views in their originals, which are sharper; a view whose original has another shape stays as it is.
+def size_of(file: Path) -> NDArray[np.float64]:
+    """Width and height of an image file. Raises InputError if it cannot be read (names it)."""
+    try:
+        with Image.open(file) as image:
+            return np.array(image.size, np.float64)
+    except OSError as error:
+        raise InputError(
+            f"Training image {file} cannot be read ({brief(error)}): repair it or remove its frame."
+        ) from error
 
-    A copy shows the whole original, however its size was rounded: a position relative to width and height is the same
-    in both. Focal lengths are those of the copy times the factor, as nerfstudio divided them by it.
+
+def whole_of(file: Path) -> tuple[Path, NDArray[np.float64], NDArray[np.float64]]:
+    """What a downscaled copy was made from, its size, and the copy's, however this was rounded.
+
+    A file without an original, or whose original has another shape, stands for itself.
 
     Raises:
         InputError: an image file cannot be read (names it).
     """
-    files, sizes, intrinsics = [], images.sizes.copy(), images.intrinsics.copy()
-    for i, file in enumerate(images.files):
-        for candidate, factor in (original_of(file), (file, 1)):
-            try:
-                with Image.open(candidate) as image:
-                    size = np.array(image.size, np.float64)
-            except OSError as error:
-                raise InputError(
-                    f"Training image {candidate} cannot be read ({brief(error)}): repair it or remove its frame."
-                ) from error
-            if factor == 1 or (np.abs(size - factor * images.sizes[i]) <= factor).all():
-                break
-        files.append(candidate)
-        sizes[i] = size
-        intrinsics[i] *= factor
-    return replace(images, files=tuple(files), sizes=sizes, intrinsics=intrinsics)
+    size, (original, factor) = size_of(file), original_of(file)
+    if factor > 1:
+        whole = size_of(original)
+        if (np.abs(whole - factor * size) <= factor).all():
+            return original, whole, size
+    return file, size, size
+
+
+def at_full_size(images: PosedImages) -> PosedImages:
+    """The same views in their originals, which are sharper; a view whose original has another shape stays as it is.
+
+    A copy shows the whole original: a position relative to width and height is the same in both.
+
+    Raises:
+        InputError: an image file cannot be read (names it).
+    """
+    files, sizes, copies = zip(*map(whole_of, images.files), strict=True)
+    # Cameras have the sizes of the files but for a row or column, or those to which the files are reduced.
+    shown = np.where(np.abs(copies - images.sizes) <= 1, copies, images.sizes)
+    intrinsics = images.intrinsics * np.tile(sizes / shown, 2)
+    return replace(images, files=files, sizes=np.stack(sizes), intrinsics=intrinsics)
 
 
 def near_pairs(camera_to_worlds: NDArray[np.float64], neighbours: int) -> list[tuple[int, int]]:

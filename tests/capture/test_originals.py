@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from PIL import Image
 
+from mmpi_ns.capture.local_origin import take_local_origins, with_cameras_of_copies
 from mmpi_ns.capture.tracks import PosedImages, at_full_size, original_of
 
 
@@ -23,13 +29,29 @@ def posed(file: Path, width: int, height: int) -> PosedImages:
     return PosedImages((file,), pose, intrinsics, np.array([[float(width), height]]), np.zeros((1, 4)))
 
 
-def test_a_copy_stands_for_its_original_with_the_focal_length_that_the_parser_divided(tmp_path):
+def test_a_copy_stands_for_its_whole_original(tmp_path):
     original = write(tmp_path / "images/a/x.png", 1242, 375)
     copy = write(tmp_path / "images_4/a/x.png", 310, 93)  # rounded down: the scale of its pixels is not 4
     assert original_of(copy) == (original, 4)
-    found = at_full_size(posed(copy, 310, 93))
-    assert found.files == (original,) and found.sizes.tolist() == [[1242, 375]]
-    assert found.intrinsics.tolist() == [[722, 726, 609, 174]]
+    views = at_full_size(posed(copy, 310, 93))
+    assert views.files == (original,) and views.sizes.tolist() == [[1242, 375]]
+    x, y = 1242 / 310, 375 / 93
+    assert views.intrinsics[0] == pytest.approx([180.5 * x, 181.5 * y, 152.25 * x, 43.5 * y])
+
+
+def test_a_copy_that_was_rounded_up_has_the_same_original_though_its_camera_was_rounded_down(tmp_path):
+    original = write(tmp_path / "images/x.png", 1242, 375)
+    copy = write(tmp_path / "images_4/x.png", 311, 94)
+    views = at_full_size(posed(copy, 310, 93))
+    x, y = 1242 / 311, 375 / 94
+    assert views.files == (original,)
+    assert views.intrinsics[0] == pytest.approx([180.5 * x, 181.5 * y, 152.25 * x, 43.5 * y])
+
+
+def test_an_image_that_is_reduced_when_it_is_read_keeps_its_angles(tmp_path):
+    file = write(tmp_path / "x.png", 1240, 372)
+    views = at_full_size(posed(file, 310, 93))
+    assert views.sizes.tolist() == [[1240, 372]] and views.intrinsics[0] == pytest.approx([722, 726, 609, 174])
 
 
 def test_an_image_without_an_original_is_its_own(tmp_path):
@@ -49,3 +71,38 @@ def test_a_file_of_that_name_but_of_another_shape_is_no_original(tmp_path):
 def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(ValueError, match=r"x\.png cannot be read"):
         at_full_size(posed(tmp_path / "x.png", 4, 4))
+
+
+@pytest.mark.parametrize("size", [(310, 93), (311, 94)], ids=["rounded down", "rounded up"])
+def test_cameras_of_copies_look_where_those_of_the_originals_do(tmp_path, size):
+    """nerfstudio divides intrinsics by 4: the lower right corner would look 0.3 and 0.7 pixels past its image."""
+    for name in ("0.png", "1.png", "2.png"):
+        write(tmp_path / "images" / name, 1242, 375)
+        write(tmp_path / "images_4" / name, *size)
+    camera = {"fl_x": 721.5, "fl_y": 720.5, "cx": 609.6, "cy": 172.9, "w": 1242, "h": 375}
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    poses[:, 0, 3] = range(3)
+    frames = [{"file_path": f"images/{i}.png", "transform_matrix": pose.tolist()} for i, pose in enumerate(poses)]
+    (tmp_path / "transforms.json").write_text(json.dumps({**camera, "frames": frames}))
+
+    def cameras(factor: int) -> Cameras:
+        config = NerfstudioDataParserConfig(data=tmp_path, downscale_factor=factor)
+        take_local_origins(config)
+        return config.setup().get_dataparser_outputs("train").cameras
+
+    whole, copies = cameras(1), cameras(4)
+    assert copies.width[0] == 310 and copies.height[0] == 93
+    for at in ((0.0, 0.0), (0.3, 0.9), (1.0, 1.0)):  # of width and height
+        tangents = [
+            ((at[0] * w - float(c.cx[i])) / float(c.fx[i]), (at[1] * h - float(c.cy[i])) / float(c.fy[i]))
+            for c, (w, h) in ((whole, (1242, 375)), (copies, size))
+            for i in range(len(c))
+        ]
+        assert np.ptp(np.array(tangents), axis=0) == pytest.approx([0, 0], abs=1e-6)
+
+
+def test_cameras_of_copies_without_originals_stay(tmp_path):
+    file = write(tmp_path / "images_4/x.png", 310, 93)
+    camera = Cameras(torch.eye(4)[None, :3], 180.5, 181.5, 152.25, 43.5, 310, 93)
+    outputs = DataparserOutputs([file, tmp_path / "images_4/missing.png"], camera)
+    assert float(with_cameras_of_copies(outputs, 4).cameras.fx) == 180.5
