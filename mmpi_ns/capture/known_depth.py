@@ -39,7 +39,7 @@ from mmpi_ns.utils.parallel import in_order, num_threads
 Map = NDArray[np.float32]
 Codes = NDArray[np.int16]
 
-VERSION = 6
+VERSION = 7
 """Version of the algorithm: cached depths of another version are recomputed."""
 FINER, WIDEST = 2.0, 1600
 """Images are matched at this multiple of the training size, and at most this wide, if the originals are available."""
@@ -163,7 +163,6 @@ def _remembered_depths(original: PosedImages, posed: PosedImages, observations: 
     """Depths by dense matching, from the cache if possible."""
     seen_by, points = observations.tracked
     shapes = [(int(h), int(w)) for w, h in observations.sizes]
-    file_shapes = [_file_shape(original, posed, i) for i in range(len(shapes))]
     widest, pixels = max(w for _, w in shapes), sum(w * h for h, w in shapes)
     width = int(min(WIDEST, widest * min(FINER, (MOST_WORKING / pixels) ** 0.5)))
 
@@ -176,7 +175,7 @@ def _remembered_depths(original: PosedImages, posed: PosedImages, observations: 
         )
         return find_depths(
             original, lambda i: points[seen_by == i], width,
-            lambda i, view, depth: packed(at_training_pixels(view, depth, original, i, shapes[i], file_shapes[i])),
+            lambda i, view, depth: packed(at_training_pixels(view, depth, posed, i, shapes[i])),
             progress=lambda work, count: track(work, "Depths", count, console=CONSOLE),
         )  # fmt: skip
 
@@ -215,9 +214,7 @@ def with_sensor(
     return KnownDepth(Computed(len(files), replaced))
 
 
-def at_training_pixels(
-    view: View, depth: Depth, original: PosedImages, i: int, shape: tuple[int, int], file_shape: tuple[int, int]
-) -> Map:
+def at_training_pixels(view: View, depth: Depth, posed: PosedImages, i: int, shape: tuple[int, int]) -> Map:
     """Distances of a training image's pixels from the depths of its view at working size.
 
     A training pixel takes the mean over its area, weighted by certainty; the spread within the area, large at an
@@ -226,10 +223,9 @@ def at_training_pixels(
     Args:
         view: the image at working size.
         depth: its depths.
-        original: cameras of the originals.
+        posed: the training images.
         i: the image's place in them.
         shape: height and width of the training image.
-        file_shape: height and width of its file, which may have a row or column more.
 
     Returns:
         [H, W, 2] inverse distance and expected error.
@@ -239,7 +235,7 @@ def at_training_pixels(
     fx, fy, cx, cy = view.pinhole
     scale_x, scale_y = width / view.gray.shape[1], height / view.gray.shape[0]
     for rows in strips(shape):
-        x, y = straightened(original, i, shape, file_shape, rows)
+        x, y = straightened(posed, i, shape, shape, rows)
         at, longer = ((fx * x + cx) * scale_x, (fy * y + cy) * scale_y), np.sqrt(x**2 + y**2 + 1)
         for n, values in enumerate(maps):
             distances[rows, :, n] = look_up(values, *at, nearest=True) / longer

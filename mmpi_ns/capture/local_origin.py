@@ -1,7 +1,7 @@
 """nerfstudio's data parsers with exact cameras.
 
-Map coordinates: a local origin is subtracted in float64, before they round to float32. Downscaled copies: they show the
-whole image, which 1242 x 375 pixels do in 310 x 93, not in a quarter.
+Map coordinates: a local origin is subtracted in float64, before they round to float32. Downscaled copies: most show the
+whole image, so 1242 x 375 pixels become 310 x 93, which are no quarter.
 
 Point clouds (PLY) are read in float64 too, and without open3d, which is often missing or lacks system libraries.
 """
@@ -79,14 +79,14 @@ class LocalOrigin:
 
 
 def with_cameras_of_copies(outputs: DataparserOutputs, factor: int | None) -> DataparserOutputs:
-    """Parser outputs whose cameras fit downscaled copies: the parser divides by the factor, whatever was rounded."""
+    """Parser outputs whose cameras fit downscaled copies; the parser divides by the factor, whatever was rounded."""
     if factor is not None and factor > 1:
         cameras = outputs.cameras
         for i, file in enumerate(outputs.image_filenames):
             with suppress(InputError):  # is named when it is read
-                original, whole, copy = whole_of(Path(file))
+                original, _, scale = whole_of(Path(file))
                 if original != file:
-                    for name, ratio in zip(("fx", "fy", "cx", "cy"), np.tile(factor * copy / whole, 2), strict=True):
+                    for name, ratio in zip(("fx", "fy", "cx", "cy"), np.tile(factor / scale, 2), strict=True):
                         getattr(cameras, name)[i] *= ratio
     return outputs
 

@@ -9,7 +9,9 @@ from __future__ import annotations
 import os
 import re
 import tempfile
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -110,7 +112,7 @@ def size_of(file: Path) -> NDArray[np.float64]:
 
 
 def whole_of(file: Path) -> tuple[Path, NDArray[np.float64], NDArray[np.float64]]:
-    """What a downscaled copy was made from, its size, and the copy's, however this was rounded.
+    """What a downscaled copy was made from, its size, and its pixels (columns, rows) in one of the copy.
 
     A file without an original, or whose original has another shape, stands for itself.
 
@@ -121,22 +123,42 @@ def whole_of(file: Path) -> tuple[Path, NDArray[np.float64], NDArray[np.float64]
     if factor > 1:
         whole = size_of(original)
         if (np.abs(whole - factor * size) <= factor).all():
-            return original, whole, size
-    return file, size, size
+            is_cut = (factor * size < whole).any() and (factor * size <= whole).all() and _is_cut(file.parent)
+            return original, whole, np.full(2, float(factor)) if is_cut else whole / size
+    return file, size, np.ones(2)
+
+
+@lru_cache(maxsize=64)
+def _is_cut(folder: Path) -> bool:
+    """Whether downscaled copies leave out the last columns and rows of originals that are no multiple of the factor.
+
+    Other programs reduce the whole image to a size that they round. The first such copy is compared with both.
+    """
+    for file in sorted(folder.iterdir()):
+        original, factor = original_of(file)
+        if factor > 1:
+            with suppress(OSError), Image.open(original) as whole, Image.open(file) as copy:
+                width, height = copy.size
+                if (factor * width, factor * height) != whole.size:
+                    gray, shown = whole.convert("L"), np.asarray(copy.convert("L"), float)
+                    cut = gray.crop((0, 0, factor * width, factor * height)).reduce(factor)
+                    reduced = gray.resize(copy.size, Image.Resampling.BOX)
+                    errors = [np.square(np.asarray(image, float) - shown).sum() for image in (cut, reduced)]
+                    return errors[0] < errors[1]
+    return False
 
 
 def at_full_size(images: PosedImages) -> PosedImages:
     """The same views in their originals, which are sharper; a view whose original has another shape stays as it is.
 
-    A copy shows the whole original: a position relative to width and height is the same in both.
-
     Raises:
         InputError: an image file cannot be read (names it).
     """
-    files, sizes, copies = zip(*map(whole_of, images.files), strict=True)
+    files, sizes, scales = zip(*map(whole_of, images.files), strict=True)
     # Cameras have the sizes of the files but for a row or column, or those to which the files are reduced.
-    shown = np.where(np.abs(copies - images.sizes) <= 1, copies, images.sizes)
-    intrinsics = images.intrinsics * np.tile(sizes / shown, 2)
+    copies = np.array([size_of(file) for file in images.files])
+    reduced = np.where(np.abs(copies - images.sizes) <= 1, 1, copies / images.sizes)
+    intrinsics = images.intrinsics * np.tile(scales * reduced, 2)
     return replace(images, files=files, sizes=np.stack(sizes), intrinsics=intrinsics)
 
 

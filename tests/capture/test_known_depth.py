@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -45,8 +47,8 @@ def test_a_panorama_wider_than_sixteen_bits_count_gets_its_distances():
     pinhole = posed.intrinsics[0]
     inverse = slanted(pinhole, (HEIGHT, WIDTH)).astype(F32)
     view = View(np.zeros((HEIGHT, WIDTH), np.uint8), pinhole, posed.camera_to_worlds[0], np.ones((HEIGHT, WIDTH), bool))
-    found = at_training_pixels(view, Depth(inverse, 0.01 * inverse), posed, 0, shape, shape)
-    same_size = at_training_pixels(view, Depth(inverse, 0.01 * inverse), posed, 0, (HEIGHT, WIDTH), (HEIGHT, WIDTH))
+    found = at_training_pixels(view, Depth(inverse, 0.01 * inverse), posed, 0, shape)
+    same_size = at_training_pixels(view, Depth(inverse, 0.01 * inverse), posed, 0, (HEIGHT, WIDTH))
     assert found[:, 312::625, 0] == pytest.approx(same_size[..., 0], rel=0.02)
 
 
@@ -58,7 +60,7 @@ def test_a_training_pixel_gets_the_distance_of_what_it_shows(lens, fisheye):
     pinhole, shape = posed.intrinsics[0], (HEIGHT, WIDTH)
     inverse = slanted(pinhole, shape).astype(F32)
     view = View(np.zeros(shape, np.uint8), pinhole, posed.camera_to_worlds[0], np.ones(shape, bool))
-    found = at_training_pixels(view, Depth(inverse, 0.01 * inverse), posed, 0, (15, 20), (15, 20))
+    found = at_training_pixels(view, Depth(inverse, 0.01 * inverse), posed, 0, (15, 20))
     rows, columns = np.meshgrid(np.arange(15) + 0.5, np.arange(20) + 0.5, indexing="ij")
     at = np.stack([columns * 4, rows * 4], -1).reshape(-1, 1, 2)
     matrix = np.array([[60.0, 0, 40], [0, 60.0, 30], [0, 0, 1]])
@@ -73,12 +75,12 @@ def test_a_training_pixel_gets_the_distance_of_what_it_shows(lens, fisheye):
 
 def test_a_copy_whose_size_was_rounded_shows_the_whole_original():
     """1242 x 375 as 310 x 93: pixel 300 of the copy lies at 300.5 * 1242/310 of the original."""
-    posed = PosedImages(("x.png",), np.eye(4)[None, :3], np.array([[720.0, 720, 610, 170]]), np.array([[1242.0, 375]]),
-                        np.zeros((1, 4)))  # type: ignore[arg-type]  # fmt: skip
+    camera = np.array([[720.0, 720, 610, 170]]), np.array([[1242.0, 375]]), np.zeros((1, 4))
+    posed = PosedImages((Path("x.png"),), np.eye(4)[None, :3], *camera)
     shape, pinhole = (188, 621), np.array([720.0 * 621 / 1242, 720.0 * 188 / 375, 610 * 621 / 1242, 170 * 188 / 375])
     inverse = slanted(pinhole, shape).astype(F32)
     view = View(np.zeros(shape, np.uint8), pinhole, np.eye(4)[:3], np.ones(shape, bool))
-    found = at_training_pixels(view, Depth(inverse, 0.01 * inverse), posed, 0, (93, 310), (93, 310))
+    found = at_training_pixels(view, Depth(inverse, 0.01 * inverse), posed, 0, (93, 310))
     u, v = (300.5 * 1242 / 310 - 610) / 720, (10.5 * 375 / 93 - 170) / 720
     # The pixel that is looked up lies within half a training pixel of the exact place.
     assert found[10, 300, 0] == pytest.approx((0.5 + 0.2 * u + 0.1 * v) / np.sqrt(u * u + v * v + 1), rel=3e-3)

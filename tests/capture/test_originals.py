@@ -15,6 +15,7 @@ from PIL import Image
 
 from mmpi_ns.capture.local_origin import take_local_origins, with_cameras_of_copies
 from mmpi_ns.capture.tracks import PosedImages, at_full_size, original_of
+from mmpi_ns.prepare.export import downscale
 
 
 def write(path: Path, width: int, height: int) -> Path:
@@ -36,6 +37,28 @@ def test_a_copy_stands_for_its_whole_original(tmp_path):
     views = at_full_size(posed(copy, 310, 93))
     assert views.files == (original,) and views.sizes.tolist() == [[1242, 375]]
     x, y = 1242 / 310, 375 / 93
+    assert views.intrinsics[0] == pytest.approx([180.5 * x, 181.5 * y, 152.25 * x, 43.5 * y])
+
+
+def picture(width: int, height: int) -> Image.Image:
+    rng = np.random.default_rng(0)
+    return Image.fromarray(rng.integers(0, 256, (height // 6 + 1, width // 6 + 1)).astype(np.uint8)).resize(
+        (width, height), Image.Resampling.BICUBIC
+    )
+
+
+@pytest.mark.parametrize("by", [downscale, None], ids=["cut by mmpi-prepare", "whole"])
+def test_copies_that_are_cut_are_told_from_those_of_the_whole_image(tmp_path, by):
+    original, copy = tmp_path / "images/x.jpg", tmp_path / "images_4/x.jpg"
+    original.parent.mkdir()
+    picture(1243, 375).save(original)
+    if by is None:
+        copy.parent.mkdir()
+        picture(1243, 375).resize((310, 93), Image.Resampling.LANCZOS).save(copy)
+    else:
+        by(original, copy, 4)
+    views = at_full_size(posed(copy, 310, 93))
+    x, y = (4, 4) if by else (1243 / 310, 375 / 93)
     assert views.intrinsics[0] == pytest.approx([180.5 * x, 181.5 * y, 152.25 * x, 43.5 * y])
 
 
