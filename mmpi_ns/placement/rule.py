@@ -23,6 +23,8 @@ from mmpi_ns.placement.visibility import VisiblePoints, find_visible_points, pix
 from mmpi_ns.scene.plan import MOST_DETAIL, CubePlan, MPIPlan, ScenePlan
 
 MIN_PLANES = 16
+FULL, FINER = 0.8, 1.03
+"""Share of the budget of texels that is enough; and the step of their size while there is room for finer ones."""
 BUDGET_ROUNDS = 8
 """Attempts at keeping to the budget of texels; each starts with coarser ones."""
 BEYOND = 0.05
@@ -132,29 +134,45 @@ def affordable_texels(config: PlacementConfig, training_rays: int | None) -> flo
 
 
 def _choose(
-    observations: Observations, visible: VisiblePoints, config: PlacementConfig, texel_pixels: float
+    observations: Observations, visible: VisiblePoints, config: PlacementConfig, finest: float
 ) -> tuple[list[MPIPlan | CubePlan], float]:
     """The heads for a scene, with texels no finer than the budget allows, and the pixels that a texel spans."""
     candidates = find_candidates(observations, visible, with_cubes=config.max_voxels > 0)
-    best: tuple[list[MPIPlan | CubePlan], float] | None = None
-    chosen: list[MPIPlan | CubePlan] = []
-    too_fine, tried = None, texel_pixels
+
+    def heads_at(choice: _Choice, chosen: list[int], size: float) -> list[MPIPlan | CubePlan]:
+        heads = choice.heads(chosen, size)
+        mpis = widened([h for h in heads if isinstance(h, MPIPlan)], observations, visible)
+        return [*mpis, *(h for h in heads if isinstance(h, CubePlan))]
+
+    def excess(heads: list[MPIPlan | CubePlan]) -> float:
+        return sum(h.texels for h in heads) / config.max_texels if config.max_texels else 0.0
+
+    choices: list[tuple[float, float, _Choice, list[int]]] = []
+    too_fine, texel_pixels = None, finest
     for _ in range(BUDGET_ROUNDS):
-        tried = texel_pixels
-        chosen = _Choice(candidates, visible.weights, config, texel_pixels).run()
-        mpis = widened([h for h in chosen if isinstance(h, MPIPlan)], observations, visible)
-        chosen = [*mpis, *(h for h in chosen if isinstance(h, CubePlan))]
-        excess = sum(h.texels for h in chosen) / config.max_texels if config.max_texels else 0.0
-        if excess <= 1.0:
-            best = chosen, tried
-            if too_fine is None or excess > 0.8:
-                break
-            texel_pixels = (too_fine * texel_pixels) ** 0.5
-        else:
+        choice = _Choice(candidates, visible.weights, config, texel_pixels)
+        chosen = choice.run()
+        used = excess(heads_at(choice, chosen, texel_pixels))
+        choices.append((used, texel_pixels, choice, chosen))
+        if used > 1.0:
             too_fine = texel_pixels
             # Coarser texels mean fewer rows, columns and planes: nearly a third power.
-            texel_pixels *= max(1.04, excess ** (1 / 3)) if best is None else 1.1
-    return (chosen, tried) if best is None else best
+            texel_pixels *= max(1.04, used ** (1 / 3)) if min(c[0] for c in choices) > 1.0 else 1.1
+        elif too_fine is None or used > FULL:
+            break
+        else:
+            texel_pixels = (too_fine * texel_pixels) ** 0.5
+    # The last that fits; if none does, the last.
+    fitting = [c for c in choices if c[0] <= 1.0] or choices
+    _, texel_pixels, choice, chosen = fitting[-1]
+    heads = heads_at(choice, chosen, texel_pixels)
+    # Texels a little finer may have asked for further heads, which do not fit: then there is room for those alone.
+    while texel_pixels / FINER >= finest and excess(heads) < FULL:
+        finer = heads_at(choice, chosen, texel_pixels / FINER)
+        if excess(finer) > 1.0:
+            break
+        heads, texel_pixels = finer, texel_pixels / FINER
+    return heads, texel_pixels
 
 
 class _Choice:
@@ -163,7 +181,7 @@ class _Choice:
     def __init__(
         self, candidates: list[Candidate], weights: NDArray[np.float64], config: PlacementConfig, texel_pixels: float
     ) -> None:
-        self.candidates, self.weights, self.config, self.texel_pixels = candidates, weights, config, texel_pixels
+        self.candidates, self.weights, self.config = candidates, weights, config
         # Of each observation if a candidate serves it: log2 of the expected pixel error over ``enough``.
         enough, cost = config.enough * texel_pixels, []
         for c in candidates:
@@ -173,28 +191,39 @@ class _Choice:
         self.cost: NDArray[np.float32] = np.stack(cost)
         self.nothing = np.full(self.cost.shape[1], self.cost.max(), np.float32)
         texels = [c.at(texel_pixels, config.max_planes, config.max_voxels).texels for c in candidates]
-        self.price = np.array(texels, dtype=np.float64) ** config.texel_cost
+        self.texels = np.array(texels, dtype=np.float64)
+        self.price = self.texels**config.texel_cost
         self.is_cube = np.array([isinstance(c.frame, CubePlan) for c in candidates])
 
-    def run(self) -> list[MPIPlan | CubePlan]:
-        """The chosen heads, each MPI with the planes it needs."""
-        chosen: list[int] = []
+    def run(self) -> list[int]:
+        """The chosen candidates."""
+        # A scene needs an MPI, however little it gains.
+        gain = np.maximum(self.nothing - self.cost, 0) @ self.weights
+        chosen = [int(np.where(self.is_cube, -1.0, gain / self.price).argmax())]
         while len(chosen) < self.config.max_mpis:
             best = self._next(chosen)
             if best is None:
                 break
             grown = self._without_superfluous([*chosen, best])
-            if chosen and self._total(grown) >= self._total(chosen):  # it makes itself or its better superfluous
+            if self._total(grown) >= self._total(chosen):  # it makes itself or its better superfluous
                 break
             chosen = grown
+        # The first is chosen for its texels, and further ones may only make up for it: one of as many may do alone.
+        affordable = (self.texels <= self.texels[chosen].sum()) & ~self.is_cube
+        alone = [int(np.where(affordable, gain, -1.0).argmax())]
+        spared = self.config.min_gain * (len(chosen) - 1)
+        return alone if self._total(alone) <= self._total(chosen) + spared else chosen
+
+    def heads(self, chosen: list[int], texel_pixels: float) -> list[MPIPlan | CubePlan]:
+        """The chosen heads with texels of a size, each MPI with the planes it needs."""
         owner, heads, config = self.cost[chosen].argmin(0), [], self.config
         for n, candidate in enumerate(self.candidates[j] for j in chosen):
             # Planes at which the error of four fifths of the observations that it serves is small enough.
             error = candidate.plane[owner == n]
             error = error[np.isfinite(error)]
-            steps = float(np.quantile(error, 0.8)) / (config.plane_pixels * self.texel_pixels) if len(error) else 0.0
+            steps = float(np.quantile(error, 0.8)) / (config.plane_pixels * texel_pixels) if len(error) else 0.0
             planes = int(np.clip(8 * round((1 + steps) / 8), MIN_PLANES, config.max_planes))
-            heads.append(candidate.at(self.texel_pixels, planes, config.max_voxels))
+            heads.append(candidate.at(texel_pixels, planes, config.max_voxels))
         return heads
 
     def _total(self, chosen: list[int]) -> float:
@@ -203,11 +232,8 @@ class _Choice:
         return float(served @ self.weights)
 
     def _next(self, chosen: list[int]) -> int | None:
-        """The candidate with the largest gain for its texels; None if none gains enough. The first must be an MPI."""
-        served = np.minimum(self.nothing, self.cost[chosen].min(0)) if chosen else self.nothing
-        gain = np.maximum(served - self.cost, 0) @ self.weights
-        if not chosen:  # a scene needs an MPI, however little it gains
-            return int(np.where(self.is_cube, -1.0, gain / self.price).argmax())
+        """The candidate with the largest gain for its texels; None if none gains enough."""
+        gain = np.maximum(np.minimum(self.nothing, self.cost[chosen].min(0)) - self.cost, 0) @ self.weights
         allowed = gain >= self.config.min_gain
         if self.is_cube[chosen].any():
             allowed &= ~self.is_cube
