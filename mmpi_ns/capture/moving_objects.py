@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mmpi_ns.capture.dense import correlation, mean_and_contrast
+from mmpi_ns.capture.dense import Parallax, correlation, mean_and_contrast
 from mmpi_ns.capture.moving_evidence import ALL, SOLID, Evidence, Mask, Neighbour, Shot
 from mmpi_ns.capture.views import look_up, pixel_grid
 
@@ -152,17 +152,17 @@ def without_holes(mask: Mask) -> Mask:
 
 
 def followed(shot: Shot, other: Shot, mask: Mask, flow: cv2.DISOpticalFlow) -> Mask:
-    """Where a shot shows what moves in another one, by optical flow there and back. [h, w]"""
-    height, width = shape = shot.view.gray.shape
-    whole = np.maximum(shape, other.view.gray.shape)  # the flow needs images of one size
-    grays = [
-        np.pad(gray, [(0, n - m) for n, m in zip(whole, gray.shape, strict=True)], mode="edge")
-        for gray in (shot.view.gray, other.view.gray)
-    ]
-    there = np.asarray(flow.calc(*grays, None))[:height, :width]  # type: ignore[call-overload]
-    back = np.asarray(flow.calc(*grays[::-1], None))  # type: ignore[call-overload]
-    x, y = pixel_grid(shape)
+    """Where a shot shows what moves in another one, by optical flow there and back. [h, w]
+
+    Both look the same way first: optical flow finds what is near the same pixel, and turning the head shifts all.
+    """
+    gray = shot.view.gray
+    x, y, _ = Parallax.between(shot.view, other.view).pixels(np.zeros(gray.shape, np.float32))
+    turned, moves = look_up(other.view.gray, x, y), look_up(mask.astype(np.uint8), x, y, nearest=True)
+    there = np.asarray(flow.calc(gray, turned, None))  # type: ignore[call-overload]
+    back = np.asarray(flow.calc(turned, gray, None))  # type: ignore[call-overload]
+    x, y = pixel_grid(gray.shape)
     at = x + there[..., 0], y + there[..., 1]
     returned = np.abs(there + look_up(back, *at)).max(-1) < 1.5
-    alike = correlation(shot.view.gray, look_up(other.view.gray, *at), mean_and_contrast(shot.view.gray))
-    return returned & (alike > FOLLOWED) & (look_up(mask.astype(np.uint8), *at, nearest=True) > 0)
+    alike = correlation(gray, look_up(turned, *at), mean_and_contrast(gray))
+    return returned & (alike > FOLLOWED) & (look_up(moves, *at, nearest=True) > 0)
