@@ -46,7 +46,7 @@ EDGE = 0.4
 """Share of a mover around a pixel from which it is masked."""
 SECONDS = 0.7
 """Processor seconds for an image, for the forecast (docs/results/moving.md)."""
-VERSION = 4
+VERSION = 5
 """Version of the algorithm: cached masks of another version are found anew."""
 ENOUGH, SAMPLES = 200, 5000
 """Pixels of one depth in both images from which their exposures are compared, at least and at most."""
@@ -174,11 +174,11 @@ def _moves(
     if swept is None:
         swept = sweep(shot, others)
     shown = evidence(shot, others, [masks[j] for j in near], swept.impossible)
-    core = swept.certain & ~is_static(shot, shown)
+    core = swept.certain
     if len(others) >= 2:
-        core |= seeds(shot, others, shown)
+        core = core | seeds(shot, others, shown)
         flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
         for j in near[:AFTER]:
             if masks[j].any():
-                core |= followed(shot, shots[j], masks[j], flow)
-    return grown(shot, shown, core), swept
+                core = core | followed(shot, shots[j], masks[j], flow)
+    return grown(shot, shown, core & ~is_static(shot, shown)), swept
