@@ -174,11 +174,11 @@ def _moves(
     if swept is None:
         swept = sweep(shot, others)
     shown = evidence(shot, others, [masks[j] for j in near], swept.impossible)
-    core = swept.certain
+    core = swept.certain & ~is_static(shot, shown)
     if len(others) >= 2:
-        core = core | seeds(shot, others, shown)
+        core |= seeds(shot, others, shown)
         flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
         for j in near[:AFTER]:
             if masks[j].any():
-                core = core | followed(shot, shots[j], masks[j], flow)
-    return grown(shot, shown, core & ~is_static(shot, shown)), swept
+                core |= followed(shot, shots[j], masks[j], flow)
+    return grown(shot, shown, core), swept
