@@ -46,7 +46,7 @@ EDGE = 0.4
 """Share of a mover around a pixel from which it is masked."""
 SECONDS = 0.7
 """Processor seconds for an image, for the forecast (docs/results/moving.md)."""
-VERSION = 4
+VERSION = 5
 """Version of the algorithm: cached masks of another version are found anew."""
 ENOUGH, SAMPLES = 200, 5000
 """Pixels of one depth in both images from which their exposures are compared, at least and at most."""

@@ -12,14 +12,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mmpi_ns.capture.dense import correlation, mean_and_contrast
+from mmpi_ns.capture.dense import Parallax, correlation, mean_and_contrast
 from mmpi_ns.capture.moving_evidence import ALL, SOLID, Evidence, Mask, Neighbour, Shot
 from mmpi_ns.capture.views import look_up, pixel_grid
 
 LEAST_LEVELS, NOISES = 12.0, 4.0
 """Levels of strong evidence from which a pixel is a seed: the first, plus this multiple of the image's noise."""
-WEAKER = 1.3
-"""Times as many levels of weak evidence make a seed."""
 STEPS, REACH = 48, 1.2
 """Inverse depths at which seeds are searched in the neighbours, up to this multiple of the nearest content's."""
 DENSITY, AROUND = 0.35, 7
@@ -30,6 +28,11 @@ TOGETHER = 15
 """Pixels across which seeds belong to one object."""
 TALL = 1.15
 """Height of an object over that of the camera, at most."""
+NARROW, UPRIGHT, LOW = 0.4, 1.05, 0.8
+"""Width over the height of the camera below which an object is a person, as tall as the second, with a head of other
+colours than its body; others are filled up to the third."""
+CORE = 0.1
+"""Share of an object that seeds cover, at least: else it is a strip that fell out of what stands."""
 CERTAIN = 10
 """Levels of evidence up to which a pixel of known depth is static."""
 STATIC = 0.5
@@ -43,7 +46,7 @@ FOLLOWED = 0.7
 def seeds(shot: Shot, others: Sequence[Neighbour], evidence: Evidence) -> Mask:
     """Pixels that show something that moves, beyond doubt. [h, w]"""
     least = LEAST_LEVELS + NOISES * evidence.noise
-    candidates = (evidence.strong > least) | (evidence.weak > WEAKER * least)
+    candidates = evidence.strong > least
     result = candidates.copy()
     result[candidates] = unexplained(shot, others, candidates) > least
     share = cv2.boxFilter(result.astype(np.float32), -1, (AROUND, AROUND))
@@ -105,7 +108,8 @@ def grown(shot: Shot, evidence: Evidence, core: Mask) -> Mask:
         horizon = bottom if shot.horizon is None else float(shot.horizon[left:right].mean())
         if bottom > horizon:  # something that stands on the ground, as seen from the camera's height
             highest = min(top - 0.1 * (bottom - top), bottom - TALL * (bottom - horizon))
-            body = min(top, round(bottom - 0.8 * (bottom - horizon)))
+            tall = UPRIGHT if right - left < NARROW * (bottom - horizon) else LOW
+            body = min(top, round(bottom - tall * (bottom - horizon)))
         aside = max(3, round(0.12 * (right - left)))
         result |= _object(shot, part, static, (left - aside, int(highest), right + aside, bottom + 2), body)
     for left, top, right, bottom in shot.people:
@@ -141,7 +145,8 @@ def _object(shot: Shot, part: Mask, static: Mask, room: tuple[int, int, int, int
     result |= columns_of & (y >= np.minimum(first, body)) & (y <= last) & ~static
     closed = cv2.morphologyEx(result.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
     _, labels = cv2.connectedComponents(closed)
-    return without_holes(np.isin(labels, np.setdiff1d(labels[part & (closed > 0)], [0])))
+    whole = without_holes(np.isin(labels, np.setdiff1d(labels[part & (closed > 0)], [0])))
+    return whole if part.sum() > CORE * whole.sum() else np.zeros_like(whole)
 
 
 def without_holes(mask: Mask) -> Mask:
@@ -152,17 +157,17 @@ def without_holes(mask: Mask) -> Mask:
 
 
 def followed(shot: Shot, other: Shot, mask: Mask, flow: cv2.DISOpticalFlow) -> Mask:
-    """Where a shot shows what moves in another one, by optical flow there and back. [h, w]"""
-    height, width = shape = shot.view.gray.shape
-    whole = np.maximum(shape, other.view.gray.shape)  # the flow needs images of one size
-    grays = [
-        np.pad(gray, [(0, n - m) for n, m in zip(whole, gray.shape, strict=True)], mode="edge")
-        for gray in (shot.view.gray, other.view.gray)
-    ]
-    there = np.asarray(flow.calc(*grays, None))[:height, :width]  # type: ignore[call-overload]
-    back = np.asarray(flow.calc(*grays[::-1], None))  # type: ignore[call-overload]
-    x, y = pixel_grid(shape)
+    """Where a shot shows what moves in another one, by optical flow there and back. [h, w]
+
+    Both look the same way first: optical flow finds what is near the same pixel, and turning the head shifts all.
+    """
+    gray = shot.view.gray
+    x, y, _ = Parallax.between(shot.view, other.view).pixels(np.zeros(gray.shape, np.float32))
+    turned, moves = look_up(other.view.gray, x, y), look_up(mask.astype(np.uint8), x, y, nearest=True)
+    there = np.asarray(flow.calc(gray, turned, None))  # type: ignore[call-overload]
+    back = np.asarray(flow.calc(turned, gray, None))  # type: ignore[call-overload]
+    x, y = pixel_grid(gray.shape)
     at = x + there[..., 0], y + there[..., 1]
     returned = np.abs(there + look_up(back, *at)).max(-1) < 1.5
-    alike = correlation(shot.view.gray, look_up(other.view.gray, *at), mean_and_contrast(shot.view.gray))
-    return returned & (alike > FOLLOWED) & (look_up(mask.astype(np.uint8), *at, nearest=True) > 0)
+    alike = correlation(gray, look_up(turned, *at), mean_and_contrast(gray))
+    return returned & (alike > FOLLOWED) & (look_up(moves, *at, nearest=True) > 0)
