@@ -30,7 +30,7 @@ from torch import Tensor
 
 from mmpi_ns.capture.tracks import PosedImages
 from mmpi_ns.capture.views import Map, View, camera_matrix, load_view, look_up, pixel_grid, strips
-from mmpi_ns.ops.matches import average_matches, follow_motion, place_pixels, solve_matches
+from mmpi_ns.ops.matches import average_matches, compare_depths, follow_motion, place_pixels, solve_matches
 from mmpi_ns.scene.near_views import nearest_views
 from mmpi_ns.utils.host import give_back_freed_memory
 from mmpi_ns.utils.parallel import num_threads, one_thread_each
@@ -341,14 +341,12 @@ def confirmed(view: View, depth: Depth, others: list[tuple[View, Depth]]) -> Dep
     """Keeps the depths confirmed by the depth of at least one other image and by at least as many as contradict it."""
     confirm, contradict = np.zeros(depth.inverse.shape, np.int8), np.zeros(depth.inverse.shape, np.int8)
     for neighbour, theirs in others:
-        x, y, ahead = Parallax.between(view, neighbour).pixels(depth.inverse)
-        there = look_up(np.stack([theirs.inverse, theirs.error], -1), x, y, nearest=True)
-        for rows in strips(ahead.shape):
-            inverse, error = there[rows, :, 0], there[rows, :, 1]  # 0 behind the neighbour
-            expected = depth.inverse[rows] / np.maximum(ahead[rows], 1e-6)
-            tolerance = 3 * np.sqrt(error * error + depth.error[rows] ** 2) + SAME_DEPTH * expected
-            both, apart = (inverse > 0) & (expected > 0), inverse - expected
-            confirm[rows] += both & (np.abs(apart) < tolerance)
-            contradict[rows] += both & (apart < -tolerance)
+        there = torch.from_numpy(theirs.inverse), torch.from_numpy(theirs.error)
+        parallax = Parallax.between(view, neighbour).tensors
+        for rows in strips(depth.inverse.shape):
+            here = torch.from_numpy(depth.inverse[rows]), torch.from_numpy(depth.error[rows])
+            confirms, contradicts = compare_depths(*here, *there, *parallax, rows.start, SAME_DEPTH)
+            confirm[rows] += confirms.numpy()
+            contradict[rows] += contradicts.numpy()
     kept = (confirm >= 1) & (confirm > contradict)
     return Depth(np.where(kept, depth.inverse, 0), np.where(kept, depth.error, 0))

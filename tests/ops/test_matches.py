@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from mmpi_ns.ops import dispatch
-from mmpi_ns.ops.matches import average_matches, follow_motion, place_pixels, solve_matches
+from mmpi_ns.ops.matches import average_matches, compare_depths, follow_motion, place_pixels, solve_matches
 
 ROWS, COLUMNS, FIRST_ROW = 9, 37, 5
 NOISE, FARTHEST, MOST_RELATIVE = 0.3, 1.0, 0.15
@@ -110,6 +110,33 @@ def test_matches_that_tell_no_depth_have_none(what):
     maps, usable = tensors(x + 0.5, y, alike), torch.ones(x.shape, dtype=torch.bool)
     inverse, certainty = solve_matches(*maps, usable, *tensors(linear, b), FIRST_ROW, NOISE, FARTHEST)
     assert certainty.max() < 1e-9 and not inverse.any()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_depths_are_compared_with_the_nearest_pixel_of_the_other_image(seed):
+    rng = np.random.default_rng(seed)
+    linear, b = two_cameras(seed)
+    shape, other = (ROWS, COLUMNS), (17, 29)
+    inverse, error = rng.uniform(-0.2, 0.5, shape).clip(0), rng.uniform(0, 0.02, shape)
+    # A plane at one inverse depth, now and then nearer, farther or unknown.
+    theirs, their_error = rng.choice([0, 0.1, 0.2, 0.3], other), rng.uniform(0, 0.02, other)
+    depths = tensors(inverse, error, theirs, their_error)
+    inverse, error, theirs, their_error = (x.numpy().astype(float) for x in depths)
+    compared = [x.numpy() for x in compare_depths(*depths, *tensors(linear, b), FIRST_ROW, 0.03)]
+    counts, unsure = np.zeros(2, int), 0
+    for r, c in np.ndindex(shape):
+        at, ahead = place(linear, b, r, c, inverse[r, c])
+        if np.abs(at - np.rint(at)).min() < 1e-3:  # between two pixels
+            unsure += 1
+            continue
+        column, row = np.floor(at).astype(int)
+        expected, says = inverse[r, c] / ahead, [False, False]
+        if inverse[r, c] > 0 and ahead > 1e-6 and 0 <= column < 29 and 0 <= row < 17 and theirs[row, column] > 0:
+            tolerance = 3 * np.sqrt(error[r, c] ** 2 + their_error[row, column] ** 2) + 0.03 * expected
+            says = [abs(theirs[row, column] - expected) < tolerance, theirs[row, column] + tolerance < expected]
+        assert [x[r, c] for x in compared] == says
+        counts += says
+    assert unsure < 10 and counts.min() > 5
 
 
 def averaged_slowly(inverse, weight):

@@ -39,6 +39,15 @@ class Moved(NamedTuple):
     y: Float[Tensor, "R W"]
 
 
+class Compared(NamedTuple):
+    """What another image's depths say of an image's."""
+
+    confirms: Bool[Tensor, "R W"]
+    """It has the same depth there,"""
+    contradicts: Bool[Tensor, "R W"]
+    """or a farther one: it sees through."""
+
+
 class Measured(NamedTuple):
     """Inverse depths with a number that tells how certain they are; both 0 where there is none."""
 
@@ -154,6 +163,38 @@ def average_matches(inverse: Float[Tensor, "M P"], certainty: Float[Tensor, "M P
         error = torch.where(better, (scatter.clamp(min=1) / total).sqrt(), error)
     kept = (best > 0) & (error < most_relative * mean)
     return Measured(torch.where(kept, mean, 0.0), torch.where(kept, error, 0.0))
+
+
+@operation("cpu")
+def compare_depths(
+    inverse: Float[Tensor, "R W"],
+    error: Float[Tensor, "R W"],
+    their_inverse: Float[Tensor, "A B"],
+    their_error: Float[Tensor, "A B"],
+    linear: Float[Tensor, "3 3"],
+    b: Float[Tensor, "3"],
+    first_row: int,
+    same: float,
+) -> Compared:
+    """Whether another image confirms or contradicts depths, by its nearest pixel where both have one.
+
+    Args:
+        inverse: inverse depths of some rows of an image; 0 without one.
+        error: their expected errors.
+        their_inverse, their_error: the same of the other image.
+        linear, b, first_row: as of ``place_pixels``.
+        same: relative difference, beside three errors, within which depths agree.
+    """
+    height, width = their_inverse.shape
+    x, y, ahead = place_pixels.reference(inverse, linear, b, first_row)
+    column, row = (x - 0.5).round(), (y - 0.5).round()
+    both = (column >= 0) & (column < width) & (row >= 0) & (row < height) & (inverse > 0)
+    place = torch.where(both, row, 0.0).long() * width + torch.where(both, column, 0.0).long()
+    theirs, their_errors = their_inverse.flatten()[place], their_error.flatten()[place]
+    expected = inverse / ahead.clamp(min=LEAST_AHEAD)
+    tolerance, apart = 3 * torch.hypot(their_errors, error) + same * expected, theirs - expected
+    both &= theirs > 0
+    return Compared(both & (apart.abs() < tolerance), both & (apart < -tolerance))
 
 
 def _linear(image: Tensor, linear: Tensor, first_row: int) -> list[Tensor]:

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from mmpi_ns.ops.build import run_in_parts
 from mmpi_ns.ops.layout import shaped
-from mmpi_ns.ops.matches import Measured, Moved, Places
+from mmpi_ns.ops.matches import Compared, Measured, Moved, Places
 
 MOST = 16
 """Measurements of a pixel, as in ``matches.cpp``."""
@@ -49,3 +49,16 @@ def average_matches(inverse: Tensor, certainty: Tensor, most_relative: float) ->
     averaged = Measured(torch.empty(pixels), torch.empty(pixels))
     run_in_parts("mmpi_average_matches", [0, pixels], arrays, (pixels, count, most_relative, *averaged))
     return averaged
+
+
+def compare_depths(
+    inverse: Tensor, error: Tensor, their_inverse: Tensor, their_error: Tensor, linear: Tensor, b: Tensor,
+    first_row: int, same: float,
+) -> Compared:  # fmt: skip
+    (rows, width), theirs = inverse.shape, their_inverse.shape
+    depths = shaped(inverse, rows, width), shaped(error, rows, width)
+    others = shaped(their_inverse, *theirs), shaped(their_error, *theirs)
+    compared = Compared(*torch.empty(2, rows, width, dtype=torch.bool))
+    arrays = *depths, *others, shaped(linear, 3, 3), shaped(b, 3)
+    run_in_parts("mmpi_compare_depths", [0, rows], arrays, (width, *theirs, first_row, same, *compared))
+    return compared

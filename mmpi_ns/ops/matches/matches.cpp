@@ -114,6 +114,34 @@ void mmpi_solve_matches(const float* x, const float* y, const float* alike, cons
         }
 }
 
+// Rows [begin, end) of depths: whether those of another image confirm or contradict them.
+void mmpi_compare_depths(const float* inverse, const float* error, const float* their_inverse, const float* their_error,
+                         const float* linear, const float* b, int64_t begin, int64_t end, int64_t width,
+                         int64_t their_height, int64_t their_width, int64_t first_row, float same, bool* confirms,
+                         bool* contradicts) {
+    for (int64_t row = begin; row < end; row++) {
+        const float down = first_row + row + 0.5f;
+        for (int64_t column = 0, i = row * width; column < width; column++, i++) {
+            confirms[i] = contradicts[i] = false;
+            const float q = inverse[i], right = column + 0.5f;
+            if (!(q > 0)) continue;
+            float at[3];
+            for (int n = 0; n < 3; n++)
+                at[n] = linear[3 * n] * right + (linear[3 * n + 1] * down + linear[3 * n + 2]) + q * b[n];
+            if (!(at[2] > LEAST_AHEAD)) continue;
+            const float x = std::nearbyint(at[0] / at[2] - 0.5f), y = std::nearbyint(at[1] / at[2] - 0.5f);
+            if (!(x >= 0 && x < their_width && y >= 0 && y < their_height)) continue;
+            const int64_t there = int64_t(y) * their_width + int64_t(x);
+            if (!(their_inverse[there] > 0)) continue;
+            const float expected = q / at[2], apart = their_inverse[there] - expected;
+            const float squares = their_error[there] * their_error[there] + error[i] * error[i];
+            const float tolerance = 3 * std::sqrt(squares) + same * expected;
+            confirms[i] = std::abs(apart) < tolerance;
+            contradicts[i] = apart < -tolerance;
+        }
+    }
+}
+
 // Pixels [begin, end): mean of the largest consistent subset of their measurements, which lie `pixels` apart.
 void mmpi_average_matches(const float* inverse, const float* certainty, int64_t begin, int64_t end, int64_t pixels,
                           int64_t measurements, float most_relative, float* mean, float* error) {
@@ -158,4 +186,5 @@ void mmpi_average_matches(const float* inverse, const float* certainty, int64_t 
 IN_PARTS(mmpi_place_pixels)
 IN_PARTS(mmpi_follow_motion)
 IN_PARTS(mmpi_solve_matches)
+IN_PARTS(mmpi_compare_depths)
 IN_PARTS(mmpi_average_matches)
