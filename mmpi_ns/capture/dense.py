@@ -49,7 +49,7 @@ SMALLEST = 12
 """Pixels of the longer side that OpenCV's optical flow needs."""
 ROUNDS = {False: (1, 1, 1), True: (2, 1)}
 """Rounds of matching, of small and of large images, each at the working size divided by this."""
-SECONDS = 0.95
+SECONDS = 0.8
 """Processor seconds for a million working pixels of an image, for the forecast (docs/log/performance.md)."""
 STRIDE, ITERATIONS = {False: 5, True: 6}, 8
 """Pixels between patches of the optical flow, in small and in large images, and iterations."""
