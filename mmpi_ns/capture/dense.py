@@ -9,7 +9,7 @@ Python's lock), and an image is in memory only while its neighbours are worked o
 A point at inverse depth q appears in the neighbour at the homogeneous pixel a + q b, where a is linear in the pixel. A
 match there gives two linear equations r + q s = 0, in pixels once divided by the point's depth: q is their
 least-squares solution, the residual is the distance from the epipolar line, and |s| / depth is the parallax in pixels
-for each unit of q.
+for each unit of q (``ops/matches``).
 """
 
 from __future__ import annotations
@@ -23,11 +23,14 @@ from typing import Any, Generic, TypeVar
 
 import cv2
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
+from torch import Tensor
 
 from mmpi_ns.capture.tracks import PosedImages
 from mmpi_ns.capture.views import Map, View, camera_matrix, load_view, look_up, pixel_grid, strips
+from mmpi_ns.ops.matches import average_matches, compare_depths, follow_motion, place_pixels, solve_matches
 from mmpi_ns.scene.near_views import nearest_views
 from mmpi_ns.utils.host import give_back_freed_memory
 from mmpi_ns.utils.parallel import num_threads, one_thread_each
@@ -46,7 +49,7 @@ SMALLEST = 12
 """Pixels of the longer side that OpenCV's optical flow needs."""
 ROUNDS = {False: (1, 1, 1), True: (2, 1)}
 """Rounds of matching, of small and of large images, each at the working size divided by this."""
-SECONDS = 0.95
+SECONDS = 0.8
 """Processor seconds for a million working pixels of an image, for the forecast (docs/log/performance.md)."""
 STRIDE, ITERATIONS = {False: 5, True: 6}, 8
 """Pixels between patches of the optical flow, in small and in large images, and iterations."""
@@ -56,8 +59,6 @@ WINDOW = 7
 """Side of the window in which images are compared, working pixels."""
 MIN_CORRELATION, MIN_CONTRAST = 0.5, 1.0
 """Least correlation of windows that match, and least standard deviation of their gray levels."""
-AGREE = 2.5
-"""Matches agree if they differ by at most this many standard deviations."""
 EDGE, STEP = 9, 1.1
 """An edge: inverse depths that differ by this factor in a window of this many pixels. Background there moves along."""
 OWN_CONTRAST = 4.0
@@ -118,37 +119,19 @@ class Parallax:
         linear = to_pixels @ turn @ np.linalg.inv(camera_matrix(view.pinhole))
         return Parallax(linear, (to_pixels @ shift).astype(np.float32))
 
-    def a(self, rows: slice, width: int) -> list[Map]:
-        """The three parts of a at the pixels of some rows. [h, w] each"""
-        x, y = np.arange(width) + 0.5, np.arange(rows.start, rows.stop)[:, None] + 0.5
-        return [(m[0] * x).astype(np.float32) + (m[1] * y + m[2]).astype(np.float32) for m in self.linear]
+    @property
+    def tensors(self) -> tuple[Tensor, Tensor]:
+        """As compiled operations read them."""
+        return torch.from_numpy(self.linear).float(), torch.from_numpy(self.b)
 
     def pixels(self, inverse: Map) -> tuple[Map, Map, Map]:
         """Pixels x and y of points at these inverse depths, far outside if behind, and their depths over those here."""
-        maps = x, y, depth = np.empty_like(inverse), np.empty_like(inverse), np.empty_like(inverse)
+        maps = np.empty((3, *inverse.shape), np.float32)
         for rows in strips(inverse.shape):
-            for part, a, b in zip(maps, self.a(rows, inverse.shape[1]), self.b, strict=True):
-                np.multiply(inverse[rows], b, out=part[rows])
-                part[rows] += a
-            behind = ~(depth[rows] > 1e-6)
-            np.copyto(depth[rows], 1, where=behind)
-            x[rows] /= depth[rows]
-            y[rows] /= depth[rows]
-            for part, far in ((x, -1e4), (y, -1e4), (depth, 0)):
-                np.copyto(part[rows], far, where=behind)
-        return x, y, depth
-
-    def solve(self, x: Map, y: Map, rows: slice) -> tuple[Map, Map, Map]:
-        """Inverse depth of matches at pixels (x, y) of some rows, and squares of epipolar distance and parallax."""
-        a = self.a(rows, x.shape[1])
-        r1, s1 = a[0] - x * a[2], self.b[0] - x * self.b[2]
-        r2, s2 = a[1] - y * a[2], self.b[1] - y * self.b[2]
-        squared = np.maximum(s1 * s1 + s2 * s2, 1e-20)
-        inverse = -(r1 * s1 + r2 * s2) / squared
-        depth = a[2] + inverse * self.b[2]
-        depth_squared = np.where(depth > 1e-6, depth * depth, np.nan)
-        across = r1 * s2 - r2 * s1  # of r and s, as r + q s is what of r is not along s
-        return inverse, across * across / (squared * depth_squared), squared / depth_squared
+            places = place_pixels(torch.from_numpy(inverse[rows]), *self.tensors, rows.start)
+            for part, values in zip(maps, places, strict=True):
+                part[rows] = values.numpy()
+        return maps[0], maps[1], maps[2]
 
 
 def measure(
@@ -166,20 +149,20 @@ def measure(
     parallax = Parallax.between(view, neighbour)
     x, y, _ = parallax.pixels(start)
     motion = np.asarray(flow.calc(view.gray, look_up(neighbour.gray, x, y), None))  # type: ignore[call-overload]
-    right, down = (np.arange(n, dtype=np.float32) + 0.5 for n in view.gray.shape[::-1])
-    moved = motion[..., 0] + right, motion[..., 1] + down[:, None]
-    x, y = look_up(x, *moved), look_up(y, *moved)
+    near = torch.from_numpy(x), torch.from_numpy(y)
+    x, y = np.empty_like(x), np.empty_like(y)
+    for rows in strips(x.shape):
+        moved = follow_motion(*near, torch.from_numpy(motion[rows]), rows.start)
+        x[rows], y[rows] = (values.numpy() for values in moved)
     seen = look_up(np.ascontiguousarray(neighbour.inside, np.uint8), x, y, nearest=True) > 0
     alike = correlation(view.gray, look_up(neighbour.gray, x, y), of_view)
-    good = view.inside & seen & (alike > MIN_CORRELATION) & (of_view[1] > MIN_CONTRAST)
+    usable = view.inside & seen & (alike > MIN_CORRELATION) & (of_view[1] > MIN_CONTRAST)
     inverse, weight = np.empty_like(start), np.empty_like(start)
-    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        for rows in strips(start.shape):
-            q, off_line, parallax_squared = parallax.solve(x[rows], y[rows], rows)
-            noise = (NOISE**2 + off_line) * (11 - 10 * np.minimum(alike[rows], 1))
-            certainty = parallax_squared / noise
-            measured = good[rows] & (off_line < MAX_EPIPOLAR**2) & np.isfinite(q) & np.isfinite(certainty)
-            inverse[rows], weight[rows] = np.where(measured, q, 0), np.where(measured, certainty, 0)
+    for rows in strips(start.shape):
+        at, correlations = (torch.from_numpy(x[rows]), torch.from_numpy(y[rows])), torch.from_numpy(alike[rows])
+        counted = torch.from_numpy(usable[rows])
+        solved = solve_matches(*at, correlations, counted, *parallax.tensors, rows.start, NOISE, MAX_EPIPOLAR)
+        inverse[rows], weight[rows] = (values.numpy() for values in solved)
     return inverse, weight
 
 
@@ -207,45 +190,17 @@ def _mean(x: NDArray[Any], side: int = WINDOW, *, squared: bool = False) -> Map:
     return np.asarray(box_filter(x, cv2.CV_32F, (side, side), borderType=cv2.BORDER_REPLICATE), np.float32)
 
 
-def fuse(inverse: NDArray[np.float32], weight: NDArray[np.float32]) -> Depth:
-    """The mean of the largest consistent subset of n measurements [n, h, w], and its error, at least their scatter.
+def fuse(inverse: Sequence[Map], weight: Sequence[Map]) -> Depth:
+    """The mean of the largest consistent subset of n measurements [h, w], and its error (``average_matches``).
 
-    Weights are one over squared errors, 0 without a measurement. A single one counts if there is no other.
+    Weights are one over squared errors, 0 without a measurement.
     """
-    depth, count = Depth(*np.empty((2, *inverse.shape[1:]), np.float32)), len(inverse)
-    for rows in strips(inverse.shape):
-        q, weights = inverse[:, rows], weight[:, rows]
-        variance, there = AGREE**2 / np.maximum(weights, 1e-30), weights > 0
-        measured, all_weight = there.sum(0, dtype=np.int8), np.maximum(weights.sum(0), 1e-30)
-        best, mean, error = (np.zeros_like(q[0]) for _ in range(3))
-        pairs = {}
-        for k in range(count):
-            # Relative to measurement k, so that sums of squares are exact.
-            number, total = np.ones_like(measured), weights[k].copy()
-            first, second = np.zeros_like(mean), np.zeros_like(mean)
-            for n in (n for n in range(count) if n != k):
-                if n > k:
-                    apart = q[n] - q[k]
-                    agrees = there[n] & there[k] & (apart * apart < variance[n] + variance[k])
-                    pairs[k, n] = apart, agrees
-                apart, agrees = pairs[min(k, n), max(k, n)]
-                w = weights[n] * agrees
-                total += w
-                w *= apart
-                first += w if n > k else -w
-                w *= apart
-                second += w
-                number += agrees
-            shift = first / np.maximum(total, 1e-30)
-            average = q[k] + shift
-            scatter = np.maximum(second - first * shift, 0) / np.maximum(number - 1, 1)
-            value = number + total / all_weight
-            better = there[k] & (number >= np.minimum(measured, 2)) & (average > 0) & (value > best)
-            np.copyto(best, value, where=better)
-            np.copyto(mean, average, where=better)
-            np.copyto(error, np.sqrt(np.maximum(scatter, 1) / np.maximum(total, 1e-30)), where=better)
-        kept = (best > 0) & (error < MAX_RELATIVE * mean)
-        depth.inverse[rows], depth.error[rows] = np.where(kept, mean, 0), np.where(kept, error, 0)
+    depth = Depth(*np.empty((2, *inverse[0].shape), np.float32))
+    for rows in strips(inverse[0].shape):
+        q, certainty = (torch.from_numpy(np.stack([x[rows].ravel() for x in each])) for each in (inverse, weight))
+        averaged = average_matches(q, certainty, MAX_RELATIVE)
+        for values, average in zip((depth.inverse, depth.error), averaged, strict=True):
+            values[rows] = average.numpy().reshape(-1, values.shape[1])
     return depth
 
 
@@ -369,7 +324,7 @@ def matched(view: View, others: list[View], points: NDArray[np.float64], rounds:
             rough = np.asarray(cv2.resize(rough, small.gray.shape[::-1], interpolation=cv2.INTER_LINEAR), np.float32)
         of_view = mean_and_contrast(small.gray)
         pairs = [measure(small, neighbour.reduced(factor), rough, flow, of_view) for neighbour in others]
-        depth = without_fringes(small, fuse(*(np.stack(part) for part in zip(*pairs, strict=True))))
+        depth = without_fringes(small, fuse(*zip(*pairs, strict=True)))
     return depth
 
 
@@ -386,14 +341,12 @@ def confirmed(view: View, depth: Depth, others: list[tuple[View, Depth]]) -> Dep
     """Keeps the depths confirmed by the depth of at least one other image and by at least as many as contradict it."""
     confirm, contradict = np.zeros(depth.inverse.shape, np.int8), np.zeros(depth.inverse.shape, np.int8)
     for neighbour, theirs in others:
-        x, y, ahead = Parallax.between(view, neighbour).pixels(depth.inverse)
-        there = look_up(np.stack([theirs.inverse, theirs.error], -1), x, y, nearest=True)
-        for rows in strips(ahead.shape):
-            inverse, error = there[rows, :, 0], there[rows, :, 1]  # 0 behind the neighbour
-            expected = depth.inverse[rows] / np.maximum(ahead[rows], 1e-6)
-            tolerance = 3 * np.sqrt(error * error + depth.error[rows] ** 2) + SAME_DEPTH * expected
-            both, apart = (inverse > 0) & (expected > 0), inverse - expected
-            confirm[rows] += both & (np.abs(apart) < tolerance)
-            contradict[rows] += both & (apart < -tolerance)
+        there = torch.from_numpy(theirs.inverse), torch.from_numpy(theirs.error)
+        parallax = Parallax.between(view, neighbour).tensors
+        for rows in strips(depth.inverse.shape):
+            here = torch.from_numpy(depth.inverse[rows]), torch.from_numpy(depth.error[rows])
+            confirms, contradicts = compare_depths(*here, *there, *parallax, rows.start, SAME_DEPTH)
+            confirm[rows] += confirms.numpy()
+            contradict[rows] += contradicts.numpy()
     kept = (confirm >= 1) & (confirm > contradict)
     return Depth(np.where(kept, depth.inverse, 0), np.where(kept, depth.error, 0))

@@ -139,21 +139,32 @@ def camera_matrix(pinhole: NDArray[np.float64]) -> NDArray[np.float64]:
 def project(posed: PosedImages, j: int, points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Pixels [P, 2] at which a camera shows points [P, 3], lens included; far outside for points behind it or so far to
     the side that the lens's polynomial turns back."""
-    pose = posed.camera_to_worlds[j]
-    local = (points - pose[:, 3]) @ pose[:, :3] * [1, -1, -1]  # OpenCV's axes: right, down, ahead
-    ahead = local[:, 2] > 0
-    aside = np.hypot(local[:, 0], local[:, 1])
-    fisheye = posed.is_fisheye(j)
-    radius = np.arctan2(aside, local[:, 2]) if fisheye else aside / np.where(ahead, local[:, 2], 1)
-    # The radius r > 0 from which r (1 + k1 r^2 + k2 r^4 + ...) falls, if it ever does, by its slope's roots in r^2.
-    slope = [1.0, *((2 * n + 3) * k for n, k in enumerate(posed.distortion[j, : 4 if fisheye else 2]))]
+    pose, fisheye, lens = posed.camera_to_worlds[j], posed.is_fisheye(j), posed.distortion[j]
+    x, y, depth = ((points - pose[:, 3]) @ pose[:, :3] * [1, -1, -1]).T  # OpenCV's axes: right, down, ahead
+    ahead, aside = depth > 0, np.hypot(x, y)
+    depth = np.where(ahead, depth, 1)
+    radius = np.arctan2(aside, depth) if fisheye else aside / depth
+    # Powers of the squared radius; the radius from which the lens turns back is where their sum's slope has its root.
+    powers = np.array([1.0, *lens[: 4 if fisheye else 2]])
+    slope = powers * (2 * np.arange(len(powers)) + 1)
     roots = np.polynomial.polynomial.polyroots(np.trim_zeros(slope, "b"))
     squares = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)]
     ahead &= radius < np.sqrt(squares.min(initial=np.inf))
-    local = np.where(ahead[:, None], local, [0.0, 0.0, 1.0])[:, None]
-    matrix, still = camera_matrix(posed.intrinsics[j]), np.zeros(3)
-    bend = cv2.fisheye.projectPoints if fisheye else cv2.projectPoints
-    at = bend(local, still, still, matrix, posed.distortion[j])[0].reshape(-1, 2)
+    with np.errstate(over="ignore", invalid="ignore"):  # of points that are not shown
+        squared = radius * radius
+        bent = np.polynomial.polynomial.polyval(squared, powers)
+        if fisheye:
+            bent *= radius / np.maximum(aside, 1e-300)
+            x, y = x * bent, y * bent
+        else:
+            x, y, (p1, p2) = x / depth, y / depth, lens[2:4]
+            across = 2 * x * y
+            x, y = (
+                x * bent + p1 * across + p2 * (squared + 2 * x * x),
+                y * bent + p2 * across + p1 * (squared + 2 * y * y),
+            )
+        fx, fy, cx, cy = posed.intrinsics[j]
+        at = np.stack([fx * x + cx, fy * y + cy], -1)
     return np.where(ahead[:, None], at, -1e4)
 
 

@@ -1,0 +1,204 @@
+"""Parallax between two images: where points appear in the other one, depths of matches there, and their mean.
+
+A point at inverse depth q on pixel (x, y) of an image appears in another one at the homogeneous pixel a + q b, where a
+is linear in (x, y, 1) (``capture/dense.py``). A match there gives two linear equations r + q s = 0.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from mmpi_ns.ops.dispatch import operation
+
+FAR = -1e4
+"""Pixel of a point behind the other image."""
+LEAST_AHEAD = 1e-6
+"""Depth over that in the first image, below which a point is behind the other one."""
+AGREE = 2.5
+"""Measurements agree if they differ by at most this many standard deviations."""
+
+
+class Places(NamedTuple):
+    """Where the points of an image's pixels appear in another image."""
+
+    x: Float[Tensor, "H W"]
+    """Pixels, ``FAR`` for points behind."""
+    y: Float[Tensor, "H W"]
+    ahead: Float[Tensor, "H W"]
+    """Depth there over depth here; 0 for points behind."""
+
+
+class Moved(NamedTuple):
+    """Values of two maps."""
+
+    x: Float[Tensor, "R W"]
+    y: Float[Tensor, "R W"]
+
+
+class Compared(NamedTuple):
+    """What another image's depths say of an image's."""
+
+    confirms: Bool[Tensor, "R W"]
+    """It has the same depth there,"""
+    contradicts: Bool[Tensor, "R W"]
+    """or a farther one: it sees through."""
+
+
+class Measured(NamedTuple):
+    """Inverse depths with a number that tells how certain they are; both 0 where there is none."""
+
+    inverse: Float[Tensor, "*N"]
+    certainty: Float[Tensor, "*N"]
+    """One over the squared error of a match; the error of a mean."""
+
+
+@operation("cpu")
+def place_pixels(
+    inverse: Float[Tensor, "H W"], linear: Float[Tensor, "3 3"], b: Float[Tensor, "3"], first_row: int
+) -> Places:
+    """Places of pixels in another image.
+
+    Args:
+        inverse: inverse depths of some rows of an image.
+        linear: a at a pixel (x, y) is this times (x, y, 1).
+        b: change of the homogeneous pixel for each unit of inverse depth.
+        first_row: row of the image with which ``inverse`` begins.
+    """
+    x, y, ahead = (a + inverse * shift for a, shift in zip(_linear(inverse, linear, first_row), b, strict=True))
+    behind = ~(ahead > LEAST_AHEAD)
+    divisor = torch.where(behind, 1.0, ahead)
+    x, y = (torch.where(behind, FAR, c / divisor) for c in (x, y))
+    return Places(x, y, torch.where(behind, 0.0, ahead))
+
+
+@operation("cpu")
+def follow_motion(
+    x: Float[Tensor, "H W"], y: Float[Tensor, "H W"], motion: Float[Tensor, "R W 2"], first_row: int
+) -> Moved:
+    """Values of two maps at the places that pixels have moved to, interpolated; beyond the borders those of the border.
+
+    Args:
+        x, y: the maps, of at least two rows and columns.
+        motion: right and down, pixels, of some rows.
+        first_row: row of the maps with which ``motion`` begins.
+    """
+    height, width = x.shape
+    right = (torch.arange(width) + motion[..., 0]).clamp(0, width - 1)
+    down = (torch.arange(len(motion))[:, None] + first_row + motion[..., 1]).clamp(0, height - 1)
+    left, top = right.long().clamp(max=width - 2), down.long().clamp(max=height - 2)
+    u, v = right - left, down - top
+
+    def at(image: Tensor) -> Tensor:
+        above, below = (torch.lerp(image[r, left], image[r, left + 1], u) for r in (top, top + 1))
+        return torch.lerp(above, below, v)
+
+    return Moved(at(x), at(y))
+
+
+@operation("cpu")
+def solve_matches(
+    x: Float[Tensor, "H W"],
+    y: Float[Tensor, "H W"],
+    alike: Float[Tensor, "H W"],
+    usable: Bool[Tensor, "H W"],
+    linear: Float[Tensor, "3 3"],
+    b: Float[Tensor, "3"],
+    first_row: int,
+    noise: float,
+    farthest: float,
+) -> Measured:
+    """Inverse depths of matches, by least squares: q = -r.s / s.s.
+
+    Args:
+        x, y: pixels of another image that match those of some rows of an image.
+        alike: correlation of the windows about both.
+        usable: which matches count.
+        linear, b, first_row: as of ``place_pixels``.
+        noise: standard deviation of a match where images look alike, pixels.
+        farthest: largest distance from the epipolar line, pixels.
+    """
+    a = _linear(x, linear, first_row)
+    r1, s1 = a[0] - x * a[2], b[0] - x * b[2]
+    r2, s2 = a[1] - y * a[2], b[1] - y * b[2]
+    squared = (s1 * s1 + s2 * s2).clamp(min=1e-20)
+    inverse = -(r1 * s1 + r2 * s2) / squared
+    depth = a[2] + inverse * b[2]
+    across = r1 * s2 - r2 * s1  # of r and s, as r + q s is what of r is not along s
+    off_line = across * across / (squared * depth * depth)
+    certainty = squared / (depth * depth * (noise**2 + off_line) * (11 - 10 * alike.clamp(max=1)))
+    kept = usable & (depth > LEAST_AHEAD) & (off_line < farthest**2) & inverse.isfinite() & certainty.isfinite()
+    return Measured(torch.where(kept, inverse, 0.0), torch.where(kept, certainty, 0.0))
+
+
+@operation("cpu")
+def average_matches(inverse: Float[Tensor, "M P"], certainty: Float[Tensor, "M P"], most_relative: float) -> Measured:
+    """The mean of the largest consistent subset of the M measurements of each pixel, and its error.
+
+    The error is at least the scatter of the subset. A single measurement counts if there is no other.
+
+    Args:
+        inverse: measurements.
+        certainty: one over their squared errors; 0 without a measurement.
+        most_relative: means with a larger relative error are discarded.
+    """
+    there = certainty > 0
+    variance, fewest = AGREE**2 / certainty.clamp(min=1e-30), there.sum(0).clamp(max=2)
+    all_certainty = certainty.sum(0).clamp(min=1e-30)
+    best, mean, error = (torch.zeros_like(inverse[0]) for _ in range(3))
+    for k in range(len(inverse)):
+        apart = inverse - inverse[k]  # relative to measurement k, so that sums of squares are exact
+        agrees = there & there[k] & (apart * apart < variance + variance[k])
+        weight = torch.where(agrees, certainty, 0.0)
+        number, total = agrees.sum(0), weight.sum(0).clamp(min=1e-30)
+        first = (weight * apart).sum(0)
+        shift = first / total
+        scatter = ((weight * apart * apart).sum(0) - first * shift).clamp(min=0) / (number - 1).clamp(min=1)
+        value, average = number + total / all_certainty, inverse[k] + shift
+        better = there[k] & (number >= fewest) & (average > 0) & (value > best)
+        best, mean = torch.where(better, value, best), torch.where(better, average, mean)
+        error = torch.where(better, (scatter.clamp(min=1) / total).sqrt(), error)
+    kept = (best > 0) & (error < most_relative * mean)
+    return Measured(torch.where(kept, mean, 0.0), torch.where(kept, error, 0.0))
+
+
+@operation("cpu")
+def compare_depths(
+    inverse: Float[Tensor, "R W"],
+    error: Float[Tensor, "R W"],
+    their_inverse: Float[Tensor, "A B"],
+    their_error: Float[Tensor, "A B"],
+    linear: Float[Tensor, "3 3"],
+    b: Float[Tensor, "3"],
+    first_row: int,
+    same: float,
+) -> Compared:
+    """Whether another image confirms or contradicts depths, by its nearest pixel where both have one.
+
+    Args:
+        inverse: inverse depths of some rows of an image; 0 without one.
+        error: their expected errors.
+        their_inverse, their_error: the same of the other image.
+        linear, b, first_row: as of ``place_pixels``.
+        same: relative difference, beside three errors, within which depths agree.
+    """
+    height, width = their_inverse.shape
+    x, y, ahead = place_pixels.reference(inverse, linear, b, first_row)
+    column, row = (x - 0.5).round(), (y - 0.5).round()
+    both = (column >= 0) & (column < width) & (row >= 0) & (row < height) & (inverse > 0)
+    place = torch.where(both, row, 0.0).long() * width + torch.where(both, column, 0.0).long()
+    theirs, their_errors = their_inverse.flatten()[place], their_error.flatten()[place]
+    expected = inverse / ahead.clamp(min=LEAST_AHEAD)
+    tolerance, apart = 3 * torch.hypot(their_errors, error) + same * expected, theirs - expected
+    both &= theirs > 0
+    return Compared(both & (apart.abs() < tolerance), both & (apart < -tolerance))
+
+
+def _linear(image: Tensor, linear: Tensor, first_row: int) -> list[Tensor]:
+    """The three parts of a at pixels of some rows. [H, W] each"""
+    x = torch.arange(image.shape[1], dtype=image.dtype) + 0.5
+    y = torch.arange(image.shape[0], dtype=image.dtype)[:, None] + (first_row + 0.5)
+    return [m[0] * x + (m[1] * y + m[2]) for m in linear]
