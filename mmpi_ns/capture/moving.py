@@ -174,11 +174,12 @@ def _moves(
     if swept is None:
         swept = sweep(shot, others)
     shown = evidence(shot, others, [masks[j] for j in near], swept.impossible)
-    core = swept.certain & ~is_static(shot, shown)
+    static = is_static(shot, shown)
+    core = swept.certain & ~static
     if len(others) >= 2:
         core |= seeds(shot, others, shown)
         flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
         for j in near[:AFTER]:
             if masks[j].any():
-                core |= followed(shot, shots[j], masks[j], flow)
+                core |= followed(shot, shots[j], masks[j], flow) & ~static
     return grown(shot, shown, core), swept

@@ -18,6 +18,8 @@ from mmpi_ns.capture.views import look_up, pixel_grid
 
 LEAST_LEVELS, NOISES = 12.0, 4.0
 """Levels of strong evidence from which a pixel is a seed: the first, plus this multiple of the image's noise."""
+WEAKER = 1.3
+"""Times as many levels of weak evidence make a seed."""
 STEPS, REACH = 48, 1.2
 """Inverse depths at which seeds are searched in the neighbours, up to this multiple of the nearest content's."""
 DENSITY, AROUND = 0.35, 7
@@ -46,7 +48,7 @@ FOLLOWED = 0.7
 def seeds(shot: Shot, others: Sequence[Neighbour], evidence: Evidence) -> Mask:
     """Pixels that show something that moves, beyond doubt. [h, w]"""
     least = LEAST_LEVELS + NOISES * evidence.noise
-    candidates = evidence.strong > least
+    candidates = (evidence.strong > least) | (evidence.weak > WEAKER * least)
     result = candidates.copy()
     result[candidates] = unexplained(shot, others, candidates) > least
     share = cv2.boxFilter(result.astype(np.float32), -1, (AROUND, AROUND))

@@ -46,7 +46,7 @@ def test_most_of_the_cars_is_masked_and_little_else(drive, manager):
         mask = ~manager.train_dataset.get_data(i, image_type="uint8")["mask"][..., 0].numpy()
         moving.append(mask[truth == MOVER])
         static.append(mask[truth == 0])
-    assert np.concatenate(moving).mean() > 0.7
+    assert np.concatenate(moving).mean() > 0.75
     assert np.concatenate(static).mean() < 0.02
 
 
@@ -213,15 +213,14 @@ def a_scene(color, horizon=None):
 
 
 @pytest.mark.parametrize(("width", "reaches"), [(10, True), (30, False)], ids=["person", "car"])
-def test_a_narrow_thing_reaches_the_horizon_also_in_other_colours(width, reaches):
-    color = np.full((*SIZE, 3), 90, np.uint8)
-    color[20:55, 30 : 30 + width] = 200
-    color[12:20, 30 : 30 + width] = 91  # a head in the colours of what is behind it
+def test_a_narrow_thing_reaches_the_horizon_also_in_the_colours_behind_it(width, reaches):
+    color = np.random.default_rng(0).integers(80, 100, (*SIZE, 3)).astype(np.uint8)
     core = np.zeros(SIZE, bool)
-    core[25:55, 30 : 30 + width] = True
+    core[23:55, 30 : 30 + width] = True
+    color[core] += 100
     mask = grown(*a_scene(color, horizon=14), core)
-    assert mask[25:55, 31 : 29 + width].all()
-    assert bool(mask[14:19, 31 : 29 + width].all()) == reaches and mask[14:19, 31 : 29 + width].any() == reaches
+    assert mask[24:54, 31 : 29 + width].all()
+    assert mask[14:19, 31 : 29 + width].mean() == reaches
 
 
 @pytest.mark.parametrize(("apart", "kept"), [(6, True), (13, False)])
