@@ -13,7 +13,7 @@ from training_runs import datamanager
 
 from mmpi_ns.capture.dense import Depth, Parallax
 from mmpi_ns.capture.load import load_observations
-from mmpi_ns.capture.moving import in_image
+from mmpi_ns.capture.moving import LARGE, in_image, large_nearby
 from mmpi_ns.capture.moving_evidence import Evidence, Neighbour, Shot, ground_of, nearest_known, splat
 from mmpi_ns.capture.moving_objects import followed, grown, unexplained, without_holes
 from mmpi_ns.capture.tracks import PosedImages
@@ -48,6 +48,16 @@ def test_most_of_the_cars_is_masked_and_little_else(drive, manager):
         static.append(mask[truth == 0])
     assert np.concatenate(moving).mean() > 0.75
     assert np.concatenate(static).mean() < 0.02
+
+
+def test_small_masks_count_only_in_and_near_images_with_a_large_one():
+    masks = [np.zeros((10, 100), bool) for _ in range(5)]
+    for mask, pixels in zip(masks, (3, 0, 1000 * LARGE, 5, 7), strict=True):
+        mask.flat[: int(pixels)] = True
+    near = [[1], [0, 2], [1, 3], [2, 4], [3]]
+    assert [int(mask.sum()) for mask in large_nearby(masks, near)] == [0, 0, 20, 5, 0]
+    assert not any(mask.any() for mask in large_nearby([mask & (masks[2] < 1) for mask in masks], near))
+    assert large_nearby([], []) == []
 
 
 def test_masked_pixels_have_no_depth_and_draw_no_ray(manager):
