@@ -46,7 +46,7 @@ EDGE = 0.4
 """Share of a mover around a pixel from which it is masked."""
 SECONDS = 0.7
 """Processor seconds for an image, for the forecast (docs/results/moving.md)."""
-LARGE = 0.02
+LARGE = 0.015
 """Share of an image from which its masks count, and those of the images near it."""
 VERSION = 6
 """Version of the algorithm: cached masks of another version are found anew."""
