@@ -47,8 +47,8 @@ EDGE = 0.4
 SECONDS = 0.7
 """Processor seconds for an image, for the forecast (docs/results/moving.md)."""
 LARGE = 0.015
-"""Share of an image from which its masks count, and those of the images near it."""
-VERSION = 6
+"""Share of an image that must be masked in one of them, or nothing is."""
+VERSION = 7
 """Version of the algorithm: cached masks of another version are found anew."""
 ENOUGH, SAMPLES = 200, 5000
 """Pixels of one depth in both images from which their exposures are compared, at least and at most."""
@@ -88,16 +88,10 @@ def find_moving(
         second = list(pool.map(lambda i: _moves(shots, near[i], i, masks, first[i][1]), again))
         for i, (mask, _) in zip(again, second, strict=True):
             masks[i] = mask
-    return [shot.view for shot in shots], large_nearby(masks, near)
-
-
-def large_nearby(masks: Sequence[Mask], near: Sequence[Sequence[int]]) -> list[Mask]:
-    """The masks of images that have a large one, or are near such an image; the others are cleared.
-
-    Whatever moves comes close at some time. Small masks alone are mostly false, and cost more than what is small can.
-    """
-    large = np.array([mask.mean() >= LARGE for mask in masks])
-    return [mask & (large[i] or large[list(near[i])].any()) for i, mask in enumerate(masks)]
+    # Whatever moves comes close at some time: small masks alone are false, and their holes cost more than small movers.
+    if max((mask.mean() for mask in masks), default=0.0) < LARGE:
+        masks = [np.zeros_like(mask) for mask in masks]
+    return [shot.view for shot in shots], masks
 
 
 def in_image(view: View, mask: Mask, images: PosedImages, i: int, shape: tuple[int, int]) -> Mask:

@@ -5,15 +5,17 @@ from __future__ import annotations
 import json
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 from training_runs import datamanager
 
+from mmpi_ns.capture import moving
 from mmpi_ns.capture.dense import Depth, Parallax
 from mmpi_ns.capture.load import load_observations
-from mmpi_ns.capture.moving import LARGE, in_image, large_nearby
+from mmpi_ns.capture.moving import find_moving, in_image
 from mmpi_ns.capture.moving_evidence import Evidence, Neighbour, Shot, ground_of, nearest_known, splat
 from mmpi_ns.capture.moving_objects import followed, grown, unexplained, without_holes
 from mmpi_ns.capture.tracks import PosedImages
@@ -50,14 +52,24 @@ def test_most_of_the_cars_is_masked_and_little_else(drive, manager):
     assert np.concatenate(static).mean() < 0.02
 
 
-def test_small_masks_count_only_in_and_near_images_with_a_large_one():
-    masks = [np.zeros((10, 100), bool) for _ in range(5)]
-    for mask, pixels in zip(masks, (3, 0, 1000 * LARGE, 5, 7), strict=True):
-        mask.flat[: int(pixels)] = True
-    near = [[1], [0, 2], [1, 3], [2, 4], [3]]
-    assert [int(mask.sum()) for mask in large_nearby(masks, near)] == [0, 0, 15, 5, 0]
-    assert not any(mask.any() for mask in large_nearby([mask & (masks[2] < 1) for mask in masks], near))
-    assert large_nearby([], []) == []
+@pytest.mark.parametrize("large", [False, True])
+def test_small_masks_count_only_where_one_image_has_a_large_one(monkeypatch, large):
+    view = View(np.zeros((20, 50), np.uint8), np.ones(4), np.eye(4)[:3], np.ones((20, 50), bool))
+    nothing = Depth(*np.zeros((2, 20, 50), np.float32))
+    shots = [Shot(view, np.zeros((20, 50, 3), np.uint8), nothing, None) for _ in range(3)]
+
+    def moves(shots, near, i, masks, first):
+        mask = np.zeros((20, 50), bool)
+        mask.flat[: (16 if large else 14) if i == 1 else 3] = True
+        return mask, None
+
+    monkeypatch.setattr(moving, "find_depths", lambda *_: iter(shots))
+    monkeypatch.setattr(moving, "_moves", moves)
+    poses = np.tile(np.eye(4)[:3], (3, 1, 1))
+    poses[:, 0, 3] = range(3)
+    images = PosedImages((Path("x"),) * 3, poses, np.ones((3, 4)), np.tile([50.0, 20], (3, 1)), np.zeros((3, 4)))
+    _, masks = find_moving(images, lambda i: np.zeros((0, 3)))
+    assert [int(mask.sum()) for mask in masks] == ([3, 16, 3] if large else [0, 0, 0])
 
 
 def test_masked_pixels_have_no_depth_and_draw_no_ray(manager):
