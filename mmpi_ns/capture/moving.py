@@ -88,7 +88,7 @@ def find_moving(
         second = list(pool.map(lambda i: _moves(shots, near[i], i, masks, first[i][1]), again))
         for i, (mask, _) in zip(again, second, strict=True):
             masks[i] = mask
-    # Whatever moves comes close at some time: small masks alone are false, and their holes cost more than small movers.
+    # Whatever moves comes close at some time; what is found where nothing moves is mostly small.
     if max((mask.mean() for mask in masks), default=0.0) < LARGE:
         masks = [np.zeros_like(mask) for mask in masks]
     return [shot.view for shot in shots], masks
