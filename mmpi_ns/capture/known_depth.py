@@ -18,7 +18,6 @@ from jaxtyping import Float, Int16
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import ArrayLike, NDArray
-from PIL import Image
 from rich.progress import track
 from torch import Tensor
 
@@ -29,7 +28,7 @@ from mmpi_ns.capture.lone_depth import continued, is_lone
 from mmpi_ns.capture.loose_points import POINT_ERROR, contradict, see_points
 from mmpi_ns.capture.observe import drop_masked, posed_images
 from mmpi_ns.capture.rays import Rays
-from mmpi_ns.capture.tracks import PosedImages, at_full_size
+from mmpi_ns.capture.tracks import PosedImages, at_full_size, shown_size, size_of
 from mmpi_ns.capture.views import STRIP, View, look_up, straightened, strips
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.utils.errors import duration, say
@@ -153,7 +152,7 @@ def know_depths(
     depths = with_points(depths, seen)
     if files:
         unit = outputs.metadata.get("depth_unit_scale_factor", 1.0) * outputs.dataparser_scale
-        depths = with_sensor(depths, [Path(f) for f in files], float(unit), original, posed)
+        depths = with_sensor(depths, [Path(f) for f in files], float(unit), posed)
     depths = with_continued(depths, posed, dataset, rays)
     give_back_freed_memory()
     return depths, seen
@@ -189,23 +188,14 @@ def _from_cache(key: str, find: Callable[[], Iterable[Codes]]) -> KnownDepth:
     return KnownDepth(Computed(len(arrays), lambda i: cast(Codes, arrays[f"{i}"])))
 
 
-def _file_shape(original: PosedImages, posed: PosedImages, i: int) -> tuple[int, int]:
-    """Height and width of a training image's file; its camera may have a row or column less."""
-    if original.files[i] == posed.files[i]:
-        return int(original.sizes[i, 1]), int(original.sizes[i, 0])
-    with Image.open(posed.files[i]) as image:
-        return image.height, image.width
-
-
-def with_sensor(
-    known: KnownDepth, files: list[Path], unit: float, original: PosedImages, posed: PosedImages
-) -> KnownDepth:
+def with_sensor(known: KnownDepth, files: list[Path], unit: float, posed: PosedImages) -> KnownDepth:
     """Replaces depths by those of sensors where there are any; where both are known and contradict, neither is kept."""
 
     def replaced(i: int) -> Codes:
         codes = known.codes[i]
         shape = codes.shape[0], codes.shape[1]
-        measured = packed(read_sensor(files[i], unit, original, i, shape, _file_shape(original, posed, i)))
+        width, height = shown_size(size_of(posed.files[i]), posed.sizes[i]).astype(int)
+        measured = packed(read_sensor(files[i], unit, posed, i, shape, (height, width)))
         apart = contradict(*(unpacked(torch.from_numpy(x)).numpy() for x in (measured, codes)))
         codes = np.where(measured[..., :1] != UNKNOWN, measured, codes)
         codes[apart] = UNKNOWN
@@ -235,7 +225,7 @@ def at_training_pixels(view: View, depth: Depth, posed: PosedImages, i: int, sha
     fx, fy, cx, cy = view.pinhole
     scale_x, scale_y = width / view.gray.shape[1], height / view.gray.shape[0]
     for rows in strips(shape):
-        x, y = straightened(posed, i, shape, shape, rows)
+        x, y = straightened(posed, i, shape, rows)
         at, longer = ((fx * x + cx) * scale_x, (fy * y + cy) * scale_y), np.sqrt(x**2 + y**2 + 1)
         for n, values in enumerate(maps):
             distances[rows, :, n] = look_up(values, *at, nearest=True) / longer
@@ -357,24 +347,24 @@ def with_points(known: KnownDepth, observations: Observations) -> KnownDepth:
 
 
 def read_sensor(
-    file: Path, unit: float, original: PosedImages, i: int, shape: tuple[int, int], file_shape: tuple[int, int]
+    file: Path, unit: float, posed: PosedImages, i: int, shape: tuple[int, int], file_shape: tuple[int, int]
 ) -> Map:
     """Distances from a depth image (along the optical axis, 0 where unknown), for a training image's pixels.
 
     Args:
         file: 16-bit PNG or .npy.
         unit: length of a depth of 1, scene units.
-        original: cameras of the originals.
+        posed: the training images.
         i: the image's place in them.
         shape: height and width of the training image.
-        file_shape: height and width of its file.
+        file_shape: those of all that its file shows, which may have a row or column more.
 
     Raises:
         InputError: the file cannot be read (names it).
     """
     depth = read_depth_image(file, unit)
     nearest = cv2.resize(depth, file_shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT)[: shape[0], : shape[1]]
-    x, y = straightened(original, i, shape, file_shape)
+    x, y = straightened(posed, i, shape)
     longer = np.sqrt(x**2 + y**2 + 1)
     hit = np.isfinite(nearest) & (nearest > 0)
     inverse = np.where(hit, 1 / (np.where(hit, nearest, 1) * longer), 0)

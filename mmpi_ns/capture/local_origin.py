@@ -24,7 +24,7 @@ from torch import Tensor
 from mmpi_ns.capture.checks import say_once
 from mmpi_ns.capture.dataset import NO_MASK
 from mmpi_ns.capture.sfm import checked_model
-from mmpi_ns.capture.tracks import whole_of
+from mmpi_ns.capture.tracks import size_of, whole_of
 from mmpi_ns.utils.errors import InputError
 from mmpi_ns.utils.host import transforms_changed
 
@@ -84,7 +84,7 @@ def with_cameras_of_copies(outputs: DataparserOutputs, factor: int | None) -> Da
         cameras = outputs.cameras
         for i, file in enumerate(outputs.image_filenames):
             with suppress(InputError):  # is named when it is read
-                original, _, scale = whole_of(Path(file))
+                original, _, scale = whole_of(Path(file), size_of(Path(file)))
                 if original != file:
                     for name, ratio in zip(("fx", "fy", "cx", "cy"), np.tile(factor / scale, 2), strict=True):
                         getattr(cameras, name)[i] *= ratio

@@ -104,7 +104,7 @@ def in_image(view: View, mask: Mask, images: PosedImages, i: int, shape: tuple[i
         i: the image's place in them.
         shape: height and width that are asked for; the image may be a copy of another size.
     """
-    x, y = straightened(images, i, shape, shape)
+    x, y = straightened(images, i, shape)
     fx, fy, cx, cy = view.pinhole
     return look_up(mask.astype(np.float32), fx * x + cx, fy * y + cy) > EDGE
 

@@ -111,15 +111,29 @@ def size_of(file: Path) -> NDArray[np.float64]:
         ) from error
 
 
-def whole_of(file: Path) -> tuple[Path, NDArray[np.float64], NDArray[np.float64]]:
+def shown_size(size: NDArray[np.float64], camera: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Width and height of a file as its camera shows it, which may lack a last row or column.
+
+    Args:
+        size: of the file.
+        camera: of the camera; of another size if files are reduced when they are read.
+    """
+    return np.where(np.abs(size - camera) <= 1, size, camera)
+
+
+def whole_of(file: Path, size: NDArray[np.float64]) -> tuple[Path, NDArray[np.float64], NDArray[np.float64]]:
     """What a downscaled copy was made from, its size, and its pixels (columns, rows) in one of the copy.
 
     A file without an original, or whose original has another shape, stands for itself.
 
+    Args:
+        file: the copy.
+        size: its width and height.
+
     Raises:
         InputError: an image file cannot be read (names it).
     """
-    size, (original, factor) = size_of(file), original_of(file)
+    original, factor = original_of(file)
     if factor > 1:
         whole = size_of(original)
         if (np.abs(whole - factor * size) <= factor).all():
@@ -154,10 +168,9 @@ def at_full_size(images: PosedImages) -> PosedImages:
     Raises:
         InputError: an image file cannot be read (names it).
     """
-    files, sizes, scales = zip(*map(whole_of, images.files), strict=True)
-    # Cameras have the sizes of the files but for a row or column, or those to which the files are reduced.
-    copies = np.array([size_of(file) for file in images.files])
-    reduced = np.where(np.abs(copies - images.sizes) <= 1, 1, copies / images.sizes)
+    copies = [size_of(file) for file in images.files]
+    files, sizes, scales = zip(*map(whole_of, images.files, copies), strict=True)
+    reduced = np.stack(copies) / [shown_size(*pair) for pair in zip(copies, images.sizes, strict=True)]
     intrinsics = images.intrinsics * np.tile(scales * reduced, 2)
     return replace(images, files=files, sizes=np.stack(sizes), intrinsics=intrinsics)
 

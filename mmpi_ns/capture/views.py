@@ -97,25 +97,23 @@ def straightened_color(images: PosedImages, i: int, view: View) -> NDArray[np.ui
     return np.asarray(color, np.uint8)
 
 
-def straightened(
-    original: PosedImages, i: int, shape: tuple[int, int], file_shape: tuple[int, int], some: slice | None = None
-) -> NDArray[np.float64]:
-    """Tangents (right, down) at which a training image's pixels look, lens taken out; of some rows. [2, H, W]"""
-    lens = tuple(original.distortion[i]) if original.is_bent(i) else ()
-    camera = tuple(original.sizes[i]), tuple(original.intrinsics[i]), lens, original.is_fisheye(i)
+def straightened(images: PosedImages, i: int, shape: tuple[int, int], some: slice | None = None) -> NDArray[np.float64]:
+    """Tangents (right, down) at which pixels of an image of this shape look, lens taken out; of some rows. [2, H, W]"""
+    lens = tuple(images.distortion[i]) if images.is_bent(i) else ()
+    camera = tuple(images.sizes[i]), tuple(images.intrinsics[i]), lens, images.is_fisheye(i)
     rows = [some] if some else strips(shape)
-    parts = [_straightened_rows(*camera, shape[1], file_shape, part.start, part.stop) for part in rows]
+    parts = [_straightened_rows(*camera, shape, part.start, part.stop) for part in rows]
     return parts[0] if some else np.concatenate(parts, 1)
 
 
 @lru_cache(maxsize=32)
 def _straightened_rows(
     size: tuple[float, float], pinhole: tuple[float, ...], lens: tuple[float, ...], fisheye: bool,
-    width: int, file_shape: tuple[int, int], first: int, last: int,
+    shape: tuple[int, int], first: int, last: int,
 ) -> NDArray[np.float64]:  # fmt: skip
     """The same of a strip of rows: cameras of one lens share them."""
-    columns, rows = np.meshgrid(np.arange(width) + 0.5, np.arange(first, last) + 0.5)
-    at = np.stack([columns * size[0] / file_shape[1], rows * size[1] / file_shape[0]], -1).reshape(-1, 1, 2)
+    columns, rows = np.meshgrid(np.arange(shape[1]) + 0.5, np.arange(first, last) + 0.5)
+    at = np.stack([columns * size[0] / shape[1], rows * size[1] / shape[0]], -1).reshape(-1, 1, 2)
     fx, fy, cx, cy = pinhole
     if lens:
         straighten = cv2.fisheye.undistortPoints if fisheye else cv2.undistortPoints

@@ -139,40 +139,57 @@ def _choose(
     """The heads for a scene, with texels no finer than the budget allows, and the pixels that a texel spans."""
     candidates = find_candidates(observations, visible, with_cubes=config.max_voxels > 0)
 
-    def heads_at(choice: _Choice, chosen: list[int], size: float) -> list[MPIPlan | CubePlan]:
-        heads = choice.heads(chosen, size)
+    def heads_at(chosen: _Chosen, size: float) -> tuple[list[MPIPlan | CubePlan], float]:
+        """Heads, and the share of the budget that they use."""
+        heads = chosen.heads(config, size)
         mpis = widened([h for h in heads if isinstance(h, MPIPlan)], observations, visible)
-        return [*mpis, *(h for h in heads if isinstance(h, CubePlan))]
+        heads = [*mpis, *(h for h in heads if isinstance(h, CubePlan))]
+        return heads, sum(h.texels for h in heads) / config.max_texels if config.max_texels else 0.0
 
-    def excess(heads: list[MPIPlan | CubePlan]) -> float:
-        return sum(h.texels for h in heads) / config.max_texels if config.max_texels else 0.0
-
-    choices: list[tuple[float, float, _Choice, list[int]]] = []
+    tried: list[tuple[_Chosen, float, list[MPIPlan | CubePlan], float]] = []
     too_fine, texel_pixels = None, finest
     for _ in range(BUDGET_ROUNDS):
-        choice = _Choice(candidates, visible.weights, config, texel_pixels)
-        chosen = choice.run()
-        used = excess(heads_at(choice, chosen, texel_pixels))
-        choices.append((used, texel_pixels, choice, chosen))
+        chosen = _Choice(candidates, visible.weights, config, texel_pixels).run()
+        heads, used = heads_at(chosen, texel_pixels)
+        tried.append((chosen, texel_pixels, heads, used))
         if used > 1.0:
             too_fine = texel_pixels
             # Coarser texels mean fewer rows, columns and planes: nearly a third power.
-            texel_pixels *= max(1.04, used ** (1 / 3)) if min(c[0] for c in choices) > 1.0 else 1.1
+            texel_pixels *= max(1.04, used ** (1 / 3)) if min(t[-1] for t in tried) > 1.0 else 1.1
         elif too_fine is None or used > FULL:
             break
         else:
             texel_pixels = (too_fine * texel_pixels) ** 0.5
     # The last that fits; if none does, the last.
-    fitting = [c for c in choices if c[0] <= 1.0] or choices
-    _, texel_pixels, choice, chosen = fitting[-1]
-    heads = heads_at(choice, chosen, texel_pixels)
+    chosen, texel_pixels, heads, used = ([t for t in tried if t[-1] <= 1.0] or tried)[-1]
     # Texels a little finer may have asked for further heads, which do not fit: then there is room for those alone.
-    while texel_pixels / FINER >= finest and excess(heads) < FULL:
-        finer = heads_at(choice, chosen, texel_pixels / FINER)
-        if excess(finer) > 1.0:
+    while used < FULL and texel_pixels / FINER >= finest:
+        finer, used = heads_at(chosen, texel_pixels / FINER)
+        if used > 1.0:
             break
         heads, texel_pixels = finer, texel_pixels / FINER
     return heads, texel_pixels
+
+
+@dataclass(frozen=True)
+class _Chosen:
+    """Candidates that serve a scene."""
+
+    candidates: list[Candidate]
+    owner: NDArray[np.int64]
+    """Which of them serves each observation."""
+
+    def heads(self, config: PlacementConfig, texel_pixels: float) -> list[MPIPlan | CubePlan]:
+        """Their heads with texels of a size, each MPI with the planes it needs."""
+        heads = []
+        for n, candidate in enumerate(self.candidates):
+            # Planes at which the error of four fifths of the observations that it serves is small enough.
+            error = candidate.plane[self.owner == n]
+            error = error[np.isfinite(error)]
+            steps = float(np.quantile(error, 0.8)) / (config.plane_pixels * texel_pixels) if len(error) else 0.0
+            planes = int(np.clip(8 * round((1 + steps) / 8), MIN_PLANES, config.max_planes))
+            heads.append(candidate.at(texel_pixels, planes, config.max_voxels))
+        return heads
 
 
 class _Choice:
@@ -195,8 +212,7 @@ class _Choice:
         self.price = self.texels**config.texel_cost
         self.is_cube = np.array([isinstance(c.frame, CubePlan) for c in candidates])
 
-    def run(self) -> list[int]:
-        """The chosen candidates."""
+    def run(self) -> _Chosen:
         # A scene needs an MPI, however little it gains.
         gain = np.maximum(self.nothing - self.cost, 0) @ self.weights
         chosen = [int(np.where(self.is_cube, -1.0, gain / self.price).argmax())]
@@ -212,19 +228,8 @@ class _Choice:
         affordable = (self.texels <= self.texels[chosen].sum()) & ~self.is_cube
         alone = [int(np.where(affordable, gain, -1.0).argmax())]
         spared = self.config.min_gain * (len(chosen) - 1)
-        return alone if self._total(alone) <= self._total(chosen) + spared else chosen
-
-    def heads(self, chosen: list[int], texel_pixels: float) -> list[MPIPlan | CubePlan]:
-        """The chosen heads with texels of a size, each MPI with the planes it needs."""
-        owner, heads, config = self.cost[chosen].argmin(0), [], self.config
-        for n, candidate in enumerate(self.candidates[j] for j in chosen):
-            # Planes at which the error of four fifths of the observations that it serves is small enough.
-            error = candidate.plane[owner == n]
-            error = error[np.isfinite(error)]
-            steps = float(np.quantile(error, 0.8)) / (config.plane_pixels * texel_pixels) if len(error) else 0.0
-            planes = int(np.clip(8 * round((1 + steps) / 8), MIN_PLANES, config.max_planes))
-            heads.append(candidate.at(texel_pixels, planes, config.max_voxels))
-        return heads
+        chosen = alone if self._total(alone) <= self._total(chosen) + spared else chosen
+        return _Chosen([self.candidates[j] for j in chosen], self.cost[chosen].argmin(0))
 
     def _total(self, chosen: list[int]) -> float:
         """Remaining expected error, in bits, summed over images."""

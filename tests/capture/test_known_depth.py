@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -34,6 +35,12 @@ def camera(lens=(0.0, 0.0, 0.0, 0.0), fisheye=False):
     intrinsics = np.array([[60.0, 60.0, 40.0, 30.0]])
     pose, sizes = np.eye(4)[None, :3], np.array([[float(WIDTH), HEIGHT]])
     return PosedImages(("x.png",), pose, intrinsics, sizes, np.array([lens]), fisheye)  # type: ignore[arg-type]
+
+
+def photographed(folder):
+    """The camera with its image."""
+    cv2.imwrite(str(folder / "x.png"), np.zeros((HEIGHT, WIDTH), np.uint8))
+    return replace(camera(), files=(folder / "x.png",))
 
 
 def slanted(pinhole, shape):
@@ -148,8 +155,21 @@ def test_a_sensor_goes_before_other_sources_where_it_knows_something(tmp_path):
     depth[:30] = 2000
     cv2.imwrite(str(tmp_path / "d.png"), depth)
     before = KnownDepth([packed(np.full((HEIGHT, WIDTH, 2), 0.25))])
-    found = with_sensor(before, [tmp_path / "d.png"], 1e-3, camera(), camera()).image(0)
+    found = with_sensor(before, [tmp_path / "d.png"], 1e-3, photographed(tmp_path)).image(0)
     assert (found[30:] == 0.25).all() and found[29, 40, 0] == pytest.approx(0.5, rel=1e-3)
+
+
+def test_depth_images_of_images_that_are_reduced_when_they_are_read_show_the_whole(tmp_path):
+    depth = np.full((HEIGHT, WIDTH), 2000, np.uint16)
+    depth[:, WIDTH // 2 :] = 4000
+    cv2.imwrite(str(tmp_path / "d.png"), depth)
+    posed = photographed(tmp_path)
+    half = replace(posed, intrinsics=posed.intrinsics / 2, sizes=posed.sizes / 2)
+    nothing = KnownDepth([packed(np.zeros((HEIGHT // 2, WIDTH // 2, 2)))])
+    distances = 1 / with_sensor(nothing, [tmp_path / "d.png"], 1e-3, half).image(0)[15, :, 0]
+    longer = np.sqrt(((np.arange(40) + 0.5 - 20) / 30) ** 2 + (0.5 / 30) ** 2 + 1)
+    assert distances[:20] == pytest.approx(2 * longer[:20], rel=1e-3)
+    assert distances[20:] == pytest.approx(4 * longer[20:], rel=1e-3)
 
 
 def test_a_sensor_and_matches_that_contradict_each_other_are_both_left_out(tmp_path):
@@ -157,13 +177,13 @@ def test_a_sensor_and_matches_that_contradict_each_other_are_both_left_out(tmp_p
     depth[:, 40:] = 0
     cv2.imwrite(str(tmp_path / "d.png"), depth)
     sensor = with_sensor(
-        KnownDepth([packed(np.zeros((HEIGHT, WIDTH, 2)))]), [tmp_path / "d.png"], 1e-3, camera(), camera()
+        KnownDepth([packed(np.zeros((HEIGHT, WIDTH, 2)))]), [tmp_path / "d.png"], 1e-3, photographed(tmp_path)
     ).image(0)
     matched = np.stack([1.8 * sensor[..., 0], np.full((HEIGHT, WIDTH), 0.01, F32)], -1)  # as a mirror shows
     matched[:20, :, 0] = 1.02 * sensor[:20, :, 0]  # within the errors
     matched[:, 40:] = 0.25  # the sensor says nothing
     matched[50:] = 0  # the matches say nothing
-    found = with_sensor(KnownDepth([packed(matched)]), [tmp_path / "d.png"], 1e-3, camera(), camera()).image(0)
+    found = with_sensor(KnownDepth([packed(matched)]), [tmp_path / "d.png"], 1e-3, photographed(tmp_path)).image(0)
     assert (found[20:50, :40] == 0).all()
     assert (found[:20, :40] == sensor[:20, :40]).all() and (found[50:, :40] == sensor[50:, :40]).all()
     assert (found[:50, 40:] == 0.25).all() and sensor[0, 0, 0] > 0.3

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 import pytest
 import torch
 from nerfstudio.cameras.cameras import Cameras
-from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
+from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig, DataparserOutputs
+from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from PIL import Image
 
@@ -96,20 +99,41 @@ def test_a_missing_file_is_named(tmp_path):
         at_full_size(posed(tmp_path / "x.png", 4, 4))
 
 
-@pytest.mark.parametrize("size", [(310, 93), (311, 94)], ids=["rounded down", "rounded up"])
-def test_cameras_of_copies_look_where_those_of_the_originals_do(tmp_path, size):
-    """nerfstudio divides intrinsics by 4: the lower right corner would look 0.3 and 0.7 pixels past its image."""
-    for name in ("0.png", "1.png", "2.png"):
-        write(tmp_path / "images" / name, 1242, 375)
-        write(tmp_path / "images_4" / name, *size)
+def transforms(folder: Path) -> Callable[[int], DataParserConfig]:
+    """Parsers of a scene of three originals in nerfstudio's format, by downscale factor."""
     camera = {"fl_x": 721.5, "fl_y": 720.5, "cx": 609.6, "cy": 172.9, "w": 1242, "h": 375}
     poses = np.tile(np.eye(4), (3, 1, 1))
     poses[:, 0, 3] = range(3)
     frames = [{"file_path": f"images/{i}.png", "transform_matrix": pose.tolist()} for i, pose in enumerate(poses)]
-    (tmp_path / "transforms.json").write_text(json.dumps({**camera, "frames": frames}))
+    (folder / "transforms.json").write_text(json.dumps({**camera, "frames": frames}))
+    return lambda factor: NerfstudioDataParserConfig(data=folder, downscale_factor=factor)
+
+
+def colmap(folder: Path) -> Callable[[int], DataParserConfig]:
+    """The same of a COLMAP model."""
+    model = pycolmap.Reconstruction()
+    camera = pycolmap.Camera(model="PINHOLE", width=1242, height=375, params=[721.5, 720.5, 609.6, 172.9], camera_id=1)
+    model.add_camera_with_trivial_rig(camera)
+    for i in range(3):
+        image = pycolmap.Image(name=f"{i}.png", camera_id=1, image_id=i + 1)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(), [float(i), 0, 0]))
+        model.register_frame(model.image(i + 1).frame_id)
+    (folder / "sparse/0").mkdir(parents=True)
+    model.write(folder / "sparse/0")
+    return lambda factor: ColmapDataParserConfig(data=folder, colmap_path=Path("sparse/0"), downscale_factor=factor)
+
+
+@pytest.mark.parametrize("scene", [transforms, colmap])
+@pytest.mark.parametrize("size", [(310, 93), (311, 94)], ids=["rounded down", "rounded up"])
+def test_cameras_of_copies_look_where_those_of_the_originals_do(tmp_path, size, scene):
+    """nerfstudio divides intrinsics by 4: the lower right corner would look 0.3 and 0.7 pixels past its image."""
+    for name in ("0.png", "1.png", "2.png"):
+        write(tmp_path / "images" / name, 1242, 375)
+        write(tmp_path / "images_4" / name, *size)
+    parser = scene(tmp_path)
 
     def cameras(factor: int) -> Cameras:
-        config = NerfstudioDataParserConfig(data=tmp_path, downscale_factor=factor)
+        config = parser(factor)
         take_local_origins(config)
         return config.setup().get_dataparser_outputs("train").cameras
 
