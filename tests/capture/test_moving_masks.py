@@ -72,6 +72,22 @@ def test_small_masks_count_only_where_one_image_has_a_large_one(monkeypatch, lar
     assert [int(mask.sum()) for mask in masks] == ([3, 16, 3] if large else [0, 0, 0])
 
 
+def test_what_is_static_for_sure_is_neither_swept_nor_followed_but_may_be_a_seed(monkeypatch):
+    """One row: swept, followed, a seed, each with a static pixel and one that is not."""
+    swept, followed_pixels, seed, static = (np.zeros((1, 6), bool) for _ in range(4))
+    swept[0, :2] = followed_pixels[0, 2:4] = seed[0, 4:] = static[0, ::2] = True
+    sweeps = moving.Sweep(swept, swept)
+    for name, value in (
+        ("at_exposure_of", None), ("sweep", sweeps), ("evidence", None), ("is_static", static), ("seeds", seed),
+        ("followed", followed_pixels),
+    ):  # fmt: skip
+        monkeypatch.setattr(moving, name, lambda *_, value=value: value)
+    monkeypatch.setattr(moving, "grown", lambda shot, shown, core: core)
+    masks = [np.ones((1, 6), bool)] * 3
+    core, _ = moving._moves([None] * 3, [1, 2], 0, masks, None)  # type: ignore[list-item]
+    assert core[0].tolist() == [False, True, False, True, True, True]
+
+
 def test_masked_pixels_have_no_depth_and_draw_no_ray(manager):
     masked = [~manager.train_dataset.get_data(i, image_type="uint8")["mask"][..., 0].numpy() for i in range(8)]
     assert sum(mask.sum() for mask in masked) > 1000
