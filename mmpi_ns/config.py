@@ -16,6 +16,7 @@ from mmpi_ns.model import MMPIModelConfig
 from mmpi_ns.placement.defaults import DEFAULTS
 from mmpi_ns.placement.rule import PlacementConfig
 from mmpi_ns.rendering.pipeline import MMPIPipelineConfig
+from mmpi_ns.rendering.rendered import RenderingConfig
 from mmpi_ns.training.learning_rates import PhaseSchedulerConfig
 from mmpi_ns.training.losses import LossWeights
 from mmpi_ns.training.phases import ScheduleConfig
@@ -92,6 +93,7 @@ mmpi_kitti = _method(
     paper=True,
     model=MMPIModelConfig(
         placement=PlacementConfig(arrangement="drive", window_length=0.0, planes=256, height=270, width=270),
+        rendering=RenderingConfig(nearest_images=0),
         schedule=replace(
             PAPER_SCHEDULE, training="two-phase", rays_per_mpi="split", blend_share=0.25, finetune_share=0.0
         ),
@@ -110,6 +112,7 @@ mmpi_scannet, mmpi_scannet_short = (
             placement=PlacementConfig(
                 arrangement="room", window_length=0.0, planes=128, height=192, width=192, cube_voxels=160
             ),
+            rendering=RenderingConfig(nearest_images=0),
             schedule=replace(PAPER_SCHEDULE, training="joint"),
         ),
     )

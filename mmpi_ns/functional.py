@@ -107,6 +107,7 @@ def _load_run(config_path: Path, device: torch.device) -> Scene:
     model = config.setup(scene_box=unbounded, num_train_data=len(cameras), metadata={}, device=device).to(device)
     tensors = {k.removeprefix("_model."): v for k, v in state["pipeline"].items() if k.startswith("_model.")}
     model.load_state_dict(tensors)
+    model.update_to_step(max(checkpoints))
     model.eval()
     fx, fy, cx, cy = cameras[:, 12:16].unbind(-1)
     path = CameraPath(cameras[:, :12].view(-1, 3, 4), _intrinsics(fx, fy, cx, cy), cameras[:, 16:].long())

@@ -30,9 +30,10 @@ from mmpi_ns.placement.defaults import steps_for
 from mmpi_ns.placement.rule import PlacementConfig
 from mmpi_ns.placement.split import most_pixels, place_windows
 from mmpi_ns.rendering.baked import BakedWindow, bake, suits_bricks
+from mmpi_ns.rendering.details import DETAILS_FOLDER, Details, details_of
 from mmpi_ns.rendering.exposure import Exposures
 from mmpi_ns.rendering.images import rays_per_chunk, render_in_chunks, render_windows
-from mmpi_ns.rendering.metrics import ImageMetrics, depth_metrics, pictures
+from mmpi_ns.rendering.metrics import ImageMetrics, depth_metrics, pictures, psnr, ssim
 from mmpi_ns.rendering.rendered import (
     BACKGROUNDS,
     RenderedRays,
@@ -59,6 +60,8 @@ from mmpi_ns.utils.errors import InputError, say
 from mmpi_ns.utils.parallel import torch_apart
 from mmpi_ns.utils.random_draws import generator
 
+FIELD_METRICS = {"psnr": psnr, "ssim": ssim}
+"""Metrics of the field's image without details."""
 FAIR_SHARE = 0.1
 """While the resolution grows, samples with more than this fraction of an equal weight are kept."""
 
@@ -133,6 +136,7 @@ class MMPIModel(Model):
         self.store = WindowStore(config.windows_folder, self._new_field, budget, config.rendering.half_windows)
         self.exposures = Exposures(metadata.get(GAINS), None if views is None else views.origins)
         self.sampler = MMPISampler()
+        self.details: Details | None = None
         self.metrics = ImageMetrics(config.lpips_net)
         self.scoring: Callable[[dict[str, Tensor], dict[str, Tensor]], tuple[dict, dict]] | None = None
         """In place of ``scores_and_images`` while the pipeline evaluates images, whose exposures it knows."""
@@ -288,12 +292,11 @@ class MMPIModel(Model):
         how = {"blends": blends, "threshold": self.config.rendering.threshold, "head_mask": head_mask}
         once = field.shading == "ray" and not torch.is_grad_enabled()
         outputs = (shown_outputs if once else sampled_outputs)(bounded(bundle, field.plan), field, **how)
-        behind, exposure = outputs.pop("transmittance") * background.to(outputs["rgb"]), self.exposures.mean
+        behind = outputs.pop("transmittance") * background.to(outputs["rgb"])
+        exposure = self.exposures.shown(self.config.rendering.exposure, bundle.origins[0]) if len(bundle) else None
         outputs |= winners(outputs, bundle, field, first_head)
         if exposure is None:
             return outputs | {"rgb": (outputs["rgb"] + behind).clamp(0, 1)}
-        if self.config.rendering.exposure == "nearest" and len(bundle):
-            exposure = self.exposures.nearest(bundle.origins[0])
         radiance = outputs["rgb"] + behind / exposure
         rgb = (exposure * radiance).clamp(0, 1)
         return outputs | {"rgb": rgb, "radiance": radiance}
@@ -331,7 +334,18 @@ class MMPIModel(Model):
         """Renders an image: window by window, each as many rays at once as asked for or as suit the device."""
         with torch_apart():
             outputs = self.image_outputs(camera_ray_bundle.flatten(), self.chunk_size)
-        return {name: values.view(*camera_ray_bundle.shape, -1) for name, values in outputs.items()}
+            outputs = {name: values.view(*camera_ray_bundle.shape, -1) for name, values in outputs.items()}
+            shows_all = self.progress.windows.find(self.show.value) is None
+            if self.details is None or not shows_all:
+                return outputs
+            exposure = self.exposures.shown(self.config.rendering.exposure, camera_ray_bundle.origins.view(-1, 3)[0])
+            return self.details.added(outputs, camera_ray_bundle, self.config.rendering.nearest_images, exposure)
+
+    def update_to_step(self, step: int) -> None:
+        """Is told the step of a checkpoint before it is loaded."""
+        folder = self.config.windows_folder
+        if self.config.rendering.nearest_images and folder is not None and not self.trains:
+            self.details = details_of(folder.parent / DETAILS_FOLDER, step)
 
     @property
     def chunk_size(self) -> int:
@@ -388,6 +402,10 @@ class MMPIModel(Model):
         """Metrics of an image, and pictures of it."""
         observed = self.observed(batch).to(outputs["rgb"].device)
         values = self.metrics(outputs["rgb"], observed)
+        if "field_rgb" in outputs:
+            values |= {
+                f"field_{name}": metric(outputs["field_rgb"], observed) for name, metric in FIELD_METRICS.items()
+            }
         values["dropped_mass"] = float(outputs["dropped_mass"].mean())
         if "distance" in batch:
             values |= depth_metrics(outputs["depth"], batch["distance"].to(outputs["depth"]))

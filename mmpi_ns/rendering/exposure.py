@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -49,6 +49,10 @@ class Exposures(torch.nn.Module):
             stored = state_dict.setdefault(prefix + name, current)
             setattr(self, name, torch.empty_like(stored, device=current.device))
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
+
+    def shown(self, mode: Literal["mean", "nearest"], center: Float[Tensor, "3"]) -> Float[Tensor, "3"] | None:
+        """Exposure of an image taken at a position; None where all have the field's."""
+        return self.mean if self.mean is None or mode == "mean" else self.nearest(center)
 
     @property
     def mean(self) -> Float[Tensor, "3"] | None:

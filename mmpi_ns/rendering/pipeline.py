@@ -87,7 +87,11 @@ class MMPIPipeline(VanillaPipeline):
         if exposure is None:
             say("No training image shows what an evaluated one does, or they are gone: it is scored at mean exposure.")
             return outputs
-        return outputs | {"rgb": (exposure.to(outputs["radiance"]) * outputs["radiance"]).clamp(0, 1)}
+        exposure, radiance = exposure.to(outputs["radiance"]), outputs["radiance"]
+        exposed = {"rgb": (exposure * radiance).clamp(0, 1)}
+        if "detail" in outputs:
+            exposed["field_rgb"] = (exposure * (radiance - outputs["detail"])).clamp(0, 1)
+        return outputs | exposed
 
 
 def refined_camera(model: Any, camera: Cameras, image: Tensor, seed: int) -> tuple[Cameras, float, float]:

@@ -46,6 +46,9 @@ class RenderingConfig:
     exposure: Literal["mean", "nearest"] = "mean"
     """Exposure of images where that of the training images differs: their mean, so that films do not flicker, or that
     of the training image taken nearest (rendered exactly)."""
+    nearest_images: int = 6
+    """Nearest training images whose details, which the field lacks, are added to an image (docs/details.md); 0 shows
+    the field alone, and a training with 0 keeps no details."""
     resident_gib: float = 2.0
     """Device memory for rendering the windows of a long capture, GiB, in addition to the one trained last. As many as
     fit are kept, at least one; the least recently used is evicted first."""

@@ -61,7 +61,7 @@ RANGES = {
         "position_frequencies": Number(0, 32, whole=True),
         "direction_frequencies": Number(0, 32, whole=True),
     },
-    "pipeline.model.rendering": {"threshold": SHARE, "resident_gib": NOT_NEGATIVE},
+    "pipeline.model.rendering": {"threshold": SHARE, "resident_gib": NOT_NEGATIVE, "nearest_images": COUNT},
     "pipeline.model.loss": {f.name: NOT_NEGATIVE for f in fields(LossWeights)} | {"tv_every": Number(1, whole=True)},
 }
 """Values of the options that a run can use, by the options' group."""

@@ -8,6 +8,7 @@ import shutil
 import sys
 from contextlib import nullcontext
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from time import monotonic
 from typing import Any, Literal, NoReturn, cast
@@ -18,8 +19,10 @@ from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils import comms, writer
 
 from mmpi_ns.capture.datamanager import MMPIDataManager
+from mmpi_ns.capture.new_views import image_and_mask
 from mmpi_ns.field.tables import in_half_precision
 from mmpi_ns.placement.defaults import DEFAULTS, rays_times
+from mmpi_ns.rendering.details import DETAILS_FOLDER, details_of, moved_cameras, write_details
 from mmpi_ns.rendering.rendered import BACKGROUNDS
 from mmpi_ns.scene.texels import BRICK
 from mmpi_ns.scene.windows import WindowedPlan
@@ -307,12 +310,23 @@ class MMPITrainer(Trainer):
         seconds = monotonic() - self._began
         say(f"Training finished: {self._last_step + 1 - self._start_step:,} steps in {duration(seconds)}.")
         model: Any = self.pipeline.model
+        if model.config.rendering.nearest_images:
+            model.eval()
+            self._write_details(model)
         images = self._manager.eval_dataset
         if self._says_lines and images is not None:
             say(quick_test(model, images, BACKGROUNDS[model.config.rendering.background]))
         say(next_commands(self.base_dir))
         if not self.config.viewer.quit_on_train_completion:
             self._train_complete_viewer()
+
+    def _write_details(self, model: Any) -> None:
+        """Keeps what the trained field lacks in its training images; the model shows it from now on."""
+        images, folder = self._manager.train_dataset, self.base_dir / DETAILS_FOLDER
+        cameras = moved_cameras(images.cameras.to(model.device), model.camera_optimizer)
+        render = model.get_outputs_for_camera_ray_bundle
+        say(write_details(folder, self.step, cameras, model.exposures.factors, partial(image_and_mask, images), render))
+        model.details = details_of(folder, self.step)
 
     # Checkpoints --------------------------------------------------------------------------------------------------
 

@@ -1,0 +1,314 @@
+"""Details: what the field lacks in its training images, added to images of the same surfaces from elsewhere.
+
+A field is smooth where rays are few, and colours that change with the viewing direction faster than its network are
+averaged. The difference of each training image from its rendering is kept with the rendered depths. An image from
+another place adds the differences of the nearest training images, each where it shows the same surface, the more the
+nearer its viewing direction is. Source: weights as in unstructured lumigraph rendering (Buehler et al. 2001), applied
+to differences instead of colours, so that what no training image shows stays the field's.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Callable
+from copy import copy
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from nerfstudio.cameras.camera_optimizers import CameraOptimizer
+from nerfstudio.cameras.cameras import Cameras, CameraType
+from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.utils.rich_utils import CONSOLE
+from numpy.typing import NDArray
+from rich.progress import track
+from torch import Tensor
+from torch.nn.functional import grid_sample
+
+from mmpi_ns.capture.rays import image_rays
+from mmpi_ns.scene.near_views import nearest_views
+from mmpi_ns.utils.errors import InputError, brief, say
+from mmpi_ns.utils.files import write_atomically
+
+STRENGTH = 0.75
+"""Share of a difference that is shown: the rest does not recur in other views."""
+MAX_ANGLE = 45.0
+"""Between the viewing directions of an image and of the training images that it takes details from, degrees."""
+TURN = 0.01
+"""Angle between the viewing directions of a surface below which weights hardly grow, radians."""
+SAME_DEPTH = 0.05
+"""Relative difference of inverse depths within which two images show the same surface."""
+SAME_PIXELS = 0.5
+"""... or displacement by their difference, pixels."""
+LEAST = 0.1
+"""Total weight of training images below which details fade."""
+LARGEST = 0.5
+"""Largest difference that is kept, of colours in [0, 1]."""
+LEVELS = 127
+"""Levels of a difference to either side of 0: half of a grey level each."""
+PART = 2**18
+"""Rays whose details are computed at once."""
+DETAILS_FOLDER = "details"
+CAMERAS_FILE = "cameras.npz"
+"""Written last, so that a folder without it is none."""
+
+
+@dataclass(frozen=True)
+class DetailView:
+    """A training image, as details need it."""
+
+    pose: Float[Tensor, "3 4"]
+    """Camera to world: x right, y up, looking along -z."""
+    intrinsics: Float[Tensor, "4"]
+    """fx, fy, cx, cy, pixels."""
+    lens: Float[Tensor, "6"]
+    """nerfstudio's distortion parameters k1, k2, k3, k4, p1, p2."""
+    fisheye: bool
+    """Angles are proportional to distances from the centre, before the distortion."""
+    reach: float
+    """Largest distance from the centre, before the distortion, of the pixels, focal lengths."""
+    planes: Float[Tensor, "4 H W"]
+    """Difference of the radiance (image minus rendering, red, green, blue), and inverse depth along the ray; -1 where
+    the image is masked."""
+
+    def project(self, local: Float[Tensor, "P 3"]) -> tuple[Float[Tensor, "P 2"], Bool[Tensor, "P"]]:
+        """Pixel coordinates of directions in the camera's axes, and whether they lie in the image."""
+        x, y, ahead = local[:, 0], -local[:, 1], -local[:, 2]
+        radius = torch.hypot(x, y)
+        if self.fisheye:
+            scale = torch.atan2(radius, ahead) / radius.clamp(min=1e-12)
+        else:
+            scale = 1 / torch.where(ahead > 0, ahead, 1e-12)
+        u, v = x * scale, y * scale
+        inside = (radius * scale <= self.reach) & (self.fisheye | (ahead > 0))
+        if bool(self.lens.any()):
+            k1, k2, k3, k4, p1, p2 = self.lens
+            r = u * u + v * v
+            radial = 1 + r * (k1 + r * (k2 + r * (k3 + r * k4)))
+            u, v = (
+                radial * u + 2 * p1 * u * v + p2 * (r + 2 * u * u),
+                radial * v + 2 * p2 * u * v + p1 * (r + 2 * v * v),
+            )
+        fx, fy, cx, cy = self.intrinsics
+        pixels = torch.stack([fx * u + cx, fy * v + cy], -1)
+        height, width = self.planes.shape[1:]
+        inside &= (pixels > 0).all(-1) & (pixels[:, 0] < width) & (pixels[:, 1] < height)
+        return pixels, inside
+
+    def seen(
+        self, origins: Float[Tensor, "P 3"], directions: Float[Tensor, "P 3"], inverse: Float[Tensor, "P 1"]
+    ) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "P 1"]]:
+        """The differences at the surfaces that rays end at, and their weights: 0 where another surface is shown.
+
+        Args:
+            origins: of the rays.
+            directions: of the rays, unit length.
+            inverse: 1 / distance of their surfaces; 0 is infinity.
+        """
+        towards = origins - self.pose[:, 3]
+        relative = inverse * towards + directions  # to the surface, over its distance along the ray
+        length = relative.norm(dim=-1, keepdim=True).clamp(min=1e-12)
+        pixels, inside = self.project(relative @ self.pose[:, :3])
+        size = pixels.new_tensor(self.planes.shape[:0:-1])
+        grid = torch.where(inside[:, None], 2 * pixels / size - 1, 0.0)
+        sampled = grid_sample(self.planes[None], grid[None, None], padding_mode="border", align_corners=False)[
+            0, :, 0
+        ].T
+        there, here = sampled[:, 3:], inverse / length
+        focal_baseline = self.intrinsics[0] * towards.norm(dim=-1, keepdim=True)
+        margin = SAME_DEPTH * torch.maximum(there, here) + SAME_PIXELS / focal_baseline.clamp(min=1e-9)
+        turn = (relative / length - directions).norm(dim=-1, keepdim=True)
+        weights = inside[:, None] * (there >= 0) * torch.exp(-(((there - here) / margin) ** 2)) / (turn + TURN)
+        return sampled[:, :3], weights
+
+
+def blended_details(
+    views: list[DetailView],
+    shares: list[float],
+    origins: Float[Tensor, "P 3"],
+    directions: Float[Tensor, "P 3"],
+    depth: Float[Tensor, "P 1"],
+) -> Float[Tensor, "P 3"]:
+    """What to add to the radiance of rays: the weighted mean of the differences that training images show.
+
+    Args:
+        views: the training images.
+        shares: factor on the weights of each.
+        origins: of the rays.
+        directions: of the rays, unit length.
+        depth: distances of their surfaces along the rays; infinity is allowed.
+    """
+    total, weight = torch.zeros_like(origins), torch.full_like(depth, LEAST)
+    for view, share in zip(views, shares, strict=True):
+        difference, seen = view.seen(origins, directions, 1 / depth)
+        total += share * seen * difference
+        weight += share * seen
+    return STRENGTH * total / weight
+
+
+class Details:
+    """The details of a run, read from its folder as images need them.
+
+    Args:
+        folder: that ``write_details`` has filled.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        try:
+            with np.load(folder / CAMERAS_FILE) as file:
+                self.step, self.cameras = int(file["step"]), torch.from_numpy(file["cameras"])
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+            raise _damaged(folder / CAMERAS_FILE, error) from error
+        self._poses = self.cameras[:, :12].view(-1, 3, 4).double().numpy()
+        self.view = lru_cache(maxsize=8)(self._read)
+
+    def _read(self, i: int, device: torch.device) -> DetailView:
+        path, row = self.folder / f"{i:05d}.npz", self.cameras[i].to(device)
+        try:
+            with np.load(path) as file:
+                difference, inverse = (torch.from_numpy(file[name]).to(device) for name in ("difference", "inverse"))
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+            raise _damaged(path, error) from error
+        planes = torch.cat([difference.float() * (LARGEST / LEVELS), inverse.float()[..., None]], -1).movedim(-1, 0)
+        pose, intrinsics, lens, (fisheye, reach) = row[:12].view(3, 4), row[12:16], row[16:22], row[22:].tolist()
+        return DetailView(pose, intrinsics, lens, bool(fisheye), reach, planes.contiguous())
+
+    def added(
+        self, outputs: dict[str, Tensor], bundle: RayBundle, nearest: int, exposure: Float[Tensor, "3"] | None
+    ) -> dict[str, Tensor]:
+        """The outputs of an image [H, W, C] with details: in rgb and radiance; and ``detail`` and ``field_rgb`` apart.
+
+        Args:
+            outputs: of the field.
+            bundle: rays of the image. [H, W]
+            nearest: as for ``of_image``.
+            exposure: of rgb over the radiance; None if they are the same.
+        """
+        detail = self.of_image(bundle, outputs["depth"], nearest) * outputs["accumulation"]
+        rgb = (outputs["rgb"] + (detail if exposure is None else exposure * detail)).clamp(0, 1)
+        radiance = {"radiance": outputs["radiance"] + detail} if "radiance" in outputs else {}
+        return outputs | radiance | {"rgb": rgb, "field_rgb": outputs["rgb"], "detail": detail}
+
+    def of_image(self, bundle: RayBundle, depth: Float[Tensor, "H W 1"], nearest: int) -> Float[Tensor, "H W 3"]:
+        """What to add to the radiance of an image.
+
+        Args:
+            bundle: its rays. [H, W]
+            depth: rendered distances along them.
+            nearest: number of training images that it takes details from. The next one's distance is where shares
+                reach 0, so that none appears at once as a camera moves.
+        """
+        origins, directions = bundle.origins.reshape(-1, 3), bundle.directions.reshape(-1, 3)
+        pose = np.zeros((1, 3, 4))
+        pose[0, :, 3], ahead = origins[0].double().cpu().numpy(), directions.double().mean(0).cpu().numpy()
+        length = float(np.linalg.norm(ahead))
+        pose[0, :, 2] = -ahead / max(length, 1e-9)
+        angle = MAX_ANGLE if length > 0.5 else 180.0  # a panorama looks everywhere
+        chosen = nearest_views(np.concatenate([self._poses, pose]), len(self._poses), nearest + 1, angle, apart=False)
+        distances = np.linalg.norm(self._poses[chosen, :, 3] - pose[0, :, 3], axis=-1)
+        limit = distances[-1] if len(chosen) > nearest and distances[-1] > 0 else np.inf
+        chosen, shares = chosen[:nearest], (1 - (distances / limit) ** 2)[:nearest].tolist()
+        views = [self.view(i, origins.device) for i in chosen]
+        rays = zip(*(x.split(PART) for x in (origins, directions, depth.reshape(-1, 1))), strict=True)
+        return torch.cat([blended_details(views, shares, *part) for part in rays]).view(bundle.origins.shape)
+
+
+def _damaged(path: Path, error: Exception) -> InputError:
+    return InputError(
+        f"{path} is damaged ({brief(error)}): remove the folder {path.parent}, and images show the field alone, or "
+        "train again."
+    )
+
+
+def details_of(folder: Path | None, step: int) -> Details | None:
+    """The details of a run that belong to its checkpoint of a step; None, with a sentence, if it has none."""
+    if folder is not None and (folder / CAMERAS_FILE).is_file():
+        details = Details(folder)
+        if details.step == step:
+            return details
+    say("This checkpoint has no details of the training images (they are made after the last step): images show the "
+        "field alone.")  # fmt: skip
+    return None
+
+
+def moved_cameras(cameras: Cameras, poses: CameraOptimizer) -> Cameras:
+    """Training cameras where training has moved them."""
+    if poses.config.mode == "off":
+        return cameras
+    moves, cameras = poses(list(range(len(cameras)))).detach(), copy(cameras)
+    before = cameras.camera_to_worlds
+    shift = before[..., 3:] + moves[:, :3, 3:]
+    cameras.camera_to_worlds = torch.cat([moves[:, :3, :3] @ before[..., :3], shift], -1)
+    return cameras
+
+
+@torch.no_grad()
+def write_details(
+    folder: Path,
+    step: int,
+    cameras: Cameras,
+    factors: Float[Tensor, "N 3"],
+    image_of: Callable[[int], tuple[NDArray[np.uint8], NDArray[np.uint8]]],
+    outputs_of: Callable[[RayBundle], dict[str, Tensor]],
+) -> str:
+    """Renders all training images and writes what the field lacks in them; what was made of it, as a sentence.
+
+    Args:
+        folder: is made, and filled anew.
+        step: of the checkpoint that the details belong to.
+        cameras: of the N training images, where training has moved them.
+        factors: exposures of the images over that of the field; empty if they are the same.
+        image_of: colours of a training image [H, W, 3 or 4], and where they may be used [H, W].
+        outputs_of: the field's outputs for the rays of an image: depth, and radiance or rgb [H, W, C].
+
+    Raises:
+        WriteError: the disk is full.
+    """
+    kinds = cameras.camera_type.reshape(-1)
+    if not bool(torch.isin(kinds, torch.tensor([CameraType.PERSPECTIVE.value, CameraType.FISHEYE.value])).all()):
+        return "Images show the field without details: some cameras are neither perspective nor fisheye."
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / CAMERAS_FILE).unlink(missing_ok=True)
+    rows, size = [], 0
+    for i in track(range(len(cameras)), "Details", console=CONSOLE):
+        bundle = image_rays(cameras[i : i + 1])
+        image, usable = image_of(i)
+        outputs = outputs_of(bundle)
+        factor = (factors[i] if len(factors) else torch.ones(3)).to(outputs["depth"])
+        observed = torch.from_numpy(image[..., :3]).to(factor) / 255
+        shown = (factor * outputs.get("radiance", outputs["rgb"])).clamp(0, 1)
+        difference = (observed - shown) / factor * (LEVELS / LARGEST)
+        masked = torch.from_numpy(usable == 0).to(factor.device)
+        arrays = {
+            "difference": difference.round().clamp(-LEVELS, LEVELS).to(torch.int8).cpu().numpy(),
+            "inverse": torch.where(masked, -1.0, 1 / outputs["depth"][..., 0]).half().cpu().numpy(),
+        }
+        path = folder / f"{i:05d}.npz"
+        write_atomically(path, partial(_save, arrays))
+        size += path.stat().st_size
+        rows.append(_camera_row(cameras[i], bundle, int(kinds[i]) == CameraType.FISHEYE.value))
+    write_atomically(folder / CAMERAS_FILE, partial(_save, {"step": np.array(step), "cameras": np.stack(rows)}))
+    return f"Details of {len(rows)} training images, {size / 2**20:,.0f} MiB, are in {folder}."
+
+
+def _save(arrays: dict[str, NDArray[Any]], path: Path) -> None:
+    with open(path, "wb") as file:  # np.savez would add an ending to the name
+        np.savez(file, **arrays)
+
+
+def _camera_row(camera: Cameras, bundle: RayBundle, fisheye: bool) -> NDArray[np.float32]:
+    """Numbers of a camera [24]: pose, intrinsics, lens, whether it is a fisheye, and its reach."""
+    pose = camera.camera_to_worlds.reshape(3, 4)
+    local = bundle.directions.reshape(-1, 3) @ pose[:, :3]
+    radius, ahead = local[:, :2].norm(dim=-1), -local[:, 2]
+    reach = (torch.atan2(radius, ahead) if fisheye else radius / ahead.clamp(min=1e-6)).max()
+    lens = camera.distortion_params
+    lens = torch.zeros(6) if lens is None else lens.reshape(-1)
+    intrinsics = (x.reshape(1) for x in (camera.fx, camera.fy, camera.cx, camera.cy))
+    numbers = [pose.reshape(-1), *intrinsics, lens, torch.tensor([float(fisheye), 1.001 * float(reach)])]
+    return torch.cat([x.float().cpu() for x in numbers]).numpy()
