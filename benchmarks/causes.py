@@ -75,10 +75,10 @@ def causes(pipeline: Any, count: int) -> Row:
         scores["training images"].append(psnr_of(squared(rgb, training.get_image_float32(int(i))[..., :3])))
     parts = []
     for i, (camera, image) in enumerate(images_of(pipeline, count)):
-        outputs = pipeline._as_exposed(camera, model.get_outputs_for_camera(camera), image)
+        outputs = pipeline.as_exposed(camera, model.get_outputs_for_camera(camera), image)
         with torch.enable_grad():
             moved = refined_camera(model, camera, image, model.config.seed + i)[0]
-        again = pipeline._as_exposed(moved, model.get_outputs_for_camera(moved), image)
+        again = pipeline.as_exposed(moved, model.get_outputs_for_camera(moved), image)
         plain, fitted = squared(outputs["rgb"], image), squared(color_corrected(again["rgb"], image), image)
         seen = times_seen(camera, outputs["depth"][..., 0].cpu().numpy(), posed, distances)
         for name, error in (

@@ -47,11 +47,13 @@ def read_run_config(path: Path) -> MMPIModelConfig:
 
 
 def load_model(load_config: Path) -> Any:
-    """The pipeline of a finished run, ready to render exactly. Raises InputError as ``read_run_config``."""
+    """The pipeline of a finished run, ready to render its field alone, exactly. Raises InputError as
+    ``read_run_config``."""
     read_run_config(load_config)
     _, pipeline, _, _ = eval_setup(load_config, test_mode="test")
     assert isinstance(pipeline.model, MMPIModel)
     pipeline.model.config.rendering.mode = "exact"  # the exact renderer is the reference
+    pipeline.model.details = None
     return pipeline
 
 

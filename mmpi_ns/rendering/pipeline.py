@@ -54,11 +54,11 @@ class MMPIPipeline(VanillaPipeline):
 
         def score(outputs: dict[str, Tensor], batch: Any) -> tuple[dict[str, float], dict[str, Tensor]]:
             i, observed = int(batch["image_idx"]), model.observed(batch)
-            values, images = model.scores_and_images(self._as_exposed(cameras[i : i + 1], outputs, observed), batch)
+            values, images = model.scores_and_images(self.as_exposed(cameras[i : i + 1], outputs, observed), batch)
             if self.config.refine_eval_poses:
                 camera = cameras[i : i + 1].to(model.device)
                 camera, degrees, units = refined_camera(model, camera, observed, model.config.seed + i)
-                outputs = self._as_exposed(camera, model.get_outputs_for_camera(camera), observed)
+                outputs = self.as_exposed(camera, model.get_outputs_for_camera(camera), observed)
                 refined = model.scores_and_images(outputs, batch)[0]
                 refined |= {"rotation_degrees": degrees, "translation": units}
                 values |= {REFINED + name: value for name, value in refined.items()}
@@ -77,7 +77,7 @@ class MMPIPipeline(VanillaPipeline):
         say(summary([(names[i], values) for i, values in scores]))
         return means
 
-    def _as_exposed(self, camera: Any, outputs: dict[str, Tensor], observed: Tensor) -> dict[str, Tensor]:
+    def as_exposed(self, camera: Any, outputs: dict[str, Tensor], observed: Tensor) -> dict[str, Tensor]:
         """The outputs at the exposure of the evaluated image itself, where exposures differ."""
         model: Any = self.model
         if "radiance" not in outputs:
