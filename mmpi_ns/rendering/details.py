@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from nerfstudio.cameras.camera_optimizers import CameraOptimizer
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.cameras.rays import RayBundle
@@ -27,9 +27,9 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
 from rich.progress import track
 from torch import Tensor
-from torch.nn.functional import grid_sample
 
 from mmpi_ns.capture.rays import image_rays
+from mmpi_ns.ops.details import seen_details
 from mmpi_ns.scene.near_views import nearest_views
 from mmpi_ns.utils.errors import InputError, brief, say
 from mmpi_ns.utils.files import write_atomically
@@ -38,12 +38,6 @@ STRENGTH = 0.75
 """Share of a difference that is shown: the rest does not recur in other views."""
 MAX_ANGLE = 45.0
 """Between the viewing directions of an image and of the training images that it takes details from, degrees."""
-TURN = 0.01
-"""Angle between the viewing directions of a surface below which weights hardly grow, radians."""
-SAME_DEPTH = 0.05
-"""Relative difference of inverse depths within which two images show the same surface."""
-SAME_PIXELS = 0.5
-"""... or displacement by their difference, pixels."""
 LEAST = 0.1
 """Total weight of training images below which details fade."""
 LARGEST = 0.5
@@ -52,6 +46,8 @@ LEVELS = 127
 """Levels of a difference to either side of 0: half of a grey level each."""
 PART = 2**18
 """Rays whose details are computed at once."""
+DAMAGED = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile)
+"""What reading a damaged file raises."""
 DETAILS_FOLDER = "details"
 CAMERAS_FILE = "cameras.npz"
 """Written last, so that a folder without it is none."""
@@ -59,71 +55,12 @@ CAMERAS_FILE = "cameras.npz"
 
 @dataclass(frozen=True)
 class DetailView:
-    """A training image, as details need it."""
+    """A training image, as ``ops.details.seen_details`` needs it."""
 
-    pose: Float[Tensor, "3 4"]
-    """Camera to world: x right, y up, looking along -z."""
-    intrinsics: Float[Tensor, "4"]
-    """fx, fy, cx, cy, pixels."""
-    lens: Float[Tensor, "6"]
-    """nerfstudio's distortion parameters k1, k2, k3, k4, p1, p2."""
-    fisheye: bool
-    """Angles are proportional to distances from the centre, before the distortion."""
-    reach: float
-    """Largest distance from the centre, before the distortion, of the pixels, focal lengths."""
-    planes: Float[Tensor, "4 H W"]
-    """Difference of the radiance (image minus rendering, red, green, blue), and inverse depth along the ray; -1 where
-    the image is masked."""
-
-    def project(self, local: Float[Tensor, "P 3"]) -> tuple[Float[Tensor, "P 2"], Bool[Tensor, "P"]]:
-        """Pixel coordinates of directions in the camera's axes, and whether they lie in the image."""
-        x, y, ahead = local[:, 0], -local[:, 1], -local[:, 2]
-        radius = torch.hypot(x, y)
-        if self.fisheye:
-            scale = torch.atan2(radius, ahead) / radius.clamp(min=1e-12)
-        else:
-            scale = 1 / torch.where(ahead > 0, ahead, 1e-12)
-        u, v = x * scale, y * scale
-        inside = (radius * scale <= self.reach) & (self.fisheye | (ahead > 0))
-        if bool(self.lens.any()):
-            k1, k2, k3, k4, p1, p2 = self.lens
-            r = u * u + v * v
-            radial = 1 + r * (k1 + r * (k2 + r * (k3 + r * k4)))
-            u, v = (
-                radial * u + 2 * p1 * u * v + p2 * (r + 2 * u * u),
-                radial * v + 2 * p2 * u * v + p1 * (r + 2 * v * v),
-            )
-        fx, fy, cx, cy = self.intrinsics
-        pixels = torch.stack([fx * u + cx, fy * v + cy], -1)
-        height, width = self.planes.shape[1:]
-        inside &= (pixels > 0).all(-1) & (pixels[:, 0] < width) & (pixels[:, 1] < height)
-        return pixels, inside
-
-    def seen(
-        self, origins: Float[Tensor, "P 3"], directions: Float[Tensor, "P 3"], inverse: Float[Tensor, "P 1"]
-    ) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "P 1"]]:
-        """The differences at the surfaces that rays end at, and their weights: 0 where another surface is shown.
-
-        Args:
-            origins: of the rays.
-            directions: of the rays, unit length.
-            inverse: 1 / distance of their surfaces; 0 is infinity.
-        """
-        towards = origins - self.pose[:, 3]
-        relative = inverse * towards + directions  # to the surface, over its distance along the ray
-        length = relative.norm(dim=-1, keepdim=True).clamp(min=1e-12)
-        pixels, inside = self.project(relative @ self.pose[:, :3])
-        size = pixels.new_tensor(self.planes.shape[:0:-1])
-        grid = torch.where(inside[:, None], 2 * pixels / size - 1, 0.0)
-        sampled = grid_sample(self.planes[None], grid[None, None], padding_mode="border", align_corners=False)[
-            0, :, 0
-        ].T
-        there, here = sampled[:, 3:], inverse / length
-        focal_baseline = self.intrinsics[0] * towards.norm(dim=-1, keepdim=True)
-        margin = SAME_DEPTH * torch.maximum(there, here) + SAME_PIXELS / focal_baseline.clamp(min=1e-9)
-        turn = (relative / length - directions).norm(dim=-1, keepdim=True)
-        weights = inside[:, None] * (there >= 0) * torch.exp(-(((there - here) / margin) ** 2)) / (turn + TURN)
-        return sampled[:, :3], weights
+    image: Float[Tensor, "H W 4"]
+    """Difference of the radiance (image minus rendering: red, green, blue), and inverse distance along the ray; -1
+    where the image is masked."""
+    camera: Float[Tensor, "24"]
 
 
 def blended_details(
@@ -142,9 +79,9 @@ def blended_details(
         directions: of the rays, unit length.
         depth: distances of their surfaces along the rays; infinity is allowed.
     """
-    total, weight = torch.zeros_like(origins), torch.full_like(depth, LEAST)
+    total, weight, inverse = torch.zeros_like(origins), torch.full_like(depth, LEAST), 1 / depth
     for view, share in zip(views, shares, strict=True):
-        difference, seen = view.seen(origins, directions, 1 / depth)
+        difference, seen = seen_details(origins, directions, inverse, view.image, view.camera)
         total += share * seen * difference
         weight += share * seen
     return STRENGTH * total / weight
@@ -162,21 +99,20 @@ class Details:
         try:
             with np.load(folder / CAMERAS_FILE) as file:
                 self.step, self.cameras = int(file["step"]), torch.from_numpy(file["cameras"])
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        except DAMAGED as error:
             raise _damaged(folder / CAMERAS_FILE, error) from error
         self._poses = self.cameras[:, :12].view(-1, 3, 4).double().numpy()
         self.view = lru_cache(maxsize=8)(self._read)
 
     def _read(self, i: int, device: torch.device) -> DetailView:
-        path, row = self.folder / f"{i:05d}.npz", self.cameras[i].to(device)
+        path = self.folder / f"{i:05d}.npz"
         try:
             with np.load(path) as file:
                 difference, inverse = (torch.from_numpy(file[name]).to(device) for name in ("difference", "inverse"))
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        except DAMAGED as error:
             raise _damaged(path, error) from error
-        planes = torch.cat([difference.float() * (LARGEST / LEVELS), inverse.float()[..., None]], -1).movedim(-1, 0)
-        pose, intrinsics, lens, (fisheye, reach) = row[:12].view(3, 4), row[12:16], row[16:22], row[22:].tolist()
-        return DetailView(pose, intrinsics, lens, bool(fisheye), reach, planes.contiguous())
+        image = torch.cat([difference.float() * (LARGEST / LEVELS), inverse.float()[..., None]], -1)
+        return DetailView(image, self.cameras[i].to(device))
 
     def added(
         self, outputs: dict[str, Tensor], bundle: RayBundle, nearest: int, exposure: Float[Tensor, "3"] | None
@@ -302,7 +238,7 @@ def _save(arrays: dict[str, NDArray[Any]], path: Path) -> None:
 
 
 def _camera_row(camera: Cameras, bundle: RayBundle, fisheye: bool) -> NDArray[np.float32]:
-    """Numbers of a camera [24]: pose, intrinsics, lens, whether it is a fisheye, and its reach."""
+    """The numbers of a camera that ``seen_details`` takes. [24]"""
     pose = camera.camera_to_worlds.reshape(3, 4)
     local = bundle.directions.reshape(-1, 3) @ pose[:, :3]
     radius, ahead = local[:, :2].norm(dim=-1), -local[:, 2]
