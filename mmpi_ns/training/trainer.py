@@ -235,6 +235,8 @@ class MMPITrainer(Trainer):
             for window in self._share.unfinished(self._run.progress.windows, self._run.store):
                 self.train_window(window)
             self._share.wait_for_all()
+            if self._share.rank == 0:
+                self._write_details(self._total_steps - 1)
             return
         self._began = monotonic()
         if self._start_step >= self._total_steps:
@@ -309,10 +311,8 @@ class MMPITrainer(Trainer):
             return
         seconds = monotonic() - self._began
         say(f"Training finished: {self._last_step + 1 - self._start_step:,} steps in {duration(seconds)}.")
+        self._write_details(self.step)
         model: Any = self.pipeline.model
-        if model.config.rendering.nearest_images:
-            model.eval()
-            self._write_details(model)
         images = self._manager.eval_dataset
         if self._says_lines and images is not None:
             say(quick_test(model, images, BACKGROUNDS[model.config.rendering.background]))
@@ -320,13 +320,17 @@ class MMPITrainer(Trainer):
         if not self.config.viewer.quit_on_train_completion:
             self._train_complete_viewer()
 
-    def _write_details(self, model: Any) -> None:
-        """Keeps what the trained field lacks in its training images; the model shows it from now on."""
+    def _write_details(self, step: int) -> None:
+        """Keeps what the trained field lacks in its training images, if it is to be shown, as it is from now on."""
+        model: Any = self.pipeline.model
+        if not model.config.rendering.nearest_images:
+            return
+        model.eval()
         images, folder = self._manager.train_dataset, self.base_dir / DETAILS_FOLDER
         cameras = moved_cameras(images.cameras.to(model.device), model.camera_optimizer)
         render = model.get_outputs_for_camera_ray_bundle
-        say(write_details(folder, self.step, cameras, model.exposures.factors, partial(image_and_mask, images), render))
-        model.details = details_of(folder, self.step)
+        say(write_details(folder, step, cameras, model.exposures.factors, partial(image_and_mask, images), render))
+        model.details = details_of(folder, step)
 
     # Checkpoints --------------------------------------------------------------------------------------------------
 
