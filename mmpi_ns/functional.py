@@ -20,7 +20,7 @@ from mmpi_ns.export.bake import read_run_config
 from mmpi_ns.export.files import HEADER, BakedScene, read_baked
 from mmpi_ns.rendering.images import SHOWN_RAYS, render_in_chunks
 from mmpi_ns.scene.windows import WindowedPlan
-from mmpi_ns.training.checkpoints import checkpoints_in, read_checkpoint
+from mmpi_ns.training.checkpoints import last_checkpoint, read_checkpoint
 from mmpi_ns.utils.errors import InputError
 from mmpi_ns.utils.values import Number, check_number
 
@@ -96,11 +96,8 @@ def load(path: str | Path, device: str | torch.device | None = None) -> Scene:
 
 def _load_run(config_path: Path, device: torch.device) -> Scene:
     """The model of a run with its last checkpoint, without a data manager."""
-    config, folder = read_run_config(config_path), config_path.parent / "nerfstudio_models"
-    checkpoints = checkpoints_in(folder)
-    if not checkpoints:
-        raise InputError(f"There is no checkpoint in {folder} to load: train first, or put it back.")
-    state = read_checkpoint(checkpoints[max(checkpoints)])
+    config = read_run_config(config_path)
+    state = read_checkpoint(last_checkpoint(config_path.parent / "nerfstudio_models"))
     cameras = state["capture"]["cameras"]
     config.windows_folder, config.rendering.mode = config_path.parent / "windows", "exact"
     unbounded = SceneBox(torch.tensor([[-1.0] * 3, [1.0] * 3]))

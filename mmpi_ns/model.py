@@ -40,20 +40,19 @@ from mmpi_ns.rendering.rendered import (
     background_of,
     bounded,
     render_rays,
-    sampled_outputs,
     shown_outputs,
     winners,
 )
-from mmpi_ns.rendering.sampler import MMPISampler, SamplingConfig
+from mmpi_ns.rendering.sampler import MMPISampler, SamplingConfig, rays_of
 from mmpi_ns.rendering.window_store import WindowStore
 from mmpi_ns.scene.plan import NO_PLAN
 from mmpi_ns.scene.visible_tiles import TrainingViews
 from mmpi_ns.scene.windows import WindowedPlan
-from mmpi_ns.training.checkpoints import check_there_are_checkpoints
+from mmpi_ns.training.checkpoints import last_checkpoint
 from mmpi_ns.training.losses import LossWeights, batch_losses, over_background, photometric
 from mmpi_ns.training.memory import Work, fit_memory
 from mmpi_ns.training.options import grouped
-from mmpi_ns.training.phases import ScheduleConfig, make_schedule
+from mmpi_ns.training.phases import TRAINS, ScheduleConfig, make_schedule
 from mmpi_ns.training.run import Progress, TrainingRun, individual_rays, move_rays, views_of
 from mmpi_ns.utils.errors import InputError, say
 from mmpi_ns.utils.parallel import torch_apart
@@ -176,7 +175,9 @@ class MMPIModel(Model):
         if config.plan_file is not None and (observations is not None or config.plan_file.is_file()):
             return WindowedPlan.load(config.plan_file)
         if observations is None:
-            check_there_are_checkpoints(config.windows_folder)
+            folder = None if config.windows_folder is None else config.windows_folder.parent / "nerfstudio_models"
+            if folder is not None and folder.is_dir():
+                last_checkpoint(folder)  # nerfstudio looks for it only after making the model, and ends in a traceback
             return WindowedPlan.single(NO_PLAN)
         return place_windows(observations, placement, config.total_steps * metadata[RAYS_PER_STEP])
 
@@ -224,7 +225,7 @@ class MMPIModel(Model):
         if progress.phase.name == "individual":
             g = generator(self.config.seed, progress.step, "assignment", self.device)
             bundle, head_mask, choose = individual_rays(bundle, field.plan, self.config.schedule.rays_per_mpi, g)
-        blends = progress.schedule.blends_at(progress.step) and self.blends(field)
+        blends = "reliability" in TRAINS[progress.phase.name] and self.blends(field)
         sampling = {"head_mask": head_mask, "choose": choose, **self.training_bounds()}
         rays = render_rays(self.sampler, bundle, field, blends=blends, **sampling)
         return {"training": replace(rays, times=len(bundle) // asked)}
@@ -276,8 +277,11 @@ class MMPIModel(Model):
         background = background_of(self.config.rendering.background, bundle.origins)
         one_exposure = self.exposures.mean is None or self.config.rendering.exposure == "mean"
         may_bake = mode == "auto" and not self.trains and one_exposure
+        bundle = bounded(bundle, field.plan)
         if chosen is None and (mode == "baked" or (may_bake and suits_bricks(field))):
-            outputs = self.baked(field).outputs(bounded(bundle, field.plan), background)
+            rays = rays_of(bundle)
+            bounds = rays.nears, rays.fars
+            outputs = self.baked(field).render(rays.origins, rays.directions, bounds, background)
             return outputs | winners(outputs, bundle, field, first_head)
         blends, head_mask = self.blends(field), None
         if chosen is not None:
@@ -285,9 +289,8 @@ class MMPIModel(Model):
             heads = field.planned_heads(torch.arange(field.plan.num_heads, device=self.device))
             head_mask = (heads == head).expand(len(bundle), -1)
             blends = False
-        how = {"blends": blends, "threshold": self.config.rendering.threshold, "head_mask": head_mask}
-        once = field.shading == "ray" and not torch.is_grad_enabled()
-        outputs = (shown_outputs if once else sampled_outputs)(bounded(bundle, field.plan), field, **how)
+        threshold = self.config.rendering.threshold
+        outputs = shown_outputs(bundle, field, blends=blends, threshold=threshold, head_mask=head_mask)
         behind, exposure = outputs.pop("transmittance") * background.to(outputs["rgb"]), self.exposures.mean
         outputs |= winners(outputs, bundle, field, first_head)
         if exposure is None:
