@@ -105,8 +105,7 @@ def _load_run(config_path: Path, device: torch.device) -> Scene:
     tensors = {k.removeprefix("_model."): v for k, v in state["pipeline"].items() if k.startswith("_model.")}
     model.load_state_dict(tensors)
     model.eval()
-    fx, fy, cx, cy = cameras[:, 12:16].unbind(-1)
-    path = CameraPath(cameras[:, :12].view(-1, 3, 4), _intrinsics(fx, fy, cx, cy), cameras[:, 16:].long())
+    path = CameraPath(cameras[:, :12].view(-1, 3, 4), _intrinsics(cameras[:, 12:16]), cameras[:, 16:].long())
     return Scene(model.progress.windows.names, path, device, model.get_outputs_for_camera)
 
 
@@ -122,12 +121,14 @@ def _load_baked(baked: BakedScene, device: torch.device) -> Scene:
     numbers = torch.tensor([(*pose.focal, *pose.center) for pose in baked.path])
     poses, sizes = torch.tensor([pose.to_world for pose in baked.path]), torch.tensor([p.size for p in baked.path])
     names = WindowedPlan(tuple(place for place, _ in baked.windows)).names
-    return Scene(names, CameraPath(poses, _intrinsics(*numbers.unbind(-1)), sizes), device, render_image)
+    return Scene(names, CameraPath(poses, _intrinsics(numbers), sizes), device, render_image)
 
 
-def _intrinsics(fx: Tensor, fy: Tensor, cx: Tensor, cy: Tensor) -> Float[Tensor, "N 3 3"]:
-    zero, one = torch.zeros_like(fx), torch.ones_like(fx)
-    return torch.stack([fx, zero, cx, zero, fy, cy, zero, zero, one], -1).view(-1, 3, 3)
+def _intrinsics(numbers: Float[Tensor, "N 4"]) -> Float[Tensor, "N 3 3"]:
+    """Matrices of focal lengths and principal points (fx, fy, cx, cy)."""
+    matrices = torch.eye(3).repeat(len(numbers), 1, 1)
+    matrices[:, [0, 1, 0, 1], [0, 1, 2, 2]] = numbers
+    return matrices
 
 
 @torch.no_grad()
@@ -171,8 +172,8 @@ def render(
     fx, fy, cx, cy = (lenses[:, i, j, None] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
     cameras = Cameras(poses, fx, fy, cx, cy, width, height)
     outputs = [scene._render(cameras[i : i + 1].to(scene.device)) for i in range(len(poses))]
-    stacked = {
-        name: torch.stack([image[name] for image in outputs]).to(scene.device).view(*batch, height, width, -1)
+    rgb, depth, accumulation, winner = (
+        torch.stack([image[name] for image in outputs]).to(scene.device).view(*batch, height, width, -1)
         for name in ("rgb", "depth", "accumulation", "winning_mpi")
-    }
-    return Images(stacked["rgb"], stacked["depth"], stacked["accumulation"], stacked["winning_mpi"].long())
+    )
+    return Images(rgb, depth, accumulation, winner.long())

@@ -125,8 +125,6 @@ class MMPIModel(Model):
         count = len(windows)
         schedule = make_schedule(phases, max(1, config.total_steps), count, metadata.get(DEPTHS_KNOWN, False))
         self.progress = Progress(windows, schedule)
-        self._expect_shapes()
-        dispatch.choose(config.ops)
         self.field = self._new_field(views_of(windows.windows[0], views))
         budget = config.rendering.resident_gib * 2**30
         self.store = WindowStore(config.windows_folder, self._new_field, budget, config.rendering.half_windows)
@@ -135,7 +133,9 @@ class MMPIModel(Model):
         self.metrics = ImageMetrics(config.lpips_net)
         self.scoring: Callable[[dict[str, Tensor], dict[str, Tensor]], tuple[dict, dict]] | None = None
         """In place of ``scores_and_images`` while the pipeline evaluates images, whose exposures it knows."""
-        self.show = ViewerDropdown("Show MPI", "all", ["all", *windows.names], hint="One MPI alone, or all")
+        self.show = ViewerDropdown("Show MPI", "all", ["all"], hint="One MPI alone, or all")
+        self._take_plan()
+        dispatch.choose(config.ops)
         self.camera_optimizer = config.camera_optimizer.setup(num_cameras=self.num_train_data, device=device)
         if config.camera_optimizer.mode != "off" and count > 1:
             raise InputError(
@@ -194,16 +194,12 @@ class MMPIModel(Model):
             cube_alpha=self.config.sampling.cube_alpha,
         )
 
-    def _take_plan(self, _: Any) -> None:
-        """Takes over plan and schedule of a checkpoint that was loaded."""
-        self.field.shares_depth = self.progress.schedule.is_joint
-        self.show.set_options(["all", *self.progress.windows.names])
-        self._expect_shapes()
-
-    def _expect_shapes(self) -> None:
-        """Says what a GPU's kernels will be compiled for."""
-        joint, channels = self.progress.schedule.is_joint, self.config.colour.feature_channels
-        dispatch.expect(Shapes.of(self.progress.windows.plans, blends=not joint, channels=channels))
+    def _take_plan(self, _: Any = None) -> None:
+        """Takes over plan and schedule, also of a checkpoint that was loaded; a GPU's kernels are compiled for them."""
+        joint, windows = self.progress.schedule.is_joint, self.progress.windows
+        self.field.shares_depth = joint
+        self.show.set_options(["all", *windows.names])
+        dispatch.expect(Shapes.of(windows.plans, blends=not joint, channels=self.config.colour.feature_channels))
 
     def get_param_groups(self) -> dict[str, list[Parameter]]:
         return self.run.parameters()

@@ -93,11 +93,11 @@ def place(observations: Observations, config: PlacementConfig, training_rays: in
     size = (config.planes, config.height, config.width)
     if config.arrangement == "drive":
         # The hand-made rule is in metres; it was made where the nearest point lies 5 m away.
-        return drive_plan(observations, visible.near / 5, *size, config.faces, config.drive_pull_back)
+        return drive_plan(observations, visible.near / 5, size, config.faces, config.drive_pull_back)
     if config.arrangement == "room":
         half_size = float(np.abs(observations.centers - observations.centers.mean(0)).max()) + visible.near
         near = max(0.5 * visible.near, 1e-6)
-        return room_plan(observations, *size, config.cube_voxels, near, half_size)
+        return room_plan(observations, size, config.cube_voxels, near, half_size)
     trainable = trainable_texel(observations, visible, config, training_rays)
     budget = affordable_texels(config, training_rays)
     finest = max(config.texel_pixels, trainable)

@@ -20,7 +20,6 @@ from nerfstudio.utils import comms, writer
 from mmpi_ns.capture.datamanager import MMPIDataManager
 from mmpi_ns.field.tables import in_half_precision
 from mmpi_ns.placement.defaults import DEFAULTS, rays_times
-from mmpi_ns.rendering.rendered import BACKGROUNDS
 from mmpi_ns.scene.texels import BRICK
 from mmpi_ns.scene.windows import WindowedPlan
 from mmpi_ns.training.checkpoints import (
@@ -300,10 +299,9 @@ class MMPITrainer(Trainer):
             return
         seconds = monotonic() - self._began
         say(f"Training finished: {self._last_step + 1 - self._start_step:,} steps in {duration(seconds)}.")
-        model: Any = self.pipeline.model
         images = self._manager.eval_dataset
         if self._says_lines and images is not None:
-            say(quick_test(model, images, BACKGROUNDS[model.config.rendering.background]))
+            say(quick_test(self.pipeline.model, images))
         say(next_commands(self.base_dir))
         if not self.config.viewer.quit_on_train_completion:
             self._train_complete_viewer()
