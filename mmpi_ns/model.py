@@ -394,5 +394,4 @@ class MMPIModel(Model):
 
     def observed(self, batch: dict[str, Tensor]) -> Tensor:
         """The pixels of a batch, over the background where they are transparent."""
-        image = batch["image"].to(self.device)
-        return over_background(image, torch.full_like(image[..., :3], BACKGROUNDS[self.config.rendering.background]))
+        return over_background(batch["image"].to(self.device), BACKGROUNDS[self.config.rendering.background])

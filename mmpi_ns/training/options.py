@@ -10,15 +10,14 @@ from typing import Any
 import torch
 from nerfstudio.engine.trainer import TrainerConfig
 
-from mmpi_ns.placement.defaults import DEFAULTS, check_placement
+from mmpi_ns.placement.defaults import DEFAULTS, NOT_NEGATIVE, POSITIVE, check_placement
 from mmpi_ns.training.losses import LossWeights
 from mmpi_ns.training.phases import check_schedule
 from mmpi_ns.utils.errors import InputError
 from mmpi_ns.utils.machine import unused_gpu
 from mmpi_ns.utils.values import Number, check_number, check_options, shown
 
-POSITIVE, NOT_NEGATIVE, COUNT = Number(0, above=True), Number(0), Number(0, whole=True)
-SHARE = Number(0, 1)
+COUNT, SHARE = Number(0, whole=True), Number(0, 1)
 LONGEST_NAME = 255
 """Bytes of a folder's name."""
 RANGES = {
