@@ -122,10 +122,9 @@ def check_nothing_left(model: Any) -> None:
 
 def check_device(device_type: str) -> None:
     """Raises InputError if training is to run on a GPU that torch does not see."""
-    usable = {"cuda": torch.cuda.is_available, "mps": torch.backends.mps.is_available}
-    if device_type in usable and not usable[device_type]():
+    if device_type == "cuda" and not torch.cuda.is_available():
         raise InputError(
-            f"--machine.device-type {device_type} asks for a GPU, and torch sees none: "
+            "--machine.device-type cuda asks for a GPU, and torch sees none: "
             f"{unused_gpu() or 'check the driver and the build of torch'}; --machine.device-type cpu trains without."
         )
 
