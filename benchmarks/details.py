@@ -66,7 +66,7 @@ def scores(pipeline: Any, config: Path, count: int) -> Row:
         observed = images.get_data(i, image_type="float32")["image"][..., :3].to(model.device)
         camera = images.cameras[i : i + 1].to(model.device)
         bundle, field = image_rays(camera), model.get_outputs_for_camera(camera)
-        exposure = model.exposures.shown("mean", bundle.origins[0, 0])
+        exposure = model.exposures.shown("mean", bundle)
         for name, (nearest, share) in {"none": (0, 0.0), **settings(usual.nearest_images)}.items():
             start = clock()
             with mock.patch.object(details, "STRENGTH", share):

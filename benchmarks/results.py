@@ -8,13 +8,14 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 from lab import SceneBench, figure, train_and_evaluate
 from methods import Method
 from report import Report, Row, page, slug, table
 from suites import DEFAULT, SUITES
 
 from mmpi_ns.capture.load import load_observations
-from mmpi_ns.placement.errors import pixel_errors
+from mmpi_ns.placement.errors import PixelErrors, pixel_errors
 from mmpi_ns.placement.visibility import find_visible_points
 from mmpi_ns.scene.windows import WindowedPlan
 from mmpi_ns.scripts.command import run
@@ -63,8 +64,19 @@ class Results(SceneBench):
         )
         visible = find_visible_points(observations)
         row |= {"mpis": len(plan.mpis), "texels": plan.texels}
-        row |= pixel_errors(plan, observations, visible.cameras, visible.points).summary()
+        row |= error_figures(pixel_errors(plan, observations, visible.cameras, visible.points))
         return row | made | {"steps": steps_of(run), "command": " ".join(["ns-train", variant.registered, *options])}
+
+
+def error_figures(errors: PixelErrors) -> dict[str, float]:
+    """Medians and 90th percentiles over the observations, each in its best head; fraction outside all heads."""
+    served = np.isfinite(errors.combined.min(-1))
+    figures = {"unserved": float(1 - served.mean()) if len(served) else 0.0}
+    for name, values in (("e_p", errors.plane), ("e_t", errors.texel)):
+        best = np.take_along_axis(values, errors.best[:, None], -1)[served, 0]
+        for q in (50, 90):
+            figures[f"{name}_{q}"] = float(np.percentile(best, q)) if len(best) else float("nan")
+    return figures
 
 
 def markdown(suite: str, content: Row) -> str:

@@ -71,19 +71,12 @@ def _method(
     return MethodSpecification(config=config, description=description)
 
 
-mmpi = _method(
-    "mmpi",
-    "MMPI: several multi-plane images, placed among the training cameras.",
-    steps=0,
-    rays=DEFAULTS["mmpi"].rays,
-    model=MMPIModelConfig(placement=DEFAULTS["mmpi"].placement),
-)
-mmpi_small = _method(
-    "mmpi-small",
-    "MMPI in a size that a two-core CPU trains in minutes.",
-    steps=0,
-    rays=DEFAULTS["mmpi-small"].rays,
-    model=MMPIModelConfig(placement=DEFAULTS["mmpi-small"].placement),
+mmpi, mmpi_small = (
+    _method(name, text, steps=0, rays=DEFAULTS[name].rays, model=MMPIModelConfig(placement=DEFAULTS[name].placement))
+    for name, text in (
+        ("mmpi", "MMPI: several multi-plane images, placed among the training cameras."),
+        ("mmpi-small", "MMPI in a size that a two-core CPU trains in minutes."),
+    )
 )
 mmpi_kitti = _method(
     "mmpi-kitti",

@@ -20,7 +20,7 @@ from mmpi_ns.export.bake import read_run_config
 from mmpi_ns.export.files import HEADER, BakedScene, read_baked
 from mmpi_ns.rendering.images import SHOWN_RAYS, render_in_chunks
 from mmpi_ns.scene.windows import WindowedPlan
-from mmpi_ns.training.checkpoints import checkpoints_in, read_checkpoint
+from mmpi_ns.training.checkpoints import last_checkpoint, read_checkpoint
 from mmpi_ns.utils.errors import InputError
 from mmpi_ns.utils.values import Number, check_number
 
@@ -96,21 +96,17 @@ def load(path: str | Path, device: str | torch.device | None = None) -> Scene:
 
 def _load_run(config_path: Path, device: torch.device) -> Scene:
     """The model of a run with its last checkpoint, without a data manager."""
-    config, folder = read_run_config(config_path), config_path.parent / "nerfstudio_models"
-    checkpoints = checkpoints_in(folder)
-    if not checkpoints:
-        raise InputError(f"There is no checkpoint in {folder} to load: train first, or put it back.")
-    state = read_checkpoint(checkpoints[max(checkpoints)])
+    config = read_run_config(config_path)
+    state = read_checkpoint(last_checkpoint(config_path.parent / "nerfstudio_models"))
     cameras = state["capture"]["cameras"]
     config.windows_folder, config.rendering.mode = config_path.parent / "windows", "exact"
     unbounded = SceneBox(torch.tensor([[-1.0] * 3, [1.0] * 3]))
     model = config.setup(scene_box=unbounded, num_train_data=len(cameras), metadata={}, device=device).to(device)
     tensors = {k.removeprefix("_model."): v for k, v in state["pipeline"].items() if k.startswith("_model.")}
     model.load_state_dict(tensors)
-    model.update_to_step(max(checkpoints))
+    model.update_to_step(state["step"])
     model.eval()
-    fx, fy, cx, cy = cameras[:, 12:16].unbind(-1)
-    path = CameraPath(cameras[:, :12].view(-1, 3, 4), _intrinsics(fx, fy, cx, cy), cameras[:, 16:].long())
+    path = CameraPath(cameras[:, :12].view(-1, 3, 4), _intrinsics(cameras[:, 12:16]), cameras[:, 16:].long())
     return Scene(model.progress.windows.names, path, device, model.get_outputs_for_camera)
 
 
@@ -126,12 +122,14 @@ def _load_baked(baked: BakedScene, device: torch.device) -> Scene:
     numbers = torch.tensor([(*pose.focal, *pose.center) for pose in baked.path])
     poses, sizes = torch.tensor([pose.to_world for pose in baked.path]), torch.tensor([p.size for p in baked.path])
     names = WindowedPlan(tuple(place for place, _ in baked.windows)).names
-    return Scene(names, CameraPath(poses, _intrinsics(*numbers.unbind(-1)), sizes), device, render_image)
+    return Scene(names, CameraPath(poses, _intrinsics(numbers), sizes), device, render_image)
 
 
-def _intrinsics(fx: Tensor, fy: Tensor, cx: Tensor, cy: Tensor) -> Float[Tensor, "N 3 3"]:
-    zero, one = torch.zeros_like(fx), torch.ones_like(fx)
-    return torch.stack([fx, zero, cx, zero, fy, cy, zero, zero, one], -1).view(-1, 3, 3)
+def _intrinsics(numbers: Float[Tensor, "N 4"]) -> Float[Tensor, "N 3 3"]:
+    """Matrices of focal lengths and principal points (fx, fy, cx, cy)."""
+    matrices = torch.eye(3).repeat(len(numbers), 1, 1)
+    matrices[:, [0, 1, 0, 1], [0, 1, 2, 2]] = numbers
+    return matrices
 
 
 @torch.no_grad()
@@ -175,8 +173,8 @@ def render(
     fx, fy, cx, cy = (lenses[:, i, j, None] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
     cameras = Cameras(poses, fx, fy, cx, cy, width, height)
     outputs = [scene._render(cameras[i : i + 1].to(scene.device)) for i in range(len(poses))]
-    stacked = {
-        name: torch.stack([image[name] for image in outputs]).to(scene.device).view(*batch, height, width, -1)
+    rgb, depth, accumulation, winner = (
+        torch.stack([image[name] for image in outputs]).to(scene.device).view(*batch, height, width, -1)
         for name in ("rgb", "depth", "accumulation", "winning_mpi")
-    }
-    return Images(stacked["rgb"], stacked["depth"], stacked["accumulation"], stacked["winning_mpi"].long())
+    )
+    return Images(rgb, depth, accumulation, winner.long())

@@ -33,7 +33,7 @@ from mmpi_ns.rendering.baked import BakedWindow, bake, suits_bricks
 from mmpi_ns.rendering.details import DETAILS_FOLDER, Details, details_of
 from mmpi_ns.rendering.exposure import Exposures
 from mmpi_ns.rendering.images import rays_per_chunk, render_in_chunks, render_windows
-from mmpi_ns.rendering.metrics import ImageMetrics, depth_metrics, pictures, psnr, ssim
+from mmpi_ns.rendering.metrics import ImageMetrics, depth_metrics, pictures, psnr_and_ssim
 from mmpi_ns.rendering.rendered import (
     BACKGROUNDS,
     RenderedRays,
@@ -41,27 +41,24 @@ from mmpi_ns.rendering.rendered import (
     background_of,
     bounded,
     render_rays,
-    sampled_outputs,
     shown_outputs,
     winners,
 )
-from mmpi_ns.rendering.sampler import MMPISampler, SamplingConfig
+from mmpi_ns.rendering.sampler import MMPISampler, SamplingConfig, rays_of
 from mmpi_ns.rendering.window_store import WindowStore
 from mmpi_ns.scene.plan import NO_PLAN
 from mmpi_ns.scene.visible_tiles import TrainingViews
 from mmpi_ns.scene.windows import WindowedPlan
-from mmpi_ns.training.checkpoints import check_there_are_checkpoints
+from mmpi_ns.training.checkpoints import last_checkpoint
 from mmpi_ns.training.losses import LossWeights, batch_losses, over_background, photometric
 from mmpi_ns.training.memory import Work, fit_memory
 from mmpi_ns.training.options import grouped
-from mmpi_ns.training.phases import ScheduleConfig, make_schedule
+from mmpi_ns.training.phases import TRAINS, ScheduleConfig, make_schedule
 from mmpi_ns.training.run import Progress, TrainingRun, individual_rays, move_rays, views_of
 from mmpi_ns.utils.errors import InputError, say
 from mmpi_ns.utils.parallel import torch_apart
 from mmpi_ns.utils.random_draws import generator
 
-FIELD_METRICS = {"psnr": psnr, "ssim": ssim}
-"""Metrics of the field's image without details."""
 FAIR_SHARE = 0.1
 """While the resolution grows, samples with more than this fraction of an equal weight are kept."""
 
@@ -129,8 +126,6 @@ class MMPIModel(Model):
         count = len(windows)
         schedule = make_schedule(phases, max(1, config.total_steps), count, metadata.get(DEPTHS_KNOWN, False))
         self.progress = Progress(windows, schedule)
-        self._expect_shapes()
-        dispatch.choose(config.ops)
         self.field = self._new_field(views_of(windows.windows[0], views))
         budget = config.rendering.resident_gib * 2**30
         self.store = WindowStore(config.windows_folder, self._new_field, budget, config.rendering.half_windows)
@@ -140,7 +135,9 @@ class MMPIModel(Model):
         self.metrics = ImageMetrics(config.lpips_net)
         self.scoring: Callable[[dict[str, Tensor], dict[str, Tensor]], tuple[dict, dict]] | None = None
         """In place of ``scores_and_images`` while the pipeline evaluates images, whose exposures it knows."""
-        self.show = ViewerDropdown("Show MPI", "all", ["all", *windows.names], hint="One MPI alone, or all")
+        self.show = ViewerDropdown("Show MPI", "all", ["all"], hint="One MPI alone, or all")
+        self._take_plan()
+        dispatch.choose(config.ops)
         self.camera_optimizer = config.camera_optimizer.setup(num_cameras=self.num_train_data, device=device)
         if config.camera_optimizer.mode != "off" and count > 1:
             raise InputError(
@@ -180,7 +177,9 @@ class MMPIModel(Model):
         if config.plan_file is not None and (observations is not None or config.plan_file.is_file()):
             return WindowedPlan.load(config.plan_file)
         if observations is None:
-            check_there_are_checkpoints(config.windows_folder)
+            folder = None if config.windows_folder is None else config.windows_folder.parent / "nerfstudio_models"
+            if folder is not None and folder.is_dir():
+                last_checkpoint(folder)  # nerfstudio looks for it only after making the model, and ends in a traceback
             return WindowedPlan.single(NO_PLAN)
         return place_windows(observations, placement, config.total_steps * metadata[RAYS_PER_STEP])
 
@@ -197,16 +196,12 @@ class MMPIModel(Model):
             cube_alpha=self.config.sampling.cube_alpha,
         )
 
-    def _take_plan(self, _: Any) -> None:
-        """Takes over plan and schedule of a checkpoint that was loaded."""
-        self.field.shares_depth = self.progress.schedule.is_joint
-        self.show.set_options(["all", *self.progress.windows.names])
-        self._expect_shapes()
-
-    def _expect_shapes(self) -> None:
-        """Says what a GPU's kernels will be compiled for."""
-        joint, channels = self.progress.schedule.is_joint, self.config.colour.feature_channels
-        dispatch.expect(Shapes.of(self.progress.windows.plans, blends=not joint, channels=channels))
+    def _take_plan(self, _: Any = None) -> None:
+        """Takes over plan and schedule, also of a checkpoint that was loaded; a GPU's kernels are compiled for them."""
+        joint, windows = self.progress.schedule.is_joint, self.progress.windows
+        self.field.shares_depth = joint
+        self.show.set_options(["all", *windows.names])
+        dispatch.expect(Shapes.of(windows.plans, blends=not joint, channels=self.config.colour.feature_channels))
 
     def get_param_groups(self) -> dict[str, list[Parameter]]:
         return self.run.parameters()
@@ -228,7 +223,7 @@ class MMPIModel(Model):
         if progress.phase.name == "individual":
             g = generator(self.config.seed, progress.step, "assignment", self.device)
             bundle, head_mask, choose = individual_rays(bundle, field.plan, self.config.schedule.rays_per_mpi, g)
-        blends = progress.schedule.blends_at(progress.step) and self.blends(field)
+        blends = "reliability" in TRAINS[progress.phase.name] and self.blends(field)
         sampling = {"head_mask": head_mask, "choose": choose, **self.training_bounds()}
         rays = render_rays(self.sampler, bundle, field, blends=blends, **sampling)
         return {"training": replace(rays, times=len(bundle) // asked)}
@@ -280,8 +275,11 @@ class MMPIModel(Model):
         background = background_of(self.config.rendering.background, bundle.origins)
         one_exposure = self.exposures.mean is None or self.config.rendering.exposure == "mean"
         may_bake = mode == "auto" and not self.trains and one_exposure
+        bundle = bounded(bundle, field.plan)
         if chosen is None and (mode == "baked" or (may_bake and suits_bricks(field))):
-            outputs = self.baked(field).outputs(bounded(bundle, field.plan), background)
+            rays = rays_of(bundle)
+            bounds = rays.nears, rays.fars
+            outputs = self.baked(field).render(rays.origins, rays.directions, bounds, background)
             return outputs | winners(outputs, bundle, field, first_head)
         blends, head_mask = self.blends(field), None
         if chosen is not None:
@@ -289,17 +287,15 @@ class MMPIModel(Model):
             heads = field.planned_heads(torch.arange(field.plan.num_heads, device=self.device))
             head_mask = (heads == head).expand(len(bundle), -1)
             blends = False
-        how = {"blends": blends, "threshold": self.config.rendering.threshold, "head_mask": head_mask}
-        once = field.shading == "ray" and not torch.is_grad_enabled()
-        outputs = (shown_outputs if once else sampled_outputs)(bounded(bundle, field.plan), field, **how)
+        threshold = self.config.rendering.threshold
+        outputs = shown_outputs(bundle, field, blends=blends, threshold=threshold, head_mask=head_mask)
         behind = outputs.pop("transmittance") * background.to(outputs["rgb"])
-        exposure = self.exposures.shown(self.config.rendering.exposure, bundle.origins[0]) if len(bundle) else None
         outputs |= winners(outputs, bundle, field, first_head)
+        exposure = self.exposures.shown(self.config.rendering.exposure, bundle)
         if exposure is None:
             return outputs | {"rgb": (outputs["rgb"] + behind).clamp(0, 1)}
         radiance = outputs["rgb"] + behind / exposure
-        rgb = (exposure * radiance).clamp(0, 1)
-        return outputs | {"rgb": rgb, "radiance": radiance}
+        return outputs | {"rgb": (exposure * radiance).clamp(0, 1), "radiance": radiance}
 
     def baked(self, field: MMPIField) -> BakedWindow:
         """Baked form of a field, cached until the field is trained on. Raises ValueError if it cannot be baked."""
@@ -335,10 +331,9 @@ class MMPIModel(Model):
         with torch_apart():
             outputs = self.image_outputs(camera_ray_bundle.flatten(), self.chunk_size)
             outputs = {name: values.view(*camera_ray_bundle.shape, -1) for name, values in outputs.items()}
-            shows_all = self.progress.windows.find(self.show.value) is None
-            if self.details is None or not shows_all:
+            if self.details is None or self.progress.windows.find(self.show.value) is not None:
                 return outputs
-            exposure = self.exposures.shown(self.config.rendering.exposure, camera_ray_bundle.origins.view(-1, 3)[0])
+            exposure = self.exposures.shown(self.config.rendering.exposure, camera_ray_bundle)
             return self.details.added(outputs, camera_ray_bundle, self.config.rendering.nearest_images, exposure)
 
     def update_to_step(self, step: int) -> None:
@@ -403,9 +398,7 @@ class MMPIModel(Model):
         observed = self.observed(batch).to(outputs["rgb"].device)
         values = self.metrics(outputs["rgb"], observed)
         if "field_rgb" in outputs:
-            values |= {
-                f"field_{name}": metric(outputs["field_rgb"], observed) for name, metric in FIELD_METRICS.items()
-            }
+            values |= {f"field_{name}": value for name, value in psnr_and_ssim(outputs["field_rgb"], observed).items()}
         values["dropped_mass"] = float(outputs["dropped_mass"].mean())
         if "distance" in batch:
             values |= depth_metrics(outputs["depth"], batch["distance"].to(outputs["depth"]))
@@ -413,5 +406,4 @@ class MMPIModel(Model):
 
     def observed(self, batch: dict[str, Tensor]) -> Tensor:
         """The pixels of a batch, over the background where they are transparent."""
-        image = batch["image"].to(self.device)
-        return over_background(image, torch.full_like(image[..., :3], BACKGROUNDS[self.config.rendering.background]))
+        return over_background(batch["image"].to(self.device), BACKGROUNDS[self.config.rendering.background])

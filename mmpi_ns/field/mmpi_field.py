@@ -104,10 +104,6 @@ class MMPIField(TexelTables):
             sizes = (feature_channels, hidden_width, position_frequencies, direction_frequencies)
             self.networks = ColorNetworks(plan.num_heads, *sizes)
 
-    def renew_networks(self) -> None:
-        """Starts the networks anew, as many as the current plan needs."""
-        self.networks.resize(1 if self.shading == "ray" else self.full_plan.num_heads)
-
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
         """Takes the number of colour networks from the checkpoint first."""
         stored = state_dict.get(prefix + "networks.weights")

@@ -70,9 +70,10 @@ def find_candidates(observations: Observations, visible: VisiblePoints, with_cub
     Raises:
         InputError: no camera has a field of view that an MPI can have.
     """
-    spread = spread_cameras(observations, visible, MAX_WIDE_VIEWS if observations.wide.any() else MAX_VIEWS)
-    candidates = []
-    for i in spread:
+    centers, back = observations.centers / max(visible.near, 1e-12), observations.camera_to_worlds[:, :, 2]
+    places = np.concatenate([centers, back * 2], -1)
+    most, candidates = MAX_WIDE_VIEWS if observations.wide.any() else MAX_VIEWS, []
+    for i in farthest_first(places, count=min(most, len(places))):  # far apart in position or direction
         fx, fy = observations.intrinsics[i, :2]
         for (name, axes, u, v), pull_back in product(_faces(observations, i), PULL_BACKS):
             behind = pull_back * visible.near
@@ -95,13 +96,6 @@ def find_candidates(observations: Observations, visible: VisiblePoints, with_cub
             "No MPI fits the field of view of any training camera: check camera_model, focal lengths and distortion."
         )
     return [*candidates, *(_cubes(observations, visible) if with_cubes else [])]
-
-
-def spread_cameras(observations: Observations, visible: VisiblePoints, count: int) -> list[int]:
-    """Cameras far apart in position or direction, each the farthest from the previous ones."""
-    reach = max(visible.near, 1e-12)
-    place = np.concatenate([observations.centers / reach, observations.camera_to_worlds[:, :, 2] * 2], -1)
-    return farthest_first(place, count=min(count, len(place)))
 
 
 def _faces(observations: Observations, i: int) -> Iterator[tuple[str, Array, Array, Array]]:

@@ -39,17 +39,6 @@ class PixelErrors:
         """[Q] the head that serves each observation best."""
         return self.combined.argmin(-1)
 
-    def summary(self) -> dict[str, float]:
-        """Medians and 90th percentiles over the observations, each in its best head; fraction outside all heads."""
-        rows = np.arange(len(self.plane))
-        served = np.isfinite(self.combined.min(-1))
-        result = {"unserved": float(1 - served.mean()) if len(rows) else 0.0}
-        for name, values in (("e_p", self.plane), ("e_t", self.texel)):
-            chosen = values[rows, self.best][served]
-            for q in (50, 90):
-                result[f"{name}_{q}"] = float(np.percentile(chosen, q)) if len(chosen) else float("nan")
-        return result
-
 
 def pixel_errors(plan: ScenePlan, observations: Observations, cameras: NDArray[np.int64], points: Array) -> PixelErrors:
     """e_p and e_t of observed points in every head of a plan: its MPIs, then the cube if there is one.

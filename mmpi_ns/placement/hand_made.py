@@ -30,20 +30,14 @@ def facing_axes(base: Array, name: str) -> tuple[Vector, Vector, Vector]:
 
 
 def drive_plan(
-    observations: Observations,
-    metre: float,
-    planes: int,
-    height: int,
-    width: int,
-    names: tuple[str, ...],
-    pull_back: float,
+    observations: Observations, metre: float, size: tuple[int, int, int], names: tuple[str, ...], pull_back: float
 ) -> ScenePlan:
     """Four MPIs along a straight drive, placed by hand in metres (fixed, as a baseline).
 
     Args:
         observations: training cameras; the drive runs along their mean direction.
         metre: scene units in a metre.
-        planes, height, width: planes of every MPI, and their texel rows and columns.
+        size: planes of every MPI, and their texel rows and columns.
         names: which of the four to use.
         pull_back: distance of the front MPI behind the first camera, as a fraction of the travel.
     """
@@ -63,24 +57,18 @@ def drive_plan(
     for name in names:
         origin, near, extent = rule[name]
         world = (start + np.array(origin) * metre) @ base
-        mpis.append(MPIPlan(name, vector(world), facing_axes(base, name), near * metre, extent, planes, height, width))
+        mpis.append(MPIPlan(name, vector(world), facing_axes(base, name), near * metre, extent, *size))
     return ScenePlan(tuple(mpis), None, 1.0 * metre, 5.0 * metre, "hand-made drive")
 
 
 def room_plan(
-    observations: Observations,
-    planes: int,
-    height: int,
-    width: int,
-    cube_voxels: int,
-    near: float,
-    cube_half_size: float,
+    observations: Observations, size: tuple[int, int, int], cube_voxels: int, near: float, cube_half_size: float
 ) -> ScenePlan:
     """The paper's ScanNet arrangement: five MPIs around the cameras' centre and a cube (sec. IV).
 
     Args:
         observations: training cameras.
-        planes, height, width: planes of every MPI, and their texel rows and columns.
+        size: planes of every MPI, and their texel rows and columns.
         cube_voxels: voxels along each side of the cube; 0 for none.
         near: depth of the first plane, scene units.
         cube_half_size: half the cube's side, scene units.
@@ -89,7 +77,7 @@ def room_plan(
     center = (observations.centers.min(0) + observations.centers.max(0)) / 2
     extent = (-OVERLAPPING, OVERLAPPING, -OVERLAPPING, OVERLAPPING)
     names = ("front", "back", "left", "right", "below")
-    mpis = (MPIPlan(n, vector(center), facing_axes(base, n), near, extent, planes, height, width) for n in names)
+    mpis = (MPIPlan(n, vector(center), facing_axes(base, n), near, extent, *size) for n in names)
     corners = vector(center - cube_half_size), vector(center + cube_half_size)
     cube = CubePlan(*corners, (cube_voxels, cube_voxels, cube_voxels)) if cube_voxels else None
     return ScenePlan(tuple(mpis), cube, 0.1 * near, near, "hand-made room")

@@ -93,11 +93,11 @@ def place(observations: Observations, config: PlacementConfig, training_rays: in
     size = (config.planes, config.height, config.width)
     if config.arrangement == "drive":
         # The hand-made rule is in metres; it was made where the nearest point lies 5 m away.
-        return drive_plan(observations, visible.near / 5, *size, config.faces, config.drive_pull_back)
+        return drive_plan(observations, visible.near / 5, size, config.faces, config.drive_pull_back)
     if config.arrangement == "room":
         half_size = float(np.abs(observations.centers - observations.centers.mean(0)).max()) + visible.near
         near = max(0.5 * visible.near, 1e-6)
-        return room_plan(observations, *size, config.cube_voxels, near, half_size)
+        return room_plan(observations, size, config.cube_voxels, near, half_size)
     trainable = trainable_texel(observations, visible, config, training_rays)
     budget = affordable_texels(config, training_rays)
     finest = max(config.texel_pixels, trainable)
@@ -213,13 +213,18 @@ class _Choice:
         self.is_cube = np.array([isinstance(c.frame, CubePlan) for c in candidates])
 
     def run(self) -> _Chosen:
+        """Adds, one by one, the candidate with the largest gain for its texels, until none gains enough."""
         # A scene needs an MPI, however little it gains.
         gain = np.maximum(self.nothing - self.cost, 0) @ self.weights
         chosen = [int(np.where(self.is_cube, -1.0, gain / self.price).argmax())]
         while len(chosen) < self.config.max_mpis:
-            best = self._next(chosen)
-            if best is None:
+            more = np.maximum(np.minimum(self.nothing, self.cost[chosen].min(0)) - self.cost, 0) @ self.weights
+            allowed = more >= self.config.min_gain
+            if self.is_cube[chosen].any():
+                allowed &= ~self.is_cube
+            if not allowed.any():
                 break
+            best = int(np.where(allowed, more / self.price, -1.0).argmax())
             grown = self._without_superfluous([*chosen, best])
             if self._total(grown) >= self._total(chosen):  # it makes itself or its better superfluous
                 break
@@ -235,14 +240,6 @@ class _Choice:
         """Remaining expected error, in bits, summed over images."""
         served = np.minimum(self.nothing, self.cost[chosen].min(0)) if chosen else self.nothing
         return float(served @ self.weights)
-
-    def _next(self, chosen: list[int]) -> int | None:
-        """The candidate with the largest gain for its texels; None if none gains enough."""
-        gain = np.maximum(np.minimum(self.nothing, self.cost[chosen].min(0)) - self.cost, 0) @ self.weights
-        allowed = gain >= self.config.min_gain
-        if self.is_cube[chosen].any():
-            allowed &= ~self.is_cube
-        return int(np.where(allowed, gain / self.price, -1.0).argmax()) if allowed.any() else None
 
     def _without_superfluous(self, chosen: list[int]) -> list[int]:
         """Removes, one by one, heads whose absence costs less than the minimum gain."""

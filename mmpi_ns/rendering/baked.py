@@ -14,7 +14,6 @@ from typing import TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int
-from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 
 from mmpi_ns.field.mmpi_field import MMPIField
@@ -99,23 +98,27 @@ class BakedWindow:
     ) -> dict[str, Tensor]:
         """rgb, accumulation, depth, winning MPI and dropped mass of rays, like those of the model.
 
+        Bricks are read on the CPU; the outputs lie where the rays do.
+
         Args:
             origins: of the rays.
             directions: of the rays, unit vectors.
             bounds: nears and fars of the rays; None: from ``ray_near`` to infinity.
             background: colour behind everything; None: the window's own.
         """
-        shown = show_baked(self.mpis, Rays(origins, directions, *(bounds or self.unbounded(origins))), self.threshold)
-        shaded = shade_baked(self.shader, shown.gathered, shown.mass, directions)
+        rays = Rays(*(x.cpu() for x in (origins, directions, *(bounds or self.unbounded(origins)))))
+        shown = show_baked(self.mpis, rays, self.threshold)
+        shaded = shade_baked(self.shader, shown.gathered, shown.mass, rays.directions)
         rgb = torch.where(shown.mass > 0, shaded * shaded.new_tensor(self.exposure), 0.0)
-        behind = self.background if background is None else background
-        return {
+        behind = self.background if background is None else background.cpu()
+        outputs = {
             "rgb": (rgb * shown.accumulation + behind * shown.transmittance).clamp(0, 1),
             "accumulation": shown.accumulation,
             "depth": 1 / shown.inverse_t.clamp(min=1 / self.farthest),
             "winning_mpi": shown.winner,
             "dropped_mass": shown.dropped_mass,
         }
+        return {name: values.to(origins.device) for name, values in outputs.items()}
 
     def unbounded(self, origins: Float[Tensor, "R 3"]) -> tuple[Float[Tensor, "R 1"], Float[Tensor, "R 1"]]:
         """Nears and fars of rays that see everything."""
@@ -136,13 +139,6 @@ class BakedWindow:
             for o, d in zip(*(x.split(AT_ONCE) for x in rays_of(view)), strict=True):
                 show_baked(self.mpis, Rays(o, d, *self.unbounded(o)), self.threshold, peaks)
         return peaks
-
-    def outputs(self, bundle: RayBundle, background: Float[Tensor, "3"]) -> dict[str, Tensor]:
-        """The same for a bundle with nears and fars on any device; bricks are read on the CPU."""
-        assert bundle.nears is not None and bundle.fars is not None
-        bounds = bundle.nears.cpu(), bundle.fars.cpu()
-        outputs = self.render(bundle.origins.cpu(), bundle.directions.cpu(), bounds, background.cpu())
-        return {name: values.to(bundle.origins.device) for name, values in outputs.items()}
 
     def keep(self, kept: Bool[Tensor, "B"]) -> BakedWindow:
         """The same window with only some of the bricks."""

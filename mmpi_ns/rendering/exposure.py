@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 
 from mmpi_ns.capture.datamanager import MMPIDataManager
@@ -50,9 +51,11 @@ class Exposures(torch.nn.Module):
             setattr(self, name, torch.empty_like(stored, device=current.device))
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
-    def shown(self, mode: Literal["mean", "nearest"], center: Float[Tensor, "3"]) -> Float[Tensor, "3"] | None:
-        """Exposure of an image taken at a position; None where all have the field's."""
-        return self.mean if self.mean is None or mode == "mean" else self.nearest(center)
+    def shown(self, mode: Literal["mean", "nearest"], bundle: RayBundle) -> Float[Tensor, "3"] | None:
+        """Exposure that an image is shown at; None where all have the field's."""
+        if self.mean is None or mode == "mean" or not len(bundle):
+            return self.mean
+        return self.nearest(bundle.origins.reshape(-1, 3)[0])
 
     @property
     def mean(self) -> Float[Tensor, "3"] | None:

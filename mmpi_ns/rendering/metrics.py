@@ -31,10 +31,7 @@ class ImageMetrics:
 
     @torch.no_grad()
     def __call__(self, predicted: Float[Tensor, "H W 3"], observed: Float[Tensor, "H W 3"]) -> dict[str, float]:
-        values = {"psnr": psnr(predicted, observed)}
-        if min(predicted.shape[:2]) >= WINDOW:
-            values["ssim"] = ssim(predicted, observed)
-        values |= {"cc_psnr": psnr(color_corrected(predicted, observed), observed)}
+        values = psnr_and_ssim(predicted, observed) | {"cc_psnr": psnr(color_corrected(predicted, observed), observed)}
         if self.lpips_net != "none" and not self._lpips_tried:
             self._lpips_tried = True
             try:
@@ -51,6 +48,12 @@ class ImageMetrics:
             a, b = (torch.moveaxis(x, -1, 0)[None].float().clamp(0, 1) for x in (predicted, observed))
             values[f"lpips_{self.lpips_net}"] = float(self._lpips(a, b))
         return values
+
+
+def psnr_and_ssim(predicted: Float[Tensor, "H W 3"], observed: Float[Tensor, "H W 3"]) -> dict[str, float]:
+    """Both of an image in [0, 1]; PSNR alone of one that is smaller than SSIM's window."""
+    values = {"psnr": psnr(predicted, observed)}
+    return values if min(predicted.shape[:2]) < WINDOW else values | {"ssim": ssim(predicted, observed)}
 
 
 def psnr(predicted: Float[Tensor, "*N 3"], observed: Float[Tensor, "*N 3"]) -> float:

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import torch
-from jaxtyping import Float
 from nerfstudio.cameras.rays import RayBundle, RaySamples
 from nerfstudio.model_components import renderers
 from torch import Tensor
@@ -81,12 +80,6 @@ def bounded(bundle: RayBundle, plan: ScenePlan) -> RayBundle:
     return bundle
 
 
-def distances_of(inverse_t: Float[Tensor, "R 1"], plan: ScenePlan) -> Float[Tensor, "R 1"]:
-    """Distances from inverse ones; infinity becomes ten times the farthest finite plane."""
-    farthest = 10 * max(m.farthest for m in plan.mpis)
-    return 1 / inverse_t.clamp(min=1 / farthest)
-
-
 def winners(outputs: dict[str, Tensor], bundle: RayBundle, field: MMPIField, first_head: int) -> dict[str, Tensor]:
     """What is told of the heads with the most weight in each ray.
 
@@ -141,49 +134,38 @@ def render_rays(
     return RenderedRays(bundle, samples, composite, colors, report, lookup)
 
 
-def sampled_outputs(bundle: RayBundle, field: MMPIField, *, blends: bool, **sampling: Any) -> dict[str, Tensor]:
-    """``shown_outputs`` for any field, also with gradients."""
-    rays = render_rays(MMPISampler(), bundle, field, blends=blends, **sampling)
-    meta, composite = metadata_of(rays.samples), rays.composite
-    with torch.no_grad():
-        inverse_t = median_inverse_distance(composite.weights, meta["inverse_t"][..., 0], meta["valid"][..., 0])
-    return {
-        "rgb": rays.colors.rgb,
-        "accumulation": composite.accumulation,
-        "transmittance": composite.transmittance,
-        "depth": distances_of(inverse_t, field.plan),
-        "winning_mpi": winning_heads(composite.weights, meta["heads"][..., 0], field.plan.num_heads),
-        "dropped_mass": rays.report.dropped_mass,
-    }
-
-
-@torch.no_grad()
 def shown_outputs(
-    bundle: RayBundle,
-    field: MMPIField,
-    *,
-    blends: bool,
-    threshold: float,
-    head_mask: Tensor | None,
+    bundle: RayBundle, field: MMPIField, *, blends: bool, threshold: float, head_mask: Tensor | None
 ) -> dict[str, Tensor]:
     """rgb (without background), accumulation, transmittance, depth, winning head and dropped mass of rays [R, .].
 
+    Without gradients, a field that shades a ray once is rendered in one pass that stores no samples.
+
     Args:
         bundle: the rays.
-        field: with ``shading ray``.
+        field: to render.
         blends: samples are blended by reliability.
         threshold: weight below which a sample is dropped.
         head_mask: heads that may render each ray; None for all.
     """
-    assert isinstance(field.networks, RayShader)
-    options = MarchOptions(threshold, blends=blends)
-    scene = (field.layout, field.tables, field.features.data)
-    shown = show_rays(*scene, rays_of(bundle, head_mask), options)
+    if isinstance(field.networks, RayShader) and not torch.is_grad_enabled():
+        options, tables = MarchOptions(threshold, blends=blends), (field.tables, field.features.data)
+        shown = show_rays(field.layout, *tables, rays_of(bundle, head_mask), options)
+        rgb = field.networks.shade(shown.gathered, shown.mass, shown.accumulation, bundle.directions)
+        light, inverse_t, winner, dropped_mass = shown, shown.inverse_t, shown.winner, shown.dropped_mass
+    else:
+        rays = render_rays(MMPISampler(), bundle, field, blends=blends, threshold=threshold, head_mask=head_mask)
+        rgb, light, meta = rays.colors.rgb, rays.composite, metadata_of(rays.samples)
+        with torch.no_grad():
+            inverse_t = median_inverse_distance(light.weights, meta["inverse_t"][..., 0], meta["valid"][..., 0])
+        winner = winning_heads(light.weights, meta["heads"][..., 0], field.plan.num_heads)
+        dropped_mass = rays.report.dropped_mass
+    farthest = 10 * max(m.farthest for m in field.plan.mpis)  # stands for infinity
     return {
-        "rgb": field.networks.shade(shown.gathered, shown.mass, shown.accumulation, bundle.directions),
-        "accumulation": shown.accumulation,
-        "transmittance": shown.transmittance,
-        "depth": distances_of(shown.inverse_t, field.plan),
-        "winning_mpi": shown.winner,
-        "dropped_mass": shown.dropped_mass,
+        "rgb": rgb,
+        "accumulation": light.accumulation,
+        "transmittance": light.transmittance,
+        "depth": 1 / inverse_t.clamp(min=1 / farthest),
+        "winning_mpi": winner,
+        "dropped_mass": dropped_mass,
     }

@@ -70,14 +70,12 @@ def claim(folder: Path, checkpoints: Path, resumes_from: Path | None) -> None:
         unfinished.unlink(missing_ok=True)
 
 
-def check_there_are_checkpoints(windows_folder: Path | None) -> None:
-    """Raises InputError if a run has finished windows but no checkpoint.
-
-    ns-eval, ns-render and ns-viewer look for the last checkpoint only after making the model, and end in a traceback.
-    """
-    folder = None if windows_folder is None else windows_folder.parent / "nerfstudio_models"
-    if folder is not None and folder.is_dir() and not checkpoints_in(folder):
+def last_checkpoint(folder: Path) -> Path:
+    """The checkpoint of the latest step in a folder. Raises InputError if there is none."""
+    steps = checkpoints_in(folder)
+    if not steps:
         raise InputError(f"There is no checkpoint in {folder} to load: train first, or put it back.")
+    return steps[max(steps)]
 
 
 def checkpoint_to_load(config: TrainerConfig) -> Path | None:

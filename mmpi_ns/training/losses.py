@@ -188,7 +188,7 @@ def _depth_sums(rays: RenderedRays, field: MMPIField) -> DepthSums:
     return depth_sums(weights, inverse_t, valid, intervals, targets, field.plan.content_near)
 
 
-def over_background(image: Tensor, background: Tensor) -> Tensor:
+def over_background(image: Tensor, background: Tensor | float) -> Tensor:
     """RGBA over a background; RGB unchanged."""
     if image.shape[-1] == 4:
         return image[..., :3] * image[..., 3:] + background * (1 - image[..., 3:])

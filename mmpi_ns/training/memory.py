@@ -185,28 +185,24 @@ def describe(windows: WindowedPlan, steps: int, tables: Sequence[int], pixels: S
         f"Memory in training: at most {(tables[most] + pixels[most]) / GIB:.2f} GiB (tables and moments "
         f"{tables[most] / GIB:.2f}, pixels {pixels[most] / GIB:.2f}), plus the program and the work of a step."
     )
-    if len(windows) == 1:
-        return "\n".join([*_describe_plan(windows.plans[0]), memory])
-    texels = [plan.texels for plan in windows.plans]
-    lines = [
-        f"A long capture: {len(windows)} windows of {steps} steps each, one after the other; {sum(texels) / 1e6:.1f} M "
-        f"texels on disk, at most {max(texels) / 1e6:.1f} M in training at a time."
-    ]
-    for i, window in enumerate(windows.windows):
-        lines.append(f"Window {i}, cameras within {window.radius:.3g} (and {window.margin:.3g} more to mix):")
-        lines += ["  " + line for line in _describe_plan(window.plan)]
-    return "\n".join([*lines, memory])
-
-
-def _describe_plan(plan: ScenePlan) -> list[str]:
-    count = f"{len(plan.mpis)} {'MPI' if len(plan.mpis) == 1 else 'MPIs'}"
-    lines = [f"Scene plan ({plan.origin_of_plan}): {count}, {plan.texels / 1e6:.1f} M texels"]
-    for m in plan.mpis:
-        tangents = " ".join(f"{t:.2f}" for t in m.extent)
+    texels, lines, indent = [plan.texels for plan in windows.plans], [], ""
+    if len(windows) > 1:
         lines.append(
-            f"  {m.name}: {m.planes} planes of {m.height} x {m.width}, "
-            f"depths {m.near:.3g} to {m.far:.3g}, tangents {tangents}"
+            f"A long capture: {len(windows)} windows of {steps} steps each, one after the other; "
+            f"{sum(texels) / 1e6:.1f} M texels on disk, at most {max(texels) / 1e6:.1f} M in training at a time."
         )
-    if plan.cube is not None:
-        lines.append(f"  cube: {' x '.join(str(n) for n in plan.cube.shape)} voxels")
-    return lines
+    for i, window in enumerate(windows.windows):
+        if len(windows) > 1:
+            indent = "  "
+            lines.append(f"Window {i}, cameras within {window.radius:.3g} (and {window.margin:.3g} more to mix):")
+        plan, count = window.plan, len(window.plan.mpis)
+        mpis = f"{count} {'MPI' if count == 1 else 'MPIs'}"
+        lines.append(f"{indent}Scene plan ({plan.origin_of_plan}): {mpis}, {plan.texels / 1e6:.1f} M texels")
+        for m in plan.mpis:
+            lines.append(
+                f"{indent}  {m.name}: {m.planes} planes of {m.height} x {m.width}, depths {m.near:.3g} to {m.far:.3g}, "
+                f"tangents {' '.join(f'{t:.2f}' for t in m.extent)}"
+            )
+        if plan.cube is not None:
+            lines.append(f"{indent}  cube: {' x '.join(map(str, plan.cube.shape))} voxels")
+    return "\n".join([*lines, memory])

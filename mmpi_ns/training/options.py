@@ -10,15 +10,14 @@ from typing import Any
 import torch
 from nerfstudio.engine.trainer import TrainerConfig
 
-from mmpi_ns.placement.defaults import DEFAULTS, check_placement
+from mmpi_ns.placement.defaults import DEFAULTS, NOT_NEGATIVE, POSITIVE, check_placement
 from mmpi_ns.training.losses import LossWeights
 from mmpi_ns.training.phases import check_schedule
 from mmpi_ns.utils.errors import InputError
 from mmpi_ns.utils.machine import unused_gpu
 from mmpi_ns.utils.values import Number, check_number, check_options, shown
 
-POSITIVE, NOT_NEGATIVE, COUNT = Number(0, above=True), Number(0), Number(0, whole=True)
-SHARE = Number(0, 1)
+COUNT, SHARE = Number(0, whole=True), Number(0, 1)
 LONGEST_NAME = 255
 """Bytes of a folder's name."""
 RANGES = {
@@ -123,10 +122,9 @@ def check_nothing_left(model: Any) -> None:
 
 def check_device(device_type: str) -> None:
     """Raises InputError if training is to run on a GPU that torch does not see."""
-    usable = {"cuda": torch.cuda.is_available, "mps": torch.backends.mps.is_available}
-    if device_type in usable and not usable[device_type]():
+    if device_type == "cuda" and not torch.cuda.is_available():
         raise InputError(
-            f"--machine.device-type {device_type} asks for a GPU, and torch sees none: "
+            "--machine.device-type cuda asks for a GPU, and torch sees none: "
             f"{unused_gpu() or 'check the driver and the build of torch'}; --machine.device-type cpu trains without."
         )
 

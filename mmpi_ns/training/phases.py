@@ -102,6 +102,10 @@ class Schedule:
         """The window that an absolute step trains; the last one after the end."""
         return min(step // self.window_steps, self.windows - 1)
 
+    def steps_of(self, window: int) -> range:
+        """The absolute steps that train a window."""
+        return range(window * self.window_steps, (window + 1) * self.window_steps)
+
     def _local(self, step: int) -> int:
         return step - self.window_at(step) * self.window_steps
 
@@ -110,10 +114,6 @@ class Schedule:
         first = self.window_at(step) * self.window_steps
         chosen = next((phase for phase in self.phases if step - first < phase.end), self.phases[-1])
         return Phase(chosen.name, chosen.start + first, chosen.end + first)
-
-    def blends_at(self, step: int) -> bool:
-        """Whether reliability takes part in rendering at this step."""
-        return self.phase_at(step).name in ("blend", "finetune")
 
     def texel_factor(self, step: int) -> float:
         """Share of the plan's texels in use at this step, a power of two."""

@@ -5,15 +5,14 @@ from __future__ import annotations
 import math
 from pathlib import Path
 from time import monotonic
+from typing import Any
 
 import numpy as np
 import torch
 from nerfstudio.data.datasets.base_dataset import InputDataset
-from nerfstudio.models.base_model import Model
 from torch import Tensor
 
 from mmpi_ns.rendering.metrics import ImageMetrics
-from mmpi_ns.training.losses import over_background
 from mmpi_ns.training.phases import Schedule
 from mmpi_ns.utils.errors import duration, quoted, say
 
@@ -86,15 +85,14 @@ def forecast(method: str, steps: int, rays: int, threads: int, cores: float) -> 
 
 
 @torch.no_grad()
-def quick_test(model: Model, images: InputDataset, background: float) -> str:
-    """PSNR and SSIM of a few test images over a grey level, as a sentence. The model is in training mode afterwards."""
+def quick_test(model: Any, images: InputDataset) -> str:
+    """PSNR and SSIM of a few test images, as a sentence. The model is in training mode afterwards."""
     model.eval()
     metrics, scores, began = ImageMetrics("none"), [], monotonic()
     count = min(VIEWS, len(images))
     for i in np.linspace(0, len(images) - 1, count).round().astype(int).tolist():
         predicted = model.get_outputs_for_camera(images.cameras[i : i + 1].to(model.device))["rgb"]
-        image = images.get_data(i, image_type="float32")["image"].to(predicted)
-        scores.append(metrics(predicted, over_background(image, torch.full_like(image[..., :3], background))))
+        scores.append(metrics(predicted, model.observed(images.get_data(i, image_type="float32")).to(predicted)))
         if monotonic() - began > LOOK_SECONDS:
             break
     model.train()

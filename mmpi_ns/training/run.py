@@ -93,13 +93,7 @@ def individual_rays(
     heads = torch.arange(num_mpis, device=device).repeat_interleave(len(bundle))
     mask = torch.arange(plan.num_heads, device=device) == heads[:, None]
     mask[:, num_mpis:].fill_(True)
-
-    def repeat(x: Tensor | None) -> Any:
-        return None if x is None else x.repeat(num_mpis, *([1] * (x.ndim - 1)))
-
-    names = ("origins", "directions", "pixel_area", "camera_indices", "nears", "fars")
-    metadata = {name: repeat(values) for name, values in bundle.metadata.items()}
-    return RayBundle(**{name: repeat(getattr(bundle, name)) for name in names}, metadata=metadata), mask, None
+    return bundle.broadcast_to((num_mpis, len(bundle))).flatten(), mask, None
 
 
 class Progress(nn.Module):
@@ -187,7 +181,7 @@ class TrainingRun:
             self.store.forget(window)
             field.views = views_of(progress.windows.windows[window], self.views)
             field.build(progress.windows.plans[window], schedule.texel_factor(step))
-            field.renew_networks()
+            field.networks.resize(1 if field.shading == "ray" else field.full_plan.num_heads)
             progress.window_number.fill_(window)
             progress.window = window
             for kind, params in groups.items():

@@ -23,7 +23,6 @@ from mmpi_ns.capture.new_views import image_and_mask
 from mmpi_ns.field.tables import in_half_precision
 from mmpi_ns.placement.defaults import DEFAULTS, rays_times
 from mmpi_ns.rendering.details import DETAILS_FOLDER, details_of, moved_cameras, write_details
-from mmpi_ns.rendering.rendered import BACKGROUNDS
 from mmpi_ns.scene.texels import BRICK
 from mmpi_ns.scene.windows import WindowedPlan
 from mmpi_ns.training.checkpoints import (
@@ -144,7 +143,7 @@ class MMPITrainer(Trainer):
             self._share: WindowShare | None = None
             if self.world_size > 1:
                 folders = [self.checkpoint_dir, *([config.load_dir] if config.load_dir else [])]
-                self._share = WindowShare(comms.get_rank(), self.world_size, self._window_steps, folders)
+                self._share = WindowShare(comms.get_rank(), self.world_size, folders)
                 # Processes share the windows; nerfstudio would make them average their gradients.
                 self.world_size, config.load_dir = 1, None
             self._says_lines, config.logging.local_writer.enable = config.logging.local_writer.enable, False
@@ -176,12 +175,6 @@ class MMPITrainer(Trainer):
             processors = torch.cuda.get_device_properties(self.device).multi_processor_count
             model_config.rays_times = times = rays_times(method, processors)
             manager.train_num_rays_per_batch, manager.keypoint_rays = times * rays, times * manager.keypoint_rays
-
-    @property
-    def _rays(self) -> dict[str, int]:
-        """Rays of a step by kind; those of new views follow the pixels'."""
-        config = self._manager.config
-        return {"pixel": config.train_num_rays_per_batch, "keypoint": config.keypoint_rays}
 
     def _announce(self, plan: WindowedPlan) -> None:
         """Prints capture, plan, memory and expected time together, before the first step."""
@@ -215,10 +208,10 @@ class MMPITrainer(Trainer):
         assert isinstance(run, TrainingRun) and isinstance(manager, MMPIDataManager), "MMPITrainer trains MMPIModel"
         self._run, self._manager, progress = run, manager, run.progress
         self._window_steps = progress.schedule.window_steps
+        # Rays of a step by kind; those of new views follow the pixels'.
+        self._rays = {"pixel": manager.config.train_num_rays_per_batch, "keypoint": manager.config.keypoint_rays}
         if self._follows_capture:
             self.config.steps_per_save = max(self.config.steps_per_save, self._window_steps // 4)
-        if self._share is not None:
-            self._share.window_steps = self._window_steps
         # nerfstudio shows what is left
         self._total_steps = self.config.max_num_iterations = progress.schedule.total_steps
         config: dict[str, Any] = {
@@ -232,7 +225,7 @@ class MMPITrainer(Trainer):
     def train(self) -> None:
         """Runs max-num-iterations in total (a window); nerfstudio 1.1.5 would run as many again after a resume."""
         if self._share is not None:
-            for window in self._share.unfinished(self._run.progress.windows, self._run.store):
+            for window in self._share.unfinished(self._run.progress, self._run.store):
                 self.train_window(window)
             self._share.wait_for_all()
             if self._share.rank == 0:
@@ -261,8 +254,8 @@ class MMPITrainer(Trainer):
 
     def train_window(self, window: int) -> None:
         """Trains one window of several, from where the resumed run left it."""
-        steps = range(window * self._window_steps, (window + 1) * self._window_steps)
-        checkpoints = {} if self._share is None else self._share.checkpoints_of(window)
+        steps = self._run.progress.schedule.steps_of(window)
+        checkpoints = {} if self._share is None else self._share.checkpoints_of(steps)
         self._start_step = steps.start
         if checkpoints:
             self.config.load_checkpoint = checkpoints[max(checkpoints)]
@@ -309,13 +302,12 @@ class MMPITrainer(Trainer):
         writer.write_out_storage()
         if self._stopped_by is not None or self._share is not None:
             return
+        self._write_details(self.step)
         seconds = monotonic() - self._began
         say(f"Training finished: {self._last_step + 1 - self._start_step:,} steps in {duration(seconds)}.")
-        self._write_details(self.step)
-        model: Any = self.pipeline.model
         images = self._manager.eval_dataset
         if self._says_lines and images is not None:
-            say(quick_test(model, images, BACKGROUNDS[model.config.rendering.background]))
+            say(quick_test(self.pipeline.model, images))
         say(next_commands(self.base_dir))
         if not self.config.viewer.quit_on_train_completion:
             self._train_complete_viewer()
@@ -364,8 +356,8 @@ class MMPITrainer(Trainer):
         }
         write_atomically(path, lambda p: torch.save(state, p), self.base_dir)
         if self.config.save_only_latest_checkpoint:
-            share = self._share  # checkpoints of other windows are other processes' work
-            steps = None if share is None else share.steps_of(step // self._window_steps)
+            progress = self._run.progress  # checkpoints of other windows are other processes' work
+            steps = None if self._share is None else progress.schedule.steps_of(progress.window)
             for old in checkpoints_in(self.checkpoint_dir, steps).values():
                 if old != path:
                     old.unlink()

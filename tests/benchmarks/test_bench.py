@@ -7,6 +7,7 @@ from pathlib import Path
 
 import lab
 import numpy as np
+import pytest
 import results
 from all_planes import render_densely
 from lab import train_and_evaluate
@@ -15,6 +16,7 @@ from random_fields import bundle, random_field, random_rays
 from suites import DEFAULT, SUITES
 
 from mmpi_ns.bench.trainers import Scene
+from mmpi_ns.placement.errors import PixelErrors
 from mmpi_ns.rendering.rendered import render_rays
 from mmpi_ns.rendering.sampler import MMPISampler
 
@@ -90,3 +92,12 @@ def test_budgets_are_drawn_with_the_default_apart(tmp_path):
         pictures.append(np.asarray(Image.open(tmp_path / "budgets.png").convert("RGB"), np.int32))
     star = (np.abs(pictures[1] - [214, 39, 40]).max(-1) < 8).sum()
     assert star > 50 and not (np.abs(pictures[0] - [214, 39, 40]).max(-1) < 8).any()
+
+
+def test_figures_of_pixel_errors_are_those_of_the_head_that_serves_best():
+    inf = float("inf")
+    plane = np.array([[3.0, 0.0], [9.0, 4.0], [inf, 1.0], [inf, inf]])
+    texel = np.array([[8.0, 12.0], [0.0, 6.0], [inf, 2.0], [inf, inf]])
+    found = results.error_figures(PixelErrors(plane, texel))
+    assert found["unserved"] == 0.25 and found["e_p_50"] == 3 and found["e_t_50"] == 6
+    assert found["e_p_90"] == pytest.approx(3.8) and found["e_t_90"] == pytest.approx(7.6)

@@ -132,7 +132,7 @@ def test_rays_that_are_not_chosen_learn_no_colour():
 
 def test_a_fresh_network_shows_the_diffuse_colour():
     field = ray_field()
-    field.renew_networks()
+    field.networks.resize(1)
     colors, made = shown(field, bundle(*random_rays(field.plan, 20, seed=6)))
     diffuse = colors.first / colors.mass.clamp(min=1e-6) * made.accumulation
     assert torch.allclose(colors.rgb, diffuse, atol=1e-6) and len(field.networks.weights) == 1

@@ -51,8 +51,9 @@ def test_a_phase_ends_just_before_the_next_begins(step, name):
 
 def test_reliability_takes_part_from_the_first_blend_step_on():
     schedule = two_phase(finetune_share=0.25)
-    assert [schedule.blends_at(s) for s in (0, 19_999, 20_000, 29_999, 30_000, 40_000)] == [False] * 2 + [True] * 4
-    assert not schedule_of("joint", 100).blends_at(100)
+    phases = [schedule.phase_at(s).name for s in (0, 19_999, 20_000, 29_999, 30_000, 40_000)]
+    assert ["reliability" in TRAINS[name] for name in phases] == [False] * 2 + [True] * 4
+    assert "reliability" not in TRAINS[schedule_of("joint", 100).phase_at(100).name]
 
 
 @pytest.mark.parametrize("kind", KINDS)
