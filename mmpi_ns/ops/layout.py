@@ -143,6 +143,11 @@ def shaped(x: Tensor, *shape: int, dtype: torch.dtype = torch.float32) -> Tensor
     return x.contiguous()
 
 
+def dense(*tensors: Tensor, dtype: torch.dtype = torch.float32) -> list[Tensor]:
+    """``shaped`` for tensors whose shapes ``check_shapes`` has compared."""
+    return [shaped(x, *x.shape, dtype=dtype) for x in tensors]
+
+
 class Shapes(NamedTuple):
     """What kernels are compiled for in a run."""
 

@@ -22,7 +22,7 @@ def taken(parts, seed=0):
     table, rows = torch.randn(COUNT, 8, generator=g), torch.randint(COUNT, (COUNT,), generator=g)
     values = torch.full((COUNT, 8), torch.nan)
     bounds = [COUNT * i // parts for i in range(parts + 1)]
-    build.run_in_parts("mmpi_take_rows", bounds, (rows,), (8, table, values))
+    build.run_in_parts("mmpi_take_rows", bounds, rows, 8, table, values)
     return torch.equal(values, table[rows])
 
 
@@ -34,7 +34,7 @@ def test_every_part_is_done_once_and_before_the_call_ends(parts):
 def test_every_part_has_a_number_of_its_own():
     words, counts = torch.full((6,), 3), torch.full((3,), -1)
     for _ in range(200):
-        build.run_in_parts("mmpi_count_rows", [0, 1, 3, 6], (), (words, counts.fill_(-1)))
+        build.run_in_parts("mmpi_count_rows", [0, 1, 3, 6], words, counts.fill_(-1))
         assert counts.tolist() == [2, 4, 6]
 
 

@@ -139,15 +139,12 @@ struct Bytes {
     }
 };
 
-} // namespace
-
-extern "C" {
-
 // Where peaks are asked for, the largest weight that reads a texel is written there.
-void mmpi_show_baked(const BakedScene* scene, const Rays* rays, float threshold, float* peaks, int64_t begin,
-                     int64_t end, const Outputs* to) {
+void mmpi_show_baked(int64_t begin, int64_t end, const BakedScene* scene, const Rays* rays, float threshold,
+                     float* peaks, const Outputs* to) {
     show(Bytes(*scene, threshold, peaks), *rays, begin, end, *to);
 }
-}
+
+} // namespace
 
 IN_PARTS(mmpi_show_baked)

@@ -8,8 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from mmpi_ns.ops.build import arguments, call_in_parts
-from mmpi_ns.ops.cpu_scene import Layer, addresses
+from mmpi_ns.ops.build import call_in_parts, structs
 from mmpi_ns.ops.gather import COLORS
 from mmpi_ns.ops.layout import frame_rows, shaped
 from mmpi_ns.ops.march.cpu import pointers_to, shown
@@ -17,61 +16,42 @@ from mmpi_ns.ops.march.rays import Rays, Shown
 from mmpi_ns.scene.baked import FINENESS, MOST_CHANNELS, SIDE, BakedMpis, Shader, columns_of, tiles_of
 
 
-class _Stack(ctypes.Structure):
-    """Planes of an MPI (``cpp/walk.h``)."""
-
-    _fields_ = [
-        *((n, ctypes.c_float) for n in ("step", "end", "u0", "v0", "x_scale", "y_scale")),
-        *((n, ctypes.c_int32) for n in ("planes", "height", "width", "down", "across", "first_column")),
+def _pack(baked: BakedMpis) -> ctypes.Array:
+    """A scene as the kernel reads it."""
+    count, bricks, channels = len(baked.mpis), baked.num_bricks, len(baked.channel_codes)
+    assert channels <= MOST_CHANNELS
+    codes = torch.arange(255 * FINENESS + 1, dtype=torch.float64) / FINENESS
+    # Light that passes a sample of each MPI, at codes 0, 1/8, 2/8, ... 255.
+    through = [torch.exp(-baked.optical_depth(k, codes)).float().contiguous() for k in range(count)]
+    stacks = []
+    for k, mpi in enumerate(baked.mpis):
+        u0, u1, v0, v1 = mpi.extent
+        scales = ((mpi.width - 1) / (u1 - u0), (mpi.height - 1) / (v1 - v0))
+        sizes = (mpi.planes, mpi.height, mpi.width, *tiles_of(mpi)[1:], baked.first_column(k))
+        planes = (float(mpi.disparity_step), float(mpi.last_disparity), float(u0), float(v0))
+        stacks.append((*planes, *scales, *map(ctypes.c_int32, sizes)))
+    density = shaped(baked.density, bricks, SIDE, SIDE, dtype=torch.uint8)
+    texels = shaped(baked.texels, bricks, SIDE, SIDE, channels, dtype=torch.uint8)
+    low, step = (torch.tensor([getattr(c, name) for c in baked.channel_codes]) for name in ("low", "step"))
+    doubled = torch.tensor([1.0] * COLORS + [2.0] * (channels - COLORS))  # tanh x = 2 sigmoid(2 x) - 1
+    tables = [
+        shaped(baked.columns, sum(columns_of(m) for m in baked.mpis), 2, dtype=torch.int32),
+        # Sixteen channels are read at once, also those of the last texel, and four densities.
+        *(pad(x.reshape(-1), (0, MOST_CHANNELS)) for x in (density, texels)),
+        *(pad(doubled * x, (0, MOST_CHANNELS - channels)) for x in (low, step)),
     ]
-
-
-class _Scene(ctypes.Structure):
-    _fields_ = [
-        *((n, ctypes.c_int64) for n in ("num_mpis", "channels")),
-        *addresses("frames", "stacks", "through", "columns", "density", "texels", "low", "step"),
-    ]
-
-
-class _Packed:
-    """A scene as the kernel reads it, with all that it points to."""
-
-    def __init__(self, baked: BakedMpis) -> None:
-        count, bricks, channels = len(baked.mpis), baked.num_bricks, len(baked.channel_codes)
-        assert channels <= MOST_CHANNELS
-        codes = torch.arange(255 * FINENESS + 1, dtype=torch.float64) / FINENESS
-        self.through = [torch.exp(-baked.optical_depth(k, codes)).float().contiguous() for k in range(count)]
-        """Light that passes a sample of each MPI, at codes 0, 1/8, 2/8, ... 255."""
-        self.addresses = (ctypes.c_void_p * count)(*(x.data_ptr() for x in self.through))
-        self.stacks = (_Stack * count)()
-        for k, mpi in enumerate(baked.mpis):
-            u0, u1, v0, v1 = mpi.extent
-            scales = ((mpi.width - 1) / (u1 - u0), (mpi.height - 1) / (v1 - v0))
-            sizes = (mpi.planes, mpi.height, mpi.width, *tiles_of(mpi)[1:], baked.first_column(k))
-            self.stacks[k] = _Stack(mpi.disparity_step, mpi.last_disparity, u0, v0, *scales, *sizes)
-        density = shaped(baked.density, bricks, SIDE, SIDE, dtype=torch.uint8)
-        texels = shaped(baked.texels, bricks, SIDE, SIDE, channels, dtype=torch.uint8)
-        low, step = (torch.tensor([getattr(c, name) for c in baked.channel_codes]) for name in ("low", "step"))
-        doubled = torch.tensor([1.0] * COLORS + [2.0] * (channels - COLORS))  # tanh x = 2 sigmoid(2 x) - 1
-        self.tables = [
-            shaped(baked.columns, sum(columns_of(m) for m in baked.mpis), 2, dtype=torch.int32),
-            # Sixteen channels are read at once, also those of the last texel, and four densities.
-            *(pad(x.reshape(-1), (0, MOST_CHANNELS)) for x in (density, texels)),
-            *(pad(doubled * x, (0, MOST_CHANNELS - channels)) for x in (low, step)),
-        ]
-        self.frames = shaped(frame_rows(baked.frames), count, 19)
-        plan = (*arguments([self.frames]), *map(ctypes.addressof, (self.stacks, self.addresses)))
-        self.scene = _Scene(count, channels, *plan, *arguments(self.tables))
+    frames = shaped(frame_rows(baked.frames), count, 19)
+    return structs((count, channels, frames, structs(*stacks), structs(through), *tables))
 
 
 def show_baked(scene: BakedMpis, rays: Rays, threshold: float, peaks: Tensor | None = None) -> Shown:
     if "cpu" not in scene.packed:
-        scene.packed["cpu"] = _Packed(scene)
-    packed, count = scene.packed["cpu"].scene, len(scene.mpis)
+        scene.packed["cpu"] = _pack(scene)
     if peaks is not None:
         assert shaped(peaks, scene.num_bricks, SIDE, SIDE) is peaks, "peaks are written in place"
-    before = (ctypes.byref(packed), ctypes.byref(pointers_to(rays, count, count)), float(threshold), peaks)
-    return shown("mmpi_show_baked", len(rays.origins), len(scene.channel_codes), before)
+    count, channels = len(scene.mpis), len(scene.channel_codes)
+    walk = (scene.packed["cpu"], pointers_to(rays, count, count), float(threshold), peaks)
+    return shown("mmpi_show_baked", len(rays.origins), channels, *walk)
 
 
 def shade_baked(shader: Shader, gathered: Tensor, mass: Tensor, directions: Tensor) -> Tensor:
@@ -83,5 +63,6 @@ def shade_baked(shader: Shader, gathered: Tensor, mass: Tensor, directions: Tens
     assert inputs == COLORS, f"a network of {inputs} outputs where a colour is read"
     sums = [shaped(x, num_rays, n) for x, n in ((gathered, channels), (mass, 1), (directions, 3))]
     rgb, sizes = torch.empty(num_rays, 3), (len(numbers), channels, shader.direction_octaves, float(shader.bound))
-    call_in_parts("mmpi_shade_baked", num_rays, (Layer.array(numbers), *sizes, *sums), (rgb,))
+    layers = structs(*((*weights.shape, weights, biases) for weights, biases in numbers))
+    call_in_parts("mmpi_shade_baked", num_rays, layers, *sizes, *sums, rgb)
     return rgb

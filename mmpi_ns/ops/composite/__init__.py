@@ -6,7 +6,9 @@ log(1 - alpha), while tau is an ordinary number. All arithmetic is float32 or wi
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -35,13 +37,6 @@ class Composite:
     """What passes the whole ray."""
 
 
-def checked(tau: Tensor, valid: Tensor, skipped_before: Tensor, skipped_total: Tensor) -> tuple[Tensor, ...]:
-    """The arguments of ``composite_weights`` as the kernels read them."""
-    shape = tau.shape
-    flags = shaped(valid, *shape, dtype=torch.bool)
-    return shaped(tau, *shape), flags, shaped(skipped_before, *shape), shaped(skipped_total, shape[0], 1)
-
-
 @operation("cpu", "gpu")
 def composite_weights(
     tau: Float[Tensor, "R S"],
@@ -67,6 +62,39 @@ def composite_weights(
     weights = torch.exp(log_transmittance) * -torch.expm1(-tau)
     weights = torch.where(valid, weights, torch.zeros_like(weights))
     depth = tau.sum(-1, keepdim=True) + skipped_total
+    return Composite(weights, -torch.expm1(-depth), torch.exp(-depth))
+
+
+class _Compiled(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, run: Callable[..., None], tau: Tensor, valid: Tensor, before: Tensor, total: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        weights, depth = torch.empty_like(tau), torch.empty_like(total)
+        run("composite", tau, valid, before, total, weights, depth)
+        ctx.run = run
+        ctx.save_for_backward(tau, valid, before, weights)
+        return weights, depth
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
+        tau, *_ = saved = ctx.saved_tensors
+        grad = torch.empty_like(tau)
+        ctx.run("composite_back", *saved, *(g.contiguous() for g in grad_outputs), grad)
+        return None, grad, None, None, None
+
+
+def composited(run: Callable[..., None], tau: Tensor, valid: Tensor, before: Tensor, total: Tensor) -> Composite:
+    """``composite_weights`` by a compiled form.
+
+    Args:
+        run: calls its function "composite" or "composite_back" with tensors, of which the last ones are written.
+        tau, valid, before, total: arguments of ``composite_weights``.
+    """
+    shape = tau.shape
+    flags, total = shaped(valid, *shape, dtype=torch.bool), shaped(total, shape[0], 1)
+    arguments = (run, shaped(tau, *shape), flags, shaped(before, *shape), total)
+    weights, depth = _Compiled.apply(*arguments)  # type: ignore[misc]
     return Composite(weights, -torch.expm1(-depth), torch.exp(-depth))
 
 

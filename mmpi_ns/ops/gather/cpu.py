@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from mmpi_ns.ops.build import arguments, call_in_parts, owned_bounds, run_in_parts
+from mmpi_ns.ops.build import call_in_parts, owned_bounds, run_in_parts, structs
 from mmpi_ns.ops.gather import COLORS, RaySums, Taps, split_sums
 
 LANES = 16
@@ -18,22 +19,12 @@ AT_LEAST = 1 << 14
 """Texels read that are worth another thread."""
 
 
-class _Taps(ctypes.Structure):
-    _fields_ = [
-        ("positions", ctypes.c_void_p),
-        ("weights", ctypes.c_void_p),
-        ("count", ctypes.c_int64),
-        ("grad_weights", ctypes.c_void_p),
-    ]
-
-    @staticmethod
-    def both(taps: list[Tensor], to_weights: list[Tensor | None] | None = None) -> ctypes.Array:
-        """Positions and weights of the taps of planes, then those of the cube, and the gradients of the weights."""
-        groups = (_Taps * 2)()
-        positions, weights = taps[::2], taps[1::2]
-        for each, weight, to in zip(positions, weights, to_weights or [None] * len(weights), strict=True):
-            groups[each.shape[1] // 8] = _Taps(*arguments((each, weight, len(each), to)))
-        return groups
+def _groups(taps: list[Tensor], to_weights: Sequence[Tensor | None] = (None, None)) -> ctypes.Array:
+    """The taps of planes, then those of the cube, with the gradients of their weights: ``Taps`` of ``gather.cpp``."""
+    groups: list[tuple] = [(None, None, 0, None)] * 2
+    for positions, weights, to in zip(taps[::2], taps[1::2], to_weights, strict=False):
+        groups[positions.shape[1] // 8] = (positions, weights, len(positions), to)
+    return structs(*groups)
 
 
 class _GatherTaps(torch.autograd.Function):
@@ -45,10 +36,10 @@ class _GatherTaps(torch.autograd.Function):
         saved = [x.contiguous() for x in (values, weights, slots, chosen, *taps)]
         values, weights, slots, chosen = saved[:4]
         numbers = torch.full((num_rays, width), -1, dtype=torch.int32)
-        call_in_parts("mmpi_number_samples", len(slots), (slots,), (chosen, width, numbers), AT_LEAST)
+        call_in_parts("mmpi_number_samples", len(slots), slots, chosen, width, numbers, least=AT_LEAST)
         sums = torch.empty(num_rays, channels + 1 + COLORS)
-        before = (values, *values.shape, _Taps.both(saved[4:]), numbers, weights)
-        call_in_parts("mmpi_gather_taps", num_rays, before, (width, sums))
+        samples = (_groups(saved[4:]), numbers, weights, width)
+        call_in_parts("mmpi_gather_taps", num_rays, values, *values.shape, *samples, sums)
         ctx.save_for_backward(*saved)
         parts = split_sums(sums, channels)
         ctx.mark_non_differentiable(parts[1])
@@ -62,10 +53,10 @@ class _GatherTaps(torch.autograd.Function):
         to_weights = torch.zeros_like(weights)
         moved = zip(taps[1::2], ctx.needs_input_grad[5::2], strict=True)
         to_taps = [torch.zeros_like(x) if moves else None for x, moves in moved]
-        batch = (values, *values.shape, _Taps.both(taps, to_taps), slots, chosen, weights)
+        batch = (values, *values.shape, _groups(taps, to_taps), slots, chosen, weights)
         grads = [pad(g, (0, -g.shape[1] % LANES)).contiguous() for g in (to_sums, to_first, 2 * to_second)]
         bounds = owned_bounds(taps[::2], len(values), AT_LEAST)
-        run_in_parts("mmpi_gather_back", bounds, (*batch, *grads, weights.shape[1]), (to_values, to_weights))
+        run_in_parts("mmpi_gather_back", bounds, *batch, *grads, weights.shape[1], to_values, to_weights)
         return to_values, to_weights, None, None, *(x for to in to_taps for x in (None, to))
 
 

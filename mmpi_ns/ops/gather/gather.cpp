@@ -68,14 +68,10 @@ void gather(const Table& table, const std::vector<Sample>& samples, float* sums)
     for (int c = 0; c < COLORS; c++) sums[table.channels + 1 + c] = squares[c];
 }
 
-} // namespace
-
-extern "C" {
-
 // Sums [R, channels + 4] of rays [begin, end): `numbers` [R, S] says which sample is in a slot, -1 if there is none. The
 // next ray's memory is asked for before one is summed.
-void mmpi_gather_taps(const float* values, int64_t rows, int64_t channels, const Taps* groups, const int32_t* numbers,
-                      const float* weights, int64_t begin, int64_t end, int64_t slots, float* sums) {
+void mmpi_gather_taps(int64_t begin, int64_t end, const float* values, int64_t rows, int64_t channels,
+                      const Taps* groups, const int32_t* numbers, const float* weights, int64_t slots, float* sums) {
     const Table table{values, rows, channels};
     std::vector<Sample> samples[2];
     const auto prepare = [&](int64_t ray) {
@@ -95,7 +91,7 @@ void mmpi_gather_taps(const float* values, int64_t rows, int64_t channels, const
 }
 
 // numbers[slots[n]] = n for samples [begin, end) of rays that are chosen.
-void mmpi_number_samples(const int64_t* slots, int64_t begin, int64_t end, const bool* chosen, int64_t slots_per_ray,
+void mmpi_number_samples(int64_t begin, int64_t end, const int64_t* slots, const bool* chosen, int64_t slots_per_ray,
                          int32_t* numbers) {
     for (int64_t n = begin; n < end; n++)
         if (chosen[slots[n] / slots_per_ray]) numbers[slots[n]] = int32_t(n);
@@ -106,10 +102,10 @@ void mmpi_number_samples(const int64_t* slots, int64_t begin, int64_t end, const
 // colours and twice those of squared colours [R, 16], padded with zeros. Samples of rays that are not `chosen` have none.
 // Rows [begin, end) have one owner, who adds the samples in the order of `slots`: sums do not depend on the threads. The
 // owner of a sample's first row writes the other gradients.
-void mmpi_gather_back(const float* values, int64_t rows, int64_t channels, const Taps* groups, const int64_t* slots,
-                      const bool* chosen, const float* weights, const float* grad_sums, const float* grad_colors,
-                      const float* grad_squares, int64_t slots_per_ray, int64_t begin, int64_t end, float* grad_values,
-                      float* grad_weights) {
+void mmpi_gather_back(int64_t begin, int64_t end, const float* values, int64_t rows, int64_t channels,
+                      const Taps* groups, const int64_t* slots, const bool* chosen, const float* weights,
+                      const float* grad_sums, const float* grad_colors, const float* grad_squares,
+                      int64_t slots_per_ray, float* grad_values, float* grad_weights) {
     const Table table{values, rows, channels};
     const Owned owned{begin, end};
     if (grad_values) std::fill(grad_values + begin * channels, grad_values + end * channels, 0.0f);
@@ -155,7 +151,8 @@ void mmpi_gather_back(const float* values, int64_t rows, int64_t channels, const
         grad_weights[slot] = sum;
     }
 }
-}
+
+} // namespace
 
 IN_PARTS(mmpi_gather_taps)
 IN_PARTS(mmpi_number_samples)

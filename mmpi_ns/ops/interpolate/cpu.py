@@ -9,7 +9,7 @@ from torch import Tensor
 
 from mmpi_ns.ops import interpolate
 from mmpi_ns.ops.build import call_in_parts, even_bounds, owned_bounds, run_in_parts
-from mmpi_ns.ops.cpu_scene import CpuScene
+from mmpi_ns.ops.cpu_scene import grids_of
 from mmpi_ns.ops.interpolate import HeadSamples, RowIndex
 from mmpi_ns.ops.layout import Places, SceneLayout
 from mmpi_ns.scene.texels import BRICK
@@ -24,13 +24,13 @@ def order_by_head(places: Places, num_heads: int, counts: Sequence[int] | None) 
     heads, planes, ndc, valid = (x.contiguous() for x in places)
     bounds = even_bounds(heads.numel(), AT_LEAST)
     in_parts = torch.zeros(len(bounds) - 1, num_heads, dtype=torch.int64)
-    run_in_parts("mmpi_count_heads", bounds, (heads, valid), (num_heads, in_parts))
+    run_in_parts("mmpi_count_heads", bounds, heads, valid, num_heads, in_parts)
     totals = in_parts.sum(0)
     starts = totals.cumsum(0) - totals + in_parts.cumsum(0) - in_parts
     count = int(totals.sum())
-    slots, of_heads, of_planes = (torch.empty(count, dtype=torch.int64) for _ in range(3))
+    slots, of_heads, of_planes = torch.empty(3, count, dtype=torch.int64)
     columns = (slots, of_heads, of_planes, torch.empty(count, 3))
-    run_in_parts("mmpi_order_by_head", bounds, (heads, planes, ndc, valid), (num_heads, starts, *columns))
+    run_in_parts("mmpi_order_by_head", bounds, heads, planes, ndc, valid, num_heads, starts, *columns)
     return HeadSamples(*columns, totals.tolist())
 
 
@@ -39,7 +39,7 @@ def texel_rows(layout: SceneLayout, heads: Tensor, planes: Tensor, ndc: Tensor) 
         return interpolate.texel_rows.reference(layout, heads, planes, ndc)
     rows, weights = torch.empty(len(heads), 4, dtype=torch.int64), torch.empty(len(heads), 4)
     samples = (x.contiguous() for x in (heads, planes, ndc))
-    call_in_parts("mmpi_texel_rows", len(heads), (CpuScene.of(layout).grids, *samples), (rows, weights), AT_LEAST)
+    call_in_parts("mmpi_texel_rows", len(heads), grids_of(layout), *samples, rows, weights, least=AT_LEAST)
     return rows, weights
 
 
@@ -49,24 +49,23 @@ def index_rows(rows: Tensor, table_rows: int, pads: bool) -> RowIndex:
         return interpolate.index_rows.reference(rows, table_rows, pads)
     words = torch.zeros(-(-table_rows // BRICK), dtype=torch.int64)
     before, positions = torch.empty(len(words), dtype=torch.int32), torch.empty(rows.shape, dtype=torch.int32)
-    call_in_parts("mmpi_mark_rows", count, (listed,), (words,), AT_LEAST)
+    call_in_parts("mmpi_mark_rows", count, listed, words, least=AT_LEAST)
     bounds = even_bounds(len(words), AT_LEAST)
     counts = torch.empty(len(bounds) - 1, dtype=torch.int64)
-    run_in_parts("mmpi_count_rows", bounds, (), (words, counts))
+    run_in_parts("mmpi_count_rows", bounds, words, counts)
     ends = counts.cumsum(0)
     unique = torch.empty(int(ends[-1]), dtype=torch.int64)
-    run_in_parts("mmpi_list_rows", bounds, (), (words, ends - counts, before, unique))
-    call_in_parts("mmpi_place_rows", count, (listed,), (words, before, positions), AT_LEAST)
+    run_in_parts("mmpi_list_rows", bounds, words, ends - counts, before, unique)
+    call_in_parts("mmpi_place_rows", count, listed, words, before, positions, least=AT_LEAST)
     return RowIndex(unique, positions)
 
 
 def sum_rows(positions: Tensor, values: Tensor, weights: Tensor, count: int) -> Tensor:
     if positions.dtype != torch.int32:
         return interpolate.sum_rows.reference(positions, values, weights, count)
-    sums, (samples, taps) = torch.empty(count, values.shape[1]), positions.shape
-    entries = (*(x.contiguous() for x in (positions, weights, values)), samples, taps, values.shape[1])
+    sums, entries = torch.empty(count, values.shape[1]), (x.contiguous() for x in (positions, weights, values))
     bounds = owned_bounds([positions], count, AT_LEAST)
-    run_in_parts("mmpi_sum_rows", bounds, entries, (sums,))
+    run_in_parts("mmpi_sum_rows", bounds, *entries, *positions.shape, values.shape[1], sums)
     return sums
 
 
@@ -74,21 +73,21 @@ def weighted_rows(table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
     if rows.dtype != torch.int32 or not table.is_contiguous():
         return interpolate.weighted_rows.reference(table, rows, weights)
     (count, taps), channels = rows.shape, table.shape[1]
-    values, before = torch.empty(count, channels), (table, channels, rows.contiguous(), weights.contiguous(), taps)
-    call_in_parts("mmpi_weigh_rows", count, before, (values,), AT_LEAST)
+    values, entries = torch.empty(count, channels), (rows.contiguous(), weights.contiguous(), taps)
+    call_in_parts("mmpi_weigh_rows", count, table, channels, *entries, values, least=AT_LEAST)
     return values
 
 
 def raise_peaks(peaks: Tensor, rows: Tensor, positions: Tensor, weights: Tensor) -> None:
     if positions.dtype != torch.int32:
         return interpolate.raise_peaks.reference(peaks, rows, positions, weights)
-    samples, after = (positions.contiguous(), weights.contiguous()), (positions.shape[1], rows.contiguous(), peaks)
-    call_in_parts("mmpi_raise_peaks", len(positions), samples, after, AT_LEAST)
+    samples = (positions.contiguous(), weights.contiguous(), positions.shape[1])
+    call_in_parts("mmpi_raise_peaks", len(positions), *samples, rows.contiguous(), peaks, least=AT_LEAST)
 
 
 def take_rows(table: Tensor, rows: Tensor) -> Tensor:
     if not table.is_contiguous():
         return interpolate.take_rows.reference(table, rows)
     values = torch.empty(len(rows), table.shape[1])
-    call_in_parts("mmpi_take_rows", len(rows), (rows.contiguous(),), (table.shape[1], table, values), AT_LEAST)
+    call_in_parts("mmpi_take_rows", len(rows), rows.contiguous(), table.shape[1], table, values, least=AT_LEAST)
     return values

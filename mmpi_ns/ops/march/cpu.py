@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import ctypes
+from typing import Any
 
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from mmpi_ns.ops.build import call_in_parts
-from mmpi_ns.ops.cpu_scene import CpuScene, Pointers, addresses
+from mmpi_ns.ops.build import call_in_parts, structs
+from mmpi_ns.ops.cpu_scene import scene_of
 from mmpi_ns.ops.layout import SceneLayout, Tables, shaped
 from mmpi_ns.ops.march.rays import MarchOptions, MergedSamples, Rays, Shown
 from mmpi_ns.scene.baked import columns_from
@@ -18,52 +19,36 @@ _FLAT = (torch.int32, torch.int32, *[torch.float32] * 4)
 _SLOTS = (torch.int64, torch.int64, *[torch.float32] * 4, torch.bool)
 
 
-class _Rays(Pointers):
-    _fields_ = addresses("origins", "directions", "nears", "fars", "heads", "priorities")
-
-
-class _Tiles(Pointers):
-    _fields_ = addresses("columns", "bricks")
-
-
-class _Outputs(Pointers):
-    _fields_ = addresses("gathered", "mass", "transmittance", "accumulation", "inverse_t", "winner", "dropped")
-
-
-def pointers_to(rays: Rays, num_mpis: int, num_heads: int) -> _Rays:
+def pointers_to(rays: Rays, num_mpis: int, num_heads: int) -> ctypes.Array:
     """Rays as the kernels read them (``cpp/crossings.h``)."""
     count = len(rays.origins)
     parts = [shaped(x, count, n) for x, n in zip(rays[:4], (3, 3, 1, 1), strict=True)]
     heads = None if rays.heads is None else shaped(rays.heads, count, num_heads, dtype=torch.bool)
-    return _Rays.to(*parts, heads, None if rays.priorities is None else shaped(rays.priorities, count, num_mpis))
+    return structs((*parts, heads, None if rays.priorities is None else shaped(rays.priorities, count, num_mpis)))
 
 
-def shown(name: str, num_rays: int, channels: int, before: tuple) -> Shown:
-    """What a compiled function of ``(*before, begin, end, outputs)`` shows."""
+def shown(name: str, num_rays: int, channels: int, *values: Any) -> Shown:
+    """What a compiled function of ``(begin, end, *values, outputs)`` shows."""
     outputs = [torch.empty(num_rays, n) for n in (channels, 1, 1, 1, 1, 1, 1)]
-    call_in_parts(name, num_rays, before, (ctypes.byref(_Outputs.to(*outputs)),))
+    call_in_parts(name, num_rays, *values, structs(outputs))
     return Shown(*outputs)
 
 
-def _how(options: MarchOptions) -> tuple[float, float, ctypes.c_bool]:
-    return float(options.threshold), float(options.fair_share), ctypes.c_bool(options.blends)
-
-
 def march(layout: SceneLayout, tables: Tables, rays: Rays, options: MarchOptions) -> MergedSamples:
-    scene, packed = CpuScene.of(layout).with_tables(tables), pointers_to(rays, len(layout.mpis), layout.num_heads)
     num_rays, room = len(rays.origins), options.most_kept(layout.most_samples)
     flat = [torch.empty((num_rays * room, 3) if i == 2 else num_rays * room, dtype=t) for i, t in enumerate(_FLAT)]
     starts, kept, live = torch.empty(3, num_rays, dtype=torch.int64)
     explained, (skipped, dropped) = torch.empty(num_rays, 1, dtype=torch.bool), torch.empty(2, num_rays, 1)
-    before = (ctypes.byref(scene), ctypes.byref(packed), room, *_how(options))
-    call_in_parts("mmpi_march", num_rays, before, (starts, kept, live, explained, skipped, dropped, *flat))
+    walk = (scene_of(layout, tables), pointers_to(rays, len(layout.mpis), layout.num_heads))
+    how = (float(options.threshold), float(options.fair_share), options.blends)
+    call_in_parts("mmpi_march", num_rays, *walk, room, *how, starts, kept, live, explained, skipped, dropped, *flat)
     shape = (num_rays, max(1, int(kept.max())) if num_rays else 1)
     slots = [torch.empty((*shape, 3) if i == 2 else shape, dtype=t) for i, t in enumerate(_SLOTS)]
-    call_in_parts("mmpi_pack", num_rays, (starts, kept), (shape[1], *flat, *slots))
+    call_in_parts("mmpi_pack", num_rays, starts, kept, shape[1], *flat, *slots)
     return MergedSamples(*slots, skipped_total=skipped, dropped_mass=dropped, live=live, explained=explained)
 
 
-def _tiles(layout: SceneLayout) -> _Tiles:
+def _tiles(layout: SceneLayout) -> ctypes.Array:
     """The tiles of all MPIs from which something can be read, so that rays pass over the others: where the lower corner
     of four texels is in the tile, one of them is stored."""
     columns, bricks, count = [torch.zeros(0, 2, dtype=torch.int32)], [torch.zeros(1, 4, dtype=torch.int32)], 0
@@ -75,12 +60,11 @@ def _tiles(layout: SceneLayout) -> _Tiles:
         columns.append(stored)
         bricks.append(corners[tuple(places.T)])
         count += len(places)
-    return _Tiles.to(torch.cat(columns), torch.cat(bricks[1:] + bricks[:1]))
+    return structs((torch.cat(columns), torch.cat(bricks[1:] + bricks[:1])))
 
 
 def show_rays(layout: SceneLayout, tables: Tables, features: Tensor, rays: Rays, options: MarchOptions) -> Shown:
-    scene, packed = CpuScene.of(layout).with_tables(tables), pointers_to(rays, len(layout.mpis), layout.num_heads)
-    rows, channels = features.shape
-    features, tiles = shaped(features, len(tables.density), channels), layout.once("tiles", _tiles)
-    before = (ctypes.byref(scene), ctypes.byref(packed), ctypes.byref(tiles), features, rows, channels, *_how(options))
-    return shown("mmpi_show", len(rays.origins), channels, before)
+    walk = (scene_of(layout, tables), pointers_to(rays, len(layout.mpis), layout.num_heads))
+    texels = (layout.once("tiles", _tiles), shaped(features, len(tables.density), features.shape[1]), *features.shape)
+    how = (float(options.threshold), float(options.fair_share), options.blends)
+    return shown("mmpi_show", len(rays.origins), features.shape[1], *walk, *texels, *how)

@@ -208,14 +208,10 @@ class Training {
     }
 };
 
-} // namespace
-
-extern "C" {
-
 // Marches rays [begin, end), each of which keeps `room` samples at most. What they keep is written one ray behind the
 // other, from begin * room on; where a ray's samples begin, to starts[ray]; how many, to kept[ray].
-void mmpi_march(const Scene* scene, const Rays* rays, int64_t room, float threshold, float fair_share, bool blends,
-                int64_t begin, int64_t end, int64_t* starts, int64_t* kept, int64_t* live, bool* explained,
+void mmpi_march(int64_t begin, int64_t end, const Scene* scene, const Rays* rays, int64_t room, float threshold,
+                float fair_share, bool blends, int64_t* starts, int64_t* kept, int64_t* live, bool* explained,
                 float* skipped_total, float* dropped_mass, int32_t* heads, int32_t* planes, float* ndc,
                 float* inverse_t, float* taus, float* skipped_before) {
     Training training(*scene, threshold, fair_share, blends);
@@ -234,7 +230,7 @@ void mmpi_march(const Scene* scene, const Rays* rays, int64_t room, float thresh
 }
 
 // Copies what rays [begin, end) kept into `width` slots each; the rest of the slots is 0.
-void mmpi_pack(const int64_t* starts, const int64_t* kept, int64_t begin, int64_t end, int64_t width,
+void mmpi_pack(int64_t begin, int64_t end, const int64_t* starts, const int64_t* kept, int64_t width,
                const int32_t* heads, const int32_t* planes, const float* ndc, const float* inverse_t, const float* tau,
                const float* skipped_before, int64_t* to_heads, int64_t* to_planes, float* to_ndc, float* to_inverse_t,
                float* to_tau, float* to_skipped_before, bool* valid) {
@@ -255,7 +251,8 @@ void mmpi_pack(const int64_t* starts, const int64_t* kept, int64_t begin, int64_
         std::fill_n(valid + to + size, width - size, false);
     }
 }
-}
+
+} // namespace
 
 IN_PARTS(mmpi_march)
 IN_PARTS(mmpi_pack)

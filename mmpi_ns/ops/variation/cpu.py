@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from mmpi_ns.ops.build import call_in_parts
-from mmpi_ns.ops.cpu_scene import CpuScene
+from mmpi_ns.ops.cpu_scene import grids_of
 from mmpi_ns.ops.layout import SceneLayout
 from mmpi_ns.ops.variation import Scales, WithGradient
 
@@ -15,10 +15,10 @@ PART = 4096
 
 
 def total_variation(values: Tensor, table: Tensor, rows: Tensor, layout: SceneLayout, scales: Scales) -> Tensor:
-    gradient, grids = torch.empty_like(values), CpuScene.of(layout).grids
-    totals = torch.zeros(-(-len(rows) // PART), dtype=torch.float64)
-    around = (len(grids), layout.grids[0].places, torch.tensor(scales, dtype=torch.float32))
-    inputs = (table.shape[1], table, len(table), grids, *around)
-    rows = rows.contiguous()
-    call_in_parts("mmpi_total_variation", len(totals), (rows, len(rows)), (*inputs, gradient, totals), least=1)
+    gradient, totals = torch.empty_like(values), torch.zeros(-(-len(rows) // PART), dtype=torch.float64)
+    inputs = (rows.contiguous(), len(rows), table.shape[1], table, len(table), grids_of(layout), layout.num_heads)
+    weights = torch.tensor(scales, dtype=torch.float32)
+    outputs = (gradient, totals)
+    places = layout.grids[0].places
+    call_in_parts("mmpi_total_variation", len(totals), *inputs, places, weights, *outputs, least=1)
     return WithGradient.apply(values, totals.sum().to(values.dtype), gradient)  # type: ignore[no-any-return]
