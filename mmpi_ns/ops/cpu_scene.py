@@ -19,7 +19,7 @@ def grids_of(layout: SceneLayout) -> ctypes.Array:
 def scene_of(layout: SceneLayout, tables: Tables) -> ctypes.Array:
     """A ``Scene`` of a layout and its tables."""
     sizes = (len(layout.mpis), layout.num_heads, float(layout.content_near))
-    return structs((*sizes, *layout.once("cpu", _pack), *tables.of_rows(layout.num_rows)))
+    return structs((*sizes, *layout.once("cpu", _pack), *tables.dense()))
 
 
 def _pack(layout: SceneLayout) -> tuple[Any, ...]:

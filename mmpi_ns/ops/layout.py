@@ -30,10 +30,9 @@ class Tables(NamedTuple):
     touched: UInt8[Tensor, "T"]
     """1 where a training ray read the row."""
 
-    def of_rows(self, count: int) -> Tables:
+    def dense(self) -> list[Tensor]:
         """The tables as compiled code reads them."""
-        density, reliability = (shaped(x, count, 1) for x in (self.density, self.reliability))
-        return Tables(density, reliability, shaped(self.touched, count, dtype=torch.uint8))
+        return [*dense(self.density, self.reliability), *dense(self.touched, dtype=torch.uint8)]
 
 
 class Places(NamedTuple):
@@ -143,9 +142,9 @@ def shaped(x: Tensor, *shape: int, dtype: torch.dtype = torch.float32) -> Tensor
     return x.contiguous()
 
 
-def dense(*tensors: Tensor, dtype: torch.dtype = torch.float32) -> list[Tensor]:
-    """``shaped`` for tensors whose shapes ``check_shapes`` has compared."""
-    return [shaped(x, *x.shape, dtype=dtype) for x in tensors]
+def dense(*tensors: Tensor | None, dtype: torch.dtype = torch.float32) -> list[Any]:
+    """``shaped`` for tensors whose shapes ``check_shapes`` has compared; None stays so."""
+    return [x if x is None else shaped(x, *x.shape, dtype=dtype) for x in tensors]
 
 
 class Shapes(NamedTuple):

@@ -10,8 +10,8 @@ from torch.nn.functional import pad
 
 from mmpi_ns.ops.build import call_in_parts, structs
 from mmpi_ns.ops.gather import COLORS
-from mmpi_ns.ops.layout import frame_rows, shaped
-from mmpi_ns.ops.march.cpu import pointers_to, shown
+from mmpi_ns.ops.layout import dense, frame_rows, shaped
+from mmpi_ns.ops.march.cpu import shown
 from mmpi_ns.ops.march.rays import Rays, Shown
 from mmpi_ns.scene.baked import FINENESS, MOST_CHANNELS, SIDE, BakedMpis, Shader, columns_of, tiles_of
 
@@ -28,8 +28,8 @@ def _pack(baked: BakedMpis) -> ctypes.Array:
         u0, u1, v0, v1 = mpi.extent
         scales = ((mpi.width - 1) / (u1 - u0), (mpi.height - 1) / (v1 - v0))
         sizes = (mpi.planes, mpi.height, mpi.width, *tiles_of(mpi)[1:], baked.first_column(k))
-        planes = (float(mpi.disparity_step), float(mpi.last_disparity), float(u0), float(v0))
-        stacks.append((*planes, *scales, *map(ctypes.c_int32, sizes)))
+        places = map(float, (mpi.disparity_step, mpi.last_disparity, u0, v0, *scales))
+        stacks.append((*places, *map(ctypes.c_int32, sizes)))
     density = shaped(baked.density, bricks, SIDE, SIDE, dtype=torch.uint8)
     texels = shaped(baked.texels, bricks, SIDE, SIDE, channels, dtype=torch.uint8)
     low, step = (torch.tensor([getattr(c, name) for c in baked.channel_codes]) for name in ("low", "step"))
@@ -48,10 +48,9 @@ def show_baked(scene: BakedMpis, rays: Rays, threshold: float, peaks: Tensor | N
     if "cpu" not in scene.packed:
         scene.packed["cpu"] = _pack(scene)
     if peaks is not None:
-        assert shaped(peaks, scene.num_bricks, SIDE, SIDE) is peaks, "peaks are written in place"
-    count, channels = len(scene.mpis), len(scene.channel_codes)
-    walk = (scene.packed["cpu"], pointers_to(rays, count, count), float(threshold), peaks)
-    return shown("mmpi_show_baked", len(rays.origins), channels, *walk)
+        assert dense(peaks)[0] is peaks, "peaks are written in place"
+    walk = (scene.packed["cpu"], structs(rays.dense()), float(threshold), peaks)
+    return shown("mmpi_show_baked", len(rays.origins), len(scene.channel_codes), *walk)
 
 
 def shade_baked(shader: Shader, gathered: Tensor, mass: Tensor, directions: Tensor) -> Tensor:
@@ -61,8 +60,7 @@ def shade_baked(shader: Shader, gathered: Tensor, mass: Tensor, directions: Tens
         numbers.append((shaped(weights, len(biases), inputs), shaped(biases, len(biases))))
         inputs = len(biases)
     assert inputs == COLORS, f"a network of {inputs} outputs where a colour is read"
-    sums = [shaped(x, num_rays, n) for x, n in ((gathered, channels), (mass, 1), (directions, 3))]
     rgb, sizes = torch.empty(num_rays, 3), (len(numbers), channels, shader.direction_octaves, float(shader.bound))
     layers = structs(*((*weights.shape, weights, biases) for weights, biases in numbers))
-    call_in_parts("mmpi_shade_baked", num_rays, layers, *sizes, *sums, rgb)
+    call_in_parts("mmpi_shade_baked", num_rays, layers, *sizes, *dense(gathered, mass, directions), rgb)
     return rgb

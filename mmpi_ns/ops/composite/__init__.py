@@ -16,7 +16,7 @@ from torch import Tensor
 
 from mmpi_ns.ops.dispatch import operation
 from mmpi_ns.ops.ends import HALF
-from mmpi_ns.ops.layout import shaped
+from mmpi_ns.ops.layout import dense
 
 
 def exclusive_cumsum(values: Float[Tensor, "R S"]) -> Float[Tensor, "R S"]:
@@ -91,10 +91,8 @@ def composited(run: Callable[..., None], tau: Tensor, valid: Tensor, before: Ten
         run: calls its function "composite" or "composite_back" with tensors, of which the last ones are written.
         tau, valid, before, total: arguments of ``composite_weights``.
     """
-    shape = tau.shape
-    flags, total = shaped(valid, *shape, dtype=torch.bool), shaped(total, shape[0], 1)
-    arguments = (run, shaped(tau, *shape), flags, shaped(before, *shape), total)
-    weights, depth = _Compiled.apply(*arguments)  # type: ignore[misc]
+    tensors = (*dense(tau), *dense(valid, dtype=torch.bool), *dense(before, total))
+    weights, depth = _Compiled.apply(run, *tensors)  # type: ignore[misc]
     return Composite(weights, -torch.expm1(-depth), torch.exp(-depth))
 
 

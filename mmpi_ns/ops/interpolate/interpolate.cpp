@@ -1,7 +1,6 @@
 // Rows of tables that a batch reads: which, what is there, and their gradients.
 #include "parts.h"
-#include "scene.h"
-#include "table.h"
+#include "taps.h"
 
 namespace {
 
@@ -117,15 +116,10 @@ void mmpi_order_by_head(int64_t begin, int64_t end, const int64_t* heads, const 
 void mmpi_texel_rows(int64_t begin, int64_t end, const Grid* grids, const int64_t* heads, const int64_t* planes,
                      const float* ndc, int64_t* rows, float* weights) {
     for (int64_t i = begin; i < end; i++) {
-        const Grid& grid = grids[heads[i]];
-        const Cell x(ndc[3 * i], grid.width), y(ndc[3 * i + 1], grid.height);
-        const Corners corners(grid, planes[i], y.lower, x.lower);
-        const float fx = x.fraction, fy = y.fraction, gx = 1 - fx, gy = 1 - fy;
-        const float weight[4] = {gx * gy, fx * gy, gx * fy, fx * fy};
-        for (int k = 0; k < 4; k++) {
-            rows[4 * i + k] = corners.row[k];
-            weights[4 * i + k] = weight[k];
-        }
+        Sample sample;
+        sample.put(grids[heads[i]], false, planes[i], ndc + 3 * i);
+        std::copy_n(sample.rows, 4, rows + 4 * i);
+        std::copy_n(sample.shares, 4, weights + 4 * i);
     }
 }
 

@@ -30,21 +30,6 @@ OPAQUE_DEPTH = 9.2
 """exp(-9.2) = 1e-4 of the light: far below the weight of a kept sample."""
 
 
-class Crossings(NamedTuple):
-    """The live samples of R rays in the H heads that may answer them."""
-
-    origins: Float[Tensor, "R 3"]
-    directions: Float[Tensor, "R 3"]
-    hits: PlaneHits
-    """Crossings of the rays with the planes."""
-    first: Int[Tensor, "R H"]
-    """m of each head's nearest live plane; the cube's first sample in the last column, where there is a cube."""
-    counts: Int[Tensor, "R H"]
-    """Live samples of each head."""
-    explained: Bool[Tensor, "R 1"]
-    """See ``MergedSamples``."""
-
-
 class LiveSamples(NamedTuple):
     """A flat list of live samples: head by head, ray by ray, near to far."""
 
@@ -66,15 +51,17 @@ def march(layout: SceneLayout, tables: Tables, rays: Rays, options: MarchOptions
         rays: R rays.
         options: which samples are kept, and how they are blended.
     """
-    at = crossings(layout, rays, plane_hits(*rays[:4], layout.frames))
-    flat = _live_samples(at, layout, tables)
-    per_ray, number = at.counts.sum(-1), torch.cat([_enumerate(each)[1] for each in at.counts.unbind(-1)])
-    width, before = max(1, int(per_ray.max())) if per_ray.numel() else 1, at.counts.cumsum(-1) - at.counts
+    hits = plane_hits(*rays[:4], layout.frames)
+    first, counts, explained = crossings(layout, rays, hits)
+    flat = _live_samples(layout, tables, rays, hits, first, counts)
+    per_ray, number = counts.sum(-1), torch.cat([_enumerate(each)[1] for each in counts.unbind(-1)])
+    width, before = max(1, int(per_ray.max())) if per_ray.numel() else 1, counts.cumsum(-1) - counts
     slots = flat.rays * width + before[flat.rays, flat.heads] + number
-    order, valid = merge(slots, flat.inverse_t, per_ray, presorted=bool(((at.counts > 0).sum(-1) <= 1).all()))
+    order, valid = merge(slots, flat.inverse_t, per_ray, presorted=bool(((counts > 0).sum(-1) <= 1).all()))
     tau = flat.tau
     if options.blends and tau.numel():
-        tau = _blend_visible(order, valid, flat, at, layout, tables)
+        local = LocalRays(rays.origins, rays.directions, hits.local_origins, hits.local_directions)
+        tau = _blend_visible(order, valid, flat, local, layout, tables)
     pruned = prune(order, valid, tau, options.threshold, options.fair_share)
     order, valid = pruned.order, pruned.valid
 
@@ -92,8 +79,8 @@ def march(layout: SceneLayout, tables: Tables, rays: Rays, options: MarchOptions
         valid=valid,
         skipped_total=pruned.skipped_total,
         dropped_mass=pruned.dropped_mass,
-        live=at.counts.sum(-1),
-        explained=at.explained,
+        live=per_ray,
+        explained=explained,
     )
 
 
@@ -130,8 +117,15 @@ def show_rays(
 # Crossings -----------------------------------------------------------------------------------------------------------
 
 
-def crossings(layout: SceneLayout, rays: Rays, hits: PlaneHits) -> Crossings:
-    """The live samples of rays in the heads that may answer them, from their crossings with all planes."""
+def crossings(
+    layout: SceneLayout, rays: Rays, hits: PlaneHits
+) -> tuple[Int[Tensor, "R H"], Int[Tensor, "R H"], Bool[Tensor, "R 1"]]:
+    """The live samples of rays in the heads that may answer them, from their crossings with all planes.
+
+    Returns:
+        m of each head's nearest live plane (of the cube, which comes last, its first sample), how many live samples
+        each head has, and ``MergedSamples.explained``.
+    """
     first, counts = hits.m_first, hits.count
     if rays.priorities is not None:
         met = torch.where(counts > 0, rays.priorities, torch.full_like(rays.priorities, -1.0))
@@ -155,22 +149,29 @@ def crossings(layout: SceneLayout, rays: Rays, hits: PlaneHits) -> Crossings:
         endless = live & (hits.m_first - counts[:, : len(layout.mpis)] < 0) & (frames.last_disparities == 0)
         explained &= (live & (entry * layout.content_near >= 1)).any(-1, keepdim=True)
         explained &= endless.any(-1, keepdim=True)
-    return Crossings(rays.origins, rays.directions, hits, first, counts, explained)
+    return first, counts, explained
 
 
 # Sample --------------------------------------------------------------------------------------------------------------
 
 
-def _live_samples(at: Crossings, layout: SceneLayout, tables: Tables) -> LiveSamples:
+def _live_samples(
+    layout: SceneLayout,
+    tables: Tables,
+    rays: Rays,
+    hits: PlaneHits,
+    first: Int[Tensor, "R H"],
+    counts: Int[Tensor, "R H"],
+) -> LiveSamples:
     """All live planes of every MPI, and the samples inside the cube, at fixed distances from each camera."""
-    parts, hits, frames = [], at.hits, layout.frames
+    parts, frames = [], layout.frames
     for k, grid in enumerate(layout.grids):
-        rays, index = _enumerate(at.counts[:, k])
+        numbers, index = _enumerate(counts[:, k])
         if k < len(layout.mpis):
-            m, mpi = hits.m_first[:, k][rays] - index, layout.mpis[k]
+            m, mpi = first[:, k][numbers] - index, layout.mpis[k]
             ray = torch.cat(
                 [hits.u[:, k], hits.v[:, k], hits.local_origins[:, k, 2:], hits.local_directions[:, k, 2:]], -1
-            ).index_select(0, rays)
+            ).index_select(0, numbers)
             w = sample_disparity(m, frames.disparity_steps[k], frames.last_disparities[k])
             u0, u1, v0, v1 = mpi.extent
             u = (ray[:, 0] + w * ray[:, 1] - u0) * (2 / (u1 - u0)) - 1
@@ -180,12 +181,13 @@ def _live_samples(at: Crossings, layout: SceneLayout, tables: Tables) -> LiveSam
             texels = grid.bilinear(planes, ndc)
         else:
             assert layout.cube is not None
-            planes = at.first[:, -1][rays] + index
-            t = (planes + 0.5).to(at.origins.dtype) * layout.cube.step
-            ndc, inverse_t = layout.cube.normalised(at.origins[rays] + at.directions[rays] * t[:, None]), 1 / t
+            planes = first[:, k][numbers] + index
+            t = (planes + 0.5).to(rays.origins.dtype) * layout.cube.step
+            points = rays.origins[numbers] + rays.directions[numbers] * t[:, None]
+            ndc, inverse_t = layout.cube.normalised(points), 1 / t
             texels = grid.trilinear(ndc)
         tau = layout.optical_depth(k, interpolate(tables.density, *texels)[:, 0], planes)
-        parts.append((rays, torch.full_like(rays, k), planes, ndc, inverse_t, tau))
+        parts.append((numbers, torch.full_like(numbers, k), planes, ndc, inverse_t, tau))
     return LiveSamples(*(torch.cat(columns) for columns in zip(*parts, strict=True)))
 
 
@@ -239,7 +241,7 @@ def _blend_visible(
     order: Int[Tensor, "R S"],
     valid: Bool[Tensor, "R S"],
     flat: LiveSamples,
-    at: Crossings,
+    local: LocalRays,
     layout: SceneLayout,
     tables: Tables,
 ) -> Float[Tensor, "N"]:
@@ -248,7 +250,6 @@ def _blend_visible(
     Reliability costs a lookup in every head, and most samples lie behind the first surface: those keep their own depth,
     which changes weights by less than exp(-OPAQUE_DEPTH). Samples too thin to matter get an equal share without one.
     """
-    local = LocalRays(at.origins, at.directions, at.hits.local_origins, at.hits.local_directions)
     tau = flat.tau.clone()
     passed = tau.new_zeros(order.shape[0])
     for start in range(0, order.shape[1], BLEND_BLOCK):

@@ -11,20 +11,12 @@ from torch.nn.functional import pad
 
 from mmpi_ns.ops.build import call_in_parts, structs
 from mmpi_ns.ops.cpu_scene import scene_of
-from mmpi_ns.ops.layout import SceneLayout, Tables, shaped
+from mmpi_ns.ops.layout import SceneLayout, Tables, dense
 from mmpi_ns.ops.march.rays import MarchOptions, MergedSamples, Rays, Shown
 from mmpi_ns.scene.baked import columns_from
 
 _FLAT = (torch.int32, torch.int32, *[torch.float32] * 4)
 _SLOTS = (torch.int64, torch.int64, *[torch.float32] * 4, torch.bool)
-
-
-def pointers_to(rays: Rays, num_mpis: int, num_heads: int) -> ctypes.Array:
-    """Rays as the kernels read them (``cpp/crossings.h``)."""
-    count = len(rays.origins)
-    parts = [shaped(x, count, n) for x, n in zip(rays[:4], (3, 3, 1, 1), strict=True)]
-    heads = None if rays.heads is None else shaped(rays.heads, count, num_heads, dtype=torch.bool)
-    return structs((*parts, heads, None if rays.priorities is None else shaped(rays.priorities, count, num_mpis)))
 
 
 def shown(name: str, num_rays: int, channels: int, *values: Any) -> Shown:
@@ -39,7 +31,7 @@ def march(layout: SceneLayout, tables: Tables, rays: Rays, options: MarchOptions
     flat = [torch.empty((num_rays * room, 3) if i == 2 else num_rays * room, dtype=t) for i, t in enumerate(_FLAT)]
     starts, kept, live = torch.empty(3, num_rays, dtype=torch.int64)
     explained, (skipped, dropped) = torch.empty(num_rays, 1, dtype=torch.bool), torch.empty(2, num_rays, 1)
-    walk = (scene_of(layout, tables), pointers_to(rays, len(layout.mpis), layout.num_heads))
+    walk = (scene_of(layout, tables), structs(rays.dense()))
     how = (float(options.threshold), float(options.fair_share), options.blends)
     call_in_parts("mmpi_march", num_rays, *walk, room, *how, starts, kept, live, explained, skipped, dropped, *flat)
     shape = (num_rays, max(1, int(kept.max())) if num_rays else 1)
@@ -64,7 +56,7 @@ def _tiles(layout: SceneLayout) -> ctypes.Array:
 
 
 def show_rays(layout: SceneLayout, tables: Tables, features: Tensor, rays: Rays, options: MarchOptions) -> Shown:
-    walk = (scene_of(layout, tables), pointers_to(rays, len(layout.mpis), layout.num_heads))
-    texels = (layout.once("tiles", _tiles), shaped(features, len(tables.density), features.shape[1]), *features.shape)
+    walk = (scene_of(layout, tables), structs(rays.dense()))
+    texels = (layout.once("tiles", _tiles), *dense(features), *features.shape)
     how = (float(options.threshold), float(options.fair_share), options.blends)
     return shown("mmpi_show", len(rays.origins), features.shape[1], *walk, *texels, *how)

@@ -19,21 +19,9 @@ from torch import Tensor
 
 from mmpi_ns.ops import ends
 from mmpi_ns.ops.gather.gpu import activate, lanes, sizes
-from mmpi_ns.ops.gpu_scene import (
-    DEPTH,
-    HEIGHT,
-    INTS,
-    WIDTH,
-    GpuScene,
-    block_size,
-    cell,
-    launch,
-    one_minus_exp,
-    row_of,
-)
-from mmpi_ns.ops.layout import SceneLayout, Tables, shaped
-from mmpi_ns.ops.march.gpu_hits import cross
-from mmpi_ns.ops.march.gpu_walk import before, next_samples, pass_empty
+from mmpi_ns.ops.gpu_scene import DEPTH, HEIGHT, INTS, WIDTH, GpuScene, block_size, cell, launch, one_minus_exp, row_of
+from mmpi_ns.ops.layout import SceneLayout, Tables, dense
+from mmpi_ns.ops.march.gpu_walk import before, cross, next_samples, pass_empty
 from mmpi_ns.ops.march.rays import MarchOptions, MergedSamples, Rays, Shown
 
 OPAQUE = tl.constexpr(ends.OPAQUE)
@@ -241,10 +229,8 @@ def march_into_slots(layout: SceneLayout, tables: Tables, rays: Rays, options: M
     """``march`` before anything is waited for."""
     num_rays, num_heads, device = len(rays.origins), layout.num_heads, rays.origins.device
     scene, threshold, room = GpuScene.of(layout), float(options.threshold), options.most_kept(layout.most_samples)
-    parts = [shaped(x, num_rays, width) for x, width in zip(rays[:4], (3, 3, 1, 1), strict=True)]
     # Where all heads may answer, what stands for the choice is not read.
-    parts.append(parts[0] if rays.heads is None else shaped(rays.heads, num_rays, num_heads, dtype=torch.bool))
-    parts.append(parts[0] if rays.priorities is None else shaped(rays.priorities, num_rays, len(layout.mpis)))
+    parts = [rays.origins if x is None else x for x in rays.dense()]
     live = torch.empty(num_rays, dtype=torch.int64, device=device)
     explained = torch.empty(num_rays, 1, dtype=torch.bool, device=device)
     kept = torch.empty(num_rays, dtype=torch.int32, device=device)
@@ -256,7 +242,7 @@ def march_into_slots(layout: SceneLayout, tables: Tables, rays: Rays, options: M
     at_once = block_size(max(1, min(RAYS if num_rays >= MANY else FEW_RAYS, RANGES // heads)), device)
     launch(
         march_kernel, num_rays, at_once, *parts,
-        scene.heads, scene.grids, scene.biases, scene.cube, *tables.of_rows(layout.num_rows),
+        scene.heads, scene.grids, scene.biases, scene.cube, *tables.dense(),
         live, explained, kept, skipped, dropped, *slots, numbers,
         num_rays, room, threshold, float(options.fair_share), float(layout.content_near),
         K=len(layout.mpis), HEADS=heads, HAS_CUBE=layout.cube is not None,
@@ -288,7 +274,7 @@ def show_rays(layout: SceneLayout, tables: Tables, features: Tensor, rays: Rays,
     mass, depth, median, winner = (torch.empty(num_rays, 1, device=device) for _ in range(4))
     columns, block = sizes(channels, device, NUMBERS)
     launch(
-        show_kernel, num_rays, block, m.kept, *m.slots, m.skipped_total, shaped(features, layout.num_rows, channels),
+        show_kernel, num_rays, block, m.kept, *m.slots, m.skipped_total, *dense(features),
         GpuScene.of(layout).grids, gathered, mass, depth, median, winner, num_rays, m.room, channels, len(layout.mpis),
         HAS_CUBE=layout.cube is not None, HEADS=triton.next_power_of_2(layout.num_heads), CHANNELS=columns, BLOCK=block,
         num_warps=lanes(block),

@@ -32,13 +32,6 @@ class Places(NamedTuple):
     """Depth there over depth here; 0 for points behind."""
 
 
-class Moved(NamedTuple):
-    """Values of two maps."""
-
-    x: Float[Tensor, "R W"]
-    y: Float[Tensor, "R W"]
-
-
 class Compared(NamedTuple):
     """What another image's depths say of an image's."""
 
@@ -78,7 +71,7 @@ def place_pixels(
 @operation("cpu")
 def follow_motion(
     x: Float[Tensor, "H W"], y: Float[Tensor, "H W"], motion: Float[Tensor, "R W 2"], first_row: int
-) -> Moved:
+) -> tuple[Float[Tensor, "R W"], Float[Tensor, "R W"]]:
     """Values of two maps at the places that pixels have moved to, interpolated; beyond the borders those of the border.
 
     Args:
@@ -96,7 +89,7 @@ def follow_motion(
         above, below = (torch.lerp(image[r, left], image[r, left + 1], u) for r in (top, top + 1))
         return torch.lerp(above, below, v)
 
-    return Moved(at(x), at(y))
+    return at(x), at(y)
 
 
 @operation("cpu")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, TypeVar
 
 import torch
@@ -9,9 +10,9 @@ from torch import Tensor
 
 from mmpi_ns.ops.build import run_in_parts
 from mmpi_ns.ops.layout import dense
-from mmpi_ns.ops.matches import Compared, Measured, Moved, Places
+from mmpi_ns.ops.matches import Compared, Measured, Places
 
-Maps = TypeVar("Maps", Places, Moved, Measured, Compared)
+Maps = TypeVar("Maps", bound=Sequence[Tensor])
 MOST = 16
 """Measurements of a pixel, as in ``matches.cpp``."""
 
@@ -26,9 +27,9 @@ def place_pixels(inverse: Tensor, linear: Tensor, b: Tensor, first_row: int) -> 
     return _written(places, "place_pixels", *dense(inverse, linear, b), inverse.shape[1], first_row)
 
 
-def follow_motion(x: Tensor, y: Tensor, motion: Tensor, first_row: int) -> Moved:
+def follow_motion(x: Tensor, y: Tensor, motion: Tensor, first_row: int) -> tuple[Tensor, Tensor]:
     assert min(x.shape) > 1, x.shape
-    moved = Moved(*torch.empty(2, *motion.shape[:2]))
+    moved = (torch.empty(motion.shape[:2]), torch.empty(motion.shape[:2]))
     return _written(moved, "follow_motion", *dense(x, y, motion), *x.shape, first_row)
 
 
