@@ -77,14 +77,9 @@ class SceneLayout:
         return self.packed[name] if name in self.packed else self.packed.setdefault(name, make(self))
 
     @property
-    def num_rows(self) -> int:
-        """Rows of the pooled tables."""
-        return len(self.grids[0].places) * BRICK
-
-    @property
     def sizes(self) -> dict[str, int]:
         """What letters in shapes stand for: rows of the tables, heads and MPIs."""
-        return {"T": self.num_rows, "H": self.num_heads, "K": len(self.mpis)}
+        return {"T": len(self.grids[0].places) * BRICK, "H": self.num_heads, "K": len(self.mpis)}
 
     @cached_property
     def most_samples(self) -> int:

@@ -71,7 +71,7 @@ class _Compiled(torch.autograd.Function):
         ctx: Any, run: Callable[..., None], tau: Tensor, valid: Tensor, before: Tensor, total: Tensor
     ) -> tuple[Tensor, Tensor]:
         weights, depth = torch.empty_like(tau), torch.empty_like(total)
-        run("composite", tau, valid, before, total, weights, depth)
+        run("mmpi_composite", *tau.shape, tau, valid, before, total, weights, depth)
         ctx.run = run
         ctx.save_for_backward(tau, valid, before, weights)
         return weights, depth
@@ -80,7 +80,7 @@ class _Compiled(torch.autograd.Function):
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
         tau, *_ = saved = ctx.saved_tensors
         grad = torch.empty_like(tau)
-        ctx.run("composite_back", *saved, *(g.contiguous() for g in grad_outputs), grad)
+        ctx.run("mmpi_composite_back", *tau.shape, *saved, *(g.contiguous() for g in grad_outputs), grad)
         return None, grad, None, None, None
 
 
@@ -88,7 +88,7 @@ def composited(run: Callable[..., None], tau: Tensor, valid: Tensor, before: Ten
     """``composite_weights`` by a compiled form.
 
     Args:
-        run: calls its function "composite" or "composite_back" with tensors, of which the last ones are written.
+        run: calls the function "mmpi_composite" or "mmpi_composite_back" of numbers of rays and slots, and tensors.
         tau, valid, before, total: arguments of ``composite_weights``.
     """
     tensors = (*dense(tau), *dense(valid, dtype=torch.bool), *dense(before, total))

@@ -59,15 +59,14 @@ def composite_backward_kernel(
     tl.store(tau_grads + at, tl.where(has, grad, 0.0), inside)
 
 
-KERNELS = {"composite": composite_kernel, "composite_back": composite_backward_kernel}
+KERNELS = {"mmpi_composite": composite_kernel, "mmpi_composite_back": composite_backward_kernel}
 
 
 def composite_weights(tau: Tensor, valid: Tensor, skipped_before: Tensor, skipped_total: Tensor) -> Composite:
-    num_rays, slots = tau.shape
-    width = triton.next_power_of_2(max(16, slots))  # few widths, each of which is compiled
+    width = triton.next_power_of_2(max(16, tau.shape[1]))  # few widths, each of which is compiled
     rays = max(1, block_size(SLOTS, tau.device) // width)
 
-    def run(name: str, *tensors: Tensor) -> None:
+    def run(name: str, num_rays: int, slots: int, *tensors: Tensor) -> None:
         launch(KERNELS[name], num_rays, rays, *tensors, num_rays, slots, RAYS=rays, SLOTS=width)
 
     return composited(run, tau, valid, skipped_before, skipped_total)

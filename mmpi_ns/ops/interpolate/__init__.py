@@ -165,12 +165,6 @@ def read_rows(table: Table, rows: Int[Tensor, "U"]) -> Float[Tensor, "U C"]:
     return _ReadRows.apply(table, rows)  # type: ignore[no-any-return]
 
 
-@operation("cpu")
-def take_rows(table: Float[Tensor, "T C"], rows: Int[Tensor, "U"]) -> Float[Tensor, "U C"]:
-    """Values of ``read_rows``."""
-    return table.index_select(0, rows)
-
-
 def weigh_rows(
     values: Float[Tensor, "U C"], positions: Int[Tensor, "N B"], weights: Float[Tensor, "N B"]
 ) -> Float[Tensor, "N C"]:
@@ -178,7 +172,7 @@ def weigh_rows(
     return _WeighRows.apply(values, positions, weights.to(values.dtype))  # type: ignore[no-any-return]
 
 
-@operation("cpu", "gpu")
+@operation("gpu")
 def weighted_rows(
     table: Float[Tensor, "T C"], rows: Int[Tensor, "N B"], weights: Float[Tensor, "N B"]
 ) -> Float[Tensor, "N C"]:
@@ -207,7 +201,7 @@ class _ReadRows(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, table: Table, rows: Tensor) -> Tensor:
         ctx.table, ctx.rows = table, rows
-        return take_rows(table, rows)
+        return table.index_select(0, rows)
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[None, None]:

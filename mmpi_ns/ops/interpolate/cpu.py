@@ -69,25 +69,8 @@ def sum_rows(positions: Tensor, values: Tensor, weights: Tensor, count: int) -> 
     return sums
 
 
-def weighted_rows(table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
-    if rows.dtype != torch.int32 or not table.is_contiguous():
-        return interpolate.weighted_rows.reference(table, rows, weights)
-    (count, taps), channels = rows.shape, table.shape[1]
-    values, entries = torch.empty(count, channels), (rows.contiguous(), weights.contiguous(), taps)
-    call_in_parts("mmpi_weigh_rows", count, table, channels, *entries, values, least=AT_LEAST)
-    return values
-
-
 def raise_peaks(peaks: Tensor, rows: Tensor, positions: Tensor, weights: Tensor) -> None:
     if positions.dtype != torch.int32:
         return interpolate.raise_peaks.reference(peaks, rows, positions, weights)
     samples = (positions.contiguous(), weights.contiguous(), positions.shape[1])
     call_in_parts("mmpi_raise_peaks", len(positions), *samples, rows.contiguous(), peaks, least=AT_LEAST)
-
-
-def take_rows(table: Tensor, rows: Tensor) -> Tensor:
-    if not table.is_contiguous():
-        return interpolate.take_rows.reference(table, rows)
-    values = torch.empty(len(rows), table.shape[1])
-    call_in_parts("mmpi_take_rows", len(rows), rows.contiguous(), table.shape[1], table, values, least=AT_LEAST)
-    return values

@@ -9,10 +9,8 @@ namespace {
 inline void cells(Lanes coordinate, int64_t size, IntLanes& lower, Lanes& fraction) {
     const float last = float(size - 1);
     const Lanes position = least(most((coordinate + 1.0f) * (0.5f * last), Lanes{}), splat(last));
-    lower = __builtin_convertvector(position, IntLanes); // towards zero, and positions are not negative
-    const IntLanes highest = int32_t(size - 2) - IntLanes{};
-    lower = lower < highest ? lower : highest;
-    fraction = position - __builtin_convertvector(lower, Lanes);
+    lower = least(truncated(position), whole(int32_t(size - 2))); // positions are not negative
+    fraction = position - real(lower);
 }
 
 // Where sixteen samples lie on planes of an MPI, and the texels at their lower corners.
@@ -32,9 +30,6 @@ struct PlaneCells {
         store(edge, (in_x == 7) | (in_y == 7));
         store(fx, fraction_x), store(fy, fraction_y);
     }
-
-    static void store(int32_t* to, IntLanes x) { __builtin_memcpy(to, &x, sizeof x); }
-    static void store(float* to, Lanes x) { ::store(to, x); }
 };
 
 // One head's samples along one ray, looked up a block at a time.
@@ -74,7 +69,7 @@ void fill_mpi(Run& run, const Scene& scene, const Crossing& at, int ray, int64_t
         float ndc[3][WIDTH], inverse_t[WIDTH];
         store(ndc[0], x), store(ndc[1], y), store(ndc[2], 1.0f - mpi.s_scale * (w - mpi.end));
         store(inverse_t, w * dz / (1.0f - w * oz));
-        const PlaneCells cells(grid, x, y, __builtin_convertvector(IOTA, IntLanes) + int32_t(first));
+        const PlaneCells cells(grid, x, y, truncated(IOTA) + int32_t(first));
         for (int j = 0; j < count; j++) {
             float corners[4];
             if (!cells.edge[j]) {
