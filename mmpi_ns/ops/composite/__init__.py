@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from mmpi_ns.ops.build import call_in_parts
 from mmpi_ns.ops.dispatch import operation
 from mmpi_ns.ops.ends import HALF
 from mmpi_ns.ops.layout import dense
@@ -37,7 +38,7 @@ class Composite:
     """What passes the whole ray."""
 
 
-@operation("cpu", "gpu")
+@operation("gpu")
 def composite_weights(
     tau: Float[Tensor, "R S"],
     valid: Bool[Tensor, "R S"],
@@ -127,3 +128,8 @@ def winning_heads(weights: Float[Tensor, "R S"], heads: Int[Tensor, "R S"], num_
     """The head that gives each ray most of its weight, as nerfstudio's images take it; the first of equals."""
     mass = weights.new_zeros(len(weights), num_heads).scatter_add(1, heads, weights)
     return mass.argmax(-1, keepdim=True).to(weights.dtype)
+
+
+@composite_weights.on_cpu
+def composite_weights_on_cpu(tau: Tensor, valid: Tensor, skipped_before: Tensor, skipped_total: Tensor) -> Composite:
+    return composited(call_in_parts, tau, valid, skipped_before, skipped_total)

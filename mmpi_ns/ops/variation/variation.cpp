@@ -7,7 +7,7 @@
 
 namespace {
 
-constexpr int64_t PART = 4096; // rows whose differences are summed together (PART of cpu.py)
+constexpr int64_t PART = 4096; // rows whose differences are summed together (PART of __init__.py)
 
 // What lies around a brick.
 struct Surroundings {
