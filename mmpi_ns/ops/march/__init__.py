@@ -25,7 +25,7 @@ from mmpi_ns.ops.ends import NEGLIGIBLE
 from mmpi_ns.ops.gather import gather_places
 from mmpi_ns.ops.interpolate import interpolate
 from mmpi_ns.ops.layout import SceneLayout, Tables, dense
-from mmpi_ns.ops.march.rays import MarchOptions, MergedSamples, Rays, Shown
+from mmpi_ns.ops.march.rays import MarchOptions, MergedSamples, Rays, Shown, empty_samples
 from mmpi_ns.scene.baked import columns_from
 from mmpi_ns.scene.geometry import LocalRays, PlaneHits, cube_hits, inverse_distance, plane_hits, sample_disparity
 
@@ -334,10 +334,6 @@ def prune(
 # On a CPU ------------------------------------------------------------------------------------------------------------
 
 
-_FLAT = (torch.int32, torch.int32, *[torch.float32] * 4)
-_SLOTS = (torch.int64, torch.int64, *[torch.float32] * 4, torch.bool)
-
-
 def shown(name: str, num_rays: int, channels: int, *values: Any) -> Shown:
     """What a compiled function of ``(begin, end, *values, outputs)`` shows."""
     outputs = [torch.empty(num_rays, n) for n in (channels, 1, 1, 1, 1, 1, 1)]
@@ -348,14 +344,14 @@ def shown(name: str, num_rays: int, channels: int, *values: Any) -> Shown:
 @march.on_cpu
 def march_on_cpu(layout: SceneLayout, tables: Tables, rays: Rays, options: MarchOptions) -> MergedSamples:
     num_rays, room = len(rays.origins), options.most_kept(layout.most_samples)
-    flat = [torch.empty((num_rays * room, 3) if i == 2 else num_rays * room, dtype=t) for i, t in enumerate(_FLAT)]
+    flat = empty_samples(num_rays * room, index=torch.int32)
     starts, kept, live = torch.empty(3, num_rays, dtype=torch.int64)
     explained, (skipped, dropped) = torch.empty(num_rays, 1, dtype=torch.bool), torch.empty(2, num_rays, 1)
     walk = (scene_of(layout, tables), structs(rays.dense()))
     how = (float(options.threshold), float(options.fair_share), options.blends)
     call_in_parts("mmpi_march", num_rays, *walk, room, *how, starts, kept, live, explained, skipped, dropped, *flat)
     shape = (num_rays, max(1, int(kept.max())) if num_rays else 1)
-    slots = [torch.empty((*shape, 3) if i == 2 else shape, dtype=t) for i, t in enumerate(_SLOTS)]
+    slots = [*empty_samples(*shape), torch.empty(shape, dtype=torch.bool)]
     call_in_parts("mmpi_pack", num_rays, starts, kept, shape[1], *flat, *slots)
     return MergedSamples(*slots, skipped_total=skipped, dropped_mass=dropped, live=live, explained=explained)
 

@@ -22,7 +22,7 @@ from mmpi_ns.ops.gather.gpu import activate, lanes, sizes
 from mmpi_ns.ops.gpu_scene import DEPTH, HEIGHT, INTS, WIDTH, GpuScene, block_size, cell, launch, one_minus_exp, row_of
 from mmpi_ns.ops.layout import SceneLayout, Tables, dense
 from mmpi_ns.ops.march.gpu_walk import before, cross, next_samples, pass_empty
-from mmpi_ns.ops.march.rays import MarchOptions, MergedSamples, Rays, Shown
+from mmpi_ns.ops.march.rays import MarchOptions, MergedSamples, Rays, Shown, empty_samples
 
 OPAQUE = tl.constexpr(ends.OPAQUE)
 HALF = tl.constexpr(ends.HALF)
@@ -215,7 +215,7 @@ class Slots:
     kept: Int[Tensor, "R"]
     """Number of them; what the other slots hold means nothing."""
     slots: list[Tensor]
-    """Heads, planes, NDC, inverse distances, optical depths, and optical depths skipped before: each [R, room, .]."""
+    """See ``empty_samples``; [R, room] each."""
     room: int
     skipped_total: Float[Tensor, "R 1"]
     dropped_mass: Float[Tensor, "R 1"]
@@ -235,8 +235,7 @@ def march_into_slots(layout: SceneLayout, tables: Tables, rays: Rays, options: M
     explained = torch.empty(num_rays, 1, dtype=torch.bool, device=device)
     kept = torch.empty(num_rays, dtype=torch.int32, device=device)
     skipped, dropped = (torch.empty(num_rays, 1, device=device) for _ in range(2))
-    slots = [torch.empty(num_rays, room, dtype=torch.int32, device=device) for _ in range(2)]
-    slots += [torch.empty(num_rays, room, width, device=device) for width in (3, 1, 1, 1)]
+    slots = empty_samples(num_rays, room, index=torch.int32, device=device)
     numbers = torch.zeros(1 + num_heads, dtype=torch.int32, device=device)
     heads = triton.next_power_of_2(num_heads)
     at_once = block_size(max(1, min(RAYS if num_rays >= MANY else FEW_RAYS, RANGES // heads)), device)
@@ -256,11 +255,9 @@ def march(layout: SceneLayout, tables: Tables, rays: Rays, options: MarchOptions
     """Waits for the device once, to size the result."""
     m = march_into_slots(layout, tables, rays, options)
     widest, *of_heads = m.numbers.tolist()
-    num_rays, width = len(m.kept), max(1, widest)
-    shapes = [(num_rays, width, 3) if i == 2 else (num_rays, width) for i in range(7)]
-    types = (torch.int64, torch.int64, *[torch.float32] * 4, torch.bool)
-    packed = [torch.empty(shape, dtype=t, device=m.kept.device) for shape, t in zip(shapes, types, strict=True)]
-    size = num_rays * width
+    shape, device = (len(m.kept), max(1, widest)), m.kept.device
+    packed = [*empty_samples(*shape, device=device), torch.empty(shape, dtype=torch.bool, device=device)]
+    size, width = packed[0].numel(), shape[1]
     launch(pack_kernel, size, 1024, m.kept, *m.slots, *packed, size, width, m.room, BLOCK=1024)
     left = {"skipped_total": m.skipped_total, "dropped_mass": m.dropped_mass}
     return MergedSamples(*packed, **left, live=m.live, explained=m.explained, head_counts=tuple(of_heads))

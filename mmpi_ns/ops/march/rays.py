@@ -80,6 +80,12 @@ class MergedSamples:
         return Places(self.heads, self.planes, self.ndc, self.valid)
 
 
+def empty_samples(*shape: int, index: torch.dtype = torch.int64, device: torch.device | str = "cpu") -> list[Tensor]:
+    """Arrays for heads, planes, NDC, inverse distances, optical depths and optical depths skipped before each sample."""
+    types = (index, index, *[torch.float32] * 4)
+    return [torch.empty((*shape, 3) if i == 2 else shape, dtype=t, device=device) for i, t in enumerate(types)]
+
+
 @dataclass(frozen=True)
 class Shown:
     """What rays show."""
