@@ -344,15 +344,15 @@ def shown(name: str, num_rays: int, channels: int, *values: Any) -> Shown:
 @march.on_cpu
 def march_on_cpu(layout: SceneLayout, tables: Tables, rays: Rays, options: MarchOptions) -> MergedSamples:
     num_rays, room = len(rays.origins), options.most_kept(layout.most_samples)
-    flat = empty_samples(num_rays * room, index=torch.int32)
+    samples = structs(empty_samples(num_rays * room, index=torch.int32))
     starts, kept, live = torch.empty(3, num_rays, dtype=torch.int64)
     explained, (skipped, dropped) = torch.empty(num_rays, 1, dtype=torch.bool), torch.empty(2, num_rays, 1)
     walk = (scene_of(layout, tables), structs(rays.dense()))
     how = (float(options.threshold), float(options.fair_share), options.blends)
-    call_in_parts("mmpi_march", num_rays, *walk, room, *how, starts, kept, live, explained, skipped, dropped, *flat)
-    shape = (num_rays, max(1, int(kept.max())) if num_rays else 1)
-    slots = [*empty_samples(*shape), torch.empty(shape, dtype=torch.bool)]
-    call_in_parts("mmpi_pack", num_rays, starts, kept, shape[1], *flat, *slots)
+    call_in_parts("mmpi_march", num_rays, *walk, room, *how, starts, kept, live, explained, skipped, dropped, samples)
+    width = max(1, int(kept.max())) if num_rays else 1
+    slots = [*empty_samples(num_rays, width), torch.empty(num_rays, width, dtype=torch.bool)]
+    call_in_parts("mmpi_pack", num_rays, starts, kept, width, samples, structs(slots))
     return MergedSamples(*slots, skipped_total=skipped, dropped_mass=dropped, live=live, explained=explained)
 
 

@@ -116,16 +116,23 @@ void fill_cube(Run& run, const Scene& scene, const Packet& rays, int ray, bool s
     finish(run, cube.interval);
 }
 
+template <typename Int> struct Samples {
+    Int *heads, *planes;
+    float *ndc, *inverse_t, *tau, *skipped_before;
+};
+
+struct Packed : Samples<int64_t> {
+    bool* valid;
+};
+
 // What a ray keeps goes behind what the rays before it kept.
-struct Slots {
-    int32_t *heads, *planes;
-    float *ndc, *inverse_t, *taus, *skipped_before;
+struct Slots : Samples<int32_t> {
     int64_t size;
 
-    void keep(const Run& run, int64_t head, float tau, float skipped) {
+    void keep(const Run& run, int64_t head, float depth, float skipped) {
         heads[size] = int32_t(head), planes[size] = run.plane[run.at];
         for (int a = 0; a < 3; a++) ndc[3 * size + a] = run.ndc[run.at][a];
-        inverse_t[size] = run.inverse_t[run.at], taus[size] = tau, skipped_before[size] = skipped;
+        inverse_t[size] = run.inverse_t[run.at], tau[size] = depth, skipped_before[size] = skipped;
         size++;
     }
 };
@@ -207,11 +214,10 @@ class Training {
 // other, from begin * room on; where a ray's samples begin, to starts[ray]; how many, to kept[ray].
 void mmpi_march(int64_t begin, int64_t end, const Scene* scene, const Rays* rays, int64_t room, float threshold,
                 float fair_share, bool blends, int64_t* starts, int64_t* kept, int64_t* live, bool* explained,
-                float* skipped_total, float* dropped_mass, int32_t* heads, int32_t* planes, float* ndc,
-                float* inverse_t, float* taus, float* skipped_before) {
+                float* skipped_total, float* dropped_mass, const Samples<int32_t>* samples) {
     Training training(*scene, threshold, fair_share, blends);
     Crossings crossings;
-    Slots slots{heads, planes, ndc, inverse_t, taus, skipped_before, begin * room};
+    Slots slots{*samples, begin * room};
     for (int64_t first = begin; first < end; first += WIDTH) {
         const Packet packet(*rays, first, std::min<int64_t>(WIDTH, end - first));
         crossings.cross(*scene, *rays, packet);
@@ -226,24 +232,22 @@ void mmpi_march(int64_t begin, int64_t end, const Scene* scene, const Rays* rays
 
 // Copies what rays [begin, end) kept into `width` slots each; the rest of the slots is 0.
 void mmpi_pack(int64_t begin, int64_t end, const int64_t* starts, const int64_t* kept, int64_t width,
-               const int32_t* heads, const int32_t* planes, const float* ndc, const float* inverse_t, const float* tau,
-               const float* skipped_before, int64_t* to_heads, int64_t* to_planes, float* to_ndc, float* to_inverse_t,
-               float* to_tau, float* to_skipped_before, bool* valid) {
+               const Samples<int32_t>* from, const Packed* to) {
     // Array by array, so that copies and zeros (most slots, where one ray keeps many) go a cache line at a time.
     const auto pack = [](const auto* from, int64_t size, int64_t room, auto* to) {
         std::copy_n(from, size, to);
         std::fill_n(to + size, room - size, 0);
     };
     for (int64_t ray = begin; ray < end; ray++) {
-        const int64_t to = ray * width, from = starts[ray], size = kept[ray];
-        pack(heads + from, size, width, to_heads + to);
-        pack(planes + from, size, width, to_planes + to);
-        pack(ndc + 3 * from, 3 * size, 3 * width, to_ndc + 3 * to);
-        pack(inverse_t + from, size, width, to_inverse_t + to);
-        pack(tau + from, size, width, to_tau + to);
-        pack(skipped_before + from, size, width, to_skipped_before + to);
-        std::fill_n(valid + to, size, true);
-        std::fill_n(valid + to + size, width - size, false);
+        const int64_t put = ray * width, at = starts[ray], size = kept[ray];
+        pack(from->heads + at, size, width, to->heads + put);
+        pack(from->planes + at, size, width, to->planes + put);
+        pack(from->ndc + 3 * at, 3 * size, 3 * width, to->ndc + 3 * put);
+        pack(from->inverse_t + at, size, width, to->inverse_t + put);
+        pack(from->tau + at, size, width, to->tau + put);
+        pack(from->skipped_before + at, size, width, to->skipped_before + put);
+        std::fill_n(to->valid + put, size, true);
+        std::fill_n(to->valid + put + size, width - size, false);
     }
 }
 

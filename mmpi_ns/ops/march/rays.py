@@ -81,7 +81,7 @@ class MergedSamples:
 
 
 def empty_samples(*shape: int, index: torch.dtype = torch.int64, device: torch.device | str = "cpu") -> list[Tensor]:
-    """Arrays for heads, planes, NDC, inverse distances, optical depths and optical depths skipped before each sample."""
+    """Arrays for heads, planes, NDC, inverse distances, optical depths and those skipped before each sample."""
     types = (index, index, *[torch.float32] * 4)
     return [torch.empty((*shape, 3) if i == 2 else shape, dtype=t, device=device) for i, t in enumerate(types)]
 
