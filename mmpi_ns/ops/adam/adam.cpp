@@ -8,13 +8,6 @@
 
 namespace {
 
-constexpr int64_t AHEAD = 8; // rows whose cache lines are asked for before they are needed
-
-template <typename T> void prefetch_row(const T* row, int64_t channels) {
-    const char* end = reinterpret_cast<const char*>(row + channels);
-    for (const char* line = reinterpret_cast<const char*>(row); line < end; line += 64) __builtin_prefetch(line);
-}
-
 // Numbers in bfloat16 are the upper halves of floats; the nearest, and of two the even one.
 float widen(uint16_t half) {
     const uint32_t bits = uint32_t(half) << 16;

@@ -5,6 +5,13 @@
 #pragma once
 #include "lanes.h"
 
+constexpr int64_t AHEAD = 8; // rows whose cache lines are asked for before they are needed
+
+template <typename T> inline void prefetch_row(const T* row, int64_t channels) {
+    const char* end = reinterpret_cast<const char*>(row + channels);
+    for (const char* line = reinterpret_cast<const char*>(row); line < end; line += 64) __builtin_prefetch(line);
+}
+
 constexpr int64_t OCTET = 8;
 typedef float Octet __attribute__((vector_size(32)));
 

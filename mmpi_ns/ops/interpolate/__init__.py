@@ -167,6 +167,12 @@ def read_rows(table: Table, rows: Int[Tensor, "U"]) -> Float[Tensor, "U C"]:
     return _ReadRows.apply(table, rows)  # type: ignore[no-any-return]
 
 
+@operation()
+def take_rows(table: Float[Tensor, "T C"], rows: Int[Tensor, "U"]) -> Float[Tensor, "U C"]:
+    """Values of ``read_rows``."""
+    return table.index_select(0, rows)
+
+
 def weigh_rows(
     values: Float[Tensor, "U C"], positions: Int[Tensor, "N B"], weights: Float[Tensor, "N B"]
 ) -> Float[Tensor, "N C"]:
@@ -203,7 +209,7 @@ class _ReadRows(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, table: Table, rows: Tensor) -> Tensor:
         ctx.table, ctx.rows = table, rows
-        return table.index_select(0, rows)
+        return take_rows(table, rows)
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[None, None]:
@@ -283,6 +289,24 @@ def sum_rows_on_cpu(positions: Tensor, values: Tensor, weights: Tensor, count: i
     bounds = owned_bounds([positions], count, AT_LEAST)
     run_in_parts("mmpi_sum_rows", bounds, *entries, *positions.shape, values.shape[1], sums)
     return sums
+
+
+@weighted_rows.on_cpu
+def weighted_rows_on_cpu(table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
+    if rows.dtype != torch.int32 or not table.is_contiguous():
+        return weighted_rows.reference(table, rows, weights)
+    values, entries = torch.empty(len(rows), table.shape[1]), (rows.contiguous(), weights.contiguous(), rows.shape[1])
+    call_in_parts("mmpi_weigh_rows", len(rows), table, *table.shape, *entries, values, least=AT_LEAST)
+    return values
+
+
+@take_rows.on_cpu
+def take_rows_on_cpu(table: Tensor, rows: Tensor) -> Tensor:
+    if not table.is_contiguous():
+        return take_rows.reference(table, rows)
+    values = torch.empty(len(rows), table.shape[1])
+    call_in_parts("mmpi_take_rows", len(rows), rows.contiguous(), table.shape[1], table, values, least=AT_LEAST)
+    return values
 
 
 @raise_peaks.on_cpu

@@ -43,6 +43,17 @@ void mmpi_place_rows(int64_t begin, int64_t end, const int64_t* rows, const uint
     }
 }
 
+// Rows [begin, end) of a list, read from the table; those that follow each other as one stretch.
+void mmpi_take_rows(int64_t begin, int64_t end, const int64_t* rows, int64_t channels, const float* table,
+                    float* values) {
+    for (int64_t i = begin, next; i < end; i = next) {
+        for (next = i + 1; next < end && rows[next] == rows[next - 1] + 1;) next++;
+        for (int64_t soon = std::min(end, i + 2 * AHEAD); soon < std::min(end, next + 2 * AHEAD); soon++)
+            prefetch_row(table + rows[soon] * channels, channels);
+        std::copy_n(table + rows[i] * channels, (next - i) * channels, values + i * channels);
+    }
+}
+
 // peaks[brick] is raised to the largest weight of those of samples [begin, end) that read one of its rows.
 void mmpi_raise_peaks(int64_t begin, int64_t end, const int32_t* positions, const float* weights, int64_t taps,
                       const int64_t* rows, float* peaks) {
@@ -53,6 +64,19 @@ void mmpi_raise_peaks(int64_t begin, int64_t end, const int32_t* positions, cons
         while (now < weight && !__atomic_compare_exchange(peak, &now, &weight, true, __ATOMIC_RELAXED, __ATOMIC_RELAXED))
             ;
     }
+}
+
+// The sum of weights[n, b] * table[positions[n, b]] over b, of samples [begin, end).
+void mmpi_weigh_rows(int64_t begin, int64_t end, const float* numbers, int64_t rows, int64_t channels,
+                     const int32_t* positions, const float* weights, int64_t taps, float* values) {
+    const Table table{numbers, rows, channels};
+    for (int64_t n = begin; n < end; n++)
+        for (int64_t first = 0; first < channels; first += WIDTH) {
+            Lanes sum{};
+            for (int64_t i = n * taps; i < (n + 1) * taps; i++)
+                sum += weights[i] * table.read(positions[i] * channels + first);
+            for (int64_t c = first; c < std::min(channels, first + WIDTH); c++) values[n * channels + c] = sum[c - first];
+        }
 }
 
 // values[positions[n, b]] is the sum of weights[n, b] * grad[n], of the entries at positions [begin, end): each has one
@@ -104,7 +128,9 @@ IN_PARTS(mmpi_mark_rows)
 IN_PARTS(mmpi_count_rows)
 IN_PARTS(mmpi_list_rows)
 IN_PARTS(mmpi_place_rows)
+IN_PARTS(mmpi_take_rows)
 IN_PARTS(mmpi_raise_peaks)
+IN_PARTS(mmpi_weigh_rows)
 IN_PARTS(mmpi_sum_rows)
 IN_PARTS(mmpi_count_heads)
 IN_PARTS(mmpi_order_by_head)
