@@ -29,7 +29,7 @@ BRICK_OF_TILE, TILE_OF_BRICK, INTS = map(tl.constexpr, range(7, 10))
 
 @dataclass(frozen=True)
 class GpuScene:
-    """A layout on the device (``CpuScene`` for the GPU), made once by ``GpuScene.of``."""
+    """A layout on the device, made once by ``GpuScene.of``."""
 
     heads: Float[Tensor, "K 26"]
     grids: Int[Tensor, "N"]

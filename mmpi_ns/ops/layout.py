@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import functools
 import math
 from collections.abc import Callable, Iterable, Mapping
@@ -13,6 +14,7 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
+from mmpi_ns.ops.build import structs
 from mmpi_ns.scene.geometry import Cube, Frames
 from mmpi_ns.scene.plan import MPIPlan, ScenePlan
 from mmpi_ns.scene.texels import BRICK, TexelGrid
@@ -108,6 +110,26 @@ class SceneLayout:
             corner, extent = cube.lower.tolist(), (cube.upper - cube.lower).tolist()
             numbers = [*corner, *extent, cube.step, self.cube_bias, self.cube_interval, *cube.upper.tolist()]
         return torch.tensor(numbers, dtype=torch.float32, device=self.frames.origins.device)
+
+    @cached_property
+    def cpu_grids(self) -> ctypes.Array:
+        """Texels of all heads for C++: ``Grid`` of ``cpp/scene.h``."""
+        assert self.grids[0].tiles.dtype == torch.int32
+        sizes = [(g.depth, g.height, g.width, g.down, g.across, g.first_tile, g.tiles) for g in self.grids]
+        return structs(*((*each, bias) for each, bias in zip(sizes, self.bias_starts(), strict=True)))
+
+    @cached_property
+    def _cpu_rows(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Numbers of the MPIs, frames, biases and the cube for C++."""
+        count, planes = len(self.mpis), sum(m.planes for m in self.mpis)
+        mpis, frames = shaped(self.head_rows, count, 9), shaped(frame_rows(self.frames), count, 19)
+        return mpis, frames, shaped(torch.cat(self.biases).float(), planes), shaped(self.cube_row, 12)
+
+    def cpu_scene(self, tables: Tables) -> ctypes.Array:
+        """The layout and its tables for C++: a ``Scene`` of ``cpp/scene.h``."""
+        mpis, frames, biases, cube = self._cpu_rows
+        sizes = (len(self.mpis), self.num_heads, float(self.content_near))
+        return structs((*sizes, mpis, frames, self.cpu_grids, biases, cube, *tables.dense()))
 
     def bias_starts(self) -> list[int]:
         """Where each head's planes begin in the list of all biases."""

@@ -1,4 +1,4 @@
-// What the kernels know of a plan: MPIs first, the cube last. Filled by ops/cpu_scene.py, field by field.
+// What the kernels know of a plan: MPIs first, the cube last. Filled by ops/layout.py, field by field.
 #pragma once
 #include <algorithm>
 #include <cmath>

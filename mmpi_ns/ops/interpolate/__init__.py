@@ -14,7 +14,6 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from mmpi_ns.ops.build import call_in_parts, even_bounds, owned_bounds, run_in_parts
-from mmpi_ns.ops.cpu_scene import grids_of
 from mmpi_ns.ops.dispatch import operation
 from mmpi_ns.ops.layout import Places, SceneLayout
 from mmpi_ns.scene.texels import BRICK
@@ -259,7 +258,7 @@ def texel_rows_on_cpu(layout: SceneLayout, heads: Tensor, planes: Tensor, ndc: T
         return texel_rows.reference(layout, heads, planes, ndc)
     rows, weights = torch.empty(len(heads), 4, dtype=torch.int64), torch.empty(len(heads), 4)
     samples = (x.contiguous() for x in (heads, planes, ndc))
-    call_in_parts("mmpi_texel_rows", len(heads), grids_of(layout), *samples, rows, weights, least=AT_LEAST)
+    call_in_parts("mmpi_texel_rows", len(heads), layout.cpu_grids, *samples, rows, weights, least=AT_LEAST)
     return rows, weights
 
 

@@ -19,7 +19,6 @@ from torch.nn.functional import pad
 from mmpi_ns.ops.blending import blended_optical_depth, log_shares
 from mmpi_ns.ops.build import call_in_parts, structs
 from mmpi_ns.ops.composite import composite_weights, exclusive_cumsum, median_inverse_distance, winning_heads
-from mmpi_ns.ops.cpu_scene import scene_of
 from mmpi_ns.ops.dispatch import operation
 from mmpi_ns.ops.ends import NEGLIGIBLE
 from mmpi_ns.ops.gather import gather_places
@@ -347,7 +346,7 @@ def march_on_cpu(layout: SceneLayout, tables: Tables, rays: Rays, options: March
     samples = structs(empty_samples(num_rays * room, index=torch.int32))
     starts, kept, live = torch.empty(3, num_rays, dtype=torch.int64)
     explained, (skipped, dropped) = torch.empty(num_rays, 1, dtype=torch.bool), torch.empty(2, num_rays, 1)
-    walk = (scene_of(layout, tables), structs(rays.dense()))
+    walk = (layout.cpu_scene(tables), structs(rays.dense()))
     how = (float(options.threshold), float(options.fair_share), options.blends)
     call_in_parts("mmpi_march", num_rays, *walk, room, *how, starts, kept, live, explained, skipped, dropped, samples)
     width = max(1, int(kept.max())) if num_rays else 1
@@ -373,7 +372,7 @@ def _tiles(layout: SceneLayout) -> ctypes.Array:
 
 @show_rays.on_cpu
 def show_rays_on_cpu(layout: SceneLayout, tables: Tables, features: Tensor, rays: Rays, options: MarchOptions) -> Shown:
-    walk = (scene_of(layout, tables), structs(rays.dense()))
+    walk = (layout.cpu_scene(tables), structs(rays.dense()))
     texels = (layout.once("tiles", _tiles), *dense(features), *features.shape)
     how = (float(options.threshold), float(options.fair_share), options.blends)
     return shown("mmpi_show", len(rays.origins), features.shape[1], *walk, *texels, *how)

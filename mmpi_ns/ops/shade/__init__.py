@@ -10,7 +10,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mmpi_ns.ops.build import call_in_parts, structs
-from mmpi_ns.ops.cpu_scene import grids_of
 from mmpi_ns.ops.dispatch import operation
 from mmpi_ns.ops.gather import interpolated
 from mmpi_ns.ops.layout import Places, SceneLayout, check_shapes
@@ -109,5 +108,5 @@ def shade_on_cpu(
     tensors, colors = [x.contiguous() for x in (axes, table, directions, *places)], torch.empty(*places.valid.shape, 3)
     shading = structs((*tensors, *table.shape, colors.shape[1], *networks[1:]))
     layers = structs(*((*w.shape, w, b) for w, b in pairs))
-    call_in_parts("mmpi_shade", len(colors), grids_of(layout), len(layout.mpis), len(axes), shading, layers, colors)
+    call_in_parts("mmpi_shade", len(colors), layout.cpu_grids, len(layout.mpis), len(axes), shading, layers, colors)
     return colors

@@ -9,7 +9,6 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from mmpi_ns.ops.build import call_in_parts
-from mmpi_ns.ops.cpu_scene import grids_of
 from mmpi_ns.ops.dispatch import operation
 from mmpi_ns.ops.layout import SceneLayout
 
@@ -87,7 +86,7 @@ PART = 4096
 @total_variation.on_cpu
 def total_variation_on_cpu(values: Tensor, table: Tensor, rows: Tensor, layout: SceneLayout, scales: Scales) -> Tensor:
     gradient, totals = torch.empty_like(values), torch.zeros(-(-len(rows) // PART), dtype=torch.float64)
-    inputs = (rows.contiguous(), len(rows), table.shape[1], table, len(table), grids_of(layout), layout.num_heads)
+    inputs = (rows.contiguous(), len(rows), table.shape[1], table, len(table), layout.cpu_grids, layout.num_heads)
     weights = torch.tensor(scales, dtype=torch.float32)
     outputs = (gradient, totals)
     places = layout.grids[0].places
