@@ -92,15 +92,20 @@ class SceneLayout:
         return planes + int(2 * math.hypot(*(cube.upper - cube.lower).tolist()) / cube.step) + 2
 
     @cached_property
-    def head_rows(self) -> Float[Tensor, "K 9"]:
-        """Of each MPI: disparity between planes and of the last one, 1 - near / far, scale of the NDC s, lower end and
-        scale of u and of v, interval."""
+    def head_rows(self) -> Float[Tensor, "K 26"]:
+        """Of each MPI: ``frame_rows``, 1 - near / far, scale of NDC s, lower end and scale of u and of v, interval."""
         rows = []
-        for k, (mpi, step) in enumerate(zip(self.mpis, self.frames.disparity_steps.tolist(), strict=True)):
+        for k, mpi in enumerate(self.mpis):
             u0, u1, v0, v1 = mpi.extent
-            depth = (step, mpi.last_disparity, mpi.depth_share, 2 * mpi.near / mpi.depth_share)
+            depth = (mpi.depth_share, 2 * mpi.near / mpi.depth_share)
             rows.append((*depth, u0, 2 / (u1 - u0), v0, 2 / (v1 - v0), self.interval(k)))
-        return torch.tensor(rows, dtype=torch.float32, device=self.frames.origins.device).reshape(len(rows), 9)
+        numbers = torch.tensor(rows, dtype=torch.float32, device=self.frames.origins.device).reshape(len(rows), 7)
+        return torch.cat([frame_rows(self.frames), numbers], -1)
+
+    @cached_property
+    def bias_row(self) -> Float[Tensor, "P"]:
+        """Biases of all planes of all MPIs."""
+        return torch.cat(self.biases).to(self.frames.origins.device, torch.float32)
 
     @cached_property
     def cube_row(self) -> Float[Tensor, "12"]:
@@ -118,21 +123,13 @@ class SceneLayout:
         sizes = [(g.depth, g.height, g.width, g.down, g.across, g.first_tile, g.tiles) for g in self.grids]
         return structs(*((*each, bias) for each, bias in zip(sizes, self.bias_starts(), strict=True)))
 
-    @cached_property
-    def _cpu_rows(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Numbers of the MPIs, frames, biases and the cube for C++."""
-        count, planes = len(self.mpis), sum(m.planes for m in self.mpis)
-        mpis, frames = shaped(self.head_rows, count, 9), shaped(frame_rows(self.frames), count, 19)
-        return mpis, frames, shaped(torch.cat(self.biases).float(), planes), shaped(self.cube_row, 12)
-
     def cpu_scene(self, tables: Tables) -> ctypes.Array:
         """The layout and its tables for C++: a ``Scene`` of ``cpp/scene.h``."""
-        mpis, frames, biases, cube = self._cpu_rows
         sizes = (len(self.mpis), self.num_heads, float(self.content_near))
-        return structs((*sizes, mpis, frames, self.cpu_grids, biases, cube, *tables.dense()))
+        return structs((*sizes, self.head_rows, self.cpu_grids, self.bias_row, self.cube_row, *tables.dense()))
 
     def bias_starts(self) -> list[int]:
-        """Where each head's planes begin in the list of all biases."""
+        """Where each head's planes begin in ``bias_row``."""
         return [sum(len(b) for b in self.biases[:k]) for k in range(self.num_heads)]
 
     def interval(self, k: int) -> float:
@@ -150,7 +147,7 @@ def frame_rows(frames: Frames) -> Float[Tensor, "K 19"]:
     """Of each MPI: origin, axes, extent, disparity between planes and of the last one, number of the first one."""
     columns = (frames.disparity_steps, frames.last_disparities, frames.num_planes - 1)
     parts = (frames.origins, frames.axes.flatten(1), frames.extents, *(x[:, None] for x in columns))
-    return torch.cat([x.float() for x in parts], -1).contiguous()
+    return torch.cat([x.float() for x in parts], -1)
 
 
 def shaped(x: Tensor, *shape: int, dtype: torch.dtype = torch.float32) -> Tensor:

@@ -115,8 +115,8 @@ def _pack(baked: BakedMpis) -> ctypes.Array:
         *(pad(x.reshape(-1), (0, MOST_CHANNELS)) for x in (density, texels)),
         *(pad(doubled * x, (0, MOST_CHANNELS - channels)) for x in (low, step)),
     ]
-    frames = shaped(frame_rows(baked.frames), count, 19)
-    return structs((count, channels, frames, structs(*stacks), structs(through), *tables))
+    mpis = pad(frame_rows(baked.frames), (0, 7))  # of the rest of ``SceneLayout.head_rows`` nothing is read
+    return structs((count, channels, mpis, structs(*stacks), structs(through), *tables))
 
 
 @show_baked.on_cpu

@@ -12,7 +12,7 @@ typedef uint16_t ShortLanes __attribute__((vector_size(32)));
 
 struct BakedScene {
     int64_t num_mpis, channels;
-    const Frame* frames;
+    const Mpi* mpis;
     const Stack* stacks;
     const float* const* through; // of each MPI: e^-tau at codes 0, 1/8, ...
     const Column* columns;
@@ -65,7 +65,7 @@ struct Bytes {
     const Lanes low, range, low_twice, range_twice;
 
     Bytes(const BakedScene& baked, float threshold, float* peaks)
-        : baked(baked), scene{baked.num_mpis, baked.num_mpis, 0, nullptr, baked.frames}, columns(baked.columns),
+        : baked(baked), scene{baked.num_mpis, baked.num_mpis, 0, baked.mpis}, columns(baked.columns),
           stacks(baked.stacks), channels(baked.channels), threshold(threshold), peaks(peaks), low(load(baked.low)),
           range(load(baked.step)), low_twice(join(lower_half(low), lower_half(low))),
           range_twice(join(lower_half(range), lower_half(range))) {}

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from mmpi_ns.ops import ends
 from mmpi_ns.ops.gather.gpu import activate, lanes, sizes
-from mmpi_ns.ops.gpu_scene import DEPTH, HEIGHT, INTS, WIDTH, GpuScene, block_size, cell, launch, one_minus_exp, row_of
+from mmpi_ns.ops.gpu_scene import DEPTH, HEIGHT, INTS, WIDTH, block_size, cell, grids_of, launch, one_minus_exp, row_of
 from mmpi_ns.ops.layout import SceneLayout, Tables, dense
 from mmpi_ns.ops.march.gpu_walk import before, cross, next_samples, pass_empty
 from mmpi_ns.ops.march.rays import MarchOptions, MergedSamples, Rays, Shown, empty_samples
@@ -228,7 +228,7 @@ class Slots:
 def march_into_slots(layout: SceneLayout, tables: Tables, rays: Rays, options: MarchOptions) -> Slots:
     """``march`` before anything is waited for."""
     num_rays, num_heads, device = len(rays.origins), layout.num_heads, rays.origins.device
-    scene, threshold, room = GpuScene.of(layout), float(options.threshold), options.most_kept(layout.most_samples)
+    threshold, room = float(options.threshold), options.most_kept(layout.most_samples)
     # Where all heads may answer, what stands for the choice is not read.
     parts = [rays.origins if x is None else x for x in rays.dense()]
     live = torch.empty(num_rays, dtype=torch.int64, device=device)
@@ -241,7 +241,7 @@ def march_into_slots(layout: SceneLayout, tables: Tables, rays: Rays, options: M
     at_once = block_size(max(1, min(RAYS if num_rays >= MANY else FEW_RAYS, RANGES // heads)), device)
     launch(
         march_kernel, num_rays, at_once, *parts,
-        scene.heads, scene.grids, scene.biases, scene.cube, *tables.dense(),
+        layout.head_rows, grids_of(layout), layout.bias_row, layout.cube_row, *tables.dense(),
         live, explained, kept, skipped, dropped, *slots, numbers,
         num_rays, room, threshold, float(options.fair_share), float(layout.content_near),
         K=len(layout.mpis), HEADS=heads, HAS_CUBE=layout.cube is not None,
@@ -272,7 +272,7 @@ def show_rays(layout: SceneLayout, tables: Tables, features: Tensor, rays: Rays,
     columns, block = sizes(channels, device, NUMBERS)
     launch(
         show_kernel, num_rays, block, m.kept, *m.slots, m.skipped_total, *dense(features),
-        GpuScene.of(layout).grids, gathered, mass, depth, median, winner, num_rays, m.room, channels, len(layout.mpis),
+        grids_of(layout), gathered, mass, depth, median, winner, num_rays, m.room, channels, len(layout.mpis),
         HAS_CUBE=layout.cube is not None, HEADS=triton.next_power_of_2(layout.num_heads), CHANNELS=columns, BLOCK=block,
         num_warps=lanes(block),
     )  # fmt: skip
