@@ -67,25 +67,11 @@ def march(layout: SceneLayout, tables: Tables, rays: Rays, options: MarchOptions
         local = LocalRays(rays.origins, rays.directions, hits.local_origins, hits.local_directions)
         tau = _blend_visible(order, valid, flat, local, layout, tables)
     pruned = prune(order, valid, tau, options.threshold, options.fair_share)
-    order, valid = pruned.order, pruned.valid
-
-    def pick(values: Tensor) -> Tensor:
-        kept = values[order] if len(values) else values.new_zeros((*order.shape, *values.shape[1:]))
-        return kept.masked_fill(~(valid[..., None] if values.ndim > 1 else valid), 0)
-
-    return MergedSamples(
-        heads=pick(flat.heads),
-        planes=pick(flat.planes),
-        ndc=pick(flat.ndc),
-        inverse_t=pick(flat.inverse_t),
-        tau=pick(tau),
-        skipped_before=pruned.skipped_before,
-        valid=valid,
-        skipped_total=pruned.skipped_total,
-        dropped_mass=pruned.dropped_mass,
-        live=per_ray,
-        explained=explained,
-    )
+    order = torch.where(pruned.valid, pruned.order, len(tau))  # empty slots take the zeros behind the samples
+    columns = (flat.heads, flat.planes, flat.ndc, flat.inverse_t, tau)
+    heads, planes, ndc, inverse_t, tau = (torch.cat([x, x.new_zeros(1, *x.shape[1:])])[order] for x in columns)
+    rest = (pruned.skipped_before, pruned.valid, pruned.skipped_total, pruned.dropped_mass)
+    return MergedSamples(heads, planes, ndc, inverse_t, tau, *rest, live=per_ray, explained=explained)
 
 
 @operation("gpu")

@@ -87,12 +87,10 @@ def follow_motion(
     down = (torch.arange(len(motion))[:, None] + first_row + motion[..., 1]).clamp(0, height - 1)
     left, top = right.long().clamp(max=width - 2), down.long().clamp(max=height - 2)
     u, v = right - left, down - top
-
-    def at(image: Tensor) -> Tensor:
-        above, below = (torch.lerp(image[r, left], image[r, left + 1], u) for r in (top, top + 1))
-        return torch.lerp(above, below, v)
-
-    return at(x), at(y)
+    maps = torch.stack([x, y])
+    above, below = (torch.lerp(maps[:, row, left], maps[:, row, left + 1], u) for row in (top, top + 1))
+    moved_x, moved_y = torch.lerp(above, below, v)
+    return moved_x, moved_y
 
 
 @operation()
