@@ -26,6 +26,8 @@ OPS = Path(__file__).parent
 HEADERS = OPS / "cpp"
 FLAGS = ["-std=c++17", "-O3", "-march=native", "-fno-math-errno", "-shared", "-fPIC", f"-I{HEADERS}"]
 """No option that reorders sums, so that results do not depend on the compiler."""
+FORMS = {int: ctypes.c_int64, bool: ctypes.c_bool, float: ctypes.c_float}
+"""What numbers are passed as."""
 ENTRIES_PER_PART = 1024
 """Entries that are looked at to divide sums evenly among threads."""
 
@@ -84,7 +86,7 @@ def library() -> ctypes.CDLL:
 def arguments(values: Iterable[Any]) -> list[Any]:
     """Arguments of the compiled functions, and fields of their structs: addresses of contiguous tensors and of
     ``structs``, null for None, 64-bit integers, 32-bit floats; others unchanged."""
-    forms, passed = {int: ctypes.c_int64, bool: ctypes.c_bool, float: ctypes.c_float}, []
+    passed = []
     for x in values:
         if isinstance(x, Tensor):
             assert x.is_contiguous(), x.stride()
@@ -92,7 +94,7 @@ def arguments(values: Iterable[Any]) -> list[Any]:
         elif x is None or isinstance(x, ctypes.Array):
             passed.append(ctypes.c_void_p(None if x is None else ctypes.addressof(x)))
         else:
-            passed.append(forms[type(x)](x) if type(x) in forms else x)
+            passed.append(FORMS[type(x)](x) if type(x) in FORMS else x)
     return passed
 
 

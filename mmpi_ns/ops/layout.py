@@ -158,7 +158,8 @@ def shaped(x: Tensor, *shape: int, dtype: torch.dtype = torch.float32) -> Tensor
 
 def dense(*tensors: Tensor | None, dtype: torch.dtype = torch.float32) -> list[Any]:
     """``shaped`` for tensors whose shapes ``check_shapes`` has compared; None stays so."""
-    return [x if x is None else shaped(x, *x.shape, dtype=dtype) for x in tensors]
+    assert all(x is None or x.dtype == dtype for x in tensors), f"not all are {dtype}, which is read"
+    return [x if x is None else x.contiguous() for x in tensors]
 
 
 class Shapes(NamedTuple):
