@@ -1,2 +1,2 @@
 """Operations: the inner loops. Each is a folder that defines it in plain torch (``dispatch.operation``), with compiled
-forms of the same signature beside it: ``cpu.py`` with C++, ``gpu.py`` with Triton."""
+forms of the same signature beside it: ``NAME_on_cpu`` calls C++, ``gpu.py`` has Triton's."""

@@ -26,6 +26,8 @@ OPS = Path(__file__).parent
 HEADERS = OPS / "cpp"
 FLAGS = ["-std=c++17", "-O3", "-march=native", "-fno-math-errno", "-shared", "-fPIC", f"-I{HEADERS}"]
 """No option that reorders sums, so that results do not depend on the compiler."""
+FORMS = {int: ctypes.c_int64, bool: ctypes.c_bool, float: ctypes.c_float}
+"""What numbers are passed as."""
 ENTRIES_PER_PART = 1024
 """Entries that are looked at to divide sums evenly among threads."""
 
@@ -82,33 +84,45 @@ def library() -> ctypes.CDLL:
 
 
 def arguments(values: Iterable[Any]) -> list[Any]:
-    """Arguments of the compiled functions: addresses of contiguous tensors, 64-bit integers, 32-bit floats; others
-    unchanged."""
-    forms, passed = {int: ctypes.c_int64, bool: ctypes.c_int64, float: ctypes.c_float}, []
+    """Arguments of the compiled functions, and fields of their structs: addresses of contiguous tensors and of
+    ``structs``, null for None, 64-bit integers, 32-bit floats; others unchanged."""
+    passed = []
     for x in values:
         if isinstance(x, Tensor):
             assert x.is_contiguous(), x.stride()
             passed.append(ctypes.c_void_p(x.data_ptr()))
+        elif x is None or isinstance(x, ctypes.Array):
+            passed.append(ctypes.c_void_p(None if x is None else ctypes.addressof(x)))
         else:
-            passed.append(forms[type(x)](x) if type(x) in forms else x)
+            passed.append(FORMS[type(x)](x) if type(x) in FORMS else x)
     return passed
 
 
-def run_in_parts(name: str, bounds: Sequence[int], before: Iterable[Any], after: Iterable[Any]) -> None:
-    """Calls a compiled function of ``(*before, begin, end, *after)`` for the parts between bounds, each by a thread
-    (``cpp/parts.h``). Parts must not write to one place.
-    """
+def structs(*rows: Sequence[Any]) -> ctypes.Array:
+    """C++ structs of these fields (see ``arguments``), one behind the other; what they point to lives as long."""
+    fields = [tuple(arguments(row)) for row in rows]
+    array = (_struct(*map(type, fields[0])) * len(rows))(*fields)
+    array.held = rows  # type: ignore[attr-defined]
+    return array
+
+
+@functools.cache
+def _struct(*types: type) -> type[ctypes.Structure]:
+    return type("Struct", (ctypes.Structure,), {"_fields_": [(f"_{i}", t) for i, t in enumerate(types)]})
+
+
+def run_in_parts(name: str, bounds: Sequence[int], *values: Any) -> None:
+    """Calls a compiled function of ``(begin, end, *values)`` for the parts between bounds, each by a thread
+    (``cpp/parts.h``). Parts must not write to one place."""
     function = ctypes.c_void_p.in_dll(library(), f"{name}_in_parts").value
     assert function is not None
-    tensors = list(before), list(after)  # which live until all parts are done
-    first, last = (arguments(x) for x in tensors)
-    how = (ctypes.c_int64 * len(bounds))(*bounds), *arguments((len(bounds) - 1, len(first)))
-    ctypes.CFUNCTYPE(None)(function)(*how, *first, *arguments((0, 0)), *last)
+    how = (ctypes.c_int64 * len(bounds))(*bounds), ctypes.c_int64(len(bounds) - 1)
+    ctypes.CFUNCTYPE(None)(function)(*how, *arguments(values))
 
 
-def call_in_parts(name: str, count: int, before: Iterable[Any], after: Iterable[Any], least: int = 256) -> None:
+def call_in_parts(name: str, count: int, *values: Any, least: int = 256) -> None:
     """``run_in_parts`` for even parts of 0..count (see ``even_bounds``)."""
-    run_in_parts(name, even_bounds(count, least), before, after)
+    run_in_parts(name, even_bounds(count, least), *values)
 
 
 def even_bounds(count: int, least: int = 256) -> list[int]:

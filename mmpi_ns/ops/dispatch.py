@@ -47,8 +47,9 @@ _tries_afresh = False
 
 
 class Operation(Generic[P, R]):
-    """A function that is defined in plain torch, with compiled forms of the same name and signature in the modules
-    ``cpu`` (C++) and ``gpu`` (Triton) beside it. A call takes the form that suits the tensors among its arguments.
+    """A function that is defined in plain torch, with compiled forms of the same signature: for a CPU (C++, ``on_cpu``)
+    and for a GPU (Triton, of the same name in the module ``gpu`` beside it). A call takes the form that suits the
+    tensors among its arguments.
 
     Raises:
         ValueError: by a call: the shape of a tensor is not that of its annotation (``layout.py``).
@@ -58,9 +59,15 @@ class Operation(Generic[P, R]):
         self, reference: Callable[P, R], compiled: tuple[Form, ...], check: Callable[..., None] | None
     ) -> None:
         functools.update_wrapper(self, reference)
-        self.reference, self.compiled, self.check = reference, compiled, check
+        self.reference, self.compiled, self.check = reference, list(compiled), check
         self.name, self.signature = reference.__name__, inspect.signature(reference)
         _OPERATIONS[self.name] = self
+
+    def on_cpu(self, form: Callable[P, R]) -> Callable[P, R]:
+        """Makes a function the form for a CPU."""
+        self.compiled.append("cpu")
+        self.cpu = form
+        return form
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
         names = self.signature.parameters
@@ -96,7 +103,7 @@ def operation(*compiled: Form, check: Callable[..., None] | None = None) -> Call
     """Makes an operation of a function.
 
     Args:
-        compiled: the forms that there are besides plain torch.
+        compiled: the forms in modules beside it.
         check: takes the same arguments and raises what their annotations cannot say.
     """
     return lambda reference: Operation(reference, compiled, check)
@@ -140,7 +147,7 @@ def on_device(tensor: Tensor) -> bool:
 def function(name: str, form: Form) -> Any:
     """One form of an operation."""
     of = operations()[name]
-    return of.reference if form == "reference" else getattr(importlib.import_module(f"{of.__module__}.{form}"), name)
+    return getattr(of, form) if form != "gpu" else getattr(importlib.import_module(f"{of.__module__}.gpu"), name)
 
 
 def choose(path: Route) -> None:

@@ -7,77 +7,40 @@ Imported only where Triton is wanted (``dispatch.py``): the package runs without
 # pyright: reportGeneralTypeIssues=false, reportCallIssue=false, reportArgumentType=false
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import torch
 import triton
 import triton.language as tl
-from jaxtyping import Float, Int
+from jaxtyping import Int
 from torch import Tensor
 
-from mmpi_ns.ops.layout import SceneLayout, frame_rows, shaped
+from mmpi_ns.ops.layout import SceneLayout
 
-# Columns of the constants of an MPI: those of ``frame_rows``, and what ``head_rows`` has besides.
-ORIGIN = tl.constexpr(0)
-AXES = tl.constexpr(3)
-EXTENT = tl.constexpr(12)
-STEP = tl.constexpr(16)
-END = tl.constexpr(17)
-LAST = tl.constexpr(18)
-SHARE = tl.constexpr(19)
-S_SCALE = tl.constexpr(20)
-U0 = tl.constexpr(21)
-U_SCALE = tl.constexpr(22)
-V0 = tl.constexpr(23)
-V_SCALE = tl.constexpr(24)
-INTERVAL = tl.constexpr(25)
-FLOATS = tl.constexpr(26)
+# Columns of ``head_rows``.
+ORIGIN, AXES, EXTENT, STEP, END, LAST = map(tl.constexpr, (0, 3, 12, 16, 17, 18))
+SHARE, S_SCALE, U0, U_SCALE, V0, V_SCALE, INTERVAL, FLOATS = map(tl.constexpr, range(19, 27))
 # Columns of a head's layout. BRICK_OF_TILE and TILE_OF_BRICK say where in the same tensor the brick of the head's first
 # tile, and the tile of the first brick of all, are.
-FIRST_TILE = tl.constexpr(0)
-DEPTH = tl.constexpr(1)
-HEIGHT = tl.constexpr(2)
-WIDTH = tl.constexpr(3)
-BIAS = tl.constexpr(4)
-DOWN = tl.constexpr(5)
-ACROSS = tl.constexpr(6)
-BRICK_OF_TILE = tl.constexpr(7)
-TILE_OF_BRICK = tl.constexpr(8)
-INTS = tl.constexpr(9)
+FIRST_TILE, DEPTH, HEIGHT, WIDTH, BIAS, DOWN, ACROSS = map(tl.constexpr, range(7))
+BRICK_OF_TILE, TILE_OF_BRICK, INTS = map(tl.constexpr, range(7, 10))
 
 
-@dataclass(frozen=True)
-class GpuScene:
-    """A layout on the device (``CpuScene`` for the GPU), made once by ``GpuScene.of``."""
-
-    heads: Float[Tensor, "K 26"]
-    grids: Int[Tensor, "N"]
+def grids_of(layout: SceneLayout) -> Int[Tensor, "N"]:
     """Where the texels of every head are, for ``row_of`` and ``texel_of``: a row of numbers for each head, then the
     brick of every tile and the tile of every brick."""
-    biases: Float[Tensor, "P"]
-    cube: Float[Tensor, "12"]
-
-    @staticmethod
-    def of(layout: SceneLayout) -> GpuScene:
-        return layout.once("gpu", _pack)
+    return layout.once("gpu", _pack)
 
 
-def _pack(layout: SceneLayout) -> GpuScene:
-    device, planes = layout.frames.origins.device, [m.planes for m in layout.mpis]
-    grids, start = layout.grids, layout.num_heads * INTS.value
+def _pack(layout: SceneLayout) -> Tensor:
+    device, grids, start = layout.frames.origins.device, layout.grids, layout.num_heads * INTS.value
     tiles, places = grids[0].tiles, grids[0].places
     rows = [
         (g.first_tile, g.depth, g.height, g.width, b, g.down, g.across, start + g.first_tile, start + len(tiles))
         for g, b in zip(grids, layout.bias_starts(), strict=True)
     ]
     head = torch.tensor(rows, dtype=torch.int32, device=device).reshape(-1)
-    return GpuScene(
-        shaped(torch.cat([frame_rows(layout.frames), layout.head_rows[:, 2:]], -1), len(planes), FLOATS.value),
-        torch.cat([head, tiles.to(device), places.to(device, torch.int32)]),
-        shaped(torch.cat(layout.biases).to(device, torch.float32), sum(planes)),
-        shaped(layout.cube_row, 12),
-    )
+    return torch.cat([head, tiles.to(device), places.to(device, torch.int32)])
 
 
 def block_size(size: int, device: torch.device) -> int:
@@ -180,6 +143,18 @@ def nearest(coordinate, size):
     odd = down - 2 * tl.floor(0.5 * down)
     up = ((position - down > 0.5) | ((position - down == 0.5) & (odd == 1))).to(tl.float32)
     return (down + up).to(tl.int64)
+
+
+@triton.jit
+def read_taps(values, positions, shares, number, inside, channels, column, TAPS: tl.constexpr):
+    """Sums over taps of share times row of a table."""
+    raw = number[:, None] * column * 0.0
+    for tap in tl.static_range(TAPS):
+        row = tl.load(positions + number * TAPS + tap, inside, 0).to(tl.int64)
+        share = tl.load(shares + number * TAPS + tap, inside, 0.0)
+        read = tl.load(values + row[:, None] * channels + column, inside[:, None] & (column < channels), 0.0)
+        raw += share[:, None] * read
+    return raw
 
 
 # Arithmetic that avoids cancellation ---------------------------------------------------------

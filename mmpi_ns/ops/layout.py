@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import functools
 import math
 from collections.abc import Callable, Iterable, Mapping
@@ -13,6 +14,7 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
+from mmpi_ns.ops.build import structs
 from mmpi_ns.scene.geometry import Cube, Frames
 from mmpi_ns.scene.plan import MPIPlan, ScenePlan
 from mmpi_ns.scene.texels import BRICK, TexelGrid
@@ -30,10 +32,9 @@ class Tables(NamedTuple):
     touched: UInt8[Tensor, "T"]
     """1 where a training ray read the row."""
 
-    def of_rows(self, count: int) -> Tables:
+    def dense(self) -> list[Tensor]:
         """The tables as compiled code reads them."""
-        density, reliability = (shaped(x, count, 1) for x in (self.density, self.reliability))
-        return Tables(density, reliability, shaped(self.touched, count, dtype=torch.uint8))
+        return [*dense(self.density, self.reliability), *dense(self.touched, dtype=torch.uint8)]
 
 
 class Places(NamedTuple):
@@ -78,14 +79,9 @@ class SceneLayout:
         return self.packed[name] if name in self.packed else self.packed.setdefault(name, make(self))
 
     @property
-    def num_rows(self) -> int:
-        """Rows of the pooled tables."""
-        return len(self.grids[0].places) * BRICK
-
-    @property
     def sizes(self) -> dict[str, int]:
         """What letters in shapes stand for: rows of the tables, heads and MPIs."""
-        return {"T": self.num_rows, "H": self.num_heads, "K": len(self.mpis)}
+        return {"T": len(self.grids[0].places) * BRICK, "H": self.num_heads, "K": len(self.mpis)}
 
     @cached_property
     def most_samples(self) -> int:
@@ -96,15 +92,20 @@ class SceneLayout:
         return planes + int(2 * math.hypot(*(cube.upper - cube.lower).tolist()) / cube.step) + 2
 
     @cached_property
-    def head_rows(self) -> Float[Tensor, "K 9"]:
-        """Of each MPI: disparity between planes and of the last one, 1 - near / far, scale of the NDC s, lower end and
-        scale of u and of v, interval."""
+    def head_rows(self) -> Float[Tensor, "K 26"]:
+        """Of each MPI: ``frame_rows``, 1 - near / far, scale of NDC s, lower end and scale of u and of v, interval."""
         rows = []
-        for k, (mpi, step) in enumerate(zip(self.mpis, self.frames.disparity_steps.tolist(), strict=True)):
+        for k, mpi in enumerate(self.mpis):
             u0, u1, v0, v1 = mpi.extent
-            depth = (step, mpi.last_disparity, mpi.depth_share, 2 * mpi.near / mpi.depth_share)
+            depth = (mpi.depth_share, 2 * mpi.near / mpi.depth_share)
             rows.append((*depth, u0, 2 / (u1 - u0), v0, 2 / (v1 - v0), self.interval(k)))
-        return torch.tensor(rows, dtype=torch.float32, device=self.frames.origins.device).reshape(len(rows), 9)
+        numbers = torch.tensor(rows, dtype=torch.float32, device=self.frames.origins.device).reshape(len(rows), 7)
+        return torch.cat([frame_rows(self.frames), numbers], -1)
+
+    @cached_property
+    def bias_row(self) -> Float[Tensor, "P"]:
+        """Biases of all planes of all MPIs."""
+        return torch.cat(self.biases).to(self.frames.origins.device, torch.float32)
 
     @cached_property
     def cube_row(self) -> Float[Tensor, "12"]:
@@ -115,8 +116,20 @@ class SceneLayout:
             numbers = [*corner, *extent, cube.step, self.cube_bias, self.cube_interval, *cube.upper.tolist()]
         return torch.tensor(numbers, dtype=torch.float32, device=self.frames.origins.device)
 
+    @cached_property
+    def cpu_grids(self) -> ctypes.Array:
+        """Texels of all heads for C++: ``Grid`` of ``cpp/scene.h``."""
+        assert self.grids[0].tiles.dtype == torch.int32
+        sizes = [(g.depth, g.height, g.width, g.down, g.across, g.first_tile, g.tiles) for g in self.grids]
+        return structs(*((*each, bias) for each, bias in zip(sizes, self.bias_starts(), strict=True)))
+
+    def cpu_scene(self, tables: Tables) -> ctypes.Array:
+        """The layout and its tables for C++: a ``Scene`` of ``cpp/scene.h``."""
+        sizes = (len(self.mpis), self.num_heads, float(self.content_near))
+        return structs((*sizes, self.head_rows, self.cpu_grids, self.bias_row, self.cube_row, *tables.dense()))
+
     def bias_starts(self) -> list[int]:
-        """Where each head's planes begin in the list of all biases."""
+        """Where each head's planes begin in ``bias_row``."""
         return [sum(len(b) for b in self.biases[:k]) for k in range(self.num_heads)]
 
     def interval(self, k: int) -> float:
@@ -134,13 +147,19 @@ def frame_rows(frames: Frames) -> Float[Tensor, "K 19"]:
     """Of each MPI: origin, axes, extent, disparity between planes and of the last one, number of the first one."""
     columns = (frames.disparity_steps, frames.last_disparities, frames.num_planes - 1)
     parts = (frames.origins, frames.axes.flatten(1), frames.extents, *(x[:, None] for x in columns))
-    return torch.cat([x.float() for x in parts], -1).contiguous()
+    return torch.cat([x.float() for x in parts], -1)
 
 
 def shaped(x: Tensor, *shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
     """A tensor as compiled code reads it, which checks nothing itself: contiguous, of this shape and type."""
     assert x.shape == shape and x.dtype == dtype, f"{list(x.shape)} {x.dtype} where {list(shape)} {dtype} is read"
     return x.contiguous()
+
+
+def dense(*tensors: Tensor | None, dtype: torch.dtype = torch.float32) -> list[Any]:
+    """``shaped`` for tensors whose shapes ``check_shapes`` has compared; None stays so."""
+    assert all(x is None or x.dtype == dtype for x in tensors), f"not all are {dtype}, which is read"
+    return [x if x is None else x.contiguous() for x in tensors]
 
 
 class Shapes(NamedTuple):

@@ -11,7 +11,7 @@ from gather_batches import batch, in_float32, parts_of, with_gradients
 from random_fields import bundle, random_field, random_rays
 
 from mmpi_ns.field.samples import metadata_of, places_of
-from mmpi_ns.ops.gather import Taps, cpu, gather_places, gather_taps
+from mmpi_ns.ops.gather import Taps, gather_places, gather_taps
 from mmpi_ns.rendering.sampler import MMPISampler
 
 CHANNELS = (3, 8, 9, 16, 20)
@@ -103,7 +103,7 @@ def test_values_that_do_not_train_get_no_gradient_and_weights_do():
 
 @pytest.mark.parametrize("threads", [1, 2, 5])
 def test_bits_do_not_depend_on_threads(threads, monkeypatch):
-    monkeypatch.setattr(cpu, "AT_LEAST", 1000)
+    monkeypatch.setattr("mmpi_ns.ops.gather.AT_LEAST", 1000)
     given = in_float32(batch(9, rays=1500))
     upstream = [torch.randn(1500, n, generator=torch.Generator().manual_seed(1)) for n in (9, 1, 3, 3)]
     one = with_gradients(gather_taps, given, upstream)

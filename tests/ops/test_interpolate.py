@@ -10,7 +10,6 @@ from compiled import both, compiled, normal  # noqa: F401
 
 from mmpi_ns.ops.interpolate import (
     Table,
-    cpu,
     index_rows,
     interpolate,
     interpolate_densely,
@@ -235,7 +234,7 @@ def test_samples_by_head_are_those_of_loops(counted):
 
 @pytest.mark.parametrize("threads", [2, 3, 7])
 def test_bits_of_all_operations_on_rows_do_not_depend_on_threads(threads, monkeypatch):
-    monkeypatch.setattr(cpu, "AT_LEAST", 1000)
+    monkeypatch.setattr("mmpi_ns.ops.interpolate.AT_LEAST", 1000)
     rows = torch.randint(0, 2**20, (20_000,), generator=torch.Generator().manual_seed(1))[:, None] * 8 + torch.arange(4)
     values, weights, layout = normal(20_000, 9), normal(20_000, 4, seed=2).abs(), bricked_field().layout
     heads = torch.arange(20_000) % len(layout.mpis)

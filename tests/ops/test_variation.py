@@ -11,8 +11,7 @@ from compiled import compiled, normal  # noqa: F401
 from hand_made import make_mpi
 
 from mmpi_ns.field.mmpi_field import MMPIField
-from mmpi_ns.ops.variation import total_variation
-from mmpi_ns.ops.variation.cpu import PART
+from mmpi_ns.ops.variation import PART, total_variation
 from mmpi_ns.scene.plan import CubePlan, ScenePlan
 from mmpi_ns.scene.texels import BRICK
 

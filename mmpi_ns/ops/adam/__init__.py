@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from mmpi_ns.ops.build import call_in_parts
 from mmpi_ns.ops.dispatch import operation
 from mmpi_ns.scene.texels import BRICK
 
@@ -24,7 +25,7 @@ class AdamConstants(NamedTuple):
     """With the first moment's correction: lr / (1 - beta1^step)."""
 
 
-@operation("cpu", "gpu")
+@operation("gpu")
 def adam_rows(
     param: Float[Tensor, "T C"],
     moments: Float[Tensor, "T 2 C"],
@@ -61,3 +62,11 @@ def adam(
     delta = mean / square.sqrt().div_(correction).add_(eps)
     delta = torch.where(touched, delta, torch.zeros_like(delta))
     return param - delta.mul_(rate), torch.stack([mean, square], 1).to(moments.dtype)
+
+
+@adam_rows.on_cpu
+def adam_rows_on_cpu(param: Tensor, moments: Tensor, rows: Tensor, grad: Tensor, constants: AdamConstants) -> None:
+    if not param.is_contiguous() or moments.dtype != torch.bfloat16:
+        return adam_rows.reference(param, moments, rows, grad, constants)
+    step = (rows.contiguous(), param.shape[1], grad.contiguous(), param, moments, *map(float, constants))
+    call_in_parts("mmpi_adam_rows", len(rows), *step, least=4096)

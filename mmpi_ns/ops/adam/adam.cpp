@@ -22,13 +22,9 @@ uint16_t narrow(float x) {
     return uint16_t((bits + 0x7fff + ((bits >> 16) & 1)) >> 16);
 }
 
-} // namespace
-
-extern "C" {
-
 // Adam on distinct rows; the empty brick, and entries whose gradient is exactly 0, are left alone. `moments`
 // [T, 2, channels], means and uncentred variances, are in bfloat16.
-void mmpi_adam_rows(const int64_t* rows, int64_t begin, int64_t end, int64_t channels, const float* grad, float* param,
+void mmpi_adam_rows(int64_t begin, int64_t end, const int64_t* rows, int64_t channels, const float* grad, float* param,
                     uint16_t* moments, float beta1, float beta2, float correction, float eps, float rate) {
     for (int64_t i = begin; i < end; i++) {
         if (i + AHEAD < end) {
@@ -56,6 +52,7 @@ void mmpi_adam_rows(const int64_t* rows, int64_t begin, int64_t end, int64_t cha
             step_row(channels);
     }
 }
-}
+
+} // namespace
 
 IN_PARTS(mmpi_adam_rows)

@@ -12,7 +12,7 @@ typedef uint16_t ShortLanes __attribute__((vector_size(32)));
 
 struct BakedScene {
     int64_t num_mpis, channels;
-    const Frame* frames;
+    const Mpi* mpis;
     const Stack* stacks;
     const float* const* through; // of each MPI: e^-tau at codes 0, 1/8, ...
     const Column* columns;
@@ -65,7 +65,7 @@ struct Bytes {
     const Lanes low, range, low_twice, range_twice;
 
     Bytes(const BakedScene& baked, float threshold, float* peaks)
-        : baked(baked), scene{baked.num_mpis, baked.num_mpis, 0, nullptr, baked.frames}, columns(baked.columns),
+        : baked(baked), scene{baked.num_mpis, baked.num_mpis, 0, baked.mpis}, columns(baked.columns),
           stacks(baked.stacks), channels(baked.channels), threshold(threshold), peaks(peaks), low(load(baked.low)),
           range(load(baked.step)), low_twice(join(lower_half(low), lower_half(low))),
           range_twice(join(lower_half(range), lower_half(range))) {}
@@ -139,15 +139,12 @@ struct Bytes {
     }
 };
 
-} // namespace
-
-extern "C" {
-
 // Where peaks are asked for, the largest weight that reads a texel is written there.
-void mmpi_show_baked(const BakedScene* scene, const Rays* rays, float threshold, float* peaks, int64_t begin,
-                     int64_t end, const Outputs* to) {
+void mmpi_show_baked(int64_t begin, int64_t end, const BakedScene* scene, const Rays* rays, float threshold,
+                     float* peaks, const Outputs* to) {
     show(Bytes(*scene, threshold, peaks), *rays, begin, end, *to);
 }
-}
+
+} // namespace
 
 IN_PARTS(mmpi_show_baked)

@@ -2,11 +2,11 @@
 #include "layers.h"
 #include "parts.h"
 
-extern "C" {
+namespace {
 
 // Colours of rays [begin, end): the network sees the means of what each gathered, and the direction.
-void mmpi_shade_baked(const Layer* layers, int64_t num_layers, int64_t channels, int64_t octaves, float bound,
-                      const float* sums, const float* mass, const float* directions, int64_t begin, int64_t end,
+void mmpi_shade_baked(int64_t begin, int64_t end, const Layer* layers, int64_t num_layers, int64_t channels,
+                      int64_t octaves, float bound, const float* sums, const float* mass, const float* directions,
                       float* rgb) {
     std::vector<Lanes> now, next;
     for (int64_t first = begin; first < end; first += WIDTH) {
@@ -30,6 +30,7 @@ void mmpi_shade_baked(const Layer* layers, int64_t num_layers, int64_t channels,
         }
     }
 }
-}
+
+} // namespace
 
 IN_PARTS(mmpi_shade_baked)

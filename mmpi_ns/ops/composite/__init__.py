@@ -6,15 +6,18 @@ log(1 - alpha), while tau is an ordinary number. All arithmetic is float32 or wi
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from mmpi_ns.ops.build import call_in_parts
 from mmpi_ns.ops.dispatch import operation
 from mmpi_ns.ops.ends import HALF
-from mmpi_ns.ops.layout import shaped
+from mmpi_ns.ops.layout import dense
 
 
 def exclusive_cumsum(values: Float[Tensor, "R S"]) -> Float[Tensor, "R S"]:
@@ -35,14 +38,7 @@ class Composite:
     """What passes the whole ray."""
 
 
-def checked(tau: Tensor, valid: Tensor, skipped_before: Tensor, skipped_total: Tensor) -> tuple[Tensor, ...]:
-    """The arguments of ``composite_weights`` as the kernels read them."""
-    shape = tau.shape
-    flags = shaped(valid, *shape, dtype=torch.bool)
-    return shaped(tau, *shape), flags, shaped(skipped_before, *shape), shaped(skipped_total, shape[0], 1)
-
-
-@operation("cpu", "gpu")
+@operation("gpu")
 def composite_weights(
     tau: Float[Tensor, "R S"],
     valid: Bool[Tensor, "R S"],
@@ -67,6 +63,37 @@ def composite_weights(
     weights = torch.exp(log_transmittance) * -torch.expm1(-tau)
     weights = torch.where(valid, weights, torch.zeros_like(weights))
     depth = tau.sum(-1, keepdim=True) + skipped_total
+    return Composite(weights, -torch.expm1(-depth), torch.exp(-depth))
+
+
+class _Compiled(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, run: Callable[..., None], tau: Tensor, valid: Tensor, before: Tensor, total: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        weights, depth = torch.empty_like(tau), torch.empty_like(total)
+        run("mmpi_composite", *tau.shape, tau, valid, before, total, weights, depth)
+        ctx.run = run
+        ctx.save_for_backward(tau, valid, before, weights)
+        return weights, depth
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
+        tau, *_ = saved = ctx.saved_tensors
+        grad = torch.empty_like(tau)
+        ctx.run("mmpi_composite_back", *tau.shape, *saved, *(g.contiguous() for g in grad_outputs), grad)
+        return None, grad, None, None, None
+
+
+def composited(run: Callable[..., None], tau: Tensor, valid: Tensor, before: Tensor, total: Tensor) -> Composite:
+    """``composite_weights`` by a compiled form.
+
+    Args:
+        run: calls the function "mmpi_composite" or "mmpi_composite_back" of numbers of rays and slots, and tensors.
+        tau, valid, before, total: arguments of ``composite_weights``.
+    """
+    tensors = (*dense(tau), *dense(valid, dtype=torch.bool), *dense(before, total))
+    weights, depth = _Compiled.apply(run, *tensors)  # type: ignore[misc]
     return Composite(weights, -torch.expm1(-depth), torch.exp(-depth))
 
 
@@ -101,3 +128,8 @@ def winning_heads(weights: Float[Tensor, "R S"], heads: Int[Tensor, "R S"], num_
     """The head that gives each ray most of its weight, as nerfstudio's images take it; the first of equals."""
     mass = weights.new_zeros(len(weights), num_heads).scatter_add(1, heads, weights)
     return mass.argmax(-1, keepdim=True).to(weights.dtype)
+
+
+@composite_weights.on_cpu
+def composite_weights_on_cpu(tau: Tensor, valid: Tensor, skipped_before: Tensor, skipped_total: Tensor) -> Composite:
+    return composited(call_in_parts, tau, valid, skipped_before, skipped_total)

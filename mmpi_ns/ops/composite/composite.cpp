@@ -42,13 +42,9 @@ struct Ray {
     }
 };
 
-} // namespace
-
-extern "C" {
-
 // Rays [begin, end): weights [R, S], and e^-depth of the whole ray [R].
-void mmpi_composite(const float* tau, const bool* valid, const float* skipped_before, const float* skipped_total,
-                    int64_t begin, int64_t end, int64_t slots, float* weights, float* depth) {
+void mmpi_composite(int64_t begin, int64_t end, int64_t slots, const float* tau, const bool* valid,
+                    const float* skipped_before, const float* skipped_total, float* weights, float* depth) {
     Ray ray(slots);
     for (int64_t r = begin; r < end; r++) {
         const int64_t first = r * slots;
@@ -63,9 +59,9 @@ void mmpi_composite(const float* tau, const bool* valid, const float* skipped_be
 }
 
 // Gradient of the optical depths from that of the weights and of the whole depth.
-void mmpi_composite_back(const float* tau, const bool* valid, const float* skipped_before, const float* weights,
-                         const float* grad_weights, const float* grad_depth, int64_t begin, int64_t end, int64_t slots,
-                         float* grad) {
+void mmpi_composite_back(int64_t begin, int64_t end, int64_t slots, const float* tau, const bool* valid,
+                         const float* skipped_before, const float* weights, const float* grad_weights,
+                         const float* grad_depth, float* grad) {
     Ray ray(slots);
     for (int64_t r = begin; r < end; r++) {
         const int64_t first = r * slots;
@@ -81,7 +77,8 @@ void mmpi_composite_back(const float* tau, const bool* valid, const float* skipp
         }
     }
 }
-}
+
+} // namespace
 
 IN_PARTS(mmpi_composite)
 IN_PARTS(mmpi_composite_back)

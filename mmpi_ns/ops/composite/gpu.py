@@ -4,14 +4,11 @@
 # pyright: reportGeneralTypeIssues=false, reportCallIssue=false, reportArgumentType=false
 from __future__ import annotations
 
-from typing import Any
-
-import torch
 import triton
 import triton.language as tl
 from torch import Tensor
 
-from mmpi_ns.ops.composite import Composite, checked
+from mmpi_ns.ops.composite import Composite, composited
 from mmpi_ns.ops.gpu_scene import block_size, launch, one_minus_exp
 
 SLOTS = 2048
@@ -62,33 +59,14 @@ def composite_backward_kernel(
     tl.store(tau_grads + at, tl.where(has, grad, 0.0), inside)
 
 
-def _shape(slots: int, device: torch.device) -> tuple[int, int]:
-    """Rays and slots of a program; few widths, each of which is compiled."""
-    width = triton.next_power_of_2(max(16, slots))
-    return max(1, block_size(SLOTS, device) // width), width  # type: ignore[return-value]
-
-
-class _Weights(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, tau: Tensor, valid: Tensor, before: Tensor, total: Tensor) -> tuple[Tensor, Tensor]:
-        num_rays, slots = tau.shape
-        weights, depth = torch.empty_like(tau), torch.empty_like(total)
-        rays, width = _shape(slots, tau.device)
-        tensors = (tau, valid, before, total, weights, depth)
-        launch(composite_kernel, num_rays, rays, *tensors, num_rays, slots, RAYS=rays, SLOTS=width)
-        ctx.save_for_backward(tau, valid, before, weights)
-        return weights, depth
-
-    @staticmethod
-    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor, None, None, None]:
-        tau, *_ = saved = ctx.saved_tensors
-        num_rays, slots = tau.shape
-        grad, (rays, width) = torch.empty_like(tau), _shape(slots, tau.device)
-        tensors = (*saved, *(g.contiguous() for g in grad_outputs), grad)
-        launch(composite_backward_kernel, num_rays, rays, *tensors, num_rays, slots, RAYS=rays, SLOTS=width)
-        return grad, None, None, None
+KERNELS = {"mmpi_composite": composite_kernel, "mmpi_composite_back": composite_backward_kernel}
 
 
 def composite_weights(tau: Tensor, valid: Tensor, skipped_before: Tensor, skipped_total: Tensor) -> Composite:
-    weights, depth = _Weights.apply(*checked(tau, valid, skipped_before, skipped_total))  # type: ignore[misc]
-    return Composite(weights, -torch.expm1(-depth), torch.exp(-depth))
+    width = triton.next_power_of_2(max(16, tau.shape[1]))  # few widths, each of which is compiled
+    rays = max(1, block_size(SLOTS, tau.device) // width)
+
+    def run(name: str, num_rays: int, slots: int, *tensors: Tensor) -> None:
+        launch(KERNELS[name], num_rays, rays, *tensors, num_rays, slots, RAYS=rays, SLOTS=width)
+
+    return composited(run, tau, valid, skipped_before, skipped_total)

@@ -52,11 +52,11 @@ struct Crossing {
 
     Crossing() = default;
 
-    Crossing(const Frame& frame, const Packet& rays) {
+    Crossing(const Mpi& mpi, const Packet& rays) {
         for (int a = 0; a < 3; a++) {
-            const float* axis = frame.axes[a];
-            origin[a] = axis[0] * (rays.origin[0] - frame.origin[0]) + axis[1] * (rays.origin[1] - frame.origin[1]) +
-                        axis[2] * (rays.origin[2] - frame.origin[2]);
+            const float* axis = mpi.axes[a];
+            origin[a] = axis[0] * (rays.origin[0] - mpi.origin[0]) + axis[1] * (rays.origin[1] - mpi.origin[1]) +
+                        axis[2] * (rays.origin[2] - mpi.origin[2]);
             const int i = a < 2; // which product is rounded: as in all scenes trained so far, to the bit
             direction[a] = axis[i] * rays.direction[i] + axis[1 - i] * rays.direction[1 - i] + axis[2] * rays.direction[2];
         }
@@ -66,23 +66,23 @@ struct Crossing {
         u = direction[0] / depth, v = direction[1] / depth;
         u_slope = origin[0] - oz * u, v_slope = origin[1] - oz * v;
         // Half-spaces p w <= q in disparity in which a plane is live.
-        const float* e = frame.extent;
+        const float* e = mpi.extent;
         const Lanes p[6] = {dz * rays.near + oz, -(dz + oz * inverse_far), u_slope, -u_slope, v_slope, -v_slope};
         const Lanes q[6] = {splat(1), -inverse_far, e[1] - u, u - e[0], e[3] - v, v - e[2]};
         Mask never{};
-        Lanes low{}, high = splat(frame.last);
+        Lanes low{}, high = splat(mpi.last);
         for (int i = 0; i < 6; i++) {
-            const Lanes slope = p[i] * frame.step, rest = q[i] - p[i] * frame.end;
+            const Lanes slope = p[i] * mpi.step, rest = q[i] - p[i] * mpi.end;
             const Lanes bound = rest / pick(slope == 0, splat(1), slope);
             high = pick(slope > 0, least(bound, high), high);
             low = pick(slope < 0, most(bound, low), low);
             never |= (slope == 0) & (rest < 0);
         }
         high = pick(never, splat(-1), floored(most(high, splat(-1))));
-        low = pick(never, splat(frame.last + 1), -floored(-least(low, splat(frame.last + 1))));
+        low = pick(never, splat(mpi.last + 1), -floored(-least(low, splat(mpi.last + 1))));
         const auto live = [&](Lanes m) {
-            const Lanes w = m * frame.step + frame.end;
-            Mask all = (w * oz < 1) & (m >= 0) & (m <= frame.last);
+            const Lanes w = m * mpi.step + mpi.end;
+            Mask all = (w * oz < 1) & (m >= 0) & (m <= mpi.last);
             for (int i = 0; i < 6; i++) all &= p[i] * w <= q[i];
             return all;
         };
@@ -133,7 +133,7 @@ struct Crossings {
     void cross(const Scene& scene, const Rays& rays, const Packet& packet) {
         const int64_t K = scene.num_mpis, H = scene.num_heads;
         mpis.resize(K);
-        for (int64_t k = 0; k < K; k++) mpis[k] = Crossing(scene.frames[k], packet);
+        for (int64_t k = 0; k < K; k++) mpis[k] = Crossing(scene.mpis[k], packet);
         cube = H > K ? CubeCrossing(*scene.cube, packet) : CubeCrossing();
         if (rays.priorities) choose(rays.priorities, packet);
         for (int64_t h = 0; h < H && rays.heads; h++)
@@ -163,13 +163,13 @@ struct Crossings {
     Mask sees_all(const Scene& scene) const {
         Mask entered{}, endless{};
         for (size_t k = 0; k < mpis.size(); k++) {
-            const Frame& frame = scene.frames[k];
+            const Mpi& mpi = scene.mpis[k];
             const Mask live = mpis[k].count > 0;
             // One plane before the first live one bounds the entry; behind the camera: the ray starts inside.
-            const Lanes w = least(real(mpis[k].first + 1), splat(frame.last)) * frame.step + frame.end;
+            const Lanes w = least(real(mpis[k].first + 1), splat(mpi.last)) * mpi.step + mpi.end;
             const Lanes bent = w * mpis[k].origin[2];
             entered |= live & ((bent >= 1) | (w * mpis[k].direction[2] / (1 - bent) * scene.content_near >= 1));
-            if (frame.end == 0) endless |= live & (mpis[k].first - mpis[k].count < 0);
+            if (mpi.end == 0) endless |= live & (mpis[k].first - mpis[k].count < 0);
         }
         return entered & endless;
     }

@@ -68,6 +68,7 @@ inline Lanes load(const float* from) {
 }
 
 inline void store(float* to, Lanes x) { __builtin_memcpy(to, &x, sizeof x); }
+inline void store(int32_t* to, IntLanes x) { __builtin_memcpy(to, &x, sizeof x); }
 
 // e^x to 2 ulp for x in [-87, 88], clamped there (Cephes' expf).
 inline Lanes exp_lanes(Lanes x) {

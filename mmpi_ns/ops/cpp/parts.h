@@ -6,10 +6,7 @@
 #include <cstdint>
 #include <mutex>
 #include <thread>
-#include <tuple>
-#include <type_traits>
 #include <unistd.h>
-#include <utility>
 
 #if defined(__x86_64__) || defined(__i386__)
 inline void relax() { __builtin_ia32_pause(); }
@@ -99,25 +96,11 @@ inline Crew& crew() {
 }
 
 template <auto F> struct InParts;
-template <class... A, void (*F)(A...)> struct InParts<F> {
-    template <size_t I> static void put(std::tuple<A...>& all, size_t at, int64_t value) {
-        if constexpr (std::is_same_v<std::tuple_element_t<I, std::tuple<A...>>, int64_t>)
-            if (I == at) std::get<I>(all) = value;
-    }
-    template <size_t... I>
-    static void put(std::tuple<A...>& all, size_t at, int64_t value, std::index_sequence<I...>) {
-        (put<I>(all, at, value), ...);
-    }
-    // F for all parts between bounds, which take the place of arguments `at` and `at` + 1.
-    static void run(const int64_t* bounds, int64_t parts, int64_t at, A... arguments) {
-        const std::tuple<A...> all(arguments...);
-        crew().run(parts, [&](int64_t part) {
-            std::tuple<A...> own = all;
-            for (int64_t end : {0, 1}) put(own, size_t(at + end), bounds[part + end], std::index_sequence_for<A...>());
-            std::apply(F, own);
-        });
+template <class... A, void (*F)(int64_t, int64_t, A...)> struct InParts<F> {
+    static void run(const int64_t* bounds, int64_t parts, A... arguments) {
+        crew().run(parts, [&](int64_t part) { F(bounds[part], bounds[part + 1], arguments...); });
     }
 };
 
-// Makes an operation callable in parts (ops/build.run_in_parts).
+// Makes an operation of (begin, end, ...) callable for all parts between bounds (ops/build.run_in_parts).
 #define IN_PARTS(NAME) extern "C" { void* NAME##_in_parts = reinterpret_cast<void*>(&InParts<&NAME>::run); }

@@ -1,23 +1,18 @@
-// What the kernels know of a plan: MPIs first, the cube last. Filled by ops/cpu_scene.py, field by field.
+// What the kernels know of a plan: MPIs first, the cube last. Filled by ops/layout.py, field by field.
 #pragma once
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
 
+// Of an MPI (layout.head_rows).
 struct Mpi {
-    float step;        // disparity between neighbouring planes
-    float end;         // disparity of the last plane, 1 / far; 0 at infinity
-    float share;       // 1 - near / far
-    float s_scale;     // 2 * near / share: ndc s = 1 - (w - end) * s_scale
-    float u0, u_scale; // ndc u = (u - u0) * u_scale - 1
+    float origin[3], axes[3][3], extent[4]; // u0, u1, v0, v1
+    float step, end, last; // disparity between planes and of the last one, 1 / far (0 at infinity); number of the first one
+    float share;           // 1 - near / far
+    float s_scale;         // 2 * near / share: ndc s = 1 - (w - end) * s_scale
+    float u0, u_scale;     // ndc u = (u - u0) * u_scale - 1
     float v0, v_scale;
     float interval; // factor on softplus
-};
-
-// Where an MPI is (layout.frame_rows).
-struct Frame {
-    float origin[3], axes[3][3], extent[4]; // u0, u1, v0, v1
-    float step, end, last;                  // disparity between planes and of the last one; number of the first one
 };
 
 // A head's texels, in bricks of 8 x 8 on one plane (texels.py).
@@ -53,7 +48,6 @@ struct Scene {
     int64_t num_mpis, num_heads; // heads = MPIs, and the cube where there is one
     float content_near;          // distance to the first content
     const Mpi* mpis;
-    const Frame* frames;
     const Grid* grids;
     const float* biases;
     const Cube* cube; // null without one

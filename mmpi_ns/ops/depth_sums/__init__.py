@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from mmpi_ns.ops.build import call_in_parts
 from mmpi_ns.ops.composite import exclusive_cumsum
 from mmpi_ns.ops.dispatch import operation
+from mmpi_ns.ops.layout import dense
 
 REACH = 3.0
 """Widths within which a sample reaches the target of its ray."""
@@ -26,7 +28,7 @@ class DepthSums(NamedTuple):
     """Whether a sample lies within three widths of the target, and there is one."""
 
 
-@operation("cpu")
+@operation()
 def depth_sums(
     weights: Float[Tensor, "R S"],
     inverse_t: Float[Tensor, "R S"],
@@ -55,3 +57,30 @@ def depth_sums(
     window = torch.where(valid, torch.exp(-0.5 * scaled.square().clamp(max=120)), torch.zeros_like(scaled))
     reached = (valid & (scaled.abs() < REACH)).any(-1) & (targets[:, 0] > 0)
     return DepthSums(spread, (weights * window).sum(-1), reached)
+
+
+class _DepthSums(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, scale: float, valid: Tensor, *floats: Tensor) -> tuple[Tensor, ...]:
+        rays, slots = valid.shape
+        arrays = [*dense(valid, dtype=torch.bool), *dense(*floats)]
+        sums = [*torch.empty(2, rays), torch.empty(rays, dtype=torch.bool)]
+        call_in_parts("mmpi_depth_sums", rays, slots, scale, *arrays, *sums)
+        ctx.save_for_backward(*arrays)
+        ctx.scale = scale
+        ctx.mark_non_differentiable(sums[2])
+        return tuple(sums)
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
+        valid, weights, *_ = saved = ctx.saved_tensors
+        gradient = torch.empty_like(weights)
+        call_in_parts("mmpi_depth_sums_back", *valid.shape, ctx.scale, *saved, *dense(*grad_outputs[:2]), gradient)
+        return None, None, gradient, None, None, None
+
+
+@depth_sums.on_cpu
+def depth_sums_on_cpu(
+    weights: Tensor, inverse_t: Tensor, valid: Tensor, intervals: Tensor, targets: Tensor, scale: float
+) -> DepthSums:
+    return DepthSums(*_DepthSums.apply(scale, valid, weights, inverse_t, intervals, targets))  # type: ignore[misc]

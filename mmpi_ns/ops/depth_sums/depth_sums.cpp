@@ -14,14 +14,10 @@ float position(float inverse_t, float scale) { return 1 / (1 + scale * inverse_t
 
 float window(float scaled) { return scaled * scaled < FADES ? std::exp(-0.5f * scaled * scaled) : 0; }
 
-} // namespace
-
-extern "C" {
-
 // Rays [begin, end): spread, mass, and whether a sample is near the target.
-void mmpi_depth_sums(const float* weights, const float* inverse_t, const bool* valid, const float* intervals,
-                     const float* targets, int64_t begin, int64_t end, int64_t slots, float scale, float* spread,
-                     float* mass, bool* reached) {
+void mmpi_depth_sums(int64_t begin, int64_t end, int64_t slots, float scale, const bool* valid, const float* weights,
+                     const float* inverse_t, const float* intervals, const float* targets, float* spread, float* mass,
+                     bool* reached) {
     for (int64_t r = begin; r < end; r++) {
         const float target = targets[2 * r], width = targets[2 * r + 1];
         // In double: differences of sums that agree in most digits where a ray ends in one surface.
@@ -46,9 +42,9 @@ void mmpi_depth_sums(const float* weights, const float* inverse_t, const bool* v
 }
 
 // Gradient of the weights from those of spread and mass.
-void mmpi_depth_sums_back(const float* weights, const float* inverse_t, const bool* valid, const float* intervals,
-                          const float* targets, const float* grad_spread, const float* grad_mass, int64_t begin,
-                          int64_t end, int64_t slots, float scale, float* gradient) {
+void mmpi_depth_sums_back(int64_t begin, int64_t end, int64_t slots, float scale, const bool* valid,
+                          const float* weights, const float* inverse_t, const float* intervals, const float* targets,
+                          const float* grad_spread, const float* grad_mass, float* gradient) {
     for (int64_t r = begin; r < end; r++) {
         const float target = targets[2 * r], width = targets[2 * r + 1];
         double before = 0, moment = 0, all = 0, moments = 0;
@@ -70,7 +66,8 @@ void mmpi_depth_sums_back(const float* weights, const float* inverse_t, const bo
         }
     }
 }
-}
+
+} // namespace
 
 IN_PARTS(mmpi_depth_sums)
 IN_PARTS(mmpi_depth_sums_back)

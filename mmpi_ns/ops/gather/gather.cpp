@@ -38,19 +38,6 @@ struct SampleTaps {
     }
 };
 
-// Rows [begin, end) of the values, whose gradients one thread sums.
-struct Owned {
-    int64_t begin, end;
-
-    bool has(int32_t row) const { return begin <= row && row < end; }
-
-    bool any(const SampleTaps& x) const {
-        for (int tap = 0; tap < x.taps; tap++)
-            if (has(x.positions[tap])) return true;
-        return false;
-    }
-};
-
 // Sums over a ray's samples: weight times what their texels hold, weight, weight times squared colour.
 void gather(const Table& table, const std::vector<Sample>& samples, float* sums) {
     float mass = 0;
@@ -68,14 +55,10 @@ void gather(const Table& table, const std::vector<Sample>& samples, float* sums)
     for (int c = 0; c < COLORS; c++) sums[table.channels + 1 + c] = squares[c];
 }
 
-} // namespace
-
-extern "C" {
-
 // Sums [R, channels + 4] of rays [begin, end): `numbers` [R, S] says which sample is in a slot, -1 if there is none. The
 // next ray's memory is asked for before one is summed.
-void mmpi_gather_taps(const float* values, int64_t rows, int64_t channels, const Taps* groups, const int32_t* numbers,
-                      const float* weights, int64_t begin, int64_t end, int64_t slots, float* sums) {
+void mmpi_gather_taps(int64_t begin, int64_t end, const float* values, int64_t rows, int64_t channels,
+                      const Taps* groups, const int32_t* numbers, const float* weights, int64_t slots, float* sums) {
     const Table table{values, rows, channels};
     std::vector<Sample> samples[2];
     const auto prepare = [&](int64_t ray) {
@@ -95,7 +78,7 @@ void mmpi_gather_taps(const float* values, int64_t rows, int64_t channels, const
 }
 
 // numbers[slots[n]] = n for samples [begin, end) of rays that are chosen.
-void mmpi_number_samples(const int64_t* slots, int64_t begin, int64_t end, const bool* chosen, int64_t slots_per_ray,
+void mmpi_number_samples(int64_t begin, int64_t end, const int64_t* slots, const bool* chosen, int64_t slots_per_ray,
                          int32_t* numbers) {
     for (int64_t n = begin; n < end; n++)
         if (chosen[slots[n] / slots_per_ray]) numbers[slots[n]] = int32_t(n);
@@ -106,12 +89,12 @@ void mmpi_number_samples(const int64_t* slots, int64_t begin, int64_t end, const
 // colours and twice those of squared colours [R, 16], padded with zeros. Samples of rays that are not `chosen` have none.
 // Rows [begin, end) have one owner, who adds the samples in the order of `slots`: sums do not depend on the threads. The
 // owner of a sample's first row writes the other gradients.
-void mmpi_gather_back(const float* values, int64_t rows, int64_t channels, const Taps* groups, const int64_t* slots,
-                      const bool* chosen, const float* weights, const float* grad_sums, const float* grad_colors,
-                      const float* grad_squares, int64_t slots_per_ray, int64_t begin, int64_t end, float* grad_values,
-                      float* grad_weights) {
+void mmpi_gather_back(int64_t begin, int64_t end, const float* values, int64_t rows, int64_t channels,
+                      const Taps* groups, const int64_t* slots, const bool* chosen, const float* weights,
+                      const float* grad_sums, const float* grad_colors, const float* grad_squares,
+                      int64_t slots_per_ray, float* grad_values, float* grad_weights) {
     const Table table{values, rows, channels};
-    const Owned owned{begin, end};
+    const auto owns = [&](int32_t row) { return begin <= row && row < end; };
     if (grad_values) std::fill(grad_values + begin * channels, grad_values + end * channels, 0.0f);
     const int64_t padded = (channels + WIDTH - 1) / WIDTH * WIDTH, count = groups[0].count + groups[1].count;
     constexpr int64_t AHEAD = 6;
@@ -119,7 +102,7 @@ void mmpi_gather_back(const float* values, int64_t rows, int64_t channels, const
         if (n + AHEAD < count) {
             const SampleTaps soon(groups, n + AHEAD);
             for (int tap = 0; tap < soon.taps; tap++) {
-                if (!owned.has(soon.positions[tap])) continue;
+                if (!owns(soon.positions[tap])) continue;
                 table.prefetch(soon.positions[tap]);
                 if (!grad_values) continue;
                 __builtin_prefetch(grad_values + soon.positions[tap] * channels, 1);
@@ -127,11 +110,11 @@ void mmpi_gather_back(const float* values, int64_t rows, int64_t channels, const
             }
         }
         const SampleTaps at(groups, n);
-        if (!owned.any(at)) continue;
+        if (std::none_of(at.positions, at.positions + at.taps, owns)) continue;
         const int64_t slot = slots[n], ray = slot / slots_per_ray;
         if (!chosen[ray]) continue;
         const Sample sample = at.sample(weights[slot]);
-        const bool is_first = owned.has(at.positions[0]);
+        const bool is_first = owns(at.positions[0]);
         Lanes total{};
         for (int64_t first = 0; first < channels; first += WIDTH) {
             const Texel texel = activate(interpolate(table, sample, first), first);
@@ -142,7 +125,7 @@ void mmpi_gather_back(const float* values, int64_t rows, int64_t channels, const
             store(down, sample.weight * slope * texel.slope);
             const int64_t size = std::min<int64_t>(WIDTH, channels - first);
             for (int tap = 0; grad_values && tap < at.taps; tap++)
-                if (owned.has(at.positions[tap]))
+                if (owns(at.positions[tap]))
                     add_row(grad_values + at.positions[tap] * channels + first, down, at.weights[tap], size);
             for (int tap = 0; is_first && at.grad_weights && tap < at.taps; tap++) {
                 const float* read = values + at.positions[tap] * channels + first;
@@ -155,7 +138,8 @@ void mmpi_gather_back(const float* values, int64_t rows, int64_t channels, const
         grad_weights[slot] = sum;
     }
 }
-}
+
+} // namespace
 
 IN_PARTS(mmpi_gather_taps)
 IN_PARTS(mmpi_number_samples)

@@ -13,7 +13,7 @@ import triton.language as tl
 from torch import Tensor
 
 from mmpi_ns.ops.gather import COLORS, RaySums, Taps, split_sums
-from mmpi_ns.ops.gpu_scene import block_size, launch
+from mmpi_ns.ops.gpu_scene import block_size, launch, read_taps
 
 NUMBERS = 512
 """Rays, or samples, of a program, times their channels: what its registers hold."""
@@ -24,18 +24,6 @@ def activate(raw, column):
     """Colours and features of samples."""
     share = 1 / (1 + tl.exp(-tl.where(column < 3, raw, 2 * raw)))
     return tl.where(column < 3, share, 2 * share - 1)
-
-
-@triton.jit
-def read_taps(values, positions, shares, number, inside, channels, column, TAPS: tl.constexpr):
-    """Interpolated texels of samples."""
-    raw = number[:, None] * column * 0.0
-    for tap in tl.static_range(TAPS):
-        row = tl.load(positions + number * TAPS + tap, inside, 0).to(tl.int64)
-        share = tl.load(shares + number * TAPS + tap, inside, 0.0)
-        read = tl.load(values + row[:, None] * channels + column, inside[:, None] & (column < channels), 0.0)
-        raw += share[:, None] * read
-    return raw
 
 
 # Arrays that are parts of others begin anywhere, and no variant is compiled for those that happen to be aligned.

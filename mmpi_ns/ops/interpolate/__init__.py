@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from mmpi_ns.ops.build import call_in_parts, even_bounds, owned_bounds, run_in_parts
 from mmpi_ns.ops.dispatch import operation
 from mmpi_ns.ops.layout import Places, SceneLayout
 from mmpi_ns.scene.texels import BRICK
@@ -77,7 +78,7 @@ class Table(nn.Parameter):
         return torch.zeros_like(self.data).index_add_(0, self.grad_rows, self._row_grad)
 
 
-@operation("cpu")
+@operation()
 def order_by_head(places: Places, num_heads: int, counts: Sequence[int] | None = None) -> HeadSamples:
     """Valid samples of a batch, ordered by head and otherwise by slot.
 
@@ -97,7 +98,7 @@ def order_by_head(places: Places, num_heads: int, counts: Sequence[int] | None =
     return HeadSamples(slots, heads[slots], planes, ndc, counts)
 
 
-@operation("cpu", "gpu")
+@operation("gpu")
 def texel_rows(
     layout: SceneLayout, heads: Int[Tensor, "N"], planes: Int[Tensor, "N"], ndc: Float[Tensor, "N 3"]
 ) -> tuple[Int[Tensor, "N 4"], Float[Tensor, "N 4"]]:
@@ -117,7 +118,7 @@ def texel_rows(
     return rows, weights
 
 
-@operation("cpu", "gpu")
+@operation("gpu")
 def index_rows(rows: Int[Tensor, "..."], table_rows: int, pads: bool = False) -> RowIndex:
     """Distinct rows of a list, rising.
 
@@ -130,7 +131,7 @@ def index_rows(rows: Int[Tensor, "..."], table_rows: int, pads: bool = False) ->
     return RowIndex(*torch.unique(rows, return_inverse=True))
 
 
-@operation("cpu", "gpu")
+@operation("gpu")
 def sum_rows(
     positions: Int[Tensor, "N B"], values: Float[Tensor, "N C"], weights: Float[Tensor, "N B"], count: int
 ) -> Float[Tensor, "U C"]:
@@ -144,7 +145,7 @@ def sum_rows(
     return out.index_add_(0, positions.reshape(-1), each)
 
 
-@operation("cpu")
+@operation()
 def raise_peaks(
     peaks: Float[Tensor, "K"], rows: Int[Tensor, "U"], positions: Int[Tensor, "N B"], weights: Float[Tensor, "N"]
 ) -> None:
@@ -165,7 +166,7 @@ def read_rows(table: Table, rows: Int[Tensor, "U"]) -> Float[Tensor, "U C"]:
     return _ReadRows.apply(table, rows)  # type: ignore[no-any-return]
 
 
-@operation("cpu")
+@operation()
 def take_rows(table: Float[Tensor, "T C"], rows: Int[Tensor, "U"]) -> Float[Tensor, "U C"]:
     """Values of ``read_rows``."""
     return table.index_select(0, rows)
@@ -178,7 +179,7 @@ def weigh_rows(
     return _WeighRows.apply(values, positions, weights.to(values.dtype))  # type: ignore[no-any-return]
 
 
-@operation("cpu", "gpu")
+@operation("gpu")
 def weighted_rows(
     table: Float[Tensor, "T C"], rows: Int[Tensor, "N B"], weights: Float[Tensor, "N B"]
 ) -> Float[Tensor, "N C"]:
@@ -228,3 +229,88 @@ class _WeighRows(torch.autograd.Function):
         to_values = sum_rows(positions, grad, weights, ctx.count) if ctx.needs_input_grad[0] else None
         to_weights = None if values is None else (values[positions] * grad[:, None]).sum(-1)
         return to_values, None, to_weights
+
+
+MOST_ROWS = 2**31
+"""A bit is taken for every row of the table: beyond this, torch's sort."""
+AT_LEAST = 1 << 15
+"""Entries, samples or bricks that are worth another thread, whose start takes as long as a tenth of a millisecond."""
+
+
+@order_by_head.on_cpu
+def order_by_head_on_cpu(places: Places, num_heads: int, counts: Sequence[int] | None = None) -> HeadSamples:
+    heads, planes, ndc, valid = (x.contiguous() for x in places)
+    bounds = even_bounds(heads.numel(), AT_LEAST)
+    in_parts = torch.zeros(len(bounds) - 1, num_heads, dtype=torch.int64)
+    run_in_parts("mmpi_count_heads", bounds, heads, valid, num_heads, in_parts)
+    totals = in_parts.sum(0)
+    starts = totals.cumsum(0) - totals + in_parts.cumsum(0) - in_parts
+    count = int(totals.sum())
+    slots, of_heads, of_planes = torch.empty(3, count, dtype=torch.int64)
+    columns = (slots, of_heads, of_planes, torch.empty(count, 3))
+    run_in_parts("mmpi_order_by_head", bounds, heads, planes, ndc, valid, num_heads, starts, *columns)
+    return HeadSamples(*columns, totals.tolist())
+
+
+@texel_rows.on_cpu
+def texel_rows_on_cpu(layout: SceneLayout, heads: Tensor, planes: Tensor, ndc: Tensor) -> tuple[Tensor, Tensor]:
+    if ndc.requires_grad:
+        return texel_rows.reference(layout, heads, planes, ndc)
+    rows, weights = torch.empty(len(heads), 4, dtype=torch.int64), torch.empty(len(heads), 4)
+    samples = (x.contiguous() for x in (heads, planes, ndc))
+    call_in_parts("mmpi_texel_rows", len(heads), layout.cpu_grids, *samples, rows, weights, least=AT_LEAST)
+    return rows, weights
+
+
+@index_rows.on_cpu
+def index_rows_on_cpu(rows: Tensor, table_rows: int, pads: bool = False) -> RowIndex:
+    count, listed = rows.numel(), rows.long().contiguous()
+    if table_rows > MOST_ROWS or not 0 < count < 2**31:
+        return index_rows.reference(rows, table_rows, pads)
+    words = torch.zeros(-(-table_rows // BRICK), dtype=torch.int64)
+    before, positions = torch.empty(len(words), dtype=torch.int32), torch.empty(rows.shape, dtype=torch.int32)
+    call_in_parts("mmpi_mark_rows", count, listed, words, least=AT_LEAST)
+    bounds = even_bounds(len(words), AT_LEAST)
+    counts = torch.empty(len(bounds) - 1, dtype=torch.int64)
+    run_in_parts("mmpi_count_rows", bounds, words, counts)
+    ends = counts.cumsum(0)
+    unique = torch.empty(int(ends[-1]), dtype=torch.int64)
+    run_in_parts("mmpi_list_rows", bounds, words, ends - counts, before, unique)
+    call_in_parts("mmpi_place_rows", count, listed, words, before, positions, least=AT_LEAST)
+    return RowIndex(unique, positions)
+
+
+@sum_rows.on_cpu
+def sum_rows_on_cpu(positions: Tensor, values: Tensor, weights: Tensor, count: int) -> Tensor:
+    if positions.dtype != torch.int32:
+        return sum_rows.reference(positions, values, weights, count)
+    sums, entries = torch.empty(count, values.shape[1]), (x.contiguous() for x in (positions, weights, values))
+    bounds = owned_bounds([positions], count, AT_LEAST)
+    run_in_parts("mmpi_sum_rows", bounds, *entries, *positions.shape, values.shape[1], sums)
+    return sums
+
+
+@weighted_rows.on_cpu
+def weighted_rows_on_cpu(table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
+    if rows.dtype != torch.int32 or not table.is_contiguous():
+        return weighted_rows.reference(table, rows, weights)
+    values, entries = torch.empty(len(rows), table.shape[1]), (rows.contiguous(), weights.contiguous(), rows.shape[1])
+    call_in_parts("mmpi_weigh_rows", len(rows), table, *table.shape, *entries, values, least=AT_LEAST)
+    return values
+
+
+@take_rows.on_cpu
+def take_rows_on_cpu(table: Tensor, rows: Tensor) -> Tensor:
+    if not table.is_contiguous():
+        return take_rows.reference(table, rows)
+    values = torch.empty(len(rows), table.shape[1])
+    call_in_parts("mmpi_take_rows", len(rows), rows.contiguous(), table.shape[1], table, values, least=AT_LEAST)
+    return values
+
+
+@raise_peaks.on_cpu
+def raise_peaks_on_cpu(peaks: Tensor, rows: Tensor, positions: Tensor, weights: Tensor) -> None:
+    if positions.dtype != torch.int32:
+        return raise_peaks.reference(peaks, rows, positions, weights)
+    samples = (positions.contiguous(), weights.contiguous(), positions.shape[1])
+    call_in_parts("mmpi_raise_peaks", len(positions), *samples, rows.contiguous(), peaks, least=AT_LEAST)

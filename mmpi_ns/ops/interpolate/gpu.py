@@ -10,7 +10,7 @@ import triton.language as tl
 from torch import Tensor
 
 from mmpi_ns.ops import interpolate
-from mmpi_ns.ops.gpu_scene import HEIGHT, INTS, WIDTH, GpuScene, block_size, cell, launch, row_of
+from mmpi_ns.ops.gpu_scene import HEIGHT, INTS, WIDTH, block_size, cell, grids_of, launch, read_taps, row_of
 from mmpi_ns.ops.interpolate import RowIndex
 from mmpi_ns.ops.layout import SceneLayout
 from mmpi_ns.scene.texels import BRICK
@@ -41,11 +41,11 @@ def texel_rows_kernel(heads, planes, ndc, grids, rows, weights, count, BLOCK: tl
 def texel_rows(layout: SceneLayout, heads: Tensor, planes: Tensor, ndc: Tensor) -> tuple[Tensor, Tensor]:
     if ndc.requires_grad:
         return interpolate.texel_rows.reference(layout, heads, planes, ndc)
-    count, scene = len(heads), GpuScene.of(layout)
+    count, grids = len(heads), grids_of(layout)
     rows = torch.empty(count, 4, dtype=torch.int64, device=ndc.device)
     weights = torch.empty(count, 4, device=ndc.device)
     tensors, block = (x.contiguous() for x in (heads, planes, ndc)), block_size(ROWS, ndc.device)
-    launch(texel_rows_kernel, count, block, *tensors, scene.grids, rows, weights, count, BLOCK=block)
+    launch(texel_rows_kernel, count, block, *tensors, grids, rows, weights, count, BLOCK=block)
     return rows, weights
 
 
@@ -57,15 +57,10 @@ def weighted_rows_kernel(
     table, rows, weights, out, count, channels, TAPS: tl.constexpr, CHANNELS: tl.constexpr, BLOCK: tl.constexpr
 ):
     """out[n] = sum_b weights[n, b] table[rows[n, b]]."""
-    i, c = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK), tl.arange(0, CHANNELS)
+    i, column = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK), tl.arange(0, CHANNELS)[None, :]
     inside = i < count
-    both = inside[:, None] & (c < channels)[None, :]
-    total = tl.zeros([BLOCK, CHANNELS], tl.float32)
-    for tap in tl.static_range(TAPS):
-        row = tl.load(rows + i * TAPS + tap, inside, 0).to(tl.int64)
-        weight = tl.load(weights + i * TAPS + tap, inside, 0.0)
-        total += weight[:, None] * tl.load(table + row[:, None] * channels + c[None, :], both, 0.0)
-    tl.store(out + i[:, None] * channels + c[None, :], total, both)
+    total = read_taps(table, rows, weights, i, inside, channels, column, TAPS)
+    tl.store(out + i[:, None] * channels + column, total, inside[:, None] & (column < channels))
 
 
 def weighted_rows(table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:

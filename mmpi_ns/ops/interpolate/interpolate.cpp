@@ -1,15 +1,14 @@
 // Rows of tables that a batch reads: which, what is there, and their gradients.
 #include "parts.h"
-#include "scene.h"
-#include "table.h"
+#include "taps.h"
 
-extern "C" {
+namespace {
 
 // Distinct values of `rows`, none negative, in four steps of which each may be done in parts by several threads: every
 // brick has a word of 64 bits, all 0 before the first step, and only the words are read of bricks that no row lies in.
 
 // Sets the bits of rows [begin, end) of a list.
-void mmpi_mark_rows(const int64_t* rows, int64_t begin, int64_t end, uint64_t* words) {
+void mmpi_mark_rows(int64_t begin, int64_t end, const int64_t* rows, uint64_t* words) {
     for (int64_t i = begin; i < end; i++) {
         uint64_t* word = words + (rows[i] >> 6);
         const uint64_t bit = uint64_t(1) << (rows[i] & 63);
@@ -36,7 +35,7 @@ void mmpi_list_rows(int64_t begin, int64_t end, const uint64_t* words, const int
 }
 
 // Places of rows [begin, end) among the marked ones.
-void mmpi_place_rows(const int64_t* rows, int64_t begin, int64_t end, const uint64_t* words, const int32_t* before,
+void mmpi_place_rows(int64_t begin, int64_t end, const int64_t* rows, const uint64_t* words, const int32_t* before,
                      int32_t* positions) {
     for (int64_t i = begin; i < end; i++) {
         const uint64_t earlier = words[rows[i] >> 6] & ((uint64_t(1) << (rows[i] & 63)) - 1);
@@ -45,8 +44,8 @@ void mmpi_place_rows(const int64_t* rows, int64_t begin, int64_t end, const uint
 }
 
 // Rows [begin, end) of a list, read from the table; those that follow each other as one stretch.
-void mmpi_take_rows(const int64_t* rows, int64_t begin, int64_t end, int64_t channels, const float* table,
-                      float* values) {
+void mmpi_take_rows(int64_t begin, int64_t end, const int64_t* rows, int64_t channels, const float* table,
+                    float* values) {
     for (int64_t i = begin, next; i < end; i = next) {
         for (next = i + 1; next < end && rows[next] == rows[next - 1] + 1;) next++;
         for (int64_t soon = std::min(end, i + 2 * AHEAD); soon < std::min(end, next + 2 * AHEAD); soon++)
@@ -56,7 +55,7 @@ void mmpi_take_rows(const int64_t* rows, int64_t begin, int64_t end, int64_t cha
 }
 
 // peaks[brick] is raised to the largest weight of those of samples [begin, end) that read one of its rows.
-void mmpi_raise_peaks(const int32_t* positions, const float* weights, int64_t begin, int64_t end, int64_t taps,
+void mmpi_raise_peaks(int64_t begin, int64_t end, const int32_t* positions, const float* weights, int64_t taps,
                       const int64_t* rows, float* peaks) {
     for (int64_t i = begin * taps; i < end * taps; i++) {
         float* peak = peaks + rows[positions[i]] / BRICK;
@@ -68,23 +67,22 @@ void mmpi_raise_peaks(const int32_t* positions, const float* weights, int64_t be
 }
 
 // The sum of weights[n, b] * table[positions[n, b]] over b, of samples [begin, end).
-void mmpi_weigh_rows(const float* table, int64_t channels, const int32_t* positions, const float* weights, int64_t taps,
-                     int64_t begin, int64_t end, float* values) {
-    for (int64_t n = begin; n < end; n++) {
-        if (n + AHEAD < end)
-            for (int64_t i = (n + AHEAD) * taps; i < (n + AHEAD + 1) * taps; i++)
-                __builtin_prefetch(table + positions[i] * channels);
-        float* sum = values + n * channels;
-        std::fill_n(sum, channels, 0.0f);
-        for (int64_t i = n * taps; i < (n + 1) * taps; i++)
-            for (int64_t c = 0; c < channels; c++) sum[c] += weights[i] * table[positions[i] * channels + c];
-    }
+void mmpi_weigh_rows(int64_t begin, int64_t end, const float* numbers, int64_t rows, int64_t channels,
+                     const int32_t* positions, const float* weights, int64_t taps, float* values) {
+    const Table table{numbers, rows, channels};
+    for (int64_t n = begin; n < end; n++)
+        for (int64_t first = 0; first < channels; first += WIDTH) {
+            Lanes sum{};
+            for (int64_t i = n * taps; i < (n + 1) * taps; i++)
+                sum += weights[i] * table.read(positions[i] * channels + first);
+            for (int64_t c = first; c < std::min(channels, first + WIDTH); c++) values[n * channels + c] = sum[c - first];
+        }
 }
 
 // values[positions[n, b]] is the sum of weights[n, b] * grad[n], of the entries at positions [begin, end): each has one
 // owner, who adds in the order of samples.
-void mmpi_sum_rows(const int32_t* positions, const float* weights, const float* grad, int64_t samples, int64_t taps,
-                   int64_t channels, int64_t begin, int64_t end, float* values) {
+void mmpi_sum_rows(int64_t begin, int64_t end, const int32_t* positions, const float* weights, const float* grad,
+                   int64_t samples, int64_t taps, int64_t channels, float* values) {
     std::fill(values + begin * channels, values + end * channels, 0.0f);
     for (int64_t i = 0; i < samples * taps; i++)
         if (begin <= positions[i] && positions[i] < end)
@@ -92,7 +90,7 @@ void mmpi_sum_rows(const int32_t* positions, const float* weights, const float* 
 }
 
 // Adds to the part's `counts` [parts, num_heads] how many of slots [begin, end) hold a sample of each head.
-void mmpi_count_heads(const int64_t* heads, const bool* valid, int64_t begin, int64_t end, int64_t num_heads,
+void mmpi_count_heads(int64_t begin, int64_t end, const int64_t* heads, const bool* valid, int64_t num_heads,
                       int64_t* counts) {
     counts += this_part * num_heads;
     for (int64_t i = begin; i < end; i++) counts[heads[i]] += valid[i];
@@ -100,8 +98,8 @@ void mmpi_count_heads(const int64_t* heads, const bool* valid, int64_t begin, in
 
 // Writes slot, head, plane and position of each sample in slots [begin, end) to the next place of its head; the
 // part's `next` [parts, num_heads] is advanced.
-void mmpi_order_by_head(const int64_t* heads, const int64_t* planes, const float* ndc, const bool* valid, int64_t begin,
-                        int64_t end, int64_t num_heads, int64_t* next, int64_t* slots, int64_t* of_heads,
+void mmpi_order_by_head(int64_t begin, int64_t end, const int64_t* heads, const int64_t* planes, const float* ndc,
+                        const bool* valid, int64_t num_heads, int64_t* next, int64_t* slots, int64_t* of_heads,
                         int64_t* of_planes, float* of_ndc) {
     next += this_part * num_heads;
     for (int64_t i = begin; i < end; i++) {
@@ -114,21 +112,17 @@ void mmpi_order_by_head(const int64_t* heads, const int64_t* planes, const float
 
 // Rows and weights of bilinear lookups of samples [begin, end) at (u, v, .) of `ndc` on planes of MPIs
 // (TexelGrid.bilinear).
-void mmpi_texel_rows(const Grid* grids, const int64_t* heads, const int64_t* planes, const float* ndc, int64_t begin,
-                     int64_t end, int64_t* rows, float* weights) {
+void mmpi_texel_rows(int64_t begin, int64_t end, const Grid* grids, const int64_t* heads, const int64_t* planes,
+                     const float* ndc, int64_t* rows, float* weights) {
     for (int64_t i = begin; i < end; i++) {
-        const Grid& grid = grids[heads[i]];
-        const Cell x(ndc[3 * i], grid.width), y(ndc[3 * i + 1], grid.height);
-        const Corners corners(grid, planes[i], y.lower, x.lower);
-        const float fx = x.fraction, fy = y.fraction, gx = 1 - fx, gy = 1 - fy;
-        const float weight[4] = {gx * gy, fx * gy, gx * fy, fx * fy};
-        for (int k = 0; k < 4; k++) {
-            rows[4 * i + k] = corners.row[k];
-            weights[4 * i + k] = weight[k];
-        }
+        Sample sample;
+        sample.put(grids[heads[i]], false, planes[i], ndc + 3 * i);
+        std::copy_n(sample.rows, 4, rows + 4 * i);
+        std::copy_n(sample.shares, 4, weights + 4 * i);
     }
 }
-}
+
+} // namespace
 
 IN_PARTS(mmpi_mark_rows)
 IN_PARTS(mmpi_count_rows)

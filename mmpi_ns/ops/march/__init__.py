@@ -7,42 +7,31 @@ must weigh to be kept), so a ray costs what lies in front of its first surfaces.
 
 from __future__ import annotations
 
+import ctypes
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.nn.functional import pad
 
 from mmpi_ns.ops.blending import blended_optical_depth, log_shares
+from mmpi_ns.ops.build import call_in_parts, structs
 from mmpi_ns.ops.composite import composite_weights, exclusive_cumsum, median_inverse_distance, winning_heads
 from mmpi_ns.ops.dispatch import operation
 from mmpi_ns.ops.ends import NEGLIGIBLE
 from mmpi_ns.ops.gather import gather_places
 from mmpi_ns.ops.interpolate import interpolate
-from mmpi_ns.ops.layout import SceneLayout, Tables
-from mmpi_ns.ops.march.rays import MarchOptions, MergedSamples, Rays, Shown
+from mmpi_ns.ops.layout import SceneLayout, Tables, dense
+from mmpi_ns.ops.march.rays import MarchOptions, MergedSamples, Rays, Shown, empty_samples
+from mmpi_ns.scene.baked import columns_from
 from mmpi_ns.scene.geometry import LocalRays, PlaneHits, cube_hits, inverse_distance, plane_hits, sample_disparity
 
 BLEND_BLOCK = 16
 """Samples of a ray between two checks whether it is already opaque."""
 OPAQUE_DEPTH = 9.2
 """exp(-9.2) = 1e-4 of the light: far below the weight of a kept sample."""
-
-
-class Crossings(NamedTuple):
-    """The live samples of R rays in the H heads that may answer them."""
-
-    origins: Float[Tensor, "R 3"]
-    directions: Float[Tensor, "R 3"]
-    hits: PlaneHits
-    """Crossings of the rays with the planes."""
-    first: Int[Tensor, "R H"]
-    """m of each head's nearest live plane; the cube's first sample in the last column, where there is a cube."""
-    counts: Int[Tensor, "R H"]
-    """Live samples of each head."""
-    explained: Bool[Tensor, "R 1"]
-    """See ``MergedSamples``."""
 
 
 class LiveSamples(NamedTuple):
@@ -56,7 +45,7 @@ class LiveSamples(NamedTuple):
     tau: Float[Tensor, "N"]
 
 
-@operation("cpu", "gpu")
+@operation("gpu")
 def march(layout: SceneLayout, tables: Tables, rays: Rays, options: MarchOptions) -> MergedSamples:
     """The samples of each ray that matter.
 
@@ -66,38 +55,26 @@ def march(layout: SceneLayout, tables: Tables, rays: Rays, options: MarchOptions
         rays: R rays.
         options: which samples are kept, and how they are blended.
     """
-    at = crossings(layout, rays, plane_hits(*rays[:4], layout.frames))
-    flat = _live_samples(at, layout, tables)
-    per_ray, number = at.counts.sum(-1), torch.cat([_enumerate(each)[1] for each in at.counts.unbind(-1)])
-    width, before = max(1, int(per_ray.max())) if per_ray.numel() else 1, at.counts.cumsum(-1) - at.counts
+    hits = plane_hits(*rays[:4], layout.frames)
+    first, counts, explained = crossings(layout, rays, hits)
+    flat = _live_samples(layout, tables, rays, hits, first, counts)
+    per_ray, number = counts.sum(-1), torch.cat([_enumerate(each)[1] for each in counts.unbind(-1)])
+    width, before = max(1, int(per_ray.max())) if per_ray.numel() else 1, counts.cumsum(-1) - counts
     slots = flat.rays * width + before[flat.rays, flat.heads] + number
-    order, valid = merge(slots, flat.inverse_t, per_ray, presorted=bool(((at.counts > 0).sum(-1) <= 1).all()))
+    order, valid = merge(slots, flat.inverse_t, per_ray, presorted=bool(((counts > 0).sum(-1) <= 1).all()))
     tau = flat.tau
     if options.blends and tau.numel():
-        tau = _blend_visible(order, valid, flat, at, layout, tables)
+        local = LocalRays(rays.origins, rays.directions, hits.local_origins, hits.local_directions)
+        tau = _blend_visible(order, valid, flat, local, layout, tables)
     pruned = prune(order, valid, tau, options.threshold, options.fair_share)
-    order, valid = pruned.order, pruned.valid
-
-    def pick(values: Tensor) -> Tensor:
-        kept = values[order] if len(values) else values.new_zeros((*order.shape, *values.shape[1:]))
-        return kept.masked_fill(~(valid[..., None] if values.ndim > 1 else valid), 0)
-
-    return MergedSamples(
-        heads=pick(flat.heads),
-        planes=pick(flat.planes),
-        ndc=pick(flat.ndc),
-        inverse_t=pick(flat.inverse_t),
-        tau=pick(tau),
-        skipped_before=pruned.skipped_before,
-        valid=valid,
-        skipped_total=pruned.skipped_total,
-        dropped_mass=pruned.dropped_mass,
-        live=at.counts.sum(-1),
-        explained=at.explained,
-    )
+    order = torch.where(pruned.valid, pruned.order, len(tau))  # empty slots take the zeros behind the samples
+    columns = (flat.heads, flat.planes, flat.ndc, flat.inverse_t, tau)
+    heads, planes, ndc, inverse_t, tau = (torch.cat([x, x.new_zeros(1, *x.shape[1:])])[order] for x in columns)
+    rest = (pruned.skipped_before, pruned.valid, pruned.skipped_total, pruned.dropped_mass)
+    return MergedSamples(heads, planes, ndc, inverse_t, tau, *rest, live=per_ray, explained=explained)
 
 
-@operation("cpu", "gpu")
+@operation("gpu")
 def show_rays(
     layout: SceneLayout, tables: Tables, features: Float[Tensor, "T C"], rays: Rays, options: MarchOptions
 ) -> Shown:
@@ -130,8 +107,15 @@ def show_rays(
 # Crossings -----------------------------------------------------------------------------------------------------------
 
 
-def crossings(layout: SceneLayout, rays: Rays, hits: PlaneHits) -> Crossings:
-    """The live samples of rays in the heads that may answer them, from their crossings with all planes."""
+def crossings(
+    layout: SceneLayout, rays: Rays, hits: PlaneHits
+) -> tuple[Int[Tensor, "R H"], Int[Tensor, "R H"], Bool[Tensor, "R 1"]]:
+    """The live samples of rays in the heads that may answer them, from their crossings with all planes.
+
+    Returns:
+        m of each head's nearest live plane (of the cube, which comes last, its first sample), how many live samples
+        each head has, and ``MergedSamples.explained``.
+    """
     first, counts = hits.m_first, hits.count
     if rays.priorities is not None:
         met = torch.where(counts > 0, rays.priorities, torch.full_like(rays.priorities, -1.0))
@@ -155,22 +139,29 @@ def crossings(layout: SceneLayout, rays: Rays, hits: PlaneHits) -> Crossings:
         endless = live & (hits.m_first - counts[:, : len(layout.mpis)] < 0) & (frames.last_disparities == 0)
         explained &= (live & (entry * layout.content_near >= 1)).any(-1, keepdim=True)
         explained &= endless.any(-1, keepdim=True)
-    return Crossings(rays.origins, rays.directions, hits, first, counts, explained)
+    return first, counts, explained
 
 
 # Sample --------------------------------------------------------------------------------------------------------------
 
 
-def _live_samples(at: Crossings, layout: SceneLayout, tables: Tables) -> LiveSamples:
+def _live_samples(
+    layout: SceneLayout,
+    tables: Tables,
+    rays: Rays,
+    hits: PlaneHits,
+    first: Int[Tensor, "R H"],
+    counts: Int[Tensor, "R H"],
+) -> LiveSamples:
     """All live planes of every MPI, and the samples inside the cube, at fixed distances from each camera."""
-    parts, hits, frames = [], at.hits, layout.frames
+    parts, frames = [], layout.frames
     for k, grid in enumerate(layout.grids):
-        rays, index = _enumerate(at.counts[:, k])
+        numbers, index = _enumerate(counts[:, k])
         if k < len(layout.mpis):
-            m, mpi = hits.m_first[:, k][rays] - index, layout.mpis[k]
+            m, mpi = first[:, k][numbers] - index, layout.mpis[k]
             ray = torch.cat(
                 [hits.u[:, k], hits.v[:, k], hits.local_origins[:, k, 2:], hits.local_directions[:, k, 2:]], -1
-            ).index_select(0, rays)
+            ).index_select(0, numbers)
             w = sample_disparity(m, frames.disparity_steps[k], frames.last_disparities[k])
             u0, u1, v0, v1 = mpi.extent
             u = (ray[:, 0] + w * ray[:, 1] - u0) * (2 / (u1 - u0)) - 1
@@ -180,12 +171,13 @@ def _live_samples(at: Crossings, layout: SceneLayout, tables: Tables) -> LiveSam
             texels = grid.bilinear(planes, ndc)
         else:
             assert layout.cube is not None
-            planes = at.first[:, -1][rays] + index
-            t = (planes + 0.5).to(at.origins.dtype) * layout.cube.step
-            ndc, inverse_t = layout.cube.normalised(at.origins[rays] + at.directions[rays] * t[:, None]), 1 / t
+            planes = first[:, k][numbers] + index
+            t = (planes + 0.5).to(rays.origins.dtype) * layout.cube.step
+            points = rays.origins[numbers] + rays.directions[numbers] * t[:, None]
+            ndc, inverse_t = layout.cube.normalised(points), 1 / t
             texels = grid.trilinear(ndc)
         tau = layout.optical_depth(k, interpolate(tables.density, *texels)[:, 0], planes)
-        parts.append((rays, torch.full_like(rays, k), planes, ndc, inverse_t, tau))
+        parts.append((numbers, torch.full_like(numbers, k), planes, ndc, inverse_t, tau))
     return LiveSamples(*(torch.cat(columns) for columns in zip(*parts, strict=True)))
 
 
@@ -239,7 +231,7 @@ def _blend_visible(
     order: Int[Tensor, "R S"],
     valid: Bool[Tensor, "R S"],
     flat: LiveSamples,
-    at: Crossings,
+    local: LocalRays,
     layout: SceneLayout,
     tables: Tables,
 ) -> Float[Tensor, "N"]:
@@ -248,7 +240,6 @@ def _blend_visible(
     Reliability costs a lookup in every head, and most samples lie behind the first surface: those keep their own depth,
     which changes weights by less than exp(-OPAQUE_DEPTH). Samples too thin to matter get an equal share without one.
     """
-    local = LocalRays(at.origins, at.directions, at.hits.local_origins, at.hits.local_directions)
     tau = flat.tau.clone()
     passed = tau.new_zeros(order.shape[0])
     for start in range(0, order.shape[1], BLEND_BLOCK):
@@ -323,3 +314,51 @@ def prune(
         skipped_total=skipped.sum(-1, keepdim=True),
         dropped_mass=torch.where(kept, 0.0, weights).sum(-1, keepdim=True),
     )
+
+
+# On a CPU ------------------------------------------------------------------------------------------------------------
+
+
+def shown(name: str, num_rays: int, channels: int, *values: Any) -> Shown:
+    """What a compiled function of ``(begin, end, *values, outputs)`` shows."""
+    outputs = [torch.empty(num_rays, n) for n in (channels, 1, 1, 1, 1, 1, 1)]
+    call_in_parts(name, num_rays, *values, structs(outputs))
+    return Shown(*outputs)
+
+
+@march.on_cpu
+def march_on_cpu(layout: SceneLayout, tables: Tables, rays: Rays, options: MarchOptions) -> MergedSamples:
+    num_rays, room = len(rays.origins), options.most_kept(layout.most_samples)
+    samples = structs(empty_samples(num_rays * room, index=torch.int32))
+    starts, kept, live = torch.empty(3, num_rays, dtype=torch.int64)
+    explained, (skipped, dropped) = torch.empty(num_rays, 1, dtype=torch.bool), torch.empty(2, num_rays, 1)
+    walk = (layout.cpu_scene(tables), structs(rays.dense()))
+    how = (float(options.threshold), float(options.fair_share), options.blends)
+    call_in_parts("mmpi_march", num_rays, *walk, room, *how, starts, kept, live, explained, skipped, dropped, samples)
+    width = max(1, int(kept.max())) if num_rays else 1
+    slots = [*empty_samples(num_rays, width), torch.empty(num_rays, width, dtype=torch.bool)]
+    call_in_parts("mmpi_pack", num_rays, starts, kept, width, samples, structs(slots))
+    return MergedSamples(*slots, skipped_total=skipped, dropped_mass=dropped, live=live, explained=explained)
+
+
+def _tiles(layout: SceneLayout) -> ctypes.Array:
+    """The tiles of all MPIs from which something can be read, so that rays pass over the others: where the lower corner
+    of four texels is in the tile, one of them is stored."""
+    columns, bricks, count = [torch.zeros(0, 2, dtype=torch.int32)], [torch.zeros(1, 4, dtype=torch.int32)], 0
+    for grid in layout.grids[: len(layout.mpis)]:
+        tiles = pad(grid.own_tiles, (0, 1, 0, 1))
+        down, across = ((n - 2) // 8 + 1 for n in (grid.height, grid.width))  # of lower corners
+        corners = torch.stack([tiles[:, y : y + down, x : x + across] for y in (0, 1) for x in (0, 1)], -1)
+        stored, places = columns_from((corners > 0).any(-1), count)
+        columns.append(stored)
+        bricks.append(corners[tuple(places.T)])
+        count += len(places)
+    return structs((torch.cat(columns), torch.cat(bricks[1:] + bricks[:1])))
+
+
+@show_rays.on_cpu
+def show_rays_on_cpu(layout: SceneLayout, tables: Tables, features: Tensor, rays: Rays, options: MarchOptions) -> Shown:
+    walk = (layout.cpu_scene(tables), structs(rays.dense()))
+    texels = (layout.once("tiles", _tiles), *dense(features), *features.shape)
+    how = (float(options.threshold), float(options.fair_share), options.blends)
+    return shown("mmpi_show", len(rays.origins), features.shape[1], *walk, *texels, *how)

@@ -19,22 +19,10 @@ from torch import Tensor
 
 from mmpi_ns.ops import ends
 from mmpi_ns.ops.gather.gpu import activate, lanes, sizes
-from mmpi_ns.ops.gpu_scene import (
-    DEPTH,
-    HEIGHT,
-    INTS,
-    WIDTH,
-    GpuScene,
-    block_size,
-    cell,
-    launch,
-    one_minus_exp,
-    row_of,
-)
-from mmpi_ns.ops.layout import SceneLayout, Tables, shaped
-from mmpi_ns.ops.march.gpu_hits import cross
-from mmpi_ns.ops.march.gpu_walk import before, next_samples, pass_empty
-from mmpi_ns.ops.march.rays import MarchOptions, MergedSamples, Rays, Shown
+from mmpi_ns.ops.gpu_scene import DEPTH, HEIGHT, INTS, WIDTH, block_size, cell, grids_of, launch, one_minus_exp, row_of
+from mmpi_ns.ops.layout import SceneLayout, Tables, dense
+from mmpi_ns.ops.march.gpu_walk import before, cross, next_samples, pass_empty
+from mmpi_ns.ops.march.rays import MarchOptions, MergedSamples, Rays, Shown, empty_samples
 
 OPAQUE = tl.constexpr(ends.OPAQUE)
 HALF = tl.constexpr(ends.HALF)
@@ -227,7 +215,7 @@ class Slots:
     kept: Int[Tensor, "R"]
     """Number of them; what the other slots hold means nothing."""
     slots: list[Tensor]
-    """Heads, planes, NDC, inverse distances, optical depths, and optical depths skipped before: each [R, room, .]."""
+    """See ``empty_samples``; [R, room] each."""
     room: int
     skipped_total: Float[Tensor, "R 1"]
     dropped_mass: Float[Tensor, "R 1"]
@@ -240,23 +228,20 @@ class Slots:
 def march_into_slots(layout: SceneLayout, tables: Tables, rays: Rays, options: MarchOptions) -> Slots:
     """``march`` before anything is waited for."""
     num_rays, num_heads, device = len(rays.origins), layout.num_heads, rays.origins.device
-    scene, threshold, room = GpuScene.of(layout), float(options.threshold), options.most_kept(layout.most_samples)
-    parts = [shaped(x, num_rays, width) for x, width in zip(rays[:4], (3, 3, 1, 1), strict=True)]
+    threshold, room = float(options.threshold), options.most_kept(layout.most_samples)
     # Where all heads may answer, what stands for the choice is not read.
-    parts.append(parts[0] if rays.heads is None else shaped(rays.heads, num_rays, num_heads, dtype=torch.bool))
-    parts.append(parts[0] if rays.priorities is None else shaped(rays.priorities, num_rays, len(layout.mpis)))
+    parts = [rays.origins if x is None else x for x in rays.dense()]
     live = torch.empty(num_rays, dtype=torch.int64, device=device)
     explained = torch.empty(num_rays, 1, dtype=torch.bool, device=device)
     kept = torch.empty(num_rays, dtype=torch.int32, device=device)
     skipped, dropped = (torch.empty(num_rays, 1, device=device) for _ in range(2))
-    slots = [torch.empty(num_rays, room, dtype=torch.int32, device=device) for _ in range(2)]
-    slots += [torch.empty(num_rays, room, width, device=device) for width in (3, 1, 1, 1)]
+    slots = empty_samples(num_rays, room, index=torch.int32, device=device)
     numbers = torch.zeros(1 + num_heads, dtype=torch.int32, device=device)
     heads = triton.next_power_of_2(num_heads)
     at_once = block_size(max(1, min(RAYS if num_rays >= MANY else FEW_RAYS, RANGES // heads)), device)
     launch(
         march_kernel, num_rays, at_once, *parts,
-        scene.heads, scene.grids, scene.biases, scene.cube, *tables.of_rows(layout.num_rows),
+        layout.head_rows, grids_of(layout), layout.bias_row, layout.cube_row, *tables.dense(),
         live, explained, kept, skipped, dropped, *slots, numbers,
         num_rays, room, threshold, float(options.fair_share), float(layout.content_near),
         K=len(layout.mpis), HEADS=heads, HAS_CUBE=layout.cube is not None,
@@ -270,11 +255,9 @@ def march(layout: SceneLayout, tables: Tables, rays: Rays, options: MarchOptions
     """Waits for the device once, to size the result."""
     m = march_into_slots(layout, tables, rays, options)
     widest, *of_heads = m.numbers.tolist()
-    num_rays, width = len(m.kept), max(1, widest)
-    shapes = [(num_rays, width, 3) if i == 2 else (num_rays, width) for i in range(7)]
-    types = (torch.int64, torch.int64, *[torch.float32] * 4, torch.bool)
-    packed = [torch.empty(shape, dtype=t, device=m.kept.device) for shape, t in zip(shapes, types, strict=True)]
-    size = num_rays * width
+    shape, device = (len(m.kept), max(1, widest)), m.kept.device
+    packed = [*empty_samples(*shape, device=device), torch.empty(shape, dtype=torch.bool, device=device)]
+    size, width = packed[0].numel(), shape[1]
     launch(pack_kernel, size, 1024, m.kept, *m.slots, *packed, size, width, m.room, BLOCK=1024)
     left = {"skipped_total": m.skipped_total, "dropped_mass": m.dropped_mass}
     return MergedSamples(*packed, **left, live=m.live, explained=m.explained, head_counts=tuple(of_heads))
@@ -288,8 +271,8 @@ def show_rays(layout: SceneLayout, tables: Tables, features: Tensor, rays: Rays,
     mass, depth, median, winner = (torch.empty(num_rays, 1, device=device) for _ in range(4))
     columns, block = sizes(channels, device, NUMBERS)
     launch(
-        show_kernel, num_rays, block, m.kept, *m.slots, m.skipped_total, shaped(features, layout.num_rows, channels),
-        GpuScene.of(layout).grids, gathered, mass, depth, median, winner, num_rays, m.room, channels, len(layout.mpis),
+        show_kernel, num_rays, block, m.kept, *m.slots, m.skipped_total, *dense(features),
+        grids_of(layout), gathered, mass, depth, median, winner, num_rays, m.room, channels, len(layout.mpis),
         HAS_CUBE=layout.cube is not None, HEADS=triton.next_power_of_2(layout.num_heads), CHANNELS=columns, BLOCK=block,
         num_warps=lanes(block),
     )  # fmt: skip

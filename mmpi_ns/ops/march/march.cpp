@@ -9,10 +9,8 @@ namespace {
 inline void cells(Lanes coordinate, int64_t size, IntLanes& lower, Lanes& fraction) {
     const float last = float(size - 1);
     const Lanes position = least(most((coordinate + 1.0f) * (0.5f * last), Lanes{}), splat(last));
-    lower = __builtin_convertvector(position, IntLanes); // towards zero, and positions are not negative
-    const IntLanes highest = int32_t(size - 2) - IntLanes{};
-    lower = lower < highest ? lower : highest;
-    fraction = position - __builtin_convertvector(lower, Lanes);
+    lower = least(truncated(position), whole(int32_t(size - 2))); // positions are not negative
+    fraction = position - real(lower);
 }
 
 // Where sixteen samples lie on planes of an MPI, and the texels at their lower corners.
@@ -32,9 +30,6 @@ struct PlaneCells {
         store(edge, (in_x == 7) | (in_y == 7));
         store(fx, fraction_x), store(fy, fraction_y);
     }
-
-    static void store(int32_t* to, IntLanes x) { __builtin_memcpy(to, &x, sizeof x); }
-    static void store(float* to, Lanes x) { ::store(to, x); }
 };
 
 // One head's samples along one ray, looked up a block at a time.
@@ -74,7 +69,7 @@ void fill_mpi(Run& run, const Scene& scene, const Crossing& at, int ray, int64_t
         float ndc[3][WIDTH], inverse_t[WIDTH];
         store(ndc[0], x), store(ndc[1], y), store(ndc[2], 1.0f - mpi.s_scale * (w - mpi.end));
         store(inverse_t, w * dz / (1.0f - w * oz));
-        const PlaneCells cells(grid, x, y, __builtin_convertvector(IOTA, IntLanes) + int32_t(first));
+        const PlaneCells cells(grid, x, y, truncated(IOTA) + int32_t(first));
         for (int j = 0; j < count; j++) {
             float corners[4];
             if (!cells.edge[j]) {
@@ -121,16 +116,23 @@ void fill_cube(Run& run, const Scene& scene, const Packet& rays, int ray, bool s
     finish(run, cube.interval);
 }
 
+template <typename Int> struct Samples {
+    Int *heads, *planes;
+    float *ndc, *inverse_t, *tau, *skipped_before;
+};
+
+struct Packed : Samples<int64_t> {
+    bool* valid;
+};
+
 // What a ray keeps goes behind what the rays before it kept.
-struct Slots {
-    int32_t *heads, *planes;
-    float *ndc, *inverse_t, *taus, *skipped_before;
+struct Slots : Samples<int32_t> {
     int64_t size;
 
-    void keep(const Run& run, int64_t head, float tau, float skipped) {
+    void keep(const Run& run, int64_t head, float depth, float skipped) {
         heads[size] = int32_t(head), planes[size] = run.plane[run.at];
         for (int a = 0; a < 3; a++) ndc[3 * size + a] = run.ndc[run.at][a];
-        inverse_t[size] = run.inverse_t[run.at], taus[size] = tau, skipped_before[size] = skipped;
+        inverse_t[size] = run.inverse_t[run.at], tau[size] = depth, skipped_before[size] = skipped;
         size++;
     }
 };
@@ -208,19 +210,14 @@ class Training {
     }
 };
 
-} // namespace
-
-extern "C" {
-
 // Marches rays [begin, end), each of which keeps `room` samples at most. What they keep is written one ray behind the
 // other, from begin * room on; where a ray's samples begin, to starts[ray]; how many, to kept[ray].
-void mmpi_march(const Scene* scene, const Rays* rays, int64_t room, float threshold, float fair_share, bool blends,
-                int64_t begin, int64_t end, int64_t* starts, int64_t* kept, int64_t* live, bool* explained,
-                float* skipped_total, float* dropped_mass, int32_t* heads, int32_t* planes, float* ndc,
-                float* inverse_t, float* taus, float* skipped_before) {
+void mmpi_march(int64_t begin, int64_t end, const Scene* scene, const Rays* rays, int64_t room, float threshold,
+                float fair_share, bool blends, int64_t* starts, int64_t* kept, int64_t* live, bool* explained,
+                float* skipped_total, float* dropped_mass, const Samples<int32_t>* samples) {
     Training training(*scene, threshold, fair_share, blends);
     Crossings crossings;
-    Slots slots{heads, planes, ndc, inverse_t, taus, skipped_before, begin * room};
+    Slots slots{*samples, begin * room};
     for (int64_t first = begin; first < end; first += WIDTH) {
         const Packet packet(*rays, first, std::min<int64_t>(WIDTH, end - first));
         crossings.cross(*scene, *rays, packet);
@@ -234,28 +231,27 @@ void mmpi_march(const Scene* scene, const Rays* rays, int64_t room, float thresh
 }
 
 // Copies what rays [begin, end) kept into `width` slots each; the rest of the slots is 0.
-void mmpi_pack(const int64_t* starts, const int64_t* kept, int64_t begin, int64_t end, int64_t width,
-               const int32_t* heads, const int32_t* planes, const float* ndc, const float* inverse_t, const float* tau,
-               const float* skipped_before, int64_t* to_heads, int64_t* to_planes, float* to_ndc, float* to_inverse_t,
-               float* to_tau, float* to_skipped_before, bool* valid) {
+void mmpi_pack(int64_t begin, int64_t end, const int64_t* starts, const int64_t* kept, int64_t width,
+               const Samples<int32_t>* from, const Packed* to) {
     // Array by array, so that copies and zeros (most slots, where one ray keeps many) go a cache line at a time.
     const auto pack = [](const auto* from, int64_t size, int64_t room, auto* to) {
         std::copy_n(from, size, to);
         std::fill_n(to + size, room - size, 0);
     };
     for (int64_t ray = begin; ray < end; ray++) {
-        const int64_t to = ray * width, from = starts[ray], size = kept[ray];
-        pack(heads + from, size, width, to_heads + to);
-        pack(planes + from, size, width, to_planes + to);
-        pack(ndc + 3 * from, 3 * size, 3 * width, to_ndc + 3 * to);
-        pack(inverse_t + from, size, width, to_inverse_t + to);
-        pack(tau + from, size, width, to_tau + to);
-        pack(skipped_before + from, size, width, to_skipped_before + to);
-        std::fill_n(valid + to, size, true);
-        std::fill_n(valid + to + size, width - size, false);
+        const int64_t put = ray * width, at = starts[ray], size = kept[ray];
+        pack(from->heads + at, size, width, to->heads + put);
+        pack(from->planes + at, size, width, to->planes + put);
+        pack(from->ndc + 3 * at, 3 * size, 3 * width, to->ndc + 3 * put);
+        pack(from->inverse_t + at, size, width, to->inverse_t + put);
+        pack(from->tau + at, size, width, to->tau + put);
+        pack(from->skipped_before + at, size, width, to->skipped_before + put);
+        std::fill_n(to->valid + put, size, true);
+        std::fill_n(to->valid + put + size, width - size, false);
     }
 }
-}
+
+} // namespace
 
 IN_PARTS(mmpi_march)
 IN_PARTS(mmpi_pack)

@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from mmpi_ns.ops.layout import Places
+from mmpi_ns.ops.layout import Places, dense
 
 
 class Rays(NamedTuple):
@@ -26,6 +27,10 @@ class Rays(NamedTuple):
     """Heads that may answer each ray; None for all."""
     priorities: Float[Tensor, "R K"] | None = None
     """Of the MPIs: each ray is answered by the first one of those it meets (and by the cube). None: by all."""
+
+    def dense(self) -> list[Tensor | None]:
+        """The rays as compiled code reads them."""
+        return [*dense(*self[:4]), *dense(self.heads, dtype=torch.bool), *dense(self.priorities)]
 
 
 class MarchOptions(NamedTuple):
@@ -73,6 +78,12 @@ class MergedSamples:
     @property
     def places(self) -> Places:
         return Places(self.heads, self.planes, self.ndc, self.valid)
+
+
+def empty_samples(*shape: int, index: torch.dtype = torch.int64, device: torch.device | str = "cpu") -> list[Tensor]:
+    """Arrays for heads, planes, NDC, inverse distances, optical depths and those skipped before each sample."""
+    types = (index, index, *[torch.float32] * 4)
+    return [torch.empty((*shape, 3) if i == 2 else shape, dtype=t, device=device) for i, t in enumerate(types)]
 
 
 @dataclass(frozen=True)

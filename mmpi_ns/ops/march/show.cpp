@@ -114,16 +114,13 @@ struct Floats {
     }
 };
 
-} // namespace
-
-extern "C" {
-
-void mmpi_show(const Scene* scene, const Rays* rays, const Tiles* tiles, const float* features, int64_t rows,
-               int64_t channels, float threshold, float fair_share, bool blends, int64_t begin, int64_t end,
+void mmpi_show(int64_t begin, int64_t end, const Scene* scene, const Rays* rays, const Tiles* tiles,
+               const float* features, int64_t rows, int64_t channels, float threshold, float fair_share, bool blends,
                const Outputs* to) {
     const Floats texels(*scene, *tiles, Table{features, rows, channels}, threshold, fair_share, blends);
     show(texels, *rays, begin, end, *to);
 }
-}
+
+} // namespace
 
 IN_PARTS(mmpi_show)

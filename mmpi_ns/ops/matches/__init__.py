@@ -6,13 +6,16 @@ is linear in (x, y, 1) (``capture/dense.py``). A match there gives two linear eq
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from mmpi_ns.ops.build import run_in_parts
 from mmpi_ns.ops.dispatch import operation
+from mmpi_ns.ops.layout import dense
 
 FAR = -1e4
 """Pixel of a point behind the other image."""
@@ -32,13 +35,6 @@ class Places(NamedTuple):
     """Depth there over depth here; 0 for points behind."""
 
 
-class Moved(NamedTuple):
-    """Values of two maps."""
-
-    x: Float[Tensor, "R W"]
-    y: Float[Tensor, "R W"]
-
-
 class Compared(NamedTuple):
     """What another image's depths say of an image's."""
 
@@ -56,7 +52,7 @@ class Measured(NamedTuple):
     """One over the squared error of a match; the error of a mean."""
 
 
-@operation("cpu")
+@operation()
 def place_pixels(
     inverse: Float[Tensor, "H W"], linear: Float[Tensor, "3 3"], b: Float[Tensor, "3"], first_row: int
 ) -> Places:
@@ -75,10 +71,10 @@ def place_pixels(
     return Places(x, y, torch.where(behind, 0.0, ahead))
 
 
-@operation("cpu")
+@operation()
 def follow_motion(
     x: Float[Tensor, "H W"], y: Float[Tensor, "H W"], motion: Float[Tensor, "R W 2"], first_row: int
-) -> Moved:
+) -> tuple[Float[Tensor, "R W"], Float[Tensor, "R W"]]:
     """Values of two maps at the places that pixels have moved to, interpolated; beyond the borders those of the border.
 
     Args:
@@ -91,15 +87,13 @@ def follow_motion(
     down = (torch.arange(len(motion))[:, None] + first_row + motion[..., 1]).clamp(0, height - 1)
     left, top = right.long().clamp(max=width - 2), down.long().clamp(max=height - 2)
     u, v = right - left, down - top
-
-    def at(image: Tensor) -> Tensor:
-        above, below = (torch.lerp(image[r, left], image[r, left + 1], u) for r in (top, top + 1))
-        return torch.lerp(above, below, v)
-
-    return Moved(at(x), at(y))
+    maps = torch.stack([x, y])
+    above, below = (torch.lerp(maps[:, row, left], maps[:, row, left + 1], u) for row in (top, top + 1))
+    moved_x, moved_y = torch.lerp(above, below, v)
+    return moved_x, moved_y
 
 
-@operation("cpu")
+@operation()
 def solve_matches(
     x: Float[Tensor, "H W"],
     y: Float[Tensor, "H W"],
@@ -134,7 +128,7 @@ def solve_matches(
     return Measured(torch.where(kept, inverse, 0.0), torch.where(kept, certainty, 0.0))
 
 
-@operation("cpu")
+@operation()
 def average_matches(inverse: Float[Tensor, "M P"], certainty: Float[Tensor, "M P"], most_relative: float) -> Measured:
     """The mean of the largest consistent subset of the M measurements of each pixel, and its error.
 
@@ -165,7 +159,7 @@ def average_matches(inverse: Float[Tensor, "M P"], certainty: Float[Tensor, "M P
     return Measured(torch.where(kept, mean, 0.0), torch.where(kept, error, 0.0))
 
 
-@operation("cpu")
+@operation()
 def compare_depths(
     inverse: Float[Tensor, "R W"],
     error: Float[Tensor, "R W"],
@@ -202,3 +196,54 @@ def _linear(image: Tensor, linear: Tensor, first_row: int) -> list[Tensor]:
     x = torch.arange(image.shape[1], dtype=image.dtype) + 0.5
     y = torch.arange(image.shape[0], dtype=image.dtype)[:, None] + (first_row + 0.5)
     return [m[0] * x + (m[1] * y + m[2]) for m in linear]
+
+
+Maps = TypeVar("Maps", bound=Sequence[Tensor])
+MOST = 16
+"""Measurements of a pixel, as in ``matches.cpp``."""
+
+
+def _written(maps: Maps, name: str, *values: Any) -> Maps:
+    run_in_parts(f"mmpi_{name}", [0, len(maps[0])], *values, *maps)
+    return maps
+
+
+@place_pixels.on_cpu
+def place_pixels_on_cpu(inverse: Tensor, linear: Tensor, b: Tensor, first_row: int) -> Places:
+    places = Places(*torch.empty(3, *inverse.shape))
+    return _written(places, "place_pixels", *dense(inverse, linear, b), inverse.shape[1], first_row)
+
+
+@follow_motion.on_cpu
+def follow_motion_on_cpu(x: Tensor, y: Tensor, motion: Tensor, first_row: int) -> tuple[Tensor, Tensor]:
+    assert min(x.shape) > 1, x.shape
+    moved = (torch.empty(motion.shape[:2]), torch.empty(motion.shape[:2]))
+    return _written(moved, "follow_motion", *dense(x, y, motion), *x.shape, first_row)
+
+
+@solve_matches.on_cpu
+def solve_matches_on_cpu(
+    x: Tensor, y: Tensor, alike: Tensor, usable: Tensor, linear: Tensor, b: Tensor,
+    first_row: int, noise: float, farthest: float,
+) -> Measured:  # fmt: skip
+    arrays = *dense(x, y, alike), *dense(usable, dtype=torch.bool), *dense(linear, b)
+    measured = Measured(*torch.empty(2, *x.shape))
+    return _written(measured, "solve_matches", *arrays, x.shape[1], first_row, noise**2, farthest**2)
+
+
+@average_matches.on_cpu
+def average_matches_on_cpu(inverse: Tensor, certainty: Tensor, most_relative: float) -> Measured:
+    count, pixels = inverse.shape
+    assert count <= MOST, count
+    averaged = Measured(*torch.empty(2, pixels))
+    return _written(averaged, "average_matches", *dense(inverse, certainty), pixels, count, most_relative)
+
+
+@compare_depths.on_cpu
+def compare_depths_on_cpu(
+    inverse: Tensor, error: Tensor, their_inverse: Tensor, their_error: Tensor, linear: Tensor, b: Tensor,
+    first_row: int, same: float,
+) -> Compared:  # fmt: skip
+    arrays = dense(inverse, error, their_inverse, their_error, linear, b)
+    compared = Compared(*torch.empty(2, *inverse.shape, dtype=torch.bool))
+    return _written(compared, "compare_depths", *arrays, inverse.shape[1], *their_inverse.shape, first_row, same)

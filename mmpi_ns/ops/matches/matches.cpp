@@ -48,12 +48,8 @@ struct Linear {
     }
 };
 
-} // namespace
-
-extern "C" {
-
 // Rows [begin, end) of pixels at inverse depths: their places, and depths over those here.
-void mmpi_place_pixels(const float* inverse, const float* linear, const float* b, int64_t begin, int64_t end,
+void mmpi_place_pixels(int64_t begin, int64_t end, const float* inverse, const float* linear, const float* b,
                        int64_t width, int64_t first_row, float* x, float* y, float* ahead) {
     for (int64_t row = begin; row < end; row++)
         for (int64_t column = 0; column < width; column += WIDTH) {
@@ -69,7 +65,7 @@ void mmpi_place_pixels(const float* inverse, const float* linear, const float* b
 }
 
 // Rows [begin, end) of motions: values of two maps at the places moved to, interpolated, at most at the border.
-void mmpi_follow_motion(const float* x, const float* y, const float* motion, int64_t begin, int64_t end, int64_t height,
+void mmpi_follow_motion(int64_t begin, int64_t end, const float* x, const float* y, const float* motion, int64_t height,
                         int64_t width, int64_t first_row, float* moved_x, float* moved_y) {
     for (int64_t row = begin; row < end; row++)
         for (int64_t column = 0, i = row * width; column < width; column++, i++) {
@@ -91,8 +87,8 @@ void mmpi_follow_motion(const float* x, const float* y, const float* motion, int
 }
 
 // Rows [begin, end) of matches at (x, y): inverse depths and one over their squared errors.
-void mmpi_solve_matches(const float* x, const float* y, const float* alike, const bool* usable, const float* linear,
-                        const float* b, int64_t begin, int64_t end, int64_t width, int64_t first_row,
+void mmpi_solve_matches(int64_t begin, int64_t end, const float* x, const float* y, const float* alike,
+                        const bool* usable, const float* linear, const float* b, int64_t width, int64_t first_row,
                         float noise_squared, float farthest_squared, float* inverse, float* certainty) {
     for (int64_t row = begin; row < end; row++)
         for (int64_t column = 0; column < width; column += WIDTH) {
@@ -115,10 +111,10 @@ void mmpi_solve_matches(const float* x, const float* y, const float* alike, cons
 }
 
 // Rows [begin, end) of depths: whether those of another image confirm or contradict them.
-void mmpi_compare_depths(const float* inverse, const float* error, const float* their_inverse, const float* their_error,
-                         const float* linear, const float* b, int64_t begin, int64_t end, int64_t width,
-                         int64_t their_height, int64_t their_width, int64_t first_row, float same, bool* confirms,
-                         bool* contradicts) {
+void mmpi_compare_depths(int64_t begin, int64_t end, const float* inverse, const float* error,
+                         const float* their_inverse, const float* their_error, const float* linear, const float* b,
+                         int64_t width, int64_t their_height, int64_t their_width, int64_t first_row, float same,
+                         bool* confirms, bool* contradicts) {
     for (int64_t row = begin; row < end; row++) {
         const float down = first_row + row + 0.5f;
         for (int64_t column = 0, i = row * width; column < width; column++, i++) {
@@ -143,7 +139,7 @@ void mmpi_compare_depths(const float* inverse, const float* error, const float* 
 }
 
 // Pixels [begin, end): mean of the largest consistent subset of their measurements, which lie `pixels` apart.
-void mmpi_average_matches(const float* inverse, const float* certainty, int64_t begin, int64_t end, int64_t pixels,
+void mmpi_average_matches(int64_t begin, int64_t end, const float* inverse, const float* certainty, int64_t pixels,
                           int64_t measurements, float most_relative, float* mean, float* error) {
     for (int64_t p = begin; p < end; p += WIDTH) {
         const int64_t count = end - p;
@@ -181,7 +177,8 @@ void mmpi_average_matches(const float* inverse, const float* certainty, int64_t 
         put(error + p, pick(kept, deviation, Lanes{}), count);
     }
 }
-}
+
+} // namespace
 
 IN_PARTS(mmpi_place_pixels)
 IN_PARTS(mmpi_follow_motion)

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mmpi_ns.ops.build import call_in_parts, structs
 from mmpi_ns.ops.dispatch import operation
 from mmpi_ns.ops.gather import interpolated
 from mmpi_ns.ops.layout import Places, SceneLayout, check_shapes
@@ -71,7 +72,7 @@ def _check_networks(
         raise ValueError(f"networks of {len(networks.layers)} heads where the scene has {layout.num_heads}")
 
 
-@operation("cpu", check=_check_networks)
+@operation(check=_check_networks)
 def shade(
     layout: SceneLayout,
     table: Float[Tensor, "T C"],
@@ -97,3 +98,15 @@ def shade(
         direction = positional_encoding(rotate(axes[k], directions), networks.direction_frequencies)
         colors[slots] = sample_colors(networks.layers[k], features, position, direction[slots // valid.shape[1]])
     return colors.view(*valid.shape, 3)
+
+
+@shade.on_cpu
+def shade_on_cpu(
+    layout: SceneLayout, table: Tensor, networks: SampleNetworks, axes: Tensor, directions: Tensor, places: Places
+) -> Tensor:
+    pairs = [(w.contiguous(), b.contiguous()) for x in networks.layers for w, b in zip(x[::2], x[1::2], strict=True)]
+    tensors, colors = [x.contiguous() for x in (axes, table, directions, *places)], torch.empty(*places.valid.shape, 3)
+    shading = structs((*tensors, *table.shape, colors.shape[1], *networks[1:]))
+    layers = structs(*((*w.shape, w, b) for w, b in pairs))
+    call_in_parts("mmpi_shade", len(colors), layout.cpu_grids, len(layout.mpis), len(axes), shading, layers, colors)
+    return colors

@@ -52,13 +52,9 @@ void shade(const Shading& shading, const Layer* layers, Waiting& head, float* co
     head.size = 0;
 }
 
-} // namespace
-
-extern "C" {
-
 // Colours [R, S, 3] of the valid samples of rays [begin, end); empty slots become black. DEPTH layers a head.
-void mmpi_shade(const Grid* grids, int64_t num_mpis, int64_t num_heads, const Shading* shading, const Layer* layers,
-                int64_t begin, int64_t end, float* colors) {
+void mmpi_shade(int64_t begin, int64_t end, const Grid* grids, int64_t num_mpis, int64_t num_heads,
+                const Shading* shading, const Layer* layers, float* colors) {
     std::vector<Waiting> heads(num_heads);
     const auto shade_head = [&](int64_t h) { shade(*shading, layers + DEPTH * h, heads[h], colors); };
     std::fill(colors + 3 * begin * shading->slots, colors + 3 * end * shading->slots, 0.0f);
@@ -75,6 +71,7 @@ void mmpi_shade(const Grid* grids, int64_t num_mpis, int64_t num_heads, const Sh
     for (int64_t h = 0; h < num_heads; h++)
         if (heads[h].size) shade_head(h);
 }
-}
+
+} // namespace
 
 IN_PARTS(mmpi_shade)

@@ -13,8 +13,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mmpi_ns.ops.build import arguments, library
-from mmpi_ns.ops.layout import check_shapes, shaped
+from mmpi_ns.ops.build import arguments, library, structs
+from mmpi_ns.ops.layout import check_shapes, dense
 
 BLUR = 0.3
 """Variance that is added to a projected Gaussian, square pixels (as in ``splat.cpp``)."""
@@ -93,23 +93,12 @@ def splat_opacities(
     return sums
 
 
-class _View(ctypes.Structure):
-    _fields_ = [
-        ("to_world", ctypes.c_float * 12),
-        *((n, ctypes.c_float) for n in ("fx", "fy", "cx", "cy")),
-        *((n, ctypes.c_int32) for n in ("width", "height")),
-    ]
-
-
-class _Gaussians(ctypes.Structure):
-    _fields_ = [("count", ctypes.c_int64), *((n, ctypes.c_void_p) for n in ("means", "covariances", "alphas"))]
-
-
 def _run(function: Callable[..., Tensor], gaussians: Gaussians, view: View, out: Tensor, **tensors: Tensor) -> None:
     """Calls the compiled form of a function, which writes to ``out``."""
     (width, height), count = view.size, len(gaussians.means)
     check_shapes(function, {"gaussians": gaussians, "view": view, **tensors}, {"W": width, "H": height, "N": count})
-    camera = _View((ctypes.c_float * 12)(*view.to_world.flatten().tolist()), *view.focal, *view.center, *view.size)
-    held = [shaped(x, *x.shape) for x in (*gaussians, *tensors.values(), out)]  # alive until it has run
-    addresses = _Gaussians(count, *(x.data_ptr() for x in held[:3]))
-    getattr(library(), f"mmpi_{function.__name__}")(ctypes.byref(camera), addresses, *arguments(held[3:]))
+    numbers = map(float, (*view.to_world.flatten(), *view.focal, *view.center))
+    inputs = dense(*gaussians, *tensors.values())
+    camera, seen = structs((*numbers, *map(ctypes.c_int32, view.size))), structs((count, *inputs[:3]))
+    values = (camera, seen, *inputs[3:], out)  # alive until it has run
+    getattr(library(), f"mmpi_{function.__name__}")(*arguments(values))

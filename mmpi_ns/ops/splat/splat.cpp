@@ -104,16 +104,16 @@ template <typename Tell> std::vector<float> lay(const View& view, const std::vec
 extern "C" {
 
 // An image [height, width, 4] of colours and passing light.
-void mmpi_splat_image(const View* view, Gaussians all, const float* colors, float* image) {
-    const auto light = lay(*view, sorted(*view, all), [&](int64_t i, int64_t pixel, float alpha, float before) {
+void mmpi_splat_image(const View* view, const Gaussians* all, const float* colors, float* image) {
+    const auto light = lay(*view, sorted(*view, *all), [&](int64_t i, int64_t pixel, float alpha, float before) {
         for (int c = 0; c < 3; c++) image[4 * pixel + c] += before * alpha * colors[3 * i + c];
     });
     for (size_t p = 0; p < light.size(); p++) image[4 * p + 3] = light[p];
 }
 
 // The sums [count, 4] over pixels of each Gaussian's weight times (error, 1).
-void mmpi_splat_sums(const View* view, Gaussians all, const float* errors, float* sums) {
-    lay(*view, sorted(*view, all), [&](int64_t i, int64_t pixel, float alpha, float before) {
+void mmpi_splat_sums(const View* view, const Gaussians* all, const float* errors, float* sums) {
+    lay(*view, sorted(*view, *all), [&](int64_t i, int64_t pixel, float alpha, float before) {
         for (int c = 0; c < 3; c++) sums[4 * i + c] += before * alpha * errors[3 * pixel + c];
         sums[4 * i + 3] += before * alpha;
     });
@@ -121,9 +121,9 @@ void mmpi_splat_sums(const View* view, Gaussians all, const float* errors, float
 
 // With J what a number of the image changes with the logit of a Gaussian's opacity, the sums [count, 2] over an image's
 // numbers of (J error / (sum of all Gaussians' |J|), |J|). `shown` is the image with its background, [height, width, 3].
-void mmpi_splat_opacities(const View* view, Gaussians all, const float* colors, const float* shown, const float* errors,
-                          float* sums) {
-    const std::vector<Seen> seen = sorted(*view, all);
+void mmpi_splat_opacities(const View* view, const Gaussians* all, const float* colors, const float* shown,
+                          const float* errors, float* sums) {
+    const std::vector<Seen> seen = sorted(*view, *all);
     std::vector<float> front, total(int64_t(view->width) * view->height * 3, 0.0f);
     const auto walk = [&](auto use) {
         front.assign(total.size(), 0.0f);
@@ -132,7 +132,7 @@ void mmpi_splat_opacities(const View* view, Gaussians all, const float* colors, 
                 const int64_t at = 3 * pixel + c;
                 front[at] += before * alpha * colors[3 * i + c];
                 const float behind = (shown[at] - front[at]) / (1 - alpha);
-                const float change = alpha < STRONGEST ? alpha * (1 - all.alphas[i]) : 0.0f;
+                const float change = alpha < STRONGEST ? alpha * (1 - all->alphas[i]) : 0.0f;
                 use(i, at, change * (before * colors[3 * i + c] - behind));
             }
         });

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from mmpi_ns.ops.build import call_in_parts
 from mmpi_ns.ops.dispatch import operation
 from mmpi_ns.ops.layout import SceneLayout
 
@@ -19,7 +20,7 @@ def _check_scales(values: Tensor, table: Tensor, rows: Tensor, layout: SceneLayo
         raise ValueError(f"scales of {len(scales)} heads where the scene has {layout.num_heads}")
 
 
-@operation("cpu", "gpu", check=_check_scales)
+@operation("gpu", check=_check_scales)
 def total_variation(
     values: Float[Tensor, "U C"],
     table: Float[Tensor, "T C"],
@@ -76,3 +77,18 @@ class WithGradient(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor, None, None]:
         return ctx.saved_tensors[0] * grad_outputs[0], None, None
+
+
+PART = 4096
+"""Texels whose differences are summed together, so that a sum does not depend on the threads."""
+
+
+@total_variation.on_cpu
+def total_variation_on_cpu(values: Tensor, table: Tensor, rows: Tensor, layout: SceneLayout, scales: Scales) -> Tensor:
+    gradient, totals = torch.empty_like(values), torch.zeros(-(-len(rows) // PART), dtype=torch.float64)
+    inputs = (rows.contiguous(), len(rows), table.shape[1], table, len(table), layout.cpu_grids, layout.num_heads)
+    weights = torch.tensor(scales, dtype=torch.float32)
+    outputs = (gradient, totals)
+    places = layout.grids[0].places
+    call_in_parts("mmpi_total_variation", len(totals), *inputs, places, weights, *outputs, least=1)
+    return WithGradient.apply(values, totals.sum().to(values.dtype), gradient)  # type: ignore[no-any-return]

@@ -9,7 +9,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from mmpi_ns.ops.gpu_scene import DEPTH, HEIGHT, INTS, WIDTH, GpuScene, block_size, is_stored, launch, row_of, texel_of
+from mmpi_ns.ops.gpu_scene import DEPTH, HEIGHT, INTS, WIDTH, block_size, grids_of, is_stored, launch, row_of, texel_of
 from mmpi_ns.ops.layout import SceneLayout
 from mmpi_ns.ops.variation import Scales, WithGradient
 
@@ -48,7 +48,7 @@ def total_variation(values: Tensor, table: Tensor, rows: Tensor, layout: SceneLa
     (count, channels), device, block = values.shape, values.device, block_size(ROWS, values.device)
     weights = layout.once(f"scales {scales}", lambda _: torch.tensor(scales, dtype=torch.float32, device=device))
     gradient, totals = torch.empty_like(values), torch.zeros(max(1, triton.cdiv(count, block)), device=device)
-    tensors = (rows.contiguous(), values.contiguous(), table, GpuScene.of(layout).grids, weights, gradient, totals)
+    tensors = (rows.contiguous(), values.contiguous(), table, grids_of(layout), weights, gradient, totals)
     launch(
         variation_kernel, count, block, *tensors, count, channels, NUM_HEADS=len(scales),
         CHANNELS=triton.next_power_of_2(channels), BLOCK=block,

@@ -7,7 +7,7 @@
 
 namespace {
 
-constexpr int64_t PART = 4096; // rows whose differences are summed together (PART of cpu.py)
+constexpr int64_t PART = 4096; // rows whose differences are summed together (PART of __init__.py)
 
 // What lies around a brick.
 struct Surroundings {
@@ -107,14 +107,10 @@ Lanes vary(const Table& table, const Group& group, const float* scale, float* gr
     return total;
 }
 
-} // namespace
-
-extern "C" {
-
 // Huber loss of the differences of texels with their stored neighbours, and its gradient [count, channels], which holds
 // neighbours fixed. Works on parts [begin, end) of PART rows each and writes the loss of each. Rows of a brick should
 // come together. `places` names the tile of every brick, `scales` are those of x, y and z of each head.
-void mmpi_total_variation(const int64_t* rows, int64_t count, int64_t begin, int64_t end, int64_t channels,
+void mmpi_total_variation(int64_t begin, int64_t end, const int64_t* rows, int64_t count, int64_t channels,
                           const float* numbers, int64_t table_rows, const Grid* grids, int64_t num_heads,
                           const int64_t* places, const float* scales, float* grad, double* totals) {
     const Table table{numbers, table_rows, channels};
@@ -161,6 +157,7 @@ void mmpi_total_variation(const int64_t* rows, int64_t count, int64_t begin, int
         totals[part] = total;
     }
 }
-}
+
+} // namespace
 
 IN_PARTS(mmpi_total_variation)
