@@ -83,8 +83,25 @@ def check_transforms(parser: NerfstudioDataParserConfig, data: Path, splits: Seq
     poses = np.stack([_pose(frame, path) for frame in frames])
     _check_whole_file(meta, frames, splits, path, by_name=(parser.downscale_factor or 1) > 1)
     check_lenses(meta, frames, path)
-    if opens:
-        _check_first_image(parser.downscale_factor, path.parent, frames[0]["file_path"])
+    first, factor = path.parent / frames[0]["file_path"], parser.downscale_factor
+    if opens and factor is not None:
+        if not Number(1, 1024, whole=True).holds(factor):
+            raise InputError(f"--downscale-factor must be a whole number of at least 1, not {factor}.")
+        copy = path.parent / f"images_{factor}" / first.name
+        if factor > 1 and not copy.is_file():
+            copies = ", ".join(sorted(p.name for p in path.parent.glob("images_*") if p.is_dir())) or "no copies"
+            raise InputError(
+                f"There is no {copy}, a copy at 1/{factor} of its size: make copies (mmpi-prepare does) or give "
+                f"another --downscale-factor (there are {copies})."
+            )
+    elif opens:
+        try:
+            with Image.open(first):
+                pass
+        except (OSError, ValueError, Image.DecompressionBombError) as error:
+            raise InputError(
+                f"Image {first} cannot be read ({brief(error)}): repair it or remove its frame."
+            ) from error
     names = [str(frame["file_path"]) for frame in frames]
     _check_places(poses[:, :3, 3], names, path, auto_scale=parser.auto_scale_poses)
     files = [str(frame[key]) for frame in frames for key in PATHS if key in frame]
@@ -218,27 +235,6 @@ def _check_whole_file(
                 f"{shown(lost[0])}, listed in {key} of {path}, is the file_path of no frame ({len(lost)} such in "
                 "all): correct the list."
             )
-
-
-def _check_first_image(factor: int | None, folder: Path, first: str) -> None:
-    if factor is not None:
-        if not Number(1, 1024, whole=True).holds(factor):
-            raise InputError(f"--downscale-factor must be a whole number of at least 1, not {factor}.")
-        copy = folder / f"images_{factor}" / Path(first).name
-        if factor > 1 and not copy.is_file():
-            copies = ", ".join(sorted(p.name for p in folder.glob("images_*") if p.is_dir())) or "no copies"
-            raise InputError(
-                f"There is no {copy}, a copy at 1/{factor} of its size: make copies (mmpi-prepare does) or give "
-                f"another --downscale-factor (there are {copies})."
-            )
-        return
-    try:
-        with Image.open(folder / first):
-            pass
-    except (OSError, ValueError, Image.DecompressionBombError) as error:
-        raise InputError(
-            f"Image {folder / first} cannot be read ({brief(error)}): repair it or remove its frame."
-        ) from error
 
 
 def _check_places(centers: NDArray[np.float64], names: Sequence[str], path: Path, *, auto_scale: bool) -> None:

@@ -28,7 +28,7 @@ from mmpi_ns.capture.moving import moving_masks, share_of_moving
 from mmpi_ns.capture.new_views import find_shared_points, image_and_mask
 from mmpi_ns.capture.observe import drop_masked, observe, posed_images, sfm_folder
 from mmpi_ns.capture.photometry import SAME_LIGHT, Gains, color_ratios, image_gains
-from mmpi_ns.capture.ray_sources import Keypoints, PixelPool, RaySources
+from mmpi_ns.capture.ray_sources import PixelPool, RaySources, rays_to_keypoints
 from mmpi_ns.capture.rays import PinholeRays
 from mmpi_ns.capture.tracks import at_full_size
 from mmpi_ns.placement.observations import Observations
@@ -51,38 +51,6 @@ RAYS_PER_STEP = "mmpi_rays_per_step"
 """Key of the pixel rays of a training step."""
 TRAINING_VIEWS = "mmpi_training_views"
 """Key of the positions and fields of view of the training cameras (``TrainingViews``)."""
-
-
-class DrawnAhead:
-    """Draws the rays of steps, keyed on (seed, step); with several threads, one of them draws those of the next step
-    meanwhile. Drawing is small operations of torch, which take the time of one core."""
-
-    _thread: ClassVar = ThreadPoolExecutor(1, thread_name_prefix="mmpi-rays")
-
-    def __init__(self, seed: int, device: str | torch.device) -> None:
-        self.seed, self.device = seed, device
-        self._next: tuple[RaySources, tuple[int, int], Future[Batch]] | None = None
-
-    def draw(self, sources: RaySources, step: int, pixel_rays: int) -> Batch:
-        """What ``RaySources.draw`` draws for a step.
-
-        Args:
-            sources: of the rays.
-            step: of the training.
-            pixel_rays: rays through pixels.
-        """
-        batch = None
-        if self._next is not None:
-            of, key, future = self._next
-            batch = future.result() if of is sources and key == (step, pixel_rays) else None
-        batch = batch or self._drawn(sources, step, pixel_rays)
-        if num_threads() > 1 and torch.device(self.device).type == "cpu":
-            following = step + 1, pixel_rays
-            self._next = sources, following, self._thread.submit(self._drawn, sources, *following)
-        return batch
-
-    def _drawn(self, sources: RaySources, step: int, pixel_rays: int) -> Batch:
-        return sources.draw(pixel_rays, generator(self.seed, step, "pixels", self.device))
 
 
 @dataclass
@@ -126,6 +94,8 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
     """Draws training batches from ``RaySources`` and hands the scene's observations to the model."""
 
     config: MMPIDataManagerConfig
+    _thread: ClassVar = ThreadPoolExecutor(1, thread_name_prefix="mmpi-rays")
+    """Draws the rays of the next step during this one: small operations of torch, which take the time of one core."""
 
     def __init__(self, config: MMPIDataManagerConfig, **kwargs: Any) -> None:
         self.known_depth: KnownDepth | None = None
@@ -136,6 +106,8 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         """Sources that a step draws from now."""
         self._resident: RaySources | None = None
         """The sources of all cameras, if they are in memory all the time."""
+        self._ahead: tuple[RaySources, tuple[int, int], Future[Batch]] | None = None
+        """Rays of the next step with what they are drawn from, their step and number."""
         parser = config.dataparser
         check_options(parser, {name: number for name, number in PARSER_OPTIONS.items() if hasattr(parser, name)}, "--")
         if isinstance(parser, NerfstudioDataParserConfig):
@@ -202,13 +174,11 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         """Reads the pixels into memory, unless there are too many, instead of nerfstudio's image cache."""
         # Samples nothing: ns-export sets its batches' size here.
         self.train_pixel_sampler = self._get_pixel_sampler(self.train_dataset, self.config.train_num_rays_per_batch)
-        self._rays = DrawnAhead(self.config.seed, self.device)
         gains = self.calibrated() if self.config.correct_exposure and self.test_mode == "val" else None
         if gains is not None:
             say(gains.describe())
-        self.gains = gains if gains is not None and gains.matter else None
-        if self.gains is not None:
-            self.train_dataset.metadata[GAINS] = self.gains
+            if gains.matter:
+                self.gains = self.train_dataset.metadata[GAINS] = gains
         if self._sizes(None).sum() <= self.config.resident_pixels and self.test_mode == "val":
             CONSOLE.print(f"Reading {len(self.train_dataset)} training images.")
             self.sources = self._resident = self._read_sources(None)
@@ -243,7 +213,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
 
     def _read_sources(self, cameras: NDArray[np.int64] | None) -> RaySources:
         """The pixels, new views and keypoints of all training cameras, or of some; notes if pixels are left out."""
-        config, images = self.config, range(len(self.train_dataset)) if cameras is None else cameras.tolist()
+        config, images = self.config, list(range(len(self.train_dataset))) if cameras is None else cameras.tolist()
         total, most = self._sizes(cameras).sum(), int(config.resident_pixels)
         if 0 < most < total:
             CONSOLE.print(
@@ -263,8 +233,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         else:
             chosen = images, config.seed, self.device, exposures
             new_views = find_shared_points(self.train_dataset, posed, depths, rays, *chosen)
-        keypoints = Keypoints.of(self.observations, self.device) if self.test_mode == "val" else None
-        keypoints = keypoints if cameras is None else keypoints and keypoints.of_images(torch.from_numpy(cameras))
+        keypoints = rays_to_keypoints(self.observations, self.device, images) if self.test_mode == "val" else None
         counts = config.new_view_share, config.keypoint_rays
         return RaySources(pixels, new_views, keypoints, rays, *counts, no_new_views, exposures)
 
@@ -327,15 +296,27 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         return self.eval_ray_generator(batch["indices"]), batch
 
     def next_train(self, step: int) -> tuple[RayBundle, dict]:
-        """The rays of a step, keyed on (seed, step), as by ``RaySources.draw``.
+        """The rays of a step, keyed on (seed, step), as by ``RaySources.draw``; with several threads, those of the next
+        step are drawn meanwhile.
 
         Outside training (ns-export always requests step 0) only pixel rays, different ones in each call.
         """
         self.train_count += 1
         if self.sources is None:  # nobody said which window
             self.use_cameras(None)
-        assert self.sources is not None
-        if self.training:
-            return self._rays.draw(self.sources, step, self.get_train_rays_per_batch())
-        g = generator(self.config.seed, self.train_count, "pixels", self.device)
-        return self.sources.draw(self.get_train_rays_per_batch(), g, pixels_alone=True)
+        sources, pixel_rays, batch = self.sources, self.get_train_rays_per_batch(), None
+        assert sources is not None
+        if not self.training:
+            g = generator(self.config.seed, self.train_count, "pixels", self.device)
+            return sources.draw(pixel_rays, g, pixels_alone=True)
+
+        def drawn(of: int) -> Batch:
+            return sources.draw(pixel_rays, generator(self.config.seed, of, "pixels", self.device))
+
+        if self._ahead is not None:
+            source, key, future = self._ahead
+            batch = future.result() if source is sources and key == (step, pixel_rays) else None
+        batch = batch or drawn(step)
+        if num_threads() > 1 and torch.device(self.device).type == "cpu":
+            self._ahead = sources, (step + 1, pixel_rays), self._thread.submit(drawn, step + 1)
+        return batch

@@ -12,14 +12,11 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float
-from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.data.utils.data_utils import get_image_mask_tensor_from_path
 from numpy.typing import NDArray
 from PIL import Image
-from torch import Tensor
 
 from mmpi_ns.capture.exif import is_turned
 from mmpi_ns.capture.rays import image_rays
@@ -33,12 +30,8 @@ NO_MASK = "no mask"
 """Name of the mask file of a frame that has none where others have one: nerfstudio's parser knows all or none."""
 
 
-class UnusableFile(InputError):
-    """An image or mask file that cannot be used; the message names it and the remedy."""
-
-
 class MMPIDataset(InputDataset):
-    """Images, masks and distances of the size of their cameras; raises ``UnusableFile`` where one cannot be used."""
+    """Images, masks and distances of the size of their cameras; raises ``InputError`` where one cannot be used."""
 
     @cached_property
     def has_alpha(self) -> bool:
@@ -83,9 +76,7 @@ class MMPIDataset(InputDataset):
                 else:
                     pixels = np.array(image.convert("RGBA" if image.has_transparency_data else "RGB"))
         except UNREADABLE as error:
-            raise UnusableFile(
-                f"Image {name} cannot be read ({brief(error)}): repair it or remove its frame."
-            ) from error
+            raise InputError(f"Image {name} cannot be read ({brief(error)}): repair it or remove its frame.") from error
         if self.scale_factor == 1.0:
             return pixels
         size = [int(side * self.scale_factor) for side in pixels.shape[1::-1]]
@@ -103,7 +94,7 @@ class MMPIDataset(InputDataset):
                 if mask.shape[:2] != shape:
                     raise ValueError(f"it has {mask.shape[1]} x {mask.shape[0]} pixels")
             except UNREADABLE as error:
-                raise UnusableFile(
+                raise InputError(
                     f"Mask {file} cannot be used ({brief(error)}): give one channel of the image's size, white where "
                     "used."
                 ) from error
@@ -113,18 +104,19 @@ class MMPIDataset(InputDataset):
         if not (0 <= rows - height <= 1 and 0 <= columns - width <= 1):
             name, size = self.image_filenames[image_idx], f"{columns} x {rows} pixels and its camera {width} x {height}"
             if 0 <= columns - height <= 1 and 0 <= rows - width <= 1 and is_turned(name):
-                raise UnusableFile(
+                raise InputError(
                     f"Image {name} has {size}: its EXIF alone turns it, so turn its pixels, as mmpi-prepare does."
                 )
-            raise UnusableFile(
+            raise InputError(
                 f"Image {name} has {size}: correct the camera's size or give the images that the cameras belong to."
             )
         if image_type == "float32" and (files := self.metadata.get("depth_filenames")):
             unit = self.metadata.get("depth_unit_scale_factor", 1.0) * self._dataparser_outputs.dataparser_scale
             depth = read_depth_image(Path(files[image_idx]), unit)
             depth = cv2.resize(depth, (columns, rows), interpolation=cv2.INTER_NEAREST_EXACT)
-            depth = torch.from_numpy(depth[:height, :width])
-            data["distance"] = distances(depth, self.cameras[image_idx : image_idx + 1])
+            camera = self.cameras[image_idx : image_idx + 1]
+            along_axis = -(image_rays(camera).directions * camera.camera_to_worlds[0, :, 2]).sum(-1)
+            data["distance"] = (torch.from_numpy(depth[:height, :width]) / along_axis.clamp(min=1e-6))[..., None]
         return data | {k: data[k][:height, :width] for k in ("image", "mask", "distance") if k in data}
 
     def usable(self, image_idx: int) -> NDArray[np.bool_]:
@@ -134,12 +126,6 @@ class MMPIDataset(InputDataset):
         if self.moving is not None:
             return ~self.moving[image_idx]
         return np.ones([int(n.reshape(-1)[image_idx]) for n in (self.cameras.height, self.cameras.width)], bool)
-
-
-def distances(depth: Float[Tensor, "H W"], camera: Cameras) -> Float[Tensor, "H W 1"]:
-    """Distance of the content of each pixel from a camera, by its depth along the optical axis."""
-    along_axis = -(image_rays(camera).directions * camera.camera_to_worlds[0, :, 2]).sum(-1)
-    return (depth / along_axis.clamp(min=1e-6))[..., None]
 
 
 def read_depth_image(file: Path, unit: float) -> NDArray[np.float32]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import cast
 
@@ -136,10 +136,9 @@ def know_depths(
     files = outputs.metadata.get("depth_filenames") if sensor else None
     if posed is None or not (dense or files or observations.loose is not None):
         return depths, observations
-    original, seen = at_full_size(posed), observations
+    original = at_full_size(posed)
     cloud = None if observations.loose is None else see_points(observations.loose, posed)
-    if cloud is not None:
-        seen = cloud.added_to(observations)
+    seen = observations if cloud is None else cloud.added_to(observations)
     if dense:
         depths = _remembered_depths(original, posed, seen)
     if dense and cloud is not None:
@@ -189,13 +188,28 @@ def _from_cache(key: str, find: Callable[[], Iterable[Codes]]) -> KnownDepth:
 
 
 def with_sensor(known: KnownDepth, files: list[Path], unit: float, posed: PosedImages) -> KnownDepth:
-    """Replaces depths by those of sensors where there are any; where both are known and contradict, neither is kept."""
+    """Replaces depths by those of sensors where there are any; where both are known and contradict, neither is kept.
+
+    Args:
+        known: depths from other sources.
+        files: depth image (16-bit PNG or .npy) of each training image.
+        unit: length of a depth of 1, scene units.
+        posed: the training images.
+
+    Raises:
+        InputError: a file cannot be read (names it); when an image's depths are.
+    """
 
     def replaced(i: int) -> Codes:
         codes = known.codes[i]
         shape = codes.shape[0], codes.shape[1]
-        width, height = shown_size(size_of(posed.files[i]), posed.sizes[i]).astype(int)
-        measured = packed(read_sensor(files[i], unit, posed, i, shape, (height, width)))
+        size = shown_size(size_of(posed.files[i]), posed.sizes[i]).astype(int).tolist()
+        depth = read_depth_image(files[i], unit)  # along the optical axis
+        depth = cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST_EXACT)[: shape[0], : shape[1]]
+        x, y = straightened(posed, i, shape)
+        longer = np.sqrt(x**2 + y**2 + 1)
+        inverse = np.where(depth > 0, 1 / (np.where(depth > 0, depth, 1) * longer), 0)
+        measured = packed(np.stack([inverse, SENSOR_ERROR * inverse], -1))
         apart = contradict(*(unpacked(torch.from_numpy(x)).numpy() for x in (measured, codes)))
         codes = np.where(measured[..., :1] != UNKNOWN, measured, codes)
         codes[apart] = UNKNOWN
@@ -254,36 +268,34 @@ def with_continued(known: KnownDepth, posed: PosedImages, dataset: MMPIDataset, 
 
     Masked pixels have no distance: what moves is nowhere.
     """
+
+    def codes_of(i: int) -> Codes:
+        """Computed for every n-th pixel of a large image."""
+        codes, hidden = np.array(known.codes[i]), ~dataset.usable(i)
+        codes[hidden] = UNKNOWN
+        step = -(-max(codes.shape[:2]) // CONTINUED)
+        rows, columns = (np.minimum(np.arange(0, n, step) + step // 2, n - 1) for n in codes.shape[:2])
+        pixels = np.stack(np.meshgrid(i, rows, columns, indexing="ij"), -1).reshape(-1, 3)
+        directions = rays(torch.from_numpy(pixels)).directions.cpu().numpy().reshape(len(rows), len(columns), 3)
+        sparse = unpacked(torch.from_numpy(codes[np.ix_(rows, columns)])).numpy()
+        extended = continued(sparse, directions)
+        down, across = np.nonzero(extended[..., 0])
+        points = posed.camera_to_worlds[i, :, 3] + directions[down, across] / extended[down, across, :1]
+        seen = ~is_lone(posed, i, points)
+        extended[down[seen], across[seen]] = 0
+        for first, fine in zip(range(0, len(codes), step), packed(extended), strict=True):
+            part = codes[first : first + step]
+            np.copyto(part, np.repeat(fine, step, 0)[: part.shape[1]], where=part[..., :1] == UNKNOWN)
+        codes[hidden] = UNKNOWN
+        return codes
+
     count = len(known.codes)
     cameras = posed.camera_to_worlds, posed.intrinsics, posed.distortion, posed.fisheye
     masks = [digest((), dataset.usable(i)) for i in range(count)] if dataset.has_masks else []
     contents = [digest((), codes) for codes in known.codes]
     key = digest(posed.files, "continued", VERSION, *cameras, contents, masks)
-    codes_of = partial(_continued_codes, known, posed, dataset, rays)
-    return _from_cache(
-        key, lambda: track(in_order(codes_of, range(count)), "Extrapolating surfaces", count, console=CONSOLE)
-    )
-
-
-def _continued_codes(known: KnownDepth, posed: PosedImages, dataset: MMPIDataset, rays: Rays, i: int) -> Codes:
-    """Codes of one image with extrapolated surfaces; computed for every n-th pixel of a large image."""
-    codes, hidden = np.array(known.codes[i]), ~dataset.usable(i)
-    codes[hidden] = UNKNOWN
-    step = -(-max(codes.shape[:2]) // CONTINUED)
-    rows, columns = (np.minimum(np.arange(0, n, step) + step // 2, n - 1) for n in codes.shape[:2])
-    pixels = np.stack(np.meshgrid(i, rows, columns, indexing="ij"), -1).reshape(-1, 3)
-    directions = rays(torch.from_numpy(pixels)).directions.cpu().numpy().reshape(len(rows), len(columns), 3)
-    sparse = unpacked(torch.from_numpy(codes[np.ix_(rows, columns)])).numpy()
-    extended = continued(sparse, directions)
-    down, across = np.nonzero(extended[..., 0])
-    points = posed.camera_to_worlds[i, :, 3] + directions[down, across] / extended[down, across, :1]
-    seen = ~is_lone(posed, i, points)
-    extended[down[seen], across[seen]] = 0
-    for first, fine in zip(range(0, len(codes), step), packed(extended), strict=True):
-        part = codes[first : first + step]
-        np.copyto(part, np.repeat(fine, step, 0)[: part.shape[1]], where=part[..., :1] == UNKNOWN)
-    codes[hidden] = UNKNOWN
-    return codes
+    work = "Extrapolating surfaces"
+    return _from_cache(key, lambda: track(in_order(codes_of, range(count)), work, count, console=CONSOLE))
 
 
 def of_cells(observations: Observations, known: KnownDepth, dataset: MMPIDataset) -> Observations:
@@ -316,10 +328,8 @@ def of_cells(observations: Observations, known: KnownDepth, dataset: MMPIDataset
     if not len(cells):
         return observations
     if len(observations.seen_by) > MOST_KEYPOINTS * len(cells):
-        observations = replace(
-            observations, points=cells[:0], seen_at=observations.seen_at[:0],
-            seen_by=observations.seen_by[:0], seen_point=observations.seen_point[:0],
-        )  # fmt: skip
+        nothing = observations.with_keypoints(np.zeros(len(observations.seen_by), np.bool_))
+        observations = replace(nothing, points=cells[:0])
     return replace(
         observations,
         points=np.concatenate([observations.points, cells]),
@@ -344,28 +354,3 @@ def with_points(known: KnownDepth, observations: Observations) -> KnownDepth:
         return codes
 
     return KnownDepth(Computed(len(known.codes), added))
-
-
-def read_sensor(
-    file: Path, unit: float, posed: PosedImages, i: int, shape: tuple[int, int], file_shape: tuple[int, int]
-) -> Map:
-    """Distances from a depth image (along the optical axis, 0 where unknown), for a training image's pixels.
-
-    Args:
-        file: 16-bit PNG or .npy.
-        unit: length of a depth of 1, scene units.
-        posed: the training images.
-        i: the image's place in them.
-        shape: height and width of the training image.
-        file_shape: those of all that its file shows, which may have a row or column more.
-
-    Raises:
-        InputError: the file cannot be read (names it).
-    """
-    depth = read_depth_image(file, unit)
-    nearest = cv2.resize(depth, file_shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT)[: shape[0], : shape[1]]
-    x, y = straightened(posed, i, shape)
-    longer = np.sqrt(x**2 + y**2 + 1)
-    hit = np.isfinite(nearest) & (nearest > 0)
-    inverse = np.where(hit, 1 / (np.where(hit, nearest, 1) * longer), 0)
-    return np.stack([inverse, SENSOR_ERROR * inverse], -1).astype(np.float32)

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -70,8 +71,7 @@ ROUNDS = 20
 MOST_HEADROOM = 0.5
 
 
-@dataclass(frozen=True)
-class ColorRatios:
+class ColorRatios(NamedTuple):
     """Colours of the same surfaces in pairs of images: medians of M groups of matches."""
 
     first: Int[ndarray, "M"]
@@ -82,13 +82,9 @@ class ColorRatios:
     falloff: Float[ndarray, "M 2"]
     """Change of r^2 and r^4 from the first to the second; r is 1 at the corners."""
 
-    def some(self, chosen: NDArray[np.bool_]) -> ColorRatios:
-        return ColorRatios(*(getattr(self, name)[chosen] for name in self.__dataclass_fields__))
-
     @staticmethod
     def join(parts: Sequence[ColorRatios]) -> ColorRatios:
-        names = ColorRatios.__dataclass_fields__
-        return ColorRatios(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+        return ColorRatios(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 @dataclass(frozen=True)
@@ -360,9 +356,9 @@ def image_gains(ratios: ColorRatios, count: int, exposures: Float[ndarray, "N"] 
     fold = np.unique(pairs, return_inverse=True)[1] % FOLDS
     residuals: dict[bool, list[NDArray[np.float64]]] = {False: [], True: []}
     for number in np.unique(fold):
-        left_out = ratios.some(fold == number)
+        used, left_out = (ColorRatios(*(x[chosen] for x in ratios)) for chosen in (fold != number, fold == number))
         for gains, parts in residuals.items():
-            logs, _, falloff = solve(ratios.some(fold != number), count, exposures, gains=gains)
+            logs, _, falloff = solve(used, count, exposures, gains=gains)
             change = logs[left_out.second] - logs[left_out.first]
             parts.append(np.abs(left_out.log_ratios - change - left_out.falloff @ falloff).ravel())
     logs, errors, falloff = solve(ratios, count, exposures)

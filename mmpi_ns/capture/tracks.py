@@ -45,24 +45,11 @@ MIN_TRACK = 2
 """Minimum number of images of a point; with given poses, two are enough."""
 COPIES = re.compile(r"(.+)_(\d+)")
 """Name of a folder of downscaled copies: that of the originals, and the factor."""
+EFFORTS = ((0.0067, False, 15), (0.002, True, 8))
+"""Contrast of the faintest features (SIFT), whether a pair is matched again along the epipolar lines of its first
+matches, and its least inliers: for textured images, and for rooms at low resolution (two to four times slower)."""
 ENOUGH = 100
 """Average number of keypoints in an image above which the thorough search is skipped."""
-
-
-@dataclass(frozen=True)
-class Effort:
-    """Effort of the search for matches."""
-
-    peak_threshold: float
-    """Contrast of the faintest features (SIFT)."""
-    guided: bool
-    """Whether a pair is matched again along the epipolar lines of its first matches."""
-    min_matches: int
-    """Minimum number of inlier matches of a pair."""
-
-
-EFFORTS = (Effort(0.0067, False, 15), Effort(0.002, True, 8))
-"""Settings for textured images, and for rooms at low resolution (two to four times slower)."""
 
 
 @dataclass(frozen=True)
@@ -211,8 +198,9 @@ def triangulate(images: PosedImages) -> SfmModel:
         return _attempt(images, EFFORTS[-1])
 
 
-def _attempt(images: PosedImages, effort: Effort) -> SfmModel:
+def _attempt(images: PosedImages, effort: tuple[float, bool, int]) -> SfmModel:
     pycolmap, pairs, error = load_pycolmap(), near_pairs(images.camera_to_worlds, NEIGHBOURS), np.nan
+    peak_threshold, guided, least = effort
     with tempfile.TemporaryDirectory(prefix="mmpi-tracks-") as folder:
         work, database = Path(folder) / "images", Path(folder) / "database.db"
         work.mkdir()
@@ -234,14 +222,14 @@ def _attempt(images: PosedImages, effort: Effort) -> SfmModel:
         options = pycolmap.FeatureExtractionOptions()
         options.max_image_size = LARGE
         options.sift.first_octave = -1 if images.sizes.max() <= SMALL else 0
-        options.sift.peak_threshold = effort.peak_threshold
+        options.sift.peak_threshold = peak_threshold
         find_features(database, work, names, options)
         for file, features in zip(images.files, count_features(database), strict=True):
             if features is None:
                 raise InputError(f"Training image {file} cannot be read: repair or remove it.")
         if pairs:
             named = [(names[i], names[j]) for i, j in pairs]
-            match_pairs(database, named, guided=effort.guided, least=effort.min_matches)
+            match_pairs(database, named, guided=guided, least=least)
             error = _epipolar_error(database, model)
             model = triangulate_points(model, database, work, pairs_alone=True)
         tracks = read_reconstruction(model, MIN_TRACK)
