@@ -206,10 +206,9 @@ def _check_whole_file(
             check_row(f"Row {i + 1} of applied_transform of {path}", row, 4, Number(-1e18, 1e18))
         if abs(np.linalg.det(np.array(rows, dtype=np.float64)[:, :3])) < 1e-12:
             raise InputError(f"applied_transform of {path} is singular: give a rotation and a translation.")
-    if "applied_scale" in meta:
-        check_number(f"applied_scale of {path}", meta["applied_scale"], Number(0, 1e18, above=True))
-    if "fisheye_crop_radius" in meta:
-        check_number(f"fisheye_crop_radius of {path}", meta["fisheye_crop_radius"], Number(0, 1e6, above=True))
+    for key, most in (("applied_scale", 1e18), ("fisheye_crop_radius", 1e6)):
+        if key in meta:
+            check_number(f"{key} of {path}", meta[key], Number(0, most, above=True))
     cloud = meta.get("ply_file_path", "given")
     if not isinstance(cloud, str):
         raise InputError(f"ply_file_path of {path} is {shown(cloud)}: give the path of a PLY file, or leave it out.")
@@ -246,14 +245,12 @@ def _check_places(centers: NDArray[np.float64], names: Sequence[str], path: Path
             f"All {len(centers)} camera(s) of {path} stand in one place, so no distance can be learned: give images "
             "from two places, or learn colours alone (nerfstudio-data --auto-scale-poses False)."
         )
-    middle = np.median(centers, axis=0)
-    off = np.linalg.norm(centers - middle, axis=-1)
-    order: list[int] = np.argsort(off).tolist()
-    most = max(len(off) - 1 - int(FEW * len(off)), 0)
-    usual = off[order[max(min(most, len(off) - 2), 0)]]
-    if usual > 0 and off[order[-1]] > FAR_OFF * usual:
+    off = np.linalg.norm(centers - np.median(centers, axis=0), axis=-1)
+    count, last = len(off), int(off.argmax())
+    usual = np.sort(off)[min(count - 1 - int(FEW * count), count - 2)]
+    if usual > 0 and off[last] > FAR_OFF * usual:
         raise InputError(
-            f"The camera of frame {cut(names[order[-1]])} of {path} stands {off[order[-1]]:.3g} from the others, which "
+            f"The camera of frame {cut(names[last])} of {path} stands {off[last]:.3g} from the others, which "
             f"lie within {usual:.3g}: correct its transform_matrix or remove the frame."
         )
 

@@ -135,15 +135,8 @@ class Parallax:
 def measure(
     view: View, neighbour: View, start: Map, flow: cv2.DISOpticalFlow, of_view: tuple[Map, Map]
 ) -> tuple[Map, Map]:
-    """Inverse depths of a view's pixels by comparison with another view, and one over their squared errors (0: none).
-
-    Args:
-        view: the image that gets depths.
-        neighbour: the image that it is compared with.
-        start: rough inverse depths. [h, w]
-        flow: finds small motions.
-        of_view: its ``mean_and_contrast``.
-    """
+    """Inverse depths [h, w] of a view's pixels by comparison with another view, and one over their squared errors (0:
+    none), from rough inverse depths and the view's ``mean_and_contrast``; ``flow`` finds small motions."""
     parallax = Parallax.between(view, neighbour)
     x, y, _ = parallax.pixels(start)
     motion = np.asarray(flow.calc(view.gray, look_up(neighbour.gray, x, y), None))  # type: ignore[call-overload]
@@ -221,7 +214,7 @@ def find_depths(
         rounds: of matching; None: by size.
     """
     with one_thread_each(), ThreadPoolExecutor(num_threads()) as pool:
-        results = in_turn(_tasks(pool, images, points_of, width, finish, rounds), num_threads())
+        results = in_turn(_tasks(pool, images, points_of, width, finish, rounds), num_threads() + 1)
         for n, (is_last, result) in enumerate(progress(results, 2 * len(images.files))):
             if n % TRIMMED == 0:
                 give_back_freed_memory()

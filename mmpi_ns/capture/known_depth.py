@@ -25,8 +25,7 @@ from mmpi_ns.capture.cache import Computed, digest, remembered
 from mmpi_ns.capture.dataset import MMPIDataset, read_depth_image
 from mmpi_ns.capture.dense import SECONDS, Depth, find_depths
 from mmpi_ns.capture.lone_depth import continued, is_lone
-from mmpi_ns.capture.loose_points import POINT_ERROR, contradict, see_points
-from mmpi_ns.capture.observe import drop_masked, posed_images
+from mmpi_ns.capture.observe import POINT_ERROR, contradict, drop_masked, posed_images, see_points
 from mmpi_ns.capture.rays import Rays
 from mmpi_ns.capture.tracks import PosedImages, at_full_size, shown_size, size_of
 from mmpi_ns.capture.views import STRIP, View, look_up, straightened, strips
@@ -192,12 +191,9 @@ def with_sensor(known: KnownDepth, files: list[Path], unit: float, posed: PosedI
 
     Args:
         known: depths from other sources.
-        files: depth image (16-bit PNG or .npy) of each training image.
+        files: depth image of each training image.
         unit: length of a depth of 1, scene units.
         posed: the training images.
-
-    Raises:
-        InputError: a file cannot be read (names it); when an image's depths are.
     """
 
     def replaced(i: int) -> Codes:
@@ -219,7 +215,7 @@ def with_sensor(known: KnownDepth, files: list[Path], unit: float, posed: PosedI
 
 
 def at_training_pixels(view: View, depth: Depth, posed: PosedImages, i: int, shape: tuple[int, int]) -> Map:
-    """Distances of a training image's pixels from the depths of its view at working size.
+    """Inverse distances and errors [H, W, 2] of a training image's pixels from the depths of its view at working size.
 
     A training pixel takes the mean over its area, weighted by certainty; the spread within the area, large at an
     edge, is added to its error. One that is smaller than a working pixel takes the depth of that.
@@ -230,12 +226,20 @@ def at_training_pixels(view: View, depth: Depth, posed: PosedImages, i: int, sha
         posed: the training images.
         i: the image's place in them.
         shape: height and width of the training image.
-
-    Returns:
-        [H, W, 2] inverse distance and expected error.
     """
     height, width = (min(pair) for pair in zip(shape, view.gray.shape, strict=True))
-    maps, distances = pooled(depth, (height, width)), np.empty((*shape, 2), np.float32)
+    maps, distances = (depth.inverse, depth.error), np.empty((*shape, 2), np.float32)
+    if view.gray.shape != (height, width):
+        measured = (depth.inverse > 0).astype(np.float32)
+        weight = measured / np.maximum(depth.error, 1e-12) ** 2
+        cover, total, first, second = (
+            cv2.resize(m.astype(np.float64), (width, height), interpolation=cv2.INTER_AREA)
+            for m in (measured, weight, weight * depth.inverse, weight * depth.inverse**2)
+        )
+        mean = first / np.maximum(total, 1e-30)
+        spread = np.maximum(second / np.maximum(total, 1e-30) - mean**2, 0)
+        error = np.sqrt(cover / np.maximum(total, 1e-30) + spread)
+        maps = tuple(np.where(cover >= COVERED, m, 0).astype(np.float32) for m in (mean, error))
     fx, fy, cx, cy = view.pinhole
     scale_x, scale_y = width / view.gray.shape[1], height / view.gray.shape[0]
     for rows in strips(shape):
@@ -244,23 +248,6 @@ def at_training_pixels(view: View, depth: Depth, posed: PosedImages, i: int, sha
         for n, values in enumerate(maps):
             distances[rows, :, n] = look_up(values, *at, nearest=True) / longer
     return distances
-
-
-def pooled(depth: Depth, shape: tuple[int, int]) -> tuple[Map, Map]:
-    """Inverse depth and error over the areas of a coarser grid [h, w]; 0 where too little of an area is known."""
-    if depth.inverse.shape == shape:
-        return depth.inverse, depth.error
-    measured = (depth.inverse > 0).astype(np.float32)
-    weight = measured / np.maximum(depth.error, 1e-12) ** 2
-    cover, total, first, second = (
-        cv2.resize(m.astype(np.float64), shape[::-1], interpolation=cv2.INTER_AREA)
-        for m in (measured, weight, weight * depth.inverse, weight * depth.inverse**2)
-    )
-    mean = first / np.maximum(total, 1e-30)
-    spread = np.maximum(second / np.maximum(total, 1e-30) - mean**2, 0)
-    error = np.sqrt(cover / np.maximum(total, 1e-30) + spread)
-    kept = cover >= COVERED
-    return np.where(kept, mean, 0).astype(np.float32), np.where(kept, error, 0).astype(np.float32)
 
 
 def with_continued(known: KnownDepth, posed: PosedImages, dataset: MMPIDataset, rays: Rays) -> KnownDepth:

@@ -12,8 +12,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from mmpi_ns.capture.checks import check_transforms
 from mmpi_ns.capture.datamanager import OBSERVATIONS, MMPIDataManagerConfig
-from mmpi_ns.capture.dataset import MMPIDataset
-from mmpi_ns.capture.local_origin import take_local_origins
+from mmpi_ns.capture.dataset import MMPIDataset, take_local_origins
 from mmpi_ns.capture.moving_picture import draw_moving
 from mmpi_ns.capture.observe import observe, sfm_folder
 from mmpi_ns.placement.observations import Observations

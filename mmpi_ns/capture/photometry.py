@@ -143,14 +143,8 @@ class Gains:
 def grouped(
     first: int, second: int, log_ratios: Float[ndarray, "P 3"], radii: tuple[Float[ndarray, "P"], Float[ndarray, "P"]]
 ) -> ColorRatios | None:
-    """Medians of the matches of a pair of images, in groups of similar change of radius; None for too few.
-
-    Args:
-        first: number of the first image.
-        second: of the other.
-        log_ratios: of each match.
-        radii: squared radius of each match in the first and in the second image.
-    """
+    """Medians of the matches of two images, given by their numbers, in groups of similar change of the squared radius
+    from the first to the second; None for too few."""
     if len(log_ratios) < FEWEST:
         return None
     change = np.stack([radii[1] - radii[0], radii[1] ** 2 - radii[0] ** 2], -1)
@@ -204,14 +198,9 @@ def pair_ratios(
     pixels: Int[ndarray, "P 2"],
     points: Float[ndarray, "P 3"],
 ) -> ColorRatios | None:
-    """Colours of surfaces that one image shows, in another; None if it shows too few of them.
+    """Colours of surfaces, at pixels (row, column) of one image, in another; None if it shows too few of them.
 
-    Args:
-        first: the image that shows them. If ``second`` has no distances, what it shows instead is told by colour.
-        second: the other image.
-        cameras: of both.
-        pixels: row and column of each surface in the first image.
-        points: where the surfaces are.
+    If ``second`` has no distances, what it shows instead of a surface is told by colour.
     """
     rows, columns = pixels.T
     at = project(cameras, second.number, points)

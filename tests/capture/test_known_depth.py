@@ -16,7 +16,6 @@ from mmpi_ns.capture.known_depth import (
     KnownDepth,
     at_training_pixels,
     packed,
-    pooled,
     with_points,
     with_sensor,
 )
@@ -97,7 +96,10 @@ def test_areas_take_the_mean_by_certainty_and_edges_have_large_errors():
     inverse[:, 4:6], error[:, 5] = 0.1, 0.01  # an edge inside the third area of 2 x 2: none; inside the fourth: below
     inverse[:2, 7] = 0.9
     inverse[2:, :3], error[2:, :3] = 0, 0
-    mean, spread = pooled(Depth(inverse, error), (2, 4))
+    pinhole, pose, size = np.array([1e6, 1e6, 4, 2]), np.eye(4)[:3], np.array([[8.0, 4]])  # all along the axis
+    view = View(np.zeros((4, 8), np.uint8), pinhole, pose, np.ones((4, 8), bool))
+    posed = PosedImages((Path("x.png"),), pose[None], pinhole[None], size, np.zeros((1, 4)))
+    mean, spread = np.moveaxis(at_training_pixels(view, Depth(inverse, error), posed, 0, (2, 4)), -1, 0)
     assert mean[0] == pytest.approx([0.5, 0.5, 0.1, 0.7]) and spread[0, :3] == pytest.approx([0.01] * 3, rel=1e-3)
     assert spread[0, 3] == pytest.approx(np.hypot(0.2, 0.01), rel=1e-3)
     assert mean[1, 0] == 0 and mean[1, 1] == pytest.approx(0.5)  # nothing known; half of the area known

@@ -8,8 +8,7 @@ import pytest
 import torch
 
 from mmpi_ns.ops.interpolate import interpolate_densely
-from mmpi_ns.scene.bricks import resample
-from mmpi_ns.scene.texels import BRICK, head_grids, make_grids
+from mmpi_ns.scene.texels import BRICK, head_grids, make_grids, resample
 
 F64 = torch.float64
 
