@@ -23,10 +23,8 @@ from PIL import Image
 from mmpi_ns.utils.errors import InputError, brief
 from mmpi_ns.utils.values import Number, check_number, check_row, cut, shown
 
-SAME_PLACE = 1e-6
-"""Cameras closer together than this fraction of their distance from the origin count as one place, in float32."""
 FLOAT64_SAME = 1e-12
-"""The same for numbers as they are in a file."""
+"""Cameras of a file closer together than this fraction of their distance from the origin count as one place."""
 ROTATION_SLACK = 0.01
 """Tolerance on the length of the axes of a pose, which should be 1."""
 FAR_OFF = 1000.0
@@ -114,11 +112,6 @@ def check_transforms(parser: NerfstudioDataParserConfig, data: Path, splits: Seq
 def say_once(text: str) -> None:
     """Prints a note once."""
     CONSOLE.print(text)
-
-
-def in_one_place(centers: NDArray[np.float64], share: float = SAME_PLACE) -> bool:
-    """Test of camera centres [M, 3] for equality up to rounding, relative to their distance from the origin."""
-    return float(np.ptp(centers, axis=0).max()) <= share * max(1.0, float(np.abs(centers).max()))
 
 
 def _read(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
@@ -238,7 +231,7 @@ def _check_whole_file(
 
 def _check_places(centers: NDArray[np.float64], names: Sequence[str], path: Path, *, auto_scale: bool) -> None:
     """Camera positions must differ, and none may be far from all others."""
-    if in_one_place(centers, FLOAT64_SAME):
+    if np.ptp(centers, axis=0).max() <= FLOAT64_SAME * max(1.0, np.abs(centers).max()):
         if not auto_scale:
             return
         raise InputError(

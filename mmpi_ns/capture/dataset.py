@@ -24,11 +24,10 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.data.utils.data_utils import get_image_mask_tensor_from_path
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import ExifTags, Image
 from torch import Tensor
 
 from mmpi_ns.capture.checks import say_once
-from mmpi_ns.capture.exif import is_turned
 from mmpi_ns.capture.rays import image_rays
 from mmpi_ns.capture.sfm import checked_model
 from mmpi_ns.capture.tracks import size_of, whole_of
@@ -120,7 +119,9 @@ class MMPIDataset(InputDataset):
         # Downscaled images may have been rounded up where cameras are rounded down: one pixel is cut off.
         if not (0 <= rows - height <= 1 and 0 <= columns - width <= 1):
             name, size = self.image_filenames[image_idx], f"{columns} x {rows} pixels and its camera {width} x {height}"
-            if 0 <= columns - height <= 1 and 0 <= rows - width <= 1 and is_turned(name):
+            with Image.open(name) as image:
+                shows_rows_as_columns = image.getexif().get(ExifTags.Base.Orientation, 1) in (5, 6, 7, 8)
+            if shows_rows_as_columns and 0 <= columns - height <= 1 and 0 <= rows - width <= 1:
                 raise InputError(
                     f"Image {name} has {size}: its EXIF alone turns it, so turn its pixels, as mmpi-prepare does."
                 )

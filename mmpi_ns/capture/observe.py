@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter
 
 from mmpi_ns.capture.cache import Arrays, digest, remembered
-from mmpi_ns.capture.checks import in_one_place, say_once
+from mmpi_ns.capture.checks import say_once
 from mmpi_ns.capture.dataset import MMPIDataset
 from mmpi_ns.capture.rays import lens_directions
 from mmpi_ns.capture.sfm import SfmModel, find_sfm_model
@@ -34,6 +34,8 @@ from mmpi_ns.utils.errors import InputError, quoted
 
 Array = NDArray[np.float64]
 
+SAME_PLACE = 1e-6
+"""Cameras closer together than this fraction of their distance from the origin count as one place, in float32."""
 MAX_REPROJECTION = 0.02
 """Median angle between keypoints and points, as a fraction of the image, above which a model is in another frame."""
 POSES_OFF = 0.5
@@ -81,7 +83,7 @@ def observe(
         InputError: poses or intrinsics that cannot be used.
     """
     observations = read_observations(outputs, dataset.cameras, find_sfm_model(sfm))
-    if in_one_place(observations.centers):
+    if np.ptp(observations.centers, axis=0).max() <= SAME_PLACE * max(1.0, np.abs(observations.centers).max()):
         CONSOLE.print("[bold yellow]All training cameras stand in one place: no distance can be learned.")
     if find_points:
         if not len(observations.seen_by):
