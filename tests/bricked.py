@@ -9,9 +9,10 @@ from random_fields import fill
 
 from mmpi_ns.field.mmpi_field import MMPIField
 from mmpi_ns.ops.layout import SceneLayout
+from mmpi_ns.scene.bricks import new_table
 from mmpi_ns.scene.geometry import Frames
 from mmpi_ns.scene.plan import CubePlan, ScenePlan
-from mmpi_ns.scene.texels import BRICK, make_grids, new_table, number_tiles
+from mmpi_ns.scene.texels import BRICK, make_grids, number_tiles
 
 SHAPES = [(3, 8, 8), (2, 9, 16), (4, 7, 31), (1, 24, 2), (3, 19, 21)]
 

@@ -16,20 +16,9 @@ from torch import Tensor, nn
 
 from mmpi_ns.field.samples import Lookup
 from mmpi_ns.ops.interpolate import Table, raise_peaks
+from mmpi_ns.scene.bricks import grown_tiles, keep_bricks, new_table, resample, take_bricks, tiles_with_copies
 from mmpi_ns.scene.plan import ScenePlan
-from mmpi_ns.scene.texels import (
-    BRICK,
-    TexelGrid,
-    grown_tiles,
-    head_grids,
-    keep_bricks,
-    make_grids,
-    new_table,
-    number_tiles,
-    resample,
-    take_bricks,
-    tiles_with_copies,
-)
+from mmpi_ns.scene.texels import BRICK, TexelGrid, head_grids, make_grids, number_tiles
 from mmpi_ns.scene.visible_tiles import TrainingViews, reachable_tiles
 from mmpi_ns.utils.files import to_bytes, to_text
 

@@ -11,8 +11,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mmpi_ns.field.tables import TABLES, TexelTables
+from mmpi_ns.scene.bricks import tiles_with_copies, widened_tiles
 from mmpi_ns.scene.plan import FINER, MOST_TEXELS
-from mmpi_ns.scene.texels import BRICK, head_shapes, tiles_with_copies, widened_tiles
+from mmpi_ns.scene.texels import BRICK, head_shapes
 from mmpi_ns.training.memory import Work, stored_bytes, training_bytes
 from mmpi_ns.training.phases import Schedule
 from mmpi_ns.utils.errors import say

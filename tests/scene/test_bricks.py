@@ -16,17 +16,15 @@ from mmpi_ns.ops import dispatch
 from mmpi_ns.ops.interpolate import interpolate_densely, texel_rows
 from mmpi_ns.ops.variation import total_variation
 from mmpi_ns.rendering.sampler import MMPISampler
-from mmpi_ns.scene.texels import (
-    BRICK,
+from mmpi_ns.scene.bricks import (
     grown_tiles,
     keep_bricks,
-    make_grids,
     new_table,
-    number_tiles,
     read_planes,
     resample,
     write_planes,
 )
+from mmpi_ns.scene.texels import BRICK, make_grids, number_tiles
 from mmpi_ns.training.touched_adam import TouchedAdam
 
 # Rows ----------------------------------------------------------------------------------------------------------------

@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from mmpi_ns.ops.interpolate import interpolate_densely
-from mmpi_ns.scene.texels import BRICK, head_grids, make_grids, resample
+from mmpi_ns.scene.bricks import resample
+from mmpi_ns.scene.texels import BRICK, head_grids, make_grids
 
 F64 = torch.float64
 

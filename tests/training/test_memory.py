@@ -116,7 +116,7 @@ def test_what_steps_leave_is_given_back_before_tables_grow_and_zeros_take_nothin
     work = """if True:
         import os, torch
         from pathlib import Path
-        from mmpi_ns.scene.texels import resample
+        from mmpi_ns.scene.bricks import resample
         from mmpi_ns.scene.texels import BRICK, make_grids
         from mmpi_ns.utils.host import KEPT, OWN_MAPPING, give_back_freed_memory, malloc_keeps
         from mmpi_ns.utils.machine import lazy_zeros

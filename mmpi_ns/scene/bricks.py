@@ -1,0 +1,172 @@
+"""Tables of bricks as a whole: allocating, filling, growing and compacting them. Row arithmetic is in ``texels.py``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torch.nn.functional import interpolate, max_pool2d, pad
+
+from mmpi_ns.scene.plan import FINER
+from mmpi_ns.scene.texels import BRICK, SIDE, TexelGrid, number_tiles
+from mmpi_ns.utils.machine import lazy_zeros
+
+CHUNK = 1 << 17
+"""Texels of an MPI that are resampled at once: for nine channels this takes some 40 MB besides both tables."""
+
+
+def new_table(tiles: Int[Tensor, "T"], channels: int, empty: float = 0.0, dtype=torch.float32) -> Float[Tensor, "N C"]:
+    """A table of zeros with a brick for every stored tile; the empty brick contains ``empty``."""
+    bricks = int((tiles > 0).sum()) + 1
+    table = torch.zeros(bricks * BRICK, channels, dtype=dtype, device=tiles.device)
+    table[:BRICK] = empty
+    return table
+
+
+def read_planes(table: Float[Tensor, "N C"], grid: TexelGrid, planes: slice) -> Float[Tensor, "P H W C"]:
+    """Texels of some planes of one head, as images."""
+    tiles = grid.own_tiles[planes]
+    blocks = table.view(-1, SIDE, SIDE, table.shape[-1])[tiles.to(torch.int64)]
+    images = blocks.permute(0, 1, 3, 2, 4, 5).reshape(len(tiles), grid.down * SIDE, grid.across * SIDE, -1)
+    return images[:, : grid.height, : grid.width]
+
+
+def write_planes(table: Float[Tensor, "N C"], grid: TexelGrid, planes: slice, images: Float[Tensor, "P H W C"]) -> None:
+    """Stores images in the existing bricks; texels of other tiles are left out."""
+    tiles = grid.own_tiles[planes]
+    stored = tiles > 0
+    below, right = grid.down * SIDE - grid.height, grid.across * SIDE - grid.width
+    padded = pad(images, (0, 0, 0, right, 0, below))
+    blocks = padded.view(len(tiles), grid.down, SIDE, grid.across, SIDE, -1).permute(0, 1, 3, 2, 4, 5)
+    table.view(-1, SIDE, SIDE, table.shape[-1])[tiles[stored].to(torch.int64)] = blocks[stored]
+
+
+def keep_bricks(tiles: Int[Tensor, "T"], keep: Bool[Tensor, "B"]) -> tuple[Int[Tensor, "T"], Int[Tensor, "K"]]:
+    """``tiles`` without the released bricks, and the previous numbers of the others (including 0)."""
+    keep = keep.clone()
+    keep[0] = True
+    numbers = (keep.cumsum(0) - 1) * keep
+    return numbers[tiles.to(torch.int64)].to(torch.int32), keep.nonzero()[:, 0]
+
+
+def take_bricks(table: Float[Tensor, "N C"], kept: Int[Tensor, "K"]) -> Float[Tensor, "M C"]:
+    """The chosen bricks of a table."""
+    return table.view(-1, BRICK, *table.shape[1:])[kept].flatten(0, 1)
+
+
+def grown_tiles(
+    old: list[TexelGrid],
+    new: list[TexelGrid],
+    is_cube: list[bool],
+    reachable: Bool[Tensor, "T"] | None,
+    least: float = 0.0,
+) -> Int[Tensor, "T"]:
+    """``tiles`` at another resolution, with the tiles that a stored texel of the old one and a training ray reach.
+
+    Args:
+        old: current heads.
+        new: heads at the new resolution; their tiles are not read.
+        is_cube: which of them is the cube.
+        reachable: tiles that training rays cross; None for all.
+        least: share of stored texels in an interpolated one from which (0: above which) it is stored.
+    """
+    stored = torch.zeros_like(new[0].tiles, dtype=torch.bool)
+    for source, target, cube in zip(old, new, is_cube, strict=True):
+        for sources, planes in _chunks(target, cube):
+            share = _resize(stored_texels(source, sources).float(), target, cube)[..., 0]
+            there = share >= least if least else share > 0
+            reached = pad(there.float(), (0, -target.width % SIDE, 0, -target.height % SIDE))
+            tiles = max_pool2d(reached[:, None], SIDE)[:, 0] > 0
+            first = target.first_tile + planes.start * target.down * target.across
+            stored[first : first + tiles.numel()] = tiles.reshape(-1).cpu()
+    return number_tiles(stored if reachable is None else stored & reachable)
+
+
+def tiles_with_copies(
+    grids: list[TexelGrid], copies: list[TexelGrid], chosen: Bool[Tensor, "T"]
+) -> tuple[Bool[Tensor, "S"], Bool[Tensor, "T"]]:
+    """Tiles that finer copies of MPIs store of chosen ones, and those that the MPIs themselves go on storing.
+
+    A chosen tile has FINER x FINER tiles in the copy. The MPI gives it up where all stored tiles around it are chosen
+    too, so copy and MPI overlap by a tile and no seam is seen.
+
+    Args:
+        grids: all heads, MPIs first.
+        copies: of the MPIs, at their resolution; their tiles are not read.
+        chosen: stored tiles of MPIs.
+
+    Returns:
+        Tiles of the copies, and of all heads.
+    """
+    stored, fine = grids[0].tiles > 0, torch.zeros_like(copies[0].tiles, dtype=torch.bool)
+    kept = stored.clone()
+    for grid, copy in zip(grids, copies, strict=False):
+        here = slice(grid.first_tile, grid.first_tile + grid.own_tiles.numel())
+        taken = chosen[here].view(grid.own_tiles.shape)
+        beside = max_pool2d((stored[here].view_as(taken) & ~taken)[:, None].float(), 3, 1, 1)[:, 0] > 0
+        kept[here] &= (~taken | beside).reshape(-1)
+        wide = taken.repeat_interleave(FINER, 1).repeat_interleave(FINER, 2)[:, : copy.down, : copy.across]
+        fine[copy.first_tile :][: wide.numel()] = wide.reshape(-1)
+    return fine, kept
+
+
+def widened_tiles(grids: list[TexelGrid], chosen: Bool[Tensor, "T"]) -> Bool[Tensor, "T"]:
+    """Chosen tiles and the stored ones around them, on their planes."""
+    wide = chosen.clone()
+    for grid in grids:
+        here = slice(grid.first_tile, grid.first_tile + grid.own_tiles.numel())
+        images = chosen[here].view(grid.own_tiles.shape)[:, None].float()
+        wide[here] |= (max_pool2d(images, 3, 1, 1) > 0).reshape(-1)
+    return wide & (grids[0].tiles > 0)
+
+
+def resample(
+    table: Float[Tensor, "N C"], old: list[TexelGrid], new: list[TexelGrid], is_cube: list[bool], empty: float = 0.0
+) -> Float[Tensor, "M C"]:
+    """The table at another resolution: bilinear on every plane of an MPI, trilinear in the cube (paper growth).
+
+    Texels next to an empty tile extend the stored ones. Planes are processed a few at a time, so only the old and the
+    new table need memory.
+    """
+    if not empty and not bool(table.any()):  # untrained reliability takes no memory
+        return lazy_zeros((int((new[0].tiles > 0).sum() + 1) * BRICK, table.shape[-1]), table.dtype, table.device)
+    out = new_table(new[0].tiles, table.shape[-1], empty, table.dtype)
+    for source, target, cube in zip(old, new, is_cube, strict=True):
+        for sources, planes in _chunks(target, cube):
+            if not bool(target.own_tiles[planes].any()):
+                continue
+            images = read_planes(table, source, sources)
+            stored = stored_texels(source, sources).to(table.dtype)
+            if bool(stored.all()):
+                write_planes(out, target, planes, _resize(images, target, cube))
+                continue
+            there, value = _resize(stored, target, cube), _resize(images * stored, target, cube)
+            value = torch.where(there > 1 - 1e-6, value, value / there.clamp(min=1e-12))
+            write_planes(out, target, planes, torch.where(there > 0, value, empty))
+    return out
+
+
+def _chunks(target: TexelGrid, is_cube: bool) -> Iterator[tuple[slice, slice]]:
+    """A few planes at a time: where they come from and where they go. The cube's layers go together."""
+    step = target.depth if is_cube else max(1, CHUNK // (target.height * target.width))
+    for start in range(0, target.depth, step):
+        planes = slice(start, min(start + step, target.depth))
+        yield (slice(None) if is_cube else planes), planes
+
+
+def stored_texels(grid: TexelGrid, planes: slice) -> Bool[Tensor, "P h w 1"]:
+    """Which texels of some planes are stored."""
+    wide = (grid.own_tiles[planes] > 0).repeat_interleave(SIDE, 1).repeat_interleave(SIDE, 2)
+    return wide[:, : grid.height, : grid.width, None]
+
+
+def _resize(images: Float[Tensor, "P h w C"], target: TexelGrid, is_cube: bool) -> Float[Tensor, "Q H W C"]:
+    """Images of another size, corners on corners; the layers of a cube are resized as well."""
+    if is_cube:
+        size = (target.depth, target.height, target.width)
+        out = interpolate(images.permute(3, 0, 1, 2)[None], size=size, mode="trilinear", align_corners=True)
+        return out[0].permute(1, 2, 3, 0)
+    size = (target.height, target.width)
+    return interpolate(images.permute(0, 3, 1, 2), size=size, mode="bilinear", align_corners=True).permute(0, 2, 3, 1)
