@@ -5,7 +5,6 @@ And the observations of a scene outside training, as ``ns-train`` would pass the
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -129,6 +128,8 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
                 f"--pipeline.datamanager.camera-res-scale-factor {self.config.camera_res_scale_factor:g} leaves no "
                 "pixel of an image: give a larger one."
             )
+        self._pixels = (dataset.cameras.width * dataset.cameras.height).reshape(-1).cpu().numpy()
+        """Of each training image."""
         dataset.metadata[RAYS_PER_STEP] = self.config.train_num_rays_per_batch
         dataset.metadata[TRAINING_VIEWS] = TrainingViews.of(dataset.cameras)
         device = self.device
@@ -184,7 +185,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
             say(gains.describe())
             if gains.matter:
                 self.gains = self.train_dataset.metadata[GAINS] = gains
-        if self._sizes(None).sum() <= self.config.resident_pixels and self.test_mode == "val":
+        if self._pixels.sum() <= self.config.resident_pixels and self.test_mode == "val":
             CONSOLE.print(f"Reading {len(self.train_dataset)} training images.")
             self.sources = self._resident = self._read_sources(None)
 
@@ -219,7 +220,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
     def _read_sources(self, cameras: NDArray[np.int64] | None) -> RaySources:
         """The pixels, new views and keypoints of all training cameras, or of some; notes if pixels are left out."""
         config, images = self.config, list(range(len(self.train_dataset))) if cameras is None else cameras.tolist()
-        total, most = self._sizes(cameras).sum(), int(config.resident_pixels)
+        total, most = self._pixels[images].sum(), int(config.resident_pixels)
         if 0 < most < total:
             CONSOLE.print(
                 f"{most / 1e6:.3g} of {total / 1e6:.3g} M training pixels are used, drawn at random: more are "
@@ -255,16 +256,12 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
             parts.append(f"{100 * self.known_depth.share:.0f} % of the training pixels have a known depth")
         return f"Capture: {'; '.join(parts)}."
 
-    def _sizes(self, images: Sequence[int] | NDArray[np.int64] | None) -> NDArray[np.int64]:
-        """Pixels of each training image, or of some."""
-        sizes = (self.train_dataset.cameras.width * self.train_dataset.cameras.height).reshape(-1).cpu().numpy()
-        return sizes if images is None else sizes[images]
-
     def pixel_bytes(self, cameras: NDArray[np.int64] | None = None) -> int:
         """Bytes of the training pixels in memory while these cameras are drawn from; where masks hide some, at most."""
         if self._resident is not None:
             return self._resident.pixels.nbytes
-        dataset, sizes, most = self.train_dataset, self._sizes(cameras), int(self.config.resident_pixels)
+        sizes = self._pixels if cameras is None else self._pixels[cameras]
+        dataset, most = self.train_dataset, int(self.config.resident_pixels)
         share = min(1.0, most / sizes.sum()) if most else 1.0
         # As in ``PixelPool``: colour, place in the image where it must be kept, and depth.
         place, depth = share < 1 or dataset.has_masks, self.known_depth is not None
