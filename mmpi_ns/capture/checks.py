@@ -249,11 +249,7 @@ def _check_places(centers: NDArray[np.float64], names: Sequence[str], path: Path
 
 
 def check_lenses(meta: Mapping[str, Any], frames: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Checks the intrinsics of every camera; as in nerfstudio, a value for all frames overrides that of a frame.
-
-    Raises:
-        InputError: a value is missing, is no number, or cannot be a lens; names the file, the frame and the field.
-    """
+    """Checks the intrinsics of every camera; as in nerfstudio, a value for all frames overrides that of a frame."""
     model = meta.get("camera_model", "OPENCV")
     if not isinstance(model, str) or model not in MODELS:
         raise InputError(f"The camera_model of {path} is {shown(model)}: give one of {', '.join(MODELS)}.")

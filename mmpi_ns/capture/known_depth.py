@@ -28,13 +28,12 @@ from mmpi_ns.capture.lone_depth import continued, is_lone
 from mmpi_ns.capture.observe import POINT_ERROR, contradict, drop_masked, posed_images, see_points
 from mmpi_ns.capture.rays import Rays
 from mmpi_ns.capture.tracks import PosedImages, at_full_size, shown_size, size_of
-from mmpi_ns.capture.views import STRIP, View, look_up, straightened, strips
+from mmpi_ns.capture.views import STRIP, Map, View, look_up, straightened, strips
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.utils.errors import duration, say
 from mmpi_ns.utils.host import give_back_freed_memory
 from mmpi_ns.utils.parallel import in_order, num_threads
 
-Map = NDArray[np.float32]
 Codes = NDArray[np.int16]
 
 VERSION = 7

@@ -15,10 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mmpi_ns.capture.tracks import PosedImages
-from mmpi_ns.capture.views import project
+from mmpi_ns.capture.views import Map, project
 from mmpi_ns.scene.near_views import nearest_views
-
-Map = NDArray[np.float32]
 
 WIDTHS = (1 / 80, 1 / 40, 1 / 20, 1 / 10, 1 / 5)
 """Widths of the Gaussian weights, as fractions of the longer side of the image; the most certain fit is used."""
