@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from mmpi_ns.capture.local_origin import parser_points
+from mmpi_ns.capture.dataset import parser_points
 from mmpi_ns.ops.interpolate import weigh_rows
 
 

@@ -34,7 +34,7 @@ CALM = {
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 _context = multiprocessing.get_context("forkserver")
-_context.set_forkserver_preload([*COMMANDS.values(), "mmpi_ns.config", "mmpi_ns.capture.load", "pycolmap"])
+_context.set_forkserver_preload([*COMMANDS.values(), "mmpi_ns.config", "mmpi_ns.capture.datamanager", "pycolmap"])
 
 
 @dataclass(frozen=True)

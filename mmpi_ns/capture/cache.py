@@ -137,9 +137,8 @@ def _write(path: Path, arrays: Arrays | Pairs) -> None:
 
 def _read(path: Path) -> Arrays | None:
     """The arrays of an .npz, which stays open, as others may remove it meanwhile; None if it is missing or damaged."""
-    try:
+    with suppress(OSError, ValueError, EOFError, zipfile.BadZipFile):
         arrays = np.load(path)
         path.touch()
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile):
-        return None
-    return arrays
+        return arrays
+    return None

@@ -23,10 +23,8 @@ from PIL import Image
 from mmpi_ns.utils.errors import InputError, brief
 from mmpi_ns.utils.values import Number, check_number, check_row, cut, shown
 
-SAME_PLACE = 1e-6
-"""Cameras closer together than this fraction of their distance from the origin count as one place, in float32."""
 FLOAT64_SAME = 1e-12
-"""The same for numbers as they are in a file."""
+"""Cameras of a file closer together than this fraction of their distance from the origin count as one place."""
 ROTATION_SLACK = 0.01
 """Tolerance on the length of the axes of a pose, which should be 1."""
 FAR_OFF = 1000.0
@@ -83,8 +81,25 @@ def check_transforms(parser: NerfstudioDataParserConfig, data: Path, splits: Seq
     poses = np.stack([_pose(frame, path) for frame in frames])
     _check_whole_file(meta, frames, splits, path, by_name=(parser.downscale_factor or 1) > 1)
     check_lenses(meta, frames, path)
-    if opens:
-        _check_first_image(parser.downscale_factor, path.parent, frames[0]["file_path"])
+    first, factor = path.parent / frames[0]["file_path"], parser.downscale_factor
+    if opens and factor is not None:
+        if not Number(1, 1024, whole=True).holds(factor):
+            raise InputError(f"--downscale-factor must be a whole number of at least 1, not {factor}.")
+        copy = path.parent / f"images_{factor}" / first.name
+        if factor > 1 and not copy.is_file():
+            copies = ", ".join(sorted(p.name for p in path.parent.glob("images_*") if p.is_dir())) or "no copies"
+            raise InputError(
+                f"There is no {copy}, a copy at 1/{factor} of its size: make copies (mmpi-prepare does) or give "
+                f"another --downscale-factor (there are {copies})."
+            )
+    elif opens:
+        try:
+            with Image.open(first):
+                pass
+        except (OSError, ValueError, Image.DecompressionBombError) as error:
+            raise InputError(
+                f"Image {first} cannot be read ({brief(error)}): repair it or remove its frame."
+            ) from error
     names = [str(frame["file_path"]) for frame in frames]
     _check_places(poses[:, :3, 3], names, path, auto_scale=parser.auto_scale_poses)
     files = [str(frame[key]) for frame in frames for key in PATHS if key in frame]
@@ -97,11 +112,6 @@ def check_transforms(parser: NerfstudioDataParserConfig, data: Path, splits: Seq
 def say_once(text: str) -> None:
     """Prints a note once."""
     CONSOLE.print(text)
-
-
-def in_one_place(centers: NDArray[np.float64], share: float = SAME_PLACE) -> bool:
-    """Test of camera centres [M, 3] for equality up to rounding, relative to their distance from the origin."""
-    return float(np.ptp(centers, axis=0).max()) <= share * max(1.0, float(np.abs(centers).max()))
 
 
 def _read(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
@@ -189,10 +199,9 @@ def _check_whole_file(
             check_row(f"Row {i + 1} of applied_transform of {path}", row, 4, Number(-1e18, 1e18))
         if abs(np.linalg.det(np.array(rows, dtype=np.float64)[:, :3])) < 1e-12:
             raise InputError(f"applied_transform of {path} is singular: give a rotation and a translation.")
-    if "applied_scale" in meta:
-        check_number(f"applied_scale of {path}", meta["applied_scale"], Number(0, 1e18, above=True))
-    if "fisheye_crop_radius" in meta:
-        check_number(f"fisheye_crop_radius of {path}", meta["fisheye_crop_radius"], Number(0, 1e6, above=True))
+    for key, most in (("applied_scale", 1e18), ("fisheye_crop_radius", 1e6)):
+        if key in meta:
+            check_number(f"{key} of {path}", meta[key], Number(0, most, above=True))
     cloud = meta.get("ply_file_path", "given")
     if not isinstance(cloud, str):
         raise InputError(f"ply_file_path of {path} is {shown(cloud)}: give the path of a PLY file, or leave it out.")
@@ -220,54 +229,27 @@ def _check_whole_file(
             )
 
 
-def _check_first_image(factor: int | None, folder: Path, first: str) -> None:
-    if factor is not None:
-        if not Number(1, 1024, whole=True).holds(factor):
-            raise InputError(f"--downscale-factor must be a whole number of at least 1, not {factor}.")
-        copy = folder / f"images_{factor}" / Path(first).name
-        if factor > 1 and not copy.is_file():
-            copies = ", ".join(sorted(p.name for p in folder.glob("images_*") if p.is_dir())) or "no copies"
-            raise InputError(
-                f"There is no {copy}, a copy at 1/{factor} of its size: make copies (mmpi-prepare does) or give "
-                f"another --downscale-factor (there are {copies})."
-            )
-        return
-    try:
-        with Image.open(folder / first):
-            pass
-    except (OSError, ValueError, Image.DecompressionBombError) as error:
-        raise InputError(
-            f"Image {folder / first} cannot be read ({brief(error)}): repair it or remove its frame."
-        ) from error
-
-
 def _check_places(centers: NDArray[np.float64], names: Sequence[str], path: Path, *, auto_scale: bool) -> None:
     """Camera positions must differ, and none may be far from all others."""
-    if in_one_place(centers, FLOAT64_SAME):
+    if np.ptp(centers, axis=0).max() <= FLOAT64_SAME * max(1.0, np.abs(centers).max()):
         if not auto_scale:
             return
         raise InputError(
             f"All {len(centers)} camera(s) of {path} stand in one place, so no distance can be learned: give images "
             "from two places, or learn colours alone (nerfstudio-data --auto-scale-poses False)."
         )
-    middle = np.median(centers, axis=0)
-    off = np.linalg.norm(centers - middle, axis=-1)
-    order: list[int] = np.argsort(off).tolist()
-    most = max(len(off) - 1 - int(FEW * len(off)), 0)
-    usual = off[order[max(min(most, len(off) - 2), 0)]]
-    if usual > 0 and off[order[-1]] > FAR_OFF * usual:
+    off = np.linalg.norm(centers - np.median(centers, axis=0), axis=-1)
+    count, last = len(off), int(off.argmax())
+    usual = np.sort(off)[min(count - 1 - int(FEW * count), count - 2)]
+    if usual > 0 and off[last] > FAR_OFF * usual:
         raise InputError(
-            f"The camera of frame {cut(names[order[-1]])} of {path} stands {off[order[-1]]:.3g} from the others, which "
+            f"The camera of frame {cut(names[last])} of {path} stands {off[last]:.3g} from the others, which "
             f"lie within {usual:.3g}: correct its transform_matrix or remove the frame."
         )
 
 
 def check_lenses(meta: Mapping[str, Any], frames: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Checks the intrinsics of every camera; as in nerfstudio, a value for all frames overrides that of a frame.
-
-    Raises:
-        InputError: a value is missing, is no number, or cannot be a lens; names the file, the frame and the field.
-    """
+    """Checks the intrinsics of every camera; as in nerfstudio, a value for all frames overrides that of a frame."""
     model = meta.get("camera_model", "OPENCV")
     if not isinstance(model, str) or model not in MODELS:
         raise InputError(f"The camera_model of {path} is {shown(model)}: give one of {', '.join(MODELS)}.")

@@ -1,18 +1,21 @@
-"""nerfstudio's data manager: training batches, drawn ahead, and the cameras, SfM points and depths for the model."""
+"""nerfstudio's data manager: training batches, drawn ahead, and the cameras, SfM points and depths for the model.
+
+And the observations of a scene outside training, as ``ns-train`` would pass them to placement.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import torch
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager, VanillaDataManagerConfig
+from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader, RandIndicesEvalDataloader
 from nerfstudio.model_components.ray_generators import RayGenerator
@@ -20,15 +23,15 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
 
 from mmpi_ns.capture.checks import PARSER_OPTIONS, check_transforms, say_once
-from mmpi_ns.capture.dataset import MMPIDataset
+from mmpi_ns.capture.dataset import MMPIDataset, take_local_origins
 from mmpi_ns.capture.exif import light_of
 from mmpi_ns.capture.known_depth import KnownDepth, know_depths, of_cells
-from mmpi_ns.capture.local_origin import take_local_origins
 from mmpi_ns.capture.moving import moving_masks, share_of_moving
+from mmpi_ns.capture.moving_picture import draw_moving
 from mmpi_ns.capture.new_views import find_shared_points, image_and_mask
 from mmpi_ns.capture.observe import drop_masked, observe, posed_images, sfm_folder
 from mmpi_ns.capture.photometry import SAME_LIGHT, Gains, color_ratios, image_gains
-from mmpi_ns.capture.ray_sources import Keypoints, PixelPool, RaySources
+from mmpi_ns.capture.ray_sources import PixelPool, RaySources, rays_to_keypoints
 from mmpi_ns.capture.rays import PinholeRays
 from mmpi_ns.capture.tracks import at_full_size
 from mmpi_ns.placement.observations import Observations
@@ -39,6 +42,7 @@ from mmpi_ns.utils.random_draws import generator
 from mmpi_ns.utils.values import check_options
 
 Batch = tuple[RayBundle, dict[str, Any]]
+Parser = Literal["auto", "nerfstudio", "colmap"]
 OBSERVATIONS = "mmpi_observations"
 """Key of the scene's Observations in the data set's metadata, for the model."""
 GAINS = "mmpi_gains"
@@ -51,38 +55,6 @@ RAYS_PER_STEP = "mmpi_rays_per_step"
 """Key of the pixel rays of a training step."""
 TRAINING_VIEWS = "mmpi_training_views"
 """Key of the positions and fields of view of the training cameras (``TrainingViews``)."""
-
-
-class DrawnAhead:
-    """Draws the rays of steps, keyed on (seed, step); with several threads, one of them draws those of the next step
-    meanwhile. Drawing is small operations of torch, which take the time of one core."""
-
-    _thread: ClassVar = ThreadPoolExecutor(1, thread_name_prefix="mmpi-rays")
-
-    def __init__(self, seed: int, device: str | torch.device) -> None:
-        self.seed, self.device = seed, device
-        self._next: tuple[RaySources, tuple[int, int], Future[Batch]] | None = None
-
-    def draw(self, sources: RaySources, step: int, pixel_rays: int) -> Batch:
-        """What ``RaySources.draw`` draws for a step.
-
-        Args:
-            sources: of the rays.
-            step: of the training.
-            pixel_rays: rays through pixels.
-        """
-        batch = None
-        if self._next is not None:
-            of, key, future = self._next
-            batch = future.result() if of is sources and key == (step, pixel_rays) else None
-        batch = batch or self._drawn(sources, step, pixel_rays)
-        if num_threads() > 1 and torch.device(self.device).type == "cpu":
-            following = step + 1, pixel_rays
-            self._next = sources, following, self._thread.submit(self._drawn, sources, *following)
-        return batch
-
-    def _drawn(self, sources: RaySources, step: int, pixel_rays: int) -> Batch:
-        return sources.draw(pixel_rays, generator(self.seed, step, "pixels", self.device))
 
 
 @dataclass
@@ -126,6 +98,8 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
     """Draws training batches from ``RaySources`` and hands the scene's observations to the model."""
 
     config: MMPIDataManagerConfig
+    _thread: ClassVar = ThreadPoolExecutor(1, thread_name_prefix="mmpi-rays")
+    """Draws the rays of the next step during this one: small operations of torch, which take the time of one core."""
 
     def __init__(self, config: MMPIDataManagerConfig, **kwargs: Any) -> None:
         self.known_depth: KnownDepth | None = None
@@ -136,6 +110,8 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         """Sources that a step draws from now."""
         self._resident: RaySources | None = None
         """The sources of all cameras, if they are in memory all the time."""
+        self._ahead: tuple[RaySources, tuple[int, int], Future[Batch]] | None = None
+        """Rays of the next step with what they are drawn from, their step and number."""
         parser = config.dataparser
         check_options(parser, {name: number for name, number in PARSER_OPTIONS.items() if hasattr(parser, name)}, "--")
         if isinstance(parser, NerfstudioDataParserConfig):
@@ -152,6 +128,8 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
                 f"--pipeline.datamanager.camera-res-scale-factor {self.config.camera_res_scale_factor:g} leaves no "
                 "pixel of an image: give a larger one."
             )
+        self._pixels = (dataset.cameras.width * dataset.cameras.height).reshape(-1).cpu().numpy()
+        """Of each training image."""
         dataset.metadata[RAYS_PER_STEP] = self.config.train_num_rays_per_batch
         dataset.metadata[TRAINING_VIEWS] = TrainingViews.of(dataset.cameras)
         device = self.device
@@ -202,14 +180,12 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         """Reads the pixels into memory, unless there are too many, instead of nerfstudio's image cache."""
         # Samples nothing: ns-export sets its batches' size here.
         self.train_pixel_sampler = self._get_pixel_sampler(self.train_dataset, self.config.train_num_rays_per_batch)
-        self._rays = DrawnAhead(self.config.seed, self.device)
         gains = self.calibrated() if self.config.correct_exposure and self.test_mode == "val" else None
         if gains is not None:
             say(gains.describe())
-        self.gains = gains if gains is not None and gains.matter else None
-        if self.gains is not None:
-            self.train_dataset.metadata[GAINS] = self.gains
-        if self._sizes(None).sum() <= self.config.resident_pixels and self.test_mode == "val":
+            if gains.matter:
+                self.gains = self.train_dataset.metadata[GAINS] = gains
+        if self._pixels.sum() <= self.config.resident_pixels and self.test_mode == "val":
             CONSOLE.print(f"Reading {len(self.train_dataset)} training images.")
             self.sources = self._resident = self._read_sources(None)
 
@@ -243,8 +219,8 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
 
     def _read_sources(self, cameras: NDArray[np.int64] | None) -> RaySources:
         """The pixels, new views and keypoints of all training cameras, or of some; notes if pixels are left out."""
-        config, images = self.config, range(len(self.train_dataset)) if cameras is None else cameras.tolist()
-        total, most = self._sizes(cameras).sum(), int(config.resident_pixels)
+        config, images = self.config, list(range(len(self.train_dataset))) if cameras is None else cameras.tolist()
+        total, most = self._pixels[images].sum(), int(config.resident_pixels)
         if 0 < most < total:
             CONSOLE.print(
                 f"{most / 1e6:.3g} of {total / 1e6:.3g} M training pixels are used, drawn at random: more are "
@@ -263,8 +239,7 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         else:
             chosen = images, config.seed, self.device, exposures
             new_views = find_shared_points(self.train_dataset, posed, depths, rays, *chosen)
-        keypoints = Keypoints.of(self.observations, self.device) if self.test_mode == "val" else None
-        keypoints = keypoints if cameras is None else keypoints and keypoints.of_images(torch.from_numpy(cameras))
+        keypoints = rays_to_keypoints(self.observations, self.device, images) if self.test_mode == "val" else None
         counts = config.new_view_share, config.keypoint_rays
         return RaySources(pixels, new_views, keypoints, rays, *counts, no_new_views, exposures)
 
@@ -281,16 +256,12 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
             parts.append(f"{100 * self.known_depth.share:.0f} % of the training pixels have a known depth")
         return f"Capture: {'; '.join(parts)}."
 
-    def _sizes(self, images: Sequence[int] | NDArray[np.int64] | None) -> NDArray[np.int64]:
-        """Pixels of each training image, or of some."""
-        sizes = (self.train_dataset.cameras.width * self.train_dataset.cameras.height).reshape(-1).cpu().numpy()
-        return sizes if images is None else sizes[images]
-
     def pixel_bytes(self, cameras: NDArray[np.int64] | None = None) -> int:
         """Bytes of the training pixels in memory while these cameras are drawn from; where masks hide some, at most."""
         if self._resident is not None:
             return self._resident.pixels.nbytes
-        dataset, sizes, most = self.train_dataset, self._sizes(cameras), int(self.config.resident_pixels)
+        sizes = self._pixels if cameras is None else self._pixels[cameras]
+        dataset, most = self.train_dataset, int(self.config.resident_pixels)
         share = min(1.0, most / sizes.sum()) if most else 1.0
         # As in ``PixelPool``: colour, place in the image where it must be kept, and depth.
         place, depth = share < 1 or dataset.has_masks, self.known_depth is not None
@@ -327,15 +298,80 @@ class MMPIDataManager(VanillaDataManager[MMPIDataset]):
         return self.eval_ray_generator(batch["indices"]), batch
 
     def next_train(self, step: int) -> tuple[RayBundle, dict]:
-        """The rays of a step, keyed on (seed, step), as by ``RaySources.draw``.
+        """The rays of a step, keyed on (seed, step), as by ``RaySources.draw``; with several threads, those of the next
+        step are drawn meanwhile.
 
         Outside training (ns-export always requests step 0) only pixel rays, different ones in each call.
         """
         self.train_count += 1
         if self.sources is None:  # nobody said which window
             self.use_cameras(None)
-        assert self.sources is not None
-        if self.training:
-            return self._rays.draw(self.sources, step, self.get_train_rays_per_batch())
-        g = generator(self.config.seed, self.train_count, "pixels", self.device)
-        return self.sources.draw(self.get_train_rays_per_batch(), g, pixels_alone=True)
+        sources, pixel_rays, batch = self.sources, self.get_train_rays_per_batch(), None
+        assert sources is not None
+        if not self.training:
+            g = generator(self.config.seed, self.train_count, "pixels", self.device)
+            return sources.draw(pixel_rays, g, pixels_alone=True)
+
+        def drawn(of: int) -> Batch:
+            return sources.draw(pixel_rays, generator(self.config.seed, of, "pixels", self.device))
+
+        if self._ahead is not None:
+            source, key, future = self._ahead
+            batch = future.result() if source is sources and key == (step, pixel_rays) else None
+        batch = batch or drawn(step)
+        if num_threads() > 1 and torch.device(self.device).type == "cpu":
+            self._ahead = sources, (step + 1, pixel_rays), self._thread.submit(drawn, step + 1)
+        return batch
+
+
+def check_there(data: Path) -> None:
+    """Raises InputError where there is neither a folder nor a file."""
+    if not data.exists():
+        raise InputError(f"There is no scene at {data}: check the path.")
+
+
+def load_observations(
+    data: Path, downscale_factor: int | None = None, parser: Parser = "auto", moving: Path | None = None
+) -> tuple[Observations, str]:
+    """The observations that training on a scene would use, and a sentence on what moves in its images.
+
+    Args:
+        data: the scene's folder.
+        downscale_factor: size of the images, as for the data parser; None leaves it to the parser.
+        parser: format of the scene; auto means nerfstudio's format if there is a transforms.json.
+        moving: file for a picture of what moves. None: neither movers nor depths of pixels are searched, which takes
+            minutes; tracks or a plane sweep take their place.
+
+    Raises:
+        InputError: the folder holds no scene, or one that cannot be trained.
+    """
+    check_there(data)
+    config = MMPIDataManagerConfig(dataparser=NerfstudioDataParserConfig(load_3D_points=True))
+    is_nerfstudio = data.suffix == ".json" or (data / "transforms.json").is_file()
+    if parser == "colmap" or (parser == "auto" and not is_nerfstudio):
+        model = next((p for p in ("colmap/sparse/0", "sparse/0", "sparse") if (data / p).is_dir()), None)
+        if model is None:
+            raise InputError(f"{data} holds neither a transforms.json nor a COLMAP model: it is not a scene.")
+        config.dataparser = ColmapDataParserConfig(colmap_path=Path(model))
+        config.sfm_path = Path(model)
+    parser_config = config.dataparser
+    config.data = parser_config.data = data
+    parser_config.downscale_factor = downscale_factor  # type: ignore[attr-defined]
+    if isinstance(parser_config, NerfstudioDataParserConfig):
+        check_transforms(parser_config, data, ("train",), opens=True)
+    take_local_origins(parser_config)
+    outputs = parser_config.setup().get_dataparser_outputs(split="train")
+    if any(Path(name).is_file() for name in outputs.image_filenames):
+        # As ns-train does, so that it refuses what ns-train would refuse, and finds the depths that it would find.
+        config.mask_moving = config.dense_depth = config.depth_images = moving is not None
+        config.new_view_share, config.correct_exposure = 0.0, False  # placement asks for neither
+        manager = config.setup(device="cpu", test_mode="val")
+        masks = manager.train_dataset.moving
+        if moving is not None and masks is not None:
+            names = [Path(name).name for name in outputs.image_filenames]
+            colors = (manager.train_dataset.get_data(i, "uint8")["image"][..., :3] for i in range(len(names)))
+            draw_moving(moving, zip(names, (np.flip(x.numpy(), -1) for x in colors), strict=True), masks)
+        return manager.train_dataset.metadata[OBSERVATIONS], manager.moves
+    CONSOLE.print(f"The images of {data} are not there: its cameras and points alone are judged.")
+    folder = sfm_folder(parser_config, config.sfm_path)
+    return observe(outputs, MMPIDataset(outputs), folder, find_points=True, triangulates=config.triangulate), ""

@@ -1,4 +1,9 @@
-"""nerfstudio's data set of images, with errors that name the file and the remedy."""
+"""nerfstudio's data set of images, with errors that name the file and the remedy, and its parsers with exact cameras.
+
+Map coordinates: a local origin is subtracted in float64, before they round to float32. Downscaled copies: most show the
+whole image, so 1242 x 375 pixels become 310 x 93, which are no quarter. Point clouds (PLY) are read in float64 too, and
+without open3d, which is often missing or lacks system libraries.
+"""
 
 from __future__ import annotations
 
@@ -12,18 +17,22 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float
-from nerfstudio.cameras.cameras import Cameras
-from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
+from nerfstudio.data.dataparsers import nerfstudio_dataparser
+from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig, DataparserOutputs
+from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParser
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.data.utils.data_utils import get_image_mask_tensor_from_path
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import ExifTags, Image
 from torch import Tensor
 
-from mmpi_ns.capture.exif import is_turned
+from mmpi_ns.capture.checks import say_once
 from mmpi_ns.capture.rays import image_rays
+from mmpi_ns.capture.sfm import checked_model
+from mmpi_ns.capture.tracks import size_of, whole_of
 from mmpi_ns.utils.errors import InputError, brief
+from mmpi_ns.utils.host import transforms_changed
 
 # Pillow reports damaged files by any of these (SyntaxError: a broken PNG chunk), nerfstudio odd shapes by assertions.
 UNREADABLE = (OSError, SyntaxError, ValueError, AssertionError, EOFError, Image.DecompressionBombError)
@@ -31,14 +40,14 @@ SIXTEEN_BIT = ("I", "I;16", "I;16B", "I;16L", "I;16N")
 """Pillow's modes of gray images with up to 16 bits a pixel."""
 NO_MASK = "no mask"
 """Name of the mask file of a frame that has none where others have one: nerfstudio's parser knows all or none."""
-
-
-class UnusableFile(InputError):
-    """An image or mask file that cannot be used; the message names it and the remedy."""
+FAR = 10.0
+"""Cameras this many times as far from the origin as from each other get a local origin."""
+GRAY = 128
+"""Gray level of points without colours."""
 
 
 class MMPIDataset(InputDataset):
-    """Images, masks and distances of the size of their cameras; raises ``UnusableFile`` where one cannot be used."""
+    """Images, masks and distances of the size of their cameras; raises ``InputError`` where one cannot be used."""
 
     @cached_property
     def has_alpha(self) -> bool:
@@ -83,9 +92,7 @@ class MMPIDataset(InputDataset):
                 else:
                     pixels = np.array(image.convert("RGBA" if image.has_transparency_data else "RGB"))
         except UNREADABLE as error:
-            raise UnusableFile(
-                f"Image {name} cannot be read ({brief(error)}): repair it or remove its frame."
-            ) from error
+            raise InputError(f"Image {name} cannot be read ({brief(error)}): repair it or remove its frame.") from error
         if self.scale_factor == 1.0:
             return pixels
         size = [int(side * self.scale_factor) for side in pixels.shape[1::-1]]
@@ -103,7 +110,7 @@ class MMPIDataset(InputDataset):
                 if mask.shape[:2] != shape:
                     raise ValueError(f"it has {mask.shape[1]} x {mask.shape[0]} pixels")
             except UNREADABLE as error:
-                raise UnusableFile(
+                raise InputError(
                     f"Mask {file} cannot be used ({brief(error)}): give one channel of the image's size, white where "
                     "used."
                 ) from error
@@ -112,19 +119,22 @@ class MMPIDataset(InputDataset):
         # Downscaled images may have been rounded up where cameras are rounded down: one pixel is cut off.
         if not (0 <= rows - height <= 1 and 0 <= columns - width <= 1):
             name, size = self.image_filenames[image_idx], f"{columns} x {rows} pixels and its camera {width} x {height}"
-            if 0 <= columns - height <= 1 and 0 <= rows - width <= 1 and is_turned(name):
-                raise UnusableFile(
+            with Image.open(name) as image:
+                shows_rows_as_columns = image.getexif().get(ExifTags.Base.Orientation, 1) in (5, 6, 7, 8)
+            if shows_rows_as_columns and 0 <= columns - height <= 1 and 0 <= rows - width <= 1:
+                raise InputError(
                     f"Image {name} has {size}: its EXIF alone turns it, so turn its pixels, as mmpi-prepare does."
                 )
-            raise UnusableFile(
+            raise InputError(
                 f"Image {name} has {size}: correct the camera's size or give the images that the cameras belong to."
             )
         if image_type == "float32" and (files := self.metadata.get("depth_filenames")):
             unit = self.metadata.get("depth_unit_scale_factor", 1.0) * self._dataparser_outputs.dataparser_scale
             depth = read_depth_image(Path(files[image_idx]), unit)
             depth = cv2.resize(depth, (columns, rows), interpolation=cv2.INTER_NEAREST_EXACT)
-            depth = torch.from_numpy(depth[:height, :width])
-            data["distance"] = distances(depth, self.cameras[image_idx : image_idx + 1])
+            camera = self.cameras[image_idx : image_idx + 1]
+            along_axis = -(image_rays(camera).directions * camera.camera_to_worlds[0, :, 2]).sum(-1)
+            data["distance"] = (torch.from_numpy(depth[:height, :width]) / along_axis.clamp(min=1e-6))[..., None]
         return data | {k: data[k][:height, :width] for k in ("image", "mask", "distance") if k in data}
 
     def usable(self, image_idx: int) -> NDArray[np.bool_]:
@@ -134,12 +144,6 @@ class MMPIDataset(InputDataset):
         if self.moving is not None:
             return ~self.moving[image_idx]
         return np.ones([int(n.reshape(-1)[image_idx]) for n in (self.cameras.height, self.cameras.width)], bool)
-
-
-def distances(depth: Float[Tensor, "H W"], camera: Cameras) -> Float[Tensor, "H W 1"]:
-    """Distance of the content of each pixel from a camera, by its depth along the optical axis."""
-    along_axis = -(image_rays(camera).directions * camera.camera_to_worlds[0, :, 2]).sum(-1)
-    return (depth / along_axis.clamp(min=1e-6))[..., None]
 
 
 def read_depth_image(file: Path, unit: float) -> NDArray[np.float32]:
@@ -162,3 +166,157 @@ def read_depth_image(file: Path, unit: float) -> NDArray[np.float32]:
         raise InputError(f"Depth image {file} is not one channel of depths: give a 16-bit PNG or a .npy file.")
     depth = depth * unit
     return np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)
+
+
+class MapOutputs(DataparserOutputs):
+    """Parser outputs of a capture in map coordinates, with the transform in float64."""
+
+    def transform_poses_to_original_space(
+        self, poses: Tensor, camera_convention: Literal["opengl", "opencv"] = "opencv"
+    ) -> Tensor:
+        return super().transform_poses_to_original_space(poses.double(), camera_convention)
+
+
+class LocalOrigin:
+    """Origin of one capture, in the axes in which its poses are saved."""
+
+    def __init__(self, meta: dict[str, Any], source: Path) -> None:
+        """Subtracts the local origin from poses of a transforms.json or a COLMAP model that are far from the origin."""
+        poses = np.array([frame["transform_matrix"] for frame in meta["frames"]], dtype=np.float64)
+        centers = poses[:, :3, 3]
+        self.place, self.applied = centers.mean(0), self._applied(meta)[:, 3]
+        extent = float(np.ptp(centers, axis=0).max())
+        self.taken = bool(max(np.abs(self.place).max(), np.abs(self.applied).max()) > FAR * extent)
+        self._meta = meta
+        if self.taken:
+            centers -= self.place  # in ``poses``
+            for frame, pose in zip(meta["frames"], poses, strict=True):
+                frame["transform_matrix"] = pose.tolist()
+            if "applied_transform" in meta:
+                meta["applied_transform"] = np.c_[self._applied(meta)[:, :3], np.zeros(3)].tolist()
+            place = ", ".join(f"{x:.10g}" for x in self.place)
+            say_once(f"{source} has map coordinates: they are taken from ({place}).")
+
+    @staticmethod
+    def _applied(meta: dict[str, Any]) -> NDArray[np.float64]:
+        return np.array(meta.get("applied_transform", np.eye(4)[:3]), dtype=np.float64)
+
+    def tell(self, outputs: DataparserOutputs) -> DataparserOutputs:
+        """Gives the transform from the capture's own coordinates, in float64, for the points of a model."""
+        if not self.taken:
+            return outputs
+        transform = outputs.dataparser_transform.double().numpy().copy()
+        # The parser adds an applied_transform where the file has none.
+        to_file = np.linalg.solve(self._applied(self._meta)[:, :3], self.applied - self.place)
+        transform[:, 3] += transform[:, :3] @ to_file
+        return MapOutputs(**{**vars(outputs), "dataparser_transform": torch.from_numpy(transform)})
+
+
+def with_cameras_of_copies(outputs: DataparserOutputs, factor: int | None) -> DataparserOutputs:
+    """Parser outputs whose cameras fit downscaled copies; the parser divides by the factor, whatever was rounded."""
+    if factor is not None and factor > 1:
+        cameras = outputs.cameras
+        for i, file in enumerate(outputs.image_filenames):
+            with suppress(InputError):  # is named when it is read
+                original, _, scale = whole_of(Path(file), size_of(Path(file)))
+                if original != file:
+                    for name, ratio in zip(("fx", "fy", "cx", "cy"), np.tile(factor / scale, 2), strict=True):
+                        getattr(cameras, name)[i] *= ratio
+    return outputs
+
+
+class LocalNerfstudio(Nerfstudio):
+    """nerfstudio's parser of a transforms.json."""
+
+    _origin: LocalOrigin
+    prompted_user, create_pc = True, False
+    """The parser asks no question on the terminal where ``transforms.json`` names no point cloud."""
+
+    def _generate_dataparser_outputs(self, split: str = "train") -> DataparserOutputs:
+        def subtract(meta: dict[str, Any], path: Path) -> None:
+            self._origin = LocalOrigin(meta, path)
+            if any("mask_path" in frame for frame in meta["frames"]):
+                for frame in meta["frames"]:
+                    frame.setdefault("mask_path", NO_MASK)
+
+        with transforms_changed(nerfstudio_dataparser, subtract):
+            outputs = super()._generate_dataparser_outputs(split)
+        return with_cameras_of_copies(self._origin.tell(outputs), self.downscale_factor)
+
+    def _load_3D_points(self, ply_file_path: Path, transform_matrix: Tensor, scale_factor: float) -> Any:
+        origin = self._origin.place if self._origin.taken else 0.0
+        try:
+            points = parser_points(ply_file_path, transform_matrix, scale_factor, origin)
+        except InputError as error:
+            say_once(f"[bold yellow]{error} Training goes on without the point cloud.")
+            return None
+        if points is None:
+            say_once(f"[bold yellow]The point cloud {ply_file_path} holds no point: training goes on without it.")
+        return points
+
+
+class LocalColmap(ColmapDataParser):
+    """nerfstudio's parser of a COLMAP model."""
+
+    _origin: LocalOrigin
+
+    def _get_all_images_and_cameras(self, recon_dir: Path) -> dict[str, Any]:
+        with checked_model(recon_dir):
+            meta = super()._get_all_images_and_cameras(recon_dir)
+        self._origin = LocalOrigin(meta, recon_dir)
+        return meta
+
+    def _generate_dataparser_outputs(self, split: str = "train", **kwargs: Any) -> DataparserOutputs:
+        model = self.config.data / self.config.colmap_path
+        if not model.is_dir():
+            raise InputError(f"There is no COLMAP model at {model}: check --data, and --colmap-path after colmap.")
+        outputs = super()._generate_dataparser_outputs(split, **kwargs)
+        return with_cameras_of_copies(self._origin.tell(outputs), self._downscale_factor)
+
+    def _load_3D_points(self, colmap_path: Path, transform_matrix: Tensor, scale_factor: float) -> Any:
+        return {}  # in float32; ``find_sfm_model`` reads the model's points and tracks in float64
+
+
+TARGETS: dict[type, type] = {Nerfstudio: LocalNerfstudio, ColmapDataParser: LocalColmap}
+
+
+def take_local_origins(config: DataParserConfig) -> None:
+    """Makes a parser's settings build the one that reads map coordinates, if there is one."""
+    config._target = TARGETS.get(config._target, config._target)
+
+
+def read_ply(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    """Positions [P, 3] and colours [P, 3] of a PLY file of points.
+
+    Raises:
+        InputError: it is no such file.
+    """
+    from plyfile import PlyData, PlyParseError  # slow to import; comes with nerfstudio's viewer
+
+    try:
+        points = PlyData.read(path)["vertex"]
+        xyz = np.stack([np.asarray(points[name], dtype=np.float64) for name in "xyz"], -1)
+        named = {p.name for p in points.properties} >= {"red", "green", "blue"}
+        rgb = [np.asarray(points[name]) if named else np.full(len(xyz), GRAY) for name in ("red", "green", "blue")]
+    except (PlyParseError, KeyError, ValueError, TypeError, OSError) as error:
+        raise InputError(f"{path} is not a PLY file of points ({error}): write it again.") from error
+    return xyz, np.stack(rgb, -1).astype(np.uint8)
+
+
+def parser_points(
+    path: Path, transform_matrix: Tensor, scale_factor: float, origin: NDArray[np.float64] | float = 0.0
+) -> dict[str, Tensor] | None:
+    """A point cloud as nerfstudio's data parser returns it; None if it holds no point.
+
+    Args:
+        path: PLY file.
+        transform_matrix: [3, 4], from the file's axes to the scene's.
+        scale_factor: of the scene.
+        origin: taken off the points before they are rounded to float32.
+    """
+    xyz, colors = read_ply(path)
+    if not len(xyz):
+        return None
+    local = torch.from_numpy(xyz - origin).float()
+    points = (local @ transform_matrix[:, :3].T + transform_matrix[:, 3]) * scale_factor
+    return {"points3D_xyz": points, "points3D_rgb": torch.from_numpy(colors)}

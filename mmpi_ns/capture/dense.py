@@ -14,12 +14,10 @@ for each unit of q (``ops/matches``).
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from itertools import chain, repeat
-from typing import Any, Generic, TypeVar
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
@@ -33,7 +31,7 @@ from mmpi_ns.capture.views import Map, View, camera_matrix, load_view, look_up, 
 from mmpi_ns.ops.matches import average_matches, compare_depths, follow_motion, place_pixels, solve_matches
 from mmpi_ns.scene.near_views import nearest_views
 from mmpi_ns.utils.host import give_back_freed_memory
-from mmpi_ns.utils.parallel import num_threads, one_thread_each
+from mmpi_ns.utils.parallel import in_turn, num_threads, one_thread_each
 
 T = TypeVar("T")
 Progress = Callable[[Iterable[Any], int], Iterable[Any]]
@@ -137,15 +135,8 @@ class Parallax:
 def measure(
     view: View, neighbour: View, start: Map, flow: cv2.DISOpticalFlow, of_view: tuple[Map, Map]
 ) -> tuple[Map, Map]:
-    """Inverse depths of a view's pixels by comparison with another view, and one over their squared errors (0: none).
-
-    Args:
-        view: the image that gets depths.
-        neighbour: the image that it is compared with.
-        start: rough inverse depths. [h, w]
-        flow: finds small motions.
-        of_view: its ``mean_and_contrast``.
-    """
+    """Inverse depths [h, w] of a view's pixels by comparison with another view, and one over their squared errors (0:
+    none), from rough inverse depths and the view's ``mean_and_contrast``; ``flow`` finds small motions."""
     parallax = Parallax.between(view, neighbour)
     x, y, _ = parallax.pixels(start)
     motion = np.asarray(flow.calc(view.gray, look_up(neighbour.gray, x, y), None))  # type: ignore[call-overload]
@@ -204,17 +195,6 @@ def fuse(inverse: Sequence[Map], weight: Sequence[Map]) -> Depth:
     return depth
 
 
-def filled(depth: Depth, rough: Map) -> Map:
-    """Inverse depths of all pixels: rough ones pulled towards measured ones nearby, from coarse to fine."""
-    relative = depth.error / np.maximum(depth.inverse, 1e-12)
-    weight = np.where(depth.inverse > 0, 1 / np.maximum(relative, 0.01), 0).astype(np.float32)
-    for side in (65, 33, 17, 9):
-        near = _mean(weight, side)
-        share = near / (near + PRIOR_ERROR)
-        rough = share * _mean(weight * depth.inverse, side) / np.maximum(near, 1e-9) + (1 - share) * rough
-    return rough
-
-
 def find_depths(
     images: PosedImages,
     points_of: Callable[[int], NDArray[np.float64]],
@@ -234,7 +214,7 @@ def find_depths(
         rounds: of matching; None: by size.
     """
     with one_thread_each(), ThreadPoolExecutor(num_threads()) as pool:
-        results = _Pipeline(images, points_of, width, finish, rounds).results(pool, num_threads() + 1)
+        results = in_turn(_tasks(pool, images, points_of, width, finish, rounds), num_threads() + 1)
         for n, (is_last, result) in enumerate(progress(results, 2 * len(images.files))):
             if n % TRIMMED == 0:
                 give_back_freed_memory()
@@ -242,66 +222,44 @@ def find_depths(
                 yield result
 
 
-class _Pipeline(Generic[T]):
-    """Images on their way through a pool of threads: matched, then confirmed, then forgotten, in order.
+def _tasks(
+    pool: ThreadPoolExecutor,
+    images: PosedImages,
+    points_of: Callable[[int], NDArray[np.float64]],
+    width: int,
+    finish: Callable[[int, View, Depth], T],
+    rounds: Sequence[int] | None,
+) -> Iterator[tuple[bool, Future[Any]]]:
+    """Matches and confirms images, in an order in which no thread waits for a later task; True: an image's last task.
 
-    Arguments as of ``find_depths``.
+    An image is forgotten once all tasks that need it are submitted, which alone hold it then.
     """
 
-    def __init__(
-        self,
-        images: PosedImages,
-        points_of: Callable[[int], NDArray[np.float64]],
-        width: int,
-        finish: Callable[[int, View, Depth], T],
-        rounds: Sequence[int] | None,
-    ) -> None:
-        self.images, self.points_of, self.width, self.finish, self.rounds = images, points_of, width, finish, rounds
-        count = len(images.files)
-        self.near = [nearest_views(images.camera_to_worlds, i, NEIGHBOURS, MAX_ANGLE) for i in range(count)]
-        last_uses = list(range(count))
-        for i, neighbours in enumerate(self.near):
-            for j in neighbours:
-                last_uses[j] = max(last_uses[j], i)
-        self.freed: list[list[int]] = [[] for _ in range(count)]
-        """Images that none needs after this one."""
-        for j, last in enumerate(last_uses):
-            self.freed[last].append(j)
-        self.views: dict[int, Future[View]] = {}
-        self.depths: dict[int, Future[Depth]] = {}
+    def match(i: int, views: list[Future[View]]) -> Depth:
+        view, *others = (future.result() for future in views)
+        return matched(view, others, points_of(i), rounds)
 
-    def match(self, i: int) -> Depth:
-        view, *others = (self.views[j].result() for j in (i, *self.near[i]))
-        return matched(view, others, self.points_of(i), self.rounds)
+    def confirm(i: int, matches: list[tuple[Future[View], Future[Depth]]]) -> T:
+        (view, depth), *others = ((one.result(), other.result()) for one, other in matches)
+        return finish(i, view, confirmed(view, depth, others))
 
-    def confirm(self, i: int) -> T:
-        (view, depth), *others = ((self.views[j].result(), self.depths[j].result()) for j in (i, *self.near[i]))
-        return self.finish(i, view, confirmed(view, depth, others))
-
-    def tasks(self, pool: ThreadPoolExecutor) -> Iterator[tuple[Future[Any], int | None]]:
-        """In an order in which no thread waits for a later task; an image's last one comes with its number."""
-        first = 0
-        for i, neighbours in enumerate(self.near):
-            for j in (i, *neighbours):
-                if j not in self.views:
-                    self.views[j] = pool.submit(load_view, self.images, j, self.width)
-            self.depths[i] = pool.submit(self.match, i)
-            yield self.depths[i], None
-            while first < len(self.near) and max([first, *self.near[first]]) <= i:
-                yield pool.submit(self.confirm, first), first
-                first += 1
-
-    def results(self, pool: ThreadPoolExecutor, ahead: int) -> Iterator[tuple[bool, Any]]:
-        """Results of the tasks, ``ahead`` of which are in work at once, and whether they are an image's last."""
-        waiting: deque[tuple[Future[Any], int | None]] = deque()
-        for task in chain(self.tasks(pool), repeat(None, ahead)):
-            if len(waiting) == ahead or (task is None and waiting):
-                future, number = waiting.popleft()
-                yield number is not None, future.result()
-                for j in [] if number is None else self.freed[number]:
-                    del self.views[j], self.depths[j]
-            if task is not None:
-                waiting.append(task)
+    # Each image, then its neighbours.
+    near = [[i, *nearest_views(images.camera_to_worlds, i, NEIGHBOURS, MAX_ANGLE)] for i in range(len(images.files))]
+    last_uses = {j: i for i, views in enumerate(near) for j in views}
+    shown: dict[int, Future[View]] = {}
+    depths: dict[int, Future[Depth]] = {}
+    first = 0
+    for i, views in enumerate(near):
+        for j in views:
+            if j not in shown:
+                shown[j] = pool.submit(load_view, images, j, width)
+        depths[i] = pool.submit(match, i, [shown[j] for j in views])
+        yield False, depths[i]
+        while first < len(near) and max(near[first]) <= i:
+            yield True, pool.submit(confirm, first, [(shown[j], depths[j]) for j in near[first]])
+            for j in [j for j, last in last_uses.items() if last == first]:
+                del shown[j], depths[j]
+            first += 1
 
 
 def matched(view: View, others: list[View], points: NDArray[np.float64], rounds: Sequence[int] | None = None) -> Depth:
@@ -320,7 +278,13 @@ def matched(view: View, others: list[View], points: NDArray[np.float64], rounds:
         if rough is None:
             rough = rough_inverse_depth(small, points)
         else:
-            rough = filled(depth, rough)
+            # Rough depths are pulled towards measured ones nearby, from coarse to fine.
+            relative = depth.error / np.maximum(depth.inverse, 1e-12)
+            weight = np.where(depth.inverse > 0, 1 / np.maximum(relative, 0.01), 0).astype(np.float32)
+            for side in (65, 33, 17, 9):
+                near = _mean(weight, side)
+                share = near / (near + PRIOR_ERROR)
+                rough = share * _mean(weight * depth.inverse, side) / np.maximum(near, 1e-9) + (1 - share) * rough
             rough = np.asarray(cv2.resize(rough, small.gray.shape[::-1], interpolation=cv2.INTER_LINEAR), np.float32)
         of_view = mean_and_contrast(small.gray)
         pairs = [measure(small, neighbour.reduced(factor), rough, flow, of_view) for neighbour in others]

@@ -33,12 +33,6 @@ def light_of(file: Path) -> float:
     return (time or float("nan")) * (sensitivity or 100.0) / (aperture or 1.0) ** 2
 
 
-def is_turned(file: Path) -> bool:
-    """Whether the EXIF of an image says that rows are shown as columns."""
-    with Image.open(file) as image:
-        return image.getexif().get(ExifTags.Base.Orientation, 1) in (5, 6, 7, 8)
-
-
 def positive_number(value: Any) -> float | None:
     """A tag's number; None where it is missing, no number, or not positive (0/0 stands for unknown)."""
     try:

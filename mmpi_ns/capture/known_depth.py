@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import cast
 
@@ -25,17 +25,15 @@ from mmpi_ns.capture.cache import Computed, digest, remembered
 from mmpi_ns.capture.dataset import MMPIDataset, read_depth_image
 from mmpi_ns.capture.dense import SECONDS, Depth, find_depths
 from mmpi_ns.capture.lone_depth import continued, is_lone
-from mmpi_ns.capture.loose_points import POINT_ERROR, contradict, see_points
-from mmpi_ns.capture.observe import drop_masked, posed_images
+from mmpi_ns.capture.observe import POINT_ERROR, contradict, drop_masked, posed_images, see_points
 from mmpi_ns.capture.rays import Rays
 from mmpi_ns.capture.tracks import PosedImages, at_full_size, shown_size, size_of
-from mmpi_ns.capture.views import STRIP, View, look_up, straightened, strips
+from mmpi_ns.capture.views import STRIP, Map, View, look_up, straightened, strips
 from mmpi_ns.placement.observations import Observations
 from mmpi_ns.utils.errors import duration, say
 from mmpi_ns.utils.host import give_back_freed_memory
 from mmpi_ns.utils.parallel import in_order, num_threads
 
-Map = NDArray[np.float32]
 Codes = NDArray[np.int16]
 
 VERSION = 7
@@ -136,10 +134,9 @@ def know_depths(
     files = outputs.metadata.get("depth_filenames") if sensor else None
     if posed is None or not (dense or files or observations.loose is not None):
         return depths, observations
-    original, seen = at_full_size(posed), observations
+    original = at_full_size(posed)
     cloud = None if observations.loose is None else see_points(observations.loose, posed)
-    if cloud is not None:
-        seen = cloud.added_to(observations)
+    seen = observations if cloud is None else cloud.added_to(observations)
     if dense:
         depths = _remembered_depths(original, posed, seen)
     if dense and cloud is not None:
@@ -189,13 +186,25 @@ def _from_cache(key: str, find: Callable[[], Iterable[Codes]]) -> KnownDepth:
 
 
 def with_sensor(known: KnownDepth, files: list[Path], unit: float, posed: PosedImages) -> KnownDepth:
-    """Replaces depths by those of sensors where there are any; where both are known and contradict, neither is kept."""
+    """Replaces depths by those of sensors where there are any; where both are known and contradict, neither is kept.
+
+    Args:
+        known: depths from other sources.
+        files: depth image of each training image.
+        unit: length of a depth of 1, scene units.
+        posed: the training images.
+    """
 
     def replaced(i: int) -> Codes:
         codes = known.codes[i]
         shape = codes.shape[0], codes.shape[1]
-        width, height = shown_size(size_of(posed.files[i]), posed.sizes[i]).astype(int)
-        measured = packed(read_sensor(files[i], unit, posed, i, shape, (height, width)))
+        size = shown_size(size_of(posed.files[i]), posed.sizes[i]).astype(int).tolist()
+        depth = read_depth_image(files[i], unit)  # along the optical axis
+        depth = cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST_EXACT)[: shape[0], : shape[1]]
+        x, y = straightened(posed, i, shape)
+        longer = np.sqrt(x**2 + y**2 + 1)
+        inverse = np.where(depth > 0, 1 / (np.where(depth > 0, depth, 1) * longer), 0)
+        measured = packed(np.stack([inverse, SENSOR_ERROR * inverse], -1))
         apart = contradict(*(unpacked(torch.from_numpy(x)).numpy() for x in (measured, codes)))
         codes = np.where(measured[..., :1] != UNKNOWN, measured, codes)
         codes[apart] = UNKNOWN
@@ -205,7 +214,7 @@ def with_sensor(known: KnownDepth, files: list[Path], unit: float, posed: PosedI
 
 
 def at_training_pixels(view: View, depth: Depth, posed: PosedImages, i: int, shape: tuple[int, int]) -> Map:
-    """Distances of a training image's pixels from the depths of its view at working size.
+    """Inverse distances and errors [H, W, 2] of a training image's pixels from the depths of its view at working size.
 
     A training pixel takes the mean over its area, weighted by certainty; the spread within the area, large at an
     edge, is added to its error. One that is smaller than a working pixel takes the depth of that.
@@ -216,12 +225,20 @@ def at_training_pixels(view: View, depth: Depth, posed: PosedImages, i: int, sha
         posed: the training images.
         i: the image's place in them.
         shape: height and width of the training image.
-
-    Returns:
-        [H, W, 2] inverse distance and expected error.
     """
     height, width = (min(pair) for pair in zip(shape, view.gray.shape, strict=True))
-    maps, distances = pooled(depth, (height, width)), np.empty((*shape, 2), np.float32)
+    maps, distances = (depth.inverse, depth.error), np.empty((*shape, 2), np.float32)
+    if view.gray.shape != (height, width):
+        measured = (depth.inverse > 0).astype(np.float32)
+        weight = measured / np.maximum(depth.error, 1e-12) ** 2
+        cover, total, first, second = (
+            cv2.resize(m.astype(np.float64), (width, height), interpolation=cv2.INTER_AREA)
+            for m in (measured, weight, weight * depth.inverse, weight * depth.inverse**2)
+        )
+        mean = first / np.maximum(total, 1e-30)
+        spread = np.maximum(second / np.maximum(total, 1e-30) - mean**2, 0)
+        error = np.sqrt(cover / np.maximum(total, 1e-30) + spread)
+        maps = tuple(np.where(cover >= COVERED, m, 0).astype(np.float32) for m in (mean, error))
     fx, fy, cx, cy = view.pinhole
     scale_x, scale_y = width / view.gray.shape[1], height / view.gray.shape[0]
     for rows in strips(shape):
@@ -232,58 +249,39 @@ def at_training_pixels(view: View, depth: Depth, posed: PosedImages, i: int, sha
     return distances
 
 
-def pooled(depth: Depth, shape: tuple[int, int]) -> tuple[Map, Map]:
-    """Inverse depth and error over the areas of a coarser grid [h, w]; 0 where too little of an area is known."""
-    if depth.inverse.shape == shape:
-        return depth.inverse, depth.error
-    measured = (depth.inverse > 0).astype(np.float32)
-    weight = measured / np.maximum(depth.error, 1e-12) ** 2
-    cover, total, first, second = (
-        cv2.resize(m.astype(np.float64), shape[::-1], interpolation=cv2.INTER_AREA)
-        for m in (measured, weight, weight * depth.inverse, weight * depth.inverse**2)
-    )
-    mean = first / np.maximum(total, 1e-30)
-    spread = np.maximum(second / np.maximum(total, 1e-30) - mean**2, 0)
-    error = np.sqrt(cover / np.maximum(total, 1e-30) + spread)
-    kept = cover >= COVERED
-    return np.where(kept, mean, 0).astype(np.float32), np.where(kept, error, 0).astype(np.float32)
-
-
 def with_continued(known: KnownDepth, posed: PosedImages, dataset: MMPIDataset, rays: Rays) -> KnownDepth:
     """Extrapolates surfaces into regions that hardly any other image shows (``lone_depth.py``); cached.
 
     Masked pixels have no distance: what moves is nowhere.
     """
+
+    def codes_of(i: int) -> Codes:
+        """Computed for every n-th pixel of a large image."""
+        codes, hidden = np.array(known.codes[i]), ~dataset.usable(i)
+        codes[hidden] = UNKNOWN
+        step = -(-max(codes.shape[:2]) // CONTINUED)
+        rows, columns = (np.minimum(np.arange(0, n, step) + step // 2, n - 1) for n in codes.shape[:2])
+        pixels = np.stack(np.meshgrid(i, rows, columns, indexing="ij"), -1).reshape(-1, 3)
+        directions = rays(torch.from_numpy(pixels)).directions.cpu().numpy().reshape(len(rows), len(columns), 3)
+        sparse = unpacked(torch.from_numpy(codes[np.ix_(rows, columns)])).numpy()
+        extended = continued(sparse, directions)
+        down, across = np.nonzero(extended[..., 0])
+        points = posed.camera_to_worlds[i, :, 3] + directions[down, across] / extended[down, across, :1]
+        seen = ~is_lone(posed, i, points)
+        extended[down[seen], across[seen]] = 0
+        for first, fine in zip(range(0, len(codes), step), packed(extended), strict=True):
+            part = codes[first : first + step]
+            np.copyto(part, np.repeat(fine, step, 0)[: part.shape[1]], where=part[..., :1] == UNKNOWN)
+        codes[hidden] = UNKNOWN
+        return codes
+
     count = len(known.codes)
     cameras = posed.camera_to_worlds, posed.intrinsics, posed.distortion, posed.fisheye
     masks = [digest((), dataset.usable(i)) for i in range(count)] if dataset.has_masks else []
     contents = [digest((), codes) for codes in known.codes]
     key = digest(posed.files, "continued", VERSION, *cameras, contents, masks)
-    codes_of = partial(_continued_codes, known, posed, dataset, rays)
-    return _from_cache(
-        key, lambda: track(in_order(codes_of, range(count)), "Extrapolating surfaces", count, console=CONSOLE)
-    )
-
-
-def _continued_codes(known: KnownDepth, posed: PosedImages, dataset: MMPIDataset, rays: Rays, i: int) -> Codes:
-    """Codes of one image with extrapolated surfaces; computed for every n-th pixel of a large image."""
-    codes, hidden = np.array(known.codes[i]), ~dataset.usable(i)
-    codes[hidden] = UNKNOWN
-    step = -(-max(codes.shape[:2]) // CONTINUED)
-    rows, columns = (np.minimum(np.arange(0, n, step) + step // 2, n - 1) for n in codes.shape[:2])
-    pixels = np.stack(np.meshgrid(i, rows, columns, indexing="ij"), -1).reshape(-1, 3)
-    directions = rays(torch.from_numpy(pixels)).directions.cpu().numpy().reshape(len(rows), len(columns), 3)
-    sparse = unpacked(torch.from_numpy(codes[np.ix_(rows, columns)])).numpy()
-    extended = continued(sparse, directions)
-    down, across = np.nonzero(extended[..., 0])
-    points = posed.camera_to_worlds[i, :, 3] + directions[down, across] / extended[down, across, :1]
-    seen = ~is_lone(posed, i, points)
-    extended[down[seen], across[seen]] = 0
-    for first, fine in zip(range(0, len(codes), step), packed(extended), strict=True):
-        part = codes[first : first + step]
-        np.copyto(part, np.repeat(fine, step, 0)[: part.shape[1]], where=part[..., :1] == UNKNOWN)
-    codes[hidden] = UNKNOWN
-    return codes
+    work = "Extrapolating surfaces"
+    return _from_cache(key, lambda: track(in_order(codes_of, range(count)), work, count, console=CONSOLE))
 
 
 def of_cells(observations: Observations, known: KnownDepth, dataset: MMPIDataset) -> Observations:
@@ -316,10 +314,8 @@ def of_cells(observations: Observations, known: KnownDepth, dataset: MMPIDataset
     if not len(cells):
         return observations
     if len(observations.seen_by) > MOST_KEYPOINTS * len(cells):
-        observations = replace(
-            observations, points=cells[:0], seen_at=observations.seen_at[:0],
-            seen_by=observations.seen_by[:0], seen_point=observations.seen_point[:0],
-        )  # fmt: skip
+        nothing = observations.with_keypoints(np.zeros(len(observations.seen_by), np.bool_))
+        observations = replace(nothing, points=cells[:0])
     return replace(
         observations,
         points=np.concatenate([observations.points, cells]),
@@ -344,28 +340,3 @@ def with_points(known: KnownDepth, observations: Observations) -> KnownDepth:
         return codes
 
     return KnownDepth(Computed(len(known.codes), added))
-
-
-def read_sensor(
-    file: Path, unit: float, posed: PosedImages, i: int, shape: tuple[int, int], file_shape: tuple[int, int]
-) -> Map:
-    """Distances from a depth image (along the optical axis, 0 where unknown), for a training image's pixels.
-
-    Args:
-        file: 16-bit PNG or .npy.
-        unit: length of a depth of 1, scene units.
-        posed: the training images.
-        i: the image's place in them.
-        shape: height and width of the training image.
-        file_shape: those of all that its file shows, which may have a row or column more.
-
-    Raises:
-        InputError: the file cannot be read (names it).
-    """
-    depth = read_depth_image(file, unit)
-    nearest = cv2.resize(depth, file_shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT)[: shape[0], : shape[1]]
-    x, y = straightened(posed, i, shape)
-    longer = np.sqrt(x**2 + y**2 + 1)
-    hit = np.isfinite(nearest) & (nearest > 0)
-    inverse = np.where(hit, 1 / (np.where(hit, nearest, 1) * longer), 0)
-    return np.stack([inverse, SENSOR_ERROR * inverse], -1).astype(np.float32)

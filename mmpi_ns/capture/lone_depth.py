@@ -15,10 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mmpi_ns.capture.tracks import PosedImages
-from mmpi_ns.capture.views import project
+from mmpi_ns.capture.views import Map, project
 from mmpi_ns.scene.near_views import nearest_views
-
-Map = NDArray[np.float32]
 
 WIDTHS = (1 / 80, 1 / 40, 1 / 20, 1 / 10, 1 / 5)
 """Widths of the Gaussian weights, as fractions of the longer side of the image; the most certain fit is used."""
@@ -55,7 +53,7 @@ def continued(depths: Map, directions: Map) -> Map:
     q, v = inverse / scale, np.moveaxis(directions, -1, 0).astype(np.float64, order="C")
     trust = np.where(has_depth, 1 / (1 + (error / np.maximum(LEAST_ERROR * inverse, 1e-30)) ** 2), 0)
     parts = [trust, trust * q * q, *(trust * q * axis for axis in v)]
-    parts += [trust * v[i] * v[j] for i, j in _PAIRS]
+    parts += [trust * v[i] * v[j] for i in range(3) for j in range(i, 3)]
     height, width = inverse.shape
     for share in WIDTHS:
         # Sums under a wide Gaussian, zero outside, from smaller images.
@@ -76,13 +74,10 @@ def continued(depths: Map, directions: Map) -> Map:
     return extended
 
 
-_PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-
-
 def _planes(
     sums: Sequence[NDArray[np.float64]], directions: Sequence[NDArray[np.float64]]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Of w.v fitted to pixels by sums [P] of weights, w q^2, w q v (3) and w v v^T (6, ``_PAIRS``): q along directions,
+    """Of w.v fitted to pixels by sums [P] of weights, w q^2, w q v (3) and w v v^T (6): q along directions,
     their three parts [P], and its expected error, the scatter about the plane, larger the farther extrapolated."""
     _, squares, *right, xx, xy, xz, yy, yz, zz = (part / sums[0] for part in sums)
     xx, yy, zz = xx + 1e-7, yy + 1e-7, zz + 1e-7

@@ -45,9 +45,6 @@ BYTES_OF_IMAGE = 18
 MOST = 2_000_000
 """Maximum number of pixel pairs (30 bytes each), spread over the images."""
 
-PARTS = ("pixels", "other", "colors", "depths")
-"""What is known of every point."""
-
 
 @dataclass(frozen=True)
 class SharedPoints:
@@ -68,9 +65,9 @@ class SharedPoints:
 
     def of_images(self, images: Int[Tensor, "I"]) -> SharedPoints | None:
         """The points shared by two of the given images; None if there is none."""
-        images = images.to(self.pixels)
+        images, names = images.to(self.pixels), ("pixels", "other", "colors", "depths")
         shared = (torch.isin(self.pixels[:, 0], images) & torch.isin(self.other, images)).nonzero()[:, 0]
-        return replace(self, **{name: getattr(self, name)[shared] for name in PARTS}) if len(shared) else None
+        return replace(self, **{name: getattr(self, name)[shared] for name in names}) if len(shared) else None
 
     def draw(
         self, count: int, rays: Rays, g: torch.Generator, exposures: Float[Tensor, "M 3"] | None = None
@@ -187,7 +184,7 @@ def _matches(
     seed: int,
     exposures: Float[Tensor, "M 3"] | None,
 ) -> tuple[list[tuple[Tensor, ...]], float]:
-    """Points that image i shares with its neighbours among others, each as the ``PARTS`` of ``SharedPoints``.
+    """Points that image i shares with its neighbours among others, each as the first four fields of ``SharedPoints``.
 
     Its pixels of certain depth are compared, ``most`` at most; second comes the number of matches that all would have.
     """

@@ -1,10 +1,16 @@
-"""Observations of a data set for placement: cameras, points, and which camera saw which point."""
+"""Observations of a data set for placement: cameras, points, and which camera saw which point.
+
+The points of a cloud (``ply_file_path``) do not say which images saw them. Projection alone would see through walls.
+Where a pixel's depth is known from matches, a point is visible if it lies there, hidden if it lies behind, and
+contradicted if it lies in front: then the image looks through it. Elsewhere coarse depth images of the cloud decide: a
+point is visible if no other one lies clearly in front of it, in its cell or a neighbouring one.
+"""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,17 +20,22 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig, DataparserOutputs
 from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
+from scipy.ndimage import minimum_filter
 
 from mmpi_ns.capture.cache import Arrays, digest, remembered
-from mmpi_ns.capture.checks import in_one_place, say_once
+from mmpi_ns.capture.checks import say_once
 from mmpi_ns.capture.dataset import MMPIDataset
-from mmpi_ns.capture.loose_points import usable_points
 from mmpi_ns.capture.rays import lens_directions
 from mmpi_ns.capture.sfm import SfmModel, find_sfm_model
 from mmpi_ns.capture.tracks import PosedImages, at_full_size, triangulate
+from mmpi_ns.capture.views import Map, project
 from mmpi_ns.placement.observations import Observations, add_swept_points
 from mmpi_ns.utils.errors import InputError, quoted
 
+Array = NDArray[np.float64]
+
+SAME_PLACE = 1e-6
+"""Cameras closer together than this fraction of their distance from the origin count as one place, in float32."""
 MAX_REPROJECTION = 0.02
 """Median angle between keypoints and points, as a fraction of the image, above which a model is in another frame."""
 POSES_OFF = 0.5
@@ -35,6 +46,18 @@ THUMBNAIL = 128
 """Maximum pixels along a side of the gray images for the plane sweep, box-filtered."""
 ENOUGH_KEYPOINTS = 20
 """Average number of keypoints in an image above which no plane sweep is needed."""
+CELLS = 48
+"""Cells of a coarse depth image along the longer side."""
+BEHIND = 1.15
+"""A point farther away than the nearest one around it by this factor is hidden."""
+POINT_ERROR = 0.01
+"""Minimum relative error of the distance of a point."""
+CONTRADICTS = 6.0
+"""Difference of two sources, in expected errors of both, from which one of them is wrong."""
+MOST_POINTS = 100_000
+"""Points that are used of a larger cloud, such as a laser scan's."""
+FARTHEST = 1e5
+"""Distance of a point from the cameras, over their own extent, from which it is a mistake."""
 
 
 def sfm_folder(parser: DataParserConfig, default: Path) -> Path:
@@ -60,7 +83,7 @@ def observe(
         InputError: poses or intrinsics that cannot be used.
     """
     observations = read_observations(outputs, dataset.cameras, find_sfm_model(sfm))
-    if in_one_place(observations.centers):
+    if np.ptp(observations.centers, axis=0).max() <= SAME_PLACE * max(1.0, np.abs(observations.centers).max()):
         CONSOLE.print("[bold yellow]All training cameras stand in one place: no distance can be learned.")
     if find_points:
         if not len(observations.seen_by):
@@ -110,16 +133,11 @@ def _find_points(observations: Observations, dataset: MMPIDataset, triangulates:
 
 
 def tell_poses(off: float, image: Path) -> None:
-    """Reports inaccurate poses, with the command that refines them.
-
-    Args:
-        off: median distance of matches or keypoints from their positions predicted by the poses, training pixels.
-        image: one of the training images.
-    """
+    """Reports poses from which matches or keypoints are off by this many training pixels (median), with the command
+    that refines them, for one of the training images."""
     if not off > POSES_OFF:  # or not a number, as nothing matched
         return
-    folder = image.parent
-    full = folder.with_name(re.sub(r"_\d+$", "", folder.name))  # images for images_2
+    full = image.parent.with_name(re.sub(r"_\d+$", "", image.parent.name))  # images for images_2
     refined, poses = full.parent.with_name(f"{full.parent.name}-refined"), full.parent / "transforms.json"
     command = f"mmpi-prepare {quoted(full)} {quoted(refined)} --poses {quoted(poses)} --refine-poses"
     says = f"The poses are off by {off:.1f} training pixels (median over the matches of the images)"
@@ -201,17 +219,18 @@ def posed_images(observations: Observations, dataset: MMPIDataset) -> PosedImage
 
 
 def with_tracks(observations: Observations, model: SfmModel, names: Sequence[str] | None = None) -> Observations:
-    """The observations with the points of a model.
-
-    Args:
-        observations: the cameras.
-        model: tracks in their frame.
-        names: of the training images in the model; None for their indices.
-    """
-    names = [str(i) for i in range(len(observations.centers))] if names is None else names
-    seen_by, seen_point, relative = model.keypoints_of(names)
-    seen_at = relative * observations.sizes[seen_by]
-    return replace(observations, points=model.points, seen_by=seen_by, seen_point=seen_point, seen_at=seen_at)
+    """The observations with the points of a model in their frame; images are named by their indices unless ``names``
+    are given."""
+    number = {name: m for m, name in enumerate(model.names.tolist())}
+    count = len(observations.centers)
+    images = np.array([number.get(name, -1) for name in names or map(str, range(count))], np.int64)
+    begins, ends = (np.searchsorted(model.seen_by, images, side) for side in ("left", "right"))
+    order = np.concatenate([np.zeros(0, np.int64), *map(np.arange, begins, ends)])
+    seen_by = np.repeat(np.arange(count), ends - begins)
+    seen_at = model.seen_at[order] * observations.sizes[seen_by]
+    return replace(
+        observations, points=model.points, seen_by=seen_by, seen_point=model.seen_point[order], seen_at=seen_at
+    )
 
 
 def drop_masked(observations: Observations, dataset: MMPIDataset) -> Observations:
@@ -225,3 +244,120 @@ def drop_masked(observations: Observations, dataset: MMPIDataset) -> Observation
         x, y = observations.seen_at[keypoints].astype(int).T
         keep[keypoints] = mask[y.clip(0, mask.shape[0] - 1), x.clip(0, mask.shape[1] - 1)]
     return observations.with_keypoints(keep)
+
+
+def contradict(a: Map, b: Map) -> NDArray[np.bool_]:
+    """Mask [...] of two sources' inverse distances [..., 2] that differ by more than their errors can explain."""
+    apart = np.abs(a[..., 0] - b[..., 0]) > CONTRADICTS * np.hypot(a[..., 1], b[..., 1])
+    return apart & (a[..., 0] > 0) & (b[..., 0] > 0)
+
+
+def usable_points(points: Array, centers: Array) -> Array:
+    """The points of a cloud [P, 3] that can be used, a random subset of ``MOST_POINTS`` if there are more.
+
+    Says how many are NaN or absurdly far away.
+
+    Args:
+        points: in scene units.
+        centers: of the cameras. [M, 3]
+    """
+    middle = np.median(centers, axis=0)
+    extent = float(np.ptp(centers, axis=0).max())
+    with np.errstate(invalid="ignore"):
+        usable = np.abs(points - middle).max(-1) < (FARTHEST * extent or np.inf)
+    if not usable.all():
+        say_once(
+            f"{(~usable).sum():,} of {len(usable):,} points of the point cloud are not used: they are no finite "
+            "numbers, or absurdly far away."
+        )
+    points = points[usable]
+    if len(points) <= MOST_POINTS:
+        return points
+    return points[np.sort(np.random.default_rng(0).choice(len(points), MOST_POINTS, replace=False))]
+
+
+@dataclass(frozen=True)
+class Sightings:
+    """Places at which training images see the points of a cloud."""
+
+    points: Array
+    """[P, 3]"""
+    seen_by: NDArray[np.int64]
+    """[Q] camera."""
+    seen_point: NDArray[np.int64]
+    """[Q] point."""
+    seen_at: Array
+    """[Q, 2] pixel (x, y)."""
+    confirmed: NDArray[np.int64]
+    """[P] images in which a point lies at the known depth of its pixel."""
+    contradicted: NDArray[np.int64]
+    """[P] images whose known depth there is behind it."""
+
+    @property
+    def fits(self) -> bool:
+        """True if at least as many points are confirmed as contradicted."""
+        return bool((self.confirmed > self.contradicted).sum() >= (self.contradicted > self.confirmed).sum())
+
+    def added_to(self, tracks: Observations) -> Observations:
+        """The observations with these after the keypoints of their tracks; contradicted points are left out."""
+        kept = (self.contradicted <= self.confirmed)[self.seen_point]
+        count, first = len(tracks.seen_at), len(tracks.points)
+        return replace(
+            tracks,
+            points=np.concatenate([tracks.points, self.points]),
+            seen_by=np.concatenate([tracks.seen_by[:count], self.seen_by[kept], tracks.seen_by[count:]]),
+            seen_point=np.concatenate(
+                [tracks.seen_point[:count], first + self.seen_point[kept], tracks.seen_point[count:]]
+            ),
+            seen_at=np.concatenate([tracks.seen_at, self.seen_at[kept]]),
+            loose=None,
+        )
+
+    def describe(self) -> str:
+        """Number of points that are used, and their use, in one line."""
+        out = self.contradicted > self.confirmed
+        if not self.fits:
+            return (
+                f"The point cloud does not fit the images, which look through {out.sum():,} of its points where they "
+                f"confirm {(self.confirmed > 0).sum():,}, so it is not used: state its frame as applied_transform in "
+                "transforms.json."
+            )
+        used = np.unique(self.seen_point[~out[self.seen_point]])
+        left_out = f"; {out.sum():,} are left out, as images look through them" if out.any() else ""
+        return (
+            f"Point cloud: {len(used):,} of {len(self.points):,} points are seen, {(self.confirmed > 0).sum():,} of "
+            f"them where matches have a depth{left_out}. They are used for placement and depths."
+        )
+
+
+def see_points(points: Array, posed: PosedImages, depths: Callable[[int], Map] | None = None) -> Sightings:
+    """Sightings of points [P, 3] in the training images.
+
+    Args:
+        points: in scene units.
+        posed: the images.
+        depths: known inverse distances and their errors for an image, 0 where unknown. [H, W, 2]
+    """
+    seen: list[tuple[NDArray[np.int64], NDArray[np.int64], Array]] = []
+    confirmed, contradicted = np.zeros((2, len(points)), np.int64)
+    for i, size in enumerate(posed.sizes):
+        at = project(posed, i, points)
+        inside = np.nonzero(((at >= 0) & (at < size)).all(-1))[0]
+        at = at[inside]
+        distance = np.linalg.norm(points[inside] - posed.camera_to_worlds[i, :, 3], axis=-1)
+        cell = max(size) / CELLS
+        columns, rows = (at / cell).astype(int).T
+        nearest = np.full((int(size[1] / cell) + 1, int(size[0] / cell) + 1), np.inf)
+        np.minimum.at(nearest, (rows, columns), distance)
+        visible = distance < BEHIND * minimum_filter(nearest, 3, mode="nearest")[rows, columns]
+        if depths is not None:
+            columns, rows = at.astype(int).T
+            measured = depths(i)[rows, columns]
+            expected = np.outer(1 / np.maximum(distance, 1e-30), [1, POINT_ERROR]).astype(np.float32)
+            has_depth, apart = measured[:, 0] > 0, contradict(expected, measured)
+            visible = np.where(has_depth, ~apart, visible)
+            confirmed[inside] += has_depth & ~apart
+            contradicted[inside] += apart & (expected[:, 0] > measured[:, 0])
+        seen.append((np.full(visible.sum(), i), inside[visible], at[visible]))
+    seen_by, seen_point, seen_at = (np.concatenate(parts) for parts in zip(*seen, strict=True))
+    return Sightings(points, seen_by, seen_point, seen_at, confirmed, contradicted)

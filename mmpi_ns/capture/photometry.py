@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -70,8 +71,7 @@ ROUNDS = 20
 MOST_HEADROOM = 0.5
 
 
-@dataclass(frozen=True)
-class ColorRatios:
+class ColorRatios(NamedTuple):
     """Colours of the same surfaces in pairs of images: medians of M groups of matches."""
 
     first: Int[ndarray, "M"]
@@ -82,13 +82,9 @@ class ColorRatios:
     falloff: Float[ndarray, "M 2"]
     """Change of r^2 and r^4 from the first to the second; r is 1 at the corners."""
 
-    def some(self, chosen: NDArray[np.bool_]) -> ColorRatios:
-        return ColorRatios(*(getattr(self, name)[chosen] for name in self.__dataclass_fields__))
-
     @staticmethod
     def join(parts: Sequence[ColorRatios]) -> ColorRatios:
-        names = ColorRatios.__dataclass_fields__
-        return ColorRatios(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+        return ColorRatios(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 @dataclass(frozen=True)
@@ -147,14 +143,8 @@ class Gains:
 def grouped(
     first: int, second: int, log_ratios: Float[ndarray, "P 3"], radii: tuple[Float[ndarray, "P"], Float[ndarray, "P"]]
 ) -> ColorRatios | None:
-    """Medians of the matches of a pair of images, in groups of similar change of radius; None for too few.
-
-    Args:
-        first: number of the first image.
-        second: of the other.
-        log_ratios: of each match.
-        radii: squared radius of each match in the first and in the second image.
-    """
+    """Medians of the matches of two images, given by their numbers, in groups of similar change of the squared radius
+    from the first to the second; None for too few."""
     if len(log_ratios) < FEWEST:
         return None
     change = np.stack([radii[1] - radii[0], radii[1] ** 2 - radii[0] ** 2], -1)
@@ -208,14 +198,9 @@ def pair_ratios(
     pixels: Int[ndarray, "P 2"],
     points: Float[ndarray, "P 3"],
 ) -> ColorRatios | None:
-    """Colours of surfaces that one image shows, in another; None if it shows too few of them.
+    """Colours of surfaces, at pixels (row, column) of one image, in another; None if it shows too few of them.
 
-    Args:
-        first: the image that shows them. If ``second`` has no distances, what it shows instead is told by colour.
-        second: the other image.
-        cameras: of both.
-        pixels: row and column of each surface in the first image.
-        points: where the surfaces are.
+    If ``second`` has no distances, what it shows instead of a surface is told by colour.
     """
     rows, columns = pixels.T
     at = project(cameras, second.number, points)
@@ -360,9 +345,9 @@ def image_gains(ratios: ColorRatios, count: int, exposures: Float[ndarray, "N"] 
     fold = np.unique(pairs, return_inverse=True)[1] % FOLDS
     residuals: dict[bool, list[NDArray[np.float64]]] = {False: [], True: []}
     for number in np.unique(fold):
-        left_out = ratios.some(fold == number)
+        used, left_out = (ColorRatios(*(x[chosen] for x in ratios)) for chosen in (fold != number, fold == number))
         for gains, parts in residuals.items():
-            logs, _, falloff = solve(ratios.some(fold != number), count, exposures, gains=gains)
+            logs, _, falloff = solve(used, count, exposures, gains=gains)
             change = logs[left_out.second] - logs[left_out.first]
             parts.append(np.abs(left_out.log_ratios - change - left_out.falloff @ falloff).ravel())
     logs, errors, falloff = solve(ratios, count, exposures)

@@ -56,25 +56,24 @@ class PixelPool:
     def from_dataset(
         dataset: MMPIDataset,
         device: str | torch.device,
-        images: Sequence[int] | None = None,
-        known_depth: KnownDepth | None = None,
-        most: int = 0,
-        seed: int = 0,
+        images: Sequence[int],
+        known_depth: KnownDepth | None,
+        most: int,
+        seed: int,
     ) -> PixelPool:
         """Reads images once; masked pixels are left out.
 
         Args:
             dataset: the training images.
             device: of the pixels.
-            images: which of them; None for all.
-            known_depth: their depths.
+            images: which of them.
+            known_depth: their depths, if any are known.
             most: maximum number of pixels; beyond it, a random subset, the same fraction of each image. 0: no limit.
             seed: of the subset.
 
         Raises:
             InputError: an image or mask cannot be used (names the file), or the masks leave nothing.
         """
-        images = range(len(dataset)) if images is None else images
         widths, heights = (x.reshape(-1).tolist() for x in (dataset.cameras.width, dataset.cameras.height))
         sizes = [widths[i] * heights[i] for i in images]
         share = min(1.0, most / sum(sizes)) if most else 1.0
@@ -99,7 +98,7 @@ class PixelPool:
             raise InputError("The masks leave no training pixel: white (non-zero) mask pixels are the ones used.")
         rows = slice(starts[-1])
         places, depths = (None if x is None else x[rows].to(device) for x in (places, depths))
-        columns = list(images), [widths[i] for i in images], starts[:-1], starts[1:]
+        columns = images, [widths[i] for i in images], starts[:-1], starts[1:]
         numbers, image_widths, begins, ends = (torch.tensor(column, device=device) for column in columns)
         return PixelPool(colors[rows].to(device), numbers, image_widths, begins, ends, places, depths)
 
@@ -154,40 +153,24 @@ def _pixels_of(dataset: MMPIDataset, i: int, share: float, seed: int) -> tuple[U
     return image, kept
 
 
-@dataclass(frozen=True)
-class Keypoints:
-    """Rays from training cameras to the SfM points that they saw.
+def rays_to_keypoints(
+    observations: Observations, device: str | torch.device, images: Sequence[int]
+) -> RayBundle | None:
+    """Rays from some training cameras to the SfM points that they saw, with ``KEYPOINT_DEPTH``; None if there are none.
 
     A ray goes to the point itself, a fraction of a pixel from the keypoint, so no lens model is needed.
     """
-
-    cameras: Int[Tensor, "Q"]
-    origins: Float[Tensor, "Q 3"]
-    directions: Float[Tensor, "Q 3"]
-    inverse_distances: Float[Tensor, "Q"]
-
-    @staticmethod
-    def of(observations: Observations, device: str | torch.device) -> Keypoints | None:
-        """Keypoint rays of all training images; None if there are none."""
-        cameras, points = observations.tracked
-        if not len(cameras):
-            return None
-        origins = observations.centers[cameras]
-        distance = np.maximum(np.linalg.norm(points - origins, axis=-1, keepdims=True), 1e-12)
-        parts = origins, (points - origins) / distance, 1 / distance[:, 0]
-        return Keypoints(torch.from_numpy(cameras).to(device), *(torch.from_numpy(x).float().to(device) for x in parts))
-
-    def of_images(self, images: Int[Tensor, "I"]) -> Keypoints | None:
-        """Keypoint rays of some images; None if there are none."""
-        kept = torch.isin(self.cameras, images.to(self.cameras)).nonzero()[:, 0]
-        return Keypoints(*(x[kept] for x in vars(self).values())) if len(kept) else None
-
-    def draw(self, count: int, g: torch.Generator) -> tuple[RayBundle, Float[Tensor, "R 1"]]:
-        """Random rays and the inverse distances of their points."""
-        chosen = torch.randint(len(self.cameras), (count,), generator=g, device=g.device).to(self.cameras.device)
-        cameras, origins, directions, inverse = (x[chosen] for x in vars(self).values())
-        area = torch.ones_like(inverse[:, None])
-        return RayBundle(origins, directions, area, camera_indices=cameras[:, None]), inverse[:, None]
+    cameras, points = observations.tracked
+    chosen = np.isin(cameras, images)
+    if not chosen.any():
+        return None
+    cameras, points = cameras[chosen], points[chosen]
+    origins = observations.centers[cameras]
+    distance = np.maximum(np.linalg.norm(points - origins, axis=-1, keepdims=True), 1e-12)
+    parts = origins, (points - origins) / distance, 1 / distance
+    origins, directions, inverse = (torch.from_numpy(x).float().to(device) for x in parts)
+    numbers = torch.from_numpy(cameras)[:, None].to(device)
+    return RayBundle(origins, directions, torch.ones_like(inverse), numbers, metadata={KEYPOINT_DEPTH: inverse})
 
 
 @dataclass(frozen=True)
@@ -196,7 +179,8 @@ class RaySources:
 
     pixels: PixelPool
     new_views: SharedPoints | None
-    keypoints: Keypoints | None
+    keypoints: RayBundle | None
+    """By ``rays_to_keypoints``."""
     rays: Rays
     """Makes rays through pixel centres (image, row, column)."""
     new_view_share: float
@@ -210,12 +194,16 @@ class RaySources:
 
     def of_images(self, images: NDArray[np.int64]) -> RaySources:
         """The sources of some images. Raises InputError if masks leave them no pixel."""
-        numbers = torch.from_numpy(images)
+        numbers, keypoints = torch.from_numpy(images), self.keypoints
+        if keypoints is not None and keypoints.camera_indices is not None:
+            cameras = keypoints.camera_indices[:, 0]
+            kept = torch.isin(cameras, numbers.to(cameras)).nonzero()[:, 0]
+            keypoints = keypoints[kept] if len(kept) else None
         return replace(
             self,
             pixels=self.pixels.of_images(numbers),
             new_views=self.new_views and self.new_views.of_images(numbers),
-            keypoints=self.keypoints and self.keypoints.of_images(numbers),
+            keypoints=keypoints,
             no_new_views=self.no_new_views if self.new_views is None else "no two of these images show a point alike",
         )
 
@@ -265,10 +253,10 @@ class RaySources:
             colors, depths = torch.cat([colors, seen]), torch.cat([depths, distances])
         keypoint_depths = torch.zeros(len(colors), 1, device=device)
         if self.keypoints is not None and keypoint_rays:
-            targets, inverse = self.keypoints.draw(keypoint_rays, g)
-            bundles.append(targets)
-            keypoint_depths = torch.cat([keypoint_depths, inverse])
-            depths = torch.cat([depths, depths.new_zeros(len(inverse), 2)])
+            chosen = torch.randint(len(self.keypoints), (keypoint_rays,), generator=g, device=g.device)
+            bundles.append(self.keypoints[chosen.to(device)])
+            keypoint_depths = torch.cat([keypoint_depths, bundles[-1].metadata[KEYPOINT_DEPTH]])
+            depths = torch.cat([depths, depths.new_zeros(keypoint_rays, 2)])
         fields = ("origins", "directions", "pixel_area", "camera_indices")
         joined = {name: torch.cat([getattr(bundle, name) for bundle in bundles]) for name in fields}
         is_own_pixel = (torch.arange(len(depths), device=device) < len(indices))[:, None]

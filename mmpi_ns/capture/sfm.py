@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -49,16 +49,6 @@ class SfmModel:
     off: float = np.nan
     """Median distance of the matches from the epipolar lines of given poses, relative to the width of the image; NaN
     for a model read from files."""
-
-    def keypoints_of(
-        self, image_names: Sequence[str]
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-        """(index into ``image_names``, point, relative position) of the keypoints of these images only."""
-        number = {name: m for m, name in enumerate(self.names.tolist())}
-        images = np.array([number.get(name, -1) for name in image_names], np.int64)
-        begins, ends = (np.searchsorted(self.seen_by, images, side) for side in ("left", "right"))
-        order = np.concatenate([np.zeros(0, np.int64), *map(np.arange, begins, ends)])
-        return np.repeat(np.arange(len(images)), ends - begins), self.seen_point[order], self.seen_at[order]
 
 
 def find_sfm_model(path: Path) -> SfmModel | None:

@@ -19,18 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from mmpi_ns.capture.matching import (
-    count_features,
-    epipolar_distances,
-    find_features,
-    match_pairs,
-    new_model,
-    quiet,
-    rigid3d,
-    triangulate_points,
-    verified_matches,
-    write_images,
-)
+from mmpi_ns.capture import matching
 from mmpi_ns.capture.sfm import SfmModel, load_pycolmap, read_reconstruction
 from mmpi_ns.scene.near_views import nearest_views
 from mmpi_ns.utils.errors import InputError, brief
@@ -45,24 +34,11 @@ MIN_TRACK = 2
 """Minimum number of images of a point; with given poses, two are enough."""
 COPIES = re.compile(r"(.+)_(\d+)")
 """Name of a folder of downscaled copies: that of the originals, and the factor."""
+EFFORTS = ((0.0067, False, 15), (0.002, True, 8))
+"""Contrast of the faintest features (SIFT), whether a pair is matched again along the epipolar lines of its first
+matches, and its least inliers: for textured images, and for rooms at low resolution (two to four times slower)."""
 ENOUGH = 100
 """Average number of keypoints in an image above which the thorough search is skipped."""
-
-
-@dataclass(frozen=True)
-class Effort:
-    """Effort of the search for matches."""
-
-    peak_threshold: float
-    """Contrast of the faintest features (SIFT)."""
-    guided: bool
-    """Whether a pair is matched again along the epipolar lines of its first matches."""
-    min_matches: int
-    """Minimum number of inlier matches of a pair."""
-
-
-EFFORTS = (Effort(0.0067, False, 15), Effort(0.002, True, 8))
-"""Settings for textured images, and for rooms at low resolution (two to four times slower)."""
 
 
 @dataclass(frozen=True)
@@ -112,12 +88,8 @@ def size_of(file: Path) -> NDArray[np.float64]:
 
 
 def shown_size(size: NDArray[np.float64], camera: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Width and height of a file as its camera shows it, which may lack a last row or column.
-
-    Args:
-        size: of the file.
-        camera: of the camera; of another size if files are reduced when they are read.
-    """
+    """Width and height of a file of this size as its camera shows it, which may lack a last row or column, or be of
+    another size if files are reduced when they are read."""
     return np.where(np.abs(size - camera) <= 1, size, camera)
 
 
@@ -203,7 +175,7 @@ def triangulate(images: PosedImages) -> SfmModel:
     Raises:
         InputError: an image file cannot be read.
     """
-    with quiet():
+    with matching.quiet():
         for effort in EFFORTS[:-1]:
             tracks = _attempt(images, effort)
             if len(tracks.seen_by) >= ENOUGH * len(images.files):
@@ -211,8 +183,9 @@ def triangulate(images: PosedImages) -> SfmModel:
         return _attempt(images, EFFORTS[-1])
 
 
-def _attempt(images: PosedImages, effort: Effort) -> SfmModel:
+def _attempt(images: PosedImages, effort: tuple[float, bool, int]) -> SfmModel:
     pycolmap, pairs, error = load_pycolmap(), near_pairs(images.camera_to_worlds, NEIGHBOURS), np.nan
+    peak_threshold, guided, least = effort
     with tempfile.TemporaryDirectory(prefix="mmpi-tracks-") as folder:
         work, database = Path(folder) / "images", Path(folder) / "database.db"
         work.mkdir()
@@ -228,22 +201,22 @@ def _attempt(images: PosedImages, effort: Effort) -> SfmModel:
             camera.has_prior_focal_length = True
             cameras.append(camera)
         opencv = images.camera_to_worlds @ np.diag([1.0, -1.0, -1.0, 1.0])
-        poses = dict(zip(names, map(rigid3d, opencv), strict=True))
-        model = new_model(cameras, names, range(1, len(names) + 1), poses)
-        write_images(model, database)
+        poses = dict(zip(names, map(matching.rigid3d, opencv), strict=True))
+        model = matching.new_model(cameras, names, range(1, len(names) + 1), poses)
+        matching.write_images(model, database)
         options = pycolmap.FeatureExtractionOptions()
         options.max_image_size = LARGE
         options.sift.first_octave = -1 if images.sizes.max() <= SMALL else 0
-        options.sift.peak_threshold = effort.peak_threshold
-        find_features(database, work, names, options)
-        for file, features in zip(images.files, count_features(database), strict=True):
+        options.sift.peak_threshold = peak_threshold
+        matching.find_features(database, work, names, options)
+        for file, features in zip(images.files, matching.count_features(database), strict=True):
             if features is None:
                 raise InputError(f"Training image {file} cannot be read: repair or remove it.")
         if pairs:
             named = [(names[i], names[j]) for i, j in pairs]
-            match_pairs(database, named, guided=effort.guided, least=effort.min_matches)
+            matching.match_pairs(database, named, guided=guided, least=least)
             error = _epipolar_error(database, model)
-            model = triangulate_points(model, database, work, pairs_alone=True)
+            model = matching.triangulate_points(model, database, work, pairs_alone=True)
         tracks = read_reconstruction(model, MIN_TRACK)
         return replace(tracks, names=np.array([str(names.index(name)) for name in tracks.names], np.str_), off=error)
 
@@ -258,7 +231,7 @@ def _epipolar_error(database: Path, model: Any) -> float:
     with pycolmap.Database.open(database) as opened:
         keypoints = {i: np.asarray(opened.read_keypoints(i), np.float64).reshape(-1, 6)[:, :2] for i in model.images}
     rays = {i: np.asarray(cameras[i].cam_from_img(points)) for i, points in keypoints.items()}
-    for a, b, matches in verified_matches(database):
-        distance = epipolar_distances(model, a, b, (rays[a][matches[:, 0]], rays[b][matches[:, 1]]))
+    for a, b, matches in matching.verified_matches(database):
+        distance = matching.epipolar_distances(model, a, b, (rays[a][matches[:, 0]], rays[b][matches[:, 1]]))
         distances.append(distance * cameras[a].mean_focal_length() / cameras[a].width)
     return float(np.median(np.concatenate(distances))) if sum(map(len, distances)) else np.nan

@@ -44,10 +44,8 @@ class View:
         size = max(1, round(width / factor)), max(1, round(height / factor))
         pinhole = self.pinhole * np.tile([size[0] / width, size[1] / height], 2)
         gray = cv2.resize(self.gray, size, interpolation=cv2.INTER_AREA)
-        inside = np.broadcast_to(True, gray.shape)  # of no size
-        if self.inside.strides != (0, 0):
-            inside = cv2.resize(self.inside.view(np.uint8), size, interpolation=cv2.INTER_NEAREST).view(np.bool_)
-        return replace(self, gray=np.asarray(gray, np.uint8), pinhole=pinhole, inside=inside)
+        inside = cv2.resize(self.inside.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+        return replace(self, gray=np.asarray(gray, np.uint8), pinhole=pinhole, inside=inside > 0)
 
 
 def load_view(images: PosedImages, i: int, width: int) -> View:

@@ -62,7 +62,7 @@ class Observations:
     """[M, G, G, 3] unit directions, in camera axes, through a grid over each image from border to border, row after
     row; None if all cameras are pinholes."""
     loose: Array | None = None
-    """[L, 3] points of a cloud that does not record which images saw them (``capture/loose_points.py`` finds out)."""
+    """[L, 3] points of a cloud that does not record which images saw them (``capture/observe.py`` finds out)."""
 
     @staticmethod
     def of_cameras(camera_to_worlds: Array, intrinsics: ArrayLike, sizes: ArrayLike) -> Observations:

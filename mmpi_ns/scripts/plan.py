@@ -46,7 +46,7 @@ class PlanCommand:
 
     def main(self) -> None:
         # Slow imports, which --help does not need.
-        from mmpi_ns.capture.load import check_there, load_observations
+        from mmpi_ns.capture.datamanager import check_there, load_observations
         from mmpi_ns.placement.split import most_pixels, place_windows
         from mmpi_ns.scene.windows import WindowedPlan
         from mmpi_ns.utils.files import write_errors

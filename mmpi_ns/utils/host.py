@@ -14,7 +14,7 @@ import signal
 import sys
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from threading import current_thread, main_thread
 from types import ModuleType, TracebackType
@@ -53,10 +53,9 @@ MALLOC_DEFAULT = 128 << 10
 """glibc's value of both thresholds at the start."""
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
-Undo = Callable[[], object]
 
-
-def _show_errors() -> Undo:
+@contextmanager
+def _show_errors() -> Iterator[None]:
     """sys.excepthook: an InputError ends a command with its sentence alone."""
     before = sys.excepthook
 
@@ -68,40 +67,43 @@ def _show_errors() -> Undo:
         print(f"{Path(sys.argv[0]).stem}: {error}", file=sys.stderr, flush=True)
 
     sys.excepthook = show
-    return lambda: setattr(sys, "excepthook", before)
+    yield
+    sys.excepthook = before
 
 
-def _hide_notices() -> Undo:
+@contextmanager
+def _hide_notices() -> Iterator[None]:
     """warnings.filters, CONSOLE.print, CONSOLE.log: nobody who trains can do anything about ``WARNINGS``, ``NOTICES``
     and the lines of nerfstudio's log."""
-    filters, plain = list(warnings.filters), CONSOLE.print
-    for message in WARNINGS:
-        warnings.filterwarnings("ignore", message=message)
+    plain = CONSOLE.print
 
     def print_for_users(*objects: Any, **how: Any) -> None:
         if not (objects and isinstance(objects[0], str) and objects[0].startswith(NOTICES)):
             plain(*objects, **how)
 
-    def undo_both() -> None:
-        warnings.filters[:] = filters  # type: ignore[index]
-        for name in ("print", "log"):
-            vars(CONSOLE).pop(name, None)
-
     if os.environ.get(TRACEBACK) != "1":
         vars(CONSOLE).update(print=print_for_users, log=lambda *_, **__: None)
-    return undo_both
+    filters = list(warnings.filters)
+    for message in WARNINGS:
+        warnings.filterwarnings("ignore", message=message)
+    yield
+    warnings.filters[:] = filters  # type: ignore[index]
+    for name in ("print", "log"):
+        vars(CONSOLE).pop(name, None)
 
 
-def _keep_freed_memory() -> Undo:
+@contextmanager
+def _keep_freed_memory() -> Iterator[None]:
     """glibc's malloc: a training step takes again what the last one freed; see ``malloc_keeps``."""
     malloc_keeps(KEPT, OWN_MAPPING)
-    return lambda: malloc_keeps(MALLOC_DEFAULT, MALLOC_DEFAULT)
+    yield
+    malloc_keeps(MALLOC_DEFAULT, MALLOC_DEFAULT)
 
 
 PATCHES = (_show_errors, _hide_notices)
 TRAINING_PATCHES = (_keep_freed_memory,)
 """Each makes a change of the host that lasts until it is undone; its docstring says of what, and why."""
-_undos: dict[Callable[[], Undo], Undo] = {}
+_entered: dict[Callable[[], AbstractContextManager[None]], AbstractContextManager[None]] = {}
 
 
 def command() -> str | None:
@@ -124,14 +126,15 @@ def enter_command(training: bool = False) -> None:
     nerfstudio's commands have no hook for this, so it is called by the first code of ours that each of them runs.
     """
     for patch in (*PATCHES, *(TRAINING_PATCHES if training else ())) if command() is not None else ():
-        if patch not in _undos:
-            _undos[patch] = patch()
+        if patch not in _entered:
+            _entered[patch] = patch()
+            _entered[patch].__enter__()
 
 
 def undo() -> None:
     """Takes all patches back, the last one first."""
-    while _undos:
-        _undos.popitem()[1]()
+    while _entered:
+        _entered.popitem()[1].__exit__(None, None, None)
 
 
 def malloc_keeps(freed: int, own_mapping: int) -> bool:

@@ -87,10 +87,16 @@ def in_order(function: Callable[[Item], Result], items: Iterable[Item]) -> Itera
         yield from map(function, items)
         return
     with one_thread_each(), ThreadPoolExecutor(threads) as pool:
-        ahead: deque[Future[Result]] = deque()
-        for item in items:
-            ahead.append(pool.submit(function, item))
-            if len(ahead) > threads:
-                yield ahead.popleft().result()
-        while ahead:
-            yield ahead.popleft().result()
+        yield from (result for _, result in in_turn(((item, pool.submit(function, item)) for item in items), threads))
+
+
+def in_turn(tasks: Iterable[tuple[Item, Future[Result]]], ahead: int) -> Iterator[tuple[Item, Result]]:
+    """Results of tasks, each with its key, of which ``ahead`` are started before the first result is waited for."""
+    started: deque[tuple[Item, Future[Result]]] = deque()
+    for task in tasks:
+        started.append(task)
+        if len(started) > ahead:
+            key, future = started.popleft()
+            yield key, future.result()
+    for key, future in started:
+        yield key, future.result()

@@ -12,7 +12,7 @@ import torch
 from nerfstudio.field_components.encodings import HashEncoding
 from trainings import Progress
 
-from mmpi_ns.capture.local_origin import read_ply
+from mmpi_ns.capture.dataset import read_ply
 from mmpi_ns.ops import dispatch
 
 

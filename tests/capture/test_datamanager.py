@@ -60,7 +60,7 @@ def test_rays_drawn_ahead_are_those_of_the_step_whatever_comes_between(scene, ma
     torch.set_num_threads(2)
     try:
         assert same(alone[0], ahead.next_train(0))
-        following = ahead._rays._next[2].result()
+        following = ahead._ahead[2].result()
         assert ahead.next_train(1) is following and same(alone[1], following)
         assert same(alone[3], ahead.next_train(3))
         ahead.use_cameras(np.array([2]))
@@ -220,7 +220,7 @@ def test_rays_of_new_views_come_after_the_pixels_and_leave_fewer_keypoint_rays(s
     manager.use_cameras(np.array([0, 1, 2]))
     own = manager.sources.new_views
     assert set(own.pixels[:, 0].tolist()) | set(own.other.tolist()) <= {0, 1, 2}
-    assert set(manager.sources.keypoints.cameras.tolist()) == {0, 1, 2}
+    assert set(manager.sources.keypoints.camera_indices[:, 0].tolist()) == {0, 1, 2}
     manager.use_cameras(None)
     assert len(manager.sources.new_views.pixels) == count
 
@@ -245,7 +245,7 @@ def test_one_window_of_more_pixels_than_are_held_has_its_new_views_and_keypoints
     some.use_cameras(None)
     assert len(some.sources.pixels.colors) <= 1000 < len(all_held.sources.pixels.colors)
     assert torch.equal(some.sources.new_views.pixels, all_held.sources.new_views.pixels)
-    assert torch.equal(some.sources.keypoints.cameras, all_held.sources.keypoints.cameras)
+    assert torch.equal(some.sources.keypoints.camera_indices, all_held.sources.keypoints.camera_indices)
     assert len(some.next_train(0)[0]) == 128
 
 

@@ -16,8 +16,6 @@ from mmpi_ns.capture.known_depth import (
     KnownDepth,
     at_training_pixels,
     packed,
-    pooled,
-    read_sensor,
     with_points,
     with_sensor,
 )
@@ -98,7 +96,10 @@ def test_areas_take_the_mean_by_certainty_and_edges_have_large_errors():
     inverse[:, 4:6], error[:, 5] = 0.1, 0.01  # an edge inside the third area of 2 x 2: none; inside the fourth: below
     inverse[:2, 7] = 0.9
     inverse[2:, :3], error[2:, :3] = 0, 0
-    mean, spread = pooled(Depth(inverse, error), (2, 4))
+    pinhole, pose, size = np.array([1e6, 1e6, 4, 2]), np.eye(4)[:3], np.array([[8.0, 4]])  # all along the axis
+    view = View(np.zeros((4, 8), np.uint8), pinhole, pose, np.ones((4, 8), bool))
+    posed = PosedImages((Path("x.png"),), pose[None], pinhole[None], size, np.zeros((1, 4)))
+    mean, spread = np.moveaxis(at_training_pixels(view, Depth(inverse, error), posed, 0, (2, 4)), -1, 0)
     assert mean[0] == pytest.approx([0.5, 0.5, 0.1, 0.7]) and spread[0, :3] == pytest.approx([0.01] * 3, rel=1e-3)
     assert spread[0, 3] == pytest.approx(np.hypot(0.2, 0.01), rel=1e-3)
     assert mean[1, 0] == 0 and mean[1, 1] == pytest.approx(0.5)  # nothing known; half of the area known
@@ -144,9 +145,11 @@ def test_a_depth_image_of_a_sensor_is_along_the_axis_in_its_unit_and_0_is_unknow
     depth = np.full((HEIGHT, WIDTH), 3000, np.uint16)
     depth[:, 40:] = 0
     np.save(file, depth) if suffix == "npy" else cv2.imwrite(str(file), depth)
-    found = read_sensor(file, 0.002, camera(), 0, (30, 40), (30, 40))
+    posed = photographed(tmp_path)
+    half = replace(posed, intrinsics=posed.intrinsics / 2, sizes=posed.sizes / 2)
+    found = with_sensor(KnownDepth([packed(np.zeros((30, 40, 2)))]), [file], 0.002, half).image(0)
     u, v = (5.5 * 2 - 40) / 60, (3.5 * 2 - 30) / 60
-    assert found[3, 5] == pytest.approx(np.array([1, SENSOR_ERROR]) / (6 * np.sqrt(u * u + v * v + 1)), rel=1e-5)
+    assert found[3, 5] == pytest.approx(np.array([1, SENSOR_ERROR]) / (6 * np.sqrt(u * u + v * v + 1)), rel=STEP)
     assert not found[:, 20:].any()
 
 
@@ -195,7 +198,7 @@ def test_a_depth_image_that_cannot_be_read_is_named(tmp_path, content):
     if content is not None:
         file.write_bytes(content)
     with pytest.raises(ValueError, match=r"lost\.png"):
-        read_sensor(file, 1e-3, camera(), 0, (30, 40), (30, 40))
+        with_sensor(KnownDepth([packed(np.zeros((HEIGHT, WIDTH, 2)))]), [file], 1e-3, photographed(tmp_path)).image(0)
 
 
 def test_the_observations_need_no_points():

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mmpi_ns.capture.loose_points import FARTHEST, MOST_POINTS, see_points, usable_points
+from mmpi_ns.capture.observe import FARTHEST, MOST_POINTS, see_points, usable_points
 from mmpi_ns.capture.tracks import PosedImages
 from mmpi_ns.placement.observations import Observations
 

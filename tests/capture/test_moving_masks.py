@@ -13,8 +13,8 @@ import pytest
 from training_runs import datamanager
 
 from mmpi_ns.capture import moving
+from mmpi_ns.capture.datamanager import load_observations
 from mmpi_ns.capture.dense import Depth, Parallax
-from mmpi_ns.capture.load import load_observations
 from mmpi_ns.capture.moving import find_moving, in_image
 from mmpi_ns.capture.moving_evidence import Evidence, Neighbour, Shot, ground_of, nearest_known, splat
 from mmpi_ns.capture.moving_objects import followed, grown, unexplained, without_holes

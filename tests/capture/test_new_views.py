@@ -157,7 +157,7 @@ def test_the_number_of_threads_does_not_change_the_points(monkeypatch):
     for threads in (1, 3):
         monkeypatch.setattr("mmpi_ns.utils.parallel.num_threads", lambda threads=threads: threads)
         points.append(find())
-    for name in new_views.PARTS:
+    for name in ("pixels", "other", "colors", "depths"):
         assert torch.equal(*(getattr(p, name) for p in points))
 
 

@@ -16,7 +16,7 @@ from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from PIL import Image
 
-from mmpi_ns.capture.local_origin import take_local_origins, with_cameras_of_copies
+from mmpi_ns.capture.dataset import take_local_origins, with_cameras_of_copies
 from mmpi_ns.capture.tracks import PosedImages, at_full_size, original_of
 from mmpi_ns.prepare.export import downscale
 

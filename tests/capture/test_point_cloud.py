@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mmpi_ns.capture.local_origin import GRAY, read_ply
+from mmpi_ns.capture.dataset import GRAY, read_ply
 
 
 def test_points_without_colours_are_gray_and_keep_all_their_digits(tmp_path):

@@ -11,7 +11,9 @@ from PIL import Image
 from value_noise import noise
 
 from mmpi_ns.capture import tracks as triangulation
+from mmpi_ns.capture.observe import with_tracks
 from mmpi_ns.capture.tracks import EFFORTS, NEIGHBOURS, PosedImages, near_pairs, triangulate
+from mmpi_ns.placement.observations import Observations
 
 WIDTH, HEIGHT, FOCAL = 200, 150, 180.0
 LENS = (0.05, -0.02, 0.001, -0.002)
@@ -129,9 +131,10 @@ def test_perspective_and_fisheye_images_are_matched_with_each_other(tmp_path):
         for name in ("camera_to_worlds", "intrinsics", "sizes", "distortion")
     }
     is_fisheye = np.array([False] * len(straight.files) + [True] * len(round_.files))
-    found = triangulate(PosedImages(files=straight.files + round_.files, **both, fisheye=is_fisheye))
+    both = PosedImages(files=straight.files + round_.files, **both, fisheye=is_fisheye)
+    found = triangulate(both)
     assert len(found.points) > 100 and np.median(depth_error(found.points)) < 0.005
-    cameras, points, _ = found.keypoints_of([str(i) for i in range(len(POSES))])
+    cameras, points, _ = keypoints_of(found, both)
     mixed = [len(set(is_fisheye[cameras[points == p]])) == 2 for p in range(len(found.points))]
     assert np.mean(mixed) > 0.5
 
@@ -162,8 +165,15 @@ def test_faint_images_are_searched_more_thoroughly_and_others_are_not(tmp_path, 
     assert efforts == [EFFORTS[1]]
 
 
+def keypoints_of(model, images):
+    """Image, point and relative place of each keypoint."""
+    cameras = Observations.of_cameras(images.camera_to_worlds, images.intrinsics, images.sizes)
+    seen = with_tracks(cameras, model)
+    return seen.seen_by, seen.seen_point, seen.seen_at / images.sizes[seen.seen_by]
+
+
 def test_keypoints_are_where_the_points_project(images, model):
-    cameras, points, relative = model.keypoints_of([str(i) for i in range(len(POSES))])
+    cameras, points, relative = keypoints_of(model, images)
     assert len(cameras) >= 3 * len(model.points)
     poses = images.camera_to_worlds[cameras]
     local = np.einsum("qji,qj->qi", poses[:, :, :3], model.points[points] - poses[:, :, 3])

@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-ERRORS = ("InputError", "WriteError", "UnusableFile", "Damaged")
+ERRORS = ("InputError", "WriteError", "Damaged")
 
 
 def template(node):

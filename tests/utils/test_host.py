@@ -124,7 +124,7 @@ def test_nothing_happens_at_import():
             package = importlib.import_module(f"mmpi_ns.{wing}")
             for module in pkgutil.walk_packages(package.__path__, f"mmpi_ns.{wing}."):
                 importlib.import_module(module.name)
-        assert state() == before and not mmpi_ns.utils.host._undos
+        assert state() == before and not mmpi_ns.utils.host._entered
     """
     done = subprocess.run([sys.executable, "-c", work], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-2000:]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from concurrent.futures import Future
 from threading import Thread
 
 import pytest
@@ -78,3 +79,18 @@ def test_a_thread_that_began_within_the_block_has_all_kernel_threads_too(three_t
 def test_results_come_in_order_whatever_the_threads(three_threads):
     with parallel.torch_apart():
         assert list(parallel.in_order(lambda i: i * i, range(20))) == [i * i for i in range(20)]
+
+
+def test_a_few_tasks_are_started_ahead_of_the_results():
+    started = []
+
+    def tasks():
+        for i in range(6):
+            started.append(i)
+            future = Future()
+            future.set_result(i * i)
+            yield f"{i}", future
+
+    results = parallel.in_turn(tasks(), 2)
+    assert not started and next(results) == ("0", 0) and started == [0, 1, 2]
+    assert list(results) == [(f"{i}", i * i) for i in range(1, 6)]

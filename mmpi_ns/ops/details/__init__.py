@@ -9,7 +9,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
+from mmpi_ns.ops.build import call_in_parts
 from mmpi_ns.ops.dispatch import operation
+from mmpi_ns.ops.layout import dense
 
 TURN = 0.01
 """Angle between the viewing directions of a surface below which weights hardly grow, radians."""
@@ -54,7 +56,7 @@ def project(
     return torch.stack([column, row], -1), inside
 
 
-@operation("cpu")
+@operation()
 def seen_details(
     origins: Float[Tensor, "R 3"],
     directions: Float[Tensor, "R 3"],
@@ -89,3 +91,13 @@ def seen_details(
     turn = (relative / length - directions).norm(dim=-1, keepdim=True)
     agrees = torch.exp(-((there - here) / margin).square().clamp(max=80)) / (turn + TURN)
     return SeenDetails(values[:, :3], torch.where(inside[:, None] & (there >= 0), agrees, 0.0))
+
+
+@seen_details.on_cpu
+def seen_details_on_cpu(
+    origins: Tensor, directions: Tensor, inverse: Tensor, image: Tensor, camera: Tensor
+) -> SeenDetails:
+    seen = SeenDetails(torch.empty(len(origins), 3), torch.empty(len(origins), 1))
+    arrays = dense(origins, directions, inverse, image, camera)
+    call_in_parts("mmpi_seen_details", len(origins), *image.shape[:2], *arrays, *seen)
+    return seen

@@ -47,13 +47,9 @@ void look_up(const float* image, int64_t height, int64_t width, float column, fl
     }
 }
 
-} // namespace
-
-extern "C" {
-
 // Rays [begin, end): the image's values at their surfaces, and weights.
-void mmpi_seen_details(const float* origins, const float* directions, const float* inverse, const float* image,
-                       const float* numbers, int64_t begin, int64_t end, int64_t height, int64_t width,
+void mmpi_seen_details(int64_t begin, int64_t end, int64_t height, int64_t width, const float* origins,
+                       const float* directions, const float* inverse, const float* image, const float* numbers,
                        float* difference, float* weight) {
     const Camera& camera = *reinterpret_cast<const Camera*>(numbers);
     for (int64_t i = begin; i < end; i++) {
@@ -76,6 +72,7 @@ void mmpi_seen_details(const float* origins, const float* directions, const floa
         for (int k = 0; k < 3; k++) difference[3 * i + k] = values[k];
     }
 }
-}
+
+} // namespace
 
 IN_PARTS(mmpi_seen_details)
