@@ -8,7 +8,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from mmpi_ns.prepare.stages import PrepareError
+from mmpi_ns.utils.errors import InputError
 
 Array = NDArray[np.float64]
 ROTATION_WEIGHT = 1.0
@@ -102,7 +102,7 @@ def fit_ground(points: Array, centers: Array, up: Array) -> tuple[Array, float]:
         Unit normal towards the cameras [3], and the cameras' median height above the plane.
 
     Raises:
-        PrepareError: too few points below the cameras, or no plane among them.
+        InputError: too few points below the cameras, or no plane among them.
     """
     # Points below the nearest camera and near the track.
     some = centers[:: max(1, len(centers) // 32)]
@@ -112,7 +112,7 @@ def fit_ground(points: Array, centers: Array, up: Array) -> tuple[Array, float]:
     across = np.linalg.norm(offset - height[:, None] * up, axis=-1)
     below = points[(height < 0) & (-height > 0.05 * across) & (across < reach)]
     if len(below) < LEAST_GROUND:
-        raise PrepareError(
+        raise InputError(
             f"--camera-height: only {len(below)} points lie below the cameras: too few to find the ground."
         )
     tolerance = 0.04 * abs(float(np.median(-((below - np.median(centers, axis=0)) @ up))))
@@ -126,7 +126,7 @@ def fit_ground(points: Array, centers: Array, up: Array) -> tuple[Array, float]:
         near = np.abs((below - a) @ normal) < tolerance * length
         inside = near if near.sum() > inside.sum() else inside
     if inside.sum() < GROUND_SHARE * len(below):
-        raise PrepareError("--camera-height: the points below the cameras lie on no common plane.")
+        raise InputError("--camera-height: the points below the cameras lie on no common plane.")
     center = below[inside].mean(0)
     normal = np.linalg.eigh((below[inside] - center).T @ (below[inside] - center))[1][:, 0]
     normal *= np.sign(normal @ up)
@@ -148,7 +148,7 @@ def choose_frame(model: pycolmap.Reconstruction, camera_height: float | None) ->
         points = np.array([p.xyz for p in model.points3D.values()])
         up, height = fit_ground(points, centers, up)
         if height <= 0:
-            raise PrepareError("--camera-height: the ground found lies above the cameras.")
+            raise InputError("--camera-height: the ground found lies above the cameras.")
         scale, words = camera_height / height, "normal of the ground"
         unit = f"1 metre, from a camera height of {camera_height:g} m above the ground"
     else:

@@ -32,8 +32,7 @@ from mmpi_ns.capture.matching import (
     write_images,
 )
 from mmpi_ns.prepare.images import Photo
-from mmpi_ns.prepare.stages import PrepareError
-from mmpi_ns.utils.errors import progress
+from mmpi_ns.utils.errors import InputError, progress
 from mmpi_ns.utils.files import whole
 
 BATCH = 8
@@ -89,7 +88,7 @@ def extract(
         Features of each image.
 
     Raises:
-        PrepareError: an image cannot be read, or hardly any has features.
+        InputError: an image cannot be read, or hardly any has features.
     """
     options = pycolmap.FeatureExtractionOptions()
     options.num_threads, options.max_image_size = threads, LARGEST_SIDE
@@ -113,10 +112,10 @@ def extract(
                 advance(len(names[start : start + BATCH]))
     counts = count_features(database)
     if None in counts:
-        raise PrepareError(f"{names[counts.index(None)]} cannot be read by COLMAP: repair or remove it.")
+        raise InputError(f"{names[counts.index(None)]} cannot be read by COLMAP: repair or remove it.")
     numbers = [n or 0 for n in counts]
     if sum(n >= FEATURES for n in numbers) < 2:
-        raise PrepareError(
+        raise InputError(
             f"Hardly any features: {max(numbers)} in the best image. The images are blank, blurred or masked over."
         )
     return numbers

@@ -15,8 +15,7 @@ import pycolmap
 from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 
 from mmpi_ns.capture.exif import kept_tags, positive_number
-from mmpi_ns.prepare.stages import PrepareError
-from mmpi_ns.utils.errors import progress, say
+from mmpi_ns.utils.errors import InputError, progress, say
 from mmpi_ns.utils.files import whole, write_text
 
 IMAGES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
@@ -55,10 +54,10 @@ class Photo:
 
 
 def find_images(folder: Path) -> list[Path]:
-    """The images in a folder in natural order; in its subfolders if it has none itself. Raises PrepareError for fewer
+    """The images in a folder in natural order; in its subfolders if it has none itself. Raises InputError for fewer
     than two."""
     if not folder.is_dir():
-        raise PrepareError(f"{folder} is no folder of images and no video ({', '.join(VIDEOS)}).")
+        raise InputError(f"{folder} is no folder of images and no video ({', '.join(VIDEOS)}).")
     readable = (*IMAGES, *(HEIF if reads_heif() else ()))
     files = [p for p in folder.rglob("*") if p.is_file() and not p.name.startswith(".")]
     images = [p for p in files if p.suffix.lower() in readable]
@@ -75,7 +74,7 @@ def find_images(folder: Path) -> list[Path]:
         say(f"{len(names)} {kind} files {why} ({in_short(names)}).", "yellow")
     if len(images) < 2:
         count = "no image" if not images else f"one image only ({images[0].name})"
-        raise PrepareError(
+        raise InputError(
             f"{folder} holds {count} ({', '.join(readable)}): a scene needs at least two views, better twenty."
         )
     return sorted(images, key=lambda p: natural_key(str(p.relative_to(folder))))
@@ -118,7 +117,7 @@ def scene_names(files: Sequence[Path], folder: Path) -> list[str]:
 
 def gather(folder: Path, files: Sequence[Path], target: Path) -> list[Photo]:
     """Copies images upright into ``target/images``, unless they are there, and notes their sizes and EXIF. Raises
-    PrepareError naming an image that cannot be read."""
+    InputError naming an image that cannot be read."""
     (target / "images").mkdir(parents=True, exist_ok=True)
     photos = []
     with progress("Reading images", len(files)) as advance:
@@ -159,13 +158,13 @@ def read_photos(target: Path) -> list[Photo]:
 
 
 def open_image(path: Path) -> Image.Image:
-    """An image, decoded. Raises PrepareError naming the file if it cannot be read."""
+    """An image, decoded. Raises InputError naming the file if it cannot be read."""
     try:
         with Image.open(path) as image:
             image.load()
             return image
     except (OSError, UnidentifiedImageError, SyntaxError, ValueError) as error:
-        raise PrepareError(f"{path} cannot be read ({error}): repair or remove it.") from error
+        raise InputError(f"{path} cannot be read ({error}): repair or remove it.") from error
 
 
 def _convert(image: Image.Image, path: Path, suffix: str) -> None:
@@ -189,7 +188,7 @@ def gather_masks(folder: Path, photos: Sequence[Photo], target: Path) -> int:
         Images that had a mask; the others get an all-white one, since nerfstudio wants all or none.
 
     Raises:
-        PrepareError: no mask fits an image, or one has another size.
+        InputError: no mask fits an image, or one has another size.
     """
     files = [p for p in sorted(folder.rglob("*")) if p.suffix.lower() in IMAGES]
     bare = [SUFFIXES.sub("", p.relative_to(folder).as_posix()) for p in files]
@@ -206,13 +205,13 @@ def gather_masks(folder: Path, photos: Sequence[Photo], target: Path) -> int:
             count += 1
             mask = ImageOps.exif_transpose(open_image(source)).convert("L").point(lambda v: 255 if v else 0)
             if mask.size != (photo.width, photo.height):
-                raise PrepareError(
+                raise InputError(
                     f"Mask {source} is {mask.size[0]}x{mask.size[1]}, its image {photo.name} "
                     f"{photo.width}x{photo.height}: they must be of one size."
                 )
         mask.save(target / f"{photo.name}.png")
     if not count:
-        raise PrepareError(f"No mask in {folder} is named like an image (a.png or a.jpg.png for a.jpg).")
+        raise InputError(f"No mask in {folder} is named like an image (a.png or a.jpg.png for a.jpg).")
     if count < len(photos):
         say(f"{len(photos) - count} of {len(photos)} images have no mask: all their pixels are used.", "yellow")
     return count
@@ -232,26 +231,26 @@ class Intrinsics:
 
 
 def parse_camera(values: Sequence[float], fisheye: bool) -> Intrinsics:
-    """The camera of ``--camera``. Raises PrepareError if the numbers fit none or a focal length is not positive."""
+    """The camera of ``--camera``. Raises InputError if the numbers fit none or a focal length is not positive."""
     if len(values) not in GIVEN_COUNTS:
-        raise PrepareError(f"--camera takes {' or '.join(GIVEN_COUNTS.values())}, not {len(values)} numbers.")
+        raise InputError(f"--camera takes {' or '.join(GIVEN_COUNTS.values())}, not {len(values)} numbers.")
     if len(values) == 3:
         values = (values[0], *values)
     if min(values[:2]) <= 0:
-        raise PrepareError("--camera: focal lengths must be positive, in pixels.")
+        raise InputError("--camera: focal lengths must be positive, in pixels.")
     lens = tuple(values[4:]) or (0.0,) * 4
     return Intrinsics(*values[:4], distortion=lens, fisheye=fisheye)  # type: ignore[arg-type]
 
 
 def share(photos: Sequence[Photo], sharing: Sharing, lenses: dict[str, Intrinsics]) -> list[int]:
     """Camera of each image, numbered from 1: images of one size, lens and given intrinsics share one. Raises
-    PrepareError if images of different sizes are to share one camera."""
+    InputError if images of different sizes are to share one camera."""
     if sharing == "per-image":
         return list(range(1, len(photos) + 1))
     sizes = {(p.width, p.height) for p in photos}
     if sharing == "shared" and len(sizes) > 1:
         listed = ", ".join(f"{w}x{h}" for w, h in sorted(sizes))
-        raise PrepareError(f"--intrinsics shared, but the images are of different sizes ({listed}): use auto.")
+        raise InputError(f"--intrinsics shared, but the images are of different sizes ({listed}): use auto.")
     numbers: dict[Any, int] = {}
     keys = [(p.width, p.height, "" if sharing == "shared" else p.lens, lenses.get(p.name)) for p in photos]
     return [numbers.setdefault(key, len(numbers) + 1) for key in keys]
@@ -290,12 +289,12 @@ def make_cameras(
 
 
 def read_intrinsics(camera: pycolmap.Camera) -> Intrinsics:
-    """A pycolmap camera as OpenCV's. Raises PrepareError if nerfstudio-data does not support the lens model."""
+    """A pycolmap camera as OpenCV's. Raises InputError if nerfstudio-data does not support the lens model."""
     name, p = camera.model.name, [float(v) for v in camera.params]
     f = (camera.focal_length_x, camera.focal_length_y, camera.principal_point_x, camera.principal_point_y)
     terms = {"SIMPLE_PINHOLE": [], "PINHOLE": [], "SIMPLE_RADIAL": p[3:], "RADIAL": p[3:]}
     terms |= {"OPENCV": p[4:], "OPENCV_FISHEYE": p[4:]}
     if name not in terms:
-        raise PrepareError(f"Lens model {name} is not supported in transforms.json.")
+        raise InputError(f"Lens model {name} is not supported in transforms.json.")
     k1, k2, k3, k4 = (*terms[name], 0.0, 0.0, 0.0, 0.0)[:4]
     return Intrinsics(*f, distortion=(k1, k2, k3, k4), fisheye=name == "OPENCV_FISHEYE")

@@ -16,9 +16,8 @@ from mmpi_ns.capture.matching import SEED, quiet
 from mmpi_ns.prepare.adjustment import polish, with_all_points
 from mmpi_ns.prepare.evidence import Witness, agreement, share, witness_of
 from mmpi_ns.prepare.mapping import ATTEMPTS, Task, map_globally, reconstruct
-from mmpi_ns.prepare.stages import PrepareError
 from mmpi_ns.prepare.verdict import NEARLY_ALL, ORDER, Grade, Verdict, agrees, best_first, judge_alone, judge_together
-from mmpi_ns.utils.errors import progress, say
+from mmpi_ns.utils.errors import InputError, progress, say
 
 STARTS = (0.7, 1.2)
 """Focal lengths over the longer side that are tried where none is known: telephones and cars, then COLMAP's guess."""
@@ -59,7 +58,7 @@ def map_and_judge(task: Task) -> Solution:
     """Runs the global mapper, then the incremental one from the focal length that fits, and chooses by the evidence.
 
     The chosen model is given all points and adjusted (``polish``), unless that makes the evidence worse. Raises
-    PrepareError if neither mapper makes a model.
+    InputError if neither mapper makes a model.
     """
     chosen, *others = _candidates(task)
     with progress("Adding points", 1) as advance:
@@ -93,11 +92,11 @@ def _candidates(task: Task) -> list[Candidate]:
         best = candidates[best_first([c.witness for c in candidates], task.is_ordered)[0]].model
         start = task.work / "from-global.db"
         start_from(task.database, start, {n: c.mean_focal_length() for n, c in best.cameras.items()})
-    failed: PrepareError | None = None
+    failed: InputError | None = None
     try:
         attempts = 1 if is_settled and not is_part else len(ATTEMPTS)
         candidates.append(_judged("incremental", *reconstruct(task, start, attempts), task))
-    except PrepareError as error:
+    except InputError as error:
         failed = error
     nearly_all = NEARLY_ALL * len(task.offered)
     if is_part and not any(len(c.witness.images) >= nearly_all and c.grade == "right" for c in candidates):

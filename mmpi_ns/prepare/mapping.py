@@ -23,8 +23,7 @@ from mmpi_ns.capture.matching import MIN_ANGLE, MIN_INLIERS, SEED, quiet, triang
 from mmpi_ns.prepare.adjustment import STILL, Free, adjust, with_all_points
 from mmpi_ns.prepare.alignment import camera_poses, degrees_between, similarity_between
 from mmpi_ns.prepare.features import matched_keypoints, matching_pairs
-from mmpi_ns.prepare.stages import PrepareError
-from mmpi_ns.utils.errors import progress, say
+from mmpi_ns.utils.errors import InputError, progress, say
 
 ENOUGH = 0.95
 """Fraction of registered images at which no further attempt is made."""
@@ -117,11 +116,11 @@ def reconstruct(task: Task, database: Path, attempts: int = len(ATTEMPTS)) -> tu
         attempts: maximum number of attempts.
 
     Raises:
-        PrepareError: no attempt found an initial pair.
+        InputError: no attempt found an initial pair.
     """
     total, pairs = len(task.offered), len(matching_pairs(database))
     if not pairs:
-        raise PrepareError(
+        raise InputError(
             "No two images have enough matches in common: they do not overlap, or show too little texture. "
             "Take views with more overlap (two thirds and more)."
         )
@@ -139,7 +138,7 @@ def reconstruct(task: Task, database: Path, attempts: int = len(ATTEMPTS)) -> tu
         if result and size >= ENOUGH * total and not is_bent(result[0]):
             break
     if best is None:
-        raise PrepareError(
+        raise InputError(
             f"No pair of images can start a reconstruction ({pairs} pairs have matches): the camera hardly moved "
             "(turning on the spot gives no depth), or the focal length is far off: check --focal and --camera."
         )
@@ -293,7 +292,7 @@ def map_known_poses(
         The model with points, and what was done in words.
 
     Raises:
-        PrepareError: the poses do not fit the matches.
+        InputError: the poses do not fit the matches.
     """
     _, before = camera_poses(model)
     refines = refine_poses or refine_lens
@@ -301,7 +300,7 @@ def map_known_poses(
         model = triangulate_points(model, database, images, threads, COARSE_PX if refines else FINE_PX)
     share = model.compute_num_observations() / max(matched_keypoints(database, list(model.reg_image_ids())), 1)
     if share < LEAST_SHARE:
-        raise PrepareError(
+        raise InputError(
             f"Only {share:.0%} of the matched keypoints become points from the given poses: the camera axes "
             "(--poses-axes opencv or opengl), the order of the images, the direction (camera "
             "to world is wanted) or the intrinsics (--focal, --camera) are not what the poses were made with."

@@ -24,10 +24,10 @@ from mmpi_ns.prepare.mappers import Solution, map_and_judge
 from mmpi_ns.prepare.mapping import Task, map_known_poses
 from mmpi_ns.prepare.poses import read_poses
 from mmpi_ns.prepare.settings import Settings, check_options, read_lists
-from mmpi_ns.prepare.stages import PrepareError, Stages, only_one
+from mmpi_ns.prepare.stages import Stages, only_one
 from mmpi_ns.prepare.verdict import REMEDY, Verdict
 from mmpi_ns.prepare.video import select_frames
-from mmpi_ns.utils.errors import progress, quoted, say
+from mmpi_ns.utils.errors import InputError, progress, quoted, say
 from mmpi_ns.utils.files import whole
 
 WORK = ".prepare"
@@ -54,7 +54,7 @@ class Preparation:
             self._read_input()
             self.known_poses = read_poses(s.poses, s.poses_axes, self.photos) if s.poses else None
             if self.known_poses is None and len(self.photos) < LEAST_IMAGES:
-                raise PrepareError(
+                raise InputError(
                     f"Poses cannot be found for {len(self.photos)} images alone, as no third confirms them: take more "
                     "(better twenty), or give known poses (--poses)."
                 )
@@ -74,13 +74,13 @@ class Preparation:
         count, total = solution.model.num_reg_images(), len(self.photos)
         if count < LEAST_SHARE * total and not s.allow_partial:
             groups = "".join(f" Another group of {len(g)}: {in_short(g, 4)}." for g in self.groups)
-            raise PrepareError(
+            raise InputError(
                 f"Only {count} of {total} images could be registered: {in_short(camera_poses(solution.model)[0], 4)}."
                 f"{groups} The groups need images that connect them. For a scene of the {count} alone: "
                 "--allow-partial. What was found so far is kept, and a new run goes on from it."
             )
         if solution.verdict.grade == "broken" and not s.allow_doubtful:
-            raise PrepareError(
+            raise InputError(
                 f"The track that was found is wrong, so no scene was made. {solution.verdict.words()} {REMEDY} "
                 "To look at it all the same: --allow-doubtful."
             )
@@ -98,7 +98,7 @@ class Preparation:
         s = self.settings
         self.is_video = s.input.is_file()
         if self.is_video and s.input.suffix.lower() not in images.VIDEOS:
-            raise PrepareError(f"{s.input} is neither a folder nor a video ({', '.join(images.VIDEOS)}).")
+            raise InputError(f"{s.input} is neither a folder nor a video ({', '.join(images.VIDEOS)}).")
         files = [s.input] if self.is_video else images.find_images(s.input)
         source = [(str(p), p.stat().st_size, p.stat().st_mtime) for p in files]
         source = [*source[0], s.max_frames, s.frame_motion] if self.is_video else source
@@ -129,7 +129,7 @@ class Preparation:
         self.cameras = make_cameras(self.photos, self.numbers, lenses, s.focal, s.lens)
         is_given = bool(lenses) or s.focal is not None
         if self.known_poses is not None and not is_given and not all(p.exif_focal for p in self.photos):
-            raise PrepareError("Known poses need the intrinsics they were made with: give --focal or --camera.")
+            raise InputError("Known poses need the intrinsics they were made with: give --focal or --camera.")
         return (is_given or self.known_poses is not None) and not s.refine_intrinsics
 
     def _matches(self, database: Path) -> tuple[Path, str]:
@@ -289,7 +289,7 @@ class Preparation:
             for i, name in enumerate(names):
                 gray = cv2.imread(str(self.image_folder / name), cv2.IMREAD_GRAYSCALE)
                 if gray is None:
-                    raise PrepareError(f"{name} cannot be read: repair or remove it.")
+                    raise InputError(f"{name} cannot be read: repair or remove it.")
                 sharp[i] = checks.sharpness(gray)  # type: ignore[arg-type]
                 advance(1)
         findings += checks.blurred(names, sharp, self.is_ordered)
@@ -328,20 +328,20 @@ class Preparation:
 
 
 def prepare(settings: Settings) -> Verdict:
-    """Makes the scene; returns how far it can be believed. Raises PrepareError if the input is missing or cannot be
+    """Makes the scene; returns how far it can be believed. Raises InputError if the input is missing or cannot be
     made into a scene, or something would be lost in its folder."""
     load_pycolmap()  # in a version that is new enough
     check_options(settings)
     source, scene = settings.input.resolve(), settings.scene.resolve()
     if not source.exists():
-        raise PrepareError(f"{settings.input} does not exist.")
+        raise InputError(f"{settings.input} does not exist.")
     if settings.scene.is_file():
-        raise PrepareError(f"{settings.scene} is a file: name a folder for the scene.")
+        raise InputError(f"{settings.scene} is a file: name a folder for the scene.")
     taken = export.existing_parts(scene)
     if scene == source or source in scene.parents or any((scene / part) in (source, *source.parents) for part in taken):
-        raise PrepareError(f"The scene {settings.scene} would be mixed with its input: name another folder.")
+        raise InputError(f"The scene {settings.scene} would be mixed with its input: name another folder.")
     if taken and not settings.overwrite:
-        raise PrepareError(
+        raise InputError(
             f"{settings.scene} already holds {', '.join(taken)}: name another folder, or give --overwrite "
             "(the old files are then moved aside)."
         )

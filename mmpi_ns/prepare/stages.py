@@ -21,10 +21,6 @@ LEFT = 1 << 20
 """Free bytes below which a failure to write is attributed to a full disk; COLMAP's errors give no reason."""
 
 
-class PrepareError(InputError):
-    """The input cannot be made into a scene; the message says why and what to do."""
-
-
 class Stages:
     """Stages of a preparation, run in order; a stage that was finished with the same settings is skipped.
 
@@ -66,18 +62,18 @@ class Stages:
 
 @contextmanager
 def only_one(work: Path) -> Iterator[None]:
-    """Locks a work folder against a second run. Raises PrepareError if one is at work there, or the disk is full."""
+    """Locks a work folder against a second run. Raises InputError if one is at work there, or the disk is full."""
     work.mkdir(parents=True, exist_ok=True)
     try:
         with FileLock(work / "lock", blocking=False):
             yield
     except Timeout as error:
-        raise PrepareError(f"Another mmpi-prepare is making {work.parent}: wait for it, or name another.") from error
+        raise InputError(f"Another mmpi-prepare is making {work.parent}: wait for it, or name another.") from error
     except InputError:
         raise
     except (OSError, RuntimeError, ValueError) as error:
         free = shutil.disk_usage(work.parent).free
         if getattr(error, "errno", None) in FULL or free < LEFT:
             says = f"The disk of {work.parent} is full ({free / 2**20:.0f} MB free): make room and repeat the command."
-            raise PrepareError(says) from error
+            raise InputError(says) from error
         raise

@@ -20,7 +20,7 @@ from mmpi_ns.prepare.mappers import map_and_judge
 from mmpi_ns.prepare.mapping import Task
 from mmpi_ns.prepare.pipeline import WORK, prepare
 from mmpi_ns.prepare.settings import Settings
-from mmpi_ns.prepare.stages import PrepareError
+from mmpi_ns.utils.errors import InputError
 
 COUNT = 12
 
@@ -67,7 +67,7 @@ def test_a_long_sequence_is_confirmed_by_a_part_of_it(task, monkeypatch):
 
 def test_all_images_are_placed_at_once_where_the_incremental_mapper_fails(task, monkeypatch):
     def fail(*args):
-        raise PrepareError("no pair can start")
+        raise InputError("no pair can start")
 
     monkeypatch.setattr(mapping, "PLACED", COUNT // 2)
     monkeypatch.setattr(mappers, "reconstruct", fail)
@@ -76,7 +76,7 @@ def test_all_images_are_placed_at_once_where_the_incremental_mapper_fails(task, 
     assert error_of(believed.model) < 0.01
     monkeypatch.setattr(mappers, "map_globally", lambda *args: None)
     (task.work / "none").mkdir()
-    with pytest.raises(PrepareError, match="no pair can start"):
+    with pytest.raises(InputError, match="no pair can start"):
         map_and_judge(replace(task, work=task.work / "none"))
 
 

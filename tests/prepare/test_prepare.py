@@ -126,10 +126,10 @@ def test_report_states_the_figures(scene):
 
 
 def test_existing_scene_is_refused_and_left_alone(scene, capture):
-    from mmpi_ns.prepare.stages import PrepareError
+    from mmpi_ns.utils.errors import InputError
 
     before = (scene / "transforms.json").read_bytes()
-    with pytest.raises(PrepareError, match="already holds"):
+    with pytest.raises(InputError, match="already holds"):
         prepare(Settings(capture / "frames", scene, threads=1))
     assert (scene / "transforms.json").read_bytes() == before
 

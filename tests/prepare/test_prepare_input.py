@@ -28,8 +28,8 @@ from mmpi_ns.prepare.images import (
 )
 from mmpi_ns.prepare.pipeline import prepare
 from mmpi_ns.prepare.settings import Settings
-from mmpi_ns.prepare.stages import PrepareError
 from mmpi_ns.prepare.video import choose_frames, measure, select_frames
+from mmpi_ns.utils.errors import InputError
 
 
 def save(path, size=(40, 30), value=100, **more):
@@ -167,7 +167,7 @@ def test_masks_of_two_folders_go_to_the_images_of_theirs(tmp_path):
 
 def test_mask_of_another_size_is_refused(tmp_path):
     save(tmp_path / "masks/a.png", (5, 3), 0)
-    with pytest.raises(PrepareError, match="5x3"):
+    with pytest.raises(InputError, match="5x3"):
         gather_masks(tmp_path / "masks", [Photo("a.jpg", 4, 3, source="a.jpg")], tmp_path / "out")
 
 
@@ -183,7 +183,7 @@ def test_images_of_one_lens_share_a_camera():
     photos = [Photo("a", 4, 3, "x"), Photo("b", 4, 3, "x"), Photo("c", 4, 3, "y"), Photo("d", 8, 6, "x")]
     assert share(photos, "auto", {}) == [1, 1, 2, 3]
     assert share(photos, "per-image", {}) == [1, 2, 3, 4]
-    with pytest.raises(PrepareError, match="different sizes"):
+    with pytest.raises(InputError, match="different sizes"):
         share(photos, "shared", {})
 
 
@@ -198,7 +198,7 @@ def test_given_camera_comes_back_from_colmaps():
     given = parse_camera((90.0, 91.0, 50.0, 26.0, 0.1, -0.02, 0.003, 0.004), fisheye=False)
     camera = make_cameras([Photo("a", 100, 50)], [1], {"a": given}, None, "auto")[0]
     assert read_intrinsics(camera) == given
-    with pytest.raises(PrepareError, match="--camera takes"):
+    with pytest.raises(InputError, match="--camera takes"):
         parse_camera((1.0, 2.0), fisheye=False)
 
 
@@ -257,7 +257,7 @@ def test_split_by_count_and_by_list():
     assert split.train == ("1.jpg", "4.jpg", "7.jpg") and len(split.test) == 6
     lists = {"train_filenames": ["x/2.jpg"], "test_filenames": ["x/3.jpg", "x/99.jpg"]}
     assert export.split_from(lists, names, "s").test == ("3.jpg",)
-    with pytest.raises(PrepareError, match="among the registered"):
+    with pytest.raises(InputError, match="among the registered"):
         export.split_from({"train_filenames": ["2.jpg"], "test_filenames": ["77.jpg"]}, names, "s")
 
 
@@ -296,10 +296,10 @@ def test_no_more_frames_than_asked():
 
 def test_broken_video_is_named(tmp_path, drive):
     (tmp_path / "no.mp4").write_bytes(b"not a video at all" * 100)
-    with pytest.raises(PrepareError, match=r"no\.mp4"):
+    with pytest.raises(InputError, match=r"no\.mp4"):
         measure(tmp_path / "no.mp4")
     still = write_video(tmp_path / "still.avi", [drive[0]] * 5)
-    with pytest.raises(PrepareError, match="no motion"):
+    with pytest.raises(InputError, match="no motion"):
         select_frames(still, tmp_path / "out2", 300, 0.02)
 
 
@@ -308,13 +308,13 @@ def test_too_few_images_are_refused(count, words, tmp_path):
     (tmp_path / "in").mkdir()
     for n in range(count):
         save(tmp_path / "in" / f"{n}.png")
-    with pytest.raises(PrepareError, match=words):
+    with pytest.raises(InputError, match=words):
         prepare(Settings(tmp_path / "in", tmp_path / "scene"))
 
 
 def test_two_images_without_poses_are_refused_before_any_work(tmp_path):
     corridor.write_images(tmp_path / "in", 2)
-    with pytest.raises(PrepareError, match="for 2 images alone, as no third confirms them"):
+    with pytest.raises(InputError, match="for 2 images alone, as no third confirms them"):
         prepare(Settings(tmp_path / "in", tmp_path / "scene", threads=1))
     assert not (tmp_path / "scene/.prepare/features").exists()
 
@@ -322,14 +322,14 @@ def test_two_images_without_poses_are_refused_before_any_work(tmp_path):
 def test_truncated_image_is_named(tmp_path):
     save(tmp_path / "in/a.png")
     (tmp_path / "in/b.jpg").write_bytes(save(tmp_path / "whole.jpg", (90, 90)).read_bytes()[:300])
-    with pytest.raises(PrepareError, match=r"b\.jpg cannot be read"):
+    with pytest.raises(InputError, match=r"b\.jpg cannot be read"):
         prepare(Settings(tmp_path / "in", tmp_path / "scene"))
 
 
 def test_blank_images_are_refused(tmp_path):
     for n in range(3):
         save(tmp_path / "in" / f"{n}.png")
-    with pytest.raises(PrepareError, match="Hardly any features"):
+    with pytest.raises(InputError, match="Hardly any features"):
         prepare(Settings(tmp_path / "in", tmp_path / "scene", threads=1))
 
 
@@ -337,7 +337,7 @@ def test_images_without_overlap_are_refused(tmp_path):
     (tmp_path / "in").mkdir()
     for n in range(3):
         Image.fromarray(corridor.picture(corridor.poses(1)[0], seed=n)).save(tmp_path / "in" / f"{n}.png")
-    with pytest.raises(PrepareError, match="overlap"):
+    with pytest.raises(InputError, match="overlap"):
         prepare(Settings(tmp_path / "in", tmp_path / "scene", threads=1))
 
 
@@ -353,7 +353,7 @@ def test_two_disconnected_groups_are_named_and_the_larger_can_be_had(tmp_path):
 def test_scene_and_input_are_kept_apart(tmp_path):
     corridor.write_images(tmp_path / "scene/images", 2)
     for scene in (tmp_path / "scene", tmp_path / "scene/images", tmp_path / "scene/images/out"):
-        with pytest.raises(PrepareError, match="mixed with its input"):
+        with pytest.raises(InputError, match="mixed with its input"):
             prepare(Settings(tmp_path / "scene/images", scene, overwrite=True))
     assert len(list((tmp_path / "scene/images").iterdir())) == 2
 

@@ -17,8 +17,8 @@ from mmpi_ns.prepare import export, features, mapping
 from mmpi_ns.prepare.adjustment import Free, adjust, polish
 from mmpi_ns.prepare.alignment import choose_frame, similarity_between
 from mmpi_ns.prepare.images import Intrinsics, Photo, make_cameras, read_intrinsics, share
-from mmpi_ns.prepare.stages import PrepareError
 from mmpi_ns.prepare.video import choose_frames, median_motion
+from mmpi_ns.utils.errors import InputError
 
 
 def model_of(poses, *cameras):
@@ -127,7 +127,7 @@ def test_a_lens_of_colmap_projects_as_opencv_says(model, params):
 
 
 def test_a_lens_without_a_place_in_transforms_is_named():
-    with pytest.raises(PrepareError, match="FULL_OPENCV"):
+    with pytest.raises(InputError, match="FULL_OPENCV"):
         read_intrinsics(pycolmap.Camera(model="FULL_OPENCV", params=[150, 140, 98, 83, *[0.0] * 8], **SIZE))
 
 
@@ -164,7 +164,7 @@ def test_images_of_several_cameras_state_their_own_intrinsics():
         content["fl_x"] == 151 and content["k4"] == 1 and set(content["frames"][0]) == {"file_path", "transform_matrix"}
     )
     mixed = [shared, pycolmap.Camera(model="PINHOLE", params=[9, 9, 4, 3], width=8, height=6, camera_id=3)]
-    with pytest.raises(PrepareError, match="Fisheye and perspective"):
+    with pytest.raises(InputError, match="Fisheye and perspective"):
         export.transforms(model_of(corridor.poses(2), *mixed), split, False, {})
 
 
