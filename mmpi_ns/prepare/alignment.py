@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
@@ -68,18 +66,6 @@ def similarity_between(source: Array, target: Array) -> pycolmap.Sim3d:
     return pycolmap.Sim3d(scale, pycolmap.Rotation3d(rotation), translation)
 
 
-@dataclass(frozen=True)
-class SceneFrame:
-    """Transform from the model to the scene, and its sources in words."""
-
-    similarity: pycolmap.Sim3d
-    """Scene from model."""
-    up: str
-    """Source of the up direction, in words."""
-    unit: str
-    """The unit, in words."""
-
-
 def up_from_cameras(poses: Array) -> Array:
     """Up, assuming level cameras: perpendicular to all right vectors if they turn, else the mean up vector. [3]"""
     mean = -poses[:, :3, 1].mean(0)
@@ -133,12 +119,15 @@ def fit_ground(points: Array, centers: Array, up: Array) -> tuple[Array, float]:
     return normal, float(np.median((centers - center) @ normal))
 
 
-def choose_frame(model: pycolmap.Reconstruction, camera_height: float | None) -> SceneFrame:
+def choose_frame(model: pycolmap.Reconstruction, camera_height: float | None) -> tuple[pycolmap.Sim3d, str, str]:
     """Up to +z, the first camera's heading to +y, the cameras' middle (or the ground below it) as origin.
 
     Args:
         model: in its own frame.
         camera_height: metres above the ground, or None: then one unit is the extent of the track.
+
+    Returns:
+        The transform from the model to the scene, and the sources of up and of the unit in words.
     """
     _, poses = camera_poses(model)
     centers = poses[:, :3, 3]
@@ -160,4 +149,4 @@ def choose_frame(model: pycolmap.Reconstruction, camera_height: float | None) ->
     heading = heading / np.linalg.norm(heading)
     rotation = np.stack([np.cross(heading, up), heading, up])
     similarity = pycolmap.Sim3d(scale, pycolmap.Rotation3d(rotation), -scale * rotation @ centers.mean(0))
-    return SceneFrame(similarity, words, unit)
+    return similarity, words, unit

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import re
 import shutil
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,7 +15,7 @@ from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 
 from mmpi_ns.capture.exif import kept_tags, positive_number
 from mmpi_ns.utils.errors import InputError, progress, say
-from mmpi_ns.utils.files import whole, write_text
+from mmpi_ns.utils.files import whole
 
 IMAGES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
 HEIF = (".heic", ".heif")
@@ -116,8 +115,8 @@ def scene_names(files: Sequence[Path], folder: Path) -> list[str]:
 
 
 def gather(folder: Path, files: Sequence[Path], target: Path) -> list[Photo]:
-    """Copies images upright into ``target/images``, unless they are there, and notes their sizes and EXIF. Raises
-    InputError naming an image that cannot be read."""
+    """Copies images upright into ``target/images``, unless they are there; reads sizes and EXIF. Raises InputError
+    naming an image that cannot be read."""
     (target / "images").mkdir(parents=True, exist_ok=True)
     photos = []
     with progress("Reading images", len(files)) as advance:
@@ -144,17 +143,7 @@ def gather(folder: Path, files: Sequence[Path], target: Path) -> list[Photo]:
             lens = " ".join(str(part).strip() for part in parts if part)
             photos.append(Photo(name, *size, lens, focal, str(file.relative_to(folder))))
             advance(1)
-    write_photos(photos, target)
     return photos
-
-
-def write_photos(photos: Sequence[Photo], target: Path) -> None:
-    write_text(target / "photos.json", json.dumps([asdict(p) for p in photos], indent=1))
-
-
-def read_photos(target: Path) -> list[Photo]:
-    """Photos as ``gather`` or the frame selection noted them."""
-    return [Photo(**entry) for entry in json.loads((target / "photos.json").read_text(encoding="utf-8"))]
 
 
 def open_image(path: Path) -> Image.Image:

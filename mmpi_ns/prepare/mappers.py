@@ -7,7 +7,7 @@ import os
 import shutil
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import pycolmap
@@ -29,16 +29,6 @@ whatever the focal length, and drops the points that do not fit."""
 
 
 @dataclass(frozen=True)
-class Solution:
-    """Poses and points, how they came about, and how far they can be believed."""
-
-    model: pycolmap.Reconstruction
-    says: str
-    """The mappers in words."""
-    verdict: Verdict = field(default_factory=lambda: Verdict("right"))
-
-
-@dataclass(frozen=True)
 class Candidate:
     """A mapper's model, and the evidence on it."""
 
@@ -54,11 +44,16 @@ def _judged(mapper: str, model: pycolmap.Reconstruction, says: str, task: Task) 
     return Candidate(model, witness, says, judge_alone(witness, task.is_ordered).grade)
 
 
-def map_and_judge(task: Task) -> Solution:
+def map_and_judge(task: Task) -> tuple[pycolmap.Reconstruction, str, Verdict]:
     """Runs the global mapper, then the incremental one from the focal length that fits, and chooses by the evidence.
 
-    The chosen model is given all points and adjusted (``polish``), unless that makes the evidence worse. Raises
-    InputError if neither mapper makes a model.
+    The chosen model is given all points and adjusted (``polish``), unless that makes the evidence worse.
+
+    Returns:
+        Poses and points, the mappers in words, and how far they can be believed.
+
+    Raises:
+        InputError: neither mapper makes a model.
     """
     chosen, *others = _candidates(task)
     with progress("Adding points", 1) as advance:
@@ -72,7 +67,7 @@ def map_and_judge(task: Task) -> Solution:
         chosen = polished
     verdict = judge_together(chosen.witness, [c.witness for c in others], task.is_ordered)
     beside = [f"{c.says}, {c.grade} by itself" for c in others]
-    return Solution(chosen.model, "; beside it ".join([chosen.says, *beside]), verdict)
+    return chosen.model, "; beside it ".join([chosen.says, *beside]), verdict
 
 
 def _candidates(task: Task) -> list[Candidate]:

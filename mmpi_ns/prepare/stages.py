@@ -6,7 +6,7 @@ import errno
 import hashlib
 import json
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -33,13 +33,13 @@ class Stages:
         self._key = ""
         work.mkdir(parents=True, exist_ok=True)
 
-    @contextmanager
-    def stage(self, name: str, settings: Any) -> Iterator[tuple[Path, bool]]:
-        """A stage's own folder, and whether it was finished before; it counts as finished when the block ends.
+    def run(self, name: str, settings: Any, make: Callable[[Path], Any]) -> tuple[Path, Any]:
+        """A stage's own folder, and what the work on it returned, now or before.
 
         Args:
             name: the folder's name.
             settings: everything the result depends on besides the earlier stages; JSON or text.
+            make: fills the folder, and returns JSON.
         """
         text = self._key + name + json.dumps(settings, sort_keys=True, default=str)
         self._key = hashlib.sha256(text.encode()).hexdigest()
@@ -50,14 +50,14 @@ class Stages:
             state = {}  # missing or truncated: the stage starts over
         if state.get("key") != self._key:
             shutil.rmtree(folder, ignore_errors=True)
-            write_text(stamp, json.dumps({"key": self._key, "finished": False}))
-        elif state.get("finished"):
+            write_text(stamp, json.dumps({"key": self._key}))
+        elif "result" in state:
             say(f"{name}: done before", "dim")
-            yield folder, True
-            return
+            return folder, state["result"]
         folder.mkdir(exist_ok=True)
-        yield folder, False
-        write_text(stamp, json.dumps({"key": self._key, "finished": True}))
+        result = make(folder)
+        write_text(stamp, json.dumps({"key": self._key, "result": result}))
+        return folder, result
 
 
 @contextmanager

@@ -70,11 +70,8 @@ class Verdict:
     """The verdict on a model."""
 
     grade: Grade
-    reasons: tuple[str, ...] = ()
-    """Sentences, the most severe first; none if it is right."""
-
-    def words(self) -> str:
-        return " ".join(self.reasons)
+    says: str = ""
+    """Why, in sentences, the most severe first; empty if it is right."""
 
 
 def worse(value: float, limits: tuple[float, float]) -> Grade:
@@ -103,7 +100,7 @@ def judge_alone(witness: Witness, is_sequence: bool) -> Verdict:
         grade: Grade = "broken" if len(loose) > 0.1 * count else "doubtful" if loose else "right"
         problems.append((grade, f"Most matches of {in_short(loose, 4)} contradict their poses."))
     severe = sorted((p for p in problems if p[0] != "right"), key=lambda p: -ORDER.index(p[0]))
-    return Verdict(severe[0][0], tuple(says for _, says in severe)) if severe else Verdict("right")
+    return Verdict(severe[0][0], " ".join(says for _, says in severe)) if severe else Verdict("right")
 
 
 def _problems_along(witness: Witness) -> list[tuple[Grade, str]]:
@@ -201,7 +198,7 @@ def judge_together(chosen: Witness, others: Sequence[Witness], is_sequence: bool
         f"({difference.centers.max():.1%} at most; most at {', '.join(worst)}), with focal lengths of "
         f"{chosen.focal:.2f} and {other.focal:.2f} image sides."
     )
-    return Verdict("doubtful", (*alone.reasons, says))
+    return Verdict("doubtful", f"{alone.says} {says}".strip())
 
 
 def _fit(witness: Witness) -> float:

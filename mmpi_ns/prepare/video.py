@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mmpi_ns.prepare.checks import sharpness
-from mmpi_ns.prepare.images import Photo, write_photos
+from mmpi_ns.prepare.images import Photo
 from mmpi_ns.utils.errors import InputError, progress, say
 from mmpi_ns.utils.files import whole, write_text
 
@@ -61,7 +61,6 @@ def select_frames(video: Path, target: Path, max_frames: int, step: float) -> li
             photos.append(Photo(name, frame.shape[1], frame.shape[0], source=name))
             advance(1)
     capture.release()
-    write_photos(photos, target)
     return photos
 
 

@@ -47,7 +47,7 @@ def moved(frames, shift=(0.0, 0.0, 0.0), scale=1.0, about=0):
 
 def test_sound_track_is_right(sound):
     verdict = judge_alone(sound, is_sequence=True)
-    assert verdict.grade == "right" and not verdict.reasons
+    assert verdict.grade == "right" and not verdict.says
     assert judge_alone(sound, is_sequence=False).grade == "right"
 
 
@@ -61,7 +61,7 @@ def test_jump_along_the_way_is_broken_though_epipolar_lines_do_not_see_it(keypoi
     assert bridges(witness.pairs, len(straight), witness.pairs.fitting).min() > 0.99
     verdict = judge_alone(witness, is_sequence=True)
     assert verdict.grade == "broken"
-    assert "between frame_011 and frame_012" in verdict.words() and "usual steps" in verdict.words()
+    assert "between frame_011 and frame_012" in verdict.says and "usual steps" in verdict.says
 
 
 def test_a_break_before_the_last_image_is_doubtful_and_believed_where_two_mappers_agree(sound):
@@ -69,16 +69,16 @@ def test_a_break_before_the_last_image_is_doubtful_and_believed_where_two_mapper
     tracked = np.where(pairs.second == 23, 0.1 * pairs.matches, pairs.tracked)
     witness = replace(sound, pairs=replace(pairs, tracked=tracked))
     verdict = judge_alone(witness, is_sequence=True)
-    assert verdict.grade == "doubtful" and "between frame_022 and frame_023" in verdict.words()
+    assert verdict.grade == "doubtful" and "between frame_022 and frame_023" in verdict.says
     assert judge_together(replace(witness, name="global"), [sound], True).grade == "right"
     inside = np.where((pairs.first < 12) & (pairs.second >= 12), 0.15 * pairs.matches, tracked)
     verdict = judge_alone(replace(sound, pairs=replace(pairs, tracked=inside)), is_sequence=True)
-    assert verdict.grade == "broken" and "between frame_011 and frame_012" in verdict.words()
+    assert verdict.grade == "broken" and "between frame_011 and frame_012" in verdict.says
 
 
 def test_scale_that_breaks_half_way_is_not_right(keypoints):
     verdict = judge_alone(witness_with(moved(np.s_[12:], scale=0.3, about=11), *keypoints), is_sequence=True)
-    assert verdict.grade != "right" and "frame_01" in verdict.words()
+    assert verdict.grade != "right" and "frame_01" in verdict.says
 
 
 def test_mirrored_piece_is_broken(keypoints):
@@ -87,7 +87,7 @@ def test_mirrored_piece_is_broken(keypoints):
     normal, place = poses[11, :3, 2], poses[11, :3, 3]
     poses[12:, :3, 3] -= 2 * ((poses[12:, :3, 3] - place) @ normal)[:, None] * normal
     verdict = judge_alone(witness_with(poses, *keypoints), is_sequence=True)
-    assert verdict.grade == "broken" and "The track breaks between frame_" in verdict.words()
+    assert verdict.grade == "broken" and "The track breaks between frame_" in verdict.says
 
 
 def test_collapsed_track_is_broken(keypoints):
@@ -105,7 +105,7 @@ def test_wrong_focal_length_in_a_bend_is_not_right(keypoints):
 def test_one_misplaced_image_of_an_unordered_set_is_named(keypoints):
     poses = moved([7], shift=(3.0, -1.0, 2.0))
     verdict = judge_alone(witness_with(poses, *keypoints), is_sequence=False)
-    assert verdict.grade != "right" and "frame_007" in verdict.words()
+    assert verdict.grade != "right" and "frame_007" in verdict.says
 
 
 def test_gap_in_the_capture_is_no_break(keypoints):
@@ -128,7 +128,7 @@ def test_two_mappers_of_one_mind_are_right_and_of_two_minds_doubtful(sound, keyp
     assert judge_together(sound, [replace(sound, poses=other)], True).grade == "right"
     bent = replace(sound, poses=drive(turn=0.03), name="global", focal=0.7)
     verdict = judge_together(sound, [bent], True)
-    assert verdict.grade == "doubtful" and "0.58 and 0.70 image sides" in verdict.words()
+    assert verdict.grade == "doubtful" and "0.58 and 0.70 image sides" in verdict.says
 
 
 def test_a_broken_second_mapper_does_not_speak_against_a_right_one(sound, keypoints):
@@ -213,8 +213,8 @@ def test_scale_that_changes_is_measured_where_it_changes(keypoints):
 def test_scale_that_changes_by_a_third_is_broken_though_most_matches_hold(keypoints, sound):
     changed = witness_with(moved(np.s_[12:], scale=1.33, about=11), *keypoints)
     verdict = judge_alone(replace(sound, scales=changed.scales), is_sequence=True)
-    assert verdict.grade == "broken" and "changes by 3" in verdict.words()
-    assert "between frame_011 and frame_012" in verdict.words()
+    assert verdict.grade == "broken" and "changes by 3" in verdict.says
+    assert "between frame_011 and frame_012" in verdict.says
 
 
 def test_colmaps_sampson_error_is_the_squared_distance_to_the_nearest_exact_match():
@@ -247,7 +247,7 @@ def test_one_misplaced_image_of_a_sequence_is_named_though_most_matches_across_i
     held = held_by_side(witness.pairs, len(sideways))
     assert np.nanmin(held) == min(held[0, 12], held[1, 12]) < 0.4
     verdict = judge_alone(witness, is_sequence=True)
-    assert verdict.grade != "right" and "frame_012 is misplaced" in verdict.words()
+    assert verdict.grade != "right" and "frame_012 is misplaced" in verdict.says
 
 
 def test_sides_of_an_image_are_its_earlier_and_its_later_partners():
@@ -271,7 +271,7 @@ def test_false_matches_far_from_their_lines_bend_nothing_and_those_beside_them_d
     assert judge_alone(false, is_sequence=True).grade == "right"
     bent = replace(sound, pairs=replace(pairs, fitting=fitting, beside=np.where(across, 0.4 * pairs.matches, 0.0)))
     verdict = judge_alone(bent, is_sequence=True)
-    assert verdict.grade == "doubtful" and "bent between frame_011 and frame_012: 60%" in verdict.words()
+    assert verdict.grade == "doubtful" and "bent between frame_011 and frame_012: 60%" in verdict.says
 
 
 def test_a_sound_piece_comes_after_a_doubtful_whole_and_a_broken_whole_after_both(sound, keypoints):
