@@ -231,50 +231,52 @@ def parse_camera(values: Sequence[float], fisheye: bool) -> Intrinsics:
     return Intrinsics(*values[:4], distortion=lens, fisheye=fisheye)  # type: ignore[arg-type]
 
 
-def share(photos: Sequence[Photo], sharing: Sharing, lenses: dict[str, Intrinsics]) -> list[int]:
-    """Camera of each image, numbered from 1: images of one size, lens and given intrinsics share one. Raises
-    InputError if images of different sizes are to share one camera."""
-    if sharing == "per-image":
-        return list(range(1, len(photos) + 1))
+def make_cameras(
+    photos: Sequence[Photo], sharing: Sharing, lenses: dict[str, Intrinsics], focal: float | None, lens: Lens
+) -> tuple[list[int], list[pycolmap.Camera]]:
+    """Cameras from given intrinsics, else from EXIF, else guessed.
+
+    Args:
+        photos: the images.
+        sharing: which of them share a camera; auto: those of one size, lens and known intrinsics.
+        lenses: known intrinsics by image name.
+        focal: focal length in pixels, from the command line.
+        lens: distortion model if none is given.
+
+    Returns:
+        Camera of each image, numbered from 1, and the cameras in this order.
+
+    Raises:
+        InputError: images of different sizes are to share one camera.
+    """
     sizes = {(p.width, p.height) for p in photos}
     if sharing == "shared" and len(sizes) > 1:
         listed = ", ".join(f"{w}x{h}" for w, h in sorted(sizes))
         raise InputError(f"--intrinsics shared, but the images are of different sizes ({listed}): use auto.")
-    numbers: dict[Any, int] = {}
-    keys = [(p.width, p.height, "" if sharing == "shared" else p.lens, lenses.get(p.name)) for p in photos]
-    return [numbers.setdefault(key, len(numbers) + 1) for key in keys]
-
-
-def make_cameras(
-    photos: Sequence[Photo], numbers: Sequence[int], lenses: dict[str, Intrinsics], focal: float | None, lens: Lens
-) -> list[pycolmap.Camera]:
-    """One pycolmap camera for each number, from given intrinsics, else from EXIF, else guessed.
-
-    Args:
-        photos: the images.
-        numbers: camera of each image.
-        lenses: known intrinsics by image name.
-        focal: focal length in pixels, from the command line.
-        lens: distortion model if none is given.
-    """
-    cameras: dict[int, pycolmap.Camera] = {}
-    for photo, number in zip(photos, numbers, strict=True):
-        if number in cameras:
-            continue
+    by_key: dict[Any, int] = {}
+    numbers: list[int] = []
+    cameras: list[pycolmap.Camera] = []
+    for photo in photos:
         intrinsics = lenses.get(photo.name)
+        key = (photo.width, photo.height, "" if sharing == "shared" else photo.lens, intrinsics)
+        number = by_key.setdefault(photo.name if sharing == "per-image" else key, len(cameras) + 1)
+        numbers.append(number)
+        if number <= len(cameras):
+            continue
         if intrinsics is not None:
             params = [intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy]
             is_bent = intrinsics.fisheye or any(intrinsics.distortion)
             model = "OPENCV_FISHEYE" if intrinsics.fisheye else "OPENCV" if is_bent else "PINHOLE"
             params += intrinsics.distortion if is_bent else ()
             size = {"width": photo.width, "height": photo.height, "camera_id": number}
-            cameras[number] = pycolmap.Camera(model=model, params=params, **size)
+            camera = pycolmap.Camera(model=model, params=params, **size)
         else:
             model = MODELS["radial" if lens == "auto" and focal is None else "pinhole" if lens == "auto" else lens]
             guess = focal or photo.exif_focal or GUESSED_FOCAL * max(photo.width, photo.height)
-            cameras[number] = pycolmap.Camera.create_from_model_name(number, model, guess, photo.width, photo.height)
-        cameras[number].has_prior_focal_length = bool(intrinsics or focal or photo.exif_focal)
-    return [cameras[n] for n in sorted(cameras)]
+            camera = pycolmap.Camera.create_from_model_name(number, model, guess, photo.width, photo.height)
+        camera.has_prior_focal_length = bool(intrinsics or focal or photo.exif_focal)
+        cameras.append(camera)
+    return numbers, cameras
 
 
 def read_intrinsics(camera: pycolmap.Camera) -> Intrinsics:

@@ -21,7 +21,7 @@ from mmpi_ns.capture.tracks import near_pairs
 from mmpi_ns.prepare import checks, export, features, images
 from mmpi_ns.prepare.adjustment import Free, focal_in_words, focal_interval
 from mmpi_ns.prepare.alignment import camera_poses, choose_frame
-from mmpi_ns.prepare.images import Photo, in_short, make_cameras, parse_camera, share
+from mmpi_ns.prepare.images import Photo, in_short, make_cameras, parse_camera
 from mmpi_ns.prepare.mappers import map_and_judge
 from mmpi_ns.prepare.mapping import Task, map_known_poses
 from mmpi_ns.prepare.poses import read_poses
@@ -125,8 +125,7 @@ class Preparation:
             lenses = dict.fromkeys((p.name for p in self.photos), parse_camera(s.camera, s.lens == "fisheye"))
         elif s.focal is not None:
             lenses = {}
-        self.numbers = share(self.photos, s.intrinsics, lenses)
-        self.cameras = make_cameras(self.photos, self.numbers, lenses, s.focal, s.lens)
+        self.numbers, self.cameras = make_cameras(self.photos, s.intrinsics, lenses, s.focal, s.lens)
         is_given = bool(lenses) or s.focal is not None
         if self.known_poses is not None and not is_given and not all(p.exif_focal for p in self.photos):
             raise InputError("Known poses need the intrinsics they were made with: give --focal or --camera.")
@@ -150,10 +149,7 @@ class Preparation:
             says = f"the {2 * s.overlap} nearest by pose"
         else:
             alike = features.image_similarity(database, len(names))
-            chosen, why = features.choose(s.matching, names, alike, self.is_video)
-            pairs, says = features.list_pairs(chosen, alike, s.overlap), f"{chosen} ({why})"
-            if chosen == "sequential":
-                says += f", {len(features.revisits(alike, s.overlap))} pairs that may be revisits"
+            pairs, says = features.choose_pairs(s.matching, names, alike, s.overlap, self.is_video)
         verified = features.match(database, self.photos, pairs, s.threads)
         return f"{says}; {verified} of {len(pairs)} pairs match"
 

@@ -24,7 +24,6 @@ from mmpi_ns.prepare.images import (
     read_intrinsics,
     reads_heif,
     scene_names,
-    share,
 )
 from mmpi_ns.prepare.pipeline import prepare
 from mmpi_ns.prepare.settings import Settings
@@ -181,22 +180,23 @@ def test_masked_pixels_stay_masked_when_downscaled(tmp_path):
 
 def test_images_of_one_lens_share_a_camera():
     photos = [Photo("a", 4, 3, "x"), Photo("b", 4, 3, "x"), Photo("c", 4, 3, "y"), Photo("d", 8, 6, "x")]
-    assert share(photos, "auto", {}) == [1, 1, 2, 3]
-    assert share(photos, "per-image", {}) == [1, 2, 3, 4]
+    for sharing, numbers in (("auto", [1, 1, 2, 3]), ("per-image", [1, 2, 3, 4])):
+        assert make_cameras(photos, sharing, {}, None, "auto")[0] == numbers
     with pytest.raises(InputError, match="different sizes"):
-        share(photos, "shared", {})
+        make_cameras(photos, "shared", {}, None, "auto")
 
 
 def test_focal_length_comes_from_the_option_then_exif_then_a_guess():
     photos = [Photo("a", 100, 50, exif_focal=77.0)]
-    assert make_cameras(photos, [1], {}, 60.0, "auto")[0].mean_focal_length() == 60
-    assert make_cameras(photos, [1], {}, None, "auto")[0].mean_focal_length() == 77
-    assert make_cameras([Photo("a", 100, 50)], [1], {}, None, "auto")[0].mean_focal_length() == 120
+    bare = [Photo("a", 100, 50)]
+    for images, focal, expected in ((photos, 60.0, 60), (photos, None, 77), (bare, None, 120)):
+        (camera,) = make_cameras(images, "auto", {}, focal, "auto")[1]
+        assert camera.mean_focal_length() == expected
 
 
 def test_given_camera_comes_back_from_colmaps():
     given = parse_camera((90.0, 91.0, 50.0, 26.0, 0.1, -0.02, 0.003, 0.004), fisheye=False)
-    camera = make_cameras([Photo("a", 100, 50)], [1], {"a": given}, None, "auto")[0]
+    (camera,) = make_cameras([Photo("a", 100, 50)], "auto", {"a": given}, None, "auto")[1]
     assert read_intrinsics(camera) == given
     with pytest.raises(InputError, match="--camera takes"):
         parse_camera((1.0, 2.0), fisheye=False)
@@ -216,17 +216,23 @@ def test_matching_is_chosen_by_count_and_order():
     numbered = [f"f{i:03d}.jpg" for i in range(200)]
     shuffled = np.random.default_rng(0).permutation(200)
     mixed = chain(200)[np.ix_(shuffled, shuffled)]
-    assert features.choose("auto", numbered[:20], chain(20), False)[0] == "exhaustive"
-    assert features.choose("auto", numbered, chain(200), False)[0] == "sequential"
-    assert features.choose("auto", numbered, mixed, False)[0] == "retrieval"
-    assert features.choose("auto", numbered[:100], mixed[:100, :100], False)[0] == "exhaustive"
-    assert features.choose("auto", numbered, mixed, True)[0] == "sequential"
+    for names, alike, from_video, way in (
+        (numbered[:20], chain(20), False, "exhaustive (20 images are few)"),
+        (numbered, chain(200), False, "sequential (numbered frames that look like their neighbours), 0 pairs"),
+        (numbered, mixed, False, "retrieval (200 images in no order are too many to match all)"),
+        (numbered[:100], mixed[:100, :100], False, "exhaustive (100 images in no order)"),
+        (numbered, mixed, True, "sequential (frames of a video), "),
+    ):
+        assert features.choose_pairs("auto", names, alike, 10, from_video)[1].startswith(way)
 
 
 def test_revisits_close_the_loop_and_a_straight_drive_has_none():
-    found = features.revisits(chain(150, loop=10), 10)
-    assert (0, 140) in found and all(i < 20 and j >= 130 for i, j in found)
-    assert features.revisits(chain(150), 10) == []
+    names = [str(i) for i in range(150)]
+    found, _ = features.choose_pairs("sequential", names, chain(150, loop=10), 10, False)
+    again = [(i, j) for i, j in found if j - i > 45]
+    assert (0, 140) in again and all(i < 20 and j >= 130 for i, j in again)
+    straight, says = features.choose_pairs("sequential", names, chain(150), 10, False)
+    assert says.endswith(" 0 pairs that may be revisits") and max(j - i for i, j in straight) == 45
 
 
 def test_look_alikes_are_found_by_their_features(tmp_path):
@@ -234,7 +240,7 @@ def test_look_alikes_are_found_by_their_features(tmp_path):
         corridor.write_images(tmp_path / "in" / str(seed), 2, seed=seed)
     photos = gather(tmp_path / "in", find_images(tmp_path / "in"), tmp_path)
     database = tmp_path / "database.db"
-    features.create_database(database, photos, [1] * 4, make_cameras(photos, [1] * 4, {}, None, "auto"))
+    features.create_database(database, photos, *make_cameras(photos, "shared", {}, None, "auto"))
     features.extract(database, tmp_path / "images", photos, None, 1000, 1)
     alike = features.image_similarity(database, 4)
     assert alike.argmax(-1).tolist() == [1, 0, 3, 2]

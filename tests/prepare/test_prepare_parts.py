@@ -16,7 +16,7 @@ from mmpi_ns.capture.matching import rigid3d
 from mmpi_ns.prepare import export, features, mapping
 from mmpi_ns.prepare.adjustment import Free, adjust, polish
 from mmpi_ns.prepare.alignment import choose_frame, similarity_between
-from mmpi_ns.prepare.images import Intrinsics, Photo, make_cameras, read_intrinsics, share
+from mmpi_ns.prepare.images import Intrinsics, Photo, make_cameras, read_intrinsics
 from mmpi_ns.prepare.video import choose_frames, median_motion
 from mmpi_ns.utils.errors import InputError
 
@@ -42,12 +42,15 @@ def test_a_sequence_is_matched_with_near_and_far_frames_and_where_it_comes_back(
     place[115:] = place[:5]  # comes back to its start
     alike = np.exp(-((place[:, None] - place) ** 2) / 50).astype(np.float32)
     np.fill_diagonal(alike, -1)
-    found = features.list_pairs("sequential", alike, 4)
+    names = [str(i) for i in range(120)]
+    found, says = features.choose_pairs("sequential", names, alike, 4, False)
     steps = {j - i for i, j in found if j < 115}
     assert steps == {1, 2, 3, 4, 15, 20, 30, 45}
     assert sum(j - i == 45 for i, j in found) == 120 - 45
     assert {(i, 115 + i) for i in range(5)} <= set(found)
-    assert len(features.list_pairs("exhaustive", alike[:7, :7], 4)) == 21
+    again = sum(j - i > 45 for i, j in found)
+    assert says == f"sequential (as asked), {again} pairs that may be revisits"
+    assert len(features.choose_pairs("exhaustive", names[:7], alike[:7, :7], 4, False)[0]) == 21
 
 
 # The scene's frame ---------------------------------------------------------------------------------------------------
@@ -135,9 +138,8 @@ def test_given_lenses_are_kept_apart_and_come_back_from_colmaps():
     photos = [Photo(name, 200, 160, source=name) for name in "abcd"]
     first = Intrinsics(150.0, 140.0, 98.0, 83.0, (0.1, -0.05, 0.02, -0.01), fisheye=True)
     given = {"a": first, "b": Intrinsics(150.0, 140.0, 98.0, 83.0), "c": first}
-    numbers = share(photos, "auto", given)
-    assert numbers == [1, 2, 1, 3]
-    cameras = make_cameras(photos, numbers, given, 120.0, "auto")
+    numbers, cameras = make_cameras(photos, "auto", given, 120.0, "auto")
+    assert numbers == [1, 2, 1, 3] and [c.camera_id for c in cameras] == [1, 2, 3]
     assert [c.model.name for c in cameras[:2]] == ["OPENCV_FISHEYE", "PINHOLE"]
     assert [read_intrinsics(c) for c in cameras[:2]] == [given["a"], given["b"]]
 
