@@ -10,16 +10,15 @@ from typing import Literal
 import numpy as np
 
 from mmpi_ns.prepare.evidence import (
+    FEW,
     Agreement,
     Array,
     Witness,
     agreement,
     bridges,
-    held_by_image,
     held_by_side,
-    jumps,
     share,
-    speed_changes,
+    strides,
 )
 from mmpi_ns.prepare.images import in_short
 
@@ -95,10 +94,11 @@ def judge_alone(witness: Witness, is_sequence: bool) -> Verdict:
     if is_sequence:
         problems += _problems_along(witness)
     else:
-        held = held_by_image(pairs, count)
-        loose = [witness.images[int(i)] for i in np.flatnonzero(held < LOOSE)]
+        ends = np.concatenate([pairs.first, pairs.second])
+        held, matches = (np.bincount(ends, np.tile(x, 2), count) for x in (pairs.tracked, pairs.matches))
+        loose = [witness.images[int(i)] for i in np.flatnonzero((matches >= FEW) & (held < LOOSE * matches))]
         grade: Grade = "broken" if len(loose) > 0.1 * count else "doubtful" if loose else "right"
-        problems.append((grade, f"Most matches of {in_short(loose, 4)} contradict their poses."))
+        problems.append((grade, f"Most matches of {in_short(loose)} contradict their poses."))
     severe = sorted((p for p in problems if p[0] != "right"), key=lambda p: -ORDER.index(p[0]))
     return Verdict(severe[0][0], " ".join(says for _, says in severe)) if severe else Verdict("right")
 
@@ -147,13 +147,14 @@ def _leaps(witness: Witness, across: Array, between: Sequence[str]) -> list[tupl
         grade: Grade = "right" if change < SCALE[0] else "doubtful" if change < SCALE[1] else "broken"
         problems.append((grade, f"The scale changes by {np.expm1(change):.0%} {between[at]}."))
     is_weak = across < WEAK * float(np.nanmedian(across))
-    leaps = np.where(is_weak, jumps(witness), 0.0)
+    jumps, changes = strides(witness)
+    leaps = np.where(is_weak, jumps, 0.0)
     if leaps.max(initial=0.0) > JUMP:
         at = int(leaps.argmax())
         says = f"{between[at]}, {leaps[at]:.0f} usual steps, and few matches across it hold."
         problems.append(("broken", f"The track jumps {says}"))
     beside_weak = np.append(is_weak, False) | np.append(False, is_weak)
-    changes = np.where(beside_weak, speed_changes(witness), 1.0)
+    changes = np.where(beside_weak, changes, 1.0)
     if changes.max(initial=1.0) > CHANGE:
         at = int(changes.argmax())
         says = f"{changes[at]:.1f} times at {witness.images[at]}"
