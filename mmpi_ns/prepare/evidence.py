@@ -78,8 +78,6 @@ class Witness:
     pairs: Pairs
     focal: float
     """Mean focal length over the longer side."""
-    error: float
-    """Mean reprojection error, pixels."""
     scales: Array
     """Logarithm of the change of scale across each gap, reduced to its certain part; NaN if unknown. [N - 1]"""
 
@@ -129,7 +127,6 @@ def witness_of(name: str, model: pycolmap.Reconstruction, database: Path, offere
         poses,
         _pair_evidence(model, database, points, rays),
         camera.mean_focal_length() / max(camera.width, camera.height),
-        model.compute_mean_reprojection_error(),
         scale_changes(points_seen, frames, centers, directions, len(names)),
     )
 
@@ -261,9 +258,7 @@ def strides(witness: Witness) -> tuple[Array, Array]:
     jumps = lengths / np.maximum(local_median(lengths, WINDOW) + 0.05 * usual, 1e-12)
     changes = np.ones(len(witness.places))
     for i in range(WINDOW, len(lengths) - WINDOW + 1):
-        before, after = (
-            float(np.median(lengths[s])) + 0.1 * usual for s in (slice(i - WINDOW, i), slice(i, i + WINDOW))
-        )
+        before, after = (float(np.median(lengths[s : s + WINDOW])) + 0.1 * usual for s in (i - WINDOW, i))
         changes[i] = max(before, after) / max(min(before, after), 1e-12)
     return jumps, changes
 

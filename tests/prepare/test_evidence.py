@@ -106,6 +106,15 @@ def test_one_misplaced_image_of_an_unordered_set_is_named(keypoints):
     assert verdict.grade != "right" and "frame_007" in verdict.says
 
 
+def test_an_image_of_an_unordered_set_is_doubted_below_a_quarter_of_its_matches(sound):
+    pairs = sound.pairs
+    of_image = (pairs.first == 7) | (pairs.second == 7)
+    for share, names in ((0.24, True), (0.26, False)):
+        tracked = np.where(of_image, share, 0.9) * pairs.matches
+        verdict = judge_alone(replace(sound, pairs=replace(pairs, tracked=tracked)), is_sequence=False)
+        assert ("frame_007" in verdict.says) == names
+
+
 def test_gap_in_the_capture_is_no_break(keypoints):
     """Frames that are missing make a long step, over which the matches hold."""
     pixels, seen = keypoints
@@ -172,7 +181,7 @@ def test_speed_that_halves_is_seen_where_it_halves():
     pairs = Pairs(*(np.zeros(0, np.int64) for _ in range(2)), *(np.zeros(0) for _ in range(4)))
     from mmpi_ns.prepare.evidence import Witness
 
-    _, changes = strides(Witness("x", [str(i) for i in range(20)], np.arange(20), poses, pairs, 1.0, 0.3, np.zeros(19)))
+    _, changes = strides(Witness("x", [str(i) for i in range(20)], np.arange(20), poses, pairs, 1.0, np.zeros(19)))
     assert changes[9] == changes.max() and 1.6 < changes.max() <= 2
     assert changes[:5] == pytest.approx(1) and changes[-4:] == pytest.approx(1)
 
