@@ -66,16 +66,6 @@ def similarity_between(source: Array, target: Array) -> pycolmap.Sim3d:
     return pycolmap.Sim3d(scale, pycolmap.Rotation3d(rotation), translation)
 
 
-def up_from_cameras(poses: Array) -> Array:
-    """Up, assuming level cameras: perpendicular to all right vectors if they turn, else the mean up vector. [3]"""
-    mean = -poses[:, :3, 1].mean(0)
-    mean /= max(float(np.linalg.norm(mean)), 1e-12)
-    values, vectors = np.linalg.eigh(poses[:, :3, 0].T @ poses[:, :3, 0] / len(poses))
-    level = vectors[:, 0] * np.sign(vectors[:, 0] @ mean)
-    turns_enough = values[1] > LEVEL_TURN and values[0] < 0.1 * values[1]
-    return level if turns_enough and level @ mean > 0.5 else mean
-
-
 def fit_ground(points: Array, centers: Array, up: Array) -> tuple[Array, float]:
     """The plane that the cameras stand over: the most populous among roughly level ones, by RANSAC.
 
@@ -122,6 +112,9 @@ def fit_ground(points: Array, centers: Array, up: Array) -> tuple[Array, float]:
 def choose_frame(model: pycolmap.Reconstruction, camera_height: float | None) -> tuple[pycolmap.Sim3d, str, str]:
     """Up to +z, the first camera's heading to +y, the cameras' middle (or the ground below it) as origin.
 
+    Without a ground, cameras are assumed level: up is perpendicular to all right vectors if they turn, else the mean up
+    vector.
+
     Args:
         model: in its own frame.
         camera_height: metres above the ground, or None: then one unit is the extent of the track.
@@ -131,8 +124,12 @@ def choose_frame(model: pycolmap.Reconstruction, camera_height: float | None) ->
     """
     _, poses = camera_poses(model)
     centers = poses[:, :3, 3]
-    up = up_from_cameras(poses)
-    words = "mean of the cameras, assumed level"
+    up, words = -poses[:, :3, 1].mean(0), "mean of the cameras, assumed level"
+    up /= max(float(np.linalg.norm(up)), 1e-12)
+    values, vectors = np.linalg.eigh(poses[:, :3, 0].T @ poses[:, :3, 0] / len(poses))
+    level = vectors[:, 0] * np.sign(vectors[:, 0] @ up)
+    if values[1] > LEVEL_TURN and values[0] < 0.1 * values[1] and level @ up > 0.5:
+        up = level
     if camera_height is not None:
         points = np.array([p.xyz for p in model.points3D.values()])
         up, height = fit_ground(points, centers, up)

@@ -281,11 +281,9 @@ def make_cameras(
 
 def read_intrinsics(camera: pycolmap.Camera) -> Intrinsics:
     """A pycolmap camera as OpenCV's. Raises InputError if nerfstudio-data does not support the lens model."""
-    name, p = camera.model.name, [float(v) for v in camera.params]
-    f = (camera.focal_length_x, camera.focal_length_y, camera.principal_point_x, camera.principal_point_y)
-    terms = {"SIMPLE_PINHOLE": [], "PINHOLE": [], "SIMPLE_RADIAL": p[3:], "RADIAL": p[3:]}
-    terms |= {"OPENCV": p[4:], "OPENCV_FISHEYE": p[4:]}
-    if name not in terms:
+    name, terms = camera.model.name, [float(v) for v in camera.params[camera.extra_params_idxs()]]
+    if name not in (*MODELS.values(), "SIMPLE_PINHOLE", "RADIAL"):
         raise InputError(f"Lens model {name} is not supported in transforms.json.")
-    k1, k2, k3, k4 = (*terms[name], 0.0, 0.0, 0.0, 0.0)[:4]
+    f = (camera.focal_length_x, camera.focal_length_y, camera.principal_point_x, camera.principal_point_y)
+    k1, k2, k3, k4 = (*terms, 0.0, 0.0, 0.0, 0.0)[:4]
     return Intrinsics(*f, distortion=(k1, k2, k3, k4), fisheye=name == "OPENCV_FISHEYE")

@@ -8,6 +8,7 @@ import json
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ LEFT = 1 << 20
 """Free bytes below which a failure to write is attributed to a full disk; COLMAP's errors give no reason."""
 
 
+@dataclass
 class Stages:
     """Stages of a preparation, run in order; a stage that was finished with the same settings is skipped.
 
@@ -28,10 +30,9 @@ class Stages:
     emptied, and so are all after it. An interrupted stage finds its own partial output again.
     """
 
-    def __init__(self, work: Path) -> None:
-        self.work = work
-        self._key = ""
-        work.mkdir(parents=True, exist_ok=True)
+    work: Path
+    """Folder of all stages."""
+    _key: str = ""
 
     def run(self, name: str, settings: Any, make: Callable[[Path], Any]) -> tuple[Path, Any]:
         """A stage's own folder, and what the work on it returned, now or before.

@@ -12,7 +12,6 @@ from PIL.TiffImagePlugin import IFDRational
 
 from mmpi_ns.capture.exif import light_of
 from mmpi_ns.prepare import checks, export, features
-from mmpi_ns.prepare.alignment import up_from_cameras
 from mmpi_ns.prepare.checks import exposure_in_words
 from mmpi_ns.prepare.images import (
     Photo,
@@ -244,17 +243,6 @@ def test_look_alikes_are_found_by_their_features(tmp_path):
     features.extract(database, tmp_path / "images", photos, None, 1000, 1)
     alike = features.image_similarity(database, 4)
     assert alike.argmax(-1).tolist() == [1, 0, 3, 2]
-
-
-def test_up_is_found_by_cameras_that_look_down_on_a_turn():
-    poses = np.tile(np.eye(4), (9, 1, 1))
-    for pose, angle in zip(poses, np.linspace(0, 2, 9), strict=True):
-        right = np.array([np.cos(angle), -np.sin(angle), 0])
-        forward = np.array([np.sin(angle), np.cos(angle), -0.6]) / np.sqrt(1.36)
-        pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], -1)
-    assert up_from_cameras(poses) == pytest.approx([0, 0, 1], abs=1e-9)
-    straight = corridor.poses(5, bend=0.0)
-    assert up_from_cameras(straight) == pytest.approx([0, 0, 1], abs=1e-9)
 
 
 def test_split_by_count_and_by_list():

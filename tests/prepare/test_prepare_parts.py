@@ -72,6 +72,17 @@ def test_without_metres_the_track_is_one_unit_long_about_the_origin_and_heads_al
     assert centers[-1, 1] > centers[0, 1] + 0.9 and "extent" in unit
 
 
+def test_up_is_found_by_cameras_that_look_down_on_a_turn():
+    poses = np.tile(np.eye(4), (9, 1, 1))
+    for pose, angle in zip(poses, np.linspace(0, 2, 9), strict=True):
+        right = np.array([np.cos(angle), -np.sin(angle), 0])
+        forward = np.array([np.sin(angle), np.cos(angle), -0.6]) / np.sqrt(1.36)
+        pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], -1)
+    assert choose_frame(model_of(poses), None)[0].rotation.matrix()[2] == pytest.approx([0, 0, 1], abs=1e-9)
+    straight = corridor.poses(5, bend=0.0)
+    assert choose_frame(model_of(straight), None)[0].rotation.matrix()[2] == pytest.approx([0, 0, 1], abs=1e-9)
+
+
 def test_a_straight_track_is_fitted_without_a_turn_about_itself():
     straight = corridor.poses(6, bend=0.0)
     straight[:, 0, 3] = 0
