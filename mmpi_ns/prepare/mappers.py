@@ -75,44 +75,43 @@ def _candidates(task: Task) -> list[Candidate]:
 
     A global mapper that placed a part of a long sequence places all images if the incremental one fails.
     """
-    starts, candidates, is_settled = _starts(task), [], False
+    starts, candidates, is_settled = list(_starts(task).items()), [], False
     for some in (starts[:2], starts[2:]):
         if some and not is_settled:
             candidates += _globally(some, task.placed, task)
             right = [c.witness for c in candidates if c.grade == "right"]
             differences = [agreement(right[0], w) for w in right[1:]]
             is_settled = bool(right) and all(d is not None and agrees(d) for d in differences)
-    start, is_part = task.database, len(task.placed) < len(task.offered)
+    focals, is_part, failed = {}, len(task.placed) < len(task.offered), None
     if candidates and task.free.lens:
         best = candidates[best_first([c.witness for c in candidates], task.is_ordered)[0]].model
-        start = task.work / "from-global.db"
-        start_from(task.database, start, {n: c.mean_focal_length() for n, c in best.cameras.items()})
-    failed: InputError | None = None
+        focals = {n: c.mean_focal_length() for n, c in best.cameras.items()}
+    attempts = 1 if is_settled and not is_part else len(ATTEMPTS)
     try:
-        attempts = 1 if is_settled and not is_part else len(ATTEMPTS)
+        start = _start_from(task, "from-global", focals)
         candidates.append(_judged("incremental", *reconstruct(task, start, attempts), task))
     except InputError as error:
         failed = error
     nearly_all = NEARLY_ALL * len(task.offered)
     if is_part and not any(len(c.witness.images) >= nearly_all and c.grade == "right" for c in candidates):
-        candidates += _globally([("global-all", start)], task.offered, task)
+        candidates += _globally([("global-all", focals)], task.offered, task)
     if failed and not candidates:
         raise failed
     return [candidates[i] for i in best_first([c.witness for c in candidates], task.is_ordered)]
 
 
-def _starts(task: Task) -> list[tuple[str, Path]]:
-    """Databases for the global mapper, by name: unchanged if the focal length is known, else one for each guess. The
-    first guess is the focal length for which the fundamental matrices of the pairs become essential ones, if they
-    determine it (in a straight drive they do not). The others are fixed multiples of the image side."""
-    database, work = task.database, task.work
-    with pycolmap.Database.open(database) as opened:
+def _starts(task: Task) -> dict[str, dict[int, float]]:
+    """Focal lengths that the global mapper starts from, by name of the start and id of the camera: those of the
+    database if they are known, else guesses. The first guess is the focal length for which the fundamental matrices of
+    the pairs become essential ones, if they determine it (in a straight drive they do not). The others are fixed
+    multiples of the image side."""
+    with pycolmap.Database.open(task.database) as opened:
         unknown = [c for c in opened.read_all_cameras() if not c.has_prior_focal_length]
     if not task.free.lens or not unknown:
-        return [("global", database)]
+        return {"global": {}}
     guesses = {f"global-{ratio}": {c.camera_id: ratio * max(c.width, c.height) for c in unknown} for ratio in STARTS}
-    calibrated_database = work / "calibrated.db"
-    shutil.copyfile(database, calibrated_database)
+    calibrated_database = task.work / "calibrated.db"
+    shutil.copyfile(task.database, calibrated_database)
     options = pycolmap.ViewGraphCalibrationOptions()
     options.random_seed = SEED
     options.reestimate_relative_pose = False  # only the focal lengths are taken
@@ -123,33 +122,33 @@ def _starts(task: Task) -> list[tuple[str, Path]]:
     calibrated_database.unlink()
     if all(abs(calibrated[n] / focal - 1) > NEAR for guess in guesses.values() for n, focal in guess.items()):
         guesses = {"global-calibrated": {c.camera_id: calibrated[c.camera_id] for c in unknown}} | guesses
-    for name, focals in guesses.items():
-        if not (work / name / "done").exists():
-            start_from(database, work / f"{name}.db", focals)
-    return [(name, work / f"{name}.db") for name in guesses]
+    return guesses
 
 
-def start_from(database: Path, copy: Path, focals: Mapping[int, float]) -> None:
-    """A copy of a database whose cameras start with other focal lengths, in pixels by camera id; replaces ``copy``."""
-    copy.parent.mkdir(parents=True, exist_ok=True)
-    shutil.copyfile(database, copy)
-    with pycolmap.Database.open(copy) as opened:
+def _start_from(task: Task, name: str, focals: Mapping[int, float]) -> Path:
+    """A copy of the database whose cameras start with other focal lengths; the database itself where there are none."""
+    if not focals:
+        return task.database
+    database = task.work / f"{name}.db"
+    shutil.copyfile(task.database, database)
+    with pycolmap.Database.open(database) as opened:
         for camera in opened.read_all_cameras():
             if camera.camera_id in focals:
                 params = camera.params.copy()
                 params[camera.focal_length_idxs()] = focals[camera.camera_id]
                 camera.params = params
                 opened.update_camera(camera)
+    return database
 
 
-def _globally(starts: Sequence[tuple[str, Path]], names: Sequence[str], task: Task) -> list[Candidate]:
+def _globally(starts: Sequence[tuple[str, dict[int, float]]], names: Sequence[str], task: Task) -> list[Candidate]:
     """Runs the global mapper on some images from all starts in parallel on all cores; failed starts are left out."""
     cores = task.threads if task.threads > 0 else os.cpu_count() or 1
     workers = min(cores, len(starts))
 
-    def run(start: tuple[str, Path]) -> pycolmap.Reconstruction | None:
-        name, path = start
-        model = map_globally(task, name, path, names, max(1, cores // workers))
+    def run(start: tuple[str, dict[int, float]]) -> pycolmap.Reconstruction | None:
+        name, focals = start
+        model = map_globally(task, name, _start_from(task, name, focals), names, max(1, cores // workers))
         advance()
         return model
 

@@ -127,8 +127,8 @@ def reconstruct(task: Task, database: Path, attempts: int = len(ATTEMPTS)) -> tu
     best: tuple[pycolmap.Reconstruction, Path] | None = None
     chosen, tried = "", []
     for attempt in ATTEMPTS[1 if task.is_sequence else 0 :][:attempts]:
-        carries = best is not None and not is_bent(best[0]) and best[0].num_reg_images() >= CARRIES * total
-        result = _run(task, attempt, database, best[1] if best is not None and carries else None)
+        carries = best and not is_bent(best[0]) and best[0].num_reg_images() >= CARRIES * total
+        result = _run(task, attempt, database, best[1] if best and carries else None)
         size = result[0].num_reg_images() if result else 0
         tried.append(f"{attempt.name} {size}")
         says = f", {result[0].compute_mean_reprojection_error():.2f} px" if result else ""
