@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import errno
+import hashlib
+import json
 import shutil
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from functools import partial
@@ -14,6 +17,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pycolmap
+from filelock import FileLock, Timeout
 
 from mmpi_ns.capture.matching import new_model, rigid3d
 from mmpi_ns.capture.sfm import load_pycolmap
@@ -26,13 +30,15 @@ from mmpi_ns.prepare.mappers import map_and_judge
 from mmpi_ns.prepare.mapping import Task, map_known_poses
 from mmpi_ns.prepare.poses import read_poses
 from mmpi_ns.prepare.settings import Settings, check_options, read_lists
-from mmpi_ns.prepare.stages import Stages, only_one
 from mmpi_ns.prepare.verdict import REMEDY, Verdict
 from mmpi_ns.prepare.video import select_frames
 from mmpi_ns.utils.errors import InputError, progress, quoted, say
-from mmpi_ns.utils.files import whole
+from mmpi_ns.utils.files import whole, write_text
 
 WORK, DATABASE = ".prepare", "database.db"
+FULL = (errno.ENOSPC, errno.EDQUOT)
+LEFT = 1 << 20
+"""Free bytes below which a failure to write is attributed to a full disk; COLMAP's errors give no reason."""
 LEAST_IMAGES = 3
 """From which poses can be found; COLMAP's mappers make no smaller model."""
 LEAST_SHARE = 0.5
@@ -40,14 +46,19 @@ LEAST_SHARE = 0.5
 
 
 class Preparation:
-    """A run of mmpi-prepare; the work folder holds what an interrupted run left."""
+    """A run of mmpi-prepare in stages. The work folder holds what an interrupted run left, a folder for each stage.
+
+    A stage is valid while its own settings and those of all earlier ones are unchanged, and is skipped if it was
+    finished; the first that changed is emptied, and so are all after it. An interrupted stage finds its own partial
+    output again.
+    """
 
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
         self.work = settings.scene / WORK
         self.image_folder = self.work / "input" / "images"
         self.times: dict[str, float] = {}
-        self.stages = Stages(self.work)
+        self.key = ""
 
     def run(self) -> Verdict:
         """Input to scene; how far it can be believed."""
@@ -56,15 +67,15 @@ class Preparation:
             self._read()
         with self._timed("features"):
             source = [[c.summary() for c in self.cameras], self.numbers, s.max_features, bool(self.masks)]
-            folder, _ = self.stages.run("features", source, self._find_features)
+            folder, _ = self._stage("features", source, self._find_features)
         with self._timed("matching"):
             poses = {n: p.tolist() for n, p in self.known_poses.poses.items()} if self.known_poses else None
             source = [s.matching, s.overlap, poses]
-            folder, self.matching = self.stages.run("matches", source, partial(self._match, folder / DATABASE))
+            folder, self.matching = self._stage("matches", source, partial(self._match, folder / DATABASE))
             say(f"Matching: {self.matching}.")
         with self._timed("mapping"):
             source = [s.refine_poses, s.refine_intrinsics, s.lens, self.is_fixed]
-            folder, self.mapped = self.stages.run("model", source, partial(self._map, folder / DATABASE))
+            folder, self.mapped = self._stage("model", source, partial(self._map, folder / DATABASE))
         model, verdict = pycolmap.Reconstruction(folder / "model"), Verdict(**self.mapped["verdict"])
         count, total = model.num_reg_images(), len(self.photos)
         if count < LEAST_SHARE * total and not s.allow_partial:
@@ -80,6 +91,32 @@ class Preparation:
                 "To look at it all the same: --allow-doubtful."
             )
         return self._write(model, verdict)
+
+    def _stage(self, name: str, settings: Any, make: Callable[[Path], Any]) -> tuple[Path, Any]:
+        """A stage's own folder, and what the work on it returned, now or before.
+
+        Args:
+            name: the folder's name.
+            settings: everything the result depends on besides the earlier stages; JSON or text.
+            make: fills the folder, and returns JSON.
+        """
+        text = self.key + name + json.dumps(settings, sort_keys=True, default=str)
+        self.key = hashlib.sha256(text.encode()).hexdigest()
+        folder, stamp = self.work / name, self.work / f"{name}.json"
+        try:
+            state = json.loads(stamp.read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            state = {}  # missing or truncated: the stage starts over
+        if state.get("key") != self.key:
+            shutil.rmtree(folder, ignore_errors=True)
+            write_text(stamp, json.dumps({"key": self.key}))
+        elif "result" in state:
+            say(f"{name}: done before", "dim")
+            return folder, state["result"]
+        folder.mkdir(exist_ok=True)
+        result = make(folder)
+        write_text(stamp, json.dumps({"key": self.key, "result": result}))
+        return folder, result
 
     @contextmanager
     def _timed(self, name: str) -> Iterator[None]:
@@ -102,12 +139,12 @@ class Preparation:
                 return [asdict(p) for p in select_frames(s.input, folder, s.max_frames, s.frame_motion)]
             return [asdict(p) for p in images.gather(s.input, files, folder)]
 
-        self.photos = [Photo(**entry) for entry in self.stages.run("input", source, read)[1]]
+        self.photos = [Photo(**entry) for entry in self._stage("input", source, read)[1]]
         self.is_ordered = self.is_video or features.are_numbered([p.name for p in self.photos])
         self.masks = None
         if s.masks is not None:
             stamps = [(str(p), p.stat().st_mtime) for p in sorted(s.masks.rglob("*"))]
-            self.masks, _ = self.stages.run("masks", stamps, partial(images.gather_masks, s.masks, self.photos))
+            self.masks, _ = self._stage("masks", stamps, partial(images.gather_masks, s.masks, self.photos))
         self.known_poses = read_poses(s.poses, s.poses_axes, self.photos) if s.poses else None
         if self.known_poses is None and len(self.photos) < LEAST_IMAGES:
             raise InputError(
@@ -299,6 +336,25 @@ class Preparation:
             "bold red" if not is_right else "" if findings else "green",
         )
         say(f"ns-train mmpi-small --data {quoted(scene)}")
+
+
+@contextmanager
+def only_one(work: Path) -> Iterator[None]:
+    """Locks a work folder against a second run. Raises InputError if one is at work there, or the disk is full."""
+    work.mkdir(parents=True, exist_ok=True)
+    try:
+        with FileLock(work / "lock", blocking=False):
+            yield
+    except Timeout as error:
+        raise InputError(f"Another mmpi-prepare is making {work.parent}: wait for it, or name another.") from error
+    except InputError:
+        raise
+    except (OSError, RuntimeError, ValueError) as error:
+        free = shutil.disk_usage(work.parent).free
+        if getattr(error, "errno", None) in FULL or free < LEFT:
+            says = f"The disk of {work.parent} is full ({free / 2**20:.0f} MB free): make room and repeat the command."
+            raise InputError(says) from error
+        raise
 
 
 def prepare(settings: Settings) -> Verdict:

@@ -18,9 +18,8 @@ from PIL import Image
 
 from mmpi_ns.prepare import images
 from mmpi_ns.prepare.checks import Finding, by_kind
-from mmpi_ns.prepare.pipeline import WORK, prepare
+from mmpi_ns.prepare.pipeline import WORK, only_one, prepare
 from mmpi_ns.prepare.settings import Settings
-from mmpi_ns.prepare.stages import only_one
 from mmpi_ns.utils.errors import InputError, progress
 
 NAN = float("nan")
