@@ -65,7 +65,7 @@ class Pairs:
 
 @dataclass(frozen=True)
 class Witness:
-    """The model of one mapper, reduced to its evidence."""
+    """The model of one mapper, and the evidence on it."""
 
     name: str
     """Of the mapper."""
@@ -80,6 +80,9 @@ class Witness:
     """Mean focal length over the longer side."""
     scales: Array
     """Logarithm of the change of scale across each gap, reduced to its certain part; NaN if unknown. [N - 1]"""
+    says: str
+    """How the mapper made it, in words."""
+    model: pycolmap.Reconstruction
 
 
 @dataclass(frozen=True)
@@ -94,11 +97,12 @@ class Agreement:
     """Degrees between the rotations. [N]"""
 
 
-def witness_of(name: str, model: pycolmap.Reconstruction, database: Path, offered: Sequence[str]) -> Witness:
+def witness_of(name: str, says: str, model: pycolmap.Reconstruction, database: Path, offered: Sequence[str]) -> Witness:
     """The evidence on a mapper's model.
 
     Args:
         name: of the mapper.
+        says: how it made the model, in words.
         model: poses and points, with the keypoints of the database.
         database: verified matches.
         offered: names of all images of the capture, in order.
@@ -128,6 +132,8 @@ def witness_of(name: str, model: pycolmap.Reconstruction, database: Path, offere
         _pair_evidence(model, database, points, rays),
         camera.mean_focal_length() / max(camera.width, camera.height),
         scale_changes(points_seen, frames, centers, directions, len(names)),
+        says,
+        model,
     )
 
 

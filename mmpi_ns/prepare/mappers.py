@@ -7,7 +7,6 @@ import os
 import shutil
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 
 import pycolmap
@@ -16,7 +15,7 @@ from mmpi_ns.capture.matching import SEED, quiet
 from mmpi_ns.prepare.adjustment import polish, with_all_points
 from mmpi_ns.prepare.evidence import Witness, agreement, share, witness_of
 from mmpi_ns.prepare.mapping import ATTEMPTS, Task, map_globally, reconstruct
-from mmpi_ns.prepare.verdict import NEARLY_ALL, ORDER, Grade, Verdict, agrees, best_first, judge_alone, judge_together
+from mmpi_ns.prepare.verdict import NEARLY_ALL, ORDER, Verdict, agrees, best_first, judge_alone, judge_together
 from mmpi_ns.utils.errors import InputError, progress, say
 
 STARTS = (0.7, 1.2)
@@ -26,22 +25,6 @@ NEAR = 0.1
 LEAST_POINTS = 0.05
 """Share of the matches that must have become points of the global mapper's model, or it is none: it places every image
 whatever the focal length, and drops the points that do not fit."""
-
-
-@dataclass(frozen=True)
-class Candidate:
-    """A mapper's model, and the evidence on it."""
-
-    model: pycolmap.Reconstruction
-    witness: Witness
-    says: str
-    grade: Grade
-    """By its own evidence."""
-
-
-def _judged(mapper: str, model: pycolmap.Reconstruction, says: str, task: Task) -> Candidate:
-    witness = witness_of(mapper, model, task.database, task.offered)
-    return Candidate(model, witness, says, judge_alone(witness, task.is_ordered).grade)
 
 
 def map_and_judge(task: Task) -> tuple[pycolmap.Reconstruction, str, Verdict]:
@@ -60,17 +43,19 @@ def map_and_judge(task: Task) -> tuple[pycolmap.Reconstruction, str, Verdict]:
         model = copy.deepcopy(chosen.model)
         model = with_all_points(model, task.database, task.images, task.free.lens, task.threads)
         advance()
-    polished = _judged(chosen.witness.name, polish(model, task.free, task.threads), chosen.says, task)
-    if ORDER.index(polished.grade) > ORDER.index(chosen.grade):
+    model = polish(model, task.free, task.threads)
+    polished = witness_of(chosen.name, chosen.says, model, task.database, task.offered)
+    before, after = (ORDER.index(judge_alone(w, task.is_ordered).grade) for w in (chosen, polished))
+    if after > before:
         say("The final bundle adjustment makes the evidence worse: left out.", "yellow")
     else:
         chosen = polished
-    verdict = judge_together(chosen.witness, [c.witness for c in others], task.is_ordered)
-    beside = [f"{c.says}, {c.grade} by itself" for c in others]
+    verdict = judge_together(chosen, others, task.is_ordered)
+    beside = [f"{w.says}, {judge_alone(w, task.is_ordered).grade} by itself" for w in others]
     return chosen.model, "; beside it ".join([chosen.says, *beside]), verdict
 
 
-def _candidates(task: Task) -> list[Candidate]:
+def _candidates(task: Task) -> list[Witness]:
     """The models of both mappers, of the global one from several focal lengths, the most credible first.
 
     A global mapper that placed a part of a long sequence places all images if the incremental one fails.
@@ -79,25 +64,26 @@ def _candidates(task: Task) -> list[Candidate]:
     for some in (starts[:2], starts[2:]):
         if some and not is_settled:
             candidates += _globally(some, task.placed, task)
-            right = [c.witness for c in candidates if c.grade == "right"]
+            right = [w for w in candidates if judge_alone(w, task.is_ordered).grade == "right"]
             differences = [agreement(right[0], w) for w in right[1:]]
             is_settled = bool(right) and all(d is not None and agrees(d) for d in differences)
     focals, is_part, failed = {}, len(task.placed) < len(task.offered), None
     if candidates and task.free.lens:
-        best = candidates[best_first([c.witness for c in candidates], task.is_ordered)[0]].model
+        best = best_first(candidates, task.is_ordered)[0].model
         focals = {n: c.mean_focal_length() for n, c in best.cameras.items()}
     attempts = 1 if is_settled and not is_part else len(ATTEMPTS)
     try:
         start = _start_from(task, "from-global", focals)
-        candidates.append(_judged("incremental", *reconstruct(task, start, attempts), task))
+        model, says = reconstruct(task, start, attempts)
+        candidates.append(witness_of("incremental", says, model, task.database, task.offered))
     except InputError as error:
         failed = error
-    nearly_all = NEARLY_ALL * len(task.offered)
-    if is_part and not any(len(c.witness.images) >= nearly_all and c.grade == "right" for c in candidates):
+    large = [w for w in candidates if len(w.images) >= NEARLY_ALL * len(task.offered)]
+    if is_part and not any(judge_alone(w, task.is_ordered).grade == "right" for w in large):
         candidates += _globally([("global-all", focals)], task.offered, task)
     if failed and not candidates:
         raise failed
-    return [candidates[i] for i in best_first([c.witness for c in candidates], task.is_ordered)]
+    return best_first(candidates, task.is_ordered)
 
 
 def _starts(task: Task) -> dict[str, dict[int, float]]:
@@ -141,7 +127,7 @@ def _start_from(task: Task, name: str, focals: Mapping[int, float]) -> Path:
     return database
 
 
-def _globally(starts: Sequence[tuple[str, dict[int, float]]], names: Sequence[str], task: Task) -> list[Candidate]:
+def _globally(starts: Sequence[tuple[str, dict[int, float]]], names: Sequence[str], task: Task) -> list[Witness]:
     """Runs the global mapper on some images from all starts in parallel on all cores; failed starts are left out."""
     cores = task.threads if task.threads > 0 else os.cpu_count() or 1
     workers = min(cores, len(starts))
@@ -166,11 +152,10 @@ def _globally(starts: Sequence[tuple[str, dict[int, float]]], names: Sequence[st
         focal = ", ".join(f"{c.mean_focal_length():.1f}" for _, c in sorted(model.cameras.items())[:3])
         error = model.compute_mean_reprojection_error()
         says = f"{model.num_reg_images()} of {len(names)} images, {error:.2f} px, focal length {focal} px"
-        candidate = _judged("global", model, f"{name} ({says})", task)
-        pairs = candidate.witness.pairs
-        if share(pairs.tracked, pairs.matches) < LEAST_POINTS:
+        witness = witness_of("global", f"{name} ({says})", model, task.database, task.offered)
+        if share(witness.pairs.tracked, witness.pairs.matches) < LEAST_POINTS:
             says += "; left out, as hardly any match became a point"
         else:
-            candidates.append(candidate)
+            candidates.append(witness)
         say(f"Mapping, {name}: {says}.")
     return candidates

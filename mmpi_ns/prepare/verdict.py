@@ -207,20 +207,19 @@ def _fit(witness: Witness) -> float:
     return round(share(witness.pairs.fitting, witness.pairs.matches), 2)
 
 
-def best_first(witnesses: Sequence[Witness], is_sequence: bool) -> list[int]:
-    """Numbers of the witnesses, the most credible first.
+def best_first(witnesses: Sequence[Witness], is_sequence: bool) -> list[Witness]:
+    """The witnesses, the most credible first.
 
     Broken ones are last, and those with clearly fewer images than another come after it: a small part of the capture
     is seldom wrong. Then by verdict, by images, by the share of the matches that fit the poses, to a hundredth, and by
     matches that became points. (A bent track may have more points than a right one: its points fit its bends.)
     """
-    grades = [judge_alone(w, is_sequence).grade for w in witnesses]
-    most = max((len(w.images) for w, grade in zip(witnesses, grades, strict=True) if grade != "broken"), default=0)
+    graded: list[tuple[Grade, Witness]] = [(judge_alone(witness, is_sequence).grade, witness) for witness in witnesses]
+    most = max((len(witness.images) for grade, witness in graded if grade != "broken"), default=0)
 
-    def key(number: int) -> tuple[bool, bool, int, int, float, float]:
-        witness, grade = witnesses[number], grades[number]
-        size = len(witness.images)
-        tracked = float(witness.pairs.tracked.sum())
+    def key(pair: tuple[Grade, Witness]) -> tuple[bool, bool, int, int, float, float]:
+        grade, witness = pair
+        size, tracked = len(witness.images), float(witness.pairs.tracked.sum())
         return grade != "broken", size >= NEARLY_ALL * most, -ORDER.index(grade), size, _fit(witness), tracked
 
-    return sorted(range(len(witnesses)), key=key, reverse=True)
+    return [witness for _, witness in sorted(graded, key=key, reverse=True)]
