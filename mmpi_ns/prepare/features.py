@@ -17,9 +17,8 @@ from typing import Literal
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
+from scipy.cluster.hierarchy import DisjointSet
 from scipy.cluster.vq import kmeans2, vq
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from mmpi_ns.capture.matching import (
     MIN_INLIERS,
@@ -136,15 +135,13 @@ def matching_pairs(database: Path) -> list[tuple[int, int]]:
     return [pycolmap.pair_id_to_image_pair(p) for p, n in zip(pairs, inliers, strict=True) if n >= MIN_INLIERS]
 
 
-def connected(database: Path, places: Sequence[int]) -> list[list[int]]:
-    """Groups of at least three of some images (by their places) that verified matches connect, the largest first."""
-    row = {place + 1: n for n, place in enumerate(places)}
-    edges = [(row[a], row[b]) for a, b in matching_pairs(database) if a in row and b in row]
-    ends = np.array(edges, dtype=int).reshape(-1, 2).T
-    graph = coo_array((np.ones(len(edges)), tuple(ends)), shape=(len(places), len(places)))
-    _, labels = connected_components(graph, directed=False)
-    groups = [[places[i] for i in np.flatnonzero(labels == label)] for label in np.unique(labels)]
-    return sorted((g for g in groups if len(g) > 2), key=len, reverse=True)
+def connected(database: Path, image_ids: Sequence[int]) -> list[list[int]]:
+    """Groups of at least three of these images that verified matches connect, the largest first."""
+    groups = DisjointSet(image_ids)
+    for first, second in matching_pairs(database):
+        if first in groups and second in groups:
+            groups.merge(first, second)
+    return sorted((sorted(group) for group in groups.subsets() if len(group) > 2), key=len, reverse=True)
 
 
 def matched_keypoints(database: Path, image_ids: Sequence[int]) -> int:

@@ -208,8 +208,8 @@ class Preparation:
             model, says, verdict = map_and_judge(
                 Task(database, self.image_folder, folder, names, free, s.threads, is_sequence, self.is_ordered)
             )
-            lost = sorted(set(range(len(names))) - {i - 1 for i in model.reg_image_ids()})
-            groups = [[names[i] for i in group] for group in features.connected(database, lost)]
+            lost = sorted(set(range(1, len(names) + 1)) - set(model.reg_image_ids()))
+            groups = [[names[i - 1] for i in group] for group in features.connected(database, lost)]
         (folder / "model").mkdir(exist_ok=True)
         model.write(folder / "model")
         if not self.is_fixed:
