@@ -23,6 +23,7 @@ HEIF = (".heic", ".heif")
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg")
 SUFFIXES = re.compile(rf"({'|'.join(map(re.escape, IMAGES))}){{1,2}}$", re.IGNORECASE)
 """Of a mask: a.jpg.png is that of a.jpg."""
+BODY_TAGS = (ExifTags.Base.Make, ExifTags.Base.Model)
 FOCAL_TAGS = (ExifTags.Base.FocalLength, ExifTags.Base.FocalLengthIn35mmFilm)
 KEPT = {"JPEG": (".jpg", ".jpeg"), "PNG": (".png",)}
 """Formats that are copied unchanged; others become PNG."""
@@ -133,14 +134,10 @@ def gather(folder: Path, files: Sequence[Path], target: Path) -> list[Photo]:
                     else:
                         _convert(image, partial, copy.suffix.lower())
             shot = exif.get_ifd(ExifTags.IFD.Exif)
-            parts = [
-                exif.get(ExifTags.Base.Make),
-                exif.get(ExifTags.Base.Model),
-                *(shot.get(tag) for tag in FOCAL_TAGS),
-            ]
+            parts = [exif.get(tag) for tag in BODY_TAGS] + [shot.get(tag) for tag in FOCAL_TAGS]
+            lens = " ".join(str(part).strip() for part in parts if part)
             focal = positive_number(shot.get(FOCAL_TAGS[1]))
             focal = focal and focal / FILM_WIDTH * max(size)
-            lens = " ".join(str(part).strip() for part in parts if part)
             photos.append(Photo(name, *size, lens, focal, str(file.relative_to(folder))))
             advance(1)
     return photos

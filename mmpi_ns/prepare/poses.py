@@ -127,11 +127,10 @@ def _read_tum(rows: Array, path: Path, photos: Sequence[Photo]) -> KnownPoses:
 
 def _read_matrices(path: Path, photos: Sequence[Photo]) -> KnownPoses:
     """4x4 matrices: one text file for each image, by name, else in order."""
-    files = sorted(
-        (p for p in path.iterdir() if p.suffix.lower() in (".txt", ".mat", "")), key=lambda p: natural_key(p.name)
-    )
+    files = [p for p in path.iterdir() if p.suffix.lower() in (".txt", ".mat", "")]
+    files.sort(key=lambda p: natural_key(p.name))
     by_stem = {_pose_stem(p): p for p in files if p.is_file()}
-    chosen = {p.name: by_stem[s] for p in photos for s in (_pose_stem(Path(p.source)),) if s in by_stem}
+    chosen = {p.name: by_stem[stem] for p in photos if (stem := _pose_stem(Path(p.source))) in by_stem}
     says = "4x4 matrices, by name"
     if len(chosen) < 2:
         if len(files) != len(photos):
