@@ -23,11 +23,10 @@ from mmpi_ns.capture.matching import new_model, rigid3d
 from mmpi_ns.capture.sfm import load_pycolmap
 from mmpi_ns.capture.tracks import near_pairs
 from mmpi_ns.prepare import checks, export, features, images
-from mmpi_ns.prepare.adjustment import Free, focal_in_words, focal_interval
+from mmpi_ns.prepare.adjustment import Free, focal_in_words, focal_interval, map_known_poses
 from mmpi_ns.prepare.alignment import camera_poses, choose_frame
 from mmpi_ns.prepare.images import Photo, in_short, make_cameras, parse_camera
-from mmpi_ns.prepare.mappers import map_and_judge
-from mmpi_ns.prepare.mapping import Task, map_known_poses
+from mmpi_ns.prepare.mapping import Task, map_and_judge
 from mmpi_ns.prepare.poses import read_poses
 from mmpi_ns.prepare.settings import Settings, check_options, read_lists
 from mmpi_ns.prepare.verdict import REMEDY, Verdict

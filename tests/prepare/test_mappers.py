@@ -13,12 +13,11 @@ import pytest
 from PIL import Image
 
 from mmpi_ns.capture.matching import count_features
-from mmpi_ns.prepare import adjustment, features, mappers, mapping
+from mmpi_ns.prepare import adjustment, features, mapping
 from mmpi_ns.prepare.adjustment import Free, with_all_points, with_fewer_points
 from mmpi_ns.prepare.alignment import camera_poses, similarity_between
 from mmpi_ns.prepare.images import Photo
-from mmpi_ns.prepare.mappers import map_and_judge
-from mmpi_ns.prepare.mapping import Task
+from mmpi_ns.prepare.mapping import Task, map_and_judge
 from mmpi_ns.prepare.pipeline import WORK, prepare
 from mmpi_ns.prepare.settings import Settings
 from mmpi_ns.utils.errors import InputError
@@ -71,18 +70,18 @@ def test_all_images_are_placed_at_once_where_the_incremental_mapper_fails(task, 
         raise InputError("no pair can start")
 
     monkeypatch.setattr(mapping, "PLACED", COUNT // 2)
-    monkeypatch.setattr(mappers, "reconstruct", fail)
+    monkeypatch.setattr(mapping, "reconstruct", fail)
     model, says, _ = map_and_judge(task)
     assert model.num_reg_images() == COUNT and says.startswith("global-all")
     assert error_of(model) < 0.01
-    monkeypatch.setattr(mappers, "map_globally", lambda *args: None)
+    monkeypatch.setattr(mapping, "map_globally", lambda *args: None)
     (task.work / "none").mkdir()
     with pytest.raises(InputError, match="no pair can start"):
         map_and_judge(replace(task, work=task.work / "none"))
 
 
 def test_a_global_model_without_points_neither_counts_nor_gives_its_focal_length(task, monkeypatch):
-    place, build, starts = mappers.map_globally, mappers.reconstruct, []
+    place, build, starts = mapping.map_globally, mapping.reconstruct, []
 
     def without_points(*args):
         model = place(*args)
@@ -94,8 +93,8 @@ def test_a_global_model_without_points_neither_counts_nor_gives_its_focal_length
         starts.append(start)
         return build(task, start, attempts)
 
-    monkeypatch.setattr(mappers, "map_globally", without_points)
-    monkeypatch.setattr(mappers, "reconstruct", watch)
+    monkeypatch.setattr(mapping, "map_globally", without_points)
+    monkeypatch.setattr(mapping, "reconstruct", watch)
     model, says, _ = map_and_judge(task)
     assert says.startswith("incremental") and "global" not in says
     assert starts == [task.database] and error_of(model) < 0.01
@@ -166,7 +165,7 @@ def test_the_adjusted_model_is_kept_and_judged_unless_its_evidence_is_worse(task
         made.append(adjustment.polish(*args))
         return made[-1]
 
-    monkeypatch.setattr(mappers, "polish", watch)
+    monkeypatch.setattr(mapping, "polish", watch)
     assert map_and_judge(task)[0] is made[-1]
 
     def spoil(model, *rest):
@@ -175,6 +174,6 @@ def test_the_adjusted_model_is_kept_and_judged_unless_its_evidence_is_worse(task
             spoilt.delete_point3D(number)
         return spoilt
 
-    monkeypatch.setattr(mappers, "polish", spoil)
+    monkeypatch.setattr(mapping, "polish", spoil)
     model, _, verdict = map_and_judge(task)
     assert model is not made[-1] and verdict.grade == "right"

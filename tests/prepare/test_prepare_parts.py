@@ -14,7 +14,7 @@ from PIL import Image
 
 from mmpi_ns.capture.matching import rigid3d
 from mmpi_ns.prepare import export, features, mapping
-from mmpi_ns.prepare.adjustment import Free, adjust, polish
+from mmpi_ns.prepare.adjustment import Free, adjust, is_bent, polish, quality
 from mmpi_ns.prepare.alignment import choose_frame, similarity_between
 from mmpi_ns.prepare.images import Intrinsics, Photo, make_cameras, read_intrinsics
 from mmpi_ns.prepare.video import choose_frames, median_motion
@@ -225,10 +225,10 @@ def found_model(images, error, width=1000):
 
 
 def test_a_sound_model_beats_a_bent_one_with_more_images_and_errors_are_judged_by_image_size():
-    assert mapping.is_bent(found_model(9, 0.9)) and not mapping.is_bent(found_model(9, 0.7))
-    assert not mapping.is_bent(found_model(9, 1.5, width=2000)) and mapping.is_bent(found_model(9, 0.9, width=300))
+    assert is_bent(found_model(9, 0.9)) and not is_bent(found_model(9, 0.7))
+    assert not is_bent(found_model(9, 1.5, width=2000)) and is_bent(found_model(9, 0.9, width=300))
     models = [found_model(50, 0.9), found_model(30, 0.7), found_model(31, 0.7), found_model(31, 0.6)]
-    ranked = sorted(range(4), key=lambda i: mapping._quality(models[i]))
+    ranked = sorted(range(4), key=lambda i: quality(models[i]))
     assert ranked == [0, 1, 2, 3]
 
 
