@@ -219,7 +219,8 @@ class Preparation:
 
     def _write(self, model: pycolmap.Reconstruction, verdict: Verdict) -> Verdict:
         """Moves the model into the scene's frame and writes the scene; the verdict, with the findings of the checks."""
-        s, up, unit, says = self.settings, "that of the given poses", "that of the given poses", self.mapped["says"]
+        s, says = self.settings, self.mapped["says"]
+        up = unit = "that of the given poses"
         if self.known_poses is None or s.camera_height is not None:
             similarity, up, unit = choose_frame(model, s.camera_height)
             model.transform(similarity)
